@@ -1,0 +1,64 @@
+"""Commands from the supervisor to the loop: a number and a row of floats, so that the loop decodes without parsing.
+
+Stands on nothing; written by the supervisor into shared memory, read by the loop at the end of a cycle.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import NamedTuple
+
+
+class Op(IntEnum):
+    """What the loop can be told. Arguments in the comment."""
+
+    NONE = 0
+    ENABLE = 1  # [reset_fault 0/1]
+    DISABLE = 2  # [] ramp down, then disable
+    QUICK_STOP = 3  # []
+    HALT = 4  # [0/1] stop the reference and hold / go on
+    RESET_FAULT = 5  # []
+    ACTIVATE = 6  # [serial, law, n_params, params...]: bumpless change of the controller
+    REFERENCE = 7  # [ReferenceKind, arguments...]
+    SHUTDOWN = 8  # [] ramp down, disable, end the loop
+    NODE_EVENT = 9  # [fault code] something the supervisor saw (heartbeat lost, boot-up, EMCY): raise this fault
+
+
+class ReferenceKind(IntEnum):
+    """Reference motions. All start at the present reference position and add to it."""
+
+    HOLD = 0  # []
+    SINE = 1  # [amplitude_rad, frequency_hz, duration_s]
+    PAPER = 2  # [duration_s]: trajectory (19), x = (0.1 - 0.0033 t) sin(0.2 pi t)
+    STEP = 3  # [amplitude_rad, duration_s]
+    TABLE = 4  # [n_samples]: positions in the shared trajectory area, one for each period
+
+
+class Refusal(IntEnum):
+    """Why a command was not carried out; 0 is done."""
+
+    DONE = 0
+    NOT_ENABLED = 1
+    FAULT_PRESENT = 2
+    MOTION_RUNNING = 3
+    BAD_ARGUMENT = 4
+    OUT_OF_RANGE = 5
+    NOT_AT_REST = 6
+
+
+REFUSAL_TEXT: dict[Refusal, str] = {
+    Refusal.NOT_ENABLED: "the axis is not enabled; run `servoctl enable` first",
+    Refusal.FAULT_PRESENT: "a fault is latched; see `servoctl status`, then `servoctl enable --reset-fault`",
+    Refusal.MOTION_RUNNING: "a motion is running; `servoctl stop` ends it",
+    Refusal.BAD_ARGUMENT: "an argument is not a finite number or out of range",
+    Refusal.OUT_OF_RANGE: "the motion would leave limits.position_min_rad to position_max_rad",
+    Refusal.NOT_AT_REST: "the joint still moves",
+}
+
+
+class Command(NamedTuple):
+    """One command; `seq` grows by one with each and comes back in the cycle record when it was carried out."""
+
+    seq: int
+    op: int
+    arguments: tuple[float, ...]

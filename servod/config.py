@@ -1,0 +1,189 @@
+"""The axis configuration file: everything about bus, nodes, limits and services of one axis. Gains live elsewhere.
+
+Every key has its unit in its name and its range here; an unknown key is an error (servod.yaml12). The daemon, the
+command line and the virtual axis read the same file, the virtual axis only for node ids and bus.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from servod.yaml12 import Strict, load_model
+
+NodeId = Annotated[int, Field(ge=1, le=127, description="CANopen node id, 1 to 127")]
+Positive = Annotated[float, Field(gt=0.0)]
+
+
+class BusConfig(Strict):
+    """How to reach the bus. `virtual`: channel is the hub's Unix socket; `socketcan`: an interface name; any other
+    name goes to python-can with `options`."""
+
+    interface: str = Field("virtual", min_length=1)
+    channel: str = Field("/run/servod/vbus0", min_length=1)
+    bit_rate: Literal[10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000] = 1_000_000
+    max_load: float = Field(0.7, gt=0.0, le=0.95, description="share of the bit rate the cyclic frames may use")
+    options: dict[str, Any] = Field(default_factory=dict, description="further arguments for python-can")
+
+
+class CycleConfig(Strict):
+    """The 1 kHz cycle and what it asks of the operating system."""
+
+    period_us: int = Field(1000, ge=500, le=20_000)
+    feedback_timeout_us: int = Field(600, ge=50, le=19_000, description="how long to wait for the TPDOs after SYNC")
+    cpu: int | None = Field(None, ge=0, le=1023, description="core to pin the loop to")
+    priority: int = Field(80, ge=0, le=98, description="SCHED_FIFO priority; 0 leaves the default scheduler")
+
+    @model_validator(mode="after")
+    def _timeout_fits(self) -> CycleConfig:
+        if self.feedback_timeout_us >= self.period_us:
+            raise ValueError("cycle.feedback_timeout_us less than cycle.period_us")
+        return self
+
+
+class HeartbeatConfig(Strict):
+    """Heartbeats both ways (CiA 301: 0x1016, 0x1017)."""
+
+    master_node_id: NodeId = 126
+    master_period_ms: int = Field(50, ge=10, le=1000)
+    drive_timeout_ms: int = Field(150, ge=20, le=5000, description="0x1016 in the drive: the last line of defence")
+    node_period_ms: int = Field(50, ge=10, le=1000, description="0x1017 in the nodes")
+    node_timeout_ms: int = Field(150, ge=20, le=5000)
+
+    @model_validator(mode="after")
+    def _timeouts_exceed_periods(self) -> HeartbeatConfig:
+        if self.drive_timeout_ms < 2 * self.master_period_ms:
+            raise ValueError("heartbeat.drive_timeout_ms at least twice master_period_ms")
+        if self.node_timeout_ms < 2 * self.node_period_ms:
+            raise ValueError("heartbeat.node_timeout_ms at least twice node_period_ms")
+        return self
+
+
+class Identity(Strict):
+    """Identity object 0x1018; every number that is given is checked before anything else is written."""
+
+    vendor_id: int | None = Field(None, ge=0, le=0xFFFFFFFF)
+    product_code: int | None = Field(None, ge=0, le=0xFFFFFFFF)
+    revision: int | None = Field(None, ge=0, le=0xFFFFFFFF)
+    serial: int | None = Field(None, ge=0, le=0xFFFFFFFF)
+
+
+class AmplifierConfig(Strict):
+    """The servo amplifier. Positions of 0x6064 are counts of the motor encoder; the joint turns 1/gear_ratio of it."""
+
+    driver: str = Field("cia402", min_length=1)
+    node_id: NodeId = 1
+    eds: str | None = Field(None, description="EDS or DCF file; without it the driver's generic dictionary is used")
+    identity: Identity = Identity()
+    quirks: str = Field("none", description="row of the quirks table, e.g. epos4, elmo, copley, nanotec, technosoft")
+    counts_per_turn: int = Field(1_048_576, ge=4, le=2**32 - 1)
+    gear_ratio: Positive = 1.0
+    position_direction: Literal[1, -1] = 1
+    torque_direction: Literal[1, -1] = 1
+    rated_torque_mnm: int | None = Field(None, ge=1, description="what 0x6076 must read; None takes what is there")
+    quick_stop_option: Literal[0, 1, 2, 3, 4, 5, 6, 7, 8] = 2
+    heartbeat_reaction: Literal[1, 2, 3] = Field(3, description="0x6007: 1 fault, 2 disable voltage, 3 quick stop")
+    enable_timeout_s: float = Field(2.0, gt=0.0, le=60.0)
+
+
+class EncoderConfig(Strict):
+    """The joint's encoder and how its velocity is made."""
+
+    driver: str = Field("cia406", min_length=1)
+    node_id: NodeId = 2
+    eds: str | None = None
+    identity: Identity = Identity()
+    counts_per_turn: int = Field(1_048_576, ge=4, le=2**32 - 1, description="0x6001, checked against the device")
+    measuring_range_counts: int | None = Field(None, ge=4, le=2**32, description="0x6002; None takes what is there")
+    direction: Literal[1, -1] = 1
+    zero_offset_rad: float = 0.0
+    velocity_cutoff_hz: float = Field(120.0, gt=0.0, le=2000.0, description="first-order low-pass of the velocity")
+
+
+class LimitsConfig(Strict):
+    """The independent last layer before the wire (servod.limits)."""
+
+    torque_nm: Positive
+    torque_rate_nm_per_s: Positive
+    speed_rad_s: Positive
+    position_min_rad: float
+    position_max_rad: float
+    following_error_rad: Positive
+    encoder_mismatch_rad: Positive
+    stale_cycles: int = Field(5, ge=1, le=1000)
+    late_cycles: int = Field(20, ge=1, le=10_000, description="consecutive skipped periods that end the motion")
+    ramp_down_s: float = Field(0.05, gt=0.0, le=10.0, description="torque to zero in this time on RAMP_DOWN")
+
+    @model_validator(mode="after")
+    def _range_is_a_range(self) -> LimitsConfig:
+        if self.position_min_rad >= self.position_max_rad:
+            raise ValueError("limits.position_min_rad less than limits.position_max_rad")
+        return self
+
+
+class GainsConfig(Strict):
+    """Where gain sets are kept and which one is active at start."""
+
+    directory: Path = Path("/var/lib/servod/gains")
+    initial: Path
+    accept_uncertified: bool = Field(False, description="run gain sets without a valid certificate")
+
+
+class ControlConfig(Strict):
+    """The control socket: whose members of which group may command (root always may)."""
+
+    socket: Path = Path("/run/servod/axis.sock")
+    group: str = "servod"
+
+
+class RecorderConfig(Strict):
+    """Recordings and the history kept before a fault."""
+
+    directory: Path = Path("/var/lib/servod/recordings")
+    history_s: float = Field(10.0, ge=0.0, le=600.0, description="kept in memory, written at a fault")
+    always: bool = Field(False, description="record from start to stop")
+
+
+class MetricsConfig(Strict):
+    """Prometheus metrics: a local HTTP port, a textfile for the node exporter, both or none."""
+
+    http_port: int | None = Field(None, ge=1, le=65535)
+    http_address: str = "127.0.0.1"
+    textfile: Path | None = None
+
+
+class AxisConfig(Strict):
+    """One axis: the whole configuration file."""
+
+    name: str = Field("axis", pattern=r"^[A-Za-z0-9_.-]{1,64}$")
+    bus: BusConfig = BusConfig()
+    cycle: CycleConfig = CycleConfig()
+    heartbeat: HeartbeatConfig = HeartbeatConfig()
+    amplifier: AmplifierConfig = AmplifierConfig()
+    encoder: EncoderConfig = EncoderConfig()
+    limits: LimitsConfig
+    gains: GainsConfig
+    model: Path | None = Field(None, description="axis model file, attached to every recording")
+    control: ControlConfig = ControlConfig()
+    recorder: RecorderConfig = RecorderConfig()
+    metrics: MetricsConfig = MetricsConfig()
+
+    @model_validator(mode="after")
+    def _node_ids_differ(self) -> AxisConfig:
+        ids = (self.heartbeat.master_node_id, self.amplifier.node_id, self.encoder.node_id)
+        if len(set(ids)) != len(ids):
+            raise ValueError(
+                "different ids for heartbeat.master_node_id, amplifier.node_id and encoder.node_id"
+            )
+        return self
+
+
+def load_config(path: str | Path) -> AxisConfig:
+    """Read and check an axis configuration; relative paths inside are relative to the file. Raises BadInput."""
+    config = load_model(path, AxisConfig)
+    base = Path(path).resolve().parent
+    gains = config.gains.model_copy(update={"initial": base / config.gains.initial})
+    model = None if config.model is None else base / config.model
+    return config.model_copy(update={"gains": gains, "model": model})
