@@ -1,0 +1,145 @@
+"""The control socket's protocol and its client: one JSON object per line over a Unix stream socket.
+
+Between command line and daemon. Request `{"id": 1, "verb": "status", "args": {}}`, answer `{"id": 1, "ok": true,
+"result": {...}}` or `{"id": 1, "ok": false, "error": {"exit_code": 3, "message": "one line"}}`. The server side is
+servod.daemon.control_server.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Iterator
+from enum import StrEnum
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from servod.errors import AnswerIsNo, BadInput, ServodError, Unreachable
+
+#: Longest line either side takes: ten minutes of positions at 1 kHz fit; a longer line ends the connection.
+MAX_LINE_BYTES = 12 * 1024 * 1024
+
+
+class Verb(StrEnum):
+    """What the daemon can be asked."""
+
+    STATUS = "status"
+    WATCH = "watch"
+    ENABLE = "enable"
+    DISABLE = "disable"
+    STOP = "stop"
+    HALT = "halt"
+    TRACK = "track"
+    GAINS_LOAD = "gains_load"
+    GAINS_LIST = "gains_list"
+    GAINS_ACTIVATE = "gains_activate"
+    GAINS_ROLLBACK = "gains_rollback"
+    RECORD_START = "record_start"
+    RECORD_STOP = "record_stop"
+    SCAN = "scan"
+
+
+#: Verbs that only look; everything else needs the right to command.
+READING = frozenset({Verb.STATUS, Verb.WATCH, Verb.GAINS_LIST})
+
+
+class RemoteBadInput(BadInput):
+    """Bad input that the daemon found; carries its line as it stands."""
+
+    def __init__(self, line: str) -> None:
+        ServodError.__init__(self, line)
+        self.where, self.found, self.allowed = "daemon", line, ""
+
+
+_ERRORS: dict[int, type[ServodError]] = {1: AnswerIsNo, 2: RemoteBadInput}
+
+
+def encode_line(message: dict[str, Any]) -> bytes:
+    """One JSON object as a line; NaN and infinity are refused, JSON has none. Raises ValueError."""
+    return json.dumps(message, separators=(",", ":"), allow_nan=False).encode() + b"\n"
+
+
+def decode_line(line: bytes) -> dict[str, Any]:
+    """The JSON object of one line. Raises ValueError when it is anything else."""
+    try:
+        message = json.loads(line)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    if not isinstance(message, dict):
+        raise ValueError("not a JSON object")
+    return message
+
+
+class ControlClient:
+    """One connection to a running daemon; holds the right to command, once used, until it is closed."""
+
+    def __init__(self, path: str | Path, timeout_s: float = 30.0) -> None:
+        self._path = str(path)
+        self._id = 0
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
+        self._socket.settimeout(timeout_s)
+        try:
+            self._socket.connect(self._path)
+        except OSError as error:
+            self._socket.close()
+            raise Unreachable(f"{path}: no daemon answers ({error.strerror or error}); is servod running?") from None
+        self._lines = self._socket.makefile("rb")
+
+    def __enter__(self) -> ControlClient:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave; gives back the right to command."""
+        self._lines.close()
+        self._socket.close()
+
+    def call(self, verb: Verb | str, **args: Any) -> dict[str, Any]:
+        """Ask and wait for the answer's result. Raises Unreachable, BadInput or AnswerIsNo by its exit code."""
+        self._ask(verb, args)
+        while True:
+            answer = self._answer()
+            if answer.get("id") == self._id:
+                return _result(answer)
+
+    def watch(self, period_s: float = 0.2) -> Iterator[dict[str, Any]]:
+        """Status after status until the daemon stops or the connection is closed; raises as `call` does."""
+        self._ask(Verb.WATCH, {"period_s": period_s})
+        while True:
+            yield _result(self._answer())
+
+    def _ask(self, verb: Verb | str, args: dict[str, Any]) -> None:
+        self._id += 1
+        try:
+            line = encode_line({"id": self._id, "verb": str(verb), "args": args})
+        except ValueError:
+            raise BadInput(f"{verb}", "a number that is not finite", "finite numbers") from None
+        try:
+            self._socket.sendall(line)
+        except OSError as error:
+            raise Unreachable(f"{self._path}: the daemon hung up ({error.strerror or error})") from None
+
+    def _answer(self) -> dict[str, Any]:
+        try:
+            line = self._lines.readline(MAX_LINE_BYTES)
+        except TimeoutError:
+            raise Unreachable(f"{self._path}: no answer within {self._socket.gettimeout()} s") from None
+        except OSError as error:
+            raise Unreachable(f"{self._path}: the daemon hung up ({error.strerror or error})") from None
+        if not line.endswith(b"\n"):
+            raise Unreachable(f"{self._path}: the daemon hung up")
+        try:
+            return decode_line(line)
+        except ValueError as error:
+            raise Unreachable(f"{self._path}: answers with something else than servod would ({error})") from None
+
+
+def _result(answer: dict[str, Any]) -> dict[str, Any]:
+    if answer.get("ok"):
+        result = answer.get("result")
+        return result if isinstance(result, dict) else {}
+    error = answer.get("error") or {}
+    raise _ERRORS.get(int(error.get("exit_code", 3)), Unreachable)(str(error.get("message", "refused")))
