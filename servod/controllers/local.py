@@ -1,0 +1,92 @@
+"""Local-model law (9), (16): friction state with a decay per local set, and state feedback scheduled over two regions.
+
+    z_hat' = -a(v)*z_hat + v + l(v)*u*,   a = sum mu_i*a_i,  l = sum mu_i*l_i                               (9)
+    u*     = mu_L*(k_x e + k_v e' - k_z z_hat)|L + mu_H*(k_x e + k_v e' - k_z z_hat)|H,   e = x_ref - x     (13), (16)
+    u      = K*u* + c0*z_hat + d0*v + m_ff*a_ref + d_hat                                                    (16)
+
+All three gains are negative feedback. l > 0 makes z_hat push the way the feedback pushes (integral action through the
+friction state); the other sign is harmful. Every direction has its own nodes, so asymmetry needs nothing special.
+Options: the velocity of z_hat, of d0 and of both schedules is the measured one or the reference's, led by a stated
+time; an output disturbance observer around the whole (bandwidth 0: none).
+At rest: within the hold width neither l nor the observer acts, and the leak floor lets z_hat fade: no hunting, no
+creep.
+"""
+
+from __future__ import annotations
+
+from collections.abc import MutableSequence, Sequence
+
+from servod.controllers.exact import decayed, limited
+from servod.controllers.observer import observe, remember
+from servod.controllers.state import ASKED, DISTURBANCE, FRICTION_STATE
+from servod.controllers.weights import blended
+from servod.controllers.windup import winds_up
+
+INPUT_SCALE = 0  # K [N*m per unit of u*]
+LOW_K_Z, LOW_K_X, LOW_K_V = 1, 2, 3  # gains of Omega_L [1/rad, 1/rad, s/rad]
+HIGH_K_Z, HIGH_K_X, HIGH_K_V = 4, 5, 6  # gains of Omega_H
+BLEND_FROM = 7  # speed up to which Omega_L holds alone [rad/s]
+BLEND_TO = 8  # speed from which Omega_H holds alone [rad/s]
+STIFFNESS = 9  # c0_hat [N*m/rad]
+VISCOUS = 10  # d0_hat [N*m*s/rad]
+LEAK = 11  # least decay of z_hat [1/s]
+STATE_LIMIT = 12  # bound of |z_hat| [rad], F_max/c0 as below (8)
+SOURCE = 13  # VelocitySource
+LEAD = 14  # time by which the reference velocity is led [s]
+SHAPE = 15  # servod.controllers.weights.Shape
+HOLD_WITHIN = 16  # hold width [rad]
+FEEDFORWARD_INERTIA = 17  # m_ff [kg*m^2]
+OBSERVER_BANDWIDTH = 18  # g of the output disturbance observer [rad/s], 0: none
+OBSERVER_INERTIA = 19  # nominal m of the observer [kg*m^2]
+OBSERVER_LIMIT = 20  # bound of |d_hat| [N*m]
+N_SETS = 21  # number n of local sets
+FIRST_NODE = 22  # then n nodes v_i [rad/s], n decays a_i [1/s], n gains l_i
+
+MEASURED = 0.0
+REFERENCE = 1.0
+
+
+def scheduled(p: Sequence[float], speed: float, error: float, error_rate: float, z: float) -> float:
+    """u* of (13), gains blended from Omega_L to Omega_H over the overlap, linearly in the speed [rad/s]."""
+    low = p[LOW_K_X] * error + p[LOW_K_V] * error_rate - p[LOW_K_Z] * z
+    if speed <= p[BLEND_FROM]:
+        return low
+    high = p[HIGH_K_X] * error + p[HIGH_K_V] * error_rate - p[HIGH_K_Z] * z
+    if speed >= p[BLEND_TO]:
+        return high
+    return low + (high - low) * (speed - p[BLEND_FROM]) / (p[BLEND_TO] - p[BLEND_FROM])
+
+
+def step(  # noqa: PLR0917  (the one signature that all laws share)
+    p: Sequence[float],
+    s: MutableSequence[float],
+    x_ref: float,
+    v_ref: float,
+    a_ref: float,
+    x: float,
+    v: float,
+    u_applied: float,
+    dt: float,
+) -> tuple[float, float, float, float]:
+    """One cycle: (torque, of it feedback K*u*, friction compensation, other) in N*m."""
+    w = v_ref + p[LEAD] * a_ref if p[SOURCE] == REFERENCE else v
+    error = x_ref - x
+    u_star = scheduled(p, abs(w), error, v_ref - v, s[FRICTION_STATE])
+    moves = not (v_ref == 0.0 and a_ref == 0.0 and abs(error) <= p[HOLD_WITHIN])
+    decay, gain = blended(p, FIRST_NODE, int(p[N_SETS]), p[SHAPE], w)
+    drive = w
+    if moves and gain != 0.0 and not winds_up(s, u_star, u_applied):
+        drive += gain * u_star
+    z = limited(decayed(s[FRICTION_STATE], max(decay, p[LEAK]), drive, dt), p[STATE_LIMIT])
+    s[FRICTION_STATE] = z
+    friction = p[STIFFNESS] * z + p[VISCOUS] * w
+    other = p[FEEDFORWARD_INERTIA] * a_ref
+    if p[OBSERVER_BANDWIDTH] > 0.0:
+        if moves:
+            observe(s, p[OBSERVER_BANDWIDTH], p[OBSERVER_INERTIA], p[OBSERVER_LIMIT], v, u_applied, dt)
+        remember(s, v, friction, u_applied)
+        other += s[DISTURBANCE]
+    feedback = p[INPUT_SCALE] * u_star
+    torque = feedback + friction + other
+    s[ASKED] = torque
+    return torque, feedback, friction, other

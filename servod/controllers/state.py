@@ -1,0 +1,16 @@
+"""State of a control law: one layout for all laws, so that the engine can carry it over when the law changes.
+
+Stands under the laws. A law's state is a list of `N_STATES` floats (a float64 array when compiled), changed in place.
+"""
+
+from __future__ import annotations
+
+N_STATES = 7
+
+FRICTION_STATE = 0  # z_hat, estimated bristle deflection [rad]; 0.0 where the law has none
+DISTURBANCE = 1  # d_hat, estimated disturbance [N*m]; 0.0 where the law has none
+ASKED = 2  # torque asked for in the previous step, before limits [N*m]
+ACTED = 3  # torque that acted while the previous sample became the present one [N*m]
+LAST_VELOCITY = 4  # velocity of the previous step [rad/s]
+MODELLED = 5  # friction torque that the law knew of in the previous step [N*m]
+STARTED = 6  # 0.0 before the first step
