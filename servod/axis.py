@@ -1,0 +1,236 @@
+"""The axis: from what is wanted and what the drive says to a goal for the drive and a share of torque, each cycle.
+
+Stands between drivers and controller on the data path. It enables only on an explicit request, turns each fault into its
+reaction (servod.errors.FAULTS), and brings the axis to rest by one of three ways: braking the reference and then
+ramping the torque down (DISABLE, SHUTDOWN, a lost supervisor), the drive's quick stop, or voltage off at once.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import NamedTuple
+
+from servod.commands import Refusal
+from servod.errors import FAULTS, FaultCode, Reaction
+from servod.hal import AmplifierFeedback, DriveState, Goal, Mode, Reason
+
+_BIT = {code: fault.bit for code, fault in FAULTS.items()}
+_MASK = {r: sum(f.bit for f in FAULTS.values() if f.reaction == r) for r in Reaction}
+_STATUS_WARNING, _STATUS_LIMIT = 1 << 7, 1 << 11
+
+
+class AxisState(IntEnum):
+    """What the axis is doing, for people and for the record."""
+
+    DISABLED = 0
+    ENABLING = 1
+    ENABLED = 2
+    BRAKING = 3  # controller still active, reference slowing down
+    RAMPING = 4  # torque going to zero
+    QUICK_STOPPING = 5  # the drive stops the axis
+    FAULT = 6
+
+
+_CONTROLLED = (AxisState.ENABLED, AxisState.BRAKING, AxisState.RAMPING)
+
+
+class AxisOutput(NamedTuple):
+    """What the axis asks for in this cycle."""
+
+    goal: Goal
+    torque_share: float  # 0..1, applied to the controller's torque
+    controlled: bool  # the controller runs and its torque goes out
+    just_enabled: bool  # first controlled cycle: seed reference, controller and limits
+    brake: bool  # let the reference come to rest
+    reset_fault: bool  # one rising edge for the drive
+
+
+class Axis:
+    """State of one axis and its faults; `step` once per cycle."""
+
+    def __init__(self, period_s: float, ramp_down_s: float, enable_timeout_s: float, mode: Mode) -> None:
+        """Times in seconds; `mode` is what the drive must show while enabled."""
+        self.state = AxisState.DISABLED
+        self.faults = 0  # present in this cycle
+        self.latched = 0  # since the last enable or reset
+        self._period_s, self._mode = period_s, int(mode)
+        self._ramp_cycles = max(1, round(ramp_down_s / period_s))
+        self._timeout_cycles = max(1, round(enable_timeout_s / period_s))
+        self._cycles_in_state = 0
+        self._reset_wanted = False
+        self._end_state = AxisState.DISABLED
+
+    @property
+    def goal(self) -> Goal:
+        """What the drive shall do in the present state."""
+        return _GOAL[self.state]
+
+    def enable(self, reset_fault: bool) -> Refusal:
+        """Explicit request to enable; with `reset_fault` latched faults and the drive's fault are reset first."""
+        if self.state not in (AxisState.DISABLED, AxisState.FAULT):
+            return Refusal.DONE if self.state in (AxisState.ENABLED, AxisState.ENABLING) else Refusal.MOTION_RUNNING
+        if reset_fault:
+            self.reset_fault()
+        if self.latched & ~_MASK[Reaction.NONE] & ~_MASK[Reaction.CLIP]:
+            return Refusal.FAULT_PRESENT
+        self.latched = 0
+        self._enter(AxisState.ENABLING)
+        return Refusal.DONE
+
+    def reset_fault(self) -> Refusal:
+        """Forget latched faults and ask the drive once to reset its own."""
+        if self.state in _CONTROLLED:
+            return Refusal.MOTION_RUNNING
+        self.latched, self._reset_wanted = 0, True
+        if self.state == AxisState.FAULT:
+            self._enter(AxisState.DISABLED)
+        return Refusal.DONE
+
+    def disable(self) -> None:
+        """Bring the axis to rest under control, then switch off."""
+        if self.state == AxisState.ENABLED:
+            self._stop(AxisState.BRAKING, AxisState.DISABLED)
+        elif self.state == AxisState.ENABLING:
+            self._enter(AxisState.DISABLED)
+
+    def quick_stop(self) -> None:
+        """Let the drive stop the axis by its quick-stop option."""
+        if self.state in _CONTROLLED:
+            self._stop(AxisState.QUICK_STOPPING, AxisState.DISABLED)
+        elif self.state == AxisState.ENABLING:
+            self._enter(AxisState.DISABLED)
+
+    def step(self, amplifier: AmplifierFeedback, faults: int, reference_at_rest: bool) -> AxisOutput:
+        """One cycle: `faults` are the bits that limits, bus and supervisor raised; returns what to do."""
+        self._cycles_in_state += 1
+        self.faults = faults | self._drive_faults(amplifier)
+        if self.state not in (AxisState.DISABLED, AxisState.FAULT):
+            self._react()
+        just_enabled = self._move_on(amplifier, reference_at_rest)
+        reset, self._reset_wanted = self._reset_wanted, False
+        return AxisOutput(
+            self.goal,
+            self._torque_share(),
+            self.state in _CONTROLLED,
+            just_enabled,
+            self.state == AxisState.BRAKING,
+            reset,
+        )
+
+    def raise_fault(self, fault_bits: int) -> None:
+        """A fault found after `step` in the same cycle (the torque limits): react at once."""
+        self.faults |= fault_bits
+        if self.state not in (AxisState.DISABLED, AxisState.FAULT):
+            self._react()
+
+    def _enter(self, state: AxisState) -> None:
+        self.state, self._cycles_in_state = state, 0
+
+    def _stop(self, way: AxisState, end: AxisState) -> None:
+        self._end_state = end
+        self._enter(way)
+
+    def _react(self) -> None:
+        """Apply the strongest reaction among the present faults; a stop in progress is only ever made stronger."""
+        faults, state = self.faults, self.state
+        self.latched |= faults
+        if not faults:
+            return
+        if faults & _MASK[Reaction.DISABLE]:
+            self._enter(AxisState.FAULT)
+        elif faults & _MASK[Reaction.QUICK_STOP]:
+            if state == AxisState.ENABLING:
+                self._enter(AxisState.FAULT)
+            elif state != AxisState.QUICK_STOPPING:
+                self._stop(AxisState.QUICK_STOPPING, AxisState.FAULT)
+            self._end_state = AxisState.FAULT
+        elif faults & _MASK[Reaction.RAMP_DOWN]:
+            self._react_ramp_down(faults)
+
+    def _react_ramp_down(self, faults: int) -> None:
+        self._end_state = AxisState.FAULT
+        if self.state == AxisState.ENABLING:
+            self._enter(AxisState.FAULT)
+        elif self.state == AxisState.ENABLED:
+            # A lost supervisor leaves a sound controller: brake first. A following error does not: ramp at once.
+            sound = faults & _MASK[Reaction.RAMP_DOWN] == _BIT[FaultCode.SUPERVISOR_LOST]
+            self._stop(AxisState.BRAKING if sound else AxisState.RAMPING, AxisState.FAULT)
+
+    def _drive_faults(self, amplifier: AmplifierFeedback) -> int:
+        """What the drive's own words say is wrong, as fault bits; stale words say nothing (limits count the age)."""
+        if amplifier.age_cycles > 0:
+            return 0
+        faults, state = 0, amplifier.state
+        if state in (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE) and not self._being_reset():
+            faults |= _BIT[FaultCode.DRIVE_FAULT]
+        if amplifier.status_word & _STATUS_WARNING:
+            faults |= _BIT[FaultCode.DRIVE_WARNING]
+        if self.state in _CONTROLLED:
+            faults |= self._operation_faults(amplifier)
+        return faults
+
+    def _operation_faults(self, amplifier: AmplifierFeedback) -> int:
+        state = amplifier.state
+        if state == DriveState.UNKNOWN:
+            return _BIT[FaultCode.DRIVE_STATUS_UNKNOWN]
+        faults = 0
+        if state not in (DriveState.OPERATION_ENABLED, DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE):
+            faults |= _BIT[FaultCode.DRIVE_LEFT_OPERATION]
+        if amplifier.mode not in (-1, self._mode):
+            faults |= _BIT[FaultCode.DRIVE_MODE_WRONG]
+        if amplifier.status_word & _STATUS_LIMIT:
+            faults |= _BIT[FaultCode.DRIVE_LIMITS_TORQUE]
+        return faults
+
+    def _being_reset(self) -> bool:
+        """While enabling, the drive may still be in the fault that was just reset; the time-out judges."""
+        return self.state == AxisState.ENABLING
+
+    def _move_on(self, amplifier: AmplifierFeedback, reference_at_rest: bool) -> bool:
+        """Transitions that come with time and the drive's answer; True in the first controlled cycle."""
+        state = self.state
+        if state == AxisState.ENABLING:
+            return self._finish_enabling(amplifier)
+        if state == AxisState.BRAKING and (reference_at_rest or self._cycles_in_state > self._ramp_cycles):
+            self._enter(AxisState.RAMPING)
+        elif state == AxisState.RAMPING and self._cycles_in_state >= self._ramp_cycles:
+            self._enter(self._end_state)
+        elif state == AxisState.QUICK_STOPPING and self._quick_stop_is_over(amplifier):
+            self._enter(self._end_state)
+        return False
+
+    def _finish_enabling(self, amplifier: AmplifierFeedback) -> bool:
+        if amplifier.goal_reached and amplifier.state == DriveState.OPERATION_ENABLED:
+            self._enter(AxisState.ENABLED)
+            return True
+        if self._cycles_in_state > self._timeout_cycles:
+            fault = FaultCode.DRIVE_FAULT if amplifier.reasons & Reason.IN_FAULT else FaultCode.ENABLE_TIMEOUT
+            self.faults |= _BIT[fault]
+            self.latched |= _BIT[fault]
+            self._enter(AxisState.FAULT)
+        return False
+
+    def _quick_stop_is_over(self, amplifier: AmplifierFeedback) -> bool:
+        """Over when the drive has switched itself off, or has had its time (it may hold in quick stop active)."""
+        off = amplifier.age_cycles == 0 and amplifier.state in (
+            DriveState.SWITCH_ON_DISABLED,
+            DriveState.READY_TO_SWITCH_ON,
+            DriveState.FAULT,
+        )
+        return off or self._cycles_in_state > self._timeout_cycles
+
+    def _torque_share(self) -> float:
+        if self.state == AxisState.RAMPING:
+            return max(0.0, 1.0 - self._cycles_in_state / self._ramp_cycles)
+        return 1.0 if self.state in _CONTROLLED else 0.0
+
+
+_GOAL: dict[AxisState, Goal] = {
+    AxisState.DISABLED: Goal.OFF,
+    AxisState.ENABLING: Goal.ENABLED,
+    AxisState.ENABLED: Goal.ENABLED,
+    AxisState.BRAKING: Goal.ENABLED,
+    AxisState.RAMPING: Goal.ENABLED,
+    AxisState.QUICK_STOPPING: Goal.QUICK_STOP,
+    AxisState.FAULT: Goal.OFF,
+}

@@ -1,0 +1,101 @@
+"""Limits: the last word before the wire. They trust neither the controller nor the configuration of the drive.
+
+One call per cycle, after the controller and before the driver. Finite numbers are checked before anything is clamped,
+because min() and max() turn NaN into a limit value. What each fault does to the axis stands in servod.errors.FAULTS.
+"""
+
+from __future__ import annotations
+
+import math
+
+from servod.config import LimitsConfig
+from servod.errors import FAULTS, FaultCode
+from servod.hal import AmplifierFeedback, EncoderFeedback
+
+_BIT = {code: fault.bit for code, fault in FAULTS.items()}
+_NOT_FINITE = _BIT[FaultCode.NOT_FINITE]
+_STALE = _BIT[FaultCode.FEEDBACK_STALE]
+_ALARM = _BIT[FaultCode.ENCODER_ALARM]
+_MISMATCH = _BIT[FaultCode.ENCODER_IMPLAUSIBLE]
+_SPEED = _BIT[FaultCode.SPEED_LIMIT]
+_POSITION = _BIT[FaultCode.POSITION_LIMIT]
+_FOLLOWING = _BIT[FaultCode.FOLLOWING_ERROR]
+_LATE = _BIT[FaultCode.DEADLINE_LATE]
+_BUDGET = _BIT[FaultCode.DEADLINE_BUDGET]
+_CLIPPED = _BIT[FaultCode.TORQUE_CLIPPED]
+_RATE = _BIT[FaultCode.TORQUE_RATE_CLIPPED]
+
+
+class Limits:
+    """Limits of one axis; holds the last torque, the encoder offset at enable and the count of late cycles."""
+
+    def __init__(self, config: LimitsConfig) -> None:
+        """Copies the numbers out of `config`, so that the cycle touches plain floats only."""
+        self.torque_nm = config.torque_nm
+        self.torque_rate_nm_per_s = config.torque_rate_nm_per_s
+        self.speed_rad_s = config.speed_rad_s
+        self.position_min_rad, self.position_max_rad = config.position_min_rad, config.position_max_rad
+        self.following_error_rad = config.following_error_rad
+        self.encoder_mismatch_rad = config.encoder_mismatch_rad
+        self.stale_cycles, self.late_cycles = config.stale_cycles, config.late_cycles
+        self._last_torque_nm = 0.0
+        self._encoder_offset_rad = 0.0
+        self._late_in_a_row = 0
+
+    def arm(self, amplifier: AmplifierFeedback, encoder: EncoderFeedback) -> None:
+        """At enable: both position sensors agree by definition now; torque starts from what is produced now."""
+        self._encoder_offset_rad = amplifier.position_rad - encoder.position_rad
+        self._last_torque_nm = amplifier.torque_nm if math.isfinite(amplifier.torque_nm) else 0.0
+
+    def feedback_faults(self, amplifier: AmplifierFeedback, encoder: EncoderFeedback, skipped: int) -> int:
+        """Faults of feedback and deadline, which count whether or not the axis is enabled; as fault bits."""
+        faults = self._deadline_faults(skipped)
+        if amplifier.age_cycles >= self.stale_cycles or encoder.age_cycles >= self.stale_cycles:
+            faults |= _STALE
+        if encoder.alarms:
+            faults |= _ALARM
+        # One non-finite summand makes the sum non-finite (an overflow of finite ones is no sane feedback either).
+        total = amplifier.position_rad + amplifier.torque_nm + encoder.position_rad + encoder.velocity_rad_s
+        if not math.isfinite(total):
+            faults |= _NOT_FINITE
+        return faults
+
+    def motion_faults(self, amplifier: AmplifierFeedback, encoder: EncoderFeedback, reference_rad: float) -> int:
+        """Faults of the motion of an enabled axis, as fault bits. Comparisons are written so that NaN is a fault."""
+        faults = 0
+        position = encoder.position_rad
+        if not abs(encoder.velocity_rad_s) <= self.speed_rad_s:
+            faults |= _SPEED
+        if not self.position_min_rad <= position <= self.position_max_rad:
+            faults |= _POSITION
+        if not abs(reference_rad - position) <= self.following_error_rad:
+            faults |= _FOLLOWING
+        if not abs(amplifier.position_rad - position - self._encoder_offset_rad) <= self.encoder_mismatch_rad:
+            faults |= _MISMATCH
+        return faults
+
+    def limit_torque(self, wanted_nm: float, dt_s: float) -> tuple[float, int]:
+        """The torque that may go out, and fault bits of what was limited. Not finite gives zero."""
+        if not (math.isfinite(wanted_nm) and math.isfinite(dt_s)):
+            self._last_torque_nm = 0.0
+            return 0.0, _NOT_FINITE
+        faults, torque_nm = 0, wanted_nm
+        if abs(torque_nm) > self.torque_nm:
+            torque_nm, faults = math.copysign(self.torque_nm, torque_nm), _CLIPPED
+        step_nm = self.torque_rate_nm_per_s * dt_s
+        change_nm = torque_nm - self._last_torque_nm
+        if abs(change_nm) > step_nm:
+            torque_nm, faults = self._last_torque_nm + math.copysign(step_nm, change_nm), faults | _RATE
+        self._last_torque_nm = torque_nm
+        return torque_nm, faults
+
+    def release(self) -> None:
+        """The axis produces no torque: the next ramp starts from zero."""
+        self._last_torque_nm = 0.0
+
+    def _deadline_faults(self, skipped: int) -> int:
+        if skipped == 0:
+            self._late_in_a_row = 0
+            return 0
+        self._late_in_a_row += skipped
+        return _LATE | (_BUDGET if self._late_in_a_row > self.late_cycles else 0)

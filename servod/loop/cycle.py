@@ -1,0 +1,211 @@
+"""One cycle of the loop, in the order in which it happens:
+
+    SYNC -> frames -> feedback in SI units -> axis: state, goal -> controller: torque -> limits: last word
+         -> control word and torque in one PDO -> heartbeat -> record -> at most one command from the supervisor
+
+A synchronous RPDO acts at the next SYNC: one cycle of delay belongs to the loop by design.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Protocol
+
+from servod.axis import Axis, AxisOutput, AxisState
+from servod.bus import Bus
+from servod.clock import Clock
+from servod.commands import Command
+from servod.controllers.engine import Controller
+from servod.drivers import load_driver
+from servod.errors import FAULTS, FaultCode
+from servod.hal import AmplifierCommand, AmplifierFeedback, EncoderFeedback, Goal, Mode
+from servod.limits import Limits
+from servod.loop.exchange import Exchange
+from servod.loop.orders import carry_out
+from servod.loop.plan import LoopPlan
+from servod.references import Reference
+from servod.units import NS_PER_S, NS_PER_US
+
+_SUPERVISOR_LOST = FAULTS[FaultCode.SUPERVISOR_LOST].bit
+#: Cycles with goal OFF before the loop ends, so that the drive has surely seen it.
+GOODBYE_CYCLES = 20
+
+
+class Link(Protocol):
+    """The loop's side of its supervisor: shared memory in a process of its own, plain lists when stepped."""
+
+    trajectory: Sequence[float]
+
+    def write_record(self, values: Sequence[float]) -> None:
+        """Publish one cycle record."""
+        ...
+
+    def next_command(self) -> Command | None:
+        """The next command, or None."""
+        ...
+
+
+class _Torque(NamedTuple):
+    """Torque of one cycle and its parts, N*m."""
+
+    sent: float = 0.0
+    controller: float = 0.0
+    feedback: float = 0.0
+    friction: float = 0.0
+    other: float = 0.0
+
+
+_NO_TORQUE = _Torque()
+
+
+class Cycle:
+    """Everything that one cycle touches. `finished` turns true when a shutdown is complete."""
+
+    def __init__(
+        self, plan: LoopPlan, bus: Bus, clock: Clock, link: Link, supervisor_alive: Callable[[], bool]
+    ) -> None:
+        """Build the cycle of `plan` on `bus`; all configuration is copied into plain values here."""
+        config = plan.config
+        self.clock, self.link, self._supervisor_alive = clock, link, supervisor_alive
+        self.period_ns = config.cycle.period_us * NS_PER_US
+        self._period_s = self.period_ns / NS_PER_S
+        self._feedback_timeout_ns = config.cycle.feedback_timeout_us * NS_PER_US
+        self.amplifier: Any = load_driver(plan.amplifier.driver).cyclic(plan.amplifier)
+        self.encoder: Any = load_driver(plan.encoder.driver).cyclic(plan.encoder)
+        self.exchange = Exchange(bus, clock, self.amplifier, self.encoder, config.heartbeat.master_node_id)
+        self.axis = Axis(
+            self._period_s, config.limits.ramp_down_s, config.amplifier.enable_timeout_s, Mode.CYCLIC_SYNC_TORQUE
+        )
+        self.limits = Limits(config.limits)
+        self.controller = Controller()
+        self.controller.activate(plan.law, plan.parameters, 0.0)
+        self.controller_serial = plan.serial
+        self.reference = Reference(config.limits.ramp_down_s)
+        self.event_faults = 0  # raised by the supervisor for one cycle
+        self.shutting_down = self.finished = False
+        self.torque_nm = 0.0
+        self._ramp_from_nm = 0.0
+        self._heartbeat_every = max(1, config.heartbeat.master_period_ms * 1000 // config.cycle.period_us)
+        self._number = self._missed = self._heartbeat_due = 0
+        self._last_sync_ns = self.exchange.sync_ns - self.period_ns
+        self._command_seq = self._command_result = 0
+        self._tick_ns = self._torque_sent_ns = self._goodbye = 0
+
+    def step(self, deadline_ns: int, woke_ns: int, skipped: int) -> None:
+        """One cycle; `skipped` periods were missed before it."""
+        self._number += 1 + skipped
+        self._missed += skipped
+        sync_ns = self.exchange.sync()
+        waiting_from_ns = self.clock.now_ns()
+        self.exchange.collect(sync_ns + self._feedback_timeout_ns)
+        waited_ns = self.clock.now_ns() - waiting_from_ns
+        amplifier, encoder = self.amplifier.read(), self.encoder.read()
+        dt_s = self._interval_s(sync_ns)
+        output = self.axis.step(amplifier, self._faults(amplifier, encoder, skipped), self.reference.at_rest)
+        torque = self._torque(output, amplifier, encoder, dt_s)
+        self._send(torque.sent, output)
+        self._torque_sent_ns = self.clock.now_ns() - deadline_ns
+        self._record(woke_ns - deadline_ns, amplifier, encoder, torque)
+        self._take_command()
+        self._say_goodbye()
+        self._tick_ns = self.clock.now_ns() - woke_ns - waited_ns
+
+    def shut_down(self) -> None:
+        """Bring the axis to rest, switch it off, and be finished some cycles later."""
+        self.shutting_down = True
+        self.axis.disable()
+
+    def _interval_s(self, sync_ns: int) -> float:
+        """Measured time since the last SYNC; a long stall is not integrated as if the loop had been there."""
+        interval_s = (sync_ns - self._last_sync_ns) / NS_PER_S
+        self._last_sync_ns = sync_ns
+        return min(max(interval_s, 0.2 * self._period_s), 20.0 * self._period_s)
+
+    def _faults(self, amplifier: AmplifierFeedback, encoder: EncoderFeedback, skipped: int) -> int:
+        faults = self.limits.feedback_faults(amplifier, encoder, skipped) | self.exchange.faults() | self.event_faults
+        self.event_faults = 0
+        if self.axis.state in (AxisState.ENABLED, AxisState.BRAKING):
+            faults |= self.limits.motion_faults(amplifier, encoder, self.reference.position_rad)
+        if not self._supervisor_alive():
+            faults |= _SUPERVISOR_LOST
+            self.shutting_down = True
+        return faults
+
+    def _torque(
+        self, output: AxisOutput, amplifier: AmplifierFeedback, encoder: EncoderFeedback, dt_s: float
+    ) -> _Torque:
+        """Controller and limits; zero torque when the axis is not controlled."""
+        if not output.controlled:
+            self._rest(encoder)
+            return _NO_TORQUE
+        if output.just_enabled:
+            self._seed(amplifier, encoder)
+        if output.brake:
+            self.reference.halt(True)
+        self.reference.advance(dt_s)
+        reference = self.reference
+        law = self.controller.step(
+            reference.position_rad, reference.velocity_rad_s, reference.acceleration_rad_s2,
+            encoder.position_rad, encoder.velocity_rad_s, self.torque_nm, dt_s,
+        )  # fmt: skip
+        wanted_nm = law.u if output.torque_share == 1.0 else self._ramp_from_nm * output.torque_share
+        sent_nm, faults = self.limits.limit_torque(wanted_nm, dt_s)
+        if faults:
+            self.axis.raise_fault(faults)
+        if output.torque_share == 1.0:
+            self._ramp_from_nm = sent_nm
+        self.torque_nm = sent_nm
+        return _Torque(sent_nm, law.u, law.feedback, law.friction, law.other)
+
+    def _seed(self, amplifier: AmplifierFeedback, encoder: EncoderFeedback) -> None:
+        """First controlled cycle: stay where the joint is, go on from the torque that is produced now."""
+        self.limits.arm(amplifier, encoder)
+        self.torque_nm = self._ramp_from_nm = amplifier.torque_nm
+        self.reference.hold(encoder.position_rad)
+        self.controller.reset(amplifier.torque_nm)
+
+    def _rest(self, encoder: EncoderFeedback) -> None:
+        """Not controlled: the reference follows the joint, torque and ramps start from zero next time."""
+        self.reference.hold(encoder.position_rad)
+        self.limits.release()
+        self.torque_nm = self._ramp_from_nm = 0.0
+
+    def _send(self, torque_nm: float, output: AxisOutput) -> None:
+        """Control word and torque in one frame; the goal is asked anew, since the limits may just have changed it."""
+        goal = self.axis.goal
+        command = AmplifierCommand(goal, torque_nm if goal == Goal.ENABLED else 0.0, False, output.reset_fault)
+        self.exchange.send(*self.amplifier.write(command))
+        if self._number >= self._heartbeat_due:
+            self._heartbeat_due = self._number + self._heartbeat_every
+            self.exchange.heartbeat()
+
+    def _record(self, lag_ns: int, amplifier: AmplifierFeedback, encoder: EncoderFeedback, torque: _Torque) -> None:
+        """Publish the cycle, in the order of servod.record.FIELDS."""
+        axis, reference, controller = self.axis, self.reference, self.controller
+        queue_full, error_frames = self.exchange.counts()
+        self.link.write_record((
+            self.exchange.sync_ns, self._number, self._missed, lag_ns, self._tick_ns, self._torque_sent_ns,
+            axis.state, amplifier.state, amplifier.status_word, amplifier.mode, axis.goal, amplifier.goal_reached,
+            amplifier.reasons, axis.faults, axis.latched, amplifier.error_code,
+            amplifier.age_cycles, encoder.age_cycles, self.controller_serial, self._command_seq, self._command_result,
+            reference.active, queue_full, error_frames,
+            reference.position_rad, reference.velocity_rad_s, encoder.position_rad, encoder.velocity_rad_s,
+            amplifier.position_rad, amplifier.torque_nm,
+            torque.sent, torque.controller, torque.feedback, torque.friction, torque.other,
+            controller.friction_state, controller.disturbance,
+        ))  # fmt: skip
+
+    def _take_command(self) -> None:
+        command = self.link.next_command()
+        if command is not None:
+            self._command_result = carry_out(self, command)
+            self._command_seq = command.seq
+
+    def _say_goodbye(self) -> None:
+        """After a shutdown: finished once the drive has had the goal OFF for some cycles."""
+        if not self.shutting_down:
+            return
+        self.axis.disable()
+        resting = self.axis.state in (AxisState.DISABLED, AxisState.FAULT)
+        self._goodbye = self._goodbye + 1 if resting else 0
+        self.finished = self._goodbye >= GOODBYE_CYCLES

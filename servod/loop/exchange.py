@@ -1,0 +1,80 @@
+"""Frames of one cycle: SYNC out, feedback in, torque and heartbeat out. The only place of the loop that knows the bus."""
+
+from __future__ import annotations
+
+from servod.bus import Bus
+from servod.cia import HEARTBEAT_BASE, SYNC_ID, NmtState
+from servod.clock import Clock
+from servod.errors import FAULTS, FaultCode
+from servod.hal import Amplifier, Encoder
+from servod.units import NS_PER_S
+
+_OFF, _DOWN, _FULL = (FAULTS[c].bit for c in (FaultCode.BUS_OFF, FaultCode.BUS_DOWN, FaultCode.BUS_QUEUE_FULL))
+_OPERATIONAL = bytes([NmtState.OPERATIONAL])
+#: A cycle takes at most this many frames from the socket, so that a babbling node cannot hold the loop.
+MAX_FRAMES = 64
+
+
+class Exchange:
+    """The loop's own connection to the bus, and which frame belongs to which device."""
+
+    def __init__(self, bus: Bus, clock: Clock, amplifier: Amplifier, encoder: Encoder, master_node_id: int) -> None:
+        """Frames of other nodes are read and dropped."""
+        self._bus, self._clock = bus, clock
+        self._receivers = {i: device for device in (amplifier, encoder) for i in device.receive_ids}
+        self._sync_frames = amplifier.sync_frames + encoder.sync_frames
+        self._heartbeat_id = HEARTBEAT_BASE + master_node_id
+        self._queue_full = 0
+        self.sync_ns = clock.now_ns()
+
+    def sync(self) -> int:
+        """Take what came since the last cycle, send SYNC, and return the moment of it: all feedback is sampled then."""
+        self._drain()
+        self.sync_ns = self._clock.now_ns()
+        self._bus.send(SYNC_ID, b"")
+        return self.sync_ns
+
+    def collect(self, until_ns: int) -> None:
+        """Wait for this SYNC's feedback, at the longest until `until_ns`."""
+        missing, clock, bus, sync_ns = self._sync_frames, self._clock, self._bus, self.sync_ns
+        for _ in range(MAX_FRAMES):
+            remaining_ns = until_ns - clock.now_ns()
+            frame = bus.receive(remaining_ns / NS_PER_S) if remaining_ns > 0 else None
+            if frame is None:
+                return
+            receiver = self._receivers.get(frame.can_id)
+            if receiver is not None and receiver.on_frame(frame.can_id, frame.data, sync_ns):
+                missing -= 1
+                if missing == 0:
+                    return
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """Queue the torque frame; a full queue is counted and seen in `faults`."""
+        self._bus.send(can_id, data)
+
+    def heartbeat(self) -> None:
+        """The master's heartbeat: when this process dies, the drive notices."""
+        self._bus.send(self._heartbeat_id, _OPERATIONAL)
+
+    def faults(self) -> int:
+        """What is wrong with the bus now, as fault bits."""
+        counters = self._bus.counters
+        faults = (_OFF if counters.bus_off else 0) | (_DOWN if counters.down else 0)
+        if counters.queue_full != self._queue_full:
+            self._queue_full = counters.queue_full
+            faults |= _FULL
+        return faults
+
+    def counts(self) -> tuple[int, int]:
+        """Frames that could not be queued, and error frames seen."""
+        return self._bus.counters.queue_full, self._bus.counters.error_frames
+
+    def _drain(self) -> None:
+        """Frames from between the cycles; a late one of the previous SYNC was sampled at that SYNC."""
+        for _ in range(MAX_FRAMES):
+            frame = self._bus.receive(0.0)
+            if frame is None:
+                return
+            receiver = self._receivers.get(frame.can_id)
+            if receiver is not None:
+                receiver.on_frame(frame.can_id, frame.data, self.sync_ns)

@@ -1,0 +1,96 @@
+"""The supervisor's commands, carried out by the loop between two cycles. One small function for each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+from servod.axis import AxisState
+from servod.commands import Command, Op, Refusal
+from servod.errors import FAULTS, FaultCode
+from servod.references import make_motion
+from servod.units import NS_PER_S
+
+if TYPE_CHECKING:
+    from servod.loop.cycle import Cycle
+
+Order = Callable[["Cycle", Sequence[float]], Refusal]
+
+
+def carry_out(cycle: Cycle, command: Command) -> Refusal:
+    """Carry out one command; the answer goes into the cycle record."""
+    order = _ORDERS.get(command.op)
+    return Refusal.BAD_ARGUMENT if order is None else order(cycle, command.arguments)
+
+
+def _enable(cycle: Cycle, arguments: Sequence[float]) -> Refusal:
+    return cycle.axis.enable(bool(arguments and arguments[0]))
+
+
+def _disable(cycle: Cycle, _arguments: Sequence[float]) -> Refusal:
+    cycle.axis.disable()
+    return Refusal.DONE
+
+
+def _quick_stop(cycle: Cycle, _arguments: Sequence[float]) -> Refusal:
+    cycle.axis.quick_stop()
+    return Refusal.DONE
+
+
+def _halt(cycle: Cycle, arguments: Sequence[float]) -> Refusal:
+    cycle.reference.halt(bool(arguments and arguments[0]))
+    return Refusal.DONE
+
+
+def _reset_fault(cycle: Cycle, _arguments: Sequence[float]) -> Refusal:
+    return cycle.axis.reset_fault()
+
+
+def _activate(cycle: Cycle, arguments: Sequence[float]) -> Refusal:
+    serial, law, count, *parameters = arguments
+    if len(parameters) != int(count):
+        return Refusal.BAD_ARGUMENT
+    torque_now_nm = cycle.torque_nm if cycle.axis.state == AxisState.ENABLED else 0.0
+    cycle.controller.activate(int(law), tuple(parameters), torque_now_nm)
+    cycle.controller_serial = int(serial)
+    return Refusal.DONE
+
+
+def _reference(cycle: Cycle, arguments: Sequence[float]) -> Refusal:
+    if cycle.axis.state != AxisState.ENABLED:
+        return Refusal.NOT_ENABLED
+    if cycle.reference.active:
+        return Refusal.MOTION_RUNNING
+    motion = make_motion(arguments, cycle.period_ns / NS_PER_S, cycle.link.trajectory)
+    if isinstance(motion, Refusal):
+        return motion
+    here, limits = cycle.reference.position_rad, cycle.limits
+    if here + motion.lowest_rad < limits.position_min_rad or here + motion.highest_rad > limits.position_max_rad:
+        return Refusal.OUT_OF_RANGE
+    cycle.reference.start(motion)
+    return Refusal.DONE
+
+
+def _shutdown(cycle: Cycle, _arguments: Sequence[float]) -> Refusal:
+    cycle.shut_down()
+    return Refusal.DONE
+
+
+def _node_event(cycle: Cycle, arguments: Sequence[float]) -> Refusal:
+    bit = FAULTS[FaultCode(int(arguments[0]))].bit
+    cycle.event_faults |= bit
+    cycle.axis.latched |= bit
+    return Refusal.DONE
+
+
+_ORDERS: dict[int, Order] = {
+    Op.ENABLE: _enable,
+    Op.DISABLE: _disable,
+    Op.QUICK_STOP: _quick_stop,
+    Op.HALT: _halt,
+    Op.RESET_FAULT: _reset_fault,
+    Op.ACTIVATE: _activate,
+    Op.REFERENCE: _reference,
+    Op.SHUTDOWN: _shutdown,
+    Op.NODE_EVENT: _node_event,
+}

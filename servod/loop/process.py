@@ -1,0 +1,73 @@
+"""The loop process: `python -m servod.loop.process FD`, with the plan on standard input.
+
+One thread. Absolute deadlines; a missed period is skipped and counted, never made up for. Its death stops the master's
+heartbeat, which the drive watches (0x1016); the death of its parent makes it brake, ramp down and switch off.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Callable
+
+from servod.bus.open import open_bus
+from servod.clock import Clock, WallClock
+from servod.loop.channel import Channel
+from servod.loop.cycle import Cycle
+from servod.loop.plan import LoopPlan
+from servod.realtime import apply_realtime
+from servod.units import NS_PER_S
+
+#: A supervisor whose beat stands still for this long counts as lost (its death is seen within one cycle).
+SUPERVISOR_TIMEOUT_S = 0.3
+
+
+def supervisor_watch(channel: Channel, clock: Clock) -> Callable[[], bool]:
+    """A check, cheap enough for every cycle: is the parent the same, and does its beat go on?"""
+    parent = os.getppid()
+    timeout_ns = int(SUPERVISOR_TIMEOUT_S * NS_PER_S)
+    last_beats, since_ns = channel.supervisor_beats(), clock.now_ns()
+
+    def alive() -> bool:
+        nonlocal last_beats, since_ns
+        if os.getppid() != parent:
+            return False
+        beats = channel.supervisor_beats()
+        if beats != last_beats:
+            last_beats, since_ns = beats, clock.now_ns()
+            return True
+        return clock.now_ns() - since_ns < timeout_ns
+
+    return alive
+
+
+def run(cycle: Cycle, clock: Clock) -> None:
+    """Cycle after cycle until it is finished."""
+    period_ns = cycle.period_ns
+    deadline_ns = clock.now_ns() + period_ns
+    while not cycle.finished:
+        clock.sleep_until(deadline_ns)
+        woke_ns = clock.now_ns()
+        skipped = (woke_ns - deadline_ns) // period_ns
+        deadline_ns += skipped * period_ns
+        cycle.step(deadline_ns, woke_ns, skipped)
+        deadline_ns += period_ns
+
+
+def main() -> None:
+    """Entry point of the loop process."""
+    plan = LoopPlan.from_json(sys.stdin.read())
+    channel, clock = Channel(int(sys.argv[1])), WallClock()
+    bus = open_bus(plan.config.bus)
+    cycle = Cycle(plan, bus, clock, channel, supervisor_watch(channel, clock))
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: cycle.shut_down())
+    grants = apply_realtime(plan.config.cycle.cpu, plan.config.cycle.priority)
+    channel.publish_ready(grants)
+    run(cycle, clock)
+    bus.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,174 @@
+"""Reference motions of the loop: where the joint shall be in this cycle. Stands on commands and math.
+
+All motions start at the reference position that holds when they begin and add to it. Time runs on a scale between 0 and
+1 ("feed hold"): halting and braking lower the scale smoothly, so that the path stays the same and only slows down.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from servod.commands import ReferenceKind, Refusal
+
+#: The paper's trajectory (19): (A - B t) sin(w t)
+PAPER_AMPLITUDE_RAD = 0.1
+PAPER_DECAY_RAD_PER_S = 0.0033
+PAPER_OMEGA_RAD_PER_S = 0.2 * math.pi
+
+Sample = tuple[float, float, float]
+
+
+class Motion(NamedTuple):
+    """One motion: its path over time (position, velocity, acceleration), its duration and its extent, all relative."""
+
+    path: Callable[[float], Sample]
+    duration_s: float
+    lowest_rad: float
+    highest_rad: float
+
+
+def paper(t_s: float) -> Sample:
+    """Trajectory (19) of the paper, x = (0.1 - 0.0033 t) sin(0.2 pi t) rad, and its derivatives."""
+    w, envelope = PAPER_OMEGA_RAD_PER_S, PAPER_AMPLITUDE_RAD - PAPER_DECAY_RAD_PER_S * t_s
+    sin, cos = math.sin(w * t_s), math.cos(w * t_s)
+    return (
+        envelope * sin,
+        envelope * w * cos - PAPER_DECAY_RAD_PER_S * sin,
+        -envelope * w * w * sin - 2.0 * PAPER_DECAY_RAD_PER_S * w * cos,
+    )
+
+
+def sine(amplitude_rad: float, frequency_hz: float) -> Callable[[float], Sample]:
+    """A sine of position."""
+    w = 2.0 * math.pi * frequency_hz
+
+    def path(t_s: float) -> Sample:
+        sin, cos = math.sin(w * t_s), math.cos(w * t_s)
+        return amplitude_rad * sin, amplitude_rad * w * cos, -amplitude_rad * w * w * sin
+
+    return path
+
+
+def table(positions_rad: Sequence[float], period_s: float) -> Callable[[float], Sample]:
+    """Positions one period apart, linear between them, with the velocity of the present interval."""
+    last = len(positions_rad) - 1
+
+    def path(t_s: float) -> Sample:
+        index = min(int(t_s / period_s + 1e-9), last - 1)
+        here, there = positions_rad[index], positions_rad[index + 1]
+        velocity = (there - here) / period_s
+        return here + velocity * (t_s - index * period_s), velocity, 0.0
+
+    return path
+
+
+def make_motion(arguments: Sequence[float], period_s: float, trajectory: Sequence[float]) -> Motion | Refusal:
+    """The motion that Op.REFERENCE's arguments describe; `trajectory` is the shared area that TABLE reads from."""
+    if not arguments or not all(math.isfinite(a) for a in arguments):
+        return Refusal.BAD_ARGUMENT
+    kind, *rest = arguments
+    builder = _BUILDERS.get(int(kind))
+    if builder is None:
+        return Refusal.BAD_ARGUMENT
+    try:
+        return builder(rest, period_s, trajectory)
+    except (ValueError, IndexError):
+        return Refusal.BAD_ARGUMENT
+
+
+def _hold(_rest: Sequence[float], _period_s: float, _trajectory: Sequence[float]) -> Motion:
+    return Motion(lambda _t: (0.0, 0.0, 0.0), 0.0, 0.0, 0.0)
+
+
+def _sine(rest: Sequence[float], _period_s: float, _trajectory: Sequence[float]) -> Motion:
+    amplitude_rad, frequency_hz, duration_s = rest
+    if frequency_hz <= 0.0 or duration_s <= 0.0:
+        raise ValueError("frequency and duration are positive")
+    return Motion(sine(amplitude_rad, frequency_hz), duration_s, -abs(amplitude_rad), abs(amplitude_rad))
+
+
+def _paper(rest: Sequence[float], _period_s: float, _trajectory: Sequence[float]) -> Motion:
+    (duration_s,) = rest
+    if not 0.0 < duration_s <= PAPER_AMPLITUDE_RAD / PAPER_DECAY_RAD_PER_S:
+        raise ValueError("the envelope of (19) ends at 30.3 s")
+    return Motion(paper, duration_s, -PAPER_AMPLITUDE_RAD, PAPER_AMPLITUDE_RAD)
+
+
+def _step(rest: Sequence[float], _period_s: float, _trajectory: Sequence[float]) -> Motion:
+    amplitude_rad, duration_s = rest
+    if duration_s <= 0.0:
+        raise ValueError("duration is positive")
+    return Motion(lambda _t: (amplitude_rad, 0.0, 0.0), duration_s, min(0.0, amplitude_rad), max(0.0, amplitude_rad))
+
+
+def _table(rest: Sequence[float], period_s: float, trajectory: Sequence[float]) -> Motion:
+    samples, lowest_rad, highest_rad = int(rest[0]), rest[1], rest[2]
+    if not 2 <= samples <= len(trajectory):
+        raise ValueError("between 2 samples and the size of the trajectory area")
+    return Motion(table(trajectory[:samples], period_s), (samples - 1) * period_s, lowest_rad, highest_rad)
+
+
+_BUILDERS: dict[int, Callable[[Sequence[float], float, Sequence[float]], Motion]] = {
+    ReferenceKind.HOLD: _hold,
+    ReferenceKind.SINE: _sine,
+    ReferenceKind.PAPER: _paper,
+    ReferenceKind.STEP: _step,
+    ReferenceKind.TABLE: _table,
+}
+
+
+class Reference:
+    """The running reference: base position plus motion, on a time scale that halting and braking lower smoothly."""
+
+    def __init__(self, scale_time_s: float) -> None:
+        """`scale_time_s`: how long the time scale takes from 1 to 0 and back."""
+        self._scale_rate_per_s = 1.0 / scale_time_s
+        self.position_rad, self.velocity_rad_s, self.acceleration_rad_s2 = 0.0, 0.0, 0.0
+        self.active = False
+        self._motion: Motion | None = None
+        self._base_rad = self._time_s = 0.0
+        self._scale = self._wanted_scale = 1.0
+
+    @property
+    def at_rest(self) -> bool:
+        """No motion, or its time stands still."""
+        return not self.active or self._scale == 0.0
+
+    def hold(self, position_rad: float) -> None:
+        """End any motion; stay at `position_rad`."""
+        self.active, self._motion, self._base_rad = False, None, position_rad
+        self.position_rad, self.velocity_rad_s, self.acceleration_rad_s2 = position_rad, 0.0, 0.0
+        self._scale = self._wanted_scale = 1.0
+
+    def start(self, motion: Motion) -> None:
+        """Begin `motion` from the present reference position."""
+        self._motion, self._base_rad, self._time_s = motion, self.position_rad, 0.0
+        self.active, self._scale, self._wanted_scale = motion.duration_s > 0.0, 1.0, 1.0
+
+    def halt(self, on: bool) -> None:
+        """Let time slow down to a stand (`on`) or run again."""
+        self._wanted_scale = 0.0 if on else 1.0
+
+    def advance(self, dt_s: float) -> None:
+        """Move time on by `dt_s`, as the scale has it, and take the new reference."""
+        if not self.active or self._motion is None:
+            return
+        self._change_scale(dt_s)
+        self._time_s += dt_s * self._scale
+        if self._time_s >= self._motion.duration_s:
+            self._finish(self._motion)
+            return
+        x, v, a = self._motion.path(self._time_s)
+        scale = self._scale
+        self.position_rad = self._base_rad + x
+        self.velocity_rad_s, self.acceleration_rad_s2 = v * scale, a * scale * scale
+
+    def _change_scale(self, dt_s: float) -> None:
+        step = self._scale_rate_per_s * dt_s
+        self._scale += min(max(self._wanted_scale - self._scale, -step), step)
+
+    def _finish(self, motion: Motion) -> None:
+        """Stay where the motion ends."""
+        self.hold(self._base_rad + motion.path(motion.duration_s)[0])

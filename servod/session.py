@@ -1,0 +1,129 @@
+"""A whole axis in one process and virtual time: master, cycle and virtual world, stepped from SYNC to SYNC.
+
+The same Master, the same Cycle, the same nodes as over a real bus; only the clock and the wires differ. Used by the fast
+demo, by benchmarks, by tests, and wherever a virtual axis is run as fast as it computes.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections import deque
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from servod.commands import REFUSAL_TEXT, Command, Op, ReferenceKind, Refusal
+from servod.config import AxisConfig
+from servod.errors import AnswerIsNo
+from servod.loop.channel import TRAJECTORY_SAMPLES
+from servod.loop.cycle import Cycle
+from servod.loop.plan import LoopPlan
+from servod.master import BringUp, Master
+from servod.record import RECORD, CycleRecord
+from servod.units import NS_PER_S
+
+if TYPE_CHECKING:
+    from servod.drivers.virtual.world import SteppedWorld
+
+
+class _ListLink:
+    """The cycle's link without a second process: records are packed into one growing buffer."""
+
+    def __init__(self) -> None:
+        self.trajectory = array("d", bytes(8 * TRAJECTORY_SAMPLES))
+        self.commands: deque[Command] = deque()
+        self.raw = bytearray()
+
+    def write_record(self, values: Sequence[float]) -> None:
+        self.raw += RECORD.pack(*values)
+
+    def next_command(self) -> Command | None:
+        return self.commands.popleft() if self.commands else None
+
+
+class SteppedSession:
+    """Brings the axis up on construction; `run` advances virtual time; `records` holds every cycle since `clear`."""
+
+    def __init__(self, config: AxisConfig, world: SteppedWorld, law: int, parameters: Sequence[float]) -> None:
+        """`law` and `parameters`: the first controller (a packed gain set)."""
+        self.config, self.world, self.clock = config, world, world.clock
+        self.master = Master(config, world.connect(), world.clock, threaded=False)
+        self.bring_up: BringUp = self.master.bring_up()
+        plan = LoopPlan(config, self.bring_up.amplifier, self.bring_up.encoder, law, tuple(parameters))
+        self._link = _ListLink()
+        self.cycle = Cycle(plan, world.connect(), world.clock, self._link, lambda: True)
+        self._deadline_ns = self.clock.now_ns() + self.cycle.period_ns
+        self._seq = 0
+        self._cycles_until_poll = 0
+
+    @property
+    def raw(self) -> bytes:
+        """All records since `clear`, back to back (servod.record.RECORD)."""
+        return bytes(self._link.raw)
+
+    @property
+    def records(self) -> list[CycleRecord]:
+        """All records since `clear`."""
+        return [CycleRecord._make(row) for row in RECORD.iter_unpack(self._link.raw)]
+
+    @property
+    def latest(self) -> CycleRecord:
+        """The last record."""
+        return CycleRecord.unpack(self._link.raw[-RECORD.size :])
+
+    def clear(self) -> None:
+        """Forget the records so far."""
+        self._link.raw.clear()
+
+    def run(self, duration_s: float) -> None:
+        """Advance virtual time, cycle by cycle."""
+        cycle, clock = self.cycle, self.clock
+        for _ in range(round(duration_s * NS_PER_S / cycle.period_ns)):
+            clock.sleep_until(self._deadline_ns)
+            cycle.step(self._deadline_ns, self._deadline_ns, 0)
+            self._deadline_ns += cycle.period_ns
+            self._look_after_nodes()
+
+    def send(self, op: Op, arguments: Sequence[float] = ()) -> Refusal:
+        """Give the loop one command and run until it has answered."""
+        self._seq += 1
+        self._link.commands.append(Command(self._seq, op, tuple(map(float, arguments))))
+        self.run(2 * self.cycle.period_ns / NS_PER_S)
+        return Refusal(self.latest.command_result)
+
+    def enable(self, reset_fault: bool = False) -> None:
+        """Enable and wait for it; raises AnswerIsNo when the axis does not get there."""
+        self._must(self.send(Op.ENABLE, [reset_fault]))
+        for _ in range(100):
+            self.run(self.config.amplifier.enable_timeout_s / 100.0)
+            if self.cycle.axis.state.name == "ENABLED":
+                return
+        raise AnswerIsNo(f"the axis is {self.cycle.axis.state.name}, not enabled")
+
+    def move(self, kind: ReferenceKind, arguments: Sequence[float], timeout_s: float = 600.0) -> None:
+        """Start a motion and run until it is over; raises AnswerIsNo when it is refused or ends in a fault."""
+        self._must(self.send(Op.REFERENCE, [kind, *arguments]))
+        for _ in range(round(timeout_s / 0.1)):
+            if not self.cycle.reference.active:
+                break
+            self.run(0.1)
+        if self.cycle.axis.state.name != "ENABLED":
+            raise AnswerIsNo(f"the motion ended with the axis in {self.cycle.axis.state.name}")
+
+    def load_trajectory(self, positions_rad: Sequence[float]) -> None:
+        """Fill the area that ReferenceKind.TABLE reads."""
+        self._link.trajectory[: len(positions_rad)] = array("d", positions_rad)
+
+    def _must(self, refusal: Refusal) -> None:
+        if refusal != Refusal.DONE:
+            raise AnswerIsNo(REFUSAL_TEXT[refusal])
+
+    def _look_after_nodes(self) -> None:
+        """The supervisor's part: ten times a second, and each event becomes a fault in the loop."""
+        self._cycles_until_poll -= 1
+        if self._cycles_until_poll > 0:
+            return
+        self._cycles_until_poll = 100
+        self.master.poll()
+        for event in self.master.events():
+            self._seq += 1
+            self._link.commands.append(Command(self._seq, Op.NODE_EVENT, (float(event.fault),)))
