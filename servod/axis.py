@@ -1,7 +1,7 @@
 """The axis: from what is wanted and what the drive says to a goal for the drive and a share of torque, each cycle.
 
-Stands between drivers and controller on the data path. It enables only on an explicit request, turns each fault into its
-reaction (servod.errors.FAULTS), and brings the axis to rest by one of three ways: braking the reference and then
+Stands between drivers and controller on the data path. It enables only on an explicit request, turns each fault into
+its reaction (servod.errors.FAULTS), and brings the axis to rest by one of three ways: braking the reference and then
 ramping the torque down (DISABLE, SHUTDOWN, a lost supervisor), the drive's quick stop, or voltage off at once.
 """
 
@@ -193,9 +193,8 @@ class Axis:
             return self._finish_enabling(amplifier)
         if state == AxisState.BRAKING and (reference_at_rest or self._cycles_in_state > self._ramp_cycles):
             self._enter(AxisState.RAMPING)
-        elif state == AxisState.RAMPING and self._cycles_in_state >= self._ramp_cycles:
-            self._enter(self._end_state)
-        elif state == AxisState.QUICK_STOPPING and self._quick_stop_is_over(amplifier):
+        ramped = state == AxisState.RAMPING and self._cycles_in_state >= self._ramp_cycles
+        if ramped or (state == AxisState.QUICK_STOPPING and self._quick_stop_is_over(amplifier)):
             self._enter(self._end_state)
         return False
 

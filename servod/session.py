@@ -1,7 +1,7 @@
 """A whole axis in one process and virtual time: master, cycle and virtual world, stepped from SYNC to SYNC.
 
-The same Master, the same Cycle, the same nodes as over a real bus; only the clock and the wires differ. Used by the fast
-demo, by benchmarks, by tests, and wherever a virtual axis is run as fast as it computes.
+The same Master, the same Cycle, the same nodes as over a real bus; only the clock and the wires differ. Used by the
+fast demo, by benchmarks, by tests, and wherever a virtual axis is run as fast as it computes.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class SteppedSession:
     @property
     def latest(self) -> CycleRecord:
         """The last record."""
-        return CycleRecord.unpack(self._link.raw[-RECORD.size :])
+        return CycleRecord.unpack(bytes(self._link.raw[-RECORD.size :]))
 
     def clear(self) -> None:
         """Forget the records so far."""

@@ -1,4 +1,4 @@
-"""Frames of one cycle: SYNC out, feedback in, torque and heartbeat out. The only place of the loop that knows the bus."""
+"""Frames of one cycle: SYNC out, feedback in, torque and heartbeat out. Only this file knows the bus."""
 
 from __future__ import annotations
 

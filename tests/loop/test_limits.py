@@ -1,4 +1,4 @@
-"""The limits are tested at their boundary, on both sides of it, and by mutation: each check must be the one that bites."""
+"""The limits are tested at their boundary, on both sides of it, and by mutation: each check must bite."""
 
 import math
 

@@ -1,6 +1,7 @@
 """Reference motions: the paper's trajectory against its formula, derivatives against differences, halting smooth."""
 
 import math
+from itertools import pairwise
 
 import pytest
 from hypothesis import given
@@ -65,8 +66,8 @@ def test_halt_slows_down_without_leaving_the_path_and_goes_on():
     positions = run(reference, 60)
     assert reference.at_rest
     assert reference.velocity_rad_s == 0.0
-    steps = [abs(b - a) for a, b in zip(positions, positions[1:], strict=False)]
-    assert all(b <= a + 1e-12 for a, b in zip(steps, steps[1:], strict=False))
+    steps = [abs(b - a) for a, b in pairwise(positions)]
+    assert all(b <= a + 1e-12 for a, b in pairwise(steps))
     reference.halt(False)
     run(reference, 60)
     assert abs(reference.velocity_rad_s) == pytest.approx(abs(speed), rel=0.3)
