@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from servod.commands import ReferenceKind, Refusal
 
@@ -18,6 +18,14 @@ PAPER_DECAY_RAD_PER_S = 0.0033
 PAPER_OMEGA_RAD_PER_S = 0.2 * math.pi
 
 Sample = tuple[float, float, float]
+
+
+class Samples(Protocol):
+    """Positions that a table motion reads: a list, an array or the shared trajectory area."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int, /) -> float: ...
 
 
 class Motion(NamedTuple):
@@ -51,9 +59,9 @@ def sine(amplitude_rad: float, frequency_hz: float) -> Callable[[float], Sample]
     return path
 
 
-def table(positions_rad: Sequence[float], period_s: float) -> Callable[[float], Sample]:
-    """Positions one period apart, linear between them, with the velocity of the present interval."""
-    last = len(positions_rad) - 1
+def table(positions_rad: Samples, samples: int, period_s: float) -> Callable[[float], Sample]:
+    """The first `samples` positions, one period apart, linear between them, with the velocity of the present interval."""
+    last = samples - 1
 
     def path(t_s: float) -> Sample:
         index = min(int(t_s / period_s + 1e-9), last - 1)
@@ -64,7 +72,7 @@ def table(positions_rad: Sequence[float], period_s: float) -> Callable[[float], 
     return path
 
 
-def make_motion(arguments: Sequence[float], period_s: float, trajectory: Sequence[float]) -> Motion | Refusal:
+def make_motion(arguments: Sequence[float], period_s: float, trajectory: Samples) -> Motion | Refusal:
     """The motion that Op.REFERENCE's arguments describe; `trajectory` is the shared area that TABLE reads from."""
     if not arguments or not all(math.isfinite(a) for a in arguments):
         return Refusal.BAD_ARGUMENT
@@ -78,39 +86,39 @@ def make_motion(arguments: Sequence[float], period_s: float, trajectory: Sequenc
         return Refusal.BAD_ARGUMENT
 
 
-def _hold(_rest: Sequence[float], _period_s: float, _trajectory: Sequence[float]) -> Motion:
+def _hold(_rest: Sequence[float], _period_s: float, _trajectory: Samples) -> Motion:
     return Motion(lambda _t: (0.0, 0.0, 0.0), 0.0, 0.0, 0.0)
 
 
-def _sine(rest: Sequence[float], _period_s: float, _trajectory: Sequence[float]) -> Motion:
+def _sine(rest: Sequence[float], _period_s: float, _trajectory: Samples) -> Motion:
     amplitude_rad, frequency_hz, duration_s = rest
     if frequency_hz <= 0.0 or duration_s <= 0.0:
         raise ValueError("frequency and duration are positive")
     return Motion(sine(amplitude_rad, frequency_hz), duration_s, -abs(amplitude_rad), abs(amplitude_rad))
 
 
-def _paper(rest: Sequence[float], _period_s: float, _trajectory: Sequence[float]) -> Motion:
+def _paper(rest: Sequence[float], _period_s: float, _trajectory: Samples) -> Motion:
     (duration_s,) = rest
     if not 0.0 < duration_s <= PAPER_AMPLITUDE_RAD / PAPER_DECAY_RAD_PER_S:
         raise ValueError("the envelope of (19) ends at 30.3 s")
     return Motion(paper, duration_s, -PAPER_AMPLITUDE_RAD, PAPER_AMPLITUDE_RAD)
 
 
-def _step(rest: Sequence[float], _period_s: float, _trajectory: Sequence[float]) -> Motion:
+def _step(rest: Sequence[float], _period_s: float, _trajectory: Samples) -> Motion:
     amplitude_rad, duration_s = rest
     if duration_s <= 0.0:
         raise ValueError("duration is positive")
     return Motion(lambda _t: (amplitude_rad, 0.0, 0.0), duration_s, min(0.0, amplitude_rad), max(0.0, amplitude_rad))
 
 
-def _table(rest: Sequence[float], period_s: float, trajectory: Sequence[float]) -> Motion:
+def _table(rest: Sequence[float], period_s: float, trajectory: Samples) -> Motion:
     samples, lowest_rad, highest_rad = int(rest[0]), rest[1], rest[2]
     if not 2 <= samples <= len(trajectory):
         raise ValueError("between 2 samples and the size of the trajectory area")
-    return Motion(table(trajectory[:samples], period_s), (samples - 1) * period_s, lowest_rad, highest_rad)
+    return Motion(table(trajectory, samples, period_s), (samples - 1) * period_s, lowest_rad, highest_rad)
 
 
-_BUILDERS: dict[int, Callable[[Sequence[float], float, Sequence[float]], Motion]] = {
+_BUILDERS: dict[int, Callable[[Sequence[float], float, Samples], Motion]] = {
     ReferenceKind.HOLD: _hold,
     ReferenceKind.SINE: _sine,
     ReferenceKind.PAPER: _paper,

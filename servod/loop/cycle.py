@@ -23,7 +23,7 @@ from servod.limits import Limits
 from servod.loop.exchange import Exchange
 from servod.loop.orders import carry_out
 from servod.loop.plan import LoopPlan
-from servod.references import Reference
+from servod.references import Reference, Samples
 from servod.units import NS_PER_S, NS_PER_US
 
 _SUPERVISOR_LOST = FAULTS[FaultCode.SUPERVISOR_LOST].bit
@@ -34,7 +34,10 @@ GOODBYE_CYCLES = 20
 class Link(Protocol):
     """The loop's side of its supervisor: shared memory in a process of its own, plain lists when stepped."""
 
-    trajectory: Sequence[float]
+    @property
+    def trajectory(self) -> Samples:
+        """Positions that a table motion reads."""
+        ...
 
     def write_record(self, values: Sequence[float]) -> None:
         """Publish one cycle record."""

@@ -51,7 +51,8 @@ def _activate(cycle: Cycle, arguments: Sequence[float]) -> Refusal:
     if len(parameters) != int(count):
         return Refusal.BAD_ARGUMENT
     torque_now_nm = cycle.torque_nm if cycle.axis.state == AxisState.ENABLED else 0.0
-    cycle.controller.activate(int(law), tuple(parameters), torque_now_nm)
+    if not cycle.controller.activate(int(law), parameters, torque_now_nm):
+        return Refusal.BAD_ARGUMENT
     cycle.controller_serial = int(serial)
     return Refusal.DONE
 
