@@ -60,7 +60,7 @@ def sine(amplitude_rad: float, frequency_hz: float) -> Callable[[float], Sample]
 
 
 def table(positions_rad: Samples, samples: int, period_s: float) -> Callable[[float], Sample]:
-    """The first `samples` positions, one period apart, linear between them, with the velocity of the present interval."""
+    """The first `samples` positions, one period apart, linear between them, with the velocity of the interval."""
     last = samples - 1
 
     def path(t_s: float) -> Sample:
