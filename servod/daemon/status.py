@@ -13,6 +13,7 @@ from servod.axis import AxisState
 from servod.errors import Fault, faults_in
 from servod.hal import REASON_TEXT, DriveState, Goal, Reason
 from servod.record import CycleRecord
+from servod.recorder import RecorderState
 
 
 class AxisStatus(TypedDict):
@@ -119,18 +120,6 @@ class GrantStatus(TypedDict):
     reason: str
 
 
-class RecorderStatus(TypedDict):
-    """What is being recorded; `failure` is empty while all is well."""
-
-    recording: bool
-    path: str
-    records: int
-    bytes: int
-    dropped: int
-    history_s: float
-    failure: str
-
-
 class LeaseStatus(TypedDict):
     """The client that commands; pid 0 when none does."""
 
@@ -153,7 +142,7 @@ class Status(TypedDict):
     bus: BusStatus
     nodes: list[NodeStatus]
     grants: list[GrantStatus]
-    recorder: RecorderStatus
+    recorder: RecorderState
     lease: LeaseStatus
 
 

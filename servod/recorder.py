@@ -1,0 +1,251 @@
+"""The recorder: every cycle to a file on demand, and the last seconds before a fault without being asked.
+
+Beside the loop, fed by the supervisor with the records it drained. All file work happens in one thread of its own, so
+that a slow or full disk never holds up the supervisor; the way there is a bounded queue, and what does not fit is
+dropped, counted and reported as RECORDER_FAILED.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from datetime import datetime
+from pathlib import Path
+from typing import Any, TypedDict, TypeVar
+
+from servod.config import RecorderConfig
+from servod.errors import BadInput, ServodError, Unreachable
+from servod.recorder_history import HistoryRing
+from servod.recorder_mcap import McapFile, split_rows, wall_offset_ns
+
+T = TypeVar("T")
+
+#: A file on disk is never older than this; kill -9 loses no more (the contract allows a second).
+SYNC_PERIOD_S = 0.2
+_QUEUE_BATCHES = 1024
+_KEPT_EVENTS = 256
+
+
+class RecorderState(TypedDict):
+    """What is being recorded; `failure` is empty while all is well."""
+
+    recording: bool
+    path: str
+    records: int
+    bytes: int
+    dropped: int
+    history_s: float
+    failure: str
+
+
+class Recorder:
+    """Recordings of one axis; all methods are for the supervisor's thread and return at once."""
+
+    def __init__(self, config: RecorderConfig, axis_name: str, period_us: int) -> None:
+        self._directory, self._axis_name, self._history_s = config.directory, axis_name, config.history_s
+        self._history = HistoryRing(round(config.history_s * 1e6 / period_us))
+        self._events: deque[dict[str, Any]] = deque(maxlen=_KEPT_EVENTS)
+        self._attachments: dict[str, bytes] = {}
+        self._offset_ns = wall_offset_ns()
+        self._file: McapFile | None = None
+        self._path, self._records, self._bytes, self._dropped = "", 0, 0, 0
+        self._failure, self._new_failure = "", ""
+        self._jobs: queue.Queue[Callable[[], None] | None] = queue.Queue(_QUEUE_BATCHES)
+        self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
+        self._thread.start()
+
+    # --- supervisor's thread -------------------------------------------------------------------------------------
+    def add_rows(self, rows: Sequence[bytes]) -> None:
+        """Take packed cycle records, oldest first: into the history, and into the file when one is open."""
+        self._history.add(rows)
+        if rows and self._file is not None and not self._put(lambda: self._write_rows(rows)):
+            self._dropped += len(rows)
+            self._fail("the disk does not keep up; cycles were dropped")
+
+    def add_event(self, kind: str, text: str, **details: Any) -> None:
+        """Note something that happened (fault, command, node event); kept for fault files too."""
+        event = {"time_ns": time.monotonic_ns(), "kind": kind, "text": text, **details}
+        self._events.append(event)
+        self._put(lambda: self._write_event(event))
+
+    def set_attachment(self, name: str, data: bytes) -> None:
+        """Attach a file (config.yaml, gains.yaml, model.yaml) to every recording, the running one included."""
+        self._attachments[name] = data
+        self._put(lambda: self._attach(name, data))
+
+    def start(self, name: str | None = None) -> Future[Path]:
+        """Begin a recording in the configured directory; the future gives its path, or BadInput or Unreachable."""
+        attachments = dict(self._attachments)
+        return self._ask(lambda: self._open(self._recording_path(name), attachments))
+
+    def stop(self) -> Future[RecorderState]:
+        """End the recording; the future gives what was written."""
+        return self._ask(self._stop)
+
+    def write_fault_file(self, label: str) -> Future[Path]:
+        """Write the history, and the events so far, to a file of their own named after `label`."""
+        rows, events, attachments = self._history.snapshot(), list(self._events), dict(self._attachments)
+        return self._ask(lambda: self._write_history(label, rows, events, attachments))
+
+    def take_failure(self) -> str:
+        """Why recording failed since the last call; empty when it did not."""
+        failure, self._new_failure = self._new_failure, ""
+        return failure
+
+    def state(self) -> RecorderState:
+        """What `status` shows."""
+        return {
+            "recording": self._file is not None,
+            "path": self._path,
+            "records": self._records,
+            "bytes": self._bytes,
+            "dropped": self._dropped,
+            "history_s": self._history_s,
+            "failure": self._failure,
+        }
+
+    def close(self, timeout_s: float = 2.0) -> None:
+        """Finish what is queued and close the file; gives up on a disk that hangs after `timeout_s`."""
+        deadline = time.monotonic() + timeout_s
+        while not self._put(None) and time.monotonic() < deadline:
+            time.sleep(0.01)
+        self._thread.join(max(0.0, deadline - time.monotonic()))
+
+    def _put(self, job: Callable[[], None] | None) -> bool:
+        try:
+            self._jobs.put_nowait(job)
+        except queue.Full:
+            return False
+        return True
+
+    def _ask(self, job: Callable[[], T]) -> Future[T]:
+        future: Future[T] = Future()
+        if not self._put(lambda: _resolve(future, job)):
+            future.set_exception(Unreachable("recorder: the disk does not keep up"))
+        return future
+
+    def _fail(self, text: str) -> None:
+        if text != self._failure:
+            self._failure = self._new_failure = text
+
+    # --- writing thread ------------------------------------------------------------------------------------------
+    def _work(self) -> None:
+        synced = time.monotonic()
+        while True:
+            try:
+                job = self._jobs.get(timeout=SYNC_PERIOD_S)
+            except queue.Empty:
+                job = _nothing
+            if job is None:
+                break
+            self._guard(job)
+            if time.monotonic() - synced >= SYNC_PERIOD_S:
+                self._guard(self._sync)
+                synced = time.monotonic()
+        self._guard(self._finish)
+
+    def _guard(self, job: Callable[[], None]) -> None:
+        """Run one job; a disk that fails ends the recording, never the thread."""
+        try:
+            job()
+        except (OSError, ValueError) as error:
+            self._fail(f"{self._path}: {getattr(error, 'strerror', None) or error}")
+            if self._file is not None:
+                self._file.abandon()
+                self._file = None
+
+    def _write_rows(self, rows: Sequence[bytes]) -> None:
+        if self._file is not None:
+            self._file.write_rows(rows)
+
+    def _write_event(self, event: dict[str, Any]) -> None:
+        if self._file is not None:
+            self._file.write_event(event)
+
+    def _attach(self, name: str, data: bytes) -> None:
+        if self._file is not None:
+            self._file.attach(name, data)
+
+    def _sync(self) -> None:
+        if self._file is not None:
+            self._file.sync()
+            self._records, self._bytes = self._file.records, self._file.size_bytes()
+
+    def _finish(self) -> None:
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def _open(self, path: Path, attachments: dict[str, bytes]) -> Path:
+        if self._file is not None:
+            raise Unreachable(f"recorder: already records to {self._path}; `servoctl record stop` ends it")
+        self._file = _create(path, attachments, self._offset_ns)
+        self._path, self._records, self._bytes, self._dropped, self._failure = str(path), 0, 0, 0, ""
+        return path
+
+    def _stop(self) -> RecorderState:
+        if self._file is not None:
+            self._sync()
+            self._finish()
+        return self.state()
+
+    def _write_history(
+        self, label: str, rows: bytes, events: list[dict[str, Any]], attachments: dict[str, bytes]
+    ) -> Path:
+        path = self._unused(f"{self._axis_name}-fault-{_stamp()}-{label}")
+        file = _create(path, attachments, self._offset_ns)
+        try:
+            file.write_rows(split_rows(rows))
+            for event in events:
+                file.write_event(event)
+            file.close()
+        except OSError as error:
+            file.abandon()
+            raise Unreachable(f"{path}: {error.strerror or error}") from None
+        return path
+
+    def _recording_path(self, name: str | None) -> Path:
+        """A path in the recordings' directory, and nowhere else: clients must not write where they please."""
+        if name is None:
+            return self._unused(f"{self._axis_name}-{_stamp()}")
+        path = (self._directory / name).resolve()
+        if path.parent != self._directory.resolve() or path.suffix != ".mcap":
+            raise BadInput("record_start: path", name, f"a file name ending in .mcap, in {self._directory}")
+        return path
+
+    def _unused(self, stem: str) -> Path:
+        path, number = self._directory / f"{stem}.mcap", 1
+        while path.exists():
+            number += 1
+            path = self._directory / f"{stem}-{number}.mcap"
+        return path
+
+
+def _create(path: Path, attachments: dict[str, bytes], offset_ns: int) -> McapFile:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return McapFile(path, attachments, offset_ns)
+    except OSError as error:
+        raise Unreachable(f"{path}: {error.strerror or error}") from None
+
+
+def _resolve(future: Future[T], job: Callable[[], T]) -> None:
+    try:
+        future.set_result(job())
+    except ServodError as error:
+        future.set_exception(error)
+    except (OSError, ValueError) as error:
+        future.set_exception(Unreachable(f"recorder: {error}"))
+        raise
+
+
+def _nothing() -> None:
+    """Stands for a job when the queue was empty."""
+
+
+def _stamp() -> str:
+    return datetime.now().astimezone().strftime("%Y%m%d-%H%M%S")

@@ -1,0 +1,132 @@
+"""Reads a recording back, whole or cut off by a crash, without numpy.
+
+Behind the recorder; export, replay and the physics side start here. A file that ends in the middle of a record gives
+everything before it and says `truncated`.
+"""
+
+from __future__ import annotations
+
+import array
+import json
+import re
+import struct
+import zlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import zstandard
+from mcap.exceptions import InvalidMagic, McapError
+from mcap.records import Attachment, Channel, Footer, Message, Schema
+from mcap.stream_reader import CRCValidationError, StreamReader
+
+from servod.errors import BadInput
+from servod.record import CDR_HEADER, CycleRecord
+from servod.recorder_mcap import CYCLE_TOPIC, EVENT_TOPIC
+
+_KINDS = {"float64": "d", "int64": "q"}
+_LINE = re.compile(r"^(float64|int64) (\w+)  # \[([^]]*)\]")
+_RECORD_LIMIT_BYTES = 64 * 1024 * 1024
+_BROKEN = (McapError, CRCValidationError, struct.error, zlib.error, zstandard.ZstdError, ValueError, EOFError, KeyError)
+
+
+@dataclass
+class Recording:
+    """A recording in memory: `rows` holds the cycle records one behind the other, eight bytes for each name.
+
+    `kinds` has one letter per name, "d" (float64) or "q" (int64), little endian; `truncated` tells that the file
+    ends without its footer, as after kill -9.
+    """
+
+    names: tuple[str, ...] = ()
+    kinds: str = ""
+    units: tuple[str, ...] = ()
+    rows: bytearray = field(default_factory=bytearray)
+    attachments: dict[str, bytes] = field(default_factory=dict)
+    events: list[dict[str, Any]] = field(default_factory=list)
+    truncated: bool = True
+
+    def __len__(self) -> int:
+        return len(self.rows) // self.row_bytes if self.names else 0
+
+    @property
+    def row_bytes(self) -> int:
+        """Length of one row."""
+        return 8 * len(self.names)
+
+    def column(self, name: str) -> array.array[Any]:
+        """One column as array('d') or array('q'). Raises KeyError when the recording has no such name."""
+        if name not in self.names:
+            raise KeyError(name)
+        at = self.names.index(name)
+        rows = memoryview(self.rows)
+        if self.kinds[at] == "d":
+            return array.array("d", rows.cast("d")[at :: len(self.names)])
+        return array.array("q", rows.cast("q")[at :: len(self.names)])
+
+    def records(self) -> list[CycleRecord]:
+        """All rows as cycle records. Raises ValueError when the file was written with other fields than today's."""
+        if self.names != CycleRecord._fields:
+            raise ValueError("the recording has other fields than this version's cycle record")
+        unpack = struct.Struct("<" + self.kinds).iter_unpack
+        return [CycleRecord._make(row) for row in unpack(self.rows)]
+
+
+def read_recording(path: str | Path) -> Recording:
+    """The recording at `path`. Raises BadInput when it is missing or no recording of servod's at all."""
+    recording = Recording()
+    try:
+        with Path(path).open("rb") as stream:
+            _read_stream(StreamReader(stream, validate_crcs=True, record_size_limit=_RECORD_LIMIT_BYTES), recording)
+    except InvalidMagic:
+        raise BadInput(str(path), "a file that is not MCAP", "a recording of servod (.mcap)") from None
+    except OSError as error:
+        raise BadInput(str(path), error.strerror or str(error), "a readable recording") from None
+    if not recording.names:
+        raise BadInput(str(path), f"no topic {CYCLE_TOPIC}", "a recording of servod (.mcap)")
+    return recording
+
+
+def _read_stream(reader: StreamReader, recording: Recording) -> None:
+    """Read until the footer, or until the file breaks off."""
+    schemas: dict[int, Schema] = {}
+    topics: dict[int, str] = {}
+    started = False
+    try:
+        for record in reader.records:
+            started = True
+            if isinstance(record, Footer):
+                recording.truncated = False
+            elif isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                topics[record.id] = record.topic
+                _take_channel(record, schemas, recording)
+            else:
+                _take(record, topics, recording)
+    except InvalidMagic:
+        if not started:
+            raise
+        recording.truncated = True  # the last eight bytes are missing
+    except _BROKEN:
+        if not started:
+            raise InvalidMagic((0,) * 8) from None
+
+
+def _take_channel(channel: Channel, schemas: dict[int, Schema], recording: Recording) -> None:
+    if channel.topic == CYCLE_TOPIC and not recording.names:
+        fields = [_LINE.match(line) for line in schemas[channel.schema_id].data.decode().splitlines()]
+        known = [f.groups() for f in fields if f is not None]
+        recording.kinds = "".join(_KINDS[kind] for kind, _, _ in known)
+        recording.names = tuple(name for _, name, _ in known)
+        recording.units = tuple(unit for _, _, unit in known)
+
+
+def _take(record: object, topics: dict[int, str], recording: Recording) -> None:
+    if isinstance(record, Attachment):
+        recording.attachments[record.name] = record.data
+    elif isinstance(record, Message) and topics.get(record.channel_id) == CYCLE_TOPIC:
+        if len(record.data) == len(CDR_HEADER) + recording.row_bytes:
+            recording.rows += record.data[len(CDR_HEADER) :]
+    elif isinstance(record, Message) and topics.get(record.channel_id) == EVENT_TOPIC:
+        recording.events.append(json.loads(record.data))
