@@ -1,1 +1,41 @@
-"""(set by its owner)"""
+"""The drivers, by name: one lazy table, extended by the entry-point group `servod.drivers`.
+
+A driver is `servod.hal.Driver`: a set-up face that runs in the supervisor and a cycle face that runs in the loop. The
+table names modules as text, so that listing them imports nothing. Import as `servod.drivers`, never the bare folder.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from importlib.metadata import entry_points
+
+from servod.errors import BadInput
+from servod.hal import Driver
+
+#: name -> "module:attribute" of a servod.hal.Driver.
+DRIVERS: dict[str, str] = {
+    "cia402": "servod.drivers.cia402:DRIVER",
+    "cia406": "servod.drivers.cia406:DRIVER",
+}
+ENTRY_POINT_GROUP = "servod.drivers"
+
+
+def driver_table() -> dict[str, str]:
+    """All known drivers: the table above and the installed entry points; the table wins where names collide."""
+    installed = {point.name: point.value for point in entry_points(group=ENTRY_POINT_GROUP)}
+    return installed | DRIVERS
+
+
+def load_driver(name: str) -> Driver:
+    """The driver of that name; raises BadInput with the known names when there is none or it cannot be loaded."""
+    table = driver_table()
+    if name not in table:
+        raise BadInput("driver", name, ", ".join(sorted(table)))
+    module_name, _, attribute = table[name].partition(":")
+    try:
+        driver = getattr(import_module(module_name), attribute)
+    except (ImportError, AttributeError) as error:
+        raise BadInput(f"driver {name}", f"{table[name]} ({error})", "an importable module:attribute") from error
+    if not isinstance(driver, Driver):
+        raise BadInput(f"driver {name}", type(driver).__name__, "a servod.hal.Driver")
+    return driver

@@ -10,6 +10,8 @@ Amplifier
     synchronous feedback came, and grows by one per cycle without. Before the first feedback the state is UNKNOWN.
  2. `write` is asked every cycle and always gives exactly one frame that fits the mapping. Torque is encoded only when
     the present state is OPERATION_ENABLED and the goal is ENABLED; in every other case the frame carries zero torque.
+    One exception: going back from quick stop (transition 16) the drive holds the load, so the frame then carries the
+    torque now produced.
  3. The control word is planned from the present state and the goal alone. A transient state may never be seen.
     After a state change was asked for, the driver waits HANDSHAKE_SYNCS cycles before it judges.
  4. A fault is reset only by an explicit `reset_fault` request: one rising edge for each request.
@@ -26,6 +28,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
 from typing import Any, NamedTuple, Protocol
+
+from servod.errors import Unreachable
 
 #: A control word in a synchronous RPDO acts at the next SYNC and is seen in the TPDO of the SYNC after it.
 HANDSHAKE_SYNCS = 3
@@ -131,6 +135,7 @@ class AmplifierCommand(NamedTuple):
     torque_nm: float
     halt: bool = False
     reset_fault: bool = False
+    setpoint: float = 0.0  # joint position_rad (csp, pp) or velocity_rad_s (csv); not used in cst
 
 
 class Amplifier(Protocol):
@@ -210,6 +215,14 @@ class NodePlan:
     facts: dict[str, Any] = field(default_factory=dict)  # scalings read from the device, options from the configuration
 
 
+class SdoAbort(Unreachable):
+    """The node refused an SDO transfer; `code` is CiA 301's abort code, the message says its meaning."""
+
+    def __init__(self, message: str, code: int) -> None:
+        self.code = code
+        super().__init__(message)
+
+
 class SdoAccess(Protocol):
     """What a driver's set-up face needs of the bus: confirmed reads and writes with time-out and abort codes."""
 
@@ -239,5 +252,5 @@ class Driver:
     """One row of the driver table: how to build both faces of a device."""
 
     kind: str  # "amplifier" or "encoder"
-    setup: Any  # (config section) -> Setup
+    setup: Any  # (servod.config.AxisConfig) -> Setup
     cyclic: Any  # (NodePlan) -> Amplifier | Encoder

@@ -1,0 +1,94 @@
+"""CiA 406 encoder: the set-up face. Off the control path: states the wanted PDOs, checks resolution, reads the range.
+
+Resolution and scaling are checked, never changed: an encoder that another master uses too must not be rescaled by a
+configuration file. Only a preset is written, on request and at rest.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from servod.cia import TPDO_BASE, Obj406
+from servod.drivers.setup_tools import read_optional, write_checked
+from servod.errors import BadInput, Unreachable
+from servod.hal import NodePlan, PdoEntry, PdoMap, SdoAccess
+
+if TYPE_CHECKING:
+    from servod.config import AxisConfig
+
+_SLOW_TIMER_MS = 100
+_OPERATING_SCALING = 1 << 2  # 0x6000 bit 2: scaling function on
+
+
+def encoder_pdos(node_id: int) -> tuple[PdoMap, ...]:
+    """The two PDOs of the encoder: alarms by event timer, position at each SYNC."""
+    return (
+        PdoMap(False, 1, TPDO_BASE[0] + node_id, 255, (PdoEntry(Obj406.ALARMS, 0, 16),), event_timer_ms=_SLOW_TIMER_MS),
+        PdoMap(False, 2, TPDO_BASE[1] + node_id, 1, (PdoEntry(Obj406.POSITION, 0, 32),)),
+    )
+
+
+class EncoderSetup:
+    """Set-up face of a CiA 406 encoder (servod.hal.Setup)."""
+
+    def __init__(self, config: AxisConfig) -> None:
+        self._encoder = config.encoder
+        self._period_us = config.cycle.period_us
+
+    def plan(self) -> NodePlan:
+        """The wanted mapping and the facts of the configuration."""
+        encoder = self._encoder
+        facts: dict[str, Any] = {
+            "period_s": self._period_us * 1e-6,
+            "counts_per_turn": encoder.counts_per_turn,
+            "direction": encoder.direction,
+            "zero_offset_rad": encoder.zero_offset_rad,
+            "velocity_cutoff_hz": encoder.velocity_cutoff_hz,
+            "pdo_pairs": 2,
+        }
+        if encoder.measuring_range_counts is not None:
+            facts["measuring_range_counts"] = encoder.measuring_range_counts
+        return NodePlan(encoder.driver, encoder.node_id, encoder_pdos(encoder.node_id), facts)
+
+    def configure(self, sdo: SdoAccess) -> NodePlan:
+        """Check resolution, read the range and the alarms present; raises BadInput, Unreachable."""
+        encoder, plan = self._encoder, self.plan()
+        self._check_resolution(sdo)
+        measuring_range = self._measuring_range(sdo)
+        wanted = encoder.measuring_range_counts
+        if wanted is not None and wanted != measuring_range:
+            raise BadInput("encoder.measuring_range_counts", f"{wanted}", f"{measuring_range}, what 0x6002 reads")
+        plan.facts["measuring_range_counts"] = measuring_range
+        alarms = read_optional(sdo, Obj406.ALARMS)
+        if alarms:
+            plan.facts["notes"] = [f"encoder shows alarms at start: 0x6503 = 0x{alarms:04X}"]
+        return plan
+
+    def _check_resolution(self, sdo: SdoAccess) -> None:
+        """0x6001 counts when scaling is on, the physical 0x6501 when it is off (CiA 406, 0x6000 bit 2)."""
+        scaled = (read_optional(sdo, Obj406.OPERATING_PARAMETERS) or 0) & _OPERATING_SCALING
+        index = Obj406.UNITS_PER_TURN if scaled else Obj406.SINGLE_TURN_RESOLUTION
+        counts = read_optional(sdo, index)
+        if counts is None:
+            index, counts = Obj406.UNITS_PER_TURN, sdo.read(Obj406.UNITS_PER_TURN)
+        if counts != self._encoder.counts_per_turn:
+            raise BadInput(
+                "encoder.counts_per_turn", f"{self._encoder.counts_per_turn}", f"{counts}, what 0x{index:04X} reads"
+            )
+
+    def _measuring_range(self, sdo: SdoAccess) -> int:
+        measuring_range = sdo.read(Obj406.MEASURING_RANGE)
+        if measuring_range == 0:  # 2**32 does not fit into 32 bits; makers write it as 0
+            return 2**32
+        if measuring_range < self._encoder.counts_per_turn:
+            node = self._encoder.node_id
+            raise Unreachable(f"encoder node {node}: measuring range 0x6002 = {measuring_range} is less than one turn")
+        return measuring_range
+
+
+def preset(sdo: SdoAccess, position_counts: int) -> None:
+    """Make the present position read `position_counts` (0x6003). Only at rest and disabled: the position jumps.
+
+    The cycle face must be told by `Cia406Encoder.forget` so that the jump is not taken for motion.
+    """
+    write_checked(sdo, Obj406.PRESET, 0, position_counts)

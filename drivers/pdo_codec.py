@@ -1,0 +1,46 @@
+"""Builds the struct of a PDO from its mapping, once at start; in the cycle one `unpack_from` reads the whole frame.
+
+Used by the cycle faces of cia402 and cia406, so that what they decode is what the plan maps, in its order and lengths.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Mapping
+
+from servod.errors import BadInput
+from servod.hal import NodePlan, PdoMap
+
+
+def codec(pdo: PdoMap, formats: Mapping[int, str], driver: str) -> struct.Struct:
+    """Struct of the PDO's data; `formats` gives the struct letter of each known index. Raises BadInput for others.
+
+    The letter must be as long as the mapped length: a 32-bit mapping of a 16-bit object would shift all that follows.
+    """
+    letters = []
+    for entry in pdo.entries:
+        letter = formats.get(entry.index)
+        if letter is None or 8 * struct.calcsize("<" + letter) != entry.bits:
+            known = ", ".join(f"0x{i:04X}:{8 * struct.calcsize('<' + f)}" for i, f in formats.items())
+            raise BadInput(f"mapping of driver {driver}", f"0x{entry.index:04X}:{entry.bits}", f"one of {known}")
+        letters.append(letter)
+    return struct.Struct("<" + "".join(letters))
+
+
+def slot(pdo: PdoMap, index: int) -> int:
+    """Place of object `index` in the unpacked tuple; raises BadInput when the PDO does not map it."""
+    for place, entry in enumerate(pdo.entries):
+        if entry.index == index:
+            return place
+    mapped = ", ".join(f"0x{e.index:04X}" for e in pdo.entries)
+    raise BadInput(f"mapping of PDO 0x{pdo.cob_id:03X}", mapped, f"a mapping with 0x{index:04X}")
+
+
+def find(plan: NodePlan, receive: bool, indices: Iterable[int]) -> PdoMap:
+    """The PDO of the plan that maps all `indices`; raises BadInput when there is none."""
+    wanted = set(indices)
+    for pdo in plan.pdos:
+        if pdo.receive is receive and wanted <= {e.index for e in pdo.entries}:
+            return pdo
+    names = ", ".join(f"0x{i:04X}" for i in sorted(wanted))
+    raise BadInput(f"mapping of node {plan.node_id}", "no such PDO", f"one {'R' if receive else 'T'}PDO with {names}")
