@@ -1,0 +1,138 @@
+"""Gain sets: what a control law runs with, where it comes from, and whether it is certified.
+
+Beside the data path: the supervisor loads a set, packs it into plain floats and sends these to the loop.
+"""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+import json
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import Field, model_validator
+
+from servod.controllers import LAWS, Law
+from servod.errors import BadInput
+from servod.gain_parameters import Numbers, Parameters
+from servod.yaml12 import Strict, parse_yaml, read_text, validate
+
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+#: Lower case only: names become file names, also on systems that do not tell case apart.
+GainName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_.-]{0,63}$")]
+SCHEMA_VERSION = 1
+
+
+class Provenance(Strict):
+    """Where a gain set comes from; hashes are sha256 of the files' bytes."""
+
+    author: str = Field(min_length=1, max_length=200)
+    date: datetime.date
+    tool: str = Field("by hand", min_length=1, max_length=200, description="program and version that computed it")
+    tool_sha256: Sha256 | None = None
+    model_sha256: Sha256 | None = Field(None, description="axis model that it was designed for")
+    data_sha256: list[Sha256] = Field(default_factory=list, description="recordings that the model was identified from")
+    seed: int | None = None
+    note: str = Field("", max_length=4000)
+
+
+class CertificateCheck(Numbers):
+    """One proven statement: its figure, the limit it must keep, and the margin between them (positive: kept)."""
+
+    name: str = Field(min_length=1, max_length=200)
+    value: float
+    limit: float
+    margin: float
+    passed: bool
+
+
+class Certificate(Strict):
+    """Statement that the gains were verified; bound to these very numbers by their hash."""
+
+    valid: bool = Field(strict=True)
+    parameters_sha256: Sha256
+    model_sha256: Sha256 | None = None
+    issued_by: str = Field(min_length=1, max_length=200, description="program and version that verified")
+    issued_at: datetime.datetime
+    checks: list[CertificateCheck] = Field(default_factory=list)
+
+    @model_validator(mode="after")
+    def _valid_means_checked(self) -> Certificate:
+        if self.valid and not (self.checks and all(check.passed for check in self.checks)):
+            raise ValueError("valid: true only with a list of checks that all passed")
+        return self
+
+
+class GainSet(Strict):
+    """One gain set: the file model. `parameters.law` chooses the control law and with it the allowed keys."""
+
+    schema_version: Literal[1]
+    name: GainName
+    description: str = Field("", max_length=1000)
+    parameters: Parameters
+    provenance: Provenance
+    certificate: Certificate | None = None
+
+    @property
+    def law(self) -> Law:
+        """The control law that the set is for."""
+        return LAWS[self.parameters.law]
+
+    def pack(self) -> tuple[float, ...]:
+        """Flat parameters for the law's step, all finite, in the order that the law's module states."""
+        return self.parameters.pack()
+
+    def parameters_sha256(self) -> str:
+        """Hash of law and parameters in canonical form: JSON, sorted keys, no blanks, shortest exact numbers.
+
+        Defaults are written out, so that a changed default changes the hash; comments and notes do not.
+        """
+        plain = _all_floats(self.parameters.model_dump(mode="json"))
+        return hashlib.sha256(json.dumps(plain, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+    def certificate_problem(self) -> str | None:
+        """Why the set does not count as certified, in a few words; None when it does."""
+        if self.certificate is None:
+            return "no certificate"
+        if not self.certificate.valid:
+            return "a certificate that says valid: false"
+        if self.certificate.parameters_sha256 != self.parameters_sha256():
+            return "a certificate for other parameters (they were changed after it was issued)"
+        return None
+
+    def to_yaml(self) -> str:
+        """The set as YAML text that `parse_gains` reads back to an equal set."""
+        plain = self.model_dump(mode="json", exclude_none=True)
+        return yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, width=120)
+
+
+def _all_floats(value: Any) -> Any:
+    """`value` with every number as a float, so that 1 and 1.0 hash alike."""
+    if isinstance(value, dict):
+        return {key: _all_floats(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_all_floats(item) for item in value]
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else value
+
+
+def parse_gains(text: str, where: str) -> GainSet:
+    """Check the YAML text of a gain set; `where` names it in errors. Raises BadInput (key, found, allowed)."""
+    return validate(parse_yaml(text, where), GainSet, where)
+
+
+def load_gains(path: str | Path) -> GainSet:
+    """Read and check a gain-set file. Raises BadInput (file and key, found, allowed)."""
+    return parse_gains(read_text(path), str(path))
+
+
+def require_certificate(gains: GainSet, accept_uncertified: bool) -> None:
+    """Refuse a set without a valid certificate unless told to accept it. Raises BadInput."""
+    problem = gains.certificate_problem()
+    if problem and not accept_uncertified:
+        raise BadInput(
+            f"gain set {gains.name}: certificate",
+            problem,
+            "a valid one (`servoctl verify` issues it), or gains.accept_uncertified: true in the configuration",
+        )
