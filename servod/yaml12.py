@@ -103,20 +103,36 @@ def validate(data: Any, model: type[M], where: str) -> M:
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        raise _bad_input(error, model, where) from None
+        raise _bad_input(error, model, data, where) from None
 
 
-def _bad_input(error: ValidationError, model: type[BaseModel], where: str) -> BadInput:
+def _bad_input(error: ValidationError, model: type[BaseModel], data: Any, where: str) -> BadInput:
     """Choose the most telling problem: an unknown key explains a missing one, so it goes first."""
     problems = error.errors(include_url=False)
     first = next((p for p in problems if p["type"] == "extra_forbidden"), problems[0])
-    key = ".".join(str(part) for part in first["loc"]) or "(top)"
+    key = ".".join(_file_path(first["loc"], data)) or "(top)"
+    if first["type"].startswith("union_tag"):
+        tag = str(first["ctx"]["discriminator"]).strip("'")
+        allowed = first["ctx"].get("expected_tags", "a value; this key is required")
+        return BadInput(f"{where}: {key}.{tag}", repr(first["input"].get(tag, "nothing")), allowed)
     if first["type"] == "extra_forbidden":
         return BadInput(f"{where}: {key}", "an unknown key", _known_keys(model, first["loc"]))
     if first["type"] == "missing":
         return BadInput(f"{where}: {key}", "nothing", "a value; this key is required")
     message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
     return BadInput(f"{where}: {key}", repr(first["input"])[:80], message)
+
+
+def _file_path(loc: tuple[int | str, ...], data: Any) -> list[str]:
+    """`loc` as a path in the file: without the tags that pydantic adds where a discriminated union was entered."""
+    path = []
+    for i, part in enumerate(loc):
+        here = (isinstance(data, dict) and part in data) or (isinstance(data, list) and isinstance(part, int))
+        if here or i == len(loc) - 1:
+            path.append(str(part))
+        if here:
+            data = data[part]
+    return path
 
 
 def _known_keys(model: type[BaseModel], loc: tuple[int | str, ...]) -> str:
