@@ -5,7 +5,7 @@
     u      = K_P*(x_ref - x) + K_D*(v_ref - v) + m_ff*a_ref + F_hat
 
 c0 is sigma0 of Table I; the exponent is negative (printed positive, g would grow without bound); l_f has the sign
-that makes z_hat push the way the feedback pushes. z_hat is stepped exactly and bounded by F_S/c0 (bound below (8)).
+that makes z_hat push the way the feedback pushes. z_hat is stepped exactly and bounded (F_max/c0, below (8)).
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ STRIBECK_VELOCITY = 8  # v_s [rad/s]
 OBSERVER_GAIN = 9  # l_f [rad/s per unit of u*]
 INPUT_SCALE = 10  # K [N*m per unit of u*]
 HOLD_WITHIN = 11  # below this error, with the reference at rest, l_f does not act [rad]
-N_PARAMETERS = 12
+STATE_LIMIT = 12  # bound of |z_hat| [rad]
+N_PARAMETERS = 13
 
 
 def step(  # noqa: PLR0917  (the one signature that all laws share)
@@ -52,7 +53,7 @@ def step(  # noqa: PLR0917  (the one signature that all laws share)
     if not (at_rest or winds_up(s, feedback, u_applied)):
         drive += p[OBSERVER_GAIN] * feedback / p[INPUT_SCALE]
     before = s[FRICTION_STATE]
-    z = limited(decayed(before, p[STIFFNESS] * abs(v) / level, drive, dt), p[STATIC] / p[STIFFNESS])
+    z = limited(decayed(before, p[STIFFNESS] * abs(v) / level, drive, dt), p[STATE_LIMIT])
     s[FRICTION_STATE] = z
     rate = (z - before) / dt if dt > 0.0 else 0.0
     friction = p[STIFFNESS] * z + p[DAMPING] * rate + p[VISCOUS] * v
