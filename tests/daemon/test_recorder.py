@@ -161,8 +161,8 @@ def test_full_disk_ends_the_recording_and_nothing_else(tmp_path: Path) -> None:
     recorder = _recorder(tmp_path)
     path = recorder.start("full.mcap").result(5)
     full = os.open("/dev/full", os.O_WRONLY)
-    target = f"/proc/self/fd/{next(f for f in os.listdir('/proc/self/fd') if _points_to(f, path))}"
-    os.dup2(full, int(target.rsplit("/", 1)[1]))
+    descriptor = next(d for d in Path("/proc/self/fd").iterdir() if _points_to(d, path))
+    os.dup2(full, int(descriptor.name))
     os.close(full)
     recorder.add_rows(rows(5000))
     failure = _wait_for(recorder.take_failure)
@@ -177,9 +177,9 @@ def test_full_disk_ends_the_recording_and_nothing_else(tmp_path: Path) -> None:
     assert len(read_recording(again)) == 10
 
 
-def _points_to(descriptor: str, path: Path) -> bool:
+def _points_to(descriptor: Path, path: Path) -> bool:
     try:
-        return Path(f"/proc/self/fd/{descriptor}").readlink() == path
+        return descriptor.readlink() == path
     except OSError:
         return False
 

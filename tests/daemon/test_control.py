@@ -1,0 +1,221 @@
+import json
+import selectors
+import socket
+import stat
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from servod.config import ControlConfig
+from servod.control import MAX_LINE_BYTES, ControlClient, Verb
+from servod.daemon.control_server import ControlServer, Reply
+from servod.daemon.peer import Peer, may_command
+from servod.errors import AnswerIsNo, BadInput, ServodError, Unreachable
+
+
+class Echo:
+    """A handler that answers with what it was asked; `stop` answers late, `scan` fails as told."""
+
+    def __init__(self) -> None:
+        self.late: list[Reply] = []
+
+    def handle(self, verb: Verb, args: dict[str, Any], reply: Reply) -> None:
+        if verb is Verb.STOP:
+            self.late.append(reply)
+        elif verb is Verb.SCAN:
+            raise {1: AnswerIsNo("no"), 2: BadInput("scan", 1, "2"), 3: Unreachable("gone\nreally")}[args["code"]]
+        else:
+            reply.done({"verb": verb, "args": args})
+
+    def status(self) -> dict[str, Any]:
+        return {"now": time.monotonic()}
+
+
+class Served:
+    """A control server in a thread of its own."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.handler = path, Echo()
+        self._selector = selectors.DefaultSelector()
+        self.server = ControlServer(ControlConfig(socket=path), self._selector, self.handler)
+        self._stop = threading.Event()
+        self.longest_round_s = 0.0
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            for key, events in self._selector.select(0.01):
+                began = time.monotonic()
+                key.data(events)
+                self.longest_round_s = max(self.longest_round_s, time.monotonic() - began)
+            self.server.tick(time.monotonic_ns())
+            for reply in self.handler.late:
+                reply.done({"late": True})
+            self.handler.late.clear()
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        self.server.close()
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[Served]:
+    served = Served(tmp_path / "axis.sock")
+    yield served
+    served.close()
+
+
+def _raw(served: Served) -> socket.socket:
+    connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    connection.settimeout(5)
+    connection.connect(str(served.path))
+    return connection
+
+
+def _line(connection: socket.socket) -> dict[str, Any]:
+    with connection.makefile("rb") as lines:
+        return json.loads(lines.readline())  # type: ignore[no-any-return]
+
+
+def test_call_gives_the_result(served: Served) -> None:
+    with ControlClient(served.path) as client:
+        assert client.call(Verb.TRACK, kind="sine", amplitude_rad=0.1)["args"] == {"kind": "sine", "amplitude_rad": 0.1}
+        assert client.call("stop") == {"late": True}
+
+
+@pytest.mark.parametrize(("code", "kind"), [(1, AnswerIsNo), (2, BadInput), (3, Unreachable)])
+def test_errors_keep_their_kind_and_are_one_line(served: Served, code: int, kind: type[ServodError]) -> None:
+    with ControlClient(served.path) as client, pytest.raises(kind) as caught:
+        client.call(Verb.SCAN, code=code)
+    assert caught.value.exit_code == code
+    assert "\n" not in str(caught.value)
+
+
+def test_socket_is_for_owner_and_group_only_and_goes_away(served: Served) -> None:
+    assert stat.S_IMODE(served.path.stat().st_mode) == 0o660
+    served.server.close()
+    assert not served.path.exists()
+    served.server = ControlServer(ControlConfig(socket=served.path), selectors.DefaultSelector(), served.handler)
+
+
+def test_stale_socket_is_replaced_and_other_files_are_not(tmp_path: Path) -> None:
+    path = tmp_path / "axis.sock"
+    with socket.socket(socket.AF_UNIX) as stale:
+        stale.bind(str(path))
+    ControlServer(ControlConfig(socket=path), selectors.DefaultSelector(), Echo()).close()
+    path.write_text("precious")
+    with pytest.raises(Unreachable, match="cannot listen"):
+        ControlServer(ControlConfig(socket=path), selectors.DefaultSelector(), Echo())
+    assert path.read_text() == "precious"
+
+
+def test_no_daemon_is_unreachable(tmp_path: Path) -> None:
+    with pytest.raises(Unreachable, match="is servod running"):
+        ControlClient(tmp_path / "none.sock")
+
+
+def test_one_client_commands_the_others_watch_and_may_stop(served: Served) -> None:
+    with ControlClient(served.path) as other:
+        with ControlClient(served.path) as first:
+            first.call(Verb.ENABLE)
+            with pytest.raises(Unreachable, match="commands the axis"):
+                other.call(Verb.ENABLE)
+            assert other.call(Verb.STATUS)
+            assert other.call(Verb.STOP) == {"late": True}
+            assert served.server.lease()["pid"] > 0
+        deadline = time.monotonic() + 5
+        while served.server.lease()["pid"] and time.monotonic() < deadline:
+            time.sleep(0.01)
+        other.call(Verb.ENABLE)
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        (b"garbage", "one JSON object"),
+        (b"[1,2]", "not a JSON object"),
+        (b'{"id":1,"verb":"fly"}', "'fly'; allowed: status"),
+        (b'{"id":1,"verb":["status"]}', "allowed: status"),
+        (b'{"id":1,"verb":"track","args":[1]}', "found list"),
+        (b'{"id":1,"verb":"watch","args":{"period_s":"x"}}', "watch: period_s"),
+        (b'{"id":1,"verb":"watch","args":{"period_s":1e-9}}', "watch: period_s"),
+        (b"\xff\xfe\x00", "one JSON object"),
+        (b"[" * 100_000, "one JSON object"),
+    ],
+)
+def test_bad_lines_get_one_line_back_and_the_connection_goes_on(served: Served, line: bytes, says: str) -> None:
+    connection = _raw(served)
+    connection.sendall(line + b"\n")
+    answer = _line(connection)
+    assert (answer["ok"], answer["error"]["exit_code"]) == (False, 2)
+    assert says in answer["error"]["message"]
+    connection.sendall(b'{"id":7,"verb":"status"}\n')
+    assert _line(connection)["id"] == 7
+    connection.close()
+
+
+def test_line_in_pieces_and_several_lines_at_once(served: Served) -> None:
+    connection = _raw(served)
+    for piece in (b'{"id":1,"ve', b'rb":"status"', b'}\n{"id":2,"verb":"status"}\n\n{"id":3', b',"verb":"status"}\n'):
+        connection.sendall(piece)
+        time.sleep(0.01)
+    with connection.makefile("rb") as lines:
+        assert [json.loads(lines.readline())["id"] for _ in range(3)] == [1, 2, 3]
+    connection.close()
+
+
+def test_line_without_end_loses_its_connection(served: Served) -> None:
+    connection = _raw(served)
+    with pytest.raises(OSError):
+        for _ in range(MAX_LINE_BYTES // 65_536 + 64):
+            connection.sendall(b"x" * 65_536)
+    connection.close()
+    with ControlClient(served.path) as client:
+        assert client.call(Verb.STATUS)
+
+
+def test_client_that_never_reads_is_cut_off_and_disturbs_nobody(served: Served) -> None:
+    deaf = _raw(served)
+    request = json.dumps({"id": 1, "verb": "track", "args": {"kind": "x" * 100_000}}).encode() + b"\n"
+    with pytest.raises(OSError):
+        for _ in range(1000):
+            deaf.sendall(request)
+    deaf.close()
+    with ControlClient(served.path) as client:
+        assert client.call(Verb.STATUS)
+    assert served.longest_round_s < 1.0
+
+
+def test_watch_streams_and_a_deaf_watcher_only_loses_lines(served: Served) -> None:
+    deaf = _raw(served)
+    deaf.sendall(b'{"id":1,"verb":"watch","args":{"period_s":0.02}}\n')
+    with ControlClient(served.path) as client:
+        stream = client.watch(0.02)
+        times = [next(stream)["now"] for _ in range(5)]
+    assert times == sorted(times)
+    assert times[-1] - times[0] >= 0.06
+    deaf.close()
+
+
+def test_too_many_clients_are_turned_away(served: Served) -> None:
+    crowd = [_raw(served) for _ in range(40)]
+    crowd[0].sendall(b'{"id":1,"verb":"status"}\n')
+    assert _line(crowd[0])["ok"]
+    crowd[-1].settimeout(5)
+    assert crowd[-1].recv(1) == b""
+    for connection in crowd:
+        connection.close()
+
+
+@pytest.mark.parametrize(
+    ("uid", "groups", "group", "may"),
+    [(0, {0}, None, True), (1234, {100, 55}, 55, True), (1234, {100}, 55, False), (1234, {100}, None, False)],
+)
+def test_root_and_group_may_command(uid: int, groups: set[int], group: int | None, may: bool) -> None:
+    assert may_command(Peer(1, uid, frozenset(groups)), group) is may
