@@ -21,7 +21,8 @@ from servod.yaml12 import Strict, parse_yaml, read_text, validate
 
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 #: Lower case only: names become file names, also on systems that do not tell case apart.
-GainName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_.-]{0,63}$")]
+NAME_PATTERN = r"^[a-z0-9][a-z0-9_.-]{0,63}$"
+GainName = Annotated[str, Field(pattern=NAME_PATTERN)]
 SCHEMA_VERSION = 1
 
 
