@@ -1,0 +1,51 @@
+"""`servoctl`: the command line for commissioning. One file per verb; each imports what it needs only when it runs.
+
+Stands above everything else and holds nothing that acts by itself: it talks to the daemon over its control socket, or
+works on files alone. Exit codes are those of servod.errors: 0 done, 1 the answer is no, 2 bad input, 3 unreachable.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from servod.cli import bench, check, demo, enable, faults, gains, record, scan, status, stop, track
+from servod.errors import ServodError
+
+app = typer.Typer(
+    name="servoctl",
+    help="Commission and run servo axes under servod. Every command's --help shows an example.",
+    no_args_is_help=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+for _verb in (demo, scan, status, enable, stop, track, gains, record, bench, check, faults):
+    _verb.register(app)
+
+
+def main() -> None:
+    """Entry point of `servoctl`: errors become one line on standard error and an exit code, never a traceback."""
+    sys.exit(run(sys.argv[1:]))
+
+
+def run(arguments: list[str]) -> int:
+    """Run one command line and return its exit code."""
+    try:
+        code = app(args=arguments, prog_name="servoctl", standalone_mode=False)
+    except ServodError as error:
+        return _complain(str(error), error.exit_code)
+    except typer.TyperException as error:
+        return _complain(f"{error.format_message()} (see servoctl --help)", 2)
+    except (KeyboardInterrupt, typer.Abort):
+        return _complain("interrupted", 130)
+    except BrokenPipeError:
+        sys.stderr.close()  # the reader of a pipe has gone; nothing is left to say
+        return 1
+    return code if isinstance(code, int) else 0
+
+
+def _complain(message: str, exit_code: int) -> int:
+    print("servoctl: " + " ".join(message.split()), file=sys.stderr)
+    return exit_code

@@ -1,0 +1,42 @@
+"""`servoctl bench`: how well this machine runs the loop, as a table and as JSON."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from servod.cli.common import JsonOption, example, print_json
+
+_HELP = example(
+    "Measure wake-up (against cyclictest), cycle work, two processes on the wall clock, stepped and simulated "
+    "speed, and memory. Takes about 13 minutes, most of it watching memory; --quick takes about one.",
+    "servoctl bench",
+    "servoctl bench --quick --json",
+)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb to `app`."""
+    app.command("bench", help=_HELP)(bench)
+
+
+def bench(
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Shorter runs; every figure says how long it was measured.")
+    ] = False,
+    out: Annotated[Path | None, typer.Option(help="Write the JSON document to this file as well.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Run the benchmark."""
+    from servod.benchmark import QUICK, THOROUGH, measure
+    from servod.benchmark.table import print_table, write_json
+
+    document = measure(QUICK if quick else THOROUGH, quiet=as_json)
+    if out is not None:
+        write_json(document, out)
+    if as_json:
+        print_json(document)
+    else:
+        print_table(document)

@@ -1,0 +1,131 @@
+"""`servoctl config check`: configurations, gain sets, axis models, EDS files and column maps, before they are used."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from servod.cli.common import JsonOption, example, print_json
+from servod.errors import BadInput
+
+_app = typer.Typer(
+    help=example("Check files before they are used.", "servoctl config check /etc/servod/axis.yaml"),
+    rich_markup_mode=None,
+)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb to `app`."""
+    app.add_typer(_app, name="config")
+
+
+@_app.command(
+    help=example(
+        "Check axis configurations, gain sets, axis models, column maps and EDS files, each recognised by its content, "
+        "with everything that they name.",
+        "servoctl config check /etc/servod/axis.yaml gains.yaml model.yaml drive.eds",
+    )
+)
+def check(
+    files: Annotated[list[Path], typer.Argument(help="Files to check.", metavar="FILE...")],
+    as_json: JsonOption = False,
+) -> None:
+    """Check files; the first mistake ends the command with exit code 2."""
+    found = [{"file": str(file), **_check(file)} for file in files]
+    if as_json:
+        print_json({"files": found})
+        return
+    for row in found:
+        print(f"{row['file']}: {row['kind']}, no mistakes" + (f"; {row['note']}" if row["note"] else ""))
+
+
+@_app.callback()
+def _config() -> None:
+    """Keep `check` a sub-command, although it is the only one."""
+
+
+def _check(file: Path) -> dict[str, str]:
+    from servod.yaml12 import parse_yaml, read_text
+
+    if file.suffix.lower() in (".eds", ".dcf"):
+        return {"kind": "EDS", "note": _check_eds(file)}
+    keys = parse_yaml(read_text(file), str(file))
+    if not isinstance(keys, dict):
+        raise BadInput(str(file), f"{type(keys).__name__} at the top", "a mapping of keys")
+    kind, checker = _recognise(file, keys)
+    return {"kind": kind, "note": checker(file)}
+
+
+def _recognise(file: Path, keys: dict[Any, Any]) -> tuple[str, Callable[[Path], str]]:
+    """The kind of a YAML file is the one whose tell-tale keys it has most of."""
+    hits = {kind: len(tell & set(keys)) for kind, (tell, _) in _KINDS.items()}
+    kind = max(hits, key=hits.__getitem__)
+    if hits[kind] == 0:
+        known = "; ".join(f"{name}: {', '.join(sorted(tell))}" for name, (tell, _) in _KINDS.items())
+        raise BadInput(f"{file}: {', '.join(map(str, keys)) or '(top)'}", "keys of no known kind of file", known)
+    return kind, _KINDS[kind][1]
+
+
+def _check_axis(file: Path) -> str:
+    """The configuration and everything that it names: drivers, quirks, EDS, gain set, model."""
+    from servod.axis_model import load_axis_model
+    from servod.config import load_config
+    from servod.drivers import driver_table
+    from servod.drivers.quirks import quirks_of
+    from servod.gains import load_gains, require_certificate
+
+    config = load_config(file)
+    for section, driver in (("amplifier", config.amplifier.driver), ("encoder", config.encoder.driver)):
+        if driver not in driver_table():
+            raise BadInput(f"{file}: {section}.driver", driver, ", ".join(sorted(driver_table())))
+    quirks_of(config.amplifier.quirks, f"{file}: amplifier.quirks")
+    for eds in (config.amplifier.eds, config.encoder.eds):
+        if eds is not None:
+            _check_eds(Path(eds))
+    require_certificate(load_gains(config.gains.initial), config.gains.accept_uncertified)
+    if config.model is not None:
+        load_axis_model(config.model)
+    return f"axis {config.name} on {config.bus.interface} {config.bus.channel}"
+
+
+def _check_gains(file: Path) -> str:
+    from servod.gains import load_gains
+
+    gains = load_gains(file)
+    problem = gains.certificate_problem()
+    return f"law {gains.law.name}, " + (f"not certified: {problem}" if problem else "certified")
+
+
+def _check_model(file: Path) -> str:
+    from servod.axis_model import load_axis_model
+
+    load_axis_model(file)
+    return ""
+
+
+def _check_map(file: Path) -> str:
+    from servod.recordings import load_column_map
+
+    load_column_map(file)
+    return ""
+
+
+def _check_eds(file: Path) -> str:
+    from servod.master.dictionary import load_eds
+
+    return f"{len(load_eds(file))} objects"
+
+
+#: Kind of file -> keys that tell it, and what checks it.
+_KINDS: dict[str, tuple[set[str], Callable[[Path], str]]] = {
+    "axis configuration": (
+        {"bus", "cycle", "heartbeat", "amplifier", "encoder", "limits", "gains", "control", "recorder", "metrics"},
+        _check_axis,
+    ),
+    "gain set": ({"schema_version", "parameters", "provenance", "certificate", "description"}, _check_gains),
+    "axis model": ({"axis", "inertia", "friction", "delay_s", "gravity", "torque_offset"}, _check_model),
+    "column map": ({"columns"}, _check_map),
+}

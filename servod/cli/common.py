@@ -1,0 +1,49 @@
+"""What several verbs share: the options for socket and JSON, and how results are printed.
+
+Imports typer alone, so that `servoctl --help` starts at once.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from servod.control import ControlClient
+
+DEFAULT_SOCKET = Path("/run/servod/axis.sock")
+
+SocketOption = Annotated[
+    Path, typer.Option("--socket", envvar="SERVOD_SOCKET", help="Control socket of the axis's daemon.")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
+
+
+def connect(socket: Path) -> ControlClient:
+    """A client of the daemon at `socket`; raises Unreachable when nobody listens there."""
+    from servod.control import ControlClient
+
+    return ControlClient(socket)
+
+
+def print_json(document: Any) -> None:
+    """Print `document` as the one JSON document of a command."""
+    json.dump(document, sys.stdout, indent=2, allow_nan=False)
+    sys.stdout.write("\n")
+
+
+def example(text: str, *lines: str) -> str:
+    """Help text of a command with its examples, each on a line of its own."""
+    return text + "\n\nExample:\n\n\b\n" + "\n".join(f"  {line}" for line in lines)
+
+
+def report(result: dict[str, Any], done: str, as_json: bool) -> None:
+    """Print what a commanding verb returned: the result as JSON, or the one word that says what was done."""
+    if as_json:
+        print_json(result)
+    else:
+        print(done)

@@ -1,0 +1,100 @@
+"""`servoctl gains`: load gain sets into the daemon, look at them, change between them while the axis runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, connect, example, print_json, report
+
+_app = typer.Typer(
+    help=example("Load, list, show, activate and roll back gain sets.", "servoctl gains load my_axis.yaml"),
+    rich_markup_mode=None,
+)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb to `app`."""
+    app.add_typer(_app, name="gains")
+
+
+@_app.command(help=example("Check a gain set and keep it in the daemon's store.", "servoctl gains load my_axis.yaml"))
+def load(
+    file: Annotated[Path, typer.Argument(help="Gain set, YAML.")],
+    name: Annotated[str | None, typer.Option(help="Name in the store; the file's own unless given.")] = None,
+    activate: Annotated[bool, typer.Option("--activate", help="Activate it as well.")] = False,
+    socket: SocketOption = DEFAULT_SOCKET,
+    as_json: JsonOption = False,
+) -> None:
+    """Load a gain set."""
+    from servod.gains import load_gains
+    from servod.yaml12 import read_text
+
+    load_gains(file)  # refuse here, where the file's name is known
+    stored_name = name or file.stem
+    with connect(socket) as client:
+        result = client.call("gains_load", name=stored_name, text=read_text(file))
+        if activate:
+            result |= client.call("gains_activate", name=result.get("name", stored_name))
+    report(result, f"{'activated' if activate else 'loaded'} {result.get('name', stored_name)}", as_json)
+
+
+@_app.command("list", help=example("List the gain sets in the daemon's store.", "servoctl gains list"))
+def list_(socket: SocketOption = DEFAULT_SOCKET, as_json: JsonOption = False) -> None:
+    """List gain sets."""
+    with connect(socket) as client:
+        result = client.call("gains_list")
+    if as_json:
+        print_json(result)
+    else:
+        _print(result)
+
+
+@_app.command(help=example("Check a gain set file and show what is in it.", "servoctl gains show my_axis.yaml"))
+def show(file: Annotated[Path, typer.Argument(help="Gain set, YAML.")], as_json: JsonOption = False) -> None:
+    """Show a gain set."""
+    from servod.gains import load_gains
+
+    document = load_gains(file).model_dump(mode="json")
+    if as_json:
+        print_json(document)
+        return
+    from rich.console import Console
+    from rich.pretty import Pretty
+
+    Console().print(Pretty(document))
+
+
+@_app.command(help=example("Change to a stored gain set without a bump.", "servoctl gains activate my_axis"))
+def activate(
+    name: Annotated[str, typer.Argument(help="Name in the store.")],
+    socket: SocketOption = DEFAULT_SOCKET,
+    as_json: JsonOption = False,
+) -> None:
+    """Activate a gain set."""
+    with connect(socket) as client:
+        report(client.call("gains_activate", name=name), f"activated {name}", as_json)
+
+
+@_app.command(help=example("Go back to the gain set that was active before.", "servoctl gains rollback"))
+def rollback(socket: SocketOption = DEFAULT_SOCKET, as_json: JsonOption = False) -> None:
+    """Roll back."""
+    with connect(socket) as client:
+        result = client.call("gains_rollback")
+    report(result, f"active again: {result.get('name', '')}", as_json)
+
+
+def _print(result: dict[str, Any]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    rows: list[dict[str, Any]] = result.get("gains", [])
+    if not rows:
+        print("no gain set is stored")
+        return
+    table = Table(*rows[0])
+    for row in rows:
+        table.add_row(*(str(value) for value in row.values()))
+    Console().print(table)

@@ -1,0 +1,66 @@
+"""`servoctl record`: start and stop a recording in the daemon, and export one to CSV or Parquet."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, connect, example, report
+from servod.errors import BadInput
+
+_app = typer.Typer(
+    help=example("Record every cycle; export a recording.", "servoctl record start", "servoctl record stop"),
+    rich_markup_mode=None,
+)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb to `app`."""
+    app.add_typer(_app, name="record")
+
+
+@_app.command(help=example("Start recording every cycle (MCAP).", "servoctl record start"))
+def start(
+    path: Annotated[Path | None, typer.Option(help="File; a new name in recorder.directory unless given.")] = None,
+    socket: SocketOption = DEFAULT_SOCKET,
+    as_json: JsonOption = False,
+) -> None:
+    """Start a recording."""
+    arguments = {} if path is None else {"path": str(path.resolve())}
+    with connect(socket) as client:
+        result = client.call("record_start", **arguments)
+    report(result, f"recording to {result.get('path', '')}", as_json)
+
+
+@_app.command(help=example("Stop recording.", "servoctl record stop"))
+def stop(socket: SocketOption = DEFAULT_SOCKET, as_json: JsonOption = False) -> None:
+    """Stop the recording."""
+    with connect(socket) as client:
+        result = client.call("record_stop")
+    report(result, f"recorded {result.get('path', '')}", as_json)
+
+
+@_app.command(
+    help=example(
+        "Turn a recording into CSV or Parquet, by the suffix of --out.", "servoctl record export run.mcap --out run.csv"
+    )
+)
+def export(
+    file: Annotated[Path, typer.Argument(help="Recording (.mcap).")],
+    out: Annotated[Path, typer.Option(help="File to write: .csv or .parquet.")],
+    as_json: JsonOption = False,
+) -> None:
+    """Export a recording."""
+    from servod.recorder_export import export_csv, export_parquet
+    from servod.recorder_read import read_recording
+
+    writers = {".csv": export_csv, ".parquet": export_parquet}
+    if out.suffix not in writers:
+        raise BadInput(f"--out {out}", repr(out.suffix), " or ".join(writers))
+    recording = read_recording(file)
+    rows = writers[out.suffix](recording, out)
+    cut = ", which ends in the middle of a record" if recording.truncated else ""
+    result = {"path": str(out), "rows": rows, "truncated": recording.truncated}
+    report(result, f"wrote {out}: {rows} cycles of {file}{cut}", as_json)

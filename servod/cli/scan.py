@@ -1,0 +1,78 @@
+"""`servoctl scan`: which nodes are on the bus, asked through the daemon or, where none runs, on the bus itself."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+
+from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, connect, example, print_json
+
+_HELP = example(
+    "List the nodes on the bus with identity, NMT state and LSS. Without --channel the daemon is asked; with it the "
+    "bus is opened directly, which is only for a bus that no daemon owns.",
+    "servoctl scan",
+    "servoctl scan --interface socketcan --channel can0",
+)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb to `app`."""
+    app.command("scan", help=_HELP)(scan)
+
+
+def scan(
+    interface: Annotated[str, typer.Option(help="virtual, socketcan, or a name that python-can knows.")] = "socketcan",
+    channel: Annotated[str | None, typer.Option(help="Interface name, or the virtual bus's socket.")] = None,
+    bit_rate: Annotated[int, typer.Option(help="Bit rate, for buses that python-can opens.")] = 1_000_000,
+    socket: SocketOption = DEFAULT_SOCKET,
+    as_json: JsonOption = False,
+) -> None:
+    """Scan the bus."""
+    nodes = _through_daemon(socket) if channel is None else _on_bus(interface, channel, bit_rate)
+    if as_json:
+        print_json({"nodes": nodes})
+    else:
+        _print(nodes)
+
+
+def _through_daemon(socket: Any) -> list[dict[str, Any]]:
+    with connect(socket) as client:
+        nodes: list[dict[str, Any]] = client.call("scan")["nodes"]
+    return nodes
+
+
+def _on_bus(interface: str, channel: str, bit_rate: int) -> list[dict[str, Any]]:
+    from dataclasses import asdict
+
+    from servod.bus.open import open_bus
+    from servod.clock import WallClock
+    from servod.config import BusConfig
+    from servod.master.scan import scan as scan_bus
+    from servod.yaml12 import validate
+
+    config = validate({"interface": interface, "channel": channel, "bit_rate": bit_rate}, BusConfig, "servoctl scan")
+    bus = open_bus(config)
+    try:
+        return [asdict(node) for node in scan_bus(bus, WallClock())]
+    finally:
+        bus.close()
+
+
+def _print(nodes: list[dict[str, Any]]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    if not nodes:
+        print("no node answered")
+        return
+    table = Table(*(key.replace("_", " ") for key in nodes[0]))
+    for node in nodes:
+        table.add_row(*(_cell(key, value) for key, value in node.items()))
+    Console().print(table)
+
+
+def _cell(key: str, value: object) -> str:
+    if value is None:
+        return "-"
+    return f"0x{value:X}" if isinstance(value, int) and key not in ("node_id", "serial") else str(value)

@@ -1,0 +1,20 @@
+"""`servoctl stop`: the drive's quick stop, at once."""
+
+from __future__ import annotations
+
+import typer
+
+from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, connect, example, report
+
+_HELP = example("Quick stop: the drive stops the axis by its own option (0x605A) and switches off.", "servoctl stop")
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb to `app`."""
+    app.command("stop", help=_HELP)(stop)
+
+
+def stop(socket: SocketOption = DEFAULT_SOCKET, as_json: JsonOption = False) -> None:
+    """Stop the axis."""
+    with connect(socket) as client:
+        report(client.call("stop"), "stopped", as_json)

@@ -1,0 +1,84 @@
+"""One tracking run as arrays, cut from the daemon's recording or a stepped session's records, and its score.
+
+Behind the recorder; demo, benchmark and report read runs from here. Needs numpy (the lab part).
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servod.errors import AnswerIsNo
+from servod.record import FIELDS
+
+#: One cycle record as a row of a structured array; the same bytes as servod.record.RECORD.
+ROW = np.dtype([(f.name, "<f8" if f.kind == "d" else "<i8") for f in FIELDS])
+
+#: The contract scores trajectory (19) without its first second.
+SETTLE_S = 1.0
+
+
+@dataclass(frozen=True)
+class Score:
+    """How well a run tracked: position error of the encoder against the reference, in mrad."""
+
+    rms_error_mrad: float
+    max_error_mrad: float
+
+
+@dataclass(frozen=True)
+class Run:
+    """The cycles of one motion under one controller; `rows` has the fields of servod.record."""
+
+    controller: str
+    rows: NDArray[np.void]
+
+    @property
+    def time_s(self) -> NDArray[np.float64]:
+        """Time since the motion began."""
+        time_ns = self.rows["time_ns"]
+        return (time_ns - time_ns[0]) * 1e-9  # type: ignore[no-any-return]
+
+    @property
+    def error_mrad(self) -> NDArray[np.float64]:
+        """Reference minus encoder position."""
+        return (self.rows["reference_rad"] - self.rows["position_rad"]) * 1e3  # type: ignore[no-any-return]
+
+    @property
+    def cycles(self) -> int:
+        """Periods from first to last cycle, skipped ones included."""
+        return int(self.rows["cycle"][-1] - self.rows["cycle"][0]) + 1
+
+    @property
+    def missed(self) -> int:
+        """Periods that the loop skipped in this run."""
+        return int(self.rows["missed"][-1] - self.rows["missed"][0])
+
+    def score(self) -> Score:
+        """RMS and largest error after SETTLE_S. Raises AnswerIsNo when the run is shorter than that."""
+        error = self.error_mrad[self.time_s >= SETTLE_S]
+        if error.size == 0:
+            raise AnswerIsNo(f"the run under {self.controller} ended within its first {SETTLE_S:.0f} s")
+        return Score(float(np.sqrt(np.mean(error**2))), float(np.max(np.abs(error))))
+
+
+def cut_motion(controller: str, raw: bytes | bytearray) -> Run:
+    """The cycles of `raw` (packed cycle records) in which a reference motion ran. Raises AnswerIsNo when none did."""
+    rows = np.frombuffer(raw, dtype=ROW)
+    moving = rows[rows["reference_active"] == 1]
+    if moving.size == 0:
+        raise AnswerIsNo(f"no motion was recorded under {controller}")
+    return Run(controller, moving)
+
+
+def summary(runs: list[Run], wall_s: float) -> dict[str, Any]:
+    """The demo's JSON document: the score of each controller, cycles, missed periods and elapsed time."""
+    return {
+        "controllers": {run.controller: asdict(run.score()) for run in runs},
+        "cycles": sum(run.cycles for run in runs),
+        "missed": sum(run.missed for run in runs),
+        "wall_s": wall_s,
+    }

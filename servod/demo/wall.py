@@ -1,0 +1,116 @@
+"""The demo on the wall clock: daemon and virtual axis as their own processes, commanded over the control socket.
+
+Beside the data path; a client like `servoctl`. The virtual axis is the only one that knows the plant.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from servod.config import AxisConfig
+from servod.control import ControlClient
+from servod.demo.axis import CONTROLLERS, demo_config, gains_file
+from servod.demo.processes import child, sigterm_as_interrupt, wait_until
+from servod.demo.runs import Run, cut_motion
+from servod.errors import AnswerIsNo, Unreachable
+from servod.recorder_read import read_recording
+
+#: Told how far a run is: controller and share from 0 to 1.
+Progress = Callable[[str, float], None]
+
+_START_S = 20.0
+_POLL_S = 0.1
+_HOME_S = 2.0
+
+
+@contextlib.contextmanager
+def running_axis(config: AxisConfig, plant: Path, folder: Path) -> Iterator[ControlClient]:
+    """Virtual axis and daemon for the time of a `with` block, and a client of the daemon. Raises Unreachable."""
+    file = folder / "axis.yaml"
+    file.write_text(yaml.safe_dump(config.model_dump(mode="json")))
+    bus, control = Path(config.bus.channel), config.control.socket
+    with contextlib.ExitStack() as stack:
+        log = folder / "virtual-axis.log"
+        axis = stack.enter_context(
+            child("servod.drivers.virtual.main", ["--socket", str(bus), "--plant", str(plant)], log)
+        )
+        wait_until(bus.exists, axis, log, _START_S)
+        log = folder / "servod.log"
+        daemon = stack.enter_context(child("servod.daemon.main", ["--config", str(file)], log))
+        wait_until(lambda: _answers(control), daemon, log, _START_S)
+        yield stack.enter_context(ControlClient(control))
+
+
+def _answers(control: Path) -> bool:
+    """The daemon listens, and its loop turns."""
+    try:
+        with ControlClient(control) as client:
+            return bool(client.call("status"))
+    except Unreachable:
+        return False
+
+
+def run_wall(plant: Path, duration_s: float, recordings: Path, progress: Progress) -> list[Run]:
+    """Track trajectory (19) for `duration_s` under each controller; one recording each stays in `recordings`.
+
+    Raises AnswerIsNo when the axis does not get through, Unreachable when a process does not start.
+    """
+    recordings.mkdir(parents=True, exist_ok=True)
+    with sigterm_as_interrupt(), tempfile.TemporaryDirectory(prefix="servod-demo-") as name:
+        folder = Path(name)
+        with running_axis(demo_config(folder, recordings), plant, folder) as client:
+            client.call("enable")
+            home_rad = float(client.call("status")["motion"]["reference_rad"])
+            runs = []
+            for controller in CONTROLLERS:
+                runs.append(_run(client, controller, duration_s, recordings, progress))
+                _go_home(client, home_rad)
+            client.call("disable")
+    return runs
+
+
+def _run(client: ControlClient, controller: str, duration_s: float, recordings: Path, progress: Progress) -> Run:
+    """One controller: activate it, record trajectory (19), and cut the motion from the recording."""
+    name = f"demo_{controller}"
+    client.call("gains_load", name=name, text=gains_file(controller).read_text())
+    client.call("gains_activate", name=name)
+    file = recordings / f"{controller}.mcap"
+    file.unlink(missing_ok=True)
+    path = client.call("record_start", path=str(file.resolve()))["path"]
+    started = time.monotonic()
+    client.call("track", kind="paper", duration_s=duration_s)
+    while _moves(client):
+        progress(controller, min(1.0, (time.monotonic() - started) / duration_s))
+    progress(controller, 1.0)
+    client.call("record_stop")
+    return cut_motion(controller, read_recording(path).rows)
+
+
+def _go_home(client: ControlClient, home_rad: float) -> None:
+    """Back to where the demo began, along half a cosine."""
+    way_rad = home_rad - float(client.call("status")["motion"]["reference_rad"])
+    if abs(way_rad) < 1e-9:
+        return
+    steps = round(_HOME_S * 1000)
+    positions = [0.5 * way_rad * (1.0 - math.cos(math.pi * k / steps)) for k in range(steps + 1)]
+    client.call("track", kind="csv", positions_rad=positions)
+    while _moves(client):
+        pass
+
+
+def _moves(client: ControlClient) -> bool:
+    """Wait a little; then whether the motion still runs. Raises AnswerIsNo when the axis is not enabled any more."""
+    time.sleep(_POLL_S)
+    status: dict[str, Any] = client.call("status")
+    if status["axis"]["state"] != "ENABLED":
+        faults = "; ".join(f"{f['code']}: {f['cause']}" for f in status["faults"])
+        raise AnswerIsNo(f"the axis went to {status['axis']['state']} during the demo. {faults}")
+    return bool(status["axis"]["motion_running"])

@@ -1,0 +1,78 @@
+"""Builds one self-contained HTML page: sentences, tables and plotly figures, with the plotting code inside the file.
+
+Behind everything; called by verbs that report. Needs plotly (the lab part).
+"""
+
+from __future__ import annotations
+
+import html
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import plotly.graph_objects as go
+import plotly.io
+from plotly.offline import get_plotlyjs
+
+from servod import __version__
+from servod.errors import BadInput
+
+_STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 70rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
+h1 { font-size: 1.6rem; } h2 { font-size: 1.2rem; margin-top: 2.5rem; }
+table { border-collapse: collapse; } th, td { padding: .3rem .9rem; text-align: right; border-bottom: 1px solid #ddd; }
+th:first-child, td:first-child { text-align: left; } footer { margin-top: 3rem; color: #777; font-size: .85rem; }
+"""
+
+
+class Page:
+    """A page in the making; parts appear in the order in which they were added."""
+
+    def __init__(self, title: str) -> None:
+        self._title = title
+        self._parts = [f"<h1>{html.escape(title)}</h1>"]
+        self._has_figure = False
+
+    def heading(self, text: str) -> None:
+        """Begin a section."""
+        self._parts.append(f"<h2>{html.escape(text)}</h2>")
+
+    def sentence(self, text: str) -> None:
+        """Add a paragraph of plain text."""
+        self._parts.append(f"<p>{html.escape(text)}</p>")
+
+    def table(self, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+        """Add a table; cells are plain text."""
+        head = "".join(f"<th>{html.escape(cell)}</th>" for cell in header)
+        body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+        self._parts.append(f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>")
+
+    def figure(self, figure: go.Figure) -> None:
+        """Add a plotly figure."""
+        self._has_figure = True
+        figure.update_layout(template="plotly_white", margin={"l": 60, "r": 20, "t": 40, "b": 50})
+        self._parts.append(
+            plotly.io.to_html(figure, full_html=False, include_plotlyjs=False, config={"displaylogo": False})
+        )
+
+    def html(self) -> str:
+        """The whole page; plotly's own code stands in it once, so that it opens without a network."""
+        script = f"<script>{get_plotlyjs()}</script>" if self._has_figure else ""
+        return (
+            f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{html.escape(self._title)}</title>'
+            f"<style>{_STYLE}</style>{script}</head>\n<body>\n" + "\n".join(self._parts) + "\n"
+            f"<footer>servod {__version__}</footer>\n</body></html>\n"
+        )
+
+    def write(self, path: Path) -> None:
+        """Write the page aside and rename it to `path`. Raises BadInput when that is not possible."""
+        aside = path.with_name(path.name + ".part")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with aside.open("w", encoding="utf-8") as stream:
+                stream.write(self.html())
+                stream.flush()
+                os.fsync(stream.fileno())
+            aside.replace(path)
+        except OSError as error:
+            raise BadInput(str(path), error.strerror or str(error), "a path that can be written") from None
