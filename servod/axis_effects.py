@@ -1,0 +1,308 @@
+"""Groups of keys of the axis model file, one for each effect that a plain joint model leaves out.
+
+Stands between the axis model file and the physics kernels (`servod.models`), which obey every group. Torque means force
+and rad means m when `axis: linear`. Every group says its equation and where it comes from; `servoctl explain` prints it.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from servod.yaml12 import Strict
+
+Factor = Annotated[float, Field(gt=0.0, le=100.0)]
+NonNegative = Annotated[float, Field(ge=0.0)]
+Positive = Annotated[float, Field(gt=0.0)]
+Phase = Annotated[float, Field(ge=-100.0, le=100.0, description="rad, at position 0")]
+
+
+class Harmonic(Strict):
+    """One sine over position: amplitude*sin(n*x + phase), n = periods_per_turn (2*pi*periods_per_metre when linear)."""
+
+    amplitude: float = Field(description="in the unit of the group it stands in")
+    periods_per_turn: float | None = Field(None, gt=0.0, le=100_000.0, description="rotary axes: periods in 2*pi rad")
+    periods_per_metre: float | None = Field(None, gt=0.0, le=10_000_000.0, description="linear axes: periods in 1 m")
+    phase: Phase = 0.0
+
+    @model_validator(mode="after")
+    def _one_period(self) -> Harmonic:
+        if (self.periods_per_turn is None) == (self.periods_per_metre is None):
+            raise ValueError("exactly one of periods_per_turn and periods_per_metre")
+        return self
+
+
+class Harmonics(Strict):
+    """A sum of sines over position."""
+
+    harmonics: tuple[Harmonic, ...] = Field(min_length=1, max_length=64)
+
+
+class Asymmetry(Strict):
+    """Friction differs by direction: g(v) and the viscous term are multiplied by a factor for the sign of v.
+
+    g(v) -> k(sign v)*g(v), F_v -> k_v(sign v)*F_v. Source: the paper's II-B, maps signed per direction;
+    Armstrong-Helouvry, Dupont, Canudas de Wit, Automatica 30(7), 1994.
+    """
+
+    positive_dry: Factor = Field(1.0, description="factor of Coulomb and static friction for v > 0")
+    negative_dry: Factor = Field(1.0, description="factor of Coulomb and static friction for v < 0")
+    positive_viscous: Factor = Field(1.0, description="factor of viscous friction for v > 0")
+    negative_viscous: Factor = Field(1.0, description="factor of viscous friction for v < 0")
+
+
+class Stribeck(Strict):
+    """Stribeck curve: g(v) = F_C + (F_S - F_C)*exp(-(|v|/v_s)^exponent); keys given here replace those of `friction`.
+
+    Source: the paper's (18) with the exponent's sign mended; exponent by Bo and Pavelescu, Wear 82, 1982.
+    """
+
+    static: NonNegative | None = Field(None, description="F_S, N*m")
+    stribeck_velocity: Positive | None = Field(None, description="v_s, rad/s")
+    exponent: float = Field(2.0, ge=0.2, le=10.0, description="shape; 2 is the paper's, 1 is Tustin's")
+
+
+class Presliding(Strict):
+    """Bristle: dz/dt = v - sigma0*|v|/g(v)*z, F = sigma0*z + sigma1(v)*dz/dt; keys given here replace `friction`'s.
+
+    sigma1(v) = sigma1*exp(-(v/damping_velocity)^2) when damping_velocity is given. Source: Canudas de Wit et al.,
+    IEEE TAC 40(3), 1995 (LuGre); Olsson 1996 for the fading damping.
+    """
+
+    sigma0: Positive | None = Field(None, description="stiffness, N*m/rad")
+    sigma1: NonNegative | None = Field(None, description="damping, N*m*s/rad")
+    damping_velocity: Positive | None = Field(None, description="rad/s at which the damping fades")
+
+
+class ViscousNonlinear(Strict):
+    """Viscous friction that is not a line: + quadratic*|v|*v + cubic*v^3 + power*sign(v)*|v|^exponent.
+
+    Source: Kruif, Gautier and others fit drives with |v|^n; churning losses are quadratic, greases thin (n < 1).
+    """
+
+    quadratic: float = Field(0.0, description="N*m*s^2/rad^2")
+    cubic: float = Field(0.0, description="N*m*s^3/rad^3")
+    power: float = Field(0.0, description="N*m*(s/rad)^exponent")
+    exponent: float = Field(0.5, gt=0.0, le=5.0)
+
+
+class LoadDependentFriction(Strict):
+    """Dry friction grows with what the gears carry: g -> g + per_command*|torque| + per_load*|load torque|.
+
+    Load torque is gravity + spring + disturbance. Source: Hamon, Gautier, Garrec, IROS 2010; BAM (Duclusaud 2024).
+    """
+
+    per_command: NonNegative = Field(0.0, le=10.0, description="N*m of friction per N*m of applied torque")
+    per_load: NonNegative = Field(0.0, le=10.0, description="N*m of friction per N*m of load torque")
+
+
+class Bump(Strict):
+    """A tight spot: a Gaussian over position that adds `factor` to the factor of dry friction."""
+
+    position: float = Field(description="centre, rad")
+    width: Positive = Field(description="standard deviation, rad")
+    factor: float = Field(ge=-1.0, le=100.0, description="share of dry friction at the centre")
+
+
+class PositionDependentFriction(Strict):
+    """Dry friction times 1 + sum amplitude*sin(n*x + phase) + sum factor*exp(-(x - position)^2/(2*width^2)).
+
+    Never below 5 % of its plain value. Amplitudes are shares (1 = 100 %). Source: gear mesh and bearing preload;
+    Armstrong-Helouvry 1991 (position dependence of PUMA friction).
+    """
+
+    harmonics: tuple[Harmonic, ...] = Field((), max_length=64)
+    bumps: tuple[Bump, ...] = Field((), max_length=64)
+
+
+class Cogging(Harmonics):
+    """Resisting torque sum amplitude*sin(n*x + phase), amplitudes in N*m, independent of the command.
+
+    Source: reluctance of slots against magnets; Hanselman, Brushless Permanent Magnet Motor Design, 2003.
+    """
+
+
+class TorqueRipple(Harmonics):
+    """Torque applied = torque*(1 + sum amplitude*sin(n*x + phase)), amplitudes are shares of the torque.
+
+    Source: back-EMF harmonics and gear transmission error; Jahns and Soong, IEEE TIE 43(2), 1996.
+    """
+
+
+class Gravity(Strict):
+    """Resisting torque amplitude*sin(x + phase): a pendulum. amplitude = m*g*l."""
+
+    amplitude: float = Field(0.0, description="N*m")
+    phase: Phase = 0.0
+
+
+class Spring(Strict):
+    """Resisting torque stiffness*(x - rest) + cubic*(x - rest)^3: cable, hose, counterbalance, flexure."""
+
+    stiffness: NonNegative = Field(0.0, description="N*m/rad")
+    rest: float = Field(0.0, description="position without torque, rad")
+    cubic: NonNegative = Field(0.0, description="N*m/rad^3")
+
+
+class TwoMass(Strict):
+    """What stands behind a joint's spring; shares of the model's own `inertia` and `friction.viscous`."""
+
+    load_inertia: Positive = Field(description="kg*m^2, the part of `inertia` that is behind the spring")
+    stiffness: Positive = Field(description="N*m/rad")
+    damping: NonNegative = Field(0.0, description="N*m*s/rad")
+    load_viscous: NonNegative = Field(0.0, description="N*m*s/rad, the part of friction.viscous behind the spring")
+
+
+class JointElasticity(TwoMass):
+    """Motor and load with a spring: tau = k*d + cubic*d^3 + damping*dd/dt, d = x_motor - x_load.
+
+    (J - J_L)*a_motor = u - F(v_motor) - tau; J_L*a_load = tau - load_viscous*v_load - gravity - spring + disturbance.
+    The encoder reads the motor. Source: Spong, ASME JDSMC 109(4), 1987; stiffening: Tuttle and Seering 1996.
+    """
+
+    cubic: NonNegative = Field(0.0, description="N*m/rad^3, stiffening")
+
+
+class Backlash(Strict):
+    """Dead zone before the joint's spring: tau = 0 while |d| < gap/2, else k*(d - sign(d)*gap/2) + damping*dd/dt.
+
+    The other keys say what is behind the gap; they may stand in `joint_elasticity` instead. Source: Nordin, Galic,
+    Gutman, Int. J. Adaptive Control 11, 1997.
+    """
+
+    gap: Positive = Field(description="whole width, rad")
+    load_inertia: Positive | None = Field(None, description="kg*m^2, the part of `inertia` behind the gap")
+    stiffness: Positive | None = Field(None, description="N*m/rad of the contact")
+    damping: NonNegative = Field(0.0, description="N*m*s/rad of the contact")
+    load_viscous: NonNegative = Field(0.0, description="N*m*s/rad, the part of friction.viscous behind the gap")
+
+
+class TorqueGain(Strict):
+    """Torque = factor*command (k_t, gear or amplifier scale is not what the command assumes)."""
+
+    factor: Factor = 1.0
+    negative_factor: Factor | None = Field(None, description="factor of negative commands, when different")
+
+
+class LimitShape(StrEnum):
+    """How a torque limit is reached."""
+
+    HARD = "hard"
+    TANH = "tanh"
+
+
+class TorqueSaturation(Strict):
+    """Torque = clip(torque, -negative_limit, limit), or limit*tanh(torque/limit): current limit, magnetic saturation."""
+
+    limit: Positive = Field(description="N*m")
+    negative_limit: Positive | None = Field(None, description="N*m (a positive number); None = limit")
+    shape: LimitShape = LimitShape.HARD
+
+
+class Delay(Strict):
+    """Command to torque takes delay_s + additional_s: bus cycles, filters, drive scheduling."""
+
+    additional_s: float = Field(ge=-0.001, le=0.25)
+
+
+class ActuatorLag(Strict):
+    """Torque follows the delayed command by dT/dt = (command - T)/time_constant_s, at most slew_per_s."""
+
+    time_constant_s: NonNegative = Field(0.0, le=1.0)
+    slew_per_s: Positive | None = Field(None, description="N*m/s")
+
+
+class ThermalShape(StrEnum):
+    """How friction depends on temperature."""
+
+    LINEAR = "linear"
+    EXPONENTIAL = "exponential"
+
+
+class Thermal(Strict):
+    """Friction changes with temperature T or time t: dry and viscous friction are multiplied by a factor each.
+
+    linear: 1 + k*(T - reference_c); exponential: exp(k*(T - reference_c)); k is negative for a joint that loosens when
+    warm. Time: + k_t*t, or k_t*time_s*(1 - exp(-t/time_s)) when drift_time_s is given. Factors stay above 0.05.
+    T is the recorded temperature where there is one, else dT/dt = heating_c_per_j*|F*v| - (T - ambient_c)/cooling_s.
+    Source: Bittencourt and Gunnarsson, ASME JDSMC 134(5), 2012; Simoni et al., IROS 2015.
+    """
+
+    dry_per_c: float = Field(0.0, ge=-1.0, le=1.0, description="1/degC")
+    viscous_per_c: float = Field(0.0, ge=-1.0, le=1.0, description="1/degC")
+    reference_c: float = Field(25.0, ge=-100.0, le=300.0, description="degC at which `friction` holds")
+    shape: ThermalShape = ThermalShape.LINEAR
+    dry_per_s: float = Field(0.0, ge=-10.0, le=10.0, description="1/s")
+    viscous_per_s: float = Field(0.0, ge=-10.0, le=10.0, description="1/s")
+    drift_time_s: Positive | None = Field(None, description="s in which the drift ends; None = it goes on")
+    ambient_c: float = Field(25.0, ge=-100.0, le=300.0, description="degC")
+    heating_c_per_j: NonNegative = Field(0.0, description="degC per J of friction loss")
+    cooling_s: Positive = Field(600.0, description="time constant, s")
+
+
+class PositionDependentInertia(Harmonics):
+    """M(x) = inertia*(1 + sum amplitude*sin(n*x + phase)), with M*a + dM/dx*v^2/2 = torque; amplitudes are shares.
+
+    Source: Lagrange's equation of a linkage, crank or eccentric load.
+    """
+
+
+class EncoderEccentricity(Harmonics):
+    """Encoder = x + sum amplitude*sin(n*x + phase), amplitudes in rad: the disc sits off its axis (n = 1) or is oval."""
+
+
+class DisturbanceWindow(Strict):
+    """An external torque from start_s to end_s: torque*cos(2*pi*frequency_hz*(t - start_s) + phase)."""
+
+    start_s: float
+    end_s: float
+    torque: float = Field(description="N*m, with the command's sign")
+    frequency_hz: NonNegative = 0.0
+    phase: Phase = 0.0
+
+    @model_validator(mode="after")
+    def _window(self) -> DisturbanceWindow:
+        if self.start_s >= self.end_s:
+            raise ValueError("start_s less than end_s")
+        return self
+
+
+class Disturbance(Strict):
+    """External torques, each in a time window of the recording (t_s): somebody leans on the axis, a cable catches."""
+
+    windows: tuple[DisturbanceWindow, ...] = Field(min_length=1, max_length=64)
+
+
+class Table(Strict):
+    """A resisting torque as a piecewise linear function, zero outside its grid."""
+
+    grid: tuple[float, ...] = Field(min_length=2, max_length=2048, description="ascending: rad, rad/s or s")
+    torque: tuple[float, ...] = Field(min_length=2, max_length=2048, description="N*m")
+
+    @model_validator(mode="after")
+    def _is_a_function(self) -> Table:
+        if len(self.grid) != len(self.torque):
+            raise ValueError("as many torques as grid points")
+        if any(a >= b for a, b in zip(self.grid, self.grid[1:], strict=False)):
+            raise ValueError("an ascending grid")
+        return self
+
+
+class Residual(Strict):
+    """A resisting torque that fits no known physics, kept as a table over position, velocity or time where it lives."""
+
+    position: Table | None = None
+    velocity: Table | None = None
+    time: Table | None = None
+
+
+class Noise(Strict):
+    """What a virtual plant adds: torque noise (first-order low-passed white noise), encoder noise, temperature."""
+
+    torque_rms: NonNegative = Field(0.0, description="N*m")
+    torque_bandwidth_hz: Positive = Field(100.0, description="Hz")
+    encoder_rms: NonNegative = Field(0.0, description="rad, at each reading")
+    temperature_c: float = Field(25.0, ge=-100.0, le=300.0, description="degC at the start")
+    temperature_rms_c: NonNegative = Field(0.0, description="degC, at each reading")

@@ -1,0 +1,180 @@
+"""The axis model file: what simulator, identification, synthesis, diagnosis, daemon and the virtual plant share.
+
+Stands between the file (YAML, contract.md) and the physics kernels of `servod.models`, which work on `AxisModel.pack()`.
+SI units in joint coordinates: rotary rad and N*m, linear m and N. A model omits what it does not have.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from servod import axis_effects as fx
+from servod.yaml12 import Strict, load_model
+
+NonNegative = Annotated[float, Field(ge=0.0)]
+Positive = Annotated[float, Field(gt=0.0)]
+
+
+class AxisKind(StrEnum):
+    """What the axis moves in: rad and N*m, or m and N."""
+
+    ROTARY = "rotary"
+    LINEAR = "linear"
+
+
+class LugreFriction(Strict):
+    """LuGre: dz/dt = v - sigma0*|v|/g(v)*z, F = sigma0*z + sigma1*dz/dt + viscous*v, the paper's (18)."""
+
+    kind: Literal["lugre"]
+    sigma0: Positive = Field(description="bristle stiffness, N*m/rad")
+    sigma1: NonNegative = Field(0.0, description="bristle damping, N*m*s/rad")
+    viscous: NonNegative = Field(0.0, description="N*m*s/rad")
+    coulomb: Positive = Field(description="N*m")
+    static: Positive | None = Field(None, description="N*m; None = coulomb")
+    stribeck_velocity: Positive = Field(0.1, description="rad/s")
+
+
+class CoulombViscousFriction(Strict):
+    """F = coulomb*sign(v) + viscous*v; at rest any torque up to coulomb holds."""
+
+    kind: Literal["coulomb_viscous"]
+    viscous: NonNegative = Field(0.0, description="N*m*s/rad")
+    coulomb: NonNegative = Field(0.0, description="N*m")
+
+
+class StribeckFriction(Strict):
+    """F = g(v)*sign(v) + viscous*v, g(v) = coulomb + (static - coulomb)*exp(-(v/stribeck_velocity)^2); sticks."""
+
+    kind: Literal["stribeck"]
+    viscous: NonNegative = Field(0.0, description="N*m*s/rad")
+    coulomb: NonNegative = Field(description="N*m")
+    static: NonNegative = Field(description="N*m")
+    stribeck_velocity: Positive = Field(description="rad/s")
+
+
+class LocalFriction(Strict):
+    """The paper's local sets: steady friction at set velocities of both signs, linear between, a bristle around them.
+
+    g(v) = |torque(v)| - viscous*|v| in dz/dt of LuGre, so that the steady friction is the map (7); outside the map its
+    end values are held.
+    """
+
+    kind: Literal["local"]
+    sigma0: Positive = Field(description="bristle stiffness c0, N*m/rad")
+    sigma1: NonNegative = Field(0.0, description="bristle damping, N*m*s/rad")
+    viscous: NonNegative = Field(0.0, description="d0, the part of the map that is viscous, N*m*s/rad")
+    velocities: tuple[float, ...] = Field(min_length=2, max_length=512, description="rad/s, ascending, without 0")
+    torques: tuple[float, ...] = Field(min_length=2, max_length=512, description="N*m, with the velocity's sign")
+
+    @model_validator(mode="after")
+    def _is_a_map(self) -> LocalFriction:
+        if len(self.velocities) != len(self.torques):
+            raise ValueError("as many torques as velocities")
+        if any(a >= b for a, b in zip(self.velocities, self.velocities[1:], strict=False)):
+            raise ValueError("ascending velocities")
+        if not self.velocities[0] < 0.0 < self.velocities[-1] or 0.0 in self.velocities:
+            raise ValueError("velocities of both signs, without 0")
+        if any(v * t <= 0.0 for v, t in zip(self.velocities, self.torques, strict=True)):
+            raise ValueError("torques with the sign of their velocity")
+        return self
+
+
+Friction = Annotated[
+    LugreFriction | CoulombViscousFriction | StribeckFriction | LocalFriction, Field(discriminator="kind")
+]
+
+
+class AxisModel(Strict):
+    """One axis as physics: contract.md's keys, and one optional group of keys for each effect."""
+
+    axis: AxisKind = AxisKind.ROTARY
+    inertia: Positive = Field(description="all that moves: kg*m^2, kg when linear")
+    delay_s: float = Field(0.001, ge=0.0, le=0.25, description="command to torque")
+    friction: Friction
+    gravity: fx.Gravity | None = None
+    torque_offset: float = Field(0.0, description="N*m beside the command, with the command's sign")
+    asymmetry: fx.Asymmetry | None = None
+    stribeck: fx.Stribeck | None = None
+    presliding: fx.Presliding | None = None
+    viscous_nonlinear: fx.ViscousNonlinear | None = None
+    load_dependent_friction: fx.LoadDependentFriction | None = None
+    position_dependent_friction: fx.PositionDependentFriction | None = None
+    cogging: fx.Cogging | None = None
+    torque_ripple: fx.TorqueRipple | None = None
+    spring: fx.Spring | None = None
+    backlash: fx.Backlash | None = None
+    joint_elasticity: fx.JointElasticity | None = None
+    torque_gain: fx.TorqueGain | None = None
+    torque_saturation: fx.TorqueSaturation | None = None
+    delay: fx.Delay | None = None
+    actuator_lag: fx.ActuatorLag | None = None
+    thermal: fx.Thermal | None = None
+    position_dependent_inertia: fx.PositionDependentInertia | None = None
+    encoder_eccentricity: fx.EncoderEccentricity | None = None
+    disturbance: fx.Disturbance | None = None
+    residual: fx.Residual | None = None
+    noise: fx.Noise | None = None
+
+    @model_validator(mode="after")
+    def _shares_fit(self) -> AxisModel:
+        behind = self.two_mass
+        if self.backlash is not None and behind is None:
+            raise ValueError("backlash.load_inertia and backlash.stiffness, or a joint_elasticity beside backlash")
+        if behind is not None and behind.load_inertia >= self.inertia:
+            raise ValueError("load_inertia less than inertia, which holds both masses")
+        if behind is not None and behind.load_viscous > self.friction.viscous:
+            raise ValueError("load_viscous at most friction.viscous, which holds both parts")
+        return self
+
+    @model_validator(mode="after")
+    def _numbers_make_sense(self) -> AxisModel:
+        if self.total_delay_s < 0.0:
+            raise ValueError("delay_s + delay.additional_s at least 0")
+        for share in ("torque_ripple", "position_dependent_inertia"):
+            group: fx.Harmonics | None = getattr(self, share)
+            if group is not None and sum(abs(h.amplitude) for h in group.harmonics) >= 1.0:
+                raise ValueError(f"{share}: amplitudes that sum to less than 1")
+        return self
+
+    @property
+    def total_delay_s(self) -> float:
+        """Command to torque, `delay_s` and the effect `delay` together, in s."""
+        return self.delay_s + (self.delay.additional_s if self.delay else 0.0)
+
+    @property
+    def two_mass(self) -> fx.TwoMass | None:
+        """What is behind the joint's spring or gap; None for a rigid joint."""
+        if self.joint_elasticity is not None:
+            return self.joint_elasticity
+        gap = self.backlash
+        if gap is None or gap.load_inertia is None or gap.stiffness is None:
+            return None
+        return fx.TwoMass(
+            load_inertia=gap.load_inertia,
+            stiffness=gap.stiffness,
+            damping=gap.damping,
+            load_viscous=gap.load_viscous,
+        )
+
+    def pack(self) -> tuple[float, ...]:
+        """The model as the kernels' flat parameters (`servod.models.layout`)."""
+        from servod.axis_pack import pack
+
+        return pack(self)
+
+
+def wave_number(harmonic: fx.Harmonic) -> float:
+    """n of sin(n*x + phase), in 1/rad or 1/m."""
+    if harmonic.periods_per_turn is not None:
+        return harmonic.periods_per_turn
+    return 2.0 * math.pi * (harmonic.periods_per_metre or 0.0)
+
+
+def load_axis_model(path: str | Path) -> AxisModel:
+    """Read and check an axis model file. Raises BadInput (file, key, found, allowed)."""
+    return load_model(path, AxisModel)

@@ -1,0 +1,99 @@
+"""Compiles the kernels: the same plain functions that the loop calls, turned to machine code by numba when installed.
+
+Off the control path (simulator, identification, synthesis, diagnosis, virtual plant). The kernels carry no decorator:
+`compiled` copies a function, swaps every servod function that it calls for its compiled twin, and compiles the copy.
+Machine code is cached per user in a folder named by the kernels' source and the machine, so that a change anywhere in
+a kernel, or a new numba, compiles anew (numba by itself watches only the calling file).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import os
+import types
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+Kernel = Callable[..., Any]
+
+
+@cache
+def available() -> bool:
+    """Whether kernels can be compiled here (numba is installed and not switched off by SERVOD_PURE_PYTHON=1)."""
+    if os.environ.get("SERVOD_PURE_PYTHON") == "1":
+        return False
+    try:
+        import numba  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
+def compiled(function: Kernel, **swap: Kernel) -> Kernel:
+    """`function` as machine code, with the functions it calls; `swap` replaces names that it looks up.
+
+    Parameters and states must then be float64 arrays. Give functions that call a control law the law by `swap`.
+    """
+    return _compiled(function, tuple(sorted(swap.items(), key=lambda item: item[0])))
+
+
+@cache
+def _compiled(function: Kernel, swap: tuple[tuple[str, Kernel], ...]) -> Kernel:
+    import numba
+
+    called = {name: compiled(callee) for name, callee in {**_callees(function), **dict(swap)}.items()}
+    copy = types.FunctionType(
+        function.__code__, {**function.__globals__, **called}, function.__name__, function.__defaults__
+    )
+    folder = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = str(_cache_folder(function, swap))
+    try:
+        kernel: Kernel = numba.njit(cache=True, error_model="numpy")(copy)
+    finally:
+        numba.config.CACHE_DIR = folder
+    return kernel
+
+
+def _callees(function: Kernel) -> dict[str, Kernel]:
+    """The servod functions that `function` looks up by name."""
+    found = {}
+    for name in function.__code__.co_names:
+        value = function.__globals__.get(name)
+        if isinstance(value, types.FunctionType) and value.__module__.split(".")[0] == "servod":
+            found[name] = value
+    return found
+
+
+def _sources(function: Kernel) -> set[Path]:
+    """The files in which `function` and all that it calls stand."""
+    files = {Path(inspect.getfile(function))}
+    for callee in _callees(function).values():
+        files |= _sources(callee)
+    return files
+
+
+def _cache_folder(function: Kernel, swap: tuple[tuple[str, Kernel], ...]) -> Path:
+    digest = hashlib.sha256()
+    files = set(_sources(function))
+    for name, callee in swap:
+        files |= _sources(callee)
+        digest.update(f"{name}={callee.__module__}.{callee.__qualname__}".encode())
+    layout = Path(__file__).with_name("layout.py")
+    for path in sorted({*files, layout, Path(__file__)}):
+        digest.update(path.read_bytes())
+    return _user_cache() / f"{function.__name__}-{digest.hexdigest()[:16]}"
+
+
+def _user_cache() -> Path:
+    """A folder that this user may write: XDG cache, else one under the temporary folder."""
+    import tempfile
+
+    wanted = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "servod" / "kernels"
+    try:
+        wanted.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return Path(tempfile.gettempdir()) / f"servod-kernels-{os.getuid()}"
+    return wanted if os.access(wanted, os.W_OK) else Path(tempfile.gettempdir()) / f"servod-kernels-{os.getuid()}"
