@@ -84,6 +84,7 @@ class AmplifierSetup:
             "quick_stop_option": amplifier.quick_stop_option,
             "quirks": amplifier.quirks,
             "pdo_pairs": self._quirks.pdo_pairs,
+            "reset_communication_after": sorted(self._quirks.reset_communication_after),
         }
         if amplifier.rated_torque_mnm is not None:
             facts["rated_torque_nm"] = amplifier.rated_torque_mnm * 1e-3
