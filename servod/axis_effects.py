@@ -1,7 +1,7 @@
 """Groups of keys of the axis model file, one for each effect that a plain joint model leaves out.
 
-Stands between the axis model file and the physics kernels (`servod.models`), which obey every group. Torque means force
-and rad means m when `axis: linear`. Every group says its equation and where it comes from; `servoctl explain` prints it.
+Stands between the axis model file and the physics kernels (`servod.models`), which obey every group. Torque means
+force and rad means m when `axis: linear`. Every group says its equation and source; `servoctl explain` prints it.
 """
 
 from __future__ import annotations
@@ -194,7 +194,7 @@ class LimitShape(StrEnum):
 
 
 class TorqueSaturation(Strict):
-    """Torque = clip(torque, -negative_limit, limit), or limit*tanh(torque/limit): current limit, magnetic saturation."""
+    """Torque = clip(torque, -negative_limit, limit), or limit*tanh(torque/limit): current limit, iron saturation."""
 
     limit: Positive = Field(description="N*m")
     negative_limit: Positive | None = Field(None, description="N*m (a positive number); None = limit")
@@ -250,7 +250,7 @@ class PositionDependentInertia(Harmonics):
 
 
 class EncoderEccentricity(Harmonics):
-    """Encoder = x + sum amplitude*sin(n*x + phase), amplitudes in rad: the disc sits off its axis (n = 1) or is oval."""
+    """Encoder = x + sum amplitude*sin(n*x + phase), amplitudes in rad: the disc is off its axis (n = 1) or oval."""
 
 
 class DisturbanceWindow(Strict):

@@ -1,6 +1,6 @@
 """The axis model file: what simulator, identification, synthesis, diagnosis, daemon and the virtual plant share.
 
-Stands between the file (YAML, contract.md) and the physics kernels of `servod.models`, which work on `AxisModel.pack()`.
+Stands between the file (YAML, contract.md) and the physics kernels of `servod.models`, which take `AxisModel.pack()`.
 SI units in joint coordinates: rotary rad and N*m, linear m and N. A model omits what it does not have.
 """
 

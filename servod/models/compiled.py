@@ -40,26 +40,32 @@ def compiled(function: Kernel, **swap: Kernel) -> Kernel:
     return _compiled(function, tuple(sorted(swap.items(), key=lambda item: item[0])))
 
 
+def bound(function: Kernel, **swap: Kernel) -> Kernel:
+    """`function` in pure Python with names that it looks up replaced by `swap`; for machines without numba."""
+    return types.FunctionType(
+        function.__code__, {**function.__globals__, **swap}, function.__name__, function.__defaults__
+    )
+
+
 @cache
 def _compiled(function: Kernel, swap: tuple[tuple[str, Kernel], ...]) -> Kernel:
     import numba
+    from numba.core import config
 
     called = {name: compiled(callee) for name, callee in {**_callees(function), **dict(swap)}.items()}
-    copy = types.FunctionType(
-        function.__code__, {**function.__globals__, **called}, function.__name__, function.__defaults__
-    )
-    folder = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(_cache_folder(function, swap))
+    copy = bound(function, **called)
+    folder = config.CACHE_DIR
+    config.CACHE_DIR = str(_cache_folder(function, swap))
     try:
         kernel: Kernel = numba.njit(cache=True, error_model="numpy")(copy)
     finally:
-        numba.config.CACHE_DIR = folder
+        config.CACHE_DIR = folder
     return kernel
 
 
 def _callees(function: Kernel) -> dict[str, Kernel]:
     """The servod functions that `function` looks up by name."""
-    found = {}
+    found: dict[str, Kernel] = {}
     for name in function.__code__.co_names:
         value = function.__globals__.get(name)
         if isinstance(value, types.FunctionType) and value.__module__.split(".")[0] == "servod":

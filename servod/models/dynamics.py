@@ -1,7 +1,7 @@
 """The axis as a kernel: torque command in, position out, inner steps of at most 50 us.
 
 Used by the virtual plant (`plant`), the simulator and replay (`simulate`). `advance` is the one entry: the plain joint
-(one mass, bristle, gravity, offset, delay) runs in a tight loop; any other effect takes the general loop with `effects`.
+(one mass, bristle, gravity, offset, delay) runs in a tight loop; other effects take the general loop with `effects`.
 """
 
 from __future__ import annotations

@@ -144,7 +144,7 @@ def inertia_at(p: Params, x: float) -> tuple[float, float]:
 
 
 def joint_spring(p: Params, stretch: float, ahead: float) -> tuple[float, float, float]:
-    """Torque, slope and damping of the joint's spring; `ahead` is the stretch expected at mid-step (decides contact)."""
+    """Torque, slope and damping of the joint's spring; `ahead`: stretch expected at mid-step, decides contact."""
     half = 0.5 * p[lay.P_GAP]
     if abs(ahead) < half:
         return 0.0, 0.0, 0.0
