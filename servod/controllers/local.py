@@ -6,8 +6,9 @@
 
 All three gains are negative feedback. l > 0 makes z_hat push the way the feedback pushes (integral action through the
 friction state); the other sign is harmful. Every direction has its own nodes, so asymmetry needs nothing special.
-Options: the velocity of z_hat, of d0 and of both schedules is the measured one or the reference's, led by a stated
-time; an output disturbance observer around the whole (bandwidth 0: none).
+Options: the velocity of z_hat, of d0 and of the sets is the measured one or the reference's, led by a stated time;
+an output disturbance observer around the whole (bandwidth 0: none). The regions go by the faster of both velocities:
+a step has no reference velocity, yet the gains of Omega_L on a joint that turns fast make a limit cycle.
 At rest: within the hold width neither l nor the observer acts, and the leak floor lets z_hat fade: no hunting, no
 creep.
 """
@@ -71,7 +72,7 @@ def step(  # noqa: PLR0917  (the one signature that all laws share)
     """One cycle: (torque, of it feedback K*u*, friction compensation, other) in N*m."""
     w = v_ref + p[LEAD] * a_ref if p[SOURCE] == REFERENCE else v
     error = x_ref - x
-    u_star = scheduled(p, abs(w), error, v_ref - v, s[FRICTION_STATE])
+    u_star = scheduled(p, max(abs(w), abs(v)), error, v_ref - v, s[FRICTION_STATE])
     moves = not (v_ref == 0.0 and a_ref == 0.0 and abs(error) <= p[HOLD_WITHIN])
     decay, gain = blended(p, FIRST_NODE, int(p[N_SETS]), p[SHAPE], w)
     drive = w
