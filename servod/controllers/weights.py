@@ -1,8 +1,8 @@
 """Weighting functions mu_i of the local sets (Fig. 2): a partition of unity over the velocity, in several shapes.
 
 Stands under the `local` law. `blended` is what the law evaluates, `weights` the same functions one by one for
-pictures and proofs. Outside the outermost nodes the outer set holds alone; its decay grows with |v| there, so that
-the friction stays at the level of the outer node instead of growing without bound.
+pictures and proofs. Outside the outermost nodes the weights are those of the outer node and the decay grows with |v|,
+so that the friction stays at the level of the outer node instead of growing without bound.
 """
 
 from __future__ import annotations
@@ -69,17 +69,15 @@ def blended_bells(p: Sequence[float], first: int, n: int, v: float) -> tuple[flo
 
 def blended(p: Sequence[float], first: int, n: int, shape: float, v: float) -> tuple[float, float]:
     """Decay a(v) [1/s] and gain l(v) of (9) at velocity `v` [rad/s]: sum of mu_i*a_i and of mu_i*l_i."""
-    low_end, high_end = p[first], p[first + n - 1]
-    if v <= low_end:
-        return p[first + n] * v / low_end, p[first + 2 * n]
-    if v >= high_end:
-        return p[first + 2 * n - 1] * v / high_end, p[first + 3 * n - 1]
+    held = min(max(v, p[first]), p[first + n - 1])
+    beyond = v / held if v != held else 1.0
     if shape == GAUSSIAN:
-        return blended_bells(p, first, n, v)
-    k = first + lower_node(p, first, n, v)
-    share = upper_share(shape, (v - p[k]) / (p[k + 1] - p[k]))
+        decay, gain = blended_bells(p, first, n, held)
+        return decay * beyond, gain
+    k = first + lower_node(p, first, n, held)
+    share = upper_share(shape, (held - p[k]) / (p[k + 1] - p[k]))
     decay = p[k + n] + share * (p[k + n + 1] - p[k + n])
-    return decay, p[k + 2 * n] + share * (p[k + 2 * n + 1] - p[k + 2 * n])
+    return decay * beyond, p[k + 2 * n] + share * (p[k + 2 * n + 1] - p[k + 2 * n])
 
 
 def weights(shape: Shape, nodes_rad_s: Sequence[float], v: float) -> list[float]:
