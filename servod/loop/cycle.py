@@ -75,7 +75,7 @@ class Cycle:
         self._feedback_timeout_ns = config.cycle.feedback_timeout_us * NS_PER_US
         self.amplifier: Any = load_driver(plan.amplifier.driver).cyclic(plan.amplifier)
         self.encoder: Any = load_driver(plan.encoder.driver).cyclic(plan.encoder)
-        self.exchange = Exchange(bus, clock, self.amplifier, self.encoder, config.heartbeat.master_node_id)
+        self.exchange = Exchange(bus, clock, self.amplifier, self.encoder, plan)
         self.axis = Axis(
             self._period_s, config.limits.ramp_down_s, config.amplifier.enable_timeout_s, Mode.CYCLIC_SYNC_TORQUE
         )
