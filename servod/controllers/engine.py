@@ -84,7 +84,7 @@ class Controller:
         self._state[ASKED] = torque_now_nm
         self._offset_nm, self._hand_over_nm = 0.0, torque_now_nm
 
-    def step(  # noqa: PLR0917  (the signature that all laws share)
+    def step(
         self, x_ref: float, v_ref: float, a_ref: float, x: float, v: float, u_applied: float, dt: float
     ) -> ControllerOutput:
         """One cycle; SI units. `u_applied` is the torque of the last cycle after limits, `dt` the time since then.

@@ -58,7 +58,7 @@ def scheduled(p: Sequence[float], speed: float, error: float, error_rate: float,
     return low + (high - low) * (speed - p[BLEND_FROM]) / (p[BLEND_TO] - p[BLEND_FROM])
 
 
-def step(  # noqa: PLR0917  (the one signature that all laws share)
+def step(
     p: Sequence[float],
     s: MutableSequence[float],
     x_ref: float,

@@ -12,7 +12,7 @@ from servod.controllers.exact import limited
 from servod.controllers.state import ACTED, DISTURBANCE, LAST_VELOCITY, MODELLED, STARTED
 
 
-def observe(  # noqa: PLR0917  (a kernel: plain floats, no objects)
+def observe(
     s: MutableSequence[float],
     bandwidth_rad_s: float,
     inertia: float,

@@ -15,7 +15,7 @@ FEEDFORWARD_INERTIA = 2  # m_ff [kg*m^2], 0 switches the feed-forward off
 N_PARAMETERS = 3
 
 
-def step(  # noqa: PLR0917  (the one signature that all laws share)
+def step(
     p: Sequence[float],
     s: MutableSequence[float],
     x_ref: float,

@@ -24,7 +24,7 @@ HOLD_WITHIN = 7  # hold width [rad]
 N_PARAMETERS = 8
 
 
-def step(  # noqa: PLR0917  (the one signature that all laws share)
+def step(
     p: Sequence[float],
     s: MutableSequence[float],
     x_ref: float,

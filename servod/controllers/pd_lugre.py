@@ -33,7 +33,7 @@ STATE_LIMIT = 12  # bound of |z_hat| [rad]
 N_PARAMETERS = 13
 
 
-def step(  # noqa: PLR0917  (the one signature that all laws share)
+def step(
     p: Sequence[float],
     s: MutableSequence[float],
     x_ref: float,
