@@ -17,7 +17,7 @@ def open_bus(config: BusConfig, can_ids: tuple[int, ...] | None = None) -> Bus:
     if config.interface == "socketcan":
         from servod.bus.socketcan import SocketCanBus
 
-        return SocketCanBus(config.channel, can_ids)
+        return SocketCanBus.open(config.channel, can_ids)
     if config.interface == "virtual":
         from servod.drivers.virtual.client import VirtualBus
 

@@ -36,31 +36,41 @@ def pack_filters(can_ids: tuple[int, ...]) -> bytes:
     return b"".join(struct.pack("=II", can_id, mask) for can_id in can_ids[:_MAX_FILTERS])
 
 
-class SocketCanBus:
-    """servod.bus.Bus on an interface such as can0 or vcan0; `can_ids` limits reception in the kernel."""
-
-    def __init__(self, interface: str, can_ids: tuple[int, ...] | None = None) -> None:
-        self.counters = BusCounters()
-        try:
-            self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
-        except (OSError, AttributeError) as error:
-            raise Unreachable(f"bus {interface}: this system has no SocketCAN ({error})") from error
-        try:
-            self._configure(interface, can_ids)
-        except OSError as error:
-            self._socket.close()
-            raise Unreachable(f"bus {interface}: {error.strerror}; is the interface there and up?") from error
-
-    def _configure(self, interface: str, can_ids: tuple[int, ...] | None) -> None:
-        sock = self._socket
+def open_raw(interface: str, can_ids: tuple[int, ...] | None) -> socket.socket:
+    """A bound CAN_RAW socket with error frames, time stamps and filters; raises Unreachable in one line."""
+    try:
+        sock = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+    except OSError as error:
+        raise Unreachable(f"bus {interface}: this system has no SocketCAN ({error.strerror})") from error
+    try:
         sock.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, CAN_ERR_MASK)
         if can_ids is not None:
             sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, pack_filters(can_ids))
         sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
-        sock.setblocking(False)
         sock.bind((interface,))
+    except OSError as error:
+        sock.close()
+        raise Unreachable(f"bus {interface}: {error.strerror}; is the interface there and up?") from error
+    return sock
+
+
+class SocketCanBus:
+    """servod.bus.Bus on a bound socket that carries `struct can_frame`; it owns the socket.
+
+    `open` makes it on an interface such as can0 or vcan0.
+    """
+
+    def __init__(self, sock: socket.socket) -> None:
+        self.counters = BusCounters()
+        self._socket = sock
+        sock.setblocking(False)
         self._poll = select.poll()
         self._poll.register(sock, select.POLLIN)
+
+    @classmethod
+    def open(cls, interface: str, can_ids: tuple[int, ...] | None = None) -> SocketCanBus:
+        """Open an interface; `can_ids` limits reception in the kernel. Raises Unreachable."""
+        return cls(open_raw(interface, can_ids))
 
     def send(self, can_id: int, data: bytes) -> bool:
         """Queue one frame; False and counted when the queue is full, the interface down or the controller bus-off."""
