@@ -1,0 +1,204 @@
+"""A node's object dictionary: values, types, access and ranges from its EDS file, and the abort code of every refusal.
+
+Stands behind the SDO server (upload, download) and the PDO engine (entries). Numbers are plain Python integers, so that
+the cycle packs them without conversion; strings and domains are bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import canopen
+from canopen.objectdictionary import ODVariable, datatypes
+
+from servod.cia import Abort
+
+#: Bits of the integer types of CiA 301 that the EDS files use; a negative sign marks the signed ones.
+INTEGER_BITS = {
+    datatypes.BOOLEAN: 8,
+    datatypes.INTEGER8: -8,
+    datatypes.INTEGER16: -16,
+    datatypes.INTEGER32: -32,
+    datatypes.INTEGER64: -64,
+    datatypes.UNSIGNED8: 8,
+    datatypes.UNSIGNED16: 16,
+    datatypes.UNSIGNED32: 32,
+    datatypes.UNSIGNED64: 64,
+}
+_ABORT_INJECTION = 0x2005
+_MAX_STRING, _MAX_DOMAIN = 32, 4096
+
+
+class SdoRefusal(Exception):
+    """An access that is refused; `code` goes to the client as abort code."""
+
+    def __init__(self, code: Abort | int) -> None:
+        self.code = int(code)
+        super().__init__(f"SDO abort 0x{self.code:08X}")
+
+
+class Entry:
+    """One sub-object. `value` is what stands there; `read` refreshes it before an upload; `check` may refuse a new
+    value by raising SdoRefusal; `written` acts on it afterwards; `locked` refuses writing in the present state."""
+
+    __slots__ = (
+        "bits",
+        "check",
+        "default",
+        "high",
+        "index",
+        "locked",
+        "low",
+        "mappable",
+        "name",
+        "raw",
+        "read",
+        "readable",
+        "relative",
+        "signed",
+        "subindex",
+        "value",
+        "writable",
+        "written",
+    )
+
+    def __init__(self, variable: ODVariable) -> None:
+        bits = INTEGER_BITS.get(variable.data_type, 0)
+        self.index: int = variable.index
+        self.subindex: int = variable.subindex
+        self.name: str = variable.name
+        self.bits, self.signed = abs(bits), bits < 0
+        self.raw = b""  # strings and domains
+        if bits:
+            self.default = int(variable.default or 0)
+        else:
+            self.default = 0
+            self.raw = (variable.default or "").encode("latin-1")
+        self.relative: bool = variable.relative
+        self.value = self.default
+        self.readable, self.writable = variable.readable, variable.writable
+        self.mappable: bool = variable.pdo_mappable
+        span = 1 << max(self.bits, 1)
+        lowest = -span // 2 if self.signed else 0
+        self.low: int = lowest if variable.min is None else variable.min
+        self.high: int = lowest + span - 1 if variable.max is None else variable.max
+        self.read: Callable[[], None] | None = None
+        self.check: Callable[[int], None] | None = None
+        self.written: Callable[[int], None] | None = None
+        self.locked = False
+
+    def encode(self) -> bytes:
+        """The value as it travels, least significant byte first."""
+        if not self.bits:
+            return self.raw
+        return self.value.to_bytes(self.bits // 8, "little", signed=self.signed)
+
+    def in_range(self, value: int) -> bool:
+        """True when the EDS allows `value`."""
+        return self.low <= value <= self.high
+
+
+class Dictionary:
+    """All entries of one node. `write_lock` is set while the drive is enabled: locked entries then refuse."""
+
+    def __init__(self, eds: Path) -> None:
+        source = canopen.import_od(str(eds), 0)
+        self._entries = {(e.index, e.subindex): e for e in map(Entry, _variables(source))}
+        self._indices = {index for index, _ in self._entries}
+        self.write_lock = False
+        self.injected_abort = 0
+
+    def __iter__(self) -> Iterator[Entry]:
+        return iter(self._entries.values())
+
+    def entry(self, index: int, subindex: int = 0) -> Entry:
+        """The entry; raises SdoRefusal when object or sub-index do not exist."""
+        found = self._entries.get((index, subindex))
+        if found is None:
+            raise SdoRefusal(Abort.NO_SUCH_SUBINDEX if index in self._indices else Abort.NO_SUCH_OBJECT)
+        return found
+
+    def has(self, index: int, subindex: int = 0) -> bool:
+        """True when the entry exists."""
+        return (index, subindex) in self._entries
+
+    def value(self, index: int, subindex: int = 0) -> int:
+        """Present value of an integer entry."""
+        return self._entries[index, subindex].value
+
+    def lock_while_enabled(self, indices: tuple[int, ...]) -> None:
+        """Refuse writing these objects while `write_lock` is set."""
+        for entry in self:
+            entry.locked = entry.locked or entry.index in indices
+
+    def reset(self, first: int, last: int, node_id: int) -> None:
+        """Put the EDS defaults back into first..last; `$NODEID` entries follow `node_id`."""
+        for entry in self:
+            if first <= entry.index <= last and entry.bits:
+                entry.value = entry.default + (node_id if entry.relative else 0)
+
+    def upload(self, index: int, subindex: int) -> bytes:
+        """Read one entry for a client; raises SdoRefusal."""
+        entry = self.entry(index, subindex)
+        self._strike(index)
+        if not entry.readable:
+            raise SdoRefusal(Abort.READ_OF_WRITE_ONLY)
+        if entry.read is not None:
+            entry.read()
+        return entry.encode()
+
+    def download(self, index: int, subindex: int, data: bytes) -> None:
+        """Write one entry for a client, all checks made; raises SdoRefusal."""
+        entry = self.entry(index, subindex)
+        self._strike(index)
+        if not entry.writable:
+            raise SdoRefusal(Abort.WRITE_OF_READ_ONLY)
+        if self.write_lock and entry.locked:
+            raise SdoRefusal(Abort.PRESENT_STATE)
+        if entry.bits:
+            self._download_integer(entry, data)
+        else:
+            _download_bytes(entry, data)
+
+    def _download_integer(self, entry: Entry, data: bytes) -> None:
+        if 8 * len(data) != entry.bits:
+            raise SdoRefusal(Abort.LENGTH_MISMATCH)
+        value = int.from_bytes(data, "little", signed=entry.signed)
+        if value > entry.high:
+            raise SdoRefusal(Abort.VALUE_TOO_HIGH)
+        if value < entry.low:
+            raise SdoRefusal(Abort.VALUE_TOO_LOW)
+        if entry.check is not None:
+            entry.check(value)
+        entry.value = value
+        if entry.written is not None:
+            entry.written(value)
+        if entry.index == _ABORT_INJECTION:
+            self.injected_abort = value
+
+    def _strike(self, index: int) -> None:
+        """Answer this access with the injected abort code, once."""
+        if self.injected_abort and index != _ABORT_INJECTION:
+            code, self.injected_abort = self.injected_abort, 0
+            raise SdoRefusal(code)
+
+
+def _download_bytes(entry: Entry, data: bytes) -> None:
+    """Strings have a longest and a shortest length, domains a place of limited size."""
+    if entry.name == "User data":
+        if len(data) > _MAX_DOMAIN:
+            raise SdoRefusal(Abort.OUT_OF_MEMORY)
+    elif len(data) > _MAX_STRING:
+        raise SdoRefusal(Abort.TOO_LONG)
+    elif not data:
+        raise SdoRefusal(Abort.TOO_SHORT)
+    entry.raw = data
+
+
+def _variables(source: canopen.ObjectDictionary) -> Iterator[ODVariable]:
+    for item in source.values():
+        if isinstance(item, ODVariable):
+            yield item
+        else:
+            yield from item.values()

@@ -1,0 +1,80 @@
+"""The drive's own record: what the virtual drive did, in a mapped file that outlives any kill.
+
+Written by the amplifier node, read by tests and people who want to know how the axis stopped. The file is a ring of
+fixed-size samples behind one header; the kernel owns the pages, so `kill -9` of the virtual axis loses nothing.
+"""
+
+from __future__ import annotations
+
+import mmap
+import struct
+from pathlib import Path
+from typing import NamedTuple
+
+from servod.errors import BadInput
+from servod.hal import DriveState
+
+#: magic, size of a sample, capacity in samples, samples written since the start
+_HEADER = struct.Struct("<8sIIQ")
+_COUNT = struct.Struct("<Q")
+_COUNT_OFFSET = _HEADER.size - _COUNT.size
+_MAGIC = b"svdrive1"
+_SAMPLE = struct.Struct("<qHHHhdddd")
+#: Ten minutes at 1 kHz.
+CAPACITY = 600_000
+
+
+class DriveSample(NamedTuple):
+    """The drive at one moment; torque in N*m, position and velocity of the true joint."""
+
+    time_ns: int
+    state: DriveState
+    status_word: int
+    control_word: int
+    mode: int
+    torque_demand_nm: float
+    torque_nm: float
+    position_rad: float
+    velocity_rad_s: float
+
+
+class DriveRecord:
+    """Writer of the record at `path`, which is made anew. Raises BadInput when it cannot be written."""
+
+    def __init__(self, path: str | Path, capacity: int = CAPACITY) -> None:
+        size = _HEADER.size + capacity * _SAMPLE.size
+        try:
+            with Path(path).open("wb+") as file:
+                file.truncate(size)
+                self._map = mmap.mmap(file.fileno(), size)
+        except OSError as error:
+            raise BadInput(str(path), error.strerror or str(error), "a file that can be written") from None
+        self._capacity, self._count = capacity, 0
+        self._map[: _HEADER.size] = _HEADER.pack(_MAGIC, _SAMPLE.size, capacity, 0)
+
+    def write(self, sample: tuple[int, int, int, int, int, float, float, float, float]) -> None:
+        """Append one sample (fields of DriveSample): first the sample, then the count that makes it valid."""
+        offset = _HEADER.size + self._count % self._capacity * _SAMPLE.size
+        _SAMPLE.pack_into(self._map, offset, *sample)
+        self._count += 1
+        _COUNT.pack_into(self._map, _COUNT_OFFSET, self._count)
+
+    def close(self) -> None:
+        """Unmap; the file keeps everything."""
+        self._map.close()
+
+
+def read_drive_record(path: str | Path) -> list[DriveSample]:
+    """All samples that the ring still holds, oldest first; also while it is being written. Raises BadInput."""
+    try:
+        raw = Path(path).read_bytes()
+    except OSError as error:
+        raise BadInput(str(path), error.strerror or str(error), "a readable file") from None
+    if len(raw) < _HEADER.size or not raw.startswith(_MAGIC):
+        raise BadInput(str(path), "no drive record", "a file written by servod-virtual-axis --record")
+    _, size, capacity, count = _HEADER.unpack_from(raw)
+    if size != _SAMPLE.size or len(raw) != _HEADER.size + capacity * size:
+        raise BadInput(str(path), f"{len(raw)} bytes", "a complete drive record of this version")
+    numbers = range(max(0, count - capacity), count)
+    rows = (_SAMPLE.unpack_from(raw, _HEADER.size + n % capacity * size) for n in numbers)
+    return [DriveSample(time, DriveState(state), *rest) for time, state, *rest in rows]

@@ -1,0 +1,151 @@
+"""The virtual CAN bus: arbitration by identifier, bit time, queues, error counters, faults on demand.
+
+Every frame of the virtual world passes here. Frames wait in the queue of their port, as in a controller's mailbox in
+order of sending; when the bus is free, the lowest identifier among the queue heads wins, takes its bit time, and
+reaches all other ports at its end. Driven by the world: `step` completes at most one frame, so that timers keep order.
+"""
+
+from __future__ import annotations
+
+from servod.drivers.virtual.bit_time import ERROR_BITS, arbitration_key, frame_bits
+from servod.drivers.virtual.bus_faults import FaultKind, FrameFaults
+from servod.drivers.virtual.port import ErrorState, Port
+from servod.drivers.virtual.timeline import NEVER, Timeline
+from servod.units import NS_PER_S
+
+#: What a destroyed frame adds to the transmitter's and the receivers' error counters.
+TRANSMIT_ERROR_STEP, RECEIVE_ERROR_STEP = 8, 1
+
+
+class Hub:
+    """One bus at one bit rate [bit/s]."""
+
+    def __init__(self, timeline: Timeline, bit_rate: int = 1_000_000) -> None:
+        self._timeline = timeline
+        self._bit_ns = NS_PER_S // bit_rate
+        self._ports: list[Port] = []
+        self._sender: Port | None = None
+        self._frame: tuple[int, bytes, int] = (0, b"", 0)
+        self._end_ns = 0  # of the frame on the wire, or of the last one
+        self._waiting = 0
+        self._errors = False  # some counter is not zero
+        self.faults = FrameFaults()
+        self.frames = 0
+        self.busy_ns = 0
+
+    @property
+    def ports(self) -> tuple[Port, ...]:
+        """All participants, in the order of joining."""
+        return tuple(self._ports)
+
+    def attach(self, port: Port) -> Port:
+        """Let `port` take part."""
+        self._ports.append(port)
+        return port
+
+    def detach(self, port: Port) -> None:
+        """`port` leaves; its waiting frames vanish."""
+        self._ports.remove(port)
+        self._waiting -= len(port.queue)
+        port.queue.clear()
+        if self._sender is port:
+            self._sender = None
+
+    def submit(self, port: Port, can_id: int, data: bytes, time_ns: int) -> bool:
+        """Queue a frame of `port`; False when its queue is full or it is bus-off. A silenced port loses it unseen."""
+        if port.state is ErrorState.BUS_OFF or len(port.queue) >= port.depth:
+            port.dropped += 1
+            return False
+        if time_ns >= port.silent_until_ns:
+            port.queue.append((can_id, data, time_ns + port.delay_ns))
+            self._waiting += 1
+        return True
+
+    def next_ns(self) -> int:
+        """When the bus does something next: end of the frame on the wire, or start of the next; NEVER when idle."""
+        if self._sender is not None:
+            return self._end_ns
+        return self._next_start_ns() if self._waiting else NEVER
+
+    def step(self, limit_ns: int) -> bool:
+        """Start frames and complete the first that ends by `limit_ns`; False when none does."""
+        if self._sender is None and not (self._waiting and self._start(limit_ns)):
+            return False
+        if self._end_ns > limit_ns:
+            return False
+        self._complete()
+        return True
+
+    def force_bus_off(self, port: Port, time_ns: int) -> None:
+        """Drive `port` to bus-off, as a broken transceiver would."""
+        if port.count(256 * TRANSMIT_ERROR_STEP, 0, time_ns):
+            self._bus_off(port, time_ns)
+
+    def _next_start_ns(self) -> int:
+        first_ns = min((port.queue[0][2] for port in self._ports if port.queue), default=NEVER)
+        return max(first_ns, self._end_ns)
+
+    def _start(self, limit_ns: int) -> bool:
+        """Arbitrate at the next moment at which the bus is free and somebody waits."""
+        start_ns = self._next_start_ns()
+        if start_ns > limit_ns:
+            return False
+        winner, best = None, NEVER
+        for port in self._ports:
+            if port.queue and port.queue[0][2] <= start_ns:
+                key = arbitration_key(port.queue[0][0])
+                if key < best:
+                    winner, best = port, key
+        if winner is None:
+            return False
+        self._sender, self._frame = winner, winner.queue[0]
+        duration_ns = frame_bits(self._frame[0], len(self._frame[1])) * self._bit_ns
+        self.busy_ns += duration_ns
+        self._end_ns = start_ns + duration_ns
+        return True
+
+    def _complete(self) -> None:
+        """The frame on the wire ended: deliver it, unless a fault hits it."""
+        sender, (can_id, data, _), end_ns = self._sender, self._frame, self._end_ns
+        assert sender is not None
+        self._sender = None
+        fault = self.faults.strike(can_id) if self.faults.armed else FaultKind.NONE
+        if fault is FaultKind.CORRUPT:
+            self._destroyed(sender, end_ns)
+            return
+        sender.queue.popleft()
+        self._waiting -= 1
+        self.frames += 1
+        if self._errors:
+            self._forgive(sender, end_ns)
+        if fault is FaultKind.DROP:
+            return
+        for port in list(self._ports):
+            if port is not sender and port.silent_until_ns <= end_ns and port.state is not ErrorState.BUS_OFF:
+                port.receive(can_id, data, end_ns)
+
+    def _destroyed(self, sender: Port, time_ns: int) -> None:
+        """Error frame: count on both sides; the frame stays at the head of its queue and is sent again."""
+        self._errors = True
+        self._end_ns += ERROR_BITS * self._bit_ns
+        for port in self._ports:
+            if port is not sender:
+                port.count(0, RECEIVE_ERROR_STEP, time_ns)
+        if sender.count(TRANSMIT_ERROR_STEP, 0, time_ns):
+            self._bus_off(sender, time_ns)
+
+    def _forgive(self, sender: Port, time_ns: int) -> None:
+        """Every good frame takes one from the counters."""
+        for port in self._ports:
+            if port.state is not ErrorState.BUS_OFF:
+                port.count(-1 if port is sender else 0, 0 if port is sender else -1, time_ns)
+        self._errors = any(port.transmit_errors or port.receive_errors for port in self._ports)
+
+    def _bus_off(self, port: Port, time_ns: int) -> None:
+        self._errors = True
+        self._waiting -= len(port.queue)
+        port.queue.clear()
+        if self._sender is port:
+            self._sender = None
+        if port.restart_ns:
+            self._timeline.timer(port.restart).arm(time_ns + port.restart_ns)

@@ -1,0 +1,206 @@
+"""What torque the amplifier produces: modes of operation, halt, stops, and the way from demand to power stage.
+
+Between the power machine (which says whether to follow, stop or cut) and the joint. In cyclic synchronous torque the
+target acts at once; the other modes and every stop run on the servo tick.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from servod.cia import Obj402
+from servod.drivers.virtual.dictionary import Dictionary
+from servod.drivers.virtual.joint import Joint
+from servod.drivers.virtual.motor_sensor import MotorSensor
+from servod.drivers.virtual.power_state import Ramp
+from servod.drivers.virtual.servo import TICK_NS, TICK_S, Brake, Profile, VelocityLoop, position_to_velocity
+from servod.drivers.virtual.timeline import Timeline
+from servod.drivers.virtual.torque_limits import TorqueLimits
+from servod.hal import Mode
+from servod.units import PER_MILLE
+
+_POLARITY_TORQUE = 0x20
+_HALT, _NEW_SET_POINT, _RELATIVE = 0x100, 0x10, 0x40
+_DECELERATION = {Ramp.SLOW_DOWN: 0x6084, Ramp.QUICK_STOP: 0x6085}
+_MNM_PER_NM = 1000.0
+CYCLIC = (Mode.CYCLIC_SYNC_TORQUE, Mode.CYCLIC_SYNC_VELOCITY, Mode.CYCLIC_SYNC_POSITION)
+
+
+class Motion:
+    """Torque production. `stopped(time_ns)` is called once when a stop that was asked for is done."""
+
+    def __init__(
+        self,
+        dictionary: Dictionary,
+        joint: Joint,
+        sensor: MotorSensor,
+        timeline: Timeline,
+        stopped: Callable[[int], None],
+    ) -> None:
+        self._dictionary, self._joint, self._sensor, self._stopped = dictionary, joint, sensor, stopped
+        self.limits = TorqueLimits(dictionary)
+        self._loop = VelocityLoop(joint.inertia)
+        self._tick = timeline.timer(self._ticked)
+        entry = dictionary.entry
+        self._target_torque, self._torque_offset = entry(Obj402.TARGET_TORQUE), entry(Obj402.TORQUE_OFFSET)
+        self._target_position, self._target_velocity = entry(Obj402.TARGET_POSITION), entry(Obj402.TARGET_VELOCITY)
+        self._position_offset, self._velocity_offset = entry(0x60B0), entry(0x60B1)
+        self.mode = Mode.NONE
+        self.following = False  # the target values count
+        self.halted = False
+        self.demand = 0.0  # per mille, before the limits
+        self.produced = 0  # per mille
+        self.position_demand_rad = 0.0
+        self.velocity_demand_rad_s = 0.0
+        self._brake: Brake | None = None
+        self._profile = Profile(0.0)
+        self._latched_rad: float | None = None
+        self._feed_rad_s = 0.0
+        self._control_word = 0
+        self._produced_ns = 0
+        self.nm_per_permille = 0.0
+        self.scale()
+
+    def scale(self) -> None:
+        """Take over rated torque and polarity."""
+        sign = -1.0 if self._dictionary.value(Obj402.POLARITY) & _POLARITY_TORQUE else 1.0
+        self.nm_per_permille = sign * self._dictionary.value(Obj402.RATED_TORQUE) / _MNM_PER_NM / PER_MILLE
+
+    @property
+    def reached(self) -> bool:
+        """Status word bit 10: a halt has come to rest, or a profile has arrived."""
+        if self.halted:
+            return self._brake is not None and self._brake.done
+        return self.following and self.mode is Mode.PROFILE_POSITION and self._profile.reached
+
+    @property
+    def follows(self) -> bool:
+        """Status word bit 12: the drive follows the command value (in pp: set-point acknowledged)."""
+        if self.mode is Mode.PROFILE_POSITION:
+            return bool(self._control_word & _NEW_SET_POINT)
+        return self.following and self._brake is None and self.mode in CYCLIC
+
+    def energise(self, time_ns: int) -> None:
+        """Follow the target values of the present mode."""
+        self.following, self._brake = True, None
+        self._enter_mode(time_ns)
+        if self.halted:
+            self._begin_brake(Ramp(self._dictionary.value(Obj402.HALT_OPTION)), time_ns)
+
+    def cut(self, time_ns: int) -> None:
+        """No torque."""
+        self.following, self._brake = False, None
+        self._tick.cancel()
+        self._produce(0.0, time_ns)
+
+    def stop(self, ramp: Ramp, time_ns: int) -> None:
+        """Brake to rest and hold there."""
+        self.following = False
+        self._begin_brake(ramp, time_ns)
+
+    def set_mode(self, mode: Mode, time_ns: int) -> None:
+        """Change the mode; the inner loops take over at the torque now produced."""
+        self.mode = mode
+        if self.following and self._brake is None:
+            self._enter_mode(time_ns)
+
+    def control(self, word: int, time_ns: int) -> None:
+        """Mode-specific bits and halt of the control word."""
+        edges, self._control_word = word & ~self._control_word, word
+        if edges & _NEW_SET_POINT and self.mode is Mode.PROFILE_POSITION and self.following:
+            base = self._profile.target_rad if word & _RELATIVE else 0.0
+            self._profile.target_rad = base + self._target_position.value / self._sensor.user_per_rad
+        halted = bool(word & _HALT)
+        if halted is not self.halted:
+            self.halted = halted
+            if self.following:
+                self.energise(time_ns)
+
+    def targets(self, time_ns: int) -> None:
+        """New target values came (at SYNC, or written)."""
+        if not self.following or self._brake is not None:
+            return
+        if self.mode is Mode.CYCLIC_SYNC_TORQUE:
+            self._produce(self._target_torque.value + self._torque_offset.value, time_ns)
+        elif self.mode is Mode.CYCLIC_SYNC_POSITION:
+            self._latch_position()
+
+    def _latch_position(self) -> None:
+        """Target of csp, and the velocity that its change means."""
+        target = (self._target_position.value + self._position_offset.value) / self._sensor.user_per_rad
+        if self._latched_rad is not None:
+            value = self._dictionary.value
+            period_s = value(Obj402.INTERPOLATION_PERIOD, 1) * 10.0 ** value(Obj402.INTERPOLATION_PERIOD, 2)
+            self._feed_rad_s = (target - self._latched_rad) / period_s
+        self._latched_rad = target
+
+    def _enter_mode(self, time_ns: int) -> None:
+        self._loop.reset(self._joint.torque_nm)
+        self._profile = Profile(self._sensor.position_rad())
+        self._latched_rad, self._feed_rad_s = None, 0.0
+        if self.mode is Mode.CYCLIC_SYNC_TORQUE:
+            self._tick.cancel()
+        else:
+            self._tick.arm(time_ns + TICK_NS)
+        self.targets(time_ns)
+
+    def _begin_brake(self, ramp: Ramp, time_ns: int) -> None:
+        """Start the stop; with the current limit, the ramp is as steep as the torque allows."""
+        velocity = self._sensor.velocity_rad_s
+        deceleration = self._dictionary.value(_DECELERATION.get(ramp, 0x6085)) / abs(self._sensor.user_per_rad)
+        resolution = 2.0 / (self._sensor.counts_per_rad * TICK_S)
+        self._brake = Brake(ramp, velocity, deceleration, resolution)
+        self._loop.reset(self._joint.torque_nm)
+        self._tick.arm(time_ns + TICK_NS)
+
+    def _ticked(self, time_ns: int) -> None:
+        """One servo tick."""
+        self._tick.arm(time_ns + TICK_NS)
+        self._sensor.sample(time_ns)
+        limit_nm = self._dictionary.value(Obj402.MAX_TORQUE) * abs(self.nm_per_permille)
+        if self._brake is not None:
+            self._brake_tick(self._brake, limit_nm, time_ns)
+        elif self.following:
+            wanted = self._wanted_velocity()
+            self.velocity_demand_rad_s = wanted
+            torque = self._loop.torque_nm(wanted, self._sensor.velocity_rad_s, limit_nm)
+            self._produce(torque / self.nm_per_permille + self._torque_offset.value, time_ns)
+
+    def _brake_tick(self, brake: Brake, limit_nm: float, time_ns: int) -> None:
+        was_done, actual = brake.done, self._sensor.velocity_rad_s
+        wanted = brake.wanted_rad_s(actual)
+        if brake.ramp is Ramp.VOLTAGE_LIMIT:
+            torque = self._loop.brake_nm(actual)
+        else:
+            torque = self._loop.torque_nm(wanted, actual, limit_nm)
+        self._produce(torque / self.nm_per_permille, time_ns)
+        if brake.done and not was_done and not self.following:
+            self._stopped(time_ns)
+        elif brake.done and not was_done and not self.halted:
+            self.energise(time_ns)
+
+    def _wanted_velocity(self) -> float:
+        """Velocity that the present mode wants now [rad/s]; no mode wants rest."""
+        user_per_rad = self._sensor.user_per_rad
+        offset = self._velocity_offset.value / user_per_rad
+        if self.mode is Mode.CYCLIC_SYNC_VELOCITY:
+            return self._target_velocity.value / user_per_rad + offset
+        position = self._sensor.position_rad()
+        if self.mode is Mode.CYCLIC_SYNC_POSITION and self._latched_rad is not None:
+            self.position_demand_rad = self._latched_rad
+            return position_to_velocity(self._latched_rad - position) + self._feed_rad_s + offset
+        if self.mode is Mode.PROFILE_POSITION:
+            value = self._dictionary.value
+            scale = abs(user_per_rad)
+            self._profile.advance(value(0x6081) / scale, value(0x6083) / scale, value(0x6084) / scale)
+            self.position_demand_rad = self._profile.position_rad
+            return position_to_velocity(self._profile.position_rad - position) + self._profile.velocity_rad_s
+        return 0.0
+
+    def _produce(self, demand: float, time_ns: int) -> None:
+        """The last step of every mode: limits, then the power stage."""
+        self.limits.warm(self.produced, (time_ns - self._produced_ns) / 1e9 if self._produced_ns else 0.0)
+        self._produced_ns = time_ns
+        self.demand = demand
+        self.produced = self.limits.clamp(demand, self._sensor.speed_rpm, not self.following)
+        self._joint.command(self.produced * self.nm_per_permille, time_ns)

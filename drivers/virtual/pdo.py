@@ -1,0 +1,200 @@
+"""PDO engine of a node: takes RPDOs in, sends TPDOs, at SYNC, on event, by timer and on remote request.
+
+Stands between the bus and the dictionary, in every cycle. At SYNC the synchronous TPDOs are sampled and sent first,
+then the RPDOs that came since the last SYNC are applied, each as a whole: so an answer to a command is seen one SYNC
+later. Packing is one precompiled struct for each PDO.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from typing import Protocol
+
+from servod.cia import PDO_NO_RTR, PDO_NOT_VALID, Emcy
+from servod.drivers.virtual.dictionary import Dictionary, Entry
+from servod.drivers.virtual.emergency import Emergency
+from servod.drivers.virtual.pdo_rules import PdoRules
+from servod.drivers.virtual.timeline import Timeline
+
+_CODES = {8: "b", 16: "h", 32: "i", 64: "q"}
+_NS_PER_MS, _NS_PER_100US = 1_000_000, 100_000
+_LAST_SYNCHRONOUS = 240
+RTR_SYNCHRONOUS, RTR_ONLY = 252, 253
+
+
+class Application(Protocol):
+    """What the engine asks of the device behind it."""
+
+    def refresh(self, time_ns: int) -> None:
+        """Bring the dictionary's actual values up to `time_ns`."""
+
+    def commanded(self, time_ns: int) -> None:
+        """An RPDO was applied as a whole; judge it."""
+
+
+class Pdo:
+    """What both directions share: parameters and the packing of the mapping, rebuilt after each change."""
+
+    def __init__(self, dictionary: Dictionary, parameter: int, mapping: int) -> None:
+        self._dictionary, self._parameter = dictionary, parameter
+        self._rules = PdoRules(dictionary, parameter, mapping, self._rebuild)
+        self.valid = False
+        self.cob_id = 0
+        self.kind = 255  # transmission type
+        self.event_ms = 0
+        self.entries: list[Entry] = []
+        self.packing = struct.Struct("<")
+        self.on_change: Callable[[], None] = _nothing
+
+    def configure(self) -> None:
+        """Take over what stands in the dictionary."""
+        cob = self._dictionary.value(self._parameter, 1)
+        self.cob_id, self.valid = cob & 0x7FF, not cob & PDO_NOT_VALID
+        self.kind = self._dictionary.value(self._parameter, 2)
+        self.event_ms = self._dictionary.value(self._parameter, 5)
+        self.entries = self._rules.targets()
+        codes = (_CODES[e.bits] if e.signed else _CODES[e.bits].upper() for e in self.entries)
+        self.packing = struct.Struct("<" + "".join(codes))
+
+    def _rebuild(self) -> None:
+        self.configure()
+        self.on_change()
+
+
+class Rpdo(Pdo):
+    """One PDO that the node receives."""
+
+    def __init__(self, number: int, dictionary: Dictionary, emergency: Emergency, timeline: Timeline) -> None:
+        super().__init__(dictionary, 0x1400 + number, 0x1600 + number)
+        self._emergency = emergency
+        self._deadline = timeline.timer(self._missed)
+        self._waiting: tuple[int, ...] | None = None
+
+    def stop(self) -> None:
+        """Leave operational: forget what waits, stop supervision."""
+        self._waiting = None
+        self._deadline.cancel()
+
+    def take(self, data: bytes, time_ns: int) -> bool:
+        """A frame came; True when it shall be applied now, not at SYNC."""
+        size = self.packing.size
+        if len(data) != size:
+            self._emergency.set(Emcy.PDO_LENGTH if len(data) < size else Emcy.PDO_TOO_LONG, time_ns)
+            if len(data) < size:
+                return False
+        self._waiting = self.packing.unpack_from(data)
+        if self.event_ms:
+            self._deadline.arm(time_ns + self.event_ms * _NS_PER_MS)
+            self._emergency.clear(Emcy.RPDO_TIME_OUT, time_ns)
+        return self.kind > _LAST_SYNCHRONOUS
+
+    def apply(self) -> bool:
+        """Write the waiting values into the dictionary, all of them; values out of range leave theirs as it was."""
+        values = self._waiting
+        if values is None:
+            return False
+        self._waiting = None
+        for entry, value in zip(self.entries, values, strict=True):
+            if entry.low <= value <= entry.high:
+                entry.value = value
+        return True
+
+    def _missed(self, time_ns: int) -> None:
+        self._emergency.set(Emcy.RPDO_TIME_OUT, time_ns, self.cob_id.to_bytes(2, "little"))
+
+
+class Tpdo(Pdo):
+    """One PDO that the node sends through `send(can_id, data, time_ns)`."""
+
+    def __init__(
+        self, number: int, dictionary: Dictionary, timeline: Timeline, send: Callable[[int, bytes, int], object]
+    ) -> None:
+        super().__init__(dictionary, 0x1800 + number, 0x1A00 + number)
+        self._send = send
+        self._event = timeline.timer(self.trigger)
+        self._inhibit = timeline.timer(self._inhibit_over)
+        self._refresh: Callable[[int], None] = lambda time_ns: None
+        self._owed = False
+        self._syncs = 0
+        self._last = b""
+
+    def start(self, time_ns: int, refresh: Callable[[int], None]) -> None:
+        """Enter operational: event-driven PDOs tell their state once, synchronous ones count from here."""
+        self._refresh, self._syncs, self._last, self._owed = refresh, 0, b"", False
+        if self.valid and self.kind >= 254:
+            self.trigger(time_ns)
+
+    def stop(self) -> None:
+        """Leave operational."""
+        self._event.cancel()
+        self._inhibit.cancel()
+
+    def on_sync(self, counter: int | None, time_ns: int) -> None:
+        """Send when this SYNC is ours; the values are fresh. `counter`: of the SYNC frame, when it has one."""
+        kind = self.kind
+        if kind == 1:
+            self._send(self.cob_id, self.packing.pack(*[e.value for e in self.entries]), time_ns)
+        elif 1 < kind <= _LAST_SYNCHRONOUS:
+            self._every_nth(kind, counter, time_ns)
+        elif kind == 0 and self._owed:
+            self._transmit(time_ns)
+        elif kind == RTR_SYNCHRONOUS:
+            self._last = self._packed()
+
+    def changed(self, entries: tuple[Entry, ...], time_ns: int) -> None:
+        """Application event: some of `entries` changed."""
+        if not self.valid or (self.kind != 0 and self.kind < 254) or not any(e in self.entries for e in entries):
+            return
+        if self.kind == 0:
+            self._owed = True
+        else:
+            self.trigger(time_ns)
+
+    def remote(self, time_ns: int) -> None:
+        """A remote request came."""
+        if self._dictionary.value(self._parameter, 1) & PDO_NO_RTR:
+            return
+        if self.kind == RTR_SYNCHRONOUS:
+            self._send(self.cob_id, self._last or self._packed(), time_ns)
+        else:
+            self._refresh(time_ns)
+            self._transmit(time_ns)
+
+    def trigger(self, time_ns: int) -> None:
+        """Send now, or when the inhibit time is over."""
+        if self._inhibit.armed:
+            self._owed = True
+            return
+        self._refresh(time_ns)
+        self._transmit(time_ns)
+
+    def _every_nth(self, kind: int, counter: int | None, time_ns: int) -> None:
+        start = self._dictionary.value(self._parameter, 6)
+        if start and counter is not None and self._syncs == 0 and counter != start:
+            return
+        if self._syncs == 0 or self._syncs >= kind:
+            self._syncs = 0
+            self._transmit(time_ns)
+        self._syncs += 1
+
+    def _packed(self) -> bytes:
+        return self.packing.pack(*[e.value for e in self.entries])
+
+    def _transmit(self, time_ns: int) -> None:
+        self._owed = False
+        self._send(self.cob_id, self._packed(), time_ns)
+        if self.kind >= 254:
+            inhibit = self._dictionary.value(self._parameter, 3)
+            if inhibit:
+                self._inhibit.arm(time_ns + inhibit * _NS_PER_100US)
+            if self.event_ms:
+                self._event.arm(time_ns + self.event_ms * _NS_PER_MS)
+
+    def _inhibit_over(self, time_ns: int) -> None:
+        if self._owed:
+            self.trigger(time_ns)
+
+
+def _nothing() -> None:
+    """A PDO that nobody watches changed."""

@@ -1,0 +1,161 @@
+"""SDO server of a node: expedited and segmented transfers, and the way into block transfers (CiA 301, 7.2.4).
+
+Stands between the bus and the dictionary. One client at a time; a transfer that stalls is aborted with 05040000;
+a client's abort ends a transfer without an answer.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from servod.cia import Abort
+from servod.drivers.virtual.dictionary import Dictionary, SdoRefusal
+from servod.drivers.virtual.sdo_block import BlockDownload, BlockUpload
+from servod.drivers.virtual.timeline import Timeline
+from servod.units import NS_PER_S
+
+_HEAD = struct.Struct("<BHB4s")
+_ABORT = struct.Struct("<BHBI")
+#: A transfer that gets no next request for so long is aborted.
+STALL_NS = 1 * NS_PER_S
+
+
+@dataclass(slots=True)
+class _Segments:
+    """A segmented transfer under way; `data` is what is left to send, or what came."""
+
+    index: int
+    subindex: int
+    upload: bool
+    data: bytes
+    size: int | None = None
+    toggle: int = 0
+
+
+class SdoServer:
+    """Answers requests on 0x600+id through `send`, which puts 8 bytes on 0x580+id."""
+
+    def __init__(self, dictionary: Dictionary, send: Callable[[bytes], object], timeline: Timeline) -> None:
+        self._dictionary, self._send = dictionary, send
+        self._segments: _Segments | None = None
+        self._block: BlockDownload | BlockUpload | None = None
+        self._stall = timeline.timer(self._stalled)
+        self._object = (0, 0)
+
+    def reset(self) -> None:
+        """Forget a transfer under way."""
+        self._segments = self._block = None
+        self._stall.cancel()
+
+    def request(self, data: bytes, time_ns: int) -> None:
+        """One request frame of the client."""
+        if len(data) != 8:
+            return
+        try:
+            self._serve(data)
+        except SdoRefusal as refusal:
+            self._abort(refusal.code)
+        if self._segments is None and self._block is None:
+            self._stall.cancel()
+        else:
+            self._stall.arm(time_ns + STALL_NS)
+
+    def _serve(self, data: bytes) -> None:
+        if self._block is not None and self._serve_block(data):
+            return
+        command = data[0] >> 5
+        if command == 4:
+            self.reset()
+        elif command == 1:
+            self._initiate_download(data)
+        elif command == 2:
+            self._initiate_upload(data)
+        elif command == 0:
+            self._download_segment(data)
+        elif command == 3:
+            self._upload_segment(data)
+        elif command == 6 and not data[0] & 1:
+            self._name(data)
+            self._block = BlockDownload(self._dictionary, data, self._send)
+        elif command == 5 and not data[0] & 3:
+            self._name(data)
+            self._block = BlockUpload(self._dictionary, data, self._send)
+        else:
+            raise SdoRefusal(Abort.BAD_COMMAND)
+
+    def _serve_block(self, data: bytes) -> bool:
+        """Give the frame to the block transfer; False when it is an abort, which is served as usual."""
+        assert self._block is not None
+        if data[0] == 0x80 and self._block.abortable:
+            return False
+        if self._block.frame(data):
+            self._block = None
+        return True
+
+    def _name(self, data: bytes) -> tuple[int, int]:
+        """Remember which object this transfer is about; a new transfer ends the one before."""
+        self._segments = None
+        _, index, subindex, _ = _HEAD.unpack(data)
+        self._object = (index, subindex)
+        return self._object
+
+    def _initiate_download(self, data: bytes) -> None:
+        index, subindex = self._name(data)
+        if data[0] & 2:
+            length = 4 - (data[0] >> 2 & 3) if data[0] & 1 else 4
+            self._dictionary.download(index, subindex, data[4 : 4 + length])
+        else:
+            if not self._dictionary.entry(index, subindex).writable:
+                raise SdoRefusal(Abort.WRITE_OF_READ_ONLY)
+            size = int.from_bytes(data[4:8], "little") if data[0] & 1 else None
+            self._segments = _Segments(index, subindex, upload=False, data=b"", size=size)
+        self._send(_HEAD.pack(0x60, index, subindex, b""))
+
+    def _initiate_upload(self, data: bytes) -> None:
+        index, subindex = self._name(data)
+        value = self._dictionary.upload(index, subindex)
+        if 0 < len(value) <= 4:
+            self._send(_HEAD.pack(0x43 | (4 - len(value)) << 2, index, subindex, value))
+            return
+        self._segments = _Segments(index, subindex, upload=True, data=value)
+        self._send(_HEAD.pack(0x41, index, subindex, len(value).to_bytes(4, "little")))
+
+    def _expect(self, upload: bool, toggle: int) -> _Segments:
+        transfer = self._segments
+        if transfer is None or transfer.upload is not upload:
+            raise SdoRefusal(Abort.BAD_COMMAND)
+        if transfer.toggle != toggle:
+            raise SdoRefusal(Abort.TOGGLE_BIT)
+        return transfer
+
+    def _download_segment(self, data: bytes) -> None:
+        transfer = self._expect(False, data[0] & 0x10)
+        transfer.data += data[1 : 8 - (data[0] >> 1 & 7)]
+        last = data[0] & 1
+        if len(transfer.data) > 65536:
+            raise SdoRefusal(Abort.OUT_OF_MEMORY)
+        if last:
+            if transfer.size is not None and transfer.size != len(transfer.data):
+                raise SdoRefusal(Abort.LENGTH_MISMATCH)
+            self._dictionary.download(transfer.index, transfer.subindex, transfer.data)
+            self._segments = None
+        self._send(bytes((0x20 | transfer.toggle,)).ljust(8, b"\0"))
+        transfer.toggle ^= 0x10
+
+    def _upload_segment(self, data: bytes) -> None:
+        transfer = self._expect(True, data[0] & 0x10)
+        chunk, transfer.data = transfer.data[:7], transfer.data[7:]
+        head = transfer.toggle | (7 - len(chunk)) << 1 | (0 if transfer.data else 1)
+        self._send(bytes((head,)) + chunk.ljust(7, b"\0"))
+        transfer.toggle ^= 0x10
+        if not transfer.data:
+            self._segments = None
+
+    def _stalled(self, time_ns: int) -> None:
+        self._abort(Abort.TIME_OUT)
+
+    def _abort(self, code: int) -> None:
+        self._segments = self._block = None
+        self._send(_ABORT.pack(0x80, *self._object, code))

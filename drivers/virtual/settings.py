@@ -1,0 +1,43 @@
+"""Settings of a virtual axis: nodes, sensors, bus. What the joint itself is like stands in an axis model file.
+
+Read by the virtual world from its command line or a YAML file; the master never sees them.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from servod.config import NodeId
+from servod.yaml12 import Strict
+
+
+class VirtualAxisSettings(Strict):
+    """One virtual axis. The rated torque of 100 mN*m makes one per mille of 0x6071 a step of 0.1 mN*m, fine enough
+    against 45 mN*m of friction; 300 per cent of it is the drive's maximum."""
+
+    amplifier_node_id: NodeId = 1
+    encoder_node_id: NodeId = 2
+    amplifier_serial: int = Field(1, ge=0, le=0xFFFFFFFF)
+    encoder_serial: int = Field(2, ge=0, le=0xFFFFFFFF)
+    rated_torque_mnm: int = Field(100, ge=1, le=100_000_000)
+    max_torque_permille: int = Field(3000, ge=1, le=32767)
+    amplifier_counts_per_turn: int = Field(1_048_576, ge=4, le=2**32 - 1)
+    gear_ratio: float = Field(1.0, gt=0.0, description="turns of the motor for one turn of the joint")
+    encoder_counts_per_turn: int = Field(1_048_576, ge=4, le=2**32 - 1)
+    encoder_measuring_range_counts: int = Field(2**31, ge=4, le=2**32 - 1, description="0x6002; any number")
+    encoder_noise_counts: float = Field(0.0, ge=0.0, le=1e6, description="standard deviation of a reading")
+    start_position_rad: float = 0.0
+    cycle_period_s: float = Field(0.001, gt=0.0, le=0.1, description="part of the model's delay that SYNC costs")
+    bit_rate: Literal[10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000] = 1_000_000
+    queue_depth: int = Field(64, ge=1, le=10_000, description="transmit queue of each client, in frames")
+    client_restart_ms: int = Field(0, ge=0, le=60_000, description="a client's return from bus-off; 0: never")
+    node_restart_ms: int = Field(100, ge=0, le=60_000)
+    seed: int = Field(1, ge=0, le=2**63 - 1)
+
+    @model_validator(mode="after")
+    def _node_ids_differ(self) -> VirtualAxisSettings:
+        if self.amplifier_node_id == self.encoder_node_id:
+            raise ValueError("different ids for amplifier_node_id and encoder_node_id")
+        return self

@@ -1,0 +1,243 @@
+"""The virtual world: hub, nodes and joint on one time line; and the SYNC-stepped clock that drives it in one process.
+
+`World` is the same on wall and virtual time: somebody calls `advance`. `SteppedWorld` is that somebody in virtual
+time: a clock whose sleep lets the world run, and connections whose waiting lets it run.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+from servod.axis_model import AxisModel
+from servod.bus import BusCounters, Frame
+from servod.drivers.virtual.amplifier import AmplifierNode
+from servod.drivers.virtual.bus_faults import MYSELF, BusFault, FaultKind
+from servod.drivers.virtual.drive_record import DriveRecord
+from servod.drivers.virtual.encoder import EncoderNode
+from servod.drivers.virtual.hub import Hub
+from servod.drivers.virtual.joint import Joint
+from servod.drivers.virtual.node import Node, Send
+from servod.drivers.virtual.port import ErrorState, Port
+from servod.drivers.virtual.settings import VirtualAxisSettings
+from servod.drivers.virtual.timeline import Timeline
+from servod.units import NS_PER_S
+
+__all__ = ["SteppedBus", "SteppedClock", "SteppedWorld", "Truth", "VirtualAxisSettings", "World"]
+
+_NODE_QUEUE = 1024
+_MS_NS, _US_NS = 1_000_000, 1_000
+
+
+class Truth(NamedTuple):
+    """What the joint really does, and what nobody on the bus can see."""
+
+    time_ns: int
+    position_rad: float
+    velocity_rad_s: float
+    torque_nm: float
+
+
+class Devices:
+    """The amplifier, the encoder and the joint between them; `sender` gives each node its way to the bus."""
+
+    def __init__(
+        self, settings: VirtualAxisSettings, model: AxisModel, timeline: Timeline, record: DriveRecord | None = None
+    ) -> None:
+        self.settings, self.timeline = settings, timeline
+        self.joint = Joint(model, settings.seed, settings.cycle_period_s)
+        if settings.start_position_rad:
+            self.joint.plant.place(settings.start_position_rad)
+        self._record = record
+        self.nodes: tuple[Node, ...] = ()
+
+    def build(self, amplifier_send: Send, encoder_send: Send) -> tuple[AmplifierNode, EncoderNode]:
+        """Make both nodes; `power_on` starts them."""
+        amplifier = AmplifierNode(self.settings, self.joint, self.timeline, amplifier_send, self._record)
+        encoder = EncoderNode(self.settings, self.joint, self.timeline, encoder_send)
+        self.nodes = (amplifier, encoder)
+        return amplifier, encoder
+
+    def power_on(self, time_ns: int) -> None:
+        """Both nodes boot."""
+        self.joint.advance(time_ns)
+        for node in self.nodes:
+            node.power_on(time_ns)
+
+
+class World:
+    """Hub and devices; nothing happens unless `advance` is called."""
+
+    def __init__(self, settings: VirtualAxisSettings, model: AxisModel, record: DriveRecord | None = None) -> None:
+        self.settings = settings
+        self.timeline = Timeline()
+        self.hub = Hub(self.timeline, settings.bit_rate)
+        self.devices = Devices(settings, model, self.timeline, record)
+        self._node_ports = {name: self._node_port(name) for name in ("amplifier", "encoder")}
+        sends = [self.sender(port) for port in self._node_ports.values()]
+        self.amplifier, self.encoder = self.devices.build(*sends)
+        for port, node in zip(self._node_ports.values(), self.devices.nodes, strict=True):
+            port.receive, port.on_state = node.receive, node.bus_state
+
+    def sender(self, port: Port) -> Send:
+        """The way to the bus for whoever owns `port`."""
+        submit = self.hub.submit
+        return lambda can_id, data, time_ns: submit(port, can_id, data, time_ns)
+
+    def advance(self, now_ns: int, bus_ns: int | None = None) -> None:
+        """Let everything happen that is due by `now_ns`; frames may complete until `bus_ns`, where that is later."""
+        while self.advance_once(now_ns, now_ns if bus_ns is None else bus_ns):
+            pass
+
+    def advance_once(self, now_ns: int, bus_ns: int) -> bool:
+        """The next single event; False when none is due."""
+        timer_ns = self.timeline.next_ns()
+        if self.hub.step(timer_ns if timer_ns < bus_ns else bus_ns):
+            return True
+        if timer_ns <= now_ns:
+            self.timeline.fire_next()
+            return True
+        return False
+
+    def next_ns(self) -> int:
+        """When the next event is due."""
+        return min(self.timeline.next_ns(), self.hub.next_ns())
+
+    def apply_fault(self, fault: BusFault, client: Port, time_ns: int) -> None:
+        """Carry out a fault that a client asked for."""
+        if fault.kind in (FaultKind.DROP, FaultKind.CORRUPT):
+            self.hub.faults.arm(fault.kind, fault.can_id, fault.amount)
+            return
+        port = client if fault.participant == MYSELF else self._port_of(fault.participant)
+        if port is None:
+            return
+        if fault.kind is FaultKind.BUS_OFF:
+            self.hub.force_bus_off(port, time_ns)
+        elif fault.kind is FaultKind.SILENT:
+            port.silent_until_ns = time_ns + fault.amount * _MS_NS
+        elif fault.kind is FaultKind.DELAY:
+            port.delay_ns = fault.amount * _US_NS
+
+    def truth(self, time_ns: int) -> Truth:
+        """The joint's true state."""
+        joint = self.devices.joint
+        return Truth(time_ns, joint.plant.position_rad, joint.plant.velocity_rad_s, joint.torque_nm)
+
+    def _node_port(self, name: str) -> Port:
+        port = Port(name, _deaf, depth=_NODE_QUEUE, restart_ns=self.settings.node_restart_ms * _MS_NS)
+        return self.hub.attach(port)
+
+    def _port_of(self, node_id: int) -> Port | None:
+        for port, node in zip(self._node_ports.values(), self.devices.nodes, strict=True):
+            if node.node_id == node_id:
+                return port
+        return None
+
+
+class SteppedClock:
+    """servod.clock.Clock of the stepped world: sleeping is what makes time pass."""
+
+    def __init__(self, world: World, start_ns: int) -> None:
+        self._world, self._now_ns = world, start_ns
+
+    def now_ns(self) -> int:
+        """Present virtual time."""
+        return self._now_ns
+
+    def sleep_until(self, deadline_ns: int) -> None:
+        """Let the world run until `deadline_ns`."""
+        if deadline_ns > self._now_ns:
+            self._world.advance(deadline_ns)
+            self._now_ns = deadline_ns
+
+    def reach(self, time_ns: int) -> None:
+        """An event at `time_ns` has happened."""
+        self._now_ns = max(self._now_ns, time_ns)
+
+
+class SteppedBus:
+    """servod.bus.Bus inside the process; `receive` lets virtual time pass until a frame comes."""
+
+    def __init__(self, world: World, clock: SteppedClock) -> None:
+        self._world, self._clock = world, clock
+        self._frames: deque[Frame] = deque()
+        self.counters = BusCounters()
+        settings = world.settings
+        restart_ns = settings.client_restart_ms * _MS_NS
+        self.port = Port("client", self._deliver, depth=settings.queue_depth, restart_ns=restart_ns)
+        self.port.on_state = self._state_changed
+        world.hub.attach(self.port)
+
+    def send(self, can_id: int, data: bytes) -> bool:
+        """Queue one frame; False and counted when the queue is full or the bus off or down."""
+        counters = self.counters
+        if counters.down or not self._world.hub.submit(self.port, can_id, data, self._clock.now_ns()):
+            counters.queue_full += 0 if counters.down or counters.bus_off else 1
+            return False
+        counters.sent += 1
+        return True
+
+    def receive(self, timeout_s: float = 0.0) -> Frame | None:
+        """The next frame; virtual time passes up to `timeout_s` until one comes."""
+        frames, clock = self._frames, self._clock
+        if not frames:
+            until_ns = clock.now_ns() + int(timeout_s * NS_PER_S)
+            world = self._world
+            while not frames:
+                if not world.advance_once(until_ns, until_ns):
+                    clock.reach(until_ns)
+                    return None
+        frame = frames.popleft()
+        clock.reach(frame.time_ns)
+        self.counters.received += 1
+        return frame
+
+    def inject(self, fault: BusFault) -> None:
+        """Ask the hub for a fault."""
+        self._world.apply_fault(fault, self.port, self._clock.now_ns())
+
+    def fileno(self) -> int:
+        """No descriptor: this bus is in the process."""
+        return -1
+
+    def close(self) -> None:
+        """Leave the bus."""
+        if not self.counters.down:
+            self.counters.down = True
+            self._world.hub.detach(self.port)
+
+    def _deliver(self, can_id: int, data: bytes, time_ns: int) -> None:
+        self._frames.append(Frame(can_id, data, time_ns))
+
+    def _state_changed(self, state: ErrorState, time_ns: int) -> None:
+        self.counters.error_frames += 1
+        self.counters.bus_off = state is ErrorState.BUS_OFF
+        self.counters.error_passive = state is ErrorState.PASSIVE
+
+
+class SteppedWorld(World):
+    """The virtual axis in one process and virtual time: deterministic, as fast as it computes."""
+
+    def __init__(
+        self,
+        settings: VirtualAxisSettings,
+        plant_model: AxisModel,
+        record: DriveRecord | None = None,
+        start_ns: int = NS_PER_S,
+    ) -> None:
+        super().__init__(settings, plant_model, record)
+        self.clock = SteppedClock(self, start_ns)
+        self.devices.power_on(start_ns)
+
+    def connect(self) -> SteppedBus:
+        """A new connection to the bus."""
+        return SteppedBus(self, self.clock)
+
+    def truth(self, time_ns: int | None = None) -> Truth:
+        """The joint's true state at the present virtual time."""
+        self.devices.joint.advance(self.clock.now_ns())
+        return super().truth(self.clock.now_ns() if time_ns is None else time_ns)
+
+
+def _deaf(can_id: int, data: bytes, time_ns: int) -> None:
+    """Receiver of a port whose node is not built yet."""
