@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, StrictBool, model_validator
 
 from servod.yaml12 import Strict, load_model
 
@@ -128,7 +128,7 @@ class GainsConfig(Strict):
 
     directory: Path = Path("/var/lib/servod/gains")
     initial: Path
-    accept_uncertified: bool = Field(False, description="run gain sets without a valid certificate")
+    accept_uncertified: StrictBool = Field(False, description="run gain sets without a valid certificate")
 
 
 class ControlConfig(Strict):
@@ -143,7 +143,7 @@ class RecorderConfig(Strict):
 
     directory: Path = Path("/var/lib/servod/recordings")
     history_s: float = Field(10.0, ge=0.0, le=600.0, description="kept in memory, written at a fault")
-    always: bool = Field(False, description="record from start to stop")
+    always: StrictBool = Field(False, description="record from start to stop")
 
 
 class MetricsConfig(Strict):
@@ -186,4 +186,10 @@ def load_config(path: str | Path) -> AxisConfig:
     base = Path(path).resolve().parent
     gains = config.gains.model_copy(update={"initial": base / config.gains.initial})
     model = None if config.model is None else base / config.model
-    return config.model_copy(update={"gains": gains, "model": model})
+    amplifier = config.amplifier.model_copy(update={"eds": _beside(base, config.amplifier.eds)})
+    encoder = config.encoder.model_copy(update={"eds": _beside(base, config.encoder.eds)})
+    return config.model_copy(update={"gains": gains, "model": model, "amplifier": amplifier, "encoder": encoder})
+
+
+def _beside(base: Path, name: str | None) -> str | None:
+    return None if name is None else str(base / name)

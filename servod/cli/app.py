@@ -6,6 +6,7 @@ works on files alone. Exit codes are those of servod.errors: 0 done, 1 the answe
 
 from __future__ import annotations
 
+import shlex
 import sys
 
 import typer
@@ -37,7 +38,7 @@ def run(arguments: list[str]) -> int:
     except ServodError as error:
         return _complain(str(error), error.exit_code)
     except typer.TyperException as error:
-        return _complain(f"{error.format_message()} (see servoctl --help)", 2)
+        return _complain(f"{error.format_message()} Found: `{shlex.join(['servoctl', *arguments])}`; see --help.", 2)
     except (KeyboardInterrupt, typer.Abort):
         return _complain("interrupted", 130)
     except BrokenPipeError:

@@ -30,10 +30,14 @@ def bench(
     as_json: JsonOption = False,
 ) -> None:
     """Run the benchmark."""
+    from rich.console import Console
+
     from servod.benchmark import QUICK, THOROUGH, measure
     from servod.benchmark.table import print_table, write_json
 
-    document = measure(QUICK if quick else THOROUGH, quiet=as_json)
+    console = Console(stderr=True, quiet=as_json)
+    with console.status("servoctl bench") as line:
+        document = measure(QUICK if quick else THOROUGH, lambda text: line.update(f"measuring: {text}"))
     if out is not None:
         write_json(document, out)
     if as_json:

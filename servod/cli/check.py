@@ -74,14 +74,17 @@ def _check_axis(file: Path) -> str:
     from servod.axis_model import load_axis_model
     from servod.config import load_config
     from servod.drivers import driver_table
-    from servod.drivers.quirks import quirks_of
+    from servod.drivers.quirks import load_quirks
     from servod.gains import load_gains, require_certificate
 
     config = load_config(file)
     for section, driver in (("amplifier", config.amplifier.driver), ("encoder", config.encoder.driver)):
         if driver not in driver_table():
             raise BadInput(f"{file}: {section}.driver", driver, ", ".join(sorted(driver_table())))
-    quirks_of(config.amplifier.quirks, f"{file}: amplifier.quirks")
+    try:
+        load_quirks(config.amplifier.quirks)
+    except BadInput as error:
+        raise BadInput(f"{file}: {error.where}", error.found, error.allowed) from None
     for eds in (config.amplifier.eds, config.encoder.eds):
         if eds is not None:
             _check_eds(Path(eds))
@@ -114,9 +117,11 @@ def _check_map(file: Path) -> str:
 
 
 def _check_eds(file: Path) -> str:
-    from servod.master.dictionary import load_eds
+    from servod.master.eds import load_dictionary
 
-    return f"{len(load_eds(file))} objects"
+    dictionary = load_dictionary(file, node_id=1)
+    mended = f"; mended: {'; '.join(dictionary.report)}" if dictionary.report else ""
+    return f"{len(dictionary.objects)} objects{mended}"
 
 
 #: Kind of file -> keys that tell it, and what checks it.

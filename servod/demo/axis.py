@@ -27,7 +27,7 @@ def gains_file(controller: str) -> Path:
 
 def plant_file(plant: Path | None) -> Path:
     """The axis model that the virtual axis is to be: the one given, or the shipped demo joint."""
-    return plant if plant is not None else shipped("gains/demo_axis.yaml")
+    return plant if plant is not None else shipped("gains/axes/demo_joint.yaml")
 
 
 def demo_config(folder: Path, recordings: Path) -> AxisConfig:
@@ -36,7 +36,7 @@ def demo_config(folder: Path, recordings: Path) -> AxisConfig:
         {
             "name": "demo",
             "bus": {"interface": "virtual", "channel": str(folder / "bus")},
-            "cycle": {"cpu": _last_core(), "priority": 80},
+            "cycle": {"cpu": last_core(), "priority": 80},
             "limits": {
                 "torque_nm": 0.9,
                 "torque_rate_nm_per_s": 400.0,
@@ -59,7 +59,7 @@ def demo_config(folder: Path, recordings: Path) -> AxisConfig:
     )
 
 
-def _last_core() -> int | None:
+def last_core() -> int | None:
     """The core farthest from where the system puts its interrupts; None where there is only one."""
     cores = sorted(os.sched_getaffinity(0))
     return cores[-1] if len(cores) > 1 else None

@@ -11,7 +11,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 
@@ -31,9 +31,16 @@ _POLL_S = 0.1
 _HOME_S = 2.0
 
 
+class RunningAxis(NamedTuple):
+    """A client that may command, and the daemon's process id."""
+
+    client: ControlClient
+    daemon_pid: int
+
+
 @contextlib.contextmanager
-def running_axis(config: AxisConfig, plant: Path, folder: Path) -> Iterator[ControlClient]:
-    """Virtual axis and daemon for the time of a `with` block, and a client of the daemon. Raises Unreachable."""
+def running_axis(config: AxisConfig, plant: Path, folder: Path) -> Iterator[RunningAxis]:
+    """Virtual axis and daemon for the time of a `with` block. Raises Unreachable when one does not start."""
     file = folder / "axis.yaml"
     file.write_text(yaml.safe_dump(config.model_dump(mode="json")))
     bus, control = Path(config.bus.channel), config.control.socket
@@ -46,7 +53,7 @@ def running_axis(config: AxisConfig, plant: Path, folder: Path) -> Iterator[Cont
         log = folder / "servod.log"
         daemon = stack.enter_context(child("servod.daemon.main", ["--config", str(file)], log))
         wait_until(lambda: _answers(control), daemon, log, _START_S)
-        yield stack.enter_context(ControlClient(control))
+        yield RunningAxis(stack.enter_context(ControlClient(control)), daemon.pid)
 
 
 def _answers(control: Path) -> bool:
@@ -66,7 +73,7 @@ def run_wall(plant: Path, duration_s: float, recordings: Path, progress: Progres
     recordings.mkdir(parents=True, exist_ok=True)
     with sigterm_as_interrupt(), tempfile.TemporaryDirectory(prefix="servod-demo-") as name:
         folder = Path(name)
-        with running_axis(demo_config(folder, recordings), plant, folder) as client:
+        with running_axis(demo_config(folder, recordings), plant, folder) as (client, _):
             client.call("enable")
             home_rad = float(client.call("status")["motion"]["reference_rad"])
             runs = []
