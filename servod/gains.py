@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 
 from servod.controllers import LAWS, Law
 from servod.errors import BadInput
-from servod.gain_parameters import Numbers, Parameters
+from servod.gain_parameters import LocalSet, Numbers, Parameters
 from servod.yaml12 import Strict, parse_yaml, read_text, validate
 
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -24,6 +24,14 @@ Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 NAME_PATTERN = r"^[a-z0-9][a-z0-9_.-]{0,63}$"
 GainName = Annotated[str, Field(pattern=NAME_PATTERN)]
 SCHEMA_VERSION = 1
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes one local set in one line, as a table."""
+
+    def represent_mapping(self, tag: str, mapping: Any, flow_style: bool | None = None) -> yaml.MappingNode:
+        in_one_line = isinstance(mapping, dict) and set(mapping) == set(LocalSet.model_fields)
+        return super().represent_mapping(tag, mapping, in_one_line or flow_style)
 
 
 class Provenance(Strict):
@@ -106,7 +114,7 @@ class GainSet(Strict):
     def to_yaml(self) -> str:
         """The set as YAML text that `parse_gains` reads back to an equal set."""
         plain = self.model_dump(mode="json", exclude_none=True)
-        return yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, width=120)
+        return yaml.dump(plain, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)
 
 
 def _all_floats(value: Any) -> Any:
