@@ -23,6 +23,8 @@ from servod.errors import BadInput, ServodError, Unreachable
 from servod.units import NS_PER_S
 
 _MAX_CLIENTS = 32
+_BACKLOG = 128
+_ACCEPT_AT_ONCE = 16
 _READ_BYTES = 65_536
 _MAX_BACKLOG_BYTES = 4 * 1024 * 1024
 _WATCH_BACKLOG_BYTES = 64 * 1024
@@ -102,15 +104,16 @@ class ControlServer:
             self._holder = None
 
     def _accept(self, _events: int) -> None:
-        try:
-            connection, _ = self._listener.accept()
-        except OSError:
-            return  # the client went away again, or descriptors ran out: nothing to hold against the axis
-        if len(self._clients) >= _MAX_CLIENTS:
-            connection.close()
-            return
-        connection.setblocking(False)
-        self._clients.add(_Client(connection, self._selector, self))
+        for _ in range(_ACCEPT_AT_ONCE):
+            try:
+                connection, _address = self._listener.accept()
+            except OSError:
+                return  # nobody waits, or descriptors ran out: nothing to hold against the axis
+            if len(self._clients) >= _MAX_CLIENTS:
+                connection.close()
+                continue
+            connection.setblocking(False)
+            self._clients.add(_Client(connection, self._selector, self))
 
     def dispatch(self, client: _Client, line: bytes) -> None:
         """One request line: check it, check the right to ask it, and hand it on."""
@@ -263,7 +266,7 @@ def _listen(path: Path, group: int | None) -> socket.socket:
             os.umask(before)
         if group is not None and (os.geteuid() == 0 or group in os.getgroups()):
             os.chown(path, -1, group)
-        listener.listen(_MAX_CLIENTS)
+        listener.listen(_BACKLOG)
     except OSError as error:
         listener.close()
         raise Unreachable(f"{path}: cannot listen there ({error.strerror or error})") from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import subprocess
 import sys
 import time
@@ -99,7 +100,8 @@ class LoopHandle:
         """Ask for a shutdown, wait, and kill what does not end; returns the exit code."""
         assert self._process is not None
         if self.alive():
-            self.send(Op.SHUTDOWN)
+            with contextlib.suppress(Unreachable):  # a loop that takes no commands is killed below
+                self.send(Op.SHUTDOWN)
         deadline = time.monotonic() + timeout_s
         while self.alive() and time.monotonic() < deadline:
             self.feed()

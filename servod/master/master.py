@@ -104,6 +104,10 @@ class Master:
             raise BadInput("node id", node_id, " or ".join(str(known) for known in self._nodes))
         return self._nodes[node_id].sdo
 
+    def nmt_state(self, node_id: int) -> int | None:
+        """State that the node's last heartbeat showed (servod.cia.NmtState); None before the first."""
+        return self._nodes[node_id].watch.nmt_state
+
     def nmt(self, command: NmtCommand, node_id: int) -> None:
         """Send an NMT command; node 0 is all nodes. A deliberate reset or stop is not reported as an event."""
         for node in self._nodes.values():

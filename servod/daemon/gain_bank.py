@@ -1,0 +1,101 @@
+"""The gain sets of a running axis: which stands behind the serial number in the cycle record, and changes between sets.
+
+Around the loop. The store (servod.gain_store) keeps files; the bank knows what the loop runs now. A set becomes the
+store's active one only after the loop has taken it.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+from servod.commands import Op
+from servod.config import AxisConfig
+from servod.daemon.arguments import GainsActivateArgs, GainsLoadArgs
+from servod.daemon.flows import Flow, FutureWait, Wait
+from servod.daemon.status import ControllerStatus
+from servod.gain_store import GainStore, StoredSet
+from servod.gains import require_certificate
+
+log = logging.getLogger("servod.gains")
+
+#: Sends a command to the loop and gives what to wait for.
+SendOrder = Callable[[Op, Sequence[float]], Wait]
+
+
+class GainBank:
+    """The sets that ran since the daemon's start, by serial number."""
+
+    def __init__(self, config: AxisConfig) -> None:
+        """Open the store and choose the first set: the one active last, or gains.initial. Raises BadInput."""
+        self._accept_uncertified = config.gains.accept_uncertified
+        self._store = GainStore(config.gains.directory)
+        initial = self._store.load_file(config.gains.initial)
+        active = self._store.active()
+        if active is None:
+            active = self._store.activate(initial.name, initial.version)
+        require_certificate(active.gains, self._accept_uncertified)
+        log.info("gain set %s version %d (%s)", active.name, active.version, active.gains.law.name)
+        self._sets = {0: active}
+        self._last_serial = 0
+
+    @property
+    def newest(self) -> StoredSet:
+        """The set that was sent to the loop last; before that the one it starts with, as serial 0."""
+        return self._sets[self._last_serial]
+
+    def describe(self, serial: int) -> ControllerStatus:
+        """The part of the status document."""
+        stored = self._sets.get(serial)
+        return {
+            "serial": serial,
+            "name": stored.name if stored else "unknown",
+            "law": stored.gains.law.name if stored else "unknown",
+        }
+
+    def load(self, args: GainsLoadArgs, slow: ThreadPoolExecutor) -> Flow:
+        """Check and store a set."""
+        stored = yield FutureWait(slow.submit(self._store.load, args.text, args.name))
+        return _row(stored)
+
+    def list(self, serial: int, slow: ThreadPoolExecutor) -> Flow:
+        """All stored versions, and which one runs."""
+        running = self._sets.get(serial)
+        stored = yield FutureWait(slow.submit(self._store.stored))
+        now = (running.name, running.version) if running else None
+        return {"gains": [{**_row(s), "active": (s.name, s.version) == now} for s in stored]}
+
+    def activate(self, args: GainsActivateArgs, send: SendOrder, slow: ThreadPoolExecutor) -> Flow:
+        """Change the running controller to a stored set, without a bump."""
+        stored: StoredSet = yield FutureWait(slow.submit(self._store.get, args.name, args.version))
+        yield from self._deploy(stored, send)
+        yield FutureWait(slow.submit(self._store.activate, stored.name, stored.version))
+        return _row(stored)
+
+    def rollback(self, send: SendOrder, slow: ThreadPoolExecutor) -> Flow:
+        """Go back to the set that was active before."""
+        stored: StoredSet = yield FutureWait(slow.submit(self._store.previous))
+        yield from self._deploy(stored, send)
+        yield FutureWait(slow.submit(self._store.rollback))
+        return _row(stored)
+
+    def _deploy(self, stored: StoredSet, send: SendOrder) -> Flow:
+        """Send a set to the loop and wait until its records show that it runs."""
+        require_certificate(stored.gains, self._accept_uncertified)
+        serial, parameters = self._last_serial + 1, stored.gains.pack()
+        yield send(Op.ACTIVATE, (serial, stored.gains.law.number, len(parameters), *parameters))
+        self._last_serial, self._sets[serial] = serial, stored
+        log.info("gain set %s version %d (%s) runs", stored.name, stored.version, stored.gains.law.name)
+        return {}
+
+
+def _row(stored: StoredSet) -> dict[str, Any]:
+    return {
+        "name": stored.name,
+        "version": stored.version,
+        "law": stored.gains.law.name,
+        "certified": stored.gains.certificate_problem() is None,
+        "sha256": stored.sha256,
+    }

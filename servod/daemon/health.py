@@ -1,0 +1,89 @@
+"""How the loop keeps time over the last seconds: percentiles for `status`, and one line beside every fault.
+
+Around the loop, fed by the supervisor with the records it drained. A value per record goes into rings of fixed size;
+sorting happens only when somebody asks.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterable
+
+from servod.daemon.status import Percentiles, TimingStatus
+from servod.record import CycleRecord
+
+WINDOW_S = 10.0
+
+
+class _Ring:
+    """The newest values of one quantity, in ns."""
+
+    __slots__ = ("_at", "_values", "filled")
+
+    def __init__(self, capacity: int) -> None:
+        self._values = array("q", bytes(8 * capacity))
+        self._at = self.filled = 0
+
+    def add(self, values: Iterable[int]) -> None:
+        """Take new values, oldest first."""
+        store, at, capacity = self._values, self._at, len(self._values)
+        count = self.filled
+        for value in values:
+            store[at] = value
+            at = at + 1 if at + 1 < capacity else 0
+            count += 1
+        self._at, self.filled = at, min(count, capacity)
+
+    def percentiles(self) -> Percentiles:
+        """Median, 99th percentile and maximum; zeros while empty."""
+        ordered = sorted(self._values[: self.filled])
+        if not ordered:
+            return {"p50_us": 0.0, "p99_us": 0.0, "max_us": 0.0}
+        last = len(ordered) - 1
+        return {
+            "p50_us": ordered[last // 2] / 1000.0,
+            "p99_us": ordered[last * 99 // 100] / 1000.0,
+            "max_us": ordered[last] / 1000.0,
+        }
+
+
+class Health:
+    """Timing of the loop over the last WINDOW_S seconds, and the bus's counters."""
+
+    def __init__(self, period_us: int, bus_load: float) -> None:
+        capacity = max(1, round(WINDOW_S * 1e6 / period_us))
+        self._lag, self._tick, self._torque = _Ring(capacity), _Ring(capacity), _Ring(capacity)
+        self._period_s, self.bus_load = period_us * 1e-6, bus_load
+        self.latest: CycleRecord | None = None
+
+    def add(self, records: list[CycleRecord]) -> None:
+        """Take drained records, oldest first."""
+        if records:
+            self._lag.add(r.lag_ns for r in records)
+            self._tick.add(r.tick_ns for r in records)
+            self._torque.add(r.torque_sent_ns for r in records)
+            self.latest = records[-1]
+
+    def timing(self, records_lost: int) -> TimingStatus:
+        """The part of the status document."""
+        return {
+            "window_s": self._lag.filled * self._period_s,
+            "cycle": self.latest.cycle if self.latest else 0,
+            "missed": self.latest.missed if self.latest else 0,
+            "records_lost": records_lost,
+            "lag": self._lag.percentiles(),
+            "tick": self._tick.percentiles(),
+            "torque": self._torque.percentiles(),
+        }
+
+    def line(self) -> str:
+        """Latency, jitter and bus health in one line, for the log."""
+        if self.latest is None:
+            return "no cycle yet"
+        lag, tick, now = self._lag.percentiles(), self._tick.percentiles(), self.latest
+        return (
+            f"lag p50 {lag['p50_us']:.0f} p99 {lag['p99_us']:.0f} max {lag['max_us']:.0f} us, "
+            f"tick p99 {tick['p99_us']:.0f} us, missed {now.missed}, feedback age {now.amplifier_age}/"
+            f"{now.encoder_age} cycles, queue full {now.bus_queue_full}, error frames {now.bus_error_frames}, "
+            f"bus load {self.bus_load:.0%}"
+        )

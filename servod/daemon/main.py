@@ -1,0 +1,69 @@
+"""The program `servod --config axis.yaml`: arguments, signals, exit codes. Started by systemd, or by hand to try it."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+from pathlib import Path
+from typing import NoReturn
+
+from servod import __version__
+from servod.daemon.journal import print_error, set_up_logging
+from servod.daemon.startup import check, run
+from servod.daemon.supervisor import Supervisor
+from servod.errors import BadInput, ServodError
+
+_EXAMPLE = """\
+example:
+  servod --config /etc/servod/can0.yaml          run the axis until SIGTERM
+  servod --config /etc/servod/can0.yaml --check  only check the configuration and the files it names
+
+exit codes: 0 done, 2 bad usage or input, 3 bus, device or loop cannot be reached or was lost
+"""
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong with the arguments in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        raise BadInput("servod: arguments", message, "see `servod --help`")
+
+
+def _parse(arguments: list[str] | None) -> argparse.Namespace:
+    parser = _Parser(
+        prog="servod",
+        description="Runs one servo axis over CANopen: 1 kHz friction-compensating control, supervised and recorded.",
+        epilog=_EXAMPLE,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="axis configuration (YAML)")
+    parser.add_argument("--check", action="store_true", help="check the configuration and end")
+    parser.add_argument("--version", action="version", version=f"servod {__version__}")
+    return parser.parse_args(arguments)
+
+
+def _stop_on_signals(supervisor: Supervisor) -> None:
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: supervisor.request_stop())
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the daemon; returns the exit code, with one line on standard error when it is not 0."""
+    set_up_logging()
+    try:
+        options = _parse(arguments)
+        if options.check:
+            config = check(options.config)
+            print(f"{options.config}: good; axis {config.name} on {config.bus.interface} {config.bus.channel}")
+            return 0
+        return run(options.config, _stop_on_signals)
+    except ServodError as error:
+        print_error(str(error))
+        return error.exit_code
+    except KeyboardInterrupt:
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,94 @@
+"""From a configuration file to a supervised axis, step by step, and back again in reverse whatever happens.
+
+Around the loop; runs once. The order is: read and check every file, take the locks, reach the bus, bring the nodes up,
+start the loop, open the sockets. What fails says so in one line, and nothing that was begun is left behind.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+from servod.axis_model import load_axis_model
+from servod.bus.open import open_bus
+from servod.cia import EMCY_BASE, HEARTBEAT_BASE, SDO_ANSWER_BASE
+from servod.clock import WallClock
+from servod.config import AxisConfig, load_config
+from servod.daemon.gain_bank import GainBank
+from servod.daemon.lock import InstanceLock
+from servod.daemon.supervisor import Supervisor
+from servod.gains import load_gains, require_certificate
+from servod.loop.handle import LoopHandle
+from servod.loop.plan import LoopPlan
+from servod.master import BringUp, Master
+from servod.notify import Notifier
+from servod.recorder import Recorder
+from servod.yaml12 import read_text
+
+log = logging.getLogger("servod")
+
+
+def check(path: Path) -> AxisConfig:
+    """Read and check the configuration and every file that it names. Raises BadInput."""
+    config = load_config(path)
+    require_certificate(load_gains(config.gains.initial), config.gains.accept_uncertified)
+    if config.model is not None:
+        load_axis_model(config.model)
+    return config
+
+
+def run(path: Path, on_ready: Callable[[Supervisor], None]) -> int:
+    """Run the axis that `path` configures until it ends; returns the exit code.
+
+    Raises ServodError when it cannot begin. `on_ready` is told the supervisor before it begins, for signals.
+    """
+    config = check(path)
+    with ExitStack() as stack:
+        stack.callback(InstanceLock(config).release)
+        bank = GainBank(config)
+        recorder = _recorder(config, path, bank)
+        stack.callback(recorder.close)
+        master = Master(config, open_bus(config.bus, _master_ids(config)), WallClock(), threaded=False)
+        stack.callback(master.close)
+        plans = master.bring_up()
+        for line in plans.report:
+            log.info("%s", line)
+        loop = _start_loop(config, plans, bank)
+        stack.callback(lambda: loop.alive() and loop.stop())
+        supervisor = Supervisor(config, master, plans, loop, bank, recorder, Notifier())
+        on_ready(supervisor)
+        return supervisor.run()
+
+
+def _recorder(config: AxisConfig, path: Path, bank: GainBank) -> Recorder:
+    recorder = Recorder(config.recorder, config.name, config.cycle.period_us)
+    recorder.set_attachment("config.yaml", read_text(path).encode())
+    recorder.set_attachment("gains.yaml", bank.newest.path.read_bytes())
+    if config.model is not None:
+        recorder.set_attachment("model.yaml", read_text(config.model).encode())
+    if config.recorder.always:
+        recorder.start()
+    return recorder
+
+
+def _start_loop(config: AxisConfig, plans: BringUp, bank: GainBank) -> LoopHandle:
+    gains = bank.newest.gains
+    loop = LoopHandle(LoopPlan(config, plans.amplifier, plans.encoder, int(gains.law.number), gains.pack()))
+    loop.start()
+    for grant in loop.grants:
+        log.log(
+            logging.INFO if grant.granted else logging.WARNING,
+            "real time: %s %s: %s",
+            grant.name,
+            "granted" if grant.granted else "refused",
+            grant.reason,
+        )
+    return loop
+
+
+def _master_ids(config: AxisConfig) -> tuple[int, ...]:
+    """What the master listens to; the cyclic frames are the loop's, and the kernel keeps them away where it can."""
+    bases = (EMCY_BASE, SDO_ANSWER_BASE, HEARTBEAT_BASE)
+    return tuple(base + node.node_id for node in (config.amplifier, config.encoder) for base in bases)

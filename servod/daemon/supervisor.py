@@ -1,0 +1,240 @@
+"""The supervisor's event loop: what the loop process wrote comes in, what people want goes out, nothing ever waits.
+
+Around the loop. One round every TICK_S: records to recorder, metrics, health and faults; node events to the loop;
+requests a step further; watchdog and status line to systemd, fed only while the loop's cycle counter advances.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import selectors
+import time
+from typing import Any
+
+from servod import __version__
+from servod.axis import AxisState
+from servod.cia import CW_DISABLE_VOLTAGE, NmtCommand, NmtState, Obj402
+from servod.commands import Op
+from servod.config import AxisConfig
+from servod.daemon.control_server import ControlServer
+from servod.daemon.fault_watch import FaultWatch
+from servod.daemon.gain_bank import GainBank
+from servod.daemon.health import Health
+from servod.daemon.status import NodeStatus, Status, axis_status, drive_status, fault_status, motion_status
+from servod.daemon.verbs import Verbs
+from servod.errors import FaultCode, ServodError, Unreachable
+from servod.loop.handle import LoopHandle
+from servod.master import BringUp, Master
+from servod.metrics import AxisMetrics, MetricsServer
+from servod.notify import Notifier
+from servod.record import RECORD, CycleRecord
+from servod.recorder import Recorder
+from servod.units import NS_PER_S
+
+log = logging.getLogger("servod")
+
+TICK_S = 0.02
+#: A loop that writes no record for this many rounds hangs and counts as lost.
+_HUNG_ROUNDS = 50
+_STATUS_NS = NS_PER_S
+_TEXTFILE_NS = 5 * NS_PER_S
+
+
+class Supervisor:
+    """One running axis; `run` returns the exit code."""
+
+    def __init__(
+        self,
+        config: AxisConfig,
+        master: Master,
+        plans: BringUp,
+        loop: LoopHandle,
+        bank: GainBank,
+        recorder: Recorder,
+        notifier: Notifier,
+    ) -> None:
+        """The nodes are up and the loop runs. Raises Unreachable or BadInput when a socket cannot be opened."""
+        self._config, self._master, self._plans, self._loop = config, master, plans, loop
+        self._bank, self._recorder, self._notifier = bank, recorder, notifier
+        self._started = time.monotonic()
+        self._stopping = False
+        self._silent_rounds = 0
+        self._fed_cycle = -1
+        self._next_feed_ns = self._next_status_ns = self._next_textfile_ns = 0
+        self._health = Health(config.cycle.period_us, plans.bus_load)
+        self._metrics = AxisMetrics(config.name, plans.bus_load)
+        self._faults = FaultWatch(recorder, self._health, self._metrics)
+        self._verbs = Verbs(config, loop, bank, recorder, self._document)
+        self._selector = selectors.DefaultSelector()
+        self._server = ControlServer(config.control, self._selector, self._verbs)
+        self._metrics_server = MetricsServer(config.metrics, self._metrics)
+
+    def request_stop(self) -> None:
+        """Ask for an orderly end; for signal handlers."""
+        self._stopping = True
+
+    def run(self) -> int:
+        """Supervise until asked to stop (0) or until the loop is lost (3)."""
+        self._notifier.ready(f"{self._config.name}: the loop runs, the axis is disabled")
+        try:
+            while not self._stopping:
+                for key, events in self._selector.select(TICK_S):
+                    key.data(events)
+                self._round(time.monotonic_ns())
+                if self._loop_is_lost():
+                    return self._lose_loop()
+            return self._stop()
+        finally:
+            self._close()
+
+    def _round(self, now_ns: int) -> None:
+        """Everything that is done once per round."""
+        self._loop.feed()
+        records = self._take_records(now_ns)
+        self._silent_rounds = 0 if records else self._silent_rounds + 1
+        self._take_node_events()
+        self._verbs.tick(records, now_ns)
+        self._faults.tick(now_ns)
+        self._server.tick(now_ns)
+        self._tell_manager(now_ns)
+        self._write_textfile(now_ns)
+
+    def _take_records(self, now_ns: int) -> list[CycleRecord]:
+        rows = self._loop.drain()
+        records = [CycleRecord._make(values) for values in RECORD.iter_unpack(b"".join(rows))]
+        self._recorder.add_rows(rows)
+        self._health.add(records)
+        self._metrics.count(records)
+        self._metrics.records_lost = self._loop.lost
+        self._faults.see(records, now_ns)
+        if failure := self._recorder.take_failure():
+            self._faults.raise_own(FaultCode.RECORDER_FAILED, failure)
+        return records
+
+    def _take_node_events(self) -> None:
+        """Node events become faults of the loop, which reacts in its next cycle."""
+        self._master.poll()
+        for event in self._master.events():
+            log.error("%s (%s)", event.text, event.fault.name)
+            self._recorder.add_event("node", event.text, node_id=event.node_id, fault=event.fault.name)
+            with contextlib.suppress(Unreachable):  # a loop that takes no commands is found silent below
+                self._loop.send(Op.NODE_EVENT, (float(event.fault),))
+
+    def _tell_manager(self, now_ns: int) -> None:
+        """Feed the watchdog only when the loop has gone on since the last time."""
+        latest = self._loop.latest
+        if self._notifier.watchdog_ns and now_ns >= self._next_feed_ns and latest and latest.cycle != self._fed_cycle:
+            self._fed_cycle = latest.cycle
+            self._next_feed_ns = now_ns + self._notifier.watchdog_ns // 4
+            self._notifier.alive()
+        if now_ns >= self._next_status_ns and latest:
+            self._next_status_ns = now_ns + _STATUS_NS
+            self._notifier.status(f"{AxisState(latest.axis_state).name}; {self._health.line()}")
+
+    def _write_textfile(self, now_ns: int) -> None:
+        if self._config.metrics.textfile is not None and now_ns >= self._next_textfile_ns:
+            self._next_textfile_ns = now_ns + _TEXTFILE_NS
+            self._verbs.slow.submit(self._metrics_server.write_textfile)
+
+    def _loop_is_lost(self) -> bool:
+        return not self._loop.alive() or self._silent_rounds > _HUNG_ROUNDS
+
+    def _lose_loop(self) -> int:
+        """The loop died or hangs: the drive off before anything else, then tell, then end for systemd to restart."""
+        hung = self._loop.alive()
+        self._switch_off()
+        exit_code = self._loop.stop(0.0)
+        self._take_records(time.monotonic_ns())
+        words = " / ".join(self._loop.last_words().strip().splitlines()[-3:])
+        detail = "it hung" if hung else f"exit code {exit_code}"
+        self._faults.raise_own(FaultCode.LOOP_LOST, f"{detail}{': ' + words if words else ''}")
+        self._faults.write_file(FaultCode.LOOP_LOST.name)
+        return Unreachable.exit_code
+
+    def _switch_off(self) -> None:
+        """Voltage off by SDO, then NMT pre-operational; each is tried whatever became of the other."""
+        amplifier = self._plans.amplifier.node_id
+        try:
+            self._master.sdo(amplifier).write(Obj402.CONTROL_WORD, 0, CW_DISABLE_VOLTAGE)
+        except (ServodError, OSError) as error:
+            log.error("the amplifier did not take disable voltage: %s", error)
+        self._all_pre_operational()
+
+    def _all_pre_operational(self) -> None:
+        for plan in (self._plans.amplifier, self._plans.encoder):
+            try:
+                self._master.nmt(NmtCommand.PRE_OPERATIONAL, plan.node_id)
+            except (ServodError, OSError) as error:
+                log.error("node %d: NMT pre-operational failed: %s", plan.node_id, error)
+
+    def _stop(self) -> int:
+        """Orderly end: the loop ramps down and disables, the nodes go pre-operational."""
+        log.info("stopping: ramping down and disabling")
+        self._notifier.stopping()
+        exit_code = self._loop.stop(self._config.limits.ramp_down_s + 2.0)
+        self._take_records(time.monotonic_ns())
+        if exit_code != 0:
+            self._switch_off()
+            log.error("the loop did not end in order (exit code %d)", exit_code)
+            return Unreachable.exit_code
+        try:
+            self._master.stand_down()
+        except (ServodError, OSError) as error:
+            log.warning("nodes did not stand down in order: %s", error)
+        log.info("stopped; the axis is disabled")
+        return 0
+
+    def _close(self) -> None:
+        self._server.close()
+        self._verbs.close()
+        self._faults.finish()
+        self._recorder.close()
+        self._metrics_server.close()
+        self._selector.close()
+
+    def _document(self) -> dict[str, Any]:
+        """The status document (servod.daemon.status.Status)."""
+        latest = self._loop.latest
+        if latest is None:
+            raise Unreachable("the loop has not begun")
+        bus = self._config.bus
+        document: Status = {
+            "name": self._config.name,
+            "version": __version__,
+            "uptime_s": time.monotonic() - self._started,
+            "axis": axis_status(latest),
+            "drive": drive_status(latest),
+            "motion": motion_status(latest),
+            "faults": fault_status(latest),
+            "controller": self._bank.describe(latest.controller),
+            "timing": self._health.timing(self._loop.lost),
+            "bus": {
+                "interface": bus.interface,
+                "channel": bus.channel,
+                "load": self._plans.bus_load,
+                "max_load": bus.max_load,
+                "queue_full": latest.bus_queue_full,
+                "error_frames": latest.bus_error_frames,
+            },
+            "nodes": self._nodes(),
+            "grants": [{"name": g.name, "granted": g.granted, "reason": g.reason} for g in self._loop.grants],
+            "recorder": self._recorder.state(),
+            "lease": self._server.lease(),
+        }
+        return dict(document)
+
+    def _nodes(self) -> list[NodeStatus]:
+        return [
+            {
+                "node_id": plan.node_id,
+                "role": role,
+                "driver": plan.driver,
+                "state": _nmt_name(self._master.nmt_state(plan.node_id)),
+            }
+            for role, plan in (("amplifier", self._plans.amplifier), ("encoder", self._plans.encoder))
+        ]
+
+
+def _nmt_name(state: int | None) -> str:
+    return "not heard yet" if state is None else NmtState(state).name
