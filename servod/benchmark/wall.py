@@ -11,12 +11,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-from servod.benchmark.axis import local_gains
 from servod.control import ControlClient
 from servod.demo.axis import demo_config, gains_file, plant_file
 from servod.demo.processes import sigterm_as_interrupt
 from servod.demo.runs import Run, cut_motion
-from servod.demo.wall import running_axis
+from servod.demo.wall import activate, running_axis
 from servod.errors import AnswerIsNo
 from servod.recorder_read import read_recording
 
@@ -32,9 +31,7 @@ def measure(wall_clock_s: float, memory_s: float) -> tuple[dict[str, Any], dict[
     with sigterm_as_interrupt(), tempfile.TemporaryDirectory(prefix="servod-bench-") as name:
         folder = Path(name)
         with running_axis(demo_config(folder, folder / "recordings"), plant_file(None), folder) as (client, daemon_pid):
-            gains = local_gains()
-            client.call("gains_load", name=gains.name, text=gains_file("local").read_text())
-            client.call("gains_activate", name=gains.name)
+            activate(client, gains_file("local"))
             client.call("enable")
             client.call("track", kind="sine", amplitude_rad=0.05, frequency_hz=0.5, duration_s=3600.0)
             run = _record(client, wall_clock_s)

@@ -23,7 +23,6 @@ def register(app: typer.Typer) -> None:
 @_app.command(help=example("Check a gain set and keep it in the daemon's store.", "servoctl gains load my_axis.yaml"))
 def load(
     file: Annotated[Path, typer.Argument(help="Gain set, YAML.")],
-    name: Annotated[str | None, typer.Option(help="Name in the store; the file's own unless given.")] = None,
     activate: Annotated[bool, typer.Option("--activate", help="Activate it as well.")] = False,
     socket: SocketOption = DEFAULT_SOCKET,
     as_json: JsonOption = False,
@@ -33,12 +32,11 @@ def load(
     from servod.yaml12 import read_text
 
     load_gains(file)  # refuse here, where the file's name is known
-    stored_name = name or file.stem
     with connect(socket) as client:
-        result = client.call("gains_load", name=stored_name, text=read_text(file))
+        result = client.call("gains_load", name=str(file), text=read_text(file))
         if activate:
-            result |= client.call("gains_activate", name=result.get("name", stored_name))
-    report(result, f"{'activated' if activate else 'loaded'} {result.get('name', stored_name)}", as_json)
+            result = client.call("gains_activate", name=result["name"], version=result["version"])
+    report(result, f"{'activated' if activate else 'loaded'} {_title(result)}", as_json)
 
 
 @_app.command("list", help=example("List the gain sets in the daemon's store.", "servoctl gains list"))
@@ -70,12 +68,14 @@ def show(file: Annotated[Path, typer.Argument(help="Gain set, YAML.")], as_json:
 @_app.command(help=example("Change to a stored gain set without a bump.", "servoctl gains activate my_axis"))
 def activate(
     name: Annotated[str, typer.Argument(help="Name in the store.")],
+    version: Annotated[int | None, typer.Option(min=1, help="Version; the newest unless given.")] = None,
     socket: SocketOption = DEFAULT_SOCKET,
     as_json: JsonOption = False,
 ) -> None:
     """Activate a gain set."""
     with connect(socket) as client:
-        report(client.call("gains_activate", name=name), f"activated {name}", as_json)
+        result = client.call("gains_activate", name=name, version=version)
+    report(result, f"activated {_title(result)}", as_json)
 
 
 @_app.command(help=example("Go back to the gain set that was active before.", "servoctl gains rollback"))
@@ -83,14 +83,19 @@ def rollback(socket: SocketOption = DEFAULT_SOCKET, as_json: JsonOption = False)
     """Roll back."""
     with connect(socket) as client:
         result = client.call("gains_rollback")
-    report(result, f"active again: {result.get('name', '')}", as_json)
+    report(result, f"active again: {_title(result)}", as_json)
+
+
+def _title(stored: dict[str, Any]) -> str:
+    certified = "certified" if stored["certified"] else "not certified"
+    return f"{stored['name']} version {stored['version']} (law {stored['law']}, {certified})"
 
 
 def _print(result: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    rows: list[dict[str, Any]] = result.get("gains", [])
+    rows: list[dict[str, Any]] = result["gains"]
     if not rows:
         print("no gain set is stored")
         return

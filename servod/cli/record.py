@@ -23,15 +23,16 @@ def register(app: typer.Typer) -> None:
 
 @_app.command(help=example("Start recording every cycle (MCAP).", "servoctl record start"))
 def start(
-    path: Annotated[Path | None, typer.Option(help="File; a new name in recorder.directory unless given.")] = None,
+    name: Annotated[
+        str | None, typer.Option(help="File name in recorder.directory (.mcap); a new one by default.")
+    ] = None,
     socket: SocketOption = DEFAULT_SOCKET,
     as_json: JsonOption = False,
 ) -> None:
     """Start a recording."""
-    arguments = {} if path is None else {"path": str(path.resolve())}
     with connect(socket) as client:
-        result = client.call("record_start", **arguments)
-    report(result, f"recording to {result.get('path', '')}", as_json)
+        result = client.call("record_start", path=name)
+    report(result, f"recording to {result['path']}", as_json)
 
 
 @_app.command(help=example("Stop recording.", "servoctl record stop"))
@@ -39,7 +40,7 @@ def stop(socket: SocketOption = DEFAULT_SOCKET, as_json: JsonOption = False) -> 
     """Stop the recording."""
     with connect(socket) as client:
         result = client.call("record_stop")
-    report(result, f"recorded {result.get('path', '')}", as_json)
+    report(result, f"recorded {result['records']} cycles to {result['path']}", as_json)
 
 
 @_app.command(

@@ -38,8 +38,8 @@ def demo_config(folder: Path, recordings: Path) -> AxisConfig:
             "bus": {"interface": "virtual", "channel": str(folder / "bus")},
             "cycle": {"cpu": last_core(), "priority": 80},
             "limits": {
-                "torque_nm": 0.9,
-                "torque_rate_nm_per_s": 400.0,
+                "torque_nm": 0.3,
+                "torque_rate_nm_per_s": 200.0,
                 "speed_rad_s": 3.0,
                 "position_min_rad": -0.6,
                 "position_max_rad": 0.6,

@@ -86,12 +86,9 @@ def run_wall(plant: Path, duration_s: float, recordings: Path, progress: Progres
 
 def _run(client: ControlClient, controller: str, duration_s: float, recordings: Path, progress: Progress) -> Run:
     """One controller: activate it, record trajectory (19), and cut the motion from the recording."""
-    name = f"demo_{controller}"
-    client.call("gains_load", name=name, text=gains_file(controller).read_text())
-    client.call("gains_activate", name=name)
-    file = recordings / f"{controller}.mcap"
-    file.unlink(missing_ok=True)
-    path = client.call("record_start", path=str(file.resolve()))["path"]
+    activate(client, gains_file(controller))
+    (recordings / f"{controller}.mcap").unlink(missing_ok=True)
+    path = client.call("record_start", path=f"{controller}.mcap")["path"]
     started = time.monotonic()
     client.call("track", kind="paper", duration_s=duration_s)
     while _moves(client):
@@ -99,6 +96,12 @@ def _run(client: ControlClient, controller: str, duration_s: float, recordings: 
     progress(controller, 1.0)
     client.call("record_stop")
     return cut_motion(controller, read_recording(path).rows)
+
+
+def activate(client: ControlClient, gains: Path) -> None:
+    """Load a gain-set file into the daemon and change to it."""
+    stored = client.call("gains_load", name=str(gains), text=gains.read_text())
+    client.call("gains_activate", name=stored["name"], version=stored["version"])
 
 
 def _go_home(client: ControlClient, home_rad: float) -> None:

@@ -10,6 +10,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable
+from typing import Protocol
 
 from servod.bus.open import open_bus
 from servod.clock import Clock, WallClock
@@ -42,7 +43,25 @@ def supervisor_watch(channel: Channel, clock: Clock) -> Callable[[], bool]:
     return alive
 
 
-def run(cycle: Cycle, clock: Clock) -> None:
+class Paced(Protocol):
+    """What `run` paces: the cycle, or the benchmark's probe of the wake-up."""
+
+    @property
+    def period_ns(self) -> int:
+        """Time between two steps."""
+        ...
+
+    @property
+    def finished(self) -> bool:
+        """No further step is wanted."""
+        ...
+
+    def step(self, deadline_ns: int, woke_ns: int, skipped: int) -> None:
+        """One period; `skipped` were missed before it."""
+        ...
+
+
+def run(cycle: Paced, clock: Clock) -> None:
     """Cycle after cycle until it is finished."""
     period_ns = cycle.period_ns
     deadline_ns = clock.now_ns() + period_ns
