@@ -112,6 +112,7 @@ class NodeSdo:
         self.node_id = node_id
         self.dictionary = dictionary
         self._lock = threading.Lock()
+        self._network = network
         self._client = _Client(node_id, dictionary, network)
         network.subscribe(SDO_ANSWER_BASE + node_id, self._client.on_response)
 
@@ -156,6 +157,8 @@ class NodeSdo:
 
     def _transfer(self, index: int, subindex: int, verb: str, transfer: Any) -> Any:
         with self._lock:
+            self._network.drain()  # an answer that came too late must not be taken for the next one
+            self._client.responses.clear()
             self._client.current = (index, subindex)
             try:
                 return transfer()
