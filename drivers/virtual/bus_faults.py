@@ -28,7 +28,7 @@ class FaultKind(IntEnum):
     BUS_OFF = 3  # the participant goes bus-off
     SILENT = 4  # the participant neither sends nor hears for `amount` ms (a node without supply, a cut wire)
     DELAY = 5  # the participant sends everything `amount` microseconds later
-    IGNORE = 6  # the client that asks is spared frames with `can_id` (a receive filter, no fault)
+    ACCEPT = 6  # no fault, a receive filter: the client that asks gets only the identifiers that it named
 
 
 class BusFault(NamedTuple):

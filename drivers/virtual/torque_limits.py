@@ -34,7 +34,7 @@ class TorqueLimits:
         return self._folded_back
 
     def clamp(self, demand: float, motor_speed_rpm: float, stopping: bool) -> int:
-        """The torque that is produced: 0x6072, then 0x60E0/0x60E1 (not in a quick stop), 0x6073, thermal, speed guard."""
+        """The torque produced: 0x6072, then 0x60E0/0x60E1 (not in a quick stop), 0x6073, thermal, speed guard."""
         high = low = self._max_torque.value
         if not stopping:
             high = min(high, self._positive.value)

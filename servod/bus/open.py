@@ -10,7 +10,7 @@ from servod.config import BusConfig
 
 
 def open_bus(config: BusConfig, can_ids: tuple[int, ...] | None = None) -> Bus:
-    """A new connection to the bus; `can_ids` limits reception where the bus can filter (SocketCAN, in the kernel).
+    """A new connection to the bus; `can_ids` limits reception where the bus can filter (SocketCAN, virtual).
 
     Raises Unreachable when the interface, the hub's socket or python-can's driver is not there.
     """
@@ -21,7 +21,7 @@ def open_bus(config: BusConfig, can_ids: tuple[int, ...] | None = None) -> Bus:
     if config.interface == "virtual":
         from servod.drivers.virtual.client import VirtualBus
 
-        bus: Bus = VirtualBus(config.channel)
+        bus: Bus = VirtualBus(config.channel, can_ids)
         return bus
     from servod.bus.python_can import PythonCanBus
 

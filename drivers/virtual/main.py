@@ -1,0 +1,98 @@
+"""`servod-virtual-axis`: the virtual axis as its own process, on the virtual bus or on SocketCAN.
+
+Where the real machine would be. Prints one line, `ready ...`, when it serves, and ends cleanly on SIGTERM and SIGINT.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from servod.axis_model import AxisModel, load_axis_model
+from servod.drivers.virtual.drive_record import DriveRecord
+from servod.drivers.virtual.on_can import CanServer
+from servod.drivers.virtual.server import HubServer, Timing
+from servod.drivers.virtual.settings import VirtualAxisSettings
+from servod.drivers.virtual.world import World
+from servod.errors import ServodError
+from servod.shipped import shipped
+from servod.yaml12 import load_model, validate
+
+_EXAMPLE = "example: servod-virtual-axis --socket /tmp/vbus0 --plant joint.yaml --record drive.bin --seed 7"
+#: Options that override a key of the settings, with their types.
+_SETTING_OPTIONS: dict[str, type] = {
+    "seed": int,
+    "bit-rate": int,
+    "amplifier-node-id": int,
+    "encoder-node-id": int,
+    "amplifier-counts-per-turn": int,
+    "encoder-counts-per-turn": int,
+    "encoder-measuring-range-counts": int,
+    "gear-ratio": float,
+    "rated-torque-mnm": int,
+}
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="servod-virtual-axis", description="A virtual servo axis.", epilog=_EXAMPLE)
+    bus = parser.add_mutually_exclusive_group(required=True)
+    bus.add_argument("--socket", type=Path, metavar="PATH", help="serve a virtual CAN bus at this Unix socket")
+    bus.add_argument("--can", metavar="INTERFACE", help="join a SocketCAN interface, e.g. vcan0")
+    parser.add_argument(
+        "--plant", type=Path, metavar="FILE", help="axis model of the joint (default: demo joint)"
+    )
+    parser.add_argument("--settings", type=Path, metavar="FILE", help="settings of the virtual axis (YAML)")
+    parser.add_argument("--record", type=Path, metavar="FILE", help="the drive's own record, survives any kill")
+    parser.add_argument("--timing", choices=[t.value for t in Timing], default=Timing.STAMPED.value)
+    for option, kind in _SETTING_OPTIONS.items():
+        parser.add_argument(f"--{option}", type=kind, metavar="N", help="overrides the settings file")
+    return parser
+
+
+def _settings(arguments: argparse.Namespace) -> VirtualAxisSettings:
+    """The settings file, or the defaults, with the options on top; raises BadInput."""
+    base = load_model(arguments.settings, VirtualAxisSettings) if arguments.settings else VirtualAxisSettings()
+    chosen: dict[str, Any] = {o.replace("-", "_"): getattr(arguments, o.replace("-", "_")) for o in _SETTING_OPTIONS}
+    given = {key: value for key, value in chosen.items() if value is not None}
+    return validate(base.model_dump() | given, VirtualAxisSettings, "servod-virtual-axis")
+
+
+def _server(arguments: argparse.Namespace) -> HubServer | CanServer:
+    """Everything built and bound, ready to run; raises ServodError."""
+    settings = _settings(arguments)
+    model: AxisModel = load_axis_model(arguments.plant or shipped("gains/axes/demo_joint.yaml"))
+    record = DriveRecord(arguments.record) if arguments.record else None
+    if arguments.can:
+        return CanServer(settings, model, arguments.can, record)
+    world = World(settings, model, record)
+    server = HubServer(world, arguments.socket, Timing(arguments.timing))
+    world.devices.power_on(time.monotonic_ns())
+    return server
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run until told to stop; returns the exit code of the contract."""
+    arguments = _parser().parse_args(argv)
+    try:
+        server = _server(arguments)
+    except ServodError as error:
+        print(error, file=sys.stderr)
+        return error.exit_code
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: server.stop())
+    gc.freeze()  # what stands now stays; collections in the loop then have little to look at
+    print(f"ready {arguments.can or arguments.socket}", flush=True)
+    try:
+        server.run()
+    finally:
+        server.close()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
