@@ -1,0 +1,48 @@
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from servod.config import load_config
+
+SYSTEMD = Path(__file__).parents[2] / "systemd"
+UNITS = sorted(SYSTEMD.glob("*.service"))
+needs_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
+
+
+@needs_systemd
+def test_verify_prints_nothing() -> None:
+    done = subprocess.run(["systemd-analyze", "verify", *map(str, UNITS)], capture_output=True, text=True)
+    assert (done.stdout + done.stderr, done.returncode) == ("", 0)
+
+
+@needs_systemd
+@pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.name)
+def test_exposure_is_at_most_3(unit: Path) -> None:
+    command = ["systemd-analyze", "security", "--offline=true", "--no-pager", str(unit)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    found = re.search(r"Overall exposure level for \S+: ([0-9.]+)", done.stdout)
+    assert found is not None, done.stderr
+    assert float(found[1]) <= 3.0
+
+
+def test_address_families_are_can_and_unix_only() -> None:
+    for unit in UNITS:
+        assert re.findall(r"^RestrictAddressFamilies=(.*)$", unit.read_text(), re.M) == ["AF_CAN AF_UNIX"]
+
+
+def test_install_puts_everything_where_the_units_look(tmp_path: Path) -> None:
+    subprocess.run([SYSTEMD / "install.sh"], env={**os.environ, "DESTDIR": str(tmp_path)}, check=True)
+    assert {u.name for u in UNITS} <= {p.name for p in (tmp_path / "etc/systemd/system").iterdir()}
+    config = load_config(tmp_path / "etc/servod/config/virtual.yaml")
+    assert config.gains.initial.exists()
+    command = re.search(r"--plant (\S+)", (SYSTEMD / "servod-virtual-axis.service").read_text())
+    assert command is not None
+    assert (tmp_path / command[1].lstrip("/")).exists()
+    mine = tmp_path / "etc/servod/config/can0.yaml"
+    mine.write_text("mine")
+    subprocess.run([SYSTEMD / "install.sh"], env={**os.environ, "DESTDIR": str(tmp_path)}, check=True)
+    assert mine.read_text() == "mine"
