@@ -7,7 +7,6 @@ encoder driver (difference over the measured time, exact first-order low-pass), 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 from servod.models.dynamics import advance
@@ -27,8 +26,20 @@ OUTPUTS: tuple[str, ...] = (
     "other_nm",
 )
 
-#: Replaced by the law's own function before use: (p, s, x_ref, v_ref, a_ref, x, v, u_applied, dt) -> four torques.
-control_law: Callable[..., tuple[float, float, float, float]]
+
+def control_law(
+    gains: Any,
+    law_state: Any,
+    x_ref: float,
+    v_ref: float,
+    a_ref: float,
+    x: float,
+    v: float,
+    u_applied: float,
+    dt: float,
+) -> tuple[float, float, float, float]:
+    """No control: the axis coasts. `simulate` puts the law that shall run in this function's place."""
+    return 0.0, 0.0, 0.0, 0.0
 
 
 def run(

@@ -50,7 +50,9 @@ def bound(function: Kernel, **swap: Kernel) -> Kernel:
 @cache
 def _compiled(function: Kernel, swap: tuple[tuple[str, Kernel], ...]) -> Kernel:
     import numba
-    from numba.core import config
+    from numba.core import config as numba_config
+
+    config: Any = numba_config
 
     called = {name: compiled(callee) for name, callee in {**_callees(function), **dict(swap)}.items()}
     copy = bound(function, **called)

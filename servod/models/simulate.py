@@ -77,8 +77,8 @@ def simulate_closed_loop(
 ) -> ClosedLoopRun:
     """Run `model` under `law` along `reference` (rows of position, velocity, acceleration, one for each sample).
 
-    `law` is a step function of `servod.controllers`; `gains` its flat parameters. `external_nm` acts beside the command;
-    `start` is (position, velocity, bristle deflection), by default at rest on the reference's first position.
+    `law` is a step function of `servod.controllers`; `gains` its flat parameters. `external_nm` acts beside the
+    command; `start` is (position, velocity, bristle deflection), by default at rest on the reference's first position.
     """
     settings = settings or LoopSettings()
     reference = np.ascontiguousarray(reference, dtype=np.float64)
@@ -108,5 +108,5 @@ def simulate_closed_loop(
         settings.torque_limit_nm,
     )
     columns = {name: out[:, i] for i, name in enumerate(closed_loop.OUTPUTS)}
-    t_s = np.arange(len(reference)) * settings.period_s
+    t_s: Array = np.arange(len(reference), dtype=np.float64) * settings.period_s
     return ClosedLoopRun(t_s=t_s, reference_rad=reference[:, 0], state=state, **columns)
