@@ -61,6 +61,12 @@ _Loader.add_constructor("tag:yaml.org,2002:int", _construct_int)
 _Loader.add_constructor("tag:yaml.org,2002:float", _construct_float)
 
 
+class Dumper(yaml.SafeDumper):
+    """Writes YAML that this module reads back: quotes the strings that YAML 1.2 would take for something else."""
+
+    yaml_implicit_resolvers = _Loader.yaml_implicit_resolvers
+
+
 class Strict(BaseModel):
     """Base of every file model: unknown keys are errors, values are frozen, numbers must be finite."""
 
@@ -110,7 +116,7 @@ def _bad_input(error: ValidationError, model: type[BaseModel], data: Any, where:
     """Choose the most telling problem: an unknown key explains a missing one, so it goes first."""
     problems = error.errors(include_url=False)
     first = next((p for p in problems if p["type"] == "extra_forbidden"), problems[0])
-    key = ".".join(_file_path(first["loc"], data)) or "(top)"
+    key = ".".join(_file_path(first["loc"], data, first["type"] in ("missing", "extra_forbidden"))) or "(top)"
     if first["type"].startswith("union_tag"):
         tag = str(first["ctx"]["discriminator"]).strip("'")
         allowed = first["ctx"].get("expected_tags", "a value; this key is required")
@@ -120,15 +126,27 @@ def _bad_input(error: ValidationError, model: type[BaseModel], data: Any, where:
     if first["type"] == "missing":
         return BadInput(f"{where}: {key}", "nothing", "a value; this key is required")
     message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
-    return BadInput(f"{where}: {key}", repr(first["input"])[:80], message)
+    return BadInput(f"{where}: {key}", _found(first["input"], message), message)
 
 
-def _file_path(loc: tuple[int | str, ...], data: Any) -> list[str]:
-    """`loc` as a path in the file: without the tags that pydantic adds where a discriminated union was entered."""
+def _found(value: Any, message: str) -> str:
+    """What stood in the file, at most 80 characters; of a whole mapping only the keys that `message` speaks of."""
+    if isinstance(value, dict):
+        named = [f"{key}: {item}" for key, item in value.items() if str(key) in message]
+        if named:
+            return ", ".join(named)[:80]
+    return repr(value)[:80]
+
+
+def _file_path(loc: tuple[int | str, ...], data: Any, ends_in_key: bool) -> list[str]:
+    """`loc` as a path in the file: without the tags that pydantic adds where a discriminated union was entered.
+
+    `ends_in_key`: the last part is a key although the file does not have it, or should not.
+    """
     path = []
     for i, part in enumerate(loc):
         here = (isinstance(data, dict) and part in data) or (isinstance(data, list) and isinstance(part, int))
-        if here or i == len(loc) - 1:
+        if here or (ends_in_key and i == len(loc) - 1):
             path.append(str(part))
         if here:
             data = data[part]
