@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 from servod.controllers import LAWS, Law
 from servod.errors import BadInput
 from servod.gain_parameters import LocalSet, Numbers, Parameters
-from servod.yaml12 import Strict, parse_yaml, read_text, validate
+from servod.yaml12 import Dumper, Strict, parse_yaml, read_text, validate
 
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 #: Lower case only: names become file names, also on systems that do not tell case apart.
@@ -26,7 +26,7 @@ GainName = Annotated[str, Field(pattern=NAME_PATTERN)]
 SCHEMA_VERSION = 1
 
 
-class _Dumper(yaml.SafeDumper):
+class _Dumper(Dumper):
     """Writes one local set in one line, as a table."""
 
     def represent_mapping(self, tag: str, mapping: Any, flow_style: bool | None = None) -> yaml.MappingNode:

@@ -1,0 +1,117 @@
+"""Gain sets: every mistake gives its one line, good ones survive the round trip, certificates bind to the numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from servod.controllers import LAWS, local
+from servod.errors import BadInput
+from servod.gains import GainSet, load_gains, parse_gains, require_certificate
+from tests.gains import good
+
+BAD = yaml.safe_load(Path(__file__).with_name("bad_gains.yaml").read_text(encoding="utf-8"))
+SHIPPED = sorted((Path(__file__).resolve().parents[2] / "gains").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("case", BAD, ids=lambda case: case["why"])
+def test_a_mistake_gives_one_exact_line(case: dict[str, str]) -> None:
+    text = getattr(good, case["text"])
+    old, new = case["replace"]
+    assert text.count(old) >= 1
+    with pytest.raises(BadInput) as caught:
+        parse_gains(text.replace(old, new, 1), "bad.yaml")
+    assert str(caught.value) == case["error"]
+
+
+def test_missing_file_is_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "none.yaml"
+    with pytest.raises(BadInput, match=f"{path}: found No such file or directory; allowed: a readable file"):
+        load_gains(path)
+
+
+@pytest.mark.parametrize("text", [good.PD, good.LUGRE, good.LOCAL], ids=["pd", "pd_lugre", "local"])
+def test_round_trip(text: str) -> None:
+    gains = parse_gains(text, "good.yaml")
+    again = parse_gains(gains.to_yaml(), "again.yaml")
+    assert again == gains
+    assert again.parameters_sha256() == gains.parameters_sha256()
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_every_shipped_set_is_good_and_named_as_its_file(path: Path) -> None:
+    gains = load_gains(path)
+    assert gains.name == path.stem
+    assert gains.law.accepts(gains.pack())
+    assert gains.provenance.note
+
+
+def test_the_paper_and_the_demo_ship() -> None:
+    names = {path.stem for path in SHIPPED}
+    assert {"table1_kz_kv_kx", "table1_kx_kv_kz", "paper_pd", "paper_pd_dob", "paper_pd_lugre"} <= names
+    assert {f"demo_{law}" for law in LAWS} <= names
+
+
+@pytest.mark.parametrize("name", ["1e5", "0x1f", "true", "on", "2026-11-20", "no"])
+def test_names_that_look_like_something_else_survive_the_round_trip(name: str) -> None:
+    gains = parse_gains(good.PD.replace("name: bench_pd", f"name: '{name}'"), "good.yaml")
+    assert parse_gains(gains.to_yaml(), "again.yaml").name == name
+
+
+def test_numbers_are_those_of_yaml_1_2() -> None:
+    assert parse_gains(good.PD, "good.yaml").pack() == (2.5, 0.12, 0.0)
+
+
+def test_pack_of_the_local_law_is_what_the_kernel_reads() -> None:
+    text = good.LOCAL.replace(
+        "    sets:", "    velocity: reference\n    lead_s: 0.002\n    weights: gaussian\n    sets:"
+    )
+    p = parse_gains(text, "good.yaml").pack()
+    assert p[local.INPUT_SCALE] == 0.1
+    assert p[local.LOW_K_Z : local.HIGH_K_V + 1] == (0.0, 1574.9, 0.241, 0.0, 197.0, 2.104)
+    assert (p[local.BLEND_FROM], p[local.BLEND_TO]) == (0.005, 0.02)
+    assert (p[local.STIFFNESS], p[local.VISCOUS], p[local.LEAK]) == (760.0, 0.056, 2.0)
+    assert p[local.STATE_LIMIT] == 0.12 / 760.0
+    assert (p[local.SOURCE], p[local.LEAD], p[local.SHAPE]) == (local.REFERENCE, 0.002, 2.0)
+    assert (p[local.HOLD_WITHIN], p[local.FEEDFORWARD_INERTIA], p[local.OBSERVER_BANDWIDTH]) == (0.0, 0.0, 0.0)
+    assert p[local.N_SETS :] == (3.0, -0.5, 0.0, 0.5, 8000.0, 0.0, 7000.0, 0.04, 0.0, 0.0)
+
+
+def test_hash_sees_numbers_not_spelling() -> None:
+    gains = parse_gains(good.PD, "good.yaml")
+    spelled = good.PD.replace("12e-2", "0.12").replace("for tests", "other words").replace("name: bench_pd", "name: b")
+    changed = good.PD.replace("12e-2", "0.1200001")
+    assert parse_gains(spelled, "x.yaml").parameters_sha256() == gains.parameters_sha256()
+    assert parse_gains(changed, "x.yaml").parameters_sha256() != gains.parameters_sha256()
+    whole = good.LOCAL.replace("k_x_per_rad: 197,", "k_x_per_rad: 197.0,")
+    local_hash = parse_gains(good.LOCAL, "x.yaml").parameters_sha256()
+    assert parse_gains(whole, "x.yaml").parameters_sha256() == local_hash
+
+
+def test_a_certificate_counts_until_a_number_changes() -> None:
+    gains = good.certified(parse_gains(good.PD, "good.yaml"))
+    require_certificate(gains, accept_uncertified=False)
+    tampered = parse_gains(
+        gains.to_yaml().replace("position_gain_nm_per_rad: 2.5", "position_gain_nm_per_rad: 2.6"), "t"
+    )
+    with pytest.raises(BadInput, match="they were changed after it was issued"):
+        require_certificate(tampered, accept_uncertified=False)
+    require_certificate(tampered, accept_uncertified=True)
+
+
+@pytest.mark.parametrize(
+    ("gains", "problem"),
+    [
+        (parse_gains(good.PD, "x"), "no certificate"),
+        (good.certified(parse_gains(good.PD, "x"), valid=False), "a certificate that says valid: false"),
+    ],
+)
+def test_without_a_valid_certificate_the_set_is_refused_in_one_line(gains: GainSet, problem: str) -> None:
+    with pytest.raises(BadInput) as caught:
+        require_certificate(gains, accept_uncertified=False)
+    assert str(caught.value) == (
+        f"gain set bench_pd: certificate: found {problem}; allowed: a valid one (`servoctl verify` issues it), "
+        "or gains.accept_uncertified: true in the configuration"
+    )
