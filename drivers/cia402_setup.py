@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from servod.cia import RPDO_BASE, TPDO_BASE, Obj402
 from servod.drivers.cia402_state import decode_status_word
 from servod.drivers.cia402_target import target_type
-from servod.drivers.quirks import AbortReaction, Presence, load_quirks
+from servod.drivers.quirks import Presence, Quirks, load_quirks
 from servod.drivers.setup_tools import read_optional, write_checked, write_optional
 from servod.errors import BadInput, Unreachable
 from servod.hal import DriveState, Mode, NodePlan, PdoEntry, PdoMap, SdoAccess
@@ -28,8 +28,6 @@ SUPPORTED_MODE_BIT = {
 }
 _SLOW_TIMER_MS = 100
 _POWERED = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE, DriveState.FAULT_REACTION_ACTIVE)
-#: 0x60C2:2, exponents of the interpolation period that drives accept, finest last: period = value * 10**index s.
-_PERIOD_EXPONENTS_US = ((-3, 1000), (-4, 100), (-5, 10), (-6, 1))
 
 
 def amplifier_pdos(node_id: int, mode: Mode) -> tuple[PdoMap, ...]:
@@ -49,12 +47,16 @@ def amplifier_pdos(node_id: int, mode: Mode) -> tuple[PdoMap, ...]:
     )
 
 
-def interpolation_period(period_us: int) -> tuple[int, int]:
-    """(value, exponent) of 0x60C2 for a cycle, value in 8 bits; raises BadInput when no pair fits exactly."""
-    for exponent, unit_us in _PERIOD_EXPONENTS_US:
+def interpolation_period(period_us: int, quirks: Quirks) -> tuple[int, int]:
+    """(value, exponent) of 0x60C2 for a cycle: period = value * 10**exponent s, value in 8 bits, exactly.
+
+    Raises BadInput when the drive takes no such pair.
+    """
+    for exponent in quirks.interpolation_exponents:
+        unit_us = 10 ** (6 + exponent)
         if period_us % unit_us == 0 and 0 < period_us // unit_us <= 255:
             return period_us // unit_us, exponent
-    raise BadInput("cycle.period_us", period_us, "a period that 0x60C2 can express, e.g. 1000, 2000, 500")
+    raise BadInput("cycle.period_us", period_us, f"a period that 0x60C2 of {quirks.maker} can express, e.g. 1000")
 
 
 class AmplifierSetup:
@@ -84,6 +86,7 @@ class AmplifierSetup:
             "quick_stop_option": amplifier.quick_stop_option,
             "quirks": amplifier.quirks,
             "pdo_pairs": self._quirks.pdo_pairs,
+            "reset_communication_at_start": self._quirks.reset_communication_at_start,
             "reset_communication_after": sorted(self._quirks.reset_communication_after),
         }
         if amplifier.rated_torque_mnm is not None:
@@ -94,6 +97,7 @@ class AmplifierSetup:
         """Write options and mode, read scalings; the node is pre-operational. Raises Unreachable, BadInput."""
         self._notes = []
         self._refuse_while_powered(sdo)
+        self._check_preconditions(sdo)
         self._check_mode_supported(sdo)
         plan = self.plan()
         plan.facts["rated_torque_nm"] = self._rated_torque_nm(sdo)
@@ -111,6 +115,15 @@ class AmplifierSetup:
                 f"amplifier node {self._amplifier.node_id} is powered ({state.name}): "
                 "nothing is written to it; disable it or wait for its heartbeat time-out, then start again"
             )
+
+    def _check_preconditions(self, sdo: SdoAccess) -> None:
+        for wanted in self._quirks.preconditions:
+            read = sdo.read(wanted.index, wanted.subindex)
+            if read & wanted.mask != wanted.value:
+                where = f"amplifier node {self._amplifier.node_id} ({self._quirks.maker})"
+                raise Unreachable(
+                    f"{where}: object 0x{wanted.index:04X}:{wanted.subindex} reads {read}; {wanted.remedy}"
+                )
 
     def _check_mode_supported(self, sdo: SdoAccess) -> None:
         supported = sdo.read(Obj402.SUPPORTED_MODES)
@@ -142,22 +155,11 @@ class AmplifierSetup:
         amplifier = self._amplifier
         if not write_optional(sdo, Obj402.QUICK_STOP_OPTION, 0, amplifier.quick_stop_option):
             self._notes.append("no 0x605A: the drive stops by its own quick-stop way")
-        reaction = AbortReaction(amplifier.heartbeat_reaction)
-        presence = self._quirks.abort_connection_presence
-        if presence is Presence.ABSENT:
-            self._notes.append("no 0x6007 by the quirks table: the drive's own reaction to a lost heartbeat applies")
-            return
-        if not write_optional(sdo, Obj402.ABORT_CONNECTION, 0, self._quirks.abort_code(reaction)):
-            if presence is Presence.REQUIRED:
-                raise Unreachable(
-                    f"amplifier node {amplifier.node_id}: object 0x6007 is missing, heartbeat_reaction unset"
-                )
+        if not write_optional(sdo, Obj402.ABORT_CONNECTION, 0, amplifier.heartbeat_reaction):
             self._notes.append("no 0x6007: the drive's own reaction to a lost heartbeat applies")
 
     def _write_interpolation_period(self, sdo: SdoAccess) -> None:
-        if self._quirks.interpolation_period is Presence.ABSENT:
-            return
-        value, exponent = interpolation_period(self._period_us)
+        value, exponent = interpolation_period(self._period_us, self._quirks)
         if write_optional(sdo, Obj402.INTERPOLATION_PERIOD, 1, value):
             write_checked(sdo, Obj402.INTERPOLATION_PERIOD, 2, exponent)
         elif self._quirks.interpolation_period is Presence.REQUIRED:

@@ -1,12 +1,13 @@
-"""Where real drives differ from CiA 402, as data: one row per maker, each deviation with its source.
+"""Where real drives differ from CiA 402, as data: one row per maker, each deviation with its source and our answer.
 
 The set-up face (drivers/cia402_setup.py) and the master's bring-up act on the fields; `deviations` says for people
-what was found and where. `amplifier.quirks` in the configuration names the row; "none" is the standard itself.
+what was found, where, and what servod does about it. `amplifier.quirks` in the configuration names the row; "none" is
+the standard itself. Deviations that servod's normal way already covers are listed too, so that nobody undoes it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import IntEnum
 
 from servod.cia import Emcy
@@ -14,28 +15,30 @@ from servod.errors import BadInput
 
 
 class Presence(IntEnum):
-    """Whether an object exists in a drive."""
+    """Whether an object must exist in a drive."""
 
-    ABSENT = 0  # never touched
     OPTIONAL = 1  # written when it exists, noted when not
-    REQUIRED = 2  # the drive does not work in the cyclic modes without it: a refusal ends the bring-up
-
-
-class AbortReaction(IntEnum):
-    """Meanings of 0x6007 (abort connection option code) as the standard numbers them."""
-
-    NOTHING = 0
-    FAULT = 1
-    DISABLE_VOLTAGE = 2
-    QUICK_STOP = 3
+    REQUIRED = 2  # the drive does not work in the cyclic modes without it: its absence ends the bring-up
 
 
 @dataclass(frozen=True, slots=True)
 class Deviation:
-    """One documented difference: what it is, and the manual or issue thread that says so."""
+    """One documented difference: what it is, the manual or thread that says so, and how servod meets it."""
 
     text: str
     source: str
+    answer: str
+
+
+@dataclass(frozen=True, slots=True)
+class Precondition:
+    """A vendor object that must read `value` under `mask`, else the drive ignores us; read, never written."""
+
+    index: int
+    subindex: int
+    mask: int
+    value: int
+    remedy: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,22 +47,147 @@ class Quirks:
 
     maker: str
     rated_torque_unit_nm: float = 1e-3  # one count of 0x6076
-    abort_connection: dict[AbortReaction, int] = field(default_factory=dict)  # meanings with another number in 0x6007
-    abort_connection_presence: Presence = Presence.OPTIONAL
     interpolation_period: Presence = Presence.OPTIONAL  # 0x60C2
+    interpolation_exponents: tuple[int, ...] = (-3, -4, -5, -6)  # values of 0x60C2:2 that the drive takes
     max_pdo_entries: int = 8
-    pdo_pairs: int = 4  # RPDOs and TPDOs that exist; all that are not planned are set not valid
-    reset_communication_after: frozenset[int] = frozenset()  # EMCY codes that only NMT reset communication clears
-    torque_per_rated_current: bool = False  # per mille of 0x6071 refer to rated current, 0x6076 only describes it
+    pdo_pairs: int = 4  # RPDOs and TPDOs to look for; all that are not planned are set not valid
+    reset_communication_at_start: bool = False
+    reset_communication_after: frozenset[int] = frozenset()  # error codes that only NMT reset communication clears
+    preconditions: tuple[Precondition, ...] = ()
     deviations: tuple[Deviation, ...] = ()
 
-    def abort_code(self, reaction: AbortReaction) -> int:
-        """What to write to 0x6007 for this reaction."""
-        return self.abort_connection.get(reaction, int(reaction))
 
+_MAXON = Quirks(
+    maker="maxon EPOS4",
+    rated_torque_unit_nm=1e-6,
+    interpolation_period=Presence.REQUIRED,
+    reset_communication_after=frozenset({Emcy.HEARTBEAT_LOST, Emcy.ERROR_PASSIVE}),
+    deviations=(
+        Deviation(
+            "0x6076 counts in uN*m, not mN*m",
+            "EPOS4 Firmware Specification, object 0x6076 (unit column)",
+            "rated_torque_unit_nm",
+        ),
+        Deviation(
+            "cyclic modes run rough unless 0x60C2 equals the SYNC period",
+            "maxon support article 4402184834322, cited in ros2_canopen issue 405",
+            "interpolation_period is required and read back",
+        ),
+        Deviation(
+            "after 0x8130 or 0x8120 the fault reset works only after NMT reset communication",
+            "change log of EposLib",
+            "reset_communication_after",
+        ),
+    ),
+)
+
+_ELMO = Quirks(
+    maker="Elmo",
+    reset_communication_at_start=True,
+    deviations=(
+        Deviation(
+            "SDO answers carry more bytes than the object has",
+            "ros_canopen pull request 63",
+            "answers are cut to the length that the EDS gives",
+        ),
+        Deviation(
+            "with several drives on the bus they start properly only after NMT reset communication",
+            "ros_canopen issue 67",
+            "reset_communication_at_start",
+        ),
+        Deviation(
+            "SimplIQ drives have hm, pp, ip, pv and tq, but no cyclic synchronous mode",
+            "Elmo CANopen DSP 402 Implementation Guide MAN-CAN402IG 1.2, section 5.3, object 0x6502",
+            "0x6502 is checked before the mode is chosen",
+        ),
+    ),
+)
+
+_COPLEY = Quirks(
+    maker="Copley",
+    preconditions=(
+        Precondition(
+            0x2300, 0, 0xFFFF, 30, "set the desired state 0x2300 to 30 (control by CANopen) in CME and store it"
+        ),
+    ),
+    deviations=(
+        Deviation(
+            "the drive follows the bus only while its vendor object 0x2300 (desired state) selects CANopen",
+            "Copley CANopen Programmer's Manual 95-00271, chapter 3, Desired State 0x2300",
+            "precondition",
+        ),
+        Deviation(
+            "no abort connection option code 0x6007 among the device control objects",
+            "Copley CANopen Programmer's Manual 95-00271, chapter 3, list of device control and status objects",
+            "noted in the bring-up report: the drive's own reaction to a lost heartbeat applies",
+        ),
+    ),
+)
+
+_NANOTEC = Quirks(
+    maker="Nanotec",
+    interpolation_period=Presence.REQUIRED,
+    interpolation_exponents=(-3,),
+    preconditions=(
+        Precondition(0x3202, 0, 0x1, 0x1, "commission closed loop first (0x3202 bit 0): cst runs only in closed loop"),
+    ),
+    deviations=(
+        Deviation(
+            "0x60C2:2 takes only -3, so the cycle is whole milliseconds",
+            "Nanotec PD4-E CANopen manual, Cyclic Synchronous Torque",
+            "interpolation_exponents",
+        ),
+        Deviation(
+            "cst works only in closed loop",
+            "Nanotec PD4-E CANopen manual, Cyclic Synchronous Torque",
+            "precondition",
+        ),
+        Deviation(
+            "operation enabled is refused while no mode is selected (PD4-C since a firmware upgrade)",
+            "ros_canopen pull request 331",
+            "the mode is written before the node becomes operational",
+        ),
+        Deviation(
+            "torque is in thousandths of what the rated current in 0x203B:1 gives",
+            "Nanotec PD4-E manual, objects 0x6077 and 0x6087",
+            "state amplifier.rated_torque_mnm, it is compared with 0x6076",
+        ),
+    ),
+)
+
+_TECHNOSOFT = Quirks(
+    maker="Technosoft iPOS",
+    deviations=(
+        Deviation(
+            "TPDOs come with an inhibit time of 30 ms, which swallows status changes",
+            "roboticslab-uc3m/yarp-devices issue 232",
+            "the inhibit time of every planned TPDO is written, zero unless planned",
+        ),
+        Deviation(
+            "two control words within the slow loop's 1 ms are one: a short fault reset is not seen",
+            "roboticslab-uc3m/yarp-devices issue 215 (answer of Technosoft)",
+            "the fault reset is held for the handshake time, three cycles",
+        ),
+        Deviation(
+            "changing between motion modes while enabled can make the motor jump",
+            "roboticslab-uc3m/yarp-devices issue 170",
+            "the mode is written only while the drive has no power",
+        ),
+        Deviation(
+            "torque is commanded by the vendor's external reference mode where cst is missing",
+            "roboticslab-uc3m/yarp-devices issues 170 and 187",
+            "0x6502 is checked before the mode is chosen",
+        ),
+    ),
+)
 
 QUIRKS: dict[str, Quirks] = {
     "none": Quirks(maker="CiA 402"),
+    "epos4": _MAXON,
+    "elmo": _ELMO,
+    "copley": _COPLEY,
+    "nanotec": _NANOTEC,
+    "technosoft": _TECHNOSOFT,
 }
 
 
@@ -68,7 +196,3 @@ def load_quirks(name: str) -> Quirks:
     if name not in QUIRKS:
         raise BadInput("amplifier.quirks", name, ", ".join(QUIRKS))
     return QUIRKS[name]
-
-
-#: Heartbeat loss as an EMCY code, for rows that name it.
-HEARTBEAT_LOST = frozenset({int(Emcy.HEARTBEAT_LOST)})

@@ -78,6 +78,7 @@ class Emcy(IntEnum):
     """Emergency error codes that servod names."""
 
     NONE = 0x0000
+    ERROR_PASSIVE = 0x8120
     HEARTBEAT_LOST = 0x8130
     BUS_OFF_RECOVERED = 0x8140
     PDO_LENGTH = 0x8210

@@ -62,7 +62,7 @@ class Master:
         report.append(f"bus load {load.describe()}")
         plans = []
         for node, plan in zip(nodes, wanted, strict=True):
-            report += node.clear_sticky_fault(plan)
+            report += node.reset_as_quirks_ask(plan)
             configured, lines = node.configure()
             plans.append(configured)
             report += lines

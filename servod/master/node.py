@@ -60,8 +60,11 @@ class Node:
             f"product {found.product_code}, revision {found.revision}, serial {found.serial}"
         ]
 
-    def clear_sticky_fault(self, plan: NodePlan) -> list[str]:
-        """Reset the node's communication when its last error is one that only this clears (quirks table)."""
+    def reset_as_quirks_ask(self, plan: NodePlan) -> list[str]:
+        """Reset the node's communication where its quirks want that: always, or after certain last errors."""
+        if plan.facts.get("reset_communication_at_start"):
+            self.reset_communication()
+            return [f"node {self.node_id}: communication reset, as its quirks ask"]
         sticky = plan.facts.get("reset_communication_after", ())
         newest = read_optional(self.sdo, Obj301.ERROR_HISTORY, 1) if sticky else None
         if newest is None or newest & 0xFFFF not in sticky:
