@@ -45,6 +45,9 @@ def demo_config(folder: Path, recordings: Path) -> AxisConfig:
                 "position_max_rad": 0.6,
                 "following_error_rad": 0.15,
                 "encoder_mismatch_rad": 0.05,
+                # Without real-time rights the virtual axis may wait for its turn; a real drive never does.
+                "stale_cycles": 50,
+                "late_cycles": 100,
             },
             "gains": {
                 "directory": str(folder / "gains"),

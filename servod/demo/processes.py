@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import os
 import signal
 import subprocess
 import sys
@@ -22,12 +23,18 @@ _STOP_S = 5.0
 
 
 @contextlib.contextmanager
-def child(module: str, arguments: Sequence[str], log: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """Run `python -m module arguments` for the time of a `with` block; its output goes to `log`."""
+def child(module: str, arguments: Sequence[str], log: Path, priority: int = 0) -> Iterator[subprocess.Popen[bytes]]:
+    """Run `python -m module arguments` for the time of a `with` block; its output goes to `log`.
+
+    `priority` above 0 asks for SCHED_FIFO, and does without where that is refused.
+    """
     libc = ctypes.CDLL(None)
 
-    def die_with_parent() -> None:
+    def prepare() -> None:
         libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+        if priority > 0:
+            with contextlib.suppress(OSError):
+                os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
 
     with log.open("wb") as output:
         process = subprocess.Popen(
@@ -36,7 +43,7 @@ def child(module: str, arguments: Sequence[str], log: Path) -> Iterator[subproce
             stdout=output,
             stderr=subprocess.STDOUT,
             start_new_session=True,  # Ctrl-C is for the parent, which stops the axis in the right order
-            preexec_fn=die_with_parent,  # noqa: PLW1509  (one thread; only a system call)
+            preexec_fn=prepare,  # noqa: PLW1509  (one thread; only system calls)
         )
     try:
         yield process
