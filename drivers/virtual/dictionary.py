@@ -64,7 +64,7 @@ class Entry:
     )
 
     def __init__(self, variable: ODVariable) -> None:
-        bits = INTEGER_BITS.get(variable.data_type, 0)
+        bits = INTEGER_BITS.get(variable.data_type or 0, 0)
         self.index: int = variable.index
         self.subindex: int = variable.subindex
         self.name: str = variable.name
@@ -74,7 +74,7 @@ class Entry:
             self.default = int(variable.default or 0)
         else:
             self.default = 0
-            self.raw = (variable.default or "").encode("latin-1")
+            self.raw = str(variable.default or "").encode("latin-1")
         self.relative: bool = variable.relative
         self.value = self.default
         self.readable, self.writable = variable.readable, variable.writable

@@ -43,9 +43,7 @@ def _parser() -> argparse.ArgumentParser:
     bus = parser.add_mutually_exclusive_group(required=True)
     bus.add_argument("--socket", type=Path, metavar="PATH", help="serve a virtual CAN bus at this Unix socket")
     bus.add_argument("--can", metavar="INTERFACE", help="join a SocketCAN interface, e.g. vcan0")
-    parser.add_argument(
-        "--plant", type=Path, metavar="FILE", help="axis model of the joint (default: demo joint)"
-    )
+    parser.add_argument("--plant", type=Path, metavar="FILE", help="axis model of the joint (default: demo joint)")
     parser.add_argument("--settings", type=Path, metavar="FILE", help="settings of the virtual axis (YAML)")
     parser.add_argument("--record", type=Path, metavar="FILE", help="the drive's own record, survives any kill")
     parser.add_argument("--timing", choices=[t.value for t in Timing], default=Timing.STAMPED.value)

@@ -6,6 +6,7 @@ Between the bus and the device (amplifier, encoder), which derives from it. Fram
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
 
@@ -38,7 +39,7 @@ _COMMUNICATION = (0x1000, 0x1FFF)
 _APPLICATION = (0x2000, 0x9FFF)
 
 
-class Node:
+class Node(ABC):
     """One node. Derived devices fill in `refresh`, `commanded`, `reset_application`, `connection_lost`."""
 
     def __init__(self, eds: Path, node_id: int, serial: int, timeline: Timeline, send: Send) -> None:
@@ -65,21 +66,21 @@ class Node:
 
     # --- what a device fills in --------------------------------------------------------------------------------
 
+    @abstractmethod
     def refresh(self, time_ns: int) -> None:
         """Bring the actual values of the dictionary up to `time_ns`."""
-        raise NotImplementedError
 
+    @abstractmethod
     def commanded(self, time_ns: int) -> None:
         """An RPDO was applied."""
-        raise NotImplementedError
 
+    @abstractmethod
     def reset_application(self, time_ns: int) -> None:
         """The device starts anew (power on, NMT reset node); its objects have their defaults."""
-        raise NotImplementedError
 
+    @abstractmethod
     def connection_lost(self, time_ns: int) -> None:
         """The master is silent, the bus is off, or NMT left operational."""
-        raise NotImplementedError
 
     # --- life --------------------------------------------------------------------------------------------------
 
@@ -249,8 +250,8 @@ class Node:
         entry(Obj301.HEARTBEAT_PRODUCER).written = lambda value: self.producer.restart(self.timeline.now_ns)
         entry(Obj301.SYNC_COB_ID).written = lambda value: self._route()
         for index in range(1, self.dictionary.value(Obj301.HEARTBEAT_CONSUMER) + 1):
-            entry(Obj301.HEARTBEAT_CONSUMER, index).written = lambda value: self._supervise()
+            entry(Obj301.HEARTBEAT_CONSUMER, index).written = lambda value: self._watch_heartbeats()
 
-    def _supervise(self) -> None:
+    def _watch_heartbeats(self) -> None:
         self.consumer.configure()
         self._route()

@@ -55,8 +55,10 @@ class PdoEngine:
     def stop(self) -> None:
         """The node left operational."""
         self.active = False
-        for pdo in (*self.rpdos, *self.tpdos):
-            pdo.stop()
+        for rpdo in self.rpdos:
+            rpdo.stop()
+        for tpdo in self.tpdos:
+            tpdo.stop()
 
     def identifiers(self) -> tuple[list[int], list[int]]:
         """COB-IDs of the valid RPDOs, and of the valid TPDOs (for remote requests)."""

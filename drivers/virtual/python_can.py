@@ -18,7 +18,7 @@ from servod.errors import Unreachable
 _ID_MASK = 0x1FFFFFFF
 
 
-class VirtualAxisBus(can.BusABC):  # type: ignore[misc]
+class VirtualAxisBus(can.BusABC):
     """python-can bus on the hub's socket; `channel` is its path. Raises can.CanInitializationError."""
 
     def __init__(self, channel: str, can_filters: Any = None, **kwargs: Any) -> None:

@@ -135,7 +135,8 @@ class HubServer:
         while not self._stopping:
             wait_s = (world.next_ns() - self._look_ahead_ns - now_ns) / NS_PER_S if self._behind else self._idle(now_ns)
             readers = [c for c in self._clients if c.writable]
-            ready = select.select([self._listener, *readers], (), (), min(max(wait_s, 0.0), _LONGEST_WAIT_S))[0]
+            sources: list[socket.socket | Client] = [self._listener, *readers]
+            ready = select.select(sources, (), (), min(max(wait_s, 0.0), _LONGEST_WAIT_S))[0]
             for source in ready:
                 if isinstance(source, Client):
                     source.take_packet()
