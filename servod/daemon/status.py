@@ -120,6 +120,12 @@ class GrantStatus(TypedDict):
     reason: str
 
 
+class LoopStatus(TypedDict):
+    """The loop process."""
+
+    pid: int
+
+
 class LeaseStatus(TypedDict):
     """The client that commands; pid 0 when none does."""
 
@@ -138,6 +144,7 @@ class Status(TypedDict):
     motion: MotionStatus
     faults: list[FaultStatus]
     controller: ControllerStatus
+    loop: LoopStatus
     timing: TimingStatus
     bus: BusStatus
     nodes: list[NodeStatus]

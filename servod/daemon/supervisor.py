@@ -208,6 +208,7 @@ class Supervisor:
             "motion": motion_status(latest),
             "faults": fault_status(latest),
             "controller": self._bank.describe(latest.controller),
+            "loop": {"pid": self._loop.pid},
             "timing": self._health.timing(self._loop.lost),
             "bus": {
                 "interface": bus.interface,
