@@ -68,6 +68,11 @@ def last_core() -> int | None:
     return cores[-1] if len(cores) > 1 else None
 
 
+def other_cores() -> set[int] | None:
+    """All cores but the loop's; None where there is only one."""
+    return os.sched_getaffinity(0) - {last_core()} or None
+
+
 def _own_group() -> str:
     try:
         return grp.getgrgid(os.getgid()).gr_name

@@ -17,7 +17,7 @@ import yaml
 
 from servod.config import AxisConfig
 from servod.control import ControlClient
-from servod.demo.axis import CONTROLLERS, demo_config, gains_file
+from servod.demo.axis import CONTROLLERS, demo_config, gains_file, other_cores
 from servod.demo.processes import child, sigterm_as_interrupt, wait_until
 from servod.demo.runs import Run, cut_motion
 from servod.errors import AnswerIsNo, Unreachable
@@ -50,7 +50,13 @@ def running_axis(config: AxisConfig, plant: Path, folder: Path) -> Iterator[Runn
     with contextlib.ExitStack() as stack:
         log = folder / "virtual-axis.log"
         axis = stack.enter_context(
-            child("servod.drivers.virtual.main", ["--socket", str(bus), "--plant", str(plant)], log, _AXIS_PRIORITY)
+            child(
+                "servod.drivers.virtual.main",
+                ["--socket", str(bus), "--plant", str(plant)],
+                log,
+                _AXIS_PRIORITY,
+                other_cores(),
+            )
         )
         wait_until(bus.exists, axis, log, _START_S)
         log = folder / "servod.log"
