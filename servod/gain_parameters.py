@@ -18,7 +18,10 @@ from servod.yaml12 import Strict
 Gain = Annotated[float, Field(ge=0.0, le=1e6)]
 Inertia = Annotated[float, Field(gt=0.0, le=1e4)]
 Torque = Annotated[float, Field(gt=0.0, le=1e5)]
-Width = Annotated[float, Field(ge=0.0, le=1.0)]
+Width = Annotated[
+    float,
+    Field(ge=0.0, le=1.0, description="with the reference at rest and less error than this, nothing integrates"),
+]
 
 
 class Numbers(Strict):

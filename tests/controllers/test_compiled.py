@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 
 from servod.controllers import LAWS
@@ -11,9 +12,6 @@ from servod.controllers.state import ASKED
 from servod.controllers.weights import Shape
 from servod.models.compiled import compiled
 from tests.controllers.cases import PARAMETERS, fresh_state, local_parameters
-
-np = pytest.importorskip("numpy")
-pytest.importorskip("numba")
 
 CASES = {**PARAMETERS, **{f"local {shape.name}": local_parameters(gain=0.04, shape=float(shape)) for shape in Shape}}
 
