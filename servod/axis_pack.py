@@ -19,8 +19,8 @@ SMALLEST_DRY_FRICTION = 1e-12
 
 #: Groups of keys that the kernels' plain loop leaves out; the others are in every loop or not in the dynamics at all.
 _OUTSIDE_PLAIN = (
-    *("viscous_nonlinear", "load_dependent_friction", "position_dependent_friction", "cogging", "torque_ripple"),
-    *("spring", "backlash", "joint_elasticity", "torque_gain", "torque_saturation", "actuator_lag", "thermal"),
+    *("viscous_nonlinear", "load_dependent_friction", "position_dependent_friction", "torque_ripple"),
+    *("spring", "backlash", "joint_elasticity", "torque_gain", "torque_saturation", "actuator_lag"),
     *("position_dependent_inertia", "disturbance", "residual"),
 )
 

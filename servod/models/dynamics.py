@@ -1,7 +1,7 @@
 """The axis as a kernel: torque command in, position out, inner steps of at most 50 us.
 
 Used by the virtual plant (`plant`), the simulator and replay (`simulate`). `advance` is the one entry: the plain joint
-(one mass, bristle, gravity, offset, delay) runs in a tight loop; other effects take the general loop with `effects`.
+(one mass, bristle, gravity, offset, delay, cogging, heat) runs in a tight loop; other effects take the general loop.
 """
 
 from __future__ import annotations
@@ -10,8 +10,10 @@ import math
 
 from servod.models.effects import (
     actuator,
+    delay_steps,
     delayed,
     dry_factor,
+    harmonics,
     heat,
     inertia_at,
     load_torque,
@@ -23,6 +25,8 @@ from servod.models.effects import (
 )
 from servod.models.friction import Params, bristle_step, coulomb_step, directed_curve
 from servod.models.layout import (
+    P_COGGING,
+    P_COGGING_N,
     P_COMPLEX,
     P_FRICTION_PER_COMMAND,
     P_FRICTION_PER_LOAD,
@@ -59,7 +63,7 @@ def advance(
     `temperature_c` is the recorded joint temperature, NaN where the model's own heating shall count.
     """
     if p[P_COMPLEX] == 0.0:
-        _advance_plain(p, s, command, external, steps, h, delay_s)
+        _advance_plain(p, s, command, external, steps, h, delay_s, temperature_c)
     else:
         _advance_general(p, s, command, external, steps, h, delay_s, temperature_c)
 
@@ -78,30 +82,41 @@ def friction_step(
     return bristle_step(velocity, bristle, torque, inertia, h, dry, p[P_SIGMA0], sigma1, viscous)
 
 
-def _advance_plain(p: Params, s: State, command: float, external: float, steps: int, h: float, delay_s: float) -> None:
+def _advance_plain(
+    p: Params, s: State, command: float, external: float, steps: int, h: float, delay_s: float, temperature_c: float
+) -> None:
     position, velocity, bristle, friction = s[S_POSITION], s[S_VELOCITY], s[S_BRISTLE], s[S_FRICTION]
     inertia, gravity, beside = p[P_INERTIA], p[P_GRAVITY], p[P_OFFSET] + external
+    cogging, rows = int(p[P_COGGING]), int(p[P_COGGING_N])
+    dry_warm, viscous_warm = thermal_factors(p, s, temperature_c)
+    whole, part = delay_steps(delay_s, h)
+    loss = 0.0
     for _ in range(steps):
-        torque = delayed(s, command, delay_s / h) + beside
+        torque = delayed(s, command, whole, part) + beside
         if gravity != 0.0:
             torque -= gravity * math.sin(position + p[P_GRAVITY_PHASE])
-        viscous = p[P_VISCOUS] * (p[P_POSITIVE_VISCOUS] if velocity >= 0.0 else p[P_NEGATIVE_VISCOUS])
-        dry = directed_curve(p, velocity)
+        if rows > 0:
+            torque -= harmonics(p, cogging, rows, position)
+        viscous = viscous_warm * p[P_VISCOUS] * (p[P_POSITIVE_VISCOUS] if velocity >= 0.0 else p[P_NEGATIVE_VISCOUS])
+        dry = dry_warm * directed_curve(p, velocity)
         old = velocity
         velocity, bristle, friction = friction_step(p, velocity, bristle, torque, inertia, h, dry, viscous)
         position += 0.5 * h * (old + velocity)
+        loss += friction * velocity
     s[S_POSITION], s[S_VELOCITY], s[S_BRISTLE], s[S_FRICTION] = position, velocity, bristle, friction
     s[S_LOAD_POSITION], s[S_LOAD_VELOCITY] = position, velocity
     s[S_TIME_S] += steps * h
+    heat(p, s, loss * h, steps * h, temperature_c)
 
 
 def _advance_general(
     p: Params, s: State, command: float, external: float, steps: int, h: float, delay_s: float, temperature_c: float
 ) -> None:
     dry_warm, viscous_warm = thermal_factors(p, s, temperature_c)
+    whole, part = delay_steps(delay_s, h)
     loss = 0.0
     for _ in range(steps):
-        s[S_TORQUE] = actuator(p, s[S_TORQUE], delayed(s, command, delay_s / h), h)
+        s[S_TORQUE] = actuator(p, s[S_TORQUE], delayed(s, command, whole, part), h)
         _general_step(p, s, external, h, dry_warm, viscous_warm)
         loss += s[S_FRICTION] * s[S_VELOCITY] * h
     heat(p, s, loss, steps * h, temperature_c)

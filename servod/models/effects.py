@@ -17,21 +17,26 @@ State = list[float]
 SMALLEST_FACTOR = 0.05
 
 
-def delayed(s: State, command: float, delay_steps: float) -> float:
-    """Write `command` into the delay line and give back the one of `delay_steps` inner steps ago (fractions blend)."""
+def delayed(s: State, command: float, whole: int, part: float) -> float:
+    """Write `command` into the delay line; the one of `whole + part` inner steps ago, fractions blended."""
     length = len(s) - lay.S_LINE
     head = int(s[lay.S_HEAD])
     s[lay.S_LINE + head] = command
     s[lay.S_HEAD] = head + 1.0 if head + 1 < length else 0.0
-    whole = int(delay_steps)
-    part = delay_steps - whole
     new = head - whole
     if new < 0:
         new += length
-    if part < 1e-9:
+    if part == 0.0:
         return s[lay.S_LINE + new]
     old = new - 1 if new > 0 else length - 1
     return (1.0 - part) * s[lay.S_LINE + new] + part * s[lay.S_LINE + old]
+
+
+def delay_steps(delay_s: float, h: float) -> tuple[int, float]:
+    """A delay as whole inner steps and the part of one that is left (none when it is next to nothing)."""
+    whole = int(delay_s / h + 1e-6)
+    part = delay_s / h - whole
+    return whole, part if part > 1e-6 else 0.0
 
 
 def harmonics(p: Params, start: int, rows: int, x: float) -> float:

@@ -23,6 +23,9 @@ from servod.models.layout import (
 
 Params = tuple[float, ...]
 
+#: exp(-x) is under the last digit of a sum with 1 beyond this x.
+EXP_IS_NOTHING = 40.0
+
 
 def interpolate(p: Params, start: int, rows: int, x: float, hold: bool) -> float:
     """Piecewise linear table of (x, y) rows at `p[start]`; outside it, the end values when `hold`, else 0."""
@@ -53,6 +56,8 @@ def stribeck_curve(p: Params, velocity: float) -> float:
         return p[P_COULOMB]
     ratio = speed / p[P_STRIBECK_VELOCITY]
     power = ratio * ratio if p[P_STRIBECK_EXPONENT] == 2.0 else ratio ** p[P_STRIBECK_EXPONENT]
+    if power > EXP_IS_NOTHING:
+        return p[P_COULOMB]
     return p[P_COULOMB] + extra * math.exp(-power)
 
 
@@ -87,14 +92,17 @@ def bristle_step(
     stable at any step. sigma1 is held under 4*g/|v|, the bound of passivity (Barabanov and Ortega, IEEE TAC 45, 2000);
     above that speed dz/dt is next to nothing and the steady law is untouched.
     """
-    rate = sigma0 * abs(velocity) / dry
-    damping = sigma1 if sigma1 * rate <= 4.0 * sigma0 else 4.0 * sigma0 / rate
-    shrink = 1.0 / (1.0 + rate * h)
-    carried = (sigma0 - damping * rate) * shrink * bristle
-    slope = (sigma0 * h + damping) * shrink + viscous
+    speed = abs(velocity)
+    damping = sigma1 if sigma1 * speed <= 4.0 * dry else 4.0 * dry / speed
+    # everything is multiplied by g(v)*(1 + rate*h) = dry + sigma0*|v|*h: one division less in the chain that waits
+    whole = dry + sigma0 * speed * h
+    memory = (dry - damping * speed) * sigma0 * bristle
+    slope = (sigma0 * h + damping) * dry
     gain = h / inertia
-    new_velocity = (velocity + gain * (torque - carried)) / (1.0 + gain * slope)
-    return new_velocity, (bristle + h * new_velocity) * shrink, carried + slope * new_velocity
+    new_velocity = (velocity * whole + gain * (torque * whole - memory)) / (whole + gain * (slope + viscous * whole))
+    shrink = 1.0 / whole
+    friction = (memory + slope * new_velocity) * shrink + viscous * new_velocity
+    return new_velocity, (bristle + h * new_velocity) * dry * shrink, friction
 
 
 def coulomb_step(

@@ -43,7 +43,7 @@ def noise_rms(position: Array) -> float:
     quantum = float(steps[steps > 0.0].min()) if np.any(steps > 0.0) else 0.0
     fourth = np.abs(np.diff(position, 4))
     spread = float(np.median(fourth)) / (0.6745 * np.sqrt(70.0)) if len(fourth) else 0.0
-    return max(quantum / np.sqrt(12.0), spread)
+    return float(max(quantum / np.sqrt(12.0), spread))
 
 
 def _lepski(position: Array, period: float, spans: list[int], noise: float) -> list[Array]:

@@ -7,6 +7,7 @@ later; an interval is cut where the command changes, so that any delay and uneve
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 from servod.models.dynamics import advance
@@ -64,7 +65,7 @@ def switch_row(t: Any, row: int, now: float, delay_s: float) -> int:
     return row
 
 
-def acting(torque: Any, row: int, before: float) -> float:
+def acting(torque: Sequence[float], row: int, before: float) -> float:
     """The command of `row`; `before` where no recorded command has arrived yet."""
     return before if row < 0 else torque[row]
 
@@ -192,4 +193,4 @@ def _follow_load(p: Params, s: Any, load: float, inertia: float, slope: float, h
     push = tau - load - 0.5 * slope * old * old - p[P_LOAD_VISCOUS] * old + 0.5 * h * stiffness * relative
     s[S_LOAD_VELOCITY] = old + h / inertia * push / (1.0 + h / inertia * coupling)
     s[S_LOAD_POSITION] += 0.5 * h * (old + s[S_LOAD_VELOCITY])
-    return tau
+    return float(tau)

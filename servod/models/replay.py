@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -83,6 +83,10 @@ class Replay:
     load_position: Array
     starts: NDArray[np.int64]
     error: Array
+
+    def over(self, rows: NDArray[np.bool_]) -> Replay:
+        """The same replay with its error over some rows only."""
+        return replace(self, error=self.error[rows])
 
     @property
     def rms(self) -> float:

@@ -1,0 +1,123 @@
+"""`servoctl replay`: simulate an axis model under a recorded torque and say how far it is off.
+
+Works on files alone; needs the lab extra (numpy, scipy; numba makes it fast).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from servod.cli.common import JsonOption, example, print_json
+from servod.errors import BadInput
+
+if TYPE_CHECKING:
+    from servod.axis_model import AxisModel
+    from servod.models.replay import Replay
+    from servod.recordings import Recording
+
+EXAMPLE = "servoctl replay --model model.yaml run.csv.gz --horizon 0.25 --out sim.csv"
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb to `app`."""
+    app.command(name="replay", help=example("Simulate a model under a recorded torque.", EXAMPLE))(replay)
+
+
+def replay(
+    recording: Annotated[Path, typer.Argument(metavar="REC", help="CSV, CSV.gz, Parquet, MAT v5 or MCAP.")],
+    model: Annotated[Path, typer.Option(help="Axis model (YAML).")],
+    horizon: Annotated[str, typer.Option(help="Restart from the recording every so many seconds, or `full`.")] = "full",
+    map_file: Annotated[Path | None, typer.Option("--map", help="Renames and scales foreign columns (YAML).")] = None,
+    out: Annotated[Path | None, typer.Option(help="Write t_s, position and velocity here (.csv or .parquet).")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Simulate MODEL under the torque of REC and report the open-loop position error."""
+    horizon_s = parse_horizon(horizon)
+    check_out(out)
+    from servod.axis_model import load_axis_model
+    from servod.models.replay import replay as simulate
+    from servod.recordings import load_recording
+
+    axis = load_axis_model(model)
+    recorded = load_recording(recording, map_file)
+    if recorded.axis is not axis.axis:
+        raise BadInput(f"{model}: axis", axis.axis.value, f"{recorded.axis.value}, as the columns of {recording} say")
+    result = simulate(axis, recorded.drive, horizon_s)
+    if out is not None:
+        write_simulation(out, recorded, result)
+    document = summary(recorded, axis, result, horizon_s)
+    if as_json:
+        print_json(document)
+    else:
+        print_summary(document)
+
+
+def parse_horizon(text: str) -> float | None:
+    """Seconds between restarts, None for `full`. Raises BadInput."""
+    if text == "full":
+        return None
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = 0.0
+    if not 1e-3 <= seconds < 1e6:
+        raise BadInput("--horizon", repr(text), "seconds from 0.001 up, or full")
+    return seconds
+
+
+def check_out(out: Path | None) -> None:
+    """Raise BadInput when nothing could be written to `out`."""
+    if out is None:
+        return
+    if out.suffix not in {".csv", ".parquet"}:
+        raise BadInput(f"--out {out}", repr(out.suffix), ".csv or .parquet")
+    if not out.resolve().parent.is_dir():
+        raise BadInput(f"--out {out}", "no such folder", "a file in a folder that exists")
+
+
+def write_simulation(out: Path, recorded: Recording, result: Replay) -> None:
+    """Write the simulated motion, one row for each recorded row, on the recording's own time stamps."""
+    from servod.recordings import Quantity
+    from servod.recordings.export import write_table
+
+    axis = recorded.axis
+    write_table(
+        out,
+        {
+            Quantity.TIME.column(axis): recorded.t_s,
+            Quantity.POSITION.column(axis): result.position,
+            Quantity.VELOCITY.column(axis): result.velocity,
+        },
+    )
+
+
+def summary(recorded: Recording, axis: AxisModel, result: Replay, horizon_s: float | None) -> dict[str, Any]:
+    """The command's JSON document: the error over rows whose position was measured, and what it was measured on."""
+    unit = "m" if axis.axis.value == "linear" else "rad"
+    measured = result.over(recorded.measured)
+    return {
+        "recording": str(recorded.path),
+        "rows": len(recorded),
+        "duration_s": float(recorded.t_s[-1] - recorded.t_s[0]),
+        "horizon_s": "full" if horizon_s is None else horizon_s,
+        "windows": len(result.starts),
+        "unit": unit,
+        f"rms_error_{unit}": measured.rms,
+        f"max_error_{unit}": measured.max,
+        "report": list(recorded.report),
+    }
+
+
+def print_summary(document: dict[str, Any]) -> None:
+    """Print the summary for people; large and small errors in milli-units."""
+    unit = document["unit"]
+    for line in document["report"]:
+        print(f"note: {line}")
+    windows = document["windows"]
+    span = "one free run" if windows == 1 else f"{windows} windows"
+    print(f"{document['recording']}: {document['rows']} rows, {document['duration_s']:.3f} s, {span}")
+    rms, largest = (1e3 * document[f"{kind}_error_{unit}"] for kind in ("rms", "max"))
+    print(f"open-loop position error: RMS {rms:.4g} m{unit}, max {largest:.4g} m{unit}")
