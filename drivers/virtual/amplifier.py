@@ -106,7 +106,6 @@ class AmplifierNode(Node):
 
     def reset_application(self, time_ns: int) -> None:
         """Power on, or NMT reset node."""
-        self._apply_settings()
         self._scale()
         self._error = 0
         self._too_far_since_ns = None
@@ -234,12 +233,13 @@ class AmplifierNode(Node):
         self._record.write((time_ns, *words, demand_nm, torque_nm, plant.position_rad, plant.velocity_rad_s))
 
     def _apply_settings(self) -> None:
-        """What the settings say stands in the dictionary as the drive's defaults."""
-        s, entry = self.settings, self.dictionary.entry
-        entry(Obj402.RATED_TORQUE).value = s.rated_torque_mnm
-        entry(Obj402.ENCODER_RESOLUTION, 1).value = entry(Obj402.FEED, 1).value = s.amplifier_counts_per_turn
+        """What the settings say are the drive's defaults."""
+        s, set_default = self.settings, self.dictionary.set_default
+        set_default(Obj402.RATED_TORQUE, 0, s.rated_torque_mnm)
+        set_default(Obj402.ENCODER_RESOLUTION, 1, s.amplifier_counts_per_turn)
+        set_default(Obj402.FEED, 1, s.amplifier_counts_per_turn)
         for obj in (Obj402.MAX_TORQUE, Obj402.MAX_CURRENT, Obj402.POSITIVE_TORQUE_LIMIT, Obj402.NEGATIVE_TORQUE_LIMIT):
-            entry(obj).value = s.max_torque_permille
+            set_default(obj, 0, s.max_torque_permille)
 
     def _scale(self) -> None:
         self.sensor.scale()

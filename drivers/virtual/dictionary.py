@@ -127,6 +127,11 @@ class Dictionary:
         """Present value of an integer entry."""
         return self._entries[index, subindex].value
 
+    def set_default(self, index: int, subindex: int, value: int) -> None:
+        """This device's own default, instead of the one in the EDS file; also its present value."""
+        entry = self._entries[index, subindex]
+        entry.default = entry.value = value
+
     def lock_while_enabled(self, indices: tuple[int, ...]) -> None:
         """Refuse writing these objects while `write_lock` is set."""
         for entry in self:

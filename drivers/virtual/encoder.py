@@ -53,16 +53,11 @@ class EncoderNode(Node):
         self._speed_ns = -1
         self._speed_rad = self._speed_rad_s = 0.0
         self._started_ns = 0
+        self._apply_settings()
         self._hook()
 
     def reset_application(self, time_ns: int) -> None:
         """Power on, or NMT reset node."""
-        s, entry = self.settings, self.dictionary.entry
-        entry(Obj406.UNITS_PER_TURN).value = entry(Obj406.SINGLE_TURN_RESOLUTION).value = s.encoder_counts_per_turn
-        self._range.value = s.encoder_measuring_range_counts
-        turns = max(1, s.encoder_measuring_range_counts // s.encoder_counts_per_turn)
-        entry(Obj406.TURNS).value = min(turns, 0xFFFF)
-        entry(0x650B).value = s.encoder_serial
         self._started_ns, self._read_ns, self._speed_ns = time_ns, -1, -1
         self._rescale()
 
@@ -109,6 +104,16 @@ class EncoderNode(Node):
         value = self.dictionary.value
         inside = value(0x6310, 1) <= position <= value(0x6320, 1)
         self._cam.value = int(inside is not bool(value(0x6302, 1))) if value(0x6301, 1) else 0
+
+    def _apply_settings(self) -> None:
+        """What the settings say are the encoder's defaults."""
+        s, set_default = self.settings, self.dictionary.set_default
+        set_default(Obj406.UNITS_PER_TURN, 0, s.encoder_counts_per_turn)
+        set_default(Obj406.SINGLE_TURN_RESOLUTION, 0, s.encoder_counts_per_turn)
+        set_default(Obj406.MEASURING_RANGE, 0, s.encoder_measuring_range_counts)
+        turns = max(1, s.encoder_measuring_range_counts // s.encoder_counts_per_turn)
+        set_default(Obj406.TURNS, 0, min(turns, 0xFFFF))
+        set_default(0x650B, 0, s.encoder_serial)
 
     def _rescale(self) -> None:
         """Take over operating parameters, resolution and range."""

@@ -1,0 +1,215 @@
+"""D9 (14): the process on its socket: canopen as an independent witness, python-can's tools, wall clock, record, ends."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import can
+import canopen
+import pytest
+
+from servod import drivers
+from servod.drivers.virtual.bus_faults import BusFault, FaultKind
+from servod.drivers.virtual.client import VirtualBus
+from servod.drivers.virtual.drive_record import DriveRecord, read_drive_record
+from servod.errors import BadInput, Unreachable
+from servod.hal import DriveState
+
+EDS = Path(drivers.__file__).parent / "eds"
+
+
+class Axis:
+    """The running process."""
+
+    def __init__(self, folder: Path, *options: str) -> None:
+        self.bus, self.record = folder / "bus", folder / "drive.bin"
+        command = [sys.executable, "-m", "servod.drivers.virtual.main", "--socket", str(self.bus)]
+        command += ["--record", str(self.record), *options]
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        assert self.process.stdout is not None
+        assert self.process.stdout.readline() == f"ready {self.bus}\n"
+
+
+@pytest.fixture
+def axis(tmp_path: Path) -> Iterator[Axis]:
+    running = Axis(tmp_path)
+    yield running
+    running.process.kill()
+    running.process.communicate()
+
+
+@pytest.fixture
+def network(axis: Axis) -> Iterator[canopen.Network]:
+    net = canopen.Network()
+    net.connect(interface="servod_virtual", channel=str(axis.bus))
+    yield net
+    net.disconnect()
+
+
+def wait_for_state(amplifier: canopen.RemoteNode, masked: int) -> None:
+    deadline = time.monotonic() + 5.0
+    while amplifier.sdo[0x6041].raw & 0x6F != masked:
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def test_canopen_scans_reads_configures_and_runs_the_axis(network: canopen.Network) -> None:
+    network.scanner.search(5)
+    time.sleep(0.3)
+    assert network.scanner.nodes == [1, 2]
+    amplifier = network.add_node(1, str(EDS / "amplifier.eds"))
+    encoder = network.add_node(2, str(EDS / "encoder.eds"))
+    assert amplifier.sdo[0x1008].raw == "servod virtual amplifier"
+    assert encoder.sdo[0x1018][2].raw == 0x406
+    amplifier.tpdo.read()
+    amplifier.rpdo.read()
+    amplifier.tpdo[3].clear()
+    amplifier.tpdo[3].add_variable(0x606C)
+    amplifier.tpdo[3].cob_id, amplifier.tpdo[3].trans_type, amplifier.tpdo[3].enabled = 0x381, 1, True
+    amplifier.tpdo[3].save()
+    amplifier.sdo[0x6060].raw = 10
+    network.nmt.state = "OPERATIONAL"
+    network.sync.start(0.005)
+    for word, masked in ((0x06, 0x21), (0x07, 0x23), (0x0F, 0x27)):
+        amplifier.rpdo[1][0x6040].raw = word
+        amplifier.rpdo[1][0x6071].raw = 900 if word == 0x0F else 0
+        amplifier.rpdo[1].transmit()
+        wait_for_state(amplifier, masked)
+    encoder.tpdo.read()
+    first = encoder.sdo[0x6004].raw
+    assert amplifier.tpdo[3].wait_for_reception(1.0) is not None
+    time.sleep(0.2)
+    assert encoder.sdo[0x6004].raw > first + 1000
+    assert amplifier.tpdo[3][0x606C].raw > 0
+    network.sync.stop()
+
+
+def test_canopen_reads_the_dictionary_from_the_node(network: canopen.Network) -> None:
+    node = network.add_node(2, str(EDS / "encoder.eds"))
+    with node.sdo[0x1021].open("rb", block_transfer=True, buffering=7) as file:
+        assert file.read() == (EDS / "encoder.eds").read_bytes()
+
+
+def test_tools_see_the_same_frames(axis: Axis) -> None:
+    with can.Bus(interface="servod_virtual", channel=str(axis.bus)) as viewer:
+        bus = VirtualBus(str(axis.bus))
+        assert bus.send(0x123, b"abc")
+        message = viewer.recv(1.0)
+        assert message is not None
+        assert (message.arbitration_id, bytes(message.data)) == (0x123, b"abc")
+        assert abs(message.timestamp - time.time()) < 1.0
+        viewer.send(can.Message(arbitration_id=0x321, data=b"xy", is_extended_id=False), timeout=1.0)
+        frame = bus.receive(1.0)
+        assert frame is not None
+        assert (frame.can_id, frame.data) == (0x321, b"xy")
+        bus.close()
+
+
+def test_a_filtered_connection_gets_only_its_identifiers(axis: Axis) -> None:
+    filtered, sender = VirtualBus(str(axis.bus), (0x200,)), VirtualBus(str(axis.bus))
+    time.sleep(0.05)
+    for can_id in (0x100, 0x200, 0x300):
+        sender.send(can_id, b"")
+    frame = filtered.receive(1.0)
+    assert frame is not None
+    assert frame.can_id == 0x200
+    assert filtered.receive(0.05) is None
+
+
+def test_bus_off_reaches_the_client_as_an_error_frame(axis: Axis) -> None:
+    bus = VirtualBus(str(axis.bus))
+    bus.inject(BusFault(FaultKind.BUS_OFF))
+    bus.receive(0.2)
+    assert bus.counters.bus_off
+    assert bus.counters.error_frames == 1
+    assert not bus.send(0x80, b"")
+
+
+def test_a_hub_that_dies_is_a_state_and_no_exception(axis: Axis) -> None:
+    bus = VirtualBus(str(axis.bus))
+    axis.process.kill()
+    axis.process.wait()
+    start = time.monotonic()
+    assert bus.receive(0.1) is None
+    assert bus.counters.down
+    assert not bus.send(0x80, b"")
+    assert bus.receive(0.1) is None
+    assert time.monotonic() - start > 0.05  # waiting stays waiting
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_it_ends_cleanly(axis: Axis, number: int) -> None:
+    axis.process.send_signal(number)
+    _, errors = axis.process.communicate(timeout=5)
+    assert (axis.process.returncode, errors) == (0, "")
+    assert not axis.bus.exists()
+
+
+def test_the_drive_record_survives_a_kill(axis: Axis) -> None:
+    bus = VirtualBus(str(axis.bus))
+    bus.send(0x601, bytes.fromhex("2b40600006000000"))
+    assert bus.receive(1.0) is not None
+    time.sleep(0.05)
+    axis.process.kill()
+    axis.process.wait()
+    samples = read_drive_record(axis.record)
+    assert samples[0].state is DriveState.SWITCH_ON_DISABLED
+    assert samples[-1].state is DriveState.READY_TO_SWITCH_ON
+    assert samples[-1].control_word == 6
+    assert all(a.time_ns <= b.time_ns + 2_000_000 for a, b in zip(samples, samples[1:], strict=False))
+
+
+def test_the_record_is_a_ring(tmp_path: Path) -> None:
+    record = DriveRecord(tmp_path / "ring", capacity=3)
+    for n in range(5):
+        record.write((n, 2, 0x40, 0, 10, 0.0, 0.0, 0.0, 0.0))
+    assert [sample.time_ns for sample in read_drive_record(tmp_path / "ring")] == [2, 3, 4]
+    record.close()
+    (tmp_path / "other").write_bytes(b"something else entirely")
+    with pytest.raises(BadInput):
+        read_drive_record(tmp_path / "other")
+
+
+def test_no_hub_is_unreachable(tmp_path: Path) -> None:
+    with pytest.raises(Unreachable):
+        VirtualBus(str(tmp_path / "nothing"))
+    with pytest.raises(can.CanInitializationError):
+        can.Bus(interface="servod_virtual", channel=str(tmp_path / "nothing"))
+
+
+def test_a_served_socket_is_refused_and_a_dead_one_replaced(axis: Axis, tmp_path: Path) -> None:
+    second = [sys.executable, "-m", "servod.drivers.virtual.main", "--socket", str(axis.bus)]
+    result = subprocess.run(second, capture_output=True, text=True, timeout=30)
+    assert result.returncode == 3
+    assert result.stderr.count("\n") == 1
+    dead = tmp_path / "dead"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as left:
+        left.bind(str(dead))
+    folder = tmp_path / "other"
+    folder.mkdir()
+    dead.rename(folder / "bus")
+    again = Axis(folder, "--timing", "paced")
+    again.process.terminate()
+    assert again.process.wait(5) == 0
+
+
+def test_paced_timing_waits_for_the_bus(tmp_path: Path) -> None:
+    running = Axis(tmp_path, "--timing", "paced", "--bit-rate", "10000")
+    try:
+        sender, receiver = VirtualBus(str(running.bus)), VirtualBus(str(running.bus))
+        time.sleep(0.1)
+        while receiver.receive(0.05):
+            pass
+        start = time.monotonic()
+        sender.send(0x123, bytes(8))
+        assert receiver.receive(1.0) is not None
+        assert time.monotonic() - start >= 0.0135
+    finally:
+        running.process.kill()
+        running.process.communicate()
