@@ -11,7 +11,7 @@ import sys
 
 import typer
 
-from servod.cli import bench, check, demo, enable, faults, gains, record, scan, status, stop, track
+from servod.cli import bench, check, demo, enable, faults, gains, record, replay, scan, status, stop, track
 from servod.errors import ServodError
 
 app = typer.Typer(
@@ -22,7 +22,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for _verb in (demo, scan, status, enable, stop, track, gains, record, bench, check, faults):
+for _verb in (demo, scan, status, enable, stop, track, gains, record, replay, bench, check, faults):
     _verb.register(app)
 
 

@@ -50,20 +50,22 @@ class ColumnSource(Strict):
     offset: float = Field(0.0, description="in the canonical unit")
 
 
+def _long_form(source: object) -> object:
+    """A bare name stands for that column as it is; so mistakes in either form are told of the long one."""
+    return {"from": source} if isinstance(source, str) else source
+
+
 class ColumnMap(Strict):
     """A `--map` file: `columns: {t_s: t, force_n: {from: vir, scale: 35.1507}}`."""
 
-    columns: dict[str, str | ColumnSource] = Field(min_length=1)
+    columns: dict[str, Annotated[ColumnSource, BeforeValidator(_long_form)]] = Field(min_length=1)
 
     def sources(self, where: str) -> dict[str, ColumnSource]:
         """Canonical name -> source. Raises BadInput for a name that is not canonical; `where` is the map's file."""
         for name in self.columns:
             if name not in ALL_NAMES:
                 raise BadInput(f"{where}: columns.{name}", "no canonical column", _near(name, ALL_NAMES))
-        return {
-            name: ColumnSource.model_validate({"from": source}) if isinstance(source, str) else source
-            for name, source in self.columns.items()
-        }
+        return self.columns
 
 
 def load_column_map(path: Path) -> dict[str, ColumnSource]:

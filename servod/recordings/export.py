@@ -31,7 +31,8 @@ def write_table(path: Path, columns: Mapping[str, NDArray[np.float64]]) -> None:
             if path.suffix == ".parquet":
                 pq.write_table(table, stream)
             else:
-                pc.write_csv(table, stream, pc.WriteOptions(quoting_style="none"))
+                stream.write((",".join(columns) + "\n").encode())
+                pc.write_csv(table, stream, pc.WriteOptions(include_header=False))
             stream.flush()
             os.fsync(stream.fileno())
         aside.replace(path)
