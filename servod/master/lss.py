@@ -41,6 +41,8 @@ _WAITING, _CONFIGURATION = 0, 1
 _FAST_SCAN = struct.Struct("<BIBBB")
 _CONFIRM_ALL = 128  # bit check value that any unconfigured slave answers
 _PARTS, _BITS = 4, 32
+#: After an answer others may still be on their way; taken for answers to the next request they would falsify it.
+_SETTLE_S = 0.005
 
 
 class LssMaster:
@@ -65,12 +67,14 @@ class LssMaster:
 
         if not self._network.wait(came, self._answer_s):
             return None
+        self._network.wait(lambda: False, _SETTLE_S)
         return next(data for data in self._answers if data and data[0] == answer)
 
     def switch_all(self, configuration: bool) -> None:
-        """Put all slaves into configuration or waiting state; nobody answers."""
+        """Put all slaves into configuration or waiting state; nobody answers, so they get an answer's time to act."""
         state = _CONFIGURATION if configuration else _WAITING
         self._network.send_message(LSS_TO_SLAVE_ID, bytes((LssCommand.SWITCH_GLOBAL, state)).ljust(8, b"\0"))
+        self._network.wait(lambda: False, self._answer_s)
 
     def unconfigured_present(self) -> bool:
         """Whether any slave without a node id answers (identify non-configured)."""
