@@ -91,3 +91,12 @@ def test_estimate_holds_while_the_reference_rests_and_the_error_is_small() -> No
     assert s[DISTURBANCE] == 0.01
     LAWS["pd_dob"].step(p, s, 6e-5, 0.0, 0.0, 0.0, 0.0, 0.03, DT)
     assert s[DISTURBANCE] > 0.01
+
+
+def test_nominal_viscous_friction_is_no_disturbance() -> None:
+    p = list(PARAMETERS["pd_dob"])
+    p[5] = 0.056
+    s = fresh_state("pd_dob")
+    for _ in range(500):
+        LAWS["pd_dob"].step(p, s, 0.0, 0.5, 0.0, 0.0, 0.5, 0.056 * 0.5 + 0.01, DT)
+    assert s[DISTURBANCE] == pytest.approx(0.01, rel=1e-6)

@@ -57,11 +57,13 @@ def test_blended_is_the_weighted_sum(shape: Shape, v: float) -> None:
     assert gain == pytest.approx(sum(m * g for m, g in zip(mu, gains, strict=True)), rel=1e-9, abs=1e-12)
 
 
-@pytest.mark.parametrize(("v", "end"), [(-1.5, 0), (1.5, -1)])
-def test_beyond_the_last_node_the_friction_keeps_its_level(v: float, end: int) -> None:
-    decays = [700.0 * abs(node) for node in NODES]
-    decay, _ = blended((*NODES, *decays, *([0.0] * len(NODES))), 0, len(NODES), 0.0, v)
-    assert abs(v) / decay == pytest.approx(abs(NODES[end]) / decays[end])
+@pytest.mark.parametrize("shape", list(Shape))
+@pytest.mark.parametrize(("v", "end"), [(-1.5, -0.5), (1.5, 0.5)])
+def test_beyond_the_last_node_the_friction_keeps_its_level(v: float, end: float, shape: Shape) -> None:
+    p = (*NODES, *(700.0 * abs(node) for node in NODES), *([0.0] * len(NODES)))
+    at_the_end, _ = blended(p, 0, len(NODES), float(shape), end)
+    beyond, _ = blended(p, 0, len(NODES), float(shape), v)
+    assert abs(v) / beyond == pytest.approx(abs(end) / at_the_end)
 
 
 def test_nan_velocity_gives_nan_decay() -> None:
