@@ -9,8 +9,10 @@ import difflib
 from collections.abc import Iterable, Mapping
 from enum import Enum
 from pathlib import Path
+from typing import Annotated
+from typing import Annotated
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from servod.axis_model import AxisKind
 from servod.errors import BadInput
