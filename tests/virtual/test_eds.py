@@ -78,7 +78,7 @@ def test_write(shared: Bench, node_id: int, index: int, subindex: int, options: 
         assert code == (0 if writable else 0x06010002)
         return
     low = int(options.get("LowLimit", options.get("DefaultValue", "0").replace("$NODEID+", "")), 0)
-    code = write(shared, node_id, index, subindex, (low, SIZES[kind]))
+    code = write(shared, node_id, index, subindex, (low, min(SIZES[kind], 4)))
     if not writable:
         assert code == 0x06010002
         return
