@@ -174,9 +174,7 @@ class AxisConfig(Strict):
     def _node_ids_differ(self) -> AxisConfig:
         ids = (self.heartbeat.master_node_id, self.amplifier.node_id, self.encoder.node_id)
         if len(set(ids)) != len(ids):
-            raise ValueError(
-                "different ids for heartbeat.master_node_id, amplifier.node_id and encoder.node_id"
-            )
+            raise ValueError("different ids for heartbeat.master_node_id, amplifier.node_id and encoder.node_id")
         return self
 
 

@@ -14,6 +14,8 @@ import typer
 from servod.cli import bench, check, demo, enable, faults, gains, record, replay, scan, status, stop, track
 from servod.errors import ServodError
 
+_INTERRUPTED = 130  # as shells count SIGINT
+
 app = typer.Typer(
     name="servoctl",
     help="Commission and run servo axes under servod. Every command's --help shows an example.",
@@ -40,10 +42,12 @@ def run(arguments: list[str]) -> int:
     except typer.TyperException as error:
         return _complain(f"{error.format_message()} Found: `{shlex.join(['servoctl', *arguments])}`; see --help.", 2)
     except (KeyboardInterrupt, typer.Abort):
-        return _complain("interrupted", 130)
+        code = _INTERRUPTED
     except BrokenPipeError:
         sys.stderr.close()  # the reader of a pipe has gone; nothing is left to say
         return 1
+    if code == _INTERRUPTED:  # typer turns Ctrl-C within a command into this
+        return _complain("interrupted", _INTERRUPTED)
     return code if isinstance(code, int) else 0
 
 

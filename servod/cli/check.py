@@ -110,7 +110,7 @@ def _check_model(file: Path) -> str:
 
 
 def _check_map(file: Path) -> str:
-    from servod.recordings import load_column_map
+    from servod.recordings.columns import load_column_map
 
     load_column_map(file)
     return ""

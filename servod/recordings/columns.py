@@ -10,7 +10,6 @@ from collections.abc import Iterable, Mapping
 from enum import Enum
 from pathlib import Path
 from typing import Annotated
-from typing import Annotated
 
 from pydantic import BeforeValidator, Field
 

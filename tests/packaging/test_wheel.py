@@ -82,7 +82,10 @@ def test_the_bare_folder_is_not_importable(python: Path, tmp_path: Path) -> None
 
 
 def test_the_installed_package_is_the_wheel_and_finds_its_files(python: Path, tmp_path: Path) -> None:
-    code = "import servod; from servod.demo.axis import *; print(servod.__file__, *map(gains_file, CONTROLLERS), plant_file(None))"
+    code = (
+        "import servod; from servod.demo.axis import *; "
+        "print(servod.__file__, *map(gains_file, CONTROLLERS), plant_file(None))"
+    )
     result = run(python, "-c", code, folder=tmp_path)
     assert result.returncode == 0, result.stderr
     assert all(part.startswith(str(python.parent.parent)) for part in result.stdout.split())

@@ -1,0 +1,92 @@
+"""Runs, their scores, and the page of the demo."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from servod.demo.axis import CONTROLLERS
+from servod.demo.runs import ROW, Run, cut_motion, summary
+from servod.errors import AnswerIsNo
+from servod.report.curves import thin
+from servod.report.demo import write_demo_page
+
+PERIOD_NS = 1_000_000
+
+
+def recorded(error_rad: float, seconds: float = 3.0, still: int = 100) -> np.ndarray:
+    """Cycle records: `still` cycles at rest, then a motion that is off by `error_rad`, ten times that in second one."""
+    moving = round(seconds * 1000)
+    rows = np.zeros(still + moving, dtype=ROW)
+    rows["cycle"] = np.arange(len(rows))
+    rows["time_ns"] = 5_000_000_000 + rows["cycle"] * PERIOD_NS
+    rows["reference_active"][still:] = 1
+    t = np.arange(moving) * 1e-3
+    rows["reference_rad"][still:] = 0.1 * np.sin(t)
+    rows["position_rad"][still:] = 0.1 * np.sin(t) - error_rad * np.where(t < 1.0, 10.0, 1.0)
+    rows["torque_nm"][still:] = 0.05 * np.cos(t)
+    rows["lag_ns"] = 20_000
+    rows["torque_sent_ns"] = 100_000
+    return rows
+
+
+def test_score_leaves_out_rest_and_first_second() -> None:
+    score = cut_motion("pd", recorded(0.002).tobytes()).score()
+    assert score.rms_error_mrad == pytest.approx(2.0)
+    assert score.max_error_mrad == pytest.approx(2.0)
+
+
+def test_score_is_of_the_encoder_and_signed_errors_do_not_cancel() -> None:
+    rows = recorded(0.0)
+    rows["position_rad"][-2000::2] += 0.003
+    rows["position_rad"][-2001::2] -= 0.003
+    assert cut_motion("pd", rows.tobytes()).score().rms_error_mrad == pytest.approx(3.0, rel=1e-3)
+
+
+def test_a_run_without_motion_is_no_run() -> None:
+    with pytest.raises(AnswerIsNo, match="no motion"):
+        cut_motion("pd", recorded(0.0, seconds=0.0).tobytes())
+
+
+def test_a_run_shorter_than_its_first_second_has_no_score() -> None:
+    with pytest.raises(AnswerIsNo, match="first 1 s"):
+        cut_motion("pd", recorded(0.0, seconds=0.5).tobytes()).score()
+
+
+def test_summary_has_the_keys_of_the_contract_and_counts_skipped_periods() -> None:
+    rows = recorded(0.001)
+    rows["missed"][-1000:] = 7
+    rows["cycle"][-1000:] += 7
+    document = summary([cut_motion(c, rows.tobytes()) for c in CONTROLLERS], 1.5)
+    assert set(document) == {"controllers", "cycles", "missed", "wall_s"}
+    assert set(document["controllers"]) == {"pd", "pd_dob", "pd_lugre", "local"}
+    assert set(document["controllers"]["pd"]) == {"rms_error_mrad", "max_error_mrad"}
+    assert (document["missed"], document["cycles"]) == (28, 4 * 3007)
+
+
+def test_thinning_keeps_ends_and_peaks() -> None:
+    t = np.linspace(0.0, 1.0, 100_000)
+    y = np.sin(40.0 * t)
+    y[31_337], y[70_001] = 9.0, -8.0
+    x, thinned = thin(t, y)
+    assert len(x) <= 4000
+    assert (thinned.max(), thinned.min()) == (9.0, -8.0)
+    assert np.all(np.diff(x) > 0.0)
+
+
+@pytest.mark.parametrize("stepped", [False, True])
+def test_the_page_is_whole_and_needs_no_network(tmp_path: Path, stepped: bool) -> None:
+    runs: list[Run] = [cut_motion(c, recorded(0.001 * (i + 1)).tobytes()) for i, c in enumerate(CONTROLLERS)]
+    page = tmp_path / "deep" / "report.html"
+    write_demo_page(runs, page, stepped, "a <joint>")
+    text = page.read_text()
+    assert "PD tracked best with 1.000 mrad RMS, Local models worst with 4.000 mrad." in text
+    assert "a &lt;joint&gt;" in text
+    assert text.count('class="plotly-graph-div"') == 1 + 2 * len(runs) + (0 if stepped else 2)
+    body = re.sub(r"<script>.*?</script>", "", text.replace("\n", " "), count=1)
+    assert not re.search(r"<(script|link|img)[^>]*(src|href)=", text)
+    assert "<h1>servod demo" in body and "cdn.plot.ly" not in body
+    assert list(page.parent.iterdir()) == [page]
