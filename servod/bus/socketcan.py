@@ -25,7 +25,6 @@ _CAN_RAW_ERR_FILTER = 2  # linux/can/raw.h; not in Python's socket module everyw
 _TIMESPEC = struct.Struct("@ll")
 _ANCILLARY_BYTES = socket.CMSG_SPACE(_TIMESPEC.size)
 _QUEUE_FULL = (errno.ENOBUFS, errno.EAGAIN)
-_DOWN = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
 #: At most this many filters go to the kernel; its own limit is 512 (CAN_RAW_FILTER_MAX).
 _MAX_FILTERS = 512
 
@@ -75,15 +74,15 @@ class SocketCanBus:
     def send(self, can_id: int, data: bytes) -> bool:
         """Queue one frame; False and counted when the queue is full, the interface down or the controller bus-off."""
         counters = self.counters
+        if counters.bus_off:  # frames would wait in the queue and go out stale after a restart
+            return False
         try:
             self._socket.send(CAN_FRAME.pack(can_id, len(data), data))
         except OSError as error:
             if error.errno in _QUEUE_FULL:
                 counters.queue_full += 1
-            elif error.errno in _DOWN:
-                counters.down = True
             else:
-                raise
+                counters.down = True
             return False
         counters.sent += 1
         counters.down = False  # the interface takes frames again
@@ -106,13 +105,12 @@ class SocketCanBus:
                 packet, ancillary, _, _ = self._socket.recvmsg(CAN_FRAME.size, _ANCILLARY_BYTES)
             except BlockingIOError:
                 return None
-            except OSError as error:
-                if error.errno not in _DOWN:
-                    raise
+            except OSError:  # ENETDOWN and its like: a state, until frames flow again
                 self.counters.down = True
                 return None
-            if len(packet) < CAN_FRAME.size:
-                continue
+            if len(packet) < CAN_FRAME.size:  # the other end of the socket is gone
+                self.counters.down = True
+                return None
             can_id, length, data = CAN_FRAME.unpack(packet)
             if can_id & CAN_ERR_FLAG:
                 count_error_frame(self.counters, can_id, data[:length])
