@@ -12,9 +12,8 @@ IDENTITY = (0x5EBD, 0x402, 0x10000, 1)
 
 def ask(bench: Bench, command: int, *numbers: int) -> list[bytes]:
     bench.heard.clear()
-    bench.bus.send(
-        0x7E5, struct.pack("<B", command) + b"".join(n.to_bytes(4, "little") for n in numbers).ljust(7, b"\0")
-    )
+    arguments = b"".join(n.to_bytes(4, "little") for n in numbers)
+    bench.bus.send(0x7E5, bytes((command,)) + arguments.ljust(7, b"\0"))
     bench.pass_time(0.002)
     return bench.frames(0x7E4)
 
