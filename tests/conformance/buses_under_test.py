@@ -14,8 +14,6 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-import can
-
 from servod.axis_model import AxisModel
 from servod.bus import Bus
 from servod.bus.open import open_bus
@@ -79,7 +77,7 @@ def hub() -> Iterator[Wire]:
 def python_can() -> Iterator[Wire]:
     """python-can's own virtual bus by the adapter; in a configuration its name means servod's virtual bus."""
     channel = uuid.uuid4().hex
-    one, other = (PythonCanBus(can.Bus(interface="virtual", channel=channel)) for _ in range(2))
+    one, other = (PythonCanBus.open("virtual", channel, 1_000_000, {}) for _ in range(2))
     yield Wire(one, other, bounded=False)
     one.close()
     other.close()

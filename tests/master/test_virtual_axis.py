@@ -9,6 +9,7 @@ import pytest
 from rig import Rig, stepped_world
 
 from servod.cia import NmtCommand, Obj402
+from servod.drivers.cia406_setup import preset
 from servod.drivers.virtual.bus_faults import BusFault, FaultKind
 from servod.errors import FaultCode, Unreachable
 from servod.hal import DriveState, Goal, Reason, SdoAbort
@@ -262,3 +263,12 @@ def test_an_orderly_end_leaves_no_fault_behind(enabled: Rig) -> None:
     again = Rig(enabled.world)
     again.start()
     assert again.until(Goal.ENABLED).error_code == 0
+
+
+def test_a_preset_moves_the_encoders_zero_and_is_no_motion(rig: Rig) -> None:
+    rig.run(5, Goal.OFF)
+    preset(rig.master.sdo(2), 4096)
+    rig.encoder.forget()
+    _, encoder = rig.run(2, Goal.OFF)
+    assert encoder.position_rad == pytest.approx(4096 * 2 * math.pi / 2**20, abs=1e-5)
+    assert encoder.velocity_rad_s == 0.0
