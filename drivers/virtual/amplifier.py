@@ -114,6 +114,7 @@ class AmplifierNode(Node):
         self.machine.start(time_ns)
         self._mode_taken(time_ns)
         self._watch.arm(time_ns + _WATCH_NS)
+        self._write_record(time_ns)
 
     def commanded(self, time_ns: int) -> None:
         """New control word or targets: judge the word with everything of its PDO in place."""

@@ -26,6 +26,7 @@ from servod.units import NS_PER_S
 __all__ = ["SteppedBus", "SteppedClock", "SteppedWorld", "Truth", "VirtualAxisSettings", "World"]
 
 _NODE_QUEUE = 1024
+_RECEIVE_QUEUE = 65_536
 _MS_NS, _US_NS = 1_000_000, 1_000
 
 
@@ -158,8 +159,9 @@ class SteppedClock:
 class SteppedBus:
     """servod.bus.Bus inside the process; `receive` lets virtual time pass until a frame comes."""
 
-    def __init__(self, world: World, clock: SteppedClock) -> None:
+    def __init__(self, world: World, clock: SteppedClock, can_ids: tuple[int, ...] | None = None) -> None:
         self._world, self._clock = world, clock
+        self._accepted = None if can_ids is None else frozenset(can_ids)
         self._frames: deque[Frame] = deque()
         self.counters = BusCounters()
         settings = world.settings
@@ -207,7 +209,13 @@ class SteppedBus:
             self._world.hub.detach(self.port)
 
     def _deliver(self, can_id: int, data: bytes, time_ns: int) -> None:
-        self._frames.append(Frame(can_id, data, time_ns))
+        """Take a frame that passes the filter; one that nobody reads away is lost, as in a socket's full buffer."""
+        if self._accepted is not None and can_id not in self._accepted:
+            return
+        if len(self._frames) < _RECEIVE_QUEUE:
+            self._frames.append(Frame(can_id, data, time_ns))
+        else:
+            self.counters.error_frames += 1
 
     def _state_changed(self, state: ErrorState, time_ns: int) -> None:
         self.counters.error_frames += 1
@@ -229,9 +237,9 @@ class SteppedWorld(World):
         self.clock = SteppedClock(self, start_ns)
         self.devices.power_on(start_ns)
 
-    def connect(self) -> SteppedBus:
-        """A new connection to the bus."""
-        return SteppedBus(self, self.clock)
+    def connect(self, can_ids: tuple[int, ...] | None = None) -> SteppedBus:
+        """A new connection to the bus; with `can_ids`, only these reach it."""
+        return SteppedBus(self, self.clock, can_ids)
 
     def truth(self, time_ns: int | None = None) -> Truth:
         """The joint's true state at the present virtual time."""

@@ -166,3 +166,13 @@ def test_the_same_seed_gives_the_same_frames() -> None:
         return [*bench.heard, bench.world.truth()]
 
     assert run() == run()
+
+
+def test_a_filtered_stepped_connection_gets_only_its_identifiers(bench: Bench) -> None:
+    filtered = bench.world.connect((0x282,))
+    bench.operational()
+    bench.cycle(cycles=3)
+    identifiers = []
+    while (frame := filtered.receive()) is not None:
+        identifiers.append(frame.can_id)
+    assert set(identifiers) == {0x282}
