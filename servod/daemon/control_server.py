@@ -7,6 +7,7 @@ command: the first that does holds the lease until it disconnects. Protocol: ser
 
 from __future__ import annotations
 
+import errno
 import os
 import selectors
 import socket
@@ -253,21 +254,29 @@ def _request(message: dict[str, Any]) -> tuple[Verb, dict[str, Any]]:
 
 
 def _listen(path: Path, group: int | None) -> socket.socket:
-    """Bind at `path`, readable and writable for owner and group only, in place of a stale socket."""
+    """Listen at `path`, for owner and group only, in place of a stale socket; whoever sees it can connect."""
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK)
+    aside = path.with_name(f"{path.name}+")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        if path.exists() and stat.S_ISSOCK(path.stat().st_mode):
-            path.unlink()
-        before = os.umask(0o117)
-        try:
-            listener.bind(str(path))
-        finally:
-            os.umask(before)
-        if group is not None and (os.geteuid() == 0 or group in os.getgroups()):
-            os.chown(path, -1, group)
+        aside.unlink(missing_ok=True)
+        _bind(listener, aside, group)
         listener.listen(_BACKLOG)
+        if path.exists() and not stat.S_ISSOCK(path.stat().st_mode):
+            raise FileExistsError(errno.EEXIST, "a file that is no socket stands there")
+        aside.replace(path)
     except OSError as error:
         listener.close()
+        aside.unlink(missing_ok=True)
         raise Unreachable(f"{path}: cannot listen there ({error.strerror or error})") from None
     return listener
+
+
+def _bind(listener: socket.socket, path: Path, group: int | None) -> None:
+    before = os.umask(0o117)
+    try:
+        listener.bind(str(path))
+    finally:
+        os.umask(before)
+    if group is not None and (os.geteuid() == 0 or group in os.getgroups()):
+        os.chown(path, -1, group)
