@@ -9,12 +9,11 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from servod.benchmark.axis import local_gains, stepped_session
+from servod.benchmark.axis import stepped_session
 from servod.bus import Bus, Frame
 from servod.clock import Clock
 from servod.commands import Op, ReferenceKind
-from servod.controllers.engine import Controller
-from servod.references import paper
+from servod.controllers.benchmark import controller_benchmark
 from servod.units import NS_PER_US
 
 _WARM_UP = 500
@@ -87,17 +86,10 @@ def _whole_tick(ticks: int) -> dict[str, Any]:
 
 
 def _controller(ticks: int) -> dict[str, Any]:
-    """The local-model law on trajectory (19), with an error of half a milliradian."""
-    gains = local_gains()
-    controller = Controller()
-    controller.activate(gains.law.number, gains.pack(), 0.0)
-    period_s, torque_nm, times_ns = 0.001, 0.0, []
-    for k in range(ticks + _WARM_UP):
-        x, v, a = paper((k * period_s) % 30.0)
-        started = time.perf_counter_ns()
-        torque_nm = controller.step(x, v, a, x - 0.0005, v, torque_nm, period_s).u
-        times_ns.append(time.perf_counter_ns() - started)
-    return _figures(times_ns)
+    """The local-model law with the paper's nine sets; the other laws beside it."""
+    timings = {timing.law: timing for timing in controller_benchmark(ticks)}
+    medians = {law: timing.median_us for law, timing in timings.items()}
+    return {"median": medians["local"], "p99": timings["local"].p99_us, "cycles": ticks, "median_by_law": medians}
 
 
 def _figures(times_ns: list[int]) -> dict[str, Any]:

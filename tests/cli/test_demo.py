@@ -1,0 +1,106 @@
+"""The demo as its user sees it: the JSON document, the report, and nothing left running however it ends."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from servod.cli.app import run
+
+#: Both lines of the paper's story: feedback alone sticks, a friction model removes most of the error.
+STUCK_MRAD, COMPENSATED_MRAD = 10.0, 2.0
+
+
+def check(document: dict, out: Path) -> None:
+    """The contract's keys, errors in the right order, and a report."""
+    scores = document["controllers"]
+    assert list(scores) == ["pd", "pd_dob", "pd_lugre", "local"]
+    for score in scores.values():
+        assert set(score) == {"rms_error_mrad", "max_error_mrad"}
+        assert 0.0 < score["rms_error_mrad"] <= score["max_error_mrad"]
+    rms = {name: score["rms_error_mrad"] for name, score in scores.items()}
+    assert rms["pd"] > STUCK_MRAD
+    assert max(rms["pd_dob"], rms["pd_lugre"], rms["local"]) < COMPENSATED_MRAD
+    assert rms["local"] == min(rms.values())
+    assert document["wall_s"] > 0.0
+    assert (out / "report.html").stat().st_size > 1_000_000
+
+
+def test_the_fast_demo_prints_one_document(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["demo", "--fast", "--seconds", "5", "--json", "--out", str(tmp_path)]) == 0
+    captured = capsys.readouterr()
+    document = json.loads(captured.out)
+    check(document, tmp_path)
+    assert captured.err == ""
+    assert document["missed"] == 0
+    assert document["cycles"] == pytest.approx(4 * 5000, abs=8)
+
+
+def test_the_plant_can_be_another_joint(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plant = tmp_path / "smooth.yaml"
+    plant.write_text("inertia: 0.001\nfriction: {kind: coulomb_viscous, viscous: 0.056, coulomb: 0.001}\n")
+    assert run(["demo", "--fast", "--seconds", "3", "--json", "--out", str(tmp_path), "--plant", str(plant)]) == 0
+    scores = json.loads(capsys.readouterr().out)["controllers"]
+    assert scores["pd"]["rms_error_mrad"] < STUCK_MRAD
+
+
+def start(tmp_path: Path, *arguments: str) -> subprocess.Popen[str]:
+    """The demo on the wall clock, with its temporary files under `tmp_path`."""
+    command = [sys.executable, "-m", "servod.cli", "demo", "--out", str(tmp_path / "out"), *arguments]
+    environment = os.environ | {"TMPDIR": str(tmp_path)}
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def started_by(tmp_path: Path) -> list[str]:
+    """Command lines of all processes that name a file under `tmp_path`, the demo itself not counted."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            command = (process / "cmdline").read_bytes().replace(b"\0", b" ").decode()
+        except OSError:
+            continue
+        if f"{tmp_path}/servod-demo-" in command:
+            found.append(command)
+    return found
+
+
+def wait_until_it_moves(tmp_path: Path) -> None:
+    deadline = time.monotonic() + 30.0
+    while not list(tmp_path.glob("out/recordings/pd.mcap")):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+
+
+@pytest.mark.serial
+def test_the_demo_on_the_wall_clock(tmp_path: Path) -> None:
+    demo = start(tmp_path, "--seconds", "4", "--json")
+    out, err = demo.communicate(timeout=100)
+    assert (demo.returncode, err) == (0, "")
+    check(json.loads(out), tmp_path / "out")
+    assert sorted(f.stem for f in (tmp_path / "out/recordings").glob("*.mcap")) == ["local", "pd", "pd_dob", "pd_lugre"]
+    assert started_by(tmp_path) == []
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 130), (signal.SIGHUP, 130), (signal.SIGKILL, -9)]
+)
+def test_nothing_is_left_running(tmp_path: Path, number: signal.Signals, code: int) -> None:
+    demo = start(tmp_path)
+    wait_until_it_moves(tmp_path)
+    assert len(started_by(tmp_path)) >= 2
+    demo.send_signal(number)
+    _, err = demo.communicate(timeout=30)
+    assert demo.returncode == code
+    assert "Traceback" not in err
+    deadline = time.monotonic() + 10.0
+    while started_by(tmp_path):
+        assert time.monotonic() < deadline, started_by(tmp_path)
+        time.sleep(0.1)
