@@ -130,7 +130,7 @@ class AmplifierNode(Node):
     def connection_lost(self, time_ns: int) -> None:
         """Abort connection option code 0x6007."""
         option = self.dictionary.value(Obj402.ABORT_CONNECTION)
-        if self.machine.state not in (DriveState.OPERATION_ENABLED, DriveState.SWITCHED_ON):
+        if self.machine.state is not DriveState.SWITCHED_ON and self.machine.state not in ENERGISED:
             return
         if option == _ABORT_FAULT:
             self._fault(Emcy.HEARTBEAT_LOST, time_ns)

@@ -24,6 +24,8 @@ def frame_bits(can_id: int, data_bytes: int) -> int:
 
 def arbitration_key(can_id: int) -> int:
     """The number that arbitration compares; the lowest wins. Base before extended, data before remote."""
+    if can_id <= 0x7FF:
+        return can_id << 21
     remote = 1 if can_id & CAN_RTR_FLAG else 0
     if can_id & CAN_EFF_FLAG:
         identifier = can_id & 0x1FFFFFFF

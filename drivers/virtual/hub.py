@@ -23,7 +23,7 @@ class Hub:
     def __init__(self, timeline: Timeline, bit_rate: int = 1_000_000) -> None:
         self._timeline = timeline
         self._bit_ns = NS_PER_S // bit_rate
-        self._ports: list[Port] = []
+        self._ports: tuple[Port, ...] = ()
         self._sender: Port | None = None
         self._frame: tuple[int, bytes, int] = (0, b"", 0)
         self._end_ns = 0  # of the frame on the wire, or of the last one
@@ -36,16 +36,16 @@ class Hub:
     @property
     def ports(self) -> tuple[Port, ...]:
         """All participants, in the order of joining."""
-        return tuple(self._ports)
+        return self._ports
 
     def attach(self, port: Port) -> Port:
         """Let `port` take part."""
-        self._ports.append(port)
+        self._ports = (*self._ports, port)
         return port
 
     def detach(self, port: Port) -> None:
         """`port` leaves; its waiting frames vanish."""
-        self._ports.remove(port)
+        self._ports = tuple(other for other in self._ports if other is not port)
         self._waiting -= len(port.queue)
         port.queue.clear()
         if self._sender is port:
@@ -82,8 +82,12 @@ class Hub:
             self._bus_off(port, time_ns)
 
     def _next_start_ns(self) -> int:
-        first_ns = min((port.queue[0][2] for port in self._ports if port.queue), default=NEVER)
-        return max(first_ns, self._end_ns)
+        first_ns = NEVER
+        for port in self._ports:
+            queue = port.queue
+            if queue and queue[0][2] < first_ns:
+                first_ns = queue[0][2]
+        return first_ns if first_ns > self._end_ns else self._end_ns
 
     def _start(self, limit_ns: int) -> bool:
         """Arbitrate at the next moment at which the bus is free and somebody waits."""
@@ -92,8 +96,9 @@ class Hub:
             return False
         winner, best = None, NEVER
         for port in self._ports:
-            if port.queue and port.queue[0][2] <= start_ns:
-                key = arbitration_key(port.queue[0][0])
+            queue = port.queue
+            if queue and queue[0][2] <= start_ns:
+                key = arbitration_key(queue[0][0])
                 if key < best:
                     winner, best = port, key
         if winner is None:
@@ -120,7 +125,7 @@ class Hub:
             self._forgive(sender, end_ns)
         if fault is FaultKind.DROP:
             return
-        for port in list(self._ports):
+        for port in self._ports:
             if port is not sender and port.silent_until_ns <= end_ns and port.state is not ErrorState.BUS_OFF:
                 port.receive(can_id, data, end_ns)
 

@@ -15,7 +15,7 @@ from typing import Any
 
 from servod.axis_model import AxisModel, load_axis_model
 from servod.drivers.virtual.drive_record import DriveRecord
-from servod.drivers.virtual.on_can import CanServer
+from servod.drivers.virtual.on_can import CanServer, open_pair
 from servod.drivers.virtual.server import HubServer, Timing
 from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.drivers.virtual.world import World
@@ -66,7 +66,7 @@ def _server(arguments: argparse.Namespace) -> HubServer | CanServer:
     model: AxisModel = load_axis_model(arguments.plant or shipped("gains/axes/demo_joint.yaml"))
     record = DriveRecord(arguments.record) if arguments.record else None
     if arguments.can:
-        return CanServer(settings, model, arguments.can, record)
+        return CanServer(settings, model, open_pair(arguments.can), record)
     world = World(settings, model, record)
     server = HubServer(world, arguments.socket, Timing(arguments.timing))
     world.devices.power_on(time.monotonic_ns())

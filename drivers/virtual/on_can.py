@@ -25,14 +25,13 @@ _BURST = 64
 
 
 class CanServer:
-    """The devices on a SocketCAN interface until `stop`. Raises Unreachable when the interface is not there."""
+    """The devices on `buses`, the amplifier's and the encoder's connection, until `stop`."""
 
     def __init__(
-        self, settings: VirtualAxisSettings, model: AxisModel, interface: str, record: DriveRecord | None
+        self, settings: VirtualAxisSettings, model: AxisModel, buses: tuple[Bus, Bus], record: DriveRecord | None
     ) -> None:
         self._timeline = Timeline()
-        config = BusConfig(interface="socketcan", channel=interface, bit_rate=settings.bit_rate)
-        self._buses = (open_bus(config), open_bus(config))
+        self._buses = buses
         self._devices = Devices(settings, model, self._timeline, record)
         self._devices.build(*(_sender(bus) for bus in self._buses))
         self._bus_off = [False, False]
@@ -70,6 +69,12 @@ class CanServer:
         if off is not self._bus_off[number]:
             self._bus_off[number] = off
             node.bus_state(ErrorState.BUS_OFF if off else ErrorState.ACTIVE, time.monotonic_ns())
+
+
+def open_pair(interface: str) -> tuple[Bus, Bus]:
+    """One connection for each node. Raises Unreachable when the interface is not there."""
+    config = BusConfig(interface="socketcan", channel=interface)
+    return open_bus(config), open_bus(config)
 
 
 def _sender(bus: Bus) -> Send:

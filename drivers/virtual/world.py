@@ -93,7 +93,7 @@ class World:
     def advance_once(self, now_ns: int, bus_ns: int) -> bool:
         """The next single event; False when none is due."""
         timer_ns = self.timeline.next_ns()
-        if self.hub.step(timer_ns if timer_ns < bus_ns else bus_ns):
+        if self.hub.step(timer_ns if timer_ns <= now_ns else bus_ns):
             return True
         if timer_ns <= now_ns:
             self.timeline.fire_next()

@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,11 +17,16 @@ import canopen
 import pytest
 
 from servod import drivers
+from servod.axis_model import load_axis_model
+from servod.bus.socketcan import SocketCanBus
 from servod.drivers.virtual.bus_faults import BusFault, FaultKind
 from servod.drivers.virtual.client import VirtualBus
 from servod.drivers.virtual.drive_record import DriveRecord, read_drive_record
+from servod.drivers.virtual.on_can import CanServer
+from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.errors import BadInput, Unreachable
 from servod.hal import DriveState
+from servod.shipped import shipped
 
 EDS = Path(drivers.__file__).parent / "eds"
 
@@ -216,3 +222,65 @@ def test_paced_timing_waits_for_the_bus(tmp_path: Path) -> None:
     finally:
         running.process.kill()
         running.process.communicate()
+
+
+def test_a_busy_bus_makes_send_fail_without_blocking(tmp_path: Path) -> None:
+    running = Axis(tmp_path, "--bit-rate", "10000")
+    try:
+        bus = VirtualBus(str(running.bus))
+        start = time.monotonic()
+        accepted = [bus.send(0x7FF, bytes(8)) for _ in range(2000)]
+        assert time.monotonic() - start < 1.0
+        assert accepted[0]
+        assert not accepted[-1]
+        assert bus.counters.queue_full == accepted.count(False)
+        assert bus.counters.sent == accepted.count(True)
+    finally:
+        running.process.kill()
+        running.process.communicate()
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "named"),
+    [
+        (["--can", "nosuchcan0"], 3, "nosuchcan0"),
+        (["--socket", "{folder}/no/such/folder/bus"], 2, "no/such/folder"),
+        (["--socket", "{folder}/bus", "--plant", "{folder}/missing.yaml"], 2, "missing.yaml"),
+        (["--socket", "{folder}/bus", "--settings", "{folder}/settings.yaml"], 2, "rated_torque_mnm"),
+        (["--socket", "{folder}/bus", "--seed", "-1"], 2, "seed"),
+        (["--socket", "{folder}/bus", "--encoder-node-id", "1"], 2, "node_id"),
+        (["--socket", "{folder}/bus", "--record", "{folder}/no/record"], 2, "no/record"),
+    ],
+)
+def test_bad_input_is_one_line(tmp_path: Path, options: list[str], code: int, named: str) -> None:
+    (tmp_path / "settings.yaml").write_text("rated_torque: 100\n")
+    command = [sys.executable, "-m", "servod.drivers.virtual.main", *(o.format(folder=tmp_path) for o in options)]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=30)
+    assert result.returncode == code
+    assert result.stderr.count("\n") == 1
+    assert named in result.stderr
+
+
+def test_the_same_nodes_on_socketcan_sockets() -> None:
+    """Two packet sockets of `struct can_frame` stand for two controllers on vcan."""
+    ends = [socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in range(2)]
+    masters = [SocketCanBus(end[0]) for end in ends]
+    model = load_axis_model(shipped("gains/axes/demo_joint.yaml"))
+    server = CanServer(VirtualAxisSettings(), model, (SocketCanBus(ends[0][1]), SocketCanBus(ends[1][1])), None)
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    try:
+        for master, node_id, device_type in zip(masters, (1, 2), (0x192, 0x196), strict=True):
+            boot = master.receive(5.0)
+            assert boot is not None
+            assert (boot.can_id, boot.data) == (0x700 + node_id, b"\0")
+            master.send(0x600 + node_id, bytes.fromhex("4000100000000000"))
+            answer = master.receive(5.0)
+            assert answer is not None
+            assert answer.data[4:6] == device_type.to_bytes(2, "little")
+    finally:
+        server.stop()
+        thread.join(5.0)
+        server.close()
+        for master in masters:
+            master.close()
