@@ -11,6 +11,7 @@ from servod.drivers import load_driver
 from servod.drivers.setup_tools import read_optional, write_checked
 from servod.errors import BadInput, FaultCode, Unreachable
 from servod.hal import Driver, NodePlan, Setup
+from servod.master.dcf import write_parameters
 from servod.master.eds import dictionary_for
 from servod.master.identity import check_identity, read_identity
 from servod.master.monitor import NodeWatch
@@ -80,9 +81,16 @@ class Node:
             raise Unreachable(f"node {self.node_id}: no boot-up {_BOOT_UP_S:g} s after reset communication")
 
     def configure(self) -> tuple[NodePlan, list[str]]:
-        """Parameters, then mapping written, read back and compared; the plan with its facts, and the report."""
-        plan = self.setup.configure(self.sdo)
-        report = configure_pdos(self.sdo, plan, self.dictionary)
+        """Parameters, then mapping written, read back and compared; the plan with its facts, and the report.
+
+        The set-up face goes first, because it refuses a powered device; after values of a DCF it goes again, because
+        its scalings and options have the last word.
+        """
+        plan, report = self.setup.configure(self.sdo), []
+        if written := write_parameters(self.sdo, self.dictionary):
+            plan = self.setup.configure(self.sdo)
+            report.append(f"node {self.node_id}: {written} parameters written from {self.dictionary.source}")
+        report += configure_pdos(self.sdo, plan, self.dictionary)
         report += [f"node {self.node_id}: {note}" for note in plan.facts.pop("notes", [])]
         return plan, report
 

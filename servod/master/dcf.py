@@ -1,0 +1,38 @@
+"""Writes the parameter values of a DCF to a node. Off the control path.
+
+A DCF is an EDS with ParameterValue keys: how somebody configured this device with the maker's tool. Only the device's
+own objects (0x2000 and up) are taken from it; communication objects are the bring-up's, which verifies them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from canopen.objectdictionary import ODVariable, datatypes
+
+from servod.drivers.setup_tools import write_checked
+from servod.hal import SdoAccess
+from servod.master.eds import Dictionary
+
+_FIRST_DEVICE_OBJECT = 0x2000
+_WRITABLE = ("rw", "rww", "rwr")  # CiA 306; write-only objects are commands, not parameters
+
+
+def parameters(dictionary: Dictionary) -> Iterator[tuple[int, int, int]]:
+    """(index, subindex, value) of the device's writable integers that the file gives a value, by rising index."""
+    for index in sorted(dictionary.objects):
+        entry = dictionary.objects[index]
+        for variable in (entry,) if isinstance(entry, ODVariable) else entry.values():
+            writable = variable.access_type in _WRITABLE and variable.data_type in datatypes.INTEGER_TYPES
+            if index >= _FIRST_DEVICE_OBJECT and writable and variable.value is not None:
+                yield index, variable.subindex, variable.value
+
+
+def write_parameters(sdo: SdoAccess, dictionary: Dictionary) -> int:
+    """Write each value that the node does not have yet and read it back; how many were written. Raises as SDO does."""
+    written = 0
+    for index, subindex, value in parameters(dictionary):
+        if sdo.read(index, subindex) != value:
+            write_checked(sdo, index, subindex, value)
+            written += 1
+    return written
