@@ -14,15 +14,15 @@ Array = NDArray[np.float64]
 #: Rows that a local cubic spans, shortest first.
 SPANS: tuple[int, ...] = (5, 7, 11, 15, 21, 31, 45)
 
-#: Standard errors by which a longer span's velocity may leave that of a shorter one.
+#: Standard errors by which a longer span may leave a shorter one.
 AGREE = 2.0
 
 
 def smoothed_motion(t_s: Array, position: Array) -> Array:
     """Rows of position, velocity, acceleration at the rows' own times; uneven rows go over an even grid.
 
-    Lepski's rule: from the shortest span upward, the longest one whose velocity agrees with all shorter ones within
-    their standard errors (Lepski, Theory Probab. Appl. 35, 1990).
+    Lepski's rule: from the shortest span upward, the longest one whose position and velocity agree with all shorter
+    ones within their standard errors (Lepski, Theory Probab. Appl. 35, 1990).
     """
     period = float(np.median(np.diff(t_s)))
     even = t_s[0] + period * np.arange(round((t_s[-1] - t_s[0]) / period) + 1)
@@ -51,14 +51,14 @@ def _lepski(position: Array, period: float, spans: list[int], noise: float) -> l
     from scipy.signal import savgol_coeffs, savgol_filter
 
     chosen = [savgol_filter(position, spans[0], 3, deriv=d, delta=period) for d in range(3)]
-    low, high = np.full(len(position), -np.inf), np.full(len(position), np.inf)
+    low, high = np.full((2, len(position)), -np.inf), np.full((2, len(position)), np.inf)
     alive = np.ones(len(position), dtype=bool)
     for span in spans:
-        velocity = savgol_filter(position, span, 3, deriv=1, delta=period)
-        error = AGREE * noise * float(np.linalg.norm(savgol_coeffs(span, 3, deriv=1, delta=period)))
-        low, high = np.maximum(low, velocity - error), np.minimum(high, velocity + error)
-        alive &= low <= high
-        for order in range(3):
-            part = savgol_filter(position, span, 3, deriv=order, delta=period)
-            chosen[order] = np.where(alive, part, chosen[order])
+        parts = [savgol_filter(position, span, 3, deriv=d, delta=period) for d in range(3)]
+        for order in range(2):
+            gain = float(np.linalg.norm(savgol_coeffs(span, 3, deriv=order, delta=period)))
+            low[order] = np.maximum(low[order], parts[order] - AGREE * noise * gain)
+            high[order] = np.minimum(high[order], parts[order] + AGREE * noise * gain)
+            alive &= low[order] <= high[order]
+        chosen = [np.where(alive, part, kept) for part, kept in zip(parts, chosen, strict=True)]
     return chosen

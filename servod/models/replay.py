@@ -59,6 +59,12 @@ class Drive:
         return bool(abs(speed[0]) <= AT_REST_SHARE * np.sqrt(np.mean(speed**2)))
 
     @cached_property
+    def stands_still(self) -> bool:
+        """Whether the first two rows show one position, within noise: the axis rests at the first row, surely."""
+        first = abs(float(self.position[1] - self.position[0]))
+        return self.starts_at_rest and first <= 4.0 * noise_rms(self.position)
+
+    @cached_property
     def torque_before(self) -> float:
         """The command before the first row: 0 when the axis rests and then sets off, else the first row's.
 
@@ -121,14 +127,13 @@ def start_states(parameters: Array, drive: Drive, starts: NDArray[np.int64]) -> 
     """State at the rows `starts`: position, velocity, bristle, load position, load velocity, actuator torque."""
     state = _fresh_state(drive)
     hidden = np.zeros((len(drive.t_s), 4))
-    motion = drive.motion
+    motion = drive.motion.copy()
+    if drive.stands_still or (len(starts) == 1 and drive.starts_at_rest):
+        motion[0] = drive.position[0], 0.0, 0.0
     follow = _kernel(open_loop.follow)
     step_s = min(4.0 * INNER_STEP_S, drive.period_s)
     follow(parameters, state, drive.t_s, motion, drive.torque, drive.torque_before, drive.temperature_c, hidden, step_s)
-    states = np.column_stack([motion[starts, :2], hidden[starts]])
-    if len(starts) == 1 and drive.starts_at_rest:
-        states[0] = drive.position[0], 0.0, 0.0, drive.position[0], 0.0, 0.0
-    return states
+    return np.column_stack([motion[starts, :2], hidden[starts]])
 
 
 def _fresh_state(drive: Drive) -> Array:

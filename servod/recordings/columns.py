@@ -93,8 +93,11 @@ def apply_map(
     return chosen, [name for name in present if name not in used]
 
 
-def axis_of(names: Iterable[str], where: str) -> AxisKind:
-    """Whether these canonical columns belong to a rotary or a linear axis. Raises BadInput when neither is complete."""
+def axis_of(names: Iterable[str], foreign: Iterable[str], where: str) -> AxisKind:
+    """Whether these canonical columns belong to a rotary or a linear axis; `foreign` are all that the file has.
+
+    Raises BadInput when neither set is complete.
+    """
     present = set(names)
     for axis in AxisKind:
         if all(quantity.column(axis) in present for quantity in REQUIRED):
@@ -103,9 +106,7 @@ def axis_of(names: Iterable[str], where: str) -> AxisKind:
     axis = AxisKind.LINEAR if linear else AxisKind.ROTARY
     missing = [q.column(axis) for q in REQUIRED if q.column(axis) not in present]
     wanted = "t_s, torque_nm, position_rad (rotary) or t_s, force_n, position_m (linear), or a --map file"
-    raise BadInput(
-        f"{where}: column {missing[0]}", f"none (columns: {', '.join(sorted(present)) or 'none known'})", wanted
-    )
+    raise BadInput(f"{where}: column {missing[0]}", f"none (columns: {', '.join(foreign)[:200]})", wanted)
 
 
 def _near(name: str, allowed: Iterable[str]) -> str:

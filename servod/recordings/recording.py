@@ -83,7 +83,7 @@ def load_recording(path: str | Path, map_path: str | Path | None = None) -> Reco
     foreign = read_columns(path)
     sources = load_column_map(Path(map_path)) if map_path is not None else {}
     chosen, unused = apply_map(foreign, sources, str(path))
-    axis = axis_of(chosen, str(path))
+    axis = axis_of(chosen, foreign, str(path))
     columns = {}
     for quantity in Quantity:
         source = chosen.get(quantity.column(axis))
