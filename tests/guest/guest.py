@@ -1,0 +1,133 @@
+"""A whole Linux in one process (user-mode-linux): real SocketCAN and real systemd where the host has neither.
+
+    python tests/guest/guest.py      build the image if need be, run everything inside, print the results as JSON lines
+
+Needs: apt-get install user-mode-linux mmdebstrap e2fsprogs gcc; root, and the network once.
+The image (Debian with systemd, and what servod needs of PyPI) is kept in ~/.cache/servod-guest; servod itself comes
+fresh with each run through a shared folder. One slow CPU: behaviour is tested there, never timing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import tomllib
+from pathlib import Path
+from typing import Any
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+CACHE = Path(os.environ.get("SERVOD_GUEST_CACHE", Path.home() / ".cache" / "servod-guest"))
+PACKAGES = "systemd,systemd-sysv,dbus,python3,iproute2,kmod,procps"
+GUEST_PYTHON = "3.11"  # Debian bookworm's
+BOOT_TIMEOUT_S = 420
+
+#: Runs at the end of the boot; the shared folder's path on the host stands on the kernel's command line.
+_TESTS_UNIT = """\
+[Unit]
+Description=servod tests
+[Service]
+Type=oneshot
+TimeoutStartSec=infinity
+ExecStart=/bin/sh -c 'mount -t hostfs none /mnt -o "$(sed "s/.*servod.share=//; s/ .*//" /proc/cmdline)"'
+ExecStart=/usr/bin/python3 /mnt/inside.py /mnt
+ExecStopPost=/bin/systemctl --no-block poweroff
+StandardOutput=journal+console
+"""
+
+
+def dependencies() -> list[str]:
+    """What the plain install of servod needs, and numpy for a plant that is fast enough here."""
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
+    numeric = [d for d in project["optional-dependencies"]["lab"] if d.startswith(("numpy", "numba"))]
+    return [*project["dependencies"], *numeric]
+
+
+def image() -> Path:
+    """The guest's disk, built when it is missing or the dependencies changed."""
+    key = hashlib.sha256(json.dumps([PACKAGES, GUEST_PYTHON, _TESTS_UNIT, dependencies()]).encode()).hexdigest()[:16]
+    path = CACHE / f"root-{key}.ext4"
+    if not path.exists():
+        CACHE.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=CACHE, prefix="build-") as folder:
+            _build(Path(folder) / "root", path)
+    return path
+
+
+def _build(root: Path, path: Path) -> None:
+    command = ["mmdebstrap", "--quiet", "--variant=minbase", f"--include={PACKAGES}", "bookworm", str(root)]
+    subprocess.run(command, check=True)
+    site = root / "usr/local/lib/python3.11/dist-packages"
+    command = [sys.executable, "-m", "pip", "install", "--quiet", "--only-binary=:all:", "--target", str(site)]
+    subprocess.run([*command, "--python-version", GUEST_PYTHON, *dependencies()], check=True)
+    shutil.copytree("/usr/lib/uml/modules", root / "lib/modules", dirs_exist_ok=True)
+    system = root / "etc/systemd/system"
+    for getty in ("serial-getty@ttyS0", "getty@tty1", "console-getty"):
+        (system / f"{getty}.service").symlink_to("/dev/null")
+    (system / "servod-tests.service").write_text(_TESTS_UNIT)
+    wants = system / "multi-user.target.wants"
+    wants.mkdir(exist_ok=True)
+    (wants / "servod-tests.service").symlink_to("../servod-tests.service")
+    aside = path.with_suffix(".part")
+    subprocess.run(["mke2fs", "-q", "-F", "-t", "ext4", "-d", str(root), "-L", "root", str(aside), "1400M"], check=True)
+    aside.replace(path)
+
+
+def _share(folder: Path) -> None:
+    """Everything of this run that the guest needs: servod as installed from its wheel, units, and the script."""
+    wheels = folder / "wheels"
+    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "-w", str(wheels), str(REPOSITORY)]
+    subprocess.run(command, check=True)
+    (wheel,) = wheels.glob("servod-*.whl")
+    shutil.unpack_archive(wheel, folder / "site", "zip")
+    for name in ("systemd", "gains"):
+        shutil.copytree(REPOSITORY / name, folder / name)
+    shutil.copy(Path(__file__).with_name("inside.py"), folder)
+
+
+def run() -> list[dict[str, Any]]:
+    """Boot, run tests/guest/inside.py, and give its results. Raises RuntimeError when the guest gives none."""
+    disk = image()
+    with tempfile.TemporaryDirectory(prefix="servod-guest-") as name:
+        folder = Path(name)
+        _share(folder)
+        console = _boot(disk, folder)
+        results = folder / "results.jsonl"
+        if not results.exists():
+            raise RuntimeError(f"the guest gave no results; its console ended with:\n{console[-4000:]}")
+        return [json.loads(line) for line in results.read_text().splitlines()]
+
+
+def _shim() -> Path:
+    """The library that whole_xstate.c explains."""
+    path = CACHE / "whole_xstate.so"
+    source = Path(__file__).with_name("whole_xstate.c")
+    subprocess.run(["cc", "-O2", "-shared", "-fPIC", "-o", str(path), str(source)], check=True)
+    return path
+
+
+def _boot(disk: Path, folder: Path) -> str:
+    """Run the guest to its end on one pinned CPU; returns what its console said."""
+    command = [
+        *("taskset", "-c", str(max(os.sched_getaffinity(0))), "linux.uml", "mem=768M"),
+        *(f"ubd0={folder / 'root.cow'},{disk}", "root=/dev/ubda", "rootfstype=ext4", "rw", "init=/sbin/init"),
+        *("con=null", "con0=fd:0,fd:1", "quiet", f"servod.share={folder}"),
+    ]
+    done = subprocess.run(
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        timeout=BOOT_TIMEOUT_S,
+        env={**os.environ, "LD_PRELOAD": str(_shim())},
+    )
+    return done.stdout.decode(errors="replace")
+
+
+if __name__ == "__main__":
+    for result in run():
+        print(json.dumps(result))
