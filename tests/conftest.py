@@ -1,0 +1,26 @@
+"""For all tests: which of them want the machine for themselves, and how property tests behave on a shared one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+
+ROOT = Path(__file__).resolve().parent
+
+#: Files (or folders) whose tests start real processes on the wall clock; `./test` runs them alone, after all others.
+SERIAL = ("faults", "daemon/test_daemon.py", "virtual/test_process.py")
+
+# A loaded machine is no finding; the examples are what counts.
+settings.register_profile("house", deadline=None)
+settings.load_profile("house")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests of SERIAL files, before the selection by marker."""
+    for item in items:
+        relative = item.path.relative_to(ROOT) if item.path.is_relative_to(ROOT) else item.path
+        if any(relative.is_relative_to(entry) for entry in SERIAL):
+            item.add_marker(pytest.mark.serial)
