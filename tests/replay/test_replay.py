@@ -58,7 +58,8 @@ def test_short_windows_hold_the_start_state() -> None:
     result = replay(joint(inertia=0.002, delay_s=0.001), drive, 0.1)
     assert len(result.starts) == 30
     assert np.max(np.abs(result.error[result.starts])) < 2e-5
-    assert np.allclose(result.velocity[result.starts], drive.motion[result.starts, 1])
+    assert np.allclose(result.velocity[result.starts[1:]], drive.motion[result.starts[1:], 1])
+    assert result.velocity[0] == 0.0  # it stood still when the recording began
 
 
 def test_a_free_run_starts_once_and_a_long_gap_starts_anew() -> None:
