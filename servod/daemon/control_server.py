@@ -278,5 +278,5 @@ def _bind(listener: socket.socket, path: Path, group: int | None) -> None:
         listener.bind(str(path))
     finally:
         os.umask(before)
-    if group is not None and (os.geteuid() == 0 or group in os.getgroups()):
+    if group not in (None, path.stat().st_gid) and (os.geteuid() == 0 or group in os.getgroups()):
         os.chown(path, -1, group)

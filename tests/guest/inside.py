@@ -82,6 +82,11 @@ def prop(name: str, unit: str = UNIT) -> str:
     return shell("systemctl", "show", "-p", name, "--value", unit).strip()
 
 
+def journal(unit: str = UNIT) -> str:
+    """What a unit said in this boot."""
+    return shell("journalctl", "-u", unit, "--no-pager", "-o", "cat")
+
+
 def wait_for(reached: Callable[[], Any], timeout_s: float = 60.0) -> Any:
     """Wait until `reached()` is true, and give it."""
     deadline = time.monotonic() + timeout_s
@@ -141,7 +146,7 @@ def drop_in(unit: str, text: str) -> None:
 def start() -> dict[str, Any]:
     """systemctl start returns only when the daemon said READY=1."""
     shell("systemctl", "start", "servod-virtual-axis.service")
-    time.sleep(5)
+    wait_for(lambda: "ready vcan0" in journal("servod-virtual-axis.service"), 240)
     shell("systemctl", "start", UNIT)
     now = status()
     return {
@@ -202,7 +207,7 @@ def recover(hit: Callable[[], None]) -> dict[str, Any]:
 def watchdog() -> dict[str, Any]:
     """A supervisor that hangs is killed by the watchdog."""
     result = recover(lambda: os.kill(int(prop("MainPID")), signal.SIGSTOP))
-    return {**result, "journal": "watchdog" in shell("journalctl", "-u", UNIT, "--no-pager", "-n", "200").lower()}
+    return {**result, "journal": "watchdog" in journal().lower()}
 
 
 def supervisor_killed() -> dict[str, Any]:
@@ -214,7 +219,7 @@ def loop_killed() -> dict[str, Any]:
     """kill -9 of the loop: LOOP_LOST in the journal, and the seconds before it in a file."""
     result = recover(lambda: os.kill(int(status()["loop"]["pid"]), signal.SIGKILL))
     files = list(Path("/var/lib/servod/guest/recordings").glob("*LOOP_LOST*.mcap"))
-    return {**result, "told": "LOOP_LOST" in shell("journalctl", "-u", UNIT, "--no-pager"), "files": len(files)}
+    return {**result, "told": "LOOP_LOST" in journal(), "files": len(files)}
 
 
 def bad_configuration() -> dict[str, Any]:
@@ -223,7 +228,7 @@ def bad_configuration() -> dict[str, Any]:
     unit = "servod@bad.service"
     shell("systemctl", "start", unit, check=False)
     time.sleep(4)
-    log = shell("journalctl", "-u", unit, "--no-pager", "-o", "cat")
+    log = journal(unit)
     return {
         "state": prop("ActiveState", unit),
         "exit_code": int(prop("ExecMainStatus", unit)),
@@ -242,7 +247,7 @@ def stop() -> dict[str, Any]:
         "active": prop("ActiveState"),
         "socket_left": Path(SOCKET).exists(),
         "metrics": "servod_axis_state" in Path("/var/lib/servod/metrics/guest.prom").read_text(),
-        "stopped_in_order": "the axis is disabled" in shell("journalctl", "-u", UNIT, "--no-pager", "-n", "50"),
+        "stopped_in_order": "the axis is disabled" in journal(),
     }
 
 
