@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from servod.axis_model import AxisModel
 from servod.models import open_loop
 from servod.models.compiled import Kernel, available, compiled
-from servod.models.layout import S_TEMPERATURE_C
+from servod.models.layout import S_TEMPERATURE_C, S_TORQUE
 from servod.models.motion import noise_rms, smoothed_motion
 from servod.models.plant import INNER_STEP_S, rest_state
 
@@ -138,6 +138,7 @@ def start_states(parameters: Array, drive: Drive, starts: NDArray[np.int64]) -> 
 
 def _fresh_state(drive: Drive) -> Array:
     state = np.array(rest_state(0.0))
+    state[S_TORQUE] = drive.torque_before
     if not math.isnan(drive.temperature_c[0]):
         state[S_TEMPERATURE_C] = drive.temperature_c[0]
     return state
