@@ -16,6 +16,9 @@ _HELP = example(
 )
 
 
+_PROFILE_MASK = 0xFFFF  # low word of 0x1000
+
+
 def register(app: typer.Typer) -> None:
     """Add the verb to `app`."""
     app.command("scan", help=_HELP)(scan)
@@ -52,11 +55,8 @@ def _on_bus(interface: str, channel: str, bit_rate: int) -> list[dict[str, Any]]
     from servod.yaml12 import validate
 
     config = validate({"interface": interface, "channel": channel, "bit_rate": bit_rate}, BusConfig, "servoctl scan")
-    bus = open_bus(config)
-    try:
-        return [asdict(node) for node in scan_bus(bus, WallClock())]
-    finally:
-        bus.close()
+    nodes = scan_bus(open_bus(config), WallClock())  # closes the bus
+    return [asdict(node) | {"lss": node.lss and node.lss._asdict()} for node in nodes]
 
 
 def _print(nodes: list[dict[str, Any]]) -> None:
@@ -66,13 +66,24 @@ def _print(nodes: list[dict[str, Any]]) -> None:
     if not nodes:
         print("no node answered")
         return
-    table = Table(*(key.replace("_", " ") for key in nodes[0]))
+    table = Table("Node", "Profile", "Vendor", "Product", "Revision", "Serial", "Name")
     for node in nodes:
-        table.add_row(*(_cell(key, value) for key, value in node.items()))
+        table.add_row(*_cells(node))
     Console().print(table)
 
 
-def _cell(key: str, value: object) -> str:
-    if value is None:
-        return "-"
-    return f"0x{value:X}" if isinstance(value, int) and key not in ("node_id", "serial") else str(value)
+def _cells(node: dict[str, Any]) -> list[str]:
+    """One row; a node without an id was found by LSS, which gives its identity alone."""
+    identity = node["identity"] or node["lss"] or {}
+    profile = identity.get("device_type", 0) & _PROFILE_MASK
+    return [
+        "none yet (LSS)" if node["node_id"] is None else str(node["node_id"]),
+        f"CiA {profile}" if profile else "-",
+        *(_hex(identity.get(key)) for key in ("vendor_id", "product_code", "revision")),
+        str(identity.get("serial", "-")),
+        node["name"],
+    ]
+
+
+def _hex(value: int | None) -> str:
+    return "-" if value is None else f"0x{value:X}"

@@ -1,0 +1,165 @@
+"""The verbs against a running daemon and virtual axis, as a user types them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from servod.cli.app import run
+from servod.control import ControlClient
+from servod.demo.axis import demo_config, gains_file, plant_file
+from servod.demo.wall import running_axis
+
+pytestmark = pytest.mark.serial
+
+
+@pytest.fixture(scope="module")
+def axis(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The control socket of a daemon on a virtual axis; recordings lie in `recordings` beside it."""
+    folder = tmp_path_factory.mktemp("axis")
+    config = demo_config(folder, folder / "recordings")
+    with running_axis(config, plant_file(None), folder):
+        yield config.control.socket
+
+
+class Servoctl:
+    """Types commands and reads what they print."""
+
+    def __init__(self, socket: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        self.socket, self._capsys = socket, capsys
+
+    def __call__(self, *words: str, code: int = 0) -> str:
+        """Standard output, or the one line on standard error when it shall fail."""
+        assert run([*words, "--socket", str(self.socket)]) == code, self._capsys.readouterr().err
+        captured = self._capsys.readouterr()
+        if code == 0:
+            assert captured.err == ""
+            return captured.out
+        assert (captured.out, len(captured.err.splitlines())) == ("", 1)
+        return captured.err
+
+    def json(self, *words: str) -> dict[str, Any]:
+        """The one JSON document."""
+        document: dict[str, Any] = json.loads(self(*words, "--json"))
+        return document
+
+    @property
+    def state(self) -> str:
+        """State of the axis."""
+        return str(self.json("status")["axis"]["state"])
+
+
+@pytest.fixture
+def servoctl(axis: Path, capsys: pytest.CaptureFixture[str]) -> Iterator[Servoctl]:
+    """On an axis that is disabled before and after."""
+    tool = Servoctl(axis, capsys)
+    tool("disable")
+    yield tool
+    tool("disable")
+
+
+def test_enable_move_and_disable(servoctl: Servoctl) -> None:
+    assert servoctl.state == "DISABLED"
+    assert servoctl("enable") == "enabled\n"
+    assert servoctl("track", "sine", "--amplitude", "0.02", "--frequency", "2", "--duration", "0.5") == "motion done\n"
+    assert servoctl.state == "ENABLED"
+    assert servoctl("disable") == "disabled\n"
+    assert servoctl.state == "DISABLED"
+
+
+def test_stop_ends_a_motion_and_switches_off(servoctl: Servoctl) -> None:
+    servoctl("enable")
+    servoctl("track", "paper", "--duration", "20", "--no-wait")
+    assert servoctl.json("status")["axis"]["motion_running"] is True
+    assert servoctl("stop") == "stopped\n"
+    assert servoctl.state == "DISABLED"
+
+
+def test_a_motion_from_a_file_is_relative_and_ends_where_the_file_ends(servoctl: Servoctl, tmp_path: Path) -> None:
+    file = tmp_path / "motion.csv"
+    file.write_text("t_s,reference_rad\n0,0\n0.25,0.01\n0.5,0.02\n")
+    servoctl("enable")
+    before = servoctl.json("status")["motion"]["reference_rad"]
+    servoctl("track", "csv", str(file))
+    assert servoctl.json("status")["motion"]["reference_rad"] == pytest.approx(before + 0.02)
+
+
+def test_what_is_refused_says_why_with_exit_code_3(servoctl: Servoctl) -> None:
+    assert "not enabled" in servoctl("track", "paper", code=3)
+    servoctl("enable")
+    assert "position_min_rad" in servoctl("track", "step", "--amplitude", "5", code=3)
+
+
+def test_one_commands_and_others_watch(servoctl: Servoctl) -> None:
+    with ControlClient(servoctl.socket) as commander:
+        commander.call("enable")
+        assert servoctl.json("status")["lease"]["pid"] > 0
+        assert "commands the axis" in servoctl("track", "paper", code=3)
+        assert servoctl.state == "ENABLED"
+        servoctl("stop")  # anyone may stop
+        assert servoctl.state == "DISABLED"
+
+
+def test_gains_load_activate_list_and_roll_back(servoctl: Servoctl) -> None:
+    servoctl("enable")
+    first = servoctl.json("gains", "load", str(gains_file("pd")), "--activate")
+    second = servoctl.json("gains", "load", str(gains_file("local")), "--activate")
+    assert servoctl.json("status")["controller"]["law"] == "local"
+    rows = servoctl.json("gains", "list")["gains"]
+    assert [row["name"] for row in rows if row["active"]] == [second["name"]]
+    assert second["name"] in servoctl("gains", "list")
+    assert first["name"] in servoctl("gains", "rollback")
+    assert servoctl.json("status")["controller"]["law"] == "pd"
+    assert first["name"] in servoctl("gains", "activate", first["name"])
+    assert "nobody" in servoctl("gains", "activate", "nobody", code=2)
+
+
+def test_record_and_export(servoctl: Servoctl, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    started = servoctl.json("record", "start", "--name", "trial.mcap")
+    servoctl("enable")
+    servoctl("track", "step", "--amplitude", "0.01", "--duration", "0.3")
+    stopped = servoctl.json("record", "stop")
+    assert stopped["path"] == started["path"] and stopped["records"] > 300
+    for suffix in (".csv", ".parquet"):
+        out = tmp_path / f"trial{suffix}"
+        assert run(["record", "export", started["path"], "--out", str(out), "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["rows"] == stopped["records"]
+    header, *rows = (tmp_path / "trial.csv").read_text().splitlines()
+    assert {"t_s", "position_rad", "reference_rad", "torque_nm"} <= set(header.split(","))
+    assert len(rows) == stopped["records"]
+
+
+def test_a_recording_goes_nowhere_else(servoctl: Servoctl) -> None:
+    assert "recordings" in servoctl("record", "start", "--name", "/tmp/elsewhere.mcap", code=2)
+
+
+def test_scan_lists_both_nodes(servoctl: Servoctl) -> None:
+    nodes = servoctl.json("scan")["nodes"]
+    assert [node["node_id"] for node in nodes] == [1, 2]
+    text = servoctl("scan")
+    assert "CiA 402" in text and "CiA 406" in text
+
+
+def test_scan_asks_the_bus_itself_where_no_daemon_is(axis: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bus = axis.parent / "bus"
+    assert run(["scan", "--interface", "virtual", "--channel", str(bus), "--json"]) == 0
+    nodes = json.loads(capsys.readouterr().out)["nodes"]
+    assert [node["node_id"] for node in nodes][:2] == [1, 2]
+
+
+def test_status_is_one_screen(servoctl: Servoctl) -> None:
+    text = servoctl("status")
+    assert "demo is DISABLED" in text and "deadline to torque" in text
+    assert len(text.splitlines()) <= 30
+
+
+def test_a_daemon_that_is_not_there_is_unreachable(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for verb in (["status"], ["enable"], ["stop"], ["gains", "list"], ["record", "stop"], ["scan"]):
+        assert run([*verb, "--socket", str(tmp_path / "none.sock")]) == 3
+        captured = capsys.readouterr()
+        assert (captured.out, len(captured.err.splitlines())) == ("", 1)
+        assert "none.sock" in captured.err
