@@ -37,7 +37,9 @@ def connect(path: str) -> socket.socket:
 
 
 class VirtualBus:
-    """servod.bus.Bus over the hub's socket at `channel`. With `can_ids`, only these reach this connection.
+    """servod.bus.Bus over the hub's socket at `channel`. With `can_ids`, only these reach this connection
+    (frames that the hub carried before it read the filter excepted).
+
 
     Raises Unreachable when no hub serves there.
     """

@@ -123,10 +123,10 @@ def test_a_filtered_connection_gets_only_its_identifiers(axis: Axis) -> None:
     time.sleep(0.05)
     for can_id in (0x100, 0x200, 0x300):
         sender.send(can_id, b"")
-    frame = filtered.receive(1.0)
-    assert frame is not None
-    assert frame.can_id == 0x200
-    assert filtered.receive(0.05) is None
+    heard = set()
+    while (frame := filtered.receive(0.5)) is not None:
+        heard.add(frame.can_id)
+    assert heard - {0x701, 0x702} == {0x200}  # boot-ups may come before the hub has read the filter
 
 
 def test_bus_off_reaches_the_client_as_an_error_frame(axis: Axis) -> None:
