@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 _SO_PEERGROUPS = 59  # asm-generic/socket.h; Python has no name for it
 _UCRED = struct.Struct("iII")
-_MAX_GROUPS = 4096
+_GROUPS_BYTES = 1024  # the most that Python's getsockopt takes: 256 groups
 
 
 class Peer(NamedTuple):
@@ -33,7 +33,7 @@ def peer_of(connection: socket.socket) -> Peer:
 
 def _further_groups(connection: socket.socket) -> list[int]:
     try:
-        data = connection.getsockopt(socket.SOL_SOCKET, _SO_PEERGROUPS, _MAX_GROUPS)
+        data = connection.getsockopt(socket.SOL_SOCKET, _SO_PEERGROUPS, _GROUPS_BYTES)
     except OSError:
         return []  # a kernel before 4.13, or more groups than fit: the first group still counts
     return list(array.array("I", data[: len(data) // 4 * 4]))

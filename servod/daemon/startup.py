@@ -7,6 +7,7 @@ start the loop, open the sockets. What fails says so in one line, and nothing th
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -47,6 +48,7 @@ def run(path: Path, on_ready: Callable[[Supervisor], None]) -> int:
     config = check(path)
     with ExitStack() as stack:
         stack.callback(InstanceLock(config).release)
+        _leave_core_to_loop(config.cycle.cpu)
         bank = GainBank(config)
         recorder = _recorder(config, path, bank)
         stack.callback(recorder.close)
@@ -60,6 +62,13 @@ def run(path: Path, on_ready: Callable[[Supervisor], None]) -> int:
         supervisor = Supervisor(config, master, plans, loop, bank, recorder, Notifier())
         on_ready(supervisor)
         return supervisor.run()
+
+
+def _leave_core_to_loop(cpu: int | None) -> None:
+    """Keep the supervisor off the core that the loop pins itself to, where there is another one."""
+    others = os.sched_getaffinity(0) - {cpu}
+    if others:
+        os.sched_setaffinity(0, others)
 
 
 def _recorder(config: AxisConfig, path: Path, bank: GainBank) -> Recorder:

@@ -1,7 +1,10 @@
 import json
+import os
 import selectors
 import socket
 import stat
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -13,7 +16,7 @@ import pytest
 from servod.config import ControlConfig
 from servod.control import MAX_LINE_BYTES, ControlClient, Verb
 from servod.daemon.control_server import ControlServer, Reply
-from servod.daemon.peer import Peer, may_command
+from servod.daemon.peer import Peer, may_command, peer_of
 from servod.errors import AnswerIsNo, BadInput, ServodError, Unreachable
 
 
@@ -211,6 +214,22 @@ def test_too_many_clients_are_turned_away(served: Served) -> None:
     assert crowd[-1].recv(1) == b""
     for connection in crowd:
         connection.close()
+
+
+def test_kernel_tells_the_peers_process_and_all_its_groups(tmp_path: Path) -> None:
+    further = [54321, 54322] if os.geteuid() == 0 else os.getgroups()
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(tmp_path / "s"))
+        listener.listen()
+        listener.settimeout(10)
+        code = f"import socket; s = socket.socket(socket.AF_UNIX); s.connect({str(tmp_path / 's')!r}); s.recv(1)"
+        child = subprocess.Popen([sys.executable, "-c", code], extra_groups=further if os.geteuid() == 0 else None)
+        connection, _ = listener.accept()
+        peer = peer_of(connection)
+        connection.close()
+        child.wait(10)
+    assert (peer.pid, peer.uid) == (child.pid, os.geteuid())
+    assert peer.groups == {os.getegid(), *further}
 
 
 @pytest.mark.parametrize(
