@@ -18,7 +18,13 @@ if TYPE_CHECKING:
 DEFAULT_SOCKET = Path("/run/servod/axis.sock")
 
 SocketOption = Annotated[
-    Path, typer.Option("--socket", envvar="SERVOD_SOCKET", help="Control socket of the axis's daemon.")
+    Path,
+    typer.Option(
+        "--socket",
+        envvar="SERVOD_SOCKET",
+        readable=False,  # a socket that refuses is "unreachable", not bad usage
+        help="Control socket of the axis's daemon.",
+    ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
 
