@@ -62,9 +62,10 @@ class Motion:
         self.scale()
 
     def scale(self) -> None:
-        """Take over rated torque and polarity."""
+        """Take over rated torque and polarity; per mille are of the motor, N*m of the joint behind the gear."""
         sign = -1.0 if self._dictionary.value(Obj402.POLARITY) & _POLARITY_TORQUE else 1.0
-        self.nm_per_permille = sign * self._dictionary.value(Obj402.RATED_TORQUE) / _MNM_PER_NM / PER_MILLE
+        rated_nm = self._dictionary.value(Obj402.RATED_TORQUE) / _MNM_PER_NM * self._sensor.gear_ratio
+        self.nm_per_permille = sign * rated_nm / PER_MILLE
 
     @property
     def reached(self) -> bool:

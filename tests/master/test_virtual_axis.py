@@ -69,12 +69,14 @@ def test_torque_reaches_the_joint_in_newtonmetres_with_its_sign(enabled: Rig) ->
     assert amplifier.position_rad == pytest.approx(encoder.position_rad, abs=1e-3)
 
 
-def test_both_positions_agree_through_a_gear() -> None:
+def test_torque_and_both_positions_agree_through_a_gear() -> None:
     world = stepped_world(gear_ratio=10.0)
     rig = Rig(world, amplifier={"gear_ratio": 10.0})
     rig.start()
     rig.until(Goal.ENABLED)
     amplifier, encoder = rig.run(200, Goal.ENABLED, torque_nm=0.3)
+    assert amplifier.torque_nm == pytest.approx(0.3, abs=2e-3)
+    assert world.truth().torque_nm == pytest.approx(0.3, abs=2e-3)
     assert encoder.position_rad > 1e-3
     assert amplifier.position_rad == pytest.approx(encoder.position_rad, abs=2e-3)
 
