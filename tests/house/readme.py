@@ -1,12 +1,18 @@
-"""The README's tables that come from the code. `python tests/house/readme.py` writes them anew."""
+"""The README's tables that come from the code. `python tests/house/readme.py` writes them anew.
+
+With the file of `servoctl bench --out FILE` as argument it writes the measured figures too.
+"""
 
 from __future__ import annotations
 
+import json
 import re
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from servod.benchmark.table import GOALS, figure
 from servod.config import AxisConfig
 from servod.drivers.quirks import QUIRKS
 from servod.errors import FAULTS
@@ -79,11 +85,39 @@ TABLES: dict[str, Callable[[], str]] = {"faults": faults, "quirks": quirks, "con
 def with_tables(text: str) -> str:
     """The README's text with all tables as the code has them now."""
     for name, table in TABLES.items():
-        pattern = re.compile(rf"(<!-- {name}: from the code -->\n).*?(<!-- {name}: end -->)", re.DOTALL)
-        assert pattern.search(text), f"README.md has no table {name}"
-        text = pattern.sub(lambda m, table=table: f"{m[1]}{table()}\n{m[2]}", text)
+        text = with_section(text, name, table())
     return text
 
 
+def measured(document: dict[str, Any]) -> str:
+    """The benchmark's figures beside their goals, and the machine they were measured on."""
+    machine = document["machine"]
+    rows = []
+    for goal in GOALS:
+        value = figure(document, goal)
+        rows.append([goal.label, "not measured" if value is None else goal.text.format(value), goal.goal])
+    wall_s, memory_s = document["wall_clock"]["seconds"], document["memory"]["seconds"]
+    return (
+        f"Measured by `servoctl bench` on {machine['cpu']}, {machine['cores']} cores, Linux {machine['kernel']}, "
+        f"Python {machine['python']}; wall clock over {wall_s:.0f} s, memory over {memory_s:.0f} s.\n\n"
+        + markdown(["Figure", "Measured", "Goal"], rows)
+    )
+
+
+def with_section(text: str, name: str, content: str) -> str:
+    """`text` with the part between the marks of `name` replaced."""
+    pattern = re.compile(rf"(<!-- {name}: from the code -->\n).*?(<!-- {name}: end -->)", re.DOTALL)
+    assert pattern.search(text), f"README.md has no part {name}"
+    return pattern.sub(lambda m: f"{m[1]}{content}\n{m[2]}", text)
+
+
+def main(arguments: list[str]) -> None:
+    """Write the tables, and the measured figures when their file is given."""
+    text = with_tables(README.read_text())
+    if arguments:
+        text = with_section(text, "measured", measured(json.loads(Path(arguments[0]).read_text())))
+    README.write_text(text)
+
+
 if __name__ == "__main__":
-    README.write_text(with_tables(README.read_text()))
+    main(sys.argv[1:])
