@@ -81,6 +81,9 @@ class ControlClient:
         self._socket.settimeout(timeout_s)
         try:
             self._socket.connect(self._path)
+        except PermissionError:
+            self._socket.close()
+            raise Unreachable(f"{path}: permission denied; only members of the control group may connect") from None
         except OSError as error:
             self._socket.close()
             raise Unreachable(f"{path}: no daemon answers ({error.strerror or error}); is servod running?") from None

@@ -78,10 +78,14 @@ class ControlServer:
     def tick(self, now_ns: int) -> None:
         """Send watchers what is due; call it in every round of the event loop."""
         due = [c for c in self._clients if c.watch_due(now_ns)]
-        if due:
+        if not due:
+            return
+        try:
             status = self._handler.status()
-            for client in due:
-                client.send_watch(status, now_ns)
+        except ServodError:
+            return  # before the first cycle there is nothing to watch yet
+        for client in due:
+            client.send_watch(status, now_ns)
 
     def lease(self) -> LeaseStatus:
         """Who commands; pid 0 when nobody does."""

@@ -142,6 +142,8 @@ class Flows:
             reply.done(end.value)
         except ServodError as error:
             reply.failed(error)
+        except OSError as error:  # a disk that is full or gone ends the request, never the supervisor
+            reply.failed(Unreachable(f"{error.filename or 'disk'}: {error.strerror or error}"))
 
 
 def _step(flow: Flow, wait: Wait | None) -> Wait:
@@ -150,6 +152,6 @@ def _step(flow: Flow, wait: Wait | None) -> Wait:
         return next(flow)
     try:
         value = wait.result()
-    except ServodError as error:
+    except (ServodError, OSError) as error:
         return flow.throw(error)
     return flow.send(value)

@@ -20,6 +20,7 @@ from servod.config import AxisConfig, load_config
 from servod.daemon.gain_bank import GainBank
 from servod.daemon.lock import InstanceLock
 from servod.daemon.supervisor import Supervisor
+from servod.errors import FaultCode, ServodError
 from servod.gains import load_gains, require_certificate
 from servod.loop.handle import LoopHandle
 from servod.loop.plan import LoopPlan
@@ -29,6 +30,8 @@ from servod.recorder import Recorder
 from servod.yaml12 import read_text
 
 log = logging.getLogger("servod")
+
+_RECORDER_START_S = 5.0
 
 
 def check(path: Path) -> AxisConfig:
@@ -78,8 +81,16 @@ def _recorder(config: AxisConfig, path: Path, bank: GainBank) -> Recorder:
     if config.model is not None:
         recorder.set_attachment("model.yaml", read_text(config.model).encode())
     if config.recorder.always:
-        recorder.start()
+        _record_from_the_start(recorder)
     return recorder
+
+
+def _record_from_the_start(recorder: Recorder) -> None:
+    """A recording that cannot begin is told, and no reason for the axis not to run."""
+    try:
+        log.info("recording to %s", recorder.start().result(_RECORDER_START_S))
+    except (ServodError, TimeoutError) as error:
+        log.error("fault %s: %s", FaultCode.RECORDER_FAILED.name, error or "the disk does not answer")
 
 
 def _start_loop(config: AxisConfig, plans: BringUp, bank: GainBank) -> LoopHandle:

@@ -10,6 +10,7 @@ import contextlib
 import logging
 import selectors
 import time
+from concurrent.futures import Future
 from typing import Any
 
 from servod import __version__
@@ -58,7 +59,7 @@ class Supervisor:
         self._config, self._master, self._plans, self._loop = config, master, plans, loop
         self._bank, self._recorder, self._notifier = bank, recorder, notifier
         self._started = time.monotonic()
-        self._stopping = False
+        self._stopping = self._textfile_failed = False
         self._silent_rounds = 0
         self._fed_cycle = -1
         self._next_feed_ns = self._next_status_ns = self._next_textfile_ns = 0
@@ -135,7 +136,14 @@ class Supervisor:
     def _write_textfile(self, now_ns: int) -> None:
         if self._config.metrics.textfile is not None and now_ns >= self._next_textfile_ns:
             self._next_textfile_ns = now_ns + _TEXTFILE_NS
-            self._verbs.slow.submit(self._metrics_server.write_textfile)
+            self._verbs.slow.submit(self._metrics_server.write_textfile).add_done_callback(self._textfile_written)
+
+    def _textfile_written(self, future: Future[None]) -> None:
+        """Tell of a textfile that cannot be written, once."""
+        error = None if future.cancelled() else future.exception()
+        if error and not self._textfile_failed:
+            log.warning("metrics.textfile %s: %s", self._config.metrics.textfile, error)
+        self._textfile_failed = error is not None
 
     def _loop_is_lost(self) -> bool:
         return not self._loop.alive() or self._silent_rounds > _HUNG_ROUNDS

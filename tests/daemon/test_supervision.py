@@ -218,6 +218,19 @@ def test_flow_waits_for_threads_and_states_and_may_catch_errors() -> None:
     assert answers.sent[0]["result"] == {"state": AxisState.ENABLED}
 
 
+def test_full_disk_ends_the_request_only() -> None:
+    flows, answers, future = Flows(), _Answers(), Future[int]()
+
+    def flow() -> Flow:
+        yield FutureWait(future)
+        return {}
+
+    flows.start(flow(), answers.reply())
+    future.set_exception(OSError(28, "No space left on device", "active.json"))
+    flows.poll(1)
+    assert answers.sent[0]["error"] == {"exit_code": 3, "message": "active.json: No space left on device"}
+
+
 # --- instance lock ----------------------------------------------------------------------------------------------------
 def _config(socket: Path, channel: Path) -> AxisConfig:
     limits = {

@@ -33,7 +33,7 @@ def test_daemon_is_ready_as_its_own_user_with_real_time_rights(results: Results)
 
 
 def test_only_can_and_unix_sockets_come_through(results: Results) -> None:
-    families = _of(results, "families")
+    families = {k: v for k, v in _of(results, "families").items() if k.startswith("AF_")}
     assert (families.pop("AF_CAN"), families.pop("AF_UNIX")) == ("allowed", "allowed")
     assert set(families.values()) == {"Address family not supported by protocol"}
 
