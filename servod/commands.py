@@ -31,7 +31,9 @@ class ReferenceKind(IntEnum):
     SINE = 1  # [amplitude_rad, frequency_hz, duration_s]
     PAPER = 2  # [duration_s]: trajectory (19), x = (0.1 - 0.0033 t) sin(0.2 pi t)
     STEP = 3  # [amplitude_rad, duration_s]
-    TABLE = 4  # [n_samples]: positions in the shared trajectory area, one for each period
+    TABLE = 4  # [n_samples, lowest_rad, highest_rad]: positions in the shared trajectory area, one for each period
+    EXCITE = 5  # [n_samples, lowest_rad, highest_rad, window_rad]: as TABLE, then as many torques in N*m to add;
+    # when the joint leaves the window around the reference, the motion fades out and ends
 
 
 class Refusal(IntEnum):

@@ -29,12 +29,17 @@ class Samples(Protocol):
 
 
 class Motion(NamedTuple):
-    """One motion: its path over time (position, velocity, acceleration), its duration and its extent, all relative."""
+    """One motion: its path over time (position, velocity, acceleration), its duration and its extent, all relative.
+
+    An excitation adds `torque_nm` over time, and ends when the joint is further than `window_rad` from the reference.
+    """
 
     path: Callable[[float], Sample]
     duration_s: float
     lowest_rad: float
     highest_rad: float
+    torque_nm: Callable[[float], float] | None = None
+    window_rad: float = math.inf
 
 
 def paper(t_s: float) -> Sample:
@@ -70,6 +75,16 @@ def table(positions_rad: Samples, samples: int, period_s: float) -> Callable[[fl
         return here + velocity * (t_s - index * period_s), velocity, 0.0
 
     return path
+
+
+def torque_table(samples: Samples, start: int, count: int, period_s: float) -> Callable[[float], float]:
+    """`count` torques from `samples[start]` on, each held for one period; zero behind the last."""
+
+    def torque(t_s: float) -> float:
+        index = int(t_s / period_s + 1e-9)
+        return samples[start + index] if index < count else 0.0
+
+    return torque
 
 
 def make_motion(arguments: Sequence[float], period_s: float, trajectory: Samples) -> Motion | Refusal:
@@ -118,12 +133,22 @@ def _table(rest: Sequence[float], period_s: float, trajectory: Samples) -> Motio
     return Motion(table(trajectory, samples, period_s), (samples - 1) * period_s, lowest_rad, highest_rad)
 
 
+def _excite(rest: Sequence[float], period_s: float, trajectory: Samples) -> Motion:
+    samples, lowest_rad, highest_rad, window_rad = int(rest[0]), rest[1], rest[2], rest[3]
+    if not 2 <= samples <= len(trajectory) // 2 or window_rad <= 0.0:
+        raise ValueError("between 2 samples and half the trajectory area; a positive window")
+    torque = torque_table(trajectory, samples, samples, period_s)
+    path = table(trajectory, samples, period_s)
+    return Motion(path, (samples - 1) * period_s, lowest_rad, highest_rad, torque, window_rad)
+
+
 _BUILDERS: dict[int, Callable[[Sequence[float], float, Samples], Motion]] = {
     ReferenceKind.HOLD: _hold,
     ReferenceKind.SINE: _sine,
     ReferenceKind.PAPER: _paper,
     ReferenceKind.STEP: _step,
     ReferenceKind.TABLE: _table,
+    ReferenceKind.EXCITE: _excite,
 }
 
 
@@ -134,7 +159,8 @@ class Reference:
         """`scale_time_s`: how long the time scale takes from 1 to 0 and back."""
         self._scale_rate_per_s = 1.0 / scale_time_s
         self.position_rad, self.velocity_rad_s, self.acceleration_rad_s2 = 0.0, 0.0, 0.0
-        self.active = False
+        self.torque_nm = 0.0
+        self.active = self._leaving = False
         self._motion: Motion | None = None
         self._base_rad = self._time_s = 0.0
         self._scale = self._wanted_scale = 1.0
@@ -148,16 +174,23 @@ class Reference:
         """End any motion; stay at `position_rad`."""
         self.active, self._motion, self._base_rad = False, None, position_rad
         self.position_rad, self.velocity_rad_s, self.acceleration_rad_s2 = position_rad, 0.0, 0.0
+        self.torque_nm, self._leaving = 0.0, False
         self._scale = self._wanted_scale = 1.0
 
     def start(self, motion: Motion) -> None:
         """Begin `motion` from the present reference position."""
         self._motion, self._base_rad, self._time_s = motion, self.position_rad, 0.0
         self.active, self._scale, self._wanted_scale = motion.duration_s > 0.0, 1.0, 1.0
+        self._leaving = False
 
     def halt(self, on: bool) -> None:
         """Let time slow down to a stand (`on`) or run again."""
-        self._wanted_scale = 0.0 if on else 1.0
+        self._wanted_scale = 0.0 if on or self._leaving else 1.0
+
+    def watch(self, position_rad: float) -> None:
+        """Begin to fade the motion out once the joint is outside its window."""
+        if self.active and self._motion and abs(position_rad - self.position_rad) > self._motion.window_rad:
+            self._leaving, self._wanted_scale = True, 0.0
 
     def advance(self, dt_s: float) -> None:
         """Move time on by `dt_s`, as the scale has it, and take the new reference."""
@@ -168,10 +201,14 @@ class Reference:
         if self._time_s >= self._motion.duration_s:
             self._finish(self._motion)
             return
+        if self._leaving and self._scale == 0.0:
+            self.hold(self.position_rad)
+            return
         x, v, a = self._motion.path(self._time_s)
         scale = self._scale
         self.position_rad = self._base_rad + x
         self.velocity_rad_s, self.acceleration_rad_s2 = v * scale, a * scale * scale
+        self.torque_nm = 0.0 if self._motion.torque_nm is None else scale * self._motion.torque_nm(self._time_s)
 
     def _change_scale(self, dt_s: float) -> None:
         step = self._scale_rate_per_s * dt_s

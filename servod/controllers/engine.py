@@ -85,10 +85,19 @@ class Controller:
         self._offset_nm, self._hand_over_nm = 0.0, torque_now_nm
 
     def step(
-        self, x_ref: float, v_ref: float, a_ref: float, x: float, v: float, u_applied: float, dt: float
+        self,
+        x_ref: float,
+        v_ref: float,
+        a_ref: float,
+        x: float,
+        v: float,
+        u_applied: float,
+        dt: float,
+        added_nm: float = 0.0,
     ) -> ControllerOutput:
         """One cycle; SI units. `u_applied` is the torque of the last cycle after limits, `dt` the time since then.
 
+        `added_nm` is the torque of an excitation, which comes on top and counts as `other`.
         NaN in any measurement comes out as NaN: the limits decide what happens then, not the controller.
         """
         torque, feedback, friction, other = self._law.step(
@@ -101,6 +110,6 @@ class Controller:
             self._offset_nm *= math.exp(-dt / self._bumpless_time_s)
             if abs(self._offset_nm) < NEGLIGIBLE_OFFSET_NM:
                 self._offset_nm = 0.0
-        torque += self._offset_nm
+        torque += self._offset_nm + added_nm
         self._state[ASKED] = torque
-        return ControllerOutput(torque, feedback, friction, other + self._offset_nm)
+        return ControllerOutput(torque, feedback, friction, other + self._offset_nm + added_nm)

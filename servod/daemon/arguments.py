@@ -25,6 +25,7 @@ class MotionKind(StrEnum):
     PAPER = "paper"
     STEP = "step"
     CSV = "csv"
+    EXCITE = "excite"
 
 
 _NEEDS: dict[MotionKind, tuple[str, ...]] = {
@@ -32,6 +33,7 @@ _NEEDS: dict[MotionKind, tuple[str, ...]] = {
     MotionKind.PAPER: ("duration_s",),
     MotionKind.STEP: ("amplitude_rad", "duration_s"),
     MotionKind.CSV: ("positions_rad",),
+    MotionKind.EXCITE: ("positions_rad", "torques_nm", "window_rad"),
 }
 
 
@@ -62,6 +64,8 @@ class TrackArgs(Strict):
     frequency_hz: float | None = Field(None, gt=0.0, le=500.0)
     duration_s: _Duration | None = None
     positions_rad: list[float] | None = Field(None, min_length=2, max_length=TRAJECTORY_SAMPLES)
+    torques_nm: list[float] | None = Field(None, min_length=2, max_length=TRAJECTORY_SAMPLES // 2)
+    window_rad: float | None = Field(None, gt=0.0, le=1e4)
     start_immediately: bool = True
 
     @model_validator(mode="after")
@@ -69,13 +73,23 @@ class TrackArgs(Strict):
         missing = [key for key in _NEEDS[self.kind] if getattr(self, key) is None]
         if missing:
             raise ValueError(f"track {self.kind} with {', '.join(missing)}")
+        if self.kind is MotionKind.EXCITE and len(self.positions_rad or []) != len(self.torques_nm or []):
+            raise ValueError("track excite with as many torques_nm as positions_rad")
         return self
 
+    def area(self) -> list[float]:
+        """What the motion reads from the trajectory area: positions, and behind them the torques of an excitation."""
+        return [*(self.positions_rad or []), *(self.torques_nm or [])]
+
     def reference(self) -> list[float]:
-        """The arguments of Op.REFERENCE; for CSV the positions must stand in the trajectory area already."""
+        """The arguments of Op.REFERENCE; what `area` gives must stand in the trajectory area already."""
         if self.kind is MotionKind.CSV:
             positions = self.positions_rad or []
             return [ReferenceKind.TABLE, len(positions), min(positions), max(positions)]
+        if self.kind is MotionKind.EXCITE:
+            positions = self.positions_rad or []
+            window_rad = self.window_rad or 0.0
+            return [ReferenceKind.EXCITE, len(positions), min(positions), max(positions), window_rad]
         kind = ReferenceKind[self.kind.name]
         return [kind, *(float(getattr(self, key)) for key in _NEEDS[self.kind])]
 

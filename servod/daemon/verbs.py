@@ -23,7 +23,6 @@ from servod.daemon.arguments import (
     GainsActivateArgs,
     GainsLoadArgs,
     HaltArgs,
-    MotionKind,
     NoArgs,
     RecordStartArgs,
     TrackArgs,
@@ -139,8 +138,8 @@ class Verbs:
         self._refuse_if_not_free()
         if not args.start_immediately:
             return {"kind": args.kind, "duration_s": self._duration_s(args)}
-        if args.kind is MotionKind.CSV:
-            self._loop.write_trajectory(args.positions_rad or [])
+        if args.positions_rad is not None:
+            self._loop.write_trajectory(args.area())
         record = yield self._send(Op.REFERENCE, args.reference())
         return {**_state(record), "kind": args.kind, "duration_s": self._duration_s(args)}
 

@@ -145,11 +145,12 @@ class Cycle:
             self._seed(amplifier, encoder)
         if output.brake:
             self.reference.halt(True)
+        self.reference.watch(encoder.position_rad)
         self.reference.advance(dt_s)
         reference = self.reference
         law = self.controller.step(
             reference.position_rad, reference.velocity_rad_s, reference.acceleration_rad_s2,
-            encoder.position_rad, encoder.velocity_rad_s, self.torque_nm, dt_s,
+            encoder.position_rad, encoder.velocity_rad_s, self.torque_nm, dt_s, reference.torque_nm,
         )  # fmt: skip
         wanted_nm = law.u if output.torque_share == 1.0 else self._ramp_from_nm * output.torque_share
         sent_nm, faults = self.limits.limit_torque(wanted_nm, dt_s)

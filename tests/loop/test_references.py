@@ -89,3 +89,37 @@ def test_halt_slows_down_without_leaving_the_path_and_goes_on():
 )
 def test_bad_arguments_are_refused(arguments):
     assert make_motion(arguments, PERIOD_S, [0.0, 0.0]) == Refusal.BAD_ARGUMENT
+
+
+EXCITATION = [0.0, 0.0, 0.0, 0.0, 0.01, 0.02, -0.03, 0.04]
+
+
+def test_an_excitation_holds_each_torque_for_a_period_and_ends_without():
+    reference = started(ReferenceKind.EXCITE, 4, 0.0, 0.0, 0.1, trajectory=EXCITATION)
+    torques = []
+    for _ in range(4):
+        reference.advance(PERIOD_S)
+        torques.append(reference.torque_nm)
+    assert torques == pytest.approx([0.02, -0.03, 0.0, 0.0])
+    assert not reference.active
+
+
+def test_an_excitation_fades_and_ends_when_the_joint_leaves_its_window():
+    samples = 100
+    reference = started(ReferenceKind.EXCITE, samples, 0.0, 0.0, 0.1, trajectory=[0.0] * samples + [1.0] * samples)
+    reference.watch(1.09)
+    reference.advance(PERIOD_S)
+    assert reference.torque_nm == 1.0
+    reference.watch(1.11)
+    fading = []
+    while reference.active:
+        reference.advance(PERIOD_S)
+        fading.append(reference.torque_nm)
+    assert fading == sorted(fading, reverse=True)
+    assert len(fading) < samples
+    assert reference.torque_nm == 0.0
+
+
+@pytest.mark.parametrize("arguments", [(5, 0.0, 0.0, 0.1), (1, 0.0, 0.0, 0.1), (4, 0.0, 0.0, 0.0), (4, 0.0, 0.0)])
+def test_an_excitation_must_fit_the_area_and_have_a_window(arguments):
+    assert make_motion([ReferenceKind.EXCITE, *arguments], PERIOD_S, EXCITATION) is Refusal.BAD_ARGUMENT
