@@ -33,7 +33,7 @@ class ReferenceKind(IntEnum):
     STEP = 3  # [amplitude_rad, duration_s]
     TABLE = 4  # [n_samples, lowest_rad, highest_rad]: positions in the shared trajectory area, one for each period
     EXCITE = 5  # [n_samples, lowest_rad, highest_rad, window_rad]: as TABLE, then as many torques in N*m to add;
-    # when the joint leaves the window around the reference, the motion fades out and ends
+    # when the joint's distance from the reference changes by more than the window, it fades out and ends
 
 
 class Refusal(IntEnum):

@@ -31,7 +31,8 @@ class Samples(Protocol):
 class Motion(NamedTuple):
     """One motion: its path over time (position, velocity, acceleration), its duration and its extent, all relative.
 
-    An excitation adds `torque_nm` over time, and ends when the joint is further than `window_rad` from the reference.
+    An excitation adds `torque_nm` over time, and ends when the joint's distance from the reference has changed by more
+    than `window_rad` since the motion began.
     """
 
     path: Callable[[float], Sample]
@@ -162,6 +163,7 @@ class Reference:
         self.torque_nm = 0.0
         self.active = self._leaving = False
         self._motion: Motion | None = None
+        self._first_distance_rad = math.nan
         self._base_rad = self._time_s = 0.0
         self._scale = self._wanted_scale = 1.0
 
@@ -181,7 +183,7 @@ class Reference:
         """Begin `motion` from the present reference position."""
         self._motion, self._base_rad, self._time_s = motion, self.position_rad, 0.0
         self.active, self._scale, self._wanted_scale = motion.duration_s > 0.0, 1.0, 1.0
-        self._leaving = False
+        self._leaving, self._first_distance_rad = False, math.nan
 
     def halt(self, on: bool) -> None:
         """Let time slow down to a stand (`on`) or run again."""
@@ -189,7 +191,12 @@ class Reference:
 
     def watch(self, position_rad: float) -> None:
         """Begin to fade the motion out once the joint is outside its window."""
-        if self.active and self._motion and abs(position_rad - self.position_rad) > self._motion.window_rad:
+        if not self.active or self._motion is None:
+            return
+        distance_rad = position_rad - self.position_rad
+        if math.isnan(self._first_distance_rad):
+            self._first_distance_rad = distance_rad
+        if abs(distance_rad - self._first_distance_rad) > self._motion.window_rad:
             self._leaving, self._wanted_scale = True, 0.0
 
     def advance(self, dt_s: float) -> None:

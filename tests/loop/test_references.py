@@ -107,10 +107,11 @@ def test_an_excitation_holds_each_torque_for_a_period_and_ends_without():
 def test_an_excitation_fades_and_ends_when_the_joint_leaves_its_window():
     samples = 100
     reference = started(ReferenceKind.EXCITE, samples, 0.0, 0.0, 0.1, trajectory=[0.0] * samples + [1.0] * samples)
-    reference.watch(1.09)
+    reference.watch(1.03)
+    reference.watch(1.12)
     reference.advance(PERIOD_S)
     assert reference.torque_nm == 1.0
-    reference.watch(1.11)
+    reference.watch(1.14)
     fading = []
     while reference.active:
         reference.advance(PERIOD_S)
