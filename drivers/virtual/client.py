@@ -61,7 +61,7 @@ class VirtualBus:
             counters.queue_full += 1
             return False
         except OSError:
-            counters.down = True
+            counters.set_down()
             return False
         counters.sent += 1
         return True
@@ -82,7 +82,7 @@ class VirtualBus:
                     return frame
                 continue
             if packet == b"":
-                self.counters.down = True
+                self.counters.set_down()
             if timeout_s <= 0.0:
                 return None
             now = time.monotonic()
@@ -105,7 +105,7 @@ class VirtualBus:
     def close(self) -> None:
         """Leave the bus."""
         self._socket.close()
-        self.counters.down = True
+        self.counters.set_down()
 
     def _wait(self, timeout_s: float) -> bool:
         """Wait for a packet; a hub that is gone must not turn waiting into a busy loop."""

@@ -205,7 +205,7 @@ class SteppedBus:
     def close(self) -> None:
         """Leave the bus."""
         if not self.counters.down:
-            self.counters.down = True
+            self.counters.set_down()
             self._world.hub.detach(self.port)
 
     def _deliver(self, can_id: int, data: bytes, time_ns: int) -> None:
@@ -219,7 +219,10 @@ class SteppedBus:
 
     def _state_changed(self, state: ErrorState, time_ns: int) -> None:
         self.counters.error_frames += 1
-        self.counters.bus_off = state is ErrorState.BUS_OFF
+        if state is ErrorState.BUS_OFF:
+            self.counters.set_bus_off()
+        else:
+            self.counters.bus_off = False
         self.counters.error_passive = state is ErrorState.PASSIVE
 
 

@@ -31,7 +31,11 @@ class Frame(NamedTuple):
 
 @dataclass(slots=True)
 class BusCounters:
-    """What went wrong on this connection since it was opened."""
+    """What went wrong on this connection since it was opened.
+
+    The booleans are the state now; the event counts only grow, so that whoever looks once per cycle misses nothing that
+    came and went in between.
+    """
 
     sent: int = 0
     received: int = 0
@@ -40,6 +44,20 @@ class BusCounters:
     bus_off: bool = False
     error_passive: bool = False
     down: bool = False
+    bus_off_events: int = 0  # how often bus_off became true
+    down_events: int = 0  # how often down became true
+
+    def set_bus_off(self) -> None:
+        """The controller left the bus (or never was on it)."""
+        if not self.bus_off:
+            self.bus_off_events += 1
+        self.bus_off = True
+
+    def set_down(self) -> None:
+        """The interface, the hub or the adapter does not answer."""
+        if not self.down:
+            self.down_events += 1
+        self.down = True
 
 
 class Bus(Protocol):

@@ -23,7 +23,7 @@ def count_error_frame(counters: BusCounters, can_id: int, data: bytes) -> None:
     """Take one error frame (CAN_ERR_FLAG set) into the counters; data[1] is the controller's state (CAN_ERR_CRTL)."""
     counters.error_frames += 1
     if can_id & CAN_ERR_BUSOFF:
-        counters.bus_off = True
+        counters.set_bus_off()
     if can_id & CAN_ERR_RESTARTED:  # the controller came back by restart-ms; a fault has been shown by then
         counters.bus_off = False
         counters.error_passive = False

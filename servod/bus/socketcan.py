@@ -82,7 +82,7 @@ class SocketCanBus:
             if error.errno in _QUEUE_FULL:
                 counters.queue_full += 1
             else:
-                counters.down = True
+                counters.set_down()
             return False
         counters.sent += 1
         counters.down = False  # the interface takes frames again
@@ -106,10 +106,10 @@ class SocketCanBus:
             except BlockingIOError:
                 return None
             except OSError:  # ENETDOWN and its like: a state, until frames flow again
-                self.counters.down = True
+                self.counters.set_down()
                 return None
             if len(packet) < CAN_FRAME.size:  # the other end of the socket is gone
-                self.counters.down = True
+                self.counters.set_down()
                 return None
             can_id, length, data = CAN_FRAME.unpack(packet)
             if can_id & CAN_ERR_FLAG:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import socket
 import time
 from collections.abc import Iterator
 
 import pytest
-from buses_under_test import BUSES, Wire, hub
+from buses_under_test import BUSES, Wire, hub, stepped
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -131,6 +132,48 @@ def test_bus_off_and_restart_are_states(raw: tuple[SocketCanBus, socket.socket])
     assert not bus.counters.bus_off
     assert bus.send(0x80, b"")
     assert bus.counters.error_frames == 2
+
+
+def test_a_bus_off_that_is_over_before_anybody_looks_is_counted(raw: tuple[SocketCanBus, socket.socket]) -> None:
+    bus, kernel = raw
+    for _ in range(2):
+        kernel.send(error_frame(CAN_ERR_BUSOFF))
+        kernel.send(error_frame(CAN_ERR_RESTARTED))
+    assert bus.receive(0.1) is None
+    assert not bus.counters.bus_off
+    assert bus.counters.bus_off_events == 2
+
+
+class _Downed(socket.socket):
+    """A socket whose next read says that the interface is down, as the kernel does once after `ip link set down`."""
+
+    down = False
+
+    def recvmsg(self, *arguments: int) -> tuple[bytes, list[tuple[int, int, bytes]], int, object]:
+        if self.down:
+            self.down = False
+            raise OSError(errno.ENETDOWN, "Network is down")
+        return super().recvmsg(*arguments)
+
+
+def test_an_interface_that_was_down_for_a_moment_is_counted() -> None:
+    near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    downed = _Downed(near.family, near.type, fileno=near.detach())
+    bus = SocketCanBus(downed)
+    downed.down = True
+    assert bus.receive(0.0) is None
+    assert bus.counters.down
+    assert bus.send(0x80, b"")  # up again before anybody looked
+    assert (bus.counters.down, bus.counters.down_events) == (False, 1)
+    bus.close()
+    far.close()
+
+
+def test_a_bus_off_in_the_stepped_world_is_counted() -> None:
+    with stepped() as wire:
+        wire.one.inject(BusFault(FaultKind.BUS_OFF))  # type: ignore[attr-defined]
+        wire.one.receive(0.01)
+        assert (wire.one.counters.bus_off, wire.one.counters.bus_off_events) == (True, 1)
 
 
 @pytest.mark.parametrize(("controller", "passive", "full"), [(0x10, True, 0), (0x20, True, 0), (0x02, False, 1)])
