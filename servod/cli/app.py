@@ -6,6 +6,7 @@ works on files alone. Exit codes are those of servod.errors: 0 done, 1 the answe
 
 from __future__ import annotations
 
+import re
 import shlex
 import sys
 
@@ -39,6 +40,11 @@ def run(arguments: list[str]) -> int:
         code = app(args=arguments, prog_name="servoctl", standalone_mode=False)
     except ServodError as error:
         return _complain(str(error), error.exit_code)
+    except ImportError as error:
+        if not _of_the_lab(error):
+            raise
+        command = shlex.join(["servoctl", *arguments])
+        return _complain(f"`{command}` needs servod[lab]: pip install 'servod[lab]' ({error.name} is missing)", 2)
     except typer.TyperException as error:
         return _complain(f"{error.format_message()} Found: `{shlex.join(['servoctl', *arguments])}`; see --help.", 2)
     except (KeyboardInterrupt, typer.Abort):
@@ -49,6 +55,14 @@ def run(arguments: list[str]) -> int:
     if code == _INTERRUPTED:  # typer turns Ctrl-C within a command into this
         return _complain("interrupted", _INTERRUPTED)
     return code if isinstance(code, int) else 0
+
+
+def _of_the_lab(error: ImportError) -> bool:
+    """Whether the missing package is one that only the extra `lab` installs, as servod's own metadata says."""
+    from importlib.metadata import requires
+
+    package = re.escape((error.name or "?").partition(".")[0])
+    return any(re.match(rf"{package}\b.*\bextra == .lab\b", line) for line in requires("servod") or ())
 
 
 def _complain(message: str, exit_code: int) -> int:

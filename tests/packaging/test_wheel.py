@@ -16,6 +16,11 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 CORE_IMPORTS = "servod.daemon.main servod.loop.process servod.drivers.cia402 servod.drivers.cia406 servod.cli"
 LAB = "numpy scipy numba plotly matplotlib pyarrow cvxpy"
+WITHOUT_LAB = f"""
+import importlib, sys
+for name in {LAB.split()}:
+    sys.modules[name] = None
+"""
 
 
 @pytest.fixture(scope="module")
@@ -92,12 +97,20 @@ def test_the_installed_package_is_the_wheel_and_finds_its_files(python: Path, tm
 
 
 def test_the_core_works_without_the_laboratory(python: Path, tmp_path: Path) -> None:
-    code = f"""
-import importlib, sys
-for name in {LAB.split()}:
-    sys.modules[name] = None
-for name in {CORE_IMPORTS.split()}:
-    importlib.import_module(name)
-"""
+    code = f"{WITHOUT_LAB}\nfor name in {CORE_IMPORTS.split()}:\n    importlib.import_module(name)"
     result = run(python, "-c", code, folder=tmp_path)
     assert result.returncode == 0, result.stderr
+
+
+@pytest.mark.parametrize(
+    "command", ["demo --fast", "demo", "bench --quick", "replay --model axis.yaml run.csv"], ids=lambda c: c.split()[0]
+)
+def test_a_command_that_needs_the_laboratory_says_so_in_one_line(python: Path, tmp_path: Path, command: str) -> None:
+    (tmp_path / "axis.yaml").write_text(
+        "inertia: 0.001\nfriction: {kind: coulomb_viscous, viscous: 0.1, coulomb: 0.1}\n"
+    )
+    code = f"{WITHOUT_LAB}\nfrom servod.cli.app import run\nsys.exit(run({command.split()}))"
+    result = run(python, "-c", code, folder=tmp_path)
+    assert (result.returncode, result.stdout) == (2, "")
+    (line,) = result.stderr.splitlines()
+    assert line.startswith(f"servoctl: `servoctl {command}` needs servod[lab]: pip install 'servod[lab]'")
