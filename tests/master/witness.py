@@ -42,7 +42,7 @@ class Witness:
 
     def __init__(self) -> None:
         self.channel = uuid.uuid4().hex
-        self.network = canopen.Network(can.Bus(interface="virtual", channel=self.channel), kernel_errors=False)
+        self.network = canopen.Network(can.Bus(interface="virtual", channel=self.channel))
         self.network.NOTIFIER_CYCLE = 0.05
         self.network.connect()
         self.amplifier = self.network.create_node(1, str(EDS / "amplifier.eds"))
