@@ -11,7 +11,7 @@ from enum import IntEnum
 from typing import NamedTuple
 
 from servod.commands import Refusal
-from servod.errors import FAULTS, FaultCode, Reaction
+from servod.errors import FAULTS, NEEDS_RESTART, FaultCode, Reaction
 from servod.hal import AmplifierFeedback, DriveState, Goal, Mode, Reason
 
 _BIT = {code: fault.bit for code, fault in FAULTS.items()}
@@ -31,13 +31,16 @@ class AxisState(IntEnum):
     FAULT = 6
 
 
+_OFF_MASK = sum(FAULTS[code].bit for code in NEEDS_RESTART)
+#: A drive that is told to switch off, or to stop, and still shows this after this time does not obey.
+_POWERED = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
+_OBEY_S = 0.1
 _CONTROLLED = (AxisState.ENABLED, AxisState.BRAKING, AxisState.RAMPING)
 
 
 class AxisOutput(NamedTuple):
-    """What the axis asks for in this cycle."""
+    """What the axis asks for in this cycle, beside the goal."""
 
-    goal: Goal
     torque_share: float  # 0..1, applied to the controller's torque
     controlled: bool  # the controller runs and its torque goes out
     just_enabled: bool  # first controlled cycle: seed reference, controller and limits
@@ -56,8 +59,9 @@ class Axis:
         self._period_s, self._mode = period_s, int(mode)
         self._ramp_cycles = max(1, round(ramp_down_s / period_s))
         self._timeout_cycles = max(1, round(enable_timeout_s / period_s))
-        self._cycles_in_state = 0
-        self._reset_wanted = False
+        self._cycles_in_state = self._disobeyed_cycles = 0
+        self._obey_cycles = max(4, round(_OBEY_S / period_s))
+        self._reset_wanted, self._seen_off = False, True
         self._end_state = AxisState.DISABLED
 
     @property
@@ -69,6 +73,8 @@ class Axis:
         """Explicit request to enable; with `reset_fault` latched faults and the drive's fault are reset first."""
         if self.state not in (AxisState.DISABLED, AxisState.FAULT):
             return Refusal.DONE if self.state in (AxisState.ENABLED, AxisState.ENABLING) else Refusal.MOTION_RUNNING
+        if self.latched & _OFF_MASK:
+            return Refusal.NEEDS_RESTART
         if reset_fault:
             self.reset_fault()
         if self.latched & ~_MASK[Reaction.NONE] & ~_MASK[Reaction.CLIP]:
@@ -78,10 +84,10 @@ class Axis:
         return Refusal.DONE
 
     def reset_fault(self) -> Refusal:
-        """Forget latched faults and ask the drive once to reset its own."""
+        """Forget latched faults, but for those that need a restart, and ask the drive once to reset its own."""
         if self.state in _CONTROLLED:
             return Refusal.MOTION_RUNNING
-        self.latched, self._reset_wanted = 0, True
+        self.latched, self._reset_wanted = self.latched & _OFF_MASK, True
         if self.state == AxisState.FAULT:
             self._enter(AxisState.DISABLED)
         return Refusal.DONE
@@ -96,20 +102,30 @@ class Axis:
     def quick_stop(self) -> None:
         """Let the drive stop the axis by its quick-stop option."""
         if self.state in _CONTROLLED:
-            self._stop(AxisState.QUICK_STOPPING, AxisState.DISABLED)
+            failed = self.state != AxisState.ENABLED and self._end_state == AxisState.FAULT
+            self._stop(AxisState.QUICK_STOPPING, AxisState.FAULT if failed else AxisState.DISABLED)
         elif self.state == AxisState.ENABLING:
             self._enter(AxisState.DISABLED)
 
-    def step(self, amplifier: AmplifierFeedback, faults: int, reference_at_rest: bool) -> AxisOutput:
-        """One cycle: `faults` are the bits that limits, bus and supervisor raised; returns what to do."""
+    def note(self, fault_bits: int) -> None:
+        """Latch faults that the supervisor saw, also while disabled."""
+        self.latched |= fault_bits
+
+    def step(self, amplifier: AmplifierFeedback, encoder_fresh: bool, faults: int, at_rest: bool) -> AxisOutput:
+        """One cycle: `faults` are the bits that limits, bus and supervisor raised; returns what to do.
+
+        `encoder_fresh`: the encoder's sample is of this cycle; `at_rest`: the reference stands still.
+        """
         self._cycles_in_state += 1
         self.faults = faults | self._drive_faults(amplifier)
+        self.latched |= self.faults & _OFF_MASK
         if self.state not in (AxisState.DISABLED, AxisState.FAULT):
             self._react()
-        just_enabled = self._move_on(amplifier, reference_at_rest)
+        elif self.faults & _BIT[FaultCode.DRIVE_STAYS_POWERED]:
+            self._enter(AxisState.FAULT)
+        just_enabled = self._move_on(amplifier, encoder_fresh, at_rest)
         reset, self._reset_wanted = self._reset_wanted, False
         return AxisOutput(
-            self.goal,
             self._torque_share(),
             self.state in _CONTROLLED,
             just_enabled,
@@ -158,9 +174,9 @@ class Axis:
 
     def _drive_faults(self, amplifier: AmplifierFeedback) -> int:
         """What the drive's own words say is wrong, as fault bits; stale words say nothing (limits count the age)."""
+        faults, state = self._disobedience(amplifier), amplifier.state
         if amplifier.age_cycles > 0:
-            return 0
-        faults, state = 0, amplifier.state
+            return faults
         if state in (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE) and not self._being_reset():
             faults |= _BIT[FaultCode.DRIVE_FAULT]
         if amplifier.status_word & _STATUS_WARNING:
@@ -168,6 +184,21 @@ class Axis:
         if self.state in _CONTROLLED:
             faults |= self._operation_faults(amplifier)
         return faults
+
+    def _disobedience(self, amplifier: AmplifierFeedback) -> int:
+        """The drive was told to be off or to stop, and is powered or not heard since: its own guards must act.
+
+        While it quick-stops it may be in quick stop active for as long as its ramp takes.
+        """
+        heard, powered = amplifier.age_cycles == 0, amplifier.state in _POWERED
+        if self.goal not in (Goal.OFF, Goal.QUICK_STOP):
+            self._seen_off, self._disobeyed_cycles = False, 0
+            return 0
+        self._seen_off = self._seen_off or (heard and not powered)
+        stopping = self.goal == Goal.QUICK_STOP and amplifier.state == DriveState.QUICK_STOP_ACTIVE
+        disobeys = powered and not stopping if heard else not self._seen_off
+        self._disobeyed_cycles = self._disobeyed_cycles + 1 if disobeys else 0
+        return _BIT[FaultCode.DRIVE_STAYS_POWERED] if self._disobeyed_cycles > self._obey_cycles else 0
 
     def _operation_faults(self, amplifier: AmplifierFeedback) -> int:
         state = amplifier.state
@@ -186,20 +217,21 @@ class Axis:
         """While enabling, the drive may still be in the fault that was just reset; the time-out judges."""
         return self.state == AxisState.ENABLING
 
-    def _move_on(self, amplifier: AmplifierFeedback, reference_at_rest: bool) -> bool:
+    def _move_on(self, amplifier: AmplifierFeedback, encoder_fresh: bool, at_rest: bool) -> bool:
         """Transitions that come with time and the drive's answer; True in the first controlled cycle."""
         state = self.state
         if state == AxisState.ENABLING:
-            return self._finish_enabling(amplifier)
-        if state == AxisState.BRAKING and (reference_at_rest or self._cycles_in_state > self._ramp_cycles):
+            return self._finish_enabling(amplifier, encoder_fresh)
+        if state == AxisState.BRAKING and (at_rest or self._cycles_in_state > self._ramp_cycles):
             self._enter(AxisState.RAMPING)
         ramped = state == AxisState.RAMPING and self._cycles_in_state >= self._ramp_cycles
         if ramped or (state == AxisState.QUICK_STOPPING and self._quick_stop_is_over(amplifier)):
             self._enter(self._end_state)
         return False
 
-    def _finish_enabling(self, amplifier: AmplifierFeedback) -> bool:
-        if amplifier.goal_reached and amplifier.state == DriveState.OPERATION_ENABLED:
+    def _finish_enabling(self, amplifier: AmplifierFeedback, encoder_fresh: bool) -> bool:
+        fresh = encoder_fresh and amplifier.age_cycles == 0
+        if fresh and amplifier.goal_reached and amplifier.state == DriveState.OPERATION_ENABLED:
             self._enter(AxisState.ENABLED)
             return True
         if self._cycles_in_state > self._timeout_cycles:

@@ -17,7 +17,6 @@ class Op(IntEnum):
     DISABLE = 2  # [] ramp down, then disable
     QUICK_STOP = 3  # []
     HALT = 4  # [0/1] stop the reference and hold / go on
-    RESET_FAULT = 5  # []
     ACTIVATE = 6  # [serial, law, n_params, params...]: bumpless change of the controller
     REFERENCE = 7  # [ReferenceKind, arguments...]
     SHUTDOWN = 8  # [] ramp down, disable, end the loop
@@ -25,7 +24,8 @@ class Op(IntEnum):
 
 
 class ReferenceKind(IntEnum):
-    """Reference motions. All start at the present reference position and add to it."""
+    """Reference motions. All start at the present reference position and add to it; a table is relative
+    to its first sample."""
 
     HOLD = 0  # []
     SINE = 1  # [amplitude_rad, frequency_hz, duration_s]
@@ -45,7 +45,9 @@ class Refusal(IntEnum):
     MOTION_RUNNING = 3
     BAD_ARGUMENT = 4
     OUT_OF_RANGE = 5
-    NOT_AT_REST = 6
+    NEEDS_RESTART = 6
+    OUTSIDE_LIMITS = 7
+    TOO_FAST = 8
 
 
 REFUSAL_TEXT: dict[Refusal, str] = {
@@ -54,7 +56,9 @@ REFUSAL_TEXT: dict[Refusal, str] = {
     Refusal.MOTION_RUNNING: "a motion is running; `servoctl stop` ends it",
     Refusal.BAD_ARGUMENT: "an argument is not a finite number or out of range",
     Refusal.OUT_OF_RANGE: "the motion would leave limits.position_min_rad to position_max_rad",
-    Refusal.NOT_AT_REST: "the joint still moves",
+    Refusal.NEEDS_RESTART: "a node or the bus was lost; the nodes must be configured anew: restart the daemon",
+    Refusal.OUTSIDE_LIMITS: "the joint stands outside limits.position_min_rad to position_max_rad; move it back by hand",
+    Refusal.TOO_FAST: "the motion would be faster than limits.speed_rad_s",
 }
 
 

@@ -113,8 +113,10 @@ class LimitsConfig(Strict):
     following_error_rad: Positive
     encoder_mismatch_rad: Positive
     stale_cycles: int = Field(5, ge=1, le=1000)
-    late_cycles: int = Field(20, ge=1, le=10_000, description="consecutive skipped periods that end the motion")
-    ramp_down_s: float = Field(0.05, gt=0.0, le=10.0, description="torque to zero in this time on RAMP_DOWN")
+    late_cycles: int = Field(
+        20, ge=1, le=10_000, description="skipped periods that end the motion; 20 punctual cycles make up for one"
+    )
+    ramp_down_s: float = Field(0.05, gt=0.0, le=1.0, description="torque to zero in this time on RAMP_DOWN")
 
     @model_validator(mode="after")
     def _range_is_a_range(self) -> LimitsConfig:

@@ -80,6 +80,19 @@ class FaultCode(IntEnum):
     SUPERVISOR_LOST = 23
     LOOP_LOST = 24
     RECORDER_FAILED = 25
+    DRIVE_STAYS_POWERED = 26
+
+
+#: Faults after which the nodes are not as they were configured: only a new bring-up may enable the axis again.
+NEEDS_RESTART = frozenset(
+    {
+        FaultCode.DRIVE_RESET,
+        FaultCode.NODE_HEARTBEAT_LOST,
+        FaultCode.BUS_OFF,
+        FaultCode.BUS_DOWN,
+        FaultCode.DRIVE_STAYS_POWERED,
+    }
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +182,7 @@ FAULTS: dict[FaultCode, Fault] = dict(
         _row(
             _C.DEADLINE_BUDGET,
             _R.QUICK_STOP,
-            "More cycles in a row were late than limits.late_cycles allows.",
+            "More cycles were late than limits.late_cycles allows.",
             "Find what starves the loop: see the real-time report in `servoctl status`, pin and isolate a core.",
         ),
         _row(
@@ -224,7 +237,7 @@ FAULTS: dict[FaultCode, Fault] = dict(
             _C.NODE_HEARTBEAT_LOST,
             _R.DISABLE,
             "A node's heartbeat did not arrive within its time.",
-            "Check the node's supply and the bus wiring; the node may have been reset or switched off.",
+            "Check the node's supply and the bus wiring, then restart the daemon, which configures the node anew.",
         ),
         _row(
             _C.BUS_OFF,
@@ -261,6 +274,13 @@ FAULTS: dict[FaultCode, Fault] = dict(
             _R.NONE,
             "The recording could not be written.",
             "Check free space and rights of recorder.directory.",
+        ),
+        _row(
+            _C.DRIVE_STAYS_POWERED,
+            _R.DISABLE,
+            "The drive stays powered, or is not heard, although it was told to switch off.",
+            "Cut its supply or pull its enable input; then look for what keeps the control word (RPDO1) from the drive "
+            "and restart the daemon.",
         ),
     ]
 )

@@ -26,8 +26,14 @@ _CLIPPED = _BIT[FaultCode.TORQUE_CLIPPED]
 _RATE = _BIT[FaultCode.TORQUE_RATE_CLIPPED]
 
 
+#: Skipped periods that one punctual cycle makes up for: a single good cycle does not forgive a starving machine.
+_FORGIVEN_PER_CYCLE = 0.05
+#: Above this share of the speed limit a joint counts as moving.
+_MOVING_SHARE = 0.01
+
+
 class Limits:
-    """Limits of one axis; holds the last torque, the encoder offset at enable and the count of late cycles."""
+    """Limits of one axis; holds the last torque, the encoder offset at enable and how late the loop has been."""
 
     def __init__(self, config: LimitsConfig) -> None:
         """Copies the numbers out of `config`, so that the cycle touches plain floats only."""
@@ -40,7 +46,7 @@ class Limits:
         self.stale_cycles, self.late_cycles = config.stale_cycles, config.late_cycles
         self._last_torque_nm = 0.0
         self._encoder_offset_rad = 0.0
-        self._late_in_a_row = 0
+        self._late_level = 0.0
 
     def arm(self, amplifier: AmplifierFeedback, encoder: EncoderFeedback) -> None:
         """At enable: both position sensors agree by definition now; torque starts from what is produced now."""
@@ -60,15 +66,18 @@ class Limits:
             faults |= _NOT_FINITE
         return faults
 
-    def motion_faults(self, amplifier: AmplifierFeedback, encoder: EncoderFeedback, reference_rad: float) -> int:
-        """Faults of the motion of an enabled axis, as fault bits. Comparisons are written so that NaN is a fault."""
+    def motion_faults(self, amplifier: AmplifierFeedback, encoder: EncoderFeedback, reference_rad: float | None) -> int:
+        """Faults of the motion of a powered axis, as fault bits. Comparisons are written so that NaN is a fault.
+
+        `reference_rad` None: the reference is followed no more (the torque is being ramped down).
+        """
         faults = 0
         position = encoder.position_rad
         if not abs(encoder.velocity_rad_s) <= self.speed_rad_s:
             faults |= _SPEED
         if not self.position_min_rad <= position <= self.position_max_rad:
             faults |= _POSITION
-        if not abs(reference_rad - position) <= self.following_error_rad:
+        if reference_rad is not None and not abs(reference_rad - position) <= self.following_error_rad:
             faults |= _FOLLOWING
         if not abs(amplifier.position_rad - position - self._encoder_offset_rad) <= self.encoder_mismatch_rad:
             faults |= _MISMATCH
@@ -80,22 +89,29 @@ class Limits:
             self._last_torque_nm = 0.0
             return 0.0, _NOT_FINITE
         faults, torque_nm = 0, wanted_nm
-        if abs(torque_nm) > self.torque_nm:
-            torque_nm, faults = math.copysign(self.torque_nm, torque_nm), _CLIPPED
         step_nm = self.torque_rate_nm_per_s * dt_s
-        change_nm = torque_nm - self._last_torque_nm
+        change_nm = wanted_nm - self._last_torque_nm
         if abs(change_nm) > step_nm:
-            torque_nm, faults = self._last_torque_nm + math.copysign(step_nm, change_nm), faults | _RATE
+            torque_nm, faults = self._last_torque_nm + math.copysign(step_nm, change_nm), _RATE
+        if abs(torque_nm) > self.torque_nm:  # the torque itself has the last word, wherever the ramp began
+            torque_nm, faults = math.copysign(self.torque_nm, torque_nm), faults | _CLIPPED
         self._last_torque_nm = torque_nm
         return torque_nm, faults
+
+    def ramp(self, from_nm: float, share: float, velocity_rad_s: float) -> float:
+        """Torque of a ramp-down: `share` of what there was, and nothing of a torque that drives the joint on.
+
+        The torque that a failed motion ends with may be the one that does the harm (a wrong polarity); only braking
+        and holding torque is taken away slowly.
+        """
+        drives = from_nm * velocity_rad_s > 0.0 and abs(velocity_rad_s) > _MOVING_SHARE * self.speed_rad_s
+        return 0.0 if drives else from_nm * share
 
     def release(self) -> None:
         """The axis produces no torque: the next ramp starts from zero."""
         self._last_torque_nm = 0.0
 
     def _deadline_faults(self, skipped: int) -> int:
-        if skipped == 0:
-            self._late_in_a_row = 0
-            return 0
-        self._late_in_a_row += skipped
-        return _LATE | (_BUDGET if self._late_in_a_row > self.late_cycles else 0)
+        self._late_level = max(0.0, self._late_level + skipped - _FORGIVEN_PER_CYCLE)
+        late = _LATE if skipped else 0
+        return late | (_BUDGET if self._late_level > self.late_cycles else 0)

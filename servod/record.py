@@ -46,6 +46,8 @@ FIELDS: tuple[Field, ...] = (
     Field("reference_active", "q", "bool", "a reference motion is running"),
     Field("bus_queue_full", "q", "1", "frames that could not be queued"),
     Field("bus_error_frames", "q", "1", "error frames seen"),
+    Field("late_frames", "q", "1", "feedback that came after its cycle, since the start"),
+    Field("ignored_frames", "q", "1", "frames that did not fit their mapping, since the start"),
     Field("reference_rad", "d", "rad", "reference position"),
     Field("reference_velocity_rad_s", "d", "rad/s", "reference velocity"),
     Field("position_rad", "d", "rad", "encoder position"),
@@ -95,6 +97,8 @@ class CycleRecord(NamedTuple):
     reference_active: int
     bus_queue_full: int
     bus_error_frames: int
+    late_frames: int
+    ignored_frames: int
     reference_rad: float
     reference_velocity_rad_s: float
     position_rad: float

@@ -41,6 +41,7 @@ class Motion(NamedTuple):
     highest_rad: float
     torque_nm: Callable[[float], float] | None = None
     window_rad: float = math.inf
+    speed_rad_s: float = 0.0  # fastest of the path where it is known; the sender of a table checks it
 
 
 def paper(t_s: float) -> Sample:
@@ -66,14 +67,17 @@ def sine(amplitude_rad: float, frequency_hz: float) -> Callable[[float], Sample]
 
 
 def table(positions_rad: Samples, samples: int, period_s: float) -> Callable[[float], Sample]:
-    """The first `samples` positions, one period apart, linear between them, with the velocity of the interval."""
-    last = samples - 1
+    """The first `samples` positions, one period apart, linear between them, with the velocity of the interval.
+
+    Relative to the first of them, so that no table makes the reference jump when it starts.
+    """
+    last, first_rad = samples - 1, positions_rad[0]
 
     def path(t_s: float) -> Sample:
         index = min(int(t_s / period_s + 1e-9), last - 1)
         here, there = positions_rad[index], positions_rad[index + 1]
         velocity = (there - here) / period_s
-        return here + velocity * (t_s - index * period_s), velocity, 0.0
+        return here - first_rad + velocity * (t_s - index * period_s), velocity, 0.0
 
     return path
 
@@ -110,14 +114,17 @@ def _sine(rest: Sequence[float], _period_s: float, _trajectory: Samples) -> Moti
     amplitude_rad, frequency_hz, duration_s = rest
     if frequency_hz <= 0.0 or duration_s <= 0.0:
         raise ValueError("frequency and duration are positive")
-    return Motion(sine(amplitude_rad, frequency_hz), duration_s, -abs(amplitude_rad), abs(amplitude_rad))
+    extent_rad = abs(amplitude_rad)
+    speed_rad_s = extent_rad * 2.0 * math.pi * frequency_hz
+    return Motion(sine(amplitude_rad, frequency_hz), duration_s, -extent_rad, extent_rad, speed_rad_s=speed_rad_s)
 
 
 def _paper(rest: Sequence[float], _period_s: float, _trajectory: Samples) -> Motion:
     (duration_s,) = rest
     if not 0.0 < duration_s <= PAPER_AMPLITUDE_RAD / PAPER_DECAY_RAD_PER_S:
         raise ValueError("the envelope of (19) ends at 30.3 s")
-    return Motion(paper, duration_s, -PAPER_AMPLITUDE_RAD, PAPER_AMPLITUDE_RAD)
+    speed_rad_s = PAPER_AMPLITUDE_RAD * PAPER_OMEGA_RAD_PER_S
+    return Motion(paper, duration_s, -PAPER_AMPLITUDE_RAD, PAPER_AMPLITUDE_RAD, speed_rad_s=speed_rad_s)
 
 
 def _step(rest: Sequence[float], _period_s: float, _trajectory: Samples) -> Motion:
@@ -131,7 +138,9 @@ def _table(rest: Sequence[float], period_s: float, trajectory: Samples) -> Motio
     samples, lowest_rad, highest_rad = int(rest[0]), rest[1], rest[2]
     if not 2 <= samples <= len(trajectory):
         raise ValueError("between 2 samples and the size of the trajectory area")
-    return Motion(table(trajectory, samples, period_s), (samples - 1) * period_s, lowest_rad, highest_rad)
+    first_rad = trajectory[0]
+    path = table(trajectory, samples, period_s)
+    return Motion(path, (samples - 1) * period_s, lowest_rad - first_rad, highest_rad - first_rad)
 
 
 def _excite(rest: Sequence[float], period_s: float, trajectory: Samples) -> Motion:
@@ -139,8 +148,8 @@ def _excite(rest: Sequence[float], period_s: float, trajectory: Samples) -> Moti
     if not 2 <= samples <= len(trajectory) // 2 or window_rad <= 0.0:
         raise ValueError("between 2 samples and half the trajectory area; a positive window")
     torque = torque_table(trajectory, samples, samples, period_s)
-    path = table(trajectory, samples, period_s)
-    return Motion(path, (samples - 1) * period_s, lowest_rad, highest_rad, torque, window_rad)
+    path, first_rad, duration_s = table(trajectory, samples, period_s), trajectory[0], (samples - 1) * period_s
+    return Motion(path, duration_s, lowest_rad - first_rad, highest_rad - first_rad, torque, window_rad)
 
 
 _BUILDERS: dict[int, Callable[[Sequence[float], float, Samples], Motion]] = {
@@ -203,6 +212,7 @@ class Reference:
         """Move time on by `dt_s`, as the scale has it, and take the new reference."""
         if not self.active or self._motion is None:
             return
+        before = self._scale
         self._change_scale(dt_s)
         self._time_s += dt_s * self._scale
         if self._time_s >= self._motion.duration_s:
@@ -214,7 +224,8 @@ class Reference:
         x, v, a = self._motion.path(self._time_s)
         scale = self._scale
         self.position_rad = self._base_rad + x
-        self.velocity_rad_s, self.acceleration_rad_s2 = v * scale, a * scale * scale
+        self.velocity_rad_s = v * scale
+        self.acceleration_rad_s2 = a * scale * scale + v * (scale - before) / dt_s  # chain rule: x(tau(t))
         self.torque_nm = 0.0 if self._motion.torque_nm is None else scale * self._motion.torque_nm(self._time_s)
 
     def _change_scale(self, dt_s: float) -> None:

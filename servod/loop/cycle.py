@@ -18,7 +18,7 @@ from servod.commands import Command
 from servod.controllers.engine import Controller
 from servod.drivers import load_driver
 from servod.errors import FAULTS, FaultCode
-from servod.hal import AmplifierCommand, AmplifierFeedback, EncoderFeedback, Goal, Mode
+from servod.hal import AmplifierCommand, AmplifierFeedback, DriveState, EncoderFeedback, Goal, Mode
 from servod.limits import Limits
 from servod.loop.exchange import Exchange
 from servod.loop.orders import carry_out
@@ -27,8 +27,12 @@ from servod.references import Reference, Samples
 from servod.units import NS_PER_S, NS_PER_US
 
 _SUPERVISOR_LOST = FAULTS[FaultCode.SUPERVISOR_LOST].bit
-#: Cycles with goal OFF before the loop ends, so that the drive has surely seen it.
+_STAYS_POWERED = FAULTS[FaultCode.DRIVE_STAYS_POWERED].bit
+#: At a shutdown the drive must be seen without power for so many cycles, and has so many to get there.
 GOODBYE_CYCLES = 20
+GOODBYE_TIMEOUT_CYCLES = 1000
+_POWERED = (AxisState.ENABLED, AxisState.BRAKING, AxisState.RAMPING)
+_UNPOWERED = (DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON, DriveState.FAULT)
 
 
 class Link(Protocol):
@@ -85,14 +89,14 @@ class Cycle:
         self.controller_serial = plan.serial
         self.reference = Reference(config.limits.ramp_down_s)
         self.event_faults = 0  # raised by the supervisor for one cycle
-        self.shutting_down = self.finished = False
-        self.torque_nm = 0.0
+        self.shutting_down = self.finished = self.seen_off = False
+        self.torque_nm = self.encoder_position_rad = 0.0
         self._ramp_from_nm = 0.0
         self._heartbeat_every = max(1, config.heartbeat.master_period_ms * 1000 // config.cycle.period_us)
         self._number = self._missed = self._heartbeat_due = 0
         self._last_sync_ns = self.exchange.sync_ns - self.period_ns
         self._command_seq = self._command_result = 0
-        self._tick_ns = self._torque_sent_ns = self._goodbye = 0
+        self._tick_ns = self._torque_sent_ns = self._goodbye = self._resting = 0
 
     def step(self, deadline_ns: int, woke_ns: int, skipped: int) -> None:
         """One cycle; `skipped` periods were missed before it."""
@@ -104,13 +108,15 @@ class Cycle:
         waited_ns = self.clock.now_ns() - waiting_from_ns
         amplifier, encoder = self.amplifier.read(), self.encoder.read()
         dt_s = self._interval_s(sync_ns)
-        output = self.axis.step(amplifier, self._faults(amplifier, encoder, skipped), self.reference.at_rest)
+        self.encoder_position_rad = encoder.position_rad
+        faults = self._faults(amplifier, encoder, skipped)
+        output = self.axis.step(amplifier, encoder.age_cycles == 0, faults, self.reference.at_rest)
         torque = self._torque(output, amplifier, encoder, dt_s)
         self._send(torque.sent, output)
         self._torque_sent_ns = self.clock.now_ns() - deadline_ns
         self._record(woke_ns - deadline_ns, amplifier, encoder, torque)
         self._take_command()
-        self._say_goodbye()
+        self._say_goodbye(amplifier)
         self._tick_ns = self.clock.now_ns() - woke_ns - waited_ns
 
     def shut_down(self) -> None:
@@ -127,8 +133,9 @@ class Cycle:
     def _faults(self, amplifier: AmplifierFeedback, encoder: EncoderFeedback, skipped: int) -> int:
         faults = self.limits.feedback_faults(amplifier, encoder, skipped) | self.exchange.faults() | self.event_faults
         self.event_faults = 0
-        if self.axis.state in (AxisState.ENABLED, AxisState.BRAKING):
-            faults |= self.limits.motion_faults(amplifier, encoder, self.reference.position_rad)
+        if self.axis.state in _POWERED:
+            followed = None if self.axis.state == AxisState.RAMPING else self.reference.position_rad
+            faults |= self.limits.motion_faults(amplifier, encoder, followed)
         if not self._supervisor_alive():
             faults |= _SUPERVISOR_LOST
             self.shutting_down = True
@@ -152,11 +159,14 @@ class Cycle:
             reference.position_rad, reference.velocity_rad_s, reference.acceleration_rad_s2,
             encoder.position_rad, encoder.velocity_rad_s, self.torque_nm, dt_s, reference.torque_nm,
         )  # fmt: skip
-        wanted_nm = law.u if output.torque_share == 1.0 else self._ramp_from_nm * output.torque_share
+        ramping = self.axis.state == AxisState.RAMPING
+        wanted_nm = law.u
+        if ramping:
+            wanted_nm = self.limits.ramp(self._ramp_from_nm, output.torque_share, encoder.velocity_rad_s)
         sent_nm, faults = self.limits.limit_torque(wanted_nm, dt_s)
         if faults:
             self.axis.raise_fault(faults)
-        if output.torque_share == 1.0:
+        if not ramping:
             self._ramp_from_nm = sent_nm
         self.torque_nm = sent_nm
         return _Torque(sent_nm, law.u, law.feedback, law.friction, law.other)
@@ -179,7 +189,8 @@ class Cycle:
         goal = self.axis.goal
         command = AmplifierCommand(goal, torque_nm if goal == Goal.ENABLED else 0.0, False, output.reset_fault)
         self.exchange.send(*self.amplifier.write(command))
-        if self._number >= self._heartbeat_due:
+        # A drive that does not switch off shall miss the heartbeat: its own consumer (0x1016) is the last line.
+        if self._number >= self._heartbeat_due and not self.axis.latched & _STAYS_POWERED:
             self._heartbeat_due = self._number + self._heartbeat_every
             self.exchange.heartbeat()
 
@@ -193,6 +204,7 @@ class Cycle:
             amplifier.reasons, axis.faults, axis.latched, amplifier.error_code,
             amplifier.age_cycles, encoder.age_cycles, self.controller_serial, self._command_seq, self._command_result,
             reference.active, queue_full, error_frames,
+            self.exchange.late_frames, self.amplifier.ignored_frames + self.encoder.ignored_frames,
             reference.position_rad, reference.velocity_rad_s, encoder.position_rad, encoder.velocity_rad_s,
             amplifier.position_rad, amplifier.torque_nm,
             torque.sent, torque.controller, torque.feedback, torque.friction, torque.other,
@@ -205,11 +217,19 @@ class Cycle:
             self._command_result = carry_out(self, command)
             self._command_seq = command.seq
 
-    def _say_goodbye(self) -> None:
-        """After a shutdown: finished once the drive has had the goal OFF for some cycles."""
+    def _say_goodbye(self, amplifier: AmplifierFeedback) -> None:
+        """After a shutdown: finished once the drive was seen without power for some cycles, or has had its time."""
         if not self.shutting_down:
             return
         self.axis.disable()
-        resting = self.axis.state in (AxisState.DISABLED, AxisState.FAULT)
-        self._goodbye = self._goodbye + 1 if resting else 0
-        self.finished = self._goodbye >= GOODBYE_CYCLES
+        if self.axis.state not in (AxisState.DISABLED, AxisState.FAULT):
+            return
+        self._resting += 1
+        off = amplifier.age_cycles == 0 and amplifier.state in _UNPOWERED
+        self._goodbye = self._goodbye + 1 if off else 0
+        self.seen_off = self._goodbye >= GOODBYE_CYCLES
+        self.finished = self.seen_off or self._resting >= GOODBYE_TIMEOUT_CYCLES
+
+    def let_go(self) -> None:
+        """Last frame of a loop that ends in an error: voltage off, without waiting for an answer."""
+        self.exchange.send(*self.amplifier.write(AmplifierCommand(Goal.OFF, 0.0)))

@@ -10,7 +10,9 @@ from servod.hal import Amplifier, Encoder, NodePlan
 from servod.loop.plan import LoopPlan
 from servod.units import NS_PER_S
 
-_OFF, _DOWN, _FULL = (FAULTS[c].bit for c in (FaultCode.BUS_OFF, FaultCode.BUS_DOWN, FaultCode.BUS_QUEUE_FULL))
+_BUS_OFF, _BUS_DOWN, _QUEUE_FULL = (
+    FAULTS[c].bit for c in (FaultCode.BUS_OFF, FaultCode.BUS_DOWN, FaultCode.BUS_QUEUE_FULL)
+)
 _OPERATIONAL = bytes([NmtState.OPERATIONAL])
 #: A cycle takes at most this many frames from the socket, so that a babbling node cannot hold the loop.
 MAX_FRAMES = 64
@@ -27,7 +29,7 @@ class Exchange:
         self._sync_ids = _synchronous_ids(plan.amplifier) | _synchronous_ids(plan.encoder)
         self._heartbeat_id = HEARTBEAT_BASE + plan.config.heartbeat.master_node_id
         self.late_frames = 0
-        self._queue_full = 0
+        self._queue_full = self._bus_off_events = self._down_events = 0
         self.sync_ns = clock.now_ns()
 
     def sync(self) -> int:
@@ -60,12 +62,17 @@ class Exchange:
         self._bus.send(self._heartbeat_id, _OPERATIONAL)
 
     def faults(self) -> int:
-        """What is wrong with the bus now, as fault bits."""
-        counters = self._bus.counters
-        faults = (_OFF if counters.bus_off else 0) | (_DOWN if counters.down else 0)
+        """What is wrong with the bus, or was since the last call however shortly, as fault bits."""
+        counters, faults = self._bus.counters, 0
+        if counters.bus_off or counters.bus_off_events != self._bus_off_events:
+            self._bus_off_events = counters.bus_off_events
+            faults |= _BUS_OFF
+        if counters.down or counters.down_events != self._down_events:
+            self._down_events = counters.down_events
+            faults |= _BUS_DOWN
         if counters.queue_full != self._queue_full:
             self._queue_full = counters.queue_full
-            faults |= _FULL
+            faults |= _QUEUE_FULL
         return faults
 
     def counts(self) -> tuple[int, int]:
@@ -74,7 +81,8 @@ class Exchange:
 
     def _drain(self) -> None:
         """Frames from between the cycles. Feedback of the previous SYNC that comes now is dropped and counted: taken,
-        it would pass for fresh, and a bus that is always too late would look well."""
+        it would pass for fresh, and a bus that is always a little late would look well. One that comes only after the
+        next SYNC cannot be told from an answer to that; the mismatch of both encoders and the speed limit remain."""
         for _ in range(MAX_FRAMES):
             frame = self._bus.receive(0.0)
             if frame is None:

@@ -24,6 +24,9 @@ def carry_out(cycle: Cycle, command: Command) -> Refusal:
 
 
 def _enable(cycle: Cycle, arguments: Sequence[float]) -> Refusal:
+    position_rad = cycle.encoder_position_rad
+    if not cycle.limits.position_min_rad <= position_rad <= cycle.limits.position_max_rad:
+        return Refusal.OUTSIDE_LIMITS
     return cycle.axis.enable(bool(arguments and arguments[0]))
 
 
@@ -42,16 +45,11 @@ def _halt(cycle: Cycle, arguments: Sequence[float]) -> Refusal:
     return Refusal.DONE
 
 
-def _reset_fault(cycle: Cycle, _arguments: Sequence[float]) -> Refusal:
-    return cycle.axis.reset_fault()
-
-
 def _activate(cycle: Cycle, arguments: Sequence[float]) -> Refusal:
     serial, law, count, *parameters = arguments
     if len(parameters) != int(count):
         return Refusal.BAD_ARGUMENT
-    torque_now_nm = cycle.torque_nm if cycle.axis.state == AxisState.ENABLED else 0.0
-    if not cycle.controller.activate(int(law), parameters, torque_now_nm):
+    if not cycle.controller.activate(int(law), parameters, cycle.torque_nm):
         return Refusal.BAD_ARGUMENT
     cycle.controller_serial = int(serial)
     return Refusal.DONE
@@ -68,6 +66,8 @@ def _reference(cycle: Cycle, arguments: Sequence[float]) -> Refusal:
     here, limits = cycle.reference.position_rad, cycle.limits
     if here + motion.lowest_rad < limits.position_min_rad or here + motion.highest_rad > limits.position_max_rad:
         return Refusal.OUT_OF_RANGE
+    if motion.speed_rad_s > limits.speed_rad_s:
+        return Refusal.TOO_FAST
     cycle.reference.start(motion)
     return Refusal.DONE
 
@@ -80,7 +80,7 @@ def _shutdown(cycle: Cycle, _arguments: Sequence[float]) -> Refusal:
 def _node_event(cycle: Cycle, arguments: Sequence[float]) -> Refusal:
     bit = FAULTS[FaultCode(int(arguments[0]))].bit
     cycle.event_faults |= bit
-    cycle.axis.latched |= bit
+    cycle.axis.note(bit)
     return Refusal.DONE
 
 
@@ -89,7 +89,6 @@ _ORDERS: dict[int, Order] = {
     Op.DISABLE: _disable,
     Op.QUICK_STOP: _quick_stop,
     Op.HALT: _halt,
-    Op.RESET_FAULT: _reset_fault,
     Op.ACTIVATE: _activate,
     Op.REFERENCE: _reference,
     Op.SHUTDOWN: _shutdown,

@@ -20,8 +20,11 @@ from servod.loop.plan import LoopPlan
 from servod.realtime import apply_realtime
 from servod.units import NS_PER_S
 
-#: A supervisor whose beat stands still for this long counts as lost (its death is seen within one cycle).
-SUPERVISOR_TIMEOUT_S = 0.3
+#: A supervisor whose beat stands still for this long counts as lost. Its death is seen within one cycle; this is for
+#: one that hangs, which is not urgent: the loop has everything that it needs to control the axis.
+SUPERVISOR_TIMEOUT_S = 1.0
+#: Exit code of a loop that ended in order but did not see the drive switch off.
+NOT_SEEN_OFF = 4
 
 
 def supervisor_watch(channel: Channel, clock: Clock) -> Callable[[], bool]:
@@ -74,8 +77,8 @@ def run(cycle: Paced, clock: Clock) -> None:
         deadline_ns += period_ns
 
 
-def main() -> None:
-    """Entry point of the loop process."""
+def main() -> int:
+    """Entry point of the loop process; 0 when the drive was seen switched off at the end, else NOT_SEEN_OFF."""
     plan = LoopPlan.from_json(sys.stdin.read())
     channel, clock = Channel(int(sys.argv[1])), WallClock()
     bus = open_bus(plan.config.bus)
@@ -84,9 +87,14 @@ def main() -> None:
         signal.signal(number, lambda *_: cycle.shut_down())
     grants = apply_realtime(plan.config.cycle.cpu, plan.config.cycle.priority)
     channel.publish_ready(grants)
-    run(cycle, clock)
+    try:
+        run(cycle, clock)
+    except BaseException:
+        cycle.let_go()
+        raise
     bus.close()
+    return 0 if cycle.seen_off else NOT_SEEN_OFF
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

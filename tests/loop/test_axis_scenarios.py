@@ -55,10 +55,12 @@ def test_scenario(path):
             assert (refusal or Refusal.DONE).name == entry.get("answer", "DONE"), f"{path.name}, entry {number}"
         bits = sum(FAULTS[FaultCode[name]].bit for name in entry.get("faults", []))
         for _ in range(entry.get("repeat", 1)):
-            output = axis.step(feedback(drive), bits, entry.get("reference at rest", False))
+            output = axis.step(
+                feedback(drive), "encoder stale" not in entry, bits, entry.get("reference at rest", False)
+            )
         shown = {
             "axis": axis.state.name,
-            "goal": output.goal.name,
+            "goal": axis.goal.name,
             "torque share": output.torque_share,
             "just enabled": output.just_enabled,
             "brake": output.brake,

@@ -105,15 +105,35 @@ def test_encoder_alarm():
     assert codes(armed().feedback_faults(amplifier(), encoder(alarms=1), 0)) == {FaultCode.ENCODER_ALARM}
 
 
-def test_late_cycles_warn_then_end_the_motion_and_a_good_cycle_forgives():
+def test_late_cycles_warn_then_end_the_motion_and_one_good_cycle_does_not_forgive():
     limits = armed()
     assert codes(limits.feedback_faults(amplifier(), encoder(), 4)) == {FaultCode.DEADLINE_LATE}
+    assert limits.feedback_faults(amplifier(), encoder(), 0) == 0
     assert codes(limits.feedback_faults(amplifier(), encoder(), 1)) == {
         FaultCode.DEADLINE_LATE,
         FaultCode.DEADLINE_BUDGET,
     }
-    assert limits.feedback_faults(amplifier(), encoder(), 0) == 0
+    for _ in range(100):
+        limits.feedback_faults(amplifier(), encoder(), 0)
     assert codes(limits.feedback_faults(amplifier(), encoder(), 4)) == {FaultCode.DEADLINE_LATE}
+
+
+def test_a_machine_that_is_late_every_other_cycle_does_not_pass():
+    limits, found = armed(), set()
+    for _ in range(20):
+        found |= codes(limits.feedback_faults(amplifier(), encoder(), 2))
+        limits.feedback_faults(amplifier(), encoder(), 0)
+    assert FaultCode.DEADLINE_BUDGET in found
+
+
+@pytest.mark.parametrize(
+    ("name", "bit"), [("stale_cycles", FaultCode.FEEDBACK_STALE), ("late_cycles", FaultCode.DEADLINE_BUDGET)]
+)
+def test_mutation_of_the_limits_in_cycles(name, bit):
+    wide = Limits(CONFIG.model_copy(update={name: 1000}))
+    seen = wide.feedback_faults(amplifier(age_cycles=4), encoder(), 6)
+    assert bit not in codes(seen)
+    assert bit in codes(armed().feedback_faults(amplifier(age_cycles=4), encoder(), 6))
 
 
 def test_offset_between_the_sensors_at_enable_is_not_a_mismatch():
@@ -132,16 +152,48 @@ def test_rate_limit_starts_from_the_torque_at_enable():
     assert codes(faults) == {FaultCode.TORQUE_RATE_CLIPPED}
 
 
-@given(st.lists(st.floats(allow_nan=True, allow_infinity=True), max_size=60))
-def test_no_sequence_of_wishes_gets_more_torque_or_rate_than_allowed(wishes):
-    limits, last = armed(), 0.0
+@pytest.mark.parametrize("name", ["position_min_rad", "position_max_rad", "torque_rate_nm_per_s"])
+def test_mutation_of_range_and_rate(name):
+    wide = Limits(CONFIG.model_copy(update={name: getattr(CONFIG, name) * 1000}))
+    wide.arm(amplifier(), encoder())
+
+    def seen(limits: Limits) -> set[FaultCode]:
+        low, high = encoder(position_rad=-1.5), encoder(position_rad=2.5)
+        words = [
+            limits.motion_faults(amplifier(position_rad=e.position_rad), e, None) << i
+            for i, e in ((0, low), (32, high))
+        ]
+        return {(i, limits.limit_torque(0.25, PERIOD_S)[1] != 0) for i, w in enumerate(words) if w}
+
+    assert seen(wide) != seen(armed())
+
+
+@given(st.floats(-10, 10), st.lists(st.floats(allow_nan=True, allow_infinity=True), max_size=60))
+def test_no_sequence_of_wishes_gets_more_torque_or_rate_than_allowed(start, wishes):
+    limits, last = Limits(CONFIG), start
+    limits.arm(amplifier(torque_nm=start), encoder())
     for wish in wishes:
         torque, faults = limits.limit_torque(wish, PERIOD_S)
         assert math.isfinite(torque)
         assert abs(torque) <= CONFIG.torque_nm
-        if not codes(faults) & {FaultCode.NOT_FINITE}:
+        if not codes(faults) & {FaultCode.NOT_FINITE} and abs(last) <= CONFIG.torque_nm:
             assert abs(torque - last) <= CONFIG.torque_rate_nm_per_s * PERIOD_S * (1 + 1e-12)
         last = torque
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_ramp_holds_and_brakes_but_never_drives_on(sign):
+    limits = armed()
+    assert limits.ramp(0.2 * sign, 0.5, -1.0 * sign) == 0.1 * sign
+    assert limits.ramp(0.2 * sign, 0.5, 0.0) == 0.1 * sign
+    assert limits.ramp(0.2 * sign, 0.5, 1.0 * sign) == 0.0
+
+
+def test_without_a_reference_only_the_following_error_is_left_out():
+    found = codes(
+        armed().motion_faults(amplifier(position_rad=9.0), encoder(velocity_rad_s=9.0, position_rad=5.0), None)
+    )
+    assert found == {FaultCode.SPEED_LIMIT, FaultCode.POSITION_LIMIT, FaultCode.ENCODER_IMPLAUSIBLE}
 
 
 @pytest.mark.parametrize("name", ["torque_nm", "speed_rad_s", "following_error_rad", "encoder_mismatch_rad"])

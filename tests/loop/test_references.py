@@ -52,8 +52,8 @@ def test_step_starts_at_the_present_position_and_stays_at_its_end():
 
 
 def test_table_is_followed_sample_by_sample():
-    rows = [0.0, 0.01, 0.03, 0.02]
-    reference = started(ReferenceKind.TABLE, 4, 0.0, 0.03, trajectory=rows)
+    rows = [0.5, 0.51, 0.53, 0.52]  # a table is relative to its first sample: no jump at the start
+    reference = started(ReferenceKind.TABLE, 4, 0.5, 0.53, trajectory=rows)
     assert run(reference, 3) == pytest.approx([1.01, 1.03, 1.02])
     assert not reference.active
 
@@ -124,3 +124,21 @@ def test_an_excitation_fades_and_ends_when_the_joint_leaves_its_window():
 @pytest.mark.parametrize("arguments", [(5, 0.0, 0.0, 0.1), (1, 0.0, 0.0, 0.1), (4, 0.0, 0.0, 0.0), (4, 0.0, 0.0)])
 def test_an_excitation_must_fit_the_area_and_have_a_window(arguments):
     assert make_motion([ReferenceKind.EXCITE, *arguments], PERIOD_S, EXCITATION) is Refusal.BAD_ARGUMENT
+
+
+def test_acceleration_while_halting_is_the_derivative_of_the_velocity():
+    reference = started(ReferenceKind.SINE, 0.1, 0.5, 10.0)
+    run(reference, 300)
+    reference.halt(True)
+    before = reference.velocity_rad_s
+    for _ in range(40):
+        reference.advance(PERIOD_S)
+        difference = (reference.velocity_rad_s - before) / PERIOD_S
+        assert reference.acceleration_rad_s2 == pytest.approx(difference, rel=0.05, abs=0.05)
+        before = reference.velocity_rad_s
+
+
+def test_extent_and_speed_of_a_motion_are_stated_for_the_limits():
+    motion = make_motion([ReferenceKind.TABLE, 3, 4.0, 6.0], PERIOD_S, [5.0, 6.0, 4.0])
+    assert (motion.lowest_rad, motion.highest_rad) == (-1.0, 1.0)
+    assert make_motion([ReferenceKind.SINE, -0.1, 2.0, 1.0], PERIOD_S, []).speed_rad_s == pytest.approx(0.4 * math.pi)
