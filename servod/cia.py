@@ -179,6 +179,36 @@ class Obj406(IntEnum):
     OFFSET = 0x6509
 
 
+#: Objects of CiA 402 and 406 that act when they are written: commands, modes, set-points, outputs and presets. In a file
+#: they are what a tool saw at one moment, not parameters; see `acts_when_written`.
+ACTING_OBJECTS = frozenset(
+    {
+        Obj402.CONTROL_WORD,
+        Obj402.MODE,
+        Obj402.TARGET_TORQUE,
+        Obj402.TARGET_POSITION,
+        Obj402.TARGET_VELOCITY,
+        Obj402.TORQUE_OFFSET,
+        0x6042,  # vl target velocity
+        0x60B0,  # position offset
+        0x60B1,  # velocity offset
+        0x60B8,  # touch probe function
+        0x60C1,  # interpolation data record
+        0x60FE,  # digital outputs, the brake among them
+        Obj406.PRESET,
+        0x6010,  # preset values of an encoder with several channels
+    }
+)
+_FIRST_PROFILE_OBJECT, _LAST_PROFILE_OBJECT, _LOGICAL_DEVICE = 0x6000, 0x9FFF, 0x800
+
+
+def acts_when_written(index: int) -> bool:
+    """Whether an object is in ACTING_OBJECTS, on any of the eight logical devices of a node (CiA 301: 0x800 apart)."""
+    if not _FIRST_PROFILE_OBJECT <= index <= _LAST_PROFILE_OBJECT:
+        return False
+    return _FIRST_PROFILE_OBJECT + (index - _FIRST_PROFILE_OBJECT) % _LOGICAL_DEVICE in ACTING_OBJECTS
+
+
 # --- CiA 402: status word ------------------------------------------------------------------------------------------
 #: (mask, value, state); a word that matches none of the rows is UNKNOWN.
 STATUS_WORD_TABLE: tuple[tuple[int, int, DriveState], ...] = (

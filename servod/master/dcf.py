@@ -1,7 +1,8 @@
 """Writes the parameter values of a DCF to a node. Off the control path.
 
 A DCF is an EDS with ParameterValue keys: how somebody configured this device with the maker's tool. Only the device's
-own objects (0x2000 and up) are taken from it; communication objects are the bring-up's, which verifies them.
+own parameters (0x2000 and up) are taken from it: communication objects are the bring-up's, which verifies them, and
+what acts when it is written (control word, set-points, outputs, presets) is nobody's to write from a file.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from collections.abc import Iterator
 
 from canopen.objectdictionary import ODVariable, datatypes
 
+from servod.cia import acts_when_written
 from servod.drivers.setup_tools import write_checked
 from servod.hal import SdoAccess
 from servod.master.eds import Dictionary
@@ -19,7 +21,17 @@ _WRITABLE = ("rw", "rww", "rwr")  # CiA 306; write-only objects are commands, no
 
 
 def parameters(dictionary: Dictionary) -> Iterator[tuple[int, int, int]]:
-    """(index, subindex, value) of the device's writable integers that the file gives a value, by rising index."""
+    """(index, subindex, value) of the device's parameters that the file gives a value, by rising index."""
+    return (row for row in _values(dictionary) if not acts_when_written(row[0]))
+
+
+def left_out(dictionary: Dictionary) -> list[int]:
+    """Indices of the objects that the file gives a value, but that act when they are written."""
+    return sorted({index for index, _, _ in _values(dictionary) if acts_when_written(index)})
+
+
+def _values(dictionary: Dictionary) -> Iterator[tuple[int, int, int]]:
+    """All writable integers of the device that the file gives a value."""
     for index in sorted(dictionary.objects):
         entry = dictionary.objects[index]
         for variable in (entry,) if isinstance(entry, ODVariable) else entry.values():

@@ -11,7 +11,7 @@ from servod.drivers import load_driver
 from servod.drivers.setup_tools import read_optional, write_checked
 from servod.errors import BadInput, FaultCode, Unreachable
 from servod.hal import Driver, NodePlan, Setup
-from servod.master.dcf import write_parameters
+from servod.master.dcf import left_out, write_parameters
 from servod.master.eds import dictionary_for
 from servod.master.identity import check_identity, read_identity
 from servod.master.monitor import NodeWatch
@@ -92,7 +92,13 @@ class Node:
             report.append(f"node {self.node_id}: {written} parameters written from {self.dictionary.source}")
         report += configure_pdos(self.sdo, plan, self.dictionary)
         report += [f"node {self.node_id}: {note}" for note in plan.facts.pop("notes", [])]
-        return plan, report
+        return plan, report + self._report_left_out()
+
+    def _report_left_out(self) -> list[str]:
+        if not (indices := left_out(self.dictionary)):
+            return []
+        names = ", ".join(f"0x{index:04X}" for index in indices)
+        return [f"node {self.node_id}: not written from {self.dictionary.source}, they are commands: {names}"]
 
     def start_heartbeats(self) -> None:
         """0x1017 in the node, and for the amplifier 0x1016: it must stop by itself when we die."""
