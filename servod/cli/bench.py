@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from servod.cli.common import JsonOption, example, print_json
+from servod.cli.common import JsonOption, example, need_folder, print_json
 
 _HELP = example(
     "Measure wake-up (against cyclictest), cycle work, two processes on the wall clock, stepped and simulated "
@@ -35,6 +35,8 @@ def bench(
     from servod.benchmark import QUICK, THOROUGH, measure
     from servod.benchmark.table import print_table, write_json
 
+    if out is not None:
+        need_folder("--out", out.parent)  # said now, not after a quarter of an hour
     console = Console(stderr=True, quiet=as_json)
     with console.status("servoctl bench") as line:
         document = measure(QUICK if quick else THOROUGH, lambda text: line.update(f"measuring: {text}"))

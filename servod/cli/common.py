@@ -7,10 +7,13 @@ from __future__ import annotations
 
 import json
 import sys
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from servod.errors import BadInput
 
 if TYPE_CHECKING:
     from servod.control import ControlClient
@@ -40,6 +43,16 @@ def print_json(document: Any) -> None:
     """Print `document` as the one JSON document of a command."""
     json.dump(document, sys.stdout, indent=2, allow_nan=False)
     sys.stdout.write("\n")
+
+
+def need_folder(option: str, folder: Path) -> None:
+    """Make `folder` where it is missing, and see that a file can be written in it. Raises BadInput."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise BadInput(f"{option} {folder}", error.strerror or str(error), "a folder that can be written") from None
 
 
 def example(text: str, *lines: str) -> str:

@@ -59,3 +59,15 @@ def test_an_interrupt_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytes
     assert run(["demo", "--fast", "--json"]) == 130
     captured = capsys.readouterr()
     assert (captured.out, captured.err) == ("", "servoctl: interrupted\n")
+
+
+def test_bench_refuses_a_folder_that_cannot_be_before_it_measures(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def measured(*_: object) -> None:
+        pytest.fail("the benchmark ran")
+
+    monkeypatch.setattr("servod.benchmark.measure", measured)
+    assert run(["bench", "--out", "/proc/nowhere/bench.json"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "--out /proc/nowhere" in line
