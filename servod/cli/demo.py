@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servod.cli.common import JsonOption, example, print_json
+from servod.cli.common import JsonOption, example, need_folder, print_json
 
 if TYPE_CHECKING:
+    from servod.demo.entries import Entry
     from servod.demo.runs import Run
 
 _HELP = example(
     "Run daemon and virtual axis, track the paper's trajectory (19) under PD, PD + DOB, PD + LuGre and the local-model "
-    "law, and compare. Everything that is started is stopped again.",
+    "law, and compare; further gain sets get rows of their own. Everything that is started is stopped again.",
     "servoctl demo",
-    "servoctl demo --fast",
+    "servoctl demo --fast --gains gains/demo_local_plain.yaml",
     "servoctl demo --plant my_axis.yaml --json",
 )
 
@@ -34,6 +35,9 @@ def demo(
         bool, typer.Option("--fast", help="SYNC-stepped in virtual time instead of the wall clock.")
     ] = False,
     plant: Annotated[Path | None, typer.Option(help="Axis model (YAML) that the virtual axis is to be.")] = None,
+    gains: Annotated[
+        list[Path] | None, typer.Option(help="Gain set to run beside the four controllers; may be given again.")
+    ] = None,
     seconds: Annotated[float, typer.Option(min=2.0, max=30.0, help="Length of each run in s.")] = 30.0,
     out: Annotated[Path, typer.Option(help="Folder for report and recordings.")] = Path("out/demo"),
     as_json: JsonOption = False,
@@ -41,49 +45,58 @@ def demo(
     """Run the demo."""
     from servod.axis_model import load_axis_model
     from servod.demo.axis import plant_file
+    from servod.demo.entries import entries
     from servod.demo.runs import summary
-    from servod.report.demo import write_demo_page
+    from servod.report.demo import Story, write_demo_page
 
-    model = plant_file(plant)
-    load_axis_model(model)  # a bad file is refused before anything is started
+    # Everything that can be refused is refused before anything is started.
+    model, rows = plant_file(plant), entries(gains or ())
+    load_axis_model(model)
+    recordings = out / "recordings"
+    need_folder("--out", out if fast else recordings)
     started = time.monotonic()
-    runs = _run(fast, model, seconds, out, quiet=as_json)
+    runs, refused = _run(fast, model, seconds, rows, recordings, quiet=as_json)
     elapsed_s = time.monotonic() - started
     report = out / "report.html"
-    write_demo_page(runs, report, stepped=fast, plant=model.name)
-    document = summary(runs, elapsed_s) | {"mode": "stepped" if fast else "wall", "report": str(report)}
+    write_demo_page(rows, runs, report, Story(model.name, fast, refused))
+    document = summary(runs, elapsed_s) | {
+        "mode": "stepped" if fast else "wall",
+        "realtime_refused": refused,
+        "report": str(report),
+    }
     if as_json:
         print_json(document)
     else:
-        _print(document)
+        print_document(rows, document)
 
 
-def _run(fast: bool, plant: Path, seconds: float, out: Path, quiet: bool) -> list[Run]:
-    with _progress(quiet, seconds) as tell:
+def _run(
+    fast: bool, plant: Path, seconds: float, rows: Sequence[Entry], recordings: Path, quiet: bool
+) -> tuple[list[Run], list[str]]:
+    """The runs, and the real-time rights that the loop was refused; none are asked for in virtual time."""
+    with _progress(quiet, seconds, rows) as tell:
         if fast:
             from servod.demo.fast import run_fast
 
-            return run_fast(plant, seconds, tell)
+            return run_fast(plant, seconds, rows, tell), []
         from servod.demo.wall import run_wall
 
-        return run_wall(plant, seconds, out / "recordings", tell)
+        return run_wall(plant, seconds, rows, recordings, tell)
 
 
 @contextmanager
-def _progress(quiet: bool, seconds: float) -> Iterator[Callable[[str, float], None]]:
+def _progress(quiet: bool, seconds: float, rows: Sequence[Entry]) -> Iterator[Callable[[str, float], None]]:
     """A bar for each controller on standard error; nothing at all when quiet."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-    from servod.demo.axis import CONTROLLERS, LABELS
-
     columns = (
-        TextColumn("{task.description:12}"),
+        TextColumn(f"{{task.description:{max(len(row.label) for row in rows)}}}"),
         BarColumn(),
         TextColumn("{task.completed:4.1f} of {task.total:.0f} s"),
     )
     with Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True), disable=quiet) as bars:
-        tasks: dict[str, TaskID] = {c: bars.add_task(LABELS[c], total=seconds, start=False) for c in CONTROLLERS}
+        tasks: dict[str, TaskID] = {row.name: bars.add_task(row.label, total=seconds, start=False) for row in rows}
 
         def tell(controller: str, share: float) -> None:
             if share > 0.0:
@@ -93,20 +106,24 @@ def _progress(quiet: bool, seconds: float) -> Iterator[Callable[[str, float], No
         yield tell
 
 
-def _print(document: dict[str, Any]) -> None:
+def print_document(rows: Sequence[Entry], document: dict[str, Any]) -> None:
+    """Print the demo's document as a table for people, with what each law had and what the system refused."""
     from rich.console import Console
     from rich.table import Table
 
-    from servod.demo.axis import LABELS
-
     table = Table(
-        "Controller", "RMS error / mrad", "Largest error / mrad", title="Trajectory (19), first second left out"
+        "Controller", "Options", "RMS / mrad", "Largest / mrad", title="Error on trajectory (19), first second left out"
     )
-    for controller, score in document["controllers"].items():
-        table.add_row(LABELS[controller], f"{score['rms_error_mrad']:.3f}", f"{score['max_error_mrad']:.3f}")
+    scores = document["controllers"] | document.get("others", {})
+    for row in rows:
+        score = scores[row.name]
+        table.add_row(row.label, row.options, f"{score['rms_error_mrad']:.3f}", f"{score['max_error_mrad']:.3f}")
     console = Console()
     console.print(table)
     console.print(
         f"{document['cycles']} cycles, {document['missed']} missed, {document['wall_s']:.1f} s.", highlight=False
     )
+    if document["realtime_refused"]:
+        refused = ", ".join(document["realtime_refused"])
+        console.print(f"Refused by the system, so timing may suffer: {refused}.", highlight=False)
     console.print(f"Report: {document['report']}", highlight=False, soft_wrap=True)

@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from servod.demo.axis import CONTROLLERS
 from servod.errors import AnswerIsNo
 from servod.record import FIELDS
 
 #: One cycle record as a row of a structured array; the same bytes as servod.record.RECORD.
 ROW = np.dtype([(f.name, "<f8" if f.kind == "d" else "<i8") for f in FIELDS])
 
-#: The contract scores trajectory (19) without its first second.
+#: Trajectory (19) is scored without its first second, in which the axis starts to move.
 SETTLE_S = 1.0
 
 
@@ -75,9 +76,15 @@ def cut_motion(controller: str, raw: bytes | bytearray) -> Run:
 
 
 def summary(runs: list[Run], wall_s: float) -> dict[str, Any]:
-    """The demo's JSON document: the score of each controller, cycles, missed periods and elapsed time."""
+    """The demo's JSON document: the score of each controller, cycles, missed periods and elapsed time.
+
+    Runs under gain sets beside the four controllers stand under `others`, which is there only when there are any.
+    """
+    scores = {run.controller: asdict(run.score()) for run in runs}
+    others = {name: scores.pop(name) for name in list(scores) if name not in CONTROLLERS}
     return {
-        "controllers": {run.controller: asdict(run.score()) for run in runs},
+        "controllers": scores,
+        **({"others": others} if others else {}),
         "cycles": sum(run.cycles for run in runs),
         "missed": sum(run.missed for run in runs),
         "wall_s": wall_s,

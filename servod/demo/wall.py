@@ -9,7 +9,7 @@ import contextlib
 import math
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +17,8 @@ import yaml
 
 from servod.config import AxisConfig
 from servod.control import ControlClient
-from servod.demo.axis import CONTROLLERS, demo_config, gains_file, other_cores
+from servod.demo.axis import demo_config, other_cores
+from servod.demo.entries import Entry
 from servod.demo.processes import child, sigterm_as_interrupt, wait_until
 from servod.demo.runs import Run, cut_motion
 from servod.errors import AnswerIsNo, Unreachable
@@ -74,37 +75,44 @@ def _answers(control: Path) -> bool:
         return False
 
 
-def run_wall(plant: Path, duration_s: float, recordings: Path, progress: Progress) -> list[Run]:
-    """Track trajectory (19) for `duration_s` under each controller; one recording each stays in `recordings`.
+class WallRuns(NamedTuple):
+    """The runs, and what of the loop's real-time rights the system refused, with the reason."""
+
+    runs: list[Run]
+    refused: list[str]
+
+
+def run_wall(plant: Path, duration_s: float, rows: Sequence[Entry], recordings: Path, progress: Progress) -> WallRuns:
+    """Track trajectory (19) for `duration_s` under each entry; one recording each stays in `recordings`, which exists.
 
     Raises AnswerIsNo when the axis does not get through, Unreachable when a process does not start.
     """
-    recordings.mkdir(parents=True, exist_ok=True)
     with sigterm_as_interrupt(), tempfile.TemporaryDirectory(prefix="servod-demo-") as name:
         folder = Path(name)
         with running_axis(demo_config(folder, recordings), plant, folder) as (client, _):
             client.call("enable")
-            home_rad = float(client.call("status")["motion"]["reference_rad"])
+            status = client.call("status")
+            home_rad = float(status["motion"]["reference_rad"])
             runs = []
-            for controller in CONTROLLERS:
-                runs.append(_run(client, controller, duration_s, recordings, progress))
+            for row in rows:
+                runs.append(_run(client, row, duration_s, recordings, progress))
                 _go_home(client, home_rad)
             client.call("disable")
-    return runs
+    return WallRuns(runs, [f"{g['name']} ({g['reason']})" for g in status["grants"] if not g["granted"]])
 
 
-def _run(client: ControlClient, controller: str, duration_s: float, recordings: Path, progress: Progress) -> Run:
-    """One controller: activate it, record trajectory (19), and cut the motion from the recording."""
-    activate(client, gains_file(controller))
-    (recordings / f"{controller}.mcap").unlink(missing_ok=True)
-    path = client.call("record_start", path=f"{controller}.mcap")["path"]
+def _run(client: ControlClient, row: Entry, duration_s: float, recordings: Path, progress: Progress) -> Run:
+    """One entry: activate it, record trajectory (19), and cut the motion from the recording."""
+    activate(client, row.gains)
+    (recordings / f"{row.name}.mcap").unlink(missing_ok=True)
+    path = client.call("record_start", path=f"{row.name}.mcap")["path"]
     started = time.monotonic()
     client.call("track", kind="paper", duration_s=duration_s)
     while _moves(client):
-        progress(controller, min(1.0, (time.monotonic() - started) / duration_s))
-    progress(controller, 1.0)
+        progress(row.name, min(1.0, (time.monotonic() - started) / duration_s))
+    progress(row.name, 1.0)
     client.call("record_stop")
-    return cut_motion(controller, read_recording(path).rows)
+    return cut_motion(row.name, read_recording(path).rows)
 
 
 def activate(client: ControlClient, gains: Path) -> None:
@@ -128,8 +136,13 @@ def _go_home(client: ControlClient, home_rad: float) -> None:
 def _moves(client: ControlClient) -> bool:
     """Wait a little; then whether the motion still runs. Raises AnswerIsNo when the axis is not enabled any more."""
     time.sleep(_POLL_S)
+    return motion_runs(client)
+
+
+def motion_runs(client: ControlClient) -> bool:
+    """Whether a motion runs. Raises AnswerIsNo with the faults when the axis is not enabled any more."""
     status: dict[str, Any] = client.call("status")
     if status["axis"]["state"] != "ENABLED":
         faults = "; ".join(f"{f['code']}: {f['cause']}" for f in status["faults"])
-        raise AnswerIsNo(f"the axis went to {status['axis']['state']} during the demo. {faults}")
+        raise AnswerIsNo(f"the axis went to {status['axis']['state']} while it was to move. {faults}")
     return bool(status["axis"]["motion_running"])

@@ -13,13 +13,16 @@ from pathlib import Path
 import pytest
 
 from servod.cli.app import run
+from servod.cli.demo import print_document
+from servod.demo.entries import entries
+from servod.shipped import shipped
 
 #: Both lines of the paper's story: feedback alone sticks, a friction model removes most of the error.
 STUCK_MRAD, COMPENSATED_MRAD = 10.0, 2.0
 
 
 def check(document: dict, out: Path) -> None:
-    """The contract's keys, errors in the right order, and a report."""
+    """The documented keys, errors in the right order, and a report."""
     scores = document["controllers"]
     assert list(scores) == ["pd", "pd_dob", "pd_lugre", "local"]
     for score in scores.values():
@@ -41,6 +44,41 @@ def test_the_fast_demo_prints_one_document(tmp_path: Path, capsys: pytest.Captur
     assert captured.err == ""
     assert document["missed"] == 0
     assert document["cycles"] == pytest.approx(4 * 5000, abs=8)
+
+
+def test_further_gain_sets_run_beside_the_four(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plain = str(shipped("gains/demo_local_plain.yaml"))
+    assert run(["demo", "--fast", "--seconds", "3", "--out", str(tmp_path), "--gains", plain, "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    check(document, tmp_path)
+    assert list(document["others"]) == ["demo_local_plain"]
+    assert document["others"]["demo_local_plain"]["rms_error_mrad"] < COMPENSATED_MRAD
+
+
+@pytest.mark.parametrize("mode", [[], ["--fast"]], ids=["wall", "fast"])
+@pytest.mark.parametrize("folder", ["/proc/nowhere", "{file}/demo"], ids=["not made", "a file"])
+def test_a_folder_that_cannot_be_is_refused_before_anything_runs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, mode: list[str], folder: str
+) -> None:
+    (tmp_path / "file").touch()
+    out = folder.format(file=tmp_path / "file")
+
+    def ran(*_: object) -> None:
+        pytest.fail("the demo ran")
+
+    monkeypatch.setattr("servod.cli.demo._run", ran)
+    assert run(["demo", *mode, "--out", out]) == 2
+    captured = capsys.readouterr()
+    (line,) = captured.err.splitlines()
+    assert captured.out == "" and f"--out {out}" in line
+
+
+def test_the_table_names_options_and_refused_rights(capsys: pytest.CaptureFixture[str]) -> None:
+    rows, score = entries(), {"rms_error_mrad": 1.0, "max_error_mrad": 2.0}
+    document = {"controllers": {row.name: score for row in rows}, "cycles": 1, "missed": 0, "wall_s": 1.0}
+    print_document(rows, document | {"realtime_refused": ["sched_fifo (not permitted)"], "report": "report.html"})
+    said = capsys.readouterr().out
+    assert "observer 50 rad/s" in said and "sched_fifo (not permitted)" in " ".join(said.split())
 
 
 def test_the_plant_can_be_another_joint(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from servod.demo.axis import CONTROLLERS
+from servod.demo.entries import entries
 from servod.demo.runs import ROW, Run, cut_motion, summary
-from servod.errors import AnswerIsNo
+from servod.errors import AnswerIsNo, BadInput
 from servod.report.curves import thin
-from servod.report.demo import write_demo_page
+from servod.report.demo import Story, write_demo_page
+from servod.shipped import shipped
 
 PERIOD_NS = 1_000_000
 
@@ -56,7 +58,7 @@ def test_a_run_shorter_than_its_first_second_has_no_score() -> None:
         cut_motion("pd", recorded(0.0, seconds=0.5).tobytes()).score()
 
 
-def test_summary_has_the_keys_of_the_contract_and_counts_skipped_periods() -> None:
+def test_summary_has_its_keys_and_counts_skipped_periods() -> None:
     rows = recorded(0.001)
     rows["missed"][-1000:] = 7
     rows["cycle"][-1000:] += 7
@@ -65,6 +67,37 @@ def test_summary_has_the_keys_of_the_contract_and_counts_skipped_periods() -> No
     assert set(document["controllers"]) == {"pd", "pd_dob", "pd_lugre", "local"}
     assert set(document["controllers"]["pd"]) == {"rms_error_mrad", "max_error_mrad"}
     assert (document["missed"], document["cycles"]) == (28, 4 * 3007)
+
+
+def test_further_runs_stand_apart_from_the_four_controllers() -> None:
+    raw = recorded(0.001).tobytes()
+    document = summary([cut_motion(c, raw) for c in (*CONTROLLERS, "demo_local_plain")], 1.5)
+    assert list(document["controllers"]) == list(CONTROLLERS)
+    assert list(document["others"]) == ["demo_local_plain"]
+    assert document["cycles"] == 5 * 3000
+
+
+def test_every_row_says_what_its_law_had() -> None:
+    rows = {row.name: row.options for row in entries([shipped("gains/demo_local_plain.yaml")])}
+    assert rows["pd"] == "none"
+    assert rows["pd_dob"] == "observer 50 rad/s"
+    assert rows["local"] == "friction map of 23 velocities, reference velocity, observer 50 rad/s, equal feedback"
+    assert rows["demo_local_plain"] == "friction map of 23 velocities, measured velocity, no observer, equal feedback"
+
+
+def test_a_row_is_not_given_twice() -> None:
+    plain = shipped("gains/demo_local_plain.yaml")
+    with pytest.raises(BadInput, match="found demo_local_plain"):
+        entries([plain, plain])
+
+
+def test_the_page_names_options_and_refused_rights(tmp_path: Path) -> None:
+    rows = entries([shipped("gains/demo_local_plain.yaml")])
+    runs = [cut_motion(row.name, recorded(0.001).tobytes()) for row in rows]
+    write_demo_page(rows, runs, tmp_path / "report.html", Story("joint", False, ["sched_fifo (not permitted)"]))
+    text = (tmp_path / "report.html").read_text()
+    assert all(f"<td>{row.label}</td><td>{row.options}</td>" in text for row in rows)
+    assert "refused the loop real-time rights: sched_fifo (not permitted)." in text
 
 
 def test_thinning_keeps_ends_and_peaks() -> None:
@@ -81,7 +114,7 @@ def test_thinning_keeps_ends_and_peaks() -> None:
 def test_the_page_is_whole_and_needs_no_network(tmp_path: Path, stepped: bool) -> None:
     runs: list[Run] = [cut_motion(c, recorded(0.001 * (i + 1)).tobytes()) for i, c in enumerate(CONTROLLERS)]
     page = tmp_path / "deep" / "report.html"
-    write_demo_page(runs, page, stepped, "a <joint>")
+    write_demo_page(entries(), runs, page, Story("a <joint>", stepped))
     text = page.read_text()
     assert "PD tracked best with 1.000 mrad RMS, Local models worst with 4.000 mrad." in text
     assert "a &lt;joint&gt;" in text
