@@ -15,7 +15,7 @@ from servod.control import ControlClient
 from servod.demo.axis import demo_config, gains_file, plant_file
 from servod.demo.processes import sigterm_as_interrupt
 from servod.demo.runs import Run, cut_motion
-from servod.demo.wall import activate, running_axis
+from servod.demo.wall import activate, motion_runs, running_axis
 from servod.errors import AnswerIsNo
 from servod.recorder_read import read_recording
 
@@ -96,7 +96,5 @@ def _resident_kib(pid: int) -> int:
 
 
 def _must_move(client: ControlClient) -> None:
-    status = client.call("status")
-    if status["axis"]["state"] != "ENABLED" or not status["axis"]["motion_running"]:
-        faults = "; ".join(f"{f['code']}: {f['cause']}" for f in status["faults"])
-        raise AnswerIsNo(f"the axis went to {status['axis']['state']} during the benchmark. {faults}")
+    if not motion_runs(client):
+        raise AnswerIsNo("the motion ended before the benchmark")
