@@ -222,6 +222,20 @@ def demo_local_sets(model: AxisModel) -> list[GainSet]:
             REGIONS_EQUAL,
         ),
         local(
+            "demo_local_no_observer",
+            "demo_local without its disturbance observer: what the friction map with the reference's velocity does alone.",
+            0.04,
+            REGIONS_EQUAL,
+            friction=reference,
+        ),
+        local(
+            "demo_local_measured",
+            "demo_local with the measured velocity in place of the reference's.",
+            0.04,
+            REGIONS_EQUAL,
+            disturbance_observer=DOB,
+        ),
+        local(
             "demo_local_stiff",
             "Local law with the gains of Table I, the reference's velocity and the disturbance observer: tracks best.",
             0.04,
