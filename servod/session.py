@@ -50,7 +50,8 @@ class SteppedSession:
         self.bring_up: BringUp = self.master.bring_up()
         plan = LoopPlan(config, self.bring_up.amplifier, self.bring_up.encoder, law, tuple(parameters))
         self._link = _ListLink()
-        self.cycle = Cycle(plan, world.connect(), world.clock, self._link, lambda: True)
+        self.loop_bus = world.connect()
+        self.cycle = Cycle(plan, self.loop_bus, world.clock, self._link, lambda: True)
         self._deadline_ns = self.clock.now_ns() + self.cycle.period_ns
         self._seq = 0
         self._cycles_until_poll = 0

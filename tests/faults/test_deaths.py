@@ -29,6 +29,11 @@ def has_ended(pid: int) -> bool:
     return not stat.exists() or stat.read_text().rsplit(")", 1)[1].split()[0] == "Z"
 
 
+def states_since(m: Machine, time_ns: int) -> set[DriveState]:
+    """States of the drive from `time_ns` to the end of its record."""
+    return {DriveState(s.state) for s in m.drive_samples() if s.time_ns > time_ns}
+
+
 def torque_is_gone(m: Machine, killed_ns: int) -> None:
     """From 300 ms after the kill to the end of the record there is no torque, and before it there was some."""
     samples = m.drive_samples()
@@ -50,8 +55,7 @@ def test_asked_to_stop_the_daemon_ramps_down_and_ends_with_0(tmp_path, number):
         assert m.daemon.wait(5.0) == 0
         time.sleep(0.5)
         torque_is_gone(m, asked_ns)
-        states = [s.state for s in m.drive_samples() if s.time_ns > asked_ns]
-        assert DriveState.FAULT not in states
+        assert states_since(m, asked_ns) <= {_ENABLED, DriveState.SWITCH_ON_DISABLED}
         assert not (tmp_path / "axis.sock").exists()
 
 
@@ -79,6 +83,8 @@ def test_supervisor_killed_the_loop_brakes_ramps_down_and_ends(tmp_path):
         time.sleep(0.6)
         torque_is_gone(m, killed_ns)
         assert has_ended(pid)
+        # The loop itself switched off: no quick stop of the drive's own, and no fault for want of a heartbeat.
+        assert DriveState.QUICK_STOP_ACTIVE not in states_since(m, killed_ns)
 
 
 def test_loop_and_supervisor_killed_together_leave_the_drive_to_its_heartbeat_consumer(tmp_path):
@@ -92,6 +98,7 @@ def test_loop_and_supervisor_killed_together_leave_the_drive_to_its_heartbeat_co
         os.kill(pid, signal.SIGKILL)
         time.sleep(0.6)
         torque_is_gone(m, killed_ns)
+        assert DriveState.QUICK_STOP_ACTIVE in states_since(m, killed_ns)  # 0x1016 and 0x6007, nobody else was left
 
 
 def test_virtual_axis_killed_the_daemon_goes_to_fault_and_asks_for_no_torque(tmp_path):
