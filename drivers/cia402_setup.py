@@ -93,10 +93,19 @@ class AmplifierSetup:
             facts["rated_torque_nm"] = amplifier.rated_torque_mnm * 1e-3
         return NodePlan(amplifier.driver, amplifier.node_id, pdos, facts)
 
+    def inspect(self, sdo: SdoAccess) -> None:
+        """Refuse a powered drive: it may be another axis's, or this one's whose heartbeat time-out still runs."""
+        state = decode_status_word(sdo.read(Obj402.STATUS_WORD))
+        if state in _POWERED:
+            raise Unreachable(
+                f"amplifier node {self._amplifier.node_id} is powered ({state.name}): "
+                "nothing is sent to it; disable it or wait for its heartbeat time-out, then start again"
+            )
+
     def configure(self, sdo: SdoAccess) -> NodePlan:
         """Write options and mode, read scalings; the node is pre-operational. Raises Unreachable, BadInput."""
         self._notes = []
-        self._refuse_while_powered(sdo)
+        self.inspect(sdo)
         self._check_preconditions(sdo)
         self._check_mode_supported(sdo)
         plan = self.plan()
@@ -107,14 +116,6 @@ class AmplifierSetup:
         write_checked(sdo, Obj402.MODE, 0, int(self._mode))
         plan.facts["notes"] = list(self._notes)
         return plan
-
-    def _refuse_while_powered(self, sdo: SdoAccess) -> None:
-        state = decode_status_word(sdo.read(Obj402.STATUS_WORD))
-        if state in _POWERED:
-            raise Unreachable(
-                f"amplifier node {self._amplifier.node_id} is powered ({state.name}): "
-                "nothing is written to it; disable it or wait for its heartbeat time-out, then start again"
-            )
 
     def _check_preconditions(self, sdo: SdoAccess) -> None:
         for wanted in self._quirks.preconditions:

@@ -50,8 +50,17 @@ class EncoderSetup:
             facts["measuring_range_counts"] = encoder.measuring_range_counts
         return NodePlan(encoder.driver, encoder.node_id, encoder_pdos(encoder.node_id), facts)
 
+    def inspect(self, sdo: SdoAccess) -> None:
+        """Refuse an encoder that shows alarms: its position may be wrong (CiA 406, 0x6503)."""
+        alarms = read_optional(sdo, Obj406.ALARMS)
+        if alarms:
+            raise Unreachable(
+                f"encoder node {self._encoder.node_id} shows alarms (0x6503 = 0x{alarms:04X}): "
+                "check its supply and mounting, then start again"
+            )
+
     def configure(self, sdo: SdoAccess) -> NodePlan:
-        """Check resolution, read the range and the alarms present; raises BadInput, Unreachable."""
+        """Check resolution, read the range; raises BadInput, Unreachable."""
         encoder, plan = self._encoder, self.plan()
         self._check_resolution(sdo)
         measuring_range = self._measuring_range(sdo)
@@ -59,9 +68,6 @@ class EncoderSetup:
         if wanted is not None and wanted != measuring_range:
             raise BadInput("encoder.measuring_range_counts", f"{wanted}", f"{measuring_range}, what 0x6002 reads")
         plan.facts["measuring_range_counts"] = measuring_range
-        alarms = read_optional(sdo, Obj406.ALARMS)
-        if alarms:
-            plan.facts["notes"] = [f"encoder shows alarms at start: 0x6503 = 0x{alarms:04X}"]
         return plan
 
     def _check_resolution(self, sdo: SdoAccess) -> None:

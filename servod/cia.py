@@ -179,8 +179,8 @@ class Obj406(IntEnum):
     OFFSET = 0x6509
 
 
-#: Objects of CiA 402 and 406 that act when they are written: commands, modes, set-points, outputs and presets. In a file
-#: they are what a tool saw at one moment, not parameters; see `acts_when_written`.
+#: Objects of CiA 402 and 406 that act when they are written: commands, modes, set-points, outputs and presets. In a
+#: file they are what a tool saw at one moment, not parameters; see `acts_when_written`.
 ACTING_OBJECTS = frozenset(
     {
         Obj402.CONTROL_WORD,

@@ -236,10 +236,17 @@ class SdoAccess(Protocol):
 
 
 class Setup(Protocol):
-    """Set-up face of a driver: states what it wants (for the bus load) and brings the device there."""
+    """Set-up face of a driver: states what it wants (for the bus load), looks, and brings the device there."""
 
     def plan(self) -> NodePlan:
         """The wanted mapping, from the configuration alone, without touching the bus."""
+        ...
+
+    def inspect(self, sdo: SdoAccess) -> None:
+        """Look whether the device may be set up now: reads alone, before anything else is sent to it.
+
+        Raises Unreachable when it must be left alone (powered) or cannot be used (alarms).
+        """
         ...
 
     def configure(self, sdo: SdoAccess) -> NodePlan:

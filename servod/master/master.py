@@ -1,8 +1,9 @@
 """The CANopen master of one axis: brings amplifier and encoder up, and watches them. Off the control path.
 
-The order of the bring-up is its safety: both nodes pre-operational and known (0x1018) before anything is written; the
-bus load refused before anything is started; parameters, then mapping, read back and compared; then the drive is made
-to watch us (0x1016), and only then NMT start. SYNC, PDOs and the master's heartbeat are the loop's, not ours.
+The order of the bring-up is its safety. By reads alone, so that a wrong node id harms nobody: who both nodes are
+(0x1018) and whether they may be touched (not powered, no alarms). The bus load is refused before anything is sent. Then
+pre-operational; parameters, then mapping, read back and compared; then the drive is made to watch us (0x1016), and
+only then NMT start. SYNC, PDOs and the master's heartbeat are the loop's, not ours.
 """
 
 from __future__ import annotations
@@ -53,13 +54,17 @@ class Master:
         """Bring both nodes to operational; raises BadInput, Unreachable or SdoAbort with one line that says where."""
         nodes = (self._amplifier, self._encoder)
         report = [line for node in nodes for line in node.report_dictionary()]
-        for node in nodes:
-            node.watch.watch(False)
-            report += node.reach()
         wanted = [node.setup.plan() for node in nodes]
         load = bus_load(self._config, wanted)
         check_bus_load(load, self._config.bus.max_load)
         report.append(f"bus load {load.describe()}")
+        for node in nodes:
+            node.watch.watch(False)
+            report += node.identify()
+        for node in nodes:
+            node.inspect()
+        for node in nodes:
+            node.stop_operation()
         plans = []
         for node, plan in zip(nodes, wanted, strict=True):
             report += node.reset_as_quirks_ask(plan)

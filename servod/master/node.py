@@ -10,7 +10,7 @@ from servod.config import AmplifierConfig, AxisConfig, EncoderConfig
 from servod.drivers import load_driver
 from servod.drivers.setup_tools import read_optional, write_checked
 from servod.errors import BadInput, FaultCode, Unreachable
-from servod.hal import Driver, NodePlan, Setup
+from servod.hal import Driver, NodePlan, SdoAbort, Setup
 from servod.master.dcf import left_out, write_parameters
 from servod.master.eds import dictionary_for
 from servod.master.identity import check_identity, read_identity
@@ -51,15 +51,35 @@ class Node:
         """What was mended in the EDS."""
         return [f"{self.dictionary.source}: {line}" for line in self.dictionary.report]
 
-    def reach(self) -> list[str]:
-        """Bring to pre-operational and check who it is; nothing else is written. Raises Unreachable."""
-        send_nmt(self._network, NmtCommand.PRE_OPERATIONAL, self.node_id)
-        found = read_identity(self.sdo)
+    def identify(self) -> list[str]:
+        """Check who it is, by SDO reads alone, which work in operational and pre-operational. Raises Unreachable."""
+        try:
+            found = read_identity(self.sdo)
+        except SdoAbort:
+            raise
+        except Unreachable as error:
+            raise Unreachable(self._why_silent(str(error))) from None
         check_identity(self.node_id, found, self.section.identity, PROFILE[self._kind])
         return [
             f"node {self.node_id}: profile {found.profile}, vendor 0x{found.vendor_id:08X}, "
             f"product {found.product_code}, revision {found.revision}, serial {found.serial}"
         ]
+
+    def _why_silent(self, error: str) -> str:
+        if self.watch.nmt_state == NmtState.STOPPED:
+            return (
+                f"node {self.node_id} is NMT stopped and answers no SDO, so who it is cannot be asked; "
+                "switch it off and on, or send it NMT pre-operational"
+            )
+        return f"{error}; is node {self.node_id} there, supplied, not NMT stopped, and at this bit rate?"
+
+    def inspect(self) -> None:
+        """Look whether it may be set up now; raises Unreachable when it is powered or shows alarms."""
+        self.setup.inspect(self.sdo)
+
+    def stop_operation(self) -> None:
+        """Bring to pre-operational: from here on no PDO acts. A drive that is switched on leaves that by 0x6007."""
+        send_nmt(self._network, NmtCommand.PRE_OPERATIONAL, self.node_id)
 
     def reset_as_quirks_ask(self, plan: NodePlan) -> list[str]:
         """Reset the node's communication where its quirks want that: always, or after certain last errors."""
@@ -83,8 +103,8 @@ class Node:
     def configure(self) -> tuple[NodePlan, list[str]]:
         """Parameters, then mapping written, read back and compared; the plan with its facts, and the report.
 
-        The set-up face goes first, because it refuses a powered device; after values of a DCF it goes again, because
-        its scalings and options have the last word.
+        After values of a DCF the set-up face goes again: its scalings and options have the last word, and it refuses a
+        device that the values have powered.
         """
         plan, report = self.setup.configure(self.sdo), []
         if written := write_parameters(self.sdo, self.dictionary):

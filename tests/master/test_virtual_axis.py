@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 from rig import Rig, stepped_world
 
-from servod.cia import NmtCommand, Obj402
+from servod.cia import NmtCommand, Obj301, Obj402, Obj406
 from servod.drivers.cia406_setup import preset
 from servod.drivers.virtual.bus_faults import BusFault, FaultKind
+from servod.drivers.virtual.world import SteppedBus
 from servod.errors import FaultCode, Unreachable
 from servod.hal import DriveState, Goal, Reason, SdoAbort
 
@@ -236,15 +238,60 @@ def test_what_the_enabled_drive_refuses_is_said(
         act(holding)
 
 
-def test_a_new_master_stops_a_drive_that_still_runs_before_it_writes(enabled: Rig) -> None:
-    """Pre-operational takes the old master's PDOs away: the drive brakes by 0x6007, and is written to only after."""
+def acting(spy: SteppedBus) -> list[tuple[int, bytes]]:
+    """What was sent since the last look that is no SDO read: NMT commands and SDO writes."""
+    heard = list(iter(lambda: spy.receive(0.0), None))
+    sent = [(frame.can_id, frame.data) for frame in heard if frame.can_id in (0, 0x601, 0x602)]
+    return [(can_id, data) for can_id, data in sent if can_id == 0 or data[0] != 0x40]
+
+
+@pytest.mark.parametrize(
+    ("section", "message"),
+    [
+        ({}, r"amplifier node 1 is powered \(OPERATION_ENABLED\)"),
+        ({"quirks": "elmo"}, r"amplifier node 1 is powered \(OPERATION_ENABLED\)"),  # would reset its communication
+        ({"identity": {"serial": 77}}, r"node 1 is another device: serial"),
+    ],
+)
+def test_a_drive_that_somebody_runs_is_asked_and_left_alone(
+    enabled: Rig, section: dict[str, Any], message: str
+) -> None:
     enabled.run(50, Goal.ENABLED, 0.03)
-    again = Rig(enabled.world)
-    with pytest.raises(Unreachable, match="QUICK_STOP_ACTIVE"):
+    again, spy = Rig(enabled.world, amplifier=section), enabled.world.connect()
+    with pytest.raises(Unreachable, match=message):
         again.start()
+    assert acting(spy) == []
+    enabled.deadline_ns = enabled.clock.now_ns()
+    assert enabled.run(200, Goal.ENABLED, 0.03)[0].state is S.OPERATION_ENABLED
+    assert enabled.world.truth().torque_nm == pytest.approx(0.03, abs=2e-4)
+    assert enabled.master.sdo(1).read(Obj301.HEARTBEAT_CONSUMER, 1) == 126 << 16 | 150
+
+
+def test_a_drive_whose_master_died_is_taken_over_when_it_has_stopped_itself(enabled: Rig) -> None:
+    enabled.run(50, Goal.ENABLED, 0.03)
     enabled.clock.sleep_until(enabled.clock.now_ns() + 500_000_000)
+    again = Rig(enabled.world)
     again.start()
     assert again.run(3, Goal.OFF)[0].state in (S.SWITCH_ON_DISABLED, S.FAULT)
+
+
+@pytest.mark.parametrize("node_id", [1, 2])
+def test_a_stopped_node_is_named_and_nothing_is_sent(rig: Rig, node_id: int) -> None:
+    rig.bus.send(0, bytes((NmtCommand.STOP, node_id)))
+    rig.clock.sleep_until(rig.clock.now_ns() + 1_000_000)
+    again, spy = Rig(rig.world), rig.world.connect()
+    with pytest.raises(Unreachable, match=f"node {node_id} is NMT stopped"):
+        again.start()
+    assert 0 not in [can_id for can_id, _ in acting(spy)]
+
+
+def test_an_encoder_with_alarms_is_refused_before_anything_is_sent() -> None:
+    world = stepped_world()
+    world.encoder.dictionary.entry(Obj406.ALARMS).value = 1
+    rig, spy = Rig(world), world.connect()
+    with pytest.raises(Unreachable, match=r"encoder node 2 shows alarms \(0x6503 = 0x0001\)"):
+        rig.start()
+    assert acting(spy) == []
 
 
 def test_bring_up_again_after_the_master_died(enabled: Rig) -> None:
