@@ -223,7 +223,7 @@ def demo_local_sets(model: AxisModel) -> list[GainSet]:
         ),
         local(
             "demo_local_no_observer",
-            "demo_local without its disturbance observer: what the friction map with the reference's velocity does alone.",
+            "demo_local without its disturbance observer: friction map and reference velocity alone.",
             0.04,
             REGIONS_EQUAL,
             friction=reference,
