@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
 _HELP = example(
     "Run daemon and virtual axis, track the paper's trajectory (19) under PD, PD + DOB, PD + LuGre and the local-model "
-    "law, and compare; further gain sets get rows of their own. Everything that is started is stopped again.",
+    "law, and compare. --gains adds rows; --fast adds three by itself on the shipped joint: the local law without "
+    "options, and Table I in both readings. Everything that is started is stopped again.",
     "servoctl demo",
     "servoctl demo --fast --gains gains/demo_local_plain.yaml",
     "servoctl demo --plant my_axis.yaml --json",
@@ -45,12 +46,13 @@ def demo(
     """Run the demo."""
     from servod.axis_model import load_axis_model
     from servod.demo.axis import plant_file
-    from servod.demo.entries import entries
+    from servod.demo.entries import entries, further_files
     from servod.demo.runs import summary
     from servod.report.demo import Story, write_demo_page
 
     # Everything that can be refused is refused before anything is started.
-    model, rows = plant_file(plant), entries(gains or ())
+    further = gains or (further_files() if fast and plant is None else [])
+    model, rows = plant_file(plant), entries(further)
     load_axis_model(model)
     recordings = out / "recordings"
     need_folder("--out", out if fast else recordings)

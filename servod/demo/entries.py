@@ -14,6 +14,11 @@ from servod.demo.axis import CONTROLLERS, LABELS, gains_file
 from servod.errors import BadInput
 from servod.gain_parameters import LocalParameters, PdDobParameters, PdLugreParameters
 from servod.gains import GainSet, load_gains
+from servod.shipped import shipped
+
+#: Gain sets that run beside the four controllers where that is cheap: the local law without options, and the paper's
+#: Table I in both readings of its gain labels.
+FURTHER = ("demo_local_plain", "table1_kz_kv_kx", "table1_kx_kv_kz")
 
 
 class Entry(NamedTuple):
@@ -34,6 +39,11 @@ def entries(further: Sequence[Path] = ()) -> list[Entry]:
             raise BadInput(f"--gains {file}: name", gains.name, "a name that no other row of the table has")
         rows.append(Entry(gains.name, gains.name, options_of(gains), file))
     return rows
+
+
+def further_files() -> list[Path]:
+    """The shipped files of FURTHER."""
+    return [shipped(f"gains/{name}.yaml") for name in FURTHER]
 
 
 def options_of(gains: GainSet) -> str:

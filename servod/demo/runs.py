@@ -76,12 +76,13 @@ def cut_motion(controller: str, raw: bytes | bytearray) -> Run:
 
 
 def summary(runs: list[Run], wall_s: float) -> dict[str, Any]:
-    """The demo's JSON document: the score of each controller, cycles, missed periods and elapsed time.
+    """The demo's JSON document: the score of each controller, their cycles and missed periods, and elapsed time.
 
     Runs under gain sets beside the four controllers stand under `others`, which is there only when there are any.
     """
     scores = {run.controller: asdict(run.score()) for run in runs}
     others = {name: scores.pop(name) for name in list(scores) if name not in CONTROLLERS}
+    runs = [run for run in runs if run.controller in scores]
     return {
         "controllers": scores,
         **({"others": others} if others else {}),

@@ -74,7 +74,7 @@ def test_further_runs_stand_apart_from_the_four_controllers() -> None:
     document = summary([cut_motion(c, raw) for c in (*CONTROLLERS, "demo_local_plain")], 1.5)
     assert list(document["controllers"]) == list(CONTROLLERS)
     assert list(document["others"]) == ["demo_local_plain"]
-    assert document["cycles"] == 5 * 3000
+    assert document["cycles"] == 4 * 3000
 
 
 def test_every_row_says_what_its_law_had() -> None:
