@@ -12,7 +12,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from servod.benchmark.table import GOALS, figure
+from servod.benchmark.table import GOALS
+from servod.benchmark.table import shown as shown_figure
 from servod.config import AxisConfig
 from servod.drivers.quirks import QUIRKS
 from servod.errors import FAULTS
@@ -94,13 +95,12 @@ def measured(document: dict[str, Any]) -> str:
     machine = document["machine"]
     rows = []
     for goal in GOALS:
-        value = figure(document, goal)
-        rows.append([goal.label, "not measured" if value is None else goal.text.format(value), goal.goal])
+        rows.append([goal.label, shown_figure(document, goal), goal.goal, goal.verdict(document)])
     wall_s, memory_s = document["wall_clock"]["seconds"], document["memory"]["seconds"]
     return (
         f"Measured by `servoctl bench` on {machine['cpu']}, {machine['cores']} cores, Linux {machine['kernel']}, "
         f"Python {machine['python']}; wall clock over {wall_s:.0f} s, memory over {memory_s:.0f} s.\n\n"
-        + markdown(["Figure", "Measured", "Goal"], rows)
+        + markdown(["Figure", "Measured", "Goal", ""], rows)
     )
 
 
