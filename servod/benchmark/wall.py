@@ -84,7 +84,7 @@ def _processes(daemon_pid: int) -> dict[str, int]:
 
 
 def _growth_mib(samples_kib: list[int]) -> float:
-    few = min(_AVERAGED, len(samples_kib) // 2)
+    few = max(1, min(_AVERAGED, len(samples_kib) // 2))
     return (statistics.mean(samples_kib[-few:]) - statistics.mean(samples_kib[:few])) / _KIB_PER_MIB
 
 
