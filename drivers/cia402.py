@@ -21,9 +21,10 @@ from servod.cia import (
 from servod.drivers.cia402_setup import AmplifierSetup
 from servod.drivers.cia402_state import STATE_OF_STATUS, control_words, quick_stop_stays, reached_states
 from servod.drivers.cia402_target import TARGETS
-from servod.drivers.pdo_codec import codec, find, slot
+from servod.drivers.pdo_codec import codec, find, lost_after_cycles, slot
 from servod.hal import (
     HANDSHAKE_SYNCS,
+    NEVER_CYCLES,
     AmplifierCommand,
     AmplifierFeedback,
     Driver,
@@ -71,7 +72,8 @@ class Cia402Amplifier:
         self._nm_per_mille = int(facts["torque_direction"]) * rated_nm * gear / PER_MILLE
         self.ignored_frames = 0  # too short for the mapping
         self._time_ns = 0
-        self._age_cycles = 1  # nothing has come yet
+        self._age_cycles = NEVER_CYCLES
+        self._slow_age_cycles = 0
         self._state = DriveState.UNKNOWN
         self._status_word = 0
         self._mode = _MODE_NOT_KNOWN
@@ -103,6 +105,7 @@ class Cia402Amplifier:
         if slow is not None:
             self._slow_id, self._slow_codec = slow.cob_id, codec(slow, _FORMATS, plan.driver)
             self._mode_slot, self._error_slot = slot(slow, Obj402.MODE_DISPLAY), slot(slow, Obj402.ERROR_CODE)
+        self._slow_limit_cycles = lost_after_cycles(slow, float(plan.facts["period_s"]))
         self._emcy_id = EMCY_BASE + plan.node_id
         slow_ids = () if slow is None else (self._slow_id,)
         self.receive_ids: tuple[int, ...] = (self._feedback_id, *slow_ids, self._emcy_id)
@@ -122,6 +125,7 @@ class Cia402Amplifier:
             else:
                 values = self._slow_codec.unpack_from(data)
                 self._mode, self._error_code = values[self._mode_slot], values[self._error_slot]
+                self._slow_age_cycles = 0
         elif can_id == self._emcy_id:
             if len(data) < _EMCY.size:
                 self.ignored_frames += 1
@@ -151,7 +155,7 @@ class Cia402Amplifier:
                 self._age_cycles,
                 self._state,
                 self._status_word,
-                self._mode,
+                self._shown_mode(),
                 (self._unwrapped_counts or 0) * self._rad_per_count,
                 self._torque_per_mille * self._nm_per_mille,
                 self._error_code,
@@ -160,13 +164,26 @@ class Cia402Amplifier:
             )
         return self._feedback
 
+    def _slow_lost(self) -> bool:
+        return self._slow_limit_cycles is not None and self._slow_age_cycles > self._slow_limit_cycles
+
+    def _shown_mode(self) -> int:
+        """The mode last shown; one that is not shown any more is a wrong one while the drive acts on targets.
+
+        The target goes on meanwhile as the last mode meant it, so that the axis can be brought down in order.
+        """
+        if not self._slow_lost():
+            return self._mode
+        return Mode.NONE if self._state == DriveState.OPERATION_ENABLED else _MODE_NOT_KNOWN
+
     def _reasons(self) -> int:
         """Why the goal of the last command is not reached; zero when it is."""
         if self._age_cycles >= HANDSHAKE_SYNCS or self._unwrapped_counts is None:
             return Reason.NO_FEEDBACK
         if self._state == DriveState.UNKNOWN:
             return Reason.STATE_UNKNOWN
-        mode_shown = self._slow_id < 0 or self._mode == self._wanted_mode or self._goal != Goal.ENABLED
+        shown = self._slow_id < 0 or (self._mode == self._wanted_mode and not self._slow_lost())
+        mode_shown = shown or self._goal != Goal.ENABLED
         if self._reached[self._goal][self._state]:
             reasons = Reason.HALTED if self._halt else Reason.NONE
             return reasons if mode_shown else reasons | Reason.MODE_NOT_SHOWN
@@ -233,6 +250,7 @@ class Cia402Amplifier:
             self._handshake -= 1
         self._goal, self._halt, self._control_word = goal, halt, word
         self._age_cycles += 1
+        self._slow_age_cycles += 1
         self._feedback = None
 
 

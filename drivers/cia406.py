@@ -12,8 +12,8 @@ import struct
 
 from servod.cia import Obj406
 from servod.drivers.cia406_setup import EncoderSetup
-from servod.drivers.pdo_codec import codec, find, slot
-from servod.hal import Driver, EncoderFeedback, NodePlan
+from servod.drivers.pdo_codec import codec, find, lost_after_cycles, slot
+from servod.hal import ALARMS_STALE, NEVER_CYCLES, Driver, EncoderFeedback, NodePlan
 from servod.units import NS_PER_S, TWO_PI, rad_per_count, wrapped_difference
 
 #: Lengths of the objects that this driver decodes (CiA 406).
@@ -42,6 +42,7 @@ class Cia406Encoder:
         self._alarm_id = -1 if alarm_pdo is None else alarm_pdo.cob_id
         self._alarm_codec = struct.Struct("<H") if alarm_pdo is None else codec(alarm_pdo, _FORMATS, plan.driver)
         self._alarm_slot = 0 if alarm_pdo is None else slot(alarm_pdo, Obj406.ALARMS)
+        self._alarm_limit_cycles = lost_after_cycles(alarm_pdo, float(facts["period_s"]))
         self._range = int(facts["measuring_range_counts"])
         self._rad_per_count = int(facts["direction"]) * rad_per_count(int(facts["counts_per_turn"]))
         self._zero_offset_rad = float(facts["zero_offset_rad"])
@@ -57,8 +58,9 @@ class Cia406Encoder:
         self._position_rad = 0.0
         self._velocity_rad_s = 0.0
         self._alarms = 0
+        self._alarm_age_cycles = 0
         self._fresh = False
-        self._age_cycles = 0
+        self._age_cycles = NEVER_CYCLES
 
     def on_frame(self, can_id: int, data: bytes, time_ns: int) -> bool:
         """Take one frame; True when it was this cycle's position. Short and impossible ones are ignored, counted."""
@@ -69,6 +71,7 @@ class Cia406Encoder:
                 self.ignored_frames += 1
             else:
                 self._alarms = self._alarm_codec.unpack_from(data)[self._alarm_slot]
+                self._alarm_age_cycles = 0
         return False
 
     def _take_position(self, data: bytes, time_ns: int) -> bool:
@@ -79,9 +82,7 @@ class Cia406Encoder:
         if raw >= self._range:  # not a position of this encoder: wrong range, or a corrupted counter
             self.ignored_frames += 1
             return False
-        if (
-            self._raw < 0
-        ):  # first sample: no velocity yet; the turn nearest to zero, so that -1 count is not a full range
+        if self._raw < 0:  # first sample: no velocity yet; the turn nearest to zero, so -1 count is not a full range
             self._unwrapped = self._zero_counts + wrapped_difference(raw, self._zero_counts, self._range)
         else:
             self._move(wrapped_difference(raw, self._raw, self._range), time_ns - self._time_ns)
@@ -101,12 +102,11 @@ class Cia406Encoder:
         """The feedback of this cycle; each call is one cycle, so the age grows by one when no sample came."""
         self._age_cycles = 0 if self._fresh else self._age_cycles + 1
         self._fresh = False
-        return EncoderFeedback(self._time_ns, self._age_cycles, self._position_rad, self._velocity_rad_s, self._alarms)
-
-    def forget(self) -> None:
-        """Take the next sample as the first one; for after a preset of the device (0x6003), which is no motion."""
-        self._raw = -1
-        self._velocity_rad_s = 0.0
+        self._alarm_age_cycles += 1
+        alarms, limit = self._alarms, self._alarm_limit_cycles
+        if limit is not None and self._alarm_age_cycles > limit:
+            alarms |= ALARMS_STALE
+        return EncoderFeedback(self._time_ns, self._age_cycles, self._position_rad, self._velocity_rad_s, alarms)
 
 
 DRIVER = Driver(kind="encoder", setup=EncoderSetup, cyclic=Cia406Encoder)

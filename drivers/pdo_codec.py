@@ -1,15 +1,27 @@
-"""Builds the struct of a PDO from its mapping, once at start; in the cycle one `unpack_from` reads the whole frame.
+"""What the cycle faces make of a PDO's plan, once at start: its struct, the places of its objects, its longest silence.
 
-Used by the cycle faces of cia402 and cia406, so that what they decode is what the plan maps, in its order and lengths.
+Used by cia402 and cia406, so that what they decode is what the plan maps, in its order and lengths; in the cycle one
+`unpack_from` reads the whole frame.
 """
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Iterable, Mapping
 
 from servod.errors import BadInput
 from servod.hal import NodePlan, PdoMap
+
+#: How many event timers a PDO may stay away, and the cycles on top for the jitter of bus and loop.
+_EVENT_TIMERS, _MARGIN_CYCLES = 3, 10
+
+
+def lost_after_cycles(pdo: PdoMap | None, period_s: float) -> int | None:
+    """Cycles without this PDO after which what it said is not known any more; None when it has no event timer."""
+    if pdo is None or not pdo.event_timer_ms:
+        return None
+    return math.ceil(_EVENT_TIMERS * pdo.event_timer_ms * 1e-3 / period_s) + _MARGIN_CYCLES
 
 
 def codec(pdo: PdoMap, formats: Mapping[int, str], driver: str) -> struct.Struct:

@@ -7,7 +7,8 @@ Behaviour contract (checked for every driver by tests/conformance):
 
 Amplifier
  1. `read` returns the same value until the next cycle's frames arrive; `age_cycles` is 0 exactly when this cycle's
-    synchronous feedback came, and grows by one per cycle without. Before the first feedback the state is UNKNOWN.
+    synchronous feedback came, and grows by one per cycle without. Before the first feedback the state is UNKNOWN and
+    the age is at least NEVER_CYCLES.
  2. `write` is asked every cycle and always gives exactly one frame that fits the mapping. Torque is encoded only when
     the present state is OPERATION_ENABLED and the goal is ENABLED; in every other case the frame carries zero torque.
     One exception: going back from quick stop (transition 16) the drive holds the load, so the frame then carries the
@@ -20,7 +21,11 @@ Amplifier
 Encoder
  7. Position is continuous (unwrapped) over any measuring range; the velocity is the position's difference over the
     *measured* time between samples, low-passed; `delay_s` of the driver states what differentiation and filter cost.
- 8. A sample that did not come leaves position and velocity as they were and lets `age_cycles` grow.
+ 8. A sample that did not come leaves position and velocity as they were and lets `age_cycles` grow; before the first
+    one it is at least NEVER_CYCLES.
+Both
+ 9. What comes by event timer (mode, alarms) has an age too: away for three event timers it is no longer taken for true.
+    An amplifier that is enabled then shows Mode.NONE, an encoder shows ALARMS_STALE.
 """
 
 from __future__ import annotations
@@ -33,6 +38,10 @@ from servod.errors import Unreachable
 
 #: A control word in a synchronous RPDO acts at the next SYNC and is seen in the TPDO of the SYNC after it.
 HANDSHAKE_SYNCS = 3
+#: Age of feedback that never came; what was never heard is staler than any limit.
+NEVER_CYCLES = 1_000_000
+#: Bit of EncoderFeedback.alarms above the 16 of 0x6503: the alarm word itself has not come for its time.
+ALARMS_STALE = 1 << 16
 
 
 class DriveState(IntEnum):
@@ -110,10 +119,10 @@ class AmplifierFeedback(NamedTuple):
     age_cycles: int  # 0: of this cycle
     state: DriveState
     status_word: int
-    mode: int  # 0x6061, -1 when not known
+    mode: int  # 0x6061; -1 when not known, NONE when an enabled drive has not shown it for its time
     position_rad: float  # from the amplifier's own sensor, for plausibility only
     torque_nm: float  # torque actual value
-    error_code: int  # 0x603F or EMCY, 0 when none
+    error_code: int  # 0x603F or EMCY, the last that was heard; 0 when none
     goal_reached: bool
     reasons: int  # bits of Reason
 
@@ -122,10 +131,10 @@ class EncoderFeedback(NamedTuple):
     """What the encoder said last, in SI units of the joint."""
 
     time_ns: int
-    age_cycles: int
+    age_cycles: int  # 0: of this cycle
     position_rad: float
     velocity_rad_s: float
-    alarms: int  # 0x6503, 0 when none or not mapped
+    alarms: int  # 0x6503 and ALARMS_STALE; 0 when none or not mapped
 
 
 class AmplifierCommand(NamedTuple):

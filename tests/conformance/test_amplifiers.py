@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 
 import pytest
-from drivers_under_test import RATED_TORQUE_MNM, STATUS_WORD, AmplifierBench, find_pdo, names_of
+from drivers_under_test import RATED_TORQUE_MNM, STATUS_WORD, AmplifierBench, find_pdo, names_of, plan_of
 from hypothesis import given
 from hypothesis import strategies as st
 
 from servod.cia import CW_DISABLE_VOLTAGE, CW_FAULT_RESET, CW_HALT, Obj402
-from servod.hal import HANDSHAKE_SYNCS, AmplifierFeedback, DriveState, Goal, Mode, Reason
+from servod.drivers import load_driver
+from servod.hal import HANDSHAKE_SYNCS, NEVER_CYCLES, AmplifierFeedback, DriveState, Goal, Mode, Reason
 
 RATED_NM = RATED_TORQUE_MNM * 1e-3
 ENABLED = DriveState.OPERATION_ENABLED
@@ -26,7 +28,7 @@ def bench(name: str) -> AmplifierBench:
 def test_before_the_first_feedback_the_state_is_unknown(bench: AmplifierBench) -> None:
     feedback = bench.driver.read()
     assert feedback.state is DriveState.UNKNOWN
-    assert feedback.age_cycles > 0
+    assert feedback.age_cycles >= NEVER_CYCLES
     assert not feedback.goal_reached
     assert feedback.reasons & Reason.NO_FEEDBACK
 
@@ -172,6 +174,36 @@ def test_enabled_is_reached_only_in_the_wanted_mode(bench: AmplifierBench) -> No
     assert right.goal_reached
     assert right.reasons == 0
     assert right.mode == bench.plan.facts["mode"]
+
+
+@pytest.mark.parametrize(("state", "shown"), [(ENABLED, Mode.NONE), (DriveState.SWITCHED_ON, -1)])
+def test_a_mode_that_is_not_shown_any_more_is_not_known(bench: AmplifierBench, state: DriveState, shown: int) -> None:
+    mode, timers = bench.plan.facts["mode"], bench.slow_pdo.event_timer_ms  # in cycles of 1 ms
+    bench.say_mode(mode, error_code=0x7305)
+    for _ in range(3 * timers):
+        torque = bench.cycle(state, Goal.ENABLED, 0.5)[1]
+        assert bench.driver.read().mode == mode
+    for _ in range(timers):
+        last = bench.cycle(state, Goal.ENABLED, 0.5)[1]
+    bench.say(state)
+    feedback = bench.driver.read()
+    assert (feedback.mode, feedback.error_code) == (shown, 0x7305)
+    assert feedback.reasons & Reason.MODE_NOT_SHOWN
+    assert last == torque  # the axis is brought down by the loop, not dropped
+    bench.say_mode(mode)
+    bench.cycle(state, Goal.ENABLED)
+    assert bench.driver.read().mode == mode
+
+
+def test_a_mode_without_event_timer_has_no_age(name: str) -> None:
+    plan = plan_of("amplifier", name)
+    pdos = tuple(dataclasses.replace(pdo, event_timer_ms=0) for pdo in plan.pdos)
+    bench = AmplifierBench(name)
+    bench.driver = load_driver(name).cyclic(dataclasses.replace(plan, pdos=pdos))
+    bench.say_mode(plan.facts["mode"])
+    for _ in range(2000):
+        bench.cycle(ENABLED, Goal.ENABLED)
+    assert bench.driver.read().mode == plan.facts["mode"]
 
 
 def test_no_target_reaches_a_drive_that_shows_another_mode(bench: AmplifierBench) -> None:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import pytest
-from drivers_under_test import COUNTS_PER_TURN, MEASURING_RANGE, PERIOD_NS, EncoderBench, names_of
+from drivers_under_test import COUNTS_PER_TURN, MEASURING_RANGE, PERIOD_NS, EncoderBench, names_of, plan_of
 from hypothesis import given
 from hypothesis import strategies as st
+
+from servod.drivers import load_driver
+from servod.hal import ALARMS_STALE, NEVER_CYCLES
 
 RAD = 2 * math.pi / COUNTS_PER_TURN
 PERIOD_S = PERIOD_NS * 1e-9
@@ -25,7 +29,8 @@ def test_age_is_zero_exactly_with_this_cycles_sample_and_grows_by_one(bench: Enc
         if comes:
             assert bench.say(0, cycle * PERIOD_NS)
         ages.append(bench.driver.read().age_cycles)
-    assert ages == [1, 0, 1, 2, 0]
+    assert ages[0] > NEVER_CYCLES  # never heard is no fresher than long ago
+    assert ages[1:] == [0, 1, 2, 0]
 
 
 def test_the_first_sample_has_a_position_and_no_velocity(bench: EncoderBench) -> None:
@@ -147,12 +152,20 @@ def test_short_and_impossible_frames_are_ignored_and_counted(bench: EncoderBench
     assert bench.driver.ignored_frames == len(bench.driver.receive_ids) + 1  # type: ignore[attr-defined]
 
 
-def test_a_preset_is_no_motion_when_the_driver_is_told(bench: EncoderBench) -> None:
-    for cycle in range(20):
-        bench.say(1000 + cycle, cycle * PERIOD_NS)
-    bench.driver.read()
-    bench.driver.forget()  # type: ignore[attr-defined]
-    bench.say(0, 20 * PERIOD_NS)
-    feedback = bench.driver.read()
-    assert feedback.position_rad == 0.0
-    assert feedback.velocity_rad_s == 0.0
+def test_an_alarm_word_that_stays_away_is_an_alarm_itself(bench: EncoderBench) -> None:
+    timers = bench.alarm_pdo.event_timer_ms  # in cycles of 1 ms
+    bench.say_alarms(0)
+    for _ in range(3 * timers):
+        assert bench.driver.read().alarms == 0
+    for _ in range(timers):
+        alarms = bench.driver.read().alarms
+    assert alarms == ALARMS_STALE
+    bench.say_alarms(2)
+    assert bench.driver.read().alarms == 2
+
+
+def test_an_alarm_word_without_event_timer_has_no_age(name: str) -> None:
+    plan = plan_of("encoder", name)
+    pdos = tuple(dataclasses.replace(pdo, event_timer_ms=0) for pdo in plan.pdos)
+    driver = load_driver(name).cyclic(dataclasses.replace(plan, pdos=pdos))
+    assert {driver.read().alarms for _ in range(2000)} == {0}
