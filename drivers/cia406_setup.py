@@ -12,6 +12,7 @@ from servod.cia import TPDO_BASE, Obj406
 from servod.drivers.setup_tools import read_optional, write_checked
 from servod.errors import BadInput, Unreachable
 from servod.hal import NodePlan, PdoEntry, PdoMap, SdoAccess
+from servod.units import rad_per_count
 
 if TYPE_CHECKING:
     from servod.config import AxisConfig
@@ -91,10 +92,13 @@ class EncoderSetup:
             raise Unreachable(f"encoder node {node}: measuring range 0x6002 = {measuring_range} is less than one turn")
         return measuring_range
 
+    def preset(self, sdo: SdoAccess, position_rad: float) -> int:
+        """Make the joint's present position read `position_rad` (0x6003); the device refuses it in motion.
 
-def preset(sdo: SdoAccess, position_counts: int) -> None:
-    """Make the present position read `position_counts` (0x6003). Only at rest and disabled: the position jumps.
-
-    The cycle face must be told by `Cia406Encoder.forget` so that the jump is not taken for motion.
-    """
-    write_checked(sdo, Obj406.PRESET, 0, position_counts)
+        The inverse of what the cycle face decodes. Raises Unreachable when the device kept another value.
+        """
+        encoder = self._encoder
+        counts_per_rad = encoder.direction / rad_per_count(encoder.counts_per_turn)
+        counts = round((position_rad + encoder.zero_offset_rad) * counts_per_rad) % self._measuring_range(sdo)
+        write_checked(sdo, Obj406.PRESET, 0, counts)
+        return counts

@@ -32,7 +32,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from servod.errors import Unreachable
 
@@ -260,6 +260,18 @@ class Setup(Protocol):
 
     def configure(self, sdo: SdoAccess) -> NodePlan:
         """Write parameters that are not PDO mapping, read scalings, and return the plan with its facts filled in."""
+        ...
+
+
+@runtime_checkable
+class PresetSetup(Setup, Protocol):
+    """Set-up face of a position sensor whose zero can be set in the device."""
+
+    def preset(self, sdo: SdoAccess, position_rad: float) -> int:
+        """Make the present position of the joint read `position_rad`; the counts that were written.
+
+        Only while no loop runs: the position jumps. Raises SdoAbort where the device refuses (in motion).
+        """
         ...
 
 

@@ -12,7 +12,7 @@ import sys
 
 import typer
 
-from servod.cli import bench, check, demo, enable, faults, gains, record, replay, scan, status, stop, track
+from servod.cli import bench, check, demo, enable, faults, gains, preset, record, replay, scan, status, stop, track
 from servod.errors import ServodError
 
 _INTERRUPTED = 130  # as shells count SIGINT
@@ -25,7 +25,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for _verb in (demo, scan, status, enable, stop, track, gains, record, replay, bench, check, faults):
+for _verb in (demo, scan, status, enable, stop, track, gains, preset, record, replay, bench, check, faults):
     _verb.register(app)
 
 

@@ -16,7 +16,7 @@ from servod.cia import NmtCommand
 from servod.clock import Clock
 from servod.config import AxisConfig
 from servod.errors import BadInput, Unreachable
-from servod.hal import NodePlan, SdoAccess
+from servod.hal import NodePlan, PresetSetup, SdoAccess
 from servod.master.monitor import NodeEvent
 from servod.master.network import BusNetwork
 from servod.master.node import Node, send_nmt
@@ -76,6 +76,21 @@ class Master:
         for node in nodes:
             node.start()
         return BringUp(plans[0], plans[1], load.share, report)
+
+    def preset_encoder(self, position_rad: float) -> int:
+        """Make the joint's present position read `position_rad` in the encoder; the counts that it holds then.
+
+        Instead of a bring-up, while no loop runs. Raises Unreachable where a node is not the configured one, the
+        amplifier is powered or the joint moves, BadInput when the encoder's driver knows no preset.
+        """
+        nodes, setup = (self._amplifier, self._encoder), self._encoder.setup
+        if not isinstance(setup, PresetSetup):
+            raise BadInput("encoder.driver", self._config.encoder.driver, "a driver with preset")
+        for node in nodes:
+            node.identify()
+        for node in nodes:
+            node.inspect()
+        return setup.preset(self._encoder.sdo, position_rad)
 
     def stand_down(self) -> None:
         """Orderly end: nodes pre-operational and the drive no longer watching us. Only when the drive has no torque."""

@@ -151,6 +151,11 @@ def test_scan_asks_the_bus_itself_where_no_daemon_is(axis: Path, capsys: pytest.
     assert [node["node_id"] for node in nodes][:2] == [1, 2]
 
 
+def test_preset_leaves_an_axis_alone_that_a_daemon_runs(axis: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["preset", str(axis.parent / "axis.yaml"), "--position-rad", "0"]) == 3
+    assert "another servod" in capsys.readouterr().err
+
+
 def test_status_is_one_screen(servoctl: Servoctl) -> None:
     text = servoctl("status")
     assert "demo is DISABLED" in text and "deadline to torque" in text

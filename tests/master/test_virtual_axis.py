@@ -10,7 +10,6 @@ import pytest
 from rig import Rig, stepped_world
 
 from servod.cia import NmtCommand, Obj301, Obj402, Obj406
-from servod.drivers.cia406_setup import preset
 from servod.drivers.virtual.bus_faults import BusFault, FaultKind
 from servod.drivers.virtual.world import SteppedBus
 from servod.errors import FaultCode, Unreachable
@@ -314,10 +313,18 @@ def test_an_orderly_end_leaves_no_fault_behind(enabled: Rig) -> None:
     assert again.until(Goal.ENABLED).error_code == 0
 
 
-def test_a_preset_moves_the_encoders_zero_and_is_no_motion(rig: Rig) -> None:
-    rig.run(5, Goal.OFF)
-    preset(rig.master.sdo(2), 4096)
-    rig.encoder.forget()
-    _, encoder = rig.run(2, Goal.OFF)
-    assert encoder.position_rad == pytest.approx(4096 * 2 * math.pi / 2**20, abs=1e-5)
-    assert encoder.velocity_rad_s == 0.0
+@pytest.mark.parametrize("encoder", [{}, {"direction": -1}, {"zero_offset_rad": 1.0}])
+def test_a_preset_sets_what_the_joint_reads(encoder: dict[str, Any]) -> None:
+    world = stepped_world(start_position_rad=0.3)
+    Rig(world, encoder=encoder).master.preset_encoder(-0.25)
+    rig = Rig(world, encoder=encoder)
+    rig.start()
+    _, feedback = rig.run(2, Goal.OFF)
+    assert feedback.position_rad == pytest.approx(-0.25, abs=1e-5)
+
+
+def test_no_preset_while_the_drive_has_power(enabled: Rig) -> None:
+    again, spy = Rig(enabled.world), enabled.world.connect()
+    with pytest.raises(Unreachable, match="is powered"):
+        again.master.preset_encoder(0.0)
+    assert acting(spy) == []

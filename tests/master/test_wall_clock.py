@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import yaml
 from rig import JOINT
 from witness import axis_config
 
 from servod.axis_model import AxisModel
 from servod.bus.open import open_bus
-from servod.cia import NmtCommand
+from servod.cia import NmtCommand, Obj406
+from servod.cli.app import run
 from servod.clock import WallClock
 from servod.config import AxisConfig
 from servod.drivers.virtual.bus_faults import BusFault, FaultKind
@@ -94,3 +97,17 @@ def test_a_bus_that_is_off_is_named(config: AxisConfig) -> None:
 def test_scan_finds_both(config: AxisConfig, threaded: bool) -> None:
     found = scan(open_bus(config.bus), WallClock(), threaded)
     assert [(node.node_id, node.identity.profile) for node in found if node.identity] == [(1, 402), (2, 406)]
+
+
+def test_servoctl_preset_sets_the_zero_where_no_daemon_runs(
+    config: AxisConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config.control.socket = tmp_path / "axis.sock"
+    file = tmp_path / "axis.yaml"
+    file.write_text(yaml.safe_dump(config.model_dump(mode="json")))
+    assert run(["preset", str(file), "--position-rad", "0.5"]) == 0, capsys.readouterr().err
+    counts = round(0.5 / (2 * math.pi) * 2**20)
+    assert capsys.readouterr().out == f"encoder node 2 reads 0.5 rad here (0x6003 = {counts})\n"
+    master = Master(config, open_bus(config.bus), WallClock(), threaded=False)
+    assert master.sdo(2).read(Obj406.POSITION) == pytest.approx(counts, abs=20)
+    master.close()

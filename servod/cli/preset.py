@@ -1,0 +1,44 @@
+"""`servoctl preset`: sets the joint's zero in the encoder (CiA 406, 0x6003), on the bus itself, without a daemon."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from servod.cli.common import example
+
+_HELP = example(
+    "Make the joint's present position read --position-rad in the encoder. Only while no daemon runs the axis, the "
+    "drive has no power and the joint stands: every position changes by it.",
+    "servoctl preset /etc/servod/axis.yaml --position-rad 0",
+)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb to `app`."""
+    app.command("preset", help=_HELP)(preset)
+
+
+def preset(
+    config: Annotated[Path, typer.Argument(help="Configuration of the axis.")],
+    position_rad: Annotated[float, typer.Option(help="What the present position shall read, in rad.")],
+) -> None:
+    """Set the encoder's zero."""
+    from contextlib import closing
+
+    from servod.bus.open import open_bus
+    from servod.clock import WallClock
+    from servod.config import load_config
+    from servod.daemon.lock import InstanceLock
+    from servod.master import Master
+
+    axis = load_config(config)
+    lock = InstanceLock(axis)
+    try:
+        with closing(Master(axis, open_bus(axis.bus), WallClock(), threaded=False)) as master:
+            counts = master.preset_encoder(position_rad)
+    finally:
+        lock.release()
+    print(f"encoder node {axis.encoder.node_id} reads {position_rad:g} rad here (0x6003 = {counts})")
