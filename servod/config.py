@@ -146,6 +146,8 @@ class RecorderConfig(Strict):
     directory: Path = Path("/var/lib/servod/recordings")
     history_s: float = Field(10.0, ge=0.0, le=600.0, description="kept in memory, written at a fault")
     always: StrictBool = Field(False, description="record from start to stop")
+    max_file_mib: int = Field(1024, ge=1, le=1_048_576, description="a recording that is larger goes on in a new file")
+    max_fault_files: int = Field(50, ge=1, le=100_000, description="the oldest fault files beyond this are removed")
 
 
 class MetricsConfig(Strict):
@@ -180,16 +182,31 @@ class AxisConfig(Strict):
         return self
 
 
+#: Keys that name a file or folder, by section; `bus.channel` names one only on the virtual bus.
+_PATHS: dict[str, tuple[str, ...]] = {
+    "amplifier": ("eds",),
+    "encoder": ("eds",),
+    "gains": ("directory", "initial"),
+    "control": ("socket",),
+    "recorder": ("directory",),
+    "metrics": ("textfile",),
+}
+
+
 def load_config(path: str | Path) -> AxisConfig:
-    """Read and check an axis configuration; relative paths inside are relative to the file. Raises BadInput."""
+    """Read and check an axis configuration; every relative path inside is relative to the file. Raises BadInput."""
     config = load_model(path, AxisConfig)
     base = Path(path).resolve().parent
-    gains = config.gains.model_copy(update={"initial": base / config.gains.initial})
-    model = None if config.model is None else base / config.model
-    amplifier = config.amplifier.model_copy(update={"eds": _beside(base, config.amplifier.eds)})
-    encoder = config.encoder.model_copy(update={"eds": _beside(base, config.encoder.eds)})
-    return config.model_copy(update={"gains": gains, "model": model, "amplifier": amplifier, "encoder": encoder})
+    paths = _PATHS | ({"bus": ("channel",)} if config.bus.interface == "virtual" else {})
+    changed: dict[str, Any] = {"model": _beside(base, config.model)}
+    for name, keys in paths.items():
+        section = getattr(config, name)
+        changed[name] = section.model_copy(update={key: _beside(base, getattr(section, key)) for key in keys})
+    return config.model_copy(update=changed)
 
 
-def _beside(base: Path, name: str | None) -> str | None:
-    return None if name is None else str(base / name)
+def _beside(base: Path, path: str | Path | None) -> str | Path | None:
+    """A path from the file as seen from anywhere; what the model keeps as text stays text."""
+    if path is None:
+        return None
+    return str(base / path) if isinstance(path, str) else base / path

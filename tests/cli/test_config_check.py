@@ -9,6 +9,7 @@ import pytest
 
 import servod.drivers
 from servod.cli.app import run
+from servod.config import load_config
 from servod.shipped import shipped
 
 GAINS = shipped("gains")
@@ -25,6 +26,33 @@ def test_what_ships_has_no_mistakes(file: Path, capsys: pytest.CaptureFixture[st
     assert row["kind"] == {"axes": "axis model", "config": "axis configuration", "eds": "EDS"}.get(
         file.parent.name, "gain set"
     )
+
+
+def test_every_relative_path_is_relative_to_the_file(tmp_path: Path) -> None:
+    limits = load_config(GAINS / "config" / "virtual.yaml").limits.model_dump()
+    paths = {
+        "bus": {"interface": "virtual", "channel": "run/bus"},
+        "amplifier": {"eds": "a.eds"},
+        "encoder": {"eds": "e.eds"},
+        "gains": {"directory": "gains", "initial": "../pd.yaml"},
+        "control": {"socket": "run/axis.sock"},
+        "recorder": {"directory": "/var/recordings"},
+        "metrics": {"textfile": "m.prom"},
+    }
+    file = tmp_path / "axis.yaml"
+    file.write_text(json.dumps({"limits": limits, "model": "model.yaml", **paths}))
+    config = load_config(file)
+    assert (config.bus.channel, config.amplifier.eds) == (str(tmp_path / "run/bus"), str(tmp_path / "a.eds"))
+    assert (config.encoder.eds, config.model) == (str(tmp_path / "e.eds"), tmp_path / "model.yaml")
+    assert (config.gains.directory, config.gains.initial) == (tmp_path / "gains", tmp_path / "../pd.yaml")
+    assert (config.control.socket, config.metrics.textfile) == (tmp_path / "run/axis.sock", tmp_path / "m.prom")
+    assert config.recorder.directory == Path("/var/recordings")
+
+
+def test_the_channel_of_a_real_bus_is_no_path(tmp_path: Path) -> None:
+    file = tmp_path / "axis.yaml"
+    file.write_text((GAINS / "config" / "can0.yaml").read_text())
+    assert load_config(file).bus.channel == "can0"
 
 
 def test_several_files_are_checked_in_order_and_the_first_mistake_ends_it(
