@@ -39,6 +39,13 @@ def connect(socket: Path) -> ControlClient:
     return ControlClient(socket)
 
 
+def ask(socket: Path, verb: str, **arguments: Any) -> dict[str, Any]:
+    """The result of one verb of the daemon at `socket`. Raises as the daemon's answer says."""
+    with connect(socket) as client:
+        result: dict[str, Any] = client.call(verb, **arguments)
+    return result
+
+
 def print_json(document: Any) -> None:
     """Print `document` as the one JSON document of a command."""
     json.dump(document, sys.stdout, indent=2, allow_nan=False)

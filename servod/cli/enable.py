@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, connect, example, report
+from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, example, report
 
 _ENABLE_HELP = example(
     "Enable the axis and wait until it is; holds where it stands.",
@@ -30,11 +30,9 @@ def enable(
     as_json: JsonOption = False,
 ) -> None:
     """Enable the axis."""
-    with connect(socket) as client:
-        report(client.call("enable", reset_fault=reset_fault), "enabled", as_json)
+    report(ask(socket, "enable", reset_fault=reset_fault), "enabled", as_json)
 
 
 def disable(socket: SocketOption = DEFAULT_SOCKET, as_json: JsonOption = False) -> None:
     """Disable the axis."""
-    with connect(socket) as client:
-        report(client.call("disable"), "disabled", as_json)
+    report(ask(socket, "disable"), "disabled", as_json)

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, connect, example, print_json, report
+from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, connect, example, print_json, report
 
 _app = typer.Typer(
     help=example("Load, list, show, activate and roll back gain sets.", "servoctl gains load my_axis.yaml"),
@@ -42,8 +42,7 @@ def load(
 @_app.command("list", help=example("List the gain sets in the daemon's store.", "servoctl gains list"))
 def list_(socket: SocketOption = DEFAULT_SOCKET, as_json: JsonOption = False) -> None:
     """List gain sets."""
-    with connect(socket) as client:
-        result = client.call("gains_list")
+    result = ask(socket, "gains_list")
     if as_json:
         print_json(result)
     else:
@@ -73,16 +72,14 @@ def activate(
     as_json: JsonOption = False,
 ) -> None:
     """Activate a gain set."""
-    with connect(socket) as client:
-        result = client.call("gains_activate", name=name, version=version)
+    result = ask(socket, "gains_activate", name=name, version=version)
     report(result, f"activated {_title(result)}", as_json)
 
 
 @_app.command(help=example("Go back to the gain set that was active before.", "servoctl gains rollback"))
 def rollback(socket: SocketOption = DEFAULT_SOCKET, as_json: JsonOption = False) -> None:
     """Roll back."""
-    with connect(socket) as client:
-        result = client.call("gains_rollback")
+    result = ask(socket, "gains_rollback")
     report(result, f"active again: {_title(result)}", as_json)
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, connect, example, report
+from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, example, report
 from servod.errors import BadInput
 
 _app = typer.Typer(
@@ -30,16 +30,14 @@ def start(
     as_json: JsonOption = False,
 ) -> None:
     """Start a recording."""
-    with connect(socket) as client:
-        result = client.call("record_start", path=name)
+    result = ask(socket, "record_start", path=name)
     report(result, f"recording to {result['path']}", as_json)
 
 
 @_app.command(help=example("Stop recording.", "servoctl record stop"))
 def stop(socket: SocketOption = DEFAULT_SOCKET, as_json: JsonOption = False) -> None:
     """Stop the recording."""
-    with connect(socket) as client:
-        result = client.call("record_stop")
+    result = ask(socket, "record_stop")
     report(result, f"recorded {result['records']} cycles to {result['path']}", as_json)
 
 

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, connect, example, print_json
+from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, example, print_json
+from servod.errors import Unreachable
+
+if TYPE_CHECKING:
+    from servod.config import BusConfig
 
 _HELP = example(
     "List the nodes on the bus with identity, NMT state and LSS. Without --channel the daemon is asked; with it the "
-    "bus is opened directly, which is only for a bus that no daemon owns.",
+    "bus is opened directly, unless a daemon owns it: then that is asked too.",
     "servoctl scan",
     "servoctl scan --interface socketcan --channel can0",
 )
@@ -32,7 +36,7 @@ def scan(
     as_json: JsonOption = False,
 ) -> None:
     """Scan the bus."""
-    nodes = _through_daemon(socket) if channel is None else _on_bus(interface, channel, bit_rate)
+    nodes = _through_daemon(socket) if channel is None else _on_bus(interface, channel, bit_rate, socket)
     if as_json:
         print_json({"nodes": nodes})
     else:
@@ -40,23 +44,44 @@ def scan(
 
 
 def _through_daemon(socket: Any) -> list[dict[str, Any]]:
-    with connect(socket) as client:
-        nodes: list[dict[str, Any]] = client.call("scan")["nodes"]
+    nodes: list[dict[str, Any]] = ask(socket, "scan")["nodes"]
     return nodes
 
 
-def _on_bus(interface: str, channel: str, bit_rate: int) -> list[dict[str, Any]]:
+def _on_bus(interface: str, channel: str, bit_rate: int, socket: Any) -> list[dict[str, Any]]:
+    from servod.config import BusConfig
+    from servod.daemon.lock import BusLock
+    from servod.yaml12 import validate
+
+    config = validate({"interface": interface, "channel": channel, "bit_rate": bit_rate}, BusConfig, "servoctl scan")
+    try:
+        lock = BusLock(config)
+    except Unreachable as owned:
+        return _through_owner(socket, config, owned)
+    with lock:
+        return _scan_bus(config)
+
+
+def _scan_bus(config: BusConfig) -> list[dict[str, Any]]:
     from dataclasses import asdict
 
     from servod.bus.open import open_bus
     from servod.clock import WallClock
-    from servod.config import BusConfig
     from servod.master.scan import scan as scan_bus
-    from servod.yaml12 import validate
 
-    config = validate({"interface": interface, "channel": channel, "bit_rate": bit_rate}, BusConfig, "servoctl scan")
     nodes = scan_bus(open_bus(config), WallClock())  # closes the bus
     return [asdict(node) | {"lss": node.lss and node.lss._asdict()} for node in nodes]
+
+
+def _through_owner(socket: Any, config: BusConfig, owned: Unreachable) -> list[dict[str, Any]]:
+    """Ask the daemon at `socket` if it is the one that owns the bus; raises `owned`, with what to do, otherwise."""
+    try:
+        bus = ask(socket, "status")["bus"]
+    except Unreachable:
+        bus = {}
+    if (bus.get("interface"), bus.get("channel")) != (config.interface, config.channel):
+        raise Unreachable(f"{owned}; ask it: servoctl scan --socket SOCKET")
+    return _through_daemon(socket)
 
 
 def _print(nodes: list[dict[str, Any]]) -> None:
