@@ -12,17 +12,11 @@ from servod.axis_model import load_axis_model
 from servod.controllers.engine import Controller
 from servod.gains import load_gains
 from servod.models.plant import Plant
+from servod.references import paper
 
 GAINS = Path(__file__).resolve().parents[2] / "gains"
 PERIOD_S, JITTER_S, COUNT_RAD, CUTOFF_HZ = 0.001, 1e-4, 2.0 * math.pi / 2**20, 120.0
 MISSED_SHARE, MOST_MISSED = 0.003, 5
-
-
-def reference(t: float) -> tuple[float, float, float]:
-    """Trajectory (19): position, velocity, acceleration."""
-    w, a, b = 0.2 * math.pi, 0.1 - 0.0033 * t, -0.0033
-    sine, cosine = math.sin(w * t), math.cos(w * t)
-    return a * sine, b * sine + a * w * cosine, 2 * b * w * cosine - a * w * w * sine
 
 
 def rms_mrad(gain_set: str, seed: int, seconds: float) -> float:
@@ -36,7 +30,7 @@ def rms_mrad(gain_set: str, seed: int, seconds: float) -> float:
         measured = round(plant.encoder_position_rad / COUNT_RAD) * COUNT_RAD
         dt = now - last
         velocity += ((measured - seen) / dt - velocity) * -math.expm1(-2.0 * math.pi * CUTOFF_HZ * dt)
-        x_ref, v_ref, a_ref = reference(now)
+        x_ref, v_ref, a_ref = paper(now)
         torque = round(controller.step(x_ref, v_ref, a_ref, measured, velocity, torque, dt).u, 4)
         if now > 1.0:
             squares, n = squares + (x_ref - plant.position_rad) ** 2, n + 1

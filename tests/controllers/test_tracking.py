@@ -5,7 +5,6 @@ The bounds are what the sets reach with room for another machine's rounding, not
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from servod.axis_model import AxisModel, load_axis_model
 from servod.gains import load_gains
 from servod.models.simulate import ClosedLoopRun, LoopSettings, simulate_closed_loop
+from servod.references import paper
 
 GAINS = Path(__file__).resolve().parents[2] / "gains"
 SETTINGS = LoopSettings(torque_limit_nm=0.5)
@@ -23,10 +23,7 @@ Array = NDArray[np.float64]
 
 def trajectory_19(seconds: float = 30.0) -> Array:
     """Rows of position, velocity, acceleration of x_ref = (0.1 - 0.0033 t) sin(0.2 pi t)."""
-    t, w = np.arange(int(seconds * 1000)) * 1e-3, 0.2 * math.pi
-    a, b = 0.1 - 0.0033 * t, -0.0033
-    sine, cosine = np.sin(w * t), np.cos(w * t)
-    return np.stack([a * sine, b * sine + a * w * cosine, 2 * b * w * cosine - a * w * w * sine], axis=1)
+    return np.array([paper(k * 1e-3) for k in range(int(seconds * 1000))])
 
 
 def run(gain_set: str, model: AxisModel, reference: Array, settings: LoopSettings = SETTINGS) -> ClosedLoopRun:
