@@ -64,7 +64,6 @@ FIELDS: tuple[Field, ...] = (
 )
 
 RECORD = struct.Struct("<" + "".join(f.kind for f in FIELDS))
-NAMES: tuple[str, ...] = tuple(f.name for f in FIELDS)
 
 #: CDR encapsulation header: little endian (OMG CDR, as in ROS 2 serialised messages).
 CDR_HEADER = b"\x00\x01\x00\x00"
