@@ -1,7 +1,7 @@
 """Errors for people: the exceptions that end a command, and the one table of faults that log, CLI and README read.
 
 Stands on nothing. A *fault* is something that happens to a running axis and has a reaction; an *error* ends a command
-with one line on standard error and an exit code (contract: 0 done, 1 the answer is no, 2 bad input, 3 unreachable).
+with one line on standard error and an exit code (0 done, 1 the answer is no, 2 bad input, 3 unreachable).
 """
 
 from __future__ import annotations

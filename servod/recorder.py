@@ -13,25 +13,26 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from datetime import datetime
 from pathlib import Path
 from typing import Any, TypedDict, TypeVar
 
 from servod.config import RecorderConfig
-from servod.errors import BadInput, ServodError, Unreachable
+from servod.errors import ServodError, Unreachable
+from servod.recorder_files import RecordingFiles
 from servod.recorder_history import HistoryRing
 from servod.recorder_mcap import McapFile, split_rows, wall_offset_ns
 
 T = TypeVar("T")
 
-#: A file on disk is never older than this; kill -9 loses no more (the contract allows a second).
+#: A file on disk is never older than this; kill -9 loses no more.
 SYNC_PERIOD_S = 0.2
 _QUEUE_BATCHES = 1024
 _KEPT_EVENTS = 256
 
 
 class RecorderState(TypedDict):
-    """What is being recorded; `failure` is empty while all is well."""
+    """What is being recorded: the file written now, and how much in all its parts; `failure` is empty while all is
+    well."""
 
     recording: bool
     path: str
@@ -46,12 +47,14 @@ class Recorder:
     """Recordings of one axis; all methods are for the supervisor's thread and return at once."""
 
     def __init__(self, config: RecorderConfig, axis_name: str, period_us: int) -> None:
-        self._directory, self._axis_name, self._history_s = config.directory, axis_name, config.history_s
+        self._files, self._history_s = RecordingFiles(config, axis_name), config.history_s
         self._history = HistoryRing(round(config.history_s * 1e6 / period_us))
         self._events: deque[dict[str, Any]] = deque(maxlen=_KEPT_EVENTS)
         self._attachments: dict[str, bytes] = {}
+        self._attached: dict[str, bytes] = {}  # the same, in the writing thread
         self._offset_ns = wall_offset_ns()
         self._file: McapFile | None = None
+        self._first_part, self._full_records, self._full_bytes = Path(), 0, 0
         self._path, self._records, self._bytes, self._dropped = "", 0, 0, 0
         self._failure, self._new_failure = "", ""
         self._jobs: queue.Queue[Callable[[], None] | None] = queue.Queue(_QUEUE_BATCHES)
@@ -80,7 +83,7 @@ class Recorder:
     def start(self, name: str | None = None) -> Future[Path]:
         """Begin a recording in the configured directory; the future gives its path, or BadInput or Unreachable."""
         attachments = dict(self._attachments)
-        return self._ask(lambda: self._open(self._recording_path(name), attachments))
+        return self._ask(lambda: self._open(self._files.recording(name), attachments))
 
     def stop(self) -> Future[RecorderState]:
         """End the recording; the future gives what was written."""
@@ -167,13 +170,24 @@ class Recorder:
             self._file.write_event(event)
 
     def _attach(self, name: str, data: bytes) -> None:
+        self._attached[name] = data
         if self._file is not None:
             self._file.attach(name, data)
 
     def _sync(self) -> None:
         if self._file is not None:
             self._file.sync()
-            self._records, self._bytes = self._file.records, self._file.size_bytes()
+            size = self._file.size_bytes()
+            self._records, self._bytes = self._full_records + self._file.records, self._full_bytes + size
+            if size >= self._files.max_bytes:
+                self._go_on_in_a_new_file(self._file)
+
+    def _go_on_in_a_new_file(self, full: McapFile) -> None:
+        path = self._files.next_part(self._first_part)
+        full.close()
+        self._full_records, self._full_bytes = self._records, self._full_bytes + full.path.stat().st_size
+        self._file = McapFile(path, self._attached, self._offset_ns)
+        self._path = str(path)
 
     def _finish(self) -> None:
         if self._file is not None:
@@ -184,6 +198,7 @@ class Recorder:
         if self._file is not None:
             raise Unreachable(f"recorder: already records to {self._path}; `servoctl record stop` ends it")
         self._file = _create(path, attachments, self._offset_ns)
+        self._first_part, self._full_records, self._full_bytes = path, 0, 0
         self._path, self._records, self._bytes, self._dropped, self._failure = str(path), 0, 0, 0, ""
         return path
 
@@ -196,7 +211,7 @@ class Recorder:
     def _write_history(
         self, label: str, rows: bytes, events: list[dict[str, Any]], attachments: dict[str, bytes]
     ) -> Path:
-        path = self._unused(f"{self._axis_name}-fault-{_stamp()}-{label}")
+        path = self._files.fault(label)
         file = _create(path, attachments, self._offset_ns)
         try:
             file.write_rows(split_rows(rows))
@@ -206,22 +221,7 @@ class Recorder:
         except OSError as error:
             file.abandon()
             raise Unreachable(f"{path}: {error.strerror or error}") from None
-        return path
-
-    def _recording_path(self, name: str | None) -> Path:
-        """A path in the recordings' directory, and nowhere else: clients must not write where they please."""
-        if name is None:
-            return self._unused(f"{self._axis_name}-{_stamp()}")
-        path = (self._directory / name).resolve()
-        if path.parent != self._directory.resolve() or path.suffix != ".mcap":
-            raise BadInput("record_start: path", name, f"a file name ending in .mcap, in {self._directory}")
-        return path
-
-    def _unused(self, stem: str) -> Path:
-        path, number = self._directory / f"{stem}.mcap", 1
-        while path.exists():
-            number += 1
-            path = self._directory / f"{stem}-{number}.mcap"
+        self._files.drop_old_fault_files()
         return path
 
 
@@ -245,7 +245,3 @@ def _resolve(future: Future[T], job: Callable[[], T]) -> None:
 
 def _nothing() -> None:
     """Stands for a job when the queue was empty."""
-
-
-def _stamp() -> str:
-    return datetime.now().astimezone().strftime("%Y%m%d-%H%M%S")

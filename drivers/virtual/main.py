@@ -74,7 +74,7 @@ def _server(arguments: argparse.Namespace) -> HubServer | CanServer:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run until told to stop; returns the exit code of the contract."""
+    """Run until told to stop; returns its exit code (servod.errors)."""
     arguments = _parser().parse_args(argv)
     try:
         server = _server(arguments)

@@ -28,7 +28,7 @@ def help_of(path: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> str:
     return capsys.readouterr().out
 
 
-def test_every_verb_of_the_contract_is_there() -> None:
+def test_every_verb_is_there() -> None:
     assert {path[0] for path in COMMANDS} >= VERBS
 
 

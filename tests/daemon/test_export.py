@@ -19,7 +19,7 @@ def recording(tmp_path: Path) -> Recording:
     return read_recording(tmp_path / "a.mcap")
 
 
-def test_csv_has_the_contracts_columns_and_exact_values(recording: Recording, tmp_path: Path) -> None:
+def test_csv_has_the_columns_that_are_read_and_exact_values(recording: Recording, tmp_path: Path) -> None:
     assert export_csv(recording, tmp_path / "a.csv") == 5
     with (tmp_path / "a.csv").open() as stream:
         lines = list(csv.DictReader(stream))

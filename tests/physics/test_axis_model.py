@@ -1,4 +1,4 @@
-"""The axis model file: contract's example, models that omit things, and one line for every mistake."""
+"""The axis model file: the full example, models that omit things, and one line for every mistake."""
 
 from __future__ import annotations
 
