@@ -40,11 +40,14 @@ class Exchange:
         return self.sync_ns
 
     def collect(self, until_ns: int) -> None:
-        """Wait for this SYNC's feedback, at the longest until `until_ns`."""
+        """Wait for this SYNC's feedback, at the longest until `until_ns`; what lies in the socket then is still taken.
+
+        On a machine that is slow for a moment the time may be over while the answer is already there.
+        """
         missing, clock, bus, sync_ns = self._sync_frames, self._clock, self._bus, self.sync_ns
         for _ in range(MAX_FRAMES):
             remaining_ns = until_ns - clock.now_ns()
-            frame = bus.receive(remaining_ns / NS_PER_S) if remaining_ns > 0 else None
+            frame = bus.receive(max(remaining_ns, 0) / NS_PER_S)
             if frame is None:
                 return
             receiver = self._receivers.get(frame.can_id)
