@@ -102,9 +102,8 @@ def test_scan_finds_both(config: AxisConfig, threaded: bool) -> None:
 def test_servoctl_preset_sets_the_zero_where_no_daemon_runs(
     config: AxisConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    config.control.socket = tmp_path / "axis.sock"
-    file = tmp_path / "axis.yaml"
-    file.write_text(yaml.safe_dump(config.model_dump(mode="json")))
+    file, sections = tmp_path / "axis.yaml", config.model_dump(mode="json")
+    file.write_text(yaml.safe_dump(sections | {"control": {"socket": str(tmp_path / "axis.sock")}}))
     assert run(["preset", str(file), "--position-rad", "0.5"]) == 0, capsys.readouterr().err
     counts = round(0.5 / (2 * math.pi) * 2**20)
     assert capsys.readouterr().out == f"encoder node 2 reads 0.5 rad here (0x6003 = {counts})\n"
