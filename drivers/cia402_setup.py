@@ -30,8 +30,13 @@ _SLOW_TIMER_MS = 100
 _POWERED = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE, DriveState.FAULT_REACTION_ACTIVE)
 
 
-def amplifier_pdos(node_id: int, mode: Mode) -> tuple[PdoMap, ...]:
-    """The three PDOs of the amplifier: command, synchronous feedback, and the slow rest by its event timer."""
+def amplifier_pdos(node_id: int, mode: Mode, command_deadline_ms: int) -> tuple[PdoMap, ...]:
+    """The three PDOs of the amplifier: command, synchronous feedback, and the slow rest by its event timer.
+
+    The heartbeat guards against a dead loop, the command's deadline against commands alone that do not arrive. What a
+    drive does at it is its maker's choice, from a fault to the EMCY alone (Novanta Summit, error 0x8250); the EMCY is
+    a fault of the axis in any case.
+    """
     target = target_type(mode)
     command = (PdoEntry(Obj402.CONTROL_WORD, 0, 16), PdoEntry(target.index, 0, target.bits))
     feedback = (
@@ -41,7 +46,7 @@ def amplifier_pdos(node_id: int, mode: Mode) -> tuple[PdoMap, ...]:
     )
     slow = (PdoEntry(Obj402.MODE_DISPLAY, 0, 8), PdoEntry(Obj402.ERROR_CODE, 0, 16))
     return (
-        PdoMap(True, 1, RPDO_BASE[0] + node_id, 1, command),
+        PdoMap(True, 1, RPDO_BASE[0] + node_id, 1, command, event_timer_ms=command_deadline_ms),
         PdoMap(False, 1, TPDO_BASE[0] + node_id, 1, feedback),
         PdoMap(False, 2, TPDO_BASE[1] + node_id, 255, slow, event_timer_ms=_SLOW_TIMER_MS),
     )
@@ -65,6 +70,7 @@ class AmplifierSetup:
     def __init__(self, config: AxisConfig, mode: Mode = Mode.CYCLIC_SYNC_TORQUE) -> None:
         self._amplifier = config.amplifier
         self._period_us = config.cycle.period_us
+        self._command_deadline_ms = config.heartbeat.drive_timeout_ms
         self._mode = mode
         self._quirks = load_quirks(config.amplifier.quirks)
         self._notes: list[str] = []
@@ -72,7 +78,7 @@ class AmplifierSetup:
     def plan(self) -> NodePlan:
         """The wanted mapping and the facts of the configuration; raises BadInput for what the drive cannot map."""
         amplifier = self._amplifier
-        pdos = amplifier_pdos(amplifier.node_id, self._mode)
+        pdos = amplifier_pdos(amplifier.node_id, self._mode, self._command_deadline_ms)
         longest = max(len(pdo.entries) for pdo in pdos)
         if longest > self._quirks.max_pdo_entries:
             raise BadInput("amplifier.quirks", amplifier.quirks, f"a drive that maps {longest} objects in one PDO")

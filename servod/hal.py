@@ -198,7 +198,10 @@ class PdoEntry:
 
 @dataclass(frozen=True)
 class PdoMap:
-    """One PDO as it shall stand in the device; `number` counts from 1, `receive` is seen from the device (RPDO)."""
+    """One PDO as it shall stand in the device; `number` counts from 1, `receive` is seen from the device (RPDO).
+
+    The event timer of an RPDO is its deadline: the device raises EMCY 8250 when the next one does not come in time.
+    """
 
     receive: bool
     number: int

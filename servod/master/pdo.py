@@ -7,9 +7,9 @@ lengths are checked against the EDS before, and the device's own answer against 
 from __future__ import annotations
 
 from servod.cia import PDO_NO_RTR, PDO_NOT_VALID, Obj301
-from servod.drivers.setup_tools import read_optional
+from servod.drivers.setup_tools import read_optional, write_checked
 from servod.errors import BadInput, Unreachable
-from servod.hal import NodePlan, PdoMap, SdoAccess
+from servod.hal import NodePlan, PdoMap, SdoAbort, SdoAccess
 from servod.master.eds import Dictionary
 
 _COB_ID, _TYPE, _INHIBIT, _EVENT_TIMER = 1, 2, 3, 5  # sub-indices of 1400/1800
@@ -41,8 +41,8 @@ def check_lengths(plan: NodePlan, dictionary: Dictionary) -> None:
                 raise BadInput(dictionary.source, f"object {name} with {len(variable)} bits", f"{entry.bits} bits")
 
 
-def write_pdo(sdo: SdoAccess, pdo: PdoMap) -> None:
-    """Write one PDO: not valid, mapping off, entries, mapping on, parameters, valid."""
+def write_pdo(sdo: SdoAccess, pdo: PdoMap) -> bool:
+    """Write one PDO: not valid, mapping off, entries, mapping on, parameters, valid; False when it has no deadline."""
     parameter, mapping = parameter_index(pdo), mapping_index(pdo)
     present = sdo.read(parameter, _COB_ID)
     sdo.write(parameter, _COB_ID, present | PDO_NOT_VALID)
@@ -51,26 +51,46 @@ def write_pdo(sdo: SdoAccess, pdo: PdoMap) -> None:
         sdo.write(mapping, place, entry.word)
     sdo.write(mapping, 0, len(pdo.entries))
     sdo.write(parameter, _TYPE, pdo.transmission_type)
-    if not pdo.receive:
-        _write_timers(sdo, pdo)
+    for subindex, wanted, found in timers(sdo, pdo):
+        if found != wanted:
+            sdo.write(parameter, subindex, wanted)
+    guarded = not pdo.receive or write_deadline(sdo, pdo)
     sdo.write(parameter, _COB_ID, pdo.cob_id | present & PDO_NO_RTR)
+    return guarded
 
 
-def _write_timers(sdo: SdoAccess, pdo: PdoMap) -> None:
-    """Inhibit time and event timer; a device without one of them is fine as long as nothing is wanted of it.
+def timers(sdo: SdoAccess, pdo: PdoMap) -> list[tuple[int, int, int]]:
+    """Rows of (sub-index, wanted, present) of a TPDO's timers, as far as the device has them; none of an RPDO's.
 
-    A default inhibit time is cleared: it would swallow changes that come too close together.
+    A default inhibit time is cleared: it would swallow changes that come too close together. Raises Unreachable when
+    a timer is wanted and missing.
     """
-    for subindex, wanted in ((_INHIBIT, pdo.inhibit_100us), (_EVENT_TIMER, pdo.event_timer_ms)):
+    rows = []
+    for subindex, wanted in () if pdo.receive else ((_INHIBIT, pdo.inhibit_100us), (_EVENT_TIMER, pdo.event_timer_ms)):
         present = read_optional(sdo, parameter_index(pdo), subindex)
-        if present is None and wanted:
+        if present is not None:
+            rows.append((subindex, wanted, present))
+        elif wanted:
             raise Unreachable(f"object 0x{parameter_index(pdo):04X}:{subindex} is missing, needed for {wanted}")
-        if present is not None and present != wanted:
-            sdo.write(parameter_index(pdo), subindex, wanted)
+    return rows
 
 
-def expected(pdo: PdoMap) -> list[tuple[int, int, int, int]]:
-    """What must be read back: rows of (index, subindex, mask, value)."""
+def write_deadline(sdo: SdoAccess, pdo: PdoMap) -> bool:
+    """Write and read back the deadline of an RPDO; False when the device or its EDS has none, or it is not writable.
+
+    CiA 301: EMCY 8250 when the next RPDO does not come in time. A guard beside the heartbeat, so a device may lack it.
+    """
+    index = parameter_index(pdo)
+    try:
+        if sdo.read(index, _EVENT_TIMER) != pdo.event_timer_ms:
+            write_checked(sdo, index, _EVENT_TIMER, pdo.event_timer_ms)
+    except SdoAbort:
+        return False
+    return True
+
+
+def expected(sdo: SdoAccess, pdo: PdoMap) -> list[tuple[int, int, int, int]]:
+    """What must be read back, all that was written: rows of (index, subindex, mask, value)."""
     parameter, mapping = parameter_index(pdo), mapping_index(pdo)
     rows = [
         (parameter, _COB_ID, _COMPARED_COB_BITS, pdo.cob_id),
@@ -78,14 +98,12 @@ def expected(pdo: PdoMap) -> list[tuple[int, int, int, int]]:
         (mapping, 0, 0xFF, len(pdo.entries)),
     ]
     rows += [(mapping, place, 0xFFFFFFFF, entry.word) for place, entry in enumerate(pdo.entries, start=1)]
-    if pdo.event_timer_ms:
-        rows.append((parameter, _EVENT_TIMER, 0xFFFF, pdo.event_timer_ms))
-    return rows
+    return rows + [(parameter, subindex, 0xFFFF, wanted) for subindex, wanted, _ in timers(sdo, pdo)]
 
 
 def verify_pdo(sdo: SdoAccess, node_id: int, pdo: PdoMap) -> None:
     """Read one PDO back and compare; raises Unreachable naming object, wrote and read."""
-    for index, subindex, mask, value in expected(pdo):
+    for index, subindex, mask, value in expected(sdo, pdo):
         read = sdo.read(index, subindex)
         if read & mask != value:
             name = f"node {node_id} {'R' if pdo.receive else 'T'}PDO{pdo.number}, object 0x{index:04X}:{subindex}"
@@ -114,11 +132,11 @@ def configure_pdos(sdo: SdoAccess, plan: NodePlan, dictionary: Dictionary) -> li
     """Check, write and verify all PDOs of a plan; lines for the report."""
     check_lengths(plan, dictionary)
     switched_off = disable_other_pdos(sdo, plan)
-    for pdo in plan.pdos:
-        write_pdo(sdo, pdo)
+    unguarded = [pdo for pdo in plan.pdos if not write_pdo(sdo, pdo) and pdo.event_timer_ms]
     for pdo in plan.pdos:
         verify_pdo(sdo, plan.node_id, pdo)
     report = [f"node {plan.node_id}: {len(plan.pdos)} PDOs written and read back"]
+    report += [f"node {plan.node_id} RPDO{pdo.number}: no deadline, the heartbeat guards alone" for pdo in unguarded]
     if switched_off:
         report.append(f"node {plan.node_id}: switched off {', '.join(f'0x{i:04X}' for i in switched_off)}")
     return report

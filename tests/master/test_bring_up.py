@@ -74,6 +74,7 @@ def test_the_mapping_is_written_by_the_sequence_of_cia_301(world: Witness) -> No
         (0x1600, 2),
         (0x1600, 0),
         (0x1400, 2),
+        (0x1400, 5),
         (0x1400, 1),
     ]
     assert steps[0][2] >> 31 == 1
@@ -119,6 +120,9 @@ def test_too_much_bus_load_is_refused_before_anything_is_written(world: Witness)
         (0x1A00, 0, 2, r"TPDO1, object 0x1A00:0: wrote 0x00000003, device reads 0x00000002"),
         (0x1800, 2, 255, r"TPDO1, object 0x1800:2: wrote 0x00000001, device reads 0x000000FF"),
         (0x1801, 5, 10, r"TPDO2, object 0x1801:5: wrote 0x00000064, device reads 0x0000000A"),
+        (0x1801, 3, 300, r"TPDO2, object 0x1801:3: wrote 0x00000000, device reads 0x0000012C"),
+        (0x1800, 5, 20, r"TPDO1, object 0x1800:5: wrote 0x00000000, device reads 0x00000014"),
+        (0x1400, 5, 0, r"object 0x1400:5: wrote 150, device reads 0"),
         (0x1400, 1, 0x80000201, r"RPDO1, object 0x1400:1: wrote 0x00000201, device reads 0x80000201"),
         (0x605A, 0, 0, r"0x605A:0: wrote 2, device reads 0"),
         (0x6060, 0, 8, r"0x6060:0: wrote 10, device reads 8"),
@@ -135,6 +139,13 @@ def test_a_device_that_keeps_something_else_is_found(
     world.amplifier.add_read_callback(answer)
     refuse(world, Unreachable, message)
     assert world.amplifier.nmt.state != "OPERATIONAL"
+
+
+def test_a_drive_without_a_deadline_is_reported(world: Witness) -> None:
+    del world.amplifier.object_dictionary[0x1400].subindices[5]
+    with master(world, axis_config()) as instance:
+        report = instance.bring_up().report
+    assert "node 1 RPDO1: no deadline, the heartbeat guards alone" in report
 
 
 @pytest.mark.parametrize("status_word", [0x0237, 0x0217, 0x021F])

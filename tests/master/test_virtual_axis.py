@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from rig import Rig, stepped_world
 
-from servod.cia import NmtCommand, Obj301, Obj402, Obj406
+from servod.cia import Emcy, NmtCommand, Obj301, Obj402, Obj406
 from servod.drivers.virtual.bus_faults import BusFault, FaultKind
 from servod.drivers.virtual.world import SteppedBus
 from servod.errors import FaultCode, Unreachable
@@ -155,6 +155,17 @@ def test_the_drive_stops_by_itself_when_the_masters_heartbeat_ends(enabled: Rig)
     assert truth.torque_nm == 0.0
     emcy = [event.code for event in enabled.events if event.node_id == 1]
     assert 0x8130 in emcy
+
+
+def test_commands_alone_that_do_not_arrive_are_seen_by_the_drive(enabled: Rig) -> None:
+    """The heartbeat goes on, so only the deadline of the RPDO (0x1400:5) can tell."""
+    enabled.bus.inject(BusFault(FaultKind.DROP, can_id=0x201, amount=400))
+    enabled.run(140, Goal.ENABLED, 0.03)
+    assert enabled.events == []
+    enabled.run(30, Goal.ENABLED, 0.03)
+    assert [(event.node_id, event.fault, event.code) for event in enabled.events] == [
+        (1, FaultCode.DRIVE_FAULT, Emcy.RPDO_TIME_OUT)
+    ]
 
 
 def test_a_reset_of_the_drive_while_operational_is_seen(enabled: Rig) -> None:
