@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, StrictBool, model_validator
+from pydantic import Field, model_validator
 
 from servod.yaml12 import Strict, load_model
 
@@ -130,7 +130,7 @@ class GainsConfig(Strict):
 
     directory: Path = Path("/var/lib/servod/gains")
     initial: Path
-    accept_uncertified: StrictBool = Field(False, description="run gain sets without a valid certificate")
+    accept_uncertified: bool = Field(False, description="run gain sets without a valid certificate")
 
 
 class ControlConfig(Strict):
@@ -145,7 +145,7 @@ class RecorderConfig(Strict):
 
     directory: Path = Path("/var/lib/servod/recordings")
     history_s: float = Field(10.0, ge=0.0, le=600.0, description="kept in memory, written at a fault")
-    always: StrictBool = Field(False, description="record from start to stop")
+    always: bool = Field(False, description="record from start to stop")
     max_file_mib: int = Field(1024, ge=1, le=1_048_576, description="a recording that is larger goes on in a new file")
     max_fault_files: int = Field(50, ge=1, le=100_000, description="the oldest fault files beyond this are removed")
 

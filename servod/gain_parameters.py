@@ -9,7 +9,7 @@ import itertools
 from enum import StrEnum
 from typing import Annotated, Literal
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from servod.controllers import MAX_SETS, local
 from servod.controllers.weights import Shape
@@ -22,12 +22,6 @@ Width = Annotated[
     float,
     Field(ge=0.0, le=1.0, description="with the reference at rest and less error than this, nothing integrates"),
 ]
-
-
-class Numbers(Strict):
-    """Base of these models: a number must be written as one; neither "2.5" in quotes nor true counts."""
-
-    model_config = ConfigDict(strict=True)
 
 
 class WeightShape(StrEnum):
@@ -45,7 +39,7 @@ class VelocitySource(StrEnum):
     REFERENCE = "reference"
 
 
-class PdParameters(Numbers):
+class PdParameters(Strict):
     """PD feedback, with optional feed-forward of the reference acceleration."""
 
     law: Literal["pd"]
@@ -58,7 +52,7 @@ class PdParameters(Numbers):
         return (self.position_gain_nm_per_rad, self.velocity_gain_nms_per_rad, self.feedforward_inertia_kg_m2)
 
 
-class PdDobParameters(Numbers):
+class PdDobParameters(Strict):
     """PD with a disturbance observer on nominal inertia and viscous friction."""
 
     law: Literal["pd_dob"]
@@ -85,7 +79,7 @@ class PdDobParameters(Numbers):
         )
 
 
-class PdLugreParameters(Numbers):
+class PdLugreParameters(Strict):
     """PD with the LuGre observer (18)."""
 
     law: Literal["pd_lugre"]
@@ -128,7 +122,7 @@ class PdLugreParameters(Numbers):
         )
 
 
-class RegionGains(Numbers):
+class RegionGains(Strict):
     """State feedback of one region (13): u* = k_x*e + k_v*e' - k_z*z_hat."""
 
     k_z_per_rad: float = Field(0.0, ge=-1e7, le=1e7)
@@ -140,7 +134,7 @@ class RegionGains(Numbers):
         return (self.k_z_per_rad, self.k_x_per_rad, self.k_v_s_per_rad)
 
 
-class Regions(Numbers):
+class Regions(Strict):
     """The two regions of Fig. 5 and their overlap, in speed."""
 
     low: RegionGains
@@ -159,7 +153,7 @@ class Regions(Numbers):
         return (*self.low.pack(), *self.high.pack(), self.overlap_from_rad_s, self.overlap_to_rad_s)
 
 
-class LocalSet(Numbers):
+class LocalSet(Strict):
     """One local set of (5) and (9)."""
 
     velocity_rad_s: float = Field(ge=-1e3, le=1e3, description="v_i")
@@ -167,7 +161,7 @@ class LocalSet(Numbers):
     gain: float = Field(0.0, ge=-10.0, le=10.0, description="l_i, in rad/s per unit of u*")
 
 
-class OutputObserver(Numbers):
+class OutputObserver(Strict):
     """Disturbance observer around the compensated axis."""
 
     bandwidth_rad_s: float = Field(gt=0.0, le=2000.0)
@@ -175,7 +169,7 @@ class OutputObserver(Numbers):
     disturbance_limit_nm: Torque
 
 
-class LocalFriction(Numbers):
+class LocalFriction(Strict):
     """The compensator of (9): one stiffness for all sets, a decay and a gain for each."""
 
     stiffness_nm_per_rad: float = Field(gt=0.0, le=1e8, description="c0_hat")
@@ -199,7 +193,7 @@ class LocalFriction(Numbers):
         return self
 
 
-class LocalParameters(Numbers):
+class LocalParameters(Strict):
     """The local-model gain-scheduled law (9), (16)."""
 
     law: Literal["local"]

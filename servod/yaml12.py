@@ -7,6 +7,7 @@ gain sets, axis models, column maps) comes through here, so that a number is a n
 from __future__ import annotations
 
 import difflib
+import json
 import re
 from pathlib import Path
 from typing import Any, TypeVar
@@ -33,6 +34,8 @@ class _Loader(yaml.SafeLoader):
         seen: set[Any] = set()
         for key_node, _ in node.value:
             key = self.construct_object(key_node, deep=True)
+            if not isinstance(key, str | int | float | bool | None):
+                raise yaml.constructor.ConstructorError(None, None, "a key that is no plain word", key_node.start_mark)
             if key in seen:
                 raise yaml.constructor.ConstructorError(None, None, f"key {key!r} twice", key_node.start_mark)
             seen.add(key)
@@ -85,6 +88,8 @@ def parse_yaml(text: str, where: str) -> Any:
         raise BadInput(f"{where}: line {line}", error.problem or "broken YAML", "a YAML 1.2 mapping") from None
     except (yaml.YAMLError, ValueError) as error:
         raise BadInput(where, str(error).splitlines()[0], "a YAML 1.2 mapping") from None
+    except RecursionError:
+        raise BadInput(where, "brackets nested without end", "a YAML 1.2 mapping") from None
 
 
 def read_text(path: str | Path) -> str:
@@ -103,11 +108,15 @@ def load_model(path: str | Path, model: type[M]) -> M:
 
 
 def validate(data: Any, model: type[M], where: str) -> M:
-    """Validate plain data as `model`; the first problem becomes one BadInput line."""
+    """Validate plain data as `model`; the first problem becomes one BadInput line.
+
+    Strictly: neither `true` nor "2.5" in quotes is a number. JSON is the way to have that and still read a path or an
+    enumeration from its text, as pydantic's strict mode does not from Python objects.
+    """
     if not isinstance(data, dict):
         raise BadInput(where, f"{type(data).__name__} at the top", "a mapping of keys")
     try:
-        return model.model_validate(data)
+        return model.model_validate_json(json.dumps(data, default=str), strict=True)
     except ValidationError as error:
         raise _bad_input(error, model, data, where) from None
 
