@@ -44,6 +44,40 @@ def test_recording_gives_back_rows_events_and_attachments(tmp_path: Path) -> Non
     assert [(e["kind"], e["code"]) for e in recording.events] == [("fault", "DRIVE_FAULT")]
 
 
+def test_recording_that_is_full_goes_on_in_a_new_file(tmp_path: Path) -> None:
+    recorder = Recorder(RecorderConfig(directory=tmp_path, max_file_mib=1), "axis", 1000)
+    recorder.set_attachment("config.yaml", b"name: a\n")
+    recorder.start("run.mcap").result(5)
+    noise, count = random.Random(1), 0
+    while recorder.state()["path"] in ("", str(tmp_path / "run.mcap")):
+        recorder.add_rows([row(count + n, position_rad=noise.random(), torque_nm=noise.random()) for n in range(500)])
+        count += 500
+        time.sleep(0.01)
+    assert recorder.stop().result(5)["records"] == count
+    recorder.close()
+    parts = [read_recording(tmp_path / name) for name in ("run.mcap", "run-2.mcap")]
+    assert [r.cycle for part in parts for r in part.records()] == list(range(count))
+    assert [part.attachments for part in parts] == [{"config.yaml": b"name: a\n"}] * 2
+    assert recorder.state()["bytes"] >= 1024 * 1024
+
+
+def test_only_the_newest_fault_files_are_kept_and_nothing_else_is_touched(tmp_path: Path) -> None:
+    others = ["axis-20260101-000000.mcap", "axis-fault-mine.mcap", "axis-fault-x-fault-20260101-000000-A.mcap"]
+    for name in others:
+        (tmp_path / name).write_bytes(b"")
+    for age in range(5):
+        path = tmp_path / f"axis-fault-2026010{age + 1}-000000-FOLLOWING_ERROR.mcap"
+        path.write_bytes(b"")
+        os.utime(path, (1000 + age, 1000 + age))
+    recorder = Recorder(RecorderConfig(directory=tmp_path, max_fault_files=3), "axis", 1000)
+    recorder.add_rows(rows(10))
+    newest = recorder.write_fault_file("DRIVE_FAULT").result(5)
+    recorder.close()
+    kept = {path.name for path in tmp_path.iterdir()} - set(others)
+    assert kept == {newest.name, *(f"axis-fault-2026010{day}-000000-FOLLOWING_ERROR.mcap" for day in (4, 5))}
+    assert all((tmp_path / name).exists() for name in others)
+
+
 def test_ordinary_mcap_readers_find_their_way_by_the_index(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     file = McapFile(path, {"model.yaml": b"inertia: 1\n"}, offset_ns=10**18)
