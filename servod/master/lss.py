@@ -1,4 +1,4 @@
-"""LSS master (CiA 305): finds nodes that have no node id yet, and gives them one. Off the control path.
+"""LSS master (CiA 305): finds nodes that have no node id yet, and leaves them as they are. Off the control path.
 
 Fast scan finds one unconfigured slave by its 128-bit identity, bit by bit: a slave answers when it agrees with all bits
 so far, so silence is an answer too and its time-out is what the scan costs (about 60 silences for a node).
@@ -12,7 +12,6 @@ from enum import IntEnum
 from typing import NamedTuple
 
 from servod.cia import LSS_FROM_SLAVE_ID, LSS_TO_SLAVE_ID
-from servod.errors import Unreachable
 from servod.master.network import BusNetwork
 
 
@@ -20,8 +19,6 @@ class LssCommand(IntEnum):
     """Command specifiers that are used here (CiA 305)."""
 
     SWITCH_GLOBAL = 0x04
-    CONFIGURE_NODE_ID = 0x11
-    STORE = 0x17
     IDENTIFY_SLAVE = 0x4F  # answer to fast scan
     IDENTIFY_NON_CONFIGURED_ANSWER = 0x50
     IDENTIFY_NON_CONFIGURED = 0x4C
@@ -97,14 +94,3 @@ class LssMaster:
     def _agrees(self, number: int, bit: int, part: int, next_part: int) -> bool:
         request = _FAST_SCAN.pack(LssCommand.FAST_SCAN, number, bit, part, next_part)
         return self._ask(request, LssCommand.IDENTIFY_SLAVE) is not None
-
-    def configure_node_id(self, node_id: int, store: bool) -> None:
-        """Give the one slave in configuration state a node id, and store it; raises Unreachable when it refuses."""
-        requests = [bytes((LssCommand.CONFIGURE_NODE_ID, node_id))]
-        if store:
-            requests.append(bytes((LssCommand.STORE,)))
-        for request in requests:
-            answer = self._ask(request, request[0])
-            if answer is None or answer[1] != 0:
-                reason = "no answer" if answer is None else f"error {answer[1]}"
-                raise Unreachable(f"LSS {LssCommand(request[0]).name}: {reason}")

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import struct
 
-import pytest
 from rig import stepped_world
 
 from servod.cia import LSS_TO_SLAVE_ID, NmtCommand
 from servod.drivers.virtual.bus_faults import BusFault, FaultKind
 from servod.drivers.virtual.world import SteppedWorld
-from servod.errors import Unreachable
 from servod.master.lss import LssIdentity, LssMaster
 from servod.master.network import BusNetwork
 from servod.master.scan import scan
 
-_UNCONFIGURED = 0xFF
+_CONFIGURE_NODE_ID, _UNCONFIGURED = 0x11, 0xFF
 
 
 def lss_identity(world: SteppedWorld, node_id: int) -> LssIdentity:
@@ -31,9 +29,9 @@ def forget_node_id(world: SteppedWorld, identity: LssIdentity) -> None:
     for command, number in zip(range(0x40, 0x44), identity, strict=True):
         network.send_message(LSS_TO_SLAVE_ID, struct.pack("<BI3x", command, number))
     network.wait(lambda: False, 0.01)
-    lss = LssMaster(network)
-    lss.configure_node_id(_UNCONFIGURED, store=False)
-    lss.switch_all(configuration=False)
+    network.send_message(LSS_TO_SLAVE_ID, bytes((_CONFIGURE_NODE_ID, _UNCONFIGURED)).ljust(8, b"\0"))
+    network.wait(lambda: False, 0.01)
+    LssMaster(network).switch_all(configuration=False)
     network.send_message(0, bytes((NmtCommand.RESET_COMMUNICATION, 0)))
     network.wait(lambda: False, 0.1)
     network.disconnect()
@@ -70,30 +68,3 @@ def test_two_nodes_without_id_are_both_found() -> None:
     for identity in sorted(identities):
         forget_node_id(world, identity)
     assert {node.lss for node in scan(world.connect(), world.clock)} == identities
-
-
-def test_a_found_node_can_be_given_an_id() -> None:
-    world = stepped_world()
-    identity = lss_identity(world, 2)
-    forget_node_id(world, identity)
-    network = BusNetwork(world.connect(), world.clock, threaded=False)
-    lss = LssMaster(network)
-    assert lss.fast_scan() == identity
-    lss.configure_node_id(42, store=True)
-    lss.switch_all(configuration=False)
-    network.wait(lambda: False, 0.1)
-    network.send_message(0, bytes((NmtCommand.RESET_COMMUNICATION, 0)))
-    network.wait(lambda: False, 0.1)
-    network.disconnect()
-    assert [node.node_id for node in scan(world.connect(), world.clock)] == [1, 42]
-
-
-@pytest.mark.parametrize("node_id", [0, 200])
-def test_an_id_that_the_node_refuses_is_said(node_id: int) -> None:
-    world = stepped_world()
-    forget_node_id(world, lss_identity(world, 2))
-    network = BusNetwork(world.connect(), world.clock, threaded=False)
-    lss = LssMaster(network)
-    lss.fast_scan()
-    with pytest.raises(Unreachable, match="LSS CONFIGURE_NODE_ID: error 1"):
-        lss.configure_node_id(node_id, store=False)
