@@ -39,7 +39,15 @@ class Target(Protocol):
         ...
 
 
-class TorqueTarget:
+class CyclicTarget:
+    """A target that acts at every SYNC: the cyclic synchronous modes need no bits of the control word."""
+
+    def control_bits(self, target: int, status_word: int) -> int:
+        """None."""
+        return 0
+
+
+class TorqueTarget(CyclicTarget):
     """0x6071 in cst: thousandths of rated torque, motor side; saturates at the object's 16 bits."""
 
     index = Obj402.TARGET_TORQUE
@@ -60,12 +68,8 @@ class TorqueTarget:
         """The torque now produced while the drive holds the load, else zero."""
         return torque_per_mille if holding else 0
 
-    def control_bits(self, target: int, status_word: int) -> int:
-        """None in cst."""
-        return 0
 
-
-class VelocityTarget:
+class VelocityTarget(CyclicTarget):
     """0x60FF in csv, in counts per second of the motor encoder."""
 
     index = Obj402.TARGET_VELOCITY
@@ -85,12 +89,8 @@ class VelocityTarget:
         """Standstill."""
         return 0
 
-    def control_bits(self, target: int, status_word: int) -> int:
-        """None in csv."""
-        return 0
 
-
-class PositionTarget:
+class PositionTarget(CyclicTarget):
     """0x607A in csp, in counts of the motor encoder; wraps as the drive's 32-bit counter does."""
 
     index = Obj402.TARGET_POSITION
@@ -109,10 +109,6 @@ class PositionTarget:
     def idle(self, position_counts: int, torque_per_mille: int, holding: bool) -> int:
         """The position now present."""
         return position_counts
-
-    def control_bits(self, target: int, status_word: int) -> int:
-        """None in csp."""
-        return 0
 
 
 class ProfilePositionTarget(PositionTarget):
