@@ -115,7 +115,7 @@ REASON_TEXT: dict[Reason, str] = {
 class AmplifierFeedback(NamedTuple):
     """What the amplifier said last, in SI units of the joint."""
 
-    time_ns: int  # bus time stamp of the synchronous feedback
+    time_ns: int  # moment of the SYNC that sampled this feedback; 0 before the first
     age_cycles: int  # 0: of this cycle
     state: DriveState
     status_word: int
@@ -130,7 +130,7 @@ class AmplifierFeedback(NamedTuple):
 class EncoderFeedback(NamedTuple):
     """What the encoder said last, in SI units of the joint."""
 
-    time_ns: int
+    time_ns: int  # moment of the SYNC that sampled this feedback; 0 before the first
     age_cycles: int  # 0: of this cycle
     position_rad: float
     velocity_rad_s: float
