@@ -16,7 +16,7 @@ from servod.drivers.virtual.timeline import Timeline
 _FRAME = struct.Struct("<HB5s")
 _HISTORY = 8
 _WAITING_LIMIT = 16
-#: Error register bit by the class of the code (high nibble of the high byte): D4 of CiA 301, object 0x1001.
+#: Error register bit by the class of the code (its high nibble): CiA 301, object 0x1001 and the EMCY code classes.
 _REGISTER_BIT = {0x2: 0x02, 0x3: 0x04, 0x4: 0x08, 0x8: 0x10, 0xF: 0x80}
 
 

@@ -101,7 +101,7 @@ class Rpdo(Pdo):
         return True
 
     def _missed(self, time_ns: int) -> None:
-        """The deadline passed: told, and nothing more, as some drives do (Novanta Summit, error 0x8250: no reaction)."""
+        """The deadline passed: told, and nothing more, as some drives do (Novanta Summit, error 0x8250)."""
         self._emergency.set(Emcy.RPDO_TIME_OUT, time_ns, self.cob_id.to_bytes(2, "little"))
 
 

@@ -1,4 +1,4 @@
-"""D9 (13): arbitration, bit time and the budget of D10; queues, error counters, bus-off, faults on demand."""
+"""The virtual bus: arbitration, bit time and the cycle's budget; queues, error counters, bus-off, faults on demand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""D9 (15): EDS and behaviour agree: each entry of both files is read and written."""
+"""EDS and behaviour agree (CiA 306): each entry of both files is read and written."""
 
 from __future__ import annotations
 

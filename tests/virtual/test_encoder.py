@@ -1,4 +1,4 @@
-"""D9 (12): wrap at any range, preset, scaling, direction, alarms, cyclic timer."""
+"""The virtual encoder (CiA 406): wrap at any range, preset, scaling, direction, alarms, cyclic timer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""D9 (1), (7), (8): boot-up, NMT, heartbeat in both directions, emergencies."""
+"""Network management of the nodes (CiA 301): boot-up, NMT, heartbeat in both directions, emergencies."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""D9 (5), (9): the remap sequence, transmission types, lengths, deadlines."""
+"""PDOs of the nodes (CiA 301, 0x1400 to 0x1BFF): the remap sequence, transmission types, lengths, deadlines."""
 
 from __future__ import annotations
 

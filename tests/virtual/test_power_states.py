@@ -1,4 +1,4 @@
-"""D9 (2), (3), (4), (11): all transitions over SDO and PDO, every forbidden one refused, SYNC timing, stops."""
+"""Power states (CiA 402): all transitions by SDO and PDO, every forbidden one refused, SYNC timing, stops."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""D9 (14): the process on its socket: canopen as an independent witness, python-can, wall clock, record, end."""
+"""The process on its socket: canopen as an independent witness, python-can, wall clock, record, end."""
 
 from __future__ import annotations
 

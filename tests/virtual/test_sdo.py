@@ -1,4 +1,4 @@
-"""D9 (6): every abort code of the list is reachable; segmented and block transfers."""
+"""SDO server of the nodes (CiA 301): every abort code that servod names is reachable; segmented and block transfers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""D9 (10): clamp order and bit 11; and the other modes by their behaviour on a sticking joint."""
+"""Torque of the virtual drive: clamp order and status bit 11; the other modes on a sticking joint (CiA 402)."""
 
 from __future__ import annotations
 
