@@ -226,6 +226,7 @@ class Thermal(Strict):
 
     linear: 1 + k*(T - reference_c); exponential: exp(k*(T - reference_c)); k is negative for a joint that loosens when
     warm. Time: + k_t*t, or k_t*time_s*(1 - exp(-t/time_s)) when drift_time_s is given. Factors stay above 0.05.
+    t counts from the first row of a recording, from power-on in a virtual axis.
     T is the recorded temperature where there is one, else dT/dt = heating_c_per_j*|F*v| - (T - ambient_c)/cooling_s.
     Source: Bittencourt and Gunnarsson, ASME JDSMC 134(5), 2012; Simoni et al., IROS 2015.
     """
@@ -304,5 +305,5 @@ class Noise(Strict):
     torque_rms: NonNegative = Field(0.0, description="N*m")
     torque_bandwidth_hz: Positive = Field(100.0, description="Hz")
     encoder_rms: NonNegative = Field(0.0, description="rad, at each reading")
-    temperature_c: float = Field(25.0, ge=-100.0, le=300.0, description="degC at the start")
+    temperature_c: float | None = Field(None, ge=-100.0, le=300.0, description="degC at the start; None = ambient")
     temperature_rms_c: NonNegative = Field(0.0, description="degC, at each reading")

@@ -1,6 +1,6 @@
 """The axis model file: what simulator, identification, synthesis, diagnosis, daemon and the virtual plant share.
 
-Stands between the file (YAML, contract.md) and the physics kernels of `servod.models`, which take `AxisModel.pack()`.
+Stands between the file (YAML) and the physics kernels of `servod.models`, which take `AxisModel.pack()`.
 SI units in joint coordinates: rotary rad and N*m, linear m and N. A model omits what it does not have.
 """
 
@@ -90,7 +90,7 @@ Friction = Annotated[
 
 
 class AxisModel(Strict):
-    """One axis as physics: contract.md's keys, and one optional group of keys for each effect."""
+    """One axis as physics: its basic keys, and one optional group of keys for each effect."""
 
     axis: AxisKind = AxisKind.ROTARY
     inertia: Positive = Field(description="all that moves: kg*m^2, kg when linear")
@@ -145,6 +145,13 @@ class AxisModel(Strict):
     def total_delay_s(self) -> float:
         """Command to torque, `delay_s` and the effect `delay` together, in s."""
         return self.delay_s + (self.delay.additional_s if self.delay else 0.0)
+
+    @property
+    def start_temperature_c(self) -> float:
+        """Joint temperature before anything has moved or been measured, in degC."""
+        if self.noise is not None and self.noise.temperature_c is not None:
+            return self.noise.temperature_c
+        return (self.thermal or fx.Thermal()).ambient_c
 
     @property
     def two_mass(self) -> fx.TwoMass | None:

@@ -53,6 +53,7 @@ def pack(model: AxisModel) -> tuple[float, ...]:
     _friction_effects(packer, model)
     _load(packer, model)
     _actuator(packer, model)
+    packer.put(start_c=model.start_temperature_c)
     _thermal(packer, model.thermal)
     _position(packer, model)
     _time(packer, model)

@@ -17,6 +17,18 @@ settings.register_profile("house", deadline=None)
 settings.load_profile("house")
 
 
+#: Recordings of other people beside the project, each with the tests that want it.
+SHARED = {name: ROOT.parents[1] / "shared" / name for name in ("recordings/emps", "recordings/bam_xl330", "practice")}
+
+
+def pytest_report_header() -> str:
+    """Say which recordings of other people are there: without them tests/replay/test_shared_data.py has fewer tests."""
+    there = (
+        f"{name} {'present' if folder.is_dir() else 'ABSENT, its tests do not run'}" for name, folder in SHARED.items()
+    )
+    return "shared data: " + "; ".join(there)
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the tests of SERIAL files, before the selection by marker."""

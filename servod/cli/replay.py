@@ -12,6 +12,7 @@ import typer
 
 from servod.cli.common import JsonOption, example, print_json
 from servod.errors import BadInput
+from servod.models.start import Start
 
 if TYPE_CHECKING:
     from servod.axis_model import AxisModel
@@ -32,6 +33,9 @@ def replay(
     horizon: Annotated[str, typer.Option(help="Restart from the recording every so many seconds, or `full`.")] = "full",
     map_file: Annotated[Path | None, typer.Option("--map", help="Renames and scales foreign columns (YAML).")] = None,
     out: Annotated[Path | None, typer.Option(help="Write t_s, position and velocity here (.csv or .parquet).")] = None,
+    start: Annotated[
+        Start, typer.Option(help="First row: at rest, as recorded, or at rest where it stands or was just set off.")
+    ] = Start.AUTO,
     as_json: JsonOption = False,
 ) -> None:
     """Simulate MODEL under the torque of REC and report the open-loop position error."""
@@ -45,7 +49,7 @@ def replay(
     recorded = load_recording(recording, map_file)
     if recorded.axis is not axis.axis:
         raise BadInput(f"{model}: axis", axis.axis.value, f"{recorded.axis.value}, as the columns of {recording} say")
-    result = simulate(axis, recorded.drive, horizon_s)
+    result = simulate(axis, recorded.drive, horizon_s, start=start)
     if out is not None:
         write_simulation(out, recorded, result)
     document = summary(recorded, axis, result, horizon_s)
@@ -107,8 +111,20 @@ def summary(recorded: Recording, axis: AxisModel, result: Replay, horizon_s: flo
         "unit": unit,
         f"rms_error_{unit}": measured.rms,
         f"max_error_{unit}": measured.max,
-        "report": list(recorded.report),
+        "start": "rest" if result.at_rest else "recorded",
+        "report": [*recorded.report, *gap_report(recorded, horizon_s)],
     }
+
+
+def gap_report(recorded: Recording, horizon_s: float | None) -> list[str]:
+    """What the replay did at long gaps, in a sentence."""
+    from servod.models.replay import RESTART_GAP_S, behind_gaps
+
+    gaps = len(behind_gaps(recorded.t_s))
+    if gaps == 0:
+        return []
+    did = "run through, the last command held" if horizon_s is None else "restarted from the recording behind each"
+    return [f"gaps longer than {1e3 * RESTART_GAP_S:.0f} ms and than ten samples: {gaps}; {did}"]
 
 
 def print_summary(document: dict[str, Any]) -> None:
@@ -119,5 +135,6 @@ def print_summary(document: dict[str, Any]) -> None:
     windows = document["windows"]
     span = "one free run" if windows == 1 else f"{windows} windows"
     print(f"{document['recording']}: {document['rows']} rows, {document['duration_s']:.3f} s, {span}")
+    print("start: " + ("at rest" if document["start"] == "rest" else "in motion, as recorded"))
     rms, largest = (1e3 * document[f"{kind}_error_{unit}"] for kind in ("rms", "max"))
     print(f"open-loop position error: RMS {rms:.4g} m{unit}, max {largest:.4g} m{unit}")

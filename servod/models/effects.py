@@ -16,6 +16,9 @@ State = list[float]
 #: Friction factors (temperature, position) never fall below this share: friction cannot vanish or drive.
 SMALLEST_FACTOR = 0.05
 
+#: Newton steps for the position behind an eccentric encoder or the stretch of a joint's spring; 4 reach the last digit.
+NEWTON_STEPS = 8
+
 
 def delayed(s: State, command: float, whole: int, part: float) -> float:
     """Write `command` into the delay line; the one of `whole + part` inner steps ago, fractions blended."""
@@ -57,22 +60,51 @@ def harmonics_slope(p: Params, start: int, rows: int, x: float) -> float:
     return total
 
 
+def harmonics_curvature(p: Params, start: int, rows: int, x: float) -> float:
+    """Second derivative of `harmonics` by x."""
+    total = 0.0
+    for row in range(rows):
+        i = start + 3 * row
+        total -= p[i] * p[i + 1] * p[i + 1] * math.sin(p[i + 1] * x + p[i + 2])
+    return total
+
+
 def encoder_position(p: Params, x: float) -> float:
     """What an ideal-resolution encoder shows at position `x`: eccentricity added."""
     return x + harmonics(p, int(p[lay.P_ECCENTRICITY]), int(p[lay.P_ECCENTRICITY_N]), x)
 
 
+def behind_encoder(p: Params, shown: float, rate: float, rate_of_rate: float) -> tuple[float, float, float]:
+    """True position, velocity, acceleration behind what the encoder shows: `encoder_position` inverted by Newton.
+
+    The model checks that the encoder's slope is positive everywhere, so that there is one answer.
+    """
+    start, rows = int(p[lay.P_ECCENTRICITY]), int(p[lay.P_ECCENTRICITY_N])
+    if rows == 0:
+        return shown, rate, rate_of_rate
+    x = shown
+    for _ in range(NEWTON_STEPS):
+        x -= (x + harmonics(p, start, rows, x) - shown) / (1.0 + harmonics_slope(p, start, rows, x))
+    slope = 1.0 + harmonics_slope(p, start, rows, x)
+    velocity = rate / slope
+    return x, velocity, (rate_of_rate - harmonics_curvature(p, start, rows, x) * velocity * velocity) / slope
+
+
 def actuator(p: Params, torque: float, command: float, h: float) -> float:
     """Torque behind gain, limit, lag and slew rate, one step of `h` s after it was `torque`; the lag is exact."""
-    goal = command * (p[lay.P_GAIN_POSITIVE] if command >= 0.0 else p[lay.P_GAIN_NEGATIVE])
-    if p[lay.P_LIMIT_POSITIVE] > 0.0:
-        goal = limited(p, goal)
+    goal = actuator_goal(p, command)
     if p[lay.P_LAG_S] > 0.0:
         goal = torque + (goal - torque) * (1.0 - math.exp(-h / p[lay.P_LAG_S]))
     if p[lay.P_SLEW] > 0.0:
         reach = p[lay.P_SLEW] * h
         goal = min(max(goal, torque - reach), torque + reach)
     return goal
+
+
+def actuator_goal(p: Params, command: float) -> float:
+    """The torque that a command leads to when it is held: gain, then limit."""
+    goal = command * (p[lay.P_GAIN_POSITIVE] if command >= 0.0 else p[lay.P_GAIN_NEGATIVE])
+    return limited(p, goal) if p[lay.P_LIMIT_POSITIVE] > 0.0 else goal
 
 
 def limited(p: Params, torque: float) -> float:
@@ -158,6 +190,20 @@ def joint_spring(p: Params, stretch: float, ahead: float) -> tuple[float, float,
     return (p[lay.P_STIFFNESS] + bent) * into, p[lay.P_STIFFNESS] + 3.0 * bent, p[lay.P_DAMPING]
 
 
+def static_stretch(p: Params, torque: float) -> float:
+    """Stretch x_motor - x_load under which the joint's spring carries `torque`: the load rests on that side of a gap.
+
+    Newton from the line's answer, which lies beyond the stiffening spring's, so that every step comes closer.
+    """
+    if torque == 0.0:
+        return 0.0
+    into = torque / p[lay.P_STIFFNESS]
+    for _ in range(NEWTON_STEPS):
+        bent = p[lay.P_STIFFNESS_CUBIC] * into * into
+        into -= ((p[lay.P_STIFFNESS] + bent) * into - torque) / (p[lay.P_STIFFNESS] + 3.0 * bent)
+    return into + math.copysign(0.5 * p[lay.P_GAP], torque)
+
+
 def spring_step(
     p: Params, s: State, load: float, inertia: float, slope: float, h: float
 ) -> tuple[float, float, float, float]:
@@ -184,7 +230,8 @@ def thermal_factors(p: Params, s: State, temperature_c: float) -> tuple[float, f
     if p[lay.P_THERMAL] == 0.0:
         return 1.0, 1.0
     warm = s[lay.S_TEMPERATURE_C] if math.isnan(temperature_c) else temperature_c
-    above, time_s, limit = warm - p[lay.P_REFERENCE_C], s[lay.S_TIME_S], p[lay.P_DRIFT_TIME_S]
+    above, limit = warm - p[lay.P_REFERENCE_C], p[lay.P_DRIFT_TIME_S]
+    time_s = s[lay.S_TIME_S] - s[lay.S_FIRST_S]
     drift = time_s if limit == 0.0 else limit * (1.0 - math.exp(-time_s / limit))
     dry, viscous = p[lay.P_DRY_PER_C] * above, p[lay.P_VISCOUS_PER_C] * above
     if p[lay.P_THERMAL_EXPONENTIAL] > 0.0:

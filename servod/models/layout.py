@@ -60,6 +60,7 @@ from __future__ import annotations
     P_DRY_PER_S,
     P_VISCOUS_PER_S,
     P_DRIFT_TIME_S,
+    P_START_C,  # temperature before the first step where none is recorded
     # tables behind the fixed part: first index and number of rows
     P_COGGING,
     P_COGGING_N,
@@ -86,7 +87,7 @@ from __future__ import annotations
     P_RESIDUAL_TIME,
     P_RESIDUAL_TIME_N,
     P_SIZE,
-) = range(76)
+) = range(77)
 
 # --- states: the fixed part of s, then the command delay line ----------------------------------------------------
 (
@@ -98,7 +99,8 @@ from __future__ import annotations
     S_TORQUE,  # torque behind actuator lag and limits, before ripple
     S_TEMPERATURE_C,
     S_TIME_S,
+    S_FIRST_S,  # time of the first step: drifts count from here, t_s of a recording may count from 1970
     S_FRICTION,  # friction torque of the last step
     S_HEAD,  # where the delay line is written next
     S_LINE,  # first value of the delay line; its length is len(s) - S_LINE
-) = range(11)
+) = range(12)

@@ -12,7 +12,10 @@ from typing import Any
 
 from servod.models.dynamics import advance
 from servod.models.effects import (
+    NEWTON_STEPS,
     actuator,
+    actuator_goal,
+    behind_encoder,
     dry_factor,
     encoder_position,
     inertia_at,
@@ -21,6 +24,7 @@ from servod.models.effects import (
     nonlinear_viscous,
     resisting_torque,
     ripple,
+    static_stretch,
     thermal_factors,
 )
 from servod.models.friction import Params, directed_curve
@@ -29,6 +33,7 @@ from servod.models.layout import (
     P_FRICTION_PER_COMMAND,
     P_FRICTION_PER_LOAD,
     P_INERTIA,
+    P_LAG_S,
     P_LOAD_INERTIA,
     P_LOAD_VISCOUS,
     P_NEGATIVE_VISCOUS,
@@ -37,6 +42,7 @@ from servod.models.layout import (
     P_SIGMA0,
     P_VISCOUS,
     S_BRISTLE,
+    S_FIRST_S,
     S_LOAD_POSITION,
     S_LOAD_VELOCITY,
     S_POSITION,
@@ -121,15 +127,21 @@ def begin(s: Any, start: Any) -> None:
     s[S_LOAD_POSITION], s[S_LOAD_VELOCITY], s[S_TORQUE] = start[3], start[4], start[5]
 
 
+def recorded_motion(p: Params, motion: Any) -> None:
+    """Turn rows of position, velocity, acceleration as the encoder showed them into the true ones, in place."""
+    for k in range(len(motion)):
+        motion[k, 0], motion[k, 1], motion[k, 2] = behind_encoder(p, motion[k, 0], motion[k, 1], motion[k, 2])
+
+
 def follow(
     p: Params, s: Any, t: Any, motion: Any, torque: Any, before: float, temperature: Any, out: Any, step_s: float
 ) -> None:
-    """Run bristle, load and actuator along the recorded motor motion (rows of position, velocity, acceleration).
+    """Run bristle, load and actuator along the true motor motion (rows of position, velocity, acceleration).
 
     `out` gets bristle, load position, load velocity and actuator torque of each row: with the row's position and
     velocity a complete state, drawn from the recording alone.
     """
-    s[S_LOAD_POSITION], s[S_LOAD_VELOCITY] = motion[0, 0], motion[0, 1]
+    _settle(p, s, motion, before, t[0], temperature[0])
     row = -1
     for k in range(len(t)):
         s[S_TIME_S] = t[k]
@@ -151,39 +163,46 @@ def follow(
             s[S_VELOCITY] = motion[k, 1] + share * (motion[k + 1, 1] - motion[k, 1])
             s[S_POSITION] = motion[k, 0] + share * (motion[k + 1, 0] - motion[k, 0])
             acceleration = motion[k, 2] + share * (motion[k + 1, 2] - motion[k, 2])
-            _follow_step(p, s, acceleration, temperature[k], span / steps)
+            carried = _follow_load(p, s, acceleration, span / steps)
+            _follow_bristle(p, s, carried, temperature[k], span / steps)
 
 
-def _follow_step(p: Params, s: Any, acceleration: float, temperature_c: float, h: float) -> None:
-    """One step of load and bristle under a prescribed motor motion."""
-    position, velocity = s[S_POSITION], s[S_VELOCITY]
-    load = load_torque(p, s[S_LOAD_POSITION], s[S_TIME_S])
-    inertia, slope = inertia_at(p, s[S_LOAD_POSITION])
-    carried = load + 0.5 * slope * velocity * velocity
+def _settle(p: Params, s: Any, motion: Any, before: float, time_s: float, temperature_c: float) -> None:
+    """The hidden state at the first row: in balance with the row's motion, as if that had lasted for long."""
+    s[S_TIME_S] = s[S_FIRST_S] = time_s
+    s[S_POSITION], s[S_VELOCITY] = motion[0, 0], motion[0, 1]
+    s[S_LOAD_POSITION], s[S_LOAD_VELOCITY] = motion[0, 0], motion[0, 1]
+    s[S_TORQUE] = actuator_goal(p, before)
+    carried = _carried(p, s, motion[0, 2])
     if p[P_LOAD_INERTIA] > 0.0:
-        carried = _follow_load(p, s, load, inertia, slope, h)
-        inertia = p[P_INERTIA]
-    else:
-        s[S_LOAD_POSITION], s[S_LOAD_VELOCITY] = position, velocity
-    if p[P_SIGMA0] == 0.0:
-        return
-    dry_warm, viscous_warm = thermal_factors(p, s, temperature_c)
-    drive = s[S_TORQUE] * ripple(p, position)
-    dry = directed_curve(p, velocity) * dry_factor(p, position) * dry_warm
-    dry += p[P_FRICTION_PER_COMMAND] * abs(drive) + p[P_FRICTION_PER_LOAD] * abs(load)
-    viscous = p[P_VISCOUS] * (p[P_POSITIVE_VISCOUS] if velocity >= 0.0 else p[P_NEGATIVE_VISCOUS])
-    viscous = (viscous + nonlinear_viscous(p, velocity)) * viscous_warm
-    friction = drive + p[P_OFFSET] - resisting_torque(p, position, velocity, s[S_TIME_S]) - carried
-    balance = (friction - inertia * acceleration - viscous * velocity) / p[P_SIGMA0]
-    rate = p[P_SIGMA0] * abs(velocity) / dry + BRISTLE_CORRECTION_PER_S
-    goal = (velocity + BRISTLE_CORRECTION_PER_S * balance) / rate
-    bristle = goal + (s[S_BRISTLE] - goal) * math.exp(-rate * h)
-    most = dry / p[P_SIGMA0]
-    s[S_BRISTLE] = min(max(bristle, -most), most)
+        for _ in range(NEWTON_STEPS):  # a fixed point: the load's torque changes little over the stretch
+            s[S_LOAD_POSITION] = s[S_POSITION] - static_stretch(p, carried)
+            carried = _carried(p, s, motion[0, 2])
+        carried += p[P_INERTIA] * motion[0, 2]
+    dry, viscous = _friction(p, s, temperature_c)
+    stiff = p[P_SIGMA0] if p[P_SIGMA0] > 0.0 else math.inf
+    if p[P_LAG_S] > 0.0 and s[S_VELOCITY] != 0.0 and abs(s[S_VELOCITY]) * stiff > dry * BRISTLE_CORRECTION_PER_S:
+        beside = resisting_torque(p, s[S_POSITION], s[S_VELOCITY], time_s) - p[P_OFFSET]
+        s[S_TORQUE] = carried + beside + math.copysign(dry, s[S_VELOCITY]) + viscous * s[S_VELOCITY]
+        s[S_TORQUE] /= ripple(p, s[S_POSITION])
+    _follow_bristle(p, s, carried, temperature_c, math.inf)
 
 
-def _follow_load(p: Params, s: Any, load: float, inertia: float, slope: float, h: float) -> float:
-    """Step the load behind the spring under the prescribed motor; returns the torque that the motor carries."""
+def _carried(p: Params, s: Any, acceleration: float) -> float:
+    """Torque that moves the load side (the whole axis when there is one mass) with this acceleration."""
+    inertia, slope = inertia_at(p, s[S_LOAD_POSITION])
+    speed = s[S_LOAD_VELOCITY]
+    moved = inertia * acceleration + 0.5 * slope * speed * speed + p[P_LOAD_VISCOUS] * speed
+    return float(load_torque(p, s[S_LOAD_POSITION], s[S_TIME_S]) + moved)
+
+
+def _follow_load(p: Params, s: Any, acceleration: float, h: float) -> float:
+    """Step the load under the prescribed motor; returns what the motor's torque moves besides cogging and friction."""
+    if p[P_LOAD_INERTIA] == 0.0:
+        s[S_LOAD_POSITION], s[S_LOAD_VELOCITY] = s[S_POSITION], s[S_VELOCITY]
+        return _carried(p, s, acceleration)
+    inertia, slope = inertia_at(p, s[S_LOAD_POSITION])
+    load = load_torque(p, s[S_LOAD_POSITION], s[S_TIME_S])
     relative = s[S_VELOCITY] - s[S_LOAD_VELOCITY]
     stretch = s[S_POSITION] - s[S_LOAD_POSITION]
     tau, stiffness, damping = joint_spring(p, stretch, stretch)
@@ -193,4 +212,31 @@ def _follow_load(p: Params, s: Any, load: float, inertia: float, slope: float, h
     push = tau - load - 0.5 * slope * old * old - p[P_LOAD_VISCOUS] * old + 0.5 * h * stiffness * relative
     s[S_LOAD_VELOCITY] = old + h / inertia * push / (1.0 + h / inertia * coupling)
     s[S_LOAD_POSITION] += 0.5 * h * (old + s[S_LOAD_VELOCITY])
-    return float(tau)
+    return float(tau + p[P_INERTIA] * acceleration)
+
+
+def _friction(p: Params, s: Any, temperature_c: float) -> tuple[float, float]:
+    """Dry friction and viscous coefficient of the state, as `servod.models.dynamics` has them."""
+    position, velocity = s[S_POSITION], s[S_VELOCITY]
+    dry_warm, viscous_warm = thermal_factors(p, s, temperature_c)
+    load = load_torque(p, s[S_LOAD_POSITION], s[S_TIME_S])
+    dry = directed_curve(p, velocity) * dry_factor(p, position) * dry_warm
+    dry += p[P_FRICTION_PER_COMMAND] * abs(s[S_TORQUE] * ripple(p, position)) + p[P_FRICTION_PER_LOAD] * abs(load)
+    viscous = p[P_VISCOUS] * (p[P_POSITIVE_VISCOUS] if velocity >= 0.0 else p[P_NEGATIVE_VISCOUS])
+    return dry, max(viscous + nonlinear_viscous(p, velocity), 0.0) * viscous_warm
+
+
+def _follow_bristle(p: Params, s: Any, carried: float, temperature_c: float, h: float) -> None:
+    """Step the bristle: it follows the motion, and slowly what the torque balance leaves for it."""
+    if p[P_SIGMA0] == 0.0:
+        return
+    position, velocity = s[S_POSITION], s[S_VELOCITY]
+    dry, viscous = _friction(p, s, temperature_c)
+    drive = s[S_TORQUE] * ripple(p, position)
+    friction = drive + p[P_OFFSET] - resisting_torque(p, position, velocity, s[S_TIME_S]) - carried
+    balance = (friction - viscous * velocity) / p[P_SIGMA0]
+    rate = p[P_SIGMA0] * abs(velocity) / dry + BRISTLE_CORRECTION_PER_S
+    goal = (velocity + BRISTLE_CORRECTION_PER_S * balance) / rate
+    bristle = goal + (s[S_BRISTLE] - goal) * math.exp(-rate * h)
+    most = dry / p[P_SIGMA0]
+    s[S_BRISTLE] = min(max(bristle, -most), most)

@@ -17,7 +17,7 @@ from servod.models.compiled import available, compiled
 from servod.models.dynamics import advance
 from servod.models.effects import encoder_position
 
-#: Inner step of every simulation, s (the brief of the virtual axis asks for 50 us or less).
+#: Inner step of every simulation, s (stiff bristles and springs of real joints need 50 us or less).
 INNER_STEP_S = 50e-6
 
 
@@ -26,7 +26,7 @@ def delay_line_length(delay_s: float, step_s: float) -> int:
     return math.ceil(delay_s / step_s + 1e-9) + 2
 
 
-def rest_state(delay_s: float, step_s: float = INNER_STEP_S, temperature_c: float = 25.0) -> list[float]:
+def rest_state(delay_s: float, step_s: float, temperature_c: float) -> list[float]:
     """The state of an axis at rest at position 0 without torque; `servod.models.layout` names its numbers."""
     state = [0.0] * (lay.S_LINE + delay_line_length(delay_s, step_s))
     state[lay.S_TEMPERATURE_C] = temperature_c
@@ -49,8 +49,7 @@ class Plant:
         self._noise = model.noise
         self._noise_torque_nm = 0.0
         self._owed_s = 0.0
-        warm = self._noise.temperature_c if self._noise else 25.0
-        state = rest_state(self.delay_s, INNER_STEP_S, warm)
+        state = rest_state(self.delay_s, INNER_STEP_S, model.start_temperature_c)
         self._bind(model.pack(), state, available() if compile_kernel is None else compile_kernel)
         self._draw_readings()
 

@@ -18,18 +18,12 @@ from numpy.typing import NDArray
 from servod.axis_model import AxisModel
 from servod.models import open_loop
 from servod.models.compiled import Kernel, available, compiled
-from servod.models.layout import S_TEMPERATURE_C, S_TORQUE
-from servod.models.motion import noise_rms, smoothed_motion
+from servod.models.layout import P_DELAY_S, P_START_C, S_FIRST_S
+from servod.models.motion import smoothed_motion
 from servod.models.plant import INNER_STEP_S, rest_state
+from servod.models.start import FirstRow, Start, first_row
 
 Array = NDArray[np.float64]
-
-#: A free run over a recording whose first speed is under this share of its RMS speed starts at rest: people start
-#: recorders before the motion, and the one-sided fit at the first row is the poorest of all.
-AT_REST_SHARE = 0.1
-
-#: Within this time an axis leaves its rest when the first recorded torque is new to it, s.
-SETTING_OFF_S = 0.05
 
 #: A gap longer than this and than ten samples restarts the simulation: nobody knows the torque in it.
 RESTART_GAP_S = 0.02
@@ -49,30 +43,8 @@ class Drive:
 
     @cached_property
     def motion(self) -> Array:
-        """Rows of position, velocity, acceleration (servod.models.motion), on the rows' own times."""
+        """Rows of position, velocity, acceleration, error of velocity (servod.models.motion) at the rows' times."""
         return smoothed_motion(self.t_s, self.position)
-
-    @cached_property
-    def starts_at_rest(self) -> bool:
-        """Whether the first speed is next to nothing against the speeds of the recording."""
-        speed = self.motion[:, 1]
-        return bool(abs(speed[0]) <= AT_REST_SHARE * np.sqrt(np.mean(speed**2)))
-
-    @cached_property
-    def stands_still(self) -> bool:
-        """Whether the first two rows show one position, within noise: the axis rests at the first row, surely."""
-        first = abs(float(self.position[1] - self.position[0]))
-        return self.starts_at_rest and first <= 4.0 * noise_rms(self.position)
-
-    @cached_property
-    def torque_before(self) -> float:
-        """The command before the first row: 0 when the axis rests and then sets off, else the first row's.
-
-        An axis that rests under the first row's torque stays where it is; one that leaves at once was not under it.
-        """
-        early = self.position[self.t_s <= self.t_s[0] + SETTING_OFF_S]
-        leaves = float(np.max(np.abs(early - self.position[0]))) > 5.0 * noise_rms(self.position)
-        return 0.0 if self.starts_at_rest and leaves else float(self.torque[0])
 
     @cached_property
     def period_s(self) -> float:
@@ -82,12 +54,16 @@ class Drive:
 
 @dataclass(frozen=True, slots=True)
 class Replay:
-    """What the model did: one value for each recorded row; `starts` are the rows where the motion restarted."""
+    """What the model did: one value for each recorded row.
+
+    `starts` are the rows where the motion restarted from the recording, `at_rest` whether it began at rest.
+    """
 
     position: Array
     velocity: Array
     load_position: Array
     starts: NDArray[np.int64]
+    at_rest: bool
     error: Array
 
     def over(self, rows: NDArray[np.bool_]) -> Replay:
@@ -105,17 +81,21 @@ class Replay:
         return float(np.max(np.abs(self.error)))
 
 
-def window_starts(t_s: Array, horizon_s: float | None) -> NDArray[np.int64]:
-    """First rows of the windows: every `horizon_s` (None = the first row only), and behind every long gap."""
-    rows = {0}
-    if horizon_s is not None:
-        count = math.floor((t_s[-1] - t_s[0]) / horizon_s + 1e-9)
-        edges = t_s[0] + horizon_s * np.arange(1, count + 1) - 1e-6
-        rows |= set(np.searchsorted(t_s, edges).tolist())
+def behind_gaps(t_s: Array) -> NDArray[np.int64]:
+    """Rows that follow a gap longer than RESTART_GAP_S and than ten samples: nobody knows the command in it."""
     steps = np.diff(t_s)
-    if len(steps):
-        gap = max(RESTART_GAP_S, 10.0 * float(np.median(steps)))
-        rows |= set((np.flatnonzero(steps > gap) + 1).tolist())
+    if len(steps) == 0:
+        return np.zeros(0, dtype=np.int64)
+    return np.flatnonzero(steps > max(RESTART_GAP_S, 10.0 * float(np.median(steps)))) + 1
+
+
+def window_starts(t_s: Array, horizon_s: float | None) -> NDArray[np.int64]:
+    """First rows of the windows: every `horizon_s` and behind every long gap; None = the first row only, whatever."""
+    if horizon_s is None:
+        return np.zeros(1, dtype=np.int64)
+    count = math.floor((t_s[-1] - t_s[0]) / horizon_s + 1e-9)
+    edges = np.searchsorted(t_s, t_s[0] + horizon_s * np.arange(1, count + 1) - 1e-6)
+    rows = {0, *edges.tolist(), *behind_gaps(t_s).tolist()}
     return np.array(sorted(row for row in rows if row < len(t_s)), dtype=np.int64)
 
 
@@ -123,25 +103,16 @@ def _kernel(function: Kernel) -> Kernel:
     return compiled(function) if available() else function
 
 
-def start_states(parameters: Array, drive: Drive, starts: NDArray[np.int64]) -> Array:
+def _hidden_motion(parameters: Array, drive: Drive, first: FirstRow, state: Array, starts: NDArray[np.int64]) -> Array:
     """State at the rows `starts`: position, velocity, bristle, load position, load velocity, actuator torque."""
-    state = _fresh_state(drive)
+    motion = drive.motion[:, :3].copy()
+    motion[0] = first.motion
+    _kernel(open_loop.recorded_motion)(parameters, motion)
     hidden = np.zeros((len(drive.t_s), 4))
-    motion = drive.motion.copy()
-    if drive.stands_still or (len(starts) == 1 and drive.starts_at_rest):
-        motion[0] = drive.position[0], 0.0, 0.0
-    follow = _kernel(open_loop.follow)
     step_s = min(4.0 * INNER_STEP_S, drive.period_s)
-    follow(parameters, state, drive.t_s, motion, drive.torque, drive.torque_before, drive.temperature_c, hidden, step_s)
+    rows = drive.t_s, motion, drive.torque, first.command_before, drive.temperature_c
+    _kernel(open_loop.follow)(parameters, state, *rows, hidden, step_s)
     return np.column_stack([motion[starts, :2], hidden[starts]])
-
-
-def _fresh_state(drive: Drive) -> Array:
-    state = np.array(rest_state(0.0))
-    state[S_TORQUE] = drive.torque_before
-    if not math.isnan(drive.temperature_c[0]):
-        state[S_TEMPERATURE_C] = drive.temperature_c[0]
-    return state
 
 
 def replay(
@@ -149,28 +120,22 @@ def replay(
     drive: Drive,
     horizon_s: float | None,
     *,
+    start: Start = Start.AUTO,
     inner_step_s: float = INNER_STEP_S,
 ) -> Replay:
     """Simulate `model` (or its packed parameters) under the recorded torque, restarting every `horizon_s` seconds.
 
-    `horizon_s` None is one free run from the first row. Without numba the same source runs in pure Python.
+    `horizon_s` None is one free run from the first row, gaps and all. `start` says how the first row is understood, the
+    same way for every horizon. Without numba the same source runs in pure Python.
     """
-    packed = model.pack() if isinstance(model, AxisModel) else model
-    parameters = np.array(packed, dtype=np.float64)
+    parameters = np.array(model.pack() if isinstance(model, AxisModel) else model, dtype=np.float64)
     starts = window_starts(drive.t_s, horizon_s)
-    states = start_states(parameters, drive, starts)
+    rows = drive.t_s, drive.torque, drive.position, drive.motion
+    first = first_row(start, *rows, float(parameters[P_DELAY_S]))
+    state = np.array(rest_state(0.0, inner_step_s, parameters[P_START_C]))
+    states = _hidden_motion(parameters, drive, first, state.copy(), starts)
+    state[S_FIRST_S] = drive.t_s[0]
     out = np.zeros((len(drive.t_s), 3))
-    run = _kernel(open_loop.run)
-    run(
-        parameters,
-        _fresh_state(drive),
-        drive.t_s,
-        drive.torque,
-        drive.torque_before,
-        drive.temperature_c,
-        starts,
-        states,
-        out,
-        inner_step_s,
-    )
-    return Replay(out[:, 0], out[:, 1], out[:, 2], starts, out[:, 0] - drive.position)
+    held = drive.t_s, drive.torque, first.command_before, drive.temperature_c
+    _kernel(open_loop.run)(parameters, state, *held, starts, states, out, inner_step_s)
+    return Replay(out[:, 0], out[:, 1], out[:, 2], starts, first.at_rest, out[:, 0] - drive.position)

@@ -84,7 +84,7 @@ def simulate_closed_loop(
     reference = np.ascontiguousarray(reference, dtype=np.float64)
     delay_s = model.total_delay_s if settings.delay_s is None else settings.delay_s
     steps = max(1, math.ceil(settings.period_s / settings.inner_step_s - 1e-9))
-    state = np.array(rest_state(delay_s, settings.period_s / steps, model.noise.temperature_c if model.noise else 25.0))
+    state = np.array(rest_state(delay_s, settings.period_s / steps, model.start_temperature_c))
     position, velocity, bristle = start if start is not None else (float(reference[0, 0]), 0.0, 0.0)
     state[[S_POSITION, S_LOAD_POSITION]] = position
     state[[S_VELOCITY, S_LOAD_VELOCITY]] = velocity

@@ -161,7 +161,7 @@ def _check_time(path: Path, t_s: Array, report: list[str]) -> None:
         worst = int(np.argmax(steps))
         report.append(
             f"t_s: {int(gaps.sum())} gaps, about {lost} samples missing, the longest {steps[worst]:.4g} s at "
-            f"{t_s[worst]:.6g} s; the command is held over a gap, and simulated on the recorded stamps"
+            f"{t_s[worst]:.6g} s; simulated on the recorded stamps"
         )
     if uneven.mean() > 0.01:
         share = 100.0 * float(uneven.mean())

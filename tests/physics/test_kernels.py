@@ -158,7 +158,7 @@ def test_closed_loop_is_the_same_loop_in_pure_python() -> None:
     """The compiled simulator is the source around the law that the control loop runs."""
     law, gains, rows = LAWS["pd"], (2.5, 0.12, 0.0), reference(0.3)
     fast = simulate_closed_loop(joint(delay_s=0.001), law.step, gains, rows)
-    from servod.models.plant import rest_state
+    from servod.models.plant import INNER_STEP_S, rest_state
 
     out = np.zeros((len(rows), 8))
     pure = bound(run, control_law=law.step)
@@ -166,7 +166,7 @@ def test_closed_loop_is_the_same_loop_in_pure_python() -> None:
     step = 2.0 * math.pi / 2.0**20
     pure(
         model.pack(),
-        rest_state(0.001),
+        rest_state(0.001, INNER_STEP_S, 25.0),
         gains,
         [0.0] * 16,
         rows,

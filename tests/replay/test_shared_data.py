@@ -1,7 +1,8 @@
 """Independent witnesses: real and simulated recordings made by other people, when their folder is beside the project.
 
-Without the folder this file holds no tests. EMPS: the published model gives the published error. Practice cases: with
-the concealed physics written into the model, the replay error falls to what noise and quantisation leave.
+Without the folder this file holds no tests; the head of every test run says whether it is there. EMPS: the published
+model gives the published error. Practice cases: with the concealed physics written into the model, the replay error
+falls to what noise and quantisation leave.
 """
 
 from __future__ import annotations
@@ -13,10 +14,12 @@ import pytest
 
 from servod.axis_model import AxisModel, load_axis_model
 from servod.models.replay import replay
+from servod.models.start import Start
 from servod.recordings import load_recording
 from servod.yaml12 import parse_yaml
 
 SHARED = Path(__file__).parents[3] / "shared"
+EMPS_FOLDER = SHARED / "recordings" / "emps"
 
 EMPS = {
     "axis": "linear",
@@ -61,25 +64,29 @@ def true_model(truth: dict[str, Any]) -> AxisModel:
     return AxisModel.model_validate(model)
 
 
-if (SHARED / "recordings" / "emps").is_dir():
+#: Published errors, mm: windows restarted from the recorded motion, and a free run from rest. An integrator written
+#: apart from this project (50 us steps, central differences for the restarts) gives 0.193, 1.566, 0.257, 2.22 and 9.43
+#: for these rows, with the force held, averaged or shifted by a sample within 4 % of that; how the published restarts
+#: were smoothed is not said. Each tolerance is what separates that integrator from the published figure.
+EMPS_FIGURES = [
+    ("DATA_EMPS", 0.25, Start.RECORDED, 0.183, 0.06),
+    ("DATA_EMPS", 1.0, Start.RECORDED, 1.55, 0.015),
+    ("DATA_EMPS_PULSES", 0.25, Start.RECORDED, 0.244, 0.06),
+    ("DATA_EMPS_PULSES", 1.0, Start.RECORDED, 2.19, 0.015),
+    ("DATA_EMPS_PULSES", None, Start.REST, 9.2, 0.03),
+    ("DATA_EMPS_PULSES", None, Start.AUTO, 9.2, 0.03),
+]
 
-    @pytest.mark.parametrize(
-        "file, horizon_s, rms_mm, share",
-        [
-            ("DATA_EMPS", 0.25, 0.183, 0.07),
-            ("DATA_EMPS", 1.0, 1.55, 0.02),
-            ("DATA_EMPS_PULSES", 0.25, 0.244, 0.07),
-            ("DATA_EMPS_PULSES", 1.0, 2.19, 0.02),
-            ("DATA_EMPS_PULSES", None, 9.2, 0.04),
-        ],
-    )
+if EMPS_FOLDER.is_dir():
+
+    @pytest.mark.parametrize("file, horizon_s, start, rms_mm, share", EMPS_FIGURES)
     def test_published_model_gives_the_published_error(
-        file: str, horizon_s: float | None, rms_mm: float, share: float, tmp_path: Path
+        file: str, horizon_s: float | None, start: Start, rms_mm: float, share: float, tmp_path: Path
     ) -> None:
         column_map = tmp_path / "map.yaml"
         column_map.write_text(MAP)
-        recording = load_recording(SHARED / "recordings" / "emps" / f"{file}.mat", column_map)
-        result = replay(AxisModel.model_validate(EMPS), recording.drive, horizon_s)
+        recording = load_recording(EMPS_FOLDER / f"{file}.mat", column_map)
+        result = replay(AxisModel.model_validate(EMPS), recording.drive, horizon_s, start=start)
         assert 1e3 * result.rms == pytest.approx(rms_mm, rel=share)
 
 
