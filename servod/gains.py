@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 
 from servod.controllers import LAWS, Law
 from servod.errors import BadInput
-from servod.gain_parameters import LocalSet, Numbers, Parameters
+from servod.gain_parameters import LocalSet, Parameters
 from servod.yaml12 import Dumper, Strict, parse_yaml, read_text, validate
 
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -47,7 +47,7 @@ class Provenance(Strict):
     note: str = Field("", max_length=4000)
 
 
-class CertificateCheck(Numbers):
+class CertificateCheck(Strict):
     """One proven statement: its figure, the limit it must keep, and the margin between them (positive: kept)."""
 
     name: str = Field(min_length=1, max_length=200)
