@@ -76,6 +76,7 @@ def _check_axis(file: Path) -> str:
     from servod.drivers import driver_table
     from servod.drivers.quirks import load_quirks
     from servod.gains import load_gains, require_certificate
+    from servod.master.planned import planned_bus_load
 
     config = load_config(file)
     for section, driver in (("amplifier", config.amplifier.driver), ("encoder", config.encoder.driver)):
@@ -91,7 +92,9 @@ def _check_axis(file: Path) -> str:
     require_certificate(load_gains(config.gains.initial), config.gains.accept_uncertified)
     if config.model is not None:
         load_axis_model(config.model)
-    return f"axis {config.name} on {config.bus.interface} {config.bus.channel}"
+    load = planned_bus_load(config, str(file))
+    where = f"{config.bus.interface} {config.bus.channel}"
+    return f"axis {config.name} on {where}, bus load {100.0 * load.share:.1f} % at {load.bit_rate} bit/s"
 
 
 def _check_gains(file: Path) -> str:

@@ -25,6 +25,7 @@ from servod.gains import load_gains, require_certificate
 from servod.loop.handle import LoopHandle
 from servod.loop.plan import LoopPlan
 from servod.master import BringUp, Master
+from servod.master.planned import planned_bus_load
 from servod.notify import Notifier
 from servod.recorder import Recorder
 from servod.yaml12 import read_text
@@ -40,6 +41,7 @@ def check(path: Path) -> AxisConfig:
     require_certificate(load_gains(config.gains.initial), config.gains.accept_uncertified)
     if config.model is not None:
         load_axis_model(config.model)
+    planned_bus_load(config, str(path))
     return config
 
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from servod.bus import Bus
-from servod.bus.load import bus_load, check_bus_load
 from servod.cia import NmtCommand
 from servod.clock import Clock
 from servod.config import AxisConfig
@@ -20,6 +19,7 @@ from servod.hal import NodePlan, PresetSetup, SdoAccess
 from servod.master.monitor import NodeEvent
 from servod.master.network import BusNetwork
 from servod.master.node import Node, send_nmt
+from servod.master.planned import checked_load
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,7 @@ class Master:
         nodes = (self._amplifier, self._encoder)
         report = [line for node in nodes for line in node.report_dictionary()]
         wanted = [node.setup.plan() for node in nodes]
-        load = bus_load(self._config, wanted)
-        check_bus_load(load, self._config.bus.max_load)
+        load = checked_load(self._config, wanted)
         report.append(f"bus load {load.describe()}")
         for node in nodes:
             node.watch.watch(False)

@@ -7,16 +7,16 @@ from __future__ import annotations
 
 from servod.cia import NmtCommand, NmtState, Obj301
 from servod.config import AmplifierConfig, AxisConfig, EncoderConfig
-from servod.drivers import load_driver
 from servod.drivers.setup_tools import read_optional, write_checked
-from servod.errors import BadInput, FaultCode, Unreachable
-from servod.hal import Driver, NodePlan, SdoAbort, Setup
+from servod.errors import FaultCode, Unreachable
+from servod.hal import NodePlan, SdoAbort, Setup
 from servod.master.dcf import left_out, write_parameters
 from servod.master.eds import dictionary_for
 from servod.master.identity import check_identity, read_identity
 from servod.master.monitor import NodeWatch
 from servod.master.network import BusNetwork
 from servod.master.pdo import configure_pdos
+from servod.master.planned import Kind, load_setup
 from servod.master.sdo import NodeSdo
 
 #: Device profile (0x1000, low word) that a driver kind needs.
@@ -35,14 +35,11 @@ def send_nmt(network: BusNetwork, command: NmtCommand, node_id: int) -> None:
 class Node:
     """One configured device: driver, dictionary, SDO access and supervision."""
 
-    def __init__(self, network: BusNetwork, config: AxisConfig, kind: str) -> None:
+    def __init__(self, network: BusNetwork, config: AxisConfig, kind: Kind) -> None:
         self.section: AmplifierConfig | EncoderConfig = config.amplifier if kind == "amplifier" else config.encoder
         self.node_id = self.section.node_id
         self._network, self._config, self._kind = network, config, kind
-        driver: Driver = load_driver(self.section.driver)
-        if driver.kind != kind:
-            raise BadInput(f"{kind}.driver", f"{self.section.driver} ({driver.kind})", f"a driver of kind {kind}")
-        self.setup: Setup = driver.setup(config)
+        self.setup: Setup = load_setup(config, kind)
         self.dictionary = dictionary_for(self.section.driver, self.section.eds, self.node_id)
         self.sdo = NodeSdo(network, self.node_id, self.dictionary.objects)
         self.watch = NodeWatch(network, self.node_id, _EMCY_FAULT[kind], config.heartbeat.node_timeout_ms)
