@@ -13,13 +13,21 @@ import struct
 from collections.abc import Sequence
 from enum import IntEnum
 
-from servod.commands import Command
+from servod.commands import Command, Op
 from servod.realtime import Grant
 from servod.record import RECORD
 
 RECORD_SLOTS = 8192  # eight seconds at 1 kHz for a supervisor that hangs
 COMMAND_SLOTS = 16
 COMMAND_SLOT_BYTES = 16_384
+#: How far each kind of command may fill the queue: whoever floods it leaves room for a stop, and that for what the
+#: supervisor itself has to say.
+_COMMON_SLOTS = COMMAND_SLOTS // 2
+_OPEN_SLOTS: dict[int, int] = {
+    Op.QUICK_STOP: COMMAND_SLOTS - 4,
+    Op.NODE_EVENT: COMMAND_SLOTS,
+    Op.SHUTDOWN: COMMAND_SLOTS,
+}
 MAX_ARGUMENTS = (COMMAND_SLOT_BYTES - 24) // 8
 TRAJECTORY_SAMPLES = 300_000  # five minutes at 1 kHz
 
@@ -115,9 +123,9 @@ class Channel:
         return [Grant(*row) for row in json.loads(text)]
 
     def send(self, command: Command) -> bool:
-        """Queue one command; False when the loop has not taken the last COMMAND_SLOTS ones."""
+        """Queue one command; False when the slots that are open to its kind are taken."""
         head = self._words[_Word.COMMAND_HEAD]
-        if head - self._words[_Word.COMMAND_TAIL] >= COMMAND_SLOTS:
+        if head - self._words[_Word.COMMAND_TAIL] >= _OPEN_SLOTS.get(command.op, _COMMON_SLOTS):
             return False
         at = _COMMANDS_AT + (head % COMMAND_SLOTS) * COMMAND_SLOT_BYTES
         count = len(command.arguments)

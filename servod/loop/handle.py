@@ -6,6 +6,7 @@ import contextlib
 import subprocess
 import sys
 import time
+from array import array
 from collections.abc import Sequence
 
 from servod.commands import Command, Op
@@ -77,17 +78,16 @@ class LoopHandle:
         """Queue a command and return its number; the record's `command_seq` shows when it was carried out."""
         if len(arguments) > MAX_ARGUMENTS:
             raise BadInput(f"command {op.name}", f"{len(arguments)} arguments", f"at most {MAX_ARGUMENTS}")
-        self._seq += 1
-        if not self._channel.send(Command(self._seq, op, tuple(map(float, arguments)))):
+        if not self._channel.send(Command(self._seq + 1, op, tuple(map(float, arguments)))):
             raise Unreachable("the loop does not take commands: its queue is full")
+        self._seq += 1
         return self._seq
 
     def write_trajectory(self, positions_rad: Sequence[float]) -> None:
         """Fill the shared area that ReferenceKind.TABLE reads; only while no table motion runs."""
         if len(positions_rad) > len(self._channel.trajectory):
             raise BadInput("trajectory", f"{len(positions_rad)} samples", f"at most {len(self._channel.trajectory)}")
-        for index, position in enumerate(positions_rad):
-            self._channel.trajectory[index] = position
+        self._channel.trajectory[: len(positions_rad)] = array("d", positions_rad)
 
     def drain(self) -> list[bytes]:
         """All cycle records since the last call, raw (servod.record.RECORD)."""
