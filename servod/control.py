@@ -1,15 +1,16 @@
 """The control socket's protocol and its client: one JSON object per line over a Unix stream socket.
 
 Between command line and daemon. Request `{"id": 1, "verb": "status", "args": {}}`, answer `{"id": 1, "ok": true,
-"result": {...}}` or `{"id": 1, "ok": false, "error": {"exit_code": 3, "message": "one line"}}`. The server side is
-servod.daemon.control_server.
+"result": {...}}` or `{"id": 1, "ok": false, "error": {"exit_code": 3, "message": "one line"}}`. Requests are short, so
+that reading one never holds the daemon up: a long table of samples goes ahead of its motion in pieces. The server side
+is servod.daemon.control_server.
 """
 
 from __future__ import annotations
 
 import json
 import socket
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from enum import StrEnum
 from pathlib import Path
 from types import TracebackType
@@ -17,8 +18,12 @@ from typing import Any
 
 from servod.errors import AnswerIsNo, BadInput, ServodError, Unreachable
 
-#: Longest line either side takes: ten minutes of positions at 1 kHz fit; a longer line ends the connection.
-MAX_LINE_BYTES = 12 * 1024 * 1024
+#: Longest request; a longer one ends the connection.
+MAX_LINE_BYTES = 64 * 1024
+#: Longest answer that a client takes.
+MAX_ANSWER_BYTES = 4 * 1024 * 1024
+#: Samples in one request: as text, each takes at most 25 bytes.
+PIECE_SAMPLES = 2000
 
 
 class Verb(StrEnum):
@@ -30,6 +35,7 @@ class Verb(StrEnum):
     DISABLE = "disable"
     STOP = "stop"
     HALT = "halt"
+    TRAJECTORY = "trajectory"
     TRACK = "track"
     GAINS_LOAD = "gains_load"
     GAINS_LIST = "gains_list"
@@ -42,6 +48,13 @@ class Verb(StrEnum):
 
 #: Verbs that only look; everything else needs the right to command.
 READING = frozenset({Verb.STATUS, Verb.WATCH, Verb.GAINS_LIST})
+
+
+class SampleKey(StrEnum):
+    """Arguments of `track` that may be long."""
+
+    POSITIONS = "positions_rad"
+    TORQUES = "torques_nm"
 
 
 class RemoteBadInput(BadInput):
@@ -101,8 +114,11 @@ class ControlClient:
         self._socket.close()
 
     def call(self, verb: Verb | str, **args: Any) -> dict[str, Any]:
-        """Ask and wait for the answer's result. Raises Unreachable, BadInput or AnswerIsNo by its exit code."""
-        self._ask(verb, args)
+        """Ask and wait for the answer's result. Raises Unreachable, BadInput or AnswerIsNo by its exit code.
+
+        Samples of a motion that are too many for one request are sent ahead in pieces.
+        """
+        self._ask(verb, self._send_ahead(args) if verb == Verb.TRACK else args)
         while True:
             answer = self._answer()
             if answer.get("id") == self._id:
@@ -114,12 +130,24 @@ class ControlClient:
         while True:
             yield _result(self._answer())
 
+    def _send_ahead(self, args: dict[str, Any]) -> dict[str, Any]:
+        """Upload the samples in `args` when they are many; gives the arguments that remain."""
+        tables = {key: args[key] for key in SampleKey if isinstance(args.get(key), Sequence)}
+        if sum(map(len, tables.values())) <= PIECE_SAMPLES:
+            return args
+        for key, samples in tables.items():
+            for start in range(0, len(samples), PIECE_SAMPLES):
+                self.call(Verb.TRAJECTORY, key=key, start=start, samples=samples[start : start + PIECE_SAMPLES])
+        return {key: value for key, value in args.items() if key not in tables} | {"uploaded": True}
+
     def _ask(self, verb: Verb | str, args: dict[str, Any]) -> None:
         self._id += 1
         try:
             line = encode_line({"id": self._id, "verb": str(verb), "args": args})
         except ValueError:
             raise BadInput(f"{verb}", "a number that is not finite", "finite numbers") from None
+        if len(line) > MAX_LINE_BYTES:
+            raise BadInput(f"{verb}", f"{len(line)} bytes", f"at most {MAX_LINE_BYTES} bytes in a request")
         try:
             self._socket.sendall(line)
         except OSError as error:
@@ -127,7 +155,7 @@ class ControlClient:
 
     def _answer(self) -> dict[str, Any]:
         try:
-            line = self._lines.readline(MAX_LINE_BYTES)
+            line = self._lines.readline(MAX_ANSWER_BYTES)
         except TimeoutError:
             raise Unreachable(f"{self._path}: no answer within {self._socket.gettimeout()} s") from None
         except OSError as error:

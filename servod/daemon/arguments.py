@@ -11,8 +11,8 @@ from typing import Annotated, Any
 from pydantic import Field, model_validator
 
 from servod.commands import ReferenceKind
-from servod.control import Verb
-from servod.loop.channel import TRAJECTORY_SAMPLES
+from servod.control import PIECE_SAMPLES, SampleKey, Verb
+from servod.daemon.trajectory import Table
 from servod.yaml12 import Strict, validate
 
 _Duration = Annotated[float, Field(gt=0.0, le=86_400.0)]
@@ -27,6 +27,9 @@ class MotionKind(StrEnum):
     CSV = "csv"
     EXCITE = "excite"
 
+
+#: Samples that stand in the request itself; more come ahead, with the verb `trajectory`.
+_Samples = Annotated[list[float], Field(min_length=1, max_length=PIECE_SAMPLES)]
 
 _NEEDS: dict[MotionKind, tuple[str, ...]] = {
     MotionKind.SINE: ("amplitude_rad", "frequency_hz", "duration_s"),
@@ -53,52 +56,68 @@ class HaltArgs(Strict):
     on: bool = True
 
 
+class TrajectoryArgs(Strict):
+    """`trajectory`: a piece of the samples of the motion that comes next; `start` 0 begins the column anew."""
+
+    key: SampleKey
+    start: int = Field(ge=0)
+    samples: _Samples
+
+
 class TrackArgs(Strict):
     """`track`: one motion, relative to the present reference; positions are one for each period of the loop.
 
-    With `start_immediately: false` the motion is only checked against the limits' range.
+    With `uploaded: true` the samples are those that came ahead. With `start_immediately: false` the motion is only
+    checked against the limits.
     """
 
     kind: MotionKind
     amplitude_rad: float | None = Field(None, ge=-1e4, le=1e4)
     frequency_hz: float | None = Field(None, gt=0.0, le=500.0)
     duration_s: _Duration | None = None
-    positions_rad: list[float] | None = Field(None, min_length=2, max_length=TRAJECTORY_SAMPLES)
-    torques_nm: list[float] | None = Field(None, min_length=2, max_length=TRAJECTORY_SAMPLES // 2)
+    positions_rad: _Samples | None = None
+    torques_nm: _Samples | None = None
     window_rad: float | None = Field(None, gt=0.0, le=1e4)
+    uploaded: bool = False
     start_immediately: bool = True
 
     @model_validator(mode="after")
     def _has_what_its_kind_needs(self) -> TrackArgs:
-        missing = [key for key in _NEEDS[self.kind] if getattr(self, key) is None]
+        ahead = tuple(SampleKey) if self.uploaded else ()
+        missing = [key for key in _NEEDS[self.kind] if key not in ahead and getattr(self, key) is None]
         if missing:
             raise ValueError(f"track {self.kind} with {', '.join(missing)}")
-        if self.kind is MotionKind.EXCITE and len(self.positions_rad or []) != len(self.torques_nm or []):
-            raise ValueError("track excite with as many torques_nm as positions_rad")
         return self
 
-    def area(self) -> list[float]:
-        """What the motion reads from the trajectory area: positions, and behind them the torques of an excitation."""
-        return [*(self.positions_rad or []), *(self.torques_nm or [])]
+    @property
+    def has_table(self) -> bool:
+        """The motion reads samples."""
+        return self.kind in (MotionKind.CSV, MotionKind.EXCITE)
 
-    def reference(self) -> list[float]:
-        """The arguments of Op.REFERENCE; what `area` gives must stand in the trajectory area already."""
+    def table(self, uploaded: Table) -> Table:
+        """The motion's samples, or `uploaded` when they came ahead. Raises BadInput when they do not fit the kind."""
+        if not self.has_table:
+            return Table()
+        table = uploaded if self.uploaded else Table(self.positions_rad, self.torques_nm)
+        table.require(torques=self.kind is MotionKind.EXCITE)
+        return table
+
+    def reference(self, table: Table) -> list[float]:
+        """The arguments of Op.REFERENCE; the samples of `table` must stand in the trajectory area already."""
+        if not self.has_table:
+            return [ReferenceKind[self.kind.name], *(float(getattr(self, key)) for key in _NEEDS[self.kind])]
+        positions = table.positions
+        extent = [len(positions.values), positions.lowest, positions.highest]
         if self.kind is MotionKind.CSV:
-            positions = self.positions_rad or []
-            return [ReferenceKind.TABLE, len(positions), min(positions), max(positions)]
-        if self.kind is MotionKind.EXCITE:
-            positions = self.positions_rad or []
-            window_rad = self.window_rad or 0.0
-            return [ReferenceKind.EXCITE, len(positions), min(positions), max(positions), window_rad]
-        kind = ReferenceKind[self.kind.name]
-        return [kind, *(float(getattr(self, key)) for key in _NEEDS[self.kind])]
+            return [ReferenceKind.TABLE, *extent]
+        return [ReferenceKind.EXCITE, *extent, self.window_rad or 0.0]
 
 
 class GainsLoadArgs(Strict):
     """`gains_load`: the YAML text of a gain set; `name` says in errors which one."""
 
     name: str = Field(min_length=1, max_length=200)
-    text: str = Field(max_length=1_000_000)
+    text: str
 
 
 class GainsActivateArgs(Strict):
@@ -117,6 +136,7 @@ class RecordStartArgs(Strict):
 _MODELS: dict[Verb, type[Strict]] = {
     Verb.ENABLE: EnableArgs,
     Verb.HALT: HaltArgs,
+    Verb.TRAJECTORY: TrajectoryArgs,
     Verb.TRACK: TrackArgs,
     Verb.GAINS_LOAD: GainsLoadArgs,
     Verb.GAINS_ACTIVATE: GainsActivateArgs,

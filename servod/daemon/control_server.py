@@ -1,58 +1,45 @@
 """Server side of the control socket: clients in, requests out, answers back, and never a moment of waiting.
 
 Runs inside the supervisor's event loop; sockets do not block. A client that is slow, broken or malicious loses its own
-connection and nothing else: lines, buffers and the number of clients are bounded. Only one client at a time may
-command: the first that does holds the lease until it disconnects. Protocol: servod.control.
+connection and nothing else: lines, buffers and the number of clients are bounded, in all and for each process. Only one
+client at a time may command: the first that does holds the lease until it disconnects, and while a motion that it left
+behind runs, others can only end it. Protocol: servod.control.
 """
 
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import selectors
 import socket
 import stat
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
 from servod.config import ControlConfig
-from servod.control import MAX_LINE_BYTES, READING, Verb, decode_line, encode_line
+from servod.control import READING, Verb, decode_line
+from servod.daemon.connection import Connection, Reply
 from servod.daemon.peer import Peer, group_id, may_command, peer_of
 from servod.daemon.status import LeaseStatus
 from servod.errors import BadInput, ServodError, Unreachable
-from servod.units import NS_PER_S
+
+log = logging.getLogger("servod.control")
 
 _MAX_CLIENTS = 32
+#: So that no single program can take all places from those who want to stop the axis.
+_MAX_CLIENTS_OF_A_PROCESS = 16
 _BACKLOG = 128
 _ACCEPT_AT_ONCE = 16
-_READ_BYTES = 65_536
-_MAX_BACKLOG_BYTES = 4 * 1024 * 1024
-_WATCH_BACKLOG_BYTES = 64 * 1024
-_MIN_WATCH_S, _MAX_WATCH_S = 0.02, 60.0
 
 #: Anyone who may command may stop the axis, whoever holds the lease.
 _WITHOUT_LEASE = frozenset({Verb.STOP})
-
-
-class Reply:
-    """The answer to one request, now or later; answering a client that has gone does nothing."""
-
-    def __init__(self, send: Callable[[dict[str, Any]], None], number: Any) -> None:
-        self._send, self._number = send, number
-
-    def done(self, result: dict[str, Any]) -> None:
-        """The request was carried out."""
-        self._send({"id": self._number, "ok": True, "result": result})
-
-    def failed(self, error: ServodError) -> None:
-        """The request was refused; one line and the exit code for the command line."""
-        answer = {"exit_code": error.exit_code, "message": " ".join(str(error).split())}
-        self._send({"id": self._number, "ok": False, "error": answer})
+#: What others may ask while a motion runs whose client has left: to end it, and what does not touch the axis.
+_BESIDE_MOTION = frozenset({Verb.STOP, Verb.DISABLE, Verb.HALT, Verb.RECORD_START, Verb.RECORD_STOP})
 
 
 class Handler(Protocol):
-    """What carries requests out; both methods return at once."""
+    """What carries requests out; all methods return at once."""
 
     def handle(self, verb: Verb, args: dict[str, Any], reply: Reply) -> None:
         """Carry out one request; answers through `reply`, at once or later. May raise ServodError."""
@@ -60,6 +47,14 @@ class Handler(Protocol):
 
     def status(self) -> dict[str, Any]:
         """The status document for watchers."""
+        ...
+
+    def motion_running(self) -> bool:
+        """Whether a motion runs, or is on its way to the loop."""
+        ...
+
+    def lease_ended(self) -> None:
+        """The commanding client has gone: what it began and did not finish is void."""
         ...
 
 
@@ -70,8 +65,10 @@ class ControlServer:
         """Bind and listen. Raises Unreachable when that is refused. The caller holds the instance lock."""
         self._path, self._selector, self._handler = config.socket, selector, handler
         self._group = group_id(config.group)
-        self._clients: set[_Client] = set()
-        self._holder: _Client | None = None
+        self._clients: set[Connection] = set()
+        self._holder: Connection | None = None
+        self._mover: Connection | None = None
+        self._status_failed = False
         self._listener = _listen(config.socket, self._group)
         selector.register(self._listener, selectors.EVENT_READ, self._accept)
 
@@ -82,10 +79,19 @@ class ControlServer:
             return
         try:
             status = self._handler.status()
-        except ServodError:
-            return  # before the first cycle there is nothing to watch yet
+        except Exception as error:  # whatever is wrong with the status, the event loop goes on
+            self._status_broke(due, error, now_ns)
+        else:
+            for client in due:
+                client.send_watch(lambda reply: reply.done(status), now_ns)
+
+    def _status_broke(self, due: list[Connection], error: Exception, now_ns: int) -> None:
+        """Tell the watchers; an error that is none of ours is logged, once."""
+        if not isinstance(error, ServodError) and not self._status_failed:
+            self._status_failed = True
+            log.error("the status cannot be made", exc_info=error)
         for client in due:
-            client.send_watch(status, now_ns)
+            client.send_watch(lambda reply: reply.failed(error), now_ns)
 
     def lease(self) -> LeaseStatus:
         """Who commands; pid 0 when nobody does."""
@@ -100,13 +106,14 @@ class ControlServer:
         self._listener.close()
         self._path.unlink(missing_ok=True)
 
-    def drop(self, client: _Client) -> None:
+    def drop(self, client: Connection) -> None:
         """Forget a client that has gone or must go; gives its lease back."""
         if client in self._clients:
             self._clients.remove(client)
             client.close()
         if self._holder is client:
             self._holder = None
+            self._handler.lease_ended()
 
     def _accept(self, _events: int) -> None:
         for _ in range(_ACCEPT_AT_ONCE):
@@ -114,13 +121,17 @@ class ControlServer:
                 connection, _address = self._listener.accept()
             except OSError:
                 return  # nobody waits, or descriptors ran out: nothing to hold against the axis
-            if len(self._clients) >= _MAX_CLIENTS:
+            if not self._has_place(peer_of(connection)):
                 connection.close()
                 continue
             connection.setblocking(False)
-            self._clients.add(_Client(connection, self._selector, self))
+            self._clients.add(Connection(connection, self._selector, self))
 
-    def dispatch(self, client: _Client, line: bytes) -> None:
+    def _has_place(self, peer: Peer) -> bool:
+        of_this_process = sum(c.peer.pid == peer.pid for c in self._clients)
+        return len(self._clients) < _MAX_CLIENTS and of_this_process < _MAX_CLIENTS_OF_A_PROCESS
+
+    def dispatch(self, client: Connection, line: bytes) -> None:
         """One request line: check it, check the right to ask it, and hand it on."""
         number: Any = None
         try:
@@ -137,8 +148,11 @@ class ControlServer:
             Reply(client.send, number).failed(error)
         except ValueError as error:
             Reply(client.send, number).failed(BadInput("request", str(error)[:200], "one JSON object per line"))
+        except Exception as error:  # one request ends, never the supervisor
+            log.error("a request failed", exc_info=error)
+            Reply(client.send, number).failed(error)
 
-    def _check_right(self, client: _Client, verb: Verb) -> None:
+    def _check_right(self, client: Connection, verb: Verb) -> None:
         if verb in READING:
             return
         if not may_command(client.peer, self._group):
@@ -148,103 +162,17 @@ class ControlServer:
         if self._holder not in (None, client):
             assert self._holder is not None
             raise Unreachable(f"process {self._holder.peer.pid} commands the axis; others may watch, or stop it")
+        if verb not in _BESIDE_MOTION:
+            self._refuse_beside_motion(client)
         self._holder = client
+        if verb is Verb.TRACK:
+            self._mover = client
 
-
-class _Client:
-    """One connection with its two buffers."""
-
-    def __init__(self, connection: socket.socket, selector: selectors.BaseSelector, server: ControlServer) -> None:
-        self.peer: Peer = peer_of(connection)
-        self._connection, self._selector, self._server = connection, selector, server
-        self._incoming, self._outgoing = bytearray(), bytearray()
-        self._events = selectors.EVENT_READ
-        self._watch_period_ns, self._watch_next_ns = 0, 0
-        self._watch_reply: Reply | None = None
-        selector.register(connection, self._events, self._on_events)
-
-    def _on_events(self, events: int) -> None:
-        if events & selectors.EVENT_WRITE:
-            self._flush()
-        if events & selectors.EVENT_READ:
-            self._read()
-
-    def _read(self) -> None:
-        try:
-            data = self._connection.recv(_READ_BYTES)
-        except BlockingIOError:
-            return
-        except OSError:
-            data = b""
-        if not data:
-            self._server.drop(self)
-            return
-        searched = len(self._incoming)
-        self._incoming += data
-        self._split(searched)
-
-    def _split(self, searched: int) -> None:
-        """Dispatch every complete line; a line without end must not fill the memory."""
-        start = 0
-        while (end := self._incoming.find(b"\n", max(start, searched))) >= 0:
-            line = bytes(self._incoming[start:end])
-            start = end + 1
-            if line.strip() and self._connection.fileno() >= 0:
-                self._server.dispatch(self, line)
-        del self._incoming[:start]
-        if len(self._incoming) > MAX_LINE_BYTES:
-            Reply(self.send, None).failed(BadInput("request", "a longer line", f"at most {MAX_LINE_BYTES} bytes"))
-            self._server.drop(self)
-
-    def send(self, message: dict[str, Any]) -> None:
-        """Queue one line; a client that does not read its answers is dropped."""
-        self._outgoing += encode_line(message)
-        self._flush()
-        if len(self._outgoing) > _MAX_BACKLOG_BYTES:
-            self._server.drop(self)
-
-    def _flush(self) -> None:
-        try:
-            sent = self._connection.send(self._outgoing) if self._outgoing else 0
-        except BlockingIOError:
-            sent = 0
-        except OSError:
-            self._outgoing.clear()
-            return  # the read side sees the end and drops the client
-        del self._outgoing[:sent]
-        self._want(selectors.EVENT_READ | (selectors.EVENT_WRITE if self._outgoing else 0))
-
-    def _want(self, events: int) -> None:
-        if events != self._events and self._connection.fileno() >= 0:
-            self._selector.modify(self._connection, events, self._on_events)
-            self._events = events
-
-    def start_watch(self, args: dict[str, Any], reply: Reply) -> None:
-        """Send the status every args["period_s"] from now on."""
-        period_s = args.get("period_s", 0.2)
-        if not isinstance(period_s, int | float) or not _MIN_WATCH_S <= period_s <= _MAX_WATCH_S:
-            raise BadInput("watch: period_s", repr(period_s)[:80], f"{_MIN_WATCH_S} to {_MAX_WATCH_S} seconds")
-        self._watch_period_ns, self._watch_next_ns = int(period_s * NS_PER_S), 0
-        self._watch_reply = reply
-
-    def watch_due(self, now_ns: int) -> bool:
-        """A watcher whose period is over, and that has read what it got."""
-        return (
-            self._watch_reply is not None
-            and now_ns >= self._watch_next_ns
-            and len(self._outgoing) < _WATCH_BACKLOG_BYTES
-        )
-
-    def send_watch(self, status: dict[str, Any], now_ns: int) -> None:
-        """One line for a watcher."""
-        if self._watch_reply is not None:
-            self._watch_next_ns = now_ns + self._watch_period_ns
-            self._watch_reply.done(status)
-
-    def close(self) -> None:
-        """Hang up."""
-        self._selector.unregister(self._connection)
-        self._connection.close()
+    def _refuse_beside_motion(self, client: Connection) -> None:
+        if self._mover not in (None, client) and self._handler.motion_running():
+            assert self._mover is not None
+            started = f"a motion that process {self._mover.peer.pid} started runs"
+            raise Unreachable(f"{started}; wait for its end, or stop, halt or disable the axis")
 
 
 def _request(message: dict[str, Any]) -> tuple[Verb, dict[str, Any]]:

@@ -6,15 +6,18 @@ the supervisor drives all of them once per round of its event loop.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future
 from typing import Any, Protocol
 
 from servod.commands import REFUSAL_TEXT, Refusal
-from servod.daemon.control_server import Reply
+from servod.daemon.connection import Reply
 from servod.errors import ServodError, Unreachable
 from servod.record import CycleRecord
 from servod.units import NS_PER_S
+
+log = logging.getLogger("servod.control")
 
 
 class Wait(Protocol):
@@ -50,7 +53,8 @@ class FutureWait:
 class OrderWait:
     """A command to the loop: comes back in the cycle record that shows its number."""
 
-    def __init__(self, deadline_ns: int) -> None:
+    def __init__(self, seq: int, deadline_ns: int) -> None:
+        self.seq = seq
         self.record: CycleRecord | None = None
         self._deadline_ns = deadline_ns
 
@@ -102,7 +106,7 @@ class Orders:
 
     def expect(self, seq: int, now_ns: int) -> OrderWait:
         """Wait for the command `seq`."""
-        wait = OrderWait(now_ns + self.TIMEOUT_NS)
+        wait = OrderWait(seq, now_ns + self.TIMEOUT_NS)
         self._pending[seq] = wait
         return wait
 
@@ -144,6 +148,9 @@ class Flows:
             reply.failed(error)
         except OSError as error:  # a disk that is full or gone ends the request, never the supervisor
             reply.failed(Unreachable(f"{error.filename or 'disk'}: {error.strerror or error}"))
+        except Exception as error:  # and so does what nobody foresaw
+            log.error("a request failed", exc_info=error)
+            reply.failed(error)
 
 
 def _step(flow: Flow, wait: Wait | None) -> Wait:
@@ -152,6 +159,6 @@ def _step(flow: Flow, wait: Wait | None) -> Wait:
         return next(flow)
     try:
         value = wait.result()
-    except (ServodError, OSError) as error:
+    except Exception as error:
         return flow.throw(error)
     return flow.send(value)

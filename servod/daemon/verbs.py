@@ -26,13 +26,16 @@ from servod.daemon.arguments import (
     NoArgs,
     RecordStartArgs,
     TrackArgs,
+    TrajectoryArgs,
     check_arguments,
 )
-from servod.daemon.control_server import Reply
-from servod.daemon.flows import Flow, Flows, FutureWait, Orders, StateWait, Wait
+from servod.daemon.connection import Reply
+from servod.daemon.flows import Flow, Flows, FutureWait, Orders, OrderWait, StateWait
 from servod.daemon.gain_bank import GainBank
 from servod.daemon.status import reason_texts
+from servod.daemon.trajectory import Table, check_motion
 from servod.errors import Unreachable, faults_in
+from servod.hal import DriveState
 from servod.loop.handle import LoopHandle
 from servod.master.scan import scan
 from servod.record import CycleRecord
@@ -40,6 +43,13 @@ from servod.recorder import Recorder
 from servod.units import NS_PER_S
 
 _STOPPED = (AxisState.DISABLED, AxisState.FAULT)
+_UNPOWERED = (
+    DriveState.NOT_READY_TO_SWITCH_ON,
+    DriveState.SWITCH_ON_DISABLED,
+    DriveState.READY_TO_SWITCH_ON,
+    DriveState.SWITCHED_ON,
+    DriveState.FAULT,
+)
 _STOP_TIMEOUT_S = 5.0
 
 
@@ -58,6 +68,8 @@ class Verbs:
         self._config, self._loop, self._bank, self._recorder = config, loop, bank, recorder
         self._document = document
         self._orders, self._flows = Orders(), Flows()
+        self._uploaded = Table()
+        self._reference_seq = 0  # the last motion's command
         self.slow = ThreadPoolExecutor(max_workers=1, thread_name_prefix="slow")
         self._table: dict[Verb, Callable[[Any], Flow]] = {
             Verb.STATUS: self._status,
@@ -65,6 +77,7 @@ class Verbs:
             Verb.DISABLE: self._disable,
             Verb.STOP: self._stop,
             Verb.HALT: self._halt,
+            Verb.TRAJECTORY: self._trajectory,
             Verb.TRACK: self._track,
             Verb.GAINS_LOAD: self._gains_load,
             Verb.GAINS_LIST: self._gains_list,
@@ -83,6 +96,15 @@ class Verbs:
         """The status document."""
         return self._document()
 
+    def motion_running(self) -> bool:
+        """A motion runs, or its command is on the way; until then the trajectory area must not change."""
+        record = self._loop.latest
+        return record is not None and (record.command_seq < self._reference_seq or bool(record.reference_active))
+
+    def lease_ended(self) -> None:
+        """Samples that the client sent ahead are void."""
+        self._uploaded = Table()
+
     def tick(self, records: list[CycleRecord], now_ns: int) -> None:
         """Go on with everything that waited for these records, or for time."""
         self._orders.see(records, now_ns)
@@ -93,7 +115,7 @@ class Verbs:
         self.slow.shutdown(wait=False, cancel_futures=True)
 
     # --- small tools of the flows --------------------------------------------------------------------------------
-    def _send(self, op: Op, arguments: Sequence[float] = ()) -> Wait:
+    def _send(self, op: Op, arguments: Sequence[float] = ()) -> OrderWait:
         seq = self._loop.send(op, arguments)
         self._recorder.add_event("command", op.name.lower(), arguments=list(arguments[:8]))
         return self._orders.expect(seq, time.monotonic_ns())
@@ -119,41 +141,63 @@ class Verbs:
 
     def _disable(self, _args: NoArgs) -> Flow:
         yield self._send(Op.DISABLE)
-        timeout_s = self._config.limits.ramp_down_s + _STOP_TIMEOUT_S
-        record: CycleRecord = yield self._until(lambda r: r.axis_state in _STOPPED, timeout_s)
-        if record.axis_state not in _STOPPED:
-            raise Unreachable(f"the axis is still {AxisState(record.axis_state).name}: {_why(record)}")
-        return _state(record)
+        return (yield from self._until_off(2.0 * self._config.limits.ramp_down_s))
 
     def _stop(self, _args: NoArgs) -> Flow:
         yield self._send(Op.QUICK_STOP)
-        record: CycleRecord = yield self._until(lambda r: r.axis_state in _STOPPED, _STOP_TIMEOUT_S)
+        return (yield from self._until_off(self._config.amplifier.enable_timeout_s))
+
+    def _until_off(self, usual_s: float) -> Flow:
+        """Done only when the axis has stopped and the drive itself was seen without power."""
+        record: CycleRecord = yield self._until(_is_off, usual_s + _STOP_TIMEOUT_S)
+        if not _is_off(record):
+            axis, drive = AxisState(record.axis_state).name, DriveState(record.drive_state).name
+            heard = f"heard {record.amplifier_age} cycles ago" if record.amplifier_age else "heard now"
+            raise Unreachable(f"not off: the axis is {axis}, the drive {drive} ({heard}): {_why(record)}")
         return _state(record)
 
     def _halt(self, args: HaltArgs) -> Flow:
         record = yield self._send(Op.HALT, (float(args.on),))
         return _state(record)
 
+    def _trajectory(self, args: TrajectoryArgs) -> Flow:
+        yield from ()
+        self._uploaded.add(args.key, args.start, args.samples)
+        return {"samples": args.start + len(args.samples)}
+
     def _track(self, args: TrackArgs) -> Flow:
-        self._refuse_if_not_free()
+        table = args.table(self._uploaded)
+        reference = args.reference(table)
+        duration_s = self._duration_s(args, table)
         if not args.start_immediately:
-            return {"kind": args.kind, "duration_s": self._duration_s(args)}
-        if args.positions_rad is not None:
-            self._loop.write_trajectory(args.area())
-        record = yield self._send(Op.REFERENCE, args.reference())
-        return {**_state(record), "kind": args.kind, "duration_s": self._duration_s(args)}
+            check_motion(reference, table, self._config, self._must_run())
+            return {"kind": args.kind, "duration_s": duration_s}
+        self._refuse_if_not_free()
+        check_motion(reference, table, self._config, self._must_run())
+        if args.has_table:
+            self._loop.write_trajectory(table.area())
+        wait = self._send(Op.REFERENCE, reference)
+        self._reference_seq = wait.seq
+        record = yield wait
+        return {**_state(record), "kind": args.kind, "duration_s": duration_s}
+
+    def _must_run(self) -> CycleRecord:
+        """The newest record."""
+        record = self._loop.latest
+        if record is None:
+            raise Unreachable("the loop has not begun")
+        return record
 
     def _refuse_if_not_free(self) -> None:
-        """The trajectory area must not change under a running motion; the loop checks the rest again."""
-        record = self._loop.latest
-        if record is None or record.axis_state != AxisState.ENABLED:
+        """The trajectory area must not change under a motion that runs or is about to; the loop checks the rest."""
+        if self._must_run().axis_state != AxisState.ENABLED:
             raise Unreachable(f"refused: {REFUSAL_TEXT[Refusal.NOT_ENABLED]}")
-        if record.reference_active:
+        if self.motion_running():
             raise Unreachable(f"refused: {REFUSAL_TEXT[Refusal.MOTION_RUNNING]}")
 
-    def _duration_s(self, args: TrackArgs) -> float:
-        if args.positions_rad is not None:
-            return (len(args.positions_rad) - 1) * self._config.cycle.period_us * 1e-6
+    def _duration_s(self, args: TrackArgs, table: Table) -> float:
+        if args.has_table:
+            return (len(table.positions.values) - 1) * self._config.cycle.period_us * 1e-6
         return args.duration_s or 0.0
 
     def _gains_load(self, args: GainsLoadArgs) -> Flow:
@@ -197,6 +241,11 @@ class Verbs:
 
 def _state(record: CycleRecord) -> dict[str, Any]:
     return {"state": AxisState(record.axis_state).name}
+
+
+def _is_off(record: CycleRecord) -> bool:
+    """The axis has stopped, and the drive says so itself, in this cycle."""
+    return record.axis_state in _STOPPED and record.amplifier_age == 0 and record.drive_state in _UNPOWERED
 
 
 def _why(record: CycleRecord) -> str:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from servod.record import RECORD, CycleRecord
+from servod.record import FIELDS, RECORD, CycleRecord
 
-_ZERO = CycleRecord._make([0] * 24 + [0.0] * 13)
+_ZERO = CycleRecord._make(0 if f.kind == "q" else 0.0 for f in FIELDS)
 
 
 def record(cycle: int = 0, **values: float) -> CycleRecord:

@@ -14,8 +14,9 @@ from typing import Any
 import pytest
 
 from servod.config import ControlConfig
-from servod.control import MAX_LINE_BYTES, ControlClient, Verb
-from servod.daemon.control_server import ControlServer, Reply
+from servod.control import MAX_LINE_BYTES, PIECE_SAMPLES, ControlClient, Verb
+from servod.daemon.connection import Reply
+from servod.daemon.control_server import ControlServer
 from servod.daemon.peer import Peer, may_command, peer_of
 from servod.errors import AnswerIsNo, BadInput, ServodError, Unreachable
 
@@ -25,17 +26,33 @@ class Echo:
 
     def __init__(self) -> None:
         self.late: list[Reply] = []
+        self.moves = self.broken = False
+        self.ended_leases = 0
+        self.pieces: list[tuple[str, int, list[float]]] = []
 
     def handle(self, verb: Verb, args: dict[str, Any], reply: Reply) -> None:
         if verb is Verb.STOP:
             self.late.append(reply)
         elif verb is Verb.SCAN:
             raise {1: AnswerIsNo("no"), 2: BadInput("scan", 1, "2"), 3: Unreachable("gone\nreally")}[args["code"]]
+        elif verb is Verb.TRAJECTORY:
+            self.pieces.append((args["key"], args["start"], args["samples"]))
+            reply.done({})
+        elif verb is Verb.GAINS_LIST:
+            raise KeyError("nobody foresaw this")
         else:
             reply.done({"verb": verb, "args": args})
 
     def status(self) -> dict[str, Any]:
+        if self.broken:
+            raise ZeroDivisionError("a bad byte")
         return {"now": time.monotonic()}
+
+    def motion_running(self) -> bool:
+        return self.moves
+
+    def lease_ended(self) -> None:
+        self.ended_leases += 1
 
 
 class Served:
@@ -132,10 +149,77 @@ def test_one_client_commands_the_others_watch_and_may_stop(served: Served) -> No
             assert other.call(Verb.STATUS)
             assert other.call(Verb.STOP) == {"late": True}
             assert served.server.lease()["pid"] > 0
-        deadline = time.monotonic() + 5
-        while served.server.lease()["pid"] and time.monotonic() < deadline:
-            time.sleep(0.01)
+        assert _free(served)
         other.call(Verb.ENABLE)
+
+
+def _free(served: Served) -> bool:
+    deadline = time.monotonic() + 5
+    while served.server.lease()["pid"] and time.monotonic() < deadline:
+        time.sleep(0.01)
+    return not served.server.lease()["pid"]
+
+
+def test_motion_that_a_client_left_behind_can_only_be_ended_by_others(served: Served) -> None:
+    with ControlClient(served.path) as first:
+        first.call(Verb.TRACK, kind="sine")
+    assert _free(served)
+    served.handler.moves = True
+    with ControlClient(served.path) as other:
+        for verb in (Verb.ENABLE, Verb.TRACK, Verb.GAINS_ACTIVATE, Verb.TRAJECTORY):
+            with pytest.raises(Unreachable, match=f"a motion that process {os.getpid()} started runs"):
+                other.call(verb)
+        for verb in (Verb.DISABLE, Verb.HALT, Verb.STOP):
+            assert other.call(verb)
+        served.handler.moves = False
+        other.call(Verb.TRACK, kind="paper")
+        served.handler.moves = True
+        other.call(Verb.ENABLE)
+    assert _free(served)
+    assert served.handler.ended_leases == 2
+
+
+def test_many_samples_go_ahead_in_pieces_and_few_do_not(served: Served) -> None:
+    way = [0.1 * k for k in range(4500)]
+    with ControlClient(served.path) as client:
+        args = client.call(Verb.TRACK, kind="csv", positions_rad=way)["args"]
+        assert args == {"kind": "csv", "uploaded": True}
+        assert [(key, start, len(piece)) for key, start, piece in served.handler.pieces] == [
+            ("positions_rad", 0, 2000),
+            ("positions_rad", 2000, 2000),
+            ("positions_rad", 4000, 500),
+        ]
+        assert [x for _, _, piece in served.handler.pieces for x in piece] == way
+        assert client.call(Verb.TRACK, kind="csv", positions_rad=way[:9])["args"]["positions_rad"] == way[:9]
+
+
+def test_widest_piece_fits_into_a_line(served: Served) -> None:
+    with ControlClient(served.path) as client:
+        client.call(Verb.TRACK, positions_rad=[-1.2345678901234567e-300] * (PIECE_SAMPLES + 1))
+        with pytest.raises(BadInput, match="at most 65536 bytes"):
+            client.call(Verb.GAINS_LOAD, text="x" * MAX_LINE_BYTES)
+
+
+def test_error_that_nobody_foresaw_ends_the_request_only(served: Served) -> None:
+    with ControlClient(served.path) as client:
+        with pytest.raises(Unreachable, match="nobody foresaw"):
+            client.call(Verb.GAINS_LIST)
+        assert client.call(Verb.STATUS)
+
+
+def test_status_that_cannot_be_made_is_told_and_logged_once(served: Served, caplog: pytest.LogCaptureFixture) -> None:
+    served.handler.broken = True
+    connection = _raw(served)
+    connection.sendall(b'{"id":1,"verb":"watch","args":{"period_s":0.02}}\n')
+    with connection.makefile("rb") as lines:
+        answers = [json.loads(lines.readline()) for _ in range(3)]
+    assert {a["error"]["exit_code"] for a in answers} == {3}
+    assert "a bad byte" in answers[0]["error"]["message"]
+    assert [r.getMessage() for r in caplog.records] == ["the status cannot be made"]
+    served.handler.broken = False
+    with ControlClient(served.path) as client:
+        assert client.call(Verb.STATUS)
+    connection.close()
 
 
 @pytest.mark.parametrize(
@@ -149,7 +233,7 @@ def test_one_client_commands_the_others_watch_and_may_stop(served: Served) -> No
         (b'{"id":1,"verb":"watch","args":{"period_s":"x"}}', "watch: period_s"),
         (b'{"id":1,"verb":"watch","args":{"period_s":1e-9}}', "watch: period_s"),
         (b"\xff\xfe\x00", "one JSON object"),
-        (b"[" * 100_000, "one JSON object"),
+        (b"[" * 60_000, "one JSON object"),
     ],
 )
 def test_bad_lines_get_one_line_back_and_the_connection_goes_on(served: Served, line: bytes, says: str) -> None:
@@ -183,9 +267,18 @@ def test_line_without_end_loses_its_connection(served: Served) -> None:
         assert client.call(Verb.STATUS)
 
 
+def test_long_line_is_refused_before_anything_is_made_of_it(served: Served) -> None:
+    connection = _raw(served)
+    connection.sendall(b'{"id":1,"verb":"status","args":{"a":[' + b"[]," * 22_000 + b"[]]}}\n")
+    answer = _line(connection)
+    assert (answer["error"]["exit_code"], answer["id"]) == (2, None)
+    assert "at most 65536 bytes" in answer["error"]["message"]
+    connection.close()
+
+
 def test_client_that_never_reads_is_cut_off_and_disturbs_nobody(served: Served) -> None:
     deaf = _raw(served)
-    request = json.dumps({"id": 1, "verb": "track", "args": {"kind": "x" * 100_000}}).encode() + b"\n"
+    request = json.dumps({"id": 1, "verb": "track", "args": {"kind": "x" * 50_000}}).encode() + b"\n"
     with pytest.raises(OSError):
         for _ in range(1000):
             deaf.sendall(request)
@@ -206,12 +299,16 @@ def test_watch_streams_and_a_deaf_watcher_only_loses_lines(served: Served) -> No
     deaf.close()
 
 
-def test_too_many_clients_are_turned_away(served: Served) -> None:
+def test_one_program_cannot_take_all_places(served: Served) -> None:
     crowd = [_raw(served) for _ in range(40)]
-    crowd[0].sendall(b'{"id":1,"verb":"status"}\n')
-    assert _line(crowd[0])["ok"]
-    crowd[-1].settimeout(5)
     assert crowd[-1].recv(1) == b""
+    code = f"""
+from servod.control import ControlClient
+with ControlClient({str(served.path)!r}) as client:
+    client.call("status"), client.call("stop")
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
     for connection in crowd:
         connection.close()
 

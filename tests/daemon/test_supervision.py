@@ -3,26 +3,34 @@
 import logging
 import subprocess
 import sys
+import time
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from daemon_rows import record, rows
 
 from servod.axis import AxisState
-from servod.commands import ReferenceKind, Refusal
-from servod.config import AxisConfig, RecorderConfig
-from servod.control import Verb
+from servod.commands import Command, Op, ReferenceKind, Refusal
+from servod.config import AxisConfig, BusConfig, RecorderConfig
+from servod.control import SampleKey, Verb
 from servod.daemon.arguments import check_arguments
-from servod.daemon.control_server import Reply
+from servod.daemon.connection import Reply
 from servod.daemon.fault_watch import FaultWatch
 from servod.daemon.flows import Flow, Flows, FutureWait, Orders, StateWait
-from servod.daemon.health import Health
-from servod.daemon.lock import InstanceLock
-from servod.daemon.status import axis_status, fault_status, motion_status
+from servod.daemon.gain_bank import GainBank
+from servod.daemon.health import Health, Pulse
+from servod.daemon.lock import BusLock, InstanceLock
+from servod.daemon.nodes import nmt_name
+from servod.daemon.status import axis_status, bus_status, fault_status, motion_status
+from servod.daemon.trajectory import Table, check_motion
+from servod.daemon.verbs import Verbs
 from servod.errors import BadInput, FaultCode, Unreachable
-from servod.hal import Reason
+from servod.hal import DriveState, Reason
+from servod.loop.channel import Channel
+from servod.loop.handle import LoopHandle
 from servod.metrics import AxisMetrics
 from servod.recorder import Recorder
 from servod.recorder_read import read_recording
@@ -40,6 +48,28 @@ def test_percentiles_are_of_the_last_ten_seconds_only() -> None:
     assert timing["lag"] == {"p50_us": 4999.0, "p99_us": 9899.0, "max_us": 9999.0}
     assert (timing["window_s"], timing["cycle"], timing["records_lost"]) == (10.0, 9999, 3)
     assert "bus load 50%" in health.line()
+
+
+def _look(pulse: Pulse, times_ms: Sequence[int]) -> bool:
+    for time_ms in times_ms:
+        pulse.look(False, time_ms * 1_000_000)
+    return pulse.stopped
+
+
+def test_loop_hangs_after_a_second_of_silence_however_many_rounds_that_is() -> None:
+    pulse = Pulse(1000)
+    assert not _look(pulse, [0] + [1] * 5000 + list(range(10, 1000, 10)))
+    assert _look(pulse, [1000, 1010])
+    pulse.look(True, 1_020_000_000)
+    assert not pulse.stopped
+
+
+def test_slow_loop_has_many_periods_and_a_stalled_watcher_blames_nobody() -> None:
+    assert not _look(Pulse(40_000), range(0, 2000, 20))
+    assert _look(Pulse(40_000), range(0, 2100, 20))
+    stalled = Pulse(1000)
+    assert not _look(stalled, [*range(0, 900, 20), 60_000, *range(60_020, 60_900, 20)])
+    assert _look(stalled, [*range(60_900, 61_100, 20)])
 
 
 def test_health_without_cycles() -> None:
@@ -63,6 +93,12 @@ def test_values_that_are_not_finite_are_none() -> None:
 def test_latched_and_present_faults_are_told_apart() -> None:
     faults = fault_status(record(faults=STALE, faults_latched=FOLLOWING | STALE))
     assert [(f["code"], f["present"]) for f in faults] == [("FOLLOWING_ERROR", False), ("FEEDBACK_STALE", True)]
+
+
+def test_bus_counters_and_any_nmt_state_are_shown() -> None:
+    bus = bus_status(BusConfig(), 0.4, record(late_frames=3, ignored_frames=4))
+    assert (bus["late_frames"], bus["ignored_frames"]) == (3, 4)
+    assert [nmt_name(n) for n in (None, 5, 2)] == ["not heard yet", "OPERATIONAL", "unknown state 2"]
 
 
 # --- faults -----------------------------------------------------------------------------------------------------------
@@ -125,7 +161,8 @@ def test_clipping_writes_no_file(recorder: Recorder, tmp_path: Path) -> None:
     ],
 )
 def test_motions_become_the_loops_arguments(args: dict[str, Any], reference: list[float]) -> None:
-    assert check_arguments(Verb.TRACK, args).reference() == reference
+    track = check_arguments(Verb.TRACK, args)
+    assert track.reference(track.table(Table())) == reference
 
 
 @pytest.mark.parametrize(
@@ -136,9 +173,13 @@ def test_motions_become_the_loops_arguments(args: dict[str, Any], reference: lis
         (Verb.TRACK, {"kind": "sine", "amplitude_rad": 0.1}, "frequency_hz, duration_s"),
         (Verb.TRACK, {"kind": "paper", "duration_s": -1}, "duration_s"),
         (Verb.TRACK, {"kind": "paper", "duration_s": float("nan")}, "duration_s"),
-        (Verb.TRACK, {"kind": "csv", "positions_rad": [0.0]}, "positions_rad"),
+        (Verb.TRACK, {"kind": "csv", "positions_rad": []}, "positions_rad"),
+        (Verb.TRACK, {"kind": "excite", "uploaded": True}, "window_rad"),
         (Verb.TRACK, {"kind": "csv", "positions_rad": [0.0, float("inf")]}, "positions_rad.1"),
-        (Verb.TRACK, {"kind": "csv", "positions_rad": [0.0] * 300_001}, "300000"),
+        (Verb.TRACK, {"kind": "csv", "positions_rad": [0.0] * 2001}, "2000"),
+        (Verb.TRAJECTORY, {"key": "positions", "start": 0, "samples": [1.0]}, "torques_nm"),
+        (Verb.TRAJECTORY, {"key": "positions_rad", "start": -1, "samples": [1.0]}, "start"),
+        (Verb.TRAJECTORY, {"key": "positions_rad", "start": 0, "samples": [float("nan")]}, "samples.0"),
         (Verb.TRACK, {"kind": "paper", "duration_s": 1, "speed": 2}, "speed"),
         (Verb.ENABLE, {"reset": True}, "did you mean reset_fault"),
         (Verb.ENABLE, {"reset_fault": "perhaps"}, "reset_fault"),
@@ -153,6 +194,45 @@ def test_bad_arguments_are_one_line(verb: Verb, args: dict[str, Any], says: str)
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 400
+
+
+# --- trajectories -----------------------------------------------------------------------------------------------------
+def test_pieces_become_one_column_with_its_extent_and_steps() -> None:
+    table = Table()
+    table.add(SampleKey.POSITIONS, 0, [9.0])
+    for start, piece in ((0, [0.0, 0.1]), (2, [0.4, 0.3])):
+        table.add(SampleKey.POSITIONS, start, piece)
+    positions = table.positions
+    assert list(table.area()) == [0.0, 0.1, 0.4, 0.3]
+    assert (positions.lowest, positions.highest, positions.largest_step) == (0.0, 0.4, pytest.approx(0.3))
+    with pytest.raises(BadInput, match="or 4 to go on"):
+        table.add(SampleKey.POSITIONS, 5, [0.0])
+    with pytest.raises(BadInput, match="found 0 samples; allowed: 4"):
+        table.require(torques=True)
+    with pytest.raises(BadInput, match="at most 300000"):
+        table.add(SampleKey.TORQUES, 0, [0.0] * 300_001)
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        ({"kind": "step", "amplitude_rad": 0.6, "duration_s": 1}, "from 0.5 to 1.1 rad"),
+        ({"kind": "sine", "amplitude_rad": 0.4, "frequency_hz": 2, "duration_s": 1}, "5.02655 rad/s"),
+        ({"kind": "csv", "positions_rad": [0.0, 0.0051]}, "5.1 rad/s; limits.speed_rad_s allows 5"),
+        ({"kind": "csv", "positions_rad": [0.0, -2.0]}, "-1.5 to 0.5 rad"),
+        ({"kind": "paper", "duration_s": 40}, "out of range"),
+    ],
+)
+def test_motion_is_checked_with_figures_before_the_loop_is_asked(args: dict[str, Any], says: str) -> None:
+    track = check_arguments(Verb.TRACK, args)
+    table = track.table(Table())
+    config = _config(Path("s"), Path("c"))
+    limits = config.limits.model_copy(update={"speed_rad_s": 5.0})
+    with pytest.raises(Unreachable) as caught:
+        check_motion(
+            track.reference(table), table, config.model_copy(update={"limits": limits}), record(reference_rad=0.5)
+        )
+    assert says in str(caught.value)
 
 
 # --- flows ------------------------------------------------------------------------------------------------------------
@@ -231,6 +311,126 @@ def test_full_disk_ends_the_request_only() -> None:
     assert answers.sent[0]["error"] == {"exit_code": 3, "message": "active.json: No space left on device"}
 
 
+def test_mistake_in_a_flow_ends_the_request_only() -> None:
+    flows, answers = Flows(), _Answers()
+
+    def flow() -> Flow:
+        yield from ()
+        raise KeyError("nobody foresaw this")
+
+    flows.start(flow(), answers.reply())
+    assert "nobody foresaw" in answers.sent[0]["error"]["message"]
+
+
+# --- verbs ------------------------------------------------------------------------------------------------------------
+class _Loop:
+    """What the verbs need of the loop's handle, with a loop that answers when it is told to."""
+
+    def __init__(self) -> None:
+        self.latest = record(1, axis_state=AxisState.ENABLED)
+        self.seq = 0
+        self.area: list[float] = []
+
+    def send(self, _op: Op, _arguments: Sequence[float] = ()) -> int:
+        self.seq += 1
+        return self.seq
+
+    def write_trajectory(self, positions_rad: Sequence[float]) -> None:
+        self.area = list(positions_rad)
+
+
+class _Events:
+    def add_event(self, *_: Any, **__: Any) -> None:
+        """Nothing is recorded here."""
+
+
+@pytest.fixture
+def verbs(tmp_path: Path) -> Iterator[tuple[Verbs, _Loop]]:
+    loop, config = _Loop(), _config(tmp_path / "s", tmp_path / "c")
+    config = config.model_copy(update={"limits": config.limits.model_copy(update={"speed_rad_s": 1e3})})
+    verbs = Verbs(config, cast(LoopHandle, loop), cast(GainBank, None), cast(Recorder, _Events()), dict)
+    yield verbs, loop
+    verbs.close()
+
+
+def _csv(verbs: Verbs, positions: list[float], **more: Any) -> list[dict[str, Any]]:
+    answers = _Answers()
+    verbs.handle(Verb.TRACK, {"kind": "csv", "positions_rad": positions, **more}, answers.reply())
+    return answers.sent
+
+
+def test_trajectory_is_in_use_from_its_command_to_the_motions_end(verbs: tuple[Verbs, _Loop]) -> None:
+    front, loop = verbs
+    assert _csv(front, [0.0, 0.1, 0.2]) == []
+    first = loop.area
+    for seen in ({}, {"command_seq": 1, "reference_active": 1}):
+        loop.latest = record(2, axis_state=AxisState.ENABLED, **seen)
+        assert front.motion_running()
+        (answer,) = _csv(front, [0.3, 0.3, 0.3])
+        assert "a motion is running" in answer["error"]["message"]
+        assert (loop.area, loop.seq) == (first, 1)
+    loop.latest = record(3, axis_state=AxisState.ENABLED, command_seq=1)
+    assert _csv(front, [0.3, 0.3, 0.3]) == []
+    assert loop.area == [0.3, 0.3, 0.3]
+
+
+def test_check_alone_moves_nothing_and_tells_what_is_wrong(verbs: tuple[Verbs, _Loop]) -> None:
+    front, loop = verbs
+    loop.latest = record(1, axis_state=AxisState.DISABLED)
+    (good,) = _csv(front, [0.0, 0.1], start_immediately=False)
+    assert good["result"]["duration_s"] == pytest.approx(0.001)
+    (bad,) = _csv(front, [0.0, 2.0], start_immediately=False)
+    assert "position_max_rad" in bad["error"]["message"]
+    assert (loop.area, loop.seq) == ([], 0)
+
+
+def test_samples_of_a_client_that_left_are_void(verbs: tuple[Verbs, _Loop]) -> None:
+    front, _ = verbs
+    args = {"key": "positions_rad", "start": 0, "samples": [0.0, 0.1]}
+    front.handle(Verb.TRAJECTORY, args, _Answers().reply())
+    front.lease_ended()
+    answers = _Answers()
+    front.handle(Verb.TRACK, {"kind": "csv", "uploaded": True}, answers.reply())
+    assert "found 0 samples" in answers.sent[0]["error"]["message"]
+
+
+@pytest.mark.parametrize("verb", [Verb.STOP, Verb.DISABLE])
+@pytest.mark.parametrize(
+    ("now", "says"),
+    [
+        ({"axis_state": AxisState.QUICK_STOPPING, "drive_state": DriveState.QUICK_STOP_ACTIVE}, "QUICK_STOPPING"),
+        ({"axis_state": AxisState.DISABLED, "drive_state": DriveState.OPERATION_ENABLED}, "OPERATION_ENABLED"),
+        (
+            {"axis_state": AxisState.FAULT, "drive_state": DriveState.SWITCH_ON_DISABLED, "amplifier_age": 99},
+            "99 cycles ago",
+        ),
+    ],
+)
+def test_stop_that_stopped_nothing_is_no_success(
+    verbs: tuple[Verbs, _Loop], verb: Verb, now: dict[str, int], says: str
+) -> None:
+    front, loop = verbs
+    answers = _Answers()
+    front.handle(verb, {}, answers.reply())
+    loop.latest = record(2, command_seq=1, **now)
+    front.tick([loop.latest], time.monotonic_ns())
+    front.tick([], time.monotonic_ns())
+    assert answers.sent == []
+    front.tick([], time.monotonic_ns() + 60_000_000_000)
+    assert answers.sent[0]["error"]["exit_code"] == 3
+    assert says in answers.sent[0]["error"]["message"]
+
+
+def test_queue_that_a_client_floods_leaves_room_for_stops_and_node_events() -> None:
+    channel = Channel()
+    taken = {op: [channel.send(Command(n, op, ())) for n in range(16)].count(True) for op in _FLOOD}
+    assert taken == {Op.HALT: 8, Op.QUICK_STOP: 4, Op.NODE_EVENT: 4}
+    channel.close()
+
+
+_FLOOD = (Op.HALT, Op.QUICK_STOP, Op.NODE_EVENT)
+
+
 # --- instance lock ----------------------------------------------------------------------------------------------------
 def _config(socket: Path, channel: Path) -> AxisConfig:
     limits = {
@@ -259,6 +459,8 @@ def test_second_daemon_on_socket_or_bus_is_refused(tmp_path: Path) -> None:
             InstanceLock(_config(tmp_path / socket, tmp_path / channel))
     InstanceLock(_config(tmp_path / "b.sock", tmp_path / "bus2")).release()
     first.release()
+    with BusLock(BusConfig(channel=str(tmp_path / "bus1"))), pytest.raises(Unreachable, match="another servod"):
+        InstanceLock(_config(tmp_path / "a.sock", tmp_path / "bus1"))
     InstanceLock(_config(tmp_path / "a.sock", tmp_path / "bus1")).release()
     assert not list(tmp_path.iterdir())
 
