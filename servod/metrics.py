@@ -102,6 +102,8 @@ class AxisMetrics(Collector):
         yield CounterMetricFamily("servod_missed_cycles", "Periods skipped since the start", record.missed)
         yield CounterMetricFamily("servod_bus_queue_full", "Frames that could not be queued", record.bus_queue_full)
         yield CounterMetricFamily("servod_bus_error_frames", "Error frames seen", record.bus_error_frames)
+        yield CounterMetricFamily("servod_bus_late_frames", "Feedback that came after its cycle", record.late_frames)
+        yield CounterMetricFamily("servod_bus_ignored_frames", "Frames that fit no mapping", record.ignored_frames)
         yield _state("servod_axis_state", "1 for the state of the axis", AxisState(record.axis_state), AxisState)
         yield _state("servod_drive_state", "1 for the drive's state", DriveState(record.drive_state), DriveState)
         yield GaugeMetricFamily("servod_position_radians", "Joint position", record.position_rad)

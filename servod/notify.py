@@ -40,9 +40,9 @@ class Notifier:
         """One line for `systemctl status`."""
         self._send(f"STATUS={_one_line(status)}")
 
-    def stopping(self) -> None:
-        """The daemon begins to stop."""
-        self._send("STOPPING=1")
+    def stopping(self, timeout_s: float) -> None:
+        """The daemon begins to stop, and needs at most `timeout_s` for it, whatever TimeoutStopSec says."""
+        self._send(f"STOPPING=1\nEXTEND_TIMEOUT_USEC={int(timeout_s * 1e6)}")
 
     def alive(self) -> None:
         """Feed the watchdog; call it only while the loop really advances."""

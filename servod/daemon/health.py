@@ -11,8 +11,13 @@ from collections.abc import Iterable
 
 from servod.daemon.status import Percentiles, TimingStatus
 from servod.record import CycleRecord
+from servod.units import NS_PER_S, NS_PER_US
 
 WINDOW_S = 10.0
+#: A loop that writes no record for so long hangs: at least this time, and at least so many periods.
+_HUNG_NS, _HUNG_PERIODS = NS_PER_S, 50
+#: After a pause of its own of this length, the watcher knows nothing of the loop and begins anew.
+_OWN_PAUSE_NS = NS_PER_S // 5
 
 
 class _Ring:
@@ -45,6 +50,26 @@ class _Ring:
             "p99_us": ordered[last * 99 // 100] / 1000.0,
             "max_us": ordered[last] / 1000.0,
         }
+
+
+class Pulse:
+    """Whether the loop still writes; a watcher that was itself held up does not blame the loop for it."""
+
+    def __init__(self, period_us: int) -> None:
+        self._limit_ns = max(_HUNG_NS, _HUNG_PERIODS * period_us * NS_PER_US)
+        self._silent_ns = 0
+        self._looked_ns: int | None = None
+
+    def look(self, wrote: bool, now_ns: int) -> None:
+        """Once per round: whether records came since the last look."""
+        pause_ns = 0 if self._looked_ns is None else now_ns - self._looked_ns
+        self._silent_ns = 0 if wrote or pause_ns > _OWN_PAUSE_NS else self._silent_ns + pause_ns
+        self._looked_ns = now_ns
+
+    @property
+    def stopped(self) -> bool:
+        """The loop hangs."""
+        return self._silent_ns > self._limit_ns
 
 
 class Health:

@@ -43,6 +43,11 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
+def _end_start_on_sigterm() -> None:
+    """Until the supervisor takes over, SIGTERM is as Ctrl-C: what was begun is undone."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+
+
 def _stop_on_signals(supervisor: Supervisor) -> None:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: supervisor.request_stop())
@@ -57,6 +62,7 @@ def main(arguments: list[str] | None = None) -> int:
             config = check(options.config)
             print(f"{options.config}: good; axis {config.name} on {config.bus.interface} {config.bus.channel}")
             return 0
+        _end_start_on_sigterm()
         return run(options.config, _stop_on_signals)
     except ServodError as error:
         print_error(str(error))

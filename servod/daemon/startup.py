@@ -19,12 +19,13 @@ from servod.clock import WallClock
 from servod.config import AxisConfig, load_config
 from servod.daemon.gain_bank import GainBank
 from servod.daemon.lock import InstanceLock
+from servod.daemon.nodes import Nodes
 from servod.daemon.supervisor import Supervisor
 from servod.errors import FaultCode, ServodError
 from servod.gains import load_gains, require_certificate
 from servod.loop.handle import LoopHandle
 from servod.loop.plan import LoopPlan
-from servod.master import BringUp, Master
+from servod.master import Master
 from servod.master.planned import planned_bus_load
 from servod.notify import Notifier
 from servod.recorder import Recorder
@@ -62,11 +63,29 @@ def run(path: Path, on_ready: Callable[[Supervisor], None]) -> int:
         plans = master.bring_up()
         for line in plans.report:
             log.info("%s", line)
-        loop = _start_loop(config, plans, bank)
-        stack.callback(lambda: loop.alive() and loop.stop())
-        supervisor = Supervisor(config, master, plans, loop, bank, recorder, Notifier())
-        on_ready(supervisor)
+        with ExitStack() as undo:
+            supervisor = _supervise(config, Nodes(master, plans), bank, recorder, undo)
+            on_ready(supervisor)
+            undo.pop_all()
         return supervisor.run()
+
+
+def _supervise(config: AxisConfig, nodes: Nodes, bank: GainBank, recorder: Recorder, undo: ExitStack) -> Supervisor:
+    """Loop and supervisor on nodes that are operational; `undo` is what to do when that fails half-way."""
+    gains = bank.newest.gains
+    plans = nodes.plans
+    loop = LoopHandle(LoopPlan(config, plans.amplifier, plans.encoder, int(gains.law.number), gains.pack()))
+    undo.callback(_give_back, nodes, loop)
+    _start_loop(loop)
+    return Supervisor(config, nodes, loop, bank, recorder, Notifier())
+
+
+def _give_back(nodes: Nodes, loop: LoopHandle) -> None:
+    """The axis was never enabled; still only a drive that the loop saw off may forget the master's heartbeat."""
+    if loop.alive() and loop.stop() != 0:
+        nodes.switch_off()
+    else:
+        nodes.stand_down()
 
 
 def _leave_core_to_loop(cpu: int | None) -> None:
@@ -95,9 +114,7 @@ def _record_from_the_start(recorder: Recorder) -> None:
         log.error("fault %s: %s", FaultCode.RECORDER_FAILED.name, error or "the disk does not answer")
 
 
-def _start_loop(config: AxisConfig, plans: BringUp, bank: GainBank) -> LoopHandle:
-    gains = bank.newest.gains
-    loop = LoopHandle(LoopPlan(config, plans.amplifier, plans.encoder, int(gains.law.number), gains.pack()))
+def _start_loop(loop: LoopHandle) -> None:
     loop.start()
     for grant in loop.grants:
         log.log(
@@ -107,7 +124,6 @@ def _start_loop(config: AxisConfig, plans: BringUp, bank: GainBank) -> LoopHandl
             "granted" if grant.granted else "refused",
             grant.reason,
         )
-    return loop
 
 
 def _master_ids(config: AxisConfig) -> tuple[int, ...]:

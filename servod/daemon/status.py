@@ -10,6 +10,7 @@ import math
 from typing import TypedDict
 
 from servod.axis import AxisState
+from servod.config import BusConfig
 from servod.errors import Fault, faults_in
 from servod.hal import REASON_TEXT, DriveState, Goal, Reason
 from servod.record import CycleRecord
@@ -101,6 +102,8 @@ class BusStatus(TypedDict):
     max_load: float
     queue_full: int
     error_frames: int
+    late_frames: int
+    ignored_frames: int
 
 
 class NodeStatus(TypedDict):
@@ -196,6 +199,20 @@ def motion_status(record: CycleRecord) -> MotionStatus:
         "torque_other_nm": _finite(record.torque_other_nm),
         "friction_state_rad": _finite(record.friction_state),
         "disturbance_nm": _finite(record.disturbance_nm),
+    }
+
+
+def bus_status(bus: BusConfig, load: float, record: CycleRecord) -> BusStatus:
+    """The bus as configured, and its counters."""
+    return {
+        "interface": bus.interface,
+        "channel": bus.channel,
+        "load": load,
+        "max_load": bus.max_load,
+        "queue_full": record.bus_queue_full,
+        "error_frames": record.bus_error_frames,
+        "late_frames": record.late_frames,
+        "ignored_frames": record.ignored_frames,
     }
 
 

@@ -6,7 +6,6 @@ requests a step further; watchdog and status line to systemd, fed only while the
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import selectors
 import time
@@ -15,18 +14,18 @@ from typing import Any
 
 from servod import __version__
 from servod.axis import AxisState
-from servod.cia import CW_DISABLE_VOLTAGE, NmtCommand, NmtState, Obj402
 from servod.commands import Op
 from servod.config import AxisConfig
 from servod.daemon.control_server import ControlServer
 from servod.daemon.fault_watch import FaultWatch
 from servod.daemon.gain_bank import GainBank
-from servod.daemon.health import Health
-from servod.daemon.status import NodeStatus, Status, axis_status, drive_status, fault_status, motion_status
+from servod.daemon.health import Health, Pulse
+from servod.daemon.nodes import Nodes
+from servod.daemon.status import Status, axis_status, bus_status, drive_status, fault_status, motion_status
 from servod.daemon.verbs import Verbs
-from servod.errors import FaultCode, ServodError, Unreachable
+from servod.errors import FAULTS, FaultCode, Unreachable
+from servod.loop.cycle import GOODBYE_TIMEOUT_CYCLES
 from servod.loop.handle import LoopHandle
-from servod.master import BringUp, Master
 from servod.metrics import AxisMetrics, MetricsServer
 from servod.notify import Notifier
 from servod.record import RECORD, CycleRecord
@@ -36,10 +35,11 @@ from servod.units import NS_PER_S
 log = logging.getLogger("servod")
 
 TICK_S = 0.02
-#: A loop that writes no record for this many rounds hangs and counts as lost.
-_HUNG_ROUNDS = 50
+#: For an orderly end, on top of what loop and drive may take.
+_STOP_MARGIN_S = 2.0
 _STATUS_NS = NS_PER_S
 _TEXTFILE_NS = 5 * NS_PER_S
+_STAYS_POWERED = FAULTS[FaultCode.DRIVE_STAYS_POWERED].bit
 
 
 class Supervisor:
@@ -48,23 +48,24 @@ class Supervisor:
     def __init__(
         self,
         config: AxisConfig,
-        master: Master,
-        plans: BringUp,
+        nodes: Nodes,
         loop: LoopHandle,
         bank: GainBank,
         recorder: Recorder,
         notifier: Notifier,
     ) -> None:
         """The nodes are up and the loop runs. Raises Unreachable or BadInput when a socket cannot be opened."""
-        self._config, self._master, self._plans, self._loop = config, master, plans, loop
+        self._config, self._nodes, self._loop = config, nodes, loop
         self._bank, self._recorder, self._notifier = bank, recorder, notifier
         self._started = time.monotonic()
         self._stopping = self._textfile_failed = False
-        self._silent_rounds = 0
+        self._told_off = False
+        self._unsent: dict[FaultCode, None] = {}  # an ordered set: node faults that the loop has not taken yet
         self._fed_cycle = -1
         self._next_feed_ns = self._next_status_ns = self._next_textfile_ns = 0
-        self._health = Health(config.cycle.period_us, plans.bus_load)
-        self._metrics = AxisMetrics(config.name, plans.bus_load)
+        self._pulse = Pulse(config.cycle.period_us)
+        self._health = Health(config.cycle.period_us, nodes.plans.bus_load)
+        self._metrics = AxisMetrics(config.name, nodes.plans.bus_load)
         self._faults = FaultWatch(recorder, self._health, self._metrics)
         self._verbs = Verbs(config, loop, bank, recorder, self._document)
         self._selector = selectors.DefaultSelector()
@@ -82,6 +83,7 @@ class Supervisor:
             while not self._stopping:
                 for key, events in self._selector.select(TICK_S):
                     key.data(events)
+                    self._loop.feed()  # many clients at once are no sign of a supervisor that hangs
                 self._round(time.monotonic_ns())
                 if self._loop_is_lost():
                     return self._lose_loop()
@@ -93,8 +95,9 @@ class Supervisor:
         """Everything that is done once per round."""
         self._loop.feed()
         records = self._take_records(now_ns)
-        self._silent_rounds = 0 if records else self._silent_rounds + 1
+        self._pulse.look(bool(records), now_ns)
         self._take_node_events()
+        self._switch_off_if_disobeyed(records)
         self._verbs.tick(records, now_ns)
         self._faults.tick(now_ns)
         self._server.tick(now_ns)
@@ -115,12 +118,29 @@ class Supervisor:
 
     def _take_node_events(self) -> None:
         """Node events become faults of the loop, which reacts in its next cycle."""
-        self._master.poll()
-        for event in self._master.events():
+        for event in self._nodes.events():
             log.error("%s (%s)", event.text, event.fault.name)
             self._recorder.add_event("node", event.text, node_id=event.node_id, fault=event.fault.name)
-            with contextlib.suppress(Unreachable):  # a loop that takes no commands is found silent below
-                self._loop.send(Op.NODE_EVENT, (float(event.fault),))
+            self._unsent[event.fault] = None
+        self._send_node_faults()
+
+    def _send_node_faults(self) -> None:
+        """What the loop's queue does not take now waits for the next round."""
+        try:
+            for fault in list(self._unsent):
+                self._loop.send(Op.NODE_EVENT, (float(fault),))
+                del self._unsent[fault]
+        except Unreachable:
+            return
+
+    def _switch_off_if_disobeyed(self, records: list[CycleRecord]) -> None:
+        """The loop's goal OFF did not reach the drive: by SDO and NMT, once. A drive that answers neither holds this
+        up for longer than the loop waits for us; it then ends, which is all that is left to do."""
+        if self._told_off or not any(record.faults & _STAYS_POWERED for record in records):
+            return
+        self._told_off = True
+        log.error("the drive stays powered: switching it off by SDO and NMT pre-operational")
+        self._nodes.switch_off()
 
     def _tell_manager(self, now_ns: int) -> None:
         """Feed the watchdog only when the loop has gone on since the last time."""
@@ -146,12 +166,15 @@ class Supervisor:
         self._textfile_failed = error is not None
 
     def _loop_is_lost(self) -> bool:
-        return not self._loop.alive() or self._silent_rounds > _HUNG_ROUNDS
+        """It died or hangs. The service manager's SIGTERM reaches both of us: then an orderly end is none."""
+        if self._stopping and self._loop.exit_code == 0:
+            return False
+        return not self._loop.alive() or self._pulse.stopped
 
     def _lose_loop(self) -> int:
         """The loop died or hangs: the drive off before anything else, then tell, then end for systemd to restart."""
         hung = self._loop.alive()
-        self._switch_off()
+        self._nodes.switch_off()
         exit_code = self._loop.stop(0.0)
         self._take_records(time.monotonic_ns())
         words = " / ".join(self._loop.last_words().strip().splitlines()[-3:])
@@ -160,38 +183,26 @@ class Supervisor:
         self._faults.write_file(FaultCode.LOOP_LOST.name)
         return Unreachable.exit_code
 
-    def _switch_off(self) -> None:
-        """Voltage off by SDO, then NMT pre-operational; each is tried whatever became of the other."""
-        amplifier = self._plans.amplifier.node_id
-        try:
-            self._master.sdo(amplifier).write(Obj402.CONTROL_WORD, 0, CW_DISABLE_VOLTAGE)
-        except (ServodError, OSError) as error:
-            log.error("the amplifier did not take disable voltage: %s", error)
-        self._all_pre_operational()
-
-    def _all_pre_operational(self) -> None:
-        for plan in (self._plans.amplifier, self._plans.encoder):
-            try:
-                self._master.nmt(NmtCommand.PRE_OPERATIONAL, plan.node_id)
-            except (ServodError, OSError) as error:
-                log.error("node %d: NMT pre-operational failed: %s", plan.node_id, error)
-
     def _stop(self) -> int:
-        """Orderly end: the loop ramps down and disables, the nodes go pre-operational."""
-        log.info("stopping: ramping down and disabling")
-        self._notifier.stopping()
-        exit_code = self._loop.stop(self._config.limits.ramp_down_s + 2.0)
+        """Orderly end: the loop brakes, ramps down and disables, the nodes go pre-operational."""
+        log.info("stopping: braking, ramping down and disabling")
+        timeout_s = self._stop_timeout_s()
+        self._notifier.stopping(timeout_s + _STOP_MARGIN_S)
+        exit_code = self._loop.stop(timeout_s)
         self._take_records(time.monotonic_ns())
         if exit_code != 0:
-            self._switch_off()
-            log.error("the loop did not end in order (exit code %d)", exit_code)
+            self._nodes.switch_off()
+            log.error("the loop did not see the drive off (exit code %d); 0x1016 is left as it is", exit_code)
             return Unreachable.exit_code
-        try:
-            self._master.stand_down()
-        except (ServodError, OSError) as error:
-            log.warning("nodes did not stand down in order: %s", error)
+        self._nodes.stand_down()
         log.info("stopped; the axis is disabled")
         return 0
+
+    def _stop_timeout_s(self) -> float:
+        """Braking and ramping, or the drive's quick stop, and then the wait for a drive that shall show it is off."""
+        goodbye_s = GOODBYE_TIMEOUT_CYCLES * self._config.cycle.period_us * 1e-6
+        motion_s = 2.0 * self._config.limits.ramp_down_s + self._config.amplifier.enable_timeout_s
+        return motion_s + goodbye_s + _STOP_MARGIN_S
 
     def _close(self) -> None:
         self._server.close()
@@ -206,7 +217,6 @@ class Supervisor:
         latest = self._loop.latest
         if latest is None:
             raise Unreachable("the loop has not begun")
-        bus = self._config.bus
         document: Status = {
             "name": self._config.name,
             "version": __version__,
@@ -218,32 +228,10 @@ class Supervisor:
             "controller": self._bank.describe(latest.controller),
             "loop": {"pid": self._loop.pid},
             "timing": self._health.timing(self._loop.lost),
-            "bus": {
-                "interface": bus.interface,
-                "channel": bus.channel,
-                "load": self._plans.bus_load,
-                "max_load": bus.max_load,
-                "queue_full": latest.bus_queue_full,
-                "error_frames": latest.bus_error_frames,
-            },
-            "nodes": self._nodes(),
+            "bus": bus_status(self._config.bus, self._nodes.plans.bus_load, latest),
+            "nodes": self._nodes.status(),
             "grants": [{"name": g.name, "granted": g.granted, "reason": g.reason} for g in self._loop.grants],
             "recorder": self._recorder.state(),
             "lease": self._server.lease(),
         }
         return dict(document)
-
-    def _nodes(self) -> list[NodeStatus]:
-        return [
-            {
-                "node_id": plan.node_id,
-                "role": role,
-                "driver": plan.driver,
-                "state": _nmt_name(self._master.nmt_state(plan.node_id)),
-            }
-            for role, plan in (("amplifier", self._plans.amplifier), ("encoder", self._plans.encoder))
-        ]
-
-
-def _nmt_name(state: int | None) -> str:
-    return "not heard yet" if state is None else NmtState(state).name

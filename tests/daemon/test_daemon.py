@@ -170,7 +170,7 @@ def test_daemon_starts_again_after_kill_9(tmp_path: Path) -> None:
             with ControlClient(axis.socket) as client:
                 assert client.call("status")["axis"]["state"] == "DISABLED"
             second.send_signal(signal.SIGTERM)
-            assert second.wait(10) == 0
+            assert second.wait(10) == 0, second.stderr.read() if second.stderr else ""
         assert not axis.socket.exists()
 
 

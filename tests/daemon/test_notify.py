@@ -20,12 +20,12 @@ def test_messages_are_what_systemd_reads(manager: socket.socket) -> None:
     notifier.ready("all\nwell")
     notifier.alive()
     notifier.status("ENABLED")
-    notifier.stopping()
+    notifier.stopping(2.5)
     assert [manager.recv(200) for _ in range(4)] == [
         b"READY=1\nSTATUS=all well",
         b"WATCHDOG=1",
         b"STATUS=ENABLED",
-        b"STOPPING=1",
+        b"STOPPING=1\nEXTEND_TIMEOUT_USEC=2500000",
     ]
     notifier.close()
     manager.close()

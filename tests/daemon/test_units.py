@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from servod.config import load_config
+from servod.config import LimitsConfig, load_config
+from servod.loop.cycle import GOODBYE_TIMEOUT_CYCLES
 
 SYSTEMD = Path(__file__).parents[2] / "systemd"
 UNITS = sorted(SYSTEMD.glob("*.service"))
@@ -28,6 +29,20 @@ def test_exposure_is_at_most_3(unit: Path) -> None:
 def test_address_families_are_can_and_unix_only() -> None:
     for unit in UNITS:
         assert re.findall(r"^RestrictAddressFamilies=(.*)$", unit.read_text(), re.M) == ["AF_CAN AF_UNIX"]
+
+
+def test_no_signal_kills_the_loop_before_it_has_stopped_the_axis() -> None:
+    unit = (SYSTEMD / "servod@.service").read_text()
+    assert _key(unit, "KillMode") == "control-group"  # SIGTERM to the loop also when the supervisor is gone
+    assert _key(unit, "WatchdogSignal") == "SIGTERM"  # it too goes to the whole group
+    (longest,) = [m.le for m in LimitsConfig.model_fields["ramp_down_s"].metadata if hasattr(m, "le")]
+    goodbye_s = GOODBYE_TIMEOUT_CYCLES * 0.02
+    assert float(_key(unit, "TimeoutStopSec")) > 2.0 * longest + goodbye_s
+
+
+def _key(unit: str, name: str) -> str:
+    (value,) = re.findall(rf"^{name}=(.*)$", unit, re.M)
+    return str(value)
 
 
 def test_install_puts_everything_where_the_units_look(tmp_path: Path) -> None:
