@@ -9,7 +9,7 @@ from servod.cia import NmtCommand, NmtState, Obj301
 from servod.config import AmplifierConfig, AxisConfig, EncoderConfig
 from servod.drivers.setup_tools import read_optional, write_checked
 from servod.errors import FaultCode, Unreachable
-from servod.hal import NodePlan, SdoAbort, Setup
+from servod.hal import NodePlan, Setup
 from servod.master.dcf import left_out, write_parameters
 from servod.master.eds import dictionary_for
 from servod.master.identity import check_identity, read_identity
@@ -17,7 +17,7 @@ from servod.master.monitor import NodeWatch
 from servod.master.network import BusNetwork
 from servod.master.pdo import configure_pdos
 from servod.master.planned import Kind, load_setup
-from servod.master.sdo import NodeSdo
+from servod.master.sdo import NoAnswer, NodeSdo
 
 #: Device profile (0x1000, low word) that a driver kind needs.
 PROFILE = {"amplifier": 402, "encoder": 406}
@@ -52,9 +52,7 @@ class Node:
         """Check who it is, by SDO reads alone, which work in operational and pre-operational. Raises Unreachable."""
         try:
             found = read_identity(self.sdo)
-        except SdoAbort:
-            raise
-        except Unreachable as error:
+        except NoAnswer as error:
             raise Unreachable(self._why_silent(str(error))) from None
         check_identity(self.node_id, found, self.section.identity, PROFILE[self._kind])
         return [

@@ -53,6 +53,10 @@ def abort_text(code: int) -> str:
         return "unknown abort code"
 
 
+class NoAnswer(Unreachable):
+    """The node did not answer an SDO request in time, or not to the point."""
+
+
 class _Answers(queue.Queue[bytes]):
     """canopen's queue of answers; waiting on it pumps the network, on whichever clock that runs."""
 
@@ -166,7 +170,7 @@ class NodeSdo:
                 text = f"{self._where(index, subindex)}: {verb} refused, 0x{abort.code:08X} {abort_text(abort.code)}"
                 raise SdoAbort(text, abort.code) from None
             except SdoCommunicationError as error:
-                raise Unreachable(f"{self._where(index, subindex)}: {verb} failed, {error}") from None
+                raise NoAnswer(f"{self._where(index, subindex)}: {verb} failed, {error}") from None
 
     def _where(self, index: int, subindex: int) -> str:
         return f"node {self.node_id} object 0x{index:04X}:{subindex}"
