@@ -56,6 +56,7 @@ class Asymmetry(Strict):
 class Stribeck(Strict):
     """Stribeck curve: g(v) = F_C + (F_S - F_C)*exp(-(|v|/v_s)^exponent); keys given here replace those of `friction`.
 
+    Not with friction of kind local, whose map has the curve in it.
     Source: the paper's (18) with the exponent's sign mended; exponent by Bo and Pavelescu, Wear 82, 1982.
     """
 
@@ -168,8 +169,8 @@ class JointElasticity(TwoMass):
 class Backlash(Strict):
     """Dead zone before the joint's spring: tau = 0 while |d| < gap/2, else k*(d - sign(d)*gap/2) + damping*dd/dt.
 
-    The other keys say what is behind the gap; they may stand in `joint_elasticity` instead. Source: Nordin, Galic,
-    Gutman, Int. J. Adaptive Control 11, 1997.
+    The other keys say what is behind the gap; beside `joint_elasticity`, which says it, they must not stand.
+    Source: Nordin, Galic, Gutman, Int. J. Adaptive Control 11, 1997.
     """
 
     gap: Positive = Field(description="whole width, rad")
@@ -246,6 +247,7 @@ class Thermal(Strict):
 class PositionDependentInertia(Harmonics):
     """M(x) = inertia*(1 + sum amplitude*sin(n*x + phase)), with M*a + dM/dx*v^2/2 = torque; amplitudes are shares.
 
+    Behind a joint's spring or gap it is the load that varies: shares of load_inertia over the load's position.
     Source: Lagrange's equation of a linkage, crank or eccentric load.
     """
 

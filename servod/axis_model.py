@@ -89,6 +89,13 @@ Friction = Annotated[
 ]
 
 
+#: Groups with sines over position.
+_PERIODIC = (
+    *("cogging", "torque_ripple", "position_dependent_friction", "position_dependent_inertia"),
+    "encoder_eccentricity",
+)
+
+
 class AxisModel(Strict):
     """One axis as physics: its basic keys, and one optional group of keys for each effect."""
 
@@ -129,6 +136,32 @@ class AxisModel(Strict):
             raise ValueError("load_inertia less than inertia, which holds both masses")
         if behind is not None and behind.load_viscous > self.friction.viscous:
             raise ValueError("load_viscous at most friction.viscous, which holds both parts")
+        return self
+
+    @model_validator(mode="after")
+    def _keys_have_meaning(self) -> AxisModel:
+        """Refuse keys that the friction law, the kind of axis or a group beside would leave without effect."""
+        kind, bristle = self.friction.kind, self.presliding
+        if self.stribeck is not None and kind == "local":
+            raise ValueError("stribeck: another kind than local, whose map has the curve in it")
+        if bristle is not None and bristle.sigma0 is None and kind in {"coulomb_viscous", "stribeck"}:
+            raise ValueError(f"presliding.sigma0, as friction of kind {kind} has no bristle")
+        if self.backlash is not None and self.joint_elasticity is not None:
+            for key in ("load_inertia", "stiffness", "damping", "load_viscous"):
+                if key in self.backlash.model_fields_set:
+                    raise ValueError(f"backlash.{key} not beside joint_elasticity, whose own holds")
+        return self
+
+    @model_validator(mode="after")
+    def _harmonics_fit(self) -> AxisModel:
+        wrong = "periods_per_metre" if self.axis is AxisKind.ROTARY else "periods_per_turn"
+        for name in _PERIODIC:
+            group: fx.Harmonics | fx.PositionDependentFriction | None = getattr(self, name)
+            if any(getattr(harmonic, wrong) is not None for harmonic in (group.harmonics if group else ())):
+                raise ValueError(f"{name}: no {wrong} on a {self.axis.value} axis")
+        shown = self.encoder_eccentricity
+        if shown is not None and sum(abs(h.amplitude) * wave_number(h) for h in shown.harmonics) >= 1.0:
+            raise ValueError("encoder_eccentricity: slopes amplitude*n that sum to less than 1")
         return self
 
     @model_validator(mode="after")

@@ -9,6 +9,7 @@ import math
 
 from servod.models.layout import (
     P_COULOMB,
+    P_LOAD_VISCOUS,
     P_LOCAL_NEGATIVE,
     P_LOCAL_NEGATIVE_N,
     P_LOCAL_POSITIVE,
@@ -62,12 +63,12 @@ def stribeck_curve(p: Params, velocity: float) -> float:
 
 
 def _local_curve(p: Params, velocity: float, speed: float) -> float:
-    """Local sets: the map (7) less its viscous part, never below a hundredth of the map."""
+    """Local sets: the map (7) less its viscous part on both sides of the joint, never below a hundredth of the map."""
     if velocity >= 0.0:
         steady = interpolate(p, int(p[P_LOCAL_POSITIVE]), int(p[P_LOCAL_POSITIVE_N]), speed, True)
     else:
         steady = interpolate(p, int(p[P_LOCAL_NEGATIVE]), int(p[P_LOCAL_NEGATIVE_N]), speed, True)
-    return max(steady - p[P_VISCOUS] * speed, 0.01 * steady)
+    return max(steady - (p[P_VISCOUS] + p[P_LOAD_VISCOUS]) * speed, 0.01 * steady)
 
 
 def directed_curve(p: Params, velocity: float) -> float:

@@ -13,7 +13,7 @@ from __future__ import annotations
     P_SIGMA0,  # bristle stiffness; 0 = no presliding, set-valued Coulomb friction
     P_SIGMA1,
     P_SIGMA1_VELOCITY,  # 0 = bristle damping does not fade with speed
-    P_VISCOUS,
+    P_VISCOUS,  # motor side
     P_COULOMB,
     P_STATIC,
     P_STRIBECK_VELOCITY,
@@ -40,7 +40,7 @@ from __future__ import annotations
     P_STIFFNESS,
     P_STIFFNESS_CUBIC,
     P_DAMPING,
-    P_LOAD_VISCOUS,
+    P_LOAD_VISCOUS,  # of the whole viscous friction, the part behind the joint's spring
     P_GAP,
     P_GAIN_POSITIVE,
     P_GAIN_NEGATIVE,

@@ -160,6 +160,16 @@ def test_stribeck_and_viscous_shapes() -> None:
     assert thinning == pytest.approx(0.045 + 0.112 + 0.02 * math.sqrt(2.0), rel=1e-4)
 
 
+def test_a_map_holds_the_friction_of_both_sides_of_a_joint() -> None:
+    """Sliding steadily, motor and load together resist with what the map says, however viscous friction is shared."""
+    law = {"kind": "local", "sigma0": 950.0, "sigma1": 1.0, "viscous": 0.056}
+    points = {"velocities": (-0.5, -0.01, 0.01, 0.5), "torques": (-0.07, -0.07, 0.07, 0.07)}
+    for behind in (0.0, 0.03):
+        elastic = {"load_inertia": 5e8, "stiffness": 1e9, "load_viscous": behind}
+        motor = sliding_friction(0.3, friction={**law, **points}, joint_elasticity=elastic)
+        assert motor + behind * 0.3 == pytest.approx(0.07, rel=1e-6)
+
+
 @pytest.mark.parametrize("shape, factor", [("linear", 0.9), ("exponential", math.exp(-0.1))])
 def test_friction_follows_temperature(shape: str, factor: float) -> None:
     thermal = {"dry_per_c": -0.01, "viscous_per_c": -0.01, "reference_c": 25.0, "shape": shape, "ambient_c": 35.0}
