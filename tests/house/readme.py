@@ -1,13 +1,17 @@
 """The README's tables that come from the code. `python tests/house/readme.py` writes them anew.
 
-With the file of `servoctl bench --out FILE` as argument it writes the measured figures too.
+`--measure` first runs `servoctl bench` and `servoctl demo --fast` with the README's gain sets (a quarter of an hour on
+an idle machine) and writes what they print; `--bench FILE` and `--demo FILE` take documents that were kept (--json).
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import re
+import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,8 +19,29 @@ from typing import Any
 from servod.benchmark.table import GOALS
 from servod.benchmark.table import shown as shown_figure
 from servod.config import AxisConfig
+from servod.demo.entries import entries
 from servod.drivers.quirks import QUIRKS
 from servod.errors import FAULTS
+from servod.shipped import shipped
+
+#: Gain sets beside the four controllers in the README: the local law without each option and without any, with
+#: scheduled feedback, and Table I in both readings of its gain labels.
+BESIDE = (
+    "demo_local_no_observer",
+    "demo_local_measured",
+    "demo_local_plain",
+    "demo_local_stiff",
+    "table1_kz_kv_kx",
+    "table1_kx_kv_kz",
+)
+#: What the paper measured on its laboratory joint.
+PAPER_MRAD = {
+    "pd_dob": "0.6916",
+    "pd_lugre": "0.5006",
+    "local": "0.3781",
+    "table1_kz_kv_kx": "0.3781",
+    "table1_kx_kv_kz": "0.3781",
+}
 
 README = Path(__file__).resolve().parents[2] / "README.md"
 
@@ -111,13 +136,54 @@ def with_section(text: str, name: str, content: str) -> str:
     return pattern.sub(lambda m: f"{m[1]}{content}\n{m[2]}", text)
 
 
-def main(arguments: list[str]) -> None:
-    """Write the tables, and the measured figures when their file is given."""
+def demo_arguments() -> list[str]:
+    """The demo that the README's table of tracking errors comes from."""
+    return ["demo", "--fast", *(word for name in BESIDE for word in ("--gains", f"gains/{name}.yaml"))]
+
+
+def tracking(document: dict[str, Any]) -> str:
+    """Every row of the demo's table with the options of its law, beside what the paper measured on its joint."""
+    scores = document["controllers"] | document["others"]
+    rows = []
+    for row in entries([shipped(f"gains/{name}.yaml") for name in BESIDE]):
+        score = scores[row.name]
+        rms, largest = (f"{score[f'{kind}_error_mrad']:.3f}" for kind in ("rms", "max"))
+        name = row.name if row.name in document["others"] else f"demo_{row.name}"
+        rows.append([row.label if row.label != row.name else "", f"`{name}`", row.options, rms, largest])
+        rows[-1].append(PAPER_MRAD.get(row.name, ""))
+    header = ["Controller", "Gain set", "Options", "RMS / mrad", "Largest / mrad", "Paper, RMS / mrad"]
+    return f"    servoctl {' '.join(demo_arguments())}\n\n{markdown(header, rows)}"
+
+
+def printed(arguments: list[str], folder: str) -> dict[str, Any]:
+    """The JSON document of one command of servoctl."""
+    command = [sys.executable, "-m", "servod.cli", *arguments, "--json"]
+    if arguments[0] == "demo":
+        command += ["--out", folder]
+    document: dict[str, Any] = json.loads(
+        subprocess.run(command, stdout=subprocess.PIPE, cwd=README.parent, check=True).stdout
+    )
+    return document
+
+
+def main() -> None:
+    """Write the tables, and what was measured when that is asked for or given."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--measure", action="store_true", help="run both commands and write what they print")
+    parser.add_argument("--bench", type=Path, help="document of `servoctl bench --json`")
+    parser.add_argument("--demo", type=Path, help="document of the README's `servoctl demo --json`")
+    options = parser.parse_args()
+    documents = {name: json.loads(file.read_text()) for name in ("bench", "demo") if (file := getattr(options, name))}
+    if options.measure:
+        with tempfile.TemporaryDirectory(prefix="servod-readme-") as folder:
+            documents = {"demo": printed(demo_arguments(), folder), "bench": printed(["bench"], folder)}
     text = with_tables(README.read_text())
-    if arguments:
-        text = with_section(text, "measured", measured(json.loads(Path(arguments[0]).read_text())))
+    for name, document in documents.items():
+        text = with_section(text, name, MEASURED[name](document))
     README.write_text(text)
 
 
+MEASURED: dict[str, Callable[[dict[str, Any]], str]] = {"bench": measured, "demo": tracking}
+
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
 
+import pytest
 import readme
 import source
 
@@ -34,3 +40,16 @@ def test_the_two_commands_stand_in_it_and_run_on_their_own() -> None:
     assert "./demo" in commands and "./test" in commands
     for name in ("demo", "test"):
         assert (source.ROOT / name).stat().st_mode & 0o111
+
+
+@pytest.mark.serial
+def test_the_first_steps_work_as_they_stand(tmp_path: Path) -> None:
+    """Every line between the marks, by a shell that ends at the first error; the commands are those of this Python."""
+    (block,) = re.findall(r"<!-- walk -->\n(.*?)<!-- walk: end -->", TEXT, re.DOTALL)
+    (tmp_path / "gains").symlink_to(source.ROOT / "gains")
+    environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    shell = ["bash", "-e", "-c", "trap 'kill $(jobs -p) 2>/dev/null' EXIT\n" + textwrap.dedent(block)]
+    done = subprocess.run(shell, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=100)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.count("motion done") == 2
+    assert "open-loop position error" in done.stdout
