@@ -286,11 +286,6 @@ FAULTS: dict[FaultCode, Fault] = dict(
 )
 
 
-def strongest_reaction(fault_word: int) -> Reaction:
-    """The strongest reaction among the faults whose bits are set in `fault_word`."""
-    return max((f.reaction for f in FAULTS.values() if fault_word & f.bit), default=Reaction.NONE)
-
-
 def faults_in(fault_word: int) -> list[Fault]:
     """The rows of the fault table whose bits are set in `fault_word`, in table order."""
     return [f for f in FAULTS.values() if fault_word & f.bit]

@@ -23,7 +23,6 @@ Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 #: Lower case only: names become file names, also on systems that do not tell case apart.
 NAME_PATTERN = r"^[a-z0-9][a-z0-9_.-]{0,63}$"
 GainName = Annotated[str, Field(pattern=NAME_PATTERN)]
-SCHEMA_VERSION = 1
 
 
 class _Dumper(Dumper):

@@ -20,11 +20,6 @@ def rad_per_count(counts_per_turn: float) -> float:
     return TWO_PI / counts_per_turn
 
 
-def torque_nm_per_mille(rated_torque_mnm: float) -> float:
-    """Torque of one per mille of 0x6076, in N·m, when 0x6076 is in mN·m as CiA 402 says."""
-    return rated_torque_mnm / 1000.0 / PER_MILLE
-
-
 def wrapped_difference(new_counts: int, old_counts: int, measuring_range: int) -> int:
     """Shortest signed way from `old_counts` to `new_counts` on a counter that wraps at `measuring_range`.
 

@@ -94,10 +94,6 @@ class Entry:
             return self.raw
         return self.value.to_bytes(self.bits // 8, "little", signed=self.signed)
 
-    def in_range(self, value: int) -> bool:
-        """True when the EDS allows `value`."""
-        return self.low <= value <= self.high
-
 
 class Dictionary:
     """All entries of one node. `write_lock` is set while the drive is enabled: locked entries then refuse."""
