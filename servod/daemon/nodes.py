@@ -6,10 +6,12 @@ Around the loop, on top of the master.
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable, Sequence
 
 from servod.cia import CW_DISABLE_VOLTAGE, NmtCommand, NmtState, Obj402
+from servod.commands import Op
 from servod.daemon.status import NodeStatus
-from servod.errors import ServodError
+from servod.errors import FaultCode, ServodError, Unreachable
 from servod.master import BringUp, Master
 from servod.master.monitor import NodeEvent
 
@@ -60,6 +62,27 @@ class Nodes:
             }
             for role, plan in (("amplifier", self.plans.amplifier), ("encoder", self.plans.encoder))
         ]
+
+
+class FaultRelay:
+    """Node faults on their way to the loop; what its queue does not take now waits for the next round."""
+
+    def __init__(self, send: Callable[[Op, Sequence[float]], int]) -> None:
+        self._send = send
+        self._waiting: dict[FaultCode, None] = {}  # an ordered set
+
+    def add(self, fault: FaultCode) -> None:
+        """One more for the loop; one that still waits is not sent twice."""
+        self._waiting[fault] = None
+
+    def flush(self) -> None:
+        """Send what the queue takes, oldest first."""
+        try:
+            for fault in list(self._waiting):
+                self._send(Op.NODE_EVENT, (float(fault),))
+                del self._waiting[fault]
+        except Unreachable:
+            return
 
 
 def nmt_name(state: int | None) -> str:

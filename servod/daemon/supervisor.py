@@ -14,13 +14,12 @@ from typing import Any
 
 from servod import __version__
 from servod.axis import AxisState
-from servod.commands import Op
 from servod.config import AxisConfig
 from servod.daemon.control_server import ControlServer
 from servod.daemon.fault_watch import FaultWatch
 from servod.daemon.gain_bank import GainBank
 from servod.daemon.health import Health, Pulse
-from servod.daemon.nodes import Nodes
+from servod.daemon.nodes import FaultRelay, Nodes
 from servod.daemon.status import Status, axis_status, bus_status, drive_status, fault_status, motion_status
 from servod.daemon.verbs import Verbs
 from servod.errors import FAULTS, FaultCode, Unreachable
@@ -60,7 +59,7 @@ class Supervisor:
         self._started = time.monotonic()
         self._stopping = self._textfile_failed = False
         self._told_off = False
-        self._unsent: dict[FaultCode, None] = {}  # an ordered set: node faults that the loop has not taken yet
+        self._relay = FaultRelay(loop.send)
         self._fed_cycle = -1
         self._next_feed_ns = self._next_status_ns = self._next_textfile_ns = 0
         self._pulse = Pulse(config.cycle.period_us)
@@ -121,17 +120,8 @@ class Supervisor:
         for event in self._nodes.events():
             log.error("%s (%s)", event.text, event.fault.name)
             self._recorder.add_event("node", event.text, node_id=event.node_id, fault=event.fault.name)
-            self._unsent[event.fault] = None
-        self._send_node_faults()
-
-    def _send_node_faults(self) -> None:
-        """What the loop's queue does not take now waits for the next round."""
-        try:
-            for fault in list(self._unsent):
-                self._loop.send(Op.NODE_EVENT, (float(fault),))
-                del self._unsent[fault]
-        except Unreachable:
-            return
+            self._relay.add(event.fault)
+        self._relay.flush()
 
     def _switch_off_if_disobeyed(self, records: list[CycleRecord]) -> None:
         """The loop's goal OFF did not reach the drive: by SDO and NMT, once. A drive that answers neither holds this

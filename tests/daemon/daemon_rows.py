@@ -1,7 +1,10 @@
-"""Packed cycle records for tests of everything around the loop."""
+"""Packed cycle records and a configuration for tests of everything around the loop."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
+from servod.config import AxisConfig
 from servod.record import FIELDS, RECORD, CycleRecord
 
 _ZERO = CycleRecord._make(0 if f.kind == "q" else 0.0 for f in FIELDS)
@@ -22,3 +25,24 @@ def row(cycle: int = 0, **values: float) -> bytes:
 def rows(count: int, first: int = 0) -> list[bytes]:
     """`count` packed cycles with a position that names the cycle."""
     return [row(c, position_rad=c * 0.001) for c in range(first, first + count)]
+
+
+def axis_config(socket: Path, channel: Path) -> AxisConfig:
+    """An axis with these paths."""
+    limits = {
+        "torque_nm": 1,
+        "torque_rate_nm_per_s": 1,
+        "speed_rad_s": 1,
+        "position_min_rad": -1,
+        "position_max_rad": 1,
+        "following_error_rad": 1,
+        "encoder_mismatch_rad": 1,
+    }
+    return AxisConfig.model_validate(
+        {
+            "limits": limits,
+            "gains": {"initial": "x.yaml"},
+            "control": {"socket": str(socket)},
+            "bus": {"channel": str(channel)},
+        }
+    )

@@ -1,5 +1,6 @@
 """The daemon as a whole, over its control socket, with loop, bus and drive behind it."""
 
+import json
 import math
 import os
 import signal
@@ -109,6 +110,19 @@ def test_gain_sets_change_while_the_axis_runs_and_roll_back(client: ControlClien
 def test_scan_finds_both_nodes(client: ControlClient) -> None:
     nodes = client.call("scan")["nodes"]
     assert [(n["node_id"], n["identity"]["device_type"] & 0xFFFF) for n in nodes] == [(1, 402), (2, 406)]
+
+
+def test_scan_of_a_bus_that_a_daemon_owns_goes_through_the_daemon(axis: Running) -> None:
+    def scan(socket: Path) -> subprocess.CompletedProcess[str]:
+        bus = ["--interface", "virtual", "--channel", str(axis.folder / "bus")]
+        command = [sys.executable, "-m", "servod.cli", "scan", *bus, "--socket", str(socket), "--json"]
+        return subprocess.run(command, capture_output=True, text=True)
+
+    done = scan(axis.socket)
+    assert [node["node_id"] for node in json.loads(done.stdout)["nodes"]] == [1, 2]
+    refused = scan(axis.folder / "none.sock")
+    assert refused.returncode == 3
+    assert f"another servod (process {axis.daemon.pid}) owns it; ask it" in refused.stderr
 
 
 def test_second_daemon_is_refused_with_the_holder_and_leaves_the_first_alone(
