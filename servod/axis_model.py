@@ -14,6 +14,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from servod import axis_effects as fx
+from servod.errors import BadInput
 from servod.yaml12 import Strict, load_model
 
 NonNegative = Annotated[float, Field(ge=0.0)]
@@ -218,3 +219,15 @@ def wave_number(harmonic: fx.Harmonic) -> float:
 def load_axis_model(path: str | Path) -> AxisModel:
     """Read and check an axis model file. Raises BadInput (file, key, found, allowed)."""
     return load_model(path, AxisModel)
+
+
+def load_rotary_model(path: str | Path) -> AxisModel:
+    """An axis model for a drive that turns, real or virtual. Raises BadInput, also for a linear axis."""
+    return rotary(load_axis_model(path), str(path))
+
+
+def rotary(model: AxisModel, where: str) -> AxisModel:
+    """`model` itself; raises BadInput for a linear axis, whose N and m a drive would take for N*m and rad."""
+    if model.axis is not AxisKind.ROTARY:
+        raise BadInput(f"{where}: axis", model.axis.value, "rotary: drive, encoder and loop count turns")
+    return model

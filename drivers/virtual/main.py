@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from servod.axis_model import AxisModel, load_axis_model
+from servod.axis_model import load_rotary_model
 from servod.drivers.virtual.drive_record import DriveRecord
 from servod.drivers.virtual.on_can import CanServer, open_pair
 from servod.drivers.virtual.server import HubServer, Timing
@@ -63,7 +63,7 @@ def _settings(arguments: argparse.Namespace) -> VirtualAxisSettings:
 def _server(arguments: argparse.Namespace) -> HubServer | CanServer:
     """Everything built and bound, ready to run; raises ServodError."""
     settings = _settings(arguments)
-    model: AxisModel = load_axis_model(arguments.plant or shipped("gains/axes/demo_joint.yaml"))
+    model = load_rotary_model(arguments.plant or shipped("gains/axes/demo_joint.yaml"))
     record = DriveRecord(arguments.record) if arguments.record else None
     if arguments.can:
         return CanServer(settings, model, open_pair(arguments.can), record)

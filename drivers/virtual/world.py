@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 from typing import NamedTuple
 
-from servod.axis_model import AxisModel
+from servod.axis_model import AxisModel, rotary
 from servod.bus import BusCounters, Frame
 from servod.drivers.virtual.amplifier import AmplifierNode
 from servod.drivers.virtual.bus_faults import MYSELF, BusFault, FaultKind
@@ -40,13 +40,16 @@ class Truth(NamedTuple):
 
 
 class Devices:
-    """The amplifier, the encoder and the joint between them; `sender` gives each node its way to the bus."""
+    """The amplifier, the encoder and the joint between them; `build` gives each node its way to the bus.
+
+    Raises BadInput for the model of a linear axis.
+    """
 
     def __init__(
         self, settings: VirtualAxisSettings, model: AxisModel, timeline: Timeline, record: DriveRecord | None = None
     ) -> None:
         self.settings, self.timeline = settings, timeline
-        self.joint = Joint(model, settings.seed, settings.cycle_period_s)
+        self.joint = Joint(rotary(model, "plant"), settings.seed, settings.cycle_period_s)
         if settings.start_position_rad:
             self.joint.plant.place(settings.start_position_rad)
         self._record = record

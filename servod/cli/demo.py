@@ -44,7 +44,7 @@ def demo(
     as_json: JsonOption = False,
 ) -> None:
     """Run the demo."""
-    from servod.axis_model import load_axis_model
+    from servod.axis_model import load_rotary_model
     from servod.demo.axis import plant_file
     from servod.demo.entries import entries, further_files
     from servod.demo.runs import summary
@@ -53,7 +53,7 @@ def demo(
     # Everything that can be refused is refused before anything is started.
     further = gains or (further_files() if fast and plant is None else [])
     model, rows = plant_file(plant), entries(further)
-    load_axis_model(model)
+    load_rotary_model(model)
     recordings = out / "recordings"
     need_folder("--out", out if fast else recordings)
     started = time.monotonic()

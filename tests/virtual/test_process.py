@@ -67,7 +67,7 @@ def wait_for_state(amplifier: canopen.RemoteNode, masked: int) -> None:
 
 
 def test_canopen_scans_reads_configures_and_runs_the_axis(network: canopen.Network) -> None:
-    network.scanner.search(5)
+    network.scanner.search()
     time.sleep(0.3)
     assert network.scanner.nodes == [1, 2]
     amplifier = network.add_node(1, str(EDS / "amplifier.eds"))
@@ -240,12 +240,28 @@ def test_a_busy_bus_makes_send_fail_without_blocking(tmp_path: Path) -> None:
         running.process.communicate()
 
 
+def test_a_tool_waits_for_a_busy_bus(tmp_path: Path) -> None:
+    running = Axis(tmp_path, "--bit-rate", "50000")
+    frame = can.Message(arbitration_id=0x7FF, data=bytes(8), is_extended_id=False)
+    try:
+        with can.Bus(interface="servod_virtual", channel=str(running.bus)) as bus:
+            for _ in range(300):
+                bus.send(frame)
+            with pytest.raises(can.CanOperationError, match="queue full"):
+                for _ in range(2000):
+                    bus.send(frame, timeout=0.0)
+    finally:
+        running.process.kill()
+        running.process.communicate()
+
+
 @pytest.mark.parametrize(
     ("options", "code", "named"),
     [
         (["--can", "nosuchcan0"], 3, "nosuchcan0"),
         (["--socket", "{folder}/no/such/folder/bus"], 2, "no/such/folder"),
         (["--socket", "{folder}/bus", "--plant", "{folder}/missing.yaml"], 2, "missing.yaml"),
+        (["--socket", "{folder}/bus", "--plant", "{folder}/slide.yaml"], 2, "slide.yaml: axis: found linear"),
         (["--socket", "{folder}/bus", "--settings", "{folder}/settings.yaml"], 2, "rated_torque_mnm"),
         (["--socket", "{folder}/bus", "--seed", "-1"], 2, "seed"),
         (["--socket", "{folder}/bus", "--encoder-node-id", "1"], 2, "node_id"),
@@ -254,6 +270,7 @@ def test_a_busy_bus_makes_send_fail_without_blocking(tmp_path: Path) -> None:
 )
 def test_bad_input_is_one_line(tmp_path: Path, options: list[str], code: int, named: str) -> None:
     (tmp_path / "settings.yaml").write_text("rated_torque: 100\n")
+    (tmp_path / "slide.yaml").write_text("axis: linear\ninertia: 9\nfriction: {kind: coulomb_viscous}\n")
     command = [sys.executable, "-m", "servod.drivers.virtual.main", *(o.format(folder=tmp_path) for o in options)]
     result = subprocess.run(command, capture_output=True, text=True, timeout=30)
     assert result.returncode == code
