@@ -21,6 +21,9 @@ from servod.models.plant import INNER_STEP_S, rest_state
 
 Array = NDArray[np.float64]
 
+#: Room for a law's state, which no law fills.
+LAW_STATES = 16
+
 
 @dataclass(frozen=True, slots=True)
 class LoopSettings:
@@ -44,7 +47,7 @@ class ClosedLoopRun:
     """One simulated motion, a value for each sample; torques in N*m, positions in rad.
 
     `position_rad` is the true joint (load) position, `encoder_rad` what the law saw, `velocity_rad_s` the filtered
-    velocity that it saw. `parameters` and `state` are the plant's at the end.
+    velocity that it saw. `state` is the plant's at the end (`servod.models.layout`).
     """
 
     t_s: Array
@@ -71,7 +74,6 @@ def simulate_closed_loop(
     reference: Array,
     settings: LoopSettings | None = None,
     *,
-    n_law_states: int = 16,
     external_nm: Array | None = None,
     start: tuple[float, float, float] | None = None,
 ) -> ClosedLoopRun:
@@ -82,31 +84,24 @@ def simulate_closed_loop(
     """
     settings = settings or LoopSettings()
     reference = np.ascontiguousarray(reference, dtype=np.float64)
+    external = np.zeros(len(reference)) if external_nm is None else np.asarray(external_nm, dtype=np.float64)
     delay_s = model.total_delay_s if settings.delay_s is None else settings.delay_s
     steps = max(1, math.ceil(settings.period_s / settings.inner_step_s - 1e-9))
-    state = np.array(rest_state(delay_s, settings.period_s / steps, model.start_temperature_c))
-    position, velocity, bristle = start if start is not None else (float(reference[0, 0]), 0.0, 0.0)
-    state[[S_POSITION, S_LOAD_POSITION]] = position
-    state[[S_VELOCITY, S_LOAD_VELOCITY]] = velocity
-    state[S_BRISTLE] = bristle
+    state = _start_state(model, start or (float(reference[0, 0]), 0.0, 0.0), delay_s, settings.period_s / steps)
     out = np.zeros((len(reference), len(closed_loop.OUTPUTS)))
-    external = np.zeros(len(reference)) if external_nm is None else np.asarray(external_nm, dtype=np.float64)
     kernel = compiled(closed_loop.run, control_law=law) if available() else bound(closed_loop.run, control_law=law)
-    kernel(
-        np.array(model.pack()),
-        state,
-        np.array(gains, dtype=np.float64),
-        np.zeros(n_law_states),
-        reference,
-        external,
-        out,
-        settings.period_s,
-        steps,
-        delay_s,
-        settings.resolution_rad,
-        settings.velocity_cutoff_hz,
-        settings.torque_limit_nm,
-    )
+    loop = np.array(gains, dtype=np.float64), np.zeros(LAW_STATES)
+    around = settings.resolution_rad, settings.velocity_cutoff_hz, settings.torque_limit_nm
+    kernel(np.array(model.pack()), state, *loop, reference, external, out, settings.period_s, steps, delay_s, *around)
     columns = {name: out[:, i] for i, name in enumerate(closed_loop.OUTPUTS)}
     t_s: Array = np.arange(len(reference), dtype=np.float64) * settings.period_s
     return ClosedLoopRun(t_s=t_s, reference_rad=reference[:, 0], state=state, **columns)
+
+
+def _start_state(model: AxisModel, start: tuple[float, float, float], delay_s: float, step_s: float) -> Array:
+    """The plant's state at (position, velocity, bristle deflection), motor and load together."""
+    state = np.array(rest_state(delay_s, step_s, model.start_temperature_c))
+    state[[S_POSITION, S_LOAD_POSITION]] = start[0]
+    state[[S_VELOCITY, S_LOAD_VELOCITY]] = start[1]
+    state[S_BRISTLE] = start[2]
+    return state
