@@ -16,6 +16,8 @@ from servod.drivers.virtual.client import STAMPED_FRAME, connect
 from servod.errors import Unreachable
 
 _ID_MASK = 0x1FFFFFFF
+#: How long `send` waits for a full queue unless told: a full one is empty again within some 10 ms at 1 Mbit/s.
+SEND_TIMEOUT_S = 1.0
 
 
 class VirtualAxisBus(can.BusABC):
@@ -32,15 +34,27 @@ class VirtualAxisBus(can.BusABC):
         super().__init__(channel=channel, can_filters=can_filters, **kwargs)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Send one message; raises can.CanOperationError when the hub's queue stays full for `timeout` s."""
+        """Send one message; raises can.CanOperationError when the hub's queue stays full for `timeout` s.
+
+        Without a time it waits for SEND_TIMEOUT_S, so that tools may send many frames at once.
+        """
         flags = (CAN_EFF_FLAG if msg.is_extended_id else 0) | (CAN_RTR_FLAG if msg.is_remote_frame else 0)
         packet = CAN_FRAME.pack(msg.arbitration_id | flags, msg.dlc, bytes(msg.data))
+        deadline = time.monotonic() + (SEND_TIMEOUT_S if timeout is None else timeout)
         try:
-            if not select.select((), (self._socket,), (), timeout or 0.0)[1]:
-                raise can.CanOperationError("transmit queue full")
-            self._socket.send(packet)
+            while not self._send_now(packet):
+                if not select.select((), (self._socket,), (), max(0.0, deadline - time.monotonic()))[1]:
+                    raise can.CanOperationError("transmit queue full")
         except OSError as error:
             raise can.CanOperationError(f"virtual bus: {error.strerror}") from None
+
+    def _send_now(self, packet: bytes) -> bool:
+        """Whether the socket took the packet."""
+        try:
+            self._socket.send(packet)
+        except BlockingIOError:
+            return False
+        return True
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         """The next message within `timeout` s (None: for ever); filtering is left to python-can."""
