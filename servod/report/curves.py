@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 
 Series = NDArray[np.float64]
 
-#: A screen is some thousand pixels wide; more points than this cannot be seen.
-_POINTS = 4000
+#: Lowest and highest for each of 900 columns, about a pixel each; more points than this cannot be seen.
+_POINTS = 1800
+#: Above the curves: beside them, its width would depend on the names in it.
+_LEGEND = {"orientation": "h", "x": 0.0, "xanchor": "left", "y": 1.0, "yanchor": "bottom"}
 
 
 def thin(time_s: Series, values: Series, points: int = _POINTS) -> tuple[Series, Series]:
@@ -35,14 +37,19 @@ def _extremes(values: Series, first: int, last: int) -> list[int]:
 
 
 def time_curves(time_s: Series, curves: Mapping[str, Series], title: str, unit: str) -> go.Figure:
-    """Several series over the same time axis; `unit` labels the vertical one."""
+    """Several series over the same time axis; `unit` labels the vertical one.
+
+    Drawn as SVG: browsers allow a page only a few WebGL contexts and blank the rest, some have none. The margins stay
+    as they are whatever the labels, so that equal times stand below each other in all figures.
+    """
     figure = go.Figure()
     for name, values in curves.items():
         x, y = thin(time_s, np.asarray(values, dtype=np.float64))
-        figure.add_scattergl(
-            x=x.astype(np.float32), y=y.astype(np.float32), name=name, mode="lines", line={"width": 1.2}
-        )
-    figure.update_layout(title=title, xaxis_title="time in s", yaxis_title=unit, height=380, hovermode="x unified")
+        figure.add_scatter(x=x.astype(np.float32), y=y.astype(np.float32), name=name, mode="lines", line={"width": 1.2})
+    figure.update_layout(title=title, height=400, hovermode="x unified", showlegend=True, legend=_LEGEND)
+    span_s = [float(time_s[0]), float(time_s[-1])] if len(time_s) else None
+    figure.update_xaxes(title="time in s", range=span_s, automargin=False)
+    figure.update_yaxes(title=unit, automargin=False)
     return figure
 
 

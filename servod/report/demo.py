@@ -6,10 +6,13 @@ Behind servod.demo; needs the lab part.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import plotly.graph_objects as go
+from plotly.colors import qualitative
 
 from servod.demo.entries import Entry
 from servod.demo.runs import SETTLE_S, Run
@@ -17,6 +20,17 @@ from servod.report.curves import histogram, time_curves
 from servod.report.page import Page
 
 Labels = Mapping[str, str]
+
+#: Errors below this share of the worst cannot be told apart beside it; they get a picture of their own.
+_FINE = 0.1
+
+#: What the legend of the torque figures means.
+_PARTS = (
+    "The torque sent to the drive is the sum of three parts, after the limits: PD feedback, from the tracking error; "
+    "friction model, what the law's own model of friction asks for; observer and feed-forward, the estimate of a "
+    "disturbance observer, which is where PD + DOB compensates friction, and the inertia's part of the reference. A "
+    "part that a law does not have is not drawn."
+)
 
 
 class Story(NamedTuple):
@@ -33,6 +47,9 @@ def write_demo_page(rows: Sequence[Entry], runs: Sequence[Run], path: Path, stor
     labels = {row.name: row.label for row in rows}
     _say(page, labels, runs, story)
     _compare(page, rows, runs)
+    _show_errors(page, rows, runs)
+    page.heading("Positions and torques")
+    page.sentence(_PARTS)
     for run in runs:
         _show(page, labels[run.controller], run)
     if not story.stepped:
@@ -83,12 +100,32 @@ def _compare(page: Page, rows: Sequence[Entry], runs: Sequence[Run]) -> None:
             ]
         )
     page.table(["controller", "options", "RMS error / mrad", "largest error / mrad", "cycles", "missed"], cells)
+
+
+def _show_errors(page: Page, rows: Sequence[Entry], runs: Sequence[Run]) -> None:
+    """All errors on one scale, and then the small ones on theirs; a controller keeps its colour."""
     page.heading("Tracking errors")
-    figure = time_curves(runs[0].time_s, {}, "Reference minus encoder position", "mrad")
-    for row, run in zip(rows, runs, strict=True):
-        part = time_curves(run.time_s, {row.label: run.error_mrad}, "", "")
-        figure.add_traces(part.data)
-    page.figure(figure)
+    shown = list(zip(rows, runs, strict=True))
+    colours = dict(zip((row.name for row in rows), cycle(qualitative.Plotly), strict=False))
+    page.figure(_errors(shown, "Reference minus encoder position", colours))
+    limit_mrad = _FINE * max(run.score().rms_error_mrad for run in runs)
+    fine = [(row, run) for row, run in shown if run.score().rms_error_mrad < limit_mrad]
+    if fine:
+        page.sentence("Large errors hide the small ones; here those below a tenth of the worst stand by themselves.")
+        left_out = " and ".join(row.label for row, run in shown if run.score().rms_error_mrad >= limit_mrad)
+        page.figure(_errors(fine, f"The same without {left_out}", colours))
+
+
+def _errors(shown: Sequence[tuple[Entry, Run]], title: str, colours: Mapping[str, str]) -> go.Figure:
+    figure = time_curves(shown[0][1].time_s, {}, title, "mrad")
+    for row, run in shown:
+        figure.add_traces(time_curves(run.time_s, {row.label: run.error_mrad}, "", "").data)
+        figure.data[-1].line.color = colours[row.name]
+    # The first second is not scored; it may leave the picture, so that it does not set the scale.
+    scored = [run.error_mrad[run.time_s >= SETTLE_S] for _, run in shown]
+    reach = 1.1 * max(float(abs(error).max(initial=0.0)) for error in scored)
+    figure.update_yaxes(range=[-reach, reach] if reach > 0.0 else None)
+    return figure
 
 
 def _show(page: Page, label: str, run: Run) -> None:
@@ -98,10 +135,10 @@ def _show(page: Page, label: str, run: Run) -> None:
         time_curves(time_s, {"reference": rows["reference_rad"], "encoder": rows["position_rad"]}, "Position", "rad")
     )
     parts = {
-        "sent": rows["torque_nm"],
-        "feedback": rows["torque_feedback_nm"],
-        "friction compensation": rows["torque_friction_nm"],
-        "other": rows["torque_other_nm"],
+        "sent to the drive": rows["torque_nm"],
+        "PD feedback": rows["torque_feedback_nm"],
+        "friction model": rows["torque_friction_nm"],
+        "observer and feed-forward": rows["torque_other_nm"],
     }
     page.figure(time_curves(time_s, {k: v for k, v in parts.items() if np.any(v)}, "Torque and its parts", "N·m"))
 

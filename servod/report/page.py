@@ -50,7 +50,7 @@ class Page:
     def figure(self, figure: go.Figure) -> None:
         """Add a plotly figure."""
         self._has_figure = True
-        figure.update_layout(template="plotly_white", margin={"l": 60, "r": 20, "t": 40, "b": 50})
+        figure.update_layout(template="plotly_white", margin={"l": 70, "r": 20, "t": 75, "b": 50})
         self._parts.append(
             plotly.io.to_html(figure, full_html=False, include_plotlyjs=False, config={"displaylogo": False})
         )

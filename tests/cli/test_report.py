@@ -12,7 +12,7 @@ from servod.demo.axis import CONTROLLERS
 from servod.demo.entries import entries
 from servod.demo.runs import ROW, Run, cut_motion, summary
 from servod.errors import AnswerIsNo, BadInput
-from servod.report.curves import thin
+from servod.report.curves import thin, time_curves
 from servod.report.demo import Story, write_demo_page
 from servod.shipped import shipped
 
@@ -105,7 +105,7 @@ def test_thinning_keeps_ends_and_peaks() -> None:
     y = np.sin(40.0 * t)
     y[31_337], y[70_001] = 9.0, -8.0
     x, thinned = thin(t, y)
-    assert len(x) <= 4000
+    assert len(x) <= 1800
     assert (thinned.max(), thinned.min()) == (9.0, -8.0)
     assert np.all(np.diff(x) > 0.0)
 
@@ -123,3 +123,32 @@ def test_the_page_is_whole_and_needs_no_network(tmp_path: Path, stepped: bool) -
     assert not re.search(r"<(script|link|img)[^>]*(src|href)=", text)
     assert "<h1>servod demo" in body and "cdn.plot.ly" not in body
     assert list(page.parent.iterdir()) == [page]
+
+
+def test_curves_need_no_webgl_and_make_a_small_page(tmp_path: Path) -> None:
+    run = cut_motion("pd", recorded(0.001, seconds=30.0).tobytes())
+    figure = time_curves(run.time_s, {"error": run.error_mrad}, "Error", "mrad")
+    assert [trace.type for trace in figure.data] == ["scatter"]
+    page = tmp_path / "report.html"
+    rows = entries()
+    write_demo_page(rows, [Run(row.name, run.rows) for row in rows], page, Story("joint", True))
+    assert page.stat().st_size < 6e6
+
+
+def test_good_controllers_are_shown_apart_from_pd(tmp_path: Path) -> None:
+    runs = [cut_motion(c, recorded(0.1 if c == "pd" else 0.001).tobytes()) for c in CONTROLLERS]
+    page = tmp_path / "report.html"
+    write_demo_page(entries(), runs, page, Story("joint", True))
+    with_pd, without = page.read_text().split("Tracking errors</h2>")[1].split('class="plotly-graph-div"')[1:3]
+    assert re.findall(r'"name":"([^"]*)"', with_pd) == ["PD", "PD + DOB", "PD + LuGre", "Local models"]
+    assert re.findall(r'"name":"([^"]*)"', without) == ["PD + DOB", "PD + LuGre", "Local models"]
+    assert re.search(r'"range":\[-1\.1\d*,1\.1\d*\]', without)
+
+
+def test_equal_times_stand_below_each_other(tmp_path: Path) -> None:
+    runs = [cut_motion(c, recorded(0.001).tobytes()) for c in CONTROLLERS]
+    page = tmp_path / "report.html"
+    write_demo_page(entries(), runs, page, Story("joint", True))
+    axes = re.findall(r'"xaxis":\{.*?"range":(\[[^]]*\])', page.read_text().split("</script></head>")[1])
+    assert len(axes) == 1 + 2 * len(runs)
+    assert len(set(axes)) == 1
