@@ -12,6 +12,7 @@ import pytest
 from servod.cli.app import run
 from servod.control import ControlClient
 from servod.demo.axis import demo_config, gains_file, plant_file
+from servod.demo.processes import child, wait_until
 from servod.demo.wall import running_axis
 
 pytestmark = pytest.mark.serial
@@ -144,9 +145,16 @@ def test_scan_lists_both_nodes(servoctl: Servoctl) -> None:
     assert "CiA 402" in text and "CiA 406" in text
 
 
-def test_scan_asks_the_bus_itself_where_no_daemon_is(axis: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    bus = axis.parent / "bus"
-    assert run(["scan", "--interface", "virtual", "--channel", str(bus), "--json"]) == 0
+def test_scan_asks_the_bus_itself_where_no_daemon_is(
+    axis: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["scan", "--interface", "virtual", "--json", "--channel"]
+    assert run([*words, str(axis.parent / "bus")]) == 3
+    assert "another servod" in capsys.readouterr().err
+    bus, log = tmp_path / "bus", tmp_path / "virtual-axis.log"
+    with child("servod.drivers.virtual.main", ["--socket", str(bus), "--plant", str(plant_file(None))], log) as alone:
+        wait_until(bus.exists, alone, log, 20.0)
+        assert run([*words, str(bus)]) == 0
     nodes = json.loads(capsys.readouterr().out)["nodes"]
     assert [node["node_id"] for node in nodes][:2] == [1, 2]
 
