@@ -12,11 +12,11 @@ import typer
 
 from servod.cli.common import JsonOption, example, print_json
 from servod.errors import BadInput
-from servod.models.start import Start
 
 if TYPE_CHECKING:
     from servod.axis_model import AxisModel
     from servod.models.replay import Replay
+    from servod.models.start import Start
     from servod.recordings import Recording
 
 EXAMPLE = "servoctl replay --model model.yaml run.csv.gz --horizon 0.25 --out sim.csv"
@@ -34,13 +34,14 @@ def replay(
     map_file: Annotated[Path | None, typer.Option("--map", help="Renames and scales foreign columns (YAML).")] = None,
     out: Annotated[Path | None, typer.Option(help="Write t_s, position and velocity here (.csv or .parquet).")] = None,
     start: Annotated[
-        Start, typer.Option(help="First row: at rest, as recorded, or at rest where it stands or was just set off.")
-    ] = Start.AUTO,
+        str, typer.Option(help="First row: rest, recorded, or auto (at rest where it stands or was just set off).")
+    ] = "auto",
     as_json: JsonOption = False,
 ) -> None:
     """Simulate MODEL under the torque of REC and report the open-loop position error."""
     horizon_s = parse_horizon(horizon)
     check_out(out)
+    first = parse_start(start)
     from servod.axis_model import load_axis_model
     from servod.models.replay import replay as simulate
     from servod.recordings import load_recording
@@ -49,7 +50,7 @@ def replay(
     recorded = load_recording(recording, map_file)
     if recorded.axis is not axis.axis:
         raise BadInput(f"{model}: axis", axis.axis.value, f"{recorded.axis.value}, as the columns of {recording} say")
-    result = simulate(axis, recorded.drive, horizon_s, start=start)
+    result = simulate(axis, recorded.drive, horizon_s, start=first)
     if out is not None:
         write_simulation(out, recorded, result)
     document = summary(recorded, axis, result, horizon_s)
@@ -70,6 +71,15 @@ def parse_horizon(text: str) -> float | None:
     if not 1e-3 <= seconds < 1e6:
         raise BadInput("--horizon", repr(text), "seconds from 0.001 up, or full")
     return seconds
+
+
+def parse_start(text: str) -> Start:
+    """What the first row is taken for. Raises BadInput."""
+    from servod.models.start import Start
+
+    if text not in set(Start):
+        raise BadInput("--start", repr(text), ", ".join(Start))
+    return Start(text)
 
 
 def check_out(out: Path | None) -> None:

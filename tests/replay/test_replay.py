@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from servod.axis_model import AxisModel
 from servod.cli.app import run
@@ -137,7 +138,7 @@ def test_the_command_before_the_first_row() -> None:
     t = np.arange(200) * 1e-3
     moved = np.where(t > 0.003, 10.0 * np.clip(t - 0.003, 0.0, None) ** 2, 0.0)
 
-    def before(torque: np.ndarray, position: np.ndarray) -> float:
+    def before(torque: NDArray[np.float64], position: NDArray[np.float64]) -> float:
         return first_row(Start.AUTO, t, torque, position, smoothed_motion(t, position)).command_before
 
     assert before(np.full(200, 0.2), moved) == 0.0
@@ -236,6 +237,7 @@ def test_command_says_what_it_did_at_gaps_and_at_the_start(
         (["--horizon", "soon"], "--horizon"),
         (["--horizon", "-1"], "--horizon"),
         (["--horizon", "nan"], "--horizon"),
+        (["--start", "moving"], "auto, rest, recorded"),
         (["--out", "sim.xlsx"], ".csv or .parquet"),
         (["--out", "/no/such/folder/sim.csv"], "no such folder"),
         (["--map", "none.yaml"], "none.yaml"),
