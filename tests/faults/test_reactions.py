@@ -76,7 +76,13 @@ def limited(name: str, value: float) -> AxisConfig:
 
 #: What happens, which faults may name it, and within how many milliseconds the joint must feel no torque.
 CASES = {
-    "torque frames lost": (lambda a: inject(a, BusFault(FaultKind.DROP, RPDO1, ALWAYS)), None, 300),
+    # The longest chain: the drive misses its RPDO1 (EMCY 8250), does not hear "off" either, and is left to its own
+    # heartbeat consumer: 0.15 s, 0.1 s and 0.15 s one after the other.
+    "torque frames lost": (
+        lambda a: inject(a, BusFault(FaultKind.DROP, RPDO1, ALWAYS)),
+        {FaultCode.DRIVE_STAYS_POWERED},
+        500,
+    ),
     "encoder silent": (
         lambda a: inject(a, BusFault(FaultKind.SILENT, amount=5000, participant=ENCODER)),
         {FaultCode.FEEDBACK_STALE},
