@@ -158,7 +158,7 @@ FAULTS: dict[FaultCode, Fault] = dict(
         _row(
             _C.ENCODER_ALARM,
             _R.DISABLE,
-            "The encoder reports an alarm (CiA 406, 0x6503).",
+            "The encoder reports an alarm (CiA 406, 0x6503), or its alarm word comes no more.",
             "Read 0x6503 with `servoctl status`; check supply and mounting of the encoder.",
         ),
         _row(
