@@ -1,4 +1,4 @@
-"""Turns a recording into CSV (core) or Parquet (with pyarrow, of the lab extra), with the column names that servod.recordings reads.
+"""Turns a recording into CSV (core) or Parquet (pyarrow, lab extra), with the column names of servod.recordings.
 
 Behind recorder_read. The first column is t_s, seconds since the first cycle; the others keep the record's names, which
 carry their units. Files are written aside, synced and renamed.
