@@ -23,6 +23,7 @@ from typing import Any
 
 SITE = Path("/usr/local/lib/python3.11/dist-packages")
 UNIT, SOCKET = "servod@guest.service", "/run/servod/guest.sock"
+DRIVE_RECORD = "/run/servod/drive.bin"
 PROGRAMS = {
     "servod": "servod.daemon.main",
     "servoctl": "servod.cli",
@@ -46,7 +47,7 @@ metrics: {textfile: /var/lib/servod/metrics/guest.prom}
 VIRTUAL_AXIS_DROP_IN = """
 [Service]
 ExecStart=
-ExecStart=/usr/bin/env servod-virtual-axis --can vcan0 --plant /etc/servod/axes/demo_joint.yaml
+ExecStart=/usr/bin/env servod-virtual-axis --can vcan0 --plant /etc/servod/axes/demo_joint.yaml --record {record}
 """
 #: Runs in the daemon's own sandbox, before it.
 FAMILIES_DROP_IN = """
@@ -123,7 +124,7 @@ def install() -> dict[str, Any]:
     shell("/opt/servod-source/systemd/install.sh")
     Path("/etc/servod/config/guest.yaml").write_text(CONFIG)
     Path("/usr/local/lib/servod-families.py").write_text(FAMILIES_PROBE)
-    drop_in("servod-virtual-axis.service", VIRTUAL_AXIS_DROP_IN)
+    drop_in("servod-virtual-axis.service", VIRTUAL_AXIS_DROP_IN.format(record=DRIVE_RECORD))
     drop_in("servod@.service", FAMILIES_DROP_IN)
     shell("useradd", "--groups", "servod", "fitter")
     shell("useradd", "stranger")
@@ -211,8 +212,32 @@ def watchdog() -> dict[str, Any]:
 
 
 def supervisor_killed() -> dict[str, Any]:
-    """kill -9 of the supervisor."""
-    return recover(lambda: os.kill(int(prop("MainPID")), signal.SIGKILL))
+    """kill -9 of the supervisor while the axis moves: the loop brakes, ramps down and switches off by itself."""
+    killed_ns = 0
+
+    def hit() -> None:
+        nonlocal killed_ns
+        with client() as connection:
+            connection.call("track", kind="sine", amplitude_rad=0.3, frequency_hz=0.5, duration_s=60.0)
+            time.sleep(2)
+            killed_ns = time.monotonic_ns()
+            os.kill(int(prop("MainPID")), signal.SIGKILL)
+
+    return {**recover(hit), **how_it_stopped(killed_ns)}
+
+
+def how_it_stopped(since_ns: int) -> dict[str, Any]:
+    """The drive's own record: its states since then, and its torque before and when operation ended."""
+    from servod.drivers.virtual.drive_record import read_drive_record
+
+    samples = read_drive_record(DRIVE_RECORD)
+    after = [s for s in samples if s.time_ns >= since_ns]
+    enabled = [s for s in after if s.state.name == "OPERATION_ENABLED"]
+    return {
+        "drive_states": list(dict.fromkeys(s.state.name for s in after)),
+        "torque_before_nm": max(abs(s.torque_demand_nm) for s in samples if s.time_ns < since_ns),
+        "torque_at_end_nm": abs(enabled[-1].torque_demand_nm),
+    }
 
 
 def loop_killed() -> dict[str, Any]:

@@ -58,6 +58,14 @@ def test_daemon_comes_back_disabled(results: Results, step: str) -> None:
     assert recovered["axis"] == "DISABLED"
 
 
+def test_loop_outlives_its_supervisor_and_ramps_the_torque_down(results: Results) -> None:
+    killed = _of(results, "supervisor_killed")
+    assert killed["torque_before_nm"] > 0.05
+    assert killed["torque_at_end_nm"] < 0.02
+    assert killed["drive_states"][0] == "OPERATION_ENABLED"
+    assert not {"FAULT", "FAULT_REACTION_ACTIVE", "QUICK_STOP_ACTIVE"} & set(killed["drive_states"])
+
+
 def test_watchdog_and_lost_loop_are_told(results: Results) -> None:
     assert _of(results, "watchdog")["journal"]
     assert _of(results, "loop_killed")["told"]
