@@ -14,7 +14,7 @@ LAYERS: list[set[str]] = [
     {"hal", "cia", "clock", "commands", "config", "record", "realtime", "bus"},
     {"axis_effects", "axis_model", "axis_pack", "models", "controllers", "gain_parameters", "gains", "gain_store"},
     {"drivers", "limits", "axis", "references"},
-    {"master", "recorder_mcap", "recorder_read", "recorder_history", "recorder_export", "recordings"},
+    {"master", "recorder_mcap", "recorder_read", "recorder_history", "recorder_files", "recorder_export", "recordings"},
     {"loop", "control", "recorder", "metrics"},
     {"daemon", "session", "replay"},
     {"demo"},
