@@ -8,27 +8,55 @@ from bisect import bisect_right
 from collections.abc import Iterable
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 from servod.errors import BadInput
+from servod.loop.channel import TRAJECTORY_SAMPLES
 from servod.yaml12 import read_text
 
 COLUMNS = ("t_s", "reference_rad")
+#: Spreadsheets begin UTF-8 files with it.
+_BYTE_ORDER_MARK = "\ufeff"
 
 
-def read_motion(path: Path, period_s: float) -> list[float]:
-    """Positions in rad, one for each period, linear between the file's samples; raises BadInput (file, column, row)."""
+class MotionFile(NamedTuple):
+    """The samples of a file, times in s that grow and positions in rad."""
+
+    path: Path
+    times: list[float]
+    positions: list[float]
+
+    def on_grid(self, period_s: float) -> list[float]:
+        """Positions in rad, one for each period, linear between the samples.
+
+        Raises BadInput when the motion is shorter than a period or longer than the loop's memory.
+        """
+        length_s, longest_s = self.times[-1] - self.times[0], (TRAJECTORY_SAMPLES - 1) * period_s
+        if not period_s <= length_s * (1.0 + 1e-9):
+            raise BadInput(f"{self.path}: t_s", f"{length_s:g} s in all", f"at least one period of {period_s:g} s")
+        if not length_s <= longest_s * (1.0 + 1e-9):
+            raise BadInput(f"{self.path}: t_s", f"{length_s:g} s in all", _longest(longest_s, period_s))
+        count = math.floor(length_s / period_s + 1e-6) + 1
+        return [_at(self.times, self.positions, self.times[0] + k * period_s) for k in range(count)]
+
+
+def _longest(longest_s: float, period_s: float) -> str:
+    return f"at most {longest_s:g} s, which is {TRAJECTORY_SAMPLES} samples at one for each {period_s:g} s"
+
+
+def read_motion(path: Path) -> MotionFile:
+    """The motion in `path`; raises BadInput (file, column, row)."""
     times, positions = _columns(path)
     if len(times) < 2:
         raise BadInput(f"{path}: t_s", f"{len(times)} rows", "at least 2 rows")
-    count = math.floor((times[-1] - times[0]) / period_s + 1e-9) + 1
-    if count < 2:
-        raise BadInput(f"{path}: t_s", f"{times[-1] - times[0]} s in all", f"more than one period of {period_s} s")
-    return [_at(times, positions, times[0] + k * period_s) for k in range(count)]
+    return MotionFile(path, times, positions)
 
 
 def _columns(path: Path) -> tuple[list[float], list[float]]:
-    lines = (line for line in read_text(path).splitlines() if line.strip() and not line.startswith("#"))
-    reader = csv.DictReader(lines)
+    text = read_text(path).removeprefix(_BYTE_ORDER_MARK)
+    reader = csv.DictReader(line for line in text.splitlines() if line.strip() and not line.startswith("#"))
+    if any(";" in name for name in reader.fieldnames or ()):
+        raise BadInput(f"{path}: separator", "`;`", "`,` between columns, and a point in numbers")
     missing = [c for c in COLUMNS if c not in (reader.fieldnames or ())]
     if missing:
         found = ", ".join(map(str, reader.fieldnames or ())) or "an empty file"

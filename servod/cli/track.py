@@ -1,25 +1,34 @@
-"""`servoctl track`: run a reference motion on the enabled axis and wait for its end; Ctrl-C stops it."""
+"""`servoctl track`: run a reference motion on the enabled axis and wait for its end; Ctrl-C or SIGTERM stops it."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, connect, example, report
+from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, connect, example, report
 from servod.errors import AnswerIsNo
 
 if TYPE_CHECKING:
     from servod.control import ControlClient
 
+#: Told how far a motion is: seconds since its start, and the status document's motion.
+Tell = Callable[[float, dict[str, Any]], None]
+
+#: The longest period that a configuration may have (servod.config.CycleConfig).
+LONGEST_PERIOD_US = 20_000
 _POLL_S = 0.1
 _app = typer.Typer(
     help=example("Run a reference motion from where the axis stands.", "servoctl track paper --duration 30"),
     rich_markup_mode=None,
 )
-_Wait = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait for the end; Ctrl-C then stops the axis.")]
+_Wait = Annotated[
+    bool, typer.Option("--wait/--no-wait", help="Wait for the end; Ctrl-C or SIGTERM then stops the axis.")
+]
 _Duration = Annotated[float, typer.Option(min=0.001, help="Duration in s.")]
 
 
@@ -39,7 +48,7 @@ def sine(
 ) -> None:
     """Track a sine."""
     motion = {"kind": "sine", "amplitude_rad": amplitude, "frequency_hz": frequency, "duration_s": duration}
-    _track(socket, motion, wait, as_json)
+    _track(socket, motion, duration, wait, as_json)
 
 
 @_app.command(
@@ -52,7 +61,7 @@ def paper(
     as_json: JsonOption = False,
 ) -> None:
     """Track trajectory (19)."""
-    _track(socket, {"kind": "paper", "duration_s": duration}, wait, as_json)
+    _track(socket, {"kind": "paper", "duration_s": duration}, duration, wait, as_json)
 
 
 @_app.command(help=example("A step of the reference.", "servoctl track step --amplitude 0.01 --duration 2"))
@@ -64,7 +73,7 @@ def step(
     as_json: JsonOption = False,
 ) -> None:
     """Track a step."""
-    _track(socket, {"kind": "step", "amplitude_rad": amplitude, "duration_s": duration}, wait, as_json)
+    _track(socket, {"kind": "step", "amplitude_rad": amplitude, "duration_s": duration}, duration, wait, as_json)
 
 
 @_app.command(
@@ -75,7 +84,9 @@ def step(
 )
 def csv(
     file: Annotated[Path, typer.Argument(help="CSV file with the columns t_s and reference_rad.")],
-    period_us: Annotated[int, typer.Option(min=500, max=20_000, help="Period of the loop.")] = 1000,
+    period_us: Annotated[
+        int | None, typer.Option(min=500, max=LONGEST_PERIOD_US, help="Period of the loop; the daemon knows it.")
+    ] = None,
     wait: _Wait = True,
     socket: SocketOption = DEFAULT_SOCKET,
     as_json: JsonOption = False,
@@ -83,31 +94,75 @@ def csv(
     """Track positions from a file."""
     from servod.cli.motion_file import read_motion
 
-    positions = read_motion(file, period_us * 1e-6)
-    _track(socket, {"kind": "csv", "positions_rad": positions}, wait, as_json)
+    motion = read_motion(file)
+    motion.on_grid((period_us or LONGEST_PERIOD_US) * 1e-6)  # what no daemon can take is refused without one
+    if period_us is None:
+        period_us = int(ask(socket, "status")["timing"]["period_us"])
+    positions = motion.on_grid(period_us * 1e-6)
+    duration_s = len(positions) * period_us * 1e-6
+    _track(socket, {"kind": "csv", "positions_rad": positions}, duration_s, wait, as_json)
 
 
-def _track(socket: Path, motion: dict[str, Any], wait: bool, as_json: bool) -> None:
+def _track(socket: Path, motion: dict[str, Any], duration_s: float, wait: bool, as_json: bool) -> None:
     with connect(socket) as client:
-        result = client.call("track", **motion)
         if wait:
-            _wait_for_end(client)
+            with _progress(duration_s, as_json) as tell:
+                result = _run(client, motion, tell)
+        else:
+            result = client.call("track", **motion)
     report(result, "motion done" if wait else "motion started", as_json)
 
 
-def _wait_for_end(client: ControlClient) -> None:
-    """Poll until the motion is over; an interrupt stops the axis before it ends the command."""
-    try:
-        while True:
-            time.sleep(_POLL_S)
-            status = client.call("status")
-            if status["axis"]["state"] != "ENABLED":
-                raise AnswerIsNo(f"the motion ended with the axis in {status['axis']['state']}: {_why(status)}")
-            if not status["axis"]["motion_running"]:
-                return
-    except KeyboardInterrupt:
-        client.call("stop")
-        raise
+def _run(client: ControlClient, motion: dict[str, Any], tell: Tell) -> dict[str, Any]:
+    """Start the motion and wait for its end; whatever interrupts it stops the axis before it ends the command."""
+    from servod.demo.processes import sigterm_as_interrupt
+
+    with sigterm_as_interrupt():
+        try:
+            result = client.call("track", **motion)
+            _wait_for_end(client, tell)
+        except KeyboardInterrupt:
+            client.call("stop")
+            raise
+    return result
+
+
+def _wait_for_end(client: ControlClient, tell: Tell) -> None:
+    """Poll until the motion is over."""
+    started = time.monotonic()
+    while True:
+        time.sleep(_POLL_S)
+        status = client.call("status")
+        if status["axis"]["state"] != "ENABLED":
+            raise AnswerIsNo(f"the motion ended with the axis in {status['axis']['state']}: {_why(status)}")
+        if not status["axis"]["motion_running"]:
+            return
+        tell(time.monotonic() - started, status["motion"])
+
+
+@contextmanager
+def _progress(duration_s: float, quiet: bool) -> Iterator[Tell]:
+    """A bar on a terminal's standard error: time, reference and error; nothing elsewhere."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    console = Console(stderr=True)
+    columns = (BarColumn(), TextColumn("{task.completed:.1f} of {task.total:.1f} s  {task.description}"))
+    with Progress(*columns, console=console, disable=quiet or not console.is_terminal, transient=True) as bar:
+        task = bar.add_task("", total=duration_s)
+
+        def tell(elapsed_s: float, motion: dict[str, Any]) -> None:
+            bar.update(task, completed=min(elapsed_s, duration_s), description=_where(motion))
+
+        yield tell
+
+
+def _where(motion: dict[str, Any]) -> str:
+    """Reference and error of the status document in words; either is None while it is not finite."""
+    reference, error = motion["reference_rad"], motion["following_error_rad"]
+    if reference is None or error is None:
+        return ""
+    return f"reference {reference:+.4f} rad, error {1e3 * error:+.3f} mrad"
 
 
 def _why(status: dict[str, Any]) -> str:

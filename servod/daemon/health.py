@@ -92,6 +92,7 @@ class Health:
     def timing(self, records_lost: int) -> TimingStatus:
         """The part of the status document."""
         return {
+            "period_us": round(self._period_s * 1e6),
             "window_s": self._lag.filled * self._period_s,
             "cycle": self.latest.cycle if self.latest else 0,
             "missed": self.latest.missed if self.latest else 0,

@@ -76,6 +76,7 @@ class Percentiles(TypedDict):
 class TimingStatus(TypedDict):
     """How the loop keeps time: `lag` wake-up after the deadline, `tick` its work, `torque` deadline to torque frame."""
 
+    period_us: int
     window_s: float
     cycle: int
     missed: int

@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
+import pty
+import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -87,6 +92,31 @@ def test_a_motion_from_a_file_is_relative_and_ends_where_the_file_ends(servoctl:
     before = servoctl.json("status")["motion"]["reference_rad"]
     servoctl("track", "csv", str(file))
     assert servoctl.json("status")["motion"]["reference_rad"] == pytest.approx(before + 0.02)
+
+
+def test_a_motion_from_a_spreadsheet_has_a_byte_order_mark(servoctl: Servoctl, tmp_path: Path) -> None:
+    file = tmp_path / "motion.csv"
+    file.write_text("t_s,reference_rad\n0,0\n0.25,0.01\n", encoding="utf-8-sig")
+    servoctl("enable")
+    assert servoctl("track", "csv", str(file)) == "motion done\n"
+    assert servoctl.json("status")["timing"]["period_us"] == 1000
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_whatever_ends_track_stops_the_axis(servoctl: Servoctl, number: signal.Signals) -> None:
+    servoctl("enable")
+    screen, terminal = pty.openpty()
+    words = ["track", "paper", "--duration", "20", "--socket", str(servoctl.socket)]
+    track = subprocess.Popen([sys.executable, "-m", "servod.cli", *words], stdout=subprocess.PIPE, stderr=terminal)
+    os.close(terminal)
+    shown = b""
+    while b"reference +" not in shown:
+        shown += os.read(screen, 4096)
+    assert b" of 20.0 s" in shown
+    track.send_signal(number)
+    assert track.wait(10) == 130
+    os.close(screen)
+    assert servoctl.state == "DISABLED"
 
 
 def test_what_is_refused_says_why_with_exit_code_3(servoctl: Servoctl) -> None:
