@@ -13,10 +13,7 @@ from numpy.typing import NDArray
 
 from servod.demo.axis import CONTROLLERS
 from servod.errors import AnswerIsNo
-from servod.record import FIELDS
-
-#: One cycle record as a row of a structured array; the same bytes as servod.record.RECORD.
-ROW = np.dtype([(f.name, "<f8" if f.kind == "d" else "<i8") for f in FIELDS])
+from servod.recordings.rows import ROW
 
 #: Trajectory (19) is scored without its first second, in which the axis starts to move.
 SETTLE_S = 1.0
