@@ -9,13 +9,15 @@ from __future__ import annotations
 import math
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
+import yaml
 from pydantic import Field, model_validator
 
 from servod import axis_effects as fx
 from servod.errors import BadInput
-from servod.yaml12 import Strict, load_model
+from servod.identified import Identified
+from servod.yaml12 import Dumper, Strict, load_model
 
 NonNegative = Annotated[float, Field(ge=0.0)]
 Positive = Annotated[float, Field(gt=0.0)]
@@ -127,6 +129,7 @@ class AxisModel(Strict):
     disturbance: fx.Disturbance | None = None
     residual: fx.Residual | None = None
     noise: fx.Noise | None = None
+    identified: Identified | None = Field(None, description="what was measured, with 95 % intervals; no physics")
 
     @model_validator(mode="after")
     def _shares_fit(self) -> AxisModel:
@@ -207,6 +210,23 @@ class AxisModel(Strict):
         from servod.axis_pack import pack
 
         return pack(self)
+
+
+def axis_model_yaml(model: AxisModel) -> str:
+    """The model as YAML text that `load_axis_model` reads back to an equal model; lists of numbers in one line."""
+    plain = model.model_dump(mode="json", exclude_none=True, exclude_defaults=True)
+    return yaml.dump(plain, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)
+
+
+class _Dumper(Dumper):
+    """Writes lists of numbers, and single values with their interval, in one line."""
+
+    def represent_sequence(self, tag: str, sequence: Any, flow_style: bool | None = None) -> yaml.SequenceNode:
+        return super().represent_sequence(tag, sequence, flow_style or not any(isinstance(i, dict) for i in sequence))
+
+    def represent_mapping(self, tag: str, mapping: Any, flow_style: bool | None = None) -> yaml.MappingNode:
+        in_one_line = isinstance(mapping, dict) and {"value", "low", "high"} <= set(mapping)
+        return super().represent_mapping(tag, mapping, in_one_line or flow_style)
 
 
 def wave_number(harmonic: fx.Harmonic) -> float:

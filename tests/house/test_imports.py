@@ -12,11 +12,13 @@ import source
 LAYERS: list[set[str]] = [
     {"units", "errors", "yaml12", "shipped", "notify"},
     {"hal", "cia", "clock", "commands", "config", "record", "realtime", "bus"},
+    {"identified"},
     {"axis_effects", "axis_model", "axis_pack", "models", "controllers", "gain_parameters", "gains", "gain_store"},
     {"drivers", "limits", "axis", "references"},
     {"master", "recorder_mcap", "recorder_read", "recorder_history", "recorder_files", "recorder_export", "recordings"},
     {"loop", "control", "recorder", "metrics"},
     {"daemon", "session", "replay"},
+    {"identify"},
     {"demo"},
     {"report", "benchmark"},
     {"cli"},
