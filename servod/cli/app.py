@@ -12,7 +12,22 @@ import sys
 
 import typer
 
-from servod.cli import bench, check, demo, enable, faults, gains, preset, record, replay, scan, status, stop, track
+from servod.cli import (
+    bench,
+    check,
+    demo,
+    enable,
+    faults,
+    gains,
+    identify,
+    preset,
+    record,
+    replay,
+    scan,
+    status,
+    stop,
+    track,
+)
 from servod.errors import ServodError
 
 _INTERRUPTED = 130  # as shells count SIGINT
@@ -25,7 +40,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for _verb in (demo, scan, status, enable, stop, track, gains, preset, record, replay, bench, check, faults):
+_VERBS = (demo, scan, status, enable, stop, track, identify, gains, preset, record, replay, bench, check, faults)
+for _verb in _VERBS:
     _verb.register(app)
 
 

@@ -1,0 +1,170 @@
+"""`servoctl identify`: experiments on the axis, or their recordings, become an axis model with intervals."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, connect, example, print_json
+from servod.errors import BadInput
+
+if TYPE_CHECKING:
+    from servod.axis_model import AxisModel
+    from servod.identify.analysis import Analysis
+    from servod.identify.walk import Tell
+
+_HELP = example(
+    "Identify the axis: noise, break-away, presliding stiffness, inertia, delay, friction map. Ctrl-C leaves it off.",
+    "servoctl identify --out model.yaml --config /etc/servod/config/can0.yaml",
+    "servoctl identify --out model.yaml --plant joint.yaml",
+    "servoctl identify --out model.yaml --recordings model_recordings",
+)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb to `app`."""
+    app.command("identify", help=_HELP)(identify)
+
+
+def identify(
+    out: Annotated[Path, typer.Option(help="Axis model to write; recordings go to a folder beside it.")],
+    plant: Annotated[Path | None, typer.Option(help="Start a virtual axis with this joint, SYNC-stepped.")] = None,
+    config: Annotated[Path | None, typer.Option(help="Axis configuration; needed on a daemon's axis.")] = None,
+    recordings: Annotated[Path | None, typer.Option(help="No axis: fit the recordings in this folder.")] = None,
+    before: Annotated[Path | None, typer.Option(help="Earlier model: say what has changed since.")] = None,
+    travel: Annotated[float | None, typer.Option(min=0.02, help="Travel to each side at most, rad.")] = None,
+    speed: Annotated[float | None, typer.Option(min=0.02, help="Speed at most, rad/s.")] = None,
+    encoder_counts: Annotated[int, typer.Option(min=4, help="Virtual axis: counts per turn.")] = 1_048_576,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of excitation and virtual noise.")] = 1,
+    socket: SocketOption = DEFAULT_SOCKET,
+    as_json: JsonOption = False,
+) -> None:
+    """Run or read the experiments, fit, write the model."""
+    from servod.axis_model import axis_model_yaml
+    from servod.identify.result import document, model_of
+
+    old = _identified_in(before)
+    with _progress(quiet=as_json) as tell:
+        if recordings is not None:
+            analysis = _from_recordings(recordings)
+        elif plant is not None:
+            analysis = _virtual(plant, config, out, tell, travel, speed, encoder_counts, seed)
+        else:
+            analysis = _on_daemon(socket, config, out, tell, travel, speed, seed)
+    model = model_of(analysis)
+    _write(out, axis_model_yaml(model))
+    found = document(analysis) | {"model": str(out)} | _changes(old, model)
+    if as_json:
+        print_json(found)
+    else:
+        _print(found)
+
+
+def recordings_folder(out: Path) -> Path:
+    """Where the recordings of a model file go."""
+    return out.with_name(out.stem + "_recordings")
+
+
+def _from_recordings(folder: Path) -> Analysis:
+    from servod.identify.analysis import analyse
+    from servod.identify.store import load
+
+    return analyse(load(folder))
+
+
+def _virtual(
+    plant: Path, config: Path | None, out: Path, tell: Tell,
+    travel: float | None, speed: float | None, encoder_counts: int, seed: int,
+) -> Analysis:  # fmt: skip
+    from servod.axis_model import load_axis_model
+    from servod.config import load_config
+    from servod.identify.links import SteppedLink
+    from servod.identify.virtual import virtual_session
+    from servod.identify.walk import identify as walk
+
+    joint, chosen = load_axis_model(plant), load_config(config) if config is not None else None
+    with tempfile.TemporaryDirectory(prefix="servod-identify-") as folder:
+        link = SteppedLink(virtual_session(joint, Path(folder), encoder_counts, seed, chosen))
+        return walk(link, recordings_folder(out), tell, travel_rad=travel, speed_rad_s=speed, seed=seed)
+
+
+def _on_daemon(
+    socket: Path, config: Path | None, out: Path, tell: Tell, travel: float | None, speed: float | None, seed: int
+) -> Analysis:
+    from servod.config import load_config
+    from servod.identify.daemon_link import DaemonLink
+    from servod.identify.walk import identify as walk
+
+    if config is None:
+        raise BadInput(
+            "--config", "nothing", "the configuration that the daemon runs with, or --plant, or --recordings"
+        )
+    with connect(socket) as client:
+        link = DaemonLink(client, load_config(config))
+        return walk(link, recordings_folder(out), tell, travel_rad=travel, speed_rad_s=speed, seed=seed)
+
+
+def _identified_in(before: Path | None) -> AxisModel | None:
+    if before is None:
+        return None
+    from servod.axis_model import load_axis_model
+
+    model = load_axis_model(before)
+    if model.identified is None:
+        raise BadInput(f"{before}: identified", "nothing", "a model that servoctl identify wrote")
+    return model
+
+
+def _changes(old: AxisModel | None, new: AxisModel) -> dict[str, Any]:
+    from servod.identify.result import changes
+
+    if old is None or old.identified is None or new.identified is None:
+        return {}
+    return {"changes": changes(old.identified, new.identified)}
+
+
+def _write(path: Path, text: str) -> None:
+    """Aside first, so that nobody reads half a model. Raises BadInput."""
+    aside = path.with_name(path.name + ".part")
+    try:
+        aside.write_text(text, encoding="utf-8")
+        aside.replace(path)
+    except OSError as error:
+        raise BadInput(str(path), error.strerror or str(error), "a file that can be written") from None
+
+
+@contextmanager
+def _progress(quiet: bool) -> Iterator[Callable[[str, float], None]]:
+    """One bar over the whole walk on standard error; nothing when quiet."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description:20}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), disable=quiet) as bars:
+        task = bars.add_task("identify", total=1.0)
+        yield lambda what, share: bars.update(task, description=what, completed=share)
+
+
+def _print(found: dict[str, Any]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("Quantity", "Value", "95 % interval", "Unit", title="Identified")
+    for name, number in found["identified"].items():
+        interval = f"{number['low']:.4g} to {number['high']:.4g}"
+        table.add_row(name, f"{number['value']:.5g}", interval, number["unit"])
+    console = Console()
+    console.print(table)
+    for name, number in found["identified"].items():
+        if number["note"]:
+            console.print(f"{name}: {number['note']}.", highlight=False)
+    for name, remedy in found["not_identifiable"].items():
+        console.print(f"Not identifiable from these excitations: {name}. {remedy}.", highlight=False)
+    for line in found.get("changes", []):
+        console.print(f"Changed: {line}.", highlight=False)
+    console.print(f"Model: {found['model']}", highlight=False, soft_wrap=True)

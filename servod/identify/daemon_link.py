@@ -1,0 +1,94 @@
+"""The link to an axis under a running daemon: its verbs over the control socket, its recordings from disk.
+
+Beside `links`, which states the protocol. The daemon's own limits, lease and heartbeats guard everything that is done.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servod.config import AxisConfig
+from servod.control import ControlClient, Verb
+from servod.errors import AnswerIsNo, ServodError
+from servod.gain_parameters import PdParameters
+from servod.gains import GainSet, Provenance
+from servod.identify.trace import rows_of
+from servod.recorder_read import read_recording
+
+#: Name of the gain set that experiments run under, in the daemon's store.
+GAIN_NAME = "identify_pd"
+_POLL_S = 0.05
+
+
+class DaemonLink:
+    """An axis on the wall clock. `config` must be the file that the daemon was started with."""
+
+    def __init__(self, client: ControlClient, config: AxisConfig) -> None:
+        self._client, self.config = client, config
+
+    def enable(self) -> float:
+        """Enable with zero gains."""
+        self.set_gains(0.0, 0.0)
+        self._client.call(Verb.ENABLE)
+        return float(self._client.call(Verb.STATUS)["motion"]["position_rad"])
+
+    def set_gains(self, position_nm_per_rad: float, velocity_nms_per_rad: float) -> None:
+        """Load and activate a PD set; the daemon must accept sets without a certificate for this."""
+        parameters = PdParameters(
+            law="pd",
+            position_gain_nm_per_rad=position_nm_per_rad,
+            velocity_gain_nms_per_rad=velocity_nms_per_rad,
+            feedforward_inertia_kg_m2=0.0,
+        )
+        source = Provenance(
+            author="servod", date=datetime.datetime.now(tz=datetime.UTC).date(), tool="servoctl identify"
+        )
+        gains = GainSet(schema_version=1, name=GAIN_NAME, parameters=parameters, provenance=source)
+        self._client.call(Verb.GAINS_LOAD, name=GAIN_NAME, text=gains.to_yaml())
+        self._client.call(Verb.GAINS_ACTIVATE, name=GAIN_NAME)
+
+    def excite(
+        self, positions_rad: Sequence[float], torques_nm: Sequence[float], window_rad: float
+    ) -> NDArray[np.void]:
+        """Run the motion under the daemon's recorder and read its cycles back."""
+        path = Path(self._client.call(Verb.RECORD_START)["path"])
+        try:
+            self._client.call(
+                Verb.TRACK,
+                kind="excite",
+                positions_rad=list(positions_rad),
+                torques_nm=list(torques_nm),
+                window_rad=window_rad,
+            )
+            self._wait()
+        finally:
+            self._client.call(Verb.RECORD_STOP)
+        rows = rows_of(read_recording(path).rows)
+        moving: NDArray[np.void] = rows[rows["reference_active"] == 1]
+        return moving
+
+    def disable(self) -> None:
+        """Ask for it; an axis that is off already, or a daemon that is gone, needs none."""
+        with contextlib.suppress(ServodError):
+            self._client.call(Verb.DISABLE)
+
+    def _wait(self) -> None:
+        while True:
+            time.sleep(_POLL_S)
+            status = self._client.call(Verb.STATUS)
+            if status["axis"]["state"] != "ENABLED":
+                raise AnswerIsNo(f"the experiment ended with the axis in {status['axis']['state']}. {_why(status)}")
+            if not status["axis"]["motion_running"]:
+                return
+
+
+def _why(status: dict[str, Any]) -> str:
+    return "; ".join(f"{f['code']}: {f['cause']} {f['remedy']}" for f in status["faults"])

@@ -1,0 +1,120 @@
+"""How experiments reach an axis: the small protocol, and the SYNC-stepped virtual axis behind it.
+
+Above the session; `daemon_link` has the same for a running daemon. An experiment says gains, positions and torques, and
+gets the recorded cycles of its motion back.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servod.axis import AxisState
+from servod.commands import REFUSAL_TEXT, Op, ReferenceKind, Refusal
+from servod.config import AxisConfig
+from servod.controllers import LAWS
+from servod.errors import AnswerIsNo, faults_in
+from servod.identify.trace import rows_of
+from servod.record import CycleRecord
+from servod.session import SteppedSession
+
+#: Told after every slice of a motion: how many seconds of it have passed.
+Watch = Callable[[float], None]
+
+_SLICE_S = 0.1
+
+
+class Link(Protocol):
+    """An axis that experiments may move. Every method raises AnswerIsNo when the axis drops out or refuses."""
+
+    @property
+    def config(self) -> AxisConfig:
+        """Limits, period and encoder of the axis."""
+        ...
+
+    def enable(self) -> float:
+        """Enable under no torque; returns the present position in rad."""
+        ...
+
+    def set_gains(self, position_nm_per_rad: float, velocity_nms_per_rad: float) -> None:
+        """Change the PD feedback under which motions run; bumpless."""
+        ...
+
+    def excite(
+        self, positions_rad: Sequence[float], torques_nm: Sequence[float], window_rad: float
+    ) -> NDArray[np.void]:
+        """Run a motion relative to the present reference with torque on top; returns its cycles.
+
+        It ends by itself when the joint is further than `window_rad` from the reference.
+        """
+        ...
+
+    def disable(self) -> None:
+        """Ramp the torque down and switch off; never raises."""
+        ...
+
+
+class SteppedLink:
+    """The virtual axis in virtual time."""
+
+    def __init__(self, session: SteppedSession, watch: Watch | None = None) -> None:
+        self.session = session
+        self._watch = watch or (lambda _seconds: None)
+
+    @property
+    def config(self) -> AxisConfig:
+        """The session's configuration."""
+        return self.session.config
+
+    def enable(self) -> float:
+        """Enable with zero gains."""
+        self.set_gains(0.0, 0.0)
+        self.session.enable()
+        return self.session.latest.position_rad
+
+    def set_gains(self, position_nm_per_rad: float, velocity_nms_per_rad: float) -> None:
+        """PD feedback of the session's controller."""
+        law = LAWS["pd"]
+        gains = [position_nm_per_rad, velocity_nms_per_rad, 0.0]
+        self._must(self.session.send(Op.ACTIVATE, [0, law.number, len(gains), *gains]))
+
+    def excite(
+        self, positions_rad: Sequence[float], torques_nm: Sequence[float], window_rad: float
+    ) -> NDArray[np.void]:
+        """Run the motion as fast as it computes."""
+        session = self.session
+        session.load_trajectory([*positions_rad, *torques_nm])
+        session.clear()
+        extent = [min(positions_rad), max(positions_rad)]
+        self._must(session.send(Op.REFERENCE, [ReferenceKind.EXCITE, len(positions_rad), *extent, window_rad]))
+        passed_s = 0.0
+        while session.cycle.reference.active:
+            session.run(_SLICE_S)
+            passed_s += _SLICE_S
+            self._watch(passed_s)
+        check_state(session.latest)
+        rows = rows_of(session.raw)
+        moving: NDArray[np.void] = rows[rows["reference_active"] == 1]
+        return moving
+
+    def disable(self) -> None:
+        """Switch off and let the drive see it."""
+        with contextlib.suppress(AnswerIsNo):
+            self.session.send(Op.DISABLE)
+            self.session.run(self.config.limits.ramp_down_s + 0.1)
+
+    def _must(self, refusal: Refusal) -> None:
+        if refusal != Refusal.DONE:
+            raise AnswerIsNo(f"the axis refused the experiment: {REFUSAL_TEXT[refusal]}")
+
+
+def check_state(record: CycleRecord) -> None:
+    """Raise AnswerIsNo, with the faults and their remedies, when the axis is not enabled any more."""
+    if record.axis_state == AxisState.ENABLED:
+        return
+    why = "; ".join(f"{f.code.name}: {f.cause} {f.remedy}" for f in faults_in(record.faults_latched))
+    raise AnswerIsNo(f"the experiment ended with the axis in {AxisState(record.axis_state).name}. {why}")

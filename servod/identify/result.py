@@ -1,0 +1,174 @@
+"""What an identification found, as the axis model file and as one document with every number and interval.
+
+Behind the analysis; what stands here is what synthesis, certificate and report read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servod.axis_effects import ActuatorLag, Cogging
+from servod.axis_effects import Harmonic as ModelHarmonic
+from servod.axis_model import AxisModel, LocalFriction
+from servod.identified import Identified, IdentifiedMap, IdentifiedValue
+from servod.identify.analysis import Analysis
+from servod.identify.estimate import Estimate
+from servod.identify.fits.curve import CurveFit
+from servod.identify.fits.friction_map import Side
+
+Array = NDArray[np.float64]
+
+#: The viscous part of the map leaves at least this share of it to the bristles, at every speed.
+LEAST_DRY_SHARE = 0.2
+#: Bristle damping against the critical one of inertia on the bristle, taken where it is not measured.
+ASSUMED_DAMPING = 0.5
+
+#: What these experiments cannot tell, and what would.
+NOT_IDENTIFIABLE: dict[str, str] = {
+    "torque_gain": "torque is known only by the command; hang a known weight on a known lever, or couple a known "
+    "inertia, and identify again: the ratio is the gain",
+    "torque_offset": "a constant torque looks like friction that differs by direction, and is contained in the map; "
+    "turn the axis over (or take the load off) and identify again",
+    "sigma1": "bristle damping does not show below 20 Hz; rock the joint below break-away with a multisine up to 200 "
+    "Hz on an encoder of 20 bit or more. The model assumes half of the critical damping",
+}
+
+
+def model_of(analysis: Analysis) -> AxisModel:
+    """The axis model: bristle, map per direction, cogging, delay; and `identified` with the intervals."""
+    answer, stiffness = analysis.response, analysis.presliding.stiffness.value
+    lag_s = answer.lag_s.value
+    return AxisModel(
+        inertia=answer.inertia.value,
+        delay_s=round(answer.delay_s.value, 9),
+        friction=LocalFriction(
+            kind="local",
+            sigma0=stiffness,
+            sigma1=ASSUMED_DAMPING * 2.0 * float(np.sqrt(stiffness * answer.inertia.value)),
+            viscous=_viscous(analysis),
+            velocities=_rounded(_velocities(analysis)),
+            torques=_rounded(_torques(analysis)),
+        ),
+        cogging=_cogging(analysis),
+        actuator_lag=ActuatorLag(time_constant_s=lag_s) if lag_s > 0.0 else None,
+        identified=identified(analysis),
+    )
+
+
+def identified(analysis: Analysis) -> Identified:
+    """Every number with its interval, and what cannot be told."""
+    return Identified(
+        values={name: _value(number) for name, number in estimates(analysis).items()},
+        friction_map=IdentifiedMap(
+            velocities=list(_rounded(_velocities(analysis))),
+            torques=list(_rounded(_torques(analysis))),
+            half_widths=list(_rounded(_both(analysis.map.negative.half_width, analysis.map.positive.half_width))),
+        ),
+        not_identifiable=NOT_IDENTIFIABLE,
+    )
+
+
+def estimates(analysis: Analysis) -> dict[str, Estimate]:
+    """All estimates by name, SI units."""
+    answer = analysis.response
+    numbers = {
+        "inertia": answer.inertia,
+        "delay_s": answer.delay_s,
+        "lag_s": answer.lag_s,
+        "viscous_slope": answer.viscous_slope,
+        "sigma0": analysis.presliding.stiffness,
+        "break_away_positive": analysis.break_away.positive,
+        "break_away_negative": analysis.break_away.negative,
+        **_of_curve(analysis.positive, "positive"),
+        **_of_curve(analysis.negative, "negative"),
+        "encoder_noise_rms": analysis.noise.encoder_rms,
+        "torque_reading_noise_rms": analysis.noise.torque_reading_rms,
+        "torque_noise_rms": answer.torque_noise_rms,
+    }
+    numbers |= {f"cogging_{wave.order}": wave.amplitude for wave in analysis.map.cogging}
+    if answer.resonance_hz is not None:
+        numbers["resonance_hz"] = answer.resonance_hz
+    return numbers
+
+
+def document(analysis: Analysis) -> dict[str, Any]:
+    """The JSON document of `servoctl identify`."""
+    found = identified(analysis)
+    low, high = _lean(analysis)
+    return {
+        "identified": {name: number.model_dump() for name, number in found.values.items()},
+        "friction_map": found.friction_map.model_dump(),
+        "asymmetry": {"value": 0.5 * (low + high), "low": low, "high": high, "unit": "1"},
+        "not_identifiable": dict(found.not_identifiable),
+    }
+
+
+def changes(before: Identified, now: Identified) -> list[str]:
+    """What has changed between two identifications beyond both intervals, one sentence each; empty when nothing has."""
+    told = []
+    for name, new in now.values.items():
+        old = before.values.get(name)
+        if old is None or (old.low <= new.high and new.low <= old.high):
+            continue
+        told.append(f"{name} went from {old.value:.4g} to {new.value:.4g} {new.unit}, outside both 95 % intervals")
+    return told
+
+
+def _of_curve(curve: CurveFit, direction: str) -> dict[str, Estimate]:
+    return {f"{name}_{direction}": number for name, number in curve._asdict().items()}
+
+
+def _value(number: Estimate) -> IdentifiedValue:
+    value, low, high = _rounded([number.value, number.low, number.high])
+    return IdentifiedValue(value=value, low=low, high=high, unit=number.unit, note=number.note)
+
+
+def _rounded(values: Iterable[float]) -> tuple[float, ...]:
+    """Six digits: far below any interval, and readable."""
+    return tuple(float(f"{float(value):.6g}") for value in values)
+
+
+def _both(negative: Array, positive: Array) -> Array:
+    """Values of both directions in the order of ascending velocity."""
+    return np.concatenate([negative[::-1], positive])
+
+
+def _velocities(analysis: Analysis) -> Array:
+    return _both(-analysis.map.negative.speed, analysis.map.positive.speed)
+
+
+def _torques(analysis: Analysis) -> Array:
+    return _both(-analysis.map.negative.friction, analysis.map.positive.friction)
+
+
+def _viscous(analysis: Analysis) -> float:
+    """d0 of the map: the weaker direction's viscous friction, as far as the map leaves a dry part everywhere."""
+    sides: list[Side] = [analysis.map.positive, analysis.map.negative]
+    most = min(float(np.min((1.0 - LEAST_DRY_SHARE) * side.friction / side.speed)) for side in sides)
+    return min(analysis.positive.viscous.value, analysis.negative.viscous.value, most)
+
+
+def _cogging(analysis: Analysis) -> Cogging | None:
+    if not analysis.map.cogging:
+        return None
+    return Cogging(
+        harmonics=tuple(
+            ModelHarmonic(amplitude=w.amplitude.value, periods_per_turn=float(w.order), phase=w.phase)
+            for w in analysis.map.cogging
+        )
+    )
+
+
+def _lean(analysis: Analysis) -> tuple[float, float]:
+    """Interval of the friction's asymmetry: difference of both directions over their mean, over the map's nodes."""
+    plus, minus = analysis.map.positive, analysis.map.negative
+    other = np.interp(np.log(plus.speed), np.log(minus.speed), minus.friction)
+    other_half = np.interp(np.log(plus.speed), np.log(minus.speed), minus.half_width)
+    mean = 0.5 * (plus.friction + other)
+    lean = float(np.mean((plus.friction - other) / mean))
+    half = float(np.mean(np.hypot(plus.half_width, other_half) / mean))
+    return lean - half, lean + half

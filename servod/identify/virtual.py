@@ -1,0 +1,69 @@
+"""A virtual axis that suits its joint, SYNC-stepped: drive and limits of the size that somebody would have bought.
+
+Behind `--plant`. Only the size of the drive is taken from the plant; everything else has to be identified.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from servod.axis_model import AxisModel
+from servod.config import AxisConfig
+from servod.controllers import LAWS
+from servod.drivers.virtual.world import SteppedWorld, VirtualAxisSettings
+from servod.session import SteppedSession
+from servod.yaml12 import validate
+
+#: Rated torque of the drive over the joint's static friction, and peak over rated, as of the demo's axis.
+RATED_RATIO, PEAK_RATIO = 1.43, 3.0
+#: The torque limit is reached from zero in a millisecond.
+RATE_PER_S = 1000.0
+SPEED_RAD_S, TRAVEL_RAD, FOLLOWING_RAD, MISMATCH_RAD = 3.0, 3.0, 0.5, 0.05
+
+
+def rated_torque_mnm(plant: AxisModel) -> int:
+    """Rated torque of a drive for this joint, in mN*m, to two digits."""
+    friction = plant.friction
+    sticks = getattr(friction, "static", None) or getattr(friction, "coulomb", None)
+    static = sticks if sticks is not None else max(abs(t) for t in getattr(friction, "torques", (0.07,)))
+    held = abs(plant.gravity.amplitude) if plant.gravity else 0.0
+    wanted = 1000.0 * RATED_RATIO * (float(static) + held)
+    return max(1, int(float(f"{wanted:.1e}")))
+
+
+def virtual_config(folder: Path, rated_mnm: int, encoder_counts: int) -> AxisConfig:
+    """Configuration of the master's side; `folder` is for sockets and stores, which a stepped axis never opens."""
+    peak_nm = PEAK_RATIO * rated_mnm * 1e-3
+    return validate(
+        {
+            "name": "virtual",
+            "bus": {"interface": "virtual", "channel": str(folder / "bus")},
+            "encoder": {"counts_per_turn": encoder_counts},
+            "limits": {
+                "torque_nm": peak_nm,
+                "torque_rate_nm_per_s": RATE_PER_S * peak_nm,
+                "speed_rad_s": SPEED_RAD_S,
+                "position_min_rad": -TRAVEL_RAD,
+                "position_max_rad": TRAVEL_RAD,
+                "following_error_rad": FOLLOWING_RAD,
+                "encoder_mismatch_rad": MISMATCH_RAD,
+            },
+            "gains": {"directory": str(folder), "initial": str(folder / "pd.yaml"), "accept_uncertified": True},
+            "recorder": {"directory": str(folder)},
+        },
+        AxisConfig,
+        "virtual axis",
+    )
+
+
+def virtual_session(
+    plant: AxisModel, folder: Path, encoder_counts: int, seed: int, config: AxisConfig | None = None
+) -> SteppedSession:
+    """A session on the virtual axis, disabled, zero gains; a `config` of the user's replaces the one that suits."""
+    rated = rated_torque_mnm(plant)
+    config = config or virtual_config(folder, rated, encoder_counts)
+    settings = VirtualAxisSettings(
+        rated_torque_mnm=rated, encoder_counts_per_turn=config.encoder.counts_per_turn, seed=seed
+    )
+    law = LAWS["pd"]
+    return SteppedSession(config, SteppedWorld(settings, plant), law.number, (0.0,) * law.n_parameters)

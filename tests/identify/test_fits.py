@@ -1,0 +1,98 @@
+"""Fits against what they must find: closed forms against brute force, intervals against known scatter."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from servod.axis_model import AxisModel
+from servod.identify.estimate import estimate, jackknife, sandwich
+from servod.identify.fits import cogging
+from servod.identify.fits.presliding import bend_factor, fundamental
+from servod.identify.fits.rigid import Rigid, response_of
+from servod.identify.signals import acting_torque, smooth
+from servod.models.plant import Plant
+from servod.yaml12 import validate
+
+PERIOD_S = 1e-3
+
+
+@pytest.mark.parametrize(
+    "joint",
+    [Rigid(1e-3, 0.05, 0.0013, 0.0), Rigid(1e-3, 0.05, 0.002, 0.001), Rigid(0.1, -2.0, 0.0005, 0.0)],
+)
+def test_the_sampled_response_is_that_of_a_simulated_pulse(joint):
+    h, way, position, velocity, torque = 1e-6, [], 0.0, 0.0, 0.0
+    held, late = round(PERIOD_S / h), round(joint.delay_s / h)
+    for step in range(6 * held):
+        if step % held == 0:
+            way.append(position)
+        command = 1.0 if 0 <= step - late < held else 0.0
+        torque = torque + (command - torque) * h / joint.lag_s if joint.lag_s else command
+        velocity += h * (torque - joint.viscous * velocity) / joint.inertia
+        position += h * velocity
+    radius, count = 1.2, 256
+    z = radius * np.exp(2j * np.pi * np.arange(count) / count)
+    response = response_of(joint, np.log(z) / (2j * np.pi * PERIOD_S), PERIOD_S)
+    pulse = np.fft.ifft(response).real * radius ** np.arange(count)
+    assert pulse[:5] == pytest.approx(np.diff(way), rel=2e-3, abs=1e-6 / joint.inertia * 1e-3)
+
+
+@pytest.mark.parametrize("share", [0.2, 0.4, 0.6])
+def test_the_bend_of_the_dahl_loop_is_that_of_the_plant(share):
+    friction = {"kind": "lugre", "sigma0": 950.0, "sigma1": 1.0, "coulomb": 0.045, "static": 0.07}
+    model = validate({"inertia": 1e-3, "delay_s": 0.0, "friction": friction}, AxisModel, "joint")
+    plant, amplitude, frequency_hz = Plant(model), share * 0.07, 8.0
+    t = np.arange(1500) * PERIOD_S
+    way = []
+    for torque in amplitude * np.sin(2.0 * np.pi * frequency_hz * t):
+        way.append(plant.position_rad)
+        plant.advance(float(torque), PERIOD_S)
+    softened = abs(fundamental(np.array(way[500:]), frequency_hz, PERIOD_S)) * 950.0 / amplitude
+    assert bend_factor(amplitude, 0.07, 0.07) == pytest.approx(softened, rel=0.01)
+
+
+def test_acting_torque_is_the_held_command_averaged_over_the_sample():
+    command = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    assert acting_torque(command, 1.0 * PERIOD_S, PERIOD_S) == pytest.approx([0, 0, 0, 0.5, 0.5, 0])
+    assert acting_torque(command, 1.3 * PERIOD_S, PERIOD_S) == pytest.approx([0, 0, 0, 0.2, 0.8, 0])
+
+
+def test_smoothing_differentiates_a_parabola_exactly():
+    t = np.arange(400) * PERIOD_S
+    s = smooth(t, np.full(400, 0.02), 0.3 + 0.5 * t + 2.0 * t**2, 0.001, 0.01)
+    assert s.velocity == pytest.approx(0.5 + 4.0 * s.t_s)
+    assert s.acceleration == pytest.approx(4.0, rel=1e-6)
+    assert s.torque == pytest.approx(0.02)
+
+
+def test_intervals_hold_their_promise():
+    rng, held = np.random.default_rng(5), 0
+    for _ in range(400):
+        parts = list(rng.normal(3.0, 0.5, 12))
+        value, deviation = jackknife(lambda p: np.array([np.mean(p)]), parts)
+        held += estimate(float(value[0]), float(deviation[0]), 11, "1").holds(3.0)
+    assert held / 400 == pytest.approx(0.95, abs=0.03)
+
+
+def test_the_sandwich_sees_errors_that_parts_share():
+    rng = np.random.default_rng(6)
+    parts = np.repeat(np.arange(40), 25)
+    spread = []
+    design = np.ones((1000, 1))
+    for _ in range(200):
+        noise = rng.normal(0.0, 1.0, 40)[parts] + rng.normal(0.0, 0.1, 1000)
+        spread.append(noise.mean())
+    residual = noise - noise.mean()
+    deviation = np.sqrt(sandwich(design, residual, np.ones(1000), parts)[0, 0])
+    assert deviation == pytest.approx(np.std(spread), rel=0.35)
+
+
+def test_cogging_orders_are_found_beside_friction_and_none_where_there_is_none():
+    rng = np.random.default_rng(7)
+    x = np.linspace(-1.0, 1.0, 3000)
+    base = np.column_stack([x > 0.0, x <= 0.0]).astype(float)
+    torque = base @ [0.05, -0.04] + rng.normal(0.0, 2e-4, len(x))
+    assert cogging.find_orders(base, x, torque, 60) == []
+    torque = torque + 0.002 * np.sin(22.0 * x + 0.3) + 0.001 * np.sin(7.0 * x)
+    assert sorted(cogging.find_orders(base, x, torque, 60)) == [7, 22]

@@ -1,0 +1,133 @@
+"""A whole identification on the virtual axis against the truth, which nothing but these tests reads."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from servod.axis import AxisState
+from servod.axis_model import AxisModel, axis_model_yaml
+from servod.errors import AnswerIsNo
+from servod.identify import store
+from servod.identify.analysis import Analysis, analyse
+from servod.identify.links import SteppedLink
+from servod.identify.result import changes, document, identified, model_of
+from servod.identify.virtual import virtual_session
+from servod.identify.walk import identify
+from servod.yaml12 import parse_yaml, validate
+from tests.identify.conftest import Identification
+from tests.identify.joints import draw, steady_friction
+
+
+@pytest.fixture(params=["fine", "coarse_and_large"])
+def found(request: pytest.FixtureRequest) -> Identification:
+    return request.getfixturevalue(request.param)
+
+
+def map_errors(analysis: Analysis, truth: AxisModel) -> tuple[np.ndarray, np.ndarray]:
+    """Relative errors of the map from 5 mrad/s up, and whether each interval holds the truth."""
+    errors, held = [], []
+    for side, sign in ((analysis.map.positive, 1.0), (analysis.map.negative, -1.0)):
+        kept = side.speed >= 0.005
+        true = sign * steady_friction(truth, sign * side.speed[kept])
+        errors.append(side.friction[kept] / true - 1.0)
+        held.append(np.abs(side.friction[kept] - true) <= side.half_width[kept])
+    return np.concatenate(errors), np.concatenate(held)
+
+
+def test_stiffness_inertia_and_delay(found):
+    truth, analysis = found.joint.model, found.analysis
+    allowed = 0.08 if found.joint.encoder_counts == 2**20 else 0.12
+    assert analysis.presliding.stiffness.value == pytest.approx(truth.friction.sigma0, rel=allowed)
+    assert analysis.response.inertia.value == pytest.approx(truth.inertia, rel=0.05)
+    assert analysis.response.delay_s.value == pytest.approx(truth.delay_s, abs=2e-4)
+    assert analysis.presliding.stiffness.holds(truth.friction.sigma0)
+    assert analysis.response.inertia.holds(truth.inertia)
+    assert analysis.response.delay_s.holds(truth.delay_s)
+
+
+def test_friction_map_from_5_mrad_s_up(found):
+    errors, held = map_errors(found.analysis, found.joint.model)
+    assert np.max(np.abs(errors)) <= 0.05
+    assert np.mean(held) >= 0.9
+
+
+def test_asymmetry_shows_in_the_intervals(found):
+    lean = document(found.analysis)["asymmetry"]
+    assert lean["low"] * lean["high"] > 0.0
+    sides = found.joint.model.asymmetry
+    assert np.sign(lean["value"]) == np.sign(sides.positive_dry - sides.negative_dry)
+
+
+def test_cogging_is_found(found):
+    (true,) = found.joint.model.cogging.harmonics
+    waves = {wave.order: wave for wave in found.analysis.map.cogging}
+    assert waves[int(true.periods_per_turn)].amplitude.value == pytest.approx(true.amplitude, rel=0.1)
+
+
+def test_the_model_file_says_all_of_it(found):
+    model = model_of(found.analysis)
+    again = validate(parse_yaml(axis_model_yaml(model), "model"), AxisModel, "model")
+    assert again == model
+    speeds = np.array([-0.3, -0.02, 0.02, 0.3])
+    assert steady_friction(again, speeds) == pytest.approx(steady_friction(found.joint.model, speeds), rel=0.05)
+    assert "torque_gain" in again.identified.not_identifiable
+
+
+def test_recordings_alone_give_the_same_numbers(fine):
+    again = analyse(store.load(fine.recordings))
+    assert document(again) == document(fine.analysis)
+
+
+def test_the_axis_is_off_afterwards_and_progress_was_told(fine):
+    assert fine.link.session.cycle.axis.state == AxisState.DISABLED
+    shares = [share for _, share in fine.told]
+    assert shares == sorted(shares)
+
+
+def test_an_interrupt_leaves_the_axis_off(tmp_path):
+    joint = draw(3)
+    link = SteppedLink(virtual_session(joint.model, tmp_path, joint.encoder_counts, 1))
+
+    def interrupt(what: str, _share: float) -> None:
+        if what == "presliding":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        identify(link, tmp_path / "recordings", interrupt)
+    assert link.session.cycle.axis.state == AxisState.DISABLED
+    assert abs(link.session.world.truth().velocity_rad_s) < 1e-4
+    assert [t.kind.value for t in store.load(tmp_path / "recordings")] == ["noise", "break_away", "break_away"]
+
+
+def test_wrong_polarity_is_found_before_the_joint_moves_far(tmp_path):
+    joint = draw(4)
+    session = virtual_session(joint.model, tmp_path, joint.encoder_counts, 1)
+    turned = session.config.model_copy(
+        update={"encoder": session.config.encoder.model_copy(update={"direction": -1}), "limits": session.config.limits}
+    )
+    session = virtual_session(joint.model, tmp_path, joint.encoder_counts, 1, turned)
+    link = SteppedLink(session)
+    with pytest.raises(AnswerIsNo, match="torque_direction|ENCODER_IMPLAUSIBLE"):
+        identify(link, tmp_path / "recordings", lambda _what, _share: None)
+    assert abs(session.world.truth().position_rad) < 0.02
+
+
+def test_a_blocked_joint_is_said_to_be_blocked(tmp_path):
+    joint = draw(5)
+    friction = joint.model.friction.model_copy(update={"static": 1.0, "coulomb": 1.0})
+    blocked = joint.model.model_copy(update={"friction": friction})
+    session = virtual_session(joint.model, tmp_path, joint.encoder_counts, 1)
+    session = virtual_session(blocked, tmp_path, joint.encoder_counts, 1, session.config)
+    with pytest.raises(AnswerIsNo, match="did not move"):
+        identify(SteppedLink(session), tmp_path / "recordings", lambda _what, _share: None)
+
+
+def test_changes_are_those_beyond_both_intervals(fine):
+    before = identified(fine.analysis)
+    assert changes(before, before) == []
+    inertia = before.values["inertia"]
+    moved = inertia.model_copy(update={k: 1.1 * getattr(inertia, k) for k in ("value", "low", "high")})
+    now = before.model_copy(update={"values": before.values | {"inertia": moved}})
+    (told,) = changes(before, now)
+    assert told.startswith("inertia went from")
