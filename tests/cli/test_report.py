@@ -11,8 +11,8 @@ import pytest
 from servod.demo.axis import CONTROLLERS
 from servod.demo.entries import entries
 from servod.demo.runs import Run, cut_motion, summary
-from servod.recordings.rows import ROW
 from servod.errors import AnswerIsNo, BadInput
+from servod.recordings.rows import ROW
 from servod.report.curves import thin, time_curves
 from servod.report.demo import Story, write_demo_page
 from servod.shipped import shipped

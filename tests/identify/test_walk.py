@@ -108,7 +108,7 @@ def test_wrong_polarity_is_found_before_the_joint_moves_far(tmp_path):
     )
     session = virtual_session(joint.model, tmp_path, joint.encoder_counts, 1, turned)
     link = SteppedLink(session)
-    with pytest.raises(AnswerIsNo, match="torque_direction|ENCODER_IMPLAUSIBLE"):
+    with pytest.raises(AnswerIsNo, match=r"torque_direction|ENCODER_IMPLAUSIBLE"):
         identify(link, tmp_path / "recordings", lambda _what, _share: None)
     assert abs(session.world.truth().position_rad) < 0.02
 
