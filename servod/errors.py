@@ -183,7 +183,8 @@ FAULTS: dict[FaultCode, Fault] = dict(
             _C.DEADLINE_BUDGET,
             _R.QUICK_STOP,
             "More cycles were late than limits.late_cycles allows.",
-            "Find what starves the loop: see the real-time report in `servoctl status`, pin and isolate a core.",
+            "Find what takes the processor from the loop: see the real-time report in `servoctl status`, pin and "
+            "isolate a core.",
         ),
         _row(
             _C.DRIVE_FAULT,
@@ -261,7 +262,8 @@ FAULTS: dict[FaultCode, Fault] = dict(
             _C.SUPERVISOR_LOST,
             _R.RAMP_DOWN,
             "The supervisor process died or hangs; the loop stops the axis by itself.",
-            "See the journal for the reason; systemd restarts the service, enabling stays an explicit act.",
+            "See the journal for the reason, or what else took the processor; systemd restarts the service, enabling "
+            "stays an explicit act.",
         ),
         _row(
             _C.LOOP_LOST,
@@ -289,3 +291,8 @@ FAULTS: dict[FaultCode, Fault] = dict(
 def faults_in(fault_word: int) -> list[Fault]:
     """The rows of the fault table whose bits are set in `fault_word`, in table order."""
     return [f for f in FAULTS.values() if fault_word & f.bit]
+
+
+def fault_text(fault_word: int) -> str:
+    """The faults of `fault_word` in one line: code, cause and remedy of each."""
+    return " ".join(f"{f.code.name}: {f.cause} {f.remedy}" for f in faults_in(fault_word)) or "No fault is latched."

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from servod.commands import REFUSAL_TEXT, Command, Op, ReferenceKind, Refusal
 from servod.config import AxisConfig
-from servod.errors import AnswerIsNo
+from servod.errors import AnswerIsNo, fault_text
 from servod.loop.channel import TRAJECTORY_SAMPLES
 from servod.loop.cycle import Cycle
 from servod.loop.plan import LoopPlan
@@ -98,7 +98,7 @@ class SteppedSession:
             self.run(self.config.amplifier.enable_timeout_s / 100.0)
             if self.cycle.axis.state.name == "ENABLED":
                 return
-        raise AnswerIsNo(f"the axis is {self.cycle.axis.state.name}, not enabled")
+        raise AnswerIsNo(f"the axis is {self.cycle.axis.state.name}, not enabled. {self.why}")
 
     def move(self, kind: ReferenceKind, arguments: Sequence[float], timeout_s: float = 600.0) -> None:
         """Start a motion and run until it is over; raises AnswerIsNo when it is refused or ends in a fault."""
@@ -108,7 +108,12 @@ class SteppedSession:
                 break
             self.run(0.1)
         if self.cycle.axis.state.name != "ENABLED":
-            raise AnswerIsNo(f"the motion ended with the axis in {self.cycle.axis.state.name}")
+            raise AnswerIsNo(f"the motion ended with the axis in {self.cycle.axis.state.name}. {self.why}")
+
+    @property
+    def why(self) -> str:
+        """The latched faults with cause and remedy, for the person who reads the message."""
+        return fault_text(self.latest.faults_latched)
 
     def load_trajectory(self, positions_rad: Sequence[float]) -> None:
         """Fill the area that ReferenceKind.TABLE reads."""

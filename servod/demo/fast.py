@@ -19,7 +19,7 @@ from servod.commands import REFUSAL_TEXT, Op, ReferenceKind, Refusal
 from servod.demo.axis import demo_config
 from servod.demo.entries import Entry
 from servod.demo.runs import Run, cut_motion
-from servod.errors import AnswerIsNo, faults_in
+from servod.errors import AnswerIsNo
 
 if TYPE_CHECKING:
     from servod.session import SteppedSession
@@ -88,5 +88,4 @@ def _follow(session: SteppedSession, index: int, name: str, duration_s: float) -
         done_s += _SLICE_S
         _shares[index] = min(1.0, done_s / duration_s)
     if session.cycle.axis.state != AxisState.ENABLED:
-        names = ", ".join(fault.code.name for fault in faults_in(session.latest.faults_latched))
-        raise AnswerIsNo(f"the axis went to {session.cycle.axis.state.name} under {name}: {names}")
+        raise AnswerIsNo(f"the axis went to {session.cycle.axis.state.name} under {name}. {session.why}")

@@ -9,7 +9,7 @@ import contextlib
 import math
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,7 +21,7 @@ from servod.demo.axis import demo_config, other_cores
 from servod.demo.entries import Entry
 from servod.demo.processes import child, sigterm_as_interrupt, wait_until
 from servod.demo.runs import Run, cut_motion
-from servod.errors import AnswerIsNo, Unreachable
+from servod.errors import AnswerIsNo, FaultCode, Unreachable
 from servod.recorder_read import read_recording
 
 #: Told how far a run is: controller and share from 0 to 1.
@@ -139,10 +139,32 @@ def _moves(client: ControlClient) -> bool:
     return motion_runs(client)
 
 
+#: What follows when a process of the demo did not get its turn in time.
+_STARVATION = frozenset(
+    code.name
+    for code in (
+        FaultCode.DEADLINE_BUDGET,
+        FaultCode.FEEDBACK_STALE,
+        FaultCode.NODE_HEARTBEAT_LOST,
+        FaultCode.SUPERVISOR_LOST,
+    )
+)
+
+
+def why(faults: Sequence[Mapping[str, Any]]) -> str:
+    """The status document's faults with cause and remedy, and what is behind lateness where the bus is not real."""
+    told = " ".join(f"{f['code']}: {f['cause']} {f['remedy']}" for f in faults)
+    if _STARVATION.isdisjoint(fault["code"] for fault in faults):
+        return told
+    return (
+        f"{told} Likely other programs took the processor: the demo on the wall clock wants the machine for itself; "
+        "`servoctl demo --fast` does not."
+    )
+
+
 def motion_runs(client: ControlClient) -> bool:
     """Whether a motion runs. Raises AnswerIsNo with the faults when the axis is not enabled any more."""
     status: dict[str, Any] = client.call("status")
     if status["axis"]["state"] != "ENABLED":
-        faults = "; ".join(f"{f['code']}: {f['cause']}" for f in status["faults"])
-        raise AnswerIsNo(f"the axis went to {status['axis']['state']} while it was to move. {faults}")
+        raise AnswerIsNo(f"the axis went to {status['axis']['state']} while it was to move. {why(status['faults'])}")
     return bool(status["axis"]["motion_running"])

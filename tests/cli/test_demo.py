@@ -11,10 +11,13 @@ import time
 from pathlib import Path
 
 import pytest
+import yaml
 
 from servod.cli.app import run
 from servod.cli.demo import print_document
 from servod.demo.entries import entries
+from servod.demo.wall import why
+from servod.errors import FAULTS, FaultCode
 from servod.shipped import shipped
 
 #: Both lines of the paper's story: feedback alone sticks, a friction model removes most of the error.
@@ -90,6 +93,40 @@ def test_the_plant_can_be_another_joint(tmp_path: Path, capsys: pytest.CaptureFi
     scores = document["controllers"]
     assert "others" not in document
     assert scores["pd"]["rms_error_mrad"] < STUCK_MRAD
+
+
+@pytest.mark.parametrize(
+    ("plant", "where"),
+    [
+        ("{friction: {kind: coulomb_viscous, viscous: 0.056, coulomb: 0.2}, torque_offset: 0.4}", "not enabled"),
+        ("{inertia: 1.0e-5, friction: {kind: coulomb_viscous, viscous: 0.0, coulomb: 0.0}}", "under pd"),
+    ],
+)
+def test_a_fault_in_virtual_time_is_named_with_its_remedy(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], plant: str, where: str
+) -> None:
+    (tmp_path / "wild.yaml").write_text(yaml.safe_dump({"inertia": 0.001} | yaml.safe_load(plant)))
+    words = ["demo", "--fast", "--seconds", "2", "--json", "--out", str(tmp_path)]
+    assert run([*words, "--plant", str(tmp_path / "wild.yaml")]) == 1
+    said = capsys.readouterr().err
+    fault = FAULTS[FaultCode.SPEED_LIMIT]
+    assert where in said and f"SPEED_LIMIT: {fault.cause} {fault.remedy}" in said
+
+
+@pytest.mark.parametrize(
+    ("fault", "starved"),
+    [
+        (FaultCode.SUPERVISOR_LOST, True),
+        (FaultCode.DEADLINE_BUDGET, True),
+        (FaultCode.FEEDBACK_STALE, True),
+        (FaultCode.SPEED_LIMIT, False),
+    ],
+)
+def test_faults_of_lateness_name_the_busy_machine(fault: FaultCode, starved: bool) -> None:
+    row = FAULTS[fault]
+    said = why([{"code": fault.name, "cause": row.cause, "remedy": row.remedy}])
+    assert said.startswith(f"{fault.name}: {row.cause} {row.remedy}")
+    assert ("wants the machine for itself" in said) == starved
 
 
 def start(tmp_path: Path, *arguments: str) -> subprocess.Popen[str]:
