@@ -6,6 +6,9 @@ works on files alone. Exit codes are those of servod.errors: 0 done, 1 the answe
 
 from __future__ import annotations
 
+import errno
+import io
+import os
 import re
 import shlex
 import sys
@@ -47,7 +50,25 @@ for _verb in _VERBS:
 
 def main() -> None:
     """Entry point of `servoctl`: errors become one line on standard error and an exit code, never a traceback."""
-    sys.exit(run(sys.argv[1:]))
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal without the character still gets the rest
+    try:
+        code = run(sys.argv[1:])
+        sys.stdout.flush()
+    except OSError as error:
+        code = _output_refused(error)
+    sys.exit(code)
+
+
+def _output_refused(error: OSError) -> int:
+    """The exit code when nobody takes standard output; any other error is raised again."""
+    if error.filename is not None or error.errno not in (errno.ENOSPC, errno.EIO, errno.EPIPE):
+        raise error
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the interpreter flushes once more
+    if error.errno == errno.EPIPE:
+        return 1  # the reader of a pipe has gone; nothing is left to say
+    return _complain(f"standard output: {error.strerror}", 1)
 
 
 def run(arguments: list[str]) -> int:
@@ -65,9 +86,6 @@ def run(arguments: list[str]) -> int:
         return _complain(f"{error.format_message()} Found: `{shlex.join(['servoctl', *arguments])}`; see --help.", 2)
     except (KeyboardInterrupt, typer.Abort):
         code = _INTERRUPTED
-    except BrokenPipeError:
-        sys.stderr.close()  # the reader of a pipe has gone; nothing is left to say
-        return 1
     if code == _INTERRUPTED:  # typer turns Ctrl-C within a command into this
         return _complain("interrupted", _INTERRUPTED)
     return code if isinstance(code, int) else 0

@@ -1,0 +1,39 @@
+"""Where standard output goes is no reason for a traceback."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+
+def servoctl(*words: str, **options: Any) -> subprocess.CompletedProcess[bytes]:
+    command = [sys.executable, "-m", "servod.cli", *words]
+    return subprocess.run(command, stderr=subprocess.PIPE, timeout=60, check=False, **options)
+
+
+@pytest.mark.parametrize("words", [("faults",), ("faults", "--json"), ("--help",)])
+def test_a_full_disk_is_one_line(words: tuple[str, ...]) -> None:
+    with Path("/dev/full").open("wb") as full:
+        done = servoctl(*words, stdout=full)
+    assert (done.returncode, done.stderr) == (1, b"servoctl: standard output: No space left on device\n")
+
+
+@pytest.mark.parametrize("words", [("faults",), ("faults", "--json")])
+def test_a_reader_that_has_gone_is_silence(words: tuple[str, ...]) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = servoctl(*words, stdout=writer)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (1, b"")
+
+
+def test_a_terminal_without_the_characters_gets_the_rest() -> None:
+    plain = {"PATH": os.environ["PATH"], "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONIOENCODING": "ascii"}
+    done = servoctl("faults", stdout=subprocess.PIPE, env=plain)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert b"TORQUE_CLIPPED" in done.stdout
