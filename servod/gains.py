@@ -16,6 +16,7 @@ from pydantic import Field, model_validator
 
 from servod.controllers import LAWS, Law
 from servod.errors import BadInput
+from servod.gain_design import Design
 from servod.gain_parameters import LocalSet, Parameters
 from servod.yaml12 import Dumper, Strict, parse_yaml, read_text, validate
 
@@ -31,6 +32,12 @@ class _Dumper(Dumper):
     def represent_mapping(self, tag: str, mapping: Any, flow_style: bool | None = None) -> yaml.MappingNode:
         in_one_line = isinstance(mapping, dict) and set(mapping) == set(LocalSet.model_fields)
         return super().represent_mapping(tag, mapping, in_one_line or flow_style)
+
+    def represent_sequence(self, tag: str, sequence: Any, flow_style: bool | None = None) -> yaml.SequenceNode:
+        """One row of a matrix in one line."""
+        items = list(sequence)
+        in_one_line = bool(items) and all(isinstance(item, float) for item in items)
+        return super().represent_sequence(tag, items, in_one_line or flow_style)
 
 
 class Provenance(Strict):
@@ -65,6 +72,7 @@ class Certificate(Strict):
     issued_by: str = Field(min_length=1, max_length=200, description="program and version that verified")
     issued_at: datetime.datetime
     checks: list[CertificateCheck] = Field(default_factory=list)
+    observations: dict[str, float] = Field(default_factory=dict, description="figures that are told, not judged")
 
     @model_validator(mode="after")
     def _valid_means_checked(self) -> Certificate:
@@ -81,7 +89,9 @@ class GainSet(Strict):
     description: str = Field("", max_length=1000)
     parameters: Parameters
     provenance: Provenance
+    design: Design | None = Field(None, description="what the set was designed for, with its proofs")
     certificate: Certificate | None = None
+    seal: Sha256 | None = Field(None, description="hash of all the rest, written by the tool that wrote the set")
 
     @property
     def law(self) -> Law:
@@ -97,8 +107,20 @@ class GainSet(Strict):
 
         Defaults are written out, so that a changed default changes the hash; comments and notes do not.
         """
-        plain = _all_floats(self.parameters.model_dump(mode="json"))
-        return hashlib.sha256(json.dumps(plain, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+        return _digest(self.parameters.model_dump(mode="json"))
+
+    def content_sha256(self) -> str:
+        """Hash of the whole set but its seal, in the same canonical form."""
+        return _digest(self.model_dump(mode="json", exclude={"seal"}))
+
+    def sealed(self) -> GainSet:
+        """The same set with a seal that fits: every later change of a number shows."""
+        return self.model_copy(update={"seal": self.content_sha256()})
+
+    @property
+    def seal_broken(self) -> bool:
+        """Whether the set has a seal that does not fit, or a design without one."""
+        return (self.seal is not None or self.design is not None) and self.seal != self.content_sha256()
 
     def certificate_problem(self) -> str | None:
         """Why the set does not count as certified, in a few words; None when it does."""
@@ -108,12 +130,19 @@ class GainSet(Strict):
             return "a certificate that says valid: false"
         if self.certificate.parameters_sha256 != self.parameters_sha256():
             return "a certificate for other parameters (they were changed after it was issued)"
+        if self.seal_broken:
+            return "numbers that were changed after the set was sealed"
         return None
 
     def to_yaml(self) -> str:
         """The set as YAML text that `parse_gains` reads back to an equal set."""
         plain = self.model_dump(mode="json", exclude_none=True)
         return yaml.dump(plain, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)
+
+
+def _digest(value: Any) -> str:
+    plain = json.dumps(_all_floats(value), sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(plain.encode()).hexdigest()
 
 
 def _all_floats(value: Any) -> Any:

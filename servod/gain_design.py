@@ -1,0 +1,99 @@
+"""The design behind a gain set: model, intervals and the matrices that prove it; anyone can check the set alone.
+
+Beside the data path: `servoctl synthesize` writes it, `servoctl verify` reads it; the daemon only carries it along.
+Matrices are lists of rows. States of a region's matrices: [x, v_f, u_(k-1), ..., u_(k-n), v - v_f, z], each divided by
+its `scale`.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated
+
+from pydantic import ConfigDict, Field
+
+from servod.axis_model import AxisModel
+from servod.yaml12 import Strict
+
+Share = Annotated[float, Field(ge=0.0, lt=0.9)]
+Positive = Annotated[float, Field(gt=0.0)]
+Row = list[float]
+Matrix = list[Row]
+
+
+class _Numbers(Strict):
+    model_config = ConfigDict(strict=True)
+
+
+class Uncertainty(Strict):
+    """Half widths of the intervals in which the true axis lies, each a share of the model's value."""
+
+    inertia: Share = 0.05
+    torque_gain: Share = 0.01
+    stiffness: Share = Field(0.12, description="bristle stiffness c0")
+    damping: Share = Field(0.3, description="bristle damping sigma1")
+    dry: Share = Field(0.05, description="level of dry friction")
+    slope: Share = Field(0.05, description="fall of the Stribeck curve beyond the level of dry friction")
+    viscous: Share = 0.1
+
+    def scaled(self, factor: float) -> Uncertainty:
+        """All half widths times `factor`, at most 0.85."""
+        return Uncertainty(**{key: min(factor * value, 0.85) for key, value in self.model_dump().items()})
+
+
+class Vertex(_Numbers):
+    """One vertex of a region: the sampled joint, and the matrices that prove it; `name` says which ends it takes.
+
+    `mode` names the polytope that it is a corner of (sliding or sticking) and with it the slack matrix.
+    """
+
+    name: str
+    mode: str
+    a: Matrix
+    b: Row
+    e: Row
+    disc_centre: float
+    disc_radius: Positive
+    lyapunov_disc: Matrix = Field(description="Q")
+    lyapunov_h2: Matrix | None = Field(None, description="P; None where the H2 norm does not count")
+    output: Matrix | None = Field(None, description="W, trace = squared H2 norm bound")
+
+
+class RegionProof(_Numbers):
+    """Proof of one region: feedback u = feedback*[x, v_f] in scaled units, one slack per mode, one P and Q per vertex.
+
+    H2 (de Oliveira, Geromel, Bernussou, IJC 75, 2002): [P - E E', A G; *, G + G' - P] > 0, [W, C G; *, G + G' - P] > 0
+    with the loop closed; pole disc: [r Q, (A - c) G; *, r (G + G' - Q)] > 0.
+    """
+
+    name: str
+    speed_from_rad_s: float
+    speed_to_rad_s: float
+    scale: Row
+    torque_scale_nm: Positive
+    position_weight: Positive = Field(description="alpha, on the scaled position error")
+    torque_weight: Positive = Field(description="beta, on the scaled torque")
+    feedback: Row
+    slack: dict[str, Matrix] = Field(description="G, one for each mode")
+    vertices: list[Vertex] = Field(min_length=1, max_length=64)
+
+
+class DesignMode(StrEnum):
+    """The paper's continuous-time programme, or the one with delay and filter that is meant to run."""
+
+    REFERENCE = "reference"
+    DEPLOYED = "deployed"
+
+
+class Design(_Numbers):
+    """What a gain set was designed for, and its proofs."""
+
+    mode: DesignMode = Field(strict=False)
+    period_s: Positive
+    velocity_cutoff_hz: Positive
+    counts_per_turn: Annotated[float, Field(ge=0.0)]
+    speed_max_rad_s: Positive
+    accuracy: Share = Field(0.0, description="force tolerance between local sets, as a share")
+    model: AxisModel = Field(strict=False)
+    uncertainty: Uncertainty
+    regions: list[RegionProof] = Field(default_factory=list, max_length=2)
