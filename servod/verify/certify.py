@@ -1,0 +1,72 @@
+"""`servoctl verify` without the command line: all checks of a gain set, and the certificate that they make.
+
+Top of servod.verify. A set is judged from itself alone: model, intervals and proofs stand in its design.
+"""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+from servod import __version__
+from servod.errors import BadInput
+from servod.gains import Certificate, CertificateCheck, GainSet
+from servod.verify.checks import SIMULATED, STATIC, Subject, observations
+
+PLANTS, SEED, PROCESSES = 1000, 1, 2
+
+
+@dataclass(frozen=True, slots=True)
+class Verification:
+    """The outcome: every check with figure, limit and margin, and what is told beside."""
+
+    checks: list[CertificateCheck]
+    observations: dict[str, float]
+
+    @property
+    def valid(self) -> bool:
+        """Whether every check passed."""
+        return all(check.passed for check in self.checks)
+
+    def certificate(self, gains: GainSet) -> Certificate:
+        """The certificate for these very gains."""
+        return Certificate(
+            valid=self.valid,
+            parameters_sha256=gains.parameters_sha256(),
+            model_sha256=gains.provenance.model_sha256,
+            issued_by=f"servod {__version__} verify, source {source_sha256()[:16]}",
+            issued_at=datetime.datetime.now(datetime.UTC).replace(microsecond=0),
+            checks=self.checks,
+            observations=self.observations,
+        )
+
+    def certified(self, gains: GainSet) -> GainSet:
+        """`gains` with the certificate, sealed."""
+        return gains.model_copy(update={"certificate": self.certificate(gains)}).sealed()
+
+
+def source_sha256() -> str:
+    """Hash of the sources that verify: which tool said so."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def verify(
+    gains: GainSet, plants: int = PLANTS, seed: int = SEED, processes: int = PROCESSES, where: str = "gain set"
+) -> Verification:
+    """Judge `gains` by its own design. Raises BadInput when it has none.
+
+    Simulations run only when everything cheaper has passed: what is refused is refused at once.
+    """
+    if gains.design is None:
+        raise BadInput(f"{where}: design", "nothing", "a design, as `servoctl synthesize` writes it")
+    subject = Subject(gains, gains.design, plants, seed, processes)
+    checks = [check for judge in STATIC for check in judge(subject)]
+    if not all(check.passed for check in checks):
+        return Verification(checks, {})
+    checks += [check for judge in SIMULATED for check in judge(subject)]
+    return Verification(checks, observations(subject))

@@ -1,0 +1,169 @@
+"""Every check of a certificate, one function each: figure, limit, margin. Told figures stand in `observations`.
+
+Stands on proof, margins and trials. A check is added to the table at the end and nowhere else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from servod.gain_design import Design
+from servod.gain_parameters import LocalParameters
+from servod.gains import CertificateCheck, GainSet
+from servod.verify.closed_loop import Deviation, corners, inner_points
+from servod.verify.margins import NOMINAL, Sweep, largest_tolerated
+from servod.verify.plants import drawn
+from servod.verify.proof import region_margin, stored_deviation
+from servod.verify.sampled import Timing
+from servod.verify.steady_friction import steady_friction
+from servod.verify.trials import hold_ripple, monte_carlo, ramp_ripples
+
+CORNER_SPEEDS, DENSE_SPEEDS, INNER_POINTS = 30, 60, 24
+SLOWEST = 1e-3  # share of the top speed
+TOP = 1.5  # speeds beyond the map that are judged as well, as a factor
+STIFFNESS_LIMIT = 0.8  # of c0: stable with one to three cycles of delay
+DISK_LIMIT = 0.1
+HOLD_LIMIT_RAD, RAMP_LIMIT_RAD = 2e-5, 2e-4
+SAME = 1e-9  # relative difference that writing and reading numbers may make
+EXTRA_DELAY_CYCLES, FACTOR_LIMIT = 4.0, 10.0
+LIMIT_CYCLE_PLANTS = 4
+
+
+@dataclass(frozen=True)
+class Subject:
+    """The set under judgement, with how thoroughly it shall be judged."""
+
+    gains: GainSet
+    design: Design
+    plants: int
+    seed: int
+    processes: int
+
+    @property
+    def timing(self) -> Timing:
+        """Period, delay and filter that the design states."""
+        d = self.design
+        return Timing(d.period_s, d.model.total_delay_s, d.velocity_cutoff_hz)
+
+    def sweep(self, speeds: int) -> Sweep:
+        """The linearised law at `speeds` speeds per direction."""
+        friction = steady_friction(self.design.model)
+        return Sweep(self.gains.law, self.gains.pack(), friction, self.timing, speeds_of(self.design, speeds))
+
+    @cached_property
+    def coarse(self) -> Sweep:
+        """The sweep for corners and tolerances."""
+        return self.sweep(CORNER_SPEEDS)
+
+    @cached_property
+    def dense(self) -> Sweep:
+        """The sweep for inner points, dense enough to lie between nodes and between the regions."""
+        return self.sweep(DENSE_SPEEDS)
+
+
+def speeds_of(design: Design, count: int) -> list[float]:
+    """`count` speeds from creeping to beyond the map [rad/s]."""
+    top = design.speed_max_rad_s
+    return [float(v) for v in np.geomspace(SLOWEST * top, TOP * top, count)]
+
+
+def at_least(name: str, value: float, limit: float) -> CertificateCheck:
+    """A check whose figure must not be below its limit; figures are kept finite."""
+    value = float(np.clip(value, -1e12, 1e12))
+    return CertificateCheck(name=name, value=value, limit=limit, margin=value - limit, passed=bool(value >= limit))
+
+
+def at_most(name: str, value: float, limit: float) -> CertificateCheck:
+    """A check whose figure must not be above its limit."""
+    value = float(np.clip(np.nan_to_num(value, nan=1e12), -1e12, 1e12))
+    return CertificateCheck(name=name, value=value, limit=limit, margin=limit - value, passed=bool(value <= limit))
+
+
+def check_seal(s: Subject) -> Iterator[CertificateCheck]:
+    """No number was changed since the set was written."""
+    yield at_most("numbers changed since the set was sealed (0 no, 1 yes)", float(s.gains.seal_broken), 0.0)
+
+
+def check_regions(s: Subject) -> Iterator[CertificateCheck]:
+    """LMIs by eigenvalues; stored vertices as the model says; the law's gains as proven."""
+    local = s.gains.parameters
+    for region in s.design.regions:
+        margin, _ = region_margin(region)
+        yield at_least(f"LMI of region {region.name}, least relative eigenvalue", margin, 0.0)
+        yield at_most(f"vertices of region {region.name} against the model", stored_deviation(s.design, region), SAME)
+        if isinstance(local, LocalParameters):
+            own = getattr(local.regions, region.name)
+            used = np.array([own.k_x_per_rad, own.k_v_s_per_rad]) * local.input_scale_nm
+            proven = -np.array(region.feedback) * region.torque_scale_nm / np.array(region.scale[:2])
+            difference = float(np.abs(used / proven - 1.0).max()) + abs(own.k_z_per_rad)
+            yield at_most(f"gains of region {region.name} against the proven ones", difference, SAME)
+
+
+def check_stiffness(s: Subject) -> Iterator[CertificateCheck]:
+    """c0_hat below its stability bound, at the soft end of the interval."""
+    local = s.gains.parameters
+    if isinstance(local, LocalParameters):
+        softest = steady_friction(s.design.model).stiffness * (1.0 - s.design.uncertainty.stiffness)
+        share = local.friction.stiffness_nm_per_rad / softest
+        yield at_most("c0_hat as a share of the lowest c0", share, STIFFNESS_LIMIT + SAME)
+
+
+def check_loop(s: Subject) -> Iterator[CertificateCheck]:
+    """Largest pole of the full sampled loop: every corner, inner points between nodes and regions, one cycle."""
+    cases = corners(s.design.uncertainty)
+    yield at_most("largest pole, corners of the intervals", s.coarse.worst(cases).radius, 1.0)
+    inner = inner_points(s.design.uncertainty, INNER_POINTS, s.seed)
+    yield at_most("largest pole, inner points, dense speeds", s.dense.worst(inner).radius, 1.0)
+    one = Timing(s.design.period_s, s.design.period_s, s.design.velocity_cutoff_hz)
+    yield at_most("largest pole, one cycle of delay", s.dense.worst(NOMINAL, one).radius, 1.0)
+    yield at_least("symmetric disk margin", s.coarse.disk_margin()[0], DISK_LIMIT)
+
+
+def check_monte_carlo(s: Subject) -> Iterator[CertificateCheck]:
+    """Plants drawn from the intervals, simulated with the law that runs."""
+    trials = monte_carlo(s.gains, s.plants, s.seed, s.processes)
+    failed = sum(not trial.stable for trial in trials)
+    yield at_most(f"plants of {len(trials)} that do not follow or do not rest", float(failed), 0.0)
+    yield at_most("largest error over these plants [rad]", max(t.error_rad for t in trials), 2e-3)
+
+
+def check_limit_cycles(s: Subject) -> Iterator[CertificateCheck]:
+    """20 s hold and slow ramps on the model and on drawn plants."""
+    some = [drawn(s.design.model, s.design.uncertainty, s.seed, i) for i in range(LIMIT_CYCLE_PLANTS)]
+    quantum = 2.0 * 2.0 * np.pi / s.design.counts_per_turn if s.design.counts_per_turn else 0.0
+    hold = max(hold_ripple(s.gains, s.design, plant) for plant in (s.design.model, *some))
+    yield at_most("20 s hold, peak to peak [rad]", hold, HOLD_LIMIT_RAD + quantum)
+    ramps = max(r for plant in (s.design.model, *some) for r in ramp_ripples(s.gains, s.design, plant))
+    yield at_most("slow ramps, peak to peak error [rad]", ramps, RAMP_LIMIT_RAD + quantum)
+
+
+def observations(s: Subject) -> dict[str, float]:
+    """Figures that are told and not judged: two cycles of delay, and how far one value alone may go."""
+    sweep, period = s.coarse, s.design.period_s
+    two = Timing(period, 2.0 * period, s.design.velocity_cutoff_hz)
+    longest = largest_tolerated(lambda d: sweep.stable(Deviation(), d), 0.0, EXTRA_DELAY_CYCLES * period)
+    return {
+        "largest pole, two cycles of delay": s.dense.worst(NOMINAL, two).radius,
+        "largest tolerated delay [s]": s.timing.delay_s + longest,
+        "largest tolerated friction scale": largest_tolerated(
+            lambda f: sweep.stable(Deviation(dry=f, viscous=f)), 1.0, FACTOR_LIMIT
+        ),
+        "largest tolerated inertia scale": largest_tolerated(
+            lambda f: sweep.stable(Deviation(inertia=f)), 1.0, FACTOR_LIMIT
+        ),
+        "least tolerated inertia scale": largest_tolerated(lambda f: sweep.stable(Deviation(inertia=f)), 1.0, 0.1),
+    }
+
+
+#: Cheap ones first: a set that fails them is not simulated.
+STATIC: tuple[Callable[[Subject], Iterator[CertificateCheck]], ...] = (
+    check_seal,
+    check_regions,
+    check_stiffness,
+    check_loop,
+)
+SIMULATED = (check_monte_carlo, check_limit_cycles)

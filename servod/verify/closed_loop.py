@@ -1,0 +1,193 @@
+"""The full sampled closed loop around one velocity: joint with bristle, delay, velocity filter and the law itself.
+
+Stands on `sampled` and on the control law's own step function, which is linearised numerically as it is: friction
+state, disturbance observer, schedules and l_i are in it because they are in the law. States: [x, v, z, v_f, u_(k-1),
+..., law state]. A joint is judged where it slides steadily (the bristle follows g(v)), where the bristle still sticks
+(b = 1) and where it is being turned over after a reversal (b = 2).
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from servod.controllers import Law
+from servod.controllers.state import ASKED, FRICTION_STATE, LAST_VELOCITY, N_STATES
+from servod.gain_design import Uncertainty
+from servod.verify.sampled import Array, Timing, with_delay_and_filter
+from servod.verify.steady_friction import SteadyFriction
+
+N_JOINT = 3  # x, v, z
+SETTLE_CYCLES = 100  # at most, after the first long one
+LONG_S = 1e4  # the friction state's step is exact, so one long cycle settles it
+NUDGE = 1e-7
+STUCK_DECAY_PER_S = 1000.0  # of the bristle state where the stiffness acts on the position and the state does nothing
+
+
+class Bristle(Enum):
+    """What the bristle does in a linearisation: value is z over its steady value, which gives dz'/dv = 1 - value."""
+
+    SLIDES = 1.0
+    STICKS = 0.0
+    TURNS = -1.0
+
+
+@dataclass(frozen=True, slots=True)
+class JointPoint:
+    """The joint linearised at one velocity: z' = -a z + b v, m v' = gain*u - sigma0 z - sigma1 z' - viscous v + w."""
+
+    velocity: float
+    bristle: Bristle
+    inertia: float
+    gain: float
+    decay: float
+    build_up: float
+    stiffness: float
+    damping: float
+    viscous: float
+
+    def matrices(self) -> tuple[Array, Array, Array]:
+        """(A, B, E) in states x, v, z.
+
+        At rest z - x is constant and cannot be controlled, so the stiffness acts on the position itself.
+        """
+        m, s1 = self.inertia, self.damping
+        b, e = np.array([0.0, self.gain / m, 0.0]), np.array([0.0, 1.0 / m, 0.0])
+        if self.decay == 0.0:
+            stuck = [-self.stiffness / m, -(self.viscous + s1) / m, 0.0]
+            return np.array([[0.0, 1.0, 0.0], stuck, [0.0, 0.0, -STUCK_DECAY_PER_S]]), b, e
+        row = [0.0, -(self.viscous + s1 * self.build_up) / m, -(self.stiffness - s1 * self.decay) / m]
+        a = np.array([[0.0, 1.0, 0.0], row, [0.0, self.build_up, -self.decay]])
+        return a, b, e
+
+
+@dataclass(frozen=True, slots=True)
+class Deviation:
+    """Factors on the model's values: one corner, or an inner point, of the intervals.
+
+    `dry` scales g(v) with its slope; `slope` makes the slope steeper than that.
+    """
+
+    inertia: float = 1.0
+    torque_gain: float = 1.0
+    stiffness: float = 1.0
+    damping: float = 1.0
+    dry: float = 1.0
+    slope: float = 1.0
+    viscous: float = 1.0
+
+
+def corners(u: Uncertainty) -> list[Deviation]:
+    """Every corner of the intervals that matter to small deviations; the level of dry friction moves with its slope."""
+    names = ("inertia", "stiffness", "damping", "slope", "viscous")
+    found = []
+    for signs in itertools.product((-1.0, 1.0), repeat=len(names)):
+        factors = {n: 1.0 + s * getattr(u, n) for n, s in zip(names, signs, strict=True)}
+        found.append(Deviation(**factors, torque_gain=1.0 + signs[0] * -u.torque_gain, dry=1.0 + signs[3] * u.dry))
+    return found
+
+
+def inner_points(u: Uncertainty, count: int, seed: int) -> list[Deviation]:
+    """`count` points of the intervals, uniformly at random."""
+    random = np.random.default_rng(seed)
+    names = Uncertainty.model_fields
+    draws = random.uniform(-1.0, 1.0, (count, len(names)))
+    return [Deviation(**{n: float(1.0 + d * getattr(u, n)) for n, d in zip(names, row, strict=True)}) for row in draws]
+
+
+def joint_point(friction: SteadyFriction, velocity: float, bristle: Bristle, d: Deviation) -> JointPoint:
+    """The joint at `velocity` [rad/s], with the true Stribeck slope in how the bristle builds up."""
+    speed = abs(velocity)
+    stiffness, dry = friction.stiffness * d.stiffness, friction.dry(velocity) * d.dry
+    slope = speed * friction.dry_slope(velocity) * d.slope / friction.dry(velocity) if speed else 0.0
+    return JointPoint(
+        velocity,
+        bristle,
+        friction.inertia * d.inertia,
+        d.torque_gain,
+        stiffness * speed / dry,
+        1.0 - bristle.value + bristle.value * slope if speed else 1.0,
+        stiffness,
+        min(friction.damping(velocity) * d.damping, 4.0 * dry / speed) if speed else friction.damping(0.0) * d.damping,
+        friction.viscous(velocity) * d.viscous,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class LawSlopes:
+    """The law linearised: [u, next law state] = matrix times [x, v_f, law state]; `frozen` states never change."""
+
+    matrix: Array
+    frozen: tuple[int, ...]
+
+
+def settled_state(law: Law, gains: tuple[float, ...], velocity: float, moves: bool, period_s: float) -> list[float]:
+    """State of the law in steady motion without error: what it settles to when fed its own torque."""
+    state = [0.0] * N_STATES
+    state[LAST_VELOCITY] = velocity
+    nudge = np.finfo(float).tiny if moves else 0.0
+    for cycle in range(SETTLE_CYCLES):
+        before = list(state)
+        dt = period_s if cycle else LONG_S
+        law.step(gains, state, 0.0, velocity, nudge, 0.0, velocity, state[ASKED], dt)
+        if max(abs(x - y) for x, y in zip(before, state, strict=True)) < 1e-15:
+            break
+    return state
+
+
+def law_slopes(law: Law, gains: tuple[float, ...], velocity: float, moves: bool, timing: Timing) -> LawSlopes:
+    """Central differences of the law's step at steady motion; at rest `moves` tells crossing zero from holding."""
+    base = settled_state(law, gains, velocity, moves, timing.period_s)
+    nudge = np.finfo(float).tiny if moves else 0.0
+    scale = np.full(N_STATES, NUDGE)
+    scale[FRICTION_STATE] = NUDGE * max(abs(base[FRICTION_STATE]), 1e-4)
+
+    def stepped(x: float, v: float, shift: Array) -> Array:
+        state = [value + float(extra) for value, extra in zip(base, shift, strict=True)]
+        u = law.step(gains, state, 0.0, velocity, nudge, x, velocity + v, state[ASKED], timing.period_s)[0]
+        return np.array([u, *state])
+
+    still = np.zeros(N_STATES)
+    columns = [
+        (stepped(1e-10, 0.0, still) - stepped(-1e-10, 0.0, still)) / 2e-10,
+        (stepped(0.0, NUDGE, still) - stepped(0.0, -NUDGE, still)) / (2.0 * NUDGE),
+    ]
+    for i in range(N_STATES):
+        shift = np.zeros(N_STATES)
+        shift[i] = scale[i]
+        columns.append((stepped(0.0, 0.0, shift) - stepped(0.0, 0.0, -shift)) / (2.0 * scale[i]))
+    matrix = np.stack(columns, axis=1)
+    unit = np.eye(N_STATES)
+    frozen = tuple(i for i in range(N_STATES) if np.allclose(matrix[1 + i], [0.0, 0.0, *unit[i]], atol=1e-9))
+    return LawSlopes(matrix, frozen)
+
+
+def loops(points: list[JointPoint], law: LawSlopes, timing: Timing) -> tuple[Array, Array, Array]:
+    """(closed loops, torque input column, row that gives the law's torque) for joints under one linearised law.
+
+    States that the law keeps constant (a held disturbance estimate, the flag of the first step) are left out.
+    """
+    parts = [point.matrices() for point in points]
+    a, b, e = (np.array(part) for part in zip(*parts, strict=True))
+    plant_a, plant_b, _ = with_delay_and_filter(a, b, e, timing)
+    n = plant_a.shape[-1]
+    keep = [i for i in range(N_STATES) if i not in law.frozen]
+    seen = [0, 1, *(2 + i for i in keep)]
+    row = np.zeros(n + len(keep))
+    row[[0, N_JOINT, *range(n, n + len(keep))]] = law.matrix[0, seen]
+    closed = np.zeros((len(points), len(row), len(row)))
+    closed[:, :n, :n] = plant_a
+    column = np.concatenate([plant_b, np.zeros((len(points), len(keep)))], axis=1)
+    closed += column[:, :, None] * row
+    for j, i in enumerate(keep):
+        closed[:, n + j, [0, N_JOINT, *range(n, n + len(keep))]] = law.matrix[1 + i, seen]
+    return closed, column, row
+
+
+def spectral_radius(closed: Array) -> Array:
+    """Largest pole magnitude of each loop."""
+    radius: Array = np.abs(np.linalg.eigvals(closed)).max(axis=-1)
+    return radius

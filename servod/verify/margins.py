@@ -1,0 +1,106 @@
+"""What the full sampled loop tolerates: worst poles over points and intervals, disk margin, delay, friction, inertia.
+
+Stands on `closed_loop`. A sweep linearises the law once per velocity and judges many joints under it at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from servod.controllers import Law
+from servod.verify.closed_loop import Bristle, Deviation, LawSlopes, joint_point, law_slopes, loops, spectral_radius
+from servod.verify.sampled import Array, Timing
+from servod.verify.steady_friction import SteadyFriction
+
+FREQUENCIES = 200
+SEARCH_STEPS = 14
+NOMINAL = (Deviation(),)
+
+
+@dataclass(frozen=True, slots=True)
+class Worst:
+    """The worst pole of a sweep, and where it is."""
+
+    radius: float
+    velocity_rad_s: float
+    bristle: str
+    case: int
+
+
+class Sweep:
+    """One law on one axis, to be judged at many velocities; `speeds` ascend, both directions are taken."""
+
+    def __init__(
+        self, law: Law, gains: tuple[float, ...], friction: SteadyFriction, timing: Timing, speeds: Sequence[float]
+    ) -> None:
+        self.law, self.gains, self.friction, self.timing = law, gains, friction, timing
+        self.speeds = tuple(speeds)
+
+    @cached_property
+    def slopes(self) -> list[tuple[float, LawSlopes]]:
+        """The linearised law: moving through zero, holding at rest, and at every velocity in both directions."""
+        rest = [(0.0, law_slopes(self.law, self.gains, 0.0, moves, self.timing)) for moves in (True, False)]
+        velocities = [side * v for side in (1.0, -1.0) for v in self.speeds]
+        return rest + [(v, law_slopes(self.law, self.gains, v, True, self.timing)) for v in velocities]
+
+    def systems(
+        self, cases: Sequence[Deviation], timing: Timing | None = None, *, transient: bool = True
+    ) -> Iterator[tuple[float, Bristle, tuple[Array, Array, Array]]]:
+        """Closed loops of all `cases` at each velocity; `transient`: also with the bristle not yet following."""
+        for velocity, slopes in self.slopes:
+            kinds = [Bristle.STICKS] if velocity == 0.0 else [Bristle.SLIDES]
+            if transient and velocity != 0.0:
+                kinds += [Bristle.STICKS, Bristle.TURNS]
+            for kind in kinds:
+                points = [joint_point(self.friction, velocity, kind, case) for case in cases]
+                yield velocity, kind, loops(points, slopes, timing or self.timing)
+
+    def worst(self, cases: Sequence[Deviation], timing: Timing | None = None) -> Worst:
+        """The worst pole over all velocities, bristle states and cases."""
+        found = Worst(0.0, 0.0, "", 0)
+        for velocity, kind, (closed, _, _) in self.systems(cases, timing):
+            radius = spectral_radius(closed)
+            i = int(radius.argmax())
+            if radius[i] > found.radius:
+                found = Worst(float(radius[i]), velocity, kind.name.lower(), i)
+        return found
+
+    def disk_margin(self) -> tuple[float, float]:
+        """(symmetric disk margin, velocity where it is least), with the joint as modelled.
+
+        alpha = 2/max|S - T| over the frequencies: gain may change by (2 + alpha)/(2 - alpha) and phase by
+        2*atan(alpha/2) at the drive. Source: Seiler, Packard, Gahinet, IEEE Control Systems 40(5), 2020.
+        """
+        z = np.exp(1j * np.geomspace(1e-3, np.pi, FREQUENCIES))
+        least, where = np.inf, 0.0
+        for velocity, _, (closed, column, row) in self.systems(NOMINAL, transient=False):
+            identity = np.eye(len(row))
+            resolvent = np.linalg.solve(z[:, None, None] * identity - closed[0], column[0].astype(complex)[:, None])
+            sensitivity = 1.0 + (row @ resolvent)[:, 0]
+            margin = 1.0 / float(np.abs(sensitivity - 0.5).max())
+            if margin < least:
+                least, where = margin, velocity
+        return least, where
+
+    def stable(self, case: Deviation, extra_delay_s: float = 0.0) -> bool:
+        """Whether all poles are inside, steady sliding and sticking, for one case and a longer delay."""
+        timing = replace(self.timing, delay_s=self.timing.delay_s + extra_delay_s)
+        systems = self.systems((case,), timing, transient=False)
+        return all(spectral_radius(closed)[0] < 1.0 for _, _, (closed, _, _) in systems)
+
+
+def largest_tolerated(stable: Callable[[float], bool], start: float, end: float) -> float:
+    """Largest value between `start` and `end` with all stable from `start` on, by bisection; `start` if none."""
+    if not stable(start):
+        return start
+    if stable(end):
+        return end
+    good, bad = start, end
+    for _ in range(SEARCH_STEPS):
+        middle = 0.5 * (good + bad)
+        good, bad = (middle, bad) if stable(middle) else (good, middle)
+    return good

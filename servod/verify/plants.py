@@ -1,0 +1,64 @@
+"""Axis models drawn from a design's intervals: what the Monte-Carlo runs and the limit-cycle tests simulate.
+
+Stands on the axis model alone; every draw has its own seed, so that any plant of a run can be made again.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from servod.axis_effects import Asymmetry, TorqueGain
+from servod.axis_model import AxisModel, LugreFriction
+from servod.gain_design import Uncertainty
+
+DIRECTION_SHARE = 0.5  # of the interval of dry friction, drawn for each direction by itself
+
+
+def drawn(model: AxisModel, uncertainty: Uncertainty, seed: int, index: int) -> AxisModel:
+    """Plant number `index`: every uncertain value uniform in its interval, dry friction per direction as well."""
+    random = np.random.default_rng([seed, index])
+    factor = {name: float(1.0 + random.uniform(-1.0, 1.0) * getattr(uncertainty, name)) for name in FIELDS}
+    sides = 1.0 + random.uniform(-1.0, 1.0, 2) * DIRECTION_SHARE * uncertainty.dry
+    return scaled(model, factor, (float(sides[0]), float(sides[1])))
+
+
+FIELDS = tuple(Uncertainty.model_fields)
+
+
+def scaled(model: AxisModel, factor: dict[str, float], sides: tuple[float, float] = (1.0, 1.0)) -> AxisModel:
+    """`model` with its values times `factor` (keys of Uncertainty), dry friction per direction times `sides`."""
+    one = dict.fromkeys(FIELDS, 1.0) | factor
+    asymmetry = model.asymmetry or Asymmetry()
+    gain = model.torque_gain or TorqueGain()
+    update: dict[str, Any] = {
+        "inertia": model.inertia * one["inertia"],
+        "friction": _friction(model, one),
+        "asymmetry": Asymmetry(
+            positive_dry=asymmetry.positive_dry * one["dry"] * sides[0],
+            negative_dry=asymmetry.negative_dry * one["dry"] * sides[1],
+            positive_viscous=asymmetry.positive_viscous * one["viscous"],
+            negative_viscous=asymmetry.negative_viscous * one["viscous"],
+        ),
+        "torque_gain": gain.model_copy(
+            update={
+                "factor": gain.factor * one["torque_gain"],
+                "negative_factor": gain.negative_factor and gain.negative_factor * one["torque_gain"],
+            }
+        ),
+    }
+    if model.presliding is not None:
+        p = model.presliding
+        own = {"sigma0": p.sigma0 and p.sigma0 * one["stiffness"], "sigma1": p.sigma1 and p.sigma1 * one["damping"]}
+        update["presliding"] = p.model_copy(update=own)
+    return model.model_copy(update=update)
+
+
+def _friction(model: AxisModel, factor: dict[str, float]) -> Any:
+    """The friction group with bristle and Stribeck curve scaled."""
+    friction: Any = model.friction
+    update = {"sigma0": friction.sigma0 * factor["stiffness"], "sigma1": friction.sigma1 * factor["damping"]}
+    if isinstance(friction, LugreFriction) and friction.static is not None:
+        update["static"] = friction.coulomb + (friction.static - friction.coulomb) * factor["slope"]
+    return friction.model_copy(update=update)

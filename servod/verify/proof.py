@@ -1,0 +1,93 @@
+"""The LMIs of a gain set, evaluated by eigenvalues from the stored matrices: no solver, no trust in who made them.
+
+Stands on numpy and the stored design. A margin is the least eigenvalue of a block matrix divided by its largest; the
+inequality holds when it is positive.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from servod.gain_design import Design, RegionProof, Vertex
+from servod.verify.sampled import Array, Timing
+from servod.verify.steady_friction import steady_friction
+from servod.verify.vertices import Span, joints, sampled_vertices
+
+
+def relative_margin(matrix: Array) -> float:
+    """Least eigenvalue of the symmetric part, as a share of the largest magnitude of its eigenvalues."""
+    values = np.linalg.eigvalsh(0.5 * (matrix + matrix.T))
+    return float(values[0] / np.abs(values).max())
+
+
+def h2_state_block(a: Array, e: Array, slack: Array, lyapunov: Array) -> Array:
+    """[P - E E', A G; *, G + G' - P] of the closed loop, de Oliveira's H2 condition."""
+    moved = a @ slack
+    return np.block([[lyapunov - np.outer(e, e), moved], [moved.T, slack + slack.T - lyapunov]])
+
+
+def h2_output_block(c: Array, slack: Array, lyapunov: Array, output: Array) -> Array:
+    """[W, C G; *, G + G' - P]; trace W bounds the squared H2 norm."""
+    moved = c @ slack
+    return np.block([[output, moved], [moved.T, slack + slack.T - lyapunov]])
+
+
+def disc_block(a: Array, slack: Array, lyapunov: Array, centre: float, radius: float) -> Array:
+    """[r Q, (A - c) G; *, r (G + G' - Q)]: all poles in the disc of centre c and radius r (decay and damping)."""
+    moved = a @ slack - centre * slack
+    return np.block([[radius * lyapunov, moved], [moved.T, radius * (slack + slack.T - lyapunov)]])
+
+
+def closed(region: RegionProof, vertex: Vertex) -> tuple[Array, Array]:
+    """(A closed by the feedback, output matrix of [alpha*x; beta*u]) of one vertex, in scaled states."""
+    a, b = np.array(vertex.a), np.array(vertex.b)
+    feedback = np.zeros(len(a))
+    feedback[:2] = region.feedback
+    outputs = np.zeros((2, len(a)))
+    outputs[0, 0] = region.position_weight
+    outputs[1] = region.torque_weight * feedback
+    return a + np.outer(b, feedback), outputs
+
+
+def vertex_margin(region: RegionProof, vertex: Vertex) -> float:
+    """Least relative margin of the inequalities at one vertex: the pole disc, and H2 where it counts."""
+    a, c = closed(region, vertex)
+    slack = np.array(region.slack[vertex.mode])
+    margin = relative_margin(
+        disc_block(a, slack, np.array(vertex.lyapunov_disc), vertex.disc_centre, vertex.disc_radius)
+    )
+    if vertex.lyapunov_h2 is None or vertex.output is None:
+        return margin
+    p = np.array(vertex.lyapunov_h2)
+    return min(
+        margin,
+        relative_margin(h2_state_block(a, np.array(vertex.e), slack, p)),
+        relative_margin(h2_output_block(c, slack, p, np.array(vertex.output))),
+    )
+
+
+def region_margin(region: RegionProof) -> tuple[float, str]:
+    """(least relative margin over all vertices, the vertex that has it)."""
+    return min((vertex_margin(region, vertex), vertex.name) for vertex in region.vertices)
+
+
+def scaled_vertices(design: Design, region: RegionProof) -> tuple[list[str], Array, Array, Array]:
+    """Names and scaled (A, B, E) of the region's vertices, made anew from the design's model and intervals."""
+    span = Span(region.name, region.speed_from_rad_s, region.speed_to_rad_s)
+    found = joints(steady_friction(design.model), span, design.uncertainty)
+    timing = Timing(design.period_s, design.model.total_delay_s, design.velocity_cutoff_hz)
+    a, b, e = sampled_vertices(found, timing)
+    scale = np.array(region.scale)
+    torque = region.torque_scale_nm
+    return [j.name for j in found], a * (scale / scale[:, None]), b * torque / scale, e * torque / scale
+
+
+def stored_deviation(design: Design, region: RegionProof) -> float:
+    """Largest difference between the stored vertices and those made anew; infinite when they are not the same ones."""
+    names, a, b, e = scaled_vertices(design, region)
+    if names != [vertex.name for vertex in region.vertices]:
+        return float("inf")
+    return max(
+        float(max(np.abs(a[i] - v.a).max(), np.abs(b[i] - v.b).max(), np.abs(e[i] - v.e).max()))
+        for i, v in enumerate(region.vertices)
+    )

@@ -1,0 +1,123 @@
+"""Vertices of a region: the ends of the identified intervals as linear joints, ready for the LMIs of the deployed mode.
+
+Stands on the steady friction; synthesis solves over these vertices, verification makes them anew from the model and
+compares. A frozen a_i would imply the damping g/v; what acts on a small deviation is the true slope g'(v), below zero
+where the Stribeck curve falls, and sigma1 makes it act at once. Near rest the bristle sticks (stiffness c0,
+damping sigma1) or has broken away and slides: both are vertices of Omega_L.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from servod.gain_design import Uncertainty
+from servod.verify.closed_loop import Bristle, Deviation, joint_point
+from servod.verify.sampled import Array, Timing, with_delay_and_filter
+from servod.verify.steady_friction import SteadyFriction
+
+GRID = 40  # speeds at which slopes are taken, in each direction
+LEAST_SPEED = 0.1  # share of the region's upper speed from which slopes count: below it the bristle only creeps
+
+
+@dataclass(frozen=True, slots=True)
+class Joint:
+    """One vertex: dx/dt = A x + B u + E w with states position, velocity, bristle.
+
+    `mode` is the polytope that it is a corner of: the bristle slides or sticks. `performs` says whether the H2
+    norm counts here: not where the Stribeck curve falls.
+    """
+
+    name: str
+    mode: str
+    performs: bool
+    a: Array
+    b: Array
+    e: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """The speeds of one region; Omega_L holds rest, where the bristle may stick."""
+
+    name: str
+    from_rad_s: float
+    to_rad_s: float
+
+    @property
+    def holds_rest(self) -> bool:
+        """Whether zero velocity lies in the region."""
+        return self.from_rad_s == 0.0
+
+
+def ends(share: float) -> tuple[float, float]:
+    """Both ends of the interval of half width `share`, as factors."""
+    return 1.0 - share, 1.0 + share
+
+
+def steepest(friction: SteadyFriction, span: Span) -> tuple[float, float]:
+    """Velocities of the region at which friction falls most and rises most, over both directions [rad/s]."""
+    lowest = max(span.from_rad_s, LEAST_SPEED * span.to_rad_s)
+    velocities = [side * float(v) for side in (1.0, -1.0) for v in np.geomspace(lowest, span.to_rad_s, GRID)]
+    slopes = [friction.dry_slope(v) + friction.viscous(v) for v in velocities]
+    return velocities[int(np.argmin(slopes))], velocities[int(np.argmax(slopes))]
+
+
+def sliding(friction: SteadyFriction, span: Span, u: Uncertainty) -> list[Joint]:
+    """The joint where friction falls most (every end of what makes that worse) and where it rises most."""
+    falls, rises = steepest(friction, span)
+    slope = friction.dry_slope(falls) * (1.0 + u.slope) * (1.0 + u.dry) + friction.viscous(falls) * (1.0 - u.viscous)
+    found = []
+    for mass, damping in itertools.product(ends(u.inertia), ends(u.damping)):
+        gain = 1.0 + u.torque_gain if mass < 1.0 else 1.0 - u.torque_gain
+        shared = {"inertia": mass, "torque_gain": gain, "damping": damping}
+        size = f"{'light' if mass < 1.0 else 'heavy'} {'ringing' if damping < 1.0 else 'damped'}"
+        worse = Deviation(**shared, dry=1.0 + u.dry, slope=1.0 + u.slope, viscous=1.0 - u.viscous)
+        better = Deviation(**shared, dry=1.0 - u.dry, viscous=1.0 + u.viscous)
+        for name, velocity, deviation, performs in (
+            ("falling", falls, worse, slope >= 0.0),
+            ("rising", rises, better, True),
+        ):
+            matrices = joint_point(friction, velocity, Bristle.SLIDES, deviation).matrices()
+            found.append(Joint(f"sliding {name} {size}", "sliding", performs, *matrices))
+    return found
+
+
+def sticking(friction: SteadyFriction, u: Uncertainty) -> list[Joint]:
+    """The joint on its bristle: every end of stiffness, damping and inertia."""
+    found = []
+    for stiff, damped, mass in itertools.product(ends(u.stiffness), ends(u.damping), ends(u.inertia)):
+        gain = 1.0 + u.torque_gain if mass < 1.0 else 1.0 - u.torque_gain
+        corner = Deviation(mass, gain, stiff, damped, viscous=1.0 - u.viscous)
+        name = f"sticking {'soft' if stiff < 1.0 else 'stiff'} {'ringing' if damped < 1.0 else 'damped'}"
+        matrices = joint_point(friction, 0.0, Bristle.STICKS, corner).matrices()
+        found.append(Joint(f"{name} {'light' if mass < 1.0 else 'heavy'}", "sticking", True, *matrices))
+    return found
+
+
+def joints(friction: SteadyFriction, span: Span, uncertainty: Uncertainty) -> list[Joint]:
+    """All vertices of the region: sliding, and sticking where it holds rest."""
+    stuck = sticking(friction, uncertainty) if span.holds_rest else []
+    return sliding(friction, span, uncertainty) + stuck
+
+
+def sampled_vertices(found: list[Joint], timing: Timing) -> tuple[Array, Array, Array]:
+    """(A, B, E) of all vertices, states [x, v_f, u_(k-1), ..., v - v_f, z]: what the law feeds back comes first."""
+    a, b, e = (np.array([getattr(joint, name) for joint in found]) for name in ("a", "b", "e"))
+    full_a, full_b, full_e = with_delay_and_filter(a, b, e, timing)
+    change = _to_feedback_first(full_a.shape[-1])
+    back = np.linalg.inv(change)
+    return change @ full_a @ back, full_b @ change.T, full_e @ change.T
+
+
+def _to_feedback_first(size: int) -> Array:
+    """From [x, v, z, v_f, u_(k-1), ...] to [x, v_f, u_(k-1), ..., v - v_f, z]."""
+    change = np.zeros((size, size))
+    change[0, 0] = 1.0
+    for row in range(1, size - 2):
+        change[row, row + 2] = 1.0
+    change[size - 2, 1], change[size - 2, 3] = 1.0, -1.0
+    change[size - 1, 2] = 1.0
+    return change
