@@ -29,7 +29,9 @@ from servod.cli import (
     scan,
     status,
     stop,
+    synthesize,
     track,
+    verify,
 )
 from servod.errors import ServodError
 
@@ -43,8 +45,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-_VERBS = (demo, scan, status, enable, stop, track, identify, gains, preset, record, replay, bench, check, faults)
-for _verb in _VERBS:
+_DAEMON = (demo, scan, status, enable, stop, track, gains, preset, record)
+_LABORATORY = (identify, synthesize, verify, replay)
+for _verb in (*_DAEMON, *_LABORATORY, bench, check, faults):
     _verb.register(app)
 
 

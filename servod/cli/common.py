@@ -6,6 +6,7 @@ Imports typer alone, so that `servoctl --help` starts at once.
 from __future__ import annotations
 
 import json
+import os
 import sys
 import tempfile
 from pathlib import Path
@@ -60,6 +61,11 @@ def need_folder(option: str, folder: Path) -> None:
             pass
     except OSError as error:
         raise BadInput(f"{option} {folder}", error.strerror or str(error), "a folder that can be written") from None
+
+
+def one_thread() -> None:
+    """Keep linear algebra to one thread, before numpy is imported: threads on small matrices cost a factor of ten."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def example(text: str, *lines: str) -> str:

@@ -1,0 +1,66 @@
+"""`servoctl verify`: judge a gain set by its own design, and write the certificate into it. No solver is imported."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from servod.cli.common import JsonOption, example, one_thread, print_json
+from servod.errors import AnswerIsNo
+
+if TYPE_CHECKING:
+    from servod.verify.certify import Verification
+
+EXAMPLE = "servoctl verify gains.yaml --json"
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb to `app`."""
+    app.command(name="verify", help=example("Certify a gain set, or say why not.", EXAMPLE))(verify)
+
+
+def verify(
+    gains: Annotated[Path, typer.Argument(help="Gain set, YAML, with its design.")],
+    plants: Annotated[int, typer.Option(min=1, max=1_000_000, help="Plants of the Monte-Carlo.")] = 1000,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the drawn plants.")] = 1,
+    processes: Annotated[int, typer.Option(min=1, max=64, help="Worker processes.")] = 2,
+    write: Annotated[bool, typer.Option(help="Write the certificate into the file when it is valid.")] = True,
+    as_json: JsonOption = False,
+) -> None:
+    """Verify GAINS; exit code 1 when the set is not valid."""
+    one_thread()
+    from servod.gain_store import write_atomically
+    from servod.gains import load_gains
+    from servod.verify.certify import verify
+
+    checked = load_gains(gains)
+    result = verify(checked, plants, seed, processes, str(gains))
+    if result.valid and write:
+        write_atomically(gains, result.certified(checked).to_yaml())
+    if as_json:
+        print_json(document(result))
+    else:
+        print_checks(result)
+    if not result.valid:
+        failed = [check.name for check in result.checks if not check.passed]
+        raise AnswerIsNo(f"{gains}: not valid: {'; '.join(failed)}")
+
+
+def document(result: Verification) -> dict[str, Any]:
+    """The command's JSON document."""
+    return {
+        "valid": result.valid,
+        "checks": [check.model_dump() for check in result.checks],
+        "observations": result.observations,
+    }
+
+
+def print_checks(result: Verification) -> None:
+    """Print every check with its figure, limit and margin, and what was observed."""
+    for check in result.checks:
+        mark = "pass" if check.passed else "FAIL"
+        print(f"{mark}  {check.name}: {check.value:.6g} (limit {check.limit:.6g}, margin {check.margin:.3g})")
+    for name, value in result.observations.items():
+        print(f"told  {name}: {value:.6g}")

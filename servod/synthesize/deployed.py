@@ -1,0 +1,255 @@
+"""The deployed mode: from an axis model with intervals to a gain set with feedback for both regions and their proofs.
+
+Stands on the LMIs and the local sets. What it cannot reach it says, and offers the smallest relaxation that would do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from servod.axis_model import AxisModel
+from servod.gain_design import Design, DesignMode, RegionProof, Uncertainty, Vertex
+from servod.gain_parameters import RegionGains
+from servod.synthesize.lmi_deployed import Programme, Solution, synthesise
+from servod.synthesize.regions import pole_disc
+from servod.verify.proof import region_margin, scaled_vertices
+from servod.verify.sampled import Array, Timing
+from servod.verify.steady_friction import SteadyFriction, steady_friction
+from servod.verify.vertices import Span, joints
+
+#: Cut-offs of the velocity filter that are tried. The filter's lag decides what is possible where friction falls: at
+#: 120 Hz hardly anything, and no observer; beyond 500 Hz the encoder's steps shake the torque.
+CUTOFFS_HZ = (300.0, 500.0)
+#: Pole radii asked for where the Stribeck curve falls, best first: the faster ones leave room for the observer.
+SLOW_DISCS = (0.96, 0.985, 0.998)
+POSITION_BANDWIDTH_RAD_S = 120.0  # sets the scale of positions, and with it what alpha and beta mean
+RELAX_STEPS = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Wishes:
+    """What is asked of a design; speeds in rad/s."""
+
+    uncertainty: Uncertainty = field(default_factory=Uncertainty)
+    period_s: float = 0.001
+    cutoff_hz: float | None = None  # of the velocity filter; None = the lowest that is feasible
+    counts_per_turn: float = 2.0**20
+    speed_max: float = 0.5
+    overlap: tuple[float, float] = (0.005, 0.02)
+    position_weight: float = 1.0
+    torque_weight: float = 0.02
+    least_decay_per_s: float = 5.0
+    least_damping: float = 0.05
+    slow_disc: float | None = None  # pole radius where friction falls; None = the least that is feasible
+    solver: str = "CLARABEL"
+
+    @property
+    def spans(self) -> tuple[Span, Span]:
+        """Omega_L and Omega_H, which share the overlap."""
+        return Span("low", 0.0, self.overlap[1]), Span("high", self.overlap[0], self.speed_max)
+
+
+@dataclass(frozen=True, slots=True)
+class Relaxation:
+    """The smallest change found that makes a design feasible; offered, never taken."""
+
+    wish: str
+    asked: float
+    enough: float
+
+    def __str__(self) -> str:
+        return f"{self.wish} {self.enough:.3g} instead of {self.asked:.3g}"
+
+
+@dataclass(frozen=True, slots=True)
+class Infeasible:
+    """No design: which regions failed at which vertices, and what would help."""
+
+    regions: tuple[str, ...]
+    clashes: tuple[str, ...]
+    relaxations: tuple[Relaxation, ...]
+
+
+def empty_design(model: AxisModel, wishes: Wishes, cutoff_hz: float) -> Design:
+    """The design without its proofs."""
+    return Design(
+        mode=DesignMode.DEPLOYED,
+        period_s=wishes.period_s,
+        velocity_cutoff_hz=cutoff_hz,
+        counts_per_turn=wishes.counts_per_turn,
+        speed_max_rad_s=wishes.speed_max,
+        model=model,
+        uncertainty=wishes.uncertainty,
+    )
+
+
+def scales(friction: SteadyFriction, design: Design) -> tuple[list[float], float]:
+    """(scale of each state, scale of torques): the largest friction, and the deflection that it makes."""
+    torque = friction.largest(design.speed_max_rad_s)
+    position = torque / (friction.inertia * POSITION_BANDWIDTH_RAD_S**2)
+    speed = position * POSITION_BANDWIDTH_RAD_S
+    commands = Timing(design.period_s, design.model.total_delay_s, design.velocity_cutoff_hz).kept_commands
+    return [position, speed, *[torque] * commands, speed, torque / friction.stiffness], torque
+
+
+def programme(design: Design, proof: RegionProof, wishes: Wishes) -> Programme:
+    """The LMI programme of one region, over the vertices that verification will make anew."""
+    friction = steady_friction(design.model)
+    found = joints(friction, Span(proof.name, proof.speed_from_rad_s, proof.speed_to_rad_s), wishes.uncertainty)
+    _, a, b, e = scaled_vertices(design, proof)
+    disc = pole_disc(wishes.least_decay_per_s, wishes.least_damping, wishes.period_s)
+    performs = [j.performs for j in found]
+    return Programme(
+        [j.mode for j in found],
+        performs,
+        a,
+        b,
+        e,
+        wishes.position_weight,
+        wishes.torque_weight,
+        [disc if p else (0.0, wishes.slow_disc or SLOW_DISCS[-1]) for p in performs],
+        wishes.solver,
+    )
+
+
+def bare_proof(design: Design, span: Span, wishes: Wishes) -> RegionProof:
+    """A region's frame: speeds, scales and weights, with a vertex list still to come."""
+    scale, torque = scales(steady_friction(design.model), design)
+    return RegionProof.model_construct(
+        name=span.name,
+        speed_from_rad_s=span.from_rad_s,
+        speed_to_rad_s=span.to_rad_s,
+        scale=scale,
+        torque_scale_nm=torque,
+        position_weight=wishes.position_weight,
+        torque_weight=wishes.torque_weight,
+        feedback=[],
+        slack={},
+        vertices=[],
+    )
+
+
+def _rows(matrix: Array | None) -> list[list[float]] | None:
+    return None if matrix is None else [[float(x) for x in row] for row in matrix]
+
+
+def proven(design: Design, frame: RegionProof, p: Programme, solution: Solution) -> RegionProof:
+    """The region's proof with all matrices as plain numbers."""
+    names, _, _, _ = scaled_vertices(design, frame)
+    vertices = [
+        Vertex(
+            name=names[i],
+            mode=p.modes[i],
+            a=_rows(p.a[i]) or [],
+            b=p.b[i].tolist(),
+            e=p.e[i].tolist(),
+            disc_centre=p.discs[i][0],
+            disc_radius=p.discs[i][1],
+            lyapunov_disc=_rows(solution.lyapunov_disc[i]) or [],
+            lyapunov_h2=_rows(solution.lyapunov_h2[i]),
+            output=_rows(solution.outputs[i]),
+        )
+        for i in range(len(names))
+    ]
+    slack = {mode: _rows(matrix) or [] for mode, matrix in solution.slack.items()}
+    found = {"feedback": solution.feedback.tolist(), "slack": slack, "vertices": vertices}
+    return RegionProof.model_validate(frame.model_dump() | found)
+
+
+def region(design: Design, span: Span, wishes: Wishes) -> RegionProof | None:
+    """Feedback and proof of one region; None when the programme is infeasible or its proof does not hold."""
+    frame = bare_proof(design, span, wishes)
+    p = programme(design, frame, wishes)
+    solution = synthesise(p)
+    if solution is None:
+        return None
+    proof = proven(design, frame, p, solution)
+    return proof if region_margin(proof)[0] > 0.0 else None
+
+
+def regions(model: AxisModel, wishes: Wishes) -> Design | None:
+    """Both regions at the lowest feasible cut-off of the velocity filter (or at the one that is asked for)."""
+    for cutoff in (wishes.cutoff_hz,) if wishes.cutoff_hz else CUTOFFS_HZ:
+        design = empty_design(model, wishes, cutoff)
+        for slow in (wishes.slow_disc,) if wishes.slow_disc else SLOW_DISCS:
+            low, high = wishes.spans
+            hard = region(design, high, replace(wishes, slow_disc=slow))
+            easy = None if hard is None else region(design, low, replace(wishes, slow_disc=slow))
+            if hard is not None and easy is not None:
+                return design.model_copy(update={"regions": [easy, hard]})
+    return None
+
+
+def region_gains(proof: RegionProof, input_scale_nm: float) -> RegionGains:
+    """The law's gains from the scaled feedback: u = -K*(k_x*x + k_v*v_f)."""
+    position, speed = (-proof.torque_scale_nm * k / s for k, s in zip(proof.feedback, proof.scale, strict=False))
+    return RegionGains(k_x_per_rad=position / input_scale_nm, k_v_s_per_rad=speed / input_scale_nm)
+
+
+def clashing_vertices(design: Design, span: Span, wishes: Wishes) -> Iterator[str]:
+    """Vertices that no feedback of the grid keeps inside their disc, alone or together with the others."""
+    from servod.synthesize.lmi_deployed import first_feedback
+
+    frame = bare_proof(design, span, wishes)
+    p = programme(design, frame, wishes)
+    feedback = np.concatenate([first_feedback(p), np.zeros(p.a.shape[-1] - 2)])
+    poles = np.linalg.eigvals(p.a + p.b[:, :, None] * feedback)
+    names, _, _, _ = scaled_vertices(design, frame)
+    for name, roots, (centre, radius) in zip(names, poles, p.discs, strict=True):
+        outside = float(np.abs(roots - centre).max()) / radius
+        if outside >= 1.0:
+            yield f"{span.name}: {name}: poles at {outside:.3f} of the disc (1 allowed)"
+
+
+def explain(model: AxisModel, wishes: Wishes) -> Infeasible:
+    """Why there is no design, and the smallest relaxation of each wish that alone makes one."""
+    design = empty_design(model, wishes, wishes.cutoff_hz or CUTOFFS_HZ[-1])
+    failed = [span for span in wishes.spans if region(design, span, wishes) is None]
+    clashes = [line for span in failed for line in clashing_vertices(design, span, wishes)]
+    return Infeasible(tuple(s.name for s in failed), tuple(clashes), tuple(relaxations(model, wishes)))
+
+
+def relaxations(model: AxisModel, wishes: Wishes) -> Iterator[Relaxation]:
+    """Each wish lowered by itself until a design exists; wishes that do not help even at their end are left out."""
+    slow = wishes.slow_disc or SLOW_DISCS[-1]
+    fixed = replace(wishes, cutoff_hz=wishes.cutoff_hz or CUTOFFS_HZ[-1], slow_disc=slow)
+
+    def shrunk(factor: float) -> Wishes:
+        return replace(fixed, uncertainty=wishes.uncertainty.scaled(factor))
+
+    def slower(factor: float) -> Wishes:
+        return replace(fixed, least_decay_per_s=factor * wishes.least_decay_per_s)
+
+    def rougher(factor: float) -> Wishes:
+        return replace(fixed, least_damping=factor * wishes.least_damping)
+
+    for wish, asked, change in (
+        ("scale of the uncertainty", 1.0, shrunk),
+        ("least decay [1/s]", wishes.least_decay_per_s, slower),
+        ("least damping ratio", wishes.least_damping, rougher),
+    ):
+        factor = _largest_feasible(model, change)
+        if factor is not None:
+            yield Relaxation(wish, asked, factor * asked)
+    for cutoff in CUTOFFS_HZ:
+        if wishes.cutoff_hz and cutoff > wishes.cutoff_hz and regions(model, replace(fixed, cutoff_hz=cutoff)):
+            yield Relaxation("cut-off of the velocity filter [Hz]", wishes.cutoff_hz, cutoff)
+            return
+
+
+def _largest_feasible(model: AxisModel, change: Callable[[float], Wishes]) -> float | None:
+    """Largest factor below 1 whose wishes have a design, by bisection; None when even 0.02 has none."""
+
+    def feasible(factor: float) -> bool:
+        return regions(model, change(factor)) is not None
+
+    low, high = 0.02, 1.0
+    if not feasible(low):
+        return None
+    for _ in range(RELAX_STEPS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if feasible(middle) else (low, middle)
+    return low

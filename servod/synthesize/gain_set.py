@@ -1,0 +1,136 @@
+"""From an axis model to a gain set: local sets, both regions, options of the law, provenance and design.
+
+Top of servod.synthesize. What the law gets is chosen here from what its loop allows, by the same sweep that
+verification uses.
+"""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from servod import __version__
+from servod.axis_model import AxisModel
+from servod.controllers import LAWS
+from servod.gain_design import Design
+from servod.gain_parameters import LocalFriction, LocalParameters, OutputObserver, Regions, VelocitySource
+from servod.gains import GainSet, Provenance
+from servod.synthesize.deployed import Infeasible, Wishes, explain, region_gains, regions
+from servod.synthesize.local_sets import PAPER_NODES, STIFFNESS_SHARE, compensator, local_sets, sets_at
+from servod.verify.checks import CORNER_SPEEDS, DISK_LIMIT, speeds_of
+from servod.verify.closed_loop import corners
+from servod.verify.margins import Sweep
+from servod.verify.sampled import Timing
+from servod.verify.steady_friction import SteadyFriction, steady_friction
+
+#: Bandwidths of the output observer, best first; the first that every corner of the intervals stands is taken.
+OBSERVERS_RAD_S = (60.0, 50.0, 40.0, 30.0, 20.0, 15.0, 10.0, 5.0)
+LIMIT_SHARE = 1.5  # bound of the compensated force, as a share of the largest friction
+HOLD_COUNTS = 1.2  # hold width in encoder counts: what the joint creeps under noise is twice this
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """Named options of the law and of its local sets."""
+
+    name: str = "synthesized"
+    accuracy: float = 0.02
+    paper_nodes: bool = False
+    velocity: VelocitySource = VelocitySource.REFERENCE
+    observer: bool = True
+    gain: float = 0.0  # l_i: 0 where the observer is the integral action
+
+
+def input_scale(friction: SteadyFriction, speed: float) -> float:
+    """K: the power of ten next to the largest friction, 0.1 N*m for the paper's joint."""
+    return float(10.0 ** round(math.log10(friction.largest(speed))))
+
+
+def parameters(design: Design, friction: SteadyFriction, options: Options, bandwidth: float) -> LocalParameters:
+    """The law's parameters with an output observer of `bandwidth` rad/s (0: none)."""
+    speed, largest = design.speed_max_rad_s, friction.largest(design.speed_max_rad_s)
+    share = STIFFNESS_SHARE * (1.0 - design.uncertainty.stiffness)
+    c, scale = compensator(friction, speed, share), input_scale(friction, speed)
+    sets = (
+        sets_at(friction, c, PAPER_NODES, options.gain)
+        if options.paper_nodes
+        else local_sets(friction, c, speed, options.accuracy, options.gain)
+    )
+    low, high = design.regions
+    return LocalParameters(
+        law="local",
+        input_scale_nm=scale,
+        regions=Regions(
+            low=region_gains(low, scale),
+            high=region_gains(high, scale),
+            overlap_from_rad_s=high.speed_from_rad_s,
+            overlap_to_rad_s=low.speed_to_rad_s,
+        ),
+        friction=LocalFriction(
+            stiffness_nm_per_rad=c.stiffness,
+            viscous_nms_per_rad=c.viscous,
+            friction_limit_nm=LIMIT_SHARE * largest,
+            velocity=options.velocity,
+            sets=sets,
+        ),
+        disturbance_observer=OutputObserver(
+            bandwidth_rad_s=bandwidth, inertia_kg_m2=friction.inertia, disturbance_limit_nm=largest
+        )
+        if bandwidth
+        else None,
+        feedforward_inertia_kg_m2=friction.inertia,
+        hold_within_rad=HOLD_COUNTS * 2.0 * math.pi / design.counts_per_turn if design.counts_per_turn else 0.0,
+    )
+
+
+def stands(design: Design, friction: SteadyFriction, law: LocalParameters) -> bool:
+    """Whether the full sampled loop is stable at every corner of the intervals, with the disk margin that is asked."""
+    timing = Timing(design.period_s, design.model.total_delay_s, design.velocity_cutoff_hz)
+    sweep = Sweep(LAWS["local"], law.pack(), friction, timing, speeds_of(design, CORNER_SPEEDS))
+    return sweep.worst(corners(design.uncertainty)).radius < 1.0 and sweep.disk_margin()[0] >= DISK_LIMIT
+
+
+def synthesize(
+    model: AxisModel, wishes: Wishes | None = None, options: Options | None = None, model_path: Path | None = None
+) -> GainSet | Infeasible:
+    """The gain set for `model`, sealed and not yet certified; or why there is none and what would help."""
+    wishes, options = wishes or Wishes(), options or Options()
+    friction = steady_friction(model)
+    design = regions(model, wishes)
+    if design is None:
+        return explain(model, wishes)
+    for bandwidth in OBSERVERS_RAD_S if options.observer else ():
+        law = parameters(design, friction, options, bandwidth)
+        if stands(design, friction, law):
+            break
+    else:
+        law = parameters(design, friction, replace(options, observer=False), 0.0)
+    return gain_set(design, law, options, model_path)
+
+
+def gain_set(design: Design, law: LocalParameters, options: Options, model_path: Path | None) -> GainSet:
+    """The sealed set with its provenance."""
+    digest = hashlib.sha256(model_path.read_bytes()).hexdigest() if model_path else None
+    observer = law.disturbance_observer
+    note = (
+        f"Velocity filter: set encoder.velocity_cutoff_hz to {design.velocity_cutoff_hz:g}. c0_hat is "
+        f"{STIFFNESS_SHARE:g} of the lowest c0 in its interval; 1.0 is marginal. "
+        + (f"Output observer {observer.bandwidth_rad_s:g} rad/s." if observer else "No output observer stands.")
+    )
+    return GainSet(
+        schema_version=1,
+        name=options.name,
+        description=f"Local law for inertia {design.model.inertia:g}, {design.mode.value} mode.",
+        parameters=law,
+        provenance=Provenance(
+            author="servod",
+            date=datetime.datetime.now(datetime.UTC).date(),
+            tool=f"servod {__version__} synthesize",
+            model_sha256=digest,
+            note=note,
+        ),
+        design=design,
+    ).sealed()

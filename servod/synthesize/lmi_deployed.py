@@ -1,0 +1,208 @@
+"""The LMI programme of the deployed mode: sampled polytopic H2 with a pole disc, one Lyapunov matrix per vertex.
+
+Stands on cvxpy; in: scaled vertices (servod.verify.vertices), out: feedback of [x, v_f] and the matrices that prove it.
+The bristle either sticks or slides: two polytopes, each with its own slack, one feedback for both (one slack for both
+was infeasible for every gain). The joint's velocity and the waiting torques are not fed back, so the slack needs a
+structure that lets R = K G be linear: G = [G1 M, G1 X; G2, G3] and R = [R1 M, R1 X] with M and X fixed gives
+K = R1 inv(G1). Block triangular slack (M = 1, X = 0) was tried first and loses most of Omega_H. Here M and X come from
+an analysis with the last feedback and full slack, in turn: neither step can lose what the other has won.
+
+H2 norm, decay and damping count where the axis performs. Where the Stribeck curve falls, the joint is unstable with
+poles beyond 150 1/s, and the velocity filter and the delay leave room for stability alone (a slow disc): asking for
+decay there too costs two thirds of the position gain everywhere.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
+
+from servod.verify.sampled import Array
+
+EPSILON = 1e-8  # strictness of the inequalities in scaled states
+PROOF_EPSILON = 1e-5  # of the proof that is kept: what rounding in a file cannot turn
+ROUNDS = 1  # a second one wins less than 2 % of the H2 norm
+SOLVED = ("optimal", "optimal_inaccurate")
+POSITIONS, VELOCITIES = -np.geomspace(0.003, 3.0, 25), -np.geomspace(0.02, 20.0, 30)
+
+
+@dataclass(frozen=True, slots=True)
+class Programme:
+    """One region in scaled states: vertices (stacked), weights alpha and beta, and a pole disc for each vertex.
+
+    `modes` says which slack a vertex has, `performs` where the H2 norm counts.
+    """
+
+    modes: list[str]
+    performs: list[bool]
+    a: Array
+    b: Array
+    e: Array
+    position_weight: float
+    torque_weight: float
+    discs: list[tuple[float, float]]
+    solver: str = "CLARABEL"
+
+    def only(self, mode: str) -> Programme:
+        """The same programme over the vertices of one mode."""
+        i = [j for j, m in enumerate(self.modes) if m == mode]
+        return replace(
+            self,
+            modes=[mode] * len(i),
+            performs=[self.performs[j] for j in i],
+            discs=[self.discs[j] for j in i],
+            a=self.a[i],
+            b=self.b[i],
+            e=self.e[i],
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """Feedback of [x, v_f] in scaled units, and its proof."""
+
+    feedback: Array
+    slack: dict[str, Array]
+    outputs: list[Array | None]
+    lyapunov_h2: list[Array | None]
+    lyapunov_disc: list[Array]
+
+    @property
+    def h2_bound(self) -> float:
+        """Bound of the H2 norm over all vertices, in scaled units."""
+        return float(np.sqrt(max(np.trace(w) for w in self.outputs if w is not None)))
+
+    def guides(self) -> dict[str, Array]:
+        """[M, X] of each mode: the upper rows of its slack, seen from the first mode's G1."""
+        first = next(iter(self.slack.values()))[:2, :2]
+        return {
+            mode: np.asarray(np.linalg.solve(first, slack[:2]), dtype=np.float64) for mode, slack in self.slack.items()
+        }
+
+
+class _Unknowns:
+    """Slacks, R and W of one programme: with the feedback fixed (analysis) or open (synthesis along `guides`)."""
+
+    def __init__(self, p: Programme, feedback: Array | None, guides: dict[str, Array] | None) -> None:
+        size = p.a.shape[-1]
+        self.outputs = [cp.Variable((2, 2), symmetric=True) if performs else None for performs in p.performs]
+        self.h2 = [cp.Variable((size, size), symmetric=True) if performs else None for performs in p.performs]
+        self.disc = [cp.Variable((size, size), symmetric=True) for _ in p.modes]
+        self.upper, self.row = cp.Variable((2, 2)), cp.Variable((1, 2))
+        self.slack: dict[str, Any] = {}
+        self.r: dict[str, Any] = {}
+        for mode in dict.fromkeys(p.modes):
+            if guides is None:
+                assert feedback is not None
+                self.slack[mode] = cp.Variable((size, size))
+                self.r[mode] = np.concatenate([feedback, np.zeros(size - 2)])[None, :] @ self.slack[mode]
+            else:
+                self.slack[mode] = cp.vstack([self.upper @ guides[mode], cp.Variable((size - 2, size))])
+                self.r[mode] = self.row @ guides[mode]
+
+    def gain(self) -> Array:
+        """The feedback after a synthesis."""
+        solved: Array = np.linalg.solve(np.asarray(self.upper.value).T, np.asarray(self.row.value)[0])
+        return solved
+
+
+def _positive(blocks: list[list[Any]], size: int, strictness: float) -> Any:
+    return cp.bmat(blocks) >> strictness * np.eye(size)
+
+
+def _h2_constraints(p: Programme, i: int, u: _Unknowns, moved: Any, strictness: float) -> list[Any]:
+    """The two H2 inequalities of vertex i: servod.verify.proof.h2_state_block and h2_output_block."""
+    size = p.a.shape[-1]
+    slack, h2 = u.slack[p.modes[i]], u.h2[i]
+    both = slack + slack.T
+    pick = np.zeros((2, size))
+    pick[0, 0] = p.position_weight
+    seen = pick @ slack + np.array([[0.0], [p.torque_weight]]) @ u.r[p.modes[i]]
+    return [
+        _positive([[h2 - np.outer(p.e[i], p.e[i]), moved], [moved.T, both - h2]], 2 * size, strictness),
+        _positive([[u.outputs[i], seen], [seen.T, both - h2]], size + 2, strictness),
+    ]
+
+
+def _vertex_constraints(p: Programme, i: int, u: _Unknowns, in_disc: bool, strictness: float) -> list[Any]:
+    """All inequalities of vertex i; without `in_disc` stability is enough where the H2 norm counts."""
+    slack, disc = u.slack[p.modes[i]], u.disc[i]
+    moved = p.a[i] @ slack + p.b[i][:, None] @ u.r[p.modes[i]]
+    both = slack + slack.T
+    centre, radius = p.discs[i]
+    found = _h2_constraints(p, i, u, moved, strictness) if p.performs[i] else []
+    if in_disc or not p.performs[i]:
+        shifted = moved - centre * slack
+        blocks = [[radius * disc, shifted], [shifted.T, radius * (both - disc)]]
+        found.append(_positive(blocks, 2 * p.a.shape[-1], strictness))
+    return found
+
+
+def solve(
+    p: Programme,
+    feedback: Array | None,
+    guides: dict[str, Array] | None,
+    in_disc: bool = True,
+    strictness: float = EPSILON,
+) -> Solution | None:
+    """One convex programme: analysis of `feedback`, or synthesis with slack along `guides`; None when infeasible."""
+    u = _Unknowns(p, feedback, guides)
+    constraints = [c for i in range(len(p.a)) for c in _vertex_constraints(p, i, u, in_disc, strictness)]
+    cost = sum(cp.trace(w) for w in u.outputs if w is not None)
+    problem = cp.Problem(cp.Minimize(cost), constraints)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # an inaccurate solution is judged by eigenvalues, not by its label
+            problem.solve(solver=p.solver)
+    except cp.error.SolverError:
+        return None
+    if problem.status not in SOLVED or next(iter(u.slack.values())).value is None:
+        return None
+    return Solution(
+        u.gain() if feedback is None else feedback,
+        {mode: np.asarray(slack.value) for mode, slack in u.slack.items()},
+        [None if w is None else np.asarray(w.value) for w in u.outputs],
+        [None if x is None else np.asarray(x.value) for x in u.h2],
+        [np.asarray(x.value) for x in u.disc] if in_disc else [],
+    )
+
+
+def first_feedback(p: Programme) -> Array:
+    """Feedback of the grid that keeps the largest pole over all vertices smallest: where the rounds start."""
+    size = p.a.shape[-1]
+    best, best_radius = np.zeros(2), np.inf
+    for position in POSITIONS:
+        rows = np.zeros((len(VELOCITIES), 1, 1, size))
+        rows[:, 0, 0, 0] = position
+        rows[:, 0, 0, 1] = VELOCITIES
+        loops = p.a[None] + p.b[None, :, :, None] * rows
+        radius = np.abs(np.linalg.eigvals(loops)).max(axis=(1, 2))
+        j = int(radius.argmin())
+        if radius[j] < best_radius:
+            best, best_radius = rows[j, 0, 0, :2].copy(), float(radius[j])
+    return best
+
+
+def synthesise(p: Programme) -> Solution | None:
+    """Feedback with the least summed H2 norms that the rounds reach, proven over all vertices; None when infeasible.
+
+    Only sliding vertices shape the feedback: stuck on its bristle, which is far stiffer than any feedback, the joint
+    is proven afterwards. The start need not keep the disc; a round without it is taken where the disc asks too much.
+    """
+    shaping = p.only("sliding")
+    last = solve(shaping, first_feedback(shaping), None, in_disc=False)
+    best: Solution | None = None
+    for _ in range(ROUNDS + 1):
+        if last is None:
+            break
+        better = solve(shaping, None, last.guides())
+        if better is not None:
+            best = better
+            break
+        plain = solve(shaping, None, last.guides(), in_disc=False)
+        last = None if plain is None else solve(shaping, plain.feedback, None, in_disc=False)
+    return None if best is None else solve(p, best.feedback, None, strictness=PROOF_EPSILON)

@@ -1,0 +1,87 @@
+"""Certificates: what a good set gets, and that every kind of change is seen."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+
+from servod.errors import BadInput
+from servod.gains import GainSet, load_gains, parse_gains
+from servod.verify.certify import verify
+from servod.verify.checks import Subject, check_loop, check_regions, check_seal
+from servod.verify.trials import monte_carlo
+from tests.synthesize.designs import MODEL, table1_set
+
+
+def subject(gains: GainSet) -> Subject:
+    assert gains.design is not None
+    return Subject(gains, gains.design, 4, 1, 1)
+
+
+def changed(path: tuple[Any, ...], factor: float) -> GainSet:
+    """The set with one number changed and sealed anew, as somebody who knows of the seal would."""
+    data = table1_set().model_dump(mode="json", exclude_none=True)
+    here = data
+    for key in path[:-1]:
+        here = here[key]
+    here[path[-1]] *= factor
+    return GainSet.model_validate(data).sealed()
+
+
+def test_a_synthesized_set_is_certified_and_the_daemon_takes_it() -> None:
+    result = verify(table1_set(), plants=6, processes=1)
+    assert result.valid, [check for check in result.checks if not check.passed]
+    certified = parse_gains(result.certified(table1_set()).to_yaml(), "set")
+    assert certified.certificate_problem() is None
+    assert result.observations["largest tolerated delay [s]"] > 0.001
+
+
+def test_one_number_changed_breaks_the_seal() -> None:
+    text = table1_set().to_yaml()
+    line = next(line for line in text.splitlines() if "overlap_to_rad_s" in line)
+    meddled = parse_gains(text.replace(line, line.replace("0.02", "0.021")), "set")
+    assert meddled.seal_broken
+    assert not next(check_seal(subject(meddled))).passed
+    assert not verify(meddled, plants=1, processes=1).valid
+
+
+@pytest.mark.parametrize(
+    ("path", "factor"),
+    [
+        (("parameters", "regions", "low", "k_x_per_rad"), 1.01),
+        (("design", "regions", 0, "vertices", 2, "a", 1, 1), 1.01),
+        (("design", "regions", 1, "feedback", 0), 0.5),
+        (("design", "regions", 1, "vertices", 0, "lyapunov_disc", 0, 0), 0.5),
+        (("design", "model", "inertia"), 1.01),
+        (("design", "uncertainty", "slope"), 1.5),
+    ],
+)
+def test_the_proof_sees_a_change_that_was_sealed_again(path: tuple[Any, ...], factor: float) -> None:
+    assert not all(check.passed for check in check_regions(subject(changed(path, factor))))
+
+
+def test_the_loop_check_sees_what_the_regions_cannot() -> None:
+    unstable = changed(("parameters", "disturbance_observer", "bandwidth_rad_s"), 30.0)
+    assert not all(check.passed for check in check_loop(subject(unstable)))
+
+
+def test_a_set_without_design_cannot_be_verified() -> None:
+    with pytest.raises(BadInput, match="design"):
+        verify(load_gains(MODEL.parents[1] / "demo_local.yaml"))
+
+
+def test_the_same_seed_draws_the_same_plants_over_any_number_of_processes() -> None:
+    alone, shared = (monte_carlo(table1_set(), 4, 7, processes) for processes in (1, 2))
+    assert alone == shared
+    assert np.ptp([trial.error_rad for trial in alone]) > 0.0
+
+
+def test_no_solver_is_imported() -> None:
+    code = "import sys, servod.verify.certify; print(' '.join(m.split('.')[0] for m in sys.modules))"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not {"cvxpy", "clarabel", "scs"} & set(result.stdout.split())
+    assert "servod.synthesize" not in result.stdout

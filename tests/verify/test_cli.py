@@ -1,0 +1,41 @@
+"""`servoctl synthesize` and `servoctl verify` from file to file, with their exit codes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from servod.cli.app import run
+from servod.gains import load_gains
+from tests.synthesize.designs import MODEL, table1_set
+
+
+def test_from_a_model_to_a_certified_set(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "gains.yaml"
+    assert run(["synthesize", "--model", str(MODEL), "--out", str(out), "--name", "table1", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["feasible"] and told["velocity_cutoff_hz"] >= 120.0
+    assert run(["verify", str(out), "--json", "--plants", "4", "--processes", "1"]) == 0
+    judged = json.loads(capsys.readouterr().out)
+    assert judged["valid"] and all({"value", "limit", "margin"} <= set(check) for check in judged["checks"])
+    assert load_gains(out).certificate_problem() is None
+
+
+def test_one_number_changed_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "gains.yaml"
+    text = table1_set().to_yaml()
+    out.write_text(text.replace("leak_per_s: 2.0", "leak_per_s: 2.5"))
+    assert run(["verify", str(out), "--json"]) == 1
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["valid"] is False
+    assert "sealed" in captured.err and captured.err.count("\n") == 1
+    assert load_gains(out).certificate is None
+
+
+def test_a_model_without_stiffness_is_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model = tmp_path / "model.yaml"
+    model.write_text("inertia: 0.001\nfriction: {kind: coulomb_viscous, coulomb: 0.05}\n")
+    assert run(["synthesize", "--model", str(model), "--out", str(tmp_path / "gains.yaml")]) == 2
+    assert "friction.kind" in capsys.readouterr().err
