@@ -225,8 +225,8 @@ class Cycle:
         if self.axis.state not in (AxisState.DISABLED, AxisState.FAULT):
             return
         self._resting += 1
-        off = amplifier.age_cycles == 0 and amplifier.state in _UNPOWERED
-        self._goodbye = self._goodbye + 1 if off else 0
+        if amplifier.age_cycles == 0:  # a cycle without an answer says nothing, neither good nor bad
+            self._goodbye = self._goodbye + 1 if amplifier.state in _UNPOWERED else 0
         self.seen_off = self._goodbye >= GOODBYE_CYCLES
         self.finished = self.seen_off or self._resting >= GOODBYE_TIMEOUT_CYCLES
 
