@@ -9,7 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from servod.errors import AnswerIsNo
-from servod.identify.fits import break_away, curve, friction_map, kick, noise, presliding, response
+from servod.identify.estimate import Estimate
+from servod.identify.fits import break_away, bristle, curve, friction_map, kick, noise, presliding, response
 from servod.identify.trace import Kind, Trace
 
 
@@ -25,6 +26,7 @@ class Analysis:
     map: friction_map.MapFit
     positive: curve.CurveFit
     negative: curve.CurveFit
+    damping: Estimate | None
 
     @property
     def break_away_rad(self) -> float:
@@ -32,9 +34,9 @@ class Analysis:
         return break_away_rad(self.break_away, self.presliding)
 
 
-def break_away_rad(slides: break_away.BreakAwayFit, bristle: presliding.PreslidingFit) -> float:
+def break_away_rad(slides: break_away.BreakAwayFit, rocked: presliding.PreslidingFit) -> float:
     """Mean static friction over stiffness."""
-    return 0.5 * (slides.positive.value + slides.negative.value) / bristle.stiffness.value
+    return 0.5 * (slides.positive.value + slides.negative.value) / rocked.stiffness.value
 
 
 def of_kind(traces: Sequence[Trace], kind: Kind) -> list[Trace]:
@@ -49,19 +51,31 @@ def analyse(traces: Sequence[Trace]) -> Analysis:
     """Fit everything. Raises AnswerIsNo where an experiment is missing or tells nothing."""
     ramps = of_kind(traces, Kind.BREAK_AWAY)
     slides = break_away.fit([ramp for ramp in ramps if not ramp.settings["search"]] or ramps)
-    bristle = presliding.fit(of_kind(traces, Kind.PRESLIDING), slides)
+    rocked = presliding.fit(of_kind(traces, Kind.PRESLIDING), slides)
     kicked = kick.fit(of_kind(traces, Kind.KICK)[-2:])
     answer = response.fit(of_kind(traces, Kind.RESPONSE)[-1], kicked.inertia)
     delay_s = answer.delay_s.value + answer.lag_s.value
-    way = break_away_rad(slides, bristle)
+    way = break_away_rad(slides, rocked)
     mapped = friction_map.fit(of_kind(traces, Kind.FRICTION_MAP), answer.inertia.value, delay_s, way)
+    positive, negative = curve.fit(mapped.positive), curve.fit(mapped.negative)
     return Analysis(
         noise.fit(of_kind(traces, Kind.NOISE)[-1]),
         slides,
-        bristle,
+        rocked,
         kicked,
         answer,
         mapped,
-        curve.fit(mapped.positive),
-        curve.fit(mapped.negative),
+        positive,
+        negative,
+        _damping(traces, answer, rocked, 0.5 * (positive.viscous.value + negative.viscous.value)),
     )
+
+
+def _damping(
+    traces: Sequence[Trace], answer: response.ResponseFit, rocked: presliding.PreslidingFit, viscous: float
+) -> Estimate | None:
+    """Bristle damping from the newest recording that shows it; None when there is none or it does not tell."""
+    ringing = [trace for trace in traces if trace.kind == Kind.BRISTLE]
+    if not ringing or answer.lag_s.value > 0.0:
+        return None
+    return bristle.fit(ringing[-1], answer.inertia.value, answer.delay_s.value, viscous, rocked.stiffness.value)

@@ -33,8 +33,8 @@ NOT_IDENTIFIABLE: dict[str, str] = {
     "inertia, and identify again: the ratio is the gain",
     "torque_offset": "a constant torque looks like friction that differs by direction, and is contained in the map; "
     "turn the axis over (or take the load off) and identify again",
-    "sigma1": "bristle damping does not show below 20 Hz; rock the joint below break-away with a multisine up to 200 "
-    "Hz on an encoder of 20 bit or more. The model assumes half of the critical damping",
+    "sigma1": "the ringing of the joint on its bristles is lost in the encoder's steps; identify again with an encoder "
+    "of 20 bit or more. The model assumes half of the critical damping",
 }
 
 
@@ -48,7 +48,7 @@ def model_of(analysis: Analysis) -> AxisModel:
         friction=LocalFriction(
             kind="local",
             sigma0=stiffness,
-            sigma1=ASSUMED_DAMPING * 2.0 * float(np.sqrt(stiffness * answer.inertia.value)),
+            sigma1=_damping(analysis),
             viscous=_viscous(analysis),
             velocities=_rounded(_velocities(analysis)),
             torques=_rounded(_torques(analysis)),
@@ -68,7 +68,7 @@ def identified(analysis: Analysis) -> Identified:
             torques=list(_rounded(_torques(analysis))),
             half_widths=list(_rounded(_both(analysis.map.negative.half_width, analysis.map.positive.half_width))),
         ),
-        not_identifiable=NOT_IDENTIFIABLE,
+        not_identifiable=_not_identifiable(analysis),
     )
 
 
@@ -90,6 +90,8 @@ def estimates(analysis: Analysis) -> dict[str, Estimate]:
         "torque_noise_rms": answer.torque_noise_rms,
     }
     numbers |= {f"cogging_{wave.order}": wave.amplitude for wave in analysis.map.cogging}
+    if analysis.damping is not None:
+        numbers["sigma1"] = analysis.damping
     if answer.resonance_hz is not None:
         numbers["resonance_hz"] = answer.resonance_hz
     return numbers
@@ -116,6 +118,18 @@ def changes(before: Identified, now: Identified) -> list[str]:
             continue
         told.append(f"{name} went from {old.value:.4g} to {new.value:.4g} {new.unit}, outside both 95 % intervals")
     return told
+
+
+def _damping(analysis: Analysis) -> float:
+    """sigma1: measured, or assumed where the encoder is too coarse for it."""
+    if analysis.damping is not None:
+        return analysis.damping.value
+    stiffness, inertia = analysis.presliding.stiffness.value, analysis.response.inertia.value
+    return ASSUMED_DAMPING * 2.0 * float(np.sqrt(stiffness * inertia))
+
+
+def _not_identifiable(analysis: Analysis) -> dict[str, str]:
+    return {k: v for k, v in NOT_IDENTIFIABLE.items() if k != "sigma1" or analysis.damping is None}
 
 
 def _of_curve(curve: CurveFit, direction: str) -> dict[str, Estimate]:

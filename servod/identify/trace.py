@@ -24,6 +24,7 @@ class Kind(StrEnum):
     PRESLIDING = "presliding"
     KICK = "kick"
     RESPONSE = "response"
+    BRISTLE = "bristle"
     FRICTION_MAP = "friction_map"
 
 

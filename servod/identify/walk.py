@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from servod.identify import store
 from servod.identify.analysis import Analysis, analyse, break_away_rad, of_kind
 from servod.identify.bounds import bounds_from
-from servod.identify.experiments import break_away, friction_map, kick, noise, presliding, response
+from servod.identify.experiments import break_away, bristle, friction_map, kick, noise, presliding, response
 from servod.identify.experiments.common import Bench
 from servod.identify.feedback import CAREFUL, STIFF, feedback
 from servod.identify.fits import break_away as break_away_fit
@@ -72,11 +72,13 @@ def _experiments(bench: Bench, tell: Tell) -> None:
     config = bench.link.config
     gains = feedback(config, first.inertia, first.delay_s + UNKNOWN_DELAY_S, CAREFUL)
     answer = response_fit.fit(response.run(bench, first.inertia, gains), first.inertia)
-    tell("friction map", 0.4)
+    tell("bristle damping", 0.38)
+    bristle.run(bench, min(found))
+    tell("friction map", 0.42)
     slides = break_away_fit.fit([ramp for ramp in bench.of(Kind.BREAK_AWAY) if not ramp.settings["search"]])
-    bristle = presliding_fit.fit(of_kind(bench.traces, Kind.PRESLIDING), slides)
+    rocked = presliding_fit.fit(of_kind(bench.traces, Kind.PRESLIDING), slides)
     gains = feedback(config, answer.inertia.value, answer.delay_s.value + answer.lag_s.value, STIFF)
-    friction_map.run(bench, gains, slides, break_away_rad(slides, bristle))
+    friction_map.run(bench, gains, slides, break_away_rad(slides, rocked))
     bench.go_to(0.0, gains, 0.3 * bench.bounds.speed_rad_s)
 
 

@@ -65,6 +65,12 @@ def test_cogging_is_found(found):
     assert waves[int(true.periods_per_turn)].amplitude.value == pytest.approx(true.amplitude, rel=0.1)
 
 
+def test_bristle_damping_where_the_encoder_is_fine(fine):
+    truth = fine.joint.model.friction.sigma1
+    assert fine.analysis.damping.value == pytest.approx(truth, rel=0.15)
+    assert fine.analysis.damping.holds(truth)
+
+
 def test_the_model_file_says_all_of_it(found):
     model = model_of(found.analysis)
     again = validate(parse_yaml(axis_model_yaml(model), "model"), AxisModel, "model")

@@ -27,6 +27,9 @@ _LOOP_STEPS = 2000
 #: Share of c0 for what the scatter of bursts does not show: break-away's own error in the bend, bristle damping.
 ALLOWANCE = 0.02
 
+#: Share of a count that may be left of the encoder's steps in the displacement from peak to peak.
+STEP_SHARE = 0.1
+
 
 class PreslidingFit(NamedTuple):
     """Stiffness c0 in N*m/rad, and the averaged curve: torque over displacement, one cycle."""
@@ -72,17 +75,21 @@ def fit(bursts: Sequence[Trace], break_away: BreakAwayFit) -> PreslidingFit:
     responses = [_response(b) for b in used]
     amplitude = float(np.mean([abs(u) for u, _ in responses]))
     bend = bend_factor(amplitude, break_away.positive.value, break_away.negative.value)
-    sensitivity = _sensitivity(amplitude, break_away, bend)
+    curve = _curve(used)
+    unseen = math.hypot(ALLOWANCE, _sensitivity(amplitude, break_away, bend), _steps(used[0], curve[0]))
 
     def stiffness(parts: Sequence[tuple[complex, complex]]) -> Array:
         torque, way = sum(u for u, _ in parts), sum(x for _, x in parts)
         return np.array([bend * abs(torque / way)]) if abs(way) > 0.0 else np.array([math.inf])
 
     value, deviation = jackknife(stiffness, responses)
-    result = estimate(
-        float(value[0]), float(deviation[0]), len(used) - 1, "N*m/rad", share=math.hypot(ALLOWANCE, sensitivity)
-    )
-    return PreslidingFit(result, bend, *_curve(used))
+    result = estimate(float(value[0]), float(deviation[0]), len(used) - 1, "N*m/rad", share=unseen)
+    return PreslidingFit(result, bend, *curve)
+
+
+def _steps(burst: Trace, way: Array) -> float:
+    """Relative half width for the encoder's steps, which a few bursts do not average out entirely."""
+    return STEP_SHARE * burst.settings["resolution_rad"] / float(np.ptp(way))
 
 
 def _sensitivity(amplitude: float, break_away: BreakAwayFit, bend: float) -> float:

@@ -1,0 +1,31 @@
+"""Experiments on an axis under a running daemon: real processes, the daemon's own recorder."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from servod.config import load_config
+from servod.control import ControlClient
+from servod.identify.bounds import bounds_from
+from servod.identify.daemon_link import DaemonLink
+from servod.identify.experiments import break_away
+from servod.identify.experiments.common import Bench
+from servod.identify.fits.break_away import torque_of
+from tests.daemon.running import running
+
+pytestmark = pytest.mark.serial
+
+
+def test_break_away_is_measured_through_the_daemon(tmp_path):
+    with running(tmp_path) as axis, ControlClient(axis.socket) as client:
+        link = DaemonLink(client, load_config(axis.folder / "axis.yaml"))
+        bounds = bounds_from(link.config.limits, link.enable(), None, None)
+        kept: list[int] = []
+        bench = Bench(link, bounds, lambda rows, _trace: kept.append(len(rows)), np.random.default_rng(1))
+        ramp = break_away.search(bench, 1.0)
+        assert torque_of(ramp) == pytest.approx(0.0805, rel=0.1)  # the demo joint, forwards
+        assert ramp.excitation_nm == pytest.approx(ramp.torque_nm, abs=1e-9)
+        assert kept == [len(ramp)]
+        link.disable()
+        assert client.call("status")["axis"]["state"] == "DISABLED"
