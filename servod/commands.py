@@ -57,7 +57,7 @@ REFUSAL_TEXT: dict[Refusal, str] = {
     Refusal.BAD_ARGUMENT: "an argument is not a finite number or out of range",
     Refusal.OUT_OF_RANGE: "the motion would leave limits.position_min_rad to position_max_rad",
     Refusal.NEEDS_RESTART: "a node or the bus was lost; the nodes must be configured anew: restart the daemon",
-    Refusal.OUTSIDE_LIMITS: "the joint stands outside limits.position_min_rad to position_max_rad; move it back by hand",
+    Refusal.OUTSIDE_LIMITS: "the joint is outside limits.position_min_rad to position_max_rad; move it back by hand",
     Refusal.TOO_FAST: "the motion would be faster than limits.speed_rad_s",
 }
 
