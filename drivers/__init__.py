@@ -6,6 +6,7 @@ table names modules as text, so that listing them imports nothing. Import as `se
 
 from __future__ import annotations
 
+from contextlib import suppress
 from importlib import import_module
 from importlib.metadata import entry_points
 
@@ -24,6 +25,16 @@ def driver_table() -> dict[str, str]:
     """All known drivers: the table above and the installed entry points; the table wins where names collide."""
     installed = {point.name: point.value for point in entry_points(group=ENTRY_POINT_GROUP)}
     return installed | DRIVERS
+
+
+def drivers_of(kind: str) -> list[str]:
+    """The names of the drivers of that kind ("amplifier" or "encoder"); those that cannot be loaded are left out."""
+    found = []
+    for name in sorted(driver_table()):
+        with suppress(BadInput):
+            if load_driver(name).kind == kind:
+                found.append(name)
+    return found
 
 
 def load_driver(name: str) -> Driver:

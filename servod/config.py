@@ -14,7 +14,6 @@ from pydantic import Field, model_validator
 from servod.yaml12 import Strict, load_model
 
 NodeId = Annotated[int, Field(ge=1, le=127, description="CANopen node id, 1 to 127")]
-Positive = Annotated[float, Field(gt=0.0)]
 
 
 class BusConfig(Strict):
@@ -79,7 +78,7 @@ class AmplifierConfig(Strict):
     identity: Identity = Identity()
     quirks: str = Field("none", description="row of the quirks table, e.g. epos4, elmo, copley, nanotec, technosoft")
     counts_per_turn: int = Field(1_048_576, ge=4, le=2**32 - 1)
-    gear_ratio: Positive = 1.0
+    gear_ratio: float = Field(1.0, ge=1e-6, le=1e6)
     position_direction: Literal[1, -1] = 1
     torque_direction: Literal[1, -1] = 1
     rated_torque_mnm: int | None = Field(None, ge=1, description="what 0x6076 must read; None takes what is there")
@@ -98,20 +97,20 @@ class EncoderConfig(Strict):
     counts_per_turn: int = Field(1_048_576, ge=4, le=2**32 - 1, description="0x6001, checked against the device")
     measuring_range_counts: int | None = Field(None, ge=4, le=2**32, description="0x6002; None takes what is there")
     direction: Literal[1, -1] = 1
-    zero_offset_rad: float = 0.0
+    zero_offset_rad: float = Field(0.0, ge=-1e6, le=1e6)
     velocity_cutoff_hz: float = Field(120.0, gt=0.0, le=2000.0, description="first-order low-pass of the velocity")
 
 
 class LimitsConfig(Strict):
     """The independent last layer before the wire (servod.limits)."""
 
-    torque_nm: Positive
-    torque_rate_nm_per_s: Positive
-    speed_rad_s: Positive
-    position_min_rad: float
-    position_max_rad: float
-    following_error_rad: Positive
-    encoder_mismatch_rad: Positive
+    torque_nm: float = Field(gt=0.0, le=1e5)
+    torque_rate_nm_per_s: float = Field(gt=0.0, le=1e9)
+    speed_rad_s: float = Field(gt=0.0, le=1e5)
+    position_min_rad: float = Field(ge=-1e6, le=1e6)
+    position_max_rad: float = Field(ge=-1e6, le=1e6)
+    following_error_rad: float = Field(gt=0.0, le=1e6)
+    encoder_mismatch_rad: float = Field(gt=0.0, le=1e6)
     stale_cycles: int = Field(5, ge=1, le=1000)
     late_cycles: int = Field(
         20, ge=1, le=10_000, description="skipped periods that end the motion; 20 punctual cycles make up for one"

@@ -73,15 +73,12 @@ def _check_axis(file: Path) -> str:
     """The configuration and everything that it names: drivers, quirks, EDS, gain set, model."""
     from servod.axis_model import load_axis_model
     from servod.config import load_config
-    from servod.drivers import driver_table
     from servod.drivers.quirks import load_quirks
     from servod.gains import load_gains, require_certificate
-    from servod.master.planned import planned_bus_load
+    from servod.master.planned import check_names, planned_bus_load
 
     config = load_config(file)
-    for section, driver in (("amplifier", config.amplifier.driver), ("encoder", config.encoder.driver)):
-        if driver not in driver_table():
-            raise BadInput(f"{file}: {section}.driver", driver, ", ".join(sorted(driver_table())))
+    notes = check_names(config, str(file))
     try:
         load_quirks(config.amplifier.quirks)
     except BadInput as error:
@@ -94,7 +91,8 @@ def _check_axis(file: Path) -> str:
         load_axis_model(config.model)
     load = planned_bus_load(config, str(file))
     where = f"{config.bus.interface} {config.bus.channel}"
-    return f"axis {config.name} on {where}, bus load {100.0 * load.share:.1f} % at {load.bit_rate} bit/s"
+    notes.insert(0, f"axis {config.name} on {where}, bus load {100.0 * load.share:.1f} % at {load.bit_rate} bit/s")
+    return "; ".join(notes)
 
 
 def _check_gains(file: Path) -> str:

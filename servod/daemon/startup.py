@@ -26,7 +26,7 @@ from servod.gains import load_gains, require_certificate
 from servod.loop.handle import LoopHandle
 from servod.loop.plan import LoopPlan
 from servod.master import Master
-from servod.master.planned import planned_bus_load
+from servod.master.planned import check_names, planned_bus_load
 from servod.notify import Notifier
 from servod.recorder import Recorder
 from servod.yaml12 import read_text
@@ -39,6 +39,8 @@ _RECORDER_START_S = 5.0
 def check(path: Path) -> AxisConfig:
     """Read and check the configuration and every file that it names. Raises BadInput."""
     config = load_config(path)
+    for note in check_names(config, str(path)):
+        log.warning("%s", note)
     require_certificate(load_gains(config.gains.initial), config.gains.accept_uncertified)
     if config.model is not None:
         load_axis_model(config.model)

@@ -5,25 +5,65 @@ Off the control path. `servod --check` and `servoctl config check` refuse by it 
 
 from __future__ import annotations
 
+import grp
+import os
 from typing import Literal
 
 from servod.bus.load import BusLoad, bus_load, check_bus_load
 from servod.config import AxisConfig
-from servod.drivers import load_driver
+from servod.drivers import driver_table, drivers_of, load_driver
 from servod.errors import BadInput
 from servod.hal import Driver, NodePlan, Setup
+
+#: What a Unix socket's path may be long (sockaddr_un.sun_path with its end, unix(7)).
+SOCKET_PATH_BYTES = 107
+_OWN_INTERFACES = ("socketcan", "virtual")
 
 Kind = Literal["amplifier", "encoder"]
 
 
 def load_setup(config: AxisConfig, kind: Kind) -> Setup:
-    """The set-up face of the configured amplifier or encoder; raises BadInput for a driver of the other kind."""
-    section = config.amplifier if kind == "amplifier" else config.encoder
-    driver: Driver = load_driver(section.driver)
-    if driver.kind != kind:
-        raise BadInput(f"{kind}.driver", f"{section.driver} ({driver.kind})", f"a driver of kind {kind}")
+    """The set-up face of the configured amplifier or encoder; raises BadInput unless it is a driver of that kind."""
+    name = (config.amplifier if kind == "amplifier" else config.encoder).driver
+    driver: Driver | None = load_driver(name) if name in driver_table() else None
+    if driver is None or driver.kind != kind:
+        found = f"{name} ({driver.kind})" if driver else name
+        raise BadInput(f"{kind}.driver", found, ", ".join(drivers_of(kind)))
     setup: Setup = driver.setup(config)
     return setup
+
+
+def check_names(config: AxisConfig, source: str) -> list[str]:
+    """Check what the configuration in the file `source` calls by name and no file stands for; gives notes for people.
+
+    Raises BadInput for a bus interface that nobody knows and for a socket whose path the kernel does not take. A
+    control group that is missing is a note: the machine that checks need not be the one that runs.
+    """
+    _check_interface(config.bus.interface, source)
+    paths = {"control.socket": str(config.control.socket)}
+    if config.bus.interface == "virtual":
+        paths["bus.channel"] = config.bus.channel
+    for key, path in paths.items():
+        length = len(os.fsencode(path))
+        if length > SOCKET_PATH_BYTES:
+            raise BadInput(f"{source}: {key}", f"{path} ({length} bytes)", f"at most {SOCKET_PATH_BYTES} bytes")
+    try:
+        grp.getgrnam(config.control.group)
+    except KeyError:
+        return [
+            f"this machine has no group {config.control.group} (control.group): only root and the daemon's user command"
+        ]
+    return []
+
+
+def _check_interface(interface: str, source: str) -> None:
+    if interface in _OWN_INTERFACES:
+        return
+    from can import VALID_INTERFACES
+
+    if interface not in VALID_INTERFACES:
+        names = ", ".join(sorted({*_OWN_INTERFACES, *VALID_INTERFACES}))
+        raise BadInput(f"{source}: bus.interface", interface, names)
 
 
 def checked_load(config: AxisConfig, plans: list[NodePlan]) -> BusLoad:

@@ -62,3 +62,11 @@ def test_several_files_are_checked_in_order_and_the_first_mistake_ends_it(
     bad.write_text("inertia: -1\n")
     assert run(["config", "check", str(SHIPPED[0]), str(bad)]) == 2
     assert "bad.yaml: inertia" in capsys.readouterr().err
+
+
+def test_a_group_that_is_not_there_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "axis.yaml"
+    text = (GAINS / "config" / "can0.yaml").read_text().replace("../demo_pd.yaml", str(GAINS / "demo_pd.yaml"))
+    file.write_text(text.replace("group: servod", "group: nobody-has-this"))
+    assert run(["config", "check", str(file)]) == 0
+    assert "no group nobody-has-this (control.group)" in capsys.readouterr().out
