@@ -6,6 +6,7 @@ carry their units. Files are written aside, synced and renamed.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import os
 from collections.abc import Iterator
@@ -28,8 +29,15 @@ def export_csv(recording: Recording, path: Path) -> int:
             os.fsync(stream.fileno())
         aside.replace(path)
     except OSError as error:
+        _remove(aside)
         raise BadInput(str(path), error.strerror or str(error), "a path that can be written") from None
     return len(recording)
+
+
+def _remove(aside: Path) -> None:
+    """Take away what could not be written whole: on a full disk it is what fills it."""
+    with contextlib.suppress(OSError):
+        aside.unlink(missing_ok=True)
 
 
 def _write_csv(recording: Recording, stream: TextIO) -> None:
@@ -71,5 +79,6 @@ def export_parquet(recording: Recording, path: Path) -> int:
         pq.write_table(pa.table(columns, schema=pa.schema(fields)), aside)
         aside.replace(path)
     except OSError as error:
+        _remove(aside)
         raise BadInput(str(path), error.strerror or str(error), "a path that can be written") from None
     return len(recording)

@@ -1,4 +1,5 @@
 import csv
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -39,3 +40,14 @@ def test_parquet_has_the_same_and_the_units(recording: Recording, tmp_path: Path
 def test_target_that_cannot_be_written_is_bad_input(recording: Recording, tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="No such file"):
         export_csv(recording, tmp_path / "nowhere" / "a.csv")
+
+
+@pytest.mark.parametrize("export", [export_csv, export_parquet])
+def test_what_cannot_be_written_whole_leaves_nothing(
+    recording: Recording, tmp_path: Path, export: Callable[[Recording, Path], int]
+) -> None:
+    target = tmp_path / "out" / "a.table"
+    target.mkdir(parents=True)  # the last step, the renaming, fails
+    with pytest.raises(BadInput, match="a path that can be written"):
+        export(recording, target)
+    assert list(target.parent.iterdir()) == [target]
