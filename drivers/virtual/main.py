@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import gc
+import os
 import signal
 import sys
 import time
@@ -36,6 +37,8 @@ _SETTING_OPTIONS: dict[str, type] = {
     "gear-ratio": float,
     "rated-torque-mnm": int,
 }
+_OVERRIDES = "overrides the settings file"
+_SETTING_HELP = {"seed": f"begins the noise: the same number, the same noise; {_OVERRIDES}"}
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -46,9 +49,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--plant", type=Path, metavar="FILE", help="axis model of the joint (default: demo joint)")
     parser.add_argument("--settings", type=Path, metavar="FILE", help="settings of the virtual axis (YAML)")
     parser.add_argument("--record", type=Path, metavar="FILE", help="the drive's own record, survives any kill")
-    parser.add_argument("--timing", choices=[t.value for t in Timing], default=Timing.STAMPED.value)
+    timing = "frames come at once with the bus's time on them (stamped), or when they have really ended (paced)"
+    parser.add_argument("--timing", choices=[t.value for t in Timing], default=Timing.STAMPED.value, help=timing)
+    scheduler = "SCHED_FIFO priority, below the loop's; 0 leaves the scheduler alone (default: 40)"
+    parser.add_argument("--priority", type=int, choices=range(99), metavar="N", default=40, help=scheduler)
     for option, kind in _SETTING_OPTIONS.items():
-        parser.add_argument(f"--{option}", type=kind, metavar="N", help="overrides the settings file")
+        parser.add_argument(f"--{option}", type=kind, metavar="N", help=_SETTING_HELP.get(option, _OVERRIDES))
     return parser
 
 
@@ -57,7 +63,7 @@ def _settings(arguments: argparse.Namespace) -> VirtualAxisSettings:
     base = load_model(arguments.settings, VirtualAxisSettings) if arguments.settings else VirtualAxisSettings()
     chosen: dict[str, Any] = {o.replace("-", "_"): getattr(arguments, o.replace("-", "_")) for o in _SETTING_OPTIONS}
     given = {key: value for key, value in chosen.items() if value is not None}
-    return validate(base.model_dump() | given, VirtualAxisSettings, "servod-virtual-axis")
+    return validate(base.model_dump() | given, VirtualAxisSettings, "options")
 
 
 def _server(arguments: argparse.Namespace) -> HubServer | CanServer:
@@ -73,18 +79,29 @@ def _server(arguments: argparse.Namespace) -> HubServer | CanServer:
     return server
 
 
+def _take_turns_first(priority: int) -> str:
+    """Ask for real-time scheduling: an axis that queues behind ordinary processes answers late; a note if refused."""
+    if priority == 0:
+        return ""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    except OSError as error:
+        return f" (without SCHED_FIFO {priority}: {error.strerror})"
+    return ""
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run until told to stop; returns its exit code (servod.errors)."""
     arguments = _parser().parse_args(argv)
     try:
         server = _server(arguments)
     except ServodError as error:
-        print(error, file=sys.stderr)
+        print(f"servod-virtual-axis: {error}", file=sys.stderr)
         return error.exit_code
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: server.stop())
     gc.freeze()  # what stands now stays; collections in the loop then have little to look at
-    print(f"ready {arguments.can or arguments.socket}", flush=True)
+    print(f"ready {arguments.can or arguments.socket}{_take_turns_first(arguments.priority)}", flush=True)
     try:
         server.run()
     finally:

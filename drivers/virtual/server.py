@@ -187,7 +187,10 @@ def _listen(path: Path) -> socket.socket:
         listener.listen(16)
     except OSError as error:
         listener.close()
-        raise BadInput(f"--socket {path}", error.strerror or str(error), "a path for a new socket") from None
+        found = error.strerror or str(error)
+        if not path.parent.is_dir():
+            found = f"no folder {path.parent}"
+        raise BadInput(f"--socket {path}", found, "a path for a new socket in a folder that is there") from None
     listener.setblocking(False)
     return listener
 

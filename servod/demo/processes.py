@@ -24,11 +24,11 @@ _STOP_S = 5.0
 
 @contextlib.contextmanager
 def child(
-    module: str, arguments: Sequence[str], log: Path, priority: int = 0, cores: set[int] | None = None
+    module: str, arguments: Sequence[str], log: Path, cores: set[int] | None = None
 ) -> Iterator[subprocess.Popen[bytes]]:
     """Run `python -m module arguments` for the time of a `with` block; its output goes to `log`.
 
-    `priority` above 0 asks for SCHED_FIFO, and does without where that is refused; `cores` keeps it to these.
+    `cores` keeps it to these.
     """
     libc = ctypes.CDLL(None)
 
@@ -36,9 +36,6 @@ def child(
         libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
         if cores:
             os.sched_setaffinity(0, cores)
-        if priority > 0:
-            with contextlib.suppress(OSError):
-                os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
 
     with log.open("wb") as output:
         process = subprocess.Popen(

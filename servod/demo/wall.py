@@ -27,9 +27,6 @@ from servod.recorder_read import read_recording
 #: Told how far a run is: controller and share from 0 to 1.
 Progress = Callable[[str, float], None]
 
-#: The virtual axis answers within a fraction of the cycle, or the loop finds its feedback stale: it must not queue
-#: behind ordinary processes. Below the loop's own priority.
-_AXIS_PRIORITY = 40
 _START_S = 20.0
 _POLL_S = 0.1
 _HOME_S = 2.0
@@ -55,8 +52,7 @@ def running_axis(config: AxisConfig, plant: Path, folder: Path) -> Iterator[Runn
                 "servod.drivers.virtual.main",
                 ["--socket", str(bus), "--plant", str(plant)],
                 log,
-                _AXIS_PRIORITY,
-                other_cores(),
+                cores=other_cores(),
             )
         )
         wait_until(bus.exists, axis, log, _START_S)

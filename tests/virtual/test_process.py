@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import signal
 import socket
 import subprocess
@@ -40,7 +41,8 @@ class Axis:
         command += ["--record", str(self.record), *options]
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         assert self.process.stdout is not None
-        assert self.process.stdout.readline() == f"ready {self.bus}\n"
+        self.ready = self.process.stdout.readline().rstrip("\n")
+        assert self.ready.partition(" (without ")[0] == f"ready {self.bus}"
 
 
 @pytest.fixture
@@ -255,11 +257,25 @@ def test_a_tool_waits_for_a_busy_bus(tmp_path: Path) -> None:
         running.process.communicate()
 
 
+def test_it_asks_for_real_time_by_itself(axis: Axis, tmp_path: Path) -> None:
+    (tmp_path / "left").mkdir()
+    left = Axis(tmp_path / "left", "--priority", "0")
+    try:
+        assert os.sched_getscheduler(left.process.pid) == os.SCHED_OTHER
+        if os.sched_getscheduler(axis.process.pid) == os.SCHED_FIFO:
+            assert os.sched_getparam(axis.process.pid).sched_priority == 40
+        else:
+            assert "SCHED_FIFO 40" in axis.ready
+    finally:
+        left.process.kill()
+        left.process.communicate()
+
+
 @pytest.mark.parametrize(
     ("options", "code", "named"),
     [
         (["--can", "nosuchcan0"], 3, "nosuchcan0"),
-        (["--socket", "{folder}/no/such/folder/bus"], 2, "no/such/folder"),
+        (["--socket", "{folder}/no/such/folder/bus"], 2, "found no folder "),
         (["--socket", "{folder}/bus", "--plant", "{folder}/missing.yaml"], 2, "missing.yaml"),
         (["--socket", "{folder}/bus", "--plant", "{folder}/slide.yaml"], 2, "slide.yaml: axis: found linear"),
         (["--socket", "{folder}/bus", "--settings", "{folder}/settings.yaml"], 2, "rated_torque_mnm"),
@@ -276,6 +292,7 @@ def test_bad_input_is_one_line(tmp_path: Path, options: list[str], code: int, na
     assert result.returncode == code
     assert result.stderr.count("\n") == 1
     assert named in result.stderr
+    assert result.stderr.startswith("servod-virtual-axis: ")
 
 
 def test_the_same_nodes_on_socketcan_sockets() -> None:
