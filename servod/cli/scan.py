@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, example, print_json
-from servod.errors import Unreachable
+from servod.errors import BadInput, Unreachable
 
 if TYPE_CHECKING:
     from servod.config import BusConfig
@@ -29,14 +29,19 @@ def register(app: typer.Typer) -> None:
 
 
 def scan(
-    interface: Annotated[str, typer.Option(help="virtual, socketcan, or a name that python-can knows.")] = "socketcan",
+    interface: Annotated[
+        str | None,
+        typer.Option(help="virtual, socketcan (with --channel the default), or a name that python-can knows."),
+    ] = None,
     channel: Annotated[str | None, typer.Option(help="Interface name, or the virtual bus's socket.")] = None,
     bit_rate: Annotated[int, typer.Option(help="Bit rate, for buses that python-can opens.")] = 1_000_000,
     socket: SocketOption = DEFAULT_SOCKET,
     as_json: JsonOption = False,
 ) -> None:
     """Scan the bus."""
-    nodes = _through_daemon(socket) if channel is None else _on_bus(interface, channel, bit_rate, socket)
+    if interface is not None and channel is None:
+        raise BadInput(f"--interface {interface}", "no --channel", "--channel with the interface's name or socket too")
+    nodes = _through_daemon(socket) if channel is None else _on_bus(interface or "socketcan", channel, bit_rate, socket)
     if as_json:
         print_json({"nodes": nodes})
     else:

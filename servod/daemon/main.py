@@ -16,8 +16,8 @@ from servod.errors import BadInput, ServodError
 
 _EXAMPLE = """\
 example:
-  servod --config /etc/servod/can0.yaml          run the axis until SIGTERM
-  servod --config /etc/servod/can0.yaml --check  only check the configuration and the files it names
+  servod --config /etc/servod/config/can0.yaml          run the axis until SIGTERM
+  servod --config /etc/servod/config/can0.yaml --check  only check the configuration and the files it names
 
 exit codes: 0 done, 2 bad usage or input, 3 bus, device or loop cannot be reached or was lost
 """
@@ -27,7 +27,7 @@ class _Parser(argparse.ArgumentParser):
     """Says what is wrong with the arguments in one line."""
 
     def error(self, message: str) -> NoReturn:
-        raise BadInput("servod: arguments", message, "see `servod --help`")
+        raise BadInput("arguments", message, "see `servod --help`")
 
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
