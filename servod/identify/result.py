@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from servod.axis_effects import ActuatorLag, Cogging
+from servod.axis_effects import ActuatorLag, Cogging, Gravity
 from servod.axis_effects import Harmonic as ModelHarmonic
 from servod.axis_model import AxisModel, LocalFriction
 from servod.identified import Identified, IdentifiedMap, IdentifiedValue
 from servod.identify.analysis import Analysis
 from servod.identify.estimate import Estimate
+from servod.identify.fits.cogging import GRAVITY
 from servod.identify.fits.curve import CurveFit
 from servod.identify.fits.friction_map import Side
 
@@ -53,6 +54,7 @@ def model_of(analysis: Analysis) -> AxisModel:
             velocities=_rounded(_velocities(analysis)),
             torques=_rounded(_torques(analysis)),
         ),
+        gravity=_gravity(analysis),
         cogging=_cogging(analysis),
         actuator_lag=ActuatorLag(time_constant_s=lag_s) if lag_s > 0.0 else None,
         identified=identified(analysis),
@@ -89,7 +91,9 @@ def estimates(analysis: Analysis) -> dict[str, Estimate]:
         "torque_reading_noise_rms": analysis.noise.torque_reading_rms,
         "torque_noise_rms": answer.torque_noise_rms,
     }
-    numbers |= {f"cogging_{wave.order}": wave.amplitude for wave in analysis.map.cogging}
+    numbers |= {
+        "gravity" if wave.order == GRAVITY else f"cogging_{wave.order}": wave.amplitude for wave in analysis.map.cogging
+    }
     if analysis.damping is not None:
         numbers["sigma1"] = analysis.damping
     if answer.resonance_hz is not None:
@@ -167,14 +171,22 @@ def _viscous(analysis: Analysis) -> float:
 
 
 def _cogging(analysis: Analysis) -> Cogging | None:
-    if not analysis.map.cogging:
+    waves = [wave for wave in analysis.map.cogging if wave.order != GRAVITY]
+    if not waves:
         return None
     return Cogging(
         harmonics=tuple(
-            ModelHarmonic(amplitude=w.amplitude.value, periods_per_turn=float(w.order), phase=w.phase)
-            for w in analysis.map.cogging
+            ModelHarmonic(amplitude=w.amplitude.value, periods_per_turn=float(w.order), phase=w.phase) for w in waves
         )
     )
+
+
+def _gravity(analysis: Analysis) -> Gravity | None:
+    """The wave of one period a turn: a pendulum, amplitude*sin(x + phase)."""
+    for wave in analysis.map.cogging:
+        if wave.order == GRAVITY:
+            return Gravity(amplitude=wave.amplitude.value, phase=wave.phase)
+    return None
 
 
 def _lean(analysis: Analysis) -> tuple[float, float]:

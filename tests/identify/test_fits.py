@@ -96,3 +96,12 @@ def test_cogging_orders_are_found_beside_friction_and_none_where_there_is_none()
     assert cogging.find_orders(base, x, torque, 60) == []
     torque = torque + 0.002 * np.sin(22.0 * x + 0.3) + 0.001 * np.sin(7.0 * x)
     assert sorted(cogging.find_orders(base, x, torque, 60)) == [7, 22]
+
+
+def test_gravity_is_found_on_less_than_a_turn():
+    rng = np.random.default_rng(8)
+    x = np.concatenate([np.linspace(-1.0, 1.0, 1500), np.linspace(1.0, -1.0, 1500)])
+    forward = np.arange(3000) < 1500
+    base = np.column_stack([forward, ~forward]).astype(float)
+    torque = base @ [0.05, -0.04] + 0.02 * np.sin(x + 0.3) + rng.normal(0.0, 2e-4, len(x))
+    assert cogging.find_orders(base, x, torque, 60) == [cogging.GRAVITY]

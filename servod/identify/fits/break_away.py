@@ -16,7 +16,7 @@ from servod.identify.trace import Trace
 LEAD_S = 0.002
 
 #: Share of the value that the ramps' scatter does not show: creep before, and the fall into sliding.
-ALLOWANCE = 0.015
+ALLOWANCE = 0.03
 
 
 class BreakAwayFit(NamedTuple):

@@ -15,6 +15,8 @@ HIGHEST_ORDER = 150
 MOST_ORDERS = 6
 #: An order must show at least this share of a period in the travel.
 LEAST_PERIODS = 0.75
+#: Gravity is the order that is looked for on less than that, from this travel on.
+GRAVITY, GRAVITY_TRAVEL_RAD = 1, 1.0
 #: It must take at least this share off the variance that is left, and this many times its own expectation.
 LEAST_SHARE, LEAST_RATIO = 0.02, 12.0
 
@@ -30,6 +32,8 @@ def find_orders(base: Array, position: Array, torque: Array, parts: int) -> list
     """Orders whose sine explains what `base` leaves of `torque`; `parts`: number of independent pieces of data."""
     lowest = max(1, int(np.ceil(LEAST_PERIODS * 2.0 * np.pi / float(np.ptp(position)))))
     candidates = list(range(lowest, HIGHEST_ORDER + 1))
+    if lowest > GRAVITY and float(np.ptp(position)) > GRAVITY_TRAVEL_RAD:
+        candidates.insert(0, GRAVITY)
     orders: list[int] = []
     while len(orders) < MOST_ORDERS:
         basis, _ = np.linalg.qr(np.column_stack([base, columns(position, orders)]))
