@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, example, report
-from servod.errors import BadInput
+from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, connect, example, report
+from servod.errors import AnswerIsNo, BadInput
 
 _app = typer.Typer(
     help=example("Record every cycle; export a recording.", "servoctl record start", "servoctl record stop"),
@@ -34,10 +34,14 @@ def start(
     report(result, f"recording to {result['path']}", as_json)
 
 
-@_app.command(help=example("Stop recording.", "servoctl record stop"))
+@_app.command(help=example("Stop recording; exit code 1 when there is none.", "servoctl record stop"))
 def stop(socket: SocketOption = DEFAULT_SOCKET, as_json: JsonOption = False) -> None:
     """Stop the recording."""
-    result = ask(socket, "record_stop")
+    with connect(socket) as client:
+        recorder = client.call("status")["recorder"]
+        if not recorder["recording"]:
+            raise AnswerIsNo(f"not recording. {recorder['failure']}")
+        result = client.call("record_stop")
     report(result, f"recorded {result['records']} cycles to {result['path']}", as_json)
 
 

@@ -164,6 +164,10 @@ def test_record_and_export(servoctl: Servoctl, tmp_path: Path, capsys: pytest.Ca
     assert len(rows) == stopped["records"]
 
 
+def test_what_is_not_recorded_cannot_be_stopped(servoctl: Servoctl) -> None:
+    assert "not recording" in servoctl("record", "stop", code=1)
+
+
 def test_a_recording_goes_nowhere_else(servoctl: Servoctl) -> None:
     assert "recordings" in servoctl("record", "start", "--name", "/tmp/elsewhere.mcap", code=2)
 
