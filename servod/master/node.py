@@ -57,7 +57,7 @@ class Node:
         check_identity(self.node_id, found, self.section.identity, PROFILE[self._kind])
         return [
             f"node {self.node_id}: profile {found.profile}, vendor 0x{found.vendor_id:08X}, "
-            f"product {found.product_code}, revision {found.revision}, serial {found.serial}"
+            f"product 0x{found.product_code:X}, revision 0x{found.revision:X}, serial {found.serial}"
         ]
 
     def _why_silent(self, error: str) -> str:

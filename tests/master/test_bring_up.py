@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from rig import Rig
 from witness import Witness, axis_config, master, witness
 
 from servod.cia import Obj301, Obj402, Obj406
@@ -223,3 +224,9 @@ def test_aborts_carry_code_and_meaning(world: Witness) -> None:
     with master(world, axis_config()) as instance, pytest.raises(SdoAbort, match=message) as abort:
         instance.sdo(1).read(0x5FFF)
     assert abort.value.code == 0x06020000
+
+
+def test_the_identity_reads_as_scan_shows_it() -> None:
+    rig = Rig()
+    rig.start()
+    assert any("product 0x406, revision 0x" in line for line in rig.up.report)
