@@ -31,7 +31,7 @@ class Uncertainty(Strict):
     inertia: Share = 0.05
     torque_gain: Share = 0.01
     stiffness: Share = Field(0.12, description="bristle stiffness c0")
-    damping: Share = Field(0.3, description="bristle damping sigma1")
+    damping: Share = Field(0.2, description="bristle damping sigma1")
     dry: Share = Field(0.05, description="level of dry friction")
     slope: Share = Field(0.05, description="fall of the Stribeck curve beyond the level of dry friction")
     viscous: Share = 0.1

@@ -21,10 +21,10 @@ from servod.verify.steady_friction import SteadyFriction, steady_friction
 from servod.verify.vertices import Span, joints
 
 #: Cut-offs of the velocity filter that are tried. The filter's lag decides what is possible where friction falls: at
-#: 120 Hz hardly anything, and no observer; beyond 500 Hz the encoder's steps shake the torque.
-CUTOFFS_HZ = (300.0, 500.0)
+#: 120 Hz hardly anything, and no observer; beyond 800 Hz the encoder's steps shake the torque.
+CUTOFFS_HZ = (300.0, 500.0, 800.0)
 #: Pole radii asked for where the Stribeck curve falls, best first: the faster ones leave room for the observer.
-SLOW_DISCS = (0.96, 0.985, 0.998)
+SLOW_DISCS = (0.96, 0.985)
 POSITION_BANDWIDTH_RAD_S = 120.0  # sets the scale of positions, and with it what alpha and beta mean
 RELAX_STEPS = 6
 
@@ -50,6 +50,12 @@ class Wishes:
     def spans(self) -> tuple[Span, Span]:
         """Omega_L and Omega_H, which share the overlap."""
         return Span("low", 0.0, self.overlap[1]), Span("high", self.overlap[0], self.speed_max)
+
+    def choices(self) -> Iterator[Wishes]:
+        """What was left open, narrowed: every cut-off with every pole radius where friction falls, best first."""
+        for cutoff in (self.cutoff_hz,) if self.cutoff_hz else CUTOFFS_HZ:
+            for slow in (self.slow_disc,) if self.slow_disc else SLOW_DISCS:
+                yield replace(self, cutoff_hz=cutoff, slow_disc=slow)
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,15 +177,15 @@ def region(design: Design, span: Span, wishes: Wishes) -> RegionProof | None:
 
 
 def regions(model: AxisModel, wishes: Wishes) -> Design | None:
-    """Both regions at the lowest feasible cut-off of the velocity filter (or at the one that is asked for)."""
-    for cutoff in (wishes.cutoff_hz,) if wishes.cutoff_hz else CUTOFFS_HZ:
-        design = empty_design(model, wishes, cutoff)
-        for slow in (wishes.slow_disc,) if wishes.slow_disc else SLOW_DISCS:
-            low, high = wishes.spans
-            hard = region(design, high, replace(wishes, slow_disc=slow))
-            easy = None if hard is None else region(design, low, replace(wishes, slow_disc=slow))
-            if hard is not None and easy is not None:
-                return design.model_copy(update={"regions": [easy, hard]})
+    """Both regions at the first feasible choice of what `wishes` leaves open; None when there is none."""
+    low, high = wishes.spans
+    for choice in wishes.choices():
+        assert choice.cutoff_hz is not None
+        design = empty_design(model, choice, choice.cutoff_hz)
+        hard = region(design, high, choice)
+        easy = None if hard is None else region(design, low, choice)
+        if hard is not None and easy is not None:
+            return design.model_copy(update={"regions": [easy, hard]})
     return None
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import datetime
 import hashlib
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from servod import __version__
@@ -28,6 +28,8 @@ from servod.verify.steady_friction import SteadyFriction, steady_friction
 
 #: Bandwidths of the output observer, best first; the first that every corner of the intervals stands is taken.
 OBSERVERS_RAD_S = (60.0, 50.0, 40.0, 30.0, 20.0, 15.0, 10.0, 5.0)
+#: From this bandwidth on no other choice of filter and poles is tried.
+ENOUGH_RAD_S = 30.0
 LIMIT_SHARE = 1.5  # bound of the compensated force, as a share of the largest friction
 HOLD_COUNTS = 1.2  # hold width in encoder counts: what the joint creeps under noise is twice this
 
@@ -99,16 +101,27 @@ def synthesize(
     """The gain set for `model`, sealed and not yet certified; or why there is none and what would help."""
     wishes, options = wishes or Wishes(), options or Options()
     friction = steady_friction(model)
-    design = regions(model, wishes)
-    if design is None:
-        return explain(model, wishes)
-    for bandwidth in OBSERVERS_RAD_S if options.observer else ():
-        law = parameters(design, friction, options, bandwidth)
-        if stands(design, friction, law):
+    best: tuple[float, Design] | None = None
+    for narrowed in wishes.choices():
+        design = regions(model, narrowed)
+        if design is None:
+            continue
+        bandwidth = widest_observer(design, friction, options)
+        if best is None or bandwidth > best[0]:
+            best = bandwidth, design
+        if bandwidth >= ENOUGH_RAD_S or not options.observer:
             break
-    else:
-        law = parameters(design, friction, replace(options, observer=False), 0.0)
-    return gain_set(design, law, options, model_path)
+    if best is None:
+        return explain(model, wishes)
+    return gain_set(best[1], parameters(best[1], friction, options, best[0]), options, model_path)
+
+
+def widest_observer(design: Design, friction: SteadyFriction, options: Options) -> float:
+    """Largest bandwidth of the list that the full loop stands [rad/s]; 0 where it stands none, or none is wanted."""
+    for bandwidth in OBSERVERS_RAD_S if options.observer else ():
+        if stands(design, friction, parameters(design, friction, options, bandwidth)):
+            return bandwidth
+    return 0.0
 
 
 def gain_set(design: Design, law: LocalParameters, options: Options, model_path: Path | None) -> GainSet:
