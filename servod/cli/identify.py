@@ -6,17 +6,29 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, connect, example, print_json
+from servod.cli.common import (
+    DEFAULT_SOCKET,
+    JsonOption,
+    SocketOption,
+    connect,
+    example,
+    need_folder,
+    one_thread,
+    print_json,
+)
 from servod.errors import BadInput
 
 if TYPE_CHECKING:
     from servod.axis_model import AxisModel
     from servod.identify.analysis import Analysis
+    from servod.identify.links import Link
     from servod.identify.walk import Tell
+
+    Job = Callable[["_Walk", Tell], Analysis]
 
 _HELP = example(
     "Identify the axis: noise, break-away, presliding stiffness, inertia, delay, friction map. Ctrl-C leaves it off.",
@@ -45,17 +57,20 @@ def identify(
     as_json: JsonOption = False,
 ) -> None:
     """Run or read the experiments, fit, write the model."""
+    one_thread()
     from servod.axis_model import axis_model_yaml
     from servod.identify.result import document, model_of
 
+    need_folder("--out", out.resolve().parent)
     old = _identified_in(before)
+    if recordings is not None:
+        job = _from_recordings(recordings)
+    elif plant is not None:
+        job = _virtual(plant, config, encoder_counts, seed)
+    else:
+        job = _on_daemon(socket, config)
     with _progress(quiet=as_json) as tell:
-        if recordings is not None:
-            analysis = _from_recordings(recordings)
-        elif plant is not None:
-            analysis = _virtual(plant, config, out, tell, travel, speed, encoder_counts, seed)
-        else:
-            analysis = _on_daemon(socket, config, out, tell, travel, speed, seed)
+        analysis = job(_Walk(recordings_folder(out), travel, speed, seed), tell)
     model = model_of(analysis)
     _write(out, axis_model_yaml(model))
     found = document(analysis) | {"model": str(out)} | _changes(old, model)
@@ -70,43 +85,60 @@ def recordings_folder(out: Path) -> Path:
     return out.with_name(out.stem + "_recordings")
 
 
-def _from_recordings(folder: Path) -> Analysis:
+class _Walk(NamedTuple):
+    """What every walk on an axis is given."""
+
+    folder: Path
+    travel: float | None
+    speed: float | None
+    seed: int
+
+    def on(self, link: Link, tell: Tell) -> Analysis:
+        """Run all experiments on this axis."""
+        from servod.identify.walk import identify as walk
+
+        return walk(link, self.folder, tell, travel_rad=self.travel, speed_rad_s=self.speed, seed=self.seed)
+
+
+def _from_recordings(folder: Path) -> Job:
+    """Reads at once, so that a mistake is told before anything begins."""
     from servod.identify.analysis import analyse
     from servod.identify.store import load
 
-    return analyse(load(folder))
+    traces = load(folder)
+    return lambda _walk, _tell: analyse(traces)
 
 
-def _virtual(
-    plant: Path, config: Path | None, out: Path, tell: Tell,
-    travel: float | None, speed: float | None, encoder_counts: int, seed: int,
-) -> Analysis:  # fmt: skip
+def _virtual(plant: Path, config: Path | None, encoder_counts: int, seed: int) -> Job:
     from servod.axis_model import load_axis_model
     from servod.config import load_config
     from servod.identify.links import SteppedLink
     from servod.identify.virtual import virtual_session
-    from servod.identify.walk import identify as walk
 
     joint, chosen = load_axis_model(plant), load_config(config) if config is not None else None
-    with tempfile.TemporaryDirectory(prefix="servod-identify-") as folder:
-        link = SteppedLink(virtual_session(joint, Path(folder), encoder_counts, seed, chosen))
-        return walk(link, recordings_folder(out), tell, travel_rad=travel, speed_rad_s=speed, seed=seed)
+
+    def job(walk: _Walk, tell: Tell) -> Analysis:
+        with tempfile.TemporaryDirectory(prefix="servod-identify-") as folder:
+            return walk.on(SteppedLink(virtual_session(joint, Path(folder), encoder_counts, seed, chosen)), tell)
+
+    return job
 
 
-def _on_daemon(
-    socket: Path, config: Path | None, out: Path, tell: Tell, travel: float | None, speed: float | None, seed: int
-) -> Analysis:
+def _on_daemon(socket: Path, config: Path | None) -> Job:
     from servod.config import load_config
     from servod.identify.daemon_link import DaemonLink
-    from servod.identify.walk import identify as walk
 
     if config is None:
         raise BadInput(
             "--config", "nothing", "the configuration that the daemon runs with, or --plant, or --recordings"
         )
-    with connect(socket) as client:
-        link = DaemonLink(client, load_config(config))
-        return walk(link, recordings_folder(out), tell, travel_rad=travel, speed_rad_s=speed, seed=seed)
+    chosen = load_config(config)
+
+    def job(walk: _Walk, tell: Tell) -> Analysis:
+        with connect(socket) as client:
+            return walk.on(DaemonLink(client, chosen), tell)
+
+    return job
 
 
 def _identified_in(before: Path | None) -> AxisModel | None:
