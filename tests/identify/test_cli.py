@@ -11,6 +11,8 @@ from servod.cli.app import run
 from servod.shipped import shipped
 from tests.identify.conftest import Identification
 
+pytestmark = pytest.mark.timeout(600)  # a whole identification is part of the first test that needs it
+
 
 def test_recordings_become_a_model_and_a_document(fine: Identification, tmp_path, capsys):
     out = tmp_path / "model.yaml"

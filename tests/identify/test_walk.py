@@ -19,6 +19,8 @@ from servod.yaml12 import parse_yaml, validate
 from tests.identify.conftest import Identification
 from tests.identify.joints import draw, steady_friction
 
+pytestmark = pytest.mark.timeout(600)  # a whole identification is part of the first test that needs it
+
 
 @pytest.fixture(params=["fine", "coarse_and_large"])
 def found(request: pytest.FixtureRequest) -> Identification:
