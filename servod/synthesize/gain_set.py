@@ -16,7 +16,14 @@ from servod import __version__
 from servod.axis_model import AxisModel
 from servod.controllers import LAWS
 from servod.gain_design import Design
-from servod.gain_parameters import LocalFriction, LocalParameters, OutputObserver, Regions, VelocitySource
+from servod.gain_parameters import (
+    LocalFriction,
+    LocalParameters,
+    OutputObserver,
+    RegionGains,
+    Regions,
+    VelocitySource,
+)
 from servod.gains import GainSet, Provenance
 from servod.synthesize.deployed import Infeasible, Wishes, explain, region_gains, regions
 from servod.synthesize.local_sets import PAPER_NODES, STIFFNESS_SHARE, compensator, local_sets, sets_at
@@ -147,3 +154,20 @@ def gain_set(design: Design, law: LocalParameters, options: Options, model_path:
         ),
         design=design,
     ).sealed()
+
+
+def with_feedback(gains: GainSet, name: str, position_nm_per_rad: float, velocity_nms_per_rad: float) -> GainSet:
+    """The same compensation with a given PD feedback in both regions: for comparisons at equal feedback.
+
+    It has no design, for nothing proves it, and so it cannot be certified.
+    """
+    law = gains.parameters
+    assert isinstance(law, LocalParameters)
+    same = RegionGains(
+        k_x_per_rad=position_nm_per_rad / law.input_scale_nm, k_v_s_per_rad=velocity_nms_per_rad / law.input_scale_nm
+    )
+    regions_with = law.regions.model_copy(update={"low": same, "high": same})
+    changed = law.model_copy(update={"regions": regions_with})
+    return gains.model_copy(
+        update={"name": name, "parameters": changed, "design": None, "certificate": None, "seal": None}
+    )
