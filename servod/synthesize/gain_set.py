@@ -156,10 +156,16 @@ def gain_set(design: Design, law: LocalParameters, options: Options, model_path:
     ).sealed()
 
 
-def with_feedback(gains: GainSet, name: str, position_nm_per_rad: float, velocity_nms_per_rad: float) -> GainSet:
+def with_feedback(
+    gains: GainSet,
+    name: str,
+    position_nm_per_rad: float,
+    velocity_nms_per_rad: float,
+    observer_rad_s: float | None = None,
+) -> GainSet:
     """The same compensation with a given PD feedback in both regions: for comparisons at equal feedback.
 
-    It has no design, for nothing proves it, and so it cannot be certified.
+    `observer_rad_s` replaces the observer's bandwidth where the set has an observer. It has no design, for nothing proves it, and so it cannot be certified.
     """
     law = gains.parameters
     assert isinstance(law, LocalParameters)
@@ -167,7 +173,10 @@ def with_feedback(gains: GainSet, name: str, position_nm_per_rad: float, velocit
         k_x_per_rad=position_nm_per_rad / law.input_scale_nm, k_v_s_per_rad=velocity_nms_per_rad / law.input_scale_nm
     )
     regions_with = law.regions.model_copy(update={"low": same, "high": same})
-    changed = law.model_copy(update={"regions": regions_with})
+    observer = law.disturbance_observer
+    if observer is not None and observer_rad_s is not None:
+        observer = observer.model_copy(update={"bandwidth_rad_s": observer_rad_s})
+    changed = law.model_copy(update={"regions": regions_with, "disturbance_observer": observer})
     return gains.model_copy(
         update={"name": name, "parameters": changed, "design": None, "certificate": None, "seal": None}
     )
