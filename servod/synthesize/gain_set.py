@@ -165,7 +165,8 @@ def with_feedback(
 ) -> GainSet:
     """The same compensation with a given PD feedback in both regions: for comparisons at equal feedback.
 
-    `observer_rad_s` replaces the observer's bandwidth where the set has an observer. It has no design, for nothing proves it, and so it cannot be certified.
+    `observer_rad_s` replaces the observer's bandwidth where the set has an observer. The result has no design, for
+    nothing proves it, and so it cannot be certified.
     """
     law = gains.parameters
     assert isinstance(law, LocalParameters)
