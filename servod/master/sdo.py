@@ -22,7 +22,7 @@ from servod.hal import SdoAbort
 from servod.master.network import BusNetwork
 
 #: Seconds to wait for the answer to one frame.
-SDO_TIMEOUT_S = 0.3
+SDO_TIMEOUT_S = 0.6
 _ABORT_REQUEST = struct.Struct("<BHBL")
 _ABORT_COMMAND = 0x80
 

@@ -192,7 +192,8 @@ def test_shipped_configurations_are_good(name: str) -> None:
     path = Path(__file__).parents[2] / "gains" / "config" / f"{name}.yaml"
     command = [sys.executable, "-m", "servod.daemon.main", "--config", str(path), "--check"]
     done = subprocess.run(command, capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (0, "")
+    assert done.returncode == 0, done.stderr
+    assert "ERROR" not in done.stderr  # a note on a group that this machine does not have is all that may come
 
 
 def test_daemon_imports_nothing_of_the_laboratory() -> None:
