@@ -8,16 +8,19 @@ from __future__ import annotations
 import datetime
 import hashlib
 import json
+import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
 from pydantic import Field, model_validator
 
+from servod.config import AxisConfig
 from servod.controllers import LAWS, Law
 from servod.errors import BadInput
 from servod.gain_design import Design
 from servod.gain_parameters import LocalSet, Parameters
+from servod.units import NS_PER_S, NS_PER_US
 from servod.yaml12 import Dumper, Strict, parse_yaml, read_text, validate
 
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -173,3 +176,20 @@ def require_certificate(gains: GainSet, accept_uncertified: bool) -> None:
             problem,
             "a valid one (`servoctl verify` issues it), or gains.accept_uncertified: true in the configuration",
         )
+
+
+def require_fit(gains: GainSet, config: AxisConfig) -> None:
+    """Refuse a set that this axis may not run: no valid certificate, or one for another cycle or velocity filter.
+
+    What was certified is the sampled loop with its delay and its filter; with others the proof says nothing.
+    Raises BadInput, unless the configuration accepts uncertified sets.
+    """
+    require_certificate(gains, config.gains.accept_uncertified)
+    if gains.design is None or config.gains.accept_uncertified:
+        return
+    design, cutoff_hz = gains.design, config.encoder.velocity_cutoff_hz
+    period_s = config.cycle.period_us * NS_PER_US / NS_PER_S
+    facts = {"velocity_cutoff_hz": (design.velocity_cutoff_hz, cutoff_hz), "period_s": (design.period_s, period_s)}
+    for key, (wanted, found) in facts.items():
+        if not math.isclose(wanted, found, rel_tol=1e-6):
+            raise BadInput(f"gain set {gains.name}: design.{key}", wanted, f"{found}, as the axis is configured")

@@ -74,7 +74,7 @@ def _check_axis(file: Path) -> str:
     from servod.axis_model import load_axis_model
     from servod.config import load_config
     from servod.drivers.quirks import load_quirks
-    from servod.gains import load_gains, require_certificate
+    from servod.gains import load_gains, require_fit
     from servod.master.planned import check_names, planned_bus_load
 
     config = load_config(file)
@@ -86,7 +86,7 @@ def _check_axis(file: Path) -> str:
     for eds in (config.amplifier.eds, config.encoder.eds):
         if eds is not None:
             _check_eds(Path(eds))
-    require_certificate(load_gains(config.gains.initial), config.gains.accept_uncertified)
+    require_fit(load_gains(config.gains.initial), config)
     if config.model is not None:
         load_axis_model(config.model)
     load = planned_bus_load(config, str(file))

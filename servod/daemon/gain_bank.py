@@ -17,7 +17,7 @@ from servod.daemon.arguments import GainsActivateArgs, GainsLoadArgs
 from servod.daemon.flows import Flow, FutureWait, Wait
 from servod.daemon.status import ControllerStatus
 from servod.gain_store import GainStore, StoredSet
-from servod.gains import require_certificate
+from servod.gains import require_fit
 
 log = logging.getLogger("servod.gains")
 
@@ -30,13 +30,13 @@ class GainBank:
 
     def __init__(self, config: AxisConfig) -> None:
         """Open the store and choose the first set: the one active last, or gains.initial. Raises BadInput."""
-        self._accept_uncertified = config.gains.accept_uncertified
+        self._config = config
         self._store = GainStore(config.gains.directory)
         initial = self._store.load_file(config.gains.initial)
         active = self._store.active()
         if active is None:
             active = self._store.activate(initial.name, initial.version)
-        require_certificate(active.gains, self._accept_uncertified)
+        require_fit(active.gains, config)
         log.info("gain set %s version %d (%s)", active.name, active.version, active.gains.law.name)
         self._sets = {0: active}
         self._last_serial = 0
@@ -83,7 +83,7 @@ class GainBank:
 
     def _deploy(self, stored: StoredSet, send: SendOrder) -> Flow:
         """Send a set to the loop and wait until its records show that it runs."""
-        require_certificate(stored.gains, self._accept_uncertified)
+        require_fit(stored.gains, self._config)
         serial, parameters = self._last_serial + 1, stored.gains.pack()
         yield send(Op.ACTIVATE, (serial, stored.gains.law.number, len(parameters), *parameters))
         self._last_serial, self._sets[serial] = serial, stored

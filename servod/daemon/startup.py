@@ -22,7 +22,7 @@ from servod.daemon.lock import InstanceLock
 from servod.daemon.nodes import Nodes
 from servod.daemon.supervisor import Supervisor
 from servod.errors import FaultCode, ServodError
-from servod.gains import load_gains, require_certificate
+from servod.gains import load_gains, require_fit
 from servod.loop.handle import LoopHandle
 from servod.loop.plan import LoopPlan
 from servod.master import Master
@@ -41,7 +41,7 @@ def check(path: Path) -> AxisConfig:
     config = load_config(path)
     for note in check_names(config, str(path)):
         log.warning("%s", note)
-    require_certificate(load_gains(config.gains.initial), config.gains.accept_uncertified)
+    require_fit(load_gains(config.gains.initial), config)
     if config.model is not None:
         load_axis_model(config.model)
     planned_bus_load(config, str(path))

@@ -7,9 +7,12 @@ from pathlib import Path
 import pytest
 import yaml
 
+from servod.config import load_config
 from servod.controllers import LAWS, local
 from servod.errors import BadInput
-from servod.gains import GainSet, load_gains, parse_gains, require_certificate
+from servod.gain_design import Design
+from servod.gains import GainSet, load_gains, parse_gains, require_certificate, require_fit
+from servod.shipped import shipped
 from tests.gains import good
 
 BAD = yaml.safe_load(Path(__file__).with_name("bad_gains.yaml").read_text(encoding="utf-8"))
@@ -115,3 +118,21 @@ def test_without_a_valid_certificate_the_set_is_refused_in_one_line(gains: GainS
         f"gain set bench_pd: certificate: found {problem}; allowed: a valid one (`servoctl verify` issues it), "
         "or gains.accept_uncertified: true in the configuration"
     )
+
+
+def test_a_set_designed_for_another_filter_or_cycle_does_not_fit_the_axis() -> None:
+    config = load_config(shipped("gains/config/virtual.yaml"))
+    strict = config.model_copy(update={"gains": config.gains.model_copy(update={"accept_uncertified": False})})
+    certified = good.certified(parse_gains(good.PD, "good.yaml"))
+
+    def designed(period_s: float, cutoff_hz: float) -> GainSet:
+        design = Design.model_construct(period_s=period_s, velocity_cutoff_hz=cutoff_hz)
+        return certified.model_copy(update={"design": design})
+
+    cutoff_hz = config.encoder.velocity_cutoff_hz
+    require_fit(designed(0.001, cutoff_hz), strict)
+    with pytest.raises(BadInput, match=r"design\.velocity_cutoff_hz: found 500\.0"):
+        require_fit(designed(0.001, 500.0), strict)
+    with pytest.raises(BadInput, match=r"design\.period_s: found 0\.002"):
+        require_fit(designed(0.002, cutoff_hz), strict)
+    require_fit(designed(0.002, 500.0), config)  # told to accept what is not certified
