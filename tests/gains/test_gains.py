@@ -127,7 +127,7 @@ def test_a_set_designed_for_another_filter_or_cycle_does_not_fit_the_axis() -> N
 
     def designed(period_s: float, cutoff_hz: float) -> GainSet:
         design = Design.model_construct(period_s=period_s, velocity_cutoff_hz=cutoff_hz)
-        return certified.model_copy(update={"design": design})
+        return certified.model_copy(update={"design": design}).sealed()
 
     cutoff_hz = config.encoder.velocity_cutoff_hz
     require_fit(designed(0.001, cutoff_hz), strict)
