@@ -25,8 +25,8 @@ class Plan:
     simulated_s: float
 
 
-THOROUGH = Plan(10.0, 3, 20_000, 60.0, 600.0, 20.0, 300.0)
-QUICK = Plan(3.0, 3, 5_000, 10.0, 20.0, 4.0, 60.0)
+THOROUGH = Plan(3.0, 10, 20_000, 60.0, 600.0, 20.0, 300.0)
+QUICK = Plan(1.5, 6, 5_000, 10.0, 20.0, 4.0, 60.0)
 
 
 def measure(plan: Plan, tell: Callable[[str], None]) -> dict[str, Any]:

@@ -55,7 +55,10 @@ class LagProbe:
 
 
 def measure(duration_s: float, rounds: int) -> dict[str, Any]:
-    """Median and p99 of both in each round, and best round against best round; None where cyclictest is missing."""
+    """Median and p99 of both in each round, and best round against best round; None where cyclictest is missing.
+
+    Rounds are short and many, in turn: a host's stalls then spoil single rounds of both, not the comparison.
+    """
     core, cycles = last_core() or 0, round(duration_s * 1e6 / INTERVAL_US) + _WARM_UP
     pairs = [(_loop(core, cycles), _cyclictest(core, cycles)) for _ in range(rounds)]
     result: dict[str, Any] = {
