@@ -25,7 +25,7 @@ from servod.recorder_mcap import McapFile, split_rows, wall_offset_ns
 T = TypeVar("T")
 
 #: A file on disk is never older than this; kill -9 loses no more.
-SYNC_PERIOD_S = 0.2
+SYNC_PERIOD_S = 0.5
 _QUEUE_BATCHES = 1024
 _KEPT_EVENTS = 256
 

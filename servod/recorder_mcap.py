@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import tempfile
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -34,25 +35,32 @@ def wall_offset_ns() -> int:
     return time.time_ns() - time.monotonic_ns()
 
 
-class _PackedIndexes(list[ChunkIndex]):
-    """The writer's list of chunk indexes, kept as bytes: as objects it would grow by megabytes an hour."""
+class _SpooledIndexes(list[ChunkIndex]):
+    """The writer's list of chunk indexes, kept in a nameless file beside the recording: in memory it would grow by
+    megabytes an hour."""
 
-    def __init__(self) -> None:
+    def __init__(self, folder: Path) -> None:
         super().__init__()
-        self._bytes = bytearray()
+        self._spool = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - open as long as the recording is
         self._builder = RecordBuilder()
 
     def append(self, index: ChunkIndex) -> None:
         index.write(self._builder)
-        self._bytes += self._builder.end()
+        self._spool.write(self._builder.end())
 
     def __iter__(self) -> Iterator[Any]:
         """One entry that writes them all; it has the one method that the MCAP writer calls."""
         yield self
 
     def write(self, builder: Any) -> None:
-        """Put the packed indexes into the summary section."""
-        builder.write(bytes(self._bytes))
+        """Put the spooled indexes into the summary section."""
+        self._spool.seek(0)
+        builder.write(self._spool.read())
+
+    def close(self) -> None:
+        """Let go of the spool; it has no name, so nothing is left."""
+        with contextlib.suppress(OSError):  # a full disk may refuse its last bytes
+            self._spool.close()
 
 
 class McapFile:
@@ -62,6 +70,7 @@ class McapFile:
         """Create `path`; `offset_ns` turns record times into the log times of the file."""
         self.path, self.records = path, 0
         self._offset_ns = offset_ns
+        self._indexes = _SpooledIndexes(path.parent)
         self._stream = path.open("xb")
         try:
             self._begin(attachments)
@@ -71,7 +80,7 @@ class McapFile:
 
     def _begin(self, attachments: Mapping[str, bytes]) -> None:
         self._writer = Writer(self._stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
-        self._writer._Writer__chunk_indices = _PackedIndexes()
+        self._writer._Writer__chunk_indices = self._indexes
         self._writer.start(profile="ros2", library="servod")
         cycle_schema = self._writer.register_schema(CYCLE_SCHEMA, "ros2msg", ros2msg().encode())
         event_schema = self._writer.register_schema("servod.Event", "jsonschema", json.dumps(_EVENT_SCHEMA).encode())
@@ -112,6 +121,7 @@ class McapFile:
         """Write index and footer, and close."""
         self._writer.finish()
         self._stream.close()
+        self._indexes.close()
 
     def abandon(self) -> None:
         """Let go of a file that cannot be written any more; what is in it stays readable."""
@@ -119,6 +129,7 @@ class McapFile:
             self._stream.raw.close()
         with contextlib.suppress(OSError, ValueError):
             self._stream.close()
+        self._indexes.close()
 
 
 def split_rows(data: bytes | bytearray | memoryview) -> Iterator[bytes]:
