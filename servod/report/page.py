@@ -6,7 +6,6 @@ Behind everything; called by verbs that report. Needs plotly (the lab part).
 from __future__ import annotations
 
 import html
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,7 +14,9 @@ import plotly.io
 from plotly.offline import get_plotlyjs
 
 from servod import __version__
-from servod.errors import BadInput
+from servod.report.figure import Figure
+from servod.report.files import write_bytes
+from servod.report.page_figure import HEAD_PX, plotly_figure
 
 _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 70rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
@@ -47,13 +48,17 @@ class Page:
         body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
         self._parts.append(f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>")
 
-    def figure(self, figure: go.Figure) -> None:
-        """Add a plotly figure."""
+    def figure(self, figure: Figure | go.Figure) -> None:
+        """Add a figure, of this project or of plotly; the caption of the former stands below it."""
         self._has_figure = True
-        figure.update_layout(template="plotly_white", margin={"l": 70, "r": 20, "t": 75, "b": 50})
+        drawn = plotly_figure(figure) if isinstance(figure, Figure) else figure
+        top = HEAD_PX if isinstance(figure, Figure) else 75
+        drawn.update_layout(template="plotly_white", margin={"l": 70, "r": 20, "t": top, "b": 50})
         self._parts.append(
-            plotly.io.to_html(figure, full_html=False, include_plotlyjs=False, config={"displaylogo": False})
+            plotly.io.to_html(drawn, full_html=False, include_plotlyjs=False, config={"displaylogo": False})
         )
+        if isinstance(figure, Figure) and figure.caption:
+            self.sentence(figure.caption)
 
     def html(self) -> str:
         """The whole page; plotly's own code stands in it once, so that it opens without a network."""
@@ -66,13 +71,4 @@ class Page:
 
     def write(self, path: Path) -> None:
         """Write the page aside and rename it to `path`. Raises BadInput when that is not possible."""
-        aside = path.with_name(path.name + ".part")
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with aside.open("w", encoding="utf-8") as stream:
-                stream.write(self.html())
-                stream.flush()
-                os.fsync(stream.fileno())
-            aside.replace(path)
-        except OSError as error:
-            raise BadInput(str(path), error.strerror or str(error), "a path that can be written") from None
+        write_bytes(path, self.html().encode())

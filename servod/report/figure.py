@@ -1,0 +1,135 @@
+"""What a figure shows, apart from how it is drawn: curves in panels, with units on every axis.
+
+Behind everything. Functions of `figures` make a `Figure` from results; `page_figure` draws it with plotly and
+`pictures` with matplotlib, so that both show the same. Colours are Okabe's and Ito's, which colour-blind readers tell
+apart, and line styles differ as well, so that a figure survives black and white.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+class Colour(Enum):
+    """Colours that differ for every kind of colour vision and in print (Okabe and Ito, 2008), and two greys."""
+
+    BLUE = "#0072b2"
+    ORANGE = "#d55e00"
+    GREEN = "#009e73"
+    PURPLE = "#aa4499"
+    YELLOW = "#e69f00"
+    SKY = "#56b4e9"
+    BLACK = "#222222"
+    GREY = "#9a9a9a"
+
+
+#: Colours in the order in which curves of one figure take them.
+COLOURS = (Colour.BLUE, Colour.ORANGE, Colour.GREEN, Colour.PURPLE, Colour.YELLOW, Colour.SKY, Colour.BLACK)
+
+
+class Style(Enum):
+    """How a curve is drawn."""
+
+    LINE = "line"
+    DASHED = "dashed"
+    DOTTED = "dotted"
+    POINTS = "points"
+
+
+class Scale(Enum):
+    """Scale of an axis; the values are what both plotting libraries call it."""
+
+    LINEAR = "linear"
+    LOG = "log"
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One curve. Curves with the same `label` share one entry of the legend; `detail` tells them apart under the mouse.
+
+    `bounds` are lower and upper bounds of y, drawn as a band (as bars for points).
+    """
+
+    label: str
+    x: Array
+    y: Array
+    colour: Colour = Colour.BLUE
+    style: Style = Style.LINE
+    width: float = 1.4
+    detail: str = ""
+    bounds: tuple[Array, Array] | None = None
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One axis: its label with the unit, its scale, and its range where the data should not choose it."""
+
+    label: str
+    scale: Scale = Scale.LINEAR
+    span: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One pair of axes with its curves."""
+
+    x: Axis
+    y: Axis
+    curves: tuple[Curve, ...]
+    title: str = ""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """Panels, row by row in `columns` columns. `name` is the stem of its picture files; `caption` says what is seen."""
+
+    name: str
+    title: str
+    panels: tuple[Panel, ...]
+    columns: int = 1
+    caption: str = ""
+    row_height: float = 1.0
+
+    @property
+    def rows(self) -> int:
+        """Rows of panels."""
+        return -(-len(self.panels) // self.columns)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of plain cells; the first column is text, the others are aligned as numbers."""
+
+    title: str
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+    def markdown(self) -> str:
+        """The table in Markdown, without its title."""
+        lines = [self.header, ("---",) * len(self.header), *self.rows]
+        return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+
+
+def curve(
+    label: str,
+    x: ArrayLike,
+    y: ArrayLike,
+    colour: Colour = Colour.BLUE,
+    style: Style = Style.LINE,
+    width: float = 1.4,
+    detail: str = "",
+    bounds: tuple[Array, Array] | None = None,
+) -> Curve:
+    """A curve of anything that numpy takes for numbers."""
+    return Curve(label, array(x), array(y), colour, style, width, detail, bounds)
+
+
+def array(values: ArrayLike) -> Array:
+    """`values` as numbers."""
+    return np.asarray(values, dtype=np.float64)
