@@ -49,6 +49,7 @@ def run(
     law_state: Any,
     reference: Any,
     external: Any,
+    reading: Any,
     out: Any,
     dt: float,
     steps: int,
@@ -60,13 +61,14 @@ def run(
     """Run the loop over the rows of `reference` (position, velocity, acceleration); fills the rows of `out`.
 
     The command of sample k acts from t_k + delay_s. `resolution_rad` 0 means an encoder without steps; `external` is
-    a torque for each sample beside the command. The law sees the torque that was applied after `limit_nm`.
+    a torque for each sample beside the command, `reading` an error of each encoder reading in rad. The law sees the
+    torque that was applied after `limit_nm`.
     """
     kept = math.exp(-2.0 * math.pi * cutoff_hz * dt)
     applied, filtered = 0.0, s[S_VELOCITY]
-    seen = quantised(encoder_position(p, s[S_POSITION]), resolution_rad)
+    seen = quantised(encoder_position(p, s[S_POSITION]) + reading[0], resolution_rad)
     for k in range(len(reference)):
-        last, seen = seen, quantised(encoder_position(p, s[S_POSITION]), resolution_rad)
+        last, seen = seen, quantised(encoder_position(p, s[S_POSITION]) + reading[k], resolution_rad)
         if k > 0:
             filtered = kept * filtered + (1.0 - kept) * (seen - last) / dt
         x_ref, v_ref, a_ref = reference[k][0], reference[k][1], reference[k][2]

@@ -75,16 +75,18 @@ def simulate_closed_loop(
     settings: LoopSettings | None = None,
     *,
     external_nm: Array | None = None,
+    reading_rad: Array | None = None,
     start: tuple[float, float, float] | None = None,
 ) -> ClosedLoopRun:
     """Run `model` under `law` along `reference` (rows of position, velocity, acceleration, one for each sample).
 
     `law` is a step function of `servod.controllers`; `gains` its flat parameters. `external_nm` acts beside the
-    command; `start` is (position, velocity, bristle deflection), by default at rest on the reference's first position.
+    command, `reading_rad` is the error of each encoder reading; `start` is (position, velocity, bristle deflection), by
+    default at rest on the reference's first position.
     """
     settings = settings or LoopSettings()
     reference = np.ascontiguousarray(reference, dtype=np.float64)
-    external = np.zeros(len(reference)) if external_nm is None else np.asarray(external_nm, dtype=np.float64)
+    disturbed = _samples(external_nm, len(reference)), _samples(reading_rad, len(reference))
     delay_s = model.total_delay_s if settings.delay_s is None else settings.delay_s
     steps = max(1, math.ceil(settings.period_s / settings.inner_step_s - 1e-9))
     state = _start_state(model, start or (float(reference[0, 0]), 0.0, 0.0), delay_s, settings.period_s / steps)
@@ -92,10 +94,15 @@ def simulate_closed_loop(
     kernel = compiled(closed_loop.run, control_law=law) if available() else bound(closed_loop.run, control_law=law)
     loop = np.array(gains, dtype=np.float64), np.zeros(LAW_STATES)
     around = settings.resolution_rad, settings.velocity_cutoff_hz, settings.torque_limit_nm
-    kernel(np.array(model.pack()), state, *loop, reference, external, out, settings.period_s, steps, delay_s, *around)
+    kernel(np.array(model.pack()), state, *loop, reference, *disturbed, out, settings.period_s, steps, delay_s, *around)
     columns = {name: out[:, i] for i, name in enumerate(closed_loop.OUTPUTS)}
     t_s: Array = np.arange(len(reference), dtype=np.float64) * settings.period_s
     return ClosedLoopRun(t_s=t_s, reference_rad=reference[:, 0], state=state, **columns)
+
+
+def _samples(values: Array | None, count: int) -> Array:
+    """`values` for the kernel; zeros where there are none."""
+    return np.zeros(count) if values is None else np.asarray(values, dtype=np.float64)
 
 
 def _start_state(model: AxisModel, start: tuple[float, float, float], delay_s: float, step_s: float) -> Array:

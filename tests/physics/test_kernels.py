@@ -197,6 +197,7 @@ def test_closed_loop_is_the_same_loop_in_pure_python() -> None:
         [0.0] * 16,
         rows,
         np.zeros(len(rows)),
+        np.zeros(len(rows)),
         out,
         1e-3,
         20,
