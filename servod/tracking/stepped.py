@@ -1,0 +1,101 @@
+"""Tracking over the whole CAN loop in virtual time: the same cycle, master and nodes as on a real bus.
+
+Stands on the stepped session, which the caller makes, so that every gain set meets the same axis with the same seeds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from servod.axis import AxisState
+from servod.commands import REFUSAL_TEXT, Op, ReferenceKind, Refusal
+from servod.errors import AnswerIsNo
+from servod.gains import GainSet
+from servod.recordings.rows import ROW
+from servod.session import SteppedSession
+from servod.tracking.metrics import Curves, Tracking, tracking
+from servod.tracking.motions import HOLD_S, PAPER_S, REST_S, STEPS_MRAD
+
+#: Told how much of a measurement is done, from 0 to 1.
+Tell = Callable[[float], None]
+
+_SLICE_S = 0.5
+
+
+def measure(open_session: Callable[[], SteppedSession], gains: GainSet, tell: Tell | None = None) -> Tracking:
+    """Activate `gains` on a new session, track (19) for 30 s, then steps of 100 and 10 mrad, each held for 20 s.
+
+    The session may be enabled or not, its controller is replaced. Raises AnswerIsNo when the axis refuses or drops out.
+    """
+    session = open_session()
+    activate(session, gains)
+    whole_s = PAPER_S + HOLD_S * len(STEPS_MRAD)
+    done_s = 0.0
+
+    def move(kind: ReferenceKind, arguments: Sequence[float], duration_s: float) -> Curves:
+        nonlocal done_s
+        before_s, done_s = done_s, done_s + duration_s
+        curves = run_motion(session, kind, arguments, lambda t: tell and tell((before_s + t) / whole_s))
+        return curves
+
+    followed = move(ReferenceKind.PAPER, [PAPER_S], PAPER_S)
+    steps = {size: move(ReferenceKind.STEP, [size * 1e-3, HOLD_S], HOLD_S) for size in STEPS_MRAD}
+    return tracking(followed, steps, 2.0 * math.pi / session.config.encoder.counts_per_turn)
+
+
+def activate(session: SteppedSession, gains: GainSet) -> None:
+    """Change to `gains`, enable if need be, and rest until the change has faded out. Raises AnswerIsNo."""
+    parameters = gains.pack()
+    _must(session.send(Op.ACTIVATE, [0, gains.law.number, len(parameters), *parameters]))
+    if session.cycle.axis.state != AxisState.ENABLED:
+        session.enable()
+    session.run(REST_S)
+
+
+def run_motion(
+    session: SteppedSession, kind: ReferenceKind, arguments: Sequence[float], tell: Tell | None = None
+) -> Curves:
+    """One motion from its first cycle to its last; `tell` gets the seconds that have passed.
+
+    Raises AnswerIsNo when it is refused or the axis drops out.
+    """
+    start_rad = session.cycle.reference.position_rad
+    session.clear()
+    _must(session.send(Op.REFERENCE, [kind, *arguments]))
+    follow(session, tell)
+    return curves_of(session.raw, start_rad)
+
+
+def follow(session: SteppedSession, tell: Tell | None = None) -> None:
+    """Run until the motion is over; `tell` gets the seconds that have passed. Raises AnswerIsNo on a fault."""
+    passed_s = 0.0
+    while session.cycle.reference.active:
+        session.run(_SLICE_S)
+        passed_s += _SLICE_S
+        if tell:
+            tell(passed_s)
+    if session.cycle.axis.state != AxisState.ENABLED:
+        raise AnswerIsNo(f"the axis went to {session.cycle.axis.state.name}. {session.why}")
+
+
+def curves_of(raw: bytes, start_rad: float) -> Curves:
+    """The cycles of `raw` (packed records) in which a reference motion ran, positions relative to `start_rad`."""
+    rows = np.frombuffer(raw, dtype=ROW)
+    rows = rows[rows["reference_active"] == 1]
+    return Curves(
+        time_s=(rows["time_ns"] - rows["time_ns"][0]) * 1e-9,
+        reference_rad=rows["reference_rad"] - start_rad,
+        position_rad=rows["position_rad"] - start_rad,
+        torque_nm=rows["torque_nm"].copy(),
+        feedback_nm=rows["torque_feedback_nm"].copy(),
+        friction_nm=rows["torque_friction_nm"].copy(),
+        other_nm=rows["torque_other_nm"].copy(),
+    )
+
+
+def _must(refusal: Refusal) -> None:
+    if refusal != Refusal.DONE:
+        raise AnswerIsNo(REFUSAL_TEXT[refusal])
