@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from servod.controllers import MAX_SETS, local
+from servod.controllers.position import MAX_WAVES
 from servod.controllers.weights import Shape
 from servod.yaml12 import Strict
 
@@ -193,6 +194,33 @@ class LocalFriction(Strict):
         return self
 
 
+class PositionWave(Strict):
+    """One wave of torque over position: amplitude*sin(n*x + phase)."""
+
+    amplitude_nm: float = Field(ge=-1e5, le=1e5)
+    waves_per_turn: float = Field(gt=0.0, le=1e8, description="n, waves in 2*pi rad")
+    phase_rad: float = Field(0.0, ge=-100.0, le=100.0)
+
+
+class PositionFeedforward(Strict):
+    """Known torques over position that the joint resists with; see servod.controllers.position."""
+
+    lead_s: float = Field(0.0, ge=0.0, le=2.0, description="lead of the reference position")
+    offset_nm: float = Field(0.0, ge=-1e5, le=1e5)
+    spring_nm_per_rad: float = Field(0.0, ge=0.0, le=1e7)
+    spring_rest_rad: float = Field(0.0, ge=-1e5, le=1e5)
+    spring_cubic_nm_per_rad3: float = Field(0.0, ge=0.0, le=1e7)
+    waves: list[PositionWave] = Field(
+        default_factory=list, max_length=MAX_WAVES, description="cogging by its harmonics; gravity is one wave a turn"
+    )
+
+    def pack(self) -> tuple[float, ...]:
+        """Numbers in the order that the kernel reads."""
+        spring = (self.spring_nm_per_rad, self.spring_rest_rad, self.spring_cubic_nm_per_rad3)
+        waves = (value for w in self.waves for value in (w.amplitude_nm, w.waves_per_turn, w.phase_rad))
+        return (self.lead_s, self.offset_nm, *spring, *waves)
+
+
 class LocalParameters(Strict):
     """The local-model gain-scheduled law (9), (16)."""
 
@@ -203,9 +231,10 @@ class LocalParameters(Strict):
     disturbance_observer: OutputObserver | None = None
     feedforward_inertia_kg_m2: float = Field(0.0, ge=0.0, le=1e4)
     hold_within_rad: Width = 0.0
+    position_feedforward: PositionFeedforward | None = None
 
     def pack(self) -> tuple[float, ...]:
-        """Parameters in the order that the kernel reads: head, then all v_i, all a_i, all l_i."""
+        """Parameters in the order that the kernel reads: head, then all v_i, all a_i, all l_i, then position."""
         f, observer = self.friction, self.disturbance_observer
         return (
             self.input_scale_nm,
@@ -226,6 +255,7 @@ class LocalParameters(Strict):
             *(s.velocity_rad_s for s in f.sets),
             *(s.decay_per_s for s in f.sets),
             *(s.gain for s in f.sets),
+            *(self.position_feedforward.pack() if self.position_feedforward else ()),
         )
 
 

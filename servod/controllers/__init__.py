@@ -10,7 +10,7 @@ from collections.abc import Callable, MutableSequence, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
-from servod.controllers import local, pd, pd_dob, pd_lugre
+from servod.controllers import local, pd, pd_dob, pd_lugre, position
 from servod.controllers.state import N_STATES
 
 #: step(p, s, x_ref, v_ref, a_ref, x, v, u_applied, dt) -> (torque, feedback, friction, other), SI units.
@@ -22,7 +22,7 @@ Step = Callable[
 #: Most local sets of one gain set; keeps the ACTIVATE command bounded.
 MAX_SETS = 64
 #: Most parameters that any law has, for the size of the command slot between supervisor and loop.
-MAX_PARAMETERS = local.FIRST_NODE + 3 * MAX_SETS
+MAX_PARAMETERS = local.FIRST_NODE + 3 * MAX_SETS + position.MAX_SIZE
 
 
 class LawNumber(IntEnum):
@@ -38,7 +38,7 @@ class LawNumber(IntEnum):
 class Law:
     """One row of the table of laws.
 
-    `n_parameters` is the length of `p`, or its length without the local sets (three floats each) for `local`.
+    `n_parameters` is the length of `p`; for `local` without its sets (three floats each) and what is known of position.
     `stiffness_index` is where c0 [N*m/rad] stands in `p`, None for a law without friction state; the engine uses it
     to carry the friction *torque* over when two laws scale their state differently.
     """
@@ -57,7 +57,7 @@ class Law:
         if len(parameters) <= local.N_SETS:
             return False
         n = parameters[local.N_SETS]
-        return 2 <= n <= MAX_SETS and len(parameters) == self.n_parameters + 3 * int(n)
+        return 2 <= n <= MAX_SETS and position.fits(len(parameters) - self.n_parameters - 3 * int(n))
 
 
 LAWS: dict[str, Law] = {

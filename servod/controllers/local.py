@@ -2,10 +2,11 @@
 
     z_hat' = -a(v)*z_hat + v + l(v)*u*,   a = sum mu_i*a_i,  l = sum mu_i*l_i                               (9)
     u*     = mu_L*(k_x e + k_v e' - k_z z_hat)|L + mu_H*(k_x e + k_v e' - k_z z_hat)|H,   e = x_ref - x     (13), (16)
-    u      = K*u* + c0*z_hat + d0*v + m_ff*a_ref + d_hat                                                    (16)
+    u      = K*u* + c0*z_hat + d0*v + m_ff*a_ref + T(x_ref) + d_hat                                         (16)
 
-All three gains are negative feedback. l > 0 makes z_hat push the way the feedback pushes (integral action through the
-friction state); the other sign is harmful. Every direction has its own nodes, so asymmetry needs nothing special.
+T is what is known over position (servod.controllers.position). All three gains are negative feedback. l > 0 makes
+z_hat push the way the feedback pushes (integral action through the friction state); the other sign is harmful. Every
+direction has its own nodes, so asymmetry needs nothing special.
 Options: the velocity of z_hat, of d0 and of the sets is the measured one or the reference's, led by a stated time;
 an output disturbance observer around the whole (bandwidth 0: none). The regions go by the faster of both velocities:
 a step has no reference velocity, yet the gains of Omega_L on a joint that turns fast make a limit cycle.
@@ -19,6 +20,7 @@ from collections.abc import MutableSequence, Sequence
 
 from servod.controllers.exact import decayed, limited
 from servod.controllers.observer import observe, remember
+from servod.controllers.position import position_torque
 from servod.controllers.state import ASKED, DISTURBANCE, FRICTION_STATE
 from servod.controllers.weights import blended
 from servod.controllers.windup import winds_up
@@ -41,7 +43,7 @@ OBSERVER_BANDWIDTH = 18  # g of the output disturbance observer [rad/s], 0: none
 OBSERVER_INERTIA = 19  # nominal m of the observer [kg*m^2]
 OBSERVER_LIMIT = 20  # bound of |d_hat| [N*m]
 N_SETS = 21  # number n of local sets
-FIRST_NODE = 22  # then n nodes v_i [rad/s], n decays a_i [1/s], n gains l_i
+FIRST_NODE = 22  # then n nodes v_i [rad/s], n decays a_i [1/s], n gains l_i; then `position`, or nothing
 
 MEASURED = 0.0
 REFERENCE = 1.0
@@ -74,18 +76,21 @@ def step(
     error = x_ref - x
     u_star = scheduled(p, max(abs(w), abs(v)), error, v_ref - v, s[FRICTION_STATE])
     moves = not (v_ref == 0.0 and a_ref == 0.0 and abs(error) <= p[HOLD_WITHIN])
-    decay, gain = blended(p, FIRST_NODE, int(p[N_SETS]), p[SHAPE], w)
+    n = int(p[N_SETS])
+    decay, gain = blended(p, FIRST_NODE, n, p[SHAPE], w)
     drive = w
     if moves and gain != 0.0 and not winds_up(s, u_star, u_applied):
         drive += gain * u_star
     z = limited(decayed(s[FRICTION_STATE], max(decay, p[LEAK]), drive, dt), p[STATE_LIMIT])
     s[FRICTION_STATE] = z
     friction = p[STIFFNESS] * z + p[VISCOUS] * w
-    other = p[FEEDFORWARD_INERTIA] * a_ref
+    beyond = FIRST_NODE + 3 * n
+    known = position_torque(p, beyond, x_ref, v_ref) if len(p) > beyond else 0.0
+    other = p[FEEDFORWARD_INERTIA] * a_ref + known
     if p[OBSERVER_BANDWIDTH] > 0.0:
         if moves:
             observe(s, p[OBSERVER_BANDWIDTH], p[OBSERVER_INERTIA], p[OBSERVER_LIMIT], v, u_applied, dt)
-        remember(s, v, friction, u_applied)
+        remember(s, v, friction + known, u_applied)
         other += s[DISTURBANCE]
     feedback = p[INPUT_SCALE] * u_star
     torque = feedback + friction + other

@@ -26,6 +26,7 @@ from servod.gain_parameters import (
 )
 from servod.gains import GainSet, Provenance
 from servod.synthesize.deployed import Infeasible, Wishes, explain, region_gains, regions
+from servod.synthesize.feedforward import position_feedforward
 from servod.synthesize.local_sets import PAPER_NODES, STIFFNESS_SHARE, compensator, local_sets, sets_at
 from servod.verify.checks import CORNER_SPEEDS, DISK_LIMIT, speeds_of
 from servod.verify.closed_loop import corners
@@ -51,6 +52,7 @@ class Options:
     velocity: VelocitySource = VelocitySource.REFERENCE
     observer: bool = True
     gain: float = 0.0  # l_i: 0 where the observer is the integral action
+    position_feedforward: bool = True
 
 
 def input_scale(friction: SteadyFriction, speed: float) -> float:
@@ -92,6 +94,9 @@ def parameters(design: Design, friction: SteadyFriction, options: Options, bandw
         else None,
         feedforward_inertia_kg_m2=friction.inertia,
         hold_within_rad=HOLD_COUNTS * 2.0 * math.pi / design.counts_per_turn if design.counts_per_turn else 0.0,
+        position_feedforward=position_feedforward(design.model, friction.gain, design.period_s)
+        if options.position_feedforward
+        else None,
     )
 
 

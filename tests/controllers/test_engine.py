@@ -123,5 +123,5 @@ def test_wrong_law_or_length_is_refused_and_changes_nothing(number: int, paramet
 def test_registry_numbers_are_stable_and_sizes_bounded() -> None:
     assert {name: int(law.number) for name, law in LAWS.items()} == {"pd": 1, "pd_dob": 2, "pd_lugre": 3, "local": 4}
     nodes = tuple(-1.0 + k / 32 for k in range(MAX_SETS))
-    assert len(local_parameters(nodes)) == MAX_PARAMETERS
+    assert len(local_parameters(nodes)) <= MAX_PARAMETERS
     assert LAWS["local"].accepts(local_parameters(nodes))
