@@ -17,6 +17,7 @@ from servod.gains import CertificateCheck, GainSet
 from servod.verify.closed_loop import Deviation, corners, inner_points
 from servod.verify.margins import NOMINAL, Sweep, largest_tolerated
 from servod.verify.plants import drawn
+from servod.verify.position_slope import position_slopes
 from servod.verify.proof import region_margin, stored_deviation
 from servod.verify.sampled import Timing
 from servod.verify.steady_friction import steady_friction
@@ -120,6 +121,10 @@ def check_loop(s: Subject) -> Iterator[CertificateCheck]:
     yield at_most("largest pole, inner points, dense speeds", s.dense.worst(inner).radius, 1.0)
     one = Timing(s.design.period_s, s.design.period_s, s.design.velocity_cutoff_hz)
     yield at_most("largest pole, one cycle of delay", s.dense.worst(NOMINAL, one).radius, 1.0)
+    slopes = position_slopes(s.design.model, s.coarse.friction.gain)
+    if any(slopes):
+        steepest = [Deviation(position_slope=slope) for slope in slopes]
+        yield at_most("largest pole, steepest torque over position", s.coarse.worst(steepest).radius, 1.0)
     yield at_least("symmetric disk margin", s.coarse.disk_margin()[0], DISK_LIMIT)
 
 

@@ -37,7 +37,7 @@ class Bristle(Enum):
 
 @dataclass(frozen=True, slots=True)
 class JointPoint:
-    """The joint linearised at one velocity: z' = -a z + b v, m v' = gain*u - sigma0 z - sigma1 z' - viscous v + w."""
+    """The joint linearised: z' = -a z + b v, m v' = gain*u - sigma0 z - sigma1 z' - viscous v - slope x + w."""
 
     velocity: float
     bristle: Bristle
@@ -48,6 +48,7 @@ class JointPoint:
     stiffness: float
     damping: float
     viscous: float
+    position_slope: float = 0.0
 
     def matrices(self) -> tuple[Array, Array, Array]:
         """(A, B, E) in states x, v, z.
@@ -57,9 +58,13 @@ class JointPoint:
         m, s1 = self.inertia, self.damping
         b, e = np.array([0.0, self.gain / m, 0.0]), np.array([0.0, 1.0 / m, 0.0])
         if self.decay == 0.0:
-            stuck = [-self.stiffness / m, -(self.viscous + s1) / m, 0.0]
+            stuck = [-(self.stiffness + self.position_slope) / m, -(self.viscous + s1) / m, 0.0]
             return np.array([[0.0, 1.0, 0.0], stuck, [0.0, 0.0, -STUCK_DECAY_PER_S]]), b, e
-        row = [0.0, -(self.viscous + s1 * self.build_up) / m, -(self.stiffness - s1 * self.decay) / m]
+        row = [
+            -self.position_slope / m,
+            -(self.viscous + s1 * self.build_up) / m,
+            -(self.stiffness - s1 * self.decay) / m,
+        ]
         a = np.array([[0.0, 1.0, 0.0], row, [0.0, self.build_up, -self.decay]])
         return a, b, e
 
@@ -68,7 +73,8 @@ class JointPoint:
 class Deviation:
     """Factors on the model's values: one corner, or an inner point, of the intervals.
 
-    `dry` scales g(v) with its slope; `slope` makes the slope steeper than that.
+    `dry` scales g(v) with its slope; `slope` makes the slope steeper than that. `position_slope` is no factor: what
+    cogging, gravity and springs add as stiffness [N*m/rad].
     """
 
     inertia: float = 1.0
@@ -78,6 +84,7 @@ class Deviation:
     dry: float = 1.0
     slope: float = 1.0
     viscous: float = 1.0
+    position_slope: float = 0.0
 
 
 def corners(u: Uncertainty) -> list[Deviation]:
@@ -113,6 +120,7 @@ def joint_point(friction: SteadyFriction, velocity: float, bristle: Bristle, d: 
         stiffness,
         min(friction.damping(velocity) * d.damping, 4.0 * dry / speed) if speed else friction.damping(0.0) * d.damping,
         friction.viscous(velocity) * d.viscous,
+        d.position_slope,
     )
 
 
