@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from servod.axis_model import AxisModel
 from servod.gains import GainSet
+from servod.models.noise import noise_series
 from servod.models.simulate import ClosedLoopRun, LoopSettings, simulate_closed_loop
 from servod.tracking.metrics import Array, Curves, Tracking, tracking
 from servod.tracking.motions import HOLD_S, PAPER_S, STEPS_MRAD, paper_rows, step_rows
@@ -41,7 +40,7 @@ def measure(
 
 def run(model: AxisModel, gains: GainSet, rows: Array, settings: LoopSettings, seed: int) -> ClosedLoopRun:
     """One motion from rest at 0, with the model's own noise."""
-    torque, reading = noise_of(model, len(rows), settings.period_s, seed)
+    torque, reading = noise_series(model.noise, len(rows), settings.period_s, seed)
     return simulate_closed_loop(
         model,
         gains.law.step,
@@ -52,21 +51,6 @@ def run(model: AxisModel, gains: GainSet, rows: Array, settings: LoopSettings, s
         reading_rad=reading,
         start=(0.0, 0.0, 0.0),
     )
-
-
-def noise_of(model: AxisModel, samples: int, period_s: float, seed: int) -> tuple[Array, Array]:
-    """(torque noise in N*m, encoder reading noise in rad) as the virtual plant makes them: low-passed, and white."""
-    noise = model.noise
-    if noise is None:
-        return np.zeros(samples), np.zeros(samples)
-    random = np.random.default_rng(seed)
-    kept = math.exp(-2.0 * math.pi * noise.torque_bandwidth_hz * period_s)
-    fresh = random.normal(0.0, noise.torque_rms * math.sqrt(1.0 - kept * kept), samples).tolist()
-    value, torque = 0.0, []
-    for push in fresh:
-        value = kept * value + push
-        torque.append(value)
-    return np.array(torque), random.normal(0.0, noise.encoder_rms, samples)
 
 
 def curves_of(motion: ClosedLoopRun) -> Curves:
