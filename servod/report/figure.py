@@ -51,7 +51,8 @@ class Scale(Enum):
 
 @dataclass(frozen=True)
 class Curve:
-    """One curve. Curves with the same `label` share one entry of the legend; `detail` tells them apart under the mouse.
+    """One curve. Curves with the same `label` share one entry of the legend, without a label they have none; `detail`
+    tells curves apart under the mouse.
 
     `bounds` are lower and upper bounds of y, drawn as a band (as bars for points).
     """

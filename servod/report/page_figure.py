@@ -45,7 +45,7 @@ def _draw(drawn: go.Figure, panel: Panel, row: int, column: int, named: set[str]
     for curve in panel.curves:
         if curve.bounds is not None and curve.style is not Style.POINTS:
             drawn.add_trace(_band(curve, *curve.bounds), row=row, col=column)
-        drawn.add_trace(_trace(curve, curve.label not in named), row=row, col=column)
+        drawn.add_trace(_trace(curve, bool(curve.label) and curve.label not in named), row=row, col=column)
         named.add(curve.label)
     drawn.update_xaxes(**_axis(panel.x), row=row, col=column)
     drawn.update_yaxes(**_axis(panel.y), row=row, col=column)
@@ -71,7 +71,7 @@ def _trace(curve: Curve, first: bool) -> go.Scatter:
     return go.Scatter(
         x=x.astype(np.float32),
         y=y.astype(np.float32),
-        name=curve.label,
+        name=curve.label or curve.detail,
         legendgroup=curve.label,
         showlegend=first,
         mode="markers" if points else "lines",

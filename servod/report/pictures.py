@@ -98,7 +98,7 @@ def _axis(drawn: Any, axis: Axis, name: str) -> None:
 def _curve(drawn: Any, curve: Curve) -> None:
     colour = curve.colour.value
     if curve.style is Style.POINTS:
-        drawn.plot(curve.x, curve.y, "o", color=colour, markersize=3.5, label=curve.label)
+        drawn.plot(curve.x, curve.y, "o", color=colour, markersize=3.5, label=curve.label or None)
         if curve.bounds is not None:
             bars = np.array([curve.y - curve.bounds[0], curve.bounds[1] - curve.y])
             drawn.errorbar(curve.x, curve.y, yerr=bars, fmt="none", ecolor=colour, elinewidth=1.0)
@@ -106,4 +106,6 @@ def _curve(drawn: Any, curve: Curve) -> None:
     if curve.bounds is not None:
         drawn.fill_between(curve.x, *curve.bounds, color=colour, alpha=0.18, linewidth=0)
     x, y = thin(curve.x, curve.y)
-    drawn.plot(x, y, color=colour, linewidth=0.85 * curve.width, linestyle=_DASHES[curve.style], label=curve.label)
+    drawn.plot(
+        x, y, color=colour, linewidth=0.85 * curve.width, linestyle=_DASHES[curve.style], label=curve.label or None
+    )

@@ -17,6 +17,7 @@ from servod.report.responses import Complex, Loop, after, before, frequency_resp
 #: Velocities of both halves of Fig. 4 [rad/s]: creeping (and at rest), and where trajectory (19) is fast.
 LOW_VELOCITIES, HIGH_VELOCITIES = (0.0, 0.001), (0.05, 0.2)
 _POINTS = 400
+_ANCHOR_HZ, _ANCHOR_DEGREES = 100.0, -220.0
 #: Impulse responses are drawn until the slowest has come down to this share of its peak, at most this long.
 _FADED, _LONGEST_S = 0.02, 1.0
 
@@ -83,9 +84,10 @@ def _bode_figure(
 def curve_pair(
     label: str, response: Complex, frequencies: np.ndarray, colour: Colour, style: Style
 ) -> tuple[Curve, Curve]:
-    """Magnitude and phase in degrees, unwrapped from the lowest frequency on."""
+    """Magnitude and phase in degrees, unwrapped, so that all are near each other where only the inertia counts."""
     phase = np.degrees(np.unwrap(np.angle(response)))
-    phase -= 360.0 * np.ceil((phase[0] - 1.0) / 360.0)
+    middle = int(np.searchsorted(frequencies, _ANCHOR_HZ))
+    phase -= 360.0 * np.round((phase[middle] - _ANCHOR_DEGREES) / 360.0)
     return (
         curve(label, frequencies, np.abs(response), colour, style),
         curve(label, frequencies, phase, colour, style),

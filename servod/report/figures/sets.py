@@ -17,6 +17,7 @@ from servod.report.figure import COLOURS, Array, Axis, Colour, Curve, Figure, Pa
 from servod.verify.steady_friction import SteadyFriction, steady_friction
 
 _POINTS = 1200
+_LEGEND = 10  # so many sets have room in a legend
 MILLI = 1e3
 
 
@@ -32,26 +33,30 @@ def weighting_functions(gains: GainSet, name: str = "weighting_functions") -> Fi
     law = local_law(gains)
     nodes = [s.velocity_rad_s for s in law.friction.sets]
     near = sorted(abs(v) for v in nodes)[min(4, len(nodes) - 1)]
-    panels = []
-    for title, reach in (("whole range", 1.05 * max(map(abs, nodes))), ("around zero", 1.3 * near)):
-        velocity = np.unique(
-            np.concatenate([np.linspace(-reach, reach, _POINTS), [v for v in nodes if abs(v) < reach]])
-        )
-        share = weight_table(law, velocity)
-        curves = [
-            curve(
-                f"every {len(COLOURS)}th set from {k + 1}" if len(nodes) > len(COLOURS) else f"set {i + 1}",
-                velocity,
-                share[:, i],
-                COLOURS[k],
-                detail=f"v_i = {v:g} rad/s",
-            )
-            for i, v in enumerate(nodes)
-            for k in (i % len(COLOURS),)
-        ]
-        panels.append(Panel(Axis("velocity in rad/s", span=(-reach, reach)), Axis("weight μ_i"), tuple(curves), title))
+    panels = tuple(
+        Panel(Axis("velocity in rad/s", span=(-reach, reach)), Axis("weight μ_i"), _weights(law, reach), title)
+        for title, reach in (("whole range", 1.05 * max(map(abs, nodes))), ("around zero", 1.3 * near))
+    )
     caption = f"{len(nodes)} local sets, shape {law.friction.weights.value}; at every velocity the weights sum to one."
-    return Figure(name, "Weighting functions of the local sets", tuple(panels), 2, caption, 1.1)
+    return Figure(name, "Weighting functions of the local sets", panels, 2, caption, 1.1)
+
+
+def _weights(law: LocalParameters, reach: float) -> tuple[Curve, ...]:
+    """The weights within `reach` of zero; named by their node where the legend has room for all of them."""
+    nodes = [s.velocity_rad_s for s in law.friction.sets]
+    velocity = np.unique(np.concatenate([np.linspace(-reach, reach, _POINTS), [v for v in nodes if abs(v) < reach]]))
+    share = weight_table(law, velocity)
+    return tuple(
+        curve(
+            f"v_i = {v:g}" if len(nodes) <= _LEGEND else "",
+            velocity,
+            share[:, i],
+            COLOURS[i % len(COLOURS)],
+            Style.LINE if i < len(COLOURS) else Style.DASHED,
+            detail=f"v_i = {v:g} rad/s",
+        )
+        for i, v in enumerate(nodes)
+    )
 
 
 def weight_table(law: LocalParameters, velocity: Array) -> Array:
