@@ -124,15 +124,23 @@ class PdLugreParameters(Strict):
 
 
 class RegionGains(Strict):
-    """State feedback of one region (13): u* = k_x*e + k_v*e' - k_z*z_hat."""
+    """State feedback of one region (13): u* = k_x*e + k_v*e' - k_z*z_hat - sum k_u(i)*u*(k-i)."""
 
     k_z_per_rad: float = Field(0.0, ge=-1e7, le=1e7)
     k_x_per_rad: float = Field(ge=0.0, le=1e7)
     k_v_s_per_rad: float = Field(ge=0.0, le=1e6)
+    k_u: list[Annotated[float, Field(ge=-10.0, le=10.0)]] | None = Field(
+        None, max_length=local.COMMANDS, description="of the last commands u*, newest first"
+    )
 
     def pack(self) -> tuple[float, ...]:
-        """Gains in the order that the kernel reads."""
+        """Gains of state and error in the order that the kernel reads."""
         return (self.k_z_per_rad, self.k_x_per_rad, self.k_v_s_per_rad)
+
+    def pack_memory(self) -> tuple[float, ...]:
+        """Gains of the last commands in the order that the kernel reads."""
+        known = self.k_u or []
+        return (*known, *[0.0] * (local.COMMANDS - len(known)))
 
 
 class Regions(Strict):
@@ -251,6 +259,8 @@ class LocalParameters(Strict):
             observer.bandwidth_rad_s if observer else 0.0,
             observer.inertia_kg_m2 if observer else 0.0,
             observer.disturbance_limit_nm if observer else 0.0,
+            *self.regions.low.pack_memory(),
+            *self.regions.high.pack_memory(),
             float(len(f.sets)),
             *(s.velocity_rad_s for s in f.sets),
             *(s.decay_per_s for s in f.sets),

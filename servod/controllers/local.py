@@ -4,14 +4,17 @@
     u*     = mu_L*(k_x e + k_v e' - k_z z_hat)|L + mu_H*(k_x e + k_v e' - k_z z_hat)|H,   e = x_ref - x     (13), (16)
     u      = K*u* + c0*z_hat + d0*v + m_ff*a_ref + T(x_ref) + d_hat                                         (16)
 
-T is what is known over position (servod.controllers.position). All three gains are negative feedback. l > 0 makes
+In sampled time the state that (13) feeds back has more in it than position and velocity: commands that were given and
+do not show in the velocity yet. Each region may take -k_u(i)*u*(k-i) of the last commands, as the limits let them
+through, which is the predictor that the delay asks for (0: none). T is what is known over position (servod.controllers.position). All three gains are negative feedback. l > 0 makes
 z_hat push the way the feedback pushes (integral action through the friction state); the other sign is harmful. Every
 direction has its own nodes, so asymmetry needs nothing special.
 Options: the velocity of z_hat, of d0 and of the sets is the measured one or the reference's, led by a stated time;
 an output disturbance observer around the whole (bandwidth 0: none). The regions go by the faster of both velocities:
 a step has no reference velocity, yet the gains of Omega_L on a joint that turns fast make a limit cycle.
-At rest: within the hold width neither l nor the observer acts, and the leak floor lets z_hat fade: no hunting, no
-creep.
+At rest: within the hold width neither l nor the observer acts, so nothing hunts. Driven by the measured velocity z_hat
+creeps with its noise, and the leak floor lets it fade; driven by the reference it stays as it is, for letting it fade
+would only move the joint, by F/(c0 + k_x).
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ from collections.abc import MutableSequence, Sequence
 from servod.controllers.exact import decayed, limited
 from servod.controllers.observer import observe, remember
 from servod.controllers.position import position_torque
-from servod.controllers.state import ASKED, DISTURBANCE, FRICTION_STATE
+from servod.controllers.state import ASKED, COMMAND_1, COMMAND_2, COMMAND_3, DISTURBANCE, FRICTION_STATE
 from servod.controllers.weights import blended
 from servod.controllers.windup import winds_up
 
@@ -42,19 +45,27 @@ FEEDFORWARD_INERTIA = 17  # m_ff [kg*m^2]
 OBSERVER_BANDWIDTH = 18  # g of the output disturbance observer [rad/s], 0: none
 OBSERVER_INERTIA = 19  # nominal m of the observer [kg*m^2]
 OBSERVER_LIMIT = 20  # bound of |d_hat| [N*m]
-N_SETS = 21  # number n of local sets
-FIRST_NODE = 22  # then n nodes v_i [rad/s], n decays a_i [1/s], n gains l_i; then `position`, or nothing
+LOW_K_U, HIGH_K_U = 21, 24  # gains of the last three commands u* in Omega_L and Omega_H
+N_SETS = 27  # number n of local sets
+FIRST_NODE = 28  # then n nodes v_i [rad/s], n decays a_i [1/s], n gains l_i; then `position`, or nothing
 
 MEASURED = 0.0
 REFERENCE = 1.0
+COMMANDS = 3  # past commands that may be fed back: those of two cycles of delay, and one that the velocity lags behind
 
 
-def scheduled(p: Sequence[float], speed: float, error: float, error_rate: float, z: float) -> float:
+def remembered(p: Sequence[float], s: Sequence[float], first: int) -> float:
+    """Sum of k_u(i)*u*(k-i) with the gains from p[first] on."""
+    return p[first] * s[COMMAND_1] + p[first + 1] * s[COMMAND_2] + p[first + 2] * s[COMMAND_3]
+
+
+def scheduled(p: Sequence[float], s: Sequence[float], speed: float, error: float, error_rate: float) -> float:
     """u* of (13), gains blended from Omega_L to Omega_H over the overlap, linearly in the speed [rad/s]."""
-    low = p[LOW_K_X] * error + p[LOW_K_V] * error_rate - p[LOW_K_Z] * z
+    z = s[FRICTION_STATE]
+    low = p[LOW_K_X] * error + p[LOW_K_V] * error_rate - p[LOW_K_Z] * z - remembered(p, s, LOW_K_U)
     if speed <= p[BLEND_FROM]:
         return low
-    high = p[HIGH_K_X] * error + p[HIGH_K_V] * error_rate - p[HIGH_K_Z] * z
+    high = p[HIGH_K_X] * error + p[HIGH_K_V] * error_rate - p[HIGH_K_Z] * z - remembered(p, s, HIGH_K_U)
     if speed >= p[BLEND_TO]:
         return high
     return low + (high - low) * (speed - p[BLEND_FROM]) / (p[BLEND_TO] - p[BLEND_FROM])
@@ -74,16 +85,18 @@ def step(
     """One cycle: (torque, of it feedback K*u*, friction compensation, other) in N*m."""
     w = v_ref + p[LEAD] * a_ref if p[SOURCE] == REFERENCE else v
     error = x_ref - x
-    u_star = scheduled(p, max(abs(w), abs(v)), error, v_ref - v, s[FRICTION_STATE])
+    s[COMMAND_1] -= (s[ASKED] - u_applied) / p[INPUT_SCALE]  # what the limits cut never acts
+    u_star = scheduled(p, s, max(abs(w), abs(v)), error, v_ref - v)
+    s[COMMAND_3], s[COMMAND_2], s[COMMAND_1] = s[COMMAND_2], s[COMMAND_1], u_star
     moves = not (v_ref == 0.0 and a_ref == 0.0 and abs(error) <= p[HOLD_WITHIN])
     n = int(p[N_SETS])
     decay, gain = blended(p, FIRST_NODE, n, p[SHAPE], w)
     drive = w
     if moves and gain != 0.0 and not winds_up(s, u_star, u_applied):
         drive += gain * u_star
-    z = limited(decayed(s[FRICTION_STATE], max(decay, p[LEAK]), drive, dt), p[STATE_LIMIT])
-    s[FRICTION_STATE] = z
-    friction = p[STIFFNESS] * z + p[VISCOUS] * w
+    if moves or p[SOURCE] != REFERENCE:
+        s[FRICTION_STATE] = limited(decayed(s[FRICTION_STATE], max(decay, p[LEAK]), drive, dt), p[STATE_LIMIT])
+    friction = p[STIFFNESS] * s[FRICTION_STATE] + p[VISCOUS] * w
     beyond = FIRST_NODE + 3 * n
     known = position_torque(p, beyond, x_ref, v_ref) if len(p) > beyond else 0.0
     other = p[FEEDFORWARD_INERTIA] * a_ref + known

@@ -5,7 +5,7 @@ Stands under the laws. A law's state is a list of `N_STATES` floats (a float64 a
 
 from __future__ import annotations
 
-N_STATES = 7
+N_STATES = 10
 
 FRICTION_STATE = 0  # z_hat, estimated bristle deflection [rad]; 0.0 where the law has none
 DISTURBANCE = 1  # d_hat, estimated disturbance [N*m]; 0.0 where the law has none
@@ -14,3 +14,6 @@ ACTED = 3  # torque that acted while the previous sample became the present one 
 LAST_VELOCITY = 4  # velocity of the previous step [rad/s]
 MODELLED = 5  # friction torque that the law knew of in the previous step [N*m]
 STARTED = 6  # 0.0 before the first step
+COMMAND_1 = 7  # feedback u* of the last step, as the limits let it through
+COMMAND_2 = 8  # of the step before
+COMMAND_3 = 9

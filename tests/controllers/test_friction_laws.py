@@ -151,3 +151,25 @@ def test_parts_add_up_and_symmetric_laws_are_odd(name: str) -> None:
             assert u == pytest.approx(feedback + friction + other)
         answers.append(u)
     assert answers[0] == pytest.approx(-answers[1])
+
+
+@pytest.mark.parametrize("limit_nm", [math.inf, 0.05])
+def test_the_last_commands_count_as_the_limits_let_them_through(limit_nm: float) -> None:
+    p = local_parameters(source=local.REFERENCE, memory=(0.5, 0.25, 0.0))
+    s = fresh_state("local")
+    given: list[float] = [0.0, 0.0]
+    for _ in range(5):
+        feedback = LAWS["local"].step(p, s, 0.1, 0.0, 0.0, 0.0, 0.0, given[-1], DT)[1]
+        assert feedback == pytest.approx(0.25 - 0.5 * given[-1] - 0.25 * given[-2], rel=1e-9)
+        given.append(min(feedback, limit_nm))
+
+
+def test_driven_by_the_reference_the_friction_state_rests_with_it() -> None:
+    p = local_parameters(source=local.REFERENCE, leak=2.0, hold_within=5e-5)
+    s = fresh_state("local")
+    s[FRICTION_STATE] = 5e-5
+    for _ in range(1000):
+        LAWS["local"].step(p, s, 4e-5, 0.0, 0.0, 0.0, 0.0, s[ASKED], DT)
+    assert s[FRICTION_STATE] == 5e-5
+    LAWS["local"].step(p, s, 6e-5, 0.0, 0.0, 0.0, 0.0, s[ASKED], DT)
+    assert s[FRICTION_STATE] < 5e-5

@@ -55,7 +55,7 @@ def test_the_observer_takes_what_is_fed_forward_for_known() -> None:
 
 def test_compiled_equals_plain() -> None:
     packed = (*local_parameters(gain=0.04, bandwidth=50.0), *KNOWN.pack())
-    kernel, state, plain_state = compiled(LAWS["local"].step), np.zeros(7), fresh_state("local")
+    kernel, state, plain_state = compiled(LAWS["local"].step), np.array(fresh_state("local")), fresh_state("local")
     for k in range(200):
         x, v = math.sin(0.05 * k), math.cos(0.05 * k)
         plain = LAWS["local"].step(packed, plain_state, x, v, 0.0, x - 1e-3, v, plain_state[ASKED], 0.001)
