@@ -25,6 +25,8 @@ _ROW_IN, _HEAD_IN = 2.3, 0.9
 #: Width of the whole picture by its columns.
 _WIDTH_IN = {1: 7.2, 2: 8.6}
 _WIDEST_IN = 11.0
+#: Size of a letter of the legend, and what a curve's sample takes of it in letters.
+_LETTERS_PER_IN, _HANDLE_LETTERS = 13.0, 7
 _LOOK: Any = {
     "font.size": 9,
     "axes.titlesize": 9.5,
@@ -74,7 +76,8 @@ def _legend(canvas: Canvas, axes: Any) -> None:
         for handle, label in zip(*drawn.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
     if len(entries) > 1:
-        columns = min(len(entries), 4)
+        room = canvas.get_figwidth() * _LETTERS_PER_IN / (max(map(len, entries)) + _HANDLE_LETTERS)
+        columns = max(1, min(len(entries), int(room)))
         canvas.legend(list(entries.values()), list(entries), loc="outside lower center", ncols=columns, frameon=False)
 
 
