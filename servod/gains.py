@@ -66,6 +66,18 @@ class CertificateCheck(Strict):
     passed: bool
 
 
+class Promise(Strict):
+    """What a certified set shows on the validation motion (servod.verify.validation), as the worst of `plants` plants.
+
+    RMS error on the slow and on the brisk sine, peak to peak of the position while it holds after a step.
+    """
+
+    slow_rad: float = Field(ge=0.0)
+    brisk_rad: float = Field(ge=0.0)
+    hold_rad: float = Field(ge=0.0)
+    plants: int = Field(ge=1)
+
+
 class Certificate(Strict):
     """Statement that the gains were verified; bound to these very numbers by their hash."""
 
@@ -76,6 +88,7 @@ class Certificate(Strict):
     issued_at: datetime.datetime
     checks: list[CertificateCheck] = Field(default_factory=list)
     observations: dict[str, float] = Field(default_factory=dict, description="figures that are told, not judged")
+    promised: Promise | None = Field(None, description="what a deployment measures again on the axis")
 
     @model_validator(mode="after")
     def _valid_means_checked(self) -> Certificate:

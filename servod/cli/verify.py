@@ -54,6 +54,7 @@ def document(result: Verification) -> dict[str, Any]:
         "valid": result.valid,
         "checks": [check.model_dump() for check in result.checks],
         "observations": result.observations,
+        "promised": result.promised and result.promised.model_dump(),
     }
 
 

@@ -12,8 +12,9 @@ from pathlib import Path
 
 from servod import __version__
 from servod.errors import BadInput
-from servod.gains import Certificate, CertificateCheck, GainSet
+from servod.gains import Certificate, CertificateCheck, GainSet, Promise
 from servod.verify.checks import SIMULATED, STATIC, Subject, observations
+from servod.verify.promise import promise
 
 PLANTS, SEED, PROCESSES = 1000, 1, 2
 
@@ -24,6 +25,7 @@ class Verification:
 
     checks: list[CertificateCheck]
     observations: dict[str, float]
+    promised: Promise | None = None
 
     @property
     def valid(self) -> bool:
@@ -37,14 +39,20 @@ class Verification:
             parameters_sha256=gains.parameters_sha256(),
             model_sha256=gains.provenance.model_sha256,
             issued_by=f"servod {__version__} verify, source {source_sha256()[:16]}",
-            issued_at=datetime.datetime.now(datetime.UTC).replace(microsecond=0),
+            issued_at=today(),
             checks=self.checks,
             observations=self.observations,
+            promised=self.promised,
         )
 
     def certified(self, gains: GainSet) -> GainSet:
         """`gains` with the certificate, sealed."""
         return gains.model_copy(update={"certificate": self.certificate(gains)}).sealed()
+
+
+def today() -> datetime.datetime:
+    """The day, UTC: the same set verified again on the same day is the same file, byte for byte."""
+    return datetime.datetime.combine(datetime.datetime.now(datetime.UTC).date(), datetime.time(), datetime.UTC)
 
 
 def source_sha256() -> str:
@@ -69,4 +77,4 @@ def verify(
     if not all(check.passed for check in checks):
         return Verification(checks, {})
     checks += [check for judge in SIMULATED for check in judge(subject)]
-    return Verification(checks, observations(subject))
+    return Verification(checks, observations(subject), promise(gains, gains.design, seed))
