@@ -40,6 +40,7 @@ class Verb(StrEnum):
     GAINS_LOAD = "gains_load"
     GAINS_LIST = "gains_list"
     GAINS_ACTIVATE = "gains_activate"
+    GAINS_KEEP = "gains_keep"
     GAINS_ROLLBACK = "gains_rollback"
     RECORD_START = "record_start"
     RECORD_STOP = "record_stop"

@@ -4,7 +4,7 @@ Beside the data path; the supervisor owns it, `servoctl gains` reaches it throug
 
     DIRECTORY/sets/NAME/0001.yaml   text of version 1, never changed after it was written
     DIRECTORY/active.json           the active version and those before it, replaced as a whole
-    DIRECTORY/history.jsonl         one line for each load, activation and rollback, for people
+    DIRECTORY/history.jsonl         one line for each load, activation, rollback and rejected trial, for people
     DIRECTORY/lock                  held while something changes
 
 Every file is written aside, flushed to the disk and renamed, so that a kill at any moment leaves the old state or the
@@ -24,6 +24,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
+from pydantic import Field
+
 from servod.errors import BadInput
 from servod.gains import NAME_PATTERN, GainSet, load_gains, parse_gains
 from servod.yaml12 import Strict, load_model, read_text
@@ -39,6 +41,7 @@ class Action(StrEnum):
     LOAD = "load"
     ACTIVATE = "activate"
     ROLLBACK = "rollback"
+    REJECT = "reject"  # a set that was tried and not kept
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,13 +63,15 @@ class SetReference(Strict):
 
 
 class HistoryEntry(Strict):
-    """One line of the history; `time` is UTC."""
+    """One line of the history; `time` is UTC. A deployment leaves its reasons in `note` and what it measured."""
 
     time: datetime.datetime
     action: Action
     name: str
     version: int
     sha256: str
+    note: str = ""
+    figures: dict[str, float] = Field(default_factory=dict)
 
 
 class _Active(Strict):
@@ -173,7 +178,9 @@ class GainStore:
         state = self._active()
         return None if state is None else self.get(state.current.name, state.current.version)
 
-    def activate(self, name: str, version: int | None = None) -> StoredSet:
+    def activate(
+        self, name: str, version: int | None = None, note: str = "", figures: dict[str, float] | None = None
+    ) -> StoredSet:
         """Make a stored set the active one; the present one becomes what `rollback` returns to."""
         with self._locked():
             stored = self.get(name, version)
@@ -184,7 +191,14 @@ class GainStore:
             elif state.current != new:
                 previous = [*state.previous, state.current][-MAX_ROLLBACKS:]
                 self._write_active(_Active(current=new, previous=previous))
-            self._log(Action.ACTIVATE, stored)
+            self._log(Action.ACTIVATE, stored, note, figures)
+            return stored
+
+    def reject(self, name: str, version: int, note: str = "", figures: dict[str, float] | None = None) -> StoredSet:
+        """Note that a stored set was tried and not kept; what is active stays so."""
+        with self._locked():
+            stored = self.get(name, version)
+            self._log(Action.REJECT, stored, note, figures)
             return stored
 
     def previous(self) -> StoredSet:
@@ -228,13 +242,15 @@ class GainStore:
     def _write_active(self, state: _Active) -> None:
         write_atomically(self._active_file, state.model_dump_json(indent=1) + "\n")
 
-    def _log(self, action: Action, stored: StoredSet) -> None:
+    def _log(self, action: Action, stored: StoredSet, note: str = "", figures: dict[str, float] | None = None) -> None:
         entry = HistoryEntry(
             time=datetime.datetime.now(datetime.UTC),
             action=action,
             name=stored.name,
             version=stored.version,
             sha256=stored.sha256,
+            note=note,
+            figures=figures or {},
         )
         with self._history_file.open("a", encoding="utf-8") as file:
             file.write(entry.model_dump_json() + "\n")

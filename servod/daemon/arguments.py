@@ -121,10 +121,22 @@ class GainsLoadArgs(Strict):
 
 
 class GainsActivateArgs(Strict):
-    """`gains_activate`: a stored set, its newest version unless given."""
+    """`gains_activate`: a stored set, its newest version unless given.
+
+    With `trial` it runs only until its client says `gains_keep`; else, or when that client leaves, the set that was
+    active before runs again.
+    """
 
     name: str = Field(min_length=1, max_length=200)
     version: int | None = Field(None, ge=1)
+    trial: bool = False
+
+
+class GainsVerdictArgs(Strict):
+    """`gains_keep` and `gains_rollback`: what was measured and why, for the history of the store."""
+
+    note: str = Field("", max_length=4000)
+    figures: dict[str, float] = Field(default_factory=dict, max_length=64)
 
 
 class RecordStartArgs(Strict):
@@ -140,6 +152,8 @@ _MODELS: dict[Verb, type[Strict]] = {
     Verb.TRACK: TrackArgs,
     Verb.GAINS_LOAD: GainsLoadArgs,
     Verb.GAINS_ACTIVATE: GainsActivateArgs,
+    Verb.GAINS_KEEP: GainsVerdictArgs,
+    Verb.GAINS_ROLLBACK: GainsVerdictArgs,
     Verb.RECORD_START: RecordStartArgs,
 }
 

@@ -13,9 +13,10 @@ from typing import Any
 
 from servod.commands import Op
 from servod.config import AxisConfig
-from servod.daemon.arguments import GainsActivateArgs, GainsLoadArgs
+from servod.daemon.arguments import GainsActivateArgs, GainsLoadArgs, GainsVerdictArgs
 from servod.daemon.flows import Flow, FutureWait, Wait
 from servod.daemon.status import ControllerStatus
+from servod.errors import AnswerIsNo
 from servod.gain_store import GainStore, StoredSet
 from servod.gains import require_fit
 
@@ -40,6 +41,12 @@ class GainBank:
         log.info("gain set %s version %d (%s)", active.name, active.version, active.gains.law.name)
         self._sets = {0: active}
         self._last_serial = 0
+        self._tried: StoredSet | None = None
+
+    @property
+    def on_trial(self) -> bool:
+        """Whether the set that runs is only tried: the store's active one is another."""
+        return self._tried is not None
 
     @property
     def newest(self) -> StoredSet:
@@ -71,15 +78,36 @@ class GainBank:
         """Change the running controller to a stored set, without a bump."""
         stored: StoredSet = yield FutureWait(slow.submit(self._store.get, args.name, args.version))
         yield from self._deploy(stored, send)
-        yield FutureWait(slow.submit(self._store.activate, stored.name, stored.version))
+        self._tried = stored if args.trial else None
+        if not args.trial:
+            yield FutureWait(slow.submit(self._store.activate, stored.name, stored.version))
         return _row(stored)
 
-    def rollback(self, send: SendOrder, slow: ThreadPoolExecutor) -> Flow:
-        """Go back to the set that was active before."""
+    def keep(self, args: GainsVerdictArgs, slow: ThreadPoolExecutor) -> Flow:
+        """Make the set on trial the active one."""
+        tried, self._tried = self._tried, None
+        if tried is None:
+            raise AnswerIsNo("no gain set is on trial")
+        yield FutureWait(slow.submit(self._store.activate, tried.name, tried.version, args.note, args.figures))
+        return _row(tried)
+
+    def rollback(self, args: GainsVerdictArgs, send: SendOrder, slow: ThreadPoolExecutor) -> Flow:
+        """Go back to the set that was active before; from a trial, to the one that is."""
+        if self._tried is not None:
+            return (yield from self._reject(self._tried, args, send, slow))
         stored: StoredSet = yield FutureWait(slow.submit(self._store.previous))
         yield from self._deploy(stored, send)
         yield FutureWait(slow.submit(self._store.rollback))
         return _row(stored)
+
+    def _reject(self, tried: StoredSet, args: GainsVerdictArgs, send: SendOrder, slow: ThreadPoolExecutor) -> Flow:
+        """End a trial: the active set runs again."""
+        active: StoredSet | None = yield FutureWait(slow.submit(self._store.active))
+        assert active is not None  # the bank activated one when it began
+        yield from self._deploy(active, send)
+        self._tried = None
+        yield FutureWait(slow.submit(self._store.reject, tried.name, tried.version, args.note, args.figures))
+        return _row(active)
 
     def _deploy(self, stored: StoredSet, send: SendOrder) -> Flow:
         """Send a set to the loop and wait until its records show that it runs."""

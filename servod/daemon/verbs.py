@@ -22,6 +22,7 @@ from servod.daemon.arguments import (
     EnableArgs,
     GainsActivateArgs,
     GainsLoadArgs,
+    GainsVerdictArgs,
     HaltArgs,
     NoArgs,
     RecordStartArgs,
@@ -82,6 +83,7 @@ class Verbs:
             Verb.GAINS_LOAD: self._gains_load,
             Verb.GAINS_LIST: self._gains_list,
             Verb.GAINS_ACTIVATE: self._gains_activate,
+            Verb.GAINS_KEEP: self._gains_keep,
             Verb.GAINS_ROLLBACK: self._gains_rollback,
             Verb.RECORD_START: self._record_start,
             Verb.RECORD_STOP: self._record_stop,
@@ -102,8 +104,11 @@ class Verbs:
         return record is not None and (record.command_seq < self._reference_seq or bool(record.reference_active))
 
     def lease_ended(self) -> None:
-        """Samples that the client sent ahead are void."""
+        """Samples that the client sent ahead are void, and a gain set that it tried is not kept."""
         self._uploaded = Table()
+        if self._bank.on_trial:
+            why = GainsVerdictArgs(note="the client that tried it left")
+            self._flows.start(self._gains_rollback(why), Reply(lambda _answer: None, None))
 
     def tick(self, records: list[CycleRecord], now_ns: int) -> None:
         """Go on with everything that waited for these records, or for time."""
@@ -210,8 +215,11 @@ class Verbs:
     def _gains_activate(self, args: GainsActivateArgs) -> Flow:
         return self._attach_gains(self._bank.activate(args, self._send, self.slow))
 
-    def _gains_rollback(self, _args: NoArgs) -> Flow:
-        return self._attach_gains(self._bank.rollback(self._send, self.slow))
+    def _gains_keep(self, args: GainsVerdictArgs) -> Flow:
+        return self._bank.keep(args, self.slow)
+
+    def _gains_rollback(self, args: GainsVerdictArgs) -> Flow:
+        return self._attach_gains(self._bank.rollback(args, self._send, self.slow))
 
     def _attach_gains(self, change: Flow) -> Flow:
         """After a change of the gain set, the recording gets the new one too."""

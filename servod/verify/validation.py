@@ -106,7 +106,7 @@ class ValidationMotion:
         return [float(np.sqrt(np.mean(part**2))) for part in parts]
 
     def _times(self, duration_s: float) -> Array:
-        times: Array = np.arange(1, self._count(duration_s) + 1) * self.period_s
+        times: Array = np.arange(1, self._count(duration_s) + 1, dtype=np.float64) * self.period_s
         return times
 
     def _count(self, duration_s: float) -> int:

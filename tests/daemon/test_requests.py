@@ -222,11 +222,15 @@ class _Events:
         """Nothing is recorded here."""
 
 
+class _Bank:
+    on_trial = False
+
+
 @pytest.fixture
 def verbs(tmp_path: Path) -> Iterator[tuple[Verbs, _Loop]]:
     loop, config = _Loop(), axis_config(tmp_path / "s", tmp_path / "c")
     config = config.model_copy(update={"limits": config.limits.model_copy(update={"speed_rad_s": 1e3})})
-    verbs = Verbs(config, cast(LoopHandle, loop), cast(GainBank, None), cast(Recorder, _Events()), dict)
+    verbs = Verbs(config, cast(LoopHandle, loop), cast(GainBank, _Bank()), cast(Recorder, _Events()), dict)
     yield verbs, loop
     verbs.close()
 
