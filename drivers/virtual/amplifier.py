@@ -239,6 +239,7 @@ class AmplifierNode(Node):
         set_default(Obj402.RATED_TORQUE, 0, s.rated_torque_mnm)
         set_default(Obj402.ENCODER_RESOLUTION, 1, s.amplifier_counts_per_turn)
         set_default(Obj402.FEED, 1, s.amplifier_counts_per_turn)
+        set_default(Obj402.POLARITY, 0, s.polarity)
         for obj in (Obj402.MAX_TORQUE, Obj402.MAX_CURRENT, Obj402.POSITIVE_TORQUE_LIMIT, Obj402.NEGATIVE_TORQUE_LIMIT):
             set_default(obj, 0, s.max_torque_permille)
 

@@ -46,7 +46,7 @@ class EncoderNode(Node):
         self._speed, self._acceleration = entry(Obj406.SPEED, 1), entry(0x6040, 1)
         self._alarms, self._warnings, self._offset = entry(Obj406.ALARMS), entry(Obj406.WARNINGS), entry(Obj406.OFFSET)
         self._range, self._cam = entry(Obj406.MEASURING_RANGE), entry(0x6300, 1)
-        self._counts_per_rad = settings.encoder_counts_per_turn / TWO_PI
+        self._counts_per_rad = settings.encoder_direction * settings.encoder_counts_per_turn / TWO_PI
         self._scale = 1.0
         self._read_ns = -1
         self._units = 0  # scaled, before offset and wrap

@@ -25,8 +25,10 @@ class VirtualAxisSettings(Strict):
     max_torque_permille: int = Field(3000, ge=1, le=32767)
     amplifier_counts_per_turn: int = Field(1_048_576, ge=4, le=2**32 - 1)
     gear_ratio: float = Field(1.0, gt=0.0, description="turns of the motor for one turn of the joint")
+    polarity: int = Field(0, ge=0, le=0xE0, description="0x607E as stored in the drive; 0x20 turns round the torque")
     encoder_counts_per_turn: int = Field(1_048_576, ge=4, le=2**32 - 1)
     encoder_measuring_range_counts: int = Field(2**31, ge=4, le=2**32 - 1, description="0x6002; any number")
+    encoder_direction: Literal[1, -1] = Field(1, description="-1: mounted the other way round")
     encoder_noise_counts: float = Field(0.0, ge=0.0, le=1e6, description="standard deviation of a reading")
     start_position_rad: float = 0.0
     cycle_period_s: float = Field(0.001, gt=0.0, le=0.1, description="part of the model's delay that SYNC costs")
