@@ -5,6 +5,8 @@ Physics does not read it; synthesis takes its vertices from here, reports print 
 
 from __future__ import annotations
 
+from typing import Annotated
+
 from pydantic import Field, model_validator
 
 from servod.yaml12 import Strict
@@ -40,3 +42,6 @@ class Identified(Strict):
     values: dict[str, IdentifiedValue]
     friction_map: IdentifiedMap
     not_identifiable: dict[str, str] = Field(default_factory=dict, description="what, and what would tell it")
+    data_sha256: list[Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]] = Field(
+        default_factory=list, description="hashes of the recordings' files that it was fitted on, in their order"
+    )

@@ -51,8 +51,10 @@ def identify(
     before: Annotated[Path | None, typer.Option(help="Earlier model: say what has changed since.")] = None,
     travel: Annotated[float | None, typer.Option(min=0.02, help="Travel to each side at most, rad.")] = None,
     speed: Annotated[float | None, typer.Option(min=0.02, help="Speed at most, rad/s.")] = None,
-    encoder_counts: Annotated[int, typer.Option(min=4, help="Virtual axis: counts per turn.")] = 1_048_576,
+    settings: Annotated[Path | None, typer.Option(help="Virtual axis: what drive and encoder really are.")] = None,
+    encoder_counts: Annotated[int | None, typer.Option(min=4, help="Virtual axis: counts per turn.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of excitation and virtual noise.")] = 1,
+    resume: Annotated[bool, typer.Option(help="Go on where an interrupted walk with the same --out ended.")] = False,
     socket: SocketOption = DEFAULT_SOCKET,
     as_json: JsonOption = False,
 ) -> None:
@@ -66,11 +68,11 @@ def identify(
     if recordings is not None:
         job = _from_recordings(recordings)
     elif plant is not None:
-        job = _virtual(plant, config, encoder_counts, seed)
+        job = _virtual(plant, config, settings, encoder_counts, seed)
     else:
         job = _on_daemon(socket, config)
     with _progress(quiet=as_json) as tell:
-        analysis = job(_Walk(recordings_folder(out), travel, speed, seed), tell)
+        analysis = job(_Walk(recordings_folder(out), travel, speed, seed, resume), tell)
     model = model_of(analysis)
     _write(out, axis_model_yaml(model))
     found = document(analysis) | {"model": str(out)} | _changes(old, model)
@@ -92,12 +94,16 @@ class _Walk(NamedTuple):
     travel: float | None
     speed: float | None
     seed: int
+    resume: bool
 
-    def on(self, link: Link, tell: Tell) -> Analysis:
-        """Run all experiments on this axis."""
+    def on(self, link: Link, tell: Tell, subject: str) -> Analysis:
+        """Run all experiments on this axis; `subject` says which one it is."""
         from servod.identify.walk import identify as walk
 
-        return walk(link, self.folder, tell, travel_rad=self.travel, speed_rad_s=self.speed, seed=self.seed)
+        return walk(
+            link, self.folder, tell, travel_rad=self.travel, speed_rad_s=self.speed, seed=self.seed,
+            resume=self.resume, subject=subject,
+        )  # fmt: skip
 
 
 def _from_recordings(folder: Path) -> Job:
@@ -109,17 +115,21 @@ def _from_recordings(folder: Path) -> Job:
     return lambda _walk, _tell: analyse(traces)
 
 
-def _virtual(plant: Path, config: Path | None, encoder_counts: int, seed: int) -> Job:
-    from servod.axis_model import load_axis_model
+def _virtual(plant: Path, config: Path | None, settings: Path | None, encoder_counts: int | None, seed: int) -> Job:
+    from servod.axis_model import axis_model_yaml, load_rotary_model
     from servod.config import load_config
+    from servod.drivers.virtual.settings import VirtualAxisSettings
     from servod.identify.links import SteppedLink
     from servod.identify.virtual import virtual_session
+    from servod.yaml12 import load_model
 
-    joint, chosen = load_axis_model(plant), load_config(config) if config is not None else None
+    joint, chosen = load_rotary_model(plant), load_config(config) if config is not None else None
+    devices = load_model(settings, VirtualAxisSettings) if settings is not None else None
 
     def job(walk: _Walk, tell: Tell) -> Analysis:
         with tempfile.TemporaryDirectory(prefix="servod-identify-") as folder:
-            return walk.on(SteppedLink(virtual_session(joint, Path(folder), encoder_counts, seed, chosen)), tell)
+            session = virtual_session(joint, Path(folder), encoder_counts, seed, chosen, devices)
+            return walk.on(SteppedLink(session), tell, axis_model_yaml(joint))
 
     return job
 
@@ -136,7 +146,7 @@ def _on_daemon(socket: Path, config: Path | None) -> Job:
 
     def job(walk: _Walk, tell: Tell) -> Analysis:
         with connect(socket) as client:
-            return walk.on(DaemonLink(client, chosen), tell)
+            return walk.on(DaemonLink(client, chosen), tell, chosen.name)
 
     return job
 

@@ -27,6 +27,7 @@ class Analysis:
     positive: curve.CurveFit
     negative: curve.CurveFit
     damping: Estimate | None
+    data_sha256: tuple[str, ...]  # of the recordings' files
 
     @property
     def break_away_rad(self) -> float:
@@ -68,6 +69,7 @@ def analyse(traces: Sequence[Trace]) -> Analysis:
         positive,
         negative,
         _damping(traces, answer, rocked, 0.5 * (positive.viscous.value + negative.viscous.value)),
+        tuple(trace.sha256 for trace in traces if trace.sha256),
     )
 
 

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from servod.config import AxisConfig
 from servod.control import ControlClient, Verb
-from servod.errors import AnswerIsNo, ServodError
+from servod.errors import ServodError
 from servod.gain_parameters import PdParameters
 from servod.gains import GainSet, Provenance
+from servod.identify.links import MotionEnded, moving
 from servod.identify.trace import rows_of
 from servod.recorder_read import read_recording
 
@@ -68,26 +69,28 @@ class DaemonLink:
                 torques_nm=list(torques_nm),
                 window_rad=window_rad,
             )
-            self._wait()
+            ended = self._wait()
         finally:
             self._client.call(Verb.RECORD_STOP)
-        rows = rows_of(read_recording(path).rows)
-        moving: NDArray[np.void] = rows[rows["reference_active"] == 1]
-        return moving
+        rows = moving(rows_of(read_recording(path).rows))
+        if ended:
+            raise MotionEnded(ended, rows)
+        return rows
 
     def disable(self) -> None:
         """Ask for it; an axis that is off already, or a daemon that is gone, needs none."""
         with contextlib.suppress(ServodError):
             self._client.call(Verb.DISABLE)
 
-    def _wait(self) -> None:
+    def _wait(self) -> str:
+        """Wait for the end of the motion; returns why it ended early, empty when it did not."""
         while True:
             time.sleep(_POLL_S)
             status = self._client.call(Verb.STATUS)
             if status["axis"]["state"] != "ENABLED":
-                raise AnswerIsNo(f"the experiment ended with the axis in {status['axis']['state']}. {_why(status)}")
+                return f"the experiment ended with the axis in {status['axis']['state']}. {_why(status)}"
             if not status["axis"]["motion_running"]:
-                return
+                return ""
 
 
 def _why(status: dict[str, Any]) -> str:

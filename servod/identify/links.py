@@ -18,7 +18,7 @@ from servod.commands import REFUSAL_TEXT, Op, ReferenceKind, Refusal
 from servod.config import AxisConfig
 from servod.controllers import LAWS
 from servod.errors import AnswerIsNo, faults_in
-from servod.identify.trace import rows_of
+from servod.identify.trace import Trace, rows_of
 from servod.record import CycleRecord
 from servod.session import SteppedSession
 
@@ -26,6 +26,15 @@ from servod.session import SteppedSession
 Watch = Callable[[float], None]
 
 _SLICE_S = 0.1
+
+
+class MotionEnded(AnswerIsNo):
+    """The axis dropped out of a motion; `rows` are its cycles, and `trace` what an experiment made of them."""
+
+    def __init__(self, message: str, rows: NDArray[np.void]) -> None:
+        super().__init__(message)
+        self.rows = rows
+        self.trace: Trace | None = None
 
 
 class Link(Protocol):
@@ -49,7 +58,8 @@ class Link(Protocol):
     ) -> NDArray[np.void]:
         """Run a motion relative to the present reference with torque on top; returns its cycles.
 
-        It ends by itself when the joint is further than `window_rad` from the reference.
+        It ends by itself when the joint is further than `window_rad` from the reference. Raises MotionEnded when the
+        axis drops out.
         """
         ...
 
@@ -96,10 +106,12 @@ class SteppedLink:
             session.run(_SLICE_S)
             passed_s += _SLICE_S
             self._watch(passed_s)
-        check_state(session.latest)
-        rows = rows_of(session.raw)
-        moving: NDArray[np.void] = rows[rows["reference_active"] == 1]
-        return moving
+        rows = moving(rows_of(session.raw))
+        try:
+            check_state(session.latest)
+        except AnswerIsNo as error:
+            raise MotionEnded(str(error), rows) from None
+        return rows
 
     def disable(self) -> None:
         """Switch off and let the drive see it."""
@@ -110,6 +122,12 @@ class SteppedLink:
     def _must(self, refusal: Refusal) -> None:
         if refusal != Refusal.DONE:
             raise AnswerIsNo(f"the axis refused the experiment: {REFUSAL_TEXT[refusal]}")
+
+
+def moving(rows: NDArray[np.void]) -> NDArray[np.void]:
+    """The cycles of the motion."""
+    active: NDArray[np.void] = rows[rows["reference_active"] == 1]
+    return active
 
 
 def check_state(record: CycleRecord) -> None:

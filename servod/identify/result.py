@@ -71,6 +71,7 @@ def identified(analysis: Analysis) -> Identified:
             half_widths=list(_rounded(_both(analysis.map.negative.half_width, analysis.map.positive.half_width))),
         ),
         not_identifiable=_not_identifiable(analysis),
+        data_sha256=list(analysis.data_sha256),
     )
 
 
@@ -110,6 +111,7 @@ def document(analysis: Analysis) -> dict[str, Any]:
         "friction_map": found.friction_map.model_dump(),
         "asymmetry": {"value": 0.5 * (low + high), "low": low, "high": high, "unit": "1"},
         "not_identifiable": dict(found.not_identifiable),
+        "data_sha256": list(found.data_sha256),
     }
 
 

@@ -1,13 +1,16 @@
-"""Recordings of an identification on disk: one MCAP file for each experiment, and a list that says what each is.
+"""Recordings of an identification on disk: one MCAP file for each motion, and a list that says what each is.
 
-Beside the walk; `load` gives the traces back for fits without an axis.
+Beside the walk. `load` gives the traces back for fits without an axis; `Recordings` also gives them back to a walk that
+is taken up again, motion by motion, as long as the walk asks for the very motions that were recorded.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,56 +21,150 @@ from servod.recorder_mcap import McapFile, split_rows, wall_offset_ns
 from servod.recorder_read import read_recording
 
 LIST = "experiments.json"
-_COLUMNS = ("torque_nm", "position_rad", "reference_rad", "torque_other_nm", "torque_actual_nm")
+_COLUMNS = ("torque_nm", "position_rad", "reference_rad", "torque_other_nm", "torque_actual_nm", "motor_position_rad")
+
+
+class _Entry(NamedTuple):
+    """One line of the list; `motion` is the hash of what was asked for."""
+
+    file: str
+    kind: str
+    motion: str
+    settings: dict[str, float]
 
 
 class Recordings:
-    """A folder that gets a file for every motion, as soon as it is over."""
+    """A folder that gets a file for every motion, as soon as it is over.
 
-    def __init__(self, folder: Path) -> None:
-        """Use `folder`; recordings of an earlier identification in it are replaced. Raises BadInput."""
-        self.folder = folder
-        self._list: list[dict[str, Any]] = []
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            for old in [*folder.glob("[0-9][0-9]_*.mcap"), *folder.glob(LIST)]:
-                old.unlink()
-        except OSError as error:
-            raise BadInput(str(folder), error.strerror or str(error), "a folder that can be written") from None
+    `start_rad` is where the axis stood when the walk began; None until `begin`.
+    """
 
-    def keep(self, rows: NDArray[np.void], trace: Trace) -> None:
-        """Write one motion and the list with it. Raises BadInput when the disk does not take it."""
-        name = f"{len(self._list):02d}_{trace.kind.value}.mcap"
+    def __init__(self, folder: Path, conditions: str = "", resume: bool = False) -> None:
+        """Use `folder`; earlier recordings in it are replaced, or with `resume` kept while they fit.
+
+        They fit when they were made under the same `conditions` (a hash of configuration and options). Raises BadInput.
+        """
+        self.folder, self.conditions = folder, conditions
+        self.start_rad: float | None = None
+        self._done: list[_Entry] = []
+        self._earlier: list[_Entry] = []
+        if resume:
+            self._take_up()
+        self._drop_others()
+
+    @property
+    def waiting(self) -> int:
+        """Earlier recordings that the walk has not asked for yet."""
+        return len(self._earlier)
+
+    def begin(self, start_rad: float) -> None:
+        """The walk begins with the axis at `start_rad`."""
+        self.start_rad = start_rad
+
+    def recorded(self, kind: Kind, motion: str) -> Trace | None:
+        """The earlier recording of the next motion; None when there is none, and then all later ones are dropped."""
+        if not self._earlier:
+            return None
+        entry = self._earlier.pop(0)
+        if (entry.kind, entry.motion) != (kind.value, motion):
+            self._earlier = []
+            self._drop_others()
+            return None
+        self._done.append(entry)
+        return _trace(self.folder, entry)
+
+    def keep(self, rows: NDArray[np.void], trace: Trace, motion: str = "") -> Trace:
+        """Write one motion and the list with it; returns the trace with the file's hash. Raises BadInput."""
+        name = f"{len(self._done):02d}_{trace.kind.value}.mcap"
         try:
             file = McapFile(self.folder / name, {}, wall_offset_ns())
             file.write_rows(split_rows(rows.tobytes()))
             file.close()
-            self._list.append({"file": name, "kind": trace.kind.value, "settings": trace.settings})
-            aside = self.folder / (LIST + ".part")
-            aside.write_text(json.dumps(self._list, indent=1) + "\n", encoding="utf-8")
-            aside.replace(self.folder / LIST)
+            self._done.append(_Entry(name, trace.kind.value, motion, trace.settings))
+            self._write_list()
         except OSError as error:
-            raise BadInput(
-                str(self.folder / name), error.strerror or str(error), "a file that can be written"
-            ) from None
+            raise _unwritable(self.folder / name, error) from None
+        return replace(trace, sha256=_sha256(self.folder / name))
+
+    def _write_list(self) -> None:
+        document = {
+            "conditions": self.conditions,
+            "start_rad": self.start_rad,
+            "experiments": [entry._asdict() for entry in self._done],
+        }
+        aside = self.folder / (LIST + ".part")
+        aside.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+        aside.replace(self.folder / LIST)
+
+    def _take_up(self) -> None:
+        """Find the earlier recordings, if they were made under these conditions."""
+        if not (self.folder / LIST).exists():
+            return
+        document, entries = _read_list(self.folder)
+        if document["conditions"] == self.conditions and document["start_rad"] is not None:
+            self.start_rad, self._earlier = float(document["start_rad"]), entries
+
+    def _drop_others(self) -> None:
+        """Remove recordings in the folder that are of no use any more."""
+        kept = {entry.file for entry in (*self._done, *self._earlier)}
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            for old in self.folder.glob("[0-9][0-9]_*.mcap"):
+                if old.name not in kept:
+                    old.unlink()
+            if not kept:
+                (self.folder / LIST).unlink(missing_ok=True)
+        except OSError as error:
+            raise _unwritable(self.folder, error) from None
+
+
+def motion_hash(positions: NDArray[np.float64], torques: NDArray[np.float64], window_rad: float) -> str:
+    """Hash of what a motion asks for: equal for the same experiment after the same earlier ones."""
+    asked = hashlib.sha256()
+    for values in (positions, torques, np.array([window_rad])):
+        asked.update(np.ascontiguousarray(values, dtype=np.float64).tobytes())
+    return asked.hexdigest()
 
 
 def load(folder: Path) -> list[Trace]:
     """All traces that `Recordings` wrote to `folder`. Raises BadInput."""
+    _, entries = _read_list(folder)
+    try:
+        return [_trace(folder, entry) for entry in entries]
+    except ValueError as error:
+        raise _unreadable(folder / LIST, error) from None
+
+
+def _read_list(folder: Path) -> tuple[dict[str, Any], list[_Entry]]:
     path = folder / LIST
     try:
-        entries = json.loads(path.read_text(encoding="utf-8"))
-        return [_trace(folder, Kind(entry["kind"]), entry["file"], entry["settings"]) for entry in entries]
+        document = json.loads(path.read_text(encoding="utf-8"))
+        return {k: document[k] for k in ("conditions", "start_rad")}, [_Entry(**e) for e in document["experiments"]]
     except OSError as error:
         raise BadInput(str(path), error.strerror or str(error), "a folder that servoctl identify wrote") from None
     except (ValueError, KeyError, TypeError) as error:
-        raise BadInput(str(path), f"{type(error).__name__}: {error}", "the list that servoctl identify wrote") from None
+        raise _unreadable(path, error) from None
 
 
-def _trace(folder: Path, kind: Kind, name: str, settings: dict[str, float]) -> Trace:
-    recording = read_recording(folder / name)
+def _trace(folder: Path, entry: _Entry) -> Trace:
+    path = folder / entry.file
+    recording = read_recording(path)
     time_ns = np.asarray(recording.column("time_ns"), dtype=np.int64)
-    torque, position, reference, excitation, actual = (
+    torque, position, reference, excitation, actual, motor = (
         np.asarray(recording.column(column), dtype=np.float64) for column in _COLUMNS
     )
-    return Trace(kind, (time_ns - time_ns[0]) * 1e-9, torque, position, reference, excitation, actual, settings)
+    t_s = (time_ns - time_ns[0]) * 1e-9
+    kind, digest = Kind(entry.kind), _sha256(path)
+    return Trace(kind, t_s, torque, position, reference, excitation, actual, motor, entry.settings, digest)
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _unwritable(path: Path, error: OSError) -> BadInput:
+    return BadInput(str(path), error.strerror or str(error), "a file or folder that can be written")
+
+
+def _unreadable(path: Path, error: Exception) -> BadInput:
+    return BadInput(str(path), f"{type(error).__name__}: {error}", "the list that servoctl identify wrote")

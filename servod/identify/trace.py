@@ -30,7 +30,10 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True)
 class Trace:
-    """One motion, a value for each cycle in SI units; `settings` are what the fit must know of the experiment."""
+    """One motion, a value for each cycle in SI units; `settings` are what the fit must know of the experiment.
+
+    `motor_rad` is the joint's position by the amplifier's own sensor; `sha256` is the hash of the recording's file.
+    """
 
     kind: Kind
     t_s: Array
@@ -39,7 +42,9 @@ class Trace:
     reference_rad: Array
     excitation_nm: Array
     torque_actual_nm: Array
+    motor_rad: Array
     settings: dict[str, float] = field(default_factory=dict)
+    sha256: str = ""
 
     @property
     def period_s(self) -> float:
@@ -61,6 +66,7 @@ def trace_of(kind: Kind, rows: NDArray[np.void], settings: dict[str, float]) -> 
         rows["reference_rad"].copy(),
         rows["torque_other_nm"].copy(),
         rows["torque_actual_nm"].copy(),
+        rows["motor_position_rad"].copy(),
         settings,
     )
 

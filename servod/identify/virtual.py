@@ -18,6 +18,9 @@ from servod.yaml12 import validate
 RATED_RATIO, PEAK_RATIO = 1.43, 3.0
 #: The torque limit is reached from zero in a millisecond.
 RATE_PER_S = 1000.0
+#: A configured rated torque within this factor of what suits is taken for the drive's; any other is a wrong scale.
+ALIKE = 5.0
+ENCODER_COUNTS = 1_048_576
 SPEED_RAD_S, TRAVEL_RAD, FOLLOWING_RAD, MISMATCH_RAD = 3.0, 3.0, 0.5, 0.05
 
 
@@ -57,13 +60,37 @@ def virtual_config(folder: Path, rated_mnm: int, encoder_counts: int) -> AxisCon
 
 
 def virtual_session(
-    plant: AxisModel, folder: Path, encoder_counts: int, seed: int, config: AxisConfig | None = None
+    plant: AxisModel,
+    folder: Path,
+    encoder_counts: int | None,
+    seed: int,
+    config: AxisConfig | None = None,
+    settings: VirtualAxisSettings | None = None,
 ) -> SteppedSession:
-    """A session on the virtual axis, disabled, zero gains; a `config` of the user's replaces the one that suits."""
+    """A session on the virtual axis, disabled, zero gains; a `config` of the user's replaces the one that suits.
+
+    `settings` say what drive and encoder really are, right or wrong, as for servod-virtual-axis; without them they are
+    what suits the joint, with `encoder_counts` per turn (None: what the configuration says). Raises BadInput where the
+    configuration does not fit the devices.
+    """
     rated = rated_torque_mnm(plant)
-    config = config or virtual_config(folder, rated, encoder_counts)
-    settings = VirtualAxisSettings(
-        rated_torque_mnm=rated, encoder_counts_per_turn=config.encoder.counts_per_turn, seed=seed
-    )
+    config = config or virtual_config(folder, rated, encoder_counts or ENCODER_COUNTS)
+    settings = settings or _devices(config, rated, encoder_counts, seed)
     law = LAWS["pd"]
     return SteppedSession(config, SteppedWorld(settings, plant), law.number, (0.0,) * law.n_parameters)
+
+
+def _devices(config: AxisConfig, rated_mnm: int, encoder_counts: int | None, seed: int) -> VirtualAxisSettings:
+    """Node ids, bus and encoder of the configuration, and a drive that suits the joint."""
+    wanted = config.amplifier.rated_torque_mnm
+    if wanted is not None and rated_mnm / ALIKE <= wanted <= rated_mnm * ALIKE:
+        rated_mnm = wanted
+    return VirtualAxisSettings(
+        amplifier_node_id=config.amplifier.node_id,
+        encoder_node_id=config.encoder.node_id,
+        rated_torque_mnm=rated_mnm,
+        encoder_counts_per_turn=encoder_counts or config.encoder.counts_per_turn,
+        cycle_period_s=config.cycle.period_us * 1e-6,
+        bit_rate=config.bus.bit_rate,
+        seed=seed,
+    )

@@ -5,12 +5,15 @@ Above experiments and fits. The axis is switched off however the walk ends, Ctrl
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from servod.config import AxisConfig
 from servod.identify import store
 from servod.identify.analysis import Analysis, analyse, break_away_rad, of_kind
 from servod.identify.bounds import bounds_from
@@ -42,21 +45,37 @@ def identify(
     travel_rad: float | None = None,
     speed_rad_s: float | None = None,
     seed: int = 1,
+    resume: bool = False,
+    subject: str = "",
 ) -> Analysis:
     """Run every experiment, keep the recordings in the folder `out`, and fit them all.
 
-    `travel_rad` (to each side) and `speed_rad_s` narrow what the limits allow. Raises AnswerIsNo when the axis refuses,
-    faults, or tells nothing.
+    `travel_rad` (to each side) and `speed_rad_s` narrow what the limits allow. `resume`: experiments that `out` holds
+    already are not run again, as long as configuration and options are the same, and `subject`, a name or hash of what
+    is identified, too. Raises AnswerIsNo when the axis refuses, faults, is wired wrongly, or tells nothing.
     """
-    recordings = store.Recordings(out)
+    recordings = store.Recordings(out, _conditions(link.config, travel_rad, speed_rad_s, seed, subject), resume)
+    taken_up = recordings.start_rad is not None
     try:
-        bounds = bounds_from(link.config.limits, link.enable(), travel_rad, speed_rad_s)
-        bench = Bench(link, bounds, recordings.keep, np.random.default_rng(seed))
+        start_rad = link.enable() if recordings.start_rad is None else recordings.start_rad
+        recordings.begin(start_rad)
+        bounds = bounds_from(link.config.limits, start_rad, travel_rad, speed_rad_s)
+        rng = np.random.default_rng(seed)
+        bench = Bench(link, bounds, recordings, rng, start_rad=start_rad, enabled=not taken_up)
         _experiments(bench, tell)
     finally:
         link.disable()
     tell("fits", 0.97)
     return analyse(bench.traces)
+
+
+def _conditions(
+    config: AxisConfig, travel_rad: float | None, speed_rad_s: float | None, seed: int, subject: str
+) -> str:
+    """Hash of all that recordings of one walk must share; paths and services of the configuration do not count."""
+    parts = config.model_dump(mode="json", include={"cycle", "amplifier", "encoder", "limits"})
+    asked = json.dumps([parts, travel_rad, speed_rad_s, seed, subject], sort_keys=True)
+    return hashlib.sha256(asked.encode()).hexdigest()
 
 
 def _experiments(bench: Bench, tell: Tell) -> None:

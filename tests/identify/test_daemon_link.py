@@ -12,6 +12,7 @@ from servod.identify.daemon_link import DaemonLink
 from servod.identify.experiments import break_away
 from servod.identify.experiments.common import Bench
 from servod.identify.fits.break_away import torque_of
+from servod.identify.store import Recordings, load
 from tests.daemon.running import running
 
 pytestmark = pytest.mark.serial
@@ -21,11 +22,10 @@ def test_break_away_is_measured_through_the_daemon(tmp_path):
     with running(tmp_path) as axis, ControlClient(axis.socket) as client:
         link = DaemonLink(client, load_config(axis.folder / "axis.yaml"))
         bounds = bounds_from(link.config.limits, link.enable(), None, None)
-        kept: list[int] = []
-        bench = Bench(link, bounds, lambda rows, _trace: kept.append(len(rows)), np.random.default_rng(1))
+        bench = Bench(link, bounds, Recordings(tmp_path / "recordings"), np.random.default_rng(1))
         ramp = break_away.search(bench, 1.0)
         assert torque_of(ramp) == pytest.approx(0.0805, rel=0.1)  # the demo joint, forwards
         assert ramp.excitation_nm == pytest.approx(ramp.torque_nm, abs=1e-9)
-        assert kept == [len(ramp)]
+        assert [len(trace) for trace in load(tmp_path / "recordings")] == [len(ramp)]
         link.disable()
         assert client.call("status")["axis"]["state"] == "DISABLED"

@@ -110,19 +110,6 @@ def test_an_interrupt_leaves_the_axis_off(tmp_path):
     assert [t.kind.value for t in store.load(tmp_path / "recordings")] == ["noise", "break_away", "break_away"]
 
 
-def test_wrong_polarity_is_found_before_the_joint_moves_far(tmp_path):
-    joint = draw(4)
-    session = virtual_session(joint.model, tmp_path, joint.encoder_counts, 1)
-    turned = session.config.model_copy(
-        update={"encoder": session.config.encoder.model_copy(update={"direction": -1}), "limits": session.config.limits}
-    )
-    session = virtual_session(joint.model, tmp_path, joint.encoder_counts, 1, turned)
-    link = SteppedLink(session)
-    with pytest.raises(AnswerIsNo, match=r"torque_direction|ENCODER_IMPLAUSIBLE"):
-        identify(link, tmp_path / "recordings", lambda _what, _share: None)
-    assert abs(session.world.truth().position_rad) < 0.02
-
-
 def test_a_blocked_joint_is_said_to_be_blocked(tmp_path):
     joint = draw(5)
     friction = joint.model.friction.model_copy(update={"static": 1.0, "coulomb": 1.0})

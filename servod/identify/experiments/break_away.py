@@ -2,7 +2,7 @@
 
 Reason: it sets the scale of every later experiment, and static friction. Amplitude: an exponential ramp finds it from
 nothing, within the torque bound; linear ramps then measure it. Bounds: the torque fades out as soon as the joint has
-left a window of about a milliradian; no feedback acts, so a wrong polarity cannot run away, and is found here.
+left a window of about a milliradian; no feedback acts, so a wrong polarity cannot run away, and is found here (wiring).
 """
 
 from __future__ import annotations
@@ -10,7 +10,10 @@ from __future__ import annotations
 import numpy as np
 
 from servod.errors import AnswerIsNo
+from servod.identify.experiments import wiring
 from servod.identify.experiments.common import Bench
+from servod.identify.fits.break_away import torque_of
+from servod.identify.links import MotionEnded
 from servod.identify.shapes import growing, samples
 from servod.identify.trace import Kind, Trace
 
@@ -26,20 +29,22 @@ WINDOW_RAD, WINDOW_COUNTS = 1.2e-3, 25.0
 
 
 def search(bench: Bench, direction: float) -> Trace:
-    """The exponential ramp. Raises AnswerIsNo when nothing moves, or when it moves the wrong way."""
+    """The exponential ramp. Raises AnswerIsNo when nothing moves, or when signs or scales of the wiring are wrong."""
     ramp = direction * growing(FIRST_SHARE * bench.bounds.torque_nm, bench.bounds.torque_nm, SEARCH_S, bench.period_s)
-    trace = _ramp(bench, ramp, direction, True)
-    way = trace.position_rad - trace.position_rad[0]
-    moved = way[np.argmax(np.abs(way))]
-    if abs(moved) < window_rad(bench):
+    config, moved_rad = bench.link.config, 0.5 * window_rad(bench)
+    try:
+        trace = _ramp(bench, ramp, direction, True)
+    except MotionEnded as ended:
+        if ended.trace is not None:
+            wiring.check_motion(ended.trace, config, moved_rad)
+        raise
+    wiring.check_motion(trace, config, moved_rad)
+    if not np.isfinite(torque_of(trace)):
         raise AnswerIsNo(
-            f"the joint did not move under {bench.bounds.torque_nm:.3g} N*m; is it blocked or braked, or is "
-            "limits.torque_nm too small for its friction?"
+            f"the joint did not move under {bench.bounds.torque_nm:.3g} N*m; is it blocked or braked, is "
+            "limits.torque_nm too small for its friction, or is the scale of the torque wrong (0x6076, gear_ratio)?"
         )
-    if moved * direction < 0.0:
-        raise AnswerIsNo(
-            "positive torque moves the joint backwards; turn round amplifier.torque_direction or encoder.direction"
-        )
+    wiring.check_torque(torque_of(trace), bench.bounds.torque_nm, config.limits.torque_nm)
     return trace
 
 
@@ -58,7 +63,7 @@ def window_rad(bench: Bench) -> float:
 
 def _ramp(bench: Bench, ramp: np.ndarray[tuple[int], np.dtype[np.float64]], direction: float, search: bool) -> Trace:
     """Take the present position as reference, then ramp."""
-    bench.link.set_gains(0.0, 0.0)
+    bench.set_gains(0.0, 0.0)
     window = window_rad(bench)
     settings = {"direction": direction, "window_rad": window, "search": float(search)}
     return bench.run(Kind.BREAK_AWAY, np.zeros(len(ramp)), ramp, window, settings)

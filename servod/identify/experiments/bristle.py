@@ -26,9 +26,8 @@ def run(bench: Bench, break_away_nm: float) -> Trace:
     wave = multisine(lines, np.ones(len(lines)), count, bench.rng)
     wave *= SHARE * break_away_nm / float(np.max(np.abs(wave)))
     torque = np.concatenate([np.tile(wave, PERIODS), np.zeros(5)])
-    bench.link.set_gains(0.0, 0.0)
-    still = np.zeros(samples(0.5, bench.period_s))
-    bench.link.excite(still.tolist(), still.tolist(), bench.bounds.window_rad)  # the old feedback's torque dies away
+    bench.set_gains(0.0, 0.0)
+    bench.rest(0.5)  # the old feedback's torque dies away
     window = max(presliding.WINDOW_RAD, presliding.WINDOW_COUNTS * bench.resolution_rad)
     settings = {"count": float(count), "periods": float(PERIODS)}
     settings |= {f"line_{i}": float(line) for i, line in enumerate(lines)}

@@ -1,25 +1,46 @@
 """What the experiments share: the axis, the bounds, where recordings go, and how a motion is run.
 
-Between the walk and the links.
+Between the walk and the links. A motion that an interrupted walk has recorded already is not run again: the axis is
+enabled, and moved to where it has to be, only before the first motion that is missing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from servod.errors import AnswerIsNo
 from servod.identify.bounds import Bounds
-from servod.identify.links import Link
+from servod.identify.links import Link, MotionEnded
+from servod.identify.shapes import samples
+from servod.identify.store import motion_hash
 from servod.identify.trace import Kind, Trace, trace_of
 
 Array = NDArray[np.float64]
 
-#: Called with every recording as soon as it exists: its cycles, and the trace that the fits take.
-Keep = Callable[[NDArray[np.void], Trace], None]
+
+class Keeper(Protocol):
+    """Where recordings go, and where those of an interrupted walk come from (`store.Recordings`)."""
+
+    def recorded(self, kind: Kind, motion: str) -> Trace | None:
+        """The earlier recording of this motion, if there is one."""
+        ...
+
+    def keep(self, rows: NDArray[np.void], trace: Trace, motion: str) -> Trace:
+        """Keep a motion; returns its trace with the recording's hash."""
+        ...
+
+
+class _Move(NamedTuple):
+    """A move of the reference that nobody records."""
+
+    position_rad: float
+    gains: tuple[float, float]
+    speed_rad_s: float
 
 
 @dataclass
@@ -28,10 +49,14 @@ class Bench:
 
     link: Link
     bounds: Bounds
-    keep: Keep
+    keeper: Keeper
     rng: np.random.Generator
-    position_rad: float = 0.0  # of the reference, relative to where the axis stood at first
+    position_rad: float = 0.0  # of the reference, relative to `start_rad`
+    start_rad: float = 0.0  # where the axis stood when the walk began
+    enabled: bool = True
     traces: list[Trace] = field(default_factory=list)
+    _gains: tuple[float, float] = (0.0, 0.0)
+    _missed: _Move | None = None  # what has to be made up for before the first motion that is really run
 
     @property
     def period_s(self) -> float:
@@ -43,30 +68,71 @@ class Bench:
         """Angle of one count of the joint's encoder."""
         return 2.0 * np.pi / self.link.config.encoder.counts_per_turn
 
+    def set_gains(self, position_nm_per_rad: float, velocity_nms_per_rad: float) -> None:
+        """PD feedback of the motions to come."""
+        self._gains = (position_nm_per_rad, velocity_nms_per_rad)
+        if self.enabled:
+            self.link.set_gains(*self._gains)
+
     def run(self, kind: Kind, positions: Array, torques: Array, window_rad: float, settings: dict[str, float]) -> Trace:
         """Run one motion, keep its recording, return its trace. Raises AnswerIsNo when the bounds forbid it."""
         self._check(positions, torques)
         window_rad = min(window_rad, self.bounds.window_rad)
-        rows = self.link.excite(positions.tolist(), torques.tolist(), window_rad)
+        motion = motion_hash(positions, torques, window_rad)
+        trace = self.keeper.recorded(kind, motion) if not self.enabled else None
+        if trace is None:
+            trace = self._record(kind, motion, positions, torques, window_rad, settings)
         self.position_rad += float(positions[-1])
-        trace = trace_of(kind, rows, {"resolution_rad": self.resolution_rad, **settings})
         self.traces.append(trace)
-        self.keep(rows, trace)
         return trace
 
     def go_to(self, position_rad: float, gains: tuple[float, float], speed_rad_s: float) -> None:
         """Move the reference to `position_rad` (relative to the start), without recording it."""
-        way = position_rad - self.position_rad
-        duration_s = max(0.2, 0.5 * np.pi * abs(way) / speed_rad_s)
-        t = np.linspace(0.0, 1.0, max(2, round(duration_s / self.period_s)))
-        path = way * (0.5 - 0.5 * np.cos(np.pi * t))
-        self.link.set_gains(*gains)
-        self.link.excite(path.tolist(), np.zeros(len(path)).tolist(), self.bounds.window_rad)
+        self.set_gains(*gains)
+        if self.enabled:
+            way = position_rad - self.position_rad
+            duration_s = max(0.2, 0.5 * np.pi * abs(way) / speed_rad_s)
+            t = np.linspace(0.0, 1.0, max(2, round(duration_s / self.period_s)))
+            self._excite(way * (0.5 - 0.5 * np.cos(np.pi * t)), np.zeros(len(t)))
+        else:
+            self._missed = _Move(position_rad, gains, speed_rad_s)
         self.position_rad = position_rad
+
+    def rest(self, duration_s: float) -> None:
+        """Wait under the present gains, without recording it."""
+        if self.enabled:
+            still = np.zeros(samples(duration_s, self.period_s))
+            self._excite(still, still)
 
     def of(self, *kinds: Kind) -> list[Trace]:
         """Traces of these kinds so far."""
         return [trace for trace in self.traces if trace.kind in kinds]
+
+    def _record(
+        self, kind: Kind, motion: str, positions: Array, torques: Array, window_rad: float, settings: dict[str, float]
+    ) -> Trace:
+        """Run the motion on the axis. Raises MotionEnded, with its trace, when the axis drops out."""
+        self._wake()
+        settings = {"resolution_rad": self.resolution_rad, **settings}
+        try:
+            rows = self.link.excite(positions.tolist(), torques.tolist(), window_rad)
+        except MotionEnded as ended:
+            ended.trace = trace_of(kind, ended.rows, settings) if len(ended.rows) else None
+            raise
+        return self.keeper.keep(rows, trace_of(kind, rows, settings), motion)
+
+    def _wake(self) -> None:
+        """Enable the axis, if it is not yet, and bring it to where the walk has come."""
+        if self.enabled:
+            return
+        gains, self.enabled = self._gains, True
+        self.position_rad = self.link.enable() - self.start_rad
+        if self._missed is not None:
+            self.go_to(*self._missed)
+        self.set_gains(*gains)
+
+    def _excite(self, positions: Array, torques: Array) -> None:
+        self.link.excite(positions.tolist(), torques.tolist(), self.bounds.window_rad)
 
     def _check(self, positions: Sequence[float] | Array, torques: Array) -> None:
         farthest = np.max(np.abs(np.asarray(positions) + self.position_rad - self.bounds.centre_rad))

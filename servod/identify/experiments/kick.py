@@ -36,7 +36,7 @@ def run(bench: Bench, break_away_nm: tuple[float, float]) -> list[Trace]:
 
 
 def _kick(bench: Bench, torque_nm: float, duration_s: float) -> Trace:
-    bench.link.set_gains(0.0, 0.0)
+    bench.set_gains(0.0, 0.0)
     size = np.sign(torque_nm) * min(TORQUE_RATIO * abs(torque_nm), bench.bounds.torque_nm)
     lead, push = samples(LEAD_S, bench.period_s), samples(duration_s, bench.period_s)
     torque = np.zeros(lead + push + samples(COAST_S + duration_s, bench.period_s))

@@ -17,5 +17,5 @@ DURATION_S = 1.5
 def run(bench: Bench) -> Trace:
     """Record a rest under zero gains."""
     still = np.zeros(samples(DURATION_S, bench.period_s))
-    bench.link.set_gains(0.0, 0.0)
+    bench.set_gains(0.0, 0.0)
     return bench.run(Kind.NOISE, still, still, bench.bounds.window_rad, {})

@@ -29,7 +29,7 @@ WINDOW_COUNTS, WINDOW_RAD = 12.0, 1e-3
 
 def burst(bench: Bench, break_away_nm: float, share: float) -> Trace:
     """One burst at the present position; `break_away_nm` of the weaker direction."""
-    bench.link.set_gains(0.0, 0.0)
+    bench.set_gains(0.0, 0.0)
     duration_s = FADE_IN_S + CYCLES / FREQUENCY_HZ + TAIL_S
     t = times(duration_s, bench.period_s)
     torque = share * break_away_nm * fade_in(t, FADE_IN_S) * np.sin(2.0 * np.pi * FREQUENCY_HZ * t)

@@ -62,7 +62,7 @@ def run(bench: Bench, inertia: float, gains: tuple[float, float]) -> Trace:
         torque[start + settle : start + settle + count] = excitation.wave
     start_rad = -0.5 * float(path.max())
     bench.go_to(bench.bounds.centre_rad + start_rad, gains, 0.5 * speed)
-    bench.link.set_gains(*gains)
+    bench.set_gains(*gains)
     settings = {"first": float(starts[0] + settle), "stride": float(starts[1] - starts[0]), "count": float(count)}
     settings |= {"strokes": float(STROKES), "speed_rad_s": speed, "kp": gains[0], "kd": gains[1]}
     settings |= {f"line_{i}": float(line) for i, line in enumerate(excitation.lines)}
