@@ -22,8 +22,14 @@ LAYERS: list[set[str]] = [
     {"identify"},
     {"verify"},
     {"synthesize"},
+    {"diagnose"},
+    {"deploy"},
     {"demo"},
-    {"report", "benchmark"},
+    {"report"},
+    {"tracking"},
+    {"tune"},
+    {"commission"},
+    {"benchmark"},
     {"cli"},
 ]
 LAYER_OF = {name: rank for rank, names in enumerate(LAYERS) for name in names}

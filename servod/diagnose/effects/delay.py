@@ -1,0 +1,34 @@
+"""Delay: the torque comes later than the model says."""
+
+from __future__ import annotations
+
+from servod.diagnose.effects.effect import Effect, simple
+from servod.diagnose.hypothesis import Term, Unknown, get
+from servod.diagnose.scene import Scene
+
+#: Delays to start from, s.
+STARTS_S = (0.003, 0.008, 0.02)
+
+
+def terms(scene: Scene) -> list[Term]:
+    """Some starts: the cost has a valley for each wave of the excitation."""
+    own = get(scene.document, "delay_s", 0.001)
+    found = []
+    for start in STARTS_S:
+        unknown = Unknown("additional_s", "s", start, -min(own, 0.001), 0.1, 2e-3)
+        found.append(simple("delay", "dead time", [unknown]))
+    return found
+
+
+EFFECT = Effect(
+    name="delay",
+    group="delay",
+    equation="torque(t) = command(t - delay_s - additional_s)",
+    source="bus cycles, filters, scheduling in the drive",
+    statement="The torque comes later than the model says: a dead time",
+    shows="a mismatch in proportion to the change of the command, whatever the speed",
+    confused=("actuator_lag", "joint_elasticity", "inertia"),
+    experiment="steps of command, sampled faster than the delay: dead time waits, lag begins at once",
+    terms=terms,
+    far=True,
+)

@@ -1,0 +1,40 @@
+"""Torque saturation: large commands make less torque than asked."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from servod.diagnose.effects.effect import Effect, simple
+from servod.diagnose.hypothesis import Term, Unknown
+from servod.diagnose.scene import Scene
+
+#: Quantiles of the command at which a limit is looked for.
+QUANTILES = (0.9, 0.97, 0.995)
+
+
+def terms(scene: Scene) -> list[Term]:
+    """A hard limit from some quantiles of the command, and a smooth one."""
+    found = []
+    most = float(np.max(np.abs(scene.torque)))
+    for quantile in QUANTILES:
+        limit = max(float(np.quantile(np.abs(scene.torque), quantile)), 0.05 * most)
+        unknown = Unknown("limit", scene.force, 0.9 * limit, 0.1 * limit, 1.05 * most)
+        found.append(simple("torque_saturation", "hard", [unknown], shape="hard"))
+    for factor in (0.7, 1.5):
+        unknown = Unknown("limit", scene.force, factor * most, 0.1 * most, 4.0 * most)
+        found.append(simple("torque_saturation", "tanh", [unknown], shape="tanh"))
+    return found
+
+
+EFFECT = Effect(
+    name="torque_saturation",
+    group="torque_saturation",
+    equation="torque = clip(torque, -limit, limit), or limit*tanh(torque/limit)",
+    source="current limits; saturation of the iron: Krause et al., Analysis of Electric Machinery, 2013",
+    statement="Large commands make less torque than they ask for: the torque saturates",
+    shows="a mismatch against the command at the largest commands alone",
+    confused=("viscous_nonlinear", "torque_gain", "actuator_lag"),
+    experiment="short steps of growing command at rest or low speed",
+    terms=terms,
+    far=True,
+)

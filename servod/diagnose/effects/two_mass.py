@@ -1,0 +1,53 @@
+"""What `joint_elasticity` and `backlash` share: a part of the inertia behind a spring."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from servod.diagnose.hypothesis import Document, Reported, Term, Unknown, get
+from servod.diagnose.scene import Scene
+
+#: Share of critical damping that the joint's spring starts with.
+DAMPING = 0.05
+
+
+def two_mass_term(effect: str, scene: Scene, load: float, resonance: float, gap: float = 0.0) -> Term:
+    """A term with a share of the inertia behind a spring that resonates at `resonance` rad/s, and a gap if any."""
+    inertia = scene.inertia
+    stiffness = resonance**2 * inertia * load * (1.0 - load)
+    damping = 2.0 * DAMPING * math.sqrt(stiffness * inertia * load * (1.0 - load))
+    per = f"{scene.force}/{scene.length}"
+    unknowns = [
+        Unknown("load_share", "1", load, 0.03, 0.97, 0.3),
+        Unknown("stiffness", per, stiffness, stiffness / 300.0, stiffness * 300.0),
+        Unknown("damping", f"{scene.force}·s/{scene.length}", damping, damping / 300.0, damping * 300.0),
+    ]
+    if gap > 0.0:
+        unknowns.append(Unknown("gap", scene.length, gap, gap / 50.0, gap * 50.0))
+
+    def values_of(document: Document, values: Sequence[float]) -> dict[str, float]:
+        found = {
+            "load_inertia": values[0] * get(document, "inertia"),
+            "stiffness": values[1],
+            "damping": values[2],
+            "load_viscous": 0.2 * get(document, "friction.viscous"),
+        }
+        return found | ({"gap": values[3]} if len(values) > 3 else {})
+
+    def write(document: Document, values: Sequence[float]) -> None:
+        found = values_of(document, values)
+        if effect == "backlash" and "joint_elasticity" in document:
+            found = {"gap": found["gap"]}
+        elif effect == "joint_elasticity" and "backlash" in document:
+            document["backlash"] = {"gap": document["backlash"]["gap"]}
+        document[effect] = found
+
+    def tell(document: Document, values: Sequence[float]) -> list[Reported]:
+        units = {"load_inertia": "kg·m²", "stiffness": per, "gap": scene.length}
+        other = f"{scene.force}·s/{scene.length}"
+        return [
+            Reported(k, v, units.get(k, other)) for k, v in values_of(document, values).items() if k != "load_viscous"
+        ]
+
+    return Term(effect, "two masses", tuple(unknowns), write, tell)

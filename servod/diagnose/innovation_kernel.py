@@ -1,0 +1,81 @@
+"""One-step predictions of a recorded motion, as a kernel: the model under the recorded command, pulled to the encoder.
+
+Compiled by `servod.diagnose.predict`. Between two rows the model runs freely; at each row its motion is corrected by
+fixed gains. What is left at a row before the correction is the innovation: noise when the model is right (Ljung,
+System Identification, 1999, ch. 7: prediction-error methods).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from servod.diagnose.sample_step import step
+from servod.models.effects import encoder_position, heat, thermal_factors
+from servod.models.friction import Params
+from servod.models.layout import (
+    P_DELAY_S,
+    S_FRICTION,
+    S_LOAD_POSITION,
+    S_LOAD_VELOCITY,
+    S_POSITION,
+    S_TIME_S,
+    S_VELOCITY,
+)
+from servod.models.open_loop import acting, begin, piece_end, switch_row
+
+
+def innovate(
+    p: Params,
+    s: Any,
+    t: Any,
+    torque: Sequence[float],
+    before: float,
+    temperature: Any,
+    position: Any,
+    steps: Any,
+    position_gain: Any,
+    velocity_gain: Any,
+    load_share: float,
+    starts: Any,
+    start_states: Any,
+    out: Any,
+) -> None:
+    """Fill `out` with recorded minus predicted position of each row.
+
+    `steps` are inner steps from each row to the next; `position_gain` and `velocity_gain` (1/s) the shares of the
+    innovation that correct the motion at each row, `load_share` of them for the load. Rows in `starts` begin anew from
+    the rows of `start_states` (position, velocity, bristle, load position, load velocity, actuator torque).
+    """
+    window, row, last, acceleration = 0, -1, len(t) - 1, 0.0
+    for k in range(len(t)):
+        s[S_TIME_S] = t[k]
+        if window < len(starts) and starts[window] == k:
+            begin(s, start_states[window])
+            window += 1
+        off = position[k] - encoder_position(p, s[S_POSITION])
+        out[k] = off
+        if k == last:
+            break
+        correct(s, position_gain[k] * off, velocity_gain[k] * off, load_share)
+        now, whole = t[k], t[k + 1] - t[k]
+        dry, viscous = thermal_factors(p, s, temperature[k])
+        loss = 0.0
+        while now < t[k + 1]:
+            row = switch_row(t, row, now, p[P_DELAY_S])
+            end = piece_end(t, row, p[P_DELAY_S], t[k + 1])
+            count = max(1, round(steps[k] * (end - now) / whole))
+            command, h = acting(torque, row, before), (end - now) / count
+            for _ in range(count):
+                acceleration = step(p, s, command, h, acceleration, dry, viscous)
+                loss += s[S_FRICTION] * s[S_VELOCITY] * h
+            now = end
+        heat(p, s, loss, whole, temperature[k])
+
+
+def correct(s: Any, shift: float, push: float, load_share: float) -> None:
+    """Correct the motion of the motor, and by `load_share` of it that of the load."""
+    s[S_POSITION] += shift
+    s[S_LOAD_POSITION] += load_share * shift
+    s[S_VELOCITY] += push
+    s[S_LOAD_VELOCITY] += load_share * push
