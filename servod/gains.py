@@ -194,11 +194,20 @@ def require_certificate(gains: GainSet, accept_uncertified: bool) -> None:
 def require_fit(gains: GainSet, config: AxisConfig) -> None:
     """Refuse a set that this axis may not run: no valid certificate, or one for another cycle or velocity filter.
 
-    What was certified is the sampled loop with its delay and its filter; with others the proof says nothing.
     Raises BadInput, unless the configuration accepts uncertified sets.
     """
     require_certificate(gains, config.gains.accept_uncertified)
-    if gains.design is None or config.gains.accept_uncertified:
+    if not config.gains.accept_uncertified:
+        require_same_loop(gains, config)
+
+
+def require_same_loop(gains: GainSet, config: AxisConfig) -> None:
+    """Refuse a set whose design is for another cycle or velocity filter than the axis has.
+
+    What was certified is the sampled loop with its delay and its filter; with others the proof says nothing.
+    Raises BadInput.
+    """
+    if gains.design is None:
         return
     design, cutoff_hz = gains.design, config.encoder.velocity_cutoff_hz
     period_s = config.cycle.period_us * NS_PER_US / NS_PER_S

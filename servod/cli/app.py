@@ -19,6 +19,7 @@ from servod.cli import (
     bench,
     check,
     demo,
+    deploy,
     enable,
     faults,
     gains,
@@ -46,7 +47,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 _DAEMON = (demo, scan, status, enable, stop, track, gains, preset, record)
-_LABORATORY = (identify, synthesize, verify, replay)
+_LABORATORY = (identify, synthesize, verify, deploy, replay)
 for _verb in (*_DAEMON, *_LABORATORY, bench, check, faults):
     _verb.register(app)
 

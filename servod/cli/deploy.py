@@ -1,0 +1,102 @@
+"""`servoctl deploy`: try a certified gain set on the axis, and keep it only when it proves itself there."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, connect, example, one_thread, print_json
+from servod.cli.progress import progress
+from servod.errors import AnswerIsNo, BadInput
+
+if TYPE_CHECKING:
+    from servod.config import AxisConfig
+    from servod.deploy.links import DeployLink
+    from servod.gains import GainSet
+
+_HELP = example(
+    "Run a validation motion (20 mrad to each side, 13 s) under the present set and under GAINS, and keep GAINS only "
+    "when it is no worse and does what its certificate promised; else, and on Ctrl-C, the present set stays.",
+    "servoctl deploy gains.yaml",
+    "servoctl deploy gains.yaml --plant joint.yaml --present old.yaml",
+)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb to `app`."""
+    app.command("deploy", help=_HELP)(deploy)
+
+
+def deploy(
+    gains: Annotated[Path, typer.Argument(help="Gain set with a certificate, YAML.")],
+    plant: Annotated[Path | None, typer.Option(help="Start a virtual axis with this joint, SYNC-stepped.")] = None,
+    present: Annotated[Path | None, typer.Option(help="Virtual axis: the set that runs before.")] = None,
+    config: Annotated[Path | None, typer.Option(help="Virtual axis: its configuration.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Virtual axis: seed of its noise.")] = 1,
+    socket: SocketOption = DEFAULT_SOCKET,
+    as_json: JsonOption = False,
+) -> None:
+    """Deploy GAINS; exit code 1 when the axis was rolled back."""
+    one_thread()
+    from servod.deploy.deployment import deploy
+    from servod.gains import load_gains
+
+    wanted = load_gains(gains)
+    if present is not None and plant is None:
+        raise BadInput("--present", str(present), "only with --plant: a daemon knows what runs")
+    axis = _on_daemon(socket) if plant is None else _virtual(plant, present, config, wanted, seed)
+    with axis as link, progress("deploy", quiet=as_json) as tell:
+        done = deploy(link, wanted, tell)
+    document = done.document()
+    if as_json:
+        print_json(document)
+    else:
+        _print(document)
+    if not done.stays:
+        raise AnswerIsNo(f"rolled back to {done.present[0]} version {done.present[1]}: {'; '.join(done.reasons)}")
+
+
+@contextmanager
+def _on_daemon(socket: Path) -> Iterator[DeployLink]:
+    from servod.demo.processes import sigterm_as_interrupt
+    from servod.deploy.daemon_link import DaemonDeployLink
+
+    with connect(socket) as client, sigterm_as_interrupt():
+        yield DaemonDeployLink(client)
+
+
+@contextmanager
+def _virtual(
+    plant: Path, present: Path | None, config: Path | None, wanted: GainSet, seed: int
+) -> Iterator[DeployLink]:
+    from servod.axis_model import load_axis_model
+    from servod.config import load_config
+    from servod.deploy.virtual import virtual_link
+    from servod.gains import load_gains
+
+    joint = load_axis_model(plant)
+    chosen: AxisConfig | None = load_config(config) if config is not None else None
+    before = load_gains(present) if present is not None else None
+    with tempfile.TemporaryDirectory(prefix="servod-deploy-") as folder:
+        yield virtual_link(joint, Path(folder), wanted, before, seed, chosen)
+
+
+def _print(document: dict[str, Any]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("Figure", "Before", "After", "Promised", title="Validation motion, mrad")
+    for name, before in document["before"].items():
+        after = document["after"][name] if document["after"] else None
+        row = [f"{value:.4g}" if value is not None else "none" for value in (before, after, document["promised"][name])]
+        table.add_row(name.removesuffix("_mrad"), *row)
+    console = Console()
+    console.print(table)
+    if document["deployed"]:
+        gains = document["gains"]
+        console.print(f"deployed: {gains['name']} version {gains['version']}", highlight=False)

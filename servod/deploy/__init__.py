@@ -1,0 +1,6 @@
+"""Deployment with proof: a certified set is tried on the axis, measured against what it replaces and what it promised.
+
+links.py       the axis that it is tried on: SYNC-stepped, or under a running daemon
+judge.py       what makes a set stay or go, in numbers
+deployment.py  the trial itself
+"""

@@ -1,0 +1,119 @@
+"""The link to an axis under a running daemon: its verbs over the control socket, its recordings from disk.
+
+Beside `links`, which states the protocol. The trial is the daemon's own: when this client dies in the middle, the
+daemon goes back to the set of before by itself.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from servod.config import AxisConfig
+from servod.control import ControlClient, Verb
+from servod.deploy.links import FADE_S, Rows, Tell
+from servod.errors import AnswerIsNo, ServodError, Unreachable
+from servod.gains import GainSet
+from servod.recorder_read import read_recording
+from servod.recordings.rows import ROW
+from servod.verify.validation import STEP_S, ValidationMotion
+from servod.yaml12 import parse_yaml, validate
+
+_POLL_S = 0.05
+
+
+class DaemonDeployLink:
+    """An axis on the wall clock; its configuration is what the daemon attaches to its recordings."""
+
+    def __init__(self, client: ControlClient) -> None:
+        self._client = client
+        self.config = _config_of(client)
+
+    @property
+    def active(self) -> tuple[str, int]:
+        """The set that the loop runs."""
+        running = next((row for row in self._client.call(Verb.GAINS_LIST)["gains"] if row["active"]), None)
+        if running is None:
+            raise AnswerIsNo("the daemon's gain set is not in its store")
+        return str(running["name"]), int(running["version"])
+
+    @property
+    def enabled(self) -> bool:
+        """Whether the axis is enabled."""
+        return bool(self._client.call(Verb.STATUS)["axis"]["state"] == "ENABLED")
+
+    def enable(self) -> None:
+        """Enable, and let what is held come to rest."""
+        self._client.call(Verb.ENABLE)
+        time.sleep(FADE_S)
+
+    def disable(self) -> None:
+        """Ask for it; an axis that is off already, or a daemon that is gone, needs none."""
+        with contextlib.suppress(ServodError):
+            self._client.call(Verb.DISABLE)
+
+    def stop(self) -> None:
+        """The drive's quick stop."""
+        with contextlib.suppress(ServodError):
+            self._client.call(Verb.STOP)
+
+    def run(self, motion: ValidationMotion, window_rad: float, tell: Tell) -> Rows:
+        """Run the motion under the daemon's recorder and read its cycles back."""
+        sines, path = motion.sines.tolist(), Path(self._client.call(Verb.RECORD_START)["path"])
+        started = time.monotonic()
+
+        def move(**arguments: Any) -> None:
+            self._client.call(Verb.TRACK, **arguments)
+            while self._moves():
+                tell(min(1.0, (time.monotonic() - started) / motion.duration_s))
+
+        try:
+            move(kind="excite", positions_rad=sines, torques_nm=[0.0] * len(sines), window_rad=window_rad)
+            for step_rad in (motion.step_rad, -motion.step_rad):
+                move(kind="step", amplitude_rad=step_rad, duration_s=STEP_S)
+        finally:
+            self._client.call(Verb.RECORD_STOP)
+        return np.frombuffer(read_recording(path).rows, dtype=ROW)
+
+    def load(self, gains: GainSet) -> tuple[str, int]:
+        """Put a set into the daemon's store."""
+        stored = self._client.call(Verb.GAINS_LOAD, name=gains.name, text=gains.to_yaml())
+        return str(stored["name"]), int(stored["version"])
+
+    def attempt(self, name: str, version: int) -> None:
+        """Change to a stored set on trial."""
+        self._client.call(Verb.GAINS_ACTIVATE, name=name, version=version, trial=True)
+        time.sleep(FADE_S)
+
+    def keep(self, note: str, figures: dict[str, float]) -> None:
+        """Make the set on trial the active one."""
+        self._client.call(Verb.GAINS_KEEP, note=note, figures=figures)
+
+    def give_up(self, note: str, figures: dict[str, float]) -> None:
+        """Change back to the active set."""
+        self._client.call(Verb.GAINS_ROLLBACK, note=note, figures=figures)
+
+    def _moves(self) -> bool:
+        """Wait a little; whether the motion still runs. Raises AnswerIsNo when the axis is not enabled any more."""
+        time.sleep(_POLL_S)
+        status = self._client.call(Verb.STATUS)
+        if status["axis"]["state"] != "ENABLED":
+            why = "; ".join(f"{f['code']}: {f['cause']} {f['remedy']}" for f in status["faults"])
+            raise AnswerIsNo(f"the axis went to {status['axis']['state']}. {why}")
+        return bool(status["axis"]["motion_running"])
+
+
+def _config_of(client: ControlClient) -> AxisConfig:
+    """The daemon's configuration, out of a recording of a moment."""
+    path = Path(client.call(Verb.RECORD_START)["path"])
+    client.call(Verb.RECORD_STOP)
+    attached = read_recording(path).attachments.get("config.yaml")
+    if attached is None:
+        raise Unreachable(f"{path}: the daemon attached no configuration")
+    with contextlib.suppress(OSError):  # it may be the daemon's alone
+        path.unlink()
+    return validate(parse_yaml(attached.decode(), str(path)), AxisConfig, str(path))

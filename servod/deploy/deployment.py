@@ -1,0 +1,201 @@
+"""The trial of a gain set on an axis: the same motion before and after the change, a verdict, and the way back.
+
+Above link and judge. However it ends (verdict, fault, Ctrl-C), the set that runs afterwards is one that was meant to:
+the new one when it proved itself, else the one of before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servod.config import AxisConfig
+from servod.deploy.judge import complaints
+from servod.deploy.links import DeployLink, Rows
+from servod.errors import FAULTS, AnswerIsNo, BadInput, Reaction, faults_in
+from servod.gain_design import Design
+from servod.gains import GainSet, Promise, require_certificate, require_same_loop
+from servod.verify.validation import Figures, ValidationMotion, motion_for
+
+#: Told what is done, and the share of the whole that is.
+Tell = Callable[[str, float], None]
+
+#: The joint may be so many times the motion's travel away from the reference; at most this share of the limit.
+WINDOW_TRAVELS, WINDOW_SHARE = 3.0, 0.85
+#: Faults that say that a value had to be limited.
+_CLIPS = sum(fault.bit for fault in FAULTS.values() if fault.reaction == Reaction.CLIP)
+
+
+@dataclass(frozen=True)
+class Deployment:
+    """How a deployment ended. `stays`: the new set runs; else the one before does, and `reasons` say why."""
+
+    stays: bool
+    reasons: tuple[str, ...]
+    name: str
+    version: int
+    present: tuple[str, int]
+    promised: Promise
+    before: Figures
+    after: Figures | None
+    rows_before: Rows
+    rows_after: Rows | None
+
+    def document(self) -> dict[str, Any]:
+        """Plain values, figures in mrad."""
+        return {
+            "deployed": self.stays,
+            "reasons": list(self.reasons),
+            "gains": {"name": self.name, "version": self.version},
+            "present": {"name": self.present[0], "version": self.present[1]},
+            "before": self.before.document(),
+            "after": self.after and self.after.document(),
+            "promised": {f"{k.removesuffix('_rad')}_mrad": 1e3 * v for k, v in _figures(self.promised).items()},
+        }
+
+
+def deploy(link: DeployLink, gains: GainSet, tell: Tell) -> Deployment:
+    """Try `gains` on the axis and keep it when it proves itself; the axis is left enabled or not, as it was.
+
+    Raises BadInput when the set is not certified, promises nothing or is for another loop, AnswerIsNo when the axis
+    does not get through the motion under its present set. An interrupt stops the axis, leaves it off and the present
+    set active.
+    """
+    design, promised = admitted(gains, link.config)
+    motion = motion_for(design)
+    window_rad = min(WINDOW_TRAVELS * motion.travel_rad, WINDOW_SHARE * link.config.limits.following_error_rad)
+    was_enabled = link.enabled
+    trial = _Trial(link, motion, window_rad, promised, tell)
+    try:
+        if not was_enabled:
+            tell("enable", 0.0)
+            link.enable()
+        return trial.run(gains)
+    except BaseException:
+        link.stop()
+        trial.abandon("it was interrupted")
+        raise
+    finally:
+        if not was_enabled:
+            link.disable()
+
+
+def admitted(gains: GainSet, config: AxisConfig) -> tuple[Design, Promise]:
+    """Design and promise of a set that may be tried on this axis. Raises BadInput."""
+    require_certificate(gains, accept_uncertified=False)
+    require_same_loop(gains, config)
+    assert gains.certificate is not None
+    if gains.design is None or gains.certificate.promised is None:
+        raise BadInput(
+            f"gain set {gains.name}: certificate.promised", "nothing", "a promise; `servoctl verify` writes it anew"
+        )
+    return gains.design, gains.certificate.promised
+
+
+class _Trial:
+    """One trial: what it has done so far, so that it can be undone at any moment."""
+
+    def __init__(
+        self, link: DeployLink, motion: ValidationMotion, window_rad: float, promised: Promise, tell: Tell
+    ) -> None:
+        self._link, self._motion, self._window_rad = link, motion, window_rad
+        self._promised, self._tell = promised, tell
+        self._count_rad = 2.0 * np.pi / link.config.encoder.counts_per_turn
+        self._on_trial = False
+
+    def run(self, gains: GainSet) -> Deployment:
+        """Before, change, after, verdict."""
+        link, present = self._link, self._link.active
+        rows_before = self._move("under the present set", 0.05)
+        before = self._figures(rows_before)
+        name, version = link.load(gains)
+        if (name, version) != present:
+            self._tell("change of the set", 0.48)
+            self._on_trial = True
+            link.attempt(name, version)
+        rows_after, after, reasons = self._after(before)
+        self._end(before, after, reasons)
+        return Deployment(
+            stays=not reasons,
+            reasons=tuple(reasons),
+            name=name,
+            version=version,
+            present=present,
+            promised=self._promised,
+            before=before,
+            after=after,
+            rows_before=rows_before,
+            rows_after=rows_after,
+        )
+
+    def abandon(self, why: str) -> None:
+        """Back to the present set, when another one is on trial."""
+        if self._on_trial:
+            self._on_trial = False
+            self._link.give_up(why, {})
+
+    def _after(self, before: Figures) -> tuple[Rows | None, Figures | None, list[str]]:
+        """The motion under the new set: cycles, figures, and what speaks against it."""
+        try:
+            rows = self._move("under the new set", 0.52)
+        except AnswerIsNo as error:
+            return None, None, [str(error)]
+        try:
+            after = self._figures(rows)
+        except AnswerIsNo as error:
+            return rows, None, [str(error)]
+        return rows, after, [*limits_met(rows), *complaints(before, after, self._promised, self._count_rad)]
+
+    def _end(self, before: Figures, after: Figures | None, reasons: list[str]) -> None:
+        figures = {f"before_{key}": value for key, value in before.document().items()}
+        figures |= {f"after_{key}": value for key, value in (after.document() if after else {}).items()}
+        self._tell("verdict", 1.0)
+        if not self._on_trial:
+            return
+        self._on_trial = False
+        if reasons:
+            self._link.give_up("; ".join(reasons)[:4000], figures)
+        else:
+            self._link.keep("proven by the validation motion", figures)
+
+    def _move(self, what: str, share: float) -> Rows:
+        self._tell(what, share)
+        return self._link.run(self._motion, self._window_rad, lambda done: self._tell(what, share + 0.43 * done))
+
+    def _figures(self, rows: Rows) -> Figures:
+        """Raises AnswerIsNo when the motion was not run to its end."""
+        parts = [_every_cycle(part) for part in motions_in(rows)]
+        try:
+            sines, up, down = parts
+            return self._motion.figures(sines[0] - sines[1], (up[1], down[1]))
+        except ValueError:
+            raise AnswerIsNo(
+                f"the joint left its window of {1e3 * self._window_rad:.3g} mrad around the reference"
+            ) from None
+
+
+def motions_in(rows: Rows) -> list[Rows]:
+    """The stretches of `rows` in which a reference motion ran."""
+    edges = np.flatnonzero(np.diff(rows["reference_active"] == 1, prepend=False, append=False))
+    return [rows[start:end] for start, end in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def limits_met(rows: Rows) -> list[str]:
+    """What had to be limited in these cycles, by the table of faults."""
+    met = int(np.bitwise_or.reduce(rows["faults"])) & _CLIPS
+    return [f"{fault.code.name}: {fault.cause}" for fault in faults_in(met)]
+
+
+def _every_cycle(rows: Rows) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(reference, position) at every cycle; cycles that the loop skipped are put between their neighbours."""
+    cycle = rows["cycle"] - rows["cycle"][0]
+    every = np.arange(int(cycle[-1]) + 1)
+    return np.interp(every, cycle, rows["reference_rad"]), np.interp(every, cycle, rows["position_rad"])
+
+
+def _figures(promised: Promise) -> dict[str, float]:
+    return {key: value for key, value in promised.model_dump().items() if key.endswith("_rad")}

@@ -1,0 +1,66 @@
+"""Whether a tried set stays: its figures against those of the set before, and against its own promise.
+
+Plain numbers in, sentences out; between the trial and everybody who has to understand its end.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from servod.gains import Promise
+from servod.verify.validation import PART_TEXT, Figures, Part
+
+#: Worse than before: above its mean by this share, and by so many standard errors of both, and by a count of noise.
+WORSE_SHARE, STANDARD_ERRORS = 0.1, 3.0
+#: A broken promise: above the worst promised plant by this share, and by so many encoder counts.
+PROMISE_SHARE = 0.3
+SINE_COUNTS, HOLD_COUNTS = 1.0, 4.0
+
+
+def complaints(before: Figures, after: Figures, promised: Promise, count_rad: float) -> list[str]:
+    """Every reason against the set, one sentence each; empty when it stays. `count_rad`: the encoder's resolution."""
+    return [*worse(before, after, count_rad), *broken(after, promised, count_rad)]
+
+
+def worse(before: Figures, after: Figures, count_rad: float) -> Iterator[str]:
+    """Sines on which the set follows worse than the one before, beyond the scatter of both runs."""
+    for part in (Part.SLOW, Part.BRISK):
+        limit = worse_limit(before, after, part, count_rad)
+        if after.mean(part) > limit:
+            yield (
+                f"{PART_TEXT[part]} went from {_mrad(before.mean(part))} to {_mrad(after.mean(part))} mrad; up to "
+                f"{_mrad(limit)} would be no worse"
+            )
+
+
+def worse_limit(before: Figures, after: Figures, part: Part, count_rad: float) -> float:
+    """Largest mean that is not worse than before [rad]."""
+    chance = STANDARD_ERRORS * math.hypot(before.standard_error(part), after.standard_error(part))
+    return (1.0 + WORSE_SHARE) * before.mean(part) + chance + SINE_COUNTS * count_rad
+
+
+def broken(after: Figures, promised: Promise, count_rad: float) -> Iterator[str]:
+    """Figures beyond what the certificate promised."""
+    for part, limit in promise_limits(promised, count_rad).items():
+        if after.mean(part) > limit:
+            yield (
+                f"{PART_TEXT[part]} is {_mrad(after.mean(part))} mrad; the certificate promised "
+                f"{_mrad(promised_of(promised, part))}, {_mrad(limit)} with its tolerance: this is not the axis that "
+                "the set was designed for"
+            )
+
+
+def promise_limits(promised: Promise, count_rad: float) -> dict[Part, float]:
+    """Promise with tolerance, for each part [rad]."""
+    counts = {Part.SLOW: SINE_COUNTS, Part.BRISK: SINE_COUNTS, Part.HOLD: HOLD_COUNTS}
+    return {part: (1.0 + PROMISE_SHARE) * promised_of(promised, part) + counts[part] * count_rad for part in Part}
+
+
+def promised_of(promised: Promise, part: Part) -> float:
+    """The promised figure of one part [rad]."""
+    return {Part.SLOW: promised.slow_rad, Part.BRISK: promised.brisk_rad, Part.HOLD: promised.hold_rad}[part]
+
+
+def _mrad(value_rad: float) -> str:
+    return f"{1e3 * value_rad:.4g}"

@@ -1,0 +1,17 @@
+"""A certified set for Table I's joint, made once; the certificate's simulations are few, its promise is whole."""
+
+from __future__ import annotations
+
+from functools import cache
+
+from servod.gains import GainSet
+from servod.verify.certify import verify
+from tests.synthesize.designs import table1_set
+
+
+@cache
+def certified() -> GainSet:
+    """The set with a valid certificate."""
+    result = verify(table1_set(), plants=2, processes=1)
+    assert result.valid, [check for check in result.checks if not check.passed]
+    return result.certified(table1_set())

@@ -1,0 +1,57 @@
+"""A trial under a running daemon: real processes, and a client that dies in the middle."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from servod.control import ControlClient
+from servod.deploy.daemon_link import DaemonDeployLink
+from servod.deploy.deployment import motions_in
+from servod.errors import AnswerIsNo
+from servod.gain_store import Action, GainStore
+from servod.gains import load_gains
+from servod.shipped import shipped
+from servod.verify.validation import Array, ValidationMotion
+from tests.daemon.running import running, wait_for
+
+pytestmark = pytest.mark.serial
+
+
+class Short(ValidationMotion):
+    """Half a second of sine in place of ten."""
+
+    @property
+    def sines(self) -> Array:
+        return 0.01 * np.sin(np.linspace(0.0, 2.0 * np.pi, 500))
+
+
+def test_a_trial_is_run_kept_and_undone(tmp_path: Path) -> None:
+    motion = Short(0.001, 0.01, 0.01, 8.0, 0.002)
+    local = load_gains(shipped("gains/demo_local.yaml"))
+    with running(tmp_path) as axis:
+        with ControlClient(axis.socket) as client:
+            link = DaemonDeployLink(client)
+            assert link.config.name == "tried"
+            with pytest.raises(AnswerIsNo, match="trial"):
+                link.keep("nothing to keep", {})
+            link.enable()
+            link.attempt(*link.load(local))
+            parts = motions_in(link.run(motion, 0.1, lambda _share: None))
+            assert [round(len(part), -2) for part in parts] == [500, 1000, 1000]
+            assert link.active == ("demo_local", 1)
+            link.keep("good", {"after_slow_mrad": 0.1})
+            link.attempt(*link.load(load_gains(shipped("gains/demo_pd_dob.yaml"))))
+            assert link.active == ("demo_pd_dob", 1)
+        with ControlClient(axis.socket) as watcher:  # the client of the trial has gone
+            wait_for(lambda: watcher.call("status")["controller"]["name"] == "demo_local")
+            assert watcher.call("gains_rollback")["name"] == "demo_pd"
+            watcher.call("disable")
+    history = GainStore(axis.folder / "gains").history()
+    assert [(h.action, h.name) for h in history if h.action in (Action.REJECT, Action.ROLLBACK)] == [
+        (Action.REJECT, "demo_pd_dob"),
+        (Action.ROLLBACK, "demo_pd"),
+    ]
+    assert [h.figures for h in history if h.note == "good"] == [{"after_slow_mrad": 0.1}]

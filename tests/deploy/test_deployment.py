@@ -1,0 +1,106 @@
+"""Trials on the stepped axis: what stays, what goes and why; an interrupt leaves the old set and a safe axis."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from servod.axis import AxisState
+from servod.axis_model import AxisModel
+from servod.commands import Op
+from servod.deploy.deployment import deploy
+from servod.deploy.links import SteppedDeployLink
+from servod.deploy.virtual import pd_set, virtual_link, with_cutoff
+from servod.errors import BadInput, FaultCode
+from servod.gain_store import Action, GainStore
+from servod.verify.plants import scaled
+from tests.deploy.sets import certified
+from tests.synthesize.designs import table1
+
+PD = pd_set("present", 2.5, 0.12)
+
+
+def link_to(plant: AxisModel, folder: Path) -> SteppedDeployLink:
+    return virtual_link(plant, folder, certified(), PD)
+
+
+def quiet(_what: str, _share: float) -> None:
+    """Nobody listens."""
+
+
+def test_a_good_set_stays_and_the_history_has_the_figures_of_both_motions(tmp_path: Path) -> None:
+    link = link_to(table1(), tmp_path)
+    done = deploy(link, certified(), quiet)
+    assert done.stays, done.reasons
+    assert link.active == (certified().name, 1) and done.present == ("present", 1)
+    entry = GainStore(tmp_path / "gains").history()[-1]
+    assert (entry.action, entry.name) == (Action.ACTIVATE, certified().name)
+    assert entry.figures["after_slow_mrad"] < 0.2 * entry.figures["before_slow_mrad"]
+    assert link.session.cycle.axis.state == AxisState.DISABLED  # as it was found
+    assert GainStore(tmp_path / "gains").rollback().name == "present"
+
+
+@pytest.mark.parametrize("change", [{"dry": 2.0, "viscous": 2.0}, {"inertia": 2.0}], ids=["friction", "inertia"])
+def test_a_set_for_another_joint_is_rolled_back(change: dict[str, float], tmp_path: Path) -> None:
+    link = link_to(scaled(table1(), change), tmp_path)
+    done = deploy(link, certified(), quiet)
+    assert not done.stays
+    assert any("promised" in reason for reason in done.reasons)
+    store = GainStore(tmp_path / "gains")
+    active = store.active()
+    assert link.active == ("present", 1)
+    assert active is not None and active.name == "present"
+    entry = store.history()[-1]
+    assert (entry.action, entry.name) == (Action.REJECT, certified().name)
+    assert "promised" in entry.note
+
+
+def test_a_limit_that_is_met_rolls_back(tmp_path: Path) -> None:
+    limits = link_to(table1(), tmp_path / "roomy").config.limits.model_copy(update={"torque_nm": 0.08})
+    config = link_to(table1(), tmp_path).config.model_copy(update={"limits": limits})
+    link = virtual_link(table1(), tmp_path, certified(), PD, config=config)
+    done = deploy(link, certified(), quiet)
+    assert not done.stays and any(reason.startswith("TORQUE_CLIPPED") for reason in done.reasons)
+
+
+def test_a_fault_under_the_new_set_rolls_back_and_is_not_reset(tmp_path: Path) -> None:
+    link = link_to(table1(), tmp_path)
+
+    def drop_out(what: str, share: float) -> None:
+        if what == "under the new set" and share == 0.52:
+            link.session.send(Op.NODE_EVENT, [FaultCode.DRIVE_RESET])
+
+    done = deploy(link, certified(), drop_out)
+    assert not done.stays and done.after is None and link.active == ("present", 1)
+    assert link.session.cycle.axis.state == AxisState.FAULT
+
+
+@pytest.mark.parametrize("when", ["under the present set", "under the new set"])
+def test_an_interrupt_leaves_the_old_set_active_and_the_axis_off(when: str, tmp_path: Path) -> None:
+    link = link_to(table1(), tmp_path)
+
+    def interrupt(what: str, share: float) -> None:
+        if what == when and share % 0.45 > 0.2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        deploy(link, certified(), interrupt)
+    assert link.active == ("present", 1)
+    link.session.run(1.0)
+    assert link.session.cycle.axis.state == AxisState.DISABLED
+    assert abs(link.session.world.truth().velocity_rad_s) < 1e-3
+    assert link.session.latest.torque_nm == 0.0
+
+
+def test_a_set_without_certificate_and_one_for_another_filter_are_refused_before_anything_moves(tmp_path: Path) -> None:
+    link = link_to(table1(), tmp_path)
+    with pytest.raises(BadInput, match="certificate"):
+        deploy(link, PD, quiet)
+    promised_nothing = certified().certificate.model_copy(update={"promised": None})
+    with pytest.raises(BadInput, match="promised"):
+        deploy(link, certified().model_copy(update={"certificate": promised_nothing}).sealed(), quiet)
+    link.session.config = with_cutoff(link.config, 77.0)
+    with pytest.raises(BadInput, match="velocity_cutoff_hz"):
+        deploy(link, certified(), quiet)
+    assert link.session.cycle.axis.state == AxisState.DISABLED

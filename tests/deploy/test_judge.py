@@ -1,0 +1,53 @@
+"""The criterion in numbers: chance and encoder counts are allowed for, more is not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from servod.deploy.judge import complaints, promise_limits
+from servod.gains import Promise
+from servod.verify.validation import Figures, Part, ValidationMotion
+
+PROMISE = Promise(slow_rad=2e-5, brisk_rad=1e-4, hold_rad=1e-5, plants=25)
+COUNT_RAD = 6e-6
+
+
+def figures(slow: float = 2e-5, brisk: float = 1e-4, hold: float = 1e-5, scatter: float = 0.0) -> Figures:
+    wave = scatter * np.array([-1.0, 0.0, 1.0])
+    return Figures({Part.SLOW: tuple(slow + wave), Part.BRISK: tuple(brisk + wave), Part.HOLD: (hold, hold)})
+
+
+def test_the_same_again_is_no_worse() -> None:
+    assert complaints(figures(), figures(), PROMISE, COUNT_RAD) == []
+
+
+def test_worse_within_the_scatter_stays_and_beyond_it_goes() -> None:
+    before, after = figures(slow=1e-5, scatter=4e-6), figures(slow=2.5e-5, scatter=4e-6)
+    assert complaints(before, after, PROMISE, COUNT_RAD) == []
+    (said,) = complaints(figures(slow=1e-5), figures(slow=2.5e-5), PROMISE, COUNT_RAD)
+    assert "slow sine went from 0.01 to 0.025 mrad" in said
+
+
+@pytest.mark.parametrize("part", list(Part))
+def test_a_broken_promise_is_named(part: Part) -> None:
+    limit = promise_limits(PROMISE, COUNT_RAD)[part]
+    poor = figures(slow=1.0, brisk=1.0, hold=1.0)
+    kept, broken = (figures(**{part.value: factor * limit}) for factor in (0.99, 1.01))
+    assert complaints(poor, kept, PROMISE, COUNT_RAD) == []
+    (said,) = complaints(poor, broken, PROMISE, COUNT_RAD)
+    assert "the certificate promised" in said
+
+
+def test_figures_are_read_per_period_without_the_first_ones() -> None:
+    motion = ValidationMotion(0.001, 0.02, 0.004, 8.0, 0.002)
+    error = np.zeros(len(motion.sines))
+    error[500 : 500 + 2000] = 1.0  # the first period of the slow sine
+    error[500 + 2000 : 500 + 4000] = 0.5
+    held = np.concatenate([np.linspace(0.0, 1.0, 500), np.linspace(1.0, 1.2, 500)])
+    found = motion.figures(error, (held, held))
+    assert found.of[Part.SLOW] == (0.5, 0.0, 0.0)
+    assert set(found.of[Part.BRISK]) == {0.0} and len(found.of[Part.BRISK]) == 7
+    assert found.of[Part.HOLD] == pytest.approx((0.2, 0.2), rel=0.01)
+    with pytest.raises(ValueError, match="end"):
+        motion.figures(error[:5000], (held, held))
