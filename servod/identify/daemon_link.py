@@ -32,6 +32,8 @@ _POLL_S = 0.05
 class DaemonLink:
     """An axis on the wall clock. `config` must be the file that the daemon was started with."""
 
+    offset_ns: int | None = None
+
     def __init__(self, client: ControlClient, config: AxisConfig) -> None:
         self._client, self.config = client, config
 

@@ -45,6 +45,11 @@ class Link(Protocol):
         """Limits, period and encoder of the axis."""
         ...
 
+    @property
+    def offset_ns(self) -> int | None:
+        """What turns the records' time into the time of day; None where they have the monotonic clock's."""
+        ...
+
     def enable(self) -> float:
         """Enable under no torque; returns the present position in rad."""
         ...
@@ -79,6 +84,11 @@ class SteppedLink:
     def config(self) -> AxisConfig:
         """The session's configuration."""
         return self.session.config
+
+    @property
+    def offset_ns(self) -> int | None:
+        """Virtual time has no time of day: the same walk gives the same files, byte for byte."""
+        return 0
 
     def enable(self) -> float:
         """Enable with zero gains."""

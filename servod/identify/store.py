@@ -39,12 +39,14 @@ class Recordings:
     `start_rad` is where the axis stood when the walk began; None until `begin`.
     """
 
-    def __init__(self, folder: Path, conditions: str = "", resume: bool = False) -> None:
+    def __init__(self, folder: Path, conditions: str = "", resume: bool = False, offset_ns: int | None = None) -> None:
         """Use `folder`; earlier recordings in it are replaced, or with `resume` kept while they fit.
 
-        They fit when they were made under the same `conditions` (a hash of configuration and options). Raises BadInput.
+        They fit when they were made under the same `conditions` (a hash of configuration and options). `offset_ns`
+        turns the records' time into the time of day (None: they have the monotonic clock's). Raises BadInput.
         """
         self.folder, self.conditions = folder, conditions
+        self._offset_ns = wall_offset_ns() if offset_ns is None else offset_ns
         self.start_rad: float | None = None
         self._done: list[_Entry] = []
         self._earlier: list[_Entry] = []
@@ -77,7 +79,7 @@ class Recordings:
         """Write one motion and the list with it; returns the trace with the file's hash. Raises BadInput."""
         name = f"{len(self._done):02d}_{trace.kind.value}.mcap"
         try:
-            file = McapFile(self.folder / name, {}, wall_offset_ns())
+            file = McapFile(self.folder / name, {}, self._offset_ns)
             file.write_rows(split_rows(rows.tobytes()))
             file.close()
             self._done.append(_Entry(name, trace.kind.value, motion, trace.settings))

@@ -54,7 +54,8 @@ def identify(
     already are not run again, as long as configuration and options are the same, and `subject`, a name or hash of what
     is identified, too. Raises AnswerIsNo when the axis refuses, faults, is wired wrongly, or tells nothing.
     """
-    recordings = store.Recordings(out, _conditions(link.config, travel_rad, speed_rad_s, seed, subject), resume)
+    conditions = _conditions(link.config, travel_rad, speed_rad_s, seed, subject)
+    recordings = store.Recordings(out, conditions, resume, link.offset_ns)
     taken_up = recordings.start_rad is not None
     try:
         start_rad = link.enable() if recordings.start_rad is None else recordings.start_rad
