@@ -1,17 +1,14 @@
-"""The paper's programme (12)-(15) in its physically consistent form, continuous time: the reference mode.
+"""The paper's programme (12)-(15), continuous time: the reference mode's LMIs over one region.
 
-Stands on cvxpy and the intervals. Kept to be compared with: it knows no delay, no velocity filter and no sample time,
+Stands on cvxpy and the vertices. Kept to be compared with: it knows no delay, no velocity filter and no sample time,
 so what it finds says little about the axis, and it often finds nothing. Then it names the vertices and the constraints
-that clash. Consistent with (12): x' = (z_hat, x, v) with
-
-    A_i = [-a, 0, 1; 0, 0, 1; -dc/m, -kappa/m, -dd/m],  B_2i = [l, 0, K/m],  B_1 = [1, 0; 0, 0; 0, 1/m],
-
-the outputs [alpha x; beta u*], and Y = K_u* P, without which (14) is not jointly convex.
+that clash. With Y = K_u* P, without which (14) is not jointly convex. The form is the physically consistent one or the
+printed one, the output [alpha x; beta u*] or the printed sum (servod.gain_design).
 """
 
 from __future__ import annotations
 
-import itertools
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,129 +17,179 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
+from servod.gain_design import ReferenceForm, ReferenceOutput, ReferenceProof
+from servod.verify.reference_vertices import ContinuousVertex, Polytope, vertices
 from servod.verify.sampled import Array
 from servod.verify.steady_friction import SteadyFriction
 from servod.verify.vertices import Span
 
-STRICT = 1e-7
-KAPPA_SHARE = 0.01  # kappa of (15), the small gain that provides a solution, as a share of c0
-Found = tuple[tuple[float, float, float], float]  # (k_z, k_x, k_v) and the norm
+STRICT = 1e-6  # of the inequalities with states, time and disturbances scaled
+RATE_PER_S = 1e3  # unit of time is its inverse
 SOLVED = ("optimal", "optimal_inaccurate")
+PARTS = ("norm", "decay", "damping")
 
 
 @dataclass(frozen=True, slots=True)
 class ReferenceWishes:
-    """What (14) is asked for; mismatches are shares of c0 and of the viscous friction."""
+    """What (14) is asked for; `position_weight` is per rad, `torque_weight` per unit of u* = u/K."""
 
     input_scale_nm: float = 0.1
     position_weight: float = 1.0
-    input_weight: float = 0.01
+    torque_weight: float = 0.01
     least_decay_per_s: float = 1.0
     least_damping: float = 0.1
-    stiffness_mismatch: float = 0.2
-    damping_mismatch: float = 0.5
-    gains_l: tuple[float, float] = (0.0, 0.04)
-
-
-@dataclass(frozen=True, slots=True)
-class ContinuousVertex:
-    """One vertex of (15)."""
-
-    name: str
-    a: Array
-    b1: Array
-    b2: Array
+    form: ReferenceForm = ReferenceForm.CONSISTENT
+    output: ReferenceOutput = ReferenceOutput.VECTOR
+    solver: str = "CLARABEL"
 
 
 @dataclass(frozen=True, slots=True)
 class ReferenceAnswer:
-    """Gains (k_z, k_x, k_v) of (13) as negative feedback and the norm bound; None with what clashes."""
+    """The proof of one region with its norm bound; None with what clashes."""
 
-    gains: tuple[float, float, float] | None
+    proof: ReferenceProof | None
     norm: float | None
     clashes: tuple[str, ...]
 
 
-def vertices(
-    friction: SteadyFriction, span: Span, decays: Sequence[float], w: ReferenceWishes
-) -> list[ContinuousVertex]:
-    """All ends of a_i over the region, of the mismatches and of l_i."""
-    m, c0 = friction.inertia, friction.stiffness
-    viscous = max(friction.viscous(span.to_rad_s), 1e-9 * c0)
-    found = []
-    for (a, c), d, gain in itertools.product(
-        itertools.product(sorted({min(decays), max(decays)}), (-1.0, 1.0)), (-1.0, 1.0), sorted(set(w.gains_l))
-    ):
-        dc, dd = c * w.stiffness_mismatch * c0, d * w.damping_mismatch * viscous
-        matrix = np.array([[-a, 0.0, 1.0], [0.0, 0.0, 1.0], [-dc / m, -KAPPA_SHARE * c0 / m, -dd / m]])
-        b1 = np.array([[1.0, 0.0], [0.0, 0.0], [0.0, 1.0 / m]])
-        b2 = np.array([[gain], [0.0], [w.input_scale_nm / m]])
-        name = f"{span.name}: a={a:.3g} dc={dc:.3g} dd={dd:.3g} l={gain:g}"
-        found.append(ContinuousVertex(name, matrix, b1, b2))
-    return found
+@dataclass(frozen=True, slots=True)
+class Region:
+    """One region's programme: vertices in SI units, the scales of the states, what is asked."""
+
+    found: list[ContinuousVertex]
+    scale: Array
+    wishes: ReferenceWishes
+
+    def only(self, vertex: ContinuousVertex) -> Region:
+        """The same programme over one vertex."""
+        return Region([vertex], self.scale, self.wishes)
 
 
-def solve(found: Sequence[ContinuousVertex], w: ReferenceWishes, scale: Array, parts: frozenset[str]) -> Found | None:
-    """(gains, norm) of the programme over `found` with the named constraints, or None when it is infeasible."""
+@dataclass(frozen=True, slots=True)
+class Solved:
+    """P, Y and Q of (14) in scaled states, and the norm bound."""
+
+    lyapunov: Array
+    feedback_lyapunov: Array
+    bound: Array
+    norm: float
+
+
+def solve(region: Region, parts: frozenset[str], strict: float = STRICT) -> Solved | None:
+    """The programme over all vertices with the named constraints; None when it is infeasible.
+
+    Every inequality holds by `strict`, in scaled units.
+    """
     p, y = cp.Variable((3, 3), symmetric=True), cp.Variable((1, 3))
-    q = cp.Variable((2, 2), symmetric=True)
-    c = np.array([[0.0, w.position_weight * scale[1], 0.0]])
-    outputs = cp.vstack([c @ p, w.input_weight * y])
-    constraints = [cp.bmat([[q, outputs], [outputs.T, p]]) >> STRICT * np.eye(5), p >> STRICT * np.eye(3)]
-    for vertex in found:
-        constraints += _constraints(vertex, w, scale, parts, p, y)
+    outputs = _outputs(region, p, y)
+    rows = outputs.shape[0]
+    q = cp.Variable((rows, rows), symmetric=True)
+    constraints = [cp.bmat([[q, outputs], [outputs.T, p]]) >> strict * np.eye(3 + rows), p >> strict * np.eye(3)]
+    size = disturbance_size(region)
+    for vertex in region.found:
+        constraints += [
+            block >> strict * np.eye(block.shape[0]) for block in _blocks(vertex, region, size, parts, p, y)
+        ]
     problem = cp.Problem(cp.Minimize(cp.trace(q)), constraints)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            problem.solve(solver="CLARABEL")
+            problem.solve(solver=region.wishes.solver)
     except cp.error.SolverError:
         return None
     if problem.status not in SOLVED or p.value is None:
         return None
-    k_z, k_x, k_v = (-np.asarray(y.value) @ np.linalg.inv(np.asarray(p.value)) / scale)[0].tolist()
-    return (k_z, k_x, k_v), float(np.sqrt(max(problem.value, 0.0)))
+    values = [np.asarray(value, dtype=np.float64) * size**2 for value in (p.value, y.value[0], q.value)]
+    return Solved(values[0], values[1], values[2], size * float(np.sqrt(max(problem.value, 0.0))))
 
 
-def _constraints(
-    vertex: ContinuousVertex, w: ReferenceWishes, scale: Array, parts: frozenset[str], p: Any, y: Any
-) -> list[Any]:
-    """The named constraints of one vertex: the first of (14), least decay, and the cone of the damping ratio."""
-    flow = vertex.a * (scale / scale[:, None]) @ p + vertex.b2 / scale[:, None] @ y
-    b1, both = vertex.b1 / scale[:, None], flow + flow.T
+def disturbance_size(region: Region) -> float:
+    """Largest entry of B_1 in scaled states: divided by it, P is of the size of one."""
+    largest = max(float(np.abs(vertex.b1 / region.scale[:, None]).max()) for vertex in region.found)
+    return largest / math.sqrt(RATE_PER_S)
+
+
+def _outputs(region: Region, p: Any, y: Any) -> Any:
+    """(C' + D' K_u*) P, as in servod.verify.reference_proof.output_rows."""
+    w = region.wishes
+    position = np.array([[0.0, w.position_weight * region.scale[1], 0.0]]) @ p
+    torque = w.torque_weight * y
+    return position + torque if w.output is ReferenceOutput.SCALAR else cp.vstack([position, torque])
+
+
+def _blocks(vertex: ContinuousVertex, region: Region, size: float, parts: frozenset[str], p: Any, y: Any) -> list[Any]:
+    """The matrices of one vertex that must be positive, by constraint: see servod.verify.reference_proof."""
+    w, scale = region.wishes, region.scale
+    flow = (vertex.a * (scale / scale[:, None]) @ p + vertex.b2 / scale[:, None] @ y) / RATE_PER_S
+    b1, both = vertex.b1 / scale[:, None] / size / math.sqrt(RATE_PER_S), flow + flow.T
     theta = float(np.arccos(w.least_damping))
     wide, skew = np.sin(theta) * both, np.cos(theta) * (flow - flow.T)
     known = {
-        "norm": -cp.bmat([[both, b1], [b1.T, -np.eye(2)]]) >> STRICT * np.eye(5),
-        "decay": -both - 2.0 * w.least_decay_per_s * p >> STRICT * np.eye(3),
-        "damping": -cp.bmat([[wide, skew], [-skew, wide]]) >> STRICT * np.eye(6),
+        "norm": -cp.bmat([[both, b1], [b1.T, -np.eye(b1.shape[1])]]),
+        "decay": -both - 2.0 * w.least_decay_per_s / RATE_PER_S * p,
+        "damping": -cp.bmat([[wide, skew], [-skew, wide]]),
     }
     return [known[part] for part in PARTS if part in parts]
 
 
-PARTS = ("norm", "decay", "damping")
+def programme(friction: SteadyFriction, span: Span, intervals: Polytope, w: ReferenceWishes) -> Region:
+    """The programme of one region over all corners of its intervals."""
+    found = vertices(span.name, intervals, friction.inertia, friction.stiffness, w.input_scale_nm, w.form)
+    position = friction.largest(span.to_rad_s) / friction.stiffness
+    inertia = 1.0 if w.form is ReferenceForm.PRINTED else friction.inertia  # (15) as printed forgets it
+    speed = position * np.sqrt(friction.stiffness / inertia)
+    return Region(found, np.array([position, position, speed]), w)
 
 
 def reference(
-    friction: SteadyFriction, span: Span, decays: Sequence[float], wishes: ReferenceWishes | None = None
+    friction: SteadyFriction,
+    span: Span,
+    intervals: Polytope,
+    wishes: ReferenceWishes | None = None,
+    strict: float = STRICT,
 ) -> ReferenceAnswer:
-    """The reference design of one region: gains of (13) as negative feedback, or the clash."""
-    w = wishes or ReferenceWishes()
-    found = vertices(friction, span, decays, w)
-    position = friction.largest(span.to_rad_s) / friction.stiffness
-    scale = np.array([position, position, position * np.sqrt(friction.stiffness / friction.inertia)])
-    answer = solve(found, w, scale, frozenset(PARTS))
-    if answer is not None:
-        return ReferenceAnswer(answer[0], answer[1], ())
-    return ReferenceAnswer(None, None, tuple(_clashes(found, w, scale)))
+    """The reference design of one region: the proof with its gains, or the clash."""
+    region = programme(friction, span, intervals, wishes or ReferenceWishes())
+    solved = solve(region, frozenset(PARTS), strict)
+    if solved is not None:
+        return ReferenceAnswer(_proof(span, intervals, region, solved), solved.norm, ())
+    return ReferenceAnswer(None, None, tuple(_clashes(span, region)))
 
 
-def _clashes(found: Sequence[ContinuousVertex], w: ReferenceWishes, scale: Array) -> list[str]:
+def _proof(span: Span, intervals: Polytope, region: Region, solved: Solved) -> ReferenceProof:
+    """The region's proof as plain numbers."""
+    w = region.wishes
+    return ReferenceProof(
+        name=span.name,
+        speed_from_rad_s=span.from_rad_s,
+        speed_to_rad_s=span.to_rad_s,
+        form=w.form,
+        output=w.output,
+        decays_per_s=list(intervals.decays),
+        stiffness_mismatch_nm_per_rad=list(intervals.stiffness),
+        viscous_mismatch_nms_per_rad=list(intervals.viscous),
+        gains_l=list(intervals.gains_l),
+        input_scale_nm=w.input_scale_nm,
+        position_weight=w.position_weight,
+        torque_weight=w.torque_weight,
+        least_decay_per_s=w.least_decay_per_s,
+        least_damping=w.least_damping,
+        scale=region.scale.tolist(),
+        lyapunov=solved.lyapunov.tolist(),
+        feedback_lyapunov=solved.feedback_lyapunov.tolist(),
+        bound=solved.bound.tolist(),
+    )
+
+
+def _clashes(span: Span, region: Region) -> Sequence[str]:
     """Constraints that are infeasible by themselves, with the vertices that are so alone; else all of them together."""
     told = []
     for part in PARTS:
-        if solve(found, w, scale, frozenset({part})) is not None:
+        if solve(region, frozenset({part})) is not None:
             continue
-        alone = [v.name for v in found if solve([v], w, scale, frozenset({part})) is None]
-        told.append(f"{part}: " + ("; ".join(alone) if alone else f"one P for all {len(found)} vertices"))
-    return told or [f"norm, decay and damping together over all {len(found)} vertices"]
+        alone = [v.name for v in region.found if solve(region.only(v), frozenset({part})) is None]
+        told += [f"{part}: {name}, by itself" for name in alone]
+        if not alone:
+            told.append(f"{part}: {span.name}: one Lyapunov matrix for all {len(region.found)} vertices")
+    together = f"{span.name}: {', '.join(PARTS)} together over all {len(region.found)} vertices"
+    return told or [together]
