@@ -24,6 +24,7 @@ from servod.cli import (
     faults,
     gains,
     identify,
+    paper,
     preset,
     record,
     replay,
@@ -47,7 +48,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 _DAEMON = (demo, scan, status, enable, stop, track, gains, preset, record)
-_LABORATORY = (identify, synthesize, verify, deploy, replay)
+_LABORATORY = (identify, synthesize, verify, deploy, replay, paper)
 for _verb in (*_DAEMON, *_LABORATORY, bench, check, faults):
     _verb.register(app)
 

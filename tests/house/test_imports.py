@@ -29,6 +29,7 @@ LAYERS: list[set[str]] = [
     {"tracking"},
     {"tune"},
     {"commission"},
+    {"paper"},
     {"benchmark"},
     {"cli"},
 ]

@@ -1,0 +1,16 @@
+"""The paper from this software: its figures, its numbers beside ours, and what agrees and what does not.
+
+printed.py      what the paper prints
+claims.py       a statement of the paper, judged by figures of the run
+joints.py       the virtual axes that everything runs on
+sets.py         gain sets: the paper's in all readings, ours at its feedback
+crew.py         work on several processes, with progress and a clean end at Ctrl-C
+experiments.py  identification, design and tracking on a virtual axis, SYNC-stepped
+sweeps.py       what only the compiled simulator is fast enough for
+equations.py    printed against consistent equations
+results.py      everything that a run found
+friction.py, loops.py, motions.py, beyond.py  the figures and their claims
+table.py        the paper's numbers beside ours
+document.py     files: JSON, Markdown, page, pictures
+walk.py         all of it in order
+"""

@@ -1,0 +1,110 @@
+"""What the paper leaves open: the sign and size of l, the readings of Table I's gains, slips of its equations.
+
+Stands on the sweeps; each has a figure or a row of a table, and a sentence that its numbers choose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from servod.paper.claims import Claim, Shown
+from servod.paper.equations import TwoForms
+from servod.paper.joints import Joint
+from servod.paper.results import Results, Row
+from servod.paper.sweeps import NOISE_SHARES, SweepOfL
+from servod.report.figure import COLOURS, Axis, Colour, Figure, Panel, Scale, Style, curve
+from servod.report.figures.motion import errors
+
+#: Names of the sweeps in Results.sweeps, and of the slips in Results.slips.
+TABLE1_GAINS, PD_GAINS = "gains of Table I", "the paper's PD gains"
+EXPONENT, LITERAL_8 = "sign of the exponent in (18)", "(8) taken literally instead of (7)"
+
+
+def figures(results: Results) -> Iterator[Shown]:
+    """Sweep of l, both readings of the gains, errors over the noise on friction."""
+    yield Shown("Table I, K_i", _sweep_figure(results), tuple(_sweep_claims(results)))
+    for joint in results.found:
+        pair = (results.measured[joint, row].followed for row in (Row.TABLE1, Row.TABLE1_OTHER))
+        shown = [motion for motion in pair if motion is not None]
+        if shown:
+            title = f"Both readings of Table I's gains on {joint.label}"
+            figure = errors(shown, f"table1_readings_{joint.value}", title)
+            yield Shown("Table I, gains", figure, tuple(_readings(results, joint)))
+    yield Shown("11", _noise_figure(results), ())
+
+
+def slip_claims(results: Results) -> Iterator[Claim]:
+    """Printed against consistent equations: what the form costs on (19)."""
+    for name, forms in results.slips.items():
+        yield Claim(
+            f"{name}: the printed form serves as well", _slip(forms), forms.printed_mrad <= forms.consistent_mrad
+        )
+
+
+def _slip(forms: TwoForms) -> str:
+    speeds = ", ".join(
+        f"{1e3 * p:.4g} against {1e3 * c:.4g} at {v:g}"
+        for v, p, c in zip(forms.speeds, forms.printed_nm, forms.consistent_nm, strict=True)
+    )
+    return (
+        f"(19) is tracked with {forms.printed_mrad:.4g} mrad RMS as printed and {forms.consistent_mrad:.4g} in the "
+        f"consistent form; friction in mN·m, printed against consistent: {speeds} rad/s"
+    )
+
+
+def _sweep_figure(results: Results) -> Figure:
+    panels = []
+    for name, sweep in results.sweeps.items():
+        curves = [
+            curve(sign, sweep.factors, np.minimum(rms, 1e3), colour, style, 1.6)
+            for (sign, rms), colour, style in zip(
+                sweep.rms_mrad.items(), COLOURS, (Style.LINE, Style.DASHED, Style.DOTTED), strict=False
+            )
+        ]
+        ends = [sweep.factors[0], sweep.factors[-1]]
+        curves.append(curve("l = 0", ends, [sweep.without] * 2, Colour.BLACK, width=1.0))
+        x = Axis("l_i as a multiple of the printed K_i", Scale.LOG)
+        panels.append(Panel(x, Axis("RMS error on (19) in mrad", Scale.LOG), tuple(curves), name))
+    return Figure("table1_sweep_of_l", "Sign and size of l", tuple(panels), len(panels), row_height=1.4)
+
+
+def _sweep_claims(results: Results) -> Iterator[Claim]:
+    for name, sweep in results.sweeps.items():
+        best, factor, rms = _best(sweep)
+        printed = sweep.rms_mrad["signs as printed"][-1]
+        here = f"with {name}, as printed {printed:.4g} mrad RMS, without l {sweep.without:.4g}"
+        yield Claim("the printed K_i, read as l_i, serve", here, printed < sweep.without)
+        where = f"at {factor:.3g} times K_i ({best})"
+        here = f"with {name}, the least is {rms:.4g} mrad {where}, without l {sweep.without:.4g}"
+        yield Claim("l_i can improve the tracking", here, rms < sweep.without)
+
+
+def _best(sweep: SweepOfL) -> tuple[str, float, float]:
+    """(sign, factor, RMS) of the least error."""
+    rows = [(s, f, r) for s, values in sweep.rms_mrad.items() for f, r in zip(sweep.factors, values, strict=True)]
+    return min(rows, key=lambda row: row[2])
+
+
+def _readings(results: Results, joint: Joint) -> Iterator[Claim]:
+    for row, reading in ((Row.TABLE1, "(K_z, K_v, K_x)"), (Row.TABLE1_OTHER, "(K_x, K_v, K_z)")):
+        rms = results.rms(joint, row)
+        paper = f"{row.paper_mrad} mrad RMS with the gains of Table I, read as {reading}"
+        if rms is None or row.paper_mrad is None:
+            yield Claim(paper, f"{joint.label} is stopped", False)
+        else:
+            yield Claim(paper, f"{rms:.4g} mrad RMS on {joint.label}", rms <= row.paper_mrad)
+
+
+def _noise_figure(results: Results) -> Figure:
+    shares = [0.0, *(100.0 * share for share in NOISE_SHARES)]
+    curves = [
+        curve(label, shares, rms, colour, style, 1.6)
+        for i, (label, rms) in enumerate(results.noise.items())
+        for colour, style in ((COLOURS[i % len(COLOURS)], Style.LINE if i % 2 == 0 else Style.DASHED),)
+    ]
+    panel = Panel(
+        Axis("RMS of the noise on friction in % of F_C"), Axis("RMS error on (19) in mrad", Scale.LOG), tuple(curves)
+    )
+    return Figure("figure_11_errors_over_noise", "Errors over the noise on friction", (panel,), row_height=1.4)

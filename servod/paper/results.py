@@ -1,0 +1,65 @@
+"""Everything that a run of `paper` found, and the rows of its comparison.
+
+Between the walk, which fills it, and the figures, which read it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+
+from servod.paper.equations import TwoForms
+from servod.paper.experiments import Found, Measured
+from servod.paper.joints import Joint
+from servod.paper.printed import RMS_MRAD
+from servod.paper.sweeps import SweepOfL
+from servod.report.figures.motion import Motion
+
+
+class Row(Enum):
+    """A controller of the comparison: what people read, and the RMS error that the paper prints for it, in mrad."""
+
+    PD = "PD", None
+    DOB = "PD + DOB, 50 rad/s", RMS_MRAD["pd_dob"]
+    LUGRE = "PD + LuGre, l_f 0", RMS_MRAD["pd_lugre"]
+    LUGRE_BETTER = "PD + LuGre, l_f 0.25", RMS_MRAD["pd_lugre"]
+    LUGRE_OSCILLATES = "PD + LuGre, l_f 0.35", RMS_MRAD["pd_lugre"]
+    TABLE1 = "Table I as (K_z, K_v, K_x)", RMS_MRAD["local"]
+    TABLE1_OTHER = "Table I as (K_x, K_v, K_z)", RMS_MRAD["local"]
+    TABLE1_PRINTED_L = "Table I, l_i as printed", RMS_MRAD["local"]
+    LOCAL_PLAIN = "local, identified, the paper's PD gains", RMS_MRAD["local"]
+    LOCAL_EQUAL = "the same, with all options", RMS_MRAD["local"]
+    DEPLOYED = "local, identified and synthesized", RMS_MRAD["local"]
+
+    def __init__(self, label: str, paper_mrad: float | None) -> None:
+        self.label = label
+        self.paper_mrad = paper_mrad
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """One rival after the fair tuning: its law and class as people read them, and how it tracks."""
+
+    law: str
+    feedback: str
+    measured: Measured
+
+
+@dataclass(frozen=True)
+class Results:
+    """One run. `sines` are the motions of Fig. 9 to 12; `noise` is the RMS over NOISE_SHARES by controller."""
+
+    seed: int
+    seconds: float
+    found: dict[Joint, Found]
+    measured: dict[tuple[Joint, Row], Measured]
+    sines: dict[str, Motion]
+    sweeps: dict[str, SweepOfL]
+    noise: dict[str, list[float]]
+    slips: dict[str, TwoForms]
+    tuned: dict[Joint, list[Tuned]] = field(default_factory=dict)
+
+    def rms(self, joint: Joint, row: Row) -> float | None:
+        """RMS error of (19) in mrad; None where the axis stopped."""
+        tracking = self.measured[joint, row].tracking()
+        return None if tracking is None else tracking.rms_error_mrad
