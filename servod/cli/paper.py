@@ -10,9 +10,9 @@ import typer
 from servod.cli.common import JsonOption, example, need_folder, one_thread, print_json
 
 _HELP = example(
-    "Reproduce the paper on the virtual axis: identify Table I's joint and an asymmetric one, track trajectory (19) and "
-    "steps under every controller over the whole CAN loop, sweep what the paper leaves open, and write figures, a page "
-    "and the paper's numbers beside ours. Takes some minutes; --quick, without identification, a fraction of one.",
+    "Reproduce the paper on the virtual axis: identify Table I's joint and an asymmetric one, track trajectory (19) "
+    "and steps under every controller over the whole CAN loop, sweep what the paper leaves open, and write figures, a "
+    "page and the paper's numbers beside ours. Takes some minutes; --quick, without identification, a fraction of one.",
     "servoctl paper --out out/paper",
     "servoctl paper --out out/paper --quick --json",
 )

@@ -14,6 +14,7 @@ from servod.paper.joints import Joint
 from servod.paper.results import Results, Row
 from servod.paper.sweeps import NOISE_SHARES
 from servod.report.figures.motion import (
+    Motion,
     disturbed_friction,
     errors,
     position_and_friction,
