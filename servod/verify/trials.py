@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from multiprocessing import get_context
+from itertools import pairwise
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from servod.gains import GainSet
 from servod.models.simulate import LoopSettings, simulate_closed_loop
 from servod.verify.plants import drawn
 from servod.verify.sampled import Array
+from servod.workers import worker_pool
 
 STEP_RAD = 0.01
 SINE_RAD, SINE_HZ = 0.05, 0.25  # peak speed 79 mrad/s: through the fall of the Stribeck curve and back
@@ -96,8 +96,8 @@ def monte_carlo(gains: GainSet, plants: int, seed: int, processes: int) -> list[
     if processes <= 1:
         return _worker(text, seed, 0, plants)
     cuts = [plants * i // processes for i in range(processes + 1)]
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        parts = pool.map(_worker, [text] * processes, [seed] * processes, cuts[:-1], cuts[1:])
+    with worker_pool(processes) as pool:
+        parts = pool.starmap(_worker, [(text, seed, *ends) for ends in pairwise(cuts)])
         return [trial for part in parts for trial in part]
 
 
