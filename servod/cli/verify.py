@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -40,22 +40,12 @@ def verify(
     if result.valid and write:
         write_atomically(gains, result.certified(checked).to_yaml())
     if as_json:
-        print_json(document(result))
+        print_json(result.document())
     else:
         print_checks(result)
     if not result.valid:
         failed = [check.name for check in result.checks if not check.passed]
         raise AnswerIsNo(f"{gains}: not valid: {'; '.join(failed)}")
-
-
-def document(result: Verification) -> dict[str, Any]:
-    """The command's JSON document."""
-    return {
-        "valid": result.valid,
-        "checks": [check.model_dump() for check in result.checks],
-        "observations": result.observations,
-        "promised": result.promised and result.promised.model_dump(),
-    }
 
 
 def print_checks(result: Verification) -> None:

@@ -9,6 +9,7 @@ import datetime
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from servod import __version__
 from servod.errors import BadInput
@@ -32,6 +33,15 @@ class Verification:
     def valid(self) -> bool:
         """Whether every check passed."""
         return all(check.passed for check in self.checks)
+
+    def document(self) -> dict[str, Any]:
+        """Plain values, as `servoctl verify --json` prints them."""
+        return {
+            "valid": self.valid,
+            "checks": [check.model_dump() for check in self.checks],
+            "observations": self.observations,
+            "promised": self.promised and self.promised.model_dump(),
+        }
 
     def certificate(self, gains: GainSet) -> Certificate:
         """The certificate for these very gains."""
