@@ -131,7 +131,7 @@ def relaxations(model: AxisModel, wishes: Wishes, options: Options, asked: Refer
     rougher = largest_factor(lambda f: feasible(wishes, options, replace(asked, least_damping=f * damping)))
     if rougher is not None:
         yield Relaxation("least damping ratio", damping, rougher * damping)
-    if options.gain != 0.0 and feasible(wishes, replace(options, gain=0.0), asked):
+    if options.gain and feasible(wishes, replace(options, gain=0.0), asked):
         yield Relaxation("l", options.gain, 0.0)
     for leak in LEAKS_PER_S:
         if leak > options.leak_per_s and feasible(wishes, replace(options, leak_per_s=leak), asked):
