@@ -7,7 +7,8 @@ sets.py         gain sets: the paper's in all readings, ours at its feedback
 crew.py         work on several processes, with progress and a clean end at Ctrl-C
 experiments.py  identification, design and tracking on a virtual axis, SYNC-stepped
 sweeps.py       what only the compiled simulator is fast enough for
-equations.py    printed against consistent equations
+equations.py    printed against consistent equations: friction
+programme.py    printed against consistent equations: (12) to (15)
 results.py      everything that a run found
 friction.py, loops.py, motions.py, beyond.py  the figures and their claims
 table.py        the paper's numbers beside ours

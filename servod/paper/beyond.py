@@ -7,11 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import numpy as np
-
 from servod.paper.claims import Claim, Shown
 from servod.paper.equations import TwoForms
 from servod.paper.joints import Joint
+from servod.paper.programme import ProgrammeAnswer
 from servod.paper.results import Results, Row
 from servod.paper.sweeps import NOISE_SHARES, SweepOfL
 from servod.report.figure import COLOURS, Axis, Colour, Figure, Panel, Scale, Style, curve
@@ -35,12 +34,30 @@ def figures(results: Results) -> Iterator[Shown]:
     yield Shown("11", _noise_figure(results), ())
 
 
-def slip_claims(results: Results) -> Iterator[Claim]:
-    """Printed against consistent equations: what the form costs on (19)."""
+def equation_claims(results: Results) -> Iterator[Claim]:
+    """Printed against consistent equations: what the form costs on (19), and what the programme's answer is worth."""
     for name, forms in results.slips.items():
-        yield Claim(
-            f"{name}: the printed form serves as well", _slip(forms), forms.printed_mrad <= forms.consistent_mrad
-        )
+        serves = forms.printed_mrad <= forms.consistent_mrad
+        yield Claim(f"{name}: the printed form serves as well", _slip(forms), serves)
+    for answer in results.programme:
+        paper = f"(14) over (15) in the {answer.form} form, l_i {answer.l_i:g}, gives a stable feedback"
+        stable = answer.largest_pole is not None and answer.largest_pole < 1.0
+        yield Claim(paper, _programme(answer), stable)
+
+
+def _programme(answer: ProgrammeAnswer) -> str:
+    """Both regions' feedback or clashes, and the sampled loop."""
+    told = []
+    for name, region in answer.regions.items():
+        if region.position_nm_per_rad is None:
+            told.append(f"no feedback in region {'; '.join(region.clashes)}")
+        else:
+            gains = f"{region.position_nm_per_rad:.4g} N·m/rad and {region.velocity_nms_per_rad:.4g} N·m·s/rad"
+            told.append(f"region {name} {gains}")
+    if answer.largest_pole is not None:
+        told.append(f"the largest pole of the sampled loop is {answer.largest_pole:.3g}")
+        told.append(f"(19) with {answer.rms_mrad:.4g} mrad RMS")
+    return ", ".join(told)
 
 
 def _slip(forms: TwoForms) -> str:
@@ -58,7 +75,7 @@ def _sweep_figure(results: Results) -> Figure:
     panels = []
     for name, sweep in results.sweeps.items():
         curves = [
-            curve(sign, sweep.factors, np.minimum(rms, 1e3), colour, style, 1.6)
+            curve(sign, sweep.factors, rms, colour, style, 1.6)
             for (sign, rms), colour, style in zip(
                 sweep.rms_mrad.items(), COLOURS, (Style.LINE, Style.DASHED, Style.DOTTED), strict=False
             )

@@ -50,7 +50,8 @@ def document(results: Results, figures: Sequence[Shown], elapsed_s: float) -> di
         "sweep_of_l": {name: asdict(sweep) for name, sweep in results.sweeps.items()},
         "noise_on_friction": results.noise,
         "figures": [s.document() for s in figures],
-        "equations": [asdict(claim) for claim in beyond.slip_claims(results)],
+        "programme": [asdict(answer) for answer in results.programme],
+        "equations": [asdict(claim) for claim in beyond.equation_claims(results)],
     }
 
 

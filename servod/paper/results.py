@@ -12,6 +12,7 @@ from servod.paper.equations import TwoForms
 from servod.paper.experiments import Found, Measured
 from servod.paper.joints import Joint
 from servod.paper.printed import RMS_MRAD
+from servod.paper.programme import ProgrammeAnswer
 from servod.paper.sweeps import SweepOfL
 from servod.report.figures.motion import Motion
 
@@ -57,6 +58,7 @@ class Results:
     sweeps: dict[str, SweepOfL]
     noise: dict[str, list[float]]
     slips: dict[str, TwoForms]
+    programme: list[ProgrammeAnswer]
     tuned: dict[Joint, list[Tuned]] = field(default_factory=dict)
 
     def rms(self, joint: Joint, row: Row) -> float | None:

@@ -53,7 +53,7 @@ def without_options(gains: GainSet, name: str) -> GainSet:
 
     law = local_law(gains)
     friction = law.friction.model_copy(update={"velocity": VelocitySource.MEASURED, "lead_s": 0.0})
-    return _changed(gains, name, law.model_copy(update={"friction": friction, "disturbance_observer": None}))
+    return with_law(gains, name, law.model_copy(update={"friction": friction, "disturbance_observer": None}))
 
 
 def consistent_g(speed: float) -> float:
@@ -69,10 +69,10 @@ def printed_g(speed: float) -> float:
 
 
 def _with_sets(gains: GainSet, name: str, law: LocalParameters, sets: list[LocalSet]) -> GainSet:
-    return _changed(gains, name, law.model_copy(update={"friction": law.friction.model_copy(update={"sets": sets})}))
+    return with_law(gains, name, law.model_copy(update={"friction": law.friction.model_copy(update={"sets": sets})}))
 
 
-def _changed(gains: GainSet, name: str, law: LocalParameters) -> GainSet:
-    """What was changed is neither designed nor certified."""
+def with_law(gains: GainSet, name: str, law: LocalParameters) -> GainSet:
+    """The set with another law; what was changed is neither designed nor certified."""
     none = {"design": None, "certificate": None, "seal": None}
     return gains.model_copy(update={"name": name, "parameters": law, **none})

@@ -25,6 +25,8 @@ from servod.report.figures.motion import SETTLE_S, Motion, motion_of_run
 from servod.tracking.motions import paper_rows
 
 PERIOD_S = 0.001
+#: What counts for a joint that runs away: a hundred times the trajectory.
+RAN_AWAY_MRAD = 1e4
 #: Cut-off of the noise that tunes friction (Fig. 11): slow against the loop, fast against the reference.
 NOISE_HZ = 2.0
 #: RMS of that noise as shares of F_C; the paper prints neither.
@@ -56,10 +58,10 @@ def simulate(plant: AxisModel, gains: GainSet, rows: Array, external_nm: Array |
 
 
 def rms_mrad(plant: AxisModel, gains: GainSet, seconds: float, external_nm: Array | None = None) -> float:
-    """RMS error of (19) without its first second; infinite for a joint that ran away."""
+    """RMS error of (19) without its first second; RAN_AWAY_MRAD at most."""
     run = simulate(plant, gains, paper_rows(PERIOD_S, seconds), external_nm)
     rms = 1e3 * float(np.sqrt(np.mean(run.tracking_error_rad(SETTLE_S) ** 2)))
-    return rms if math.isfinite(rms) else math.inf
+    return min(rms, RAN_AWAY_MRAD) if math.isfinite(rms) else RAN_AWAY_MRAD
 
 
 def sweep_of_l(gains: GainSet, seconds: float, factors: Sequence[float] = FACTORS) -> SweepOfL:

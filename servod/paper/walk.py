@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from servod.gains import GainSet
-from servod.paper import beyond, document, equations, experiments, motions, sweeps
+from servod.paper import beyond, document, equations, experiments, motions, programme, sweeps
 from servod.paper.crew import Crew, Tell
 from servod.paper.experiments import Found, Measured, cutoff_of
 from servod.paper.joints import Joint
@@ -100,6 +100,7 @@ def gather(plan: PaperPlan, crew: Crew) -> Results:
         beyond.EXPONENT: crew.submit("(18)", 1.0, equations.exponent_of_18, plan.seconds),
         beyond.LITERAL_8: crew.submit("(8)", 1.0, equations.literal_8, plan.seconds),
     }
+    solved = crew.submit("(12) to (15)", 3.0, programme.answers, plan.seconds)
     sines = _sines(plan, crew)
     designed = {joint: crew.result(job) for joint, job in found.items()}
     tracked |= {key: job for joint, it in designed.items() for key, job in _track_found(plan, crew, joint, it)}
@@ -112,6 +113,7 @@ def gather(plan: PaperPlan, crew: Crew) -> Results:
         {name: crew.result(job) for name, job in swept.items()},
         crew.result(noise),
         {name: crew.result(job) for name, job in slips.items()},
+        crew.result(solved),
     )
 
 

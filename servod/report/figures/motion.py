@@ -139,11 +139,12 @@ def before_after(before: Motion, after: Motion, name: str = "before_after", titl
     return Figure(name, title, panels, caption=caption)
 
 
-def steps(motions: Sequence[Motion], name: str, title: str, settled_s: float = 0.15) -> Figure:
-    """Step responses over each other (Fig. 16, 17): position, the error near its end, torque.
+def steps(motions: Sequence[Motion], name: str, title: str, settled_s: float = 0.15, shown_s: float = 0.6) -> Figure:
+    """Step responses over each other (Fig. 16, 17): position, the error near its end, torque, for `shown_s`.
 
     Motions begin with the step. The panel of the error shows what is left from `settled_s` on.
     """
+    motions = [m.part(0.0, shown_s) for m in motions]
     colours = [COLOURS[i % len(COLOURS)] for i in range(len(motions))]
     t = Axis("time in s")
     position = [curve(m.label, m.time_s, MILLI * m.position_rad, c) for m, c in zip(motions, colours, strict=True)]
