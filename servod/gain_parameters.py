@@ -174,6 +174,7 @@ class OutputObserver(Strict):
     """Disturbance observer around the compensated axis."""
 
     bandwidth_rad_s: float = Field(gt=0.0, le=2000.0)
+    low_bandwidth_rad_s: float | None = Field(None, gt=0.0, le=2000.0, description="in Omega_L; without: the same")
     inertia_kg_m2: Inertia
     disturbance_limit_nm: Torque
 
@@ -261,6 +262,7 @@ class LocalParameters(Strict):
             observer.disturbance_limit_nm if observer else 0.0,
             *self.regions.low.pack_memory(),
             *self.regions.high.pack_memory(),
+            (observer.low_bandwidth_rad_s or observer.bandwidth_rad_s) if observer else 0.0,
             float(len(f.sets)),
             *(s.velocity_rad_s for s in f.sets),
             *(s.decay_per_s for s in f.sets),

@@ -6,9 +6,10 @@
 
 In sampled time the state that (13) feeds back has more in it than position and velocity: commands that were given and
 do not show in the velocity yet. Each region may take -k_u(i)*u*(k-i) of the last commands, as the limits let them
-through, which is the predictor that the delay asks for (0: none). T is what is known over position (servod.controllers.position). All three gains are negative feedback. l > 0 makes
-z_hat push the way the feedback pushes (integral action through the friction state); the other sign is harmful. Every
-direction has its own nodes, so asymmetry needs nothing special.
+through, which is the predictor that the delay asks for (0: none). T is what is known over position
+(servod.controllers.position). All three gains are negative feedback. l > 0 makes z_hat push the way the feedback
+pushes (integral action through the friction state); the other sign is harmful. Every direction has its own nodes, so
+asymmetry needs nothing special.
 Options: the velocity of z_hat, of d0 and of the sets is the measured one or the reference's, led by a stated time;
 an output disturbance observer around the whole (bandwidth 0: none). The regions go by the faster of both velocities:
 a step has no reference velocity, yet the gains of Omega_L on a joint that turns fast make a limit cycle.
@@ -42,12 +43,13 @@ LEAD = 14  # time by which the reference velocity is led [s]
 SHAPE = 15  # servod.controllers.weights.Shape
 HOLD_WITHIN = 16  # hold width [rad]
 FEEDFORWARD_INERTIA = 17  # m_ff [kg*m^2]
-OBSERVER_BANDWIDTH = 18  # g of the output disturbance observer [rad/s], 0: none
+OBSERVER_BANDWIDTH = 18  # g of the output disturbance observer in Omega_H [rad/s], 0: none
 OBSERVER_INERTIA = 19  # nominal m of the observer [kg*m^2]
 OBSERVER_LIMIT = 20  # bound of |d_hat| [N*m]
 LOW_K_U, HIGH_K_U = 21, 24  # gains of the last three commands u* in Omega_L and Omega_H
-N_SETS = 27  # number n of local sets
-FIRST_NODE = 28  # then n nodes v_i [rad/s], n decays a_i [1/s], n gains l_i; then `position`, or nothing
+OBSERVER_LOW = 27  # g in Omega_L [rad/s]: on its bristle the joint moves so little that the estimate would take seconds
+N_SETS = 28  # number n of local sets
+FIRST_NODE = 29  # then n nodes v_i [rad/s], n decays a_i [1/s], n gains l_i; then `position`, or nothing
 
 MEASURED = 0.0
 REFERENCE = 1.0
@@ -59,16 +61,25 @@ def remembered(p: Sequence[float], s: Sequence[float], first: int) -> float:
     return p[first] * s[COMMAND_1] + p[first + 1] * s[COMMAND_2] + p[first + 2] * s[COMMAND_3]
 
 
-def scheduled(p: Sequence[float], s: Sequence[float], speed: float, error: float, error_rate: float) -> float:
-    """u* of (13), gains blended from Omega_L to Omega_H over the overlap, linearly in the speed [rad/s]."""
-    z = s[FRICTION_STATE]
-    low = p[LOW_K_X] * error + p[LOW_K_V] * error_rate - p[LOW_K_Z] * z - remembered(p, s, LOW_K_U)
+def high_share(p: Sequence[float], speed: float) -> float:
+    """Share of Omega_H at `speed` [rad/s]: 0 in Omega_L, 1 in Omega_H, linear over the overlap."""
     if speed <= p[BLEND_FROM]:
-        return low
-    high = p[HIGH_K_X] * error + p[HIGH_K_V] * error_rate - p[HIGH_K_Z] * z - remembered(p, s, HIGH_K_U)
+        return 0.0
     if speed >= p[BLEND_TO]:
-        return high
-    return low + (high - low) * (speed - p[BLEND_FROM]) / (p[BLEND_TO] - p[BLEND_FROM])
+        return 1.0
+    return (speed - p[BLEND_FROM]) / (p[BLEND_TO] - p[BLEND_FROM])
+
+
+def scheduled(p: Sequence[float], s: Sequence[float], share: float, error: float, error_rate: float) -> float:
+    """u* of (13), blended with `share` of Omega_H."""
+    z, star = s[FRICTION_STATE], 0.0
+    if share < 1.0:
+        low = p[LOW_K_X] * error + p[LOW_K_V] * error_rate - p[LOW_K_Z] * z - remembered(p, s, LOW_K_U)
+        star += (1.0 - share) * low
+    if share > 0.0:
+        high = p[HIGH_K_X] * error + p[HIGH_K_V] * error_rate - p[HIGH_K_Z] * z - remembered(p, s, HIGH_K_U)
+        star += share * high
+    return star
 
 
 def step(
@@ -86,7 +97,8 @@ def step(
     w = v_ref + p[LEAD] * a_ref if p[SOURCE] == REFERENCE else v
     error = x_ref - x
     s[COMMAND_1] -= (s[ASKED] - u_applied) / p[INPUT_SCALE]  # what the limits cut never acts
-    u_star = scheduled(p, s, max(abs(w), abs(v)), error, v_ref - v)
+    share = high_share(p, max(abs(w), abs(v)))
+    u_star = scheduled(p, s, share, error, v_ref - v)
     s[COMMAND_3], s[COMMAND_2], s[COMMAND_1] = s[COMMAND_2], s[COMMAND_1], u_star
     moves = not (v_ref == 0.0 and a_ref == 0.0 and abs(error) <= p[HOLD_WITHIN])
     n = int(p[N_SETS])
@@ -102,7 +114,8 @@ def step(
     other = p[FEEDFORWARD_INERTIA] * a_ref + known
     if p[OBSERVER_BANDWIDTH] > 0.0:
         if moves:
-            observe(s, p[OBSERVER_BANDWIDTH], p[OBSERVER_INERTIA], p[OBSERVER_LIMIT], v, u_applied, dt)
+            bandwidth = p[OBSERVER_LOW] + share * (p[OBSERVER_BANDWIDTH] - p[OBSERVER_LOW])
+            observe(s, bandwidth, p[OBSERVER_INERTIA], p[OBSERVER_LIMIT], v, u_applied, dt)
         remember(s, v, friction + known, u_applied)
         other += s[DISTURBANCE]
     feedback = p[INPUT_SCALE] * u_star

@@ -13,7 +13,11 @@ from servod.controllers.weights import Shape
 from servod.models.compiled import compiled
 from tests.controllers.cases import PARAMETERS, fresh_state, local_parameters
 
-CASES = {**PARAMETERS, "local memory": local_parameters(memory=(0.4, 0.3, 0.1)), **{f"local {shape.name}": local_parameters(gain=0.04, shape=float(shape)) for shape in Shape}}
+CASES = {
+    **PARAMETERS,
+    "local memory": local_parameters(memory=(0.4, 0.3, 0.1)),
+    **{f"local {shape.name}": local_parameters(gain=0.04, shape=float(shape)) for shape in Shape},
+}
 
 
 @pytest.mark.parametrize("case", list(CASES))
@@ -32,5 +36,7 @@ def test_compiled_equals_plain(case: str) -> None:
 
 def test_nan_comes_through_the_compiled_kernels_too() -> None:
     for name, p in PARAMETERS.items():
-        torque = compiled(LAWS[name].step)(np.array(p), np.zeros(LAWS[name].n_states), 0.0, 0.0, 0.0, 0.0, math.nan, 0.0, 0.001)[0]
+        torque = compiled(LAWS[name].step)(
+            np.array(p), np.zeros(LAWS[name].n_states), 0.0, 0.0, 0.0, 0.0, math.nan, 0.0, 0.001
+        )[0]
         assert math.isnan(torque)
