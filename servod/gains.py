@@ -43,6 +43,21 @@ class _Dumper(Dumper):
         return super().represent_sequence(tag, items, in_one_line or flow_style)
 
 
+class CrossCheck(Strict):
+    """One region's programme solved by a second solver: both H2 bounds and whether they agree.
+
+    A bound is missing where the solver found no solution; both missing agree as well.
+    """
+
+    region: str = Field(min_length=1, max_length=200)
+    solver: str = Field(min_length=1, max_length=50, description="the second one")
+    h2_bound: float | None = None
+    other_h2_bound: float | None = None
+    difference: float | None = Field(None, description="of the bounds, relative")
+    tolerance: float
+    agrees: bool = Field(strict=True)
+
+
 class Provenance(Strict):
     """Where a gain set comes from; hashes are sha256 of the files' bytes."""
 
@@ -53,6 +68,7 @@ class Provenance(Strict):
     model_sha256: Sha256 | None = Field(None, description="axis model that it was designed for")
     data_sha256: list[Sha256] = Field(default_factory=list, description="recordings that the model was identified from")
     seed: int | None = None
+    cross_checks: list[CrossCheck] = Field(default_factory=list, description="of the synthesis, by a second solver")
     note: str = Field("", max_length=4000)
 
 

@@ -9,7 +9,6 @@ printed one, the output [alpha x; beta u*] or the printed sum (servod.gain_desig
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -18,6 +17,7 @@ import cvxpy as cp
 import numpy as np
 
 from servod.gain_design import ReferenceForm, ReferenceOutput, ReferenceProof
+from servod.synthesize.solvers import solved
 from servod.verify.reference_vertices import ContinuousVertex, Polytope, vertices
 from servod.verify.sampled import Array
 from servod.verify.steady_friction import SteadyFriction
@@ -25,7 +25,6 @@ from servod.verify.vertices import Span
 
 STRICT = 1e-6  # of the inequalities with states, time and disturbances scaled
 RATE_PER_S = 1e3  # unit of time is its inverse
-SOLVED = ("optimal", "optimal_inaccurate")
 PARTS = ("norm", "decay", "damping")
 
 
@@ -81,7 +80,7 @@ def solve(region: Region, parts: frozenset[str], strict: float = STRICT) -> Solv
     Every inequality holds by `strict`, in scaled units.
     """
     p, y = cp.Variable((3, 3), symmetric=True), cp.Variable((1, 3))
-    outputs = _outputs(region, p, y)
+    outputs = _outputs(region, p, y) / region.wishes.torque_weight
     rows = outputs.shape[0]
     q = cp.Variable((rows, rows), symmetric=True)
     constraints = [cp.bmat([[q, outputs], [outputs.T, p]]) >> strict * np.eye(3 + rows), p >> strict * np.eye(3)]
@@ -91,16 +90,12 @@ def solve(region: Region, parts: frozenset[str], strict: float = STRICT) -> Solv
             block >> strict * np.eye(block.shape[0]) for block in _blocks(vertex, region, size, parts, p, y)
         ]
     problem = cp.Problem(cp.Minimize(cp.trace(q)), constraints)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            problem.solve(solver=region.wishes.solver)
-    except cp.error.SolverError:
+    if not solved(problem, region.wishes.solver) or p.value is None:
         return None
-    if problem.status not in SOLVED or p.value is None:
-        return None
-    values = [np.asarray(value, dtype=np.float64) * size**2 for value in (p.value, y.value[0], q.value)]
-    return Solved(values[0], values[1], values[2], size * float(np.sqrt(max(problem.value, 0.0))))
+    unit = size * region.wishes.torque_weight
+    values = [np.asarray(value, dtype=np.float64) for value in (p.value, y.value[0], q.value)]
+    norm = unit * math.sqrt(max(float(problem.value), 0.0))
+    return Solved(size**2 * values[0], size**2 * values[1], unit**2 * values[2], norm)
 
 
 def disturbance_size(region: Region) -> float:
