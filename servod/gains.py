@@ -68,7 +68,7 @@ class Provenance(Strict):
     model_sha256: Sha256 | None = Field(None, description="axis model that it was designed for")
     data_sha256: list[Sha256] = Field(default_factory=list, description="recordings that the model was identified from")
     seed: int | None = None
-    cross_checks: list[CrossCheck] = Field(default_factory=list, description="of the synthesis, by a second solver")
+    cross_checks: list[CrossCheck] | None = Field(None, description="of the synthesis, by a second solver")
     note: str = Field("", max_length=4000)
 
 

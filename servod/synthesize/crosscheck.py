@@ -54,7 +54,9 @@ def stored_programme(proof: RegionProof, solver: str) -> tuple[Programme, Soluti
     programme = Programme(
         [v.mode for v in vertices],
         [v.lyapunov_h2 is not None for v in vertices],
-        *(np.array([getattr(v, name) for v in vertices]) for name in ("a", "b", "e")),
+        np.array([v.a for v in vertices]),
+        np.array([v.b for v in vertices]),
+        np.array([v.e for v in vertices]),
         proof.position_weight,
         proof.torque_weight,
         [(v.disc_centre, v.disc_radius) for v in vertices],
@@ -91,7 +93,7 @@ def reference_norm(design: Design, proof: ReferenceProof, solver: str) -> float 
     friction = steady_friction(design.model)
     programme = lmi_reference.programme(friction, span, Polytope.stored(proof), asked)
     found = lmi_reference.solve(programme, frozenset(PARTS))
-    return found and found.norm
+    return found.norm if found is not None else None
 
 
 def cross_check(gains: GainSet) -> list[CrossCheck]:
