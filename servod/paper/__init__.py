@@ -9,6 +9,7 @@ experiments.py  identification, design and tracking on a virtual axis, SYNC-step
 sweeps.py       what only the compiled simulator is fast enough for
 equations.py    printed against consistent equations: friction
 programme.py    printed against consistent equations: (12) to (15)
+rivals.py       every law tuned by the same rules, then scored
 results.py      everything that a run found
 friction.py, loops.py, motions.py, beyond.py  the figures and their claims
 table.py        the paper's numbers beside ours

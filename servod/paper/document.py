@@ -63,7 +63,8 @@ def _joint(results: Results, joint: Joint) -> dict[str, Any]:
         "feedback": _feedback(found),
         "tracking": {row.name.lower(): tracking_of(results.measured[joint, row]) for row in Row},
         "tuned": [
-            {"law": t.law, "feedback": t.feedback, **tracking_of(t.measured)} for t in results.tuned.get(joint, [])
+            {"law": t.law, "feedback": t.feedback.value, **tracking_of(t.measured)}
+            for t in results.tuned.get(joint, [])
         ],
     }
 

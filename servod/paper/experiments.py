@@ -93,14 +93,14 @@ def cutoff_of(gains: GainSet) -> float:
 def measure(
     joint: Joint, label: str, gains: GainSet, cutoff_hz: float, seed: int, seconds: float, hold_s: float
 ) -> Measured:
-    """Trajectory (19) for `seconds`, then each step from rest on an axis of its own, held for `hold_s`."""
+    """Trajectory (19) for `seconds`, then each step on an axis of its own, held for `hold_s` (0: no steps)."""
     stops: dict[str, str] = {}
     followed = _motion(joint, label, gains, cutoff_hz, seed, ReferenceKind.PAPER, [seconds], "(19)", stops)
     steps = {
         size: _motion(
             joint, label, gains, cutoff_hz, seed, ReferenceKind.STEP, [size * 1e-3, hold_s], f"{size:g} mrad", stops
         )
-        for size in STEPS_MRAD
+        for size in (STEPS_MRAD if hold_s else ())
     }
     done = {size: motion for size, motion in steps.items() if motion is not None}
     responses = {s: step_response(m.time_s, m.position_rad, s * 1e-3, COUNT_RAD) for s, m in done.items()}

@@ -13,6 +13,7 @@ from servod.paper.experiments import Found, Measured
 from servod.paper.joints import Joint
 from servod.paper.printed import RMS_MRAD
 from servod.paper.programme import ProgrammeAnswer
+from servod.paper.rivals import Contender
 from servod.paper.sweeps import SweepOfL
 from servod.report.figures.motion import Motion
 
@@ -38,15 +39,6 @@ class Row(Enum):
 
 
 @dataclass(frozen=True)
-class Tuned:
-    """One rival after the fair tuning: its law and class as people read them, and how it tracks."""
-
-    law: str
-    feedback: str
-    measured: Measured
-
-
-@dataclass(frozen=True)
 class Results:
     """One run. `sines` are the motions of Fig. 9 to 12; `noise` is the RMS over NOISE_SHARES by controller."""
 
@@ -59,7 +51,7 @@ class Results:
     noise: dict[str, list[float]]
     slips: dict[str, TwoForms]
     programme: list[ProgrammeAnswer]
-    tuned: dict[Joint, list[Tuned]] = field(default_factory=dict)
+    tuned: dict[Joint, list[Contender]] = field(default_factory=dict)
 
     def rms(self, joint: Joint, row: Row) -> float | None:
         """RMS error of (19) in mrad; None where the axis stopped."""

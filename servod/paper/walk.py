@@ -13,12 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from servod.gains import GainSet
-from servod.paper import beyond, document, equations, experiments, motions, programme, sweeps
+from servod.paper import beyond, document, equations, experiments, motions, programme, rivals, sweeps
 from servod.paper.crew import Crew, Tell
 from servod.paper.experiments import Found, Measured, cutoff_of
 from servod.paper.joints import Joint
 from servod.paper.printed import FRICTION
 from servod.paper.results import Results, Row
+from servod.paper.rivals import Contender
 from servod.paper.sets import at_paper_feedback, printed_l, shipped_set, with_l, without_options
 from servod.report.figure import Figure
 from servod.report.figures.sets import local_law
@@ -28,6 +29,8 @@ from servod.report.pictures import write_pictures
 PLAIN_L = 0.1
 #: RMS of the noise on friction in Fig. 11 and 12, as a share of F_C.
 NOISE_SHARE = 0.1
+#: What tuning one rival takes, and scoring it in both classes, in seconds of one core.
+_TUNE_S, _SCORE_S = 12.0, 3.0
 #: Shipped sets by row.
 _SHIPPED = {
     Row.PD: "paper_pd",
@@ -51,6 +54,7 @@ class PaperPlan:
     identify: bool = True
     factors: tuple[float, ...] = sweeps.FACTORS
     pictures: bool = True
+    tune: tuple[Joint, ...] = (Joint.REAL,)
 
 
 #: A look at everything that needs no identification, on Table I's joint alone.
@@ -76,7 +80,8 @@ def expected_s(plan: PaperPlan) -> float:
     """Sum of all weights below, for the progress."""
     tracked = len(Row) * len(plan.joints) * _track_s(plan)
     drawn = 1.5 * (14 + 8 * len(plan.joints)) if plan.pictures else 0.0
-    return tracked + drawn + (45.0 if plan.identify else 6.0) * len(plan.joints) + 20.0
+    tuned = len(plan.tune) * len(rivals.LABELS) * (_TUNE_S + 2.0 * _SCORE_S)
+    return tracked + drawn + tuned + (45.0 if plan.identify else 6.0) * len(plan.joints) + 20.0
 
 
 def _track_s(plan: PaperPlan) -> float:
@@ -114,6 +119,7 @@ def gather(plan: PaperPlan, crew: Crew) -> Results:
         crew.result(noise),
         {name: crew.result(job) for name, job in slips.items()},
         crew.result(solved),
+        {joint: _contenders(plan, crew, joint, designed[joint]) for joint in plan.tune if joint in designed},
     )
 
 
@@ -121,6 +127,22 @@ def _found(plan: PaperPlan, crew: Crew, joint: Joint) -> Future[Found]:
     if plan.identify:
         return crew.submit(f"{joint.label} identified", 45.0, experiments.identify_and_design, joint, plan.seed)
     return crew.submit(f"{joint.label} designed for", 6.0, experiments.design_as_told, joint)
+
+
+def _contenders(plan: PaperPlan, crew: Crew, joint: Joint, found: Found) -> list[Contender]:
+    """Every rival tuned on what was found of the joint, each scored as soon as it is there."""
+    cutoff_hz = cutoff_of(found.gains)
+    tuned = {
+        name: crew.submit(f"{label} tuned", _TUNE_S, rivals.tuned_sets, found.model, name, cutoff_hz, plan.seed)
+        for name, label in rivals.LABELS.items()
+    }
+    scored = [
+        crew.submit(label, _SCORE_S, rivals.score, joint, name, feedback, gains, cutoff_hz, plan.seed, plan.seconds)
+        for name, label in rivals.LABELS.items()
+        for feedback, gains in crew.result(tuned[name]).items()
+    ]
+    found_all = [crew.result(job) for job in scored]
+    return sorted(found_all, key=lambda contender: contender.feedback.value)
 
 
 Tracked = tuple[tuple[Joint, Row], Future[Measured]]

@@ -1,0 +1,53 @@
+"""Every law tuned by the same rules on the identified joint, then measured on the joint itself: the fair comparison.
+
+Jobs of the crew; stands on servod.tune. Tuning sees the model and its intervals, scoring the plant, with other seeds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from servod.axis_model import AxisModel
+from servod.gains import GainSet
+from servod.paper.experiments import Measured, measure
+from servod.paper.joints import ENCODER_COUNTS, Joint
+from servod.tune.plan import Feedback, TunePlan
+from servod.tune.tuning import tune
+
+#: What people read, by the rival's key in servod.tune.laws.RIVALS.
+LABELS = {
+    "pd": "PD",
+    "pd_dob": "PD + DOB",
+    "pd_lugre": "PD + LuGre, l_f tuned",
+    "pd_lugre_025": "PD + LuGre, l_f 0.25",
+    "pd_lugre_035": "PD + LuGre, l_f 0.35",
+    "local": "local",
+}
+#: Between the seeds of tuning and of scoring.
+SCORING_SEED_OFFSET = 100
+
+
+@dataclass(frozen=True)
+class Contender:
+    """One tuned law: what people read of it, its class, and what it did on the joint."""
+
+    law: str
+    feedback: Feedback
+    measured: Measured
+
+
+def tuned_sets(model: AxisModel, name: str, cutoff_hz: float, seed: int) -> dict[Feedback, GainSet]:
+    """The rival `name` in both classes, tuned for `model` within its intervals."""
+    plan = TunePlan(seed=seed, counts_per_turn=float(ENCODER_COUNTS), cutoff_hz=cutoff_hz)
+    equal = tune(model, name, Feedback.EQUAL, plan)
+    free = tune(model, name, Feedback.FREE, plan, equal.values)
+    return {Feedback.EQUAL: equal.gains, Feedback.FREE: free.gains}
+
+
+def score(
+    joint: Joint, name: str, feedback: Feedback, gains: GainSet, cutoff_hz: float, seed: int, seconds: float
+) -> Contender:
+    """Track (19) with one tuned set over the whole CAN loop."""
+    label = f"{LABELS[name]}, {feedback.value} feedback"
+    found = measure(joint, label, gains, cutoff_hz, seed + SCORING_SEED_OFFSET, seconds, 0.0)
+    return Contender(LABELS[name], feedback, found)
