@@ -18,13 +18,15 @@ from servod.synthesize.regions import pole_disc
 from servod.verify.proof import region_margin, scaled_vertices
 from servod.verify.sampled import Array, Timing
 from servod.verify.steady_friction import SteadyFriction, steady_friction
-from servod.verify.vertices import Span, joints
+from servod.verify.vertices import Span, fed_commands, joints
 
-#: Cut-offs of the velocity filter that are tried. The filter's lag decides what is possible where friction falls: at
-#: 120 Hz hardly anything, and no observer; beyond 800 Hz the encoder's steps shake the torque.
+#: Cut-offs of the velocity filter that are tried, the quietest first; above 800 Hz the encoder shakes the torque.
 CUTOFFS_HZ = (300.0, 500.0, 800.0)
-#: Pole radii asked for where the Stribeck curve falls, best first: the faster ones leave room for the observer.
-SLOW_DISCS = (0.96, 0.985)
+#: Pole radii asked for where the Stribeck curve falls, best first.
+SLOW_DISCS = (0.985, 0.998)
+#: Torque costs these shares of its weight in Omega_L, the first that is feasible: where the bristle holds the joint more
+#: gain risks little, but with two cycles of delay too much of it shakes the joint on its bristle.
+LOW_TORQUE_SHARES = (0.1, 0.5, 2.0)
 POSITION_BANDWIDTH_RAD_S = 120.0  # sets the scale of positions, and with it what alpha and beta mean
 RELAX_STEPS = 6
 
@@ -40,9 +42,9 @@ class Wishes:
     speed_max: float = 0.5
     overlap: tuple[float, float] = (0.005, 0.02)
     position_weight: float = 1.0
-    torque_weight: float = 0.02
+    torque_weight: float = 0.3  # a tenth of it costs half of the disk margin, ten times as much the position gain
     least_decay_per_s: float = 5.0
-    least_damping: float = 0.05
+    least_damping: float = 0.02  # of all poles, up to half the sample rate: more forbids the feedback of past commands
     slow_disc: float | None = None  # pole radius where friction falls; None = the least that is feasible
     solver: str = "CLARABEL"
 
@@ -97,7 +99,7 @@ def scales(friction: SteadyFriction, design: Design) -> tuple[list[float], float
     torque = friction.largest(design.speed_max_rad_s)
     position = torque / (friction.inertia * POSITION_BANDWIDTH_RAD_S**2)
     speed = position * POSITION_BANDWIDTH_RAD_S
-    commands = Timing(design.period_s, design.model.total_delay_s, design.velocity_cutoff_hz).kept_commands
+    commands = fed_commands(Timing(design.period_s, design.model.total_delay_s, design.velocity_cutoff_hz))
     return [position, speed, *[torque] * commands, speed, torque / friction.stiffness], torque
 
 
@@ -114,14 +116,15 @@ def programme(design: Design, proof: RegionProof, wishes: Wishes) -> Programme:
         a,
         b,
         e,
-        wishes.position_weight,
-        wishes.torque_weight,
+        proof.position_weight,
+        proof.torque_weight,
         [disc if p else (0.0, wishes.slow_disc or SLOW_DISCS[-1]) for p in performs],
         wishes.solver,
+        2 + fed_commands(Timing(design.period_s, design.model.total_delay_s, design.velocity_cutoff_hz)),
     )
 
 
-def bare_proof(design: Design, span: Span, wishes: Wishes) -> RegionProof:
+def bare_proof(design: Design, span: Span, wishes: Wishes, torque_share: float = 1.0) -> RegionProof:
     """A region's frame: speeds, scales and weights, with a vertex list still to come."""
     scale, torque = scales(steady_friction(design.model), design)
     return RegionProof.model_construct(
@@ -131,7 +134,7 @@ def bare_proof(design: Design, span: Span, wishes: Wishes) -> RegionProof:
         scale=scale,
         torque_scale_nm=torque,
         position_weight=wishes.position_weight,
-        torque_weight=wishes.torque_weight,
+        torque_weight=wishes.torque_weight * torque_share,
         feedback=[],
         slack={},
         vertices=[],
@@ -167,13 +170,16 @@ def proven(design: Design, frame: RegionProof, p: Programme, solution: Solution)
 
 def region(design: Design, span: Span, wishes: Wishes) -> RegionProof | None:
     """Feedback and proof of one region; None when the programme is infeasible or its proof does not hold."""
-    frame = bare_proof(design, span, wishes)
-    p = programme(design, frame, wishes)
-    solution = synthesise(p)
-    if solution is None:
-        return None
-    proof = proven(design, frame, p, solution)
-    return proof if region_margin(proof)[0] > 0.0 else None
+    for share in LOW_TORQUE_SHARES if span.holds_rest else (1.0,):
+        frame = bare_proof(design, span, wishes, share)
+        p = programme(design, frame, wishes)
+        solution = synthesise(p)
+        if solution is None:
+            continue
+        proof = proven(design, frame, p, solution)
+        if region_margin(proof)[0] > 0.0:
+            return proof
+    return None
 
 
 def regions(model: AxisModel, wishes: Wishes) -> Design | None:
@@ -190,9 +196,10 @@ def regions(model: AxisModel, wishes: Wishes) -> Design | None:
 
 
 def region_gains(proof: RegionProof, input_scale_nm: float) -> RegionGains:
-    """The law's gains from the scaled feedback: u = -K*(k_x*x + k_v*v_f)."""
-    position, speed = (-proof.torque_scale_nm * k / s for k, s in zip(proof.feedback, proof.scale, strict=False))
-    return RegionGains(k_x_per_rad=position / input_scale_nm, k_v_s_per_rad=speed / input_scale_nm)
+    """The law's gains from the scaled feedback: u = -K*(k_x*x + k_v*v_f) - sum k_u(i)*u(k-i)."""
+    gains = [-proof.torque_scale_nm * k / s for k, s in zip(proof.feedback, proof.scale, strict=False)]
+    position, speed = (gain / input_scale_nm for gain in gains[:2])
+    return RegionGains(k_x_per_rad=position, k_v_s_per_rad=speed, k_u=gains[2:])
 
 
 def clashing_vertices(design: Design, span: Span, wishes: Wishes) -> Iterator[str]:
@@ -201,7 +208,7 @@ def clashing_vertices(design: Design, span: Span, wishes: Wishes) -> Iterator[st
 
     frame = bare_proof(design, span, wishes)
     p = programme(design, frame, wishes)
-    feedback = np.concatenate([first_feedback(p), np.zeros(p.a.shape[-1] - 2)])
+    feedback = np.concatenate([first_feedback(p), np.zeros(p.a.shape[-1] - p.fed)])
     poles = np.linalg.eigvals(p.a + p.b[:, :, None] * feedback)
     names, _, _, _ = scaled_vertices(design, frame)
     for name, roots, (centre, radius) in zip(names, poles, p.discs, strict=True):

@@ -6,6 +6,7 @@ verification uses.
 
 from __future__ import annotations
 
+import bisect
 import datetime
 import hashlib
 import math
@@ -23,10 +24,12 @@ from servod.gain_parameters import (
     RegionGains,
     Regions,
     VelocitySource,
+    WeightShape,
 )
 from servod.gains import GainSet, Provenance
 from servod.synthesize.deployed import Infeasible, Wishes, explain, region_gains, regions
 from servod.synthesize.feedforward import position_feedforward
+from servod.synthesize.integral_gain import designed
 from servod.synthesize.local_sets import PAPER_NODES, STIFFNESS_SHARE, compensator, local_sets, sets_at
 from servod.verify.checks import CORNER_SPEEDS, DISK_LIMIT, speeds_of
 from servod.verify.closed_loop import corners
@@ -34,12 +37,17 @@ from servod.verify.margins import Sweep
 from servod.verify.sampled import Timing
 from servod.verify.steady_friction import SteadyFriction, steady_friction
 
-#: Bandwidths of the output observer, best first; the first that every corner of the intervals stands is taken.
-OBSERVERS_RAD_S = (60.0, 50.0, 40.0, 30.0, 20.0, 15.0, 10.0, 5.0)
+#: Bandwidths of the output observer, best first: the largest is taken that leaves the wanted disk margin at every
+#: corner of the intervals, or else the one that the certificate asks for.
+OBSERVERS_RAD_S = (80.0, 60.0, 45.0, 34.0, 25.0, 18.0, 12.0, 7.0)
+DISK_WANTED = 0.15
+LOW_FACTOR = (
+    2.5  # of the bandwidth in Omega_L over that in Omega_H: a joint on its bristle comes to rest in half a second
+)
 #: From this bandwidth on no other choice of filter and poles is tried.
-ENOUGH_RAD_S = 30.0
+ENOUGH_RAD_S = 20.0
 LIMIT_SHARE = 1.5  # bound of the compensated force, as a share of the largest friction
-HOLD_COUNTS = 1.2  # hold width in encoder counts: what the joint creeps under noise is twice this
+HOLD_COUNTS = 0.6  # hold width in encoder counts: what rounding hides, and no more, for the joint creeps as far
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +59,9 @@ class Options:
     paper_nodes: bool = False
     velocity: VelocitySource = VelocitySource.REFERENCE
     observer: bool = True
-    gain: float = 0.0  # l_i: 0 where the observer is the integral action
+    gain: float | None = None  # l_i; None = 0 where the observer is the integral action, else designed
+    leak_per_s: float = 2.0
+    weights: WeightShape = WeightShape.LINEAR
     position_feedforward: bool = True
 
 
@@ -60,35 +70,47 @@ def input_scale(friction: SteadyFriction, speed: float) -> float:
     return float(10.0 ** round(math.log10(friction.largest(speed))))
 
 
-def parameters(design: Design, friction: SteadyFriction, options: Options, bandwidth: float) -> LocalParameters:
-    """The law's parameters with an output observer of `bandwidth` rad/s (0: none)."""
+def feedback_of(design: Design, scale: float) -> Regions:
+    """Feedback of both regions as proven."""
+    low, high = design.regions
+    return Regions(
+        low=region_gains(low, scale),
+        high=region_gains(high, scale),
+        overlap_from_rad_s=high.speed_from_rad_s,
+        overlap_to_rad_s=low.speed_to_rad_s,
+    )
+
+
+def parameters(
+    design: Design, friction: SteadyFriction, options: Options, bandwidth: float, feedback: Regions | None = None
+) -> LocalParameters:
+    """The law's parameters with an output observer of `bandwidth` rad/s (0: none); `feedback`: None = as proven."""
     speed, largest = design.speed_max_rad_s, friction.largest(design.speed_max_rad_s)
     share = STIFFNESS_SHARE * (1.0 - design.uncertainty.stiffness)
     c, scale = compensator(friction, speed, share), input_scale(friction, speed)
     sets = (
-        sets_at(friction, c, PAPER_NODES, options.gain)
+        sets_at(friction, c, PAPER_NODES, options.gain or 0.0)
         if options.paper_nodes
-        else local_sets(friction, c, speed, options.accuracy, options.gain)
+        else local_sets(friction, c, speed, options.accuracy, options.gain or 0.0)
     )
-    low, high = design.regions
     return LocalParameters(
         law="local",
         input_scale_nm=scale,
-        regions=Regions(
-            low=region_gains(low, scale),
-            high=region_gains(high, scale),
-            overlap_from_rad_s=high.speed_from_rad_s,
-            overlap_to_rad_s=low.speed_to_rad_s,
-        ),
+        regions=feedback or feedback_of(design, scale),
         friction=LocalFriction(
             stiffness_nm_per_rad=c.stiffness,
             viscous_nms_per_rad=c.viscous,
             friction_limit_nm=LIMIT_SHARE * largest,
+            leak_per_s=options.leak_per_s,
             velocity=options.velocity,
+            weights=options.weights,
             sets=sets,
         ),
         disturbance_observer=OutputObserver(
-            bandwidth_rad_s=bandwidth, inertia_kg_m2=friction.inertia, disturbance_limit_nm=largest
+            bandwidth_rad_s=bandwidth,
+            low_bandwidth_rad_s=LOW_FACTOR * bandwidth,
+            inertia_kg_m2=friction.inertia,
+            disturbance_limit_nm=largest,
         )
         if bandwidth
         else None,
@@ -100,11 +122,11 @@ def parameters(design: Design, friction: SteadyFriction, options: Options, bandw
     )
 
 
-def stands(design: Design, friction: SteadyFriction, law: LocalParameters) -> bool:
-    """Whether the full sampled loop is stable at every corner of the intervals, with the disk margin that is asked."""
+def stands(design: Design, friction: SteadyFriction, law: LocalParameters, margin: float) -> bool:
+    """Whether the full sampled loop is stable at every corner of the intervals, with this disk margin at least."""
     timing = Timing(design.period_s, design.model.total_delay_s, design.velocity_cutoff_hz)
     sweep = Sweep(LAWS["local"], law.pack(), friction, timing, speeds_of(design, CORNER_SPEEDS))
-    return sweep.worst(corners(design.uncertainty)).radius < 1.0 and sweep.disk_margin()[0] >= DISK_LIMIT
+    return sweep.disk_margin()[0] >= margin and sweep.worst(corners(design.uncertainty)).radius < 1.0
 
 
 def synthesize(
@@ -125,14 +147,24 @@ def synthesize(
             break
     if best is None:
         return explain(model, wishes)
-    return gain_set(best[1], parameters(best[1], friction, options, best[0]), options, model_path)
+    law = parameters(best[1], friction, options, best[0])
+    if law.disturbance_observer is None and options.gain is None:
+        law = designed(best[1], friction, law)
+    return gain_set(best[1], law, options, model_path)
 
 
 def widest_observer(design: Design, friction: SteadyFriction, options: Options) -> float:
     """Largest bandwidth of the list that the full loop stands [rad/s]; 0 where it stands none, or none is wanted."""
-    for bandwidth in OBSERVERS_RAD_S if options.observer else ():
-        if stands(design, friction, parameters(design, friction, options, bandwidth)):
-            return bandwidth
+    if not options.observer:
+        return 0.0
+    for margin in (DISK_WANTED, DISK_LIMIT):
+        index = bisect.bisect_left(
+            OBSERVERS_RAD_S,
+            True,
+            key=lambda g, margin=margin: stands(design, friction, parameters(design, friction, options, g), margin),
+        )
+        if index < len(OBSERVERS_RAD_S):
+            return OBSERVERS_RAD_S[index]
     return 0.0
 
 

@@ -1,8 +1,9 @@
 """The LMI programme of the deployed mode: sampled polytopic H2 with a pole disc, one Lyapunov matrix per vertex.
 
-Stands on cvxpy; in: scaled vertices (servod.verify.vertices), out: feedback of [x, v_f] and the matrices that prove it.
+Stands on cvxpy; in: scaled vertices (servod.verify.vertices), out: feedback of [x, v_f, u_(k-1), ...] and the matrices
+that prove it.
 The bristle either sticks or slides: two polytopes, each with its own slack, one feedback for both (one slack for both
-was infeasible for every gain). The joint's velocity and the waiting torques are not fed back, so the slack needs a
+was infeasible for every gain). Neither the joint's true velocity nor its bristle is fed back, so the slack needs a
 structure that lets R = K G be linear: G = [G1 M, G1 X; G2, G3] and R = [R1 M, R1 X] with M and X fixed gives
 K = R1 inv(G1). Block triangular slack (M = 1, X = 0) was tried first and loses most of Omega_H. Here M and X come from
 an analysis with the last feedback and full slack, in turn: neither step can lose what the other has won.
@@ -14,20 +15,21 @@ decay there too costs two thirds of the position gain everywhere.
 
 from __future__ import annotations
 
-import warnings
+import itertools
 from dataclasses import dataclass, replace
 from typing import Any
 
 import cvxpy as cp
 import numpy as np
 
+from servod.synthesize.solvers import solved
 from servod.verify.sampled import Array
 
 EPSILON = 1e-8  # strictness of the inequalities in scaled states
 PROOF_EPSILON = 1e-5  # of the proof that is kept: what rounding in a file cannot turn
 ROUNDS = 1  # a second one wins less than 2 % of the H2 norm
-SOLVED = ("optimal", "optimal_inaccurate")
-POSITIONS, VELOCITIES = -np.geomspace(0.003, 3.0, 25), -np.geomspace(0.02, 20.0, 30)
+POSITIONS, VELOCITIES = -np.geomspace(0.01, 3.0, 14), -np.geomspace(0.3, 20.0, 16)
+MEMORY = (0.0, 0.25, 0.5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +48,7 @@ class Programme:
     torque_weight: float
     discs: list[tuple[float, float]]
     solver: str = "CLARABEL"
+    fed: int = 2
 
     def only(self, mode: str) -> Programme:
         """The same programme over the vertices of one mode."""
@@ -63,7 +66,7 @@ class Programme:
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """Feedback of [x, v_f] in scaled units, and its proof."""
+    """Feedback of the first states in scaled units, and its proof."""
 
     feedback: Array
     slack: dict[str, Array]
@@ -78,9 +81,10 @@ class Solution:
 
     def guides(self) -> dict[str, Array]:
         """[M, X] of each mode: the upper rows of its slack, seen from the first mode's G1."""
-        first = next(iter(self.slack.values()))[:2, :2]
+        n = len(self.feedback)
+        first = next(iter(self.slack.values()))[:n, :n]
         return {
-            mode: np.asarray(np.linalg.solve(first, slack[:2]), dtype=np.float64) for mode, slack in self.slack.items()
+            mode: np.asarray(np.linalg.solve(first, slack[:n]), dtype=np.float64) for mode, slack in self.slack.items()
         }
 
 
@@ -92,16 +96,16 @@ class _Unknowns:
         self.outputs = [cp.Variable((2, 2), symmetric=True) if performs else None for performs in p.performs]
         self.h2 = [cp.Variable((size, size), symmetric=True) if performs else None for performs in p.performs]
         self.disc = [cp.Variable((size, size), symmetric=True) for _ in p.modes]
-        self.upper, self.row = cp.Variable((2, 2)), cp.Variable((1, 2))
+        self.upper, self.row = cp.Variable((p.fed, p.fed)), cp.Variable((1, p.fed))
         self.slack: dict[str, Any] = {}
         self.r: dict[str, Any] = {}
         for mode in dict.fromkeys(p.modes):
             if guides is None:
                 assert feedback is not None
                 self.slack[mode] = cp.Variable((size, size))
-                self.r[mode] = np.concatenate([feedback, np.zeros(size - 2)])[None, :] @ self.slack[mode]
+                self.r[mode] = np.concatenate([feedback, np.zeros(size - p.fed)])[None, :] @ self.slack[mode]
             else:
-                self.slack[mode] = cp.vstack([self.upper @ guides[mode], cp.Variable((size - 2, size))])
+                self.slack[mode] = cp.vstack([self.upper @ guides[mode], cp.Variable((size - p.fed, size))])
                 self.r[mode] = self.row @ guides[mode]
 
     def gain(self) -> Array:
@@ -154,13 +158,7 @@ def solve(
     constraints = [c for i in range(len(p.a)) for c in _vertex_constraints(p, i, u, in_disc, strictness)]
     cost = sum(cp.trace(w) for w in u.outputs if w is not None)
     problem = cp.Problem(cp.Minimize(cost), constraints)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # an inaccurate solution is judged by eigenvalues, not by its label
-            problem.solve(solver=p.solver)
-    except cp.error.SolverError:
-        return None
-    if problem.status not in SOLVED or next(iter(u.slack.values())).value is None:
+    if not solved(problem, p.solver) or next(iter(u.slack.values())).value is None:
         return None
     return Solution(
         u.gain() if feedback is None else feedback,
@@ -174,16 +172,18 @@ def solve(
 def first_feedback(p: Programme) -> Array:
     """Feedback of the grid that keeps the largest pole over all vertices smallest: where the rounds start."""
     size = p.a.shape[-1]
-    best, best_radius = np.zeros(2), np.inf
-    for position in POSITIONS:
+    best, best_radius = np.zeros(p.fed), np.inf
+    for share, position in itertools.product(MEMORY, POSITIONS):
         rows = np.zeros((len(VELOCITIES), 1, 1, size))
         rows[:, 0, 0, 0] = position
         rows[:, 0, 0, 1] = VELOCITIES
+        rows[:, 0, 0, 2 : p.fed] = -share
         loops = p.a[None] + p.b[None, :, :, None] * rows
-        radius = np.abs(np.linalg.eigvals(loops)).max(axis=(1, 2))
+        radii = np.abs(np.linalg.eigvals(loops)).max(axis=2)
+        radius = radii.max(axis=1) + radii.mean(axis=1)
         j = int(radius.argmin())
         if radius[j] < best_radius:
-            best, best_radius = rows[j, 0, 0, :2].copy(), float(radius[j])
+            best, best_radius = rows[j, 0, 0, : p.fed].copy(), float(radius[j])
     return best
 
 

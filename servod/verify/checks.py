@@ -11,8 +11,8 @@ from functools import cached_property
 
 import numpy as np
 
-from servod.gain_design import Design
-from servod.gain_parameters import LocalParameters
+from servod.gain_design import Design, RegionProof
+from servod.gain_parameters import LocalParameters, RegionGains
 from servod.gains import CertificateCheck, GainSet
 from servod.verify.closed_loop import Deviation, corners, inner_points
 from servod.verify.margins import NOMINAL, Sweep, largest_tolerated
@@ -98,10 +98,17 @@ def check_regions(s: Subject) -> Iterator[CertificateCheck]:
         yield at_most(f"vertices of region {region.name} against the model", stored_deviation(s.design, region), SAME)
         if isinstance(local, LocalParameters):
             own = getattr(local.regions, region.name)
-            used = np.array([own.k_x_per_rad, own.k_v_s_per_rad]) * local.input_scale_nm
-            proven = -np.array(region.feedback) * region.torque_scale_nm / np.array(region.scale[:2])
-            difference = float(np.abs(used / proven - 1.0).max()) + abs(own.k_z_per_rad)
+            difference = gain_difference(own, region, local.input_scale_nm)
             yield at_most(f"gains of region {region.name} against the proven ones", difference, SAME)
+
+
+def gain_difference(own: RegionGains, proof: RegionProof, input_scale_nm: float) -> float:
+    """Largest relative difference of the law's gains from the proven feedback; k_z, which no proof has, is to be 0."""
+    size = len(proof.feedback)
+    proven = -np.array(proof.feedback) * proof.torque_scale_nm / np.array(proof.scale[:size])
+    used = np.array([own.k_x_per_rad * input_scale_nm, own.k_v_s_per_rad * input_scale_nm, *own.pack_memory()])
+    rest = abs(own.k_z_per_rad) + float(np.abs(used[size:]).sum())
+    return float(np.abs(used[:size] / proven - 1.0).max()) + rest
 
 
 def check_stiffness(s: Subject) -> Iterator[CertificateCheck]:

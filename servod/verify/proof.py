@@ -42,7 +42,7 @@ def closed(region: RegionProof, vertex: Vertex) -> tuple[Array, Array]:
     """(A closed by the feedback, output matrix of [alpha*x; beta*u]) of one vertex, in scaled states."""
     a, b = np.array(vertex.a), np.array(vertex.b)
     feedback = np.zeros(len(a))
-    feedback[:2] = region.feedback
+    feedback[: len(region.feedback)] = region.feedback
     outputs = np.zeros((2, len(a)))
     outputs[0, 0] = region.position_weight
     outputs[1] = region.torque_weight * feedback

@@ -13,13 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from servod.controllers.local import COMMANDS
 from servod.gain_design import Uncertainty
 from servod.verify.closed_loop import Bristle, Deviation, joint_point
 from servod.verify.sampled import Array, Timing, with_delay_and_filter
 from servod.verify.steady_friction import SteadyFriction
 
-GRID = 40  # speeds at which slopes are taken, in each direction
-LEAST_SPEED = 0.1  # share of the region's upper speed from which slopes count: below it the bristle only creeps
+GRID = 40  # speeds that are compared, in each direction
+LEAST_SPEED = 0.1  # share of the upper speed of Omega_L from which on it counts: below it the bristle only creeps
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,17 +58,23 @@ def ends(share: float) -> tuple[float, float]:
     return 1.0 - share, 1.0 + share
 
 
-def steepest(friction: SteadyFriction, span: Span) -> tuple[float, float]:
-    """Velocities of the region at which friction falls most and rises most, over both directions [rad/s]."""
-    lowest = max(span.from_rad_s, LEAST_SPEED * span.to_rad_s)
+def extremes(friction: SteadyFriction, span: Span, u: Uncertainty) -> tuple[float, float]:
+    """Velocities of the region at which the joint is least and most stable by itself, over both directions [rad/s].
+
+    Least stable is not where friction falls most: the slower the joint, the longer its bristle takes to follow.
+    """
+    lowest = LEAST_SPEED * span.to_rad_s if span.holds_rest else span.from_rad_s
     velocities = [side * float(v) for side in (1.0, -1.0) for v in np.geomspace(lowest, span.to_rad_s, GRID)]
+    worse = Deviation(dry=1.0 + u.dry, slope=1.0 + u.slope, viscous=1.0 - u.viscous)
+    joints = np.array([joint_point(friction, v, Bristle.SLIDES, worse).matrices()[0] for v in velocities])
+    growth = np.linalg.eigvals(joints[:, 1:, 1:]).real.max(axis=1)
     slopes = [friction.dry_slope(v) + friction.viscous(v) for v in velocities]
-    return velocities[int(np.argmin(slopes))], velocities[int(np.argmax(slopes))]
+    return velocities[int(np.argmax(growth))], velocities[int(np.argmax(slopes))]
 
 
 def sliding(friction: SteadyFriction, span: Span, u: Uncertainty) -> list[Joint]:
     """The joint where friction falls most (every end of what makes that worse) and where it rises most."""
-    falls, rises = steepest(friction, span)
+    falls, rises = extremes(friction, span, u)
     slope = friction.dry_slope(falls) * (1.0 + u.slope) * (1.0 + u.dry) + friction.viscous(falls) * (1.0 - u.viscous)
     found = []
     for mass, damping in itertools.product(ends(u.inertia), ends(u.damping)):
@@ -103,13 +110,31 @@ def joints(friction: SteadyFriction, span: Span, uncertainty: Uncertainty) -> li
     return sliding(friction, span, uncertainty) + stuck
 
 
+def fed_commands(timing: Timing) -> int:
+    """Number of past commands that are fed back: those that still act or wait, and one that the velocity lags."""
+    return min(max(timing.kept_commands, round(timing.delay_s / timing.period_s) + 1), COMMANDS)
+
+
 def sampled_vertices(found: list[Joint], timing: Timing) -> tuple[Array, Array, Array]:
     """(A, B, E) of all vertices, states [x, v_f, u_(k-1), ..., v - v_f, z]: what the law feeds back comes first."""
     a, b, e = (np.array([getattr(joint, name) for joint in found]) for name in ("a", "b", "e"))
-    full_a, full_b, full_e = with_delay_and_filter(a, b, e, timing)
+    full_a, full_b, full_e = _with_memory(*with_delay_and_filter(a, b, e, timing), timing)
     change = _to_feedback_first(full_a.shape[-1])
     back = np.linalg.inv(change)
     return change @ full_a @ back, full_b @ change.T, full_e @ change.T
+
+
+def _with_memory(a: Array, b: Array, e: Array, timing: Timing) -> tuple[Array, Array, Array]:
+    """The same systems with the commands that are only remembered as further states at the end."""
+    size, more = a.shape[-1], max(fed_commands(timing) - timing.kept_commands, 0)
+    full_a = np.pad(a, ((0, 0), (0, more), (0, more)))
+    full_b, full_e = np.pad(b, ((0, 0), (0, more))), np.pad(e, ((0, 0), (0, more)))
+    for i in range(size, size + more):
+        if i > size or timing.kept_commands:
+            full_a[:, i, i - 1] = 1.0
+        else:
+            full_b[:, i] = 1.0
+    return full_a, full_b, full_e
 
 
 def _to_feedback_first(size: int) -> Array:
