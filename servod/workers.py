@@ -19,11 +19,12 @@ _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 @contextlib.contextmanager
 def worker_pool(processes: int) -> Iterator[Pool]:
     """`processes` fresh processes for the time of a `with` block; whatever ends the block ends them at once."""
-    with get_context("spawn").Pool(processes, _begin, (os.getpid(),)) as pool:
+    with get_context("spawn").Pool(processes, begin_worker, (os.getpid(),)) as pool:
         yield pool
 
 
-def _begin(parent: int) -> None:
+def begin_worker(parent: int) -> None:
+    """What a worker of `parent` does first."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:  # it died before we asked

@@ -18,6 +18,7 @@ import typer
 from servod.cli import (
     bench,
     check,
+    commission,
     demo,
     deploy,
     enable,
@@ -48,7 +49,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 _DAEMON = (demo, scan, status, enable, stop, track, gains, preset, record)
-_LABORATORY = (identify, synthesize, verify, deploy, replay, paper)
+_LABORATORY = (identify, synthesize, verify, deploy, commission, replay, paper)
 for _verb in (*_DAEMON, *_LABORATORY, bench, check, faults):
     _verb.register(app)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -63,18 +64,22 @@ class DaemonDeployLink:
 
     def run(self, motion: ValidationMotion, window_rad: float, tell: Tell) -> Rows:
         """Run the motion under the daemon's recorder and read its cycles back."""
-        sines, path = motion.sines.tolist(), Path(self._client.call(Verb.RECORD_START)["path"])
-        started = time.monotonic()
+        sines, started = motion.sines.tolist(), time.monotonic()
+        excite = {"kind": "excite", "positions_rad": sines, "torques_nm": [0.0] * len(sines), "window_rad": window_rad}
+        steps = [
+            {"kind": "step", "amplitude_rad": step_rad, "duration_s": STEP_S}
+            for step_rad in (motion.step_rad, -motion.step_rad)
+        ]
+        return self.record([excite, *steps], lambda: tell(min(1.0, (time.monotonic() - started) / motion.duration_s)))
 
-        def move(**arguments: Any) -> None:
-            self._client.call(Verb.TRACK, **arguments)
-            while self._moves():
-                tell(min(1.0, (time.monotonic() - started) / motion.duration_s))
-
+    def record(self, motions: Sequence[dict[str, Any]], tell: Callable[[], None] = lambda: None) -> Rows:
+        """Run motions (arguments of the verb `track`) one after the other; all cycles from the daemon's recording."""
+        path = Path(self._client.call(Verb.RECORD_START)["path"])
         try:
-            move(kind="excite", positions_rad=sines, torques_nm=[0.0] * len(sines), window_rad=window_rad)
-            for step_rad in (motion.step_rad, -motion.step_rad):
-                move(kind="step", amplitude_rad=step_rad, duration_s=STEP_S)
+            for motion in motions:
+                self._client.call(Verb.TRACK, **motion)
+                while self._moves():
+                    tell()
         finally:
             self._client.call(Verb.RECORD_STOP)
         return np.frombuffer(read_recording(path).rows, dtype=ROW)

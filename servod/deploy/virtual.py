@@ -11,10 +11,11 @@ from pathlib import Path
 from servod.axis_model import AxisModel
 from servod.config import AxisConfig
 from servod.deploy.links import SteppedDeployLink
+from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.gain_parameters import PdParameters
 from servod.gain_store import GainStore
 from servod.gains import GainSet, Provenance
-from servod.identify.virtual import virtual_session
+from servod.identify.virtual import ENCODER_COUNTS, rated_torque_mnm, virtual_config, virtual_session
 
 
 def virtual_link(
@@ -24,17 +25,19 @@ def virtual_link(
     present: GainSet | None = None,
     seed: int = 1,
     config: AxisConfig | None = None,
+    settings: VirtualAxisSettings | None = None,
 ) -> SteppedDeployLink:
     """A disabled axis whose store in `folder` holds `present` (a controller without torque unless given).
 
-    A `config` of the user's stays as it is; without one the axis gets the encoder and filter of `wanted`.
+    A `config` of the user's stays as it is; without one the axis gets the encoder and filter of `wanted`. `settings`
+    say what drive and encoder really are.
     """
     design = wanted.design
-    counts = round(design.counts_per_turn) if design and design.counts_per_turn else 2**20
-    session = virtual_session(plant, folder, counts, seed, config)
-    if config is None and design is not None:
-        filtered = with_cutoff(session.config, design.velocity_cutoff_hz)
-        session = virtual_session(plant, folder, counts, seed, filtered)
+    if config is None:
+        counts = round(design.counts_per_turn) if design and design.counts_per_turn else ENCODER_COUNTS
+        config = virtual_config(folder, rated_torque_mnm(plant), counts)
+        config = with_cutoff(config, design.velocity_cutoff_hz) if design else config
+    session = virtual_session(plant, folder, config.encoder.counts_per_turn, seed, config, settings)
     return SteppedDeployLink(session, GainStore(folder / "gains"), present or powerless())
 
 

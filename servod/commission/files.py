@@ -1,0 +1,46 @@
+"""Names of the files in a walk's folder, and how plain values get into them.
+
+Under state and steps.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from servod.errors import BadInput
+from servod.gain_store import write_atomically
+from servod.yaml12 import read_text
+
+RECORDINGS = "recordings"
+MODEL, IDENTIFIED = "model.yaml", "identified.json"
+DESIGN, RELAXED = "design.yaml", "relaxed.json"
+GAINS, CERTIFICATE = "gains.yaml", "certificate.json"
+STORE, DEPLOYMENT = "store", "deployment.json"
+RIVALS, TUNING = "rivals", "tuning.json"
+TRACKING, RUNS = "tracking.json", "runs"
+REPORT, PICTURES = "report.html", "pictures"
+RESULT = "commission.json"
+
+
+def write_text(path: Path, text: str) -> None:
+    """Replace a file as a whole. Raises BadInput."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, text)
+    except OSError as error:
+        raise BadInput(str(path), error.strerror or str(error), "a file that can be written") from None
+
+
+def write_json(path: Path, document: Any) -> None:
+    """Replace a JSON file as a whole. Raises BadInput."""
+    write_text(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
+
+
+def read_json(path: Path) -> Any:
+    """The document of a JSON file. Raises BadInput."""
+    try:
+        return json.loads(read_text(path))
+    except ValueError as error:
+        raise BadInput(str(path), str(error), "the JSON that servoctl commission wrote") from None

@@ -1,0 +1,192 @@
+"""The page of a commissioning and its pictures: from the folder's files alone, so that it can be made anew at any time.
+
+Stands on the figures of servod.report; called by the last step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from servod.axis_model import AxisModel, load_axis_model
+from servod.commission.axis import VirtualWalkAxis
+from servod.commission.files import (
+    CERTIFICATE,
+    DEPLOYMENT,
+    GAINS,
+    IDENTIFIED,
+    MODEL,
+    PICTURES,
+    RECORDINGS,
+    RELAXED,
+    REPORT,
+    RUNS,
+    TRACKING,
+    read_json,
+)
+from servod.commission.runs import load_curves, load_rows
+from servod.commission.walk import Tell, Walk
+from servod.demo.axis import LABELS
+from servod.gains import GainSet, load_gains
+from servod.identify import store
+from servod.identify.analysis import analyse
+from servod.report.figure import Figure, Table
+from servod.report.figures import friction, loop, motion, proof, sets
+from servod.report.figures.motion import Motion
+from servod.report.page import Page
+from servod.report.pictures import write_pictures
+from servod.tracking.metrics import Curves, curve_key
+from servod.tracking.motions import STEPS_MRAD
+
+#: Classes of the comparison as people read them, in the order of the page.
+CLASSES = {
+    "free_feedback": "Every law at its best",
+    "equal_feedback": "Every law with the same feedback",
+}
+
+
+def write_report(walk: Walk, tell: Tell) -> None:
+    """Write report.html, and every figure as PNG and SVG. Raises BadInput."""
+    page = Page(f"Commissioning of {walk.axis.config.name}")
+    _summary(page, walk)
+    gains, model = load_gains(walk.path(GAINS)), load_axis_model(walk.path(MODEL))
+    sections = {
+        "The axis as identified": _identified(walk, model),
+        "The law and its design": _design(gains, model),
+        "The certificate": _certificate(gains),
+        "Deployment": _deployment(walk),
+        "Tracking": _tracking(walk),
+    }
+    for index, (title, parts) in enumerate(sections.items()):
+        tell(title.lower(), index / len(sections))
+        page.heading(title)
+        for part in parts:
+            _add(page, walk, part)
+    page.write(walk.path(REPORT))
+
+
+def _add(page: Page, walk: Walk, part: Figure | Table | str) -> None:
+    if isinstance(part, str):
+        page.sentence(part)
+    elif isinstance(part, Table):
+        page.sentence(part.title)
+        page.table(part.header, part.rows)
+    else:
+        page.figure(part)
+        write_pictures(part, walk.path(PICTURES))
+
+
+def _summary(page: Page, walk: Walk) -> None:
+    """What happened, in sentences."""
+    deployment, tracking = read_json(walk.path(DEPLOYMENT)), read_json(walk.path(TRACKING))["tracking"]
+    certificate, relaxed = read_json(walk.path(CERTIFICATE)), read_json(walk.path(RELAXED))
+    page.sentence(
+        "The axis was identified by its own motion; a controller was computed for what was found, judged without "
+        f"trusting the solver ({len(certificate['checks'])} checks, all passed), and tried on the axis."
+    )
+    if relaxed:
+        page.sentence(f"The design was agreed to be relaxed: {relaxed['wish']} {relaxed['enough']:.3g}.")
+    page.sentence(
+        f"On the validation motion the error went from {deployment['before']['slow_mrad']:.4g} to "
+        f"{deployment['after']['slow_mrad']:.4g} mrad RMS; {deployment['promised']['slow_mrad']:.4g} mrad was promised."
+    )
+    if "local" in tracking:
+        page.sentence(
+            f"Trajectory (19) is tracked with {tracking['local']['rms_error_mrad']:.4g} mrad RMS, at most "
+            f"{tracking['local']['max_error_mrad']:.4g} mrad."
+        )
+
+
+def _identified(walk: Walk, model: AxisModel) -> Iterator[Figure | Table | str]:
+    axis = walk.axis
+    truth = axis.joint if isinstance(axis, VirtualWalkAxis) else None
+    found = read_json(walk.path(IDENTIFIED))
+    rows = [
+        (name, f"{v['value']:.5g}", f"{v['low']:.4g} to {v['high']:.4g}", v["unit"], v["note"])
+        for name, v in found["identified"].items()
+    ]
+    yield Table("What was measured", ("quantity", "value", "95 % interval", "unit", "note"), tuple(rows))
+    yield from (f"Not identifiable: {name}. {remedy}." for name, remedy in found["not_identifiable"].items())
+    yield friction.dahl_curve(analyse(store.load(walk.path(RECORDINGS))).presliding, truth)
+    yield friction.friction_map(model, truth)
+
+
+def _design(gains: GainSet, model: AxisModel) -> Iterator[Figure]:
+    yield sets.weighting_functions(gains)
+    yield sets.local_friction(gains, model)
+    yield loop.bode(gains)
+    yield loop.impulse_responses(gains)
+
+
+def _certificate(gains: GainSet) -> Iterator[Table]:
+    yield proof.certificate_table(gains)
+    yield proof.observations_table(gains)
+
+
+def _deployment(walk: Walk) -> Iterator[Figure | Table]:
+    found = read_json(walk.path(DEPLOYMENT))
+    rows = [
+        (name.removesuffix("_mrad"), *(f"{found[run][name]:.4g}" for run in ("before", "after", "promised")))
+        for name in found["before"]
+    ]
+    yield Table("Validation motion, mrad", ("figure", "before", "after", "promised"), tuple(rows))
+    before, after = (
+        motion.motion_of_rows(label, load_rows(walk.path(RUNS) / f"deploy_{label}.mcap"))
+        for label in ("before", "after")
+    )
+    yield motion.before_after(before, after, title="The validation motion before and after")
+
+
+def _tracking(walk: Walk) -> Iterator[Figure | Table | str]:
+    found = read_json(walk.path(TRACKING))
+    for name, title in CLASSES.items():
+        figures = found.get(name) or (found["tracking"] if name == "free_feedback" else {})
+        if not figures:
+            continue
+        yield Table(f"{title}: trajectory (19) and steps, mrad and s", _HEADER, tuple(_rows(figures)))
+        ran = [law for law, found in figures.items() if "failed" not in found]
+        runs = {law: load_curves(walk.path(RUNS) / f"{name.partition('_')[0]}_{law}.npz") for law in ran}
+        yield from _figures(name, title, runs)
+    yield from (f"Not measured: {line}" for line in found.get("not_measured", []))
+
+
+def _figures(name: str, title: str, runs: dict[str, dict[str, Curves]]) -> Iterator[Figure]:
+    motions = [_motion(law, curves["paper"]) for law, curves in runs.items()]
+    yield motion.tracking_grid(motions, f"tracking_{name}", f"{title}: trajectory (19)", same_error_scale=False)
+    yield motion.errors(motions, f"errors_{name}", f"{title}: errors on trajectory (19)")
+    for step in STEPS_MRAD:
+        key = curve_key(step)
+        stepped = [_motion(law, curves[key]) for law, curves in runs.items() if key in curves]
+        if stepped:
+            yield motion.steps(stepped, f"{key}_{name}", f"{title}: step of {step:g} mrad")
+
+
+def _motion(law: str, curves: Curves) -> Motion:
+    return Motion(
+        LABELS[law], curves.time_s, curves.reference_rad, curves.position_rad, curves.torque_nm, curves.friction_nm
+    )
+
+
+_HEADER = ("controller", "RMS", "largest", "step / mrad", "settled after / s", "overshoot", "steady error", "hold")
+
+
+def _rows(figures: dict[str, Any]) -> Iterator[tuple[str, ...]]:
+    """A row for each law and step."""
+    for law, f in figures.items():
+        if "failed" in f:
+            yield (LABELS[law], f["failed"], *[""] * 6)
+            continue
+        head = (LABELS[law], f"{f['rms_error_mrad']:.4f}", f"{f['max_error_mrad']:.3f}")
+        if not f["steps"]:
+            yield (*head, *[""] * 5)
+        for size, s in f["steps"].items():
+            settled = "never" if s["settling_s"] is None else f"{s['settling_s']:.3f}"
+            swing = " (limit cycle)" if s["limit_cycle"] else ""
+            yield (
+                *head,
+                size,
+                settled,
+                f"{s['overshoot']:.1%}",
+                f"{s['steady_error_mrad']:.4f}",
+                f"{s['hold_mrad']:.4f}{swing}",
+            )

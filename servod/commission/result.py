@@ -1,0 +1,52 @@
+"""The one document of a commissioning: what was identified, certified, deployed and measured, and how long it took.
+
+Above the steps' files; `servoctl commission --json` prints it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from servod.commission.files import (
+    CERTIFICATE,
+    DEPLOYMENT,
+    GAINS,
+    IDENTIFIED,
+    MODEL,
+    PICTURES,
+    RELAXED,
+    REPORT,
+    RESULT,
+    TRACKING,
+    TUNING,
+    read_json,
+    write_json,
+)
+from servod.commission.state import State
+from servod.commission.walk import Walk
+from servod.gains import load_gains
+
+
+def result(walk: Walk, state: State) -> dict[str, Any]:
+    """Put the document together from the files of a walk that is complete, and keep it in the folder."""
+    gains = load_gains(walk.path(GAINS))
+    assert gains.design is not None  # a certified set has one
+    document = {
+        "axis": walk.axis.config.name,
+        **read_json(walk.path(IDENTIFIED)),
+        "relaxed": read_json(walk.path(RELAXED)),
+        "velocity_cutoff_hz": gains.design.velocity_cutoff_hz,
+        "certificate": read_json(walk.path(CERTIFICATE)),
+        "deployment": read_json(walk.path(DEPLOYMENT)),
+        "tuning": read_json(walk.path(TUNING)),
+        **read_json(walk.path(TRACKING)),
+        "seconds": state.seconds | {"total": round(sum(state.seconds.values()), 3)},
+        "files": {
+            "model": str(walk.path(MODEL)),
+            "gains": str(walk.path(GAINS)),
+            "report": str(walk.path(REPORT)),
+            "pictures": str(walk.path(PICTURES)),
+        },
+    }
+    write_json(walk.path(RESULT), document)
+    return document

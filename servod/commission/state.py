@@ -1,0 +1,129 @@
+"""What is done of a walk: each step by the hash of what it was made from, so that a step is redone when that changes.
+
+Under the walk. A step counts as done only when its files were complete; the record is written after them, as a whole.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+
+from servod.errors import BadInput, Unreachable
+from servod.gain_store import write_atomically
+from servod.yaml12 import Strict, read_text, validate
+
+STATE = "state.json"
+LOCK = ".lock"
+
+
+class StepRecord(Strict):
+    """One step that is done: hash of its inputs, and how long it took."""
+
+    inputs_sha256: str
+    seconds: float
+
+
+class _Content(Strict):
+    """The file."""
+
+    axis: dict[str, Any] = Field(description="which axis this is the commissioning of")
+    steps: dict[str, StepRecord] = Field(default_factory=dict)
+
+
+class State:
+    """The walk's state in its folder."""
+
+    def __init__(self, folder: Path, axis: dict[str, Any], own_files: Sequence[str]) -> None:
+        """Begin in an empty folder, or take up the walk on the same axis. `own_files`: names that the walk writes.
+
+        Raises BadInput when the folder belongs to another axis or has files of somebody else under these names.
+        """
+        self.folder, self._path = folder, folder / STATE
+        if self._path.exists():
+            self._content = self._load()
+            self._refuse_other_axis(axis)
+        else:
+            self._refuse_foreign_files(own_files)
+            self._content = _Content(axis=axis)
+            self._write()
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """How long each step took that is done."""
+        return {name: record.seconds for name, record in self._content.steps.items()}
+
+    def done(self, step: str, inputs: dict[str, Any], outputs: Sequence[str]) -> bool:
+        """Whether the step was done with these inputs and its files are there."""
+        record = self._content.steps.get(step)
+        return (
+            record is not None
+            and record.inputs_sha256 == digest(inputs)
+            and all((self.folder / name).exists() for name in outputs)
+        )
+
+    def record(self, step: str, inputs: dict[str, Any], seconds: float) -> None:
+        """The step is done; its files are complete."""
+        done = StepRecord(inputs_sha256=digest(inputs), seconds=round(seconds, 3))
+        self._content = self._content.model_copy(update={"steps": self._content.steps | {step: done}})
+        self._write()
+
+    def _load(self) -> _Content:
+        try:
+            data = json.loads(read_text(self._path))
+        except ValueError as error:
+            raise BadInput(str(self._path), str(error), "the state that servoctl commission wrote") from None
+        return validate(data, _Content, str(self._path))
+
+    def _refuse_other_axis(self, axis: dict[str, Any]) -> None:
+        for key in sorted(axis.keys() | self._content.axis.keys()):
+            found, allowed = axis.get(key), self._content.axis.get(key)
+            if found != allowed:
+                raise BadInput(
+                    f"--out {self.folder}: {key}",
+                    _short(found),
+                    f"{_short(allowed)}, whose commissioning is in this folder, or another folder",
+                )
+
+    def _refuse_foreign_files(self, own_files: Sequence[str]) -> None:
+        there = [name for name in own_files if (self.folder / name).exists()]
+        if there:
+            raise BadInput(f"--out {self.folder}", f"{', '.join(there)} without {STATE}", "an empty folder")
+
+    def _write(self) -> None:
+        try:
+            write_atomically(self._path, self._content.model_dump_json(indent=1) + "\n")
+        except OSError as error:
+            raise BadInput(str(self._path), error.strerror or str(error), "a file that can be written") from None
+
+
+@contextlib.contextmanager
+def sole_walk(folder: Path) -> Iterator[None]:
+    """Nobody else works in the folder meanwhile; the lock ends with the process. Raises Unreachable."""
+    with (folder / LOCK).open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise Unreachable(f"--out {folder}: another servoctl commission is at work there") from None
+        yield
+
+
+def digest(value: Any) -> str:
+    """Hash of plain values in canonical form."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def file_sha256(path: Path) -> str:
+    """Hash of a file's bytes; empty when there is none."""
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.exists() else ""
+
+
+def _short(value: Any) -> str:
+    text = str(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

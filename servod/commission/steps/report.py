@@ -1,0 +1,29 @@
+"""Step 7: one page that shows all of it, and its pictures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from servod import __version__
+from servod.commission.files import DEPLOYMENT, GAINS, IDENTIFIED, MODEL, PICTURES, REPORT, TRACKING
+from servod.commission.report import write_report
+from servod.commission.walk import Walk
+
+
+@dataclass(frozen=True)
+class Report:
+    """Leaves report.html and the pictures."""
+
+    name: str = "report"
+    title: str = "report"
+    outputs: tuple[str, ...] = (REPORT, PICTURES)
+
+    def inputs(self, walk: Walk) -> dict[str, Any]:
+        """Everything that is shown."""
+        return {**walk.hashes(IDENTIFIED, MODEL, GAINS, DEPLOYMENT, TRACKING), "version": __version__}
+
+    def run(self, walk: Walk) -> None:
+        """From the folder's files alone."""
+        with walk.progress(self.title) as tell:
+            write_report(walk, tell)

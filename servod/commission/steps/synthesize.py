@@ -1,0 +1,87 @@
+"""Step 2: the model becomes a gain set with its proofs, or the walk says what would have to be relaxed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+from servod.axis_model import AxisModel, load_axis_model
+from servod.commission.files import DESIGN, MODEL, RELAXED, write_json, write_text
+from servod.commission.walk import Walk
+from servod.errors import AnswerIsNo
+from servod.gains import GainSet
+from servod.synthesize.deployed import Infeasible, Relaxation, Wishes
+from servod.synthesize.gain_set import Options, synthesize
+from servod.synthesize.intervals import uncertainty_of
+from servod.units import NS_PER_S, NS_PER_US
+
+
+@dataclass(frozen=True)
+class Synthesize:
+    """Leaves the set without a certificate, and what was relaxed for it."""
+
+    name: str = "synthesize"
+    title: str = "synthesize"
+    outputs: tuple[str, ...] = (DESIGN, RELAXED)
+
+    def inputs(self, walk: Walk) -> dict[str, Any]:
+        """The model, the loop around the law, and the accuracy of the local sets."""
+        return {**walk.hashes(MODEL), "loop": _loop(walk), "accuracy": walk.options.accuracy}
+
+    def run(self, walk: Walk) -> None:
+        """Raises AnswerIsNo when the demands cannot be met and no relaxation was agreed to."""
+        model = load_axis_model(walk.path(MODEL))
+        wishes = Wishes(uncertainty=uncertainty_of(model), **_loop(walk))
+        taken: Relaxation | None = None
+        found = self._attempt(walk, model, wishes)
+        if isinstance(found, Infeasible):
+            taken = _agreed(walk, found)
+            found = self._attempt(walk, model, relaxed(wishes, taken))
+        if isinstance(found, Infeasible):
+            raise AnswerIsNo(f"synthesize: no design even with {taken}")
+        write_json(walk.path(RELAXED), asdict(taken) if taken else None)
+        write_text(walk.path(DESIGN), found.to_yaml())
+
+    def _attempt(self, walk: Walk, model: AxisModel, wishes: Wishes) -> GainSet | Infeasible:
+        with walk.progress(self.title) as tell:
+            tell("both regions", 0.1)
+            options = Options(name=f"{walk.axis.config.name.lower()}_local", accuracy=walk.options.accuracy)
+            return synthesize(model, wishes, options, walk.path(MODEL))
+
+
+def _loop(walk: Walk) -> dict[str, Any]:
+    config = walk.axis.config
+    return {
+        "period_s": config.cycle.period_us * NS_PER_US / NS_PER_S,
+        "cutoff_hz": walk.axis.cutoff_hz,
+        "counts_per_turn": float(config.encoder.counts_per_turn),
+    }
+
+
+#: Wishes that a relaxation may change, by how the synthesis names them.
+_CHANGES: dict[str, Callable[[Wishes, Relaxation], Wishes]] = {
+    "scale of the uncertainty": lambda w, r: replace(w, uncertainty=w.uncertainty.scaled(r.enough / r.asked)),
+    "least decay [1/s]": lambda w, r: replace(w, least_decay_per_s=r.enough),
+    "least damping ratio": lambda w, r: replace(w, least_damping=r.enough),
+}
+
+
+def relaxed(wishes: Wishes, relaxation: Relaxation) -> Wishes:
+    """The wishes with one of them lowered, a little further than what was found to be just enough."""
+    further = replace(relaxation, enough=0.98 * relaxation.enough)
+    return _CHANGES[relaxation.wish](wishes, further)
+
+
+def _agreed(walk: Walk, found: Infeasible) -> Relaxation:
+    """The first relaxation that a person agrees to. Raises AnswerIsNo with all that was offered."""
+    offers = [r for r in found.relaxations if r.wish in _CHANGES]
+    for relaxation in offers:
+        if walk.questions.takes(f"the demands cannot be met together; design with {relaxation}?"):
+            walk.say(f"relaxed: {relaxation}")
+            return relaxation
+    filters = [r for r in found.relaxations if r.wish not in _CHANGES]
+    remedies = [f"set encoder.velocity_cutoff_hz to {r.enough:g} in the configuration" for r in filters]
+    told = [*remedies, *(f"{relaxation} would do by itself (--yes takes the first)" for relaxation in offers)]
+    where = " and ".join(found.regions) or "both regions together"
+    raise AnswerIsNo(f"synthesize: no feedback for {where}; {'; '.join(told) or 'no single relaxation helps'}")

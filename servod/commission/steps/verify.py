@@ -1,0 +1,37 @@
+"""Step 3: the set is judged from itself alone, and gets its certificate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from servod.commission.files import CERTIFICATE, DESIGN, GAINS, write_json, write_text
+from servod.commission.walk import Walk
+from servod.errors import AnswerIsNo
+from servod.gains import load_gains
+from servod.verify.certify import SEED, verify
+
+
+@dataclass(frozen=True)
+class Verify:
+    """Leaves the certified gain set, and the document of `servoctl verify --json`."""
+
+    name: str = "verify"
+    title: str = "verify"
+    outputs: tuple[str, ...] = (GAINS, CERTIFICATE)
+
+    def inputs(self, walk: Walk) -> dict[str, Any]:
+        """The set, and how thoroughly it is judged."""
+        return {**walk.hashes(DESIGN), "plants": walk.options.plants, "seed": SEED}
+
+    def run(self, walk: Walk) -> None:
+        """Raises AnswerIsNo when the set is not valid; then nothing is left but the document."""
+        gains = load_gains(walk.path(DESIGN))
+        with walk.progress(self.title) as tell:
+            tell(f"{walk.options.plants} plants", 0.1)
+            result = verify(gains, walk.options.plants, SEED, walk.options.processes, str(walk.path(DESIGN)))
+        write_json(walk.path(CERTIFICATE), result.document())
+        if not result.valid:
+            failed = [check.name for check in result.checks if not check.passed]
+            raise AnswerIsNo(f"verify: not valid: {'; '.join(failed)}")
+        write_text(walk.path(GAINS), result.certified(gains).to_yaml())

@@ -1,0 +1,100 @@
+"""The steps of a commissioning in order: each is done once for what it is made from, whatever interrupts the walk.
+
+Above the steps, below `servoctl commission`. A step reads and writes files in the walk's folder and nothing else, so
+that the walk can be taken up by another process.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from servod.commission.axis import WalkAxis
+from servod.commission.questions import Questions
+from servod.commission.state import State, file_sha256, sole_walk
+
+#: Told what a step does, and the share of it that is done.
+Tell = Callable[[str, float], None]
+#: Opens the progress of one step, by its title.
+Progress = Callable[[str], AbstractContextManager[Tell]]
+
+
+@dataclass(frozen=True)
+class Options:
+    """What may be chosen of a walk. Seeds of tuning and of scoring differ from `seed` by constants."""
+
+    seed: int = 1
+    travel_rad: float | None = None
+    speed_rad_s: float | None = None
+    accuracy: float = 0.02
+    plants: int = 1000
+    budget: int | None = None  # of each rival's tuning; None = the tuning's own
+    rivals: bool = True
+    processes: int = 2
+
+
+@dataclass(frozen=True)
+class Walk:
+    """What every step is given."""
+
+    folder: Path
+    axis: WalkAxis
+    options: Options
+    questions: Questions
+    progress: Progress
+    say: Callable[[str], None]
+
+    def path(self, name: str) -> Path:
+        """A file in the folder."""
+        return self.folder / name
+
+    def hashes(self, *names: str) -> dict[str, str]:
+        """Hashes of files in the folder by their names."""
+        return {name: file_sha256(self.path(name)) for name in names}
+
+
+class Step(Protocol):
+    """One step: `inputs` are plain values that decide what comes out."""
+
+    @property
+    def name(self) -> str:
+        """Its key in the state."""
+        ...
+
+    @property
+    def title(self) -> str:
+        """What people read."""
+        ...
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Files in the walk's folder that are there when it is done."""
+        ...
+
+    def inputs(self, walk: Walk) -> dict[str, Any]:
+        """Everything that the result depends on."""
+        ...
+
+    def run(self, walk: Walk) -> None:
+        """Do it. Raises as the parts do; files come aside first, then under their names."""
+        ...
+
+
+def run(walk: Walk, steps: tuple[Step, ...]) -> State:
+    """Do every step that is not done yet, in order. Raises as the steps do; the state then has those that ended."""
+    with sole_walk(walk.folder):
+        state = State(walk.folder, walk.axis.identity, [name for step in steps for name in step.outputs])
+        for step in steps:
+            inputs = step.inputs(walk)
+            if state.done(step.name, inputs, step.outputs):
+                walk.say(f"{step.title}: done before")
+                continue
+            started = time.monotonic()
+            step.run(walk)
+            state.record(step.name, inputs, time.monotonic() - started)
+            walk.say(f"{step.title}: {state.seconds[step.name]:.1f} s")
+    return state
