@@ -10,18 +10,16 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from time import monotonic
 
-import numpy as np
-from numpy.typing import NDArray
-
 from servod.diagnose.effects import effects
 from servod.diagnose.fit import Fit, Fitter
 from servod.diagnose.hypothesis import Term
 from servod.diagnose.scene import Scene
 
-Array = NDArray[np.float64]
-
 #: Starts that go on to the second step, effects that are fitted to the end, and steps of such a fit.
 SECOND_ROUND, FULL_FITS, FULL_STEPS = 16, 6, 8
+
+#: A candidate is fitted to the end when it has saved at least 1 - IN_REACH of what the best has saved.
+IN_REACH = 0.4
 
 
 @dataclass(frozen=True)
@@ -47,7 +45,15 @@ class Trials:
         second = [self._refined(c, 2, kept) for c in best_of_each(first, SECOND_ROUND, 2)]
         second.sort(key=lambda c: c.fit.cost)
         chosen = best_of_each(second, FULL_FITS, 1)
-        return sorted((self._refined(c, FULL_STEPS, 0) for c in chosen), key=lambda c: c.fit.cost)
+        close = self.within_reach(chosen)
+        fitted = sorted((self._refined(c, FULL_STEPS, 0) for c in close), key=lambda c: c.fit.cost)
+        return fitted + [c for c in chosen if c.effect not in {f.effect for f in fitted}]
+
+    def within_reach(self, candidates: list[Candidate]) -> list[Candidate]:
+        """Those of the sorted candidates that a fit to the end may still bring to the top."""
+        best = candidates[0].fit.cost if candidates else 0.0
+        limit = best + IN_REACH * max(self.present.cost - best, 0.0)
+        return [c for c in candidates if c.fit.cost <= limit][:FULL_FITS]
 
     def _starts(self, name: str) -> list[Candidate]:
         """All starts of an effect after one step each."""
@@ -57,7 +63,7 @@ class Trials:
         for term in effect(name).terms(self.scene):
             for begun in self._begun(term, effect(name).far):
                 self.tried += 1
-                found.append(Candidate(name, self.fitter.refine(begun, 1, begun.jacobian.shape[1])))
+                found.append(Candidate(name, self.fitter.refine(begun, 1, begun.jacobian.shape[1], 2)))
         return found
 
     def _begun(self, term: Term, far: bool) -> list[Fit]:
@@ -66,8 +72,7 @@ class Trials:
         begun = []
         for beside in froms:
             hypothesis = beside.hypothesis.with_term(term)
-            start = hypothesis.start[len(beside.coordinates) :]
-            fit = self.fitter.begin(hypothesis, np.concatenate([beside.coordinates, start]), beside.jacobian)
+            fit = self.fitter.begin(hypothesis, hypothesis.beside(beside.coordinates), beside.jacobian)
             begun += [fit] if fit is not None else []
         return begun
 

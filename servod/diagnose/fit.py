@@ -8,7 +8,7 @@ present scale; beyond some scales a row counts by its distance only (Huber). Int
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -24,11 +24,14 @@ Array = NDArray[np.float64]
 #: Scales beyond which a row's mismatch counts by its distance only.
 HUBER = 4.0
 
-#: Step of the derivative, in coordinates.
-NUDGE = 1e-3
+#: The scale of a mismatch is at least this share of its root mean square: rare blows must not count by distance alone.
+LEAST_OF_RMS = 0.3
 
 #: A fit has converged when a step improves the cost by less than this share.
-CONVERGED = 1e-4
+CONVERGED = 1e-3
+
+#: A step that improves the cost by more than this share lets its Jacobian serve once more.
+STALE_GAIN = 0.05
 
 #: Longest step of one coordinate at once.
 LONGEST = 1.5
@@ -114,16 +117,23 @@ class Fitter:
         fit = self.begin(hypothesis, coordinates)
         return None if fit is None else self.refine(fit, steps)
 
-    def refine(self, fit: Fit, steps: int, keep_columns: int = 0) -> Fit:
-        """Go on fitting for some steps; the first `keep_columns` columns of the Jacobian are taken as they are."""
-        damping = 1e-3
+    def refine(self, fit: Fit, steps: int, keep_columns: int = 0, tries: int = 4) -> Fit:
+        """Go on fitting for some steps; the first `keep_columns` columns of the Jacobian are taken as they are.
+
+        A Jacobian serves for a second step when the first went well; a fit ends only on a fresh one.
+        """
+        damping, fresh = 1e-3, True
+        jacobian = self.derivatives(fit, keep_columns)
         for _ in range(steps):
-            jacobian = self.derivatives(fit, keep_columns)
-            stepped, damping = self._step(fit, jacobian, damping)
-            gained = fit.cost - stepped.cost
+            stepped, damping = self._step(fit, jacobian, damping, tries)
+            gained = (fit.cost - stepped.cost) / max(fit.cost, 1.0)
             fit = stepped
-            if gained <= CONVERGED * max(fit.cost, 1.0):
-                return Fit(fit.hypothesis, fit.coordinates, fit.mismatch, fit.cost, fit.jacobian, True)
+            if fresh and gained <= CONVERGED:
+                return replace(fit, converged=True)
+            if fresh and gained > STALE_GAIN:
+                fresh = False
+                continue
+            jacobian, fresh = self.derivatives(fit, keep_columns), True
         return fit
 
     def derivatives(self, fit: Fit, keep_columns: int = 0) -> Array:
@@ -134,15 +144,16 @@ class Fitter:
 
     def _column(self, fit: Fit, index: int) -> Array:
         nudged = fit.coordinates.copy()
-        nudge = NUDGE if nudged[index] + NUDGE <= fit.hypothesis.bounds[1][index] else -NUDGE
+        nudge = fit.hypothesis.unknowns[index].nudge
+        nudge = nudge if nudged[index] + nudge <= fit.hypothesis.bounds[1][index] else -nudge
         nudged[index] += nudge
         there = self.mismatch(fit.hypothesis, nudged)
         return np.zeros_like(fit.mismatch) if there is None else (there - fit.mismatch) / nudge
 
-    def _step(self, fit: Fit, jacobian: Array, damping: float) -> tuple[Fit, float]:
+    def _step(self, fit: Fit, jacobian: Array, damping: float, tries: int) -> tuple[Fit, float]:
         """One damped step that lowers the cost; the fit itself when none does."""
         normal, slope = self._normal(fit, jacobian)
-        for _ in range(6):
+        for _ in range(tries):
             change = _bounded_step(normal, slope, damping, fit)
             at = fit.coordinates + change
             mismatch = self.mismatch(fit.hypothesis, at)
@@ -186,9 +197,9 @@ def _bounded_step(normal: Array, slope: Array, damping: float, fit: Fit) -> Arra
 
 
 def scale_of(mismatch: Array, counts: NDArray[np.bool_], floor: float) -> float:
-    """Robust standard deviation of the mismatch, at least `floor`."""
+    """Robust standard deviation of the mismatch, at least `floor` and LEAST_OF_RMS of its root mean square."""
     spread = float(np.median(np.abs(mismatch[counts]))) / 0.6745
-    return max(spread, floor)
+    return max(spread, LEAST_OF_RMS * float(np.sqrt(np.mean(mismatch[counts] ** 2))), floor)
 
 
 def covariance(fit: Fit, weighing: Weighing, period_s: float) -> Array:

@@ -26,7 +26,8 @@ Document = dict[str, Any]
 class Unknown:
     """A number to estimate. `size` 0 means its coordinate is the logarithm, else it is value/size.
 
-    `spread` is the standard deviation, in coordinates, of what is believed of it before any data; `start` its centre.
+    `spread` is the standard deviation, in coordinates, of what is believed of it before any data; `start` its centre;
+    `nudge` the step of derivatives, large where the mismatch has steps of its own.
     """
 
     key: str
@@ -36,6 +37,7 @@ class Unknown:
     high: float
     size: float = 0.0
     spread: float = math.inf
+    nudge: float = 1e-3
 
     def coordinate(self, value: float) -> float:
         """Coordinate of a value."""
@@ -67,7 +69,7 @@ Teller = Callable[[Document, Sequence[float]], list[Reported]]
 class Term:
     """One effect in one form: its unknowns, how they are written, and bounds of the model's own that it opens.
 
-    `opens` maps keys of the base to new (low, high). Terms without unknowns open only.
+    `opens` maps keys of the base to new (low, high) and `begins` to start values. Terms without unknowns open only.
     """
 
     effect: str
@@ -76,11 +78,7 @@ class Term:
     write: Writer
     tell: Teller
     opens: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-
-    def starting_at(self, values: Sequence[float]) -> Term:
-        """The same term with other start values."""
-        pairs = zip(self.unknowns, values, strict=True)
-        return replace(self, unknowns=tuple(replace(u, start=float(v)) for u, v in pairs))
+    begins: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -128,6 +126,16 @@ class Hypothesis:
     def values(self, coordinates: Array) -> list[float]:
         """Values of the unknowns."""
         return [u.value(float(c)) for u, c in zip(self.unknowns, coordinates, strict=True)]
+
+    def beside(self, coordinates: Array) -> Array:
+        """Start coordinates of the last term beside others that stand at `coordinates`."""
+        term = self.terms[-1]
+        start = self.start.copy()
+        start[: len(coordinates)] = coordinates
+        for index, unknown in enumerate(self.base):
+            if unknown.key in term.begins:
+                start[index] = unknown.coordinate(term.begins[unknown.key])
+        return start
 
     def share(self, index: int) -> slice:
         """Where the unknowns of term `index` stand among all."""

@@ -24,6 +24,9 @@ Columns = Callable[[float], tuple[Array, Array]]
 #: Periods that must lie within the range of positions before a periodic effect may be named.
 LEAST_PERIODS = 1.5
 
+#: Periods within the range, or in a radian turned (a metre), up to which a period is searched.
+MOST_PERIODS, MOST_IN_TURN = 100.0, 130.0
+
 #: Orders tried, at most; beyond them the grid gets coarse in vain.
 MOST_ORDERS = 2500
 
@@ -152,7 +155,9 @@ class Scene:
         """Wave numbers n to search, from LEAST_PERIODS in the range up to what the observer resolves, 1/rad or 1/m."""
         lowest = 2.0 * math.pi * LEAST_PERIODS / self.reach
         slow = float(np.quantile(np.abs(self.velocity), 0.3))
-        highest = min(self.predictor.rate * 3.0 / max(slow, 1e-9), 2.0 * math.pi * 400.0 / self.reach)
+        highest = min(
+            self.predictor.rate * 3.0 / max(slow, 1e-9), max(2.0 * math.pi * MOST_PERIODS / self.reach, MOST_IN_TURN)
+        )
         step = max(0.25 * 2.0 * math.pi / self.reach, (highest - lowest) / MOST_ORDERS)
         return np.arange(lowest, max(highest, 1.5 * lowest), step)
 

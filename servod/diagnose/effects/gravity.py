@@ -30,9 +30,9 @@ def terms(scene: Scene) -> list[Term]:
     size = max(scene.dry, 0.1 * scene.effort)
     unknowns = (share("sine", 0.0, -most, most, size), share("cosine", 0.0, -most, most, size))
 
-    def tell(document: Document, values: Sequence[float]) -> list[Reported]:
-        amplitude, phase = _add(document, values)
-        return [Reported("amplitude", amplitude, scene.force), Reported("phase", phase, "rad")]
+    def tell(document: Document, _values: Sequence[float]) -> list[Reported]:
+        units = {"amplitude": scene.force, "phase": "rad"}
+        return [Reported(key, get(document, f"gravity.{key}"), unit) for key, unit in units.items()]
 
     return [Term("gravity", "weight", unknowns, _write, tell)]
 

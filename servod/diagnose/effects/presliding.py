@@ -2,27 +2,52 @@
 
 from __future__ import annotations
 
-from servod.diagnose.effects.effect import Effect, positive, simple
-from servod.diagnose.hypothesis import Term, get
+from collections.abc import Sequence
+
+from servod.diagnose.effects.effect import Effect, keys, positive, simple
+from servod.diagnose.hypothesis import Document, Reported, Teller, Term, Unknown, get
 from servod.diagnose.scene import Scene
+
+#: Factors on the model's own stiffness and damping to start from, and by which they may be off.
+STARTS, MOST = ((0.25, 0.5), (4.0, 2.0), (1.0, 5.0), (1.0, 0.2)), 300.0
+
+#: Without a bristle in the model: ways to break away to start from, as shares of the range.
+WAYS = (1e-4, 1e-3, 1e-2)
+
+
+def _tell(scene: Scene) -> Teller:
+    units = {"sigma0": f"{scene.force}/{scene.length}", "sigma1": f"{scene.force}·s/{scene.length}"}
+
+    def tell(document: Document, values: Sequence[float]) -> list[Reported]:
+        found = [Reported(key, get(document, f"friction.{key}"), unit) for key, unit in units.items()]
+        return found + [Reported("damping_velocity", value, f"{scene.length}/s") for value in values]
+
+    return tell
 
 
 def terms(scene: Scene) -> list[Term]:
     """The bristle of the model released, softer and stiffer; a bristle where the model has none; fading damping."""
-    own = get(scene.document, "friction.sigma0")
-    damping = get(scene.document, "friction.sigma1")
-    starts = [own, own / 5.0, own * 5.0] if own > 0.0 else [scene.dry / (f * scene.reach) for f in (1e-4, 1e-3, 1e-2)]
+    own, damping = get(scene.document, "friction.sigma0"), get(scene.document, "friction.sigma1")
+    if own <= 0.0:
+        return [_new(scene, scene.dry / (way * scene.reach)) for way in WAYS]
+    opens = {"friction.sigma0": (own / MOST, own * MOST)}
+    opens |= {"friction.sigma1": (damping / MOST, damping * MOST)} if damping > 0.0 else {}
     found = []
-    for stiffness in starts:
-        fair = damping if damping > 0.0 else 0.3 * (stiffness * scene.inertia) ** 0.5
-        bristle = [
-            positive("sigma0", f"{scene.force}/{scene.length}", stiffness),
-            positive("sigma1", f"{scene.force}·s/{scene.length}", fair),
-        ]
-        found.append(simple("presliding", "bristle", bristle))
-    fading = positive("damping_velocity", f"{scene.length}/s", 0.1 * scene.speed, 100.0)
-    found.append(simple("presliding", "fading damping", [*bristle[:1], bristle[1], fading]))
-    return found
+    for stiff, damped in STARTS if damping > 0.0 else STARTS[:2]:
+        begins = {"friction.sigma0": stiff * own, "friction.sigma1": damped * damping}
+        found.append(Term("presliding", "bristle", (), lambda _d, _v: None, _tell(scene), opens, begins))
+    fading = Unknown("damping_velocity", f"{scene.length}/s", 0.1 * scene.speed, 1e-4 * scene.speed, 10.0 * scene.speed)
+    write = keys("presliding", ["damping_velocity"])
+    return [*found, Term("presliding", "fading damping", (fading,), write, _tell(scene), opens)]
+
+
+def _new(scene: Scene, stiffness: float) -> Term:
+    """A bristle for a model without one."""
+    unknowns = [
+        positive("sigma0", f"{scene.force}/{scene.length}", stiffness),
+        positive("sigma1", f"{scene.force}·s/{scene.length}", 0.3 * (stiffness * scene.inertia) ** 0.5),
+    ]
+    return simple("presliding", "bristle", unknowns)
 
 
 EFFECT = Effect(

@@ -4,45 +4,55 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from servod.diagnose.effects.effect import Effect, share
-from servod.diagnose.hypothesis import Document, Reported, Teller, Term, Unknown, get
+from servod.diagnose.effects.effect import Effect
+from servod.diagnose.hypothesis import Document, Reported, Teller, Term, Unknown, get, put
 from servod.diagnose.scene import Scene
 
-
-def _write(document: Document, values: Sequence[float]) -> None:
-    group = document.setdefault("stribeck", {})
-    group["static"] = max(get(document, "friction.coulomb") * (1.0 + values[0]), 1e-9)
-    group["stribeck_velocity"] = values[1]
-    if len(values) > 2:
-        group["exponent"] = values[2]
+#: Static friction to start from, as a multiple of Coulomb friction.
+START = 1.4
 
 
 def _tell(scene: Scene) -> Teller:
-    def tell(document: Document, values: Sequence[float]) -> list[Reported]:
-        found = [
-            Reported("static", get(document, "friction.coulomb") * (1.0 + values[0]), scene.force),
-            Reported("stribeck_velocity", values[1], f"{scene.length}/s"),
-        ]
-        return found + [Reported("exponent", value, "1") for value in values[2:]]
+    def tell(document: Document, _values: Sequence[float]) -> list[Reported]:
+        found = []
+        for key, unit in (("static", scene.force), ("stribeck_velocity", f"{scene.length}/s"), ("exponent", "1")):
+            value = get(document, f"stribeck.{key}") or get(document, f"friction.{key}")
+            found += [Reported(key, value, unit)] if value else []
+        return found
 
     return tell
 
 
+def _exponent(document: Document, values: Sequence[float]) -> None:
+    put(document, "stribeck.exponent", values[-1])
+
+
+def _whole(document: Document, values: Sequence[float]) -> None:
+    """The whole curve in its own group, for a model whose friction has none."""
+    static = get(document, "friction.coulomb") * (1.0 + values[0])
+    document["stribeck"] = {"static": static, "stribeck_velocity": values[1]}
+
+
 def terms(scene: Scene) -> list[Term]:
     """The curve with the paper's exponent from some velocities, and one with a free exponent."""
-    if get(scene.document, "friction.coulomb") <= 0.0:
-        return []
     coulomb = get(scene.document, "friction.coulomb")
-    own = get(scene.document, "friction.static", coulomb) / coulomb - 1.0
-    excess = share("excess", own + 0.1, -0.6, 6.0, 1.0)
-    tell = _tell(scene)
-    found = []
-    for speed in (get(scene.document, "friction.stribeck_velocity", 0.1 * scene.speed), 0.03 * scene.speed):
-        velocity = Unknown("velocity", f"{scene.length}/s", speed, 1e-3 * scene.speed, 1.0 * scene.speed)
-        found.append(Term("stribeck", "gauss", (excess, velocity), _write, tell))
-    exponent = Unknown("exponent", "1", 1.0, 0.4, 4.0)
-    found.append(Term("stribeck", "free exponent", (excess, velocity, exponent), _write, tell))
-    return found
+    if coulomb <= 0.0:
+        return []
+    own = get(scene.document, "friction.stribeck_velocity", 0.05 * scene.speed)
+    speeds = (own, 0.02 * scene.speed)
+    unit = f"{scene.length}/s"
+    if get(scene.document, "friction.static") <= 0.0:
+        excess = Unknown("excess", "1", START - 1.0, -0.8, 10.0, 1.0)
+        curves = [(excess, Unknown("velocity", unit, v, 1e-4 * scene.speed, scene.speed)) for v in speeds]
+        return [Term("stribeck", "gauss", curve, _whole, _tell(scene)) for curve in curves]
+    opens = {
+        "friction.static": (0.2 * coulomb, 10.0 * coulomb),
+        "friction.stribeck_velocity": (1e-4 * scene.speed, scene.speed),
+    }
+    begins = [{"friction.static": START * coulomb, "friction.stribeck_velocity": v} for v in speeds]
+    found = [Term("stribeck", "gauss", (), lambda _d, _v: None, _tell(scene), opens, begin) for begin in begins]
+    free = Unknown("exponent", "1", 1.0, 0.4, 4.0)
+    return [*found, Term("stribeck", "free exponent", (free,), _exponent, _tell(scene), opens, begins[0])]
 
 
 EFFECT = Effect(

@@ -8,23 +8,27 @@ from collections.abc import Sequence
 from servod.diagnose.hypothesis import Document, Reported, Term, Unknown, get
 from servod.diagnose.scene import Scene
 
-#: Share of critical damping that the joint's spring starts with.
-DAMPING = 0.05
+#: Shares of critical damping that the joint's spring, and the contact behind a gap, start with.
+DAMPING, CONTACT_DAMPING = 0.05, 0.4
+
+#: Step of derivatives behind a gap, where every contact comes a sample earlier or later.
+GAP_NUDGE = 0.03
 
 
 def two_mass_term(effect: str, scene: Scene, load: float, resonance: float, gap: float = 0.0) -> Term:
     """A term with a share of the inertia behind a spring that resonates at `resonance` rad/s, and a gap if any."""
     inertia = scene.inertia
     stiffness = resonance**2 * inertia * load * (1.0 - load)
-    damping = 2.0 * DAMPING * math.sqrt(stiffness * inertia * load * (1.0 - load))
+    nudge = GAP_NUDGE if gap > 0.0 else 1e-3
+    damping = 2.0 * (CONTACT_DAMPING if gap > 0.0 else DAMPING) * math.sqrt(stiffness * inertia * load * (1.0 - load))
     per = f"{scene.force}/{scene.length}"
     unknowns = [
-        Unknown("load_share", "1", load, 0.03, 0.97, 0.3),
-        Unknown("stiffness", per, stiffness, stiffness / 300.0, stiffness * 300.0),
-        Unknown("damping", f"{scene.force}·s/{scene.length}", damping, damping / 300.0, damping * 300.0),
+        Unknown("load_share", "1", load, 0.03, 0.97, 0.3, nudge=nudge),
+        Unknown("stiffness", per, stiffness, stiffness / 300.0, stiffness * 300.0, nudge=nudge),
+        Unknown("damping", f"{scene.force}·s/{scene.length}", damping, damping / 300.0, damping * 300.0, nudge=nudge),
     ]
     if gap > 0.0:
-        unknowns.append(Unknown("gap", scene.length, gap, gap / 50.0, gap * 50.0))
+        unknowns.append(Unknown("gap", scene.length, gap, gap / 50.0, gap * 50.0, nudge=nudge))
 
     def values_of(document: Document, values: Sequence[float]) -> dict[str, float]:
         found = {

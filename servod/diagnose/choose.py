@@ -1,0 +1,231 @@
+"""Decides what is named: terms come in one at a time, the best that is left, and go again when others do their work.
+
+Stands between the candidates and the verdict. A term stays only while it is significant against correlated noise with a
+correction for the number of things tried, and worth naming by the outside contract.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from time import monotonic
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servod.axis_model import AxisModel
+from servod.diagnose.base import base_unknowns, document_of
+from servod.diagnose.candidates import Candidate, Trials
+from servod.diagnose.fit import Fit, Fitter, Weighing, long_run, scale_of
+from servod.diagnose.floor import noise_floor, stretch_means
+from servod.diagnose.hypothesis import Hypothesis
+from servod.diagnose.predict import Predictor
+from servod.diagnose.scene import Scene
+
+Array = NDArray[np.float64]
+Tell = Callable[[str], None]
+
+#: Worth naming (outside contract): share of the explainable error, or share of Coulomb friction where it acts; and the
+#: least torque that any finding must carry there.
+WORTH_SHARE, WORTH_TORQUE, LEAST_TORQUE = 0.05, 0.03, 0.008
+
+#: Rows that show where an effect acts: its torque there is this quantile of what it changes.
+ACTS_AT = 0.98
+
+#: Most terms.
+MOST_TERMS = 5
+
+#: A fit that takes so much of the explainable error counts though its last steps still improved it.
+SURE_SHARE = 0.3
+
+#: Nothing worth naming is left when the mismatch above the floor, and its mean over any short stretch but this share of
+#: them, are below these shares of dry friction.
+NOTHING_RMS, NOTHING_STRETCH, BUT_SHARE = 0.006, 0.02, 0.005
+
+#: Scale of the mismatch is never taken smaller than this share of dry friction.
+LEAST_SCALE = 0.002
+
+
+@dataclass(frozen=True)
+class Merit:
+    """What a term is worth: its share of the explainable error, its torque as a share of dry friction, its cost gain.
+
+    `gain` is twice the cost that it saves, in units of noise that counts correlated rows as one.
+    """
+
+    share: float
+    torque: float
+    gain: float
+
+
+@dataclass
+class Choice:
+    """The outcome: the fit with all that is named, the fit of the base alone, and who else was in the running.
+
+    `rivals` has for each term (by its place) the candidates that stood beside it when it came in.
+    """
+
+    base: Fit
+    fit: Fit
+    merits: list[Merit]
+    rivals: list[list[Candidate]]
+    minor: dict[str, Merit]
+    floor: float
+    tried: int
+    rounds: list[str] = field(default_factory=list)
+
+
+class Chooser:
+    """Runs the selection on fixed recordings."""
+
+    def __init__(self, predictor: Predictor, nominal: AxisModel, deadline: float, tell: Tell) -> None:
+        self.predictor, self.deadline, self.tell = predictor, deadline, tell
+        self.start = Hypothesis(document_of(nominal), base_unknowns(nominal))
+        self.rows = predictor.counts.astype(np.float64)
+        self.tried = 0
+        self.base_error = 0.0
+        self.floor = 0.0
+
+    def fitter(self, mismatch: Array) -> Fitter:
+        """A fitter that counts costs in the scale of this mismatch."""
+        least = LEAST_SCALE * self.predictor.dry
+        return Fitter(self.predictor, Weighing(scale_of(mismatch, self.predictor.counts, least), self.rows))
+
+    def error(self, mismatch: Array) -> float:
+        """Mean square of the mismatch over the rows that count."""
+        return float(np.mean(mismatch[self.predictor.counts] ** 2))
+
+    def run(self) -> Choice:
+        """Fit the base, add terms, prune; the outcome."""
+        base = self._fit_base()
+        choice = Choice(base, base, [], [], {}, self.floor, 0)
+        nominal = self._nominal(base)
+        while len(choice.fit.hypothesis.terms) < MOST_TERMS and monotonic() < self.deadline:
+            if self.nothing_left(choice.fit.mismatch):
+                break
+            if not self._add(choice, nominal):
+                break
+            nominal = None
+            if len(choice.fit.hypothesis.terms) >= 2:
+                self._prune(choice)
+        choice.tried = self.tried
+        return choice
+
+    def _fit_base(self) -> Fit:
+        mismatch = self.predictor.mismatch(self.start.model(self.start.start))
+        fit = self._settled(self.start, None, mismatch)
+        self.base_error = self.error(fit.mismatch)
+        self.floor = noise_floor(self.predictor, fit.mismatch)
+        return fit
+
+    def _settled(self, hypothesis: Hypothesis, coordinates: Array | None, mismatch: Array) -> Fit:
+        """Fit in the scale of the present mismatch, then in the scale of what is left, with a fresh Jacobian."""
+        for _ in range(2):
+            fitter = self.fitter(mismatch)
+            fit = fitter.fit(hypothesis, coordinates)
+            if fit is None:
+                raise ValueError("a hypothesis that makes no sense at its start")
+            coordinates, mismatch = fit.coordinates, fit.mismatch
+        return self._fresh(fit)
+
+    def _fresh(self, fit: Fit) -> Fit:
+        """The fit with cost and Jacobian in the scale of its own mismatch."""
+        fitter = self.fitter(fit.mismatch)
+        cost = fitter.cost(fit.hypothesis, fit.coordinates, fit.mismatch)
+        return replace(fit, cost=cost, jacobian=fitter.derivatives(fit))
+
+    def _nominal(self, base: Fit) -> Fit | None:
+        fitter = self.fitter(base.mismatch)
+        begun = fitter.begin(self.start)
+        return None if begun is None else replace(begun, jacobian=fitter.derivatives(begun))
+
+    def _add(self, choice: Choice, nominal: Fit | None) -> bool:
+        """Try all effects beside the present fit and take the best if it deserves it."""
+        present = choice.fit
+        fitter = self.fitter(present.mismatch)
+        scene = Scene(self.start.document, self.predictor, present.mismatch)
+        trials = Trials(fitter, present, scene, nominal, self.deadline)
+        candidates = trials.run(skip=_once(present.hypothesis))
+        self.tried += trials.tried
+        self.tell(f"{trials.tried} starts tried; best: " + ", ".join(c.effect for c in candidates[:3]))
+        for candidate in candidates:
+            settled = self._settled(candidate.fit.hypothesis, candidate.fit.coordinates, candidate.fit.mismatch)
+            self.floor = min(self.floor, noise_floor(self.predictor, settled.mismatch))
+            merit = self.merit(present, settled)
+            if self.deserves(merit, settled) and (settled.converged or merit.share >= SURE_SHARE):
+                choice.fit = settled
+                choice.merits.append(merit)
+                choice.rivals.append([c for c in candidates if c.effect != candidate.effect])
+                choice.floor = self.floor
+                return True
+            if self._significant(merit, settled):
+                choice.minor.setdefault(candidate.effect, merit)
+            if candidate.fit.cost > candidates[0].fit.cost + 0.3 * (present.cost - candidates[0].fit.cost):
+                break
+        choice.floor = self.floor
+        return False
+
+    def nothing_left(self, mismatch: Array) -> bool:
+        """Whether no effect worth naming can hide in this mismatch."""
+        above = math.sqrt(max(self.error(mismatch) - self.floor, 0.0)) / self.predictor.dry
+        stretches = stretch_means(self.predictor, mismatch) / self.predictor.dry
+        return above < NOTHING_RMS and float(np.quantile(np.abs(stretches), 1.0 - BUT_SHARE)) < NOTHING_STRETCH
+
+    def merit(self, without: Fit, with_term: Fit) -> Merit:
+        """What the step from one fit to the other is worth."""
+        explainable = max(self.base_error - self.floor, 1e-30)
+        saved = self.error(without.mismatch) - self.error(with_term.mismatch)
+        changed = np.abs(without.mismatch - with_term.mismatch)[self.predictor.counts]
+        fitter = self.fitter(with_term.mismatch)
+        cost = fitter.cost(without.hypothesis, without.coordinates, without.mismatch)
+        gain = 2.0 * (cost - with_term.cost) / self._correlation(with_term.mismatch, fitter.weighing.scale)
+        return Merit(saved / explainable, float(np.quantile(changed, ACTS_AT)) / self.predictor.dry, gain)
+
+    def _correlation(self, mismatch: Array, scale: float) -> float:
+        """By how much correlated rows exaggerate a gain: long-run over plain variance, at least 1."""
+        period = self.predictor.traces[0].period_s
+        clipped = np.clip(mismatch / scale, -4.0, 4.0)
+        plain = float(clipped @ clipped)
+        slow = float(long_run(clipped[:, None], max(1, round(0.1 / period)))[0, 0])
+        return max(slow / max(plain, 1e-30), 1.0)
+
+    def deserves(self, merit: Merit, fit: Fit) -> bool:
+        """Whether a term is significant and worth naming."""
+        worth = merit.torque >= WORTH_TORQUE or merit.share >= WORTH_SHARE
+        return worth and merit.torque >= LEAST_TORQUE and self._significant(merit, fit)
+
+    def _significant(self, merit: Merit, fit: Fit) -> bool:
+        """Bayesian information criterion with a correction for the number of starts tried."""
+        unknowns = max(len(fit.hypothesis.terms[-1].unknowns), 1)
+        rows = float(self.rows.sum())
+        return merit.gain > unknowns * math.log(rows) + 2.0 * math.log(max(self.tried, 1)) + 20.0
+
+    def _prune(self, choice: Choice) -> None:
+        """Drop every earlier term whose work the others now do."""
+        index = 0
+        while index < len(choice.fit.hypothesis.terms) - 1:
+            less = self._less(choice.fit, index)
+            merit = self.merit(less, choice.fit)
+            if self.deserves(merit, choice.fit):
+                choice.merits[index] = merit
+                index += 1
+                continue
+            choice.fit = less
+            choice.merits.pop(index)
+            choice.rivals.pop(index)
+
+    def _less(self, fit: Fit, index: int) -> Fit:
+        """The fit without one of its terms."""
+        gone = fit.hypothesis.share(index)
+        kept = np.concatenate([fit.coordinates[: gone.start], fit.coordinates[gone.stop :]])
+        return self._settled(fit.hypothesis.without(index), kept, fit.mismatch)
+
+
+#: Effects that may come in again with another period or place.
+_REPEATED = ("cogging", "torque_ripple", "disturbance", "position_dependent_friction")
+
+
+def _once(hypothesis: Hypothesis) -> set[str]:
+    """Effects that are in already and cannot come in again."""
+    return {term.effect for term in hypothesis.terms} - set(_REPEATED)
