@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.errors import AnswerIsNo
-from servod.report.curves import thin
 
 Array = NDArray[np.float64]
 
@@ -28,12 +27,18 @@ BAND_COUNTS = 3.0
 HOLD_FROM_S = 1.0
 #: The steady error is the mean of the last part of the hold.
 STEADY_S = 1.0
-#: A limit cycle swings by more than this many counts, peak to peak: three is what noise of a count shows in 20 s ...
-CYCLE_COUNTS = 3.5
-#: ... or by more than this where the encoder has no steps [rad] ...
-CYCLE_LEAST_RAD = 1e-5
-#: ... and swings so many times while it is held: two whole periods. Creep goes one way.
-CYCLE_SWINGS = 4
+#: Fast oscillation: a line of the spectrum, from LINE_FROM_HZ on, whose amplitude is more counts than this. Noise of a
+#: count is spread over all lines and shows a tenth of it in each.
+LINE_COUNTS = 1.0
+LINE_FROM_HZ = 5.0
+SEGMENT_S = 1.0
+#: Slow hunting: the mean position of every SMOOTH_S turns and comes back by more counts than this ...
+SWING_COUNTS = 2.5
+SMOOTH_S = 0.05
+#: ... so many times while it is held: two whole periods. Creep goes one way.
+SWINGS = 4
+#: What counts as a count where the encoder has no steps, or finer ones [rad].
+LEAST_COUNT_RAD = 4e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,14 +60,6 @@ class Curves:
     def error_mrad(self) -> Array:
         """Reference minus position."""
         return (self.reference_rad - self.position_rad) * 1e3
-
-    def thinned(self, points: int = 2400) -> dict[str, tuple[Array, Array]]:
-        """(time, values) of each series with at most about `points` values, highest and lowest of each bin kept.
-
-        Keys: the attribute names, `error_mrad` among them. Every series is thinned by itself, so that no peak is lost.
-        """
-        names = ("reference_rad", "position_rad", "error_mrad", "torque_nm", "feedback_nm", "friction_nm", "other_nm")
-        return {name: thin(self.time_s, getattr(self, name), points) for name in names}
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,7 +161,7 @@ def step_response(time_s: Array, position_rad: Array, step_rad: float, count_rad
         overshoot=max(0.0, float(beyond) / abs(step_rad)),
         steady_error_mrad=abs(float(np.mean(error[time_s >= time_s[-1] - STEADY_S]))) * 1e3,
         hold_mrad=float(np.ptp(held)) * 1e3,
-        limit_cycle=swings(held, max(CYCLE_COUNTS * count_rad, CYCLE_LEAST_RAD)) >= CYCLE_SWINGS,
+        limit_cycle=oscillates(held, float(time_s[1] - time_s[0]), max(count_rad, LEAST_COUNT_RAD)),
     )
 
 
@@ -175,6 +172,29 @@ def settling(time_s: Array, error: Array, band: float) -> float | None:
         return 0.0
     last = int(outside[-1])
     return None if last + 1 == len(error) else float(time_s[last + 1])
+
+
+def oscillates(held_rad: Array, period_s: float, count_rad: float) -> bool:
+    """Whether a held position has a limit cycle, fast or slow; encoder noise, torque noise and creep are none."""
+    width = round(SMOOTH_S / period_s)
+    whole = len(held_rad) // width * width
+    smooth: Array = held_rad[:whole].reshape(-1, width).mean(axis=1)
+    hunts = whole > 0 and swings(smooth, SWING_COUNTS * count_rad) >= SWINGS
+    return hunts or line_amplitude(held_rad, period_s) > LINE_COUNTS * count_rad
+
+
+def line_amplitude(position_rad: Array, period_s: float) -> float:
+    """Amplitude of the strongest line above LINE_FROM_HZ, over Hann windows of SEGMENT_S; 0 when there are none."""
+    length = round(SEGMENT_S / period_s)
+    count = len(position_rad) // length
+    if count == 0:
+        return 0.0
+    window = np.hanning(length)
+    parts = position_rad[: count * length].reshape(count, length)
+    spectrum = np.fft.rfft((parts - parts.mean(axis=1, keepdims=True)) * window)
+    power = 2.0 * np.mean(np.abs(spectrum) ** 2, axis=0) / (length * np.sum(window**2))
+    line = np.convolve(power, np.ones(5), mode="same")  # a line fills three bins, and wanders a little
+    return float(np.sqrt(2.0 * np.max(line[round(LINE_FROM_HZ * SEGMENT_S) :])))
 
 
 def swings(position_rad: Array, width_rad: float) -> int:
