@@ -12,21 +12,15 @@ import tempfile
 from collections.abc import Callable, Sequence
 from multiprocessing.pool import AsyncResult
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from servod.axis import AxisState
-from servod.commands import REFUSAL_TEXT, Op, ReferenceKind, Refusal
+from servod.commands import ReferenceKind
 from servod.demo.axis import demo_config
 from servod.demo.entries import Entry
 from servod.demo.runs import Run, cut_motion
-from servod.errors import AnswerIsNo
-
-if TYPE_CHECKING:
-    from servod.session import SteppedSession
 
 Progress = Callable[[str, float], None]
 
-_SLICE_S = 0.5
 _POLL_S = 0.2
 _shares: Any = None  # one share of progress for each entry, in memory that the workers share
 
@@ -65,6 +59,7 @@ def _run(index: int, row: Entry, plant: str, duration_s: float) -> bytes:
     from servod.drivers.virtual.world import SteppedWorld, VirtualAxisSettings
     from servod.gains import load_gains
     from servod.session import SteppedSession
+    from servod.tracking.stepped import begin, follow
 
     gains = load_gains(row.gains)
     with tempfile.TemporaryDirectory(prefix="servod-demo-") as folder:
@@ -73,19 +68,10 @@ def _run(index: int, row: Entry, plant: str, duration_s: float) -> bytes:
         session = SteppedSession(config, world, gains.law.number, gains.pack())
         session.enable()
         session.clear()
-        refusal = session.send(Op.REFERENCE, [ReferenceKind.PAPER, duration_s])
-        if refusal != Refusal.DONE:
-            raise AnswerIsNo(REFUSAL_TEXT[refusal])
-        _follow(session, index, row.name, duration_s)
+        begin(session, ReferenceKind.PAPER, [duration_s])
+        follow(session, lambda seconds: _tell(index, seconds / duration_s), row.name)
     return session.raw
 
 
-def _follow(session: SteppedSession, index: int, name: str, duration_s: float) -> None:
-    """Run until the motion is over, and say how far it is. Raises AnswerIsNo when the axis drops out."""
-    done_s = 0.0
-    while session.cycle.reference.active:
-        session.run(_SLICE_S)
-        done_s += _SLICE_S
-        _shares[index] = min(1.0, done_s / duration_s)
-    if session.cycle.axis.state != AxisState.ENABLED:
-        raise AnswerIsNo(f"the axis went to {session.cycle.axis.state.name} under {name}. {session.why}")
+def _tell(index: int, share: float) -> None:
+    _shares[index] = min(1.0, share)

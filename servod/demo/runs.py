@@ -1,4 +1,4 @@
-"""One tracking run as arrays, cut from the daemon's recording or a stepped session's records, and its score.
+"""One tracking run as arrays, cut from the daemon's recording or a stepped session's records.
 
 Behind the recorder; demo, benchmark and report read runs from here. Needs numpy (the lab part).
 """
@@ -14,17 +14,7 @@ from numpy.typing import NDArray
 from servod.demo.axis import CONTROLLERS
 from servod.errors import AnswerIsNo
 from servod.recordings.rows import ROW
-
-#: Trajectory (19) is scored without its first second, in which the axis starts to move.
-SETTLE_S = 1.0
-
-
-@dataclass(frozen=True)
-class Score:
-    """How well a run tracked: position error of the encoder against the reference, in mrad."""
-
-    rms_error_mrad: float
-    max_error_mrad: float
+from servod.tracking.metrics import Score, score
 
 
 @dataclass(frozen=True)
@@ -56,11 +46,8 @@ class Run:
         return int(self.rows["missed"][-1] - self.rows["missed"][0])
 
     def score(self) -> Score:
-        """RMS and largest error after SETTLE_S. Raises AnswerIsNo when the run is shorter than that."""
-        error = self.error_mrad[self.time_s >= SETTLE_S]
-        if error.size == 0:
-            raise AnswerIsNo(f"the run under {self.controller} ended within its first {SETTLE_S:.0f} s")
-        return Score(float(np.sqrt(np.mean(error**2))), float(np.max(np.abs(error))))
+        """RMS and largest error without the first second. Raises AnswerIsNo when the run is shorter than that."""
+        return score(self.time_s, self.error_mrad)
 
 
 def cut_motion(controller: str, raw: bytes | bytearray) -> Run:

@@ -15,9 +15,10 @@ import plotly.graph_objects as go
 from plotly.colors import qualitative
 
 from servod.demo.entries import Entry
-from servod.demo.runs import SETTLE_S, Run
+from servod.demo.runs import Run
 from servod.report.curves import histogram, time_curves
 from servod.report.page import Page
+from servod.tracking.metrics import SETTLE_S
 
 Labels = Mapping[str, str]
 

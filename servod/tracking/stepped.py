@@ -38,8 +38,8 @@ def measure(open_session: Callable[[], SteppedSession], gains: GainSet, tell: Te
     def move(kind: ReferenceKind, arguments: Sequence[float], duration_s: float) -> Curves:
         nonlocal done_s
         before_s, done_s = done_s, done_s + duration_s
-        curves = run_motion(session, kind, arguments, lambda t: tell and tell((before_s + t) / whole_s))
-        return curves
+        watch = None if tell is None else lambda seconds: tell((before_s + min(seconds, duration_s)) / whole_s)
+        return run_motion(session, kind, arguments, watch, gains.name)
 
     followed = move(ReferenceKind.PAPER, [PAPER_S], PAPER_S)
     steps = {size: move(ReferenceKind.STEP, [size * 1e-3, HOLD_S], HOLD_S) for size in STEPS_MRAD}
@@ -56,21 +56,33 @@ def activate(session: SteppedSession, gains: GainSet) -> None:
 
 
 def run_motion(
-    session: SteppedSession, kind: ReferenceKind, arguments: Sequence[float], tell: Tell | None = None
+    session: SteppedSession,
+    kind: ReferenceKind,
+    arguments: Sequence[float],
+    tell: Tell | None = None,
+    name: str = "the gain set",
 ) -> Curves:
     """One motion from its first cycle to its last; `tell` gets the seconds that have passed.
 
-    Raises AnswerIsNo when it is refused or the axis drops out.
+    Raises AnswerIsNo when it is refused or the axis drops out; `name` says under what.
     """
     start_rad = session.cycle.reference.position_rad
     session.clear()
-    _must(session.send(Op.REFERENCE, [kind, *arguments]))
-    follow(session, tell)
+    begin(session, kind, arguments)
+    follow(session, tell, name)
     return curves_of(session.raw, start_rad)
 
 
-def follow(session: SteppedSession, tell: Tell | None = None) -> None:
-    """Run until the motion is over; `tell` gets the seconds that have passed. Raises AnswerIsNo on a fault."""
+def begin(session: SteppedSession, kind: ReferenceKind, arguments: Sequence[float]) -> None:
+    """Start a motion. Raises AnswerIsNo when it is refused."""
+    _must(session.send(Op.REFERENCE, [kind, *arguments]))
+
+
+def follow(session: SteppedSession, tell: Tell | None = None, name: str = "the gain set") -> None:
+    """Run until the motion is over; `tell` gets the seconds that have passed.
+
+    Raises AnswerIsNo when the axis drops out; `name` says under what.
+    """
     passed_s = 0.0
     while session.cycle.reference.active:
         session.run(_SLICE_S)
@@ -78,7 +90,7 @@ def follow(session: SteppedSession, tell: Tell | None = None) -> None:
         if tell:
             tell(passed_s)
     if session.cycle.axis.state != AxisState.ENABLED:
-        raise AnswerIsNo(f"the axis went to {session.cycle.axis.state.name}. {session.why}")
+        raise AnswerIsNo(f"the axis went to {session.cycle.axis.state.name} under {name}. {session.why}")
 
 
 def curves_of(raw: bytes, start_rad: float) -> Curves:
