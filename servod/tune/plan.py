@@ -61,10 +61,11 @@ class Tuned:
     """A tuned gain set, not certified. `cost` is what the search made least, in mrad (servod.tune.trial).
 
     `simulations` is what it spent; `roughness` a multiple of the paper's PD, beyond the plan's limit only where even
-    the smoothest set of the law is.
+    the smoothest set of the law is. `values` are the tuned numbers by the names of their ranges (servod.tune.laws).
     """
 
     gains: GainSet
     cost: float
     simulations: int
     roughness: float
+    values: dict[str, float]

@@ -1,29 +1,27 @@
 """All contenders of a comparison, tuned by the same rules in both classes, over worker processes.
 
-Stands on `tuning`. Each rival is one task: its equal class, then its free class, which starts from there.
+Stands on `tuning`. The free class of a rival starts from its equal class, so that more freedom is never worse.
 """
 
 from __future__ import annotations
 
-import multiprocessing
 import os
-import signal
+import time
 from collections.abc import Callable
 from dataclasses import replace
-from multiprocessing.pool import AsyncResult
-from typing import Any
+from multiprocessing.pool import AsyncResult, Pool
 
 from servod.axis_model import AxisModel
 from servod.tune.laws import RIVALS
 from servod.tune.plan import BUDGET, Feedback, Tuned, TunePlan
-from servod.tune.tuning import tune
+from servod.tune.tuning import Values, tune
+from servod.workers import worker_pool
 
-#: Told how much of all tunings is done, from 0 to 1, by rival and class.
+#: Told what has just been tuned ("pd_dob, equal feedback"), and how much of everything is done, from 0 to 1.
 Tell = Callable[[str, float], None]
-Both = dict[Feedback, Tuned]
+Key = tuple[Feedback, str]
 
-_POLL_S = 0.2
-_shares: Any = None  # of each rival, in memory that the workers share
+_POLL_S = 0.05
 
 
 def rivals(
@@ -42,62 +40,41 @@ def rivals(
     BadInput when the model has no bristle stiffness to compensate.
     """
     plan = replace(plan or TunePlan(), seed=seed, budget=budget)
-    workers = processes or min(len(os.sched_getaffinity(0)), len(RIVALS))
-    found = _alone(model, plan, tell) if workers == 1 else _together(model, plan, workers, tell)
-    return {feedback: {name: found[name][feedback] for name in RIVALS} for feedback in Feedback}
+    with worker_pool(processes or len(os.sched_getaffinity(0))) as pool:
+        found = _Field(pool, model, plan, tell).tuned()
+    return {feedback: {name: found[feedback, name] for name in RIVALS} for feedback in Feedback}
 
 
-def both_classes(model: AxisModel, name: str, plan: TunePlan, tell: Callable[[float], None] | None = None) -> Both:
-    """One rival in the equal class, then in the free class from there."""
+class _Field:
+    """The running tasks and what they have found."""
 
-    def half(offset: float) -> Callable[[float], None] | None:
-        return None if tell is None else lambda share: tell(offset + 0.5 * share)
+    def __init__(self, pool: Pool, model: AxisModel, plan: TunePlan, tell: Tell | None) -> None:
+        self._pool, self._text, self._plan, self._tell = pool, model.model_dump_json(), plan, tell
+        self._tasks: dict[Key, AsyncResult[Tuned]] = {}
+        self._found: dict[Key, Tuned] = {}
 
-    equal, values = tune(model, name, Feedback.EQUAL, plan, None, half(0.0))
-    free, _ = tune(model, name, Feedback.FREE, plan, values, half(0.5))
-    return {Feedback.EQUAL: equal, Feedback.FREE: free}
+    def tuned(self) -> dict[Key, Tuned]:
+        """Wait for everything; the first failure is raised."""
+        for name in RIVALS:
+            self._begin((Feedback.EQUAL, name), None)
+        while self._tasks:
+            for key in [key for key, task in self._tasks.items() if task.ready()]:
+                self._take(key)
+            time.sleep(_POLL_S)
+        return self._found
 
+    def _begin(self, key: Key, start: Values | None) -> None:
+        feedback, name = key
+        self._tasks[key] = self._pool.apply_async(_task, (self._text, name, feedback, self._plan, start))
 
-def _alone(model: AxisModel, plan: TunePlan, tell: Tell | None) -> dict[str, Both]:
-    """Everything in this process."""
-
-    def one(name: str) -> Both:
-        return both_classes(model, name, plan, None if tell is None else lambda share: tell(name, share))
-
-    return {name: one(name) for name in RIVALS}
-
-
-def _together(model: AxisModel, plan: TunePlan, workers: int, tell: Tell | None) -> dict[str, Both]:
-    """One task for each rival; the pool ends with the block, however it ends."""
-    context = multiprocessing.get_context("spawn")
-    shares = context.Array("d", len(RIVALS), lock=False)
-    with context.Pool(workers, _start_worker, (shares,)) as pool:
-        text = model.model_dump_json()
-        tasks = {name: pool.apply_async(_task, (i, text, name, plan)) for i, name in enumerate(RIVALS)}
-        _watch(tasks, shares, tell)
-        return {name: task.get() for name, task in tasks.items()}
-
-
-def _watch(tasks: dict[str, AsyncResult[Both]], shares: Any, tell: Tell | None) -> None:
-    """Tell until all is done, or the first task fails."""
-    while not all(task.ready() for task in tasks.values()):
-        next(task for task in tasks.values() if not task.ready()).wait(_POLL_S)
-        for name, share in zip(tasks, shares, strict=True):
-            if tasks[name].ready():
-                tasks[name].get()
-            if tell:
-                tell(name, share)
+    def _take(self, key: Key) -> None:
+        feedback, name = key
+        self._found[key] = self._tasks.pop(key).get()
+        if feedback is Feedback.EQUAL:
+            self._begin((Feedback.FREE, name), self._found[key].values)
+        if self._tell:
+            self._tell(f"{name}, {feedback.value} feedback", len(self._found) / (len(RIVALS) * len(Feedback)))
 
 
-def _start_worker(shares: Any) -> None:
-    """Ctrl-C is for the parent, which ends the pool."""
-    global _shares  # noqa: PLW0603  (how a pool hands inherited memory to its workers)
-    _shares = shares
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _task(index: int, model: str, name: str, plan: TunePlan) -> Both:
-    def tell(share: float) -> None:
-        _shares[index] = share
-
-    return both_classes(AxisModel.model_validate_json(model), name, plan, tell)
+def _task(model: str, name: str, feedback: Feedback, plan: TunePlan, start: Values | None) -> Tuned:
+    return tune(AxisModel.model_validate_json(model), name, feedback, plan, start)

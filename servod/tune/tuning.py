@@ -33,7 +33,7 @@ def tune(
     plan: TunePlan,
     start: Values | None = None,
     tell: Tell | None = None,
-) -> tuple[Tuned, Values]:
+) -> Tuned:
     """Tune the rival `name` (a key of servod.tune.laws.RIVALS) in one class; the same arguments give the same set.
 
     `start` are values that are tried beside the usual start; those of the equal class, for the free one, make sure that
@@ -59,10 +59,8 @@ def tune(
     best = values(least(cost, shares, candidates, plan.seed))
     parameters = rival.build(trial.axis, best)
     reached = trial.cost(parameters)
-    tuned = Tuned(
-        gain_set(name, rival, feedback, plan, parameters), reached.value, done * plan.plants, reached.roughness
-    )
-    return tuned, best
+    gains = gain_set(name, rival, feedback, plan, parameters)
+    return Tuned(gains, reached.value, done * plan.plants, reached.roughness, best)
 
 
 def gain_set(name: str, rival: Rival, feedback: Feedback, plan: TunePlan, parameters: Parameters) -> GainSet:
