@@ -57,7 +57,7 @@ def print_document(document: dict[str, Any], out: Path) -> None:
     widths = [max(len(line[i]) for line in (table.header, *table.rows)) for i in range(len(table.header))]
     for line in (table.header, *table.rows):
         print("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip())
-    claims = [claim for figure in document["figures"] for claim in figure["claims"]] + document["equations"]
+    claims = [claim for figure in document["figures"] for claim in figure["claims"]] + document["statements"]
     agree = sum(claim["agrees"] for claim in claims)
     print(f"{agree} of {len(claims)} statements of the paper hold here; {document['elapsed_s']:.0f} s.")
     print(f"Page: {out / 'paper.html'}; table and statements: {out / 'paper.md'}; pictures: {out / 'pictures'}")

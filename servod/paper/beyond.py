@@ -7,14 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from servod.paper.claims import Claim, Shown
+from servod.paper.claims import Claim, Shown, least
 from servod.paper.equations import TwoForms
 from servod.paper.joints import Joint
 from servod.paper.programme import ProgrammeAnswer
 from servod.paper.results import Results, Row
+from servod.paper.rivals import LABELS
 from servod.paper.sweeps import NOISE_SHARES, SweepOfL
 from servod.report.figure import COLOURS, Axis, Colour, Figure, Panel, Scale, Style, curve
 from servod.report.figures.motion import errors
+from servod.tune.plan import Feedback
 
 #: Names of the sweeps in Results.sweeps, and of the slips in Results.slips.
 TABLE1_GAINS, PD_GAINS = "gains of Table I", "the paper's PD gains"
@@ -34,7 +36,30 @@ def figures(results: Results) -> Iterator[Shown]:
     yield Shown("11", _noise_figure(results), ())
 
 
-def equation_claims(results: Results) -> Iterator[Claim]:
+def statements(results: Results) -> Iterator[tuple[str, Claim]]:
+    """Claims without a figure, each with what it is about."""
+    yield from (("equations", claim) for claim in _equations(results))
+    yield from (("rivals", claim) for joint in results.tuned for claim in _rivals(results, joint))
+
+
+def _rivals(results: Results, joint: Joint) -> Iterator[Claim]:
+    """The paper's order once every law is tuned by the same rules, in both classes."""
+    for feedback in Feedback:
+        found = {
+            c.law: t.rms_error_mrad
+            for c in results.tuned[joint]
+            if c.feedback is feedback and (t := c.measured.tracking()) is not None
+        }
+        paper = (
+            f"the local law tracks best, every law tuned by the same rules, {feedback.value} feedback, {joint.label}"
+        )
+        if LABELS["local"] in found:
+            yield least(LABELS["local"], found, paper)
+        else:
+            yield Claim(paper, "the axis stopped under the local law", False)
+
+
+def _equations(results: Results) -> Iterator[Claim]:
     """Printed against consistent equations: what the form costs on (19), and what the programme's answer is worth."""
     for name, forms in results.slips.items():
         serves = forms.printed_mrad <= forms.consistent_mrad

@@ -6,7 +6,7 @@ Under the figures of `paper`.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -43,7 +43,7 @@ class Shown:
         }
 
 
-def least(label: str, values: dict[str, float], paper: str) -> Claim:
+def least(label: str, values: Mapping[str, float], paper: str) -> Claim:
     """Whether `label` has the least of `values` [mrad RMS]."""
     here = ", ".join(f"{name} {value:.4g}" for name, value in values.items()) + " mrad RMS"
     return Claim(paper, here, values[label] == min(values.values()))

@@ -23,13 +23,13 @@ MOST_WORKERS = 4
 
 
 class Crew:
-    """Worker processes, one for each core that may be used; leaving the block by an exception ends them at once."""
+    """Worker processes, one for each core and at least two; leaving the block by an exception ends them at once."""
 
     def __init__(self, tell: Tell, expected_s: float) -> None:
         """`expected_s`: sum of the weights of all jobs that will come, in seconds of one core."""
         self._tell, self._expected_s, self._done_s = tell, expected_s, 0.0
         self._others = set(multiprocessing.active_children())
-        workers = min(MOST_WORKERS, len(os.sched_getaffinity(0)))
+        workers = min(MOST_WORKERS, max(2, len(os.sched_getaffinity(0))))
         context = multiprocessing.get_context("spawn")
         self._pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker)
         self._open: dict[Future[object], tuple[str, float]] = {}
@@ -53,7 +53,7 @@ class Crew:
 
     def result(self, future: Future[T]) -> T:
         """The result of one job; others that end meanwhile count as progress. Raises what a job raised, at once."""
-        while not future.done():
+        while future in self._open:
             done, _ = wait(self._open, timeout=1.0, return_when=FIRST_COMPLETED)
             for ended in done:
                 self._count(ended)

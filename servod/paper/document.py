@@ -15,7 +15,7 @@ from typing import Any
 from servod import __version__
 from servod.gain_parameters import LocalParameters
 from servod.paper import beyond, friction, loops, motions, table
-from servod.paper.claims import Shown
+from servod.paper.claims import Claim, Shown
 from servod.paper.experiments import Found, Measured
 from servod.paper.joints import Joint
 from servod.paper.results import Results, Row
@@ -51,7 +51,7 @@ def document(results: Results, figures: Sequence[Shown], elapsed_s: float) -> di
         "noise_on_friction": results.noise,
         "figures": [s.document() for s in figures],
         "programme": [asdict(answer) for answer in results.programme],
-        "equations": [asdict(claim) for claim in beyond.equation_claims(results)],
+        "statements": [{"about": about, **asdict(claim)} for about, claim in beyond.statements(results)],
     }
 
 
@@ -118,9 +118,11 @@ def write(folder: Path, figures: Sequence[Shown], found: dict[str, Any]) -> None
         for claim in s.claims:
             page.sentence(str(claim))
         page.figure(s.figure)
-    page.heading("Printed against consistent equations")
-    for claim in found["equations"]:
-        page.sentence(f"{'Agrees' if claim['agrees'] else 'Does not agree'}: {claim['paper']}; here {claim['here']}.")
+    for about in dict.fromkeys(said["about"] for said in found["statements"]):
+        page.heading(about.capitalize())
+        for said in found["statements"]:
+            if said["about"] == about:
+                page.sentence(str(Claim(said["paper"], said["here"], said["agrees"])))
     page.write(folder / "paper.html")
     write_bytes(folder / "paper.md", markdown(found).encode())
     write_bytes(folder / "paper.json", (json.dumps(found, indent=1, allow_nan=False) + "\n").encode())

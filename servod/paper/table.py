@@ -126,12 +126,19 @@ def tuned(document: dict[str, Any], joint: Joint) -> Table:
 def claims(document: dict[str, Any]) -> Table:
     """Every claim by its figure, and whether it agrees."""
     rows = [
-        (figure["number"], claim["paper"], claim["here"], "agrees" if claim["agrees"] else "does not agree")
+        (figure["number"], claim["paper"], claim["here"], _verdict(claim))
         for figure in document["figures"]
         for claim in figure["claims"]
     ]
-    rows += [
-        ("equations", c["paper"], c["here"], "agrees" if c["agrees"] else "does not agree")
-        for c in document["equations"]
-    ]
+    rows += [(said["about"], said["paper"], said["here"], _verdict(said)) for said in document["statements"]]
     return Table("What agrees and what does not", ("figure", "the paper", "here", ""), tuple(rows))
+
+
+def _verdict(claim: dict[str, Any]) -> str:
+    return "agrees" if claim["agrees"] else "does not agree"
+
+
+def quotation(document: dict[str, Any]) -> str:
+    """What the README quotes: the numbers, and the rivals where they were tuned, as paper.md has them."""
+    joints = [Joint(name) for name in document["joints"] if document["joints"][name]["tuned"]]
+    return "\n\n".join(each.markdown() for each in (numbers(document), *(tuned(document, joint) for joint in joints)))

@@ -58,7 +58,15 @@ class PaperPlan:
 
 
 #: A look at everything that needs no identification, on Table I's joint alone.
-QUICK = PaperPlan(joints=(Joint.TABLE1,), seconds=10.0, hold_s=1.5, identify=False, factors=(0.01, 0.1, 1.0))
+QUICK = PaperPlan(
+    joints=(Joint.TABLE1,),
+    seconds=4.0,
+    hold_s=1.2,
+    identify=False,
+    factors=(0.01, 0.1, 1.0),
+    pictures=False,
+    tune=(),
+)
 
 
 def paper(plan: PaperPlan, out: Path, tell: Tell) -> dict[str, Any]:

@@ -107,7 +107,7 @@ def document() -> dict[str, Any]:
     return {
         "joints": {"table1_joint": joint},
         "figures": [{"number": "2", "claims": [claim]}],
-        "equations": [claim],
+        "statements": [{"about": "equations", **claim}],
     }
 
 
