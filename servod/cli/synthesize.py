@@ -5,66 +5,188 @@ Works on files alone; needs the lab extra (cvxpy). The set comes out without a c
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
+from servod.cli import synthesis_options as ask
 from servod.cli.common import JsonOption, example, one_thread, print_json
-from servod.errors import AnswerIsNo
+from servod.errors import AnswerIsNo, BadInput
 
 if TYPE_CHECKING:
+    from servod.axis_model import AxisModel
     from servod.gains import GainSet
-    from servod.synthesize.deployed import Infeasible
+    from servod.synthesize.deployed import Infeasible, Wishes
+    from servod.synthesize.gain_set import Options
 
-EXAMPLE = "servoctl synthesize --model model.yaml --out gains.yaml"
+EXAMPLES = (
+    "servoctl synthesize --model model.yaml --out gains.yaml",
+    "servoctl synthesize --model model.yaml --out paper.yaml --mode reference --cross-check",
+)
 
 
 def register(app: typer.Typer) -> None:
     """Add the verb to `app`."""
-    app.command(name="synthesize", help=example("Compute a gain set for an axis model.", EXAMPLE))(synthesize)
+    app.command(name="synthesize", help=example("Compute a gain set for an axis model.", *EXAMPLES))(synthesize)
 
 
 def synthesize(
-    model: Annotated[Path, typer.Option(help="Axis model (YAML).")],
-    out: Annotated[Path, typer.Option(help="Gain set to write (YAML).")],
-    name: Annotated[str, typer.Option(help="Name of the gain set.")] = "synthesized",
-    accuracy: Annotated[float, typer.Option(min=0.001, max=0.5, help="Force tolerance between local sets.")] = 0.02,
-    paper_nodes: Annotated[bool, typer.Option("--paper-nodes", help="The paper's nine local sets.")] = False,
-    uncertainty: Annotated[float, typer.Option(min=0.0, max=10.0, help="Scale of all intervals.")] = 1.0,
-    cutoff_hz: Annotated[float | None, typer.Option(min=10.0, max=2000.0, help="Velocity filter, Hz.")] = None,
-    decay: Annotated[float, typer.Option(min=0.1, max=500.0, help="Least decay, 1/s.")] = 5.0,
-    damping: Annotated[float, typer.Option(min=0.001, max=0.9, help="Least damping ratio.")] = 0.05,
-    speed: Annotated[float, typer.Option(min=0.01, max=100.0, help="Highest speed of the map, rad/s.")] = 0.5,
-    observer: Annotated[bool, typer.Option(help="Output disturbance observer.")] = True,
+    model: ask.Model,
+    out: ask.Out,
+    name: ask.Name = "synthesized",
+    mode: ask.ModeOption = ask.Mode.DEPLOYED,
+    scalar_output: ask.ScalarOutput = False,
+    cross_check: ask.CrossCheck = False,
+    alpha: ask.Alpha = None,
+    beta: ask.Beta = None,
+    decay: ask.Decay = None,
+    zeta_min: ask.ZetaMin = None,
+    uncertainty: ask.Uncertainty = 1.0,
+    delay_s: ask.Delay = None,
+    period_us: ask.Period = 1000,
+    cutoff_hz: ask.Cutoff = None,
+    encoder_counts: ask.Counts = 2**20,
+    speed: ask.Speed = 0.5,
+    overlap_from: ask.OverlapFrom = 0.005,
+    overlap_to: ask.OverlapTo = 0.02,
+    accuracy: ask.Accuracy = 0.02,
+    paper_nodes: ask.PaperNodes = False,
+    weights: ask.WeightsOption = ask.Weights.LINEAR,
+    velocity: ask.VelocityOption = ask.Velocity.REFERENCE,
+    observer: ask.Observer = True,
+    position_torque: ask.PositionTorque = True,
+    leak: ask.Leak = 2.0,
+    gain_l: ask.GainL = None,
     as_json: JsonOption = False,
 ) -> None:
     """Synthesize a gain set for MODEL; exit code 1 when the demands cannot be met."""
     one_thread()
     from servod.axis_model import load_axis_model
-    from servod.gain_store import write_atomically
-    from servod.synthesize.deployed import Infeasible, Wishes
-    from servod.synthesize.gain_set import Options, synthesize
+
+    need_order(overlap_from, overlap_to, speed)
+    axis = delayed(load_axis_model(model), delay_s)
+    overlap = overlap_from, overlap_to
+    wishes = wishes_of(axis, uncertainty, period_us, cutoff_hz, encoder_counts, speed, overlap)
+    options = options_of(
+        name, accuracy, paper_nodes, weights, velocity, observer, position_torque, leak_per_s=leak, gain=gain_l
+    )
+    asked = given(position_weight=alpha, torque_weight=beta, least_decay_per_s=decay, least_damping=zeta_min)
+    finish(solved(mode, axis, wishes, options, asked, scalar_output, model), out, cross_check, as_json)
+
+
+def wishes_of(
+    axis: AxisModel,
+    uncertainty: float,
+    period_us: int,
+    cutoff_hz: float | None,
+    counts: int,
+    speed: float,
+    overlap: tuple[float, float],
+) -> Wishes:
+    """What is asked of the loop, with the intervals that were identified."""
+    from servod.synthesize.deployed import Wishes
     from servod.synthesize.intervals import uncertainty_of
 
-    axis = load_axis_model(model)
-    wishes = Wishes(
+    return Wishes(
         uncertainty=uncertainty_of(axis).scaled(uncertainty),
+        period_s=1e-6 * period_us,
         cutoff_hz=cutoff_hz,
-        least_decay_per_s=decay,
-        least_damping=damping,
+        counts_per_turn=float(counts),
         speed_max=speed,
+        overlap=overlap,
     )
-    result = synthesize(axis, wishes, Options(name, accuracy, paper_nodes, observer=observer), model)
+
+
+def options_of(
+    name: str,
+    accuracy: float,
+    paper_nodes: bool,
+    weights: ask.Weights,
+    velocity: ask.Velocity,
+    observer: bool,
+    position_torque: bool,
+    leak_per_s: float,
+    gain: float | None,
+) -> Options:
+    """What is asked of the law."""
+    from servod.gain_parameters import VelocitySource, WeightShape
+    from servod.synthesize.gain_set import Options
+
+    return Options(
+        name,
+        accuracy,
+        paper_nodes,
+        velocity=VelocitySource(velocity),
+        observer=observer,
+        gain=gain,
+        leak_per_s=leak_per_s,
+        weights=WeightShape(weights),
+        position_feedforward=position_torque,
+    )
+
+
+def finish(result: GainSet | Infeasible, out: Path, cross_check: bool, as_json: bool) -> None:
+    """Write and print the set, or say why there is none. Raises AnswerIsNo."""
+    from servod.gain_store import write_atomically
+    from servod.synthesize.deployed import Infeasible
+
     if isinstance(result, Infeasible):
         refuse(result, as_json)
         return
+    if cross_check:
+        from servod.synthesize.crosscheck import cross_checked
+
+        result = cross_checked(result)
     write_atomically(out, result.to_yaml())
     document = summary(result, out)
     if as_json:
         print_json(document)
     else:
         print_summary(document)
+
+
+def need_order(overlap_from: float, overlap_to: float, speed: float) -> None:
+    """The regions overlap, and Omega_H reaches beyond the overlap. Raises BadInput."""
+    if overlap_from >= overlap_to:
+        raise BadInput("--overlap-from", f"{overlap_from:g}", f"less than --overlap-to, {overlap_to:g}")
+    if overlap_to >= speed:
+        raise BadInput("--overlap-to", f"{overlap_to:g}", f"less than --speed, {speed:g}")
+
+
+def delayed(model: AxisModel, delay_s: float | None) -> AxisModel:
+    """`model` with another delay in total; the same when none is given."""
+    return model if delay_s is None else model.model_copy(update={"delay_s": delay_s, "delay": None})
+
+
+def given(**values: float | None) -> dict[str, Any]:
+    """The wishes that were asked for; the others are the mode's own."""
+    return {key: value for key, value in values.items() if value is not None}
+
+
+def solved(
+    mode: ask.Mode,
+    axis: AxisModel,
+    wishes: Wishes,
+    options: Options,
+    asked: dict[str, Any],
+    scalar_output: bool,
+    path: Path,
+) -> GainSet | Infeasible:
+    """The set of the mode that was chosen, or why there is none."""
+    from servod.synthesize.gain_set import synthesize
+
+    if mode is ask.Mode.DEPLOYED:
+        if scalar_output:
+            raise BadInput("--scalar-output", "the deployed mode", "--mode reference")
+        return synthesize(axis, replace(wishes, **asked), options, path)
+    from servod.gain_design import ReferenceOutput
+    from servod.synthesize.lmi_reference import ReferenceWishes
+    from servod.synthesize.reference import reference_set
+
+    output = ReferenceOutput.SCALAR if scalar_output else ReferenceOutput.VECTOR
+    return reference_set(axis, wishes, options, ReferenceWishes(output=output, **asked), path)
 
 
 def refuse(result: Infeasible, as_json: bool) -> None:
@@ -86,6 +208,7 @@ def summary(gains: GainSet, out: Path) -> dict[str, Any]:
     """The command's JSON document."""
     assert gains.design is not None
     parameters = gains.parameters.model_dump(mode="json")
+    provenance = gains.provenance.model_dump(mode="json")
     return {
         "feasible": True,
         "out": str(out),
@@ -94,9 +217,13 @@ def summary(gains: GainSet, out: Path) -> dict[str, Any]:
         "regions": parameters["regions"],
         "input_scale_nm": parameters["input_scale_nm"],
         "local_sets": len(parameters["friction"]["sets"]),
+        "gains_l": [s["gain"] for s in parameters["friction"]["sets"]],
         "disturbance_observer": parameters["disturbance_observer"],
+        "position_feedforward": parameters["position_feedforward"],
         "velocity_cutoff_hz": gains.design.velocity_cutoff_hz,
         "uncertainty": gains.design.uncertainty.model_dump(),
+        "cross_checks": provenance["cross_checks"],
+        "hashes": {key: provenance[key] for key in ("model_sha256", "data_sha256", "tool_sha256")},
         "certified": False,
     }
 
@@ -110,5 +237,28 @@ def print_summary(document: dict[str, Any]) -> None:
         print(f"region {region}: {position:.4g} N*m/rad, {speed:.4g} N*m*s/rad")
     observer = document["disturbance_observer"]
     print(f"{document['local_sets']} local sets; observer {observer['bandwidth_rad_s'] if observer else 0:g} rad/s")
+    if any(document["gains_l"]):
+        print(f"l from {min(document['gains_l']):.3g} to {max(document['gains_l']):.3g}")
+    print_known(document["position_feedforward"])
+    for check in document["cross_checks"] or []:
+        print_cross_check(check)
     print(f"set encoder.velocity_cutoff_hz to {document['velocity_cutoff_hz']:g}")
     print(f"written to {document['out']}; `servoctl verify {document['out']}` certifies it")
+
+
+def print_known(known: dict[str, Any] | None) -> None:
+    """One line on what is fed forward over position."""
+    if known is None:
+        return
+    waves = ", ".join(f"{1e3 * w['amplitude_nm']:.3g} mN*m at {w['waves_per_turn']:g} a turn" for w in known["waves"])
+    spring = f"spring {known['spring_nm_per_rad']:g} N*m/rad" if known["spring_nm_per_rad"] else ""
+    offset = f"constant {known['offset_nm']:g} N*m" if known["offset_nm"] else ""
+    print(f"fed forward over position: {'; '.join(part for part in (waves, spring, offset) if part)}")
+
+
+def print_cross_check(check: dict[str, Any]) -> None:
+    """One line on what the second solver says of a region."""
+    bounds = [f"{b:.4g}" if b is not None else "nothing" for b in (check["h2_bound"], check["other_h2_bound"])]
+    verdict = "agrees" if check["agrees"] else "DISAGREES"
+    limit = f"tolerance {100 * check['tolerance']:g} %"
+    print(f"region {check['region']}: {check['solver']} {verdict}: H2 bound {bounds[1]} against {bounds[0]} ({limit})")

@@ -1,0 +1,41 @@
+"""Where a synthesized set comes from: hashes of the model's file, of the recordings behind it, and of this tool.
+
+Beside the synthesis. The recordings' hashes stand in the model that an identification wrote; the tool's hash is over
+the sources that compute, so that two versions of one number are told apart.
+"""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+from pathlib import Path
+
+import servod
+from servod.axis_model import AxisModel
+from servod.gains import Provenance
+
+#: What computes a design: packages and single files below the package's folder.
+SOURCES = ("synthesize", "verify", "models", "controllers", "gain_parameters.py", "gain_design.py")
+
+
+def tool_sha256() -> str:
+    """Hash of the sources that compute a design, by their names and contents."""
+    root, digest = Path(servod.__file__).parent, hashlib.sha256()
+    for name in SOURCES:
+        at = root / name
+        for path in sorted(at.rglob("*.py")) if at.is_dir() else [at]:
+            digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()
+
+
+def provenance(model: AxisModel, model_path: Path | None, note: str) -> Provenance:
+    """The provenance of a set for `model`, which was read from `model_path`. Raises OSError when it cannot be read."""
+    return Provenance(
+        author="servod",
+        date=datetime.datetime.now(datetime.UTC).date(),
+        tool=f"servod {servod.__version__} synthesize",
+        tool_sha256=tool_sha256(),
+        model_sha256=hashlib.sha256(model_path.read_bytes()).hexdigest() if model_path else None,
+        data_sha256=list(model.identified.data_sha256) if model.identified else [],
+        note=note,
+    )
