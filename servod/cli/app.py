@@ -21,7 +21,9 @@ from servod.cli import (
     commission,
     demo,
     deploy,
+    diagnose,
     enable,
+    explain,
     faults,
     gains,
     identify,
@@ -49,7 +51,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 _DAEMON = (demo, scan, status, enable, stop, track, gains, preset, record)
-_LABORATORY = (identify, synthesize, verify, deploy, commission, replay, paper)
+_LABORATORY = (identify, synthesize, verify, deploy, commission, replay, diagnose, explain, paper)
 for _verb in (*_DAEMON, *_LABORATORY, bench, check, faults):
     _verb.register(app)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from time import monotonic
 
 import numpy as np
@@ -59,21 +59,26 @@ class Merit:
     gain: float
 
 
+@dataclass(frozen=True)
+class Entry:
+    """How a term came in: costs of the fit before it and of its own, in one scale, and the other candidates."""
+
+    present: float
+    cost: float
+    rivals: list[Candidate]
+
+
 @dataclass
 class Choice:
-    """The outcome: the fit with all that is named, the fit of the base alone, and who else was in the running.
-
-    `rivals` has for each term (by its place) the candidates that stood beside it when it came in.
-    """
+    """The outcome: the fit with all that is named, the fit of the base alone, and for each term how it came in."""
 
     base: Fit
     fit: Fit
     merits: list[Merit]
-    rivals: list[list[Candidate]]
+    entries: list[Entry]
     minor: dict[str, Merit]
     floor: float
     tried: int
-    rounds: list[str] = field(default_factory=list)
 
 
 class Chooser:
@@ -114,22 +119,23 @@ class Chooser:
 
     def _fit_base(self) -> Fit:
         mismatch = self.predictor.mismatch(self.start.model(self.start.start))
-        fit = self._settled(self.start, None, mismatch)
+        fit = self.settled(self.start, None, mismatch)
         self.base_error = self.error(fit.mismatch)
         self.floor = noise_floor(self.predictor, fit.mismatch)
         return fit
 
-    def _settled(self, hypothesis: Hypothesis, coordinates: Array | None, mismatch: Array) -> Fit:
+    def settled(self, hypothesis: Hypothesis, coordinates: Array | None, mismatch: Array) -> Fit:
         """Fit in the scale of the present mismatch, then in the scale of what is left, with a fresh Jacobian."""
-        for _ in range(2):
-            fitter = self.fitter(mismatch)
-            fit = fitter.fit(hypothesis, coordinates)
-            if fit is None:
-                raise ValueError("a hypothesis that makes no sense at its start")
-            coordinates, mismatch = fit.coordinates, fit.mismatch
-        return self._fresh(fit)
+        first = self._fitted(hypothesis, coordinates, mismatch)
+        return self.fresh(self._fitted(hypothesis, first.coordinates, first.mismatch))
 
-    def _fresh(self, fit: Fit) -> Fit:
+    def _fitted(self, hypothesis: Hypothesis, coordinates: Array | None, mismatch: Array) -> Fit:
+        fit = self.fitter(mismatch).fit(hypothesis, coordinates)
+        if fit is None:
+            raise ValueError("a hypothesis that makes no sense at its start")
+        return fit
+
+    def fresh(self, fit: Fit) -> Fit:
         """The fit with cost and Jacobian in the scale of its own mismatch."""
         fitter = self.fitter(fit.mismatch)
         cost = fitter.cost(fit.hypothesis, fit.coordinates, fit.mismatch)
@@ -150,13 +156,14 @@ class Chooser:
         self.tried += trials.tried
         self.tell(f"{trials.tried} starts tried; best: " + ", ".join(c.effect for c in candidates[:3]))
         for candidate in candidates:
-            settled = self._settled(candidate.fit.hypothesis, candidate.fit.coordinates, candidate.fit.mismatch)
+            settled = self.settled(candidate.fit.hypothesis, candidate.fit.coordinates, candidate.fit.mismatch)
             self.floor = min(self.floor, noise_floor(self.predictor, settled.mismatch))
             merit = self.merit(present, settled)
             if self.deserves(merit, settled) and (settled.converged or merit.share >= SURE_SHARE):
                 choice.fit = settled
                 choice.merits.append(merit)
-                choice.rivals.append([c for c in candidates if c.effect != candidate.effect])
+                others = [c for c in candidates if c.effect != candidate.effect]
+                choice.entries.append(Entry(present.cost, candidate.fit.cost, others))
                 choice.floor = self.floor
                 return True
             if self._significant(merit, settled):
@@ -205,7 +212,7 @@ class Chooser:
         """Drop every earlier term whose work the others now do."""
         index = 0
         while index < len(choice.fit.hypothesis.terms) - 1:
-            less = self._less(choice.fit, index)
+            less = self.less(choice.fit, index)
             merit = self.merit(less, choice.fit)
             if self.deserves(merit, choice.fit):
                 choice.merits[index] = merit
@@ -213,13 +220,13 @@ class Chooser:
                 continue
             choice.fit = less
             choice.merits.pop(index)
-            choice.rivals.pop(index)
+            choice.entries.pop(index)
 
-    def _less(self, fit: Fit, index: int) -> Fit:
+    def less(self, fit: Fit, index: int) -> Fit:
         """The fit without one of its terms."""
         gone = fit.hypothesis.share(index)
         kept = np.concatenate([fit.coordinates[: gone.start], fit.coordinates[gone.stop :]])
-        return self._settled(fit.hypothesis.without(index), kept, fit.mismatch)
+        return self.settled(fit.hypothesis.without(index), kept, fit.mismatch)
 
 
 #: Effects that may come in again with another period or place.

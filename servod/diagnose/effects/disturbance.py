@@ -1,4 +1,4 @@
-"""Disturbance: an external torque in a time window of one recording."""
+"""Disturbance: an external torque in a window of time, of one recording or after the start of every one."""
 
 from __future__ import annotations
 
@@ -16,9 +16,12 @@ Array = NDArray[np.float64]
 #: Lengths of windows that are tried, s, and windows that are kept.
 LENGTHS_S, KEPT = (0.2, 0.5, 1.0, 2.0, 4.0), 2
 
+#: The form of a window that comes at the same time after the start of every recording.
+EVERY = "in every recording"
+
 
 def windows(mismatch: Array, period_s: float) -> list[tuple[float, int, int]]:
-    """(share, first row, last row) of the windows whose constant torque takes most of the mismatch, best first."""
+    """(power taken, first row, last row) of the windows whose constant torque takes most, best first."""
     total = np.concatenate([[0.0], np.cumsum(mismatch)])
     found = []
     for length in LENGTHS_S:
@@ -27,41 +30,58 @@ def windows(mismatch: Array, period_s: float) -> list[tuple[float, int, int]]:
             continue
         sums = total[rows:] - total[:-rows]
         best = int(np.argmax(np.abs(sums)))
-        found.append((float(sums[best] ** 2 / rows), best, best + rows))
+        found.append((float(sums[best] ** 2 / rows), best, best + rows - 1))
     return sorted(found, reverse=True)
 
 
-def _write(document: Document, values: Sequence[float]) -> None:
-    start, length, torque = values
-    group = document.setdefault("disturbance", {}).setdefault("windows", [])
-    group.append({"start_s": start, "end_s": start + length, "torque": torque})
-
-
 def terms(scene: Scene) -> list[Term]:
-    """The windows of all recordings in which a constant torque takes most; several recordings need different times."""
+    """The windows of single recordings in which a constant torque takes most, and windows common to all of them."""
     found = []
-    for trace, part in zip(scene.predictor.traces, scene.predictor.slices, strict=True):
-        t_s = trace.drive.t_s
+    traces = scene.predictor.traces
+    for trace, part in zip(traces, scene.predictor.slices, strict=True):
         for taken, first, last in windows(scene.mismatch[part], trace.period_s)[:KEPT]:
-            mean = float(np.mean(scene.mismatch[part][first:last]))
-            found.append((taken, float(t_s[first]), float(t_s[last] - t_s[first]), mean))
+            begun = float(trace.drive.t_s[first] - trace.shift_s)
+            length = float(trace.drive.t_s[last] - trace.drive.t_s[first])
+            found.append((taken, begun, length, float(np.mean(scene.mismatch[part][first:last])), trace.shift_s))
     best = sorted(found, reverse=True)[:KEPT]
-    return [_term(scene, start, length, mean) for _, start, length, mean in best]
+    single = [_term(scene, begun, length, mean, (shift,)) for _, begun, length, mean, shift in best]
+    return single + (_common(scene) if len(traces) > 1 else [])
 
 
-def _term(scene: Scene, start: float, length: float, torque: float) -> Term:
+def _common(scene: Scene) -> list[Term]:
+    """Windows at the same time after the start of every recording."""
+    traces, parts = scene.predictor.traces, scene.predictor.slices
+    rows = min(part.stop - part.start for part in parts)
+    mean = np.mean([scene.mismatch[part][:rows] for part in parts], axis=0)
+    t_s = traces[0].drive.t_s - traces[0].shift_s
+    shifts = tuple(trace.shift_s for trace in traces)
+    best = windows(mean, traces[0].period_s)[:1]
+    return [
+        _term(scene, float(t_s[first]), float(t_s[last] - t_s[first]), float(np.mean(mean[first:last])), shifts)
+        for _, first, last in best
+    ]
+
+
+def _term(scene: Scene, start: float, length: float, torque: float, shifts: tuple[float, ...]) -> Term:
+    """A window in the recordings whose times stand `shifts` later than recorded."""
     most = 50.0 * max(scene.dry, 0.2 * scene.effort)
     unknowns = (
-        Unknown("start_s", "s", start, start - 2.0 * length, start + 2.0 * length, 0.05),
-        Unknown("length_s", "s", length, 0.02, 4.0 * length),
+        Unknown("start_s", "s", start, start - 2.0 * length, start + 2.0 * length, 0.05, nudge=0.05),
+        Unknown("length_s", "s", length, 0.02, 4.0 * length, nudge=0.02),
         Unknown("torque", scene.force, torque, -most, most, scene.dry),
     )
+
+    def write(document: Document, values: Sequence[float]) -> None:
+        group = document.setdefault("disturbance", {}).setdefault("windows", [])
+        for shift in shifts:
+            start_s = shift + values[0]
+            group.append({"start_s": start_s, "end_s": start_s + values[1], "torque": values[2]})
 
     def tell(_document: Document, values: Sequence[float]) -> list[Reported]:
         found = [Reported("start_s", values[0], "s"), Reported("end_s", values[0] + values[1], "s")]
         return [*found, Reported("torque", values[2], scene.force)]
 
-    return Term("disturbance", "constant", unknowns, _write, tell)
+    return Term("disturbance", EVERY if len(shifts) > 1 else "in one recording", unknowns, write, tell)
 
 
 EFFECT = Effect(

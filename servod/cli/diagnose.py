@@ -1,0 +1,108 @@
+"""`servoctl diagnose`: where recordings and model differ, what physics was left out, and the model with it put in.
+
+Works on files alone; needs the lab extra.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from servod.cli.common import JsonOption, example, need_folder, one_thread, print_json
+from servod.errors import AnswerIsNo, BadInput
+
+if TYPE_CHECKING:
+    from servod.axis_model import AxisModel
+    from servod.diagnose.engine import Diagnosis
+    from servod.recordings import Recording
+
+EXAMPLE = "servoctl diagnose --model model.yaml run1.csv.gz run2.csv.gz --out diagnosis"
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb to `app`."""
+    app.command(name="diagnose", help=example("Find what physics a model leaves out.", EXAMPLE))(diagnose)
+
+
+def diagnose(
+    recordings: Annotated[list[Path], typer.Argument(metavar="REC...", help="CSV, CSV.gz, Parquet, MAT v5 or MCAP.")],
+    model: Annotated[Path, typer.Option(help="Axis model (YAML) that the recordings are compared with.")],
+    out: Annotated[Path, typer.Option(help="Folder for diagnosis.json and model.yaml.")],
+    map_file: Annotated[Path | None, typer.Option("--map", help="Renames and scales foreign columns (YAML).")] = None,
+    time_limit: Annotated[float, typer.Option(help="Seconds after which the search ends with what it has.")] = 120.0,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare RECs with MODEL, name what is missing, write the extended model. Exit code 1: these data cannot tell."""
+    if not 1.0 <= time_limit <= 1e5:
+        raise BadInput("--time-limit", repr(time_limit), "seconds from 1 to 100000")
+    one_thread()
+    from servod.axis_model import load_axis_model
+    from servod.diagnose.document import diagnosis_document, extended_model
+    from servod.diagnose.engine import diagnose as run
+
+    axis = load_axis_model(model)
+    recorded = _load(recordings, map_file, axis, model)
+    need_folder("--out", out)
+    found = run(axis, recorded, time_limit, _quiet if as_json else _progress)
+    document = diagnosis_document(found)
+    _write(out, document, extended_model(found))
+    if as_json:
+        print_json(document)
+    else:
+        _print(found, document, out)
+    if found.evidence is None:
+        raise AnswerIsNo(document["summary"])
+
+
+def _load(paths: list[Path], map_file: Path | None, axis: AxisModel, model: Path) -> list[Recording]:
+    from servod.recordings import load_recording
+
+    recorded = [load_recording(path, map_file) for path in paths]
+    for recording in recorded:
+        if recording.axis is not axis.axis:
+            wanted = f"{recording.axis.value}, as the columns of {recording.path} say"
+            raise BadInput(f"{model}: axis", axis.axis.value, wanted)
+    return recorded
+
+
+def _quiet(_line: str) -> None:
+    """No progress beside a JSON document."""
+
+
+def _progress(line: str) -> None:
+    """Progress on standard error."""
+    print(line, file=sys.stderr, flush=True)
+
+
+def _write(out: Path, document: dict[str, Any], extended: AxisModel | None) -> None:
+    """Write both files aside and rename them."""
+    from servod.axis_model import axis_model_yaml
+
+    texts = {"diagnosis.json": json.dumps(document, indent=1, allow_nan=False) + "\n"}
+    if extended is not None:
+        texts["model.yaml"] = axis_model_yaml(extended)
+    for name, text in texts.items():
+        aside = out / f"{name}.part"
+        aside.write_text(text, encoding="utf-8")
+        aside.replace(out / name)
+
+
+def _print(found: Diagnosis, document: dict[str, Any], out: Path) -> None:
+    """The answer for people: verdict, findings with their parameters, what was recalibrated."""
+    for refused in found.refused:
+        print(f"not used: {refused.name}: {refused.reason}")
+    print(f"{document['verdict']}: {document['summary']}")
+    for finding in document["findings"]:
+        print(f"- {finding['effect']} (confidence {finding['confidence']:.2f}): {finding['statement']}")
+        for name, value in finding["parameters"].items():
+            low, high = value["interval"]
+            print(f"    {name} = {value['value']:.5g} {value['unit']}  [{low:.5g}, {high:.5g}]")
+        for other in finding["alternatives"]:
+            print(f"    not told apart from {other['effect']}: {other['experiment']}")
+    for name, change in document["recalibrated"].items():
+        print(f"recalibrated: {name} {change['from']:.5g} -> {change['to']:.5g} {change['unit']}")
+    print(f"written: {out / 'diagnosis.json'}" + (f", {out / 'model.yaml'}" if found.evidence else ""))

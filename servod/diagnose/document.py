@@ -1,0 +1,218 @@
+"""The outside contract's `diagnosis.json` and `model.yaml` from a diagnosis.
+
+The last step before the files: plain numbers, sentences for people, nothing decided here.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servod.axis_model import AxisModel
+from servod.diagnose.effects import effect
+from servod.diagnose.effects.disturbance import EVERY
+from servod.diagnose.engine import Diagnosis, Evidence
+from servod.diagnose.fit import Fit
+from servod.diagnose.hypothesis import Document, Reported
+from servod.diagnose.locate import places
+from servod.diagnose.verdict import alternatives, confidence
+from servod.diagnose.windows import window_errors
+
+Array = NDArray[np.float64]
+
+#: Half width of a 95 % interval in standard deviations.
+Z95 = 1.96
+
+#: A change of a parameter below this share is none.
+LEAST_CHANGE = 0.002
+
+
+def diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:
+    """The JSON document."""
+    evidence = diagnosis.evidence
+    found: dict[str, Any] = {"verdict": diagnosis.verdict.value, "summary": summary(diagnosis)}
+    found["findings"] = findings(evidence) if evidence else []
+    found["recalibrated"] = recalibrated(evidence) if evidence else {}
+    found["minor"] = minor(evidence) if evidence else {}
+    found["fit"] = fit_document(diagnosis, evidence) if evidence else {}
+    if evidence is not None and evidence.unnamed is not None:
+        left = evidence.unnamed
+        table = {"grid": left.grid.tolist(), "torque": left.torque.tolist()}
+        found["unexplained"] = {"coordinate": left.coordinate, "share": left.share, **table}
+    if evidence is not None:
+        found["located"] = [m.document() for m in evidence.maps_before]
+        found["remaining"] = [m.document() for m in evidence.maps_after]
+    found["recordings"] = recordings(diagnosis)
+    found["seconds"] = {stage: round(value, 2) for stage, value in diagnosis.seconds.items()}
+    return found
+
+
+def summary(diagnosis: Diagnosis) -> str:
+    """One or two plain sentences."""
+    evidence = diagnosis.evidence
+    if evidence is None:
+        reasons = "; ".join(f"{r.name}: {r.reason}" for r in diagnosis.refused)
+        return f"These data cannot tell: {reasons}."
+    names = list(dict.fromkeys(evidence.fit.hypothesis.terms[place].effect for place in evidence.named))
+    if names:
+        sentences = " ".join(f"{effect(name).statement}." for name in names)
+        return f"{sentences} {100.0 * evidence.errors.removed:.0f} % of the explainable mismatch is gone."
+    if diagnosis.verdict.value == "unexplained":
+        where = evidence.maps_before[0].coordinate
+        return f"Something is left that no known physics explains; it shows most over {where}."
+    return "The model is adequate: nothing worth naming is left beyond the noise."
+
+
+def findings(evidence: Evidence) -> list[dict[str, Any]]:
+    """One entry for each effect; terms of the same effect are one finding."""
+    terms = evidence.fit.hypothesis.terms
+    names = list(dict.fromkeys(terms[place].effect for place in evidence.named))
+    return [_finding(evidence, name, [p for p in evidence.named if terms[p].effect == name]) for name in names]
+
+
+def _finding(evidence: Evidence, name: str, named: list[int]) -> dict[str, Any]:
+    fit, first = evidence.fit, named[0]
+    what = effect(name)
+    contribution = evidence.less[first].mismatch - fit.mismatch
+    merit = evidence.choice.merits[first]
+    statement = (
+        f"{what.statement}: it carries {100.0 * max(merit.share, 0.0):.0f} % of the explainable mismatch and "
+        f"{100.0 * merit.torque:.1f} % of dry friction where it acts; {what.shows}."
+    )
+    others = [
+        {"effect": other, "experiment": effect(other).experiment} for other in alternatives(evidence.choice, first)
+    ]
+    return {
+        "effect": name,
+        "statement": statement,
+        "located": places(evidence.predictor, contribution, evidence.predictor.dry),
+        "form": [fit.hypothesis.terms[place].form for place in named],
+        "parameters": _parameters(evidence, named),
+        "confidence": min(confidence(evidence.choice, place) for place in named),
+        "alternatives": others,
+        "confused_with": list(what.confused),
+        "experiment": what.experiment,
+        "held_out": {"before": evidence.without[first].rms, "after": evidence.after.rms, "unit": "N·m"},
+    }
+
+
+def _parameters(evidence: Evidence, named: list[int]) -> dict[str, Any]:
+    """Reported values of the terms with their 95 % intervals; later terms of the same effect are numbered."""
+    found: dict[str, Any] = {}
+    for count, place in enumerate(named):
+        told = _told(evidence.fit, place, evidence.fit.coordinates)
+        spread = _spread(evidence, place, told)
+        for reported, deviation in zip(told, spread, strict=True):
+            name = reported.name if count == 0 else f"{reported.name}_term{count + 1}"
+            low, high = reported.value - Z95 * deviation, reported.value + Z95 * deviation
+            found[name] = {"value": reported.value, "unit": reported.unit, "interval": [low, high]}
+    return found
+
+
+def _told(fit: Fit, place: int, coordinates: Array) -> list[Reported]:
+    document = fit.hypothesis.written(coordinates)
+    return fit.hypothesis.terms[place].tell(document, fit.hypothesis.values(coordinates)[fit.hypothesis.share(place)])
+
+
+def _spread(evidence: Evidence, place: int, told: list[Reported]) -> Array:
+    """Standard deviations of reported values, by their derivatives."""
+    fit = evidence.fit
+    slopes = np.zeros((len(told), len(fit.coordinates)))
+    for index in range(len(fit.coordinates)):
+        nudged = fit.coordinates.copy()
+        nudged[index] += 1e-5
+        there = _told(fit, place, nudged)
+        slopes[:, index] = [(b.value - a.value) / 1e-5 for a, b in zip(told, there, strict=True)]
+    variances = np.einsum("ij,jk,ik->i", slopes, evidence.spread, slopes)
+    return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
+
+
+def recalibrated(evidence: Evidence) -> dict[str, Any]:
+    """Parameters of the model itself that were off: from, to, 95 % interval. Those of a finding are not here."""
+    fit = evidence.fit
+    opened = {key for place in evidence.named for key in fit.hypothesis.terms[place].opens}
+    found = {}
+    for index, (unknown, nominal) in enumerate(zip(fit.hypothesis.unknowns, fit.hypothesis.base, strict=False)):
+        value = fit.values[index]
+        deviation = math.sqrt(max(float(evidence.spread[index, index]), 0.0))
+        size = unknown.size if unknown.size else abs(value)
+        if unknown.key in opened or abs(value - nominal.start) <= max(LEAST_CHANGE, Z95 * deviation) * size:
+            continue
+        half = Z95 * deviation * size
+        entry = {"from": nominal.start, "to": value, "unit": unknown.unit, "interval": [value - half, value + half]}
+        found[unknown.key] = entry
+    return found
+
+
+def minor(evidence: Evidence) -> dict[str, Any]:
+    """Effects that are there but not worth naming: torque as a share of dry friction, share of the error."""
+    return {
+        name: {"torque_over_coulomb": round(merit.torque, 5), "share": round(max(merit.share, 0.0), 5)}
+        for name, merit in evidence.choice.minor.items()
+    }
+
+
+def fit_document(diagnosis: Diagnosis, evidence: Evidence) -> dict[str, Any]:
+    """Errors before and after on data that a fit has not seen, the floor, and windows simulated from the recording."""
+    after = extended_model(diagnosis)
+    return {
+        "unit": "N·m",
+        "held_out": {"before": evidence.before.rms, "after": evidence.after.rms},
+        "noise_floor": evidence.errors.floor,
+        "explainable_removed": round(evidence.errors.removed, 4),
+        "windows": window_errors(evidence.traces, diagnosis.nominal, after) if after else {},
+        "observer_rad_s": evidence.predictor.rate,
+        "starts_tried": evidence.choice.tried,
+    }
+
+
+def recordings(diagnosis: Diagnosis) -> list[dict[str, Any]]:
+    """What was taken in and refused, with notes."""
+    evidence = diagnosis.evidence
+    found: list[dict[str, Any]] = []
+    for part, trace in zip(evidence.predictor.slices, evidence.traces, strict=True) if evidence else ():
+        rows = evidence.predictor.counts[part] if evidence else np.zeros(0, bool)
+        entry = {
+            "name": trace.name,
+            "taken": True,
+            "duration_s": trace.duration_s,
+            "rows": int(rows.sum()),
+            "position_noise": trace.position_noise,
+            "notes": list(trace.notes),
+        }
+        if evidence:
+            entry["mismatch_before"] = _rms(evidence.choice.base.mismatch[part][rows])
+            entry["mismatch_after"] = _rms(evidence.fit.mismatch[part][rows])
+        found.append(entry)
+    return found + [{"name": r.name, "taken": False, "reason": r.reason} for r in diagnosis.refused]
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0
+
+
+def extended_model(diagnosis: Diagnosis) -> AxisModel | None:
+    """The axis model with the physics added; None when nothing could be told.
+
+    A disturbance that stood in one recording is an event, no physics of the axis, and stays out.
+    """
+    evidence = diagnosis.evidence
+    if evidence is None:
+        return None
+    fit = evidence.fit
+    document: Document = fit.hypothesis.written(fit.coordinates)
+    document.pop("disturbance", None)
+    values = fit.values
+    for place, term in enumerate(fit.hypothesis.terms):
+        if term.effect == "disturbance" and term.form == EVERY:
+            start, length, torque = values[fit.hypothesis.share(place)]
+            rows = document.setdefault("disturbance", {}).setdefault("windows", [])
+            rows.append({"start_s": start, "end_s": start + length, "torque": torque})
+    if evidence.unnamed is not None:
+        evidence.unnamed.write(document)
+    if diagnosis.nominal.noise is not None:
+        document["noise"] = diagnosis.nominal.noise.model_dump(mode="json", exclude_none=True)
+    return AxisModel.model_validate(document)

@@ -1,0 +1,146 @@
+"""The whole diagnosis: recordings and a model in, verdict and evidence out.
+
+Stands between the command line and everything else here; writes nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from time import monotonic
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servod.axis_model import AxisModel
+from servod.diagnose.choose import Choice, Chooser
+from servod.diagnose.fit import Fit, Weighing, covariance
+from servod.diagnose.held_out import HeldOut, held_out
+from servod.diagnose.intake import Refusal, taken_in
+from servod.diagnose.locate import Map, maps
+from servod.diagnose.predict import Predictor
+from servod.diagnose.tidy import tidied
+from servod.diagnose.trace import Trace
+from servod.diagnose.unnamed import Unnamed, unnamed
+from servod.diagnose.verdict import Shares, Verdict, named_terms, shares, verdict
+from servod.recordings import Recording
+
+Array = NDArray[np.float64]
+Tell = Callable[[str], None]
+
+#: Part of the time limit that the search for terms may take; the proof needs the rest.
+SEARCH_SHARE = 0.75
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What was found. Without any recording that can tell, only `refused` and `verdict` mean anything.
+
+    `named` are places of terms in `choice.fit`; `less` are the fits without each of them; `held` has the mismatch by
+    fits that have not seen it: "before" (the base), "after", and one for each named term without it.
+    """
+
+    nominal: AxisModel
+    refused: list[Refusal]
+    verdict: Verdict
+    evidence: Evidence | None
+    seconds: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Everything behind a verdict on recordings that can tell."""
+
+    traces: tuple[Trace, ...]
+    predictor: Predictor
+    choice: Choice
+    named: list[int]
+    errors: Shares
+    spread: Array
+    less: dict[int, Fit]
+    before: HeldOut
+    after: HeldOut
+    without: dict[int, HeldOut]
+    unnamed: Unnamed | None
+    maps_before: list[Map]
+    maps_after: list[Map]
+
+    @property
+    def fit(self) -> Fit:
+        """The fit that stands."""
+        return self.choice.fit
+
+
+def diagnose(
+    model: AxisModel, recordings: Sequence[Recording], time_limit_s: float = 120.0, tell: Tell | None = None
+) -> Diagnosis:
+    """Diagnose `model` by `recordings`. `tell` is called with a line of progress now and then."""
+    tell = tell or (lambda _line: None)
+    begun = monotonic()
+    traces, refused = taken_in(recordings, model)
+    seconds = {"intake": monotonic() - begun}
+    if not traces:
+        return Diagnosis(model, refused, Verdict.CANNOT_TELL, None, seconds)
+    tell(f"{len(traces)} recordings taken in")
+    predictor = Predictor(traces, model)
+    chooser = Chooser(predictor, model, begun + SEARCH_SHARE * time_limit_s, tell)
+    choice = chooser.run()
+    seconds["search"] = monotonic() - begun - seconds["intake"]
+    choice.fit = tidied(chooser, choice.fit)
+    evidence = _evidence(predictor, chooser, choice, tell)
+    seconds["proof"] = monotonic() - begun - seconds["intake"] - seconds["search"]
+    final = verdict(choice, evidence.named, evidence.errors, predictor.dry)
+    if final is Verdict.UNEXPLAINED:
+        evidence = _without_names(evidence)
+    return Diagnosis(model, refused, final, evidence, seconds)
+
+
+def _evidence(predictor: Predictor, chooser: Chooser, choice: Choice, tell: Tell) -> Evidence:
+    fit = choice.fit
+    nominal = chooser.start.document
+    named = named_terms(choice, nominal)
+    errors = shares(choice, predictor.counts)
+    tell("held-out recordings")
+    less = {place: chooser.less(fit, place) for place in named}
+    weighing = Weighing(chooser.fitter(fit.mismatch).weighing.scale, chooser.rows)
+    before = held_out(predictor, choice.base, _frozen(choice.base))
+    after = held_out(predictor, fit, _frozen(fit)) if fit is not choice.base else before
+    alone = len(named) == 1 and len(fit.hypothesis.terms) == 1
+    without = {p: before if alone else held_out(predictor, f, _frozen(f)) for p, f in less.items()}
+    return Evidence(
+        traces=predictor.traces,
+        predictor=predictor,
+        choice=choice,
+        named=named,
+        errors=errors,
+        spread=covariance(fit, weighing, predictor.traces[0].period_s),
+        less=less,
+        before=before,
+        after=after,
+        without=without,
+        unnamed=None,
+        maps_before=maps(predictor, choice.base.mismatch),
+        maps_after=maps(predictor, fit.mismatch),
+    )
+
+
+def _frozen(fit: Fit) -> NDArray[np.bool_]:
+    """Coordinates of events, which no other recording foretells."""
+    frozen = np.zeros(len(fit.coordinates), dtype=bool)
+    for place, term in enumerate(fit.hypothesis.terms):
+        if term.effect == "disturbance":
+            frozen[fit.hypothesis.share(place)] = True
+    return frozen
+
+
+def _without_names(evidence: Evidence) -> Evidence:
+    """The evidence when no name may stand: the base, and a table of what is left without a name."""
+    choice = evidence.choice
+    bare = replace(choice, fit=choice.base, merits=[], entries=[])
+    left = unnamed(evidence.predictor, choice.base.mismatch)
+    size = len(choice.base.coordinates)
+    errors = shares(bare, evidence.predictor.counts)
+    return replace(
+        evidence, choice=bare, named=[], errors=errors, less={}, without={}, unnamed=left, after=evidence.before,
+        spread=evidence.spread[:size, :size], maps_after=evidence.maps_before,
+    )  # fmt: skip

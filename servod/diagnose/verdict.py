@@ -1,0 +1,126 @@
+"""From a choice of terms to a verdict: what is a finding, what was only recalibrated, how sure, and what is left.
+
+Stands between the selection and the document. The levels of the outside contract are applied here once more to what the
+fit says, so that a term whose value came back under its level is recalibration.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from servod.diagnose.base import BRISTLE_FACTOR, DELAY_S, OFFSET_SHARE, RECALIBRATION, STRIBECK_SHARE
+from servod.diagnose.candidates import Candidate
+from servod.diagnose.choose import Choice
+from servod.diagnose.hypothesis import Document, get
+
+#: Below this share of the explainable error no named physics may stand: what is there is something else.
+LEAST_EXPLAINED = 0.75
+
+#: What is left above the noise floor counts as unexplained from this share of dry friction, if it is also this share of
+#: what could be explained.
+LEFT_TORQUE, LEFT_SHARE = 0.02, 0.15
+
+#: A rival that saves at least this share of what the finding saves cannot be told apart.
+ALIKE = 0.9
+
+#: Confidence 0.5 + 0.49*(1 - exp(-gap/GAP)), gap = share of the saving that the best rival does not reach.
+GAP = 0.08
+
+
+class Verdict(StrEnum):
+    """The outside contract's verdicts, and one for data that can tell nothing."""
+
+    ADEQUATE = "adequate"
+    MISSING_PHYSICS = "missing_physics"
+    UNEXPLAINED = "unexplained"
+    CANNOT_TELL = "cannot_tell"
+
+
+@dataclass(frozen=True)
+class Shares:
+    """Errors as root mean squares of the mismatch, N*m, and the share of the explainable error that was removed."""
+
+    before: float
+    after: float
+    floor: float
+    removed: float
+
+    @property
+    def left(self) -> float:
+        """What is left above the noise floor, N*m."""
+        return math.sqrt(max(self.after**2 - self.floor**2, 0.0))
+
+
+def shares(choice: Choice, counts: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Shares:
+    """Errors of the base and of the chosen fit."""
+    before, after = (float(np.mean(fit.mismatch[counts] ** 2)) for fit in (choice.base, choice.fit))
+    removed = (before - after) / max(before - choice.floor, 1e-30)
+    return Shares(math.sqrt(before), math.sqrt(after), math.sqrt(choice.floor), min(max(removed, 0.0), 1.0))
+
+
+def verdict(choice: Choice, named: list[int], errors: Shares, dry: float) -> Verdict:
+    """The verdict on what was named (places of terms) and what is left."""
+    left = errors.left / dry
+    much = left > LEFT_TORQUE and 1.0 - errors.removed > LEFT_SHARE
+    if much and (not named or errors.removed < LEAST_EXPLAINED):
+        return Verdict.UNEXPLAINED
+    return Verdict.MISSING_PHYSICS if named else Verdict.ADEQUATE
+
+
+def named_terms(choice: Choice, nominal: Document) -> list[int]:
+    """Places of the terms whose effect is at least at its level."""
+    fitted = choice.fit.hypothesis.written(choice.fit.coordinates)
+    return [i for i, term in enumerate(choice.fit.hypothesis.terms) if _at_level(term.effect, nominal, fitted)]
+
+
+def _at_level(effect: str, nominal: Document, fitted: Document) -> bool:
+    """Whether an effect that is a level of the model's own parameters has left its band."""
+    coulomb = get(nominal, "friction.coulomb")
+    if effect == "inertia":
+        return _factor(nominal, fitted, "inertia") >= 1.0 + RECALIBRATION
+    if effect == "torque_offset":
+        return abs(get(fitted, "torque_offset") - get(nominal, "torque_offset")) >= OFFSET_SHARE * coulomb
+    if effect == "delay":
+        return abs(get(fitted, "delay.additional_s") + get(fitted, "delay_s") - get(nominal, "delay_s")) >= DELAY_S
+    if effect == "presliding" and get(nominal, "friction.sigma0") > 0.0 and "presliding" not in fitted:
+        return max(_factor(nominal, fitted, f"friction.{key}") for key in ("sigma0", "sigma1")) >= BRISTLE_FACTOR
+    if effect == "stribeck" and "stribeck" not in fitted:
+        was, now = (get(d, "friction.static") - get(d, "friction.coulomb") for d in (nominal, fitted))
+        return abs(now - was) >= STRIBECK_SHARE * coulomb
+    if effect == "torque_gain":
+        factors = [get(fitted, f"torque_gain.{key}", 1.0) for key in ("factor", "negative_factor")]
+        return max(max(f, 1.0 / f) for f in factors) >= 1.0 + RECALIBRATION
+    return True
+
+
+def _factor(nominal: Document, fitted: Document, key: str) -> float:
+    was, now = get(nominal, key), get(fitted, key)
+    return max(was, now) / min(was, now) if min(was, now) > 0.0 else 1.0
+
+
+def confidence(choice: Choice, index: int) -> float:
+    """Probability that the name of a term is right, from how far its best rival stayed behind."""
+    rival = _best_rival(choice, index)
+    gap = 1.0 if rival is None else max(1.0 - rival[1], 0.0)
+    return round(0.5 + 0.49 * (1.0 - math.exp(-gap / GAP)), 3)
+
+
+def alternatives(choice: Choice, index: int) -> list[str]:
+    """Effects that these data cannot tell apart from a term."""
+    return [c.effect for c, saved in _savings(choice, index) if saved >= ALIKE]
+
+
+def _best_rival(choice: Choice, index: int) -> tuple[Candidate, float] | None:
+    found = _savings(choice, index)
+    return max(found, key=lambda pair: pair[1]) if found else None
+
+
+def _savings(choice: Choice, index: int) -> list[tuple[Candidate, float]]:
+    """Rivals of a term and what each saved as a share of the term's own saving, when the term came in."""
+    entry = choice.entries[index]
+    saved = max(entry.present - entry.cost, 1e-30)
+    return [(rival, (entry.present - rival.fit.cost) / saved) for rival in entry.rivals]
