@@ -1,22 +1,22 @@
 """Tries every effect on what the present fit leaves: a step or two for all starts, full fits for the best.
 
-Stands between the effects' files and the selection. Candidates reuse the Jacobian of the present fit for what they have
-in common with it, so that a start costs a few simulations only.
+Stands between the effects' files and the selection. First rounds run on shortened data and reuse the Jacobian of the
+present fit for what they have in common with it, so that a start costs a few short simulations only.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import monotonic
 
-from servod.diagnose.effects import effects
+from servod.diagnose.effects import effect, effects
 from servod.diagnose.fit import Fit, Fitter
 from servod.diagnose.hypothesis import Term
 from servod.diagnose.scene import Scene
 
-#: Starts that go on to the second step, effects that are fitted to the end, and steps of such a fit.
-SECOND_ROUND, FULL_FITS, FULL_STEPS = 16, 6, 8
+#: Starts that go on to the second round and its steps; effects that are fitted to the end and steps of such a fit.
+SECOND_ROUND, SECOND_STEPS, FULL_FITS, FULL_STEPS = 16, 3, 5, 8
 
 #: A candidate is fitted to the end when it has saved at least 1 - IN_REACH of what the best has saved.
 IN_REACH = 0.4
@@ -24,62 +24,72 @@ IN_REACH = 0.4
 
 @dataclass(frozen=True)
 class Candidate:
-    """An effect on trial: its fit and how many forms and starts stood in competition."""
+    """An effect on trial: its fit, and what is left of the cost of the present fit as a share of it."""
 
     effect: str
     fit: Fit
+    left: float
 
 
 class Trials:
-    """Fits candidates against one present fit."""
+    """Fits candidates against one present fit: `short` works on shortened data, `whole` on everything."""
 
-    def __init__(self, fitter: Fitter, present: Fit, scene: Scene, nominal: Fit | None, deadline: float) -> None:
-        self.fitter, self.present, self.scene, self.nominal, self.deadline = fitter, present, scene, nominal, deadline
+    def __init__(
+        self, whole: Fitter, short: Fitter, present: Fit, scene: Scene, nominal: bool, deadline: float
+    ) -> None:
+        self.whole, self.short, self.present, self.scene, self.deadline = whole, short, present, scene, deadline
         self.tried = 0
+        self.beside = self._with_jacobian(short.begin(present.hypothesis, present.coordinates))
+        self.from_nominal = self._with_jacobian(short.begin(present.hypothesis)) if nominal else None
+
+    def _with_jacobian(self, fit: Fit | None) -> Fit:
+        if fit is None:
+            raise ValueError("a hypothesis that makes no sense at its start")
+        return replace(fit, jacobian=self.short.derivatives(fit))
 
     def run(self, skip: Iterable[str] = ()) -> list[Candidate]:
-        """Candidates fitted to the end, best first; effects in `skip` are not tried."""
-        first = [c for effect in effects() if effect.name not in skip for c in self._starts(effect.name)]
-        first.sort(key=lambda c: c.fit.cost)
-        kept = len(self.present.coordinates)
-        second = [self._refined(c, 2, kept) for c in best_of_each(first, SECOND_ROUND, 2)]
-        second.sort(key=lambda c: c.fit.cost)
-        chosen = best_of_each(second, FULL_FITS, 1)
-        close = self.within_reach(chosen)
-        fitted = sorted((self._refined(c, FULL_STEPS, 0) for c in close), key=lambda c: c.fit.cost)
+        """Candidates fitted to the end, best first, then the others; effects in `skip` are not tried."""
+        first = [c for what in effects() if what.name not in skip for c in self._starts(what.name)]
+        first.sort(key=lambda c: c.left)
+        second = [self._second(c) for c in best_of_each(first, SECOND_ROUND, 2)]
+        second.sort(key=lambda c: c.left)
+        chosen = best_of_each(second, len(second), 1)
+        limit = chosen[0].left + IN_REACH * max(1.0 - chosen[0].left, 0.0) if chosen else 0.0
+        close = [c for c in chosen if c.left <= limit][:FULL_FITS]
+        fitted = sorted((self._full(c) for c in close), key=lambda c: c.left)
         return fitted + [c for c in chosen if c.effect not in {f.effect for f in fitted}]
-
-    def within_reach(self, candidates: list[Candidate]) -> list[Candidate]:
-        """Those of the sorted candidates that a fit to the end may still bring to the top."""
-        best = candidates[0].fit.cost if candidates else 0.0
-        limit = best + IN_REACH * max(self.present.cost - best, 0.0)
-        return [c for c in candidates if c.fit.cost <= limit][:FULL_FITS]
 
     def _starts(self, name: str) -> list[Candidate]:
         """All starts of an effect after one step each."""
-        from servod.diagnose.effects import effect
-
-        found = []
-        for term in effect(name).terms(self.scene):
-            for begun in self._begun(term, effect(name).far):
-                self.tried += 1
-                found.append(Candidate(name, self.fitter.refine(begun, 1, begun.jacobian.shape[1], 2)))
-        return found
+        what = effect(name)
+        begun = [fit for term in what.terms(self.scene) for fit in self._begun(term, what.far)]
+        self.tried += len(begun)
+        return [self._short(name, self.short.refine(fit, 1, fit.jacobian.shape[1], 2), fit) for fit in begun]
 
     def _begun(self, term: Term, far: bool) -> list[Fit]:
         """The term beside the present fit, and for far effects beside the nominal model."""
-        froms = [self.present, self.nominal] if far and self.nominal is not None else [self.present]
-        begun = []
+        froms = [self.beside] + ([self.from_nominal] if far and self.from_nominal is not None else [])
+        fits = []
         for beside in froms:
             hypothesis = beside.hypothesis.with_term(term)
-            fit = self.fitter.begin(hypothesis, hypothesis.beside(beside.coordinates), beside.jacobian)
-            begun += [fit] if fit is not None else []
-        return begun
+            fits.append(self.short.begin(hypothesis, hypothesis.beside(beside.coordinates), beside.jacobian))
+        return [fit for fit in fits if fit is not None]
 
-    def _refined(self, candidate: Candidate, steps: int, keep: int) -> Candidate:
-        if monotonic() > self.deadline:
+    def _short(self, name: str, fit: Fit, begun: Fit) -> Candidate:
+        """A candidate on shortened data; it shares the Jacobian it began with, for many are kept."""
+        return Candidate(name, replace(fit, jacobian=begun.jacobian), fit.cost / max(self.beside.cost, 1e-30))
+
+    def _second(self, candidate: Candidate) -> Candidate:
+        fit = candidate.fit
+        return self._short(candidate.effect, self.short.refine(fit, SECOND_STEPS, fit.jacobian.shape[1]), fit)
+
+    def _full(self, candidate: Candidate) -> Candidate:
+        """Fit on everything, as long as there is time."""
+        begun = self.whole.begin(candidate.fit.hypothesis, candidate.fit.coordinates)
+        if begun is None or monotonic() > self.deadline:
             return candidate
-        return Candidate(candidate.effect, self.fitter.refine(candidate.fit, steps, keep))
+        fit = self.whole.refine(begun, FULL_STEPS)
+        return Candidate(candidate.effect, fit, fit.cost / max(self.present.cost, 1e-30))
 
 
 def best_of_each(sorted_candidates: list[Candidate], count: int, each: int) -> list[Candidate]:

@@ -22,6 +22,7 @@ from servod.diagnose.floor import noise_floor, stretch_means
 from servod.diagnose.hypothesis import Hypothesis
 from servod.diagnose.predict import Predictor
 from servod.diagnose.scene import Scene
+from servod.diagnose.shortened import shortened
 
 Array = NDArray[np.float64]
 Tell = Callable[[str], None]
@@ -43,6 +44,9 @@ SURE_SHARE = 0.3
 #: them, are below these shares of dry friction.
 NOTHING_RMS, NOTHING_STRETCH, BUT_SHARE = 0.006, 0.02, 0.005
 
+#: Rivals that saved at least 1 - CLOSE of what the best saved get their chance when the best does not deserve it.
+CLOSE = 0.3
+
 #: Scale of the mismatch is never taken smaller than this share of dry friction.
 LEAST_SCALE = 0.002
 
@@ -61,10 +65,9 @@ class Merit:
 
 @dataclass(frozen=True)
 class Entry:
-    """How a term came in: costs of the fit before it and of its own, in one scale, and the other candidates."""
+    """How a term came in: what it left of the cost as a share, and the other candidates."""
 
-    present: float
-    cost: float
+    left: float
     rivals: list[Candidate]
 
 
@@ -86,6 +89,7 @@ class Chooser:
 
     def __init__(self, predictor: Predictor, nominal: AxisModel, deadline: float, tell: Tell) -> None:
         self.predictor, self.deadline, self.tell = predictor, deadline, tell
+        self.nominal = nominal
         self.start = Hypothesis(document_of(nominal), base_unknowns(nominal))
         self.rows = predictor.counts.astype(np.float64)
         self.tried = 0
@@ -105,16 +109,14 @@ class Chooser:
         """Fit the base, add terms, prune; the outcome."""
         base = self._fit_base()
         choice = Choice(base, base, [], [], {}, self.floor, 0)
-        nominal = self._nominal(base)
         while len(choice.fit.hypothesis.terms) < MOST_TERMS and monotonic() < self.deadline:
             if self.nothing_left(choice.fit.mismatch):
                 break
-            if not self._add(choice, nominal):
+            if not self._add(choice):
                 break
-            nominal = None
             if len(choice.fit.hypothesis.terms) >= 2:
                 self._prune(choice)
-        choice.tried = self.tried
+        choice.tried, choice.floor = self.tried, self.floor
         return choice
 
     def _fit_base(self) -> Fit:
@@ -141,37 +143,37 @@ class Chooser:
         cost = fitter.cost(fit.hypothesis, fit.coordinates, fit.mismatch)
         return replace(fit, cost=cost, jacobian=fitter.derivatives(fit))
 
-    def _nominal(self, base: Fit) -> Fit | None:
-        fitter = self.fitter(base.mismatch)
-        begun = fitter.begin(self.start)
-        return None if begun is None else replace(begun, jacobian=fitter.derivatives(begun))
-
-    def _add(self, choice: Choice, nominal: Fit | None) -> bool:
+    def _add(self, choice: Choice) -> bool:
         """Try all effects beside the present fit and take the best if it deserves it."""
         present = choice.fit
-        fitter = self.fitter(present.mismatch)
-        scene = Scene(self.start.document, self.predictor, present.mismatch)
-        trials = Trials(fitter, present, scene, nominal, self.deadline)
-        candidates = trials.run(skip=_once(present.hypothesis))
-        self.tried += trials.tried
-        self.tell(f"{trials.tried} starts tried; best: " + ", ".join(c.effect for c in candidates[:3]))
+        candidates = self._candidates(present)
         for candidate in candidates:
-            settled = self.settled(candidate.fit.hypothesis, candidate.fit.coordinates, candidate.fit.mismatch)
+            if candidate.left > candidates[0].left + CLOSE * (1.0 - candidates[0].left):
+                break
+            settled = self.settled(candidate.fit.hypothesis, candidate.fit.coordinates, present.mismatch)
             self.floor = min(self.floor, noise_floor(self.predictor, settled.mismatch))
             merit = self.merit(present, settled)
             if self.deserves(merit, settled) and (settled.converged or merit.share >= SURE_SHARE):
+                others = [c for c in candidates if c.effect != candidate.effect]
                 choice.fit = settled
                 choice.merits.append(merit)
-                others = [c for c in candidates if c.effect != candidate.effect]
-                choice.entries.append(Entry(present.cost, candidate.fit.cost, others))
-                choice.floor = self.floor
+                choice.entries.append(Entry(candidate.left, others))
                 return True
             if self._significant(merit, settled):
                 choice.minor.setdefault(candidate.effect, merit)
-            if candidate.fit.cost > candidates[0].fit.cost + 0.3 * (present.cost - candidates[0].fit.cost):
-                break
-        choice.floor = self.floor
         return False
+
+    def _candidates(self, present: Fit) -> list[Candidate]:
+        """All effects tried beside the present fit, best first."""
+        whole = self.fitter(present.mismatch)
+        quick = shortened(self.predictor, self.nominal, present.mismatch)
+        short = Fitter(quick, Weighing(whole.weighing.scale, quick.counts.astype(np.float64)))
+        scene = Scene(self.start.document, self.predictor, present.mismatch)
+        trials = Trials(whole, short, present, scene, not present.hypothesis.terms, self.deadline)
+        candidates = trials.run(skip=_once(present.hypothesis))
+        self.tried += trials.tried
+        self.tell(f"{trials.tried} starts tried; best: " + ", ".join(c.effect for c in candidates[:3]))
+        return candidates
 
     def nothing_left(self, mismatch: Array) -> bool:
         """Whether no effect worth naming can hide in this mismatch."""

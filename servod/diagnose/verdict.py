@@ -122,5 +122,5 @@ def _best_rival(choice: Choice, index: int) -> tuple[Candidate, float] | None:
 def _savings(choice: Choice, index: int) -> list[tuple[Candidate, float]]:
     """Rivals of a term and what each saved as a share of the term's own saving, when the term came in."""
     entry = choice.entries[index]
-    saved = max(entry.present - entry.cost, 1e-30)
-    return [(rival, (entry.present - rival.fit.cost) / saved) for rival in entry.rivals]
+    saved = max(1.0 - entry.left, 1e-9)
+    return [(rival, (1.0 - rival.left) / saved) for rival in entry.rivals]
