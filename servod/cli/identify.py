@@ -163,7 +163,7 @@ def _identified_in(before: Path | None) -> AxisModel | None:
 
 
 def _changes(old: AxisModel | None, new: AxisModel) -> dict[str, Any]:
-    from servod.identify.result import changes
+    from servod.identify.changes import changes
 
     if old is None or old.identified is None or new.identified is None:
         return {}

@@ -5,13 +5,20 @@ Above the fits, below the walk; never touches an axis.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from servod.errors import AnswerIsNo
 from servod.identify.estimate import Estimate
 from servod.identify.fits import break_away, bristle, curve, friction_map, kick, noise, presliding, response
+from servod.identify.fits.bristle_lag import Bristle
 from servod.identify.trace import Kind, Trace
+
+#: Bristle damping against the critical one of inertia on the bristle, taken where it is not measured.
+ASSUMED_DAMPING = 0.5
+#: Torque noise lets a joint break away early by so many standard deviations.
+EARLY_BY = 2.0
 
 
 @dataclass(frozen=True)
@@ -56,28 +63,45 @@ def analyse(traces: Sequence[Trace]) -> Analysis:
     kicked = kick.fit(of_kind(traces, Kind.KICK)[-2:])
     answer = response.fit(of_kind(traces, Kind.RESPONSE)[-1], kicked.inertia)
     delay_s = answer.delay_s.value + answer.lag_s.value
-    way = break_away_rad(slides, rocked)
-    mapped = friction_map.fit(of_kind(traces, Kind.FRICTION_MAP), answer.inertia.value, delay_s, way)
+    damping = _damping(traces, answer, rocked)
+    bristles = _bristle(slides, rocked, damping, answer.inertia.value)
+    mapped = friction_map.fit(of_kind(traces, Kind.FRICTION_MAP), answer.inertia.value, delay_s, bristles)
     positive, negative = curve.fit(mapped.positive), curve.fit(mapped.negative)
+    cogs = sum(wave.amplitude.value for wave in mapped.cogging)
     return Analysis(
         noise.fit(of_kind(traces, Kind.NOISE)[-1]),
-        slides,
+        break_away.widened(slides, math.hypot(cogs, EARLY_BY * answer.torque_noise_rms.value)),
         rocked,
         kicked,
         answer,
         mapped,
         positive,
         negative,
-        _damping(traces, answer, rocked, 0.5 * (positive.viscous.value + negative.viscous.value)),
+        damping,
         tuple(trace.sha256 for trace in traces if trace.sha256),
     )
 
 
+def assumed_damping(inertia: float, stiffness: float) -> float:
+    """sigma1 where it is not measured: a share of the critical damping of inertia on the bristle."""
+    return ASSUMED_DAMPING * 2.0 * math.sqrt(stiffness * inertia)
+
+
 def _damping(
-    traces: Sequence[Trace], answer: response.ResponseFit, rocked: presliding.PreslidingFit, viscous: float
+    traces: Sequence[Trace], answer: response.ResponseFit, rocked: presliding.PreslidingFit
 ) -> Estimate | None:
     """Bristle damping from the newest recording that shows it; None when there is none or it does not tell."""
     ringing = [trace for trace in traces if trace.kind == Kind.BRISTLE]
     if not ringing or answer.lag_s.value > 0.0:
         return None
+    viscous = max(0.0, answer.viscous_slope.value)
     return bristle.fit(ringing[-1], answer.inertia.value, answer.delay_s.value, viscous, rocked.stiffness.value)
+
+
+def _bristle(
+    slides: break_away.BreakAwayFit, rocked: presliding.PreslidingFit, damping: Estimate | None, inertia: float
+) -> Bristle:
+    """What the map must know of the bristles."""
+    stiffness = rocked.stiffness.value
+    measured = damping.value if damping is not None else assumed_damping(inertia, stiffness)
+    return Bristle(stiffness, measured, 0.5 * (slides.positive.value + slides.negative.value))

@@ -11,22 +11,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from servod.axis_effects import ActuatorLag, Cogging, Gravity
+from servod.axis_effects import ActuatorLag, Cogging, Gravity, JointElasticity
 from servod.axis_effects import Harmonic as ModelHarmonic
 from servod.axis_model import AxisModel, LocalFriction
 from servod.identified import Identified, IdentifiedMap, IdentifiedValue
-from servod.identify.analysis import Analysis
+from servod.identify.analysis import Analysis, assumed_damping
 from servod.identify.estimate import Estimate
 from servod.identify.fits.cogging import GRAVITY
 from servod.identify.fits.curve import CurveFit
 from servod.identify.fits.friction_map import Side
+from servod.identify.fits.response import Resonance
 
 Array = NDArray[np.float64]
 
 #: The viscous part of the map leaves at least this share of it to the bristles, at every speed.
 LEAST_DRY_SHARE = 0.2
-#: Bristle damping against the critical one of inertia on the bristle, taken where it is not measured.
-ASSUMED_DAMPING = 0.5
 
 #: What these experiments cannot tell, and what would.
 NOT_IDENTIFIABLE: dict[str, str] = {
@@ -34,6 +33,8 @@ NOT_IDENTIFIABLE: dict[str, str] = {
     "inertia, and identify again: the ratio is the gain",
     "torque_offset": "a constant torque looks like friction that differs by direction, and is contained in the map; "
     "turn the axis over (or take the load off) and identify again",
+    "resonance_hz": "the joint is rigid as far as the multisine reaches, 160 Hz; for one beyond, identify again "
+    "with a shorter cycle.period_us, or knock on the load while servoctl record runs",
     "sigma1": "the ringing of the joint on its bristles is lost in the encoder's steps; identify again with an encoder "
     "of 20 bit or more. The model assumes half of the critical damping",
 }
@@ -57,6 +58,7 @@ def model_of(analysis: Analysis) -> AxisModel:
         gravity=_gravity(analysis),
         cogging=_cogging(analysis),
         actuator_lag=ActuatorLag(time_constant_s=lag_s) if lag_s > 0.0 else None,
+        joint_elasticity=_elasticity(answer.resonance),
         identified=identified(analysis),
     )
 
@@ -97,8 +99,8 @@ def estimates(analysis: Analysis) -> dict[str, Estimate]:
     }
     if analysis.damping is not None:
         numbers["sigma1"] = analysis.damping
-    if answer.resonance_hz is not None:
-        numbers["resonance_hz"] = answer.resonance_hz
+    if answer.resonance is not None:
+        numbers |= {"resonance_hz": answer.resonance.frequency_hz, "load_inertia": answer.resonance.load_inertia}
     return numbers
 
 
@@ -115,27 +117,16 @@ def document(analysis: Analysis) -> dict[str, Any]:
     }
 
 
-def changes(before: Identified, now: Identified) -> list[str]:
-    """What has changed between two identifications beyond both intervals, one sentence each; empty when nothing has."""
-    told = []
-    for name, new in now.values.items():
-        old = before.values.get(name)
-        if old is None or (old.low <= new.high and new.low <= old.high):
-            continue
-        told.append(f"{name} went from {old.value:.4g} to {new.value:.4g} {new.unit}, outside both 95 % intervals")
-    return told
-
-
 def _damping(analysis: Analysis) -> float:
     """sigma1: measured, or assumed where the encoder is too coarse for it."""
     if analysis.damping is not None:
         return analysis.damping.value
-    stiffness, inertia = analysis.presliding.stiffness.value, analysis.response.inertia.value
-    return ASSUMED_DAMPING * 2.0 * float(np.sqrt(stiffness * inertia))
+    return assumed_damping(analysis.response.inertia.value, analysis.presliding.stiffness.value)
 
 
 def _not_identifiable(analysis: Analysis) -> dict[str, str]:
-    return {k: v for k, v in NOT_IDENTIFIABLE.items() if k != "sigma1" or analysis.damping is None}
+    found = {"sigma1": analysis.damping is not None, "resonance_hz": analysis.response.resonance is not None}
+    return {name: remedy for name, remedy in NOT_IDENTIFIABLE.items() if not found.get(name, False)}
 
 
 def _of_curve(curve: CurveFit, direction: str) -> dict[str, Estimate]:
@@ -189,6 +180,15 @@ def _gravity(analysis: Analysis) -> Gravity | None:
         if wave.order == GRAVITY:
             return Gravity(amplitude=wave.amplitude.value, phase=wave.phase)
     return None
+
+
+def _elasticity(resonance: Resonance | None) -> JointElasticity | None:
+    """The spring in the joint, where one was found."""
+    if resonance is None:
+        return None
+    joint = resonance.joint
+    load, stiffness, damping = _rounded([joint.load_inertia, joint.stiffness, joint.damping])
+    return JointElasticity(load_inertia=load, stiffness=stiffness, damping=damping)
 
 
 def _lean(analysis: Analysis) -> tuple[float, float]:

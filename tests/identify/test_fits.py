@@ -7,7 +7,9 @@ import pytest
 
 from servod.axis_model import AxisModel
 from servod.identify.estimate import estimate, jackknife, sandwich
-from servod.identify.fits import cogging
+from servod.identify.fits import cogging, elastic
+from servod.identify.fits.bristle_lag import Bristle, dry_columns, follow
+from servod.identify.fits.elastic import Elastic
 from servod.identify.fits.presliding import bend_factor, fundamental
 from servod.identify.fits.rigid import Rigid, response_of
 from servod.identify.signals import acting_torque, smooth
@@ -105,3 +107,59 @@ def test_gravity_is_found_on_less_than_a_turn():
     base = np.column_stack([forward, ~forward]).astype(float)
     torque = base @ [0.05, -0.04] + 0.02 * np.sin(x + 0.3) + rng.normal(0.0, 2e-4, len(x))
     assert cogging.find_orders(base, x, torque, 60) == [cogging.GRAVITY]
+
+
+def test_a_stiff_spring_is_a_rigid_joint():
+    frequency = np.array([3.0, 10.0, 30.0, 60.0, 150.0])
+    sprung = elastic.response_of(Elastic(1e-3, 0.05, 0.0016, 2e4, 0.3, 0.05), frequency, PERIOD_S)
+    assert sprung == pytest.approx(response_of(Rigid(1e-3, 0.05, 0.0016, 0.0), frequency, PERIOD_S), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    "joint", [Elastic(1e-3, 0.05, 0.0015, 60.0, 0.3, 0.03), Elastic(0.1, 5.0, 0.002, 95.0, 0.6, 0.02)]
+)
+def test_the_resonance_of_two_masses_is_found(joint):
+    frequency = np.unique(np.round(np.geomspace(3.0, 160.0, 26)))
+    rng = np.random.default_rng(9)
+    exact = elastic.response_of(joint, frequency, PERIOD_S)
+    noisy = exact * (1.0 + 0.005 * (rng.normal(size=len(exact)) + 1j * rng.normal(size=len(exact))))
+    found, cost = elastic.solve(frequency, noisy, np.full(len(frequency), 0.005), PERIOD_S, 0.6 * joint.inertia)
+    assert cost < 4.0 * len(frequency)
+    assert found.resonance_hz == pytest.approx(joint.resonance_hz, rel=0.02)
+    assert found.inertia == pytest.approx(joint.inertia, rel=0.03)
+    assert found.load_share == pytest.approx(joint.load_share, rel=0.05)
+    assert found.delay_s == pytest.approx(joint.delay_s, abs=1e-4)
+
+
+def test_bristle_force_along_a_recorded_motion_is_that_of_the_plant():
+    friction = {"kind": "lugre", "sigma0": 950.0, "sigma1": 1.0, "coulomb": 0.045, "static": 0.07}
+    model = validate({"inertia": 1e-3, "delay_s": 0.0, "friction": friction}, AxisModel, "joint")
+    plant, position, velocity, acceleration = Plant(model), [], [], []
+    torque = 0.09 * np.sin(2.0 * np.pi * 3.0 * np.arange(700) * PERIOD_S)
+    for u in torque:
+        before = plant.velocity_rad_s
+        plant.advance(float(u), PERIOD_S)
+        position.append(plant.position_rad)
+        velocity.append(plant.velocity_rad_s)
+        acceleration.append((plant.velocity_rad_s - before) / PERIOD_S)
+    v = np.array(velocity)
+    steady = np.sign(v) * (0.045 + 0.025 * np.exp(-((v / 0.1) ** 2)))
+    length, way = np.maximum(np.abs(steady), 0.01) / 950.0, np.abs(np.diff(position, prepend=0.0))
+    force = dry_columns(steady[:, None], v, way, length, Bristle(950.0, 1.0, 0.07))[:, 0]
+    measured = torque - 1e-3 * np.array(acceleration)
+    settled = np.sign(v) * follow(np.sign(v)[:, None], way, length)[:, 0] > 0.95
+    assert np.count_nonzero(settled) > 300
+    assert np.sqrt(np.mean((force - measured)[settled] ** 2)) < 0.03 * 0.045
+
+
+def test_a_bristle_settles_over_its_length():
+    settled = follow(np.ones((100, 1)), np.full(100, 0.1), np.ones(100))[:, 0]
+    turned = follow(np.concatenate([np.ones(50), -np.ones(50)])[:, None], np.full(100, 0.1), np.ones(100))[:, 0]
+    assert settled == pytest.approx(1.0)
+    assert turned[59] == pytest.approx(2.0 * np.exp(-1.0) - 1.0)
+
+
+def test_cogging_seen_through_smoothing_is_given_back_whole():
+    x = np.linspace(0.0, 1.0, 200)
+    seen = cogging.columns(x, [40], 0.01)
+    assert seen == pytest.approx(np.exp(-0.08) * cogging.columns(x, [40]))

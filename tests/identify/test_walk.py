@@ -10,9 +10,10 @@ from servod.axis_model import AxisModel, axis_model_yaml
 from servod.errors import AnswerIsNo
 from servod.identify import store
 from servod.identify.analysis import Analysis, analyse
+from servod.identify.changes import changes
 from servod.identify.fits.cogging import GRAVITY
 from servod.identify.links import SteppedLink
-from servod.identify.result import changes, document, identified, model_of
+from servod.identify.result import document, identified, model_of
 from servod.identify.virtual import virtual_session
 from servod.identify.walk import identify
 from servod.yaml12 import parse_yaml, validate
@@ -128,3 +129,12 @@ def test_changes_are_those_beyond_both_intervals(fine):
     now = before.model_copy(update={"values": before.values | {"inertia": moved}})
     (told,) = changes(before, now)
     assert told.startswith("inertia went from")
+
+
+def test_a_repeat_on_a_worn_joint_says_how_much_friction_rose(fine):
+    before = identified(fine.analysis)
+    found = before.friction_map
+    worn = [t * (1.15 if v > 0.0 else 1.0) for v, t in zip(found.velocities, found.torques, strict=True)]
+    now = before.model_copy(update={"friction_map": found.model_copy(update={"torques": worn})})
+    (told,) = changes(before, now)
+    assert told.startswith("friction in positive direction rose by 15.0 % over the map")

@@ -36,7 +36,7 @@ HIGHEST_HZ = 0.6
 LONGEST_PERIOD_S = 9.0
 TURNS = 2
 #: Crossings: peak velocity, periods, and accelerations as shares of v^2/z at SLOW_CROSSING_RAD_S, z the bristle's way.
-CROSSING_RAD_S, CROSSING_TURNS, CROSSING_SHARES, SLOW_CROSSING_RAD_S = 0.25, 9, (0.12, 0.3), 0.02
+CROSSING_RAD_S, CROSSING_TURNS, CROSSING_SHARES, SLOW_CROSSING_RAD_S = 0.25, (9, 9, 24), (0.12, 0.3, 0.8), 0.02
 #: Share of break-away that is fed forward, full from this share of the peak velocity on.
 FORWARD_SHARE, FORWARD_FROM = 0.8, 0.05
 
@@ -49,9 +49,9 @@ def plan(bench: Bench, break_away_rad: float) -> list[Sine]:
     peaks = np.geomspace(SLOWEST_RAD_S, fastest, count)
     sines = [Sine(float(p), float(min(p * LONGEST_PERIOD_S / (2.0 * np.pi), travel)), TURNS) for p in peaks]
     peak = min(CROSSING_RAD_S, fastest)
-    for share in CROSSING_SHARES:
+    for share, turns in zip(CROSSING_SHARES, CROSSING_TURNS, strict=True):
         acceleration = share * SLOW_CROSSING_RAD_S**2 / break_away_rad
-        sines.append(Sine(peak, float(min(peak**2 / acceleration, travel)), CROSSING_TURNS))
+        sines.append(Sine(peak, float(min(peak**2 / acceleration, travel)), turns))
     return sines
 
 

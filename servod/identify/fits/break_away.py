@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -43,6 +44,17 @@ def torque_of(ramp: Trace) -> float:
 def fit(ramps: Sequence[Trace]) -> BreakAwayFit:
     """Mean and spread over the ramps of each direction. Raises AnswerIsNo when a direction has none."""
     return BreakAwayFit(*(_direction(ramps, sign) for sign in (1.0, -1.0)))
+
+
+def widened(found: BreakAwayFit, half_nm: float) -> BreakAwayFit:
+    """Intervals that hold wherever the joint stands, given what cogging and noise add or take (`half_nm`)."""
+    wider = [np.hypot(each.half_width, half_nm) for each in found]
+    return BreakAwayFit(
+        *(
+            replace(each, low=each.value - w, high=each.value + w)
+            for each, w in zip(found, map(float, wider), strict=True)
+        )
+    )
 
 
 def _direction(ramps: Sequence[Trace], sign: float) -> Estimate:

@@ -26,7 +26,7 @@ LEAST_PERIODS = 3
 #: Wider than this share of its value, the damping counts as not identified.
 WIDEST_SHARE = 0.5
 #: Share for what the periods' scatter does not show: the loop's loss is only nearly the same at every frequency.
-ALLOWANCE = 0.15
+ALLOWANCE = 0.2
 
 
 class _Period(NamedTuple):

@@ -21,9 +21,10 @@ GRAVITY, GRAVITY_TRAVEL_RAD = 1, 1.0
 LEAST_SHARE, LEAST_RATIO = 0.02, 12.0
 
 
-def columns(position: Array, orders: list[int]) -> Array:
-    """sin and cos of every order, side by side."""
-    waves = [wave(order * position) for order in orders for wave in (np.sin, np.cos)]
+def columns(position: Array, orders: list[int], smear: Array | float = 0.0) -> Array:
+    """sin and cos of every order, side by side; a torque smoothed over `smear` (Gaussian, rad) shows less of them."""
+    seen = [np.exp(-0.5 * (order * np.asarray(smear)) ** 2) for order in orders]
+    waves = [s * wave(order * position) for order, s in zip(orders, seen, strict=True) for wave in (np.sin, np.cos)]
     stacked: Array = np.column_stack(waves) if waves else np.zeros((len(position), 0))
     return stacked
 

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 #: Range of the exponent; at its ends the result says so.
 EXPONENT = (0.5, 4.0)
 #: Static friction is the curve's end at no speed, slower than anything that was measured.
-SLOWEST_ALLOWANCE = 0.015
+SLOWEST_ALLOWANCE = 0.03
 #: Misfit that every node is allowed, as a share of friction.
 SHARE = 0.003
 #: Closer to a bound than this share of its range is on it.
@@ -54,7 +54,7 @@ def fit(side: Side) -> CurveFit:
     found = [
         least_squares(
             lambda x: (friction(x, side.speed) - side.friction) * weight,
-            np.array([0.8 * least, 0.4 * least, np.log(speed), 1.5, 0.2 * top / side.speed[-1]]),
+            np.clip([0.8 * least, 0.4 * least, np.log(speed), 1.5, 0.2 * top / side.speed[-1]], low, high),
             bounds=(low, high),
             x_scale=[top, top, 1.0, 1.0, top / side.speed[-1]],
         )

@@ -1,4 +1,4 @@
-"""Rows of slow motion that show steady friction: smoothed, presliding and stick-slip left out.
+"""Slow motions made ready for the friction map: smoothed, inertia taken off, cut into parts.
 
 Between the recordings and the friction map's regression.
 """
@@ -10,97 +10,106 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation
 
 from servod.identify.signals import Smooth, smooth
 from servod.identify.trace import Trace
 
 Array = NDArray[np.float64]
 
-#: Smoothing as a share of the motion's period, and its ends in s.
-WIDTH_SHARE, NARROWEST_S, WIDEST_S = 0.004, 0.004, 0.03
-#: After a reversal the bristles settle over this many times break-away displacement.
-PRESLIDING_LENGTHS = 4.5
+#: Smoothing of torque and motion: s at the finest, and so many counts' worth of time for a coarse encoder.
+NARROWEST_S, WIDEST_S, WIDTH_S_PER_RAD = 0.0015, 0.0035, 110.0
+#: Rows further apart than so many widths of the smoothing say something new.
+SPACING = 2.0
+#: Smoothing of the velocity where nothing says that it changes more quickly.
+CALM_S = 0.03
+#: What the encoder's steps may make of the quick velocity, in counts over the smoothing.
+QUICK_COUNTS = 0.3
 #: Slower than this share of the slowest motion's peak, or than so many counts per second, is not on the map.
-SLOWEST_SHARE, SLOWEST_COUNTS_PER_S = 0.3, 70.0
-#: Where the quick velocity is off the smooth one by this share, the joint sticks and slips, and for a time around.
-SLIP_SHARE, SLIP_AROUND_S = 0.25, 0.03
-#: Smoothing of the quick velocity, and what encoder steps may make of it, in counts over that time.
-QUICK_S, QUICK_COUNTS = 0.004, 0.3
-#: The lag of the bristles behind velocity may shift it by this share at most; more is no steady friction.
-MOST_SHIFT = 0.5
+SLOWEST_SHARE, SLOWEST_COUNTS_PER_S = 0.4, 70.0
+#: A joint follows its reference when its velocity is off by less than this share and so much more. Where it sticks and
+#: slips, torque noise has chosen the moment, and the friction seen in between is biased: such rows weigh little.
+FOLLOWS_SHARE, FOLLOWS_RAD_S, ASTRAY_WEIGHT = 0.4, 0.004, 0.01
 #: Each stroke counts as this many independent parts.
 PARTS = 3
 
 
-class Rows(NamedTuple):
-    """Regression rows: velocity rad/s, position rad, friction plus cogging N*m, and the part each row belongs to.
+class Motion(NamedTuple):
+    """One motion on an even grid: velocity rad/s, position rad, friction plus cogging N*m, and its part's number.
 
-    The velocity is the one whose steady friction acts: the bristles follow with the way z behind them, so that while
-    the joint accelerates by a, friction is that of v - a*z/|v| (first order of the bristle equation, the paper's (18)).
+    `way` is the distance from the row before, `smear` the way that the smoothing of torque takes in (one standard
+    deviation), `weight` is less where the joint sticks and slips.
     """
 
     velocity: Array
     position: Array
     torque: Array
     part: NDArray[np.int64]
+    way: Array
+    smear: Array
+    weight: Array
+    spacing: int  # rows between two that say something new
 
 
-def rows_from(traces: Sequence[Trace], inertia: float, delay_s: float, break_away_rad: float) -> Rows:
-    """Rows of all motions; inertia's torque is taken off. `break_away_rad` is static friction over stiffness."""
-    slowest = max(
-        SLOWEST_SHARE * min(t.settings["peak_rad_s"] for t in traces),
-        SLOWEST_COUNTS_PER_S * max(t.settings["resolution_rad"] for t in traces),
-    )
-    pieces, parts = [], 0
+def motions_from(traces: Sequence[Trace], inertia: float, delay_s: float) -> list[Motion]:
+    """All motions; parts are numbered through."""
+    motions, parts = [], 0
     for trace in traces:
-        piece = _rows(trace, inertia, delay_s, break_away_rad, slowest)
-        pieces.append(piece._replace(part=piece.part + parts))
-        parts += int(piece.part.max(initial=-1)) + 1
-    return Rows(*(np.concatenate(columns) for columns in zip(*pieces, strict=True)))
+        motion = _motion(trace, inertia, delay_s)
+        motions.append(motion._replace(part=motion.part + parts))
+        parts += int(motion.part.max(initial=-1)) + 1
+    return motions
 
 
-def _rows(trace: Trace, inertia: float, delay_s: float, break_away_rad: float, slowest: float) -> Rows:
-    period_of_motion = float(np.pi * np.ptp(trace.reference_rad) / trace.settings["peak_rad_s"])
-    width = float(np.clip(WIDTH_SHARE * period_of_motion, NARROWEST_S, WIDEST_S))
-    s = smooth(trace.t_s, trace.torque_nm, trace.position_rad, delay_s, width)
-    stroke, way = strokes_of(s)
-    speed = np.maximum(np.abs(s.velocity), 1e-9)
-    shift = s.acceleration * break_away_rad / speed
-    slides = (speed - np.sign(s.velocity) * shift > slowest) & (way > PRESLIDING_LENGTHS * break_away_rad)
-    slides &= np.abs(shift) < MOST_SHIFT * speed
-    slides &= ~_slips(trace, s, delay_s)
-    slides &= np.arange(len(s.t_s)) % max(1, round(width / trace.period_s)) == 0
-    part = PARTS * stroke + np.minimum((PARTS * _progress(stroke)).astype(np.int64), PARTS - 1)
-    torque = s.torque - inertia * s.acceleration
-    return Rows((s.velocity - shift)[slides], s.position[slides], torque[slides], part[slides])
+def slowest_rad_s(traces: Sequence[Trace]) -> float:
+    """The lowest speed that the recordings can tell."""
+    return max(SLOWEST_SHARE * min(t.settings["peak_rad_s"] for t in traces), coarse_rad_s(traces))
 
 
-def _slips(trace: Trace, s: Smooth, delay_s: float) -> NDArray[np.bool_]:
-    """Rows in or near stick-slip: the quick velocity swings away from the smooth one, beyond the encoder's noise."""
-    quick = smooth(trace.t_s, trace.torque_nm, trace.position_rad, delay_s, QUICK_S)
-    velocity = np.interp(s.t_s, quick.t_s, quick.velocity)
-    noise = QUICK_COUNTS * trace.settings["resolution_rad"] / QUICK_S
-    off = np.abs(velocity - s.velocity) > SLIP_SHARE * np.abs(s.velocity) + noise
-    around = np.ones(2 * round(SLIP_AROUND_S / trace.period_s) + 1, dtype=bool)
-    near: NDArray[np.bool_] = binary_dilation(off, around)
-    return near
+def coarse_rad_s(traces: Sequence[Trace]) -> float:
+    """The speed at which the encoder's steps begin to hide the motion."""
+    return SLOWEST_COUNTS_PER_S * max(t.settings["resolution_rad"] for t in traces)
 
 
-def strokes_of(s: Smooth) -> tuple[NDArray[np.int64], Array]:
-    """Number of the stroke that each row belongs to, and the way since its reversal."""
+def _motion(trace: Trace, inertia: float, delay_s: float) -> Motion:
+    resolution = trace.settings["resolution_rad"]
+    width = float(np.clip(WIDTH_S_PER_RAD * resolution, NARROWEST_S, WIDEST_S))
+    calm = smooth(trace.t_s, trace.torque_nm, trace.position_rad, delay_s, CALM_S)
+    quick = smooth(trace.t_s, trace.torque_nm, trace.position_rad, delay_s, width)
+    step = max(1, round(0.5 * width / trace.period_s))
+    grid = np.arange(np.searchsorted(quick.t_s, calm.t_s[0]), len(quick.t_s), step)
+    grid = grid[quick.t_s[grid] <= calm.t_s[-1]]
+    velocity = _velocity(quick.velocity[grid], np.interp(quick.t_s[grid], calm.t_s, calm.velocity), resolution, width)
+    part = np.interp(quick.t_s[grid], calm.t_s, _parts(calm)).round().astype(np.int64)
+    torque = quick.torque[grid] - inertia * quick.acceleration[grid]
+    wanted = np.gradient(trace.reference_rad, trace.period_s)
+    weight = _weight(velocity, np.interp(quick.t_s[grid], trace.t_s, wanted))
+    spacing = max(1, round(SPACING * width / (step * trace.period_s)))
+    way = np.abs(velocity) * step * trace.period_s
+    return Motion(velocity, quick.position[grid], torque, part, way, np.abs(velocity) * width, weight, spacing)
+
+
+def _weight(velocity: Array, wanted: Array) -> Array:
+    """1 where the joint follows its reference, less where it sticks and slips."""
+    off = np.abs(velocity - wanted) > FOLLOWS_SHARE * np.abs(wanted) + FOLLOWS_RAD_S
+    weight: Array = np.where(off, ASTRAY_WEIGHT, 1.0)
+    return weight
+
+
+def _velocity(quick: Array, calm: Array, resolution: float, width_s: float) -> Array:
+    """The calm velocity, and the quick one where it is off it by more than encoder steps make."""
+    noise = QUICK_COUNTS * resolution / width_s
+    chosen: Array = np.where(np.abs(quick - calm) > noise, quick, calm)
+    return chosen
+
+
+def _parts(s: Smooth) -> NDArray[np.int64]:
+    """Number of the part of a stroke that each row belongs to."""
     turned = np.flatnonzero(np.diff(np.sign(s.velocity)) != 0.0) + 1
     stroke = np.zeros(len(s.velocity), dtype=np.int64)
     stroke[turned] = 1
     stroke = np.cumsum(stroke)
-    starts = np.concatenate([[0], turned])
-    way: Array = np.abs(s.position - s.position[starts][stroke])
-    return stroke, way
-
-
-def _progress(stroke: NDArray[np.int64]) -> Array:
-    """How far each row is through its stroke, 0 to 1, by time."""
     counts = np.bincount(stroke)
     starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    progress: Array = (np.arange(len(stroke)) - starts[stroke]) / counts[stroke]
-    return progress
+    progress = (np.arange(len(stroke)) - starts[stroke]) / counts[stroke]
+    part: NDArray[np.int64] = PARTS * stroke + np.minimum((PARTS * progress).astype(np.int64), PARTS - 1)
+    return part

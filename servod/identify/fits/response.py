@@ -8,6 +8,7 @@ System Identification, 2012, 2.7 and 7). The model is the exact sampled response
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +17,8 @@ from scipy import stats
 from scipy.optimize import least_squares
 
 from servod.errors import AnswerIsNo
-from servod.identify.estimate import Estimate, estimate, jackknife
+from servod.identify.estimate import LEVEL, Estimate, estimate, jackknife
+from servod.identify.fits import elastic
 from servod.identify.fits.rigid import Rigid, response_of
 from servod.identify.trace import Trace
 
@@ -29,10 +31,18 @@ LEAST_COHERENCE = 0.6
 LONGEST_DELAY_S = 0.05
 #: The lag must lower the misfit this significantly before it counts as one.
 LAG_SIGNIFICANCE = 1e-3
-#: A resonance shows as a line this many dB above the rigid joint, clearly beyond its own uncertainty.
-RESONANCE_DB = 3.0
+#: A rigid joint that leaves this misfit per line is not all; two masses must leave at most this share of it.
+UNEXPLAINED, SPRUNG_COST = 1.5, 0.2
 #: Half widths that the scatter does not show: inertia by share, delay in s.
 INERTIA_ALLOWANCE, DELAY_ALLOWANCE_S = 0.01, 3e-5
+
+
+class Resonance(NamedTuple):
+    """A first resonance: of both masses against each other, and the inertia behind the spring."""
+
+    frequency_hz: Estimate
+    load_inertia: Estimate
+    joint: elastic.Elastic
 
 
 class ResponseFit(NamedTuple):
@@ -42,7 +52,7 @@ class ResponseFit(NamedTuple):
     viscous_slope: Estimate
     delay_s: Estimate
     lag_s: Estimate
-    resonance_hz: Estimate | None
+    resonance: Resonance | None
     torque_noise_rms: Estimate
     frequency_hz: Array
     response: Complex
@@ -62,6 +72,23 @@ class _Stroke(NamedTuple):
     excitation: Complex
 
 
+class _Lines(NamedTuple):
+    """What the models are fitted to: lines in Hz, relative deviation of one stroke at each, period in s."""
+
+    frequency: Array
+    deviation: Array
+    period_s: float
+
+
+class _Found(NamedTuple):
+    """The chosen model: inertia, viscous, delay, lag; its deviations; the spring, where there is one."""
+
+    values: Array
+    spread: Array
+    lag: Estimate
+    resonance: Resonance | None
+
+
 def fit(trace: Trace, inertia: float) -> ResponseFit:
     """Fit one multisine recording; `inertia` is the first idea of it. Raises AnswerIsNo without coherence."""
     frequency, strokes = _spectra(trace)
@@ -72,31 +99,68 @@ def fit(trace: Trace, inertia: float) -> ResponseFit:
             "inertia and delay are not identifiable from this multisine: the motion is not coherent with it; allow "
             "more torque or speed, or a finer encoder"
         )
-    deviation = _deviation(strokes)
-    period = trace.period_s
-    start = np.log([inertia, max(inertia * 10.0, 1e-12)])
-
-    def solve(parts: Sequence[_Stroke], lag: bool) -> Array:
-        return _solve(frequency[used], _ratio(parts)[used], deviation[used], period, start, lag)
-
-    plain, with_lag = solve(strokes, False), solve(strokes, True)
-    lag = _worse(frequency, strokes, deviation, used, period, plain, with_lag)
-    values, spread = jackknife(lambda parts: solve(parts, lag), strokes)
-    freedom = len(strokes) - 1
-    response = _position_over_torque(frequency, _ratio(strokes), period)
-    fitted = _position_over_torque(frequency, _model(frequency, values, period), period)
+    deviation, period = _deviation(strokes), trace.period_s
+    seen = [_Stroke(s.velocity[used], s.torque[used], s.excitation[used]) for s in strokes]
+    found = _choose(_Lines(frequency[used], deviation[used], period), seen, inertia)
+    values, spread, freedom = found.values, found.spread, len(strokes) - 1
     return ResponseFit(
         estimate(values[0], spread[0], freedom, "kg*m^2", share=INERTIA_ALLOWANCE),
         estimate(values[1], spread[1], freedom, "N*m*s/rad", note="slope of the friction map at the sliding speed"),
-        _delay(values, spread, freedom),
-        _lag(values, spread, freedom, lag),
-        _resonance(frequency, response, fitted, deviation),
+        _delay(values, spread, freedom, found.lag),
+        found.lag,
+        found.resonance,
         _torque_noise(strokes, trace, values),
         frequency,
-        response,
+        _position_over_torque(frequency, _ratio(strokes), period),
         deviation,
         coherence,
     )
+
+
+def _choose(lines: _Lines, strokes: Sequence[_Stroke], inertia: float) -> _Found:
+    """The simplest model that explains the response: rigid, rigid behind a lag, two masses."""
+    start = np.log([inertia, max(inertia * 10.0, 1e-12)])
+
+    def solve(parts: Sequence[_Stroke], lag: bool) -> Array:
+        return _solve(lines.frequency, _ratio(parts), lines.deviation, lines.period_s, start, lag)
+
+    ratio = _ratio(strokes)
+    plain, with_lag = solve(strokes, False), solve(strokes, True)
+    costs = [_cost(lines, ratio, values) for values in (plain, with_lag)]
+    if min(costs) > UNEXPLAINED * len(lines.frequency) and (sprung := _sprung(lines, strokes, inertia, min(costs))):
+        return sprung
+    lagged, lag_spread = jackknife(lambda parts: solve(parts, True), strokes)
+    freedom = len(strokes) - 1
+    if _worse(costs, lines, len(strokes), with_lag):
+        lag = estimate(lagged[3], lag_spread[3], freedom, "s", floor=DELAY_ALLOWANCE_S)
+        return _Found(lagged, lag_spread, lag, None)
+    unseen = lagged[3] + float(stats.t.ppf(LEVEL, freedom)) * lag_spread[3]
+    note = "none that could be told from the delay; what there is, is part of the delay"
+    lag = Estimate(0.0, 0.0, min(max(1e-4, unseen), float(plain[2])), "s", note)
+    return _Found(*jackknife(lambda parts: solve(parts, False), strokes), lag, None)
+
+
+def _sprung(lines: _Lines, strokes: Sequence[_Stroke], inertia: float, rigid_cost: float) -> _Found | None:
+    """Two masses with a spring, if they explain what the rigid joint leaves."""
+    joint, cost = elastic.solve(lines.frequency, _ratio(strokes), lines.deviation, lines.period_s, inertia)
+    if cost > SPRUNG_COST * rigid_cost:
+        return None
+
+    def solve(parts: Sequence[_Stroke]) -> Array:
+        return np.array(elastic.solve_from(joint, lines.frequency, _ratio(parts), lines.deviation, lines.period_s))
+
+    values, spread = jackknife(solve, strokes)
+    freedom = len(strokes) - 1
+    load_spread = float(np.hypot(spread[4] * values[0], spread[0] * values[4]))
+    resonance = Resonance(
+        estimate(values[3], spread[3], freedom, "Hz", share=2.0 * INERTIA_ALLOWANCE),
+        estimate(values[4] * values[0], load_spread, freedom, "kg*m^2", share=3.0 * INERTIA_ALLOWANCE),
+        elastic.Elastic(*values),
+    )
+    unseen = min(lines.period_s, float(values[2]))
+    lag = Estimate(0.0, 0.0, unseen, "s", "not told beside a resonance; what there is, is part of the delay")
+    rigid, deviations = np.array([*values[:3], 0.0]), np.array([*spread[:3], 0.0])
+    return _Found(rigid, deviations, lag, resonance)
 
 
 def _spectra(trace: Trace) -> tuple[Array, list[_Stroke]]:
@@ -171,30 +235,24 @@ def _solve(frequency: Array, ratio: Complex, deviation: Array, period: float, st
     return np.array([np.exp(x[0]), x[1] * np.exp(start[0]), x[2] * 1e-3, x[3] * 1e-3 if lag else 0.0])
 
 
-def _worse(
-    frequency: Array, strokes: list[_Stroke], deviation: Array, used: NDArray[np.bool_], period: float,
-    plain: Array, with_lag: Array,
-) -> bool:  # fmt: skip
+def _cost(lines: _Lines, ratio: Complex, values: Array) -> float:
+    """Misfit of the rigid joint: sum of squares, relative to the deviation of one stroke."""
+    error = (_model(lines.frequency, values, lines.period_s) / ratio - 1.0) / lines.deviation
+    return float(np.sum(np.abs(error) ** 2))
+
+
+def _worse(costs: Sequence[float], lines: _Lines, strokes: int, with_lag: Array) -> bool:
     """Whether the response without lag is significantly worse than with one (F test on one more parameter)."""
-    ratio = _ratio(strokes)[used]
-    costs = [
-        float(np.sum(np.abs((_model(frequency[used], v, period) / ratio - 1.0) / deviation[used]) ** 2))
-        for v in (plain, with_lag)
-    ]
-    freedom = 2 * len(ratio) - 4
-    gain = (costs[0] - costs[1]) / max(costs[1] / freedom, 1.0 / len(strokes))
+    freedom = 2 * len(lines.frequency) - 4
+    gain = (costs[0] - costs[1]) / max(costs[1] / freedom, 1.0 / strokes)
     return with_lag[3] > 1e-4 and float(stats.f.sf(gain, 1, freedom)) < LAG_SIGNIFICANCE
 
 
-def _delay(values: Array, spread: Array, freedom: int) -> Estimate:
+def _delay(values: Array, spread: Array, freedom: int, lag: Estimate) -> Estimate:
+    """The delay; where a lag could not be told from it, it may be shorter by that."""
     note = "at the end of its range" if values[2] < 1e-6 or values[2] > 0.99 * LONGEST_DELAY_S else ""
-    return estimate(values[2], spread[2], freedom, "s", floor=DELAY_ALLOWANCE_S, note=note)
-
-
-def _lag(values: Array, spread: Array, freedom: int, lag: bool) -> Estimate:
-    if lag:
-        return estimate(values[3], spread[3], freedom, "s", floor=DELAY_ALLOWANCE_S)
-    return Estimate(0.0, 0.0, 1e-4, "s", "none that could be told from the delay")
+    found = estimate(values[2], spread[2], freedom, "s", floor=DELAY_ALLOWANCE_S, note=note)
+    return found if lag.value > 0.0 else replace(found, low=found.low - lag.high)
 
 
 def _position_over_torque(frequency: Array, ratio: Complex, period_s: float) -> Complex:
@@ -202,17 +260,6 @@ def _position_over_torque(frequency: Array, ratio: Complex, period_s: float) -> 
     z = np.exp(2j * np.pi * frequency * period_s)
     position: Complex = ratio / (z - 1.0)
     return position
-
-
-def _resonance(frequency: Array, response: Complex, fitted: Complex, deviation: Array) -> Estimate | None:
-    """The line that stands out most over the rigid joint, between its neighbours; None when none does."""
-    excess = 20.0 * np.log10(np.abs(response / fitted))
-    beyond = excess - 20.0 * np.log10(1.0 + 3.0 * deviation)
-    top = int(np.argmax(beyond))
-    if beyond[top] < RESONANCE_DB:
-        return None
-    low, high = frequency[max(top - 1, 0)], frequency[min(top + 1, len(frequency) - 1)]
-    return Estimate(float(frequency[top]), float(low), float(high), "Hz", "resolution of the excited lines")
 
 
 def _torque_noise(strokes: list[_Stroke], trace: Trace, values: Array) -> Estimate:
