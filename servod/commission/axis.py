@@ -29,7 +29,6 @@ from servod.identify.links import Link, SteppedLink
 from servod.identify.virtual import rated_torque_mnm, virtual_config, virtual_session
 from servod.session import SteppedSession
 
-
 #: A step of the reference is as fast as the torque lets it be: so many times the speed of the experiments' limit.
 STEP_SPEEDS = 10.0
 

@@ -144,7 +144,7 @@ def _tracking(walk: Walk) -> Iterator[Figure | Table | str]:
         if not figures:
             continue
         yield Table(f"{title}: trajectory (19) and steps, mrad and s", _HEADER, tuple(_rows(figures)))
-        ran = [law for law, found in figures.items() if "failed" not in found]
+        ran = [law for law, measured in figures.items() if "failed" not in measured]
         runs = {law: load_curves(walk.path(RUNS) / f"{name.partition('_')[0]}_{law}.npz") for law in ran}
         yield from _figures(name, title, runs)
     yield from (f"Not measured: {line}" for line in found.get("not_measured", []))

@@ -148,7 +148,11 @@ class _Trial:
             after = self._figures(rows)
         except AnswerIsNo as error:
             return rows, None, [str(error)]
-        return rows, after, [*limits_met(rows), *complaints(before, after, self._promised, self._count_rad)]
+        return (
+            rows,
+            after,
+            [*limits_met(motions_in(rows)[0]), *complaints(before, after, self._promised, self._count_rad)],
+        )
 
     def _end(self, before: Figures, after: Figures | None, reasons: list[str]) -> None:
         figures = {f"before_{key}": value for key, value in before.document().items()}
@@ -185,7 +189,7 @@ def motions_in(rows: Rows) -> list[Rows]:
 
 
 def limits_met(rows: Rows) -> list[str]:
-    """What had to be limited in these cycles, by the table of faults."""
+    """What had to be limited in these cycles, by the table of faults. A step may be limited, a sine may not."""
     met = int(np.bitwise_or.reduce(rows["faults"])) & _CLIPS
     return [f"{fault.code.name}: {fault.cause}" for fault in faults_in(met)]
 

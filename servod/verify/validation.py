@@ -35,14 +35,14 @@ PART_TEXT: Mapping[Part, str] = {
 }
 
 #: Peak speeds of the sines, as shares of the speed that the set was designed for.
-SLOW_SHARE, BRISK_SHARE = 0.126, 0.4
+SLOW_SHARE, BRISK_SHARE = 0.126, 0.5
 SLOW_HZ, SLOW_PERIODS = 0.5, 4
 #: The brisk sine is as fast as the cycle can sample well: this many cycles to a period, at most so many Hz.
-BRISK_HZ, BRISK_CYCLES, BRISK_PERIODS = 8.0, 60, 10
+BRISK_HZ, BRISK_CYCLES, BRISK_PERIODS = 12.5, 60, 16
 REST_S, STEP_S = 0.5, 1.0
 #: Periods at the start of each sine that are not judged: it begins with a jump of the velocity.
-SLOW_SKIPPED, BRISK_SKIPPED = 1, 3
-STEP_SHARE = 0.1  # of the slow sine's amplitude
+SLOW_SKIPPED, BRISK_SKIPPED = 1, 4
+STEP_SHARE = 0.05  # of the slow sine's amplitude: a stiff law answers a larger step with its whole torque
 #: What is held is judged from here after the step on.
 HOLD_FROM_S = 0.5
 

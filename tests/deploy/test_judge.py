@@ -47,7 +47,7 @@ def test_figures_are_read_per_period_without_the_first_ones() -> None:
     held = np.concatenate([np.linspace(0.0, 1.0, 500), np.linspace(1.0, 1.2, 500)])
     found = motion.figures(error, (held, held))
     assert found.of[Part.SLOW] == (0.5, 0.0, 0.0)
-    assert set(found.of[Part.BRISK]) == {0.0} and len(found.of[Part.BRISK]) == 7
+    assert set(found.of[Part.BRISK]) == {0.0} and len(found.of[Part.BRISK]) == 12
     assert found.of[Part.HOLD] == pytest.approx((0.2, 0.2), rel=0.01)
     with pytest.raises(ValueError, match="end"):
         motion.figures(error[:5000], (held, held))
