@@ -33,7 +33,7 @@ def figures(results: Results) -> Iterator[Shown]:
             title = f"Both readings of Table I's gains on {joint.label}"
             figure = errors(shown, f"table1_readings_{joint.value}", title)
             yield Shown("Table I, gains", figure, tuple(_readings(results, joint)))
-    yield Shown("11", _noise_figure(results), ())
+    yield Shown("11", _noise_figure(results), (_noise_claim(results),))
 
 
 def statements(results: Results) -> Iterator[tuple[str, Claim]]:
@@ -137,6 +137,12 @@ def _readings(results: Results, joint: Joint) -> Iterator[Claim]:
             yield Claim(paper, f"{joint.label} is stopped", False)
         else:
             yield Claim(paper, f"{rms:.4g} mrad RMS on {joint.label}", rms <= row.paper_mrad)
+
+
+def _noise_claim(results: Results) -> Claim:
+    """The proposed law against the rivals with the same noise."""
+    last = {label: rms[-1] for label, rms in results.noise.items()}
+    return least(Row.TABLE1.label, last, f"with noise of {NOISE_SHARES[-1]:.0%} of F_C the proposed law does best")
 
 
 def _noise_figure(results: Results) -> Figure:

@@ -12,10 +12,12 @@ from servod.paper import table
 from servod.paper.claims import Claim, ordered
 from servod.paper.equations import compensator, equal_force_decay, exponent_of_18
 from servod.paper.joints import Joint
+from servod.paper.motions import SLOW_RAD_S, around_zero
 from servod.paper.printed import L_I, NODES_RAD_S, RMS_MRAD
 from servod.paper.results import Row
 from servod.paper.sets import at_paper_feedback, consistent_g, printed_g, printed_l, shipped_set, with_l
 from servod.paper.sweeps import filtered_noise, joint_friction, on_sine, rms_mrad, simulate, sweep_of_l
+from servod.report.figures.motion import Motion
 from servod.report.figures.sets import local_law
 from servod.synthesize.local_sets import force_after
 from servod.tracking.motions import paper_rows
@@ -132,3 +134,14 @@ def test_every_claim_and_every_rival_is_in_a_table() -> None:
 
 def test_a_claim_is_its_two_halves() -> None:
     assert str(Claim("x", "y", True)) == "Agrees: x; here y."
+
+
+def test_an_error_around_zero_velocity_is_told_from_one_elsewhere() -> None:
+    """A reference that stands still at its ends: an error there alone agrees, one everywhere else does not."""
+    t = np.arange(10_000) * 1e-3
+    reference, speed = 0.05 * np.sin(0.2 * np.pi * t), 0.01 * np.pi * np.abs(np.cos(0.2 * np.pi * t))
+    slow = speed < SLOW_RAD_S
+    for wrong, agrees in ((slow, True), (~slow, False)):
+        nothing = np.zeros_like(t)
+        motion = Motion("x", t, reference, reference - 1e-3 * wrong, nothing, nothing)
+        assert around_zero(motion).agrees is agrees
