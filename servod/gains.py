@@ -100,6 +100,8 @@ class Certificate(Strict):
     valid: bool = Field(strict=True)
     parameters_sha256: Sha256
     model_sha256: Sha256 | None = None
+    data_sha256: list[Sha256] | None = Field(None, description="recordings that the model was identified from")
+    tool_sha256: Sha256 | None = Field(None, description="sources of the program that verified")
     issued_by: str = Field(min_length=1, max_length=200, description="program and version that verified")
     issued_at: datetime.datetime
     checks: list[CertificateCheck] = Field(default_factory=list)

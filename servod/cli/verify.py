@@ -11,6 +11,7 @@ from servod.cli.common import JsonOption, example, one_thread, print_json
 from servod.errors import AnswerIsNo
 
 if TYPE_CHECKING:
+    from servod.gains import GainSet
     from servod.verify.certify import Verification
 
 EXAMPLE = "servoctl verify gains.yaml --json"
@@ -40,12 +41,31 @@ def verify(
     if result.valid and write:
         write_atomically(gains, result.certified(checked).to_yaml())
     if as_json:
-        print_json(result.document())
+        print_json(result.document() | {"hashes": hashes(checked)})
     else:
         print_checks(result)
+        print_hashes(hashes(checked))
     if not result.valid:
         failed = [check.name for check in result.checks if not check.passed]
         raise AnswerIsNo(f"{gains}: not valid: {'; '.join(failed)}")
+
+
+def hashes(gains: GainSet) -> dict[str, str | list[str] | None]:
+    """What the set was made from, by hashes: the model's file, its recordings, the tool; and of the law itself."""
+    origin = gains.provenance
+    return {
+        "parameters": gains.parameters_sha256(),
+        "model": origin.model_sha256,
+        "data": list(origin.data_sha256),
+        "tool": origin.tool_sha256,
+    }
+
+
+def print_hashes(found: dict[str, str | list[str] | None]) -> None:
+    """Print the hashes, shortened; the JSON has them whole."""
+    for name, value in found.items():
+        short = ", ".join(item[:16] for item in value) if isinstance(value, list) else value and value[:16]
+        print(f"hash  {name}: {short or 'not stated'}")
 
 
 def print_checks(result: Verification) -> None:

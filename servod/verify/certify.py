@@ -49,6 +49,8 @@ class Verification:
             valid=self.valid,
             parameters_sha256=gains.parameters_sha256(),
             model_sha256=gains.provenance.model_sha256,
+            data_sha256=list(gains.provenance.data_sha256),
+            tool_sha256=source_sha256(),
             issued_by=f"servod {__version__} verify, source {source_sha256()[:16]}",
             issued_at=today(),
             checks=self.checks,
