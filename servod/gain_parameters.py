@@ -240,6 +240,9 @@ class LocalParameters(Strict):
     disturbance_observer: OutputObserver | None = None
     feedforward_inertia_kg_m2: float = Field(0.0, ge=0.0, le=1e4)
     hold_within_rad: Width = 0.0
+    error_limit_rad: float | None = Field(
+        None, gt=0.0, le=1e3, description="the feedback sees no more error, which bounds the speed of a step"
+    )
     position_feedforward: PositionFeedforward | None = None
 
     def pack(self) -> tuple[float, ...]:
@@ -263,6 +266,7 @@ class LocalParameters(Strict):
             *self.regions.low.pack_memory(),
             *self.regions.high.pack_memory(),
             (observer.low_bandwidth_rad_s or observer.bandwidth_rad_s) if observer else 0.0,
+            self.error_limit_rad or 0.0,
             float(len(f.sets)),
             *(s.velocity_rad_s for s in f.sets),
             *(s.decay_per_s for s in f.sets),

@@ -13,6 +13,7 @@ asymmetry needs nothing special.
 Options: the velocity of z_hat, of d0 and of the sets is the measured one or the reference's, led by a stated time;
 an output disturbance observer around the whole (bandwidth 0: none). The regions go by the faster of both velocities:
 a step has no reference velocity, yet the gains of Omega_L on a joint that turns fast make a limit cycle.
+Far from its goal, as in a step, the joint is approached with a bounded speed: the feedback sees a limited error.
 At rest: within the hold width neither l nor the observer acts, so nothing hunts. Driven by the measured velocity z_hat
 creeps with its noise, and the leak floor lets it fade; driven by the reference it stays as it is, for letting it fade
 would only move the joint, by F/(c0 + k_x).
@@ -48,8 +49,9 @@ OBSERVER_INERTIA = 19  # nominal m of the observer [kg*m^2]
 OBSERVER_LIMIT = 20  # bound of |d_hat| [N*m]
 LOW_K_U, HIGH_K_U = 21, 24  # gains of the last three commands u* in Omega_L and Omega_H
 OBSERVER_LOW = 27  # g in Omega_L [rad/s]: on its bristle the joint moves so little that the estimate would take seconds
-N_SETS = 28  # number n of local sets
-FIRST_NODE = 29  # then n nodes v_i [rad/s], n decays a_i [1/s], n gains l_i; then `position`, or nothing
+ERROR_LIMIT = 28  # the feedback sees no more error than this, which bounds the speed of a step [rad], 0: none
+N_SETS = 29  # number n of local sets
+FIRST_NODE = 30  # then n nodes v_i [rad/s], n decays a_i [1/s], n gains l_i; then `position`, or nothing
 
 MEASURED = 0.0
 REFERENCE = 1.0
@@ -98,7 +100,8 @@ def step(
     error = x_ref - x
     s[COMMAND_1] -= (s[ASKED] - u_applied) / p[INPUT_SCALE]  # what the limits cut never acts
     share = high_share(p, max(abs(w), abs(v)))
-    u_star = scheduled(p, s, share, error, v_ref - v)
+    seen = limited(error, p[ERROR_LIMIT]) if p[ERROR_LIMIT] > 0.0 else error
+    u_star = scheduled(p, s, share, seen, v_ref - v)
     s[COMMAND_3], s[COMMAND_2], s[COMMAND_1] = s[COMMAND_2], s[COMMAND_1], u_star
     moves = not (v_ref == 0.0 and a_ref == 0.0 and abs(error) <= p[HOLD_WITHIN])
     n = int(p[N_SETS])

@@ -24,8 +24,8 @@ from servod.verify.vertices import Span, fed_commands, joints
 CUTOFFS_HZ = (300.0, 500.0, 800.0)
 #: Pole radii asked for where the Stribeck curve falls, best first.
 SLOW_DISCS = (0.985, 0.998)
-#: Torque costs these shares of its weight in Omega_L, the first that is feasible: where the bristle holds the joint more
-#: gain risks little, but with two cycles of delay too much of it shakes the joint on its bristle.
+#: Torque costs these shares of its weight in Omega_L, the first that is feasible: where the bristle holds the joint,
+#: more gain risks little, but with two cycles of delay too much of it shakes the joint on its bristle.
 LOW_TORQUE_SHARES = (0.1, 0.5, 2.0)
 POSITION_BANDWIDTH_RAD_S = 120.0  # sets the scale of positions, and with it what alpha and beta mean
 RELAX_STEPS = 6

@@ -7,13 +7,11 @@ verification uses.
 from __future__ import annotations
 
 import bisect
-import datetime
-import hashlib
 import math
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-from servod import __version__
 from servod.axis_model import AxisModel
 from servod.controllers import LAWS
 from servod.gain_design import Design
@@ -26,11 +24,12 @@ from servod.gain_parameters import (
     VelocitySource,
     WeightShape,
 )
-from servod.gains import GainSet, Provenance
+from servod.gains import GainSet
 from servod.synthesize.deployed import Infeasible, Wishes, explain, region_gains, regions
 from servod.synthesize.feedforward import position_feedforward
 from servod.synthesize.integral_gain import designed
 from servod.synthesize.local_sets import PAPER_NODES, STIFFNESS_SHARE, compensator, local_sets, sets_at
+from servod.synthesize.origin import provenance
 from servod.verify.checks import CORNER_SPEEDS, DISK_LIMIT, speeds_of
 from servod.verify.closed_loop import corners
 from servod.verify.margins import Sweep
@@ -47,6 +46,7 @@ LOW_FACTOR = (
 #: From this bandwidth on no other choice of filter and poles is tried.
 ENOUGH_RAD_S = 20.0
 LIMIT_SHARE = 1.5  # bound of the compensated force, as a share of the largest friction
+APPROACH = 3.0  # speed with which a step is approached, as a factor on the map's highest
 HOLD_COUNTS = 0.6  # hold width in encoder counts: what rounding hides, and no more, for the joint creeps as far
 
 
@@ -93,10 +93,11 @@ def parameters(
         if options.paper_nodes
         else local_sets(friction, c, speed, options.accuracy, options.gain or 0.0)
     )
+    used = feedback or feedback_of(design, scale)
     return LocalParameters(
         law="local",
         input_scale_nm=scale,
-        regions=feedback or feedback_of(design, scale),
+        regions=used,
         friction=LocalFriction(
             stiffness_nm_per_rad=c.stiffness,
             viscous_nms_per_rad=c.viscous,
@@ -116,10 +117,16 @@ def parameters(
         else None,
         feedforward_inertia_kg_m2=friction.inertia,
         hold_within_rad=HOLD_COUNTS * 2.0 * math.pi / design.counts_per_turn if design.counts_per_turn else 0.0,
+        error_limit_rad=approach_error(used.high, APPROACH * speed),
         position_feedforward=position_feedforward(design.model, friction.gain, design.period_s)
         if options.position_feedforward
         else None,
     )
+
+
+def approach_error(high: RegionGains, speed: float) -> float | None:
+    """Error at which the feedback of Omega_H asks for `speed` [rad/s]; None without position feedback."""
+    return speed * high.k_v_s_per_rad / high.k_x_per_rad if high.k_x_per_rad > 0.0 else None
 
 
 def stands(design: Design, friction: SteadyFriction, law: LocalParameters, margin: float) -> bool:
@@ -155,14 +162,12 @@ def synthesize(
 
 def widest_observer(design: Design, friction: SteadyFriction, options: Options) -> float:
     """Largest bandwidth of the list that the full loop stands [rad/s]; 0 where it stands none, or none is wanted."""
-    if not options.observer:
-        return 0.0
-    for margin in (DISK_WANTED, DISK_LIMIT):
-        index = bisect.bisect_left(
-            OBSERVERS_RAD_S,
-            True,
-            key=lambda g, margin=margin: stands(design, friction, parameters(design, friction, options, g), margin),
-        )
+
+    def fits(bandwidth: float, margin: float) -> bool:
+        return stands(design, friction, parameters(design, friction, options, bandwidth), margin)
+
+    for margin in (DISK_WANTED, DISK_LIMIT) if options.observer else ():
+        index = bisect.bisect_left(OBSERVERS_RAD_S, True, key=partial(fits, margin=margin))
         if index < len(OBSERVERS_RAD_S):
             return OBSERVERS_RAD_S[index]
     return 0.0
@@ -170,7 +175,6 @@ def widest_observer(design: Design, friction: SteadyFriction, options: Options) 
 
 def gain_set(design: Design, law: LocalParameters, options: Options, model_path: Path | None) -> GainSet:
     """The sealed set with its provenance."""
-    digest = hashlib.sha256(model_path.read_bytes()).hexdigest() if model_path else None
     observer = law.disturbance_observer
     note = (
         f"Velocity filter: set encoder.velocity_cutoff_hz to {design.velocity_cutoff_hz:g}. c0_hat is "
@@ -182,13 +186,7 @@ def gain_set(design: Design, law: LocalParameters, options: Options, model_path:
         name=options.name,
         description=f"Local law for inertia {design.model.inertia:g}, {design.mode.value} mode.",
         parameters=law,
-        provenance=Provenance(
-            author="servod",
-            date=datetime.datetime.now(datetime.UTC).date(),
-            tool=f"servod {__version__} synthesize",
-            model_sha256=digest,
-            note=note,
-        ),
+        provenance=provenance(design.model, model_path, note),
         design=design,
     ).sealed()
 
@@ -213,8 +211,10 @@ def with_feedback(
     regions_with = law.regions.model_copy(update={"low": same, "high": same})
     observer = law.disturbance_observer
     if observer is not None and observer_rad_s is not None:
-        observer = observer.model_copy(update={"bandwidth_rad_s": observer_rad_s})
-    changed = law.model_copy(update={"regions": regions_with, "disturbance_observer": observer})
+        observer = observer.model_copy(update={"bandwidth_rad_s": observer_rad_s, "low_bandwidth_rad_s": None})
+    changed = law.model_copy(
+        update={"regions": regions_with, "disturbance_observer": observer, "error_limit_rad": None}
+    )
     return gains.model_copy(
         update={"name": name, "parameters": changed, "design": None, "certificate": None, "seal": None}
     )

@@ -39,7 +39,7 @@ class FittedCurve:
 
     def slope(self, speed: float) -> float:
         """dF/d|v| at `speed` [N*m*s/rad]."""
-        power = (speed / self.speed) ** self.exponent
+        power: float = (speed / self.speed) ** self.exponent
         return self.viscous - self.fall * self.exponent * power * math.exp(-power) / speed
 
 

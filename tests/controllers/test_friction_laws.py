@@ -173,3 +173,10 @@ def test_driven_by_the_reference_the_friction_state_rests_with_it() -> None:
     assert s[FRICTION_STATE] == 5e-5
     LAWS["local"].step(p, s, 6e-5, 0.0, 0.0, 0.0, 0.0, s[ASKED], DT)
     assert s[FRICTION_STATE] < 5e-5
+
+
+def test_the_feedback_sees_a_limited_error() -> None:
+    p = local_parameters(error_limit=0.01)
+    for error, seen in ((0.005, 0.005), (0.1, 0.01), (-0.1, -0.01)):
+        feedback = LAWS["local"].step(p, fresh_state("local"), error, 0.0, 0.0, 0.0, 0.0, 0.0, DT)[1]
+        assert feedback == pytest.approx(2.5 * seen)

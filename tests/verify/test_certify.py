@@ -65,7 +65,7 @@ def test_the_proof_sees_a_change_that_was_sealed_again(path: tuple[Any, ...], fa
 
 
 def test_the_loop_check_sees_what_the_regions_cannot() -> None:
-    unstable = changed(("parameters", "disturbance_observer", "bandwidth_rad_s"), 30.0)
+    unstable = changed(("parameters", "disturbance_observer", "bandwidth_rad_s"), 12.0)
     assert not all(check.passed for check in check_loop(subject(unstable)))
 
 
