@@ -114,7 +114,7 @@ class Range:
 
 
 #: Multiples of the paper's PD gains. Beyond these ends the loop of a cycle of delay is unstable, or does not slide.
-FREE_FEEDBACK = {"k_p": Range(0.3, 100.0, 3.0), "k_d": Range(0.3, 8.0, 1.5)}
+FREE_FEEDBACK = {"k_p": Range(0.3, 100.0, 3.0), "k_d": Range(0.3, 20.0, 1.5)}
 #: The equal class in these multiples.
 PAPER_FEEDBACK = {"k_p": 1.0, "k_d": 1.0}
 _HOLD = Range(1.2, 30.0, 3.0)  # hold width in counts: how far from rest nothing integrates
@@ -214,7 +214,7 @@ _LUGRE = {"stiffness": _STIFFNESS, "damping": _SHARE, "hold": _HOLD}
 RIVALS: dict[str, Rival] = {
     "pd": Rival("pd", {}, _pd),
     "pd_dob": Rival("pd_dob", {"bandwidth": _BANDWIDTH, "hold": _HOLD}, _pd_dob),
-    "pd_lugre": Rival("pd_lugre", {"gain": Range(0.0, 0.8, 0.2, ratios=False), **_LUGRE}, _pd_lugre),
+    "pd_lugre": Rival("pd_lugre", {"gain": Range(0.0, 1.2, 0.2, ratios=False), **_LUGRE}, _pd_lugre),
     "pd_lugre_025": Rival("pd_lugre", _LUGRE, _fixed_gain(0.25)),
     "pd_lugre_035": Rival("pd_lugre", _LUGRE, _fixed_gain(0.35)),
     "local": Rival(

@@ -16,7 +16,7 @@ from servod.models.simulate import LoopSettings
 SEARCH_STEP_S = 1e-4
 
 
-#: Simulated plants for each law and class: 120 sets of gains on three plants. Four times as many win 5 to 10 %.
+#: Simulated plants for each law and class: 120 sets of gains on three plants, 5 s of one core.
 BUDGET = 360
 
 
