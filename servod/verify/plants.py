@@ -13,6 +13,7 @@ from servod.axis_effects import Asymmetry, TorqueGain
 from servod.axis_model import AxisModel, LugreFriction
 from servod.gain_design import Uncertainty
 
+POSITION_SHARE = 0.2  # half width of the interval of torques over position, which is no part of the LMIs
 DIRECTION_SHARE = 0.5  # of the interval of dry friction, drawn for each direction by itself
 
 
@@ -21,7 +22,19 @@ def drawn(model: AxisModel, uncertainty: Uncertainty, seed: int, index: int) -> 
     random = np.random.default_rng([seed, index])
     factor = {name: float(1.0 + random.uniform(-1.0, 1.0) * getattr(uncertainty, name)) for name in FIELDS}
     sides = 1.0 + random.uniform(-1.0, 1.0, 2) * DIRECTION_SHARE * uncertainty.dry
-    return scaled(model, factor, (float(sides[0]), float(sides[1])))
+    plant = scaled(model, factor, (float(sides[0]), float(sides[1])))
+    return over_position(plant, float(1.0 + random.uniform(-1.0, 1.0) * POSITION_SHARE))
+
+
+def over_position(model: AxisModel, factor: float) -> AxisModel:
+    """`model` with cogging and gravity times `factor`: what is fed forward never fits to the last."""
+    update: dict[str, Any] = {}
+    if model.cogging is not None:
+        waves = (w.model_copy(update={"amplitude": factor * w.amplitude}) for w in model.cogging.harmonics)
+        update["cogging"] = model.cogging.model_copy(update={"harmonics": tuple(waves)})
+    if model.gravity is not None:
+        update["gravity"] = model.gravity.model_copy(update={"amplitude": factor * model.gravity.amplitude})
+    return model.model_copy(update=update)
 
 
 FIELDS = tuple(Uncertainty.model_fields)

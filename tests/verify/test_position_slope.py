@@ -5,9 +5,11 @@ from __future__ import annotations
 import pytest
 
 from servod.axis_effects import Cogging, Gravity, Harmonic, Spring
+from servod.gain_design import Uncertainty
 from servod.gain_parameters import LocalParameters
 from servod.verify.checks import Subject, check_loop
 from servod.verify.closed_loop import Deviation
+from servod.verify.plants import drawn
 from servod.verify.position_slope import position_slopes
 from tests.synthesize.designs import table1, table1_set
 
@@ -34,6 +36,15 @@ def test_the_loop_stands_cogging_and_is_judged_by_it_only_where_there_is_some() 
     assert STEEPEST not in {check.name for check in check_loop(subject())}
     checks = {check.name: check for check in check_loop(subject(table1().model_copy(update={"cogging": COGGING})))}
     assert checks[STEEPEST].passed
+
+
+def test_drawn_plants_differ_in_what_is_fed_forward() -> None:
+    model = table1().model_copy(update={"cogging": COGGING, "gravity": Gravity(amplitude=0.2)})
+    plants = [drawn(model, Uncertainty(), 1, index) for index in range(30)]
+    cogging = [plant.cogging.harmonics[0].amplitude / 0.004 for plant in plants if plant.cogging]
+    gravity = [plant.gravity.amplitude / 0.2 for plant in plants if plant.gravity]
+    assert cogging == pytest.approx(gravity) and len(set(cogging)) == 30
+    assert 0.8 <= min(cogging) < 0.9 and 1.1 < max(cogging) <= 1.2
 
 
 def test_a_slope_that_outweighs_the_feedback_is_unstable() -> None:
