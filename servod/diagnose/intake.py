@@ -27,8 +27,8 @@ APART_S = 1e5
 #: Least that a recording must hold: seconds, rows, distinct positions, share of rows in motion.
 LEAST_S, LEAST_ROWS, LEAST_COUNTS, LEAST_MOVING = 1.5, 300, 40, 0.03
 
-#: Noise as a share of dry friction, in the mismatch at the slowest observer, from which nothing can be said.
-MOST_NOISE = 0.5
+#: Noise as a share of dry friction (or of so much of the command's spread, if that is more), in the mismatch at the slowest observer, from which nothing can be said.
+MOST_NOISE, NOISE_OF_COMMAND = 0.5, 0.3
 
 #: Share of rows at the end of the command's range from which a recording is saturated; and from which it is told.
 SATURATED, TOLD_SATURATED = 0.4, 0.02
@@ -167,9 +167,9 @@ def _saturated(trace: Trace) -> str | None:
 
 def _too_noisy(trace: Trace, model: AxisModel) -> str | None:
     dry = dry_friction(model)
-    moved = model.inertia * float(np.quantile(np.abs(trace.acceleration), 0.9))
+    spoken = NOISE_OF_COMMAND * float(np.std(trace.drive.torque))
     noise = model.inertia * SLOWEST**2 * trace.position_noise * math.sqrt(SLOWEST * trace.period_s)
-    if noise <= MOST_NOISE * max(dry, moved):
+    if noise <= MOST_NOISE * max(dry, spoken):
         return None
     return f"too noisy: encoder noise makes {noise:.3g} of torque, dry friction is {dry:.3g}"
 

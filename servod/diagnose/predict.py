@@ -38,6 +38,9 @@ POLES_DAMPING = 0.8
 LONGEST_STEP_S = 0.0013
 STEPS_AT_REVERSAL, STEPS_IN_GAP = 4, 3
 
+#: Share of the motor's correction that the load gets: all behind a gap, less behind a spring, which it would ring.
+LOAD_SHARE, LOAD_SHARE_IN_GAP = 0.6, 1.0
+
 #: Bandwidths (time constants of the observer) that pass before a row behind a start counts.
 SETTLING = 30.0
 
@@ -133,7 +136,8 @@ class Predictor:
         out = np.zeros(len(drive.t_s))
         steps = seen.steps * STEPS_IN_GAP if p[P_GAP] > 0.0 else seen.steps
         held = drive.t_s, drive.torque, first.command_before, drive.temperature_c, drive.position
-        gains = steps, seen.position_gain, seen.velocity_gain, 1.0
+        share = LOAD_SHARE_IN_GAP if p[P_GAP] > 0.0 else LOAD_SHARE
+        gains = steps, seen.position_gain, seen.velocity_gain, share
         self._run(p, state, *held, *gains, trace.starts, states, out)
         return seen.to_torque * out
 

@@ -24,11 +24,11 @@ LEAST_EXPLAINED = 0.75
 #: what could be explained.
 LEFT_TORQUE, LEFT_SHARE = 0.02, 0.15
 
-#: A rival that saves at least this share of what the finding saves cannot be told apart.
-ALIKE = 0.9
+#: A rival that leaves at most this many times what the finding leaves cannot be told apart.
+ALIKE = 1.2
 
-#: Confidence 0.5 + 0.49*(1 - exp(-gap/GAP)), gap = share of the saving that the best rival does not reach.
-GAP = 0.08
+#: Confidence 0.5 + 0.49*(1 - exp(-gap/GAP)); gap: logarithm of what the best rival leaves over what the finding leaves.
+GAP = 0.15
 
 
 class Verdict(StrEnum):
@@ -104,23 +104,17 @@ def _factor(nominal: Document, fitted: Document, key: str) -> float:
 
 def confidence(choice: Choice, index: int) -> float:
     """Probability that the name of a term is right, from how far its best rival stayed behind."""
-    rival = _best_rival(choice, index)
-    gap = 1.0 if rival is None else max(1.0 - rival[1], 0.0)
+    left = [ratio for _, ratio in _rivals(choice, index)]
+    gap = math.log(max(min(left, default=math.inf), 1.0)) if left else math.inf
     return round(0.5 + 0.49 * (1.0 - math.exp(-gap / GAP)), 3)
 
 
 def alternatives(choice: Choice, index: int) -> list[str]:
     """Effects that these data cannot tell apart from a term."""
-    return [c.effect for c, saved in _savings(choice, index) if saved >= ALIKE]
+    return [rival.effect for rival, ratio in _rivals(choice, index) if ratio <= ALIKE]
 
 
-def _best_rival(choice: Choice, index: int) -> tuple[Candidate, float] | None:
-    found = _savings(choice, index)
-    return max(found, key=lambda pair: pair[1]) if found else None
-
-
-def _savings(choice: Choice, index: int) -> list[tuple[Candidate, float]]:
-    """Rivals of a term and what each saved as a share of the term's own saving, when the term came in."""
+def _rivals(choice: Choice, index: int) -> list[tuple[Candidate, float]]:
+    """Rivals of a term and what each left of the cost over what the term left, when the term came in."""
     entry = choice.entries[index]
-    saved = max(1.0 - entry.left, 1e-9)
-    return [(rival, (1.0 - rival.left) / saved) for rival in entry.rivals]
+    return [(rival, rival.left / max(entry.left, 1e-12)) for rival in entry.rivals]

@@ -1,0 +1,63 @@
+"""The mismatch of the true model is noise, and that of a wrong one is the torque that it lacks."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from servod.axis_model import AxisModel
+from servod.diagnose.intake import taken_in
+from servod.diagnose.predict import Predictor
+from tests.diagnose.axes import believed, record
+
+HIDDEN: list[dict[str, Any]] = [
+    {},
+    {"asymmetry": {"positive_dry": 1.2, "negative_dry": 0.9}},
+    {"spring": {"stiffness": 0.3, "rest": 0.1}},
+    {"cogging": {"harmonics": [{"amplitude": 0.03, "periods_per_turn": 12.0, "phase": 0.4}]}},
+    {"joint_elasticity": {"load_inertia": 0.012, "stiffness": 90.0, "damping": 0.05, "load_viscous": 0.004}},
+    {"delay": {"additional_s": 0.0063}},
+    {"actuator_lag": {"time_constant_s": 0.006}},
+    {"position_dependent_inertia": {"harmonics": [{"amplitude": 0.2, "periods_per_turn": 1.0}]}},
+    {"encoder_eccentricity": {"harmonics": [{"amplitude": 0.004, "periods_per_turn": 2.0}]}},
+    {"viscous_nonlinear": {"quadratic": 0.01}, "torque_gain": {"factor": 1.2}},
+]
+
+
+@pytest.mark.parametrize("hidden", HIDDEN, ids=lambda h: "+".join(h) or "nothing")
+def test_true_model_leaves_noise(hidden: dict[str, Any]) -> None:
+    true = believed(**hidden)
+    traces, refused = taken_in(record(true), believed())
+    assert refused == []
+    predictor = Predictor(traces, believed())
+    left = rms(predictor, true)
+    assert left < 0.015
+    if hidden:
+        assert rms(predictor, believed()) > 5.0 * left
+
+
+def rms(predictor: Predictor, model: AxisModel) -> float:
+    return float(np.sqrt(np.mean(predictor.mismatch(model)[predictor.counts] ** 2))) / predictor.dry
+
+
+def test_mismatch_is_the_missing_torque() -> None:
+    true = believed(spring={"stiffness": 0.2, "rest": 0.0})
+    traces, _ = taken_in(record(true)[:1], believed())
+    predictor = Predictor(traces, believed())
+    mismatch = predictor.mismatch(believed())
+    late = traces[0].drive.position - 1.6 / predictor.rate * traces[0].velocity
+    fast = predictor.counts & (np.abs(traces[0].velocity) > 0.5)
+    assert np.polyfit(late[fast], mismatch[fast], 1)[0] == pytest.approx(-0.2, rel=0.05)
+
+
+def test_rows_after_a_gap_begin_anew() -> None:
+    made = record(believed())[0]
+    keep = (made.t_s < 2.0) | (made.t_s > 2.6)
+    columns = {quantity: values[keep] for quantity, values in made.columns.items()}
+    cut = type(made)(made.path, made.axis, columns, made.measured[keep], ())
+    traces, _ = taken_in([cut], believed())
+    predictor = Predictor(traces, believed())
+    assert len(traces[0].starts) == 2
+    assert rms(predictor, believed()) < 0.015
