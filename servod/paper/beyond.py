@@ -32,7 +32,7 @@ def figures(results: Results) -> Iterator[Shown]:
         if shown:
             title = f"Both readings of Table I's gains on {joint.label}"
             figure = errors(shown, f"table1_readings_{joint.value}", title)
-            yield Shown("Table I, gains", figure, tuple(_readings(results, joint)))
+            yield Shown("Table I, gains", figure, tuple(_readings(results, joint)), joint.label)
     yield Shown("11", _noise_figure(results), (_noise_claim(results),))
 
 

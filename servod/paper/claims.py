@@ -27,16 +27,18 @@ class Claim:
 
 @dataclass(frozen=True)
 class Shown:
-    """One figure of the paper from this software, with its claims; `number` is the paper's."""
+    """One figure of the paper from this software, with its claims; `number` is the paper's, `where` names the joint."""
 
     number: str
     figure: Figure
     claims: tuple[Claim, ...]
+    where: str = ""
 
     def document(self) -> dict[str, Any]:
         """Plain values, as JSON has them; without the curves."""
         return {
             "number": self.number,
+            "where": self.where,
             "name": self.figure.name,
             "title": self.figure.title,
             "claims": [asdict(claim) for claim in self.claims],

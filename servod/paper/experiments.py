@@ -20,7 +20,7 @@ from servod.identify.fits.presliding import PreslidingFit
 from servod.identify.links import SteppedLink
 from servod.identify.result import model_of
 from servod.identify.walk import identify
-from servod.paper.joints import CUTOFF_HZ, ENCODER_COUNTS, Joint, open_session
+from servod.paper.joints import CUTOFF_HZ, ENCODER_COUNTS, Joint, open_for_tracking, open_session
 from servod.paper.printed import STEPS_MRAD
 from servod.report.figures.motion import Motion
 from servod.session import SteppedSession
@@ -120,7 +120,7 @@ def _motion(
 ) -> Motion | None:
     """One motion on a fresh axis; None, and the reason in `stops`, when the axis did not stand it."""
     with tempfile.TemporaryDirectory(prefix="servod-paper-") as folder:
-        session = open_session(joint, Path(folder), seed, cutoff_hz)
+        session = open_for_tracking(joint, Path(folder), seed, cutoff_hz)
         try:
             activate(session, gains)
             return motion_of_curves(label, run_motion(session, kind, arguments))

@@ -40,9 +40,9 @@ def figures(results: Results) -> Iterator[Shown]:
         if found.presliding is None:
             continue
         dahl = dahl_curve(found.presliding, joint.model(), f"figure_07_dahl_{joint.value}")
-        yield Shown("7", dahl, (_stiffness(found, joint),))
+        yield Shown("7", dahl, (_stiffness(found, joint),), joint.label)
         drawn = friction_map(found.model, joint.model(), f"figure_08_map_{joint.value}")
-        yield Shown("8", drawn, (_map_error(found, joint), _asymmetry(found, joint)))
+        yield Shown("8", drawn, (_map_error(found, joint), _asymmetry(found, joint)), joint.label)
 
 
 def _unity(gains: GainSet) -> Claim:

@@ -10,7 +10,6 @@ from enum import Enum
 from pathlib import Path
 
 from servod.axis_model import AxisModel, load_axis_model
-from servod.config import AxisConfig
 from servod.identify.virtual import rated_torque_mnm, virtual_config, virtual_session
 from servod.session import SteppedSession
 from servod.shipped import shipped
@@ -19,6 +18,8 @@ from servod.shipped import shipped
 ENCODER_COUNTS = 2**20
 #: Cut-off of the velocity filter under the paper's gain sets, as the demo has it; synthesized sets bring their own.
 CUTOFF_HZ = 120.0
+#: Speed limit while gain sets are compared: the gains of Table I turn the joint at 3.6 rad/s after a step of 100 mrad.
+STEP_SPEED_RAD_S = 10.0
 
 
 class Joint(Enum):
@@ -37,14 +38,16 @@ class Joint(Enum):
         return load_axis_model(shipped(f"gains/axes/{self.value}.yaml"))
 
 
-def config(plant: AxisModel, folder: Path, cutoff_hz: float) -> AxisConfig:
-    """The configuration that suits the joint, with the velocity filter of the gain set that is to run."""
+def open_session(joint: Joint, folder: Path, seed: int) -> SteppedSession:
+    """A session on the virtual axis for its identification, SYNC-stepped and disabled."""
+    return virtual_session(joint.model(), folder, ENCODER_COUNTS, seed)
+
+
+def open_for_tracking(joint: Joint, folder: Path, seed: int, cutoff_hz: float) -> SteppedSession:
+    """The same axis with the velocity filter of the gain set that is to run, and room for the steps of section V."""
+    plant = joint.model()
     found = virtual_config(folder, rated_torque_mnm(plant), ENCODER_COUNTS)
     encoder = found.encoder.model_copy(update={"velocity_cutoff_hz": cutoff_hz})
-    return found.model_copy(update={"encoder": encoder})
-
-
-def open_session(joint: Joint, folder: Path, seed: int, cutoff_hz: float = CUTOFF_HZ) -> SteppedSession:
-    """A session on the virtual axis, SYNC-stepped and disabled."""
-    plant = joint.model()
-    return virtual_session(plant, folder, ENCODER_COUNTS, seed, config(plant, folder, cutoff_hz))
+    limits = found.limits.model_copy(update={"speed_rad_s": STEP_SPEED_RAD_S})
+    config = found.model_copy(update={"encoder": encoder, "limits": limits})
+    return virtual_session(plant, folder, ENCODER_COUNTS, seed, config)

@@ -29,9 +29,9 @@ class Row(Enum):
     TABLE1 = "Table I as (K_z, K_v, K_x)", RMS_MRAD["local"]
     TABLE1_OTHER = "Table I as (K_x, K_v, K_z)", RMS_MRAD["local"]
     TABLE1_PRINTED_L = "Table I, l_i as printed", RMS_MRAD["local"]
-    LOCAL_PLAIN = "local, identified, the paper's PD gains", RMS_MRAD["local"]
-    LOCAL_EQUAL = "the same, with all options", RMS_MRAD["local"]
-    DEPLOYED = "local, identified and synthesized", RMS_MRAD["local"]
+    LOCAL_PLAIN = "local at the paper's PD gains, no options", RMS_MRAD["local"]
+    LOCAL_EQUAL = "local at the paper's PD gains, all options", RMS_MRAD["local"]
+    DEPLOYED = "local, synthesized", RMS_MRAD["local"]
 
     def __init__(self, label: str, paper_mrad: float | None) -> None:
         self.label = label

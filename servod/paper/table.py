@@ -126,7 +126,7 @@ def tuned(document: dict[str, Any], joint: Joint) -> Table:
 def claims(document: dict[str, Any]) -> Table:
     """Every claim by its figure, and whether it agrees."""
     rows = [
-        (figure["number"], claim["paper"], claim["here"], _verdict(claim))
+        (", ".join(filter(None, (figure["number"], figure["where"]))), claim["paper"], claim["here"], _verdict(claim))
         for figure in document["figures"]
         for claim in figure["claims"]
     ]

@@ -108,7 +108,7 @@ def document() -> dict[str, Any]:
     claim = {"paper": "says", "here": "finds", "agrees": False}
     return {
         "joints": {"table1_joint": joint},
-        "figures": [{"number": "2", "claims": [claim]}],
+        "figures": [{"number": "2", "where": "", "claims": [claim]}],
         "statements": [{"about": "equations", **claim}],
     }
 
