@@ -16,6 +16,8 @@ from scipy.optimize import least_squares
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
+#: No resonance is looked for below: there the sliding joint is disturbed by what repeats with position.
+LOWEST_HZ = 12.0
 #: Where the search for the resonance begins, as shares of the lines' range (logarithmic), and shares of the load.
 _STARTS, _LOADS = (0.35, 0.55, 0.75, 0.9), (0.25, 0.6)
 #: Ranges: share of the inertia behind the spring, damping ratio of the resonance.
@@ -74,15 +76,15 @@ def response_of(joint: Elastic, frequency_hz: Array, period_s: float) -> Complex
     return response
 
 
-def solve(frequency: Array, ratio: Complex, deviation: Array, period_s: float, inertia: float) -> tuple[Elastic, float]:
-    """The two masses that fit the measured `ratio` best, and their misfit: sum of squares, relative to `deviation`."""
-    band = np.log(frequency[[0, -1]])
+def solve(frequency: Array, ratio: Complex, deviation: Array, period_s: float, inertia: float) -> Elastic:
+    """The two masses that fit the measured `ratio` best, relative to its `deviation`."""
+    band = np.log([LOWEST_HZ, frequency[-1]])
     found = [
         _from(frequency, ratio, deviation, period_s, np.array([np.log(inertia), 50.0, 1.5, place, load, 0.03]))
         for place in band[0] + np.array(_STARTS) * (band[1] - band[0])
         for load in _LOADS
     ]
-    return min(found, key=lambda each: each[1])
+    return min(found, key=lambda each: each[1])[0]
 
 
 def solve_from(first: Elastic, frequency: Array, ratio: Complex, deviation: Array, period_s: float) -> Elastic:
@@ -99,7 +101,7 @@ def _from(frequency: Array, ratio: Complex, deviation: Array, period_s: float, x
         error = (response_of(_joint(values), frequency, period_s) / ratio - 1.0) / deviation
         return np.concatenate([error.real, error.imag])
 
-    low = [x[0] - 3.0, -2000.0, 0.0, np.log(frequency[0]), _LOAD[0], _DAMPING[0]]
+    low = [x[0] - 3.0, -2000.0, 0.0, np.log(LOWEST_HZ), _LOAD[0], _DAMPING[0]]
     high = [x[0] + 3.0, 1e4, 50.0, np.log(2.0 * frequency[-1]), _LOAD[1], _DAMPING[1]]
     found = least_squares(misfit, np.clip(x, low, high), bounds=(low, high), loss="soft_l1", x_scale="jac", max_nfev=60)
     return _joint(found.x), float(np.sum(found.fun**2))

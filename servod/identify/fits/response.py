@@ -127,7 +127,7 @@ def _choose(lines: _Lines, strokes: Sequence[_Stroke], inertia: float) -> _Found
     ratio = _ratio(strokes)
     plain, with_lag = solve(strokes, False), solve(strokes, True)
     costs = [_cost(lines, ratio, values) for values in (plain, with_lag)]
-    if min(costs) > UNEXPLAINED * len(lines.frequency) and (sprung := _sprung(lines, strokes, inertia, min(costs))):
+    if sprung := _sprung(lines, strokes, inertia, (plain, with_lag)):
         return sprung
     lagged, lag_spread = jackknife(lambda parts: solve(parts, True), strokes)
     freedom = len(strokes) - 1
@@ -140,10 +140,16 @@ def _choose(lines: _Lines, strokes: Sequence[_Stroke], inertia: float) -> _Found
     return _Found(*jackknife(lambda parts: solve(parts, False), strokes), lag, None)
 
 
-def _sprung(lines: _Lines, strokes: Sequence[_Stroke], inertia: float, rigid_cost: float) -> _Found | None:
-    """Two masses with a spring, if they explain what the rigid joint leaves."""
-    joint, cost = elastic.solve(lines.frequency, _ratio(strokes), lines.deviation, lines.period_s, inertia)
-    if cost > SPRUNG_COST * rigid_cost:
+def _sprung(lines: _Lines, strokes: Sequence[_Stroke], inertia: float, rigid: Sequence[Array]) -> _Found | None:
+    """Two masses with a spring, if they explain what the `rigid` joints leave, beyond where cogging disturbs."""
+    upper, ratio = lines.frequency >= elastic.LOWEST_HZ, _ratio(strokes)
+    seen = _Lines(lines.frequency[upper], lines.deviation[upper], lines.period_s)
+    rigid_cost = min(_cost(seen, ratio[upper], values) for values in rigid)
+    if rigid_cost < UNEXPLAINED * np.count_nonzero(upper):
+        return None
+    joint = elastic.solve(lines.frequency, ratio, lines.deviation, lines.period_s, inertia)
+    error = elastic.response_of(joint, seen.frequency, seen.period_s) / ratio[upper] - 1.0
+    if float(np.sum(np.abs(error / seen.deviation) ** 2)) > SPRUNG_COST * rigid_cost:
         return None
 
     def solve(parts: Sequence[_Stroke]) -> Array:
