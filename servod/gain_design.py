@@ -2,7 +2,7 @@
 
 Beside the data path: `servoctl synthesize` writes it, `servoctl verify` reads it; the daemon only carries it along.
 Matrices are lists of rows. States of a region's matrices: [x, v_f, u_(k-1), ..., u_(k-n), v - v_f, z], each divided by
-its `scale`.
+its `scale`; the reference mode has its own.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Vertex(_Numbers):
 
 
 class RegionProof(_Numbers):
-    """Proof of one region: feedback u = feedback*[x, v_f] in scaled units, one slack per mode, one P and Q per vertex.
+    """Proof of one region: u = feedback*[x, v_f, u_(k-1), ...] in scaled units, a slack per mode, P and Q per vertex.
 
     H2 (de Oliveira, Geromel, Bernussou, IJC 75, 2002): [P - E E', A G; *, G + G' - P] > 0, [W, C G; *, G + G' - P] > 0
     with the loop closed; pole disc: [r Q, (A - c) G; *, r (G + G' - Q)] > 0.
@@ -76,6 +76,46 @@ class RegionProof(_Numbers):
     feedback: Row
     slack: dict[str, Matrix] = Field(description="G, one for each mode")
     vertices: list[Vertex] = Field(min_length=1, max_length=64)
+
+
+class ReferenceForm(StrEnum):
+    """How the equations (12), (15) are read: as physics has them, or to the letter."""
+
+    CONSISTENT = "consistent"
+    PRINTED = "printed"
+
+
+class ReferenceOutput(StrEnum):
+    """The output of (14): both outputs weighed as in the LQG problem that the text names, or their literal sum."""
+
+    VECTOR = "vector"
+    SCALAR = "scalar"
+
+
+class ReferenceProof(_Numbers):
+    """Proof of one region of the reference mode: P, Y = K_u* P and Q of (14), common to all vertices of (15).
+
+    Every interval is [lower end, upper end]; the vertices are all their corners. States [z_hat, x, v] by `scale`.
+    """
+
+    name: str
+    speed_from_rad_s: float
+    speed_to_rad_s: float
+    form: ReferenceForm = Field(ReferenceForm.CONSISTENT, strict=False)
+    output: ReferenceOutput = Field(ReferenceOutput.VECTOR, strict=False)
+    decays_per_s: Row = Field(description="a_i")
+    stiffness_mismatch_nm_per_rad: Row = Field(description="dc_i")
+    viscous_mismatch_nms_per_rad: Row = Field(description="dd_i")
+    gains_l: Row = Field(description="l_i")
+    input_scale_nm: Positive = Field(description="K")
+    position_weight: Positive = Field(description="alpha")
+    torque_weight: Positive = Field(description="beta")
+    least_decay_per_s: float
+    least_damping: Share
+    scale: Row
+    lyapunov: Matrix = Field(description="P")
+    feedback_lyapunov: Row = Field(description="Y")
+    bound: Matrix = Field(description="Q, trace = squared H2 norm bound")
 
 
 class DesignMode(StrEnum):
@@ -97,3 +137,4 @@ class Design(_Numbers):
     model: AxisModel = Field(strict=False)
     uncertainty: Uncertainty
     regions: list[RegionProof] = Field(default_factory=list, max_length=2)
+    reference: list[ReferenceProof] = Field(default_factory=list, max_length=2, description="of the reference mode")
