@@ -118,7 +118,7 @@ FREE_FEEDBACK = {"k_p": Range(0.3, 100.0, 3.0), "k_d": Range(0.3, 20.0, 1.5)}
 #: The equal class in these multiples.
 PAPER_FEEDBACK = {"k_p": 1.0, "k_d": 1.0}
 _HOLD = Range(1.2, 30.0, 3.0)  # hold width in counts: how far from rest nothing integrates
-_STIFFNESS = Range(0.2, 0.9, 0.75, ratios=False)  # c0_hat as a share of c0; from 1.0 on the loop is unstable
+_STIFFNESS = Range(0.05, 0.9, 0.75)  # c0_hat as a share of c0; from 1.0 on the loop is unstable
 
 
 @dataclass(frozen=True, slots=True)
