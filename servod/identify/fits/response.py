@@ -165,8 +165,7 @@ def _sprung(lines: _Lines, strokes: Sequence[_Stroke], inertia: float, rigid: Se
     )
     unseen = min(lines.period_s, float(values[2]))
     lag = Estimate(0.0, 0.0, unseen, "s", "not told beside a resonance; what there is, is part of the delay")
-    rigid, deviations = np.array([*values[:3], 0.0]), np.array([*spread[:3], 0.0])
-    return _Found(rigid, deviations, lag, resonance)
+    return _Found(np.array([*values[:3], 0.0]), np.array([*spread[:3], 0.0]), lag, resonance)
 
 
 def _spectra(trace: Trace) -> tuple[Array, list[_Stroke]]:
