@@ -70,13 +70,13 @@ def _joint(results: Results, joint: Joint) -> dict[str, Any]:
 
 
 def _feedback(found: Found) -> dict[str, dict[str, float]]:
-    """Synthesized feedback per region in N*m/rad and N*m*s/rad."""
+    """Synthesized feedback per region in N*m/rad and N*m*s/rad, as it is once the commands it remembers are steady."""
     law = found.gains.parameters
     assert isinstance(law, LocalParameters)
     return {
         name: {
-            "position_nm_per_rad": law.input_scale_nm * gains.k_x_per_rad,
-            "velocity_nms_per_rad": law.input_scale_nm * gains.k_v_s_per_rad,
+            "position_nm_per_rad": law.input_scale_nm * gains.k_x_per_rad / (1.0 + sum(gains.k_u or ())),
+            "velocity_nms_per_rad": law.input_scale_nm * gains.k_v_s_per_rad / (1.0 + sum(gains.k_u or ())),
         }
         for name, gains in (("low", law.regions.low), ("high", law.regions.high))
     }
