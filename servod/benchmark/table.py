@@ -20,6 +20,7 @@ class Goal(NamedTuple):
     goal: str
     met: Callable[[float], bool]
     seconds: float = 0.0  # how long the goal wants to be watched; the document says how long it was
+    plants: int = 0  # how many plants the goal is for; the document says how many there were
 
     def verdict(self, document: dict[str, Any]) -> str:
         """Empty when the goal is met; else "missed", or why it could not be judged."""
@@ -30,6 +31,8 @@ class Goal(NamedTuple):
             measured_s = float(document[self.keys[0]]["seconds"])
             if round(measured_s) < self.seconds:
                 return f"not judged (measured {measured_s:g} s)"
+        if self.plants and document[self.keys[0]]["plants"] < self.plants:
+            return f"not judged (measured with {document[self.keys[0]]['plants']} plants)"
         return "" if self.met(value) else "missed"
 
 
@@ -53,6 +56,16 @@ GOALS = (
     Goal("stepped, against real time", ("stepped_speed",), "{:.1f}×", "at least 5×", lambda x: x >= 5.0),
     Goal("simulator, against real time", ("simulator_speed",), "{:.0f}×", "at least 500×", lambda x: x >= 500.0),
     Goal("growth of memory", ("memory", "growth_mib"), "{:.2f} MiB", "below 1 MiB in 10 min", lambda x: x < 1.0, 600.0),
+    Goal("synthesis of both regions", ("synthesis", "seconds"), "{:.1f} s", "at most 2 s", lambda x: x <= 2.0),
+    Goal(
+        "verification with 1000 plants",
+        ("verification", "seconds"),
+        "{:.0f} s",
+        "at most 60 s",
+        lambda x: x <= 60.0,
+        plants=1000,
+    ),
+    Goal("commission", ("commission", "seconds"), "{:.0f} s", "at most 240 s", lambda x: x <= 240.0),
 )
 
 
@@ -60,7 +73,7 @@ def figure(document: dict[str, Any], goal: Goal) -> float | None:
     """The figure of one row; None when it could not be measured."""
     value: Any = document
     for key in goal.keys:
-        value = value[key]
+        value = None if value is None else value.get(key)
     return None if value is None else float(value)
 
 

@@ -26,6 +26,9 @@ def document(**changes: Any) -> dict[str, Any]:
         "stepped_speed": 10.0,
         "simulator_speed": 700.0,
         "memory": {"growth_mib": 0.3, "seconds": 600.0},
+        "synthesis": {"seconds": 1.5},
+        "verification": {"seconds": 50.0, "plants": 1000},
+        "commission": {"seconds": 200.0},
     } | changes
 
 
@@ -47,6 +50,9 @@ def test_nothing_is_said_of_goals_that_are_met() -> None:
         ({"stepped_speed": 4.9}, "stepped, against real time"),
         ({"simulator_speed": 499.0}, "simulator, against real time"),
         ({"memory": {"growth_mib": 1.0, "seconds": 600.0}}, "growth of memory"),
+        ({"synthesis": {"seconds": 2.1}}, "synthesis of both regions"),
+        ({"verification": {"seconds": 61.0, "plants": 1000}}, "verification with 1000 plants"),
+        ({"commission": {"seconds": 241.0}}, "commission"),
     ],
 )
 def test_a_goal_that_is_missed_is_called_so(changes: dict[str, Any], label: str) -> None:
@@ -57,6 +63,18 @@ def test_a_figure_measured_for_too_short_is_not_judged() -> None:
     assert verdicts(memory={"growth_mib": 5.0, "seconds": 120.0}) == {"growth of memory": "not judged (measured 120 s)"}
     short = {"seconds": 10.0, "missed_share": 0.0, "deadline_to_torque_us": 100.0}
     assert verdicts(wall_clock=short) == {"missed periods": "not judged (measured 10 s)"}
+
+
+def test_a_certificate_of_few_plants_is_not_judged_and_what_was_left_out_is_told() -> None:
+    few = {"seconds": 90.0, "plants": 100}
+    label = "verification with 1000 plants"
+    assert verdicts(verification=few) == {label: "not judged (measured with 100 plants)"}
+    assert verdicts(commission=None) == {"commission": "not measured"}
+
+
+def test_a_document_of_an_earlier_version_is_still_read() -> None:
+    earlier = {key: value for key, value in document().items() if key != "synthesis"}
+    assert [figure(earlier, goal) for goal in GOALS if goal.keys[0] == "synthesis"] == [None]
 
 
 def test_a_missing_cyclictest_is_told_in_the_table(
