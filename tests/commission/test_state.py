@@ -1,0 +1,155 @@
+"""What counts as done, whose folder it is, and that steps are taken up where they were interrupted."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from servod.commission.axis import VirtualWalkAxis
+from servod.commission.files import write_text
+from servod.commission.questions import Questions
+from servod.commission.state import State, sole_walk
+from servod.commission.walk import Options, Tell, Walk, run
+from servod.errors import AnswerIsNo, BadInput, Unreachable
+from tests.synthesize.designs import table1
+
+AXIS = VirtualWalkAxis(table1(), seed=1)
+
+
+@contextmanager
+def silent(_title: str) -> Iterator[Tell]:
+    """No progress."""
+    yield lambda _what, _share: None
+
+
+def walk(folder: Path, axis: VirtualWalkAxis = AXIS, **options: Any) -> Walk:
+    folder.mkdir(exist_ok=True)
+    return Walk(folder, axis, Options(**options), Questions(True, lambda _q: True), silent, lambda _line: None)
+
+
+@dataclass(frozen=True)
+class Copy:
+    """Writes its source's text and its own word into its file; may be interrupted before, and counts its runs."""
+
+    name: str
+    source: str | None
+    runs: list[str]
+    interrupt: bool = False
+
+    @property
+    def title(self) -> str:
+        return self.name
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        return (f"{self.name}.txt",)
+
+    def inputs(self, walk: Walk) -> dict[str, Any]:
+        return {**(walk.hashes(self.source) if self.source else {}), "accuracy": walk.options.accuracy}
+
+    def run(self, walk: Walk) -> None:
+        if self.interrupt:
+            raise KeyboardInterrupt
+        self.runs.append(self.name)
+        before = walk.path(self.source).read_text() if self.source else ""
+        write_text(walk.path(self.outputs[0]), f"{before}{self.name} {walk.options.accuracy}\n")
+
+
+def chain(runs: list[str], interrupted: str = "") -> tuple[Copy, ...]:
+    names = [None, "one", "two", "three"]
+    return tuple(
+        Copy(str(name), f"{before}.txt" if before else None, runs, name == interrupted)
+        for before, name in itertools.pairwise(names)
+    )
+
+
+def test_a_walk_is_taken_up_at_the_step_that_was_interrupted(tmp_path: Path) -> None:
+    runs: list[str] = []
+    for name in ("one", "two", "three"):
+        with pytest.raises(KeyboardInterrupt):
+            run(walk(tmp_path / "cut"), chain(runs, interrupted=name))
+    state = run(walk(tmp_path / "cut"), chain(runs))
+    assert runs == ["one", "two", "three"]
+    assert set(state.seconds) == {"one", "two", "three"}
+    run(walk(tmp_path / "whole"), chain([]))
+    assert (tmp_path / "cut" / "three.txt").read_text() == (tmp_path / "whole" / "three.txt").read_text()
+
+
+def test_what_is_done_is_not_done_again_and_what_changed_is(tmp_path: Path) -> None:
+    runs: list[str] = []
+    run(walk(tmp_path), chain(runs))
+    run(walk(tmp_path), chain(runs))
+    assert runs == ["one", "two", "three"]
+    (tmp_path / "two.txt").write_text("by hand\n")
+    run(walk(tmp_path), chain(runs))
+    assert runs[3:] == ["three"]
+    assert (tmp_path / "three.txt").read_text() == "by hand\nthree 0.02\n"
+    (tmp_path / "three.txt").unlink()
+    run(walk(tmp_path), chain(runs))
+    assert runs[4:] == ["three"]
+    run(walk(tmp_path, accuracy=0.05), chain(runs))
+    assert runs[5:] == ["one", "two", "three"]
+
+
+def test_the_folder_of_another_axis_is_refused(tmp_path: Path) -> None:
+    run(walk(tmp_path), chain([]))
+    heavier = VirtualWalkAxis(table1().model_copy(update={"inertia": 0.002}), seed=1)
+    with pytest.raises(BadInput, match="plant"):
+        run(walk(tmp_path, heavier), chain([]))
+    coarser = VirtualWalkAxis(table1(), seed=1, encoder_counts=2**17)
+    with pytest.raises(BadInput, match="encoder"):
+        run(walk(tmp_path, coarser), chain([]))
+
+
+def test_files_of_somebody_else_are_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "two.txt").write_text("mine\n")
+    with pytest.raises(BadInput, match=r"two\.txt"):
+        run(walk(tmp_path), chain([]))
+    assert (tmp_path / "two.txt").read_text() == "mine\n"
+
+
+@pytest.mark.parametrize("text", ["{", "{}", '{"axis": {}, "steps": {"one": 1}}'])
+def test_a_broken_state_is_bad_input(text: str, tmp_path: Path) -> None:
+    (tmp_path / "state.json").write_text(text)
+    with pytest.raises(BadInput, match="state"):
+        run(walk(tmp_path), chain([]))
+
+
+def test_one_walk_at_a_time(tmp_path: Path) -> None:
+    with sole_walk(tmp_path), pytest.raises(Unreachable, match="at work"), sole_walk(tmp_path):
+        pass
+
+
+def test_a_kill_between_file_and_state_only_repeats_the_step(tmp_path: Path) -> None:
+    runs: list[str] = []
+    run(walk(tmp_path), chain(runs))
+    state = json.loads((tmp_path / "state.json").read_text())
+    del state["steps"]["two"]
+    (tmp_path / "state.json").write_text(json.dumps(state))
+    run(walk(tmp_path), chain(runs))
+    assert runs[3:] == ["two"]
+    assert State(tmp_path, AXIS.identity, []).seconds.keys() == {"one", "two", "three"}
+
+
+def test_without_a_person_only_yes_agrees() -> None:
+    asked: list[str] = []
+
+    def put(question: str) -> bool:
+        asked.append(question)
+        return len(asked) == 1
+
+    Questions(True, put).agree("move?")
+    with pytest.raises(BadInput, match="--yes, which agrees to: move"):
+        Questions(False, put, lambda: False).agree("move?")
+    assert not Questions(False, put, lambda: False).takes("less?")
+    assert asked == []
+    Questions(False, put, lambda: True).agree("move?")
+    with pytest.raises(AnswerIsNo, match="deploy"):
+        Questions(False, put, lambda: True).agree("deploy?")
