@@ -30,7 +30,7 @@ from servod.synthesize.feedforward import position_feedforward
 from servod.synthesize.integral_gain import designed
 from servod.synthesize.local_sets import PAPER_NODES, STIFFNESS_SHARE, compensator, local_sets, sets_at
 from servod.synthesize.origin import provenance
-from servod.verify.checks import CORNER_SPEEDS, DISK_LIMIT, speeds_of
+from servod.verify.checks import DISK_LIMIT, speeds_of
 from servod.verify.closed_loop import corners
 from servod.verify.margins import Sweep
 from servod.verify.sampled import Timing
@@ -40,9 +40,8 @@ from servod.verify.steady_friction import SteadyFriction, steady_friction
 #: corner of the intervals, or else the one that the certificate asks for.
 OBSERVERS_RAD_S = (80.0, 60.0, 45.0, 34.0, 25.0, 18.0, 12.0, 7.0)
 DISK_WANTED = 0.15
-LOW_FACTOR = (
-    2.5  # of the bandwidth in Omega_L over that in Omega_H: a joint on its bristle comes to rest in half a second
-)
+SPEEDS = 16  # per direction, at which a bandwidth is judged; the certificate looks more closely
+LOW_FACTOR = 2.5  # bandwidth in Omega_L over that in Omega_H: on its bristle a joint then rests in half a second
 #: From this bandwidth on no other choice of filter and poles is tried.
 ENOUGH_RAD_S = 20.0
 LIMIT_SHARE = 1.5  # bound of the compensated force, as a share of the largest friction
@@ -132,7 +131,7 @@ def approach_error(high: RegionGains, speed: float) -> float | None:
 def stands(design: Design, friction: SteadyFriction, law: LocalParameters, margin: float) -> bool:
     """Whether the full sampled loop is stable at every corner of the intervals, with this disk margin at least."""
     timing = Timing(design.period_s, design.model.total_delay_s, design.velocity_cutoff_hz)
-    sweep = Sweep(LAWS["local"], law.pack(), friction, timing, speeds_of(design, CORNER_SPEEDS))
+    sweep = Sweep(LAWS["local"], law.pack(), friction, timing, speeds_of(design, SPEEDS))
     return sweep.disk_margin()[0] >= margin and sweep.worst(corners(design.uncertainty)).radius < 1.0
 
 
@@ -162,9 +161,10 @@ def synthesize(
 
 def widest_observer(design: Design, friction: SteadyFriction, options: Options) -> float:
     """Largest bandwidth of the list that the full loop stands [rad/s]; 0 where it stands none, or none is wanted."""
+    law = parameters(design, friction, options, OBSERVERS_RAD_S[0])
 
     def fits(bandwidth: float, margin: float) -> bool:
-        return stands(design, friction, parameters(design, friction, options, bandwidth), margin)
+        return stands(design, friction, with_observer(law, bandwidth, LOW_FACTOR * bandwidth), margin)
 
     for margin in (DISK_WANTED, DISK_LIMIT) if options.observer else ():
         index = bisect.bisect_left(OBSERVERS_RAD_S, True, key=partial(fits, margin=margin))
@@ -191,6 +191,13 @@ def gain_set(design: Design, law: LocalParameters, options: Options, model_path:
     ).sealed()
 
 
+def with_observer(law: LocalParameters, high_rad_s: float, low_rad_s: float | None) -> LocalParameters:
+    """`law` with other bandwidths of the observer that it has: in Omega_H and in Omega_L (None: the same)."""
+    assert law.disturbance_observer is not None
+    bandwidths = {"bandwidth_rad_s": high_rad_s, "low_bandwidth_rad_s": low_rad_s}
+    return law.model_copy(update={"disturbance_observer": law.disturbance_observer.model_copy(update=bandwidths)})
+
+
 def with_feedback(
     gains: GainSet,
     name: str,
@@ -209,12 +216,9 @@ def with_feedback(
         k_x_per_rad=position_nm_per_rad / law.input_scale_nm, k_v_s_per_rad=velocity_nms_per_rad / law.input_scale_nm
     )
     regions_with = law.regions.model_copy(update={"low": same, "high": same})
-    observer = law.disturbance_observer
-    if observer is not None and observer_rad_s is not None:
-        observer = observer.model_copy(update={"bandwidth_rad_s": observer_rad_s, "low_bandwidth_rad_s": None})
-    changed = law.model_copy(
-        update={"regions": regions_with, "disturbance_observer": observer, "error_limit_rad": None}
-    )
+    if law.disturbance_observer is not None and observer_rad_s is not None:
+        law = with_observer(law, observer_rad_s, None)
+    changed = law.model_copy(update={"regions": regions_with, "error_limit_rad": None})
     return gains.model_copy(
         update={"name": name, "parameters": changed, "design": None, "certificate": None, "seal": None}
     )
