@@ -31,6 +31,10 @@ Tell = Callable[[str], None]
 #: least torque that any finding must carry there.
 WORTH_SHARE, WORTH_TORQUE, LEAST_TORQUE = 0.05, 0.03, 0.008
 
+#: A term that takes less than WORTH_SHARE must take this share of what is left above the floor: a name that leaves most
+#: of the rest as it was is not what the rest is made of.
+LEAST_OF_LEFT = 0.25
+
 #: Rows that show where an effect acts: its torque there is this quantile of what it changes.
 ACTS_AT = 0.98
 
@@ -55,10 +59,12 @@ LEAST_SCALE = 0.002
 class Merit:
     """What a term is worth: its share of the explainable error, its torque as a share of dry friction, its cost gain.
 
-    `gain` is twice the cost that it saves, in units of noise that counts correlated rows as one.
+    `gain` is twice the cost that it saves, in units of noise that counts correlated rows as one; `of_left` its share of
+    what the fit before it had left above the noise floor.
     """
 
     share: float
+    of_left: float
     torque: float
     gain: float
 
@@ -82,6 +88,12 @@ class Choice:
     minor: dict[str, Merit]
     floor: float
     tried: int
+
+    def drop(self, index: int, less: Fit) -> None:
+        """Take a term out; `less` is the fit without it."""
+        self.fit = less
+        self.merits.pop(index)
+        self.entries.pop(index)
 
 
 class Chooser:
@@ -189,7 +201,8 @@ class Chooser:
         fitter = self.fitter(with_term.mismatch)
         cost = fitter.cost(without.hypothesis, without.coordinates, without.mismatch)
         gain = 2.0 * (cost - with_term.cost) / self._correlation(with_term.mismatch, fitter.weighing.scale)
-        return Merit(saved / explainable, float(np.quantile(changed, ACTS_AT)) / self.predictor.dry, gain)
+        left = max(self.error(without.mismatch) - self.floor, 1e-30)
+        return Merit(saved / explainable, saved / left, float(np.quantile(changed, ACTS_AT)) / self.predictor.dry, gain)
 
     def _correlation(self, mismatch: Array, scale: float) -> float:
         """By how much correlated rows exaggerate a gain: long-run over plain variance, at least 1."""
@@ -201,7 +214,7 @@ class Chooser:
 
     def deserves(self, merit: Merit, fit: Fit) -> bool:
         """Whether a term is significant and worth naming."""
-        worth = merit.torque >= WORTH_TORQUE or merit.share >= WORTH_SHARE
+        worth = merit.share >= WORTH_SHARE or (merit.torque >= WORTH_TORQUE and merit.of_left >= LEAST_OF_LEFT)
         return worth and merit.torque >= LEAST_TORQUE and self._significant(merit, fit)
 
     def _significant(self, merit: Merit, fit: Fit) -> bool:
@@ -220,9 +233,7 @@ class Chooser:
                 choice.merits[index] = merit
                 index += 1
                 continue
-            choice.fit = less
-            choice.merits.pop(index)
-            choice.entries.pop(index)
+            choice.drop(index, less)
 
     def less(self, fit: Fit, index: int) -> Fit:
         """The fit without one of its terms."""

@@ -88,6 +88,9 @@ def diagnose(
     seconds["search"] = monotonic() - begun - seconds["intake"]
     choice.fit = tidied(chooser, choice.fit)
     evidence = _evidence(predictor, chooser, choice, tell)
+    while (worse := _worse_unseen(evidence)) is not None:
+        choice.drop(worse, evidence.less[worse])
+        evidence = _evidence(predictor, chooser, choice, tell)
     seconds["proof"] = monotonic() - begun - seconds["intake"] - seconds["search"]
     final = verdict(choice, evidence.named, evidence.errors, predictor.dry)
     if final is Verdict.UNEXPLAINED:
@@ -122,6 +125,12 @@ def _evidence(predictor: Predictor, chooser: Chooser, choice: Choice, tell: Tell
         maps_before=maps(predictor, choice.base.mismatch),
         maps_after=maps(predictor, fit.mismatch),
     )
+
+
+def _worse_unseen(evidence: Evidence) -> int | None:
+    """The named term without which unseen recordings are foretold best, if better than with it."""
+    others = {place: held.rms for place, held in evidence.without.items() if held.rms <= evidence.after.rms}
+    return min(others, key=lambda place: others[place]) if others else None
 
 
 def _frozen(fit: Fit) -> NDArray[np.bool_]:

@@ -27,7 +27,8 @@ APART_S = 1e5
 #: Least that a recording must hold: seconds, rows, distinct positions, share of rows in motion.
 LEAST_S, LEAST_ROWS, LEAST_COUNTS, LEAST_MOVING = 1.5, 300, 40, 0.03
 
-#: Noise as a share of dry friction (or of so much of the command's spread, if that is more), in the mismatch at the slowest observer, from which nothing can be said.
+#: Noise that the slowest observer makes of the encoder's, as a share of dry friction, from which nothing can be said; a
+#: share of the command's spread counts for dry friction where it is more.
 MOST_NOISE, NOISE_OF_COMMAND = 0.5, 0.3
 
 #: Share of rows at the end of the command's range from which a recording is saturated; and from which it is told.

@@ -36,7 +36,7 @@ POLES_DAMPING = 0.8
 
 #: Longest step of the model, s; and the factor on the number of steps for reversals and for a gap.
 LONGEST_STEP_S = 0.0013
-STEPS_AT_REVERSAL, STEPS_IN_GAP = 4, 3
+STEPS_AT_REVERSAL, STEPS_IN_GAP = 4, 2
 
 #: Share of the motor's correction that the load gets: all behind a gap, less behind a spring, which it would ring.
 LOAD_SHARE, LOAD_SHARE_IN_GAP = 0.6, 1.0

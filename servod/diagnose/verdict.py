@@ -17,12 +17,9 @@ from servod.diagnose.candidates import Candidate
 from servod.diagnose.choose import Choice
 from servod.diagnose.hypothesis import Document, get
 
-#: Below this share of the explainable error no named physics may stand: what is there is something else.
-LEAST_EXPLAINED = 0.75
-
 #: What is left above the noise floor counts as unexplained from this share of dry friction, if it is also this share of
 #: what could be explained.
-LEFT_TORQUE, LEFT_SHARE = 0.02, 0.15
+LEFT_TORQUE, LEFT_SHARE = 0.02, 0.05
 
 #: A rival that leaves at most this many times what the finding leaves cannot be told apart.
 ALIKE = 1.2
@@ -65,8 +62,7 @@ def shares(choice: Choice, counts: np.ndarray[tuple[int], np.dtype[np.bool_]]) -
 def verdict(choice: Choice, named: list[int], errors: Shares, dry: float) -> Verdict:
     """The verdict on what was named (places of terms) and what is left."""
     left = errors.left / dry
-    much = left > LEFT_TORQUE and 1.0 - errors.removed > LEFT_SHARE
-    if much and (not named or errors.removed < LEAST_EXPLAINED):
+    if left > LEFT_TORQUE and 1.0 - errors.removed > LEFT_SHARE:
         return Verdict.UNEXPLAINED
     return Verdict.MISSING_PHYSICS if named else Verdict.ADEQUATE
 
