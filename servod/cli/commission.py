@@ -53,7 +53,9 @@ def commission(
     rivals: Annotated[bool, typer.Option(help="Tune rivals and compare, on a virtual axis.")] = True,
     processes: Annotated[int, typer.Option(min=1, max=64, help="Worker processes.")] = 2,
     seed: Annotated[int, typer.Option(min=0, help="Seed of excitation, tuning and virtual noise.")] = 1,
-    yes: Annotated[bool, typer.Option("--yes", help="Agree to every question.")] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Agree to every question; goes without saying on a virtual axis.")
+    ] = False,
     socket: SocketOption = DEFAULT_SOCKET,
     as_json: JsonOption = False,
 ) -> None:
@@ -71,7 +73,7 @@ def commission(
         out,
         axis,
         Options(seed, travel, speed, accuracy, plants, budget, rivals, processes),
-        Questions(yes, _put),
+        Questions(yes or plant is not None, _put),
         lambda title: _bar(title, as_json),
         lambda line: None if as_json else print(line, file=sys.stderr, flush=True),
     )
