@@ -5,7 +5,7 @@ Stands on the figures of servod.report; called by the last step.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from servod.axis_model import AxisModel, load_axis_model
@@ -38,6 +38,7 @@ from servod.report.pictures import write_pictures
 from servod.tracking.metrics import Curves, curve_key
 from servod.tracking.motions import STEPS_MRAD
 
+Part = Figure | Table | str
 #: Classes of the comparison as people read them, in the order of the page.
 CLASSES = {
     "free_feedback": "Every law at its best",
@@ -50,22 +51,27 @@ def write_report(walk: Walk, tell: Tell) -> None:
     page = Page(f"Commissioning of {walk.axis.config.name}")
     _summary(page, walk)
     gains, model = load_gains(walk.path(GAINS)), load_axis_model(walk.path(MODEL))
-    sections = {
-        "The axis as identified": _identified(walk, model),
-        "The law and its design": _design(gains, model),
-        "The certificate": _certificate(gains),
-        "Deployment": _deployment(walk),
-        "Tracking": _tracking(walk),
-    }
-    for index, (title, parts) in enumerate(sections.items()):
-        tell(title.lower(), index / len(sections))
+    shown = sections(walk, gains, model)
+    for index, (title, parts) in enumerate(shown.items()):
+        tell(title.lower(), index / len(shown))
         page.heading(title)
-        for part in parts:
+        for part in parts():
             _add(page, walk, part)
     page.write(walk.path(REPORT))
 
 
-def _add(page: Page, walk: Walk, part: Figure | Table | str) -> None:
+def sections(walk: Walk, gains: GainSet, model: AxisModel) -> dict[str, Callable[[], Iterator[Part]]]:
+    """What makes the parts of each section, by its title, in the order of the page."""
+    return {
+        "The axis as identified": lambda: _identified(walk, model),
+        "The law and its design": lambda: _design(gains, model),
+        "The certificate": lambda: _certificate(gains),
+        "Deployment": lambda: _deployment(walk),
+        "Tracking": lambda: _tracking(walk),
+    }
+
+
+def _add(page: Page, walk: Walk, part: Part) -> None:
     if isinstance(part, str):
         page.sentence(part)
     elif isinstance(part, Table):
@@ -97,7 +103,7 @@ def _summary(page: Page, walk: Walk) -> None:
         )
 
 
-def _identified(walk: Walk, model: AxisModel) -> Iterator[Figure | Table | str]:
+def _identified(walk: Walk, model: AxisModel) -> Iterator[Part]:
     axis = walk.axis
     truth = axis.joint if isinstance(axis, VirtualWalkAxis) else None
     found = read_json(walk.path(IDENTIFIED))
@@ -111,19 +117,19 @@ def _identified(walk: Walk, model: AxisModel) -> Iterator[Figure | Table | str]:
     yield friction.friction_map(model, truth)
 
 
-def _design(gains: GainSet, model: AxisModel) -> Iterator[Figure]:
+def _design(gains: GainSet, model: AxisModel) -> Iterator[Part]:
     yield sets.weighting_functions(gains)
     yield sets.local_friction(gains, model)
     yield loop.bode(gains)
     yield loop.impulse_responses(gains)
 
 
-def _certificate(gains: GainSet) -> Iterator[Table]:
+def _certificate(gains: GainSet) -> Iterator[Part]:
     yield proof.certificate_table(gains)
     yield proof.observations_table(gains)
 
 
-def _deployment(walk: Walk) -> Iterator[Figure | Table]:
+def _deployment(walk: Walk) -> Iterator[Part]:
     found = read_json(walk.path(DEPLOYMENT))
     rows = [
         (name.removesuffix("_mrad"), *(f"{found[run][name]:.4g}" for run in ("before", "after", "promised")))
@@ -137,7 +143,7 @@ def _deployment(walk: Walk) -> Iterator[Figure | Table]:
     yield motion.before_after(before, after, title="The validation motion before and after")
 
 
-def _tracking(walk: Walk) -> Iterator[Figure | Table | str]:
+def _tracking(walk: Walk) -> Iterator[Part]:
     found = read_json(walk.path(TRACKING))
     for name, title in CLASSES.items():
         figures = found.get(name) or (found["tracking"] if name == "free_feedback" else {})

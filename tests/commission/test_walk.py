@@ -1,0 +1,130 @@
+"""Real steps from a known model to a deployed set: bit for bit the same after interruptions, and told on one page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from servod.axis_model import axis_model_yaml
+from servod.commission.axis import VirtualWalkAxis
+from servod.commission.files import (
+    DEPLOYMENT,
+    GAINS,
+    MODEL,
+    RELAXED,
+    RUNS,
+    TRACKING,
+    read_json,
+    write_json,
+    write_text,
+)
+from servod.commission.questions import Questions
+from servod.commission.report import sections
+from servod.commission.runs import load_curves, load_rows, save_curves
+from servod.commission.state import file_sha256
+from servod.commission.steps.deploy import Deploy
+from servod.commission.steps.synthesize import Synthesize, relaxed
+from servod.commission.steps.verify import Verify
+from servod.commission.walk import Options, Step, Tell, Walk, run
+from servod.gains import load_gains
+from servod.report.figure import Figure, Table
+from servod.synthesize.deployed import Relaxation, Wishes
+from servod.tracking import simulated
+from tests.synthesize.designs import table1
+
+AXIS = VirtualWalkAxis(table1(), seed=1)
+
+
+@dataclass(frozen=True)
+class Known:
+    """In place of an identification: the model is known, as when it came from a file."""
+
+    name: str = "known"
+    title: str = "known"
+    outputs: tuple[str, ...] = (MODEL,)
+
+    def inputs(self, _walk: Walk) -> dict[str, Any]:
+        return {}
+
+    def run(self, walk: Walk) -> None:
+        write_text(walk.path(MODEL), axis_model_yaml(table1()))
+
+
+STEPS: tuple[Step, ...] = (Known(), Synthesize(), Verify(), Deploy())
+
+
+def walk_in(folder: Path, interrupted: str = "") -> Walk:
+    """A walk with few plants; `interrupted` names the step whose progress brings Ctrl-C."""
+
+    @contextmanager
+    def progress(title: str) -> Iterator[Tell]:
+        def tell(_what: str, share: float) -> None:
+            if title == interrupted and share > 0.05:
+                raise KeyboardInterrupt
+
+        yield tell
+
+    options = Options(plants=2, processes=1)
+    return Walk(folder, AXIS, options, Questions(True, lambda _q: True), progress, lambda _line: None)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder whose walk was interrupted in every step and taken up."""
+    folder = tmp_path_factory.mktemp("walk")
+    for step in STEPS[1:]:
+        with pytest.raises(KeyboardInterrupt):
+            run(walk_in(folder, interrupted=step.title), STEPS)
+    run(walk_in(folder), STEPS)
+    return folder
+
+
+def test_the_set_is_deployed_and_its_runs_are_kept(folder: Path) -> None:
+    found = read_json(folder / DEPLOYMENT)
+    assert found["deployed"] and found["present"]["name"] == "identification"
+    assert found["after"]["slow_mrad"] < found["before"]["slow_mrad"]
+    assert len(load_rows(folder / RUNS / "deploy_after.mcap")) > 12_000
+    assert read_json(folder / RELAXED) is None
+
+
+def test_made_again_every_file_is_the_same_byte_for_byte(folder: Path) -> None:
+    names = [GAINS, DEPLOYMENT]
+    before = [file_sha256(folder / name) for name in names]
+    for name in names:
+        (folder / name).unlink()
+    run(walk_in(folder), STEPS)
+    assert [file_sha256(folder / name) for name in names] == before
+
+
+def test_a_relaxation_changes_its_own_wish_alone() -> None:
+    wishes = Wishes()
+    smaller = relaxed(wishes, Relaxation("scale of the uncertainty", 1.0, 0.5))
+    assert smaller.uncertainty == wishes.uncertainty.scaled(0.49)
+    slower = relaxed(wishes, Relaxation("least decay [1/s]", wishes.least_decay_per_s, 2.0))
+    assert slower.least_decay_per_s == pytest.approx(1.96) and slower.uncertainty == wishes.uncertainty
+
+
+def test_curves_come_back_from_disk_and_stand_on_the_page(folder: Path) -> None:
+    gains = load_gains(folder / GAINS)
+    assert gains.design is not None
+    cutoff_hz = gains.design.velocity_cutoff_hz
+    run_of = simulated.measure(table1(), gains, counts_per_turn=2.0**20, cutoff_hz=cutoff_hz, seed=7)
+    save_curves(folder / RUNS / "free_local.npz", run_of.curves)
+    again = load_curves(folder / RUNS / "free_local.npz")
+    assert again["paper"].error_mrad == pytest.approx(run_of.curves["paper"].error_mrad, abs=1e-3)
+    write_json(folder / TRACKING, {"tracking": {"local": run_of.document()}})
+    walk = walk_in(folder)
+    made = {title: list(parts()) for title, parts in sections(walk, gains, table1()).items() if title in SHOWN}
+    assert set(made) == SHOWN
+    figures = {part.name for parts in made.values() for part in parts if isinstance(part, Figure)}
+    assert {"bode", "impulse_responses", "weighting_functions", "before_after", "step_100_free_feedback"} <= figures
+    assert any(isinstance(part, Table) and "Certificate" in part.title for part in made["The certificate"])
+
+
+#: Sections that need no recordings of an identification.
+SHOWN = {"The law and its design", "The certificate", "Deployment", "Tracking"}
