@@ -5,6 +5,7 @@ Stands on the LMIs and the local sets. What it cannot reach it says, and offers 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 
@@ -110,6 +111,8 @@ def programme(design: Design, proof: RegionProof, wishes: Wishes) -> Programme:
     _, a, b, e = scaled_vertices(design, proof)
     disc = pole_disc(wishes.least_decay_per_s, wishes.least_damping, wishes.period_s)
     performs = [j.performs for j in found]
+    ringing = 0.0, math.exp(-wishes.least_decay_per_s * wishes.period_s)  # its bristle's damping is the joint's own
+    falling = 0.0, wishes.slow_disc or SLOW_DISCS[-1]
     return Programme(
         [j.mode for j in found],
         performs,
@@ -118,7 +121,7 @@ def programme(design: Design, proof: RegionProof, wishes: Wishes) -> Programme:
         e,
         proof.position_weight,
         proof.torque_weight,
-        [disc if p else (0.0, wishes.slow_disc or SLOW_DISCS[-1]) for p in performs],
+        [falling if not j.performs else ringing if j.mode == "sticking" else disc for j in found],
         wishes.solver,
         2 + fed_commands(Timing(design.period_s, design.model.total_delay_s, design.velocity_cutoff_hz)),
     )
