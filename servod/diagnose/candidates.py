@@ -13,6 +13,7 @@ from time import monotonic
 from servod.diagnose.effects import effect, effects
 from servod.diagnose.fit import Fit, Fitter
 from servod.diagnose.hypothesis import Term
+from servod.diagnose.parallel import side_by_side
 from servod.diagnose.scene import Scene
 
 #: Starts that go on to the second round and its steps; effects that are fitted to the end and steps of such a fit.
@@ -49,14 +50,15 @@ class Trials:
 
     def run(self, skip: Iterable[str] = ()) -> list[Candidate]:
         """Candidates fitted to the end, best first, then the others; effects in `skip` are not tried."""
-        first = [c for what in effects() if what.name not in skip for c in self._starts(what.name)]
+        names = [what.name for what in effects() if what.name not in skip]
+        first = [c for found in side_by_side("starts", self._starts, names) for c in found]
         first.sort(key=lambda c: c.left)
-        second = [self._second(c) for c in best_of_each(first, SECOND_ROUND, 2)]
+        second = side_by_side("starts", self._second, best_of_each(first, SECOND_ROUND, 2))
         second.sort(key=lambda c: c.left)
         chosen = best_of_each(second, len(second), 1)
         limit = chosen[0].left + IN_REACH * max(1.0 - chosen[0].left, 0.0) if chosen else 0.0
         close = [c for c in chosen if c.left <= limit][:FULL_FITS]
-        fitted = sorted((self._full(c) for c in close), key=lambda c: c.left)
+        fitted = sorted(side_by_side("starts", self._full, close), key=lambda c: c.left)
         return fitted + [c for c in chosen if c.effect not in {f.effect for f in fitted}]
 
     def _starts(self, name: str) -> list[Candidate]:

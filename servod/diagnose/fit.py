@@ -17,6 +17,7 @@ from pydantic import ValidationError
 
 from servod.axis_model import AxisModel
 from servod.diagnose.hypothesis import Hypothesis
+from servod.diagnose.parallel import side_by_side
 from servod.diagnose.predict import Predictor
 
 Array = NDArray[np.float64]
@@ -139,7 +140,8 @@ class Fitter:
     def derivatives(self, fit: Fit, keep_columns: int = 0) -> Array:
         """Derivative of the mismatch by each coordinate, N*m; forward differences, backward at an upper bound."""
         columns = [fit.jacobian[:, i] for i in range(min(keep_columns, fit.jacobian.shape[1]))]
-        columns += [self._column(fit, i) for i in range(len(columns), len(fit.coordinates))]
+        left = range(len(columns), len(fit.coordinates))
+        columns += side_by_side("columns", lambda index: self._column(fit, index), left)
         return np.column_stack(columns)
 
     def _column(self, fit: Fit, index: int) -> Array:

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from servod.axis_model import AxisModel
 from servod.diagnose.innovation_kernel import innovate
+from servod.diagnose.parallel import released
 from servod.diagnose.trace import Trace
 from servod.models import open_loop
-from servod.models.compiled import Kernel, available, compiled
 from servod.models.layout import P_DELAY_S, P_GAP, P_START_C, S_FIRST_S
 from servod.models.plant import rest_state
 from servod.models.start import FirstRow
@@ -86,10 +86,6 @@ def _steps(trace: Trace, step: Array) -> NDArray[np.int64]:
     return np.where(slow, np.maximum(base, STEPS_AT_REVERSAL), base)
 
 
-def _kernel(function: Kernel) -> Kernel:
-    return compiled(function) if available() else function
-
-
 class Predictor:
     """Mismatch of any model with fixed recordings; the scale of torque is that of the nominal model."""
 
@@ -102,7 +98,7 @@ class Predictor:
         self.slices = tuple(slice(int(a), int(b)) for a, b in zip([0, *ends[:-1]], ends, strict=True))
         self.counts = np.concatenate([self._counting(trace) for trace in self.traces])
         self.evaluations = 0
-        self._run, self._follow = _kernel(innovate), _kernel(open_loop.follow)
+        self._run, self._follow = released(innovate), released(open_loop.follow)
 
     def _counting(self, trace: Trace) -> NDArray[np.bool_]:
         """Rows that count: those of the trace, once the observer has settled behind each start."""
