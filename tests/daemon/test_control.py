@@ -196,7 +196,7 @@ def test_many_samples_go_ahead_in_pieces_and_few_do_not(served: Served) -> None:
 def test_widest_piece_fits_into_a_line(served: Served) -> None:
     with ControlClient(served.path) as client:
         client.call(Verb.TRACK, positions_rad=[-1.2345678901234567e-300] * (PIECE_SAMPLES + 1))
-        with pytest.raises(BadInput, match="at most 65536 bytes"):
+        with pytest.raises(BadInput, match=f"at most {MAX_LINE_BYTES} bytes"):
             client.call(Verb.GAINS_LOAD, text="x" * MAX_LINE_BYTES)
 
 
@@ -272,7 +272,7 @@ def test_long_line_is_refused_before_anything_is_made_of_it(served: Served) -> N
     connection.sendall(b'{"id":1,"verb":"status","args":{"a":[' + b"[]," * 22_000 + b"[]]}}\n")
     answer = _line(connection)
     assert (answer["error"]["exit_code"], answer["id"]) == (2, None)
-    assert "at most 65536 bytes" in answer["error"]["message"]
+    assert f"at most {MAX_LINE_BYTES} bytes" in answer["error"]["message"]
     connection.close()
 
 
