@@ -269,7 +269,7 @@ def test_line_without_end_loses_its_connection(served: Served) -> None:
 
 def test_long_line_is_refused_before_anything_is_made_of_it(served: Served) -> None:
     connection = _raw(served)
-    connection.sendall(b'{"id":1,"verb":"status","args":{"a":[' + b"[]," * 22_000 + b"[]]}}\n")
+    connection.sendall(b'{"id":1,"verb":"status","args":{"a":[' + b"[]," * (MAX_LINE_BYTES // 3) + b"[]]}}\n")
     answer = _line(connection)
     assert (answer["error"]["exit_code"], answer["id"]) == (2, None)
     assert f"at most {MAX_LINE_BYTES} bytes" in answer["error"]["message"]
