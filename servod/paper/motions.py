@@ -38,8 +38,8 @@ STEADY_SHARE = 0.01
 SWING_S = (0.1, 0.4)
 #: A torque that swings by more than this, half of F_S from peak to peak, oscillates [N*m].
 OSCILLATES_NM = 0.5 * FRICTION.static
-#: Reference velocities around zero [rad/s]: a sixth of the peak of (19).
-SLOW_RAD_S = 0.01
+#: Reference velocities around zero [rad/s]: a third of the peak of (19).
+SLOW_RAD_S = 0.02
 _COLUMNS = (Row.DOB, Row.LUGRE_BETTER, Row.TABLE1, Row.DEPLOYED)
 
 
