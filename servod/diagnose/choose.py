@@ -163,7 +163,7 @@ class Chooser:
             if candidate.left > candidates[0].left + CLOSE * (1.0 - candidates[0].left):
                 break
             settled = self.settled(candidate.fit.hypothesis, candidate.fit.coordinates, present.mismatch)
-            self.floor = min(self.floor, noise_floor(self.predictor, settled.mismatch))
+            self.lower_floor(settled.mismatch)
             merit = self.merit(present, settled)
             if self.deserves(merit, settled) and (settled.converged or merit.share >= SURE_SHARE):
                 others = [c for c in candidates if c.effect != candidate.effect]
@@ -174,6 +174,10 @@ class Chooser:
             if self._significant(merit, settled):
                 choice.minor.setdefault(candidate.effect, merit)
         return False
+
+    def lower_floor(self, mismatch: Array) -> None:
+        """Take a mismatch into account that shows a lower floor than those before."""
+        self.floor = min(self.floor, noise_floor(self.predictor, mismatch), self.error(mismatch))
 
     def _candidates(self, present: Fit) -> list[Candidate]:
         """All effects tried beside the present fit, best first."""

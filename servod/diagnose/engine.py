@@ -87,6 +87,8 @@ def diagnose(
     choice = chooser.run()
     seconds["search"] = monotonic() - begun - seconds["intake"]
     choice.fit = tidied(chooser, choice.fit)
+    chooser.lower_floor(choice.fit.mismatch)
+    choice.floor = chooser.floor
     evidence = _evidence(predictor, chooser, choice, tell)
     while (worse := _worse_unseen(evidence)) is not None:
         choice.drop(worse, evidence.less[worse])
