@@ -23,11 +23,13 @@ from servod.verify.vertices import Span, fed_commands, joints
 
 #: Cut-offs of the velocity filter that are tried, the quietest first; above 800 Hz the encoder shakes the torque.
 CUTOFFS_HZ = (300.0, 500.0, 800.0)
+#: Those of an encoder so coarse that at 300 Hz each of its steps is half of the friction.
+COARSE_CUTOFFS_HZ, COARSE_COUNTS = (150.0, 300.0, 500.0), 2.0**18
 #: Pole radii asked for where the Stribeck curve falls, best first.
 SLOW_DISCS = (0.985, 0.998)
 #: Torque costs these shares of its weight in Omega_L, the first that is feasible: where the bristle holds the joint,
 #: more gain risks little, but with two cycles of delay too much of it shakes the joint on its bristle.
-LOW_TORQUE_SHARES = (0.1, 0.5, 2.0)
+LOW_TORQUE_SHARES = (0.3, 1.0, 3.0)
 POSITION_BANDWIDTH_RAD_S = 120.0  # sets the scale of positions, and with it what alpha and beta mean
 RELAX_STEPS = 6
 
@@ -50,13 +52,20 @@ class Wishes:
     solver: str = "CLARABEL"
 
     @property
+    def cutoffs_hz(self) -> tuple[float, ...]:
+        """Cut-offs of the velocity filter to try, in their order."""
+        if self.cutoff_hz is not None:
+            return (self.cutoff_hz,)
+        return COARSE_CUTOFFS_HZ if 0.0 < self.counts_per_turn <= COARSE_COUNTS else CUTOFFS_HZ
+
+    @property
     def spans(self) -> tuple[Span, Span]:
         """Omega_L and Omega_H, which share the overlap."""
         return Span("low", 0.0, self.overlap[1]), Span("high", self.overlap[0], self.speed_max)
 
     def choices(self) -> Iterator[Wishes]:
         """What was left open, narrowed: every cut-off with every pole radius where friction falls, best first."""
-        for cutoff in (self.cutoff_hz,) if self.cutoff_hz else CUTOFFS_HZ:
+        for cutoff in self.cutoffs_hz:
             for slow in (self.slow_disc,) if self.slow_disc else SLOW_DISCS:
                 yield replace(self, cutoff_hz=cutoff, slow_disc=slow)
 
