@@ -1,7 +1,8 @@
 """The README's tables that come from the code. `python tests/house/readme.py` writes them anew.
 
-`--measure` first runs `servoctl bench` and `servoctl demo --fast` with the README's gain sets (a quarter of an hour on
-an idle machine) and writes what they print; `--bench FILE` and `--demo FILE` take documents that were kept (--json).
+`--measure` first runs `servoctl bench`, `servoctl paper` and `servoctl demo --fast` with the README's gain sets (twenty
+minutes on an idle machine) and writes what they print; `--bench FILE`, `--paper FILE` and `--demo FILE` take documents
+that were kept (--json).
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from servod.config import AxisConfig
 from servod.demo.entries import entries
 from servod.drivers.quirks import QUIRKS
 from servod.errors import FAULTS
+from servod.paper.table import quotation
 from servod.shipped import shipped
 
 #: Gain sets beside the four controllers in the README: the local law without each option and without any, with
@@ -158,7 +160,7 @@ def tracking(document: dict[str, Any]) -> str:
 def printed(arguments: list[str], folder: str) -> dict[str, Any]:
     """The JSON document of one command of servoctl."""
     command = [sys.executable, "-m", "servod.cli", *arguments, "--json"]
-    if arguments[0] == "demo":
+    if arguments[0] in ("demo", "paper"):
         command += ["--out", folder]
     document: dict[str, Any] = json.loads(
         subprocess.run(command, stdout=subprocess.PIPE, cwd=README.parent, check=True).stdout
@@ -169,21 +171,27 @@ def printed(arguments: list[str], folder: str) -> dict[str, Any]:
 def main() -> None:
     """Write the tables, and what was measured when that is asked for or given."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--measure", action="store_true", help="run both commands and write what they print")
+    parser.add_argument("--measure", action="store_true", help="run the commands and write what they print")
     parser.add_argument("--bench", type=Path, help="document of `servoctl bench --json`")
     parser.add_argument("--demo", type=Path, help="document of the README's `servoctl demo --json`")
+    parser.add_argument("--paper", type=Path, help="paper.json of `servoctl paper`")
     options = parser.parse_args()
-    documents = {name: json.loads(file.read_text()) for name in ("bench", "demo") if (file := getattr(options, name))}
+    documents = {name: json.loads(file.read_text()) for name in MEASURED if (file := getattr(options, name))}
     if options.measure:
         with tempfile.TemporaryDirectory(prefix="servod-readme-") as folder:
-            documents = {"demo": printed(demo_arguments(), folder), "bench": printed(["bench"], folder)}
+            commands = {"demo": demo_arguments(), "bench": ["bench"], "paper": ["paper"]}
+            documents = {name: printed(arguments, folder) for name, arguments in commands.items()}
     text = with_tables(README.read_text())
     for name, document in documents.items():
         text = with_section(text, name, MEASURED[name](document))
     README.write_text(text)
 
 
-MEASURED: dict[str, Callable[[dict[str, Any]], str]] = {"bench": measured, "demo": tracking}
+MEASURED: dict[str, Callable[[dict[str, Any]], str]] = {
+    "bench": measured,
+    "demo": tracking,
+    "paper": quotation,
+}
 
 if __name__ == "__main__":
     main()
