@@ -14,6 +14,7 @@ import readme
 import source
 
 from servod.cli.app import app
+from servod.paper.table import QUANTITIES
 
 TEXT = readme.README.read_text()
 
@@ -21,6 +22,12 @@ TEXT = readme.README.read_text()
 def test_the_tables_are_current() -> None:
     """`python tests/house/readme.py` writes them anew."""
     assert readme.with_tables(TEXT) == TEXT
+
+
+def test_the_papers_table_has_the_rows_that_are_printed() -> None:
+    (part,) = re.findall(r"<!-- paper: from the code -->\n(.*?)<!-- paper: end -->", TEXT, re.DOTALL)
+    numbers = part.split("\n\n")[0].splitlines()[2:]
+    assert tuple(line.split(" | ")[0].removeprefix("| ") for line in numbers) == QUANTITIES
 
 
 def test_every_servoctl_command_that_is_shown_exists() -> None:
