@@ -7,16 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from servod.axis_model import LugreFriction
 from servod.gain_design import Uncertainty
 from servod.gain_parameters import LocalParameters
-from servod.gains import parse_gains
+from servod.gains import GainSet, parse_gains
 from servod.models.simulate import LoopSettings, simulate_closed_loop
 from servod.references import paper
 from servod.synthesize import deployed
 from servod.synthesize.deployed import Wishes
-from servod.synthesize.gain_set import with_feedback
+from servod.synthesize.gain_set import synthesize, with_feedback
 from servod.synthesize.regions import pole_disc
+from servod.verify.checks import speeds_of
+from servod.verify.margins import Sweep
 from servod.verify.proof import closed, region_margin
+from servod.verify.sampled import Timing
+from servod.verify.steady_friction import steady_friction
 from tests.synthesize.designs import table1, table1_set
 
 
@@ -98,3 +103,62 @@ def test_the_disc_lies_inside_decay_and_damping(decay: float, damping: float) ->
     s = np.log(z) / 0.001
     assert (s.real <= -decay + 1e-6).all()
     assert (-s.real / np.abs(s) >= damping - 1e-3).all()
+
+
+def test_feeding_the_last_commands_back_is_worth_disk_margin() -> None:
+    gains = table1_set()
+    law = gains.parameters
+    assert isinstance(law, LocalParameters) and gains.design is not None
+    low, high = law.regions.low, law.regions.high
+    assert low.k_u and high.k_u
+    plain = {
+        name: region.model_copy(
+            update={
+                "k_x_per_rad": region.k_x_per_rad / (1.0 + sum(region.k_u or [])),
+                "k_v_s_per_rad": region.k_v_s_per_rad / (1.0 + sum(region.k_u or [])),
+                "k_u": None,
+            }
+        )
+        for name, region in (("low", low), ("high", high))
+    }
+    without = law.model_copy(update={"regions": law.regions.model_copy(update=plain)})
+    timing = Timing(gains.design.period_s, gains.design.model.total_delay_s, gains.design.velocity_cutoff_hz)
+    margins = [
+        Sweep(gains.law, p.pack(), steady_friction(table1()), timing, speeds_of(gains.design, 16)).disk_margin()[0]
+        for p in (law, without)
+    ]
+    assert margins[0] > 1.2 * margins[1]
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.0, 1.2])
+def test_friction_that_changes_after_the_design_hardly_shows(factor: float) -> None:
+    gains, joint = table1_set(), table1()
+    assert gains.design is not None and isinstance(joint.friction, LugreFriction)
+    f = joint.friction
+    assert f.static is not None
+    update = {"coulomb": f.coulomb * factor, "static": f.static * factor, "viscous": f.viscous * factor}
+    motion = np.array([paper(k * 1e-3) for k in range(12_000)])
+    settings = LoopSettings(velocity_cutoff_hz=gains.design.velocity_cutoff_hz)
+    changed = joint.model_copy(update={"friction": f.model_copy(update=update)})
+    run = simulate_closed_loop(changed, gains.law.step, gains.pack(), motion, settings)
+    assert np.sqrt(np.mean(run.tracking_error_rad(1.0) ** 2)) < 0.025e-3
+
+
+@pytest.mark.parametrize("amplitude_rad", [0.1, -0.01])
+def test_a_step_comes_to_rest_within_two_hundredths_of_a_milliradian(amplitude_rad: float) -> None:
+    gains = table1_set()
+    assert gains.design is not None
+    motion = np.zeros((8000, 3))
+    motion[:, 0] = amplitude_rad
+    settings = LoopSettings(velocity_cutoff_hz=gains.design.velocity_cutoff_hz, torque_limit_nm=0.3)
+    run = simulate_closed_loop(table1(), gains.law.step, gains.pack(), motion, settings, start=(0.0, 0.0, 0.0))
+    assert np.ptp(run.position_rad[1000:]) < 2e-5
+    assert np.abs(run.true_velocity_rad_s).max() < 2.0
+
+
+def test_with_two_cycles_of_delay_there_is_still_a_design() -> None:
+    slow = table1().model_copy(update={"delay_s": 0.002})
+    gains = synthesize(slow)
+    assert isinstance(gains, GainSet) and isinstance(gains.parameters, LocalParameters)
+    assert gains.parameters.disturbance_observer is not None
+    assert len(gains.parameters.regions.high.k_u or []) == 3
