@@ -133,10 +133,14 @@ class GainsActivateArgs(Strict):
 
 
 class GainsVerdictArgs(Strict):
-    """`gains_keep` and `gains_rollback`: what was measured and why, for the history of the store."""
+    """`gains_keep` and `gains_rollback`: what was measured and why, for the history of the store.
+
+    A `gains_rollback` with `trial` ends a trial and does nothing else.
+    """
 
     note: str = Field("", max_length=4000)
     figures: dict[str, float] = Field(default_factory=dict, max_length=64)
+    trial: bool = False
 
 
 class RecordStartArgs(Strict):

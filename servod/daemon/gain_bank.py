@@ -22,6 +22,7 @@ from servod.gains import require_fit
 
 log = logging.getLogger("servod.gains")
 
+_NO_TRIAL = "no gain set is on trial"
 #: Sends a command to the loop and gives what to wait for.
 SendOrder = Callable[[Op, Sequence[float]], Wait]
 
@@ -87,12 +88,14 @@ class GainBank:
         """Make the set on trial the active one."""
         tried, self._tried = self._tried, None
         if tried is None:
-            raise AnswerIsNo("no gain set is on trial")
+            raise AnswerIsNo(_NO_TRIAL)
         yield FutureWait(slow.submit(self._store.activate, tried.name, tried.version, args.note, args.figures))
         return _row(tried)
 
     def rollback(self, args: GainsVerdictArgs, send: SendOrder, slow: ThreadPoolExecutor) -> Flow:
         """Go back to the set that was active before; from a trial, to the one that is."""
+        if self._tried is None and args.trial:
+            raise AnswerIsNo(_NO_TRIAL)
         if self._tried is not None:
             return (yield from self._reject(self._tried, args, send, slow))
         stored: StoredSet = yield FutureWait(slow.submit(self._store.previous))

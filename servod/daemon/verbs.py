@@ -52,6 +52,7 @@ _UNPOWERED = (
     DriveState.FAULT,
 )
 _STOP_TIMEOUT_S = 5.0
+_LEFT = GainsVerdictArgs(note="the client that tried it left", trial=True)
 
 
 class Verbs:
@@ -71,6 +72,7 @@ class Verbs:
         self._orders, self._flows = Orders(), Flows()
         self._uploaded = Table()
         self._reference_seq = 0  # the last motion's command
+        self._leases_ended = 0
         self.slow = ThreadPoolExecutor(max_workers=1, thread_name_prefix="slow")
         self._table: dict[Verb, Callable[[Any], Flow]] = {
             Verb.STATUS: self._status,
@@ -106,9 +108,9 @@ class Verbs:
     def lease_ended(self) -> None:
         """Samples that the client sent ahead are void, and a gain set that it tried is not kept."""
         self._uploaded = Table()
+        self._leases_ended += 1
         if self._bank.on_trial:
-            why = GainsVerdictArgs(note="the client that tried it left")
-            self._flows.start(self._gains_rollback(why), Reply(lambda _answer: None, None))
+            self._flows.start(self._gains_rollback(_LEFT), Reply(lambda _answer: None, None))
 
     def tick(self, records: list[CycleRecord], now_ns: int) -> None:
         """Go on with everything that waited for these records, or for time."""
@@ -213,7 +215,12 @@ class Verbs:
         return self._bank.list(record.controller if record else 0, self.slow)
 
     def _gains_activate(self, args: GainsActivateArgs) -> Flow:
-        return self._attach_gains(self._bank.activate(args, self._send, self.slow))
+        """A trial whose client left before it began ends at once."""
+        leases = self._leases_ended
+        result = yield from self._attach_gains(self._bank.activate(args, self._send, self.slow))
+        if args.trial and self._leases_ended != leases:
+            yield from self._gains_rollback(_LEFT)
+        return result
 
     def _gains_keep(self, args: GainsVerdictArgs) -> Flow:
         return self._bank.keep(args, self.slow)

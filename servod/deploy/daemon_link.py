@@ -100,7 +100,7 @@ class DaemonDeployLink:
 
     def give_up(self, note: str, figures: dict[str, float]) -> None:
         """Change back to the active set."""
-        self._client.call(Verb.GAINS_ROLLBACK, note=note, figures=figures)
+        self._client.call(Verb.GAINS_ROLLBACK, note=note, figures=figures, trial=True)
 
     def _moves(self) -> bool:
         """Wait a little; whether the motion still runs. Raises AnswerIsNo when the axis is not enabled any more."""

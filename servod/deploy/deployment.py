@@ -6,6 +6,7 @@ the new one when it proved itself, else the one of before.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from servod.config import AxisConfig
 from servod.deploy.judge import complaints
 from servod.deploy.links import DeployLink, Rows
-from servod.errors import FAULTS, AnswerIsNo, BadInput, Reaction, faults_in
+from servod.errors import FAULTS, AnswerIsNo, BadInput, Reaction, ServodError, faults_in
 from servod.gain_design import Design
 from servod.gains import GainSet, Promise, require_certificate, require_same_loop
 from servod.verify.validation import Figures, ValidationMotion, motion_for
@@ -133,10 +134,11 @@ class _Trial:
         )
 
     def abandon(self, why: str) -> None:
-        """Back to the present set, when another one is on trial."""
+        """Back to the present set, when another one is on trial; a daemon goes back by itself when this client ends."""
         if self._on_trial:
             self._on_trial = False
-            self._link.give_up(why, {})
+            with contextlib.suppress(ServodError):
+                self._link.give_up(why, {})
 
     def _after(self, before: Figures) -> tuple[Rows | None, Figures | None, list[str]]:
         """The motion under the new set: cycles, figures, and what speaks against it."""
@@ -148,11 +150,8 @@ class _Trial:
             after = self._figures(rows)
         except AnswerIsNo as error:
             return rows, None, [str(error)]
-        return (
-            rows,
-            after,
-            [*limits_met(motions_in(rows)[0]), *complaints(before, after, self._promised, self._count_rad)],
-        )
+        reasons = [*limits_met(motions_in(rows)[0]), *complaints(before, after, self._promised, self._count_rad)]
+        return rows, after, [*reasons, *(skipped(rows) if reasons else [])]
 
     def _end(self, before: Figures, after: Figures | None, reasons: list[str]) -> None:
         figures = {f"before_{key}": value for key, value in before.document().items()}
@@ -192,6 +191,16 @@ def limits_met(rows: Rows) -> list[str]:
     """What had to be limited in these cycles, by the table of faults. A step may be limited, a sine may not."""
     met = int(np.bitwise_or.reduce(rows["faults"])) & _CLIPS
     return [f"{fault.code.name}: {fault.cause}" for fault in faults_in(met)]
+
+
+def skipped(rows: Rows) -> list[str]:
+    """What a loop that does not keep time makes doubtful."""
+    missed, cycles = int(rows["missed"][-1] - rows["missed"][0]), int(rows["cycle"][-1] - rows["cycle"][0])
+    if not missed:
+        return []
+    return [
+        f"the loop skipped {missed} of {cycles} cycles, and no promise holds then: see `servoctl bench`, and try again"
+    ]
 
 
 def _every_cycle(rows: Rows) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

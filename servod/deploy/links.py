@@ -80,7 +80,7 @@ class DeployLink(Protocol):
         ...
 
     def give_up(self, note: str, figures: dict[str, float]) -> None:
-        """Change back to the active set."""
+        """Change back to the active set; nothing where no set is on trial."""
         ...
 
 
@@ -148,18 +148,17 @@ class SteppedDeployLink:
 
     def keep(self, note: str, figures: dict[str, float]) -> None:
         """Make the set on trial the store's active one."""
-        tried, self._tried = self._on_trial(), None
+        tried, self._tried = self._tried, None
+        assert tried is not None  # `attempt` came before
         self._store.activate(tried.name, tried.version, note, figures)
 
     def give_up(self, note: str, figures: dict[str, float]) -> None:
         """The store's active set runs again."""
-        tried, self._tried = self._on_trial(), None
+        tried, self._tried = self._tried, None
+        if tried is None:
+            return
         self._change(self._active())
         self._store.reject(tried.name, tried.version, note, figures)
-
-    def _on_trial(self) -> StoredSet:
-        assert self._tried is not None  # `attempt` came before
-        return self._tried
 
     def _active(self) -> StoredSet:
         stored = self._store.active()

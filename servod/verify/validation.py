@@ -40,7 +40,10 @@ SLOW_HZ, SLOW_PERIODS = 0.5, 4
 #: The brisk sine is as fast as the cycle can sample well: this many cycles to a period, at most so many Hz.
 BRISK_HZ, BRISK_CYCLES, BRISK_PERIODS = 12.5, 60, 16
 REST_S, STEP_S = 0.5, 1.0
-#: Periods at the start of each sine that are not judged: it begins with a jump of the velocity.
+#: A sine swells from nothing before its periods and fades behind them, in this time: a jump of the velocity would ask
+#: a stiff law for more than the torque limits give.
+SWELL_S = 0.25
+#: Periods at the start of each sine that are not judged: the law settles.
 SLOW_SKIPPED, BRISK_SKIPPED = 1, 4
 STEP_SHARE = 0.05  # of the slow sine's amplitude: a stiff law answers a larger step with its whole torque
 #: What is held is judged from here after the step on.
@@ -70,10 +73,9 @@ class ValidationMotion:
     @property
     def sines(self) -> Array:
         """Positions of the first half, one for each cycle: rest, slow sine, rest, brisk sine, rest."""
-        t_slow, t_brisk = self._times(SLOW_PERIODS / SLOW_HZ), self._times(BRISK_PERIODS / self.brisk_hz)
         rest = np.zeros(self._count(REST_S))
-        slow = self.slow_rad * np.sin(2.0 * math.pi * SLOW_HZ * t_slow)
-        brisk = self.brisk_rad * np.sin(2.0 * math.pi * self.brisk_hz * t_brisk)
+        slow = self._sine(self.slow_rad, SLOW_HZ, SLOW_PERIODS)
+        brisk = self._sine(self.brisk_rad, self.brisk_hz, BRISK_PERIODS)
         return np.concatenate([rest, slow, rest, brisk, rest])
 
     def rows(self) -> Array:
@@ -90,9 +92,9 @@ class ValidationMotion:
 
         Raises ValueError when a part is too short.
         """
-        slow_start = self._count(REST_S)
+        slow_start, swell = self._count(REST_S) + self._count(SWELL_S), self._count(SWELL_S)
         slow = self._periods(sine_error_rad, slow_start, SLOW_HZ, SLOW_PERIODS)[SLOW_SKIPPED:]
-        brisk_start = 2 * slow_start + self._count(SLOW_PERIODS / SLOW_HZ)
+        brisk_start = 2 * slow_start + self._count(SLOW_PERIODS / SLOW_HZ) + swell
         brisk = self._periods(sine_error_rad, brisk_start, self.brisk_hz, BRISK_PERIODS)[BRISK_SKIPPED:]
         hold = [float(np.ptp(held[self._count(HOLD_FROM_S) :])) for held in held_rad]
         return Figures({Part.SLOW: tuple(slow), Part.BRISK: tuple(brisk), Part.HOLD: tuple(hold)})
@@ -105,9 +107,14 @@ class ValidationMotion:
             raise ValueError("the motion was not run to its end")
         return [float(np.sqrt(np.mean(part**2))) for part in parts]
 
-    def _times(self, duration_s: float) -> Array:
-        times: Array = np.arange(1, self._count(duration_s) + 1, dtype=np.float64) * self.period_s
-        return times
+    def _sine(self, amplitude_rad: float, frequency_hz: float, periods: int) -> Array:
+        """So many periods, with their swelling before and their fading behind."""
+        swell, cycles = self._count(SWELL_S), self._count(periods / frequency_hz)
+        k = np.arange(1 - swell, cycles + swell + 1, dtype=np.float64)
+        inside = np.clip(np.minimum(k + swell, cycles + swell - k) / swell, 0.0, 1.0)
+        envelope = 0.5 - 0.5 * np.cos(math.pi * inside)
+        wave: Array = amplitude_rad * envelope * np.sin(2.0 * math.pi * frequency_hz * self.period_s * k)
+        return wave
 
     def _count(self, duration_s: float) -> int:
         return round(duration_s / self.period_s)

@@ -42,8 +42,8 @@ def test_a_broken_promise_is_named(part: Part) -> None:
 def test_figures_are_read_per_period_without_the_first_ones() -> None:
     motion = ValidationMotion(0.001, 0.02, 0.004, 8.0, 0.002)
     error = np.zeros(len(motion.sines))
-    error[500 : 500 + 2000] = 1.0  # the first period of the slow sine
-    error[500 + 2000 : 500 + 4000] = 0.5
+    error[750 : 750 + 2000] = 1.0  # the first period of the slow sine
+    error[750 + 2000 : 750 + 4000] = 0.5
     held = np.concatenate([np.linspace(0.0, 1.0, 500), np.linspace(1.0, 1.2, 500)])
     found = motion.figures(error, (held, held))
     assert found.of[Part.SLOW] == (0.5, 0.0, 0.0)

@@ -9,7 +9,7 @@ from servod.commission.files import CERTIFICATE, DESIGN, GAINS, write_json, writ
 from servod.commission.walk import Walk
 from servod.errors import AnswerIsNo
 from servod.gains import load_gains
-from servod.verify.certify import SEED, verify
+from servod.verify.certify import SEED, source_sha256, verify
 
 
 @dataclass(frozen=True)
@@ -21,8 +21,8 @@ class Verify:
     outputs: tuple[str, ...] = (GAINS, CERTIFICATE)
 
     def inputs(self, walk: Walk) -> dict[str, Any]:
-        """The set, and how thoroughly it is judged."""
-        return {**walk.hashes(DESIGN), "plants": walk.options.plants, "seed": SEED}
+        """The set, how thoroughly it is judged, and by which sources."""
+        return {**walk.hashes(DESIGN), "plants": walk.options.plants, "seed": SEED, "tool": source_sha256()}
 
     def run(self, walk: Walk) -> None:
         """Raises AnswerIsNo when the set is not valid; then nothing is left but the document."""
