@@ -35,6 +35,9 @@ WORTH_SHARE, WORTH_TORQUE, LEAST_TORQUE = 0.05, 0.03, 0.008
 #: of the rest as it was is not what the rest is made of.
 LEAST_OF_LEFT = 0.25
 
+#: Robust deviations beyond which a mismatch is a blow, and counts no more for what is left.
+BLOW = 8.0
+
 #: Rows that show where an effect acts: its torque there is this quantile of what it changes.
 ACTS_AT = 0.98
 
@@ -205,8 +208,10 @@ class Chooser:
         fitter = self.fitter(with_term.mismatch)
         cost = fitter.cost(without.hypothesis, without.coordinates, without.mismatch)
         gain = 2.0 * (cost - with_term.cost) / self._correlation(with_term.mismatch, fitter.weighing.scale)
-        left = max(self.error(without.mismatch) - self.floor, 1e-30)
-        return Merit(saved / explainable, saved / left, float(np.quantile(changed, ACTS_AT)) / self.predictor.dry, gain)
+        blow = BLOW * float(np.median(np.abs(with_term.mismatch[self.predictor.counts]))) / 0.6745
+        was, now = (self.error(np.clip(fit.mismatch, -blow, blow)) for fit in (without, with_term))
+        of_left = (was - now) / max(was - self.floor, 1e-30)
+        return Merit(saved / explainable, of_left, float(np.quantile(changed, ACTS_AT)) / self.predictor.dry, gain)
 
     def _correlation(self, mismatch: Array, scale: float) -> float:
         """By how much correlated rows exaggerate a gain: long-run over plain variance, at least 1."""

@@ -100,9 +100,14 @@ def _factor(nominal: Document, fitted: Document, key: str) -> float:
 
 def confidence(choice: Choice, index: int) -> float:
     """Probability that the name of a term is right, from how far its best rival stayed behind."""
-    left = [ratio for _, ratio in _rivals(choice, index)]
-    gap = math.log(max(min(left, default=math.inf), 1.0)) if left else math.inf
-    return round(0.5 + 0.49 * (1.0 - math.exp(-gap / GAP)), 3)
+    own = len(choice.fit.hypothesis.terms[index].unknowns)
+    gaps = [math.log(max(ratio, 1.0)) + GAP * _more_unknowns(rival, own) for rival, ratio in _rivals(choice, index)]
+    return round(0.5 + 0.49 * (1.0 - math.exp(-min(gaps, default=math.inf) / GAP)), 3)
+
+
+def _more_unknowns(rival: Candidate, own: int) -> int:
+    """Unknowns that a rival needs beyond the finding's own: one that only does as well with more is no evidence."""
+    return max(len(rival.fit.hypothesis.terms[-1].unknowns) - own, 0)
 
 
 def alternatives(choice: Choice, index: int) -> list[str]:

@@ -16,6 +16,9 @@ Array = NDArray[np.float64]
 #: Lengths of windows that are tried, s, and windows that are kept.
 LENGTHS_S, KEPT = (0.2, 0.5, 1.0, 2.0, 4.0), 2
 
+#: A shorter push is a blow that any mass behind a gap or spring can make, s.
+SHORTEST_S = 0.12
+
 #: The form of a window that comes at the same time after the start of every recording.
 EVERY = "in every recording"
 
@@ -67,7 +70,7 @@ def _term(scene: Scene, start: float, length: float, torque: float, shifts: tupl
     most = 50.0 * max(scene.dry, 0.2 * scene.effort)
     unknowns = (
         Unknown("start_s", "s", start, start - 2.0 * length, start + 2.0 * length, 0.05, nudge=0.05),
-        Unknown("length_s", "s", length, 0.02, 4.0 * length, nudge=0.02),
+        Unknown("length_s", "s", length, SHORTEST_S, 4.0 * length, nudge=0.02),
         Unknown("torque", scene.force, torque, -most, most, scene.dry),
     )
 
