@@ -11,7 +11,8 @@ from servod.cli.common import JsonOption, example, need_folder, print_json
 
 _HELP = example(
     "Measure wake-up (against cyclictest), cycle work, two processes on the wall clock, stepped and simulated "
-    "speed, and memory. Takes about 13 minutes, most of it watching memory; --quick takes about one.",
+    "speed, memory, and how long synthesis, certificate and commissioning take. Takes about 18 minutes, most of it "
+    "watching memory; --quick takes about two, without a commissioning.",
     "servoctl bench",
     "servoctl bench --quick --json",
 )

@@ -37,6 +37,8 @@ def test_a_trial_is_run_kept_and_undone(tmp_path: Path) -> None:
             assert link.config.name == "tried"
             with pytest.raises(AnswerIsNo, match="trial"):
                 link.keep("nothing to keep", {})
+            with pytest.raises(AnswerIsNo, match="trial"):
+                link.give_up("nothing to give up", {})
             link.enable()
             link.attempt(*link.load(local))
             parts = motions_in(link.run(motion, 0.1, lambda _share: None))
