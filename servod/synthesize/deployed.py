@@ -29,7 +29,7 @@ COARSE_CUTOFFS_HZ, COARSE_COUNTS = (150.0, 300.0, 500.0), 2.0**18
 SLOW_DISCS = (0.985, 0.998)
 #: Torque costs these shares of its weight in Omega_L, the first that is feasible: where the bristle holds the joint,
 #: more gain risks little, but with two cycles of delay too much of it shakes the joint on its bristle.
-LOW_TORQUE_SHARES = (0.3, 1.0, 3.0)
+LOW_TORQUE_SHARES = (0.6, 2.0)
 POSITION_BANDWIDTH_RAD_S = 120.0  # sets the scale of positions, and with it what alpha and beta mean
 RELAX_STEPS = 6
 

@@ -42,7 +42,7 @@ OBSERVERS_RAD_S = (80.0, 60.0, 45.0, 34.0, 25.0, 18.0, 12.0, 7.0)
 DISK_WANTED = 0.15
 FEW_SPEEDS = 12  # per direction, at which a bandwidth is looked for; what is found is judged as the certificate does
 STABLE = 0.9999  # largest pole: the certificate looks between the corners and between these speeds as well
-LOW_FACTOR = 2.5  # bandwidth in Omega_L over that in Omega_H: on its bristle a joint then rests in half a second
+LOW_FACTOR = 3.0  # bandwidth in Omega_L over that in Omega_H: on its bristle a joint then rests in half a second
 #: From this bandwidth on no other choice of filter and poles is tried.
 ENOUGH_RAD_S = 20.0
 LIMIT_SHARE = 1.5  # bound of the compensated force, as a share of the largest friction
