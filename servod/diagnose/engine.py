@@ -34,11 +34,7 @@ SEARCH_SHARE = 0.75
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found. Without any recording that can tell, only `refused` and `verdict` mean anything.
-
-    `named` are places of terms in `choice.fit`; `less` are the fits without each of them; `held` has the mismatch by
-    fits that have not seen it: "before" (the base), "after", and one for each named term without it.
-    """
+    """What was found; without any recording that can tell there is no evidence."""
 
     nominal: AxisModel
     refused: list[Refusal]
@@ -49,7 +45,12 @@ class Diagnosis:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Everything behind a verdict on recordings that can tell."""
+    """Everything behind a verdict on recordings that can tell.
+
+    `named` are places of terms in the fit and `less` the fits without each of them; `before`, `after` and `without` are
+    by fits that have not seen the rows. `attempt` is the share of the explainable error that known physics
+    removes, also where its names may not stand.
+    """
 
     traces: tuple[Trace, ...]
     predictor: Predictor
@@ -64,6 +65,7 @@ class Evidence:
     unnamed: Unnamed | None
     maps_before: list[Map]
     maps_after: list[Map]
+    attempt: float
 
     @property
     def fit(self) -> Fit:
@@ -126,6 +128,7 @@ def _evidence(predictor: Predictor, chooser: Chooser, choice: Choice, tell: Tell
         unnamed=None,
         maps_before=maps(predictor, choice.base.mismatch),
         maps_after=maps(predictor, fit.mismatch),
+        attempt=errors.removed,
     )
 
 

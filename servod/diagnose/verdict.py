@@ -17,6 +17,10 @@ from servod.diagnose.candidates import Candidate
 from servod.diagnose.choose import Choice
 from servod.diagnose.hypothesis import Document, get
 
+#: Below this share of the explainable error no known name may stand: what is there is something else. Real machines
+#: keep some of theirs above it, so that it is no nearer to 1; confidence falls with what is left instead.
+LEAST_EXPLAINED = 0.7
+
 #: What is left above the noise floor counts as unexplained from this share of dry friction, if it is also this share of
 #: what could be explained.
 LEFT_TORQUE, LEFT_SHARE = 0.02, 0.05
@@ -26,6 +30,10 @@ ALIKE = 1.2
 
 #: Confidence 0.5 + 0.49*(1 - exp(-gap/GAP)); gap: logarithm of what the best rival leaves over what the finding leaves.
 GAP = 0.15
+
+
+#: From this share of the explainable error removed on, what is left says nothing against the names.
+FULLY = 0.95
 
 
 class Verdict(StrEnum):
@@ -62,7 +70,8 @@ def shares(choice: Choice, counts: np.ndarray[tuple[int], np.dtype[np.bool_]]) -
 def verdict(choice: Choice, named: list[int], errors: Shares, dry: float) -> Verdict:
     """The verdict on what was named (places of terms) and what is left."""
     left = errors.left / dry
-    if left > LEFT_TORQUE and 1.0 - errors.removed > LEFT_SHARE:
+    much = left > LEFT_TORQUE and 1.0 - errors.removed > LEFT_SHARE
+    if much and (not named or errors.removed < LEAST_EXPLAINED):
         return Verdict.UNEXPLAINED
     return Verdict.MISSING_PHYSICS if named else Verdict.ADEQUATE
 
@@ -98,11 +107,15 @@ def _factor(nominal: Document, fitted: Document, key: str) -> float:
     return max(was, now) / min(was, now) if min(was, now) > 0.0 else 1.0
 
 
-def confidence(choice: Choice, index: int) -> float:
-    """Probability that the name of a term is right, from how far its best rival stayed behind."""
+def confidence(choice: Choice, index: int, removed: float) -> float:
+    """Probability that the name of a term is right, from how far its best rival stayed behind.
+
+    `removed` is the share of the explainable error that all names together remove: what they leave may be their fault.
+    """
     own = len(choice.fit.hypothesis.terms[index].unknowns)
     gaps = [math.log(max(ratio, 1.0)) + GAP * _more_unknowns(rival, own) for rival, ratio in _rivals(choice, index)]
-    return round(0.5 + 0.49 * (1.0 - math.exp(-min(gaps, default=math.inf) / GAP)), 3)
+    sure = 0.5 + 0.49 * (1.0 - math.exp(-min(gaps, default=math.inf) / GAP))
+    return round(sure * min(1.0, removed / FULLY), 3)
 
 
 def _more_unknowns(rival: Candidate, own: int) -> int:
