@@ -129,7 +129,7 @@ class GainsConfig(Strict):
 
     directory: Path = Path("/var/lib/servod/gains")
     initial: Path
-    accept_uncertified: bool = Field(False, description="run gain sets without a valid certificate")
+    accept_uncertified: bool = Field(False, description="run gain sets that carry no certificate")
 
 
 class ControlConfig(Strict):

@@ -139,13 +139,14 @@ class GainSet(Strict):
     def parameters_sha256(self) -> str:
         """Hash of law and parameters in canonical form: JSON, sorted keys, no blanks, shortest exact numbers.
 
-        Defaults are written out, so that a changed default changes the hash; comments and notes do not.
+        Defaults are written out, so that a changed default changes the hash; comments and notes do not. A key that is
+        not there counts as none, so that an optional key of a later version leaves the hash as it is.
         """
-        return _digest(self.parameters.model_dump(mode="json"))
+        return _digest(self.parameters.model_dump(mode="json", exclude_none=True))
 
     def content_sha256(self) -> str:
         """Hash of the whole set but its seal, in the same canonical form."""
-        return _digest(self.model_dump(mode="json", exclude={"seal"}))
+        return _digest(self.model_dump(mode="json", exclude={"seal"}, exclude_none=True))
 
     def sealed(self) -> GainSet:
         """The same set with a seal that fits: every later change of a number shows."""
@@ -158,14 +159,14 @@ class GainSet(Strict):
 
     def certificate_problem(self) -> str | None:
         """Why the set does not count as certified, in a few words; None when it does."""
+        if self.seal_broken:
+            return "numbers that were changed after the set was sealed"
         if self.certificate is None:
             return "no certificate"
         if not self.certificate.valid:
             return "a certificate that says valid: false"
         if self.certificate.parameters_sha256 != self.parameters_sha256():
             return "a certificate for other parameters (they were changed after it was issued)"
-        if self.seal_broken:
-            return "numbers that were changed after the set was sealed"
         return None
 
     def to_yaml(self) -> str:
@@ -199,24 +200,28 @@ def load_gains(path: str | Path) -> GainSet:
 
 
 def require_certificate(gains: GainSet, accept_uncertified: bool) -> None:
-    """Refuse a set without a valid certificate unless told to accept it. Raises BadInput."""
+    """Refuse a set without a valid certificate. Raises BadInput.
+
+    `accept_uncertified` lets a set pass that carries no certificate at all; one whose certificate says no or is for
+    other numbers, or whose seal is broken, never passes.
+    """
     problem = gains.certificate_problem()
-    if problem and not accept_uncertified:
-        raise BadInput(
-            f"gain set {gains.name}: certificate",
-            problem,
-            "a valid one (`servoctl verify` issues it), or gains.accept_uncertified: true in the configuration",
-        )
+    if problem is None:
+        return
+    where, issue = f"gain set {gains.name}: certificate", "a valid one (`servoctl verify` issues it)"
+    if gains.certificate is not None or gains.seal_broken:
+        raise BadInput(where, problem, issue)
+    if not accept_uncertified:
+        raise BadInput(where, problem, f"{issue}, or gains.accept_uncertified: true in the configuration")
 
 
 def require_fit(gains: GainSet, config: AxisConfig) -> None:
-    """Refuse a set that this axis may not run: no valid certificate, or one for another cycle or velocity filter.
+    """Refuse a set that this axis may not run: no certificate that counts, or one for another cycle or velocity filter.
 
-    Raises BadInput, unless the configuration accepts uncertified sets.
+    Raises BadInput. The configuration may accept sets without a certificate, but not one of another loop.
     """
     require_certificate(gains, config.gains.accept_uncertified)
-    if not config.gains.accept_uncertified:
-        require_same_loop(gains, config)
+    require_same_loop(gains, config)
 
 
 def require_same_loop(gains: GainSet, config: AxisConfig) -> None:

@@ -11,6 +11,7 @@ from servod.config import load_config
 from servod.controllers import LAWS, local
 from servod.errors import BadInput
 from servod.gain_design import Design
+from servod.gain_parameters import PdParameters
 from servod.gains import GainSet, load_gains, parse_gains, require_certificate, require_fit
 from servod.shipped import shipped
 from tests.gains import good
@@ -99,29 +100,62 @@ def test_a_certificate_counts_until_a_number_changes() -> None:
     tampered = parse_gains(
         gains.to_yaml().replace("position_gain_nm_per_rad: 2.5", "position_gain_nm_per_rad: 2.6"), "t"
     )
-    with pytest.raises(BadInput, match="they were changed after it was issued"):
-        require_certificate(tampered, accept_uncertified=False)
-    require_certificate(tampered, accept_uncertified=True)
+    for accept_uncertified in (False, True):
+        with pytest.raises(BadInput, match="they were changed after it was issued"):
+            require_certificate(tampered, accept_uncertified)
 
 
-@pytest.mark.parametrize(
-    ("gains", "problem"),
-    [
-        (parse_gains(good.PD, "x"), "no certificate"),
-        (good.certified(parse_gains(good.PD, "x"), valid=False), "a certificate that says valid: false"),
-    ],
-)
-def test_without_a_valid_certificate_the_set_is_refused_in_one_line(gains: GainSet, problem: str) -> None:
+def test_a_set_without_a_certificate_passes_only_where_the_configuration_accepts_it() -> None:
+    gains = parse_gains(good.PD, "x")
+    require_certificate(gains, accept_uncertified=True)
     with pytest.raises(BadInput) as caught:
         require_certificate(gains, accept_uncertified=False)
     assert str(caught.value) == (
-        f"gain set bench_pd: certificate: found {problem}; allowed: a valid one (`servoctl verify` issues it), "
+        "gain set bench_pd: certificate: found no certificate; allowed: a valid one (`servoctl verify` issues it), "
         "or gains.accept_uncertified: true in the configuration"
     )
 
 
+@pytest.mark.parametrize("accept_uncertified", [False, True])
+@pytest.mark.parametrize(
+    ("gains", "problem"),
+    [
+        (good.certified(parse_gains(good.PD, "x"), valid=False), "a certificate that says valid: false"),
+        (
+            parse_gains(good.PD, "x").model_copy(update={"seal": "0" * 64}),
+            "numbers that were changed after the set was sealed",
+        ),
+    ],
+)
+def test_a_certificate_that_says_no_and_a_broken_seal_are_refused_always(
+    gains: GainSet, problem: str, accept_uncertified: bool
+) -> None:
+    with pytest.raises(BadInput) as caught:
+        require_certificate(gains, accept_uncertified)
+    assert str(caught.value) == (
+        f"gain set bench_pd: certificate: found {problem}; allowed: a valid one (`servoctl verify` issues it)"
+    )
+
+
+def test_an_optional_key_of_a_later_version_leaves_certificate_and_seal_as_they_are() -> None:
+    class LaterParameters(PdParameters):
+        later: float | None = None
+
+    class LaterSet(GainSet):
+        later: float | None = None
+
+    gains = good.certified(parse_gains(good.PD, "good.yaml")).sealed()
+    content = {key: getattr(gains, key) for key in GainSet.model_fields}
+    parameters = LaterParameters(**gains.parameters.model_dump())
+    later = LaterSet.model_construct(**content | {"parameters": parameters})
+    assert later.certificate_problem() is None
+    used = LaterSet.model_construct(**content | {"parameters": parameters, "later": 1.0})
+    assert used.seal_broken
+
+
 def test_a_set_designed_for_another_filter_or_cycle_does_not_fit_the_axis() -> None:
     config = load_config(shipped("gains/config/virtual.yaml"))
+    assert config.gains.accept_uncertified  # which does not make another loop the same one
     strict = config.model_copy(update={"gains": config.gains.model_copy(update={"accept_uncertified": False})})
     certified = good.certified(parse_gains(good.PD, "good.yaml"))
 
@@ -130,9 +164,9 @@ def test_a_set_designed_for_another_filter_or_cycle_does_not_fit_the_axis() -> N
         return certified.model_copy(update={"design": design}).sealed()
 
     cutoff_hz = config.encoder.velocity_cutoff_hz
-    require_fit(designed(0.001, cutoff_hz), strict)
-    with pytest.raises(BadInput, match=r"design\.velocity_cutoff_hz: found 500\.0"):
-        require_fit(designed(0.001, 500.0), strict)
-    with pytest.raises(BadInput, match=r"design\.period_s: found 0\.002"):
-        require_fit(designed(0.002, cutoff_hz), strict)
-    require_fit(designed(0.002, 500.0), config)  # told to accept what is not certified
+    for axis in (strict, config):
+        require_fit(designed(0.001, cutoff_hz), axis)
+        with pytest.raises(BadInput, match=r"design\.velocity_cutoff_hz: found 500\.0"):
+            require_fit(designed(0.001, 500.0), axis)
+        with pytest.raises(BadInput, match=r"design\.period_s: found 0\.002"):
+            require_fit(designed(0.002, cutoff_hz), axis)
