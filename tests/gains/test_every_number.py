@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import datetime
+import functools
+import operator
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -46,13 +48,20 @@ def numbers(node: Any, at: Path = ()) -> Iterator[Path]:
 @contextmanager
 def changed(document: Any, path: Path) -> Iterator[Any]:
     """The file's content with the number at `path` changed by a millionth, or from 0 to a billionth."""
-    node = document
-    for key in path[:-1]:
-        node = node[key]
-    value = node[path[-1]]
-    node[path[-1]] = value * (1.0 + 1e-6) if value else 1e-9
-    yield document
-    node[path[-1]] = value
+    value = functools.reduce(operator.getitem, path, document)
+    with replaced(document, path, value * (1.0 + 1e-6) if value else 1e-9):
+        yield document
+
+
+@contextmanager
+def replaced(document: Any, path: Path, number: float) -> Iterator[None]:
+    """The file's content with `number` at `path`."""
+    node = functools.reduce(operator.getitem, path[:-1], document)
+    value, node[path[-1]] = node[path[-1]], number
+    try:
+        yield
+    finally:
+        node[path[-1]] = value
 
 
 def accepted(document: Any) -> bool:
@@ -94,3 +103,12 @@ def test_a_changed_hash_or_a_removed_seal_is_refused_as_well() -> None:
     assert accepted(document)
     assert not accepted({key: value for key, value in document.items() if key != "seal"})
     assert not accepted(document | {"seal": "0" * 64})
+
+
+@pytest.mark.parametrize("number", [float("nan"), float("inf")])
+def test_a_number_that_is_not_finite_is_bad_input_wherever_it_stands(number: float) -> None:
+    document = parse_yaml(table1_set().to_yaml(), "set")
+    for path in chosen(document):
+        with replaced(document, path, number), pytest.raises(BadInput) as caught:
+            validate(document, GainSet, "set")
+        assert f"set: {'.'.join(map(str, path))}: found {number}" in str(caught.value)
