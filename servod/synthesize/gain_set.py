@@ -46,6 +46,7 @@ LOW_FACTOR = 3.0  # bandwidth in Omega_L over that in Omega_H: on its bristle a 
 #: From this bandwidth on no other choice of filter and poles is tried.
 ENOUGH_RAD_S = 20.0
 LIMIT_SHARE = 1.5  # bound of the compensated force, as a share of the largest friction
+OBSERVER_SHARE = 2.5  # bound of the estimate: friction that turned against a z_hat that a step leaves as it was
 APPROACH = 3.0  # speed with which a step is approached, as a factor on the map's highest
 HOLD_COUNTS = 0.6  # hold width in encoder counts: what rounding hides, and no more, for the joint creeps as far
 
@@ -111,7 +112,7 @@ def parameters(
             bandwidth_rad_s=bandwidth,
             low_bandwidth_rad_s=LOW_FACTOR * bandwidth,
             inertia_kg_m2=friction.inertia,
-            disturbance_limit_nm=largest,
+            disturbance_limit_nm=OBSERVER_SHARE * largest,
         )
         if bandwidth
         else None,
