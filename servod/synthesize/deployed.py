@@ -159,10 +159,10 @@ def _rows(matrix: Array | None) -> list[list[float]] | None:
 
 def proven(design: Design, frame: RegionProof, p: Programme, solution: Solution) -> RegionProof:
     """The region's proof with all matrices as plain numbers."""
-    names, _, _, _ = scaled_vertices(design, frame)
+    found, _, _, _ = scaled_vertices(design, frame)
     vertices = [
         Vertex(
-            name=names[i],
+            name=found[i].name,
             mode=p.modes[i],
             a=_rows(p.a[i]) or [],
             b=p.b[i].tolist(),
@@ -173,11 +173,11 @@ def proven(design: Design, frame: RegionProof, p: Programme, solution: Solution)
             lyapunov_h2=_rows(solution.lyapunov_h2[i]),
             output=_rows(solution.outputs[i]),
         )
-        for i in range(len(names))
+        for i in range(len(found))
     ]
     slack = {mode: _rows(matrix) or [] for mode, matrix in solution.slack.items()}
-    found = {"feedback": solution.feedback.tolist(), "slack": slack, "vertices": vertices}
-    return RegionProof.model_validate(frame.model_dump() | found)
+    solved = {"feedback": solution.feedback.tolist(), "slack": slack, "vertices": vertices}
+    return RegionProof.model_validate(frame.model_dump() | solved)
 
 
 def region(design: Design, span: Span, wishes: Wishes) -> RegionProof | None:
@@ -222,11 +222,11 @@ def clashing_vertices(design: Design, span: Span, wishes: Wishes) -> Iterator[st
     p = programme(design, frame, wishes)
     feedback = np.concatenate([first_feedback(p), np.zeros(p.a.shape[-1] - p.fed)])
     poles = np.linalg.eigvals(p.a + p.b[:, :, None] * feedback)
-    names, _, _, _ = scaled_vertices(design, frame)
-    for name, roots, (centre, radius) in zip(names, poles, p.discs, strict=True):
+    found, _, _, _ = scaled_vertices(design, frame)
+    for joint, roots, (centre, radius) in zip(found, poles, p.discs, strict=True):
         outside = float(np.abs(roots - centre).max()) / radius
         if outside >= 1.0:
-            yield f"{span.name}: {name}: poles at {outside:.3f} of the disc (1 allowed)"
+            yield f"{span.name}: {joint.name}: poles at {outside:.3f} of the disc (1 allowed)"
 
 
 def explain(model: AxisModel, wishes: Wishes) -> Infeasible:

@@ -18,7 +18,7 @@ from servod.verify.closed_loop import Deviation, corners, inner_points
 from servod.verify.margins import NOMINAL, Sweep, largest_tolerated
 from servod.verify.plants import drawn
 from servod.verify.position_slope import position_slopes
-from servod.verify.proof import region_margin, stored_deviation
+from servod.verify.proof import disc_reach, region_margin, stored_deviation
 from servod.verify.sampled import Timing
 from servod.verify.steady_friction import steady_friction
 from servod.verify.trials import hold_ripple, monte_carlo, ramp_ripples
@@ -75,7 +75,7 @@ def speeds_of(design: Design, count: int) -> list[float]:
 
 def at_least(name: str, value: float, limit: float) -> CertificateCheck:
     """A check whose figure must not be below its limit; figures are kept finite."""
-    value = float(np.clip(value, -1e12, 1e12))
+    value = float(np.clip(np.nan_to_num(value, nan=-1e12), -1e12, 1e12))
     return CertificateCheck(name=name, value=value, limit=limit, margin=value - limit, passed=bool(value >= limit))
 
 
@@ -90,12 +90,19 @@ def check_seal(s: Subject) -> Iterator[CertificateCheck]:
     yield at_most("numbers changed since the set was sealed (0 no, 1 yes)", float(s.gains.seal_broken), 0.0)
 
 
+def check_law(s: Subject) -> Iterator[CertificateCheck]:
+    """The proofs are of the local law; the gains of another are compared with nothing, and so prove nothing."""
+    other = not isinstance(s.gains.parameters, LocalParameters)
+    yield at_most("a law that the proofs are not of (0 no, 1 yes)", float(other), 0.0)
+
+
 def check_regions(s: Subject) -> Iterator[CertificateCheck]:
     """LMIs by eigenvalues; stored vertices as the model says; the law's gains as proven."""
     local = s.gains.parameters
     for region in s.design.regions:
         margin, _ = region_margin(region)
         yield at_least(f"LMI of region {region.name}, least relative eigenvalue", margin, 0.0)
+        yield at_most(f"pole discs of region {region.name}, largest |c| + r", disc_reach(region), 1.0)
         yield at_most(f"vertices of region {region.name} against the model", stored_deviation(s.design, region), SAME)
         if isinstance(local, LocalParameters):
             own = getattr(local.regions, region.name)
@@ -176,6 +183,7 @@ def observations(s: Subject) -> dict[str, float]:
 #: Cheap ones first: a set that fails them is not simulated.
 STATIC: tuple[Callable[[Subject], Iterator[CertificateCheck]], ...] = (
     check_seal,
+    check_law,
     check_regions,
     check_stiffness,
     check_loop,

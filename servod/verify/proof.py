@@ -6,16 +6,20 @@ inequality holds when it is positive.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from servod.gain_design import Design, RegionProof, Vertex
 from servod.verify.sampled import Array, Timing
 from servod.verify.steady_friction import steady_friction
-from servod.verify.vertices import Span, joints, sampled_vertices
+from servod.verify.vertices import Joint, Span, joints, sampled_vertices
 
 
 def relative_margin(matrix: Array) -> float:
-    """Least eigenvalue of the symmetric part, as a share of the largest magnitude of its eigenvalues."""
+    """Least eigenvalue of the symmetric part, as a share of the largest magnitude of its eigenvalues; NaN stays NaN."""
+    if not np.isfinite(matrix).all():
+        return math.nan
     values = np.linalg.eigvalsh(0.5 * (matrix + matrix.T))
     return float(values[0] / np.abs(values).max())
 
@@ -59,35 +63,48 @@ def vertex_margin(region: RegionProof, vertex: Vertex) -> float:
     if vertex.lyapunov_h2 is None or vertex.output is None:
         return margin
     p = np.array(vertex.lyapunov_h2)
-    return min(
-        margin,
-        relative_margin(h2_state_block(a, np.array(vertex.e), slack, p)),
-        relative_margin(h2_output_block(c, slack, p, np.array(vertex.output))),
-    )
+    state = relative_margin(h2_state_block(a, np.array(vertex.e), slack, p))
+    output = relative_margin(h2_output_block(c, slack, p, np.array(vertex.output)))
+    return float(np.min([margin, state, output]))
 
 
 def region_margin(region: RegionProof) -> tuple[float, str]:
-    """(least relative margin over all vertices, the vertex that has it)."""
-    return min((vertex_margin(region, vertex), vertex.name) for vertex in region.vertices)
+    """(least relative margin over all vertices, the vertex that has it); NaN counts as the least."""
+    margins = [vertex_margin(region, vertex) for vertex in region.vertices]
+    least = int(np.argmin(margins))
+    return margins[least], region.vertices[least].name
 
 
-def scaled_vertices(design: Design, region: RegionProof) -> tuple[list[str], Array, Array, Array]:
-    """Names and scaled (A, B, E) of the region's vertices, made anew from the design's model and intervals."""
+def disc_reach(region: RegionProof) -> float:
+    """Largest |c| + r of the stored pole discs: up to 1 a disc lies in the unit circle, and to be in it is to decay."""
+    return float(np.max([abs(vertex.disc_centre) + vertex.disc_radius for vertex in region.vertices]))
+
+
+def scaled_vertices(design: Design, region: RegionProof) -> tuple[list[Joint], Array, Array, Array]:
+    """Joints and scaled (A, B, E) of the region's vertices, made anew from the design's model and intervals."""
     span = Span(region.name, region.speed_from_rad_s, region.speed_to_rad_s)
     found = joints(steady_friction(design.model), span, design.uncertainty)
     timing = Timing(design.period_s, design.model.total_delay_s, design.velocity_cutoff_hz)
     a, b, e = sampled_vertices(found, timing)
     scale = np.array(region.scale)
     torque = region.torque_scale_nm
-    return [j.name for j in found], a * (scale / scale[:, None]), b * torque / scale, e * torque / scale
+    return found, a * (scale / scale[:, None]), b * torque / scale, e * torque / scale
 
 
 def stored_deviation(design: Design, region: RegionProof) -> float:
-    """Largest difference between the stored vertices and those made anew; infinite when they are not the same ones."""
-    names, a, b, e = scaled_vertices(design, region)
-    if names != [vertex.name for vertex in region.vertices]:
-        return float("inf")
-    return max(
-        float(max(np.abs(a[i] - v.a).max(), np.abs(b[i] - v.b).max(), np.abs(e[i] - v.e).max()))
-        for i, v in enumerate(region.vertices)
-    )
+    """Largest difference between the stored vertices and those made anew.
+
+    Infinite when they are not the same ones of the same mode, and where one that is to perform has no H2 proof.
+    """
+    found, a, b, e = scaled_vertices(design, region)
+    if [(joint.name, joint.mode) for joint in found] != [(vertex.name, vertex.mode) for vertex in region.vertices]:
+        return math.inf
+    if any(joint.performs and not proves_h2(vertex) for joint, vertex in zip(found, region.vertices, strict=True)):
+        return math.inf
+    pairs = [pair for i, v in enumerate(region.vertices) for pair in ((a[i], v.a), (b[i], v.b), (e[i], v.e))]
+    return float(np.max([np.abs(made - np.array(stored)).max() for made, stored in pairs]))
+
+
+def proves_h2(vertex: Vertex) -> bool:
+    """Whether the vertex has both matrices of its H2 proof."""
+    return vertex.lyapunov_h2 is not None and vertex.output is not None

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
+
 from servod.gain_parameters import LocalParameters
 from servod.gains import CertificateCheck
 from servod.verify.checks import SAME, Subject, at_least, at_most
@@ -31,5 +33,6 @@ def check_reference(s: Subject) -> Iterator[CertificateCheck]:
             own = getattr(local.regions, proof.name)
             used = (own.k_z_per_rad, own.k_x_per_rad, own.k_v_s_per_rad)
             pairs = list(zip(used, gain_numbers(proof), strict=True))
-            away = max(abs(x - y) / max(abs(x), abs(y), 1e-12) for x, y in pairs) + sum(map(abs, own.pack_memory()))
+            worst = float(np.max([abs(x - y) / max(abs(x), abs(y), 1e-12) for x, y in pairs]))
+            away = worst + sum(map(abs, own.pack_memory()))
             yield at_most(f"gains of region {proof.name} against the proven ones", away, SAME)

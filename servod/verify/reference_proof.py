@@ -49,7 +49,7 @@ def reference_margin(design: Design, proof: ReferenceProof) -> float:
     rows = output_rows(proof, p, y)
     blocks = [p, np.block([[np.array(proof.bound), rows], [rows.T, p]])]
     blocks += [block for vertex in found for block in vertex_blocks(proof, vertex).values()]
-    return min(_balanced_margin(block) for block in blocks)
+    return float(np.min([_balanced_margin(block) for block in blocks]))
 
 
 def _balanced_margin(matrix: Array) -> float:
@@ -64,7 +64,7 @@ def stored_polytope_deviation(design: Design, law: LocalFriction, proof: Referen
     made = polytope(steady_friction(design.model), law, span, design.uncertainty)
     kept = Polytope.stored(proof)
     pairs = [(getattr(made, name)[i], getattr(kept, name)[i]) for name in Polytope.__dataclass_fields__ for i in (0, 1)]
-    return max(float(abs(x - y) / max(abs(x), abs(y), 1e-12)) for x, y in pairs)
+    return float(np.max([abs(x - y) / max(abs(x), abs(y), 1e-12) for x, y in pairs]))
 
 
 def gain_numbers(proof: ReferenceProof) -> tuple[float, float, float]:
