@@ -14,15 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from servod.config import AxisConfig
 from servod.control import ControlClient, Verb
+from servod.daemon_config import daemon_config
 from servod.deploy.links import FADE_S, Rows, Tell
-from servod.errors import AnswerIsNo, ServodError, Unreachable
+from servod.errors import AnswerIsNo, ServodError
 from servod.gains import GainSet
 from servod.recorder_read import read_recording
 from servod.recordings.rows import ROW
 from servod.verify.validation import STEP_S, ValidationMotion
-from servod.yaml12 import parse_yaml, validate
 
 _POLL_S = 0.05
 
@@ -32,7 +31,7 @@ class DaemonDeployLink:
 
     def __init__(self, client: ControlClient) -> None:
         self._client = client
-        self.config = _config_of(client)
+        self.config = daemon_config(client)
 
     @property
     def active(self) -> tuple[str, int]:
@@ -110,15 +109,3 @@ class DaemonDeployLink:
             why = "; ".join(f"{f['code']}: {f['cause']} {f['remedy']}" for f in status["faults"])
             raise AnswerIsNo(f"the axis went to {status['axis']['state']}. {why}")
         return bool(status["axis"]["motion_running"])
-
-
-def _config_of(client: ControlClient) -> AxisConfig:
-    """The daemon's configuration, out of a recording of a moment."""
-    path = Path(client.call(Verb.RECORD_START)["path"])
-    client.call(Verb.RECORD_STOP)
-    attached = read_recording(path).attachments.get("config.yaml")
-    if attached is None:
-        raise Unreachable(f"{path}: the daemon attached no configuration")
-    with contextlib.suppress(OSError):  # it may be the daemon's alone
-        path.unlink()
-    return validate(parse_yaml(attached.decode(), str(path)), AxisConfig, str(path))
