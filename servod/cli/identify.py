@@ -97,13 +97,15 @@ class _Walk(NamedTuple):
     resume: bool
 
     def on(self, link: Link, tell: Tell, subject: str) -> Analysis:
-        """Run all experiments on this axis; `subject` says which one it is."""
+        """Run all experiments on this axis, and switch it off whatever ends them; `subject` says which one it is."""
+        from servod.demo.processes import sigterm_as_interrupt
         from servod.identify.walk import identify as walk
 
-        return walk(
-            link, self.folder, tell, travel_rad=self.travel, speed_rad_s=self.speed, seed=self.seed,
-            resume=self.resume, subject=subject,
-        )  # fmt: skip
+        with sigterm_as_interrupt():
+            return walk(
+                link, self.folder, tell, travel_rad=self.travel, speed_rad_s=self.speed, seed=self.seed,
+                resume=self.resume, subject=subject,
+            )  # fmt: skip
 
 
 def _from_recordings(folder: Path) -> Job:

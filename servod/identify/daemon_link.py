@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from servod.config import AxisConfig
 from servod.control import ControlClient, Verb
+from servod.daemon_config import require_daemon_config
 from servod.errors import ServodError
 from servod.gain_parameters import PdParameters
 from servod.gains import GainSet, Provenance
@@ -30,11 +31,15 @@ _POLL_S = 0.05
 
 
 class DaemonLink:
-    """An axis on the wall clock. `config` must be the file that the daemon was started with."""
+    """An axis on the wall clock. The feedback of the experiments is only on trial: afterwards, also when this client
+    dies, the gain set of before runs again and is still the stored active one.
+    """
 
     offset_ns: int | None = None
 
     def __init__(self, client: ControlClient, config: AxisConfig) -> None:
+        """`config` must be the file that the daemon was started with. Raises BadInput, naming the first other key."""
+        require_daemon_config(client, config)
         self._client, self.config = client, config
 
     def enable(self) -> float:
@@ -44,7 +49,7 @@ class DaemonLink:
         return float(self._client.call(Verb.STATUS)["motion"]["position_rad"])
 
     def set_gains(self, position_nm_per_rad: float, velocity_nms_per_rad: float) -> None:
-        """Load and activate a PD set; the daemon must accept sets without a certificate for this."""
+        """Load a PD set and run it on trial; the daemon must accept sets without a certificate for this."""
         parameters = PdParameters(
             law="pd",
             position_gain_nm_per_rad=position_nm_per_rad,
@@ -56,7 +61,7 @@ class DaemonLink:
         )
         gains = GainSet(schema_version=1, name=GAIN_NAME, parameters=parameters, provenance=source)
         self._client.call(Verb.GAINS_LOAD, name=GAIN_NAME, text=gains.to_yaml())
-        self._client.call(Verb.GAINS_ACTIVATE, name=GAIN_NAME)
+        self._client.call(Verb.GAINS_ACTIVATE, name=GAIN_NAME, trial=True)
 
     def excite(
         self, positions_rad: Sequence[float], torques_nm: Sequence[float], window_rad: float
@@ -80,9 +85,11 @@ class DaemonLink:
         return rows
 
     def disable(self) -> None:
-        """Ask for it; an axis that is off already, or a daemon that is gone, needs none."""
+        """Ask for it, and for the set of before; an axis that is off already, or a daemon that is gone, needs none."""
         with contextlib.suppress(ServodError):
             self._client.call(Verb.DISABLE)
+        with contextlib.suppress(ServodError):
+            self._client.call(Verb.GAINS_ROLLBACK, trial=True, note="the feedback of experiments, which are over")
 
     def _wait(self) -> str:
         """Wait for the end of the motion; returns why it ended early, empty when it did not."""
