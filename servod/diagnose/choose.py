@@ -159,7 +159,10 @@ class Chooser:
         return replace(fit, cost=cost, jacobian=fitter.derivatives(fit))
 
     def _add(self, choice: Choice) -> bool:
-        """Try all effects beside the present fit and take the best if it deserves it."""
+        """Try all effects beside the present fit and take the best if it deserves it.
+
+        A fit behind a gap may improve by being fitted again: what a term is worth counts from there.
+        """
         present = choice.fit
         candidates = self._candidates(present)
         for candidate in candidates:
@@ -168,7 +171,11 @@ class Chooser:
             settled = self.settled(candidate.fit.hypothesis, candidate.fit.coordinates, present.mismatch)
             self.lower_floor(settled.mismatch)
             merit = self.merit(present, settled)
-            if self.deserves(merit, settled) and (settled.converged or merit.share >= SURE_SHARE):
+            if self._enters(merit, settled):
+                bare = self.less(settled, len(settled.hypothesis.terms) - 1)
+                if self.error(bare.mismatch) < self.error(present.mismatch):
+                    choice.fit, merit = bare, self.merit(bare, settled)
+            if self._enters(merit, settled):
                 others = [c for c in candidates if c.effect != candidate.effect]
                 choice.fit = settled
                 choice.merits.append(merit)
@@ -220,6 +227,10 @@ class Chooser:
         plain = float(clipped @ clipped)
         slow = float(long_run(clipped[:, None], max(1, round(0.1 / period)))[0, 0])
         return max(slow / max(plain, 1e-30), 1.0)
+
+    def _enters(self, merit: Merit, fit: Fit) -> bool:
+        """Whether a new term may come in: it deserves it and its fit has come to an end."""
+        return self.deserves(merit, fit) and (fit.converged or merit.share >= SURE_SHARE)
 
     def deserves(self, merit: Merit, fit: Fit) -> bool:
         """Whether a term is significant and worth naming."""

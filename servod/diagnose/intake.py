@@ -135,7 +135,7 @@ def _tell_saturation(torque: Array, notes: list[str]) -> None:
 def cannot_tell(trace: Trace, model: AxisModel) -> str | None:
     """Why this recording cannot tell anything about this model; None when it can."""
     return (
-        _too_short(trace) or _too_still(trace) or _saturated(trace) or _too_noisy(trace, model) or _wrong(trace, model)
+        _too_short(trace) or _too_noisy(trace, model) or _too_still(trace) or _saturated(trace) or _wrong(trace, model)
     )
 
 

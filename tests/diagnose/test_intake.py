@@ -39,7 +39,7 @@ def test_too_still(made: Recording) -> None:
 
 
 def test_too_noisy(made: Recording) -> None:
-    noise = np.random.default_rng(1).normal(size=len(made.t_s)) * 0.1
+    noise = np.random.default_rng(1).normal(size=len(made.t_s)) * 0.3
     assert "too noisy" in refused_for(recording(made.t_s, made.torque, made.position + noise))
 
 
