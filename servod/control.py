@@ -66,7 +66,11 @@ class RemoteBadInput(BadInput):
         self.where, self.found, self.allowed = "daemon", line, ""
 
 
-_ERRORS: dict[int, type[ServodError]] = {1: AnswerIsNo, 2: RemoteBadInput}
+class Refused(Unreachable):
+    """The daemon answered, and did not do it: a limit, a state, somebody else who commands."""
+
+
+_ERRORS: dict[int, type[ServodError]] = {1: AnswerIsNo, 2: RemoteBadInput, 3: Refused}
 
 
 def encode_line(message: dict[str, Any]) -> bytes:
@@ -108,6 +112,11 @@ class ControlClient:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         self.close()
+
+    @property
+    def path(self) -> str:
+        """The socket's."""
+        return self._path
 
     def close(self) -> None:
         """Leave; gives back the right to command."""

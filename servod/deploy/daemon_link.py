@@ -16,7 +16,7 @@ import numpy as np
 
 from servod.control import ControlClient, Verb
 from servod.daemon_config import daemon_config
-from servod.deploy.links import FADE_S, Rows, Tell
+from servod.deploy.links import FADE_S, Rows, Tell, cut
 from servod.errors import AnswerIsNo, ServodError
 from servod.gains import GainSet
 from servod.recorder_read import read_recording
@@ -57,9 +57,9 @@ class DaemonDeployLink:
             self._client.call(Verb.DISABLE)
 
     def stop(self) -> None:
-        """The drive's quick stop."""
-        with contextlib.suppress(ServodError):
-            self._client.call(Verb.STOP)
+        """The drive's quick stop, over a connection of its own: an interrupt may have cut a request on the other one."""
+        with contextlib.suppress(ServodError), ControlClient(self._client.path) as client:
+            client.call(Verb.STOP)
 
     def run(self, motion: ValidationMotion, window_rad: float, tell: Tell) -> Rows:
         """Run the motion under the daemon's recorder and read its cycles back."""
@@ -69,18 +69,32 @@ class DaemonDeployLink:
             {"kind": "step", "amplitude_rad": step_rad, "duration_s": STEP_S}
             for step_rad in (motion.step_rad, -motion.step_rad)
         ]
-        return self.record([excite, *steps], lambda: tell(min(1.0, (time.monotonic() - started) / motion.duration_s)))
+
+        def told() -> None:
+            tell(min(1.0, (time.monotonic() - started) / motion.duration_s))
+
+        rows = self.record([excite], told)
+        return rows if cut(rows, motion) else np.concatenate([rows, self.record(steps, told)])
 
     def record(self, motions: Sequence[dict[str, Any]], tell: Callable[[], None] = lambda: None) -> Rows:
-        """Run motions (arguments of the verb `track`) one after the other; all cycles from the daemon's recording."""
+        """Run motions (arguments of the verb `track`) one after the other; all cycles from the daemon's recording.
+
+        Raises AnswerIsNo when the axis drops out, Refused when the daemon takes a motion not on. An interrupt stops the
+        axis before anything else is waited for.
+        """
         path = Path(self._client.call(Verb.RECORD_START)["path"])
         try:
             for motion in motions:
                 self._client.call(Verb.TRACK, **motion)
                 while self._moves():
                     tell()
-        finally:
-            self._client.call(Verb.RECORD_STOP)
+        except BaseException as error:
+            if not isinstance(error, ServodError):
+                self.stop()
+            with contextlib.suppress(ServodError):
+                self._client.call(Verb.RECORD_STOP)
+            raise
+        self._client.call(Verb.RECORD_STOP)
         return np.frombuffer(read_recording(path).rows, dtype=ROW)
 
     def load(self, gains: GainSet) -> tuple[str, int]:

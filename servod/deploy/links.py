@@ -30,6 +30,8 @@ Tell = Callable[[float], None]
 #: After a change of the set, until its offset has faded out.
 FADE_S = 1.0
 _SLICE_S = 0.25
+#: The sines may be short by so many cycles at their ends and still be whole: a record of the first may be late.
+_CUT_CYCLES = 50
 
 
 class DeployLink(Protocol):
@@ -63,8 +65,11 @@ class DeployLink(Protocol):
         ...
 
     def run(self, motion: ValidationMotion, window_rad: float, tell: Tell) -> Rows:
-        """Run the motion from where the axis stands; all its cycles. The sines end when the joint is further than
-        `window_rad` from the reference."""
+        """Run the motion from where the axis stands; all its cycles.
+
+        The sines end when the joint is further than `window_rad` from the reference. Nothing follows them then: a law
+        that lost the joint on a sine is given no step.
+        """
         ...
 
     def load(self, gains: GainSet) -> tuple[str, int]:
@@ -131,6 +136,8 @@ class SteppedDeployLink:
         session.clear()
         session.load_trajectory([*sines, *[0.0] * len(sines)])
         self._move(ReferenceKind.EXCITE, [len(sines), min(sines), max(sines), window_rad], tell, motion)
+        if cut(np.frombuffer(session.raw, dtype=ROW), motion):
+            return np.frombuffer(session.raw, dtype=ROW)
         for step_rad in (motion.step_rad, -motion.step_rad):
             self._move(ReferenceKind.STEP, [step_rad, STEP_S], tell, motion)
         return np.frombuffer(session.raw, dtype=ROW)
@@ -183,6 +190,12 @@ class SteppedDeployLink:
         with contextlib.suppress(AnswerIsNo):
             self.session.send(op)
             self.session.run(self.config.limits.ramp_down_s + 0.1)
+
+
+def cut(rows: Rows, motion: ValidationMotion) -> bool:
+    """Whether the reference of `rows`, which hold the sines alone, ended before the sines did."""
+    ran = rows["cycle"][rows["reference_active"] == 1]
+    return len(ran) == 0 or int(ran[-1]) - int(ran[0]) < len(motion.sines) - _CUT_CYCLES
 
 
 def _must(refusal: Refusal) -> None:

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from servod.axis import AxisState
 from servod.axis_model import AxisModel
 from servod.commands import Op
-from servod.deploy.deployment import deploy
-from servod.deploy.links import SteppedDeployLink
+from servod.deploy.deployment import deploy, motions_in
+from servod.deploy.links import Rows, SteppedDeployLink, Tell, cut
 from servod.deploy.virtual import pd_set, virtual_link, with_cutoff
 from servod.errors import BadInput, FaultCode
 from servod.gain_store import Action, GainStore
 from servod.verify.plants import scaled
+from servod.verify.validation import ValidationMotion, motion_for
 from tests.deploy.sets import certified
 from tests.synthesize.designs import table1
 
@@ -62,6 +64,32 @@ def test_a_limit_that_is_met_rolls_back(tmp_path: Path) -> None:
     link = virtual_link(table1(), tmp_path, certified(), PD, config=config)
     done = deploy(link, certified(), quiet)
     assert not done.stays and any(reason.startswith("TORQUE_CLIPPED") for reason in done.reasons)
+
+
+def test_a_set_that_loses_the_joint_on_a_sine_is_given_no_step(tmp_path: Path) -> None:
+    link = link_to(scaled(table1(), {"dry": 3.0, "viscous": 3.0}), tmp_path)
+    link.enable()
+    motion = motion_for(certified().design or pytest.fail("designed"))
+    rows = link.run(motion, 2e-4, lambda _share: None)
+    (sines,) = motions_in(rows)
+    assert len(sines) < len(motion.sines) and cut(rows, motion)
+    assert np.ptp(sines["reference_rad"]) < motion.travel_rad
+    assert len(motions_in(link.run(motion, 0.4, lambda _share: None))) == 3
+
+
+class Narrow(SteppedDeployLink):
+    """An axis whose window is too narrow for any set but the present one."""
+
+    def run(self, motion: ValidationMotion, window_rad: float, tell: Tell) -> Rows:
+        return super().run(motion, window_rad if self.active[0] == PD.name else 1e-5, tell)
+
+
+def test_a_cut_sine_rolls_back(tmp_path: Path) -> None:
+    link = Narrow(link_to(table1(), tmp_path).session, GainStore(tmp_path / "gains"), PD)
+    done = deploy(link, certified(), quiet)
+    assert not done.stays and done.after is None and "window" in done.reasons[0]
+    assert done.rows_after is not None and len(motions_in(done.rows_after)) == 1
+    assert link.active == ("present", 1)
 
 
 def test_a_fault_under_the_new_set_rolls_back_and_is_not_reset(tmp_path: Path) -> None:

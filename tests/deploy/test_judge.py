@@ -23,10 +23,24 @@ def test_the_same_again_is_no_worse() -> None:
 
 
 def test_worse_within_the_scatter_stays_and_beyond_it_goes() -> None:
-    before, after = figures(slow=1e-5, scatter=4e-6), figures(slow=2.5e-5, scatter=4e-6)
-    assert complaints(before, after, PROMISE, COUNT_RAD) == []
+    before = figures(slow=1e-5, scatter=4e-6)
+    assert complaints(before, figures(slow=2.5e-5 - 2e-6), PROMISE, COUNT_RAD) == []
     (said,) = complaints(figures(slow=1e-5), figures(slow=2.5e-5), PROMISE, COUNT_RAD)
     assert "slow sine went from 0.01 to 0.025 mrad" in said
+
+
+def test_a_restless_set_does_not_widen_its_own_limit() -> None:
+    before = figures(slow=1e-5)
+    calm, restless = figures(slow=2.5e-5), figures(slow=2.5e-5, scatter=2.4e-5)
+    assert complaints(before, restless, PROMISE, COUNT_RAD) == complaints(before, calm, PROMISE, COUNT_RAD) != []
+
+
+def test_a_hold_that_swings_more_than_before_goes_though_it_was_promised() -> None:
+    promised = PROMISE.model_copy(update={"hold_rad": 1e-4})
+    before = figures(hold=1e-5)
+    assert complaints(before, figures(hold=1.1e-5 + 3.9 * COUNT_RAD), promised, COUNT_RAD) == []
+    (said,) = complaints(before, figures(hold=1.1e-5 + 4.1 * COUNT_RAD), promised, COUNT_RAD)
+    assert said.startswith("swing while it holds")
 
 
 @pytest.mark.parametrize("part", list(Part))
