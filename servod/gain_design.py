@@ -26,7 +26,7 @@ class _Numbers(Strict):
 
 
 class Uncertainty(Strict):
-    """Half widths of the intervals in which the true axis lies, each a share of the model's value."""
+    """Half widths of the intervals in which the true axis lies, each a share of the model's value but the delay's."""
 
     inertia: Share = 0.05
     torque_gain: Share = 0.01
@@ -35,10 +35,15 @@ class Uncertainty(Strict):
     dry: Share = Field(0.05, description="level of dry friction")
     slope: Share = Field(0.05, description="fall of the Stribeck curve beyond the level of dry friction")
     viscous: Share = 0.1
+    delay_s: float = Field(20e-6, ge=0.0, le=0.01, description="half width in s: what a cycle jitters, at least")
 
     def scaled(self, factor: float) -> Uncertainty:
-        """All half widths times `factor`, at most 0.85."""
+        """All half widths times `factor`, shares at most 0.85."""
         return Uncertainty(**{key: min(factor * value, 0.85) for key, value in self.model_dump().items()})
+
+
+#: Keys of Uncertainty that are shares of a value of the model.
+SHARES = tuple(name for name in Uncertainty.model_fields if name != "delay_s")
 
 
 class Vertex(_Numbers):

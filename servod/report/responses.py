@@ -15,7 +15,7 @@ from servod.gain_parameters import LocalParameters, OutputObserver, RegionGains,
 from servod.report.figure import Array
 from servod.verify.closed_loop import Bristle, Deviation, JointPoint, LawSlopes, joint_point, law_slopes, loops
 from servod.verify.proof import closed
-from servod.verify.sampled import Timing
+from servod.verify.sampled import timing_of
 from servod.verify.steady_friction import steady_friction
 
 Complex = NDArray[np.complex128]
@@ -91,11 +91,6 @@ def rigid(design: Design, frequencies_hz: Array) -> Complex:
     late = np.exp(-s * (timing.delay_s + 0.5 * timing.period_s))
     response: Complex = late / (friction.inertia * s**2)
     return response
-
-
-def timing_of(design: Design) -> Timing:
-    """Period, delay and velocity filter of the design."""
-    return Timing(design.period_s, design.model.total_delay_s, design.velocity_cutoff_hz)
 
 
 def _point(design: Design, velocity: float) -> JointPoint:

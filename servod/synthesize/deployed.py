@@ -17,7 +17,7 @@ from servod.gain_parameters import RegionGains
 from servod.synthesize.lmi_deployed import Programme, Solution, synthesise
 from servod.synthesize.regions import pole_disc
 from servod.verify.proof import region_margin, scaled_vertices
-from servod.verify.sampled import Array, Timing
+from servod.verify.sampled import Array, timing_of
 from servod.verify.steady_friction import SteadyFriction, steady_friction
 from servod.verify.vertices import Span, fed_commands, joints
 
@@ -109,7 +109,7 @@ def scales(friction: SteadyFriction, design: Design) -> tuple[list[float], float
     torque = friction.largest(design.speed_max_rad_s)
     position = torque / (friction.inertia * POSITION_BANDWIDTH_RAD_S**2)
     speed = position * POSITION_BANDWIDTH_RAD_S
-    commands = fed_commands(Timing(design.period_s, design.model.total_delay_s, design.velocity_cutoff_hz))
+    commands = fed_commands(timing_of(design))
     return [position, speed, *[torque] * commands, speed, torque / friction.stiffness], torque
 
 
@@ -132,7 +132,7 @@ def programme(design: Design, proof: RegionProof, wishes: Wishes) -> Programme:
         proof.torque_weight,
         [falling if not j.performs else ringing if j.mode == "sticking" else disc for j in found],
         wishes.solver,
-        2 + fed_commands(Timing(design.period_s, design.model.total_delay_s, design.velocity_cutoff_hz)),
+        2 + fed_commands(timing_of(design)),
     )
 
 

@@ -16,10 +16,10 @@ import numpy as np
 from servod.controllers import LAWS
 from servod.gain_design import Design
 from servod.gain_parameters import LocalParameters
-from servod.verify.checks import DISK_LIMIT, speeds_of
-from servod.verify.closed_loop import corners
+from servod.verify.checks import CORNER_DISK, DISK_LIMIT, speeds_of
+from servod.verify.closed_loop import late_corners
 from servod.verify.margins import Sweep
-from servod.verify.sampled import Timing
+from servod.verify.sampled import timing_of
 from servod.verify.steady_friction import SteadyFriction
 
 #: Candidates [rad/s per unit of u* = u/K].
@@ -39,9 +39,10 @@ def with_gains(law: LocalParameters, speeds: list[float], gains: list[float]) ->
 
 def stands(design: Design, friction: SteadyFriction, law: LocalParameters, speeds: list[float]) -> bool:
     """Whether the sampled loop is stable at every corner of the intervals with the margin, at rest and at `speeds`."""
-    timing = Timing(design.period_s, design.model.total_delay_s, design.velocity_cutoff_hz)
-    sweep = Sweep(LAWS["local"], law.pack(), friction, timing, speeds)
-    return sweep.worst(corners(design.uncertainty)).radius < 1.0 and sweep.disk_margin()[0] >= MARGIN
+    sweep = Sweep(LAWS["local"], law.pack(), friction, timing_of(design), speeds)
+    late = late_corners(design.uncertainty)
+    wide = sweep.disk_margin()[0] >= MARGIN and sweep.disk_margin(late)[0] >= CORNER_DISK
+    return wide and sweep.worst(late).radius < 1.0
 
 
 def largest_gain(design: Design, friction: SteadyFriction, law: LocalParameters, speed: float) -> float:

@@ -9,14 +9,14 @@ state, disturbance observer, schedules and l_i are in it because they are in the
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
 
 from servod.controllers import Law
 from servod.controllers.state import ASKED, FRICTION_STATE, LAST_VELOCITY, N_STATES
-from servod.gain_design import Uncertainty
+from servod.gain_design import SHARES, Uncertainty
 from servod.verify.sampled import Array, Timing, with_delay_and_filter
 from servod.verify.steady_friction import SteadyFriction
 
@@ -74,7 +74,7 @@ class Deviation:
     """Factors on the model's values: one corner, or an inner point, of the intervals.
 
     `dry` scales g(v) with its slope; `slope` makes the slope steeper than that. `position_slope` is no factor: what
-    cogging, gravity and springs add as stiffness [N*m/rad].
+    cogging, gravity and springs add as stiffness [N*m/rad]; `delay_s` is added to the delay.
     """
 
     inertia: float = 1.0
@@ -85,6 +85,11 @@ class Deviation:
     slope: float = 1.0
     viscous: float = 1.0
     position_slope: float = 0.0
+    delay_s: float = 0.0
+
+
+#: Parts of the delay's interval at which inner points lie: joints of one delay are judged together.
+DELAY_STEPS = (-1.0, -0.5, 0.0, 0.5, 1.0)
 
 
 def corners(u: Uncertainty) -> list[Deviation]:
@@ -93,16 +98,23 @@ def corners(u: Uncertainty) -> list[Deviation]:
     found = []
     for signs in itertools.product((-1.0, 1.0), repeat=len(names)):
         factors = {n: 1.0 + s * getattr(u, n) for n, s in zip(names, signs, strict=True)}
-        found.append(Deviation(**factors, torque_gain=1.0 + signs[0] * -u.torque_gain, dry=1.0 + signs[3] * u.dry))
+        corner = Deviation(**factors, torque_gain=1.0 + signs[0] * -u.torque_gain, dry=1.0 + signs[3] * u.dry)
+        found += [replace(corner, delay_s=delay) for delay in sorted({-u.delay_s, u.delay_s})]
     return found
+
+
+def late_corners(u: Uncertainty) -> list[Deviation]:
+    """The corners with the longest delay: where a design is looked for, before all are judged."""
+    return [corner for corner in corners(u) if corner.delay_s == u.delay_s]
 
 
 def inner_points(u: Uncertainty, count: int, seed: int) -> list[Deviation]:
     """`count` points of the intervals, uniformly at random."""
     random = np.random.default_rng(seed)
-    names = Uncertainty.model_fields
-    draws = random.uniform(-1.0, 1.0, (count, len(names)))
-    return [Deviation(**{n: float(1.0 + d * getattr(u, n)) for n, d in zip(names, row, strict=True)}) for row in draws]
+    draws = random.uniform(-1.0, 1.0, (count, len(SHARES)))
+    delays = random.choice(DELAY_STEPS, count) * u.delay_s
+    factors = [{n: float(1.0 + d * getattr(u, n)) for n, d in zip(SHARES, row, strict=True)} for row in draws]
+    return [Deviation(**own, delay_s=float(delay)) for own, delay in zip(factors, delays, strict=True)]
 
 
 def joint_point(friction: SteadyFriction, velocity: float, bristle: Bristle, d: Deviation) -> JointPoint:
@@ -130,6 +142,24 @@ class LawSlopes:
 
     matrix: Array
     frozen: tuple[int, ...]
+
+    @property
+    def autonomous(self) -> dict[int, float]:
+        """States that go by themselves, seeing neither joint nor other states, with their pole: a leak of z_hat.
+
+        The reference drives them, the loop does not, so their pole says nothing of how well the loop is damped.
+        """
+        found = {}
+        for i in range(N_STATES):
+            row, own = self.matrix[1 + i].copy(), float(self.matrix[1 + i, 2 + i])
+            row[2 + i] = 0.0
+            if i not in self.frozen and own != 0.0 and np.allclose(row, 0.0, atol=1e-12):
+                found[i] = own
+        return found
+
+    def coupled(self) -> LawSlopes:
+        """The same without the states that go by themselves: the loop's other poles, and its frequency response."""
+        return replace(self, frozen=(*self.frozen, *self.autonomous))
 
 
 def settled_state(law: Law, gains: tuple[float, ...], velocity: float, moves: bool, period_s: float) -> list[float]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from servod.axis_effects import Asymmetry, TorqueGain
 from servod.axis_model import AxisModel, LugreFriction
-from servod.gain_design import Uncertainty
+from servod.gain_design import SHARES, Uncertainty
 
 POSITION_SHARE = 0.2  # half width of the interval of torques over position, which is no part of the LMIs
 DIRECTION_SHARE = 0.5  # of the interval of dry friction, drawn for each direction by itself
@@ -20,10 +20,13 @@ DIRECTION_SHARE = 0.5  # of the interval of dry friction, drawn for each directi
 def drawn(model: AxisModel, uncertainty: Uncertainty, seed: int, index: int) -> AxisModel:
     """Plant number `index`: every uncertain value uniform in its interval, dry friction per direction as well."""
     random = np.random.default_rng([seed, index])
-    factor = {name: float(1.0 + random.uniform(-1.0, 1.0) * getattr(uncertainty, name)) for name in FIELDS}
+    factor = {name: float(1.0 + random.uniform(-1.0, 1.0) * getattr(uncertainty, name)) for name in SHARES}
     sides = 1.0 + random.uniform(-1.0, 1.0, 2) * DIRECTION_SHARE * uncertainty.dry
     plant = scaled(model, factor, (float(sides[0]), float(sides[1])))
-    return over_position(plant, float(1.0 + random.uniform(-1.0, 1.0) * POSITION_SHARE))
+    known = over_position(plant, float(1.0 + random.uniform(-1.0, 1.0) * POSITION_SHARE))
+    least = -(model.delay.additional_s if model.delay else 0.0)  # the delay as a whole stays at least 0
+    delay_s = max(known.delay_s + float(random.uniform(-1.0, 1.0)) * uncertainty.delay_s, least, 0.0)
+    return known.model_copy(update={"delay_s": delay_s})
 
 
 def over_position(model: AxisModel, factor: float) -> AxisModel:
@@ -37,12 +40,9 @@ def over_position(model: AxisModel, factor: float) -> AxisModel:
     return model.model_copy(update=update)
 
 
-FIELDS = tuple(Uncertainty.model_fields)
-
-
 def scaled(model: AxisModel, factor: dict[str, float], sides: tuple[float, float] = (1.0, 1.0)) -> AxisModel:
     """`model` with its values times `factor` (keys of Uncertainty), dry friction per direction times `sides`."""
-    one = dict.fromkeys(FIELDS, 1.0) | factor
+    one = dict.fromkeys(SHARES, 1.0) | factor
     asymmetry = model.asymmetry or Asymmetry()
     gain = model.torque_gain or TorqueGain()
     update: dict[str, Any] = {

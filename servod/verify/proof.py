@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from servod.gain_design import Design, RegionProof, Vertex
-from servod.verify.sampled import Array, Timing
+from servod.verify.sampled import Array, timing_of
 from servod.verify.steady_friction import steady_friction
 from servod.verify.vertices import Joint, Span, joints, sampled_vertices
 
@@ -84,8 +84,7 @@ def scaled_vertices(design: Design, region: RegionProof) -> tuple[list[Joint], A
     """Joints and scaled (A, B, E) of the region's vertices, made anew from the design's model and intervals."""
     span = Span(region.name, region.speed_from_rad_s, region.speed_to_rad_s)
     found = joints(steady_friction(design.model), span, design.uncertainty)
-    timing = Timing(design.period_s, design.model.total_delay_s, design.velocity_cutoff_hz)
-    a, b, e = sampled_vertices(found, timing)
+    a, b, e = sampled_vertices(found, timing_of(design))
     scale = np.array(region.scale)
     torque = region.torque_scale_nm
     return found, a * (scale / scale[:, None]), b * torque / scale, e * torque / scale

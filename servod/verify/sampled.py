@@ -14,8 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from servod.gain_design import Design
+
 Array = NDArray[np.float64]
 WHOLE = 1e-6  # a delay nearer than this to whole periods is whole
+#: Lag in periods that counts as delay: a loop that crosses at a third of 1/period loses 5 % of its gain to it, half of
+#: what the disk margin keeps. A longer one is physics that the loop check does not know.
+LONGEST_LAG = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +51,17 @@ class Timing:
     def kept_commands(self) -> int:
         """Number of past commands that still act or wait: u_(k-1), ..., u_(k-n)."""
         return self.whole + (1 if self.part else 0)
+
+
+def timing_of(design: Design) -> Timing:
+    """Period, delay and filter that the design states, with the actuator's lag as delay.
+
+    A lag tau turns the phase by atan(w*tau), a delay of tau by w*tau, which is more at every frequency, so the loop is
+    judged later than it is. What this leaves out is the gain that the lag takes: up to LONGEST_LAG it is small.
+    """
+    model = design.model
+    lag_s = model.actuator_lag.time_constant_s if model.actuator_lag else 0.0
+    return Timing(design.period_s, model.total_delay_s + lag_s, design.velocity_cutoff_hz)
 
 
 def sample_joint(a: Array, b: Array, e: Array, timing: Timing) -> tuple[Array, Array, Array, Array]:

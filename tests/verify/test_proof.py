@@ -58,10 +58,9 @@ def test_nan_in_any_vertex_is_no_margin(key: str) -> None:
     vertex: Vertex = proof().vertices[performing()]
     matrix = np.array(getattr(vertex, key))
     matrix[0, 0] = math.nan
-
-    assert "LMI of region high, least relative eigenvalue" in failed(
-        with_vertex(performing(), **{key: matrix.tolist()})
-    )
+    region = with_vertex(performing(), **{key: matrix.tolist()})
+    assert math.isnan(region_margin(region)[0])
+    assert "LMI of region high, least relative eigenvalue" in failed(region)
 
 
 def test_a_figure_that_is_no_number_fails_its_limit() -> None:
