@@ -7,12 +7,15 @@ import pytest
 
 from servod.axis_model import AxisModel
 from servod.identify.estimate import estimate, jackknife, sandwich
-from servod.identify.fits import cogging, elastic
+from servod.identify.fits import cogging, curve, elastic, response
 from servod.identify.fits.bristle_lag import Bristle, dry_columns, follow
 from servod.identify.fits.elastic import Elastic
+from servod.identify.fits.friction_map import Side
 from servod.identify.fits.presliding import bend_factor, fundamental
 from servod.identify.fits.rigid import Rigid, response_of
+from servod.identify.shapes import multisine
 from servod.identify.signals import acting_torque, smooth
+from servod.identify.trace import Kind, Trace
 from servod.models.plant import Plant
 from servod.yaml12 import validate
 
@@ -116,7 +119,12 @@ def test_a_stiff_spring_is_a_rigid_joint():
 
 
 @pytest.mark.parametrize(
-    "joint", [Elastic(1e-3, 0.05, 0.0015, 60.0, 0.3, 0.03), Elastic(0.1, 5.0, 0.002, 95.0, 0.6, 0.02)]
+    "joint",
+    [
+        Elastic(1e-3, 0.05, 0.0015, 60.0, 0.3, 0.03),
+        Elastic(0.1, 5.0, 0.002, 95.0, 0.6, 0.02),
+        Elastic(1e-3, 0.05, 0.0015, 140.0, 0.2, 0.02),
+    ],
 )
 def test_the_resonance_of_two_masses_is_found(joint):
     frequency = np.unique(np.round(np.geomspace(3.0, 160.0, 26)))
@@ -162,3 +170,43 @@ def test_cogging_seen_through_smoothing_is_given_back_whole():
     x = np.linspace(0.0, 1.0, 200)
     seen = cogging.columns(x, [40], 0.01)
     assert seen == pytest.approx(np.exp(-0.08) * cogging.columns(x, [40]))
+
+
+def excited(disturbance_nm: list[float]) -> Trace:
+    """Strokes of a rigid joint under a multisine, each with its disturbance (RMS below 40 Hz), without gaps."""
+    joint, count, rng = Rigid(1e-3, 0.06, 0.0015, 0.0), 1000, np.random.default_rng(3)
+    lines = np.unique(np.round(np.geomspace(3.0, 160.0, 26))).astype(int)
+    wave = 0.02 * multisine(lines, lines / lines.max(), count, rng)
+    frequency = np.fft.rfftfreq(count, PERIOD_S)
+    ratio = np.concatenate([[0.0], response_of(joint, frequency[1:], PERIOD_S)])
+    ways, torques = [], []
+    for rms in disturbance_nm:
+        noise = np.fft.rfft(rng.normal(size=count)) * ((frequency > 0.0) & (frequency < 40.0))
+        noise *= rms / np.std(np.fft.irfft(noise))
+        ways.append(np.fft.irfft(ratio * (np.fft.rfft(wave) + noise), count))
+        torques.append(wave)
+    position, torque = np.concatenate([[0.0], np.cumsum(ways)]), np.append(np.concatenate(torques), 0.0)
+    settings = {"first": 0.0, "stride": float(count), "count": float(count), "strokes": float(len(ways))}
+    settings |= {f"line_{i}": float(line) for i, line in enumerate(lines)}
+    t = np.arange(len(torque)) * PERIOD_S
+    return Trace(Kind.RESPONSE, t, torque, position, position, torque, torque, position, settings)
+
+
+def test_the_interval_of_the_torque_noise_is_the_scatter_of_the_strokes():
+    steady = response.fit(excited([4e-4] * 12), 1e-3).torque_noise_rms
+    assert steady.holds(4e-4)
+    assert 0.03 < steady.half_width / steady.value < 0.15
+    once = response.fit(excited([1e-5] * 11 + [1.4e-3]), 1e-3).torque_noise_rms
+    assert once.half_width > 0.5 * once.value
+
+
+@pytest.mark.parametrize("top_rad_s", [0.02, 0.3, 30.0])
+def test_a_stribeck_curve_is_found_whatever_its_range_of_speed(top_rad_s):
+    speed = np.geomspace(1e-2, 1.0, 25) * top_rad_s
+    truth = np.array([0.05, 0.03, np.log(0.15 * top_rad_s), 1.4, 0.01 / top_rad_s])
+    torque = curve.friction(truth, speed)
+    side = Side(speed, torque, 1e-3 * torque, np.diag((1e-4 * torque) ** 2))
+    found = curve.fit(side)
+    assert found.coulomb.value == pytest.approx(0.05, rel=1e-3)
+    assert found.static.value == pytest.approx(0.08, rel=1e-3)
+    assert found.stribeck_velocity.value == pytest.approx(0.15 * top_rad_s, rel=1e-3)

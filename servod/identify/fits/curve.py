@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 
 #: Range of the exponent; at its ends the result says so.
 EXPONENT = (0.5, 4.0)
+#: Where the search for the Stribeck velocity begins, as shares of the map's range of log speed.
+STARTS = np.array([0.3, 0.5, 0.7, 0.85])
 #: Static friction is the curve's end at no speed, slower than anything that was measured.
 SLOWEST_ALLOWANCE = 0.03
 #: Misfit that every node is allowed, as a share of friction.
@@ -58,8 +60,7 @@ def fit(side: Side) -> CurveFit:
             bounds=(low, high),
             x_scale=[top, top, 1.0, 1.0, top / side.speed[-1]],
         )
-        for speed in (0.03, 0.1, 0.3)
-        if side.speed[0] < speed < side.speed[-1]
+        for speed in np.exp(low[2] + STARTS * (high[2] - low[2]))
     ]
     best = min(found, key=lambda result: result.cost)
     gain = np.linalg.pinv(best.jac) * weight

@@ -19,7 +19,7 @@ Complex = NDArray[np.complex128]
 #: No resonance is looked for below: there the sliding joint is disturbed by what repeats with position.
 LOWEST_HZ = 12.0
 #: Where the search for the resonance begins, as shares of the lines' range (logarithmic), and shares of the load.
-_STARTS, _LOADS = (0.35, 0.55, 0.75, 0.9), (0.25, 0.6)
+_STARTS, _LOADS = (0.3, 0.5, 0.65, 0.8, 0.9, 1.0), (0.25, 0.6)
 #: Ranges: share of the inertia behind the spring, damping ratio of the resonance.
 _LOAD, _DAMPING = (0.02, 0.95), (1e-3, 0.7)
 

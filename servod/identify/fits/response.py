@@ -35,6 +35,8 @@ LAG_SIGNIFICANCE = 1e-3
 UNEXPLAINED, SPRUNG_COST = 1.5, 0.2
 #: Half widths that the scatter does not show: inertia by share, delay in s.
 INERTIA_ALLOWANCE, DELAY_ALLOWANCE_S = 0.01, 3e-5
+#: Torque noise is told up to here: above, the encoder's own shows more.
+NOISE_HZ = 40.0
 
 
 class Resonance(NamedTuple):
@@ -109,7 +111,7 @@ def fit(trace: Trace, inertia: float) -> ResponseFit:
         _delay(values, spread, freedom, found.lag),
         found.lag,
         found.resonance,
-        _torque_noise(strokes, trace, values),
+        _torque_noise(_Lines(frequency, deviation, period), strokes, trace, values),
         frequency,
         _position_over_torque(frequency, _ratio(strokes), period),
         deviation,
@@ -267,13 +269,19 @@ def _position_over_torque(frequency: Array, ratio: Complex, period_s: float) -> 
     return position
 
 
-def _torque_noise(strokes: list[_Stroke], trace: Trace, values: Array) -> Estimate:
-    """Torque disturbance in the lower half of the lines' band, from what the motion does beyond the torque."""
-    frequency, _ = _spectra(trace)
-    ratio = _model(frequency, values, trace.period_s)
-    low = frequency < 40.0
-    errors = np.array([np.abs((s.velocity - ratio * s.torque) / ratio)[low] for s in strokes])
-    per_line = np.mean(2.0 * errors**2)
-    bandwidth_lines = 40.0 * trace.settings["count"] * trace.period_s
-    rms = float(np.sqrt(per_line * bandwidth_lines))
-    return estimate(rms, 0.1 * rms, errors.size, "N*m", note="below 40 Hz while sliding, cogging included")
+def _torque_noise(lines: _Lines, strokes: Sequence[_Stroke], trace: Trace, values: Array) -> Estimate:
+    """Torque disturbance below `NOISE_HZ`, from what the motion does beyond the torque; by the scatter of strokes.
+
+    `lines` and `strokes` are all that were excited, coherent or not.
+    """
+    ratio = _model(lines.frequency, values, lines.period_s)
+    low = lines.frequency < NOISE_HZ
+    bandwidth_lines = NOISE_HZ * trace.settings["count"] * lines.period_s
+
+    def rms(parts: Sequence[_Stroke]) -> Array:
+        errors = np.array([np.abs((s.velocity - ratio * s.torque) / ratio)[low] for s in parts])
+        return np.sqrt(np.atleast_1d(np.mean(2.0 * errors**2) * bandwidth_lines))
+
+    found, spread = jackknife(rms, strokes)
+    note = f"below {NOISE_HZ:g} Hz while sliding, cogging included"
+    return estimate(found[0], spread[0], len(strokes) - 1, "N*m", share=INERTIA_ALLOWANCE, note=note)
