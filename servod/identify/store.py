@@ -10,27 +10,37 @@ import hashlib
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from servod.errors import BadInput
 from servod.identify.trace import Kind, Trace
 from servod.recorder_mcap import McapFile, split_rows, wall_offset_ns
 from servod.recorder_read import read_recording
+from servod.yaml12 import Strict, validate
 
 LIST = "experiments.json"
+_ALLOWED = "a folder that servoctl identify wrote"
 _COLUMNS = ("torque_nm", "position_rad", "reference_rad", "torque_other_nm", "torque_actual_nm", "motor_position_rad")
 
 
-class _Entry(NamedTuple):
-    """One line of the list; `motion` is the hash of what was asked for."""
+class _Entry(Strict):
+    """One recording; `motion` is the hash of what was asked for."""
 
-    file: str
-    kind: str
+    file: str = Field(pattern=r"^[0-9]{2,}_[a-z_]+\.mcap$")
+    kind: Kind
     motion: str
     settings: dict[str, float]
+
+
+class _List(Strict):
+    """Content of the list."""
+
+    conditions: str
+    start_rad: float | None
+    experiments: list[_Entry]
 
 
 class Recordings:
@@ -68,7 +78,7 @@ class Recordings:
         if not self._earlier:
             return None
         entry = self._earlier.pop(0)
-        if (entry.kind, entry.motion) != (kind.value, motion):
+        if (entry.kind, entry.motion) != (kind, motion):
             self._earlier = []
             self._drop_others()
             return None
@@ -82,29 +92,25 @@ class Recordings:
             file = McapFile(self.folder / name, {}, self._offset_ns)
             file.write_rows(split_rows(rows.tobytes()))
             file.close()
-            self._done.append(_Entry(name, trace.kind.value, motion, trace.settings))
+            self._done.append(_Entry(file=name, kind=trace.kind, motion=motion, settings=trace.settings))
             self._write_list()
         except OSError as error:
             raise _unwritable(self.folder / name, error) from None
         return replace(trace, sha256=_sha256(self.folder / name))
 
     def _write_list(self) -> None:
-        document = {
-            "conditions": self.conditions,
-            "start_rad": self.start_rad,
-            "experiments": [entry._asdict() for entry in self._done],
-        }
+        written = _List(conditions=self.conditions, start_rad=self.start_rad, experiments=self._done)
         aside = self.folder / (LIST + ".part")
-        aside.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+        aside.write_text(written.model_dump_json(indent=1) + "\n", encoding="utf-8")
         aside.replace(self.folder / LIST)
 
     def _take_up(self) -> None:
         """Find the earlier recordings, if they were made under these conditions."""
         if not (self.folder / LIST).exists():
             return
-        document, entries = _read_list(self.folder)
-        if document["conditions"] == self.conditions and document["start_rad"] is not None:
-            self.start_rad, self._earlier = float(document["start_rad"]), entries
+        earlier = _read_list(self.folder)
+        if earlier.conditions == self.conditions and earlier.start_rad is not None:
+            self.start_rad, self._earlier = earlier.start_rad, list(earlier.experiments)
 
     def _drop_others(self) -> None:
         """Remove recordings in the folder that are of no use any more."""
@@ -130,22 +136,20 @@ def motion_hash(positions: NDArray[np.float64], torques: NDArray[np.float64], wi
 
 def load(folder: Path) -> list[Trace]:
     """All traces that `Recordings` wrote to `folder`. Raises BadInput."""
-    _, entries = _read_list(folder)
-    try:
-        return [_trace(folder, entry) for entry in entries]
-    except ValueError as error:
-        raise _unreadable(folder / LIST, error) from None
+    return [_trace(folder, entry) for entry in _read_list(folder).experiments]
 
 
-def _read_list(folder: Path) -> tuple[dict[str, Any], list[_Entry]]:
+def _read_list(folder: Path) -> _List:
     path = folder / LIST
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
-        return {k: document[k] for k in ("conditions", "start_rad")}, [_Entry(**e) for e in document["experiments"]]
     except OSError as error:
-        raise BadInput(str(path), error.strerror or str(error), "a folder that servoctl identify wrote") from None
-    except (ValueError, KeyError, TypeError) as error:
-        raise _unreadable(path, error) from None
+        raise BadInput(str(path), error.strerror or str(error), _ALLOWED) from None
+    except ValueError as error:
+        raise BadInput(str(path), str(error), _ALLOWED) from None
+    if isinstance(document, list):
+        raise BadInput(str(path), "a list as earlier versions wrote it", f"{_ALLOWED} of this version; identify anew")
+    return validate(document, _List, str(path))
 
 
 def _trace(folder: Path, entry: _Entry) -> Trace:
@@ -156,8 +160,7 @@ def _trace(folder: Path, entry: _Entry) -> Trace:
         np.asarray(recording.column(column), dtype=np.float64) for column in _COLUMNS
     )
     t_s = (time_ns - time_ns[0]) * 1e-9
-    kind, digest = Kind(entry.kind), _sha256(path)
-    return Trace(kind, t_s, torque, position, reference, excitation, actual, motor, entry.settings, digest)
+    return Trace(entry.kind, t_s, torque, position, reference, excitation, actual, motor, entry.settings, _sha256(path))
 
 
 def _sha256(path: Path) -> str:
@@ -166,7 +169,3 @@ def _sha256(path: Path) -> str:
 
 def _unwritable(path: Path, error: OSError) -> BadInput:
     return BadInput(str(path), error.strerror or str(error), "a file or folder that can be written")
-
-
-def _unreadable(path: Path, error: Exception) -> BadInput:
-    return BadInput(str(path), f"{type(error).__name__}: {error}", "the list that servoctl identify wrote")

@@ -8,6 +8,8 @@ import pytest
 
 from servod.axis_model import load_axis_model
 from servod.cli.app import run
+from servod.errors import BadInput
+from servod.identify.store import LIST, Recordings
 from servod.shipped import shipped
 from tests.identify.conftest import Identification
 
@@ -41,3 +43,39 @@ def test_bad_input_is_one_line(options, said, tmp_path, capsys):
     assert captured.err.count("\n") == 1
     assert said in captured.err
     assert not (tmp_path / "model.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[]", "found a list as earlier versions wrote it"),
+        ("not json", "Expecting value"),
+        ('{"conditions": "", "start_rad": 0.0}', "experiments: found nothing"),
+        ('{"conditions": "", "start_rad": 0.0, "experiments": [{}]}', "experiments.0.file: found nothing"),
+        (
+            '{"conditions": "", "start_rad": 0, "experiments": [{"file": "../a", "kind": "noise", "motion": "", '
+            '"settings": {}}]}',
+            "experiments.0.file: found '../a'",
+        ),
+        (
+            '{"conditions": "", "start_rad": 0, "experiments": [{"file": "00_noise.mcap", "kind": "noise", '
+            '"motion": "", "settings": {}}]}',
+            "00_noise.mcap: found No such file or directory",
+        ),
+    ],
+)
+def test_recordings_of_another_kind_are_one_line(text, said, tmp_path, capsys):
+    folder = tmp_path / "model_recordings"
+    folder.mkdir()
+    (folder / LIST).write_text(text)
+    assert run(["identify", "--out", str(tmp_path / "model.yaml"), "--recordings", str(folder)]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and said in error
+
+
+def test_an_old_list_does_not_stop_a_new_walk_but_one_that_goes_on(tmp_path):
+    (tmp_path / LIST).write_text("[]")
+    with pytest.raises(BadInput, match="earlier versions"):
+        Recordings(tmp_path, resume=True)
+    assert Recordings(tmp_path).waiting == 0
+    assert not (tmp_path / LIST).exists()
