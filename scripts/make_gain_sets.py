@@ -114,6 +114,7 @@ def paper_sets() -> list[GainSet]:
     """PD, PD + DOB and PD + LuGre with the paper's numbers."""
 
     def paper(name: str, description: str, parameters: dict[str, Any], note: str) -> GainSet:
+        """A set on the paper's joint."""
         return gain_set(name, description, parameters, "table1_joint.yaml", note)
 
     lugre = {"law": "pd_lugre", **PD, **LUGRE}
@@ -151,6 +152,7 @@ def table1_sets(model: AxisModel) -> list[GainSet]:
     )
 
     def local(name: str, description: str, regions: dict[str, Any]) -> GainSet:
+        """Table I's local sets with the feedback of these regions."""
         parameters = {"law": "local", "regions": regions | OVERLAP, "friction": friction}
         return gain_set(name, description, parameters, "table1_joint.yaml", note)
 
@@ -168,6 +170,7 @@ def demo_rivals() -> list[GainSet]:
     """What the demo compares the local law with, all with the paper's PD gains."""
 
     def demo(name: str, description: str, parameters: dict[str, Any], note: str) -> GainSet:
+        """A set on the demo joint."""
         return gain_set(name, description, parameters, "demo_joint.yaml", note)
 
     observer = {"stiffness_nm_per_rad": STIFFNESS_SHARE * LUGRE["stiffness_nm_per_rad"], "observer_gain": 0.2}
@@ -201,6 +204,7 @@ def demo_local_sets(model: AxisModel) -> list[GainSet]:
     reference = {"velocity": "reference"}
 
     def local(name: str, description: str, gain: float, regions: dict[str, Any], **options: Any) -> GainSet:
+        """The measured friction with one l_i for all sets; `options` are further keys, `friction` those of the map."""
         friction = local_friction(measured, lambda i: gain, **options.pop("friction", {}))
         parameters = {"law": "local", "regions": regions | OVERLAP, "friction": friction, **options, **HOLD}
         return gain_set(name, description, parameters, "demo_joint.yaml", note, MAP_SEED)
