@@ -9,6 +9,7 @@ import yaml
 
 from servod.config import load_config
 from servod.controllers import LAWS, local
+from servod.daemon.gain_bank import GainBank
 from servod.errors import BadInput
 from servod.gain_design import Design
 from servod.gain_parameters import PdParameters
@@ -170,3 +171,17 @@ def test_a_set_designed_for_another_filter_or_cycle_does_not_fit_the_axis() -> N
             require_fit(designed(0.001, 500.0), axis)
         with pytest.raises(BadInput, match=r"design\.period_s: found 0\.002"):
             require_fit(designed(0.002, cutoff_hz), axis)
+
+
+def test_the_daemon_refuses_a_changed_set_although_it_accepts_sets_without_a_certificate(tmp_path: Path) -> None:
+    file = tmp_path / "bench_pd.yaml"
+    file.write_text(good.certified(parse_gains(good.PD, "good.yaml")).sealed().to_yaml())
+    config = load_config(shipped("gains/config/virtual.yaml"))
+    gains = config.gains.model_copy(update={"directory": tmp_path / "store", "initial": file})
+    assert gains.accept_uncertified
+    axis = config.model_copy(update={"gains": gains})
+    assert GainBank(axis).newest.name == "bench_pd"
+    file.write_text(file.read_text().replace("position_gain_nm_per_rad: 2.5", "position_gain_nm_per_rad: 2.6"))
+    elsewhere = gains.model_copy(update={"directory": tmp_path / "new"})
+    with pytest.raises(BadInput, match="changed after the set was sealed"):
+        GainBank(config.model_copy(update={"gains": elsewhere}))
