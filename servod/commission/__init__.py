@@ -5,7 +5,8 @@ state.py      what is done, by hashes of what it was made from
 questions.py  what a person must decide
 walk.py       the steps in order
 steps/        one file for each step
-tracking.py   runs of the tracking comparison on disk
+comparison.py laws measured on the axis itself, none twice
+runs.py       runs of deployments and comparisons on disk
 result.py     the one document that comes out
 report.py     the page and its pictures
 """

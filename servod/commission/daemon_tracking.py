@@ -10,20 +10,21 @@ from collections.abc import Callable
 from pathlib import Path
 
 from servod.config import AxisConfig
-from servod.control import ControlClient
+from servod.control import ControlClient, Refused
 from servod.deploy.daemon_link import DaemonDeployLink
-from servod.errors import Unreachable
+from servod.errors import AnswerIsNo
 from servod.tracking.metrics import Curves, Tracking, tracking
 from servod.tracking.motions import HOLD_S, PAPER_S, STEPS_MRAD
 from servod.tracking.stepped import curves_of
 
 
 def measure_on_daemon(
-    socket: Path, config: AxisConfig, tell: Callable[[float], None]
+    socket: Path, config: AxisConfig, deployed: tuple[str, int], tell: Callable[[float], None]
 ) -> tuple[Tracking | None, list[str]]:
-    """Figures of the set that runs, and what the daemon refused; None where it refused trajectory (19).
+    """Figures of the set `deployed` (name, version), and what the daemon refused; None where it refused (19).
 
-    The axis is left enabled or not, as it was. Raises AnswerIsNo when the axis drops out.
+    The axis is left enabled or not, as it was. Raises AnswerIsNo when another set runs or the axis drops out,
+    Unreachable when the daemon does not answer any more.
     """
     motions = {"paper": {"kind": "paper", "duration_s": PAPER_S}}
     motions |= {
@@ -33,6 +34,7 @@ def measure_on_daemon(
     refused: list[str] = []
     with ControlClient(socket) as client:
         link = DaemonDeployLink(client)
+        _require_active(link, deployed)
         was_enabled = link.enabled
         try:
             if not was_enabled:
@@ -42,7 +44,9 @@ def measure_on_daemon(
                 start_rad = float(client.call("status")["motion"]["reference_rad"])
                 try:
                     curves[name] = curves_of(link.record([motion]).tobytes(), start_rad)
-                except Unreachable as error:
+                except Refused as error:
+                    if not link.enabled:  # not the motion was refused: the axis has dropped out, or the loop is gone
+                        raise
                     refused.append(f"{name}: {error}")
         except BaseException:
             link.stop()
@@ -54,3 +58,14 @@ def measure_on_daemon(
         return None, refused
     steps = {mrad: curves[f"{mrad:g}"] for mrad in STEPS_MRAD if f"{mrad:g}" in curves}
     return tracking(curves["paper"], steps, 2.0 * math.pi / config.encoder.counts_per_turn), refused
+
+
+def _require_active(link: DaemonDeployLink, deployed: tuple[str, int]) -> None:
+    """What is measured is what was deployed. Raises AnswerIsNo."""
+    if link.active == deployed:
+        return
+    (runs, runs_version), (name, version) = link.active, deployed
+    raise AnswerIsNo(
+        f"the axis runs {runs} version {runs_version}, but {name} version {version} was deployed; to measure that, "
+        f"`servoctl gains activate {name} --version {version}`"
+    )

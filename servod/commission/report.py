@@ -10,6 +10,7 @@ from typing import Any
 
 from servod.axis_model import AxisModel, load_axis_model
 from servod.commission.axis import VirtualWalkAxis
+from servod.commission.comparison import DEPLOYED, run_files
 from servod.commission.files import (
     CERTIFICATE,
     DEPLOYMENT,
@@ -22,6 +23,7 @@ from servod.commission.files import (
     REPORT,
     RUNS,
     TRACKING,
+    TUNING,
     read_json,
 )
 from servod.commission.runs import load_curves, load_rows
@@ -39,6 +41,8 @@ from servod.tracking.metrics import Curves, curve_key
 from servod.tracking.motions import STEPS_MRAD
 
 Part = Figure | Table | str
+#: Laws as people read them.
+NAMES = {**LABELS, DEPLOYED: "Deployed"}
 #: Classes of the comparison as people read them, in the order of the page.
 CLASSES = {
     "free_feedback": "Every law at its best",
@@ -146,14 +150,32 @@ def _deployment(walk: Walk) -> Iterator[Part]:
 def _tracking(walk: Walk) -> Iterator[Part]:
     found = read_json(walk.path(TRACKING))
     for name, title in CLASSES.items():
-        figures = found.get(name) or (found["tracking"] if name == "free_feedback" else {})
-        if not figures:
+        if not (figures := found[name]):
             continue
         yield Table(f"{title}: trajectory (19) and steps, mrad and s", _HEADER, tuple(_rows(figures)))
-        ran = [law for law, measured in figures.items() if "failed" not in measured]
-        runs = {law: load_curves(walk.path(RUNS) / f"{name.partition('_')[0]}_{law}.npz") for law in ran}
+        feedback = name.partition("_")[0]
+        yield from _tuned(feedback, title, read_json(walk.path(TUNING)).get(feedback, {}))
+        keys = {law: law if law == DEPLOYED else f"{feedback}_{law}" for law in figures if "failed" not in figures[law]}
+        runs = {law: load_curves(run_files(walk, key)[1]) for law, key in keys.items()}
         yield from _figures(name, title, runs)
     yield from (f"Not measured: {line}" for line in found.get("not_measured", []))
+
+
+def _tuned(feedback: str, title: str, tuned: dict[str, Any]) -> Iterator[Table]:
+    """What the tuning of a class reached on simulated plants, with the roughness that bounds every law alike."""
+    if tuned:
+        header = ("controller", "cost / mrad", "simulated plants", "roughness, times that of the paper's PD", "limit")
+        rows = [
+            (
+                NAMES[law],
+                f"{t['cost_mrad']:.4f}",
+                str(t["simulations"]),
+                f"{t['roughness']:.2f}",
+                f"{t['roughness_limit']:g}",
+            )
+            for law, t in tuned.items()
+        ]
+        yield Table(f"{title}: what tuning reached", header, tuple(rows))
 
 
 def _figures(name: str, title: str, runs: dict[str, dict[str, Curves]]) -> Iterator[Figure]:
@@ -169,20 +191,31 @@ def _figures(name: str, title: str, runs: dict[str, dict[str, Curves]]) -> Itera
 
 def _motion(law: str, curves: Curves) -> Motion:
     return Motion(
-        LABELS[law], curves.time_s, curves.reference_rad, curves.position_rad, curves.torque_nm, curves.friction_nm
+        NAMES[law], curves.time_s, curves.reference_rad, curves.position_rad, curves.torque_nm, curves.friction_nm
     )
 
 
-_HEADER = ("controller", "RMS", "largest", "step / mrad", "settled after / s", "overshoot", "steady error", "hold")
+_HEADER = (
+    "controller",
+    "RMS",
+    "largest",
+    "roughness / mN*m per cycle",
+    "step / mrad",
+    "settled after / s",
+    "overshoot",
+    "steady error",
+    "hold",
+)
 
 
 def _rows(figures: dict[str, Any]) -> Iterator[tuple[str, ...]]:
     """A row for each law and step."""
     for law, f in figures.items():
         if "failed" in f:
-            yield (LABELS[law], f["failed"], *[""] * 6)
+            yield (NAMES[law], f["failed"], *[""] * 7)
             continue
-        head = (LABELS[law], f"{f['rms_error_mrad']:.4f}", f"{f['max_error_mrad']:.3f}")
+        torque = f"{1e3 * f['roughness_nm']:.3g}"
+        head = (NAMES[law], f"{f['rms_error_mrad']:.4f}", f"{f['max_error_mrad']:.3f}", torque)
         if not f["steps"]:
             yield (*head, *[""] * 5)
         for size, s in f["steps"].items():

@@ -57,7 +57,7 @@ class DaemonDeployLink:
             self._client.call(Verb.DISABLE)
 
     def stop(self) -> None:
-        """The drive's quick stop, over a connection of its own: an interrupt may have cut a request on the other one."""
+        """The drive's quick stop, on a connection of its own: an interrupt may have cut a request on the other."""
         with contextlib.suppress(ServodError), ControlClient(self._client.path) as client:
             client.call(Verb.STOP)
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from multiprocessing.pool import AsyncResult, Pool
 
@@ -26,6 +26,7 @@ _POLL_S = 0.05
 
 def rivals(
     model: AxisModel,
+    names: Sequence[str] = tuple(RIVALS),
     *,
     seed: int = 1,
     budget: int = BUDGET,
@@ -33,7 +34,7 @@ def rivals(
     plan: TunePlan | None = None,
     processes: int | None = None,
 ) -> dict[Feedback, dict[str, Tuned]]:
-    """Every rival of servod.tune.laws.RIVALS tuned in both classes on `model`'s intervals.
+    """The rivals `names` of servod.tune.laws.RIVALS tuned in both classes on `model`'s intervals.
 
     `plan` says encoder, filter, limits and whatever else is not `seed` and `budget`. The result depends neither on the
     number of `processes` (default: one for each core) nor on their timing. Ctrl-C ends the workers at once. Raises
@@ -41,21 +42,22 @@ def rivals(
     """
     plan = replace(plan or TunePlan(), seed=seed, budget=budget)
     with worker_pool(processes or len(os.sched_getaffinity(0))) as pool:
-        found = _Field(pool, model, plan, tell).tuned()
-    return {feedback: {name: found[feedback, name] for name in RIVALS} for feedback in Feedback}
+        found = _Field(pool, model, names, plan, tell).tuned()
+    return {feedback: {name: found[feedback, name] for name in names} for feedback in Feedback}
 
 
 class _Field:
     """The running tasks and what they have found."""
 
-    def __init__(self, pool: Pool, model: AxisModel, plan: TunePlan, tell: Tell | None) -> None:
+    def __init__(self, pool: Pool, model: AxisModel, names: Sequence[str], plan: TunePlan, tell: Tell | None) -> None:
+        self._names = names
         self._pool, self._text, self._plan, self._tell = pool, model.model_dump_json(), plan, tell
         self._tasks: dict[Key, AsyncResult[Tuned]] = {}
         self._found: dict[Key, Tuned] = {}
 
     def tuned(self) -> dict[Key, Tuned]:
         """Wait for everything; the first failure is raised."""
-        for name in RIVALS:
+        for name in self._names:
             self._begin((Feedback.EQUAL, name), None)
         while self._tasks:
             for key in [key for key, task in self._tasks.items() if task.ready()]:
@@ -73,7 +75,7 @@ class _Field:
         if feedback is Feedback.EQUAL:
             self._begin((Feedback.FREE, name), self._found[key].values)
         if self._tell:
-            self._tell(f"{name}, {feedback.value} feedback", len(self._found) / (len(RIVALS) * len(Feedback)))
+            self._tell(f"{name}, {feedback.value} feedback", len(self._found) / (len(self._names) * len(Feedback)))
 
 
 def _task(model: str, name: str, feedback: Feedback, plan: TunePlan, start: Values | None) -> Tuned:

@@ -63,6 +63,12 @@ def tune(
     return Tuned(gains, reached.value, done * plan.plants, reached.roughness, best)
 
 
+def as_tuned(model: AxisModel, gains: GainSet, plan: TunePlan) -> Tuned:
+    """A set that came in another way, by the measures of a tuning: its cost and its roughness on the same plants."""
+    reached = Trial(Axis(model, plan)).cost(gains.parameters)
+    return Tuned(gains, reached.value, plan.plants, reached.roughness, {})
+
+
 def gain_set(name: str, rival: Rival, feedback: Feedback, plan: TunePlan, parameters: Parameters) -> GainSet:
     """The tuned numbers as a gain set with their provenance, uncertified."""
     tuned = ", ".join(rival.space(feedback)) or "nothing"

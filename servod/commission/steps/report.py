@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from servod import __version__
-from servod.commission.files import DEPLOYMENT, GAINS, IDENTIFIED, MODEL, PICTURES, REPORT, TRACKING
+from servod.commission.files import DEPLOYMENT, GAINS, IDENTIFIED, MODEL, PICTURES, REPORT, TRACKING, TUNING
 from servod.commission.report import write_report
 from servod.commission.walk import Walk
 
@@ -21,7 +21,7 @@ class Report:
 
     def inputs(self, walk: Walk) -> dict[str, Any]:
         """Everything that is shown."""
-        return {**walk.hashes(IDENTIFIED, MODEL, GAINS, DEPLOYMENT, TRACKING), "version": __version__}
+        return {**walk.hashes(IDENTIFIED, MODEL, GAINS, DEPLOYMENT, TRACKING, TUNING), "version": __version__}
 
     def run(self, walk: Walk) -> None:
         """From the folder's files alone."""

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from servod.axis_model import load_axis_model
+from servod.commission.comparison import DEPLOYED
 from servod.commission.files import GAINS, MODEL, RIVALS, TUNING, write_json, write_text
 from servod.commission.walk import Walk
 from servod.gains import load_gains
-from servod.tune.laws import RIVALS as RIVAL_LAWS
 from servod.tune.plan import BUDGET, Feedback, Tuned, TunePlan
 from servod.tune.rivals import rivals
+from servod.tune.tuning import as_tuned
 
-#: Who is measured in each class. The deployed law stands beside the free ones as it is.
-CLASSES: dict[Feedback, tuple[str, ...]] = {
-    Feedback.EQUAL: ("pd", "pd_dob", "pd_lugre", "local"),
-    Feedback.FREE: ("pd", "pd_dob", "pd_lugre"),
-}
+#: Who is tuned and measured in each class; the deployed law, which is synthesized and not tuned, stands beside them.
+CONTENDERS = ("pd", "pd_dob", "pd_lugre", "local")
 
 
 @dataclass(frozen=True)
@@ -41,18 +39,20 @@ class Rivals:
             return
         o, model = walk.options, load_axis_model(walk.path(MODEL))
         with walk.progress(self.title) as tell:
-            shares: dict[str, float] = {}
-
-            def heard(name: str, share: float) -> None:
-                shares[name] = share
-                tell(name, sum(shares.values()) / len(RIVAL_LAWS))
-
+            plan = replace(_plan(walk), seed=o.seed, budget=o.budget or BUDGET)
             found = rivals(
-                model, seed=o.seed, budget=o.budget or BUDGET, tell=heard, plan=_plan(walk), processes=o.processes
+                model, CONTENDERS, seed=plan.seed, budget=plan.budget, tell=tell, plan=plan, processes=o.processes
             )
+            limit = plan.roughness_limit
+            told = {
+                feedback.value: {name: _told(t, limit) for name, t in tuned.items()}
+                for feedback, tuned in found.items()
+            }
+            tell("the deployed law by the same measures", 1.0)
+            told[Feedback.FREE.value][DEPLOYED] = _told(as_tuned(model, load_gains(walk.path(GAINS)), plan), limit)
         for feedback, name in contenders():
             write_text(rival_file(walk, feedback, name), found[feedback][name].gains.to_yaml())
-        write_json(walk.path(TUNING), {f.value: _told(tuned) for f, tuned in found.items()})
+        write_json(walk.path(TUNING), told)
 
 
 def compared(walk: Walk) -> bool:
@@ -62,7 +62,7 @@ def compared(walk: Walk) -> bool:
 
 def contenders() -> list[tuple[Feedback, str]]:
     """Class and name of every rival."""
-    return [(feedback, name) for feedback, names in CLASSES.items() for name in names]
+    return [(feedback, name) for feedback in Feedback for name in CONTENDERS]
 
 
 def rival_file(walk: Walk, feedback: Feedback, name: str) -> Path:
@@ -82,7 +82,11 @@ def _plan(walk: Walk) -> TunePlan:
     )
 
 
-def _told(tuned: dict[str, Tuned]) -> dict[str, dict[str, float]]:
+def _told(tuned: Tuned, limit: float) -> dict[str, float]:
+    """Roughness and its limit are multiples of what the paper's PD makes."""
     return {
-        name: {"cost_mrad": t.cost, "simulations": t.simulations, "roughness": t.roughness} for name, t in tuned.items()
+        "cost_mrad": tuned.cost,
+        "simulations": tuned.simulations,
+        "roughness": tuned.roughness,
+        "roughness_limit": limit,
     }
