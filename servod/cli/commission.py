@@ -54,7 +54,7 @@ def commission(
     processes: Annotated[int, typer.Option(min=1, max=64, help="Worker processes.")] = 2,
     seed: Annotated[int, typer.Option(min=0, help="Seed of excitation, tuning and virtual noise.")] = 1,
     yes: Annotated[
-        bool, typer.Option("--yes", help="Agree to every question; goes without saying on a virtual axis.")
+        bool, typer.Option("--yes", help="Agree to every question, and take what is offered where demands clash.")
     ] = False,
     socket: SocketOption = DEFAULT_SOCKET,
     as_json: JsonOption = False,
@@ -62,9 +62,9 @@ def commission(
     """Walk from identification to validation in OUT; exit code 1 when a step's answer is no."""
     one_thread()
     from servod.commission.questions import Questions
-    from servod.commission.result import result
+    from servod.commission.result import failure, result
     from servod.commission.steps import STEPS
-    from servod.commission.walk import Options, Walk, run
+    from servod.commission.walk import Options, StepFailed, Walk, run
     from servod.demo.processes import sigterm_as_interrupt
 
     axis = _virtual(plant, config, settings, encoder_counts, seed) if plant else _on_daemon(socket, config)
@@ -73,12 +73,17 @@ def commission(
         out,
         axis,
         Options(seed, travel, speed, accuracy, plants, budget, rivals, processes),
-        Questions(yes or plant is not None, _put),
+        Questions(yes, _put),
         lambda title: _bar(title, as_json),
         lambda line: None if as_json else print(line, file=sys.stderr, flush=True),
     )
-    with sigterm_as_interrupt():
-        document = result(walk, run(walk, STEPS))
+    try:
+        with sigterm_as_interrupt():
+            document = result(walk, run(walk, STEPS))
+    except StepFailed as failed:
+        if as_json:
+            print_json(failure(walk, failed))
+        raise
     if as_json:
         print_json(document)
     else:

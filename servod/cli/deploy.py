@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,8 +21,10 @@ if TYPE_CHECKING:
     from servod.gains import GainSet
 
 _HELP = example(
-    "Run a validation motion (20 mrad to each side, 13 s) under the present set and under GAINS, and keep GAINS only "
-    "when it is no worse and does what its certificate promised; else, and on Ctrl-C, the present set stays.",
+    "Run a validation motion under the present set and under GAINS, and keep GAINS only when it is no worse and does "
+    "what its certificate promised; else, and on Ctrl-C, the present set stays. Travel and speed go with the speed "
+    "that GAINS was designed for: 20 mrad to each side at 0.25 rad/s for a design for 0.5 rad/s, 14 s each. What it "
+    "will be is said before anything moves.",
     "servoctl deploy gains.yaml",
     "servoctl deploy gains.yaml --plant joint.yaml --present old.yaml",
 )
@@ -43,12 +46,15 @@ def deploy(
 ) -> None:
     """Deploy GAINS; exit code 1 when the axis was rolled back."""
     one_thread()
-    from servod.deploy.deployment import deploy
-    from servod.gains import load_gains
+    from servod.deploy.deployment import announced, deploy
+    from servod.gains import load_gains, require_certificate
 
     wanted = load_gains(gains)
     if present is not None and plant is None:
         raise BadInput("--present", str(present), "only with --plant: a daemon knows what runs")
+    require_certificate(wanted, accept_uncertified=False)
+    if not as_json:
+        print(f"{wanted.name}: {announced(wanted)}", file=sys.stderr, flush=True)
     axis = _on_daemon(socket) if plant is None else _virtual(plant, present, config, wanted, seed)
     with axis as link, progress("deploy", quiet=as_json) as tell:
         done = deploy(link, wanted, tell)

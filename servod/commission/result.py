@@ -23,8 +23,21 @@ from servod.commission.files import (
     write_json,
 )
 from servod.commission.state import State
-from servod.commission.walk import Walk
+from servod.commission.walk import StepFailed, Walk
 from servod.gains import load_gains
+
+
+def failure(walk: Walk, failed: StepFailed) -> dict[str, Any]:
+    """The document of a walk that a step ended with a no: which one and why, and its own document where it has one."""
+    own = {"verify": ("certificate", CERTIFICATE), "deploy": ("deployment", DEPLOYMENT)}
+    key, name = own.get(failed.step, ("", ""))
+    document: dict[str, Any] = {
+        "axis": walk.axis.config.name,
+        "failed": {"step": failed.step, "message": str(failed)},
+    }
+    if name and walk.path(name).exists():
+        document[key] = read_json(walk.path(name))
+    return document
 
 
 def result(walk: Walk, state: State) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from typing import Any, Protocol
 from servod.commission.axis import WalkAxis
 from servod.commission.questions import Questions
 from servod.commission.state import State, file_sha256, sole_walk
+from servod.errors import AnswerIsNo
 
 #: Told what a step does, and the share of it that is done.
 Tell = Callable[[str, float], None]
@@ -84,8 +85,19 @@ class Step(Protocol):
         ...
 
 
+class StepFailed(AnswerIsNo):
+    """A step's answer was no; carries the step's name."""
+
+    def __init__(self, step: str, message: str) -> None:
+        super().__init__(message)
+        self.step = step
+
+
 def run(walk: Walk, steps: tuple[Step, ...]) -> State:
-    """Do every step that is not done yet, in order. Raises as the steps do; the state then has those that ended."""
+    """Do every step that is not done yet, in order; the state then has those that ended.
+
+    Raises StepFailed when a step's answer is no, else as the steps do.
+    """
     with sole_walk(walk.folder):
         state = State(walk.folder, walk.axis.identity, [name for step in steps for name in step.outputs])
         for step in steps:
@@ -94,7 +106,10 @@ def run(walk: Walk, steps: tuple[Step, ...]) -> State:
                 walk.say(f"{step.title}: done before")
                 continue
             started = time.monotonic()
-            step.run(walk)
+            try:
+                step.run(walk)
+            except AnswerIsNo as error:
+                raise StepFailed(step.name, str(error)) from error
             state.record(step.name, inputs, time.monotonic() - started)
             walk.say(f"{step.title}: {state.seconds[step.name]:.1f} s")
     return state

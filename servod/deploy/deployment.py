@@ -97,6 +97,18 @@ def admitted(gains: GainSet, config: AxisConfig) -> tuple[Design, Promise]:
     return gains.design, gains.certificate.promised
 
 
+def announced(gains: GainSet) -> str:
+    """How far, how fast and how long the axis will move in the trial of a set, for people. Raises BadInput."""
+    if gains.design is None:
+        raise BadInput(f"gain set {gains.name}: design", "nothing", "a design; `servoctl synthesize` makes it")
+    motion = motion_for(gains.design)
+    speed_rad_s = float(np.abs(np.diff(motion.sines)).max()) / motion.period_s
+    return (
+        f"sines and steps of up to {1e3 * motion.travel_rad:.3g} mrad to each side, sines at up to {speed_rad_s:.2g} "
+        f"rad/s, {motion.duration_s:.0f} s under the present set and as long under the new one"
+    )
+
+
 class _Trial:
     """One trial: what it has done so far, so that it can be undone at any moment."""
 

@@ -39,8 +39,9 @@ def test_wrong_polarity_stops_the_walk_before_the_joint_moves_far(
     wrong.write_text("rated_torque_mnm: 100\npolarity: 0x20\n")
     assert run(["commission", "--plant", str(plant), "--settings", str(wrong), "--out", str(out), "--json"]) == 1
     captured = capsys.readouterr()
-    assert captured.out == "" and captured.err.count("\n") == 1
-    assert "direction" in captured.err
+    assert captured.err.count("\n") == 1 and "direction" in captured.err
+    failed = json.loads(captured.out)["failed"]
+    assert failed["step"] == "identify" and "direction" in failed["message"]
     assert json.loads((out / "state.json").read_text())["steps"] == {}
     assert not (out / "model.yaml").exists()
 

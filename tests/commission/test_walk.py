@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,21 +19,25 @@ from servod.commission.files import (
     RELAXED,
     RUNS,
     TRACKING,
+    TUNING,
     read_json,
     write_json,
     write_text,
 )
 from servod.commission.questions import Questions
 from servod.commission.report import sections
+from servod.commission.result import failure
 from servod.commission.runs import load_curves, load_rows, save_curves
 from servod.commission.state import file_sha256
 from servod.commission.steps.deploy import Deploy
-from servod.commission.steps.synthesize import Synthesize, relaxed
+from servod.commission.steps.synthesize import Synthesize, agreed, relaxed
 from servod.commission.steps.verify import Verify
-from servod.commission.walk import Options, Step, Tell, Walk, run
+from servod.commission.walk import Options, Step, StepFailed, Tell, Walk, run
+from servod.deploy.deployment import announced
+from servod.errors import AnswerIsNo
 from servod.gains import load_gains
 from servod.report.figure import Figure, Table
-from servod.synthesize.deployed import Relaxation, Wishes
+from servod.synthesize.deployed import Infeasible, Relaxation, Wishes
 from servod.tracking import simulated
 from tests.synthesize.designs import table1
 
@@ -109,20 +113,64 @@ def test_a_relaxation_changes_its_own_wish_alone() -> None:
     assert slower.least_decay_per_s == pytest.approx(1.96) and slower.uncertainty == wishes.uncertainty
 
 
+def test_no_design_is_for_more_speed_than_the_axis_may_have_or_was_identified_with(tmp_path: Path) -> None:
+    def loop(options: Options, limit_rad_s: float) -> dict[str, Any]:
+        limits = AXIS.config.limits.model_copy(update={"speed_rad_s": limit_rad_s})
+        axis = replace(AXIS, chosen=AXIS.config.model_copy(update={"limits": limits}))
+        found: dict[str, Any] = Synthesize().inputs(replace(walk_in(tmp_path), axis=axis, options=options))["loop"]
+        assert found["overlap"][0] < found["overlap"][1] < found["speed_max"]
+        return found
+
+    assert loop(Options(), 3.0)["speed_max"] == 0.5
+    assert loop(Options(), 0.2)["speed_max"] == 0.2
+    assert loop(Options(speed_rad_s=0.1), 0.2)["speed_max"] == 0.1
+    assert loop(Options(speed_rad_s=0.02), 0.2)["speed_max"] == 0.02
+
+
+def test_what_is_announced_of_a_trial_goes_with_the_design(folder: Path) -> None:
+    gains = load_gains(folder / GAINS)
+    assert gains.design is not None
+    assert announced(gains).startswith("sines and steps of up to 20.1 mrad to each side, sines at up to 0.25 rad/s")
+    slower = gains.model_copy(update={"design": gains.design.model_copy(update={"speed_max_rad_s": 0.1})})
+    assert announced(slower).startswith("sines and steps of up to 4.01 mrad to each side, sines at up to 0.05 rad/s")
+
+
+def test_what_is_offered_is_taken_by_yes_or_a_person_alone_also_on_a_virtual_axis(tmp_path: Path) -> None:
+    offer = Relaxation("least decay [1/s]", 5.0, 2.0)
+    clash = Infeasible(("low",), (), (offer,))
+    nobody = Questions(False, lambda _q: True, person=lambda: False)
+    with pytest.raises(AnswerIsNo, match=r"least decay.*--yes"):
+        agreed(replace(walk_in(tmp_path), questions=nobody), clash)
+    for questions in (Questions(True, lambda _q: False), Questions(False, lambda _q: True, person=lambda: True)):
+        assert agreed(replace(walk_in(tmp_path), questions=questions), clash) == offer
+
+
+def test_a_step_that_says_no_is_named_in_the_document(folder: Path) -> None:
+    document = failure(walk_in(folder), StepFailed("deploy", "rolled back"))
+    assert document["failed"] == {"step": "deploy", "message": "rolled back"}
+    assert document["deployment"] == read_json(folder / DEPLOYMENT)
+
+
 def test_curves_come_back_from_disk_and_stand_on_the_page(folder: Path) -> None:
     gains = load_gains(folder / GAINS)
     assert gains.design is not None
     cutoff_hz = gains.design.velocity_cutoff_hz
     run_of = simulated.measure(table1(), gains, counts_per_turn=2.0**20, cutoff_hz=cutoff_hz, seed=7)
+    save_curves(folder / RUNS / "deployed.npz", run_of.curves)
     save_curves(folder / RUNS / "free_local.npz", run_of.curves)
-    again = load_curves(folder / RUNS / "free_local.npz")
+    again = load_curves(folder / RUNS / "deployed.npz")
     assert again["paper"].error_mrad == pytest.approx(run_of.curves["paper"].error_mrad, abs=1e-3)
-    write_json(folder / TRACKING, {"tracking": {"local": run_of.document()}})
+    found, tuned = run_of.document(), {"cost_mrad": 0.1, "simulations": 3, "roughness": 4.2, "roughness_limit": 5.0}
+    rows = {"local": found, "deployed": found}
+    write_json(folder / TRACKING, {"tracking": {"local": found}, "equal_feedback": {}, "free_feedback": rows})
+    write_json(folder / TUNING, {"free": {"local": tuned, "deployed": tuned}})
     walk = walk_in(folder)
     made = {title: list(parts()) for title, parts in sections(walk, gains, table1()).items() if title in SHOWN}
     assert set(made) == SHOWN
     figures = {part.name for parts in made.values() for part in parts if isinstance(part, Figure)}
     assert {"bode", "impulse_responses", "weighting_functions", "before_after", "step_100_free_feedback"} <= figures
+    (reached,) = (p for p in made["Tracking"] if isinstance(p, Table) and "tuning reached" in p.title)
+    assert [(row[0], *row[3:]) for row in reached.rows] == [("Local models", "4.20", "5"), ("Deployed", "4.20", "5")]
     assert any(isinstance(part, Table) and "Certificate" in part.title for part in made["The certificate"])
 
 

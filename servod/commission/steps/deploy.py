@@ -9,7 +9,7 @@ from servod.axis_model import load_axis_model
 from servod.commission.files import DEPLOYMENT, GAINS, MODEL, RUNS, STORE, write_json
 from servod.commission.runs import save_rows
 from servod.commission.walk import Walk
-from servod.deploy.deployment import Deployment, deploy
+from servod.deploy.deployment import Deployment, announced, deploy
 from servod.deploy.virtual import pd_set
 from servod.errors import AnswerIsNo
 from servod.gains import GainSet, load_gains
@@ -32,7 +32,8 @@ class Deploy:
         """Raises AnswerIsNo when the set was rolled back; the document then says why."""
         gains = load_gains(walk.path(GAINS))
         if not walk.axis.virtual:
-            walk.questions.agree(f"try the certified set {gains.name} on {walk.axis.config.name} with a short motion?")
+            name = walk.axis.config.name
+            walk.questions.agree(f"try the certified set {gains.name} on {name}: {announced(gains)}; is its way free?")
         with (
             walk.axis.deployment(walk.path(STORE), gains, _present(walk)) as link,
             walk.progress(self.title) as tell,

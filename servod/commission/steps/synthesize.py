@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -15,6 +16,9 @@ from servod.synthesize.deployed import Infeasible, Relaxation, Wishes
 from servod.synthesize.gain_set import Options, synthesize
 from servod.synthesize.intervals import uncertainty_of
 from servod.units import NS_PER_S, NS_PER_US
+
+#: The regions' overlap ends at this share of the speed at most.
+OVERLAP_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -36,7 +40,7 @@ class Synthesize:
         taken: Relaxation | None = None
         found = self._attempt(walk, model, wishes)
         if isinstance(found, Infeasible):
-            taken = _agreed(walk, found)
+            taken = agreed(walk, found)
             found = self._attempt(walk, model, relaxed(wishes, taken))
         if isinstance(found, Infeasible):
             raise AnswerIsNo(f"synthesize: no design even with {taken}")
@@ -51,8 +55,15 @@ class Synthesize:
 
 
 def _loop(walk: Walk) -> dict[str, Any]:
+    """The loop around the law, and up to which speed it is for: no faster than the axis may move and was identified."""
     config = walk.axis.config
+    usual = Wishes()
+    speed_max = min(usual.speed_max, config.limits.speed_rad_s, walk.options.speed_rad_s or math.inf)
+    low, high = usual.overlap
+    narrow = min(1.0, OVERLAP_SHARE * speed_max / high)
     return {
+        "speed_max": speed_max,
+        "overlap": (narrow * low, narrow * high),
         "period_s": config.cycle.period_us * NS_PER_US / NS_PER_S,
         "cutoff_hz": walk.axis.cutoff_hz,
         "counts_per_turn": float(config.encoder.counts_per_turn),
@@ -73,7 +84,7 @@ def relaxed(wishes: Wishes, relaxation: Relaxation) -> Wishes:
     return _CHANGES[relaxation.wish](wishes, further)
 
 
-def _agreed(walk: Walk, found: Infeasible) -> Relaxation:
+def agreed(walk: Walk, found: Infeasible) -> Relaxation:
     """The first relaxation that a person agrees to. Raises AnswerIsNo with all that was offered."""
     offers = [r for r in found.relaxations if r.wish in _CHANGES]
     for relaxation in offers:
