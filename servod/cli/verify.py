@@ -24,10 +24,12 @@ def register(app: typer.Typer) -> None:
 
 def verify(
     gains: Annotated[Path, typer.Argument(help="Gain set, YAML, with its design.")],
-    plants: Annotated[int, typer.Option(min=1, max=1_000_000, help="Plants of the Monte-Carlo.")] = 1000,
+    plants: Annotated[
+        int, typer.Option(min=1, max=1_000_000, help="Plants of the Monte-Carlo; below 1000 nothing is certified.")
+    ] = 1000,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the drawn plants.")] = 1,
     processes: Annotated[int, typer.Option(min=1, max=64, help="Worker processes.")] = 2,
-    write: Annotated[bool, typer.Option(help="Write the certificate into the file when it is valid.")] = True,
+    write: Annotated[bool, typer.Option(help="Write the certificate, valid or not, into the file.")] = True,
     as_json: JsonOption = False,
 ) -> None:
     """Verify GAINS; exit code 1 when the set is not valid."""
@@ -38,7 +40,7 @@ def verify(
 
     checked = load_gains(gains)
     result = verify(checked, plants, seed, processes, str(gains))
-    if result.valid and write:
+    if write:
         write_atomically(gains, result.certified(checked).to_yaml())
     if as_json:
         print_json(result.document() | {"hashes": hashes(checked)})

@@ -36,6 +36,7 @@ class Options:
     budget: int | None = None  # of each rival's tuning; None = the tuning's own
     rivals: bool = True
     processes: int = 2
+    least_plants: int = 1000  # with fewer no certificate is issued
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.axis_effects import Noise
+from servod.axis_model import AxisModel
 
 Array = NDArray[np.float64]
+
+#: Bandwidth of the torque noise that an identification measures while the joint slides.
+IDENTIFIED_HZ = 40.0
+
+
+def noise_of(model: AxisModel, resolution_rad: float = 0.0) -> Noise | None:
+    """The model's own noise, or what its identification measured; None where nobody says anything of it.
+
+    What was measured at rest has the rounding to encoder counts in it: a simulation that rounds to `resolution_rad`
+    by itself gets the rest. The torque noise was measured while sliding with the cogging in it, and is an upper bound.
+    """
+    if model.noise is not None or model.identified is None:
+        return model.noise
+    known = model.identified.values
+    torque, encoder = known.get("torque_noise_rms"), known.get("encoder_noise_rms")
+    return Noise(
+        torque_rms=torque.value if torque else 0.0,
+        torque_bandwidth_hz=IDENTIFIED_HZ,
+        encoder_rms=math.sqrt(max(encoder.value**2 - resolution_rad**2 / 12.0, 0.0)) if encoder else 0.0,
+    )
 
 
 def noise_series(noise: Noise | None, samples: int, period_s: float, seed: int) -> tuple[Array, Array]:

@@ -14,11 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servod.axis_effects import Noise
 from servod.axis_model import AxisModel
 from servod.controllers import LAWS
 from servod.gain_parameters import Parameters
-from servod.models.noise import noise_series
+from servod.models.noise import noise_of, noise_series
 from servod.models.simulate import simulate_closed_loop
 from servod.synthesize.intervals import uncertainty_of
 from servod.tracking.metrics import SETTLE_S, Array
@@ -68,7 +67,7 @@ class Trial:
     @cached_property
     def plants(self) -> list[AxisModel]:
         """The model's own draws from its intervals; the last with more delay."""
-        plan, model = self.axis.plan, with_noise(self.axis.model)
+        plan, model = self.axis.plan, with_noise(self.axis.model, self.axis.plan.loop.resolution_rad)
         plants = [drawn(model, uncertainty_of(model), plan.seed, i) for i in range(plan.plants)]
         return [*plants[:-1], _later(plants[-1], EXTRA_DELAY * plan.period_s)]
 
@@ -146,17 +145,9 @@ class Trial:
         )
 
 
-def with_noise(model: AxisModel) -> AxisModel:
-    """`model` with the noise that its identification measured, where it does not say another."""
-    if model.noise is not None or model.identified is None:
-        return model
-    known = model.identified.values
-    rms = {key: known[name].value for key, name in NOISE.items() if name in known}
-    return model.model_copy(update={"noise": Noise(**rms)}) if rms else model
-
-
-#: Keys of the model's noise, and the names of the identified values.
-NOISE = {"torque_rms": "torque_noise_rms", "encoder_rms": "encoder_noise_rms"}
+def with_noise(model: AxisModel, resolution_rad: float) -> AxisModel:
+    """`model` with the noise that its identification measured beside the encoder's steps, unless it has its own."""
+    return model.model_copy(update={"noise": noise_of(model, resolution_rad)})
 
 
 def _later(model: AxisModel, extra_s: float) -> AxisModel:

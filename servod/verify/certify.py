@@ -14,11 +14,15 @@ from typing import Any
 from servod import __version__
 from servod.errors import BadInput
 from servod.gains import Certificate, CertificateCheck, GainSet, Promise
-from servod.verify.checks import SIMULATED, STATIC, Subject, observations
+from servod.verify.checks import LEAST_PLANTS, SIMULATED, STATIC, Subject, observations
 from servod.verify.promise import promise
 from servod.verify.reference_checks import check_reference
 
-PLANTS, SEED, PROCESSES = 1000, 1, 2
+SEED, PROCESSES = 1, 2
+SOURCES = (
+    *("verify/*.py", "models/*.py", "controllers/*.py", "axis_*.py", "identified.py"),
+    *("gain_design.py", "gain_parameters.py", "gains.py", "references.py"),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,8 +63,9 @@ class Verification:
         )
 
     def certified(self, gains: GainSet) -> GainSet:
-        """`gains` with the certificate, sealed."""
-        return gains.model_copy(update={"certificate": self.certificate(gains)}).sealed()
+        """`gains` with the certificate, valid or not, sealed; a seal that was broken stays so."""
+        judged = gains.model_copy(update={"certificate": self.certificate(gains)})
+        return judged if gains.seal_broken else judged.sealed()
 
 
 def today() -> datetime.datetime:
@@ -69,23 +74,38 @@ def today() -> datetime.datetime:
 
 
 def source_sha256() -> str:
-    """Hash of the sources that verify: which tool said so."""
+    """Hash of the sources that verify: which tool said so.
+
+    The checks, and what they stand on: simulator, control laws, model and design.
+    """
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(path.read_bytes())
+    for path in sources():
+        digest.update(path.name.encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()
 
 
+def sources() -> list[Path]:
+    """Files whose change may change what a verification says."""
+    package = Path(__file__).parents[1]
+    return sorted(path for pattern in SOURCES for path in package.glob(pattern))
+
+
 def verify(
-    gains: GainSet, plants: int = PLANTS, seed: int = SEED, processes: int = PROCESSES, where: str = "gain set"
+    gains: GainSet,
+    plants: int = LEAST_PLANTS,
+    seed: int = SEED,
+    processes: int = PROCESSES,
+    where: str = "gain set",
+    *,
+    least_plants: int = LEAST_PLANTS,
 ) -> Verification:
-    """Judge `gains` by its own design. Raises BadInput when it has none.
+    """Judge `gains` by its own design, valid with `least_plants` and more. Raises BadInput when it has none.
 
     Simulations run only when everything cheaper has passed: what is refused is refused at once.
     """
     if gains.design is None:
         raise BadInput(f"{where}: design", "nothing", "a design, as `servoctl synthesize` writes it")
-    subject = Subject(gains, gains.design, plants, seed, processes)
+    subject = Subject(gains, gains.design, plants, seed, processes, least_plants)
     checks = [check for judge in (*STATIC, check_reference) for check in judge(subject)]
     if not all(check.passed for check in checks):
         return Verification(checks, {})

@@ -5,13 +5,15 @@ Stands on the axis model alone; every draw has its own seed, so that any plant o
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
 from servod.axis_effects import Asymmetry, TorqueGain
-from servod.axis_model import AxisModel, LugreFriction
+from servod.axis_model import AxisModel, LocalFriction, LugreFriction
 from servod.gain_design import SHARES, Uncertainty
+from servod.verify.steady_friction import fitted_curves
 
 POSITION_SHARE = 0.2  # half width of the interval of torques over position, which is no part of the LMIs
 DIRECTION_SHARE = 0.5  # of the interval of dry friction, drawn for each direction by itself
@@ -68,10 +70,34 @@ def scaled(model: AxisModel, factor: dict[str, float], sides: tuple[float, float
     return model.model_copy(update=update)
 
 
+def fallen(model: AxisModel, friction: LocalFriction, factor: float) -> tuple[float, ...]:
+    """The map's torques with the fall of the Stribeck curve times `factor`; its level stays.
+
+    What is fall says the curve that the identification fitted, or else what dry friction has above its least so far.
+    """
+    fitted, torques = fitted_curves(model), []
+    for velocity, torque in zip(friction.velocities, friction.torques, strict=True):
+        if fitted is not None:
+            fall = fitted[0 if velocity > 0.0 else 1].above_level(abs(velocity))
+        else:
+            dry = [abs(t) - friction.viscous * abs(v) for v, t in _outwards(friction, velocity)]
+            fall = dry[0] - min(dry)
+        torques.append(torque + (factor - 1.0) * math.copysign(fall, velocity))
+    return tuple(torques)
+
+
+def _outwards(friction: LocalFriction, velocity: float) -> list[tuple[float, float]]:
+    """Nodes (velocity, torque) from `velocity` on to faster ones of its direction."""
+    nodes = zip(friction.velocities, friction.torques, strict=True)
+    return sorted((node for node in nodes if node[0] * velocity >= velocity * velocity), key=lambda node: abs(node[0]))
+
+
 def _friction(model: AxisModel, factor: dict[str, float]) -> Any:
     """The friction group with bristle and Stribeck curve scaled."""
     friction: Any = model.friction
     update = {"sigma0": friction.sigma0 * factor["stiffness"], "sigma1": friction.sigma1 * factor["damping"]}
     if isinstance(friction, LugreFriction) and friction.static is not None:
         update["static"] = friction.coulomb + (friction.static - friction.coulomb) * factor["slope"]
+    if isinstance(friction, LocalFriction):
+        update["torques"] = fallen(model, friction, factor["slope"])
     return friction.model_copy(update=update)

@@ -7,24 +7,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from servod.axis_effects import Noise
 from servod.axis_model import AxisModel
 from servod.gain_design import Design
 from servod.gains import GainSet, Promise
-from servod.models.noise import noise_series
+from servod.models.noise import noise_of, noise_series
 from servod.models.simulate import LoopSettings, simulate_closed_loop
 from servod.verify.plants import drawn
 from servod.verify.validation import STEP_S, Array, Figures, Part, ValidationMotion, motion_for
 
 PLANTS = 24
-#: Bandwidth of the torque noise that an identification measures while the joint slides.
-NOISE_HZ = 40.0
 
 
 def promise(gains: GainSet, design: Design, seed: int) -> Promise | None:
     """Worst figures over the model and PLANTS plants of the intervals; None where one does not get through."""
     motion = motion_for(design)
-    rows, noise = motion.rows(), noise_of(design.model)
+    resolution_rad = 2.0 * np.pi / design.counts_per_turn if design.counts_per_turn else 0.0
+    rows, noise = motion.rows(), noise_of(design.model, resolution_rad)
     plants = [design.model, *(drawn(design.model, design.uncertainty, seed, i) for i in range(PLANTS))]
     runs = [simulated(gains, design, plant.model_copy(update={"noise": noise}), motion, rows) for plant in plants]
     worst = {part: max(figures.mean(part) for figures in runs) for part in Part}
@@ -54,16 +52,3 @@ def simulated(
     steps = round(STEP_S / design.period_s)
     sines = len(rows) - 2 * steps
     return motion.figures(rows[:sines, 0] - position[:sines], (position[sines : sines + steps], position[-steps:]))
-
-
-def noise_of(model: AxisModel) -> Noise | None:
-    """The model's noise, or what its identification measured."""
-    if model.noise is not None or model.identified is None:
-        return model.noise
-    known = model.identified.values
-    torque, encoder = known.get("torque_noise_rms"), known.get("encoder_noise_rms")
-    return Noise(
-        torque_rms=torque.value if torque else 0.0,
-        torque_bandwidth_hz=NOISE_HZ,
-        encoder_rms=encoder.value if encoder else 0.0,
-    )

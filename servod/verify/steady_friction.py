@@ -37,6 +37,11 @@ class FittedCurve:
     exponent: float
     viscous: float
 
+    def above_level(self, speed: float) -> float:
+        """What the curve has left of its fall at `speed`, above F_C [N*m]."""
+        rest: float = self.fall * math.exp(-((speed / self.speed) ** self.exponent))
+        return rest
+
     def slope(self, speed: float) -> float:
         """dF/d|v| at `speed` [N*m*s/rad]."""
         power: float = (speed / self.speed) ** self.exponent

@@ -12,73 +12,161 @@ from itertools import pairwise
 
 import numpy as np
 
+from servod.axis_effects import Noise
 from servod.axis_model import AxisModel
 from servod.gain_design import Design
 from servod.gains import GainSet
+from servod.models.noise import noise_of, noise_series
 from servod.models.simulate import LoopSettings, simulate_closed_loop
 from servod.verify.plants import drawn
 from servod.verify.sampled import Array
+from servod.verify.steady_friction import steady_friction
 from servod.workers import worker_pool
 
-STEP_RAD = 0.01
-SINE_RAD, SINE_HZ = 0.05, 0.25  # peak speed 79 mrad/s: through the fall of the Stribeck curve and back
-LEAD_IN_S, STEP_S, SINE_S, HOLD_S = 0.1, 0.6, 4.0, 0.5
-ERROR_LIMIT_RAD = 2e-3  # while it follows the sine: a plant beyond it does not follow
-RIPPLE_LIMIT_RAD = 1e-4  # peak to peak over the last part of the hold, half a second after the motion
-RAMPS_RAD_S = (0.0005, 0.002, 0.01)
+#: Steps in seconds of travel at the top speed, 10 and 100 mrad at 0.5 rad/s: one that the joint answers on its bristle,
+#: and one that it must travel for.
+SMALL_STEP_S, LARGE_STEP_S = 0.02, 0.2
+SINE_HZ = 0.25
+#: Peak speed of the sine: past the fall of the Stribeck curve, and no less than this share of the top speed.
+PAST_FALL, LEAST_PEAK = 1.3, 0.16
+LEAD_IN_S, STEP_S, SINE_S, HOLD_S, LARGE_S = 0.1, 0.6, 4.0, 1.0, 1.0
+ERROR_SHARE = 0.04  # of the sine's amplitude: a plant beyond it does not follow
+RIPPLE_LIMIT_RAD = 1e-4  # peak to peak of a long hold, torque noise included
+#: Of the large step, peak to peak from 0.8 s after a motion on, noise included: a tenth of what counts as settled. An
+#: axis of two cycles swings out for a second; one that does not rest at all is found by the long hold as well.
+RIPPLE_SHARE = 0.002
+RIPPLE_S = 0.2
+SETTLED_SHARE = 0.02  # of the large step: a plant that is further off at its end does not get there
+TORQUE_FACTOR = 3.0  # of the largest friction: the drive that the motions are certified with has no more
+RAMP_SHARES = (0.001, 0.004, 0.02)  # of the top speed
 RAMP_S = 4.0
 LONG_HOLD_S = 20.0
+GRID = 60  # speeds per direction at which the fall is looked for
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """The motions of one axis: steps and sine in rad, the drive's torque in N*m, by its speeds and its friction."""
+
+    top_rad_s: float
+    peak_rad_s: float
+    torque_nm: float
+
+    @property
+    def small_rad(self) -> float:
+        """The small step."""
+        return SMALL_STEP_S * self.top_rad_s
+
+    @property
+    def large_rad(self) -> float:
+        """The large step."""
+        return LARGE_STEP_S * self.top_rad_s
+
+    @property
+    def sine_rad(self) -> float:
+        """Amplitude of the sine."""
+        return self.peak_rad_s / (2.0 * math.pi * SINE_HZ)
+
+
+def scale_of(design: Design) -> Scale:
+    """Motions that pass the fall of this axis's friction, in both directions, within the speeds of its design."""
+    friction, top = steady_friction(design.model), design.speed_max_rad_s
+    falls = []
+    for side in (1.0, -1.0):
+        speeds = [float(v) for v in np.geomspace(0.01 * top, top, GRID)]
+        slopes = [friction.dry_slope(side * v) + friction.viscous(side * v) for v in speeds]
+        falls += [speeds[int(np.argmin(slopes))]] if min(slopes) < 0.0 else []
+    peak = max([PAST_FALL * speed for speed in falls], default=0.0)
+    return Scale(top, min(max(peak, LEAST_PEAK * top), top), TORQUE_FACTOR * friction.largest(top))
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One plant's figures: largest error on the sine, ripple at the end; `stable` is what they say together."""
+    """One plant's figures: largest error as a share of the sine; ripple and rest as shares of the large step."""
 
     index: int
-    error_rad: float
-    ripple_rad: float
+    error_share: float
+    ripple_share: float
+    unsettled_share: float
+
+    @property
+    def follows(self) -> bool:
+        """Whether the plant followed the sine."""
+        return self.error_share < ERROR_SHARE
+
+    @property
+    def rests(self) -> bool:
+        """Whether it came to rest after the sine and after the large step."""
+        return self.ripple_share < RIPPLE_SHARE
+
+    @property
+    def arrives(self) -> bool:
+        """Whether it got to the end of the large step."""
+        return self.unsettled_share < SETTLED_SHARE
 
     @property
     def stable(self) -> bool:
-        """Whether the plant followed and came to rest."""
-        return self.error_rad < ERROR_LIMIT_RAD and self.ripple_rad < RIPPLE_LIMIT_RAD
+        """All three."""
+        return self.follows and self.rests and self.arrives
 
 
-def trial_motion(period_s: float) -> Array:
-    """Rest, a step, a sine through both directions, rest: rows of position, velocity, acceleration."""
-    counts = [round(t / period_s) for t in (LEAD_IN_S, STEP_S, SINE_S, HOLD_S)]
-    parts = [np.zeros((counts[0], 3)), np.zeros((counts[1], 3)), np.zeros((counts[2], 3)), np.zeros((counts[3], 3))]
-    w, t = 2.0 * math.pi * SINE_HZ, np.arange(counts[2]) * period_s
-    parts[2][:, 0], parts[2][:, 1] = SINE_RAD * np.sin(w * t), SINE_RAD * w * np.cos(w * t)
-    parts[2][:, 2] = -SINE_RAD * w * w * np.sin(w * t)
+def counts(period_s: float) -> list[int]:
+    """Cycles of the parts of the trial motion: rest, small step, sine, hold, large step."""
+    return [round(t / period_s) for t in (LEAD_IN_S, STEP_S, SINE_S, HOLD_S, LARGE_S)]
+
+
+def trial_motion(period_s: float, scale: Scale) -> Array:
+    """Rest, small step, sine through both directions, rest, large step: rows of position, velocity, acceleration."""
+    lengths = counts(period_s)
+    parts = [np.zeros((n, 3)) for n in lengths]
+    w, t, amplitude = 2.0 * math.pi * SINE_HZ, np.arange(lengths[2]) * period_s, scale.sine_rad
+    parts[2][:, 0], parts[2][:, 1] = amplitude * np.sin(w * t), amplitude * w * np.cos(w * t)
+    parts[2][:, 2] = -amplitude * w * w * np.sin(w * t)
+    parts[4][:, 0] = scale.large_rad
     motion = np.concatenate(parts)
-    motion[counts[0] :, 0] += STEP_RAD
+    motion[lengths[0] :, 0] += scale.small_rad
     return motion
 
 
-def settings_of(design: Design, model: AxisModel) -> LoopSettings:
-    """Loop around the law as the design states it."""
-    return LoopSettings(design.period_s, design.counts_per_turn, design.velocity_cutoff_hz, delay_s=model.total_delay_s)
+def quiet(plant: AxisModel, resolution_rad: float) -> AxisModel:
+    """`plant` with its encoder's noise but none in its torque: what still moves there moves by itself."""
+    noise = noise_of(plant, resolution_rad) or Noise()
+    return plant.model_copy(update={"noise": noise.model_copy(update={"torque_rms": 0.0})})
 
 
 def simulated(gains: GainSet, design: Design, plant: AxisModel, motion: Array, seed: int) -> tuple[Array, Array]:
-    """(tracking error, position) of one plant along `motion`, with the model's torque noise."""
-    noise = plant.noise.torque_rms if plant.noise else 0.0
-    external = np.random.default_rng(seed).normal(0.0, noise, len(motion)) if noise else None
+    """(tracking error, position) of one plant along `motion`, with noise, encoder steps and a drive's torque limit."""
+    settings = LoopSettings(
+        design.period_s, design.counts_per_turn, design.velocity_cutoff_hz, scale_of(design).torque_nm
+    )
+    noise = noise_of(plant, settings.resolution_rad)
+    torque, reading = noise_series(noise, len(motion), design.period_s, seed)
     run = simulate_closed_loop(
-        plant, gains.law.step, gains.pack(), motion, settings_of(design, plant), external_nm=external
+        plant,
+        gains.law.step,
+        gains.pack(),
+        motion,
+        settings,
+        external_nm=torque,
+        reading_rad=reading,
     )
     return run.tracking_error_rad(), run.position_rad
 
 
 def run_trial(gains: GainSet, design: Design, motion: Array, seed: int, index: int) -> Trial:
-    """One plant of the Monte-Carlo; a plant that runs away counts with an infinite error."""
+    """One plant of the Monte-Carlo; a plant that runs away counts with infinite figures."""
     error, position = simulated(gains, design, drawn(design.model, design.uncertainty, seed, index), motion, index)
     if not np.isfinite(position).all():
-        return Trial(index, math.inf, math.inf)
-    start = round((LEAD_IN_S + STEP_S + 0.2) / design.period_s)  # the sine starts with a jump of velocity
-    end = round((LEAD_IN_S + STEP_S + SINE_S) / design.period_s)
-    return Trial(index, float(np.abs(error[start:end]).max()), float(np.ptp(position[-round(0.2 / design.period_s) :])))
+        return Trial(index, math.inf, math.inf, math.inf)
+    scale, ends, last = scale_of(design), np.cumsum(counts(design.period_s)), round(RIPPLE_S / design.period_s)
+    sine = error[ends[1] + last : ends[2]]  # the sine starts with a jump of velocity
+    rests = [np.ptp(position[end - last : end]) for end in (ends[3], ends[4])]
+    return Trial(
+        index,
+        float(np.abs(sine).max()) / scale.sine_rad,
+        float(max(rests)) / scale.large_rad,
+        float(np.abs(error[-last:]).max()) / scale.large_rad,
+    )
 
 
 def _worker(text: str, seed: int, first: int, last: int) -> list[Trial]:
@@ -86,7 +174,7 @@ def _worker(text: str, seed: int, first: int, last: int) -> list[Trial]:
 
     gains = parse_gains(text, "gain set")
     assert gains.design is not None
-    motion = trial_motion(gains.design.period_s)
+    motion = trial_motion(gains.design.period_s, scale_of(gains.design))
     return [run_trial(gains, gains.design, motion, seed, i) for i in range(first, last)]
 
 
@@ -104,7 +192,7 @@ def monte_carlo(gains: GainSet, plants: int, seed: int, processes: int) -> list[
 def hold_ripple(gains: GainSet, design: Design, plant: AxisModel) -> float:
     """Peak to peak position over the last 15 s of a 20 s hold after a step [rad]: a limit cycle shows here."""
     motion = np.zeros((round(LONG_HOLD_S / design.period_s), 3))
-    motion[100:, 0] = STEP_RAD
+    motion[round(LEAD_IN_S / design.period_s) :, 0] = scale_of(design).small_rad
     _, position = simulated(gains, design, plant, motion, 0)
     return float(np.ptp(position[len(position) // 4 :])) if np.isfinite(position).all() else math.inf
 
@@ -112,7 +200,8 @@ def hold_ripple(gains: GainSet, design: Design, plant: AxisModel) -> float:
 def ramp_ripples(gains: GainSet, design: Design, plant: AxisModel) -> Iterator[float]:
     """Peak to peak tracking error of slow ramps in both directions, after their first quarter [rad]: stick-slip."""
     t = np.arange(round(RAMP_S / design.period_s)) * design.period_s
-    for speed in (side * v for v in RAMPS_RAD_S for side in (1.0, -1.0)):
+    top = design.speed_max_rad_s
+    for speed in (side * share * top for share in RAMP_SHARES for side in (1.0, -1.0)):
         motion = np.stack([speed * t, np.full_like(t, speed), np.zeros_like(t)], axis=1)
         error, _ = simulated(gains, design, plant, motion, 0)
         yield float(np.ptp(error[len(t) // 4 :])) if np.isfinite(error).all() else math.inf

@@ -73,7 +73,7 @@ def walk_in(folder: Path, interrupted: str = "") -> Walk:
 
         yield tell
 
-    options = Options(plants=2, processes=1)
+    options = Options(plants=2, processes=1, least_plants=2)
     return Walk(folder, AXIS, options, Questions(True, lambda _q: True), progress, lambda _line: None)
 
 

@@ -12,6 +12,6 @@ from tests.synthesize.designs import table1_set
 @cache
 def certified() -> GainSet:
     """The set with a valid certificate."""
-    result = verify(table1_set(), plants=2, processes=1)
+    result = verify(table1_set(), plants=2, processes=1, least_plants=2)
     assert result.valid, [check for check in result.checks if not check.passed]
     return result.certified(table1_set())

@@ -6,10 +6,13 @@ import pytest
 
 from servod.axis_model import AxisModel
 from servod.gain_design import Uncertainty
-from servod.synthesize.intervals import ASSUMED_DAMPING, FLOORS, uncertainty_of
+from servod.identified import IdentifiedValue
+from servod.synthesize.intervals import FLOORS, uncertainty_of
+from servod.verify.checks import Subject, check_intervals
+from servod.verify.measured import ASSUMED_DAMPING
 from servod.verify.steady_friction import steady_friction
 from servod.yaml12 import validate
-from tests.synthesize.designs import table1
+from tests.synthesize.designs import table1, table1_set
 
 SPEEDS = (0.005, 0.02, 0.05, 0.1, 0.2, 0.5)
 
@@ -58,8 +61,31 @@ def test_wide_intervals_are_taken_as_they_are_and_narrow_ones_at_their_floor() -
     wide, narrow = uncertainty_of(identified(0.3, 0.004)), uncertainty_of(identified(0.001, 1e-5))
     assert (wide.inertia, wide.stiffness, wide.damping, wide.viscous) == pytest.approx((0.3,) * 4, rel=1e-9)
     assert wide.slope == pytest.approx(2.0**0.5 * 0.004 / 0.025)
-    assert narrow.model_dump(exclude={"torque_gain"}) == FLOORS
+    assert narrow.model_dump(exclude={"torque_gain"}) == FLOORS  # the delay, of which nothing was said, by default
+    friction = steady_friction(table1())
+    assert wide.dry == pytest.approx(0.004 / min(friction.torque(v) for v in SPEEDS))
     assert wide.torque_gain == 0.0  # torques are identified in units of the command
+
+
+def test_the_wider_side_counts_and_nothing_is_cut_at_half() -> None:
+    model = identified(0.001, 1e-5)
+    assert model.identified is not None
+    values = dict(model.identified.values)
+    values["sigma1"] = values["sigma1"].model_copy(update={"low": 0.9, "high": 1.7})
+    values["delay_s"] = IdentifiedValue(value=0.001, low=0.00093, high=0.00101, unit="s")
+    known = model.identified.model_copy(update={"values": values})
+    found = uncertainty_of(model.model_copy(update={"identified": known}))
+    assert found.damping == pytest.approx(0.7) and found.delay_s == pytest.approx(7e-5)
+
+
+def test_a_design_narrower_than_what_was_measured_is_not_certified() -> None:
+    gains, model = table1_set(), identified(0.3, 0.004)
+    assert gains.design is not None
+    wide = uncertainty_of(model)
+    for widths, passed in ((wide, True), (wide.scaled(0.5), False)):
+        design = gains.design.model_copy(update={"model": model, "uncertainty": widths})
+        check = next(check_intervals(Subject(gains, design, 1, 1, 1)))
+        assert check.passed == passed and ("stiffness" in check.name) == (not passed)
 
 
 def test_an_assumed_damping_has_the_interval_of_an_assumption() -> None:

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from servod.errors import BadInput
-from servod.gains import GainSet, load_gains, parse_gains
-from servod.verify.certify import verify
-from servod.verify.checks import Subject, check_loop, check_regions, check_seal
+from servod.gains import CertificateCheck, GainSet, load_gains, parse_gains
+from servod.verify.certify import Verification, sources, verify
+from servod.verify.checks import Subject, check_loop, check_monte_carlo, check_regions, check_seal
 from servod.verify.trials import monte_carlo
 from tests.synthesize.designs import MODEL, table1_set
 
@@ -33,11 +33,27 @@ def changed(path: tuple[Any, ...], factor: float) -> GainSet:
 
 
 def test_a_synthesized_set_is_certified_and_the_daemon_takes_it() -> None:
-    result = verify(table1_set(), plants=6, processes=1)
+    result = verify(table1_set(), plants=6, processes=1, least_plants=6)
     assert result.valid, [check for check in result.checks if not check.passed]
     certified = parse_gains(result.certified(table1_set()).to_yaml(), "set")
     assert certified.certificate_problem() is None
     assert result.observations["largest tolerated delay [s]"] > 0.001
+
+
+def test_few_plants_make_no_certificate() -> None:
+    failed = [check.name for check in check_monte_carlo(subject(table1_set())) if not check.passed]
+    assert failed == ["plants of the Monte-Carlo"]
+
+
+def test_a_broken_seal_is_not_mended_by_a_verification() -> None:
+    meddled = table1_set().model_copy(update={"name": "other"})
+    judged = Verification([CertificateCheck(name="seal", value=1.0, limit=0.0, margin=-1.0, passed=False)], {})
+    assert judged.certified(meddled).seal_broken and not judged.certified(table1_set()).seal_broken
+
+
+def test_the_tool_is_what_the_verification_stands_on() -> None:
+    names = {f"{path.parent.name}/{path.name}" for path in sources()}
+    assert {"verify/checks.py", "models/closed_loop.py", "controllers/local.py", "servod/gain_design.py"} <= names
 
 
 def test_one_number_changed_breaks_the_seal() -> None:
@@ -77,7 +93,7 @@ def test_a_set_without_design_cannot_be_verified() -> None:
 def test_the_same_seed_draws_the_same_plants_over_any_number_of_processes() -> None:
     alone, shared = (monte_carlo(table1_set(), 4, 7, processes) for processes in (1, 2))
     assert alone == shared
-    assert np.ptp([trial.error_rad for trial in alone]) > 0.0
+    assert np.ptp([trial.error_share for trial in alone]) > 0.0
 
 
 def test_no_solver_is_imported() -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from servod.cli.app import run
 from servod.gains import load_gains
+from servod.verify.certify import verify
 from tests.synthesize.designs import MODEL, table1_set
 
 
@@ -17,10 +18,22 @@ def test_from_a_model_to_a_certified_set(tmp_path: Path, capsys: pytest.CaptureF
     assert run(["synthesize", "--model", str(MODEL), "--out", str(out), "--name", "table1", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["feasible"] and told["velocity_cutoff_hz"] >= 120.0
-    assert run(["verify", str(out), "--json", "--plants", "4", "--processes", "1"]) == 0
+    assert run(["verify", str(out), "--json", "--plants", "4", "--processes", "1"]) == 1
     judged = json.loads(capsys.readouterr().out)
-    assert judged["valid"] and all({"value", "limit", "margin"} <= set(check) for check in judged["checks"])
+    assert [check["name"] for check in judged["checks"] if not check["passed"]] == ["plants of the Monte-Carlo"]
+    assert all({"value", "limit", "margin"} <= set(check) for check in judged["checks"])
+    assert load_gains(out).certificate_problem() == "a certificate that says valid: false"
+
+
+def test_a_set_that_fails_keeps_no_old_certificate(tmp_path: Path) -> None:
+    result = verify(table1_set(), plants=2, processes=1, least_plants=2)
+    out = tmp_path / "gains.yaml"
+    out.write_text(result.certified(table1_set()).to_yaml())
     assert load_gains(out).certificate_problem() is None
+    assert run(["verify", str(out), "--plants", "2", "--processes", "1", "--no-write"]) == 1
+    assert load_gains(out).certificate_problem() is None
+    assert run(["verify", str(out), "--plants", "2", "--processes", "1"]) == 1
+    assert load_gains(out).certificate_problem() == "a certificate that says valid: false"
 
 
 def test_one_number_changed_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -31,7 +44,8 @@ def test_one_number_changed_is_refused(tmp_path: Path, capsys: pytest.CaptureFix
     captured = capsys.readouterr()
     assert json.loads(captured.out)["valid"] is False
     assert "sealed" in captured.err and captured.err.count("\n") == 1
-    assert load_gains(out).certificate is None
+    judged = load_gains(out)
+    assert judged.certificate is not None and not judged.certificate.valid and judged.seal_broken
 
 
 def test_a_model_without_stiffness_is_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -29,7 +29,8 @@ class Verify:
         gains = load_gains(walk.path(DESIGN))
         with walk.progress(self.title) as tell:
             tell(f"{walk.options.plants} plants", 0.1)
-            result = verify(gains, walk.options.plants, SEED, walk.options.processes, str(walk.path(DESIGN)))
+            options, where = walk.options, str(walk.path(DESIGN))
+            result = verify(gains, options.plants, SEED, options.processes, where, least_plants=options.least_plants)
         write_json(walk.path(CERTIFICATE), result.document())
         if not result.valid:
             failed = [check.name for check in result.checks if not check.passed]
