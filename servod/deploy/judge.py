@@ -13,6 +13,9 @@ from servod.verify.validation import PART_TEXT, Figures, Part
 #: Worse than before: above its mean by this share, by so many of its standard errors, and by some encoder counts. The
 #: scatter of the new run is not allowed for: a restless set would widen its own limit.
 WORSE_SHARE, STANDARD_ERRORS = 0.1, 3.0
+#: A joint that sticks far from its reference does not swing, one that still moves to it does: the hold may swing by this
+#: share more of the error that the set before left on the slow sine. Of a set that compensates, that is next to nothing.
+STUCK_SHARE = 0.05
 #: A broken promise: above the worst promised plant by this share, and by so many encoder counts.
 PROMISE_SHARE = 0.3
 #: What rounding and noise of the encoder make of an RMS error, and of a swing from peak to peak.
@@ -38,7 +41,8 @@ def worse(before: Figures, after: Figures, count_rad: float) -> Iterator[str]:
 def worse_limit(before: Figures, part: Part, count_rad: float) -> float:
     """Largest mean that is not worse than before [rad]."""
     chance = STANDARD_ERRORS * before.standard_error(part)
-    return (1.0 + WORSE_SHARE) * before.mean(part) + chance + COUNTS[part] * count_rad
+    sticks = STUCK_SHARE * before.mean(Part.SLOW) if part is Part.HOLD else 0.0
+    return (1.0 + WORSE_SHARE) * before.mean(part) + chance + sticks + COUNTS[part] * count_rad
 
 
 def broken(after: Figures, promised: Promise, count_rad: float) -> Iterator[str]:

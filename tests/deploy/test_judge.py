@@ -37,10 +37,12 @@ def test_a_restless_set_does_not_widen_its_own_limit() -> None:
 
 def test_a_hold_that_swings_more_than_before_goes_though_it_was_promised() -> None:
     promised = PROMISE.model_copy(update={"hold_rad": 1e-4})
-    before = figures(hold=1e-5)
-    assert complaints(before, figures(hold=1.1e-5 + 3.9 * COUNT_RAD), promised, COUNT_RAD) == []
-    (said,) = complaints(before, figures(hold=1.1e-5 + 4.1 * COUNT_RAD), promised, COUNT_RAD)
+    before, limit = figures(hold=1e-5), 1.1e-5 + 4.0 * COUNT_RAD + 0.05 * 2e-5
+    assert complaints(before, figures(hold=0.99 * limit), promised, COUNT_RAD) == []
+    (said,) = complaints(before, figures(hold=1.01 * limit), promised, COUNT_RAD)
     assert said.startswith("swing while it holds")
+    stuck = figures(slow=8e-3, hold=1e-5)  # milliradians away, and still
+    assert complaints(stuck, figures(hold=1.3e-4), promised, COUNT_RAD) == []
 
 
 @pytest.mark.parametrize("part", list(Part))
