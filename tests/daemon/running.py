@@ -24,8 +24,8 @@ limits:
   torque_nm: 0.9
   torque_rate_nm_per_s: 400.0
   speed_rad_s: 5.0
-  position_min_rad: -0.6
-  position_max_rad: 0.6
+  position_min_rad: -{travel_rad}
+  position_max_rad: {travel_rad}
   following_error_rad: 0.3
   encoder_mismatch_rad: 0.05
   stale_cycles: 200           # behaviour is tested here, on machines that may be busy
@@ -65,14 +65,21 @@ class Running:
 
 
 @contextlib.contextmanager
-def running(folder: Path) -> Iterator[Running]:
-    """Start both, wait until the daemon answers, and leave nothing behind."""
+def running(folder: Path, plant: Path | None = None, more: str = "", travel_rad: float = 0.6) -> Iterator[Running]:
+    """Start both, wait until the daemon answers, and leave nothing behind.
+
+    `plant` is another joint than the demo's, `more` further sections of the configuration.
+    """
     config = folder / "axis.yaml"
-    config.write_text(CONFIG.format(folder=folder, gains=shipped("gains/demo_pd.yaml")))
+    initial = shipped("gains/demo_pd.yaml")
+    config.write_text(CONFIG.format(folder=folder, gains=initial, travel_rad=travel_rad) + more)
+    joint = ["--plant", str(plant)] if plant else []
     log = folder / "daemon.log"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as manager:
         manager.bind(str(folder / "notify"))
-        with child("servod.drivers.virtual.main", ["--socket", str(folder / "bus")], folder / "axis.log") as axis:
+        with child(
+            "servod.drivers.virtual.main", ["--socket", str(folder / "bus"), *joint], folder / "axis.log"
+        ) as axis:
             wait_until((folder / "bus").exists, axis, folder / "axis.log", 30.0)
             with _told_to(folder / "notify"), child("servod.daemon.main", ["--config", str(config)], log) as daemon:
                 wait_until((folder / "axis.sock").exists, daemon, log, 30.0)

@@ -1,4 +1,4 @@
-"""A trial under a running daemon: real processes, and a client that dies in the middle."""
+"""A trial under a running daemon: real processes, and a client that leaves without keeping what it tried."""
 
 from __future__ import annotations
 

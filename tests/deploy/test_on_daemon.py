@@ -1,0 +1,78 @@
+"""A whole deployment on a daemon and a virtual axis, and a client that is killed in the middle of a motion."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from servod.axis_model import axis_model_yaml
+from servod.commission.axis import DaemonWalkAxis
+from servod.config import load_config
+from servod.control import ControlClient
+from servod.deploy.deployment import deploy, motions_in
+from servod.gain_store import Action, GainStore
+from servod.shipped import shipped
+from tests.daemon.running import at_rest, running, wait_for
+from tests.deploy.sets import certified
+from tests.synthesize.designs import table1
+
+pytestmark = pytest.mark.serial
+
+#: A client that tries a set and moves; it is killed and cleans nothing up.
+TRIES = """
+import sys
+from servod.control import ControlClient
+from servod.deploy.daemon_link import DaemonDeployLink
+from servod.gains import load_gains
+
+link = DaemonDeployLink(ControlClient(sys.argv[1]))
+link.enable()
+link.attempt(*link.load(load_gains(sys.argv[2])))
+link.record([{"kind": "sine", "amplitude_rad": 0.05, "frequency_hz": 0.5, "duration_s": 4.0}])
+"""
+
+
+def test_a_set_is_deployed_on_a_daemon(tmp_path: Path) -> None:
+    """Half a minute: the motion takes its time twice. A loop that skipped cycles promises nothing, and says so."""
+    gains = certified()
+    assert gains.design is not None
+    plant = tmp_path / "plant.yaml"
+    plant.write_text(axis_model_yaml(table1()))
+    more = f"encoder: {{velocity_cutoff_hz: {gains.design.velocity_cutoff_hz}}}\n"
+    with running(tmp_path, plant, more) as axis:
+        walk_axis = DaemonWalkAxis(axis.socket, load_config(axis.folder / "axis.yaml"))
+        assert walk_axis.cutoff_hz == gains.design.velocity_cutoff_hz
+        with walk_axis.deployment(tmp_path, gains, gains) as link:
+            done = deploy(link, gains, lambda _what, _share: None)
+            assert link.active == ((gains.name, 1) if done.stays else done.present)
+            assert not link.enabled  # as it was found
+    assert done.stays or "skipped" in done.reasons[-1], done.reasons
+    assert done.present == ("demo_pd", 1)
+    assert done.rows_after is not None and len(motions_in(done.rows_after)) == len(motions_in(done.rows_before)) == 3
+    last = GainStore(axis.folder / "gains").history()[-1]
+    assert (last.action, last.name) == (Action.ACTIVATE if done.stays else Action.REJECT, gains.name)
+    assert last.figures["before_slow_mrad"] == pytest.approx(done.before.document()["slow_mrad"])
+
+
+def test_a_client_killed_in_a_motion_leaves_the_old_set_and_a_held_axis(tmp_path: Path) -> None:
+    """The daemon goes back at once; the motion, which was checked as a whole, runs to its end, and anyone may stop."""
+    with running(tmp_path) as axis, ControlClient(axis.socket) as watcher:
+        command = [sys.executable, "-c", TRIES, str(axis.socket), str(shipped("gains/demo_local.yaml"))]
+        with subprocess.Popen(command) as client:
+            wait_for(lambda: watcher.call("status")["axis"]["motion_running"], 20.0)
+            assert watcher.call("status")["controller"]["name"] == "demo_local"
+            client.send_signal(signal.SIGKILL)
+        wait_for(lambda: watcher.call("status")["controller"]["name"] == "demo_pd")
+        left = watcher.call("status")["axis"]
+        assert (left["state"], left["motion_running"]) == ("ENABLED", True)
+        wait_for(at_rest(watcher))
+        assert watcher.call("status")["axis"]["state"] == "ENABLED"
+        assert watcher.call("disable")["state"] == "DISABLED"
+        store = GainStore(axis.folder / "gains")
+        active = store.active()
+        assert active is not None and active.name == "demo_pd"
+        assert [(h.action, h.name) for h in store.history()][-1] == (Action.REJECT, "demo_local")
