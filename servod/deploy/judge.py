@@ -13,8 +13,8 @@ from servod.verify.validation import PART_TEXT, Figures, Part
 #: Worse than before: above its mean by this share, by so many of its standard errors, and by some encoder counts. The
 #: scatter of the new run is not allowed for: a restless set would widen its own limit.
 WORSE_SHARE, STANDARD_ERRORS = 0.1, 3.0
-#: A joint that sticks far from its reference does not swing, one that still moves to it does: the hold may swing by this
-#: share more of the error that the set before left on the slow sine. Of a set that compensates, that is next to nothing.
+#: A joint that sticks far from its reference does not swing, one that still moves to it does: the hold may swing by
+#: this share more of the error that the set before left on the slow sine. Of a set that compensates, that is nothing.
 STUCK_SHARE = 0.05
 #: A broken promise: above the worst promised plant by this share, and by so many encoder counts.
 PROMISE_SHARE = 0.3
