@@ -92,6 +92,14 @@ def write_atomically(path: Path, text: str) -> None:
     _flush_directory(path.parent)
 
 
+def write_file(path: Path, text: str) -> None:
+    """`write_atomically` for files that a user named. Raises BadInput."""
+    try:
+        write_atomically(path, text)
+    except OSError as error:
+        raise BadInput(str(path), error.strerror or str(error), "a file that can be written") from None
+
+
 def _flush_directory(directory: Path) -> None:
     descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
     try:

@@ -52,7 +52,7 @@ def deploy(
     wanted = load_gains(gains)
     if present is not None and plant is None:
         raise BadInput("--present", str(present), "only with --plant: a daemon knows what runs")
-    require_certificate(wanted, accept_uncertified=False)
+    require_certificate(wanted, accept_uncertified=None)
     if not as_json:
         print(f"{wanted.name}: {announced(wanted)}", file=sys.stderr, flush=True)
     axis = _on_daemon(socket) if plant is None else _virtual(plant, present, config, wanted, seed)

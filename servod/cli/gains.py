@@ -54,14 +54,18 @@ def show(file: Annotated[Path, typer.Argument(help="Gain set, YAML.")], as_json:
     """Show a gain set."""
     from servod.gains import load_gains
 
-    document = load_gains(file).model_dump(mode="json")
+    gains = load_gains(file)
+    document, problem = gains.model_dump(mode="json"), gains.certificate_problem()
     if as_json:
-        print_json(document)
+        print_json(document | {"certificate_problem": problem})
         return
     from rich.console import Console
     from rich.pretty import Pretty
 
-    Console().print(Pretty(document))
+    document["design"] = None if gains.design is None else f"{gains.design.mode.value}, see --json"
+    console = Console()
+    console.print(Pretty(document))
+    console.print(f"certificate: {problem or 'valid'}", highlight=False)
 
 
 @_app.command(help=example("Change to a stored gain set without a bump.", "servoctl gains activate my_axis"))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from servod.cli import synthesis_options as ask
-from servod.cli.common import JsonOption, example, one_thread, print_json
+from servod.cli.common import JsonOption, example, need_folder, one_thread, print_json
 from servod.errors import AnswerIsNo, BadInput
 
 if TYPE_CHECKING:
@@ -66,6 +66,7 @@ def synthesize(
     from servod.axis_model import load_axis_model
 
     need_order(overlap_from, overlap_to, speed)
+    need_folder("--out", out.resolve().parent)
     axis = delayed(load_axis_model(model), delay_s)
     overlap = overlap_from, overlap_to
     wishes = wishes_of(axis, uncertainty, period_us, cutoff_hz, encoder_counts, speed, overlap)
@@ -129,7 +130,7 @@ def options_of(
 
 def finish(result: GainSet | Infeasible, out: Path, cross_check: bool, as_json: bool) -> None:
     """Write and print the set, or say why there is none. Raises AnswerIsNo."""
-    from servod.gain_store import write_atomically
+    from servod.gain_store import write_file
     from servod.synthesize.deployed import Infeasible
 
     if isinstance(result, Infeasible):
@@ -139,7 +140,7 @@ def finish(result: GainSet | Infeasible, out: Path, cross_check: bool, as_json: 
         from servod.synthesize.crosscheck import cross_checked
 
         result = cross_checked(result)
-    write_atomically(out, result.to_yaml())
+    write_file(out, result.to_yaml())
     document = summary(result, out)
     if as_json:
         print_json(document)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from servod.errors import BadInput
-from servod.gain_store import write_atomically
+from servod.gain_store import write_file
 from servod.yaml12 import read_text
 
 RECORDINGS = "recordings"
@@ -28,9 +28,9 @@ def write_text(path: Path, text: str) -> None:
     """Replace a file as a whole. Raises BadInput."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, text)
     except OSError as error:
         raise BadInput(str(path), error.strerror or str(error), "a file that can be written") from None
+    write_file(path, text)
 
 
 def write_json(path: Path, document: Any) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 from pydantic import Field
 
 from servod.errors import BadInput, Unreachable
-from servod.gain_store import write_atomically
+from servod.gain_store import write_file
 from servod.yaml12 import Strict, read_text, validate
 
 STATE = "state.json"
@@ -97,10 +97,7 @@ class State:
             raise BadInput(f"--out {self.folder}", f"{', '.join(there)} without {STATE}", "an empty folder")
 
     def _write(self) -> None:
-        try:
-            write_atomically(self._path, self._content.model_dump_json(indent=1) + "\n")
-        except OSError as error:
-            raise BadInput(str(self._path), error.strerror or str(error), "a file that can be written") from None
+        write_file(self._path, self._content.model_dump_json(indent=1) + "\n")
 
 
 @contextlib.contextmanager
