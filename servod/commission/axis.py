@@ -19,6 +19,7 @@ from typing import Any, Protocol
 from servod.axis_model import AxisModel, axis_model_yaml
 from servod.config import AxisConfig
 from servod.control import ControlClient
+from servod.daemon_config import require_daemon_config
 from servod.deploy.daemon_link import DaemonDeployLink
 from servod.deploy.links import DeployLink
 from servod.deploy.virtual import virtual_link, with_cutoff
@@ -151,8 +152,9 @@ class DaemonWalkAxis:
 
     @contextlib.contextmanager
     def deployment(self, folder: Path, gains: GainSet, present: GainSet) -> Iterator[DeployLink]:
-        """Over the daemon's control socket; the sets are in its own store."""
+        """Over the daemon's control socket; the sets are in its own store. Raises BadInput on another configuration."""
         with ControlClient(self.socket) as client:
+            require_daemon_config(client, self.config)
             yield DaemonDeployLink(client)
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from servod.config import AxisConfig
 from servod.control import ControlClient, Refused
+from servod.daemon_config import require_daemon_config
 from servod.deploy.daemon_link import DaemonDeployLink
 from servod.errors import AnswerIsNo
 from servod.tracking.metrics import Curves, Tracking, tracking
@@ -24,7 +25,7 @@ def measure_on_daemon(
     """Figures of the set `deployed` (name, version), and what the daemon refused; None where it refused (19).
 
     The axis is left enabled or not, as it was. Raises AnswerIsNo when another set runs or the axis drops out,
-    Unreachable when the daemon does not answer any more.
+    BadInput when the daemon has another configuration than `config`, Unreachable when it does not answer any more.
     """
     motions = {"paper": {"kind": "paper", "duration_s": PAPER_S}}
     motions |= {
@@ -33,6 +34,7 @@ def measure_on_daemon(
     curves: dict[str, Curves] = {}
     refused: list[str] = []
     with ControlClient(socket) as client:
+        require_daemon_config(client, config)
         link = DaemonDeployLink(client)
         _require_active(link, deployed)
         was_enabled = link.enabled

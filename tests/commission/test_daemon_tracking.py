@@ -9,7 +9,7 @@ import pytest
 from servod.commission.daemon_tracking import measure_on_daemon
 from servod.config import load_config
 from servod.control import ControlClient
-from servod.errors import AnswerIsNo, Unreachable
+from servod.errors import AnswerIsNo, BadInput, Unreachable
 from servod.tracking.motions import STEPS_MRAD
 from tests.daemon.running import running
 
@@ -21,6 +21,11 @@ def test_only_the_deployed_set_is_measured_and_a_refusal_is_no_death(tmp_path: P
         config = load_config(axis.folder / "axis.yaml")
         with pytest.raises(AnswerIsNo, match="runs demo_pd version 1, but deployed version 2 was deployed"):
             measure_on_daemon(axis.socket, config, ("deployed", 2), lambda _share: None)
+        coarse = config.encoder.model_copy(update={"counts_per_turn": 1000})
+        with pytest.raises(BadInput, match=r"encoder\.counts_per_turn"):
+            measure_on_daemon(
+                axis.socket, config.model_copy(update={"encoder": coarse}), ("demo_pd", 1), lambda _share: None
+            )
         found, refused = measure_on_daemon(axis.socket, config, ("demo_pd", 1), lambda _share: None)
         assert found is None
         assert [line.partition(":")[0] for line in refused] == ["paper", *(f"{mrad:g}" for mrad in STEPS_MRAD)]

@@ -57,3 +57,22 @@ def test_a_trial_is_run_kept_and_undone(tmp_path: Path) -> None:
         (Action.ROLLBACK, "demo_pd"),
     ]
     assert [h.figures for h in history if h.note == "good"] == [{"after_slow_mrad": 0.1}]
+
+
+def test_an_interrupt_stops_the_axis_before_the_recorder(tmp_path: Path) -> None:
+    """Also when it cut a request on the link's own connection."""
+    motion = {"kind": "sine", "amplitude_rad": 0.05, "frequency_hz": 0.5, "duration_s": 10.0}
+    with running(tmp_path) as axis, ControlClient(axis.socket) as watcher:
+        with ControlClient(axis.socket) as client:
+            link = DaemonDeployLink(client)
+            link.enable()
+
+            def interrupt() -> None:
+                client.close()
+                raise KeyboardInterrupt
+
+            with pytest.raises(KeyboardInterrupt):
+                link.record([motion], interrupt)
+        status = watcher.call("status")
+        assert (status["axis"]["state"], status["motion"]["torque_nm"]) == ("DISABLED", 0.0)
+        assert status["controller"]["name"] == "demo_pd"
