@@ -218,6 +218,7 @@ def summary(gains: GainSet, out: Path) -> dict[str, Any]:
         "regions": parameters["regions"],
         "input_scale_nm": parameters["input_scale_nm"],
         "local_sets": len(parameters["friction"]["sets"]),
+        "equation_8": cited_mismatch(gains),
         "gains_l": [s["gain"] for s in parameters["friction"]["sets"]],
         "disturbance_observer": parameters["disturbance_observer"],
         "position_feedforward": parameters["position_feedforward"],
@@ -229,6 +230,16 @@ def summary(gains: GainSet, out: Path) -> dict[str, Any]:
     }
 
 
+def cited_mismatch(gains: GainSet) -> dict[str, float] | None:
+    """What (8) of the paper says of neighbouring sets: cited, not used, for to the letter it wants equal forces."""
+    from servod.gain_parameters import LocalParameters
+    from servod.synthesize.local_sets import FINITE_TIME_S, largest_mismatch
+
+    law = gains.parameters
+    found = largest_mismatch(law.friction) if isinstance(law, LocalParameters) else None
+    return found and {"time_s": FINITE_TIME_S, **found._asdict()}
+
+
 def print_summary(document: dict[str, Any]) -> None:
     """Print the summary for people."""
     scale = document["input_scale_nm"]
@@ -238,6 +249,10 @@ def print_summary(document: dict[str, Any]) -> None:
         print(f"region {region}: {position:.4g} N*m/rad, {speed:.4g} N*m*s/rad")
     observer = document["disturbance_observer"]
     print(f"{document['local_sets']} local sets; observer {observer['bandwidth_rad_s'] if observer else 0:g} rad/s")
+    apart = document["equation_8"]
+    if apart:
+        between = f"{apart['from_rad_s']:.3g} and {apart['to_rad_s']:.3g} rad/s"
+        print(f"(8) after {apart['time_s']:g} s: neighbours differ by {100 * apart['share']:.2g} % at most, {between}")
     if any(document["gains_l"]):
         print(f"l from {min(document['gains_l']):.3g} to {max(document['gains_l']):.3g}")
     print_known(document["position_feedforward"])

@@ -9,18 +9,21 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from servod.controllers import MAX_SETS
 from servod.errors import BadInput
-from servod.gain_parameters import LocalSet
+from servod.gain_parameters import LocalFriction, LocalSet
 from servod.verify.steady_friction import SteadyFriction
 
 #: v_i of Table I.
 PAPER_NODES = (-0.5, -0.2, -0.01, -0.001, 0.0, 0.001, 0.05, 0.12, 0.5)
 #: c0_hat as a share of the lowest c0 in its interval: stable with one to three cycles of delay; 1.0 is marginal.
 STIFFNESS_SHARE = 0.8
+#: t_f of (8): what a set has to reach its force.
+FINITE_TIME_S = 0.1
 GRID = 400  # speeds per direction at which the tolerance is checked
 
 
@@ -117,3 +120,25 @@ def adjacent_mismatch(c: Compensator, sets: list[LocalSet], time_s: float) -> li
     """
     forces = [force_after(c, s.decay_per_s, s.velocity_rad_s, time_s) for s in sets]
     return [upper - lower for lower, upper in itertools.pairwise(forces)]
+
+
+class Mismatch(NamedTuple):
+    """Two neighbouring sets of one direction, and by how much their forces differ in (8)."""
+
+    from_rad_s: float
+    to_rad_s: float
+    difference_nm: float
+    share: float
+
+
+def largest_mismatch(law: LocalFriction, time_s: float = FINITE_TIME_S) -> Mismatch | None:
+    """The neighbours of one direction that (8) finds furthest apart, as a share of the larger force; or None."""
+    c, sets = Compensator(law.stiffness_nm_per_rad, law.viscous_nms_per_rad), law.sets
+    pairs = zip(itertools.pairwise(sets), adjacent_mismatch(c, sets, time_s), strict=True)
+    found = []
+    for (lower, upper), difference in pairs:
+        if lower.velocity_rad_s * upper.velocity_rad_s > 0.0:
+            forces = [abs(force_after(c, s.decay_per_s, s.velocity_rad_s, time_s)) for s in (lower, upper)]
+            share = abs(difference) / max(forces)
+            found.append(Mismatch(lower.velocity_rad_s, upper.velocity_rad_s, difference, share))
+    return max(found, key=lambda pair: pair.share, default=None)

@@ -7,15 +7,17 @@ import pytest
 
 from servod.controllers.weights import blended
 from servod.errors import BadInput
+from servod.gain_parameters import LocalParameters
 from servod.synthesize.local_sets import (
     PAPER_NODES,
     adjacent_mismatch,
     compensator,
+    largest_mismatch,
     local_sets,
     sets_at,
 )
 from servod.verify.steady_friction import steady_friction
-from tests.synthesize.designs import table1
+from tests.synthesize.designs import table1, table1_set
 
 FRICTION = steady_friction(table1())
 COMPENSATOR = compensator(FRICTION, 0.5, 0.8)
@@ -51,6 +53,17 @@ def test_equation_8_settles_to_the_difference_of_the_map() -> None:
     mismatch = adjacent_mismatch(COMPENSATOR, sets, 100.0)
     expected = FRICTION.torque(0.5) - FRICTION.torque(0.12)
     assert mismatch[-1] == pytest.approx(expected, rel=1e-6)
+
+
+def test_equation_8_is_told_of_the_neighbours_that_are_furthest_apart() -> None:
+    law = table1_set().parameters
+    assert isinstance(law, LocalParameters)
+    found = largest_mismatch(law.friction, 100.0)
+    assert found is not None and found.from_rad_s * found.to_rad_s > 0.0
+    forces = [FRICTION.torque(s.velocity_rad_s) for s in law.friction.sets if s.velocity_rad_s > 0.0]
+    steps = np.abs(np.diff(forces))
+    assert abs(found.difference_nm) <= steps.max() * 1.001
+    assert 0.0 < found.share < 0.5
 
 
 def test_more_sets_than_the_law_holds_are_refused() -> None:
