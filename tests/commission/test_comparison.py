@@ -1,0 +1,34 @@
+"""The comparison keeps its runs: a law is measured again only when what it depends on has changed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from servod.commission.axis import VirtualWalkAxis
+from servod.commission.comparison import measured, run_files
+from servod.commission.files import read_json, write_json, write_text
+from servod.deploy.virtual import pd_set
+from tests.commission.test_state import walk
+from tests.synthesize.designs import table1
+
+
+def test_nothing_is_measured_twice(tmp_path: Path) -> None:
+    """An axis that refuses the motion as too fast ends a run at once; that is a result as well."""
+    suits, file = VirtualWalkAxis(table1(), seed=1).config, tmp_path / "slow.yaml"
+    limits = suits.limits.model_copy(update={"speed_rad_s": 0.01})
+    axis = VirtualWalkAxis(table1(), seed=1, chosen=suits.model_copy(update={"limits": limits}))
+    here = walk(tmp_path, axis, processes=1)
+
+    def again(stiffness: float) -> str:
+        write_text(file, pd_set("slow", stiffness, 0.1).to_yaml())
+        found = measured(here, axis, {"free_slow": file}, 300.0, lambda _what, _share: None)
+        return str(found["free_slow"]["failed"])
+
+    said = again(2.0)
+    assert "speed" in said
+    figures, _ = run_files(here, "free_slow")
+    kept = read_json(figures)
+    write_json(figures, kept | {"figures": kept["figures"] | {"failed": "as before"}})
+    assert again(2.0) == "as before"
+    assert again(2.1) != "as before"
+    assert read_json(figures)["inputs_sha256"] != kept["inputs_sha256"]
