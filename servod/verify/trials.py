@@ -32,8 +32,9 @@ PAST_FALL, LEAST_PEAK = 1.3, 0.16
 LEAD_IN_S, STEP_S, SINE_S, HOLD_S, LARGE_S = 0.1, 0.6, 4.0, 1.0, 1.0
 ERROR_SHARE = 0.04  # of the sine's amplitude: a plant beyond it does not follow
 RIPPLE_LIMIT_RAD = 1e-4  # peak to peak of a long hold, torque noise included
-#: Of the large step, peak to peak from 0.8 s after a motion on, noise included: a tenth of what counts as settled. An
-#: axis of two cycles swings out for a second; one that does not rest at all is found by the long hold as well.
+#: Of the large step, peak to peak from 0.8 s after a motion on, noise included, beyond two encoder counts (nothing
+#: holds a joint between these): a tenth of what counts as settled. An axis of two cycles swings out for a second; one
+#: that does not rest at all is found by the long hold as well.
 RIPPLE_SHARE = 0.002
 RIPPLE_S = 0.2
 SETTLED_SHARE = 0.02  # of the large step: a plant that is further off at its end does not get there
@@ -159,12 +160,13 @@ def run_trial(gains: GainSet, design: Design, motion: Array, seed: int, index: i
     if not np.isfinite(position).all():
         return Trial(index, math.inf, math.inf, math.inf)
     scale, ends, last = scale_of(design), np.cumsum(counts(design.period_s)), round(RIPPLE_S / design.period_s)
+    between = 2.0 * 2.0 * math.pi / design.counts_per_turn if design.counts_per_turn else 0.0
     sine = error[ends[1] + last : ends[2]]  # the sine starts with a jump of velocity
     rests = [np.ptp(position[end - last : end]) for end in (ends[3], ends[4])]
     return Trial(
         index,
         float(np.abs(sine).max()) / scale.sine_rad,
-        float(max(rests)) / scale.large_rad,
+        max(float(max(rests)) - between, 0.0) / scale.large_rad,
         float(np.abs(error[-last:]).max()) / scale.large_rad,
     )
 
