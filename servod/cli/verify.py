@@ -34,14 +34,14 @@ def verify(
 ) -> None:
     """Verify GAINS; exit code 1 when the set is not valid."""
     one_thread()
-    from servod.gain_store import write_atomically
+    from servod.gain_store import write_file
     from servod.gains import load_gains
     from servod.verify.certify import verify
 
     checked = load_gains(gains)
     result = verify(checked, plants, seed, processes, str(gains))
     if write:
-        write_atomically(gains, result.certified(checked).to_yaml())
+        write_file(gains, result.certified(checked).to_yaml())
     if as_json:
         print_json(result.document() | {"hashes": hashes(checked)})
     else:
