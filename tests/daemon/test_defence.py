@@ -153,7 +153,7 @@ def _drive_state(bus: VirtualBus) -> DriveState:
 
 def test_start_that_fails_leaves_no_node_operational(tmp_path: Path) -> None:
     config, bus_path = tmp_path / "axis.yaml", tmp_path / "bus"
-    config.write_text(CONFIG.format(folder=tmp_path, gains=shipped("gains/demo_pd.yaml")))
+    config.write_text(CONFIG.format(folder=tmp_path, gains=shipped("gains/demo_pd.yaml"), travel_rad=0.6))
     (tmp_path / "axis.sock").write_text("precious")
     with child("servod.drivers.virtual.main", ["--socket", str(bus_path)], tmp_path / "axis.log") as virtual:
         wait_until(bus_path.exists, virtual, tmp_path / "axis.log", 30.0)
