@@ -36,6 +36,7 @@ link.record([{"kind": "sine", "amplitude_rad": 0.05, "frequency_hz": 0.5, "durat
 """
 
 
+@pytest.mark.timeout(300)  # a synthesis, a certificate and two motions of a quarter of a minute
 def test_a_set_is_deployed_on_a_daemon(tmp_path: Path) -> None:
     """Half a minute: the motion takes its time twice. A loop that skipped cycles promises nothing, and says so."""
     gains = certified()
