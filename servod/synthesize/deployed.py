@@ -251,12 +251,15 @@ def relaxations(model: AxisModel, wishes: Wishes) -> Iterator[Relaxation]:
     def rougher(factor: float) -> Wishes:
         return replace(fixed, least_damping=factor * wishes.least_damping)
 
+    def designs(change: Callable[[float], Wishes]) -> Callable[[float], bool]:
+        return lambda factor: regions(model, change(factor)) is not None
+
     for wish, asked, change in (
         ("scale of the uncertainty", 1.0, shrunk),
         ("least decay [1/s]", wishes.least_decay_per_s, slower),
         ("least damping ratio", wishes.least_damping, rougher),
     ):
-        factor = _largest_feasible(model, change)
+        factor = largest_factor(designs(change))
         if factor is not None:
             yield Relaxation(wish, asked, factor * asked)
     for cutoff in CUTOFFS_HZ:
@@ -265,12 +268,8 @@ def relaxations(model: AxisModel, wishes: Wishes) -> Iterator[Relaxation]:
             return
 
 
-def _largest_feasible(model: AxisModel, change: Callable[[float], Wishes]) -> float | None:
-    """Largest factor below 1 whose wishes have a design, by bisection; None when even 0.02 has none."""
-
-    def feasible(factor: float) -> bool:
-        return regions(model, change(factor)) is not None
-
+def largest_factor(feasible: Callable[[float], bool]) -> float | None:
+    """Largest factor below 1 that is feasible, by bisection; None when even 0.02 is not."""
     low, high = 0.02, 1.0
     if not feasible(low):
         return None

@@ -6,7 +6,7 @@ floor, c0_hat) against the model within its intervals. A solution is taken only 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from servod.axis_model import AxisModel
 from servod.gain_design import Design, DesignMode, ReferenceProof
 from servod.gain_parameters import LocalParameters, RegionGains, Regions
 from servod.gains import GainSet
-from servod.synthesize.deployed import Infeasible, Relaxation, Wishes, empty_design
+from servod.synthesize.deployed import Infeasible, Relaxation, Wishes, empty_design, largest_factor
 from servod.synthesize.gain_set import Options, gain_set, parameters
 from servod.synthesize.lmi_reference import (
     PARTS,
@@ -31,7 +31,6 @@ from servod.verify.vertices import Span
 
 CUTOFF_HZ = 300.0  # of the velocity filter, which this mode does not know
 LEAKS_PER_S = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
-RELAX_STEPS = 6
 STRICTNESS = (1e-6, 1e-5, 1e-4)  # tried in turn until the solution also holds by eigenvalues
 
 
@@ -137,14 +136,3 @@ def relaxations(model: AxisModel, wishes: Wishes, options: Options, asked: Refer
         if leak > options.leak_per_s and feasible(wishes, replace(options, leak_per_s=leak), asked):
             yield Relaxation("leak of the friction state [1/s]", options.leak_per_s, leak)
             return
-
-
-def largest_factor(feasible: Callable[[float], bool]) -> float | None:
-    """Largest factor below 1 that is feasible, by bisection; None when even 0.02 is not."""
-    low, high = 0.02, 1.0
-    if not feasible(low):
-        return None
-    for _ in range(RELAX_STEPS):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if feasible(middle) else (low, middle)
-    return low
