@@ -9,21 +9,44 @@ import contextlib
 import ctypes
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from functools import cache
 from multiprocessing import get_context, resource_tracker
-from multiprocessing.pool import Pool
 from multiprocessing.util import Finalize
+from typing import Any
+
+from servod.errors import Unreachable
 
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 @contextlib.contextmanager
-def worker_pool(processes: int) -> Iterator[Pool]:
-    """`processes` fresh processes for the time of a `with` block; whatever ends the block ends them at once."""
+def worker_pool(processes: int, begin: Callable[..., None] | None = None, *given: Any) -> Iterator[Executor]:
+    """`processes` fresh processes for the time of a `with` block; whatever ends the block ends them at once.
+
+    Each calls `begin(*given)` first. Raises Unreachable when one of them dies, which an executor tells to whoever waits
+    for a result: a `multiprocessing.Pool` would replace it in silence and wait for what it had taken.
+    """
     _tracker_goes_with_us()
-    with get_context("spawn").Pool(processes, begin_worker, (os.getpid(),)) as pool:
+    pool = ProcessPoolExecutor(processes, get_context("spawn"), begin_worker, (os.getpid(), begin, given))
+    try:
         yield pool
+    except BrokenProcessPool:
+        raise Unreachable(
+            "a worker process ended before its work was done: it could not start, was killed, or memory ran out "
+            "(`dmesg` tells); run the command again, with fewer --processes where it has them"
+        ) from None
+    finally:
+        _end(pool)
+
+
+def _end(pool: ProcessPoolExecutor) -> None:
+    """Kill and wait. The pool's own way out lets every job that has begun come to its end (until Python 3.14)."""
+    for process in list((pool._processes or {}).values()):
+        process.kill()
+    pool.shutdown(wait=True, cancel_futures=True)
 
 
 @cache
@@ -37,9 +60,11 @@ def _tracker_goes_with_us() -> None:
     Finalize(None, stop, exitpriority=-1)
 
 
-def begin_worker(parent: int) -> None:
+def begin_worker(parent: int, begin: Callable[..., None] | None, given: tuple[Any, ...]) -> None:
     """What a worker of `parent` does first."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:  # it died before we asked
         os._exit(1)
+    if begin is not None:
+        begin(*given)

@@ -20,9 +20,9 @@ def run_jobs(
     """`work(*job)` for every job, in their order. Raises what the first job that fails raises."""
     tell(", ".join(names[:processes]), 0.0)
     with worker_pool(min(processes, len(jobs))) as pool:
-        pending = [pool.apply_async(work, job) for job in jobs]
+        pending = [pool.submit(work, *job) for job in jobs]
         results = []
         for index, result in enumerate(pending):
-            results.append(result.get())
+            results.append(result.result())
             tell(", ".join(names[index + 1 : index + 1 + processes]) or names[-1], (index + 1) / len(jobs))
     return results

@@ -5,12 +5,11 @@ Beside the data path. Each run is a session of its own (servod.session) in a wor
 
 from __future__ import annotations
 
-import multiprocessing
 import os
-import signal
 import tempfile
 from collections.abc import Callable, Sequence
-from multiprocessing.pool import AsyncResult
+from concurrent.futures import FIRST_COMPLETED, wait
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from servod.commands import ReferenceKind
 from servod.demo.axis import demo_config
 from servod.demo.entries import Entry
 from servod.demo.runs import Run, cut_motion
+from servod.workers import worker_pool
 
 Progress = Callable[[str, float], None]
 
@@ -27,30 +27,24 @@ _shares: Any = None  # one share of progress for each entry, in memory that the 
 
 def run_fast(plant: Path, duration_s: float, rows: Sequence[Entry], progress: Progress) -> list[Run]:
     """Track trajectory (19) for `duration_s` of virtual time under each entry. Raises as the session does."""
-    context = multiprocessing.get_context("spawn")
-    shares = context.Array("d", len(rows), lock=False)
+    shares = get_context("spawn").Array("d", len(rows), lock=False)
     workers = min(len(rows), len(os.sched_getaffinity(0)))
-    with context.Pool(workers, _start_worker, (shares,)) as pool:
-        results = [pool.apply_async(_run, (index, row, str(plant), duration_s)) for index, row in enumerate(rows)]
-        while not all(result.ready() for result in results):
-            next(r for r in results if not r.ready()).wait(_POLL_S)
-            _raise_first_failure(results)
+    with worker_pool(workers, _start_worker, shares) as pool:
+        results = [pool.submit(_run, index, row, str(plant), duration_s) for index, row in enumerate(rows)]
+        left = set(results)
+        while left:
+            ended, left = wait(left, _POLL_S, FIRST_COMPLETED)
+            for result in ended:
+                result.result()  # the first failure ends all
             for row, share in zip(rows, shares, strict=True):
                 progress(row.name, share)
-        return [cut_motion(row.name, result.get()) for row, result in zip(rows, results, strict=True)]
-
-
-def _raise_first_failure(results: list[AsyncResult[bytes]]) -> None:
-    for result in results:
-        if result.ready() and not result.successful():
-            result.get()
+        return [cut_motion(row.name, result.result()) for row, result in zip(rows, results, strict=True)]
 
 
 def _start_worker(shares: Any) -> None:
-    """Ctrl-C is for the parent, which ends the pool."""
+    """Keeps the memory that it shares with the parent."""
     global _shares  # noqa: PLW0603  (how a pool hands inherited memory to its workers)
     _shares = shares
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _run(index: int, row: Entry, plant: str, duration_s: float) -> bytes:

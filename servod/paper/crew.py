@@ -9,8 +9,8 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from contextlib import ExitStack
-from multiprocessing.pool import ApplyResult
 from types import TracebackType
 from typing import Any, ParamSpec, TypeVar
 
@@ -33,7 +33,7 @@ class Crew:
         """`expected_s`: sum of the weights of all jobs that will come, in seconds of one core."""
         self._tell, self._expected_s, self._done_s = tell, expected_s, 0.0
         self._stack = ExitStack()
-        self._open: dict[ApplyResult[Any], tuple[str, float]] = {}
+        self._open: dict[Future[Any], tuple[str, float]] = {}
 
     def __enter__(self) -> Crew:
         workers = min(MOST_WORKERS, max(2, len(os.sched_getaffinity(0))))
@@ -45,26 +45,24 @@ class Crew:
     ) -> None:
         self._stack.__exit__(kind, error, trace)
 
-    def submit(
-        self, what: str, weight_s: float, job: Callable[P, T], *args: P.args, **kwargs: P.kwargs
-    ) -> ApplyResult[T]:
+    def submit(self, what: str, weight_s: float, job: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
         """Begin `job` as soon as a worker is free; `weight_s` is its share of the progress."""
-        pending = self._pool.apply_async(job, args, kwargs)
+        pending = self._pool.submit(job, *args, **kwargs)
         self._open[pending] = (what, weight_s)
         return pending
 
-    def result(self, pending: ApplyResult[T]) -> T:
+    def result(self, pending: Future[T]) -> T:
         """The result of one job; others that end meanwhile count as progress. Raises what a job raised, at once."""
         while pending in self._open:
-            ended = [job for job in self._open if job.ready()]
+            ended = [job for job in self._open if job.done()]
             for job in ended:
                 self._count(job)
             if not ended:
                 time.sleep(_POLL_S)
-        return pending.get()
+        return pending.result()
 
-    def _count(self, ended: ApplyResult[Any]) -> None:
+    def _count(self, ended: Future[Any]) -> None:
         what, weight_s = self._open.pop(ended)
-        ended.get()  # a failure of any job ends the walk, not only of the one that is waited for
+        ended.result()  # a failure of any job ends the walk, not only of the one that is waited for
         self._done_s += weight_s
         self._tell(what, min(1.0, self._done_s / self._expected_s))

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from concurrent.futures import Future
 from dataclasses import dataclass
-from multiprocessing.pool import ApplyResult
 from pathlib import Path
 from typing import Any
 
@@ -131,7 +131,7 @@ def gather(plan: PaperPlan, crew: Crew) -> Results:
     )
 
 
-def _found(plan: PaperPlan, crew: Crew, joint: Joint) -> ApplyResult[Found]:
+def _found(plan: PaperPlan, crew: Crew, joint: Joint) -> Future[Found]:
     if plan.identify:
         return crew.submit(f"{joint.label} identified", 45.0, experiments.identify_and_design, joint, plan.seed)
     return crew.submit(f"{joint.label} designed for", 6.0, experiments.design_as_told, joint)
@@ -153,7 +153,7 @@ def _contenders(plan: PaperPlan, crew: Crew, joint: Joint, found: Found) -> list
     return sorted(found_all, key=lambda contender: contender.feedback.value)
 
 
-Tracked = tuple[tuple[Joint, Row], ApplyResult[Measured]]
+Tracked = tuple[tuple[Joint, Row], Future[Measured]]
 
 
 def _track_shipped(plan: PaperPlan, crew: Crew, joint: Joint) -> Iterator[Tracked]:
@@ -181,7 +181,7 @@ def _track(
         yield (joint, row), crew.submit(what, _track_s(plan), experiments.measure, joint, row.label, gains, *settings)
 
 
-def _sweep(plan: PaperPlan, crew: Crew) -> dict[str, ApplyResult[sweeps.SweepOfL]]:
+def _sweep(plan: PaperPlan, crew: Crew) -> dict[str, Future[sweeps.SweepOfL]]:
     table1 = shipped_set("table1_kz_kv_kx")
     bases = {beyond.TABLE1_GAINS: table1, beyond.PD_GAINS: at_paper_feedback(table1, "pd_gains")}
     return {
@@ -194,7 +194,7 @@ def _noise_sets() -> dict[str, GainSet]:
     return {row.label: shipped_set(_SHIPPED[row]) for row in (Row.DOB, Row.LUGRE, Row.LUGRE_BETTER, Row.TABLE1)}
 
 
-def _sines(plan: PaperPlan, crew: Crew) -> dict[str, ApplyResult[Any]]:
+def _sines(plan: PaperPlan, crew: Crew) -> dict[str, Future[Any]]:
     """Fig. 9 to 12."""
     table1, pd = shipped_set("table1_kz_kv_kx"), shipped_set("paper_pd")
     noise_nm = NOISE_SHARE * FRICTION.coulomb

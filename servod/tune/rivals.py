@@ -8,8 +8,8 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, Future
 from dataclasses import replace
-from multiprocessing.pool import AsyncResult, Pool
 
 from servod.axis_model import AxisModel
 from servod.tune.laws import RIVALS
@@ -49,10 +49,12 @@ def rivals(
 class _Field:
     """The running tasks and what they have found."""
 
-    def __init__(self, pool: Pool, model: AxisModel, names: Sequence[str], plan: TunePlan, tell: Tell | None) -> None:
+    def __init__(
+        self, pool: Executor, model: AxisModel, names: Sequence[str], plan: TunePlan, tell: Tell | None
+    ) -> None:
         self._names = names
         self._pool, self._text, self._plan, self._tell = pool, model.model_dump_json(), plan, tell
-        self._tasks: dict[Key, AsyncResult[Tuned]] = {}
+        self._tasks: dict[Key, Future[Tuned]] = {}
         self._found: dict[Key, Tuned] = {}
 
     def tuned(self) -> dict[Key, Tuned]:
@@ -60,18 +62,18 @@ class _Field:
         for name in self._names:
             self._begin((Feedback.EQUAL, name), None)
         while self._tasks:
-            for key in [key for key, task in self._tasks.items() if task.ready()]:
+            for key in [key for key, task in self._tasks.items() if task.done()]:
                 self._take(key)
             time.sleep(_POLL_S)
         return self._found
 
     def _begin(self, key: Key, start: Values | None) -> None:
         feedback, name = key
-        self._tasks[key] = self._pool.apply_async(_task, (self._text, name, feedback, self._plan, start))
+        self._tasks[key] = self._pool.submit(_task, self._text, name, feedback, self._plan, start)
 
     def _take(self, key: Key) -> None:
         feedback, name = key
-        self._found[key] = self._tasks.pop(key).get()
+        self._found[key] = self._tasks.pop(key).result()
         if feedback is Feedback.EQUAL:
             self._begin((Feedback.FREE, name), self._found[key].values)
         if self._tell:

@@ -187,8 +187,8 @@ def monte_carlo(gains: GainSet, plants: int, seed: int, processes: int) -> list[
         return _worker(text, seed, 0, plants)
     cuts = [plants * i // processes for i in range(processes + 1)]
     with worker_pool(processes) as pool:
-        parts = pool.starmap(_worker, [(text, seed, *ends) for ends in pairwise(cuts)])
-        return [trial for part in parts for trial in part]
+        parts = [pool.submit(_worker, text, seed, *ends) for ends in pairwise(cuts)]
+        return [trial for part in parts for trial in part.result()]
 
 
 def hold_ripple(gains: GainSet, design: Design, plant: AxisModel) -> float:

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+
+from servod.errors import Unreachable
+from servod.workers import worker_pool
 
 #: Two workers at work; says so, and leaves the block by Ctrl-C.
 WORKS = """
@@ -20,10 +25,9 @@ from servod.workers import worker_pool
 if __name__ == "__main__":
     try:
         with worker_pool(2) as pool:
-            pool.map(abs, [1, 2])
-            pending = pool.map_async(time.sleep, [60, 60])
+            pending = [pool.submit(time.sleep, 60) for _ in range(2)]
             print("at work", flush=True)
-            pending.get()
+            pending[0].result()
     except KeyboardInterrupt:
         pass
 """
@@ -64,3 +68,28 @@ def wait_for(reached: Callable[[], bool]) -> None:
     while not reached():
         assert time.monotonic() < deadline
         time.sleep(0.1)
+
+
+def kill_the_first_worker() -> None:
+    """Wait until a worker has begun, and kill it."""
+    wait_for(lambda: bool(multiprocessing.active_children()))
+    multiprocessing.active_children()[0].kill()
+
+
+def test_a_worker_that_is_killed_ends_the_work_in_one_line() -> None:
+    killer = threading.Thread(target=kill_the_first_worker)
+    with pytest.raises(Unreachable, match="worker process ended"), worker_pool(2) as pool:
+        killer.start()
+        pool.submit(time.sleep, 60).result()
+    killer.join()
+    assert multiprocessing.active_children() == []
+
+
+def test_a_worker_that_dies_at_its_start_ends_the_work() -> None:
+    with pytest.raises(Unreachable, match="could not start"), worker_pool(1, os._exit, 3) as pool:
+        pool.submit(time.sleep, 60).result()
+
+
+def test_a_failure_of_the_work_itself_is_raised_as_it_is() -> None:
+    with pytest.raises(ZeroDivisionError), worker_pool(1) as pool:
+        pool.submit(divmod, 1, 0).result()
