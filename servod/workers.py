@@ -60,7 +60,7 @@ def _tracker_goes_with_us() -> None:
     Finalize(None, stop, exitpriority=-1)
 
 
-def begin_worker(parent: int, begin: Callable[..., None] | None, given: tuple[Any, ...]) -> None:
+def begin_worker(parent: int, begin: Callable[..., None] | None = None, given: tuple[Any, ...] = ()) -> None:
     """What a worker of `parent` does first."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
