@@ -69,7 +69,7 @@ class Trace:
         known = self._first.get(delay_s)
         if known is None:
             drive = self.drive
-            known = first_row(Start.AUTO, drive.t_s, drive.torque, drive.position, drive.motion, delay_s)
+            known = first_row(Start.AUTO, drive.t_s, drive.torque, drive.position, drive.motion, delay_s, free=False)
             self._first[delay_s] = known
         return known
 

@@ -125,13 +125,13 @@ def replay(
 ) -> Replay:
     """Simulate `model` (or its packed parameters) under the recorded torque, restarting every `horizon_s` seconds.
 
-    `horizon_s` None is one free run from the first row, gaps and all. `start` says how the first row is understood, the
-    same way for every horizon. Without numba the same source runs in pure Python.
+    `horizon_s` None is one free run from the first row, gaps and all. `start` says how the first row is understood; an
+    axis that was just set off counts as at rest in a free run only (`first_row`). Without numba the same source runs in pure Python.
     """
     parameters = np.array(model.pack() if isinstance(model, AxisModel) else model, dtype=np.float64)
     starts = window_starts(drive.t_s, horizon_s)
     rows = drive.t_s, drive.torque, drive.position, drive.motion
-    first = first_row(start, *rows, float(parameters[P_DELAY_S]))
+    first = first_row(start, *rows, float(parameters[P_DELAY_S]), free=horizon_s is None)
     state = np.array(rest_state(0.0, inner_step_s, parameters[P_START_C]))
     states = _hidden_motion(parameters, drive, first, state.copy(), starts)
     state[S_FIRST_S] = drive.t_s[0]

@@ -19,6 +19,9 @@ Array = NDArray[np.float64]
 #: An axis whose motion, extrapolated backward, began at most so long before the first row was just set off, s.
 MOTION_BEGAN_S = 0.01
 
+#: ... or so many rows, for windows that start from what was recorded: the smoothing errs by no more.
+MOTION_BEGAN_ROWS = 2.0
+
 #: ... provided that its command began at most so long before: mid-motion, friction keeps the command up all the time.
 COMMAND_BEGAN_S = 0.05
 
@@ -56,18 +59,21 @@ class FirstRow:
 
 
 def first_row(
-    start: Start, t_s: Array, torque: Array, position: Array, motion: Array, delay_s: float = 0.0
+    start: Start, t_s: Array, torque: Array, position: Array, motion: Array, delay_s: float = 0.0, *, free: bool = True
 ) -> FirstRow:
     """How the motion begins; `motion` has the rows of `smoothed_motion`, a command acts `delay_s` after its row.
 
     AUTO is rest when the first row's speed is within its error of zero, or when the axis was just set off: motion and
     command both extrapolate to nothing within MOTION_BEGAN_S and COMMAND_BEGAN_S before the first row. People start
     recorder and motion together; the recorder's first rows then lag the start, and such a recording is understood as
-    one from rest (EMPS: 7 and 45 ms). A recording cut out of a motion keeps its speed, however small.
+    one from rest (EMPS: 7 and 45 ms) where the model runs on freely from there (`free`); the first of many windows
+    starts as recorded unless its motion began with its first rows. A recording cut out of a motion keeps its speed.
     """
     place, speed, acceleration = (float(value) for value in motion[0, :3])
     still = stands(t_s, position, motion)
-    rest = start is Start.REST or (start is Start.AUTO and (still or just_set_off(t_s, torque, position)))
+    within_s = MOTION_BEGAN_S if free else MOTION_BEGAN_ROWS * float(t_s[1] - t_s[0])
+    begun = still or just_set_off(t_s, torque, position, within_s)
+    rest = start is Start.REST or (start is Start.AUTO and begun)
     if still and rest:
         acceleration = 0.0
     moved = place, 0.0 if rest else speed, acceleration
@@ -102,15 +108,15 @@ def trend(t_s: Array, torque: Array) -> float:
     return float(np.polyfit(since, torque[: len(since)], 1)[0]) if len(np.unique(since)) >= LEAST_ROWS else 0.0
 
 
-def just_set_off(t_s: Array, torque: Array, position: Array) -> bool:
-    """Whether both motion and command, extrapolated backward, began only just before the first row."""
+def just_set_off(t_s: Array, torque: Array, position: Array, within_s: float = MOTION_BEGAN_S) -> bool:
+    """Whether both motion and command, extrapolated backward, began only just (`within_s`) before the first row."""
     rows = first_rows(t_s)
     since = t_s[:rows] - t_s[0]
     if len(np.unique(since)) < LEAST_ROWS:
         return False
     bend, speed, _ = np.polyfit(since, position[:rows], 2)
     growth, command = np.polyfit(since, torque[:rows], 1)
-    moves_on = speed * bend > 0.0 and abs(speed) <= MOTION_BEGAN_S * abs(2.0 * bend)
+    moves_on = speed * bend > 0.0 and abs(speed) <= within_s * abs(2.0 * bend)
     grows = command * growth > 0.0 and abs(command) <= COMMAND_BEGAN_S * abs(growth)
     return bool(moves_on and grows and command * speed > 0.0)
 
