@@ -34,7 +34,7 @@ def replay(
     map_file: Annotated[Path | None, typer.Option("--map", help="Renames and scales foreign columns (YAML).")] = None,
     out: Annotated[Path | None, typer.Option(help="Write t_s, position and velocity here (.csv or .parquet).")] = None,
     start: Annotated[
-        str, typer.Option(help="First row: rest, recorded, or auto (at rest where it stands, in a free run also when just set off).")
+        str, typer.Option(help="First row: rest, recorded, or auto (at rest where it stands; just set off: free runs).")
     ] = "auto",
     as_json: JsonOption = False,
 ) -> None:

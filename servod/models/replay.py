@@ -126,7 +126,8 @@ def replay(
     """Simulate `model` (or its packed parameters) under the recorded torque, restarting every `horizon_s` seconds.
 
     `horizon_s` None is one free run from the first row, gaps and all. `start` says how the first row is understood; an
-    axis that was just set off counts as at rest in a free run only (`first_row`). Without numba the same source runs in pure Python.
+    axis that was just set off counts as at rest in a free run only (`first_row`). Without numba
+    the same source runs in pure Python.
     """
     parameters = np.array(model.pack() if isinstance(model, AxisModel) else model, dtype=np.float64)
     starts = window_starts(drive.t_s, horizon_s)
