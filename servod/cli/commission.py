@@ -52,6 +52,7 @@ def commission(
     budget: Annotated[int | None, typer.Option(min=1, help="Simulated plants for each rival's tuning.")] = None,
     rivals: Annotated[bool, typer.Option(help="Tune rivals and compare, on a virtual axis.")] = True,
     processes: Annotated[int, typer.Option(min=1, max=64, help="Worker processes.")] = 2,
+    again: Annotated[list[str] | None, typer.Option(help="Do this step anew, though it was done; repeatable.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of excitation, tuning and virtual noise.")] = 1,
     yes: Annotated[
         bool, typer.Option("--yes", help="Agree to every question, and take what is offered where demands clash.")
@@ -72,7 +73,7 @@ def commission(
     walk = Walk(
         out,
         axis,
-        Options(seed, travel, speed, accuracy, plants, budget, rivals, processes),
+        Options(seed, travel, speed, accuracy, plants, budget, rivals, processes, again=tuple(again or ())),
         Questions(yes, _put),
         lambda title: _bar(title, as_json),
         lambda line: None if as_json else print(line, file=sys.stderr, flush=True),

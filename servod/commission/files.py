@@ -15,7 +15,7 @@ from servod.yaml12 import read_text
 
 RECORDINGS = "recordings"
 MODEL, IDENTIFIED = "model.yaml", "identified.json"
-DESIGN, RELAXED = "design.yaml", "relaxed.json"
+DESIGN, RELAXED, INFEASIBLE = "design.yaml", "relaxed.json", "infeasible.json"
 GAINS, CERTIFICATE = "gains.yaml", "certificate.json"
 STORE, DEPLOYMENT = "store", "deployment.json"
 RIVALS, TUNING = "rivals", "tuning.json"

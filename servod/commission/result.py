@@ -12,6 +12,7 @@ from servod.commission.files import (
     DEPLOYMENT,
     GAINS,
     IDENTIFIED,
+    INFEASIBLE,
     MODEL,
     PICTURES,
     RELAXED,
@@ -29,7 +30,11 @@ from servod.gains import load_gains
 
 def failure(walk: Walk, failed: StepFailed) -> dict[str, Any]:
     """The document of a walk that a step ended with a no: which one and why, and its own document where it has one."""
-    own = {"verify": ("certificate", CERTIFICATE), "deploy": ("deployment", DEPLOYMENT)}
+    own = {
+        "synthesize": ("infeasible", INFEASIBLE),
+        "verify": ("certificate", CERTIFICATE),
+        "deploy": ("deployment", DEPLOYMENT),
+    }
     key, name = own.get(failed.step, ("", ""))
     document: dict[str, Any] = {
         "axis": walk.axis.config.name,

@@ -1,6 +1,7 @@
 """What is done of a walk: each step by the hash of what it was made from, so that a step is redone when that changes.
 
-Under the walk. A step counts as done only when its files were complete; the record is written after them, as a whole.
+Under the walk. A step counts as done only when its files were complete; the record is written after them, as a whole,
+with their hashes: a file that was edited since is neither taken for the step's own nor overwritten in silence.
 """
 
 from __future__ import annotations
@@ -24,10 +25,11 @@ LOCK = ".lock"
 
 
 class StepRecord(Strict):
-    """One step that is done: hash of its inputs, and how long it took."""
+    """One step that is done: hash of its inputs, how long it took, and the hash of each file that it left."""
 
     inputs_sha256: str
     seconds: float
+    files_sha256: dict[str, str] = Field(default_factory=dict)
 
 
 class _Content(Strict):
@@ -60,17 +62,29 @@ class State:
         return {name: record.seconds for name, record in self._content.steps.items()}
 
     def done(self, step: str, inputs: dict[str, Any], outputs: Sequence[str]) -> bool:
-        """Whether the step was done with these inputs and its files are there."""
-        record = self._content.steps.get(step)
-        return (
-            record is not None
-            and record.inputs_sha256 == digest(inputs)
-            and all((self.folder / name).exists() for name in outputs)
-        )
+        """Whether the step was done with these inputs and its files are there.
 
-    def record(self, step: str, inputs: dict[str, Any], seconds: float) -> None:
+        Raises BadInput when one of them is not what the step wrote.
+        """
+        record = self._content.steps.get(step)
+        if record is None or record.inputs_sha256 != digest(inputs):
+            return False
+        if not all((self.folder / name).exists() for name in outputs):
+            return False
+        self._refuse_edited_files(step, record)
+        return True
+
+    def begin(self, step: str) -> None:
+        """The step is not done: from here on its files are whatever an interruption leaves of them."""
+        if step in self._content.steps:
+            others = {name: record for name, record in self._content.steps.items() if name != step}
+            self._content = self._content.model_copy(update={"steps": others})
+            self._write()
+
+    def record(self, step: str, inputs: dict[str, Any], seconds: float, outputs: Sequence[str]) -> None:
         """The step is done; its files are complete."""
-        done = StepRecord(inputs_sha256=digest(inputs), seconds=round(seconds, 3))
+        files = {name: file_sha256(self.folder / name) for name in outputs if (self.folder / name).is_file()}
+        done = StepRecord(inputs_sha256=digest(inputs), seconds=round(seconds, 3), files_sha256=files)
         self._content = self._content.model_copy(update={"steps": self._content.steps | {step: done}})
         self._write()
 
@@ -89,6 +103,16 @@ class State:
                     f"--out {self.folder}: {key}",
                     _short(found),
                     f"{_short(allowed)}, whose commissioning is in this folder, or another folder",
+                )
+
+    def _refuse_edited_files(self, step: str, record: StepRecord) -> None:
+        for name, sha256 in record.files_sha256.items():
+            if file_sha256(self.folder / name) != sha256:
+                raise BadInput(
+                    f"--out {self.folder}: {name}",
+                    f"a file that was changed after the step {step} had written it",
+                    f"the file as it was; to have it made anew, delete it or use --again {step}. Of a model or a set "
+                    "of your own `servoctl synthesize`, `verify` and `deploy` make the same by single steps",
                 )
 
     def _refuse_foreign_files(self, own_files: Sequence[str]) -> None:

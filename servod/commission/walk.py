@@ -16,7 +16,7 @@ from typing import Any, Protocol
 from servod.commission.axis import WalkAxis
 from servod.commission.questions import Questions
 from servod.commission.state import State, file_sha256, sole_walk
-from servod.errors import AnswerIsNo
+from servod.errors import AnswerIsNo, BadInput
 
 #: Told what a step does, and the share of it that is done.
 Tell = Callable[[str, float], None]
@@ -37,6 +37,7 @@ class Options:
     rivals: bool = True
     processes: int = 2
     least_plants: int = 1000  # with fewer no certificate is issued
+    again: tuple[str, ...] = ()  # steps that are done anew, whatever was done before
 
 
 @dataclass(frozen=True)
@@ -97,20 +98,25 @@ class StepFailed(AnswerIsNo):
 def run(walk: Walk, steps: tuple[Step, ...]) -> State:
     """Do every step that is not done yet, in order; the state then has those that ended.
 
-    Raises StepFailed when a step's answer is no, else as the steps do.
+    Raises StepFailed when a step's answer is no, BadInput on a file that was edited, else as the steps do.
     """
+    names = [step.name for step in steps]
+    for name in walk.options.again:
+        if name not in names:
+            raise BadInput("--again", name, ", ".join(names))
     with sole_walk(walk.folder):
         state = State(walk.folder, walk.axis.identity, [name for step in steps for name in step.outputs])
         for step in steps:
             inputs = step.inputs(walk)
-            if state.done(step.name, inputs, step.outputs):
+            if step.name not in walk.options.again and state.done(step.name, inputs, step.outputs):
                 walk.say(f"{step.title}: done before")
                 continue
+            state.begin(step.name)
             started = time.monotonic()
             try:
                 step.run(walk)
             except AnswerIsNo as error:
                 raise StepFailed(step.name, str(error)) from error
-            state.record(step.name, inputs, time.monotonic() - started)
+            state.record(step.name, inputs, time.monotonic() - started, step.outputs)
             walk.say(f"{step.title}: {state.seconds[step.name]:.1f} s")
     return state

@@ -87,15 +87,45 @@ def test_what_is_done_is_not_done_again_and_what_changed_is(tmp_path: Path) -> N
     run(walk(tmp_path), chain(runs))
     run(walk(tmp_path), chain(runs))
     assert runs == ["one", "two", "three"]
-    (tmp_path / "two.txt").write_text("by hand\n")
-    run(walk(tmp_path), chain(runs))
-    assert runs[3:] == ["three"]
-    assert (tmp_path / "three.txt").read_text() == "by hand\nthree 0.02\n"
     (tmp_path / "three.txt").unlink()
     run(walk(tmp_path), chain(runs))
-    assert runs[4:] == ["three"]
+    assert runs[3:] == ["three"]
     run(walk(tmp_path, accuracy=0.05), chain(runs))
-    assert runs[5:] == ["one", "two", "three"]
+    assert runs[4:] == ["one", "two", "three"]
+
+
+@pytest.mark.parametrize("way_out", ["delete", "again"])
+def test_an_edited_file_is_named_with_the_way_out(way_out: str, tmp_path: Path) -> None:
+    runs: list[str] = []
+    run(walk(tmp_path), chain(runs))
+    edited = tmp_path / "two.txt"
+    whole = edited.read_text()
+    edited.write_text("by hand\n")
+    with pytest.raises(BadInput, match=r"two\.txt.*changed after the step two.*delete it or use --again two"):
+        run(walk(tmp_path), chain(runs))
+    assert edited.read_text() == "by hand\n" and runs == ["one", "two", "three"]
+    if way_out == "delete":
+        edited.unlink()
+        run(walk(tmp_path), chain(runs))
+    else:
+        run(walk(tmp_path, again=("two",)), chain(runs))
+    assert edited.read_text() == whole
+    assert runs[3:] == ["two"]  # what came out is the same, so the step after it stays
+
+
+def test_an_interrupted_repetition_is_no_edited_file(tmp_path: Path) -> None:
+    run(walk(tmp_path), chain([]))
+    with pytest.raises(KeyboardInterrupt):
+        run(walk(tmp_path, again=("two",)), chain([], interrupted="two"))
+    (tmp_path / "two.txt").write_text("half of it\n")
+    runs: list[str] = []
+    run(walk(tmp_path), chain(runs))
+    assert runs == ["two"]
+
+
+def test_only_a_step_can_be_done_again(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="--again: found four; allowed: one, two, three"):
+        run(walk(tmp_path, again=("four",)), chain([]))
 
 
 def test_the_folder_of_another_axis_is_refused(tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ from servod.commission.result import failure
 from servod.commission.runs import load_curves, load_rows, save_curves
 from servod.commission.state import file_sha256
 from servod.commission.steps.deploy import Deploy
-from servod.commission.steps.synthesize import Synthesize, agreed, relaxed
+from servod.commission.steps.synthesize import Synthesize, agreed, relaxed, tell_clashes
 from servod.commission.steps.verify import Verify
 from servod.commission.walk import Options, Step, StepFailed, Tell, Walk, run
 from servod.deploy.deployment import announced
@@ -149,6 +149,17 @@ def test_a_step_that_says_no_is_named_in_the_document(folder: Path) -> None:
     document = failure(walk_in(folder), StepFailed("deploy", "rolled back"))
     assert document["failed"] == {"step": "deploy", "message": "rolled back"}
     assert document["deployment"] == read_json(folder / DEPLOYMENT)
+
+
+def test_clashing_vertices_are_told_and_stand_in_the_document(tmp_path: Path) -> None:
+    told: list[str] = []
+    here = replace(walk_in(tmp_path), say=told.append)
+    clashes = ("low: sticking soft: poles at 1.200 of the disc (1 allowed)", "low: sliding falling: poles at 1.1")
+    tell_clashes(here, Infeasible(("low",), clashes, (Relaxation("least decay [1/s]", 5.0, 2.0),)))
+    assert told == [f"clash: {line}" for line in clashes]
+    found = failure(here, StepFailed("synthesize", "no feedback"))["infeasible"]
+    assert found["regions"] == ["low"] and found["clashes"] == list(clashes)
+    assert found["relaxations"] == [{"wish": "least decay [1/s]", "asked": 5.0, "enough": 2.0}]
 
 
 def test_curves_come_back_from_disk_and_stand_on_the_page(folder: Path) -> None:

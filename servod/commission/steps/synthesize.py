@@ -8,13 +8,14 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from servod.axis_model import AxisModel, load_axis_model
-from servod.commission.files import DESIGN, MODEL, RELAXED, write_json, write_text
+from servod.commission.files import DESIGN, INFEASIBLE, MODEL, RELAXED, write_json, write_text
 from servod.commission.walk import Walk
 from servod.errors import AnswerIsNo
 from servod.gains import GainSet
 from servod.synthesize.deployed import Infeasible, Relaxation, Wishes
 from servod.synthesize.gain_set import Options, synthesize
 from servod.synthesize.intervals import uncertainty_of
+from servod.synthesize.origin import tool_sha256
 from servod.units import NS_PER_S, NS_PER_US
 
 #: The regions' overlap ends at this share of the speed at most.
@@ -30,8 +31,9 @@ class Synthesize:
     outputs: tuple[str, ...] = (DESIGN, RELAXED)
 
     def inputs(self, walk: Walk) -> dict[str, Any]:
-        """The model, the loop around the law, and the accuracy of the local sets."""
-        return {**walk.hashes(MODEL), "loop": _loop(walk), "accuracy": walk.options.accuracy}
+        """The model, the loop around the law, the accuracy of the local sets, and by which sources."""
+        loop, accuracy = _loop(walk), walk.options.accuracy
+        return {**walk.hashes(MODEL), "loop": loop, "accuracy": accuracy, "tool": tool_sha256()}
 
     def run(self, walk: Walk) -> None:
         """Raises AnswerIsNo when the demands cannot be met and no relaxation was agreed to."""
@@ -40,9 +42,11 @@ class Synthesize:
         taken: Relaxation | None = None
         found = self._attempt(walk, model, wishes)
         if isinstance(found, Infeasible):
+            tell_clashes(walk, found)
             taken = agreed(walk, found)
             found = self._attempt(walk, model, relaxed(wishes, taken))
         if isinstance(found, Infeasible):
+            tell_clashes(walk, found)
             raise AnswerIsNo(f"synthesize: no design even with {taken}")
         write_json(walk.path(RELAXED), asdict(taken) if taken else None)
         write_text(walk.path(DESIGN), found.to_yaml())
@@ -52,6 +56,13 @@ class Synthesize:
             tell("both regions", 0.1)
             options = Options(name=f"{walk.axis.config.name.lower()}_local", accuracy=walk.options.accuracy)
             return synthesize(model, wishes, options, walk.path(MODEL))
+
+
+def tell_clashes(walk: Walk, found: Infeasible) -> None:
+    """Which vertices clash, and what would help: for people at once, and as a file for the document of the failure."""
+    write_json(walk.path(INFEASIBLE), asdict(found))
+    for line in found.clashes:
+        walk.say(f"clash: {line}")
 
 
 def _loop(walk: Walk) -> dict[str, Any]:
