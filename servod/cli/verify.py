@@ -66,8 +66,9 @@ def hashes(gains: GainSet) -> dict[str, str | list[str] | None]:
 def print_hashes(found: dict[str, str | list[str] | None]) -> None:
     """Print the hashes, shortened; the JSON has them whole."""
     for name, value in found.items():
-        short = ", ".join(item[:16] for item in value) if isinstance(value, list) else value and value[:16]
-        print(f"hash  {name}: {short or 'not stated'}")
+        hashes = value if isinstance(value, list) else [value] if value else []
+        more = f" and {len(hashes) - 1} more (--json has all)" if len(hashes) > 1 else ""
+        print(f"hash  {name}: {hashes[0][:16] + more if hashes else 'not stated'}")
 
 
 def print_checks(result: Verification) -> None:
