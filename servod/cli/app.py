@@ -29,6 +29,7 @@ from servod.cli import (
     identify,
     paper,
     preset,
+    prove,
     record,
     replay,
     scan,
@@ -51,7 +52,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 _DAEMON = (demo, scan, status, enable, stop, track, gains, preset, record)
-_LABORATORY = (identify, synthesize, verify, deploy, commission, replay, diagnose, explain, paper)
+_LABORATORY = (identify, synthesize, verify, deploy, commission, replay, diagnose, explain, prove, paper)
 for _verb in (*_DAEMON, *_LABORATORY, bench, check, faults):
     _verb.register(app)
 

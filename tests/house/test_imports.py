@@ -30,10 +30,14 @@ LAYERS: list[set[str]] = [
     {"report"},
     {"commission"},
     {"paper"},
+    {"prove"},
     {"benchmark"},
     {"cli"},
 ]
 LAYER_OF = {name: rank for rank, names in enumerate(LAYERS) for name in names}
+
+#: What a blind trial is about: its plant and its cases share nothing with them.
+_SUBJECT = ("servod.models", "servod.axis_effects", "servod.axis_model", "servod.diagnose")
 
 #: Whoever is on the left never imports what is on the right, whatever their layers say.
 NEVER = {
@@ -43,6 +47,13 @@ NEVER = {
     "servod.drivers.cia406": ("servod.models", "servod.axis_model", "servod.drivers.virtual"),
     "servod.drivers.virtual": ("servod.master", "servod.loop", "servod.axis", "servod.controllers", "servod.limits"),
     "servod.master": ("servod.models", "servod.axis_model", "servod.drivers.virtual"),
+    "servod.prove.plant": _SUBJECT,
+    "servod.prove.physics": _SUBJECT,
+    "servod.prove.axes": _SUBJECT,
+    "servod.prove.hidden": _SUBJECT,
+    "servod.prove.unlisted": _SUBJECT,
+    "servod.prove.case": _SUBJECT,
+    "servod.prove.truth": _SUBJECT,
     "servod.loop": ("servod.models", "servod.axis_model", "servod.drivers.virtual", "canopen", "can"),
     "servod.daemon": ("servod.models", "servod.drivers.virtual"),
 }
