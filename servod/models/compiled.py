@@ -53,13 +53,15 @@ def _compiled(function: Kernel, swap: tuple[tuple[str, Kernel], ...]) -> Kernel:
     from numba.core import config as numba_config
 
     config: Any = numba_config
+    njit: Any = numba.njit  # its stubs do not know _nrt
 
     called = {name: compiled(callee) for name, callee in {**_callees(function), **dict(swap)}.items()}
     copy = bound(function, **called)
     folder = config.CACHE_DIR
     config.CACHE_DIR = str(_cache_folder(function, swap))
     try:
-        kernel: Kernel = numba.njit(cache=True, error_model="numpy")(copy)
+        # no kernel makes an array, so none needs numba's counting of references: it took two thirds of the time
+        kernel: Kernel = njit(cache=True, error_model="numpy", _nrt=False)(copy)
     finally:
         config.CACHE_DIR = folder
     return kernel
