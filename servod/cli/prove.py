@@ -1,27 +1,40 @@
 """`servoctl prove`: a blind trial of `servoctl diagnose` on axes that conceal something.
 
-Works on files alone; needs the lab extra.
+Works on files alone; needs the lab extra. Three processes: the first conceals and seals, the second is given the case
+folders, the third opens the seal.
 """
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from servod.cli.common import example, need_folder, one_thread
+from servod.cli.common import JsonOption, example, need_folder, one_thread
+from servod.errors import BadInput
+
+if TYPE_CHECKING:
+    from servod.prove.trial import Trial
 
 _HELP = example(
-    "Prove the diagnosis on concealed cases: draw axes, hide physics in them, record them, and see what is named.",
-    "servoctl prove --cases 120 --seed 7 --out out/prove",
+    "Prove the diagnosis on cases that it has not seen: draw axes, conceal physics in them, record them, seal the "
+    "truth and print its SHA-256; diagnose each folder in a process of its own; open the seal and score. An "
+    "interrupted trial goes on where it was. Exit code 0: it was scored.",
+    "servoctl prove --cases 24 --seed 7 --out out/prove",
+    "servoctl prove --cases 120 --seed 8 --harder --out out/harder",
 )
 
 
 class Stage(StrEnum):
     """What `--only` may ask for."""
 
+    CONCEAL = "conceal"
+    DIAGNOSE = "diagnose"
+    SCORE = "score"
     CASES = "cases"
 
 
@@ -31,21 +44,105 @@ def register(app: typer.Typer) -> None:
 
 
 def prove(
-    out: Annotated[Path, typer.Option(help="Folder of the trial.")],
+    out: Annotated[Path, typer.Option(help="Folder of the trial: cases, sealed truth, answers, report.")],
     cases: Annotated[int, typer.Option(min=1, max=10_000, help="How many cases.")] = 120,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the trial; the same draws the same cases.")] = 1,
     harder: Annotated[
         bool, typer.Option("--harder", help="1 % of other effects, four times the noise, other forms in the plant.")
     ] = False,
-    only: Annotated[Stage | None, typer.Option(help="`cases`: write open cases, truth and all, into OUT.")] = None,
+    jobs: Annotated[int, typer.Option(min=1, max=64, help="Diagnoses at a time.")] = 2,
+    time_limit: Annotated[float, typer.Option(min=1.0, max=1e5, help="Of each diagnosis, s.")] = 120.0,
+    only: Annotated[
+        Stage | None, typer.Option(help="One stage alone; `cases`: open cases into OUT, truth and all.")
+    ] = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Run the trial in OUT."""
     one_thread()
-    from servod.cli.progress import progress
-    from servod.prove.conceal import open_cases
-    from servod.prove.plan import HARDER, Settings, plans
-
     need_folder("--out", out)
+    match only:
+        case None:
+            drawn = [f"--cases={cases}", f"--seed={seed}", *(["--harder"] if harder else [])]
+            _in_processes(out, drawn, [f"--jobs={jobs}", f"--time-limit={time_limit}"], ["--json"] if as_json else [])
+        case Stage.CONCEAL | Stage.CASES:
+            _conceal(out, cases, seed, harder, sealed=only is Stage.CONCEAL)
+        case Stage.DIAGNOSE:
+            _diagnose(out, jobs, time_limit)
+        case Stage.SCORE:
+            _score(out, as_json)
+
+
+def _in_processes(out: Path, drawn: list[str], diagnosed: list[str], scored: list[str]) -> None:
+    """Each stage in a process of its own; a stage that fails ends the trial as it ended."""
+    stages = {Stage.CONCEAL: drawn, Stage.DIAGNOSE: diagnosed, Stage.SCORE: scored}
+    for stage, options in stages.items():
+        arguments = ["prove", f"--out={out}", f"--only={stage}", *options]
+        code = subprocess.run([sys.executable, "-m", "servod.cli", *arguments], check=False).returncode
+        if code != 0:
+            raise typer.Exit(code)
+
+
+def _conceal(out: Path, cases: int, seed: int, harder: bool, sealed: bool) -> None:
+    from dataclasses import replace
+
+    from servod.cli.progress import progress
+    from servod.prove.conceal import conceal, open_cases
+    from servod.prove.plan import HARDER, Settings, plans
+    from servod.prove.trial import FILE, Trial, read_trial, write_trial
+
+    trial, there = Trial(cases, seed, harder), read_trial(out)
+    if there is not None and not there.same(trial):
+        found = f"{there.cases} cases of seed {there.seed}" + (", harder" if there.harder else "")
+        raise BadInput(str(out / FILE), found, "the same trial, or another folder")
     settings = HARDER if harder else Settings()
-    with progress("cases", quiet=False) as tell:
-        open_cases(plans(cases, seed, settings), settings, out, lambda n, of: tell(f"case {n} of {of}", n / of))
+    if there is None:
+        with progress("conceal", quiet=False) as tell:
+            make = conceal if sealed else open_cases
+            digest = make(
+                plans(cases, seed, settings), settings, out, lambda n, of: tell(f"concealed {n} of {of}", n / of)
+            )
+        if digest is None:
+            return
+        there = replace(trial, sha256=digest)
+        write_trial(out, there)
+    print(f"sealed: SHA-256 {there.sha256} of the truth of {cases} cases", file=sys.stderr, flush=True)
+
+
+def _diagnose(out: Path, jobs: int, time_limit: float) -> None:
+    from servod.prove.examine import Examiner
+
+    _sealed(out)
+    Examiner(out, time_limit).run(jobs, _line)
+
+
+def _line(name: str, done: int, of: int) -> None:
+    """Progress on standard error, a line a case."""
+    print(f"{name} diagnosed: {done} of {of}", file=sys.stderr, flush=True)
+
+
+def _score(out: Path, as_json: bool) -> None:
+    from servod.cli.common import print_json
+    from servod.cli.progress import progress
+    from servod.prove.document import score, write
+
+    trial = _sealed(out)
+    with progress("score", quiet=as_json) as tell:
+        document = score(trial, out, lambda n, of: tell(f"scored {n} of {of}", n / of))
+        write(document, out)
+    if as_json:
+        print_json(document)
+    else:
+        from servod.prove.tables import text
+
+        print(text(document))
+        print(f"Page: {out / 'prove.html'}; tables: {out / 'prove.md'}; all figures: {out / 'prove.json'}")
+
+
+def _sealed(out: Path) -> Trial:
+    """The trial that was sealed in `out`. Raises BadInput when there is none."""
+    from servod.prove.trial import FILE, read_trial
+
+    trial = read_trial(out)
+    if trial is None:
+        raise BadInput(str(out / FILE), "no such file", "a folder in which `servoctl prove --only conceal` was done")
+    return trial

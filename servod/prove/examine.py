@@ -1,0 +1,100 @@
+"""Runs `servoctl diagnose` on every case folder, as a user would: a process each, that is given this folder alone.
+
+The second of the three processes. What is done is not done again, so that an interrupted trial goes on where it was.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from threading import Lock
+
+from servod.prove.conceal import CASES
+from servod.report.files import write_bytes
+
+#: Told the case that was diagnosed last, how many are done and how many there are.
+Tell = Callable[[str, int, int], None]
+
+ANSWERS, RUN, DIAGNOSIS, MODEL, SAID = "answers", "run.json", "diagnosis.json", "model.yaml", "said.txt"
+
+
+@dataclass(frozen=True)
+class Run:
+    """How one diagnosis went: exit code, seconds of wall clock and of all cores, and its largest memory."""
+
+    exit_code: int
+    wall_s: float
+    cpu_s: float
+    memory_mib: float
+
+
+class Examiner:
+    """Diagnoses the cases of a trial, some at a time."""
+
+    def __init__(self, out: Path, time_limit_s: float) -> None:
+        self._out, self._time_limit_s = out, time_limit_s
+        self._running: set[subprocess.Popen[bytes]] = set()
+        self._lock = Lock()
+        self._ended = False
+
+    def run(self, jobs: int, tell: Tell) -> None:
+        """Diagnose all cases that have no answer. An interrupt ends what runs and keeps what is done."""
+        names = sorted(folder.name for folder in (self._out / CASES).iterdir())
+        open_cases = [name for name in names if not (self._out / ANSWERS / name / RUN).exists()]
+        done = len(names) - len(open_cases)
+        with self._crew(jobs) as crew:
+            pending: dict[Future[None], str] = {crew.submit(self._examine, name): name for name in open_cases}
+            for job in as_completed(pending):
+                job.result()
+                done += 1
+                tell(pending[job], done, len(names))
+
+    @contextmanager
+    def _crew(self, jobs: int) -> Iterator[ThreadPoolExecutor]:
+        """Threads that wait for processes; whatever ends the block ends these."""
+        crew = ThreadPoolExecutor(jobs)
+        try:
+            yield crew
+        finally:
+            with self._lock:
+                self._ended = True
+                for process in self._running:
+                    process.terminate()
+            crew.shutdown(cancel_futures=True)
+
+    def _examine(self, name: str) -> None:
+        folder, answers = self._out / CASES / name, self._out / ANSWERS / name
+        answers.mkdir(parents=True, exist_ok=True)
+        recordings = sorted(str(path.resolve()) for path in folder.glob("*.csv.gz"))
+        limit = f"{self._time_limit_s:g}"
+        model = ["--model", str((folder / MODEL).resolve())]
+        arguments = ["diagnose", *model, *recordings, "--out", str(answers.resolve()), "--time-limit", limit]
+        with (answers / SAID).open("wb") as said:
+            run = self._spend([sys.executable, "-m", "servod.cli", *arguments], answers, said.fileno())
+        if run is not None:
+            write_bytes(answers / RUN, (json.dumps(asdict(run)) + "\n").encode())
+
+    def _spend(self, command: Sequence[str], where: Path, said: int) -> Run | None:
+        """Run a command to its end; None when we were told to stop meanwhile."""
+        begun = time.monotonic()
+        with self._lock:
+            if self._ended:
+                return None
+            process = subprocess.Popen(command, cwd=where, stdin=subprocess.DEVNULL, stdout=said, stderr=said)
+            self._running.add(process)
+        _, status, used = os.wait4(process.pid, 0)
+        with self._lock:
+            self._running.discard(process)
+            process.returncode = os.waitstatus_to_exitcode(status)
+            if self._ended:
+                return None
+        cpu_s = used.ru_utime + used.ru_stime
+        return Run(process.returncode, time.monotonic() - begun, cpu_s, used.ru_maxrss / 1024.0)
