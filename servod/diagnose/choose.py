@@ -164,7 +164,7 @@ class Chooser:
         A fit behind a gap may improve by being fitted again: what a term is worth counts from there.
         """
         present = choice.fit
-        candidates = self._candidates(present)
+        candidates = self.candidates(present)
         for candidate in candidates:
             if candidate.left > candidates[0].left + CLOSE * (1.0 - candidates[0].left):
                 break
@@ -181,7 +181,7 @@ class Chooser:
                 choice.merits.append(merit)
                 choice.entries.append(Entry(candidate.left, others))
                 return True
-            if self._significant(merit, settled):
+            if self.significant(merit, settled):
                 choice.minor.setdefault(candidate.effect, merit)
         return False
 
@@ -189,14 +189,14 @@ class Chooser:
         """Take a mismatch into account that shows a lower floor than those before."""
         self.floor = min(self.floor, noise_floor(self.predictor, mismatch), self.error(mismatch))
 
-    def _candidates(self, present: Fit) -> list[Candidate]:
-        """All effects tried beside the present fit, best first."""
+    def candidates(self, present: Fit, fine: bool = False, skip: frozenset[str] = frozenset()) -> list[Candidate]:
+        """All effects but `skip` tried beside the present fit, best first; `fine`: finer forms among them."""
         whole = self.fitter(present.mismatch)
         quick = shortened(self.predictor, self.nominal, present.mismatch)
         short = Fitter(quick, Weighing(whole.weighing.scale, quick.counts.astype(np.float64)))
-        scene = Scene(self.start.document, self.predictor, present.mismatch)
+        scene = Scene(self.start.document, self.predictor, present.mismatch, fine)
         trials = Trials(whole, short, present, scene, not present.hypothesis.terms, self.deadline)
-        candidates = trials.run(skip=_once(present.hypothesis))
+        candidates = trials.run(skip=_once(present.hypothesis) | skip)
         self.tried += trials.tried
         self.tell(f"{trials.tried} starts tried; best: " + ", ".join(c.effect for c in candidates[:3]))
         return candidates
@@ -235,9 +235,9 @@ class Chooser:
     def deserves(self, merit: Merit, fit: Fit) -> bool:
         """Whether a term is significant and worth naming."""
         worth = merit.share >= WORTH_SHARE or (merit.torque >= WORTH_TORQUE and merit.of_left >= LEAST_OF_LEFT)
-        return worth and merit.torque >= LEAST_TORQUE and self._significant(merit, fit)
+        return worth and merit.torque >= LEAST_TORQUE and self.significant(merit, fit)
 
-    def _significant(self, merit: Merit, fit: Fit) -> bool:
+    def significant(self, merit: Merit, fit: Fit) -> bool:
         """Bayesian information criterion with a correction for the number of starts tried."""
         unknowns = max(len(fit.hypothesis.terms[-1].unknowns), 1)
         rows = float(self.rows.sum())

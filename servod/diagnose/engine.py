@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from servod.axis_model import AxisModel
 from servod.diagnose.choose import Choice, Chooser
+from servod.diagnose.detail import detail
 from servod.diagnose.fit import Fit, Weighing, covariance
 from servod.diagnose.held_out import HeldOut, held_out
 from servod.diagnose.intake import Refusal, taken_in
@@ -87,6 +88,7 @@ def diagnose(
     predictor = Predictor(traces, model)
     chooser = Chooser(predictor, model, begun + SEARCH_SHARE * time_limit_s, tell)
     choice = chooser.run()
+    detail(chooser, choice)
     seconds["search"] = monotonic() - begun - seconds["intake"]
     choice.fit = tidied(chooser, choice.fit)
     chooser.lower_floor(choice.fit.mismatch)

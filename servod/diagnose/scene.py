@@ -46,11 +46,15 @@ class Peak:
 
 @dataclass(frozen=True)
 class Scene:
-    """The nominal document, the predictor with its traces, and the mismatch of the fit that stands now (N*m)."""
+    """The nominal document, the predictor with its traces, and the mismatch of the fit that stands now (N*m).
+
+    `fine` asks for finer forms too, with more unknowns than a first look may spend.
+    """
 
     document: Document
     predictor: Predictor
     mismatch: Array
+    fine: bool = False
 
     @property
     def linear(self) -> bool:

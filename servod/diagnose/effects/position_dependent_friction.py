@@ -6,9 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from servod.diagnose.effects.effect import Effect, sine_term, told
+from servod.diagnose.effects.effect import Effect, harmonic, sine_term, told
 from servod.diagnose.hypothesis import Document, Term, Unknown
 from servod.diagnose.scene import Peak, Scene
+
+#: Half waves along the way that make a profile.
+PROFILE = 4
 
 
 def _write_bump(document: Document, values: Sequence[float]) -> None:
@@ -40,12 +43,27 @@ def _bumps(scene: Scene) -> list[Term]:
 
 
 def terms(scene: Scene) -> list[Term]:
-    """Sines over position whose period is searched, one of low order, and a tight spot."""
+    """Sines over position whose period is searched, one of low order, a tight spot, and a profile of the whole way."""
     carrier = -scene.dry * np.tanh(scene.velocity / (0.02 * scene.speed))
     peaks = scene.peaks(scene.carried(carrier), 2)
     low = Peak(2.0 * np.pi / scene.reach, 0.0, 0.0, 0.0)
     found = [sine_term("position_dependent_friction", scene, peak, 0.3, "1", most=0.95) for peak in (*peaks, low)]
-    return found + _bumps(scene)
+    return found + _bumps(scene) + ([_profile(scene)] if scene.fine else [])
+
+
+def _profile(scene: Scene) -> Term:
+    """A smooth profile: half-range cosines from one end of the way to the other."""
+    first, count = float(scene.position.min()), PROFILE
+    unknowns = tuple(Unknown(f"wave_{k}", "1", 0.0, -0.9, 0.9, 0.3) for k in range(1, count + 1))
+
+    def write(document: Document, values: Sequence[float]) -> None:
+        rows = document.setdefault("position_dependent_friction", {}).setdefault("harmonics", [])
+        for k, amplitude in enumerate(values, 1):
+            n = k * np.pi / scene.reach
+            phase = float(np.pi / 2.0 - np.remainder(n * first, 2.0 * np.pi))
+            rows.append(harmonic(scene, n, amplitude, phase))
+
+    return Term("position_dependent_friction", "profile", unknowns, write, told(unknowns))
 
 
 EFFECT = Effect(
