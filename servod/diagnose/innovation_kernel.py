@@ -7,6 +7,7 @@ System Identification, 1999, ch. 7: prediction-error methods).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -37,6 +38,7 @@ def innovate(
     position_gain: Any,
     velocity_gain: Any,
     load_share: float,
+    quiet: float,
     starts: Any,
     start_states: Any,
     out: Any,
@@ -44,8 +46,10 @@ def innovate(
     """Fill `out` with recorded minus predicted position of each row.
 
     `steps` are inner steps from each row to the next; `position_gain` and `velocity_gain` (1/s) the shares of the
-    innovation that correct the motion at each row, `load_share` of them for the load. Rows in `starts` begin anew from
-    the rows of `start_states` (position, velocity, bristle, load position, load velocity, actuator torque).
+    innovation that correct the motion at each row, `load_share` of them for the load. A correction of the position is
+    motion to the bristle, else a model that sticks could be held along by its own break-away torque while the joint
+    slides; but not where the innovation is within `quiet`, for noise would wear the bristle off. Rows in `starts` begin
+    anew from the rows of `start_states` (position, velocity, bristle, load position, load velocity, actuator torque).
     """
     window, row, last, acceleration = 0, -1, len(t) - 1, 0.0
     for k in range(len(t)):
@@ -61,9 +65,11 @@ def innovate(
         now, whole = t[k], t[k + 1] - t[k]
         dry, viscous = thermal_factors(p, s, temperature[k])
         loss = 0.0
+        beyond = max(abs(off) - quiet, 0.0)
+        pull = math.copysign(position_gain[k] * beyond / whole, off) if whole > 0.0 else 0.0
         if steps[k] == 1:
             row, command = mean_command(t, torque, before, row, p[P_DELAY_S], now, t[k + 1])
-            acceleration = step(p, s, command, whole, acceleration, dry, viscous)
+            acceleration = step(p, s, command, whole, acceleration, dry, viscous, pull)
             loss, now = s[S_FRICTION] * s[S_VELOCITY] * whole, t[k + 1]
         while now < t[k + 1]:
             row = switch_row(t, row, now, p[P_DELAY_S])
@@ -71,7 +77,7 @@ def innovate(
             count = max(1, round(steps[k] * (end - now) / whole))
             command, h = acting(torque, row, before), (end - now) / count
             for _ in range(count):
-                acceleration = step(p, s, command, h, acceleration, dry, viscous)
+                acceleration = step(p, s, command, h, acceleration, dry, viscous, pull)
                 loss += s[S_FRICTION] * s[S_VELOCITY] * h
             now = end
         heat(p, s, loss, whole, temperature[k])

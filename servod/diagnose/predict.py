@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from servod.axis_model import AxisModel
+from servod.axis_model import AxisKind, AxisModel
 from servod.diagnose.innovation_kernel import innovate
 from servod.diagnose.parallel import released
 from servod.diagnose.trace import Trace
@@ -40,6 +40,9 @@ STEPS_AT_REVERSAL, STEPS_IN_GAP = 4, 2
 
 #: Share of the motor's correction that the load gets: all behind a gap, less behind a spring, which it would ring.
 LOAD_SHARE, LOAD_SHARE_IN_GAP = 0.6, 1.0
+
+#: Innovations below this many noises of the encoder carry the model's friction nowhere.
+QUIET = 5.0
 
 #: Bandwidths (time constants of the observer) that pass before a row behind a start counts.
 SETTLING = 30.0
@@ -92,6 +95,7 @@ class Predictor:
     def __init__(self, traces: Sequence[Trace], nominal: AxisModel, rate: float | None = None) -> None:
         self.traces = tuple(traces)
         self.dry = dry_friction(nominal)
+        self.linear = nominal.axis is AxisKind.LINEAR
         self.rate = bandwidth(nominal.inertia, self.dry, traces) if rate is None else rate
         self.observers = tuple(observer(trace, nominal.inertia, self.rate) for trace in self.traces)
         ends = np.cumsum([len(trace.drive.t_s) for trace in self.traces])
@@ -133,7 +137,7 @@ class Predictor:
         steps = seen.steps * STEPS_IN_GAP if p[P_GAP] > 0.0 else seen.steps
         held = drive.t_s, drive.torque, first.command_before, drive.temperature_c, drive.position
         share = LOAD_SHARE_IN_GAP if p[P_GAP] > 0.0 else LOAD_SHARE
-        gains = steps, seen.position_gain, seen.velocity_gain, share
+        gains = steps, seen.position_gain, seen.velocity_gain, share, QUIET * trace.position_noise
         self._run(p, state, *held, *gains, trace.starts, states, out)
         return seen.to_torque * out
 

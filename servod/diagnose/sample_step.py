@@ -50,13 +50,16 @@ from servod.models.layout import (
 State = list[float]
 
 
-def step(p: Params, s: State, command: float, h: float, acceleration: float, dry: float, viscous: float) -> float:
+def step(
+    p: Params, s: State, command: float, h: float, acceleration: float, dry: float, viscous: float, pull: float
+) -> float:
     """Advance `s` by `h` seconds under a command that has arrived; returns the acceleration.
 
-    `acceleration` is the last step's, `dry` and `viscous` are the friction's factors of warmth.
+    `acceleration` is the last step's, `dry` and `viscous` are the friction's factors of warmth. `pull` is the speed with
+    which an observer carries the model along beside its own: friction is that of both together.
     """
     old = s[S_VELOCITY]
-    velocity = old + 0.5 * h * acceleration
+    velocity = old + 0.5 * h * acceleration + pull
     position = s[S_POSITION] + 0.5 * h * old
     load_speed = s[S_LOAD_VELOCITY]
     load_position = s[S_LOAD_POSITION] + 0.5 * h * load_speed
@@ -72,14 +75,14 @@ def step(p: Params, s: State, command: float, h: float, acceleration: float, dry
     inertia, slope = inertia_at(p, load_position)
     if p[P_LOAD_INERTIA] > 0.0:
         tau, extra, base, share = load_step(p, s, load, inertia, slope, h)
-        mean = mid_velocity(p, s, velocity, push - tau, p[P_INERTIA], h, grip, slide, extra)
+        mean = mid_velocity(p, s, velocity, push - tau, p[P_INERTIA], h, grip, slide, extra, pull)
         load_mean = base + share * mean
         s[S_LOAD_POSITION] += h * load_mean
         s[S_LOAD_VELOCITY] = 2.0 * load_mean - load_speed
         s[S_POSITION] += h * mean
     else:
         push -= load + 0.5 * slope * velocity * velocity
-        mean = mid_velocity(p, s, velocity, push, inertia, h, grip, slide, 0.0)
+        mean = mid_velocity(p, s, velocity, push, inertia, h, grip, slide, 0.0, pull)
         s[S_POSITION] += h * mean
         s[S_LOAD_POSITION], s[S_LOAD_VELOCITY] = s[S_POSITION], 2.0 * mean - old
     s[S_VELOCITY] = 2.0 * mean - old
@@ -109,6 +112,7 @@ def mid_velocity(
     grip: float,
     viscous: float,
     extra: float,
+    pull: float,
 ) -> float:
     """Mean velocity of the step under `torque` and friction; `extra` is what the joint's spring adds to `viscous`.
 
@@ -131,8 +135,9 @@ def mid_velocity(
     bristle = s[S_BRISTLE]
     memory = (p[P_SIGMA0] * held + damping * (kept - 1.0) / h) * bristle
     slope = p[P_SIGMA0] * follow + damping * gained / h
+    memory += (slope + viscous) * pull
     mean = (pushed - memory) / (impulse + slope + viscous + extra)
-    s[S_BRISTLE] = kept * bristle + gained * mean
+    s[S_BRISTLE] = kept * bristle + gained * (mean + pull)
     s[S_FRICTION] = memory + (slope + viscous) * mean
     return mean
 

@@ -7,10 +7,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from servod.axis_model import AxisModel
+from servod.axis_effects import Gravity
+from servod.axis_model import AxisModel, load_axis_model
+from servod.controllers import pd
 from servod.diagnose.intake import taken_in
 from servod.diagnose.predict import Predictor
-from tests.diagnose.axes import believed, record
+from servod.models.simulate import LoopSettings, simulate_closed_loop
+from servod.shipped import shipped
+from servod.tracking.motions import paper_rows
+from tests.diagnose.axes import believed, record, recording
+
+#: A weight that pulls nearly the same way wherever the joint stands.
+GRAVITY = Gravity(amplitude=0.02, phase=1.5)
 
 HIDDEN: list[dict[str, Any]] = [
     {},
@@ -61,3 +69,17 @@ def test_rows_after_a_gap_begin_anew() -> None:
     predictor = Predictor(traces, believed())
     assert len(traces[0].starts) == 2
     assert rms(predictor, believed()) < 0.015
+
+
+def test_a_model_never_sticks_where_the_joint_slides_slowly() -> None:
+    """Within the Stribeck curve of a stiff bristle an observer could hold a sticking model along for good."""
+    true = load_axis_model(shipped("gains/axes/table1_joint.yaml")).model_copy(update={"gravity": GRAVITY})
+    settings = LoopSettings(counts_per_turn=2.0**20)
+    run = simulate_closed_loop(true, pd.step, (30.0, 0.3, 0.0), paper_rows(1e-3, 14.0), settings)
+    believed_without = true.model_copy(update={"gravity": None})
+    traces, refused = taken_in([recording(run.t_s, run.torque_nm, run.encoder_rad)], believed_without)
+    assert refused == []
+    predictor = Predictor(traces, believed_without)
+    assert rms(predictor, true) < 0.03
+    seen = predictor.mismatch(believed_without)[predictor.counts]
+    assert np.median(seen) == pytest.approx(-GRAVITY.amplitude, rel=0.1)
