@@ -55,8 +55,8 @@ def step(
 ) -> float:
     """Advance `s` by `h` seconds under a command that has arrived; returns the acceleration.
 
-    `acceleration` is the last step's, `dry` and `viscous` are the friction's factors of warmth. `pull` is the speed with
-    which an observer carries the model along beside its own: friction is that of both together.
+    `acceleration` is the last step's, `dry` and `viscous` are the friction's factors of warmth. `pull` is the speed
+    with which an observer carries the model along beside its own: friction is that of both together.
     """
     old = s[S_VELOCITY]
     velocity = old + 0.5 * h * acceleration + pull
