@@ -32,6 +32,7 @@ from servod.synthesize.local_sets import PAPER_NODES, STIFFNESS_SHARE, compensat
 from servod.synthesize.origin import provenance
 from servod.verify.checks import CORNER_DISK, CORNER_SPEEDS, DISK_LIMIT, speeds_of
 from servod.verify.closed_loop import late_corners
+from servod.verify.effect_checks import late_effects
 from servod.verify.margins import Sweep
 from servod.verify.sampled import timing_of
 from servod.verify.steady_friction import SteadyFriction, steady_friction
@@ -133,12 +134,13 @@ def approach_error(high: RegionGains, speed: float) -> float | None:
 def stands(design: Design, friction: SteadyFriction, law: LocalParameters, margin: float, speeds: int) -> bool:
     """Whether the full sampled loop is stable at every corner of the intervals, and has this disk margin as modelled.
 
-    At `speeds` speeds in each direction; at the corners with the longest delay, where CORNER_WANTED must be left.
+    At `speeds` speeds in each direction; at the corners with the longest delay, where CORNER_WANTED must be left, and
+    at the ends of what the model's own effects make of the joint.
     """
-    late = late_corners(design.uncertainty)
+    late, own = late_corners(design.uncertainty), late_effects(design)
     sweep = Sweep(LAWS["local"], law.pack(), friction, timing_of(design), speeds_of(design, speeds))
     wide = sweep.disk_margin()[0] >= margin and sweep.disk_margin(late)[0] >= CORNER_WANTED
-    return wide and sweep.worst(late).radius < STABLE
+    return wide and sweep.worst([*late, *own]).radius < STABLE
 
 
 def synthesize(

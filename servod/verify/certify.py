@@ -15,6 +15,7 @@ from servod import __version__
 from servod.errors import BadInput
 from servod.gains import Certificate, CertificateCheck, GainSet, Promise
 from servod.verify.checks import LEAST_PLANTS, SIMULATED, STATIC, Subject, observations
+from servod.verify.effect_checks import check_effects
 from servod.verify.promise import promise
 from servod.verify.reference_checks import check_reference
 
@@ -106,7 +107,7 @@ def verify(
     if gains.design is None:
         raise BadInput(f"{where}: design", "nothing", "a design, as `servoctl synthesize` writes it")
     subject = Subject(gains, gains.design, plants, seed, processes, least_plants)
-    checks = [check for judge in (*STATIC, check_reference) for check in judge(subject)]
+    checks = [check for judge in (*STATIC, check_effects, check_reference) for check in judge(subject)]
     if not all(check.passed for check in checks):
         return Verification(checks, {})
     checks += [check for judge in SIMULATED for check in judge(subject)]

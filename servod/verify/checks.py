@@ -17,7 +17,6 @@ from servod.gain_parameters import LocalParameters, RegionGains
 from servod.gains import CertificateCheck, GainSet
 from servod.models.noise import noise_of
 from servod.verify.closed_loop import Deviation, corners, inner_points
-from servod.verify.known_physics import unknown_physics
 from servod.verify.margins import NOMINAL, Sweep, largest_tolerated
 from servod.verify.measured import measured_widths
 from servod.verify.plants import drawn
@@ -165,13 +164,6 @@ def check_intervals(s: Subject) -> Iterator[CertificateCheck]:
     yield at_most(name, float(np.max([0.0, *beyond.values()])), 1.0 + SAME)
 
 
-def check_known(s: Subject) -> Iterator[CertificateCheck]:
-    """The model has no physics that poles and margins leave out, though drawn plants are simulated with it."""
-    unknown = list(unknown_physics(s.design.model, s.design.period_s))
-    name = f"physics that the loop check does not know{': ' if unknown else ''}{', '.join(unknown)}"
-    yield at_most(name[:MOST_NAME], float(len(unknown)), 0.0)
-
-
 def check_stiffness(s: Subject) -> Iterator[CertificateCheck]:
     """c0_hat below its stability bound, at the soft end of the interval."""
     local = s.gains.parameters
@@ -283,7 +275,6 @@ STATIC: tuple[Callable[[Subject], Iterator[CertificateCheck]], ...] = (
     check_regions,
     check_stiffness,
     check_intervals,
-    check_known,
     check_loop,
 )
 SIMULATED = (check_monte_carlo, check_limit_cycles)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass, replace
 from enum import Enum
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +21,6 @@ from servod.gain_design import SHARES, Uncertainty
 from servod.verify.sampled import Array, Timing, with_delay_and_filter
 from servod.verify.steady_friction import SteadyFriction
 
-N_JOINT = 3  # x, v, z
 SETTLE_CYCLES = 100  # at most, after the first long one
 LONG_S = 1e4  # the friction state's step is exact, so one long cycle settles it
 NUDGE = 1e-7
@@ -36,8 +36,32 @@ class Bristle(Enum):
 
 
 @dataclass(frozen=True, slots=True)
+class Behind:
+    """What the motor drives through a spring: m_L v_L' = k*(x - x_L) + c*(v - v_L) - viscous*v_L, per unit of gain."""
+
+    inertia: float
+    stiffness: float
+    damping: float
+    viscous: float
+
+    def attached(self, a: Array, b: Array, e: Array, motor_inertia: float) -> tuple[Array, Array, Array]:
+        """A motor's (A, B, E) in x, v, z with the load as two more states, x_L and v_L."""
+        k, c, m = self.stiffness, self.damping, self.inertia
+        full = np.zeros((5, 5))
+        full[:3, :3] = a
+        pull = np.array([k, c, 0.0, -k, -c])
+        full[1] -= pull / motor_inertia
+        full[3, 4] = 1.0
+        full[4] = (pull - np.array([0.0, 0.0, 0.0, 0.0, self.viscous])) / m
+        return full, np.pad(b, (0, 2)), np.pad(e, (0, 2))
+
+
+@dataclass(frozen=True, slots=True)
 class JointPoint:
-    """The joint linearised: z' = -a z + b v, m v' = gain*u - sigma0 z - sigma1 z' - viscous v - slope x + w."""
+    """The joint linearised: z' = -a z + b v, m v' = gain*u - sigma0 z - sigma1 z' - viscous v - slope x + w.
+
+    With something `behind` a spring, `inertia` is the motor's alone, which has friction and encoder.
+    """
 
     velocity: float
     bristle: Bristle
@@ -49,8 +73,14 @@ class JointPoint:
     damping: float
     viscous: float
     position_slope: float = 0.0
+    behind: Behind | None = None
 
     def matrices(self) -> tuple[Array, Array, Array]:
+        """(A, B, E) in states x, v, z, and those of what is behind a spring."""
+        rigid = self._rigid()
+        return self.behind.attached(*rigid, self.inertia) if self.behind else rigid
+
+    def _rigid(self) -> tuple[Array, Array, Array]:
         """(A, B, E) in states x, v, z.
 
         At rest z - x is constant and cannot be controlled, so the stiffness acts on the position itself.
@@ -73,8 +103,9 @@ class JointPoint:
 class Deviation:
     """Factors on the model's values: one corner, or an inner point, of the intervals.
 
-    `dry` scales g(v) with its slope; `slope` makes the slope steeper than that. `position_slope` is no factor: what
-    cogging, gravity and springs add as stiffness [N*m/rad]; `delay_s` is added to the delay.
+    `dry` scales g(v) with its slope; `slope` makes the slope steeper than that. No factors are `position_slope`, what
+    cogging, gravity and springs add as stiffness [N*m/rad], and `more_viscous`, what is added to viscous friction
+    [N*m*s/rad]; `delay_s` is added to the delay. Of the inertia `behind` has its part, where the joint has a spring.
     """
 
     inertia: float = 1.0
@@ -85,20 +116,45 @@ class Deviation:
     slope: float = 1.0
     viscous: float = 1.0
     position_slope: float = 0.0
+    more_viscous: float = 0.0
     delay_s: float = 0.0
+    behind: Behind | None = None
 
+
+@dataclass(frozen=True, slots=True)
+class Reach:
+    """Ends of the factors that effects of the model itself put on its values, over its travel and its temperatures."""
+
+    inertia: tuple[float, float] = (1.0, 1.0)
+    torque_gain: tuple[float, float] = (1.0, 1.0)
+    dry: tuple[float, float] = (1.0, 1.0)
+    viscous: tuple[float, float] = (1.0, 1.0)
+
+    def end(self, name: str, sign: float) -> float:
+        """The lower (`sign` below zero) or upper end of one value; 1.0 for a value that no effect reaches."""
+        low, high = getattr(self, name, (1.0, 1.0))
+        return float(low if sign < 0.0 else high)
+
+
+NO_REACH = Reach()
 
 #: Parts of the delay's interval at which inner points lie: joints of one delay are judged together.
 DELAY_STEPS = (-1.0, -0.5, 0.0, 0.5, 1.0)
 
 
-def corners(u: Uncertainty) -> list[Deviation]:
-    """Every corner of the intervals that matter to small deviations; the level of dry friction moves with its slope."""
+def corners(u: Uncertainty, reach: Reach = NO_REACH) -> list[Deviation]:
+    """Every corner of the intervals that matter to small deviations; the level of dry friction moves with its slope.
+
+    `reach` widens them by what the model's own effects make of a value.
+    """
     names = ("inertia", "stiffness", "damping", "slope", "viscous")
     found = []
     for signs in itertools.product((-1.0, 1.0), repeat=len(names)):
-        factors = {n: 1.0 + s * getattr(u, n) for n, s in zip(names, signs, strict=True)}
-        corner = Deviation(**factors, torque_gain=1.0 + signs[0] * -u.torque_gain, dry=1.0 + signs[3] * u.dry)
+        factors: dict[str, Any] = {
+            n: (1.0 + s * getattr(u, n)) * reach.end(n, s) for n, s in zip(names, signs, strict=True)
+        }
+        gain = (1.0 - signs[0] * u.torque_gain) * reach.end("torque_gain", -signs[0])
+        corner = Deviation(**factors, torque_gain=gain, dry=(1.0 + signs[3] * u.dry) * reach.end("dry", signs[3]))
         found += [replace(corner, delay_s=delay) for delay in sorted({-u.delay_s, u.delay_s})]
     return found
 
@@ -113,7 +169,9 @@ def inner_points(u: Uncertainty, count: int, seed: int) -> list[Deviation]:
     random = np.random.default_rng(seed)
     draws = random.uniform(-1.0, 1.0, (count, len(SHARES)))
     delays = random.choice(DELAY_STEPS, count) * u.delay_s
-    factors = [{n: float(1.0 + d * getattr(u, n)) for n, d in zip(SHARES, row, strict=True)} for row in draws]
+    factors: list[dict[str, Any]] = [
+        {n: float(1.0 + d * getattr(u, n)) for n, d in zip(SHARES, row, strict=True)} for row in draws
+    ]
     return [Deviation(**own, delay_s=float(delay)) for own, delay in zip(factors, delays, strict=True)]
 
 
@@ -125,14 +183,15 @@ def joint_point(friction: SteadyFriction, velocity: float, bristle: Bristle, d: 
     return JointPoint(
         velocity,
         bristle,
-        friction.inertia * d.inertia,
+        friction.inertia * d.inertia - (d.behind.inertia if d.behind else 0.0),
         d.torque_gain,
         stiffness * speed / dry,
         1.0 - bristle.value + bristle.value * slope if speed else 1.0,
         stiffness,
         min(friction.damping(velocity) * d.damping, 4.0 * dry / speed) if speed else friction.damping(0.0) * d.damping,
-        friction.viscous(velocity) * d.viscous,
+        friction.viscous(velocity) * d.viscous + d.more_viscous,
         d.position_slope,
+        d.behind,
     )
 
 
@@ -211,17 +270,17 @@ def loops(points: list[JointPoint], law: LawSlopes, timing: Timing) -> tuple[Arr
     parts = [point.matrices() for point in points]
     a, b, e = (np.array(part) for part in zip(*parts, strict=True))
     plant_a, plant_b, _ = with_delay_and_filter(a, b, e, timing)
-    n = plant_a.shape[-1]
+    n, filtered = plant_a.shape[-1], a.shape[-1]
     keep = [i for i in range(N_STATES) if i not in law.frozen]
     seen = [0, 1, *(2 + i for i in keep)]
     row = np.zeros(n + len(keep))
-    row[[0, N_JOINT, *range(n, n + len(keep))]] = law.matrix[0, seen]
+    row[[0, filtered, *range(n, n + len(keep))]] = law.matrix[0, seen]
     closed = np.zeros((len(points), len(row), len(row)))
     closed[:, :n, :n] = plant_a
     column = np.concatenate([plant_b, np.zeros((len(points), len(keep)))], axis=1)
     closed += column[:, :, None] * row
     for j, i in enumerate(keep):
-        closed[:, n + j, [0, N_JOINT, *range(n, n + len(keep))]] = law.matrix[1 + i, seen]
+        closed[:, n + j, [0, filtered, *range(n, n + len(keep))]] = law.matrix[1 + i, seen]
     return closed, column, row
 
 

@@ -109,9 +109,9 @@ class Sweep:
 
 
 def by_delay(cases: Sequence[Deviation]) -> list[list[int]]:
-    """Numbers of the cases in groups of one delay: only these have the same states."""
-    delays = dict.fromkeys(case.delay_s for case in cases)
-    return [[i for i, case in enumerate(cases) if case.delay_s == delay] for delay in delays]
+    """Numbers of the cases in groups of one delay, with a spring or without: only these have the same states."""
+    kinds = [(case.delay_s, case.behind is None) for case in cases]
+    return [[i for i, kind in enumerate(kinds) if kind == one] for one in dict.fromkeys(kinds)]
 
 
 def sensitivity(closed: Array, column: Array, row: Array) -> NDArray[np.complex128]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -79,7 +80,7 @@ def sliding(friction: SteadyFriction, span: Span, u: Uncertainty) -> list[Joint]
     found = []
     for mass, damping in itertools.product(ends(u.inertia), ends(u.damping)):
         gain = 1.0 + u.torque_gain if mass < 1.0 else 1.0 - u.torque_gain
-        shared = {"inertia": mass, "torque_gain": gain, "damping": damping}
+        shared: dict[str, Any] = {"inertia": mass, "torque_gain": gain, "damping": damping}
         size = f"{'light' if mass < 1.0 else 'heavy'} {'ringing' if damping < 1.0 else 'damped'}"
         worse = Deviation(**shared, dry=1.0 + u.dry, slope=1.0 + u.slope, viscous=1.0 - u.viscous)
         better = Deviation(**shared, dry=1.0 - u.dry, viscous=1.0 + u.viscous)

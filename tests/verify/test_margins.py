@@ -1,4 +1,4 @@
-"""Margins and poles of the full loop: lag, delay interval, corners, what goes by itself, and what is not in it."""
+"""Margins and poles of the full loop: lag, delay interval, corners, what goes by itself."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from servod.axis_effects import ActuatorLag, JointElasticity, TorqueSaturation
+from servod.axis_effects import ActuatorLag
 from servod.axis_model import AxisModel
 from servod.gain_design import Uncertainty
-from servod.verify.checks import CORNER_DISK, Subject, check_known, check_loop, observations
+from servod.verify.checks import CORNER_DISK, Subject, check_loop, observations
 from servod.verify.closed_loop import Bristle, Deviation, corners, inner_points, joint_point, late_corners
 from servod.verify.margins import NOMINAL, Sweep, sensitivity
 from servod.verify.plants import drawn
@@ -113,18 +113,3 @@ def test_an_axis_of_two_cycles_is_judged_by_its_own_delay_and_says_so() -> None:
     assert "largest pole, the axis's own delay of 2.00 cycles" in names
     assert "largest pole, one cycle of delay" not in names
     assert {"largest pole, one cycle of delay", "largest pole, two cycles of delay"} <= set(observations(two))
-
-
-@pytest.mark.parametrize(
-    ("effects", "named"),
-    [
-        ({}, None),
-        ({"joint_elasticity": JointElasticity(load_inertia=0.0005, stiffness=50.0)}, "joint_elasticity"),
-        ({"torque_saturation": TorqueSaturation(limit=0.3)}, "torque_saturation"),
-        ({"actuator_lag": ActuatorLag(time_constant_s=0.0005)}, None),
-        ({"actuator_lag": ActuatorLag(time_constant_s=0.003, slew_per_s=50.0)}, "actuator_lag.time_constant_s"),
-    ],
-)
-def test_physics_that_no_pole_has_in_it_is_named(effects: dict[str, object], named: str | None) -> None:
-    check = next(check_known(subject(table1().model_copy(update=effects))))
-    assert check.passed == (named is None) and (named or "") in check.name
