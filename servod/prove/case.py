@@ -32,7 +32,7 @@ SEEN, TRIES = 0.08, 8
 #: A loop is sane while its error is below this share of the travel and its command at the limit for less than this.
 SANE_ERROR, SANE_LIMITED = 0.35, 0.15
 
-#: Under Cover.NOISE: factors on noise and on strength. Cover.ABSORBED: share by which the model's friction went along.
+#: Under Cover.NOISE: least factor on noise, factor on strength. Cover.ABSORBED: share by which the model's friction went along.
 BELOW_NOISE, FAINT, TAKEN_UP = 3.0, 0.6, 0.08
 
 #: How far (share) known parameters are off, and how large clutter is as a share of Coulomb friction.
@@ -72,7 +72,7 @@ def make_case(plan: Plan, settings: Settings) -> Case:
         seen.append(size)
     physics = _all_changes(axis.physics, hidden)
     plant = _cluttered(physics, axis, rng, plan.effects) if settings.clutter else physics
-    noisy = settings.noise * (BELOW_NOISE if plan.cover is Cover.NOISE else 1.0)
+    noisy = max(settings.noise, BELOW_NOISE if plan.cover is Cover.NOISE else 1.0)
     trial = Trial(loop, TORQUE_NOISE * noisy * axis.physics.coulomb)
     believed = _believed(axis.physics, hidden)
     if plan.cover is Cover.ABSORBED:
