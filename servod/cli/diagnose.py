@@ -5,7 +5,6 @@ Works on files alone; needs the lab extra.
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -31,7 +30,7 @@ def register(app: typer.Typer) -> None:
 def diagnose(
     recordings: Annotated[list[Path], typer.Argument(metavar="REC...", help="CSV, CSV.gz, Parquet, MAT v5 or MCAP.")],
     model: Annotated[Path, typer.Option(help="Axis model (YAML) that the recordings are compared with.")],
-    out: Annotated[Path, typer.Option(help="Folder for diagnosis.json and model.yaml.")],
+    out: Annotated[Path, typer.Option(help="Folder for diagnosis.json, model.yaml and report.html.")],
     map_file: Annotated[Path | None, typer.Option("--map", help="Renames and scales foreign columns (YAML).")] = None,
     time_limit: Annotated[float, typer.Option(help="Seconds after which the search ends with what it has.")] = 120.0,
     as_json: JsonOption = False,
@@ -41,15 +40,14 @@ def diagnose(
         raise BadInput("--time-limit", repr(time_limit), "seconds from 1 to 100000")
     one_thread()
     from servod.axis_model import load_axis_model
-    from servod.diagnose.document import diagnosis_document, extended_model
     from servod.diagnose.engine import diagnose as run
+    from servod.diagnose.files import write_files
 
     axis = load_axis_model(model)
     recorded = _load(recordings, map_file, axis, model)
     need_folder("--out", out)
     found = run(axis, recorded, time_limit, _quiet if as_json else _progress)
-    document = diagnosis_document(found)
-    _write(out, document, extended_model(found))
+    document = write_files(out, found, model.name)
     if as_json:
         print_json(document)
     else:
@@ -78,19 +76,6 @@ def _progress(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
 
 
-def _write(out: Path, document: dict[str, Any], extended: AxisModel | None) -> None:
-    """Write both files aside and rename them."""
-    from servod.axis_model import axis_model_yaml
-
-    texts = {"diagnosis.json": json.dumps(document, indent=1, allow_nan=False) + "\n"}
-    if extended is not None:
-        texts["model.yaml"] = axis_model_yaml(extended)
-    for name, text in texts.items():
-        aside = out / f"{name}.part"
-        aside.write_text(text, encoding="utf-8")
-        aside.replace(out / name)
-
-
 def _print(found: Diagnosis, document: dict[str, Any], out: Path) -> None:
     """The answer for people: verdict, findings with their parameters, what was recalibrated."""
     for refused in found.refused:
@@ -105,4 +90,5 @@ def _print(found: Diagnosis, document: dict[str, Any], out: Path) -> None:
             print(f"    not told apart from {other['effect']}: {other['experiment']}")
     for name, change in document["recalibrated"].items():
         print(f"recalibrated: {name} {change['from']:.5g} -> {change['to']:.5g} {change['unit']}")
-    print(f"written: {out / 'diagnosis.json'}" + (f", {out / 'model.yaml'}" if found.evidence else ""))
+    model = f", {out / 'model.yaml'}" if found.evidence else ""
+    print(f"written: {out / 'diagnosis.json'}{model}, {out / 'report.html'}")

@@ -6,20 +6,25 @@ The last step before the files: plain numbers, sentences for people, nothing dec
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from servod.axis_model import AxisModel
+from servod.diagnose.coordinates import units
 from servod.diagnose.effects import effect
 from servod.diagnose.effects.disturbance import EVERY
 from servod.diagnose.engine import Diagnosis, Evidence
 from servod.diagnose.fit import Fit
+from servod.diagnose.floor import trace_floor
+from servod.diagnose.held_out import Fold
 from servod.diagnose.hypothesis import Document, Reported
 from servod.diagnose.locate import places
+from servod.diagnose.signature import where
 from servod.diagnose.verdict import alternatives, confidence
-from servod.diagnose.windows import window_errors
+from servod.diagnose.windows import WindowErrors, window_errors, windows_document
 
 Array = NDArray[np.float64]
 
@@ -30,14 +35,15 @@ Z95 = 1.96
 LEAST_CHANGE = 0.002
 
 
-def diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:
-    """The JSON document."""
+def diagnosis_document(diagnosis: Diagnosis, windows: Sequence[WindowErrors] | None = None) -> dict[str, Any]:
+    """The JSON document; `windows` are those of `window_evidence` where they have been computed already."""
     evidence = diagnosis.evidence
+    told = units(diagnosis.nominal)
     found: dict[str, Any] = {"verdict": diagnosis.verdict.value, "summary": summary(diagnosis)}
     found["findings"] = findings(evidence) if evidence else []
     found["recalibrated"] = recalibrated(evidence) if evidence else {}
     found["minor"] = minor(evidence) if evidence else {}
-    found["fit"] = fit_document(diagnosis, evidence) if evidence else {}
+    found["fit"] = fit_document(diagnosis, evidence, windows) if evidence else {}
     if evidence is not None and evidence.unnamed is not None:
         left = evidence.unnamed
         table = {"grid": left.grid.tolist(), "torque": left.torque.tolist()}
@@ -46,6 +52,7 @@ def diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:
         found["located"] = [m.document() for m in evidence.maps_before]
         found["remaining"] = [m.document() for m in evidence.maps_after]
     found["recordings"] = recordings(diagnosis)
+    found["units"] = {"position": told.length, "torque": told.force}
     found["seconds"] = {stage: round(value, 2) for stage, value in diagnosis.seconds.items()}
     return found
 
@@ -75,12 +82,15 @@ def findings(evidence: Evidence) -> list[dict[str, Any]]:
 
 def _finding(evidence: Evidence, name: str, named: list[int]) -> dict[str, Any]:
     fit, first = evidence.fit, named[0]
+    force = units(evidence.predictor).force
     what = effect(name)
     contribution = evidence.less[first].mismatch - fit.mismatch
     merit = evidence.choice.merits[first]
+    located = places(evidence.predictor, contribution, evidence.predictor.dry)
     statement = (
-        f"{what.statement}: it carries {100.0 * max(merit.share, 0.0):.0f} % of the explainable mismatch and "
-        f"{100.0 * merit.torque:.1f} % of dry friction where it acts; {what.shows}."
+        f"{what.statement}. It carries {100.0 * max(merit.share, 0.0):.0f} % of the explainable mismatch and "
+        f"{100.0 * merit.torque:.1f} % of dry friction where it acts. It shows as {what.shows}; it is strongest "
+        f"{where(name, located)}."
     )
     others = [
         {"effect": other, "experiment": effect(other).experiment} for other in alternatives(evidence.choice, first)
@@ -88,14 +98,14 @@ def _finding(evidence: Evidence, name: str, named: list[int]) -> dict[str, Any]:
     return {
         "effect": name,
         "statement": statement,
-        "located": places(evidence.predictor, contribution, evidence.predictor.dry),
+        "located": located,
         "form": [fit.hypothesis.terms[place].form for place in named],
         "parameters": _parameters(evidence, named),
         "confidence": min(confidence(evidence.choice, place, evidence.errors.removed) for place in named),
         "alternatives": others,
         "confused_with": list(what.confused),
         "experiment": what.experiment,
-        "held_out": {"before": evidence.without[first].rms, "after": evidence.after.rms, "unit": "N·m"},
+        "held_out": {"before": evidence.without[first].rms, "after": evidence.after.rms, "unit": force},
     }
 
 
@@ -155,40 +165,57 @@ def minor(evidence: Evidence) -> dict[str, Any]:
     }
 
 
-def fit_document(diagnosis: Diagnosis, evidence: Evidence) -> dict[str, Any]:
+def fit_document(
+    diagnosis: Diagnosis, evidence: Evidence, windows: Sequence[WindowErrors] | None = None
+) -> dict[str, Any]:
     """Errors before and after on data that a fit has not seen, the floor, and windows simulated from the recording."""
-    after = extended_model(diagnosis)
+    if windows is None:
+        windows = window_evidence(diagnosis, evidence)
     return {
-        "unit": "N·m",
+        "unit": units(evidence.predictor).force,
         "held_out": {"before": evidence.before.rms, "after": evidence.after.rms},
         "noise_floor": evidence.errors.floor,
         "explainable_removed": round(evidence.errors.removed, 4),
         "removed_by_known_physics": round(evidence.attempt, 4),
-        "windows": window_errors(evidence.traces, diagnosis.nominal, after) if after else {},
+        "windows": windows_document(windows, evidence.predictor),
         "observer_rad_s": evidence.predictor.rate,
         "starts_tried": evidence.choice.tried,
     }
 
 
+def window_evidence(diagnosis: Diagnosis, evidence: Evidence) -> list[WindowErrors]:
+    """Errors of free windows. What has no name is a table over everything, so that its rows have been seen."""
+    after = evidence.after.folds
+    if evidence.unnamed is not None:
+        extended = extended_model(diagnosis)
+        assert extended is not None  # there is evidence
+        after = (Fold(np.ones(len(evidence.predictor.counts), dtype=bool), extended),)
+    return window_errors(evidence.predictor, diagnosis.nominal, evidence.before.folds, after)
+
+
 def recordings(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """What was taken in and refused, with notes."""
     evidence = diagnosis.evidence
-    found: list[dict[str, Any]] = []
-    for part, trace in zip(evidence.predictor.slices, evidence.traces, strict=True) if evidence else ():
-        rows = evidence.predictor.counts[part] if evidence else np.zeros(0, bool)
-        entry = {
-            "name": trace.name,
-            "taken": True,
-            "duration_s": trace.duration_s,
-            "rows": int(rows.sum()),
-            "position_noise": trace.position_noise,
-            "notes": list(trace.notes),
-        }
-        if evidence:
-            entry["mismatch_before"] = _rms(evidence.choice.base.mismatch[part][rows])
-            entry["mismatch_after"] = _rms(evidence.fit.mismatch[part][rows])
-        found.append(entry)
-    return found + [{"name": r.name, "taken": False, "reason": r.reason} for r in diagnosis.refused]
+    taken = [_recording(evidence, index) for index in range(len(evidence.traces))] if evidence else []
+    return taken + [{"name": r.name, "taken": False, "reason": r.reason} for r in diagnosis.refused]
+
+
+def _recording(evidence: Evidence, index: int) -> dict[str, Any]:
+    """One recording: what was repaired, its noise, and what is left of its mismatch."""
+    trace, part, predictor = evidence.traces[index], evidence.predictor.slices[index], evidence.predictor
+    rows = predictor.counts[part]
+    return {
+        "name": trace.name,
+        "taken": True,
+        "duration_s": trace.duration_s,
+        "rows": int(rows.sum()),
+        "period_s": trace.period_s,
+        "position_noise": trace.position_noise,
+        "notes": list(trace.notes),
+        "noise_floor": math.sqrt(trace_floor(predictor, index, evidence.fit.mismatch)),
+        "mismatch_before": _rms(evidence.choice.base.mismatch[part][rows]),
+        "mismatch_after": _rms(evidence.fit.mismatch[part][rows]),
+    }
 
 
 def _rms(values: Array) -> float:

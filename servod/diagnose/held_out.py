@@ -11,6 +11,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from servod.axis_model import AxisModel
 from servod.diagnose.fit import Fit, Fitter, Weighing, scale_of
 from servod.diagnose.predict import Predictor
 
@@ -25,11 +26,20 @@ STRETCHES = 4
 
 
 @dataclass(frozen=True)
+class Fold:
+    """Rows that were left out together, and the model that was fitted without them."""
+
+    rows: Rows
+    model: AxisModel
+
+
+@dataclass(frozen=True)
 class HeldOut:
     """Mismatch (N*m) of every row by a fit that has not seen it; `rms` is over the rows that count."""
 
     mismatch: Array
     rms: float
+    folds: tuple[Fold, ...] = ()
 
 
 def folds(predictor: Predictor) -> list[Rows]:
@@ -54,6 +64,7 @@ def held_out(predictor: Predictor, fit: Fit, frozen: Rows) -> HeldOut:
     """
     mismatch = np.zeros_like(fit.mismatch)
     least = 1e-3 * predictor.dry
+    models: list[Fold] = []
     free = Fit(fit.hypothesis, fit.coordinates, fit.mismatch, fit.cost, np.where(frozen, 0.0, fit.jacobian), False)
     for out in folds(predictor):
         rows = (predictor.counts & ~out).astype(np.float64)
@@ -61,8 +72,9 @@ def held_out(predictor: Predictor, fit: Fit, frozen: Rows) -> HeldOut:
         fitter = Fitter(predictor, weighing)
         begun = fitter.begin(fit.hypothesis, fit.coordinates, free.jacobian)
         if begun is None or rows.sum() < len(fit.coordinates):
-            mismatch[out] = fit.mismatch[out]
-            continue
-        again = fitter.refine(begun, STEPS, len(fit.coordinates))
+            again = fit
+        else:
+            again = fitter.refine(begun, STEPS, len(fit.coordinates))
         mismatch[out] = again.mismatch[out]
-    return HeldOut(mismatch, float(np.sqrt(np.mean(mismatch[predictor.counts] ** 2))))
+        models.append(Fold(out, again.model))
+    return HeldOut(mismatch, float(np.sqrt(np.mean(mismatch[predictor.counts] ** 2))), tuple(models))

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.axis_model import AxisModel
+from servod.diagnose.plausible import implausible
 from servod.diagnose.predict import SLOWEST, dry_friction
 from servod.diagnose.trace import Rows, Trace
 from servod.models.motion import noise_rms
@@ -37,8 +38,8 @@ SATURATED, TOLD_SATURATED = 0.4, 0.02
 #: A row that leaves its neighbours by so many noises, or so many usual steps, and comes back, is a glitch.
 GLITCH_NOISES, GLITCH_STEPS = 30.0, 8.0
 
-#: Correlation between command and the torque that the model needs from which the sign is wrong; ratio for the unit.
-WRONG_SIGN, WRONG_UNIT = -0.5, 5.0
+#: Rows of the neighbourhood whose median a glitch leaves; so many names of a list are told.
+NEIGHBOURHOOD, NAMES_TOLD = 7, 6
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,7 @@ def taken_in(recordings: Sequence[Recording], model: AxisModel) -> tuple[list[Tr
 
 def trace_of(recording: Recording, name: str, shift_s: float) -> Trace:
     """The recording with glitches repaired, on a time of its own."""
-    notes = list(recording.report)
+    notes = [_shortened(note) for note in recording.report]
     drive = recording.drive
     counts = recording.measured.copy()
     position = _unwrapped(drive.position, notes)
@@ -81,6 +82,15 @@ def trace_of(recording: Recording, name: str, shift_s: float) -> Trace:
     has_temperature = warm is not None and bool(np.isfinite(drive.temperature_c).all()) and _warms(drive.temperature_c)
     moved = Drive(t_s, torque, position, drive.temperature_c)
     return Trace(name, moved, counts, tuple(notes), has_temperature, shift_s - float(drive.t_s[0]))
+
+
+def _shortened(note: str) -> str:
+    """A note whose list of names is cut."""
+    head, colon, names = note.partition(": ")
+    told = names.split(", ")
+    if not head.startswith("columns not used") or len(told) <= NAMES_TOLD:
+        return note
+    return f"{head}{colon}{', '.join(told[:NAMES_TOLD])} and {len(told) - NAMES_TOLD} more"
 
 
 def _warms(temperature_c: Array) -> bool:
@@ -114,7 +124,7 @@ def glitches(values: Array) -> Rows:
     """Rows that leave the median of their neighbourhood far and alone."""
     from scipy.ndimage import median_filter
 
-    off = np.abs(values - median_filter(values, 5, mode="nearest"))
+    off = np.abs(values - median_filter(values, NEIGHBOURHOOD, mode="nearest"))
     step = np.abs(np.diff(values))
     usual = float(np.quantile(step, 0.995)) if len(step) else 0.0
     return np.asarray(off > max(GLITCH_NOISES * noise_rms(values), GLITCH_STEPS * usual, 1e-300))
@@ -135,7 +145,11 @@ def _tell_saturation(torque: Array, notes: list[str]) -> None:
 def cannot_tell(trace: Trace, model: AxisModel) -> str | None:
     """Why this recording cannot tell anything about this model; None when it can."""
     return (
-        _too_short(trace) or _too_noisy(trace, model) or _too_still(trace) or _saturated(trace) or _wrong(trace, model)
+        _too_short(trace)
+        or _too_noisy(trace, model)
+        or _too_still(trace)
+        or _saturated(trace)
+        or implausible(trace, model)
     )
 
 
@@ -173,21 +187,3 @@ def _too_noisy(trace: Trace, model: AxisModel) -> str | None:
     if noise <= MOST_NOISE * max(dry, spoken):
         return None
     return f"too noisy: encoder noise makes {noise:.3g} of torque, dry friction is {dry:.3g}"
-
-
-def _wrong(trace: Trace, model: AxisModel) -> str | None:
-    """A sign or a unit that cannot be: the torque that the model needs against the command."""
-    viscous = model.friction.viscous
-    needed = model.inertia * trace.acceleration + viscous * trace.velocity
-    needed = needed + dry_friction(model) * np.tanh(trace.velocity / max(float(np.std(trace.velocity)) * 0.05, 1e-12))
-    gravity = model.gravity
-    if gravity is not None:
-        needed = needed + gravity.amplitude * np.sin(trace.drive.position + gravity.phase)
-    command = trace.drive.torque
-    likeness = float(np.corrcoef(needed, command)[0, 1])
-    if likeness < WRONG_SIGN:
-        return f"command and motion have opposite signs (correlation {likeness:.2f})"
-    ratio = float(np.std(command) / max(float(np.std(needed)), 1e-30))
-    if likeness > -WRONG_SIGN and not 1.0 / WRONG_UNIT < ratio < WRONG_UNIT:
-        return f"the command is {ratio:.3g} times what the model needs: another unit, or another axis"
-    return None

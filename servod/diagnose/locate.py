@@ -8,18 +8,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from servod.diagnose.coordinates import coordinates, units
 from servod.diagnose.predict import Predictor
+from servod.diagnose.scene import Scene
 
 Array = NDArray[np.float64]
 
 #: Bins of a map, and rows that a bin needs.
-BINS, LEAST_IN_BIN = 24, 30
+BINS, TIME_BINS, LEAST_IN_BIN = 24, 96, 30
 
 #: Probability under noise below which a map counts as seen.
 SEEN = 1e-3
@@ -35,8 +37,8 @@ BANDS: tuple[tuple[float, float], ...] = ((0.0, 0.5), (0.5, 2.0), (2.0, 5.0), (5
 class Map:
     """Mean of the mismatch over one coordinate: bin edges, means and standard errors (N*m), rows in each bin.
 
-    `share` is the part of the mismatch's power that the means carry beyond chance, `chance` the probability that noise
-    makes them.
+    `share` is the part of the mismatch's power over all rows that the means carry beyond chance, `chance` the
+    probability that noise makes them.
     """
 
     coordinate: str
@@ -63,49 +65,26 @@ class Map:
         }
 
 
-def coordinates(predictor: Predictor) -> dict[str, tuple[str, Array]]:
-    """Coordinates of every row: name -> (unit, values)."""
-    traces = predictor.traces
-    x, v, a, u, warm = (predictor.over(n) for n in ("position", "velocity", "acceleration", "torque", "temperature_c"))
-    found = {
-        "position": ("rad", x),
-        "velocity": ("rad/s", v),
-        "direction": ("1", np.sign(v)),
-        "acceleration": ("rad/s²", a),
-        "load": ("N·m", u),
-        "time since reversal": ("s", np.concatenate([since_reversal(t.drive.t_s, t.velocity) for t in traces])),
-    }
-    if all(trace.has_temperature for trace in traces):
-        found["temperature"] = ("°C", warm)
-    return found
-
-
-def since_reversal(t_s: Array, velocity: Array) -> Array:
-    """Time since the velocity last changed its sign, s, at most 1."""
-    turned = np.concatenate([[True], np.diff(np.sign(velocity)) != 0.0])
-    last = np.maximum.accumulate(np.where(turned, np.arange(len(t_s)), 0))
-    return np.minimum(t_s - t_s[last], 1.0)
-
-
 def maps(predictor: Predictor, mismatch: Array) -> list[Map]:
     """Maps over all coordinates, the one that carries most first."""
     memory = max(1, round(2.0 / (predictor.rate * predictor.traces[0].period_s)))
     found = [
-        map_over(name, unit, values, mismatch, predictor.counts, memory)
+        map_over(name, unit, values, mismatch, predictor.counts, memory, TIME_BINS if name == "time" else BINS)
         for name, (unit, values) in coordinates(predictor).items()
+        if int(np.sum(predictor.counts & np.isfinite(values))) >= 2 * LEAST_IN_BIN
     ]
-    for name, values in _both_ways(predictor).items():
-        found.append(map_over(name, "rad", values, mismatch, predictor.counts, memory))
-    return sorted(found, key=lambda m: -m.share)
+    return sorted([*found, modulo_period(predictor, mismatch, memory)], key=lambda m: -m.share)
 
 
-def _both_ways(predictor: Predictor) -> dict[str, Array]:
-    """Position for each direction of motion alone (NaN elsewhere)."""
-    x, v = predictor.over("position"), predictor.over("velocity")
-    return {
-        "position, moving forward": np.where(v > 0.0, x, np.nan),
-        "position, moving back": np.where(v < 0.0, x, np.nan),
-    }
+def modulo_period(predictor: Predictor, mismatch: Array, memory: int) -> Map:
+    """The map over the position modulo the period that takes most; its chance counts all periods that were tried."""
+    axis = "linear" if predictor.linear else "rotary"
+    scene = Scene({"axis": axis}, predictor, mismatch)
+    best = scene.peaks(scene.carried(np.ones_like(scene.position)), 1)[0]
+    period, unit = 2.0 * math.pi / best.n, units(predictor).length
+    name = f"position modulo {period:.4g} {unit}"
+    found = map_over(name, unit, scene.lagged_position % period, mismatch, predictor.counts, memory)
+    return replace(found, chance=min(1.0, found.chance * len(scene.orders)))
 
 
 def map_over(
@@ -126,8 +105,9 @@ def map_over(
     error = np.sqrt(np.maximum(square - mean**2, 0.0) / independent)
     total, between = float(here @ here), float(count @ mean**2)
     free, rest = len(edges) - 1, max(len(here) / memory - len(edges) + 1, 1.0)
-    ratio = (between / free) / max((total - between) / rest, 1e-30) / memory * 1.0
-    share = max(between - free * memory * (total - between) / max(len(here), 1), 0.0) / max(total, 1e-30)
+    ratio = (between / free) / max((total - between) / rest, 1e-30) / memory
+    carried = max(between - free * memory * (total - between) / max(len(here), 1), 0.0)
+    share = carried / max(float(np.sum(mismatch[counts] ** 2)), 1e-30)
     return Map(name, unit, edges, mean, error, count, share, float(fisher.sf(ratio, free, rest)))
 
 
@@ -142,8 +122,10 @@ def places(predictor: Predictor, effect: Array, scale: float) -> dict[str, Any]:
         found["recordings"][trace.name] = round(float(np.sqrt(np.mean(here**2))) / scale, 4)
         found["time_windows"] += _windows(trace.name, trace.drive.t_s - trace.shift_s, here)
     for name, (unit, values) in coordinates(predictor).items():
-        found[name.replace(" ", "_")] = _strong(values, effect, predictor.counts) | {"unit": unit}
-    found["frequency"] = _bands(predictor, effect) | {"unit": "Hz"}
+        if name != "time" and "," not in name:
+            found[name.replace(" ", "_")] = _strong(values, effect, predictor.counts) | {"unit": unit}
+    found["unit"] = units(predictor).force
+    found["frequency"] = bands(predictor, effect) | {"unit": "Hz"}
     return found
 
 
@@ -176,7 +158,7 @@ def _strong(values: Array, effect: Array, counts: NDArray[np.bool_]) -> dict[str
     return {"from": float(edges[strong[0]]), "to": float(edges[strong[-1] + 1])}
 
 
-def _bands(predictor: Predictor, effect: Array) -> dict[str, Any]:
+def bands(predictor: Predictor, effect: Array) -> dict[str, Any]:
     """The band of frequencies that carries most, and the share of each."""
     from scipy.signal import periodogram
 

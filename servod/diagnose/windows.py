@@ -1,40 +1,93 @@
 """Errors of windows that are simulated freely from the recorded state: how far a model is off after a while.
 
-Stands beside the mismatch in the report; the same replay that `servoctl replay` runs.
+Stands beside the mismatch in the report; the same replay that `servoctl replay` runs. Every row is judged by a model
+that was fitted without it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from servod.axis_model import AxisModel
+from servod.diagnose.held_out import Fold
+from servod.diagnose.predict import Predictor
 from servod.diagnose.trace import Trace
 from servod.models.replay import Drive, replay
+
+Array = NDArray[np.float64]
 
 #: Lengths of the windows, s.
 HORIZONS_S = (0.25, 1.0)
 
 
-def window_errors(traces: Sequence[Trace], before: AxisModel, after: AxisModel) -> dict[str, Any]:
-    """RMS position error (rad or m) over all recordings: horizon -> before, after."""
+@dataclass(frozen=True)
+class WindowErrors:
+    """Simulated minus recorded position (rad or m) of every row, in windows of `horizon_s`.
+
+    `nominal` is by the model as it came, `recalibrated` by its own parameters fitted elsewhere, `after` by the model
+    with the physics added, fitted elsewhere.
+    """
+
+    horizon_s: float
+    nominal: Array
+    recalibrated: Array
+    after: Array
+
+    def document(self, counts: NDArray[np.bool_]) -> dict[str, float]:
+        """RMS over the rows that count."""
+        values = {"before": self.nominal, "recalibrated": self.recalibrated, "after": self.after}
+        return {name: float(np.sqrt(np.mean(error[counts] ** 2))) for name, error in values.items()}
+
+
+def window_errors(
+    predictor: Predictor, nominal: AxisModel, base: Sequence[Fold], after: Sequence[Fold]
+) -> list[WindowErrors]:
+    """Errors for every horizon; each fold's model judges the rows that it has not seen."""
+    whole = [Fold(np.ones(len(predictor.counts), dtype=bool), nominal)]
+    return [
+        WindowErrors(horizon, *(_errors(predictor, folds, horizon) for folds in (whole, base, after)))
+        for horizon in HORIZONS_S
+    ]
+
+
+def windows_document(errors: Sequence[WindowErrors], predictor: Predictor) -> dict[str, Any]:
+    """RMS errors by horizon, of all recordings and of each."""
     found: dict[str, Any] = {}
-    for horizon in HORIZONS_S:
-        found[f"{horizon:g}"] = {
-            "before": _rms(traces, before, horizon),
-            "after": _rms(traces, after, horizon),
+    for window in errors:
+        entry: dict[str, Any] = {"unit": "m" if predictor.linear else "rad", **window.document(predictor.counts)}
+        entry["recordings"] = {
+            trace.name: window.document(_within(predictor, part))
+            for trace, part in zip(predictor.traces, predictor.slices, strict=True)
+            if predictor.counts[part].any()
         }
+        found[f"{window.horizon_s:g}"] = entry
     return found
 
 
-def _rms(traces: Sequence[Trace], model: AxisModel, horizon_s: float) -> float:
-    total, rows = 0.0, 0
-    for trace in traces:
-        drive = trace.drive
-        recorded = Drive(drive.t_s - trace.shift_s, drive.torque, drive.position, drive.temperature_c)
-        error = replay(model, recorded, horizon_s).error[trace.counts]
-        total += float(error @ error)
-        rows += len(error)
-    return float(np.sqrt(total / max(rows, 1)))
+def _within(predictor: Predictor, part: slice) -> NDArray[np.bool_]:
+    inside = np.zeros_like(predictor.counts)
+    inside[part] = predictor.counts[part]
+    return inside
+
+
+def _errors(predictor: Predictor, folds: Sequence[Fold], horizon_s: float) -> Array:
+    error = np.zeros(len(predictor.counts))
+    for fold in folds:
+        for trace, part in zip(predictor.traces, predictor.slices, strict=True):
+            rows = fold.rows[part]
+            if rows.any():
+                error[part][rows] = replay(fold.model, _drive(trace, fold), horizon_s).error[rows]
+    return error
+
+
+def _drive(trace: Trace, fold: Fold) -> Drive:
+    """The recording on the time that the model's windows of disturbance are in: shifted, where one was fitted."""
+    if fold.model.disturbance is not None and fold.model.disturbance.windows:
+        return trace.drive
+    drive = trace.drive
+    return Drive(drive.t_s - trace.shift_s, drive.torque, drive.position, drive.temperature_c)

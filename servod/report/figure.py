@@ -40,6 +40,7 @@ class Style(Enum):
     DASHED = "dashed"
     DOTTED = "dotted"
     POINTS = "points"
+    BARS = "bars"  # lying: x is their length, y their place
 
 
 class Scale(Enum):
@@ -54,7 +55,8 @@ class Curve:
     """One curve. Curves with the same `label` share one entry of the legend, without a label they have none; `detail`
     tells curves apart under the mouse.
 
-    `bounds` are lower and upper bounds of y, drawn as a band (as bars for points).
+    `bounds` are lower and upper bounds of y, drawn as a band (as bars for points). `width` is in points; of lying bars
+    it is their thickness, places being whole numbers.
     """
 
     label: str
@@ -69,11 +71,15 @@ class Curve:
 
 @dataclass(frozen=True)
 class Axis:
-    """One axis: its label with the unit, its scale, and its range where the data should not choose it."""
+    """One axis: its label with the unit, its scale, and its range where the data should not choose it.
+
+    `names` stand at 0, 1, 2, ... in place of numbers.
+    """
 
     label: str
     scale: Scale = Scale.LINEAR
     span: tuple[float, float] | None = None
+    names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

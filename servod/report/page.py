@@ -22,7 +22,11 @@ _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 70rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
 h1 { font-size: 1.6rem; } h2 { font-size: 1.2rem; margin-top: 2.5rem; }
 table { border-collapse: collapse; } th, td { padding: .3rem .9rem; text-align: right; border-bottom: 1px solid #ddd; }
-th:first-child, td:first-child { text-align: left; } footer { margin-top: 3rem; color: #777; font-size: .85rem; }
+th:first-child, td:first-child { text-align: left; } table { margin: 1rem 0; }
+.lead { font-size: 1.25rem; font-weight: 600; border-left: 4px solid #0072b2;
+  padding-left: .8rem; }
+details { margin: .8rem 0; } summary { cursor: pointer; color: #0072b2; } details p { margin: .4rem 1.2rem; }
+footer { margin-top: 3rem; color: #777; font-size: .85rem; }
 """
 
 
@@ -41,6 +45,19 @@ class Page:
     def sentence(self, text: str) -> None:
         """Add a paragraph of plain text."""
         self._parts.append(f"<p>{html.escape(text)}</p>")
+
+    def lead(self, text: str) -> None:
+        """Add a paragraph that stands out: the answer in one sentence."""
+        self._parts.append(f'<p class="lead">{html.escape(text)}</p>')
+
+    def points(self, lines: Sequence[str]) -> None:
+        """Add a list of plain sentences."""
+        self._parts.append("<ul>" + "".join(f"<li>{html.escape(line)}</li>" for line in lines) + "</ul>")
+
+    def folded(self, title: str, lines: Sequence[str]) -> None:
+        """Add paragraphs that are shown when their title is clicked: mathematics, and what few readers need."""
+        inner = "".join(f"<p>{html.escape(line)}</p>" for line in lines)
+        self._parts.append(f"<details><summary>{html.escape(title)}</summary>{inner}</details>")
 
     def table(self, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         """Add a table; cells are plain text."""

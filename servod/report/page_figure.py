@@ -45,7 +45,8 @@ def _draw(drawn: go.Figure, panel: Panel, row: int, column: int, named: set[str]
     for curve in panel.curves:
         if curve.bounds is not None and curve.style is not Style.POINTS:
             drawn.add_trace(_band(curve, *curve.bounds), row=row, col=column)
-        drawn.add_trace(_trace(curve, bool(curve.label) and curve.label not in named), row=row, col=column)
+        trace = _bars if curve.style is Style.BARS else _trace
+        drawn.add_trace(trace(curve, bool(curve.label) and curve.label not in named), row=row, col=column)
         named.add(curve.label)
     drawn.update_xaxes(**_axis(panel.x), row=row, col=column)
     drawn.update_yaxes(**_axis(panel.y), row=row, col=column)
@@ -55,6 +56,8 @@ def _axis(axis: Axis) -> dict[str, object]:
     settings: dict[str, object] = {"title": {"text": axis.label, "standoff": 6}, "type": axis.scale.value}
     if axis.scale is Scale.LOG:
         settings |= {"exponentformat": "power", "dtick": 1}
+    if axis.names:
+        settings |= {"tickvals": list(range(len(axis.names))), "ticktext": list(axis.names), "automargin": True}
     if axis.span is not None:
         settings["range"] = [float(np.log10(v)) if axis.scale is Scale.LOG else v for v in axis.span]
     return settings
@@ -79,6 +82,20 @@ def _trace(curve: Curve, first: bool) -> go.Scatter:
         marker={"color": curve.colour.value, "size": 6},
         error_y=bars,
         hovertext=curve.detail or None,
+    )
+
+
+def _bars(curve: Curve, first: bool) -> go.Bar:
+    """Lying bars."""
+    return go.Bar(
+        x=curve.x.astype(np.float32),
+        y=curve.y.astype(np.float32),
+        orientation="h",
+        width=curve.width,
+        name=curve.label or curve.detail,
+        legendgroup=curve.label,
+        showlegend=first,
+        marker={"color": curve.colour.value},
     )
 
 

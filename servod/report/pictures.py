@@ -92,7 +92,9 @@ def _draw(drawn: Any, panel: Panel) -> None:
 def _axis(drawn: Any, axis: Axis, name: str) -> None:
     getattr(drawn, f"set_{name}label")(axis.label)
     getattr(drawn, f"set_{name}scale")(axis.scale.value)
-    if axis.scale is Scale.LINEAR:
+    if axis.names:
+        getattr(drawn, f"set_{name}ticks")(range(len(axis.names)), axis.names)
+    elif axis.scale is Scale.LINEAR:
         drawn.ticklabel_format(axis=name, style="sci", scilimits=(-4, 5), useMathText=True)
     if axis.span is not None:
         getattr(drawn, f"set_{name}lim")(*axis.span)
@@ -100,6 +102,9 @@ def _axis(drawn: Any, axis: Axis, name: str) -> None:
 
 def _curve(drawn: Any, curve: Curve) -> None:
     colour = curve.colour.value
+    if curve.style is Style.BARS:
+        drawn.barh(curve.y, curve.x, curve.width, color=colour, label=curve.label or None)
+        return
     if curve.style is Style.POINTS:
         drawn.plot(curve.x, curve.y, "o", color=colour, markersize=3.5, label=curve.label or None)
         if curve.bounds is not None:
