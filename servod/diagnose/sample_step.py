@@ -122,8 +122,9 @@ def mid_velocity(
     impulse = 2.0 * inertia / h
     pushed = torque + impulse * s[S_VELOCITY]
     if p[P_SIGMA0] == 0.0:
-        mean = sliding_or_held(pushed, impulse + viscous + extra, grip)
-        s[S_FRICTION] = pushed - (impulse + extra) * mean
+        free = impulse + extra
+        mean = sliding_or_held(pushed + free * pull, free + viscous, grip) - pull
+        s[S_FRICTION] = pushed - free * mean
         return mean
     speed = abs(velocity)
     damping = bristle_damping(p, velocity, grip)
