@@ -32,7 +32,7 @@ SEEN, TRIES = 0.08, 8
 #: A loop is sane while its error is below this share of the travel and its command at the limit for less than this.
 SANE_ERROR, SANE_LIMITED = 0.35, 0.15
 
-#: Under Cover.NOISE: least factor on noise, factor on strength. Cover.ABSORBED: share by which the model's friction went along.
+#: Cover.NOISE: least factor on noise, factor on strength. Cover.ABSORBED: by how much the model's friction went along.
 BELOW_NOISE, FAINT, TAKEN_UP = 3.0, 0.6, 0.08
 
 #: How far (share) known parameters are off, and how large clutter is as a share of Coulomb friction.
