@@ -6,6 +6,8 @@ is wrong is told with the key to turn round, so that no position loop is ever cl
 
 from __future__ import annotations
 
+import numpy as np
+
 from servod.config import AxisConfig
 from servod.errors import AnswerIsNo
 from servod.identify.trace import Trace
@@ -13,6 +15,9 @@ from servod.units import TWO_PI
 
 #: The two sensors' ways may differ by this factor (slack, elasticity) and by so many counts of the coarser one.
 MOST_RATIO, COUNTS = 2.0, 3.0
+#: So far apart over the whole way and over its second half as well, when slack is taken up and a spring is wound: a
+#: wrong scale shows in both alike, slack in the first half, and a spring unwinds in the second.
+STEADY_RATIO = 1.5
 #: A joint that moves at less than this share of the torque limit: scale or limit is wrong.
 LEAST_TORQUE_SHARE = 0.04
 
@@ -27,7 +32,7 @@ def check_motion(ramp: Trace, config: AxisConfig, moved_rad: float) -> None:
     motor = sign * float(ramp.motor_rad[-1] - ramp.motor_rad[0])
     if max(abs(encoder), abs(motor)) < moved_rad:
         return
-    _check_scale(abs(encoder), abs(motor), config)
+    _check_scale((abs(encoder), abs(motor)), _second_half(ramp), config)
     _check_signs(encoder, motor)
 
 
@@ -42,12 +47,22 @@ def check_torque(found_nm: float, allowed_nm: float, limit_nm: float) -> None:
         )
 
 
-def _check_scale(encoder: float, motor: float, config: AxisConfig) -> None:
-    """Magnitudes of both ways against each other."""
-    amplifier = config.amplifier
+def _second_half(ramp: Trace) -> tuple[float, float]:
+    """Ways of encoder and amplifier's sensor from where the one that moves further has half of its way behind it."""
+    ways = [np.abs(sensor - sensor[0]) for sensor in (ramp.position_rad, ramp.motor_rad)]
+    further = max(ways, key=lambda way: float(way[-1]))
+    half = int(np.argmax(further >= 0.5 * further[-1]))
+    encoder, motor = (abs(float(way[-1] - way[half])) for way in ways)
+    return encoder, motor
+
+
+def _check_scale(whole: tuple[float, float], late: tuple[float, float], config: AxisConfig) -> None:
+    """Magnitudes of both ways, encoder's and amplifier's, against each other: of the whole, and of its second half."""
+    (encoder, motor), amplifier = whole, config.amplifier
     count_rad = TWO_PI / min(amplifier.counts_per_turn * amplifier.gear_ratio, float(config.encoder.counts_per_turn))
     small, large = min(encoder, motor), max(encoder, motor)
-    if large <= MOST_RATIO * small + COUNTS * count_rad:
+    longer = {_apart(ways, STEADY_RATIO, count_rad) for ways in (whole, late)}
+    if longer not in ({1}, {-1}) and not _apart(whole, MOST_RATIO, count_rad):
         return
     first, second = ("amplifier's", "encoder's") if motor > encoder else ("encoder's", "amplifier's")
     if small < count_rad:
@@ -59,6 +74,14 @@ def _check_scale(encoder: float, motor: float, config: AxisConfig) -> None:
         f"the {first} sensor moved {large / small:.2g} times as far as the {second}: wrong scale; check "
         "encoder.counts_per_turn, amplifier.counts_per_turn and amplifier.gear_ratio against the data sheets"
     )
+
+
+def _apart(ways: tuple[float, float], ratio: float, count_rad: float) -> int:
+    """Which of two ways is the longer by more than `ratio` and some counts: 1 the first, -1 the second, 0 neither."""
+    first, second = ways
+    if max(ways) <= ratio * min(ways) + COUNTS * count_rad:
+        return 0
+    return 1 if first > second else -1
 
 
 def _check_signs(encoder: float, motor: float) -> None:
