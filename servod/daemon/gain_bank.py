@@ -16,9 +16,9 @@ from servod.config import AxisConfig
 from servod.daemon.arguments import GainsActivateArgs, GainsLoadArgs, GainsVerdictArgs
 from servod.daemon.flows import Flow, FutureWait, Wait
 from servod.daemon.status import ControllerStatus
-from servod.errors import AnswerIsNo
+from servod.errors import AnswerIsNo, BadInput
 from servod.gain_store import GainStore, StoredSet
-from servod.gains import require_fit
+from servod.gains import require_fit, require_same_loop
 
 log = logging.getLogger("servod.gains")
 
@@ -31,13 +31,23 @@ class GainBank:
     """The sets that ran since the daemon's start, by serial number."""
 
     def __init__(self, config: AxisConfig) -> None:
-        """Open the store and choose the first set: the one active last, or gains.initial. Raises BadInput."""
+        """Open the store and choose the first set: the one active last, or gains.initial. Raises BadInput.
+
+        A set that was designed for another cycle or velocity filter than the axis has now gives way to gains.initial.
+        """
         self._config = config
         self._store = GainStore(config.gains.directory)
         initial = self._store.load_file(config.gains.initial)
         active = self._store.active()
         if active is None:
             active = self._store.activate(initial.name, initial.version)
+        elif (why := _misfit(active, config)) is not None:
+            log.warning(
+                "%s; %s version %d (gains.initial) runs in its place. Set the configuration back and `servoctl gains "
+                "activate %s`, or make a set for this one: `servoctl synthesize`, `verify`, `deploy`",
+                *(why, initial.name, initial.version, active.name),
+            )
+            active = self._store.activate(initial.name, initial.version, f"in place of {active.name}: {why}")
         require_fit(active.gains, config)
         log.info("gain set %s version %d (%s)", active.name, active.version, active.gains.law.name)
         self._sets = {0: active}
@@ -120,6 +130,15 @@ class GainBank:
         self._last_serial, self._sets[serial] = serial, stored
         log.info("gain set %s version %d (%s) runs", stored.name, stored.version, stored.gains.law.name)
         return {}
+
+
+def _misfit(stored: StoredSet, config: AxisConfig) -> str | None:
+    """Why the set, whatever its certificate says, is for another loop than the axis has; None where it is for this."""
+    try:
+        require_same_loop(stored.gains, config)
+    except BadInput as error:
+        return str(error)
+    return None
 
 
 def _row(stored: StoredSet) -> dict[str, Any]:

@@ -7,12 +7,14 @@ from pathlib import Path
 import pytest
 import yaml
 
+from servod.axis_model import load_axis_model
 from servod.config import load_config
 from servod.controllers import LAWS, local
 from servod.daemon.gain_bank import GainBank
 from servod.errors import BadInput
-from servod.gain_design import Design
+from servod.gain_design import Design, DesignMode, Uncertainty
 from servod.gain_parameters import PdParameters
+from servod.gain_store import GainStore
 from servod.gains import GainSet, load_gains, parse_gains, require_certificate, require_fit
 from servod.shipped import shipped
 from tests.gains import good
@@ -185,3 +187,33 @@ def test_the_daemon_refuses_a_changed_set_although_it_accepts_sets_without_a_cer
     elsewhere = gains.model_copy(update={"directory": tmp_path / "new"})
     with pytest.raises(BadInput, match="changed after the set was sealed"):
         GainBank(config.model_copy(update={"gains": elsewhere}))
+
+
+def test_a_daemon_starts_with_the_initial_set_when_the_active_one_is_for_another_filter(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    config = load_config(shipped("gains/config/virtual.yaml"))
+    plain = parse_gains(good.PD, "good.yaml")
+    file = tmp_path / "bench_pd.yaml"
+    file.write_text(plain.to_yaml())
+    design = Design(
+        mode=DesignMode.DEPLOYED,
+        period_s=0.001,
+        velocity_cutoff_hz=config.encoder.velocity_cutoff_hz,
+        counts_per_turn=2.0**20,
+        speed_max_rad_s=0.5,
+        model=load_axis_model(shipped("gains/axes/table1_joint.yaml")),
+        uncertainty=Uncertainty(),
+    )
+    wanted = good.certified(plain.model_copy(update={"name": "designed", "design": design}).sealed())
+    gains = config.gains.model_copy(update={"directory": tmp_path / "store", "initial": file})
+    axis = config.model_copy(update={"gains": gains})
+    store = GainStore(gains.directory)
+    store.load(wanted.sealed().to_yaml(), "designed")
+    store.activate("designed")
+    assert GainBank(axis).newest.name == "designed"
+    encoder = config.encoder.model_copy(update={"velocity_cutoff_hz": 500.0})
+    assert GainBank(axis.model_copy(update={"encoder": encoder})).newest.name == "bench_pd"
+    assert "design.velocity_cutoff_hz" in caplog.text and "servoctl gains activate designed" in caplog.text
+    active, last = store.active(), store.history()[-1]
+    assert active is not None and active.name == "bench_pd" and "in place of designed" in last.note
