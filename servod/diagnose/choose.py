@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from servod.axis_model import AxisModel
 from servod.diagnose.base import base_unknowns, document_of
 from servod.diagnose.candidates import Candidate, Trials
+from servod.diagnose.excited import unseen
 from servod.diagnose.fit import Fit, Fitter, Weighing, long_run, scale_of
 from servod.diagnose.floor import noise_floor, stretch_means
 from servod.diagnose.hypothesis import Hypothesis
@@ -106,6 +107,7 @@ class Chooser:
         self.predictor, self.deadline, self.tell = predictor, deadline, tell
         self.nominal = nominal
         self.start = Hypothesis(document_of(nominal), base_unknowns(nominal))
+        self.unseen = unseen(predictor.traces, nominal.inertia)
         self.rows = predictor.counts.astype(np.float64)
         self.tried = 0
         self.base_error = 0.0
@@ -196,7 +198,7 @@ class Chooser:
         short = Fitter(quick, Weighing(whole.weighing.scale, quick.counts.astype(np.float64)))
         scene = Scene(self.start.document, self.predictor, present.mismatch, fine)
         trials = Trials(whole, short, present, scene, not present.hypothesis.terms, self.deadline)
-        candidates = trials.run(skip=_once(present.hypothesis) | skip)
+        candidates = trials.run(skip=_once(present.hypothesis) | skip | self.unseen)
         self.tried += trials.tried
         self.tell(f"{trials.tried} starts tried; best: " + ", ".join(c.effect for c in candidates[:3]))
         return candidates

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.axis_model import AxisKind, AxisModel
+from servod.diagnose.excited import creeps
 from servod.diagnose.innovation_kernel import innovate
 from servod.diagnose.parallel import released
 from servod.diagnose.trace import Trace
@@ -27,6 +28,9 @@ Array = NDArray[np.float64]
 
 #: Bandwidth of the observer, rad/s: what the noise allows within these bounds, and a share of the sampling rate.
 SLOWEST, FASTEST, SHARE_OF_SAMPLING = 25.0, 200.0, 0.1
+
+#: The share of the sampling rate where the axis creeps: a slower observer carries a model along that sticks and slips.
+SHARE_CREEPING = 0.35
 
 #: Share of dry friction that encoder noise may make of the mismatch; sets the bandwidth.
 WANTED_NOISE = 0.006
@@ -68,7 +72,8 @@ def bandwidth(inertia: float, dry: float, traces: Sequence[Trace]) -> float:
     period = max(trace.period_s for trace in traces)
     allowed = math.sqrt(WANTED_NOISE * dry / (inertia * noise)) if noise > 0.0 else FASTEST
     allowed *= math.sqrt(1.0 / math.sqrt(allowed * period))  # a slow observer averages over more rows
-    return min(max(allowed, SLOWEST), FASTEST, SHARE_OF_SAMPLING / period)
+    share = SHARE_CREEPING if creeps(traces, inertia) else SHARE_OF_SAMPLING
+    return min(max(allowed, SLOWEST), FASTEST, share / period)
 
 
 def observer(trace: Trace, inertia: float, rate: float) -> Observer:
