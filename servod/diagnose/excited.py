@@ -1,8 +1,8 @@
 """What recordings can tell at all: effects that only an axis in swift motion shows, or one that goes both ways.
 
 Stands between the traces and the selection. On an axis that creeps under a command spent on friction and cogging, what
-scales, limits or delays the command, or acts on the mass, shows next to nothing; a fit that may use it makes the command
-mean nothing and so explains everything.
+scales, limits or delays the command, or acts on the mass, shows next to nothing; a fit that may use it makes the
+command mean nothing and so explains everything.
 """
 
 from __future__ import annotations
