@@ -27,6 +27,9 @@ Tell = Callable[[str, float], None]
 
 #: The joint may be so many times the motion's travel away from the reference; at most this share of the limit.
 WINDOW_TRAVELS, WINDOW_SHARE = 3.0, 0.85
+#: A value that is limited in no more than this share of the sines' cycles says nothing against a set: one cycle in a
+#: reversal of coarse counts, or as long as an offset fades. What it does to the motion is in the figures.
+FEW_LIMITED = 0.002
 #: Faults that say that a value had to be limited.
 _CLIPS = sum(fault.bit for fault in FAULTS.values() if fault.reaction == Reaction.CLIP)
 
@@ -130,7 +133,7 @@ class _Trial:
             self._tell("change of the set", 0.48)
             self._on_trial = True
             link.attempt(name, version)
-        rows_after, after, reasons = self._after(before)
+        rows_after, after, reasons = self._after(rows_before, before)
         self._end(before, after, reasons)
         return Deployment(
             stays=not reasons,
@@ -152,7 +155,7 @@ class _Trial:
             with contextlib.suppress(ServodError):
                 self._link.give_up(why, {})
 
-    def _after(self, before: Figures) -> tuple[Rows | None, Figures | None, list[str]]:
+    def _after(self, rows_before: Rows, before: Figures) -> tuple[Rows | None, Figures | None, list[str]]:
         """The motion under the new set: cycles, figures, and what speaks against it."""
         try:
             rows = self._move("under the new set", 0.52)
@@ -162,7 +165,8 @@ class _Trial:
             after = self._figures(rows)
         except AnswerIsNo as error:
             return rows, None, [str(error)]
-        reasons = [*limits_met(motions_in(rows)[0]), *complaints(before, after, self._promised, self._count_rad)]
+        limited = limits_met(motions_in(rows)[0], motions_in(rows_before)[0])
+        reasons = [*limited, *complaints(before, after, self._promised, self._count_rad)]
         return rows, after, [*reasons, *(skipped(rows) if reasons else [])]
 
     def _end(self, before: Figures, after: Figures | None, reasons: list[str]) -> None:
@@ -199,10 +203,17 @@ def motions_in(rows: Rows) -> list[Rows]:
     return [rows[start:end] for start, end in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def limits_met(rows: Rows) -> list[str]:
-    """What had to be limited in these cycles, by the table of faults. A step may be limited, a sine may not."""
-    met = int(np.bitwise_or.reduce(rows["faults"])) & _CLIPS
-    return [f"{fault.code.name}: {fault.cause}" for fault in faults_in(met)]
+def limits_met(rows: Rows, before: Rows) -> list[str]:
+    """What had to be limited in these sines, by the table of faults; a step may be limited.
+
+    Not what few cycles met, and not what the set `before` met half as often: then the limit is too low for the motion.
+    """
+    found = []
+    for fault in faults_in(int(np.bitwise_or.reduce(rows["faults"])) & _CLIPS):
+        share, earlier = (float(np.mean((of["faults"] & fault.bit) != 0)) for of in (rows, before))
+        if share > max(FEW_LIMITED, 2.0 * earlier):
+            found.append(f"{fault.code.name} in {100.0 * share:.2g} % of the cycles: {fault.cause}")
+    return found
 
 
 def skipped(rows: Rows) -> list[str]:

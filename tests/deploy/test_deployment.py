@@ -10,11 +10,12 @@ import pytest
 from servod.axis import AxisState
 from servod.axis_model import AxisModel
 from servod.commands import Op
-from servod.deploy.deployment import deploy, motions_in
+from servod.deploy.deployment import deploy, limits_met, motions_in
 from servod.deploy.links import Rows, SteppedDeployLink, Tell, cut
 from servod.deploy.virtual import pd_set, virtual_link, with_cutoff
-from servod.errors import BadInput, FaultCode
+from servod.errors import FAULTS, BadInput, FaultCode
 from servod.gain_store import Action, GainStore
+from servod.recordings.rows import ROW
 from servod.verify.plants import scaled
 from servod.verify.validation import ValidationMotion, motion_for
 from tests.deploy.sets import certified
@@ -64,6 +65,18 @@ def test_a_limit_that_is_met_rolls_back(tmp_path: Path) -> None:
     link = virtual_link(table1(), tmp_path, certified(), PD, config=config)
     done = deploy(link, certified(), quiet)
     assert not done.stays and any(reason.startswith("TORQUE_CLIPPED") for reason in done.reasons)
+
+
+def test_few_limited_cycles_and_those_that_the_set_before_met_as_well_are_not_held_against_a_set() -> None:
+    def limited(cycles: int) -> Rows:
+        rows = np.zeros(10_000, dtype=ROW)
+        rows["faults"][:cycles] = FAULTS[FaultCode.TORQUE_CLIPPED].bit
+        return rows
+
+    assert limits_met(limited(15), limited(0)) == []
+    assert limits_met(limited(300), limited(200)) == []
+    (said,) = limits_met(limited(300), limited(100))
+    assert said.startswith("TORQUE_CLIPPED in 3 % of the cycles")
 
 
 def test_a_set_that_loses_the_joint_on_a_sine_is_given_no_step(tmp_path: Path) -> None:
