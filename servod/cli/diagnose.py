@@ -32,6 +32,8 @@ def diagnose(
     model: Annotated[Path, typer.Option(help="Axis model (YAML) that the recordings are compared with.")],
     out: Annotated[Path, typer.Option(help="Folder for diagnosis.json, model.yaml and report.html.")],
     map_file: Annotated[Path | None, typer.Option("--map", help="Renames and scales foreign columns (YAML).")] = None,
+    from_s: Annotated[float | None, typer.Option(help="First time of the RECs to use, s.")] = None,
+    to_s: Annotated[float | None, typer.Option(help="Time of the RECs to stop before, s.")] = None,
     time_limit: Annotated[float, typer.Option(help="Seconds after which the search ends with what it has.")] = 120.0,
     as_json: JsonOption = False,
 ) -> None:
@@ -44,7 +46,7 @@ def diagnose(
     from servod.diagnose.files import write_files
 
     axis = load_axis_model(model)
-    recorded = _load(recordings, map_file, axis, model)
+    recorded = [one.between(from_s, to_s) for one in _load(recordings, map_file, axis, model)]
     need_folder("--out", out)
     found = run(axis, recorded, time_limit, _quiet if as_json else _progress)
     document = write_files(out, found, model.name)

@@ -36,6 +36,8 @@ def replay(
     start: Annotated[
         str, typer.Option(help="First row: rest, recorded, or auto (at rest where it stands; just set off: free runs).")
     ] = "auto",
+    from_s: Annotated[float | None, typer.Option(help="First time of REC to use, s.")] = None,
+    to_s: Annotated[float | None, typer.Option(help="Time of REC to stop before, s.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Simulate MODEL under the torque of REC and report the open-loop position error."""
@@ -47,7 +49,7 @@ def replay(
     from servod.recordings import load_recording
 
     axis = load_axis_model(model)
-    recorded = load_recording(recording, map_file)
+    recorded = load_recording(recording, map_file).between(from_s, to_s)
     if recorded.axis is not axis.axis:
         raise BadInput(f"{model}: axis", axis.axis.value, f"{recorded.axis.value}, as the columns of {recording} say")
     result = simulate(axis, recorded.drive, horizon_s, start=first)

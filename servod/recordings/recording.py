@@ -5,7 +5,7 @@ Stands between the readers and everything that works on recordings: replay, iden
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -65,6 +65,22 @@ class Recording:
     def get(self, quantity: Quantity) -> Array | None:
         """A column, or None when the recording does not have it; optional columns may hold NaN."""
         return self.columns.get(quantity)
+
+    def between(self, from_s: float | None, to_s: float | None) -> Recording:
+        """The rows from `from_s` to before `to_s`, in the recording's own time (None: its start, its end).
+
+        Raises BadInput where fewer than LEAST_ROWS are left.
+        """
+        first = 0 if from_s is None else int(np.searchsorted(self.t_s, from_s))
+        last = len(self) if to_s is None else int(np.searchsorted(self.t_s, to_s))
+        if last - first < LEAST_ROWS:
+            found = f"{max(last - first, 0)} rows from {from_s} to {to_s} s"
+            raise BadInput(f"{self.path}: column t_s", found, f"{self.t_s[0]:g} to {self.t_s[-1]:g} s")
+        if last - first == len(self):
+            return self
+        columns = {quantity: values[first:last] for quantity, values in self.columns.items()}
+        told = f"rows from {self.t_s[first]:g} to {self.t_s[last - 1]:g} s used, as asked"
+        return replace(self, columns=columns, measured=self.measured[first:last], report=(*self.report, told))
 
     @cached_property
     def drive(self) -> Drive:

@@ -142,3 +142,13 @@ def test_a_missing_file_and_bad_maps_are_named(tmp_path: Path) -> None:
     ):
         with pytest.raises(BadInput, match=word):
             load_recording(path, written(tmp_path, text, "m.yaml"))
+
+
+def test_a_stretch_of_time_is_cut_out_and_told(tmp_path: Path) -> None:
+    recording = load_recording(written(tmp_path, rows()))
+    part = recording.between(float(T[5]), float(T[25]))
+    assert np.allclose(part.t_s, T[5:25]) and np.allclose(part.torque, U[5:25], rtol=1e-8)
+    assert len(part.measured) == 20 and "as asked" in part.report[-1]
+    assert recording.between(None, None) is recording
+    with pytest.raises(BadInput, match=r"r\.csv: column t_s: 0 rows from 1000"):
+        recording.between(1000.0, None)
