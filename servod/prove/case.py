@@ -29,8 +29,10 @@ TORQUE_NOISE, ENCODER_NOISE, THERMOMETER_NOISE_C = 0.01, 0.3, 0.02
 #: An effect is seen when the command differs by this share of Coulomb friction in 2 % of the time; tries to get there.
 SEEN, TRIES = 0.08, 8
 
-#: A loop is sane while its error is below this share of the travel and its command at the limit for less than this.
-SANE_ERROR, SANE_LIMITED = 0.35, 0.15
+#: A loop is sane while its error is below this share of the travel, its command at the limit for less than this share
+#: of the time, its effort below this multiple of what it is without the effect, and all but 2 % of what the effect
+#: changes below this share of the command's limit.
+SANE_ERROR, SANE_LIMITED, SANE_EFFORT, SANE_CHANGE = 0.3, 0.15, 2.5, 0.6
 
 #: Cover.NOISE: least factor on noise, factor on strength. Cover.ABSORBED: by how much the model's friction went along.
 BELOW_NOISE, FAINT, TAKEN_UP = 3.0, 0.6, 0.08
@@ -64,9 +66,10 @@ def make_case(plan: Plan, settings: Settings) -> Case:
     axis = draw_axis(rng, plan.kind, plan.weight)
     loop = axis.loop if plan.cover is Cover.INTEGRATOR else axis.loop._replace(ki=0.0)
     axis = replace(axis, loop=loop)
-    hidden, seen = [], []
+    hidden: list[Concealed] = []
+    seen = []
     for name in plan.effects:
-        concealed, size = draw_seen(name, axis, plan, rng)
+        concealed, size = draw_seen(name, axis, hidden, plan, rng)
         axis = axis.with_travel(concealed.travel)
         hidden.append(concealed)
         seen.append(size)
@@ -85,25 +88,27 @@ def make_case(plan: Plan, settings: Settings) -> Case:
     return Case(believed_model(believed, off), record(axis, plant, trial, hidden, rng), truth)
 
 
-def draw_seen(name: str, axis: Axis, plan: Plan, rng: np.random.Generator) -> tuple[Concealed, float]:
-    """A drawing of an effect that shows and leaves the loop stable, and how much of the command it changes."""
+def draw_seen(
+    name: str, axis: Axis, others: Sequence[Concealed], plan: Plan, rng: np.random.Generator
+) -> tuple[Concealed, float]:
+    """A drawing of an effect that shows beside others and leaves the loop stable; by how much the command differs."""
     seed = int(rng.integers(2**31))
     strength = FAINT if plan.cover in (Cover.NOISE, Cover.BAND) else 1.0
     enough = SEEN * (FAINT if plan.cover in (Cover.NOISE, Cover.BAND) else 1.0)
     hide = (UNLISTED if plan.sort is Sort.UNKNOWN else HIDE)[name]
     for _ in range(TRIES):
         concealed = hide(Draw(axis, np.random.default_rng(seed), strength, plan.other))
-        size, sane = shows(axis.with_travel(concealed.travel), concealed, seed)
+        size, sane = shows(axis.with_travel(concealed.travel), others, concealed, seed)
         if sane and size >= enough:
             break
         strength *= 1.45 if sane else 0.7
     return concealed, size
 
 
-def shows(axis: Axis, concealed: Concealed, seed: int) -> tuple[float, bool]:
+def shows(axis: Axis, others: Sequence[Concealed], concealed: Concealed, seed: int) -> tuple[float, bool]:
     """By how much of Coulomb friction the command differs in 2 % of the time, and whether the loop remains sane."""
-    changed = _all_changes(axis.physics, [concealed])
-    plain = axis.physics._replace(**concealed.believed)
+    changed = _all_changes(axis.physics, [*others, concealed])
+    plain = _all_changes(axis.physics, others)._replace(**concealed.believed)
     largest, sane = 0.0, True
     for reference in (axis.motions.slow_sine, axis.motions.multisine, axis.motions.moves):
         wanted = reference(np.random.default_rng(seed), 12.0)
@@ -111,8 +116,9 @@ def shows(axis: Axis, concealed: Concealed, seed: int) -> tuple[float, bool]:
         largest = max(largest, float(np.quantile(np.abs(there[:, 0] - without[:, 0]), 0.98)))
         error = float(np.std(there[:, 1] - wanted)) / axis.motions.travel
         limited = float(np.mean(np.abs(there[:, 0]) >= 0.999 * axis.loop.limit))
-        sane = sane and error < SANE_ERROR and limited < SANE_LIMITED
-    return largest / axis.physics.coulomb, sane
+        wilder = float(np.std(there[:, 0]) / np.std(without[:, 0]))
+        sane = sane and error < SANE_ERROR and limited < SANE_LIMITED and wilder < SANE_EFFORT
+    return largest / axis.physics.coulomb, sane and largest < SANE_CHANGE * axis.loop.limit
 
 
 def _followed(axis: Axis, physics: Physics, wanted: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Runs `servoctl diagnose` on every case folder, as a user would: a process each, that is given this folder alone.
+"""Runs `servoctl diagnose` on every case folder, as a user would: a process each, in a copy of this folder alone.
 
 The second of the three processes. What is done is not done again, so that an interrupted trial goes on where it was.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -15,6 +16,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from threading import Lock
 
 from servod.prove.conceal import CASES
@@ -71,16 +73,19 @@ class Examiner:
             crew.shutdown(cancel_futures=True)
 
     def _examine(self, name: str) -> None:
-        folder, answers = self._out / CASES / name, self._out / ANSWERS / name
+        """Diagnose a copy of a case in a folder where there is nothing else, then fetch the answer."""
+        answers = self._out / ANSWERS / name
         answers.mkdir(parents=True, exist_ok=True)
-        recordings = sorted(str(path.resolve()) for path in folder.glob("*.csv.gz"))
-        limit = f"{self._time_limit_s:g}"
-        model = ["--model", str((folder / MODEL).resolve())]
-        arguments = ["diagnose", *model, *recordings, "--out", str(answers.resolve()), "--time-limit", limit]
-        with (answers / SAID).open("wb") as said:
-            run = self._spend([sys.executable, "-m", "servod.cli", *arguments], answers, said.fileno())
-        if run is not None:
-            write_bytes(answers / RUN, (json.dumps(asdict(run)) + "\n").encode())
+        with TemporaryDirectory(prefix="servod-case-") as alone, (answers / SAID).open("wb") as said:
+            case, answer = Path(alone) / "case", Path(alone) / "answer"
+            shutil.copytree(self._out / CASES / name, case)
+            recordings = sorted(str(path) for path in case.glob("*.csv.gz"))
+            arguments = ["diagnose", "--model", str(case / MODEL), *recordings, "--out", str(answer)]
+            limit = f"--time-limit={self._time_limit_s:g}"
+            run = self._spend([sys.executable, "-m", "servod.cli", *arguments, limit], case, said.fileno())
+            if run is not None:
+                shutil.copytree(answer, answers, dirs_exist_ok=True)
+                write_bytes(answers / RUN, (json.dumps(asdict(run)) + "\n").encode())
 
     def _spend(self, command: Sequence[str], where: Path, said: int) -> Run | None:
         """Run a command to its end; None when we were told to stop meanwhile."""
