@@ -150,5 +150,5 @@ def test_a_stretch_of_time_is_cut_out_and_told(tmp_path: Path) -> None:
     assert np.allclose(part.t_s, T[5:25]) and np.allclose(part.torque, U[5:25], rtol=1e-8)
     assert len(part.measured) == 20 and "as asked" in part.report[-1]
     assert recording.between(None, None) is recording
-    with pytest.raises(BadInput, match=r"r\.csv: column t_s: 0 rows from 1000"):
+    with pytest.raises(BadInput, match=r"r\.csv: column t_s: found 0 rows from 1000"):
         recording.between(1000.0, None)
