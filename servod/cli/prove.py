@@ -6,6 +6,7 @@ folders, the third opens the seal.
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 from enum import StrEnum
@@ -112,6 +113,7 @@ def _diagnose(out: Path, jobs: int, time_limit: float) -> None:
     from servod.prove.examine import Examiner
 
     _sealed(out)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # what runs ends with us, whoever ends us
     Examiner(out, time_limit).run(jobs, _line)
 
 

@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from servod.prove.case import make_case
 from servod.prove.conceal import CASES, write_case
@@ -43,7 +44,8 @@ def test_what_is_done_is_not_done_again(tmp_path: Path) -> None:
     assert "These data cannot tell" in (tmp_path / ANSWERS / "c001" / SAID).read_text()
 
 
-def test_an_interrupt_ends_what_runs_and_keeps_nothing_half_done(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_ends_what_runs_and_keeps_nothing_half_done(tmp_path: Path, number: signal.Signals) -> None:
     case = make_case(plans(5, 1, Settings())[0], Settings())
     write_case(case, tmp_path / CASES / "c000", tmp_path / "held")
     write_trial(tmp_path, Trial(1, 1, False, "0" * 64))
@@ -56,7 +58,7 @@ def test_an_interrupt_ends_what_runs_and_keeps_nothing_half_done(tmp_path: Path)
     children = Path(f"/proc/{trial.pid}/task").glob("*/children")
     running = [int(pid) for file in children for pid in file.read_text().split()]
     assert len(running) == 1
-    os.kill(trial.pid, signal.SIGINT)
+    os.kill(trial.pid, number)
     _, error = trial.communicate(timeout=30)
     assert trial.returncode == 130, error
     assert not (tmp_path / ANSWERS / "c000" / RUN).exists()
