@@ -146,10 +146,10 @@ def cannot_tell(trace: Trace, model: AxisModel) -> str | None:
     """Why this recording cannot tell anything about this model; None when it can."""
     return (
         _too_short(trace)
+        or implausible(trace, model)
         or _too_noisy(trace, model)
         or _too_still(trace)
         or _saturated(trace)
-        or implausible(trace, model)
     )
 
 

@@ -70,3 +70,48 @@ def test_nothing_that_can_tell_is_said_so(made: Recording) -> None:
     found = diagnose(believed(), [recording(made.t_s[:900], made.torque[:900], made.position[:900])])
     assert found.verdict is Verdict.CANNOT_TELL
     assert found.evidence is None
+
+
+def test_command_that_never_changes(made: Recording) -> None:
+    assert "never changes" in refused_for(recording(made.t_s, np.full(len(made), 0.1), made.position))
+
+
+def test_position_in_degrees_or_counts(made: Recording) -> None:
+    assert "degrees" in refused_for(recording(made.t_s, made.torque, np.degrees(made.position)))
+    counts = np.round(made.position / (2.0 * np.pi) * 2.0**20)
+    assert "counts" in refused_for(recording(made.t_s, made.torque, counts))
+
+
+def test_physics_that_is_missing_is_no_wrong_unit() -> None:
+    """A weight ten times the friction, a torque constant off by a half, a third of the inertia: all are taken in."""
+    heavy = believed(gravity={"amplitude": 1.2, "phase": 0.3})
+    weak, light = believed(torque_gain={"factor": 0.5}), believed(inertia=0.007)
+    for true in (heavy, weak, light):
+        assert taken_in(record(true)[1:2], believed())[1] == []
+
+
+def test_several_rows_of_telemetry_that_lies(made: Recording) -> None:
+    torque = made.torque.copy()
+    torque[1500:1502] = torque[3000] = 65535.0
+    traces, refused = taken_in([recording(made.t_s, torque, made.position)], believed())
+    assert refused == []
+    assert traces[0].notes == ("command: 3 glitches, the first in row 1501, replaced",)
+    assert np.max(np.abs(traces[0].drive.torque - made.torque)) < 0.5 * np.ptp(made.torque)
+
+
+@pytest.mark.parametrize("every", [2, 5])
+def test_slow_and_uneven_sampling_is_taken(made: Recording, every: int) -> None:
+    """200 and 500 Hz, stamps that jitter, and a hole in the middle."""
+    rows = np.arange(0, len(made), every)
+    rows = rows[(rows < 2000) | (rows > 2300)]
+    jitter = np.random.default_rng(1).uniform(-2e-4, 2e-4, len(rows))
+    traces, refused = taken_in([recording(made.t_s[rows] + jitter, made.torque[rows], made.position[rows])], believed())
+    assert refused == []
+    assert len(traces[0].starts) == 2
+
+
+def test_long_list_of_unused_columns_is_cut(made: Recording) -> None:
+    names = ", ".join(f"column{i}" for i in range(30))
+    told = Recording(made.path, made.axis, made.columns, made.measured, (f"columns not used: {names}",))
+    note = taken_in([told], believed())[0][0].notes[0]
+    assert note.endswith("column5 and 24 more")
