@@ -17,16 +17,20 @@ Far from its goal, as in a step, the joint is approached with a bounded speed: t
 At rest: within the hold width neither l nor the observer acts, so nothing hunts. Driven by the measured velocity z_hat
 creeps with its noise, and the leak floor lets it fade; driven by the reference it stays as it is, for letting it fade
 would only move the joint, by F/(c0 + k_x).
+Longer at rest the joint stands on its bristle, far stiffer than any feedback, and feedback and observer would only move
+it with the encoder's noise: a stated share of them is left, which stops creep, and all of it is back within
+milliseconds when the error grows beyond what the encoder may show of a joint that stands, or the reference moves.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import MutableSequence, Sequence
 
 from servod.controllers.exact import decayed, limited
 from servod.controllers.observer import observe, remember
 from servod.controllers.position import position_torque
-from servod.controllers.state import ASKED, COMMAND_1, COMMAND_2, COMMAND_3, DISTURBANCE, FRICTION_STATE
+from servod.controllers.state import ASKED, COMMAND_1, COMMAND_2, COMMAND_3, DISTURBANCE, FRICTION_STATE, REST
 from servod.controllers.weights import blended
 from servod.controllers.windup import winds_up
 
@@ -50,17 +54,31 @@ OBSERVER_LIMIT = 20  # bound of |d_hat| [N*m]
 LOW_K_U, HIGH_K_U = 21, 24  # gains of the last three commands u* in Omega_L and Omega_H
 OBSERVER_LOW = 27  # g in Omega_L [rad/s]: on its bristle the joint moves so little that the estimate would take seconds
 ERROR_LIMIT = 28  # the feedback sees no more error than this, which bounds the speed of a step [rad], 0: none
-N_SETS = 29  # number n of local sets
-FIRST_NODE = 30  # then n nodes v_i [rad/s], n decays a_i [1/s], n gains l_i; then `position`, or nothing
+REST_WITHIN = 29  # error within which a joint under a resting reference counts as at rest [rad], 0: never
+REST_SHARE = 30  # of feedback and observer that is left at rest
+N_SETS = 31  # number n of local sets
+FIRST_NODE = 32  # then n nodes v_i [rad/s], n decays a_i [1/s], n gains l_i; then `position`, or nothing
 
 MEASURED = 0.0
 REFERENCE = 1.0
+REST_TO_S, REST_FROM_S = 0.02, 0.004  # time constants with which a joint comes to count as at rest, and ceases to
 COMMANDS = 3  # past commands that may be fed back: those of two cycles of delay, and one that the velocity lags behind
 
 
 def remembered(p: Sequence[float], s: Sequence[float], first: int) -> float:
     """Sum of k_u(i)*u*(k-i) with the gains from p[first] on."""
     return p[first] * s[COMMAND_1] + p[first + 1] * s[COMMAND_2] + p[first + 2] * s[COMMAND_3]
+
+
+def awake(p: Sequence[float], s: MutableSequence[float], stands: bool, error: float, dt: float) -> float:
+    """Share of feedback and observer that acts: 1, and going towards REST_SHARE while the joint is at rest."""
+    if not stands or p[REST_WITHIN] == 0.0:
+        s[REST] = 0.0
+    elif abs(error) <= p[REST_WITHIN]:
+        s[REST] = 1.0 + (s[REST] - 1.0) * math.exp(-dt / REST_TO_S)
+    else:
+        s[REST] *= math.exp(-dt / REST_FROM_S)
+    return 1.0 - s[REST] * (1.0 - p[REST_SHARE])
 
 
 def high_share(p: Sequence[float], speed: float) -> float:
@@ -101,9 +119,11 @@ def step(
     s[COMMAND_1] -= (s[ASKED] - u_applied) / p[INPUT_SCALE]  # what the limits cut never acts
     share = high_share(p, max(abs(w), abs(v)))
     seen = limited(error, p[ERROR_LIMIT]) if p[ERROR_LIMIT] > 0.0 else error
-    u_star = scheduled(p, s, share, seen, v_ref - v)
+    stands = v_ref == 0.0 and a_ref == 0.0
+    acts = awake(p, s, stands, error, dt)
+    u_star = acts * scheduled(p, s, share, seen, v_ref - v)
     s[COMMAND_3], s[COMMAND_2], s[COMMAND_1] = s[COMMAND_2], s[COMMAND_1], u_star
-    moves = not (v_ref == 0.0 and a_ref == 0.0 and abs(error) <= p[HOLD_WITHIN])
+    moves = not (stands and abs(error) <= p[HOLD_WITHIN])
     n = int(p[N_SETS])
     decay, gain = blended(p, FIRST_NODE, n, p[SHAPE], w)
     drive = w
@@ -118,7 +138,7 @@ def step(
     if p[OBSERVER_BANDWIDTH] > 0.0:
         if moves:
             bandwidth = p[OBSERVER_LOW] + share * (p[OBSERVER_BANDWIDTH] - p[OBSERVER_LOW])
-            observe(s, bandwidth, p[OBSERVER_INERTIA], p[OBSERVER_LIMIT], v, u_applied, dt)
+            observe(s, acts * bandwidth, p[OBSERVER_INERTIA], p[OBSERVER_LIMIT], v, u_applied, dt)
         remember(s, v, friction + known, u_applied)
         other += s[DISTURBANCE]
     feedback = p[INPUT_SCALE] * u_star

@@ -5,7 +5,7 @@ Stands under the laws. A law's state is a list of `N_STATES` floats (a float64 a
 
 from __future__ import annotations
 
-N_STATES = 10
+N_STATES = 11
 
 FRICTION_STATE = 0  # z_hat, estimated bristle deflection [rad]; 0.0 where the law has none
 DISTURBANCE = 1  # d_hat, estimated disturbance [N*m]; 0.0 where the law has none
@@ -17,3 +17,4 @@ STARTED = 6  # 0.0 before the first step
 COMMAND_1 = 7  # feedback u* of the last step, as the limits let it through
 COMMAND_2 = 8  # of the step before
 COMMAND_3 = 9
+REST = 10  # 0 moving to 1 at rest: how long the joint has been where it shall be
