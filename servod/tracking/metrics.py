@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -66,14 +67,18 @@ class Curves:
 class StepResponse:
     """One step and its hold. `settling_s` is None when the error does not come to stay within the band.
 
-    `overshoot` is a share of the step, `steady_error_mrad` the mean error at the end of the hold, without sign,
-    `hold_mrad` peak to peak of the position from HOLD_FROM_S on.
+    `overshoot` is a share of the step, `steady_error_mrad` the mean error at the end of the hold, without sign.
+    `hold_mrad` is peak to peak of the position from HOLD_FROM_S on: of the joint itself in a virtual world, and on any
+    other axis, as `hold_encoder_mrad`, of what the encoder shows. In that is the encoder's noise: `hold_noise_mrad` is
+    what readings that scatter as these do from cycle to cycle show of a joint that stands.
     """
 
     settling_s: float | None
     overshoot: float
     steady_error_mrad: float
     hold_mrad: float
+    hold_encoder_mrad: float
+    hold_noise_mrad: float
     limit_cycle: bool
 
     def document(self) -> dict[str, Any]:
@@ -113,17 +118,27 @@ class Tracking:
         }
 
 
-def tracking(followed: Curves, steps: Mapping[float, Curves], count_rad: float) -> Tracking:
+def tracking(
+    followed: Curves,
+    steps: Mapping[float, Curves],
+    count_rad: float,
+    true_swings_rad: Mapping[float, float] | None = None,
+) -> Tracking:
     """Judge one run of (19) and of the steps (by their size in mrad), all relative to where they began.
 
-    `count_rad` is the encoder's resolution (0: none).
+    `count_rad` is the encoder's resolution (0: none); `true_swings_rad` is how far the joint itself moved in each hold,
+    where a world knows that.
     """
+    swings_rad = true_swings_rad or {}
     error = score(followed.time_s, followed.error_mrad)
     return Tracking(
         rms_error_mrad=error.rms_error_mrad,
         max_error_mrad=error.max_error_mrad,
         roughness_nm=roughness(followed.time_s, followed.torque_nm),
-        steps={size: step_response(c.time_s, c.position_rad, size * 1e-3, count_rad) for size, c in steps.items()},
+        steps={
+            size: step_response(c.time_s, c.position_rad, size * 1e-3, count_rad, swings_rad.get(size))
+            for size, c in steps.items()
+        },
         curves={"paper": followed} | {curve_key(size): c for size, c in steps.items()},
     )
 
@@ -146,23 +161,37 @@ def roughness(time_s: Array, torque_nm: Array) -> float:
     return float(np.sqrt(np.mean(np.diff(torque_nm[time_s >= SETTLE_S]) ** 2)))
 
 
-def step_response(time_s: Array, position_rad: Array, step_rad: float, count_rad: float) -> StepResponse:
+def step_response(
+    time_s: Array, position_rad: Array, step_rad: float, count_rad: float, true_swing_rad: float | None = None
+) -> StepResponse:
     """Judge a step that is asked for at time 0; positions count from the place that was held before.
 
-    `count_rad` is the encoder's resolution (0: none). Raises AnswerIsNo when the hold is shorter than HOLD_FROM_S.
+    `count_rad` is the encoder's resolution (0: none), `true_swing_rad` how far the joint itself moved in the hold,
+    where that is known. Raises AnswerIsNo when the hold is shorter than HOLD_FROM_S.
     """
     held = position_rad[time_s >= HOLD_FROM_S]
     if held.size == 0:
         raise AnswerIsNo(f"the step was held for less than {HOLD_FROM_S:.0f} s")
-    error = step_rad - position_rad
+    error, swing_rad = step_rad - position_rad, float(np.ptp(held))
     beyond = np.max(-error * np.sign(step_rad))
     return StepResponse(
         settling_s=settling(time_s, error, max(BAND_SHARE * abs(step_rad), BAND_COUNTS * count_rad)),
         overshoot=max(0.0, float(beyond) / abs(step_rad)),
         steady_error_mrad=abs(float(np.mean(error[time_s >= time_s[-1] - STEADY_S]))) * 1e3,
-        hold_mrad=float(np.ptp(held)) * 1e3,
+        hold_mrad=1e3 * (swing_rad if true_swing_rad is None else true_swing_rad),
+        hold_encoder_mrad=1e3 * swing_rad,
+        hold_noise_mrad=1e3 * noise_swing(held),
         limit_cycle=oscillates(held, float(time_s[1] - time_s[0]), max(count_rad, LEAST_COUNT_RAD)),
     )
+
+
+def noise_swing(held_rad: Array) -> float:
+    """Peak to peak of white noise that changes from cycle to cycle as `held_rad` does [rad].
+
+    The largest of n normal values lies where one of 2*n is expected beyond.
+    """
+    sigma = float(np.sqrt(np.mean(np.diff(held_rad) ** 2) / 2.0))
+    return 2.0 * sigma * NormalDist().inv_cdf(1.0 - 0.5 / len(held_rad))
 
 
 def settling(time_s: Array, error: Array, band: float) -> float | None:

@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from servod.axis_model import AxisModel
 from servod.gains import GainSet
 from servod.models.noise import noise_series
 from servod.models.simulate import ClosedLoopRun, LoopSettings, simulate_closed_loop
-from servod.tracking.metrics import Array, Curves, Tracking, tracking
+from servod.tracking.metrics import HOLD_FROM_S, Array, Curves, Tracking, tracking
 from servod.tracking.motions import HOLD_S, PAPER_S, STEPS_MRAD, paper_rows, step_rows
 
 
@@ -31,11 +33,13 @@ def measure(
     """
     settings = LoopSettings(period_s, counts_per_turn, cutoff_hz, torque_limit_nm)
     followed = run(model, gains, paper_rows(period_s, PAPER_S), settings, seed)
-    steps = {
-        size: curves_of(run(model, gains, step_rows(period_s, size, HOLD_S), settings, seed + 1 + i))
+    runs = {
+        size: run(model, gains, step_rows(period_s, size, HOLD_S), settings, seed + 1 + i)
         for i, size in enumerate(STEPS_MRAD)
     }
-    return tracking(curves_of(followed), steps, settings.resolution_rad)
+    swings = {size: float(np.ptp(r.position_rad[r.t_s >= HOLD_FROM_S])) for size, r in runs.items()}
+    steps = {size: curves_of(r) for size, r in runs.items()}
+    return tracking(curves_of(followed), steps, settings.resolution_rad, swings)
 
 
 def run(model: AxisModel, gains: GainSet, rows: Array, settings: LoopSettings, seed: int) -> ClosedLoopRun:

@@ -16,13 +16,13 @@ from servod.errors import AnswerIsNo
 from servod.gains import GainSet
 from servod.recordings.rows import ROW
 from servod.session import SteppedSession
-from servod.tracking.metrics import Curves, Tracking, tracking
+from servod.tracking.metrics import HOLD_FROM_S, Curves, Tracking, tracking
 from servod.tracking.motions import HOLD_S, PAPER_S, REST_S, STEPS_MRAD
 
 #: Told how much of a measurement is done, from 0 to 1.
 Tell = Callable[[float], None]
 
-_SLICE_S = 0.5
+_SLICE_S, _LOOK_S = 0.5, 0.005
 
 
 def measure(open_session: Callable[[], SteppedSession], gains: GainSet, tell: Tell | None = None) -> Tracking:
@@ -35,15 +35,35 @@ def measure(open_session: Callable[[], SteppedSession], gains: GainSet, tell: Te
     whole_s = PAPER_S + HOLD_S * len(STEPS_MRAD)
     done_s = 0.0
 
-    def move(kind: ReferenceKind, arguments: Sequence[float], duration_s: float) -> Curves:
+    def move(kind: ReferenceKind, arguments: Sequence[float], duration_s: float, swing: Swing | None = None) -> Curves:
         nonlocal done_s
         before_s, done_s = done_s, done_s + duration_s
         watch = None if tell is None else lambda seconds: tell((before_s + min(seconds, duration_s)) / whole_s)
-        return run_motion(session, kind, arguments, watch, gains.name)
+        return run_motion(session, kind, arguments, watch, gains.name, swing)
 
     followed = move(ReferenceKind.PAPER, [PAPER_S], PAPER_S)
-    steps = {size: move(ReferenceKind.STEP, [size * 1e-3, HOLD_S], HOLD_S) for size in STEPS_MRAD}
-    return tracking(followed, steps, 2.0 * math.pi / session.config.encoder.counts_per_turn)
+    swings = {size: Swing() for size in STEPS_MRAD}
+    steps = {size: move(ReferenceKind.STEP, [size * 1e-3, HOLD_S], HOLD_S, swings[size]) for size in STEPS_MRAD}
+    widths_rad = {size: swing.width_rad for size, swing in swings.items()}
+    return tracking(followed, steps, 2.0 * math.pi / session.config.encoder.counts_per_turn, widths_rad)
+
+
+class Swing:
+    """How far the joint itself moves while a step is held, from HOLD_FROM_S on: what no encoder can tell from noise."""
+
+    def __init__(self) -> None:
+        self._lowest, self._highest = math.inf, -math.inf
+
+    @property
+    def width_rad(self) -> float:
+        """Peak to peak; before HOLD_FROM_S below zero."""
+        return self._highest - self._lowest
+
+    def look(self, session: SteppedSession, passed_s: float) -> None:
+        """Take the joint's position at `passed_s` after the motion began."""
+        if passed_s >= HOLD_FROM_S and session.cycle.reference.active:
+            x = session.world.truth().position_rad
+            self._lowest, self._highest = min(self._lowest, x), max(self._highest, x)
 
 
 def activate(session: SteppedSession, gains: GainSet) -> None:
@@ -61,15 +81,16 @@ def run_motion(
     arguments: Sequence[float],
     tell: Tell | None = None,
     name: str = "the gain set",
+    swing: Swing | None = None,
 ) -> Curves:
-    """One motion from its first cycle to its last; `tell` gets the seconds that have passed.
+    """One motion from its first cycle to its last; `tell` gets the seconds that have passed, `swing` looks on.
 
     Raises AnswerIsNo when it is refused or the axis drops out; `name` says under what.
     """
     start_rad = session.cycle.reference.position_rad
     session.clear()
     begin(session, kind, arguments)
-    follow(session, tell, name)
+    follow(session, tell, name, swing)
     return curves_of(session.raw, start_rad)
 
 
@@ -78,19 +99,31 @@ def begin(session: SteppedSession, kind: ReferenceKind, arguments: Sequence[floa
     _must(session.send(Op.REFERENCE, [kind, *arguments]))
 
 
-def follow(session: SteppedSession, tell: Tell | None = None, name: str = "the gain set") -> None:
-    """Run until the motion is over; `tell` gets the seconds that have passed.
+def follow(
+    session: SteppedSession, tell: Tell | None = None, name: str = "the gain set", swing: Swing | None = None
+) -> None:
+    """Run until the motion is over; `tell` gets the seconds that have passed, `swing` looks on.
 
     Raises AnswerIsNo when the axis drops out; `name` says under what.
     """
     passed_s = 0.0
     while session.cycle.reference.active:
-        session.run(_SLICE_S)
+        _pass(session, passed_s, swing)
         passed_s += _SLICE_S
         if tell:
             tell(passed_s)
     if session.cycle.axis.state != AxisState.ENABLED:
         raise AnswerIsNo(f"the axis went to {session.cycle.axis.state.name} under {name}. {session.why}")
+
+
+def _pass(session: SteppedSession, passed_s: float, swing: Swing | None) -> None:
+    """One slice of time, with a look at the joint every _LOOK_S."""
+    if swing is None:
+        session.run(_SLICE_S)
+        return
+    for look in range(1, round(_SLICE_S / _LOOK_S) + 1):
+        session.run(_LOOK_S)
+        swing.look(session, passed_s + look * _LOOK_S)
 
 
 def curves_of(raw: bytes, start_rad: float) -> Curves:

@@ -130,6 +130,19 @@ def test_the_document_has_steps_by_their_size_in_mrad() -> None:
     document = run.document()
     assert document["rms_error_mrad"] == pytest.approx(1.0)
     assert list(document["steps"]) == ["100", "10"]
-    assert set(document["steps"]["10"]) == {"settling_s", "overshoot", "steady_error_mrad", "hold_mrad", "limit_cycle"}
+    figures = {"settling_s", "overshoot", "steady_error_mrad", "limit_cycle"}
+    assert set(document["steps"]["10"]) == figures | {"hold_mrad", "hold_encoder_mrad", "hold_noise_mrad"}
     assert set(run.curves) == {"paper", "step_100", "step_10"}
     assert isinstance(run, Tracking)
+
+
+def test_a_hold_is_judged_by_the_joint_where_it_is_known_and_beside_its_encoder_by_what_noise_shows() -> None:
+    t, random = hold(), np.random.default_rng(1)
+    position = np.round((0.01 + random.normal(0.0, 4e-6, len(t))) / COUNT_RAD) * COUNT_RAD
+    told = step_response(t, position, 0.01, COUNT_RAD, true_swing_rad=5e-6)
+    alone = step_response(t, position, 0.01, COUNT_RAD)
+    assert told.hold_mrad == pytest.approx(0.005)
+    assert alone.hold_mrad == alone.hold_encoder_mrad == told.hold_encoder_mrad
+    assert alone.hold_encoder_mrad == pytest.approx(alone.hold_noise_mrad, rel=0.25)
+    moved = step_response(t, position + 3e-5 * np.sin(0.5 * t), 0.01, COUNT_RAD)
+    assert moved.hold_encoder_mrad > 1.8 * moved.hold_noise_mrad

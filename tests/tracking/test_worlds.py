@@ -65,6 +65,7 @@ def test_a_whole_measurement_has_trajectory_steps_and_curves(
         assert abs(curves.position_rad[0]) < 5e-4  # each step counts from where the last is held
         assert response.settling_s is not None and response.settling_s < 0.5
         assert response.steady_error_mrad < 0.3
+        assert 0.0 < response.hold_mrad < response.hold_encoder_mrad
     parts = found.curves["paper"]
     whole = parts.feedback_nm + parts.friction_nm + parts.other_nm
     assert whole == pytest.approx(parts.torque_nm, abs=1e-9)
