@@ -13,7 +13,8 @@ from servod.controllers.state import N_STATES
 from servod.gain_design import Design, RegionProof, Vertex
 from servod.gain_parameters import LocalParameters, OutputObserver, RegionGains, VelocitySource
 from servod.report.figure import Array
-from servod.verify.closed_loop import Bristle, Deviation, JointPoint, LawSlopes, joint_point, law_slopes, loops
+from servod.verify.closed_loop import Bristle, Deviation, JointPoint, joint_point, loops
+from servod.verify.law_slopes import LawSlopes, law_slopes
 from servod.verify.proof import closed
 from servod.verify.sampled import timing_of
 from servod.verify.steady_friction import steady_friction

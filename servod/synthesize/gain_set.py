@@ -6,14 +6,11 @@ verification uses.
 
 from __future__ import annotations
 
-import bisect
 import math
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 from servod.axis_model import AxisModel
-from servod.controllers import LAWS
 from servod.gain_design import Design
 from servod.gain_parameters import (
     LocalFriction,
@@ -25,30 +22,24 @@ from servod.gain_parameters import (
     WeightShape,
 )
 from servod.gains import GainSet
+from servod.models.noise import noise_of
 from servod.synthesize.deployed import Infeasible, Wishes, explain, region_gains, regions
 from servod.synthesize.feedforward import position_feedforward
 from servod.synthesize.integral_gain import designed
 from servod.synthesize.local_sets import PAPER_NODES, STIFFNESS_SHARE, compensator, local_sets, sets_at
+from servod.synthesize.observer_width import OBSERVERS_RAD_S, with_observer, with_widest_observer
 from servod.synthesize.origin import provenance
-from servod.verify.checks import CORNER_DISK, CORNER_SPEEDS, DISK_LIMIT, speeds_of
-from servod.verify.closed_loop import late_corners
-from servod.verify.effect_checks import late_effects
-from servod.verify.margins import Sweep
-from servod.verify.sampled import timing_of
 from servod.verify.steady_friction import SteadyFriction, steady_friction
 
-#: Bandwidths of the output observer, best first: the largest is taken with which every corner of the intervals stands
-#: with CORNER_WANTED, and the axis as modelled with the wanted disk margin, or else with the one of the certificate.
-OBSERVERS_RAD_S = (80.0, 60.0, 45.0, 34.0, 25.0, 18.0, 12.0, 7.0)
-DISK_WANTED, CORNER_WANTED = 0.15, 1.25 * CORNER_DISK
-FEW_SPEEDS = 12  # per direction, at which a bandwidth is looked for; what is found is judged as the certificate does
-STABLE = 0.9999  # largest pole: the certificate looks between the corners and between these speeds as well
-LOW_FACTOR = 3.0  # bandwidth in Omega_L over that in Omega_H: on its bristle a joint then rests in half a second
-#: From this bandwidth on no other choice of filter and poles is tried.
+#: From this bandwidth of the output observer on no other choice of filter and poles is tried.
 ENOUGH_RAD_S = 20.0
 LIMIT_SHARE = 1.5  # bound of the compensated force, as a share of the largest friction
 OBSERVER_SHARE = 2.5  # bound of the estimate: friction that turned against a z_hat that a step leaves as it was
 APPROACH = 3.0  # speed with which a step is approached, as a factor on the map's highest
+#: At rest a joint stands on its bristle, and what feedback adds is the encoder's noise: this share of feedback and
+#: observer keeps it where it is (at 20 bit 5 urad instead of 15 to 45); less of it lets it creep and hunt.
+REST_SHARE = 0.3
+REST_SIGMAS = 5.0  # of the encoder's noise, beyond the hold width, within which a joint counts as at rest
 HOLD_COUNTS = 0.6  # hold width in encoder counts: what rounding hides, and no more, for the joint creeps as far
 
 
@@ -111,14 +102,15 @@ def parameters(
         ),
         disturbance_observer=OutputObserver(
             bandwidth_rad_s=bandwidth,
-            low_bandwidth_rad_s=LOW_FACTOR * bandwidth,
             inertia_kg_m2=friction.inertia,
             disturbance_limit_nm=OBSERVER_SHARE * largest,
         )
         if bandwidth
         else None,
         feedforward_inertia_kg_m2=friction.inertia,
-        hold_within_rad=HOLD_COUNTS * 2.0 * math.pi / design.counts_per_turn if design.counts_per_turn else 0.0,
+        hold_within_rad=HOLD_COUNTS * count_rad(design),
+        rest_within_rad=rest_width(design),
+        rest_share=REST_SHARE,
         error_limit_rad=approach_error(used.high, APPROACH * speed),
         position_feedforward=position_feedforward(design.model, friction.gain, design.period_s)
         if options.position_feedforward
@@ -126,21 +118,20 @@ def parameters(
     )
 
 
+def count_rad(design: Design) -> float:
+    """Angle of one count of the encoder [rad]; 0 where it has no steps."""
+    return 2.0 * math.pi / design.counts_per_turn if design.counts_per_turn else 0.0
+
+
+def rest_width(design: Design) -> float:
+    """Error that rounding and noise of the encoder may show of a joint that stands where it shall [rad]."""
+    noise = noise_of(design.model, count_rad(design))
+    return HOLD_COUNTS * count_rad(design) + (REST_SIGMAS * noise.encoder_rms if noise else 0.0)
+
+
 def approach_error(high: RegionGains, speed: float) -> float | None:
     """Error at which the feedback of Omega_H asks for `speed` [rad/s]; None without position feedback."""
     return speed * high.k_v_s_per_rad / high.k_x_per_rad if high.k_x_per_rad > 0.0 else None
-
-
-def stands(design: Design, friction: SteadyFriction, law: LocalParameters, margin: float, speeds: int) -> bool:
-    """Whether the full sampled loop is stable at every corner of the intervals, and has this disk margin as modelled.
-
-    At `speeds` speeds in each direction; at the corners with the longest delay, where CORNER_WANTED must be left, and
-    at the ends of what the model's own effects make of the joint.
-    """
-    late, own = late_corners(design.uncertainty), late_effects(design)
-    sweep = Sweep(LAWS["local"], law.pack(), friction, timing_of(design), speeds_of(design, speeds))
-    wide = sweep.disk_margin()[0] >= margin and sweep.disk_margin(late)[0] >= CORNER_WANTED
-    return wide and sweep.worst([*late, *own]).radius < STABLE
 
 
 def synthesize(
@@ -149,37 +140,25 @@ def synthesize(
     """The gain set for `model`, sealed and not yet certified; or why there is none and what would help."""
     wishes, options = wishes or Wishes(), options or Options()
     friction = steady_friction(model)
-    best: tuple[float, Design] | None = None
+    best: tuple[float, Design, LocalParameters] | None = None
     for narrowed in wishes.choices():
         design = regions(model, narrowed)
         if design is None:
             continue
-        bandwidth = widest_observer(design, friction, options)
+        law = parameters(design, friction, options, OBSERVERS_RAD_S[0] if options.observer else 0.0)
+        if law.disturbance_observer is not None:
+            law = with_widest_observer(design, friction, law, best[0] if best else 0.0)
+        bandwidth = law.disturbance_observer.bandwidth_rad_s if law.disturbance_observer else 0.0
         if best is None or bandwidth > best[0]:
-            best = bandwidth, design
+            best = bandwidth, design, law
         if bandwidth >= ENOUGH_RAD_S or not options.observer:
             break
     if best is None:
         return explain(model, wishes)
-    law = parameters(best[1], friction, options, best[0])
+    _, design, law = best
     if law.disturbance_observer is None and options.gain is None:
-        law = designed(best[1], friction, law)
-    return gain_set(best[1], law, options, model_path)
-
-
-def widest_observer(design: Design, friction: SteadyFriction, options: Options) -> float:
-    """Largest bandwidth of the list that the full loop stands [rad/s]; 0 where it stands none, or none is wanted."""
-    law = parameters(design, friction, options, OBSERVERS_RAD_S[0])
-
-    def fits(bandwidth: float, margin: float, speeds: int = FEW_SPEEDS) -> bool:
-        return stands(design, friction, with_observer(law, bandwidth, LOW_FACTOR * bandwidth), margin, speeds)
-
-    for margin in (DISK_WANTED, DISK_LIMIT) if options.observer else ():
-        first = bisect.bisect_left(OBSERVERS_RAD_S, True, key=partial(fits, margin=margin))
-        for bandwidth in OBSERVERS_RAD_S[first:]:
-            if fits(bandwidth, margin, CORNER_SPEEDS):
-                return bandwidth
-    return 0.0
+        law = designed(design, friction, law)
+    return gain_set(design, law, options, model_path)
 
 
 def gain_set(design: Design, law: LocalParameters, options: Options, model_path: Path | None) -> GainSet:
@@ -198,13 +177,6 @@ def gain_set(design: Design, law: LocalParameters, options: Options, model_path:
         provenance=provenance(design.model, model_path, note),
         design=design,
     ).sealed()
-
-
-def with_observer(law: LocalParameters, high_rad_s: float, low_rad_s: float | None) -> LocalParameters:
-    """`law` with other bandwidths of the observer that it has: in Omega_H and in Omega_L (None: the same)."""
-    assert law.disturbance_observer is not None
-    bandwidths = {"bandwidth_rad_s": high_rad_s, "low_bandwidth_rad_s": low_rad_s}
-    return law.model_copy(update={"disturbance_observer": law.disturbance_observer.model_copy(update=bandwidths)})
 
 
 def with_feedback(

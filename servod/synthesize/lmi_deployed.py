@@ -191,7 +191,8 @@ def synthesise(p: Programme) -> Solution | None:
     """Feedback with the least summed H2 norms that the rounds reach, proven over all vertices; None when infeasible.
 
     Only sliding vertices shape the feedback: stuck on its bristle, which is far stiffer than any feedback, the joint
-    is proven afterwards. The start need not keep the disc; a round without it is taken where the disc asks too much.
+    is proven afterwards. For the others the synthesis is the proof as well. The start need not keep the disc; a round
+    without it is taken where the disc asks too much.
     """
     shaping = p.only("sliding")
     last = solve(shaping, first_feedback(shaping), None, in_disc=False)
@@ -199,10 +200,31 @@ def synthesise(p: Programme) -> Solution | None:
     for _ in range(ROUNDS + 1):
         if last is None:
             break
-        better = solve(shaping, None, last.guides())
+        better = solve(shaping, None, last.guides(), strictness=PROOF_EPSILON)
         if better is not None:
             best = better
             break
         plain = solve(shaping, None, last.guides(), in_disc=False)
         last = None if plain is None else solve(shaping, plain.feedback, None, in_disc=False)
-    return None if best is None else solve(p, best.feedback, None, strictness=PROOF_EPSILON)
+    if best is None or len(shaping.modes) == len(p.modes):
+        return best
+    stuck = solve(p.only("sticking"), best.feedback, None, strictness=PROOF_EPSILON)
+    return None if stuck is None else both(p, best, stuck)
+
+
+def both(p: Programme, sliding: Solution, sticking: Solution) -> Solution:
+    """One proof of two: no inequality has vertices of both modes in it, so each polytope is proven by itself."""
+    parts = {"sliding": sliding, "sticking": sticking}
+
+    def in_order(name: str) -> list[Any]:
+        """The matrices `name` of all vertices in their order."""
+        left = {mode: iter(getattr(part, name)) for mode, part in parts.items()}
+        return [next(left[mode]) for mode in p.modes]
+
+    return Solution(
+        sliding.feedback,
+        sliding.slack | sticking.slack,
+        in_order("outputs"),
+        in_order("lyapunov_h2"),
+        in_order("lyapunov_disc"),
+    )

@@ -1,6 +1,6 @@
 """The full sampled closed loop around one velocity: joint with bristle, delay, velocity filter and the law itself.
 
-Stands on `sampled` and on the control law's own step function, which is linearised numerically as it is: friction
+Stands on `sampled` and on `law_slopes`, the control law's own step function linearised numerically as it is: friction
 state, disturbance observer, schedules and l_i are in it because they are in the law. States: [x, v, z, v_f, u_(k-1),
 ..., law state]. A joint is judged where it slides steadily (the bristle follows g(v)), where the bristle still sticks
 (b = 1) and where it is being turned over after a reversal (b = 2).
@@ -9,21 +9,19 @@ state, disturbance observer, schedules and l_i are in it because they are in the
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
 import numpy as np
 
-from servod.controllers import Law
-from servod.controllers.state import ASKED, FRICTION_STATE, LAST_VELOCITY, N_STATES
+from servod.controllers.state import N_STATES
 from servod.gain_design import SHARES, Uncertainty
+from servod.verify.law_slopes import LawSlopes
 from servod.verify.sampled import Array, Timing, with_delay_and_filter
 from servod.verify.steady_friction import SteadyFriction
 
-SETTLE_CYCLES = 100  # at most, after the first long one
-LONG_S = 1e4  # the friction state's step is exact, so one long cycle settles it
-NUDGE = 1e-7
 STUCK_DECAY_PER_S = 1000.0  # of the bristle state where the stiffness acts on the position and the state does nothing
 
 
@@ -175,109 +173,68 @@ def inner_points(u: Uncertainty, count: int, seed: int) -> list[Deviation]:
     return [Deviation(**own, delay_s=float(delay)) for own, delay in zip(factors, delays, strict=True)]
 
 
+def joint_points(
+    friction: SteadyFriction, velocity: float, bristle: Bristle, cases: Sequence[Deviation]
+) -> list[JointPoint]:
+    """The joint at `velocity` [rad/s] in each case, with the true Stribeck slope in how the bristle builds up."""
+    speed, dry, damping = abs(velocity), friction.dry(velocity), friction.damping(velocity)
+    slope, viscous = friction.dry_slope(velocity) if speed else 0.0, friction.viscous(velocity)
+    points = []
+    for d in cases:
+        stiffness, level = friction.stiffness * d.stiffness, dry * d.dry
+        build_up = speed * slope * d.slope / dry
+        points.append(
+            JointPoint(
+                velocity,
+                bristle,
+                friction.inertia * d.inertia - (d.behind.inertia if d.behind else 0.0),
+                d.torque_gain,
+                stiffness * speed / level,
+                1.0 - bristle.value + bristle.value * build_up if speed else 1.0,
+                stiffness,
+                min(damping * d.damping, 4.0 * level / speed) if speed else damping * d.damping,
+                viscous * d.viscous + d.more_viscous,
+                d.position_slope,
+                d.behind,
+            )
+        )
+    return points
+
+
 def joint_point(friction: SteadyFriction, velocity: float, bristle: Bristle, d: Deviation) -> JointPoint:
-    """The joint at `velocity` [rad/s], with the true Stribeck slope in how the bristle builds up."""
-    speed = abs(velocity)
-    stiffness, dry = friction.stiffness * d.stiffness, friction.dry(velocity) * d.dry
-    slope = speed * friction.dry_slope(velocity) * d.slope / friction.dry(velocity) if speed else 0.0
-    return JointPoint(
-        velocity,
-        bristle,
-        friction.inertia * d.inertia - (d.behind.inertia if d.behind else 0.0),
-        d.torque_gain,
-        stiffness * speed / dry,
-        1.0 - bristle.value + bristle.value * slope if speed else 1.0,
-        stiffness,
-        min(friction.damping(velocity) * d.damping, 4.0 * dry / speed) if speed else friction.damping(0.0) * d.damping,
-        friction.viscous(velocity) * d.viscous + d.more_viscous,
-        d.position_slope,
-        d.behind,
-    )
+    """The joint at `velocity` [rad/s] in one case."""
+    return joint_points(friction, velocity, bristle, (d,))[0]
 
 
-@dataclass(frozen=True, slots=True)
-class LawSlopes:
-    """The law linearised: [u, next law state] = matrix times [x, v_f, law state]; `frozen` states never change."""
+def sampled_points(points: Sequence[JointPoint], timing: Timing) -> tuple[Array, Array, int]:
+    """(A, B) of each joint, sampled with delay and velocity filter, and which state is the filtered velocity.
 
-    matrix: Array
-    frozen: tuple[int, ...]
-
-    @property
-    def autonomous(self) -> dict[int, float]:
-        """States that go by themselves, seeing neither joint nor other states, with their pole: a leak of z_hat.
-
-        The reference drives them, the loop does not, so their pole says nothing of how well the loop is damped.
-        """
-        found = {}
-        for i in range(N_STATES):
-            row, own = self.matrix[1 + i].copy(), float(self.matrix[1 + i, 2 + i])
-            row[2 + i] = 0.0
-            if i not in self.frozen and own != 0.0 and np.allclose(row, 0.0, atol=1e-12):
-                found[i] = own
-        return found
-
-    def coupled(self) -> LawSlopes:
-        """The same without the states that go by themselves: the loop's other poles, and its frequency response."""
-        return replace(self, frozen=(*self.frozen, *self.autonomous))
-
-
-def settled_state(law: Law, gains: tuple[float, ...], velocity: float, moves: bool, period_s: float) -> list[float]:
-    """State of the law in steady motion without error: what it settles to when fed its own torque."""
-    state = [0.0] * N_STATES
-    state[LAST_VELOCITY] = velocity
-    nudge = np.finfo(float).tiny if moves else 0.0
-    for cycle in range(SETTLE_CYCLES):
-        before = list(state)
-        dt = period_s if cycle else LONG_S
-        law.step(gains, state, 0.0, velocity, nudge, 0.0, velocity, state[ASKED], dt)
-        if max(abs(x - y) for x, y in zip(before, state, strict=True)) < 1e-15:
-            break
-    return state
-
-
-def law_slopes(law: Law, gains: tuple[float, ...], velocity: float, moves: bool, timing: Timing) -> LawSlopes:
-    """Central differences of the law's step at steady motion; at rest `moves` tells crossing zero from holding."""
-    base = settled_state(law, gains, velocity, moves, timing.period_s)
-    nudge = np.finfo(float).tiny if moves else 0.0
-    scale = np.full(N_STATES, NUDGE)
-    scale[FRICTION_STATE] = NUDGE * max(abs(base[FRICTION_STATE]), 1e-4)
-
-    def stepped(x: float, v: float, shift: Array) -> Array:
-        state = [value + float(extra) for value, extra in zip(base, shift, strict=True)]
-        u = law.step(gains, state, 0.0, velocity, nudge, x, velocity + v, state[ASKED], timing.period_s)[0]
-        return np.array([u, *state])
-
-    still = np.zeros(N_STATES)
-    columns = [
-        (stepped(1e-10, 0.0, still) - stepped(-1e-10, 0.0, still)) / 2e-10,
-        (stepped(0.0, NUDGE, still) - stepped(0.0, -NUDGE, still)) / (2.0 * NUDGE),
-    ]
-    for i in range(N_STATES):
-        shift = np.zeros(N_STATES)
-        shift[i] = scale[i]
-        columns.append((stepped(0.0, 0.0, shift) - stepped(0.0, 0.0, -shift)) / (2.0 * scale[i]))
-    matrix = np.stack(columns, axis=1)
-    unit = np.eye(N_STATES)
-    frozen = tuple(i for i in range(N_STATES) if np.allclose(matrix[1 + i], [0.0, 0.0, *unit[i]], atol=1e-9))
-    return LawSlopes(matrix, frozen)
-
-
-def loops(points: list[JointPoint], law: LawSlopes, timing: Timing) -> tuple[Array, Array, Array]:
-    """(closed loops, torque input column, row that gives the law's torque) for joints under one linearised law.
-
-    States that the law keeps constant (a held disturbance estimate, the flag of the first step) are left out.
+    It is what every law closes its loop around.
     """
     parts = [point.matrices() for point in points]
     a, b, e = (np.array(part) for part in zip(*parts, strict=True))
     plant_a, plant_b, _ = with_delay_and_filter(a, b, e, timing)
-    n, filtered = plant_a.shape[-1], a.shape[-1]
+    return plant_a, plant_b, a.shape[-1]
+
+
+def loops(points: Sequence[JointPoint], law: LawSlopes, timing: Timing) -> tuple[Array, Array, Array]:
+    """(closed loops, torque input column, row that gives the law's torque) for joints under one linearised law."""
+    return loops_around(*sampled_points(points, timing), law)
+
+
+def loops_around(plant_a: Array, plant_b: Array, filtered: int, law: LawSlopes) -> tuple[Array, Array, Array]:
+    """The same for joints that are sampled already.
+
+    States that the law keeps constant (a held disturbance estimate, the flag of the first step) are left out.
+    """
+    n = plant_a.shape[-1]
     keep = [i for i in range(N_STATES) if i not in law.frozen]
     seen = [0, 1, *(2 + i for i in keep)]
     row = np.zeros(n + len(keep))
     row[[0, filtered, *range(n, n + len(keep))]] = law.matrix[0, seen]
-    closed = np.zeros((len(points), len(row), len(row)))
+    closed = np.zeros((len(plant_a), len(row), len(row)))
     closed[:, :n, :n] = plant_a
-    column = np.concatenate([plant_b, np.zeros((len(points), len(keep)))], axis=1)
+    column = np.concatenate([plant_b, np.zeros((len(plant_a), len(keep)))], axis=1)
     closed += column[:, :, None] * row
     for j, i in enumerate(keep):
         closed[:, n + j, [0, filtered, *range(n, n + len(keep))]] = law.matrix[1 + i, seen]

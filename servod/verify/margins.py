@@ -7,13 +7,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from servod.controllers import Law
-from servod.verify.closed_loop import Bristle, Deviation, LawSlopes, joint_point, law_slopes, loops, spectral_radius
+from servod.verify.closed_loop import (
+    Bristle,
+    Deviation,
+    joint_points,
+    loops_around,
+    sampled_points,
+    spectral_radius,
+)
+from servod.verify.law_slopes import LawSlopes, law_slopes
 from servod.verify.sampled import Array, Timing
 from servod.verify.steady_friction import SteadyFriction
 
@@ -31,6 +40,25 @@ class Worst:
     velocity_rad_s: float
     bristle: str
     case: int
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """Largest pole and least disk margin of a sweep; `hardest` are the cases worst in either at some velocity."""
+
+    radius: float
+    radius_at_rad_s: float
+    disk_margin: float
+    disk_at_rad_s: float
+    hardest: list[Deviation]
+
+
+@lru_cache(maxsize=1024)
+def joints_at(
+    friction: SteadyFriction, velocity: float, bristle: Bristle, cases: tuple[Deviation, ...], timing: Timing
+) -> tuple[Array, Array, int]:
+    """`sampled_points` in each case: the same for every law, and most of the work of a sweep."""
+    return sampled_points(joint_points(friction, velocity, bristle, cases), timing)
 
 
 class Sweep:
@@ -66,14 +94,14 @@ class Sweep:
 
         Without the states of the law that go by themselves; `own_radius` has their poles.
         """
-        late = replace(timing or self.timing, delay_s=(timing or self.timing).delay_s + cases[0].delay_s)
+        own = timing or self.timing
+        late, known = replace(own, delay_s=own.delay_s + cases[0].delay_s), tuple(cases)
         for velocity, slopes in self.coupled:
             kinds = [Bristle.STICKS] if velocity == 0.0 else [Bristle.SLIDES]
             if transient and velocity != 0.0:
                 kinds += [Bristle.STICKS, Bristle.TURNS]
             for kind in kinds:
-                points = [joint_point(self.friction, velocity, kind, case) for case in cases]
-                yield velocity, kind, loops(points, slopes, late)
+                yield velocity, kind, loops_around(*joints_at(self.friction, velocity, kind, known, late), slopes)
 
     def worst(self, cases: Sequence[Deviation], timing: Timing | None = None) -> Worst:
         """The worst pole over all velocities, bristle states and cases."""
@@ -96,10 +124,26 @@ class Sweep:
         least, where = np.inf, 0.0
         for group in by_delay(cases):
             for velocity, _, (closed, column, row) in self.systems([cases[i] for i in group], transient=False):
-                worst = float(np.abs(sensitivity(closed, column, row) - 0.5).max())
-                if 1.0 / worst < least:
-                    least, where = 1.0 / worst, velocity
+                margin = float(disk_margins(sensitivity(closed, column, row)).min())
+                if margin < least:
+                    least, where = margin, velocity
         return least, where
+
+    def judge(self, cases: Sequence[Deviation]) -> Judgement:
+        """Poles and disk margin of `cases` of one delay at once, for a search: what `worst` and `disk_margin` say."""
+        found, hardest = Judgement(self.own_radius, 0.0, np.inf, 0.0, []), set()
+        for velocity, kind, (closed, column, row) in self.systems(cases):
+            poles = np.linalg.eigvals(closed)
+            radius = np.abs(poles).max(axis=-1)
+            hardest.add(int(radius.argmax()))
+            if radius.max() > found.radius:
+                found = replace(found, radius=float(radius.max()), radius_at_rad_s=velocity)
+            if kind is Bristle.SLIDES or velocity == 0.0:
+                margin = disk_margins(sensitivity(closed, column, row, poles))
+                hardest.add(int(margin.argmin()))
+                if margin.min() < found.disk_margin:
+                    found = replace(found, disk_margin=float(margin.min()), disk_at_rad_s=velocity)
+        return replace(found, hardest=[cases[i] for i in sorted(hardest)])
 
     def stable(self, case: Deviation, extra_delay_s: float = 0.0) -> bool:
         """Whether all poles are inside, steady sliding and sticking, for one case and a longer delay."""
@@ -114,16 +158,22 @@ def by_delay(cases: Sequence[Deviation]) -> list[list[int]]:
     return [[i for i, kind in enumerate(kinds) if kind == one] for one in dict.fromkeys(kinds)]
 
 
-def sensitivity(closed: Array, column: Array, row: Array) -> NDArray[np.complex128]:
-    """S of each closed loop at the drive over FREQUENCIES up to half the sample rate, from the poles.
+def sensitivity(closed: Array, column: Array, row: Array, poles: NDArray[Any] | None = None) -> NDArray[np.complex128]:
+    """S of each closed loop at the drive over FREQUENCIES up to half the sample rate, from its `poles` if known.
 
     S(z) = det(z - A_open)/det(z - A_closed): the zeros of S are the poles of the open loop.
     """
+    known = np.linalg.eigvals(closed) if poles is None else poles
     z = np.exp(1j * np.geomspace(1e-3, np.pi, FREQUENCIES))[None, :, None]
-    poles = np.linalg.eigvals(closed)[:, None, :]
-    zeros = np.linalg.eigvals(closed - column[:, :, None] * row)[:, None, :]
-    response: NDArray[np.complex128] = np.prod((z - zeros) / (z - poles), axis=2)
+    zeros = np.linalg.eigvals(closed - column[:, :, None] * row)
+    response: NDArray[np.complex128] = np.prod((z - zeros[:, None, :]) / (z - known[:, None, :]), axis=2)
     return response
+
+
+def disk_margins(response: NDArray[np.complex128]) -> Array:
+    """Symmetric disk margin 1/max|S - 1/2| of each response of S."""
+    margins: Array = 1.0 / np.abs(response - 0.5).max(axis=1)
+    return margins
 
 
 def largest_tolerated(stable: Callable[[float], bool], start: float, end: float) -> float:

@@ -1,0 +1,129 @@
+"""How fast the output observer may be: the widest bandwidth that the full sampled loop stands, in either region.
+
+Stands on the sweep that verification uses, between the feedback that the LMIs gave and the gain set. A search judges
+all corners at few speeds, and at many speeds those corners that were the worst somewhere; verification judges all.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+from servod.controllers import LAWS
+from servod.gain_design import Design
+from servod.gain_parameters import LocalParameters
+from servod.verify.checks import CORNER_DISK, CORNER_SPEEDS, DISK_LIMIT, speeds_of
+from servod.verify.closed_loop import Deviation, late_corners
+from servod.verify.effect_checks import late_effects
+from servod.verify.margins import Judgement, Sweep
+from servod.verify.sampled import timing_of
+from servod.verify.steady_friction import SteadyFriction
+
+#: Bandwidths, best first: the first is taken with which every corner of the intervals stands with CORNER_WANTED, and
+#: the axis as modelled with the wanted disk margin, or else with the one of the certificate.
+OBSERVERS_RAD_S = (80.0, 60.0, 45.0, 34.0, 25.0, 18.0, 12.0, 7.0)
+DISK_WANTED, CORNER_WANTED = 0.15, 1.25 * CORNER_DISK
+FEW_SPEEDS = 12  # per direction
+STABLE = 0.9999  # largest pole: the certificate looks between the corners and between these speeds as well
+#: Bandwidth in Omega_L over that in Omega_H, best first: on its bristle a joint rests the sooner the more it is ...
+LOW_FACTORS = (10.0, 8.0, 6.0, 4.5, 3.0)
+#: ... up to this rate, bandwidth*k_x/c0, with which the error on the bristle goes: rest within a quarter of a second.
+REST_RATE_PER_S = 20.0
+#: ... and as far as one step of the encoder, which it takes for an acceleration, moves the torque by this share of the
+#: largest friction: with coarse encoders a fast observer makes slow ramps stick and slip.
+COUNT_SHARE = 0.05
+WORTH = 1.2  # a bandwidth less than this times the least one is not worth a judgement
+
+
+@dataclass
+class Search:
+    """Laws of one design that are tried one after the other, each first at the speeds where others failed."""
+
+    design: Design
+    friction: SteadyFriction
+    refused_at: list[float] = field(default_factory=list)
+
+    def stands(self, law: LocalParameters, disk_wanted: float, below_rad_s: float = math.inf) -> bool:
+        """Whether `law` is stable at every corner with CORNER_WANTED, and has `disk_wanted` as modelled.
+
+        At the corners with the longest delay, and stable at the ends of what the model's own effects make of the joint;
+        at speeds below `below_rad_s`, where that is all that has changed.
+        """
+        cases: Sequence[Deviation] = late_corners(self.design.uncertainty)
+        counts = FEW_SPEEDS, CORNER_SPEEDS
+        few, many = ([v for v in speeds_of(self.design, count) if v < below_rad_s] for count in counts)
+        hard = sorted(v for v in self.refused_at if v < below_rad_s)
+        if hard and self._judged(law, hard, cases, disk_wanted) is None:
+            return False
+        found = self._judged(law, few, cases, disk_wanted)
+        if found is None or self._judged(law, many, found.hardest, disk_wanted) is None:
+            return False
+        own = late_effects(self.design)
+        return not own or self._sweep(law, many).worst(own).radius < STABLE
+
+    def _sweep(self, law: LocalParameters, speeds: list[float]) -> Sweep:
+        return Sweep(LAWS["local"], law.pack(), self.friction, timing_of(self.design), speeds)
+
+    def _judged(
+        self, law: LocalParameters, speeds: list[float], cases: Sequence[Deviation], disk_wanted: float
+    ) -> Judgement | None:
+        """How `cases` stand under `law` at `speeds`; None where they do not, and the speed is kept."""
+        sweep = self._sweep(law, speeds)
+        margin, at = sweep.disk_margin()
+        found = None if margin < disk_wanted else sweep.judge(cases)
+        if found is not None and found.disk_margin >= CORNER_WANTED:
+            if found.radius < STABLE:
+                return found
+            at = found.radius_at_rad_s
+        elif found is not None:
+            at = found.disk_at_rad_s
+        self._refuse(abs(at))
+        return None
+
+    def _refuse(self, speed_rad_s: float) -> None:
+        if speed_rad_s > 0.0 and speed_rad_s not in self.refused_at:
+            self.refused_at.append(speed_rad_s)
+
+
+def with_observer(law: LocalParameters, high_rad_s: float, low_rad_s: float | None) -> LocalParameters:
+    """`law` with other bandwidths of the observer that it has: in Omega_H and in Omega_L (None: the same)."""
+    assert law.disturbance_observer is not None
+    bandwidths = {"bandwidth_rad_s": high_rad_s, "low_bandwidth_rad_s": low_rad_s}
+    return law.model_copy(update={"disturbance_observer": law.disturbance_observer.model_copy(update=bandwidths)})
+
+
+def with_widest_observer(
+    design: Design, friction: SteadyFriction, law: LocalParameters, beyond_rad_s: float = 0.0
+) -> LocalParameters:
+    """`law` with the widest observer beyond `beyond_rad_s` that it stands; without one where it stands none."""
+    search = Search(design, friction)
+    for disk in (DISK_WANTED, DISK_LIMIT):
+        for bandwidth in (g for g in OBSERVERS_RAD_S if g > beyond_rad_s):
+            slow = with_observer(law, bandwidth, LOW_FACTORS[-1] * bandwidth)
+            if search.stands(slow, disk):
+                return with_fastest_rest(search, slow, disk)
+    return law.model_copy(update={"disturbance_observer": None})
+
+
+def with_fastest_rest(search: Search, law: LocalParameters, disk_wanted: float) -> LocalParameters:
+    """`law`, which stands, with the widest bandwidth in Omega_L that also stands."""
+    assert law.disturbance_observer is not None
+    high = law.disturbance_observer.bandwidth_rad_s
+    for low in low_bandwidths(search.design, search.friction, law):
+        faster = with_observer(law, high, low)
+        if search.stands(faster, disk_wanted, law.regions.overlap_to_rad_s):
+            return faster
+    return law
+
+
+def low_bandwidths(design: Design, friction: SteadyFriction, law: LocalParameters) -> Iterable[float]:
+    """Bandwidths in Omega_L that are worth a try beyond the least one, best first [rad/s]."""
+    assert law.disturbance_observer is not None
+    high = law.disturbance_observer.bandwidth_rad_s
+    enough = REST_RATE_PER_S * friction.stiffness / (law.input_scale_nm * law.regions.low.k_x_per_rad)
+    if design.counts_per_turn:
+        step_nm_s = friction.inertia * 2.0 * math.pi / design.counts_per_turn / design.period_s
+        enough = min(enough, COUNT_SHARE * friction.largest(design.speed_max_rad_s) / step_nm_s)
+    wanted = sorted({min(factor * high, enough) for factor in LOW_FACTORS[:-1]}, reverse=True)
+    return [low for low in wanted if low > WORTH * LOW_FACTORS[-1] * high]
