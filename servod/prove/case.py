@@ -53,7 +53,7 @@ class Case:
 
 
 @dataclass(frozen=True)
-class Trial:
+class Recorder:
     """How an axis is recorded: the controller and the torque noise in N*m."""
 
     loop: Loop
@@ -76,7 +76,7 @@ def make_case(plan: Plan, settings: Settings) -> Case:
     physics = _all_changes(axis.physics, hidden)
     plant = _cluttered(physics, axis, rng, plan.effects) if settings.clutter else physics
     noisy = max(settings.noise, BELOW_NOISE if plan.cover is Cover.NOISE else 1.0)
-    trial = Trial(loop, TORQUE_NOISE * noisy * axis.physics.coulomb)
+    recorder = Recorder(loop, TORQUE_NOISE * noisy * axis.physics.coulomb)
     believed = _believed(axis.physics, hidden)
     if plan.cover is Cover.ABSORBED:
         believed = _absorbing(believed, axis, physics, rng)
@@ -85,7 +85,7 @@ def make_case(plan: Plan, settings: Settings) -> Case:
         "params": _told(plant),
         "true_model": true_model(physics, [c.model for c in hidden]),
     }
-    return Case(believed_model(believed, off), record(axis, plant, trial, hidden, rng), truth)
+    return Case(believed_model(believed, off), record(axis, plant, recorder, hidden, rng), truth)
 
 
 def draw_seen(
@@ -128,7 +128,7 @@ def _followed(axis: Axis, physics: Physics, wanted: Array) -> Array:
 
 
 def record(
-    axis: Axis, plant: Physics, trial: Trial, hidden: Sequence[Concealed], rng: np.random.Generator
+    axis: Axis, plant: Physics, recorder: Recorder, hidden: Sequence[Concealed], rng: np.random.Generator
 ) -> dict[str, dict[str, Array]]:
     """Three recordings and the one held out; the joint cools a little between them."""
     motions = axis.motions
@@ -141,7 +141,7 @@ def record(
         start = rest(25.0 if any(c.cold for c in hidden) else warm, float(rng.uniform(0.0, 50.0)))
         out = np.zeros((len(reference), 3))
         jitter = ENCODER_NOISE * rng.normal(size=len(reference))
-        run(here, trial.loop, start, reference, trial.noise * rng.normal(size=len(reference)), jitter, out)
+        run(here, recorder.loop, start, reference, recorder.noise * rng.normal(size=len(reference)), jitter, out)
         warm = 25.0 + 0.8 * (float(out[-1, 2]) - 25.0)
         found[name] = _columns(reference, out, rng, all(c.thermometer for c in hidden))
     return found

@@ -24,7 +24,7 @@ CONFIDENCES = (0.0, 0.5, 0.7, 0.85, 0.95, 1.0)
 #: A hold-out says something of a missing effect when the believed model is off by this many times the true one.
 TELLING = 3.0
 
-#: What a trial has to reach (`servoctl prove` says which it does): key -> least share, or most for ratios.
+#: What a trial has to reach: least shares of right answers, plain and harder; then most and least of the other figures.
 GOALS = {Sort.SINGLE: 0.85, Sort.PAIR: 0.70, Sort.NOTHING: 0.95, Sort.UNKNOWN: 0.90}
 HARDER_GOALS = {Sort.SINGLE: 0.70, Sort.NOTHING: 0.90}
 MOST_ERROR, LEAST_COVERED, MOST_HELD_OUT, MOST_OVER_TRUE = 0.10, 0.90, 0.15, 2.0

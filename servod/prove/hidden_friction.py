@@ -22,7 +22,7 @@ def asymmetry(draw: Draw) -> Concealed:
 
 
 def stribeck(draw: Draw) -> Concealed:
-    """The model's curve is flat, or the axis's is; otherwise the exponent is Tustin's or steeper."""
+    """Friction falls as the axis sets off, where the model's is flat; otherwise by another exponent."""
     p = draw.physics
     excess = min(draw.size(0.4, 0.9), 2.5)
     exponent = draw.one_of(1.0, 0.7, 3.0) if draw.other else 2.0

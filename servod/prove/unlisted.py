@@ -16,7 +16,7 @@ def cage_resonance(draw: Draw) -> Concealed:
 
 
 def ageing_contacts(draw: Draw) -> Concealed:
-    """Friction that grows with the logarithm-like time at rest and takes some time in motion to forget it."""
+    """Friction that grows with the time at rest and is forgotten in motion, which takes time too."""
     return Concealed({"ageing": draw.size(0.6, 1.2), "ageing_s": draw.between(0.15, 0.4)})
 
 
