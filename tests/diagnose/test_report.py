@@ -1,0 +1,120 @@
+"""The page of a diagnosis: one file without a network, sentences first, pictures as PNG; and the document's keys."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from servod.axis_model import AxisKind, load_axis_model
+from servod.diagnose.engine import diagnose
+from servod.diagnose.files import write_files
+from servod.diagnose.signature import LOOKS, where
+from servod.recordings import Quantity, Recording
+from tests.diagnose.axes import BELIEVED, believed, record
+
+#: Keys of the outside contract.
+FINDING = {"effect", "statement", "located", "parameters", "confidence", "alternatives", "held_out"}
+TOP = {"verdict", "findings", "recalibrated", "minor", "fit", "recordings"}
+
+
+def linear(made: Recording) -> Recording:
+    """The same numbers on an axis that moves in metres."""
+    return Recording(made.path, AxisKind.LINEAR, made.columns, made.measured, made.report)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """A linear axis with a spring, diagnosed and written."""
+    folder = tmp_path_factory.mktemp("diagnosis")
+    hidden = record(believed(spring={"stiffness": 0.3, "rest": 0.1}), seconds=4.0)
+    model = type(believed()).model_validate(BELIEVED | {"axis": "linear"})
+    found = diagnose(model, [linear(made) for made in hidden], time_limit_s=90.0)
+    return folder, write_files(folder, found, "model.yaml")
+
+
+def test_document_has_the_keys_of_the_contract(written: tuple[Path, dict[str, Any]]) -> None:
+    folder, document = written
+    assert json.loads((folder / "diagnosis.json").read_text()) == document
+    assert set(document) >= TOP
+    assert [finding["effect"] for finding in document["findings"]] == ["spring"]
+    finding = document["findings"][0]
+    assert set(finding) >= FINDING
+    located = finding["located"]
+    assert set(located["recordings"]) == {"run0.csv", "run1.csv", "run2.csv"}
+    assert {w["recording"] for w in located["time_windows"]} <= set(located["recordings"])
+    assert {"position", "velocity", "direction", "frequency", "load", "acceleration"} <= set(located)
+    assert finding["held_out"]["after"] < 0.3 * finding["held_out"]["before"]
+    assert {row["noise_floor"] > 0.0 for row in document["recordings"]} == {True}
+    assert load_axis_model(folder / "model.yaml").spring is not None
+
+
+def test_a_linear_axis_has_metres_and_newtons(written: tuple[Path, dict[str, Any]]) -> None:
+    folder, document = written
+    told = json.dumps(document, ensure_ascii=False)
+    assert not re.search(r"N·m|\brad\b(?!_s)|kg·m²", told)
+    assert document["findings"][0]["parameters"]["stiffness"]["unit"] == "N/m"
+    assert document["findings"][0]["located"]["position"]["unit"] == "m"
+    page = (folder / "report.html").read_text()
+    assert "kg·m²" not in page.split("<body>")[1]
+
+
+def test_windows_are_judged_by_models_that_have_not_seen_them(written: tuple[Path, dict[str, Any]]) -> None:
+    for window in written[1]["fit"]["windows"].values():
+        assert set(window["recordings"]) == {"run0.csv", "run1.csv", "run2.csv"}
+        assert window["after"] < 0.5 * window["before"]
+        assert window["unit"] == "m"
+
+
+def test_page_stands_alone(written: tuple[Path, dict[str, Any]]) -> None:
+    folder, document = written
+    page = (folder / "report.html").read_text()
+    body = page.split("<body>")[1]
+    assert not re.search(r'<(script|link|img)[^>]+(src|href)="?http', page)
+    order = (
+        'class="lead"',
+        "Where the model is off",
+        "Finding 1: spring",
+        "95 % interval",
+        "The fit before and after",
+        "What remains",
+        "Which experiment next",
+        "The recordings",
+        "How it was found",
+        "Time by stage",
+    )
+    places = [body.index(part) for part in order]
+    assert places == sorted(places)
+    assert body.index(document["findings"][0]["statement"][:40]) < body.index("Where the model is off")
+    pictures = {path.name for path in (folder / "pictures").iterdir()}
+    assert {"where.png", "finding_spring_1.png", "held_out.png", "over_time.png", "maps.png", "spectrum.png",
+            "windows.png"} <= pictures  # fmt: skip
+
+
+def test_data_that_cannot_tell_get_a_page_and_no_model(tmp_path: Path) -> None:
+    (tmp_path / "model.yaml").write_text("stale")
+    made = record(believed())[0]
+    still = {q: v.copy() for q, v in made.columns.items()}
+    still[Quantity.POSITION] = np.zeros(len(made))
+    document = write_files(
+        tmp_path, diagnose(believed(), [Recording(made.path, made.axis, still, made.measured, ())]), "model.yaml"
+    )
+    assert document["verdict"] == "cannot_tell"
+    assert document["findings"] == []
+    assert not (tmp_path / "model.yaml").exists()
+    page = (tmp_path / "report.html").read_text()
+    assert "These data cannot tell" in page
+    assert "too still" in page
+    assert "Let the axis move" in page
+
+
+def test_every_look_can_be_said() -> None:
+    for effect, look in LOOKS.items():
+        key = look.coordinate.replace(" ", "_")
+        located = {"recordings": {"a.csv": 1.0}, "time_windows": [], key: {"from": 0.0, "to": 1.0, "unit": "rad"}}
+        located["time_windows"] = [{"recording": "a.csv", "start_s": 1.0, "end_s": 2.0}]
+        assert where(effect, located).endswith("in a.csv from 1.00 to 2.00 s")
