@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from servod.cli.common import JsonOption, example, need_folder, print_json
+from servod.errors import BadInput
 
 if TYPE_CHECKING:
     from servod.demo.entries import Entry
@@ -23,6 +24,7 @@ _HELP = example(
     "servoctl demo",
     "servoctl demo --fast --gains gains/demo_local_plain.yaml",
     "servoctl demo --plant my_axis.yaml --json",
+    "servoctl demo --diagnose --fast --conceal asymmetry",
 )
 
 
@@ -41,9 +43,20 @@ def demo(
     ] = None,
     seconds: Annotated[float, typer.Option(min=2.0, max=30.0, help="Length of each run in s.")] = 30.0,
     out: Annotated[Path, typer.Option(help="Folder for report and recordings.")] = Path("out/demo"),
+    diagnose: Annotated[
+        bool, typer.Option("--diagnose", help="Conceal an effect, diagnose it from the axis's recordings, and cure it.")
+    ] = False,
+    conceal: Annotated[
+        str | None, typer.Option(help="Effect that --diagnose conceals, or takes out of what is believed of --plant.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Run the demo."""
+    if diagnose:
+        _diagnose(plant, conceal, fast, out, as_json)
+        return
+    if conceal is not None:
+        raise BadInput("--conceal", conceal, "only with --diagnose")
     from servod.axis_model import load_rotary_model
     from servod.demo.axis import plant_file
     from servod.demo.entries import entries, further_files
@@ -70,6 +83,16 @@ def demo(
         print_json(document)
     else:
         print_document(rows, document)
+
+
+def _diagnose(plant: Path | None, conceal: str | None, fast: bool, out: Path, as_json: bool) -> None:
+    """The other demo: an axis that conceals something; on Table I's joint unless another is given."""
+    from servod.cli.demo_diagnose import demo_diagnose
+    from servod.demo.concealed import DEFAULT
+    from servod.shipped import shipped
+
+    joint = plant or shipped("gains/axes/table1_joint.yaml")
+    demo_diagnose(joint, conceal or DEFAULT, fast, out, as_json)
 
 
 def _run(

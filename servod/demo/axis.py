@@ -54,7 +54,7 @@ def demo_config(folder: Path, recordings: Path) -> AxisConfig:
                 "initial": str(gains_file(CONTROLLERS[0])),
                 "accept_uncertified": True,
             },
-            "control": {"socket": str(folder / "axis.sock"), "group": _own_group()},
+            "control": {"socket": str(folder / "axis.sock"), "group": own_group()},
             "recorder": {"directory": str(recordings.resolve()), "history_s": 5.0},
         },
         AxisConfig,
@@ -73,7 +73,8 @@ def other_cores() -> set[int] | None:
     return os.sched_getaffinity(0) - {last_core()} or None
 
 
-def _own_group() -> str:
+def own_group() -> str:
+    """The group of this process, by name where it has one."""
     try:
         return grp.getgrgid(os.getgid()).gr_name
     except KeyError:

@@ -40,8 +40,13 @@ class RunningAxis(NamedTuple):
 
 
 @contextlib.contextmanager
-def running_axis(config: AxisConfig, plant: Path, folder: Path) -> Iterator[RunningAxis]:
-    """Virtual axis and daemon for the time of a `with` block. Raises Unreachable when one does not start."""
+def running_axis(
+    config: AxisConfig, plant: Path, folder: Path, axis_options: Sequence[str] = ()
+) -> Iterator[RunningAxis]:
+    """Virtual axis and daemon for the time of a `with` block. Raises Unreachable when one does not start.
+
+    `axis_options` are further arguments of servod-virtual-axis.
+    """
     file = folder / "axis.yaml"
     file.write_text(yaml.safe_dump(config.model_dump(mode="json")))
     bus, control = Path(config.bus.channel), config.control.socket
@@ -50,7 +55,7 @@ def running_axis(config: AxisConfig, plant: Path, folder: Path) -> Iterator[Runn
         axis = stack.enter_context(
             child(
                 "servod.drivers.virtual.main",
-                ["--socket", str(bus), "--plant", str(plant)],
+                ["--socket", str(bus), "--plant", str(plant), *axis_options],
                 log,
                 cores=other_cores(),
             )

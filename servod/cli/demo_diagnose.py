@@ -1,0 +1,56 @@
+"""`servoctl demo --diagnose`: the story of an effect that was concealed, from its cost to its cure, in one command."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+from servod.cli.common import need_folder, one_thread, print_json
+from servod.cli.progress import progress
+from servod.errors import AnswerIsNo
+
+#: Share of the cost that must come back.
+LEAST_RECOVERED = 0.8
+
+
+def demo_diagnose(plant: Path, effect: str, fast: bool, out: Path, as_json: bool) -> None:
+    """Run the story on `plant` and print it. Raises AnswerIsNo when less than LEAST_RECOVERED comes back."""
+    one_thread()
+    from servod.axis_model import load_rotary_model
+    from servod.demo.concealed import believed_and_true
+    from servod.demo.processes import sigterm_as_interrupt
+    from servod.demo.recovery import recover
+    from servod.demo.recovery_axes import daemon_axis, stepped_axis
+    from servod.report.recovery import write_recovery_page
+
+    believed, true = believed_and_true(load_rotary_model(plant), effect)
+    need_folder("--out", out)
+    begun = time.monotonic()
+    with sigterm_as_interrupt(), progress("demo --diagnose", quiet=as_json) as tell:
+        found = recover(believed, true, effect, stepped_axis if fast else daemon_axis, out, tell)
+    report = write_recovery_page(found, out)
+    document = found.summary() | {
+        "mode": "stepped" if fast else "wall",
+        "wall_s": time.monotonic() - begun,
+        "report": str(report),
+    }
+    if as_json:
+        print_json(document)
+    else:
+        _print(document)
+    if document["recovered_share"] < LEAST_RECOVERED:
+        share = f"{100.0 * document['recovered_share']:.0f} % of what {effect} cost came back"
+        raise AnswerIsNo(f"{share}, at least {100.0 * LEAST_RECOVERED:.0f} % should")
+
+
+def _print(document: dict[str, Any]) -> None:
+    rms = document["rms_error_mrad"]
+    found = ", ".join(f"{f['effect']} ({f['confidence']:.2f})" for f in document["findings"]) or document["verdict"]
+    print(f"as believed         {rms['before']:.4f} mrad RMS on trajectory (19)")
+    print(f"{document['concealed']} concealed   {rms['concealed']:.4f} mrad")
+    print(f"diagnosed: {found}")
+    print(
+        f"after new design    {rms['after']:.4f} mrad: {100.0 * document['recovered_share']:.0f} % of the cost is back"
+    )
+    print(f"Report: {document['report']}")

@@ -1,0 +1,194 @@
+"""`servoctl demo --diagnose`: an axis conceals an effect, its recordings tell which, the controller learns of it.
+
+Beside the data path. Design for what is believed, track, record, diagnose, design anew, deploy, track again; every step
+is the product's own.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from servod.axis_model import AxisModel, axis_model_yaml, load_axis_model
+from servod.commission.runs import save_rows
+from servod.demo.recovery_axes import RecoveryAxis
+from servod.deploy.deployment import Deployment, deploy
+from servod.deploy.links import Rows
+from servod.diagnose.engine import Diagnosis, diagnose
+from servod.diagnose.files import MODEL, write_files
+from servod.errors import AnswerIsNo
+from servod.gains import GainSet
+from servod.recordings import load_recording
+from servod.report.files import write_bytes
+from servod.synthesize.deployed import Infeasible, Wishes
+from servod.synthesize.gain_set import Options, synthesize
+from servod.tracking.metrics import Array, score
+from servod.verify.certify import verify
+
+#: Told what is done, and the share of the whole that is.
+Tell = Callable[[str, float], None]
+
+#: Opens an enabled axis: joint, gain set, folder, seed of its noise.
+OpenAxis = Callable[[AxisModel, GainSet, Path, int], AbstractContextManager[RecoveryAxis]]
+
+#: How long (19) is tracked, how much of it is diagnosed, and how long each motion for the diagnosis is, s.
+PAPER_S, DIAGNOSED_S, MOTION_S = 30.0, 14.0, 12.0
+
+#: Folder of the diagnosis within the demo's.
+DIAGNOSIS = "diagnosis"
+
+#: What the diagnosis may take, s.
+TIME_LIMIT_S = 60.0
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """What came of it; rows are the cycles on trajectory (19), figures RMS errors there in mrad."""
+
+    effect: str
+    before: Rows
+    concealed: Rows
+    after: Rows
+    diagnosis: Diagnosis
+    document: dict[str, Any]
+    first: GainSet
+    second: GainSet
+    deployment: Deployment
+
+    @property
+    def rms_mrad(self) -> dict[str, float]:
+        """RMS error on (19) without its first second: as promised, with the effect concealed, and after."""
+        runs = {"before": self.before, "concealed": self.concealed, "after": self.after}
+        return {name: score(time_s(rows), error_mrad(rows)).rms_error_mrad for name, rows in runs.items()}
+
+    def summary(self) -> dict[str, Any]:
+        """The command's JSON document."""
+        rms = self.rms_mrad
+        findings = [{"effect": f["effect"], "confidence": f["confidence"]} for f in self.document["findings"]]
+        return {
+            "concealed": self.effect,
+            "verdict": self.document["verdict"],
+            "findings": findings,
+            "rms_error_mrad": rms,
+            "recovered_share": self.recovered_share,
+            "deployment": self.deployment.document(),
+            "promised_before": promised_mrad(self.first),
+        }
+
+    @property
+    def recovered_share(self) -> float:
+        """Share of the error that the effect cost which is gone again."""
+        rms = self.rms_mrad
+        return (rms["concealed"] - rms["after"]) / max(rms["concealed"] - rms["before"], 1e-12)
+
+
+def promised_mrad(gains: GainSet) -> dict[str, float]:
+    """What a certificate promised of the validation motion, mrad."""
+    promised = gains.certificate.promised if gains.certificate else None
+    values = promised.model_dump() if promised else {}
+    return {k.replace("_rad", "_mrad"): 1e3 * v for k, v in values.items() if k.endswith("_rad")}
+
+
+def time_s(rows: Rows) -> Array:
+    """Time since the motion began."""
+    return np.asarray((rows["time_ns"] - rows["time_ns"][0]) * 1e-9)
+
+
+def error_mrad(rows: Rows) -> Array:
+    """Reference minus encoder position."""
+    return np.asarray((rows["reference_rad"] - rows["position_rad"]) * 1e3)
+
+
+def recover(
+    believed: AxisModel, true: AxisModel, effect: str, open_axis: OpenAxis, out: Path, tell: Tell, seed: int = 1
+) -> Recovery:
+    """Run the whole story; files stay in `out`. Raises AnswerIsNo when a step's answer is no."""
+    tell("design for what is believed", 0.02)
+    write_bytes(out / "believed.yaml", axis_model_yaml(believed).encode())
+    first = designed(believed, out / "believed.yaml", out / "gains_before.yaml", None)
+    with tempfile.TemporaryDirectory(prefix="servod-demo-") as folder:
+        tell("the axis as it is believed to be", 0.2)
+        with open_axis(believed, first, _folder(folder, "believed"), seed) as axis:
+            before = axis.paper(PAPER_S)
+        with open_axis(true, first, _folder(folder, "true"), seed) as axis:
+            tell("the axis as it is", 0.25)
+            concealed = axis.paper(PAPER_S)
+            recordings = _recorded(axis, concealed, out, tell)
+            tell("diagnosis", 0.4)
+            found, document = _diagnosed(believed, recordings, out / DIAGNOSIS)
+            tell("design for what was found", 0.65)
+            extended = out / DIAGNOSIS / MODEL
+            second = designed(load_axis_model(extended), extended, out / "gains_after.yaml", first)
+            done = deploy(axis.link, second, lambda what, share: tell(f"deploy: {what}", 0.85 + 0.08 * share))
+            tell("the axis under what was found", 0.95)
+            after = axis.paper(PAPER_S)
+    return Recovery(effect, before, concealed, after, found, document, first, second, done)
+
+
+def _folder(parent: str, name: str) -> Path:
+    folder = Path(parent) / name
+    folder.mkdir()
+    return folder
+
+
+def designed(model: AxisModel, model_file: Path, gains_file: Path, same_filter: GainSet | None) -> GainSet:
+    """The paper's law for `model` with a certificate, without a disturbance observer beside it, which would hide much.
+
+    `same_filter` is a set whose velocity filter the axis has already. Raises AnswerIsNo.
+    """
+    cutoff = same_filter.design.velocity_cutoff_hz if same_filter and same_filter.design else None
+    options = Options(name=gains_file.stem, observer=False)
+    found = synthesize(model, Wishes(cutoff_hz=cutoff), options, model_file)
+    if isinstance(found, Infeasible):
+        raise AnswerIsNo(f"no feedback for {model_file.name}: {'; '.join(found.clashes)}")
+    checked = verify(found, where=str(gains_file))
+    certified = checked.certified(found)
+    write_bytes(gains_file, certified.to_yaml().encode())
+    if not checked.valid:
+        failed = [check.name for check in checked.checks if not check.passed]
+        raise AnswerIsNo(f"{gains_file}: not valid: {'; '.join(failed)}")
+    return certified
+
+
+def _recorded(axis: RecoveryAxis, tracked: Rows, out: Path, tell: Tell) -> list[Path]:
+    """The axis's own recordings: a part of (19), and motions that show more."""
+    runs = {"paper": tracked[time_s(tracked) < DIAGNOSED_S]}
+    for index, (name, positions) in enumerate(motions(MOTION_S).items()):
+        tell(f"recording: {name}", 0.3 + 0.03 * index)
+        runs[name] = axis.follow(positions.tolist())
+    paths = [out / "recordings" / f"{name}.mcap" for name in runs]
+    for path, rows in zip(paths, runs.values(), strict=True):
+        save_rows(path, rows)
+    return paths
+
+
+def _diagnosed(believed: AxisModel, recordings: list[Path], out: Path) -> tuple[Diagnosis, dict[str, Any]]:
+    """The same code as `servoctl diagnose`. Raises AnswerIsNo when these data cannot tell."""
+    found = diagnose(believed, [load_recording(path) for path in recordings], TIME_LIMIT_S)
+    out.mkdir(parents=True, exist_ok=True)
+    document = write_files(out, found, "believed.yaml")
+    if found.evidence is None:
+        raise AnswerIsNo(document["summary"])
+    return found, document
+
+
+def motions(duration_s: float, period_s: float = 0.001) -> dict[str, Array]:
+    """Positions for a diagnosis, rad: a slow sine over a long way, a mix of frequencies, moves with rests between."""
+    t = np.arange(round(duration_s / period_s)) * period_s
+    fade = np.minimum(1.0, np.minimum(t, t[::-1]))
+    slow = 0.5 * np.sin(2.0 * math.pi * 0.25 * t) * fade
+    parts = ((0.12, 0.4, 0.0), (0.06, 1.1, 1.0), (0.025, 2.3, 2.0), (0.012, 4.1, 3.0))
+    mixed = sum((a * np.sin(2.0 * math.pi * f * t + p) for a, f, p in parts), start=np.zeros_like(t)) * fade
+    corners = np.arange(0.0, duration_s + 0.8, 0.8)
+    moves = np.interp(t, corners, np.resize([0.0, 0.4, 0.4, -0.3, -0.25, -0.25, 0.5], len(corners))) * fade
+    width = round(0.3 / period_s) | 1
+    smooth = np.hanning(width + 2)[1:-1]
+    moves = np.convolve(np.pad(moves, width // 2, mode="edge"), smooth / smooth.sum(), mode="valid")
+    return {"slow_sine": slow, "multisine": mixed, "moves": moves}
