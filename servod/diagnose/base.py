@@ -18,6 +18,9 @@ RECALIBRATION = 0.10
 #: What is known beforehand of a known parameter: off by some per cent.
 KNOWN_WITHIN = 0.04
 
+#: Where a known weight hangs: off by so much at most, and known so well, rad. More would soak up offset and asymmetry.
+PHASE_OFF, PHASE_KNOWN = 0.03, 0.008
+
 #: Levels of the contract: static - coulomb and offset as shares of Coulomb friction, bristle as a factor, delay in s.
 STRIBECK_SHARE, OFFSET_SHARE, BRISTLE_FACTOR, DELAY_S = 0.25, 0.03, 2.0, 0.002
 
@@ -76,7 +79,7 @@ def _gravity(document: Document, force: str) -> list[Unknown]:
     if amplitude == 0.0:
         return []
     phase = get(document, "gravity.phase")
-    turn = Unknown("gravity.phase", "rad", phase, phase - RECALIBRATION, phase + RECALIBRATION, 1.0, 0.5 * KNOWN_WITHIN)
+    turn = Unknown("gravity.phase", "rad", phase, phase - PHASE_OFF, phase + PHASE_OFF, 1.0, PHASE_KNOWN)
     return [known("gravity.amplitude", force, amplitude), turn]
 
 

@@ -19,6 +19,9 @@ from servod.diagnose.scene import Scene
 #: Starts that go on to the second round and its steps; effects that are fitted to the end and steps of such a fit.
 SECOND_ROUND, SECOND_STEPS, FULL_FITS, FULL_STEPS = 16, 3, 5, 8
 
+#: Starts of a far effect that get a step of their own: those that the model's own parameters can follow best.
+FAR_STARTS = 4
+
 #: A candidate is fitted to the end when it has saved at least 1 - IN_REACH of what the best has saved.
 IN_REACH = 0.4
 
@@ -66,6 +69,9 @@ class Trials:
         what = effect(name)
         begun = [fit for term in what.terms(self.scene) for fit in self._begun(term, what.far)]
         self.tried += len(begun)
+        if what.far:
+            begun = sorted(begun, key=self.short.promised)[:FAR_STARTS]
+        begun = [self.short.opened(fit) for fit in begun]
         return [self._short(name, self.short.refine(fit, 1, fit.jacobian.shape[1], 2), fit) for fit in begun]
 
     def _begun(self, term: Term, far: bool) -> list[Fit]:
@@ -87,10 +93,10 @@ class Trials:
 
     def _full(self, candidate: Candidate) -> Candidate:
         """Fit on everything, as long as there is time."""
-        begun = self.whole.begin(candidate.fit.hypothesis, candidate.fit.coordinates)
+        begun = self.whole.begin(candidate.fit.hypothesis, candidate.fit.coordinates, self.present.jacobian)
         if begun is None or monotonic() > self.deadline:
             return candidate
-        fit = self.whole.refine(begun, FULL_STEPS)
+        fit = self.whole.refine(self.whole.opened(begun), FULL_STEPS, known=self.present.jacobian.shape[1])
         return Candidate(candidate.effect, fit, fit.cost / max(self.present.cost, 1e-30))
 
 

@@ -55,6 +55,9 @@ NOTHING_RMS, NOTHING_STRETCH, BUT_SHARE = 0.006, 0.02, 0.005
 #: Rivals that saved at least 1 - CLOSE of what the best saved get their chance when the best does not deserve it.
 CLOSE = 0.3
 
+#: Steps of a fit, in each of two scales.
+STEPS = 12
+
 #: Scale of the mismatch is never taken smaller than this share of dry friction.
 LEAST_SCALE = 0.002
 
@@ -143,16 +146,25 @@ class Chooser:
         self.floor = noise_floor(self.predictor, fit.mismatch)
         return fit
 
-    def settled(self, hypothesis: Hypothesis, coordinates: Array | None, mismatch: Array) -> Fit:
-        """Fit in the scale of the present mismatch, then in the scale of what is left, with a fresh Jacobian."""
-        first = self._fitted(hypothesis, coordinates, mismatch)
-        return self.fresh(self._fitted(hypothesis, first.coordinates, first.mismatch))
+    def settled(
+        self, hypothesis: Hypothesis, coordinates: Array | None, mismatch: Array, jacobian: Array | None = None
+    ) -> Fit:
+        """Fit in the scale of the present mismatch, then in the scale of what is left; its Jacobian is fresh.
 
-    def _fitted(self, hypothesis: Hypothesis, coordinates: Array | None, mismatch: Array) -> Fit:
-        fit = self.fitter(mismatch).fit(hypothesis, coordinates)
-        if fit is None:
+        `jacobian` is one to begin with, where one is known.
+        """
+        begun = self.fitter(mismatch).begin(hypothesis, coordinates, jacobian)
+        if begun is None:
             raise ValueError("a hypothesis that makes no sense at its start")
-        return fit
+        first = self._refined(begun, mismatch, begun.jacobian.shape[1])
+        second = self._refined(first, first.mismatch, len(first.coordinates))
+        return second if second.converged else self.fresh(second)
+
+    def _refined(self, fit: Fit, mismatch: Array, known: int) -> Fit:
+        """The fit refined in the scale of a mismatch, with the first columns of its Jacobian to begin with."""
+        fitter = self.fitter(mismatch)
+        cost = fitter.cost(fit.hypothesis, fit.coordinates, fit.mismatch)
+        return fitter.refine(replace(fit, cost=cost, converged=False), STEPS, known=known)
 
     def fresh(self, fit: Fit) -> Fit:
         """The fit with cost and Jacobian in the scale of its own mismatch."""
@@ -170,7 +182,7 @@ class Chooser:
         for candidate in candidates:
             if candidate.left > candidates[0].left + CLOSE * (1.0 - candidates[0].left):
                 break
-            settled = self.settled(candidate.fit.hypothesis, candidate.fit.coordinates, present.mismatch)
+            settled = self._settled(candidate.fit, present.mismatch)
             self.lower_floor(settled.mismatch)
             merit = self.merit(present, settled)
             if self._enters(merit, settled):
@@ -186,6 +198,11 @@ class Chooser:
             if self.significant(merit, settled):
                 choice.minor.setdefault(candidate.effect, merit)
         return False
+
+    def _settled(self, fit: Fit, mismatch: Array) -> Fit:
+        """A candidate's fit settled; its Jacobian serves when it has all rows."""
+        known = fit.jacobian if len(fit.jacobian) == len(mismatch) else None
+        return self.settled(fit.hypothesis, fit.coordinates, mismatch, known)
 
     def lower_floor(self, mismatch: Array) -> None:
         """Take a mismatch into account that shows a lower floor than those before."""
@@ -260,8 +277,8 @@ class Chooser:
     def less(self, fit: Fit, index: int) -> Fit:
         """The fit without one of its terms."""
         gone = fit.hypothesis.share(index)
-        kept = np.concatenate([fit.coordinates[: gone.start], fit.coordinates[gone.stop :]])
-        return self.settled(fit.hypothesis.without(index), kept, fit.mismatch)
+        kept = np.delete(fit.coordinates, gone)
+        return self.settled(fit.hypothesis.without(index), kept, fit.mismatch, np.delete(fit.jacobian, gone, axis=1))
 
 
 #: Effects that may come in again with another period or place.

@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from servod.axis_model import AxisModel
 from servod.diagnose.choose import Choice, Chooser
 from servod.diagnose.detail import detail
-from servod.diagnose.fit import Fit, Weighing, covariance
+from servod.diagnose.fit import Fit, Weighing
 from servod.diagnose.held_out import HeldOut, held_out
 from servod.diagnose.intake import Refusal, taken_in
 from servod.diagnose.locate import Map, maps
 from servod.diagnose.predict import Predictor
+from servod.diagnose.spread import spread
 from servod.diagnose.tidy import tidied
 from servod.diagnose.trace import Trace
 from servod.diagnose.unnamed import Unnamed, unnamed
@@ -122,7 +123,7 @@ def _evidence(predictor: Predictor, chooser: Chooser, choice: Choice, tell: Tell
         choice=choice,
         named=named,
         errors=errors,
-        spread=covariance(fit, weighing, predictor.traces[0].period_s),
+        spread=spread(fit, weighing, predictor.traces[0].period_s, after),
         less=less,
         before=before,
         after=after,

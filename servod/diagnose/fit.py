@@ -31,8 +31,9 @@ LEAST_OF_RMS = 0.3
 #: A fit has converged when a step improves the cost by less than this share.
 CONVERGED = 1e-3
 
-#: A step that improves the cost by more than this share lets its Jacobian serve once more.
-STALE_GAIN = 0.05
+#: Damping that steps begin with, as a share of the normal matrix's diagonal: so little that where the data say nothing,
+#: what was known beforehand decides.
+LEAST_DAMPING = 1e-8
 
 #: Longest step of one coordinate at once.
 LONGEST = 1.5
@@ -113,29 +114,41 @@ class Fitter:
         known = np.zeros((len(mismatch), 0)) if jacobian is None else jacobian
         return Fit(hypothesis, at, mismatch, self.cost(hypothesis, at, mismatch), known, False)
 
-    def fit(self, hypothesis: Hypothesis, coordinates: Array | None = None, steps: int = 12) -> Fit | None:
-        """Fit from the start, every derivative anew at each step."""
-        fit = self.begin(hypothesis, coordinates)
-        return None if fit is None else self.refine(fit, steps)
+    def promised(self, fit: Fit) -> float:
+        """The cost after one step along the columns of the Jacobian that are known, by the Jacobian alone."""
+        columns = fit.jacobian.shape[1]
+        normal, slope = self._normal(fit, fit.jacobian)
+        return fit.cost - 0.5 * float(slope @ np.linalg.solve(normal + 1e-9 * np.eye(columns), slope))
 
-    def refine(self, fit: Fit, steps: int, keep_columns: int = 0, tries: int = 4) -> Fit:
+    def refine(self, fit: Fit, steps: int, keep_columns: int = 0, tries: int = 4, known: int = 0) -> Fit:
         """Go on fitting for some steps; the first `keep_columns` columns of the Jacobian are taken as they are.
 
-        A Jacobian serves for a second step when the first went well; a fit ends only on a fresh one.
+        The first `known` are taken as they are to begin with. The Jacobian follows the steps by secants (Broyden, Math.
+        Comp. 19, 1965) and is taken anew when they stop to help; a fit ends only on a fresh one.
         """
-        damping, fresh = 1e-3, True
-        jacobian = self.derivatives(fit, keep_columns)
+        damping, fresh = LEAST_DAMPING, known <= keep_columns
+        jacobian = self.derivatives(fit, max(keep_columns, known))
         for _ in range(steps):
             stepped, damping = self._step(fit, jacobian, damping, tries)
             gained = (fit.cost - stepped.cost) / max(fit.cost, 1.0)
-            fit = stepped
-            if fresh and gained <= CONVERGED:
-                return replace(fit, converged=True)
-            if fresh and gained > STALE_GAIN:
-                fresh = False
+            if gained > CONVERGED:
+                jacobian, fresh = secant(jacobian, fit, stepped), False
+                fit = replace(stepped, jacobian=jacobian)
                 continue
-            jacobian, fresh = self.derivatives(fit, keep_columns), True
+            fit = stepped
+            if fresh:
+                return replace(fit, converged=True)
+            jacobian, fresh, damping = self.derivatives(fit, keep_columns), True, LEAST_DAMPING
         return fit
+
+    def opened(self, fit: Fit) -> Fit:
+        """The fit with those columns of its Jacobian anew that belong to parameters opened by its last term."""
+        keys = fit.hypothesis.terms[-1].opens
+        jacobian = fit.jacobian.copy() if keys else fit.jacobian
+        for index, unknown in enumerate(fit.hypothesis.base):
+            if unknown.key in keys and index < jacobian.shape[1]:
+                jacobian[:, index] = self._column(fit, index)
+        return replace(fit, jacobian=jacobian)
 
     def derivatives(self, fit: Fit, keep_columns: int = 0) -> Array:
         """Derivative of the mismatch by each coordinate, N*m; forward differences, backward at an upper bound."""
@@ -162,7 +175,7 @@ class Fitter:
             if mismatch is not None:
                 cost = self.cost(fit.hypothesis, at, mismatch)
                 if cost < fit.cost:
-                    return Fit(fit.hypothesis, at, mismatch, cost, jacobian, False), max(0.2 * damping, 1e-6)
+                    return Fit(fit.hypothesis, at, mismatch, cost, jacobian, False), max(0.2 * damping, LEAST_DAMPING)
             damping = max(8.0 * damping, 1e-2)
         return Fit(fit.hypothesis, fit.coordinates, fit.mismatch, fit.cost, jacobian, False), damping
 
@@ -171,9 +184,20 @@ class Fitter:
         off = fit.mismatch / self.weighing.scale
         weight = self.weighing.rows * np.minimum(1.0, HUBER / np.maximum(np.abs(off), 1e-12))
         scaled = jacobian / self.weighing.scale
-        centre, precision = fit.hypothesis.prior
+        some = slice(jacobian.shape[1])
+        centre, precision = (part[some] for part in fit.hypothesis.prior)
         normal = scaled.T @ (weight[:, None] * scaled) + np.diag(precision**2)
-        return normal, scaled.T @ (weight * off) + precision**2 * (fit.coordinates - centre)
+        return normal, scaled.T @ (weight * off) + precision**2 * (fit.coordinates[some] - centre)
+
+
+def secant(jacobian: Array, old: Fit, new: Fit) -> Array:
+    """The Jacobian with the slope along the last step as it was found there."""
+    step = new.coordinates - old.coordinates
+    length = float(step @ step)
+    if length == 0.0:
+        return jacobian
+    missed = new.mismatch - old.mismatch - jacobian @ step
+    return np.asarray(jacobian + np.outer(missed, step / length))
 
 
 def _bounded_step(normal: Array, slope: Array, damping: float, fit: Fit) -> Array:

@@ -35,11 +35,15 @@ class Fold:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Mismatch (N*m) of every row by a fit that has not seen it; `rms` is over the rows that count."""
+    """Mismatch (N*m) of every row by a fit that has not seen it; `rms` is over the rows that count.
+
+    `coordinates` are those of each fold's fit.
+    """
 
     mismatch: Array
     rms: float
     folds: tuple[Fold, ...] = ()
+    coordinates: tuple[Array, ...] = ()
 
 
 def folds(predictor: Predictor) -> list[Rows]:
@@ -65,6 +69,7 @@ def held_out(predictor: Predictor, fit: Fit, frozen: Rows) -> HeldOut:
     mismatch = np.zeros_like(fit.mismatch)
     least = 1e-3 * predictor.dry
     models: list[Fold] = []
+    coordinates: list[Array] = []
     free = Fit(fit.hypothesis, fit.coordinates, fit.mismatch, fit.cost, np.where(frozen, 0.0, fit.jacobian), False)
     for out in folds(predictor):
         rows = (predictor.counts & ~out).astype(np.float64)
@@ -77,4 +82,7 @@ def held_out(predictor: Predictor, fit: Fit, frozen: Rows) -> HeldOut:
             again = fitter.refine(begun, STEPS, len(fit.coordinates))
         mismatch[out] = again.mismatch[out]
         models.append(Fold(out, again.model))
-    return HeldOut(mismatch, float(np.sqrt(np.mean(mismatch[predictor.counts] ** 2))), tuple(models))
+        coordinates.append(again.coordinates)
+    return HeldOut(
+        mismatch, float(np.sqrt(np.mean(mismatch[predictor.counts] ** 2))), tuple(models), tuple(coordinates)
+    )

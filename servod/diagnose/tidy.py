@@ -32,16 +32,20 @@ FIRM = 1e-6
 
 
 def tidied(chooser: Chooser, fit: Fit) -> Fit:
-    """The fit with as many of LEVELS at their nominal values as the data do not mind; those that a term opens stay."""
+    """The fit with as many of LEVELS at their nominal values as the data do not mind; those that a term opens stay.
+
+    They are held for the fit alone: what is known of them, and so every interval, stays as it was.
+    """
     opened = {key for term in fit.hypothesis.terms for key in term.opens}
     candidates = [key for key in LEVELS if key not in opened and any(u.key == key for u in fit.hypothesis.base)]
+    tidy = fit
     for keys in [candidates, *[[key] for key in candidates]]:
-        held = _held(chooser, fit, keys)
+        held = _held(chooser, tidy, keys)
         if held is not None:
-            fit = held
+            tidy = held
             if keys is candidates:
                 break
-    return fit
+    return fit if tidy is fit else chooser.fresh(replace(tidy, hypothesis=fit.hypothesis))
 
 
 def _held(chooser: Chooser, fit: Fit, keys: list[str]) -> Fit | None:
@@ -60,4 +64,4 @@ def _held(chooser: Chooser, fit: Fit, keys: list[str]) -> Fit | None:
     changed = np.abs(held.mismatch - fit.mismatch)[chooser.predictor.counts]
     if float(np.quantile(changed, 0.99)) > MINDS * chooser.predictor.dry:
         return None
-    return chooser.fresh(held) if chooser.error(held.mismatch) <= (1.0 + GROWS) * chooser.error(fit.mismatch) else None
+    return held if chooser.error(held.mismatch) <= (1.0 + GROWS) * chooser.error(fit.mismatch) else None

@@ -19,7 +19,7 @@ from servod.diagnose.hypothesis import Document, get
 
 #: Below this share of the explainable error no known name may stand: what is there is something else. Real machines
 #: keep some of theirs above it, so that it is no nearer to 1; confidence falls with what is left instead.
-LEAST_EXPLAINED = 0.7
+LEAST_EXPLAINED = 0.75
 
 #: What is left above the noise floor counts as unexplained from this share of dry friction, if it is also this share of
 #: what could be explained.

@@ -4,41 +4,51 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from servod.diagnose.effects.effect import Effect, share
-from servod.diagnose.hypothesis import Document, Reported, Term
+from servod.diagnose.effects.effect import Effect, positive, share
+from servod.diagnose.hypothesis import Document, Reported, Teller, Term, Writer
 from servod.diagnose.scene import Scene
 
 
 def _write(document: Document, values: Sequence[float]) -> None:
-    dry, viscous = values[0], values[1] if len(values) > 1 else values[0]
+    """Values: half the difference of dry friction, that of viscous friction, and a factor on dry friction."""
+    dry, viscous, level = (*values, 1.0)[:3]
     document["asymmetry"] = {
-        "positive_dry": 1.0 + dry,
-        "negative_dry": 1.0 - dry,
+        "positive_dry": level * (1.0 + dry),
+        "negative_dry": level * (1.0 - dry),
         "positive_viscous": 1.0 + viscous,
         "negative_viscous": 1.0 - viscous,
     }
 
 
 def _write_dry(document: Document, values: Sequence[float]) -> None:
-    _write(document, (values[0], 0.0))
+    """Dry friction alone: half the difference, and a factor on both directions."""
+    _write(document, (values[0], 0.0, values[1] if len(values) > 1 else 1.0))
 
 
-def _tell(document: Document, values: Sequence[float]) -> list[Reported]:
+def _teller(write: Writer) -> Teller:
     """The ratio of friction for v < 0 to that for v > 0, and the factors themselves."""
-    written: Document = {}
-    (_write if len(values) > 1 else _write_dry)(written, values)
-    found = [Reported("negative_over_positive", (1.0 - values[0]) / (1.0 + values[0]), "1")]
-    return found + [Reported(key, value, "1") for key, value in written["asymmetry"].items()]
+
+    def tell(_document: Document, values: Sequence[float]) -> list[Reported]:
+        written: Document = {}
+        write(written, values)
+        found = [Reported("negative_over_positive", (1.0 - values[0]) / (1.0 + values[0]), "1")]
+        return found + [Reported(key, value, "1") for key, value in written["asymmetry"].items()]
+
+    return tell
 
 
-def terms(scene: Scene) -> list[Term]:
-    """Dry friction by direction; dry and viscous friction each by direction; both by the same factor."""
+def terms(_scene: Scene) -> list[Term]:
+    """Dry friction by direction, and dry and viscous friction; each also with another level than the model's."""
     dry = share("dry", 0.0, -0.9, 0.9, 1.0)
     viscous = share("viscous", 0.0, -0.9, 0.9, 1.0)
-    return [
-        Term("asymmetry", "both", (dry, viscous), _write, _tell),
-        Term("asymmetry", "dry", (dry,), _write_dry, _tell),
-    ]
+    level = positive("level", "1", 1.0, 3.0)
+    forms = {
+        "both": (_write, (dry, viscous)),
+        "dry": (_write_dry, (dry,)),
+        "both, another level": (_write, (dry, viscous, level)),
+        "dry, another level": (_write_dry, (dry, level)),
+    }
+    return [Term("asymmetry", form, unknowns, write, _teller(write)) for form, (write, unknowns) in forms.items()]
 
 
 EFFECT = Effect(
