@@ -24,6 +24,9 @@ CONFIDENCES = (0.0, 0.5, 0.7, 0.85, 0.95, 1.0)
 #: A hold-out says something of a missing effect when the believed model is off by this many times the true one.
 TELLING = 3.0
 
+#: A diagnosis that took this share of its time limit may have ended its search early: the machine was too busy.
+HURRIED = 0.7
+
 #: What a trial has to reach: least shares of right answers, plain and harder; then most and least of the other figures.
 GOALS = {Sort.SINGLE: 0.85, Sort.PAIR: 0.70, Sort.NOTHING: 0.95, Sort.UNKNOWN: 0.90}
 HARDER_GOALS = {Sort.SINGLE: 0.70, Sort.NOTHING: 0.90}
@@ -124,7 +127,8 @@ def held_out(cases: Sequence[Scored]) -> Document:
 def times(cases: Sequence[Scored]) -> Document:
     """Wall clock, processor time and memory of the diagnoses."""
     runs = [case.run for case in cases if case.run]
-    return {key: _spread([run[key] for run in runs]) for key in ("wall_s", "cpu_s", "memory_mib")}
+    spent = {key: _spread([run[key] for run in runs]) for key in ("wall_s", "cpu_s", "memory_mib")}
+    return spent | {"hurried": sum(run["wall_s"] >= HURRIED * run["time_limit_s"] for run in runs)}
 
 
 def _spread(values: Sequence[float]) -> Document:

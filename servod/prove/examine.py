@@ -30,12 +30,13 @@ ANSWERS, RUN, DIAGNOSIS, MODEL, SAID = "answers", "run.json", "diagnosis.json", 
 
 @dataclass(frozen=True)
 class Run:
-    """How one diagnosis went: exit code, seconds of wall clock and of all cores, and its largest memory."""
+    """How one diagnosis went: exit code, seconds of wall clock and of all cores, its largest memory, its time limit."""
 
     exit_code: int
     wall_s: float
     cpu_s: float
     memory_mib: float
+    time_limit_s: float
 
 
 class Examiner:
@@ -102,4 +103,4 @@ class Examiner:
             if self._ended:
                 return None
         cpu_s = used.ru_utime + used.ru_stime
-        return Run(process.returncode, time.monotonic() - begun, cpu_s, used.ru_maxrss / 1024.0)
+        return Run(process.returncode, time.monotonic() - begun, cpu_s, used.ru_maxrss / 1024.0, self._time_limit_s)

@@ -46,6 +46,8 @@ def sentences(found: Mapping[str, Any]) -> Iterator[str]:
         f"closed loop, diagnosed by servod {found['version']} from their folders alone. SHA-256 of the truth, told "
         f"before: {found['sha256']}."
     )
+    if found["times"]["hurried"]:
+        yield f"The time limit may have ended {found['times']['hurried']} diagnoses early: too little of the processor."
     for case, named in found["false_alarms"].items():
         yield f"False alarm: {', '.join(named)} in {case}, where nothing is hidden."
 

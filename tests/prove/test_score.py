@@ -20,6 +20,8 @@ from servod.prove.plan import Cover, Plan, Settings, Sort, plans
 from servod.prove.score import Scored, is_right, matches, parameters_of
 from servod.prove.trial import FILE, Trial, write_trial
 
+RAN = {"exit_code": 0, "wall_s": 10.0, "cpu_s": 15.0, "memory_mib": 300.0, "time_limit_s": 12.0}
+
 
 def quiet(_done: int, _of: int) -> None:
     """No progress."""
@@ -52,7 +54,7 @@ def answered(trial: Path, tmp_path: Path, **answers: dict[str, Any]) -> Path:
         (folder / DIAGNOSIS).write_text(json.dumps(answer))
         model = yaml.safe_load((out / CASES / name / MODEL).read_text()) | answer.get("model", {})
         (folder / MODEL).write_text(yaml.safe_dump(model))
-        (folder / RUN).write_text(json.dumps({"exit_code": 0, "wall_s": 10.0, "cpu_s": 15.0, "memory_mib": 300.0}))
+        (folder / RUN).write_text(json.dumps(RAN))
     return out
 
 
@@ -86,6 +88,7 @@ def test_a_false_alarm_and_a_missing_answer_count_as_wrong(trial: Path, tmp_path
     assert [part["cases"] for part in found["calibration"]] == [0, 1, 0, 0, 0]
     write(found, out)
     assert json.loads((out / "prove.json").read_text()) == found
+    assert "may have ended 1 diagnoses early" in (out / "prove.md").read_text()
     assert "cogging in c001" in (out / "prove.md").read_text()
     assert (out / "prove.html").read_text().count("plotly") > 1
     assert {path.name for path in (out / "pictures").iterdir()} == {"confusion.png", "calibration.png"}
