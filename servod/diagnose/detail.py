@@ -21,7 +21,7 @@ MUCH_LEFT, LEFT_SHARE = 0.025, 0.08
 MOST_TERMS = 9
 
 #: A term takes at least this share of what is left when it comes in; all of them together at least that share.
-LEAST_EACH, LEAST_TOGETHER = 0.1, 0.35
+LEAST_EACH, LEAST_TOGETHER = 0.06, 0.35
 
 #: A term acts with at least this share of dry friction, seen through the observer's low-pass.
 LEAST_TORQUE = 0.025

@@ -16,6 +16,9 @@ from servod.diagnose.trace import Trace
 #: Inertia must take this share of the command (root mean squares) before effects of SWIFT can be told.
 LEAST_INERTIAL = 0.15
 
+#: Share of the rows, at most, in which an axis that creeps may do otherwise: it had to get there.
+OTHERWISE = 0.05
+
 #: Effects that show against the inertia of the axis alone.
 SWIFT = frozenset(
     (
@@ -42,6 +45,7 @@ def unseen(traces: Sequence[Trace], inertia: float) -> frozenset[str]:
 
 def creeps(traces: Sequence[Trace], inertia: float) -> bool:
     """Whether the command of an axis of this inertia goes into friction and cogging alone."""
-    needed = np.concatenate([inertia * trace.acceleration[trace.counts] for trace in traces])
+    needed = np.abs(np.concatenate([inertia * trace.acceleration[trace.counts] for trace in traces]))
+    needed = np.minimum(needed, np.quantile(needed, 1.0 - OTHERWISE))
     command = np.concatenate([trace.drive.torque[trace.counts] for trace in traces])
     return float(np.sqrt(np.mean(needed**2))) < LEAST_INERTIAL * float(np.sqrt(np.mean(command**2)))
