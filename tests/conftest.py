@@ -22,7 +22,8 @@ settings.load_profile("house")
 
 
 #: Recordings of other people beside the project, each with the tests that want it.
-SHARED = {name: ROOT.parents[1] / "shared" / name for name in ("recordings/emps", "recordings/bam_xl330", "practice")}
+NAMES = ("recordings/emps", "recordings/bam_xl330", "recordings/odrive_cogging", "practice")
+SHARED = {name: ROOT.parents[1] / "shared" / name for name in NAMES}
 
 
 def pytest_report_header() -> str:
