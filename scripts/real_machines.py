@@ -1,0 +1,123 @@
+"""Diagnose recordings of three real machines and print what was missing, with errors on data that no fit has seen.
+
+    python scripts/real_machines.py --recordings ../shared/recordings --out out/machines
+
+`--recordings` holds `emps`, `odrive_cogging` and `bam_xl330` (sources in the README); models and maps are in
+`examples`. Everything runs through `servoctl diagnose` and `servoctl replay`, as one would by hand.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+
+#: Length of the windows that restart from the recording, s.
+HORIZONS = ("0.25", "1")
+
+#: Length of one lap of EMPS, s.
+LAP_S = "6.24"
+
+
+@dataclass(frozen=True)
+class Machine:
+    """Files of one machine: those that a diagnosis sees, those that it does not, and its name in `examples`."""
+
+    example: str
+    seen: tuple[str, ...]
+    unseen: tuple[str, ...]
+
+
+XL330 = "bam_xl330"
+ODRIVE = "odrive_cogging"
+
+MACHINES = (
+    Machine("emps", ("emps/DATA_EMPS.mat",), ()),
+    Machine("odrive", (f"{ODRIVE}/slow_turn_nocomp_0.csv.gz",), (f"{ODRIVE}/slow_turn_nocomp_2.csv.gz",)),
+    Machine(
+        "xl330",
+        tuple(f"{XL330}/{run}.csv.gz" for run in ("sin_sin_kp200", "sin_time_square_kp100", "sin_time_square_kp200")),
+        tuple(f"{XL330}/{run}.csv.gz" for run in ("sin_sin_kp100", "sin_sin_kp400", "sin_time_square_kp400")),
+    ),
+)
+
+
+def servoctl(*arguments: str | Path) -> dict[str, Any]:
+    """The JSON document of a command."""
+    program = [str(Path(sys.executable).with_name("servoctl")), *(str(argument) for argument in arguments), "--json"]
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run(program, env=environment, stdout=subprocess.PIPE, text=True, check=True)
+    document: dict[str, Any] = json.loads(done.stdout)
+    return document
+
+
+def diagnosed(machine: Machine, model: Path, recordings: list[Path], out: Path, *more: str) -> dict[str, Any]:
+    """What `servoctl diagnose` says of the recordings."""
+    out.mkdir(parents=True, exist_ok=True)
+    column_map = EXAMPLES / f"{machine.example}_map.yaml"
+    found = servoctl("diagnose", "--model", model, "--map", column_map, *recordings, "--out", out, *more)
+    print(f"\n{machine.example}: {', '.join(path.name for path in recordings)}: {found['verdict']}")
+    for finding in found["findings"]:
+        print(f"  {finding['effect']}: {finding['statement']}")
+    for name, change in found["recalibrated"].items():
+        print(f"  recalibrated: {name} {change['from']:.5g} -> {change['to']:.5g} {change['unit']}")
+    return found
+
+
+def window_errors(machine: Machine, model: Path, recording: Path, *more: str) -> list[float]:
+    """Position errors of windows of HORIZONS, thousandths of a rad or m, RMS."""
+    column_map = EXAMPLES / f"{machine.example}_map.yaml"
+    same = ("replay", "--model", model, "--map", column_map, recording, *more, "--horizon")
+    unit = "m" if machine.example == "emps" else "rad"
+    return [1e3 * float(servoctl(*same, horizon)[f"rms_error_{unit}"]) for horizon in HORIZONS]
+
+
+def row(what: str, before: list[float], after: list[float]) -> None:
+    """One row of the table."""
+    cells = " | ".join(f"{old:.3g} → {new:.3g}" for old, new in zip(before, after, strict=True))
+    print(f"| {what} | {cells} |")
+
+
+def main() -> None:
+    """Diagnose every machine, then EMPS's second session; print a table of errors before and after."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--recordings", type=Path, required=True)
+    parser.add_argument("--out", type=Path, default=Path("out/machines"))
+    parser.add_argument("--time-limit", default="300", help="seconds for each search")
+    given = parser.parse_args()
+    rows: list[tuple[str, list[float], list[float]]] = []
+    for machine in MACHINES:
+        seen = [given.recordings / name for name in machine.seen]
+        plain, out = EXAMPLES / f"{machine.example}.yaml", given.out / machine.example
+        diagnosed(machine, plain, seen, out, "--time-limit", given.time_limit)
+        for name in machine.unseen or machine.seen:
+            recording = given.recordings / name
+            pair = [window_errors(machine, model, recording) for model in (plain, out / "model.yaml")]
+            rows.append((f"{machine.example}, {recording.name}", *pair))
+    rows += second_session(given.recordings, given.out, given.time_limit)
+    print("\n| recording | windows of 0.25 s | windows of 1 s |\n| --- | --- | --- |")
+    for what, before, after in rows:
+        row(what, before, after)
+
+
+def second_session(recordings: Path, out: Path, time_limit: str) -> list[tuple[str, list[float], list[float]]]:
+    """EMPS on another day: what has changed by its first lap, judged on the other laps."""
+    emps = MACHINES[0]
+    pulses = recordings / "emps/DATA_EMPS_PULSES.mat"
+    first = out / "emps/model.yaml"
+    diagnosed(emps, first, [pulses], out / "emps_pulses", "--to-s", LAP_S, "--time-limit", time_limit)
+    models = (EXAMPLES / "emps.yaml", first, out / "emps_pulses/model.yaml")
+    plain, before, after = (window_errors(emps, model, pulses, "--from-s", LAP_S) for model in models)
+    what = "emps, DATA_EMPS_PULSES.mat, laps 2 to 4"
+    return [(f"{what}, model of DATA_EMPS", plain, before), (f"{what}, what changed put in", before, after)]
+
+
+if __name__ == "__main__":
+    main()
