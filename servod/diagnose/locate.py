@@ -66,14 +66,29 @@ class Map:
 
 
 def maps(predictor: Predictor, mismatch: Array) -> list[Map]:
-    """Maps over all coordinates, the one that carries most first."""
+    """Maps over all coordinates, the one that carries most first, and at the end what is everywhere alike."""
     memory = max(1, round(2.0 / (predictor.rate * predictor.traces[0].period_s)))
     found = [
         map_over(name, unit, values, mismatch, predictor.counts, memory, TIME_BINS if name == "time" else BINS)
         for name, (unit, values) in coordinates(predictor).items()
         if int(np.sum(predictor.counts & np.isfinite(values))) >= 2 * LEAST_IN_BIN
     ]
-    return sorted([*found, modulo_period(predictor, mismatch, memory)], key=lambda m: -m.share)
+    found.append(modulo_period(predictor, mismatch, memory))
+    return [*sorted(found, key=lambda m: -m.share), everywhere(predictor, mismatch, memory)]
+
+
+def everywhere(predictor: Predictor, mismatch: Array, memory: int) -> Map:
+    """The part of the mismatch that is the same in all rows, as a map of one bin."""
+    from scipy.stats import f as fisher
+
+    here = mismatch[predictor.counts]
+    mean, power, rows = float(np.mean(here)), max(float(np.mean(here**2)), 1e-30), max(len(here) / memory, 2.0)
+    spread = max(power - mean**2, 1e-30) / rows
+    chance = float(fisher.sf(mean**2 / spread, 1, rows - 1.0))
+    edges, one = np.array([0.0, 1.0]), np.array([len(here)])
+    return Map(
+        "everywhere alike", "1", edges, np.array([mean]), np.array([math.sqrt(spread)]), one, mean**2 / power, chance
+    )
 
 
 def modulo_period(predictor: Predictor, mismatch: Array, memory: int) -> Map:
@@ -90,7 +105,10 @@ def modulo_period(predictor: Predictor, mismatch: Array, memory: int) -> Map:
 def map_over(
     name: str, unit: str, values: Array, mismatch: Array, counts: NDArray[np.bool_], memory: int, bins: int = BINS
 ) -> Map:
-    """Means of the mismatch over bins of `values` with as many rows each; `memory` rows count as one."""
+    """Means of the mismatch over bins of `values` with as many rows each; `memory` rows count as one.
+
+    Share and chance are of what differs between the bins; what is everywhere alike is no matter of a coordinate.
+    """
     from scipy.stats import f as fisher
 
     rows = counts & np.isfinite(values)
@@ -103,8 +121,9 @@ def map_over(
     square = np.bincount(place, here**2, len(edges) - 1) / np.maximum(count, 1)
     independent = np.maximum(count / memory, 1.0)
     error = np.sqrt(np.maximum(square - mean**2, 0.0) / independent)
-    total, between = float(here @ here), float(count @ mean**2)
-    free, rest = len(edges) - 1, max(len(here) / memory - len(edges) + 1, 1.0)
+    alike = float(np.mean(here))
+    total, between = float(here @ here) - len(here) * alike**2, float(count @ (mean - alike) ** 2)
+    free, rest = max(len(edges) - 2, 1), max(len(here) / memory - len(edges) + 1, 1.0)
     ratio = (between / free) / max((total - between) / rest, 1e-30) / memory
     carried = max(between - free * memory * (total - between) / max(len(here), 1), 0.0)
     share = carried / max(float(np.sum(mismatch[counts] ** 2)), 1e-30)

@@ -27,8 +27,9 @@ def write_recovery_page(found: Recovery, out: Path) -> Path:
     """Write `report.html` and pictures into `out`. Raises BadInput when that is not possible."""
     report = Report(out, "servod demo: an axis that conceals something")
     rms, page = found.rms_mrad, report.page
+    back = min(100.0 * found.recovered_share, 100.0)
     page.lead(
-        f"{100.0 * found.recovered_share:.0f} % of what the concealed effect cost is back: {rms['before']:.3f} mrad "
+        f"{back:.0f} % of what the concealed effect cost is back: {rms['before']:.3f} mrad "
         f"RMS on trajectory (19) as believed, {rms['concealed']:.3f} with it, {rms['after']:.3f} once it is known."
     )
     name = found.effect.replace("_", " ")

@@ -10,12 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from servod.axis_model import AxisKind, load_axis_model
+from servod.axis_model import AxisKind, axis_model_yaml, load_axis_model
+from servod.cli.app import run
 from servod.diagnose.engine import diagnose
 from servod.diagnose.files import write_files
+from servod.diagnose.intake import taken_in
+from servod.diagnose.locate import maps
+from servod.diagnose.predict import Predictor
 from servod.diagnose.signature import LOOKS, where
 from servod.recordings import Quantity, Recording
-from tests.diagnose.axes import BELIEVED, believed, record
+from tests.diagnose.axes import BELIEVED, believed, record, recording, write_csv
 
 #: Keys of the outside contract.
 FINDING = {"effect", "statement", "located", "parameters", "confidence", "alternatives", "held_out"}
@@ -112,9 +116,45 @@ def test_data_that_cannot_tell_get_a_page_and_no_model(tmp_path: Path) -> None:
     assert "Let the axis move" in page
 
 
+def test_command_ends_with_no_when_nothing_can_be_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = record(believed())[1]
+    most = 0.2 * float(np.median(np.abs(made.torque)))
+    short, cut = recording(made.t_s[:900], made.torque[:900], made.position[:900]), np.clip(made.torque, -most, most)
+    for name, bad in {"short": short, "saturated": recording(made.t_s, cut, made.position)}.items():
+        write_csv(bad, tmp_path / f"{name}.csv")
+    (tmp_path / "model.yaml").write_text(axis_model_yaml(believed()))
+    files = [str(tmp_path / f"{name}.csv") for name in ("short", "saturated")]
+    out = tmp_path / "out"
+    assert run(["diagnose", "--model", str(tmp_path / "model.yaml"), *files, "--out", str(out), "--json"]) == 1
+    told = capsys.readouterr()
+    document = json.loads(told.out)
+    assert document["verdict"] == "cannot_tell"
+    reasons = {row["name"]: row["reason"] for row in document["recordings"]}
+    assert "too short" in reasons["short.csv"]
+    assert "saturated" in reasons["saturated.csv"]
+    assert "These data cannot tell" in told.err
+    assert (out / "report.html").exists()
+    assert not (out / "model.yaml").exists()
+
+
 def test_every_look_can_be_said() -> None:
     for effect, look in LOOKS.items():
         key = look.coordinate.replace(" ", "_")
         located = {"recordings": {"a.csv": 1.0}, "time_windows": [], key: {"from": 0.0, "to": 1.0, "unit": "rad"}}
         located["time_windows"] = [{"recording": "a.csv", "start_s": 1.0, "end_s": 2.0}]
         assert where(effect, located).endswith("in a.csv from 1.00 to 2.00 s")
+
+
+def test_maps_tell_a_curve_from_a_constant() -> None:
+    made = record(believed(), seconds=4.0)
+    traces, _ = taken_in(made, believed())
+    predictor = Predictor(traces, believed())
+    rng = np.random.default_rng(1)
+    noise = 0.01 * rng.normal(size=len(predictor.counts))
+    constant = {m.coordinate: m for m in maps(predictor, noise + 0.05)}
+    assert constant["everywhere alike"].share > 0.9
+    assert max(m.share for name, m in constant.items() if name != "everywhere alike") < 0.05
+    curve = np.where(predictor.counts, 0.1 * predictor.over("position"), 0.0)
+    ordered = maps(predictor, noise + curve)
+    assert ordered[0].coordinate == "position"
+    assert ordered[0].share > 0.7

@@ -77,7 +77,7 @@ def _mean(seen: Map, label: str, colour: Colour) -> Curve:
 def map_grid(before: Sequence[Map], after: Sequence[Map], predictor: Predictor) -> Figure:
     """The maps that carry most, before and after on the same scale."""
     later = {seen.coordinate: seen for seen in after}
-    chosen = [seen for seen in before if seen.coordinate in later][:SHOWN]
+    chosen = [seen for seen in before if seen.coordinate in later and len(seen.rows) > 1][:SHOWN]
     panels = [map_panel(seen, predictor, later[seen.coordinate]) for seen in chosen]
     caption = (
         "Mean error over each coordinate with twice its standard error, before and after. Where the physics was "
