@@ -48,7 +48,7 @@ def two_mass_term(effect: str, scene: Scene, load: float, resonance: float, gap:
         document[effect] = found
 
     def tell(document: Document, values: Sequence[float]) -> list[Reported]:
-        units = {"load_inertia": "kg·m²", "stiffness": per, "gap": scene.length}
+        units = {"load_inertia": "kg" if scene.linear else "kg·m²", "stiffness": per, "gap": scene.length}
         other = f"{scene.force}·s/{scene.length}"
         return [
             Reported(k, v, units.get(k, other)) for k, v in values_of(document, values).items() if k != "load_viscous"
