@@ -88,7 +88,7 @@ def demo(
 def _diagnose(plant: Path | None, conceal: str | None, fast: bool, out: Path, as_json: bool) -> None:
     """The other demo: an axis that conceals something; on Table I's joint unless another is given."""
     from servod.cli.demo_diagnose import demo_diagnose
-    from servod.demo.concealed import DEFAULT
+    from servod.recovery.concealed import DEFAULT
     from servod.shipped import shipped
 
     joint = plant or shipped("gains/axes/table1_joint.yaml")

@@ -18,11 +18,11 @@ def demo_diagnose(plant: Path, effect: str, fast: bool, out: Path, as_json: bool
     """Run the story on `plant` and print it. Raises AnswerIsNo when less than LEAST_RECOVERED comes back."""
     one_thread()
     from servod.axis_model import load_rotary_model
-    from servod.demo.concealed import believed_and_true
     from servod.demo.processes import sigterm_as_interrupt
-    from servod.demo.recovery import recover
-    from servod.demo.recovery_axes import daemon_axis, stepped_axis
-    from servod.report.recovery import write_recovery_page
+    from servod.recovery.axes import daemon_axis, stepped_axis
+    from servod.recovery.concealed import believed_and_true
+    from servod.recovery.page import write_recovery_page
+    from servod.recovery.walk import recover
 
     believed, true = believed_and_true(load_rotary_model(plant), effect)
     need_folder("--out", out)

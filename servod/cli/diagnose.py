@@ -43,7 +43,7 @@ def diagnose(
     one_thread()
     from servod.axis_model import load_axis_model
     from servod.diagnose.engine import diagnose as run
-    from servod.diagnose.files import write_files
+    from servod.report.diagnosis_files import write_files
 
     axis = load_axis_model(model)
     recorded = [one.between(from_s, to_s) for one in _load(recordings, map_file, axis, model)]

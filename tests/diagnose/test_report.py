@@ -13,12 +13,12 @@ import pytest
 from servod.axis_model import AxisKind, axis_model_yaml, load_axis_model
 from servod.cli.app import run
 from servod.diagnose.engine import diagnose
-from servod.diagnose.files import write_files
 from servod.diagnose.intake import taken_in
 from servod.diagnose.locate import maps
 from servod.diagnose.predict import Predictor
 from servod.diagnose.signature import LOOKS, where
 from servod.recordings import Quantity, Recording
+from servod.report.diagnosis_files import write_files
 from tests.diagnose.axes import BELIEVED, believed, record, recording, write_csv
 
 #: Keys of the outside contract.

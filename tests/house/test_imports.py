@@ -29,6 +29,7 @@ LAYERS: list[set[str]] = [
     {"demo"},
     {"report"},
     {"commission"},
+    {"recovery"},
     {"paper"},
     {"prove"},
     {"benchmark"},

@@ -1,6 +1,6 @@
 """The page of a diagnosis and its pictures: plain sentences first, where before what, mathematics folded behind.
 
-The last step beside `document`, whose numbers it shows; nothing is decided here.
+Stands on the evidence of a diagnosis and on its document, whose numbers it shows; nothing is decided here.
 """
 
 from __future__ import annotations

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from servod.axis_model import load_axis_model
-from servod.demo.concealed import CONCEALED, believed_and_true
-from servod.demo.recovery import motions
 from servod.errors import BadInput
+from servod.recovery.concealed import CONCEALED, believed_and_true
+from servod.recovery.walk import motions
 from servod.shipped import shipped
 
 TABLE1, DEMO = shipped("gains/axes/table1_joint.yaml"), shipped("gains/axes/demo_joint.yaml")

@@ -1,15 +1,15 @@
 """The page of `servoctl demo --diagnose`: what was promised, what came, what was found, and what that gave back.
 
-Behind servod.demo.recovery; the diagnosis has its own page beside it.
+The last step of `walk`; the diagnosis has its own page beside it.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from servod.demo.recovery import DIAGNOSIS, Recovery, error_mrad, promised_mrad, time_s
-from servod.diagnose.report import Report
 from servod.diagnose.sentences import certainty
+from servod.recovery.walk import DIAGNOSIS, Recovery, error_mrad, promised_mrad, time_s
+from servod.report.diagnosis import Report
 from servod.report.figure import Axis, Colour, Curve, Figure, Panel, curve
 from servod.report.figures import mismatch
 from servod.report.figures.signature import signature

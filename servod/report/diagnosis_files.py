@@ -13,7 +13,7 @@ from typing import Any
 from servod.axis_model import axis_model_yaml
 from servod.diagnose.document import diagnosis_document, extended_model, window_evidence
 from servod.diagnose.engine import Diagnosis
-from servod.diagnose.report import write_report
+from servod.report.diagnosis import write_report
 from servod.report.files import write_bytes
 
 #: Names of the files of the outside contract.
