@@ -89,5 +89,6 @@ def _command(model: AxisModel, force: str) -> list[Unknown]:
     room = OFFSET_SHARE * coulomb if coulomb > 0.0 else 1e-9
     own, late = model.torque_offset, model.delay_s
     offset = Unknown("torque_offset", force, own, own - room, own + room, max(coulomb, 1e-9), OFFSET_SHARE)
-    delay = Unknown("delay_s", "s", late, max(late - DELAY_S, 0.0), late + DELAY_S, 1e-3, 0.3)
+    room_s = 0.5 * DELAY_S  # what is more is for the term to say
+    delay = Unknown("delay_s", "s", late, max(late - room_s, 0.0), late + room_s, 1e-3, 0.3)
     return [offset, delay]

@@ -21,6 +21,7 @@ from servod.diagnose.intake import Refusal, taken_in
 from servod.diagnose.locate import Map, maps
 from servod.diagnose.predict import Predictor
 from servod.diagnose.spread import spread
+from servod.diagnose.swap import swapped
 from servod.diagnose.tidy import tidied
 from servod.diagnose.trace import Trace
 from servod.diagnose.unnamed import Unnamed, unnamed
@@ -89,6 +90,7 @@ def diagnose(
     predictor = Predictor(traces, model)
     chooser = Chooser(predictor, model, begun + SEARCH_SHARE * time_limit_s, tell)
     choice = chooser.run()
+    swapped(chooser, choice)
     detail(chooser, choice)
     seconds["search"] = monotonic() - begun - seconds["intake"]
     choice.fit = tidied(chooser, choice.fit)

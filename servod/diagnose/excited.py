@@ -13,8 +13,9 @@ import numpy as np
 
 from servod.diagnose.trace import Trace
 
-#: Inertia must take this share of the command (root mean squares) before effects of SWIFT can be told.
-LEAST_INERTIAL = 0.15
+#: Inertia must take this share of the command (root mean squares) before effects of SWIFT can be told; on an axis that
+#: goes both ways, whose command swings with its friction, less will do.
+LEAST_INERTIAL, LEAST_BOTH_WAYS = 0.15, 0.02
 
 #: Share of the rows, at most, in which an axis that creeps may do otherwise: it had to get there.
 OTHERWISE = 0.05
@@ -37,10 +38,14 @@ GOES = 0.1
 
 def unseen(traces: Sequence[Trace], inertia: float) -> frozenset[str]:
     """Effects that these recordings of an axis of this inertia cannot show."""
+    return (SWIFT if creeps(traces, inertia) else frozenset()) | (DIRECTED if one_way(traces) else frozenset())
+
+
+def one_way(traces: Sequence[Trace]) -> bool:
+    """Whether the axis hardly goes one of its two ways."""
     speed = np.concatenate([trace.velocity[trace.counts] for trace in traces])
     goes = GOES * float(np.quantile(np.abs(speed), 0.98))
-    one_way = min(float(np.mean(speed > goes)), float(np.mean(speed < -goes))) < LEAST_EITHER_WAY
-    return (SWIFT if creeps(traces, inertia) else frozenset()) | (DIRECTED if one_way else frozenset())
+    return min(float(np.mean(speed > goes)), float(np.mean(speed < -goes))) < LEAST_EITHER_WAY
 
 
 def creeps(traces: Sequence[Trace], inertia: float) -> bool:
@@ -48,4 +53,5 @@ def creeps(traces: Sequence[Trace], inertia: float) -> bool:
     needed = np.abs(np.concatenate([inertia * trace.acceleration[trace.counts] for trace in traces]))
     needed = np.minimum(needed, np.quantile(needed, 1.0 - OTHERWISE))
     command = np.concatenate([trace.drive.torque[trace.counts] for trace in traces])
-    return float(np.sqrt(np.mean(needed**2))) < LEAST_INERTIAL * float(np.sqrt(np.mean(command**2)))
+    least = LEAST_INERTIAL if one_way(traces) else LEAST_BOTH_WAYS
+    return float(np.sqrt(np.mean(needed**2))) < least * float(np.sqrt(np.mean(command**2)))

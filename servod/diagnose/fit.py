@@ -94,7 +94,7 @@ class Fitter:
     def mismatch(self, hypothesis: Hypothesis, coordinates: Array) -> Array | None:
         """Mismatch of all rows, or None where the model makes no sense."""
         try:
-            return self.predictor.mismatch(hypothesis.model(coordinates))
+            return self.predictor.mismatch(*hypothesis.models(coordinates, len(self.predictor.traces)))
         except ValidationError:
             return None
 

@@ -65,11 +65,16 @@ Writer = Callable[[Document, Sequence[float]], None]
 Teller = Callable[[Document, Sequence[float]], list[Reported]]
 
 
+#: Writes what differs in one recording, by its number, into its model document.
+EachWriter = Callable[[Document, Sequence[float], int], None]
+
+
 @dataclass(frozen=True)
 class Term:
     """One effect in one form: its unknowns, how they are written, and bounds of the model's own that it opens.
 
     `opens` maps keys of the base to new (low, high) and `begins` to start values. Terms without unknowns open only.
+    `each` writes what differs from recording to recording.
     """
 
     effect: str
@@ -79,6 +84,7 @@ class Term:
     tell: Teller
     opens: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     begins: Mapping[str, float] = field(default_factory=dict)
+    each: EachWriter | None = None
 
 
 @dataclass(frozen=True)
@@ -155,6 +161,20 @@ class Hypothesis:
     def model(self, coordinates: Array) -> AxisModel:
         """The axis model at these coordinates. Raises pydantic's ValidationError where it makes no sense."""
         return AxisModel.model_validate(self.written(coordinates))
+
+    def models(self, coordinates: Array, recordings: int) -> list[AxisModel]:
+        """One model for each recording, or a single one for all. Raises like `model`."""
+        if all(term.each is None for term in self.terms):
+            return [self.model(coordinates)]
+        document, values = self.written(coordinates), self.values(coordinates)
+        found = []
+        for recording in range(recordings):
+            own = copy.deepcopy(document)
+            for index, term in enumerate(self.terms):
+                if term.each is not None:
+                    term.each(own, values[self.share(index)], recording)
+            found.append(AxisModel.model_validate(own))
+        return found
 
 
 def put(document: Document, key: str, value: float) -> None:

@@ -81,7 +81,7 @@ def trace_of(recording: Recording, name: str, shift_s: float) -> Trace:
     warm = recording.get(Quantity.TEMPERATURE)
     has_temperature = warm is not None and bool(np.isfinite(drive.temperature_c).all()) and _warms(drive.temperature_c)
     moved = Drive(t_s, torque, position, drive.temperature_c)
-    return Trace(name, moved, counts, tuple(notes), has_temperature, shift_s - float(drive.t_s[0]))
+    return Trace(name, moved, counts, tuple(notes), has_temperature, shift_s - float(drive.t_s[0]), shift_s)
 
 
 def _shortened(note: str) -> str:

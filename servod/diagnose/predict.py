@@ -123,11 +123,15 @@ class Predictor:
             [np.asarray(getattr(trace, name, getattr(trace.drive, name, None))) for trace in self.traces]
         )
 
-    def mismatch(self, model: AxisModel) -> Array:
-        """Torque mismatch of every row of all traces, N*m or N; 0 in rows that do not count."""
-        p = np.array(model.pack())
+    def mismatch(self, *models: AxisModel) -> Array:
+        """Torque mismatch of every row of all traces, N*m or N; 0 in rows that do not count.
+
+        One model for all traces, or one for each.
+        """
+        packed = [np.array(model.pack()) for model in models]
+        each = packed if len(packed) > 1 else packed * len(self.traces)
         self.evaluations += 1
-        parts = [self._one(p, trace, seen) for trace, seen in zip(self.traces, self.observers, strict=True)]
+        parts = [self._one(p, trace, seen) for p, trace, seen in zip(each, self.traces, self.observers, strict=True)]
         limit = WORST * self.dry
         clean = np.nan_to_num(np.concatenate(parts), nan=limit, posinf=limit, neginf=-limit)
         return np.where(self.counts, np.clip(clean, -limit, limit), 0.0)
@@ -136,7 +140,7 @@ class Predictor:
         drive = trace.drive
         first = trace.first(float(p[P_DELAY_S]))
         state = np.array(rest_state(0.0, 5e-5, float(p[P_START_C])))
-        state[S_FIRST_S] = drive.t_s[0]
+        state[S_FIRST_S] = trace.begun_s
         states = np.array([self._start(p, trace, int(row), first) for row in trace.starts])
         out = np.zeros(len(drive.t_s))
         steps = seen.steps * STEPS_IN_GAP if p[P_GAP] > 0.0 else seen.steps

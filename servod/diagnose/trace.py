@@ -24,7 +24,8 @@ class Trace:
     """A checked recording: `drive` (SI units of the axis), `counts` marks the rows that may be compared with a model.
 
     `notes` say in plain sentences what was found wrong and what was done about it. `shift_s` was added to the recorded
-    times, so that no instant stands in two recordings and an event can belong to one of them.
+    times, so that no instant stands in two recordings and an event can belong to one of them;
+    `begun_s` is the time of its first row then, also for a part of it.
     """
 
     name: str
@@ -33,6 +34,7 @@ class Trace:
     notes: tuple[str, ...]
     has_temperature: bool = False
     shift_s: float = 0.0
+    begun_s: float = 0.0
 
     @cached_property
     def starts(self) -> NDArray[np.int64]:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from servod.diagnose.effects.effect import Effect, simple
+from servod.diagnose.effects.effect import Effect, known_delay, simple
 from servod.diagnose.hypothesis import Term, Unknown
 from servod.diagnose.scene import Scene
 
@@ -14,11 +16,12 @@ STARTS_S = (0.002, 0.006, 0.02)
 
 def terms(scene: Scene) -> list[Term]:
     """A lag from some time constants, and a limited rate."""
-    found = [simple("actuator_lag", "lag", [Unknown("time_constant_s", "s", start, 1e-5, 0.5)]) for start in STARTS_S]
+    own = known_delay(scene.document)
+    lags = [simple("actuator_lag", "lag", [Unknown("time_constant_s", "s", start, 1e-5, 0.5)]) for start in STARTS_S]
     step = np.abs(np.diff(scene.torque)) / max(trace.period_s for trace in scene.predictor.traces)
     fast = max(float(np.quantile(step, 0.98)), 1e-9)
     rate = Unknown("slew_per_s", f"{scene.force}/s", fast, 0.01 * fast, 20.0 * fast)
-    return [*found, simple("actuator_lag", "rate limit", [rate])]
+    return [replace(term, opens=own) for term in (*lags, simple("actuator_lag", "rate limit", [rate]))]
 
 
 EFFECT = Effect(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from servod.diagnose.effects.effect import Effect, simple
+from dataclasses import replace
+
+from servod.diagnose.effects.effect import Effect, known_delay, simple
 from servod.diagnose.hypothesis import Term, Unknown, get
 from servod.diagnose.scene import Scene
 
@@ -16,7 +18,7 @@ def terms(scene: Scene) -> list[Term]:
     found = []
     for start in STARTS_S:
         unknown = Unknown("additional_s", "s", start, -min(own, 0.001), 0.1, 2e-3)
-        found.append(simple("delay", "dead time", [unknown]))
+        found.append(replace(simple("delay", "dead time", [unknown]), opens=known_delay(scene.document)))
     return found
 
 

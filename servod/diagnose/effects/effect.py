@@ -9,8 +9,11 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from servod.diagnose.hypothesis import Document, Reported, Teller, Term, Unknown, Writer
+from servod.diagnose.hypothesis import Document, Reported, Teller, Term, Unknown, Writer, get
 from servod.diagnose.scene import Peak, Scene
+
+#: By how much the model's own delay may be off beside a lag or a longer delay, s.
+OWN_DELAY_S = 0.0002
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,12 @@ def simple(effect: str, form: str, unknowns: Sequence[Unknown], **fixed: float |
     """A term whose unknowns are keys of the effect's own group."""
     write = keys(effect, [u.key for u in unknowns], **fixed)
     return Term(effect, form, tuple(unknowns), write, told(unknowns))
+
+
+def known_delay(document: Document) -> dict[str, tuple[float, float]]:
+    """Bounds of the model's own delay beside an effect that would share a longer one with it."""
+    own = get(document, "delay_s", 0.001)
+    return {"delay_s": (max(own - OWN_DELAY_S, 0.0), own + OWN_DELAY_S)}
 
 
 def harmonic(scene: Scene, n: float, amplitude: float, phase: float) -> Document:

@@ -11,13 +11,15 @@ from servod.diagnose.scene import Scene
 RESONANCES, SHARES = (0.3, 0.7, 1.4, 2.8), (0.3, 0.65)
 
 
+#: Share by which a high command stiffens the spring, to start from.
+BEND = 0.1
+
+
 def terms(scene: Scene) -> list[Term]:
-    """Many starts: the cost has a valley for each resonance that the excitation holds."""
-    return [
-        two_mass_term("joint_elasticity", scene, share, fast * scene.predictor.rate)
-        for fast in RESONANCES
-        for share in SHARES
-    ]
+    """Many starts: the cost has a valley for each resonance that the excitation holds; and springs that stiffen."""
+    grid = [(fast * scene.predictor.rate, share) for fast in RESONANCES for share in SHARES]
+    straight = [two_mass_term("joint_elasticity", scene, share, rate) for rate, share in grid]
+    return straight + [two_mass_term("joint_elasticity", scene, share, rate, bend=BEND) for rate, share in grid[::2]]
 
 
 EFFECT = Effect(

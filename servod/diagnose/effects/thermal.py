@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from servod.diagnose.effects.effect import Effect, share, simple
-from servod.diagnose.hypothesis import Term
+from collections.abc import Sequence
+
+from servod.diagnose.effects.effect import Effect, share, simple, told
+from servod.diagnose.hypothesis import Document, Term, Unknown
 from servod.diagnose.scene import Scene
 
 
 def terms(scene: Scene) -> list[Term]:
-    """By the recorded temperature where there is one, linear and exponential; by time otherwise."""
+    """By the recorded temperature where there is one, linear and exponential; by time; by recording."""
     found = []
     if scene.warm:
         rates = [share(key, 0.0, -0.5, 0.5, 0.05, "1/°C") for key in ("dry_per_c", "viscous_per_c")]
@@ -18,7 +20,31 @@ def terms(scene: Scene) -> list[Term]:
     drifts = [
         share(key, 0.0, -3.0 / length, 3.0 / length, 0.3 / length, "1/s") for key in ("dry_per_s", "viscous_per_s")
     ]
-    return [*found, simple("thermal", "drift", drifts)]
+    count = len(scene.predictor.traces)
+    between = [_between(drifts, count)] if count > 1 else []
+    return [*found, simple("thermal", "drift", drifts), *between]
+
+
+def _between(drifts: list[Unknown], recordings: int) -> Term:
+    """A drift, and another level of friction in each recording than in the first: a colder lubricant."""
+    names = [f"{kind}_recording_{n}" for n in range(2, recordings + 1) for kind in ("dry", "viscous")]
+    levels = [share(name, 0.0, -0.8, 4.0, 1.0) for name in names]
+
+    def each(document: Document, values: Sequence[float], recording: int) -> None:
+        if recording == 0:
+            return
+        dry, viscous = values[2 * recording : 2 * recording + 2]
+        for key, more in (("coulomb", dry), ("static", dry), ("viscous", viscous)):
+            if key in document["friction"]:
+                document["friction"][key] *= 1.0 + more
+
+    drift = simple("thermal", "drift", drifts)
+
+    def write(document: Document, values: Sequence[float]) -> None:
+        drift.write(document, values[:2])
+
+    unknowns = (*drifts, *levels)
+    return Term("thermal", "between recordings", unknowns, write, told(unknowns), each=each)
 
 
 EFFECT = Effect(

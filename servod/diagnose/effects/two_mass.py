@@ -15,8 +15,13 @@ DAMPING, CONTACT_DAMPING = 0.05, 0.4
 GAP_NUDGE = 0.03
 
 
-def two_mass_term(effect: str, scene: Scene, load: float, resonance: float, gap: float = 0.0) -> Term:
-    """A term with a share of the inertia behind a spring that resonates at `resonance` rad/s, and a gap if any."""
+def two_mass_term(
+    effect: str, scene: Scene, load: float, resonance: float, gap: float = 0.0, bend: float = 0.0
+) -> Term:
+    """A term with a share of the inertia behind a spring that resonates at `resonance` rad/s, and a gap if any.
+
+    With `bend` the spring stiffens: by that share of its stiffness at the stretch of a high command.
+    """
     inertia = scene.inertia
     stiffness = resonance**2 * inertia * load * (1.0 - load)
     nudge = GAP_NUDGE if gap > 0.0 else 1e-3
@@ -27,6 +32,10 @@ def two_mass_term(effect: str, scene: Scene, load: float, resonance: float, gap:
         Unknown("stiffness", per, stiffness, stiffness / 300.0, stiffness * 300.0, nudge=nudge),
         Unknown("damping", f"{scene.force}·s/{scene.length}", damping, damping / 300.0, damping * 300.0, nudge=nudge),
     ]
+    if bend > 0.0:
+        stiffening = bend * stiffness**3 / scene.effort**2
+        unit = f"{per}/{scene.length}²"
+        unknowns.append(Unknown("cubic", unit, stiffening, stiffening / 1e4, stiffening * 1e4, nudge=nudge))
     if gap > 0.0:
         unknowns.append(Unknown("gap", scene.length, gap, gap / 50.0, gap * 50.0, nudge=nudge))
 
@@ -37,7 +46,7 @@ def two_mass_term(effect: str, scene: Scene, load: float, resonance: float, gap:
             "damping": values[2],
             "load_viscous": 0.2 * get(document, "friction.viscous"),
         }
-        return found | ({"gap": values[3]} if len(values) > 3 else {})
+        return found | ({unknowns[3].key: values[3]} if len(values) > 3 else {})
 
     def write(document: Document, values: Sequence[float]) -> None:
         found = values_of(document, values)
@@ -48,10 +57,11 @@ def two_mass_term(effect: str, scene: Scene, load: float, resonance: float, gap:
         document[effect] = found
 
     def tell(document: Document, values: Sequence[float]) -> list[Reported]:
-        units = {"load_inertia": "kg" if scene.linear else "kg·m²", "stiffness": per, "gap": scene.length}
+        mass = "kg" if scene.linear else "kg·m²"
+        units = {"load_inertia": mass, "stiffness": per, "gap": scene.length, "cubic": f"{per}/{scene.length}²"}
         other = f"{scene.force}·s/{scene.length}"
         return [
             Reported(k, v, units.get(k, other)) for k, v in values_of(document, values).items() if k != "load_viscous"
         ]
 
-    return Term(effect, "two masses", tuple(unknowns), write, tell)
+    return Term(effect, "stiffening" if bend > 0.0 else "two masses", tuple(unknowns), write, tell)
