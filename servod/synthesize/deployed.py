@@ -14,12 +14,13 @@ import numpy as np
 from servod.axis_model import AxisModel
 from servod.gain_design import Design, DesignMode, RegionProof, Uncertainty, Vertex
 from servod.gain_parameters import RegionGains
+from servod.synthesize.late import too_late
 from servod.synthesize.lmi_deployed import Programme, Solution, synthesise
 from servod.synthesize.regions import pole_disc
 from servod.verify.proof import region_margin, scaled_vertices
 from servod.verify.sampled import Array, timing_of
 from servod.verify.steady_friction import SteadyFriction, steady_friction
-from servod.verify.vertices import Span, fed_commands, joints
+from servod.verify.vertices import Span, fed_commands, joints, known_commands
 
 #: Cut-offs of the velocity filter that are tried, the quietest first; above 800 Hz the encoder shakes the torque.
 CUTOFFS_HZ = (300.0, 500.0, 800.0)
@@ -109,7 +110,7 @@ def scales(friction: SteadyFriction, design: Design) -> tuple[list[float], float
     torque = friction.largest(design.speed_max_rad_s)
     position = torque / (friction.inertia * POSITION_BANDWIDTH_RAD_S**2)
     speed = position * POSITION_BANDWIDTH_RAD_S
-    commands = fed_commands(timing_of(design))
+    commands = known_commands(timing_of(design))
     return [position, speed, *[torque] * commands, speed, torque / friction.stiffness], torque
 
 
@@ -197,7 +198,7 @@ def region(design: Design, span: Span, wishes: Wishes) -> RegionProof | None:
 def regions(model: AxisModel, wishes: Wishes) -> Design | None:
     """Both regions at the first feasible choice of what `wishes` leaves open; None when there is none."""
     low, high = wishes.spans
-    for choice in wishes.choices():
+    for choice in () if too_late(model, wishes.period_s) else wishes.choices():
         assert choice.cutoff_hz is not None
         design = empty_design(model, choice, choice.cutoff_hz)
         hard = region(design, high, choice)
@@ -231,6 +232,9 @@ def clashing_vertices(design: Design, span: Span, wishes: Wishes) -> Iterator[st
 
 def explain(model: AxisModel, wishes: Wishes) -> Infeasible:
     """Why there is no design, and the smallest relaxation of each wish that alone makes one."""
+    late = too_late(model, wishes.period_s)
+    if late is not None:
+        return Infeasible(tuple(span.name for span in wishes.spans), (late,), ())
     design = empty_design(model, wishes, wishes.cutoff_hz or CUTOFFS_HZ[-1])
     failed = [span for span in wishes.spans if region(design, span, wishes) is None]
     clashes = [line for span in failed for line in clashing_vertices(design, span, wishes)]

@@ -116,6 +116,11 @@ def fed_commands(timing: Timing) -> int:
     return min(max(timing.kept_commands, round(timing.delay_s / timing.period_s) + 1), COMMANDS)
 
 
+def known_commands(timing: Timing) -> int:
+    """Number of past commands among the states: those that are fed back, and those of a longer delay that still act."""
+    return max(fed_commands(timing), timing.kept_commands)
+
+
 def sampled_vertices(found: list[Joint], timing: Timing) -> tuple[Array, Array, Array]:
     """(A, B, E) of all vertices, states [x, v_f, u_(k-1), ..., v - v_f, z]: what the law feeds back comes first."""
     a, b, e = (np.array([getattr(joint, name) for joint in found]) for name in ("a", "b", "e"))
@@ -127,7 +132,7 @@ def sampled_vertices(found: list[Joint], timing: Timing) -> tuple[Array, Array, 
 
 def _with_memory(a: Array, b: Array, e: Array, timing: Timing) -> tuple[Array, Array, Array]:
     """The same systems with the commands that are only remembered as further states at the end."""
-    size, more = a.shape[-1], max(fed_commands(timing) - timing.kept_commands, 0)
+    size, more = a.shape[-1], known_commands(timing) - timing.kept_commands
     full_a = np.pad(a, ((0, 0), (0, more), (0, more)))
     full_b, full_e = np.pad(b, ((0, 0), (0, more))), np.pad(e, ((0, 0), (0, more)))
     for i in range(size, size + more):
