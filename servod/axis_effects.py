@@ -278,6 +278,17 @@ class Disturbance(Strict):
     windows: tuple[DisturbanceWindow, ...] = Field(min_length=1, max_length=64)
 
 
+class OffsetDrift(Strict):
+    """The torque offset drifts: torque += per_s*t, or per_s*time_s*(1 - exp(-t/time_s)) when time_s is given.
+
+    t counts from the first row of a recording, from power-on in a virtual axis. Source: offset of a current sensor or
+    amplifier that warms up (data sheets: offset drift); a counterbalance that leaks; a cable that settles.
+    """
+
+    per_s: float = Field(description="N*m/s at the first row, with the command's sign")
+    time_s: Positive | None = Field(None, description="s in which the drift ends; None = it goes on")
+
+
 class Table(Strict):
     """A resisting torque as a piecewise linear function, zero outside its grid."""
 

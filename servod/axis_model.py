@@ -127,6 +127,7 @@ class AxisModel(Strict):
     position_dependent_inertia: fx.PositionDependentInertia | None = None
     encoder_eccentricity: fx.EncoderEccentricity | None = None
     disturbance: fx.Disturbance | None = None
+    offset_drift: fx.OffsetDrift | None = None
     residual: fx.Residual | None = None
     noise: fx.Noise | None = None
     identified: Identified | None = Field(None, description="what was measured, with 95 % intervals; no physics")

@@ -48,6 +48,8 @@ def pack(model: AxisModel) -> tuple[float, ...]:
     """The flat parameters of `model`, SI units, in the order of `servod.models.layout`."""
     packer = _Packer()
     packer.put(delay_s=model.total_delay_s, offset=model.torque_offset)
+    if model.offset_drift is not None:
+        packer.put(offset_per_s=model.offset_drift.per_s, offset_time_s=model.offset_drift.time_s or 0.0)
     packer.put(complex=any(getattr(model, name) is not None for name in _OUTSIDE_PLAIN))
     _friction(packer, model)
     _friction_effects(packer, model)

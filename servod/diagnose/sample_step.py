@@ -17,6 +17,7 @@ from servod.models.effects import (
     joint_spring,
     load_torque,
     nonlinear_viscous,
+    offset,
     resisting_torque,
     ripple,
 )
@@ -30,7 +31,6 @@ from servod.models.layout import (
     P_LOAD_INERTIA,
     P_LOAD_VISCOUS,
     P_NEGATIVE_VISCOUS,
-    P_OFFSET,
     P_POSITIVE_VISCOUS,
     P_SIGMA0,
     P_SIGMA1,
@@ -65,7 +65,7 @@ def step(
     load_position = s[S_LOAD_POSITION] + 0.5 * h * load_speed
     drive = mean_drive(p, s, command, h) * ripple(p, position)
     load = load_torque(p, load_position, s[S_TIME_S] + 0.5 * h)
-    push = drive + p[P_OFFSET] - resisting_torque(p, position, velocity, s[S_TIME_S] + 0.5 * h)
+    push = drive + offset(p, s) - resisting_torque(p, position, velocity, s[S_TIME_S] + 0.5 * h)
     grip = directed_curve(p, velocity) * dry_factor(p, position) * dry
     grip += p[P_FRICTION_PER_COMMAND] * abs(drive) + p[P_FRICTION_PER_LOAD] * abs(load)
     slide = p[P_VISCOUS] * (p[P_POSITIVE_VISCOUS] if velocity >= 0.0 else p[P_NEGATIVE_VISCOUS])

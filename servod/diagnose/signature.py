@@ -50,6 +50,7 @@ LOOKS: dict[str, Look] = {
     "encoder_eccentricity": Look("position", Split.DIRECTION, periodic=True),
     "torque_offset": Look("time"),
     "disturbance": Look("time"),
+    "offset_drift": Look("time"),
 }
 
 

@@ -18,6 +18,7 @@ from servod.models.effects import (
     inertia_at,
     load_torque,
     nonlinear_viscous,
+    offset,
     resisting_torque,
     ripple,
     spring_step,
@@ -35,7 +36,6 @@ from servod.models.layout import (
     P_INERTIA,
     P_LOAD_INERTIA,
     P_NEGATIVE_VISCOUS,
-    P_OFFSET,
     P_POSITIVE_VISCOUS,
     P_SIGMA0,
     P_SIGMA1,
@@ -86,7 +86,7 @@ def _advance_plain(
     p: Params, s: State, command: float, external: float, steps: int, h: float, delay_s: float, temperature_c: float
 ) -> None:
     position, velocity, bristle, friction = s[S_POSITION], s[S_VELOCITY], s[S_BRISTLE], s[S_FRICTION]
-    inertia, gravity, beside = p[P_INERTIA], p[P_GRAVITY], p[P_OFFSET] + external
+    inertia, gravity, beside = p[P_INERTIA], p[P_GRAVITY], offset(p, s) + external
     cogging, rows = int(p[P_COGGING]), int(p[P_COGGING_N])
     dry_warm, viscous_warm = thermal_factors(p, s, temperature_c)
     whole, part = delay_steps(delay_s, h)
@@ -127,7 +127,7 @@ def _general_step(p: Params, s: State, external: float, h: float, dry_warm: floa
     position, velocity = s[S_POSITION], s[S_VELOCITY]
     load = load_torque(p, s[S_LOAD_POSITION], s[S_TIME_S]) - external
     drive = s[S_TORQUE] * ripple(p, position)
-    torque = drive + p[P_OFFSET] - resisting_torque(p, position, velocity, s[S_TIME_S])
+    torque = drive + offset(p, s) - resisting_torque(p, position, velocity, s[S_TIME_S])
     dry = directed_curve(p, velocity) * dry_factor(p, position) * dry_warm
     dry += p[P_FRICTION_PER_COMMAND] * abs(drive) + p[P_FRICTION_PER_LOAD] * abs(load)
     viscous = p[P_VISCOUS] * (p[P_POSITIVE_VISCOUS] if velocity >= 0.0 else p[P_NEGATIVE_VISCOUS])

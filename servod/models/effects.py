@@ -122,6 +122,19 @@ def ripple(p: Params, x: float) -> float:
     return 1.0 + harmonics(p, int(p[lay.P_RIPPLE]), int(p[lay.P_RIPPLE_N]), x)
 
 
+def offset(p: Params, s: State) -> float:
+    """Constant torque beside the command, with what it has drifted since the first step."""
+    if p[lay.P_OFFSET_PER_S] == 0.0:
+        return p[lay.P_OFFSET]
+    return p[lay.P_OFFSET] + p[lay.P_OFFSET_PER_S] * drifted(s, p[lay.P_OFFSET_TIME_S])
+
+
+def drifted(s: State, limit_s: float) -> float:
+    """Time since the first step, s; of a drift that ends (`limit_s` above 0), the time it would take without an end."""
+    time_s = s[lay.S_TIME_S] - s[lay.S_FIRST_S]
+    return time_s if limit_s == 0.0 else limit_s * (1.0 - math.exp(-time_s / limit_s))
+
+
 def resisting_torque(p: Params, x: float, velocity: float, time_s: float) -> float:
     """Cogging and the tables of unexplained torque: what resists on the motor side besides friction."""
     torque = 0.0
@@ -230,9 +243,7 @@ def thermal_factors(p: Params, s: State, temperature_c: float) -> tuple[float, f
     if p[lay.P_THERMAL] == 0.0:
         return 1.0, 1.0
     warm = s[lay.S_TEMPERATURE_C] if math.isnan(temperature_c) else temperature_c
-    above, limit = warm - p[lay.P_REFERENCE_C], p[lay.P_DRIFT_TIME_S]
-    time_s = s[lay.S_TIME_S] - s[lay.S_FIRST_S]
-    drift = time_s if limit == 0.0 else limit * (1.0 - math.exp(-time_s / limit))
+    above, drift = warm - p[lay.P_REFERENCE_C], drifted(s, p[lay.P_DRIFT_TIME_S])
     dry, viscous = p[lay.P_DRY_PER_C] * above, p[lay.P_VISCOUS_PER_C] * above
     if p[lay.P_THERMAL_EXPONENTIAL] > 0.0:
         dry, viscous = math.exp(dry) - 1.0, math.exp(viscous) - 1.0

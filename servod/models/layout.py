@@ -21,6 +21,8 @@ from __future__ import annotations
     P_GRAVITY,
     P_GRAVITY_PHASE,
     P_OFFSET,
+    P_OFFSET_PER_S,  # 0 = the offset does not drift
+    P_OFFSET_TIME_S,  # 0 = its drift has no end
     P_DELAY_S,
     P_COMPLEX,  # 1 = some effect is present that the plain loop leaves out
     P_POSITIVE_DRY,  # factors of dry and viscous friction by direction
@@ -87,7 +89,7 @@ from __future__ import annotations
     P_RESIDUAL_TIME,
     P_RESIDUAL_TIME_N,
     P_SIZE,
-) = range(77)
+) = range(79)
 
 # --- states: the fixed part of s, then the command delay line ----------------------------------------------------
 (

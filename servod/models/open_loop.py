@@ -22,6 +22,7 @@ from servod.models.effects import (
     joint_spring,
     load_torque,
     nonlinear_viscous,
+    offset,
     resisting_torque,
     ripple,
     static_stretch,
@@ -37,7 +38,6 @@ from servod.models.layout import (
     P_LOAD_INERTIA,
     P_LOAD_VISCOUS,
     P_NEGATIVE_VISCOUS,
-    P_OFFSET,
     P_POSITIVE_VISCOUS,
     P_SIGMA0,
     P_VISCOUS,
@@ -182,7 +182,7 @@ def _settle(p: Params, s: Any, motion: Any, before: float, time_s: float, temper
     dry, viscous = _friction(p, s, temperature_c)
     stiff = p[P_SIGMA0] if p[P_SIGMA0] > 0.0 else math.inf
     if p[P_LAG_S] > 0.0 and s[S_VELOCITY] != 0.0 and abs(s[S_VELOCITY]) * stiff > dry * BRISTLE_CORRECTION_PER_S:
-        beside = resisting_torque(p, s[S_POSITION], s[S_VELOCITY], time_s) - p[P_OFFSET]
+        beside = resisting_torque(p, s[S_POSITION], s[S_VELOCITY], time_s) - offset(p, s)
         s[S_TORQUE] = carried + beside + math.copysign(dry, s[S_VELOCITY]) + viscous * s[S_VELOCITY]
         s[S_TORQUE] /= ripple(p, s[S_POSITION])
     _follow_bristle(p, s, carried, temperature_c, math.inf)
@@ -233,7 +233,7 @@ def _follow_bristle(p: Params, s: Any, carried: float, temperature_c: float, h: 
     position, velocity = s[S_POSITION], s[S_VELOCITY]
     dry, viscous = _friction(p, s, temperature_c)
     drive = s[S_TORQUE] * ripple(p, position)
-    friction = drive + p[P_OFFSET] - resisting_torque(p, position, velocity, s[S_TIME_S]) - carried
+    friction = drive + offset(p, s) - resisting_torque(p, position, velocity, s[S_TIME_S]) - carried
     balance = (friction - viscous * velocity) / p[P_SIGMA0]
     rate = p[P_SIGMA0] * abs(velocity) / dry + BRISTLE_CORRECTION_PER_S
     goal = (velocity + BRISTLE_CORRECTION_PER_S * balance) / rate

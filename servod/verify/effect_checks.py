@@ -119,7 +119,7 @@ def covered(effects: dict[str, Effect]) -> str:
     slope = max(-own.position_slope[0], own.position_slope[1])
     factors += [f"slope {slope:.2g} N*m/rad"] if slope else []
     told = f" ({own.told})" if own.told else ""
-    return f"{', '.join(factors)}{told}: {', '.join(effects)}"
+    return f"{', '.join(factors)}{told}: {', '.join(effects)}".lstrip()
 
 
 def _range(ends_of: tuple[float, float]) -> str:

@@ -90,7 +90,18 @@ def level_of(model: AxisModel, friction: SteadyFriction, top_rad_s: float) -> Le
     spring, load = model.spring, abs(model.gravity.amplitude) if model.gravity else 0.0
     if spring is not None:
         load += (spring.stiffness + spring.cubic * SPRING_STRETCH_RAD**2) * SPRING_STRETCH_RAD
-    return Level(friction, top_rad_s, load)
+    offset = drifted_offset(model, Level(friction, top_rad_s, load))
+    return Level(friction, top_rad_s, load + abs(offset))
+
+
+def drifted_offset(model: AxisModel, level: Level) -> float:
+    """What the drift of the offset adds to the load at its end, N*m; one without an end is followed as a factor is."""
+    drift = model.offset_drift
+    if drift is None or drift.per_s == 0.0:
+        return 0.0
+    if drift.time_s is not None:
+        return drift.per_s * drift.time_s
+    return math.copysign((DRIFT[1] - 1.0) * level.least_dry_nm, drift.per_s)
 
 
 def around(share: float) -> Ends:
@@ -196,6 +207,17 @@ def _gain_by_sign(model: AxisModel, level: Level) -> Effect:
     return Effect(torque_gain=(ends[0], ends[1]))
 
 
+def _offset_drift(model: AxisModel, level: Level) -> Effect:
+    """A constant torque closes no loop: it is load, and until when a drift without an end is followed is told."""
+    drift = model.offset_drift
+    assert drift is not None
+    end_nm = drifted_offset(model, level)
+    if end_nm == 0.0:
+        return Effect()
+    lasts = f" after {end_nm / drift.per_s:.3g} s" if drift.time_s is None else ""
+    return Effect(told=f"offset drifts by {end_nm:.2g} N*m{lasts}")
+
+
 def _residual(model: AxisModel, _level: Level) -> Effect:
     """Tables over position and velocity by their steepest pieces; one over time acts from outside."""
     r = model.residual
@@ -221,6 +243,7 @@ EFFECTS: dict[str, Callable[[AxisModel, Level], Effect]] = {
     "encoder_eccentricity": _eccentricity,
     "torque_saturation": _saturation,
     "torque_gain": _gain_by_sign,
+    "offset_drift": _offset_drift,
     "residual": _residual,
 }
 

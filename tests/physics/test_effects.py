@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -198,6 +199,18 @@ def test_friction_drifts_with_time() -> None:
         axis.advance(0.0, 0.01)
     factor = 1.0 + 0.1 * 2.0 * (1.0 - math.exp(-1.0))
     assert axis.friction_nm == pytest.approx(factor * g(0.3) + 0.056 * 0.3, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("ends", "speed"),
+    [({}, 0.5 * 0.02 * 0.5**2), ({"time_s": 0.1}, 0.02 * 0.1 * (0.5 - 0.1 * (1.0 - math.exp(-5.0))))],
+)
+@pytest.mark.parametrize("more", [{}, {"spring": {"stiffness": 0.0}}], ids=["plain", "general"])
+def test_an_offset_drifts_with_time(ends: dict[str, float], speed: float, more: dict[str, Any]) -> None:
+    """A free axis of 0.001 kg*m^2 gets the integral of the torque, in either loop."""
+    axis = plant(smooth(offset_drift={"per_s": 0.02, **ends}, **more))
+    rows = states(axis, 0.0, 0.5)
+    assert rows[-1, 1] == pytest.approx(speed / 0.001, rel=5e-3)
 
 
 def test_disturbance_acts_in_its_window_only() -> None:

@@ -51,6 +51,7 @@ EVERYTHING: dict[str, Any] = {
     "position_dependent_inertia": {"harmonics": [{"amplitude": 0.2, "periods_per_turn": 2}]},
     "encoder_eccentricity": {"harmonics": [{"amplitude": 0.001, "periods_per_turn": 1}]},
     "disturbance": {"windows": [{"start_s": 0.1, "end_s": 0.2, "torque": 0.02, "frequency_hz": 7.0}]},
+    "offset_drift": {"per_s": 0.01, "time_s": 0.2},
     "residual": {"velocity": {"grid": [-1.0, 0.0, 1.0], "torque": [0.0, 0.002, -0.001]}},
     "noise": {"torque_rms": 0.001, "encoder_rms": 1e-5},
 }

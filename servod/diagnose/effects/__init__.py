@@ -7,7 +7,7 @@ from importlib import import_module
 
 from servod.diagnose.effects.effect import Effect
 
-#: Names of the outside contract, in the order in which they are tried and explained.
+#: Names of the outside contract and our own (offset_drift), in the order in which they are tried and explained.
 NAMES: tuple[str, ...] = (
     "asymmetry",
     "stribeck",
@@ -31,6 +31,7 @@ NAMES: tuple[str, ...] = (
     "encoder_eccentricity",
     "torque_offset",
     "disturbance",
+    "offset_drift",
 )
 
 
