@@ -32,15 +32,13 @@ from servod.synthesize.deployed import Infeasible, Wishes
 from servod.synthesize.gain_set import Options, synthesize
 from servod.tracking.metrics import Array, score
 from servod.verify.certify import verify
+from servod.verify.checks import LEAST_PLANTS
 
 #: Told what is done, and the share of the whole that is.
 Tell = Callable[[str, float], None]
 
 #: Opens an enabled axis: joint, gain set, folder, seed of its noise.
 OpenAxis = Callable[[AxisModel, GainSet, Path, int], AbstractContextManager[RecoveryAxis]]
-
-#: How long (19) is tracked, how much of it is diagnosed, and how long each motion for the diagnosis is, s.
-PAPER_S, DIAGNOSED_S, MOTION_S = 30.0, 14.0, 12.0
 
 #: Shares of the usual uncertainty that a design is tried with: what recordings fitted is known better.
 SCALES = (1.0, 0.5, 0.25)
@@ -50,6 +48,18 @@ DIAGNOSIS = "diagnosis"
 
 #: What the diagnosis may take, s.
 TIME_LIMIT_S = 60.0
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How long (19) is tracked, how much of it is diagnosed, how long each motion for the diagnosis is, s; and the
+    plants of a certificate.
+    """
+
+    paper_s: float = 30.0
+    diagnosed_s: float = 14.0
+    motion_s: float = 12.0
+    plants: int = LEAST_PLANTS
 
 
 @dataclass(frozen=True)
@@ -111,28 +121,35 @@ def error_mrad(rows: Rows) -> Array:
 
 
 def recover(
-    believed: AxisModel, true: AxisModel, effect: str, open_axis: OpenAxis, out: Path, tell: Tell, seed: int = 1
+    believed: AxisModel,
+    true: AxisModel,
+    effect: str,
+    open_axis: OpenAxis,
+    out: Path,
+    tell: Tell,
+    seed: int = 1,
+    effort: Effort = Effort(),
 ) -> Recovery:
     """Run the whole story; files stay in `out`. Raises AnswerIsNo when a step's answer is no."""
     tell("design for what is believed", 0.02)
     write_bytes(out / "believed.yaml", axis_model_yaml(believed).encode())
-    first = designed(believed, out / "believed.yaml", out / "gains_before.yaml", None)
+    first = designed(believed, out / "believed.yaml", out / "gains_before.yaml", None, effort.plants)
     with tempfile.TemporaryDirectory(prefix="servod-demo-") as folder:
         tell("the axis as it is believed to be", 0.2)
         with open_axis(believed, first, _folder(folder, "believed"), seed) as axis:
-            before = axis.paper(PAPER_S)
+            before = axis.paper(effort.paper_s)
         with open_axis(true, first, _folder(folder, "true"), seed) as axis:
             tell("the axis as it is", 0.25)
-            concealed = axis.paper(PAPER_S)
-            recordings = _recorded(axis, concealed, out, tell)
+            concealed = axis.paper(effort.paper_s)
+            recordings = _recorded(axis, concealed, out, tell, effort)
             tell("diagnosis", 0.4)
             found, document = _diagnosed(believed, recordings, out / DIAGNOSIS)
             tell("design for what was found", 0.65)
             extended = out / DIAGNOSIS / MODEL
-            second = designed(load_axis_model(extended), extended, out / "gains_after.yaml", first)
+            second = designed(load_axis_model(extended), extended, out / "gains_after.yaml", first, effort.plants)
             done = deploy(axis.link, second, lambda what, share: tell(f"deploy: {what}", 0.85 + 0.08 * share))
             tell("the axis under what was found", 0.95)
-            after = axis.paper(PAPER_S)
+            after = axis.paper(effort.paper_s)
     return Recovery(effect, before, concealed, after, found, document, first, second, done)
 
 
@@ -142,7 +159,7 @@ def _folder(parent: str, name: str) -> Path:
     return folder
 
 
-def designed(model: AxisModel, model_file: Path, gains_file: Path, same_filter: GainSet | None) -> GainSet:
+def designed(model: AxisModel, model_file: Path, gains_file: Path, same_filter: GainSet | None, plants: int) -> GainSet:
     """The paper's law for `model` with a certificate, without a disturbance observer beside it, which would hide much.
 
     `same_filter` is a set whose velocity filter the axis has already. Raises AnswerIsNo.
@@ -155,7 +172,7 @@ def designed(model: AxisModel, model_file: Path, gains_file: Path, same_filter: 
         if isinstance(found, Infeasible):
             said = f"no feedback for {model_file.name}: {'; '.join(found.clashes)}"
             continue
-        checked = verify(found, where=str(gains_file))
+        checked = verify(found, plants, where=str(gains_file), least_plants=plants)
         certified = checked.certified(found)
         write_bytes(gains_file, certified.to_yaml().encode())
         if checked.valid:
@@ -164,10 +181,10 @@ def designed(model: AxisModel, model_file: Path, gains_file: Path, same_filter: 
     raise AnswerIsNo(said)
 
 
-def _recorded(axis: RecoveryAxis, tracked: Rows, out: Path, tell: Tell) -> list[Path]:
+def _recorded(axis: RecoveryAxis, tracked: Rows, out: Path, tell: Tell, effort: Effort) -> list[Path]:
     """The axis's own recordings: a part of (19), and motions that show more."""
-    runs = {"paper": tracked[time_s(tracked) < DIAGNOSED_S]}
-    for index, (name, positions) in enumerate(motions(MOTION_S).items()):
+    runs = {"paper": tracked[time_s(tracked) < effort.diagnosed_s]}
+    for index, (name, positions) in enumerate(motions(effort.motion_s).items()):
         tell(f"recording: {name}", 0.3 + 0.03 * index)
         runs[name] = axis.follow(positions.tolist())
     paths = [out / "recordings" / f"{name}.mcap" for name in runs]
