@@ -35,17 +35,19 @@ SOAK_UP = frozenset(
 TRIED = 3
 
 
-def detail(chooser: Chooser, choice: Choice) -> None:
-    """Add terms to `choice` where much is left, all or none of them."""
+def detail(chooser: Chooser, choice: Choice) -> bool:
+    """Add terms to `choice` where much is left, all or none of them; whether any came in."""
     if not choice.fit.hypothesis.terms or not much_left(chooser, choice):
-        return
+        return False
     refined = replace(choice, merits=list(choice.merits), entries=list(choice.entries))
     while len(refined.fit.hypothesis.terms) < MOST_TERMS and monotonic() < chooser.deadline:
         if chooser.nothing_left(refined.fit.mismatch) or not _add(chooser, refined):
             break
-    if chooser.merit(choice.fit, refined.fit).of_left >= LEAST_TOGETHER:
-        choice.fit, choice.merits, choice.entries = refined.fit, refined.merits, refined.entries
-        choice.tried, choice.floor = chooser.tried, chooser.floor
+    if refined.fit is choice.fit or chooser.merit(choice.fit, refined.fit).of_left < LEAST_TOGETHER:
+        return False
+    choice.fit, choice.merits, choice.entries = refined.fit, refined.merits, refined.entries
+    choice.tried, choice.floor = chooser.tried, chooser.floor
+    return True
 
 
 def much_left(chooser: Chooser, choice: Choice) -> bool:

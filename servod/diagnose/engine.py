@@ -20,6 +20,7 @@ from servod.diagnose.held_out import HeldOut, held_out
 from servod.diagnose.intake import Refusal, taken_in
 from servod.diagnose.locate import Map, maps
 from servod.diagnose.predict import Predictor
+from servod.diagnose.slow import slow
 from servod.diagnose.spread import spread
 from servod.diagnose.swap import swapped
 from servod.diagnose.tidy import tidied
@@ -91,7 +92,8 @@ def diagnose(
     chooser = Chooser(predictor, model, begun + SEARCH_SHARE * time_limit_s, tell)
     choice = chooser.run()
     swapped(chooser, choice)
-    detail(chooser, choice)
+    if detail(chooser, choice):
+        slow(chooser, choice)
     seconds["search"] = monotonic() - begun - seconds["intake"]
     choice.fit = tidied(chooser, choice.fit)
     chooser.lower_floor(choice.fit.mismatch)

@@ -9,12 +9,15 @@ import numpy as np
 import pytest
 
 from servod.diagnose.base import document_of
+from servod.diagnose.choose import Choice, Chooser
+from servod.diagnose.detail import LEAST_TORQUE
 from servod.diagnose.document import diagnosis_document
 from servod.diagnose.effects import effect
 from servod.diagnose.engine import diagnose
 from servod.diagnose.intake import taken_in
 from servod.diagnose.predict import Predictor
 from servod.diagnose.scene import Scene
+from servod.diagnose.slow import slow
 from tests.diagnose.axes import believed, record
 
 
@@ -32,15 +35,8 @@ def test_a_drift_is_named() -> None:
     assert values["per_s"] * lasts * (1.0 - math.exp(-5.0 / lasts)) == pytest.approx(0.03, rel=0.05)
 
 
-@pytest.mark.parametrize(
-    ("name", "hidden"),
-    [
-        ("torque_offset", {"torque_offset": 0.02}),
-        ("thermal", {"thermal": {"dry_per_s": 0.05, "viscous_per_s": 0.05}}),
-    ],
-)
-def test_nothing_else_is_a_drift(name: str, hidden: dict[str, Any]) -> None:
-    assert list(findings(**hidden)) == [name]
+def test_friction_that_drifts_is_none() -> None:
+    assert list(findings(thermal={"dry_per_s": 0.05, "viscous_per_s": 0.05})) == ["thermal"]
 
 
 def test_a_drift_starts_near_its_size() -> None:
@@ -53,3 +49,21 @@ def test_a_drift_starts_near_its_size() -> None:
     assert change.start == pytest.approx(0.006 * traces[0].duration_s, rel=0.2)
     late = 1.0 - np.exp(-traces[0].duration_s / time_s.start)
     assert changes.start * late == pytest.approx(0.006 * traces[0].duration_s, rel=0.3)
+
+
+@pytest.mark.parametrize(
+    ("hidden", "terms"), [({"offset_drift": {"per_s": 0.0006}}, ["offset_drift"]), ({"torque_offset": 0.002}, [])]
+)
+def test_a_small_drift_is_found_over_seconds(hidden: dict[str, Any], terms: list[str]) -> None:
+    """2.5 % of dry friction over the recording: under what any row shows of an effect worth naming."""
+    model = believed()
+    traces, _ = taken_in(record(believed(**hidden)), model)
+    predictor = Predictor(traces, model)
+    chooser = Chooser(predictor, model, math.inf, lambda _line: None)
+    base = chooser.settled(chooser.start, None, predictor.mismatch(model))
+    choice = Choice(base, base, [], [], {}, 0.0, 0)
+    slow(chooser, choice)
+    assert [term.effect for term in choice.fit.hypothesis.terms] == terms
+    if terms:
+        assert choice.fit.values[-1] / traces[0].duration_s == pytest.approx(0.0006, rel=0.15)
+        assert choice.merits[0].torque < LEAST_TORQUE
