@@ -49,7 +49,8 @@ def base_unknowns(model: AxisModel) -> tuple[Unknown, ...]:
     axis = "m" if model.axis.value == "linear" else "rad"
     force = "N" if axis == "m" else "N·m"
     inertia = known("inertia", "kg" if axis == "m" else "kg·m²", model.inertia)
-    return (inertia, *_friction(document, axis, force), *_gravity(document, force), *_command(model, force))
+    own = (*_friction(document, axis, force), *_gravity(document, force), *_command(model, force))
+    return (inertia, *own, *_drift(document, force))
 
 
 def _friction(document: Document, axis: str, force: str) -> list[Unknown]:
@@ -92,3 +93,11 @@ def _command(model: AxisModel, force: str) -> list[Unknown]:
     room_s = 0.5 * DELAY_S  # what is more is for the term to say
     delay = Unknown("delay_s", "s", late, max(late - room_s, 0.0), late + room_s, 1e-3, 0.3)
     return [offset, delay]
+
+
+def _drift(document: Document, force: str) -> list[Unknown]:
+    """A drift that the model has from other recordings: anything from none at all to all of it in these."""
+    per_s = get(document, "offset_drift.per_s")
+    if per_s == 0.0:
+        return []
+    return [Unknown("offset_drift.per_s", f"{force}/s", per_s, min(per_s, 0.0), max(per_s, 0.0), abs(per_s), 1.0)]

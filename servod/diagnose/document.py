@@ -6,7 +6,7 @@ The last step before the files: plain numbers, sentences for people, nothing dec
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -42,6 +42,7 @@ def diagnosis_document(diagnosis: Diagnosis, windows: Sequence[WindowErrors] | N
     found: dict[str, Any] = {"verdict": diagnosis.verdict.value, "summary": summary(diagnosis)}
     found["findings"] = findings(evidence) if evidence else []
     found["recalibrated"] = recalibrated(evidence) if evidence else {}
+    found["summary"] = " ".join(part for part in (found["summary"], differs(found["recalibrated"])) if part)
     found["minor"] = minor(evidence) if evidence else {}
     found["fit"] = fit_document(diagnosis, evidence, windows) if evidence else {}
     if evidence is not None and evidence.unnamed is not None:
@@ -71,6 +72,17 @@ def summary(diagnosis: Diagnosis) -> str:
         where = evidence.maps_before[0].coordinate
         return f"Something is left that no known physics explains; it shows most over {where}."
     return "The model is adequate: nothing worth naming is left beyond the noise."
+
+
+def differs(changes: Mapping[str, Any]) -> str:
+    """What was recalibrated, as a sentence about these recordings; empty where nothing was."""
+    said = []
+    for name, change in changes.items():
+        words = name.removeprefix("friction.").removesuffix(".per_s").removesuffix("_s").replace("_", " ")
+        was, now, unit = change["from"], change["to"], change["unit"]
+        share = f" ({100.0 * (now - was) / abs(was):+.2g} %)" if was != 0.0 else ""
+        said.append(f"{words} is {now:.4g} instead of {was:.4g} {unit}{share}")
+    return f"What differs from the model in these recordings: {'; '.join(said)}." if said else ""
 
 
 def findings(evidence: Evidence) -> list[dict[str, Any]]:
