@@ -23,6 +23,8 @@ Width = Annotated[
     float,
     Field(ge=0.0, le=1.0, description="with the reference at rest and less error than this, nothing integrates"),
 ]
+# Sets are sealed and certified by their hash. A key that comes later is None where it is missing, and so out of the
+# hash; with another default every set of an earlier version would read as changed.
 
 
 class WeightShape(StrEnum):
@@ -243,8 +245,12 @@ class LocalParameters(Strict):
     error_limit_rad: float | None = Field(
         None, gt=0.0, le=1e3, description="the feedback sees no more error, which bounds the speed of a step"
     )
-    rest_within_rad: Width = Field(0.0, description="with less error than this, a joint that shall stand is at rest")
-    rest_share: float = Field(1.0, gt=0.0, le=1.0, description="of feedback and observer that is left at rest")
+    rest_within_rad: Width | None = Field(
+        None, description="with less error than this, a joint that shall stand is at rest; without: never"
+    )
+    rest_share: float | None = Field(
+        None, gt=0.0, le=1.0, description="of feedback and observer that is left at rest; without: all"
+    )
     position_feedforward: PositionFeedforward | None = None
 
     def pack(self) -> tuple[float, ...]:
@@ -269,8 +275,8 @@ class LocalParameters(Strict):
             *self.regions.high.pack_memory(),
             (observer.low_bandwidth_rad_s or observer.bandwidth_rad_s) if observer else 0.0,
             self.error_limit_rad or 0.0,
-            self.rest_within_rad,
-            self.rest_share,
+            self.rest_within_rad or 0.0,
+            self.rest_share or 1.0,
             float(len(f.sets)),
             *(s.velocity_rad_s for s in f.sets),
             *(s.decay_per_s for s in f.sets),

@@ -183,8 +183,13 @@ class GainStore:
 
     def active(self) -> StoredSet | None:
         """The active set; None before the first activation."""
+        current = self.active_reference()
+        return None if current is None else self.get(current.name, current.version)
+
+    def active_reference(self) -> SetReference | None:
+        """Name and version of the active set, whatever has become of its file; None before the first activation."""
         state = self._active()
-        return None if state is None else self.get(state.current.name, state.current.version)
+        return None if state is None else state.current
 
     def activate(
         self, name: str, version: int | None = None, note: str = "", figures: dict[str, float] | None = None

@@ -18,7 +18,7 @@ from servod.daemon.flows import Flow, FutureWait, Wait
 from servod.daemon.status import ControllerStatus
 from servod.errors import AnswerIsNo, BadInput
 from servod.gain_store import GainStore, StoredSet
-from servod.gains import require_fit, require_same_loop
+from servod.gains import require_fit
 
 log = logging.getLogger("servod.gains")
 
@@ -33,21 +33,13 @@ class GainBank:
     def __init__(self, config: AxisConfig) -> None:
         """Open the store and choose the first set: the one active last, or gains.initial. Raises BadInput.
 
-        A set that was designed for another cycle or velocity filter than the axis has now gives way to gains.initial.
+        A set that this axis may not run any more, whatever the reason, gives way to gains.initial: the configuration
+        or the version of servod may have changed since it was activated, and the axis shall start all the same.
         """
         self._config = config
         self._store = GainStore(config.gains.directory)
         initial = self._store.load_file(config.gains.initial)
-        active = self._store.active()
-        if active is None:
-            active = self._store.activate(initial.name, initial.version)
-        elif (why := _misfit(active, config)) is not None:
-            log.warning(
-                "%s; %s version %d (gains.initial) runs in its place. Set the configuration back and `servoctl gains "
-                "activate %s`, or make a set for this one: `servoctl synthesize`, `verify`, `deploy`",
-                *(why, initial.name, initial.version, active.name),
-            )
-            active = self._store.activate(initial.name, initial.version, f"in place of {active.name}: {why}")
+        active = self._active_or(initial)
         require_fit(active.gains, config)
         log.info("gain set %s version %d (%s)", active.name, active.version, active.gains.law.name)
         self._sets = {0: active}
@@ -113,6 +105,23 @@ class GainBank:
         yield FutureWait(slow.submit(self._store.rollback))
         return _row(stored)
 
+    def _active_or(self, initial: StoredSet) -> StoredSet:
+        """The stored active set where the axis may run it; else `initial`, which is active from then on."""
+        last = self._store.active_reference()
+        if last is None:
+            return self._store.activate(initial.name, initial.version)
+        try:
+            active = self._store.get(last.name, last.version)
+            require_fit(active.gains, self._config)
+        except BadInput as error:
+            log.warning(
+                "%s; %s version %d (gains.initial) runs in place of %s version %d. Set back what was changed and "
+                "`servoctl gains activate %s`, or make a set anew: `servoctl synthesize`, `verify`, `deploy`",
+                *(error, initial.name, initial.version, last.name, last.version, last.name),
+            )
+            return self._store.activate(initial.name, initial.version, f"in place of {last.name}: {error}")
+        return active
+
     def _reject(self, tried: StoredSet, args: GainsVerdictArgs, send: SendOrder, slow: ThreadPoolExecutor) -> Flow:
         """End a trial: the active set runs again."""
         active: StoredSet | None = yield FutureWait(slow.submit(self._store.active))
@@ -130,15 +139,6 @@ class GainBank:
         self._last_serial, self._sets[serial] = serial, stored
         log.info("gain set %s version %d (%s) runs", stored.name, stored.version, stored.gains.law.name)
         return {}
-
-
-def _misfit(stored: StoredSet, config: AxisConfig) -> str | None:
-    """Why the set, whatever its certificate says, is for another loop than the axis has; None where it is for this."""
-    try:
-        require_same_loop(stored.gains, config)
-    except BadInput as error:
-        return str(error)
-    return None
 
 
 def _row(stored: StoredSet) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from servod.shipped import shipped
 from tests.gains import good
 
 BAD = yaml.safe_load(Path(__file__).with_name("bad_gains.yaml").read_text(encoding="utf-8"))
+SEALED_BEFORE_REST = Path(__file__).with_name("sealed_before_rest.yaml")
 SHIPPED = sorted((Path(__file__).resolve().parents[2] / "gains").glob("*.yaml"))
 
 
@@ -217,3 +218,38 @@ def test_a_daemon_starts_with_the_initial_set_when_the_active_one_is_for_another
     assert "design.velocity_cutoff_hz" in caplog.text and "servoctl gains activate designed" in caplog.text
     active, last = store.active(), store.history()[-1]
     assert active is not None and active.name == "bench_pd" and "in place of designed" in last.note
+
+
+def test_a_set_that_an_earlier_version_sealed_is_what_it_was() -> None:
+    """No key of a later version writes itself into it: seal and certificate hold, and so do the numbers."""
+    text = SEALED_BEFORE_REST.read_text(encoding="utf-8")
+    gains = parse_gains(text, "earlier")
+    assert gains.certificate_problem() is None
+    assert gains.to_yaml() == text
+    packed = gains.pack()
+    assert (packed[local.REST_WITHIN], packed[local.REST_SHARE]) == (0.0, 1.0)
+    require_fit(gains, load_config(shipped("gains/config/virtual.yaml")))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("bandwidth_rad_s: 50.0", "bandwidth_rad_s: 51.0"), "changed after the set was sealed"),
+        (("hold_within_rad:", "hold_within_turns:"), "hold_within_turns"),
+    ],
+    ids=["a broken seal", "a key that is not known"],
+)
+def test_a_daemon_starts_with_the_initial_set_whatever_is_wrong_with_the_active_one(
+    change: tuple[str, str], said: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    config = load_config(shipped("gains/config/virtual.yaml"))
+    axis = config.model_copy(update={"gains": config.gains.model_copy(update={"directory": tmp_path})})
+    store = GainStore(tmp_path)
+    stored = store.load_file(SEALED_BEFORE_REST)
+    store.activate(stored.name)
+    assert GainBank(axis).newest.name == "sealed_before_rest"
+    stored.path.write_text(stored.path.read_text().replace(*change))
+    assert GainBank(axis).newest.name == "demo_pd"
+    assert said in caplog.text and "runs in place of sealed_before_rest version 1" in caplog.text
+    active, last = store.active(), store.history()[-1]
+    assert active is not None and active.name == "demo_pd" and said in last.note
