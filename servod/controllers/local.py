@@ -14,6 +14,8 @@ Options: the velocity of z_hat, of d0 and of the sets is the measured one or the
 an output disturbance observer around the whole (bandwidth 0: none). The regions go by the faster of both velocities:
 a step has no reference velocity, yet the gains of Omega_L on a joint that turns fast make a limit cycle.
 Far from its goal, as in a step, the joint is approached with a bounded speed: the feedback sees a limited error.
+The observer has a bandwidth of its own for coming to rest, in Omega_L under a reference that rests. Under one that
+moves it would take friction that turns over for a disturbance, and throw the joint forward by what it has gathered.
 At rest: within the hold width neither l nor the observer acts, so nothing hunts. Driven by the measured velocity z_hat
 creeps with its noise, and the leak floor lets it fade; driven by the reference it stays as it is, for letting it fade
 would only move the joint, by F/(c0 + k_x).
@@ -52,7 +54,7 @@ OBSERVER_BANDWIDTH = 18  # g of the output disturbance observer in Omega_H [rad/
 OBSERVER_INERTIA = 19  # nominal m of the observer [kg*m^2]
 OBSERVER_LIMIT = 20  # bound of |d_hat| [N*m]
 LOW_K_U, HIGH_K_U = 21, 24  # gains of the last three commands u* in Omega_L and Omega_H
-OBSERVER_LOW = 27  # g in Omega_L [rad/s]: on its bristle the joint moves so little that the estimate would take seconds
+OBSERVER_LOW = 27  # g in Omega_L under a resting reference [rad/s]: on its bristle the estimate would take seconds
 ERROR_LIMIT = 28  # the feedback sees no more error than this, which bounds the speed of a step [rad], 0: none
 REST_WITHIN = 29  # error within which a joint under a resting reference counts as at rest [rad], 0: never
 REST_SHARE = 30  # of feedback and observer that is left at rest
@@ -72,9 +74,9 @@ def remembered(p: Sequence[float], s: Sequence[float], first: int) -> float:
 
 def awake(p: Sequence[float], s: MutableSequence[float], stands: bool, error: float, dt: float) -> float:
     """Share of feedback and observer that acts: 1, and going towards REST_SHARE while the joint is at rest."""
-    if not stands or p[REST_WITHIN] == 0.0:
+    if p[REST_WITHIN] == 0.0:
         s[REST] = 0.0
-    elif abs(error) <= p[REST_WITHIN]:
+    elif stands and abs(error) <= p[REST_WITHIN]:
         s[REST] = 1.0 + (s[REST] - 1.0) * math.exp(-dt / REST_TO_S)
     else:
         s[REST] *= math.exp(-dt / REST_FROM_S)
@@ -137,7 +139,8 @@ def step(
     other = p[FEEDFORWARD_INERTIA] * a_ref + known
     if p[OBSERVER_BANDWIDTH] > 0.0:
         if moves:
-            bandwidth = p[OBSERVER_LOW] + share * (p[OBSERVER_BANDWIDTH] - p[OBSERVER_LOW])
+            slow = 1.0 - share if stands else 0.0
+            bandwidth = p[OBSERVER_BANDWIDTH] + slow * (p[OBSERVER_LOW] - p[OBSERVER_BANDWIDTH])
             observe(s, acts * bandwidth, p[OBSERVER_INERTIA], p[OBSERVER_LIMIT], v, u_applied, dt)
         remember(s, v, friction + known, u_applied)
         other += s[DISTURBANCE]

@@ -16,7 +16,7 @@ from servod.gain_parameters import LocalParameters
 from servod.verify.checks import CORNER_DISK, CORNER_SPEEDS, DISK_LIMIT, speeds_of
 from servod.verify.closed_loop import Deviation, late_corners
 from servod.verify.effect_checks import late_effects
-from servod.verify.margins import Judgement, Sweep
+from servod.verify.margins import Judgement, Sweep, arrival_of
 from servod.verify.sampled import timing_of
 from servod.verify.steady_friction import SteadyFriction
 
@@ -63,7 +63,7 @@ class Search:
         return not own or self._sweep(law, many).worst(own).radius < STABLE
 
     def _sweep(self, law: LocalParameters, speeds: list[float]) -> Sweep:
-        return Sweep(LAWS["local"], law.pack(), self.friction, timing_of(self.design), speeds)
+        return Sweep(LAWS["local"], law.pack(), self.friction, timing_of(self.design), speeds, arrival_of(law))
 
     def _judged(
         self, law: LocalParameters, speeds: list[float], cases: Sequence[Deviation], disk_wanted: float

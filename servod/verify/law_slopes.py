@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from servod.controllers import Law
-from servod.controllers.state import ASKED, FRICTION_STATE, LAST_VELOCITY, N_STATES
+from servod.controllers.state import ASKED, FRICTION_STATE, LAST_VELOCITY, N_STATES, STARTED
 from servod.verify.sampled import Array, Timing
 
 SETTLE_CYCLES = 100  # at most, after the first long one
@@ -59,20 +59,35 @@ def settled_state(law: Law, gains: tuple[float, ...], velocity: float, moves: bo
 
 
 def law_slopes(law: Law, gains: tuple[float, ...], velocity: float, moves: bool, timing: Timing) -> LawSlopes:
-    """Central differences of the law's step at steady motion; at rest `moves` tells crossing zero from holding."""
+    """Slopes at steady motion with the reference; at rest `moves` tells crossing zero from holding."""
     base = settled_state(law, gains, velocity, moves, timing.period_s)
     nudge = np.finfo(float).tiny if moves else 0.0
+    return _differences(law, gains, base, (0.0, velocity, nudge, velocity), timing)
+
+
+def arriving_slopes(law: Law, gains: tuple[float, ...], velocity: float, error_rad: float, timing: Timing) -> LawSlopes:
+    """Slopes where the reference rests and the joint creeps towards it, `error_rad` away: more than holding allows."""
+    base = [0.0] * N_STATES
+    base[LAST_VELOCITY], base[STARTED] = velocity, 1.0
+    return _differences(law, gains, base, (error_rad, 0.0, 0.0, velocity), timing)
+
+
+def _differences(
+    law: Law, gains: tuple[float, ...], base: list[float], around: tuple[float, float, float, float], timing: Timing
+) -> LawSlopes:
+    """Central differences of the law's step around (error, reference's velocity and acceleration, velocity)."""
+    error, v_ref, a_ref, velocity = around
     scale = np.full(N_STATES, NUDGE)
     scale[FRICTION_STATE] = NUDGE * max(abs(base[FRICTION_STATE]), 1e-4)
 
     def stepped(x: float, v: float, shift: Array) -> Array:
         state = [value + float(extra) for value, extra in zip(base, shift, strict=True)]
-        u = law.step(gains, state, 0.0, velocity, nudge, x, velocity + v, state[ASKED], timing.period_s)[0]
+        u = law.step(gains, state, error, v_ref, a_ref, x, velocity + v, state[ASKED], timing.period_s)[0]
         return np.array([u, *state])
 
-    still = np.zeros(N_STATES)
+    still, dx = np.zeros(N_STATES), max(1e-10, NUDGE * abs(error))
     columns = [
-        (stepped(1e-10, 0.0, still) - stepped(-1e-10, 0.0, still)) / 2e-10,
+        (stepped(dx, 0.0, still) - stepped(-dx, 0.0, still)) / (2.0 * dx),
         (stepped(0.0, NUDGE, still) - stepped(0.0, -NUDGE, still)) / (2.0 * NUDGE),
     ]
     for i in range(N_STATES):

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.controllers import Law
+from servod.gain_parameters import LocalParameters
 from servod.verify.closed_loop import (
     Bristle,
     Deviation,
@@ -22,13 +23,15 @@ from servod.verify.closed_loop import (
     sampled_points,
     spectral_radius,
 )
-from servod.verify.law_slopes import LawSlopes, law_slopes
+from servod.verify.law_slopes import LawSlopes, arriving_slopes, law_slopes
 from servod.verify.sampled import Array, Timing
 from servod.verify.steady_friction import SteadyFriction
 
 FREQUENCIES = 200
 SEARCH_STEPS = 14
 NOMINAL = (Deviation(),)
+BEYOND_HOLD = 4.0  # widths of holding, at which a joint has not arrived yet
+LEAST_ERROR_RAD = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,21 +64,56 @@ def joints_at(
     return sampled_points(joint_points(friction, velocity, bristle, cases), timing)
 
 
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """How a joint arrives where its law is another one then: this far from its resting reference, slower than this."""
+
+    error_rad: float
+    below_rad_s: float
+
+
+def arrival_of(law: LocalParameters) -> Arrival | None:
+    """Arrival under a law with an observer of its own for it; None where a joint arrives as it moves."""
+    observer = law.disturbance_observer
+    if observer is None or observer.low_bandwidth_rad_s in (None, observer.bandwidth_rad_s):
+        return None
+    beyond = BEYOND_HOLD * max(law.hold_within_rad, law.rest_within_rad or 0.0, LEAST_ERROR_RAD)
+    return Arrival(beyond, law.regions.overlap_to_rad_s)
+
+
 class Sweep:
     """One law on one axis, to be judged at many velocities; `speeds` ascend, both directions are taken."""
 
     def __init__(
-        self, law: Law, gains: tuple[float, ...], friction: SteadyFriction, timing: Timing, speeds: Sequence[float]
+        self,
+        law: Law,
+        gains: tuple[float, ...],
+        friction: SteadyFriction,
+        timing: Timing,
+        speeds: Sequence[float],
+        arrival: Arrival | None = None,
     ) -> None:
         self.law, self.gains, self.friction, self.timing = law, gains, friction, timing
-        self.speeds = tuple(speeds)
+        self.speeds, self.arrival = tuple(speeds), arrival
+
+    def at(self, speeds: Sequence[float]) -> Sweep:
+        """The same law on the same axis at other speeds."""
+        return Sweep(self.law, self.gains, self.friction, self.timing, speeds, self.arrival)
 
     @cached_property
     def slopes(self) -> list[tuple[float, LawSlopes]]:
-        """The linearised law: moving through zero, holding at rest, and at every velocity in both directions."""
+        """The linearised law: moving through zero, holding, at every velocity in both directions, and arriving."""
         rest = [(0.0, law_slopes(self.law, self.gains, 0.0, moves, self.timing)) for moves in (True, False)]
         velocities = [side * v for side in (1.0, -1.0) for v in self.speeds]
-        return rest + [(v, law_slopes(self.law, self.gains, v, True, self.timing)) for v in velocities]
+        moving = [(v, law_slopes(self.law, self.gains, v, True, self.timing)) for v in velocities]
+        return rest + moving + self._arriving(velocities)
+
+    def _arriving(self, velocities: Sequence[float]) -> list[tuple[float, LawSlopes]]:
+        """The same where the joint comes to rest: sticking, and creeping at every velocity that is slow enough."""
+        if self.arrival is None:
+            return []
+        slow = [0.0, *(v for v in velocities if abs(v) < self.arrival.below_rad_s)]
+        return [(v, arriving_slopes(self.law, self.gains, v, self.arrival.error_rad, self.timing)) for v in slow]
 
     @cached_property
     def coupled(self) -> list[tuple[float, LawSlopes]]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 
 from servod.controllers import LAWS, local
@@ -52,10 +54,14 @@ def test_one_reading_beyond_the_width_wakes_a_little_and_a_push_wakes_within_mil
 
 
 @pytest.mark.parametrize("motion", [(0.1, 0.0), (0.0, 1.0)])
-def test_a_reference_that_moves_wakes_at_once(motion: tuple[float, float]) -> None:
-    s = rested()
-    assert feedback(RESTING, s, 0.9 * WITHIN, *motion) == pytest.approx(2.5 * 0.9 * WITHIN)
-    assert s[REST] == 0.0
+def test_a_reference_that_moves_wakes_within_milliseconds_and_without_a_jump(motion: tuple[float, float]) -> None:
+    s, error, courses = rested(), 0.9 * WITHIN, []
+    before, whole = feedback(RESTING, s, error), 2.5 * error
+    for _ in range(20):
+        courses.append(feedback(RESTING, s, error, *motion))
+    steps = [after - earlier for earlier, after in pairwise([before, *courses])]
+    assert 0.0 < max(steps) < 0.25 * (whole - before)
+    assert courses[-1] == pytest.approx(whole, rel=0.01)
 
 
 def test_without_a_width_nothing_rests() -> None:
@@ -64,3 +70,17 @@ def test_without_a_width_nothing_rests() -> None:
         assert feedback(ALWAYS_AWAKE, s, 0.0) == 0.0
     assert s[REST] == 0.0
     assert local_parameters()[local.REST_WITHIN] == 0.0
+
+
+def learned(v_ref: float, low_bandwidth: float) -> float:
+    """Estimate after three steps at a torque that moves nothing, creeping in Omega_L."""
+    p, s = list(local_parameters(bandwidth=50.0)), fresh_state("local")
+    p[local.OBSERVER_LOW] = low_bandwidth
+    for _ in range(3):
+        LAWS["local"].step(tuple(p), s, 1e-3, v_ref, 0.0, 0.0, v_ref, 0.01, DT)
+    return s[DISTURBANCE]
+
+
+def test_the_observer_for_coming_to_rest_waits_for_a_reference_that_rests() -> None:
+    assert learned(0.0, 500.0) > 5.0 * learned(0.0, 50.0) > 0.0
+    assert learned(1e-4, 500.0) == learned(1e-4, 50.0) != 0.0
