@@ -15,17 +15,18 @@ from servod.axis_model import AxisModel
 from servod.gain_design import Design, RegionProof
 from servod.gain_parameters import LocalParameters, RegionGains
 from servod.gains import CertificateCheck, GainSet
-from servod.models.noise import noise_of
 from servod.verify.closed_loop import Deviation, corners, inner_points
-from servod.verify.margins import NOMINAL, Sweep, largest_tolerated
+from servod.verify.margins import NOMINAL, Sweep, arrival_of, largest_tolerated
 from servod.verify.measured import measured_widths
 from servod.verify.plants import drawn
 from servod.verify.position_slope import position_slopes
 from servod.verify.proof import disc_reach, region_margin, stored_deviation
+from servod.verify.rounding import LEAST_COUNTS, NOISE_SWING, count_rad, gives_way_rad, rounding_rad
 from servod.verify.sampled import Timing, timing_of
 from servod.verify.steady_friction import steady_friction
 from servod.verify.trials import (
     ERROR_SHARE,
+    RAMP_SHARES,
     RIPPLE_LIMIT_RAD,
     SETTLED_SHARE,
     Trial,
@@ -49,7 +50,6 @@ CORNER_DISK = 0.02
 MOST_NAME = 200
 #: Hold: beyond two counts of the encoder and its noise, which no law can tell from motion; stick-slip swings by more.
 HOLD_LIMIT_RAD, RAMP_LIMIT_RAD = 2e-5, 2e-4
-NOISE_SWING = 7.0  # peak to peak over rms: noise of 40 Hz stays within +-3.5 sigma for 15 s
 SAME = 1e-9  # relative difference that writing and reading numbers may make
 ONE_CYCLE = 1.5  # cycles of delay up to which one cycle must be stood; commands of two cycles ago, fed back, need two
 EXTRA_DELAY_CYCLES, FACTOR_LIMIT = 4.0, 10.0
@@ -84,13 +84,27 @@ class Subject:
 
     def sweep(self, speeds: int) -> Sweep:
         """The linearised law at `speeds` speeds per direction."""
-        friction = steady_friction(self.design.model)
-        return Sweep(self.gains.law, self.gains.pack(), friction, self.timing, speeds_of(self.design, speeds))
+        friction, local = steady_friction(self.design.model), self.gains.parameters
+        arrival = arrival_of(local) if isinstance(local, LocalParameters) else None
+        return Sweep(self.gains.law, self.gains.pack(), friction, self.timing, speeds_of(self.design, speeds), arrival)
 
     @cached_property
     def trials(self) -> list[Trial]:
         """The Monte-Carlo's plants, simulated."""
-        return monte_carlo(self.gains, self.plants, self.seed, self.processes)
+        shaken_rad = self.rounding_rad + self.gives_way_rad
+        return monte_carlo(self.gains, self.plants, self.seed, self.processes, shaken_rad)
+
+    @cached_property
+    def rounding_rad(self) -> float:
+        """Peak to peak that the encoder's rounding may make of a joint that creeps as slowly as the ramps."""
+        speeds = [share * self.design.speed_max_rad_s for share in RAMP_SHARES]
+        return rounding_rad(self.coarse.at(speeds), self.design)
+
+    @property
+    def gives_way_rad(self) -> float:
+        """Peak to peak by which the torque's noise moves a joint that slides."""
+        local = self.gains.parameters
+        return gives_way_rad(local, self.design) if isinstance(local, LocalParameters) else 0.0
 
     @cached_property
     def coarse(self) -> Sweep:
@@ -214,26 +228,22 @@ def check_monte_carlo(s: Subject) -> Iterator[CertificateCheck]:
 def check_limit_cycles(s: Subject) -> Iterator[CertificateCheck]:
     """20 s hold and slow ramps on the model and on drawn plants: first without torque noise, then with it.
 
-    What moves by more than the encoder shows of a joint that stands is a limit cycle or stick-slip. Under torque
-    noise a joint that holds must rest within RIPPLE_LIMIT_RAD; one that slides is held by its feedback alone, which
-    gives way by torque over stiffness.
+    A joint that holds may show two counts of the encoder and its noise, no more: what moves further moves by itself.
+    One that slides slowly is moved by its encoder's rounding (`rounding_rad`), and gives way to noise of the torque by
+    torque over stiffness; what a ramp swings beyond RAMP_LIMIT_RAD and that is stick-slip.
     """
-    local, noise = s.gains.parameters, noise_of(s.design.model)
-    assert isinstance(local, LocalParameters)
     plants = (drawn(s.design.model, s.design.uncertainty, s.seed, i) for i in range(LIMIT_CYCLE_PLANTS))
     some = [s.design.model, *plants]
-    count = 2.0 * np.pi / s.design.counts_per_turn if s.design.counts_per_turn else 0.0
-    quantum = 2.0 * count
-    stiffness = local.input_scale_nm * min(local.regions.low.k_x_per_rad, local.regions.high.k_x_per_rad)
-    gives_way = NOISE_SWING * noise.torque_rms / max(stiffness, SAME) if noise else 0.0
+    count = count_rad(s.design)
     still = [quiet(plant, count) for plant in some]
     seen = still[0].noise
-    shown = NOISE_SWING * seen.encoder_rms if seen else 0.0
-    yield at_most("20 s hold, peak to peak [rad]", worst_hold(s, still), HOLD_LIMIT_RAD + quantum + shown)
-    yield at_most("slow ramps, peak to peak error [rad]", worst_ramp(s, still), RAMP_LIMIT_RAD + quantum)
-    yield at_most("20 s hold under torque noise, peak to peak [rad]", worst_hold(s, some), RIPPLE_LIMIT_RAD + quantum)
+    shown = LEAST_COUNTS * count + (NOISE_SWING * seen.encoder_rms if seen else 0.0)
+    slides, noisy = RAMP_LIMIT_RAD + s.rounding_rad, RIPPLE_LIMIT_RAD + LEAST_COUNTS * count
+    yield at_most("20 s hold, peak to peak [rad]", worst_hold(s, still), HOLD_LIMIT_RAD + shown)
+    yield at_most("slow ramps, peak to peak error [rad]", worst_ramp(s, still), slides)
+    yield at_most("20 s hold under torque noise, peak to peak [rad]", worst_hold(s, some), noisy)
     ramps = worst_ramp(s, some)
-    yield at_most("slow ramps under torque noise, peak to peak [rad]", ramps, RAMP_LIMIT_RAD + quantum + gives_way)
+    yield at_most("slow ramps under torque noise, peak to peak [rad]", ramps, slides + s.gives_way_rad)
 
 
 def worst_hold(s: Subject, plants: list[AxisModel]) -> float:

@@ -32,8 +32,8 @@ PAST_FALL, LEAST_PEAK = 1.3, 0.16
 LEAD_IN_S, STEP_S, SINE_S, HOLD_S, LARGE_S = 0.1, 0.6, 4.0, 1.0, 1.0
 ERROR_SHARE = 0.04  # of the sine's amplitude: a plant beyond it does not follow
 RIPPLE_LIMIT_RAD = 1e-4  # peak to peak of a long hold, torque noise included
-#: Of the large step, peak to peak from 0.8 s after a motion on, noise included, beyond two encoder counts (nothing
-#: holds a joint between these): a tenth of what counts as settled. An axis of two cycles swings out for a second; one
+#: Of the large step, peak to peak from 0.8 s after a motion on, beyond what the encoder's counts and the torque's noise
+#: make of a joint that slides: a tenth of what counts as settled. An axis of two cycles swings out for a second; one
 #: that does not rest at all is found by the long hold as well.
 RIPPLE_SHARE = 0.002
 RIPPLE_S = 0.2
@@ -154,40 +154,42 @@ def simulated(gains: GainSet, design: Design, plant: AxisModel, motion: Array, s
     return run.tracking_error_rad(), run.position_rad
 
 
-def run_trial(gains: GainSet, design: Design, motion: Array, seed: int, index: int) -> Trial:
-    """One plant of the Monte-Carlo; a plant that runs away counts with infinite figures."""
+def run_trial(gains: GainSet, design: Design, motion: Array, seed: int, index: int, shaken_rad: float = 0.0) -> Trial:
+    """One plant of the Monte-Carlo; a plant that runs away counts with infinite figures.
+
+    `shaken_rad`: how far counts and noise alone may move a joint, peak to peak; no part of the ripple.
+    """
     error, position = simulated(gains, design, drawn(design.model, design.uncertainty, seed, index), motion, index)
     if not np.isfinite(position).all():
         return Trial(index, math.inf, math.inf, math.inf)
     scale, ends, last = scale_of(design), np.cumsum(counts(design.period_s)), round(RIPPLE_S / design.period_s)
-    between = 2.0 * 2.0 * math.pi / design.counts_per_turn if design.counts_per_turn else 0.0
     sine = error[ends[1] + last : ends[2]]  # the sine starts with a jump of velocity
     rests = [np.ptp(position[end - last : end]) for end in (ends[3], ends[4])]
     return Trial(
         index,
         float(np.abs(sine).max()) / scale.sine_rad,
-        max(float(max(rests)) - between, 0.0) / scale.large_rad,
+        max(float(max(rests)) - shaken_rad, 0.0) / scale.large_rad,
         float(np.abs(error[-last:]).max()) / scale.large_rad,
     )
 
 
-def _worker(text: str, seed: int, first: int, last: int) -> list[Trial]:
+def _worker(text: str, seed: int, shaken_rad: float, first: int, last: int) -> list[Trial]:
     from servod.gains import parse_gains
 
     gains = parse_gains(text, "gain set")
     assert gains.design is not None
     motion = trial_motion(gains.design.period_s, scale_of(gains.design))
-    return [run_trial(gains, gains.design, motion, seed, i) for i in range(first, last)]
+    return [run_trial(gains, gains.design, motion, seed, i, shaken_rad) for i in range(first, last)]
 
 
-def monte_carlo(gains: GainSet, plants: int, seed: int, processes: int) -> list[Trial]:
+def monte_carlo(gains: GainSet, plants: int, seed: int, processes: int, shaken_rad: float = 0.0) -> list[Trial]:
     """`plants` trials over worker processes; the same seed gives the same plants whatever the number of processes."""
     text = gains.to_yaml()
     if processes <= 1:
-        return _worker(text, seed, 0, plants)
+        return _worker(text, seed, shaken_rad, 0, plants)
     cuts = [plants * i // processes for i in range(processes + 1)]
     with worker_pool(processes) as pool:
-        parts = [pool.submit(_worker, text, seed, *ends) for ends in pairwise(cuts)]
+        parts = [pool.submit(_worker, text, seed, shaken_rad, *ends) for ends in pairwise(cuts)]
         return [trial for part in parts for trial in part.result()]
 
 
