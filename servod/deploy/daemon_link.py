@@ -6,18 +6,17 @@ daemon goes back to the set of before by itself.
 
 from __future__ import annotations
 
-import contextlib
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from servod.control import ControlClient, Verb
 from servod.daemon_config import daemon_config
+from servod.daemon_recording import quick_stop, recording, switch_off
 from servod.deploy.links import FADE_S, Rows, Tell, cut
-from servod.errors import AnswerIsNo, ServodError
+from servod.errors import AnswerIsNo
 from servod.gains import GainSet
 from servod.recorder_read import read_recording
 from servod.recordings.rows import ROW
@@ -53,13 +52,11 @@ class DaemonDeployLink:
 
     def disable(self) -> None:
         """Ask for it; an axis that is off already, or a daemon that is gone, needs none."""
-        with contextlib.suppress(ServodError):
-            self._client.call(Verb.DISABLE)
+        switch_off(self._client)
 
     def stop(self) -> None:
         """The drive's quick stop, on a connection of its own: an interrupt may have cut a request on the other."""
-        with contextlib.suppress(ServodError), ControlClient(self._client.path) as client:
-            client.call(Verb.STOP)
+        quick_stop(self._client)
 
     def run(self, motion: ValidationMotion, window_rad: float, tell: Tell) -> Rows:
         """Run the motion under the daemon's recorder and read its cycles back."""
@@ -82,19 +79,11 @@ class DaemonDeployLink:
         Raises AnswerIsNo when the axis drops out, Refused when the daemon takes a motion not on. An interrupt stops the
         axis before anything else is waited for.
         """
-        path = Path(self._client.call(Verb.RECORD_START)["path"])
-        try:
+        with recording(self._client) as path:
             for motion in motions:
                 self._client.call(Verb.TRACK, **motion)
                 while self._moves():
                     tell()
-        except BaseException as error:
-            if not isinstance(error, ServodError):
-                self.stop()
-            with contextlib.suppress(ServodError):
-                self._client.call(Verb.RECORD_STOP)
-            raise
-        self._client.call(Verb.RECORD_STOP)
         return np.frombuffer(read_recording(path).rows, dtype=ROW)
 
     def load(self, gains: GainSet) -> tuple[str, int]:

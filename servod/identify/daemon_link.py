@@ -9,7 +9,6 @@ import contextlib
 import datetime
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from servod.config import AxisConfig
 from servod.control import ControlClient, Verb
 from servod.daemon_config import require_daemon_config
+from servod.daemon_recording import recording, switch_off
 from servod.errors import ServodError
 from servod.gain_parameters import PdParameters
 from servod.gains import GainSet, Provenance
@@ -66,9 +66,11 @@ class DaemonLink:
     def excite(
         self, positions_rad: Sequence[float], torques_nm: Sequence[float], window_rad: float
     ) -> NDArray[np.void]:
-        """Run the motion under the daemon's recorder and read its cycles back."""
-        path = Path(self._client.call(Verb.RECORD_START)["path"])
-        try:
+        """Run the motion under the daemon's recorder and read its cycles back.
+
+        An interrupt stops the axis before anything else is waited for.
+        """
+        with recording(self._client) as path:
             self._client.call(
                 Verb.TRACK,
                 kind="excite",
@@ -77,8 +79,6 @@ class DaemonLink:
                 window_rad=window_rad,
             )
             ended = self._wait()
-        finally:
-            self._client.call(Verb.RECORD_STOP)
         rows = moving(rows_of(read_recording(path).rows))
         if ended:
             raise MotionEnded(ended, rows)
@@ -86,8 +86,7 @@ class DaemonLink:
 
     def disable(self) -> None:
         """Ask for it, and for the set of before; an axis that is off already, or a daemon that is gone, needs none."""
-        with contextlib.suppress(ServodError):
-            self._client.call(Verb.DISABLE)
+        switch_off(self._client)
         with contextlib.suppress(ServodError):
             self._client.call(Verb.GAINS_ROLLBACK, trial=True, note="the feedback of experiments, which are over")
 

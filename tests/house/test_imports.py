@@ -18,7 +18,7 @@ LAYERS: list[set[str]] = [
     {"drivers", "limits", "axis", "references"},
     {"master", "recorder_mcap", "recorder_read", "recorder_history", "recorder_files", "recorder_export", "recordings"},
     {"loop", "control", "recorder", "metrics"},
-    {"daemon", "daemon_config", "session", "replay"},
+    {"daemon", "daemon_config", "daemon_recording", "session", "replay"},
     {"identify"},
     {"verify"},
     {"synthesize"},

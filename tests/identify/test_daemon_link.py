@@ -102,3 +102,36 @@ def test_ctrl_c_in_the_middle_of_an_experiment_switches_the_axis_off(tmp_path):
         assert client.call("status")["motion"]["torque_nm"] == 0.0
         assert [trace.kind.value for trace in load(tmp_path / "recordings")] == ["noise"]
         undone(axis, client)
+
+
+class _Cut(ControlClient):
+    """The first look at a motion that runs is interrupted in the middle of its request."""
+
+    def call(self, verb, **args):
+        answer = super().call(verb, **args)
+        if verb == "status" and answer["axis"]["motion_running"]:
+            self.close()
+            raise KeyboardInterrupt
+        return answer
+
+
+def test_an_interrupt_stops_the_axis_before_the_recorder(tmp_path):
+    """Also when it cut a request on the link's own connection."""
+    with running(tmp_path) as axis, ControlClient(axis.socket) as watcher:
+        link = DaemonLink(_Cut(axis.socket), load_config(axis.folder / "axis.yaml"))
+        link.enable()
+        with pytest.raises(KeyboardInterrupt):
+            link.excite([0.0] * 10_000, [0.0] * 10_000, 0.1)
+        status = watcher.call("status")
+        assert (status["axis"]["state"], status["motion"]["torque_nm"]) == ("DISABLED", 0.0)
+        undone(axis, watcher)
+
+
+def test_an_axis_whose_connection_is_cut_is_switched_off_all_the_same(tmp_path):
+    with running(tmp_path) as axis, ControlClient(axis.socket) as watcher:
+        client = ControlClient(axis.socket)
+        link = DaemonLink(client, load_config(axis.folder / "axis.yaml"))
+        link.enable()
+        client.close()
+        link.disable()
+        assert watcher.call("status")["axis"]["state"] == "DISABLED"
