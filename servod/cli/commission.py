@@ -130,9 +130,9 @@ def _print(document: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table("Controller", "RMS / mrad", "Largest / mrad", title="Trajectory (19), every law at its best")
+    table = Table("Controller", "RMS / mrad", "Largest / mrad", "Roughness / PD's", "", title="Trajectory (19)")
     for law, found in document["tracking"].items():
-        table.add_row(law, f"{found['rms_error_mrad']:.4f}", f"{found['max_error_mrad']:.4f}")
+        table.add_row(*_cells(law, found))
     console = Console()
     console.print(table)
     deployed = document["deployment"]["gains"]
@@ -144,3 +144,14 @@ def _print(document: dict[str, Any]) -> None:
     ]
     for line in lines:
         console.print(line, highlight=False, soft_wrap=True)
+
+
+def _cells(law: str, found: dict[str, Any]) -> tuple[str, ...]:
+    """A row of the table: what a law reached, its roughness, and whether that is more than the tuned laws may have."""
+    if "failed" in found:
+        return law, found["failed"]
+    errors = f"{found['rms_error_mrad']:.4f}", f"{found['max_error_mrad']:.4f}"
+    rough = f"{found['roughness_ratio']:.3g}" if "roughness_ratio" in found else ""
+    over = not found.get("within_roughness_limit", True)
+    notes = ("" if found["tuned"] else "deployed", f"over the limit of {found['roughness_limit']:g}" if over else "")
+    return law, *errors, rough, ", ".join(filter(None, notes))

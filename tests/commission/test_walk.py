@@ -31,6 +31,7 @@ from servod.commission.runs import load_curves, load_rows, save_curves
 from servod.commission.state import file_sha256
 from servod.commission.steps.deploy import Deploy
 from servod.commission.steps.synthesize import Synthesize, agreed, relaxed, tell_clashes
+from servod.commission.steps.validate import document as comparison
 from servod.commission.steps.verify import Verify
 from servod.commission.walk import Options, Step, StepFailed, Tell, Walk, run
 from servod.deploy.deployment import announced
@@ -171,18 +172,44 @@ def test_curves_come_back_from_disk_and_stand_on_the_page(folder: Path) -> None:
     save_curves(folder / RUNS / "free_local.npz", run_of.curves)
     again = load_curves(folder / RUNS / "deployed.npz")
     assert again["paper"].error_mrad == pytest.approx(run_of.curves["paper"].error_mrad, abs=1e-3)
-    found, tuned = run_of.document(), {"cost_mrad": 0.1, "simulations": 3, "roughness": 4.2, "roughness_limit": 5.0}
-    rows = {"local": found, "deployed": found}
-    write_json(folder / TRACKING, {"tracking": {"local": found}, "equal_feedback": {}, "free_feedback": rows})
-    write_json(folder / TUNING, {"free": {"local": tuned, "deployed": tuned}})
+    cost = {"cost_mrad": 0.1, "simulations": 3}
+    tuning = {"free": {"local": cost | judged(4.2), "deployed": cost | judged(10.0)}}
+    write_json(folder / TRACKING, comparison({"free_local": run_of.document()}, run_of.document(), tuning))
+    write_json(folder / TUNING, tuning)
     walk = walk_in(folder)
     made = {title: list(parts()) for title, parts in sections(walk, gains, table1()).items() if title in SHOWN}
     assert set(made) == SHOWN
     figures = {part.name for parts in made.values() for part in parts if isinstance(part, Figure)}
     assert {"bode", "impulse_responses", "weighting_functions", "before_after", "step_100_free_feedback"} <= figures
     (reached,) = (p for p in made["Tracking"] if isinstance(p, Table) and "tuning reached" in p.title)
-    assert [(row[0], *row[3:]) for row in reached.rows] == [("Local models", "4.20", "5"), ("Deployed", "4.20", "5")]
+    over = "Deployed, over the limit (x2)"
+    assert [(row[0], *row[3:]) for row in reached.rows] == [("Local models", "4.20", "5"), (over, "10.00", "5")]
+    (compared,) = (p for p in made["Tracking"] if isinstance(p, Table) and "mrad and s" in p.title)
+    assert {(row[0], row[4]) for row in compared.rows} == {("Local models", "4.2"), (over, "10")}
+    (said,) = (p for p in made["Tracking"] if isinstance(p, str))
+    assert "10 times the roughness of the paper's PD, over the limit (x2)" in said
     assert any(isinstance(part, Table) and "Certificate" in part.title for part in made["The certificate"])
+
+
+def judged(ratio: float) -> dict[str, Any]:
+    """What tuning tells of a law with `ratio` times the roughness of the paper's PD."""
+    return {"roughness_ratio": ratio, "roughness_limit": 5.0, "within_roughness_limit": ratio <= 5.0}
+
+
+def test_the_deployed_law_is_never_taken_for_one_that_was_tuned_within_the_limit() -> None:
+    figures = {"free_local": {"rms_error_mrad": 0.01}, "equal_local": {"rms_error_mrad": 0.03}}
+    tuning = {"free": {"local": judged(4.9), "deployed": judged(10.0)}, "equal": {"local": judged(3.0)}}
+    found = comparison(figures, {"rms_error_mrad": 0.005}, tuning)
+    tuned = {"rms_error_mrad": 0.01, "tuned": True, **judged(4.9)}
+    deployed = {"rms_error_mrad": 0.005, "tuned": False, **judged(10.0)}
+    assert found["free_feedback"] == {"local": tuned, "deployed": deployed}
+    assert found["tracking"] == {"local": deployed}
+    assert found["equal_feedback"]["local"]["within_roughness_limit"]
+
+
+def test_a_law_that_stands_alone_says_no_roughness_limit() -> None:
+    found = comparison({}, {"rms_error_mrad": 0.005}, {})
+    assert found["tracking"] == {"local": {"rms_error_mrad": 0.005, "tuned": False}}
 
 
 #: Sections that need no recordings of an identification.

@@ -15,13 +15,17 @@ from servod.tune.plan import BUDGET, Feedback, Tuned, TunePlan
 from servod.tune.rivals import rivals
 from servod.tune.tuning import as_tuned
 
-#: Who is tuned and measured in each class; the deployed law, which is synthesized and not tuned, stands beside them.
+#: Who is tuned and measured in each class; the deployed law, which is synthesized and not tuned, and which no limit on
+#: roughness bounds, stands beside them.
 CONTENDERS = ("pd", "pd_dob", "pd_lugre", "local")
 
 
 @dataclass(frozen=True)
 class Rivals:
-    """Leaves a gain set for each rival in each class, and what its tuning reached and cost."""
+    """Leaves a gain set for each rival in each class, and what its tuning reached and cost.
+
+    The deployed law is judged by the same measures; it may be over the limit on roughness, which bounds tuning alone.
+    """
 
     name: str = "rivals"
     title: str = "tune the rivals"
@@ -87,6 +91,7 @@ def _told(tuned: Tuned, limit: float) -> dict[str, float]:
     return {
         "cost_mrad": tuned.cost,
         "simulations": tuned.simulations,
-        "roughness": tuned.roughness,
+        "roughness_ratio": tuned.roughness,
         "roughness_limit": limit,
+        "within_roughness_limit": tuned.roughness <= limit,
     }

@@ -78,6 +78,7 @@ def _loop(walk: Walk) -> dict[str, Any]:
         "period_s": config.cycle.period_us * NS_PER_US / NS_PER_S,
         "cutoff_hz": walk.axis.cutoff_hz,
         "counts_per_turn": float(config.encoder.counts_per_turn),
+        "torque_limit_nm": config.limits.torque_nm,
     }
 
 

@@ -17,13 +17,17 @@ from servod.errors import AnswerIsNo
 from servod.gains import load_gains
 from servod.tune.plan import Feedback
 
+#: What tuning tells of a law's roughness, by the keys of its document.
+ROUGHNESS = ("roughness_ratio", "roughness_limit", "within_roughness_limit")
+
 
 @dataclass(frozen=True)
 class Validate:
     """Leaves the figures of every law, and the curves of its runs.
 
-    In each class every law is tuned by the same rules, and among the free ones stands the deployed law as its own row;
-    `tracking` has the deployed law as `local`, and the rivals at their best beside it.
+    In each class every law is tuned by the same rules, within the same limit on roughness. The deployed law, which no
+    such limit bounds, is a row of its own beside the free ones; `tracking` has it in place of their `local`. Every law
+    says whether it was tuned, its roughness as a multiple of the paper's PD, and whether that is within the limit.
     """
 
     name: str = "validate"
@@ -53,7 +57,7 @@ def _on_daemon(walk: Walk, axis: DaemonWalkAxis, title: str) -> dict[str, Any]:
         tracking, missing = measure_on_daemon(axis.socket, axis.config, deployed, partial(tell, "deployed law"))
     if tracking:
         save_curves(run_files(walk, DEPLOYED)[1], tracking.curves)
-    return _document({}, tracking.document() if tracking else None) | {"not_measured": missing}
+    return document({}, tracking.document() if tracking else None, {}) | {"not_measured": missing}
 
 
 def _on_virtual(walk: Walk, axis: VirtualWalkAxis, title: str) -> dict[str, Any]:
@@ -67,18 +71,30 @@ def _on_virtual(walk: Walk, axis: VirtualWalkAxis, title: str) -> dict[str, Any]
         figures = measured(walk, axis, sets, deployed.design.velocity_cutoff_hz, tell)
     if "failed" in (proven := figures.pop(DEPLOYED)):
         raise AnswerIsNo(f"validate: {proven['failed']}")
-    return _document(figures, proven)
+    return document(figures, proven, read_json(walk.path(TUNING)))
 
 
-def _document(figures: dict[str, Any], deployed: dict[str, Any] | None) -> dict[str, Any]:
-    """Figures by class and law."""
+def document(figures: dict[str, Any], deployed: dict[str, Any] | None, tuning: dict[str, Any]) -> dict[str, Any]:
+    """Figures by class and law, with what `tuning` (by class and law, of the step before) says of their roughness."""
     classes = {
-        feedback: {name: figures[key] for name in CONTENDERS if (key := f"{feedback.value}_{name}") in figures}
+        feedback: {
+            name: figures[key] | _bounded(tuning, feedback, name)
+            for name in CONTENDERS
+            if (key := f"{feedback.value}_{name}") in figures
+        }
         for feedback in Feedback
     }
     free = classes[Feedback.FREE]
+    if deployed:
+        deployed = deployed | _bounded(tuning, Feedback.FREE, DEPLOYED)
     return {
         "tracking": free | ({"local": deployed} if deployed else {}),
         "equal_feedback": classes[Feedback.EQUAL],
         "free_feedback": free | ({DEPLOYED: deployed} if deployed else {}),
     }
+
+
+def _bounded(tuning: dict[str, Any], feedback: Feedback, name: str) -> dict[str, Any]:
+    """Whether a law was tuned, and its roughness beside the limit; where nothing is compared there is neither."""
+    told = tuning.get(feedback.value, {}).get(name, {})
+    return {"tuned": name != DEPLOYED} | {key: told[key] for key in ROUGHNESS if key in told}
