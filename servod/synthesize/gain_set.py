@@ -22,13 +22,13 @@ from servod.gain_parameters import (
     WeightShape,
 )
 from servod.gains import GainSet
-from servod.models.noise import noise_of
 from servod.synthesize.deployed import Infeasible, Wishes, explain, region_gains, regions
 from servod.synthesize.feedforward import position_feedforward
 from servod.synthesize.integral_gain import designed
 from servod.synthesize.local_sets import PAPER_NODES, STIFFNESS_SHARE, compensator, local_sets, sets_at
 from servod.synthesize.observer_width import OBSERVERS_RAD_S, with_observer, with_widest_observer
 from servod.synthesize.origin import provenance
+from servod.verify.rest import hold_width, rest_width
 from servod.verify.steady_friction import SteadyFriction, steady_friction
 
 #: From this bandwidth of the output observer on no other choice of filter and poles is tried.
@@ -39,8 +39,6 @@ APPROACH = 3.0  # speed with which a step is approached, as a factor on the map'
 #: At rest a joint stands on its bristle, and what feedback adds is the encoder's noise: this share of feedback and
 #: observer keeps it where it is (at 20 bit 5 urad instead of 15 to 45); less of it lets it creep and hunt.
 REST_SHARE = 0.3
-REST_SIGMAS = 5.0  # of the encoder's noise, beyond the hold width, within which a joint counts as at rest
-HOLD_COUNTS = 0.6  # hold width in encoder counts: what rounding hides, and no more, for the joint creeps as far
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +106,7 @@ def parameters(
         if bandwidth
         else None,
         feedforward_inertia_kg_m2=friction.inertia,
-        hold_within_rad=HOLD_COUNTS * count_rad(design),
+        hold_within_rad=hold_width(design),
         rest_within_rad=rest_width(design),
         rest_share=REST_SHARE,
         error_limit_rad=approach_error(used.high, APPROACH * speed),
@@ -116,17 +114,6 @@ def parameters(
         if options.position_feedforward
         else None,
     )
-
-
-def count_rad(design: Design) -> float:
-    """Angle of one count of the encoder [rad]; 0 where it has no steps."""
-    return 2.0 * math.pi / design.counts_per_turn if design.counts_per_turn else 0.0
-
-
-def rest_width(design: Design) -> float:
-    """Error that rounding and noise of the encoder may show of a joint that stands where it shall [rad]."""
-    noise = noise_of(design.model, count_rad(design))
-    return HOLD_COUNTS * count_rad(design) + (REST_SIGMAS * noise.encoder_rms if noise else 0.0)
 
 
 def approach_error(high: RegionGains, speed: float) -> float | None:

@@ -18,6 +18,8 @@ from servod.verify.checks import LEAST_PLANTS, SIMULATED, STATIC, Subject, obser
 from servod.verify.effect_checks import check_effects
 from servod.verify.promise import promise
 from servod.verify.reference_checks import check_reference
+from servod.verify.rest_checks import check_loads, check_rest
+from servod.verify.trials import scale_of
 
 SEED, PROCESSES = 1, 2
 SOURCES = (
@@ -61,6 +63,7 @@ class Verification:
             checks=self.checks,
             observations=self.observations,
             promised=self.promised,
+            torque_nm=scale_of(gains.design).torque_nm if gains.design else None,
         )
 
     def certified(self, gains: GainSet) -> GainSet:
@@ -107,8 +110,8 @@ def verify(
     if gains.design is None:
         raise BadInput(f"{where}: design", "nothing", "a design, as `servoctl synthesize` writes it")
     subject = Subject(gains, gains.design, plants, seed, processes, least_plants)
-    checks = [check for judge in (*STATIC, check_effects, check_reference) for check in judge(subject)]
+    checks = [check for judge in (*STATIC, check_rest, check_effects, check_reference) for check in judge(subject)]
     if not all(check.passed for check in checks):
         return Verification(checks, {})
-    checks += [check for judge in SIMULATED for check in judge(subject)]
+    checks += [check for judge in (*SIMULATED, check_loads) for check in judge(subject)]
     return Verification(checks, observations(subject), promise(gains, gains.design, seed))

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from servod.controllers import Law
-from servod.controllers.state import ASKED, FRICTION_STATE, LAST_VELOCITY, N_STATES, STARTED
+from servod.controllers.state import ASKED, FRICTION_STATE, LAST_VELOCITY, N_STATES, REST, STARTED
 from servod.verify.sampled import Array, Timing
 
 SETTLE_CYCLES = 100  # at most, after the first long one
@@ -65,10 +65,15 @@ def law_slopes(law: Law, gains: tuple[float, ...], velocity: float, moves: bool,
     return _differences(law, gains, base, (0.0, velocity, nudge, velocity), timing)
 
 
-def arriving_slopes(law: Law, gains: tuple[float, ...], velocity: float, error_rad: float, timing: Timing) -> LawSlopes:
-    """Slopes where the reference rests and the joint creeps towards it, `error_rad` away: more than holding allows."""
+def arriving_slopes(
+    law: Law, gains: tuple[float, ...], velocity: float, error_rad: float, timing: Timing, rest: float = 0.0
+) -> LawSlopes:
+    """Slopes where the reference rests and the joint slides `error_rad` away from it.
+
+    `rest`: how far it counts as at rest, from 0, as on its way there, to 1, as when it stood and was pushed.
+    """
     base = [0.0] * N_STATES
-    base[LAST_VELOCITY], base[STARTED] = velocity, 1.0
+    base[LAST_VELOCITY], base[STARTED], base[REST] = velocity, 1.0, rest
     return _differences(law, gains, base, (error_rad, 0.0, 0.0, velocity), timing)
 
 
