@@ -35,23 +35,22 @@ SOAK_UP = frozenset(
 TRIED = 3
 
 
-def detail(chooser: Chooser, choice: Choice) -> bool:
-    """Add terms to `choice` where much is left, all or none of them; whether any came in."""
-    if not choice.fit.hypothesis.terms or not much_left(chooser, choice):
-        return False
+def detail(chooser: Chooser, choice: Choice) -> None:
+    """Add terms to `choice`, all or none of them."""
     refined = replace(choice, merits=list(choice.merits), entries=list(choice.entries))
     while len(refined.fit.hypothesis.terms) < MOST_TERMS and monotonic() < chooser.deadline:
         if chooser.nothing_left(refined.fit.mismatch) or not _add(chooser, refined):
             break
     if refined.fit is choice.fit or chooser.merit(choice.fit, refined.fit).of_left < LEAST_TOGETHER:
-        return False
+        return
     choice.fit, choice.merits, choice.entries = refined.fit, refined.merits, refined.entries
     choice.tried, choice.floor = chooser.tried, chooser.floor
-    return True
 
 
 def much_left(chooser: Chooser, choice: Choice) -> bool:
-    """Whether what is left is more than forms and noise make."""
+    """Whether terms came in, and what they left is more than forms and noise make."""
+    if not choice.fit.hypothesis.terms:
+        return False
     left = chooser.error(choice.fit.mismatch) - chooser.floor
     explainable = max(chooser.base_error - chooser.floor, 1e-30)
     return left > LEFT_SHARE * explainable and math.sqrt(max(left, 0.0)) > MUCH_LEFT * chooser.predictor.dry

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from servod.axis_model import AxisModel
 from servod.diagnose.choose import Choice, Chooser
-from servod.diagnose.detail import detail
+from servod.diagnose.detail import detail, much_left
 from servod.diagnose.fit import Fit, Weighing
 from servod.diagnose.held_out import HeldOut, held_out
 from servod.diagnose.intake import Refusal, taken_in
@@ -92,7 +92,8 @@ def diagnose(
     chooser = Chooser(predictor, model, begun + SEARCH_SHARE * time_limit_s, tell)
     choice = chooser.run()
     swapped(chooser, choice)
-    if detail(chooser, choice):
+    if much_left(chooser, choice):
+        detail(chooser, choice)
         slow(chooser, choice)
     seconds["search"] = monotonic() - begun - seconds["intake"]
     choice.fit = tidied(chooser, choice.fit)
