@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.config import AxisConfig
-from servod.deploy.judge import complaints
+from servod.deploy.judge import complaints, promise_document
 from servod.deploy.links import DeployLink, Rows
 from servod.errors import FAULTS, AnswerIsNo, BadInput, Reaction, ServodError, faults_in
 from servod.gain_design import Design
@@ -58,7 +58,7 @@ class Deployment:
             "present": {"name": self.present[0], "version": self.present[1]},
             "before": self.before.document(),
             "after": self.after and self.after.document(),
-            "promised": {f"{k.removesuffix('_rad')}_mrad": 1e3 * v for k, v in _figures(self.promised).items()},
+            "promised": promise_document(self.promised),
         }
 
 
@@ -231,7 +231,3 @@ def _every_cycle(rows: Rows) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     cycle = rows["cycle"] - rows["cycle"][0]
     every = np.arange(int(cycle[-1]) + 1)
     return np.interp(every, cycle, rows["reference_rad"]), np.interp(every, cycle, rows["position_rad"])
-
-
-def _figures(promised: Promise) -> dict[str, float]:
-    return {key: value for key, value in promised.model_dump().items() if key.endswith("_rad")}

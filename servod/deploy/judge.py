@@ -66,5 +66,10 @@ def promised_of(promised: Promise, part: Part) -> float:
     return {Part.SLOW: promised.slow_rad, Part.BRISK: promised.brisk_rad, Part.HOLD: promised.hold_rad}[part]
 
 
+def promise_document(promised: Promise) -> dict[str, float]:
+    """The promised figure of every part in mrad, by the names of the measured ones."""
+    return {f"{part.value}_mrad": 1e3 * promised_of(promised, part) for part in Part}
+
+
 def _mrad(value_rad: float) -> str:
     return f"{1e3 * value_rad:.4g}"
