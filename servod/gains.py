@@ -9,12 +9,14 @@ import datetime
 import hashlib
 import json
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
 from pydantic import Field, model_validator
 
+from servod.axis_model import load_axis_model
 from servod.config import AxisConfig
 from servod.controllers import LAWS, Law
 from servod.errors import BadInput
@@ -26,6 +28,8 @@ from servod.yaml12 import Dumper, Strict, parse_yaml, read_text, validate
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 #: Lower case only: names become file names, also on systems that do not tell case apart.
 NAME_PATTERN = r"^[a-z0-9][a-z0-9_.-]{0,63}$"
+#: A model's delay may be so much of a cycle longer than the set's and still be the same: identified, it differs.
+DELAY_SHARE = 0.1
 GainName = Annotated[str, Field(pattern=NAME_PATTERN)]
 
 
@@ -107,6 +111,7 @@ class Certificate(Strict):
     checks: list[CertificateCheck] = Field(default_factory=list)
     observations: dict[str, float] = Field(default_factory=dict, description="figures that are told, not judged")
     promised: Promise | None = Field(None, description="what a deployment measures again on the axis")
+    torque_nm: float | None = Field(None, gt=0.0, description="the drive's torque that the trials took for granted")
 
     @model_validator(mode="after")
     def _valid_means_checked(self) -> Certificate:
@@ -227,16 +232,45 @@ def require_fit(gains: GainSet, config: AxisConfig) -> None:
 
 
 def require_same_loop(gains: GainSet, config: AxisConfig) -> None:
-    """Refuse a set whose design is for another cycle or velocity filter than the axis has.
+    """Refuse a set whose design is for another cycle, filter, encoder, torque or delay than the axis has.
 
-    What was certified is the sampled loop with its delay and its filter; with others the proof says nothing.
+    What was certified is the sampled loop with its delay and its filter; with others the proof says nothing. A finer
+    encoder, more torque and less delay are no worse. What a set or a configuration does not state is not compared.
     Raises BadInput.
     """
     if gains.design is None:
         return
     design, cutoff_hz = gains.design, config.encoder.velocity_cutoff_hz
     period_s = config.cycle.period_us * NS_PER_US / NS_PER_S
-    facts = {"velocity_cutoff_hz": (design.velocity_cutoff_hz, cutoff_hz), "period_s": (design.period_s, period_s)}
-    for key, (wanted, found) in facts.items():
+    same = {"velocity_cutoff_hz": (design.velocity_cutoff_hz, cutoff_hz), "period_s": (design.period_s, period_s)}
+    for key, (wanted, found) in same.items():
         if not math.isclose(wanted, found, rel_tol=1e-6):
             raise BadInput(f"gain set {gains.name}: design.{key}", wanted, f"{found}, as the axis is configured")
+    for key, wanted, found in _no_more(gains, design, config):
+        if wanted > found * (1.0 + 1e-6):
+            raise BadInput(f"gain set {gains.name}: {key}", wanted, f"at most {found:g}, as the axis is configured")
+    _require_delay(gains, design, config)
+
+
+def _no_more(gains: GainSet, design: Design, config: AxisConfig) -> Iterator[tuple[str, float, float]]:
+    """Key, what the set takes for granted, and what the axis has of it; an encoder without counts has no steps."""
+    yield "design.counts_per_turn", design.counts_per_turn, config.encoder.counts_per_turn
+    if gains.certificate is not None and gains.certificate.torque_nm is not None:
+        yield "certificate.torque_nm", gains.certificate.torque_nm, config.limits.torque_nm
+
+
+def _require_delay(gains: GainSet, design: Design, config: AxisConfig) -> None:
+    """Refuse a set for less delay than the axis's model has; that model is the data sheet's, and so only about right.
+
+    A client that was told the configuration by the daemon may not have the file; the daemon itself has.
+    """
+    if config.model is None or not config.model.is_file():
+        return
+    found = load_axis_model(config.model).total_delay_s
+    most = design.model.total_delay_s + max(design.uncertainty.delay_s, DELAY_SHARE * design.period_s)
+    if found > most:
+        raise BadInput(
+            f"gain set {gains.name}: design.model.delay_s",
+            design.model.total_delay_s,
+            f"{found:g}, as in {config.model}",
+        )

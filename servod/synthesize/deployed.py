@@ -43,6 +43,7 @@ class Wishes:
     period_s: float = 0.001
     cutoff_hz: float | None = None  # of the velocity filter; None = the lowest that is feasible
     counts_per_turn: float = 2.0**20
+    torque_limit_nm: float | None = None  # of the axis
     speed_max: float = 0.5
     overlap: tuple[float, float] = (0.005, 0.02)
     position_weight: float = 1.0
@@ -100,6 +101,7 @@ def empty_design(model: AxisModel, wishes: Wishes, cutoff_hz: float) -> Design:
         velocity_cutoff_hz=cutoff_hz,
         counts_per_turn=wishes.counts_per_turn,
         speed_max_rad_s=wishes.speed_max,
+        torque_limit_nm=wishes.torque_limit_nm,
         model=model,
         uncertainty=wishes.uncertainty,
     )

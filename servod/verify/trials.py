@@ -38,7 +38,7 @@ RIPPLE_LIMIT_RAD = 1e-4  # peak to peak of a long hold, torque noise included
 RIPPLE_SHARE = 0.002
 RIPPLE_S = 0.2
 SETTLED_SHARE = 0.02  # of the large step: a plant that is further off at its end does not get there
-TORQUE_FACTOR = 3.0  # of the largest friction: the drive that the motions are certified with has no more
+TORQUE_FACTOR = 3.0  # of the largest friction: the drive of the trials has no more, nor more than its limit
 RAMP_SHARES = (0.001, 0.004, 0.02)  # of the top speed
 RAMP_S = 4.0
 LONG_HOLD_S = 20.0
@@ -78,7 +78,8 @@ def scale_of(design: Design) -> Scale:
         slopes = [friction.dry_slope(side * v) + friction.viscous(side * v) for v in speeds]
         falls += [speeds[int(np.argmin(slopes))]] if min(slopes) < 0.0 else []
     peak = max([PAST_FALL * speed for speed in falls], default=0.0)
-    return Scale(top, min(max(peak, LEAST_PEAK * top), top), TORQUE_FACTOR * friction.largest(top))
+    torque = min(TORQUE_FACTOR * friction.largest(top), design.torque_limit_nm or math.inf)
+    return Scale(top, min(max(peak, LEAST_PEAK * top), top), torque)
 
 
 @dataclass(frozen=True, slots=True)

@@ -63,7 +63,10 @@ def test_a_limit_that_is_met_rolls_back(tmp_path: Path) -> None:
     limits = link_to(table1(), tmp_path / "roomy").config.limits.model_copy(update={"torque_nm": 0.075})
     config = link_to(table1(), tmp_path).config.model_copy(update={"limits": limits})
     link = virtual_link(table1(), tmp_path, certified(), PD, config=config)
-    done = deploy(link, certified(), quiet)
+    with pytest.raises(BadInput, match=r"certificate\.torque_nm: .* at most 0\.075"):
+        deploy(link, certified(), quiet)
+    earlier = certified().certificate.model_copy(update={"torque_nm": None})  # issued before torque was stated
+    done = deploy(link, certified().model_copy(update={"certificate": earlier}).sealed(), quiet)
     assert not done.stays and any(reason.startswith("TORQUE_CLIPPED") for reason in done.reasons)
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from servod.axis_model import load_axis_model
-from servod.config import load_config
+from servod.axis_model import axis_model_yaml, load_axis_model
+from servod.config import AxisConfig, load_config
 from servod.controllers import LAWS, local
 from servod.daemon.gain_bank import GainBank
 from servod.errors import BadInput
@@ -21,6 +21,15 @@ from tests.gains import good
 
 BAD = yaml.safe_load(Path(__file__).with_name("bad_gains.yaml").read_text(encoding="utf-8"))
 SEALED_BEFORE_REST = Path(__file__).with_name("sealed_before_rest.yaml")
+DESIGN = Design(
+    mode=DesignMode.DEPLOYED,
+    period_s=0.001,
+    velocity_cutoff_hz=120.0,
+    counts_per_turn=2.0**20,
+    speed_max_rad_s=0.5,
+    model=load_axis_model(shipped("gains/axes/table1_joint.yaml")),
+    uncertainty=Uncertainty(),
+)
 SHIPPED = sorted((Path(__file__).resolve().parents[2] / "gains").glob("*.yaml"))
 
 
@@ -164,7 +173,7 @@ def test_a_set_designed_for_another_filter_or_cycle_does_not_fit_the_axis() -> N
     certified = good.certified(parse_gains(good.PD, "good.yaml"))
 
     def designed(period_s: float, cutoff_hz: float) -> GainSet:
-        design = Design.model_construct(period_s=period_s, velocity_cutoff_hz=cutoff_hz)
+        design = DESIGN.model_copy(update={"period_s": period_s, "velocity_cutoff_hz": cutoff_hz})
         return certified.model_copy(update={"design": design}).sealed()
 
     cutoff_hz = config.encoder.velocity_cutoff_hz
@@ -197,15 +206,7 @@ def test_a_daemon_starts_with_the_initial_set_when_the_active_one_is_for_another
     plain = parse_gains(good.PD, "good.yaml")
     file = tmp_path / "bench_pd.yaml"
     file.write_text(plain.to_yaml())
-    design = Design(
-        mode=DesignMode.DEPLOYED,
-        period_s=0.001,
-        velocity_cutoff_hz=config.encoder.velocity_cutoff_hz,
-        counts_per_turn=2.0**20,
-        speed_max_rad_s=0.5,
-        model=load_axis_model(shipped("gains/axes/table1_joint.yaml")),
-        uncertainty=Uncertainty(),
-    )
+    design = DESIGN.model_copy(update={"velocity_cutoff_hz": config.encoder.velocity_cutoff_hz})
     wanted = good.certified(plain.model_copy(update={"name": "designed", "design": design}).sealed())
     gains = config.gains.model_copy(update={"directory": tmp_path / "store", "initial": file})
     axis = config.model_copy(update={"gains": gains})
@@ -253,3 +254,32 @@ def test_a_daemon_starts_with_the_initial_set_whatever_is_wrong_with_the_active_
     assert said in caplog.text and "runs in place of sealed_before_rest version 1" in caplog.text
     active, last = store.active(), store.history()[-1]
     assert active is not None and active.name == "demo_pd" and said in last.note
+
+
+def test_a_set_for_a_finer_encoder_more_torque_or_less_delay_does_not_fit_the_axis(tmp_path: Path) -> None:
+    config = load_config(shipped("gains/config/virtual.yaml"))
+    designed = good.certified(parse_gains(good.PD, "good.yaml").model_copy(update={"design": DESIGN}).sealed())
+    assert designed.certificate is not None
+
+    def certified_with(torque_nm: float | None) -> GainSet:
+        assert designed.certificate is not None
+        certificate = designed.certificate.model_copy(update={"torque_nm": torque_nm})
+        return designed.model_copy(update={"certificate": certificate}).sealed()
+
+    def with_encoder(counts: int) -> AxisConfig:
+        return config.model_copy(update={"encoder": config.encoder.model_copy(update={"counts_per_turn": counts})})
+
+    def with_model(delay_s: float) -> AxisConfig:
+        path = tmp_path / f"{delay_s}.yaml"
+        path.write_text(axis_model_yaml(DESIGN.model.model_copy(update={"delay_s": delay_s})))
+        return config.model_copy(update={"model": path})
+
+    for torque_nm in (None, config.limits.torque_nm):
+        for axis in (config, with_encoder(2**23), with_model(0.00105), with_model(0.0005)):
+            require_fit(certified_with(torque_nm), axis)
+    with pytest.raises(BadInput, match=r"design\.counts_per_turn: found 1048576\.0; allowed: at most 131072"):
+        require_fit(certified_with(None), with_encoder(2**17))
+    with pytest.raises(BadInput, match=r"certificate\.torque_nm: found 0\.4; allowed: at most 0\.3"):
+        require_fit(certified_with(0.4), config)
+    with pytest.raises(BadInput, match=r"design\.model\.delay_s: found 0\.001; allowed: 0\.002"):
+        require_fit(certified_with(None), with_model(0.002))

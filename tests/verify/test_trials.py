@@ -80,3 +80,10 @@ def test_a_plant_that_gets_nowhere_fails_by_what_it_misses() -> None:
     heavy = gains.design.model.model_copy(update={"torque_offset": -1.0})
     lost = run_trial(gains, gains.design.model_copy(update={"model": heavy}), motion, 1, 0)
     assert not lost.follows and not lost.arrives and not lost.stable
+
+
+def test_the_drive_of_the_trials_has_no_more_torque_than_the_axis() -> None:
+    design = table1_set().design
+    assert design is not None
+    assert scale_of(design).torque_nm == pytest.approx(3.0 * steady_friction(design.model).largest(0.5))
+    assert scale_of(design.model_copy(update={"torque_limit_nm": 0.1})).torque_nm == 0.1

@@ -79,6 +79,7 @@ def _loop(walk: Walk) -> dict[str, Any]:
         "cutoff_hz": walk.axis.cutoff_hz,
         "counts_per_turn": float(config.encoder.counts_per_turn),
         "torque_limit_nm": config.limits.torque_nm,
+        "torque_limit_nm": config.limits.torque_nm,
     }
 
 
