@@ -26,6 +26,10 @@ FAR_STARTS = 4
 IN_REACH = 0.4
 
 
+#: What a number more must take of the rest to be worth it.
+PER_NUMBER = 0.02
+
+
 @dataclass(frozen=True)
 class Candidate:
     """An effect on trial: its fit, and what is left of the cost of the present fit as a share of it."""
@@ -61,7 +65,7 @@ class Trials:
         chosen = best_of_each(second, len(second), 1)
         limit = chosen[0].left + IN_REACH * max(1.0 - chosen[0].left, 0.0) if chosen else 0.0
         close = [c for c in chosen if c.left <= limit][:FULL_FITS]
-        fitted = sorted(side_by_side("starts", self._full, close), key=lambda c: c.left)
+        fitted = sorted(side_by_side("starts", self._full, close), key=plainly)
         return fitted + [c for c in chosen if c.effect not in {f.effect for f in fitted}]
 
     def _starts(self, name: str) -> list[Candidate]:
@@ -98,6 +102,12 @@ class Trials:
             return candidate
         fit = self.whole.refine(self.whole.opened(begun), FULL_STEPS, known=self.present.jacobian.shape[1])
         return Candidate(candidate.effect, fit, fit.cost / max(self.present.cost, 1e-30))
+
+
+def plainly(candidate: Candidate) -> float:
+    """What is left, a little more for every number that the term needs: the plainest of equals comes first."""
+    term = candidate.fit.hypothesis.terms[-1]
+    return candidate.left * (1.0 + PER_NUMBER * (len(term.unknowns) + len(term.opens)))
 
 
 def best_of_each(sorted_candidates: list[Candidate], count: int, each: int) -> list[Candidate]:

@@ -24,6 +24,9 @@ Columns = Callable[[float], tuple[Array, Array]]
 #: Periods that must lie within the range of positions before a periodic effect may be named.
 LEAST_PERIODS = 1.5
 
+#: Share of a period that must lie within the range when its order is given by the turn.
+LEAST_OF_PERIOD = 0.8
+
 #: Periods within the range, or in a radian turned (a metre), up to which a period is searched.
 MOST_PERIODS, MOST_IN_TURN = 100.0, 130.0
 
@@ -164,6 +167,10 @@ class Scene:
         )
         step = max(0.25 * 2.0 * math.pi / self.reach, (highest - lowest) / MOST_ORDERS)
         return np.arange(lowest, max(highest, 1.5 * lowest), step)
+
+    def low_orders(self, *orders: float) -> list[float]:
+        """Those of some orders per turn that go through most of a period within the range: less is no wave."""
+        return [n for n in orders if n * self.reach >= 2.0 * math.pi * LEAST_OF_PERIOD]
 
     @cached_property
     def thinned(self) -> NDArray[np.int64]:

@@ -44,7 +44,7 @@ def jackknife(fit: Fit, held: HeldOut) -> Array:
 
 
 def model_error(fit: Fit) -> Array:
-    """MODEL_ERROR of each value; of the sines and cosines of a term, of their common size."""
+    """MODEL_ERROR of each value; of the sines of a term, of their common size; of an order, over the range."""
     sizes = np.ones(len(fit.coordinates))
     linear = np.array([unknown.size != 0.0 for unknown in fit.hypothesis.unknowns])
     sizes[linear] = np.abs(fit.coordinates[linear])
@@ -52,6 +52,8 @@ def model_error(fit: Fit) -> Array:
         waves = [u.key.startswith(("sine", "cosine")) for u in term.unknowns]
         some = np.arange(len(sizes))[fit.hypothesis.share(place)][np.array(waves, dtype=bool)]
         sizes[some] = np.linalg.norm(fit.coordinates[some])
+        orders = [u.key == "n" for u in term.unknowns]
+        sizes[np.arange(len(sizes))[fit.hypothesis.share(place)][np.array(orders, dtype=bool)]] = 1.0
     return np.diag((MODEL_ERROR * sizes) ** 2)
 
 

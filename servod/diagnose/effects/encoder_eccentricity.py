@@ -35,7 +35,7 @@ def terms(scene: Scene) -> list[Term]:
     for peak in scene.peaks(_columns(scene), 2):
         bound = min(most, 0.4 / peak.n)
         found.append(sine_term(effect, scene, peak, size, scene.length, most=bound))
-    low = () if scene.linear else (1.0, 2.0)
+    low = [] if scene.linear else scene.low_orders(1.0, 2.0)
     fixed = [sine_term(effect, scene, Peak(n, 0.0, 0.0, 0.0), size, scene.length, most=most, free=False) for n in low]
     return fixed + found
 

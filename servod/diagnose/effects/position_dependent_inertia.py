@@ -14,7 +14,7 @@ def terms(scene: Scene) -> list[Term]:
     effect = "position_dependent_inertia"
     peaks = scene.peaks(scene.carried(-scene.inertia * scene.acceleration), 1)
     found = [sine_term(effect, scene, peak, 0.2, "1", most=0.65) for peak in peaks]
-    low = (2.0 * math.pi / scene.reach,) if scene.linear else (1.0, 2.0, 3.0)
+    low = [2.0 * math.pi / scene.reach] if scene.linear else scene.low_orders(1.0, 2.0, 3.0)
     fixed = [sine_term(effect, scene, Peak(n, 0.0, 0.0, 0.0), 0.2, "1", most=0.65, free=False) for n in low]
     return fixed + found
 
