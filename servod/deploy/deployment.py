@@ -30,6 +30,9 @@ WINDOW_TRAVELS, WINDOW_SHARE = 3.0, 0.85
 #: A value that is limited in no more than this share of the sines' cycles says nothing against a set: one cycle in a
 #: reversal of coarse counts, or as long as an offset fades. What it does to the motion is in the figures.
 FEW_LIMITED = 0.002
+#: Where the set of before met the limit as well it is low for the motion, and twice as often may be chance; but no more
+#: than so much more often, and never more than the most, where that set did not either.
+MORE_LIMITED, MOST_LIMITED = 0.01, 0.05
 #: Faults that say that a value had to be limited.
 _CLIPS = sum(fault.bit for fault in FAULTS.values() if fault.reaction == Reaction.CLIP)
 
@@ -206,14 +209,19 @@ def motions_in(rows: Rows) -> list[Rows]:
 def limits_met(rows: Rows, before: Rows) -> list[str]:
     """What had to be limited in these sines, by the table of faults; a step may be limited.
 
-    Not what few cycles met, and not what the set `before` met half as often: then the limit is too low for the motion.
+    Not what few cycles met, and not what the set `before` met about as often: then the limit is too low for the motion.
     """
     found = []
     for fault in faults_in(int(np.bitwise_or.reduce(rows["faults"])) & _CLIPS):
         share, earlier = (float(np.mean((of["faults"] & fault.bit) != 0)) for of in (rows, before))
-        if share > max(FEW_LIMITED, 2.0 * earlier):
+        if share > limited_at_most(earlier):
             found.append(f"{fault.code.name} in {100.0 * share:.2g} % of the cycles: {fault.cause}")
     return found
+
+
+def limited_at_most(earlier: float) -> float:
+    """Share of cycles that may be limited where it was `earlier` under the set of before; at least as much as that."""
+    return max(FEW_LIMITED, earlier, min(2.0 * earlier, earlier + MORE_LIMITED, MOST_LIMITED))
 
 
 def skipped(rows: Rows) -> list[str]:

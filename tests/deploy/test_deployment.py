@@ -78,6 +78,10 @@ def test_few_limited_cycles_and_those_that_the_set_before_met_as_well_are_not_he
 
     assert limits_met(limited(15), limited(0)) == []
     assert limits_met(limited(300), limited(200)) == []
+    assert limits_met(limited(500), limited(450)) == []
+    assert limits_met(limited(6000), limited(6000)) == []
+    for more, before in ((10_000, 5000), (6001, 6000), (501, 450), (301, 200), (60, 25), (25, 0)):
+        assert limits_met(limited(more), limited(before))
     (said,) = limits_met(limited(300), limited(100))
     assert said.startswith("TORQUE_CLIPPED in 3 % of the cycles")
 
