@@ -6,8 +6,10 @@ are judged by the same rules. Needs numpy (the lab part).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from enum import StrEnum
 from statistics import NormalDist
 from typing import Any
 
@@ -15,6 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.errors import AnswerIsNo
+from servod.gains import GainSet
+from servod.models.noise import noise_of
 
 Array = NDArray[np.float64]
 
@@ -38,8 +42,12 @@ SWING_COUNTS = 2.5
 SMOOTH_S = 0.05
 #: ... so many times while it is held: two whole periods. Creep goes one way.
 SWINGS = 4
+#: Fast motion without a line: readings scatter from cycle to cycle by more than this factor on what is known of the
+#: encoder. A joint that stands between two counts scatters by the root of three on rounding alone.
+SCATTER = 2.0
 #: What counts as a count where the encoder has no steps, or finer ones [rad].
 LEAST_COUNT_RAD = 4e-6
+ROUNDING = math.sqrt(12.0)  # a count over the RMS of rounding to it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,20 +71,28 @@ class Curves:
         return (self.reference_rad - self.position_rad) * 1e3
 
 
+class HoldOf(StrEnum):
+    """Whose swing `hold_mrad` is: the joint's own, which only a virtual world knows, or that of its readings."""
+
+    JOINT = "joint"
+    ENCODER = "encoder"
+
+
 @dataclass(frozen=True, slots=True)
 class StepResponse:
     """One step and its hold. `settling_s` is None when the error does not come to stay within the band.
 
     `overshoot` is a share of the step, `steady_error_mrad` the mean error at the end of the hold, without sign.
-    `hold_mrad` is peak to peak of the position from HOLD_FROM_S on: of the joint itself in a virtual world, and on any
-    other axis, as `hold_encoder_mrad`, of what the encoder shows. In that is the encoder's noise: `hold_noise_mrad` is
-    what readings that scatter as these do from cycle to cycle show of a joint that stands.
+    `hold_mrad` is peak to peak of the position from HOLD_FROM_S on: `hold_of` the joint itself in a virtual world, and
+    on any other axis, as `hold_encoder_mrad`, of what the encoder shows. In that is the encoder's noise:
+    `hold_noise_mrad` is what rounding, and the noise that is known of the encoder, show of a joint that stands.
     """
 
     settling_s: float | None
     overshoot: float
     steady_error_mrad: float
     hold_mrad: float
+    hold_of: HoldOf
     hold_encoder_mrad: float
     hold_noise_mrad: float
     limit_cycle: bool
@@ -123,11 +139,12 @@ def tracking(
     steps: Mapping[float, Curves],
     count_rad: float,
     true_swings_rad: Mapping[float, float] | None = None,
+    encoder_rms_rad: float | None = None,
 ) -> Tracking:
     """Judge one run of (19) and of the steps (by their size in mrad), all relative to where they began.
 
     `count_rad` is the encoder's resolution (0: none); `true_swings_rad` is how far the joint itself moved in each hold,
-    where a world knows that.
+    where a world knows that; `encoder_rms_rad` is the encoder's noise beside its rounding, where it is known.
     """
     swings_rad = true_swings_rad or {}
     error = score(followed.time_s, followed.error_mrad)
@@ -136,7 +153,7 @@ def tracking(
         max_error_mrad=error.max_error_mrad,
         roughness_nm=roughness(followed.time_s, followed.torque_nm),
         steps={
-            size: step_response(c.time_s, c.position_rad, size * 1e-3, count_rad, swings_rad.get(size))
+            size: step_response(c.time_s, c.position_rad, size * 1e-3, count_rad, swings_rad.get(size), encoder_rms_rad)
             for size, c in steps.items()
         },
         curves={"paper": followed} | {curve_key(size): c for size, c in steps.items()},
@@ -162,36 +179,57 @@ def roughness(time_s: Array, torque_nm: Array) -> float:
 
 
 def step_response(
-    time_s: Array, position_rad: Array, step_rad: float, count_rad: float, true_swing_rad: float | None = None
+    time_s: Array,
+    position_rad: Array,
+    step_rad: float,
+    count_rad: float,
+    true_swing_rad: float | None = None,
+    encoder_rms_rad: float | None = None,
 ) -> StepResponse:
     """Judge a step that is asked for at time 0; positions count from the place that was held before.
 
     `count_rad` is the encoder's resolution (0: none), `true_swing_rad` how far the joint itself moved in the hold,
-    where that is known. Raises AnswerIsNo when the hold is shorter than HOLD_FROM_S.
+    where that is known, `encoder_rms_rad` the encoder's noise beside its rounding, where it is known. Raises AnswerIsNo
+    when the hold is shorter than HOLD_FROM_S.
     """
     held = position_rad[time_s >= HOLD_FROM_S]
     if held.size == 0:
         raise AnswerIsNo(f"the step was held for less than {HOLD_FROM_S:.0f} s")
     error, swing_rad = step_rad - position_rad, float(np.ptp(held))
     beyond = np.max(-error * np.sign(step_rad))
+    sigma_rad = reading_rms(count_rad, encoder_rms_rad or 0.0)
+    moves = encoder_rms_rad is not None and scatter(held) > SCATTER * max(sigma_rad, LEAST_COUNT_RAD / ROUNDING)
     return StepResponse(
         settling_s=settling(time_s, error, max(BAND_SHARE * abs(step_rad), BAND_COUNTS * count_rad)),
         overshoot=max(0.0, float(beyond) / abs(step_rad)),
         steady_error_mrad=abs(float(np.mean(error[time_s >= time_s[-1] - STEADY_S]))) * 1e3,
         hold_mrad=1e3 * (swing_rad if true_swing_rad is None else true_swing_rad),
+        hold_of=HoldOf.ENCODER if true_swing_rad is None else HoldOf.JOINT,
         hold_encoder_mrad=1e3 * swing_rad,
-        hold_noise_mrad=1e3 * noise_swing(held),
-        limit_cycle=oscillates(held, float(time_s[1] - time_s[0]), max(count_rad, LEAST_COUNT_RAD)),
+        hold_noise_mrad=1e3 * noise_swing(sigma_rad, len(held)),
+        limit_cycle=moves or oscillates(held, float(time_s[1] - time_s[0]), max(count_rad, LEAST_COUNT_RAD)),
     )
 
 
-def noise_swing(held_rad: Array) -> float:
-    """Peak to peak of white noise that changes from cycle to cycle as `held_rad` does [rad].
+def known_noise(gains: GainSet, count_rad: float) -> float | None:
+    """Noise of the encoder's readings beside rounding, as the set's design knows it [rad]; None without one."""
+    noise = noise_of(gains.design.model, count_rad) if gains.design else None
+    return noise.encoder_rms if noise else None
 
-    The largest of n normal values lies where one of 2*n is expected beyond.
-    """
-    sigma = float(np.sqrt(np.mean(np.diff(held_rad) ** 2) / 2.0))
-    return 2.0 * sigma * NormalDist().inv_cdf(1.0 - 0.5 / len(held_rad))
+
+def reading_rms(count_rad: float, encoder_rms_rad: float) -> float:
+    """RMS of a reading of a joint that stands: rounding to counts, and noise beside it [rad]."""
+    return math.hypot(encoder_rms_rad, count_rad / ROUNDING)
+
+
+def scatter(held_rad: Array) -> float:
+    """RMS of white noise that changes from cycle to cycle as `held_rad` does [rad]."""
+    return float(np.sqrt(np.mean(np.diff(held_rad) ** 2) / 2.0))
+
+
+def noise_swing(sigma_rad: float, count: int) -> float:
+    """Peak to peak of `count` white readings [rad]: the largest of n normal values lies where one of 2*n is beyond."""
+    return 2.0 * sigma_rad * NormalDist().inv_cdf(1.0 - 0.5 / count)
 
 
 def settling(time_s: Array, error: Array, band: float) -> float | None:

@@ -39,7 +39,8 @@ def measure(
     }
     swings = {size: float(np.ptp(r.position_rad[r.t_s >= HOLD_FROM_S])) for size, r in runs.items()}
     steps = {size: curves_of(r) for size, r in runs.items()}
-    return tracking(curves_of(followed), steps, settings.resolution_rad, swings)
+    heard_rad = model.noise.encoder_rms if model.noise else 0.0
+    return tracking(curves_of(followed), steps, settings.resolution_rad, swings, heard_rad)
 
 
 def run(model: AxisModel, gains: GainSet, rows: Array, settings: LoopSettings, seed: int) -> ClosedLoopRun:

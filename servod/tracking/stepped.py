@@ -16,13 +16,13 @@ from servod.errors import AnswerIsNo
 from servod.gains import GainSet
 from servod.recordings.rows import ROW
 from servod.session import SteppedSession
-from servod.tracking.metrics import HOLD_FROM_S, Curves, Tracking, tracking
+from servod.tracking.metrics import HOLD_FROM_S, Curves, Tracking, known_noise, tracking
 from servod.tracking.motions import HOLD_S, PAPER_S, REST_S, STEPS_MRAD
 
 #: Told how much of a measurement is done, from 0 to 1.
 Tell = Callable[[float], None]
 
-_SLICE_S, _LOOK_S = 0.5, 0.005
+_SLICE_S = 0.5
 
 
 def measure(open_session: Callable[[], SteppedSession], gains: GainSet, tell: Tell | None = None) -> Tracking:
@@ -45,7 +45,8 @@ def measure(open_session: Callable[[], SteppedSession], gains: GainSet, tell: Te
     swings = {size: Swing() for size in STEPS_MRAD}
     steps = {size: move(ReferenceKind.STEP, [size * 1e-3, HOLD_S], HOLD_S, swings[size]) for size in STEPS_MRAD}
     widths_rad = {size: swing.width_rad for size, swing in swings.items()}
-    return tracking(followed, steps, 2.0 * math.pi / session.config.encoder.counts_per_turn, widths_rad)
+    count_rad = 2.0 * math.pi / session.config.encoder.counts_per_turn
+    return tracking(followed, steps, count_rad, widths_rad, known_noise(gains, count_rad))
 
 
 class Swing:
@@ -117,13 +118,14 @@ def follow(
 
 
 def _pass(session: SteppedSession, passed_s: float, swing: Swing | None) -> None:
-    """One slice of time, with a look at the joint every _LOOK_S."""
+    """One slice of time, with a look at the joint in every cycle: a slower look misses cycles of its own multiples."""
     if swing is None:
         session.run(_SLICE_S)
         return
-    for look in range(1, round(_SLICE_S / _LOOK_S) + 1):
-        session.run(_LOOK_S)
-        swing.look(session, passed_s + look * _LOOK_S)
+    period_s = session.cycle.period_ns * 1e-9
+    for look in range(1, round(_SLICE_S / period_s) + 1):
+        session.run(period_s)
+        swing.look(session, passed_s + look * period_s)
 
 
 def curves_of(raw: bytes, start_rad: float) -> Curves:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from servod.errors import AnswerIsNo
-from servod.tracking.metrics import Curves, Tracking, roughness, score, step_response, swings, tracking
+from servod.tracking.metrics import Curves, HoldOf, Tracking, roughness, score, step_response, swings, tracking
 
 PERIOD_S = 1e-3
 COUNT_RAD = 2.0 * math.pi / 2**20
@@ -131,7 +131,7 @@ def test_the_document_has_steps_by_their_size_in_mrad() -> None:
     assert document["rms_error_mrad"] == pytest.approx(1.0)
     assert list(document["steps"]) == ["100", "10"]
     figures = {"settling_s", "overshoot", "steady_error_mrad", "limit_cycle"}
-    assert set(document["steps"]["10"]) == figures | {"hold_mrad", "hold_encoder_mrad", "hold_noise_mrad"}
+    assert set(document["steps"]["10"]) == figures | {"hold_mrad", "hold_of", "hold_encoder_mrad", "hold_noise_mrad"}
     assert set(run.curves) == {"paper", "step_100", "step_10"}
     assert isinstance(run, Tracking)
 
@@ -139,10 +139,31 @@ def test_the_document_has_steps_by_their_size_in_mrad() -> None:
 def test_a_hold_is_judged_by_the_joint_where_it_is_known_and_beside_its_encoder_by_what_noise_shows() -> None:
     t, random = hold(), np.random.default_rng(1)
     position = np.round((0.01 + random.normal(0.0, 4e-6, len(t))) / COUNT_RAD) * COUNT_RAD
-    told = step_response(t, position, 0.01, COUNT_RAD, true_swing_rad=5e-6)
-    alone = step_response(t, position, 0.01, COUNT_RAD)
+    told = step_response(t, position, 0.01, COUNT_RAD, true_swing_rad=5e-6, encoder_rms_rad=4e-6)
+    alone = step_response(t, position, 0.01, COUNT_RAD, encoder_rms_rad=4e-6)
     assert told.hold_mrad == pytest.approx(0.005)
+    assert (told.hold_of, alone.hold_of) == (HoldOf.JOINT, HoldOf.ENCODER)
     assert alone.hold_mrad == alone.hold_encoder_mrad == told.hold_encoder_mrad
     assert alone.hold_encoder_mrad == pytest.approx(alone.hold_noise_mrad, rel=0.25)
-    moved = step_response(t, position + 3e-5 * np.sin(0.5 * t), 0.01, COUNT_RAD)
+    assert not alone.limit_cycle
+    moved = step_response(t, position + 3e-5 * np.sin(0.5 * t), 0.01, COUNT_RAD, encoder_rms_rad=4e-6)
     assert moved.hold_encoder_mrad > 1.8 * moved.hold_noise_mrad
+
+
+@pytest.mark.parametrize("wanders", [0.0, 60.0])
+def test_a_fast_cycle_is_no_noise(wanders: float) -> None:
+    """40 urad at 300 Hz, with a line, and without where its frequency wanders: known noise does not explain it."""
+    t, random = hold(), np.random.default_rng(2)
+    phase = np.cumsum(2.0 * math.pi * (300.0 + wanders * random.normal(0.0, 1.0, len(t))) * PERIOD_S)
+    reading = 0.01 + 2e-5 * np.sin(phase) + random.normal(0.0, 2e-6, len(t))
+    position = np.round(reading / COUNT_RAD) * COUNT_RAD
+    found = step_response(t, position, 0.01, COUNT_RAD, encoder_rms_rad=2e-6)
+    assert found.limit_cycle and found.hold_encoder_mrad > 1.5 * found.hold_noise_mrad
+    unknown = step_response(t, position, 0.01, COUNT_RAD)
+    assert unknown.hold_noise_mrad < found.hold_noise_mrad  # rounding alone explains less
+
+
+def test_a_joint_between_two_counts_is_no_limit_cycle() -> None:
+    t, random = hold(), np.random.default_rng(3)
+    position = np.round(0.5 + random.normal(0.0, 0.05, len(t))) * COUNT_RAD
+    assert not step_response(t, position, 0.5 * COUNT_RAD, COUNT_RAD, encoder_rms_rad=0.0).limit_cycle

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -76,3 +77,24 @@ def test_a_motion_that_the_axis_refuses_is_told(plant: AxisModel, tmp_path: Path
     stepped.activate(axis, set_of("pd"))
     with pytest.raises(AnswerIsNo, match="would leave limits"):
         stepped.run_motion(axis, ReferenceKind.STEP, [5.0, 1.0])
+
+
+class Watch(stepped.Swing):
+    """A swing that notes when it looks."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.looks_s: list[float] = []
+
+    def look(self, session: SteppedSession, passed_s: float) -> None:
+        self.looks_s.append(passed_s)
+        super().look(session, passed_s)
+
+
+def test_a_hold_is_looked_at_in_every_cycle(plant: AxisModel, tmp_path: Path) -> None:
+    """A slower look sees nothing of a joint that swings at a multiple of its rate."""
+    axis, watch = session(plant, tmp_path), Watch()
+    stepped.activate(axis, set_of("local"))
+    stepped.run_motion(axis, ReferenceKind.STEP, [0.01, 0.6], swing=watch)
+    apart_s = [after - before for before, after in pairwise(watch.looks_s)]
+    assert max(apart_s) == pytest.approx(axis.cycle.period_ns * 1e-9)
