@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
+import signal
 import subprocess
 import sys
 import textwrap
 from pathlib import Path
+from subprocess import PIPE
 
 import pytest
 import readme
@@ -56,7 +59,14 @@ def test_the_first_steps_work_as_they_stand(tmp_path: Path) -> None:
     (tmp_path / "gains").symlink_to(source.ROOT / "gains")
     environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
     shell = ["bash", "-e", "-c", "trap 'kill $(jobs -p) 2>/dev/null || true' EXIT\n" + textwrap.dedent(block)]
-    done = subprocess.run(shell, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=100)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert done.stdout.count("motion done") == 2
-    assert "open-loop position error" in done.stdout
+    begun = subprocess.Popen(
+        shell, cwd=tmp_path, env=environment, stdout=PIPE, stderr=PIPE, text=True, start_new_session=True
+    )
+    try:
+        told, complained = begun.communicate(timeout=100)
+    finally:  # also what the shell started and a time-out leaves behind
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(begun.pid, signal.SIGKILL)
+    assert begun.returncode == 0, told + complained
+    assert told.count("motion done") == 2
+    assert "open-loop position error" in told
