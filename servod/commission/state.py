@@ -64,15 +64,15 @@ class State:
     def done(self, step: str, inputs: dict[str, Any], outputs: Sequence[str]) -> bool:
         """Whether the step was done with these inputs and its files are there.
 
-        Raises BadInput when one of them is not what the step wrote.
+        Raises BadInput when one of them is not what the step wrote, whatever else speaks for doing the step anew: that
+        would overwrite it.
         """
         record = self._content.steps.get(step)
-        if record is None or record.inputs_sha256 != digest(inputs):
-            return False
-        if not all((self.folder / name).exists() for name in outputs):
+        if record is None:
             return False
         self._refuse_edited_files(step, record)
-        return True
+        there = all((self.folder / name).exists() for name in {*outputs, *record.files_sha256})
+        return there and record.inputs_sha256 == digest(inputs)
 
     def begin(self, step: str) -> None:
         """The step is not done: from here on its files are whatever an interruption leaves of them."""
@@ -107,7 +107,7 @@ class State:
 
     def _refuse_edited_files(self, step: str, record: StepRecord) -> None:
         for name, sha256 in record.files_sha256.items():
-            if file_sha256(self.folder / name) != sha256:
+            if file_sha256(self.folder / name) not in ("", sha256):
                 raise BadInput(
                     f"--out {self.folder}: {name}",
                     f"a file that was changed after the step {step} had written it",

@@ -73,9 +73,8 @@ class Step(Protocol):
         """What people read."""
         ...
 
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """Files in the walk's folder that are there when it is done."""
+    def outputs(self, walk: Walk) -> tuple[str, ...]:
+        """Files in the walk's folder that are there when it is done, and that nobody else writes."""
         ...
 
     def inputs(self, walk: Walk) -> dict[str, Any]:
@@ -105,10 +104,10 @@ def run(walk: Walk, steps: tuple[Step, ...]) -> State:
         if name not in names:
             raise BadInput("--again", name, ", ".join(names))
     with sole_walk(walk.folder):
-        state = State(walk.folder, walk.axis.identity, [name for step in steps for name in step.outputs])
+        state = State(walk.folder, walk.axis.identity, [name for step in steps for name in step.outputs(walk)])
         for step in steps:
             inputs = step.inputs(walk)
-            if step.name not in walk.options.again and state.done(step.name, inputs, step.outputs):
+            if step.name not in walk.options.again and state.done(step.name, inputs, step.outputs(walk)):
                 walk.say(f"{step.title}: done before")
                 continue
             state.begin(step.name)
@@ -117,6 +116,6 @@ def run(walk: Walk, steps: tuple[Step, ...]) -> State:
                 step.run(walk)
             except AnswerIsNo as error:
                 raise StepFailed(step.name, str(error)) from error
-            state.record(step.name, inputs, time.monotonic() - started, step.outputs)
+            state.record(step.name, inputs, time.monotonic() - started, step.outputs(walk))
             walk.say(f"{step.title}: {state.seconds[step.name]:.1f} s")
     return state

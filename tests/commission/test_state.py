@@ -42,14 +42,14 @@ class Copy:
     source: str | None
     runs: list[str]
     interrupt: bool = False
+    more: tuple[str, ...] = ()
 
     @property
     def title(self) -> str:
         return self.name
 
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        return (f"{self.name}.txt",)
+    def outputs(self, _walk: Walk) -> tuple[str, ...]:
+        return (f"{self.name}.txt", *(f"{self.name}_{more}.txt" for more in self.more))
 
     def inputs(self, walk: Walk) -> dict[str, Any]:
         return {**(walk.hashes(self.source) if self.source else {}), "accuracy": walk.options.accuracy}
@@ -59,7 +59,8 @@ class Copy:
             raise KeyboardInterrupt
         self.runs.append(self.name)
         before = walk.path(self.source).read_text() if self.source else ""
-        write_text(walk.path(self.outputs[0]), f"{before}{self.name} {walk.options.accuracy}\n")
+        for name in self.outputs(walk):
+            write_text(walk.path(name), f"{before}{self.name} {walk.options.accuracy}\n")
 
 
 def chain(runs: list[str], interrupted: str = "") -> tuple[Copy, ...]:
@@ -111,6 +112,21 @@ def test_an_edited_file_is_named_with_the_way_out(way_out: str, tmp_path: Path) 
         run(walk(tmp_path, again=("two",)), chain(runs))
     assert edited.read_text() == whole
     assert runs[3:] == ["two"]  # what came out is the same, so the step after it stays
+
+
+def test_an_edited_file_is_kept_although_the_step_is_to_be_done_anew(tmp_path: Path) -> None:
+    """By other inputs, or for another of its files that is gone."""
+    runs: list[str] = []
+    steps = (Copy("one", None, runs, more=("a", "b")),)
+    run(walk(tmp_path), steps)
+    (tmp_path / "one_a.txt").write_text("by hand\n")
+    (tmp_path / "one_b.txt").unlink()
+    for accuracy in (walk(tmp_path).options.accuracy, 0.05):
+        with pytest.raises(BadInput, match=r"one_a\.txt.*changed after the step one.*--again one"):
+            run(walk(tmp_path, accuracy=accuracy), steps)
+    assert (tmp_path / "one_a.txt").read_text() == "by hand\n" and runs == ["one"]
+    run(walk(tmp_path, again=("one",)), steps)
+    assert runs == ["one", "one"] and (tmp_path / "one_a.txt").read_text() == (tmp_path / "one_b.txt").read_text()
 
 
 def test_an_interrupted_repetition_is_no_edited_file(tmp_path: Path) -> None:

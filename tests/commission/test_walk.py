@@ -51,7 +51,9 @@ class Known:
 
     name: str = "known"
     title: str = "known"
-    outputs: tuple[str, ...] = (MODEL,)
+
+    def outputs(self, _walk: Walk) -> tuple[str, ...]:
+        return (MODEL,)
 
     def inputs(self, _walk: Walk) -> dict[str, Any]:
         return {}

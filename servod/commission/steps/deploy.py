@@ -15,6 +15,9 @@ from servod.errors import AnswerIsNo
 from servod.gains import GainSet, load_gains
 from servod.identify.feedback import STIFF, feedback
 
+#: Recordings of the motion under the set of before and under the new one.
+_MOTIONS = ("deploy_before", "deploy_after")
+
 
 @dataclass(frozen=True)
 class Deploy:
@@ -22,7 +25,10 @@ class Deploy:
 
     name: str = "deploy"
     title: str = "deploy"
-    outputs: tuple[str, ...] = (DEPLOYMENT,)
+
+    def outputs(self, _walk: Walk) -> tuple[str, ...]:
+        """Files in the walk's folder."""
+        return (DEPLOYMENT, *(f"{RUNS}/{name}.mcap" for name in _MOTIONS))
 
     def inputs(self, walk: Walk) -> dict[str, Any]:
         """The set, and the axis."""
@@ -44,7 +50,7 @@ class Deploy:
             raise AnswerIsNo(f"deploy: rolled back: {'; '.join(done.reasons)}")
 
     def _keep(self, walk: Walk, done: Deployment) -> None:
-        for name, rows in (("deploy_before", done.rows_before), ("deploy_after", done.rows_after)):
+        for name, rows in zip(_MOTIONS, (done.rows_before, done.rows_after), strict=True):
             if rows is not None:
                 save_rows(walk.path(RUNS) / f"{name}.mcap", rows)
         write_json(walk.path(DEPLOYMENT), done.document())

@@ -20,7 +20,10 @@ class Identify:
 
     name: str = "identify"
     title: str = "identify"
-    outputs: tuple[str, ...] = (MODEL, IDENTIFIED)
+
+    def outputs(self, _walk: Walk) -> tuple[str, ...]:
+        """Files in the walk's folder."""
+        return (MODEL, IDENTIFIED)
 
     def inputs(self, walk: Walk) -> dict[str, Any]:
         """The axis, and what the experiments may do."""

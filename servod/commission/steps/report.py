@@ -17,7 +17,10 @@ class Report:
 
     name: str = "report"
     title: str = "report"
-    outputs: tuple[str, ...] = (REPORT, PICTURES)
+
+    def outputs(self, _walk: Walk) -> tuple[str, ...]:
+        """Files in the walk's folder."""
+        return (REPORT, PICTURES)
 
     def inputs(self, walk: Walk) -> dict[str, Any]:
         """Everything that is shown."""

@@ -29,7 +29,11 @@ class Rivals:
 
     name: str = "rivals"
     title: str = "tune the rivals"
-    outputs: tuple[str, ...] = (TUNING,)
+
+    def outputs(self, walk: Walk) -> tuple[str, ...]:
+        """The sets themselves, for they are what is compared, and the document of their tuning."""
+        sets = [f"{RIVALS}/{rival_file(walk, *who).name}" for who in contenders()] if compared(walk) else []
+        return (TUNING, *sets)
 
     def inputs(self, walk: Walk) -> dict[str, Any]:
         """The model, the filter of the deployed set, and the budget."""

@@ -28,7 +28,10 @@ class Synthesize:
 
     name: str = "synthesize"
     title: str = "synthesize"
-    outputs: tuple[str, ...] = (DESIGN, RELAXED)
+
+    def outputs(self, _walk: Walk) -> tuple[str, ...]:
+        """Files in the walk's folder."""
+        return (DESIGN, RELAXED)
 
     def inputs(self, walk: Walk) -> dict[str, Any]:
         """The model, the loop around the law, the accuracy of the local sets, and by which sources."""
@@ -78,7 +81,6 @@ def _loop(walk: Walk) -> dict[str, Any]:
         "period_s": config.cycle.period_us * NS_PER_US / NS_PER_S,
         "cutoff_hz": walk.axis.cutoff_hz,
         "counts_per_turn": float(config.encoder.counts_per_turn),
-        "torque_limit_nm": config.limits.torque_nm,
         "torque_limit_nm": config.limits.torque_nm,
     }
 

@@ -9,7 +9,7 @@ from typing import Any
 from servod.commission.axis import DaemonWalkAxis, VirtualWalkAxis
 from servod.commission.comparison import DEPLOYED, measured, run_files
 from servod.commission.daemon_tracking import measure_on_daemon
-from servod.commission.files import DEPLOYMENT, GAINS, RIVALS, TRACKING, TUNING, read_json, write_json
+from servod.commission.files import DEPLOYMENT, GAINS, RIVALS, RUNS, TRACKING, TUNING, read_json, write_json
 from servod.commission.runs import save_curves
 from servod.commission.steps.rivals import CONTENDERS, compared, contenders, rival_file
 from servod.commission.walk import Walk
@@ -32,7 +32,11 @@ class Validate:
 
     name: str = "validate"
     title: str = "compare on the axis"
-    outputs: tuple[str, ...] = (TRACKING,)
+
+    def outputs(self, walk: Walk) -> tuple[str, ...]:
+        """Figures, and what is there of every law's run: one that the axis dropped out under has no curves."""
+        runs = [file for key in _keys() for file in run_files(walk, key) if file.exists()]
+        return (TRACKING, *(f"{RUNS}/{file.name}" for file in runs))
 
     def inputs(self, walk: Walk) -> dict[str, Any]:
         """The sets that run, and the axis."""
@@ -47,6 +51,11 @@ class Validate:
         elif isinstance(axis, DaemonWalkAxis):
             walk.questions.agree("track trajectory (19) and steps of 100 and 10 mrad with the deployed set (72 s)?")
             write_json(walk.path(TRACKING), _on_daemon(walk, axis, self.title))
+
+
+def _keys() -> list[str]:
+    """Every law of the comparison."""
+    return [DEPLOYED, *(f"{feedback.value}_{name}" for feedback, name in contenders())]
 
 
 def _on_daemon(walk: Walk, axis: DaemonWalkAxis, title: str) -> dict[str, Any]:

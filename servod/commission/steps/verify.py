@@ -18,7 +18,10 @@ class Verify:
 
     name: str = "verify"
     title: str = "verify"
-    outputs: tuple[str, ...] = (GAINS, CERTIFICATE)
+
+    def outputs(self, _walk: Walk) -> tuple[str, ...]:
+        """Files in the walk's folder."""
+        return (GAINS, CERTIFICATE)
 
     def inputs(self, walk: Walk) -> dict[str, Any]:
         """The set, how thoroughly it is judged, and by which sources."""
