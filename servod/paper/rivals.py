@@ -12,7 +12,7 @@ from servod.gains import GainSet
 from servod.paper.experiments import Measured, measure
 from servod.paper.joints import ENCODER_COUNTS, Joint
 from servod.tune.plan import Feedback, TunePlan
-from servod.tune.tuning import tune
+from servod.tune.rivals import tuned_in_turn
 
 #: What people read, by the rival's key in servod.tune.laws.RIVALS.
 LABELS = {
@@ -23,6 +23,8 @@ LABELS = {
     "pd_lugre_035": "PD + LuGre, l_f 0.35",
     "local": "local",
 }
+#: Rivals by the law that they run: one job tunes those of a law, for they start from each other.
+FAMILIES = (("pd",), ("pd_dob",), ("pd_lugre", "pd_lugre_025", "pd_lugre_035"), ("local",))
 #: Between the seeds of tuning and of scoring.
 SCORING_SEED_OFFSET = 100
 
@@ -36,12 +38,12 @@ class Contender:
     measured: Measured
 
 
-def tuned_sets(model: AxisModel, name: str, cutoff_hz: float, seed: int) -> dict[Feedback, GainSet]:
-    """The rival `name` in both classes, tuned for `model` within its intervals."""
+def tuned_sets(
+    model: AxisModel, names: tuple[str, ...], cutoff_hz: float, seed: int
+) -> dict[tuple[Feedback, str], GainSet]:
+    """The rivals `names`, which share one law and its budget, in both classes, tuned for `model` in its intervals."""
     plan = TunePlan(seed=seed, counts_per_turn=float(ENCODER_COUNTS), cutoff_hz=cutoff_hz)
-    equal = tune(model, name, Feedback.EQUAL, plan)
-    free = tune(model, name, Feedback.FREE, plan, equal.values)
-    return {Feedback.EQUAL: equal.gains, Feedback.FREE: free.gains}
+    return {key: found.gains for key, found in tuned_in_turn(model, names, plan).items()}
 
 
 def score(

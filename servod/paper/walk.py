@@ -24,13 +24,14 @@ from servod.paper.sets import at_paper_feedback, printed_l, shipped_set, with_l,
 from servod.report.figure import Figure
 from servod.report.figures.sets import local_law
 from servod.report.pictures import write_pictures
+from servod.tune.plan import Feedback
 
 #: l_i of the local law at the paper's PD gains without options, in all its sets; as the demo's plain set.
 PLAIN_L = 0.1
 #: RMS of the noise on friction in Fig. 11 and 12, as a share of F_C.
 NOISE_SHARE = 0.1
-#: What tuning one rival takes, and scoring it in both classes, in seconds of one core.
-_TUNE_S, _SCORE_S = 12.0, 3.0
+#: What tuning the rivals of one law takes, and scoring one in one class, in seconds of one core.
+_TUNE_S, _SCORE_S = 18.0, 3.0
 #: Shipped sets by row.
 _SHIPPED = {
     Row.PD: "paper_pd",
@@ -88,7 +89,7 @@ def expected_s(plan: PaperPlan) -> float:
     """Sum of all weights below, for the progress."""
     tracked = len(Row) * len(plan.joints) * _track_s(plan)
     drawn = 1.5 * (14 + 8 * len(plan.joints)) if plan.pictures else 0.0
-    tuned = len(plan.tune) * len(rivals.LABELS) * (_TUNE_S + 2.0 * _SCORE_S)
+    tuned = len(plan.tune) * (len(rivals.FAMILIES) * _TUNE_S + len(rivals.LABELS) * 2.0 * _SCORE_S)
     return tracked + drawn + tuned + (45.0 if plan.identify else 6.0) * len(plan.joints) + 20.0
 
 
@@ -138,19 +139,20 @@ def _found(plan: PaperPlan, crew: Crew, joint: Joint) -> Future[Found]:
 
 
 def _contenders(plan: PaperPlan, crew: Crew, joint: Joint, found: Found) -> list[Contender]:
-    """Every rival tuned on what was found of the joint, each scored as soon as it is there."""
+    """Every rival tuned on what was found of the joint, each scored as soon as its law is done."""
     cutoff_hz = cutoff_of(found.gains)
-    tuned = {
-        name: crew.submit(f"{label} tuned", _TUNE_S, rivals.tuned_sets, found.model, name, cutoff_hz, plan.seed)
-        for name, label in rivals.LABELS.items()
-    }
-    scored = [
-        crew.submit(label, _SCORE_S, rivals.score, joint, name, feedback, gains, cutoff_hz, plan.seed, plan.seconds)
-        for name, label in rivals.LABELS.items()
-        for feedback, gains in crew.result(tuned[name]).items()
+    tuned = [
+        crew.submit(f"{names[0]} tuned", _TUNE_S, rivals.tuned_sets, found.model, names, cutoff_hz, plan.seed)
+        for names in rivals.FAMILIES
     ]
-    found_all = [crew.result(job) for job in scored]
-    return sorted(found_all, key=lambda contender: contender.feedback.value)
+    scored = {
+        (feedback, name): crew.submit(
+            f"{name} scored", _SCORE_S, rivals.score, joint, name, feedback, gains, cutoff_hz, plan.seed, plan.seconds
+        )
+        for job in tuned
+        for (feedback, name), gains in crew.result(job).items()
+    }
+    return [crew.result(scored[feedback, name]) for feedback in Feedback for name in rivals.LABELS]
 
 
 Tracked = tuple[tuple[Joint, Row], Future[Measured]]

@@ -16,8 +16,9 @@ from servod.models.simulate import LoopSettings
 SEARCH_STEP_S = 1e-4
 
 
-#: Simulated plants for each law and class: 120 sets of gains on three plants, 5 s of one core.
-BUDGET = 360
+#: Simulated plants for each law and class: 180 sets of gains on three plants, 8 s of one core. PD + LuGre shares it
+#: among three searches: with each of the paper's two l_f, and with l_f tuned, which starts where those ended.
+BUDGET = 540
 
 
 class Feedback(Enum):
@@ -31,11 +32,12 @@ class Feedback(Enum):
 class TunePlan:
     """What is the same for every law of a comparison; defaults are the paper's axis.
 
-    `budget` is the number of plants that one law may simulate in one class, `plants` of them for each set of gains that
-    is tried; `seed` begins plants, noise and search (scoring takes another). `roughness_limit` bounds the RMS of the
-    torque's change from cycle to cycle, as a multiple of what the paper's PD gains make of encoder steps and noise on
-    the same plants: an absolute figure would favour fine encoders and large axes. Five times is what the paper's own
-    LuGre observer with l_f 0.25 makes, which ran on a joint; beyond that a drive hears encoder, not friction.
+    `budget` is the number of plants that one law may simulate in one class in all its searches together, `plants` of
+    them for each set of gains that is tried; `seed` begins plants, noise and search (scoring takes another).
+    `roughness_limit` bounds the RMS of the torque's change from cycle to cycle, as a multiple of what the paper's PD
+    gains make of encoder steps and noise on the same plants: an absolute figure would favour fine encoders and large
+    axes. Five times is what the paper's own LuGre observer with l_f 0.25 makes, which ran on a joint; beyond that a
+    drive hears encoder, not friction.
     """
 
     budget: int = BUDGET
@@ -60,8 +62,8 @@ class TunePlan:
 class Tuned:
     """A tuned gain set, not certified. `cost` is what the search made least, in mrad (servod.tune.trial).
 
-    `simulations` is what it spent; `roughness` a multiple of the paper's PD, beyond the plan's limit only where even
-    the smoothest set of the law is. `values` are the tuned numbers by the names of their ranges (servod.tune.laws).
+    `simulations` is what its search spent; `roughness` a multiple of the paper's PD, beyond the plan's limit only where
+    even the smoothest set of the law is. `values` are the numbers it was built from, by the names of servod.tune.laws.
     """
 
     gains: GainSet

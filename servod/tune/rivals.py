@@ -1,6 +1,7 @@
 """All contenders of a comparison, tuned by the same rules in both classes, over worker processes.
 
-Stands on `tuning`. The free class of a rival starts from its equal class, so that more freedom is never worse.
+Stands on `tuning`. The free class of a rival starts from its equal class, and a rival from its forerunners, which have
+some of its numbers fixed, so that more freedom is never worse.
 """
 
 from __future__ import annotations
@@ -46,39 +47,70 @@ def rivals(
     return {feedback: {name: found[feedback, name] for name in names} for feedback in Feedback}
 
 
+def tuned_in_turn(model: AxisModel, names: Sequence[str], plan: TunePlan) -> dict[Key, Tuned]:
+    """The rivals `names` in both classes by the same rules, one after the other in this process, without workers."""
+    found: dict[Key, Tuned] = {}
+    for key in needed(names):
+        found[key] = tune(model, key[1], key[0], plan, [found[before].values for before in before_it(key)])
+    return found
+
+
+def before_it(key: Key) -> list[Key]:
+    """Whose best sets a search starts from: its forerunners in the same class, and its own equal class."""
+    feedback, name = key
+    own = [(Feedback.EQUAL, name)] if feedback is Feedback.FREE else []
+    return [*((feedback, forerunner) for forerunner in RIVALS[name].forerunners), *own]
+
+
+def needed(names: Sequence[str]) -> list[Key]:
+    """Every search that tuning `names` takes, each behind those that it starts from."""
+    every: list[Key] = []
+
+    def add(key: Key) -> None:
+        for before in before_it(key):
+            add(before)
+        if key not in every:
+            every.append(key)
+
+    for feedback in Feedback:
+        for name in names:
+            add((feedback, name))
+    return every
+
+
 class _Field:
     """The running tasks and what they have found."""
 
     def __init__(
         self, pool: Executor, model: AxisModel, names: Sequence[str], plan: TunePlan, tell: Tell | None
     ) -> None:
-        self._names = names
+        self._waiting = needed(names)
+        self._all = len(self._waiting)
         self._pool, self._text, self._plan, self._tell = pool, model.model_dump_json(), plan, tell
         self._tasks: dict[Key, Future[Tuned]] = {}
         self._found: dict[Key, Tuned] = {}
 
     def tuned(self) -> dict[Key, Tuned]:
         """Wait for everything; the first failure is raised."""
-        for name in self._names:
-            self._begin((Feedback.EQUAL, name), None)
-        while self._tasks:
+        while self._waiting or self._tasks:
+            for key in [key for key in self._waiting if all(before in self._found for before in before_it(key))]:
+                self._begin(key)
             for key in [key for key, task in self._tasks.items() if task.done()]:
                 self._take(key)
             time.sleep(_POLL_S)
         return self._found
 
-    def _begin(self, key: Key, start: Values | None) -> None:
-        feedback, name = key
-        self._tasks[key] = self._pool.submit(_task, self._text, name, feedback, self._plan, start)
+    def _begin(self, key: Key) -> None:
+        self._waiting.remove(key)
+        starts = [self._found[before].values for before in before_it(key)]
+        self._tasks[key] = self._pool.submit(_task, self._text, key, self._plan, starts)
 
     def _take(self, key: Key) -> None:
         feedback, name = key
         self._found[key] = self._tasks.pop(key).result()
-        if feedback is Feedback.EQUAL:
-            self._begin((Feedback.FREE, name), self._found[key].values)
         if self._tell:
-            self._tell(f"{name}, {feedback.value} feedback", len(self._found) / (len(self._names) * len(Feedback)))
+            self._tell(f"{name}, {feedback.value} feedback", len(self._found) / self._all)
 
 
-def _task(model: str, name: str, feedback: Feedback, plan: TunePlan, start: Values | None) -> Tuned:
-    return tune(AxisModel.model_validate_json(model), name, feedback, plan, start)
+def _task(model: str, key: Key, plan: TunePlan, starts: Sequence[Values]) -> Tuned:
+    return tune(AxisModel.model_validate_json(model), key[1], key[0], plan, starts)

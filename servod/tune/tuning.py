@@ -7,7 +7,7 @@ an axis runs it only when it accepts uncertified sets.
 from __future__ import annotations
 
 import datetime
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from servod import __version__
 from servod.axis_model import AxisModel
 from servod.gain_parameters import Parameters
 from servod.gains import GainSet, Provenance
-from servod.tune.laws import PAPER_FEEDBACK, RIVALS, Axis, Rival
+from servod.tune.laws import PAPER_FEEDBACK, RIVALS, Axis, Range, Rival
 from servod.tune.plan import Feedback, Tuned, TunePlan
 from servod.tune.search import Array, least
 from servod.tune.trial import Trial
@@ -31,21 +31,21 @@ def tune(
     name: str,
     feedback: Feedback,
     plan: TunePlan,
-    start: Values | None = None,
+    starts: Sequence[Values] = (),
     tell: Tell | None = None,
 ) -> Tuned:
     """Tune the rival `name` (a key of servod.tune.laws.RIVALS) in one class; the same arguments give the same set.
 
-    `start` are values that are tried beside the usual start; those of the equal class, for the free one, make sure that
-    more freedom is never worse. Raises BadInput when the model has no bristle stiffness to compensate.
+    `starts` are values that are tried beside the usual start: those of the equal class for the free one, and those of
+    its forerunners, make sure that more freedom is never worse. Raises BadInput when the model has no bristle stiffness
+    to compensate.
     """
     rival, trial = RIVALS[name], Trial(Axis(model, plan))
-    ranges = rival.space(feedback)
-    candidates = plan.budget // plan.plants if ranges else 1
+    ranges, candidates = rival.space(feedback), candidates_of(rival, feedback, plan)
     done = 0
 
     def values(shares: Array) -> Values:
-        return {key: r.at(float(share)) for (key, r), share in zip(ranges.items(), shares, strict=True)}
+        return {**rival.fixed, **{k: r.at(float(s)) for (k, r), s in zip(ranges.items(), shares, strict=True)}}
 
     def cost(shares: Array) -> float:
         nonlocal done
@@ -54,13 +54,22 @@ def tune(
             tell(done / candidates)
         return trial.cost(rival.build(trial.axis, values(shares))).value
 
-    starts = [{key: r.start for key, r in ranges.items()}, *([{**PAPER_FEEDBACK, **start}] if start else [])]
-    shares = [np.array([r.share(point[key]) for key, r in ranges.items()]) for point in starts]
-    best = values(least(cost, shares, candidates, plan.seed))
+    best = values(least(cost, _shares(ranges, starts), candidates, plan.seed))
     parameters = rival.build(trial.axis, best)
     reached = trial.cost(parameters)
     gains = gain_set(name, rival, feedback, plan, parameters)
     return Tuned(gains, reached.value, done * plan.plants, reached.roughness, best)
+
+
+def candidates_of(rival: Rival, feedback: Feedback, plan: TunePlan) -> int:
+    """How many sets one search of a rival may try: its part of the law's budget, or one where nothing is tuned."""
+    return plan.budget // (plan.plants * rival.searches) if rival.space(feedback) else 1
+
+
+def _shares(ranges: Mapping[str, Range], starts: Sequence[Values]) -> list[Array]:
+    """The usual start and `starts` as shares of the ranges; feedback that a start does not name is the paper's."""
+    points = [{key: r.start for key, r in ranges.items()}, *({**PAPER_FEEDBACK, **start} for start in starts)]
+    return [np.array([r.share(point[key]) for key, r in ranges.items()]) for point in points]
 
 
 def as_tuned(model: AxisModel, gains: GainSet, plan: TunePlan) -> Tuned:
@@ -82,7 +91,8 @@ def gain_set(name: str, rival: Rival, feedback: Feedback, plan: TunePlan, parame
             date=datetime.datetime.now(datetime.UTC).date(),
             tool=f"servod {__version__} tune",
             seed=plan.seed,
-            note=f"Tuned: {tuned}; {plan.budget} simulated plants, {plan.plants} for each set that was tried, velocity "
+            note=f"Tuned: {tuned}; {candidates_of(rival, feedback, plan) * plan.plants} simulated plants of the law's "
+            f"{plan.budget}, {plan.plants} for each set that was tried, velocity "
             f"filter {plan.cutoff_hz:g} Hz, roughness at most {plan.roughness_limit:g} times the paper's PD.",
         ),
     )

@@ -15,14 +15,16 @@ from servod.tune.trial import Trial, with_noise
 from servod.verify.steady_friction import steady_friction
 from tests.tune.axis import joint, small
 
-STARTS = {name: {key: r.start for key, r in rival.ranges.items()} for name, rival in RIVALS.items()}
+STARTS = {name: {**rival.fixed, **{key: r.start for key, r in rival.ranges.items()}} for name, rival in RIVALS.items()}
 
 
 @pytest.mark.parametrize("ratios", [True, False])
 def test_a_range_and_its_shares_are_inverse(ratios: bool) -> None:
     r = Range(2.0, 50.0, 10.0, ratios)
     assert (r.at(0.0), r.at(1.0)) == pytest.approx((2.0, 50.0))
-    assert [r.at(r.share(value)) for value in (2.0, 7.0, 50.0)] == pytest.approx([2.0, 7.0, 50.0])
+    assert [r.at(r.share(value)) for value in (2.0, 7.0, 50.0)] == [2.0, 7.0, 50.0]
+    tuned = [r.at(share) for share in np.linspace(0.0, 1.0, 50).tolist()]
+    assert [r.at(r.share(value)) for value in tuned] == tuned
 
 
 def test_the_symmetric_curve_is_the_joint_where_that_is_symmetric() -> None:

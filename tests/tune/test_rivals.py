@@ -14,6 +14,7 @@ from servod.tracking.motions import paper_rows
 from servod.tracking.simulated import curves_of, run
 from servod.tune import Feedback, Tuned, rivals, tune
 from servod.tune.laws import RIVALS
+from servod.tune.rivals import before_it, needed
 from tests.identify.joints import draw
 from tests.tune.axis import joint, small
 
@@ -34,13 +35,33 @@ def field() -> dict[Feedback, dict[str, Tuned]]:
 
 def test_every_rival_is_tuned_in_both_classes_within_its_budget(field: dict[Feedback, dict[str, Tuned]]) -> None:
     assert all(list(field[feedback]) == list(RIVALS) for feedback in Feedback)
-    assert all(tuned.simulations <= 24 for tuneds in field.values() for tuned in tuneds.values())
+    for tuneds in field.values():
+        spent = {
+            law: sum(t.simulations for name, t in tuneds.items() if RIVALS[name].law == law)
+            for law in ("pd_dob", "pd_lugre", "local")
+        }
+        assert spent == dict.fromkeys(spent, 24)
     assert field[Feedback.EQUAL]["pd"].simulations == 2  # there is nothing to tune
 
 
 def test_more_freedom_is_never_worse(field: dict[Feedback, dict[str, Tuned]]) -> None:
     for name in RIVALS:
         assert field[Feedback.FREE][name].cost <= field[Feedback.EQUAL][name].cost * (1.0 + 1e-9)
+
+
+@pytest.mark.parametrize("feedback", list(Feedback))
+def test_a_tuned_l_f_is_never_worse_than_a_fixed_one(
+    field: dict[Feedback, dict[str, Tuned]], feedback: Feedback
+) -> None:
+    tuned = field[feedback]
+    assert tuned["pd_lugre"].cost <= min(tuned[name].cost for name in RIVALS["pd_lugre"].forerunners) * (1.0 + 1e-9)
+
+
+def test_who_is_started_from_is_tuned_too() -> None:
+    fixed = RIVALS["pd_lugre"].forerunners
+    found = needed(["pd", "pd_lugre"])
+    assert {name for _, name in found} == {"pd", "pd_lugre", *fixed}
+    assert all(found.index(before) < found.index(key) for key in found for before in before_it(key))
 
 
 def test_processes_change_nothing(field: dict[Feedback, dict[str, Tuned]]) -> None:
