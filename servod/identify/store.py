@@ -27,11 +27,12 @@ _COLUMNS = ("torque_nm", "position_rad", "reference_rad", "torque_other_nm", "to
 
 
 class _Entry(Strict):
-    """One recording; `motion` is the hash of what was asked for."""
+    """One recording; `motion` is the hash of what was asked for, `sha256` the file's (None: an earlier version's)."""
 
     file: str = Field(pattern=r"^[0-9]{2,}_[a-z_]+\.mcap$")
     kind: Kind
     motion: str
+    sha256: str | None = None
     settings: dict[str, float]
 
 
@@ -74,7 +75,10 @@ class Recordings:
         self.start_rad = start_rad
 
     def recorded(self, kind: Kind, motion: str) -> Trace | None:
-        """The earlier recording of the next motion; None when there is none, and then all later ones are dropped."""
+        """The earlier recording of the next motion; None when there is none, and then all later ones are dropped.
+
+        Raises BadInput when its file is not the one that was recorded.
+        """
         if not self._earlier:
             return None
         entry = self._earlier.pop(0)
@@ -92,11 +96,13 @@ class Recordings:
             file = McapFile(self.folder / name, {}, self._offset_ns)
             file.write_rows(split_rows(rows.tobytes()))
             file.close()
-            self._done.append(_Entry(file=name, kind=trace.kind, motion=motion, settings=trace.settings))
+            sha256 = file_sha256(self.folder / name)
+            entry = _Entry(file=name, kind=trace.kind, motion=motion, sha256=sha256, settings=trace.settings)
+            self._done.append(entry)
             self._write_list()
         except OSError as error:
             raise _unwritable(self.folder / name, error) from None
-        return replace(trace, sha256=_sha256(self.folder / name))
+        return replace(trace, sha256=sha256)
 
     def _write_list(self) -> None:
         written = _List(conditions=self.conditions, start_rad=self.start_rad, experiments=self._done)
@@ -154,16 +160,30 @@ def _read_list(folder: Path) -> _List:
 
 def _trace(folder: Path, entry: _Entry) -> Trace:
     path = folder / entry.file
+    sha256 = _require_same(path, entry)
     recording = read_recording(path)
     time_ns = np.asarray(recording.column("time_ns"), dtype=np.int64)
     torque, position, reference, excitation, actual, motor = (
         np.asarray(recording.column(column), dtype=np.float64) for column in _COLUMNS
     )
     t_s = (time_ns - time_ns[0]) * 1e-9
-    return Trace(entry.kind, t_s, torque, position, reference, excitation, actual, motor, entry.settings, _sha256(path))
+    return Trace(entry.kind, t_s, torque, position, reference, excitation, actual, motor, entry.settings, sha256)
 
 
-def _sha256(path: Path) -> str:
+def _require_same(path: Path, entry: _Entry) -> str:
+    """The file's hash, which must be the listed one. Raises BadInput."""
+    try:
+        found = file_sha256(path)
+    except OSError as error:
+        raise BadInput(str(path), error.strerror or str(error), f"the recording that {LIST} lists") from None
+    if entry.sha256 not in (None, found):
+        why = "a file that was changed or cut short after it was recorded"
+        raise BadInput(str(path), why, f"the recording that {LIST} lists; without {LIST} the axis is identified anew")
+    return found
+
+
+def file_sha256(path: Path) -> str:
+    """Hash of a recording, as the list has it."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 

@@ -13,6 +13,7 @@ from servod.errors import BadInput
 from servod.identify import store
 from servod.identify.links import SteppedLink
 from servod.identify.result import document
+from servod.identify.trace import Kind, trace_of
 from servod.identify.virtual import virtual_session
 from servod.identify.walk import identify
 from tests.identify.conftest import Identification
@@ -91,3 +92,26 @@ def test_an_identification_knows_its_recordings(fine: Identification):
     traces = store.load(fine.recordings)
     assert fine.analysis.data_sha256 == tuple(trace.sha256 for trace in traces)
     assert len(set(fine.analysis.data_sha256)) == len(traces)
+
+
+@pytest.mark.parametrize("meddle", ["exchange", "cut"])
+def test_a_recording_that_is_not_the_one_that_was_made_is_refused(meddle, tmp_path):
+    session = virtual_session(draw(3).model, tmp_path, 2**20, 1)
+    link = SteppedLink(session)
+    link.enable()
+    made = store.Recordings(tmp_path, "this axis")
+    made.begin(0.0)
+    for seconds in (0.2, 0.3):
+        rows = link.excite([0.0] * round(1000 * seconds), [0.0] * round(1000 * seconds), 0.1)
+        made.keep(rows, trace_of(Kind.NOISE, rows, {}), f"motion of {seconds} s")
+    first, second = sorted(tmp_path.glob("*.mcap"))
+    assert [trace.sha256 for trace in store.load(tmp_path)] == [store.file_sha256(first), store.file_sha256(second)]
+    if meddle == "exchange":
+        shutil.copy(second, first)
+    else:
+        first.write_bytes(first.read_bytes()[:-2000])
+    again = store.Recordings(tmp_path, "this axis", resume=True)
+    with pytest.raises(BadInput, match=rf"{first.name}: found a file that was changed or cut short"):
+        again.recorded(Kind.NOISE, "motion of 0.2 s")
+    with pytest.raises(BadInput, match=first.name):
+        store.load(tmp_path)
