@@ -1,4 +1,7 @@
-"""One synthesized set for Table I's joint, made once for all tests that look at it."""
+"""One synthesized set for Table I's joint, kept in a file for all tests that look at it.
+
+`python -m tests.synthesize.designs` makes the file anew, and test_kept_set.py says when that is due.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +9,11 @@ from functools import cache
 from pathlib import Path
 
 from servod.axis_model import AxisModel, load_axis_model
-from servod.gains import GainSet
+from servod.gains import GainSet, load_gains
 from servod.synthesize.gain_set import synthesize
 
 MODEL = Path(__file__).resolve().parents[2] / "gains" / "axes" / "table1_joint.yaml"
+KEPT = Path(__file__).with_name("table1_set.yaml")
 
 
 @cache
@@ -21,6 +25,15 @@ def table1() -> AxisModel:
 @cache
 def table1_set() -> GainSet:
     """What synthesis makes of it, not yet certified."""
+    return load_gains(KEPT)
+
+
+def made_anew() -> GainSet:
+    """The set by synthesis: what the file has to be."""
     found = synthesize(table1(), model_path=MODEL)
     assert isinstance(found, GainSet)
     return found
+
+
+if __name__ == "__main__":
+    KEPT.write_text(made_anew().to_yaml())
