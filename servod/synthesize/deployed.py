@@ -16,7 +16,7 @@ from servod.gain_design import Design, DesignMode, RegionProof, Uncertainty, Ver
 from servod.gain_parameters import RegionGains
 from servod.synthesize.late import too_late
 from servod.synthesize.lmi_deployed import Programme, Solution, synthesise
-from servod.synthesize.regions import pole_disc
+from servod.synthesize.regions import OVERLAP_RAD_S, pole_disc
 from servod.verify.proof import region_margin, scaled_vertices
 from servod.verify.sampled import Array, timing_of
 from servod.verify.steady_friction import SteadyFriction, steady_friction
@@ -45,7 +45,7 @@ class Wishes:
     counts_per_turn: float = 2.0**20
     torque_limit_nm: float | None = None  # of the axis
     speed_max: float = 0.5
-    overlap: tuple[float, float] = (0.005, 0.02)
+    overlap: tuple[float, float] = OVERLAP_RAD_S
     position_weight: float = 1.0
     torque_weight: float = 0.3  # a tenth of it costs half of the disk margin, ten times as much the position gain
     least_decay_per_s: float = 5.0

@@ -6,7 +6,6 @@ verification uses.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,7 +24,16 @@ from servod.gains import GainSet
 from servod.synthesize.deployed import Infeasible, Wishes, explain, region_gains, regions
 from servod.synthesize.feedforward import position_feedforward
 from servod.synthesize.integral_gain import designed
-from servod.synthesize.local_sets import PAPER_NODES, STIFFNESS_SHARE, compensator, local_sets, sets_at
+from servod.synthesize.local_sets import (
+    ACCURACY,
+    LIMIT_SHARE,
+    PAPER_NODES,
+    STIFFNESS_SHARE,
+    compensator,
+    input_scale,
+    local_sets,
+    sets_at,
+)
 from servod.synthesize.observer_width import OBSERVERS_RAD_S, with_observer, with_widest_observer
 from servod.synthesize.origin import provenance
 from servod.verify.rest import hold_width, rest_width
@@ -33,7 +41,6 @@ from servod.verify.steady_friction import SteadyFriction, steady_friction
 
 #: From this bandwidth of the output observer on no other choice of filter and poles is tried.
 ENOUGH_RAD_S = 20.0
-LIMIT_SHARE = 1.5  # bound of the compensated force, as a share of the largest friction
 OBSERVER_SHARE = 2.5  # bound of the estimate: friction that turned against a z_hat that a step leaves as it was
 APPROACH = 3.0  # speed with which a step is approached, as a factor on the map's highest
 #: At rest a joint stands on its bristle, and what feedback adds is the encoder's noise: this share of feedback and
@@ -46,7 +53,7 @@ class Options:
     """Named options of the law and of its local sets."""
 
     name: str = "synthesized"
-    accuracy: float = 0.02
+    accuracy: float = ACCURACY
     paper_nodes: bool = False
     velocity: VelocitySource = VelocitySource.REFERENCE
     observer: bool = True
@@ -54,11 +61,6 @@ class Options:
     leak_per_s: float = 2.0
     weights: WeightShape = WeightShape.LINEAR
     position_feedforward: bool = True
-
-
-def input_scale(friction: SteadyFriction, speed: float) -> float:
-    """K: the power of ten next to the largest friction, 0.1 N*m for the paper's joint."""
-    return float(10.0 ** round(math.log10(friction.largest(speed))))
 
 
 def feedback_of(design: Design, scale: float) -> Regions:

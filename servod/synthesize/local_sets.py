@@ -22,6 +22,10 @@ from servod.verify.steady_friction import SteadyFriction
 PAPER_NODES = (-0.5, -0.2, -0.01, -0.001, 0.0, 0.001, 0.05, 0.12, 0.5)
 #: c0_hat as a share of the lowest c0 in its interval: stable with one to three cycles of delay; 1.0 is marginal.
 STIFFNESS_SHARE = 0.8
+#: Bound of the compensated force, as a share of the largest friction.
+LIMIT_SHARE = 1.5
+#: Tolerance of the force between local sets, as a share of it.
+ACCURACY = 0.02
 #: t_f of (8): what a set has to reach its force.
 FINITE_TIME_S = 0.1
 GRID = 400  # speeds per direction at which the tolerance is checked
@@ -45,6 +49,11 @@ class Compensator:
     def torque(self, decay: float, speed: float) -> float:
         """Steady torque of a set with `decay` [1/s] at `speed` [rad/s]: (7) read the other way."""
         return self.stiffness * speed / decay + self.viscous * speed
+
+
+def input_scale(friction: SteadyFriction, speed: float) -> float:
+    """K: the power of ten next to the largest friction up to `speed`, 0.1 N*m for the paper's joint."""
+    return float(10.0 ** round(math.log10(friction.largest(speed))))
 
 
 def compensator(friction: SteadyFriction, speed_max: float, stiffness_share: float) -> Compensator:

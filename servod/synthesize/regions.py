@@ -11,6 +11,8 @@ import math
 import numpy as np
 
 STEPS = 40
+#: Speeds between which the regions' gains blend [rad/s]: below the fall of the Stribeck curve of the paper's joint.
+OVERLAP_RAD_S = (0.005, 0.02)
 
 
 def pole_disc(least_decay_per_s: float, least_damping: float, period_s: float) -> tuple[float, float]:

@@ -27,16 +27,14 @@ from servod.gain_parameters import (
     VelocitySource,
 )
 from servod.synthesize.feedforward import position_feedforward
-from servod.synthesize.local_sets import compensator, local_sets
+from servod.synthesize.local_sets import ACCURACY, LIMIT_SHARE, compensator, input_scale, local_sets
+from servod.synthesize.regions import OVERLAP_RAD_S
 from servod.tune.plan import Feedback, TunePlan
 from servod.tune.symmetric import SymmetricFriction, symmetric
 from servod.verify.steady_friction import SteadyFriction, steady_friction
 
 #: K_P [N*m/rad] and K_D [N*m*s/rad] of Table I, for its friction of about 0.1 N*m.
 PAPER_K_P, PAPER_K_D, PAPER_TORQUE_NM = 2.5, 0.12, 0.1
-LIMIT_SHARE = 1.5  # bound of compensated forces, as a share of the largest friction
-OVERLAP_RAD_S = (0.005, 0.02)  # of the local law's regions, whose gains are equal here
-ACCURACY = 0.02  # force tolerance between local sets
 
 Values = Mapping[str, float]
 
@@ -66,7 +64,7 @@ class Axis:
     @property
     def scale_nm(self) -> float:
         """K: the power of ten next to the largest friction, 0.1 N*m for the paper's joint."""
-        return float(10.0 ** round(math.log10(self.largest_nm)))
+        return input_scale(self.friction, self.plan.speed_max_rad_s)
 
     @property
     def size(self) -> float:
