@@ -5,8 +5,9 @@ Beside the step that validates.
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from servod.config import AxisConfig
@@ -27,39 +28,54 @@ def measure_on_daemon(
     The axis is left enabled or not, as it was. Raises AnswerIsNo when another set runs or the axis drops out,
     BadInput when the daemon has another configuration than `config`, Unreachable when it does not answer any more.
     """
+    with ControlClient(socket) as client:
+        require_daemon_config(client, config)
+        link = DaemonDeployLink(client)
+        _require_active(link, deployed)
+        with _enabled(link):
+            curves, refused = _recorded(client, link, tell)
+    if "paper" not in curves:
+        return None, refused
+    steps = {mrad: curves[f"{mrad:g}"] for mrad in STEPS_MRAD if f"{mrad:g}" in curves}
+    return tracking(curves["paper"], steps, 2.0 * math.pi / config.encoder.counts_per_turn), refused
+
+
+@contextlib.contextmanager
+def _enabled(link: DaemonDeployLink) -> Iterator[None]:
+    """The axis enabled for what is measured, and as it was behind it; stopped before anything else when that fails."""
+    was_enabled = link.enabled
+    try:
+        if not was_enabled:
+            link.enable()
+        yield
+    except BaseException:
+        link.stop()
+        raise
+    finally:
+        if not was_enabled:
+            link.disable()
+
+
+def _recorded(
+    client: ControlClient, link: DaemonDeployLink, tell: Callable[[float], None]
+) -> tuple[dict[str, Curves], list[str]]:
+    """Curves by motion, "paper" or a step's size in mrad, and the motions that the daemon refused with its reason."""
     motions = {"paper": {"kind": "paper", "duration_s": PAPER_S}}
     motions |= {
         f"{mrad:g}": {"kind": "step", "amplitude_rad": 1e-3 * mrad, "duration_s": HOLD_S} for mrad in STEPS_MRAD
     }
     curves: dict[str, Curves] = {}
     refused: list[str] = []
-    with ControlClient(socket) as client:
-        require_daemon_config(client, config)
-        link = DaemonDeployLink(client)
-        _require_active(link, deployed)
-        was_enabled = link.enabled
+    for index, (name, motion) in enumerate(motions.items()):
+        tell(index / len(motions))
+        start_rad = float(client.call("status")["motion"]["reference_rad"])
         try:
-            if not was_enabled:
-                link.enable()
-            for index, (name, motion) in enumerate(motions.items()):
-                tell(index / len(motions))
-                start_rad = float(client.call("status")["motion"]["reference_rad"])
-                try:
-                    curves[name] = curves_of(link.record([motion]).tobytes(), start_rad)
-                except Refused as error:
-                    if not link.enabled:  # not the motion was refused: the axis has dropped out, or the loop is gone
-                        raise
-                    refused.append(f"{name}: {error}")
-        except BaseException:
-            link.stop()
-            raise
-        finally:
-            if not was_enabled:
-                link.disable()
-    if "paper" not in curves:
-        return None, refused
-    steps = {mrad: curves[f"{mrad:g}"] for mrad in STEPS_MRAD if f"{mrad:g}" in curves}
-    return tracking(curves["paper"], steps, 2.0 * math.pi / config.encoder.counts_per_turn), refused
+            curves[name] = curves_of(link.record([motion]).tobytes(), start_rad)
+        except Refused as error:
+            if not link.enabled:  # not the motion was refused: the axis has dropped out, or the loop is gone
+                raise
+            refused.append(f"{name}: {error}")
+    return curves, refused
 
 
 def _require_active(link: DaemonDeployLink, deployed: tuple[str, int]) -> None:

@@ -79,27 +79,13 @@ def parameters(
 ) -> LocalParameters:
     """The law's parameters with an output observer of `bandwidth` rad/s (0: none); `feedback`: None = as proven."""
     speed, largest = design.speed_max_rad_s, friction.largest(design.speed_max_rad_s)
-    share = STIFFNESS_SHARE * (1.0 - design.uncertainty.stiffness)
-    c, scale = compensator(friction, speed, share), input_scale(friction, speed)
-    sets = (
-        sets_at(friction, c, PAPER_NODES, options.gain or 0.0)
-        if options.paper_nodes
-        else local_sets(friction, c, speed, options.accuracy, options.gain or 0.0)
-    )
+    scale = input_scale(friction, speed)
     used = feedback or feedback_of(design, scale)
     return LocalParameters(
         law="local",
         input_scale_nm=scale,
         regions=used,
-        friction=LocalFriction(
-            stiffness_nm_per_rad=c.stiffness,
-            viscous_nms_per_rad=c.viscous,
-            friction_limit_nm=LIMIT_SHARE * largest,
-            leak_per_s=options.leak_per_s,
-            velocity=options.velocity,
-            weights=options.weights,
-            sets=sets,
-        ),
+        friction=compensation(design, friction, options),
         disturbance_observer=OutputObserver(
             bandwidth_rad_s=bandwidth,
             inertia_kg_m2=friction.inertia,
@@ -115,6 +101,26 @@ def parameters(
         position_feedforward=position_feedforward(design.model, friction.gain, design.period_s)
         if options.position_feedforward
         else None,
+    )
+
+
+def compensation(design: Design, friction: SteadyFriction, options: Options) -> LocalFriction:
+    """The local sets with what all of them share."""
+    speed = design.speed_max_rad_s
+    c = compensator(friction, speed, STIFFNESS_SHARE * (1.0 - design.uncertainty.stiffness))
+    sets = (
+        sets_at(friction, c, PAPER_NODES, options.gain or 0.0)
+        if options.paper_nodes
+        else local_sets(friction, c, speed, options.accuracy, options.gain or 0.0)
+    )
+    return LocalFriction(
+        stiffness_nm_per_rad=c.stiffness,
+        viscous_nms_per_rad=c.viscous,
+        friction_limit_nm=LIMIT_SHARE * friction.largest(speed),
+        leak_per_s=options.leak_per_s,
+        velocity=options.velocity,
+        weights=options.weights,
+        sets=sets,
     )
 
 
