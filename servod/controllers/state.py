@@ -18,3 +18,8 @@ COMMAND_1 = 7  # feedback u* of the last step, as the limits let it through
 COMMAND_2 = 8  # of the step before
 COMMAND_3 = 9
 REST = 10  # 0 moving to 1 at rest: how long the joint has been where it shall be
+
+#: What a state is called where a person reads of it, by its place.
+STATE_NAMES = ("z_hat", "d_hat", "asked", "acted", "v_last", "modelled", "started", "u*_1", "u*_2", "u*_3", "rest")
+#: States that a law may keep as they are: z_hat and d_hat while it holds, and all of an observer that it has not.
+MAY_STAY = frozenset({FRICTION_STATE, DISTURBANCE, ACTED, LAST_VELOCITY, MODELLED, STARTED})

@@ -9,19 +9,8 @@ from __future__ import annotations
 
 from servod.axis_model import AxisModel
 from servod.gain_design import Uncertainty
-from servod.verify.measured import measured_widths
+from servod.verify.measured import FLOORS, measured_widths
 
-#: Least half widths: what a day's warming may change, and what a fit of four digits would be too proud of; the delay's
-#: is what a cycle jitters [s].
-FLOORS = {
-    "inertia": 0.02,
-    "stiffness": 0.05,
-    "damping": 0.25,
-    "viscous": 0.1,
-    "dry": 0.03,
-    "slope": 0.1,
-    "delay_s": 20e-6,
-}
 #: The design's file takes no wider share. What was measured wider than this stays wider than the design, which then
 #: is not certified: `servoctl verify` compares both.
 MOST = 0.85

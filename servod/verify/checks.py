@@ -12,12 +12,13 @@ from functools import cached_property
 import numpy as np
 
 from servod.axis_model import AxisModel
+from servod.controllers.state import MAY_STAY, STATE_NAMES
 from servod.gain_design import Design, RegionProof
 from servod.gain_parameters import LocalParameters, RegionGains
 from servod.gains import CertificateCheck, GainSet
 from servod.verify.closed_loop import Deviation, corners, inner_points
 from servod.verify.margins import NOMINAL, Sweep, arrival_of, largest_tolerated
-from servod.verify.measured import measured_widths
+from servod.verify.measured import least_widths, measured_widths
 from servod.verify.plants import drawn
 from servod.verify.position_slope import position_slopes
 from servod.verify.proof import disc_reach, region_margin, stored_deviation
@@ -47,6 +48,7 @@ DISK_LIMIT = 0.1
 #: At a corner every interval is used up to its end, in the worst direction, all at once. What is left has to stand
 #: what is in no interval: +-2 % of gain (a drive resolves 0.1 %), 1.1 degrees (at 400 rad/s a cycle 50 us late).
 CORNER_DISK = 0.02
+POLE_LIMIT = 1.0 - 1e-4  # inside by more than rounding: at 1 ms what goes by a tenth in a second
 MOST_NAME = 200
 #: Hold: beyond two counts of the encoder and its noise, which no law can tell from motion; stick-slip swings by more.
 HOLD_LIMIT_RAD, RAMP_LIMIT_RAD = 2e-5, 2e-4
@@ -170,12 +172,17 @@ def gain_difference(own: RegionGains, proof: RegionProof, input_scale_nm: float)
 
 
 def check_intervals(s: Subject) -> Iterator[CertificateCheck]:
-    """The design's intervals hold the identified ones: one relaxed to a narrower world fits no axis."""
+    """The design's intervals hold the identified ones, and the least: one relaxed to a narrower world fits no axis."""
     design = s.design.uncertainty.model_dump()
     beyond = {key: width / max(design[key], SAME) for key, width in measured_widths(s.design.model).items()}
     wide = [key for key, ratio in beyond.items() if not ratio <= 1.0 + SAME]
     name = f"identified interval over the design's, the widest{': ' if wide else ''}{', '.join(wide)}"
     yield at_most(name, float(np.max([0.0, *beyond.values()])), 1.0 + SAME)
+    share = {key: design[key] / least if least else 1.0 for key, least in least_widths(s.design.model).items()}
+    narrow = [key for key, ratio in share.items() if not ratio >= 1.0 - SAME]
+    source = "" if beyond else " (intervals not measured)"
+    name = f"design's interval over the least, the narrowest{source}{': ' if narrow else ''}{', '.join(narrow)}"
+    yield at_least(name, min(share.values()), 1.0 - SAME)
 
 
 def check_stiffness(s: Subject) -> Iterator[CertificateCheck]:
@@ -193,21 +200,24 @@ def check_loop(s: Subject) -> Iterator[CertificateCheck]:
     An axis of up to ONE_CYCLE must stand one whole cycle, and two are told. One with more delay must stand its own,
     which the name of the check states, and one cycle is told: its feedback of past commands is for those that wait.
     """
+    constant = {i for _, slopes in s.coarse.slopes for i in slopes.frozen}
+    name = f"states that a loop lacks, constant in some motion: {', '.join(STATE_NAMES[i] for i in sorted(constant))}"
+    yield at_most(name, float(len(constant - MAY_STAY)), 0.0)
     cases = corners(s.design.uncertainty)
     worst = s.coarse.worst(cases)
-    yield at_most("largest pole, corners of the intervals", worst.radius, 1.0)
-    yield at_most("largest pole, corners, without the leak of z_hat's own", worst.coupled_radius, 1.0)
+    yield at_most("largest pole, corners of the intervals", worst.radius, POLE_LIMIT)
+    yield at_most("largest pole, corners, without the leak of z_hat's own", worst.coupled_radius, POLE_LIMIT)
     inner = inner_points(s.design.uncertainty, INNER_POINTS, s.seed)
-    yield at_most("largest pole, inner points, dense speeds", s.dense.worst(inner).radius, 1.0)
+    yield at_most("largest pole, inner points, dense speeds", s.dense.worst(inner).radius, POLE_LIMIT)
     if s.own_cycles <= ONE_CYCLE:
-        yield at_most("largest pole, one cycle of delay", s.dense.worst(NOMINAL, s.cycles(1.0)).radius, 1.0)
+        yield at_most("largest pole, one cycle of delay", s.dense.worst(NOMINAL, s.cycles(1.0)).radius, POLE_LIMIT)
     else:
         name = f"largest pole, the axis's own delay of {s.own_cycles:.2f} cycles"
-        yield at_most(name, s.dense.worst(NOMINAL).radius, 1.0)
+        yield at_most(name, s.dense.worst(NOMINAL).radius, POLE_LIMIT)
     slopes = position_slopes(s.design.model, s.coarse.friction.gain)
     if any(slopes):
         steepest = [Deviation(position_slope=slope) for slope in slopes]
-        yield at_most("largest pole, steepest torque over position", s.coarse.worst(steepest).radius, 1.0)
+        yield at_most("largest pole, steepest torque over position", s.coarse.worst(steepest).radius, POLE_LIMIT)
     yield at_least("symmetric disk margin", s.coarse.disk_margin()[0], DISK_LIMIT)
     yield at_least("symmetric disk margin, worst corner of the intervals", s.coarse.disk_margin(cases)[0], CORNER_DISK)
 

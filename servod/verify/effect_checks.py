@@ -18,7 +18,7 @@ from servod.axis_model import AxisModel
 from servod.gain_design import Design
 from servod.gains import CertificateCheck
 from servod.models.effects import static_stretch
-from servod.verify.checks import CORNER_DISK, MOST_NAME, Subject, at_least, at_most
+from servod.verify.checks import CORNER_DISK, MOST_NAME, POLE_LIMIT, Subject, at_least, at_most
 from servod.verify.closed_loop import Behind, Deviation, corners
 from servod.verify.effect_reach import Effect, Level, effects_of, level_of
 from servod.verify.known_physics import unknown_physics
@@ -40,12 +40,12 @@ def check_effects(s: Subject) -> Iterator[CertificateCheck]:
     effects = effects_of(model, level)
     if effects:
         cases = [*corners(s.design.uncertainty, together(effects).reach), *ends(model, friction, effects)]
-        yield at_most(f"largest pole, {covered(effects)}"[:MOST_NAME], s.coarse.worst(cases).radius, 1.0)
+        yield at_most(f"largest pole, {covered(effects)}"[:MOST_NAME], s.coarse.worst(cases).radius, POLE_LIMIT)
         margin = s.coarse.disk_margin(ends(model, friction, effects))[0]
         yield at_least("symmetric disk margin, ends of the model's own effects", margin, CORNER_DISK)
     if model.two_mass is not None:
         cases = sprung(model, level, corners(s.design.uncertainty, together(effects).reach))
-        yield at_most(f"largest pole, {resonance(model)}", s.coarse.worst(cases).radius, 1.0)
+        yield at_most(f"largest pole, {resonance(model)}", s.coarse.worst(cases).radius, POLE_LIMIT)
 
 
 def late_effects(design: Design) -> list[Deviation]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 
 from servod.axis_model import AxisModel
+from servod.gain_design import Uncertainty
 from servod.identified import Identified, IdentifiedValue
 
 #: Names of identified values, by the key of Uncertainty that they bound; of several the widest counts.
@@ -21,6 +22,17 @@ MEASURED = {
 #: Bristle damping that could not be measured is assumed at half of the critical one. Bearings and gears are found
 #: between a quarter and three quarters of it; below, the bristle would ring for long enough to be measured after all.
 ASSUMED_DAMPING = 0.5
+#: Least half widths: what a day's warming may change, and what a fit of four digits would be too proud of; the delay's
+#: is what a cycle jitters [s].
+FLOORS = {
+    "inertia": 0.02,
+    "stiffness": 0.05,
+    "damping": 0.25,
+    "viscous": 0.1,
+    "dry": 0.03,
+    "slope": 0.1,
+    "delay_s": 20e-6,
+}
 FALL_ENDS = 2.0  # Stribeck velocities: beyond, the map is wider in N*m and says nothing about the fall
 
 
@@ -36,6 +48,13 @@ def measured_widths(model: AxisModel) -> dict[str, float]:
     if "delay_s" in known.values:
         found["delay_s"] = _half_width(known.values["delay_s"])
     return found | _of_map(known)
+
+
+def least_widths(model: AxisModel) -> dict[str, float]:
+    """Half widths below which a design's intervals may not be: the floors, and a stated default where that is less."""
+    measured, default = measured_widths(model), Uncertainty().model_dump()
+    least = {key: floor if key in measured else min(floor, default[key]) for key, floor in FLOORS.items()}
+    return least | {"delay_s": min(least["delay_s"], model.total_delay_s)}
 
 
 def _widest(values: dict[str, IdentifiedValue], names: tuple[str, ...]) -> float | None:

@@ -7,9 +7,9 @@ import pytest
 from servod.axis_model import AxisModel
 from servod.gain_design import Uncertainty
 from servod.identified import IdentifiedValue
-from servod.synthesize.intervals import FLOORS, uncertainty_of
+from servod.synthesize.intervals import uncertainty_of
 from servod.verify.checks import Subject, check_intervals
-from servod.verify.measured import ASSUMED_DAMPING
+from servod.verify.measured import ASSUMED_DAMPING, FLOORS
 from servod.verify.steady_friction import steady_friction
 from servod.yaml12 import validate
 from tests.synthesize.designs import table1, table1_set
@@ -86,6 +86,18 @@ def test_a_design_narrower_than_what_was_measured_is_not_certified() -> None:
         design = gains.design.model_copy(update={"model": model, "uncertainty": widths})
         check = next(check_intervals(Subject(gains, design, 1, 1, 1)))
         assert check.passed == passed and ("stiffness" in check.name) == (not passed)
+
+
+@pytest.mark.parametrize("measured", [True, False])
+def test_intervals_below_the_floors_are_not_certified_whether_measured_or_not(measured: bool) -> None:
+    gains, model = table1_set(), identified(0.001, 1e-5) if measured else table1()
+    assert gains.design is not None
+    wide = uncertainty_of(model)
+    for widths, passed in ((wide, True), (wide.model_copy(update={"inertia": 0.001}), False)):
+        design = gains.design.model_copy(update={"model": model, "uncertainty": widths})
+        check = list(check_intervals(Subject(gains, design, 1, 1, 1)))[1]
+        assert check.passed == passed and ("inertia" in check.name) == (not passed)
+        assert ("intervals not measured" in check.name) == (not measured)
 
 
 def test_an_assumed_damping_has_the_interval_of_an_assumption() -> None:

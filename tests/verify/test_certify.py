@@ -11,7 +11,8 @@ import pytest
 
 from servod.errors import BadInput
 from servod.gains import CertificateCheck, GainSet, load_gains, parse_gains
-from servod.verify.certify import Verification, sources, verify
+from servod.sources import VERIFIES, sources
+from servod.verify.certify import Verification, verify
 from servod.verify.checks import Subject, check_loop, check_monte_carlo, check_regions, check_seal
 from servod.verify.trials import monte_carlo
 from tests.synthesize.designs import MODEL, table1_set
@@ -52,7 +53,7 @@ def test_a_broken_seal_is_not_mended_by_a_verification() -> None:
 
 
 def test_the_tool_is_what_the_verification_stands_on() -> None:
-    names = {f"{path.parent.name}/{path.name}" for path in sources()}
+    names = {f"{path.parent.name}/{path.name}" for path in sources(VERIFIES)}
     assert {"verify/checks.py", "models/closed_loop.py", "controllers/local.py", "servod/gain_design.py"} <= names
 
 
@@ -83,6 +84,15 @@ def test_the_proof_sees_a_change_that_was_sealed_again(path: tuple[Any, ...], fa
 def test_the_loop_check_sees_what_the_regions_cannot() -> None:
     unstable = changed(("parameters", "disturbance_observer", "bandwidth_rad_s"), 12.0)
     assert not all(check.passed for check in check_loop(subject(unstable)))
+
+
+def test_a_pole_on_the_circle_is_not_inside_and_constant_states_are_named() -> None:
+    s = subject(table1_set())
+    s.__dict__["dense"] = s.coarse.at(s.coarse.speeds[:2])
+    checks = list(check_loop(s))
+    poles = [check for check in checks if "largest pole" in check.name]
+    assert poles and all(check.limit < 1.0 for check in poles)
+    assert "d_hat" in checks[0].name and "z_hat" in checks[0].name and checks[0].passed
 
 
 def test_a_set_without_design_cannot_be_verified() -> None:
