@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from functools import cache
 from itertools import pairwise
 
+import numpy as np
 import pytest
 
 from servod.controllers import LAWS, local
 from servod.controllers.state import ASKED, DISTURBANCE, REST
+from servod.gain_parameters import LocalParameters
+from servod.models.simulate import LoopSettings, simulate_closed_loop
 from tests.controllers.cases import fresh_state, local_parameters
+from tests.synthesize.designs import table1, table1_set
 
 DT = 0.001
 WITHIN, SHARE = 2e-5, 0.3
@@ -84,3 +89,33 @@ def learned(v_ref: float, low_bandwidth: float) -> float:
 def test_the_observer_for_coming_to_rest_waits_for_a_reference_that_rests() -> None:
     assert learned(0.0, 500.0) > 5.0 * learned(0.0, 50.0) > 0.0
     assert learned(1e-4, 500.0) == learned(1e-4, 50.0) != 0.0
+
+
+@cache
+def held(rests: bool, push_nm: float = 0.0) -> np.ndarray:
+    """True position over six seconds of hold with a noisy 20 bit encoder; pushed from the third second on."""
+    gains = table1_set()
+    local_gains = gains.parameters
+    assert isinstance(local_gains, LocalParameters) and gains.design is not None
+    width = {"rest_within_rad": 1.4e-5 if rests else None, "rest_share": SHARE if rests else None}
+    cycles = 6000
+    run = simulate_closed_loop(
+        table1(),
+        LAWS["local"].step,
+        local_gains.model_copy(update=width).pack(),
+        np.zeros((cycles, 3)),
+        LoopSettings(DT, 2.0**20, gains.design.velocity_cutoff_hz, 1.0),
+        external_nm=np.where(np.arange(cycles) >= 3000, push_nm, 0.0),
+        reading_rad=np.random.default_rng(5).normal(0.0, 2e-6, cycles),
+    )
+    return run.position_rad
+
+
+def test_a_joint_at_rest_is_clearly_quieter_than_one_that_answers_every_reading() -> None:
+    assert np.ptp(held(True)[3000:]) < 0.6 * np.ptp(held(False)[3000:])
+
+
+def test_a_push_is_answered_as_far_and_as_fast_as_without_rest() -> None:
+    resting, awake = held(True, 0.04), held(False, 0.04)
+    assert np.abs(resting).max() < 1.25 * np.abs(awake).max()
+    assert np.abs(resting[-1000:]).max() < 1.4e-5 + 1e-5
