@@ -22,6 +22,7 @@ from servod.controllers import LAWS, Law
 from servod.errors import BadInput
 from servod.gain_design import Design
 from servod.gain_parameters import LocalSet, Parameters
+from servod.sources import VERIFIES, source_sha256
 from servod.units import NS_PER_S, NS_PER_US
 from servod.yaml12 import Dumper, Strict, parse_yaml, read_text, validate
 
@@ -173,6 +174,15 @@ class GainSet(Strict):
         if self.certificate.parameters_sha256 != self.parameters_sha256():
             return "a certificate for other parameters (they were changed after it was issued)"
         return None
+
+    def certificate_warning(self) -> str | None:
+        """What to know of a certificate that counts: other checks than this version's issued it. None when there is
+        nothing, or when the certificate does not say.
+        """
+        issued = self.certificate.tool_sha256 if self.certificate else None
+        if issued in (None, source_sha256(VERIFIES)):
+            return None
+        return "its certificate is from another version of the checks; `servoctl verify` issues it anew"
 
     def to_yaml(self) -> str:
         """The set as YAML text that `parse_gains` reads back to an equal set."""

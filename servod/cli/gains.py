@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -37,6 +38,7 @@ def load(
         if activate:
             result = client.call("gains_activate", name=result["name"], version=result["version"])
     report(result, f"{'activated' if activate else 'loaded'} {_title(result)}", as_json)
+    warn([result])
 
 
 @_app.command("list", help=example("List the gain sets in the daemon's store.", "servoctl gains list"))
@@ -47,6 +49,7 @@ def list_(socket: SocketOption = DEFAULT_SOCKET, as_json: JsonOption = False) ->
         print_json(result)
     else:
         _print(result)
+    warn(result["gains"])
 
 
 @_app.command(help=example("Check a gain set file and show what is in it.", "servoctl gains show my_axis.yaml"))
@@ -78,6 +81,7 @@ def activate(
     """Activate a gain set."""
     result = ask(socket, "gains_activate", name=name, version=version)
     report(result, f"activated {_title(result)}", as_json)
+    warn([result])
 
 
 @_app.command(help=example("Go back to the gain set that was active before.", "servoctl gains rollback"))
@@ -85,6 +89,14 @@ def rollback(socket: SocketOption = DEFAULT_SOCKET, as_json: JsonOption = False)
     """Roll back."""
     result = ask(socket, "gains_rollback")
     report(result, f"active again: {_title(result)}", as_json)
+    warn([result])
+
+
+def warn(rows: list[dict[str, Any]]) -> None:
+    """Say on stderr what the daemon says of stored sets; it is no reason to refuse them."""
+    for row in rows:
+        if row["warning"]:
+            print(f"warning: {row['name']} version {row['version']}: {row['warning']}", file=sys.stderr)
 
 
 def _title(stored: dict[str, Any]) -> str:
@@ -100,7 +112,8 @@ def _print(result: dict[str, Any]) -> None:
     if not rows:
         print("no gain set is stored")
         return
-    table = Table(*rows[0])
+    columns = [key for key in rows[0] if key != "warning"]
+    table = Table(*columns)
     for row in rows:
-        table.add_row(*(str(value) for value in row.values()))
+        table.add_row(*(str(row[key]) for key in columns))
     Console().print(table)

@@ -42,6 +42,8 @@ class GainBank:
         active = self._active_or(initial)
         require_fit(active.gains, config)
         log.info("gain set %s version %d (%s)", active.name, active.version, active.gains.law.name)
+        if warning := active.gains.certificate_warning():
+            log.warning("gain set %s version %d: %s", active.name, active.version, warning)
         self._sets = {0: active}
         self._last_serial = 0
         self._tried: StoredSet | None = None
@@ -148,4 +150,5 @@ def _row(stored: StoredSet) -> dict[str, Any]:
         "law": stored.gains.law.name,
         "certified": stored.gains.certificate_problem() is None,
         "sha256": stored.sha256,
+        "warning": stored.gains.certificate_warning() or "",
     }

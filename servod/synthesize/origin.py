@@ -13,19 +13,7 @@ from pathlib import Path
 import servod
 from servod.axis_model import AxisModel
 from servod.gains import Provenance
-
-#: What computes a design: packages and single files below the package's folder.
-SOURCES = ("synthesize", "verify", "models", "controllers", "gain_parameters.py", "gain_design.py")
-
-
-def tool_sha256() -> str:
-    """Hash of the sources that compute a design, by their names and contents."""
-    root, digest = Path(servod.__file__).parent, hashlib.sha256()
-    for name in SOURCES:
-        at = root / name
-        for path in sorted(at.rglob("*.py")) if at.is_dir() else [at]:
-            digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()
+from servod.sources import SYNTHESIZES, source_sha256
 
 
 def provenance(model: AxisModel, model_path: Path | None, note: str) -> Provenance:
@@ -34,7 +22,7 @@ def provenance(model: AxisModel, model_path: Path | None, note: str) -> Provenan
         author="servod",
         date=datetime.datetime.now(datetime.UTC).date(),
         tool=f"servod {servod.__version__} synthesize",
-        tool_sha256=tool_sha256(),
+        tool_sha256=source_sha256(SYNTHESIZES),
         model_sha256=hashlib.sha256(model_path.read_bytes()).hexdigest() if model_path else None,
         data_sha256=list(model.identified.data_sha256) if model.identified else [],
         note=note,

@@ -6,14 +6,13 @@ Top of servod.verify. A set is judged from itself alone: model, intervals and pr
 from __future__ import annotations
 
 import datetime
-import hashlib
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from servod import __version__
 from servod.errors import BadInput
 from servod.gains import Certificate, CertificateCheck, GainSet, Promise
+from servod.sources import VERIFIES, source_sha256
 from servod.verify.checks import LEAST_PLANTS, SIMULATED, STATIC, Subject, observations
 from servod.verify.effect_checks import check_effects
 from servod.verify.promise import promise
@@ -22,10 +21,6 @@ from servod.verify.rest_checks import check_loads, check_rest
 from servod.verify.trials import scale_of
 
 SEED, PROCESSES = 1, 2
-SOURCES = (
-    *("verify/*.py", "models/*.py", "controllers/*.py", "axis_*.py", "identified.py"),
-    *("gain_design.py", "gain_parameters.py", "gains.py", "references.py"),
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +52,8 @@ class Verification:
             parameters_sha256=gains.parameters_sha256(),
             model_sha256=gains.provenance.model_sha256,
             data_sha256=list(gains.provenance.data_sha256),
-            tool_sha256=source_sha256(),
-            issued_by=f"servod {__version__} verify, source {source_sha256()[:16]}",
+            tool_sha256=source_sha256(VERIFIES),
+            issued_by=f"servod {__version__} verify, source {source_sha256(VERIFIES)[:16]}",
             issued_at=today(),
             checks=self.checks,
             observations=self.observations,
@@ -75,23 +70,6 @@ class Verification:
 def today() -> datetime.datetime:
     """The day, UTC: the same set verified again on the same day is the same file, byte for byte."""
     return datetime.datetime.combine(datetime.datetime.now(datetime.UTC).date(), datetime.time(), datetime.UTC)
-
-
-def source_sha256() -> str:
-    """Hash of the sources that verify: which tool said so.
-
-    The checks, and what they stand on: simulator, control laws, model and design.
-    """
-    digest = hashlib.sha256()
-    for path in sources():
-        digest.update(path.name.encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()
-
-
-def sources() -> list[Path]:
-    """Files whose change may change what a verification says."""
-    package = Path(__file__).parents[1]
-    return sorted(path for pattern in SOURCES for path in package.glob(pattern))
 
 
 def verify(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 import yaml
 
 from servod.axis_model import axis_model_yaml, load_axis_model
+from servod.cli.gains import warn
 from servod.config import AxisConfig, load_config
 from servod.controllers import LAWS, local
 from servod.daemon.gain_bank import GainBank
@@ -17,6 +19,7 @@ from servod.gain_parameters import PdParameters
 from servod.gain_store import GainStore
 from servod.gains import GainSet, load_gains, parse_gains, require_certificate, require_fit
 from servod.shipped import shipped
+from servod.sources import VERIFIES, source_sha256
 from tests.gains import good
 
 BAD = yaml.safe_load(Path(__file__).with_name("bad_gains.yaml").read_text(encoding="utf-8"))
@@ -283,3 +286,27 @@ def test_a_set_for_a_finer_encoder_more_torque_or_less_delay_does_not_fit_the_ax
         require_fit(certified_with(0.4), config)
     with pytest.raises(BadInput, match=r"design\.model\.delay_s: found 0\.001; allowed: 0\.002"):
         require_fit(certified_with(None), with_model(0.002))
+
+
+def test_a_certificate_of_other_checks_is_told_and_no_reason_to_refuse(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = load_config(shipped("gains/config/virtual.yaml"))
+    plain = good.certified(parse_gains(good.PD, "good.yaml"))
+    assert plain.certificate is not None
+    file = tmp_path / "bench_pd.yaml"
+    gains = config.gains.model_copy(update={"directory": tmp_path / "store", "initial": file})
+    for tool, told in ((None, False), (source_sha256(VERIFIES), False), ("ab" * 32, True)):
+        certificate = plain.certificate.model_copy(update={"tool_sha256": tool})
+        file.write_text(plain.model_copy(update={"certificate": certificate}).sealed().to_yaml())
+        assert GainStore(gains.directory).load_file(file).gains.certificate_problem() is None
+        GainStore(gains.directory).activate("bench_pd")
+        bank = GainBank(config.model_copy(update={"gains": gains}))
+        with ThreadPoolExecutor(1) as slow:
+            flow = bank.list(0, slow)
+            stored = next(flow).result()
+            with pytest.raises(StopIteration) as ended:
+                flow.send(stored)
+        warn(ended.value.value["gains"][-1:])
+        assert ("another version of the checks" in caplog.text) is told
+        assert ("warning: bench_pd version" in capsys.readouterr().err) is told

@@ -12,7 +12,7 @@ from servod.axis_model import axis_model_yaml
 from servod.cli.app import run
 from servod.gains import load_gains
 from servod.identified import Identified, IdentifiedMap
-from servod.synthesize.origin import tool_sha256
+from servod.sources import SYNTHESIZES, source_sha256
 from tests.synthesize.designs import table1
 
 RECORDINGS = ["ab" * 32, "cd" * 32]
@@ -28,7 +28,7 @@ def test_the_set_carries_the_hashes_and_verify_shows_them(tmp_path: Path, capsys
     origin = load_gains(out).provenance
     assert origin.model_sha256 == told["model_sha256"] == hashlib.sha256(model.read_bytes()).hexdigest()
     assert origin.data_sha256 == told["data_sha256"] == RECORDINGS
-    assert origin.tool_sha256 == told["tool_sha256"] == tool_sha256() and "servod" in origin.tool
+    assert origin.tool_sha256 == told["tool_sha256"] == source_sha256(SYNTHESIZES) and "servod" in origin.tool
     assert run(["verify", str(out), "--json", "--plants", "1"]) == 1
     shown = json.loads(capsys.readouterr().out)["hashes"]
     assert shown == {

@@ -12,10 +12,10 @@ from servod.commission.files import DESIGN, INFEASIBLE, MODEL, RELAXED, write_js
 from servod.commission.walk import Walk
 from servod.errors import AnswerIsNo
 from servod.gains import GainSet
+from servod.sources import SYNTHESIZES, source_sha256
 from servod.synthesize.deployed import Infeasible, Relaxation, Wishes
 from servod.synthesize.gain_set import Options, synthesize
 from servod.synthesize.intervals import uncertainty_of
-from servod.synthesize.origin import tool_sha256
 from servod.units import NS_PER_S, NS_PER_US
 
 #: The regions' overlap ends at this share of the speed at most.
@@ -36,7 +36,7 @@ class Synthesize:
     def inputs(self, walk: Walk) -> dict[str, Any]:
         """The model, the loop around the law, the accuracy of the local sets, and by which sources."""
         loop, accuracy = _loop(walk), walk.options.accuracy
-        return {**walk.hashes(MODEL), "loop": loop, "accuracy": accuracy, "tool": tool_sha256()}
+        return {**walk.hashes(MODEL), "loop": loop, "accuracy": accuracy, "tool": source_sha256(SYNTHESIZES)}
 
     def run(self, walk: Walk) -> None:
         """Raises AnswerIsNo when the demands cannot be met and no relaxation was agreed to."""

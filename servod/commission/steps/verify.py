@@ -9,7 +9,8 @@ from servod.commission.files import CERTIFICATE, DESIGN, GAINS, write_json, writ
 from servod.commission.walk import Walk
 from servod.errors import AnswerIsNo
 from servod.gains import load_gains
-from servod.verify.certify import SEED, source_sha256, verify
+from servod.sources import VERIFIES, source_sha256
+from servod.verify.certify import SEED, verify
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class Verify:
 
     def inputs(self, walk: Walk) -> dict[str, Any]:
         """The set, how thoroughly it is judged, and by which sources."""
-        return {**walk.hashes(DESIGN), "plants": walk.options.plants, "seed": SEED, "tool": source_sha256()}
+        return {**walk.hashes(DESIGN), "plants": walk.options.plants, "seed": SEED, "tool": source_sha256(VERIFIES)}
 
     def run(self, walk: Walk) -> None:
         """Raises AnswerIsNo when the set is not valid; then nothing is left but the document."""

@@ -1,0 +1,34 @@
+"""Which version of the computation a number comes from: one hash over the sources that its purpose stands on.
+
+Ground floor. Certificates and provenances carry the hash; the daemon compares it without importing what it names.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from functools import cache
+from pathlib import Path
+
+_PACKAGE = Path(__file__).parent
+
+#: The checks of a set, and what they stand on: simulator, control laws, model and design.
+VERIFIES = (
+    *("verify/*.py", "models/*.py", "controllers/*.py", "axis_*.py", "identified.py"),
+    *("gain_design.py", "gain_parameters.py", "gains.py", "references.py"),
+)
+#: What computes a design: it judges its choices by the same checks.
+SYNTHESIZES = ("synthesize/*.py", *(pattern for pattern in VERIFIES if pattern != "references.py"))
+
+
+def sources(patterns: tuple[str, ...]) -> list[Path]:
+    """Files whose change may change what comes out."""
+    return sorted(path for pattern in patterns for path in _PACKAGE.glob(pattern))
+
+
+@cache
+def source_sha256(patterns: tuple[str, ...]) -> str:
+    """Hash of these files by their names and contents."""
+    digest = hashlib.sha256()
+    for path in sources(patterns):
+        digest.update(path.relative_to(_PACKAGE).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()
