@@ -36,6 +36,8 @@ _FEEDBACK: tuple[tuple[str, str, str, float], ...] = (
     ("K·K_x in Ω_H / N·m/rad", "high", "position_nm_per_rad", _GAIN * GAINS_HIGH.third),
     ("K·K_v in Ω_H / N·m·s/rad", "high", "velocity_nms_per_rad", _GAIN * GAINS_HIGH.second),
 )
+#: Class of a law that was synthesized and not tuned.
+UNLIMITED = "own, roughness not limited"
 _RMS = "RMS on (19) / mrad: "
 
 #: First column of the table, in order.
@@ -106,21 +108,19 @@ def _step(found: dict[str, Any], size: str) -> tuple[str, str, str]:
 
 
 def tuned(document: dict[str, Any], joint: Joint) -> Table:
-    """The rivals after a fair tuning on one joint, by class."""
+    """The rivals after a fair tuning on one joint, by class; then the law as synthesized, of no limited roughness."""
     header = ("controller", "feedback", "RMS on (19) / mrad", "largest / mrad", "roughness / mN·m")
-    rows = [
-        (
-            r["law"],
-            r["feedback"],
-            *(
-                ("–",) * 3
-                if r["rms_error_mrad"] is None
-                else (f"{r['rms_error_mrad']:.4f}", f"{r['max_error_mrad']:.3f}", f"{1e3 * r['roughness_nm']:.3g}")
-            ),
-        )
-        for r in document["joints"][joint.value]["tuned"]
-    ]
+    found = document["joints"][joint.value]
+    rows = [(r["law"], r["feedback"], *_tracked(r)) for r in found["tuned"]]
+    rows.append((Row.DEPLOYED.label, UNLIMITED, *_tracked(found["tracking"][Row.DEPLOYED.name.lower()])))
     return Table(f"Rivals tuned by the same rules on {joint.label}", header, tuple(rows))
+
+
+def _tracked(found: dict[str, Any]) -> tuple[str, str, str]:
+    """Errors and roughness of one run; dashes where the axis stopped."""
+    if found["rms_error_mrad"] is None:
+        return "–", "–", "–"
+    return f"{found['rms_error_mrad']:.4f}", f"{found['max_error_mrad']:.3f}", f"{1e3 * found['roughness_nm']:.3g}"
 
 
 def claims(document: dict[str, Any]) -> Table:

@@ -126,8 +126,9 @@ def test_the_table_puts_ours_beside_the_papers() -> None:
 
 def test_every_claim_and_every_rival_is_in_a_table() -> None:
     assert [row[3] for row in table.claims(document()).rows] == ["does not agree"] * 2
-    (rival,) = table.tuned(document(), Joint.TABLE1).rows
+    rival, deployed = table.tuned(document(), Joint.TABLE1).rows
     assert rival[:3] == ("pd", "equal", "2.5000")
+    assert deployed == ("local, synthesized", table.UNLIMITED, "11.0000", "11.000", "1.1e+04")
     first, *_ = table.steps(document(), Joint.TABLE1).rows
     assert first == ("PD", *("–",) * 6)
 
