@@ -15,18 +15,24 @@ from servod.control import ControlClient, Refused
 from servod.daemon_config import require_daemon_config
 from servod.deploy.daemon_link import DaemonDeployLink
 from servod.errors import AnswerIsNo
-from servod.tracking.metrics import Curves, Tracking, tracking
+from servod.gains import GainSet
+from servod.tracking.metrics import Curves, Tracking, known_noise, tracking
 from servod.tracking.motions import HOLD_S, PAPER_S, STEPS_MRAD
 from servod.tracking.stepped import curves_of
 
 
 def measure_on_daemon(
-    socket: Path, config: AxisConfig, deployed: tuple[str, int], tell: Callable[[float], None]
+    socket: Path,
+    config: AxisConfig,
+    deployed: tuple[str, int],
+    tell: Callable[[float], None],
+    gains: GainSet | None = None,
 ) -> tuple[Tracking | None, list[str]]:
     """Figures of the set `deployed` (name, version), and what the daemon refused; None where it refused (19).
 
-    The axis is left enabled or not, as it was. Raises AnswerIsNo when another set runs or the axis drops out,
-    BadInput when the daemon has another configuration than `config`, Unreachable when it does not answer any more.
+    `gains` is that set, where it is at hand: its design knows the encoder's noise. The axis is left enabled or not, as
+    it was. Raises AnswerIsNo when another set runs or the axis drops out, BadInput when the daemon has another
+    configuration than `config`, Unreachable when it does not answer any more.
     """
     with ControlClient(socket) as client:
         require_daemon_config(client, config)
@@ -37,7 +43,9 @@ def measure_on_daemon(
     if "paper" not in curves:
         return None, refused
     steps = {mrad: curves[f"{mrad:g}"] for mrad in STEPS_MRAD if f"{mrad:g}" in curves}
-    return tracking(curves["paper"], steps, 2.0 * math.pi / config.encoder.counts_per_turn), refused
+    count_rad = 2.0 * math.pi / config.encoder.counts_per_turn
+    noise_rad = known_noise(gains, count_rad) if gains else None
+    return tracking(curves["paper"], steps, count_rad, encoder_rms_rad=noise_rad), refused
 
 
 @contextlib.contextmanager

@@ -60,10 +60,10 @@ def _keys() -> list[str]:
 
 def _on_daemon(walk: Walk, axis: DaemonWalkAxis, title: str) -> dict[str, Any]:
     """The deployed law alone."""
-    gains = read_json(walk.path(DEPLOYMENT))["gains"]
+    told = read_json(walk.path(DEPLOYMENT))["gains"]
+    deployed, gains = (told["name"], told["version"]), load_gains(walk.path(GAINS))
     with walk.progress(title) as tell:
-        deployed = (gains["name"], gains["version"])
-        tracking, missing = measure_on_daemon(axis.socket, axis.config, deployed, partial(tell, "deployed law"))
+        tracking, missing = measure_on_daemon(axis.socket, axis.config, deployed, partial(tell, "deployed law"), gains)
     if tracking:
         save_curves(run_files(walk, DEPLOYED)[1], tracking.curves)
     return document({}, tracking.document() if tracking else None, {}) | {"not_measured": missing}
