@@ -21,6 +21,10 @@ SEARCH_STEP_S = 1e-4
 BUDGET = 540
 
 
+#: The limit on roughness is a price in the search's cost: a set that was tuned to it may stand this share above.
+ROUGHNESS_TOLERANCE = 0.01
+
+
 class Feedback(Enum):
     """Classes of the comparison: the paper's PD gains for every law, or PD gains tuned with the rest."""
 

@@ -11,7 +11,7 @@ from servod.commission.comparison import DEPLOYED
 from servod.commission.files import GAINS, MODEL, RIVALS, TUNING, write_json, write_text
 from servod.commission.walk import Walk
 from servod.gains import load_gains
-from servod.tune.plan import BUDGET, Feedback, Tuned, TunePlan
+from servod.tune.plan import BUDGET, ROUGHNESS_TOLERANCE, Feedback, Tuned, TunePlan
 from servod.tune.rivals import rivals
 from servod.tune.tuning import as_tuned
 
@@ -97,5 +97,5 @@ def _told(tuned: Tuned, limit: float) -> dict[str, float]:
         "simulations": tuned.simulations,
         "roughness_ratio": tuned.roughness,
         "roughness_limit": limit,
-        "within_roughness_limit": tuned.roughness <= limit,
+        "within_roughness_limit": tuned.roughness <= (1.0 + ROUGHNESS_TOLERANCE) * limit,
     }
