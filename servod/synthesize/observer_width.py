@@ -14,7 +14,7 @@ from servod.controllers import LAWS
 from servod.gain_design import Design
 from servod.gain_parameters import LocalParameters
 from servod.verify.checks import CORNER_DISK, CORNER_SPEEDS, DISK_LIMIT, speeds_of
-from servod.verify.closed_loop import Deviation, late_corners
+from servod.verify.closed_loop import Deviation, corners
 from servod.verify.effect_checks import late_effects
 from servod.verify.margins import Judgement, Sweep, arrival_of
 from servod.verify.sampled import timing_of
@@ -47,10 +47,10 @@ class Search:
     def stands(self, law: LocalParameters, disk_wanted: float, below_rad_s: float = math.inf) -> bool:
         """Whether `law` is stable at every corner with CORNER_WANTED, and has `disk_wanted` as modelled.
 
-        At the corners with the longest delay, and stable at the ends of what the model's own effects make of the joint;
-        at speeds below `below_rad_s`, where that is all that has changed.
+        And stable at the ends of what the model's own effects make of the joint; at speeds below `below_rad_s`, where
+        that is all that has changed. Corners with the shorter delay count too: with two cycles they can be the worst.
         """
-        cases: Sequence[Deviation] = late_corners(self.design.uncertainty)
+        cases: Sequence[Deviation] = corners(self.design.uncertainty)
         counts = FEW_SPEEDS, CORNER_SPEEDS
         few, many = ([v for v in speeds_of(self.design, count) if v < below_rad_s] for count in counts)
         hard = sorted(v for v in self.refused_at if v < below_rad_s)
