@@ -168,19 +168,20 @@ class Sweep:
         return least, where
 
     def judge(self, cases: Sequence[Deviation]) -> Judgement:
-        """Poles and disk margin of `cases` of one delay at once, for a search: what `worst` and `disk_margin` say."""
+        """Poles and disk margin of `cases` at once, for a search: what `worst` and `disk_margin` say."""
         found, hardest = Judgement(self.own_radius, 0.0, np.inf, 0.0, []), set()
-        for velocity, kind, (closed, column, row) in self.systems(cases):
-            poles = np.linalg.eigvals(closed)
-            radius = np.abs(poles).max(axis=-1)
-            hardest.add(int(radius.argmax()))
-            if radius.max() > found.radius:
-                found = replace(found, radius=float(radius.max()), radius_at_rad_s=velocity)
-            if kind is Bristle.SLIDES or velocity == 0.0:
-                margin = disk_margins(sensitivity(closed, column, row, poles))
-                hardest.add(int(margin.argmin()))
-                if margin.min() < found.disk_margin:
-                    found = replace(found, disk_margin=float(margin.min()), disk_at_rad_s=velocity)
+        for group in by_delay(cases):
+            for velocity, kind, (closed, column, row) in self.systems([cases[i] for i in group]):
+                poles = np.linalg.eigvals(closed)
+                radius = np.abs(poles).max(axis=-1)
+                hardest.add(group[int(radius.argmax())])
+                if radius.max() > found.radius:
+                    found = replace(found, radius=float(radius.max()), radius_at_rad_s=velocity)
+                if kind is Bristle.SLIDES or velocity == 0.0:
+                    margin = disk_margins(sensitivity(closed, column, row, poles))
+                    hardest.add(group[int(margin.argmin())])
+                    if margin.min() < found.disk_margin:
+                        found = replace(found, disk_margin=float(margin.min()), disk_at_rad_s=velocity)
         return replace(found, hardest=[cases[i] for i in sorted(hardest)])
 
     def stable(self, case: Deviation, extra_delay_s: float = 0.0) -> bool:

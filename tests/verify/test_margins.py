@@ -113,3 +113,14 @@ def test_an_axis_of_two_cycles_is_judged_by_its_own_delay_and_says_so() -> None:
     assert "largest pole, the axis's own delay of 2.00 cycles" in names
     assert "largest pole, one cycle of delay" not in names
     assert {"largest pole, one cycle of delay", "largest pole, two cycles of delay"} <= set(observations(two))
+
+
+def test_a_search_judges_corners_of_different_delays_each_with_its_own() -> None:
+    judged = subject(delay_s=1e-4)
+    cases = corners(judged.design.uncertainty)
+    sweep = judged.coarse.at((0.01, 0.2))
+    found = sweep.judge(cases)
+    assert found.radius == pytest.approx(sweep.worst(cases).radius, rel=1e-9)
+    assert found.disk_margin == pytest.approx(sweep.disk_margin(cases)[0], rel=1e-6)
+    early, late = (sweep.judge([c for c in cases if (c.delay_s > 0.0) == late]).disk_margin for late in (False, True))
+    assert found.disk_margin == min(early, late) and early != late
