@@ -33,6 +33,7 @@ from servod.synthesize.gain_set import Options, synthesize
 from servod.tracking.metrics import Array, score
 from servod.verify.certify import verify
 from servod.verify.checks import LEAST_PLANTS
+from servod.verify.measured import least_widths
 
 #: Told what is done, and the share of the whole that is.
 Tell = Callable[[str, float], None]
@@ -167,7 +168,7 @@ def designed(model: AxisModel, model_file: Path, gains_file: Path, same_filter: 
     cutoff = same_filter.design.velocity_cutoff_hz if same_filter and same_filter.design else None
     options, said = Options(name=gains_file.stem, observer=False), ""
     for scale in SCALES:
-        wishes = Wishes(cutoff_hz=cutoff, uncertainty=Uncertainty().scaled(scale))
+        wishes = Wishes(cutoff_hz=cutoff, uncertainty=_narrowed(model, scale))
         found = synthesize(model, wishes, options, model_file)
         if isinstance(found, Infeasible):
             said = f"no feedback for {model_file.name}: {'; '.join(found.clashes)}"
@@ -179,6 +180,13 @@ def designed(model: AxisModel, model_file: Path, gains_file: Path, same_filter: 
             return certified
         said = f"{gains_file}: not valid: {'; '.join(c.name for c in checked.checks if not c.passed)}"
     raise AnswerIsNo(said)
+
+
+def _narrowed(model: AxisModel, scale: float) -> Uncertainty:
+    """The usual uncertainty times `scale`, but nowhere narrower than a certificate allows."""
+    scaled = Uncertainty().scaled(scale)
+    least = {key: max(width, getattr(scaled, key)) for key, width in least_widths(model).items()}
+    return scaled.model_copy(update=least)
 
 
 def _recorded(axis: RecoveryAxis, tracked: Rows, out: Path, tell: Tell, effort: Effort) -> list[Path]:
