@@ -14,8 +14,9 @@ Options: the velocity of z_hat, of d0 and of the sets is the measured one or the
 an output disturbance observer around the whole (bandwidth 0: none). The regions go by the faster of both velocities:
 a step has no reference velocity, yet the gains of Omega_L on a joint that turns fast make a limit cycle.
 Far from its goal, as in a step, the joint is approached with a bounded speed: the feedback sees a limited error.
-The observer has a bandwidth of its own for coming to rest, in Omega_L under a reference that rests. Under one that
-moves it would take friction that turns over for a disturbance, and throw the joint forward by what it has gathered.
+The observer has bandwidths of its own in Omega_L: one for coming to rest, under a reference that rests, and one under
+a reference that moves. There a fast one may take friction that turns over for a disturbance, and throw the joint
+forward by what it has gathered.
 At rest: within the hold width neither l nor the observer acts, so nothing hunts. Driven by the measured velocity z_hat
 creeps with its noise, and the leak floor lets it fade; driven by the reference it stays as it is, for letting it fade
 would only move the joint, by F/(c0 + k_x).
@@ -58,8 +59,9 @@ OBSERVER_LOW = 27  # g in Omega_L under a resting reference [rad/s]: on its bris
 ERROR_LIMIT = 28  # the feedback sees no more error than this, which bounds the speed of a step [rad], 0: none
 REST_WITHIN = 29  # error within which a joint under a resting reference counts as at rest [rad], 0: never
 REST_SHARE = 30  # of feedback and observer that is left at rest
-N_SETS = 31  # number n of local sets
-FIRST_NODE = 32  # then n nodes v_i [rad/s], n decays a_i [1/s], n gains l_i; then `position`, or nothing
+OBSERVER_MOVING = 31  # g in Omega_L under a moving reference [rad/s]
+N_SETS = 32  # number n of local sets
+FIRST_NODE = 33  # then n nodes v_i [rad/s], n decays a_i [1/s], n gains l_i; then `position`, or nothing
 
 MEASURED = 0.0
 REFERENCE = 1.0
@@ -139,8 +141,8 @@ def step(
     other = p[FEEDFORWARD_INERTIA] * a_ref + known
     if p[OBSERVER_BANDWIDTH] > 0.0:
         if moves:
-            slow = 1.0 - share if stands else 0.0
-            bandwidth = p[OBSERVER_BANDWIDTH] + slow * (p[OBSERVER_LOW] - p[OBSERVER_BANDWIDTH])
+            low = p[OBSERVER_LOW] if stands else p[OBSERVER_MOVING]
+            bandwidth = low + share * (p[OBSERVER_BANDWIDTH] - low)
             observe(s, acts * bandwidth, p[OBSERVER_INERTIA], p[OBSERVER_LIMIT], v, u_applied, dt)
         remember(s, v, friction + known, u_applied)
         other += s[DISTURBANCE]

@@ -34,6 +34,7 @@ from servod.synthesize.local_sets import (
     local_sets,
     sets_at,
 )
+from servod.synthesize.moving_observer import with_moving_observer
 from servod.synthesize.observer_width import OBSERVERS_RAD_S, with_observer, with_widest_observer
 from servod.synthesize.origin import provenance
 from servod.verify.rest import hold_width, rest_width
@@ -153,7 +154,8 @@ def synthesize(
     _, design, law = best
     if law.disturbance_observer is None and options.gain is None:
         law = designed(design, friction, law)
-    return gain_set(design, law, options, model_path)
+    found = gain_set(design, law, options, model_path)
+    return found if law.disturbance_observer is None else with_moving_observer(found, friction)
 
 
 def gain_set(design: Design, law: LocalParameters, options: Options, model_path: Path | None) -> GainSet:

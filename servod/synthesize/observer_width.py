@@ -62,6 +62,11 @@ class Search:
         own = late_effects(self.design)
         return not own or self._sweep(law, many).worst(own).radius < STABLE
 
+    def stands_everywhere(self, law: LocalParameters, disk_wanted: float) -> bool:
+        """Whether `law` stands at all corners and all the speeds of the certificate, also where others did not fail."""
+        many = speeds_of(self.design, CORNER_SPEEDS)
+        return self._judged(law, many, corners(self.design.uncertainty), disk_wanted) is not None
+
     def _sweep(self, law: LocalParameters, speeds: list[float]) -> Sweep:
         return Sweep(LAWS["local"], law.pack(), self.friction, timing_of(self.design), speeds, arrival_of(law))
 
@@ -86,10 +91,19 @@ class Search:
             self.refused_at.append(speed_rad_s)
 
 
-def with_observer(law: LocalParameters, high_rad_s: float, low_rad_s: float | None) -> LocalParameters:
-    """`law` with other bandwidths of the observer that it has: in Omega_H and in Omega_L (None: the same)."""
+def with_observer(
+    law: LocalParameters, high_rad_s: float, low_rad_s: float | None, moving_rad_s: float | None = None
+) -> LocalParameters:
+    """`law` with other bandwidths of the observer that it has: in Omega_H, and in Omega_L at rest and moving.
+
+    None: the same as in Omega_H.
+    """
     assert law.disturbance_observer is not None
-    bandwidths = {"bandwidth_rad_s": high_rad_s, "low_bandwidth_rad_s": low_rad_s}
+    bandwidths = {
+        "bandwidth_rad_s": high_rad_s,
+        "low_bandwidth_rad_s": low_rad_s,
+        "low_moving_bandwidth_rad_s": moving_rad_s,
+    }
     return law.model_copy(update={"disturbance_observer": law.disturbance_observer.model_copy(update=bandwidths)})
 
 
@@ -102,7 +116,9 @@ def with_widest_observer(
         for bandwidth in (g for g in OBSERVERS_RAD_S if g > beyond_rad_s):
             slow = with_observer(law, bandwidth, LOW_FACTORS[-1] * bandwidth)
             if search.stands(slow, disk):
-                return with_fastest_rest(search, slow, disk)
+                fast = with_fastest_rest(search, slow, disk)
+                if search.stands_everywhere(fast, disk):
+                    return fast
     return law.model_copy(update={"disturbance_observer": None})
 
 

@@ -31,7 +31,9 @@ def local_parameters(
     """Local law with the paper's PD gains and the decays that (7) gives for Table I, one direction weaker."""
     decays = [SIGMA0 * abs(v) / (level(v) * (1.0 + math.copysign(asymmetry, v))) for v in nodes]
     head = (0.1, 0.0, 25.0, 1.2, 0.0, 25.0, 1.2, 0.005, 0.02, SIGMA0, VISCOUS, leak, 1e-3, source, 0.0, shape)
-    tail = (hold_within, 0.0, bandwidth, 0.001, 0.1, *memory, *memory, bandwidth, error_limit, *rest, float(len(nodes)))
+    observer = (bandwidth, 0.001, 0.1)
+    after = (bandwidth, error_limit, *rest, bandwidth, float(len(nodes)))
+    tail = (hold_within, 0.0, *observer, *memory, *memory, *after)
     return (*head, *tail, *nodes, *decays, *([gain] * len(nodes)))
 
 

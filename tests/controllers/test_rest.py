@@ -77,18 +77,20 @@ def test_without_a_width_nothing_rests() -> None:
     assert local_parameters()[local.REST_WITHIN] == 0.0
 
 
-def learned(v_ref: float, low_bandwidth: float) -> float:
+def learned(v_ref: float, at_rest: float, moving: float) -> float:
     """Estimate after three steps at a torque that moves nothing, creeping in Omega_L."""
     p, s = list(local_parameters(bandwidth=50.0)), fresh_state("local")
-    p[local.OBSERVER_LOW] = low_bandwidth
+    p[local.OBSERVER_LOW], p[local.OBSERVER_MOVING] = at_rest, moving
     for _ in range(3):
         LAWS["local"].step(tuple(p), s, 1e-3, v_ref, 0.0, 0.0, v_ref, 0.01, DT)
     return s[DISTURBANCE]
 
 
-def test_the_observer_for_coming_to_rest_waits_for_a_reference_that_rests() -> None:
-    assert learned(0.0, 500.0) > 5.0 * learned(0.0, 50.0) > 0.0
-    assert learned(1e-4, 500.0) == learned(1e-4, 50.0) != 0.0
+def test_the_observer_has_a_bandwidth_for_coming_to_rest_and_one_for_motion() -> None:
+    assert learned(0.0, 500.0, 50.0) > 5.0 * learned(0.0, 50.0, 50.0) > 0.0
+    assert learned(0.0, 50.0, 500.0) == learned(0.0, 50.0, 50.0)
+    assert learned(1e-4, 500.0, 50.0) == learned(1e-4, 50.0, 50.0) != 0.0
+    assert learned(1e-4, 50.0, 500.0) > 5.0 * learned(1e-4, 50.0, 50.0)
 
 
 @cache
