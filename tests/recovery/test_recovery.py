@@ -16,6 +16,7 @@ from servod.shipped import shipped
 EFFORT = Effort(paper_s=8.0, diagnosed_s=5.0, motion_s=6.0, plants=20)
 
 
+@pytest.mark.long
 @pytest.mark.timeout(600)
 def test_what_a_concealed_effect_cost_comes_back(tmp_path: Path) -> None:
     believed, true = believed_and_true(load_axis_model(shipped("gains/axes/table1_joint.yaml")), "gravity")
