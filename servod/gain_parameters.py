@@ -177,13 +177,18 @@ class OutputObserver(Strict):
 
     bandwidth_rad_s: float = Field(gt=0.0, le=2000.0)
     low_bandwidth_rad_s: float | None = Field(
-        None, gt=0.0, le=2000.0, description="in Omega_L, coming to rest; without: the same"
+        None, gt=0.0, le=2000.0, description="in Omega_L; without: bandwidth_rad_s"
     )
     low_moving_bandwidth_rad_s: float | None = Field(
-        None, gt=0.0, le=2000.0, description="in Omega_L, under a moving reference; without: the same"
+        None, gt=0.0, le=2000.0, description="in Omega_L under a moving reference; without: low_bandwidth_rad_s"
     )
     inertia_kg_m2: Inertia
     disturbance_limit_nm: Torque
+
+    @property
+    def moving_rad_s(self) -> float:
+        """Bandwidth in Omega_L under a moving reference [rad/s]."""
+        return self.low_moving_bandwidth_rad_s or self.low_bandwidth_rad_s or self.bandwidth_rad_s
 
 
 class LocalFriction(Strict):
@@ -282,7 +287,7 @@ class LocalParameters(Strict):
             self.error_limit_rad or 0.0,
             self.rest_within_rad or 0.0,
             self.rest_share or 1.0,
-            (observer.low_moving_bandwidth_rad_s or observer.bandwidth_rad_s) if observer else 0.0,
+            observer.moving_rad_s if observer else 0.0,
             float(len(f.sets)),
             *(s.velocity_rad_s for s in f.sets),
             *(s.decay_per_s for s in f.sets),

@@ -16,25 +16,8 @@ from servod.controllers.engine import Controller
 PERIOD_S = 0.001
 _NODES = (-0.5, -0.2, -0.01, -0.001, 0.0, 0.001, 0.05, 0.12, 0.5)
 _LOCAL_HEAD = (0.1, 0.017, 1574.9, 0.241, 21.615, 197.0, 2.104, 0.005, 0.02, 760.0, 0.056, 2.0, 1.6e-4, 0.0, 0.0, 0.0)
-_LOCAL_TAIL = (
-    2e-5,
-    0.001,
-    50.0,
-    0.001,
-    0.1,
-    0.4,
-    0.3,
-    0.0,
-    0.4,
-    0.3,
-    0.0,
-    50.0,
-    0.02,
-    1e-5,
-    0.3,
-    50.0,
-    float(len(_NODES)),
-)
+_OBSERVER, _MEMORY, _REST = (50.0, 0.001, 0.1), (0.4, 0.3, 0.0), (1e-5, 0.3)
+_LOCAL_TAIL = (2e-5, 0.001, *_OBSERVER, *_MEMORY, *_MEMORY, 50.0, 0.02, *_REST, 50.0, float(len(_NODES)))
 
 #: Typical parameters with every option that costs time switched on; `local` has the paper's nine sets.
 PARAMETERS: dict[str, tuple[float, ...]] = {

@@ -96,13 +96,13 @@ def with_observer(
 ) -> LocalParameters:
     """`law` with other bandwidths of the observer that it has: in Omega_H, and in Omega_L at rest and moving.
 
-    None: the same as in Omega_H.
+    None: the same as in Omega_H, which is written down where it is not the one at rest.
     """
     assert law.disturbance_observer is not None
     bandwidths = {
         "bandwidth_rad_s": high_rad_s,
         "low_bandwidth_rad_s": low_rad_s,
-        "low_moving_bandwidth_rad_s": moving_rad_s,
+        "low_moving_bandwidth_rad_s": moving_rad_s or (high_rad_s if low_rad_s else None),
     }
     return law.model_copy(update={"disturbance_observer": law.disturbance_observer.model_copy(update=bandwidths)})
 

@@ -15,7 +15,7 @@ from servod.controllers import LAWS, local
 from servod.daemon.gain_bank import GainBank
 from servod.errors import BadInput
 from servod.gain_design import Design, DesignMode, Uncertainty
-from servod.gain_parameters import PdParameters
+from servod.gain_parameters import LocalParameters, PdParameters
 from servod.gain_store import GainStore
 from servod.gains import GainSet, load_gains, parse_gains, require_certificate, require_fit
 from servod.shipped import shipped
@@ -233,6 +233,18 @@ def test_a_set_that_an_earlier_version_sealed_is_what_it_was() -> None:
     packed = gains.pack()
     assert (packed[local.REST_WITHIN], packed[local.REST_SHARE]) == (0.0, 1.0)
     require_fit(gains, load_config(shipped("gains/config/virtual.yaml")))
+
+
+@pytest.mark.parametrize(("low", "moving", "packed"), [(None, None, 50.0), (300.0, None, 300.0), (300.0, 120.0, 120.0)])
+def test_an_observer_of_an_earlier_version_keeps_its_bandwidth_in_slow_motion(
+    low: float | None, moving: float | None, packed: float
+) -> None:
+    parameters = parse_gains(SEALED_BEFORE_REST.read_text(encoding="utf-8"), "earlier").parameters
+    assert isinstance(parameters, LocalParameters) and parameters.disturbance_observer is not None
+    bandwidths = {"low_bandwidth_rad_s": low, "low_moving_bandwidth_rad_s": moving}
+    observer = parameters.disturbance_observer.model_copy(update=bandwidths)
+    pack = parameters.model_copy(update={"disturbance_observer": observer}).pack()
+    assert (pack[local.OBSERVER_BANDWIDTH], pack[local.OBSERVER_MOVING]) == (50.0, packed)
 
 
 @pytest.mark.parametrize(
