@@ -54,7 +54,7 @@ def diagnose(
         print_json(document)
     else:
         _print(found, document, out)
-    if found.evidence is None:
+    if document["verdict"] == "cannot_tell":
         raise AnswerIsNo(document["summary"])
 
 

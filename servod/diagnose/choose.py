@@ -86,7 +86,10 @@ class Entry:
 
 @dataclass
 class Choice:
-    """The outcome: the fit with all that is named, the fit of the base alone, and for each term how it came in."""
+    """The outcome: the fit with all that is named, the fit of the base alone, and for each term how it came in.
+
+    `cut`: time ended the search while something was left.
+    """
 
     base: Fit
     fit: Fit
@@ -95,6 +98,7 @@ class Choice:
     minor: dict[str, Merit]
     floor: float
     tried: int
+    cut: bool = False
 
     def drop(self, index: int, less: Fit) -> None:
         """Take a term out; `less` is the fit without it."""
@@ -129,10 +133,10 @@ class Chooser:
         """Fit the base, add terms, prune; the outcome."""
         base = self._fit_base()
         choice = Choice(base, base, [], [], {}, self.floor, 0)
-        while len(choice.fit.hypothesis.terms) < MOST_TERMS and monotonic() < self.deadline:
-            if self.nothing_left(choice.fit.mismatch):
-                break
-            if not self._add(choice):
+        while len(choice.fit.hypothesis.terms) < MOST_TERMS and not self.nothing_left(choice.fit.mismatch):
+            added = monotonic() < self.deadline and self._add(choice)
+            choice.cut = not added and monotonic() >= self.deadline
+            if not added:
                 break
             if len(choice.fit.hypothesis.terms) >= 2:
                 self._prune(choice)

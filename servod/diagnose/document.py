@@ -64,10 +64,25 @@ def summary(diagnosis: Diagnosis) -> str:
     if evidence is None:
         reasons = "; ".join(f"{r.name}: {r.reason}" for r in diagnosis.refused)
         return f"These data cannot tell: {reasons}."
+    found = _found(diagnosis, evidence)
+    return f"{found} {cut_short(evidence.choice.tried)}" if evidence.choice.cut else found
+
+
+def cut_short(tried: int) -> str:
+    """That time ended the search while something was left, after so many starts of effects."""
+    if tried == 0:
+        return "The time limit was over before any physics was tried: give more time (--time-limit)."
+    return f"The time limit ended the search after {tried} starts: with more time (--time-limit) the answer may change."
+
+
+def _found(diagnosis: Diagnosis, evidence: Evidence) -> str:
+    """What was found, when there was time for it."""
     names = list(dict.fromkeys(evidence.fit.hypothesis.terms[place].effect for place in evidence.named))
     if names:
         sentences = " ".join(f"{effect(name).statement}." for name in names)
         return f"{sentences} {100.0 * evidence.errors.removed:.0f} % of the explainable mismatch is gone."
+    if diagnosis.verdict.value == "cannot_tell":
+        return "Something is left, and nothing can be told of it yet."
     if diagnosis.verdict.value == "unexplained":
         where = evidence.maps_before[0].coordinate
         return f"Something is left that no known physics explains; it shows most over {where}."
@@ -192,6 +207,7 @@ def fit_document(
         "windows": windows_document(windows, evidence.predictor),
         "observer_rad_s": evidence.predictor.rate,
         "starts_tried": evidence.choice.tried,
+        "cut_by_time": evidence.choice.cut,
     }
 
 

@@ -107,6 +107,8 @@ def diagnose(
     final = verdict(choice, evidence.named, evidence.errors, predictor.dry)
     if final is Verdict.UNEXPLAINED:
         evidence = _without_names(evidence)
+    if final is Verdict.UNEXPLAINED and choice.cut and choice.tried == 0:
+        final = Verdict.CANNOT_TELL
     return Diagnosis(model, refused, final, evidence, seconds)
 
 

@@ -45,6 +45,16 @@ def test_asymmetry_is_named() -> None:
     assert windows["after"] < 0.3 * windows["before"]
 
 
+def test_time_that_ends_before_the_search_is_no_finding() -> None:
+    """A limit that is over after the base's fit: not `unexplained`, which would say that physics was looked for."""
+    found = diagnose(believed(), record(believed(gravity={"amplitude": 0.15, "phase": 0.5}), seconds=3.0), 1e-3)
+    document = diagnosis_document(found)
+    assert document["verdict"] == "cannot_tell"
+    assert document["findings"] == []
+    assert document["fit"]["starts_tried"] == 0
+    assert "before any physics was tried" in document["summary"]
+
+
 def test_command_writes_both_files(tmp_path: Path) -> None:
     for index, made in enumerate(record(believed(gravity={"amplitude": 0.15, "phase": 0.5}))):
         write_csv(made, tmp_path / f"run{index}.csv")
