@@ -37,6 +37,7 @@ from servod.synthesize.local_sets import (
 from servod.synthesize.moving_observer import with_moving_observer
 from servod.synthesize.observer_width import OBSERVERS_RAD_S, with_observer, with_widest_observer
 from servod.synthesize.origin import provenance
+from servod.synthesize.resting_share import SHARES, with_share_at_rest
 from servod.verify.rest import hold_width, rest_width
 from servod.verify.steady_friction import SteadyFriction, steady_friction
 
@@ -44,9 +45,6 @@ from servod.verify.steady_friction import SteadyFriction, steady_friction
 ENOUGH_RAD_S = 20.0
 OBSERVER_SHARE = 2.5  # bound of the estimate: friction that turned against a z_hat that a step leaves as it was
 APPROACH = 3.0  # speed with which a step is approached, as a factor on the map's highest
-#: At rest a joint stands on its bristle, and what feedback adds is the encoder's noise: this share of feedback and
-#: observer keeps it where it is (at 20 bit 5 urad instead of 15 to 45); less of it lets it creep and hunt.
-REST_SHARE = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +95,7 @@ def parameters(
         feedforward_inertia_kg_m2=friction.inertia,
         hold_within_rad=hold_width(design),
         rest_within_rad=rest_width(design),
-        rest_share=REST_SHARE,
+        rest_share=SHARES[0],
         error_limit_rad=approach_error(used.high, APPROACH * speed),
         position_feedforward=position_feedforward(design.model, friction.gain, design.period_s)
         if options.position_feedforward
@@ -154,7 +152,7 @@ def synthesize(
     _, design, law = best
     if law.disturbance_observer is None and options.gain is None:
         law = designed(design, friction, law)
-    found = gain_set(design, law, options, model_path)
+    found = with_share_at_rest(gain_set(design, law, options, model_path))
     return found if law.disturbance_observer is None else with_moving_observer(found, friction)
 
 

@@ -57,9 +57,14 @@ def check_rest(s: Subject) -> Iterator[CertificateCheck]:
     if local.rest_within_rad:
         share = 1.0 if local.rest_share is None else local.rest_share
         yield at_least("share of the feedback that is left at rest", share, LEAST_SHARE)
-        slow = 2.0 * local.rest_within_rad / REST_FROM_S
+        slow = resting_speed(local.rest_within_rad)
         name = f"largest pole, at rest, corners, standing and sliding up to {slow:.2g} rad/s"
         yield at_most(name, resting_radius(s, local, slow), RESTING_POLE)
+
+
+def resting_speed(rest_within_rad: float) -> float:
+    """Speed beyond which a joint has left the width before a pole could tell [rad/s]."""
+    return 2.0 * rest_within_rad / REST_FROM_S
 
 
 def resting_radius(s: Subject, local: LocalParameters, below_rad_s: float) -> float:

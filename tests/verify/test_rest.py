@@ -10,7 +10,7 @@ from servod.gain_parameters import LocalParameters
 from servod.gains import CertificateCheck
 from servod.verify.checks import Subject
 from servod.verify.rest import LEAST_SHARE, REST_SIGMAS, hold_width, rest_width
-from servod.verify.rest_checks import check_loads, check_rest, resting_radius
+from servod.verify.rest_checks import check_loads, check_rest, resting_radius, resting_speed
 from tests.synthesize.designs import table1_set
 from tests.verify.test_trials import noisy
 
@@ -64,4 +64,4 @@ def test_the_loop_at_rest_is_judged_where_the_joint_slides() -> None:
     s = resting()
     local = s.gains.parameters
     assert isinstance(local, LocalParameters) and local.rest_within_rad
-    assert resting_radius(s, local, 2.0 * local.rest_within_rad / 0.004) < 1.0 < resting_radius(s, local, 0.1)
+    assert resting_radius(s, local, resting_speed(local.rest_within_rad)) < 1.0 < resting_radius(s, local, 0.1)
