@@ -127,7 +127,7 @@ def mid_velocity(
         s[S_FRICTION] = pushed - free * mean
         return mean
     speed = abs(velocity)
-    damping = bristle_damping(p, velocity, grip)
+    damping = bristle_damping(p, velocity)
     y = p[P_SIGMA0] * speed * h / grip
     whole = 1.0 + y + 0.5 * y * y
     held = (1.0 + 0.5 * y) / whole  # share of the old deflection in the step's mean
@@ -150,14 +150,12 @@ def sliding_or_held(pushed: float, resist: float, grip: float) -> float:
     return (pushed - math.copysign(grip, pushed)) / resist
 
 
-def bristle_damping(p: Params, velocity: float, grip: float) -> float:
-    """sigma1 at this velocity, under the same bound of passivity as in `servod.models.friction`."""
-    damping = p[P_SIGMA1]
-    if p[P_SIGMA1_VELOCITY] > 0.0:
-        ratio = velocity / p[P_SIGMA1_VELOCITY]
-        damping *= math.exp(-ratio * ratio)
-    speed = abs(velocity)
-    return damping if damping * speed <= 4.0 * grip else 4.0 * grip / speed
+def bristle_damping(p: Params, velocity: float) -> float:
+    """sigma1 at this velocity."""
+    if p[P_SIGMA1_VELOCITY] == 0.0:
+        return p[P_SIGMA1]
+    ratio = velocity / p[P_SIGMA1_VELOCITY]
+    return p[P_SIGMA1] * math.exp(-ratio * ratio)
 
 
 def load_step(

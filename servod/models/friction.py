@@ -90,15 +90,14 @@ def bristle_step(
     """One implicit step of m*dv/dt = torque - F with the LuGre bristle; returns (v, z, F) after `h` seconds.
 
     z and v are solved together (backward Euler, the bristle's rate sigma0*|v|/g frozen at the step's start), so it is
-    stable at any step. sigma1 is held under 4*g/|v|, the bound of passivity (Barabanov and Ortega, IEEE TAC 45, 2000);
-    above that speed dz/dt is next to nothing and the steady law is untouched.
+    stable at any step. sigma1 acts at every speed, as the law has it: where g changes along the way or with the load,
+    the bristle follows and its damping shows. Passive up to sigma1*|v| = 4*g (Barabanov, Ortega, IEEE TAC 45, 2000).
     """
     speed = abs(velocity)
-    damping = sigma1 if sigma1 * speed <= 4.0 * dry else 4.0 * dry / speed
     # everything is multiplied by g(v)*(1 + rate*h) = dry + sigma0*|v|*h: one division less in the chain that waits
     whole = dry + sigma0 * speed * h
-    memory = (dry - damping * speed) * sigma0 * bristle
-    slope = (sigma0 * h + damping) * dry
+    memory = (dry - sigma1 * speed) * sigma0 * bristle
+    slope = (sigma0 * h + sigma1) * dry
     gain = h / inertia
     new_velocity = (velocity * whole + gain * (torque * whole - memory)) / (whole + gain * (slope + viscous * whole))
     shrink = 1.0 / whole

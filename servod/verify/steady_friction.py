@@ -94,7 +94,7 @@ class SteadyFriction:
         return (self.dry(up) - self.dry(down)) / (2.0 * step)
 
     def damping(self, velocity: float) -> float:
-        """Bristle damping sigma1 at `velocity`, held under 4*g/|v| as the simulator holds it."""
+        """Bristle damping sigma1 at `velocity`, held under 4*g/|v|: no damping counts beyond what is passive."""
         p = self.packed
         sigma1 = p[P_SIGMA1]
         if p[P_SIGMA1_VELOCITY] > 0.0:
