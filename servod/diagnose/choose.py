@@ -29,8 +29,8 @@ Array = NDArray[np.float64]
 Tell = Callable[[str], None]
 
 #: Worth naming (outside contract): share of the explainable error, or share of Coulomb friction where it acts; and the
-#: least torque that any finding must carry there.
-WORTH_SHARE, WORTH_TORQUE, LEAST_TORQUE = 0.05, 0.03, 0.008
+#: least torque that any finding must carry there, which several effects of one per cent each stay below.
+WORTH_SHARE, WORTH_TORQUE, LEAST_TORQUE = 0.05, 0.03, 0.018
 
 #: A term that takes less than WORTH_SHARE must take this share of what is left above the floor: a name that leaves most
 #: of the rest as it was is not what the rest is made of.
@@ -39,7 +39,7 @@ LEAST_OF_LEFT = 0.25
 #: Robust deviations beyond which a mismatch is a blow, and counts no more for what is left.
 BLOW = 8.0
 
-#: Rows that show where an effect acts: its torque there is this quantile of what it changes.
+#: Rows that show where an effect acts: its torque there is at least this quantile of what it changes.
 ACTS_AT = 0.98
 
 #: Most terms.
@@ -234,14 +234,14 @@ class Chooser:
         """What the step from one fit to the other is worth."""
         explainable = max(self.base_error - self.floor, 1e-30)
         saved = self.error(without.mismatch) - self.error(with_term.mismatch)
-        changed = np.abs(without.mismatch - with_term.mismatch)[self.predictor.counts]
+        torque = acting(np.abs(without.mismatch - with_term.mismatch)[self.predictor.counts])
         fitter = self.fitter(with_term.mismatch)
         cost = fitter.cost(without.hypothesis, without.coordinates, without.mismatch)
         gain = 2.0 * (cost - with_term.cost) / self._correlation(with_term.mismatch, fitter.weighing.scale)
         blow = BLOW * float(np.median(np.abs(with_term.mismatch[self.predictor.counts]))) / 0.6745
         was, now = (self.error(np.clip(fit.mismatch, -blow, blow)) for fit in (without, with_term))
         of_left = (was - now) / max(was - self.floor, 1e-30)
-        return Merit(saved / explainable, of_left, float(np.quantile(changed, ACTS_AT)) / self.predictor.dry, gain)
+        return Merit(saved / explainable, of_left, torque / self.predictor.dry, gain)
 
     def _correlation(self, mismatch: Array, scale: float) -> float:
         """By how much correlated rows exaggerate a gain: long-run over plain variance, at least 1."""
@@ -285,8 +285,21 @@ class Chooser:
         return self.settled(fit.hypothesis.without(index), kept, fit.mismatch, np.delete(fit.jacobian, gone, axis=1))
 
 
-#: Effects that may come in again with another period or place.
-_REPEATED = ("cogging", "torque_ripple", "disturbance", "position_dependent_friction")
+def acting(changed: Array) -> float:
+    """What an effect changes where it acts, N*m: a high quantile, or the root mean square weighted by power.
+
+    A wave has as much of both; a push of a second, or blows behind reversals, have next to nothing at a quantile.
+    """
+    power = float(changed @ changed)
+    weighted = math.sqrt(float(np.sum(changed**4)) / power) if power > 0.0 else 0.0
+    return max(float(np.quantile(changed, ACTS_AT)), weighted)
+
+
+#: Effects that may come in again with another period or place: a second harmonic is no second effect.
+_REPEATED = (
+    *("cogging", "torque_ripple", "disturbance", "position_dependent_friction"),
+    *("position_dependent_inertia", "encoder_eccentricity"),
+)
 
 
 def _once(hypothesis: Hypothesis) -> set[str]:

@@ -19,7 +19,7 @@ from servod.diagnose.hypothesis import Document, get
 
 #: Below this share of the explainable error no known name may stand: what is there is something else. Real machines
 #: keep some of theirs above it, so that it is no nearer to 1; confidence falls with what is left instead.
-LEAST_EXPLAINED = 0.75
+LEAST_EXPLAINED = 0.9
 
 #: What is left above the noise floor counts as unexplained from this share of dry friction, if it is also this share of
 #: what could be explained.
@@ -31,6 +31,9 @@ ALIKE = 1.2
 #: Confidence 0.5 + 0.49*(1 - exp(-gap/GAP)); gap: logarithm of what the best rival leaves over what the finding leaves.
 GAP = 0.15
 
+
+#: Torque ripple below this share of the command is what every motor has.
+RIPPLE_SHARE = 0.02
 
 #: From this share of the explainable error removed on, what is left says nothing against the names.
 FULLY = 0.95
@@ -99,7 +102,14 @@ def _at_level(effect: str, nominal: Document, fitted: Document) -> bool:
     if effect == "torque_gain":
         factors = [get(fitted, f"torque_gain.{key}", 1.0) for key in ("factor", "negative_factor")]
         return max(max(f, 1.0 / f) for f in factors) >= 1.0 + RECALIBRATION
+    if effect == "torque_ripple":
+        return _largest_wave(fitted, effect) >= RIPPLE_SHARE
     return True
+
+
+def _largest_wave(fitted: Document, effect: str) -> float:
+    """Amplitude of the largest sine over position of an effect."""
+    return max((float(row["amplitude"]) for row in fitted.get(effect, {}).get("harmonics", [])), default=0.0)
 
 
 def _factor(nominal: Document, fitted: Document, key: str) -> float:

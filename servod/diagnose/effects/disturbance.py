@@ -14,10 +14,10 @@ from servod.diagnose.scene import Scene
 Array = NDArray[np.float64]
 
 #: Lengths of windows that are tried, s, and windows that are kept.
-LENGTHS_S, KEPT = (0.2, 0.5, 1.0, 2.0, 4.0), 2
+LENGTHS_S, KEPT = (0.3, 0.6, 1.0, 2.0, 4.0), 2
 
-#: A shorter push is a blow that any mass behind a gap or spring can make, s.
-SHORTEST_S = 0.12
+#: A shorter push is a blow that any mass behind a gap or spring can make, or a contact that has aged at rest, s.
+SHORTEST_S = 0.3
 
 #: The form of a window that comes at the same time after the start of every recording.
 EVERY = "in every recording"
@@ -43,11 +43,9 @@ def terms(scene: Scene) -> list[Term]:
     traces = scene.predictor.traces
     for trace, part in zip(traces, scene.predictor.slices, strict=True):
         for taken, first, last in windows(scene.mismatch[part], trace.period_s)[:KEPT]:
-            begun = float(trace.drive.t_s[first] - trace.shift_s)
-            length = float(trace.drive.t_s[last] - trace.drive.t_s[first])
-            found.append((taken, begun, length, float(np.mean(scene.mismatch[part][first:last])), trace.shift_s))
-    best = sorted(found, reverse=True)[:KEPT]
-    single = [_term(scene, begun, length, mean, (shift,)) for _, begun, length, mean, shift in best]
+            mean = float(np.mean(scene.mismatch[part][first:last]))
+            found.append((taken, _term(scene, trace.drive.t_s - trace.shift_s, (first, last), mean, (trace.shift_s,))))
+    single = [term for _, term in sorted(found, key=lambda pair: -pair[0])[:KEPT]]
     return single + (_common(scene) if len(traces) > 1 else [])
 
 
@@ -59,17 +57,18 @@ def _common(scene: Scene) -> list[Term]:
     t_s = traces[0].drive.t_s - traces[0].shift_s
     shifts = tuple(trace.shift_s for trace in traces)
     best = windows(mean, traces[0].period_s)[:1]
-    return [
-        _term(scene, float(t_s[first]), float(t_s[last] - t_s[first]), float(np.mean(mean[first:last])), shifts)
-        for _, first, last in best
-    ]
+    t_s = t_s[:rows]
+    return [_term(scene, t_s, (first, last), float(np.mean(mean[first:last])), shifts) for _, first, last in best]
 
 
-def _term(scene: Scene, start: float, length: float, torque: float, shifts: tuple[float, ...]) -> Term:
-    """A window in the recordings whose times stand `shifts` later than recorded."""
+def _term(scene: Scene, t_s: Array, rows: tuple[int, int], torque: float, shifts: tuple[float, ...]) -> Term:
+    """A window from row to row of `t_s`, in recordings whose times stand `shifts` later; its shortest lies within."""
     most = 50.0 * max(scene.dry, 0.2 * scene.effort)
+    length = max(float(t_s[rows[1]] - t_s[rows[0]]), SHORTEST_S)
+    latest = float(t_s[-1]) - SHORTEST_S
+    start = min(float(t_s[rows[0]]), latest)
     unknowns = (
-        Unknown("start_s", "s", start, start - 2.0 * length, start + 2.0 * length, 0.05, nudge=0.05),
+        Unknown("start_s", "s", start, start - 2.0 * length, min(start + 2.0 * length, latest), 0.05, nudge=0.05),
         Unknown("length_s", "s", length, SHORTEST_S, 4.0 * length, nudge=0.02),
         Unknown("torque", scene.force, torque, -most, most, scene.dry),
     )

@@ -1,0 +1,66 @@
+"""What deserves a name: torque where it acts, levels below which every axis has some, and how much is explained."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from servod.diagnose.base import base_unknowns, document_of
+from servod.diagnose.choose import LEAST_TORQUE, Choice, acting
+from servod.diagnose.effects.disturbance import SHORTEST_S
+from servod.diagnose.effects.disturbance import terms as windows_of
+from servod.diagnose.effects.effect import sine_term
+from servod.diagnose.fit import Fit
+from servod.diagnose.hypothesis import Hypothesis
+from servod.diagnose.intake import taken_in
+from servod.diagnose.predict import Predictor
+from servod.diagnose.scene import Peak, Scene
+from servod.diagnose.verdict import Shares, Verdict, named_terms, verdict
+from tests.diagnose.axes import believed, record
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """An axis with nothing left but a push in the last tenth of a second of its last recording."""
+    model = believed()
+    predictor = Predictor(taken_in(record(model, seconds=3.0), model)[0], model)
+    mismatch = np.zeros(len(predictor.counts))
+    mismatch[-100:] = 0.05
+    return Scene(document_of(model), predictor, mismatch)
+
+
+def with_ripple(scene: Scene, amplitude: float) -> Choice:
+    term = sine_term("torque_ripple", scene, Peak(5.0, amplitude, 0.0, 0.0), 0.1, "1", most=0.45)
+    hypothesis = Hypothesis(scene.document, base_unknowns(believed()), (term,))
+    fit = Fit(hypothesis, hypothesis.start, scene.mismatch, 0.0, np.zeros((0, 0)), True)
+    return Choice(fit, fit, [], [], {}, 0.0, 1)
+
+
+def test_torque_is_judged_where_it_acts() -> None:
+    t = np.linspace(0.0, 50.0, 20_001)
+    assert acting(0.01 * np.abs(np.sin(t))) < LEAST_TORQUE
+    blows = np.where(t % 5.0 < 0.04, 0.03, 0.0)
+    assert np.quantile(blows, 0.98) == 0.0
+    assert acting(blows) == pytest.approx(0.03)
+    assert acting(np.zeros(3)) == 0.0
+
+
+def test_ripple_that_every_motor_has_is_no_finding(scene: Scene) -> None:
+    assert named_terms(with_ripple(scene, 0.01), scene.document) == []
+    assert named_terms(with_ripple(scene, 0.04), scene.document) == [0]
+
+
+def test_a_push_lies_within_its_recording(scene: Scene) -> None:
+    """One that begins shortly before the end could be any blow, and nobody has seen how long it lasts."""
+    last = scene.predictor.traces[-1].drive.t_s[-1] - scene.predictor.traces[-1].shift_s
+    for term in windows_of(scene):
+        start, length, _ = term.unknowns
+        assert start.low <= start.start <= start.high <= last - SHORTEST_S + 1e-9
+        assert length.low == SHORTEST_S
+
+
+@pytest.mark.parametrize(("removed", "answer"), [(0.85, Verdict.UNEXPLAINED), (0.93, Verdict.MISSING_PHYSICS)])
+def test_names_must_explain_most_of_what_is_left(scene: Scene, removed: float, answer: Verdict) -> None:
+    """Three names that leave an eighth of the explainable error, 12 % of dry friction, are somebody else's."""
+    after = float(np.sqrt(1.0 - removed))
+    assert verdict(with_ripple(scene, 0.1), [0], Shares(1.0, after, 0.0, removed), dry=3.0) is answer
