@@ -7,10 +7,11 @@ its `scale`; the reference mode has its own.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from enum import StrEnum
 from typing import Annotated
 
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, model_validator
 
 from servod.axis_model import AxisModel
 from servod.yaml12 import Strict
@@ -71,7 +72,7 @@ class RegionProof(_Numbers):
     with the loop closed; pole disc: [r Q, (A - c) G; *, r (G + G' - Q)] > 0.
     """
 
-    name: str
+    name: str = Field(pattern="^(low|high)$")
     speed_from_rad_s: float
     speed_to_rad_s: float
     scale: Row
@@ -81,6 +82,31 @@ class RegionProof(_Numbers):
     feedback: Row
     slack: dict[str, Matrix] = Field(description="G, one for each mode")
     vertices: list[Vertex] = Field(min_length=1, max_length=64)
+
+    @model_validator(mode="after")
+    def _sizes_fit(self) -> RegionProof:
+        n = len(self.scale)
+        if not 0 < len(self.feedback) <= n:
+            raise ValueError(f"feedback has {len(self.feedback)} entries, and scale names {n} states")
+        for name, matrix in self._matrices():
+            if [len(row) for row in matrix] != [n] * n:
+                raise ValueError(f"{name} is not {n} by {n}, as scale has it")
+        for vertex in self.vertices:
+            if {len(vertex.b), len(vertex.e)} != {n}:
+                raise ValueError(f"vertex {vertex.name}: b and e have {n} entries, as scale has")
+            if vertex.mode not in self.slack:
+                raise ValueError(f"vertex {vertex.name}: slack has no matrix for its mode {vertex.mode}")
+            if vertex.output and [len(row) for row in vertex.output] != [2, 2]:
+                raise ValueError(f"vertex {vertex.name}: output is not 2 by 2")
+        return self
+
+    def _matrices(self) -> Iterator[tuple[str, Matrix]]:
+        """(where it stands, matrix) of all that have as many rows and columns as there are states."""
+        yield from ((f"slack of {mode}", matrix) for mode, matrix in self.slack.items())
+        for v in self.vertices:
+            yield from ((f"vertex {v.name}: {key}", m) for key, m in (("a", v.a), ("lyapunov_disc", v.lyapunov_disc)))
+            if v.lyapunov_h2 is not None:
+                yield f"vertex {v.name}: lyapunov_h2", v.lyapunov_h2
 
 
 class ReferenceForm(StrEnum):

@@ -116,8 +116,8 @@ class Certificate(Strict):
 
     @model_validator(mode="after")
     def _valid_means_checked(self) -> Certificate:
-        if self.valid and not (self.checks and all(check.passed for check in self.checks)):
-            raise ValueError("valid: true only with a list of checks that all passed")
+        if self.valid and not (self.checks and all(check.passed and check.margin >= 0.0 for check in self.checks)):
+            raise ValueError("valid: true only with a list of checks that all passed, each with its margin")
         return self
 
 
@@ -169,10 +169,14 @@ class GainSet(Strict):
             return "numbers that were changed after the set was sealed"
         if self.certificate is None:
             return "no certificate"
+        if self.design is None or self.seal is None:
+            return "a certificate without the design that it is of and its seal"
         if not self.certificate.valid:
             return "a certificate that says valid: false"
         if self.certificate.parameters_sha256 != self.parameters_sha256():
             return "a certificate for other parameters (they were changed after it was issued)"
+        if self.certificate.model_sha256 not in (None, self.provenance.model_sha256):
+            return "a certificate for another axis model (certificate.model_sha256, provenance.model_sha256)"
         return None
 
     def certificate_warning(self) -> str | None:

@@ -13,7 +13,7 @@ from servod import __version__
 from servod.errors import BadInput
 from servod.gains import Certificate, CertificateCheck, GainSet, Promise
 from servod.sources import VERIFIES, source_sha256
-from servod.verify.checks import LEAST_PLANTS, SIMULATED, STATIC, Subject, observations
+from servod.verify.checks import LEAST_PLANTS, SIMULATED, STATIC, Subject, at_most, observations
 from servod.verify.effect_checks import check_effects
 from servod.verify.promise import promise
 from servod.verify.reference_checks import check_reference
@@ -92,4 +92,8 @@ def verify(
     if not all(check.passed for check in checks):
         return Verification(checks, {})
     checks += [check for judge in (*SIMULATED, check_loads) for check in judge(subject)]
-    return Verification(checks, observations(subject), promise(gains, gains.design, seed))
+    promised = promise(gains, gains.design, seed)
+    checks.append(
+        at_most("validation motion that a plant does not get through (0 no, 1 yes)", float(not promised), 0.0)
+    )
+    return Verification(checks, observations(subject), promised)

@@ -13,15 +13,15 @@ import numpy as np
 
 from servod.axis_model import AxisModel
 from servod.controllers.state import MAY_STAY, STATE_NAMES
-from servod.gain_design import Design, RegionProof
-from servod.gain_parameters import LocalParameters, RegionGains
+from servod.gain_design import Design
+from servod.gain_parameters import LocalParameters
 from servod.gains import CertificateCheck, GainSet
 from servod.verify.closed_loop import Deviation, corners, inner_points
 from servod.verify.margins import NOMINAL, Sweep, arrival_of, largest_tolerated
 from servod.verify.measured import least_widths, measured_widths
 from servod.verify.plants import drawn
 from servod.verify.position_slope import position_slopes
-from servod.verify.proof import disc_reach, region_margin, stored_deviation
+from servod.verify.proof import disc_reach, gain_difference, region_margin, stored_deviation, unproven_rad_s
 from servod.verify.rounding import LEAST_COUNTS, NOISE_SWING, count_rad, gives_way_rad, rounding_rad
 from servod.verify.sampled import Timing, timing_of
 from servod.verify.steady_friction import steady_friction
@@ -160,15 +160,11 @@ def check_regions(s: Subject) -> Iterator[CertificateCheck]:
             own = getattr(local.regions, region.name)
             difference = gain_difference(own, region, local.input_scale_nm)
             yield at_most(f"gains of region {region.name} against the proven ones", difference, SAME)
-
-
-def gain_difference(own: RegionGains, proof: RegionProof, input_scale_nm: float) -> float:
-    """Largest relative difference of the law's gains from the proven feedback; k_z, which no proof has, is to be 0."""
-    size = len(proof.feedback)
-    proven = -np.array(proof.feedback) * proof.torque_scale_nm / np.array(proof.scale[:size])
-    used = np.array([own.k_x_per_rad * input_scale_nm, own.k_v_s_per_rad * input_scale_nm, *own.pack_memory()])
-    rest = abs(own.k_z_per_rad) + float(np.abs(used[size:]).sum())
-    return float(np.abs(used[:size] / proven - 1.0).max()) + rest
+            yield at_most(
+                f"speeds of region {region.name} that no proof covers [rad/s]",
+                unproven_rad_s(local, s.design, region),
+                SAME,
+            )
 
 
 def check_intervals(s: Subject) -> Iterator[CertificateCheck]:

@@ -13,6 +13,7 @@ from servod.gains import GainSet, Promise
 from servod.models.noise import noise_of, noise_series
 from servod.models.simulate import LoopSettings, simulate_closed_loop
 from servod.verify.plants import drawn
+from servod.verify.trials import scale_of
 from servod.verify.validation import STEP_S, Array, Figures, Part, ValidationMotion, motion_for
 
 PLANTS = 24
@@ -44,7 +45,7 @@ def simulated(
         gains.law.step,
         gains.pack(),
         np.concatenate([rest, rows]),
-        LoopSettings(design.period_s, design.counts_per_turn, design.velocity_cutoff_hz),
+        LoopSettings(design.period_s, design.counts_per_turn, design.velocity_cutoff_hz, scale_of(design).torque_nm),
         external_nm=torque,
         reading_rad=reading,
     )

@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from servod.gain_design import Design, RegionProof, Vertex
+from servod.gain_parameters import LocalParameters, RegionGains
 from servod.verify.sampled import Array, timing_of
 from servod.verify.steady_friction import steady_friction
 from servod.verify.vertices import Joint, Span, joints, sampled_vertices
@@ -107,3 +108,19 @@ def stored_deviation(design: Design, region: RegionProof) -> float:
 def proves_h2(vertex: Vertex) -> bool:
     """Whether the vertex has both matrices of its H2 proof."""
     return vertex.lyapunov_h2 is not None and vertex.output is not None
+
+
+def gain_difference(own: RegionGains, proof: RegionProof, input_scale_nm: float) -> float:
+    """Largest relative difference of the law's gains from the proven feedback; k_z, which no proof has, is to be 0."""
+    size = len(proof.feedback)
+    proven = -np.array(proof.feedback) * proof.torque_scale_nm / np.array(proof.scale[:size])
+    used = np.array([own.k_x_per_rad * input_scale_nm, own.k_v_s_per_rad * input_scale_nm, *own.pack_memory()])
+    rest = abs(own.k_z_per_rad) + float(np.abs(used[size:]).sum())
+    return float(np.abs(used[:size] / proven - 1.0).max()) + rest
+
+
+def unproven_rad_s(law: LocalParameters, design: Design, region: RegionProof) -> float:
+    """By how much the law uses the region's gains below or above the speeds of their proof, the more of both."""
+    low = region.name == "low"
+    used = (0.0, law.regions.overlap_to_rad_s) if low else (law.regions.overlap_from_rad_s, design.speed_max_rad_s)
+    return float(max(region.speed_from_rad_s - used[0], used[1] - region.speed_to_rad_s, 0.0))

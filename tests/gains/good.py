@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import datetime
 
+from servod.axis_model import load_axis_model
+from servod.gain_design import Design, DesignMode, Uncertainty
 from servod.gains import Certificate, CertificateCheck, GainSet, parse_gains
+from servod.shipped import shipped
 
 PD = """\
 schema_version: 1
@@ -58,8 +61,20 @@ provenance: {author: A. Engineer, date: 2026-11-20}
 """
 
 
+#: A design without proofs, which nothing but the loop's facts are read from.
+DESIGN = Design(
+    mode=DesignMode.DEPLOYED,
+    period_s=0.001,
+    velocity_cutoff_hz=120.0,
+    counts_per_turn=2.0**20,
+    speed_max_rad_s=0.5,
+    model=load_axis_model(shipped("gains/axes/table1_joint.yaml")),
+    uncertainty=Uncertainty(),
+)
+
+
 def certified(gains: GainSet, valid: bool = True) -> GainSet:
-    """`gains` with a certificate for exactly these parameters."""
+    """`gains` with a certificate for exactly these parameters, with a design, sealed."""
     certificate = Certificate(
         valid=valid,
         parameters_sha256=gains.parameters_sha256(),
@@ -67,4 +82,5 @@ def certified(gains: GainSet, valid: bool = True) -> GainSet:
         issued_at=datetime.datetime(2026, 11, 20, 12, 0, tzinfo=datetime.UTC),
         checks=[CertificateCheck(name="spectral radius", value=0.97, limit=1.0, margin=0.03, passed=True)],
     )
-    return parse_gains(gains.model_copy(update={"certificate": certificate}).to_yaml(), "certified.yaml")
+    parts = {"certificate": certificate, "design": gains.design or DESIGN}
+    return parse_gains(gains.model_copy(update=parts).sealed().to_yaml(), "certified.yaml")

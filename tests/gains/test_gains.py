@@ -8,31 +8,22 @@ from pathlib import Path
 import pytest
 import yaml
 
-from servod.axis_model import axis_model_yaml, load_axis_model
+from servod.axis_model import axis_model_yaml
 from servod.cli.gains import warn
 from servod.config import AxisConfig, load_config
 from servod.controllers import LAWS, local
 from servod.daemon.gain_bank import GainBank
 from servod.errors import BadInput
-from servod.gain_design import Design, DesignMode, Uncertainty
 from servod.gain_parameters import LocalParameters, PdParameters
 from servod.gain_store import GainStore
 from servod.gains import GainSet, load_gains, parse_gains, require_certificate, require_fit
 from servod.shipped import shipped
 from servod.sources import VERIFIES, source_sha256
 from tests.gains import good
+from tests.gains.good import DESIGN
 
 BAD = yaml.safe_load(Path(__file__).with_name("bad_gains.yaml").read_text(encoding="utf-8"))
 SEALED_BEFORE_REST = Path(__file__).with_name("sealed_before_rest.yaml")
-DESIGN = Design(
-    mode=DesignMode.DEPLOYED,
-    period_s=0.001,
-    velocity_cutoff_hz=120.0,
-    counts_per_turn=2.0**20,
-    speed_max_rad_s=0.5,
-    model=load_axis_model(shipped("gains/axes/table1_joint.yaml")),
-    uncertainty=Uncertainty(),
-)
 SHIPPED = sorted((Path(__file__).resolve().parents[2] / "gains").glob("*.yaml"))
 
 
@@ -113,12 +104,27 @@ def test_hash_sees_numbers_not_spelling() -> None:
 def test_a_certificate_counts_until_a_number_changes() -> None:
     gains = good.certified(parse_gains(good.PD, "good.yaml"))
     require_certificate(gains, accept_uncertified=False)
-    tampered = parse_gains(
-        gains.to_yaml().replace("position_gain_nm_per_rad: 2.5", "position_gain_nm_per_rad: 2.6"), "t"
-    )
+    changed = gains.to_yaml().replace("position_gain_nm_per_rad: 2.5", "position_gain_nm_per_rad: 2.6")
+    tampered = parse_gains(changed, "t").sealed()
     for accept_uncertified in (False, True):
         with pytest.raises(BadInput, match="they were changed after it was issued"):
             require_certificate(tampered, accept_uncertified)
+
+
+@pytest.mark.parametrize("gone", [{"seal": None, "design": None}, {"design": None}, {"seal": None}], ids=str)
+def test_a_certificate_does_not_count_without_its_design_and_seal(gone: dict[str, None]) -> None:
+    gains = good.certified(parse_gains(good.PD, "good.yaml")).model_copy(update=gone)
+    for found in (gains, gains.sealed()) if "design" in gone else (gains,):
+        with pytest.raises(BadInput, match=r"sealed|without the design that it is of and its seal"):
+            require_certificate(found, accept_uncertified=True)
+
+
+def test_a_certificate_of_another_model_does_not_count() -> None:
+    gains = good.certified(parse_gains(good.PD, "good.yaml"))
+    assert gains.certificate is not None
+    other = gains.certificate.model_copy(update={"model_sha256": "ab" * 32})
+    with pytest.raises(BadInput, match="for another axis model"):
+        require_certificate(gains.model_copy(update={"certificate": other}).sealed(), accept_uncertified=True)
 
 
 def test_a_set_without_a_certificate_passes_only_where_the_configuration_accepts_it() -> None:

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 
+from servod.errors import BadInput
 from servod.gain_design import RegionProof, Vertex
+from servod.gain_parameters import LocalParameters
 from servod.gains import load_gains
 from servod.verify.checks import Subject, at_least, at_most, check_law, check_regions
 from servod.verify.proof import disc_reach, proves_h2, region_margin, stored_deviation
+from servod.yaml12 import validate
 from tests.synthesize.designs import MODEL, table1_set
 
 
@@ -74,3 +78,40 @@ def test_the_gains_of_another_law_are_not_covered_by_pasted_proofs() -> None:
     pasted = load_gains(MODEL.parents[1] / "demo_pd.yaml").model_copy(update={"design": gains.design})
     assert not next(check_law(Subject(pasted, gains.design, 1, 1, 1))).passed
     assert next(check_law(Subject(gains, gains.design, 1, 1, 1))).passed
+
+
+def overlapping(from_rad_s: float, to_rad_s: float) -> set[str]:
+    """Checks of the regions that fail when the law goes over from one to the other at other speeds."""
+    gains = table1_set()
+    assert gains.design is not None and isinstance(gains.parameters, LocalParameters)
+    speeds = {"overlap_from_rad_s": from_rad_s, "overlap_to_rad_s": to_rad_s}
+    regions = gains.parameters.regions.model_copy(update=speeds)
+    other = gains.model_copy(update={"parameters": gains.parameters.model_copy(update={"regions": regions})})
+    return {check.name for check in check_regions(Subject(other, gains.design, 1, 1, 1)) if not check.passed}
+
+
+def test_a_law_uses_gains_only_at_the_speeds_of_their_proof() -> None:
+    assert overlapping(0.2, 0.4) == {"speeds of region low that no proof covers [rad/s]"}
+    assert overlapping(0.001, 0.02) == {"speeds of region high that no proof covers [rad/s]"}
+
+
+def short(matrix: list[list[float]]) -> list[list[float]]:
+    return matrix[:-1]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda region: region["vertices"][0].update(a=short(region["vertices"][0]["a"])), "a is not 6 by 6"),
+        (lambda region: region["vertices"][0].update(b=[1.0]), "b and e have 6 entries"),
+        (lambda region: region["vertices"][0].update(mode="flying"), "no matrix for its mode flying"),
+        (lambda region: region.update(slack={}), "no matrix for its mode"),
+        (lambda region: region.update(feedback=[]), "feedback has 0 entries"),
+        (lambda region: region.update(name="middle"), "name"),
+    ],
+)
+def test_matrices_that_do_not_fit_each_other_are_bad_input(change: Callable[[dict[str, Any]], None], said: str) -> None:
+    region = proof().model_dump()
+    change(region)
+    with pytest.raises(BadInput, match=said):
+        validate(region, RegionProof, "set.yaml")
