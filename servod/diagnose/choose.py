@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.axis_model import AxisModel
+from servod.diagnose.at_end import at_end
 from servod.diagnose.base import base_unknowns, document_of
 from servod.diagnose.candidates import Candidate, Trials
 from servod.diagnose.excited import unseen
@@ -252,8 +253,8 @@ class Chooser:
         return max(slow / max(plain, 1e-30), 1.0)
 
     def _enters(self, merit: Merit, fit: Fit) -> bool:
-        """Whether a new term may come in: it deserves it and its fit has come to an end."""
-        return self.deserves(merit, fit) and (fit.converged or merit.share >= SURE_SHARE)
+        """Whether a new term may come in: it deserves it, its fit has come to an end, and not to one of a range."""
+        return self.deserves(merit, fit) and (fit.converged or merit.share >= SURE_SHARE) and not at_end(fit)
 
     def deserves(self, merit: Merit, fit: Fit) -> bool:
         """Whether a term is significant and worth naming."""

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from servod.diagnose.at_end import at_end
 from servod.diagnose.base import base_unknowns, document_of
 from servod.diagnose.choose import LEAST_TORQUE, Choice, acting
+from servod.diagnose.effects import effect
 from servod.diagnose.effects.disturbance import SHORTEST_S
 from servod.diagnose.effects.disturbance import terms as windows_of
 from servod.diagnose.effects.effect import sine_term
@@ -64,3 +66,15 @@ def test_names_must_explain_most_of_what_is_left(scene: Scene, removed: float, a
     """Three names that leave an eighth of the explainable error, 12 % of dry friction, are somebody else's."""
     after = float(np.sqrt(1.0 - removed))
     assert verdict(with_ripple(scene, 0.1), [0], Shares(1.0, after, 0.0, removed), dry=3.0) is answer
+
+
+def test_a_number_at_an_end_of_its_range_is_somebody_elses(scene: Scene) -> None:
+    """Twenty times the mass; but no stiffness at all is just no spring."""
+    mass = Hypothesis(scene.document, base_unknowns(believed()), tuple(effect("inertia").terms(scene)))
+    spring = Hypothesis(scene.document, base_unknowns(believed()), (effect("spring").terms(scene)[0],))
+    for hypothesis, at, answer in ((mass, 20.0, True), (mass, 2.0, False), (spring, 0.0, False)):
+        place = 0 if hypothesis is mass else len(hypothesis.base)
+        unknown = hypothesis.unknowns[place]
+        coordinates = hypothesis.start.copy()
+        coordinates[place] = unknown.coordinate(at * 0.02 if hypothesis is mass else at)
+        assert at_end(Fit(hypothesis, coordinates, scene.mismatch, 0.0, np.zeros((0, 0)), True)) is answer

@@ -1,0 +1,35 @@
+"""Whether a fitted effect says itself that it is something else: one of its own numbers lies at an end of its range.
+
+Stands between the fit and the selection. Ranges are wide, what is physical lies within: an optimum at an end, twenty
+times the mass or ten times the friction at rest, borrows a shape from an effect that is not there.
+"""
+
+from __future__ import annotations
+
+from servod.diagnose.fit import Fit
+
+#: Numbers that may lie at an end of their range: where they do not matter, or are known beforehand to a narrow one.
+MAY_END = frozenset(
+    ("damping", "cubic", "exponent", "delay_s", "friction.sigma1", "friction.stribeck_velocity", "damping_velocity")
+)
+
+#: Coordinates that are so close to an end lie on it.
+CLOSE = 1e-6
+
+
+def at_end(fit: Fit) -> bool:
+    """Whether a number of the last term, or one of the model's own that this term opens, lies at an end of its range.
+
+    An end where the number is zero is none: there the effect is just absent.
+    """
+    term, unknowns = fit.hypothesis.terms[-1], fit.hypothesis.unknowns
+    low, high = fit.hypothesis.bounds
+    first = fit.hypothesis.share(len(fit.hypothesis.terms) - 1).start
+    for index, (unknown, at) in enumerate(zip(unknowns, fit.coordinates, strict=True)):
+        own = index >= first or unknown.key in term.opens
+        if not own or unknown.key in MAY_END:
+            continue
+        ends = [end for end, value in ((low[index], unknown.low), (high[index], unknown.high)) if value != 0.0]
+        if any(abs(float(at) - float(end)) < CLOSE for end in ends):
+            return True
+    return False
