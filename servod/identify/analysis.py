@@ -60,7 +60,7 @@ def analyse(traces: Sequence[Trace]) -> Analysis:
     ramps = of_kind(traces, Kind.BREAK_AWAY)
     slides = break_away.fit([ramp for ramp in ramps if not ramp.settings["search"]] or ramps)
     rocked = presliding.fit(of_kind(traces, Kind.PRESLIDING), slides)
-    kicked = kick.fit(of_kind(traces, Kind.KICK)[-2:])
+    kicked = kick.fit(of_kind(traces, Kind.KICK))
     answer = response.fit(of_kind(traces, Kind.RESPONSE)[-1], kicked.inertia)
     delay_s = answer.delay_s.value + answer.lag_s.value
     damping = _damping(traces, answer, rocked)

@@ -13,7 +13,7 @@ from servod.errors import AnswerIsNo
 #: Share of each configured limit that experiments use.
 SHARE = 0.85
 
-#: Speed is kept further away from its limit: the multisine comes on top of it.
+#: Speed is planned further away from its limit: the multisine comes on top of it.
 SPEED_SHARE = 0.5
 
 #: Half of the longest travel that is of use, in rad: cogging from three periods a turn on shows all of itself.
@@ -29,7 +29,8 @@ class Bounds:
 
     travel_rad: float  # half range, centred by `centre_rad`
     centre_rad: float
-    speed_rad_s: float
+    speed_rad_s: float  # experiments plan for no more
+    most_rad_s: float  # no motion may show more
     torque_nm: float
     window_rad: float
 
@@ -47,5 +48,6 @@ def bounds_from(
     centre = min(max(0.0, SHARE * low + half), high * SHARE - half) if low < 0.0 < high else 0.0
     if low >= 0.0 or high <= 0.0 or half < SHORTEST_TRAVEL_RAD:
         raise AnswerIsNo(f"only {1e3 * half:.0f} mrad of travel are left; move the joint to the middle of its range")
-    speed = min(SPEED_SHARE * limits.speed_rad_s, speed_rad_s or limits.speed_rad_s)
-    return Bounds(half, centre, speed, SHARE * limits.torque_nm, SHARE * limits.following_error_rad)
+    most = min(SHARE * limits.speed_rad_s, speed_rad_s or limits.speed_rad_s)
+    speed = min(SPEED_SHARE * limits.speed_rad_s, SHARE * most)
+    return Bounds(half, centre, speed, most, SHARE * limits.torque_nm, SHARE * limits.following_error_rad)

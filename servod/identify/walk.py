@@ -87,7 +87,7 @@ def _experiments(bench: Bench, tell: Tell) -> None:
     tell("presliding", 0.07)
     _rock(bench, (found[0], found[1]))
     tell("kicks", 0.2)
-    first = kick_fit.fit(kick.run(bench, (found[0], found[1]))[-2:])
+    first = kick_fit.fit(kick.run(bench, (found[0], found[1])))
     tell("frequency response", 0.25)
     config = bench.link.config
     gains = feedback(config, first.inertia, first.delay_s + UNKNOWN_DELAY_S, CAREFUL)

@@ -6,7 +6,6 @@ enabled, and moved to where it has to be, only before the first motion that is m
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
@@ -21,6 +20,11 @@ from servod.identify.store import motion_hash
 from servod.identify.trace import Kind, Trace, trace_of
 
 Array = NDArray[np.float64]
+
+#: What rounding may add to a planned way or speed.
+ROUNDING = 1.02
+#: Speed is looked at over this time: long enough for the encoder's steps, short against any motion that matters.
+SPEED_SPAN_S = 0.004
 
 
 class Keeper(Protocol):
@@ -75,13 +79,17 @@ class Bench:
             self.link.set_gains(*self._gains)
 
     def run(self, kind: Kind, positions: Array, torques: Array, window_rad: float, settings: dict[str, float]) -> Trace:
-        """Run one motion, keep its recording, return its trace. Raises AnswerIsNo when the bounds forbid it."""
+        """Run one motion, keep its recording, return its trace.
+
+        Raises AnswerIsNo when the bounds forbid it, or when the joint moved faster than they allow.
+        """
         self._check(positions, torques)
         window_rad = min(window_rad, self.bounds.window_rad)
         motion = motion_hash(positions, torques, window_rad)
         trace = self.keeper.recorded(kind, motion) if not self.enabled else None
         if trace is None:
             trace = self._record(kind, motion, positions, torques, window_rad, settings)
+            self._check_speed(trace)
         self.position_rad += float(positions[-1])
         self.traces.append(trace)
         return trace
@@ -93,7 +101,9 @@ class Bench:
             way = position_rad - self.position_rad
             duration_s = max(0.2, 0.5 * np.pi * abs(way) / speed_rad_s)
             t = np.linspace(0.0, 1.0, max(2, round(duration_s / self.period_s)))
-            self._excite(way * (0.5 - 0.5 * np.cos(np.pi * t)), np.zeros(len(t)))
+            path = way * (0.5 - 0.5 * np.cos(np.pi * t))
+            self._check_plan(path)
+            self._excite(path, np.zeros(len(t)))
         else:
             self._missed = _Move(position_rad, gains, speed_rad_s)
         self.position_rad = position_rad
@@ -134,11 +144,36 @@ class Bench:
     def _excite(self, positions: Array, torques: Array) -> None:
         self.link.excite(positions.tolist(), torques.tolist(), self.bounds.window_rad)
 
-    def _check(self, positions: Sequence[float] | Array, torques: Array) -> None:
-        farthest = np.max(np.abs(np.asarray(positions) + self.position_rad - self.bounds.centre_rad))
-        if farthest > self.bounds.travel_rad * 1.02:
+    def _check(self, positions: Array, torques: Array) -> None:
+        self._check_plan(positions)
+        farthest = np.max(np.abs(positions + self.position_rad - self.bounds.centre_rad))
+        if farthest > self.bounds.travel_rad * ROUNDING:
             raise AnswerIsNo(f"an experiment would travel {farthest:.3g} rad, {self.bounds.travel_rad:.3g} are allowed")
         if np.max(np.abs(torques)) > self.bounds.torque_nm:
             raise AnswerIsNo(
                 f"an experiment would need {np.max(np.abs(torques)):.3g} N*m, {self.bounds.torque_nm:.3g} are allowed"
             )
+
+    def _check_plan(self, positions: Array) -> None:
+        fastest = float(np.max(np.abs(np.diff(positions)))) / self.period_s
+        if fastest > self.bounds.speed_rad_s * ROUNDING:
+            raise AnswerIsNo(
+                f"an experiment would go at {fastest:.3g} rad/s, {self.bounds.speed_rad_s:.3g} are allowed"
+            )
+
+    def _check_speed(self, trace: Trace) -> None:
+        """What the joint did, not what was planned: nothing but friction holds it where no feedback acts."""
+        seen = peak_speed(trace, SPEED_SPAN_S) - self.resolution_rad / SPEED_SPAN_S
+        if seen > self.bounds.most_rad_s:
+            raise AnswerIsNo(
+                f"the joint went at {seen:.3g} rad/s in the experiment {trace.kind.value}, "
+                f"{self.bounds.most_rad_s:.3g} are allowed: by its own friction it is faster as soon as it slides; "
+                f"allow {2.0 * seen:.2g} rad/s (--speed, limits.speed_rad_s)"
+            )
+
+
+def peak_speed(trace: Trace, span_s: float) -> float:
+    """The highest mean speed over `span_s` in a recording, in rad/s; 0 for one that is shorter."""
+    span = max(1, round(span_s / trace.period_s))
+    ways = np.abs(trace.position_rad[span:] - trace.position_rad[:-span])
+    return float(np.max(ways, initial=0.0)) / (span * trace.period_s)

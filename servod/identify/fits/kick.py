@@ -30,9 +30,11 @@ class KickFit(NamedTuple):
 def fit(kicks: Sequence[Trace]) -> KickFit:
     """Regression torque = inertia*acceleration + friction(direction) over sliding rows, over all delays tried.
 
-    Raises AnswerIsNo when inertia does not come out positive.
+    Of `kicks`, which grew until they told, the last of each direction counts. Raises AnswerIsNo when inertia does not
+    come out positive.
     """
-    best = min((_with_delay(kicks, d * kicks[0].period_s) for d in DELAYS), key=lambda fitted: fitted[0])
+    told = list({np.sign(kick.settings["pulse_nm"]): kick for kick in kicks}.values())
+    best = min((_with_delay(told, d * told[0].period_s) for d in DELAYS), key=lambda fitted: fitted[0])
     if best[1].inertia <= 0.0:
         raise AnswerIsNo("the kicked joint did not follow the torque; is the encoder the joint's own?")
     return best[1]
