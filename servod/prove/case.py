@@ -66,10 +66,11 @@ def make_case(plan: Plan, settings: Settings) -> Case:
     axis = draw_axis(rng, plan.kind, plan.weight)
     loop = axis.loop if plan.cover is Cover.INTEGRATOR else axis.loop._replace(ki=0.0)
     axis = replace(axis, loop=loop)
+    motions = int(rng.integers(2**31))
     hidden: list[Concealed] = []
     seen = []
     for name in plan.effects:
-        concealed, size = draw_seen(name, axis, hidden, plan, rng)
+        concealed, size = draw_seen(name, axis, hidden, plan, rng, motions)
         axis = axis.with_travel(concealed.travel)
         hidden.append(concealed)
         seen.append(size)
@@ -85,33 +86,46 @@ def make_case(plan: Plan, settings: Settings) -> Case:
         "params": _told(plant),
         "true_model": true_model(physics, [c.model for c in hidden]),
     }
-    return Case(believed_model(believed, off), record(axis, plant, recorder, hidden, rng), truth)
+    recordings = record(plant, recorder, hidden, rng, references(axis, motions))
+    return Case(believed_model(believed, off), recordings, truth)
+
+
+def references(axis: Axis, seed: int) -> list[Array]:
+    """What the axis is asked to do in each of the recordings of NAMES, rad; the same for the same seed and travel."""
+    motions = axis.motions
+    kinds = (motions.slow_sine, motions.multisine, motions.moves, motions.mixed)
+    return [kind(np.random.default_rng([seed, index])) for index, kind in enumerate(kinds)]
 
 
 def draw_seen(
-    name: str, axis: Axis, others: Sequence[Concealed], plan: Plan, rng: np.random.Generator
+    name: str, axis: Axis, others: Sequence[Concealed], plan: Plan, rng: np.random.Generator, motions: int
 ) -> tuple[Concealed, float]:
-    """A drawing of an effect that shows beside others and leaves the loop stable; by how much the command differs."""
+    """A drawing of an effect that shows beside others and leaves the loop stable; by how much the command differs.
+
+    `motions` is the seed of the motions in which it must show: those that will be recorded.
+    """
     seed = int(rng.integers(2**31))
     strength = FAINT if plan.cover in (Cover.NOISE, Cover.BAND) else 1.0
     enough = SEEN * (FAINT if plan.cover in (Cover.NOISE, Cover.BAND) else 1.0)
     hide = (UNLISTED if plan.sort is Sort.UNKNOWN else HIDE)[name]
     for _ in range(TRIES):
         concealed = hide(Draw(axis, np.random.default_rng(seed), strength, plan.other))
-        size, sane = shows(axis.with_travel(concealed.travel), others, concealed, seed)
+        size, sane = shows(axis.with_travel(concealed.travel), others, concealed, motions)
         if sane and size >= enough:
             break
         strength *= 1.45 if sane else 0.7
     return concealed, size
 
 
-def shows(axis: Axis, others: Sequence[Concealed], concealed: Concealed, seed: int) -> tuple[float, bool]:
-    """By how much of Coulomb friction the command differs in 2 % of the time, and whether the loop remains sane."""
+def shows(axis: Axis, others: Sequence[Concealed], concealed: Concealed, motions: int) -> tuple[float, bool]:
+    """By how much of Coulomb friction the command differs in 2 % of the time, and whether the loop remains sane.
+
+    The holdout does not count: nobody sees it.
+    """
     changed = _all_changes(axis.physics, [*others, concealed])
     plain = _all_changes(axis.physics, others)._replace(**concealed.believed)
     largest, sane = 0.0, True
-    for reference in (axis.motions.slow_sine, axis.motions.multisine, axis.motions.moves):
-        wanted = reference(np.random.default_rng(seed), 12.0)
+    for wanted in references(axis, motions)[:-1]:
         there, without = (_followed(axis, physics, wanted) for physics in (changed, plain))
         largest = max(largest, float(np.quantile(np.abs(there[:, 0] - without[:, 0]), 0.98)))
         error = float(np.std(there[:, 1] - wanted)) / axis.motions.travel
@@ -128,13 +142,11 @@ def _followed(axis: Axis, physics: Physics, wanted: Array) -> Array:
 
 
 def record(
-    axis: Axis, plant: Physics, recorder: Recorder, hidden: Sequence[Concealed], rng: np.random.Generator
+    plant: Physics, recorder: Recorder, hidden: Sequence[Concealed], rng: np.random.Generator, wanted: Sequence[Array]
 ) -> dict[str, dict[str, Array]]:
-    """Three recordings and the one held out; the joint cools a little between them."""
-    motions = axis.motions
-    references = (motions.slow_sine(rng), motions.multisine(rng), motions.moves(rng), motions.mixed(rng))
+    """Three recordings and the one held out of the motions `wanted`; the joint cools a little between them."""
     warm, found = 25.0, {}
-    for index, (name, reference) in enumerate(zip(NAMES, references, strict=True)):
+    for index, (name, reference) in enumerate(zip(NAMES, wanted, strict=True)):
         here = plant
         if any(c.only is not None and c.only != index for c in hidden):
             here = plant._replace(push=0.0)

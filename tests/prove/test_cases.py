@@ -61,6 +61,14 @@ def test_an_effect_shows_and_the_same_plan_makes_the_same_case() -> None:
             assert np.array_equal(values, again.recordings[name][column])
 
 
+@pytest.mark.parametrize("seed", [3, 5])
+def test_a_limit_is_met_in_what_is_recorded(seed: int) -> None:
+    """An effect is judged by the motions that are recorded, not by others of their kind."""
+    case = make_case(planned(Sort.SINGLE, ("torque_saturation",), seed=seed), Settings())
+    most = max(float(np.max(np.abs(r["torque_nm"]))) for name, r in case.recordings.items() if name != "holdout")
+    assert most > 1.05 * case.truth["parameters"]["torque_saturation"]["limit"]
+
+
 def test_harder_cases_have_clutter_noise_and_other_forms() -> None:
     easy, hard = (make_case(planned(Sort.NOTHING, ()), settings) for settings in (Settings(), HARDER))
     assert easy.truth["true_model"] == hard.truth["true_model"]  # clutter is not worth naming
