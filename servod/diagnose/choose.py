@@ -22,6 +22,7 @@ from servod.diagnose.excited import unseen
 from servod.diagnose.fit import Fit, Fitter, Weighing, long_run, scale_of
 from servod.diagnose.floor import noise_floor, stretch_means
 from servod.diagnose.hypothesis import Hypothesis
+from servod.diagnose.level import is_level, on_bound
 from servod.diagnose.predict import Predictor
 from servod.diagnose.scene import Scene
 from servod.diagnose.shortened import shortened
@@ -32,6 +33,9 @@ Tell = Callable[[str], None]
 #: Worth naming (outside contract): share of the explainable error, or share of Coulomb friction where it acts; and the
 #: least torque that any finding must carry there, which several effects of one per cent each stay below.
 WORTH_SHARE, WORTH_TORQUE, LEAST_TORQUE = 0.05, 0.03, 0.018
+
+#: The least torque of a parameter beyond its own level, which acts for some milliseconds behind a reversal.
+LEVEL_TORQUE = 0.003
 
 #: A term that takes less than WORTH_SHARE must take this share of what is left above the floor: a name that leaves most
 #: of the rest as it was is not what the rest is made of.
@@ -134,7 +138,7 @@ class Chooser:
         """Fit the base, add terms, prune; the outcome."""
         base = self._fit_base()
         choice = Choice(base, base, [], [], {}, self.floor, 0)
-        while len(choice.fit.hypothesis.terms) < MOST_TERMS and not self.nothing_left(choice.fit.mismatch):
+        while len(choice.fit.hypothesis.terms) < MOST_TERMS and self._more_to_find(choice.fit):
             added = monotonic() < self.deadline and self._add(choice)
             choice.cut = not added and monotonic() >= self.deadline
             if not added:
@@ -143,6 +147,9 @@ class Chooser:
                 self._prune(choice)
         choice.tried, choice.floor = self.tried, self.floor
         return choice
+
+    def _more_to_find(self, fit: Fit) -> bool:
+        return not self.nothing_left(fit.mismatch) or on_bound(fit)
 
     def _fit_base(self) -> Fit:
         mismatch = self.predictor.mismatch(self.start.model(self.start.start))
@@ -256,10 +263,13 @@ class Chooser:
         """Whether a new term may come in: it deserves it, its fit has come to an end, and not to one of a range."""
         return self.deserves(merit, fit) and (fit.converged or merit.share >= SURE_SHARE) and not at_end(fit)
 
-    def deserves(self, merit: Merit, fit: Fit) -> bool:
-        """Whether a term is significant and worth naming."""
-        worth = merit.share >= WORTH_SHARE or (merit.torque >= WORTH_TORQUE and merit.of_left >= LEAST_OF_LEFT)
-        return worth and merit.torque >= LEAST_TORQUE and self.significant(merit, fit)
+    def deserves(self, merit: Merit, fit: Fit, place: int = -1) -> bool:
+        """Whether a term (the last one, or the one at `place`) is significant and worth naming."""
+        least, enough = (
+            (LEVEL_TORQUE, LEVEL_TORQUE) if is_level(fit.hypothesis.terms[place]) else (LEAST_TORQUE, WORTH_TORQUE)
+        )
+        worth = merit.share >= WORTH_SHARE or (merit.torque >= enough and merit.of_left >= LEAST_OF_LEFT)
+        return worth and merit.torque >= least and self.significant(merit, fit)
 
     def significant(self, merit: Merit, fit: Fit) -> bool:
         """Bayesian information criterion with a correction for the number of starts tried."""
@@ -273,7 +283,7 @@ class Chooser:
         while index < len(choice.fit.hypothesis.terms) - 1:
             less = self.less(choice.fit, index)
             merit = self.merit(less, choice.fit)
-            if self.deserves(merit, choice.fit):
+            if self.deserves(merit, choice.fit, index):
                 choice.merits[index] = merit
                 index += 1
                 continue
