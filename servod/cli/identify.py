@@ -44,7 +44,12 @@ def register(app: typer.Typer) -> None:
 
 
 def identify(
-    out: Annotated[Path, typer.Option(help="Axis model to write; recordings go to a folder beside it.")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            help="Axis model to write; recordings go to a folder beside it, earlier ones are set aside in it."
+        ),
+    ],
     plant: Annotated[Path | None, typer.Option(help="Start a virtual axis with this joint, SYNC-stepped.")] = None,
     config: Annotated[Path | None, typer.Option(help="Axis configuration; needed on a daemon's axis.")] = None,
     recordings: Annotated[Path | None, typer.Option(help="No axis: fit the recordings in this folder.")] = None,

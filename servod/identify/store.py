@@ -1,13 +1,16 @@
 """Recordings of an identification on disk: one MCAP file for each motion, and a list that says what each is.
 
 Beside the walk. `load` gives the traces back for fits without an axis; `Recordings` also gives them back to a walk that
-is taken up again, motion by motion, as long as the walk asks for the very motions that were recorded.
+is taken up again, motion by motion, as long as the walk asks for the very motions that were recorded. Nothing is ever
+thrown away: an axis model names its recordings by their hashes, and it stays in force until another has been written.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +25,9 @@ from servod.recorder_read import read_recording
 from servod.yaml12 import Strict, validate
 
 LIST = "experiments.json"
+#: Folders within the recordings' own, counted up, that earlier walks are set aside in.
+ASIDE = "before_{:02d}"
+_FILES = "[0-9][0-9]_*.mcap"
 _ALLOWED = "a folder that servoctl identify wrote"
 _COLUMNS = ("torque_nm", "position_rad", "reference_rad", "torque_other_nm", "torque_actual_nm", "motor_position_rad")
 
@@ -51,10 +57,11 @@ class Recordings:
     """
 
     def __init__(self, folder: Path, conditions: str = "", resume: bool = False, offset_ns: int | None = None) -> None:
-        """Use `folder`; earlier recordings in it are replaced, or with `resume` kept while they fit.
+        """Use `folder`; earlier recordings in it go on with `resume` while they fit, and are else set aside.
 
-        They fit when they were made under the same `conditions` (a hash of configuration and options). `offset_ns`
-        turns the records' time into the time of day (None: they have the monotonic clock's). Raises BadInput.
+        That happens when the first new motion is kept: a walk that is refused leaves all as it was. They fit when they
+        were made under the same `conditions` (a hash of configuration and options). `offset_ns` turns the records' time
+        into the time of day (None: they have the monotonic clock's). Raises BadInput.
         """
         self.folder, self.conditions = folder, conditions
         self._offset_ns = wall_offset_ns() if offset_ns is None else offset_ns
@@ -63,7 +70,7 @@ class Recordings:
         self._earlier: list[_Entry] = []
         if resume:
             self._take_up()
-        self._drop_others()
+        self._make_folder()
 
     @property
     def waiting(self) -> int:
@@ -75,7 +82,7 @@ class Recordings:
         self.start_rad = start_rad
 
     def recorded(self, kind: Kind, motion: str) -> Trace | None:
-        """The earlier recording of the next motion; None when there is none, and then all later ones are dropped.
+        """The earlier recording of the next motion; None when there is none, and then no later one is given either.
 
         Raises BadInput when its file is not the one that was recorded.
         """
@@ -84,7 +91,6 @@ class Recordings:
         entry = self._earlier.pop(0)
         if (entry.kind, entry.motion) != (kind, motion):
             self._earlier = []
-            self._drop_others()
             return None
         self._done.append(entry)
         return _trace(self.folder, entry)
@@ -93,6 +99,7 @@ class Recordings:
         """Write one motion and the list with it; returns the trace with the file's hash. Raises BadInput."""
         name = f"{len(self._done):02d}_{trace.kind.value}.mcap"
         try:
+            self._set_aside()
             file = McapFile(self.folder / name, {}, self._offset_ns)
             file.write_rows(split_rows(rows.tobytes()))
             file.close()
@@ -118,18 +125,26 @@ class Recordings:
         if earlier.conditions == self.conditions and earlier.start_rad is not None:
             self.start_rad, self._earlier = earlier.start_rad, list(earlier.experiments)
 
-    def _drop_others(self) -> None:
-        """Remove recordings in the folder that are of no use any more."""
-        kept = {entry.file for entry in (*self._done, *self._earlier)}
+    def _make_folder(self) -> None:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            for old in self.folder.glob("[0-9][0-9]_*.mcap"):
-                if old.name not in kept:
-                    old.unlink()
-            if not kept:
-                (self.folder / LIST).unlink(missing_ok=True)
         except OSError as error:
             raise _unwritable(self.folder, error) from None
+
+    def _set_aside(self) -> None:
+        """Move an earlier walk of which this one does not use everything to a folder of its own, whole."""
+        there = sorted(self.folder.glob(_FILES))
+        unused = {path.name for path in there} - {entry.file for entry in self._done}
+        if not unused:
+            return
+        aside = next(path for n in range(1, 1_000_000) if not (path := self.folder / ASIDE.format(n)).exists())
+        aside.mkdir()
+        for path in there:
+            _copy(path, aside / path.name)
+        if (self.folder / LIST).exists():
+            shutil.copyfile(self.folder / LIST, aside / LIST)
+        for name in unused:
+            (self.folder / name).unlink()
 
 
 def motion_hash(positions: NDArray[np.float64], torques: NDArray[np.float64], window_rad: float) -> str:
@@ -180,6 +195,14 @@ def _require_same(path: Path, entry: _Entry) -> str:
         why = "a file that was changed or cut short after it was recorded"
         raise BadInput(str(path), why, f"the recording that {LIST} lists; without {LIST} the axis is identified anew")
     return found
+
+
+def _copy(path: Path, to: Path) -> None:
+    """Another name for the same file; its content where the file system knows no such thing."""
+    try:
+        os.link(path, to)
+    except OSError:
+        shutil.copyfile(path, to)
 
 
 def file_sha256(path: Path) -> str:

@@ -52,7 +52,8 @@ def identify(
 
     `travel_rad` (to each side) and `speed_rad_s` narrow what the limits allow. `resume`: experiments that `out` holds
     already are not run again, as long as configuration and options are the same, and `subject`, a name or hash of what
-    is identified, too. Raises AnswerIsNo when the axis refuses, faults, is wired wrongly, or tells nothing.
+    is identified, too; what is not taken up again the first new recording sets aside within `out`. Raises AnswerIsNo
+    when the axis refuses, faults, is wired wrongly, or tells nothing.
     """
     conditions = _conditions(link.config, travel_rad, speed_rad_s, seed, subject)
     recordings = store.Recordings(out, conditions, resume, link.offset_ns)

@@ -78,4 +78,3 @@ def test_an_old_list_does_not_stop_a_new_walk_but_one_that_goes_on(tmp_path):
     with pytest.raises(BadInput, match="earlier versions"):
         Recordings(tmp_path, resume=True)
     assert Recordings(tmp_path).waiting == 0
-    assert not (tmp_path / LIST).exists()

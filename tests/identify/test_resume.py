@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from servod.axis import AxisState
-from servod.errors import BadInput
+from servod.errors import AnswerIsNo, BadInput
 from servod.identify import store
 from servod.identify.links import SteppedLink
 from servod.identify.result import document
@@ -82,10 +82,57 @@ def test_an_interrupt_anywhere_leaves_the_axis_off_and_the_recordings(tmp_path):
     assert link.session.latest.torque_nm == 0.0
     assert abs(link.session.world.truth().velocity_rad_s) < 1e-4
     assert len(store.load(tmp_path / "recordings")) == 5
-    kept = store.Recordings(tmp_path / "recordings", "another axis", resume=True)
-    assert kept.waiting == 0
-    with pytest.raises(BadInput):
-        store.load(tmp_path / "recordings")
+    assert store.Recordings(tmp_path / "recordings", "another axis", resume=True).waiting == 0
+    assert len(store.load(tmp_path / "recordings")) == 5
+
+
+def recorded(folder, session, *durations_s: float) -> None:
+    """Rests of these durations, recorded anew in `folder`."""
+    link = SteppedLink(session)
+    link.enable()
+    made = store.Recordings(folder, "this axis")
+    made.begin(0.0)
+    for seconds in durations_s:
+        rows = link.excite([0.0] * round(1000 * seconds), [0.0] * round(1000 * seconds), 0.1)
+        made.keep(rows, trace_of(Kind.NOISE, rows, {}), f"motion of {seconds} s")
+
+
+def test_a_walk_that_is_refused_leaves_the_recordings_of_the_model_that_stands(tmp_path):
+    session = virtual_session(draw(3).model, tmp_path, 2**20, 1)
+    recorded(tmp_path / "recordings", session, 0.1, 0.2)
+    before = [trace.sha256 for trace in store.load(tmp_path / "recordings")]
+
+    class Refused(CountingLink):
+        def enable(self) -> float:
+            raise AnswerIsNo("a fault is latched")
+
+    with pytest.raises(AnswerIsNo, match="latched"):
+        identify(Refused(session), tmp_path / "recordings", lambda _what, _share: None)
+    assert [trace.sha256 for trace in store.load(tmp_path / "recordings")] == before
+
+
+def test_a_new_walk_sets_the_earlier_ones_aside_whole(tmp_path):
+    session = virtual_session(draw(3).model, tmp_path, 2**20, 1)
+    hashes = []
+    for durations_s in ((0.1, 0.2), (0.15,), (0.12, 0.13, 0.14)):
+        recorded(tmp_path, session, *durations_s)
+        hashes.append([trace.sha256 for trace in store.load(tmp_path)])
+    folders = (tmp_path / "before_01", tmp_path / "before_02", tmp_path)
+    assert [[trace.sha256 for trace in store.load(folder)] for folder in folders] == hashes
+
+
+def test_a_walk_that_leaves_the_recorded_one_halfway_sets_all_of_it_aside(tmp_path):
+    session = virtual_session(draw(3).model, tmp_path, 2**20, 1)
+    recorded(tmp_path, session, 0.1, 0.2, 0.3)
+    before = [trace.sha256 for trace in store.load(tmp_path)]
+    again = store.Recordings(tmp_path, "this axis", resume=True)
+    first = again.recorded(Kind.NOISE, "motion of 0.1 s")
+    assert again.recorded(Kind.NOISE, "another motion") is None
+    assert [trace.sha256 for trace in store.load(tmp_path)] == before
+    rows = SteppedLink(session).excite([0.0] * 50, [0.0] * 50, 0.1)
+    new = again.keep(rows, trace_of(Kind.NOISE, rows, {}), "another motion")
+    assert [trace.sha256 for trace in store.load(tmp_path)] == [first.sha256, new.sha256]
+    assert [trace.sha256 for trace in store.load(tmp_path / "before_01")] == before
 
 
 def test_an_identification_knows_its_recordings(fine: Identification):
@@ -96,14 +143,7 @@ def test_an_identification_knows_its_recordings(fine: Identification):
 
 @pytest.mark.parametrize("meddle", ["exchange", "cut"])
 def test_a_recording_that_is_not_the_one_that_was_made_is_refused(meddle, tmp_path):
-    session = virtual_session(draw(3).model, tmp_path, 2**20, 1)
-    link = SteppedLink(session)
-    link.enable()
-    made = store.Recordings(tmp_path, "this axis")
-    made.begin(0.0)
-    for seconds in (0.2, 0.3):
-        rows = link.excite([0.0] * round(1000 * seconds), [0.0] * round(1000 * seconds), 0.1)
-        made.keep(rows, trace_of(Kind.NOISE, rows, {}), f"motion of {seconds} s")
+    recorded(tmp_path, virtual_session(draw(3).model, tmp_path, 2**20, 1), 0.2, 0.3)
     first, second = sorted(tmp_path.glob("*.mcap"))
     assert [trace.sha256 for trace in store.load(tmp_path)] == [store.file_sha256(first), store.file_sha256(second)]
     if meddle == "exchange":
