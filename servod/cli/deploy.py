@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 _HELP = example(
     "Run a validation motion under the present set and under GAINS, and keep GAINS only when it is no worse and does "
-    "what its certificate promised; else, and on Ctrl-C, the present set stays. Travel and speed go with the speed "
-    "that GAINS was designed for: 20 mrad to each side at 0.25 rad/s for a design for 0.5 rad/s, 14 s each. What it "
-    "will be is said before anything moves.",
+    "what its certificate promised; else, and on Ctrl-C, the present set stays. A set that runs already is held "
+    "to its promise alone, and runs on. Travel and speed go with the speed that GAINS was designed for: 20 mrad to "
+    "each side at 0.25 rad/s for a design for 0.5 rad/s, 14 s each. What it will be is said before anything moves.",
     "servoctl deploy gains.yaml",
     "servoctl deploy gains.yaml --plant joint.yaml --present old.yaml",
 )
@@ -44,7 +44,7 @@ def deploy(
     socket: SocketOption = DEFAULT_SOCKET,
     as_json: JsonOption = False,
 ) -> None:
-    """Deploy GAINS; exit code 1 when the axis was rolled back."""
+    """Deploy GAINS; exit code 1 when the axis was rolled back, or when GAINS ran already and broke its promise."""
     one_thread()
     from servod.deploy.deployment import announced, deploy
     from servod.gains import load_gains, require_certificate
@@ -58,13 +58,14 @@ def deploy(
     axis = _on_daemon(socket) if plant is None else _virtual(plant, present, config, wanted, seed)
     with axis as link, progress("deploy", quiet=as_json) as tell:
         done = deploy(link, wanted, tell)
-    document = done.document()
     if as_json:
-        print_json(document)
+        print_json(done.document())
     else:
-        _print(document)
-    if not done.stays:
-        raise AnswerIsNo(f"rolled back to {done.present[0]} version {done.present[1]}: {'; '.join(done.reasons)}")
+        _print(done.document())
+    if not done.proven:
+        raise AnswerIsNo(done.said)
+    if not as_json:
+        print(done.said)
 
 
 @contextmanager
@@ -97,12 +98,7 @@ def _print(document: dict[str, Any]) -> None:
     from rich.table import Table
 
     table = Table("Figure", "Before", "After", "Promised", title="Validation motion, mrad")
-    for name, before in document["before"].items():
-        after = document["after"][name] if document["after"] else None
-        row = [f"{value:.4g}" if value is not None else "none" for value in (before, after, document["promised"][name])]
-        table.add_row(name.removesuffix("_mrad"), *row)
-    console = Console()
-    console.print(table)
-    if document["deployed"]:
-        gains = document["gains"]
-        console.print(f"deployed: {gains['name']} version {gains['version']}", highlight=False)
+    for name in document["promised"]:
+        runs = (document[run] for run in ("before", "after", "promised"))
+        table.add_row(name.removesuffix("_mrad"), *(f"{run[name]:.4g}" if run else "none" for run in runs))
+    Console().print(table)

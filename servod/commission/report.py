@@ -12,6 +12,8 @@ from servod.axis_model import AxisModel, load_axis_model
 from servod.commission.axis import VirtualWalkAxis
 from servod.commission.comparison import DEPLOYED, run_files
 from servod.commission.files import (
+    AFTER_ROWS,
+    BEFORE_ROWS,
     CERTIFICATE,
     DEPLOYMENT,
     GAINS,
@@ -21,7 +23,6 @@ from servod.commission.files import (
     RECORDINGS,
     RELAXED,
     REPORT,
-    RUNS,
     TRACKING,
     TUNING,
     read_json,
@@ -96,9 +97,10 @@ def _summary(page: Page, walk: Walk) -> None:
     )
     if relaxed:
         page.sentence(f"The design was agreed to be relaxed: {relaxed['wish']} {relaxed['enough']:.3g}.")
+    was = f"went from {deployment['before']['slow_mrad']:.4g} to" if deployment["before"] else "was"
     page.sentence(
-        f"On the validation motion the error went from {deployment['before']['slow_mrad']:.4g} to "
-        f"{deployment['after']['slow_mrad']:.4g} mrad RMS; {deployment['promised']['slow_mrad']:.4g} mrad was promised."
+        f"On the validation motion the error {was} {deployment['after']['slow_mrad']:.4g} mrad RMS; "
+        f"{deployment['promised']['slow_mrad']:.4g} mrad was promised."
     )
     if "local" in tracking:
         page.sentence(
@@ -135,15 +137,14 @@ def _certificate(gains: GainSet) -> Iterator[Part]:
 
 def _deployment(walk: Walk) -> Iterator[Part]:
     found = read_json(walk.path(DEPLOYMENT))
-    rows = [
-        (name.removesuffix("_mrad"), *(f"{found[run][name]:.4g}" for run in ("before", "after", "promised")))
-        for name in found["before"]
-    ]
-    yield Table("Validation motion, mrad", ("figure", "before", "after", "promised"), tuple(rows))
-    before, after = (
-        motion.motion_of_rows(label, load_rows(walk.path(RUNS) / f"deploy_{label}.mcap"))
-        for label in ("before", "after")
-    )
+    columns = [run for run in ("before", "after", "promised") if found[run]]
+    rows = [(name.removesuffix("_mrad"), *(f"{found[run][name]:.4g}" for run in columns)) for name in found["promised"]]
+    yield Table("Validation motion, mrad", ("figure", *columns), tuple(rows))
+    if not found["before"]:
+        yield "The set was active already, and nothing was measured before it: its promise alone judged it."
+        return
+    files = {"before": BEFORE_ROWS, "after": AFTER_ROWS}
+    before, after = (motion.motion_of_rows(label, load_rows(walk.path(name))) for label, name in files.items())
     yield motion.before_after(before, after, title="The validation motion before and after")
 
 

@@ -22,9 +22,12 @@ PROMISE_SHARE = 0.3
 COUNTS = {Part.SLOW: 1.0, Part.BRISK: 1.0, Part.HOLD: 4.0}
 
 
-def complaints(before: Figures, after: Figures, promised: Promise, count_rad: float) -> list[str]:
-    """Every reason against the set, one sentence each; empty when it stays. `count_rad`: the encoder's resolution."""
-    return [*worse(before, after, count_rad), *broken(after, promised, count_rad)]
+def complaints(before: Figures | None, after: Figures, promised: Promise, count_rad: float) -> list[str]:
+    """Every reason against the set, one sentence each; empty when it stays. `count_rad`: the encoder's resolution.
+
+    Without figures of `before` its promise alone counts.
+    """
+    return [*(worse(before, after, count_rad) if before else ()), *broken(after, promised, count_rad)]
 
 
 def worse(before: Figures, after: Figures, count_rad: float) -> Iterator[str]:

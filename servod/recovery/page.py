@@ -50,7 +50,7 @@ def write_recovery_page(found: Recovery, out: Path) -> Path:
 
 def _story(found: Recovery, name: str) -> list[str]:
     named = ", ".join(f["effect"].replace("_", " ") for f in found.document["findings"]) or "nothing by name"
-    stays = "was deployed" if found.deployment.stays else f"was rolled back ({'; '.join(found.deployment.reasons)})"
+    stays = "was deployed" if found.deployment.proven else f"was rolled back ({'; '.join(found.deployment.reasons)})"
     return [
         "A controller was designed and certified for what is believed of the axis.",
         f"The axis has {name} that nobody told the controller of: it tracks worse than the certificate promised.",

@@ -18,8 +18,9 @@ import numpy as np
 
 from servod.axis_model import AxisModel, axis_model_yaml, load_axis_model
 from servod.commission.runs import save_rows
-from servod.deploy.deployment import Deployment, deploy
+from servod.deploy.deployment import deploy
 from servod.deploy.links import Rows
+from servod.deploy.outcome import Deployment
 from servod.diagnose.engine import Diagnosis, diagnose
 from servod.errors import AnswerIsNo
 from servod.gain_design import Uncertainty

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from servod.control import ControlClient
+from servod.deploy.cycles import motions_in
 from servod.deploy.daemon_link import DaemonDeployLink
-from servod.deploy.deployment import motions_in
 from servod.errors import AnswerIsNo
 from servod.gain_store import Action, GainStore
 from servod.gains import load_gains

@@ -10,8 +10,10 @@ import pytest
 from servod.axis import AxisState
 from servod.axis_model import AxisModel
 from servod.commands import Op
-from servod.deploy.deployment import deploy, limits_met, motions_in
+from servod.deploy.cycles import limits_met, motions_in
+from servod.deploy.deployment import deploy
 from servod.deploy.links import Rows, SteppedDeployLink, Tell, cut
+from servod.deploy.outcome import Before, Ending
 from servod.deploy.virtual import pd_set, virtual_link, with_cutoff
 from servod.errors import FAULTS, BadInput, FaultCode
 from servod.gain_store import Action, GainStore
@@ -32,15 +34,20 @@ def quiet(_what: str, _share: float) -> None:
     """Nobody listens."""
 
 
-def test_a_good_set_stays_and_the_history_has_the_figures_of_both_motions(tmp_path: Path) -> None:
+def test_a_good_set_stays_and_is_compared_with_what_was_before_also_once_it_runs(tmp_path: Path) -> None:
     link = link_to(table1(), tmp_path)
-    done = deploy(link, certified(), quiet)
-    assert done.stays, done.reasons
-    assert link.active == (certified().name, 1) and done.present == ("present", 1)
+    told: list[Before] = []
+    done = deploy(link, certified(), quiet, remember=told.append)
+    assert done.proven, done.reasons
+    assert link.active == (certified().name, 1) and done.ending is Ending.KEPT
+    assert done.ran_before is told[0] and told[0].present == ("present", 1)
     entry = GainStore(tmp_path / "gains").history()[-1]
     assert (entry.action, entry.name) == (Action.ACTIVATE, certified().name)
     assert entry.figures["after_slow_mrad"] < 0.2 * entry.figures["before_slow_mrad"]
     assert link.session.cycle.axis.state == AxisState.DISABLED  # as it was found
+    again = deploy(link, certified(), quiet, *told, told.append)
+    assert again.ending is Ending.CONFIRMED and len(told) == 1
+    assert (again.before, again.document()["present"]) == (done.before, {"name": "present", "version": 1})
     assert GainStore(tmp_path / "gains").rollback().name == "present"
 
 
@@ -48,7 +55,7 @@ def test_a_good_set_stays_and_the_history_has_the_figures_of_both_motions(tmp_pa
 def test_a_set_for_another_joint_is_rolled_back(change: dict[str, float], tmp_path: Path) -> None:
     link = link_to(scaled(table1(), change), tmp_path)
     done = deploy(link, certified(), quiet)
-    assert not done.stays
+    assert not done.proven and done.said.startswith("rolled back to present version 1: ")
     assert any("promised" in reason for reason in done.reasons)
     store = GainStore(tmp_path / "gains")
     active = store.active()
@@ -67,7 +74,7 @@ def test_a_limit_that_is_met_rolls_back(tmp_path: Path) -> None:
         deploy(link, certified(), quiet)
     earlier = certified().certificate.model_copy(update={"torque_nm": None})  # issued before torque was stated
     done = deploy(link, certified().model_copy(update={"certificate": earlier}).sealed(), quiet)
-    assert not done.stays and any(reason.startswith("TORQUE_CLIPPED") for reason in done.reasons)
+    assert not done.proven and any(reason.startswith("TORQUE_CLIPPED") for reason in done.reasons)
 
 
 def test_few_limited_cycles_and_those_that_the_set_before_met_as_well_are_not_held_against_a_set() -> None:
@@ -107,9 +114,19 @@ class Narrow(SteppedDeployLink):
 def test_a_cut_sine_rolls_back(tmp_path: Path) -> None:
     link = Narrow(link_to(table1(), tmp_path).session, GainStore(tmp_path / "gains"), PD)
     done = deploy(link, certified(), quiet)
-    assert not done.stays and done.after is None and "window" in done.reasons[0]
+    assert not done.proven and done.after is None and "window" in done.reasons[0]
     assert done.rows_after is not None and len(motions_in(done.rows_after)) == 1
     assert link.active == ("present", 1)
+
+
+def test_a_set_that_runs_already_and_fails_is_never_said_to_be_rolled_back(tmp_path: Path) -> None:
+    session = virtual_link(table1(), tmp_path, certified(), certified()).session
+    link = Narrow(session, GainStore(tmp_path / "gains"), certified())
+    done = deploy(link, certified(), quiet)
+    assert (done.ending, done.before, done.document()["present"]) == (Ending.DOUBTED, None, None)
+    assert "STILL RUNS" in done.said and "rolled back" not in done.said and "window" in done.said
+    assert link.active == (certified().name, 1)
+    assert [h.action for h in GainStore(tmp_path / "gains").history()] == [Action.LOAD, Action.ACTIVATE]
 
 
 def test_a_fault_under_the_new_set_rolls_back_and_is_not_reset(tmp_path: Path) -> None:
@@ -120,7 +137,7 @@ def test_a_fault_under_the_new_set_rolls_back_and_is_not_reset(tmp_path: Path) -
             link.session.send(Op.NODE_EVENT, [FaultCode.DRIVE_RESET])
 
     done = deploy(link, certified(), drop_out)
-    assert not done.stays and done.after is None and link.active == ("present", 1)
+    assert not done.proven and done.after is None and link.active == ("present", 1)
     assert link.session.cycle.axis.state == AxisState.FAULT
 
 

@@ -13,7 +13,8 @@ from servod.axis_model import axis_model_yaml
 from servod.commission.axis import DaemonWalkAxis
 from servod.config import load_config
 from servod.control import ControlClient
-from servod.deploy.deployment import deploy, motions_in
+from servod.deploy.cycles import motions_in
+from servod.deploy.deployment import deploy
 from servod.gain_store import Action, GainStore
 from servod.shipped import shipped
 from tests.daemon.running import at_rest, running, wait_for
@@ -49,13 +50,15 @@ def test_a_set_is_deployed_on_a_daemon(tmp_path: Path) -> None:
         assert walk_axis.cutoff_hz == gains.design.velocity_cutoff_hz
         with walk_axis.deployment(tmp_path, gains, gains) as link:
             done = deploy(link, gains, lambda _what, _share: None)
-            assert link.active == ((gains.name, 1) if done.stays else done.present)
+            assert link.active == ((gains.name, 1) if done.proven else ("demo_pd", 1))
             assert not link.enabled  # as it was found
-    assert done.stays or "skipped" in done.reasons[-1], done.reasons
-    assert done.present == ("demo_pd", 1)
-    assert done.rows_after is not None and len(motions_in(done.rows_after)) == len(motions_in(done.rows_before)) == 3
+    assert done.proven or "skipped" in done.reasons[-1], done.reasons
+    assert done.ran_before is not None and done.ran_before.present == ("demo_pd", 1)
+    assert done.rows_after is not None
+    assert len(motions_in(done.rows_after)) == len(motions_in(done.ran_before.rows)) == 3
     last = GainStore(axis.folder / "gains").history()[-1]
-    assert (last.action, last.name) == (Action.ACTIVATE if done.stays else Action.REJECT, gains.name)
+    assert (last.action, last.name) == (Action.ACTIVATE if done.proven else Action.REJECT, gains.name)
+    assert done.before is not None
     assert last.figures["before_slow_mrad"] == pytest.approx(done.before.document()["slow_mrad"])
 
 
