@@ -82,11 +82,22 @@ def _found(diagnosis: Diagnosis, evidence: Evidence) -> str:
         sentences = " ".join(f"{effect(name).statement}." for name in names)
         return f"{sentences} {100.0 * evidence.errors.removed:.0f} % of the explainable mismatch is gone."
     if diagnosis.verdict.value == "cannot_tell":
-        return "Something is left, and nothing can be told of it yet."
+        return _too_little(evidence)
     if diagnosis.verdict.value == "unexplained":
         where = evidence.maps_before[0].coordinate
         return f"Something is left that no known physics explains; it shows most over {where}."
     return "The model is adequate: nothing worth naming is left beyond the noise."
+
+
+def _too_little(evidence: Evidence) -> str:
+    """Why recordings that were taken in cannot tell after all."""
+    if evidence.choice.cut:
+        return "Something is left, and nothing can be told of it yet."
+    noise, dry, force = evidence.predictor.encoder_noise, evidence.predictor.dry, units(evidence.predictor).force
+    return (
+        f"These data cannot tell: too noisy: noise and steps of the encoder make {noise:.3g} {force} of torque in each "
+        f"row, dry friction is {dry:.3g} {force}."
+    )
 
 
 def differs(changes: Mapping[str, Any]) -> str:

@@ -26,7 +26,7 @@ from servod.diagnose.swap import swapped
 from servod.diagnose.tidy import tidied
 from servod.diagnose.trace import Trace
 from servod.diagnose.unnamed import Unnamed, unnamed
-from servod.diagnose.verdict import Shares, Verdict, named_terms, shares, verdict
+from servod.diagnose.verdict import Shares, Verdict, drowned, named_terms, shares, verdict
 from servod.recordings import Recording
 
 Array = NDArray[np.float64]
@@ -107,7 +107,8 @@ def diagnose(
     final = verdict(choice, evidence.named, evidence.errors, predictor.dry)
     if final is Verdict.UNEXPLAINED:
         evidence = _without_names(evidence)
-    if final is Verdict.UNEXPLAINED and choice.cut and choice.tried == 0:
+    untried = final is Verdict.UNEXPLAINED and choice.cut and choice.tried == 0
+    if untried or drowned(final, predictor.encoder_noise, predictor.dry):
         final = Verdict.CANNOT_TELL
     return Diagnosis(model, refused, final, evidence, seconds)
 

@@ -146,6 +146,7 @@ def cannot_tell(trace: Trace, model: AxisModel) -> str | None:
     """Why this recording cannot tell anything about this model; None when it can."""
     return (
         _too_short(trace)
+        or _never_changes(trace)
         or implausible(trace, model)
         or _too_noisy(trace, model)
         or _too_still(trace)
@@ -173,10 +174,14 @@ def _too_still(trace: Trace) -> str | None:
     return f"too still: the axis moves over {room:.3g} in all, and in {100.0 * moving:.0f} % of the rows"
 
 
+def _never_changes(trace: Trace) -> str | None:
+    return "the command never changes" if float(np.ptp(trace.drive.torque)) == 0.0 else None
+
+
 def _saturated(trace: Trace) -> str | None:
     share = _at_limit(trace.drive.torque)
-    if share < SATURATED or float(np.ptp(trace.drive.torque)) == 0.0:
-        return None if share < SATURATED else "the command never changes"
+    if share < SATURATED:
+        return None
     return f"saturated: the command stands at its limit in {100.0 * share:.0f} % of the rows"
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,6 +122,14 @@ class Predictor:
         """A column of `Drive` or `Trace` over the rows of all traces."""
         return np.concatenate(
             [np.asarray(getattr(trace, name, getattr(trace.drive, name, None))) for trace in self.traces]
+        )
+
+    @cached_property
+    def encoder_noise(self) -> float:
+        """Mismatch that the encoder's noise and steps alone make in a row of the noisiest trace, N*m or N."""
+        return max(
+            float(np.median(seen.to_torque)) * trace.position_noise
+            for seen, trace in zip(self.observers, self.traces, strict=True)
         )
 
     def mismatch(self, *models: AxisModel) -> Array:

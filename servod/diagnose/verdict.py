@@ -25,6 +25,9 @@ LEAST_EXPLAINED = 0.9
 #: what could be explained.
 LEFT_TORQUE, LEFT_SHARE = 0.02, 0.05
 
+#: Shares of dry friction from which the encoder's noise in the mismatch hides what is left, and hides everything.
+HIDES_REST, HIDES_ALL = 0.15, 0.5
+
 #: A rival that leaves at most this many times what the finding leaves cannot be told apart.
 ALIKE = 1.2
 
@@ -77,6 +80,12 @@ def verdict(choice: Choice, named: list[int], errors: Shares, dry: float) -> Ver
     if much and (not named or errors.removed < LEAST_EXPLAINED):
         return Verdict.UNEXPLAINED
     return Verdict.MISSING_PHYSICS if named else Verdict.ADEQUATE
+
+
+def drowned(found: Verdict, encoder_noise: float, dry: float) -> bool:
+    """Whether a verdict without a name says nothing, because the encoder's noise is as large as what it is about."""
+    hides = {Verdict.UNEXPLAINED: HIDES_REST, Verdict.ADEQUATE: HIDES_ALL}
+    return found in hides and encoder_noise > hides[found] * dry
 
 
 def named_terms(choice: Choice, nominal: Document) -> list[int]:

@@ -7,7 +7,8 @@ import pytest
 
 from servod.diagnose.engine import diagnose
 from servod.diagnose.intake import taken_in
-from servod.diagnose.verdict import Verdict
+from servod.diagnose.predict import Predictor
+from servod.diagnose.verdict import Verdict, drowned
 from servod.recordings import Recording
 from tests.diagnose.axes import believed, record, recording
 
@@ -115,3 +116,19 @@ def test_long_list_of_unused_columns_is_cut(made: Recording) -> None:
     told = Recording(made.path, made.axis, made.columns, made.measured, (f"columns not used: {names}",))
     note = taken_in([told], believed())[0][0].notes[0]
     assert note.endswith("column5 and 24 more")
+
+
+def test_a_command_that_is_nothing_at_all_is_refused(made: Recording) -> None:
+    assert "the command never changes" in refused_for(recording(made.t_s, 0.0 * made.torque, made.position))
+
+
+def test_noise_that_hides_what_is_left_is_no_finding_of_physics(made: Recording) -> None:
+    """Noise of 10 mrad: too little to refuse the recording, too much to say what is left."""
+    noise = np.random.default_rng(1).normal(size=len(made.t_s)) * 0.01
+    model = believed()
+    predictor = Predictor(taken_in([recording(made.t_s, made.torque, made.position + noise)], model)[0], model)
+    assert predictor.encoder_noise == pytest.approx(model.inertia * predictor.rate**2 * 0.01, rel=0.1)
+    assert drowned(Verdict.UNEXPLAINED, predictor.encoder_noise, predictor.dry)
+    assert not drowned(Verdict.MISSING_PHYSICS, predictor.encoder_noise, predictor.dry)
+    quiet = Predictor(taken_in([made], model)[0], model)
+    assert not drowned(Verdict.UNEXPLAINED, quiet.encoder_noise, quiet.dry)
