@@ -31,7 +31,10 @@ class Identify:
         return {"axis": walk.axis.identity, "seed": o.seed, "travel": o.travel_rad, "speed": o.speed_rad_s}
 
     def run(self, walk: Walk) -> None:
-        """A virtual axis begins anew, so that the same model comes out; a real one goes on where it was interrupted."""
+        """A virtual axis begins anew, so that the same model comes out, and a real one when it is asked to (--again).
+
+        Otherwise a real one goes on where it was interrupted.
+        """
         options, axis = walk.options, walk.axis
         if not axis.virtual:
             walk.questions.agree(_free_travel(walk))
@@ -43,7 +46,7 @@ class Identify:
                 travel_rad=options.travel_rad,
                 speed_rad_s=options.speed_rad_s,
                 seed=options.seed,
-                resume=not axis.virtual,
+                resume=not axis.virtual and self.name not in options.again,
                 subject=digest(axis.identity),
             )
         write_json(walk.path(IDENTIFIED), document(analysis))
