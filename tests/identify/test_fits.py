@@ -200,6 +200,24 @@ def test_the_interval_of_the_torque_noise_is_the_scatter_of_the_strokes():
     assert once.half_width > 0.5 * once.value
 
 
+def test_the_intervals_of_the_curve_are_the_scatter_of_its_nodes():
+    speed = np.geomspace(5e-3, 1.0, 25)
+    truth = np.array([0.05, 0.03, np.log(0.1), 1.4, 0.05])
+    known = np.array([0.05, np.nan, 0.1, 1.4, 0.05])  # static friction has an allowance of its own
+    exact, rng, deviation = curve.friction(truth, speed), np.random.default_rng(12), 2e-4
+    found = []
+    for _ in range(30):
+        torque = exact + deviation * rng.normal(size=len(speed))
+        half, covariance = np.full(len(speed), 1.96 * deviation), deviation**2 * np.eye(len(speed))
+        found.append(curve.fit(Side(speed, torque, half, covariance)))
+    values = np.array([[number.value for number in each] for each in found])
+    halves = np.array([[number.half_width for number in each] for each in found])
+    told = np.isfinite(known)
+    ratio = np.median(halves, axis=0)[told] / (2.09 * np.std(values, axis=0)[told])
+    assert np.all((ratio > 0.65) & (ratio < 1.5))
+    assert np.all(np.mean(np.abs(values - known) <= halves, axis=0)[told] >= 0.85)
+
+
 @pytest.mark.parametrize("top_rad_s", [0.02, 0.3, 30.0])
 def test_a_stribeck_curve_is_found_whatever_its_range_of_speed(top_rad_s):
     speed = np.geomspace(1e-2, 1.0, 25) * top_rad_s

@@ -31,6 +31,8 @@ DEGREE = 3
 ALLOWANCE, FALLING_ALLOWANCE = 0.012, 0.08
 #: And of friction at the speed of the encoder's steps (`map_rows.coarse_rad_s`), falling with speed.
 COARSE_ALLOWANCE = 0.03
+#: Half width of a 95 % interval over the standard deviation, from many parts of strokes.
+_FACTOR = float(stats.norm.ppf(LEVEL))
 LEAST_ROWS = 20
 #: Fits, each with the map of the one before: how far bristles reach changes little.
 ROUNDS = 3
@@ -51,6 +53,13 @@ class Side(NamedTuple):
     friction: Array
     half_width: Array
     covariance: Array
+
+    @property
+    def unseen(self) -> Array:
+        """The part of the half width that stands for what no scatter shows, in N*m."""
+        seen = _FACTOR**2 * np.diag(self.covariance)
+        allowance: Array = np.sqrt(np.maximum(self.half_width**2 - seen, 0.0))
+        return allowance
 
 
 class Harmonic(NamedTuple):
@@ -213,9 +222,8 @@ class _Spline:
         basis = self._basis(log_speed)
         speed, spread = np.exp(log_speed), basis @ covariance @ basis.T
         friction = basis @ values + viscous * speed
-        factor = float(stats.norm.ppf(LEVEL))
         falling = np.maximum(-np.gradient(friction, log_speed), 0.0)
-        half = np.hypot(factor * np.sqrt(np.diag(spread)), ALLOWANCE * friction)
+        half = np.hypot(_FACTOR * np.sqrt(np.diag(spread)), ALLOWANCE * friction)
         half = np.hypot(half, FALLING_ALLOWANCE * falling)
         half = np.hypot(half, COARSE_ALLOWANCE * self._coarse_rad_s / speed * friction)
         return Side(speed, friction, half, spread)
