@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from servod.control import ControlClient, Verb
+from servod.control import ControlClient, Refused, Verb
 from servod.daemon_config import daemon_config
 from servod.daemon_recording import quick_stop, recording, switch_off
 from servod.deploy.links import FADE_S, Rows, Tell, cut
@@ -76,12 +76,12 @@ class DaemonDeployLink:
     def record(self, motions: Sequence[dict[str, Any]], tell: Callable[[], None] = lambda: None) -> Rows:
         """Run motions (arguments of the verb `track`) one after the other; all cycles from the daemon's recording.
 
-        Raises AnswerIsNo when the axis drops out, Refused when the daemon takes a motion not on. An interrupt stops the
-        axis before anything else is waited for.
+        Raises AnswerIsNo when the axis drops out or has done so, Refused when the daemon does not take on a motion of
+        an axis that is enabled. An interrupt stops the axis before anything else is waited for.
         """
         with recording(self._client) as path:
             for motion in motions:
-                self._client.call(Verb.TRACK, **motion)
+                self._begin(motion)
                 while self._moves():
                     tell()
         return np.frombuffer(read_recording(path).rows, dtype=ROW)
@@ -92,9 +92,11 @@ class DaemonDeployLink:
         return str(stored["name"]), int(stored["version"])
 
     def attempt(self, name: str, version: int) -> None:
-        """Change to a stored set on trial."""
+        """Change to a stored set on trial. Raises AnswerIsNo when the axis drops out under it at once."""
         self._client.call(Verb.GAINS_ACTIVATE, name=name, version=version, trial=True)
-        time.sleep(FADE_S)
+        faded = time.monotonic() + FADE_S
+        while time.monotonic() < faded:
+            self._moves()
 
     def keep(self, note: str, figures: dict[str, float]) -> None:
         """Make the set on trial the active one."""
@@ -104,11 +106,23 @@ class DaemonDeployLink:
         """Change back to the active set."""
         self._client.call(Verb.GAINS_ROLLBACK, note=note, figures=figures, trial=True)
 
+    def _begin(self, motion: dict[str, Any]) -> None:
+        """Start a motion. What the daemon refuses because the axis has dropped out is the axis's answer."""
+        try:
+            self._client.call(Verb.TRACK, **motion)
+        except Refused:
+            self._status_while_enabled()
+            raise
+
     def _moves(self) -> bool:
         """Wait a little; whether the motion still runs. Raises AnswerIsNo when the axis is not enabled any more."""
         time.sleep(_POLL_S)
+        return bool(self._status_while_enabled()["axis"]["motion_running"])
+
+    def _status_while_enabled(self) -> dict[str, Any]:
+        """The status document. Raises AnswerIsNo with the faults when the axis is not enabled any more."""
         status = self._client.call(Verb.STATUS)
         if status["axis"]["state"] != "ENABLED":
             why = "; ".join(f"{f['code']}: {f['cause']} {f['remedy']}" for f in status["faults"])
             raise AnswerIsNo(f"the axis went to {status['axis']['state']}. {why}")
-        return bool(status["axis"]["motion_running"])
+        return status

@@ -35,7 +35,11 @@ _CUT_CYCLES = 50
 
 
 class DeployLink(Protocol):
-    """An axis with a store of gain sets. Every method raises AnswerIsNo when the axis drops out or refuses."""
+    """An axis with a store of gain sets.
+
+    `attempt` and `run` raise AnswerIsNo when the axis drops out: that is an answer to the set that runs. Under a daemon
+    what is refused on an axis that stays enabled, and what does not reach it at all, raises Unreachable.
+    """
 
     @property
     def config(self) -> AxisConfig:
@@ -77,7 +81,7 @@ class DeployLink(Protocol):
         ...
 
     def attempt(self, name: str, version: int) -> None:
-        """Change to a stored set on trial: what is stored as active stays so."""
+        """Change to a stored set on trial: what is stored as active stays so. Back when its offset has faded out."""
         ...
 
     def keep(self, note: str, figures: dict[str, float]) -> None:
@@ -132,6 +136,7 @@ class SteppedDeployLink:
 
     def run(self, motion: ValidationMotion, window_rad: float, tell: Tell) -> Rows:
         """Run the motion as fast as it computes."""
+        self._must_be_enabled()
         session, sines = self.session, motion.sines.tolist()
         session.clear()
         session.load_trajectory([*sines, *[0.0] * len(sines)])
@@ -152,12 +157,14 @@ class SteppedDeployLink:
         self._tried = self._store.get(name, version)
         self._change(self._tried)
         self.session.run(FADE_S)
+        self._must_be_enabled()
 
     def keep(self, note: str, figures: dict[str, float]) -> None:
         """Make the set on trial the store's active one."""
-        tried, self._tried = self._tried, None
+        tried = self._tried
         assert tried is not None  # `attempt` came before
         self._store.activate(tried.name, tried.version, note, figures)
+        self._tried = None
 
     def give_up(self, note: str, figures: dict[str, float]) -> None:
         """The store's active set runs again."""
@@ -183,8 +190,12 @@ class SteppedDeployLink:
         while session.cycle.reference.active:
             session.run(_SLICE_S)
             tell(min(1.0, len(session.raw) // RECORD.size * motion.period_s / motion.duration_s))
-        if session.cycle.axis.state != AxisState.ENABLED:
-            raise AnswerIsNo(f"the axis went to {session.cycle.axis.state.name}. {session.why}")
+        self._must_be_enabled()
+
+    def _must_be_enabled(self) -> None:
+        state = self.session.cycle.axis.state
+        if state != AxisState.ENABLED:
+            raise AnswerIsNo(f"the axis went to {state.name}. {self.session.why}")
 
     def _off(self, op: Op) -> None:
         with contextlib.suppress(AnswerIsNo):

@@ -10,6 +10,7 @@ import pytest
 from servod.control import ControlClient
 from servod.deploy.cycles import motions_in
 from servod.deploy.daemon_link import DaemonDeployLink
+from servod.deploy.virtual import pd_set
 from servod.errors import AnswerIsNo
 from servod.gain_store import Action, GainStore
 from servod.gains import load_gains
@@ -18,6 +19,10 @@ from servod.verify.validation import Array, ValidationMotion
 from tests.daemon.running import running, wait_for
 
 pytestmark = pytest.mark.serial
+
+
+#: Swings by itself with 16 mrad to each side, on an axis that stands still.
+WILD = pd_set("wild", 2000.0, 0.0)
 
 
 class Short(ValidationMotion):
@@ -31,7 +36,7 @@ class Short(ValidationMotion):
 def test_a_trial_is_run_kept_and_undone(tmp_path: Path) -> None:
     motion = Short(0.001, 0.01, 0.01, 8.0, 0.002)
     local = load_gains(shipped("gains/demo_local.yaml"))
-    with running(tmp_path) as axis:
+    with running(tmp_path, travel_rad=0.013) as axis:
         with ControlClient(axis.socket) as client:
             link = DaemonDeployLink(client)
             assert link.config.name == "tried"
@@ -47,13 +52,17 @@ def test_a_trial_is_run_kept_and_undone(tmp_path: Path) -> None:
             link.keep("good", {"after_slow_mrad": 0.1})
             link.attempt(*link.load(load_gains(shipped("gains/demo_pd_dob.yaml"))))
             assert link.active == ("demo_pd_dob", 1)
+            with pytest.raises(AnswerIsNo, match=r"the axis went to .*POSITION_LIMIT"):
+                link.attempt(*link.load(WILD))
+            with pytest.raises(AnswerIsNo, match="the axis went to"):
+                link.record([{"kind": "step", "amplitude_rad": 0.01, "duration_s": 0.5}])
         with ControlClient(axis.socket) as watcher:  # the client of the trial has gone
             wait_for(lambda: watcher.call("status")["controller"]["name"] == "demo_local")
             assert watcher.call("gains_rollback")["name"] == "demo_pd"
             watcher.call("disable")
     history = GainStore(axis.folder / "gains").history()
     assert [(h.action, h.name) for h in history if h.action in (Action.REJECT, Action.ROLLBACK)] == [
-        (Action.REJECT, "demo_pd_dob"),
+        (Action.REJECT, "wild"),
         (Action.ROLLBACK, "demo_pd"),
     ]
     assert [h.figures for h in history if h.note == "good"] == [{"after_slow_mrad": 0.1}]

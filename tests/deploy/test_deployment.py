@@ -129,15 +129,17 @@ def test_a_set_that_runs_already_and_fails_is_never_said_to_be_rolled_back(tmp_p
     assert [h.action for h in GainStore(tmp_path / "gains").history()] == [Action.LOAD, Action.ACTIVATE]
 
 
-def test_a_fault_under_the_new_set_rolls_back_and_is_not_reset(tmp_path: Path) -> None:
+@pytest.mark.parametrize("when", [("change of the set", 0.48), ("under the new set", 0.52)])
+def test_a_fault_under_the_new_set_rolls_back_and_is_not_reset(when: tuple[str, float], tmp_path: Path) -> None:
     link = link_to(table1(), tmp_path)
 
     def drop_out(what: str, share: float) -> None:
-        if what == "under the new set" and share == 0.52:
+        if (what, share) == when:
             link.session.send(Op.NODE_EVENT, [FaultCode.DRIVE_RESET])
 
     done = deploy(link, certified(), drop_out)
     assert not done.proven and done.after is None and link.active == ("present", 1)
+    assert done.reasons[0].startswith("the axis went to FAULT")
     assert link.session.cycle.axis.state == AxisState.FAULT
 
 
