@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 from servod.commands import Op
@@ -16,7 +16,7 @@ from servod.config import AxisConfig
 from servod.daemon.arguments import GainsActivateArgs, GainsLoadArgs, GainsVerdictArgs
 from servod.daemon.flows import Flow, FutureWait, Wait
 from servod.daemon.status import ControllerStatus
-from servod.errors import AnswerIsNo, BadInput
+from servod.errors import AnswerIsNo, BadInput, ServodError
 from servod.gain_store import GainStore, StoredSet
 from servod.gains import require_fit
 
@@ -85,15 +85,16 @@ class GainBank:
         yield from self._deploy(stored, send)
         self._tried = stored if args.trial else None
         if not args.trial:
-            yield FutureWait(slow.submit(self._store.activate, stored.name, stored.version))
+            yield from self._write(slow.submit(self._store.activate, stored.name, stored.version), stored, send, slow)
         return _row(stored)
 
-    def keep(self, args: GainsVerdictArgs, slow: ThreadPoolExecutor) -> Flow:
-        """Make the set on trial the active one."""
-        tried, self._tried = self._tried, None
+    def keep(self, args: GainsVerdictArgs, send: SendOrder, slow: ThreadPoolExecutor) -> Flow:
+        """Make the set on trial the active one. Where the store cannot be written, the active one runs again."""
+        tried, self._tried = self._tried, None  # from here on nobody else ends the trial
         if tried is None:
             raise AnswerIsNo(_NO_TRIAL)
-        yield FutureWait(slow.submit(self._store.activate, tried.name, tried.version, args.note, args.figures))
+        written = slow.submit(self._store.activate, tried.name, tried.version, args.note, args.figures)
+        yield from self._write(written, tried, send, slow)
         return _row(tried)
 
     def rollback(self, args: GainsVerdictArgs, send: SendOrder, slow: ThreadPoolExecutor) -> Flow:
@@ -104,7 +105,7 @@ class GainBank:
             return (yield from self._reject(self._tried, args, send, slow))
         stored: StoredSet = yield FutureWait(slow.submit(self._store.previous))
         yield from self._deploy(stored, send)
-        yield FutureWait(slow.submit(self._store.rollback))
+        yield from self._write(slow.submit(self._store.rollback), stored, send, slow)
         return _row(stored)
 
     def _active_or(self, initial: StoredSet) -> StoredSet:
@@ -126,11 +127,30 @@ class GainBank:
 
     def _reject(self, tried: StoredSet, args: GainsVerdictArgs, send: SendOrder, slow: ThreadPoolExecutor) -> Flow:
         """End a trial: the active set runs again."""
+        active = yield from self._back(send, slow)
+        yield FutureWait(slow.submit(self._store.reject, tried.name, tried.version, args.note, args.figures))
+        return active
+
+    def _write(self, written: Future[StoredSet], runs: StoredSet, send: SendOrder, slow: ThreadPoolExecutor) -> Flow:
+        """Wait until the store has the set that runs as its active one; when it cannot, the active one runs again.
+
+        Should that fail too, the set that runs is on trial, so that whoever leaves or rolls back goes back.
+        """
+        try:
+            yield FutureWait(written)
+        except (ServodError, OSError) as error:
+            log.error("gain set %s version %d runs and cannot be stored as active: %s", runs.name, runs.version, error)
+            self._tried = runs
+            yield from self._back(send, slow)
+            raise
+        return {}
+
+    def _back(self, send: SendOrder, slow: ThreadPoolExecutor) -> Flow:
+        """The store's active set runs again, and none is on trial."""
         active: StoredSet | None = yield FutureWait(slow.submit(self._store.active))
         assert active is not None  # the bank activated one when it began
         yield from self._deploy(active, send)
         self._tried = None
-        yield FutureWait(slow.submit(self._store.reject, tried.name, tried.version, args.note, args.figures))
         return _row(active)
 
     def _deploy(self, stored: StoredSet, send: SendOrder) -> Flow:

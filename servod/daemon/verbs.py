@@ -223,16 +223,19 @@ class Verbs:
         return result
 
     def _gains_keep(self, args: GainsVerdictArgs) -> Flow:
-        return self._bank.keep(args, self.slow)
+        return self._attach_gains(self._bank.keep(args, self._send, self.slow))
 
     def _gains_rollback(self, args: GainsVerdictArgs) -> Flow:
         return self._attach_gains(self._bank.rollback(args, self._send, self.slow))
 
     def _attach_gains(self, change: Flow) -> Flow:
-        """After a change of the gain set, the recording gets the new one too."""
-        result = yield from change
-        self._recorder.set_attachment("gains.yaml", self._bank.newest.path.read_bytes())
-        return result
+        """After a change of the gain set, also one back when it failed, the recording gets the one that runs."""
+        before = self._bank.newest
+        try:
+            return (yield from change)
+        finally:
+            if self._bank.newest is not before:
+                self._recorder.set_attachment("gains.yaml", self._bank.newest.path.read_bytes())
 
     def _record_start(self, args: RecordStartArgs) -> Flow:
         path = yield FutureWait(self._recorder.start(args.path))
