@@ -11,6 +11,7 @@ from servod.diagnose.choose import LEAST_TORQUE, Choice, acting
 from servod.diagnose.effects import effect
 from servod.diagnose.effects.disturbance import SHORTEST_S
 from servod.diagnose.effects.disturbance import terms as windows_of
+from servod.diagnose.effects.disturbance import windows
 from servod.diagnose.effects.effect import sine_term
 from servod.diagnose.fit import Fit
 from servod.diagnose.hypothesis import Hypothesis
@@ -78,3 +79,13 @@ def test_a_number_at_an_end_of_its_range_is_somebody_elses(scene: Scene) -> None
         coordinates = hypothesis.start.copy()
         coordinates[place] = unknown.coordinate(at * 0.02 if hypothesis is mass else at)
         assert at_end(Fit(hypothesis, coordinates, scene.mismatch, 0.0, np.zeros((0, 0)), True)) is answer
+
+
+def test_a_window_is_found_where_it_begins_and_ends() -> None:
+    """Of any length, and a second one beside it, within a twentieth of a second."""
+    left = 0.01 * np.random.default_rng(1).normal(size=16_001)
+    left[4692:5951] += 0.3
+    left[9000:9400] -= 0.2
+    (_, first, last), (_, begun, ended) = windows(left, 1e-3)
+    assert [first, last, begun, ended] == pytest.approx([4692, 5951, 9000, 9400], abs=50)
+    assert windows(left[:100], 1e-3) == []

@@ -13,8 +13,8 @@ from servod.diagnose.scene import Scene
 
 Array = NDArray[np.float64]
 
-#: Lengths of windows that are tried, s, and windows that are kept.
-LENGTHS_S, KEPT = (0.3, 0.6, 1.0, 2.0, 4.0), 2
+#: Windows begin and end on this grid, s, take this share of their recording at most, and so many are kept.
+GRID_S, LONGEST, KEPT = 0.05, 0.5, 2
 
 #: A shorter push is a blow that any mass behind a gap or spring can make, or a contact that has aged at rest, s.
 SHORTEST_S = 0.3
@@ -24,17 +24,22 @@ EVERY = "in every recording"
 
 
 def windows(mismatch: Array, period_s: float) -> list[tuple[float, int, int]]:
-    """(power taken, first row, last row) of the windows whose constant torque takes most, best first."""
-    total = np.concatenate([[0.0], np.cumsum(mismatch)])
+    """(power taken, first row, last row) of the windows whose constant torque takes most, best first, none in another.
+
+    Every begin and every end of a grid is looked at: a window half as long again leaves the fit in a narrow valley.
+    """
+    step = max(round(GRID_S / period_s), 1)
+    total = np.concatenate([[0.0], np.cumsum(mismatch)])[::step]
+    count = len(total)
+    length = np.arange(count)[None, :] - np.arange(count)[:, None]
+    allowed = (length * step * period_s >= SHORTEST_S) & (length <= LONGEST * count)
+    power = np.where(allowed, (total[None, :] - total[:, None]) ** 2 / np.maximum(length * step, 1), 0.0)
     found = []
-    for length in LENGTHS_S:
-        rows = round(length / period_s)
-        if rows < 5 or rows >= len(mismatch) // 2:
-            continue
-        sums = total[rows:] - total[:-rows]
-        best = int(np.argmax(np.abs(sums)))
-        found.append((float(sums[best] ** 2 / rows), best, best + rows - 1))
-    return sorted(found, reverse=True)
+    while len(found) < KEPT and power.max(initial=0.0) > 0.0:
+        first, last = (int(i) for i in np.unravel_index(int(np.argmax(power)), power.shape))
+        found.append((float(power[first, last]), first * step, last * step - 1))
+        power[:last, first + 1 :] = 0.0
+    return found
 
 
 def terms(scene: Scene) -> list[Term]:
@@ -42,7 +47,7 @@ def terms(scene: Scene) -> list[Term]:
     found = []
     traces = scene.predictor.traces
     for trace, part in zip(traces, scene.predictor.slices, strict=True):
-        for taken, first, last in windows(scene.mismatch[part], trace.period_s)[:KEPT]:
+        for taken, first, last in windows(scene.mismatch[part], trace.period_s):
             mean = float(np.mean(scene.mismatch[part][first:last]))
             found.append((taken, _term(scene, trace.drive.t_s - trace.shift_s, (first, last), mean, (trace.shift_s,))))
     single = [term for _, term in sorted(found, key=lambda pair: -pair[0])[:KEPT]]
