@@ -9,9 +9,8 @@ from servod.diagnose.at_end import at_end
 from servod.diagnose.base import base_unknowns, document_of
 from servod.diagnose.choose import LEAST_TORQUE, Choice, acting
 from servod.diagnose.effects import effect
-from servod.diagnose.effects.disturbance import SHORTEST_S
+from servod.diagnose.effects.disturbance import SHORTEST_S, windows
 from servod.diagnose.effects.disturbance import terms as windows_of
-from servod.diagnose.effects.disturbance import windows
 from servod.diagnose.effects.effect import sine_term
 from servod.diagnose.fit import Fit
 from servod.diagnose.hypothesis import Hypothesis
