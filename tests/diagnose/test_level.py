@@ -8,7 +8,7 @@ import pytest
 from servod.diagnose.base import base_unknowns, document_of
 from servod.diagnose.effects import effect
 from servod.diagnose.fit import Fit
-from servod.diagnose.hypothesis import Hypothesis
+from servod.diagnose.hypothesis import Document, Hypothesis
 from servod.diagnose.intake import taken_in
 from servod.diagnose.level import is_level, on_bound
 from servod.diagnose.predict import Predictor
@@ -38,11 +38,31 @@ def test_what_has_no_level_is_recalibrated_only() -> None:
     assert not on_bound(fit_with("friction.stribeck_velocity", 3.0))
 
 
-def test_levels_are_what_opens_the_models_own() -> None:
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """An axis with nothing left."""
     model = believed()
     predictor = Predictor(taken_in(record(model, seconds=3.0), model)[0], model)
-    scene = Scene(document_of(model), predictor, np.zeros(len(predictor.counts)))
+    return Scene(document_of(model), predictor, np.zeros(len(predictor.counts)))
+
+
+def test_levels_are_what_opens_the_models_own(scene: Scene) -> None:
     for name in ("stribeck", "presliding", "torque_offset", "inertia"):
         assert all(is_level(term) for term in effect(name).terms(scene))
     for name in ("cogging", "delay", "actuator_lag", "viscous_nonlinear"):
         assert not any(is_level(term) for term in effect(name).terms(scene))
+
+
+@pytest.mark.parametrize("name", ["stribeck", "presliding", "torque_offset", "inertia"])
+def test_a_level_is_released_from_where_it_stands_too(scene: Scene, name: str) -> None:
+    """Beside other effects the refit has gone most of the way: far starts must not be the only ones."""
+    assert any(not term.begins and not term.unknowns for term in effect(name).terms(scene))
+
+
+def test_friction_of_one_direction_alone_may_differ(scene: Scene) -> None:
+    """Dry and viscous friction 0.72 of the model's backwards and the model's own forwards: both means are off."""
+    term = next(t for t in effect("asymmetry").terms(scene) if t.form == "both, another level")
+    document: Document = {}
+    term.write(document, (0.28 / 1.72, 0.28 / 1.72, 0.86))
+    expected = {"positive_dry": 1.0, "negative_dry": 0.72, "positive_viscous": 1.0, "negative_viscous": 0.72}
+    assert document["asymmetry"] == pytest.approx(expected)

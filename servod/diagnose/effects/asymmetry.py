@@ -10,19 +10,24 @@ from servod.diagnose.scene import Scene
 
 
 def _write(document: Document, values: Sequence[float]) -> None:
-    """Values: half the difference of dry friction, that of viscous friction, and a factor on dry friction."""
+    """Values: half the difference of dry friction, that of viscous friction, and a factor on all of it.
+
+    Friction that differs in one direction alone has another mean than the model's, dry and viscous alike.
+    """
     dry, viscous, level = (*values, 1.0)[:3]
     document["asymmetry"] = {
         "positive_dry": level * (1.0 + dry),
         "negative_dry": level * (1.0 - dry),
-        "positive_viscous": 1.0 + viscous,
-        "negative_viscous": 1.0 - viscous,
+        "positive_viscous": level * (1.0 + viscous),
+        "negative_viscous": level * (1.0 - viscous),
     }
 
 
 def _write_dry(document: Document, values: Sequence[float]) -> None:
     """Dry friction alone: half the difference, and a factor on both directions."""
-    _write(document, (values[0], 0.0, values[1] if len(values) > 1 else 1.0))
+    dry, level = (*values, 1.0)[:2]
+    sides = {"positive_dry": level * (1.0 + dry), "negative_dry": level * (1.0 - dry)}
+    document["asymmetry"] = sides | {"positive_viscous": 1.0, "negative_viscous": 1.0}
 
 
 def _teller(write: Writer) -> Teller:

@@ -26,16 +26,17 @@ def _tell(scene: Scene) -> Teller:
 
 
 def terms(scene: Scene) -> list[Term]:
-    """The bristle of the model released, softer and stiffer; a bristle where the model has none; fading damping."""
+    """The bristle of the model released, from where it stands, softer and stiffer; a new one; fading damping."""
     own, damping = get(scene.document, "friction.sigma0"), get(scene.document, "friction.sigma1")
     if own <= 0.0:
         return [_new(scene, scene.dry / (way * scene.reach)) for way in WAYS]
     opens = {"friction.sigma0": (own / MOST, own * MOST)}
     opens |= {"friction.sigma1": (damping / MOST, damping * MOST)} if damping > 0.0 else {}
-    found = []
-    for stiff, damped in STARTS if damping > 0.0 else STARTS[:2]:
-        begins = {"friction.sigma0": stiff * own, "friction.sigma1": damped * damping}
-        found.append(Term("presliding", "bristle", (), lambda _d, _v: None, _tell(scene), opens, begins))
+    starts = STARTS if damping > 0.0 else STARTS[:2]
+    begins = [{"friction.sigma0": stiff * own, "friction.sigma1": damped * damping} for stiff, damped in starts]
+    found = [
+        Term("presliding", "bristle", (), lambda _d, _v: None, _tell(scene), opens, begin) for begin in ({}, *begins)
+    ]
     fading = Unknown("damping_velocity", f"{scene.length}/s", 0.1 * scene.speed, 1e-4 * scene.speed, 10.0 * scene.speed)
     write = keys("presliding", ["damping_velocity"])
     return [*found, Term("presliding", "fading damping", (fading,), write, _tell(scene), opens)]

@@ -34,7 +34,7 @@ def _whole(document: Document, values: Sequence[float]) -> None:
 
 
 def terms(scene: Scene) -> list[Term]:
-    """The curve with the paper's exponent from some velocities, and one with a free exponent."""
+    """The curve with the paper's exponent, from where it stands and from some velocities; one with a free exponent."""
     coulomb = get(scene.document, "friction.coulomb")
     if coulomb <= 0.0:
         return []
@@ -50,7 +50,7 @@ def terms(scene: Scene) -> list[Term]:
         "friction.stribeck_velocity": (1e-4 * scene.speed, scene.speed),
     }
     begins = [{"friction.static": START * coulomb, "friction.stribeck_velocity": v} for v in speeds]
-    found = [Term("stribeck", "gauss", (), lambda _d, _v: None, _tell(scene), opens, begin) for begin in begins]
+    found = [Term("stribeck", "gauss", (), lambda _d, _v: None, _tell(scene), opens, begin) for begin in ({}, *begins)]
     free = Unknown("exponent", "1", 1.0, 0.4, 4.0)
     return [*found, Term("stribeck", "free exponent", (free,), _exponent, _tell(scene), opens, begins[0])]
 
