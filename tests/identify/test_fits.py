@@ -7,7 +7,7 @@ import pytest
 
 from servod.axis_model import AxisModel
 from servod.identify.estimate import estimate, jackknife, sandwich
-from servod.identify.fits import cogging, curve, elastic, response
+from servod.identify.fits import cogging, curve, elastic, noise, response
 from servod.identify.fits.bristle_lag import Bristle, dry_columns, follow
 from servod.identify.fits.elastic import Elastic
 from servod.identify.fits.friction_map import Side
@@ -216,6 +216,21 @@ def test_the_intervals_of_the_curve_are_the_scatter_of_its_nodes():
     ratio = np.median(halves, axis=0)[told] / (2.09 * np.std(values, axis=0)[told])
     assert np.all((ratio > 0.65) & (ratio < 1.5))
     assert np.all(np.mean(np.abs(values - known) <= halves, axis=0)[told] >= 0.85)
+
+
+@pytest.mark.parametrize("counts", [0.05, 0.2, 0.33, 0.5, 1.0, 5.0])
+def test_the_interval_of_the_encoder_noise_holds_it_beside_the_rounding(counts):
+    rng, resolution_rad, held, widths = np.random.default_rng(13), 2.0 * np.pi / 2**20, [], []
+    for _ in range(100):
+        readings = np.round(rng.uniform(-0.5, 0.5) + counts * rng.normal(size=1500))  # anywhere within a count
+        torque, zeros = rng.normal(0.0, 1e-3, 1500), np.zeros(1500)
+        x = readings * resolution_rad
+        settings = {"resolution_rad": resolution_rad}
+        found = noise.fit(Trace(Kind.NOISE, np.arange(1500) * PERIOD_S, zeros, x, x, zeros, torque, x, settings))
+        held.append((found.encoder_rms.holds(counts * resolution_rad), found.torque_reading_rms.holds(1e-3)))
+        widths.append(found.encoder_rms.half_width / resolution_rad)
+    assert np.all(np.mean(held, axis=0) >= 0.88)
+    assert np.median(widths) < max(0.25, 0.07 * counts)
 
 
 @pytest.mark.parametrize("top_rad_s", [0.02, 0.3, 30.0])

@@ -50,6 +50,12 @@ def test_stiffness_inertia_and_delay(found):
     assert analysis.response.delay_s.holds(truth.delay_s)
 
 
+def test_noise_at_rest(found):
+    known = found.joint.model.noise
+    assert known is not None
+    assert found.analysis.noise.encoder_rms.holds(known.encoder_rms)
+
+
 def test_friction_map_from_5_mrad_s_up(found):
     errors, held = map_errors(found.analysis, found.joint.model)
     assert np.max(np.abs(errors)) <= 0.05
