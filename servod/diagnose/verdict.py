@@ -18,8 +18,9 @@ from servod.diagnose.choose import Choice
 from servod.diagnose.hypothesis import Document, get
 
 #: Below this share of the explainable error no known name may stand: what is there is something else. Real machines
-#: keep some of theirs above it, so that it is no nearer to 1; confidence falls with what is left instead.
-LEAST_EXPLAINED = 0.9
+#: keep some of theirs above it, so that it is no nearer to 1; confidence falls with what is left instead. It is nearer
+#: where what is left is worth a name itself, from this share of dry friction on.
+LEAST_EXPLAINED, LEAST_BESIDE_MUCH, MUCH_TORQUE = 0.9, 0.925, 0.05
 
 #: What is left above the noise floor counts as unexplained from this share of dry friction, if it is also this share of
 #: what could be explained.
@@ -77,7 +78,8 @@ def verdict(choice: Choice, named: list[int], errors: Shares, dry: float) -> Ver
     """The verdict on what was named (places of terms) and what is left."""
     left = errors.left / dry
     much = left > LEFT_TORQUE and 1.0 - errors.removed > LEFT_SHARE
-    if much and (not named or errors.removed < LEAST_EXPLAINED):
+    least = LEAST_BESIDE_MUCH if left > MUCH_TORQUE else LEAST_EXPLAINED
+    if much and (not named or errors.removed < least):
         return Verdict.UNEXPLAINED
     return Verdict.MISSING_PHYSICS if named else Verdict.ADEQUATE
 
