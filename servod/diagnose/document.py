@@ -6,7 +6,7 @@ The last step before the files: plain numbers, sentences for people, nothing dec
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -22,17 +22,12 @@ from servod.diagnose.floor import trace_floor
 from servod.diagnose.held_out import Fold
 from servod.diagnose.hypothesis import Document, Reported
 from servod.diagnose.locate import places
+from servod.diagnose.recalibrated import Z95, differs, recalibrated, told_coordinates
 from servod.diagnose.signature import where
 from servod.diagnose.verdict import alternatives, confidence
 from servod.diagnose.windows import WindowErrors, window_errors, windows_document
 
 Array = NDArray[np.float64]
-
-#: Half width of a 95 % interval in standard deviations.
-Z95 = 1.96
-
-#: A change of a parameter below this share is none.
-LEAST_CHANGE = 0.002
 
 
 def diagnosis_document(diagnosis: Diagnosis, windows: Sequence[WindowErrors] | None = None) -> dict[str, Any]:
@@ -100,17 +95,6 @@ def _too_little(evidence: Evidence) -> str:
     )
 
 
-def differs(changes: Mapping[str, Any]) -> str:
-    """What was recalibrated, as a sentence about these recordings; empty where nothing was."""
-    said = []
-    for name, change in changes.items():
-        words = name.removeprefix("friction.").removesuffix(".per_s").removesuffix("_s").replace("_", " ")
-        was, now, unit = change["from"], change["to"], change["unit"]
-        share = f" ({100.0 * (now - was) / abs(was):+.2g} %)" if was != 0.0 else ""
-        said.append(f"{words} is {now:.4g} instead of {was:.4g} {unit}{share}")
-    return f"What differs from the model in these recordings: {'; '.join(said)}." if said else ""
-
-
 def findings(evidence: Evidence) -> list[dict[str, Any]]:
     """One entry for each effect; terms of the same effect are one finding."""
     terms = evidence.fit.hypothesis.terms
@@ -176,23 +160,6 @@ def _spread(evidence: Evidence, place: int, told: list[Reported]) -> Array:
         slopes[:, index] = [(b.value - a.value) / 1e-5 for a, b in zip(told, there, strict=True)]
     variances = np.einsum("ij,jk,ik->i", slopes, evidence.spread, slopes)
     return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
-
-
-def recalibrated(evidence: Evidence) -> dict[str, Any]:
-    """Parameters of the model itself that were off: from, to, 95 % interval. Those of a finding are not here."""
-    fit = evidence.fit
-    opened = {key for place in evidence.named for key in fit.hypothesis.terms[place].opens}
-    found = {}
-    for index, (unknown, nominal) in enumerate(zip(fit.hypothesis.unknowns, fit.hypothesis.base, strict=False)):
-        value = fit.values[index]
-        deviation = math.sqrt(max(float(evidence.spread[index, index]), 0.0))
-        size = unknown.size if unknown.size else abs(value)
-        if unknown.key in opened or abs(value - nominal.start) <= max(LEAST_CHANGE, Z95 * deviation) * size:
-            continue
-        half = Z95 * deviation * size
-        entry = {"from": nominal.start, "to": value, "unit": unknown.unit, "interval": [value - half, value + half]}
-        found[unknown.key] = entry
-    return found
 
 
 def minor(evidence: Evidence) -> dict[str, Any]:
@@ -270,7 +237,7 @@ def extended_model(diagnosis: Diagnosis) -> AxisModel | None:
     if evidence is None:
         return None
     fit = evidence.fit
-    document: Document = fit.hypothesis.written(fit.coordinates)
+    document: Document = fit.hypothesis.written(told_coordinates(evidence))
     document.pop("disturbance", None)
     values = fit.values
     for place, term in enumerate(fit.hypothesis.terms):

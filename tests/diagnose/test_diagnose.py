@@ -24,12 +24,19 @@ def found_in(seed: int = 1, off: float = 1.0, **hidden: Any) -> dict[str, Any]:
     return diagnosis_document(found)
 
 
-def test_nothing_hidden_is_adequate() -> None:
-    document = found_in(off=1.03)
+def test_nothing_hidden_is_adequate_and_the_model_holds_what_is_told() -> None:
+    model = believed(inertia=0.02 * 1.03)
+    found = diagnose(model, record(believed()))
+    document, extended = diagnosis_document(found), extended_model(found)
     assert document["verdict"] == "adequate"
     assert document["findings"] == []
-    changed = document["recalibrated"]["inertia"]
-    assert changed["to"] == pytest.approx(0.02, rel=0.005)
+    changed = document["recalibrated"]
+    assert changed["inertia"]["to"] == pytest.approx(0.02, rel=0.005)
+    assert extended is not None
+    assert extended.inertia == changed["inertia"]["to"]
+    for key, value in model.friction.model_dump().items():
+        to = changed.get(f"friction.{key}", {"to": value})["to"]
+        assert getattr(extended.friction, key) == (pytest.approx(to, rel=1e-9) if key != "kind" else to)
 
 
 def test_asymmetry_is_named() -> None:

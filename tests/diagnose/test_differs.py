@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from servod.diagnose.base import base_unknowns
-from servod.diagnose.document import differs
+from servod.diagnose.recalibrated import differs, within
 from tests.diagnose.axes import believed
 
 
@@ -26,3 +27,10 @@ def test_a_drift_of_the_model_may_be_none_in_other_recordings(per_s: float) -> N
     assert (drift.low, drift.high) == (min(per_s, 0.0), max(per_s, 0.0))
     assert drift.value(drift.coordinate(drift.start)) == per_s
     assert all(u.key != "offset_drift.per_s" for u in base_unknowns(believed()))
+
+
+def test_several_small_changes_together_may_be_told() -> None:
+    """Half a standard deviation each: together one in four such by chance, unless they are known to go together."""
+    off = np.array([0.5, -0.5])
+    assert within(off, np.eye(2))
+    assert not within(off, np.array([[1.0, 0.99], [0.99, 1.0]]))
