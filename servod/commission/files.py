@@ -23,6 +23,8 @@ RIVALS, TUNING = "rivals", "tuning.json"
 TRACKING, RUNS = "tracking.json", "runs"
 REPORT, PICTURES = "report.html", "pictures"
 RESULT = "commission.json"
+#: What steps had left that are done anew.
+EARLIER = "earlier"
 
 
 def write_text(path: Path, text: str) -> None:

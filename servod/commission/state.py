@@ -16,6 +16,7 @@ from typing import Any
 
 from pydantic import Field
 
+from servod.commission.files import EARLIER, RUNS
 from servod.errors import BadInput, Unreachable
 from servod.gain_store import write_file
 from servod.yaml12 import Strict, read_text, validate
@@ -74,9 +75,17 @@ class State:
         there = all((self.folder / name).exists() for name in {*outputs, *record.files_sha256})
         return there and record.inputs_sha256 == digest(inputs)
 
-    def begin(self, step: str) -> None:
-        """The step is not done: from here on its files are whatever an interruption leaves of them."""
-        if step in self._content.steps:
+    def begin(self, step: str, outputs: Sequence[str]) -> None:
+        """The step is not done, and nothing in its place says that it is, should it end with a no or not at all.
+
+        What it had left goes to the folder EARLIER, what an interruption left of it goes. Its runs stay: they are data
+        that say themselves what they are of.
+        """
+        record = self._content.steps.get(step)
+        for name in outputs:
+            if (self.folder / name).is_file() and not name.startswith(f"{RUNS}/"):
+                self._clear(name, keep=record is not None)
+        if record:
             others = {name: record for name, record in self._content.steps.items() if name != step}
             self._content = self._content.model_copy(update={"steps": others})
             self._write()
@@ -87,6 +96,15 @@ class State:
         done = StepRecord(inputs_sha256=digest(inputs), seconds=round(seconds, 3), files_sha256=files)
         self._content = self._content.model_copy(update={"steps": self._content.steps | {step: done}})
         self._write()
+
+    def _clear(self, name: str, keep: bool) -> None:
+        """Take a file out of the way of its successor."""
+        if not keep:
+            (self.folder / name).unlink()
+            return
+        aside = self.folder / EARLIER / name
+        aside.parent.mkdir(parents=True, exist_ok=True)
+        (self.folder / name).replace(aside)
 
     def _load(self) -> _Content:
         try:

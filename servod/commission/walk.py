@@ -110,7 +110,7 @@ def run(walk: Walk, steps: tuple[Step, ...]) -> State:
             if step.name not in walk.options.again and state.done(step.name, inputs, step.outputs(walk)):
                 walk.say(f"{step.title}: done before")
                 continue
-            state.begin(step.name)
+            state.begin(step.name, step.outputs(walk))
             started = time.monotonic()
             try:
                 step.run(walk)

@@ -6,7 +6,7 @@ import itertools
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +43,7 @@ class Copy:
     runs: list[str]
     interrupt: bool = False
     more: tuple[str, ...] = ()
+    says_no: bool = False
 
     @property
     def title(self) -> str:
@@ -57,6 +58,8 @@ class Copy:
     def run(self, walk: Walk) -> None:
         if self.interrupt:
             raise KeyboardInterrupt
+        if self.says_no:
+            raise AnswerIsNo("no")
         self.runs.append(self.name)
         before = walk.path(self.source).read_text() if self.source else ""
         for name in self.outputs(walk):
@@ -137,6 +140,24 @@ def test_an_interrupted_repetition_is_no_edited_file(tmp_path: Path) -> None:
     runs: list[str] = []
     run(walk(tmp_path), chain(runs))
     assert runs == ["two"]
+
+
+@pytest.mark.parametrize("way_out", ["no", "interrupt"])
+def test_a_step_that_fails_leaves_nothing_of_its_earlier_answer_in_place(way_out: str, tmp_path: Path) -> None:
+    runs: list[str] = []
+    steps = (Copy("one", None, runs), Copy("two", "one.txt", runs))
+    run(walk(tmp_path), steps[:1])
+    (tmp_path / "two.txt").write_text("half of it\n")
+    run(walk(tmp_path), steps)
+    assert not (tmp_path / "earlier").exists()
+    earlier = (tmp_path / "two.txt").read_text()
+    failing = (steps[0], replace(steps[1], interrupt=way_out == "interrupt", says_no=way_out == "no"))
+    with pytest.raises((KeyboardInterrupt, AnswerIsNo)):
+        run(walk(tmp_path, again=("two",)), failing)
+    assert not (tmp_path / "two.txt").exists() and (tmp_path / "one.txt").exists()
+    assert (tmp_path / "earlier" / "two.txt").read_text() == earlier
+    run(walk(tmp_path), steps)
+    assert (tmp_path / "two.txt").read_text() == (tmp_path / "earlier" / "two.txt").read_text() == earlier
 
 
 def test_only_a_step_can_be_done_again(tmp_path: Path) -> None:

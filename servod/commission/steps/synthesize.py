@@ -40,6 +40,7 @@ class Synthesize:
 
     def run(self, walk: Walk) -> None:
         """Raises AnswerIsNo when the demands cannot be met and no relaxation was agreed to."""
+        walk.path(INFEASIBLE).unlink(missing_ok=True)
         model = load_axis_model(walk.path(MODEL))
         wishes = Wishes(uncertainty=uncertainty_of(model), **_loop(walk))
         taken: Relaxation | None = None

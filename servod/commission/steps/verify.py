@@ -29,7 +29,7 @@ class Verify:
         return {**walk.hashes(DESIGN), "plants": walk.options.plants, "seed": SEED, "tool": source_sha256(VERIFIES)}
 
     def run(self, walk: Walk) -> None:
-        """Raises AnswerIsNo when the set is not valid; then nothing is left but the document."""
+        """Raises AnswerIsNo when the set is not valid; then the document stands alone, without a set to deploy."""
         gains = load_gains(walk.path(DESIGN))
         with walk.progress(self.title) as tell:
             tell(f"{walk.options.plants} plants", 0.1)
