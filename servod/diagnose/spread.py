@@ -17,6 +17,9 @@ Array = NDArray[np.float64]
 #: Error of any estimate that steps of a sample and forms that are not quite the axis's make, as a share of it.
 MODEL_ERROR = 0.006
 
+#: By how much worse steps of a sample make the bristle's stiffness and damping, which act for some samples at a time.
+BRISTLE, BRISTLE_ERROR = ("friction.sigma0", "friction.sigma1"), 2.0
+
 #: Torques of the model's own, which no recording tells from a common factor on all of them and on the command.
 TORQUES = (
     "inertia",
@@ -44,8 +47,8 @@ def jackknife(fit: Fit, held: HeldOut) -> Array:
 
 
 def model_error(fit: Fit) -> Array:
-    """MODEL_ERROR of each value; of the sines of a term, of their common size; of an order, over the range."""
-    sizes = np.ones(len(fit.coordinates))
+    """MODEL_ERROR of each value, more for the bristle; of a sine by the size of its term, of orders over the range."""
+    sizes = np.array([BRISTLE_ERROR if unknown.key in BRISTLE else 1.0 for unknown in fit.hypothesis.unknowns])
     linear = np.array([unknown.size != 0.0 for unknown in fit.hypothesis.unknowns])
     sizes[linear] = np.abs(fit.coordinates[linear])
     for place, term in enumerate(fit.hypothesis.terms):
