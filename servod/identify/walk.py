@@ -87,6 +87,8 @@ def _experiments(bench: Bench, tell: Tell) -> None:
     found = [abs(break_away_fit.torque_of(break_away.search(bench, sign))) for sign in (1.0, -1.0)]
     tell("presliding", 0.07)
     _rock(bench, (found[0], found[1]))
+    slides = break_away_fit.fit([ramp for ramp in bench.of(Kind.BREAK_AWAY) if not ramp.settings["search"]])
+    rocked = presliding_fit.fit(of_kind(bench.traces, Kind.PRESLIDING), slides)
     tell("kicks", 0.2)
     first = kick_fit.fit(kick.run(bench, (found[0], found[1])))
     tell("frequency response", 0.25)
@@ -96,8 +98,6 @@ def _experiments(bench: Bench, tell: Tell) -> None:
     tell("bristle damping", 0.38)
     bristle.run(bench, min(found))
     tell("friction map", 0.42)
-    slides = break_away_fit.fit([ramp for ramp in bench.of(Kind.BREAK_AWAY) if not ramp.settings["search"]])
-    rocked = presliding_fit.fit(of_kind(bench.traces, Kind.PRESLIDING), slides)
     gains = feedback(config, answer.inertia.value, answer.delay_s.value + answer.lag_s.value, STIFF)
     friction_map.run(bench, gains, slides, break_away_rad(slides, rocked))
     bench.go_to(0.0, gains, 0.3 * bench.bounds.speed_rad_s)

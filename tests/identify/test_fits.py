@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from servod.axis_model import AxisModel
-from servod.identify.estimate import estimate, jackknife, sandwich
-from servod.identify.fits import cogging, curve, elastic, noise, response
+from servod.errors import AnswerIsNo
+from servod.identify.estimate import Estimate, estimate, jackknife, sandwich
+from servod.identify.fits import cogging, curve, elastic, noise, presliding, response
+from servod.identify.fits.break_away import BreakAwayFit
 from servod.identify.fits.bristle_lag import Bristle, dry_columns, follow
 from servod.identify.fits.elastic import Elastic
 from servod.identify.fits.friction_map import Side
@@ -216,6 +218,41 @@ def test_the_intervals_of_the_curve_are_the_scatter_of_its_nodes():
     ratio = np.median(halves, axis=0)[told] / (2.09 * np.std(values, axis=0)[told])
     assert np.all((ratio > 0.65) & (ratio < 1.5))
     assert np.all(np.mean(np.abs(values - known) <= halves, axis=0)[told] >= 0.85)
+
+
+def bursts(counts_per_turn: int, rng: np.random.Generator) -> list[Trace]:
+    """Presliding of a joint of 950 N*m/rad at the share for coarse encoders, each burst anywhere within a count."""
+    friction = {"kind": "lugre", "sigma0": 950.0, "sigma1": 1.0, "coulomb": 0.045, "static": 0.07}
+    plant = Plant(validate({"inertia": 1e-3, "delay_s": 0.0, "friction": friction}, AxisModel, "joint"))
+    t, way = np.arange(1000) * PERIOD_S, []
+    torque = 0.62 * 0.07 * np.sin(2.0 * np.pi * 8.0 * t)
+    for u in torque:
+        way.append(plant.position_rad)
+        plant.advance(float(u), PERIOD_S)
+    resolution_rad = 2.0 * np.pi / counts_per_turn
+    settings = {"frequency_hz": 8.0, "from_s": 0.25, "cycles": 5.0, "share": 0.62, "resolution_rad": resolution_rad}
+    made = []
+    for place in rng.uniform(0.0, resolution_rad, 11):
+        x = np.round((np.array(way) + place) / resolution_rad) * resolution_rad
+        made.append(Trace(Kind.PRESLIDING, t, torque, x, x, torque, torque, x, settings))
+    return made
+
+
+SLIDES = BreakAwayFit(Estimate(0.07, 0.068, 0.072, "N*m"), Estimate(0.07, 0.068, 0.072, "N*m"))
+
+
+@pytest.mark.parametrize("bits", [16, 17, 20])
+def test_stiffness_by_an_encoder_that_shows_a_count_or_more(bits):
+    found = presliding.fit(bursts(2**bits, np.random.default_rng(bits)), SLIDES).stiffness
+    assert found.holds(950.0)
+    assert found.half_width < 0.2 * found.value
+
+
+@pytest.mark.parametrize("counts", [16_384, 10_000, 1_000])
+def test_stiffness_by_an_encoder_that_is_too_coarse_is_said_not_to_be_identifiable(counts):
+    for seed in range(6):
+        with pytest.raises(AnswerIsNo, match=r"not identifiable with this encoder: .* counts of .* or more"):
+            presliding.fit(bursts(counts, np.random.default_rng(seed)), SLIDES)
 
 
 @pytest.mark.parametrize("counts", [0.05, 0.2, 0.33, 0.5, 1.0, 5.0])

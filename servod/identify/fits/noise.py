@@ -52,7 +52,8 @@ def fit(trace: Trace) -> NoiseFit:
     encoder = _encoder(_variance(trace.position_rad), len(trace), trace.settings["resolution_rad"])
     torque = _variance(trace.torque_actual_nm)
     note = "" if torque.value > 0.0 else "no reading changed: the noise is hidden below the drive's step"
-    return NoiseFit(encoder, Estimate(*(math.sqrt(part) for part in torque), "N*m", note))
+    value, low, high = (math.sqrt(part) for part in torque)
+    return NoiseFit(encoder, Estimate(value, low, high, "N*m", note))
 
 
 def beside_rounding(low: float, high: float) -> tuple[float, float]:

@@ -30,6 +30,12 @@ ALLOWANCE = 0.02
 #: Share of a count that may be left of the encoder's steps in the displacement from peak to peak.
 STEP_SHARE = 0.1
 
+#: Wider than this share of its value, the stiffness counts as not identified; where the encoder is why, a displacement
+#: of so many counts from peak to peak would tell it.
+WIDEST_SHARE, ENOUGH_COUNTS = 0.3, 2.0
+#: What bursts that hardly ever pass an encoder step show of their displacement, in counts, is no less than this.
+LEAST_COUNTS = 0.1
+
 
 class PreslidingFit(NamedTuple):
     """Stiffness c0 in N*m/rad, and the averaged curve: torque over displacement, one cycle."""
@@ -66,7 +72,10 @@ def bend_factor(amplitude_nm: float, positive_nm: float, negative_nm: float) -> 
 
 
 def fit(bursts: Sequence[Trace], break_away: BreakAwayFit) -> PreslidingFit:
-    """c0 over all bursts that stayed below break-away. Raises AnswerIsNo when none did."""
+    """c0 over all bursts that stayed below break-away.
+
+    Raises AnswerIsNo when none did, or when the encoder shows too little of them.
+    """
     used = [b for b in bursts if len(_steady(b)) > 1]
     widest = max((b.settings["share"] for b in used), default=0.0)
     used = [b for b in used if b.settings["share"] == widest]
@@ -75,8 +84,11 @@ def fit(bursts: Sequence[Trace], break_away: BreakAwayFit) -> PreslidingFit:
     responses = [_response(b) for b in used]
     amplitude = float(np.mean([abs(u) for u, _ in responses]))
     bend = bend_factor(amplitude, break_away.positive.value, break_away.negative.value)
-    curve = _curve(used)
-    unseen = math.hypot(ALLOWANCE, _sensitivity(amplitude, break_away, bend), _steps(used[0], curve[0]))
+    resolution_rad, way_rad = used[0].settings["resolution_rad"], 2.0 * abs(sum(x for _, x in responses)) / len(used)
+    if way_rad == 0.0:
+        raise _too_coarse(resolution_rad, way_rad)
+    steps = STEP_SHARE * resolution_rad / way_rad  # a few bursts do not average them out entirely
+    unseen = math.hypot(ALLOWANCE, _sensitivity(amplitude, break_away, bend), steps)
 
     def stiffness(parts: Sequence[tuple[complex, complex]]) -> Array:
         torque, way = sum(u for u, _ in parts), sum(x for _, x in parts)
@@ -84,12 +96,20 @@ def fit(bursts: Sequence[Trace], break_away: BreakAwayFit) -> PreslidingFit:
 
     value, deviation = jackknife(stiffness, responses)
     result = estimate(float(value[0]), float(deviation[0]), len(used) - 1, "N*m/rad", share=unseen)
-    return PreslidingFit(result, bend, *curve)
+    if not result.half_width <= WIDEST_SHARE * result.value:
+        raise _too_coarse(resolution_rad, way_rad)
+    return PreslidingFit(result, bend, *_curve(used))
 
 
-def _steps(burst: Trace, way: Array) -> float:
-    """Relative half width for the encoder's steps, which a few bursts do not average out entirely."""
-    return STEP_SHARE * burst.settings["resolution_rad"] / float(np.ptp(way))
+def _too_coarse(resolution_rad: float, way_rad: float) -> AnswerIsNo:
+    """What to say where the displacement below break-away is lost in steps or noise of the encoder."""
+    counts = max(way_rad / resolution_rad, LEAST_COUNTS)
+    wanted = 2.0 * math.pi / resolution_rad * ENOUGH_COUNTS / counts
+    remedy = f"fit an encoder of {wanted:.0f} counts per turn or more" if counts < ENOUGH_COUNTS else "quieten what shakes the joint or its reading"
+    return AnswerIsNo(
+        "the bristles' stiffness is not identifiable with this encoder: below break-away the joint moves by some "
+        f"{counts:.1g} counts of {1e6 * resolution_rad:.3g} urad; {remedy}"
+    )
 
 
 def _sensitivity(amplitude: float, break_away: BreakAwayFit, bend: float) -> float:
