@@ -31,8 +31,9 @@ ALLOWANCE = 0.02
 STEP_SHARE = 0.1
 
 #: Wider than this share of its value, the stiffness counts as not identified; where the encoder is why, a displacement
-#: of so many counts from peak to peak would tell it.
-WIDEST_SHARE, ENOUGH_COUNTS = 0.3, 2.0
+#: of so many counts from peak to peak would tell it. (Two would do; of less than one, the steps show up to twice as
+#: much as there is.)
+WIDEST_SHARE, ENOUGH_COUNTS = 0.3, 4.0
 #: What bursts that hardly ever pass an encoder step show of their displacement, in counts, is no less than this.
 LEAST_COUNTS = 0.1
 
@@ -105,7 +106,9 @@ def _too_coarse(resolution_rad: float, way_rad: float) -> AnswerIsNo:
     """What to say where the displacement below break-away is lost in steps or noise of the encoder."""
     counts = max(way_rad / resolution_rad, LEAST_COUNTS)
     wanted = 2.0 * math.pi / resolution_rad * ENOUGH_COUNTS / counts
-    remedy = f"fit an encoder of {wanted:.0f} counts per turn or more" if counts < ENOUGH_COUNTS else "quieten what shakes the joint or its reading"
+    remedy = "quieten what shakes the joint or its reading"
+    if counts < ENOUGH_COUNTS:
+        remedy = f"fit an encoder of {wanted:.2g} counts per turn or more"
     return AnswerIsNo(
         "the bristles' stiffness is not identifiable with this encoder: below break-away the joint moves by some "
         f"{counts:.1g} counts of {1e6 * resolution_rad:.3g} urad; {remedy}"
