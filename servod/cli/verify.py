@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -29,7 +30,12 @@ def verify(
     ] = 1000,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the drawn plants.")] = 1,
     processes: Annotated[int, typer.Option(min=1, max=64, help="Worker processes.")] = 2,
-    write: Annotated[bool, typer.Option(help="Write the certificate, valid or not, into the file.")] = True,
+    write: Annotated[
+        bool,
+        typer.Option(
+            help="Write the certificate, valid or not, into the file; a valid one is not revoked for want of plants."
+        ),
+    ] = True,
     as_json: JsonOption = False,
 ) -> None:
     """Verify GAINS; exit code 1 when the set is not valid."""
@@ -40,7 +46,7 @@ def verify(
 
     checked = load_gains(gains)
     result = verify(checked, plants, seed, processes, str(gains))
-    if write:
+    if write and may_be_written(checked, result):
         write_file(gains, result.certified(checked).to_yaml())
     if as_json:
         print_json(result.document() | {"hashes": hashes(checked)})
@@ -50,6 +56,20 @@ def verify(
     if not result.valid:
         failed = [check.name for check in result.checks if not check.passed]
         raise AnswerIsNo(f"{gains}: not valid: {'; '.join(failed)}")
+
+
+def may_be_written(gains: GainSet, result: Verification) -> bool:
+    """Whether the result may be written: a look with few plants that finds no fault is no reason to end a certificate.
+
+    Says so on standard error where it may not.
+    """
+    from servod.verify.checks import PLANTS_CHECK
+
+    against = [check.name for check in result.checks if not check.passed]
+    if against != [PLANTS_CHECK] or gains.certificate_problem() is not None:
+        return True
+    print("the file keeps its valid certificate: these are too few plants to judge it", file=sys.stderr)
+    return False
 
 
 def hashes(gains: GainSet) -> dict[str, str | list[str] | None]:

@@ -57,6 +57,8 @@ ONE_CYCLE = 1.5  # cycles of delay up to which one cycle must be stood; commands
 EXTRA_DELAY_CYCLES, FACTOR_LIMIT = 4.0, 10.0
 LIMIT_CYCLE_PLANTS = 4
 LEAST_PLANTS = 1000
+#: The check that there were so many: the only one that says nothing against a set.
+PLANTS_CHECK = "plants of the Monte-Carlo"
 
 
 @dataclass(frozen=True)
@@ -223,7 +225,7 @@ def check_monte_carlo(s: Subject) -> Iterator[CertificateCheck]:
 
     A few plants say little: a certificate is issued for `least_plants` and more.
     """
-    yield at_least("plants of the Monte-Carlo", float(s.plants), float(s.least_plants))
+    yield at_least(PLANTS_CHECK, float(s.plants), float(s.least_plants))
     sine = f"do not follow a sine through the fall within {ERROR_SHARE:.0%}"
     step = f"do not end a step of {scale_of(s.design).large_rad:.3g} rad within {SETTLED_SHARE:.0%}"
     for what, good in ((sine, "follows"), ("do not come to rest", "rests"), (step, "arrives")):

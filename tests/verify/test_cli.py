@@ -25,12 +25,21 @@ def test_from_a_model_to_a_certified_set(tmp_path: Path, capsys: pytest.CaptureF
     assert load_gains(out).certificate_problem() == "a certificate that says valid: false"
 
 
-def test_a_set_that_fails_keeps_no_old_certificate(tmp_path: Path) -> None:
+def test_a_quick_look_revokes_no_certificate_and_one_that_finds_a_fault_does(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     result = verify(table1_set(), plants=2, processes=1, least_plants=2)
     out = tmp_path / "gains.yaml"
     out.write_text(result.certified(table1_set()).to_yaml())
     assert load_gains(out).certificate_problem() is None
-    assert run(["verify", str(out), "--plants", "2", "--processes", "1", "--no-write"]) == 1
+    whole = out.read_text()
+    assert run(["verify", str(out), "--plants", "2", "--processes", "1"]) == 1
+    assert out.read_text() == whole
+    assert "keeps its valid certificate" in capsys.readouterr().err
+    certified = load_gains(out)
+    assert certified.design is not None
+    unproven = certified.design.model_copy(update={"regions": []})
+    out.write_text(certified.model_copy(update={"design": unproven}).sealed().to_yaml())
     assert load_gains(out).certificate_problem() is None
     assert run(["verify", str(out), "--plants", "2", "--processes", "1"]) == 1
     assert load_gains(out).certificate_problem() == "a certificate that says valid: false"
