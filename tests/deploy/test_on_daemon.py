@@ -15,8 +15,13 @@ from servod.config import load_config
 from servod.control import ControlClient
 from servod.deploy.cycles import motions_in
 from servod.deploy.deployment import deploy
+from servod.deploy.links import DeployLink, Rows
+from servod.deploy.outcome import Deployment
 from servod.gain_store import Action, GainStore
+from servod.gains import GainSet
 from servod.shipped import shipped
+from servod.verify import validation
+from servod.verify.promise import promise
 from tests.daemon.running import at_rest, running, wait_for
 from tests.deploy.sets import certified
 from tests.synthesize.designs import table1
@@ -37,10 +42,40 @@ link.record([{"kind": "sine", "amplitude_rad": 0.05, "frequency_hz": 0.5, "durat
 """
 
 
-@pytest.mark.timeout(300)  # a synthesis, a certificate and two motions of a quarter of a minute
-def test_a_set_is_deployed_on_a_daemon(tmp_path: Path) -> None:
-    """Half a minute: the motion takes its time twice. A loop that skipped cycles promises nothing, and says so."""
-    gains = certified()
+#: A loop that skips this share of its cycles keeps no promise; it is given another chance.
+BUSY_SHARE, CHANCES = 0.003, 3
+
+
+@pytest.fixture
+def gains(monkeypatch: pytest.MonkeyPatch) -> GainSet:
+    """A certified set whose validation motion, and the promise for it, take half of the usual time."""
+    monkeypatch.setattr(validation, "SLOW_HZ", 2.0)
+    monkeypatch.setattr(validation, "BRISK_PERIODS", 8)
+    found = certified()
+    assert found.design is not None and found.certificate is not None
+    promised = promise(found, found.design, 1)
+    certificate = found.certificate.model_copy(update={"promised": promised})
+    return found.model_copy(update={"certificate": certificate}).sealed()
+
+
+def skipped_share(rows: Rows) -> float:
+    """Share of the cycles that the loop skipped."""
+    return float(rows["missed"][-1] - rows["missed"][0]) / float(rows["cycle"][-1] - rows["cycle"][0])
+
+
+def tried(link: DeployLink, gains: GainSet) -> tuple[Deployment, bool]:
+    """How a trial ended, and whether the loop kept time in it; the last of some chances where it did not."""
+    for _ in range(CHANCES):
+        done = deploy(link, gains, lambda _what, _share: None)
+        kept_time = done.rows_after is not None and skipped_share(done.rows_after) < BUSY_SHARE
+        if done.proven or kept_time:
+            break
+    return done, kept_time
+
+
+@pytest.mark.timeout(300)  # a synthesis, a certificate and up to three times two motions
+def test_a_set_is_deployed_on_a_daemon(gains: GainSet, tmp_path: Path) -> None:
+    """The motion takes its time twice. A loop that skips cycles promises nothing, and says so."""
     assert gains.design is not None
     plant = tmp_path / "plant.yaml"
     plant.write_text(axis_model_yaml(table1()))
@@ -49,10 +84,10 @@ def test_a_set_is_deployed_on_a_daemon(tmp_path: Path) -> None:
         walk_axis = DaemonWalkAxis(axis.socket, load_config(axis.folder / "axis.yaml"))
         assert walk_axis.cutoff_hz == gains.design.velocity_cutoff_hz
         with walk_axis.deployment(tmp_path, gains, gains) as link:
-            done = deploy(link, gains, lambda _what, _share: None)
+            done, kept_time = tried(link, gains)
             assert link.active == ((gains.name, 1) if done.proven else ("demo_pd", 1))
             assert not link.enabled  # as it was found
-    assert done.proven or "skipped" in done.reasons[-1], done.reasons
+    assert done.proven or (not kept_time and "skipped" in done.reasons[-1]), done.reasons
     assert done.ran_before is not None and done.ran_before.present == ("demo_pd", 1)
     assert done.rows_after is not None
     assert len(motions_in(done.rows_after)) == len(motions_in(done.ran_before.rows)) == 3
