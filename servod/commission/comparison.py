@@ -20,8 +20,6 @@ from servod.errors import AnswerIsNo
 from servod.gains import load_gains
 from servod.tracking.stepped import measure
 
-#: The noise under which the laws are scored is not the one that they were tuned in.
-SCORING_SEED = 1000
 #: The law that was synthesized and not tuned, by its row in the comparison.
 DEPLOYED = "deployed"
 
@@ -35,7 +33,7 @@ def measured(
     walk: Walk, axis: VirtualWalkAxis, sets: Mapping[str, Path], cutoff_hz: float, tell: Tell
 ) -> dict[str, dict[str, Any]]:
     """Figures of every gain set by its key; those that ran before under the same conditions are read."""
-    seed = walk.options.seed + SCORING_SEED
+    seed = walk.options.scoring_seed
     hashes = {key: _inputs(axis, file, cutoff_hz, seed) for key, file in sets.items()}
     left = [key for key in sets if not _done(walk, key, hashes[key])]
     jobs = [(axis, sets[key], cutoff_hz, seed, hashes[key], *run_files(walk, key)) for key in left]

@@ -24,9 +24,14 @@ Tell = Callable[[str, float], None]
 Progress = Callable[[str], AbstractContextManager[Tell]]
 
 
+#: From the seed of excitation and virtual noise to those of scoring and of tuning. A seed begins the noise of joint and
+#: encoder as itself and the next number, one of tuning that of its plants as its thousandfold and the next ones.
+SCORING_SEED, TUNING_SEED = 100, 200
+
+
 @dataclass(frozen=True)
 class Options:
-    """What may be chosen of a walk. Seeds of tuning and of scoring differ from `seed` by constants."""
+    """What may be chosen of a walk. No law is scored under noise that it was tuned in, or identified for."""
 
     seed: int = 1
     travel_rad: float | None = None
@@ -38,6 +43,16 @@ class Options:
     processes: int = 2
     least_plants: int = 1000  # with fewer no certificate is issued
     again: tuple[str, ...] = ()  # steps that are done anew, whatever was done before
+
+    @property
+    def tuning_seed(self) -> int:
+        """Begins plants, noise and search of the rivals' tuning."""
+        return self.seed + TUNING_SEED
+
+    @property
+    def scoring_seed(self) -> int:
+        """Begins the noise of the comparison on the axis."""
+        return self.seed + SCORING_SEED
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from servod.synthesize.intervals import uncertainty_of
 from servod.tracking.metrics import SETTLE_S, Array
 from servod.tracking.motions import STEPS_MRAD, paper_rows
 from servod.tune.laws import Axis
+from servod.tune.plan import TunePlan
 from servod.verify.plants import drawn
 from servod.verify.trials import RIPPLE_LIMIT_RAD
 
@@ -92,8 +93,8 @@ class Trial:
         """Torque and encoder noise of each plant: the same for every gain set."""
         plan = self.axis.plan
         return [
-            noise_series(plant.noise, len(self.motion), plan.period_s, 1000 * plan.seed + i)
-            for i, plant in enumerate(self.plants)
+            noise_series(plant.noise, len(self.motion), plan.period_s, seed)
+            for plant, seed in zip(self.plants, noise_seeds(plan), strict=True)
         ]
 
     @cached_property
@@ -143,6 +144,11 @@ class Trial:
             float(np.sqrt(np.mean(np.diff(torque_nm[start:end]) ** 2))),
             max(float(np.ptp(position_rad[e - ripple : e])) for e in ends),
         )
+
+
+def noise_seeds(plan: TunePlan) -> list[int]:
+    """What begins the noise of each plant."""
+    return [1000 * plan.seed + i for i in range(plan.plants)]
 
 
 def with_noise(model: AxisModel, resolution_rad: float) -> AxisModel:

@@ -7,7 +7,11 @@ from pathlib import Path
 from servod.commission.axis import VirtualWalkAxis
 from servod.commission.comparison import measured, run_files
 from servod.commission.files import read_json, write_json, write_text
+from servod.commission.walk import Options
 from servod.deploy.virtual import pd_set
+from servod.paper.rivals import SCORING_SEED_OFFSET
+from servod.tune.plan import TunePlan
+from servod.tune.trial import noise_seeds
 from tests.commission.test_state import walk
 from tests.synthesize.designs import table1
 
@@ -32,3 +36,18 @@ def test_nothing_is_measured_twice(tmp_path: Path) -> None:
     assert again(2.0) == "as before"
     assert again(2.1) != "as before"
     assert read_json(figures)["inputs_sha256"] != kept["inputs_sha256"]
+
+
+def test_scoring_tuning_and_identification_share_no_noise() -> None:
+    assert (Options().seed, Options().scoring_seed, Options().tuning_seed) == (1, 101, 201)
+    for seed in (*range(1200), 10**6, 10**6 + 199):
+        options = Options(seed=seed)
+        tuning = TunePlan(seed=options.tuning_seed)
+        ranges = (
+            {seed, seed + 1},  # joint and encoder of the virtual axis
+            {options.scoring_seed, options.scoring_seed + 1},
+            {tuning.seed, *noise_seeds(tuning)},
+        )
+        assert sum(map(len, ranges)) == len(set.union(*ranges)), seed
+    paper = TunePlan(seed=1)
+    assert {1 + SCORING_SEED_OFFSET, 2 + SCORING_SEED_OFFSET}.isdisjoint({1, 2, *noise_seeds(paper)})

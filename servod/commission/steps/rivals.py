@@ -38,7 +38,7 @@ class Rivals:
     def inputs(self, walk: Walk) -> dict[str, Any]:
         """The model, the filter of the deployed set, and the budget."""
         o = walk.options
-        return {**walk.hashes(MODEL, GAINS), "seed": o.seed, "budget": o.budget, "compared": compared(walk)}
+        return {**walk.hashes(MODEL, GAINS), "seed": o.tuning_seed, "budget": o.budget, "compared": compared(walk)}
 
     def run(self, walk: Walk) -> None:
         """All of them; the walk keeps those that it will measure."""
@@ -47,7 +47,7 @@ class Rivals:
             return
         o, model = walk.options, load_axis_model(walk.path(MODEL))
         with walk.progress(self.title) as tell:
-            plan = replace(_plan(walk), seed=o.seed, budget=o.budget or BUDGET)
+            plan = replace(_plan(walk), seed=o.tuning_seed, budget=o.budget or BUDGET)
             found = rivals(
                 model, CONTENDERS, seed=plan.seed, budget=plan.budget, tell=tell, plan=plan, processes=o.processes
             )
