@@ -77,7 +77,10 @@ def design_as_told(joint: Joint) -> Found:
 
 
 def design(model: AxisModel) -> GainSet:
-    """The deployed gain set for `model`. Raises AnswerIsNo when there is none."""
+    """The gain set that a deployment would begin with, designed for `model`; it is measured here, not certified.
+
+    Raises AnswerIsNo when there is none.
+    """
     wishes = Wishes(uncertainty=uncertainty_of(model), counts_per_turn=ENCODER_COUNTS)
     gains = synthesize(model, wishes, Options("deployed"))
     if isinstance(gains, Infeasible):
