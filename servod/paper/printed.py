@@ -15,8 +15,6 @@ RMS_MRAD = {"pd_dob": 0.6916, "pd_lugre": 0.5006, "local": 0.3781}
 SINE_HZ, SINE_RAD = 0.1, 0.1
 #: Steps of section V.
 STEPS_MRAD = (100.0, 10.0)
-#: l_f of the LuGre observer: the value that oscillated at 10 mrad, and the one that did better.
-L_F_OSCILLATES, L_F_BETTER = 0.35, 0.25
 
 #: K_i of Table I for the seven inner sets v_i = -0.2 to 0.12 rad/s; read as l_i, none at the outer two.
 L_I = (0.0, 0.0, -0.5, -1.5, -2.5, -1.5, 0.5, 0.0, 0.0)

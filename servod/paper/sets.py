@@ -15,9 +15,6 @@ from servod.report.figures.sets import local_law
 from servod.shipped import shipped
 from servod.synthesize.gain_set import with_feedback
 
-#: Share of the printed K_i that the shipped sets of Table I use as l_i, all positive.
-SHIPPED_L_SCALE = 0.02
-
 
 def shipped_set(name: str) -> GainSet:
     """A gain set of the folder gains."""

@@ -15,7 +15,7 @@ from servod.report.figure import Array, Axis, Colour, Curve, Figure, Panel, Scal
 from servod.verify.steady_friction import SteadyFriction, steady_friction
 
 _POINTS = 400
-MRAD, MILLI = 1e3, 1e3
+MILLI = 1e3
 
 
 def dahl_curve(found: PreslidingFit, truth: AxisModel | None = None, name: str = "dahl_curve") -> Figure:
