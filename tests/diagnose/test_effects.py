@@ -51,3 +51,11 @@ def test_explained(name: str) -> None:
     assert all(found[key] for key in ("statement", "equation", "source", "shows", "experiment"))
     assert set(found["confused_with"]) <= set(NAMES)
     assert name not in found["confused_with"]
+
+
+def test_every_number_of_a_spring_has_its_own_unit() -> None:
+    for term in effect("spring").terms(scene()):
+        told = {r.name: r.unit for r in term.tell(scene().document, [u.start for u in term.unknowns])}
+        assert told["stiffness"] == "N·m/rad"
+        assert told["rest"] == "rad"
+        assert told.get("cubic", "N·m/rad·1/rad²") == "N·m/rad·1/rad²"

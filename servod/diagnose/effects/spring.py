@@ -18,7 +18,8 @@ def terms(scene: Scene) -> list[Term]:
     unit = f"{scene.force}/{scene.length}"
     stiffness = share("stiffness", 0.2 * size / half, 0.0, most / half, size / half, unit)
     torque = share("torque_at_middle", 0.0, -most, most, size, scene.force)
-    cubic = share("cubic", 0.0, 0.0, most / half**3, size / half**3, unit + f"·1/{scene.length}²")
+    units = {"stiffness": unit, "rest": scene.length, "cubic": unit + f"·1/{scene.length}²"}
+    cubic = share("cubic", 0.0, 0.0, most / half**3, size / half**3, units["cubic"])
 
     def written(values: Sequence[float]) -> dict[str, float]:
         rest = middle - values[1] / max(values[0], 1e-3 * size / half)
@@ -33,13 +34,12 @@ def terms(scene: Scene) -> list[Term]:
         document["spring"] = {"stiffness": values[0], "rest": middle + values[1], "cubic": values[2]}
 
     def tell(_document: Document, values: Sequence[float]) -> list[Reported]:
-        units = {"stiffness": unit, "rest": scene.length, "cubic": unit + f"·1/{scene.length}²"}
         return [Reported(key, value, units[key]) for key, value in written(values).items()]
 
     def tell_centred(_document: Document, values: Sequence[float]) -> list[Reported]:
         found: Document = {}
         write_centred(found, values)
-        return [Reported(key, value, unit) for key, value in found["spring"].items()]
+        return [Reported(key, value, units[key]) for key, value in found["spring"].items()]
 
     shift = share("shift", 0.0, -2.0 * scene.reach, 2.0 * scene.reach, half, scene.length)
     return [
