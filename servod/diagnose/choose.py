@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from time import monotonic
 
 import numpy as np
@@ -18,11 +18,13 @@ from servod.axis_model import AxisModel
 from servod.diagnose.at_end import at_end
 from servod.diagnose.base import base_unknowns, document_of
 from servod.diagnose.candidates import Candidate, Trials
+from servod.diagnose.choice import Choice, Entry
 from servod.diagnose.excited import unseen
 from servod.diagnose.fit import Fit, Fitter, Weighing, long_run, scale_of
 from servod.diagnose.floor import noise_floor, stretch_means
 from servod.diagnose.hypothesis import Hypothesis
 from servod.diagnose.level import is_level, on_bound
+from servod.diagnose.merit import SURE_SHARE, Merit, acting, worth_naming
 from servod.diagnose.predict import Predictor
 from servod.diagnose.scene import Scene
 from servod.diagnose.shortened import shortened
@@ -30,28 +32,11 @@ from servod.diagnose.shortened import shortened
 Array = NDArray[np.float64]
 Tell = Callable[[str], None]
 
-#: Worth naming (outside contract): share of the explainable error, or share of Coulomb friction where it acts; and the
-#: least torque that any finding must carry there, which several effects of one per cent each stay below.
-WORTH_SHARE, WORTH_TORQUE, LEAST_TORQUE = 0.05, 0.03, 0.018
-
-#: The least torque of a parameter beyond its own level, which acts for some milliseconds behind a reversal.
-LEVEL_TORQUE = 0.003
-
-#: A term that takes less than WORTH_SHARE must take this share of what is left above the floor: a name that leaves most
-#: of the rest as it was is not what the rest is made of.
-LEAST_OF_LEFT = 0.25
-
 #: Robust deviations beyond which a mismatch is a blow, and counts no more for what is left.
 BLOW = 8.0
 
-#: Rows that show where an effect acts: its torque there is at least this quantile of what it changes.
-ACTS_AT = 0.98
-
 #: Most terms.
 MOST_TERMS = 5
-
-#: A fit that takes so much of the explainable error counts though its last steps still improved it.
-SURE_SHARE = 0.3
 
 #: Nothing worth naming is left when the mismatch above the floor, and its mean over any short stretch but this share of
 #: them, are below these shares of dry friction.
@@ -63,53 +48,12 @@ CLOSE = 0.3
 #: Steps of a fit, in each of two scales.
 STEPS = 12
 
+#: Times that such a fit goes on where a term deserves it, and the share of what it takes that is as good as nothing:
+#: blows behind a gap come a sample earlier or later, and no step ends exactly.
+MORE, NEAR = 2, 0.05
+
 #: Scale of the mismatch is never taken smaller than this share of dry friction.
 LEAST_SCALE = 0.002
-
-
-@dataclass(frozen=True)
-class Merit:
-    """What a term is worth: its share of the explainable error, its torque as a share of dry friction, its cost gain.
-
-    `gain` is twice the cost that it saves, in units of noise that counts correlated rows as one; `of_left` its share of
-    what the fit before it had left above the noise floor.
-    """
-
-    share: float
-    of_left: float
-    torque: float
-    gain: float
-
-
-@dataclass(frozen=True)
-class Entry:
-    """How a term came in: what it left of the cost as a share, and the other candidates."""
-
-    left: float
-    rivals: list[Candidate]
-
-
-@dataclass
-class Choice:
-    """The outcome: the fit with all that is named, the fit of the base alone, and for each term how it came in.
-
-    `cut`: time ended the search while something was left.
-    """
-
-    base: Fit
-    fit: Fit
-    merits: list[Merit]
-    entries: list[Entry]
-    minor: dict[str, Merit]
-    floor: float
-    tried: int
-    cut: bool = False
-
-    def drop(self, index: int, less: Fit) -> None:
-        """Take a term out; `less` is the fit without it."""
-        self.fit = less
-        self.merits.pop(index)
-        self.entries.pop(index)
 
 
 class Chooser:
@@ -194,9 +138,8 @@ class Chooser:
         for candidate in candidates:
             if candidate.left > candidates[0].left + CLOSE * (1.0 - candidates[0].left):
                 break
-            settled = self._settled(candidate.fit, present.mismatch)
+            settled, merit = self._to_end(present, self._settled(candidate.fit, present.mismatch))
             self.lower_floor(settled.mismatch)
-            merit = self.merit(present, settled)
             if self._enters(merit, settled):
                 bare = self.less(settled, len(settled.hypothesis.terms) - 1)
                 if self.error(bare.mismatch) < self.error(present.mismatch):
@@ -215,6 +158,18 @@ class Chooser:
         """A candidate's fit settled; its Jacobian serves when it has all rows."""
         known = fit.jacobian if len(fit.jacobian) == len(mismatch) else None
         return self.settled(fit.hypothesis, fit.coordinates, mismatch, known)
+
+    def _to_end(self, present: Fit, settled: Fit) -> tuple[Fit, Merit]:
+        """A fit that deserves to come in, fitted on until it is at its end or nearly; and what it is worth."""
+        merit = self.merit(present, settled)
+        for _ in range(MORE):
+            if settled.converged or not self.deserves(merit, settled):
+                break
+            further = self._refined(settled, settled.mismatch, len(settled.coordinates))
+            later = self.merit(present, further)
+            near = later.of_left - merit.of_left < NEAR * later.of_left
+            settled, merit = replace(further, converged=further.converged or near), later
+        return settled, merit
 
     def lower_floor(self, mismatch: Array) -> None:
         """Take a mismatch into account that shows a lower floor than those before."""
@@ -265,11 +220,7 @@ class Chooser:
 
     def deserves(self, merit: Merit, fit: Fit, place: int = -1) -> bool:
         """Whether a term (the last one, or the one at `place`) is significant and worth naming."""
-        least, enough = (
-            (LEVEL_TORQUE, LEVEL_TORQUE) if is_level(fit.hypothesis.terms[place]) else (LEAST_TORQUE, WORTH_TORQUE)
-        )
-        worth = merit.share >= WORTH_SHARE or (merit.torque >= enough and merit.of_left >= LEAST_OF_LEFT)
-        return worth and merit.torque >= least and self.significant(merit, fit)
+        return worth_naming(merit, is_level(fit.hypothesis.terms[place])) and self.significant(merit, fit)
 
     def significant(self, merit: Merit, fit: Fit) -> bool:
         """Bayesian information criterion with a correction for the number of starts tried."""
@@ -294,16 +245,6 @@ class Chooser:
         gone = fit.hypothesis.share(index)
         kept = np.delete(fit.coordinates, gone)
         return self.settled(fit.hypothesis.without(index), kept, fit.mismatch, np.delete(fit.jacobian, gone, axis=1))
-
-
-def acting(changed: Array) -> float:
-    """What an effect changes where it acts, N*m: a high quantile, or the root mean square weighted by power.
-
-    A wave has as much of both; a push of a second, or blows behind reversals, have next to nothing at a quantile.
-    """
-    power = float(changed @ changed)
-    weighted = math.sqrt(float(np.sum(changed**4)) / power) if power > 0.0 else 0.0
-    return max(float(np.quantile(changed, ACTS_AT)), weighted)
 
 
 #: Effects that may come in again with another period or place: a second harmonic is no second effect.

@@ -11,8 +11,10 @@ from dataclasses import replace
 from time import monotonic
 
 from servod.diagnose.candidates import Candidate
-from servod.diagnose.choose import Choice, Chooser, Entry, Merit
+from servod.diagnose.choice import Choice, Entry
+from servod.diagnose.choose import Chooser
 from servod.diagnose.fit import Fit
+from servod.diagnose.merit import Merit
 
 #: Only where what is left above the noise floor is this share of dry friction, and this share of what was explainable.
 MUCH_LEFT, LEFT_SHARE = 0.025, 0.08

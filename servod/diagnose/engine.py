@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.axis_model import AxisModel
-from servod.diagnose.choose import Choice, Chooser
+from servod.diagnose.choice import Choice
+from servod.diagnose.choose import Chooser
 from servod.diagnose.detail import detail, much_left
 from servod.diagnose.fit import Fit, Weighing
 from servod.diagnose.held_out import HeldOut, held_out

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.diagnose.candidates import Candidate
-from servod.diagnose.choose import Choice, Chooser, Entry
+from servod.diagnose.choice import Choice, Entry
+from servod.diagnose.choose import Chooser
 from servod.diagnose.effects import effect
 from servod.diagnose.fit import Fit
 from servod.diagnose.predict import Predictor

@@ -14,7 +14,7 @@ import numpy as np
 
 from servod.diagnose.base import BRISTLE_FACTOR, DELAY_S, OFFSET_SHARE, RECALIBRATION, STRIBECK_SHARE
 from servod.diagnose.candidates import Candidate
-from servod.diagnose.choose import Choice
+from servod.diagnose.choice import Choice
 from servod.diagnose.hypothesis import Document, get
 
 #: Below this share of the explainable error no known name may stand: what is there is something else. Real machines
@@ -28,6 +28,9 @@ LEFT_TORQUE, LEFT_SHARE = 0.02, 0.05
 
 #: Shares of dry friction from which the encoder's noise in the mismatch hides what is left, and hides everything.
 HIDES_REST, HIDES_ALL = 0.15, 0.5
+
+#: A delay and a lag that are in together are one finding, by the name of the longer.
+TWINS = {"delay": "actuator_lag", "actuator_lag": "delay"}
 
 #: A rival that leaves at most this many times what the finding leaves cannot be told apart.
 ALIKE = 1.2
@@ -93,7 +96,17 @@ def drowned(found: Verdict, encoder_noise: float, dry: float) -> bool:
 def named_terms(choice: Choice, nominal: Document) -> list[int]:
     """Places of the terms whose effect is at least at its level."""
     fitted = choice.fit.hypothesis.written(choice.fit.coordinates)
-    return [i for i, term in enumerate(choice.fit.hypothesis.terms) if _at_level(term.effect, nominal, fitted)]
+    lesser = _lesser_twin(fitted)
+    terms = enumerate(choice.fit.hypothesis.terms)
+    return [i for i, term in terms if term.effect != lesser and _at_level(term.effect, nominal, fitted)]
+
+
+def _lesser_twin(fitted: Document) -> str | None:
+    """The shorter of a delay and a lag where both are in: together they are one drive that is late, of higher order."""
+    late, lag = get(fitted, "delay.additional_s"), get(fitted, "actuator_lag.time_constant_s")
+    if late == 0.0 or lag == 0.0:
+        return None
+    return "delay" if late < lag else "actuator_lag"
 
 
 def _at_level(effect: str, nominal: Document, fitted: Document) -> bool:
@@ -145,8 +158,11 @@ def _more_unknowns(rival: Candidate, own: int) -> int:
 
 
 def alternatives(choice: Choice, index: int) -> list[str]:
-    """Effects that these data cannot tell apart from a term."""
-    return [rival.effect for rival, ratio in _rivals(choice, index) if ratio <= ALIKE]
+    """Effects that these data cannot tell apart from a term; its twin too where that is in beside it."""
+    terms = choice.fit.hypothesis.terms
+    twin = TWINS.get(terms[index].effect)
+    beside = [term.effect for term in terms if term.effect == twin]
+    return beside + [rival.effect for rival, ratio in _rivals(choice, index) if ratio <= ALIKE and rival.effect != twin]
 
 
 def _rivals(choice: Choice, index: int) -> list[tuple[Candidate, float]]:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from servod.diagnose.base import document_of
-from servod.diagnose.choose import Choice, Chooser
+from servod.diagnose.choice import Choice
+from servod.diagnose.choose import Chooser
 from servod.diagnose.detail import LEAST_TORQUE
 from servod.diagnose.document import diagnosis_document
 from servod.diagnose.effects import effect

@@ -7,7 +7,7 @@ import pytest
 
 from servod.diagnose.at_end import at_end
 from servod.diagnose.base import base_unknowns, document_of
-from servod.diagnose.choose import LEAST_TORQUE, Choice, acting
+from servod.diagnose.choice import Choice
 from servod.diagnose.effects import effect
 from servod.diagnose.effects.disturbance import SHORTEST_S, windows
 from servod.diagnose.effects.disturbance import terms as windows_of
@@ -15,6 +15,7 @@ from servod.diagnose.effects.effect import sine_term
 from servod.diagnose.fit import Fit
 from servod.diagnose.hypothesis import Hypothesis
 from servod.diagnose.intake import taken_in
+from servod.diagnose.merit import LEAST_TORQUE, acting
 from servod.diagnose.predict import Predictor
 from servod.diagnose.scene import Peak, Scene
 from servod.diagnose.verdict import Shares, Verdict, named_terms, verdict

@@ -34,7 +34,7 @@ def windows(mismatch: Array, period_s: float) -> list[tuple[float, int, int]]:
     length = np.arange(count)[None, :] - np.arange(count)[:, None]
     allowed = (length * step * period_s >= SHORTEST_S) & (length <= LONGEST * count)
     power = np.where(allowed, (total[None, :] - total[:, None]) ** 2 / np.maximum(length * step, 1), 0.0)
-    found = []
+    found: list[tuple[float, int, int]] = []
     while len(found) < KEPT and power.max(initial=0.0) > 0.0:
         first, last = (int(i) for i in np.unravel_index(int(np.argmax(power)), power.shape))
         found.append((float(power[first, last]), first * step, last * step - 1))
