@@ -7,7 +7,7 @@ import pytest
 
 from servod.diagnose.at_end import at_end
 from servod.diagnose.base import base_unknowns, document_of
-from servod.diagnose.choice import Choice
+from servod.diagnose.choice import Choice, Entry
 from servod.diagnose.effects import effect
 from servod.diagnose.effects.disturbance import SHORTEST_S, windows
 from servod.diagnose.effects.disturbance import terms as windows_of
@@ -15,10 +15,10 @@ from servod.diagnose.effects.effect import sine_term
 from servod.diagnose.fit import Fit
 from servod.diagnose.hypothesis import Hypothesis
 from servod.diagnose.intake import taken_in
-from servod.diagnose.merit import LEAST_TORQUE, acting
+from servod.diagnose.merit import LEAST_TORQUE, Merit, acting, worth_naming
 from servod.diagnose.predict import Predictor
 from servod.diagnose.scene import Peak, Scene
-from servod.diagnose.verdict import Shares, Verdict, named_terms, verdict
+from servod.diagnose.verdict import Shares, Verdict, alternatives, named_terms, verdict
 from tests.diagnose.axes import believed, record
 
 
@@ -101,3 +101,25 @@ def test_a_window_is_found_where_it_begins_and_ends() -> None:
     (_, first, last), (_, begun, ended) = windows(left, 1e-3)
     assert [first, last, begun, ended] == pytest.approx([4692, 5951, 9000, 9400], abs=50)
     assert windows(left[:100], 1e-3) == []
+
+
+def test_a_drive_that_is_late_has_one_name(scene: Scene) -> None:
+    """A lag of second order is a delay and a lag to a model of first order: the longer names both."""
+    terms = (effect("delay").terms(scene)[0], effect("actuator_lag").terms(scene)[0])
+    hypothesis = Hypothesis(scene.document, base_unknowns(believed()), terms)
+    coordinates = hypothesis.start.copy()
+    for late, lag, places in ((0.002, 0.003, [1]), (0.006, 0.001, [0])):
+        for place, value in ((0, late), (1, lag)):
+            coordinates[hypothesis.share(place)] = terms[place].unknowns[0].coordinate(value)
+        fit = Fit(hypothesis, coordinates, scene.mismatch, 0.0, np.zeros((0, 0)), True)
+        choice = Choice(fit, fit, [], [Entry(0.1, []), Entry(0.1, [])], {}, 0.0, 1)
+        assert named_terms(choice, scene.document) == places
+        assert alternatives(choice, places[0]) == [terms[1 - places[0]].effect]
+
+
+@pytest.mark.parametrize(
+    ("share", "of_left", "torque", "answer"),
+    [(0.08, 0.2, 0.05, False), (0.08, 0.3, 0.05, True), (0.9, 0.2, 0.05, True), (0.9, 0.9, 0.012, False)],
+)
+def test_a_name_takes_a_good_part_of_what_is_left(share: float, of_left: float, torque: float, answer: bool) -> None:
+    assert worth_naming(Merit(share, of_left, torque, 1e4), level=False) is answer
