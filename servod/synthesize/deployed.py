@@ -14,10 +14,11 @@ import numpy as np
 from servod.axis_model import AxisModel
 from servod.gain_design import Design, DesignMode, RegionProof, Uncertainty, Vertex
 from servod.gain_parameters import RegionGains
+from servod.synthesize.guides import TURNING_DISC, turning
 from servod.synthesize.late import too_late
 from servod.synthesize.lmi_deployed import Programme, Solution, synthesise
 from servod.synthesize.regions import OVERLAP_RAD_S, pole_disc
-from servod.verify.proof import region_margin, scaled_vertices
+from servod.verify.proof import region_margin, scaled, scaled_vertices
 from servod.verify.sampled import Array, timing_of
 from servod.verify.steady_friction import SteadyFriction, steady_friction
 from servod.verify.vertices import Span, fed_commands, joints, known_commands
@@ -31,6 +32,9 @@ SLOW_DISCS = (0.985, 0.998)
 #: Torque costs these shares of its weight in Omega_L, the first that is feasible: where the bristle holds the joint,
 #: more gain risks little, but with two cycles of delay too much of it shakes the joint on its bristle.
 LOW_TORQUE_SHARES = (0.6, 2.0)
+#: Position error counts with these shares of its weight once the H2 norm counts where friction falls as well: what that
+#: costs in margin where the bristle is turned over, less position gain gives back.
+FALLING_POSITION_SHARES = (1.0, 0.6)
 POSITION_BANDWIDTH_RAD_S = 120.0  # sets the scale of positions, and with it what alpha and beta mean
 RELAX_STEPS = 6
 
@@ -51,6 +55,7 @@ class Wishes:
     least_decay_per_s: float = 5.0
     least_damping: float = 0.02  # of all poles, up to half the sample rate: more forbids the feedback of past commands
     slow_disc: float | None = None  # pole radius where friction falls; None = the least that is feasible
+    h2_where_it_falls: bool = False  # the H2 norm counts there too: more velocity gain, for curves that fall steeply
     solver: str = "CLARABEL"
 
     @property
@@ -70,6 +75,11 @@ class Wishes:
         for cutoff in self.cutoffs_hz:
             for slow in (self.slow_disc,) if self.slow_disc else SLOW_DISCS:
                 yield replace(self, cutoff_hz=cutoff, slow_disc=slow)
+
+    def steadier(self) -> Iterator[Wishes]:
+        """The same wishes with the H2 norm at every vertex, for a joint whose friction falls too steeply without."""
+        for share in FALLING_POSITION_SHARES:
+            yield replace(self, h2_where_it_falls=True, position_weight=share * self.position_weight)
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,23 +127,27 @@ def scales(friction: SteadyFriction, design: Design) -> tuple[list[float], float
 
 
 def programme(design: Design, proof: RegionProof, wishes: Wishes) -> Programme:
-    """The LMI programme of one region, over the vertices that verification will make anew."""
+    """The LMI programme of one region, over the vertices that verification will make anew, and guides beside them."""
     friction = steady_friction(design.model)
-    found = joints(friction, Span(proof.name, proof.speed_from_rad_s, proof.speed_to_rad_s), wishes.uncertainty)
-    _, a, b, e = scaled_vertices(design, proof)
+    span = Span(proof.name, proof.speed_from_rad_s, proof.speed_to_rad_s)
+    found = joints(friction, span, wishes.uncertainty)
+    a, b, e = scaled(found, design, proof)
+    if wishes.h2_where_it_falls and not span.holds_rest:
+        guides, *beside = turning(design, proof, wishes.overlap[1])
+        found, (a, b, e) = found + guides, [np.concatenate(pair) for pair in zip((a, b, e), beside, strict=True)]
     disc = pole_disc(wishes.least_decay_per_s, wishes.least_damping, wishes.period_s)
-    performs = [j.performs for j in found]
     ringing = 0.0, math.exp(-wishes.least_decay_per_s * wishes.period_s)  # its bristle's damping is the joint's own
     falling = 0.0, wishes.slow_disc or SLOW_DISCS[-1]
+    discs = {"sticking": ringing, "turning": TURNING_DISC}
     return Programme(
         [j.mode for j in found],
-        performs,
+        [j.performs or (wishes.h2_where_it_falls and j.mode == "sliding") for j in found],
         a,
         b,
         e,
         proof.position_weight,
         proof.torque_weight,
-        [falling if not j.performs else ringing if j.mode == "sticking" else disc for j in found],
+        [discs.get(j.mode, disc if j.performs else falling) for j in found],
         wishes.solver,
         2 + fed_commands(timing_of(design)),
     )
@@ -178,7 +192,8 @@ def proven(design: Design, frame: RegionProof, p: Programme, solution: Solution)
         )
         for i in range(len(found))
     ]
-    slack = {mode: _rows(matrix) or [] for mode, matrix in solution.slack.items()}
+    proof_modes = {joint.mode for joint in found}  # what guided the solution beside them is no part of the proof
+    slack = {mode: _rows(matrix) or [] for mode, matrix in solution.slack.items() if mode in proof_modes}
     solved = {"feedback": solution.feedback.tolist(), "slack": slack, "vertices": vertices}
     return RegionProof.model_validate(frame.model_dump() | solved)
 
@@ -210,6 +225,17 @@ def regions(model: AxisModel, wishes: Wishes) -> Design | None:
     return None
 
 
+def designs(model: AxisModel, wishes: Wishes) -> Iterator[Design]:
+    """Every design, best choice first, each before the ones that are steadier where friction falls."""
+    for choice in wishes.choices():
+        for wish in (choice, *choice.steadier()):
+            design = regions(model, wish)
+            if design is not None:
+                yield design
+            elif not wish.h2_where_it_falls:
+                break
+
+
 def region_gains(proof: RegionProof, input_scale_nm: float) -> RegionGains:
     """The law's gains from the scaled feedback: u = -K*(k_x*x + k_v*v_f) - sum k_u(i)*u(k-i)."""
     gains = [-proof.torque_scale_nm * k / s for k, s in zip(proof.feedback, proof.scale, strict=False)]
@@ -226,7 +252,7 @@ def clashing_vertices(design: Design, span: Span, wishes: Wishes) -> Iterator[st
     feedback = np.concatenate([first_feedback(p), np.zeros(p.a.shape[-1] - p.fed)])
     poles = np.linalg.eigvals(p.a + p.b[:, :, None] * feedback)
     found, _, _, _ = scaled_vertices(design, frame)
-    for joint, roots, (centre, radius) in zip(found, poles, p.discs, strict=True):
+    for joint, roots, (centre, radius) in zip(found, poles, p.discs, strict=False):
         outside = float(np.abs(roots - centre).max()) / radius
         if outside >= 1.0:
             yield f"{span.name}: {joint.name}: poles at {outside:.3f} of the disc (1 allowed)"

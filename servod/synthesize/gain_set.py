@@ -21,7 +21,7 @@ from servod.gain_parameters import (
     WeightShape,
 )
 from servod.gains import GainSet
-from servod.synthesize.deployed import Infeasible, Wishes, explain, region_gains, regions
+from servod.synthesize.deployed import Infeasible, Wishes, designs, explain, region_gains
 from servod.synthesize.feedforward import position_feedforward
 from servod.synthesize.integral_gain import designed
 from servod.synthesize.local_sets import (
@@ -35,14 +35,18 @@ from servod.synthesize.local_sets import (
     sets_at,
 )
 from servod.synthesize.moving_observer import with_moving_observer
-from servod.synthesize.observer_width import OBSERVERS_RAD_S, with_observer, with_widest_observer
+from servod.synthesize.observer_width import (
+    OBSERVERS_RAD_S,
+    bandwidth_of,
+    is_enough,
+    with_observer,
+    with_widest_observer,
+)
 from servod.synthesize.origin import provenance
 from servod.synthesize.resting_share import SHARES, with_share_at_rest
 from servod.verify.rest import hold_width, rest_width
 from servod.verify.steady_friction import SteadyFriction, steady_friction
 
-#: From this bandwidth of the output observer on no other choice of filter and poles is tried.
-ENOUGH_RAD_S = 20.0
 OBSERVER_SHARE = 2.5  # bound of the estimate: friction that turned against a z_hat that a step leaves as it was
 APPROACH = 3.0  # speed with which a step is approached, as a factor on the map's highest
 
@@ -135,17 +139,14 @@ def synthesize(
     wishes, options = wishes or Wishes(), options or Options()
     friction = steady_friction(model)
     best: tuple[float, Design, LocalParameters] | None = None
-    for narrowed in wishes.choices():
-        design = regions(model, narrowed)
-        if design is None:
-            continue
+    for design in designs(model, wishes):
         law = parameters(design, friction, options, OBSERVERS_RAD_S[0] if options.observer else 0.0)
         if law.disturbance_observer is not None:
             law = with_widest_observer(design, friction, law, best[0] if best else 0.0)
-        bandwidth = law.disturbance_observer.bandwidth_rad_s if law.disturbance_observer else 0.0
+        bandwidth = bandwidth_of(law)
         if best is None or bandwidth > best[0]:
             best = bandwidth, design, law
-        if bandwidth >= ENOUGH_RAD_S or not options.observer:
+        if is_enough(law) or not options.observer:
             break
     if best is None:
         return explain(model, wishes)

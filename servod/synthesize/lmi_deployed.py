@@ -28,6 +28,8 @@ from servod.verify.sampled import Array
 EPSILON = 1e-8  # strictness of the inequalities in scaled states
 PROOF_EPSILON = 1e-5  # of the proof that is kept: what rounding in a file cannot turn
 ROUNDS = 1  # a second one wins less than 2 % of the H2 norm
+#: Rounds in which the turning vertices come into their discs, each by this much of radius, seen from this much more.
+TURN_ROUNDS, TURN_STEP, TURN_ROOM = 5, 0.04, 1.003
 POSITIONS, VELOCITIES = -np.geomspace(0.01, 3.0, 14), -np.geomspace(0.3, 20.0, 16)
 MEMORY = (0.0, 0.25, 0.5)
 
@@ -50,18 +52,23 @@ class Programme:
     solver: str = "CLARABEL"
     fed: int = 2
 
-    def only(self, mode: str) -> Programme:
-        """The same programme over the vertices of one mode."""
-        i = [j for j, m in enumerate(self.modes) if m == mode]
+    def only(self, *modes: str) -> Programme:
+        """The same programme over the vertices of some modes."""
+        i = [j for j, m in enumerate(self.modes) if m in modes]
         return replace(
             self,
-            modes=[mode] * len(i),
+            modes=[self.modes[j] for j in i],
             performs=[self.performs[j] for j in i],
             discs=[self.discs[j] for j in i],
             a=self.a[i],
             b=self.b[i],
             e=self.e[i],
         )
+
+    def turning_within(self, radius: float) -> Programme:
+        """The same programme with another radius of the discs of turning vertices."""
+        pairs = zip(self.modes, self.discs, strict=True)
+        return replace(self, discs=[(0.0, radius) if mode == "turning" else disc for mode, disc in pairs])
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,26 +197,58 @@ def first_feedback(p: Programme) -> Array:
 def synthesise(p: Programme) -> Solution | None:
     """Feedback with the least summed H2 norms that the rounds reach, proven over all vertices; None when infeasible.
 
-    Only sliding vertices shape the feedback: stuck on its bristle, which is far stiffer than any feedback, the joint
-    is proven afterwards. For the others the synthesis is the proof as well. The start need not keep the disc; a round
-    without it is taken where the disc asks too much.
+    Only sliding vertices shape the feedback, and turning ones where there are any: stuck on its bristle, which is far
+    stiffer than any feedback, the joint is proven afterwards. For the others the synthesis is the proof as well.
     """
-    shaping = p.only("sliding")
-    last = solve(shaping, first_feedback(shaping), None, in_disc=False)
-    best: Solution | None = None
-    for _ in range(ROUNDS + 1):
-        if last is None:
-            break
-        better = solve(shaping, None, last.guides(), strictness=PROOF_EPSILON)
-        if better is not None:
-            best = better
-            break
-        plain = solve(shaping, None, last.guides(), in_disc=False)
-        last = None if plain is None else solve(shaping, plain.feedback, None, in_disc=False)
-    if best is None or len(shaping.modes) == len(p.modes):
+    best = shaped(p.only("sliding"))
+    if best is not None and "turning" in p.modes:
+        best = turned(p, best)
+    if best is None or "sticking" not in p.modes:
         return best
     stuck = solve(p.only("sticking"), best.feedback, None, strictness=PROOF_EPSILON)
     return None if stuck is None else both(p, best, stuck)
+
+
+def shaped(shaping: Programme) -> Solution | None:
+    """Feedback from the grid's start in rounds of analysis and synthesis.
+
+    The start need not keep the disc; a round without it is taken where the disc asks too much.
+    """
+    last = solve(shaping, first_feedback(shaping), None, in_disc=False)
+    for _ in range(ROUNDS + 1):
+        if last is None:
+            return None
+        better = solve(shaping, None, last.guides(), strictness=PROOF_EPSILON)
+        if better is not None:
+            return better
+        plain = solve(shaping, None, last.guides(), in_disc=False)
+        last = None if plain is None else solve(shaping, plain.feedback, None, in_disc=False)
+    return None
+
+
+def turned(p: Programme, found: Solution) -> Solution | None:
+    """`found`, changed until it holds the joint whose bristle is turned over too; None when that is not reached.
+
+    A joint that is unstable under the feedback so far gives no guide, so its disc shrinks from what holds it now.
+    """
+    shaping, wanted = p.only("sliding", "turning"), p.discs[p.modes.index("turning")][1]
+    for _ in range(TURN_ROUNDS):
+        reach = largest_pole(p.only("turning"), found.feedback)
+        if reach <= wanted:
+            return found
+        guide = solve(shaping.turning_within(TURN_ROOM * reach), found.feedback, None)
+        radius = max(wanted, reach - TURN_STEP)
+        better = guide and solve(shaping.turning_within(radius), None, guide.guides(), strictness=PROOF_EPSILON)
+        if better is None:
+            return None
+        found = better
+    return None
+
+
+def largest_pole(p: Programme, feedback: Array) -> float:
+    """Largest pole magnitude of the vertices under `feedback` of their first states."""
+    row = np.concatenate([feedback, np.zeros(p.a.shape[-1] - p.fed)])
+    return float(np.abs(np.linalg.eigvals(p.a + p.b[:, :, None] * row)).max())
 
 
 def both(p: Programme, sliding: Solution, sticking: Solution) -> Solution:

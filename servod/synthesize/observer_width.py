@@ -23,6 +23,9 @@ from servod.verify.steady_friction import SteadyFriction
 #: Bandwidths, best first: the first is taken with which every corner of the intervals stands with CORNER_WANTED, and
 #: the axis as modelled with the wanted disk margin, or else with the one of the certificate.
 OBSERVERS_RAD_S = (80.0, 60.0, 45.0, 34.0, 25.0, 18.0, 12.0, 7.0)
+#: From this bandwidth on no other choice of filter, poles and weights is tried; the second one where there is none of
+#: its own for coming to rest.
+ENOUGH_RAD_S, EVEN_ENOUGH_RAD_S = 20.0, 45.0
 DISK_WANTED, CORNER_WANTED = 0.15, 1.25 * CORNER_DISK
 FEW_SPEEDS = 12  # per direction
 STABLE = 0.9999  # largest pole: the certificate looks between the corners and between these speeds as well
@@ -110,16 +113,41 @@ def with_observer(
 def with_widest_observer(
     design: Design, friction: SteadyFriction, law: LocalParameters, beyond_rad_s: float = 0.0
 ) -> LocalParameters:
-    """`law` with the widest observer beyond `beyond_rad_s` that it stands; without one where it stands none."""
+    """`law` with the widest observer beyond `beyond_rad_s` that it stands; without one where it stands none.
+
+    A slow one gives way to one that is enough but has no bandwidth of its own for coming to rest: where the feedback
+    of the regions differs much, the blend of both adds to it what no faster observer stands.
+    """
     search = Search(design, friction)
+    found = widest(search, law, beyond_rad_s, LOW_FACTORS[-1])
+    if bandwidth_of(found) >= ENOUGH_RAD_S:
+        return found
+    even = widest(search, law, max(beyond_rad_s, ENOUGH_RAD_S), None)
+    return even if bandwidth_of(even) else found
+
+
+def widest(search: Search, law: LocalParameters, beyond_rad_s: float, low_factor: float | None) -> LocalParameters:
+    """The same with one relation of the bandwidths; `low_factor`: in Omega_L over that in Omega_H, None: no own."""
     for disk in (DISK_WANTED, DISK_LIMIT):
         for bandwidth in (g for g in OBSERVERS_RAD_S if g > beyond_rad_s):
-            slow = with_observer(law, bandwidth, LOW_FACTORS[-1] * bandwidth)
+            slow = with_observer(law, bandwidth, low_factor and low_factor * bandwidth)
             if search.stands(slow, disk):
-                fast = with_fastest_rest(search, slow, disk)
+                fast = with_fastest_rest(search, slow, disk) if low_factor else slow
                 if search.stands_everywhere(fast, disk):
                     return fast
     return law.model_copy(update={"disturbance_observer": None})
+
+
+def is_enough(law: LocalParameters) -> bool:
+    """Whether the observer is so fast that nothing else is worth a try."""
+    observer = law.disturbance_observer
+    even = observer is not None and observer.low_bandwidth_rad_s is None
+    return bandwidth_of(law) >= (EVEN_ENOUGH_RAD_S if even else ENOUGH_RAD_S)
+
+
+def bandwidth_of(law: LocalParameters) -> float:
+    """Bandwidth of the observer in Omega_H [rad/s]; 0 without one."""
+    return law.disturbance_observer.bandwidth_rad_s if law.disturbance_observer else 0.0
 
 
 def with_fastest_rest(search: Search, law: LocalParameters, disk_wanted: float) -> LocalParameters:

@@ -85,10 +85,15 @@ def scaled_vertices(design: Design, region: RegionProof) -> tuple[list[Joint], A
     """Joints and scaled (A, B, E) of the region's vertices, made anew from the design's model and intervals."""
     span = Span(region.name, region.speed_from_rad_s, region.speed_to_rad_s)
     found = joints(steady_friction(design.model), span, design.uncertainty)
+    return found, *scaled(found, design, region)
+
+
+def scaled(found: list[Joint], design: Design, region: RegionProof) -> tuple[Array, Array, Array]:
+    """(A, B, E) of joints in the region's scaled states."""
     a, b, e = sampled_vertices(found, timing_of(design))
     scale = np.array(region.scale)
     torque = region.torque_scale_nm
-    return found, a * (scale / scale[:, None]), b * torque / scale, e * torque / scale
+    return a * (scale / scale[:, None]), b * torque / scale, e * torque / scale
 
 
 def stored_deviation(design: Design, region: RegionProof) -> float:
