@@ -28,6 +28,7 @@ from servod.verify.sampled import Array, Timing
 from servod.verify.steady_friction import SteadyFriction
 
 FREQUENCIES = 200
+ON_CIRCLE = np.exp(1j * np.geomspace(1e-3, np.pi, FREQUENCIES))
 SEARCH_STEPS = 14
 NOMINAL = (Deviation(),)
 BEYOND_HOLD = 4.0  # widths of holding, at which a joint has not arrived yet
@@ -203,9 +204,13 @@ def sensitivity(closed: Array, column: Array, row: Array, poles: NDArray[Any] | 
     S(z) = det(z - A_open)/det(z - A_closed): the zeros of S are the poles of the open loop.
     """
     known = np.linalg.eigvals(closed) if poles is None else poles
-    z = np.exp(1j * np.geomspace(1e-3, np.pi, FREQUENCIES))[None, :, None]
     zeros = np.linalg.eigvals(closed - column[:, :, None] * row)
-    response: NDArray[np.complex128] = np.prod((z - zeros[:, None, :]) / (z - known[:, None, :]), axis=2)
+    above = np.ones((len(closed), FREQUENCIES), dtype=np.complex128)
+    below = np.ones_like(above)
+    for zero, pole in zip(zeros.T, known.T, strict=True):  # one root of all loops at a time: no array in all three
+        above *= ON_CIRCLE - zero[:, None]
+        below *= ON_CIRCLE - pole[:, None]
+    response: NDArray[np.complex128] = above / below
     return response
 
 

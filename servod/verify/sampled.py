@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm
 
 from servod.gain_design import Design
 
 Array = NDArray[np.float64]
+PADE, PADE_NORM = 8, 1.0
 WHOLE = 1e-6  # a delay nearer than this to whole periods is whole
 #: Lag in periods that counts as delay: a loop that crosses at a third of 1/period loses 5 % of its gain to it, half of
 #: what the disk margin keeps. A longer one is physics that the loop check does not know.
@@ -64,6 +64,31 @@ def timing_of(design: Design) -> Timing:
     return Timing(design.period_s, model.total_delay_s + lag_s, design.velocity_cutoff_hz)
 
 
+def exponential(stack: Array) -> Array:
+    """Matrix exponentials of a stack (..., n, n) by scaling, a diagonal Pade approximant and squaring, all at once.
+
+    scipy's expm goes through a stack one by one, which took a third of a synthesis. Source: Higham, SIAM J. Matrix
+    Anal. Appl. 26(4), 2005; the approximant of degree PADE is exact to rounding for norms up to PADE_NORM.
+    """
+    norm = float(np.abs(stack).sum(axis=-1).max())
+    squarings = max(0, math.ceil(math.log2(norm / PADE_NORM))) if norm > 0.0 else 0
+    one: Array = np.broadcast_to(np.eye(stack.shape[-1]), stack.shape)
+    scaled: Array = stack / 2.0**squarings
+    term: Array = one
+    even, odd, factor = np.array(one), np.zeros(stack.shape), 1.0
+    for j in range(1, PADE + 1):
+        factor *= (PADE - j + 1) / (j * (2 * PADE - j + 1))
+        term = scaled @ term
+        if j % 2:
+            odd += factor * term
+        else:
+            even += factor * term
+    result = np.linalg.solve(even - odd, even + odd)
+    for _ in range(squarings):
+        result = np.matmul(result, result)
+    return np.asarray(result, dtype=np.float64)
+
+
 def sample_joint(a: Array, b: Array, e: Array, timing: Timing) -> tuple[Array, Array, Array, Array]:
     """(A, B_now, B_before, E) over one period for stacks of joints: a (..., n, n), b and e (..., n).
 
@@ -72,8 +97,8 @@ def sample_joint(a: Array, b: Array, e: Array, timing: Timing) -> tuple[Array, A
     n = a.shape[-1]
     big = np.zeros((*a.shape[:-2], n + 2, n + 2))
     big[..., :n, :n], big[..., :n, n], big[..., :n, n + 1] = a, b, e
-    over = expm(big * timing.period_s)
-    late = expm(big * timing.period_s * (1.0 - timing.part)) if timing.part else over
+    over = exponential(big * timing.period_s)
+    late = exponential(big * timing.period_s * (1.0 - timing.part)) if timing.part else over
     now = late[..., :n, n]
     return over[..., :n, :n], now, over[..., :n, n] - now, over[..., :n, n + 1]
 

@@ -174,21 +174,23 @@ def run_trial(gains: GainSet, design: Design, motion: Array, seed: int, index: i
     )
 
 
-def _worker(text: str, seed: int, shaken_rad: float, first: int, last: int) -> list[Trial]:
-    from servod.gains import parse_gains
-
-    gains = parse_gains(text, "gain set")
+def _trials(gains: GainSet, seed: int, shaken_rad: float, first: int, last: int) -> list[Trial]:
     assert gains.design is not None
     motion = trial_motion(gains.design.period_s, scale_of(gains.design))
     return [run_trial(gains, gains.design, motion, seed, i, shaken_rad) for i in range(first, last)]
 
 
+def _worker(text: str, seed: int, shaken_rad: float, first: int, last: int) -> list[Trial]:
+    from servod.gains import parse_gains
+
+    return _trials(parse_gains(text, "gain set"), seed, shaken_rad, first, last)
+
+
 def monte_carlo(gains: GainSet, plants: int, seed: int, processes: int, shaken_rad: float = 0.0) -> list[Trial]:
     """`plants` trials over worker processes; the same seed gives the same plants whatever the number of processes."""
-    text = gains.to_yaml()
     if processes <= 1:
-        return _worker(text, seed, shaken_rad, 0, plants)
-    cuts = [plants * i // processes for i in range(processes + 1)]
+        return _trials(gains, seed, shaken_rad, 0, plants)
+    text, cuts = gains.to_yaml(), [plants * i // processes for i in range(processes + 1)]
     with worker_pool(processes) as pool:
         parts = [pool.submit(_worker, text, seed, shaken_rad, *ends) for ends in pairwise(cuts)]
         return [trial for part in parts for trial in part.result()]
