@@ -96,17 +96,15 @@ def drowned(found: Verdict, encoder_noise: float, dry: float) -> bool:
 def named_terms(choice: Choice, nominal: Document) -> list[int]:
     """Places of the terms whose effect is at least at its level."""
     fitted = choice.fit.hypothesis.written(choice.fit.coordinates)
-    lesser = _lesser_twin(fitted)
-    terms = enumerate(choice.fit.hypothesis.terms)
-    return [i for i, term in terms if term.effect != lesser and _at_level(term.effect, nominal, fitted)]
+    terms = choice.fit.hypothesis.terms
+    lesser = _lesser_twin(fitted) if {term.effect for term in terms} >= set(TWINS) else None
+    return [i for i, term in enumerate(terms) if term.effect != lesser and _at_level(term.effect, nominal, fitted)]
 
 
-def _lesser_twin(fitted: Document) -> str | None:
-    """The shorter of a delay and a lag where both are in: together they are one drive that is late, of higher order."""
+def _lesser_twin(fitted: Document) -> str:
+    """The shorter of a delay and a lag that are both in: together they are one drive that is late, of higher order."""
     late, lag = get(fitted, "delay.additional_s"), get(fitted, "actuator_lag.time_constant_s")
-    if late == 0.0 or lag == 0.0:
-        return None
-    return "delay" if late < lag else "actuator_lag"
+    return "delay" if late < lag else "actuator_lag" if lag > 0.0 else ""  # a limited rate is no twin
 
 
 def _at_level(effect: str, nominal: Document, fitted: Document) -> bool:
