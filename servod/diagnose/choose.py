@@ -197,14 +197,29 @@ class Chooser:
         """What the step from one fit to the other is worth."""
         explainable = max(self.base_error - self.floor, 1e-30)
         saved = self.error(without.mismatch) - self.error(with_term.mismatch)
-        torque = acting(np.abs(without.mismatch - with_term.mismatch)[self.predictor.counts])
+        torque = self._acting(without.mismatch, with_term.mismatch)
         fitter = self.fitter(with_term.mismatch)
         cost = fitter.cost(without.hypothesis, without.coordinates, without.mismatch)
         gain = 2.0 * (cost - with_term.cost) / self._correlation(with_term.mismatch, fitter.weighing.scale)
         blow = BLOW * float(np.median(np.abs(with_term.mismatch[self.predictor.counts]))) / 0.6745
         was, now = (self.error(np.clip(fit.mismatch, -blow, blow)) for fit in (without, with_term))
         of_left = (was - now) / max(was - self.floor, 1e-30)
-        return Merit(saved / explainable, of_left, torque / self.predictor.dry, gain)
+        return Merit(saved / explainable, of_left, torque, gain, self._own(without, with_term))
+
+    def _acting(self, one: Array, other: Array) -> float:
+        """Where two mismatches differ, by how much, as a share of dry friction."""
+        return acting(np.abs(one - other)[self.predictor.counts]) / self.predictor.dry
+
+    def _own(self, without: Fit, with_term: Fit) -> float:
+        """The torque of the term that one fit has more than the other, all else as fitted with it; 0 for a level."""
+        hypothesis = with_term.hypothesis
+        pairs = zip(hypothesis.terms, (*without.hypothesis.terms, None), strict=False)
+        place = next(index for index, (term, other) in enumerate(pairs) if term is not other)
+        if not hypothesis.terms[place].unknowns:
+            return 0.0
+        kept = np.delete(with_term.coordinates, hypothesis.share(place))
+        bare = self.fitter(with_term.mismatch).mismatch(hypothesis.without(place), kept)
+        return 0.0 if bare is None else self._acting(bare, with_term.mismatch)
 
     def _correlation(self, mismatch: Array, scale: float) -> float:
         """By how much correlated rows exaggerate a gain: long-run over plain variance, at least 1."""

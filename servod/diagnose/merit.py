@@ -24,6 +24,10 @@ LEVEL_TORQUE = 0.003
 #: of the rest as it was is not what the rest is made of.
 LEAST_OF_LEFT = 0.25
 
+#: A term that takes this share of what is left is what the rest is made of: then the torque that it stands for counts,
+#: for what a scale on the model's own friction and inertia cannot take up of it may be little.
+NEARLY_ALL = 0.8
+
 #: Rows that show where an effect acts: its torque there is at least this quantile of what it changes.
 ACTS_AT = 0.98
 
@@ -36,19 +40,22 @@ class Merit:
     """What a term is worth: its share of the explainable error, its torque as a share of dry friction, its cost gain.
 
     `gain` is twice the cost that it saves, in units of noise that counts correlated rows as one; `of_left` its share of
-    what the fit before it had left above the noise floor.
+    what the fit before it had left above the noise floor. `torque` is what the term changes beside parameters fitted
+    anew, `own` what it changes beside the same ones.
     """
 
     share: float
     of_left: float
     torque: float
     gain: float
+    own: float = 0.0
 
 
 def worth_naming(merit: Merit, level: bool) -> bool:
     """Whether a term is worth a name; `level`: it is a parameter of the model's own beyond its level."""
     least, enough = (LEVEL_TORQUE, LEVEL_TORQUE) if level else (LEAST_TORQUE, WORTH_TORQUE)
     much = merit.share >= WORTH_SHARE or merit.torque >= enough
+    much = much or (merit.own >= WORTH_TORQUE and merit.of_left >= NEARLY_ALL)
     return much and merit.torque >= least and (merit.of_left >= LEAST_OF_LEFT or merit.share >= SURE_SHARE)
 
 

@@ -10,8 +10,11 @@ import pytest
 from servod.axis_effects import Gravity
 from servod.axis_model import AxisModel, load_axis_model
 from servod.controllers import pd
+from servod.diagnose.choose import Chooser
+from servod.diagnose.effects import effect
 from servod.diagnose.intake import taken_in
 from servod.diagnose.predict import Predictor
+from servod.diagnose.scene import Scene
 from servod.models.simulate import LoopSettings, simulate_closed_loop
 from servod.shipped import shipped
 from servod.tracking.motions import paper_rows
@@ -83,3 +86,18 @@ def test_a_model_never_sticks_where_the_joint_slides_slowly() -> None:
     assert rms(predictor, true) < 0.03
     seen = predictor.mismatch(believed_without)[predictor.counts]
     assert np.median(seen) == pytest.approx(-GRAVITY.amplitude, rel=0.1)
+
+
+def test_own_torque_is_what_the_term_stands_for() -> None:
+    """Friction of 6 % of the command beside parameters that have not moved."""
+    model = believed()
+    chooser = Chooser(Predictor(taken_in(record(model, seconds=3.0), model)[0], model), model, 1e9, print)
+    term = effect("load_dependent_friction").terms(Scene(chooser.start.document, chooser.predictor, np.zeros(0)))[0]
+    mismatch = chooser.predictor.mismatch(model)
+    base = chooser.fitter(mismatch).begin(chooser.start)
+    hypothesis = chooser.start.with_term(term)
+    beside = chooser.fitter(mismatch).begin(hypothesis, np.append(chooser.start.start, 0.6))
+    assert base is not None and beside is not None
+    merit = chooser.merit(base, beside)
+    assert merit.own == pytest.approx(merit.torque)
+    assert merit.own > 0.06
