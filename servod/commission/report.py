@@ -34,7 +34,7 @@ from servod.gains import GainSet, load_gains
 from servod.identify import store
 from servod.identify.analysis import analyse
 from servod.report.figure import Figure, Table
-from servod.report.figures import friction, loop, motion, proof, sets
+from servod.report.figures import friction, loop, motion, proof, response, sets
 from servod.report.figures.motion import Motion
 from servod.report.page import Page
 from servod.report.pictures import write_pictures
@@ -119,7 +119,9 @@ def _identified(walk: Walk, model: AxisModel) -> Iterator[Part]:
     ]
     yield Table("What was measured", ("quantity", "value", "95 % interval", "unit", "note"), tuple(rows))
     yield from (f"Not identifiable: {name}. {remedy}." for name, remedy in found["not_identifiable"].items())
-    yield friction.dahl_curve(analyse(store.load(walk.path(RECORDINGS))).presliding, truth)
+    analysis = analyse(store.load(walk.path(RECORDINGS)))
+    yield friction.dahl_curve(analysis.presliding, truth)
+    yield response.frequency_response(analysis.response)
     yield friction.friction_map(model, truth)
 
 

@@ -20,12 +20,14 @@ from servod.identify.estimate import Estimate
 from servod.identify.fits.cogging import GRAVITY
 from servod.identify.fits.curve import CurveFit
 from servod.identify.fits.friction_map import Side
-from servod.identify.fits.response import Resonance
+from servod.identify.fits.response import Resonance, ResponseFit
 
 Array = NDArray[np.float64]
 
 #: The viscous part of the map leaves at least this share of it to the bristles, at every speed.
 LEAST_DRY_SHARE = 0.2
+#: Half width of a 95 % interval over the standard deviation, two-sided.
+TWO_SIDED = 1.96
 
 #: What these experiments cannot tell, and what would.
 NOT_IDENTIFIABLE: dict[str, str] = {
@@ -112,8 +114,28 @@ def document(analysis: Analysis) -> dict[str, Any]:
         "identified": {name: number.model_dump() for name, number in found.values.items()},
         "friction_map": found.friction_map.model_dump(),
         "asymmetry": {"value": 0.5 * (low + high), "low": low, "high": high, "unit": "1"},
+        "frequency_response": frequency_response(analysis.response),
         "not_identifiable": dict(found.not_identifiable),
         "data_sha256": list(found.data_sha256),
+    }
+
+
+def frequency_response(found: ResponseFit) -> dict[str, Any]:
+    """Position over torque command at the multisine's lines: measured, fitted, and how far to be trusted.
+
+    `half_width` is that of the gain's 95 % interval as a share of it (and of the phase's in rad); `used` are the lines
+    that inertia, delay, lag and resonance rest on.
+    """
+    fitted = found.model(found.frequency_hz)
+    return {
+        "frequency_hz": list(_rounded(found.frequency_hz)),
+        "gain_rad_per_nm": list(_rounded(np.abs(found.response))),
+        "phase_deg": list(_rounded(np.degrees(np.unwrap(np.angle(found.response))))),
+        "half_width": list(_rounded(TWO_SIDED * found.deviation)),
+        "coherence": list(_rounded(found.coherence)),
+        "used": found.used.tolist(),
+        "fitted_gain_rad_per_nm": list(_rounded(np.abs(fitted))),
+        "fitted_phase_deg": list(_rounded(np.degrees(np.unwrap(np.angle(fitted))))),
     }
 
 

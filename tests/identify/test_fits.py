@@ -8,12 +8,13 @@ import pytest
 from servod.axis_model import AxisModel
 from servod.errors import AnswerIsNo
 from servod.identify.estimate import Estimate, estimate, jackknife, sandwich
-from servod.identify.fits import cogging, curve, elastic, noise, presliding, response
+from servod.identify.fits import bristle, cogging, curve, elastic, noise, presliding, response
 from servod.identify.fits.break_away import BreakAwayFit
 from servod.identify.fits.bristle_lag import Bristle, dry_columns, follow
 from servod.identify.fits.elastic import Elastic
 from servod.identify.fits.friction_map import Side
 from servod.identify.fits.presliding import bend_factor, fundamental
+from servod.identify.fits.ranges import AT_END, at_ends
 from servod.identify.fits.rigid import Rigid, response_of
 from servod.identify.shapes import multisine
 from servod.identify.signals import acting_torque, smooth
@@ -268,6 +269,36 @@ def test_the_interval_of_the_encoder_noise_holds_it_beside_the_rounding(counts):
         widths.append(found.encoder_rms.half_width / resolution_rad)
     assert np.all(np.mean(held, axis=0) >= 0.88)
     assert np.median(widths) < max(0.25, 0.07 * counts)
+
+
+def test_what_stands_at_the_end_of_its_range_says_so():
+    assert at_ends([0.0, 0.5, 1.0], [0.0] * 3, [1.0] * 3) == (AT_END, "", AT_END)
+    speed = np.geomspace(5e-3, 1.0, 25)
+    flat = curve.fit(Side(speed, 0.05 + 0.05 * speed, np.full(25, 1e-4), 1e-9 * np.eye(25)))
+    assert AT_END in flat.static.note and not flat.coulomb.note
+    strange = response.fit(excited([1e-4] * 4), 1e-3 * np.exp(4.0))
+    assert AT_END in strange.inertia.note
+    joint = Elastic(1e-3, 0.05, 0.0015, 60.0, 0.3, 1e-3)
+    assert elastic.notes(joint, 1e-3, 160.0) == ("", "", "", "", "", AT_END)
+
+
+@pytest.mark.parametrize(("damping", "noted"), [(0.6, False), (20.0, True)])
+def test_bristle_damping_beyond_its_range_says_so(damping, noted):
+    inertia, stiffness, count = 1e-3, 950.0, 1000
+    lines, rng = np.arange(25, 230, 17), np.random.default_rng(4)
+    critical = 2.0 * np.sqrt(stiffness * inertia)
+    wave = 0.01 * multisine(lines, np.ones(len(lines)), count, rng)
+    ratio = np.zeros(count // 2 + 1, dtype=complex)
+    ratio[lines] = bristle.response(lines / 1.0, inertia, stiffness, 0.1, damping * critical, 1e-3, PERIOD_S)
+    way = np.tile(np.fft.irfft(ratio * np.fft.rfft(wave), count), 5) + 1e-9 * rng.normal(size=5 * count)
+    torque, settings = np.tile(wave, 5), {"count": float(count), "periods": 5.0}
+    settings |= {f"line_{i}": float(line) for i, line in enumerate(lines)}
+    t = np.arange(5 * count) * PERIOD_S
+    found = bristle.fit(
+        Trace(Kind.BRISTLE, t, torque, way, way, torque, torque, way, settings), inertia, 1e-3, 0.0, 950.0
+    )
+    assert found is not None
+    assert (AT_END in found.note) == noted
 
 
 @pytest.mark.parametrize("top_rad_s", [0.02, 0.3, 30.0])

@@ -50,6 +50,18 @@ def test_stiffness_inertia_and_delay(found):
     assert analysis.response.delay_s.holds(truth.delay_s)
 
 
+def test_the_frequency_response_is_in_the_document(found):
+    told = document(found.analysis)["frequency_response"]
+    assert {len(column) for column in told.values()} == {len(told["frequency_hz"])}
+    used = np.array(told["used"])
+    assert np.count_nonzero(used) >= 20
+    assert np.all(np.array(told["coherence"])[used] >= 0.6)
+    # from where cogging disturbs no more, the model explains the lines
+    upper = used & (np.array(told["frequency_hz"]) > 12.0)
+    off = np.abs(np.divide(told["fitted_gain_rad_per_nm"], told["gain_rad_per_nm"]) - 1.0)
+    assert np.mean((off <= told["half_width"])[upper]) >= 0.8
+
+
 def test_noise_at_rest(found):
     known = found.joint.model.noise
     assert known is not None

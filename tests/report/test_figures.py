@@ -14,6 +14,7 @@ from servod.gains import load_gains
 from servod.identified import Identified, IdentifiedMap
 from servod.identify.estimate import Estimate
 from servod.identify.fits.presliding import PreslidingFit
+from servod.identify.fits.response import ResponseFit
 from servod.report.figure import Figure, Style
 from servod.report.figures.friction import dahl_curve, friction_map
 from servod.report.figures.loop import bode
@@ -28,6 +29,7 @@ from servod.report.figures.motion import (
     tracking_grid,
 )
 from servod.report.figures.proof import certificate_table, observations_table
+from servod.report.figures.response import frequency_response
 from servod.report.figures.sets import local_friction, local_law, steady_compensation, weight_table, weighting_functions
 from servod.report.page import Page
 from servod.report.page_figure import plotly_figure
@@ -62,10 +64,19 @@ def presliding(c0: float = 950.0) -> PreslidingFit:
     return PreslidingFit(estimate, 1.05, 0.028 / c0 * np.sin(phase - 0.3) + 1e-4, torque)
 
 
+def sliding() -> ResponseFit:
+    """The response of a rigid joint, five per cent off, as a multisine shows it."""
+    hz, one = np.geomspace(3.0, 160.0, 12), Estimate(1e-3, 9e-4, 1.1e-3, "1")
+    none = Estimate(0.0, 0.0, 0.0, "1")
+    fit = ResponseFit(one, one, one, none, None, one, hz, 0j * hz, np.full(12, 0.02), np.linspace(1.0, 0.4, 12), 1e-3)
+    return fit._replace(response=1.05 * fit.model(hz))
+
+
 def figures() -> list[Figure]:
     return [
         dahl_curve(presliding(), table1()),
         friction_map(identified_model(), table1()),
+        frequency_response(sliding()),
         weighting_functions(TABLE1),
         local_friction(TABLE1, table1()),
         tracking(MOTIONS[0]),
@@ -129,6 +140,15 @@ def test_the_dahl_curve_has_the_identified_slope() -> None:
     (panel,) = dahl_curve(presliding(700.0)).panels
     slope = next(c for c in panel.curves if c.label.startswith("c0 = 700"))
     assert np.ptp(slope.y) * 1e-3 / (np.ptp(slope.x) * 1e-6) == pytest.approx(700.0)
+
+
+def test_the_frequency_response_shows_lines_model_and_coherence() -> None:
+    gain, phase, coherence = frequency_response(sliding()).panels
+    measured, fitted = gain.curves
+    assert measured.y == pytest.approx(1.05 * np.interp(measured.x, fitted.x, fitted.y), rel=0.01)
+    assert measured.bounds is not None and measured.bounds[1] == pytest.approx(1.0392 * measured.y)
+    assert phase.curves[0].y == pytest.approx(np.interp(measured.x, fitted.x, phase.curves[1].y), abs=0.5)
+    assert coherence.curves[0].y[[0, -1]] == pytest.approx([100.0, 40.0])
 
 
 def test_the_map_shows_both_directions_with_their_intervals() -> None:

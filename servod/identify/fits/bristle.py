@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from servod.identify.estimate import Estimate, estimate, jackknife
+from servod.identify.fits.ranges import at_ends, joined
 from servod.identify.trace import Trace
 
 Array = NDArray[np.float64]
@@ -27,6 +28,8 @@ LEAST_PERIODS = 3
 WIDEST_SHARE = 0.5
 #: Share for what the periods' scatter does not show: the loop's loss is only nearly the same at every frequency.
 ALLOWANCE = 0.2
+#: Bounds of the search: stiffness over that at the lowest line, loss, damping over the critical one.
+_RANGES = ([0.2, 0.0, 0.0], [5.0, 0.8, 5.0])
 
 
 class _Period(NamedTuple):
@@ -50,7 +53,8 @@ def fit(trace: Trace, inertia: float, delay_s: float, viscous: float, stiffness:
         return np.array([(slope - viscous) * stiffness / chord])
 
     values, spread = jackknife(damping, periods)
-    found = estimate(float(values[0]), float(spread[0]), len(periods) - 1, "N*m*s/rad", share=ALLOWANCE)
+    note = _note(_searched(frequency, periods, inertia, delay_s, trace.period_s)[0])
+    found = estimate(float(values[0]), float(spread[0]), len(periods) - 1, "N*m*s/rad", share=ALLOWANCE, note=note)
     told = found.value > 0.0 and found.half_width < WIDEST_SHARE * found.value
     return found if told else None
 
@@ -86,6 +90,20 @@ def _spectra(trace: Trace) -> tuple[Array, list[_Period]]:
 
 def _solve(frequency: Array, periods: Sequence[_Period], inertia: float, delay_s: float, period_s: float) -> Array:
     """(stiffness, loss, damping) that fit the periods' mean response."""
+    (chord, loss, damping), first, critical = _searched(frequency, periods, inertia, delay_s, period_s)
+    return np.array([first * chord, loss, critical * damping])
+
+
+def _note(x: Array) -> str:
+    """What of the search stands at the end of its range."""
+    names = ("the chord's stiffness", "the loop's loss", "the damping")
+    return joined(*(f"{name} {note}" for name, note in zip(names, at_ends(x.tolist(), *_RANGES), strict=True) if note))
+
+
+def _searched(
+    frequency: Array, periods: Sequence[_Period], inertia: float, delay_s: float, period_s: float
+) -> tuple[Array, float, float]:
+    """(stiffness, loss, damping) as the search has them, and the units of stiffness and damping."""
     measured = np.asarray(sum(p.way for p in periods) / sum(p.torque for p in periods))
     first = float(1.0 / np.abs(measured[0]))
     critical = 2.0 * np.sqrt(first * inertia)
@@ -95,5 +113,4 @@ def _solve(frequency: Array, periods: Sequence[_Period], inertia: float, delay_s
         error = (model - measured) * first
         return np.concatenate([error.real, error.imag])
 
-    x = least_squares(misfit, [1.0, 0.05, 0.5], bounds=([0.2, 0.0, 0.0], [5.0, 0.8, 5.0])).x
-    return np.array([first * x[0], x[1], critical * x[2]])
+    return least_squares(misfit, [1.0, 0.05, 0.5], bounds=_RANGES).x, first, float(critical)

@@ -6,6 +6,7 @@ model.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from scipy.optimize import least_squares
 
 from servod.identify.estimate import LEVEL, Estimate, estimate
 from servod.identify.fits.friction_map import Side
+from servod.identify.fits.ranges import at_ends
 
 Array = NDArray[np.float64]
 
@@ -26,8 +28,6 @@ STARTS = np.array([0.3, 0.5, 0.7, 0.85])
 SLOWEST_ALLOWANCE = 0.03
 #: Misfit that every node is allowed, as a share of friction.
 SHARE = 0.003
-#: Closer to a bound than this share of its range is on it.
-ON_BOUND = 1e-3
 
 
 class CurveFit(NamedTuple):
@@ -66,21 +66,23 @@ def fit(side: Side) -> CurveFit:
     best = min(found, key=lambda result: result.cost)
     gain = np.linalg.pinv(best.jac) * weight
     # The allowances count node by node: as one error that all nodes share, they would leave the fall's place and shape
-    # too certain, which on joints of known friction then lay outside their intervals four times in ten.
+    # too certain, which on joints of known friction then lay outside their intervals one time in three.
     unseen = np.diag((side.unseen / float(stats.norm.ppf(LEVEL))) ** 2)
     covariance = gain @ (side.covariance + unseen) @ gain.T
-    return _named(best.x, covariance, (best.x - low) / (high - low), len(side.speed) - len(best.x))
+    return _named(
+        best.x, covariance, at_ends(best.x.tolist(), low.tolist(), high.tolist()), len(side.speed) - len(best.x)
+    )
 
 
-def _named(x: Array, covariance: Array, place: Array, freedom: int) -> CurveFit:
+def _named(x: Array, covariance: Array, notes: Sequence[str], freedom: int) -> CurveFit:
     """Estimates by name; those that stand at the end of their range say so."""
     deviation = np.sqrt(np.diag(covariance))
-    notes = ["at the end of its range" if p < ON_BOUND or p > 1.0 - ON_BOUND else "" for p in place]
+    fall = f"static friction over Coulomb friction {notes[1]}" if notes[1] else ""
     sum_deviation = float(np.sqrt(covariance[0, 0] + covariance[1, 1] + 2.0 * covariance[0, 1]))
     speed = float(np.exp(x[2]))
     return CurveFit(
         estimate(float(x[0]), float(deviation[0]), freedom, "N*m", note=notes[0]),
-        estimate(float(x[0] + x[1]), sum_deviation, freedom, "N*m", share=SLOWEST_ALLOWANCE),
+        estimate(float(x[0] + x[1]), sum_deviation, freedom, "N*m", share=SLOWEST_ALLOWANCE, note=fall),
         estimate(speed, speed * float(deviation[2]), freedom, "rad/s", note=notes[2]),
         estimate(float(x[3]), float(deviation[3]), freedom, "1", note=notes[3]),
         estimate(float(x[4]), float(deviation[4]), freedom, "N*m*s/rad", note=notes[4]),

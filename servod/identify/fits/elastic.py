@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.optimize import least_squares
 
+from servod.identify.fits.ranges import at_ends
+
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
@@ -22,6 +24,8 @@ LOWEST_HZ = 12.0
 _STARTS, _LOADS = (0.3, 0.5, 0.65, 0.8, 0.9, 1.0), (0.25, 0.6)
 #: Ranges: share of the inertia behind the spring, damping ratio of the resonance.
 _LOAD, _DAMPING = (0.02, 0.95), (1e-3, 0.7)
+#: Longest delay that is looked for, s.
+LONGEST_DELAY_S = 0.05
 
 
 class Elastic(NamedTuple):
@@ -53,6 +57,17 @@ class Elastic(NamedTuple):
         """N*m*s/rad of the spring."""
         reduced = self.inertia * self.load_share * (1.0 - self.load_share)
         return 2.0 * self.damping_ratio * 2.0 * math.pi * self.resonance_hz * reduced
+
+
+class Notes(NamedTuple):
+    """A note for each number of `Elastic`, empty where it was found within its range."""
+
+    inertia: str
+    viscous: str
+    delay_s: str
+    resonance_hz: str
+    load_share: str
+    damping_ratio: str
 
 
 def response_of(joint: Elastic, frequency_hz: Array, period_s: float) -> Complex:
@@ -89,11 +104,12 @@ def solve(frequency: Array, ratio: Complex, deviation: Array, period_s: float, i
 
 def solve_from(first: Elastic, frequency: Array, ratio: Complex, deviation: Array, period_s: float) -> Elastic:
     """The same, beginning at a solution that is nearly right."""
-    x = np.array([
-        np.log(first.inertia), first.viscous / first.inertia, 1e3 * first.delay_s, np.log(first.resonance_hz),
-        first.load_share, first.damping_ratio,
-    ])  # fmt: skip
-    return _from(frequency, ratio, deviation, period_s, x)[0]
+    return _from(frequency, ratio, deviation, period_s, _values(first))[0]
+
+
+def notes(joint: Elastic, inertia: float, highest_hz: float) -> Notes:
+    """What stands at the end of the range that was searched from `inertia` and over lines up to `highest_hz`."""
+    return Notes(*at_ends(_values(joint).tolist(), *_ranges(math.log(inertia), highest_hz)))
 
 
 def _from(frequency: Array, ratio: Complex, deviation: Array, period_s: float, x: Array) -> tuple[Elastic, float]:
@@ -101,10 +117,25 @@ def _from(frequency: Array, ratio: Complex, deviation: Array, period_s: float, x
         error = (response_of(_joint(values), frequency, period_s) / ratio - 1.0) / deviation
         return np.concatenate([error.real, error.imag])
 
-    low = [x[0] - 3.0, -2000.0, 0.0, np.log(LOWEST_HZ), _LOAD[0], _DAMPING[0]]
-    high = [x[0] + 3.0, 1e4, 50.0, np.log(2.0 * frequency[-1]), _LOAD[1], _DAMPING[1]]
+    low, high = _ranges(float(x[0]), float(frequency[-1]))
     found = least_squares(misfit, np.clip(x, low, high), bounds=(low, high), loss="soft_l1", x_scale="jac", max_nfev=60)
     return _joint(found.x), float(np.sum(found.fun**2))
+
+
+def _ranges(log_inertia: float, highest_hz: float) -> tuple[list[float], list[float]]:
+    """Lower and upper bounds of the search's values, about a first idea of inertia."""
+    low = [log_inertia - 3.0, -2000.0, 0.0, math.log(LOWEST_HZ), _LOAD[0], _DAMPING[0]]
+    high = [log_inertia + 3.0, 1e4, 1e3 * LONGEST_DELAY_S, math.log(2.0 * highest_hz), _LOAD[1], _DAMPING[1]]
+    return low, high
+
+
+def _values(joint: Elastic) -> Array:
+    """What the search varies."""
+    x: Array = np.array([
+        np.log(joint.inertia), joint.viscous / joint.inertia, 1e3 * joint.delay_s, np.log(joint.resonance_hz),
+        joint.load_share, joint.damping_ratio,
+    ])  # fmt: skip
+    return x
 
 
 def _joint(x: Array) -> Elastic:

@@ -19,7 +19,16 @@ from scipy.optimize import least_squares
 from servod.errors import AnswerIsNo
 from servod.identify.estimate import LEVEL, Estimate, estimate, jackknife
 from servod.identify.fits import elastic
+from servod.identify.fits.ranges import at_ends, joined
 from servod.identify.fits.rigid import Rigid, response_of
+from servod.identify.fits.strokes import (
+    Stroke,
+    coherence_of,
+    deviation_of,
+    position_over_torque,
+    ratio_of,
+    spectra,
+)
 from servod.identify.trace import Trace
 
 Array = NDArray[np.float64]
@@ -27,8 +36,8 @@ Complex = NDArray[np.complex128]
 
 #: Lines with less coherence than this carry no weight.
 LEAST_COHERENCE = 0.6
-#: Longest delay that is looked for, s.
-LONGEST_DELAY_S = 0.05
+#: Longest delay and lag that are looked for, s.
+LONGEST_DELAY_S = LONGEST_LAG_S = elastic.LONGEST_DELAY_S
 #: The lag must lower the misfit this significantly before it counts as one.
 LAG_SIGNIFICANCE = 1e-3
 #: A rigid joint that leaves this misfit per line is not all; two masses must leave at most this share of it.
@@ -48,7 +57,11 @@ class Resonance(NamedTuple):
 
 
 class ResponseFit(NamedTuple):
-    """Estimates, and the response itself: lines in Hz, position over torque in rad/(N*m), its relative deviation."""
+    """Estimates, and the response itself.
+
+    At the lines `frequency_hz`: position over torque in rad/(N*m), the relative standard deviation of its mean over the
+    strokes, and the coherence of motion and excitation.
+    """
 
     inertia: Estimate
     viscous_slope: Estimate
@@ -60,22 +73,25 @@ class ResponseFit(NamedTuple):
     response: Complex
     deviation: Array
     coherence: Array
+    period_s: float
 
-    def rigid(self) -> Rigid:
-        """The fitted rigid joint."""
-        return Rigid(self.inertia.value, self.viscous_slope.value, self.delay_s.value, self.lag_s.value)
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """Lines that the estimates rest on."""
+        return self.coherence >= LEAST_COHERENCE
 
-
-class _Stroke(NamedTuple):
-    """Spectra of one stroke at the excited lines: velocity, torque, excitation."""
-
-    velocity: Complex
-    torque: Complex
-    excitation: Complex
+    def model(self, frequency_hz: Array) -> Complex:
+        """Position over torque of what was fitted, rad/(N*m)."""
+        if self.resonance is not None:
+            ratio = elastic.response_of(self.resonance.joint, frequency_hz, self.period_s)
+        else:
+            rigid = Rigid(self.inertia.value, self.viscous_slope.value, self.delay_s.value, self.lag_s.value)
+            ratio = response_of(rigid, frequency_hz, self.period_s)
+        return position_over_torque(frequency_hz, ratio, self.period_s)
 
 
 class _Lines(NamedTuple):
-    """What the models are fitted to: lines in Hz, relative deviation of one stroke at each, period in s."""
+    """What the models are fitted to: lines in Hz, relative deviation of the strokes' mean at each, period in s."""
 
     frequency: Array
     deviation: Array
@@ -83,50 +99,53 @@ class _Lines(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """The chosen model: inertia, viscous, delay, lag; its deviations; the spring, where there is one."""
+    """The chosen model: inertia, viscous, delay, lag; its deviations and notes; the spring, where there is one."""
 
     values: Array
     spread: Array
+    notes: Sequence[str]
     lag: Estimate
     resonance: Resonance | None
 
 
 def fit(trace: Trace, inertia: float) -> ResponseFit:
     """Fit one multisine recording; `inertia` is the first idea of it. Raises AnswerIsNo without coherence."""
-    frequency, strokes = _spectra(trace)
-    coherence = _coherence(strokes)
+    frequency, strokes = spectra(trace)
+    coherence = coherence_of(strokes)
     used = coherence >= LEAST_COHERENCE
     if np.count_nonzero(used) < 6:
         raise AnswerIsNo(
             "inertia and delay are not identifiable from this multisine: the motion is not coherent with it; allow "
             "more torque or speed, or a finer encoder"
         )
-    deviation, period = _deviation(strokes), trace.period_s
-    seen = [_Stroke(s.velocity[used], s.torque[used], s.excitation[used]) for s in strokes]
+    deviation, period = deviation_of(strokes), trace.period_s
+    seen = [Stroke(s.velocity[used], s.torque[used], s.excitation[used]) for s in strokes]
     found = _choose(_Lines(frequency[used], deviation[used], period), seen, inertia)
-    values, spread, freedom = found.values, found.spread, len(strokes) - 1
+    values, spread, notes, freedom = found.values, found.spread, found.notes, len(strokes) - 1
+    slope = joined("slope of the friction map at the sliding speed", notes[1])
     return ResponseFit(
-        estimate(values[0], spread[0], freedom, "kg*m^2", share=INERTIA_ALLOWANCE),
-        estimate(values[1], spread[1], freedom, "N*m*s/rad", note="slope of the friction map at the sliding speed"),
-        _delay(values, spread, freedom, found.lag),
+        estimate(values[0], spread[0], freedom, "kg*m^2", share=INERTIA_ALLOWANCE, note=notes[0]),
+        estimate(values[1], spread[1], freedom, "N*m*s/rad", note=slope),
+        _delay(values[2], spread[2], freedom, notes[2], found.lag),
         found.lag,
         found.resonance,
         _torque_noise(_Lines(frequency, deviation, period), strokes, trace, values),
         frequency,
-        _position_over_torque(frequency, _ratio(strokes), period),
+        position_over_torque(frequency, ratio_of(strokes), period),
         deviation,
         coherence,
+        period,
     )
 
 
-def _choose(lines: _Lines, strokes: Sequence[_Stroke], inertia: float) -> _Found:
+def _choose(lines: _Lines, strokes: Sequence[Stroke], inertia: float) -> _Found:
     """The simplest model that explains the response: rigid, rigid behind a lag, two masses."""
     start = np.log([inertia, max(inertia * 10.0, 1e-12)])
 
-    def solve(parts: Sequence[_Stroke], lag: bool) -> Array:
-        return _solve(lines.frequency, _ratio(parts), lines.deviation, lines.period_s, start, lag)
+    def solve(parts: Sequence[Stroke], lag: bool) -> Array:
+        return _solve(lines.frequency, ratio_of(parts), lines.deviation, lines.period_s, start, lag)
 
-    ratio = _ratio(strokes)
+    ratio = ratio_of(strokes)
     plain, with_lag = solve(strokes, False), solve(strokes, True)
     costs = [_cost(lines, ratio, values) for values in (plain, with_lag)]
     if sprung := _sprung(lines, strokes, inertia, (plain, with_lag)):
@@ -134,17 +153,19 @@ def _choose(lines: _Lines, strokes: Sequence[_Stroke], inertia: float) -> _Found
     lagged, lag_spread = jackknife(lambda parts: solve(parts, True), strokes)
     freedom = len(strokes) - 1
     if _worse(costs, lines, len(strokes), with_lag):
-        lag = estimate(lagged[3], lag_spread[3], freedom, "s", floor=DELAY_ALLOWANCE_S)
-        return _Found(lagged, lag_spread, lag, None)
+        notes = _notes(lagged, start)
+        lag = estimate(lagged[3], lag_spread[3], freedom, "s", floor=DELAY_ALLOWANCE_S, note=notes[3])
+        return _Found(lagged, lag_spread, notes, lag, None)
     unseen = lagged[3] + float(stats.t.ppf(LEVEL, freedom)) * lag_spread[3]
     note = "none that could be told from the delay; what there is, is part of the delay"
     lag = Estimate(0.0, 0.0, min(max(1e-4, unseen), float(plain[2])), "s", note)
-    return _Found(*jackknife(lambda parts: solve(parts, False), strokes), lag, None)
+    values, spread = jackknife(lambda parts: solve(parts, False), strokes)
+    return _Found(values, spread, _notes(values, start), lag, None)
 
 
-def _sprung(lines: _Lines, strokes: Sequence[_Stroke], inertia: float, rigid: Sequence[Array]) -> _Found | None:
+def _sprung(lines: _Lines, strokes: Sequence[Stroke], inertia: float, rigid: Sequence[Array]) -> _Found | None:
     """Two masses with a spring, if they explain what the `rigid` joints leave, beyond where cogging disturbs."""
-    upper, ratio = lines.frequency >= elastic.LOWEST_HZ, _ratio(strokes)
+    upper, ratio = lines.frequency >= elastic.LOWEST_HZ, ratio_of(strokes)
     seen = _Lines(lines.frequency[upper], lines.deviation[upper], lines.period_s)
     rigid_cost = min(_cost(seen, ratio[upper], values) for values in rigid)
     if rigid_cost < UNEXPLAINED * np.count_nonzero(upper):
@@ -154,66 +175,25 @@ def _sprung(lines: _Lines, strokes: Sequence[_Stroke], inertia: float, rigid: Se
     if float(np.sum(np.abs(error / seen.deviation) ** 2)) > SPRUNG_COST * rigid_cost:
         return None
 
-    def solve(parts: Sequence[_Stroke]) -> Array:
-        return np.array(elastic.solve_from(joint, lines.frequency, _ratio(parts), lines.deviation, lines.period_s))
+    def solve(parts: Sequence[Stroke]) -> Array:
+        return np.array(elastic.solve_from(joint, lines.frequency, ratio_of(parts), lines.deviation, lines.period_s))
 
     values, spread = jackknife(solve, strokes)
-    freedom = len(strokes) - 1
+    freedom, notes = len(strokes) - 1, elastic.notes(elastic.Elastic(*values), inertia, float(lines.frequency[-1]))
+    damping = f"its damping {notes.damping_ratio}" if notes.damping_ratio else ""
     load_spread = float(np.hypot(spread[4] * values[0], spread[0] * values[4]))
     resonance = Resonance(
-        estimate(values[3], spread[3], freedom, "Hz", share=2.0 * INERTIA_ALLOWANCE),
-        estimate(values[4] * values[0], load_spread, freedom, "kg*m^2", share=3.0 * INERTIA_ALLOWANCE),
+        estimate(
+            values[3], spread[3], freedom, "Hz", share=2.0 * INERTIA_ALLOWANCE, note=joined(notes.resonance_hz, damping)
+        ),
+        estimate(
+            values[4] * values[0], load_spread, freedom, "kg*m^2", share=3.0 * INERTIA_ALLOWANCE, note=notes.load_share
+        ),
         elastic.Elastic(*values),
     )
     unseen = min(lines.period_s, float(values[2]))
     lag = Estimate(0.0, 0.0, unseen, "s", "not told beside a resonance; what there is, is part of the delay")
-    return _Found(np.array([*values[:3], 0.0]), np.array([*spread[:3], 0.0]), lag, resonance)
-
-
-def _spectra(trace: Trace) -> tuple[Array, list[_Stroke]]:
-    """Lines in Hz and the spectra of every whole stroke."""
-    s = trace.settings
-    count, first, stride = int(s["count"]), int(s["first"]), int(s["stride"])
-    lines = np.array([int(s[f"line_{i}"]) for i in range(sum(key.startswith("line_") for key in s))])
-    strokes = []
-    for i in range(int(s["strokes"])):
-        start = first + i * stride
-        if start + count >= len(trace):
-            break
-        way = np.diff(trace.position_rad[start : start + count + 1])
-        parts = (way - way.mean(), trace.torque_nm[start : start + count], trace.excitation_nm[start : start + count])
-        strokes.append(_Stroke(*(np.fft.rfft(part)[lines] / count for part in parts)))
-    if len(strokes) < 4:
-        raise AnswerIsNo("the multisine recording has fewer than four whole strokes")
-    return lines / (count * trace.period_s), strokes
-
-
-def _ratio(strokes: Sequence[_Stroke]) -> Complex:
-    """Way per period over torque, through the excitation as instrument."""
-    way = sum(s.velocity * s.excitation.conj() for s in strokes)
-    torque = sum(s.torque * s.excitation.conj() for s in strokes)
-    ratio: Complex = np.asarray(way / torque)
-    return ratio
-
-
-def _coherence(strokes: Sequence[_Stroke]) -> Array:
-    """Share of the motion at each line that follows the excitation."""
-    cross = np.abs(sum(s.velocity * s.excitation.conj() for s in strokes)) ** 2
-    powers = sum(np.abs(s.velocity) ** 2 for s in strokes) * sum(np.abs(s.excitation) ** 2 for s in strokes)
-    coherence: Array = np.asarray(cross / powers)
-    return coherence
-
-
-def _deviation(strokes: Sequence[_Stroke]) -> Array:
-    """Relative standard deviation of the ratio at each line, smoothed over neighbours."""
-    ratio = _ratio(strokes)
-    misfit = np.array([np.abs(s.velocity - ratio * s.torque) ** 2 for s in strokes]).sum(axis=0)
-    power = sum(np.abs(ratio * s.torque) ** 2 for s in strokes)
-    relative = misfit / (len(strokes) - 1) / np.asarray(power)
-    padded = np.pad(relative, 1, mode="edge")
-    smooth = (padded[:-2] + padded[1:-1] + padded[2:]) / 3.0
-    deviation: Array = np.sqrt(smooth + 1e-6)
-    return deviation
+    return _Found(np.array([*values[:3], 0.0]), np.array([*spread[:3], 0.0]), notes[:3], lag, resonance)
 
 
 def _model(frequency: Array, values: Array, period_s: float) -> Complex:
@@ -233,17 +213,28 @@ def _solve(frequency: Array, ratio: Complex, deviation: Array, period: float, st
     best = None
     for delay in (0.5, 2.0, 5.0):
         first = np.array([start[0], 50.0, delay] + ([0.3] if lag else []))
-        low = [start[0] - 3.0, -2000.0, 0.0] + ([0.0] if lag else [])
-        high = [start[0] + 3.0, 1e5, 1e3 * LONGEST_DELAY_S] + ([50.0] if lag else [])
-        found = least_squares(misfit, first, bounds=(low, high), loss="soft_l1", x_scale="jac")
+        bounds = [bound[: len(first)] for bound in _ranges(start)]
+        found = least_squares(misfit, first, bounds=bounds, loss="soft_l1", x_scale="jac")
         best = found if best is None or found.cost < best.cost else best
     assert best is not None
     x = best.x
     return np.array([np.exp(x[0]), x[1] * np.exp(start[0]), x[2] * 1e-3, x[3] * 1e-3 if lag else 0.0])
 
 
+def _ranges(start: Array) -> tuple[list[float], list[float]]:
+    """Bounds of log inertia, viscous slope over inertia's first idea in 1/s, delay and lag in ms."""
+    low = [start[0] - 3.0, -2000.0, 0.0, 0.0]
+    return low, [start[0] + 3.0, 1e5, 1e3 * LONGEST_DELAY_S, 1e3 * LONGEST_LAG_S]
+
+
+def _notes(values: Array, start: Array) -> tuple[str, ...]:
+    """What of (inertia, viscous, delay, lag) stands at the end of its range."""
+    inertia, viscous, delay_s, lag_s = values.tolist()
+    return at_ends([np.log(inertia), viscous / np.exp(start[0]), 1e3 * delay_s, 1e3 * lag_s], *_ranges(start))
+
+
 def _cost(lines: _Lines, ratio: Complex, values: Array) -> float:
-    """Misfit of the rigid joint: sum of squares, relative to the deviation of one stroke."""
+    """Misfit of the rigid joint: sum of squares, relative to the deviation of the strokes' mean."""
     error = (_model(lines.frequency, values, lines.period_s) / ratio - 1.0) / lines.deviation
     return float(np.sum(np.abs(error) ** 2))
 
@@ -255,21 +246,13 @@ def _worse(costs: Sequence[float], lines: _Lines, strokes: int, with_lag: Array)
     return with_lag[3] > 1e-4 and float(stats.f.sf(gain, 1, freedom)) < LAG_SIGNIFICANCE
 
 
-def _delay(values: Array, spread: Array, freedom: int, lag: Estimate) -> Estimate:
+def _delay(value_s: float, spread_s: float, freedom: int, note: str, lag: Estimate) -> Estimate:
     """The delay; where a lag could not be told from it, it may be shorter by that."""
-    note = "at the end of its range" if values[2] < 1e-6 or values[2] > 0.99 * LONGEST_DELAY_S else ""
-    found = estimate(values[2], spread[2], freedom, "s", floor=DELAY_ALLOWANCE_S, note=note)
+    found = estimate(value_s, spread_s, freedom, "s", floor=DELAY_ALLOWANCE_S, note=note)
     return found if lag.value > 0.0 else replace(found, low=found.low - lag.high)
 
 
-def _position_over_torque(frequency: Array, ratio: Complex, period_s: float) -> Complex:
-    """From way per period to position at the sample."""
-    z = np.exp(2j * np.pi * frequency * period_s)
-    position: Complex = ratio / (z - 1.0)
-    return position
-
-
-def _torque_noise(lines: _Lines, strokes: Sequence[_Stroke], trace: Trace, values: Array) -> Estimate:
+def _torque_noise(lines: _Lines, strokes: Sequence[Stroke], trace: Trace, values: Array) -> Estimate:
     """Torque disturbance below `NOISE_HZ`, from what the motion does beyond the torque; by the scatter of strokes.
 
     `lines` and `strokes` are all that were excited, coherent or not.
@@ -278,7 +261,7 @@ def _torque_noise(lines: _Lines, strokes: Sequence[_Stroke], trace: Trace, value
     low = lines.frequency < NOISE_HZ
     bandwidth_lines = NOISE_HZ * trace.settings["count"] * lines.period_s
 
-    def rms(parts: Sequence[_Stroke]) -> Array:
+    def rms(parts: Sequence[Stroke]) -> Array:
         errors = np.array([np.abs((s.velocity - ratio * s.torque) / ratio)[low] for s in parts])
         return np.sqrt(np.atleast_1d(np.mean(2.0 * errors**2) * bandwidth_lines))
 

@@ -1,4 +1,4 @@
-"""Figures of an identification: the Dahl curve with c0 (Fig. 7) and the friction-velocity map (Fig. 8).
+"""Figures of an identification's friction: the Dahl curve with c0 (Fig. 7) and the friction-velocity map (Fig. 8).
 
 Stands on the fits and the identified model; a known plant, where there is one, is drawn beside what was found.
 """
