@@ -62,6 +62,13 @@ NEVER = {
 #: The lazy table of buses names the virtual bus, whose few lines of socket code stand beside the hub.
 EXCEPTIONS = {("servod.bus.open", "servod.drivers.virtual.client")}
 
+#: The files by which an identification reaches an axis, and what nothing else in it may import.
+LINKS = {"servod.identify.links", "servod.identify.virtual", "servod.identify.daemon_link"}
+_AXIS = (
+    *("servod.bus", "servod.control", "servod.daemon", "servod.daemon_config", "servod.daemon_recording"),
+    *("servod.drivers.virtual", "servod.loop", "servod.master", "servod.session"),
+)
+
 LAB = {"numpy", "scipy", "numba", "llvmlite", "plotly", "matplotlib", "pyarrow", "cvxpy", "clarabel", "scs", "pandas"}
 CORE = ["servod.daemon.main", "servod.loop.process", "servod.drivers.cia402", "servod.drivers.cia406", "servod.cli"]
 
@@ -104,6 +111,29 @@ def test_neighbours_keep_apart(module: str) -> None:
         if source.module_name(file).startswith(module)
         for name, line in source.imports(file)
         if any(name == banned or name.startswith(banned + ".") for banned in NEVER[module])
+    ]
+    assert wrong == []
+
+
+def test_only_the_links_of_an_identification_know_an_axis() -> None:
+    wrong = [
+        f"{file.relative_to(source.ROOT)}:{line} imports {name}"
+        for file in source.files("servod/identify")
+        if source.module_name(file) not in LINKS
+        for name, line in source.imports(file)
+        if any(name == banned or name.startswith(banned + ".") for banned in _AXIS)
+    ]
+    assert wrong == []
+
+
+@pytest.mark.parametrize("part", ["fits", "analysis", "result", "store", "signals", "estimate", "changes"])
+def test_fits_know_recordings_and_no_link(part: str) -> None:
+    wrong = [
+        f"{file.relative_to(source.ROOT)}:{line} imports {name}"
+        for file in source.files("servod/identify")
+        if source.module_name(file).startswith(f"servod.identify.{part}")
+        for name, line in source.imports(file)
+        if name in {*LINKS, "servod.identify.walk"} or name.startswith("servod.identify.experiments")
     ]
     assert wrong == []
 
