@@ -55,7 +55,9 @@ def identify(
     recordings: Annotated[Path | None, typer.Option(help="No axis: fit the recordings in this folder.")] = None,
     before: Annotated[Path | None, typer.Option(help="Earlier model: say what has changed since.")] = None,
     travel: Annotated[float | None, typer.Option(min=0.02, help="Travel to each side at most, rad.")] = None,
-    speed: Annotated[float | None, typer.Option(min=0.02, help="Speed at most, rad/s.")] = None,
+    speed: Annotated[
+        float | None, typer.Option(min=0.02, help="Speed at most, rad/s; seen above it, the walk ends.")
+    ] = None,
     settings: Annotated[Path | None, typer.Option(help="Virtual axis: what drive and encoder really are.")] = None,
     encoder_counts: Annotated[int | None, typer.Option(min=4, help="Virtual axis: counts per turn.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of excitation and virtual noise.")] = 1,
