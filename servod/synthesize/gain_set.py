@@ -36,9 +36,9 @@ from servod.synthesize.local_sets import (
 )
 from servod.synthesize.moving_observer import with_moving_observer
 from servod.synthesize.observer_width import (
+    ENOUGH_RAD_S,
     OBSERVERS_RAD_S,
     bandwidth_of,
-    is_enough,
     with_observer,
     with_widest_observer,
 )
@@ -146,7 +146,7 @@ def synthesize(
         bandwidth = bandwidth_of(law)
         if best is None or bandwidth > best[0]:
             best = bandwidth, design, law
-        if is_enough(law) or not options.observer:
+        if bandwidth >= ENOUGH_RAD_S or not options.observer:
             break
     if best is None:
         return explain(model, wishes)

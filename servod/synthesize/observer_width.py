@@ -23,9 +23,7 @@ from servod.verify.steady_friction import SteadyFriction
 #: Bandwidths, best first: the first is taken with which every corner of the intervals stands with CORNER_WANTED, and
 #: the axis as modelled with the wanted disk margin, or else with the one of the certificate.
 OBSERVERS_RAD_S = (80.0, 60.0, 45.0, 34.0, 25.0, 18.0, 12.0, 7.0)
-#: From this bandwidth on no other choice of filter, poles and weights is tried; the second one where there is none of
-#: its own for coming to rest.
-ENOUGH_RAD_S, EVEN_ENOUGH_RAD_S = 20.0, 45.0
+ENOUGH_RAD_S = 20.0  # from this bandwidth on no other choice of filter, poles and weights is tried
 DISK_WANTED, CORNER_WANTED = 0.15, 1.25 * CORNER_DISK
 FEW_SPEEDS = 12  # per direction
 STABLE = 0.9999  # largest pole: the certificate looks between the corners and between these speeds as well
@@ -136,13 +134,6 @@ def widest(search: Search, law: LocalParameters, beyond_rad_s: float, low_factor
                 if search.stands_everywhere(fast, disk):
                     return fast
     return law.model_copy(update={"disturbance_observer": None})
-
-
-def is_enough(law: LocalParameters) -> bool:
-    """Whether the observer is so fast that nothing else is worth a try."""
-    observer = law.disturbance_observer
-    even = observer is not None and observer.low_bandwidth_rad_s is None
-    return bandwidth_of(law) >= (EVEN_ENOUGH_RAD_S if even else ENOUGH_RAD_S)
 
 
 def bandwidth_of(law: LocalParameters) -> float:
