@@ -130,12 +130,12 @@ def frequency_response(found: ResponseFit) -> dict[str, Any]:
     return {
         "frequency_hz": list(_rounded(found.frequency_hz)),
         "gain_rad_per_nm": list(_rounded(np.abs(found.response))),
-        "phase_deg": list(_rounded(np.degrees(np.unwrap(np.angle(found.response))))),
+        "phase_deg": list(_rounded(np.degrees(found.phase_rad(found.response)))),
         "half_width": list(_rounded(TWO_SIDED * found.deviation)),
         "coherence": list(_rounded(found.coherence)),
         "used": found.used.tolist(),
         "fitted_gain_rad_per_nm": list(_rounded(np.abs(fitted))),
-        "fitted_phase_deg": list(_rounded(np.degrees(np.unwrap(np.angle(fitted))))),
+        "fitted_phase_deg": list(_rounded(np.degrees(found.phase_rad(fitted)))),
     }
 
 

@@ -68,7 +68,10 @@ def sliding() -> ResponseFit:
     """The response of a rigid joint, five per cent off, as a multisine shows it."""
     hz, one = np.geomspace(3.0, 160.0, 12), Estimate(1e-3, 9e-4, 1.1e-3, "1")
     none = Estimate(0.0, 0.0, 0.0, "1")
-    fit = ResponseFit(one, one, one, none, None, one, hz, 0j * hz, np.full(12, 0.02), np.linspace(1.0, 0.4, 12), 1e-3)
+    slope, delay_s = Estimate(-0.004, -0.005, -0.003, "1"), Estimate(2e-3, 1e-3, 3e-3, "s")
+    fit = ResponseFit(
+        one, slope, delay_s, none, None, one, hz, 0j * hz, np.full(12, 0.02), np.linspace(1.0, 0.4, 12), 1e-3
+    )
     return fit._replace(response=1.05 * fit.model(hz))
 
 
@@ -148,6 +151,7 @@ def test_the_frequency_response_shows_lines_model_and_coherence() -> None:
     assert measured.y == pytest.approx(1.05 * np.interp(measured.x, fitted.x, fitted.y), rel=0.01)
     assert measured.bounds is not None and measured.bounds[1] == pytest.approx(1.0392 * measured.y)
     assert phase.curves[0].y == pytest.approx(np.interp(measured.x, fitted.x, phase.curves[1].y), abs=0.5)
+    assert np.all(np.abs(np.diff(phase.curves[1].y)) < 10.0) and -270.0 < phase.curves[1].y[0] < -180.0
     assert coherence.curves[0].y[[0, -1]] == pytest.approx([100.0, 40.0])
 
 

@@ -89,6 +89,22 @@ class ResponseFit(NamedTuple):
             ratio = response_of(rigid, frequency_hz, self.period_s)
         return position_over_torque(frequency_hz, ratio, self.period_s)
 
+    def phase_rad(self, of: Complex) -> Array:
+        """Phase of a response at the lines, each on the turn that is nearest to the fitted one.
+
+        The lowest lines, which cogging disturbs, do not tell by themselves how it goes from one to the next.
+        """
+        fitted = self.model(self.frequency_hz)
+        phase: Array = falling_phase_rad(fitted) + np.angle(of / fitted)
+        return phase
+
+
+def falling_phase_rad(response: Complex) -> Array:
+    """Phase of a smooth response from torque to position, which begins below zero and goes on without turns."""
+    phase = np.unwrap(np.angle(response))
+    falling: Array = phase - 2.0 * np.pi if phase[0] > 0.0 else phase
+    return falling
+
 
 class _Lines(NamedTuple):
     """What the models are fitted to: lines in Hz, relative deviation of the strokes' mean at each, period in s."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from servod.identify.fits.response import LEAST_COHERENCE, ResponseFit
+from servod.identify.fits.response import LEAST_COHERENCE, ResponseFit, falling_phase_rad
 from servod.report.figure import Array, Axis, Colour, Curve, Figure, Panel, Scale, Style, curve
 
 _POINTS = 300
@@ -19,8 +19,7 @@ def frequency_response(found: ResponseFit, name: str = "frequency_response") -> 
     """Position over torque command of the sliding joint, measured line by line and fitted, and the coherence."""
     fine = np.geomspace(found.frequency_hz[0], found.frequency_hz[-1], _POINTS)
     gain, error, fitted = np.abs(found.response), _HALF * found.deviation, found.model(fine)
-    phase, model_phase = _degrees(found.response), _degrees(fitted)
-    model_phase -= 360.0 * np.round((model_phase[0] - phase[0]) / 360.0)
+    phase, model_phase = np.degrees(found.phase_rad(found.response)), np.degrees(falling_phase_rad(fitted))
     hz = Axis("frequency in Hz", Scale.LOG)
     panels = (
         Panel(
@@ -57,8 +56,3 @@ def _coherence(found: ResponseFit) -> tuple[Curve, ...]:
     ends, least = found.frequency_hz[[0, -1]], np.full(2, 100.0 * LEAST_COHERENCE)
     line = curve("least that counts", ends, least, Colour.GREY, Style.DASHED, width=1.0)
     return curve("measured", found.frequency_hz, 100.0 * found.coherence, Colour.BLUE, Style.POINTS), line
-
-
-def _degrees(response: np.ndarray[tuple[int], np.dtype[np.complex128]]) -> Array:
-    degrees: Array = np.degrees(np.unwrap(np.angle(response)))
-    return degrees
