@@ -20,7 +20,7 @@ from servod.diagnose.hypothesis import Document, get
 #: Below this share of the explainable error no known name may stand: what is there is something else. Real machines
 #: keep some of theirs above it, so that it is no nearer to 1; confidence falls with what is left instead. It is nearer
 #: where what is left is worth a name itself, from this share of dry friction on.
-LEAST_EXPLAINED, LEAST_BESIDE_MUCH, MUCH_TORQUE = 0.9, 0.925, 0.05
+LEAST_EXPLAINED, LEAST_BESIDE_MUCH, MUCH_TORQUE = 0.85, 0.925, 0.05
 
 #: What is left above the noise floor counts as unexplained from this share of dry friction, if it is also this share of
 #: what could be explained.

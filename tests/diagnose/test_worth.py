@@ -65,15 +65,15 @@ def test_a_push_lies_within_its_recording(scene: Scene) -> None:
 @pytest.mark.parametrize(
     ("removed", "left", "answer"),
     [
-        (0.88, 0.04, Verdict.UNEXPLAINED),
-        (0.91, 0.04, Verdict.MISSING_PHYSICS),
+        (0.83, 0.04, Verdict.UNEXPLAINED),
+        (0.88, 0.04, Verdict.MISSING_PHYSICS),
         (0.91, 0.15, Verdict.UNEXPLAINED),
         (0.94, 0.15, Verdict.MISSING_PHYSICS),
         (0.60, 0.01, Verdict.MISSING_PHYSICS),
     ],
 )
 def test_names_must_explain_most_of_what_is_left(scene: Scene, removed: float, left: float, answer: Verdict) -> None:
-    """Names that leave an eighth of the explainable error are somebody else's, unless what they leave is next to none.
+    """Names that leave a sixth of the explainable error are somebody else's, unless what they leave is next to none.
 
     `left` is a share of dry friction.
     """
