@@ -17,16 +17,16 @@ MAY_END = frozenset(
 CLOSE = 1e-6
 
 
-def at_end(fit: Fit) -> bool:
-    """Whether a number of the last term, or one of the model's own that this term opens, lies at an end of its range.
+def at_end(fit: Fit, place: int = -1) -> bool:
+    """Whether a number of a term (the last), or one of the model's own that it opens, lies at an end of its range.
 
     An end where the number is zero is none: there the effect is just absent.
     """
-    term, unknowns = fit.hypothesis.terms[-1], fit.hypothesis.unknowns
+    term, unknowns = fit.hypothesis.terms[place], fit.hypothesis.unknowns
     low, high = fit.hypothesis.bounds
-    first = fit.hypothesis.share(len(fit.hypothesis.terms) - 1).start
+    share = fit.hypothesis.share(place)
     for index, (unknown, at) in enumerate(zip(unknowns, fit.coordinates, strict=True)):
-        own = index >= first or unknown.key in term.opens
+        own = share.start <= index < share.stop or unknown.key in term.opens
         if not own or unknown.key in MAY_END:
             continue
         ends = [end for end, value in ((low[index], unknown.low), (high[index], unknown.high)) if value != 0.0]

@@ -10,11 +10,16 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from time import monotonic
 
+import numpy as np
+from numpy.typing import NDArray
+
 from servod.diagnose.effects import effect, effects
 from servod.diagnose.fit import Fit, Fitter
 from servod.diagnose.hypothesis import Term
 from servod.diagnose.parallel import side_by_side
 from servod.diagnose.scene import Scene
+
+Array = NDArray[np.float64]
 
 #: Starts that go on to the second round and its steps; effects that are fitted to the end and steps of such a fit.
 SECOND_ROUND, SECOND_STEPS, FULL_FITS, FULL_STEPS = 16, 3, 5, 8
@@ -32,11 +37,25 @@ PER_NUMBER = 0.02
 
 @dataclass(frozen=True)
 class Candidate:
-    """An effect on trial: its fit, and what is left of the cost of the present fit as a share of it."""
+    """An effect on trial: its fit, and what is left of the cost of the present fit as a share of it.
+
+    `place` is that of its own term in the fit: the last, unless others came in behind it.
+    """
 
     effect: str
     fit: Fit
     left: float
+    place: int = -1
+
+    @property
+    def term(self) -> Term:
+        """The effect in the form that was fitted."""
+        return self.fit.hypothesis.terms[self.place]
+
+    @property
+    def own(self) -> Array:
+        """Coordinates of the term's own unknowns."""
+        return self.fit.coordinates[self.fit.hypothesis.share(self.place)]
 
 
 class Trials:
@@ -106,8 +125,7 @@ class Trials:
 
 def plainly(candidate: Candidate) -> float:
     """What is left, a little more for every number that the term needs: the plainest of equals comes first."""
-    term = candidate.fit.hypothesis.terms[-1]
-    return candidate.left * (1.0 + PER_NUMBER * (len(term.unknowns) + len(term.opens)))
+    return candidate.left * (1.0 + PER_NUMBER * candidate.term.numbers)
 
 
 def best_of_each(sorted_candidates: list[Candidate], count: int, each: int) -> list[Candidate]:

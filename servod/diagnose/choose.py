@@ -88,7 +88,7 @@ class Chooser:
             if not added:
                 break
             if len(choice.fit.hypothesis.terms) >= 2:
-                self._prune(choice)
+                self.prune(choice)
         choice.tried, choice.floor = self.tried, self.floor
         return choice
 
@@ -140,11 +140,11 @@ class Chooser:
                 break
             settled, merit = self._to_end(present, self._settled(candidate.fit, present.mismatch))
             self.lower_floor(settled.mismatch)
-            if self._enters(merit, settled):
+            if self.enters(merit, settled):
                 bare = self.less(settled, len(settled.hypothesis.terms) - 1)
                 if self.error(bare.mismatch) < self.error(present.mismatch):
                     choice.fit, merit = bare, self.merit(bare, settled)
-            if self._enters(merit, settled):
+            if self.enters(merit, settled):
                 others = [c for c in candidates if c.effect != candidate.effect]
                 choice.fit = settled
                 choice.merits.append(merit)
@@ -229,21 +229,21 @@ class Chooser:
         slow = float(long_run(clipped[:, None], max(1, round(0.1 / period)))[0, 0])
         return max(slow / max(plain, 1e-30), 1.0)
 
-    def _enters(self, merit: Merit, fit: Fit) -> bool:
-        """Whether a new term may come in: it deserves it, its fit has come to an end, and not to one of a range."""
-        return self.deserves(merit, fit) and (fit.converged or merit.share >= SURE_SHARE) and not at_end(fit)
+    def enters(self, merit: Merit, fit: Fit, place: int = -1) -> bool:
+        """Whether a term (the last one, or the one at `place`) may come in: it deserves it, and its fit is whole."""
+        return self.deserves(merit, fit, place) and whole(merit, fit, place)
 
     def deserves(self, merit: Merit, fit: Fit, place: int = -1) -> bool:
         """Whether a term (the last one, or the one at `place`) is significant and worth naming."""
-        return worth_naming(merit, is_level(fit.hypothesis.terms[place])) and self.significant(merit, fit)
+        return worth_naming(merit, is_level(fit.hypothesis.terms[place])) and self.significant(merit, fit, place)
 
-    def significant(self, merit: Merit, fit: Fit) -> bool:
+    def significant(self, merit: Merit, fit: Fit, place: int = -1) -> bool:
         """Bayesian information criterion with a correction for the number of starts tried."""
-        unknowns = max(len(fit.hypothesis.terms[-1].unknowns), 1)
+        unknowns = max(len(fit.hypothesis.terms[place].unknowns), 1)
         rows = float(self.rows.sum())
         return merit.gain > unknowns * math.log(rows) + 2.0 * math.log(max(self.tried, 1)) + 20.0
 
-    def _prune(self, choice: Choice) -> None:
+    def prune(self, choice: Choice) -> None:
         """Drop every earlier term whose work the others now do."""
         index = 0
         while index < len(choice.fit.hypothesis.terms) - 1:
@@ -260,6 +260,11 @@ class Chooser:
         gone = fit.hypothesis.share(index)
         kept = np.delete(fit.coordinates, gone)
         return self.settled(fit.hypothesis.without(index), kept, fit.mismatch, np.delete(fit.jacobian, gone, axis=1))
+
+
+def whole(merit: Merit, fit: Fit, place: int = -1) -> bool:
+    """Whether the fit of a term has come to an end, and not to one of a range."""
+    return (fit.converged or merit.share >= SURE_SHARE) and not at_end(fit, place)
 
 
 #: Effects that may come in again with another period or place: a second harmonic is no second effect.

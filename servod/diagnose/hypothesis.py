@@ -86,6 +86,11 @@ class Term:
     begins: Mapping[str, float] = field(default_factory=dict)
     each: EachWriter | None = None
 
+    @property
+    def numbers(self) -> int:
+        """How many numbers it needs: its own unknowns and those of the model that it opens."""
+        return len(self.unknowns) + len(self.opens)
+
 
 @dataclass(frozen=True)
 class Hypothesis:

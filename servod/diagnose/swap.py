@@ -29,18 +29,37 @@ BETTER = 0.01
 
 def swapped(chooser: Chooser, choice: Choice) -> None:
     """Try rivals in the place of every term but the last, which had them all beside it."""
+    before = choice.fit
     for index in range(len(choice.fit.hypothesis.terms) - 1):
         for rival in _rivals(choice, index):
-            if monotonic() > chooser.deadline:
-                return
-            other = _instead(chooser, choice.fit, index, rival)
-            if other is not None and _better(chooser, choice.fit, other):
-                entry = choice.entries[index]
-                old = Candidate(choice.fit.hypothesis.terms[index].effect, choice.fit, entry.left)
-                rest = [c for c in entry.rivals if c.effect != rival.effect]
-                choice.entries[index] = Entry(entry.left, [old, *rest])
-                choice.fit = other
+            if monotonic() > chooser.deadline or _swap(chooser, choice, index, rival):
                 break
+    if choice.fit is not before:
+        _judge_anew(chooser, choice)
+
+
+def _swap(chooser: Chooser, choice: Choice, index: int, rival: Candidate) -> bool:
+    """Put a rival in the place of a term if it does better there and deserves to come in; whether it did."""
+    other = _instead(chooser, choice.fit, index, rival)
+    if other is None or not _better(chooser, choice.fit, other):
+        return False
+    merit = chooser.merit(chooser.less(other, index), other)
+    if not chooser.enters(merit, other, index):
+        return False
+    entry = choice.entries[index]
+    old = Candidate(choice.fit.hypothesis.terms[index].effect, choice.fit, entry.left, index)
+    rest = [c for c in entry.rivals if c.effect != rival.effect]
+    choice.entries[index] = Entry(entry.left, [old, *rest])
+    choice.merits[index] = merit
+    choice.fit = other
+    return True
+
+
+def _judge_anew(chooser: Chooser, choice: Choice) -> None:
+    """Drop terms whose work a term that was put in now does, and say what each of the others is worth beside it."""
+    chooser.prune(choice)
+    last = len(choice.fit.hypothesis.terms) - 1
+    choice.merits[last] = chooser.merit(chooser.less(choice.fit, last), choice.fit)
 
 
 def _rivals(choice: Choice, index: int) -> list[Candidate]:
@@ -52,7 +71,7 @@ def _rivals(choice: Choice, index: int) -> list[Candidate]:
 def _instead(chooser: Chooser, fit: Fit, index: int, rival: Candidate) -> Fit | None:
     """The fit with a rival's term in the place of its own, started where the rival's fit ended."""
     terms = list(fit.hypothesis.terms)
-    terms[index] = rival.fit.hypothesis.terms[-1]
+    terms[index] = rival.term
     hypothesis = replace(fit.hypothesis, terms=tuple(terms))
     at = _coordinates(fit, hypothesis, index, rival)
     try:
@@ -64,8 +83,7 @@ def _instead(chooser: Chooser, fit: Fit, index: int, rival: Candidate) -> Fit | 
 def _coordinates(fit: Fit, hypothesis: Hypothesis, index: int, rival: Candidate) -> Array:
     """Coordinates of the fit, with the rival's own, and with its values of what either of the two opens."""
     own = fit.hypothesis.share(index)
-    new = rival.fit.coordinates[rival.fit.hypothesis.share(len(rival.fit.hypothesis.terms) - 1)]
-    at = np.concatenate([fit.coordinates[: own.start], new, fit.coordinates[own.stop :]])
+    at = np.concatenate([fit.coordinates[: own.start], rival.own, fit.coordinates[own.stop :]])
     opened = set(fit.hypothesis.terms[index].opens) | set(hypothesis.terms[index].opens)
     for place, unknown in enumerate(hypothesis.base):
         if unknown.key in opened:
@@ -82,4 +100,4 @@ def _better(chooser: Chooser, old: Fit, new: Fit) -> bool:
 
 
 def _size(fit: Fit) -> int:
-    return sum(len(term.unknowns) + len(term.opens) for term in fit.hypothesis.terms)
+    return sum(term.numbers for term in fit.hypothesis.terms)

@@ -11,11 +11,14 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
+from numpy.typing import NDArray
 
 from servod.diagnose.base import BRISTLE_FACTOR, DELAY_S, OFFSET_SHARE, RECALIBRATION, STRIBECK_SHARE
 from servod.diagnose.candidates import Candidate
 from servod.diagnose.choice import Choice
 from servod.diagnose.hypothesis import Document, get
+
+Array = NDArray[np.float64]
 
 #: Below this share of the explainable error no known name may stand: what is there is something else. Real machines
 #: keep some of theirs above it, so that it is no nearer to 1; confidence falls with what is left instead. It is nearer
@@ -70,11 +73,11 @@ class Shares:
         return math.sqrt(max(self.after**2 - self.floor**2, 0.0))
 
 
-def shares(choice: Choice, counts: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Shares:
-    """Errors of the base and of the chosen fit."""
-    before, after = (float(np.mean(fit.mismatch[counts] ** 2)) for fit in (choice.base, choice.fit))
-    removed = (before - after) / max(before - choice.floor, 1e-30)
-    return Shares(math.sqrt(before), math.sqrt(after), math.sqrt(choice.floor), min(max(removed, 0.0), 1.0))
+def shares(mismatch: tuple[Array, Array], counts: NDArray[np.bool_], floor: float) -> Shares:
+    """Errors of two mismatches, before and after, over the rows that count; `floor` is a mean square."""
+    before, after = (float(np.mean(rows[counts] ** 2)) for rows in mismatch)
+    removed = (before - after) / max(before - floor, 1e-30)
+    return Shares(math.sqrt(before), math.sqrt(after), math.sqrt(floor), min(max(removed, 0.0), 1.0))
 
 
 def verdict(choice: Choice, named: list[int], errors: Shares, dry: float) -> Verdict:
@@ -152,7 +155,7 @@ def confidence(choice: Choice, index: int, removed: float) -> float:
 
 def _more_unknowns(rival: Candidate, own: int) -> int:
     """Unknowns that a rival needs beyond the finding's own: one that only does as well with more is no evidence."""
-    return max(len(rival.fit.hypothesis.terms[-1].unknowns) - own, 0)
+    return max(len(rival.term.unknowns) - own, 0)
 
 
 def alternatives(choice: Choice, index: int) -> list[str]:
