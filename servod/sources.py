@@ -18,6 +18,8 @@ VERIFIES = (
 )
 #: What computes a design: it judges its choices by the same checks.
 SYNTHESIZES = ("synthesize/*.py", *(pattern for pattern in VERIFIES if pattern != "references.py"))
+#: What a diagnosis comes from, intake and simulator included.
+DIAGNOSES = ("diagnose/**/*.py", "recordings/*.py", "record.py", "models/*.py", "axis_*.py", "identified.py")
 
 
 def sources(patterns: tuple[str, ...]) -> list[Path]:
@@ -27,7 +29,12 @@ def sources(patterns: tuple[str, ...]) -> list[Path]:
 
 @cache
 def source_sha256(patterns: tuple[str, ...]) -> str:
-    """Hash of these files by their names and contents."""
+    """Hash of these files as they were when this process first asked: what it runs itself."""
+    return sha256_on_disk(patterns)
+
+
+def sha256_on_disk(patterns: tuple[str, ...]) -> str:
+    """Hash of these files by their names and contents as they are now: what a process that starts now will run."""
     digest = hashlib.sha256()
     for path in sources(patterns):
         digest.update(path.relative_to(_PACKAGE).as_posix().encode() + b"\0" + path.read_bytes())

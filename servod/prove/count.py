@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from servod.prove.plan import Sort
-from servod.prove.score import Guess, Scored
+from servod.prove.score import Guess, Parameter, Scored
 
 Document = dict[str, Any]
 
@@ -87,19 +87,21 @@ def confusion(cases: Sequence[Scored]) -> dict[str, dict[str, int]]:
 
 
 def parameters(cases: Sequence[Scored]) -> Document:
-    """Errors (shares) and coverage of all parameters of right findings, and by effect."""
-    told = [parameter for case in cases for parameter in case.parameters]
-    effects = sorted({parameter.effect for parameter in told})
-    rows = {effect: [p for p in told if p.effect == effect] for effect in effects}
-    return {"all": _errors(told), "by_effect": {effect: _errors(row) for effect, row in rows.items()}}
+    """Errors (shares) and coverage of all true parameters of what was found, told or not, and by effect."""
+    true = [parameter for case in cases for parameter in case.parameters]
+    effects = sorted({parameter.effect for parameter in true})
+    rows = {effect: [p for p in true if p.effect == effect] for effect in effects}
+    return {"all": _errors(true), "by_effect": {effect: _errors(row) for effect, row in rows.items()}}
 
 
-def _errors(told: Sequence[Any]) -> Document:
-    if not told:
-        return {"parameters": 0, "median_error": None, "covered": None}
-    error = float(np.median([parameter.error for parameter in told]))
-    covered = float(np.mean([parameter.covered for parameter in told]))
-    return {"parameters": len(told), "median_error": round(error, 5), "covered": round(covered, 4)}
+def _errors(true: Sequence[Parameter]) -> Document:
+    if not true:
+        return {"parameters": 0, "missing": 0, "median_error": None, "covered": None}
+    error = float(np.median([parameter.error for parameter in true]))
+    covered = float(np.mean([parameter.covered for parameter in true]))
+    missing = sum(not parameter.told for parameter in true)
+    counted = {"parameters": len(true), "missing": missing}
+    return counted | {"median_error": round(error, 5), "covered": round(covered, 4)}
 
 
 def calibration(cases: Sequence[Scored]) -> list[Document]:
@@ -114,12 +116,17 @@ def calibration(cases: Sequence[Scored]) -> list[Document]:
 
 
 def held_out(cases: Sequence[Scored]) -> Document:
-    """Windowed hold-out errors: after over before where an effect was concealed, after over the true model's own."""
+    """Windowed hold-out errors: after over before where an effect was concealed, after over the true model's own.
+
+    After over before is counted of all such cases, and of those where the believed model is off by TELLING times the
+    true one or there is no true one: where both are alike the ratio says nothing of what was found.
+    """
     hidden = [c.held_out for c in cases if c.sort in (Sort.SINGLE, Sort.PAIR)]
     telling = [h for h in hidden if not h.before < TELLING * h.own]
     known = [c.held_out for c in cases if not math.isnan(c.held_out.own)]
     return {
         "after_over_before": _spread([h.after / h.before for h in telling]),
+        "after_over_before_all": _spread([h.after / h.before for h in hidden]),
         "after_over_true": _spread([h.after / h.own for h in known]),
     }
 

@@ -14,6 +14,7 @@ from typing import Any
 from servod.errors import BadInput
 from servod.prove import count, figures, tables
 from servod.prove.conceal import SEALED, TRUTH, read_truth
+from servod.prove.examine import ANSWERS, RUN, one_diagnosis
 from servod.prove.plan import Sort
 from servod.prove.score import Scored, score_case
 from servod.prove.trial import Trial
@@ -27,11 +28,15 @@ PICTURES = "pictures"
 
 
 def score(trial: Trial, out: Path, tell: Tell) -> dict[str, Any]:
-    """Open the seal of the trial in `out` and score all answers. Raises BadInput when it is not what was sealed."""
+    """Open the seal of the trial in `out` and score all answers.
+
+    Raises BadInput when it is not what was sealed, or when not all answers are of one diagnosis.
+    """
     try:
         truth = read_truth(out, trial.sha256)
     except (OSError, ValueError) as error:
         raise BadInput(str(out / SEALED / TRUTH), str(error), "the truth as it was sealed") from None
+    one_diagnosis(out, [name for name in sorted(truth) if (out / ANSWERS / name / RUN).exists()])
     cases = []
     for number, (name, true) in enumerate(sorted(truth.items())):
         cases.append(score_case(out, name, true))
@@ -45,6 +50,7 @@ def document(trial: Trial, cases: list[Scored]) -> dict[str, Any]:
     alarmed = [case for case in cases if case.sort is Sort.NOTHING and case.guesses]
     return {
         "version": trial.version,
+        "sources": next((case.run["sources"] for case in cases if case.run), None),
         "cases": trial.cases,
         "seed": trial.seed,
         "harder": trial.harder,
@@ -86,7 +92,7 @@ def _row(case: Scored) -> dict[str, Any]:
         "named": {guess.effect: guess.confidence for guess in case.guesses},
         "right": case.right,
         "parameters": [
-            {"effect": p.effect, "name": p.name, "error": round(p.error, 5), "covered": p.covered}
+            {"effect": p.effect, "name": p.name, "error": round(p.error, 5), "covered": p.covered, "told": p.told}
             for p in case.parameters
         ],
         "held_out_rad": {key: None if math.isnan(value) else value for key, value in held.items()},

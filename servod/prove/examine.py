@@ -1,6 +1,7 @@
 """Runs `servoctl diagnose` on every case folder, as a user would: a process each, in a copy of this folder alone.
 
-The second of the three processes. What is done is not done again, so that an interrupted trial goes on where it was.
+The second of the three processes. What is done is not done again, so that an interrupted trial goes on where it was;
+but a trial is of one diagnosis, so that answers of other sources are no part of it.
 """
 
 from __future__ import annotations
@@ -19,8 +20,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Lock
 
+from servod.errors import BadInput
 from servod.prove.conceal import CASES
 from servod.report.files import write_bytes
+from servod.sources import DIAGNOSES, sha256_on_disk
 
 #: Told the case that was diagnosed last, how many are done and how many there are.
 Tell = Callable[[str, int, int], None]
@@ -30,13 +33,17 @@ ANSWERS, RUN, DIAGNOSIS, MODEL, SAID = "answers", "run.json", "diagnosis.json", 
 
 @dataclass(frozen=True)
 class Run:
-    """How one diagnosis went: exit code, seconds of wall clock and of all cores, its largest memory, its time limit."""
+    """How one diagnosis went: exit code, seconds of wall clock and of all cores, its largest memory, its time limit.
+
+    `sources` is the hash of the diagnosis that answered.
+    """
 
     exit_code: int
     wall_s: float
     cpu_s: float
     memory_mib: float
     time_limit_s: float
+    sources: str
 
 
 class Examiner:
@@ -47,12 +54,17 @@ class Examiner:
         self._running: set[subprocess.Popen[bytes]] = set()
         self._lock = Lock()
         self._ended = False
+        self._sources = sha256_on_disk(DIAGNOSES)
 
     def run(self, jobs: int, tell: Tell) -> None:
-        """Diagnose all cases that have no answer. An interrupt ends what runs and keeps what is done."""
+        """Diagnose all cases that have no answer. An interrupt ends what runs and keeps what is done.
+
+        Raises BadInput when what is done was done by other sources, or when the sources change meanwhile.
+        """
         names = sorted(folder.name for folder in (self._out / CASES).iterdir())
-        open_cases = [name for name in names if not (self._out / ANSWERS / name / RUN).exists()]
-        done = len(names) - len(open_cases)
+        answered = [name for name in names if (self._out / ANSWERS / name / RUN).exists()]
+        one_diagnosis(self._out, answered, self._sources)
+        open_cases, done = sorted(set(names) - set(answered)), len(answered)
         with self._crew(jobs) as crew:
             pending: dict[Future[None], str] = {crew.submit(self._examine, name): name for name in open_cases}
             for job in as_completed(pending):
@@ -85,6 +97,7 @@ class Examiner:
             limit = f"--time-limit={self._time_limit_s:g}"
             run = self._spend([sys.executable, "-m", "servod.cli", *arguments, limit], case, said.fileno())
             if run is not None:
+                _unchanged(sha256_on_disk(DIAGNOSES), self._sources)
                 shutil.copytree(answer, answers, dirs_exist_ok=True)
                 write_bytes(answers / RUN, (json.dumps(asdict(run)) + "\n").encode())
 
@@ -103,4 +116,29 @@ class Examiner:
             if self._ended:
                 return None
         cpu_s = used.ru_utime + used.ru_stime
-        return Run(process.returncode, time.monotonic() - begun, cpu_s, used.ru_maxrss / 1024.0, self._time_limit_s)
+        wall_s, memory_mib = time.monotonic() - begun, used.ru_maxrss / 1024.0
+        return Run(process.returncode, wall_s, cpu_s, memory_mib, self._time_limit_s, self._sources)
+
+
+def one_diagnosis(out: Path, names: Sequence[str], sources: str | None = None) -> str | None:
+    """Hash of the sources that all these answers come from, `sources` when given; None when there is no answer.
+
+    Raises BadInput when they differ: a figure over answers of two diagnoses is of neither.
+    """
+    for name in names:
+        path = out / ANSWERS / name / RUN
+        found = json.loads(path.read_text()).get("sources", "unknown")
+        if sources not in (None, found):
+            raise BadInput(
+                str(path),
+                f"an answer of sources {found[:12]}",
+                f"sources {sources[:12]} as the others have; remove {out / ANSWERS} to diagnose all cases anew",
+            )
+        sources = found
+    return sources
+
+
+def _unchanged(now: str, begun: str) -> None:
+    """Refuse an answer that came while somebody edited the diagnosis."""
+    if now != begun:
+        raise BadInput("the sources of servod", f"changed from {begun[:12]} to {now[:12]}", "the same to the end")

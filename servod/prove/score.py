@@ -43,12 +43,16 @@ class Guess:
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter of a right finding: its error as a share, and whether the 95 % interval covers the truth."""
+    """One parameter of a right finding: its error as a share, and whether the 95 % interval covers the truth.
+
+    One that the finding does not tell, as when it took another form than the plant's, counts as told to be nothing.
+    """
 
     effect: str
     name: str
     error: float
     covered: bool
+    told: bool = True
 
 
 @dataclass(frozen=True)
@@ -71,7 +75,7 @@ class Scored:
     right: bool
     parameters: tuple[Parameter, ...]
     held_out: HeldOut
-    run: Mapping[str, float] = field(default_factory=dict)
+    run: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def sort(self) -> Sort:
@@ -124,12 +128,13 @@ def is_right(sort: Sort, verdict: str, matched: set[str | None], effects: list[s
 
 
 def parameters_of(finding: Mapping[str, Any], truth: Mapping[str, Any]) -> list[Parameter]:
-    """Parameters of a right finding that the truth has too."""
+    """The truth's parameters as a right finding tells them; those that it does not tell are misses."""
     true: Mapping[str, float] = truth["parameters"][finding["effect"]]
     found = []
     for name, value in true.items():
         told = finding["parameters"].get(name)
         if told is None:
+            found.append(Parameter(finding["effect"], name, 1.0, covered=False, told=False))
             continue
         off = float(told["value"]) - value
         low, high = (float(bound) - value for bound in told["interval"])

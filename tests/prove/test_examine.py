@@ -13,11 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from servod.errors import BadInput
 from servod.prove.case import make_case
 from servod.prove.conceal import CASES, write_case
 from servod.prove.examine import ANSWERS, RUN, SAID, Examiner
 from servod.prove.plan import Settings, plans
 from servod.prove.trial import Trial, write_trial
+from servod.sources import DIAGNOSES, sha256_on_disk
 
 
 def short_case(out: Path, name: str) -> None:
@@ -34,14 +36,28 @@ def test_what_is_done_is_not_done_again(tmp_path: Path) -> None:
         short_case(tmp_path, name)
     kept = tmp_path / ANSWERS / "c000" / RUN
     kept.parent.mkdir(parents=True)
-    kept.write_text('{"exit_code": 0}')
+    done = json.dumps({"exit_code": 0, "sources": sha256_on_disk(DIAGNOSES)})
+    kept.write_text(done)
     told: list[tuple[str, int, int]] = []
     Examiner(tmp_path, 5.0).run(1, lambda name, done, of: told.append((name, done, of)))
     assert told == [("c001", 2, 2)]
-    assert kept.read_text() == '{"exit_code": 0}'
+    assert kept.read_text() == done
     run = json.loads((tmp_path / ANSWERS / "c001" / RUN).read_text())
-    assert run["exit_code"] == 1 and run["cpu_s"] > 0.1 and run["memory_mib"] > 10.0
+    assert run["exit_code"] == 1 and run["sources"] == sha256_on_disk(DIAGNOSES)
+    assert run["cpu_s"] > 0.1 and run["memory_mib"] > 10.0
     assert "These data cannot tell" in (tmp_path / ANSWERS / "c001" / SAID).read_text()
+
+
+@pytest.mark.parametrize("run", [{"exit_code": 0}, {"exit_code": 0, "sources": "ab" * 32}], ids=["unknown", "other"])
+def test_a_trial_does_not_go_on_with_other_sources(tmp_path: Path, run: dict[str, object]) -> None:
+    for name in ("c000", "c001"):
+        (tmp_path / CASES / name).mkdir(parents=True)
+    kept = tmp_path / ANSWERS / "c000" / RUN
+    kept.parent.mkdir(parents=True)
+    kept.write_text(json.dumps(run))
+    with pytest.raises(BadInput, match="to diagnose all cases anew"):
+        Examiner(tmp_path, 5.0).run(1, lambda _name, _done, _of: None)
+    assert not (tmp_path / ANSWERS / "c001").exists()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

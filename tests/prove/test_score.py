@@ -12,15 +12,16 @@ import yaml
 from typer.testing import CliRunner
 
 from servod.cli.app import app
+from servod.errors import BadInput
 from servod.prove import count, tables
 from servod.prove.conceal import CASES, SEALED, TRUTH, conceal, read_truth
 from servod.prove.document import document, score, write
 from servod.prove.examine import ANSWERS, DIAGNOSIS, MODEL, RUN
 from servod.prove.plan import Cover, Plan, Settings, Sort, plans
-from servod.prove.score import Scored, is_right, matches, parameters_of
+from servod.prove.score import HeldOut, Scored, is_right, matches, parameters_of
 from servod.prove.trial import FILE, Trial, write_trial
 
-RAN = {"exit_code": 0, "wall_s": 10.0, "cpu_s": 15.0, "memory_mib": 300.0, "time_limit_s": 12.0}
+RAN = {"exit_code": 0, "wall_s": 10.0, "cpu_s": 15.0, "memory_mib": 300.0, "time_limit_s": 12.0, "sources": "ab" * 32}
 
 
 def quiet(_done: int, _of: int) -> None:
@@ -71,11 +72,45 @@ def test_a_right_answer_counts(trial: Path, tmp_path: Path) -> None:
     good = {"verdict": "missing_physics", "findings": [near], "model": model}
     found = scored(answered(trial, tmp_path, c000=good, c001={"verdict": "adequate", "findings": []}))
     assert found["table"]["single"]["right"] == found["table"]["nothing"]["right"] == 1
-    assert found["parameters"]["all"] == {"parameters": 1, "median_error": pytest.approx(0.02), "covered": 1.0}
+    told = {"parameters": 1, "missing": 0, "median_error": pytest.approx(0.02), "covered": 1.0}
+    assert found["parameters"]["all"] == told
     assert found["held_out"]["after_over_before"]["median"] < 0.2
     assert found["held_out"]["after_over_true"]["median"] == pytest.approx(1.0, rel=1e-6)
     assert found["times"]["wall_s"]["median"] == 10.0
     assert found["confusion"]["torque_offset"] == {"torque_offset": 1}
+
+
+def test_a_true_parameter_that_is_not_told_is_a_miss(trial: Path, tmp_path: Path) -> None:
+    good = {"verdict": "missing_physics", "findings": [finding("torque_offset", 0.9)]}
+    found = scored(answered(trial, tmp_path, c000=good))
+    missed = {"parameters": 1, "missing": 1, "median_error": 1.0, "covered": 0.0}
+    assert found["parameters"]["all"] == found["parameters"]["by_effect"]["torque_offset"] == missed
+    assert "1 values, 1 of them not told" in tables.text(found)
+
+
+def test_answers_of_two_diagnoses_are_not_mixed(trial: Path, tmp_path: Path) -> None:
+    none = {"verdict": "adequate", "findings": []}
+    out = answered(trial, tmp_path, c000=none, c001=none)
+    assert "sources abababababab," in tables.text(scored(out))
+    (out / ANSWERS / "c001" / RUN).write_text(json.dumps(RAN | {"sources": "cd" * 32}))
+    with pytest.raises(BadInput, match="an answer of sources cdcdcdcdcdcd"):
+        scored(out)
+
+
+def test_windows_left_out_of_a_median_stand_beside_it(trial: Path) -> None:
+    """Where the believed model is hardly worse than the true one, its ratio is counted of all cases alone."""
+    truth = read_truth(trial, json.loads((trial / FILE).read_text())["sha256"])["c000"]
+    cases = [
+        Scored("c", truth, "adequate", (), False, (), HeldOut(before, after, 1.0))
+        for before, after in ((2.0, 1.8), (10.0, 1.0), (20.0, 3.0))
+    ]
+    found = count.held_out(cases)
+    assert found["after_over_before"]["count"] == 2
+    assert found["after_over_before"]["median"] == pytest.approx(0.125)
+    assert found["after_over_before_all"]["median"] == pytest.approx(0.15)
+    shown = tables.markdown(document(Trial(3, 7, False), cases))
+    assert "2 of 3 cases: believed model 3 times the true one's" in shown
+    assert "all 3 cases with an effect" in shown
 
 
 def test_a_false_alarm_and_a_missing_answer_count_as_wrong(trial: Path, tmp_path: Path) -> None:

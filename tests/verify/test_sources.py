@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import servod
-from servod.sources import SYNTHESIZES, VERIFIES, sources
+from servod.sources import DIAGNOSES, SYNTHESIZES, VERIFIES, sources
 
 #: Reading and writing of files, names and numbers of commands, processes: no figure depends on them.
 NEUTRAL = {"__init__.py", "commands.py", "config.py", "errors.py", "sources.py", "units.py", "workers.py", "yaml12.py"}
@@ -30,9 +30,10 @@ def imported(*modules: str) -> set[str]:
     ("patterns", "modules"),
     [
         (VERIFIES, ["servod.verify.certify"]),
+        (DIAGNOSES, ["servod.diagnose.document", "servod.recordings.rows"]),
         (SYNTHESIZES, [f"servod.synthesize.{name}" for name in ("gain_set", "reference", "intervals", "crosscheck")]),
     ],
-    ids=["verify", "synthesize"],
+    ids=["verify", "diagnose", "synthesize"],
 )
 def test_the_sources_are_what_is_imported(patterns: tuple[str, ...], modules: list[str]) -> None:
     found = imported(*modules)
