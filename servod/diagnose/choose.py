@@ -32,6 +32,9 @@ from servod.diagnose.shortened import shortened
 Array = NDArray[np.float64]
 Tell = Callable[[str], None]
 
+#: Whether a new term deserves to come in, by what it is worth and the fit with it.
+Deserves = Callable[[Merit, Fit], bool]
+
 #: Robust deviations beyond which a mismatch is a blow, and counts no more for what is left.
 BLOW = 8.0
 
@@ -138,7 +141,7 @@ class Chooser:
         for candidate in candidates:
             if candidate.left > candidates[0].left + CLOSE * (1.0 - candidates[0].left):
                 break
-            settled, merit = self._to_end(present, self._settled(candidate.fit, present.mismatch))
+            settled, merit = self.to_end(present, self._settled(candidate.fit, present.mismatch), self.deserves)
             self.lower_floor(settled.mismatch)
             if self.enters(merit, settled):
                 bare = self.less(settled, len(settled.hypothesis.terms) - 1)
@@ -159,11 +162,11 @@ class Chooser:
         known = fit.jacobian if len(fit.jacobian) == len(mismatch) else None
         return self.settled(fit.hypothesis, fit.coordinates, mismatch, known)
 
-    def _to_end(self, present: Fit, settled: Fit) -> tuple[Fit, Merit]:
+    def to_end(self, present: Fit, settled: Fit, deserves: Deserves) -> tuple[Fit, Merit]:
         """A fit that deserves to come in, fitted on until it is at its end or nearly; and what it is worth."""
         merit = self.merit(present, settled)
         for _ in range(MORE):
-            if settled.converged or not self.deserves(merit, settled):
+            if settled.converged or not deserves(merit, settled):
                 break
             further = self._refined(settled, settled.mismatch, len(settled.coordinates))
             later = self.merit(present, further)

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 from time import monotonic
 
 from servod.diagnose.candidates import Candidate
 from servod.diagnose.choice import Choice, Entry
-from servod.diagnose.choose import Chooser
+from servod.diagnose.choose import Chooser, whole
 from servod.diagnose.fit import Fit
 from servod.diagnose.merit import Merit
 
@@ -41,7 +42,9 @@ def detail(chooser: Chooser, choice: Choice) -> None:
     """Add terms to `choice`, all or none of them."""
     refined = replace(choice, merits=list(choice.merits), entries=list(choice.entries))
     while len(refined.fit.hypothesis.terms) < MOST_TERMS and monotonic() < chooser.deadline:
-        if chooser.nothing_left(refined.fit.mismatch) or not _add(chooser, refined):
+        if chooser.nothing_left(refined.fit.mismatch):
+            break
+        if not take_first(chooser, refined, chooser.candidates(refined.fit, True, SOAK_UP)):
             break
     if refined.fit is choice.fit or chooser.merit(choice.fit, refined.fit).of_left < LEAST_TOGETHER:
         return
@@ -58,15 +61,15 @@ def much_left(chooser: Chooser, choice: Choice) -> bool:
     return left > LEFT_SHARE * explainable and math.sqrt(max(left, 0.0)) > MUCH_LEFT * chooser.predictor.dry
 
 
-def _add(chooser: Chooser, choice: Choice) -> bool:
-    """Take in the first of the best candidates that deserves it."""
+def take_first(chooser: Chooser, choice: Choice, candidates: list[Candidate]) -> bool:
+    """Take in the first of the best candidates that deserves it and whose fit is whole; whether one did."""
     present = choice.fit
-    candidates = chooser.candidates(present, True, SOAK_UP)
+    deserves = partial(_deserves, chooser)
     for candidate in candidates[:TRIED]:
-        settled = chooser.settled(candidate.fit.hypothesis, candidate.fit.coordinates, present.mismatch)
+        begun = chooser.settled(candidate.fit.hypothesis, candidate.fit.coordinates, present.mismatch)
+        settled, merit = chooser.to_end(present, begun, deserves)
         chooser.lower_floor(settled.mismatch)
-        merit = chooser.merit(present, settled)
-        if _deserves(chooser, merit, settled):
+        if deserves(merit, settled) and whole(merit, settled):
             _take(choice, candidate, candidates, settled, merit)
             return True
     return False

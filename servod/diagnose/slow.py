@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from servod.diagnose.candidates import Candidate
 from servod.diagnose.choice import Choice, Entry
-from servod.diagnose.choose import Chooser
+from servod.diagnose.choose import Chooser, whole
 from servod.diagnose.effects import effect
 from servod.diagnose.fit import Fit
+from servod.diagnose.merit import Merit
 from servod.diagnose.predict import Predictor
 from servod.diagnose.scene import Scene
 
@@ -37,23 +38,29 @@ def slow(chooser: Chooser, choice: Choice) -> None:
     there = {term.effect for term in present.hypothesis.terms}
     if there & {WANTED[0], RIVAL[0]} or not effect(WANTED[0]).terms(_scene(chooser, present)):
         return
-    drift = _with(chooser, present, *WANTED)
+    drift, merit = _with(chooser, present, *WANTED)
     left = _left(chooser, present, drift)
-    merit = chooser.merit(present, drift)
-    if left > 1.0 - LEAST_TAKEN or merit.gain < LEAST_GAIN + math.log(float(chooser.rows.sum())):
+    if left > 1.0 - LEAST_TAKEN or not _gains(chooser, merit) or not whole(merit, drift):
         return
-    other = _with(chooser, present, *RIVAL)
+    other, _ = _with(chooser, present, *RIVAL)
     choice.fit = drift
     choice.merits.append(merit)
     choice.entries.append(Entry(left, [Candidate(RIVAL[0], other, _left(chooser, present, other))]))
 
 
-def _with(chooser: Chooser, present: Fit, name: str, form: str) -> Fit:
-    """The fit with a form of an effect beside all that is in."""
+def _gains(chooser: Chooser, merit: Merit) -> bool:
+    """Whether a term of one number is significant."""
+    return merit.gain >= LEAST_GAIN + math.log(float(chooser.rows.sum()))
+
+
+def _with(chooser: Chooser, present: Fit, name: str, form: str) -> tuple[Fit, Merit]:
+    """The fit with a form of an effect beside all that is in, fitted to its end, and what the effect is worth."""
     term = next(term for term in effect(name).terms(_scene(chooser, present)) if term.form == form)
     hypothesis = present.hypothesis.with_term(term)
     chooser.tried += 1
-    return chooser.settled(hypothesis, hypothesis.beside(present.coordinates), present.mismatch, present.jacobian)
+    at = hypothesis.beside(present.coordinates)
+    begun = chooser.settled(hypothesis, at, present.mismatch, present.jacobian)
+    return chooser.to_end(present, begun, lambda merit, _fit: _gains(chooser, merit))
 
 
 def _scene(chooser: Chooser, present: Fit) -> Scene:

@@ -1,4 +1,4 @@
-"""A term that was best alone gives way to the one that is best in company, and what is said of it is its own."""
+"""Terms in company: one that was best alone gives way to a better one, and a fit that is not whole gives no name."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import pytest
 from servod.diagnose.candidates import Candidate
 from servod.diagnose.choice import Choice, Entry
 from servod.diagnose.choose import Chooser
+from servod.diagnose.detail import take_first
 from servod.diagnose.effects import effect
 from servod.diagnose.fit import Fit
 from servod.diagnose.intake import taken_in
@@ -68,16 +69,31 @@ def test_what_is_said_of_a_term_that_was_put_in_is_its_own(
     assert confidence(choice, 0, 1.0) == pytest.approx(0.5)
 
 
-def test_a_rival_that_ends_at_the_end_of_a_range_is_not_put_in(
-    chooser: Chooser, mistaken: tuple[Choice, Candidate]
-) -> None:
-    given, weight = mistaken
+def bounded(weight: Candidate) -> Candidate:
+    """The weight with a range that ends shortly before its best value."""
     sine, cosine = weight.term.unknowns
     most = 0.99 * abs(sine.value(float(weight.own[0])))
     narrow = replace(weight.term, unknowns=(replace(sine, low=-most, high=most), cosine))
     hypothesis = replace(weight.fit.hypothesis, terms=(narrow,))
     at = np.clip(weight.fit.coordinates, *hypothesis.bounds)
-    rival = Candidate("gravity", replace(weight.fit, hypothesis=hypothesis, coordinates=at), 0.5)
-    choice = replace(given, merits=list(given.merits), entries=[Entry(0.5, [rival]), given.entries[1]])
+    return Candidate("gravity", replace(weight.fit, hypothesis=hypothesis, coordinates=at), weight.left)
+
+
+def test_a_rival_that_ends_at_the_end_of_a_range_is_not_put_in(
+    chooser: Chooser, mistaken: tuple[Choice, Candidate]
+) -> None:
+    given, weight = mistaken
+    entries = [Entry(0.5, [bounded(weight)]), given.entries[1]]
+    choice = replace(given, merits=list(given.merits), entries=entries)
     swapped(chooser, choice)
     assert choice.fit is given.fit
+
+
+def test_a_detail_that_ends_at_the_end_of_a_range_does_not_come_in(
+    chooser: Chooser, mistaken: tuple[Choice, Candidate]
+) -> None:
+    given, weight = mistaken
+    for candidate, comes_in in ((bounded(weight), False), (weight, True)):
+        choice = replace(given, fit=given.base, merits=[], entries=[])
+        assert take_first(chooser, choice, [candidate]) is comes_in
+        assert len(choice.fit.hypothesis.terms) == len(choice.merits) == len(choice.entries) == int(comes_in)
