@@ -75,7 +75,7 @@ def _found(diagnosis: Diagnosis, evidence: Evidence) -> str:
     names = list(dict.fromkeys(evidence.fit.hypothesis.terms[place].effect for place in evidence.named))
     if names:
         sentences = " ".join(f"{effect(name).statement}." for name in names)
-        return f"{sentences} {100.0 * evidence.errors.removed:.0f} % of the explainable mismatch is gone."
+        return f"{sentences} {100.0 * evidence.unseen.removed:.0f} % of the explainable mismatch is gone."
     if diagnosis.verdict.value == "cannot_tell":
         return _too_little(evidence)
     if diagnosis.verdict.value == "unexplained":
@@ -110,7 +110,7 @@ def _finding(evidence: Evidence, name: str, named: list[int]) -> dict[str, Any]:
     merit = evidence.choice.merits[first]
     located = places(evidence.predictor, contribution, evidence.predictor.dry)
     statement = (
-        f"{what.statement}. It carries {100.0 * max(merit.share, 0.0):.0f} % of the explainable mismatch and "
+        f"{what.statement}. It carries {100.0 * evidence.carries(first):.0f} % of the explainable mismatch and "
         f"{100.0 * merit.torque:.1f} % of dry friction where it acts. It shows as {what.shows}; it is strongest "
         f"{where(name, located)}."
     )
@@ -178,15 +178,26 @@ def fit_document(
         windows = window_evidence(diagnosis, evidence)
     return {
         "unit": units(evidence.predictor).force,
-        "held_out": {"before": evidence.before.rms, "after": evidence.after.rms},
-        "noise_floor": evidence.errors.floor,
-        "explainable_removed": round(evidence.errors.removed, 4),
+        "held_out": {"before": evidence.before.rms, "after": evidence.after.rms, **_shared(evidence)},
+        "noise_floor": evidence.unseen.floor,
+        "explainable_removed": round(evidence.unseen.removed, 4),
         "removed_by_known_physics": round(evidence.attempt, 4),
-        "windows": windows_document(windows, evidence.predictor),
+        "windows": windows_document(windows, evidence.predictor, evidence.shared.judged),
         "observer_rad_s": evidence.predictor.rate,
         "starts_tried": evidence.choice.tried,
         "cut_by_time": evidence.choice.cut,
     }
+
+
+def _shared(evidence: Evidence) -> dict[str, Any]:
+    """What was left out in turn, and for how long the recordings are not judged since only an event stands there."""
+    predictor = evidence.predictor
+    events = predictor.counts & ~evidence.shared.judged
+    seconds = sum(
+        trace.period_s * int(events[part].sum())
+        for trace, part in zip(predictor.traces, predictor.slices, strict=True)
+    )  # fmt: skip
+    return {"left_out": evidence.shared.left_out, "not_judged_s": round(seconds, 3)}
 
 
 def window_evidence(diagnosis: Diagnosis, evidence: Evidence) -> list[WindowErrors]:
@@ -195,7 +206,7 @@ def window_evidence(diagnosis: Diagnosis, evidence: Evidence) -> list[WindowErro
     if evidence.unnamed is not None:
         extended = extended_model(diagnosis)
         assert extended is not None  # there is evidence
-        after = (Fold(np.ones(len(evidence.predictor.counts), dtype=bool), extended),)
+        after = (Fold(np.ones(len(evidence.predictor.counts), dtype=bool), (extended,)),)
     return window_errors(evidence.predictor, diagnosis.nominal, evidence.before.folds, after)
 
 
@@ -207,9 +218,9 @@ def recordings(diagnosis: Diagnosis) -> list[dict[str, Any]]:
 
 
 def _recording(evidence: Evidence, index: int) -> dict[str, Any]:
-    """One recording: what was repaired, its noise, and what is left of its mismatch."""
+    """One recording: what was repaired, its noise, and its mismatch by fits that have not seen the rows."""
     trace, part, predictor = evidence.traces[index], evidence.predictor.slices[index], evidence.predictor
-    rows = predictor.counts[part]
+    rows, judged = predictor.counts[part], evidence.shared.judged[part]
     return {
         "name": trace.name,
         "taken": True,
@@ -219,8 +230,8 @@ def _recording(evidence: Evidence, index: int) -> dict[str, Any]:
         "position_noise": trace.position_noise,
         "notes": list(trace.notes),
         "noise_floor": math.sqrt(trace_floor(predictor, index, evidence.fit.mismatch)),
-        "mismatch_before": _rms(evidence.choice.base.mismatch[part][rows]),
-        "mismatch_after": _rms(evidence.fit.mismatch[part][rows]),
+        "mismatch_before": _rms(evidence.before.mismatch[part][judged]),
+        "mismatch_after": _rms(evidence.after.mismatch[part][judged]),
     }
 
 

@@ -17,7 +17,7 @@ from servod.diagnose.choice import Choice
 from servod.diagnose.choose import Chooser
 from servod.diagnose.detail import detail, much_left
 from servod.diagnose.fit import Fit, Weighing
-from servod.diagnose.held_out import HeldOut, held_out
+from servod.diagnose.held_out import HeldOut, Split, held_out, once, split
 from servod.diagnose.intake import Refusal, taken_in
 from servod.diagnose.locate import Map, maps
 from servod.diagnose.predict import Predictor
@@ -52,9 +52,10 @@ class Diagnosis:
 class Evidence:
     """Everything behind a verdict on recordings that can tell.
 
-    `named` are places of terms in the fit and `less` the fits without each of them; `before`, `after` and `without` are
-    by fits that have not seen the rows. `attempt` is the share of the explainable error that known physics
-    removes, also where its names may not stand.
+    `named` are places of terms in the fit and `less` the fits without each of them; `errors` are those of the fits to
+    everything, by which names are judged. `before`, `after` and `without` are by fits that have not seen the rows of
+    `shared`, and `unseen` has the errors of these. `attempt` is the share of the explainable error that known physics
+    removes there, also where its names may not stand.
     """
 
     traces: tuple[Trace, ...]
@@ -64,6 +65,8 @@ class Evidence:
     errors: Shares
     spread: Array
     less: dict[int, Fit]
+    shared: Split
+    unseen: Shares
     before: HeldOut
     after: HeldOut
     without: dict[int, HeldOut]
@@ -76,6 +79,12 @@ class Evidence:
     def fit(self) -> Fit:
         """The fit that stands."""
         return self.choice.fit
+
+    def carries(self, place: int) -> float:
+        """The share of the explainable error on unseen rows that a named term removes."""
+        unseen = self.unseen
+        without = float(np.mean(self.without[place].mismatch[self.predictor.counts] ** 2))
+        return max(without - unseen.after**2, 0.0) / max(unseen.before**2 - unseen.floor**2, 1e-30)
 
 
 def diagnose(
@@ -118,55 +127,60 @@ def _evidence(predictor: Predictor, chooser: Chooser, choice: Choice, tell: Tell
     fit = choice.fit
     nominal = chooser.start.document
     named = named_terms(choice, nominal)
-    errors = shares(choice, predictor.counts)
+    counts = predictor.counts
     tell("held-out recordings")
     less = {place: chooser.less(fit, place) for place in named}
     weighing = Weighing(chooser.fitter(fit.mismatch).weighing.scale, chooser.rows)
-    before = held_out(predictor, choice.base, _frozen(choice.base))
-    after = held_out(predictor, fit, _frozen(fit)) if fit is not choice.base else before
+    shared = split(predictor, fit)
+    before = held_out(predictor, choice.base, shared)
+    after = held_out(predictor, fit, shared) if fit is not choice.base else before
     alone = len(named) == 1 and len(fit.hypothesis.terms) == 1
-    without = {p: before if alone else held_out(predictor, f, _frozen(f)) for p, f in less.items()}
+    without = {p: before if alone else held_out(predictor, f, shared) for p, f in less.items()}
+    unseen = shares((before.mismatch, after.mismatch), counts, choice.floor)
     return Evidence(
         traces=predictor.traces,
         predictor=predictor,
         choice=choice,
         named=named,
-        errors=errors,
+        errors=shares((choice.base.mismatch, fit.mismatch), counts, choice.floor),
         spread=spread(fit, weighing, predictor.traces[0].period_s, after),
         less=less,
+        shared=shared,
+        unseen=unseen,
         before=before,
         after=after,
         without=without,
         unnamed=None,
         maps_before=maps(predictor, choice.base.mismatch),
         maps_after=maps(predictor, fit.mismatch),
-        attempt=errors.removed,
+        attempt=unseen.removed,
     )
 
 
 def _worse_unseen(evidence: Evidence) -> int | None:
-    """The named term without which unseen recordings are foretold best, if better than with it."""
-    others = {place: held.rms for place, held in evidence.without.items() if held.rms <= evidence.after.rms}
+    """The named term without which unseen rows are foretold best, if better than with it; no event, which none are."""
+    events = once(evidence.fit.hypothesis)
+    others = {
+        place: held.rms
+        for place, held in evidence.without.items()
+        if held.rms <= evidence.after.rms and place not in events
+    }
     return min(others, key=lambda place: others[place]) if others else None
-
-
-def _frozen(fit: Fit) -> NDArray[np.bool_]:
-    """Coordinates of events, which no other recording foretells."""
-    frozen = np.zeros(len(fit.coordinates), dtype=bool)
-    for place, term in enumerate(fit.hypothesis.terms):
-        if term.effect == "disturbance":
-            frozen[fit.hypothesis.share(place)] = True
-    return frozen
 
 
 def _without_names(evidence: Evidence) -> Evidence:
     """The evidence when no name may stand: the base, and a table of what is left without a name."""
-    choice = evidence.choice
+    choice, predictor = evidence.choice, evidence.predictor
     bare = replace(choice, fit=choice.base, merits=[], entries=[])
-    left = unnamed(evidence.predictor, choice.base.mismatch)
+    left = unnamed(predictor, choice.base.mismatch)
     size = len(choice.base.coordinates)
-    errors = shares(bare, evidence.predictor.counts)
+    shared = split(predictor, choice.base)
+    before = held_out(predictor, choice.base, shared)
+    errors, unseen = (
+        shares((rows, rows), predictor.counts, choice.floor) for rows in (choice.base.mismatch, before.mismatch)
+    )
     return replace(
-        evidence, choice=bare, named=[], errors=errors, less={}, without={}, unnamed=left, after=evidence.before,
-        spread=evidence.spread[:size, :size], maps_after=evidence.maps_before,
+        evidence, choice=bare, named=[], errors=errors, less={}, without={}, unnamed=left, shared=shared,
+        before=before, after=before, unseen=unseen, spread=evidence.spread[:size, :size],
+        maps_after=evidence.maps_before,
     )  # fmt: skip

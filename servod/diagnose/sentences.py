@@ -32,7 +32,8 @@ MATHEMATICS = (
     "Search. Every known effect is added in several forms and from many starts, together with all parameters of the "
     "model. It stays when the gain is significant against correlated noise with a correction for the number of things "
     "tried (Bayesian information criterion), and when it is large enough to be worth naming.",
-    "Proof. Each recording in turn is left out, the rest is fitted again, and the one left out is predicted. Intervals "
+    "Proof. Each recording in turn is left out, the rest is fitted again, and the one left out is predicted; a quarter "
+    "of every recording where there is only one, or where recordings differ in a number of their own. Intervals "
     "count correlated rows as fewer (Newey and West, Econometrica 55, 1987).",
 )
 

@@ -38,56 +38,56 @@ class WindowErrors:
     recalibrated: Array
     after: Array
 
-    def document(self, counts: NDArray[np.bool_]) -> dict[str, float]:
-        """RMS over the rows that count."""
+    def document(self, judged: NDArray[np.bool_]) -> dict[str, float]:
+        """RMS over the rows that are judged."""
         values = {"before": self.nominal, "recalibrated": self.recalibrated, "after": self.after}
-        return {name: float(np.sqrt(np.mean(error[counts] ** 2))) for name, error in values.items()}
+        return {name: float(np.sqrt(np.mean(error[judged] ** 2))) for name, error in values.items()}
 
 
 def window_errors(
     predictor: Predictor, nominal: AxisModel, base: Sequence[Fold], after: Sequence[Fold]
 ) -> list[WindowErrors]:
     """Errors for every horizon; each fold's model judges the rows that it has not seen."""
-    whole = [Fold(np.ones(len(predictor.counts), dtype=bool), nominal)]
+    whole = [Fold(np.ones(len(predictor.counts), dtype=bool), (nominal,))]
     return [
         WindowErrors(horizon, *(_errors(predictor, folds, horizon) for folds in (whole, base, after)))
         for horizon in HORIZONS_S
     ]
 
 
-def windows_document(errors: Sequence[WindowErrors], predictor: Predictor) -> dict[str, Any]:
-    """RMS errors by horizon, of all recordings and of each."""
+def windows_document(errors: Sequence[WindowErrors], predictor: Predictor, judged: NDArray[np.bool_]) -> dict[str, Any]:
+    """RMS errors by horizon over the rows that are judged, of all recordings and of each."""
     found: dict[str, Any] = {}
     for window in errors:
-        entry: dict[str, Any] = {"unit": "m" if predictor.linear else "rad", **window.document(predictor.counts)}
+        entry: dict[str, Any] = {"unit": "m" if predictor.linear else "rad", **window.document(judged)}
         entry["recordings"] = {
-            trace.name: window.document(_within(predictor, part))
+            trace.name: window.document(_within(judged, part))
             for trace, part in zip(predictor.traces, predictor.slices, strict=True)
-            if predictor.counts[part].any()
+            if judged[part].any()
         }
         found[f"{window.horizon_s:g}"] = entry
     return found
 
 
-def _within(predictor: Predictor, part: slice) -> NDArray[np.bool_]:
-    inside = np.zeros_like(predictor.counts)
-    inside[part] = predictor.counts[part]
+def _within(judged: NDArray[np.bool_], part: slice) -> NDArray[np.bool_]:
+    inside = np.zeros_like(judged)
+    inside[part] = judged[part]
     return inside
 
 
 def _errors(predictor: Predictor, folds: Sequence[Fold], horizon_s: float) -> Array:
     error = np.zeros(len(predictor.counts))
     for fold in folds:
-        for trace, part in zip(predictor.traces, predictor.slices, strict=True):
-            rows = fold.rows[part]
+        for index, (trace, part) in enumerate(zip(predictor.traces, predictor.slices, strict=True)):
+            rows, model = fold.rows[part], fold.of(index)
             if rows.any():
-                error[part][rows] = replay(fold.model, _drive(trace, fold), horizon_s).error[rows]
+                error[part][rows] = replay(model, _drive(trace, model), horizon_s).error[rows]
     return error
 
 
-def _drive(trace: Trace, fold: Fold) -> Drive:
+def _drive(trace: Trace, model: AxisModel) -> Drive:
     """The recording on the time that the model's windows of disturbance are in: shifted, where one was fitted."""
-    if fold.model.disturbance is not None and fold.model.disturbance.windows:
+    if model.disturbance is not None and model.disturbance.windows:
         return trace.drive
     drive = trace.drive
     return Drive(drive.t_s - trace.shift_s, drive.torque, drive.position, drive.temperature_c)

@@ -129,13 +129,18 @@ def _recalibrated(page: Page, document: Document) -> None:
 
 
 def _fit(report: Report, evidence: Evidence, document: Document) -> None:
-    fit, unit = document["fit"], document["units"]
+    fit, unit, held = document["fit"], document["units"], document["fit"]["held_out"]
     report.page.heading("The fit before and after")
     report.page.sentence(
-        f"On recordings that the fit has not seen the torque error went from {fit['held_out']['before']:.3g} to "
-        f"{fit['held_out']['after']:.3g} {fit['unit']}; the noise floor is {fit['noise_floor']:.3g} {fit['unit']}. "
-        f"{100.0 * fit['explainable_removed']:.0f} % of what could be explained is gone."
+        f"On rows that the fit has not seen ({held['left_out']} was left out) the torque error went from "
+        f"{held['before']:.3g} to {held['after']:.3g} {fit['unit']}; the noise floor is {fit['noise_floor']:.3g} "
+        f"{fit['unit']}. {100.0 * fit['explainable_removed']:.0f} % of what could be explained is gone."
     )
+    if held["not_judged_s"]:
+        report.page.sentence(
+            f"Errors leave out {held['not_judged_s']:.2g} s in and behind an external torque that came once: nothing "
+            "foretells it. The share that it carries is that of the fit itself."
+        )
     rows = [
         (f"{horizon} s", f"{w['before']:.4g}", f"{w['recalibrated']:.4g}", f"{w['after']:.4g}", w["unit"])
         for horizon, w in fit["windows"].items()
@@ -147,8 +152,13 @@ def _fit(report: Report, evidence: Evidence, document: Document) -> None:
     for horizon, window in fit["windows"].items():
         errors = {name: (w["before"], w["after"]) for name, w in window["recordings"].items()}
         panels.append(figures.before_after(errors, unit["position"], f"position after {horizon} s", named=False))
-    report.figure(figures.bars(panels))
+    report.figure(figures.bars(panels, _left_out(evidence)))
     report.figure(figures.over_time(evidence.predictor, evidence.before.mismatch, evidence.after.mismatch))
+
+
+def _left_out(evidence: Evidence) -> str | None:
+    """What was left out of the fits in turn; None where what has no name was fitted to everything."""
+    return evidence.shared.left_out if evidence.unnamed is None else None
 
 
 def _remains(report: Report, evidence: Evidence, document: Document, windows: Sequence[WindowErrors]) -> None:
@@ -157,7 +167,7 @@ def _remains(report: Report, evidence: Evidence, document: Document, windows: Se
     report.figure(figures.map_grid(evidence.maps_before, evidence.maps_after, evidence.predictor))
     report.figure(figures.spectrum(evidence.predictor, evidence.before.mismatch, evidence.after.mismatch))
     if windows:
-        report.figure(figures.window_course(evidence.predictor, windows))
+        report.figure(figures.window_course(evidence.predictor, windows, _left_out(evidence)))
 
 
 def _experiments(page: Page, document: Document) -> None:

@@ -140,7 +140,14 @@ def _density(predictor: Predictor, error: Array) -> tuple[Array, Array]:
     return array(middles), array(np.sqrt(np.maximum(power[full] / rows[full], 1e-300)))
 
 
-def window_course(predictor: Predictor, windows: Sequence[WindowErrors]) -> Figure:
+def seen_by(left_out: str | None) -> str:
+    """By what rows were judged; None: by a table that was fitted to them, since what is left has no name."""
+    if left_out is None:
+        return "What has no name is a table that has seen these rows."
+    return f"Each row is judged by a model that was fitted without it: {left_out} was left out."
+
+
+def window_course(predictor: Predictor, windows: Sequence[WindowErrors], left_out: str | None) -> Figure:
     """Error of windows that are simulated freely, over time, in the recording where it was largest."""
     worst = max(predictor.slices, key=lambda part: float(np.mean(windows[-1].nominal[part] ** 2)))
     trace = predictor.traces[predictor.slices.index(worst)]
@@ -154,16 +161,16 @@ def window_course(predictor: Predictor, windows: Sequence[WindowErrors]) -> Figu
         title = f"{trace.name}, windows of {window.horizon_s:g} s"
         panels.append(Panel(Axis("time in s"), Axis(f"position error in {prefix}{unit}"), curves, title))
     caption = (
-        "Simulated minus recorded position; the simulation begins anew from the recording at every window. The model "
-        "after was fitted without this recording."
+        "Simulated minus recorded position; the simulation begins anew from the recording at every window. "
+        f"{seen_by(left_out)}"
     )
     return Figure("windows", "How far a simulation strays", tuple(panels), 1, caption, 0.8)
 
 
-def bars(panels: Sequence[Panel]) -> Figure:
+def bars(panels: Sequence[Panel], left_out: str | None) -> Figure:
     """Errors before and after, a panel for each kind of error."""
     rows = max(len(panel.y.names) for panel in panels)
-    caption = "Root mean square errors of each recording before and after; models fitted to the other recordings."
+    caption = f"Root mean square errors of each recording before and after. {seen_by(left_out)}"
     return Figure("held_out", "Errors before and after", tuple(panels), len(panels), caption, 0.45 + 0.13 * rows)
 
 
