@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.prove.axes import Axis, draw_axis
-from servod.prove.concealed import Concealed, Document, Draw
+from servod.prove.concealed import NO_THERMOMETER, Concealed, Document, Draw
 from servod.prove.hidden import HIDE, UNLISTED
 from servod.prove.physics import Physics
 from servod.prove.plan import Cover, Plan, Settings, Sort
@@ -54,10 +54,11 @@ class Case:
 
 @dataclass(frozen=True)
 class Recorder:
-    """How an axis is recorded: the controller and the torque noise in N*m."""
+    """How an axis is recorded: the controller, the torque noise in N*m, and whether its temperature is."""
 
     loop: Loop
     noise: float
+    thermometer: bool
 
 
 def make_case(plan: Plan, settings: Settings) -> Case:
@@ -77,7 +78,7 @@ def make_case(plan: Plan, settings: Settings) -> Case:
     physics = _all_changes(axis.physics, hidden)
     plant = _cluttered(physics, axis, rng, plan.effects) if settings.clutter else physics
     noisy = max(settings.noise, BELOW_NOISE if plan.cover is Cover.NOISE else 1.0)
-    recorder = Recorder(loop, TORQUE_NOISE * noisy * axis.physics.coulomb)
+    recorder = Recorder(loop, TORQUE_NOISE * noisy * axis.physics.coulomb, has_thermometer(hidden, plan.seed))
     believed = _believed(axis.physics, hidden)
     if plan.cover is Cover.ABSORBED:
         believed = _absorbing(believed, axis, physics, rng)
@@ -95,6 +96,13 @@ def references(axis: Axis, seed: int) -> list[Array]:
     motions = axis.motions
     kinds = (motions.slow_sine, motions.multisine, motions.moves, motions.mixed)
     return [kind(np.random.default_rng([seed, index])) for index, kind in enumerate(kinds)]
+
+
+def has_thermometer(hidden: Sequence[Concealed], seed: int) -> bool:
+    """Whether temperature is recorded: as what is concealed asks for, otherwise by chance, equally often."""
+    asked = [c.thermometer for c in hidden if c.thermometer is not None]
+    # chance of its own, so that nothing else of the case depends on it
+    return all(asked) if asked else bool(np.random.default_rng([seed, 1]).uniform() >= NO_THERMOMETER)
 
 
 def draw_seen(
@@ -155,7 +163,7 @@ def record(
         jitter = ENCODER_NOISE * rng.normal(size=len(reference))
         run(here, recorder.loop, start, reference, recorder.noise * rng.normal(size=len(reference)), jitter, out)
         warm = 25.0 + 0.8 * (float(out[-1, 2]) - 25.0)
-        found[name] = _columns(reference, out, rng, all(c.thermometer for c in hidden))
+        found[name] = _columns(reference, out, rng, recorder.thermometer)
     return found
 
 

@@ -1,7 +1,7 @@
 """Writes the cases of a trial: folders with a model and recordings, and apart from them the truth, sealed by its hash.
 
 The first of the three processes. The hash is told before anybody diagnoses; the truth contains a random number, so that
-nobody finds it by trying seeds.
+nobody finds it by trying seeds. What is sealed cannot be read until it is scored, unless its owner allows it again.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ def conceal(plans: Sequence[Plan], settings: Settings, out: Path, tell: Tell) ->
     whole = {"salt": secrets.token_hex(16), "cases": truths}
     content = (json.dumps(whole, indent=1, allow_nan=False) + "\n").encode()
     write_bytes(out / SEALED / TRUTH, content)
+    lock(out)
     return hashlib.sha256(content).hexdigest()
 
 
@@ -80,8 +81,26 @@ def _rounded(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.round(values, digits)
 
 
+def lock(out: Path) -> None:
+    """Take from everybody the right to read what is sealed in `out`."""
+    _allow(out, 0)
+
+
+def unlock(out: Path) -> None:
+    """Give it back to the owner."""
+    _allow(out, 0o600)
+
+
+def _allow(out: Path, mode: int) -> None:
+    """Files, not their folder: whoever made a trial can still remove it."""
+    for path in (out / SEALED).rglob("*"):
+        if path.is_file():
+            path.chmod(mode)
+
+
 def read_truth(out: Path, digest: str) -> dict[str, Any]:
     """Open the seal: the truth of all cases. Raises ValueError when it is not the truth that was sealed."""
+    unlock(out)
     content = (out / SEALED / TRUTH).read_bytes()
     found = hashlib.sha256(content).hexdigest()
     if found != digest:

@@ -16,6 +16,9 @@ from servod.prove.physics import Physics
 
 Document = dict[str, Any]
 
+#: Share of the axes without a thermometer, whatever they conceal: that temperatures are missing must tell nothing.
+NO_THERMOMETER = 0.3
+
 
 @dataclass(frozen=True)
 class Concealed:
@@ -24,8 +27,8 @@ class Concealed:
     `changes` are the plant's numbers; `parameters` what a diagnosis should find, by the names that `servoctl explain`
     prints; `model` the groups of an axis model file that say the same, None where such a file has no words for it;
     `believed` what the model that the user has says otherwise; `travel` the least travel (rad) that shows the effect;
-    `only` the one recording in which it happens; `thermometer` and `cold` whether temperature is recorded, and whether
-    each recording starts cold.
+    `only` the one recording in which it happens; `thermometer` whether temperature must or must not be recorded, for
+    parameters that are told of it, None where that is left to chance; `cold` whether each recording starts cold.
     """
 
     changes: Mapping[str, float]
@@ -34,7 +37,7 @@ class Concealed:
     believed: Mapping[str, float] = field(default_factory=dict)
     travel: float = 0.0
     only: int | None = None
-    thermometer: bool = True
+    thermometer: bool | None = None
     cold: bool = False
 
 

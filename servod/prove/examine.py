@@ -21,7 +21,7 @@ from tempfile import TemporaryDirectory
 from threading import Lock
 
 from servod.errors import BadInput
-from servod.prove.conceal import CASES
+from servod.prove.conceal import CASES, lock
 from servod.report.files import write_bytes
 from servod.sources import DIAGNOSES, sha256_on_disk
 
@@ -61,6 +61,7 @@ class Examiner:
 
         Raises BadInput when what is done was done by other sources, or when the sources change meanwhile.
         """
+        lock(self._out)
         names = sorted(folder.name for folder in (self._out / CASES).iterdir())
         answered = [name for name in names if (self._out / ANSWERS / name / RUN).exists()]
         one_diagnosis(self._out, answered, self._sources)

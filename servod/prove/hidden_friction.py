@@ -5,7 +5,7 @@ Beside `hidden_place` and `hidden_drive`; sizes are shares of Coulomb friction.
 
 from __future__ import annotations
 
-from servod.prove.concealed import Concealed, Draw
+from servod.prove.concealed import NO_THERMOMETER, Concealed, Draw
 
 
 def asymmetry(draw: Draw) -> Concealed:
@@ -71,10 +71,10 @@ def load_dependent_friction(draw: Draw) -> Concealed:
 def thermal(draw: Draw) -> Concealed:
     """Friction falls exponentially as the joint warms; otherwise in a straight line, or nobody recorded how warm."""
     viscous, dry = min(draw.size(0.02, 0.05), 0.12), min(draw.size(0.012, 0.03), 0.08)
-    straight, blind = draw.other and draw.flip(), draw.between(0.0, 1.0) < 0.3
+    straight, blind = draw.other and draw.flip(), draw.between(0.0, 1.0) < NO_THERMOMETER
     changes = {"warm_dry": dry, "warm_viscous": viscous, "warm_shape": 0.0 if straight else 1.0}
     shape = "linear" if straight else "exponential"
     found = {"dry_per_c": -dry, "viscous_per_c": -viscous}
     if blind:
         return Concealed(changes, {}, None, thermometer=False, cold=draw.flip())
-    return Concealed(changes, found, {"thermal": {**found, "shape": shape}})
+    return Concealed(changes, found, {"thermal": {**found, "shape": shape}}, thermometer=True)

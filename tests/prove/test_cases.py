@@ -12,8 +12,9 @@ import yaml
 
 from servod.axis_model import AxisModel, load_axis_model
 from servod.models.replay import Drive, replay
-from servod.prove.case import SEEN, make_case
-from servod.prove.conceal import CASES, SEALED, TRUTH, conceal, open_cases, read_truth
+from servod.prove.case import SEEN, has_thermometer, make_case
+from servod.prove.conceal import CASES, HOLDOUT, SEALED, TRUTH, conceal, open_cases, read_truth, unlock
+from servod.prove.concealed import NO_THERMOMETER, Concealed
 from servod.prove.hidden import HIDE, UNLISTED
 from servod.prove.plan import ALIKE, FAMILIES, HARDER, Cover, Plan, Settings, Sort, plans
 from servod.recordings import Quantity, load_recording
@@ -69,6 +70,17 @@ def test_a_limit_is_met_in_what_is_recorded(seed: int) -> None:
     assert most > 1.05 * case.truth["parameters"]["torque_saturation"]["limit"]
 
 
+def test_that_temperatures_are_missing_tells_nothing() -> None:
+    asked = Concealed({}, thermometer=True)
+    chance = [has_thermometer([Concealed({})], seed) for seed in range(1000)]
+    assert np.mean(chance) == pytest.approx(1.0 - NO_THERMOMETER, abs=0.05)
+    assert chance == [has_thermometer([], seed) for seed in range(1000)]
+    assert all(has_thermometer([Concealed({}), asked], seed) for seed in range(20))
+    for told in (True, False):
+        case = make_case(planned(Sort.NOTHING, (), seed=chance.index(told)), Settings())
+        assert {"temperature_c" in columns for columns in case.recordings.values()} == {told}
+
+
 def test_harder_cases_have_clutter_noise_and_other_forms() -> None:
     easy, hard = (make_case(planned(Sort.NOTHING, ()), settings) for settings in (Settings(), HARDER))
     assert easy.truth["true_model"] == hard.truth["true_model"]  # clutter is not worth naming
@@ -76,7 +88,8 @@ def test_harder_cases_have_clutter_noise_and_other_forms() -> None:
     errors = []
     for case in (easy, hard):
         rows = case.recordings["holdout"]
-        drive = Drive(*(rows[key] for key in ("t_s", "torque_nm", "position_rad", "temperature_c")))
+        told = [rows[key] for key in ("t_s", "torque_nm", "position_rad")]
+        drive = Drive(*told, rows.get("temperature_c", np.full(len(told[0]), np.nan)))
         errors.append(replay(AxisModel.model_validate(case.truth["true_model"]), drive, 0.25).rms)
     assert errors[1] > 1.5 * errors[0]
     assert all(plan.other for plan in plans(60, 1, HARDER) if plan.sort is Sort.SINGLE)
@@ -108,7 +121,9 @@ def test_a_sealed_case_has_no_truth_in_its_folder(tmp_path: Path) -> None:
 
 def test_a_truth_that_was_changed_is_refused(tmp_path: Path) -> None:
     digest = conceal([planned(Sort.NOTHING, ())], Settings(), tmp_path, quiet)
-    path = tmp_path / SEALED / TRUTH
+    path, held = tmp_path / SEALED / TRUTH, tmp_path / SEALED / "c000" / f"{HOLDOUT}.csv.gz"
+    assert [sealed.stat().st_mode & 0o777 for sealed in (path, held)] == [0, 0]
+    unlock(tmp_path)
     whole = json.loads(path.read_text())
     assert len(whole["salt"]) == 32
     whole["cases"]["c000"]["effects"] = ["cogging"]

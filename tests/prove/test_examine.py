@@ -15,7 +15,7 @@ import pytest
 
 from servod.errors import BadInput
 from servod.prove.case import make_case
-from servod.prove.conceal import CASES, write_case
+from servod.prove.conceal import CASES, SEALED, TRUTH, write_case
 from servod.prove.examine import ANSWERS, RUN, SAID, Examiner
 from servod.prove.plan import Settings, plans
 from servod.prove.trial import Trial, write_trial
@@ -38,10 +38,14 @@ def test_what_is_done_is_not_done_again(tmp_path: Path) -> None:
     kept.parent.mkdir(parents=True)
     done = json.dumps({"exit_code": 0, "sources": sha256_on_disk(DIAGNOSES)})
     kept.write_text(done)
+    sealed = tmp_path / SEALED / TRUTH
+    sealed.parent.mkdir()
+    sealed.write_text("{}")
     told: list[tuple[str, int, int]] = []
     Examiner(tmp_path, 5.0).run(1, lambda name, done, of: told.append((name, done, of)))
     assert told == [("c001", 2, 2)]
     assert kept.read_text() == done
+    assert sealed.stat().st_mode & 0o777 == 0
     run = json.loads((tmp_path / ANSWERS / "c001" / RUN).read_text())
     assert run["exit_code"] == 1 and run["sources"] == sha256_on_disk(DIAGNOSES)
     assert run["cpu_s"] > 0.1 and run["memory_mib"] > 10.0

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from servod.cli.app import app
 from servod.errors import BadInput
 from servod.prove import count, tables
-from servod.prove.conceal import CASES, SEALED, TRUTH, conceal, read_truth
+from servod.prove.conceal import CASES, SEALED, TRUTH, conceal, read_truth, unlock
 from servod.prove.document import document, score, write
 from servod.prove.examine import ANSWERS, DIAGNOSIS, MODEL, RUN
 from servod.prove.plan import Cover, Plan, Settings, Sort, plans
@@ -48,6 +48,7 @@ def trial(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def answered(trial: Path, tmp_path: Path, **answers: dict[str, Any]) -> Path:
     """A copy of the trial with answers; each case's answer extends the model that is believed."""
     out = tmp_path / "trial"
+    unlock(trial)
     shutil.copytree(trial, out)
     for name, answer in answers.items():
         folder = out / ANSWERS / name
