@@ -11,10 +11,12 @@ import pytest
 from servod.diagnose.effects import effect
 from servod.diagnose.effects.disturbance import EVERY
 from servod.diagnose.fit import Fit, Fitter, Weighing
-from servod.diagnose.held_out import RECORDING, STRETCH, TAIL_S, held_out, once, split
+from servod.diagnose.held_out import RECORDING, STRETCH, TAIL_S, Fold, held_out, once, split
 from servod.diagnose.hypothesis import Term
 from servod.diagnose.predict import Predictor
 from servod.diagnose.scene import Scene
+from servod.diagnose.windows import window_errors
+from servod.models.replay import replay
 from tests.diagnose.axes import believed
 from tests.diagnose.test_between import colder
 
@@ -37,6 +39,13 @@ def with_term(predictor: Predictor, fit: Fit, term: Term) -> Fit:
     hypothesis = replace(fit.hypothesis, terms=(term,))
     mismatch = predictor.mismatch(*hypothesis.models(hypothesis.start, len(predictor.traces)))
     return with_jacobian(predictor, Fit(hypothesis, hypothesis.start, mismatch, 0.0, np.zeros((0, 0)), True))
+
+
+def bare(fit: Fit) -> Fit:
+    """The start of the base alone."""
+    hypothesis = fit.hypothesis.without(0)
+    jacobian = fit.jacobian[:, : len(hypothesis.base)]
+    return replace(fit, hypothesis=hypothesis, coordinates=hypothesis.start, jacobian=jacobian)
 
 
 def pushes(predictor: Predictor) -> list[Term]:
@@ -66,7 +75,7 @@ def test_a_level_is_not_that_of_the_rows_that_it_is_judged_by(levels: tuple[Pred
 
 def test_every_row_is_left_out_once(levels: tuple[Predictor, Fit]) -> None:
     predictor, fit = levels
-    for shared in (split(predictor, fit), split(predictor, replace(fit, hypothesis=fit.hypothesis.without(0)))):
+    for shared in (split(predictor, fit), split(predictor, bare(fit))):
         assert np.all(np.sum(shared.folds, axis=0) == 1)
     assert shared.left_out == RECORDING
     assert len(shared.folds) == 2
@@ -80,17 +89,28 @@ def test_models_of_a_fold_have_the_levels_of_their_recordings(levels: tuple[Pred
         assert ratio == pytest.approx(1.3, rel=0.03)
 
 
+def test_windows_are_judged_by_the_model_that_has_not_seen_them(levels: tuple[Predictor, Fit]) -> None:
+    predictor, fit = levels
+    light, heavy = (believed(inertia=0.02 * factor) for factor in (0.9, 1.2))
+    folds = [
+        Fold(rows, (model,)) for rows, model in zip(split(predictor, bare(fit)).folds, (light, heavy), strict=True)
+    ]
+    window = window_errors(predictor, believed(), folds, folds)[0]
+    for part, trace, model in zip(predictor.slices, predictor.traces, (light, heavy), strict=True):
+        drive = replace(trace.drive, t_s=trace.drive.t_s - trace.shift_s)
+        for error, judge in ((window.recalibrated, model), (window.nominal, believed())):
+            assert np.allclose(error[part], replay(judge, drive, window.horizon_s).error, atol=1e-12)
+
+
 def test_no_number_of_a_fold_comes_from_the_rows_left_out(levels: tuple[Predictor, Fit]) -> None:
     """With another command in the first recording: what was fitted without it is the same to the last bit."""
     predictor, fit = levels
     drive = predictor.traces[0].drive
     spoiled = replace(predictor.traces[0], drive=replace(drive, torque=1.2 * drive.torque))
     other = Predictor((spoiled, *predictor.traces[1:]), believed(), predictor.rate)
-    hypothesis = fit.hypothesis.without(0)
     found = []
     for one in (predictor, other):
-        mismatch = one.mismatch(hypothesis.model(hypothesis.start))
-        start = Fit(hypothesis, hypothesis.start, mismatch, 0.0, fit.jacobian[:, : len(hypothesis.base)], True)
+        start = replace(bare(fit), mismatch=one.mismatch(believed()))
         found.append(held_out(one, start, split(one, start)))
     assert np.array_equal(found[0].coordinates[0], found[1].coordinates[0])
     assert not np.allclose(found[0].coordinates[1], found[1].coordinates[1], atol=1e-3)

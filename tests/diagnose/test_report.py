@@ -67,7 +67,21 @@ def test_a_linear_axis_has_metres_and_newtons(written: tuple[Path, dict[str, Any
     assert "kg·m²" not in page.split("<body>")[1]
 
 
-def test_windows_are_judged_by_models_that_have_not_seen_them(written: tuple[Path, dict[str, Any]]) -> None:
+def test_what_is_told_of_the_mismatch_is_that_of_unseen_rows(written: tuple[Path, dict[str, Any]]) -> None:
+    """Of each recording, of all of them, and the shares in sentences: one and the same numbers."""
+    document = written[1]
+    fit, rows = document["fit"], np.array([recording["rows"] for recording in document["recordings"]])
+    for side in ("before", "after"):
+        each = np.array([recording[f"mismatch_{side}"] for recording in document["recordings"]])
+        assert np.sqrt(rows @ each**2 / rows.sum()) == pytest.approx(fit["held_out"][side], rel=1e-9)
+    before, after, floor = (v**2 for v in (fit["held_out"]["before"], fit["held_out"]["after"], fit["noise_floor"]))
+    assert fit["explainable_removed"] == pytest.approx((before - after) / (before - floor), abs=1e-4)
+    assert f"{100.0 * fit['explainable_removed']:.0f} % of the explainable mismatch is gone" in document["summary"]
+    assert f"carries {100.0 * fit['explainable_removed']:.0f} %" in document["findings"][0]["statement"]
+    assert fit["held_out"]["left_out"] in (written[0] / "report.html").read_text()
+
+
+def test_windows_stray_less_with_what_was_found(written: tuple[Path, dict[str, Any]]) -> None:
     for window in written[1]["fit"]["windows"].values():
         assert set(window["recordings"]) == {"run0.csv", "run1.csv", "run2.csv"}
         assert window["after"] < 0.5 * window["before"]
