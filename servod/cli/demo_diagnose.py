@@ -47,10 +47,13 @@ def demo_diagnose(plant: Path, effect: str, fast: bool, out: Path, as_json: bool
 def _print(document: dict[str, Any]) -> None:
     rms = document["rms_error_mrad"]
     found = ", ".join(f"{f['effect']} ({f['confidence']:.2f})" for f in document["findings"]) or document["verdict"]
-    print(f"as believed         {rms['before']:.4f} mrad RMS on trajectory (19)")
+    scale = document["uncertainty_scale"]
+    share = {key: f"certified within {value:g} of the usual uncertainty" for key, value in scale.items()}
+    print(f"as believed         {rms['before']:.4f} mrad RMS on trajectory (19), {share['before']}")
     print(f"{document['concealed']} concealed   {rms['concealed']:.4f} mrad")
+    for line in document["broken_promises"]:
+        print(f"promise broken: {line}")
     print(f"diagnosed: {found}")
-    print(
-        f"after new design    {rms['after']:.4f} mrad: {100.0 * document['recovered_share']:.0f} % of the cost is back"
-    )
+    back = f"{100.0 * document['recovered_share']:.0f} % of the cost is back"
+    print(f"after new design    {rms['after']:.4f} mrad, {share['after']}: {back}")
     print(f"Report: {document['report']}")

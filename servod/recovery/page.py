@@ -1,4 +1,4 @@
-"""The page of `servoctl demo --diagnose`: what was promised, what came, what was found, and what that gave back.
+"""The page of `servoctl demo --diagnose`: what was believed, what came, what was found, and what that gave back.
 
 The last step of `walk`; the diagnosis has its own page beside it.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from servod.diagnose.sentences import certainty
-from servod.recovery.walk import DIAGNOSIS, Recovery, error_mrad, promised_mrad, time_s
+from servod.recovery.walk import DIAGNOSIS, Designed, Recovery, error_mrad, time_s
 from servod.report.diagnosis import Report
 from servod.report.figure import Axis, Colour, Curve, Figure, Panel, curve
 from servod.report.figures import mismatch
@@ -32,8 +32,7 @@ def write_recovery_page(found: Recovery, out: Path) -> Path:
         f"{back:.0f} % of what the concealed effect cost is back: {rms['before']:.3f} mrad "
         f"RMS on trajectory (19) as believed, {rms['concealed']:.3f} with it, {rms['after']:.3f} once it is known."
     )
-    name = found.effect.replace("_", " ")
-    page.points(_story(found, name))
+    page.points(story(found))
     report.figure(_errors(found))
     _figures(report, found)
     page.heading("What the diagnosis found in the axis's own recordings")
@@ -48,15 +47,35 @@ def write_recovery_page(found: Recovery, out: Path) -> Path:
     return report.write()
 
 
-def _story(found: Recovery, name: str) -> list[str]:
+def story(found: Recovery) -> list[str]:
+    """What happened, a sentence for each step."""
+    name = found.effect.replace("_", " ")
     named = ", ".join(f["effect"].replace("_", " ") for f in found.document["findings"]) or "nothing by name"
     stays = "was deployed" if found.deployment.proven else f"was rolled back ({'; '.join(found.deployment.reasons)})"
     return [
-        "A controller was designed and certified for what is believed of the axis.",
-        f"The axis has {name} that nobody told the controller of: it tracks worse than the certificate promised.",
+        f"A controller was designed and certified for what is believed of the axis, {within(found.first)}.",
+        f"The axis has {name} that nobody told the controller of: {_kept(found)}.",
         f"The axis's own recordings were diagnosed: {named}.",
-        f"A controller designed and certified for the extended model {stays}.",
+        f"A controller designed and certified for the extended model, {within(found.second)}, {stays}.",
     ]
+
+
+def within(designed: Designed) -> str:
+    """How much of the model may be off under a certificate."""
+    if designed.scale == 1.0:
+        return "within the usual uncertainty of a model"
+    return f"within {designed.scale:g} of the usual uncertainty of a model: more of it got no certificate"
+
+
+def _kept(found: Recovery) -> str:
+    """Whether the axis did what the first certificate promised."""
+    if found.broken_promises:
+        return f"it tracks worse than the certificate promised ({'; '.join(found.broken_promises)})"
+    times = found.rms_mrad["concealed"] / found.rms_mrad["before"]
+    return (
+        "of the validation motion it does what the certificate promised all the same, and the error on trajectory (19) "
+        f"is {times:.2g} times as large"
+    )
 
 
 def _errors(found: Recovery) -> Figure:
@@ -74,7 +93,7 @@ def _errors(found: Recovery) -> Figure:
 
 def _figures(report: Report, found: Recovery) -> None:
     """What certificates promised of the validation motion, and what came."""
-    first, done = promised_mrad(found.first), found.deployment.document()
+    first, done = found.first.promised_mrad, found.deployment.document()
     after = done["after"] or {}
     rows = [
         (

@@ -19,6 +19,7 @@ import numpy as np
 from servod.axis_model import AxisModel, axis_model_yaml, load_axis_model
 from servod.commission.runs import save_rows
 from servod.deploy.deployment import deploy
+from servod.deploy.judge import broken
 from servod.deploy.links import Rows
 from servod.deploy.outcome import Deployment
 from servod.diagnose.engine import Diagnosis, diagnose
@@ -69,6 +70,21 @@ class Effort:
 
 
 @dataclass(frozen=True)
+class Designed:
+    """A certified set, and the share of the usual uncertainty of a model that it is certified for."""
+
+    gains: GainSet
+    scale: float
+
+    @property
+    def promised_mrad(self) -> dict[str, float]:
+        """What its certificate promised of the validation motion, mrad."""
+        promised = self.gains.certificate.promised if self.gains.certificate else None
+        values = promised.model_dump() if promised else {}
+        return {k.replace("_rad", "_mrad"): 1e3 * v for k, v in values.items() if k.endswith("_rad")}
+
+
+@dataclass(frozen=True)
 class Recovery:
     """What came of it; rows are the cycles on trajectory (19), figures RMS errors there in mrad."""
 
@@ -78,13 +94,16 @@ class Recovery:
     after: Rows
     diagnosis: Diagnosis
     document: dict[str, Any]
-    first: GainSet
-    second: GainSet
+    first: Designed
+    second: Designed
     deployment: Deployment
 
     @property
     def rms_mrad(self) -> dict[str, float]:
-        """RMS error on (19) without its first second: as promised, with the effect concealed, and after."""
+        """RMS error on (19) without its first second: as believed, with the effect concealed, and after.
+
+        "As believed" was measured, on an axis that is what the model says; no certificate speaks of (19).
+        """
         runs = {"before": self.before, "concealed": self.concealed, "after": self.after}
         return {name: score(time_s(rows), error_mrad(rows)).rms_error_mrad for name, rows in runs.items()}
 
@@ -99,21 +118,24 @@ class Recovery:
             "rms_error_mrad": rms,
             "recovered_share": self.recovered_share,
             "deployment": self.deployment.document(),
-            "promised_before": promised_mrad(self.first),
+            "promised_before": self.first.promised_mrad,
+            "uncertainty_scale": {"before": self.first.scale, "after": self.second.scale},
+            "broken_promises": self.broken_promises,
         }
+
+    @property
+    def broken_promises(self) -> list[str]:
+        """What of the first certificate's promises for the validation motion did not come true, a sentence each."""
+        gains, came = self.first.gains, self.deployment.before
+        if came is None or gains.design is None or gains.certificate is None or gains.certificate.promised is None:
+            return []
+        return list(broken(came, gains.certificate.promised, 2.0 * math.pi / gains.design.counts_per_turn))
 
     @property
     def recovered_share(self) -> float:
         """Share of the error that the effect cost which is gone again."""
         rms = self.rms_mrad
         return (rms["concealed"] - rms["after"]) / max(rms["concealed"] - rms["before"], 1e-12)
-
-
-def promised_mrad(gains: GainSet) -> dict[str, float]:
-    """What a certificate promised of the validation motion, mrad."""
-    promised = gains.certificate.promised if gains.certificate else None
-    values = promised.model_dump() if promised else {}
-    return {k.replace("_rad", "_mrad"): 1e3 * v for k, v in values.items() if k.endswith("_rad")}
 
 
 def time_s(rows: Rows) -> Array:
@@ -142,9 +164,9 @@ def recover(
     first = designed(believed, out / "believed.yaml", out / "gains_before.yaml", None, effort.plants)
     with tempfile.TemporaryDirectory(prefix="servod-demo-") as folder:
         tell("the axis as it is believed to be", 0.2)
-        with open_axis(believed, first, _folder(folder, "believed"), seed) as axis:
+        with open_axis(believed, first.gains, _folder(folder, "believed"), seed) as axis:
             before = axis.paper(effort.paper_s)
-        with open_axis(true, first, _folder(folder, "true"), seed) as axis:
+        with open_axis(true, first.gains, _folder(folder, "true"), seed) as axis:
             tell("the axis as it is", 0.25)
             concealed = axis.paper(effort.paper_s)
             recordings = _recorded(axis, concealed, out, tell, effort)
@@ -152,8 +174,8 @@ def recover(
             found, document = _diagnosed(believed, recordings, out / DIAGNOSIS)
             tell("design for what was found", 0.65)
             extended = _extended(believed, document, out)
-            second = designed(load_axis_model(extended), extended, out / "gains_after.yaml", first, effort.plants)
-            done = deploy(axis.link, second, lambda what, share: tell(f"deploy: {what}", 0.85 + 0.08 * share))
+            second = designed(load_axis_model(extended), extended, out / "gains_after.yaml", first.gains, effort.plants)
+            done = deploy(axis.link, second.gains, lambda what, share: tell(f"deploy: {what}", 0.85 + 0.08 * share))
             tell("the axis under what was found", 0.95)
             after = axis.paper(effort.paper_s)
     return Recovery(effect, before, concealed, after, found, document, first, second, done)
@@ -165,7 +187,9 @@ def _folder(parent: str, name: str) -> Path:
     return folder
 
 
-def designed(model: AxisModel, model_file: Path, gains_file: Path, same_filter: GainSet | None, plants: int) -> GainSet:
+def designed(
+    model: AxisModel, model_file: Path, gains_file: Path, same_filter: GainSet | None, plants: int
+) -> Designed:
     """The paper's law for `model` with a certificate, without a disturbance observer beside it, which would hide much.
 
     `same_filter` is a set whose velocity filter the axis has already. Raises AnswerIsNo.
@@ -182,7 +206,7 @@ def designed(model: AxisModel, model_file: Path, gains_file: Path, same_filter: 
         certified = checked.certified(found)
         write_bytes(gains_file, certified.to_yaml().encode())
         if checked.valid:
-            return certified
+            return Designed(certified, scale)
         said = f"{gains_file}: not valid: {'; '.join(c.name for c in checked.checks if not c.passed)}"
     raise AnswerIsNo(said)
 

@@ -10,7 +10,7 @@ from servod.axis_model import load_axis_model
 from servod.recovery.axes import stepped_axis
 from servod.recovery.concealed import believed_and_true
 from servod.recovery.page import write_recovery_page
-from servod.recovery.walk import Effort, recover
+from servod.recovery.walk import SCALES, Effort, recover
 from servod.shipped import shipped
 
 EFFORT = Effort(paper_s=8.0, diagnosed_s=5.0, motion_s=6.0, plants=20)
@@ -34,6 +34,9 @@ def test_what_a_concealed_effect_cost_comes_back(tmp_path: Path) -> None:
     assert {path.name for path in (tmp_path / "recordings").iterdir()} == {
         f"{name}.mcap" for name in ("paper", "slow_sine", "multisine", "moves")
     }
+    assert document["uncertainty_scale"]["before"] == 1.0
+    assert document["uncertainty_scale"]["after"] in SCALES
+    assert any("the certificate promised" in line for line in document["broken_promises"])
     page = (tmp_path / "report.html").read_text()
     assert "of what the concealed effect cost is back" in page
     assert (tmp_path / "diagnosis" / "report.html").exists()
