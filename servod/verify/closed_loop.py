@@ -192,7 +192,7 @@ def joint_points(
                 stiffness * speed / level,
                 1.0 - bristle.value + bristle.value * build_up if speed else 1.0,
                 stiffness,
-                min(damping * d.damping, 4.0 * level / speed) if speed else damping * d.damping,
+                damping * d.damping,
                 viscous * d.viscous + d.more_viscous,
                 d.position_slope,
                 d.behind,

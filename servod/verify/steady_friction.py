@@ -94,14 +94,12 @@ class SteadyFriction:
         return (self.dry(up) - self.dry(down)) / (2.0 * step)
 
     def damping(self, velocity: float) -> float:
-        """Bristle damping sigma1 at `velocity`, held under 4*g/|v|: no damping counts beyond what is passive."""
+        """Bristle damping sigma1 at `velocity`, as the simulator has it."""
         p = self.packed
         sigma1 = p[P_SIGMA1]
         if p[P_SIGMA1_VELOCITY] > 0.0:
             sigma1 *= math.exp(-((velocity / p[P_SIGMA1_VELOCITY]) ** 2))
-        speed = abs(velocity)
-        sigma1 /= self.gain
-        return min(sigma1, 4.0 * self.dry(velocity) / speed) if speed else sigma1
+        return sigma1 / self.gain
 
     def largest(self, speed: float) -> float:
         """Largest steady friction up to `speed` in either direction [N*m]."""
