@@ -1,4 +1,7 @@
-"""Diagnose recordings of three real machines and print what was missing, with errors on data that no fit has seen.
+"""Diagnose recordings of three real machines and print what was missing, with errors before and after.
+
+Errors are of recordings that the diagnosis has not seen; of EMPS, where its one session is all that it may see, they
+are of that session, and its row says so. Its second session is told apart, before and after what changed there.
 
     python scripts/real_machines.py --recordings ../shared/recordings --out out/machines
 
@@ -42,13 +45,24 @@ class Machine:
     seen: tuple[str, ...]
     unseen: tuple[str, ...]
 
+    def judged(self) -> dict[str, str]:
+        """Files that errors are told of, and what their rows are called: the unseen ones, where there are any."""
+        told = "" if self.unseen else " (the fit has seen it)"
+        return {name: f"{self.example}, {Path(name).name}{told}" for name in self.unseen or self.seen}
+
 
 XL330 = "bam_xl330"
 ODRIVE = "odrive_cogging"
 
+
+def _odrive(*runs: int) -> tuple[str, ...]:
+    """Runs without the compensation of cogging."""
+    return tuple(f"{ODRIVE}/slow_turn_nocomp_{run}.csv.gz" for run in runs)
+
+
 MACHINES = (
     Machine("emps", ("emps/DATA_EMPS.mat",), ()),
-    Machine("odrive", (f"{ODRIVE}/slow_turn_nocomp_0.csv.gz",), (f"{ODRIVE}/slow_turn_nocomp_2.csv.gz",)),
+    Machine("odrive", _odrive(0), _odrive(1, 2)),
     Machine(
         "xl330",
         tuple(f"{XL330}/{run}.csv.gz" for run in ("sin_sin_kp200", "sin_time_square_kp100", "sin_time_square_kp200")),
@@ -124,10 +138,9 @@ def main() -> None:
         seen = [given.recordings / name for name in machine.seen]
         plain, out = EXAMPLES / f"{machine.example}.yaml", given.out / machine.example
         diagnosed(machine, plain, seen, out, "--time-limit", given.time_limit)
-        for name in machine.unseen or machine.seen:
-            recording = given.recordings / name
-            pair = [errors(machine, model, recording) for model in (plain, out / "model.yaml")]
-            rows.append((f"{machine.example}, {recording.name}", *pair))
+        for name, what in machine.judged().items():
+            pair = [errors(machine, model, given.recordings / name) for model in (plain, out / "model.yaml")]
+            rows.append((what, *pair))
     rows += second_session(given.recordings, given.out, given.time_limit)
     print("\n| recording | windows of 0.25 s / mm, mrad | of 1 s / mm, mrad | torque mismatch / N, mN·m |")
     print("| --- | --- | --- | --- |")

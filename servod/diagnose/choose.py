@@ -55,6 +55,10 @@ STEPS = 12
 #: blows behind a gap come a sample earlier or later, and no step ends exactly.
 MORE, NEAR = 2, 0.05
 
+#: Blocks whose sums are taken to be independent when a gain is judged, s. Shorter than those of the intervals: what
+#: other missing physics leaves is slow, and must not count as noise as long as it is not named.
+GAIN_MEMORY_S = 0.1
+
 #: Scale of the mismatch is never taken smaller than this share of dry friction.
 LEAST_SCALE = 0.002
 
@@ -229,7 +233,7 @@ class Chooser:
         period = self.predictor.traces[0].period_s
         clipped = np.clip(mismatch / scale, -4.0, 4.0)
         plain = float(clipped @ clipped)
-        slow = float(long_run(clipped[:, None], max(1, round(0.1 / period)))[0, 0])
+        slow = float(long_run(clipped[:, None], max(1, round(GAIN_MEMORY_S / period)))[0, 0])
         return max(slow / max(plain, 1e-30), 1.0)
 
     def enters(self, merit: Merit, fit: Fit, place: int = -1) -> bool:

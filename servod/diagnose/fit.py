@@ -2,7 +2,7 @@
 
 Stands between hypotheses and their selection. The residual of the fit is the mismatch of every row in units of its
 present scale; beyond some scales a row counts by its distance only (Huber). Intervals count correlated rows as fewer
-(Newey and West, Econometrica 55, 1987).
+(batch means: Carlstein, Annals of Statistics 14, 1986).
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ LEAST_DAMPING = 1e-8
 #: Longest step of one coordinate at once.
 LONGEST = 1.5
 
-#: Lags over which rows are taken to be correlated, s.
+#: Length of the blocks whose sums are taken to be independent, s: rows within one may be correlated as they like.
 MEMORY_S = 0.25
 
 
@@ -229,7 +229,7 @@ def scale_of(mismatch: Array, counts: NDArray[np.bool_], floor: float) -> float:
 
 
 def covariance(fit: Fit, weighing: Weighing, period_s: float) -> Array:
-    """Covariance of the coordinates: sandwich with correlated rows (Bartlett's window over MEMORY_S)."""
+    """Covariance of the coordinates: sandwich with correlated rows (batch means, blocks of MEMORY_S)."""
     off = fit.mismatch / weighing.scale
     weight = weighing.rows * np.minimum(1.0, HUBER / np.maximum(np.abs(off), 1e-12))
     scaled = fit.jacobian / weighing.scale
@@ -240,7 +240,7 @@ def covariance(fit: Fit, weighing: Weighing, period_s: float) -> Array:
     return np.asarray(bread @ (meat + np.diag(precision**2)) @ bread)
 
 
-def long_run(scores: Array, lags: int) -> Array:
-    """Long-run covariance of the sum of `scores`, by sums over blocks of `lags` rows (batch means)."""
-    blocks = np.add.reduceat(scores, np.arange(0, len(scores), lags), axis=0)
+def long_run(scores: Array, rows: int) -> Array:
+    """Long-run covariance of the sum of `scores`, by sums over blocks of so many rows (batch means)."""
+    blocks = np.add.reduceat(scores, np.arange(0, len(scores), rows), axis=0)
     return np.asarray(blocks.T @ blocks)

@@ -109,7 +109,11 @@ def _unwrapped(position: Array, notes: list[str]) -> Array:
 
 
 def _repaired(values: Array, what: str, counts: Rows, notes: list[str]) -> Array:
-    """Single rows that leave both neighbours and come back are replaced; they and their neighbours do not count."""
+    """Single rows that leave both neighbours and come back are replaced by the line between these.
+
+    A position that was replaced is no measurement and does not count; its neighbours do. The row of a command counts:
+    nobody knows whether the drive obeyed it. If it did, a few rows mismatch, which the fit counts by distance only.
+    """
     bad = glitches(values)
     if not bad.any():
         return values

@@ -34,7 +34,8 @@ MATHEMATICS = (
     "tried (Bayesian information criterion), and when it is large enough to be worth naming.",
     "Proof. Each recording in turn is left out, the rest is fitted again, and the one left out is predicted; a quarter "
     "of every recording where there is only one, or where recordings differ in a number of their own. Intervals "
-    "count correlated rows as fewer (Newey and West, Econometrica 55, 1987).",
+    "count correlated rows as fewer (sums over blocks of a quarter of a second: Carlstein, Annals of Statistics 14, "
+    "1986).",
 )
 
 
