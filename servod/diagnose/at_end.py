@@ -9,8 +9,12 @@ from __future__ import annotations
 from servod.diagnose.fit import Fit
 
 #: Numbers that may lie at an end of their range: where they do not matter, or are known beforehand to a narrow one.
+#: A bristle's damping is one of them, the model's own as well as that of a bristle that the model does not have.
 MAY_END = frozenset(
-    ("damping", "cubic", "exponent", "delay_s", "friction.sigma1", "friction.stribeck_velocity", "damping_velocity")
+    (
+        *("damping", "cubic", "exponent", "delay_s", "sigma1", "friction.sigma1"),
+        *("friction.stribeck_velocity", "damping_velocity"),
+    )
 )
 
 #: Coordinates that are so close to an end lie on it.

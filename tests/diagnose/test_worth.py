@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -90,6 +92,18 @@ def test_a_number_at_an_end_of_its_range_is_somebody_elses(scene: Scene) -> None
         unknown = hypothesis.unknowns[place]
         coordinates = hypothesis.start.copy()
         coordinates[place] = unknown.coordinate(at * 0.02 if hypothesis is mass else at)
+        assert at_end(Fit(hypothesis, coordinates, scene.mismatch, 0.0, np.zeros((0, 0)), True)) is answer
+
+
+def test_a_bristle_may_have_no_damping_and_must_have_a_stiffness(scene: Scene) -> None:
+    """Whether the model has it already or not."""
+    friction = {"kind": "coulomb_viscous", "coulomb": 0.12, "viscous": 0.02}
+    plain = replace(scene, document=document_of(believed(friction=friction)))
+    term = effect("presliding").terms(plain)[0]
+    hypothesis = Hypothesis(plain.document, base_unknowns(believed(friction=friction)), (term,))
+    for place, answer in ((0, True), (1, False)):
+        coordinates = hypothesis.start.copy()
+        coordinates[hypothesis.share(0).start + place] = term.unknowns[place].coordinate(term.unknowns[place].low)
         assert at_end(Fit(hypothesis, coordinates, scene.mismatch, 0.0, np.zeros((0, 0)), True)) is answer
 
 
