@@ -18,8 +18,9 @@ from servod.errors import AnswerIsNo, BadInput
 if TYPE_CHECKING:
     from servod.axis_model import AxisModel
     from servod.gains import GainSet
-    from servod.synthesize.deployed import Infeasible, Wishes
+    from servod.synthesize.deployed import Wishes
     from servod.synthesize.gain_set import Options
+    from servod.synthesize.infeasible import Infeasible
 
 EXAMPLES = (
     "servoctl synthesize --model model.yaml --out gains.yaml",
@@ -131,7 +132,7 @@ def options_of(
 def finish(result: GainSet | Infeasible, out: Path, cross_check: bool, as_json: bool) -> None:
     """Write and print the set, or say why there is none. Raises AnswerIsNo."""
     from servod.gain_store import write_file
-    from servod.synthesize.deployed import Infeasible
+    from servod.synthesize.infeasible import Infeasible
 
     if isinstance(result, Infeasible):
         refuse(result, as_json)

@@ -24,8 +24,9 @@ from servod.paper.joints import CUTOFF_HZ, ENCODER_COUNTS, Joint, open_for_track
 from servod.paper.printed import STEPS_MRAD
 from servod.report.figures.motion import Motion
 from servod.session import SteppedSession
-from servod.synthesize.deployed import Infeasible, Wishes
+from servod.synthesize.deployed import Wishes
 from servod.synthesize.gain_set import Options, synthesize
+from servod.synthesize.infeasible import Infeasible
 from servod.synthesize.intervals import uncertainty_of
 from servod.tracking.metrics import Curves, StepResponse, Tracking, roughness, score, step_response
 from servod.tracking.stepped import activate, run_motion

@@ -31,8 +31,9 @@ from servod.recordings import load_recording
 from servod.recovery.axes import RecoveryAxis
 from servod.report.diagnosis_files import MODEL, write_files
 from servod.report.files import write_bytes
-from servod.synthesize.deployed import Infeasible, Wishes
+from servod.synthesize.deployed import Wishes
 from servod.synthesize.gain_set import Options, synthesize
+from servod.synthesize.infeasible import Infeasible
 from servod.tracking.metrics import Array, score
 from servod.verify.certify import verify
 from servod.verify.checks import LEAST_PLANTS
@@ -136,6 +137,13 @@ class Recovery:
         """Share of the error that the effect cost which is gone again."""
         rms = self.rms_mrad
         return (rms["concealed"] - rms["after"]) / max(rms["concealed"] - rms["before"], 1e-12)
+
+
+def within(scale: float) -> str:
+    """How much of the model may be off under a certificate, in words."""
+    if scale == 1.0:
+        return "within the usual uncertainty of a model"
+    return f"within {scale:g} of the usual uncertainty of a model (more of it got no certificate)"
 
 
 def time_s(rows: Rows) -> Array:

@@ -21,8 +21,9 @@ from servod.gain_parameters import (
     WeightShape,
 )
 from servod.gains import GainSet
-from servod.synthesize.deployed import Infeasible, Wishes, designs, explain, region_gains
+from servod.synthesize.deployed import Wishes, designs, region_gains
 from servod.synthesize.feedforward import position_feedforward
+from servod.synthesize.infeasible import Infeasible, explain
 from servod.synthesize.integral_gain import designed
 from servod.synthesize.local_sets import (
     ACCURACY,

@@ -14,8 +14,9 @@ from servod.axis_model import AxisModel
 from servod.gain_design import Design, DesignMode, ReferenceProof
 from servod.gain_parameters import LocalParameters, RegionGains, Regions
 from servod.gains import GainSet
-from servod.synthesize.deployed import Infeasible, Relaxation, Wishes, empty_design, largest_factor
+from servod.synthesize.deployed import Wishes, empty_design
 from servod.synthesize.gain_set import Options, gain_set, parameters
+from servod.synthesize.infeasible import Infeasible, Relaxation, largest_factor
 from servod.synthesize.lmi_reference import (
     PARTS,
     ReferenceAnswer,

@@ -38,7 +38,8 @@ from servod.deploy.deployment import announced
 from servod.errors import AnswerIsNo
 from servod.gains import load_gains
 from servod.report.figure import Figure, Table
-from servod.synthesize.deployed import Infeasible, Relaxation, Wishes
+from servod.synthesize.deployed import Wishes
+from servod.synthesize.infeasible import Infeasible, Relaxation
 from servod.tracking import simulated
 from tests.synthesize.designs import table1
 

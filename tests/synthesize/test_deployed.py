@@ -13,7 +13,7 @@ from servod.gain_parameters import LocalParameters
 from servod.gains import GainSet, parse_gains
 from servod.models.simulate import LoopSettings, simulate_closed_loop
 from servod.references import paper
-from servod.synthesize import deployed
+from servod.synthesize import deployed, infeasible
 from servod.synthesize.deployed import Wishes
 from servod.synthesize.gain_set import synthesize, with_feedback
 from servod.synthesize.regions import pole_disc
@@ -83,14 +83,14 @@ def test_what_cannot_be_is_refused_with_the_vertices_that_clash() -> None:
     wishes = Wishes(uncertainty=Uncertainty(slope=0.8, dry=0.6), cutoff_hz=120.0, slow_disc=0.998)
     assert deployed.regions(table1(), wishes) is None
     design = deployed.empty_design(table1(), wishes, 120.0)
-    clashes = list(deployed.clashing_vertices(design, wishes.spans[1], wishes))
+    clashes = list(infeasible.clashing_vertices(design, wishes.spans[1], wishes))
     assert any("falling" in line for line in clashes)
 
 
 def test_the_relaxation_that_is_offered_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(deployed, "RELAX_STEPS", 2)
+    monkeypatch.setattr(infeasible, "RELAX_STEPS", 2)
     wishes = Wishes(uncertainty=Uncertainty(slope=0.8, dry=0.6), cutoff_hz=300.0, slow_disc=0.998)
-    offered = next(iter(deployed.relaxations(table1(), wishes)))
+    offered = next(iter(infeasible.relaxations(table1(), wishes)))
     assert offered.wish == "scale of the uncertainty" and 0.0 < offered.enough < 1.0
     taken = replace(wishes, uncertainty=wishes.uncertainty.scaled(offered.enough))
     assert deployed.regions(table1(), taken) is not None

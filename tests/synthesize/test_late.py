@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 from servod.cli.app import run
-from servod.synthesize.deployed import Infeasible, Wishes, bare_proof, empty_design, programme
+from servod.synthesize.deployed import Wishes, bare_proof, empty_design, programme
 from servod.synthesize.gain_set import synthesize
+from servod.synthesize.infeasible import Infeasible
 from servod.verify.sampled import Timing
 from servod.verify.vertices import fed_commands, known_commands
 from tests.synthesize.designs import MODEL, table1

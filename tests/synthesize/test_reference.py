@@ -11,9 +11,10 @@ import pytest
 from servod.gain_design import DesignMode, ReferenceForm, ReferenceOutput
 from servod.gain_parameters import LocalParameters
 from servod.gains import GainSet, parse_gains
-from servod.synthesize import deployed
-from servod.synthesize.deployed import Infeasible, Wishes
+from servod.synthesize import infeasible
+from servod.synthesize.deployed import Wishes
 from servod.synthesize.gain_set import Options
+from servod.synthesize.infeasible import Infeasible
 from servod.synthesize.lmi_reference import ReferenceWishes, programme, reference, solve
 from servod.synthesize.reference import frame, reference_set
 from servod.verify.certify import verify
@@ -85,7 +86,7 @@ def test_a_set_at_rest_is_infeasible_and_its_vertices_and_constraints_are_named(
 
 
 def test_an_offered_decay_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(deployed, "RELAX_STEPS", 2)
+    monkeypatch.setattr(infeasible, "RELAX_STEPS", 2)
     asked = ReferenceWishes(least_decay_per_s=50.0)
     found = reference_set(table1(), asked=asked)
     assert isinstance(found, Infeasible)

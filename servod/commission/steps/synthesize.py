@@ -13,8 +13,9 @@ from servod.commission.walk import Walk
 from servod.errors import AnswerIsNo
 from servod.gains import GainSet
 from servod.sources import SYNTHESIZES, source_sha256
-from servod.synthesize.deployed import Infeasible, Relaxation, Wishes
+from servod.synthesize.deployed import Wishes
 from servod.synthesize.gain_set import Options, synthesize
+from servod.synthesize.infeasible import Infeasible, Relaxation
 from servod.synthesize.intervals import uncertainty_of
 from servod.units import NS_PER_S, NS_PER_US
 
