@@ -47,8 +47,9 @@ def demo_diagnose(plant: Path, effect: str, fast: bool, out: Path, as_json: bool
 def _print(document: dict[str, Any]) -> None:
     rms = document["rms_error_mrad"]
     found = ", ".join(f"{f['effect']} ({f['confidence']:.2f})" for f in document["findings"]) or document["verdict"]
-    scale = document["uncertainty_scale"]
-    share = {key: f"certified within {value:g} of the usual uncertainty" for key, value in scale.items()}
+    from servod.recovery.walk import within
+
+    share = {key: f"certified {within(scale)}" for key, scale in document["uncertainty_scale"].items()}
     print(f"as believed         {rms['before']:.4f} mrad RMS on trajectory (19), {share['before']}")
     print(f"{document['concealed']} concealed   {rms['concealed']:.4f} mrad")
     for line in document["broken_promises"]:

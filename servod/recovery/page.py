@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from servod.diagnose.sentences import certainty
-from servod.recovery.walk import DIAGNOSIS, Designed, Recovery, error_mrad, time_s
+from servod.recovery.walk import DIAGNOSIS, Recovery, error_mrad, time_s, within
 from servod.report.diagnosis import Report
 from servod.report.figure import Axis, Colour, Curve, Figure, Panel, curve
 from servod.report.figures import mismatch
@@ -53,18 +53,11 @@ def story(found: Recovery) -> list[str]:
     named = ", ".join(f["effect"].replace("_", " ") for f in found.document["findings"]) or "nothing by name"
     stays = "was deployed" if found.deployment.proven else f"was rolled back ({'; '.join(found.deployment.reasons)})"
     return [
-        f"A controller was designed and certified for what is believed of the axis, {within(found.first)}.",
+        f"A controller was designed and certified for what is believed of the axis, {within(found.first.scale)}.",
         f"The axis has {name} that nobody told the controller of: {_kept(found)}.",
         f"The axis's own recordings were diagnosed: {named}.",
-        f"A controller designed and certified for the extended model, {within(found.second)}, {stays}.",
+        f"A controller designed and certified for the extended model, {within(found.second.scale)}, {stays}.",
     ]
-
-
-def within(designed: Designed) -> str:
-    """How much of the model may be off under a certificate."""
-    if designed.scale == 1.0:
-        return "within the usual uncertainty of a model"
-    return f"within {designed.scale:g} of the usual uncertainty of a model: more of it got no certificate"
 
 
 def _kept(found: Recovery) -> str:
