@@ -22,6 +22,7 @@ from servod.diagnose.floor import trace_floor
 from servod.diagnose.held_out import Fold
 from servod.diagnose.hypothesis import Document, Reported
 from servod.diagnose.locate import places
+from servod.diagnose.merit import Merit
 from servod.diagnose.recalibrated import Z95, differs, recalibrated, told_coordinates
 from servod.diagnose.signature import where
 from servod.diagnose.verdict import alternatives, confidence
@@ -163,11 +164,23 @@ def _spread(evidence: Evidence, place: int, told: list[Reported]) -> Array:
 
 
 def minor(evidence: Evidence) -> dict[str, Any]:
-    """Effects that are there but not worth naming: torque as a share of dry friction, share of the error."""
-    return {
-        name: {"torque_over_coulomb": round(merit.torque, 5), "share": round(max(merit.share, 0.0), 5)}
-        for name, merit in evidence.choice.minor.items()
-    }
+    """Effects that are there but not worth naming: torque as a share of dry friction, share of the error.
+
+    Those that stand in the model have their parameters too, and why they are no findings.
+    """
+    terms = evidence.fit.hypothesis.terms
+    named = {terms[place].effect for place in evidence.named}
+    seen = {name: _size(merit) for name, merit in evidence.choice.minor.items() if name not in named}
+    for name in dict.fromkeys(terms[place].effect for place in evidence.kept):
+        those = [place for place in evidence.kept if terms[place].effect == name]
+        largest = max((evidence.choice.merits[place] for place in those), key=lambda merit: merit.torque)
+        why = evidence.kept[those[0]].value
+        seen[name] = {**_size(largest), "why": why, "parameters": _parameters(evidence, those)}
+    return seen
+
+
+def _size(merit: Merit) -> dict[str, Any]:
+    return {"torque_over_coulomb": round(merit.torque, 5), "share": round(max(merit.share, 0.0), 5)}
 
 
 def fit_document(

@@ -5,8 +5,8 @@ Stands between the command line and everything else here; writes nothing.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from time import monotonic
 
 import numpy as np
@@ -22,6 +22,7 @@ from servod.diagnose.intake import Refusal, taken_in
 from servod.diagnose.locate import Map, maps
 from servod.diagnose.predict import Predictor
 from servod.diagnose.slow import slow
+from servod.diagnose.sorting import Kept, sorted_out
 from servod.diagnose.spread import spread
 from servod.diagnose.swap import swapped
 from servod.diagnose.tidy import tidied
@@ -55,7 +56,7 @@ class Evidence:
     `named` are places of terms in the fit and `less` the fits without each of them; `errors` are those of the fits to
     everything, by which names are judged. `before`, `after` and `without` are by fits that have not seen the rows of
     `shared`, and `unseen` has the errors of these. `attempt` is the share of the explainable error that known physics
-    removes there, also where its names may not stand.
+    removes there, also where its names may not stand. `kept` says of terms in the fit why they are no findings.
     """
 
     traces: tuple[Trace, ...]
@@ -74,6 +75,7 @@ class Evidence:
     maps_before: list[Map]
     maps_after: list[Map]
     attempt: float
+    kept: Mapping[int, Kept] = field(default_factory=dict)
 
     @property
     def fit(self) -> Fit:
@@ -109,10 +111,11 @@ def diagnose(
     choice.fit = tidied(chooser, choice.fit)
     chooser.lower_floor(choice.fit.mismatch)
     choice.floor = chooser.floor
-    evidence = _evidence(predictor, chooser, choice, tell)
+    evidence = proved(predictor, chooser, choice, tell)
     while (worse := _worse_unseen(evidence)) is not None:
         choice.drop(worse, evidence.less[worse])
-        evidence = _evidence(predictor, chooser, choice, tell)
+        evidence = proved(predictor, chooser, choice, tell)
+    evidence = sorted_out(evidence, chooser)
     seconds["proof"] = monotonic() - begun - seconds["intake"] - seconds["search"]
     final = verdict(choice, evidence.named, evidence.errors, predictor.dry)
     if final is Verdict.UNEXPLAINED:
@@ -123,7 +126,8 @@ def diagnose(
     return Diagnosis(model, refused, final, evidence, seconds)
 
 
-def _evidence(predictor: Predictor, chooser: Chooser, choice: Choice, tell: Tell) -> Evidence:
+def proved(predictor: Predictor, chooser: Chooser, choice: Choice, tell: Tell) -> Evidence:
+    """A choice proved on rows that its fits have not seen; names are those of terms at the level of their effect."""
     fit = choice.fit
     nominal = chooser.start.document
     named = named_terms(choice, nominal)
@@ -180,7 +184,7 @@ def _without_names(evidence: Evidence) -> Evidence:
         shares((rows, rows), predictor.counts, choice.floor) for rows in (choice.base.mismatch, before.mismatch)
     )
     return replace(
-        evidence, choice=bare, named=[], errors=errors, less={}, without={}, unnamed=left, shared=shared,
+        evidence, choice=bare, named=[], kept={}, errors=errors, less={}, without={}, unnamed=left, shared=shared,
         before=before, after=before, unseen=unseen, spread=evidence.spread[:size, :size],
         maps_after=evidence.maps_before,
     )  # fmt: skip

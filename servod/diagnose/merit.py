@@ -53,10 +53,16 @@ class Merit:
 
 def worth_naming(merit: Merit, level: bool) -> bool:
     """Whether a term is worth a name; `level`: it is a parameter of the model's own beyond its level."""
-    least, enough = (LEVEL_TORQUE, LEVEL_TORQUE) if level else (LEAST_TORQUE, WORTH_TORQUE)
-    much = merit.share >= WORTH_SHARE or merit.torque >= enough
-    much = much or (merit.own >= WORTH_TORQUE and merit.of_left >= NEARLY_ALL)
-    return much and merit.torque >= least and (merit.of_left >= LEAST_OF_LEFT or merit.share >= SURE_SHARE)
+    least = LEVEL_TORQUE if level else LEAST_TORQUE
+    rest = merit.of_left >= LEAST_OF_LEFT or merit.share >= SURE_SHARE
+    return of_size(merit, level) and merit.torque >= least and rest
+
+
+def of_size(merit: Merit, level: bool) -> bool:
+    """Whether a term has the size from which the outside contract calls it worth naming; `level` as above."""
+    if merit.share >= WORTH_SHARE or merit.torque >= (LEVEL_TORQUE if level else WORTH_TORQUE):
+        return True
+    return merit.own >= WORTH_TORQUE and merit.of_left >= NEARLY_ALL
 
 
 def acting(changed: Array) -> float:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.diagnose.engine import Evidence
+from servod.diagnose.spread import within
 
 Array = NDArray[np.float64]
 
@@ -21,9 +22,6 @@ Z95 = 1.96
 
 #: A change of a parameter below this share is none.
 LEAST_CHANGE = 0.002
-
-#: Probability of the region in which all parameters lie together.
-REGION = 0.95
 
 
 def recalibrated(evidence: Evidence) -> dict[str, Any]:
@@ -57,14 +55,6 @@ def told_coordinates(evidence: Evidence) -> Array:
     told = [unknown.key in changed for unknown in fit.hypothesis.base]
     back = np.where(told, 0.0, fit.coordinates - fit.hypothesis.start)
     return fit.coordinates - back if within(back, evidence.spread) else fit.coordinates
-
-
-def within(off: Array, spread: Array) -> bool:
-    """Whether coordinates that are off by so much lie in the region of 95 % of this covariance."""
-    from scipy.stats import chi2
-
-    distance = float(off @ np.linalg.pinv(spread, hermitian=True) @ off)
-    return distance <= float(chi2.ppf(REGION, len(off)))
 
 
 def differs(changes: Mapping[str, Any]) -> str:

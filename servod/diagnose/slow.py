@@ -69,8 +69,13 @@ def _scene(chooser: Chooser, present: Fit) -> Scene:
 
 def _left(chooser: Chooser, old: Fit, new: Fit) -> float:
     """The share of the means' power that `new` leaves of what `old` left."""
-    was, now = (float(np.sum(means(chooser.predictor, fit.mismatch) ** 2)) for fit in (old, new))
+    was, now = (power(chooser.predictor, fit.mismatch) for fit in (old, new))
     return now / max(was, 1e-30)
+
+
+def power(predictor: Predictor, mismatch: Array) -> float:
+    """Power of the mismatch's means over a second, as a sum over all of them, N^2*m^2."""
+    return float(np.sum(means(predictor, mismatch) ** 2))
 
 
 def means(predictor: Predictor, mismatch: Array) -> Array:

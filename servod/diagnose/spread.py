@@ -20,6 +20,9 @@ MODEL_ERROR = 0.006
 #: By how much worse steps of a sample make the bristle's stiffness and damping, which act for some samples at a time.
 BRISTLE, BRISTLE_ERROR = ("friction.sigma0", "friction.sigma1"), 2.0
 
+#: Probability of the region in which several coordinates lie together.
+REGION = 0.95
+
 #: Torques of the model's own, which no recording tells from a common factor on all of them and on the command.
 TORQUES = (
     "inertia",
@@ -74,3 +77,11 @@ def common_factor(fit: Fit) -> Array:
         along[fit.hypothesis.share(place)] = 1.0
     known = sum(unknowns[i].spread ** -2.0 for i in np.flatnonzero(scaled))
     return np.asarray(np.outer(along, along) / max(known, 1e-12))
+
+
+def within(off: Array, spread: Array) -> bool:
+    """Whether coordinates that are off by so much lie in the region of 95 % of this covariance."""
+    from scipy.stats import chi2
+
+    distance = float(off @ np.linalg.pinv(spread, hermitian=True) @ off)
+    return distance <= float(chi2.ppf(REGION, len(off)))

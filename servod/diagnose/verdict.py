@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from servod.diagnose.base import BRISTLE_FACTOR, DELAY_S, OFFSET_SHARE, RECALIBRATION, STRIBECK_SHARE
 from servod.diagnose.candidates import Candidate
 from servod.diagnose.choice import Choice
+from servod.diagnose.fit import Fit
 from servod.diagnose.hypothesis import Document, get
 
 Array = NDArray[np.float64]
@@ -99,13 +100,15 @@ def drowned(found: Verdict, encoder_noise: float, dry: float) -> bool:
 def named_terms(choice: Choice, nominal: Document) -> list[int]:
     """Places of the terms whose effect is at least at its level."""
     fitted = choice.fit.hypothesis.written(choice.fit.coordinates)
-    terms = choice.fit.hypothesis.terms
-    lesser = _lesser_twin(fitted) if {term.effect for term in terms} >= set(TWINS) else None
+    terms, lesser = choice.fit.hypothesis.terms, lesser_twin(choice.fit)
     return [i for i, term in enumerate(terms) if term.effect != lesser and _at_level(term.effect, nominal, fitted)]
 
 
-def _lesser_twin(fitted: Document) -> str:
+def lesser_twin(fit: Fit) -> str:
     """The shorter of a delay and a lag that are both in: together they are one drive that is late, of higher order."""
+    if not {term.effect for term in fit.hypothesis.terms} >= set(TWINS):
+        return ""
+    fitted = fit.hypothesis.written(fit.coordinates)
     late, lag = get(fitted, "delay.additional_s"), get(fitted, "actuator_lag.time_constant_s")
     return "delay" if late < lag else "actuator_lag" if lag > 0.0 else ""  # a limited rate is no twin
 

@@ -121,11 +121,17 @@ def _recalibrated(page: Page, document: Document) -> None:
         ]
         page.table(("parameter", "model", "fitted", "95 % interval", "unit"), rows)
     if document["minor"]:
-        small = ", ".join(
-            f"{name.replace('_', ' ')} ({100.0 * size['torque_over_coulomb']:.1f} % of dry friction)"
-            for name, size in document["minor"].items()
-        )
-        page.sentence(f"Seen, but too small to be worth a name: {small}. Every real axis has some.")
+        small = "; ".join(_small(name, size) for name, size in document["minor"].items())
+        page.sentence(f"Seen, but no finding: {small}. Every real axis has some.")
+
+
+def _small(name: str, size: Document) -> str:
+    """An effect that is no finding: how large, and what it is if it stands in the model all the same."""
+    torque = f"{100.0 * size['torque_over_coulomb']:.1f} % of dry friction"
+    if "why" not in size:
+        return f"{name.replace('_', ' ')} ({torque}, too small to be worth a name)"
+    values = ", ".join(f"{key} {told['value']:.3g} {told['unit']}" for key, told in size["parameters"].items())
+    return f"{name.replace('_', ' ')} ({torque}, {size['why']}; in the model with {values})"
 
 
 def _fit(report: Report, evidence: Evidence, document: Document) -> None:

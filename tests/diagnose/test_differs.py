@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from servod.diagnose.base import base_unknowns
-from servod.diagnose.recalibrated import differs, within
+from servod.diagnose.recalibrated import differs
+from servod.diagnose.spread import within
 from tests.diagnose.axes import believed
 
 

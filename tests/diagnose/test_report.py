@@ -46,6 +46,7 @@ def test_document_has_the_keys_of_the_contract(written: tuple[Path, dict[str, An
     assert json.loads((folder / "diagnosis.json").read_text()) == document
     assert set(document) >= TOP
     assert [finding["effect"] for finding in document["findings"]] == ["spring"]
+    assert "spring" not in document["minor"]
     finding = document["findings"][0]
     assert set(finding) >= FINDING
     located = finding["located"]
