@@ -15,6 +15,8 @@ import yaml
 from pydantic import Field, model_validator
 
 from servod import axis_effects as fx
+from servod import axis_friction as fr
+from servod.axis_keys import Harmonic, Harmonics
 from servod.errors import BadInput
 from servod.identified import Identified
 from servod.yaml12 import Dumper, Strict, load_model
@@ -108,12 +110,12 @@ class AxisModel(Strict):
     friction: Friction
     gravity: fx.Gravity | None = None
     torque_offset: float = Field(0.0, description="N*m beside the command, with the command's sign")
-    asymmetry: fx.Asymmetry | None = None
-    stribeck: fx.Stribeck | None = None
-    presliding: fx.Presliding | None = None
-    viscous_nonlinear: fx.ViscousNonlinear | None = None
-    load_dependent_friction: fx.LoadDependentFriction | None = None
-    position_dependent_friction: fx.PositionDependentFriction | None = None
+    asymmetry: fr.Asymmetry | None = None
+    stribeck: fr.Stribeck | None = None
+    presliding: fr.Presliding | None = None
+    viscous_nonlinear: fr.ViscousNonlinear | None = None
+    load_dependent_friction: fr.LoadDependentFriction | None = None
+    position_dependent_friction: fr.PositionDependentFriction | None = None
     cogging: fx.Cogging | None = None
     torque_ripple: fx.TorqueRipple | None = None
     spring: fx.Spring | None = None
@@ -123,7 +125,7 @@ class AxisModel(Strict):
     torque_saturation: fx.TorqueSaturation | None = None
     delay: fx.Delay | None = None
     actuator_lag: fx.ActuatorLag | None = None
-    thermal: fx.Thermal | None = None
+    thermal: fr.Thermal | None = None
     position_dependent_inertia: fx.PositionDependentInertia | None = None
     encoder_eccentricity: fx.EncoderEccentricity | None = None
     disturbance: fx.Disturbance | None = None
@@ -161,7 +163,7 @@ class AxisModel(Strict):
     def _harmonics_fit(self) -> AxisModel:
         wrong = "periods_per_metre" if self.axis is AxisKind.ROTARY else "periods_per_turn"
         for name in _PERIODIC:
-            group: fx.Harmonics | fx.PositionDependentFriction | None = getattr(self, name)
+            group: Harmonics | fr.PositionDependentFriction | None = getattr(self, name)
             if any(getattr(harmonic, wrong) is not None for harmonic in (group.harmonics if group else ())):
                 raise ValueError(f"{name}: no {wrong} on a {self.axis.value} axis")
         shown = self.encoder_eccentricity
@@ -174,7 +176,7 @@ class AxisModel(Strict):
         if self.total_delay_s < 0.0:
             raise ValueError("delay_s + delay.additional_s at least 0")
         for share in ("torque_ripple", "position_dependent_inertia"):
-            group: fx.Harmonics | None = getattr(self, share)
+            group: Harmonics | None = getattr(self, share)
             if group is not None and sum(abs(h.amplitude) for h in group.harmonics) >= 1.0:
                 raise ValueError(f"{share}: amplitudes that sum to less than 1")
         return self
@@ -189,7 +191,7 @@ class AxisModel(Strict):
         """Joint temperature before anything has moved or been measured, in degC."""
         if self.noise is not None and self.noise.temperature_c is not None:
             return self.noise.temperature_c
-        return (self.thermal or fx.Thermal()).ambient_c
+        return (self.thermal or fr.Thermal()).ambient_c
 
     @property
     def two_mass(self) -> fx.TwoMass | None:
@@ -230,7 +232,7 @@ class _Dumper(Dumper):
         return super().represent_mapping(tag, mapping, in_one_line or flow_style)
 
 
-def wave_number(harmonic: fx.Harmonic) -> float:
+def wave_number(harmonic: Harmonic) -> float:
     """n of sin(n*x + phase), in 1/rad or 1/m."""
     if harmonic.periods_per_turn is not None:
         return harmonic.periods_per_turn

@@ -8,6 +8,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from servod import axis_effects as fx
+from servod import axis_friction as fr
+from servod.axis_keys import Harmonic, Harmonics
 from servod.axis_model import AxisModel, CoulombViscousFriction, LocalFriction, LugreFriction, wave_number
 from servod.models import layout as lay
 
@@ -86,8 +88,8 @@ def _friction_effects(packer: _Packer, model: AxisModel) -> None:
     if model.presliding is not None:
         given = model.presliding.model_dump(exclude_none=True)
         packer.put(**{"sigma1_velocity" if key == "damping_velocity" else key: value for key, value in given.items()})
-    packer.put(**(model.asymmetry or fx.Asymmetry()).model_dump())
-    nonlinear = model.viscous_nonlinear or fx.ViscousNonlinear()
+    packer.put(**(model.asymmetry or fr.Asymmetry()).model_dump())
+    nonlinear = model.viscous_nonlinear or fr.ViscousNonlinear()
     packer.put(quadratic=nonlinear.quadratic, cubic=nonlinear.cubic)
     packer.put(power=nonlinear.power, power_exponent=nonlinear.exponent)
     if model.load_dependent_friction is not None:
@@ -123,23 +125,23 @@ def _actuator(packer: _Packer, model: AxisModel) -> None:
         packer.put(lag_s=model.actuator_lag.time_constant_s, slew=model.actuator_lag.slew_per_s or 0.0)
 
 
-def _thermal(packer: _Packer, thermal: fx.Thermal | None) -> None:
+def _thermal(packer: _Packer, thermal: fr.Thermal | None) -> None:
     packer.put(ambient_c=25.0, cooling_s=600.0)
     if thermal is None:
         return
-    packer.put(thermal=1.0, thermal_exponential=thermal.shape is fx.ThermalShape.EXPONENTIAL)
+    packer.put(thermal=1.0, thermal_exponential=thermal.shape is fr.ThermalShape.EXPONENTIAL)
     packer.put(dry_per_c=thermal.dry_per_c, viscous_per_c=thermal.viscous_per_c, reference_c=thermal.reference_c)
     packer.put(dry_per_s=thermal.dry_per_s, viscous_per_s=thermal.viscous_per_s)
     packer.put(drift_time_s=thermal.drift_time_s or 0.0, ambient_c=thermal.ambient_c)
     packer.put(heating_c_per_j=thermal.heating_c_per_j, cooling_s=thermal.cooling_s)
 
 
-def _rows(harmonics: Iterable[fx.Harmonic]) -> list[tuple[float, float, float]]:
+def _rows(harmonics: Iterable[Harmonic]) -> list[tuple[float, float, float]]:
     return [(h.amplitude, wave_number(h), h.phase) for h in harmonics]
 
 
 def _position(packer: _Packer, model: AxisModel) -> None:
-    groups: dict[str, fx.Harmonics | fx.PositionDependentFriction | None] = {
+    groups: dict[str, Harmonics | fr.PositionDependentFriction | None] = {
         "cogging": model.cogging,
         "ripple": model.torque_ripple,
         "position_friction": model.position_dependent_friction,

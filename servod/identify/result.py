@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.axis_effects import ActuatorLag, Cogging, Gravity, JointElasticity
-from servod.axis_effects import Harmonic as ModelHarmonic
+from servod.axis_keys import Harmonic as ModelHarmonic
 from servod.axis_model import AxisModel, LocalFriction
 from servod.identified import Identified, IdentifiedMap, IdentifiedValue
 from servod.identify.analysis import Analysis, assumed_damping

@@ -12,7 +12,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
 
-from servod.axis_effects import Harmonic, Table, ThermalShape
+from servod.axis_effects import Table
+from servod.axis_friction import ThermalShape
+from servod.axis_keys import Harmonic
 from servod.axis_model import AxisModel, wave_number
 from servod.models.effects import SMALLEST_FACTOR
 from servod.verify.closed_loop import Reach

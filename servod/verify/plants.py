@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from servod.axis_effects import Asymmetry, TorqueGain
+from servod.axis_effects import TorqueGain
+from servod.axis_friction import Asymmetry
 from servod.axis_model import AxisModel, LocalFriction, LugreFriction
 from servod.gain_design import SHARES, Uncertainty
 from servod.verify.steady_friction import fitted_curves

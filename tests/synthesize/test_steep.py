@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from servod.axis_effects import Stribeck
+from servod.axis_friction import Stribeck
 from servod.axis_model import LugreFriction
 from servod.synthesize.deployed import Wishes, bare_proof, empty_design, programme, proven
 from servod.synthesize.lmi_deployed import largest_pole, shaped, turned

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from servod import axis_effects as fx
+from servod.axis_keys import Harmonic
 from servod.axis_model import AxisModel
 from servod.gains import CertificateCheck
 from servod.models import layout as lay
@@ -21,7 +21,7 @@ from servod.verify.margins import Sweep, by_delay
 from servod.verify.steady_friction import steady_friction
 from tests.synthesize.designs import table1, table1_set
 
-WAVE = fx.Harmonic(amplitude=0.05, periods_per_turn=6.0)
+WAVE = Harmonic(amplitude=0.05, periods_per_turn=6.0)
 
 
 def model(**effects: object) -> AxisModel:
@@ -85,7 +85,7 @@ def test_the_ends_hold_what_the_kernels_do_over_travel_and_temperature() -> None
 def test_small_effects_are_certified_and_large_ones_are_not() -> None:
     small = checked(thermal={"dry_per_c": -0.004, "viscous_per_c": -0.012}, torque_ripple={"harmonics": [WAVE]})
     assert len(small) == 3 and all(check.passed for check in small.values()), small
-    large = checked(torque_ripple={"harmonics": [fx.Harmonic(amplitude=0.7, periods_per_turn=6.0)]})
+    large = checked(torque_ripple={"harmonics": [Harmonic(amplitude=0.7, periods_per_turn=6.0)]})
     assert not all(check.passed for check in large.values())
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from servod.axis_effects import Cogging, Gravity, Harmonic, Spring
+from servod.axis_effects import Cogging, Gravity, Spring
+from servod.axis_keys import Harmonic
 from servod.gain_design import Uncertainty
 from servod.gain_parameters import LocalParameters
 from servod.verify.checks import Subject, check_loop
