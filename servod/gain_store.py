@@ -27,7 +27,7 @@ from pathlib import Path
 from pydantic import Field
 
 from servod.errors import BadInput
-from servod.gains import NAME_PATTERN, GainSet, load_gains, parse_gains
+from servod.gains import NAME_PATTERN, GainSet, load_gains, parse_gains, require_certificate
 from servod.yaml12 import Strict, load_model, read_text
 
 _VERSION_FILE = re.compile(r"^([0-9]{4,})\.yaml$")
@@ -140,11 +140,13 @@ class GainStore:
     def load(self, text: str, where: str, name: str | None = None) -> StoredSet:
         """Check a gain set and store it as the next version of its name; the newest text again gets none.
 
-        `name`, when given, must be the name in the file: one set is never known by two names. `where` is for errors.
+        One whose certificate or seal does not belong to its numbers is not stored: it could never be activated. `name`,
+        when given, must be the name in the file: one set is never known by two names. `where` is for errors.
         """
         gains = parse_gains(text, where)
         if name is not None and name != gains.name:
             raise BadInput(f"{where}: name", gains.name, f"{name}, the name it shall be loaded as")
+        require_certificate(gains, accept_uncertified=True, where=where)
         with self._locked():
             newest = max(self._versions(gains.name), default=0)
             if newest and self._path(gains.name, newest).read_text(encoding="utf-8") == text:

@@ -218,16 +218,17 @@ def load_gains(path: str | Path) -> GainSet:
     return parse_gains(read_text(path), str(path))
 
 
-def require_certificate(gains: GainSet, accept_uncertified: bool | None) -> None:
+def require_certificate(gains: GainSet, accept_uncertified: bool | None, where: str | None = None) -> None:
     """Refuse a set without a valid certificate. Raises BadInput.
 
     `accept_uncertified` lets a set pass that carries no certificate at all; one whose certificate says no or is for
-    other numbers, or whose seal is broken, never passes. None: there is no configuration that could accept it.
+    other numbers, or whose seal is broken, never passes. None: there is no configuration that could accept it. `where`
+    is the file, when there is one.
     """
     problem = gains.certificate_problem()
     if problem is None:
         return
-    where, issue = f"gain set {gains.name}: certificate", "a valid one (`servoctl verify` issues it)"
+    where, issue = f"{where or 'gain set ' + gains.name}: certificate", "a valid one (`servoctl verify` issues it)"
     if gains.certificate is not None or gains.seal_broken:
         raise BadInput(where, problem, issue)
     if accept_uncertified is None:

@@ -63,6 +63,13 @@ def need_folder(option: str, folder: Path) -> None:
         raise BadInput(f"{option} {folder}", error.strerror or str(error), "a folder that can be written") from None
 
 
+def need_file(option: str, file: Path) -> None:
+    """See that `file` can be written before any work is done for it. Raises BadInput."""
+    if file.is_dir():
+        raise BadInput(f"{option} {file}", "a folder", "a file that can be written")
+    need_folder(option, file.resolve().parent)
+
+
 def one_thread() -> None:
     """Keep linear algebra to one thread, before numpy is imported: threads on small matrices cost a factor of ten."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

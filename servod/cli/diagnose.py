@@ -46,6 +46,7 @@ def diagnose(
     from servod.report.diagnosis_files import write_files
 
     axis = load_axis_model(model)
+    _need_own_folder(out, model)
     recorded = [one.between(from_s, to_s) for one in _load(recordings, map_file, axis, model)]
     need_folder("--out", out)
     found = run(axis, recorded, time_limit, _quiet if as_json else _progress)
@@ -56,6 +57,20 @@ def diagnose(
         _print(found, document, out)
     if document["verdict"] == "cannot_tell":
         raise AnswerIsNo(document["summary"])
+
+
+def _need_own_folder(out: Path, model: Path) -> None:
+    """See that nothing of other origin in `out` would be overwritten. Raises BadInput."""
+    from servod.report.diagnosis import PAGE
+    from servod.report.diagnosis_files import DOCUMENT, MODEL
+
+    if model.resolve() == (out / MODEL).resolve():
+        raise BadInput("--model", str(model), "a file that the diagnosis in --out does not replace")
+    there = [name for name in (MODEL, PAGE) if (out / name).exists()]
+    if there and not (out / DOCUMENT).exists():
+        raise BadInput(
+            f"--out {out}", f"{', '.join(there)} without {DOCUMENT}", "an empty folder, or an earlier diagnosis"
+        )
 
 
 def _load(paths: list[Path], map_file: Path | None, axis: AxisModel, model: Path) -> list[Recording]:

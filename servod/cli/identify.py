@@ -16,7 +16,7 @@ from servod.cli.common import (
     SocketOption,
     connect,
     example,
-    need_folder,
+    need_file,
     one_thread,
     print_json,
 )
@@ -70,7 +70,7 @@ def identify(
     from servod.axis_model import axis_model_yaml
     from servod.identify.result import document, model_of
 
-    need_folder("--out", out.resolve().parent)
+    need_file("--out", out)
     old = _identified_in(before)
     if recordings is not None:
         job = _from_recordings(recordings)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from servod.cli import synthesis_options as ask
-from servod.cli.common import JsonOption, example, need_folder, one_thread, print_json
+from servod.cli.common import JsonOption, example, need_file, one_thread, print_json
 from servod.errors import AnswerIsNo, BadInput
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def synthesize(
     from servod.axis_model import load_axis_model
 
     need_order(overlap_from, overlap_to, speed)
-    need_folder("--out", out.resolve().parent)
+    need_file("--out", out)
     axis = delayed(load_axis_model(model), delay_s)
     overlap = overlap_from, overlap_to
     wishes = wishes_of(axis, uncertainty, period_us, cutoff_hz, encoder_counts, speed, overlap)
