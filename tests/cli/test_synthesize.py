@@ -11,7 +11,7 @@ import pytest
 from servod.cli.app import run
 from servod.gain_parameters import LocalParameters
 from servod.gains import GainSet, load_gains
-from servod.synthesize import deployed
+from servod.synthesize import infeasible
 from tests.synthesize.designs import MODEL
 
 AXES = MODEL.parent
@@ -83,7 +83,7 @@ def test_the_reference_mode_names_what_clashes_and_its_offer_is_enough(
 def test_the_deployed_mode_names_what_clashes_and_its_offer_is_enough(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(deployed, "RELAX_STEPS", 1)
+    monkeypatch.setattr(infeasible, "RELAX_STEPS", 1)
     wish = ["--cutoff-hz", "300", "--no-observer", "--l", "0"]
     told = refused(tmp_path, capsys, *wish, "--zeta-min", "0.15")
     assert set(told["regions"]) <= {"low", "high"} and all(":" in line for line in told["clashes"])
