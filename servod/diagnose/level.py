@@ -14,6 +14,9 @@ LEVELS = frozenset(
     ("friction.static", "friction.stribeck_velocity", "friction.sigma0", "friction.sigma1", "torque_offset", "inertia")
 )
 
+#: Own numbers of such terms that have no level: damping that fades with speed is judged by the torque that it makes.
+NO_LEVEL = frozenset(("damping_velocity",))
+
 #: A coordinate so near to its bound stands on it.
 ON_BOUND = 1e-6
 
@@ -31,4 +34,5 @@ def on_bound(fit: Fit) -> bool:
 
 def is_level(term: Term) -> bool:
     """Whether a term opens parameters that have a level, and no others."""
-    return bool(term.opens) and LEVELS.issuperset(term.opens)
+    own = {unknown.key for unknown in term.unknowns}
+    return bool(term.opens) and LEVELS.issuperset(term.opens) and not own & NO_LEVEL
