@@ -32,6 +32,8 @@ LAYERS: list[set[str]] = [
     {"recovery"},
     {"paper"},
     {"prove"},
+    {"campaign"},
+    {"soak"},
     {"benchmark"},
     {"cli"},
 ]

@@ -1,0 +1,6 @@
+"""The fault campaign: scenarios from files are put to a virtual axis, and its drive's own record judges the reaction.
+
+Beside the data path, above everything that runs: a scenario (YAML, `scenarios/`) says what is injected when and what
+must happen within how long; an axis under test (`stepped`, `processes`) lets it happen by `actions`; `judge` reads the
+drive's record; `catalogue` finds the scenarios; `page` shows the outcomes. Used by `servoctl faults` and the tests.
+"""

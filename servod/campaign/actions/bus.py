@@ -1,0 +1,85 @@
+"""Actions on frames and wires."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+from pydantic import Field
+
+from servod.campaign.actions.base import NODE_ID, Action, Who
+from servod.campaign.under_test import AMPLIFIER, ENCODER
+from servod.cia import HEARTBEAT_BASE, RPDO_BASE, SYNC_ID, TPDO_BASE
+from servod.drivers.virtual.bus_faults import ANY_ID, MYSELF, BusFault, FaultKind
+
+if TYPE_CHECKING:
+    from servod.campaign.under_test import AxisUnderTest
+
+_ALWAYS = 1_000_000_000
+
+
+class FrameName(StrEnum):
+    """The frames of one cycle by what they carry."""
+
+    ANY = "any"
+    SYNC = "sync"
+    TORQUE = "torque"  # RPDO1 of the amplifier: control word and torque
+    DRIVE_FEEDBACK = "drive_feedback"  # TPDO1 of the amplifier
+    ENCODER_FEEDBACK = "encoder_feedback"  # TPDO2 of the encoder
+    MASTER_HEARTBEAT = "master_heartbeat"
+
+
+CAN_ID = {
+    FrameName.ANY: ANY_ID,
+    FrameName.SYNC: SYNC_ID,
+    FrameName.TORQUE: RPDO_BASE[0] + AMPLIFIER,
+    FrameName.DRIVE_FEEDBACK: TPDO_BASE[0] + AMPLIFIER,
+    FrameName.ENCODER_FEEDBACK: TPDO_BASE[1] + ENCODER,
+    FrameName.MASTER_HEARTBEAT: HEARTBEAT_BASE + 126,
+}
+
+
+class FrameFault(StrEnum):
+    """What happens to a frame."""
+
+    DROP = "drop"  # it reaches nobody
+    DESTROY = "destroy"  # an error frame hits it, the controller repeats it
+
+
+_KIND = {FrameFault.DROP: FaultKind.DROP, FrameFault.DESTROY: FaultKind.CORRUPT}
+
+
+class Frames(Action):
+    """The next `count` frames of a kind are hit; without a count all that follow."""
+
+    of: FrameName
+    fault: FrameFault
+    count: int | None = Field(None, ge=1)
+
+    def apply(self, axis: AxisUnderTest) -> None:
+        """Arm the fault in the hub."""
+        axis.bus_fault(BusFault(_KIND[self.fault], CAN_ID[self.of], self.count or _ALWAYS))
+
+
+class Silence(Action):
+    """A participant neither sends nor hears for a while: a cut wire, a node without supply."""
+
+    who: Who
+    for_ms: int = Field(ge=1)
+
+    def apply(self, axis: AxisUnderTest) -> None:
+        """Cut it off."""
+        axis.bus_fault(BusFault(FaultKind.SILENT, amount=self.for_ms, participant=NODE_ID.get(self.who, MYSELF)))
+
+
+class BusOff(Action):
+    """A participant's CAN controller goes bus-off."""
+
+    who: Who
+
+    def apply(self, axis: AxisUnderTest) -> None:
+        """Drive its error counter over the limit."""
+        axis.bus_fault(BusFault(FaultKind.BUS_OFF, participant=NODE_ID.get(self.who, MYSELF)))
+
+
+BUS_ACTIONS: dict[str, type[Action]] = {"frames": Frames, "silence": Silence, "bus_off": BusOff}

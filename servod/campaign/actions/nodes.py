@@ -1,0 +1,51 @@
+"""Actions on nodes: network management and objects of their dictionaries."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+from pydantic import Field
+
+from servod.campaign.actions.base import NODE_ID, Action, Who
+from servod.cia import NMT_ID, NmtCommand
+
+if TYPE_CHECKING:
+    from servod.campaign.under_test import AxisUnderTest
+
+
+class NmtName(StrEnum):
+    """NMT commands (CiA 301, 7.2.8.3.1)."""
+
+    START = "start"
+    STOP = "stop"
+    PRE_OPERATIONAL = "pre_operational"
+    RESET_NODE = "reset_node"
+    RESET_COMMUNICATION = "reset_communication"
+
+
+class Nmt(Action):
+    """Somebody sends an NMT command: what a node does by itself when its supply fails, or a second master does."""
+
+    who: Who
+    command: NmtName
+
+    def apply(self, axis: AxisUnderTest) -> None:
+        """Send it."""
+        axis.frame(NMT_ID, bytes([NmtCommand[self.command.name], NODE_ID[self.who]]))
+
+
+class ObjectWrite(Action):
+    """An object of a node changes: the vendor's objects 0x2000 put causes of faults into the virtual nodes."""
+
+    who: Who
+    index: int = Field(ge=0x1000, le=0xFFFF)
+    subindex: int = Field(0, ge=0, le=254)
+    value: int
+
+    def apply(self, axis: AxisUnderTest) -> None:
+        """Write it."""
+        axis.sdo_write(NODE_ID[self.who], self.index, self.subindex, self.value)
+
+
+NODE_ACTIONS: dict[str, type[Action]] = {"nmt": Nmt, "object_write": ObjectWrite}

@@ -1,0 +1,86 @@
+"""The judge: what the drive's own record says about a scenario, held against what the scenario expects."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from servod.axis import AxisState
+from servod.campaign.scenario import Expectation
+from servod.campaign.under_test import Observation
+from servod.drivers.virtual.drive_record import DriveSample
+from servod.hal import DriveState
+
+#: The drive counts its torque in per mille of the rated torque: less than one count is none.
+NO_TORQUE_NM = 1e-9
+_NS_PER_MS = 1e6
+
+
+@dataclass(frozen=True)
+class Reaction:
+    """Times of the reaction after the first injection, in ms of bus time; None: it did not happen.
+
+    `left_ms`: the drive left operation enabled, by command or by itself; `gone_ms`: the joint feels no torque any more,
+    to the end of the record.
+    """
+
+    left_ms: float | None
+    gone_ms: float | None
+
+
+def reaction(samples: list[DriveSample], injected_ns: int) -> Reaction:
+    """What the drive did after `injected_ns`."""
+    after = [s for s in samples if s.time_ns >= injected_ns]
+    if not after:
+        return Reaction(None, None)
+    left = next((s.time_ns for s in after if s.state is not DriveState.OPERATION_ENABLED), None)
+    last = max((number for number, s in enumerate(after) if abs(s.torque_nm) > NO_TORQUE_NM), default=-1)
+    gone = after[last + 1].time_ns if last + 1 < len(after) else None
+    return Reaction(_ms(left, injected_ns), _ms(gone, injected_ns))
+
+
+def complaints(expected: Expectation, seen: Observation, times: Reaction) -> list[str]:
+    """Everything in which the outcome differs from what was expected; empty when it passed."""
+    return [text for text in _complaints(expected, seen, times) if text]
+
+
+def _complaints(expected: Expectation, seen: Observation, times: Reaction) -> list[str]:
+    names = {code.name for code in seen.latched}
+    return [
+        "" if seen.axis in expected.axis else f"the axis ended {seen.axis}, expected {' or '.join(expected.axis)}",
+        _named(set(expected.faults), names),
+        _in_time("the drive left the controller's command", times.left_ms, expected.reaction_ms),
+        _in_time("the torque was gone", times.gone_ms, expected.torque_gone_ms),
+        _refused(expected.refused, seen.refusal),
+        "" if seen.lost_records <= expected.lost_records else f"{seen.lost_records} cycle records are missing",
+        _commanded(seen),
+    ]
+
+
+def _named(expected: set[str], names: set[str]) -> str:
+    if not expected or names & expected:
+        return ""
+    return f"the faults shown are {', '.join(sorted(names)) or 'none'}, expected {' or '.join(sorted(expected))}"
+
+
+def _in_time(what: str, happened_ms: float | None, limit_ms: float | None) -> str:
+    if limit_ms is None or (happened_ms is not None and happened_ms <= limit_ms):
+        return ""
+    return f"{what} {'never' if happened_ms is None else f'after {happened_ms:.0f} ms'}, expected {limit_ms:g} ms"
+
+
+def _refused(words: str | None, refusal: str) -> str:
+    if words is None:
+        return f"refused: {refusal}" if refusal else ""
+    return "" if words in refusal else f"the refusal says {refusal or 'nothing'!r}, expected {words!r}"
+
+
+def _commanded(seen: Observation) -> str:
+    """No scenario ends with torque that nobody commands."""
+    if not seen.samples or seen.axis == AxisState.ENABLED.name:
+        return ""
+    torque_nm = seen.samples[-1].torque_nm
+    return f"the joint feels {torque_nm:.4f} N*m that nobody commands" if abs(torque_nm) > NO_TORQUE_NM else ""
+
+
+def _ms(time_ns: int | None, since_ns: int) -> float | None:
+    return None if time_ns is None else (time_ns - since_ns) / _NS_PER_MS

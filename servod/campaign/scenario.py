@@ -1,0 +1,137 @@
+"""A fault scenario as its file states it: what is injected when, what must happen, and how one recovers.
+
+One YAML file is one scenario. What an injection does stands in `servod.campaign.actions`.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field, model_validator
+
+from servod.axis import AxisState
+from servod.errors import FaultCode
+from servod.yaml12 import Strict, load_model
+
+#: After a loss of the master the torque must be gone within this time [ms].
+MASTER_LOSS_MS = 300.0
+#: After a loss of feedback the drive must have left the controller's command within this time [ms].
+FEEDBACK_LOSS_MS = 50.0
+
+AXIS_STATES = {state.name for state in AxisState}
+FAULT_NAMES = {code.name for code in FaultCode}
+
+
+class Runs(StrEnum):
+    """Which axis under test shows the scenario."""
+
+    STEPPED = "stepped"  # one process, virtual time, exact
+    PROCESSES = "processes"  # daemon, loop and virtual axis as processes, wall clock
+    GUEST = "guest"  # systemd and a real vcan in the guest machine
+
+
+class Start(StrEnum):
+    """What the axis is doing when the first injection comes."""
+
+    OFF = "off"  # before the bring-up, which is then tried
+    DISABLED = "disabled"
+    ENABLED = "enabled"  # at rest under control
+    MOVING = "moving"  # in the middle of a sine, at its fastest, with friction to overcome
+
+
+class Loss(StrEnum):
+    """What the scenario takes from the axis; each loss has its bound, whatever else the scenario expects."""
+
+    NONE = "none"
+    FEEDBACK = "feedback"
+    MASTER = "master"
+
+
+class Recovery(StrEnum):
+    """What a person does afterwards, so that the axis can be enabled again."""
+
+    NONE = "none"  # nothing to do: it never stopped
+    ENABLE = "enable"
+    RESET_FAULT = "reset_fault"  # enable with --reset-fault
+    RESTART = "restart"  # restart the daemon, then enable
+    REPAIR = "repair"  # only a person at the hardware or the configuration mends it
+
+
+class Injection(Strict):
+    """One thing that goes wrong: `do` has one key, the name of an action, with its arguments."""
+
+    at_ms: float = Field(0.0, ge=0.0, le=600_000.0)
+    do: dict[str, dict[str, Any]]
+
+    @model_validator(mode="after")
+    def _one_action(self) -> Injection:
+        if len(self.do) != 1:
+            raise ValueError("one action for each injection")
+        return self
+
+    @property
+    def action(self) -> str:
+        """Name of the action."""
+        return next(iter(self.do))
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """What the action is told."""
+        return self.do[self.action]
+
+
+class Expectation(Strict):
+    """What must happen. Times count from the first injection, on the drive's side, in bus time."""
+
+    loss: Loss = Loss.NONE
+    axis: list[str] = Field(min_length=1, description="names of servod.axis.AxisState; one of them at the end")
+    faults: list[str] = Field([], description="names of servod.errors.FaultCode; one of them at least is latched")
+    reaction_ms: float | None = Field(None, gt=0.0, description="the drive has left the controller's command by then")
+    torque_gone_ms: float | None = Field(None, gt=0.0, description="the joint feels no torque from then on")
+    refused: str | None = Field(None, description="words of the message with which the bring-up or command is refused")
+    lost_records: int = Field(0, ge=0, description="cycle records that may be missing")
+
+    @model_validator(mode="after")
+    def _names_exist(self) -> Expectation:
+        for name in set(self.axis) - AXIS_STATES:
+            raise ValueError(f"one of {', '.join(sorted(AXIS_STATES))} instead of {name}")
+        for name in set(self.faults) - FAULT_NAMES:
+            raise ValueError(f"one of {', '.join(sorted(FAULT_NAMES))} instead of {name}")
+        return self
+
+    @model_validator(mode="after")
+    def _losses_have_bounds(self) -> Expectation:
+        if self.loss is Loss.MASTER and not (self.torque_gone_ms and self.torque_gone_ms <= MASTER_LOSS_MS):
+            raise ValueError(f"torque_gone_ms of at most {MASTER_LOSS_MS:g} after a loss of the master")
+        if self.loss is Loss.FEEDBACK and not (self.reaction_ms and self.reaction_ms <= FEEDBACK_LOSS_MS):
+            raise ValueError(f"reaction_ms of at most {FEEDBACK_LOSS_MS:g} after a loss of feedback")
+        return self
+
+
+class Scenario(Strict):
+    """One scenario."""
+
+    title: str = Field(min_length=1, max_length=100)
+    why: str = Field(min_length=1, description="when this happens to a machine, in a sentence")
+    group: str = Field(min_length=1, description="heading in the table: bus, drive, encoder, process, ...")
+    runs: Runs = Runs.STEPPED
+    start: Start = Start.MOVING
+    settings: dict[str, Any] = Field({}, description="of the virtual axis, over its defaults")
+    config: dict[str, Any] = Field({}, description="of the axis, over the shipped virtual.yaml; nested")
+    plant: dict[str, Any] = Field({}, description="of the plant's axis model, over the demo joint")
+    inject: list[Injection] = Field(min_length=1)
+    watch_ms: float = Field(1000.0, gt=0.0, le=600_000.0, description="how long the axis is watched afterwards")
+    expect: Expectation
+    recover: Recovery = Recovery.RESET_FAULT
+
+
+def load_scenario(path: str | Path) -> Scenario:
+    """Read one scenario; raises BadInput (file, key, found, allowed), also for an unknown action or argument."""
+    from servod.campaign.actions import action_of
+
+    scenario = load_model(path, Scenario)
+    for number, injection in enumerate(scenario.inject):
+        action_of(injection, f"{path}: inject.{number}", scenario.runs)
+    return scenario

@@ -1,0 +1,145 @@
+"""The stepped axis under test: one process, virtual time, every run the same."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from servod.axis import AxisState
+from servod.axis_model import AxisModel, load_axis_model
+from servod.campaign.scenario import Recovery, Scenario, Start
+from servod.campaign.under_test import Observation
+from servod.commands import REFUSAL_TEXT, Op, ReferenceKind, Refusal
+from servod.config import AxisConfig, load_config
+from servod.controllers import LAWS
+from servod.drivers.virtual.bus_faults import BusFault
+from servod.drivers.virtual.drive_record import DriveRecord, read_drive_record
+from servod.drivers.virtual.world import SteppedWorld, VirtualAxisSettings
+from servod.errors import ServodError, faults_in
+from servod.gains import load_gains
+from servod.session import SteppedSession
+from servod.shipped import shipped
+from servod.yaml12 import validate
+
+#: A minute of the drive's record at one sample for each millisecond and event.
+_RECORD_SAMPLES = 120_000
+_SINE = (ReferenceKind.SINE, 0.2, 0.5, 600.0)
+
+
+class SteppedAxis:
+    """servod.campaign.under_test.AxisUnderTest in virtual time; `folder` takes the drive's record."""
+
+    def __init__(self, scenario: Scenario, folder: Path) -> None:
+        self._record_path = folder / "drive.bin"
+        where = scenario.title
+        settings = validate(scenario.settings, VirtualAxisSettings, f"{where}: settings")
+        record = DriveRecord(self._record_path, _RECORD_SAMPLES)
+        self.world = SteppedWorld(settings, _plant(scenario), record)
+        self._config = _config(scenario)
+        self._foreign = self.world.connect(())
+        self._session: SteppedSession | None = None
+        self._refusal = ""
+
+    @property
+    def session(self) -> SteppedSession:
+        """The master with its loop; it exists from the bring-up on."""
+        assert self._session is not None
+        return self._session
+
+    def now_ns(self) -> int:
+        """Virtual time."""
+        return self.world.clock.now_ns()
+
+    def start(self, start: Start) -> None:
+        """Bring up, enable and move, as far as `start` says."""
+        if start is Start.OFF:
+            return
+        self._bring_up()
+        if start in (Start.ENABLED, Start.MOVING):
+            self.session.enable()
+        if start is Start.MOVING:
+            self.command(Op.REFERENCE, _SINE)
+        self.session.run(2.0 if start is Start.MOVING else 0.1)
+
+    def run(self, duration_s: float) -> None:
+        """Advance; an axis that is off is brought up first, and a refusal is kept."""
+        if self._session is None and not self._refusal:
+            try:
+                self._bring_up()
+            except ServodError as error:
+                self._refusal = str(error)
+        if self._session is None:
+            self.world.clock.sleep_until(self.now_ns() + round(duration_s * 1e9))
+        else:
+            self._session.run(duration_s)
+
+    def bus_fault(self, fault: BusFault) -> None:
+        """Ask the hub, as the loop's connection."""
+        (self._foreign if self._session is None else self._session.loop_bus).inject(fault)
+
+    def frame(self, can_id: int, data: bytes) -> None:
+        """Send as somebody else on the bus."""
+        self._foreign.send(can_id, data)
+
+    def sdo_write(self, node_id: int, index: int, subindex: int, value: int) -> None:
+        """Write past the bus, straight into the node's dictionary."""
+        (node,) = (n for n in self.world.devices.nodes if n.node_id == node_id)
+        entry = node.dictionary.entry(index, subindex)
+        entry.value = value
+        if entry.written is not None:
+            entry.written(value)
+
+    def command(self, op: Op, arguments: Sequence[float] = ()) -> None:
+        """Give the loop a command."""
+        refusal = self.session.send(op, arguments)
+        if refusal != Refusal.DONE:
+            self._refusal = REFUSAL_TEXT[refusal]
+
+    def observe(self) -> Observation:
+        """What is seen now."""
+        samples = read_drive_record(self._record_path)
+        if self._session is None:
+            return Observation(samples, AxisState.DISABLED.name, frozenset(), self._refusal, 0)
+        axis, records = self._session.cycle.axis, self._session.records
+        lost = records[-1].cycle - records[0].cycle + 1 - len(records) - (records[-1].missed - records[0].missed)
+        latched = frozenset(fault.code for fault in faults_in(axis.latched))
+        return Observation(samples, axis.state.name, latched, self._refusal, lost)
+
+    def recover(self, recovery: Recovery) -> bool:
+        """Do what a person would do, and hold for a tenth of a second."""
+        try:
+            if recovery is Recovery.RESTART:
+                self._bring_up()
+            if recovery is not Recovery.NONE:
+                self.session.enable(recovery is Recovery.RESET_FAULT)
+        except ServodError as error:
+            self._refusal = str(error)
+            return False
+        self.session.run(0.1)
+        return self.session.cycle.axis.state is AxisState.ENABLED
+
+    def _bring_up(self) -> None:
+        if self._session is not None:
+            self._session.close()
+        gains = load_gains(shipped("gains/demo_pd.yaml"))
+        self._session = SteppedSession(self._config, self.world, LAWS[gains.law.name].number, gains.pack())
+
+
+def _plant(scenario: Scenario) -> AxisModel:
+    base = load_axis_model(shipped("gains/axes/demo_joint.yaml")).model_dump(mode="json", exclude_none=True)
+    return validate(_merged(base, scenario.plant), AxisModel, f"{scenario.title}: plant")
+
+
+def _config(scenario: Scenario) -> AxisConfig:
+    base = load_config(shipped("gains/config/virtual.yaml")).model_dump(mode="json", exclude_none=True)
+    return validate(_merged(base, scenario.config), AxisConfig, f"{scenario.title}: config")
+
+
+def _merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """`over` laid over `base`, mapping by mapping."""
+    merged = dict(base)
+    for key, value in over.items():
+        old = base.get(key)
+        merged[key] = _merged(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
+    return merged
