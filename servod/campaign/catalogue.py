@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from servod.campaign.scenario import Scenario, load_scenario
+from servod.campaign.scenario import Scenario, load_scenarios
 
 _FOLDER = Path(__file__).parent / "scenarios"
 
@@ -16,5 +16,7 @@ def shipped_scenarios() -> dict[str, Scenario]:
 
 def scenarios_in(folder: Path) -> dict[str, Scenario]:
     """All scenarios of a folder and its subfolders."""
-    found = {path.stem: load_scenario(path) for path in sorted(folder.rglob("*.yaml"))}
+    found: dict[str, Scenario] = {}
+    for path in sorted(folder.rglob("*.yaml")):
+        found |= load_scenarios(path)
     return dict(sorted(found.items(), key=lambda item: (item[1].group, item[0])))

@@ -1,6 +1,7 @@
 """A fault scenario as its file states it: what is injected when, what must happen, and how one recovers.
 
-One YAML file is one scenario. What an injection does stands in `servod.campaign.actions`.
+One YAML file is one scenario, or several that differ in a few values (`servod.campaign.variants`). What an injection
+does stands in `servod.campaign.actions`.
 """
 
 from __future__ import annotations
@@ -12,8 +13,9 @@ from typing import Any
 from pydantic import Field, model_validator
 
 from servod.axis import AxisState
+from servod.campaign.variants import variants
 from servod.errors import FaultCode
-from servod.yaml12 import Strict, load_model
+from servod.yaml12 import Strict, validate
 
 #: After a loss of the master the torque must be gone within this time [ms].
 MASTER_LOSS_MS = 300.0
@@ -127,11 +129,15 @@ class Scenario(Strict):
     recover: Recovery = Recovery.RESET_FAULT
 
 
-def load_scenario(path: str | Path) -> Scenario:
-    """Read one scenario; raises BadInput (file, key, found, allowed), also for an unknown action or argument."""
+def load_scenarios(path: str | Path) -> dict[str, Scenario]:
+    """Read the scenarios of one file by name; raises BadInput (file, key, found, allowed), also for a wrong action."""
+    return {name: _checked(data, where) for name, data, where in variants(Path(path))}
+
+
+def _checked(data: Any, where: str) -> Scenario:
     from servod.campaign.actions import action_of
 
-    scenario = load_model(path, Scenario)
+    scenario = validate(data, Scenario, where)
     for number, injection in enumerate(scenario.inject):
-        action_of(injection, f"{path}: inject.{number}", scenario.runs)
+        action_of(injection, f"{where}: inject.{number}", scenario.runs)
     return scenario
