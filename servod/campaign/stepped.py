@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from servod.axis import AxisState
-from servod.axis_model import AxisModel, load_axis_model
+from servod.campaign.inputs import config_of, plant_of, shipped_config
 from servod.campaign.scenario import Recovery, Scenario, Start
 from servod.campaign.under_test import Observation
 from servod.commands import REFUSAL_TEXT, Op, ReferenceKind, Refusal
-from servod.config import AxisConfig, load_config
 from servod.controllers import LAWS
 from servod.drivers.virtual.bus_faults import BusFault
 from servod.drivers.virtual.drive_record import DriveRecord, read_drive_record
@@ -35,8 +33,8 @@ class SteppedAxis:
         where = scenario.title
         settings = validate(scenario.settings, VirtualAxisSettings, f"{where}: settings")
         record = DriveRecord(self._record_path, _RECORD_SAMPLES)
-        self.world = SteppedWorld(settings, _plant(scenario), record)
-        self._config = _config(scenario)
+        self.world = SteppedWorld(settings, plant_of(scenario), record)
+        self._config = config_of(scenario, shipped_config())
         self._foreign = self.world.connect(())
         self._session: SteppedSession | None = None
         self._refusal = ""
@@ -124,22 +122,3 @@ class SteppedAxis:
             self._session.close()
         gains = load_gains(shipped("gains/demo_pd.yaml"))
         self._session = SteppedSession(self._config, self.world, LAWS[gains.law.name].number, gains.pack())
-
-
-def _plant(scenario: Scenario) -> AxisModel:
-    base = load_axis_model(shipped("gains/axes/demo_joint.yaml")).model_dump(mode="json", exclude_none=True)
-    return validate(_merged(base, scenario.plant), AxisModel, f"{scenario.title}: plant")
-
-
-def _config(scenario: Scenario) -> AxisConfig:
-    base = load_config(shipped("gains/config/virtual.yaml")).model_dump(mode="json", exclude_none=True)
-    return validate(_merged(base, scenario.config), AxisConfig, f"{scenario.title}: config")
-
-
-def _merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    """`over` laid over `base`, mapping by mapping."""
-    merged = dict(base)
-    for key, value in over.items():
-        old = base.get(key)
-        merged[key] = _merged(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
-    return merged
