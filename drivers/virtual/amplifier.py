@@ -82,6 +82,10 @@ class AmplifierNode(Node):
         """No cause of a fault is present, also none that counts only when switched on."""
         return self.faults.cause(self.joint.plant.temperature_c, switched_on=True) == 0
 
+    def ignores(self, state: DriveState, transition: int) -> bool:
+        """The vendor's objects make it disobey."""
+        return self.faults.ignores(state, transition)
+
     def brake(self, ramp: Ramp, time_ns: int) -> None:
         """Begin to stop."""
         self.motion.stop(ramp, time_ns)

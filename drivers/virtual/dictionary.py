@@ -7,6 +7,7 @@ the cycle packs them without conversion; strings and domains are bytes.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from enum import IntEnum
 from pathlib import Path
 
 import canopen
@@ -36,6 +37,46 @@ class SdoRefusal(Exception):
     def __init__(self, code: Abort | int) -> None:
         self.code = int(code)
         super().__init__(f"SDO abort 0x{self.code:08X}")
+
+
+class Failure(IntEnum):
+    """How the transfer of the faulty object fails below the dictionary (0x2006:5)."""
+
+    NONE = 0
+    NO_ANSWER = 1
+    WRONG_TOGGLE = 2
+
+
+class FaultyObject:
+    """The vendor's object 0x2006: which object misbehaves, and how.
+
+    Sub 1 index and 2 sub-index name it (index 0: none); 3 the abort code of every access, 4 the bits that are wrong
+    when it is read, 5 how its transfer fails (Failure). For trying what a master does with a device of that kind.
+    """
+
+    def __init__(self, entries: dict[tuple[int, int], Entry]) -> None:
+        self._words = [entries[0x2006, subindex] for subindex in range(1, 6)]
+
+    def failure(self, index: int, subindex: int) -> Failure:
+        """How a transfer of this object fails."""
+        return Failure(self._words[4].value) if self._names(index, subindex) else Failure.NONE
+
+    def refuse(self, index: int, subindex: int) -> None:
+        """Raise SdoRefusal when this object has an abort code to answer with."""
+        code = self._words[2].value
+        if code and self._names(index, subindex):
+            raise SdoRefusal(code)
+
+    def spoil(self, entry: Entry) -> bytes:
+        """What a client reads of `entry`."""
+        content, wrong = entry.encode(), self._words[3].value
+        if not wrong or not self._names(entry.index, entry.subindex):
+            return content
+        mask = wrong.to_bytes(max(4, len(content)), "little")
+        return bytes(a ^ b for a, b in zip(content, mask, strict=False))
+
+    def _names(self, index: int, subindex: int) -> bool:
+        return (index, subindex) == (self._words[0].value, self._words[1].value)
 
 
 class Entry:
@@ -104,6 +145,7 @@ class Dictionary:
         self._indices = {index for index, _ in self._entries}
         self.write_lock = False
         self.injected_abort = 0
+        self.faulty = FaultyObject(self._entries)
 
     def __iter__(self) -> Iterator[Entry]:
         return iter(self._entries.values())
@@ -142,17 +184,17 @@ class Dictionary:
     def upload(self, index: int, subindex: int) -> bytes:
         """Read one entry for a client; raises SdoRefusal."""
         entry = self.entry(index, subindex)
-        self._strike(index)
+        self._strike(index, subindex)
         if not entry.readable:
             raise SdoRefusal(Abort.READ_OF_WRITE_ONLY)
         if entry.read is not None:
             entry.read()
-        return entry.encode()
+        return self.faulty.spoil(entry)
 
     def download(self, index: int, subindex: int, data: bytes) -> None:
         """Write one entry for a client, all checks made; raises SdoRefusal."""
         entry = self.entry(index, subindex)
-        self._strike(index)
+        self._strike(index, subindex)
         if not entry.writable:
             raise SdoRefusal(Abort.WRITE_OF_READ_ONLY)
         if self.write_lock and entry.locked:
@@ -178,8 +220,9 @@ class Dictionary:
         if entry.index == _ABORT_INJECTION:
             self.injected_abort = value
 
-    def _strike(self, index: int) -> None:
-        """Answer this access with the injected abort code, once."""
+    def _strike(self, index: int, subindex: int) -> None:
+        """Answer this access with the injected abort code, once; the faulty object's at every access."""
+        self.faulty.refuse(index, subindex)
         if self.injected_abort and index != _ABORT_INJECTION:
             code, self.injected_abort = self.injected_abort, 0
             raise SdoRefusal(code)

@@ -6,6 +6,7 @@ Beside the power machine. The objects 0x2000 are the vendor's: they put causes i
 from __future__ import annotations
 
 from servod.drivers.virtual.dictionary import Dictionary
+from servod.hal import DriveState
 
 UNDER_VOLTAGE, OVER_VOLTAGE, SAFE_TORQUE_OFF, MOTOR_TEMPERATURE = 0x3220, 0x3210, 0x5441, 0x4310
 _LOWEST_MV, _HIGHEST_MV = 18_000, 60_000
@@ -15,13 +16,16 @@ _UNUSABLE = (0x2, 0x3, 0x5)
 
 
 class DriveFaults:
-    """Reads the causes; `0x2000` sub 1 error code, 2 safe torque off, 3 supply in mV, 4 local control."""
+    """Reads the causes; `0x2000` sub 1 error code, 2 safe torque off, 3 supply in mV, 4 local control, 5 the state
+    (servod.hal.DriveState) in which control words do nothing, 6 the transition that control words do not cause."""
 
     def __init__(self, dictionary: Dictionary) -> None:
         self._injected = dictionary.entry(0x2000, 1)
         self._safe_torque_off = dictionary.entry(0x2000, 2)
         self._supply_mv = dictionary.entry(0x2000, 3)
         self._local = dictionary.entry(0x2000, 4)
+        self._stuck = dictionary.entry(0x2000, 5)
+        self._refused = dictionary.entry(0x2000, 6)
 
     @property
     def supplied(self) -> bool:
@@ -37,6 +41,10 @@ class DriveFaults:
     def local(self) -> bool:
         """True while the drive takes no commands from the bus (status word bit 9 clear)."""
         return bool(self._local.value)
+
+    def ignores(self, state: DriveState, transition: int) -> bool:
+        """True when a control word shall not cause this transition from this state."""
+        return self._stuck.value == state or self._refused.value == transition
 
     @property
     def supply_mv(self) -> int:

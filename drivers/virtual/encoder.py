@@ -45,6 +45,7 @@ class EncoderNode(Node):
         self._position, self._wide, self._channel = entry(Obj406.POSITION), entry(0x6008), entry(0x6020, 1)
         self._speed, self._acceleration = entry(Obj406.SPEED, 1), entry(0x6040, 1)
         self._alarms, self._warnings, self._offset = entry(Obj406.ALARMS), entry(Obj406.WARNINGS), entry(Obj406.OFFSET)
+        self._frozen, self._jump, self._noise = (entry(0x2000, subindex) for subindex in (3, 4, 5))
         self._range, self._cam = entry(Obj406.MEASURING_RANGE), entry(0x6300, 1)
         self._counts_per_rad = settings.encoder_direction * settings.encoder_counts_per_turn / TWO_PI
         self._scale = 1.0
@@ -69,15 +70,17 @@ class EncoderNode(Node):
 
     def refresh(self, time_ns: int) -> None:
         """Read the joint at `time_ns`; a second read at the same moment gives the same value."""
-        if time_ns == self._read_ns:
+        if time_ns == self._read_ns or self._frozen.value:
             return
         self._read_ns = time_ns
         joint = self.joint
         joint.advance(time_ns)
         angle = joint.plant.encoder_position_rad
         counts = angle * self._counts_per_rad
-        if self.settings.encoder_noise_counts:
-            counts += self._random.gauss(0.0, self.settings.encoder_noise_counts)
+        noise = self.settings.encoder_noise_counts + self._noise.value
+        if noise:
+            counts += self._random.gauss(0.0, noise)
+        counts += self._jump.value
         self._units = math.floor(math.floor(counts + 0.5) * self._scale)
         self._position.value = (self._units + self._offset.value) % self._range.value
         self._refresh_speed(angle, time_ns)

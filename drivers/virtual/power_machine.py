@@ -29,6 +29,9 @@ class Drive(Protocol):
     def cause_gone(self) -> bool:
         """True when no cause of a fault is present any more."""
 
+    def ignores(self, state: DriveState, transition: int) -> bool:
+        """True when control words do not cause this transition from this state: a drive that does not obey."""
+
     def brake(self, ramp: Ramp, time_ns: int) -> None:
         """Begin to stop; the drive calls `PowerMachine.stopped` when at rest, and holds until told otherwise."""
 
@@ -64,11 +67,14 @@ class PowerMachine:
         edge = word & _FAULT_RESET & ~self._control_word
         self._control_word = word
         if self.state is _S.FAULT:
-            if edge and self._drive.cause_gone():
+            if edge and self._drive.cause_gone() and not self._drive.ignores(self.state, 15):
                 self._go(15, _S.SWITCH_ON_DISABLED)
                 self._drive.fault_cleared(time_ns)
         elif self.state is not _S.FAULT_REACTION_ACTIVE:
-            self._command(decode_command(word), time_ns)
+            command = decode_command(word)
+            number, _ = TRANSITIONS.get((self.state, command), (0, self.state))
+            if not self._drive.ignores(self.state, number):
+                self._command(command, time_ns)
 
     def command(self, command: Command, time_ns: int) -> None:
         """A command from inside the drive (abort of the connection)."""

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from servod.cia import Abort
-from servod.drivers.virtual.dictionary import Dictionary, SdoRefusal
+from servod.drivers.virtual.dictionary import Dictionary, Failure, SdoRefusal
 from servod.drivers.virtual.sdo_block import BlockDownload, BlockUpload
 from servod.drivers.virtual.timeline import Timeline
 from servod.units import NS_PER_S
@@ -32,6 +32,7 @@ class _Segments:
     data: bytes
     size: int | None = None
     toggle: int = 0
+    wrong_toggle: int = 0  # turned round in the answers of a faulty object
 
 
 class SdoServer:
@@ -53,6 +54,8 @@ class SdoServer:
         """One request frame of the client."""
         if len(data) != 8:
             return
+        if self._faulty(data) is Failure.NO_ANSWER:
+            return
         try:
             self._serve(data)
         except SdoRefusal as refusal:
@@ -61,6 +64,11 @@ class SdoServer:
             self._stall.cancel()
         else:
             self._stall.arm(time_ns + STALL_NS)
+
+    def _faulty(self, data: bytes) -> Failure:
+        """How the transfer that this request begins fails."""
+        _, index, subindex, _ = _HEAD.unpack(data)
+        return self._dictionary.faulty.failure(index, subindex)
 
     def _serve(self, data: bytes) -> None:
         if self._block is not None and self._serve_block(data):
@@ -116,10 +124,11 @@ class SdoServer:
     def _initiate_upload(self, data: bytes) -> None:
         index, subindex = self._name(data)
         value = self._dictionary.upload(index, subindex)
-        if 0 < len(value) <= 4:
+        wrong_toggle = 0x10 if self._faulty(data) is Failure.WRONG_TOGGLE else 0
+        if 0 < len(value) <= 4 and not wrong_toggle:
             self._send(_HEAD.pack(0x43 | (4 - len(value)) << 2, index, subindex, value))
             return
-        self._segments = _Segments(index, subindex, upload=True, data=value)
+        self._segments = _Segments(index, subindex, upload=True, data=value, wrong_toggle=wrong_toggle)
         self._send(_HEAD.pack(0x41, index, subindex, len(value).to_bytes(4, "little")))
 
     def _expect(self, upload: bool, toggle: int) -> _Segments:
@@ -147,7 +156,7 @@ class SdoServer:
     def _upload_segment(self, data: bytes) -> None:
         transfer = self._expect(True, data[0] & 0x10)
         chunk, transfer.data = transfer.data[:7], transfer.data[7:]
-        head = transfer.toggle | (7 - len(chunk)) << 1 | (0 if transfer.data else 1)
+        head = transfer.toggle ^ transfer.wrong_toggle | (7 - len(chunk)) << 1 | (0 if transfer.data else 1)
         self._send(bytes((head,)) + chunk.ljust(7, b"\0"))
         transfer.toggle ^= 0x10
         if not transfer.data:

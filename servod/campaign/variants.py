@@ -1,6 +1,6 @@
 """Several scenarios in one file: `for_each` lists rows of values, and `$key` in the rest of the file stands for them.
 
-A row has a `name`; its scenario is called `file/name`. Where `$key` is a whole value, the row's value takes its place as
+A row has a `name`; its scenario is `file/name`. Where `$key` is a whole value, the row's value takes its place as
 it is (a number, a list); inside a longer text it is put in as text. Between file and schema (servod.campaign.scenario).
 """
 
