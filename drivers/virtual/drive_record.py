@@ -19,7 +19,8 @@ _HEADER = struct.Struct("<8sIIQ")
 _COUNT = struct.Struct("<Q")
 _COUNT_OFFSET = _HEADER.size - _COUNT.size
 _MAGIC = b"svdrive1"
-_SAMPLE = struct.Struct("<qHHHhdddd")
+#: One sample, fields of DriveSample.
+SAMPLE = struct.Struct("<qHHHhdddd")
 #: Ten minutes at 1 kHz.
 CAPACITY = 600_000
 
@@ -42,7 +43,7 @@ class DriveRecord:
     """Writer of the record at `path`, which is made anew. Raises BadInput when it cannot be written."""
 
     def __init__(self, path: str | Path, capacity: int = CAPACITY) -> None:
-        size = _HEADER.size + capacity * _SAMPLE.size
+        size = _HEADER.size + capacity * SAMPLE.size
         try:
             with Path(path).open("wb+") as file:
                 file.truncate(size)
@@ -50,17 +51,44 @@ class DriveRecord:
         except OSError as error:
             raise BadInput(str(path), error.strerror or str(error), "a file that can be written") from None
         self._capacity, self._count = capacity, 0
-        self._map[: _HEADER.size] = _HEADER.pack(_MAGIC, _SAMPLE.size, capacity, 0)
+        self._map[: _HEADER.size] = _HEADER.pack(_MAGIC, SAMPLE.size, capacity, 0)
 
     def write(self, sample: tuple[int, int, int, int, int, float, float, float, float]) -> None:
         """Append one sample (fields of DriveSample): first the sample, then the count that makes it valid."""
-        offset = _HEADER.size + self._count % self._capacity * _SAMPLE.size
-        _SAMPLE.pack_into(self._map, offset, *sample)
+        offset = _HEADER.size + self._count % self._capacity * SAMPLE.size
+        SAMPLE.pack_into(self._map, offset, *sample)
         self._count += 1
         _COUNT.pack_into(self._map, _COUNT_OFFSET, self._count)
 
     def close(self) -> None:
         """Unmap; the file keeps everything."""
+        self._map.close()
+
+
+class DriveTail:
+    """Follows the record at `path` while it is written; `lost` counts samples that the ring had overwritten."""
+
+    def __init__(self, path: str | Path) -> None:
+        with Path(path).open("rb") as file:
+            self._map = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        self._taken = self.lost = 0
+
+    def take(self) -> bytes:
+        """All samples since the last call, back to back, fields of DriveSample as in SAMPLE."""
+        _, size, capacity, count = _HEADER.unpack_from(self._map)
+        first = max(self._taken, count - capacity)
+        self.lost += first - self._taken
+        self._taken = count
+        begin, end = first % capacity, count % capacity
+        if first == count:
+            return b""
+        data = memoryview(self._map)[_HEADER.size :]
+        if begin < end:
+            return bytes(data[begin * size : end * size])
+        return bytes(data[begin * size : capacity * size]) + bytes(data[: end * size])
+
+    def close(self) -> None:
+        """Unmap."""
         self._map.close()
 
 
@@ -73,8 +101,8 @@ def read_drive_record(path: str | Path) -> list[DriveSample]:
     if len(raw) < _HEADER.size or not raw.startswith(_MAGIC):
         raise BadInput(str(path), "no drive record", "a file written by servod-virtual-axis --record")
     _, size, capacity, count = _HEADER.unpack_from(raw)
-    if size != _SAMPLE.size or len(raw) != _HEADER.size + capacity * size:
+    if size != SAMPLE.size or len(raw) != _HEADER.size + capacity * size:
         raise BadInput(str(path), f"{len(raw)} bytes", "a complete drive record of this version")
     numbers = range(max(0, count - capacity), count)
-    rows = (_SAMPLE.unpack_from(raw, _HEADER.size + n % capacity * size) for n in numbers)
+    rows = (SAMPLE.unpack_from(raw, _HEADER.size + n % capacity * size) for n in numbers)
     return [DriveSample(time, DriveState(state), *rest) for time, state, *rest in rows]

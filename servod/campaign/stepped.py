@@ -22,6 +22,8 @@ from servod.yaml12 import validate
 
 #: A minute of the drive's record at one sample for each millisecond and event.
 _RECORD_SAMPLES = 120_000
+#: The drive's own record in the folder of a stepped axis.
+RECORD_NAME = "drive.bin"
 _SINE = (ReferenceKind.SINE, 0.2, 0.5, 600.0)
 
 
@@ -29,7 +31,7 @@ class SteppedAxis:
     """servod.campaign.under_test.AxisUnderTest in virtual time; `folder` takes the drive's record."""
 
     def __init__(self, scenario: Scenario, folder: Path) -> None:
-        self._record_path = folder / "drive.bin"
+        self._record_path = folder / RECORD_NAME
         where = scenario.title
         settings = validate(scenario.settings, VirtualAxisSettings, f"{where}: settings")
         record = DriveRecord(self._record_path, _RECORD_SAMPLES)
@@ -44,6 +46,11 @@ class SteppedAxis:
         """The master with its loop; it exists from the bring-up on."""
         assert self._session is not None
         return self._session
+
+    @property
+    def refusal(self) -> str:
+        """Why a bring-up or a command was refused last; empty when none was."""
+        return self._refusal
 
     def now_ns(self) -> int:
         """Virtual time."""
