@@ -1,17 +1,16 @@
-"""Faults of the bus on demand: frames that vanish or are destroyed, participants that fall silent, lag or go bus-off.
+"""Faults of the bus on demand: frames that vanish or come otherwise than sent, participants that fall silent or babble.
 
-Used by the hub for every frame while a fault is armed. `BusFault` is also the message by which a client of the socket
-asks for a fault: an error frame, which no CAN controller can send, with this in its data.
+The hub asks `frame_faults` for every frame while one is armed, `injection` does the rest. `BusFault` is the message by
+which a client of the socket asks for a fault: an error frame, which no CAN controller can send, with this in its data.
 """
 
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
 
-#: operation u8, participant u8, identifier u16, count or milliseconds u32
+#: operation u8, participant or detail u8, identifier u16, count or milliseconds u32
 _MESSAGE = struct.Struct("<BBHI")
 #: `can_id` of a fault that hits every frame.
 ANY_ID = 0xFFFF
@@ -29,15 +28,43 @@ class FaultKind(IntEnum):
     SILENT = 4  # the participant neither sends nor hears for `amount` ms (a node without supply, a cut wire)
     DELAY = 5  # the participant sends everything `amount` microseconds later
     ACCEPT = 6  # no fault, a receive filter: the client that asks gets only the identifiers that it named
+    LATE = 7  # the next `amount` frames with `can_id` arrive `detail` tenths of a millisecond late
+    DUPLICATE = 8  # they arrive twice
+    REORDER = 9  # they arrive right after the next frame with the same identifier
+    SHORTEN = 10  # their last `detail` bytes are missing
+    FLIP = 11  # their bit `detail` is wrong and the check sum did not show it
+    STUCK = 12  # the participant's frames wait in its queue for `amount` ms; it goes on hearing
+    DOWN = 13  # the participant's interface is down for `amount` ms
+    BABBLE = 14  # somebody sends `can_id` for `amount` ms, `detail` frames each ms (0: as many as the bus takes)
+    TWIN = 15  # a second node with the participant's id is switched on
+
+
+#: Kinds that hit the next frames with an identifier; they do not concern a participant.
+FRAME_KINDS = frozenset(
+    {
+        FaultKind.DROP,
+        FaultKind.CORRUPT,
+        FaultKind.LATE,
+        FaultKind.DUPLICATE,
+        FaultKind.REORDER,
+        FaultKind.SHORTEN,
+        FaultKind.FLIP,
+    }
+)
 
 
 class BusFault(NamedTuple):
-    """One request. `participant`: node id, or MYSELF; only for BUS_OFF, SILENT and DELAY."""
+    """One request. `participant`: node id, or MYSELF; kinds that concern none have their detail in its place."""
 
     kind: FaultKind
     can_id: int = ANY_ID
     amount: int = 1
     participant: int = MYSELF
+
+    @property
+    def detail(self) -> int:
+        """The further number that the kind asks for."""
+        return self.participant
 
     def encode(self) -> bytes:
         """Eight bytes for an error frame."""
@@ -50,39 +77,3 @@ class BusFault(NamedTuple):
         if kind not in FaultKind.__members__.values():
             return cls(FaultKind.NONE)
         return cls(FaultKind(kind), can_id, amount, participant)
-
-
-@dataclass(slots=True)
-class _Armed:
-    kind: FaultKind
-    can_id: int
-    left: int
-
-
-class FrameFaults:
-    """The armed faults that hit single frames."""
-
-    def __init__(self) -> None:
-        self._faults: list[_Armed] = []
-        self.armed = False
-
-    def arm(self, kind: FaultKind, can_id: int = ANY_ID, count: int = 1) -> None:
-        """Hit the next `count` frames whose identifier is `can_id` (or any)."""
-        self._faults.append(_Armed(kind, can_id, count))
-        self.armed = True
-
-    def clear(self) -> None:
-        """Take all armed faults back."""
-        self._faults.clear()
-        self.armed = False
-
-    def strike(self, can_id: int) -> FaultKind:
-        """What happens to the frame that ends now; uses one count up."""
-        for fault in self._faults:
-            if fault.can_id in (ANY_ID, can_id & 0x7FF):
-                fault.left -= 1
-                if fault.left <= 0:
-                    self._faults.remove(fault)
-                    self.armed = bool(self._faults)
-                return fault.kind
-        return FaultKind.NONE

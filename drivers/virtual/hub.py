@@ -7,8 +7,11 @@ reaches all other ports at its end. Driven by the world: `step` completes at mos
 
 from __future__ import annotations
 
+from functools import partial
+
 from servod.drivers.virtual.bit_time import ERROR_BITS, arbitration_key, frame_bits
-from servod.drivers.virtual.bus_faults import FaultKind, FrameFaults
+from servod.drivers.virtual.bus_faults import FaultKind
+from servod.drivers.virtual.frame_faults import UNHURT, Delivery, FrameFaults
 from servod.drivers.virtual.port import ErrorState, Port
 from servod.drivers.virtual.timeline import NEVER, Timeline
 from servod.units import NS_PER_S
@@ -57,7 +60,7 @@ class Hub:
             port.dropped += 1
             return False
         if time_ns >= port.silent_until_ns:
-            port.queue.append((can_id, data, time_ns + port.delay_ns))
+            port.queue.append((can_id, data, max(time_ns + port.delay_ns, port.stuck_until_ns)))
             self._waiting += 1
         return True
 
@@ -114,8 +117,9 @@ class Hub:
         sender, (can_id, data, _), end_ns = self._sender, self._frame, self._end_ns
         assert sender is not None
         self._sender = None
-        fault = self.faults.strike(can_id) if self.faults.armed else FaultKind.NONE
-        if fault is FaultKind.CORRUPT:
+        armed = self.faults.armed
+        strike = self.faults.strike(can_id) if armed else UNHURT
+        if strike.kind is FaultKind.CORRUPT:
             self._destroyed(sender, end_ns)
             return
         sender.queue.popleft()
@@ -123,11 +127,24 @@ class Hub:
         self.frames += 1
         if self._errors:
             self._forgive(sender, end_ns)
-        if fault is FaultKind.DROP:
-            return
+        if armed:
+            for delivery in self.faults.deliveries(strike, can_id, data):
+                self._deliver_later(sender, can_id, delivery, end_ns)
+        else:
+            self._deliver(sender, can_id, data, end_ns)
+
+    def _deliver(self, sender: Port, can_id: int, data: bytes, end_ns: int) -> None:
         for port in self._ports:
             if port is not sender and port.silent_until_ns <= end_ns and port.state is not ErrorState.BUS_OFF:
                 port.receive(can_id, data, end_ns)
+
+    def _deliver_later(self, sender: Port, can_id: int, delivery: Delivery, end_ns: int) -> None:
+        """Of a frame that a fault hit: now, or when its time has come."""
+        if delivery.delay_ns:
+            deliver = partial(self._deliver, sender, can_id, delivery.data)
+            self._timeline.timer(deliver).arm(end_ns + delivery.delay_ns)
+        else:
+            self._deliver(sender, can_id, delivery.data, end_ns)
 
     def _destroyed(self, sender: Port, time_ns: int) -> None:
         """Error frame: count on both sides; the frame stays at the head of its queue and is sent again."""

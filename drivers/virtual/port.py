@@ -23,17 +23,20 @@ class ErrorState(IntEnum):
 
 Receiver = Callable[[int, bytes, int], None]
 StateListener = Callable[[ErrorState, int], None]
+LinkListener = Callable[[bool, int], None]
 
 
 class Port:
     """A CAN controller on the hub. `receive(can_id, data, time_ns)` gets every frame of the others at the moment the
-    frame ended; `on_state(state, time_ns)` hears of error passive, bus-off and of the return to error active."""
+    frame ended; `on_state(state, time_ns)` hears of error passive, bus-off and of the return to error active,
+    `on_link(up, time_ns)` of the interface that goes down and comes back."""
 
     __slots__ = (
         "delay_ns",
         "depth",
         "dropped",
         "name",
+        "on_link",
         "on_state",
         "queue",
         "receive",
@@ -41,6 +44,7 @@ class Port:
         "restart_ns",
         "silent_until_ns",
         "state",
+        "stuck_until_ns",
         "transmit_errors",
     )
 
@@ -48,12 +52,14 @@ class Port:
         self.name, self.receive, self.depth = name, receive, depth
         self.restart_ns = restart_ns  # from bus-off back to error active; 0: never by itself
         self.on_state: StateListener = ignore_state
+        self.on_link: LinkListener = ignore_link
         self.queue: deque[tuple[int, bytes, int]] = deque()
         self.dropped = 0
         self.transmit_errors = 0
         self.receive_errors = 0
         self.state = ErrorState.ACTIVE
-        self.silent_until_ns = 0
+        self.silent_until_ns = 0  # neither sends nor hears
+        self.stuck_until_ns = 0  # what is sent waits
         self.delay_ns = 0
 
     def count(self, transmit: int, receive: int, time_ns: int) -> bool:
@@ -80,3 +86,7 @@ class Port:
 
 def ignore_state(state: ErrorState, time_ns: int) -> None:
     """State listener of a port whose owner does not care."""
+
+
+def ignore_link(up: bool, time_ns: int) -> None:
+    """Link listener of a port that has no interface."""

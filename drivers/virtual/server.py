@@ -49,7 +49,7 @@ class Client:
         sock.setblocking(False)
         settings = world.settings
         self.port = Port("client", self.deliver, settings.queue_depth, settings.client_restart_ms * 1_000_000)
-        self.port.on_state = self._state_changed
+        self.port.on_state, self.port.on_link = self._state_changed, self._link_changed
         self._accepted: set[int] | None = None
         self._overflow = False
         self.gone = False
@@ -112,6 +112,10 @@ class Client:
         counts = (min(self.port.transmit_errors, 255), min(self.port.receive_errors, 255))
         data = struct.pack("<BB4xBB", 0, controller, *counts)
         self.deliver(CAN_ERR_FLAG | error_class, data, time_ns)
+
+    def _link_changed(self, up: bool, time_ns: int) -> None:
+        """An interface that goes down ends the connection, and nothing but a new one brings it back."""
+        self.gone = self.gone or not up
 
 
 class HubServer:

@@ -12,10 +12,11 @@ from typing import NamedTuple
 from servod.axis_model import AxisModel, rotary
 from servod.bus import BusCounters, Frame
 from servod.drivers.virtual.amplifier import AmplifierNode
-from servod.drivers.virtual.bus_faults import MYSELF, BusFault, FaultKind
+from servod.drivers.virtual.bus_faults import BusFault
 from servod.drivers.virtual.drive_record import DriveRecord
 from servod.drivers.virtual.encoder import EncoderNode
 from servod.drivers.virtual.hub import Hub
+from servod.drivers.virtual.injection import inject
 from servod.drivers.virtual.joint import Joint
 from servod.drivers.virtual.node import Node, Send
 from servod.drivers.virtual.port import ErrorState, Port
@@ -27,7 +28,7 @@ __all__ = ["SteppedBus", "SteppedClock", "SteppedWorld", "Truth", "VirtualAxisSe
 
 _NODE_QUEUE = 1024
 _RECEIVE_QUEUE = 65_536
-_MS_NS, _US_NS = 1_000_000, 1_000
+_MS_NS = 1_000_000
 
 
 class Truth(NamedTuple):
@@ -73,7 +74,7 @@ class World:
     """Hub and devices; nothing happens unless `advance` is called."""
 
     def __init__(self, settings: VirtualAxisSettings, model: AxisModel, record: DriveRecord | None = None) -> None:
-        self.settings = settings
+        self.settings, self._model = settings, model
         self.timeline = Timeline()
         self.hub = Hub(self.timeline, settings.bit_rate)
         self.devices = Devices(settings, model, self.timeline, record)
@@ -109,18 +110,27 @@ class World:
 
     def apply_fault(self, fault: BusFault, client: Port, time_ns: int) -> None:
         """Carry out a fault that a client asked for."""
-        if fault.kind in (FaultKind.DROP, FaultKind.CORRUPT):
-            self.hub.faults.arm(fault.kind, fault.can_id, fault.amount)
-            return
-        port = client if fault.participant == MYSELF else self._port_of(fault.participant)
-        if port is None:
-            return
-        if fault.kind is FaultKind.BUS_OFF:
-            self.hub.force_bus_off(port, time_ns)
-        elif fault.kind is FaultKind.SILENT:
-            port.silent_until_ns = time_ns + fault.amount * _MS_NS
-        elif fault.kind is FaultKind.DELAY:
-            port.delay_ns = fault.amount * _US_NS
+        inject(self, fault, client, time_ns)
+
+    def switch_on_twin(self, node_id: int, time_ns: int) -> None:
+        """A second node with this id, on a joint of its own, is switched on: somebody set the same address twice."""
+        twins = Devices(self.settings, self._model, self.timeline)
+        ports = [self._node_port(f"twin {name}") for name in self._node_ports]
+        twins.build(*[self.sender(port) for port in ports])
+        for port, twin in zip(ports, twins.nodes, strict=True):
+            if twin.node_id == node_id:
+                port.receive, port.on_state = twin.receive, twin.bus_state
+                twins.joint.advance(time_ns)
+                twin.power_on(time_ns)
+            else:
+                self.hub.detach(port)
+
+    def port_of(self, node_id: int) -> Port | None:
+        """The CAN controller of a node."""
+        for port, node in zip(self._node_ports.values(), self.devices.nodes, strict=True):
+            if node.node_id == node_id:
+                return port
+        return None
 
     def truth(self, time_ns: int) -> Truth:
         """The joint's true state."""
@@ -130,12 +140,6 @@ class World:
     def _node_port(self, name: str) -> Port:
         port = Port(name, _deaf, depth=_NODE_QUEUE, restart_ns=self.settings.node_restart_ms * _MS_NS)
         return self.hub.attach(port)
-
-    def _port_of(self, node_id: int) -> Port | None:
-        for port, node in zip(self._node_ports.values(), self.devices.nodes, strict=True):
-            if node.node_id == node_id:
-                return port
-        return None
 
 
 class SteppedClock:
@@ -170,7 +174,7 @@ class SteppedBus:
         settings = world.settings
         restart_ns = settings.client_restart_ms * _MS_NS
         self.port = Port("client", self._deliver, depth=settings.queue_depth, restart_ns=restart_ns)
-        self.port.on_state = self._state_changed
+        self.port.on_state, self.port.on_link = self._state_changed, self._link_changed
         world.hub.attach(self.port)
 
     def send(self, can_id: int, data: bytes) -> bool:
@@ -207,9 +211,8 @@ class SteppedBus:
 
     def close(self) -> None:
         """Leave the bus."""
-        if not self.counters.down:
-            self.counters.set_down()
-            self._world.hub.detach(self.port)
+        self.counters.set_down()
+        self._world.hub.detach(self.port)
 
     def _deliver(self, can_id: int, data: bytes, time_ns: int) -> None:
         """Take a frame that passes the filter; one that nobody reads away is lost, as in a socket's full buffer."""
@@ -227,6 +230,12 @@ class SteppedBus:
         else:
             self.counters.bus_off = False
         self.counters.error_passive = state is ErrorState.PASSIVE
+
+    def _link_changed(self, up: bool, time_ns: int) -> None:
+        if up:
+            self.counters.down = False
+        else:
+            self.counters.set_down()
 
 
 class SteppedWorld(World):
