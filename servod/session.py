@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from array import array
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from servod.commands import REFUSAL_TEXT, Command, Op, ReferenceKind, Refusal
@@ -23,6 +23,10 @@ from servod.units import NS_PER_S
 
 if TYPE_CHECKING:
     from servod.drivers.virtual.world import SteppedWorld
+
+
+#: The daemon's supervisor looks at the nodes so often (servod.daemon.supervisor.TICK_S).
+_POLL_NS = 20_000_000
 
 
 class _ListLink:
@@ -40,8 +44,16 @@ class _ListLink:
         return self.commands.popleft() if self.commands else None
 
 
+def _punctual() -> int:
+    """Every wake-up in time."""
+    return 0
+
+
 class SteppedSession:
-    """Brings the axis up on construction; `run` advances virtual time; `records` holds every cycle since `clear`."""
+    """Brings the axis up on construction; `run` advances virtual time; `records` holds every cycle since `clear`.
+
+    `lateness_ns` says for each cycle how late the machine wakes the loop; whoever tries that puts a function there.
+    """
 
     def __init__(self, config: AxisConfig, world: SteppedWorld, law: int, parameters: Sequence[float]) -> None:
         """`law` and `parameters`: the first controller (a packed gain set)."""
@@ -52,9 +64,11 @@ class SteppedSession:
         self._link = _ListLink()
         self.loop_bus = world.connect()
         self.cycle = Cycle(plan, self.loop_bus, world.clock, self._link, lambda: True)
+        self.lateness_ns: Callable[[], int] = _punctual
         self._deadline_ns = self.clock.now_ns() + self.cycle.period_ns
         self._seq = 0
         self._cycles_until_poll = 0
+        self._poll_cycles = max(1, _POLL_NS // self.cycle.period_ns)
 
     @property
     def raw(self) -> bytes:
@@ -77,12 +91,20 @@ class SteppedSession:
 
     def run(self, duration_s: float) -> None:
         """Advance virtual time, cycle by cycle."""
-        cycle, clock = self.cycle, self.clock
-        for _ in range(round(duration_s * NS_PER_S / cycle.period_ns)):
-            clock.sleep_until(self._deadline_ns)
-            cycle.step(self._deadline_ns, self._deadline_ns, 0)
-            self._deadline_ns += cycle.period_ns
+        until_ns = self._deadline_ns + round(duration_s * NS_PER_S / self.cycle.period_ns) * self.cycle.period_ns
+        while self._deadline_ns < until_ns:
+            self._step()
             self._look_after_nodes()
+
+    def _step(self) -> None:
+        """One cycle, as servod.loop.process.run paces it: periods that a late wake-up missed are skipped."""
+        cycle, period_ns = self.cycle, self.cycle.period_ns
+        late_ns = self.lateness_ns()
+        self.clock.sleep_until(self._deadline_ns + late_ns)
+        skipped = late_ns // period_ns
+        self._deadline_ns += skipped * period_ns
+        cycle.step(self._deadline_ns, self._deadline_ns - skipped * period_ns + late_ns, skipped)
+        self._deadline_ns += period_ns
 
     def send(self, op: Op, arguments: Sequence[float] = ()) -> Refusal:
         """Give the loop one command and run until it has answered."""
@@ -129,11 +151,11 @@ class SteppedSession:
             raise AnswerIsNo(REFUSAL_TEXT[refusal])
 
     def _look_after_nodes(self) -> None:
-        """The supervisor's part: ten times a second, and each event becomes a fault in the loop."""
+        """The supervisor's part, as often as the daemon's: each event becomes a fault in the loop."""
         self._cycles_until_poll -= 1
         if self._cycles_until_poll > 0:
             return
-        self._cycles_until_poll = 100
+        self._cycles_until_poll = self._poll_cycles
         self.master.poll()
         for event in self.master.events():
             self._seq += 1

@@ -44,9 +44,22 @@ class FrameFault(StrEnum):
 
     DROP = "drop"  # it reaches nobody
     DESTROY = "destroy"  # an error frame hits it, the controller repeats it
+    LATE = "late"  # it arrives `detail` tenths of a millisecond later
+    DUPLICATE = "duplicate"  # it arrives twice
+    REORDER = "reorder"  # it arrives after the next one of its kind
+    SHORTEN = "shorten"  # its last `detail` bytes are missing
+    FLIP = "flip"  # its bit `detail` is wrong, and the check sum did not show it
 
 
-_KIND = {FrameFault.DROP: FaultKind.DROP, FrameFault.DESTROY: FaultKind.CORRUPT}
+_KIND = {
+    FrameFault.DROP: FaultKind.DROP,
+    FrameFault.DESTROY: FaultKind.CORRUPT,
+    FrameFault.LATE: FaultKind.LATE,
+    FrameFault.DUPLICATE: FaultKind.DUPLICATE,
+    FrameFault.REORDER: FaultKind.REORDER,
+    FrameFault.SHORTEN: FaultKind.SHORTEN,
+    FrameFault.FLIP: FaultKind.FLIP,
+}
 
 
 class Frames(Action):
@@ -55,10 +68,11 @@ class Frames(Action):
     of: FrameName
     fault: FrameFault
     count: int | None = Field(None, ge=1)
+    detail: int = Field(0, ge=0, le=255)
 
     def apply(self, axis: AxisUnderTest) -> None:
         """Arm the fault in the hub."""
-        axis.bus_fault(BusFault(_KIND[self.fault], CAN_ID[self.of], self.count or _ALWAYS))
+        axis.bus_fault(BusFault(_KIND[self.fault], CAN_ID[self.of], self.count or _ALWAYS, self.detail))
 
 
 class Silence(Action):
@@ -82,4 +96,55 @@ class BusOff(Action):
         axis.bus_fault(BusFault(FaultKind.BUS_OFF, participant=NODE_ID.get(self.who, MYSELF)))
 
 
-BUS_ACTIONS: dict[str, type[Action]] = {"frames": Frames, "silence": Silence, "bus_off": BusOff}
+class QueueStands(Action):
+    """A participant hears, but cannot send: its frames wait in the transmit queue until that is full (ENOBUFS)."""
+
+    who: Who
+    for_ms: int = Field(ge=1)
+
+    def apply(self, axis: AxisUnderTest) -> None:
+        """Stop its controller from sending."""
+        axis.bus_fault(BusFault(FaultKind.STUCK, amount=self.for_ms, participant=NODE_ID.get(self.who, MYSELF)))
+
+
+class InterfaceDown(Action):
+    """The loop's interface goes down, and is up again after a while."""
+
+    for_ms: int = Field(ge=1)
+
+    def apply(self, axis: AxisUnderTest) -> None:
+        """Take it down."""
+        axis.bus_fault(BusFault(FaultKind.DOWN, amount=self.for_ms))
+
+
+class Babble(Action):
+    """A further participant sends one identifier again and again; without `each_ms` as often as the bus takes it."""
+
+    can_id: int = Field(ge=0, le=0x7FF)
+    for_ms: int = Field(ge=1)
+    each_ms: int = Field(0, ge=0, le=20)
+
+    def apply(self, axis: AxisUnderTest) -> None:
+        """Let it begin."""
+        axis.bus_fault(BusFault(FaultKind.BABBLE, self.can_id, self.for_ms, self.each_ms))
+
+
+class SecondNode(Action):
+    """A second node with the same id is switched on."""
+
+    who: Who
+
+    def apply(self, axis: AxisUnderTest) -> None:
+        """Switch it on."""
+        axis.bus_fault(BusFault(FaultKind.TWIN, participant=NODE_ID[self.who]))
+
+
+BUS_ACTIONS: dict[str, type[Action]] = {
+    "frames": Frames,
+    "silence": Silence,
+    "bus_off": BusOff,
+    "queue_stands": QueueStands,
+    "interface_down": InterfaceDown,
+    "babble": Babble,
+    "second_node": SecondNode,
+}

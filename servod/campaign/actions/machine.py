@@ -2,28 +2,108 @@
 
 from __future__ import annotations
 
+import math
+import random
+from abc import abstractmethod
+from enum import StrEnum
 from typing import TYPE_CHECKING, ClassVar
+
+from pydantic import Field
 
 from servod.campaign.actions.base import Action
 from servod.campaign.scenario import Runs
-from servod.commands import Op
+from servod.commands import Op, ReferenceKind
 from servod.controllers import LAWS
 
 if TYPE_CHECKING:
+    from servod.campaign.stepped import SteppedAxis
     from servod.campaign.under_test import AxisUnderTest
 
 
-class Gains(Action):
-    """Other gains act from now on, past the store and its certificate: the limits are on their own."""
+class OpName(StrEnum):
+    """What a person can tell the axis without arguments."""
+
+    ENABLE = "enable"
+    DISABLE = "disable"
+    QUICK_STOP = "quick_stop"
+
+
+class SteppedAction(Action):
+    """An action that only the axis in virtual time can show."""
 
     runs: ClassVar[frozenset[Runs]] = frozenset({Runs.STEPPED})
+
+    def apply(self, axis: AxisUnderTest) -> None:
+        """Hand over to `apply_stepped`."""
+        from servod.campaign.stepped import SteppedAxis
+
+        assert isinstance(axis, SteppedAxis)  # `runs` is checked when the scenario is read
+        self.apply_stepped(axis)
+
+    @abstractmethod
+    def apply_stepped(self, axis: SteppedAxis) -> None:
+        """Let it happen to `axis` now."""
+
+
+class Tell(SteppedAction):
+    """A person gives a command."""
+
+    op: OpName
+
+    def apply_stepped(self, axis: SteppedAxis) -> None:
+        """Give it."""
+        axis.command(Op[self.op.name])
+
+
+class Sine(SteppedAction):
+    """A person starts a motion."""
+
+    amplitude_rad: float
+    frequency_hz: float
+
+    def apply_stepped(self, axis: SteppedAxis) -> None:
+        """Start it, for as long as the scenario lasts."""
+        axis.command(Op.REFERENCE, [ReferenceKind.SINE, self.amplitude_rad, self.frequency_hz, 600.0])
+
+
+class WakesLate(SteppedAction):
+    """The operating system wakes the loop late, up to `most_us`, in one cycle of `one_in`; SYNC comes as late."""
+
+    most_us: int = Field(ge=1, le=10_000_000)
+    one_in: int = Field(1, ge=1)
+    exactly: bool = Field(False, description="always the most, not a random share of it")
+    times: int | None = Field(None, ge=1, description="so often, then punctual again")
+
+    def apply_stepped(self, axis: SteppedAxis) -> None:
+        """Disturb the pace of the loop from now on."""
+        chance = random.Random(1)  # noqa: S311  (a disturbance, no secret)
+        left = self.times if self.times is not None else math.inf
+
+        def lateness_ns() -> int:
+            nonlocal left
+            if left <= 0 or chance.randrange(self.one_in):
+                return 0
+            left -= 1
+            return self.most_us * 1000 if self.exactly else chance.randrange(self.most_us * 1000)
+
+        axis.session.lateness_ns = lateness_ns
+
+
+class Gains(SteppedAction):
+    """Other gains act from now on, past the store and its certificate: the limits are on their own."""
+
     law: str
     parameters: list[float | str]
 
-    def apply(self, axis: AxisUnderTest) -> None:
+    def apply_stepped(self, axis: SteppedAxis) -> None:
         """Activate them ("nan" and "inf" are written as text)."""
         numbers = [float(p) for p in self.parameters]
         axis.command(Op.ACTIVATE, [1, LAWS[self.law].number, len(numbers), *numbers])
 
 
-MACHINE_ACTIONS: dict[str, type[Action]] = {"gains": Gains}
+MACHINE_ACTIONS: dict[str, type[Action]] = {
+    "gains": Gains,
+    "tell": Tell,
+    "sine": Sine,
+    "wakes_late": WakesLate,
+}

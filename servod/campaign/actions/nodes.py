@@ -48,4 +48,15 @@ class ObjectWrite(Action):
         axis.sdo_write(NODE_ID[self.who], self.index, self.subindex, self.value)
 
 
-NODE_ACTIONS: dict[str, type[Action]] = {"nmt": Nmt, "object_write": ObjectWrite}
+class ForeignFrame(Action):
+    """Somebody sends a frame: `data` is written as hexadecimal bytes."""
+
+    can_id: int = Field(ge=0, le=0x7FF)
+    data: str = Field("", pattern=r"^([0-9A-Fa-f]{2}){0,8}$")
+
+    def apply(self, axis: AxisUnderTest) -> None:
+        """Send it."""
+        axis.frame(self.can_id, bytes.fromhex(self.data))
+
+
+NODE_ACTIONS: dict[str, type[Action]] = {"nmt": Nmt, "object_write": ObjectWrite, "foreign_frame": ForeignFrame}
