@@ -16,6 +16,7 @@ from servod.cia import (
     EMCY_BASE,
     SW_REMOTE,
     SW_VOLTAGE_ENABLED,
+    Emcy,
     Obj402,
 )
 from servod.drivers.cia402_setup import AmplifierSetup
@@ -81,6 +82,7 @@ class Cia402Amplifier:
         self._unwrapped_counts: int | None = None
         self._torque_per_mille = 0
         self._error_code = 0
+        self._commands_missed = False
         self._feedback: AmplifierFeedback | None = None
         self._goal = Goal.OFF
         self._halt = False
@@ -130,8 +132,16 @@ class Cia402Amplifier:
             if len(data) < _EMCY.size:
                 self.ignored_frames += 1
             else:
-                self._error_code = _EMCY.unpack_from(data)[0]
+                self._take_emergency(_EMCY.unpack_from(data)[0])
         return False
+
+    def _take_emergency(self, code: int) -> None:
+        """The drive tells of the deadline of its RPDO once, and takes that back when commands come again."""
+        self._error_code, self._feedback = code, None
+        if code == Emcy.RPDO_TIME_OUT:
+            self._commands_missed = True
+        elif code >> 8 == 0:
+            self._commands_missed = False
 
     def _take_feedback(self, values: tuple[int, ...], time_ns: int) -> None:
         self._status_word = status_word = values[self._status_slot]
@@ -149,7 +159,7 @@ class Cia402Amplifier:
     def read(self) -> AmplifierFeedback:
         """The feedback of this cycle; the same value until a new frame comes or `write` closes the cycle."""
         if self._feedback is None:
-            reasons = self._reasons()
+            reasons = self._reasons() | (Reason.COMMANDS_MISSED if self._commands_missed else 0)
             self._feedback = AmplifierFeedback(
                 self._time_ns,
                 self._age_cycles,

@@ -31,6 +31,7 @@ class AxisState(IntEnum):
     FAULT = 6
 
 
+_UNHEARD_MASK = _BIT[FaultCode.DRIVE_STAYS_POWERED] | _BIT[FaultCode.COMMANDS_LOST]
 _OFF_MASK = sum(FAULTS[code].bit for code in NEEDS_RESTART)
 #: A drive that is told to switch off, or to stop, and still shows this after this time does not obey.
 _POWERED = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
@@ -68,6 +69,11 @@ class Axis:
     def goal(self) -> Goal:
         """What the drive shall do in the present state."""
         return _GOAL[self.state]
+
+    @property
+    def unheard(self) -> bool:
+        """The drive does not follow the control word, or does not get it: other ways must stop it."""
+        return bool(self.latched & _UNHEARD_MASK)
 
     def enable(self, reset_fault: bool) -> Refusal:
         """Explicit request to enable; with `reset_fault` latched faults and the drive's fault are reset first."""
@@ -121,7 +127,7 @@ class Axis:
         self.latched |= self.faults & _OFF_MASK
         if self.state not in (AxisState.DISABLED, AxisState.FAULT):
             self._react()
-        elif self.faults & _BIT[FaultCode.DRIVE_STAYS_POWERED]:
+        elif self.faults & _UNHEARD_MASK:
             self._enter(AxisState.FAULT)
         just_enabled = self._move_on(amplifier, encoder_fresh, at_rest)
         reset, self._reset_wanted = self._reset_wanted, False
@@ -177,6 +183,8 @@ class Axis:
         faults, state = self._disobedience(amplifier), amplifier.state
         if amplifier.age_cycles > 0:
             return faults
+        if amplifier.reasons & Reason.COMMANDS_MISSED and state in _POWERED:
+            faults |= _BIT[FaultCode.COMMANDS_LOST]
         if state in (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE) and not self._being_reset():
             faults |= _BIT[FaultCode.DRIVE_FAULT]
         if amplifier.status_word & _STATUS_WARNING:

@@ -81,6 +81,8 @@ class FaultCode(IntEnum):
     LOOP_LOST = 24
     RECORDER_FAILED = 25
     DRIVE_STAYS_POWERED = 26
+    COMMANDS_LOST = 27
+    SECOND_MASTER = 28
 
 
 #: Faults after which the nodes are not as they were configured: only a new bring-up may enable the axis again.
@@ -91,6 +93,7 @@ NEEDS_RESTART = frozenset(
         FaultCode.BUS_OFF,
         FaultCode.BUS_DOWN,
         FaultCode.DRIVE_STAYS_POWERED,
+        FaultCode.COMMANDS_LOST,
     }
 )
 
@@ -283,6 +286,19 @@ FAULTS: dict[FaultCode, Fault] = dict(
             "The drive stays powered, or is not heard, although it was told to switch off.",
             "Cut its supply or pull its enable input; then look for what keeps the control word (RPDO1) from the drive "
             "and restart the daemon.",
+        ),
+        _row(
+            _C.COMMANDS_LOST,
+            _R.DISABLE,
+            "The drive misses the command frames (RPDO1; EMCY 0x8250) while it is powered; it was stopped by NMT.",
+            "Check wiring and plugs, and whether something else takes the bus; then restart the daemon.",
+        ),
+        _row(
+            _C.SECOND_MASTER,
+            _R.QUICK_STOP,
+            "Somebody else sends frames that only this master may send: SYNC, the command or the master's heartbeat.",
+            "Find the other master on the bus: a second daemon, another controller, or a node that produces SYNC (0x1005 "
+            "bit 30).",
         ),
     ]
 )

@@ -96,6 +96,7 @@ class Reason(IntFlag):
     QUICK_STOP_HOLDS = 128
     HALTED = 256
     REMOTE_OFF = 512
+    COMMANDS_MISSED = 1024
 
 
 REASON_TEXT: dict[Reason, str] = {
@@ -109,6 +110,7 @@ REASON_TEXT: dict[Reason, str] = {
     Reason.QUICK_STOP_HOLDS: "quick stop is active and holds (0x605A is 5 to 8)",
     Reason.HALTED: "halt is requested",
     Reason.REMOTE_OFF: "the drive does not take commands from the bus (status word bit 9)",
+    Reason.COMMANDS_MISSED: "the command frames do not reach the drive (EMCY 0x8250)",
 }
 
 

@@ -27,10 +27,11 @@ from servod.references import Reference, Samples
 from servod.units import NS_PER_S, NS_PER_US
 
 _SUPERVISOR_LOST = FAULTS[FaultCode.SUPERVISOR_LOST].bit
-_STAYS_POWERED = FAULTS[FaultCode.DRIVE_STAYS_POWERED].bit
 #: At a shutdown the drive must be seen without power for so many cycles, and has so many to get there.
 GOODBYE_CYCLES = 20
 GOODBYE_TIMEOUT_CYCLES = 1000
+#: How long a drive stays in NMT stopped before it is asked to be pre-operational.
+_STOPPED_CYCLES = 5
 _POWERED = (AxisState.ENABLED, AxisState.BRAKING, AxisState.RAMPING)
 _UNPOWERED = (DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON, DriveState.FAULT)
 
@@ -92,11 +93,13 @@ class Cycle:
         self.shutting_down = self.finished = self.seen_off = False
         self.torque_nm = self.encoder_position_rad = 0.0
         self._ramp_from_nm = 0.0
-        self._heartbeat_every = max(1, config.heartbeat.master_period_ms * 1000 // config.cycle.period_us)
+        self._heartbeat_every = max(
+            _STOPPED_CYCLES + 1, config.heartbeat.master_period_ms * 1000 // config.cycle.period_us
+        )
         self._number = self._missed = self._heartbeat_due = 0
         self._last_sync_ns = self.exchange.sync_ns - self.period_ns
         self._command_seq = self._command_result = 0
-        self._tick_ns = self._torque_sent_ns = self._goodbye = self._resting = 0
+        self._tick_ns = self._torque_sent_ns = self._goodbye = self._resting = self._withdrawn = 0
 
     def step(self, deadline_ns: int, woke_ns: int, skipped: int) -> None:
         """One cycle; `skipped` periods were missed before it."""
@@ -189,10 +192,22 @@ class Cycle:
         goal = self.axis.goal
         command = AmplifierCommand(goal, torque_nm if goal == Goal.ENABLED else 0.0, False, output.reset_fault)
         self.exchange.send(*self.amplifier.write(command))
-        # A drive that does not switch off shall miss the heartbeat: its own consumer (0x1016) is the last line.
-        if self._number >= self._heartbeat_due and not self.axis.latched & _STAYS_POWERED:
+        if self.axis.unheard:
+            self._withdraw()
+        elif self._number >= self._heartbeat_due:
             self._heartbeat_due = self._number + self._heartbeat_every
             self.exchange.heartbeat()
+
+    def _withdraw(self) -> None:
+        """The control word does not stop the drive: NMT shall, whose identifier is another, and so shall its own
+        consumer (0x1016), which misses our heartbeat from now on. NMT stop is what 0x6007 reacts to (CiA 402-2); in
+        pre-operational, a few cycles later, the drive answers SDO again.
+        """
+        if self._withdrawn == 0:
+            self.exchange.stop_drive()
+        elif self._withdrawn % self._heartbeat_every == _STOPPED_CYCLES:
+            self.exchange.make_drive_answer()
+        self._withdrawn += 1
 
     def _record(self, lag_ns: int, amplifier: AmplifierFeedback, encoder: EncoderFeedback, torque: _Torque) -> None:
         """Publish the cycle, in the order of servod.record.FIELDS."""

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from servod.bus import Bus
-from servod.cia import HEARTBEAT_BASE, SYNC_ID, NmtState
+from servod.cia import HEARTBEAT_BASE, NMT_ID, SYNC_ID, NmtCommand, NmtState
 from servod.clock import Clock
 from servod.errors import FAULTS, FaultCode
 from servod.hal import Amplifier, Encoder, NodePlan
 from servod.loop.plan import LoopPlan
 from servod.units import NS_PER_S
 
-_BUS_OFF, _BUS_DOWN, _QUEUE_FULL = (
-    FAULTS[c].bit for c in (FaultCode.BUS_OFF, FaultCode.BUS_DOWN, FaultCode.BUS_QUEUE_FULL)
+_BUS_OFF, _BUS_DOWN, _QUEUE_FULL, _SECOND_MASTER = (
+    FAULTS[c].bit for c in (FaultCode.BUS_OFF, FaultCode.BUS_DOWN, FaultCode.BUS_QUEUE_FULL, FaultCode.SECOND_MASTER)
 )
 _OPERATIONAL = bytes([NmtState.OPERATIONAL])
 #: A cycle takes at most this many frames from the socket, so that a babbling node cannot hold the loop.
@@ -27,7 +27,10 @@ class Exchange:
         self._receivers = {i: device for device in (amplifier, encoder) for i in device.receive_ids}
         self._sync_frames = amplifier.sync_frames + encoder.sync_frames
         self._sync_ids = _synchronous_ids(plan.amplifier) | _synchronous_ids(plan.encoder)
+        self._amplifier_id = plan.amplifier.node_id
         self._heartbeat_id = HEARTBEAT_BASE + plan.config.heartbeat.master_node_id
+        self._ours = frozenset({SYNC_ID, self._heartbeat_id, *(p.cob_id for p in plan.amplifier.pdos if p.receive)})
+        self._others_frames = 0  # with identifiers that are ours, since the last look
         self.late_frames = 0
         self._queue_full = self._bus_off_events = self._down_events = 0
         self.sync_ns = clock.now_ns()
@@ -55,6 +58,8 @@ class Exchange:
                 missing -= 1
                 if missing == 0:
                     return
+            elif receiver is None and frame.can_id in self._ours:
+                self._others_frames += 1
 
     def send(self, can_id: int, data: bytes) -> None:
         """Queue the torque frame; a full queue is counted and seen in `faults`."""
@@ -63,6 +68,14 @@ class Exchange:
     def heartbeat(self) -> None:
         """The master's heartbeat: when this process dies, the drive notices."""
         self._bus.send(self._heartbeat_id, _OPERATIONAL)
+
+    def stop_drive(self) -> None:
+        """NMT stop to the amplifier."""
+        self._bus.send(NMT_ID, bytes((NmtCommand.STOP, self._amplifier_id)))
+
+    def make_drive_answer(self) -> None:
+        """NMT pre-operational to the amplifier: no PDO, but SDO."""
+        self._bus.send(NMT_ID, bytes((NmtCommand.PRE_OPERATIONAL, self._amplifier_id)))
 
     def faults(self) -> int:
         """What is wrong with the bus, or was since the last call however shortly, as fault bits."""
@@ -76,6 +89,9 @@ class Exchange:
         if counters.queue_full != self._queue_full:
             self._queue_full = counters.queue_full
             faults |= _QUEUE_FULL
+        if self._others_frames:
+            self._others_frames = 0
+            faults |= _SECOND_MASTER
         return faults
 
     def counts(self) -> tuple[int, int]:
@@ -95,6 +111,8 @@ class Exchange:
                 self.late_frames += 1
             elif receiver is not None:
                 receiver.on_frame(frame.can_id, frame.data, self.sync_ns)
+            elif frame.can_id in self._ours:
+                self._others_frames += 1
 
 
 def _synchronous_ids(plan: NodePlan) -> frozenset[int]:
