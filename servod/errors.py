@@ -9,6 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum
 
+#: Longest part of a message; what stood in a file may be of any length.
+_MOST_SHOWN = 600
+
 
 class ServodError(Exception):
     """Base of all errors that a command reports in one line; `exit_code` is what the process returns."""
@@ -32,7 +35,15 @@ class BadInput(ServodError):
 
     def __init__(self, where: str, found: object, allowed: str) -> None:
         self.where, self.found, self.allowed = where, found, allowed
-        super().__init__(f"{where}: found {found}; allowed: {allowed}".replace("\n", " "))
+        super().__init__(f"{one_line(where)}: found {one_line(found)}; allowed: {one_line(allowed)}")
+
+
+def one_line(part: object) -> str:
+    """A part of a message that may come from outside: of bounded length, with nothing that acts on a terminal."""
+    text = " ".join(str(part).split())
+    if len(text) > _MOST_SHOWN:
+        text = f"{text[: _MOST_SHOWN - 80]} ... {text[-70:]}"
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 class Unreachable(ServodError):

@@ -9,13 +9,17 @@ from __future__ import annotations
 import difflib
 import json
 import re
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from servod.errors import BadInput
+from servod.files import read_text
+
+__all__ = ["Dumper", "Strict", "load_model", "parse_yaml", "read_text", "validate"]
 
 _FLOAT = re.compile(
     r"^[-+]?(?:(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|\.(?:inf|Inf|INF))$|^\.(?:nan|NaN|NAN)$"
@@ -23,12 +27,55 @@ _FLOAT = re.compile(
 _INT = re.compile(r"^(?:[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+)$")
 _BOOL = re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$")
 _NULL = re.compile(r"^(?:~|null|Null|NULL|)$")
+#: Digits of the longest number; no float has more that count.
+_LONGEST_NUMBER = 400
+
+
+#: Longest text that is taken for one of servod's YAML files; the longest that it writes itself have 100 KiB.
+_MOST_CHARACTERS = 1024 * 1024
+#: Most values in a document, each alias counted with all that it stands for: a few lines of aliases mean billions.
+_MOST_VALUES = 100_000
+#: Most brackets within brackets.
+_DEEPEST = 50
 
 
 class _Loader(yaml.SafeLoader):
-    """SafeLoader with the core schema of YAML 1.2 (section 10.3) and without duplicate keys."""
+    """SafeLoader with the core schema of YAML 1.2 (section 10.3) alone, without duplicate keys, and of bounded size."""
 
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012  (PyYAML's own class attribute, replaced as a whole)
+    yaml_constructors: ClassVar[dict[Any, Any]] = {
+        tag: constructor
+        for tag, constructor in yaml.SafeLoader.yaml_constructors.items()
+        if tag is None or tag.rpartition(":")[2] in ("null", "bool", "int", "float", "str", "seq", "map")
+    }
+
+    def __init__(self, stream: str) -> None:
+        super().__init__(stream)
+        self._depth = self._nodes = 0
+        self._values: dict[int, int] = {}  # of each finished node, by its identity
+
+    def _mark(self) -> yaml.Mark:
+        mark: yaml.Mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
+        return mark
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """One node, counted; an alias of a node that is not finished stands within itself."""
+        if self.check_event(yaml.AliasEvent):
+            mark = self._mark()
+            node = super().compose_node(parent, index)
+            if id(node) not in self._values:
+                raise yaml.composer.ComposerError(None, None, "an alias within what it stands for", mark)
+            return node
+        mark = self._mark()
+        self._depth, self._nodes = self._depth + 1, self._nodes + 1
+        if self._depth > _DEEPEST:
+            raise yaml.composer.ComposerError(None, None, f"more than {_DEEPEST} brackets within each other", mark)
+        node = super().compose_node(parent, index) if self._nodes <= _MOST_VALUES else None
+        self._depth -= 1
+        self._values[id(node)] = count = 1 + sum(self._values[id(part)] for part in _parts(node))
+        if max(count, self._nodes) > _MOST_VALUES:
+            raise yaml.composer.ComposerError(None, None, f"more than {_MOST_VALUES} values", mark)
+        return node
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen: set[Any] = set()
@@ -42,14 +89,35 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def _construct_int(loader: yaml.SafeLoader, node: yaml.ScalarNode) -> int:
-    text = loader.construct_scalar(node)
+def _parts(node: yaml.Node | None) -> Iterator[yaml.Node]:
+    """What stands directly in a node."""
+    if isinstance(node, yaml.SequenceNode):
+        yield from node.value
+    elif isinstance(node, yaml.MappingNode):
+        for key, value in node.value:
+            yield from (key, value)
+
+
+def _scalar(loader: yaml.SafeLoader, node: yaml.Node, pattern: re.Pattern[str], what: str) -> str:
+    """Text of a scalar of the core schema; a tag may stand before any text, and before what is no scalar."""
+    text = loader.construct_scalar(node) if isinstance(node, yaml.ScalarNode) else ""
+    if not pattern.match(text) or len(text) > _LONGEST_NUMBER:
+        raise yaml.constructor.ConstructorError(None, None, f"{text[:40]!r}, which is no {what}", node.start_mark)
+    return str(text)
+
+
+def _construct_bool(loader: yaml.SafeLoader, node: yaml.Node) -> bool:
+    return _scalar(loader, node, _BOOL, "boolean").lower() == "true"
+
+
+def _construct_int(loader: yaml.SafeLoader, node: yaml.Node) -> int:
+    text = _scalar(loader, node, _INT, "integer")
     base = {"0x": 16, "0o": 8}.get(text[:2].lower(), 10)
     return int(text[2:] if base != 10 else text, base)
 
 
-def _construct_float(loader: yaml.SafeLoader, node: yaml.ScalarNode) -> float:
-    text = loader.construct_scalar(node).lower()
+def _construct_float(loader: yaml.SafeLoader, node: yaml.Node) -> float:
+    text = _scalar(loader, node, _FLOAT, "number").lower()
     return float(text.replace(".inf", "inf").replace(".nan", "nan"))
 
 
@@ -60,6 +128,7 @@ for _tag, _pattern, _first in (
     ("float", _FLOAT, list("-+.0123456789")),
 ):
     _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", _pattern, _first)
+_Loader.add_constructor("tag:yaml.org,2002:bool", _construct_bool)
 _Loader.add_constructor("tag:yaml.org,2002:int", _construct_int)
 _Loader.add_constructor("tag:yaml.org,2002:float", _construct_float)
 
@@ -81,25 +150,15 @@ M = TypeVar("M", bound=BaseModel)
 
 def parse_yaml(text: str, where: str) -> Any:
     """Parse one YAML 1.2 document; raises BadInput naming `where` and the line."""
+    if len(text) > _MOST_CHARACTERS:
+        raise BadInput(where, f"{len(text)} characters", f"a YAML file of at most {_MOST_CHARACTERS} characters")
     try:
         return yaml.load(text, Loader=_Loader)  # noqa: S506  (a SafeLoader)
     except yaml.MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else "?"
         raise BadInput(f"{where}: line {line}", error.problem or "broken YAML", "a YAML 1.2 mapping") from None
     except (yaml.YAMLError, ValueError) as error:
-        raise BadInput(where, str(error).splitlines()[0], "a YAML 1.2 mapping") from None
-    except RecursionError:
-        raise BadInput(where, "brackets nested without end", "a YAML 1.2 mapping") from None
-
-
-def read_text(path: str | Path) -> str:
-    """The file's text; raises BadInput when it is missing, unreadable or not UTF-8."""
-    try:
-        return Path(path).read_text(encoding="utf-8")
-    except UnicodeDecodeError:
-        raise BadInput(str(path), "bytes that are not UTF-8", "a text file") from None
-    except OSError as error:
-        raise BadInput(str(path), error.strerror or str(error), "a readable file") from None
+        raise BadInput(where, (str(error).splitlines() or ["broken YAML"])[0], "a YAML 1.2 mapping") from None
 
 
 def load_model(path: str | Path, model: type[M]) -> M:
@@ -114,11 +173,21 @@ def validate(data: Any, model: type[M], where: str) -> M:
     enumeration from its text, as pydantic's strict mode does not from Python objects.
     """
     if not isinstance(data, dict):
-        raise BadInput(where, f"{type(data).__name__} at the top", "a mapping of keys")
+        raise BadInput(where, f"{plain_name(data)} at the top", "a mapping of keys")
     try:
         return model.model_validate_json(json.dumps(data, default=str), strict=True)
     except ValidationError as error:
         raise _bad_input(error, model, data, where) from None
+    except RecursionError:
+        raise BadInput(where, "brackets nested without end", "a mapping of keys") from None
+
+
+def plain_name(value: Any) -> str:
+    """What kind of value stands in a file, in words of the file and not of Python."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    known = {dict: "a mapping", list: "a list", str: "text", int: "a number", float: "a number"}
+    return known.get(type(value), "nothing")
 
 
 def _bad_input(error: ValidationError, model: type[BaseModel], data: Any, where: str) -> BadInput:
@@ -134,8 +203,20 @@ def _bad_input(error: ValidationError, model: type[BaseModel], data: Any, where:
         return BadInput(f"{where}: {key}", "an unknown key", _known_keys(model, first["loc"]))
     if first["type"] == "missing":
         return BadInput(f"{where}: {key}", "nothing", "a value; this key is required")
-    message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+    if first["type"] == "json_invalid":
+        return BadInput(where, first["ctx"]["error"], "text of whole Unicode characters")
+    message = _ALLOWED.get(first["type"]) or _PYDANTIC_WORDS.sub("", first["msg"])
     return BadInput(f"{where}: {key}", _found(first["input"], message), message)
+
+
+_PYDANTIC_WORDS = re.compile(
+    r"^Value error, |^Input should be |^(?:String|List|Dictionary) should have | after validation"
+)
+#: What to say of pydantic's kinds of mistakes whose own words speak of Python.
+_ALLOWED = {
+    **dict.fromkeys(("model_type", "model_attributes_type", "dict_type"), "a mapping of keys"),
+    **{"list_type": "a list", "string_type": "text", "bool_type": "true or false", "path_type": "a path"},
+}
 
 
 def _found(value: Any, message: str) -> str:
@@ -144,7 +225,7 @@ def _found(value: Any, message: str) -> str:
         named = [f"{key}: {item}" for key, item in value.items() if str(key) in message]
         if named:
             return ", ".join(named)[:80]
-    return repr(value)[:80]
+    return plain_name(value) if isinstance(value, bool | dict | list | None) else repr(value)[:80]
 
 
 def _file_path(loc: tuple[int | str, ...], data: Any, ends_in_key: bool) -> list[str]:
