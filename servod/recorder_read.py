@@ -8,26 +8,35 @@ from __future__ import annotations
 
 import array
 import json
+import os
 import re
 import struct
 import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import zstandard
 from mcap.exceptions import InvalidMagic, McapError
-from mcap.records import Attachment, Channel, Footer, Message, Schema
-from mcap.stream_reader import CRCValidationError, StreamReader
+from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Message, Schema
+from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 
 from servod.errors import BadInput
+from servod.files import open_file
 from servod.record import CDR_HEADER, CycleRecord
 from servod.recorder_mcap import CYCLE_TOPIC, EVENT_TOPIC
 
+_TIME = "time_ns"
 _KINDS = {"float64": "d", "int64": "q"}
 _LINE = re.compile(r"^(float64|int64) (\w+)  # \[([^]]*)\]")
 _RECORD_LIMIT_BYTES = 64 * 1024 * 1024
-_BROKEN = (McapError, CRCValidationError, struct.error, zlib.error, zstandard.ZstdError, ValueError, EOFError, KeyError)
+#: Most that a file may hold unpacked; a few kilobytes can claim any amount.
+_UNPACKED_LIMIT_BYTES = 4 * 1024**3
+_BROKEN = (
+    *(McapError, CRCValidationError, struct.error, zlib.error, zstandard.ZstdError, ValueError, EOFError, KeyError),
+    *(OverflowError, RecursionError),
+)
 
 
 @dataclass
@@ -35,7 +44,7 @@ class Recording:
     """A recording in memory: `rows` holds the cycle records one behind the other, eight bytes for each name.
 
     `kinds` has one letter per name, "d" (float64) or "q" (int64), little endian; `truncated` tells that the file
-    ends without its footer, as after kill -9.
+    ends without its footer, as after kill -9, or is damaged; `damage` says then where, and what could be read.
     """
 
     names: tuple[str, ...] = ()
@@ -45,6 +54,7 @@ class Recording:
     attachments: dict[str, bytes] = field(default_factory=dict)
     events: list[dict[str, Any]] = field(default_factory=list)
     truncated: bool = True
+    damage: str = ""
 
     def __len__(self) -> int:
         return len(self.rows) // self.row_bytes if self.names else 0
@@ -76,15 +86,28 @@ def read_recording(path: str | Path) -> Recording:
     """The recording at `path`. Raises BadInput when it is missing or no recording of servod's at all."""
     recording = Recording()
     try:
-        with Path(path).open("rb") as stream:
-            _read_stream(StreamReader(stream, validate_crcs=True, record_size_limit=_RECORD_LIMIT_BYTES), recording)
+        with open_file(path) as stream:
+            reader = StreamReader(stream, validate_crcs=True, emit_chunks=True, record_size_limit=_RECORD_LIMIT_BYTES)
+            _read_stream(reader, recording)
+            _tell_damage(recording, stream.tell(), os.fstat(stream.fileno()).st_size)
     except InvalidMagic:
         raise BadInput(str(path), "a file that is not MCAP", "a recording of servod (.mcap)") from None
     except OSError as error:
         raise BadInput(str(path), error.strerror or str(error), "a readable recording") from None
     if not recording.names:
-        raise BadInput(str(path), f"no topic {CYCLE_TOPIC}", "a recording of servod (.mcap)")
+        found = f"no topic {CYCLE_TOPIC}" + (f" ({recording.damage})" if recording.damage else "")
+        raise BadInput(str(path), found, "a recording of servod (.mcap)")
+    if (_TIME, "q") not in zip(recording.names, recording.kinds, strict=True):
+        raise BadInput(f"{path}: {CYCLE_TOPIC}", f"no field int64 {_TIME}", "a recording of servod (.mcap)")
     return recording
+
+
+def _tell_damage(recording: Recording, read_bytes: int, all_bytes: int) -> None:
+    """Say where a file that has no end breaks off."""
+    if recording.truncated:
+        what = "cut off" if read_bytes >= all_bytes else "damaged"
+        readable = f"{len(recording)} cycles could be read, from the first {read_bytes} of {all_bytes} bytes"
+        recording.damage = f"the file is {what}: {readable}"
 
 
 def _read_stream(reader: StreamReader, recording: Recording) -> None:
@@ -93,7 +116,7 @@ def _read_stream(reader: StreamReader, recording: Recording) -> None:
     topics: dict[int, str] = {}
     started = False
     try:
-        for record in reader.records:
+        for record in _unpacked(reader):
             started = True
             if isinstance(record, Footer):
                 recording.truncated = False
@@ -113,6 +136,27 @@ def _read_stream(reader: StreamReader, recording: Recording) -> None:
             raise InvalidMagic((0,) * 8) from None
 
 
+def _unpacked(reader: StreamReader) -> Iterator[McapRecord]:
+    """All records, those in chunks too. Raises ValueError on a chunk that claims more than any recording has."""
+    left_bytes = _UNPACKED_LIMIT_BYTES
+    for record in reader.records:
+        if not isinstance(record, Chunk):
+            yield record
+            continue
+        size = max(record.uncompressed_size, _claimed_bytes(record))
+        left_bytes -= size
+        if size > _RECORD_LIMIT_BYTES or left_bytes < 0:
+            raise ValueError(f"a chunk of {size} bytes")
+        yield from breakup_chunk(record, validate_crc=True)
+
+
+def _claimed_bytes(chunk: Chunk) -> int:
+    """How much the packed data says that it unpacks to. Raises ValueError for a packing that servod does not write."""
+    if chunk.compression not in ("", "zstd"):
+        raise ValueError(f"compression {chunk.compression}")
+    return max(zstandard.frame_content_size(chunk.data), 0) if chunk.compression else len(chunk.data)
+
+
 def _take_channel(channel: Channel, schemas: dict[int, Schema], recording: Recording) -> None:
     if channel.topic == CYCLE_TOPIC and not recording.names:
         fields = [_LINE.match(line) for line in schemas[channel.schema_id].data.decode().splitlines()]
@@ -129,4 +173,6 @@ def _take(record: object, topics: dict[int, str], recording: Recording) -> None:
         if len(record.data) == len(CDR_HEADER) + recording.row_bytes:
             recording.rows += record.data[len(CDR_HEADER) :]
     elif isinstance(record, Message) and topics.get(record.channel_id) == EVENT_TOPIC:
-        recording.events.append(json.loads(record.data))
+        event = json.loads(record.data)
+        if isinstance(event, dict):
+            recording.events.append(event)

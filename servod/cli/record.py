@@ -64,6 +64,6 @@ def export(
         raise BadInput(f"--out {out}", repr(out.suffix), " or ".join(writers))
     recording = read_recording(file)
     rows = writers[out.suffix](recording, out)
-    cut = ", which ends in the middle of a record" if recording.truncated else ""
-    result = {"path": str(out), "rows": rows, "truncated": recording.truncated}
+    cut = f"; {recording.damage}" if recording.damage else ""
+    result = {"path": str(out), "rows": rows, "truncated": recording.truncated, "damage": recording.damage}
     report(result, f"wrote {out}: {rows} cycles of {file}{cut}", as_json)

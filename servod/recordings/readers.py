@@ -1,12 +1,14 @@
 """Reads a foreign file into named columns of numbers: CSV, CSV.gz, Parquet, MAT v5, and the daemon's MCAP.
 
 The first step behind the file; `columns` names, `recording` checks and repairs. One reader for each format, chosen by
-the file's suffix from one table.
+the file's suffix from one table. Whatever stands in a file, reading it takes bounded memory.
 """
 
 from __future__ import annotations
 
 import gzip
+import io
+import zlib
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -15,18 +17,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.errors import BadInput
+from servod.files import open_file
+from servod.recordings.mat import BrokenMatError, vectors
 
 Array = NDArray[np.float64]
-Reader = Callable[[Path], dict[str, Any]]
+#: Columns of the file at a path; what is to be told of it goes to the list.
+Reader = Callable[[Path, list[str]], dict[str, Any]]
 
 #: Longest header line of a CSV that is looked at to find its separator.
 _HEADER_BYTES = 65536
+#: Largest recording, packed and unpacked, and most numbers in it: a day of three columns at 1 kHz.
+_MOST_BYTES = 1024**3
+_MOST_CELLS = 260_000_000
 
 
-def read_columns(path: Path) -> dict[str, Any]:
-    """Columns of the file by name: float arrays, or arrow arrays of text where a column is not all numbers.
+def read_columns(path: Path) -> tuple[dict[str, Any], list[str]]:
+    """Columns of the file by name, and what is to be told of the file in plain sentences.
 
-    `numbers` turns one into floats. Raises BadInput for a missing, empty, broken or unknown file.
+    A column is a float array, or an arrow array of text where it is not all numbers; `numbers` turns one into floats.
+    Raises BadInput for a missing, empty, broken or unknown file.
     """
     if not path.is_file():
         raise BadInput(str(path), "no such file" if not path.exists() else "no file", "a recording")
@@ -34,19 +43,42 @@ def read_columns(path: Path) -> dict[str, Any]:
     reader = next((reader for suffix, reader in READERS.items() if name.endswith(suffix)), None)
     if reader is None:
         raise BadInput(str(path), f"suffix {path.suffix!r}", "a recording: " + ", ".join(READERS))
+    notes: list[str] = []
     try:
-        columns = reader(path)
+        columns = reader(path, notes)
     except OSError as error:
         raise BadInput(str(path), error.strerror or str(error), "a readable recording") from None
     if not columns:
         raise BadInput(str(path), "no columns", "a recording with named columns")
-    return columns
+    return columns, notes
+
+
+def _bounded(path: Path) -> bytes:
+    """The whole file, unpacked where it is packed. Raises BadInput when that is more than any recording."""
+    with open_file(path) as packed:
+        stream = gzip.GzipFile(fileobj=packed) if path.name.lower().endswith(".gz") else packed
+        try:
+            content = stream.read(_MOST_BYTES + 1)
+        except (gzip.BadGzipFile, EOFError, zlib.error) as error:
+            raise BadInput(str(path), str(error), "a gzip file that is whole") from None
+    if len(content) > _MOST_BYTES:
+        raise BadInput(str(path), f"more than {_MOST_BYTES} bytes", "a smaller recording, or one in parts")
+    return content
 
 
 def numbers(column: Any, path: Path, name: str) -> Array:
     """A column as float64, NaN where a cell is empty. Raises BadInput naming the first cell that is no number."""
     if isinstance(column, np.ndarray):
         return column.astype(np.float64)
+    import pyarrow as pa
+
+    try:
+        return _converted(column, path, name)
+    except (pa.ArrowException, ValueError, OverflowError):
+        raise BadInput(f"{path}: column {name}", f"values of type {column.type}", "numbers") from None
+
+
+def _converted(column: Any, path: Path, name: str) -> Array:
     import pyarrow as pa
 
     if pa.types.is_boolean(column.type):
@@ -67,34 +99,28 @@ def _parsed(cells: Iterable[object], path: Path, name: str) -> Array:
     return np.array(values)
 
 
-def _read_csv(path: Path) -> dict[str, Any]:
+def _read_csv(path: Path, _notes: list[str]) -> dict[str, Any]:
     import pyarrow as pa
     import pyarrow.csv as pc
 
-    header = _header(path)
+    content = _bounded(path)
+    header = _header(content, path)
     separator = max(",;\t", key=header.count)
     names = [name.strip().strip('"') for name in header.rstrip("\r\n").split(separator)]
-    repeated = sorted({name for name in names if names.count(name) > 1})
-    if repeated:
-        raise BadInput(f"{path}: column {repeated[0]}", "the same name twice", "one column of each name")
+    _refuse_repeated(names, path)
     try:
         table = pc.read_csv(
-            path,
+            pa.BufferReader(content),
             read_options=pc.ReadOptions(column_names=names, skip_rows=1),
             parse_options=pc.ParseOptions(delimiter=separator),
         )
-    except (pa.ArrowInvalid, OSError) as error:
-        raise BadInput(str(path), str(error).splitlines()[0], "rows with as many cells as the header") from None
+    except pa.ArrowException as error:
+        raise BadInput(str(path), _first_line(error), "rows with as many cells as the header") from None
     return {name: table.column(name).combine_chunks() for name in names}
 
 
-def _header(path: Path) -> str:
-    opener = gzip.open if path.name.lower().endswith(".gz") else open
-    try:
-        with opener(path, "rb") as stream:
-            line = stream.readline(_HEADER_BYTES)
-    except (gzip.BadGzipFile, EOFError) as error:
-        raise BadInput(str(path), str(error), "a gzip file that is whole") from None
+def _header(content: bytes, path: Path) -> str:
+    line = io.BytesIO(content).readline(_HEADER_BYTES)
     try:
         text = line.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -104,51 +130,46 @@ def _header(path: Path) -> str:
     return text
 
 
-def _read_parquet(path: Path) -> dict[str, Any]:
+def _refuse_repeated(names: list[str], path: Path) -> None:
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise BadInput(f"{path}: column {repeated[0]}", "the same name twice", "one column of each name")
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or ["a broken file"])[0]
+
+
+def _read_parquet(path: Path, _notes: list[str]) -> dict[str, Any]:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
-        table = pq.read_table(path)
+        file = pq.ParquetFile(pa.BufferReader(_bounded(path)))
+        cells = file.metadata.num_rows * file.metadata.num_columns
+        if cells > _MOST_CELLS:
+            raise BadInput(str(path), f"{cells} numbers", f"at most {_MOST_CELLS}")
+        table = file.read()
     except (pa.ArrowException, OSError) as error:
-        raise BadInput(str(path), str(error).splitlines()[0], "a Parquet file") from None
+        raise BadInput(str(path), _first_line(error), "a Parquet file") from None
+    _refuse_repeated(table.column_names, path)
     return {name: table.column(name).combine_chunks() for name in table.column_names}
 
 
-def _read_mat(path: Path) -> dict[str, Any]:
-    from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
-
+def _read_mat(path: Path, _notes: list[str]) -> dict[str, Any]:
     try:
-        content = loadmat(path, simplify_cells=True)
-    except NotImplementedError:
-        raise BadInput(str(path), "a MAT file of version 7.3", "MAT v5: save('file.mat', '-v7')") from None
-    except (MatReadError, ValueError, TypeError, EOFError) as error:
-        raise BadInput(str(path), str(error).splitlines()[0] or "a broken file", "a MAT v5 file") from None
-    return dict(_vectors(content, ""))
+        return dict(vectors(_bounded(path)))
+    except BrokenMatError as error:
+        raise BadInput(str(path), str(error), "MAT v5: save('file.mat', '-v7')") from None
 
 
-def _vectors(content: dict[str, Any], prefix: str) -> Iterable[tuple[str, Array]]:
-    """Numeric vectors of a MAT file by name; members of a struct as `struct.member`."""
-    for name, value in content.items():
-        if name.startswith("__"):
-            continue
-        if isinstance(value, dict):
-            yield from _vectors(value, f"{prefix}{name}.")
-        elif (
-            isinstance(value, np.ndarray)
-            and value.size > 1
-            and value.dtype.kind in "biuf"
-            and value.size == max(value.shape)
-        ):
-            yield f"{prefix}{name}", value.ravel().astype(np.float64)
-
-
-def _read_mcap(path: Path) -> dict[str, Any]:
+def _read_mcap(path: Path, notes: list[str]) -> dict[str, Any]:
     from servod.recorder_export import seconds
     from servod.recorder_read import read_recording
 
     recording = read_recording(path)
+    if recording.damage:
+        notes.append(recording.damage)
     columns: dict[str, Any] = {name: np.asarray(recording.column(name), dtype=np.float64) for name in recording.names}
     columns["t_s"] = np.asarray(seconds(recording))
     return columns

@@ -96,7 +96,7 @@ def load_recording(path: str | Path, map_path: str | Path | None = None) -> Reco
     Raises BadInput naming file and column.
     """
     path = Path(path)
-    foreign = read_columns(path)
+    foreign, report = read_columns(path)
     sources = load_column_map(Path(map_path)) if map_path is not None else {}
     chosen, unused = apply_map(foreign, sources, str(path))
     axis = axis_of(chosen, foreign, str(path))
@@ -106,7 +106,8 @@ def load_recording(path: str | Path, map_path: str | Path | None = None) -> Reco
         if source is not None:
             values = numbers(foreign[source.source], path, source.source)
             columns[quantity] = source.scale * values + source.offset
-    report = [f"columns not used: {', '.join(unused)}"] if unused else []
+    if unused:
+        report.append(f"columns not used: {', '.join(unused)}")
     return _checked(path, axis, columns, report)
 
 
