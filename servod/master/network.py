@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable
 import canopen
 
 from servod.bus import CAN_EFF_FLAG, CAN_RTR_FLAG, Bus
+from servod.cia import LSS_FROM_SLAVE_ID
 from servod.clock import Clock
 from servod.errors import Unreachable
 from servod.units import NS_PER_S
@@ -24,6 +25,7 @@ class BusNetwork(canopen.Network):
 
     def __init__(self, bus: Bus, clock: Clock, threaded: bool) -> None:
         super().__init__()
+        self.unsubscribe(LSS_FROM_SLAVE_ID)  # canopen's own LSS master, which nobody asks, would keep every answer
         self._servod_bus = bus
         self.clock = clock
         self._arrived = threading.Condition()

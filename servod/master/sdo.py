@@ -23,6 +23,12 @@ from servod.master.network import BusNetwork
 
 #: Seconds to wait for the answer to one frame.
 SDO_TIMEOUT_S = 0.6
+#: Frames of SDO are never shorter or longer (CiA 301, 7.2.4.3).
+_FRAME_BYTES = 8
+#: More answers than this wait for nobody; more in one transfer come from a node that never ends it.
+_MOST_WAITING, _MOST_ANSWERS = 64, 40_000
+#: Longest number of CiA 301.
+_MOST_NUMBER_BYTES = 8
 _ABORT_REQUEST = struct.Struct("<BHBL")
 _ABORT_COMMAND = 0x80
 
@@ -63,7 +69,7 @@ class _Answers(queue.Queue[bytes]):
     def __init__(self, network: BusNetwork) -> None:
         super().__init__()
         self._network = network
-        self._answers: deque[bytes] = deque()
+        self._answers: deque[bytes] = deque(maxlen=_MOST_WAITING)
 
     def put(self, item: bytes, block: bool = True, timeout: float | None = None) -> None:
         """Take an answer; called by the network's dispatch."""
@@ -94,6 +100,26 @@ class _Client(SdoClient):
         super().__init__(SDO_REQUEST_BASE + node_id, SDO_ANSWER_BASE + node_id, dictionary)  # type: ignore[no-untyped-call]
         self.network = network
         self.current = (0, 0)
+        self._answered = 0
+
+    def begin(self, index: int, subindex: int) -> None:
+        """A new transfer, of this object; what is left of the last one goes."""
+        self._answers.clear()
+        self.current, self._answered = (index, subindex), 0
+
+    def on_response(self, can_id: int, data: bytearray, timestamp: float) -> None:
+        """An answer of the server; what is too short or long for one is none."""
+        if len(data) == _FRAME_BYTES:
+            self._answers.put(bytes(data))
+
+    def read_response(self) -> bytes:
+        """The next answer. Raises SdoAbortedError, SdoCommunicationError."""
+        self._answered += 1
+        if self._answered > _MOST_ANSWERS:
+            self.abort(Abort.OUT_OF_MEMORY)
+            raise SdoCommunicationError(f"no end after {_MOST_ANSWERS} frames")
+        answer: bytes = super().read_response()  # type: ignore[no-untyped-call]
+        return answer
 
     @property
     def responses(self) -> _Answers:
@@ -128,6 +154,8 @@ class NodeSdo:
     def read(self, index: int, subindex: int = 0) -> int:
         """Upload an integer, signed as the EDS says. Raises Unreachable on time-out, SdoAbort on an abort."""
         data = self.read_bytes(index, subindex)
+        if len(data) > _MOST_NUMBER_BYTES:
+            raise Unreachable(f"{self._where(index, subindex)}: {len(data)} bytes came where a number stands")
         variable = self.variable(index, subindex)
         signed = variable is not None and variable.data_type in datatypes.SIGNED_TYPES
         if variable is not None and variable.fixed_size and 8 * len(data) < len(variable):
@@ -162,8 +190,7 @@ class NodeSdo:
     def _transfer(self, index: int, subindex: int, verb: str, transfer: Any) -> Any:
         with self._lock:
             self._network.drain()  # an answer that came too late must not be taken for the next one
-            self._client.responses.clear()
-            self._client.current = (index, subindex)
+            self._client.begin(index, subindex)
             try:
                 return transfer()
             except SdoAbortedError as abort:
