@@ -16,7 +16,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from servod.errors import AnswerIsNo, BadInput, ServodError, Unreachable
+from servod.errors import AnswerIsNo, BadInput, ServodError, Unreachable, one_line
 
 #: Longest request; a longer one ends the connection. A gain set with its design and proofs takes 100 KiB.
 MAX_LINE_BYTES = 512 * 1024
@@ -182,5 +182,9 @@ def _result(answer: dict[str, Any]) -> dict[str, Any]:
     if answer.get("ok"):
         result = answer.get("result")
         return result if isinstance(result, dict) else {}
-    error = answer.get("error") or {}
-    raise _ERRORS.get(int(error.get("exit_code", 3)), Unreachable)(str(error.get("message", "refused")))
+    error = answer.get("error")
+    if not isinstance(error, dict):
+        raise Unreachable("the daemon refused and gave no reason")
+    code = error.get("exit_code")
+    kind = _ERRORS.get(code, Unreachable) if isinstance(code, int) else Unreachable
+    raise kind(one_line(error.get("message", "refused")))
