@@ -33,6 +33,7 @@ from servod.cli import (
     record,
     replay,
     scan,
+    soak,
     status,
     stop,
     synthesize,
@@ -53,7 +54,7 @@ app = typer.Typer(
 )
 _DAEMON = (demo, scan, status, enable, stop, track, gains, preset, record)
 _LABORATORY = (identify, synthesize, verify, deploy, commission, replay, diagnose, explain, prove, paper)
-for _verb in (*_DAEMON, *_LABORATORY, bench, check, faults):
+for _verb in (*_DAEMON, *_LABORATORY, soak, bench, check, faults):
     _verb.register(app)
 
 

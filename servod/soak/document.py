@@ -1,0 +1,98 @@
+"""The document of a soak, as JSON has it: of one run, and of several added up.
+
+Behind the run; `page` and `table` show it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from servod.soak.counts import SoakedAxis
+from servod.soak.memory import LIMIT_KB_PER_H, Memory
+from servod.soak.tally import median_ms
+
+_CURVE_POINTS = 200
+_NS_PER_H = 3.6e12
+_ADDED = (
+    *("cycles", "rows", "missed", "syncs", "syncs_taken", "drive_samples", "recordings", "rows_read_back", "episodes"),
+    *("restarts", "faults_injected", "faults_found", "faults_recovered", "axis_hours"),
+)
+
+
+def document(axis: SoakedAxis, memories: Mapping[str, Memory], wall_s: float) -> dict[str, Any]:
+    """Everything of one run. It passed when nothing at all was wrong."""
+    counts, tally, findings = axis.counts, axis.tally, axis.findings
+    faults = tally.faults.values()
+    return {
+        "passed": not findings.counts,
+        "wall_s": round(wall_s, 1),
+        "axis_hours": counts.cycles * counts.period_ns / _NS_PER_H,
+        **{name: value for name, value in counts._asdict().items() if name != "period_ns"},
+        "episodes": tally.episodes,
+        "restarts": tally.restarts,
+        "faults_injected": sum(f.injected for f in faults),
+        "faults_found": sum(f.found for f in faults),
+        "faults_recovered": sum(f.recovered for f in faults),
+        "wrong": {str(kind): count for kind, count in findings.counts.items()},
+        "findings": [{**f._asdict(), "wrong": str(f.wrong)} for f in findings.told],
+        "faults": {name: fault.document() for name, fault in sorted(tally.faults.items())},
+        "moves": dict(tally.moves),
+        "endings": dict(tally.endings),
+        "gain_sets": dict(tally.laws),
+        "memory": [memory_document(name, memory) for name, memory in memories.items()],
+    }
+
+
+def memory_document(name: str, memory: Memory) -> dict[str, Any]:
+    """Memory and descriptors of one process."""
+    slope, curve = memory.slope(), memory.curve
+    step = max(1, len(curve) // _CURVE_POINTS)
+    return {
+        "process": name,
+        "growth": str(slope.growth),
+        "kb_per_h": _finite(slope.kb_per_h),
+        "interval_kb_per_h": [_finite(slope.low_kb_per_h), _finite(slope.high_kb_per_h)],
+        "limit_kb_per_h": LIMIT_KB_PER_H,
+        "descriptors_grow": memory.descriptors_grow(),
+        "curve": [[round(t, 1), round(kb), int(n)] for t, kb, n in curve[::step].tolist()],
+    }
+
+
+def added(documents: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Several independent runs as one: counts added, findings and memories side by side, the longest time."""
+    total: dict[str, Any] = {
+        "passed": all(d["passed"] for d in documents),
+        "interrupted": any(d["interrupted"] for d in documents),
+        "running": any(d["running"] for d in documents),
+        "wall_s": max(d["wall_s"] for d in documents),
+        **{name: sum(d[name] for d in documents) for name in _ADDED},
+        "findings": [finding for d in documents for finding in d["findings"]],
+        "memory": [memory for d in documents for memory in d["memory"]],
+    }
+    for name in ("wrong", "moves", "endings", "gain_sets"):
+        total[name] = dict(sum((Counter(d[name]) for d in documents), Counter()))
+    kinds = sorted({kind for d in documents for kind in d["faults"]})
+    total["faults"] = {k: _added_fault([d["faults"][k] for d in documents if k in d["faults"]]) for k in kinds}
+    return total
+
+
+def _added_fault(faults: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """One kind of fault of several runs."""
+    total: dict[str, Any] = {name: sum(f[name] for f in faults) for name in ("injected", "found", "recovered")}
+    total["latched"] = dict(sum((Counter(f["latched"]) for f in faults), Counter()))
+    for name in ("detected", "left_command", "torque_gone"):
+        bins = sum((Counter({int(place): n for place, n in f[name]["bins_ms"].items()}) for f in faults), Counter())
+        total[name] = {
+            "count": bins.total(),
+            "median_ms": median_ms(bins),
+            "largest_ms": max(f[name]["largest_ms"] for f in faults),
+            "bins_ms": {str(place): bins[place] for place in sorted(bins)},
+        }
+    return total
+
+
+def _finite(value: float) -> float | None:
+    return round(value, 1) if math.isfinite(value) else None

@@ -1,0 +1,152 @@
+"""Checks of the cycle records: every cycle one row, on its time, finite, in a state that belongs to the drive's.
+
+On the recording side of the data path. Batches of rows as numpy sees them; what must hold from batch to batch is kept.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servod.axis import AxisState
+from servod.errors import FAULTS, FaultCode, faults_in
+from servod.hal import DriveState
+from servod.record import FIELDS
+from servod.recordings.rows import ROW
+from servod.soak.finding import Findings, Wrong
+
+Rows = NDArray[np.void]
+
+#: The controller's own numbers, and those that stand for something in the world.
+_OWN = (
+    "torque_controller_nm",
+    "torque_feedback_nm",
+    "torque_friction_nm",
+    "torque_other_nm",
+    "friction_state",
+    "disturbance_nm",
+)
+_REAL = tuple(f.name for f in FIELDS if f.kind == "d" and f.name not in _OWN)
+_CONTROLLED = (AxisState.ENABLED, AxisState.BRAKING, AxisState.RAMPING)
+_OFF = (
+    *(DriveState.NOT_READY_TO_SWITCH_ON, DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON),
+    *(DriveState.FAULT_REACTION_ACTIVE, DriveState.FAULT),
+)
+#: Where the drive is when the axis has been in a state for longer than it takes the drive to answer.
+_SETTLED: dict[AxisState, tuple[DriveState, ...]] = {
+    AxisState.DISABLED: _OFF,
+    AxisState.ENABLING: (*_OFF, DriveState.SWITCHED_ON, DriveState.OPERATION_ENABLED),
+    **dict.fromkeys(_CONTROLLED, (DriveState.OPERATION_ENABLED,)),
+    AxisState.QUICK_STOPPING: (*_OFF, DriveState.QUICK_STOP_ACTIVE),
+    AxisState.FAULT: _OFF,
+}
+_BELONGS = np.zeros((len(AxisState), len(DriveState)), dtype=bool)
+for _axis, _drives in _SETTLED.items():
+    _BELONGS[_axis, list(_drives)] = True
+#: An answer of the drive is seen two SYNCs after the command, and a control word may be lost on the way.
+_ANSWER_CYCLES = 5
+_STAYS_POWERED, _NOT_FINITE = (FAULTS[c].bit for c in (FaultCode.DRIVE_STAYS_POWERED, FaultCode.NOT_FINITE))
+
+
+class RowCheck:
+    """Checks the rows of one axis; `cycles` and `rows` count what the loop numbered and what was recorded."""
+
+    def __init__(self, period_ns: int, torque_limit_nm: float, findings: Findings) -> None:
+        self._period_ns, self._limit_nm, self._findings = period_ns, torque_limit_nm * (1.0 + 1e-9), findings
+        self.cycles = self.rows = self.missed = 0
+        self._cycle = self._time_ns = self._missed_before = 0
+        self._astray = 0
+
+    def new_session(self) -> None:
+        """The next row is the first of a new loop."""
+        self._cycle = self._time_ns = self._missed_before = self._astray = 0
+
+    def check(self, rows: Rows, explained: int, answer_cycles: int = _ANSWER_CYCLES) -> None:
+        """One batch, oldest first. `explained`: the faults that may be seen; `answer_cycles`: how long drive and axis
+        may be in states that do not belong together."""
+        if not len(rows):
+            return
+        self._numbers(rows)
+        self._times(rows)
+        self._values(rows)
+        self._faults(rows, explained)
+        self._states(rows, answer_cycles)
+
+    def _numbers(self, rows: Rows) -> None:
+        """Cycle numbers grow by one and by what was missed: a gap is a lost row, a repetition one recorded twice."""
+        cycles, missed = rows["cycle"], rows["missed"]
+        steps = np.diff(cycles, prepend=self._cycle) - np.diff(missed, prepend=self._missed_before)
+        self.rows += len(rows)
+        self.cycles += int(cycles[-1]) - self._cycle
+        self.missed += int(missed[-1]) - self._missed_before
+        lost, double = steps[steps > 1], steps < 1
+        if len(lost):
+            at = int(np.argmax(steps > 1))
+            self._add(Wrong.LOST_ROW, rows, at, f"cycle {cycles[at]} follows a gap", int((lost - 1).sum()))
+        if double.any():
+            at = int(np.argmax(double))
+            self._add(Wrong.DOUBLE_ROW, rows, at, f"cycle {cycles[at]} comes again", int(double.sum()))
+        self._missed_before = int(missed[-1])
+
+    def _times(self, rows: Rows) -> None:
+        """Cycle k of a session stands at t0 + k * period, exactly."""
+        cycles, times = rows["cycle"], rows["time_ns"]
+        if self._time_ns == 0:
+            self._time_ns, self._cycle = int(times[0]), int(cycles[0])
+        off = times - (self._time_ns + (cycles - self._cycle) * self._period_ns)
+        wrong = off != 0
+        if wrong.any():
+            at = int(np.argmax(wrong))
+            self._add(Wrong.TIME, rows, at, f"cycle {cycles[at]} is {off[at]} ns off", int(wrong.sum()))
+        self._time_ns, self._cycle = int(times[-1]), int(cycles[-1])
+
+    def _values(self, rows: Rows) -> None:
+        """Finite numbers, but for the controller's own while NOT_FINITE is latched; torque only under control."""
+        bad, own = (functools.reduce(np.logical_or, [~np.isfinite(rows[n]) for n in names]) for names in (_REAL, _OWN))
+        told = (rows["faults"] | rows["faults_latched"]) & _NOT_FINITE != 0
+        self._first(Wrong.NOT_FINITE, rows, bad | (own & ~told), "a number that is not finite")
+        torque_nm = rows["torque_nm"]
+        self._first(Wrong.LIMIT, rows, np.abs(torque_nm) > self._limit_nm, "torque above limits.torque_nm")
+        uncontrolled = ~np.isin(rows["axis_state"], _CONTROLLED)
+        self._first(Wrong.TORQUE, rows, uncontrolled & (torque_nm != 0.0), "torque sent while not controlled")
+
+    def _faults(self, rows: Rows, explained: int) -> None:
+        """No fault is present or latched that the schedule does not explain."""
+        seen = int(np.bitwise_or.reduce(rows["faults"] | rows["faults_latched"])) & ~explained
+        if seen:
+            at = int(np.argmax((rows["faults"] | rows["faults_latched"]) & seen != 0))
+            names = ", ".join(f.code.name for f in faults_in(seen))
+            self._add(Wrong.UNEXPLAINED, rows, at, names)
+
+    def _states(self, rows: Rows, answer_cycles: int) -> None:
+        """Fresh words of the drive belong to the axis's state, but for as long as an answer takes."""
+        belongs = _BELONGS[rows["axis_state"], rows["drive_state"]]
+        astray = ~belongs & (rows["amplifier_age"] == 0) & (rows["faults_latched"] & _STAYS_POWERED == 0)
+        lengths = run_lengths(astray, self._astray)
+        self._astray = int(lengths[-1])
+        too_long = lengths == answer_cycles + 1
+        if too_long.any():
+            at = int(np.argmax(too_long))
+            axis, drive = AxisState(rows["axis_state"][at]).name, DriveState(rows["drive_state"][at]).name
+            self._add(Wrong.STATE, rows, at, f"axis {axis}, drive {drive}", int(too_long.sum()))
+
+    def _first(self, wrong: Wrong, rows: Rows, where: NDArray[np.bool_], text: str) -> None:
+        if where.any():
+            self._add(wrong, rows, int(np.argmax(where)), text, int(where.sum()))
+
+    def _add(self, wrong: Wrong, rows: Rows, at: int, text: str, count: int = 1) -> None:
+        self._findings.add(wrong, int(rows["time_ns"][at]), text, count)
+
+
+def rows_of(raw: bytes | bytearray) -> Rows:
+    """Packed cycle records as rows."""
+    return np.frombuffer(raw, dtype=ROW)
+
+
+def run_lengths(flags: NDArray[np.bool_], before: int) -> NDArray[np.int64]:
+    """At each place, how many true flags in a row end there; `before` of them came earlier."""
+    places = np.arange(1, len(flags) + 1)
+    last_false = np.maximum.accumulate(np.where(flags, -before, places))
+    return np.where(flags, places - last_false, 0)

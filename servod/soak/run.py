@@ -1,0 +1,103 @@
+"""Runs a soak: episode after episode until the amount, the time or the person says enough; the state goes to disk.
+
+Above the axis (stepped or wall); called by `servoctl soak`.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from servod.errors import AnswerIsNo
+from servod.report.files import write_bytes
+from servod.soak.counts import SoakedAxis
+from servod.soak.document import document
+from servod.soak.finding import Wrong
+from servod.soak.memory import Growth, Memory
+from servod.soak.plan import Episode
+
+#: Told one line on how it goes, and the share that is done.
+Tell = Callable[[str, float], None]
+DOCUMENT_NAME = "soak.json"
+_SAVE_S = 10.0
+
+
+@dataclass
+class Watch:
+    """The clock on the wall, and the memory of every process that belongs to the soak."""
+
+    limit_s: float
+    began_s: float = field(default_factory=time.monotonic)
+    memories: dict[str, Memory] = field(default_factory=dict)
+
+    @property
+    def elapsed_s(self) -> float:
+        """Time since the beginning."""
+        return time.monotonic() - self.began_s
+
+    def look(self, processes: dict[str, int]) -> None:
+        """Sample the memory of `processes`; one that was started anew is another one."""
+        for name, pid in processes.items():
+            memory = self.memories.get(name)
+            if memory is None or memory.pid != pid:
+                memory = self.memories[name] = Memory(pid)
+            memory.sample()
+
+
+def run(
+    axis: SoakedAxis, episodes: Iterable[Episode], cycles: int, limit_s: float, folder: Path, tell: Tell
+) -> dict[str, Any]:
+    """Soak for `cycles`, at the longest `limit_s`; Ctrl-C ends it early. The document is in `folder` all the time."""
+    watch, interrupted = Watch(limit_s), False
+    try:
+        _go_through(axis, episodes, cycles, watch, folder, tell)
+    except KeyboardInterrupt:
+        interrupted = True
+    except AnswerIsNo as error:
+        axis.findings.add(Wrong.NOT_RECOVERED, 0, str(error))
+    _judge_memory(axis, watch)
+    found = document(axis, watch.memories, watch.elapsed_s) | {"interrupted": interrupted, "running": False}
+    save(found, folder)
+    return found
+
+
+def save(found: dict[str, Any], folder: Path) -> None:
+    """Write the document, aside and whole."""
+    write_bytes(folder / DOCUMENT_NAME, json.dumps(found, indent=2, allow_nan=False).encode())
+
+
+def _go_through(
+    axis: SoakedAxis, episodes: Iterable[Episode], cycles: int, watch: Watch, folder: Path, tell: Tell
+) -> None:
+    next_save_s = _SAVE_S
+    watch.look(axis.processes())
+    for episode in episodes:
+        axis.episode(episode)
+        watch.look(axis.processes())
+        done, elapsed_s = axis.counts.cycles, watch.elapsed_s
+        tell(_line(axis, elapsed_s), max(done / cycles, elapsed_s / watch.limit_s))
+        if elapsed_s > next_save_s:
+            save(document(axis, watch.memories, elapsed_s) | {"interrupted": False, "running": True}, folder)
+            next_save_s = elapsed_s + _SAVE_S
+        if done >= cycles or elapsed_s >= watch.limit_s:
+            return
+
+
+def _line(axis: SoakedAxis, elapsed_s: float) -> str:
+    counts, faults = axis.counts, axis.tally.faults.values()
+    speed = counts.cycles * counts.period_ns / 1e9 / max(elapsed_s, 1e-9)
+    wrong = sum(axis.findings.counts.values())
+    return f"{counts.cycles / 1e6:.2f} M cycles, {speed:.1f}x, {sum(f.injected for f in faults)} faults, {wrong} wrong"
+
+
+def _judge_memory(axis: SoakedAxis, watch: Watch) -> None:
+    for name, memory in watch.memories.items():
+        slope = memory.slope()
+        if slope.growth is Growth.GROWS:
+            axis.findings.add(Wrong.MEMORY, 0, f"{name}: {slope.kb_per_h:.0f} kB/h")
+        if memory.descriptors_grow():
+            axis.findings.add(Wrong.DESCRIPTORS, 0, name)

@@ -1,0 +1,63 @@
+"""An independent witness of SYNC: its own place on the bus, its own count, held against the recorded rows.
+
+Beside the loop, which never sees it: what it hears has been on the bus.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servod.cia import SYNC_ID
+from servod.drivers.virtual.hub import Hub
+from servod.drivers.virtual.port import Port
+from servod.soak.finding import Findings, Wrong
+from servod.soak.rows import Rows
+
+
+class SyncListener:
+    """Hears every SYNC of the stepped bus."""
+
+    def __init__(self, hub: Hub) -> None:
+        self._times_ns: list[int] = []
+        hub.attach(Port("listener", self._heard))
+
+    def take(self) -> list[int]:
+        """Moments at which SYNC frames ended on the bus since the last call [ns]."""
+        times_ns, self._times_ns = self._times_ns, []
+        return times_ns
+
+    def _heard(self, can_id: int, _data: bytes, time_ns: int) -> None:
+        if can_id == SYNC_ID:
+            self._times_ns.append(time_ns)
+
+
+class SyncCheck:
+    """Every row has its SYNC on the bus within its period, and every SYNC its row.
+
+    `syncs` counts what was heard, `taken` the rows whose SYNC a fault of the schedule took.
+    """
+
+    def __init__(self, period_ns: int, findings: Findings) -> None:
+        self._period_ns, self._findings = period_ns, findings
+        self.syncs = self.taken = 0
+
+    def check(self, rows: Rows, heard_ns: list[int], may_be_taken: bool) -> None:
+        """One batch of whole cycles and the SYNCs that were heard meanwhile."""
+        self.syncs += len(heard_ns)
+        times_ns, heard = rows["time_ns"], np.array(heard_ns, dtype=np.int64)
+        # A row before all others takes what belongs to none of them.
+        starts = np.concatenate(([-self._period_ns], times_ns))
+        place = np.searchsorted(starts, heard, side="right") - 1
+        alone = heard - starts[place] >= self._period_ns
+        self._tell(heard, alone, "SYNC on the bus without a row")
+        counts = np.bincount(place[~alone], minlength=len(starts))[1:]
+        self._tell(times_ns, counts > 1, "row with more than one SYNC")
+        if may_be_taken:
+            self.taken += int((counts == 0).sum())
+        else:
+            self._tell(times_ns, counts == 0, "row without SYNC on the bus")
+
+    def _tell(self, times_ns: NDArray[np.int64], where: NDArray[np.bool_], text: str) -> None:
+        if where.any():
+            self._findings.add(Wrong.SYNC, int(times_ns[int(np.argmax(where))]), text, int(where.sum()))
