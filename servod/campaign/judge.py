@@ -38,9 +38,10 @@ def reaction(samples: list[DriveSample], injected_ns: int) -> Reaction:
     return Reaction(_ms(left, injected_ns), _ms(gone, injected_ns))
 
 
-def complaints(expected: Expectation, seen: Observation, times: Reaction) -> list[str]:
+def complaints(expected: Expectation, seen: Observation, times: Reaction, injected_ns: int) -> list[str]:
     """Everything in which the outcome differs from what was expected; empty when it passed."""
-    return [text for text in _complaints(expected, seen, times) if text]
+    states = {sample.state.name for sample in seen.samples if sample.time_ns > injected_ns}
+    return [text for text in (*_complaints(expected, seen, times), *_on_the_way(expected, states)) if text]
 
 
 def _complaints(expected: Expectation, seen: Observation, times: Reaction) -> list[str]:
@@ -53,6 +54,15 @@ def _complaints(expected: Expectation, seen: Observation, times: Reaction) -> li
         _refused(expected.refused, seen.refusal),
         "" if seen.lost_records <= expected.lost_records else f"{seen.lost_records} cycle records are missing",
         _commanded(seen),
+    ]
+
+
+def _on_the_way(expected: Expectation, states: set[str]) -> list[str]:
+    """The path by which the drive got there."""
+    missing, unwanted = set(expected.drive_shows) - states, set(expected.drive_never) & states
+    return [
+        f"the drive never showed {', '.join(sorted(missing))}" if missing else "",
+        f"the drive showed {', '.join(sorted(unwanted))}" if unwanted else "",
     ]
 
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from servod.campaign.actions import action_of
 from servod.campaign.judge import Reaction, complaints, reaction
-from servod.campaign.scenario import Recovery, Scenario
+from servod.campaign.processes import ProcessAxis
+from servod.campaign.scenario import Recovery, Runs, Scenario
 from servod.campaign.stepped import SteppedAxis
 from servod.campaign.under_test import AxisUnderTest
 from servod.errors import FAULTS
@@ -36,16 +39,25 @@ class Outcome:
         return not self.complaints
 
 
-def run_scenario(name: str, scenario: Scenario) -> Outcome:
+def axis_of(scenario: Scenario, folder: Path) -> AxisUnderTest:
+    """The axis under test that the scenario names. Raises BadInput for its keys."""
+    return SteppedAxis(scenario, folder) if scenario.runs is Runs.STEPPED else ProcessAxis(scenario, folder)
+
+
+def run_scenario(
+    name: str, scenario: Scenario, axis_for: Callable[[Scenario, Path], AxisUnderTest] = axis_of
+) -> Outcome:
     """Start, inject, watch, judge, recover. Raises ServodError when the axis does not get to the start."""
-    with tempfile.TemporaryDirectory(prefix="servod-faults-") as folder:
-        axis: AxisUnderTest = SteppedAxis(scenario, Path(folder))
+    with (
+        tempfile.TemporaryDirectory(prefix="servod-faults-") as folder,
+        contextlib.closing(axis_for(scenario, Path(folder))) as axis,
+    ):
         axis.start(scenario.start)
         injected_ns = _inject(axis, scenario)
         axis.run(scenario.watch_ms / 1e3)
         seen = axis.observe()
         times = reaction(seen.samples, injected_ns)
-        found = complaints(scenario.expect, seen, times)
+        found = complaints(scenario.expect, seen, times, injected_ns)
         recovered = scenario.recover is not Recovery.REPAIR and axis.recover(scenario.recover)
     if not recovered and scenario.recover is not Recovery.REPAIR:
         found.append(f"the axis was not enabled again by {scenario.recover}")

@@ -15,6 +15,7 @@ from pydantic import Field, model_validator
 from servod.axis import AxisState
 from servod.campaign.variants import variants
 from servod.errors import FaultCode
+from servod.hal import DriveState
 from servod.yaml12 import Strict, validate
 
 #: After a loss of the master the torque must be gone within this time [ms].
@@ -24,6 +25,7 @@ FEEDBACK_LOSS_MS = 50.0
 
 AXIS_STATES = {state.name for state in AxisState}
 FAULT_NAMES = {code.name for code in FaultCode}
+DRIVE_STATES = {state.name for state in DriveState}
 
 
 class Runs(StrEnum):
@@ -94,6 +96,8 @@ class Expectation(Strict):
     torque_gone_ms: float | None = Field(None, gt=0.0, description="the joint feels no torque from then on")
     refused: str | None = Field(None, description="words of the message with which the bring-up or command is refused")
     lost_records: int = Field(0, ge=0, description="cycle records that may be missing")
+    drive_shows: list[str] = Field([], description="names of servod.hal.DriveState, all seen after the injection")
+    drive_never: list[str] = Field([], description="names of servod.hal.DriveState, none seen after the injection")
 
     @model_validator(mode="after")
     def _names_exist(self) -> Expectation:
@@ -101,6 +105,8 @@ class Expectation(Strict):
             raise ValueError(f"one of {', '.join(sorted(AXIS_STATES))} instead of {name}")
         for name in set(self.faults) - FAULT_NAMES:
             raise ValueError(f"one of {', '.join(sorted(FAULT_NAMES))} instead of {name}")
+        for name in {*self.drive_shows, *self.drive_never} - DRIVE_STATES:
+            raise ValueError(f"one of {', '.join(sorted(DRIVE_STATES))} instead of {name}")
         return self
 
     @model_validator(mode="after")

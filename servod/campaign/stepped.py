@@ -24,7 +24,9 @@ from servod.yaml12 import validate
 _RECORD_SAMPLES = 120_000
 #: The drive's own record in the folder of a stepped axis.
 RECORD_NAME = "drive.bin"
-_SINE = (ReferenceKind.SINE, 0.2, 0.5, 600.0)
+#: The motion of a start in motion: whole half periods after its begin it is at its fastest, 1.3 rad/s.
+_SINE = (ReferenceKind.SINE, 0.1, 2.0, 600.0)
+_TO_THE_FASTEST_S = 0.5
 
 
 class SteppedAxis:
@@ -65,7 +67,7 @@ class SteppedAxis:
             self.session.enable()
         if start is Start.MOVING:
             self.command(Op.REFERENCE, _SINE)
-        self.session.run(2.0 if start is Start.MOVING else 0.1)
+        self.session.run(_TO_THE_FASTEST_S if start is Start.MOVING else 0.1)
 
     def run(self, duration_s: float) -> None:
         """Advance; an axis that is off is brought up first, and a refusal is kept."""
@@ -124,8 +126,12 @@ class SteppedAxis:
         self.session.run(0.1)
         return self.session.cycle.axis.state is AxisState.ENABLED
 
-    def _bring_up(self) -> None:
+    def close(self) -> None:
+        """Leave the bus."""
         if self._session is not None:
             self._session.close()
+
+    def _bring_up(self) -> None:
+        self.close()
         gains = load_gains(shipped("gains/demo_pd.yaml"))
         self._session = SteppedSession(self._config, self.world, LAWS[gains.law.name].number, gains.pack())

@@ -60,3 +60,6 @@ class AxisUnderTest(Protocol):
 
     def recover(self, recovery: Recovery) -> bool:
         """Do what a person would do; True when the axis is enabled and holds without a fault afterwards."""
+
+    def close(self) -> None:
+        """End everything that runs."""

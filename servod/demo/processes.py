@@ -18,17 +18,17 @@ from pathlib import Path
 
 from servod.errors import Unreachable
 
-_PR_SET_PDEATHSIG = 1  # linux/prctl.h
+_PR_SET_PDEATHSIG, _PR_CAPBSET_DROP = 1, 24  # linux/prctl.h
 _STOP_S = 5.0
 
 
 @contextlib.contextmanager
 def child(
-    module: str, arguments: Sequence[str], log: Path, cores: set[int] | None = None
+    module: str, arguments: Sequence[str], log: Path, cores: set[int] | None = None, dropped: Sequence[int] = ()
 ) -> Iterator[subprocess.Popen[bytes]]:
     """Run `python -m module arguments` for the time of a `with` block; its output goes to `log`.
 
-    `cores` keeps it to these.
+    `cores` keeps it to these; `dropped` are capabilities (linux/capability.h) that it shall not have.
     """
     libc = ctypes.CDLL(None)
 
@@ -36,6 +36,8 @@ def child(
         libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
         if cores:
             os.sched_setaffinity(0, cores)
+        for capability in dropped:
+            libc.prctl(_PR_CAPBSET_DROP, capability)
 
     with log.open("wb") as output:
         process = subprocess.Popen(

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from servod.campaign.actions.base import Action
 from servod.campaign.actions.bus import BUS_ACTIONS
+from servod.campaign.actions.gains import GAIN_FILE_ACTIONS
 from servod.campaign.actions.machine import MACHINE_ACTIONS
 from servod.campaign.actions.nodes import NODE_ACTIONS
+from servod.campaign.actions.processes import PROCESS_ACTIONS
 from servod.campaign.scenario import Injection, Runs
 from servod.errors import BadInput
 from servod.yaml12 import validate
@@ -17,7 +19,13 @@ from servod.yaml12 import validate
 __all__ = ["ACTIONS", "Action", "action_of"]
 
 #: The one table of actions: name in the scenario's file -> model of its arguments.
-ACTIONS: dict[str, type[Action]] = {**BUS_ACTIONS, **NODE_ACTIONS, **MACHINE_ACTIONS}
+ACTIONS: dict[str, type[Action]] = {
+    **BUS_ACTIONS,
+    **NODE_ACTIONS,
+    **MACHINE_ACTIONS,
+    **PROCESS_ACTIONS,
+    **GAIN_FILE_ACTIONS,
+}
 
 
 def action_of(injection: Injection, where: str, runs: Runs) -> Action:

@@ -1,0 +1,173 @@
+"""Actions on processes and on the machine that they share: signals, load, disks, clients, a second daemon.
+
+Only axes that are processes can show them.
+"""
+
+from __future__ import annotations
+
+import resource
+import signal
+import time
+from abc import abstractmethod
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from pydantic import Field
+
+from servod.campaign.actions.base import Action
+from servod.campaign.machine import Process
+from servod.campaign.processes import ProcessAxis
+from servod.campaign.scenario import Runs
+from servod.control import Verb
+from servod.demo.axis import last_core
+from servod.demo.processes import child, wait_until
+
+if TYPE_CHECKING:
+    from servod.campaign.under_test import AxisUnderTest
+
+_KIB = 1024
+_CLIENT_S = 20.0
+
+
+class ProcessAction(Action):
+    """An action for which there must be processes."""
+
+    runs: ClassVar[frozenset[Runs]] = frozenset({Runs.PROCESSES, Runs.GUEST})
+
+    def apply(self, axis: AxisUnderTest) -> None:
+        """Let it happen."""
+        assert isinstance(axis, ProcessAxis)  # `runs` was checked when the scenario was read
+        self.act(axis)
+
+    @abstractmethod
+    def act(self, axis: ProcessAxis) -> None:
+        """Let it happen to these processes."""
+
+
+class SignalName(StrEnum):
+    """Signals that end, stop or continue a process."""
+
+    SIGKILL = "SIGKILL"
+    SIGTERM = "SIGTERM"
+    SIGINT = "SIGINT"
+    SIGSTOP = "SIGSTOP"
+    SIGCONT = "SIGCONT"
+
+
+class Signal(ProcessAction):
+    """Processes get a signal; several that are killed die together, none can act on the other's death."""
+
+    who: list[Process] = Field(min_length=1)
+    signal: SignalName
+
+    def act(self, axis: ProcessAxis) -> None:
+        """Send it."""
+        axis.signal(self.who, signal.Signals[self.signal])
+
+
+class VirtualAxisBack(ProcessAction):
+    """Amplifier and encoder get their supply back."""
+
+    def act(self, axis: ProcessAxis) -> None:
+        """Start them."""
+        axis.machine.wait(Process.VIRTUAL_AXIS, 5.0)
+        axis.machine.start_virtual_axis()
+
+
+class RestartDaemon(ProcessAction):
+    """Somebody restarts the service."""
+
+    def act(self, axis: ProcessAxis) -> None:
+        """SIGTERM, wait, start."""
+        axis.restart_daemon()
+
+
+class SecondDaemon(ProcessAction):
+    """Somebody starts a second daemon for the same axis."""
+
+    def act(self, axis: ProcessAxis) -> None:
+        """Start it and see how it ends."""
+        axis.second_daemon()
+
+
+class Ask(ProcessAction):
+    """A person asks the daemon for something; a refusal is kept."""
+
+    verb: Verb
+    args: dict[str, Any] = Field({})
+
+    def act(self, axis: ProcessAxis) -> None:
+        """Ask."""
+        axis.call(self.verb, **self.args)
+
+
+class ClientKilled(ProcessAction):
+    """`servoctl track` moves the axis, and is killed in the middle."""
+
+    def act(self, axis: ProcessAxis) -> None:
+        """Start it, wait until the axis moves, kill it."""
+        axis.leave()
+        log = axis.folder / "client.log"
+        motion = ["sine", "--amplitude", "0.2", "--frequency", "1", "--duration", "60"]
+        with child("servod.cli", ["track", *motion, "--socket", str(axis.machine.socket)], log) as client:
+            wait_until(lambda: _moves(axis), client, log, _CLIENT_S)
+            time.sleep(0.3)
+            client.kill()
+            client.wait()
+
+
+class CpuLoad(ProcessAction):
+    """A program of higher priority takes the loop's core again and again."""
+
+    busy_ms: int = Field(ge=1, le=500)
+    idle_ms: int = Field(ge=1, le=500)
+    for_ms: int = Field(ge=1, le=5000)
+
+    def act(self, axis: ProcessAxis) -> None:
+        """Run it to its end."""
+        core = axis.config.cycle.cpu
+        numbers = (self.busy_ms, self.idle_ms, self.for_ms, last_core() if core is None else core)
+        log = axis.folder / "load.log"
+        with child("servod.campaign.load", [str(number) for number in numbers if number is not None], log) as load:
+            load.wait(_CLIENT_S)
+
+
+class DiskFull(ProcessAction):
+    """No file of the daemon grows beyond a size any more; the limit stands for the disk's end (setrlimit(2))."""
+
+    kib: int = Field(64, ge=16)
+
+    def act(self, axis: ProcessAxis) -> None:
+        """Limit it."""
+        daemon = axis.machine.daemon
+        assert daemon is not None
+        _, hard = resource.prlimit(daemon.pid, resource.RLIMIT_FSIZE)
+        resource.prlimit(daemon.pid, resource.RLIMIT_FSIZE, (self.kib * _KIB, hard))
+
+
+class RecordingsReadOnly(ProcessAction):
+    """Somebody took the right to write from the folder of the recordings."""
+
+    def act(self, axis: ProcessAxis) -> None:
+        """Take it."""
+        folder = axis.config.recorder.directory
+        folder.mkdir(exist_ok=True)
+        folder.chmod(0o555)
+
+
+def _moves(axis: ProcessAxis) -> bool:
+    with axis.machine.client() as client:
+        return bool(client.call(Verb.STATUS)["axis"]["motion_running"])
+
+
+PROCESS_ACTIONS: dict[str, type[Action]] = {
+    "signal": Signal,
+    "virtual_axis_back": VirtualAxisBack,
+    "restart_daemon": RestartDaemon,
+    "second_daemon": SecondDaemon,
+    "ask": Ask,
+    "client_killed": ClientKilled,
+    "cpu_load": CpuLoad,
+    "disk_full": DiskFull,
+    "recordings_read_only": RecordingsReadOnly,
+}
