@@ -29,6 +29,7 @@ from servod.diagnose.tidy import tidied
 from servod.diagnose.trace import Trace
 from servod.diagnose.unnamed import Unnamed, unnamed
 from servod.diagnose.verdict import Shares, Verdict, drowned, named_terms, shares, verdict
+from servod.diagnose.windows import foretold
 from servod.recordings import Recording
 
 Array = NDArray[np.float64]
@@ -36,6 +37,11 @@ Tell = Callable[[str], None]
 
 #: Part of the time limit that the search for terms may take; the proof needs the rest.
 SEARCH_SHARE = 0.75
+
+#: Free windows of unseen rows must come out by this factor better with the names than without, unless the mismatch is
+#: within FITTED times the noise floor anyway. A few terms with dynamics of their own can follow nearly any mismatch one
+#: sample ahead, and foretell nothing.
+LEAST_FORETOLD, FITTED = 0.7, 2.0
 
 
 @dataclass(frozen=True)
@@ -118,6 +124,8 @@ def diagnose(
     evidence = sorted_out(evidence, chooser)
     seconds["proof"] = monotonic() - begun - seconds["intake"] - seconds["search"]
     final = verdict(choice, evidence.named, evidence.errors, predictor.dry)
+    if final is Verdict.MISSING_PHYSICS and _foretells_nothing(evidence):
+        final = Verdict.UNEXPLAINED
     if final is Verdict.UNEXPLAINED:
         evidence = _without_names(evidence)
     untried = final is Verdict.UNEXPLAINED and choice.cut and choice.tried == 0
@@ -170,6 +178,20 @@ def _worse_unseen(evidence: Evidence) -> int | None:
         if held.rms <= evidence.after.rms and place not in events
     }
     return min(others, key=lambda place: others[place]) if others else None
+
+
+def _foretells_nothing(evidence: Evidence) -> bool:
+    """Whether free windows are hardly better for the names, although something is left: terms that only fit.
+
+    Names of events in one recording alone are not asked, since nobody can foretell them.
+    """
+    if (
+        set(evidence.named) <= set(once(evidence.fit.hypothesis))
+        or evidence.unseen.after < FITTED * evidence.unseen.floor
+    ):
+        return False
+    judged = evidence.shared.judged
+    return foretold(evidence.predictor, evidence.before, evidence.after, judged) > LEAST_FORETOLD
 
 
 def _without_names(evidence: Evidence) -> Evidence:

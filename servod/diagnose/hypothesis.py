@@ -104,10 +104,7 @@ class Hypothesis:
     def unknowns(self) -> tuple[Unknown, ...]:
         """All unknowns: those of the base, with bounds opened where a term says so, then those of each term."""
         opened = {key: bounds for term in self.terms for key, bounds in term.opens.items()}
-        base = [
-            replace(u, low=opened[u.key][0], high=opened[u.key][1], spread=math.inf) if u.key in opened else u
-            for u in self.base
-        ]
+        base = [_opened(u, *opened[u.key]) if u.key in opened else u for u in self.base]
         return (*base, *(u for term in self.terms for u in term.unknowns))
 
     @cached_property
@@ -180,6 +177,12 @@ class Hypothesis:
                     term.each(own, values[self.share(index)], recording)
             found.append(AxisModel.model_validate(own))
         return found
+
+
+def _opened(unknown: Unknown, low: float, high: float) -> Unknown:
+    """With other bounds; what was known beforehand goes where they are wider, and holds where they are narrower."""
+    wider = low < unknown.low or high > unknown.high
+    return replace(unknown, low=low, high=high, spread=math.inf if wider else unknown.spread)
 
 
 def put(document: Document, key: str, value: float) -> None:

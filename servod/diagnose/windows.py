@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.axis_model import AxisModel
-from servod.diagnose.held_out import Fold
+from servod.diagnose.held_out import Fold, HeldOut
 from servod.diagnose.predict import Predictor
 from servod.diagnose.trace import Trace
 from servod.models.replay import Drive, replay
@@ -53,6 +53,12 @@ def window_errors(
         WindowErrors(horizon, *(_errors(predictor, folds, horizon) for folds in (whole, base, after)))
         for horizon in HORIZONS_S
     ]
+
+
+def foretold(predictor: Predictor, before: HeldOut, after: HeldOut, judged: NDArray[np.bool_]) -> float:
+    """RMS of the shortest windows by fits with the physics added, as a multiple of that by fits without it."""
+    with_it, without = (_errors(predictor, held.folds, HORIZONS_S[0])[judged] for held in (after, before))
+    return float(np.sqrt(np.mean(with_it**2) / max(float(np.mean(without**2)), 1e-30)))
 
 
 def windows_document(errors: Sequence[WindowErrors], predictor: Predictor, judged: NDArray[np.bool_]) -> dict[str, Any]:

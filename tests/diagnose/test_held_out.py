@@ -15,7 +15,7 @@ from servod.diagnose.held_out import RECORDING, STRETCH, TAIL_S, Fold, held_out,
 from servod.diagnose.hypothesis import Term
 from servod.diagnose.predict import Predictor
 from servod.diagnose.scene import Scene
-from servod.diagnose.windows import window_errors
+from servod.diagnose.windows import foretold, window_errors
 from servod.models.replay import replay
 from tests.diagnose.axes import believed
 from tests.diagnose.test_between import colder
@@ -145,3 +145,12 @@ def test_an_event_of_every_recording_is_foretold_by_the_others(levels: tuple[Pre
     torque = event.hypothesis.share(0).stop - 1
     assert abs(event.coordinates[torque]) > 0.2
     assert abs(held.coordinates[1][torque]) < 0.01
+
+
+def test_names_foretell_by_how_much_free_windows_of_unseen_rows_come_nearer(levels: tuple[Predictor, Fit]) -> None:
+    predictor, fit = levels
+    shared = split(predictor, fit)
+    without, with_it = held_out(predictor, bare(fit), shared), held_out(predictor, fit, shared)
+    assert foretold(predictor, without, without, shared.judged) == pytest.approx(1.0)
+    assert foretold(predictor, without, with_it, shared.judged) < 0.3
+    assert foretold(predictor, with_it, without, shared.judged) > 3.0

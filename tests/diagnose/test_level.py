@@ -67,3 +67,18 @@ def test_friction_of_one_direction_alone_may_differ(scene: Scene) -> None:
     term.write(document, (0.28 / 1.72, 0.28 / 1.72, 0.86))
     expected = {"positive_dry": 1.0, "negative_dry": 0.72, "positive_viscous": 1.0, "negative_viscous": 0.72}
     assert document["asymmetry"] == pytest.approx(expected)
+
+
+def test_beside_a_longer_delay_the_models_own_is_as_well_known_as_before(scene: Scene) -> None:
+    """The two add up: without what is known of the model's own, nothing tells the share of either."""
+    base = Hypothesis(scene.document, base_unknowns(believed()))
+    for name in ("delay", "actuator_lag"):
+        term = effect(name).terms(scene)[0]
+        own = next(u for u in base.with_term(term).unknowns if u.key == "delay_s")
+        assert own.spread == next(u for u in base.base if u.key == "delay_s").spread
+
+
+def test_a_level_that_is_released_is_known_no_more(scene: Scene) -> None:
+    base = Hypothesis(scene.document, base_unknowns(believed()))
+    released = base.with_term(next(t for t in effect("inertia").terms(scene) if t.opens))
+    assert np.isinf(next(u for u in released.unknowns if u.key == "inertia").spread)
