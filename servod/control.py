@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import socket
+import struct
 from collections.abc import Iterator, Sequence
 from enum import StrEnum
 from pathlib import Path
@@ -24,6 +25,9 @@ MAX_LINE_BYTES = 512 * 1024
 MAX_ANSWER_BYTES = 4 * 1024 * 1024
 #: Samples in one request: as text, each takes at most 25 bytes.
 PIECE_SAMPLES = 2000
+
+
+_TIMEVAL = struct.Struct("@ll")
 
 
 class Verb(StrEnum):
@@ -96,9 +100,12 @@ class ControlClient:
         self._path = str(path)
         self._id = 0
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
-        self._socket.settimeout(timeout_s)
+        # A socket that does not block is refused by a full queue; one that blocks stands in it, for this time.
+        longest = _TIMEVAL.pack(*divmod(int(timeout_s * 1e6), 1_000_000))
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, longest)
         try:
             self._socket.connect(self._path)
+            self._socket.settimeout(timeout_s)
         except PermissionError:
             self._socket.close()
             raise Unreachable(f"{path}: permission denied; only members of the control group may connect") from None
@@ -131,7 +138,7 @@ class ControlClient:
         self._ask(verb, self._send_ahead(args) if verb == Verb.TRACK else args)
         while True:
             answer = self._answer()
-            if answer.get("id") == self._id:
+            if answer.get("id") in (self._id, None):  # no number: what the daemon says of the connection itself
                 return _result(answer)
 
     def watch(self, period_s: float = 0.2) -> Iterator[dict[str, Any]]:
@@ -160,8 +167,11 @@ class ControlClient:
             raise BadInput(f"{verb}", f"{len(line)} bytes", f"at most {MAX_LINE_BYTES} bytes in a request")
         try:
             self._socket.sendall(line)
-        except OSError as error:
-            raise Unreachable(f"{self._path}: the daemon hung up ({error.strerror or error})") from None
+        except TimeoutError:
+            raise Unreachable(f"{self._path}: the daemon does not read") from None
+        except OSError:
+            _result(self._answer())  # it hung up; what it said before stands in the socket
+            raise Unreachable(f"{self._path}: the daemon hung up") from None
 
     def _answer(self) -> dict[str, Any]:
         try:

@@ -68,7 +68,7 @@ def _watch_memory(client: ControlClient, pids: dict[str, int], duration_s: float
     time.sleep(min(_SETTLE_S, duration_s / 2.0))
     samples, end = [], time.monotonic() + duration_s
     while time.monotonic() < end:
-        samples.append({name: _resident_kib(pid) for name, pid in pids.items()})
+        samples.append({name: resident_kib(pid) for name, pid in pids.items()})
         time.sleep(_SAMPLE_S)
     _must_move(client)
     client.call("record_stop")
@@ -88,7 +88,8 @@ def _growth_mib(samples_kib: list[int]) -> float:
     return (statistics.mean(samples_kib[-few:]) - statistics.mean(samples_kib[:few])) / _KIB_PER_MIB
 
 
-def _resident_kib(pid: int) -> int:
+def resident_kib(pid: int) -> int:
+    """Resident memory of a process (proc(5), status: VmRSS); 0 when it has gone."""
     for line in Path(f"/proc/{pid}/status").read_text().splitlines():
         if line.startswith("VmRSS:"):
             return int(line.split()[1])

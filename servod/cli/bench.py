@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from servod.cli.common import JsonOption, example, need_folder, print_json
 
+if TYPE_CHECKING:
+    from rich.console import Console
+
+_QUIET_S, _ATTACK_S, _STOPS = 8.0, 8.0, 10
 _HELP = example(
     "Measure wake-up (against cyclictest), cycle work, two processes on the wall clock, stepped and simulated "
     "speed, memory, and how long synthesis, certificate and commissioning take. Takes about 18 minutes, most of it "
-    "watching memory; --quick takes about two, without a commissioning.",
+    "watching memory; --quick takes about two, without a commissioning. --attack measures wake-up and time to stop "
+    "while the control socket is under attack, and nothing else, in half a minute.",
     "servoctl bench",
+    "servoctl bench --attack",
     "servoctl bench --quick --json",
 )
 
@@ -27,6 +33,7 @@ def bench(
     quick: Annotated[
         bool, typer.Option("--quick", help="Shorter runs; every figure says how long it was measured.")
     ] = False,
+    attack: Annotated[bool, typer.Option("--attack", help="Only the control socket under attack.")] = False,
     out: Annotated[Path | None, typer.Option(help="Write the JSON document to this file as well.")] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -39,6 +46,9 @@ def bench(
     if out is not None:
         need_folder("--out", out.parent)  # said now, not after a quarter of an hour
     console = Console(stderr=True, quiet=as_json)
+    if attack:
+        _attack(console, out, as_json)
+        return
     with console.status("servoctl bench") as line:
         document = measure(QUICK if quick else THOROUGH, lambda text: line.update(f"measuring: {text}"))
     if out is not None:
@@ -47,3 +57,17 @@ def bench(
         print_json(document)
     else:
         print_table(document)
+
+
+def _attack(console: Console, out: Path | None, as_json: bool) -> None:
+    from servod.benchmark import attack
+    from servod.benchmark.table import write_json
+
+    with console.status("measuring: wake-up and stops, alone and under attack"):
+        document = attack.measure(_QUIET_S, _ATTACK_S, _STOPS)
+    if out is not None:
+        write_json(document, out)
+    if as_json:
+        print_json(document)
+    else:
+        print(attack.text(document))

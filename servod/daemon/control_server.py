@@ -1,13 +1,14 @@
 """Server side of the control socket: clients in, requests out, answers back, and never a moment of waiting.
 
 Runs inside the supervisor's event loop; sockets do not block. A client that is slow, broken or malicious loses its own
-connection and nothing else: lines, buffers and the number of clients are bounded, in all and for each process. Only one
-client at a time may command: the first that does holds the lease until it disconnects, and while a motion that it left
-behind runs, others can only end it. Protocol: servod.control.
+connection and nothing else: lines, buffers, requests under way and the number of clients are bounded, in all and for
+each process, and so is what one round of the supervisor does for each client. Who may ask what: servod.daemon.lease.
+Protocol: servod.control.
 """
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import logging
 import os
@@ -18,24 +19,26 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from servod.config import ControlConfig
-from servod.control import READING, Verb, decode_line
+from servod.control import Verb, decode_line, encode_line
 from servod.daemon.connection import Connection, Reply
-from servod.daemon.peer import Peer, group_id, may_command, peer_of
+from servod.daemon.lease import STOPPING, Lease
+from servod.daemon.peer import group_id, may_command, peer_of
+from servod.daemon.places import Places
 from servod.daemon.status import LeaseStatus
 from servod.errors import BadInput, ServodError, Unreachable
 
 log = logging.getLogger("servod.control")
 
-_MAX_CLIENTS = 32
-#: So that no single program can take all places from those who want to stop the axis.
-_MAX_CLIENTS_OF_A_PROCESS = 16
-_BACKLOG = 128
-_ACCEPT_AT_ONCE = 16
-
-#: Anyone who may command may stop the axis, whoever holds the lease.
-_WITHOUT_LEASE = frozenset({Verb.STOP})
-#: What others may ask while a motion runs whose client has left: to end it, and what does not touch the axis.
-_BESIDE_MOTION = frozenset({Verb.STOP, Verb.DISABLE, Verb.HALT, Verb.RECORD_START, Verb.RECORD_STOP})
+_BACKLOG = 24
+#: Connections taken in one round: whoever wants to stop the axis stands behind no longer a queue.
+_ACCEPT_IN_A_ROUND = _BACKLOG
+#: Requests without an answer yet, of one client and of all; a stop has room beyond them.
+_UNDER_WAY_OF_A_CLIENT, _UNDER_WAY = 8, 64
+_STOPS_BEYOND = 32
+#: What is answered at once and never under way.
+_AT_ONCE = frozenset({Verb.STATUS, Verb.TRAJECTORY})
+_ROUND_NS = 20_000_000
+_LONGEST_NUMBER = 64
 
 
 class Handler(Protocol):
@@ -65,16 +68,26 @@ class ControlServer:
         """Bind and listen. Raises Unreachable when that is refused. The caller holds the instance lock."""
         self._path, self._selector, self._handler = config.socket, selector, handler
         self._group = group_id(config.group)
-        self._clients: set[Connection] = set()
-        self._holder: Connection | None = None
-        self._mover: Connection | None = None
-        self._status_failed = False
+        self._places = Places()
+        self._lease = Lease(handler.motion_running)
+        self._under_way = self._accepted = 0
+        self._now_ns = self._next_round_ns = 0
+        self._listening = self._status_failed = False
         self._listener = _listen(config.socket, self._group)
-        selector.register(self._listener, selectors.EVENT_READ, self._accept)
+        self._listen(True)
 
     def tick(self, now_ns: int) -> None:
-        """Send watchers what is due; call it in every round of the event loop."""
-        due = [c for c in self._clients if c.watch_due(now_ns)]
+        """A new round for every client, and what watchers are due; call it in every round of the event loop."""
+        self._now_ns = now_ns
+        if now_ns >= self._next_round_ns:
+            self._next_round_ns, self._accepted = now_ns + _ROUND_NS, 0
+            self._listen(True)
+            for client in list(self._places.clients):
+                client.begin_round(now_ns)
+        self._tell_watchers(now_ns)
+
+    def _tell_watchers(self, now_ns: int) -> None:
+        due = [c for c in self._places.clients if c.watch_due(now_ns)]
         if not due:
             return
         try:
@@ -95,84 +108,116 @@ class ControlServer:
 
     def lease(self) -> LeaseStatus:
         """Who commands; pid 0 when nobody does."""
-        peer = self._holder.peer if self._holder else None
-        return {"pid": peer.pid if peer else 0, "uid": peer.uid if peer else 0}
+        return self._lease.status()
+
+    @property
+    def held_bytes(self) -> int:
+        """Memory of all clients' buffers."""
+        return sum(client.held_bytes for client in self._places.clients)
 
     def close(self) -> None:
         """Hang up on everyone and remove the socket."""
-        for client in list(self._clients):
+        for client in list(self._places.clients):
             self.drop(client)
-        self._selector.unregister(self._listener)
+        self._listen(False)
         self._listener.close()
         self._path.unlink(missing_ok=True)
 
     def drop(self, client: Connection) -> None:
         """Forget a client that has gone or must go; gives its lease back."""
-        if client in self._clients:
-            self._clients.remove(client)
-            client.close()
-        if self._holder is client:
-            self._holder = None
+        self._places.leave(client)
+        client.close()
+        if self._lease.left(client):
             self._handler.lease_ended()
 
+    def _listen(self, listening: bool) -> None:
+        """Hear of new clients, or let them queue."""
+        if listening and not self._listening:
+            self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
+        elif self._listening and not listening:
+            self._selector.unregister(self._listener)
+        self._listening = listening
+
     def _accept(self, _events: int) -> None:
-        for _ in range(_ACCEPT_AT_ONCE):
+        while self._accepted < _ACCEPT_IN_A_ROUND:
+            self._accepted += 1
             try:
                 connection, _address = self._listener.accept()
             except OSError:
                 return  # nobody waits, or descriptors ran out: nothing to hold against the axis
-            if not self._has_place(peer_of(connection)):
-                connection.close()
-                continue
             connection.setblocking(False)
-            self._clients.add(Connection(connection, self._selector, self))
+            self._admit(connection)
+        self._listen(False)
 
-    def _has_place(self, peer: Peer) -> bool:
-        of_this_process = sum(c.peer.pid == peer.pid for c in self._clients)
-        return len(self._clients) < _MAX_CLIENTS and of_this_process < _MAX_CLIENTS_OF_A_PROCESS
+    def _admit(self, connection: socket.socket) -> None:
+        """A place for a new client, or one line that says why not; what it sent with its connection is served now."""
+        peer = peer_of(connection)
+        try:
+            if not may_command(peer, self._group):
+                raise Unreachable(f"user {peer.uid} may not connect: not in the control group")
+            if leaves := self._places.make_room(peer, self._lease.holder, self._now_ns):
+                Reply(leaves.send, None).failed(Unreachable("idle for longest when others wanted its place"))
+                self.drop(leaves)
+        except Unreachable as error:
+            with contextlib.suppress(OSError):
+                Reply(lambda message: _send_once(connection, message), None).failed(error)
+            connection.close()
+            return
+        client = Connection(connection, self._selector, self, self._now_ns)
+        self._places.take(client)
+        client.read()
 
     def dispatch(self, client: Connection, line: bytes) -> None:
         """One request line: check it, check the right to ask it, and hand it on."""
-        number: Any = None
+        reply = Reply(client.send, None)
         try:
             message = decode_line(line)
-            number = message.get("id")
+            reply = Reply(client.send, _number(message))
             verb, args = _request(message)
-            self._check_right(client, verb)
-            reply = Reply(client.send, number)
+            self._lease.take(client, verb)
             if verb is Verb.WATCH:
                 client.start_watch(args, reply)
-            else:
-                self._handler.handle(verb, args, reply)
+                return
+            reply = self._begin(client, verb, _number(message))
+            self._handler.handle(verb, args, reply)
         except ServodError as error:
-            Reply(client.send, number).failed(error)
+            reply.failed(error)
         except ValueError as error:
-            Reply(client.send, number).failed(BadInput("request", str(error)[:200], "one JSON object per line"))
+            reply.failed(BadInput("request", str(error)[:200], "one JSON object per line"))
         except Exception as error:  # one request ends, never the supervisor
             log.error("a request failed", exc_info=error)
-            Reply(client.send, number).failed(error)
+            reply.failed(error)
 
-    def _check_right(self, client: Connection, verb: Verb) -> None:
-        if verb in READING:
-            return
-        if not may_command(client.peer, self._group):
-            raise Unreachable(f"user {client.peer.uid} may not command this axis: not in the control group")
-        if verb in _WITHOUT_LEASE:
-            return
-        if self._holder not in (None, client):
-            assert self._holder is not None
-            raise Unreachable(f"process {self._holder.peer.pid} commands the axis; others may watch, or stop it")
-        if verb not in _BESIDE_MOTION:
-            self._refuse_beside_motion(client)
-        self._holder = client
-        if verb is Verb.TRACK:
-            self._mover = client
+    def _begin(self, client: Connection, verb: Verb, number: int | str | None) -> Reply:
+        """The reply of a request that is now under way. Raises Unreachable when too many are."""
+        if verb in _AT_ONCE:
+            return Reply(client.send, number)
+        beyond = _STOPS_BEYOND if verb in STOPPING else 0
+        if client.under_way >= _UNDER_WAY_OF_A_CLIENT + beyond or self._under_way >= _UNDER_WAY + beyond:
+            raise Unreachable(f"{self._under_way} requests are under way; wait for their answers")
+        client.under_way += 1
+        self._under_way += 1
 
-    def _refuse_beside_motion(self, client: Connection) -> None:
-        if self._mover not in (None, client) and self._handler.motion_running():
-            assert self._mover is not None
-            started = f"a motion that process {self._mover.peer.pid} started runs"
-            raise Unreachable(f"{started}; wait for its end, or stop, halt or disable the axis")
+        def ended() -> None:
+            client.under_way -= 1
+            self._under_way -= 1
+
+        return Reply(client.send, number, ended)
+
+
+def _send_once(connection: socket.socket, message: dict[str, Any]) -> None:
+    """One short line to somebody who gets no place; it fits into the empty buffer of a new connection."""
+    connection.send(encode_line(message))
+
+
+def _number(message: dict[str, Any]) -> int | str | None:
+    """The request's number, which goes back with the answer. Raises BadInput for anything else."""
+    number = message.get("id")
+    if number is None or (isinstance(number, int | str) and len(str(number)) <= _LONGEST_NUMBER):
+        return number
+    raise BadInput(
+        "request: id", repr(number)[:80], f"a whole number or a text of at most {_LONGEST_NUMBER} characters"
+    )
 
 
 def _request(message: dict[str, Any]) -> tuple[Verb, dict[str, Any]]:

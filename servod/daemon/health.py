@@ -23,11 +23,12 @@ _OWN_PAUSE_NS = NS_PER_S // 5
 class _Ring:
     """The newest values of one quantity, in ns."""
 
-    __slots__ = ("_at", "_values", "filled")
+    __slots__ = ("_at", "_new", "_shown", "_values", "filled")
 
     def __init__(self, capacity: int) -> None:
         self._values = array("q", bytes(8 * capacity))
         self._at = self.filled = 0
+        self._new, self._shown = 0, Percentiles(p50_us=0.0, p99_us=0.0, max_us=0.0)
 
     def add(self, values: Iterable[int]) -> None:
         """Take new values, oldest first."""
@@ -37,19 +38,21 @@ class _Ring:
             store[at] = value
             at = at + 1 if at + 1 < capacity else 0
             count += 1
+        self._new += count - self.filled
         self._at, self.filled = at, min(count, capacity)
 
     def percentiles(self) -> Percentiles:
-        """Median, 99th percentile and maximum; zeros while empty."""
-        ordered = sorted(self._values[: self.filled])
-        if not ordered:
-            return {"p50_us": 0.0, "p99_us": 0.0, "max_us": 0.0}
-        last = len(ordered) - 1
-        return {
-            "p50_us": ordered[last // 2] / 1000.0,
-            "p99_us": ordered[last * 99 // 100] / 1000.0,
-            "max_us": ordered[last] / 1000.0,
-        }
+        """Median, 99th percentile and maximum; zeros while empty. Sorted anew when a hundredth of the values is new."""
+        if self._new * 100 >= self.filled and self.filled:
+            self._new = 0
+            ordered = sorted(self._values[: self.filled])
+            last = len(ordered) - 1
+            self._shown = {
+                "p50_us": ordered[last // 2] / 1000.0,
+                "p99_us": ordered[last * 99 // 100] / 1000.0,
+                "max_us": ordered[last] / 1000.0,
+            }
+        return self._shown
 
 
 class Pulse:

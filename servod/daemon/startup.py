@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import os
+import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -34,6 +35,9 @@ from servod.yaml12 import read_text
 log = logging.getLogger("servod")
 
 _RECORDER_START_S = 5.0
+#: How long a thread that works on files may hold the interpreter while the supervisor wants it (Python's own: 5 ms, and
+#: that for each system call of the supervisor).
+_SWITCH_S = 2e-4
 
 
 def check(path: Path) -> AxisConfig:
@@ -57,6 +61,7 @@ def run(path: Path, on_ready: Callable[[Supervisor], None]) -> int:
     with ExitStack() as stack:
         stack.callback(InstanceLock(config).release)
         _leave_core_to_loop(config.cycle.cpu)
+        sys.setswitchinterval(_SWITCH_S)
         bank = GainBank(config)
         recorder = _recorder(config, path, bank)
         stack.callback(recorder.close)

@@ -70,6 +70,7 @@ class Verbs:
         self._config, self._loop, self._bank, self._recorder = config, loop, bank, recorder
         self._document = document
         self._orders, self._flows = Orders(), Flows()
+        self._last: tuple[Op, OrderWait] | None = None
         self._uploaded = Table()
         self._reference_seq = 0  # the last motion's command
         self._leases_ended = 0
@@ -125,7 +126,16 @@ class Verbs:
     def _send(self, op: Op, arguments: Sequence[float] = ()) -> OrderWait:
         seq = self._loop.send(op, arguments)
         self._recorder.add_event("command", op.name.lower(), arguments=list(arguments[:8]))
-        return self._orders.expect(seq, time.monotonic_ns())
+        self._last = op, self._orders.expect(seq, time.monotonic_ns())
+        return self._last[1]
+
+    def _send_stop(self, op: Op) -> OrderWait:
+        """Of stops one after the other one is enough: nobody fills the queue so that another finds no room."""
+        if self._last is not None:
+            op_before, wait = self._last
+            if op is op_before and not wait.ready(time.monotonic_ns()):
+                return wait
+        return self._send(op)
 
     def _latest(self) -> CycleRecord | None:
         return self._loop.latest
@@ -147,11 +157,11 @@ class Verbs:
         return _state(record)
 
     def _disable(self, _args: NoArgs) -> Flow:
-        yield self._send(Op.DISABLE)
+        yield self._send_stop(Op.DISABLE)
         return (yield from self._until_off(2.0 * self._config.limits.ramp_down_s))
 
     def _stop(self, _args: NoArgs) -> Flow:
-        yield self._send(Op.QUICK_STOP)
+        yield self._send_stop(Op.QUICK_STOP)
         return (yield from self._until_off(self._config.amplifier.enable_timeout_s))
 
     def _until_off(self, usual_s: float) -> Flow:

@@ -5,83 +5,18 @@ import socket
 import stat
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
+from served import Echo, Served, answer_of, raw
 
 from servod.config import ControlConfig
 from servod.control import MAX_LINE_BYTES, PIECE_SAMPLES, ControlClient, Verb
-from servod.daemon.connection import Reply
 from servod.daemon.control_server import ControlServer
 from servod.daemon.peer import Peer, may_command, peer_of
 from servod.errors import AnswerIsNo, BadInput, ServodError, Unreachable
-
-
-class Echo:
-    """A handler that answers with what it was asked; `stop` answers late, `scan` fails as told."""
-
-    def __init__(self) -> None:
-        self.late: list[Reply] = []
-        self.moves = self.broken = False
-        self.ended_leases = 0
-        self.pieces: list[tuple[str, int, list[float]]] = []
-
-    def handle(self, verb: Verb, args: dict[str, Any], reply: Reply) -> None:
-        if verb is Verb.STOP:
-            self.late.append(reply)
-        elif verb is Verb.SCAN:
-            raise {1: AnswerIsNo("no"), 2: BadInput("scan", 1, "2"), 3: Unreachable("gone\nreally")}[args["code"]]
-        elif verb is Verb.TRAJECTORY:
-            self.pieces.append((args["key"], args["start"], args["samples"]))
-            reply.done({})
-        elif verb is Verb.GAINS_LIST:
-            raise KeyError("nobody foresaw this")
-        else:
-            reply.done({"verb": verb, "args": args})
-
-    def status(self) -> dict[str, Any]:
-        if self.broken:
-            raise ZeroDivisionError("a bad byte")
-        return {"now": time.monotonic()}
-
-    def motion_running(self) -> bool:
-        return self.moves
-
-    def lease_ended(self) -> None:
-        self.ended_leases += 1
-
-
-class Served:
-    """A control server in a thread of its own."""
-
-    def __init__(self, path: Path) -> None:
-        self.path, self.handler = path, Echo()
-        self._selector = selectors.DefaultSelector()
-        self.server = ControlServer(ControlConfig(socket=path), self._selector, self.handler)
-        self._stop = threading.Event()
-        self.longest_round_s = 0.0
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
-
-    def _run(self) -> None:
-        while not self._stop.is_set():
-            for key, events in self._selector.select(0.01):
-                began = time.monotonic()
-                key.data(events)
-                self.longest_round_s = max(self.longest_round_s, time.monotonic() - began)
-            self.server.tick(time.monotonic_ns())
-            for reply in self.handler.late:
-                reply.done({"late": True})
-            self.handler.late.clear()
-
-    def close(self) -> None:
-        self._stop.set()
-        self._thread.join()
-        self.server.close()
 
 
 @pytest.fixture
@@ -89,18 +24,6 @@ def served(tmp_path: Path) -> Iterator[Served]:
     served = Served(tmp_path / "axis.sock")
     yield served
     served.close()
-
-
-def _raw(served: Served) -> socket.socket:
-    connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    connection.settimeout(5)
-    connection.connect(str(served.path))
-    return connection
-
-
-def _line(connection: socket.socket) -> dict[str, Any]:
-    with connection.makefile("rb") as lines:
-        return json.loads(lines.readline())  # type: ignore[no-any-return]
 
 
 def test_call_gives_the_result(served: Served) -> None:
@@ -209,7 +132,7 @@ def test_error_that_nobody_foresaw_ends_the_request_only(served: Served) -> None
 
 def test_status_that_cannot_be_made_is_told_and_logged_once(served: Served, caplog: pytest.LogCaptureFixture) -> None:
     served.handler.broken = True
-    connection = _raw(served)
+    connection = raw(served)
     connection.sendall(b'{"id":1,"verb":"watch","args":{"period_s":0.02}}\n')
     with connection.makefile("rb") as lines:
         answers = [json.loads(lines.readline()) for _ in range(3)]
@@ -234,21 +157,26 @@ def test_status_that_cannot_be_made_is_told_and_logged_once(served: Served, capl
         (b'{"id":1,"verb":"watch","args":{"period_s":1e-9}}', "watch: period_s"),
         (b"\xff\xfe\x00", "one JSON object"),
         (b"[" * 60_000, "one JSON object"),
+        (b'{"id":NaN,"verb":"status"}', "request: id: found nan"),
+        (b'{"id":1e999,"verb":"status"}', "request: id: found inf"),
+        (b'{"id":"' + b"9" * 65 + b'","verb":"status"}', "at most 64 characters"),
+        (b'{"id":[[]],"verb":"status"}', "request: id: found [[]]"),
+        (b'{"id":1,"verb":"watch","args":{"period_s":NaN}}', "watch: period_s"),
     ],
 )
 def test_bad_lines_get_one_line_back_and_the_connection_goes_on(served: Served, line: bytes, says: str) -> None:
-    connection = _raw(served)
+    connection = raw(served)
     connection.sendall(line + b"\n")
-    answer = _line(connection)
+    answer = answer_of(connection)
     assert (answer["ok"], answer["error"]["exit_code"]) == (False, 2)
     assert says in answer["error"]["message"]
     connection.sendall(b'{"id":7,"verb":"status"}\n')
-    assert _line(connection)["id"] == 7
+    assert answer_of(connection)["id"] == 7
     connection.close()
 
 
 def test_line_in_pieces_and_several_lines_at_once(served: Served) -> None:
-    connection = _raw(served)
+    connection = raw(served)
     for piece in (b'{"id":1,"ve', b'rb":"status"', b'}\n{"id":2,"verb":"status"}\n\n{"id":3', b',"verb":"status"}\n'):
         connection.sendall(piece)
         time.sleep(0.01)
@@ -258,7 +186,7 @@ def test_line_in_pieces_and_several_lines_at_once(served: Served) -> None:
 
 
 def test_line_without_end_loses_its_connection(served: Served) -> None:
-    connection = _raw(served)
+    connection = raw(served)
     with pytest.raises(OSError):
         for _ in range(MAX_LINE_BYTES // 65_536 + 64):
             connection.sendall(b"x" * 65_536)
@@ -268,28 +196,30 @@ def test_line_without_end_loses_its_connection(served: Served) -> None:
 
 
 def test_long_line_is_refused_before_anything_is_made_of_it(served: Served) -> None:
-    connection = _raw(served)
+    connection = raw(served)
     connection.sendall(b'{"id":1,"verb":"status","args":{"a":[' + b"[]," * (MAX_LINE_BYTES // 3) + b"[]]}}\n")
-    answer = _line(connection)
+    answer = answer_of(connection)
     assert (answer["error"]["exit_code"], answer["id"]) == (2, None)
     assert f"at most {MAX_LINE_BYTES} bytes" in answer["error"]["message"]
     connection.close()
 
 
-def test_client_that_never_reads_is_cut_off_and_disturbs_nobody(served: Served) -> None:
-    deaf = _raw(served)
+def test_client_that_never_reads_is_served_no_more_and_disturbs_nobody(served: Served) -> None:
+    deaf = raw(served)
+    deaf.settimeout(0.3)
     request = json.dumps({"id": 1, "verb": "track", "args": {"kind": "x" * 50_000}}).encode() + b"\n"
-    with pytest.raises(OSError):
+    with pytest.raises(TimeoutError):
         for _ in range(1000):
             deaf.sendall(request)
-    deaf.close()
     with ControlClient(served.path) as client:
         assert client.call(Verb.STATUS)
+    assert served.server.held_bytes < 400_000
     assert served.longest_round_s < 1.0
+    deaf.close()
 
 
 def test_watch_streams_and_a_deaf_watcher_only_loses_lines(served: Served) -> None:
-    deaf = _raw(served)
+    deaf = raw(served)
     deaf.sendall(b'{"id":1,"verb":"watch","args":{"period_s":0.02}}\n')
     with ControlClient(served.path) as client:
         stream = client.watch(0.02)
@@ -300,8 +230,8 @@ def test_watch_streams_and_a_deaf_watcher_only_loses_lines(served: Served) -> No
 
 
 def test_one_program_cannot_take_all_places(served: Served) -> None:
-    crowd = [_raw(served) for _ in range(40)]
-    assert crowd[-1].recv(1) == b""
+    crowd = [raw(served) for _ in range(40)]
+    assert "idle for longest" in answer_of(crowd[0])["error"]["message"]
     code = f"""
 from servod.control import ControlClient
 with ControlClient({str(served.path)!r}) as client:

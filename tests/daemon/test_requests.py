@@ -303,11 +303,29 @@ def test_stop_that_stopped_nothing_is_no_success(
     assert says in answers.sent[0]["error"]["message"]
 
 
+def test_stops_one_after_the_other_are_one_command_until_the_loop_has_taken_it(verbs: tuple[Verbs, _Loop]) -> None:
+    front, loop = verbs
+    answers = _Answers()
+    for _ in range(20):
+        front.handle(Verb.STOP, {}, answers.reply())
+    assert loop.seq == 1
+    front.handle(Verb.HALT, {"on": True}, answers.reply())
+    front.handle(Verb.STOP, {}, answers.reply())  # something came between: this one counts anew
+    assert loop.seq == 3
+    off = {"axis_state": AxisState.DISABLED, "drive_state": DriveState.SWITCH_ON_DISABLED}
+    loop.latest = record(2, command_seq=3, **off)
+    front.tick([record(1, command_seq=1), record(2, command_seq=2), loop.latest], time.monotonic_ns())
+    front.tick([], time.monotonic_ns())
+    assert [a["ok"] for a in answers.sent] == [True] * 22
+    front.handle(Verb.STOP, {}, answers.reply())
+    assert loop.seq == 4
+
+
 def test_queue_that_a_client_floods_leaves_room_for_stops_and_node_events() -> None:
     channel = Channel()
     taken = {op: [channel.send(Command(n, op, ())) for n in range(16)].count(True) for op in _FLOOD}
-    assert taken == {Op.HALT: 8, Op.QUICK_STOP: 4, Op.NODE_EVENT: 4}
+    assert taken == {Op.HALT: 8, Op.DISABLE: 2, Op.QUICK_STOP: 2, Op.NODE_EVENT: 4}
     channel.close()
 
 
-_FLOOD = (Op.HALT, Op.QUICK_STOP, Op.NODE_EVENT)
+_FLOOD = (Op.HALT, Op.DISABLE, Op.QUICK_STOP, Op.NODE_EVENT)
