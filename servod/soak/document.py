@@ -6,6 +6,7 @@ Behind the run; `page` and `table` show it.
 from __future__ import annotations
 
 import math
+import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -18,7 +19,7 @@ _CURVE_POINTS = 200
 _NS_PER_H = 3.6e12
 _ADDED = (
     *("cycles", "rows", "missed", "syncs", "syncs_taken", "drive_samples", "recordings", "rows_read_back", "episodes"),
-    *("restarts", "faults_injected", "faults_found", "faults_recovered", "axis_hours"),
+    *("cpu_s", "restarts", "faults_injected", "faults_found", "faults_recovered", "axis_hours"),
 )
 
 
@@ -29,6 +30,7 @@ def document(axis: SoakedAxis, memories: Mapping[str, Memory], wall_s: float) ->
     return {
         "passed": not findings.counts,
         "wall_s": round(wall_s, 1),
+        "cpu_s": round(time.process_time(), 1),
         "axis_hours": counts.cycles * counts.period_ns / _NS_PER_H,
         **{name: value for name, value in counts._asdict().items() if name != "period_ns"},
         "episodes": tally.episodes,

@@ -5,6 +5,7 @@ Beside everything: looks at /proc of one process.
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import time
@@ -83,10 +84,11 @@ class Memory:
     def slope(self) -> Slope:
         """Growth over the second half."""
         curve = self.curve
-        half = curve[len(curve) // 2 :]
-        if len(half) < 2 * _BLOCKS:
+        edges = np.linspace(0.5, 1.0, _BLOCKS + 1) * (curve[-1, 0] if len(curve) else 0.0)
+        places = np.searchsorted(curve[:, 0], edges)
+        if np.diff(places).min() < 1:
             return Slope(0.0, -math.inf, math.inf, Growth.TOO_SHORT)
-        points = np.array([block.mean(axis=0) for block in np.array_split(half[:, :2], _BLOCKS)])
+        points = np.array([curve[begin:end, :2].mean(axis=0) for begin, end in itertools.pairwise(places)])
         hours, resident_kb = points[:, 0] / 3600.0, points[:, 1]
         (slope, level), spread = np.polyfit(hours, resident_kb, 1), hours - hours.mean()
         rest = resident_kb - slope * hours - level

@@ -44,7 +44,7 @@ def count_rows(found: dict[str, Any]) -> list[tuple[str, str]]:
         ("faults injected / found in the log", f"{found['faults_injected']:,} / {found['faults_found']:,}"),
         ("unexplained states, faults, torques", f"{sum(found['wrong'].values()):,}"),
         ("daemon restarts", f"{found['restarts']:,}"),
-        ("wall clock", f"{found['wall_s'] / 3600.0:.2f} h"),
+        ("wall clock, processor", f"{found['wall_s'] / 3600.0:.2f} h, {found['cpu_s'] / 3600.0:.2f} h"),
     ]
     return rows + [(f"memory of {m['process']}", memory_words(m)) for m in found["memory"]]
 
@@ -87,7 +87,9 @@ def write_page(found: dict[str, Any], folder: Path) -> Path:
         )
     page.heading("Faults and reactions")
     page.table(_FAULT_HEADER, fault_rows(found))
-    page.figure(_reactions(found))
+    reactions = _reactions(found)
+    if reactions.panels:
+        page.figure(reactions)
     page.heading("Memory")
     page.figure(_memory(found))
     page.write(folder / PAGE_NAME)

@@ -1,0 +1,121 @@
+"""A short soak with a dense schedule, and episodes that lie: what the schedule does not explain is found out."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from servod.campaign.scenario import Recovery
+from servod.cli.app import run as servoctl
+from servod.commands import ReferenceKind
+from servod.errors import FaultCode
+from servod.soak.document import added
+from servod.soak.finding import Wrong
+from servod.soak.kinds import KINDS, FaultKind
+from servod.soak.plan import Ending, Episode, Move, schedule
+from servod.soak.run import DOCUMENT_NAME, run
+from servod.soak.stepped import GAIN_SETS, SteppedSoak
+
+_KIND = {kind.name: kind for kind in KINDS}
+_SINE = Move(ReferenceKind.SINE, (0.1, 1.0, 1.0), 1.0)
+
+
+def quiet(_line: str, _share: float) -> None:
+    """Progress that nobody sees."""
+
+
+def befallen(fault: FaultKind) -> Episode:
+    """An episode in which `fault` comes."""
+    return Episode(1, None, _SINE, 0.25, fault, Ending.FINISH, 1)
+
+
+@pytest.fixture(scope="module")
+def axis(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SteppedSoak]:
+    soak = SteppedSoak(1, tmp_path_factory.mktemp("soak"))
+    yield soak
+    soak.close()
+
+
+@pytest.fixture
+def wrong(axis: SteppedSoak) -> Counter[Wrong]:
+    """What was found wrong in this test, told from what was found before."""
+    axis.findings.counts.clear()
+    return axis.findings.counts
+
+
+def test_twenty_thousand_cycles_of_faults_leave_nothing_wrong(tmp_path: Path) -> None:
+    soak = SteppedSoak(7, tmp_path)
+    found = run(soak, schedule(7, GAIN_SETS), 20_000, 600.0, tmp_path, quiet)
+    soak.close()
+    assert found["passed"], found["findings"]
+    assert found["cycles"] == found["rows"] == found["syncs"] + found["syncs_taken"] >= 20_000
+    assert found["faults_injected"] == found["faults_found"] == found["faults_recovered"] >= 5
+    assert found["recordings"] == 1 and found["rows_read_back"] > 100
+    assert json.loads((tmp_path / DOCUMENT_NAME).read_text()) == found
+
+
+def test_the_same_seed_gives_the_same_schedule_and_every_kind_comes() -> None:
+    first, again, other = (list(itertools.islice(schedule(seed, GAIN_SETS), 120)) for seed in (1, 1, 2))
+    assert first == again != other
+    assert {e.fault.name for e in first if e.fault} == set(_KIND)
+
+
+def test_ctrl_c_leaves_a_report_of_what_was_done(axis: SteppedSoak, wrong: Counter[Wrong], tmp_path: Path) -> None:
+    def interrupted() -> Iterator[Episode]:
+        yield befallen(_KIND["frames destroyed"])
+        raise KeyboardInterrupt
+
+    found = run(axis, interrupted(), 10**9, 600.0, tmp_path, quiet)
+    assert found["interrupted"] and found["passed"] and not wrong
+    assert json.loads((tmp_path / DOCUMENT_NAME).read_text())["rows"] == found["rows"] > 0
+
+
+@pytest.mark.parametrize(
+    ("lie", "finding"),
+    [
+        (replace(_KIND["error in the drive"], expects=frozenset({FaultCode.BUS_OFF})), Wrong.NOT_FOUND),
+        (replace(_KIND["error in the drive"], expects=frozenset()), Wrong.UNEXPLAINED),
+        (replace(_KIND["encoder feedback lost, many"], gone_ms=1.0), Wrong.LATE),
+        (replace(_KIND["encoder feedback lost, many"], latched_ms=1.0), Wrong.LATE),
+        (replace(_KIND["SYNC lost, a few"], takes_syncs=False), Wrong.SYNC),
+        (replace(_KIND["error in the drive"], recovery=Recovery.ENABLE), Wrong.NOT_RECOVERED),
+    ],
+)
+def test_what_the_schedule_does_not_explain_is_found(
+    axis: SteppedSoak, wrong: Counter[Wrong], lie: FaultKind, finding: Wrong
+) -> None:
+    axis.episode(befallen(lie))
+    assert finding in wrong
+
+
+def test_a_recorder_that_loses_a_row_is_found(
+    axis: SteppedSoak, wrong: Counter[Wrong], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder = axis._recorder._recorder
+    takes = recorder.add_rows
+    monkeypatch.setattr(recorder, "add_rows", lambda rows: takes(rows[1:]))
+    axis.episode(replace(befallen(_KIND["frames destroyed"]), number=1))
+    assert wrong == {Wrong.RECORDER: 1}
+
+
+def test_several_runs_add_up(axis: SteppedSoak, tmp_path: Path) -> None:
+    found = run(axis, [befallen(_KIND["encoder alarm"])], 1, 600.0, tmp_path, quiet)
+    both = added([found, found])
+    assert both["cycles"] == 2 * found["cycles"]
+    alarm, alarms = found["faults"]["encoder alarm"], both["faults"]["encoder alarm"]
+    assert alarms["injected"] == 2 * alarm["injected"]
+    assert alarms["detected"]["median_ms"] == alarm["detected"]["median_ms"]
+    assert alarms["detected"]["count"] == 2 * alarm["detected"]["count"] > 0
+
+
+def test_the_command_writes_its_document_and_its_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert servoctl(["soak", "--cycles", "1500", "--seed", "2", "--out", str(tmp_path), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["mode"] == "stepped" and found["seeds"] == [2] and found["cycles"] >= 1500
+    assert "Nothing wrong" in (tmp_path / "soak.html").read_text()
