@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from enum import IntEnum
+from functools import cache
 from pathlib import Path
 
 import canopen
@@ -140,8 +141,7 @@ class Dictionary:
     """All entries of one node. `write_lock` is set while the drive is enabled: locked entries then refuse."""
 
     def __init__(self, eds: Path) -> None:
-        source = canopen.import_od(str(eds), 0)
-        self._entries = {(e.index, e.subindex): e for e in map(Entry, _variables(source))}
+        self._entries = {(e.index, e.subindex): e for e in map(Entry, _variables(eds))}
         self._indices = {index for index, _ in self._entries}
         self.write_lock = False
         self.injected_abort = 0
@@ -240,9 +240,9 @@ def _download_bytes(entry: Entry, data: bytes) -> None:
     entry.raw = data
 
 
-def _variables(source: canopen.ObjectDictionary) -> Iterator[ODVariable]:
-    for item in source.values():
-        if isinstance(item, ODVariable):
-            yield item
-        else:
-            yield from item.values()
+@cache
+def _variables(eds: Path) -> tuple[ODVariable, ...]:
+    """The variables of an EDS file, which is read once: many stepped worlds are built in one process."""
+    source = canopen.import_od(str(eds), 0)
+    items = [[item] if isinstance(item, ODVariable) else item.values() for item in source.values()]
+    return tuple(variable for group in items for variable in group)

@@ -25,6 +25,8 @@ _EMCY_FAULT = {"amplifier": FaultCode.DRIVE_FAULT, "encoder": FaultCode.ENCODER_
 _BOOT_UP_S = 2.0
 _OPERATIONAL_S = 1.0
 _MAX_CONSUMERS = 16
+#: A second node with the same id answers the same request within this time.
+_TWIN_S = 0.005
 
 
 def send_nmt(network: BusNetwork, command: NmtCommand, node_id: int) -> None:
@@ -51,6 +53,7 @@ class Node:
     def identify(self) -> list[str]:
         """Check who it is, by SDO reads alone, which work in operational and pre-operational. Raises Unreachable."""
         try:
+            self._ask_for_a_twin()
             found = read_identity(self.sdo)
         except NoAnswer as error:
             raise Unreachable(self._why_silent(str(error))) from None
@@ -59,6 +62,14 @@ class Node:
             f"node {self.node_id}: profile {found.profile}, vendor 0x{found.vendor_id:08X}, "
             f"product 0x{found.product_code:X}, revision 0x{found.revision:X}, serial {found.serial}"
         ]
+
+    def _ask_for_a_twin(self) -> None:
+        """One read that tells two nodes from one; raises Unreachable when both answer."""
+        self.sdo.read(Obj301.DEVICE_TYPE)
+        if self.sdo.answered_again(_TWIN_S):
+            raise Unreachable(
+                f"two nodes answer as node {self.node_id}; give each its own id (`servoctl scan` shows who is there)"
+            )
 
     def _why_silent(self, error: str) -> str:
         if self.watch.nmt_state == NmtState.STOPPED:

@@ -151,6 +151,10 @@ class NodeSdo:
         found: ODVariable | None = self.dictionary.get_variable(index, subindex)
         return found
 
+    def answered_again(self, within_s: float) -> bool:
+        """Whether a further answer comes to what was answered already: then two nodes have this id."""
+        return self._network.wait(lambda: not self._client.responses.empty(), within_s)
+
     def read(self, index: int, subindex: int = 0) -> int:
         """Upload an integer, signed as the EDS says. Raises Unreachable on time-out, SdoAbort on an abort."""
         data = self.read_bytes(index, subindex)
