@@ -55,13 +55,16 @@ _FAULTED = (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE)
 class ProcessAxis:
     """servod.campaign.under_test.AxisUnderTest on the wall clock.
 
-    `folder` takes everything that is written; `over` is laid over the configuration before the scenario's own keys.
+    `folder` takes everything that is written; `over` is laid over the configuration before the scenario's own keys;
+    `machine` has the processes, where they are not to be made here on the hub's socket.
     """
 
-    def __init__(self, scenario: Scenario, folder: Path, wire: Wire | None = None, over: Nested | None = None) -> None:
+    def __init__(
+        self, scenario: Scenario, folder: Path, machine: Machine | None = None, over: Nested | None = None
+    ) -> None:
         """Raises BadInput for a scenario's keys."""
-        self.folder, self.wire = folder, wire or HubWire(folder)
-        self.machine = Machine(folder, self.wire)
+        self.folder, self.machine = folder, machine or Machine(folder, HubWire(folder))
+        self.wire = self.machine.wire
         self.config = config_of(scenario, merged(_base(folder, self.wire), over or {}))
         settings = validate(scenario.settings, VirtualAxisSettings, f"{scenario.title}: settings")
         (folder / "settings.yaml").write_text(yaml.safe_dump(settings.model_dump(mode="json")))
@@ -69,7 +72,7 @@ class ProcessAxis:
         self.machine.config.write_text(yaml.safe_dump(self.config.model_dump(mode="json")))
         self._client: ControlClient | None = None
         self._hit_ns: int | None = None
-        self._asked_to_end = False
+        self._asked_to_end = self._off = False
         self.refusal = ""
 
     def now_ns(self) -> int:
@@ -79,7 +82,8 @@ class ProcessAxis:
     def start(self, start: Start) -> None:
         """Start the processes, enable and move, as far as `start` says."""
         self.machine.start_virtual_axis()
-        if start is Start.OFF:
+        self._off = start is Start.OFF
+        if self._off:
             return
         self.machine.start_daemon()
         if start in (Start.ENABLED, Start.MOVING):
@@ -92,7 +96,8 @@ class ProcessAxis:
 
     def run(self, duration_s: float) -> None:
         """Let time pass; an axis that is off is brought up first, and a refusal is kept."""
-        if self.machine.daemon is None:
+        if self._off:
+            self._off = False
             try:
                 self.machine.start_daemon()
             except ServodError as error:

@@ -14,7 +14,7 @@ from servod.campaign.processes import ProcessAxis
 from servod.campaign.scenario import Recovery, Runs, Scenario
 from servod.campaign.stepped import SteppedAxis
 from servod.campaign.under_test import AxisUnderTest
-from servod.errors import FAULTS
+from servod.errors import FAULTS, Unreachable
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,9 @@ class Outcome:
 
 
 def axis_of(scenario: Scenario, folder: Path) -> AxisUnderTest:
-    """The axis under test that the scenario names. Raises BadInput for its keys."""
+    """The axis under test that the scenario names. Raises BadInput for its keys, Unreachable for one of the guest."""
+    if scenario.runs is Runs.GUEST:
+        raise Unreachable(f"{scenario.title}: needs the guest machine (scripts/guest)")
     return SteppedAxis(scenario, folder) if scenario.runs is Runs.STEPPED else ProcessAxis(scenario, folder)
 
 

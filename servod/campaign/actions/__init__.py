@@ -9,6 +9,7 @@ from __future__ import annotations
 from servod.campaign.actions.base import Action
 from servod.campaign.actions.bus import BUS_ACTIONS
 from servod.campaign.actions.gains import GAIN_FILE_ACTIONS
+from servod.campaign.actions.guest import GUEST_ACTIONS
 from servod.campaign.actions.machine import MACHINE_ACTIONS
 from servod.campaign.actions.nodes import NODE_ACTIONS
 from servod.campaign.actions.processes import PROCESS_ACTIONS
@@ -25,6 +26,7 @@ ACTIONS: dict[str, type[Action]] = {
     **MACHINE_ACTIONS,
     **PROCESS_ACTIONS,
     **GAIN_FILE_ACTIONS,
+    **GUEST_ACTIONS,
 }
 
 
