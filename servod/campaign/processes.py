@@ -31,7 +31,7 @@ from servod.commands import Op
 from servod.control import ControlClient, Verb
 from servod.demo.axis import last_core, own_group
 from servod.drivers.virtual.amplifier import AMPLIFIER_EDS
-from servod.drivers.virtual.bus_faults import MYSELF, BusFault
+from servod.drivers.virtual.bus_faults import FRAME_KINDS, MYSELF, BusFault
 from servod.drivers.virtual.client import VirtualBus
 from servod.drivers.virtual.dictionary import Dictionary
 from servod.drivers.virtual.drive_record import DriveSample
@@ -108,7 +108,8 @@ class ProcessAxis:
         """Ask the hub, as somebody else than the loop: what shall hit the loop's own connection is not to be had."""
         foreign = self.wire.foreign()
         with contextlib.closing(foreign):
-            if fault.participant == MYSELF or not isinstance(foreign, VirtualBus):
+            of_the_loop = fault.participant == MYSELF and fault.kind not in FRAME_KINDS
+            if of_the_loop or not isinstance(foreign, VirtualBus):
                 raise BadInput("bus fault", fault.kind.name, "one that another participant of the hub can ask for")
             foreign.inject(fault)
 
