@@ -46,6 +46,8 @@ from servod.yaml12 import validate
 _SINE = {"kind": "sine", "amplitude_rad": 0.2, "frequency_hz": 1.0, "duration_s": 600.0}
 #: The joint moves when its torque is so large [N*m]: enough to lose.
 _MOVING_NM, _START_S = 0.01, 20.0
+#: A participant that leaves takes with it what still waits in its queue.
+_SENT_S = 0.01
 _VERBS = {Op.DISABLE: Verb.DISABLE, Op.QUICK_STOP: Verb.STOP, Op.HALT: Verb.HALT}
 _TOLD = re.compile(r"fault ([A-Z_]+) \(")
 _DOWNLOAD = struct.Struct("<BHB4s")
@@ -117,6 +119,7 @@ class ProcessAxis:
         """Send as somebody else on the bus."""
         with contextlib.closing(self.wire.foreign()) as foreign:
             foreign.send(can_id, data)
+            time.sleep(_SENT_S)
 
     def sdo_write(self, node_id: int, index: int, subindex: int, value: int) -> None:
         """One expedited download, as a service tool on the same bus."""
