@@ -86,7 +86,7 @@ class Connection:
         self._events = 0
         self._watch_period_ns, self._watch_next_ns = 0, 0
         self._watch_reply: Reply | None = None
-        self._hung_up = select.poll()  # tells POLLHUP whatever it is asked for: the other end is closed, both ways
+        self._hung_up = select.poll()  # tells POLLHUP whatever it is asked for
         self._hung_up.register(connection, 0)
         self._want()
 
@@ -97,11 +97,15 @@ class Connection:
 
     def begin_round(self, now_ns: int) -> None:
         """A new round: the client may be read again, and lines that waited are served; who has left is forgotten."""
-        if self._hung_up.poll(0):
+        if self.has_left():
             self._owner.drop(self)
             return
         self._reads, self._lines, self._now_ns = _READS_IN_A_ROUND, _LINES_IN_A_ROUND, now_ns
         self._serve()
+
+    def has_left(self) -> bool:
+        """The other end is closed, both ways, whatever of what it sent is still to be read."""
+        return bool(self._hung_up.poll(0))
 
     def read(self) -> None:
         """Take what came, and serve the lines in it."""

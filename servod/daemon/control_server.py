@@ -174,6 +174,8 @@ class ControlServer:
             message = decode_line(line)
             reply = Reply(client.send, _number(message))
             verb, args = _request(message)
+            if (holder := self._lease.holder) is not None and holder is not client and holder.has_left():
+                self.drop(holder)
             self._lease.take(client, verb)
             if verb is Verb.WATCH:
                 client.start_watch(args, reply)

@@ -180,7 +180,7 @@ def test_daemon_starts_again_after_kill_9(tmp_path: Path) -> None:
         time.sleep(1.0)
         command = [sys.executable, "-m", "servod.daemon.main", "--config", str(tmp_path / "axis.yaml")]
         with subprocess.Popen(command, stderr=subprocess.PIPE) as second:
-            wait_for(lambda: _answers(axis.socket) or second.poll() is not None)
+            wait_for(lambda: _answers(axis.socket) or second.poll() is not None, 60.0)
             with ControlClient(axis.socket) as client:
                 assert client.call("status")["axis"]["state"] == "DISABLED"
             second.send_signal(signal.SIGTERM)
