@@ -47,6 +47,10 @@ class SoakedAxis(Protocol):
         """Let one episode happen. Raises AnswerIsNo when the axis cannot be enabled any more, by nothing."""
         ...
 
+    def finish(self) -> None:
+        """Check what is left to check. Raises ServodError when the axis does not come to its end."""
+        ...
+
     def close(self) -> None:
         """Leave everything."""
         ...

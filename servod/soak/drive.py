@@ -51,7 +51,9 @@ def reaction(samples: Samples, injected_ns: int) -> Reaction:
 class DriveCheck:
     """Checks the samples of one drive; `samples` counts them."""
 
-    def __init__(self, torque_limit_nm: float, findings: Findings) -> None:
+    def __init__(self, torque_limit_nm: float, findings: Findings, order_ns: int = 0) -> None:
+        """`order_ns`: how far samples may stand out of order, where timers and frames are served on the wall clock."""
+        self._order_ns = order_ns
         self._limit_nm, self._findings = torque_limit_nm * (1.0 + 1e-9), findings
         self.samples = 0
         self._time_ns = self._lost = 0
@@ -65,7 +67,7 @@ class DriveCheck:
         if not len(samples):
             return
         times_ns, torque_nm = samples["time_ns"], np.abs(samples["torque_nm"])
-        back = np.diff(times_ns, prepend=self._time_ns) < 0
+        back = np.diff(times_ns, prepend=max(self._time_ns, int(times_ns[0]) - self._order_ns)) < -self._order_ns
         self._first(Wrong.TIME, samples, back, "the drive's record goes back in time")
         energised = np.isin(samples["state"], _ENERGISED)
         self._first(Wrong.TORQUE, samples, ~energised & (torque_nm > NO_TORQUE_NM), "torque in a drive that is off")

@@ -11,18 +11,20 @@ import time
 from collections.abc import Sequence
 from contextlib import closing, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from servod.demo.processes import sigterm_as_interrupt
 from servod.errors import Unreachable
-from servod.soak.counts import SoakedAxis
 from servod.soak.document import added
+from servod.soak.kinds import KINDS
 from servod.soak.page import write_page
 from servod.soak.plan import schedule
 from servod.soak.run import DOCUMENT_NAME, Tell, run, save
 from servod.soak.stepped import GAIN_SETS, SteppedSoak
+from servod.soak.wall import WallSoak, of_the_wall
 
-_POLL_S = 1.0
+_POLL_S, _CYCLES_PER_S = 1.0, 1000.0
 #: After Ctrl-C a job ends its episode's check and writes its document.
 _PATIENCE_S = 60.0
 
@@ -49,12 +51,18 @@ def launch(order: Order, jobs: int, tell: Tell) -> dict[str, Any]:
 
 def _single(order: Order, tell: Tell) -> dict[str, Any]:
     limit_s = math.inf if order.limit_hours is None else order.limit_hours * 3600.0
-    with closing(_axis(order)) as axis:
+    if order.wall:
+        return _wall(order, limit_s, tell)
+    with closing(SteppedSoak(order.seed, order.out)) as axis:
         return run(axis, schedule(order.seed, GAIN_SETS), order.cycles, limit_s, order.out, tell)
 
 
-def _axis(order: Order) -> SoakedAxis:
-    return SteppedSoak(order.seed, order.out)
+def _wall(order: Order, limit_s: float, tell: Tell) -> dict[str, Any]:
+    """Cycles take their time on the wall clock; sockets want a short path."""
+    kinds = tuple(filter(of_the_wall, KINDS))
+    limit_s = min(limit_s, order.cycles / _CYCLES_PER_S)
+    with TemporaryDirectory(prefix="servod-soak-") as folder, closing(WallSoak(order.seed, Path(folder))) as axis:
+        return run(axis, schedule(order.seed, GAIN_SETS, kinds), sys.maxsize, limit_s, order.out, tell)
 
 
 def _several(order: Order, jobs: int, tell: Tell) -> dict[str, Any]:

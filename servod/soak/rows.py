@@ -53,15 +53,18 @@ _STAYS_POWERED, _NOT_FINITE = (FAULTS[c].bit for c in (FaultCode.DRIVE_STAYS_POW
 class RowCheck:
     """Checks the rows of one axis; `cycles` and `rows` count what the loop numbered and what was recorded."""
 
-    def __init__(self, period_ns: int, torque_limit_nm: float, findings: Findings) -> None:
+    def __init__(self, period_ns: int, torque_limit_nm: float, findings: Findings, tolerance_ns: int = 0) -> None:
+        """`tolerance_ns`: how far the middle row of a batch may stand off the clock of the first row; 0: no row at all
+        may."""
+        self._tolerance_ns = tolerance_ns
         self._period_ns, self._limit_nm, self._findings = period_ns, torque_limit_nm * (1.0 + 1e-9), findings
         self.cycles = self.rows = self.missed = 0
-        self._cycle = self._time_ns = self._missed_before = 0
-        self._astray = 0
+        self.new_session()
 
     def new_session(self) -> None:
         """The next row is the first of a new loop."""
-        self._cycle = self._time_ns = self._missed_before = self._astray = 0
+        self._cycle = self._missed_before = self._astray = 0
+        self._origin: tuple[int, int] | None = None  # deadline and number of the session's first cycle
 
     def check(self, rows: Rows, explained: int, answer_cycles: int = _ANSWER_CYCLES) -> None:
         """One batch, oldest first. `explained`: the faults that may be seen; `answer_cycles`: how long drive and axis
@@ -91,16 +94,18 @@ class RowCheck:
         self._missed_before = int(missed[-1])
 
     def _times(self, rows: Rows) -> None:
-        """Cycle k of a session stands at t0 + k * period, exactly."""
-        cycles, times = rows["cycle"], rows["time_ns"]
-        if self._time_ns == 0:
-            self._time_ns, self._cycle = int(times[0]), int(cycles[0])
-        off = times - (self._time_ns + (cycles - self._cycle) * self._period_ns)
-        wrong = off != 0
+        """Cycle k of a session stands at t0 + k * period: its deadline, however late the loop woke."""
+        cycles, deadlines = rows["cycle"], rows["time_ns"] - rows["lag_ns"]
+        if self._origin is None:
+            self._origin = int(deadlines[0]), int(cycles[0])
+        off = deadlines - (self._origin[0] + (cycles - self._origin[1]) * self._period_ns)
+        if self._tolerance_ns:
+            off = np.full(len(rows), np.median(off))
+        wrong = np.abs(off) > self._tolerance_ns
         if wrong.any():
             at = int(np.argmax(wrong))
-            self._add(Wrong.TIME, rows, at, f"cycle {cycles[at]} is {off[at]} ns off", int(wrong.sum()))
-        self._time_ns, self._cycle = int(times[-1]), int(cycles[-1])
+            self._add(Wrong.TIME, rows, at, f"cycle {cycles[at]} is {off[at]:.0f} ns off", int(wrong.sum()))
+        self._cycle = int(cycles[-1])
 
     def _values(self, rows: Rows) -> None:
         """Finite numbers, but for the controller's own while NOT_FINITE is latched; torque only under control."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from servod.errors import AnswerIsNo
+from servod.errors import ServodError
 from servod.report.files import write_bytes
 from servod.soak.counts import SoakedAxis
 from servod.soak.document import document
@@ -57,8 +57,12 @@ def run(
         _go_through(axis, episodes, cycles, watch, folder, tell)
     except KeyboardInterrupt:
         interrupted = True
-    except AnswerIsNo as error:
+    except ServodError as error:
         axis.findings.add(Wrong.NOT_RECOVERED, 0, str(error))
+    try:
+        axis.finish()
+    except ServodError as error:
+        axis.findings.add(Wrong.STATE, 0, f"at the end: {error}")
     _judge_memory(axis, watch)
     found = document(axis, watch.memories, watch.elapsed_s) | {"interrupted": interrupted, "running": False}
     save(found, folder)

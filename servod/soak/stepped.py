@@ -16,7 +16,7 @@ import numpy as np
 
 from servod.axis import AxisState
 from servod.campaign.actions import action_of
-from servod.campaign.scenario import Injection, Recovery, Runs, Scenario, Start
+from servod.campaign.scenario import Injection, Recovery, Runs, Start
 from servod.campaign.stepped import RECORD_NAME, SteppedAxis
 from servod.commands import REFUSAL_TEXT, Op, Refusal
 from servod.controllers import LAWS
@@ -31,6 +31,7 @@ from servod.soak.kinds import ALWAYS, FaultKind, fault_bits
 from servod.soak.plan import Ending, Episode, Move, home
 from servod.soak.recording import RecordingCheck
 from servod.soak.rows import RowCheck, Rows, rows_of
+from servod.soak.start import nothing_yet
 from servod.soak.syncs import SyncCheck, SyncListener
 from servod.soak.tally import Tally
 from servod.units import NS_PER_S
@@ -58,7 +59,7 @@ class SteppedSoak:
 
     def __init__(self, seed: int, folder: Path) -> None:
         self.findings, self.tally = Findings(), Tally()
-        self._axis = SteppedAxis(_scenario(seed), folder)
+        self._axis = SteppedAxis(nothing_yet(seed), folder)
         self._heard, self._drive = SyncListener(self._axis.world.hub), DriveTail(folder / RECORD_NAME)
         self._axis.start(Start.ENABLED)
         config = self._axis.session.config
@@ -108,6 +109,9 @@ class SteppedSoak:
         if self._axis.session.cycle.reference.active:
             self._end(episode)
         self._recorder.stop(self._axis.now_ns())
+
+    def finish(self) -> None:
+        """Everything was checked batch by batch; a batch that was interrupted is not judged."""
 
     def close(self) -> None:
         """Leave the bus and the files."""
@@ -277,17 +281,3 @@ def _detected_ms(rows: Rows, injected_ns: int, expected: int) -> float | None:
 def _drive_limit_nm(axis: SteppedAxis) -> float:
     settings = axis.world.settings
     return settings.rated_torque_mnm * settings.max_torque_permille * 1e-6 * settings.gear_ratio
-
-
-def _scenario(seed: int) -> Scenario:
-    """The campaign's stepped axis as it ships, with noise from `seed`; what a scenario injects is not used."""
-    return Scenario.model_validate(
-        {
-            "title": "soak",
-            "why": "Trust grows with hours.",
-            "group": "soak",
-            "settings": {"seed": seed},
-            "inject": [{"do": {"frames": {"of": "any", "fault": "drop"}}}],
-            "expect": {"axis": ["ENABLED"]},
-        }
-    )

@@ -5,14 +5,20 @@ Beside the loop, which never sees it: what it hears has been on the bus.
 
 from __future__ import annotations
 
+import threading
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
 from servod.cia import SYNC_ID
+from servod.drivers.virtual.client import VirtualBus
 from servod.drivers.virtual.hub import Hub
 from servod.drivers.virtual.port import Port
 from servod.soak.finding import Findings, Wrong
 from servod.soak.rows import Rows
+
+_LISTEN_S = 0.1
 
 
 class SyncListener:
@@ -61,3 +67,35 @@ class SyncCheck:
     def _tell(self, times_ns: NDArray[np.int64], where: NDArray[np.bool_], text: str) -> None:
         if where.any():
             self._findings.add(Wrong.SYNC, int(times_ns[int(np.argmax(where))]), text, int(where.sum()))
+
+
+class SyncThread:
+    """Counts SYNC as a client of the hub's socket, in a thread that does nothing else.
+
+    `count` SYNC frames so far; `overruns` tells how often the hub had to drop frames because this thread got no turn.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Raises Unreachable when no hub serves at `path`."""
+        self._bus = VirtualBus(str(path), (SYNC_ID,))
+        self.count = 0
+        self._ends = threading.Event()
+        self._thread = threading.Thread(target=self._listen, name="sync listener", daemon=True)
+        self._thread.start()
+
+    @property
+    def overruns(self) -> int:
+        """Error frames by which the hub said so."""
+        return self._bus.counters.error_frames
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._ends.set()
+        self._thread.join()
+        self._bus.close()
+
+    def _listen(self) -> None:
+        while not self._ends.is_set():
+            frame = self._bus.receive(_LISTEN_S)
+            if frame is not None and frame.can_id == SYNC_ID:
+                self.count += 1

@@ -1,0 +1,274 @@
+"""A soak on the wall clock: daemon, loop and virtual axis as the processes that ship, driven through the schedule.
+
+The rows are those that the daemon's recorder wrote, read back file by file; SYNC is counted by a client of the hub of
+its own; the drive's record is read while it grows. What a machine that does not give the loop its turn may cause is
+allowed, since no schedule explains it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+from servod.axis import AxisState
+from servod.campaign.actions import action_of
+from servod.campaign.machine import Process
+from servod.campaign.processes import ProcessAxis
+from servod.campaign.scenario import Injection, Recovery, Runs, Start
+from servod.commands import ReferenceKind
+from servod.control import Verb
+from servod.drivers.virtual.drive_record import DriveTail
+from servod.errors import AnswerIsNo, FaultCode, ServodError, Unreachable
+from servod.shipped import shipped
+from servod.soak.counts import Counts
+from servod.soak.drive import DriveCheck, reaction, samples_of
+from servod.soak.finding import Findings, Wrong
+from servod.soak.kinds import FaultKind, fault_bits
+from servod.soak.plan import Ending, Episode, Move
+from servod.soak.recorded import RecordedRows
+from servod.soak.start import nothing_yet
+from servod.soak.syncs import SyncThread
+from servod.soak.tally import Tally
+from servod.units import NS_PER_US
+
+#: What a loop may see whose processes do not get their turn, and what follows from that.
+STARVED = frozenset(
+    {
+        *(FaultCode.DEADLINE_LATE, FaultCode.DEADLINE_BUDGET, FaultCode.FEEDBACK_STALE, FaultCode.SUPERVISOR_LOST),
+        *(FaultCode.NODE_HEARTBEAT_LOST, FaultCode.DRIVE_FAULT, FaultCode.FOLLOWING_ERROR),
+    }
+)
+_POLL_S, _STOPPING_S, _TRIES = 0.05, 5.0, 3
+#: Whoever hears SYNC has heard the last one so long after the loop ended [s].
+_HEARD_S = 0.2
+#: Exit codes of a daemon that ends after a node was lost: 3 when it could not see the drive off.
+_ENDS_AFTER_LOSS = (0, Unreachable.exit_code)
+#: Timers of the virtual axis are stamped with the moment at which they were due, frames with that of the bus [ns].
+_ORDER_NS = 500_000_000
+#: What a reaction may take beyond its bound on a machine without real-time rights [ms].
+_GRACE_MS = 500.0
+
+
+def of_the_wall(kind: FaultKind) -> bool:
+    """Whether a fault can be put to a loop in a process of its own: from the bus, not from within."""
+    return all(action != "gains" and arguments.get("who") != "loop" for action, arguments in kind.do.items())
+
+
+class WallSoak:
+    """One axis of real processes; `folder` takes everything that they write."""
+
+    def __init__(self, seed: int, folder: Path) -> None:
+        """Raises Unreachable when the processes do not start."""
+        folder.mkdir(parents=True, exist_ok=True)
+        self.findings, self.tally = Findings(), Tally()
+        over = {"recorder": {"always": True, "max_file_mib": 16}}
+        with contextlib.ExitStack() as stack:
+            self._axis = ProcessAxis(nothing_yet(seed), folder, over=over)
+            stack.callback(self._axis.close)
+            self._axis.start(Start.OFF)
+            self._heard = SyncThread(folder / "bus")
+            stack.callback(self._heard.close)
+            self._tail = DriveTail(next(folder.glob("*-drive.bin")))
+            stack.callback(self._tail.close)
+            self._axis.machine.start_daemon()
+            self._ends = stack.pop_all()
+        config = self._axis.config
+        self._period_ns = config.cycle.period_us * NS_PER_US
+        self._rows = RecordedRows(config, self.findings)
+        self._samples = DriveCheck(config.limits.torque_nm, self.findings, _ORDER_NS)
+        self._explained, self._heard_before, self._syncs_taken = fault_bits(STARVED), 0, False
+        self.findings.begin(self._axis.now_ns())
+        self._recover(Recovery.ENABLE)
+
+    @property
+    def counts(self) -> Counts:
+        """What was counted so far; rows are counted when their file is complete."""
+        rows, check = self._rows, self._rows.check
+        return Counts(
+            self._period_ns,
+            check.cycles,
+            check.rows,
+            check.missed,
+            rows.syncs,
+            rows.syncs_taken,
+            self._samples.samples,
+            rows.files,
+            check.rows,
+        )
+
+    def processes(self) -> dict[str, int]:
+        """Daemon, virtual axis and this one."""
+        machine = self._axis.machine
+        assert machine.daemon is not None and machine.virtual_axis is not None
+        return {"soak": os.getpid(), "daemon": machine.daemon.pid, "virtual axis": machine.virtual_axis.pid}
+
+    def episode(self, episode: Episode) -> None:
+        """Let one episode happen. Raises AnswerIsNo when the axis cannot be enabled any more, by nothing."""
+        self.findings.episode = episode.number
+        self.tally.episodes += 1
+        if episode.law is not None:
+            self._change_law(episode.law)
+        moves = self._move(episode.move)
+        time.sleep(episode.before_s)
+        self._settle()
+        if episode.fault is not None:
+            self._befall(episode.fault, random.Random(episode.seed))  # noqa: S311
+        if moves and self._state() == AxisState.ENABLED.name:
+            self._end(episode)
+        self._rows.take(self._explained, ended=False)
+
+    def finish(self) -> None:
+        """Bring the axis to rest, end the daemon and check what it recorded last."""
+        self._end_session((0,))
+
+    def close(self) -> None:
+        """End all processes."""
+        self._ends.close()
+
+    # --- what happens ------------------------------------------------------------------------------------------
+
+    def _ask(self, verb: Verb, **args: Any) -> bool:
+        """Ask the daemon; a refusal of a sound axis is a finding, that of a starved one is none."""
+        try:
+            self._axis.client.call(verb, **args)
+        except ServodError as error:
+            if self._state() == AxisState.ENABLED.name:
+                self.findings.add(Wrong.REFUSED, self._axis.now_ns(), f"{verb}: {error}")
+            return False
+        return True
+
+    def _state(self) -> str:
+        return str(self._axis.client.call(Verb.STATUS)["axis"]["state"])
+
+    def _change_law(self, name: str) -> None:
+        text = shipped(f"gains/{name}.yaml").read_text()
+        if self._ask(Verb.GAINS_LOAD, name=f"{name}.yaml", text=text) and self._ask(Verb.GAINS_ACTIVATE, name=name):
+            self.tally.laws[name] += 1
+
+    def _move(self, move: Move) -> bool:
+        self.tally.moves[move.kind.name] += 1
+        arguments = _track(move)
+        return arguments is not None and self._ask(Verb.TRACK, **arguments)
+
+    def _end(self, episode: Episode) -> None:
+        self.tally.endings[episode.ending.name] += 1
+        if episode.ending in (Ending.DISABLE, Ending.QUICK_STOP):
+            self._ask(Verb.DISABLE if episode.ending is Ending.DISABLE else Verb.STOP)
+            self._wait_while(lambda status: status["axis"]["state"] not in ("DISABLED", "FAULT"))
+            self._recover(Recovery.ENABLE)
+            return
+        if episode.ending is Ending.HALT:
+            self._ask(Verb.HALT, on=True)
+            time.sleep(0.2)
+            self._ask(Verb.HALT, on=False)
+        self._wait_while(lambda status: bool(status["axis"]["motion_running"]))
+        self._settle()
+
+    def _wait_while(self, goes_on: Any) -> None:
+        deadline = time.monotonic() + _STOPPING_S
+        while goes_on(self._axis.client.call(Verb.STATUS)) and time.monotonic() < deadline:
+            time.sleep(_POLL_S)
+
+    # --- faults ------------------------------------------------------------------------------------------------
+
+    def _befall(self, kind: FaultKind, chance: random.Random) -> None:
+        """Inject, watch, judge, repair, recover."""
+        tally = self.tally.of(kind.name)
+        tally.injected += 1
+        self._explained |= kind.explained
+        self._syncs_taken |= kind.takes_syncs
+        injected_ns = self._axis.now_ns()
+        self._act(kind.injection(chance))
+        time.sleep(kind.watch_ms / 1e3)
+        self._judge(kind, injected_ns)
+        repair = kind.repair()
+        if repair is not None:
+            self._act(repair)
+            time.sleep(_HEARD_S)
+        tally.recovered += self._recover(kind.recovery)
+
+    def _act(self, injection: Injection) -> None:
+        action_of(injection, "soak", Runs.PROCESSES).apply(self._axis)
+
+    def _judge(self, kind: FaultKind, injected_ns: int) -> None:
+        """Does the user see the fault, and was the torque gone in time by the drive's own record?"""
+        tally, samples = self.tally.of(kind.name), self._settle()
+        seen = {FaultCode[fault["code"]] for fault in self._axis.client.call(Verb.STATUS)["faults"]}
+        unexplained = fault_bits(frozenset(seen)) & ~(kind.explained | fault_bits(STARVED))
+        if unexplained:
+            names = ", ".join(code.name for code in sorted(seen))
+            self.findings.add(Wrong.UNEXPLAINED, injected_ns, f"{kind.name}: {names}")
+        tally.latched.update(code.name for code in seen)
+        if kind.expects and not seen & kind.expects:
+            self.findings.add(
+                Wrong.NOT_FOUND, injected_ns, f"{kind.name}: {', '.join(c.name for c in seen) or 'nothing'}"
+            )
+            return
+        tally.found += 1
+        if not kind.expects:
+            return
+        gone_ms = reaction(samples, injected_ns).gone_ms
+        if gone_ms is not None:
+            tally.gone.add(gone_ms)
+        if gone_ms is None or gone_ms > kind.gone_ms + _GRACE_MS:
+            self.findings.add(Wrong.LATE, injected_ns, f"{kind.name}: torque gone after {gone_ms} ms")
+
+    def _recover(self, recovery: Recovery) -> bool:
+        """What a person does; a machine that starves the loop may need another try."""
+        for attempt in range(_TRIES):
+            if recovery is Recovery.RESTART or attempt == _TRIES - 1:
+                self._end_session(_ENDS_AFTER_LOSS)
+                self.tally.restarts += 1
+                self._axis.machine.start_daemon()
+            if self._enabled(recovery is not Recovery.NONE or attempt > 0):
+                return True
+        self.findings.add(Wrong.NOT_RECOVERED, self._axis.now_ns(), f"by {recovery}: {self._axis.refusal}")
+        raise AnswerIsNo(f"episode {self.findings.episode}: the axis cannot be enabled any more")
+
+    def _enabled(self, ask: bool) -> bool:
+        done = self._axis.recover(Recovery.RESET_FAULT) if ask else self._state() == AxisState.ENABLED.name
+        self._settle()
+        return done
+
+    # --- what was recorded -------------------------------------------------------------------------------------
+
+    def _settle(self) -> Any:
+        """Check the drive's own record since the last call; returns its samples."""
+        samples = samples_of(self._tail.take())
+        self._samples.check(samples, self._tail.lost)
+        return samples
+
+    def _end_session(self, codes: tuple[int, ...]) -> None:
+        """End the daemon as the service manager does, and hold its rows against what was heard on the bus."""
+        machine = self._axis.machine
+        self._axis.leave()
+        machine.send([Process.DAEMON], signal.SIGTERM)
+        code = machine.wait(Process.DAEMON, 20.0)
+        if code not in codes:
+            self.findings.add(Wrong.STATE, self._axis.now_ns(), f"the daemon ended with exit code {code}")
+        time.sleep(_HEARD_S)
+        heard, self._heard_before = self._heard.count - self._heard_before, self._heard.count
+        self._rows.take(self._explained, ended=True)
+        self._rows.end_session(heard, self._syncs_taken or self._heard.overruns > 0)
+        self._explained, self._syncs_taken = fault_bits(STARVED), False
+
+
+_NAMES: dict[ReferenceKind, tuple[str, ...]] = {
+    ReferenceKind.SINE: ("amplitude_rad", "frequency_hz", "duration_s"),
+    ReferenceKind.STEP: ("amplitude_rad", "duration_s"),
+    ReferenceKind.PAPER: ("duration_s",),
+}
+
+
+def _track(move: Move) -> dict[str, Any] | None:
+    """Arguments of the verb `track`; None for holding still, which needs no command."""
+    if move.kind is ReferenceKind.HOLD:
+        return None
+    if move.table:
+        return {"kind": "csv", "positions_rad": list(move.table[: int(move.arguments[0])])}
+    return {"kind": move.kind.name.lower(), **dict(zip(_NAMES[move.kind], move.arguments, strict=True))}
