@@ -16,7 +16,7 @@ from servod.hal import AmplifierFeedback, DriveState, Goal, Mode, Reason
 
 _BIT = {code: fault.bit for code, fault in FAULTS.items()}
 _MASK = {r: sum(f.bit for f in FAULTS.values() if f.reaction == r) for r in Reaction}
-_STATUS_WARNING, _STATUS_LIMIT = 1 << 7, 1 << 11
+_STATUS_WARNING, _STATUS_REMOTE, _STATUS_LIMIT = 1 << 7, 1 << 9, 1 << 11
 
 
 class AxisState(IntEnum):
@@ -62,7 +62,7 @@ class Axis:
         self._timeout_cycles = max(1, round(enable_timeout_s / period_s))
         self._cycles_in_state = self._disobeyed_cycles = 0
         self._obey_cycles = max(4, round(_OBEY_S / period_s))
-        self._reset_wanted, self._seen_off = False, True
+        self._reset_wanted, self._seen_off, self._seen_remote = False, True, False
         self._end_state = AxisState.DISABLED
 
     @property
@@ -85,7 +85,7 @@ class Axis:
             self.reset_fault()
         if self.latched & ~_MASK[Reaction.NONE] & ~_MASK[Reaction.CLIP]:
             return Refusal.FAULT_PRESENT
-        self.latched = 0
+        self.latched, self._seen_remote = 0, False
         self._enter(AxisState.ENABLING)
         return Refusal.DONE
 
@@ -219,6 +219,10 @@ class Axis:
             faults |= _BIT[FaultCode.DRIVE_MODE_WRONG]
         if amplifier.status_word & _STATUS_LIMIT:
             faults |= _BIT[FaultCode.DRIVE_LIMITS_TORQUE]
+        if amplifier.status_word & _STATUS_REMOTE:  # some drives never show it, so only its end says something
+            self._seen_remote = True
+        elif self._seen_remote:
+            faults |= _BIT[FaultCode.COMMANDS_LOST]
         return faults
 
     def _being_reset(self) -> bool:

@@ -301,15 +301,16 @@ FAULTS: dict[FaultCode, Fault] = dict(
         _row(
             _C.COMMANDS_LOST,
             _R.DISABLE,
-            "The drive misses the command frames (RPDO1; EMCY 0x8250) while it is powered; it was stopped by NMT.",
-            "Check wiring and plugs, and whether something else takes the bus; then restart the daemon.",
+            "The powered drive misses the command frames (RPDO1; EMCY 0x8250), or takes none from the bus any more "
+            "(status word bit 9); it was stopped by NMT.",
+            "Check wiring and plugs, and whether somebody else commands the drive; then restart the daemon.",
         ),
         _row(
             _C.SECOND_MASTER,
             _R.QUICK_STOP,
             "Somebody else sends frames that only this master may send: SYNC, the command or the master's heartbeat.",
-            "Find the other master on the bus: a second daemon, another controller, or a node that produces SYNC (0x1005 "
-            "bit 30).",
+            "Find the other master on the bus: a second daemon, another controller, or a node that produces SYNC (0x1005 bit "
+            "30).",
         ),
     ]
 )

@@ -18,11 +18,13 @@ PERIOD_S = 1e-3
 
 
 def feedback(text: str) -> AmplifierFeedback:
-    """`text`: a drive state, optionally followed by words: stale, warning, limit, mode=N, "misses commands"."""
+    """`text`: a drive state, optionally followed by words: stale, warning, limit, remote, mode=N, "misses
+    commands"."""
     name, *words = text.split()
     state = DriveState[name]
     mode = next((int(w[5:]) for w in words if w.startswith("mode=")), 10)
     status = (1 << 7 if "warning" in words else 0) | (1 << 11 if "limit" in words else 0)
+    status |= 1 << 9 if "remote" in words else 0
     reached = state == DriveState.OPERATION_ENABLED
     reasons = Reason.IN_FAULT if state == DriveState.FAULT else Reason.NONE
     reasons |= Reason.COMMANDS_MISSED if "misses" in words else Reason.NONE
