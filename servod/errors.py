@@ -309,8 +309,8 @@ FAULTS: dict[FaultCode, Fault] = dict(
             _C.SECOND_MASTER,
             _R.QUICK_STOP,
             "Somebody else sends frames that only this master may send: SYNC, the command or the master's heartbeat.",
-            "Find the other master on the bus: a second daemon, another controller, or a node that produces SYNC (0x1005 bit "
-            "30).",
+            "Find the other master on the bus: a second daemon, another controller, or a node that produces SYNC "
+            "(0x1005 bit 30).",
         ),
     ]
 )
