@@ -70,6 +70,7 @@ class Rpdo(Pdo):
         self._emergency = emergency
         self._deadline = timeline.timer(self._missed)
         self._waiting: tuple[int, ...] | None = None
+        self._wrong_length = False
 
     def stop(self) -> None:
         """Leave operational: forget what waits, stop supervision."""
@@ -78,16 +79,26 @@ class Rpdo(Pdo):
 
     def take(self, data: bytes, time_ns: int) -> bool:
         """A frame came; True when it shall be applied now, not at SYNC."""
-        size = self.packing.size
-        if len(data) != size:
-            self._emergency.set(Emcy.PDO_LENGTH if len(data) < size else Emcy.PDO_TOO_LONG, time_ns)
-            if len(data) < size:
-                return False
+        if not self._fits(len(data), time_ns):
+            return False
         self._waiting = self.packing.unpack_from(data)
         if self.event_ms:
             self._deadline.arm(time_ns + self.event_ms * _NS_PER_MS)
             self._emergency.clear(Emcy.RPDO_TIME_OUT, time_ns)
         return self.kind > _LAST_SYNCHRONOUS
+
+    def _fits(self, length: int, time_ns: int) -> bool:
+        """False for a frame that is too short, which is ignored; a wrong length is told once until one is right."""
+        size = self.packing.size
+        if length == size:
+            if self._wrong_length:
+                self._wrong_length = False
+                self._emergency.clear(Emcy.PDO_LENGTH, time_ns)
+                self._emergency.clear(Emcy.PDO_TOO_LONG, time_ns)
+            return True
+        self._wrong_length = True
+        self._emergency.set(Emcy.PDO_LENGTH if length < size else Emcy.PDO_TOO_LONG, time_ns)
+        return length > size
 
     def apply(self) -> bool:
         """Write the waiting values into the dictionary, all of them; values out of range leave theirs as it was."""

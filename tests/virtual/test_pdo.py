@@ -116,6 +116,11 @@ def test_wrong_lengths_are_emergencies(bench: Bench, data: bytes, code: int) -> 
     bench.cycle(cycles=2)
     assert bench.frames(0x081)[0][:2] == code.to_bytes(2, "little")
     assert bool(bench.read(AMPLIFIER, Obj402.CONTROL_WORD)) is (code == Emcy.PDO_TOO_LONG)  # a short one is ignored
+    bench.cycle(0x06, cycles=2)
+    bench.bus.send(RPDO1, data)
+    bench.cycle(cycles=2)
+    told = [frame[:2] for frame in bench.frames(0x081)]
+    assert told == [code.to_bytes(2, "little"), b"\0\0", code.to_bytes(2, "little")]  # a right one takes it back
 
 
 def test_a_missing_rpdo_is_an_emergency_and_its_return_clears_it(bench: Bench) -> None:
