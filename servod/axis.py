@@ -29,6 +29,7 @@ class AxisState(IntEnum):
     RAMPING = 4  # torque going to zero
     QUICK_STOPPING = 5  # the drive stops the axis
     FAULT = 6
+    PROVING = 7  # before the first torque: the bounded test of the wiring (servod.loop.proof)
 
 
 _UNHEARD_MASK = _BIT[FaultCode.DRIVE_STAYS_POWERED] | _BIT[FaultCode.COMMANDS_LOST]
@@ -37,6 +38,10 @@ _OFF_MASK = sum(FAULTS[code].bit for code in NEEDS_RESTART)
 _POWERED = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
 _OBEY_S = 0.1
 _CONTROLLED = (AxisState.ENABLED, AxisState.BRAKING, AxisState.RAMPING)
+#: On the way to ENABLED, or there.
+_UNDER_WAY = (AxisState.ENABLING, AxisState.PROVING, AxisState.ENABLED)
+#: Nothing is moved under control yet: whatever ends these states switches off at once.
+_BEFORE_CONTROL = (AxisState.ENABLING, AxisState.PROVING)
 
 
 class AxisOutput(NamedTuple):
@@ -64,6 +69,7 @@ class Axis:
         self._obey_cycles = max(4, round(_OBEY_S / period_s))
         self._reset_wanted, self._seen_off, self._seen_remote = False, True, False
         self._end_state = AxisState.DISABLED
+        self._prove = self._proven = False
 
     @property
     def goal(self) -> Goal:
@@ -75,10 +81,13 @@ class Axis:
         """The drive does not follow the control word, or does not get it: other ways must stop it."""
         return bool(self.latched & _UNHEARD_MASK)
 
-    def enable(self, reset_fault: bool) -> Refusal:
-        """Explicit request to enable; with `reset_fault` latched faults and the drive's fault are reset first."""
+    def enable(self, reset_fault: bool, prove: bool = False) -> Refusal:
+        """Explicit request to enable; with `reset_fault` latched faults and the drive's fault are reset first.
+
+        With `prove` the drive's power is followed by the state PROVING, which `proven` ends.
+        """
         if self.state not in (AxisState.DISABLED, AxisState.FAULT):
-            return Refusal.DONE if self.state in (AxisState.ENABLED, AxisState.ENABLING) else Refusal.MOTION_RUNNING
+            return Refusal.DONE if self.state in _UNDER_WAY else Refusal.MOTION_RUNNING
         if self.latched & _OFF_MASK:
             return Refusal.NEEDS_RESTART
         if reset_fault:
@@ -87,11 +96,16 @@ class Axis:
             return Refusal.FAULT_PRESENT
         self.latched, self._seen_remote = 0, False
         self._enter(AxisState.ENABLING)
+        self._prove, self._proven = prove, False
         return Refusal.DONE
+
+    def proven(self) -> None:
+        """The test passed: the axis is enabled in the next cycle."""
+        self._proven = True
 
     def reset_fault(self) -> Refusal:
         """Forget latched faults, but for those that need a restart, and ask the drive once to reset its own."""
-        if self.state in _CONTROLLED:
+        if self.state in _CONTROLLED or self.state == AxisState.PROVING:
             return Refusal.MOTION_RUNNING
         self.latched, self._reset_wanted = self.latched & _OFF_MASK, True
         if self.state == AxisState.FAULT:
@@ -102,7 +116,7 @@ class Axis:
         """Bring the axis to rest under control, then switch off."""
         if self.state == AxisState.ENABLED:
             self._stop(AxisState.BRAKING, AxisState.DISABLED)
-        elif self.state == AxisState.ENABLING:
+        elif self.state in _BEFORE_CONTROL:
             self._enter(AxisState.DISABLED)
 
     def quick_stop(self) -> None:
@@ -110,7 +124,7 @@ class Axis:
         if self.state in _CONTROLLED:
             failed = self.state != AxisState.ENABLED and self._end_state == AxisState.FAULT
             self._stop(AxisState.QUICK_STOPPING, AxisState.FAULT if failed else AxisState.DISABLED)
-        elif self.state == AxisState.ENABLING:
+        elif self.state in _BEFORE_CONTROL:
             self._enter(AxisState.DISABLED)
 
     def note(self, fault_bits: int) -> None:
@@ -161,7 +175,7 @@ class Axis:
         if faults & _MASK[Reaction.DISABLE]:
             self._enter(AxisState.FAULT)
         elif faults & _MASK[Reaction.QUICK_STOP]:
-            if state == AxisState.ENABLING:
+            if state in _BEFORE_CONTROL:
                 self._enter(AxisState.FAULT)
             elif state != AxisState.QUICK_STOPPING:
                 self._stop(AxisState.QUICK_STOPPING, AxisState.FAULT)
@@ -171,7 +185,7 @@ class Axis:
 
     def _react_ramp_down(self, faults: int) -> None:
         self._end_state = AxisState.FAULT
-        if self.state == AxisState.ENABLING:
+        if self.state in _BEFORE_CONTROL:
             self._enter(AxisState.FAULT)
         elif self.state == AxisState.ENABLED:
             # A lost supervisor leaves a sound controller: brake first. A following error does not: ramp at once.
@@ -189,7 +203,7 @@ class Axis:
             faults |= _BIT[FaultCode.DRIVE_FAULT]
         if amplifier.status_word & _STATUS_WARNING:
             faults |= _BIT[FaultCode.DRIVE_WARNING]
-        if self.state in _CONTROLLED:
+        if self.state in _CONTROLLED or self.state == AxisState.PROVING:
             faults |= self._operation_faults(amplifier)
         return faults
 
@@ -234,6 +248,9 @@ class Axis:
         state = self.state
         if state == AxisState.ENABLING:
             return self._finish_enabling(amplifier, encoder_fresh)
+        if state == AxisState.PROVING and self._proven:
+            self._enter(AxisState.ENABLED)
+            return True
         if state == AxisState.BRAKING and (at_rest or self._cycles_in_state > self._ramp_cycles):
             self._enter(AxisState.RAMPING)
         ramped = state == AxisState.RAMPING and self._cycles_in_state >= self._ramp_cycles
@@ -244,8 +261,8 @@ class Axis:
     def _finish_enabling(self, amplifier: AmplifierFeedback, encoder_fresh: bool) -> bool:
         fresh = encoder_fresh and amplifier.age_cycles == 0
         if fresh and amplifier.goal_reached and amplifier.state == DriveState.OPERATION_ENABLED:
-            self._enter(AxisState.ENABLED)
-            return True
+            self._enter(AxisState.PROVING if self._prove else AxisState.ENABLED)
+            return not self._prove
         if self._cycles_in_state > self._timeout_cycles:
             fault = FaultCode.DRIVE_FAULT if amplifier.reasons & Reason.IN_FAULT else FaultCode.ENABLE_TIMEOUT
             self.faults |= _BIT[fault]
@@ -276,4 +293,5 @@ _GOAL: dict[AxisState, Goal] = {
     AxisState.RAMPING: Goal.ENABLED,
     AxisState.QUICK_STOPPING: Goal.QUICK_STOP,
     AxisState.FAULT: Goal.OFF,
+    AxisState.PROVING: Goal.ENABLED,
 }

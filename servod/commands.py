@@ -13,7 +13,7 @@ class Op(IntEnum):
     """What the loop can be told. Arguments in the comment."""
 
     NONE = 0
-    ENABLE = 1  # [reset_fault 0/1]
+    ENABLE = 1  # [reset_fault 0/1, prove 0/1]: with `prove` the test of the wiring is repeated
     DISABLE = 2  # [] ramp down, then disable
     QUICK_STOP = 3  # []
     HALT = 4  # [0/1] stop the reference and hold / go on
@@ -48,6 +48,7 @@ class Refusal(IntEnum):
     NEEDS_RESTART = 6
     OUTSIDE_LIMITS = 7
     TOO_FAST = 8
+    PROVES_ONLY_FROM_OFF = 9
 
 
 REFUSAL_TEXT: dict[Refusal, str] = {
@@ -59,6 +60,7 @@ REFUSAL_TEXT: dict[Refusal, str] = {
     Refusal.NEEDS_RESTART: "a node or the bus was lost; the nodes must be configured anew: restart the daemon",
     Refusal.OUTSIDE_LIMITS: "the joint is outside limits.position_min_rad to position_max_rad; move it back by hand",
     Refusal.TOO_FAST: "the motion would be faster than limits.speed_rad_s",
+    Refusal.PROVES_ONLY_FROM_OFF: "the wiring is proven on the way from off to on; run `servoctl disable` first",
 }
 
 

@@ -124,6 +124,26 @@ class LimitsConfig(Strict):
         return self
 
 
+class WiringProofConfig(Strict):
+    """The bounded test of polarity, scale and directions before the first torque (servod.loop.proof)."""
+
+    enabled: bool = Field(True, description="prove at the first enable after a start, and after what makes it doubtful")
+    torque_nm: float | None = Field(None, gt=0.0, le=1e5, description="most torque; none: 0.9 of limits.torque_nm")
+    ramp_s: float = Field(0.2, ge=0.05, le=10.0, description="from next to no torque to the most, exponentially")
+    travel_rad: float | None = Field(
+        None, gt=0.0, le=1.0, description="a motion; none: 0.001 rad, or more where the sensors need it"
+    )
+    most_travel_rad: float | None = Field(
+        None, gt=0.0, le=1.0, description="further fails; none: 0.05 rad, or 100 counts of the encoder if that is more"
+    )
+    speed_rad_s: float | None = Field(None, gt=0.0, le=1e5, description="faster fails; none: 0.9 of limits.speed_rad_s")
+    timeout_s: float = Field(5.0, ge=0.5, le=60.0)
+    friction_nm: float | None = Field(
+        None, ge=0.0, le=1e5, description="expected at break-away, 0 for a free joint; none: what `model` says"
+    )
+    inertia: float | None = Field(None, gt=0.0, le=1e6, description="expected, kg*m^2; none: what `model` says")
+
+
 class GainsConfig(Strict):
     """Where gain sets are kept and which one is active at start."""
 
@@ -167,6 +187,7 @@ class AxisConfig(Strict):
     amplifier: AmplifierConfig = AmplifierConfig()
     encoder: EncoderConfig = EncoderConfig()
     limits: LimitsConfig
+    wiring_proof: WiringProofConfig = WiringProofConfig()
     gains: GainsConfig
     model: Path | None = Field(None, description="axis model file, attached to every recording")
     control: ControlConfig = ControlConfig()
@@ -178,6 +199,13 @@ class AxisConfig(Strict):
         ids = (self.heartbeat.master_node_id, self.amplifier.node_id, self.encoder.node_id)
         if len(set(ids)) != len(ids):
             raise ValueError("different ids for heartbeat.master_node_id, amplifier.node_id and encoder.node_id")
+        return self
+
+    @model_validator(mode="after")
+    def _proof_fits_limits(self) -> AxisConfig:
+        torque_nm = self.wiring_proof.torque_nm
+        if torque_nm is not None and torque_nm > self.limits.torque_nm:
+            raise ValueError("wiring_proof.torque_nm at most limits.torque_nm")
         return self
 
 

@@ -94,6 +94,7 @@ class FaultCode(IntEnum):
     DRIVE_STAYS_POWERED = 26
     COMMANDS_LOST = 27
     SECOND_MASTER = 28
+    WIRING_NOT_PROVEN = 29
 
 
 #: Faults after which the nodes are not as they were configured: only a new bring-up may enable the axis again.
@@ -311,6 +312,13 @@ FAULTS: dict[FaultCode, Fault] = dict(
             "Somebody else sends frames that only this master may send: SYNC, the command or the master's heartbeat.",
             "Find the other master on the bus: a second daemon, another controller, or a node that produces SYNC "
             "(0x1005 bit 30).",
+        ),
+        _row(
+            _C.WIRING_NOT_PROVEN,
+            _R.DISABLE,
+            "The bounded test before the first torque found a wrong sign, direction or scale, or no answer.",
+            "`servoctl status` and the journal name the check, what it saw and the key to mend; then `servoctl enable "
+            "--reset-fault` repeats it.",
         ),
     ]
 )

@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
+from servod.axis import AxisState
 from servod.commands import REFUSAL_TEXT, Command, Op, ReferenceKind, Refusal
 from servod.config import AxisConfig
 from servod.errors import AnswerIsNo, fault_text
@@ -20,9 +21,14 @@ from servod.loop.plan import LoopPlan
 from servod.master import BringUp, Master
 from servod.record import RECORD, CycleRecord
 from servod.units import NS_PER_S
+from servod.wiring_expected import with_expected
+from servod.wiring_proof import Proof, sentence
 
 if TYPE_CHECKING:
     from servod.drivers.virtual.world import SteppedWorld
+
+#: Virtual time between two looks at an axis that is being enabled.
+_ENABLE_STEP_S = 0.02
 
 
 #: The daemon's supervisor looks at the nodes so often (servod.daemon.supervisor.TICK_S).
@@ -36,9 +42,13 @@ class _ListLink:
         self.trajectory = array("d", bytes(8 * TRAJECTORY_SAMPLES))
         self.commands: deque[Command] = deque()
         self.raw = bytearray()
+        self.proof: Proof | None = None
 
     def write_record(self, values: Sequence[float]) -> None:
         self.raw += RECORD.pack(*values)
+
+    def write_proof(self, proof: Proof) -> None:
+        self.proof = proof
 
     def next_command(self) -> Command | None:
         return self.commands.popleft() if self.commands else None
@@ -57,6 +67,7 @@ class SteppedSession:
 
     def __init__(self, config: AxisConfig, world: SteppedWorld, law: int, parameters: Sequence[float]) -> None:
         """`law` and `parameters`: the first controller (a packed gain set)."""
+        config = with_expected(config)
         self.config, self.world, self.clock = config, world, world.clock
         self.master = Master(config, world.connect(), world.clock, threaded=False)
         self.bring_up: BringUp = self.master.bring_up()
@@ -116,11 +127,13 @@ class SteppedSession:
     def enable(self, reset_fault: bool = False) -> None:
         """Enable and wait for it; raises AnswerIsNo when the axis does not get there."""
         self._must(self.send(Op.ENABLE, [reset_fault]))
-        for _ in range(100):
-            self.run(self.config.amplifier.enable_timeout_s / 100.0)
-            if self.cycle.axis.state.name == "ENABLED":
-                return
-        raise AnswerIsNo(f"the axis is {self.cycle.axis.state.name}, not enabled. {self.why}")
+        timeout_s = self.config.amplifier.enable_timeout_s + self.config.wiring_proof.timeout_s
+        for _ in range(round(timeout_s / _ENABLE_STEP_S)):
+            self.run(_ENABLE_STEP_S)
+            if self.cycle.axis.state not in (AxisState.ENABLING, AxisState.PROVING):
+                break
+        if self.cycle.axis.state != AxisState.ENABLED:
+            raise AnswerIsNo(f"the axis is {self.cycle.axis.state.name}, not enabled. {self.why}")
 
     def move(self, kind: ReferenceKind, arguments: Sequence[float], timeout_s: float = 600.0) -> None:
         """Start a motion and run until it is over; raises AnswerIsNo when it is refused or ends in a fault."""
@@ -140,7 +153,13 @@ class SteppedSession:
     @property
     def why(self) -> str:
         """The latched faults with cause and remedy, for the person who reads the message."""
-        return fault_text(self.latest.faults_latched)
+        text = fault_text(self.latest.faults_latched)
+        return f"{sentence(self.proof)} {text}" if self.proof and not self.proof.passed else text
+
+    @property
+    def proof(self) -> Proof | None:
+        """How the last test of the wiring ended; None before there was one."""
+        return self._link.proof
 
     def load_trajectory(self, positions_rad: Sequence[float]) -> None:
         """Fill the area that ReferenceKind.TABLE reads."""

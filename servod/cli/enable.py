@@ -9,9 +9,11 @@ import typer
 from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, example, report
 
 _ENABLE_HELP = example(
-    "Enable the axis and wait until it is; holds where it stands.",
+    "Enable the axis and wait until it is; holds where it stands. The first time after a start, polarity, scale and "
+    "directions are proven by a test of small torque and travel before.",
     "servoctl enable",
     "servoctl enable --reset-fault",
+    "servoctl enable --prove",
 )
 _DISABLE_HELP = example("Bring the axis to rest, ramp the torque down and switch the drive off.", "servoctl disable")
 
@@ -26,11 +28,16 @@ def enable(
     reset_fault: Annotated[
         bool, typer.Option("--reset-fault", help="Reset latched faults and the drive's own.")
     ] = False,
+    prove: Annotated[
+        bool, typer.Option("--prove", help="Repeat the test of the wiring, although it was passed.")
+    ] = False,
     socket: SocketOption = DEFAULT_SOCKET,
     as_json: JsonOption = False,
 ) -> None:
     """Enable the axis."""
-    report(ask(socket, "enable", reset_fault=reset_fault), "enabled", as_json)
+    result = ask(socket, "enable", reset_fault=reset_fault, prove=prove)
+    wiring = result.get("wiring")
+    report(result, f"enabled; {wiring['text']}" if wiring else "enabled", as_json)
 
 
 def disable(socket: SocketOption = DEFAULT_SOCKET, as_json: JsonOption = False) -> None:

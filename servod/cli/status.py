@@ -60,7 +60,12 @@ def screen(document: dict[str, Any]) -> Group:
     from rich.console import Group
 
     return Group(
-        _headline(document), *_fault_lines(document), _values(document), _timing(document), *_grant_lines(document)
+        _headline(document),
+        *_fault_lines(document),
+        *_wiring_lines(document),
+        _values(document),
+        _timing(document),
+        *_grant_lines(document),
     )
 
 
@@ -80,6 +85,13 @@ def _fault_lines(document: dict[str, Any]) -> list[str]:
         f"[red]{'now' if f['present'] else 'was'}[/red] {f['code']} ({f['reaction']}): {f['cause']} {f['remedy']}"
         for f in document["faults"]
     ]
+
+
+def _wiring_lines(document: dict[str, Any]) -> list[str]:
+    last = document["wiring"]["last"]
+    if last is None:
+        return []
+    return [last["text"] if last["passed"] else f"[red]{last['text']}[/red]"]
 
 
 def _values(document: dict[str, Any]) -> Table:

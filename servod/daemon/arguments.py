@@ -45,9 +45,10 @@ class NoArgs(Strict):
 
 
 class EnableArgs(Strict):
-    """`enable`."""
+    """`enable`; with `prove` the test of the wiring is repeated although it was passed."""
 
     reset_fault: bool = False
+    prove: bool = False
 
 
 class HaltArgs(Strict):

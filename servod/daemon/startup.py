@@ -30,6 +30,7 @@ from servod.master import Master
 from servod.master.planned import check_names, planned_bus_load
 from servod.notify import Notifier
 from servod.recorder import Recorder
+from servod.wiring_expected import with_expected
 from servod.yaml12 import read_text
 
 log = logging.getLogger("servod")
@@ -81,7 +82,9 @@ def _supervise(config: AxisConfig, nodes: Nodes, bank: GainBank, recorder: Recor
     """Loop and supervisor on nodes that are operational; `undo` is what to do when that fails half-way."""
     gains = bank.newest.gains
     plans = nodes.plans
-    loop = LoopHandle(LoopPlan(config, plans.amplifier, plans.encoder, int(gains.law.number), gains.pack()))
+    loop = LoopHandle(
+        LoopPlan(with_expected(config), plans.amplifier, plans.encoder, int(gains.law.number), gains.pack())
+    )
     undo.callback(_give_back, nodes, loop)
     _start_loop(loop)
     return Supervisor(config, nodes, loop, bank, recorder, Notifier())

@@ -7,7 +7,7 @@ their rows of the fault table, so that readers need no tables of their own.
 from __future__ import annotations
 
 import math
-from typing import TypedDict
+from typing import Any, TypedDict
 
 from servod.axis import AxisState
 from servod.config import BusConfig
@@ -137,6 +137,13 @@ class LeaseStatus(TypedDict):
     uid: int
 
 
+class WiringStatus(TypedDict):
+    """Tests of the wiring since the start; `last` is servod.wiring_proof.document, None before the first enable."""
+
+    tests: int
+    last: dict[str, Any] | None
+
+
 class Status(TypedDict):
     """The whole document."""
 
@@ -147,6 +154,7 @@ class Status(TypedDict):
     drive: DriveStatus
     motion: MotionStatus
     faults: list[FaultStatus]
+    wiring: WiringStatus
     controller: ControllerStatus
     loop: LoopStatus
     timing: TimingStatus

@@ -20,6 +20,7 @@ from servod.daemon.fault_watch import FaultWatch
 from servod.daemon.gain_bank import GainBank
 from servod.daemon.health import Health, Pulse
 from servod.daemon.nodes import FaultRelay, Nodes
+from servod.daemon.proof_watch import ProofWatch
 from servod.daemon.status import Status, axis_status, bus_status, drive_status, fault_status, motion_status
 from servod.daemon.verbs import Verbs
 from servod.errors import FAULTS, FaultCode, Unreachable
@@ -66,6 +67,7 @@ class Supervisor:
         self._health = Health(config.cycle.period_us, nodes.plans.bus_load)
         self._metrics = AxisMetrics(config.name, nodes.plans.bus_load)
         self._faults = FaultWatch(recorder, self._health, self._metrics)
+        self._proofs = ProofWatch(loop, recorder)
         self._verbs = Verbs(config, loop, bank, recorder, self._document)
         self._selector = selectors.DefaultSelector()
         self._server = ControlServer(config.control, self._selector, self._verbs)
@@ -99,6 +101,7 @@ class Supervisor:
         self._switch_off_if_disobeyed(records)
         self._verbs.tick(records, now_ns)
         self._faults.tick(now_ns)
+        self._proofs.see()
         self._server.tick(now_ns)
         self._tell_manager(now_ns)
         self._write_textfile(now_ns)
@@ -215,6 +218,7 @@ class Supervisor:
             "drive": drive_status(latest),
             "motion": motion_status(latest),
             "faults": fault_status(latest),
+            "wiring": self._proofs.status(),
             "controller": self._bank.describe(latest.controller),
             "loop": {"pid": self._loop.pid},
             "timing": self._health.timing(self._loop.lost),

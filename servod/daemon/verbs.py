@@ -35,14 +35,17 @@ from servod.daemon.flows import Flow, Flows, FutureWait, Orders, OrderWait, Stat
 from servod.daemon.gain_bank import GainBank
 from servod.daemon.status import reason_texts
 from servod.daemon.trajectory import Table, check_motion
-from servod.errors import Unreachable, faults_in
+from servod.errors import FAULTS, AnswerIsNo, FaultCode, Unreachable, faults_in
 from servod.hal import DriveState
 from servod.loop.handle import LoopHandle
 from servod.master.scan import scan
 from servod.record import CycleRecord
 from servod.recorder import Recorder
 from servod.units import NS_PER_S
+from servod.wiring_proof import document, sentence
 
+_ON_THE_WAY = (AxisState.ENABLING, AxisState.PROVING)
+_NOT_PROVEN = FAULTS[FaultCode.WIRING_NOT_PROVEN].bit
 _STOPPED = (AxisState.DISABLED, AxisState.FAULT)
 _UNPOWERED = (
     DriveState.NOT_READY_TO_SWITCH_ON,
@@ -149,12 +152,18 @@ class Verbs:
         return self._document()
 
     def _enable(self, args: EnableArgs) -> Flow:
-        yield self._send(Op.ENABLE, (float(args.reset_fault),))
-        timeout_s = self._config.amplifier.enable_timeout_s + 1.0
-        record: CycleRecord = yield self._until(lambda r: r.axis_state != AxisState.ENABLING, timeout_s)
-        if record.axis_state != AxisState.ENABLED:
-            raise Unreachable(f"the axis is {AxisState(record.axis_state).name}, not enabled: {_why(record)}")
-        return _state(record)
+        tests_before, _ = self._loop.proofs
+        yield self._send(Op.ENABLE, (float(args.reset_fault), float(args.prove)))
+        timeout_s = self._config.amplifier.enable_timeout_s + self._config.wiring_proof.timeout_s + 1.0
+        record: CycleRecord = yield self._until(lambda r: r.axis_state not in _ON_THE_WAY, timeout_s)
+        tests, proof = self._loop.proofs
+        tested = proof if tests != tests_before else None
+        if record.axis_state == AxisState.ENABLED:
+            return {**_state(record), "wiring": document(tested) if tested else None}
+        state = AxisState(record.axis_state).name
+        if tested is not None and record.faults_latched & _NOT_PROVEN:
+            raise AnswerIsNo(f"the axis is {state}, not enabled: {sentence(tested)}")
+        raise Unreachable(f"the axis is {state}, not enabled: {_why(record)}")
 
     def _disable(self, _args: NoArgs) -> Flow:
         yield self._send_stop(Op.DISABLE)

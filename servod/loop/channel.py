@@ -16,6 +16,7 @@ from enum import IntEnum
 from servod.commands import Command, Op
 from servod.realtime import Grant
 from servod.record import RECORD
+from servod.wiring_proof import Proof
 
 RECORD_SLOTS = 8192  # eight seconds at 1 kHz for a supervisor that hangs
 COMMAND_SLOTS = 16
@@ -39,6 +40,8 @@ _RECORDS_AT = _COMMANDS_AT + COMMAND_SLOTS * COMMAND_SLOT_BYTES
 _TRAJECTORY_AT = _RECORDS_AT + RECORD_SLOTS * RECORD.size
 _SIZE = _TRAJECTORY_AT + TRAJECTORY_SAMPLES * 8
 _COMMAND_HEAD = struct.Struct("<qqq")
+_PROOF_AT = _HEADER_BYTES // 2  # behind the words, in the same page
+_PROOF = struct.Struct(f"<{len(Proof._fields)}d")
 
 
 class _Word(IntEnum):
@@ -49,6 +52,7 @@ class _Word(IntEnum):
     COMMAND_TAIL = 2
     SUPERVISOR_BEATS = 3
     LOOP_READY = 4
+    PROOFS = 5  # tests of the wiring that ended
 
 
 class Channel:
@@ -82,6 +86,11 @@ class Channel:
         RECORD.pack_into(self._memory, _RECORDS_AT + (head % RECORD_SLOTS) * RECORD.size, *values)
         self._head = head + 1
         self._words[0] = head + 1
+
+    def write_proof(self, proof: Proof) -> None:
+        """Publish how a test of the wiring ended; they are seconds apart."""
+        _PROOF.pack_into(self._memory, _PROOF_AT, *proof)
+        self._words[_Word.PROOFS] += 1
 
     def next_command(self) -> Command | None:
         """The next command, or None; called once per cycle."""
@@ -122,6 +131,11 @@ class Channel:
         (length,) = struct.unpack_from("<q", self._memory, _HEADER_BYTES)
         text = bytes(self._view[_HEADER_BYTES + 8 : _HEADER_BYTES + 8 + length])
         return [Grant(*row) for row in json.loads(text)]
+
+    def proofs(self) -> tuple[int, Proof | None]:
+        """How many tests of the wiring have ended, and how the last one did."""
+        count = self._words[_Word.PROOFS]
+        return count, Proof._make(_PROOF.unpack_from(self._memory, _PROOF_AT)) if count else None
 
     def send(self, command: Command) -> bool:
         """Queue one command; False when the slots that are open to its kind are taken."""

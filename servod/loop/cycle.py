@@ -23,16 +23,21 @@ from servod.limits import Limits
 from servod.loop.exchange import Exchange
 from servod.loop.orders import carry_out
 from servod.loop.plan import LoopPlan
+from servod.loop.proof import WiringProof
+from servod.loop.proof_judge import proof_bounds
 from servod.references import Reference, Samples
 from servod.units import NS_PER_S, NS_PER_US
+from servod.wiring_proof import Proof
 
 _SUPERVISOR_LOST = FAULTS[FaultCode.SUPERVISOR_LOST].bit
+_NOT_PROVEN = FAULTS[FaultCode.WIRING_NOT_PROVEN].bit
 #: At a shutdown the drive must be seen without power for so many cycles, and has so many to get there.
 GOODBYE_CYCLES = 20
 GOODBYE_TIMEOUT_CYCLES = 1000
 #: How long a drive stays in NMT stopped before it is asked to be pre-operational.
 _STOPPED_CYCLES = 5
-_POWERED = (AxisState.ENABLED, AxisState.BRAKING, AxisState.RAMPING)
+_POWERED = (AxisState.ENABLED, AxisState.BRAKING, AxisState.RAMPING, AxisState.PROVING)
+_FOLLOWING = (AxisState.ENABLED, AxisState.BRAKING)
 _UNPOWERED = (DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON, DriveState.FAULT)
 
 
@@ -50,6 +55,10 @@ class Link(Protocol):
 
     def next_command(self) -> Command | None:
         """The next command, or None."""
+        ...
+
+    def write_proof(self, proof: Proof) -> None:
+        """Publish how a test of the wiring ended."""
         ...
 
 
@@ -85,6 +94,8 @@ class Cycle:
             self._period_s, config.limits.ramp_down_s, config.amplifier.enable_timeout_s, Mode.CYCLIC_SYNC_TORQUE
         )
         self.limits = Limits(config.limits)
+        self.proof = WiringProof(proof_bounds(config, plan.amplifier.facts))
+        self.proof_wanted = config.wiring_proof.enabled
         self.controller = Controller()
         self.controller.activate(plan.law, plan.parameters, 0.0)
         self.controller_serial = plan.serial
@@ -137,7 +148,7 @@ class Cycle:
         faults = self.limits.feedback_faults(amplifier, encoder, skipped) | self.exchange.faults() | self.event_faults
         self.event_faults = 0
         if self.axis.state in _POWERED:
-            followed = None if self.axis.state == AxisState.RAMPING else self.reference.position_rad
+            followed = self.reference.position_rad if self.axis.state in _FOLLOWING else None
             faults |= self.limits.motion_faults(amplifier, encoder, followed)
         if not self._supervisor_alive():
             faults |= _SUPERVISOR_LOST
@@ -148,6 +159,8 @@ class Cycle:
         self, output: AxisOutput, amplifier: AmplifierFeedback, encoder: EncoderFeedback, dt_s: float
     ) -> _Torque:
         """Controller and limits; zero torque when the axis is not controlled."""
+        if self.axis.state == AxisState.PROVING:
+            return self._prove(amplifier, encoder, dt_s)
         if not output.controlled:
             self._rest(encoder)
             return _NO_TORQUE
@@ -174,6 +187,29 @@ class Cycle:
         self.torque_nm = sent_nm
         return _Torque(sent_nm, law.u, law.feedback, law.friction, law.other)
 
+    def _prove(self, amplifier: AmplifierFeedback, encoder: EncoderFeedback, dt_s: float) -> _Torque:
+        """In place of the controller, before the first torque: the bounded test of the wiring."""
+        proof = self.proof
+        if not proof.running and proof.verdict is None:
+            self.limits.arm(amplifier, encoder)
+            self.reference.hold(encoder.position_rad)
+            proof.begin(encoder.position_rad, amplifier.position_rad)
+        wanted_nm = proof.step(amplifier, encoder, self.torque_nm, dt_s)
+        if proof.verdict is not None:
+            self._finish_proof()
+        self.torque_nm, faults = self.limits.limit_torque(wanted_nm, dt_s)
+        if faults:
+            self.axis.raise_fault(faults)
+        return _Torque(self.torque_nm, wanted_nm, 0.0, 0.0, wanted_nm)
+
+    def _finish_proof(self) -> None:
+        """Tell the answer; the axis goes on to be enabled, or is switched off at once."""
+        self.link.write_proof(self.proof.report())
+        if self.proof.proven:
+            self.axis.proven()
+        elif self.axis.state == AxisState.PROVING:
+            self.axis.raise_fault(_NOT_PROVEN)
+
     def _seed(self, amplifier: AmplifierFeedback, encoder: EncoderFeedback) -> None:
         """First controlled cycle: stay where the joint is, go on from the torque that is produced now."""
         self.limits.arm(amplifier, encoder)
@@ -183,6 +219,9 @@ class Cycle:
 
     def _rest(self, encoder: EncoderFeedback) -> None:
         """Not controlled: the reference follows the joint, torque and ramps start from zero next time."""
+        if self.proof.running:  # the axis was switched off meanwhile
+            self.proof.interrupt()
+            self._finish_proof()
         self.reference.hold(encoder.position_rad)
         self.limits.release()
         self.torque_nm = self._ramp_from_nm = 0.0

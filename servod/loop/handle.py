@@ -15,6 +15,7 @@ from servod.loop.channel import MAX_ARGUMENTS, Channel
 from servod.loop.plan import LoopPlan
 from servod.realtime import Grant
 from servod.record import CycleRecord
+from servod.wiring_proof import Proof
 
 START_TIMEOUT_S = 10.0
 
@@ -55,6 +56,11 @@ class LoopHandle:
     def grants(self) -> list[Grant]:
         """What the operating system granted the loop."""
         return self._channel.grants()
+
+    @property
+    def proofs(self) -> tuple[int, Proof | None]:
+        """How many tests of the wiring have ended since the start, and how the last one did."""
+        return self._channel.proofs()
 
     @property
     def lost(self) -> int:

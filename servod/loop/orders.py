@@ -14,6 +14,18 @@ from servod.units import NS_PER_S
 if TYPE_CHECKING:
     from servod.loop.cycle import Cycle
 
+#: Faults that make what was proven doubtful: a sensor or a scale may not be what it was.
+_DOUBTFUL = sum(
+    FAULTS[code].bit
+    for code in (
+        FaultCode.SPEED_LIMIT,
+        FaultCode.ENCODER_IMPLAUSIBLE,
+        FaultCode.ENCODER_ALARM,
+        FaultCode.NOT_FINITE,
+        FaultCode.WIRING_NOT_PROVEN,
+    )
+)
+
 Order = Callable[["Cycle", Sequence[float]], Refusal]
 
 
@@ -27,7 +39,15 @@ def _enable(cycle: Cycle, arguments: Sequence[float]) -> Refusal:
     position_rad = cycle.encoder_position_rad
     if not cycle.limits.position_min_rad <= position_rad <= cycle.limits.position_max_rad:
         return Refusal.OUTSIDE_LIMITS
-    return cycle.axis.enable(bool(arguments and arguments[0]))
+    reset_fault, asked = ([bool(value) for value in arguments] + [False, False])[:2]
+    if cycle.axis.state not in (AxisState.DISABLED, AxisState.FAULT):
+        return Refusal.PROVES_ONLY_FROM_OFF if asked else cycle.axis.enable(reset_fault)
+    doubtful = not cycle.proof.proven or bool(cycle.axis.latched & _DOUBTFUL)
+    prove = asked or (cycle.proof_wanted and doubtful)
+    refusal = cycle.axis.enable(reset_fault, prove)
+    if refusal == Refusal.DONE and prove:
+        cycle.proof.forget()
+    return refusal
 
 
 def _disable(cycle: Cycle, _arguments: Sequence[float]) -> Refusal:

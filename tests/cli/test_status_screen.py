@@ -34,6 +34,7 @@ def document() -> dict[str, Any]:
             "torque_nm": 0.0123,
             "torque_friction_nm": 0.0,
         },
+        "wiring": {"tests": 1, "last": {"passed": False, "text": "wiring not proven (TORQUE_POLARITY): turn it"}},
         "faults": [
             {
                 "code": FAULT.code.name,

@@ -48,7 +48,8 @@ def test_status_after_start_is_disabled_and_healthy(client: ControlClient) -> No
 
 
 def test_a_motion_moves_the_axis_and_the_recording_shows_it(axis: Running, client: ControlClient) -> None:
-    assert client.call("enable") == {"state": "ENABLED"}
+    enabled = client.call("enable")
+    assert (enabled["state"], enabled["wiring"]["finding"]) == ("ENABLED", "PASSED")
     start_rad = _position(client)
     path = client.call("record_start", path="motion.mcap")["path"]
     way = [0.05 * (1 - math.cos(math.pi * k / 500)) / 2 for k in range(501)]

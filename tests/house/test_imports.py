@@ -11,13 +11,13 @@ import source
 #: From the ground up. A module may import its own layer and those below, nothing above.
 LAYERS: list[set[str]] = [
     {"units", "errors", "files", "yaml12", "shipped", "sources", "notify", "workers"},
-    {"hal", "cia", "clock", "commands", "config", "record", "realtime", "bus"},
+    {"hal", "cia", "clock", "commands", "config", "record", "realtime", "bus", "wiring_proof"},
     {"identified"},
     {"axis_keys", "axis_friction", "axis_effects", "axis_model", "axis_pack", "models", "controllers"}
     | {"gain_parameters", "gain_design", "gains", "gain_store"},
     {"drivers", "limits", "axis", "references"},
     {"master", "recorder_mcap", "recorder_read", "recorder_history", "recorder_files", "recorder_export", "recordings"},
-    {"loop", "control", "recorder", "metrics"},
+    {"loop", "control", "recorder", "metrics", "wiring_expected"},
     {"daemon", "daemon_config", "daemon_recording", "session", "replay"},
     {"identify"},
     {"verify"},
