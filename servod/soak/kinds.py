@@ -7,7 +7,7 @@ injected has no cause in the schedule, and counts as unexplained.
 from __future__ import annotations
 
 import random
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from servod.campaign.scenario import FEEDBACK_LOSS_MS, MASTER_LOSS_MS, Injection, Recovery
@@ -45,7 +45,8 @@ class FaultKind:
     """One kind. `do` and `undo` are actions of servod.campaign.actions, with ranges where a number is drawn.
 
     `expects`: one of these at least is latched, within `latched_ms` of the injection; empty: the axis goes on. The
-    joint feels no torque from `gone_ms` on. `takes_syncs`: SYNC frames of this axis may be missing on the bus.
+    joint feels no torque from `gone_ms` on. `takes_syncs`: SYNC frames of this axis may be missing on the bus;
+    `deaf_cycles`: so many commands may not reach the drive.
     """
 
     name: str
@@ -58,6 +59,7 @@ class FaultKind:
     watch_ms: int = 300
     recovery: Recovery = Recovery.NONE
     takes_syncs: bool = False
+    deaf_cycles: int = 0
 
     def injection(self, chance: random.Random) -> Injection:
         """One occurrence, its numbers drawn."""
@@ -89,15 +91,15 @@ def _drawn(template: Any, chance: random.Random) -> Any:
 Action = dict[str, dict[str, Any]]
 
 
-def _frames(of: str, fault: str, low: int, high: int) -> Action:
-    return {"frames": {"of": of, "fault": fault, "count": Between(low, high)}}
+def _frames(of: str | OneOf, fault: str, low: int, high: int, detail: int | Between = 0) -> Action:
+    return {"frames": {"of": of, "fault": fault, "count": Between(low, high), "detail": detail}}
 
 
 def _write(who: str, index: int, subindex: int, value: Any) -> Action:
     return {"object_write": {"who": who, "index": index, "subindex": subindex, "value": value}}
 
 
-def _silence(who: str, low_ms: int, high_ms: int) -> Action:
+def _silence(who: str | OneOf, low_ms: int, high_ms: int) -> Action:
     return {"silence": {"who": who, "for_ms": Between(low_ms, high_ms)}}
 
 
@@ -110,7 +112,7 @@ def _node(name: str, do: Action, undo: Action | None = None, takes_syncs: bool =
     expects = frozenset(
         {
             *(_F.FEEDBACK_STALE, _F.DRIVE_RESET, _F.DRIVE_LEFT_OPERATION, _F.NODE_HEARTBEAT_LOST, _F.DRIVE_FAULT),
-            _F.BUS_OFF,
+            *(_F.BUS_OFF, _F.BUS_DOWN),
         }
     )
     return FaultKind(
@@ -150,6 +152,7 @@ def _drive(name: str, subindex: int, value: Any, normal: int) -> FaultKind:
     return _resettable(name, do, {_F.DRIVE_FAULT, _F.DRIVE_LEFT_OPERATION}, undo)
 
 
+_CYCLIC = OneOf(("torque", "drive_feedback", "encoder_feedback"))
 #: An error code of each class of CiA 301 that a drive has for itself.
 _DRIVE_ERRORS = (0x2310, 0x3210, 0x4310, 0x5441, 0x6320, 0x7300, 0x8611, 0xFF01)
 _NAN_GAINS: Action = {"gains": {"law": "pd", "parameters": ["nan", "nan", 0.0]}}
@@ -159,7 +162,16 @@ KINDS: tuple[FaultKind, ...] = (
     # Ridden through.
     FaultKind("drive feedback lost, a few", _frames("drive_feedback", "drop", 1, 15)),
     FaultKind("encoder feedback lost, a few", _frames("encoder_feedback", "drop", 1, 15)),
-    FaultKind("torque frames lost", _frames("torque", "drop", 1, 10)),
+    FaultKind("torque frames lost", _frames("torque", "drop", 1, 50)),
+    FaultKind("torque frames late", _frames("torque", "late", 1, 10, 20)),
+    FaultKind("drive feedback late", _frames("drive_feedback", "late", 1, 5, 12)),
+    FaultKind("encoder feedback late", _frames("encoder_feedback", "late", 1, 5, 12)),
+    FaultKind("cyclic frames twice", _frames(_CYCLIC, "duplicate", 1, 50)),
+    FaultKind("cyclic frames reordered", _frames(_CYCLIC, "reorder", 1, 50)),
+    FaultKind("drive feedback cut short", _frames("drive_feedback", "shorten", 1, 15, Between(1, 7))),
+    FaultKind("encoder feedback cut short", _frames("encoder_feedback", "shorten", 1, 15, Between(1, 3))),
+    FaultKind("node away for a moment", _silence(OneOf(("encoder", "amplifier")), 1, 12)),
+    FaultKind("a stranger talks", {"babble": {"can_id": OneOf((0x100, 0x183, 0x7FF)), "for_ms": 250, "each_ms": 2}}),
     FaultKind("SYNC lost, a few", _frames("sync", "drop", 1, 10), takes_syncs=True),
     FaultKind("frames destroyed", _frames("any", "destroy", 1, 5)),
     FaultKind("torque frame destroyed", _frames("torque", "destroy", 1, 5)),
@@ -168,6 +180,21 @@ KINDS: tuple[FaultKind, ...] = (
     # Stopped, and enabled again after a reset.
     _resettable("drive feedback lost, many", _frames("drive_feedback", "drop", 25, 60), {_F.FEEDBACK_STALE}),
     _resettable("encoder feedback lost, many", _frames("encoder_feedback", "drop", 25, 200), {_F.FEEDBACK_STALE}),
+    replace(
+        _resettable("torque frames cut short", _frames("torque", "shorten", 1, 50, Between(1, 3)), {_F.DRIVE_FAULT}),
+        latched_ms=110.0,  # told by EMCY, and the monitor of the nodes looks ten times a second
+        deaf_cycles=50,
+    ),
+    _resettable(
+        "position bit of the encoder wrong",
+        _frames("encoder_feedback", "flip", 1, 50, Between(18, 27)),
+        {_F.ENCODER_IMPLAUSIBLE, _F.SPEED_LIMIT, _F.POSITION_LIMIT},
+    ),
+    _resettable(
+        "state of the drive wrong",
+        _frames("drive_feedback", "flip", 1, 1, Between(0, 2)),
+        {_F.DRIVE_STATUS_UNKNOWN, _F.DRIVE_LEFT_OPERATION},
+    ),
     _drive("error in the drive", 1, OneOf(_DRIVE_ERRORS), 0),
     _drive("safe torque off", 2, 1, 0),
     _drive("supply too low", 3, Between(0, 17_000), 48_000),
@@ -199,5 +226,6 @@ KINDS: tuple[FaultKind, ...] = (
     _node("drive stopped", _nmt("amplifier", "stop"), _nmt("amplifier", "pre_operational")),
     _node("encoder bus-off", {"bus_off": {"who": "encoder"}}),
     _node("drive bus-off", {"bus_off": {"who": "amplifier"}}),
+    _node("loop's interface down", {"interface_down": {"for_ms": Between(1, 500)}}, takes_syncs=True),
     _node("loop bus-off", {"bus_off": {"who": "loop"}}, takes_syncs=True),
 )

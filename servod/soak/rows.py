@@ -46,7 +46,7 @@ _BELONGS = np.zeros((len(AxisState), len(DriveState)), dtype=bool)
 for _axis, _drives in _SETTLED.items():
     _BELONGS[_axis, list(_drives)] = True
 #: An answer of the drive is seen two SYNCs after the command, and a control word may be lost on the way.
-_ANSWER_CYCLES = 5
+ANSWER_CYCLES = 5
 _STAYS_POWERED, _NOT_FINITE = (FAULTS[c].bit for c in (FaultCode.DRIVE_STAYS_POWERED, FaultCode.NOT_FINITE))
 
 
@@ -66,7 +66,7 @@ class RowCheck:
         self._cycle = self._missed_before = self._astray = 0
         self._origin: tuple[int, int] | None = None  # deadline and number of the session's first cycle
 
-    def check(self, rows: Rows, explained: int, answer_cycles: int = _ANSWER_CYCLES) -> None:
+    def check(self, rows: Rows, explained: int, answer_cycles: int = ANSWER_CYCLES) -> None:
         """One batch, oldest first. `explained`: the faults that may be seen; `answer_cycles`: how long drive and axis
         may be in states that do not belong together."""
         if not len(rows):

@@ -30,7 +30,7 @@ from servod.soak.finding import Findings, Wrong
 from servod.soak.kinds import ALWAYS, FaultKind, fault_bits
 from servod.soak.plan import Ending, Episode, Move, home
 from servod.soak.recording import RecordingCheck
-from servod.soak.rows import RowCheck, Rows, rows_of
+from servod.soak.rows import ANSWER_CYCLES, RowCheck, Rows, rows_of
 from servod.soak.start import nothing_yet
 from servod.soak.syncs import SyncCheck, SyncListener
 from servod.soak.tally import Tally
@@ -188,7 +188,7 @@ class SteppedSoak:
         injected_ns = self._axis.now_ns()
         self._act(kind.injection(chance))
         self._run(kind.watch_ms / 1e3)
-        batch = self._settle(kind.explained, kind.takes_syncs)
+        batch = self._settle(kind.explained, kind.takes_syncs, kind.deaf_cycles)
         self._judge(kind, batch, injected_ns)
         repair = kind.repair()
         if repair is not None:
@@ -260,14 +260,14 @@ class SteppedSoak:
 
     # --- what was recorded -------------------------------------------------------------------------------------
 
-    def _settle(self, explained: int = 0, may_be_taken: bool = False) -> Batch:
+    def _settle(self, explained: int = 0, may_be_taken: bool = False, deaf_cycles: int = 0) -> Batch:
         """Check everything since the last call. `explained`: faults that may be seen besides those of any motion."""
         session = self._axis.session
         raw = session.raw
         session.clear()
         rows, samples = rows_of(raw), samples_of(self._drive.take())
         self._recorder.add(raw)
-        self._rows.check(rows, explained | fault_bits(ALWAYS))
+        self._rows.check(rows, explained | fault_bits(ALWAYS), ANSWER_CYCLES + deaf_cycles)
         self._syncs.check(rows, self._heard.take(), may_be_taken)
         self._samples.check(samples, self._drive.lost)
         return Batch(rows, samples)

@@ -43,6 +43,8 @@ STARVED = frozenset(
         *(FaultCode.NODE_HEARTBEAT_LOST, FaultCode.DRIVE_FAULT, FaultCode.FOLLOWING_ERROR),
     }
 )
+#: Actions that happen within the loop's process.
+_INSIDE = ("gains", "interface_down")
 _POLL_S, _STOPPING_S, _TRIES = 0.05, 5.0, 3
 #: Whoever hears SYNC has heard the last one so long after the loop ended [s].
 _HEARD_S = 0.2
@@ -56,7 +58,7 @@ _GRACE_MS = 500.0
 
 def of_the_wall(kind: FaultKind) -> bool:
     """Whether a fault can be put to a loop in a process of its own: from the bus, not from within."""
-    return all(action != "gains" and arguments.get("who") != "loop" for action, arguments in kind.do.items())
+    return all(name not in _INSIDE and arguments.get("who") != "loop" for name, arguments in kind.do.items())
 
 
 class WallSoak:
