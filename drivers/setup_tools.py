@@ -9,7 +9,8 @@ from servod.cia import Abort
 from servod.errors import Unreachable
 from servod.hal import SdoAbort, SdoAccess
 
-_ABSENT = (Abort.NO_SUCH_OBJECT, Abort.NO_SUCH_SUBINDEX)
+#: NO_DATA is what an error history says that is empty (CiA 301, 0x1003).
+_ABSENT = (Abort.NO_SUCH_OBJECT, Abort.NO_SUCH_SUBINDEX, Abort.NO_DATA)
 
 
 def write_checked(sdo: SdoAccess, index: int, subindex: int, value: int) -> None:

@@ -79,7 +79,10 @@ class Limits:
             faults |= _POSITION
         if reference_rad is not None and not abs(reference_rad - position) <= self.following_error_rad:
             faults |= _FOLLOWING
-        if not abs(amplifier.position_rad - position - self._encoder_offset_rad) <= self.encoder_mismatch_rad:
+        # Positions of two moments differ in motion: a lost frame is for the staleness to judge.
+        same_moment = amplifier.age_cycles == encoder.age_cycles
+        difference_rad = abs(amplifier.position_rad - position - self._encoder_offset_rad)
+        if same_moment and not difference_rad <= self.encoder_mismatch_rad:
             faults |= _MISMATCH
         return faults
 

@@ -27,6 +27,8 @@ class FrameName(StrEnum):
     DRIVE_FEEDBACK = "drive_feedback"  # TPDO1 of the amplifier
     ENCODER_FEEDBACK = "encoder_feedback"  # TPDO2 of the encoder
     MASTER_HEARTBEAT = "master_heartbeat"
+    AMPLIFIER_HEARTBEAT = "amplifier_heartbeat"
+    ENCODER_HEARTBEAT = "encoder_heartbeat"
 
 
 CAN_ID = {
@@ -36,6 +38,8 @@ CAN_ID = {
     FrameName.DRIVE_FEEDBACK: TPDO_BASE[0] + AMPLIFIER,
     FrameName.ENCODER_FEEDBACK: TPDO_BASE[1] + ENCODER,
     FrameName.MASTER_HEARTBEAT: HEARTBEAT_BASE + 126,
+    FrameName.AMPLIFIER_HEARTBEAT: HEARTBEAT_BASE + AMPLIFIER,
+    FrameName.ENCODER_HEARTBEAT: HEARTBEAT_BASE + ENCODER,
 }
 
 
