@@ -29,7 +29,8 @@ _OWN = (
     "disturbance_nm",
 )
 _REAL = tuple(f.name for f in FIELDS if f.kind == "d" and f.name not in _OWN)
-_CONTROLLED = (AxisState.ENABLED, AxisState.BRAKING, AxisState.RAMPING)
+#: Where torque is commanded.
+_CONTROLLED = (AxisState.PROVING, AxisState.ENABLED, AxisState.BRAKING, AxisState.RAMPING)
 _OFF = (
     *(DriveState.NOT_READY_TO_SWITCH_ON, DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON),
     *(DriveState.FAULT_REACTION_ACTIVE, DriveState.FAULT),
