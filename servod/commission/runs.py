@@ -57,7 +57,7 @@ def save_curves(path: Path, curves: dict[str, Curves]) -> None:
 def load_curves(path: Path) -> dict[str, Curves]:
     """Curves by motion. Raises BadInput."""
     try:
-        with np.load(path) as arrays:
+        with np.load(path, allow_pickle=False) as arrays:
             motions = {name.partition(".")[0] for name in arrays.files}
             return {
                 motion: Curves(**{f.name: arrays[f"{motion}.{f.name}"].astype(np.float64) for f in fields(Curves)})

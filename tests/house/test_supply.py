@@ -1,0 +1,151 @@
+"""What is installed is locked, can be told, and nothing of it is executed from data."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import source
+from packaging.requirements import Requirement
+
+LOCKS = ("deploy", "build")
+
+
+def locked(name: str) -> dict[str, str]:
+    """Project and version of every entry of a lock."""
+    text = (source.ROOT / f"requirements/{name}.txt").read_text()
+    return {m[1].lower(): m[2] for m in re.finditer(r"^([\w.-]+)==([^ ;\\]+)", text, re.MULTILINE)}
+
+
+def wanted(name: str) -> list[Requirement]:
+    if name == "build":
+        lines = (source.ROOT / "requirements/build.in").read_text().split()
+    else:
+        lines = tomllib.loads((source.ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+    return [Requirement(line) for line in lines]
+
+
+@pytest.mark.parametrize("name", LOCKS)
+def test_every_dependency_is_locked_within_its_range(name: str) -> None:
+    """`scripts/lock` writes them anew."""
+    versions = locked(name)
+    for requirement in wanted(name):
+        assert requirement.specifier.contains(versions[requirement.name.lower()]), requirement
+
+
+@pytest.mark.parametrize("name", LOCKS)
+def test_every_locked_file_has_its_hashes(name: str) -> None:
+    entries = re.split(r"^(?=\w)", (source.ROOT / f"requirements/{name}.txt").read_text(), flags=re.MULTILINE)
+    entries = [entry for entry in entries if entry.strip()]
+    assert len(entries) == len(locked(name)) >= len(wanted(name))
+    assert [entry.split()[0] for entry in entries if "--hash=sha256:" not in entry] == []
+
+
+def test_build_backend_is_the_locked_one() -> None:
+    project = tomllib.loads((source.ROOT / "pyproject.toml").read_text())
+    assert {Requirement(line).name for line in project["build-system"]["requires"]} == {"hatchling"}
+
+
+def test_bill_of_materials_names_all_that_runs() -> None:
+    script = source.ROOT / "scripts/sbom.py"
+    bill = json.loads(subprocess.run([sys.executable, script], capture_output=True, text=True, check=True).stdout)
+    assert (bill["bomFormat"], bill["metadata"]["component"]["name"]) == ("CycloneDX", "servod")
+    names = {component["name"] for component in bill["components"]}
+    assert {requirement.name.lower() for requirement in wanted("deploy")} <= names
+    assert {"pydantic-core", "rich"} <= names and "pytest" not in names
+    assert all(c["purl"] == f"pkg:pypi/{c['name']}@{c['version']}" for c in bill["components"])
+
+
+# --- nothing is executed from data ------------------------------------------------------------------------------------
+#: Calls that turn data into code, or leave a door open.
+CALLS = {"eval", "exec", "compile", "__import__", "os.system", "os.popen", "tempfile.mktemp", "yaml.unsafe_load"}
+CALLS |= {"yaml.full_load", "yaml.load_all", "marshal.loads", "marshal.load"}
+MODULES = {"pickle", "cPickle", "dill", "cloudpickle", "shelve", "marshal", "joblib", "telnetlib", "commands"}
+SAFE_LOADERS = {"SafeLoader", "CSafeLoader"}
+
+
+def dotted(node: ast.AST) -> str:
+    """`a.b.c` of a name or attribute; empty for anything else."""
+    if isinstance(node, ast.Name):
+        return node.id
+    return f"{dotted(node.value)}.{node.attr}" if isinstance(node, ast.Attribute) and dotted(node.value) else ""
+
+
+def offences(tree: ast.AST) -> Iterator[str]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (f"imports {a.name}" for a in node.names if a.name.split(".")[0] in MODULES)
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in MODULES:
+            yield f"imports {node.module}"
+        elif isinstance(node, ast.Call):
+            yield from calls(node)
+
+
+def calls(node: ast.Call) -> Iterator[str]:
+    name, given = dotted(node.func), {word.arg: word.value for word in node.keywords}
+    if name in CALLS or (name in ("np.load", "numpy.load") and "allow_pickle" not in given):
+        yield f"calls {name}"
+    for key in ("shell", "allow_pickle"):
+        if key in given and not (isinstance(given[key], ast.Constant) and not given[key].value):  # type: ignore[attr-defined]
+            yield f"{name}({key}=...)"
+    if name == "yaml.load" and not safe_loader(given.get("Loader", node.args[1] if len(node.args) > 1 else node)):
+        yield "yaml.load with an unsafe loader"
+
+
+def safe_loader(node: ast.AST) -> bool:
+    """A safe loader of PyYAML, or one of this project's own, which are built on it (test_own_loaders_are_safe)."""
+    name = dotted(node)
+    return name.split(".")[-1] in SAFE_LOADERS or bool(re.fullmatch(r"_\w*Loader", name))
+
+
+def test_nothing_is_executed_from_data() -> None:
+    found = [
+        f"{file.relative_to(source.ROOT)}: {what}"
+        for file in [*source.files("servod", "drivers"), *sorted((source.ROOT / "scripts").glob("*.py"))]
+        for what in offences(source.tree(file))
+    ]
+    assert found == []
+
+
+def test_own_loaders_are_safe() -> None:
+    bases = [
+        {dotted(base).split(".")[-1] for base in node.bases}
+        for file in source.files("servod", "drivers")
+        for node in ast.walk(source.tree(file))
+        if isinstance(node, ast.ClassDef) and node.name.endswith("Loader") and node.name.startswith("_")
+    ]
+    safe = SAFE_LOADERS | {"SourceFileLoader"}
+    assert bases and all(kinds & (safe | {"_Loader", "_SafeLoader"}) for kinds in bases), bases
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "eval('1')",
+        "import pickle",
+        "from pickle import loads",
+        "import os; os.system('x')",
+        "subprocess.run('x', shell=True)",
+        "subprocess.run('x', shell=flag)",
+        "np.load(f)",
+        "numpy.loadtxt(f, allow_pickle=True)",
+        "yaml.load(text)",
+        "yaml.load(text, Loader=yaml.FullLoader)",
+        "tempfile.mktemp()",
+    ],
+)
+def test_each_offence_would_be_found(line: str) -> None:
+    assert list(offences(ast.parse(line)))
+
+
+def test_shell_scripts_do_not_execute_data() -> None:
+    scripts = [source.ROOT / name for name in ("demo", "test", "scripts/prepare", "scripts/lock", "systemd/install.sh")]
+    assert [s.name for s in scripts if re.search(r"^\s*eval |curl[^\n]*\| *(ba)?sh", s.read_text(), re.MULTILINE)] == []
+    assert all(isinstance(s, Path) and s.exists() for s in scripts)
