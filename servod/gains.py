@@ -22,6 +22,7 @@ from servod.controllers import LAWS, Law
 from servod.errors import BadInput
 from servod.gain_design import Design
 from servod.gain_parameters import LocalSet, Parameters
+from servod.gain_verdict import certificate_fault, seal_fault
 from servod.sources import VERIFIES, source_sha256
 from servod.units import NS_PER_S, NS_PER_US
 from servod.yaml12 import Dumper, Strict, parse_yaml, read_text, validate
@@ -161,23 +162,12 @@ class GainSet(Strict):
     @property
     def seal_broken(self) -> bool:
         """Whether the set has a seal that does not fit, or a design without one."""
-        return (self.seal is not None or self.design is not None) and self.seal != self.content_sha256()
+        return seal_fault(self) is not None
 
     def certificate_problem(self) -> str | None:
         """Why the set does not count as certified, in a few words; None when it does."""
-        if self.seal_broken:
-            return "numbers that were changed after the set was sealed"
-        if self.certificate is None:
-            return "no certificate"
-        if self.design is None or self.seal is None:
-            return "a certificate without the design that it is of and its seal"
-        if not self.certificate.valid:
-            return "a certificate that says valid: false"
-        if self.certificate.parameters_sha256 != self.parameters_sha256():
-            return "a certificate for other parameters (they were changed after it was issued)"
-        if self.certificate.model_sha256 not in (None, self.provenance.model_sha256):
-            return "a certificate for another axis model (certificate.model_sha256, provenance.model_sha256)"
-        return None
+        fault = certificate_fault(self)
+        return None if fault is None else fault.problem
 
     def certificate_warning(self) -> str | None:
         """What to know of a certificate that counts: other checks than this version's issued it. None when there is
@@ -225,46 +215,45 @@ def require_certificate(gains: GainSet, accept_uncertified: bool | None, where: 
     other numbers, or whose seal is broken, never passes. None: there is no configuration that could accept it. `where`
     is the file, when there is one.
     """
-    problem = gains.certificate_problem()
-    if problem is None:
+    fault = certificate_fault(gains)
+    if fault is None:
         return
-    where, issue = f"{where or 'gain set ' + gains.name}: certificate", "a valid one (`servoctl verify` issues it)"
-    if gains.certificate is not None or gains.seal_broken:
-        raise BadInput(where, problem, issue)
-    if accept_uncertified is None:
-        raise BadInput(where, problem, issue)
-    if not accept_uncertified:
-        raise BadInput(where, problem, f"{issue}, or gains.accept_uncertified: true in the configuration")
+    key = f"{where or 'gain set ' + gains.name}: {fault.key}"
+    never = gains.certificate is not None or gains.seal_broken or accept_uncertified is None
+    if never or not accept_uncertified:
+        otherwise = "" if never else ", or gains.accept_uncertified: true in the configuration"
+        raise BadInput(key, fault.problem, fault.remedy + otherwise)
 
 
-def require_fit(gains: GainSet, config: AxisConfig) -> None:
+def require_fit(gains: GainSet, config: AxisConfig, where: str | None = None) -> None:
     """Refuse a set that this axis may not run: no certificate that counts, or one for another cycle or velocity filter.
 
-    Raises BadInput. The configuration may accept sets without a certificate, but not one of another loop.
+    Raises BadInput; `where` is the file, when there is one. The configuration may accept sets without a certificate,
+    but not one of another loop.
     """
-    require_certificate(gains, config.gains.accept_uncertified)
-    require_same_loop(gains, config)
+    require_certificate(gains, config.gains.accept_uncertified, where)
+    require_same_loop(gains, config, where)
 
 
-def require_same_loop(gains: GainSet, config: AxisConfig) -> None:
+def require_same_loop(gains: GainSet, config: AxisConfig, where: str | None = None) -> None:
     """Refuse a set whose design is for another cycle, filter, encoder, torque or delay than the axis has.
 
     What was certified is the sampled loop with its delay and its filter; with others the proof says nothing. A finer
     encoder, more torque and less delay are no worse. What a set or a configuration does not state is not compared.
-    Raises BadInput.
+    Raises BadInput; `where` is the file, when there is one.
     """
     if gains.design is None:
         return
-    design, cutoff_hz = gains.design, config.encoder.velocity_cutoff_hz
+    design, cutoff_hz, where = gains.design, config.encoder.velocity_cutoff_hz, where or f"gain set {gains.name}"
     period_s = config.cycle.period_us * NS_PER_US / NS_PER_S
     same = {"velocity_cutoff_hz": (design.velocity_cutoff_hz, cutoff_hz), "period_s": (design.period_s, period_s)}
     for key, (wanted, found) in same.items():
         if not math.isclose(wanted, found, rel_tol=1e-6):
-            raise BadInput(f"gain set {gains.name}: design.{key}", wanted, f"{found}, as the axis is configured")
+            raise BadInput(f"{where}: design.{key}", wanted, f"{found}, as the axis is configured")
     for key, wanted, found in _no_more(gains, design, config):
         if wanted > found * (1.0 + 1e-6):
-            raise BadInput(f"gain set {gains.name}: {key}", wanted, f"at most {found:g}, as the axis is configured")
-    _require_delay(gains, design, config)
+            raise BadInput(f"{where}: {key}", wanted, f"at most {found:g}, as the axis is configured")
+    _require_delay(where, design, config)
 
 
 def _no_more(gains: GainSet, design: Design, config: AxisConfig) -> Iterator[tuple[str, float, float]]:
@@ -274,7 +263,7 @@ def _no_more(gains: GainSet, design: Design, config: AxisConfig) -> Iterator[tup
         yield "certificate.torque_nm", gains.certificate.torque_nm, config.limits.torque_nm
 
 
-def _require_delay(gains: GainSet, design: Design, config: AxisConfig) -> None:
+def _require_delay(where: str, design: Design, config: AxisConfig) -> None:
     """Refuse a set for less delay than the axis's model has; that model is the data sheet's, and so only about right.
 
     A client that was told the configuration by the daemon may not have the file; the daemon itself has.
@@ -285,7 +274,7 @@ def _require_delay(gains: GainSet, design: Design, config: AxisConfig) -> None:
     most = design.model.total_delay_s + max(design.uncertainty.delay_s, DELAY_SHARE * design.period_s)
     if found > most:
         raise BadInput(
-            f"gain set {gains.name}: design.model.delay_s",
+            f"{where}: design.model.delay_s",
             design.model.total_delay_s,
             f"{found:g}, as in {config.model}",
         )

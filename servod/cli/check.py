@@ -48,13 +48,13 @@ def _config() -> None:
 
 
 def _check(file: Path) -> dict[str, str]:
-    from servod.yaml12 import parse_yaml, read_text
+    from servod.yaml12 import parse_yaml, plain_name, read_text
 
     if file.suffix.lower() in (".eds", ".dcf"):
         return {"kind": "EDS", "note": _check_eds(file)}
     keys = parse_yaml(read_text(file), str(file))
     if not isinstance(keys, dict):
-        raise BadInput(str(file), f"{type(keys).__name__} at the top", "a mapping of keys")
+        raise BadInput(str(file), f"{plain_name(keys)} at the top", "a mapping of keys")
     kind, checker = _recognise(file, keys)
     return {"kind": kind, "note": checker(file)}
 
@@ -86,7 +86,7 @@ def _check_axis(file: Path) -> str:
     for eds in (config.amplifier.eds, config.encoder.eds):
         if eds is not None:
             _check_eds(Path(eds))
-    require_fit(load_gains(config.gains.initial), config)
+    require_fit(load_gains(config.gains.initial), config, str(config.gains.initial))
     if config.model is not None:
         load_axis_model(config.model)
     load = planned_bus_load(config, str(file))

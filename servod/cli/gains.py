@@ -55,12 +55,13 @@ def list_(socket: SocketOption = DEFAULT_SOCKET, as_json: JsonOption = False) ->
 @_app.command(help=example("Check a gain set file and show what is in it.", "servoctl gains show my_axis.yaml"))
 def show(file: Annotated[Path, typer.Argument(help="Gain set, YAML.")], as_json: JsonOption = False) -> None:
     """Show a gain set."""
+    from servod.gain_verdict import seal_fault
     from servod.gains import load_gains
 
     gains = load_gains(file)
-    document, problem = gains.model_dump(mode="json"), gains.certificate_problem()
+    document, problem, seal = gains.model_dump(mode="json"), gains.certificate_problem(), seal_fault(gains)
     if as_json:
-        print_json(document | {"certificate_problem": problem})
+        print_json(document | {"certificate_problem": problem, "seal_problem": seal and seal.problem})
         return
     from rich.console import Console
     from rich.pretty import Pretty
@@ -68,6 +69,8 @@ def show(file: Annotated[Path, typer.Argument(help="Gain set, YAML.")], as_json:
     document["design"] = None if gains.design is None else f"{gains.design.mode.value}, see --json"
     console = Console()
     console.print(Pretty(document))
+    fits = "fits" if gains.seal else "none (the set has no design)"
+    console.print(f"seal: {seal.problem if seal else fits}", highlight=False)
     console.print(f"certificate: {problem or 'valid'}", highlight=False)
 
 

@@ -46,7 +46,7 @@ def check(path: Path) -> AxisConfig:
     config = load_config(path)
     for note in check_names(config, str(path)):
         log.warning("%s", note)
-    require_fit(load_gains(config.gains.initial), config)
+    require_fit(load_gains(config.gains.initial), config, str(config.gains.initial))
     if config.model is not None:
         load_axis_model(config.model)
     planned_bus_load(config, str(path))

@@ -14,7 +14,7 @@ LAYERS: list[set[str]] = [
     {"hal", "cia", "clock", "commands", "config", "record", "realtime", "bus", "wiring_proof"},
     {"identified"},
     {"axis_keys", "axis_friction", "axis_effects", "axis_model", "axis_pack", "models", "controllers"}
-    | {"gain_parameters", "gain_design", "gains", "gain_store"},
+    | {"gain_parameters", "gain_design", "gains", "gain_verdict", "gain_store"},
     {"drivers", "limits", "axis", "references"},
     {"master", "recorder_mcap", "recorder_read", "recorder_history", "recorder_files", "recorder_export", "recordings"},
     {"loop", "control", "recorder", "metrics", "wiring_expected"},
