@@ -12,6 +12,7 @@ import os
 import re
 import shlex
 import sys
+from itertools import pairwise
 
 import typer
 
@@ -40,7 +41,8 @@ from servod.cli import (
     track,
     verify,
 )
-from servod.errors import ServodError
+from servod.cli.common import drop_empty_folders
+from servod.errors import BadInput, ServodError
 
 _INTERRUPTED = 130  # as shells count SIGINT
 
@@ -84,6 +86,7 @@ def _output_refused(error: OSError) -> int:
 def run(arguments: list[str]) -> int:
     """Run one command line and return its exit code."""
     try:
+        _refuse_empty(arguments)
         code = app(args=arguments, prog_name="servoctl", standalone_mode=False)
     except ServodError as error:
         return _complain(str(error), error.exit_code)
@@ -96,9 +99,19 @@ def run(arguments: list[str]) -> int:
         return _complain(f"{error.format_message()} Found: `{shlex.join(['servoctl', *arguments])}`; see --help.", 2)
     except (KeyboardInterrupt, typer.Abort):
         code = _INTERRUPTED
+    finally:
+        drop_empty_folders()
     if code == _INTERRUPTED:  # typer turns Ctrl-C within a command into this
         return _complain("interrupted", _INTERRUPTED)
     return code if isinstance(code, int) else 0
+
+
+def _refuse_empty(arguments: list[str]) -> None:
+    """An empty text is never meant: for a file or folder it would stand for the current one. Raises BadInput."""
+    for before, text in pairwise(["argument", *arguments]):
+        option = before if not text else text[:-1] if text.startswith("--") and text.endswith("=") else None
+        if option is not None:
+            raise BadInput(option, "an empty text", "a value")
 
 
 def _of_the_lab(error: ImportError) -> bool:

@@ -5,6 +5,7 @@ Imports typer alone, so that `servoctl --help` starts at once.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import sys
@@ -53,14 +54,26 @@ def print_json(document: Any) -> None:
     sys.stdout.write("\n")
 
 
+#: Folders that this command made for its results, outermost first.
+_made: list[Path] = []
+
+
 def need_folder(option: str, folder: Path) -> None:
     """Make `folder` where it is missing, and see that a file can be written in it. Raises BadInput."""
+    _made.extend(reversed([path for path in (folder, *folder.parents) if not path.exists()]))
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
         raise BadInput(f"{option} {folder}", error.strerror or str(error), "a folder that can be written") from None
+
+
+def drop_empty_folders() -> None:
+    """At the end of a command: folders that it made and that nothing came into, as it was refused, go again."""
+    while _made:
+        with contextlib.suppress(OSError):  # not empty
+            _made.pop().rmdir()
 
 
 def need_file(option: str, file: Path) -> None:

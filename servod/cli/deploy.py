@@ -46,17 +46,18 @@ def deploy(
 ) -> None:
     """Deploy GAINS; exit code 1 when the axis was rolled back, or when GAINS ran already and broke its promise."""
     one_thread()
-    from servod.deploy.deployment import announced, deploy
+    from servod.deploy.deployment import admitted, announced, deploy
     from servod.gains import load_gains, require_certificate
 
     wanted = load_gains(gains)
     if present is not None and plant is None:
         raise BadInput("--present", str(present), "only with --plant: a daemon knows what runs")
-    require_certificate(wanted, accept_uncertified=None)
-    if not as_json:
-        print(f"{wanted.name}: {announced(wanted)}", file=sys.stderr, flush=True)
+    require_certificate(wanted, accept_uncertified=None, where=str(gains))
     axis = _on_daemon(socket) if plant is None else _virtual(plant, present, config, wanted, seed)
     with axis as link, progress("deploy", quiet=as_json) as tell:
+        admitted(wanted, link.config, str(gains))
+        if not as_json:
+            print(f"{wanted.name}: {announced(wanted)}", file=sys.stderr, flush=True)
         done = deploy(link, wanted, tell)
     if as_json:
         print_json(done.document())

@@ -17,6 +17,7 @@ from servod.cli.common import (
     connect,
     example,
     need_file,
+    need_folder,
     one_thread,
     print_json,
 )
@@ -71,6 +72,8 @@ def identify(
     from servod.identify.result import document, model_of
 
     need_file("--out", out)
+    if recordings is None:
+        need_folder("--out", recordings_folder(out))
     old = _identified_in(before)
     if recordings is not None:
         job = _from_recordings(recordings)

@@ -117,10 +117,11 @@ class State:
         for key in sorted(axis.keys() | self._content.axis.keys()):
             found, allowed = axis.get(key), self._content.axis.get(key)
             if found != allowed:
+                inner, found, allowed = _difference(found, allowed)
                 raise BadInput(
-                    f"--out {self.folder}: {key}",
-                    _short(found),
-                    f"{_short(allowed)}, whose commissioning is in this folder, or another folder",
+                    f"--out {self.folder}: {key}{inner}",
+                    found,
+                    f"{allowed}, whose commissioning is in this folder, or another folder",
                 )
 
     def _refuse_edited_files(self, step: str, record: StepRecord) -> None:
@@ -163,6 +164,23 @@ def file_sha256(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.exists() else ""
 
 
-def _short(value: Any) -> str:
-    text = str(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+#: Characters before the first difference of two texts that are shown with it, and in all.
+_ALIKE_SHOWN, _TEXT_SHOWN = 20, 60
+
+
+def _difference(one: Any, other: Any) -> tuple[str, str, str]:
+    """Where two values that are not equal differ first: its dotted keys, and both sides there."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        key = next(key for key in sorted({*one, *other}) if one.get(key) != other.get(key))
+        inner, *sides = _difference(one.get(key), other.get(key))
+        return f".{key}{inner}", sides[0], sides[1]
+    texts = ["nothing" if value is None else str(value) for value in (one, other)]
+    alike = next((i for i, (a, b) in enumerate(zip(*texts, strict=False)) if a != b), min(map(len, texts)))
+    start = max(alike - _ALIKE_SHOWN, 0)
+    return "", _cut(texts[0], start), _cut(texts[1], start)
+
+
+def _cut(text: str, start: int) -> str:
+    """A text from `start` on, at most _TEXT_SHOWN characters of it."""
+    end = start + _TEXT_SHOWN
+    return ("..." if start else "") + text[start:end] + ("..." if len(text) > end else "")

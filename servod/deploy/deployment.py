@@ -73,14 +73,16 @@ def deploy(
             link.disable()
 
 
-def admitted(gains: GainSet, config: AxisConfig) -> tuple[Design, Promise]:
-    """Design and promise of a set that may be tried on this axis. Raises BadInput."""
-    require_certificate(gains, accept_uncertified=None)
-    require_same_loop(gains, config)
+def admitted(gains: GainSet, config: AxisConfig, where: str | None = None) -> tuple[Design, Promise]:
+    """Design and promise of a set that may be tried on this axis. Raises BadInput; `where` is the file, if any."""
+    require_certificate(gains, accept_uncertified=None, where=where)
+    require_same_loop(gains, config, where)
     assert gains.certificate is not None
     if gains.design is None or gains.certificate.promised is None:
         raise BadInput(
-            f"gain set {gains.name}: certificate.promised", "nothing", "a promise; `servoctl verify` writes it anew"
+            f"{where or 'gain set ' + gains.name}: certificate.promised",
+            "nothing",
+            "a promise; `servoctl verify` writes it anew",
         )
     return gains.design, gains.certificate.promised
 

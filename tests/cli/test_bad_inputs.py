@@ -75,6 +75,7 @@ def test_bad_input_gives_one_line_and_exit_code_2(
     assert "Traceback" not in captured.err
     for word in case["line"]:
         assert word.lower() in captured.err.lower(), captured.err
+    assert [entry for entry in tmp_path.rglob("*") if entry.is_dir()] == []
 
 
 @pytest.mark.parametrize("name", sorted(TABLE["bases"]))

@@ -80,9 +80,9 @@ def _odd_arrays(pa: Any) -> list[Any]:
         pa.array([{"a": 1}] * n),
         pa.array([b"\xff"] * n),
         pa.array(range(n), pa.timestamp("ns")),
-        pa.array([2**62] * n, pa.timestamp("s")),
+        pa.array([2**62] * n, pa.timestamp("ns")),
         pa.array(range(n), pa.time64("ns")),
-        pa.array([2**62] * n, pa.duration("s")),
+        pa.array([2**62] * n, pa.duration("ns")),
         pa.array(["a", "b"] * (n // 2)).dictionary_encode(),
         pa.array([1.0, 2.0] * (n // 2)).dictionary_encode(),
         pa.array([2**63 - 1] * n),
@@ -120,7 +120,7 @@ def mat(folder: Path) -> Target:
 
 def mcap(folder: Path) -> Target:
     """The daemon's own recordings, whole, cut, bent, and of other makers."""
-    seeds = (_recorded(folder / "seed.mcap"),)
+    seeds = (recorded(folder / "seed.mcap"),)
     made = 0
 
     def run(data: bytes) -> None:
@@ -135,7 +135,7 @@ def mcap(folder: Path) -> Target:
     return Target(run, seeds, shape, words, longest=20_000)
 
 
-def _recorded(path: Path) -> bytes:
+def recorded(path: Path) -> bytes:
     """A short recording, with chunks that are not packed, so that changes reach what is in them."""
     path.unlink(missing_ok=True)
     file = McapFile(path, {"config.yaml": b"name: x\n"}, 0)

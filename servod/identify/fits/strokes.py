@@ -40,7 +40,10 @@ def spectra(trace: Trace) -> tuple[Array, list[Stroke]]:
         parts = (way - way.mean(), trace.torque_nm[start : start + count], trace.excitation_nm[start : start + count])
         strokes.append(Stroke(*(np.fft.rfft(part)[lines] / count for part in parts)))
     if len(strokes) < 4:
-        raise AnswerIsNo("the multisine recording has fewer than four whole strokes")
+        raise AnswerIsNo(
+            f"the multisine recording has {len(strokes)} whole strokes, and four are needed: see that nothing stops "
+            "the axis on its way, or give it more --travel"
+        )
     return lines / (count * trace.period_s), strokes
 
 

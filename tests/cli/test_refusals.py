@@ -1,0 +1,77 @@
+"""What a refused command says and leaves behind, beyond the one line of bad_inputs.yaml."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from servod.cli.app import run
+from servod.commission.state import State
+from servod.errors import BadInput
+from servod.gains import parse_gains
+from tests.fuzz.recordings import recorded
+from tests.gains import good
+
+
+def test_deploy_announces_no_motion_before_its_inputs_are_checked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    missing, gains = str(tmp_path / "plant.yaml"), tmp_path / "gains.yaml"
+    gains.write_text(good.certified(parse_gains(good.PD, "good")).to_yaml())
+    assert run(["deploy", str(gains), "--plant", missing]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert missing in line and "mrad" not in line
+
+
+@pytest.mark.parametrize("asked", [["--socket", "nowhere.sock", "--config", "axis.yaml"], ["--config", "axis.yaml"]])
+def test_a_refused_command_leaves_no_folder(
+    asked: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SERVOD_SOCKET", "nowhere.sock")
+    limits = dict.fromkeys(("torque_nm", "torque_rate_nm_per_s", "speed_rad_s", "following_error_rad"), 1.0)
+    limits |= {"position_min_rad": -1.0, "position_max_rad": 1.0, "encoder_mismatch_rad": 0.1}
+    Path("axis.yaml").write_text(yaml.safe_dump({"limits": limits, "gains": {"initial": "gains.yaml"}}))
+    assert run(["identify", "--out", "deep/down/model.yaml", *asked]) == 3, capsys.readouterr()
+    assert [entry.name for entry in tmp_path.iterdir()] == ["axis.yaml"]
+
+
+def test_the_other_configuration_of_a_folder_is_told_where_it_differs(tmp_path: Path) -> None:
+    before = {"configuration": {"name": "axis", "text": "x" * 100 + "one"}}
+    State(tmp_path, before, [])
+    with pytest.raises(BadInput) as caught:
+        State(tmp_path, {"configuration": {"name": "axis", "text": "x" * 100 + "two"}}, [])
+    assert "configuration.text: found ...xxxxxxxxxxxxxxxxxxxxtwo; allowed: ...xxxxxxxxxxxxxxxxxxxxone, " in str(
+        caught.value
+    )
+
+
+def test_gains_show_gives_the_seals_verdict(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sealed = good.certified(parse_gains(good.PD, "good"))
+    whole, changed = tmp_path / "whole.yaml", tmp_path / "changed.yaml"
+    whole.write_text(sealed.to_yaml())
+    changed.write_text(sealed.model_copy(update={"seal": "0" * 64}).to_yaml())
+    for file, says in ((whole, None), (changed, "numbers that were changed after")):
+        assert run(["gains", "show", str(file), "--json"]) == 0
+        problem = json.loads(capsys.readouterr().out)["seal_problem"]
+        assert problem is None if says is None else says in problem
+    assert run(["gains", "show", str(changed)]) == 0
+    assert "seal: numbers that were changed" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("kept", "what"), [(0.7, "cut off"), (1.0, "damaged")])
+def test_a_damaged_recording_tells_how_much_could_be_read(
+    kept: float, what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = bytearray(recorded(tmp_path / "whole.mcap"))
+    at = content.find(b"zstd") + 60
+    if kept == 1.0:
+        content[at] ^= 0xFF
+    file, table = tmp_path / "run.mcap", tmp_path / "run.csv"
+    file.write_bytes(content if kept == 1.0 else content[: content.rfind(b"zstd")])
+    code = run(["record", "export", str(file), "--out", str(table)])
+    said = " ".join(capsys.readouterr())
+    assert (code, what in said, f"of {file.stat().st_size} bytes" in said) in ((0, True, True), (2, True, True)), said
