@@ -15,7 +15,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, cast
 
 import zstandard
 from mcap.exceptions import InvalidMagic, McapError
@@ -87,9 +87,12 @@ def read_recording(path: str | Path) -> Recording:
     recording = Recording()
     try:
         with open_file(path) as stream:
-            reader = StreamReader(stream, validate_crcs=True, emit_chunks=True, record_size_limit=_RECORD_LIMIT_BYTES)
+            bounded = _Bounded(stream)
+            reader = StreamReader(
+                cast(Any, bounded), validate_crcs=True, emit_chunks=True, record_size_limit=_RECORD_LIMIT_BYTES
+            )
             _read_stream(reader, recording)
-            _tell_damage(recording, stream.tell(), os.fstat(stream.fileno()).st_size)
+            _tell_damage(recording, stream.tell(), bounded.size)
     except InvalidMagic:
         raise BadInput(str(path), "a file that is not MCAP", "a recording of servod (.mcap)") from None
     except OSError as error:
@@ -100,6 +103,18 @@ def read_recording(path: str | Path) -> Recording:
     if (_TIME, "q") not in zip(recording.names, recording.kinds, strict=True):
         raise BadInput(f"{path}: {CYCLE_TOPIC}", f"no field int64 {_TIME}", "a recording of servod (.mcap)")
     return recording
+
+
+class _Bounded:
+    """A file that is never asked for more than it has: Python makes room for all that is asked for."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self.size = os.fstat(stream.fileno()).st_size
+        self._stream = stream
+
+    def read(self, count: int) -> bytes:
+        """At most `count` bytes."""
+        return self._stream.read(min(count, self.size))
 
 
 def _tell_damage(recording: Recording, read_bytes: int, all_bytes: int) -> None:

@@ -28,6 +28,9 @@ APART_S = 1e5
 #: Least that a recording must hold: seconds, rows, distinct positions, share of rows in motion.
 LEAST_S, LEAST_ROWS, LEAST_COUNTS, LEAST_MOVING = 1.5, 300, 40, 0.03
 
+#: Longest time between rows, s.
+COARSEST_S = 0.1
+
 #: Noise that the slowest observer makes of the encoder's, as a share of dry friction, from which nothing can be said; a
 #: share of the command's spread counts for dry friction where it is more.
 MOST_NOISE, NOISE_OF_COMMAND = 0.5, 0.3
@@ -149,13 +152,22 @@ def _tell_saturation(torque: Array, notes: list[str]) -> None:
 def cannot_tell(trace: Trace, model: AxisModel) -> str | None:
     """Why this recording cannot tell anything about this model; None when it can."""
     return (
-        _too_short(trace)
+        _too_coarse(trace)
+        or _too_short(trace)
         or _never_changes(trace)
         or implausible(trace, model)
         or _too_noisy(trace, model)
         or _too_still(trace)
         or _saturated(trace)
     )
+
+
+def _too_coarse(trace: Trace) -> str | None:
+    """Friction and inertia of a servo axis act within milliseconds; and time may be in other units than seconds."""
+    period_s = trace.period_s
+    if period_s <= COARSEST_S:
+        return None
+    return f"too coarse: {period_s:.3g} s between rows, at most {COARSEST_S:g} s; t_s is in seconds (--map scales it)"
 
 
 def _too_short(trace: Trace) -> str | None:

@@ -150,7 +150,7 @@ def _read_parquet(path: Path, _notes: list[str]) -> dict[str, Any]:
         if cells > _MOST_CELLS:
             raise BadInput(str(path), f"{cells} numbers", f"at most {_MOST_CELLS}")
         table = file.read()
-    except (pa.ArrowException, OSError) as error:
+    except (pa.ArrowException, OSError, ValueError) as error:  # ValueError: a name that is no UTF-8
         raise BadInput(str(path), _first_line(error), "a Parquet file") from None
     _refuse_repeated(table.column_names, path)
     return {name: table.column(name).combine_chunks() for name in table.column_names}

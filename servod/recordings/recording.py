@@ -26,6 +26,12 @@ LEAST_ROWS = 10
 #: Share of missing cells in a required column from which filling would be invention.
 MOST_MISSING = 0.5
 
+#: No measurement is so large; such a cell counts as missing, as one that is not finite does.
+LARGEST = 1e30
+
+#: Time between rows, s, beyond which the column is surely in another unit.
+SHORTEST_STEP_S, LONGEST_STEP_S = 1e-6, 20.0
+
 #: Steps that differ from the median by more than this share make a recording uneven.
 UNEVEN_SHARE = 0.1
 
@@ -105,7 +111,9 @@ def load_recording(path: str | Path, map_path: str | Path | None = None) -> Reco
         source = chosen.get(quantity.column(axis))
         if source is not None:
             values = numbers(foreign[source.source], path, source.source)
-            columns[quantity] = source.scale * values + source.offset
+            with np.errstate(over="ignore", invalid="ignore"):
+                scaled = source.scale * values + source.offset
+            columns[quantity] = np.where(np.abs(scaled) < LARGEST, scaled, np.nan)
     if unused:
         report.append(f"columns not used: {', '.join(unused)}")
     return _checked(path, axis, columns, report)
@@ -168,6 +176,9 @@ def _check_time(path: Path, t_s: Array, report: list[str]) -> None:
     period = float(np.median(steps))
     if period <= 0.0:
         raise BadInput(f"{path}: column t_s", "the same time in most rows", "time that runs forward, in seconds")
+    if not SHORTEST_STEP_S <= period <= LONGEST_STEP_S:
+        allowed = f"{SHORTEST_STEP_S:g} to {LONGEST_STEP_S:g} s, with t_s in seconds; a --map file scales it"
+        raise BadInput(f"{path}: column t_s", f"{period:.3g} s between rows", allowed)
     doubled = int(np.count_nonzero(steps == 0.0))
     if doubled:
         report.append(f"t_s: {doubled} time stamps twice; such rows get the same simulated value")

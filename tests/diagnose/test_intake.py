@@ -34,6 +34,11 @@ def test_too_short(made: Recording) -> None:
     assert "too short" in refused_for(recording(made.t_s[:900], made.torque[:900], made.position[:900]))
 
 
+def test_too_coarse_or_in_another_unit(made: Recording) -> None:
+    said = refused_for(recording(1000.0 * made.t_s, made.torque, made.position))
+    assert "too coarse: 1 s between rows, at most 0.1 s; t_s is in seconds" in said
+
+
 def test_too_still(made: Recording) -> None:
     still = np.round(1e-6 * np.sin(made.t_s) / 6e-6) * 6e-6
     assert "too still" in refused_for(recording(made.t_s, made.torque, still))
