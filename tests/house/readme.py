@@ -2,7 +2,8 @@
 
 `--measure` first runs `servoctl bench`, `servoctl paper` and `servoctl demo --fast` with the README's gain sets (twenty
 minutes on an idle machine) and writes what they print; `--bench FILE`, `--paper FILE` and `--demo FILE` take documents
-that were kept (--json).
+that were kept (--json). `--soak FILE` (again for more), `--faults FILE` and `--fuzz FILE`, given together, write the
+table of reliability from the documents of `servoctl soak`, `servoctl faults` and `python -m tests.fuzz.run`.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+
+import reliability
 
 from servod.benchmark.table import GOALS
 from servod.benchmark.table import shown as shown_figure
@@ -175,6 +178,9 @@ def main() -> None:
     parser.add_argument("--bench", type=Path, help="document of `servoctl bench --json`")
     parser.add_argument("--demo", type=Path, help="document of the README's `servoctl demo --json`")
     parser.add_argument("--paper", type=Path, help="paper.json of `servoctl paper`")
+    parser.add_argument("--soak", type=Path, action="append", default=[], help="soak.json of `servoctl soak`")
+    parser.add_argument("--faults", type=Path, help="document of `servoctl faults --json`")
+    parser.add_argument("--fuzz", type=Path, help="document of `python -m tests.fuzz.run --json`")
     options = parser.parse_args()
     documents = {name: json.loads(file.read_text()) for name in MEASURED if (file := getattr(options, name))}
     if options.measure:
@@ -184,7 +190,16 @@ def main() -> None:
     text = with_tables(README.read_text())
     for name, document in documents.items():
         text = with_section(text, name, MEASURED[name](document))
+    tried = reliability_rows(options.soak, options.faults, options.fuzz)
+    if tried:
+        text = with_section(text, "reliability", markdown(reliability.HEADER, tried))
     README.write_text(text)
+
+
+def reliability_rows(soaks: list[Path], faults: Path | None, fuzz: Path | None) -> list[list[str]]:
+    """The rows of the table of reliability from the documents that are given."""
+    campaign, fuzzed = (None if file is None else json.loads(file.read_text()) for file in (faults, fuzz))
+    return reliability.rows([json.loads(file.read_text()) for file in soaks], campaign, fuzzed)
 
 
 MEASURED: dict[str, Callable[[dict[str, Any]], str]] = {

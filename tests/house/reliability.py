@@ -1,0 +1,70 @@
+"""The README's table of what the axis was put through: soak, fault campaign and fuzzing, from their JSON documents."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+HEADER = ["Put through", "How much", "Came out", "Command"]
+Row = list[str]
+
+
+def rows(
+    soaks: Sequence[dict[str, Any]], faults: dict[str, Any] | None, fuzz: list[dict[str, Any]] | None
+) -> list[Row]:
+    """A row for each document that there is, two for the campaign's kinds of loss."""
+    return [
+        *(_soak(soak) for soak in soaks),
+        *(_faults(faults) if faults is not None else ()),
+        *([_fuzz(fuzz)] if fuzz is not None else []),
+    ]
+
+
+def _soak(soak: dict[str, Any]) -> Row:
+    """Cycles, faults and what was wrong in them."""
+    how = "SYNC-stepped" if soak["mode"] == "stepped" else "daemon, loop and virtual axis as processes"
+    much = (
+        f"{soak['cycles']:,} cycles ({soak['axis_hours']:.1f} h of axis time in {soak['wall_s'] / 3600.0:.2f} h), "
+        f"{soak['faults_injected']:,} faults of {len(soak['faults'])} kinds, {soak['restarts']:,} restarts"
+    )
+    gone_ms = max((fault["torque_gone"]["largest_ms"] for fault in soak["faults"].values()), default=0.0)
+    lost = soak["cycles"] - soak["missed"] - soak["rows"]
+    out = [
+        f"{lost:,} rows lost",
+        f"{abs(soak['rows'] - soak['syncs'] - soak['syncs_taken']):,} apart from SYNC on the bus",
+        f"{soak['faults_found']:,} faults in the log",
+        f"{sum(soak['wrong'].values()):,} unexplained states, faults or torques",
+        f"torque gone after {gone_ms:.0f} ms at the latest",
+        *(f"memory of {memory['process']} {_memory(memory)}" for memory in soak["memory"]),
+    ]
+    command = "servoctl soak" + (" --wall" if soak["mode"] == "wall" else "")
+    return [f"random moves and faults, {how}", much, "; ".join(out), f"`{command}`"]
+
+
+def _memory(memory: dict[str, Any]) -> str:
+    low, high = memory["interval_kb_per_h"]
+    return memory["growth"] if low is None else f"{memory['growth']} ({low:.0f} to {high:.0f} kB/h)"
+
+
+def _faults(faults: dict[str, Any]) -> Iterator[Row]:
+    """The campaign as a whole, and the worst times of each kind of loss by the drive's own record."""
+    lost = f"{faults['lost_records']:,} cycle records lost"
+    much = f"{faults['run']:,} of {faults['planned']:,} scenarios"
+    yield ["fault campaign", much, f"{faults['passed']:,} passed; {lost}", "`servoctl faults`"]
+    for loss, worst in faults["worst"].items():
+        if worst["scenarios"]:
+            times = [
+                f"{text} after {worst[key]:.0f} ms at the latest"
+                for key, text in (("left_ms", "the drive had left the command"), ("gone_ms", "the torque was gone"))
+                if worst[key] is not None
+            ]
+            yield [f"of these, loss of {loss}", f"{worst['scenarios']:,} scenarios", "; ".join(times), ""]
+
+
+def _fuzz(fuzz: list[dict[str, Any]]) -> Row:
+    """Inputs and crashes over all targets."""
+    inputs, hours = sum(row["inputs"] for row in fuzz), sum(row["seconds"] for row in fuzz) / 3600.0
+    targets = sorted({row["target"] for row in fuzz})
+    crashes = {(row["target"], crash["key"]) for row in fuzz for crash in row["crashes"]}
+    much = f"{inputs:,} inputs to {len(targets)} ways in, {hours:.2f} h"
+    return ["fuzzing", much, f"{len(crashes):,} crashes", "`python -m tests.fuzz.run`"]
