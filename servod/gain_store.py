@@ -27,7 +27,7 @@ from pathlib import Path
 from pydantic import Field
 
 from servod.errors import BadInput
-from servod.gains import NAME_PATTERN, GainSet, load_gains, parse_gains, require_certificate
+from servod.gains import NAME_PATTERN, GainSet, parse_gains, require_certificate
 from servod.yaml12 import Strict, load_model, read_text
 
 _VERSION_FILE = re.compile(r"^([0-9]{4,})\.yaml$")
@@ -46,7 +46,7 @@ class Action(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class StoredSet:
-    """One version of one gain set in the store; `sha256` is of the file's bytes."""
+    """One version of one gain set in the store; `sha256` is of the file's text in UTF-8."""
 
     name: str
     version: int
@@ -115,6 +115,7 @@ class GainStore:
         self.directory = directory
         self._sets, self._active_file = directory / "sets", directory / "active.json"
         self._history_file = directory / "history.jsonl"
+        self._parsed: dict[Path, tuple[tuple[int, ...], StoredSet]] = {}
         try:
             self._sets.mkdir(parents=True, exist_ok=True)
             with self._locked():
@@ -165,15 +166,32 @@ class GainStore:
         return self.load(read_text(path), str(path))
 
     def get(self, name: str, version: int | None = None) -> StoredSet:
-        """The stored set, by default its newest version; checked again, since somebody may have edited the file."""
+        """The stored set, by default its newest version; checked again, since somebody may have edited the file.
+
+        It is read once: what is checked is what runs, whatever becomes of the file meanwhile.
+        """
         versions = self._versions(name)
         if not versions:
             raise BadInput("gain set", name, ", ".join(self.names()) or "none is stored yet; `servoctl gains load` one")
         chosen = versions[-1] if version is None else version
         if chosen not in versions:
             raise BadInput(f"gain set {name}: version", version, ", ".join(map(str, versions)))
-        path = self._path(name, chosen)
-        return StoredSet(name, chosen, hashlib.sha256(path.read_bytes()).hexdigest(), path, load_gains(path))
+        return self._read(name, chosen)
+
+    def _read(self, name: str, version: int) -> StoredSet:
+        """One version; a file is parsed anew only when it was touched since, so that lists are cheap."""
+        path = self._path(name, version)
+        status = path.stat()
+        touched = (status.st_ino, status.st_mtime_ns, status.st_ctime_ns, status.st_size)
+        before, stored = self._parsed.get(path, (None, None))
+        if stored is None or before != touched:
+            text = read_text(path)
+            gains = parse_gains(text, str(path))
+            if gains.name != name:
+                raise BadInput(f"{path}: name", gains.name, f"{name}, under which it was stored; load the set anew")
+            stored = StoredSet(name, version, hashlib.sha256(text.encode()).hexdigest(), path, gains)
+            self._parsed[path] = touched, stored
+        return stored
 
     def names(self) -> list[str]:
         """Names of all stored sets, in order."""
