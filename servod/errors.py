@@ -95,6 +95,7 @@ class FaultCode(IntEnum):
     COMMANDS_LOST = 27
     SECOND_MASTER = 28
     WIRING_NOT_PROVEN = 29
+    NODE_LEFT_OPERATIONAL = 30
 
 
 #: Faults after which the nodes are not as they were configured: only a new bring-up may enable the axis again.
@@ -106,6 +107,7 @@ NEEDS_RESTART = frozenset(
         FaultCode.BUS_DOWN,
         FaultCode.DRIVE_STAYS_POWERED,
         FaultCode.COMMANDS_LOST,
+        FaultCode.NODE_LEFT_OPERATIONAL,
     }
 )
 
@@ -319,6 +321,12 @@ FAULTS: dict[FaultCode, Fault] = dict(
             "The bounded test before the first torque found a wrong sign, direction or scale, or no answer.",
             "`servoctl status` and the journal name the check, what it saw and the key to mend; then `servoctl enable "
             "--reset-fault` repeats it.",
+        ),
+        _row(
+            _C.NODE_LEFT_OPERATIONAL,
+            _R.QUICK_STOP,
+            "A node left the NMT state operational: somebody sent it an NMT command, or it did so by itself.",
+            "Find who sends NMT commands (another master, a service tool), then restart the daemon.",
         ),
     ]
 )

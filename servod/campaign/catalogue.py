@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 from servod.campaign.scenario import Scenario, load_scenarios
@@ -17,10 +18,16 @@ def shipped_scenarios() -> dict[str, Scenario]:
 
 def scenarios_in(folder: Path) -> dict[str, Scenario]:
     """All scenarios of a folder and its subfolders."""
+    found = load_all(sorted(folder.rglob("*.yaml")))
+    return dict(sorted(found.items(), key=lambda item: (item[1].group, item[0])))
+
+
+def load_all(paths: Iterable[Path]) -> dict[str, Scenario]:
+    """The scenarios of all these files, in their order. Raises BadInput, also for a name that comes twice."""
     found: dict[str, Scenario] = {}
-    for path in sorted(folder.rglob("*.yaml")):
+    for path in paths:
         more = load_scenarios(path)
         if twice := found.keys() & more.keys():
             raise BadInput(str(path), f"a second scenario {min(twice)}", "a file name that no other folder has")
         found |= more
-    return dict(sorted(found.items(), key=lambda item: (item[1].group, item[0])))
+    return found

@@ -11,7 +11,7 @@ from pathlib import Path
 from servod.campaign.actions import action_of
 from servod.campaign.judge import Reaction, complaints, reaction
 from servod.campaign.processes import ProcessAxis
-from servod.campaign.scenario import Recovery, Runs, Scenario
+from servod.campaign.scenario import Loss, Recovery, Runs, Scenario
 from servod.campaign.stepped import SteppedAxis
 from servod.campaign.under_test import AxisUnderTest
 from servod.errors import FAULTS, Unreachable
@@ -32,6 +32,7 @@ class Outcome:
     lost_records: int
     recovered: bool
     complaints: tuple[str, ...]
+    loss: Loss
 
     @property
     def passed(self) -> bool:
@@ -76,6 +77,7 @@ def run_scenario(
         seen.lost_records,
         recovered,
         tuple(found),
+        scenario.expect.loss,
     )
 
 

@@ -1,13 +1,32 @@
-"""`servoctl faults`: the one table of faults, as log, command line and README show it."""
+"""`servoctl faults`: put every fault to the virtual axis and time what the drive does; or list the faults."""
 
 from __future__ import annotations
 
+import sys
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
 import typer
 
-from servod.cli.common import JsonOption, example, print_json
-from servod.errors import FAULTS
+from servod.cli.common import JsonOption, example, need_folder, print_json
+from servod.errors import FAULTS, AnswerIsNo, BadInput
 
-_HELP = example("List every fault, what it does to the axis, its cause and its remedy.", "servoctl faults")
+if TYPE_CHECKING:
+    from servod.campaign.run import Outcome
+    from servod.campaign.scenario import Scenario
+
+_HELP = example(
+    "Run the fault campaign on the virtual axis: every scenario injects its faults, the drive's own record says when "
+    "torque was gone, and the table shows what the user is told. Scenarios in virtual time first, then those of "
+    "daemon, loop and drive as processes on the wall clock, one at a time. Exit code 1 when one did not pass. --codes "
+    "lists every fault instead: what it does to the axis, its cause and its remedy.",
+    "servoctl faults",
+    "servoctl faults --stepped --group encoder --out out/faults",
+    "servoctl faults --only 'torque_frames*' --json",
+    "servoctl faults --scenario my_fault.yaml",
+    "servoctl faults --codes",
+)
 
 
 def register(app: typer.Typer) -> None:
@@ -15,10 +34,93 @@ def register(app: typer.Typer) -> None:
     app.command("faults", help=_HELP)(faults)
 
 
-def faults(as_json: JsonOption = False) -> None:
-    """Print the fault table."""
+def faults(
+    only: Annotated[str | None, typer.Option(help="Run the scenarios whose name fits this pattern (*, ?).")] = None,
+    group: Annotated[str | None, typer.Option(help="Run the scenarios of this group.")] = None,
+    scenario: Annotated[
+        list[Path] | None, typer.Option(help="Run the scenarios of this file instead; may be given again.")
+    ] = None,
+    stepped: Annotated[bool, typer.Option("--stepped", help="Leave out the scenarios on the wall clock.")] = False,
+    jobs: Annotated[int, typer.Option(min=1, max=256, help="Scenarios in virtual time that run at once.")] = 1,
+    out: Annotated[Path | None, typer.Option(help="Folder for the page and the document of the outcomes.")] = None,
+    codes: Annotated[bool, typer.Option("--codes", help="List the faults and run nothing.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Run the campaign, or print the fault table."""
+    if codes:
+        _print_codes(as_json)
+        return
+    chosen = _chosen(scenario, only, group, stepped)
+    if out is not None:
+        need_folder("--out", out)
+    found: list[Outcome] = []
+    try:
+        _run(chosen, jobs, found, quiet=as_json)
+    finally:  # interrupted, what came so far is shown and written
+        _report(found, len(chosen), out, as_json)
+    failed = [outcome.name for outcome in found if not outcome.passed]
+    if failed:
+        raise AnswerIsNo(f"{len(failed)} of {len(found)} scenarios did not pass: {', '.join(failed)}")
+
+
+def _chosen(files: list[Path] | None, only: str | None, group: str | None, stepped: bool) -> dict[str, Scenario]:
+    """The scenarios to run. Raises BadInput for a broken file, and when nothing is left."""
+    from servod.campaign.catalogue import load_all, shipped_scenarios
+    from servod.campaign.scenario import Runs
+
+    known = load_all(files) if files else shipped_scenarios()
+    runs = {Runs.STEPPED} if stepped else {Runs.STEPPED, Runs.PROCESSES}
+    here = {name: s for name, s in known.items() if s.runs in runs}
+    groups = sorted({s.group for s in here.values()})
+    if group is not None and group not in groups:
+        raise BadInput("--group", group, ", ".join(groups))
+    chosen = {name: s for name, s in here.items() if group in (None, s.group) and fnmatchcase(name, only or "*")}
+    if not chosen:
+        found = f"{only or 'all'}, which fits none of {len(here)} scenarios"
+        raise BadInput("--only", found, "a pattern that fits a name, as in 'torque_frames*'")
+    return chosen
+
+
+def _run(chosen: dict[str, Scenario], jobs: int, found: list[Outcome], quiet: bool) -> None:
+    """Run them; each goes into `found`, and is told in a line of standard error, as it comes."""
+    from servod.campaign.campaign import outcomes
+
+    for outcome in outcomes(chosen, jobs):
+        found.append(outcome)
+        if not quiet:
+            why = "" if outcome.passed else f": {'; '.join(outcome.complaints)}"
+            word = "passed" if outcome.passed else "FAILED"
+            print(f"{len(found)} of {len(chosen)} {word} {outcome.name}{why}", file=sys.stderr, flush=True)
+
+
+def _report(found: list[Outcome], planned: int, out: Path | None, as_json: bool) -> None:
+    from servod.campaign.document import document, summary, text_table
+
+    content = document(found, planned)
+    if out is not None:
+        _write(found, planned, content, out)
     if as_json:
-        rows = FAULTS.values()
+        print_json(content)
+        return
+    print(text_table(found))
+    print("\n".join(summary(found, planned)))
+    if out is not None:
+        print(f"Page: {out / 'report.html'}; all figures: {out / 'faults.json'}")
+
+
+def _write(found: list[Outcome], planned: int, content: dict[str, Any], out: Path) -> None:
+    import json
+
+    from servod.campaign.page import write_page
+    from servod.report.files import write_bytes
+
+    write_bytes(out / "faults.json", json.dumps(content, indent=2, allow_nan=False).encode())
+    write_page(found, planned, out / "report.html")
+
+
+def _print_codes(as_json: bool) -> None:
+    rows = FAULTS.values()
+    if as_json:
         print_json(
             [
                 {
@@ -36,6 +138,6 @@ def faults(as_json: JsonOption = False) -> None:
     from rich.table import Table
 
     table = Table("Fault", "Reaction", "Cause", "Remedy")
-    for fault in FAULTS.values():
+    for fault in rows:
         table.add_row(fault.code.name, fault.reaction.name, fault.cause, fault.remedy)
     Console().print(table)

@@ -77,7 +77,7 @@ class NodeWatch:
             self._add(FaultCode.DRIVE_RESET, f"node {self.node_id}: boot-up while it should be operational", state)
         elif state != NmtState.OPERATIONAL and previous == NmtState.OPERATIONAL:
             text = f"node {self.node_id}: left NMT operational (state {state})"
-            self._add(FaultCode.DRIVE_LEFT_OPERATION, text, state)
+            self._add(FaultCode.NODE_LEFT_OPERATIONAL, text, state)
 
     def _on_emcy(self, _can_id: int, data: bytearray, time_ns: float) -> None:
         if len(data) < _EMCY.size:

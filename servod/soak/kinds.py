@@ -21,7 +21,7 @@ _MOTION = frozenset({_F.FOLLOWING_ERROR, _F.SPEED_LIMIT, _F.ENCODER_IMPLAUSIBLE}
 #: What the axis sees of a node that is not there, besides its silence.
 _NODE_GONE = _MOTION | {
     *(_F.FEEDBACK_STALE, _F.NODE_HEARTBEAT_LOST, _F.DRIVE_FAULT, _F.DRIVE_LEFT_OPERATION, _F.DRIVE_STAYS_POWERED),
-    *(_F.DRIVE_RESET, _F.DRIVE_MODE_WRONG, _F.ENCODER_ALARM, _F.COMMANDS_LOST),
+    *(_F.DRIVE_RESET, _F.DRIVE_MODE_WRONG, _F.ENCODER_ALARM, _F.COMMANDS_LOST, _F.NODE_LEFT_OPERATIONAL),
 }
 
 
@@ -112,7 +112,7 @@ def _node(name: str, do: Action, undo: Action | None = None, takes_syncs: bool =
     expects = frozenset(
         {
             *(_F.FEEDBACK_STALE, _F.DRIVE_RESET, _F.DRIVE_LEFT_OPERATION, _F.NODE_HEARTBEAT_LOST, _F.DRIVE_FAULT),
-            *(_F.BUS_OFF, _F.BUS_DOWN),
+            *(_F.BUS_OFF, _F.BUS_DOWN, _F.NODE_LEFT_OPERATIONAL),
         }
     )
     return FaultKind(

@@ -16,14 +16,14 @@ def servoctl(*words: str, **options: Any) -> subprocess.CompletedProcess[bytes]:
     return subprocess.run(command, stderr=subprocess.PIPE, timeout=60, check=False, **options)
 
 
-@pytest.mark.parametrize("words", [("faults",), ("faults", "--json"), ("--help",)])
+@pytest.mark.parametrize("words", [("faults", "--codes"), ("faults", "--codes", "--json"), ("--help",)])
 def test_a_full_disk_is_one_line(words: tuple[str, ...]) -> None:
     with Path("/dev/full").open("wb") as full:
         done = servoctl(*words, stdout=full)
     assert (done.returncode, done.stderr) == (1, b"servoctl: standard output: No space left on device\n")
 
 
-@pytest.mark.parametrize("words", [("faults",), ("faults", "--json")])
+@pytest.mark.parametrize("words", [("faults", "--codes"), ("faults", "--codes", "--json")])
 def test_a_reader_that_has_gone_is_silence(words: tuple[str, ...]) -> None:
     reader, writer = os.pipe()
     os.close(reader)
@@ -34,6 +34,6 @@ def test_a_reader_that_has_gone_is_silence(words: tuple[str, ...]) -> None:
 
 def test_a_terminal_without_the_characters_gets_the_rest() -> None:
     plain = {"PATH": os.environ["PATH"], "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONIOENCODING": "ascii"}
-    done = servoctl("faults", stdout=subprocess.PIPE, env=plain)
+    done = servoctl("faults", "--codes", stdout=subprocess.PIPE, env=plain)
     assert (done.returncode, done.stderr) == (0, b"")
     assert b"TORQUE_CLIPPED" in done.stdout

@@ -60,7 +60,7 @@ def test_a_node_that_leaves_operational_is_seen(axis: tuple[Witness, Master]) ->
     world, instance = axis
     world.amplifier.nmt.state = "PRE-OPERATIONAL"
     events = events_until(instance, bool)
-    assert (events[0].fault, events[0].code) == (FaultCode.DRIVE_LEFT_OPERATION, 127)
+    assert (events[0].fault, events[0].code) == (FaultCode.NODE_LEFT_OPERATIONAL, 127)
 
 
 @pytest.mark.parametrize(("node", "fault"), [(1, FaultCode.DRIVE_FAULT), (2, FaultCode.ENCODER_ALARM)])
