@@ -2,7 +2,7 @@
 
     /opt/servod/bin/python scripts/sbom.py > servod.cdx.json
 
-Reads the metadata of the Python that runs it, works without a network, and lists servod and all that it needs, each with
+Reads the metadata of the Python that runs it, works without a network, and lists servod and all it needs, each with
 version, licence, package URL and the hash of what was installed.
 """
 

@@ -1,0 +1,467 @@
+"""Every fault in every state of the axis, every request in every state, and every time to the exact cycle.
+
+`scripts/mutate.py axis` shows that each of these lines is needed; the stories stand in tests/cycles.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from servod.axis import Axis, AxisState
+from servod.commands import Refusal
+from servod.errors import FAULTS, NEEDS_RESTART, FaultCode, Reaction
+from servod.hal import DriveState, Goal, Mode, Reason
+from tests.boundary.feedback import amplifier
+
+S, D, F = AxisState, DriveState, FaultCode
+PERIOD_S = 2.0**-10
+RAMP, TIMEOUT, OBEY = 8, 16, 102  # cycles; 0.1 s are 102.4
+BIT = {code: fault.bit for code, fault in FAULTS.items()}
+CONTROLLED = (S.ENABLED, S.BRAKING, S.RAMPING)
+BEFORE_CONTROL = (S.ENABLING, S.PROVING)
+OFF = {"state": D.SWITCH_ON_DISABLED, "status_word": 0x0240, "goal_reached": False}
+WAITING = {"goal_reached": False}
+#: What the drive shows while the axis stays in each state.
+DRIVE: dict[AxisState, dict[str, Any]] = {
+    S.DISABLED: OFF,
+    S.ENABLING: OFF,
+    S.PROVING: WAITING,
+    S.ENABLED: {},
+    S.BRAKING: {},
+    S.RAMPING: {},
+    S.QUICK_STOPPING: {"state": D.QUICK_STOP_ACTIVE, "goal_reached": False},
+    S.FAULT: OFF,
+}
+
+
+def step(axis: Axis, faults: int = 0, fresh: bool = True, at_rest: bool = False, **drive: Any) -> Any:
+    """One cycle with a drive that stays where it is unless `drive` says otherwise."""
+    return axis.step(amplifier(**{**DRIVE[axis.state], **drive}), fresh, faults, at_rest)
+
+
+def new() -> Axis:
+    return Axis(PERIOD_S, RAMP * PERIOD_S, TIMEOUT * PERIOD_S, Mode.CYCLIC_SYNC_TORQUE)
+
+
+def axis_in(state: AxisState) -> Axis:
+    """An axis that came to `state` on the usual way."""
+    axis = new()
+    if state == S.DISABLED:
+        return axis
+    assert axis.enable(False, prove=state == S.PROVING) == Refusal.DONE
+    if state == S.ENABLING:
+        return axis
+    step(axis, state=D.OPERATION_ENABLED, status_word=0x0237, goal_reached=True)
+    if state in (S.BRAKING, S.RAMPING):
+        axis.disable()
+    if state == S.RAMPING:
+        step(axis, at_rest=True)
+    if state == S.QUICK_STOPPING:
+        axis.quick_stop()
+    if state == S.FAULT:
+        step(axis, BIT[F.ENCODER_ALARM])
+    assert axis.state == state
+    return axis
+
+
+@pytest.mark.parametrize("state", list(S))
+def test_each_state_stays_and_asks_for_what_belongs_to_it(state: AxisState) -> None:
+    axis = axis_in(state)
+    output = step(axis)
+    assert axis.state == state
+    goals = {S.DISABLED: Goal.OFF, S.FAULT: Goal.OFF, S.QUICK_STOPPING: Goal.QUICK_STOP}
+    assert axis.goal == goals.get(state, Goal.ENABLED)
+    assert output.controlled is (state in CONTROLLED)
+    assert output.torque_share == ((1.0 - 1 / RAMP if state == S.RAMPING else 1.0) if state in CONTROLLED else 0.0)
+    assert output.brake is (state == S.BRAKING)
+    assert (output.just_enabled, output.reset_fault) == (False, False)
+    assert axis.faults == 0
+    assert axis.latched == (BIT[F.ENCODER_ALARM] if state == S.FAULT else 0)
+
+
+def test_new_axis_is_disabled_without_faults() -> None:
+    assert (new().state, new().faults, new().latched, new().unheard) == (S.DISABLED, 0, 0, False)
+
+
+# --- faults -----------------------------------------------------------------------------------------------------------
+def expected(state: AxisState, code: FaultCode) -> AxisState:
+    """Where the fault leads, said anew from the documentation of the reactions."""
+    reaction = FAULTS[code].reaction
+    if state in (S.DISABLED, S.FAULT):
+        return S.FAULT if code in (F.DRIVE_STAYS_POWERED, F.COMMANDS_LOST) else state
+    if reaction <= Reaction.CLIP:
+        return state
+    if reaction == Reaction.DISABLE or state in BEFORE_CONTROL:
+        return S.FAULT
+    if reaction == Reaction.QUICK_STOP or state == S.QUICK_STOPPING:
+        return S.QUICK_STOPPING
+    if state == S.ENABLED:
+        return S.BRAKING if code == F.SUPERVISOR_LOST else S.RAMPING
+    return state
+
+
+@pytest.mark.parametrize("state", list(S))
+@pytest.mark.parametrize("code", list(F))
+def test_every_fault_in_every_state_has_its_reaction(code: FaultCode, state: AxisState) -> None:
+    axis = axis_in(state)
+    before = axis.latched
+    step(axis, BIT[code])
+    assert axis.state == expected(state, code)
+    assert axis.faults == BIT[code]
+    kept = state not in (S.DISABLED, S.FAULT) or code in NEEDS_RESTART
+    assert axis.latched == before | (BIT[code] if kept else 0)
+    assert axis.unheard is (code in (F.DRIVE_STAYS_POWERED, F.COMMANDS_LOST) and bool(axis.latched & BIT[code]))
+
+
+@pytest.mark.parametrize("state", list(S))
+@pytest.mark.parametrize("code", [F.TORQUE_CLIPPED, F.FOLLOWING_ERROR, F.SPEED_LIMIT, F.NOT_FINITE])
+def test_fault_after_the_step_reacts_in_the_same_cycle(code: FaultCode, state: AxisState) -> None:
+    axis = axis_in(state)
+    step(axis)
+    axis.raise_fault(BIT[code])
+    assert axis.state == expected(state, code)
+    assert axis.faults == BIT[code]
+    axis.raise_fault(BIT[F.DRIVE_WARNING])
+    assert axis.faults == BIT[code] | BIT[F.DRIVE_WARNING], "the one before is not forgotten"
+
+
+def test_strongest_of_several_faults_wins() -> None:
+    for weak, strong in ((F.FOLLOWING_ERROR, F.SPEED_LIMIT), (F.SPEED_LIMIT, F.NOT_FINITE)):
+        axis = axis_in(S.ENABLED)
+        step(axis, BIT[weak] | BIT[strong] | BIT[F.TORQUE_CLIPPED])
+        assert axis.state == expected(S.ENABLED, strong)
+    axis = axis_in(S.ENABLED)
+    step(axis, BIT[F.SUPERVISOR_LOST] | BIT[F.FOLLOWING_ERROR])
+    assert axis.state == S.RAMPING, "braking wants a sound controller"
+    axis = axis_in(S.ENABLED)
+    step(axis, BIT[F.SUPERVISOR_LOST] | BIT[F.TORQUE_CLIPPED])
+    assert axis.state == S.BRAKING
+
+
+@pytest.mark.parametrize("state", [S.BRAKING, S.RAMPING, S.QUICK_STOPPING])
+@pytest.mark.parametrize("code", [F.FOLLOWING_ERROR, F.SPEED_LIMIT])
+def test_stop_on_request_that_fails_ends_in_fault(state: AxisState, code: FaultCode) -> None:
+    axis = axis_in(state)
+    step(axis, BIT[code])
+    for _ in range(4 * TIMEOUT):
+        step(axis, at_rest=True)
+    assert axis.state == S.FAULT
+
+
+@pytest.mark.parametrize("state", [S.BRAKING, S.RAMPING, S.QUICK_STOPPING])
+@pytest.mark.parametrize("code", [None, F.TORQUE_CLIPPED, F.DEADLINE_LATE])
+def test_stop_on_request_ends_disabled(state: AxisState, code: FaultCode | None) -> None:
+    axis = axis_in(state)
+    step(axis, 0 if code is None else BIT[code])
+    for _ in range(4 * TIMEOUT):
+        step(axis, at_rest=True)
+    assert axis.state == S.DISABLED
+
+
+@pytest.mark.parametrize("way", [F.SUPERVISOR_LOST, F.FOLLOWING_ERROR, F.SPEED_LIMIT])
+def test_quick_stop_of_a_motion_that_failed_still_ends_in_fault(way: FaultCode) -> None:
+    axis = axis_in(S.ENABLED)
+    step(axis, BIT[way])
+    axis.quick_stop()
+    for _ in range(2 * TIMEOUT):
+        step(axis)
+    assert axis.state == S.FAULT
+
+
+# --- requests ---------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("reset", [False, True])
+@pytest.mark.parametrize(
+    ("state", "answer"),
+    [
+        (S.ENABLING, Refusal.DONE),
+        (S.PROVING, Refusal.DONE),
+        (S.ENABLED, Refusal.DONE),
+        (S.BRAKING, Refusal.MOTION_RUNNING),
+        (S.RAMPING, Refusal.MOTION_RUNNING),
+        (S.QUICK_STOPPING, Refusal.MOTION_RUNNING),
+    ],
+)
+def test_enable_beside_another_state_changes_nothing(state: AxisState, answer: Refusal, reset: bool) -> None:
+    axis = axis_in(state)
+    assert axis.enable(reset) == answer
+    assert axis.state == state
+    assert step(axis).reset_fault is False
+
+
+@pytest.mark.parametrize("code", list(F))
+@pytest.mark.parametrize("reset", [False, True])
+def test_enable_with_a_latched_fault(code: FaultCode, reset: bool) -> None:
+    axis = new()
+    axis.note(BIT[code])
+    answer = axis.enable(reset)
+    if code in NEEDS_RESTART:
+        assert (answer, axis.state) == (Refusal.NEEDS_RESTART, S.DISABLED)
+    elif not reset and FAULTS[code].reaction > Reaction.CLIP:
+        assert (answer, axis.state, axis.latched) == (Refusal.FAULT_PRESENT, S.DISABLED, BIT[code])
+    else:
+        assert (answer, axis.state, axis.latched) == (Refusal.DONE, S.ENABLING, 0)
+        assert step(axis).reset_fault is reset
+        assert step(axis).reset_fault is False, "one edge"
+
+
+@pytest.mark.parametrize("state", list(S))
+def test_reset_in_every_state(state: AxisState) -> None:
+    axis = axis_in(state)
+    axis.note(BIT[F.DRIVE_RESET] | BIT[F.SPEED_LIMIT])
+    if state in (*CONTROLLED, S.PROVING):
+        assert (axis.reset_fault(), axis.state) == (Refusal.MOTION_RUNNING, state)
+        assert axis.latched == BIT[F.DRIVE_RESET] | BIT[F.SPEED_LIMIT]
+        assert step(axis).reset_fault is False
+        return
+    assert axis.reset_fault() == Refusal.DONE
+    assert axis.latched == BIT[F.DRIVE_RESET], "what needs a restart is not forgotten"
+    assert axis.state == (S.DISABLED if state == S.FAULT else state)
+    assert [step(axis).reset_fault, step(axis).reset_fault] == [True, False]
+
+
+@pytest.mark.parametrize("state", list(S))
+def test_disable_and_quick_stop_in_every_state(state: AxisState) -> None:
+    disabled, stopped = axis_in(state), axis_in(state)
+    disabled.disable()
+    assert disabled.state == {S.ENABLED: S.BRAKING, S.ENABLING: S.DISABLED, S.PROVING: S.DISABLED}.get(state, state)
+    stopped.quick_stop()
+    after = S.QUICK_STOPPING if state in CONTROLLED else S.DISABLED if state in BEFORE_CONTROL else state
+    assert stopped.state == after
+
+
+def test_what_the_supervisor_saw_is_latched_and_does_not_act_by_itself() -> None:
+    axis = axis_in(S.ENABLED)
+    axis.note(BIT[F.SPEED_LIMIT])
+    axis.note(BIT[F.DRIVE_WARNING])
+    step(axis)
+    assert (axis.state, axis.faults) == (S.ENABLED, 0)
+    assert axis.latched == BIT[F.SPEED_LIMIT] | BIT[F.DRIVE_WARNING]
+
+
+# --- times, to the cycle ----------------------------------------------------------------------------------------------
+def test_ramp_goes_down_in_equal_steps_and_ends() -> None:
+    axis = axis_in(S.RAMPING)
+    shares = [step(axis).torque_share for _ in range(RAMP)]
+    assert shares == [1.0 - k / RAMP for k in range(1, RAMP)] + [0.0]
+    assert axis.state == S.DISABLED
+
+
+def test_braking_ends_at_rest_or_after_its_time() -> None:
+    axis = axis_in(S.BRAKING)
+    assert step(axis, at_rest=True).torque_share == 1.0, "the ramp begins where the torque is"
+    assert axis.state == S.RAMPING
+    axis = axis_in(S.BRAKING)
+    states = [(step(axis), axis.state)[1] for _ in range(RAMP + 1)]
+    assert states == [S.BRAKING] * RAMP + [S.RAMPING]
+
+
+@pytest.mark.parametrize(("reasons", "code"), [(0, F.ENABLE_TIMEOUT), (Reason.IN_FAULT, F.DRIVE_FAULT)])
+def test_drive_that_does_not_enable_has_its_time(reasons: int, code: FaultCode) -> None:
+    axis = axis_in(S.ENABLING)
+    for _ in range(TIMEOUT):
+        step(axis, reasons=reasons | Reason.NO_VOLTAGE)
+        assert (axis.state, axis.faults) == (S.ENABLING, 0)
+    step(axis, BIT[F.DEADLINE_LATE], reasons=reasons | Reason.NO_VOLTAGE)
+    assert axis.state == S.FAULT
+    assert axis.faults == axis.latched == BIT[code] | BIT[F.DEADLINE_LATE]
+
+
+@pytest.mark.parametrize("drive", [D.SWITCH_ON_DISABLED, D.READY_TO_SWITCH_ON, D.FAULT])
+def test_quick_stop_is_over_when_the_drive_says_so_now(drive: DriveState) -> None:
+    axis = axis_in(S.QUICK_STOPPING)
+    step(axis, state=drive, age_cycles=1)
+    assert axis.state == S.QUICK_STOPPING, "an old word says nothing"
+    step(axis, state=drive)
+    assert axis.state == (S.FAULT if drive == D.FAULT else S.DISABLED)
+
+
+@pytest.mark.parametrize("drive", [D.QUICK_STOP_ACTIVE, D.SWITCHED_ON, D.NOT_READY_TO_SWITCH_ON, D.UNKNOWN])
+def test_quick_stop_has_its_time(drive: DriveState) -> None:
+    axis = axis_in(S.QUICK_STOPPING)
+    for _ in range(TIMEOUT):
+        step(axis, state=drive)
+        assert axis.state == S.QUICK_STOPPING
+    step(axis, state=drive)
+    assert axis.state == S.DISABLED
+
+
+def test_times_shorter_than_a_cycle_are_one_cycle() -> None:
+    axis = Axis(PERIOD_S, 1e-9, 1e-9, Mode.CYCLIC_SYNC_TORQUE)
+    axis.enable(False)
+    step(axis)
+    assert axis.state == S.ENABLING
+    step(axis)
+    assert axis.state == S.FAULT
+
+
+# --- from the drive's word to the first torque ------------------------------------------------------------------------
+READY = {"state": D.OPERATION_ENABLED, "status_word": 0x0237, "goal_reached": True}
+
+
+@pytest.mark.parametrize(
+    "missing",
+    [{"fresh": False}, {"age_cycles": 1}, {"goal_reached": False}, {"state": D.SWITCHED_ON}, {"state": D.FAULT}],
+)
+def test_nothing_is_controlled_until_all_of_it_is_true(missing: dict[str, Any]) -> None:
+    axis = axis_in(S.ENABLING)
+    output = step(axis, **{**READY, **missing})
+    assert (axis.state, output.just_enabled, output.controlled) == (S.ENABLING, False, False)
+    output = step(axis, **READY)
+    assert (axis.state, output.just_enabled, output.controlled) == (S.ENABLED, True, True)
+    assert step(axis).just_enabled is False
+
+
+def test_proof_stands_between_power_and_control() -> None:
+    axis = axis_in(S.PROVING)
+    for _ in range(3 * TIMEOUT):
+        assert step(axis).controlled is False
+    axis.proven()
+    output = step(axis)
+    assert (axis.state, output.just_enabled, output.torque_share) == (S.ENABLED, True, 1.0)
+
+
+def test_proof_of_the_last_time_does_not_count() -> None:
+    axis = axis_in(S.PROVING)
+    axis.proven()
+    axis.disable()
+    axis.enable(False, prove=True)
+    step(axis, **READY)
+    step(axis, **READY)
+    assert axis.state == S.PROVING
+
+
+# --- what the drive says ----------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("state", list(S))
+def test_drive_in_fault_is_one_but_while_it_is_being_reset(state: AxisState) -> None:
+    for drive in (D.FAULT, D.FAULT_REACTION_ACTIVE):
+        axis = axis_in(state)
+        step(axis, state=drive)
+        assert bool(axis.faults & BIT[F.DRIVE_FAULT]) is (state != S.ENABLING)
+        axis = axis_in(state)
+        step(axis, state=drive, age_cycles=1)
+        assert not axis.faults & BIT[F.DRIVE_FAULT]
+
+
+@pytest.mark.parametrize(("bit", "code"), [(7, F.DRIVE_WARNING), (11, F.DRIVE_LIMITS_TORQUE)])
+@pytest.mark.parametrize("state", list(S))
+def test_bits_of_the_status_word(state: AxisState, bit: int, code: FaultCode) -> None:
+    axis = axis_in(state)
+    step(axis, status_word=0x0237 | 1 << bit)
+    seen = bit == 7 or state in (*CONTROLLED, S.PROVING)
+    assert axis.faults == BIT[code] * seen
+    axis = axis_in(state)
+    step(axis, status_word=0x0237 | 1 << bit, age_cycles=1)
+    assert axis.faults == 0
+
+
+@pytest.mark.parametrize("state", [*CONTROLLED, S.PROVING])
+@pytest.mark.parametrize("drive", list(D))
+def test_drive_that_leaves_operation(state: AxisState, drive: DriveState) -> None:
+    axis = axis_in(state)
+    step(axis, state=drive)
+    faults = {D.UNKNOWN: F.DRIVE_STATUS_UNKNOWN, D.FAULT: F.DRIVE_FAULT, D.FAULT_REACTION_ACTIVE: F.DRIVE_FAULT}
+    expected_word = 0 if drive == D.OPERATION_ENABLED else BIT[faults.get(drive, F.DRIVE_LEFT_OPERATION)]
+    assert axis.faults == expected_word
+
+
+@pytest.mark.parametrize("mode", [-1, 10, 0, 8, 9, 11])
+def test_mode_that_is_shown(mode: int) -> None:
+    axis = axis_in(S.ENABLED)
+    step(axis, mode=mode)
+    assert axis.faults == (0 if mode in (-1, 10) else BIT[F.DRIVE_MODE_WRONG])
+
+
+def test_remote_bit_says_something_only_once_it_was_seen() -> None:
+    never = axis_in(S.ENABLING)
+    step(never, **{**READY, "status_word": 0x0037})
+    step(never, status_word=0x0037)
+    assert never.faults == 0
+    axis = axis_in(S.ENABLED)
+    step(axis)
+    step(axis, status_word=0x0037)
+    assert axis.faults == BIT[F.COMMANDS_LOST]
+
+
+def test_remote_bit_of_the_last_enable_is_forgotten() -> None:
+    axis = axis_in(S.ENABLED)
+    step(axis)
+    axis.quick_stop()
+    step(axis, **OFF)
+    axis.enable(False)
+    step(axis, **{**READY, "status_word": 0x0037})
+    step(axis, status_word=0x0037)
+    assert axis.faults == 0
+
+
+@pytest.mark.parametrize("drive", list(D))
+def test_commands_that_do_not_arrive_matter_to_a_powered_drive(drive: DriveState) -> None:
+    axis = axis_in(S.DISABLED)
+    step(axis, state=drive, reasons=Reason.COMMANDS_MISSED | Reason.NO_VOLTAGE)
+    powered = drive in (D.OPERATION_ENABLED, D.QUICK_STOP_ACTIVE)
+    assert bool(axis.faults & BIT[F.COMMANDS_LOST]) is powered
+
+
+# --- a drive that does not obey ---------------------------------------------------------------------------------------
+STAYS = BIT[F.DRIVE_STAYS_POWERED]
+
+
+def cycles_until_disobedience(axis: Axis, **drive: Any) -> int:
+    """Cycles until the fault, at most 300."""
+    for cycle in range(1, 300):
+        step(axis, **drive)
+        if axis.faults & STAYS:
+            return cycle
+    return 0
+
+
+@pytest.mark.parametrize("drive", list(D))
+def test_drive_that_stays_powered_when_it_shall_be_off(drive: DriveState) -> None:
+    powered = drive in (D.OPERATION_ENABLED, D.QUICK_STOP_ACTIVE)
+    axis = axis_in(S.DISABLED)
+    assert cycles_until_disobedience(axis, state=drive) == (OBEY + 1 if powered else 0)
+    assert axis.state == (S.FAULT if powered else S.DISABLED if drive not in (D.FAULT,) else axis.state)
+
+
+def test_drive_that_was_not_heard_since_it_was_told_off() -> None:
+    axis = axis_in(S.ENABLED)
+    step(axis, BIT[F.NOT_FINITE])
+    assert cycles_until_disobedience(axis, state=D.SWITCH_ON_DISABLED, age_cycles=1) == OBEY + 1
+    axis = axis_in(S.ENABLED)
+    step(axis, BIT[F.NOT_FINITE])
+    step(axis, state=D.SWITCH_ON_DISABLED)
+    assert cycles_until_disobedience(axis, state=D.SWITCH_ON_DISABLED, age_cycles=1) == 0, "it was seen off"
+    assert cycles_until_disobedience(new(), age_cycles=1) == 0, "and so is a drive before its first enable"
+
+
+def test_one_obedient_cycle_begins_the_count_anew() -> None:
+    axis = axis_in(S.DISABLED)
+    for _ in range(OBEY):
+        step(axis, state=D.OPERATION_ENABLED)
+    step(axis, state=D.SWITCH_ON_DISABLED)
+    assert cycles_until_disobedience(axis, state=D.OPERATION_ENABLED) == OBEY + 1
+
+
+def test_count_begins_with_the_order_to_switch_off() -> None:
+    axis = axis_in(S.DISABLED)
+    for _ in range(OBEY):
+        step(axis, state=D.OPERATION_ENABLED)
+    axis.enable(False)
+    step(axis, **READY)
+    axis.quick_stop()
+    assert cycles_until_disobedience(axis, state=D.OPERATION_ENABLED) == OBEY + 1
+
+
+def test_quick_stop_may_hold_for_as_long_as_it_takes() -> None:
+    axis = Axis(PERIOD_S, RAMP * PERIOD_S, 1000 * PERIOD_S, Mode.CYCLIC_SYNC_TORQUE)
+    axis.enable(False)
+    step(axis, **READY)
+    axis.quick_stop()
+    assert cycles_until_disobedience(axis, state=D.QUICK_STOP_ACTIVE) == 0
+    assert axis.state == S.QUICK_STOPPING
+
+
+def test_slow_loop_gives_a_drive_four_cycles() -> None:
+    axis = Axis(0.1, 0.1, 0.1, Mode.CYCLIC_SYNC_TORQUE)
+    assert cycles_until_disobedience(axis, state=D.OPERATION_ENABLED) == 5
