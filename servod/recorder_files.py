@@ -14,6 +14,8 @@ from servod.config import RecorderConfig
 from servod.errors import BadInput
 
 MIB = 1024 * 1024
+#: Names are shown in logs, on terminals and on pages: nothing in them may act there, or look like an option.
+_FILE_NAME = re.compile(r"\w[\w .,+()-]{0,200}\.mcap")
 _STAMP = "%Y%m%d-%H%M%S"
 
 
@@ -31,8 +33,9 @@ class RecordingFiles:
         if name is None:
             return self._unused(f"{self._axis_name}-{_now()}")
         path = (self._directory / name).resolve()
-        if path.parent != self._directory.resolve() or path.suffix != ".mcap":
-            raise BadInput("record_start: path", name, f"a file name ending in .mcap, in {self._directory}")
+        if path.parent != self._directory.resolve() or not _FILE_NAME.fullmatch(path.name):
+            allowed = "a file name of letters, digits, spaces and any of . , + ( ) - that ends in .mcap, in"
+            raise BadInput("record_start: path", repr(name), f"{allowed} {self._directory}")
         return path
 
     def next_part(self, first: Path) -> Path:

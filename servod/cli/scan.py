@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, example, print_json
-from servod.errors import BadInput, Unreachable
+from servod.errors import BadInput, Unreachable, one_line
 
 if TYPE_CHECKING:
     from servod.config import BusConfig
@@ -99,7 +99,7 @@ def _print(nodes: list[dict[str, Any]]) -> None:
     table = Table("Node", "Profile", "Vendor", "Product", "Revision", "Serial", "Name")
     for node in nodes:
         table.add_row(*_cells(node))
-    Console().print(table)
+    Console(markup=False).print(table)  # names are the devices' own words
 
 
 def _cells(node: dict[str, Any]) -> list[str]:
@@ -111,7 +111,7 @@ def _cells(node: dict[str, Any]) -> list[str]:
         f"CiA {profile}" if profile else "-",
         *(_hex(identity.get(key)) for key in ("vendor_id", "product_code", "revision")),
         str(identity.get("serial", "-")),
-        node["name"],
+        one_line(node["name"]),
     ]
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, connect, example, print_json
+from servod.errors import one_line
 
 if TYPE_CHECKING:
     from rich.console import Group
@@ -59,6 +60,7 @@ def screen(document: dict[str, Any]) -> Group:
     """The status document (servod.daemon.status.Status) as one screen."""
     from rich.console import Group
 
+    document = _plain(document)
     return Group(
         _headline(document),
         *_fault_lines(document),
@@ -67,6 +69,17 @@ def screen(document: dict[str, Any]) -> Group:
         _timing(document),
         *_grant_lines(document),
     )
+
+
+def _plain(value: Any) -> Any:
+    """The document with texts that say what they say: no markup of this screen, nothing that acts on a terminal."""
+    from rich.markup import escape
+
+    if isinstance(value, dict):
+        return {key: _plain(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_plain(inner) for inner in value]
+    return escape(one_line(value)) if isinstance(value, str) else value
 
 
 def _headline(document: dict[str, Any]) -> str:

@@ -10,6 +10,11 @@ import sys
 _PRIORITY = {logging.DEBUG: 7, logging.INFO: 6, logging.WARNING: 4, logging.ERROR: 3, logging.CRITICAL: 2}
 
 
+def harmless(text: str) -> str:
+    """`text` in one line, whatever stands in it: nothing that begins a new entry, or acts on the reader's terminal."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in " ".join(text.splitlines()))
+
+
 class _JournalFormatter(logging.Formatter):
     """One line per message, whatever is in it."""
 
@@ -19,14 +24,14 @@ class _JournalFormatter(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """The line, its priority in front when the journal reads it."""
-        line = " ".join(super().format(record).splitlines())
+        line = harmless(super().format(record))
         return f"<{_PRIORITY.get(record.levelno, 6)}>{line}" if self._to_journal else line
 
 
 def print_error(text: str) -> None:
     """The one line that ends a program, on standard error."""
     prefix = f"<{_PRIORITY[logging.ERROR]}>" if "JOURNAL_STREAM" in os.environ else ""
-    print(f"{prefix}servod: {' '.join(text.split())}", file=sys.stderr, flush=True)
+    print(f"{prefix}servod: {harmless(' '.join(text.split()))}", file=sys.stderr, flush=True)
 
 
 def set_up_logging() -> None:
