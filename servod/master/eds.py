@@ -11,13 +11,13 @@ import io
 import logging
 import re
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from canopen.objectdictionary.eds import import_eds
 
 from servod.errors import BadInput
+from servod.files import read_bytes
 
 _SECTION = re.compile(r"^\s*\[([^\]]*)\]\s*$")
 _OPTION = re.compile(r"^\s*([^=;\[\s][^=]*?)\s*=\s*(.*?)\s*$")
@@ -26,6 +26,7 @@ _NUMBER_KEYS = frozenset(
     {"objecttype", "datatype", "defaultvalue", "parametervalue", "lowlimit", "highlimit", "pdomapping"}
     | {"subnumber", "nrofentries"}
 )
+_NO_NUMBER = re.compile(r"invalid literal for int\(\) with base \d+: (.*)", re.DOTALL)
 #: The generic dictionary of each driver, for configurations that name no EDS; beside the drivers.
 GENERIC_EDS = {"cia402": "amplifier.eds", "cia406": "encoder.eds"}
 
@@ -85,24 +86,30 @@ class _Warnings(logging.Handler):
 
 def load_dictionary(path: str | Path, node_id: int) -> Dictionary:
     """Read an EDS or DCF for a node ($NODEID is replaced). Raises BadInput when it is no dictionary."""
-    source = Path(path)
-    try:
-        raw = source.read_bytes()
-    except OSError as error:
-        raise BadInput(str(path), error.strerror or str(error), "a readable EDS or DCF file") from error
-    text, report = mend(_decode(raw))
+    text, report = mend(_decode(read_bytes(path, "a readable EDS or DCF file")))
     warnings, parser_log = _Warnings(), logging.getLogger("canopen.objectdictionary.eds")
     parser_log.addHandler(warnings)
     try:
         objects = import_eds(io.StringIO(text), node_id)  # type: ignore[no-untyped-call]
     except (configparser.Error, ValueError, KeyError, TypeError, AttributeError) as error:
-        reason = " ".join(str(error).split())
-        raise BadInput(str(path), f"{type(error).__name__}: {reason}", "an EDS or DCF by CiA 306") from error
+        raise BadInput(str(path), _reason(error), "an EDS or DCF by CiA 306") from error
     finally:
         parser_log.removeHandler(warnings)
     if not len(objects):
         raise BadInput(str(path), "no object", "an EDS or DCF by CiA 306 with sections such as [1000]")
     return Dictionary(str(path), objects, report + warnings.lines)
+
+
+def _reason(error: Exception) -> str:
+    """What is wrong in the file, in its own words and not in the parser's."""
+    if isinstance(error, configparser.NoOptionError):
+        return f"no {error.option} in section [{error.section}]"
+    if isinstance(error, configparser.Error):
+        return error.message
+    if isinstance(error, KeyError):
+        return f"an entry of an object that has no section of its own: {error.args[0]}"
+    found = _NO_NUMBER.search(str(error))
+    return f"{found.group(1)} where a number stands" if found else "an entry of a kind that does not fit its object"
 
 
 def _decode(raw: bytes) -> str:
@@ -118,12 +125,6 @@ def dictionary_for(driver: str, eds: str | None, node_id: int) -> Dictionary:
         return load_dictionary(eds, node_id)
     if driver not in GENERIC_EDS:
         raise BadInput(f"driver {driver}: eds", "nothing", "an EDS file: this driver has no generic dictionary")
-    return _generic(driver, node_id)
-
-
-@lru_cache(maxsize=16)
-def _generic(driver: str, node_id: int) -> Dictionary:
-    """A dictionary that ships; whoever brings up many axes in one process reads it once."""
     from servod import drivers
 
     return load_dictionary(Path(drivers.__file__).parent / "eds" / GENERIC_EDS[driver], node_id)
