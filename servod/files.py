@@ -26,17 +26,22 @@ def read_text(path: str | Path) -> str:
         raise BadInput(str(path), "bytes that are not UTF-8", "a text file") from None
 
 
-def read_bytes(path: str | Path) -> bytes:
+def read_bytes(path: str | Path, allowed: str = "a readable file") -> bytes:
     """The file's bytes; raises BadInput when it is missing, unreadable, too large, or no file: pipes may never end."""
     try:
         with open_file(path) as stream:
-            content = stream.read(MOST_BYTES + 1)
+            require_size(path, stream, MOST_BYTES)
+            return stream.read(MOST_BYTES)
     except (OSError, ValueError) as error:  # ValueError: a name with a null character
         found = getattr(error, "strerror", None) or str(error)
-        raise BadInput(str(path), found, "a readable file") from None
-    if len(content) > MOST_BYTES:
-        raise BadInput(str(path), f"more than {MOST_BYTES} bytes", "a smaller file")
-    return content
+        raise BadInput(str(path), found, allowed) from None
+
+
+def require_size(path: str | Path, stream: BinaryIO, most_bytes: int) -> None:
+    """Refuse a file that is larger, before anything of it is read. Raises BadInput."""
+    size = os.fstat(stream.fileno()).st_size
+    if size > most_bytes:
+        raise BadInput(str(path), f"{size} bytes", f"at most {most_bytes} bytes")
 
 
 def open_file(path: str | Path) -> BinaryIO:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.errors import BadInput
-from servod.files import open_file
+from servod.files import open_file, require_size
 from servod.recordings.mat import BrokenMatError, vectors
 
 Array = NDArray[np.float64]
@@ -56,13 +56,14 @@ def read_columns(path: Path) -> tuple[dict[str, Any], list[str]]:
 def _bounded(path: Path) -> bytes:
     """The whole file, unpacked where it is packed. Raises BadInput when that is more than any recording."""
     with open_file(path) as packed:
+        require_size(path, packed, _MOST_BYTES)
         stream = gzip.GzipFile(fileobj=packed) if path.name.lower().endswith(".gz") else packed
         try:
             content = stream.read(_MOST_BYTES + 1)
         except (gzip.BadGzipFile, EOFError, zlib.error) as error:
             raise BadInput(str(path), str(error), "a gzip file that is whole") from None
     if len(content) > _MOST_BYTES:
-        raise BadInput(str(path), f"more than {_MOST_BYTES} bytes", "a smaller recording, or one in parts")
+        raise BadInput(str(path), f"more than {_MOST_BYTES} bytes unpacked", "a smaller recording, or one in parts")
     return content
 
 

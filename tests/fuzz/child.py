@@ -22,10 +22,10 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import seed as seeded
 
 from tests.fuzz.judge import ROOT, bound_memory, judge
-from tests.fuzz.target import Target, load
+from tests.fuzz.target import TARGETS, Target, load
 
-#: What is watched for coverage. Not PyYAML: watched, it is too slow to get anywhere.
-INSTRUMENTED = ["servod", "canopen", "mcap"]
+#: What is watched for coverage beside servod, by the targets' module. Not PyYAML: watched, it is too slow.
+LIBRARIES = {"tests.fuzz.texts": ["canopen"], "tests.fuzz.recordings": ["mcap"]}
 #: What numba compiles, which it cannot when its code is changed; atheris wants each module's name.
 NOT_INSTRUMENTED = [
     f"servod.{package}.{file.stem}"
@@ -109,6 +109,8 @@ def search(target: Target, book: Book, way: str, folder: Path, seconds: float) -
         *(f"-max_total_time={max(int(seconds), 1)}", f"-max_len={target.longest}", "-timeout=60", "-rss_limit_mb=4096"),
         *(f"-artifact_prefix={folder}/killed-", "-print_final_stats=1", "-reload=0"),
     ]
+    if way == "shaped":
+        options.append("-len_control=0")  # short inputs are too few choices for most shapes
     if target.words:
         words = folder / "words.txt"
         words.write_text("".join(f'"{_escaped(word)}"\n' for word in target.words if word))
@@ -127,7 +129,10 @@ def _loaded(name: str, way: str, folder: Path) -> Target:
         return load(name, folder)
     import atheris
 
-    with atheris.instrument_imports(include=INSTRUMENTED, exclude=NOT_INSTRUMENTED, enable_loader_override=False):
+    libraries = LIBRARIES.get(TARGETS[name].partition(":")[0], [])
+    with atheris.instrument_imports(
+        include=["servod", *libraries], exclude=NOT_INSTRUMENTED, enable_loader_override=False
+    ):
         return load(name, folder)
 
 

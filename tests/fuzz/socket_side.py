@@ -19,6 +19,7 @@ from servod.daemon.control_server import ControlServer
 from servod.daemon.gain_bank import GainBank
 from servod.daemon.verbs import Verbs
 from servod.loop.handle import LoopHandle
+from servod.loop.plan import LoopPlan
 from servod.record import FIELDS, CycleRecord
 from servod.recorder import Recorder
 from tests.fuzz.master_side import LIMITS
@@ -49,24 +50,22 @@ _REQUESTS: tuple[dict[str, Any], ...] = tuple(
         )
     )
 )
-_ROUNDS = 200
+#: Rounds of the event loop that an answer may take; and those in which the server sees that a client has left.
+_ROUNDS, _ROUNDS_TO_LEAVE = 200, 6
 
 
-class _Loop:
+class _Loop(LoopHandle):
     """A loop that takes every command at once; what it would do then is not the requests' matter."""
 
     def __init__(self) -> None:
-        self.latest = CycleRecord._make(0 if f.kind == "q" else 0.0 for f in FIELDS)._replace(
-            axis_state=AxisState.ENABLED
-        )
+        super().__init__(cast(LoopPlan, None))  # nothing is started
+        record = CycleRecord._make(0 if f.kind == "q" else 0.0 for f in FIELDS)
+        self.latest: CycleRecord = record._replace(axis_state=AxisState.ENABLED)
 
     def send(self, op: Op, arguments: Sequence[float] = ()) -> int:
         assert all(isinstance(float(argument), float) for argument in arguments)
         self.latest = self.latest._replace(command_seq=self.latest.command_seq + 1, cycle=self.latest.cycle + 1)
         return int(self.latest.command_seq)
-
-    def write_trajectory(self, positions_rad: Sequence[float]) -> None:
-        assert len(positions_rad) > 0
 
 
 class _Desk:
@@ -86,7 +85,7 @@ class _Desk:
         self.selector, self.loop = selectors.DefaultSelector(), _Loop()
         recorder = Recorder(self.config.recorder, self.config.name, 1000)
         bank = GainBank(self.config)
-        self.verbs = Verbs(self.config, cast(LoopHandle, self.loop), bank, recorder, dict)
+        self.verbs = Verbs(self.config, self.loop, bank, recorder, dict)
         self.server = ControlServer(self.config.control, self.selector, self.verbs)
 
     def rounds(self, until: Callable[[], bool]) -> None:
@@ -142,7 +141,8 @@ def _talk(desk: _Desk, data: bytes) -> list[dict[str, Any]]:
 
     desk.rounds(exchange)
     client.close()
-    desk.rounds(lambda: True)
+    rounds = iter(range(_ROUNDS_TO_LEAVE))
+    desk.rounds(lambda: next(rounds, None) is None)
     return [json.loads(line) for line in got.splitlines() if line]
 
 

@@ -36,6 +36,7 @@ TARGETS: dict[str, str] = {
     "column_map": "tests.fuzz.texts:column_map",
     "virtual_axis_settings": "tests.fuzz.texts:virtual_axis_settings",
     "config_check": "tests.fuzz.texts:config_check",
+    "fault_scenarios": "tests.fuzz.texts:fault_scenarios",
     "motion": "tests.fuzz.texts:motion",
     "csv": "tests.fuzz.recordings:csv",
     "csv_gz": "tests.fuzz.recordings:csv_gz",

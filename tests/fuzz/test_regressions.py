@@ -3,21 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 
 import pytest
 
 from tests.fuzz.judge import judge
-from tests.fuzz.target import TARGETS, Target, load
+from tests.fuzz.target import TARGETS, Target
 
 INPUTS = sorted((Path(__file__).parent / "regressions").glob("*/*"))
-
-
-@pytest.fixture(scope="module")
-def loaded(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Target]:
-    """Targets by name, each made once."""
-    return cache(lambda name: load(name, tmp_path_factory.mktemp(name[:8])))
 
 
 @pytest.mark.parametrize("file", INPUTS, ids=[f"{file.parent.name}-{file.stem}" for file in INPUTS])

@@ -230,3 +230,14 @@ def motion(folder: Path) -> Target:
     seed = b"t_s,reference_rad\n0,0\n0.5,0.1\n1.0,0.2\n"
     read = _file(folder / "motion.csv", lambda path: read_motion(path).on_grid(1e-3))
     return Target(read, (seed,), csv_texts(COLUMNS), (b"1e999", b"nan", b'"', b"\0", b"#", b"1e12"))
+
+
+def fault_scenarios(folder: Path) -> Target:
+    """A file of scenarios of the fault campaign, with its variants."""
+    from servod.campaign.catalogue import scenarios_in
+    from servod.campaign.scenario import load_scenarios
+
+    shipped = ROOT / "servod" / "campaign" / "scenarios" / "bus"
+    assert scenarios_in(shipped)
+    seeds = [file.read_bytes() for file in sorted(shipped.glob("*.yaml"))[:4]]
+    return _yaml(folder / "scenario.yaml", load_scenarios, *seeds)

@@ -1,0 +1,70 @@
+"""Files that are none: pipes, devices, folders, loops of links and files without end, to every reader by its name."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from servod.axis_model import load_axis_model
+from servod.cli.motion_file import read_motion
+from servod.config import load_config
+from servod.errors import BadInput
+from servod.gains import load_gains
+from servod.master.eds import load_dictionary
+from servod.recorder_read import read_recording
+from servod.recordings import load_column_map, load_recording
+
+READERS: dict[str, tuple[Callable[[Path], object], str]] = {
+    "configuration": (load_config, ".yaml"),
+    "gains": (load_gains, ".yaml"),
+    "axis model": (load_axis_model, ".yaml"),
+    "column map": (load_column_map, ".yaml"),
+    "EDS": (lambda path: load_dictionary(path, 1), ".eds"),
+    "motion": (read_motion, ".csv"),
+    "daemon's recording": (read_recording, ".mcap"),
+    **{f"recording {suffix}": (load_recording, suffix) for suffix in (".csv", ".csv.gz", ".parquet", ".mat", ".mcap")},
+}
+
+
+def _pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def _loop(path: Path) -> None:
+    path.symlink_to(path)
+
+
+def _endless(path: Path) -> None:
+    """Two terabytes that take no room on the disk."""
+    with path.open("wb") as file:
+        file.truncate(2 * 1024**4)
+
+
+ODD: dict[str, Callable[[Path], None]] = {
+    "missing": lambda path: None,
+    "folder": Path.mkdir,
+    "pipe": _pipe,
+    "device": lambda path: path.symlink_to("/dev/zero"),
+    "loop of links": _loop,
+    "link to nothing": lambda path: path.symlink_to("nowhere"),
+    "no content": Path.touch,
+    "no end": _endless,
+}
+
+
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize("make", ODD.values(), ids=ODD)
+@pytest.mark.parametrize(("read", "suffix"), READERS.values(), ids=READERS)
+def test_what_is_no_file_is_refused_in_one_line(
+    read: Callable[[Path], object], suffix: str, make: Callable[[Path], None], tmp_path: Path
+) -> None:
+    path = tmp_path / f"odd{suffix}"
+    make(path)
+    with pytest.raises(BadInput) as caught:
+        read(path)
+    line = str(caught.value)
+    assert line.startswith(str(path)) and line.isprintable()
+    assert not any(word in line for word in ("Errno", "Error", "None", "NoneType", "object at"))
