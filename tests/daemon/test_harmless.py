@@ -1,4 +1,4 @@
-"""What others chose (names, paths, texts of devices) is shown and does nothing: in the journal, on a terminal, on a page."""
+"""What others chose (names, paths, texts of devices) is shown and does nothing: in journal, on terminal, on a page."""
 
 from __future__ import annotations
 
