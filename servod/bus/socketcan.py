@@ -129,11 +129,12 @@ class SocketCanBus:
 
 def _monotonic_ns(ancillary: list[tuple[int, int, bytes]]) -> int:
     """Kernel stamp of a packet on the scale of CLOCK_MONOTONIC; local time when there is none or it is not credible."""
-    now_ns = time.monotonic_ns()
+    wall_ns = time.time_ns()
+    now_ns = time.monotonic_ns()  # after the wall clock: who is held up between them must not make a frame older
     for level, kind, data in ancillary:
         if level == socket.SOL_SOCKET and kind == _SO_TIMESTAMPNS and len(data) >= _TIMESPEC.size:
             seconds, nanoseconds = _TIMESPEC.unpack_from(data)
-            age_ns: int = time.time_ns() - (seconds * NS_PER_S + nanoseconds)
+            age_ns: int = wall_ns - (seconds * NS_PER_S + nanoseconds)
             if 0 <= age_ns < NS_PER_S:
                 return now_ns - age_ns
     return now_ns
