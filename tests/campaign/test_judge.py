@@ -1,0 +1,58 @@
+"""The judge complains of everything that is not as expected, and of nothing else."""
+
+import pytest
+
+from servod.campaign.judge import complaints, reaction
+from servod.campaign.scenario import Expectation
+from servod.campaign.under_test import Observation
+from servod.drivers.virtual.drive_record import DriveSample
+from servod.errors import FaultCode
+from servod.hal import DriveState
+
+MS = 1_000_000
+ON, OFF = DriveState.OPERATION_ENABLED, DriveState.SWITCH_ON_DISABLED
+
+
+def sample(time_ms: float, state: DriveState, torque_nm: float) -> DriveSample:
+    return DriveSample(round(time_ms * MS), state, 0, 0, 10, torque_nm, torque_nm, 0.0, 0.0)
+
+
+STOPPED = [sample(0, ON, 0.1), sample(10, ON, 0.1), sample(20, OFF, 0.05), sample(30, OFF, 0.0), sample(40, OFF, 0.0)]
+RUNAWAY = [sample(0, ON, 0.1), sample(10, ON, 0.1), sample(20, OFF, 0.1)]
+
+
+def seen(samples: list[DriveSample] = STOPPED, axis: str = "FAULT", refusal: str = "", lost: int = 0) -> Observation:
+    return Observation(samples, axis, frozenset({FaultCode.FEEDBACK_STALE}), refusal, lost)
+
+
+def test_times_count_from_the_injection() -> None:
+    assert reaction(STOPPED, 5 * MS).left_ms == 15.0
+    assert reaction(STOPPED, 5 * MS).gone_ms == 25.0
+    assert reaction(RUNAWAY, 0).gone_ms is None
+    assert reaction(STOPPED, 100 * MS).left_ms is None
+
+
+@pytest.mark.parametrize(
+    ("expected", "observed", "words"),
+    [
+        ({"axis": ["FAULT"], "reaction_ms": 20, "torque_gone_ms": 30}, seen(), ""),
+        ({"axis": ["ENABLED"]}, seen(), "the axis ended FAULT"),
+        ({"axis": ["FAULT"], "faults": ["BUS_OFF"]}, seen(), "the faults shown are FEEDBACK_STALE"),
+        ({"axis": ["FAULT"], "faults": ["BUS_OFF", "FEEDBACK_STALE"]}, seen(), ""),
+        ({"axis": ["FAULT"], "reaction_ms": 19}, seen(), "after 20 ms, expected 19 ms"),
+        ({"axis": ["FAULT"], "torque_gone_ms": 29}, seen(), "the torque was gone after 30 ms"),
+        ({"axis": ["FAULT"], "torque_gone_ms": 300}, seen(RUNAWAY), "the torque was gone never"),
+        ({"axis": ["FAULT"]}, seen(RUNAWAY), "0.1000 N*m that nobody commands"),
+        ({"axis": ["ENABLED"]}, seen(RUNAWAY, axis="ENABLED"), ""),
+        ({"axis": ["FAULT"]}, seen(refusal="not now"), "refused: not now"),
+        ({"axis": ["FAULT"], "refused": "two"}, seen(refusal="not now"), "the refusal says 'not now'"),
+        ({"axis": ["FAULT"]}, seen(lost=1), "1 cycle records are missing"),
+        ({"axis": ["FAULT"], "drive_shows": ["QUICK_STOP_ACTIVE"]}, seen(), "never showed QUICK_STOP_ACTIVE"),
+        ({"axis": ["FAULT"], "drive_never": ["SWITCH_ON_DISABLED"]}, seen(), "showed SWITCH_ON_DISABLED"),
+    ],
+)
+def test_each_difference_is_a_complaint(expected: dict, observed: Observation, words: str) -> None:
+    times = reaction(observed.samples, 0)
+    found = complaints(Expectation.model_validate(expected), observed, times, 0)
+    assert bool(found) is bool(words)
+    assert words in " ".join(found)

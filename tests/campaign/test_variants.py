@@ -1,0 +1,67 @@
+"""Several scenarios in one file: names, values in their places, and what is refused."""
+
+from pathlib import Path
+
+import pytest
+
+from servod.campaign.catalogue import load_all
+from servod.campaign.scenario import Loss, load_scenarios
+from servod.errors import BadInput
+
+HEAD = "title: $count frames\nwhy: x\ngroup: bus\ninject: [{do: {frames: {of: torque, fault: drop, count: $count}}}]\n"
+EXPECT = "expect: $expect\n"
+ROWS = """for_each:
+  - {name: one, count: 1, expect: {axis: [ENABLED]}}
+  - {name: 2, count: 2, expect: {axis: [FAULT]}}
+"""
+
+
+def written(folder: Path, text: str, name: str = "lost.yaml") -> Path:
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def test_each_row_is_a_scenario_with_its_values(tmp_path: Path) -> None:
+    found = load_scenarios(written(tmp_path, HEAD + EXPECT + ROWS))
+    assert list(found) == ["lost/one", "lost/2"]
+    assert [s.title for s in found.values()] == ["1 frames", "2 frames"]
+    assert [s.inject[0].arguments["count"] for s in found.values()] == [1, 2]
+    assert [s.expect.axis for s in found.values()] == [["ENABLED"], ["FAULT"]]
+
+
+def test_a_file_without_rows_is_one_scenario(tmp_path: Path) -> None:
+    text = HEAD.replace("$count", "3") + "expect: {axis: [ENABLED]}\n"
+    (scenario,) = load_scenarios(written(tmp_path, text)).values()
+    assert (scenario.title, scenario.expect.loss) == ("3 frames", Loss.NONE)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (HEAD + EXPECT + "for_each: 3\n", "for_each: found 3"),
+        (HEAD + EXPECT + "for_each: []\n", "a list of rows"),
+        (HEAD + EXPECT + "for_each: [{count: 1}]\n", "for_each.0"),
+        (HEAD + EXPECT + ROWS + "  - {name: one, count: 1, expect: {axis: [ENABLED]}}\n", "no other row has"),
+        (HEAD + EXPECT + "for_each: [{name: a, count: 1}]\n", "no expect"),
+        (HEAD + EXPECT + ROWS.replace("count: 2", "count: many"), "lost.yaml (2): inject.0.do.frames: count"),
+        ("title: x\n", "a value; this key is required"),
+        ("- 1\n", "a mapping of keys"),
+        (HEAD.replace("frames:", "frame:") + EXPECT + ROWS, "found 'frame'; allowed: one of"),
+        (HEAD + EXPECT + ROWS.replace("[FAULT]", "[BROKEN]"), "instead of BROKEN"),
+        (HEAD + EXPECT + ROWS.replace("{axis: [FAULT]}", "{axis: [FAULT], loss: master}"), "torque_gone_ms of at most"),
+    ],
+)
+def test_what_does_not_fit_is_one_line(tmp_path: Path, text: str, words: str) -> None:
+    with pytest.raises(BadInput) as error:
+        load_scenarios(written(tmp_path, text))
+    assert words in str(error.value)
+    assert str(tmp_path) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_two_files_of_one_name_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    paths = [written(folder, HEAD + EXPECT + ROWS) for folder in (tmp_path, tmp_path / "other")]
+    with pytest.raises(BadInput, match="a second scenario lost/"):
+        load_all(paths)
