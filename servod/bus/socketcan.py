@@ -62,6 +62,7 @@ class SocketCanBus:
     def __init__(self, sock: socket.socket) -> None:
         self.counters = BusCounters()
         self._socket = sock
+        self._newest_ns = 0
         sock.setblocking(False)
         self._poll = select.poll()
         self._poll.register(sock, select.POLLIN)
@@ -116,7 +117,8 @@ class SocketCanBus:
                 count_error_frame(self.counters, can_id, data[:length])
                 continue
             self.counters.received += 1
-            return Frame(can_id, data[:length], _monotonic_ns(ancillary))
+            self._newest_ns = max(self._newest_ns, _monotonic_ns(ancillary))  # two clocks never agree: no step back
+            return Frame(can_id, data[:length], self._newest_ns)
 
     def fileno(self) -> int:
         """The socket."""
