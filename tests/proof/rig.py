@@ -60,7 +60,7 @@ def axis(plant: AxisModel, config: dict[str, Any] | None = None, **devices: Any)
     document = keys.model_dump(mode="json")
     document["limits"]["speed_rad_s"] = 10.0
     for group, values in (config or {}).items():
-        document[group] = {**document[group], **values}
+        document[group] = {**document[group], **values} if isinstance(values, dict) else values
     settings = VirtualAxisSettings(**{"rated_torque_mnm": rated, **devices})
     world = SteppedWorld(settings, plant)
     law = LAWS["pd"]
