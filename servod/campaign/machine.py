@@ -65,6 +65,11 @@ class Machine:
         self._close_loop_fd()
         self._loop_fd = os.pidfd_open(_child_of(self.daemon.pid))
 
+    def stop_daemon(self) -> None:
+        """Ask it to end, and wait for that."""
+        self.send([Process.DAEMON], signal.SIGTERM)
+        self.wait(Process.DAEMON, 10.0)
+
     def daemon_process(self, log: Path) -> Popen[bytes]:
         """One more daemon of this axis; whoever starts it waits for it."""
         arguments = ["--config", str(self.config)]

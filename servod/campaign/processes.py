@@ -231,8 +231,7 @@ class ProcessAxis:
         if not self.machine.alive(Process.VIRTUAL_AXIS):
             self.machine.start_virtual_axis()
         if self.machine.alive(Process.DAEMON):
-            self.machine.send([Process.DAEMON], signal.SIGTERM)
-            self.machine.wait(Process.DAEMON, 10.0)
+            self.machine.stop_daemon()
         self.machine.start_daemon()
 
     def _moves(self) -> bool:

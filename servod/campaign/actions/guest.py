@@ -82,7 +82,7 @@ class SetClock(GuestAction):
 class SmallDisk(GuestAction):
     """The recordings stand on a disk of `kib`, which is as good as full."""
 
-    kib: int = Field(ge=64)
+    kib: int = Field(ge=16)
 
     def act(self, axis: ProcessAxis) -> None:
         """Mount it where the daemon sees it: its folders are shared with the machine's."""

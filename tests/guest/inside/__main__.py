@@ -1,0 +1,59 @@
+"""Runs every step, also after one that failed; the results are on the host as soon as they stand."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import json
+import sys
+import time
+import traceback
+from pathlib import Path
+from typing import Any
+
+from inside.tools import shell
+
+#: Module and step; a module is imported when its first step comes, since only the first one can do without servod.
+STEPS = (
+    ("install", "install"),
+    ("bus", "conformance"),  # while nobody else is on the bus
+    ("service", "readiness"),
+    ("service", "started"),
+    ("service", "sandbox"),
+    ("service", "motion"),
+    ("bus", "witness"),
+    ("service", "rights"),
+    ("service", "reload"),
+    ("service", "restart"),
+    ("service", "watchdog"),
+    ("service", "loop_stopped"),
+    ("service", "supervisor_killed"),
+    ("service", "loop_killed"),
+    ("faults", "campaign"),
+    ("service", "bad_configuration"),
+    ("service", "stop"),
+)
+
+
+def main() -> None:
+    """Step after step into SHARE/results.jsonl; with names behind SHARE only these."""
+    share, *chosen = sys.argv[1:]
+    with (Path(share) / "results.jsonl").open("w") as results:
+        for module, step in STEPS:
+            if chosen and step not in chosen:
+                continue
+            result: dict[str, Any] = {"step": step}
+            started = time.monotonic()
+            try:
+                result |= getattr(importlib.import_module(f"inside.{module}"), step)()
+            except Exception:
+                result["error"] = traceback.format_exc()[-3000:]
+                with contextlib.suppress(Exception):
+                    result["journal_tail"] = shell("journalctl", "--no-pager", "-n", "40", "-o", "cat")[-4000:]
+            result["seconds"] = round(time.monotonic() - started, 1)
+            results.write(json.dumps(result) + "\n")
+            results.flush()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,151 @@
+"""Scenarios of the fault campaign on the installed service: systemd's processes, vcan0, the drive's own record."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from inside.tools import (
+    AXIS_UNIT,
+    CONFIG,
+    DRIVE_RECORD,
+    INTERFACE,
+    SOCKET,
+    UNIT,
+    journal,
+    prop,
+    shell,
+    status,
+    wait_for,
+)
+from servod.campaign.catalogue import shipped_scenarios
+from servod.campaign.machine import Machine, Process
+from servod.campaign.processes import ProcessAxis
+from servod.campaign.run import run_scenario
+from servod.campaign.scenario import Runs, Scenario
+from servod.campaign.wire import CanWire
+from servod.control import Verb
+from servod.drivers.virtual.drive_record import DriveSample, read_drive_record
+from servod.errors import ServodError
+
+#: The longest that a daemon may take to come back by itself or by hand.
+_BACK_S = 60.0
+
+
+class UnitMachine(Machine):
+    """The service's processes in place of the campaign's own; what still serves is used again."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder, CanWire(INTERFACE))
+        self.config, self.socket = folder / "axis.yaml", Path(SOCKET)
+        self._joined = _interface_number()
+        self._cursor = shell("journalctl", "-n", "0", "--show-cursor").rpartition("cursor: ")[2].strip()
+
+    def start_virtual_axis(self) -> None:
+        """Start it, or leave the one that has its place on the bus."""
+        if self.alive(Process.VIRTUAL_AXIS):
+            return
+        said = journal(AXIS_UNIT).count("ready ")
+        shell("systemctl", "restart", AXIS_UNIT)
+        wait_for(lambda: journal(AXIS_UNIT).count("ready ") > said, _BACK_S, "the virtual axis")
+        self._joined = _interface_number()
+
+    def start_daemon(self) -> None:
+        """Bring up a daemon without a fault and with the axis disabled; one that is so already is left."""
+        wait_for(lambda: prop("ActiveState") not in ("activating", "deactivating"), _BACK_S, "a settled service")
+        if not self._at_rest():
+            shell("systemctl", "restart", UNIT)
+
+    def stop_daemon(self) -> None:
+        """As an administrator does."""
+        shell("systemctl", "stop", UNIT)
+
+    def alive(self, who: Process) -> bool:
+        """Whether it runs; a virtual axis whose interface went away has no place on the bus any more."""
+        if who is Process.DAEMON:
+            return prop("ActiveState") == "active"
+        return prop("ActiveState", AXIS_UNIT) == "active" and _interface_number() == self._joined
+
+    def send(self, who: Sequence[Process], number: signal.Signals) -> None:
+        """Signal the main processes, and the loop by its number in the status."""
+        pids = [self._pid(process) for process in who]
+        if len(who) > 1 and number is signal.SIGKILL:
+            for pid in pids:
+                os.kill(pid, signal.SIGSTOP)
+        for pid in pids:
+            os.kill(pid, number)
+
+    def wait(self, who: Process, timeout_s: float) -> int:
+        """Exit code of the daemon."""
+        assert who is Process.DAEMON
+        wait_for(lambda: prop("ActiveState") in ("inactive", "failed"), timeout_s, "the end")
+        return int(prop("ExecMainStatus"))
+
+    def drive_samples(self) -> list[DriveSample]:
+        """The drive's own record."""
+        return read_drive_record(DRIVE_RECORD)
+
+    def daemon_log(self) -> str:
+        """What the unit said since the scenario began."""
+        return shell("journalctl", "-u", UNIT, "--no-pager", "-o", "cat", f"--after-cursor={self._cursor}")
+
+    def close(self) -> None:
+        """Leave the axis disabled."""
+        with contextlib.suppress(ServodError), self.client() as client:
+            client.call(Verb.DISABLE)
+
+    def _at_rest(self) -> bool:
+        if prop("ActiveState") != "active":
+            return False
+        now = status()
+        return now["axis"]["state"] == "DISABLED" and not now["faults"]
+
+    def _pid(self, who: Process) -> int:
+        if who is Process.LOOP:
+            return int(status()["loop"]["pid"])
+        return int(prop("MainPID", UNIT if who is Process.DAEMON else AXIS_UNIT))
+
+
+def _interface_number() -> int:
+    """It is another one when the interface was taken away and made anew."""
+    path = Path(f"/sys/class/net/{INTERFACE}/ifindex")
+    return int(path.read_text()) if path.exists() else 0
+
+
+def _axis(scenario: Scenario, folder: Path) -> ProcessAxis:
+    over = yaml.safe_load(CONFIG)
+    over["recorder"]["always"] = False
+    return ProcessAxis(scenario, folder, UnitMachine(folder), over)
+
+
+def campaign() -> dict[str, Any]:
+    """Every scenario of the guest: its complaints, or what kept it from running; row by row into SHARE as well."""
+    shell("systemctl", "start", UNIT)
+    with (Path(sys.argv[1]) / "campaign.jsonl").open("w") as rows:
+        outcomes = {}
+        for name, scenario in shipped_scenarios().items():
+            if scenario.runs is Runs.GUEST:
+                outcomes[name] = _outcome(name, scenario)
+                print(json.dumps({name: outcomes[name]}), file=rows, flush=True)
+    return {"scenarios": outcomes}
+
+
+def _outcome(name: str, scenario: Scenario) -> dict[str, Any]:
+    started = time.monotonic()
+    try:
+        outcome = run_scenario(name, scenario, _axis)
+    except Exception as error:
+        row: dict[str, Any] = {"complaints": [f"{type(error).__name__}: {error}"]}
+    else:
+        row = {"detected": outcome.detected, "axis": outcome.axis, "complaints": outcome.complaints}
+        row |= {"gone_ms": outcome.reaction.gone_ms, "left_ms": outcome.reaction.left_ms}
+    return {**row, "seconds": round(time.monotonic() - started, 1)}
