@@ -68,9 +68,15 @@ TARGETS = {
         ("tests/boundary/test_cia402_state.py", "tests/conformance/test_transitions.py"),
     ),
     "cia402_target": Target(
-        "drivers/cia402_target.py", "servod.drivers.cia402_target", ("tests/boundary/test_cia402_target.py",)
+        "drivers/cia402_target.py",
+        "servod.drivers.cia402_target",
+        ("tests/conformance/test_modes.py", "tests/conformance/test_amplifiers.py"),
     ),
-    "cia402": Target("drivers/cia402.py", "servod.drivers.cia402", ("tests/boundary/test_cia402.py",)),
+    "cia402": Target(
+        "drivers/cia402.py",
+        "servod.drivers.cia402",
+        ("tests/boundary/test_cia402.py", "tests/conformance/test_amplifiers.py", "tests/conformance/test_modes.py"),
+    ),
     "cia402_setup": Target(
         "drivers/cia402_setup.py", "servod.drivers.cia402_setup", ("tests/boundary/test_cia402_setup.py",)
     ),

@@ -85,6 +85,11 @@ def test_new_axis_is_disabled_without_faults() -> None:
     assert (new().state, new().faults, new().latched, new().unheard) == (S.DISABLED, 0, 0, False)
 
 
+def test_recorded_numbers_of_the_states_stay() -> None:
+    names = ["DISABLED", "ENABLING", "ENABLED", "BRAKING", "RAMPING", "QUICK_STOPPING", "FAULT", "PROVING"]
+    assert [(state.name, int(state)) for state in S] == [(name, number) for number, name in enumerate(names)]
+
+
 # --- faults -----------------------------------------------------------------------------------------------------------
 def expected(state: AxisState, code: FaultCode) -> AxisState:
     """Where the fault leads, said anew from the documentation of the reactions."""
@@ -294,6 +299,13 @@ def test_times_shorter_than_a_cycle_are_one_cycle() -> None:
     assert axis.state == S.ENABLING
     step(axis)
     assert axis.state == S.FAULT
+    axis = Axis(PERIOD_S, 1e-9, TIMEOUT * PERIOD_S, Mode.CYCLIC_SYNC_TORQUE)
+    axis.enable(False)
+    step(axis, **READY)
+    axis.disable()
+    step(axis, at_rest=True)
+    assert axis.state == S.RAMPING
+    assert (step(axis).torque_share, axis.state) == (0.0, S.DISABLED)
 
 
 # --- from the drive's word to the first torque ------------------------------------------------------------------------

@@ -1,0 +1,108 @@
+"""The cycle face of the CiA 402 driver at its edges: no slow PDO, cut frames, emergencies, reasons."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "conformance"))
+from drivers_under_test import AmplifierBench, encode
+
+from servod.cia import EMCY_BASE, Obj402
+from servod.drivers import load_driver
+from servod.hal import HANDSHAKE_SYNCS, AmplifierCommand, DriveState, Goal, Mode, Reason
+
+S = DriveState
+
+
+def bench(slow: bool = True, **options: object) -> AmplifierBench:
+    made = AmplifierBench("cia402", **options)
+    if not slow:
+        pdos = tuple(pdo for pdo in made.plan.pdos if pdo is not made.slow_pdo)
+        made.driver = load_driver("cia402").cyclic(dataclasses.replace(made.plan, pdos=pdos))
+    return made
+
+
+def test_drive_without_a_slow_pdo_is_taken_at_its_word() -> None:
+    axis = bench(slow=False)
+    assert len(axis.driver.receive_ids) == 2
+    assert axis.say_mode(Mode.PROFILE_TORQUE) is False
+    for _ in range(HANDSHAKE_SYNCS + 2):
+        word, torque = axis.cycle(S.OPERATION_ENABLED, Goal.ENABLED, 0.5)
+    assert (word, torque != 0) == (0x0F, True)
+    axis.say(S.OPERATION_ENABLED)
+    assert (axis.driver.read().mode, axis.driver.read().goal_reached) == (-1, True)
+
+
+@pytest.mark.parametrize("length", range(9))
+@pytest.mark.parametrize("which", ["feedback", "slow", "emcy"])
+def test_frames_count_from_their_full_length_on(which: str, length: int) -> None:
+    axis = bench()
+    can_id, whole = {
+        "feedback": (axis.feedback_pdo.cob_id, 8),
+        "slow": (axis.slow_pdo.cob_id, 3),
+        "emcy": (EMCY_BASE + axis.plan.node_id, 8),
+    }[which]
+    taken = axis.driver.on_frame(can_id, bytes(length), 1)
+    assert taken is (which == "feedback" and length >= whole)
+    assert axis.driver.ignored_frames == int(length < whole)  # type: ignore[attr-defined]
+
+
+def test_frames_of_others_are_no_ones() -> None:
+    axis = bench()
+    for can_id in (axis.feedback_pdo.cob_id + 1, EMCY_BASE, axis.command_pdo.cob_id):
+        assert axis.driver.on_frame(can_id, bytes(8), 1) is False
+    assert axis.driver.ignored_frames == 0  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(("code", "missed"), [(0x8250, True), (0x8251, False), (0x8130, False), (0x0000, False)])
+def test_emergency_of_the_commands_deadline_is_a_reason(code: int, missed: bool) -> None:
+    axis = bench()
+    axis.say(S.SWITCHED_ON)
+    axis.say_emcy(code)
+    assert bool(axis.driver.read().reasons & Reason.COMMANDS_MISSED) is missed
+    assert axis.driver.read().error_code == code
+
+
+@pytest.mark.parametrize(("code", "gone"), [(0x0000, True), (0x00FF, True), (0x0100, False), (0x2310, False)])
+def test_emergency_is_taken_back_by_error_reset_alone(code: int, gone: bool) -> None:
+    axis = bench()
+    axis.say(S.SWITCHED_ON)
+    axis.say_emcy(0x8250)
+    axis.say_emcy(code)
+    assert bool(axis.driver.read().reasons & Reason.COMMANDS_MISSED) is not gone
+
+
+def waited(axis: AmplifierBench, state: DriveState, goal: Goal, flags: int = 0) -> int:
+    """Reasons after the handshake."""
+    for _ in range(HANDSHAKE_SYNCS + 1):
+        axis.say(state, flags=flags)
+        axis.ask(goal)
+    axis.say(state, flags=flags)
+    return axis.driver.read().reasons
+
+
+@pytest.mark.parametrize("option", [2, 6])
+def test_quick_stop_that_holds_is_named(option: int) -> None:
+    held = waited(bench(quick_stop_option=option), S.QUICK_STOP_ACTIVE, Goal.READY)
+    assert bool(held & Reason.QUICK_STOP_HOLDS) is (option == 6)
+
+
+def test_drive_that_takes_no_commands_from_the_bus_is_named() -> None:
+    axis = bench()
+    for _ in range(HANDSHAKE_SYNCS + 2):
+        data = encode(axis.feedback_pdo, {Obj402.STATUS_WORD: 0x0040})  # switch on disabled; no voltage, no remote
+        axis.driver.on_frame(axis.feedback_pdo.cob_id, data, 1)
+        axis.driver.write(AmplifierCommand(Goal.ENABLED, 0.0))
+    axis.driver.on_frame(axis.feedback_pdo.cob_id, data, 1)
+    wanted = Reason.NO_VOLTAGE | Reason.REMOTE_OFF | Reason.MODE_NOT_SHOWN
+    assert axis.driver.read().reasons & wanted == wanted
+
+
+def test_goal_that_is_reached_in_a_wrong_mode_says_so() -> None:
+    axis = bench()
+    axis.say_mode(Mode.PROFILE_TORQUE)
+    assert waited(axis, S.OPERATION_ENABLED, Goal.ENABLED) == Reason.MODE_NOT_SHOWN
