@@ -6,10 +6,11 @@ Ground floor, stands on errors alone; every text that servod reads comes through
 from __future__ import annotations
 
 import errno
+import json
 import os
 import stat
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from servod.errors import BadInput
 
@@ -24,6 +25,16 @@ def read_text(path: str | Path) -> str:
         return read_bytes(path).decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
     except UnicodeDecodeError:
         raise BadInput(str(path), "bytes that are not UTF-8", "a text file") from None
+
+
+def read_json(path: str | Path, allowed: str) -> Any:
+    """The document of a JSON file; `allowed` says what file it should be. Raises BadInput."""
+    try:
+        return json.loads(read_bytes(path, allowed))
+    except ValueError as error:
+        raise BadInput(str(path), f"no JSON document ({error})", allowed) from None
+    except RecursionError:
+        raise BadInput(str(path), "brackets nested without end", allowed) from None
 
 
 def read_bytes(path: str | Path, allowed: str = "a readable file") -> bytes:

@@ -9,9 +9,9 @@ import json
 from pathlib import Path
 from typing import Any
 
+from servod import files
 from servod.errors import BadInput
 from servod.gain_store import write_file
-from servod.yaml12 import read_text
 
 RECORDINGS = "recordings"
 MODEL, IDENTIFIED = "model.yaml", "identified.json"
@@ -42,8 +42,5 @@ def write_json(path: Path, document: Any) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """The document of a JSON file. Raises BadInput."""
-    try:
-        return json.loads(read_text(path))
-    except ValueError as error:
-        raise BadInput(str(path), str(error), "the JSON that servoctl commission wrote") from None
+    """The document of a JSON file of the walk. Raises BadInput."""
+    return files.read_json(path, "the JSON that servoctl commission wrote")

@@ -5,8 +5,10 @@ Under the steps; the report reads them back.
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import fields
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,5 +65,7 @@ def load_curves(path: Path) -> dict[str, Curves]:
                 motion: Curves(**{f.name: arrays[f"{motion}.{f.name}"].astype(np.float64) for f in fields(Curves)})
                 for motion in sorted(motions)
             }
-    except (OSError, ValueError, KeyError) as error:
-        raise BadInput(str(path), f"{type(error).__name__}: {error}", "runs that servoctl commission wrote") from None
+    except OSError as error:
+        raise BadInput(str(path), error.strerror or "a broken file", "runs that servoctl commission wrote") from None
+    except (ValueError, KeyError, EOFError, BadZipFile, zlib.error):
+        raise BadInput(str(path), "a broken file", "runs that servoctl commission wrote") from None

@@ -18,8 +18,9 @@ from pydantic import Field
 
 from servod.commission.files import EARLIER, RUNS
 from servod.errors import BadInput, Unreachable
+from servod.files import read_json
 from servod.gain_store import write_file
-from servod.yaml12 import Strict, read_text, validate
+from servod.yaml12 import Strict, validate
 
 STATE = "state.json"
 LOCK = ".lock"
@@ -107,11 +108,7 @@ class State:
         (self.folder / name).replace(aside)
 
     def _load(self) -> _Content:
-        try:
-            data = json.loads(read_text(self._path))
-        except ValueError as error:
-            raise BadInput(str(self._path), str(error), "the state that servoctl commission wrote") from None
-        return validate(data, _Content, str(self._path))
+        return validate(read_json(self._path, "the state that servoctl commission wrote"), _Content, str(self._path))
 
     def _refuse_other_axis(self, axis: dict[str, Any]) -> None:
         for key in sorted(axis.keys() | self._content.axis.keys()):

@@ -8,7 +8,6 @@ thrown away: an axis model names its recordings by their hashes, and it stays in
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import shutil
 from dataclasses import replace
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from servod.errors import BadInput
+from servod.files import read_json
 from servod.identify.trace import Kind, Trace
 from servod.recorder_mcap import McapFile, split_rows, wall_offset_ns
 from servod.recorder_read import read_recording
@@ -162,12 +162,7 @@ def load(folder: Path) -> list[Trace]:
 
 def _read_list(folder: Path) -> _List:
     path = folder / LIST
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise BadInput(str(path), error.strerror or str(error), _ALLOWED) from None
-    except ValueError as error:
-        raise BadInput(str(path), str(error), _ALLOWED) from None
+    document = read_json(path, _ALLOWED)
     if isinstance(document, list):
         raise BadInput(str(path), "a list as earlier versions wrote it", f"{_ALLOWED} of this version; identify anew")
     return validate(document, _List, str(path))
@@ -177,6 +172,10 @@ def _trace(folder: Path, entry: _Entry) -> Trace:
     path = folder / entry.file
     sha256 = _require_same(path, entry)
     recording = read_recording(path)
+    missing = [name for name in ("time_ns", *_COLUMNS) if name not in recording.names]
+    if missing or not recording:
+        found = f"no {missing[0]}" if missing else "no cycles"
+        raise BadInput(str(path), found, "a recording that servoctl identify wrote")
     time_ns = np.asarray(recording.column("time_ns"), dtype=np.int64)
     torque, position, reference, excitation, actual, motor = (
         np.asarray(recording.column(column), dtype=np.float64) for column in _COLUMNS

@@ -21,6 +21,7 @@ from tempfile import TemporaryDirectory
 from threading import Lock
 
 from servod.errors import BadInput
+from servod.files import read_json
 from servod.prove.conceal import CASES, lock
 from servod.report.files import write_bytes
 from servod.sources import DIAGNOSES, sha256_on_disk
@@ -128,7 +129,7 @@ def one_diagnosis(out: Path, names: Sequence[str], sources: str | None = None) -
     """
     for name in names:
         path = out / ANSWERS / name / RUN
-        found = json.loads(path.read_text()).get("sources", "unknown")
+        found = read_json(path, "what `servoctl prove` wrote").get("sources", "unknown")
         if sources not in (None, found):
             raise BadInput(
                 str(path),

@@ -7,7 +7,6 @@ data cannot tell them apart.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -16,6 +15,7 @@ from typing import Any
 
 from servod.axis_model import AxisModel, load_axis_model
 from servod.errors import ServodError
+from servod.files import read_json
 from servod.models.replay import Drive, replay
 from servod.prove.conceal import CASES, HOLDOUT, SEALED
 from servod.prove.examine import ANSWERS, DIAGNOSIS, MODEL, RUN
@@ -179,5 +179,5 @@ def _read(path: Path) -> dict[str, Any]:
     """A document; nothing where none was written."""
     if not path.exists():
         return {}
-    found: dict[str, Any] = json.loads(path.read_text())
+    found: dict[str, Any] = read_json(path, "what `servoctl prove` wrote")
     return found

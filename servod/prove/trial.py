@@ -11,9 +11,11 @@ from pathlib import Path
 
 from servod import __version__
 from servod.errors import BadInput
+from servod.files import read_json
 from servod.report.files import write_bytes
 
 FILE = "trial.json"
+_ALLOWED = "what `servoctl prove` wrote"
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,6 @@ def read_trial(out: Path) -> Trial | None:
     if not path.exists():
         return None
     try:
-        return Trial(**json.loads(path.read_text()))
-    except (ValueError, TypeError) as error:
-        raise BadInput(str(path), str(error), "what `servoctl prove` wrote") from None
+        return Trial(**read_json(path, _ALLOWED))
+    except TypeError:
+        raise BadInput(str(path), "other keys than a trial has", _ALLOWED) from None

@@ -21,6 +21,9 @@ MOST_BYTES = 3 * 1024 * 1024 * 1024
 #: Longest line for people.
 MOST_MESSAGE = 2000
 
+#: Words of Python, which say nothing to people.
+PYTHON_WORDS = ("NoneType", "Traceback", "<class", "object at 0x", "Errno", "with base", "Error:", "object has no")
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -55,7 +58,7 @@ def _documented(target: Target, data: bytes) -> None:
         target.run(data)
     except ServodError as error:
         line = str(error)
-        if len(line) > MOST_MESSAGE or not line.isprintable():
+        if len(line) > MOST_MESSAGE or not line.isprintable() or any(word in line for word in PYTHON_WORDS):
             raise BadMessageError(f"{len(line)} characters: {line[:300]!r}") from error
 
 
