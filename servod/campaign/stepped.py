@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from servod.axis import AxisState
-from servod.campaign.inputs import config_of, plant_of, shipped_config
+from servod.campaign.inputs import config_of, merged, plant_of, shipped_config
 from servod.campaign.scenario import Recovery, Scenario, Start
 from servod.campaign.under_test import Observation
 from servod.commands import REFUSAL_TEXT, Op, ReferenceKind, Refusal
@@ -20,10 +20,14 @@ from servod.session import SteppedSession
 from servod.shipped import shipped
 from servod.yaml12 import validate
 
-#: A minute of the drive's record at one sample for each millisecond and event.
-_RECORD_SAMPLES = 120_000
+#: Samples of the drive's record for each millisecond: its commands, its own watch, its events.
+_SAMPLES_PER_MS = 2.5
+#: What a scenario takes besides its injections and its watch: bring-up, enabling, motion.
+_OTHERWISE_MS = 8000.0
 #: The drive's own record in the folder of a stepped axis.
 RECORD_NAME = "drive.bin"
+#: The wiring was proven at an enable long ago; a scenario that is about the proof asks for it.
+_PROVEN_BEFORE = {"wiring_proof": {"enabled": False}}
 #: The motion of a start in motion: whole half periods after its begin it is at its fastest, 1.3 rad/s.
 _SINE = (ReferenceKind.SINE, 0.1, 2.0, 600.0)
 _TO_THE_FASTEST_S = 0.5
@@ -36,9 +40,9 @@ class SteppedAxis:
         self._record_path = folder / RECORD_NAME
         where = scenario.title
         settings = validate(scenario.settings, VirtualAxisSettings, f"{where}: settings")
-        record = DriveRecord(self._record_path, _RECORD_SAMPLES)
+        record = DriveRecord(self._record_path, _samples(scenario))
         self.world = SteppedWorld(settings, plant_of(scenario), record)
-        self._config = config_of(scenario, shipped_config())
+        self._config = config_of(scenario, merged(shipped_config(), _PROVEN_BEFORE))
         self._foreign = self.world.connect(())
         self._session: SteppedSession | None = None
         self._refusal = ""
@@ -135,3 +139,9 @@ class SteppedAxis:
         self.close()
         gains = load_gains(shipped("gains/demo_pd.yaml"))
         self._session = SteppedSession(self._config, self.world, LAWS[gains.law.name].number, gains.pack())
+
+
+def _samples(scenario: Scenario) -> int:
+    """Capacity of the drive's record: all of the scenario, and little more, since it is read as a whole."""
+    longest_ms = max(injection.at_ms for injection in scenario.inject) + scenario.watch_ms + _OTHERWISE_MS
+    return round(longest_ms * _SAMPLES_PER_MS)

@@ -176,3 +176,76 @@ def test_a_filtered_stepped_connection_gets_only_its_identifiers(bench: Bench) -
     while (frame := filtered.receive()) is not None:
         identifiers.append(frame.can_id)
     assert set(identifiers) == {0x282}
+
+
+FRAME = bytes(range(4))
+
+
+def struck(kind: FaultKind, detail: int = 0, frames: int = 3) -> list[tuple[bytes, float]]:
+    """What c hears of some frames of a, 1 ms apart, the first of which is struck: data and ms since its sending."""
+    wire, heard = Wire(), []
+    wire.ports[2].receive = lambda can_id, data, time_ns: heard.append((data, time_ns))
+    wire.hub.faults.arm(kind, 0x181, 1, detail)
+    for number in range(frames):
+        wire.hub.submit(wire.ports[0], 0x181, FRAME + bytes([number]), number * 1_000_000)
+        wire.run(number * 1_000_000 + 900_000)
+        while wire.timeline.next_ns() < (number + 1) * 1_000_000:
+            wire.timeline.fire_next()
+    return [(data, round(time_ns / 1e6, 1)) for data, time_ns in heard]
+
+
+def test_a_late_frame_comes_later_by_its_detail() -> None:
+    assert [time_ms for _, time_ms in struck(FaultKind.LATE, 5)] == [0.6, 1.1, 2.1]
+
+
+def test_a_frame_can_come_twice() -> None:
+    assert [data[-1] for data, _ in struck(FaultKind.DUPLICATE)] == [0, 0, 1, 2]
+
+
+def test_a_reordered_frame_comes_after_the_next() -> None:
+    assert [data[-1] for data, _ in struck(FaultKind.REORDER)] == [1, 0, 2]
+
+
+def test_a_shortened_frame_lacks_its_end() -> None:
+    assert [data for data, _ in struck(FaultKind.SHORTEN, 3, frames=1)] == [FRAME[:2]]
+    assert [data for data, _ in struck(FaultKind.SHORTEN, 9, frames=1)] == [b""]
+
+
+def test_a_flipped_bit_is_the_one_that_was_named() -> None:
+    assert [data for data, _ in struck(FaultKind.FLIP, 9, frames=1)] == [bytes([0, 1 ^ 2, 2, 3, 0])]
+
+
+def test_a_queue_that_stands_fills_and_empties_again() -> None:
+    bench = Bench(queue_depth=3)
+    bench.bus.inject(BusFault(FaultKind.STUCK, amount=5))
+    assert [bench.bus.send(0x7FF, b"") for _ in range(4)] == [True, True, True, False]
+    assert bench.bus.counters.queue_full == 1
+    bench.pass_time(0.006)
+    assert bench.bus.send(0x7FF, b"")
+
+
+def test_an_interface_that_goes_down_is_up_again_after_its_time() -> None:
+    bench = Bench()
+    bench.bus.inject(BusFault(FaultKind.DOWN, amount=5))
+    assert (bench.bus.counters.down, bench.bus.send(0x7FF, b"")) == (True, False)
+    bench.world.clock.sleep_until(bench.world.clock.now_ns() + 6_000_000)
+    assert (bench.bus.counters.down, bench.bus.counters.down_events, bench.bus.send(0x7FF, b"")) == (False, 1, True)
+
+
+def test_a_babbler_sends_until_its_time_is_over() -> None:
+    bench = Bench()
+    bench.bus.inject(BusFault(FaultKind.BABBLE, 0x123, 10, 2))
+    bench.pass_time(0.03)
+    assert len(bench.frames(0x123)) == 20
+
+
+def test_a_second_node_of_the_same_id_boots_and_answers_too() -> None:
+    bench = Bench()
+    bench.pass_time(0.005)
+    assert len(bench.frames(0x702)) == 1
+    bench.bus.inject(BusFault(FaultKind.TWIN, participant=2))
+    bench.pass_time(0.005)
+    assert len(bench.frames(0x702)) == 2
+    bench.upload(2, 0x1000)
+    bench.pass_time(0.005)
+    assert len(bench.frames(0x582)) == 2
