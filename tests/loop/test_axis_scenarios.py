@@ -35,6 +35,9 @@ def ask(axis: Axis, request: str) -> Refusal | None:
     actions = {
         "enable": lambda: axis.enable(False),
         "enable with reset": lambda: axis.enable(True),
+        "enable with proof": lambda: axis.enable(False, prove=True),
+        "enable with proof and reset": lambda: axis.enable(True, prove=True),
+        "tell it is proven": axis.proven,
         "disable": axis.disable,
         "quick stop": axis.quick_stop,
         "reset fault": axis.reset_fault,
