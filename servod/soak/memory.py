@@ -5,6 +5,8 @@ Beside everything: looks at /proc of one process.
 
 from __future__ import annotations
 
+import ctypes
+import gc
 import itertools
 import math
 import os
@@ -21,7 +23,7 @@ LIMIT_KB_PER_H = 1024.0
 #: What the allocator may take and give back without it meaning anything [kB].
 _SLACK_KB = 2048.0
 _MOST_SAMPLES = 2048
-#: The second half is averaged to so many points, which may count as independent.
+#: The second half becomes so many points, which may count as independent: the least that the process held in each.
 _BLOCKS = 12
 #: Student's t for 95 %, two-sided, with _BLOCKS - 2 degrees of freedom.
 _T95 = 2.228
@@ -49,7 +51,7 @@ class Slope:
 class Memory:
     """Samples of one process; when there are too many, every other one is dropped and the interval doubled."""
 
-    def __init__(self, pid: int | None = None, interval_s: float = 0.5) -> None:
+    def __init__(self, pid: int | None = None, interval_s: float = 5.0) -> None:
         self.pid = os.getpid() if pid is None else pid
         self._folder, self._interval_s = Path("/proc") / str(self.pid), interval_s
         self._samples = np.zeros((_MOST_SAMPLES, 3))
@@ -61,6 +63,8 @@ class Memory:
         if now_s < self._next_s:
             return
         self._next_s = now_s + self._interval_s
+        if self.pid == os.getpid():
+            _hand_back()
         pages = int((self._folder / "statm").read_text().split()[1])
         self.add(now_s, pages * _PAGE_KB, sum(1 for _ in (self._folder / "fd").iterdir()))
 
@@ -88,7 +92,8 @@ class Memory:
         places = np.searchsorted(curve[:, 0], edges)
         if np.diff(places).min() < 1:
             return Slope(0.0, -math.inf, math.inf, Growth.TOO_SHORT)
-        points = np.array([curve[begin:end, :2].mean(axis=0) for begin, end in itertools.pairwise(places)])
+        blocks = [curve[begin:end] for begin, end in itertools.pairwise(places)]
+        points = np.array([(block[:, 0].mean(), block[:, 1].min()) for block in blocks])
         hours, resident_kb = points[:, 0] / 3600.0, points[:, 1]
         (slope, level), spread = np.polyfit(hours, resident_kb, 1), hours - hours.mean()
         rest = resident_kb - slope * hours - level
@@ -101,6 +106,12 @@ class Memory:
         if quarter < 4:
             return False
         return bool(descriptors[-quarter:].min() > descriptors[quarter : 2 * quarter].max())
+
+
+def _hand_back() -> None:
+    """Let this process give back what it does not use, so that only what it holds is measured (malloc_trim(3))."""
+    gc.collect()
+    ctypes.CDLL(None).malloc_trim(0)
 
 
 def _growth(slope: float, width: float, points: NDArray[np.float64]) -> Growth:
