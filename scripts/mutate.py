@@ -59,7 +59,9 @@ TARGETS = {
         "servod/limits.py", "servod.limits", ("tests/boundary/test_limits.py", "tests/loop/test_limits.py")
     ),
     "axis": Target(
-        "servod/axis.py", "servod.axis", ("tests/boundary/test_axis.py", "tests/loop/test_axis_scenarios.py")
+        "servod/axis.py",
+        "servod.axis",
+        ("tests/boundary/test_axis.py", "tests/boundary/test_axis_drive.py", "tests/loop/test_axis_scenarios.py"),
     ),
     "cia": Target("servod/cia.py", "servod.cia", ("tests/boundary/test_cia.py",)),
     "cia402_state": Target(
