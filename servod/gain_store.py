@@ -84,11 +84,16 @@ class _Active(Strict):
 def write_atomically(path: Path, text: str) -> None:
     """Replace `path` by `text`: write aside, flush to disk, rename. After a kill there is the old file or the new."""
     aside = path.with_name(f"{path.name}.{os.getpid()}.tmp")
-    with aside.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    aside.replace(path)
+    try:
+        with aside.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        aside.replace(path)
+    except OSError:
+        with contextlib.suppress(OSError):  # half a file fills the very disk that took no more
+            aside.unlink(missing_ok=True)
+        raise
     _flush_directory(path.parent)
 
 

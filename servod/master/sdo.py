@@ -169,8 +169,9 @@ class NodeSdo:
         return int.from_bytes(data, "little", signed=signed)
 
     def read_text(self, index: int, subindex: int = 0) -> str:
-        """Upload a visible string."""
-        return self.read_bytes(index, subindex).rstrip(b"\0").decode("latin-1")
+        """Upload a visible string; what is not visible in it, and may act on a terminal, becomes a question mark."""
+        text = self.read_bytes(index, subindex).rstrip(b"\0").decode("latin-1")
+        return "".join(c if c.isprintable() else "?" for c in text)
 
     def read_bytes(self, index: int, subindex: int = 0) -> bytes:
         """Upload raw data."""

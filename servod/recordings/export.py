@@ -5,6 +5,7 @@ Behind replay, identification and diagnosis; the daemon's own recordings have `s
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -37,4 +38,6 @@ def write_table(path: Path, columns: Mapping[str, NDArray[np.float64]]) -> None:
             os.fsync(stream.fileno())
         aside.replace(path)
     except OSError as error:
+        with contextlib.suppress(OSError):  # half a file fills the very disk that took no more
+            aside.unlink(missing_ok=True)
         raise BadInput(str(path), error.strerror or str(error), "a file that can be written") from None
