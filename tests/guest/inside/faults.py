@@ -66,7 +66,8 @@ class UnitMachine(Machine):
             shell("systemctl", "restart", UNIT)
 
     def stop_daemon(self) -> None:
-        """As an administrator does."""
+        """At once: an orderly end waits 1000 cycles, 20 s here, for a drive that is not heard any more."""
+        shell("systemctl", "kill", "--signal=KILL", UNIT)
         shell("systemctl", "stop", UNIT)
 
     def alive(self, who: Process) -> bool:
