@@ -23,7 +23,7 @@ cycle: {period_us: 20000, feedback_timeout_us: 15000}
 heartbeat: {master_period_ms: 200, drive_timeout_ms: 2000, node_period_ms: 200, node_timeout_ms: 3000}
 amplifier: {enable_timeout_s: 20}
 wiring_proof: {enabled: false}  # at 50 Hz the joint is far away before its first answer comes
-limits: {torque_nm: 0.9, torque_rate_nm_per_s: 400.0, speed_rad_s: 20.0, position_min_rad: -9999, position_max_rad: 9999,
+limits: {torque_nm: 0.9, torque_rate_nm_per_s: 400.0, speed_rad_s: 20.0, position_min_rad: -999, position_max_rad: 999,
   following_error_rad: 3.0, encoder_mismatch_rad: 0.5, stale_cycles: 100, late_cycles: 5000}
 gains: {directory: /var/lib/servod/guest/gains, initial: /etc/servod/demo_pd.yaml, accept_uncertified: true}
 control: {socket: /run/servod/guest.sock, group: servod}
