@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from pathlib import Path
 from typing import Any
@@ -170,3 +171,15 @@ def test_pdos_are_the_documented_ones() -> None:
         [(0x6041, 16), (0x6064, 32), (0x6077, 16)],
         [(0x6061, 8), (0x603F, 16)],
     ]
+
+
+@pytest.mark.parametrize(("entries", "fits"), [(3, True), (2, False)])
+def test_drive_that_maps_too_few_objects_is_refused(entries: int, fits: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    few = dataclasses.replace(load_quirks("none"), max_pdo_entries=entries)
+    monkeypatch.setattr("servod.drivers.cia402_setup.load_quirks", lambda _name: few)
+    setup = AmplifierSetup(axis_config())
+    if fits:
+        assert len(setup.plan().pdos) == 3
+    else:
+        with pytest.raises(BadInput, match="maps 3 objects in one PDO"):
+            setup.plan()
