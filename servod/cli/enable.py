@@ -37,7 +37,7 @@ def enable(
     """Enable the axis."""
     result = ask(socket, "enable", reset_fault=reset_fault, prove=prove)
     wiring = result.get("wiring")
-    report(result, f"enabled; {wiring['text']}" if wiring else "enabled", as_json)
+    report(result, f"enabled\n{wiring['text']}" if wiring else "enabled", as_json)
 
 
 def disable(socket: SocketOption = DEFAULT_SOCKET, as_json: JsonOption = False) -> None:
