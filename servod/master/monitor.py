@@ -17,6 +17,8 @@ from servod.master.network import BusNetwork
 
 _EMCY = struct.Struct("<HB5s")
 _TOGGLE_MASK = 0x7F
+#: States after operational that a node only reaches by NMT; a number that is none is shown, and is no state.
+_LEFT = (NmtState.STOPPED, NmtState.PRE_OPERATIONAL)
 #: More waiting events than this means that nobody reads them; the oldest are dropped then.
 _MAX_EVENTS = 1000
 
@@ -75,7 +77,7 @@ class NodeWatch:
             return
         if state == NmtState.BOOT_UP:
             self._add(FaultCode.DRIVE_RESET, f"node {self.node_id}: boot-up while it should be operational", state)
-        elif state != NmtState.OPERATIONAL and previous == NmtState.OPERATIONAL:
+        elif state in _LEFT and previous == NmtState.OPERATIONAL:
             text = f"node {self.node_id}: left NMT operational (state {state})"
             self._add(FaultCode.NODE_LEFT_OPERATIONAL, text, state)
 
