@@ -40,7 +40,8 @@ from servod.units import NS_PER_US
 STARVED = frozenset(
     {
         *(FaultCode.DEADLINE_LATE, FaultCode.DEADLINE_BUDGET, FaultCode.FEEDBACK_STALE, FaultCode.SUPERVISOR_LOST),
-        *(FaultCode.NODE_HEARTBEAT_LOST, FaultCode.DRIVE_FAULT, FaultCode.FOLLOWING_ERROR),
+        *(FaultCode.NODE_HEARTBEAT_LOST, FaultCode.DRIVE_FAULT, FaultCode.FOLLOWING_ERROR, FaultCode.BUS_QUEUE_FULL),
+        *(FaultCode.COMMANDS_LOST, FaultCode.ENCODER_ALARM),
     }
 )
 #: Actions that happen within the loop's process.
