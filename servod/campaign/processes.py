@@ -170,7 +170,8 @@ class ProcessAxis:
         samples = self.machine.drive_samples()
         axis, shown, overrun = self._shown(samples)
         told = {FaultCode[name] for name in _TOLD.findall(self.machine.daemon_log())}
-        ended_ns = None if self.machine.alive(Process.DAEMON) else self._hit_ns
+        recorded_to_the_end = self.config.recorder.always and not self.machine.alive(Process.DAEMON)
+        ended_ns = self._hit_ns if recorded_to_the_end else None
         lost = lost_records(self.config.recorder.directory, self.config.cycle.period_us * NS_PER_US, ended_ns)
         return Observation(samples, axis, frozenset(shown | told), self.refusal, lost + overrun)
 
