@@ -30,8 +30,8 @@ SURVIVORS = ROOT / "scripts/mutate_survivors.yaml"
 #: A mutant that makes the tests run for so long has been noticed.
 _LONGEST_S = 20
 _HYPOTHESIS_EXAMPLES = 40
-#: Replacements that say nothing new beside those that are left: whoever notices "-" for "+" notices "%" as well.
-_LEFT_OUT = ("_Is", "_IsNot", "_FloorDiv", "_Mod", "_Pow", "_RShift", "_LShift")
+#: Replacements that say nothing new: who notices "-" for "+" notices "%" as well, and equal states are the same ones.
+_LEFT_OUT = ("_Is", "_IsNot", "_Is_Eq", "_IsNot_NotEq", "_FloorDiv", "_Mod", "_Pow", "_RShift", "_LShift")
 _PRELOADED = (
     "hypothesis",
     "pydantic",
