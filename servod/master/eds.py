@@ -11,6 +11,7 @@ import io
 import logging
 import re
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -125,6 +126,12 @@ def dictionary_for(driver: str, eds: str | None, node_id: int) -> Dictionary:
         return load_dictionary(eds, node_id)
     if driver not in GENERIC_EDS:
         raise BadInput(f"driver {driver}: eds", "nothing", "an EDS file: this driver has no generic dictionary")
+    return _generic(driver, node_id)
+
+
+@lru_cache(maxsize=16)
+def _generic(driver: str, node_id: int) -> Dictionary:
+    """A dictionary that ships; whoever brings up many axes in one process reads it once."""
     from servod import drivers
 
     return load_dictionary(Path(drivers.__file__).parent / "eds" / GENERIC_EDS[driver], node_id)
