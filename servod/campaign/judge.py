@@ -9,6 +9,7 @@ from servod.campaign.scenario import Expectation
 from servod.campaign.under_test import Observation
 from servod.drivers.virtual.drive_record import DriveSample
 from servod.hal import DriveState
+from servod.wiring_proof import Finding
 
 #: The drive counts its torque in per mille of the rated torque: less than one count is none.
 NO_TORQUE_NM = 1e-9
@@ -52,6 +53,7 @@ def _complaints(expected: Expectation, seen: Observation, times: Reaction) -> li
         _in_time("the drive left the controller's command", times.left_ms, expected.reaction_ms),
         _in_time("the torque was gone", times.gone_ms, expected.torque_gone_ms),
         _refused(expected.refused, seen.refusal),
+        _says(expected.says, seen.says),
         "" if seen.lost_records <= expected.lost_records else f"{seen.lost_records} cycle records are missing",
         _commanded(seen),
     ]
@@ -82,6 +84,13 @@ def _refused(words: str | None, refusal: str) -> str:
     if words is None:
         return f"refused: {refusal}" if refusal else ""
     return "" if words in refusal else f"the refusal says {refusal or 'nothing'!r}, expected {words!r}"
+
+
+def _says(name: str | None, told: Finding | None) -> str:
+    """The proof of the wiring names what is wrong: each finding has a remedy of its own."""
+    if name is None or (told is not None and told.name == name):
+        return ""
+    return f"the proof of the wiring says {told.name if told else 'nothing'}, expected {name}"
 
 
 def _commanded(seen: Observation) -> str:

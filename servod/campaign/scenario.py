@@ -16,6 +16,7 @@ from servod.axis import AxisState
 from servod.campaign.variants import variants
 from servod.errors import FaultCode
 from servod.hal import DriveState
+from servod.wiring_proof import Finding
 from servod.yaml12 import Strict, validate
 
 #: After a loss of the master the torque must be gone within this time [ms].
@@ -26,6 +27,7 @@ FEEDBACK_LOSS_MS = 50.0
 AXIS_STATES = {state.name for state in AxisState}
 FAULT_NAMES = {code.name for code in FaultCode}
 DRIVE_STATES = {state.name for state in DriveState}
+FINDINGS = {finding.name for finding in Finding}
 
 
 class Runs(StrEnum):
@@ -95,6 +97,9 @@ class Expectation(Strict):
     reaction_ms: float | None = Field(None, gt=0.0, description="the drive has left the controller's command by then")
     torque_gone_ms: float | None = Field(None, gt=0.0, description="the joint feels no torque from then on")
     refused: str | None = Field(None, description="words of the message with which the bring-up or command is refused")
+    says: str | None = Field(
+        None, description="name of servod.wiring_proof.Finding: what the proof of the wiring tells"
+    )
     lost_records: int = Field(0, ge=0, description="cycle records that may be missing")
     drive_shows: list[str] = Field([], description="names of servod.hal.DriveState, all seen after the injection")
     drive_never: list[str] = Field([], description="names of servod.hal.DriveState, none seen after the injection")
@@ -105,6 +110,8 @@ class Expectation(Strict):
             raise ValueError(f"one of {', '.join(sorted(AXIS_STATES))} instead of {name}")
         for name in set(self.faults) - FAULT_NAMES:
             raise ValueError(f"one of {', '.join(sorted(FAULT_NAMES))} instead of {name}")
+        for name in {self.says} - {None} - FINDINGS:
+            raise ValueError(f"one of {', '.join(sorted(FINDINGS))} instead of {name}")
         for name in {*self.drive_shows, *self.drive_never} - DRIVE_STATES:
             raise ValueError(f"one of {', '.join(sorted(DRIVE_STATES))} instead of {name}")
         return self

@@ -18,6 +18,7 @@ from servod.errors import ServodError, faults_in
 from servod.gains import load_gains
 from servod.session import SteppedSession
 from servod.shipped import shipped
+from servod.wiring_proof import Finding
 from servod.yaml12 import validate
 
 #: Samples of the drive's record for each millisecond: its commands, its own watch, its events.
@@ -115,7 +116,9 @@ class SteppedAxis:
         axis, records = self._session.cycle.axis, self._session.records
         lost = records[-1].cycle - records[0].cycle + 1 - len(records) - (records[-1].missed - records[0].missed)
         latched = frozenset(fault.code for fault in faults_in(axis.latched))
-        return Observation(samples, axis.state.name, latched, self._refusal, lost)
+        proof = self._session.proof
+        says = None if proof is None else Finding(int(proof.finding))
+        return Observation(samples, axis.state.name, latched, self._refusal, lost, says)
 
     def recover(self, recovery: Recovery) -> bool:
         """Do what a person would do, and hold for a tenth of a second."""

@@ -11,6 +11,7 @@ from servod.commands import Op
 from servod.drivers.virtual.bus_faults import BusFault
 from servod.drivers.virtual.drive_record import DriveSample
 from servod.errors import FaultCode
+from servod.wiring_proof import Finding
 
 AMPLIFIER, ENCODER = 1, 2
 
@@ -21,7 +22,7 @@ class Observation:
 
     `samples`: the drive's own record; `axis`: name of the axis state; `latched`: the faults that the user is shown;
     `refusal`: message with which bring-up or command was refused, "" when none was; `lost_records`: cycles without a
-    record.
+    record; `says`: how the last proof of the wiring ended, None where none was told.
     """
 
     samples: list[DriveSample]
@@ -29,6 +30,7 @@ class Observation:
     latched: frozenset[FaultCode]
     refusal: str
     lost_records: int
+    says: Finding | None = None
 
 
 class AxisUnderTest(Protocol):

@@ -8,6 +8,7 @@ from servod.campaign.under_test import Observation
 from servod.drivers.virtual.drive_record import DriveSample
 from servod.errors import FaultCode
 from servod.hal import DriveState
+from servod.wiring_proof import Finding
 
 MS = 1_000_000
 ON, OFF = DriveState.OPERATION_ENABLED, DriveState.SWITCH_ON_DISABLED
@@ -21,8 +22,14 @@ STOPPED = [sample(0, ON, 0.1), sample(10, ON, 0.1), sample(20, OFF, 0.05), sampl
 RUNAWAY = [sample(0, ON, 0.1), sample(10, ON, 0.1), sample(20, OFF, 0.1)]
 
 
-def seen(samples: list[DriveSample] = STOPPED, axis: str = "FAULT", refusal: str = "", lost: int = 0) -> Observation:
-    return Observation(samples, axis, frozenset({FaultCode.FEEDBACK_STALE}), refusal, lost)
+def seen(
+    samples: list[DriveSample] = STOPPED,
+    axis: str = "FAULT",
+    refusal: str = "",
+    lost: int = 0,
+    says: Finding | None = None,
+) -> Observation:
+    return Observation(samples, axis, frozenset({FaultCode.FEEDBACK_STALE}), refusal, lost, says)
 
 
 def test_times_count_from_the_injection() -> None:
@@ -49,6 +56,9 @@ def test_times_count_from_the_injection() -> None:
         ({"axis": ["FAULT"]}, seen(lost=1), "1 cycle records are missing"),
         ({"axis": ["FAULT"], "drive_shows": ["QUICK_STOP_ACTIVE"]}, seen(), "never showed QUICK_STOP_ACTIVE"),
         ({"axis": ["FAULT"], "drive_never": ["SWITCH_ON_DISABLED"]}, seen(), "showed SWITCH_ON_DISABLED"),
+        ({"axis": ["FAULT"], "says": "ONE_WAY"}, seen(says=Finding.ONE_WAY), ""),
+        ({"axis": ["FAULT"], "says": "ONE_WAY"}, seen(says=Finding.NO_MOTION), "says NO_MOTION, expected ONE_WAY"),
+        ({"axis": ["FAULT"], "says": "ONE_WAY"}, seen(), "says nothing, expected ONE_WAY"),
     ],
 )
 def test_each_difference_is_a_complaint(expected: dict, observed: Observation, words: str) -> None:
