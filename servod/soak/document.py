@@ -1,6 +1,8 @@
 """The document of a soak, as JSON has it: of one run, and of several added up.
 
-Behind the run; `page` and `table` show it.
+Behind the run; `page` shows it. A soak passed when nothing was found wrong and nothing is `unproven`: it came to the
+end that was ordered, every job of it ended well, and every memory that was watched for long enough is flat. A memory
+that was watched too shortly to tell stands in `untold`, and the verdict says so.
 """
 
 from __future__ import annotations
@@ -9,26 +11,42 @@ import math
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from enum import StrEnum
 from typing import Any
 
 from servod.soak.counts import SoakedAxis
-from servod.soak.memory import LIMIT_KB_PER_H, Memory
+from servod.soak.memory import LIMIT_KB_PER_H, LONG_S, Growth, Memory
 from servod.soak.tally import median_ms
 
 _CURVE_POINTS = 200
 _NS_PER_H = 3.6e12
+#: Exit codes with which `servoctl soak` says what it found; None: still running.
+_SAID = (0, 1, None)
 _ADDED = (
     *("cycles", "rows", "missed", "syncs", "syncs_taken", "drive_samples", "recordings", "rows_read_back", "episodes"),
     *("cpu_s", "restarts", "faults_injected", "faults_found", "faults_recovered", "axis_hours"),
 )
 
 
-def document(axis: SoakedAxis, memories: Mapping[str, Memory], wall_s: float) -> dict[str, Any]:
-    """Everything of one run. It passed when nothing at all was wrong."""
+class Course(StrEnum):
+    """How far a soak has come."""
+
+    RUNNING = "still running"
+    COMPLETE = "complete"
+    INTERRUPTED = "interrupted"
+    CUT_SHORT = "ended short of its order"
+
+
+def document(axis: SoakedAxis, memories: Mapping[str, Memory], wall_s: float, course: Course) -> dict[str, Any]:
+    """Everything of one run."""
     counts, tally, findings = axis.counts, axis.tally, axis.findings
-    faults = tally.faults.values()
+    faults, unproven = tally.faults.values(), _unproven(memories, course)
     return {
-        "passed": not findings.counts,
+        "passed": not findings.counts and not unproven,
+        "unproven": unproven,
+        "untold": [name for name, memory in memories.items() if memory.slope().growth is Growth.TOO_SHORT],
+        "running": course is Course.RUNNING,
+        "interrupted": course is Course.INTERRUPTED,
         "wall_s": round(wall_s, 1),
         "cpu_s": round(time.process_time(), 1),
         "axis_hours": counts.cycles * counts.period_ns / _NS_PER_H,
@@ -48,6 +66,15 @@ def document(axis: SoakedAxis, memories: Mapping[str, Memory], wall_s: float) ->
     }
 
 
+def _unproven(memories: Mapping[str, Memory], course: Course) -> list[str]:
+    """Why a run in which nothing was found wrong is still no pass."""
+    reasons = [] if course is Course.COMPLETE else [str(course)]
+    for name, memory in memories.items():
+        if memory.watched_s >= LONG_S and memory.slope().growth is Growth.TOO_SHORT:
+            reasons.append(f"memory of {name} cannot be told after {memory.watched_s / 3600.0:.1f} h")
+    return reasons
+
+
 def memory_document(name: str, memory: Memory) -> dict[str, Any]:
     """Memory and descriptors of one process."""
     slope, curve = memory.slope(), memory.curve
@@ -63,10 +90,17 @@ def memory_document(name: str, memory: Memory) -> dict[str, Any]:
     }
 
 
-def added(documents: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Several independent runs as one: counts added, findings and memories side by side, the longest time."""
+def added(documents: Sequence[dict[str, Any]], exit_codes: Sequence[int | None] = ()) -> dict[str, Any]:
+    """Several independent runs as one: counts added, findings and memories side by side, the longest time.
+
+    `exit_codes` of the processes that had them: each must be that of a soak that passed, or found something wrong.
+    """
+    died = [f"job {job} ended with {code}" for job, code in enumerate(exit_codes, start=1) if code not in _SAID]
+    unproven = [reason for d in documents for reason in d["unproven"]] + died
     total: dict[str, Any] = {
-        "passed": all(d["passed"] for d in documents),
+        "passed": all(d["passed"] for d in documents) and not any(exit_codes),
+        "unproven": unproven,
+        "untold": [name for d in documents for name in d["untold"]],
         "interrupted": any(d["interrupted"] for d in documents),
         "running": any(d["running"] for d in documents),
         "wall_s": max(d["wall_s"] for d in documents),

@@ -76,9 +76,17 @@ def _several(order: Order, jobs: int, tell: Tell) -> dict[str, Any]:
     except KeyboardInterrupt:
         for process in processes:
             process.send_signal(signal.SIGTERM)
-    for process in processes:
-        process.wait(_PATIENCE_S)
-    return added([_read(folder) for folder in folders])
+    exit_codes = [_ended(process) for process in processes]
+    return added([_read(folder) for folder in folders], exit_codes)
+
+
+def _ended(process: subprocess.Popen[bytes]) -> int:
+    """The exit code of a job; one that does not come to its end is killed."""
+    try:
+        return process.wait(_PATIENCE_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()
 
 
 def _start(order: Order) -> subprocess.Popen[bytes]:

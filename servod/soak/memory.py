@@ -27,6 +27,8 @@ _MOST_SAMPLES = 2048
 _BLOCKS = 12
 #: Student's t for 95 %, two-sided, with _BLOCKS - 2 degrees of freedom.
 _T95 = 2.228
+#: A process that was watched for so long [s] must be told; one that was not cannot be.
+LONG_S = 1800.0
 _PAGE_KB = os.sysconf("SC_PAGE_SIZE") / 1024.0
 
 
@@ -99,6 +101,11 @@ class Memory:
         rest = resident_kb - slope * hours - level
         width = _T95 * math.sqrt(float(rest @ rest) / (_BLOCKS - 2) / float(spread @ spread))
         return Slope(float(slope), float(slope - width), float(slope + width), _growth(slope, width, points))
+
+    @property
+    def watched_s(self) -> float:
+        """From the first sample to the last."""
+        return float(self._samples[self._count - 1, 0] - self._samples[0, 0]) if self._count else 0.0
 
     def descriptors_grow(self) -> bool:
         """More descriptors are open in the last quarter than ever were in the second one."""

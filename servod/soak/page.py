@@ -17,14 +17,17 @@ _FAULT_HEADER = (
 
 
 def verdict(found: dict[str, Any]) -> str:
-    """The answer in one sentence."""
+    """The answer: what was wrong, why it is no pass, and what it does not tell."""
     amount = (
         f"{found['cycles']:,} cycles ({found['axis_hours']:.2f} h of axis time), {found['faults_injected']:,} faults"
     )
-    if found["passed"]:
-        return f"Nothing wrong in {amount}."
     wrong = ", ".join(f"{count:,} {kind}" for kind, count in found["wrong"].items())
-    return f"Wrong in {amount}: {wrong}."
+    said = [f"Wrong in {amount}: {wrong}." if wrong else f"Nothing wrong in {amount}."]
+    if found["unproven"]:
+        said.append(f"No pass: {', '.join(found['unproven'])}.")
+    if found["untold"]:
+        said.append(f"Whether memory grows is not told by so short a watch: {', '.join(found['untold'])}.")
+    return " ".join(said)
 
 
 def count_rows(found: dict[str, Any]) -> list[tuple[str, str]]:

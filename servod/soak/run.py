@@ -15,7 +15,7 @@ from typing import Any
 from servod.errors import ServodError
 from servod.report.files import write_bytes
 from servod.soak.counts import SoakedAxis
-from servod.soak.document import document
+from servod.soak.document import Course, document
 from servod.soak.finding import Wrong
 from servod.soak.memory import Growth, Memory
 from servod.soak.plan import Episode
@@ -33,6 +33,7 @@ class Watch:
     limit_s: float
     began_s: float = field(default_factory=time.monotonic)
     memories: dict[str, Memory] = field(default_factory=dict)
+    longest: dict[str, Memory] = field(default_factory=dict)
 
     @property
     def elapsed_s(self) -> float:
@@ -40,23 +41,29 @@ class Watch:
         return time.monotonic() - self.began_s
 
     def look(self, processes: dict[str, int]) -> None:
-        """Sample the memory of `processes`; one that was started anew is another one."""
+        """Sample the memory of `processes`; one that was started anew is another one, and the longest lived is kept."""
         for name, pid in processes.items():
             memory = self.memories.get(name)
             if memory is None or memory.pid != pid:
                 memory = self.memories[name] = Memory(pid)
             memory.sample()
+            if name not in self.longest or memory.watched_s >= self.longest[name].watched_s:
+                self.longest[name] = memory
 
 
 def run(
     axis: SoakedAxis, episodes: Iterable[Episode], cycles: int, limit_s: float, folder: Path, tell: Tell
 ) -> dict[str, Any]:
-    """Soak for `cycles`, at the longest `limit_s`; Ctrl-C ends it early. The document is in `folder` all the time."""
-    watch, interrupted = Watch(limit_s), False
+    """Soak for `cycles`, at the longest `limit_s`, or through all `episodes`; Ctrl-C ends it early, which is no pass.
+
+    The document is in `folder` all the time.
+    """
+    watch, course = Watch(limit_s), Course.CUT_SHORT
     try:
         _go_through(axis, episodes, cycles, watch, folder, tell)
+        course = Course.COMPLETE
     except KeyboardInterrupt:
-        interrupted = True
+        course = Course.INTERRUPTED
     except ServodError as error:
         axis.findings.add(Wrong.NOT_RECOVERED, 0, str(error))
     try:
@@ -64,7 +71,7 @@ def run(
     except ServodError as error:
         axis.findings.add(Wrong.STATE, 0, f"at the end: {error}")
     _judge_memory(axis, watch)
-    found = document(axis, watch.memories, watch.elapsed_s) | {"interrupted": interrupted, "running": False}
+    found = document(axis, watch.longest, watch.elapsed_s, course)
     save(found, folder)
     return found
 
@@ -77,7 +84,7 @@ def save(found: dict[str, Any], folder: Path) -> None:
 def _go_through(
     axis: SoakedAxis, episodes: Iterable[Episode], cycles: int, watch: Watch, folder: Path, tell: Tell
 ) -> None:
-    next_save_s = _SAVE_S
+    next_save_s = 0.0
     watch.look(axis.processes())
     for episode in episodes:
         axis.episode(episode)
@@ -85,7 +92,7 @@ def _go_through(
         done, elapsed_s = axis.counts.cycles, watch.elapsed_s
         tell(_line(axis, elapsed_s), max(done / cycles, elapsed_s / watch.limit_s))
         if elapsed_s > next_save_s:
-            save(document(axis, watch.memories, elapsed_s) | {"interrupted": False, "running": True}, folder)
+            save(document(axis, watch.longest, elapsed_s, Course.RUNNING), folder)
             next_save_s = elapsed_s + _SAVE_S
         if done >= cycles or elapsed_s >= watch.limit_s:
             return
@@ -99,7 +106,7 @@ def _line(axis: SoakedAxis, elapsed_s: float) -> str:
 
 
 def _judge_memory(axis: SoakedAxis, watch: Watch) -> None:
-    for name, memory in watch.memories.items():
+    for name, memory in watch.longest.items():
         slope = memory.slope()
         if slope.growth is Growth.GROWS:
             axis.findings.add(Wrong.MEMORY, 0, f"{name}: {slope.kb_per_h:.0f} kB/h")

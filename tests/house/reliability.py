@@ -36,6 +36,7 @@ def _soak(soak: dict[str, Any]) -> Row:
         f"{sum(soak['wrong'].values()):,} unexplained states, faults or torques",
         f"torque gone after {gone_ms:.0f} ms at the latest",
         *(f"memory of {memory['process']} {_memory(memory)}" for memory in soak["memory"]),
+        *(f"no pass: {reason}" for reason in soak.get("unproven", ())),
     ]
     command = "servoctl soak" + (" --wall" if soak["mode"] == "wall" else "")
     return [f"random moves and faults, {how}", much, "; ".join(out), f"`{command}`"]

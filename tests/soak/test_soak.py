@@ -4,20 +4,26 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
+import signal
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from servod.campaign.scenario import Recovery
 from servod.cli.app import run as servoctl
 from servod.commands import ReferenceKind
-from servod.errors import FaultCode
-from servod.soak.document import added
+from servod.errors import FaultCode, Unreachable
+from servod.soak.document import Course, added, document
 from servod.soak.finding import Wrong
 from servod.soak.kinds import KINDS, FaultKind
+from servod.soak.launch import Order, launch
+from servod.soak.memory import Memory
+from servod.soak.page import verdict
 from servod.soak.plan import Ending, Episode, Move, schedule
 from servod.soak.run import DOCUMENT_NAME, run
 from servod.soak.stepped import GAIN_SETS, SteppedSoak
@@ -33,6 +39,11 @@ def quiet(_line: str, _share: float) -> None:
 def befallen(fault: FaultKind) -> Episode:
     """An episode in which `fault` comes."""
     return Episode(1, None, _SINE, 0.25, fault, Ending.FINISH, 1)
+
+
+def children() -> set[int]:
+    """Processes that this one started."""
+    return {int(pid) for task in Path("/proc/self/task").iterdir() for pid in (task / "children").read_text().split()}
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +83,8 @@ def test_ctrl_c_leaves_a_report_of_what_was_done(axis: SteppedSoak, wrong: Count
         raise KeyboardInterrupt
 
     found = run(axis, interrupted(), 10**9, 600.0, tmp_path, quiet)
-    assert found["interrupted"] and found["passed"] and not wrong
+    assert found["interrupted"] and not found["passed"] and not wrong
+    assert found["unproven"] == ["interrupted"] and "No pass: interrupted." in verdict(found)
     assert json.loads((tmp_path / DOCUMENT_NAME).read_text())["rows"] == found["rows"] > 0
 
 
@@ -102,6 +114,47 @@ def test_a_recorder_that_loses_a_row_is_found(
     monkeypatch.setattr(recorder, "add_rows", lambda rows: takes(rows[1:]))
     axis.episode(replace(befallen(_KIND["frames destroyed"]), number=1))
     assert wrong == {Wrong.RECORDER: 1}
+
+
+def test_a_run_that_ends_by_itself_short_of_its_order_is_no_pass(axis: SteppedSoak, tmp_path: Path) -> None:
+    def lost() -> Iterator[Episode]:
+        raise Unreachable("the axis is not there any more")
+        yield
+
+    found = run(axis, lost(), 10**9, 600.0, tmp_path, quiet)
+    axis.findings.counts.clear()
+    assert not found["passed"] and found["unproven"] == [Course.CUT_SHORT]
+
+
+def test_jobs_that_are_killed_are_no_pass(tmp_path: Path) -> None:
+    killed, before = set[int](), children()
+
+    def kill(_line: str, _share: float) -> None:
+        """Both have told of their first episodes."""
+        for job in children() - before:
+            os.kill(job, signal.SIGKILL)
+            killed.add(job)
+
+    found = launch(Order(10**9, 1, False, None, tmp_path), 2, kill)
+    assert len(killed) == 2 and found["cycles"] > 0
+    assert not found["passed"] and found["wrong"] == {}
+    assert found["unproven"][-2:] == ["job 1 ended with -9", "job 2 ended with -9"]
+
+
+def test_a_short_run_says_that_it_cannot_tell_of_memory(axis: SteppedSoak, tmp_path: Path) -> None:
+    axis.findings.counts.clear()
+    found = run(axis, [befallen(_KIND["encoder alarm"])], 10**9, 600.0, tmp_path, quiet)
+    assert found["passed"] and found["untold"] == ["soak"] and "not told by so short a watch: soak" in verdict(found)
+
+
+def test_a_long_watch_that_cannot_tell_of_memory_is_no_pass(axis: SteppedSoak) -> None:
+    for hours, unproven in ((0.4, []), (1.0, ["memory of daemon cannot be told after 1.0 h"])):
+        memory = Memory()
+        for hour in np.linspace(0.0, hours, 100):  # more than the limit, less than what the allocator breathes
+            memory.add(hour * 3600.0, 1e5 + 1500.0 * hour, 8)
+        axis.findings.counts.clear()
+        found = document(axis, {"daemon": memory}, hours * 3600.0, Course.COMPLETE)
+        assert found["unproven"] == unproven and found["passed"] is (not unproven) and found["untold"] == ["daemon"]
 
 
 def test_several_runs_add_up(axis: SteppedSoak, tmp_path: Path) -> None:
