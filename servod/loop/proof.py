@@ -21,6 +21,8 @@ from servod.wiring_proof import Finding, Proof
 
 #: The joint must stand within this time, before the first push and after each.
 _REST_S, _SETTLE_S = 0.5, 0.5
+#: After a push it stands when it has not moved for REST_CYCLES without torque; the last torque acts so much later.
+_DELAY_CYCLES = 10
 #: The most torque is held so long before the joint counts as blocked, or twice as long while it creeps.
 _HOLD_S = 0.15
 #: Cycles without feedback over which the torque is held; then it ends and the push is done again.
@@ -75,6 +77,7 @@ class WiringProof:
         self._line = TorqueLine()
         self._pushes: list[Push] = []  # at most two
         self._signs_known = self._repeat = False
+        self._quiet_cycles = 0  # without torque, in a row
         self._stale_cycles = 0
         self._ratio = math.nan
 
@@ -156,6 +159,7 @@ class WiringProof:
     def _enter(self, stage: _Stage) -> None:
         self._stage, self._stage_s, self._torque_nm = stage, 0.0, 0.0
         self._hold_s = self._brake_direction = 0.0
+        self._quiet_cycles = 0
 
     # --- the stages ------------------------------------------------------------------------------------------------
     def _rest(self, _dt_s: float) -> Verdict | None:
@@ -216,7 +220,7 @@ class WiringProof:
             push.begin_motion(self._torque_nm, self._time_s, push.encoder_rad, push.amplifier_rad)
         verdict = (
             self._sensors()
-            or (judge.first_torque(push, self._bounds) if len(self._pushes) == 1 else None)
+            or judge.first_torque(push, self._bounds)
             or judge.energy(push, self._encoder_rad, self._bounds)
         )
         self._signs_known = verdict is None
@@ -229,7 +233,7 @@ class WiringProof:
         if len(self._pushes) == 1:
             self._enter(_Stage.SETTLE)
             return None
-        finding = Finding.ONE_WAY if self._pushes[0].began else Finding.NO_MOTION
+        finding = Finding.ONE_WAY if self._pushes[0].moved else Finding.NO_MOTION
         return judge.actual_torque(self._line, self._bounds) or Verdict(finding, self._bounds.most_nm)
 
     def _settle(self, dt_s: float) -> Verdict | None:
@@ -239,10 +243,15 @@ class WiringProof:
             self._brake(dt_s)
         else:
             self._torque_nm = 0.0
-        stands = self._torque_nm == 0.0 and not self._creeps()
-        if self._stage_s > _SETTLE_S and moves:
+        stands, late = self._stands(), self._stage_s > _SETTLE_S
+        if late and moves:
             return Verdict(Finding.NOT_AT_REST, self._encoder_rad - self._start_rad)
-        return self._go_on() if stands or self._stage_s > _SETTLE_S else None
+        return self._go_on() if stands or late else None
+
+    def _stands(self) -> bool:
+        """It has stood without torque for so long that a spring's way back is over: it would pass for a motion."""
+        self._quiet_cycles = self._quiet_cycles + 1 if self._wanted_nm == self._torque_nm == 0.0 else 0
+        return self._quiet_cycles > REST_CYCLES + _DELAY_CYCLES and not self._creeps()
 
     def _brake(self, dt_s: float) -> None:
         """Torque against the motion, growing while the joint does not slow down."""
@@ -274,7 +283,7 @@ class WiringProof:
     # --- verdicts --------------------------------------------------------------------------------------------------
     def _judge(self) -> Verdict:
         """Over both directions."""
-        if not self._pushes[0].began:
+        if not self._pushes[0].moved:
             return Verdict(Finding.ONE_WAY, self._bounds.most_nm)
         friction_nm = 0.5 * (self._break_away_nm(1.0) - self._break_away_nm(-1.0))
         return (
@@ -314,4 +323,4 @@ class WiringProof:
         return max(0.25 * self._travel_needed(), self._still_rad())
 
     def _break_away_nm(self, sign: float) -> float:
-        return next((p.sign * p.began_nm for p in self._pushes if p.sign == sign), math.nan)
+        return next((p.sign * p.began_nm for p in self._pushes if p.sign == sign and p.moved), math.nan)

@@ -123,8 +123,13 @@ class Push:
 
     @property
     def began(self) -> bool:
-        """The joint has begun to move."""
+        """The joint has begun to move, or to yield: a blocked one does so too."""
         return not math.isnan(self.began_nm)
+
+    @property
+    def moved(self) -> bool:
+        """The joint has moved by the travel that was asked for, which ended the torque."""
+        return not math.isnan(self.cut_nm)
 
     def ways(self, encoder_rad: float, amplifier_rad: float) -> tuple[float, float]:
         """Both sensors' ways since the start, positive along the torque."""

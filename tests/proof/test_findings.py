@@ -44,6 +44,15 @@ WRONG = {
     "a tenth of the torque": (stronger(0.1), {}, {"bought_for": JOINT}, Finding.NO_MOTION),
     "a thousandth of the torque": (stronger(1e-3), {}, {"bought_for": JOINT}, Finding.NO_MOTION),
     "blocked": (BLOCKED, FREE_AXIS, {"bought_for": JOINT}, Finding.NO_MOTION),
+    **{
+        f"closed brake that yields, {stiffness:g} N*m/rad": (
+            joint(friction={"kind": "lugre", "sigma0": stiffness, "sigma1": 1.0, "coulomb": 45.0, "static": 70.0}),
+            {},
+            {"bought_for": JOINT},
+            Finding.NO_MOTION,
+        )
+        for stiffness in (300.0, 400.0, 450.0, 950.0)
+    },
     "drive limits the torque": (JOINT, {}, {"max_torque_permille": 200}, Finding.TORQUE_ACTUAL),
     "free, and nobody said so": (joint(friction=FREE), FREE_AXIS, {"bought_for": JOINT}, Finding.TOO_EASY),
     "gravity and polarity": (
@@ -98,10 +107,14 @@ def test_a_load_that_friction_does_not_hold_is_said_so(phase):
     refused(outcome)
 
 
-def test_a_joint_at_a_stop_is_told_from_a_blocked_one():
-    """A load that the torque cannot lift stands for the stop."""
+@pytest.mark.parametrize("stiffness", [950.0, 150.0])
+@pytest.mark.parametrize("phase", [1.57, -1.57])
+def test_a_joint_at_a_stop_is_told_from_a_blocked_one(stiffness, phase):
+    """A load that the torque cannot lift stands for the stop, and yields like one; its way back is no motion."""
     config = {"wiring_proof": {"torque_nm": 0.08}}
-    outcome = proven(joint(gravity={"amplitude": 0.05, "phase": 1.57}), config, bought_for=JOINT)
+    friction = {"kind": "lugre", "sigma0": stiffness, "sigma1": 1.0, "coulomb": 0.045, "static": 0.07}
+    plant = joint(friction=friction, gravity={"amplitude": 0.05, "phase": phase})
+    outcome = proven(plant, config, bought_for=JOINT)
     assert outcome.finding == Finding.ONE_WAY
     refused(outcome)
 
@@ -117,7 +130,7 @@ def test_a_refused_axis_stays_refused_until_the_test_is_passed():
 
 def test_bounds_of_travel_and_speed_end_the_test():
     swift = joint(inertia=2e-4, delay_s=0.004)
-    too_far = proven(swift, {"wiring_proof": {"most_travel_rad": 0.004}})
+    too_far = proven(swift, {"wiring_proof": {"most_travel_rad": 0.003}})
     assert too_far.finding == Finding.TRAVEL
     refused(too_far)
     too_fast = proven(JOINT, {"wiring_proof": {"speed_rad_s": 0.1}})
