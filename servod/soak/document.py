@@ -24,7 +24,7 @@ _NS_PER_H = 3.6e12
 _SAID = (0, 1, None)
 _ADDED = (
     *("cycles", "rows", "missed", "syncs", "syncs_taken", "drive_samples", "recordings", "rows_read_back", "episodes"),
-    *("cpu_s", "restarts", "faults_injected", "faults_found", "faults_recovered", "axis_hours"),
+    *("cpu_s", "restarts", "faults_injected", "faults_while_proving", "faults_found", "faults_recovered", "axis_hours"),
 )
 
 
@@ -54,6 +54,7 @@ def document(axis: SoakedAxis, memories: Mapping[str, Memory], wall_s: float, co
         "episodes": tally.episodes,
         "restarts": tally.restarts,
         "faults_injected": sum(f.injected for f in faults),
+        "faults_while_proving": sum(f.proving for f in faults),
         "faults_found": sum(f.found for f in faults),
         "faults_recovered": sum(f.recovered for f in faults),
         "wrong": {str(kind): count for kind, count in findings.counts.items()},
@@ -117,7 +118,9 @@ def added(documents: Sequence[dict[str, Any]], exit_codes: Sequence[int | None] 
 
 def _added_fault(faults: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """One kind of fault of several runs."""
-    total: dict[str, Any] = {name: sum(f[name] for f in faults) for name in ("injected", "found", "recovered")}
+    total: dict[str, Any] = {
+        name: sum(f[name] for f in faults) for name in ("injected", "proving", "found", "recovered")
+    }
     total["latched"] = dict(sum((Counter(f["latched"]) for f in faults), Counter()))
     for name in ("detected", "left_command", "torque_gone"):
         bins = sum((Counter({int(place): n for place, n in f[name]["bins_ms"].items()}) for f in faults), Counter())

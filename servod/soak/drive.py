@@ -5,11 +5,10 @@ Behind the virtual drive, which writes the record by itself; nothing here comes 
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
+from servod.campaign.judge import NO_TORQUE_NM, Reaction, reaction
 from servod.drivers.virtual.drive_record import SAMPLE, DriveSample
 from servod.hal import DriveState
 from servod.soak.finding import Findings, Wrong
@@ -21,16 +20,6 @@ SAMPLE_ROW = np.dtype(
     [(name, _CODES[code]) for name, code in zip(DriveSample._fields, SAMPLE.format.lstrip("<"), strict=True)]
 )
 _ENERGISED = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE, DriveState.FAULT_REACTION_ACTIVE)
-#: Less than one count of the drive's torque is none.
-NO_TORQUE_NM = 1e-9
-
-
-class Reaction(NamedTuple):
-    """Milliseconds from the injection until the drive had left operation enabled, and until the torque was gone for the
-    rest of the samples; None when it did not happen."""
-
-    left_ms: float | None
-    gone_ms: float | None
 
 
 def samples_of(raw: bytes) -> Samples:
@@ -38,14 +27,10 @@ def samples_of(raw: bytes) -> Samples:
     return np.frombuffer(raw, dtype=SAMPLE_ROW)
 
 
-def reaction(samples: Samples, injected_ns: int) -> Reaction:
-    """What the drive did after `injected_ns`."""
-    after = samples[samples["time_ns"] >= injected_ns]
-    left = np.flatnonzero(after["state"] != DriveState.OPERATION_ENABLED)
-    torque = np.flatnonzero(np.abs(after["torque_nm"]) > NO_TORQUE_NM)
-    gone = int(torque[-1]) + 1 if len(torque) else 0
-    left_ms = _ms(after, int(left[0]), injected_ns) if len(left) else None
-    return Reaction(left_ms, _ms(after, gone, injected_ns) if gone < len(after) else None)
+def reaction_in(samples: Samples, injected_ns: int) -> Reaction:
+    """What the drive did after `injected_ns`, as the fault campaign judges it."""
+    after = samples[samples["time_ns"] >= injected_ns].tolist()
+    return reaction([DriveSample(time_ns, DriveState(state), *rest) for time_ns, state, *rest in after], injected_ns)
 
 
 class DriveCheck:
@@ -79,7 +64,3 @@ class DriveCheck:
     def _first(self, wrong: Wrong, samples: Samples, where: NDArray[np.bool_], text: str) -> None:
         if where.any():
             self._findings.add(wrong, int(samples["time_ns"][int(np.argmax(where))]), text, int(where.sum()))
-
-
-def _ms(samples: Samples, at: int, since_ns: int) -> float:
-    return float(samples["time_ns"][at] - since_ns) / 1e6

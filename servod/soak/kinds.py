@@ -45,8 +45,9 @@ class FaultKind:
     """One kind. `do` and `undo` are actions of servod.campaign.actions, with ranges where a number is drawn.
 
     `expects`: one of these at least is latched, within `latched_ms` of the injection; empty: the axis goes on. The
-    joint feels no torque from `gone_ms` on. `takes_syncs`: SYNC frames of this axis may be missing on the bus;
-    `deaf_cycles`: so many commands may not reach the drive.
+    drive has left the controller's command within `left_ms`, and the joint feels no torque from `gone_ms` on.
+    `takes_syncs`: SYNC frames of this axis may be missing on the bus; `deaf_cycles`: so many commands may not reach the
+    drive; `of_control`: the controller must act for it to be seen.
     """
 
     name: str
@@ -55,11 +56,13 @@ class FaultKind:
     explains: frozenset[FaultCode] = frozenset()
     undo: dict[str, dict[str, Any]] | None = None
     latched_ms: float = 0.0
+    left_ms: float = 0.0
     gone_ms: float = 0.0
     watch_ms: int = 300
     recovery: Recovery = Recovery.NONE
     takes_syncs: bool = False
     deaf_cycles: int = 0
+    of_control: bool = False
 
     def injection(self, chance: random.Random) -> Injection:
         """One occurrence, its numbers drawn."""
@@ -68,6 +71,12 @@ class FaultKind:
     def repair(self) -> Injection | None:
         """What takes the cause away; None when it goes by itself."""
         return None if self.undo is None else Injection(at_ms=0.0, do=self.undo)
+
+    def while_proving(self) -> FaultKind:
+        """The same when the wiring is being proven: whatever spoils the proof may end it."""
+        spoilt = frozenset({_F.WIRING_NOT_PROVEN})
+        expects = self.expects | spoilt if self.expects else self.expects
+        return replace(self, expects=expects, explains=self.explains | spoilt)
 
     @property
     def explained(self) -> int:
@@ -107,7 +116,9 @@ def _nmt(who: str, *commands: str) -> Action:
     return {"nmt": {"who": who, "command": OneOf(commands) if len(commands) > 1 else commands[0]}}
 
 
-def _node(name: str, do: Action, undo: Action | None = None, takes_syncs: bool = False) -> FaultKind:
+def _node(
+    name: str, do: Action, undo: Action | None = None, takes_syncs: bool = False, left_ms: float = MASTER_LOSS_MS
+) -> FaultKind:
     """A participant that is reset, stopped or away for long: it must be configured anew."""
     expects = frozenset(
         {
@@ -121,12 +132,18 @@ def _node(name: str, do: Action, undo: Action | None = None, takes_syncs: bool =
         expects,
         _NODE_GONE,
         undo,
-        latched_ms=MASTER_LOSS_MS,
+        latched_ms=left_ms,
+        left_ms=left_ms,
         gone_ms=MASTER_LOSS_MS,
         watch_ms=1200,
         recovery=Recovery.RESTART,
         takes_syncs=takes_syncs,
     )
+
+
+def _encoder(name: str, do: Action, undo: Action | None = None) -> FaultKind:
+    """The encoder does not answer any more, which is a loss of feedback."""
+    return _node(name, do, undo, left_ms=FEEDBACK_LOSS_MS)
 
 
 def _resettable(
@@ -140,6 +157,7 @@ def _resettable(
         _MOTION | {_F.DRIVE_LEFT_OPERATION},
         undo,
         latched_ms=latched_ms,
+        left_ms=latched_ms,
         gone_ms=latched_ms + MASTER_LOSS_MS,
         watch_ms=round(latched_ms) + 450,
         recovery=Recovery.RESET_FAULT,
@@ -182,7 +200,8 @@ KINDS: tuple[FaultKind, ...] = (
     _resettable("encoder feedback lost, many", _frames("encoder_feedback", "drop", 25, 200), {_F.FEEDBACK_STALE}),
     replace(
         _resettable("torque frames cut short", _frames("torque", "shorten", 1, 50, Between(1, 3)), {_F.DRIVE_FAULT}),
-        latched_ms=110.0,  # told by EMCY, and the monitor of the nodes looks ten times a second
+        latched_ms=70.0,  # told by EMCY, and the monitor of the nodes looks every 20 ms
+        left_ms=70.0,
         deaf_cycles=50,
     ),
     _resettable(
@@ -205,7 +224,7 @@ KINDS: tuple[FaultKind, ...] = (
         {_F.ENCODER_ALARM},
         _write("encoder", 0x2000, 1, 0),
     ),
-    _resettable("gains without numbers", _NAN_GAINS, {_F.NOT_FINITE}, _GOOD_GAINS),
+    replace(_resettable("gains without numbers", _NAN_GAINS, {_F.NOT_FINITE}, _GOOD_GAINS), of_control=True),
     _resettable(
         "another mode asked for",
         _write("amplifier", 0x6060, 0, OneOf((1, 3, 8, 9))),
@@ -214,17 +233,17 @@ KINDS: tuple[FaultKind, ...] = (
         latched_ms=400.0,
     ),
     # The nodes must be configured anew.
-    _node("encoder cut off", _silence("encoder", 40, 600)),
+    _encoder("encoder cut off", _silence("encoder", 40, 600)),
     _node("drive cut off", _silence("amplifier", 40, 600)),
     _node("loop cut off", _silence("loop", 200, 600), takes_syncs=True),
-    _node("encoder reset", _nmt("encoder", "reset_node", "reset_communication")),
+    _encoder("encoder reset", _nmt("encoder", "reset_node", "reset_communication")),
     _node("drive reset", _nmt("amplifier", "reset_node", "reset_communication")),
-    _node("encoder pre-operational", _nmt("encoder", "pre_operational")),
+    _encoder("encoder pre-operational", _nmt("encoder", "pre_operational")),
     _node("drive pre-operational", _nmt("amplifier", "pre_operational")),
     # A stopped node answers no SDO, so that nobody can ask who it is: a person sends this, or takes its supply away.
-    _node("encoder stopped", _nmt("encoder", "stop"), _nmt("encoder", "pre_operational")),
+    _encoder("encoder stopped", _nmt("encoder", "stop"), _nmt("encoder", "pre_operational")),
     _node("drive stopped", _nmt("amplifier", "stop"), _nmt("amplifier", "pre_operational")),
-    _node("encoder bus-off", {"bus_off": {"who": "encoder"}}),
+    _encoder("encoder bus-off", {"bus_off": {"who": "encoder"}}),
     _node("drive bus-off", {"bus_off": {"who": "amplifier"}}),
     _node("loop's interface down", {"interface_down": {"for_ms": Between(1, 500)}}, takes_syncs=True),
     _node("loop bus-off", {"bus_off": {"who": "loop"}}, takes_syncs=True),

@@ -45,6 +45,7 @@ def count_rows(found: dict[str, Any]) -> list[tuple[str, str]]:
         ("rows read back from recordings, byte by byte", f"{found['rows_read_back']:,}"),
         ("samples of the drive's own record", f"{found['drive_samples']:,}"),
         ("faults injected / found in the log", f"{found['faults_injected']:,} / {found['faults_found']:,}"),
+        ("of these while the wiring was being proven", f"{found['faults_while_proving']:,}"),
         ("unexplained states, faults, torques", f"{sum(found['wrong'].values()):,}"),
         ("daemon restarts", f"{found['restarts']:,}"),
         ("wall clock, processor", f"{found['wall_s'] / 3600.0:.2f} h, {found['cpu_s'] / 3600.0:.2f} h"),

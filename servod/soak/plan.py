@@ -16,6 +16,8 @@ from servod.soak.kinds import KINDS, FaultKind
 
 #: Share of the episodes in which something goes wrong.
 _FAULT_SHARE = 0.7
+#: Share of these in which it goes wrong while the wiring is proven, and how long a proof takes [s].
+_PROVING_SHARE, _PROOF_S = 0.15, 0.42
 #: The fastest reference [rad/s] and the largest amplitude [rad]: what the demo joint's torque can follow.
 _FASTEST_RAD_S, _LARGEST_RAD = 1.2, 0.3
 _SAMPLES_PER_S = 1000
@@ -43,7 +45,7 @@ class Move:
 @dataclass(frozen=True)
 class Episode:
     """One piece of a soak: `law` is a gain set to change to, None keeps what acts; the fault comes `before_s` into the
-    motion."""
+    motion, or, with `proves`, into a proof of the wiring in its place."""
 
     number: int
     law: str | None
@@ -52,6 +54,7 @@ class Episode:
     fault: FaultKind | None
     ending: Ending
     seed: int
+    proves: bool = False
 
 
 def schedule(seed: int, gain_sets: tuple[str, ...], kinds: tuple[FaultKind, ...] = KINDS) -> Iterator[Episode]:
@@ -68,8 +71,9 @@ def schedule(seed: int, gain_sets: tuple[str, ...], kinds: tuple[FaultKind, ...]
             fault = waiting.pop()
         move = _MOVES[chance.choice(tuple(_MOVES))](chance)
         law = chance.choice(gain_sets) if chance.random() < 0.3 else None
-        before_s = chance.uniform(0.02, 0.9) * min(move.duration_s, 1.5)
-        yield Episode(number, law, move, before_s, fault, chance.choice(tuple(Ending)), chance.getrandbits(32))
+        proves = fault is not None and not fault.of_control and chance.random() < _PROVING_SHARE
+        before_s = chance.uniform(0.02, 0.9) * (_PROOF_S if proves else min(move.duration_s, 1.5))
+        yield Episode(number, law, move, before_s, fault, chance.choice(tuple(Ending)), chance.getrandbits(32), proves)
 
 
 def home(from_rad: float) -> Move:

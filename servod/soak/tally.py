@@ -51,9 +51,10 @@ def median_ms(bins: Mapping[int, int]) -> int:
 
 @dataclass
 class FaultTally:
-    """One kind of fault."""
+    """One kind of fault; `proving`: so many came while the wiring was being proven."""
 
     injected: int = 0
+    proving: int = 0
     found: int = 0
     recovered: int = 0
     latched: Counter[str] = field(default_factory=Counter)
@@ -65,6 +66,7 @@ class FaultTally:
         """As JSON has it."""
         return {
             "injected": self.injected,
+            "proving": self.proving,
             "found": self.found,
             "recovered": self.recovered,
             "latched": dict(self.latched),

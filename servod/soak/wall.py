@@ -26,7 +26,7 @@ from servod.drivers.virtual.drive_record import DriveTail
 from servod.errors import AnswerIsNo, FaultCode, ServodError, Unreachable
 from servod.shipped import shipped
 from servod.soak.counts import Counts
-from servod.soak.drive import DriveCheck, reaction, samples_of
+from servod.soak.drive import DriveCheck, reaction_in, samples_of
 from servod.soak.finding import Findings, Wrong
 from servod.soak.kinds import FaultKind, fault_bits
 from servod.soak.plan import Ending, Episode, Move
@@ -71,7 +71,7 @@ class WallSoak:
         self.findings, self.tally = Findings(), Tally()
         over = {"recorder": {"always": True, "max_file_mib": 16}}
         with contextlib.ExitStack() as stack:
-            self._axis = ProcessAxis(nothing_yet(seed), folder, over=over)
+            self._axis = ProcessAxis(nothing_yet(seed, proves=False), folder, over=over)
             stack.callback(self._axis.close)
             self._axis.start(Start.OFF)
             self._heard = SyncThread(folder / "bus")
@@ -215,7 +215,7 @@ class WallSoak:
         tally.found += 1
         if not kind.expects:
             return
-        gone_ms = reaction(samples, injected_ns).gone_ms
+        gone_ms = reaction_in(samples, injected_ns).gone_ms
         if gone_ms is not None:
             tally.gone.add(gone_ms)
         if gone_ms is None or gone_ms > kind.gone_ms + _GRACE_MS:

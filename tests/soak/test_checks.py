@@ -7,6 +7,7 @@ import pytest
 
 from servod.axis import AxisState
 from servod.axis_model import load_axis_model
+from servod.campaign.judge import Reaction
 from servod.config import load_config
 from servod.controllers import LAWS
 from servod.drivers.virtual.world import SteppedWorld, VirtualAxisSettings
@@ -15,7 +16,7 @@ from servod.gains import load_gains
 from servod.hal import DriveState
 from servod.session import SteppedSession
 from servod.shipped import shipped
-from servod.soak.drive import SAMPLE_ROW, DriveCheck, reaction
+from servod.soak.drive import SAMPLE_ROW, DriveCheck, reaction_in
 from servod.soak.finding import Findings, Wrong
 from servod.soak.memory import Growth, Memory
 from servod.soak.rows import RowCheck, Rows, rows_of, run_lengths
@@ -169,8 +170,8 @@ def test_samples_that_nobody_read_are_found_once() -> None:
 def test_reaction_times_are_those_of_the_drive() -> None:
     on, off = DriveState.OPERATION_ENABLED, DriveState.SWITCH_ON_DISABLED
     samples = drive_samples([on, on, DriveState.QUICK_STOP_ACTIVE, off], [0.1, 0.1, 0.1, 0.0])
-    assert reaction(samples, PERIOD_NS) == (1.0, 2.0)
-    assert reaction(samples[:-1], PERIOD_NS) == (1.0, None)
+    assert reaction_in(samples, PERIOD_NS) == Reaction(1.0, 2.0)
+    assert reaction_in(samples[:-1], PERIOD_NS) == Reaction(1.0, None)
 
 
 @pytest.mark.parametrize(

@@ -67,7 +67,7 @@ def test_twenty_thousand_cycles_of_faults_leave_nothing_wrong(tmp_path: Path) ->
     assert found["passed"], found["findings"]
     assert found["cycles"] == found["rows"] == found["syncs"] + found["syncs_taken"] >= 20_000
     assert found["faults_injected"] == found["faults_found"] == found["faults_recovered"] >= 5
-    assert found["recordings"] == 1 and found["rows_read_back"] > 100
+    assert found["recordings"] == 2 and found["rows_read_back"] > 100
     assert json.loads((tmp_path / DOCUMENT_NAME).read_text()) == found
 
 
@@ -95,6 +95,7 @@ def test_ctrl_c_leaves_a_report_of_what_was_done(axis: SteppedSoak, wrong: Count
         (replace(_KIND["error in the drive"], expects=frozenset()), Wrong.UNEXPLAINED),
         (replace(_KIND["encoder feedback lost, many"], gone_ms=1.0), Wrong.LATE),
         (replace(_KIND["encoder feedback lost, many"], latched_ms=1.0), Wrong.LATE),
+        (replace(_KIND["encoder feedback lost, many"], left_ms=1.0), Wrong.LATE),
         (replace(_KIND["SYNC lost, a few"], takes_syncs=False), Wrong.SYNC),
         (replace(_KIND["error in the drive"], recovery=Recovery.ENABLE), Wrong.NOT_RECOVERED),
     ],
@@ -104,6 +105,26 @@ def test_what_the_schedule_does_not_explain_is_found(
 ) -> None:
     axis.episode(befallen(lie))
     assert finding in wrong
+
+
+def test_every_loss_of_feedback_is_held_to_fifty_milliseconds() -> None:
+    losses = [kind for kind in KINDS if FaultCode.FEEDBACK_STALE in kind.expects and "encoder" in kind.name]
+    assert len(losses) == 6 and {kind.left_ms for kind in losses} == {kind.latched_ms for kind in losses} == {50.0}
+
+
+@pytest.mark.parametrize("name", ["encoder alarm", "drive feedback lost, many", "encoder feedback lost, a few"])
+def test_a_fault_while_the_wiring_is_proven_leaves_nothing_wrong(
+    axis: SteppedSoak, wrong: Counter[Wrong], name: str
+) -> None:
+    before = axis.tally.of(name).proving
+    axis.episode(replace(befallen(_KIND[name]), before_s=0.2, proves=True))
+    assert axis.tally.of(name).proving == before + 1 and not wrong
+
+
+def test_the_wiring_is_proven_after_every_start(axis: SteppedSoak, wrong: Counter[Wrong]) -> None:
+    axis.episode(befallen(_KIND["encoder reset"]))
+    proof = axis._axis.session.proof
+    assert proof is not None and proof.passed and not wrong
 
 
 def test_a_recorder_that_loses_a_row_is_found(
