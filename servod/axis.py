@@ -37,6 +37,8 @@ _OFF_MASK = sum(FAULTS[code].bit for code in NEEDS_RESTART)
 #: A drive that is told to switch off, or to stop, and still shows this after this time does not obey.
 _POWERED = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
 _OBEY_S = 0.1
+#: The test of the wiring ends by itself after its time-out; one that does not is ended so much later.
+_PROOF_MARGIN_S = 0.25
 _CONTROLLED = (AxisState.ENABLED, AxisState.BRAKING, AxisState.RAMPING)
 #: On the way to ENABLED, or there.
 _UNDER_WAY = (AxisState.ENABLING, AxisState.PROVING, AxisState.ENABLED)
@@ -57,7 +59,9 @@ class AxisOutput(NamedTuple):
 class Axis:
     """State of one axis and its faults; `step` once per cycle."""
 
-    def __init__(self, period_s: float, ramp_down_s: float, enable_timeout_s: float, mode: Mode) -> None:
+    def __init__(
+        self, period_s: float, ramp_down_s: float, enable_timeout_s: float, mode: Mode, proof_timeout_s: float
+    ) -> None:
         """Times in seconds; `mode` is what the drive must show while enabled."""
         self.state = AxisState.DISABLED
         self.faults = 0  # present in this cycle
@@ -65,6 +69,7 @@ class Axis:
         self._period_s, self._mode = period_s, int(mode)
         self._ramp_cycles = max(1, round(ramp_down_s / period_s))
         self._timeout_cycles = max(1, round(enable_timeout_s / period_s))
+        self._proof_cycles = max(1, round((proof_timeout_s + _PROOF_MARGIN_S) / period_s))
         self._cycles_in_state = self._disobeyed_cycles = 0
         self._obey_cycles = max(4, round(_OBEY_S / period_s))
         self._reset_wanted, self._seen_off, self._seen_remote = False, True, False
@@ -248,9 +253,8 @@ class Axis:
         state = self.state
         if state == AxisState.ENABLING:
             return self._finish_enabling(amplifier, encoder_fresh)
-        if state == AxisState.PROVING and self._proven:
-            self._enter(AxisState.ENABLED)
-            return True
+        if state == AxisState.PROVING:
+            return self._finish_proving()
         if state == AxisState.BRAKING and (at_rest or self._cycles_in_state > self._ramp_cycles):
             self._enter(AxisState.RAMPING)
         ramped = state == AxisState.RAMPING and self._cycles_in_state >= self._ramp_cycles
@@ -264,11 +268,21 @@ class Axis:
             self._enter(AxisState.PROVING if self._prove else AxisState.ENABLED)
             return not self._prove
         if self._cycles_in_state > self._timeout_cycles:
-            fault = FaultCode.DRIVE_FAULT if amplifier.reasons & Reason.IN_FAULT else FaultCode.ENABLE_TIMEOUT
-            self.faults |= _BIT[fault]
-            self.latched |= _BIT[fault]
-            self._enter(AxisState.FAULT)
+            self._fail(FaultCode.DRIVE_FAULT if amplifier.reasons & Reason.IN_FAULT else FaultCode.ENABLE_TIMEOUT)
         return False
+
+    def _finish_proving(self) -> bool:
+        if self._proven:
+            self._enter(AxisState.ENABLED)
+        elif self._cycles_in_state > self._proof_cycles:
+            self._fail(FaultCode.WIRING_NOT_PROVEN)
+        return self._proven
+
+    def _fail(self, fault: FaultCode) -> None:
+        """What was to be enabled did not get there in its time."""
+        self.faults |= _BIT[fault]
+        self.latched |= _BIT[fault]
+        self._enter(AxisState.FAULT)
 
     def _quick_stop_is_over(self, amplifier: AmplifierFeedback) -> bool:
         """Over when the drive has switched itself off, or has had its time (it may hold in quick stop active)."""

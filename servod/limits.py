@@ -24,8 +24,11 @@ _LATE = _BIT[FaultCode.DEADLINE_LATE]
 _BUDGET = _BIT[FaultCode.DEADLINE_BUDGET]
 _CLIPPED = _BIT[FaultCode.TORQUE_CLIPPED]
 _RATE = _BIT[FaultCode.TORQUE_RATE_CLIPPED]
+_NOT_PROVEN = _BIT[FaultCode.WIRING_NOT_PROVEN]
 
 
+#: The test of the wiring ends itself beyond its travel; where it does not, the limits do beyond this multiple of it.
+PROVING_TRAVELS = 2.0
 #: Skipped periods that one punctual cycle makes up for: a single good cycle does not forgive a starving machine.
 _FORGIVEN_PER_CYCLE = 0.05
 #: Above this share of the speed limit a joint counts as moving.
@@ -45,12 +48,13 @@ class Limits:
         self.encoder_mismatch_rad = config.encoder_mismatch_rad
         self.stale_cycles, self.late_cycles = config.stale_cycles, config.late_cycles
         self._last_torque_nm = 0.0
-        self._encoder_offset_rad = 0.0
+        self._encoder_offset_rad = self._armed_at_rad = 0.0
         self._late_level = 0.0
 
     def arm(self, amplifier: AmplifierFeedback, encoder: EncoderFeedback) -> None:
         """At enable: both position sensors agree by definition now; torque starts from what is produced now."""
         self._encoder_offset_rad = amplifier.position_rad - encoder.position_rad
+        self._armed_at_rad = encoder.position_rad
         self._last_torque_nm = amplifier.torque_nm if math.isfinite(amplifier.torque_nm) else 0.0
 
     def feedback_faults(self, amplifier: AmplifierFeedback, encoder: EncoderFeedback, skipped: int) -> int:
@@ -85,6 +89,11 @@ class Limits:
         if same_moment and not difference_rad <= self.encoder_mismatch_rad:
             faults |= _MISMATCH
         return faults
+
+    def proving_faults(self, encoder: EncoderFeedback, most_travel_rad: float) -> int:
+        """While the wiring is proven: the joint stays near where the test began, whatever the test thinks of it."""
+        near = abs(encoder.position_rad - self._armed_at_rad) <= PROVING_TRAVELS * most_travel_rad
+        return 0 if near else _NOT_PROVEN
 
     def limit_torque(self, wanted_nm: float, dt_s: float) -> tuple[float, int]:
         """The torque that may go out, and fault bits of what was limited. Not finite gives zero."""

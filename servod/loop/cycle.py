@@ -91,10 +91,12 @@ class Cycle:
         self.encoder: Any = load_driver(plan.encoder.driver).cyclic(plan.encoder)
         self.exchange = Exchange(bus, clock, self.amplifier, self.encoder, plan)
         self.axis = Axis(
-            self._period_s, config.limits.ramp_down_s, config.amplifier.enable_timeout_s, Mode.CYCLIC_SYNC_TORQUE
-        )
+            self._period_s, config.limits.ramp_down_s, config.amplifier.enable_timeout_s, Mode.CYCLIC_SYNC_TORQUE,
+            config.wiring_proof.timeout_s,
+        )  # fmt: skip
         self.limits = Limits(config.limits)
-        self.proof = WiringProof(proof_bounds(config, plan.amplifier.facts))
+        bounds = proof_bounds(config, plan.amplifier.facts)
+        self.proof, self._proof_travel_rad = WiringProof(bounds), bounds.most_travel_rad
         self.proof_wanted = config.wiring_proof.enabled
         self.controller = Controller()
         self.controller.activate(plan.law, plan.parameters, 0.0)
@@ -150,6 +152,8 @@ class Cycle:
         if self.axis.state in _POWERED:
             followed = self.reference.position_rad if self.axis.state in _FOLLOWING else None
             faults |= self.limits.motion_faults(amplifier, encoder, followed)
+        if self.proof.running:
+            faults |= self.limits.proving_faults(encoder, self._proof_travel_rad)
         if not self._supervisor_alive():
             faults |= _SUPERVISOR_LOST
             self.shutting_down = True

@@ -12,7 +12,8 @@ from tests.boundary.feedback import amplifier
 
 S, D, F = AxisState, DriveState, FaultCode
 PERIOD_S = 2.0**-10
-RAMP, TIMEOUT, OBEY = 8, 16, 102  # cycles; 0.1 s are 102.4
+RAMP, TIMEOUT, OBEY, PROOF = 8, 16, 102, 64  # cycles; 0.1 s are 102.4
+PROOF_MARGIN = 256  # cycles
 BIT = {code: fault.bit for code, fault in FAULTS.items()}
 CONTROLLED = (S.ENABLED, S.BRAKING, S.RAMPING)
 BEFORE_CONTROL = (S.ENABLING, S.PROVING)
@@ -38,7 +39,7 @@ def step(axis: Axis, faults: int = 0, fresh: bool = True, at_rest: bool = False,
 
 
 def new() -> Axis:
-    return Axis(PERIOD_S, RAMP * PERIOD_S, TIMEOUT * PERIOD_S, Mode.CYCLIC_SYNC_TORQUE)
+    return Axis(PERIOD_S, RAMP * PERIOD_S, TIMEOUT * PERIOD_S, Mode.CYCLIC_SYNC_TORQUE, PROOF * PERIOD_S)
 
 
 def axis_in(state: AxisState) -> Axis:

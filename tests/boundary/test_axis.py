@@ -255,13 +255,13 @@ def test_quick_stop_has_its_time(drive: DriveState) -> None:
 
 
 def test_times_shorter_than_a_cycle_are_one_cycle() -> None:
-    axis = Axis(PERIOD_S, 1e-9, 1e-9, Mode.CYCLIC_SYNC_TORQUE)
+    axis = Axis(PERIOD_S, 1e-9, 1e-9, Mode.CYCLIC_SYNC_TORQUE, 1.0)
     axis.enable(False)
     step(axis)
     assert axis.state == S.ENABLING
     step(axis)
     assert axis.state == S.FAULT
-    axis = Axis(PERIOD_S, 1e-9, TIMEOUT * PERIOD_S, Mode.CYCLIC_SYNC_TORQUE)
+    axis = Axis(PERIOD_S, 1e-9, TIMEOUT * PERIOD_S, Mode.CYCLIC_SYNC_TORQUE, 1.0)
     axis.enable(False)
     step(axis, **READY)
     axis.disable()

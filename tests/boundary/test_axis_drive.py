@@ -15,6 +15,8 @@ from tests.boundary.axis_rig import (
     OBEY,
     OFF,
     PERIOD_S,
+    PROOF,
+    PROOF_MARGIN,
     RAMP,
     READY,
     TIMEOUT,
@@ -48,6 +50,19 @@ def test_proof_stands_between_power_and_control() -> None:
     axis.proven()
     output = step(axis)
     assert (axis.state, output.just_enabled, output.torque_share) == (S.ENABLED, True, 1.0)
+
+
+def test_proof_that_does_not_end_is_ended() -> None:
+    axis = axis_in(S.PROVING)
+    for _ in range(PROOF + PROOF_MARGIN):
+        step(axis)
+    assert (axis.state, axis.faults) == (S.PROVING, 0)
+    output = step(axis)
+    assert (axis.state, output.controlled, output.just_enabled) == (S.FAULT, False, False)
+    assert axis.latched == axis.faults == BIT[F.WIRING_NOT_PROVEN]
+    axis.proven()
+    step(axis)
+    assert axis.state == S.FAULT
 
 
 def test_proof_of_the_last_time_does_not_count() -> None:
@@ -182,7 +197,7 @@ def test_count_begins_with_the_order_to_switch_off() -> None:
 
 
 def test_quick_stop_may_hold_for_as_long_as_it_takes() -> None:
-    axis = Axis(PERIOD_S, RAMP * PERIOD_S, 1000 * PERIOD_S, Mode.CYCLIC_SYNC_TORQUE)
+    axis = Axis(PERIOD_S, RAMP * PERIOD_S, 1000 * PERIOD_S, Mode.CYCLIC_SYNC_TORQUE, 1.0)
     axis.enable(False)
     step(axis, **READY)
     axis.quick_stop()
@@ -191,5 +206,5 @@ def test_quick_stop_may_hold_for_as_long_as_it_takes() -> None:
 
 
 def test_slow_loop_gives_a_drive_four_cycles() -> None:
-    axis = Axis(0.1, 0.1, 0.1, Mode.CYCLIC_SYNC_TORQUE)
+    axis = Axis(0.1, 0.1, 0.1, Mode.CYCLIC_SYNC_TORQUE, 1.0)
     assert cycles_until_disobedience(axis, state=D.OPERATION_ENABLED) == 5

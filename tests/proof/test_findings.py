@@ -138,6 +138,31 @@ def test_bounds_of_travel_and_speed_end_the_test():
     refused(too_fast)
 
 
+@pytest.mark.parametrize(
+    ("torque_nm", "plant", "most_rad", "most_s"),
+    [
+        (0.05, JOINT, 0.01, 6.0),
+        (0.2, joint(friction={"kind": "coulomb_viscous", "coulomb": 0.045, "viscous": 0.3}), 0.12, 1.0),
+    ],
+    ids=["for ever", "too far"],
+)
+def test_what_the_test_does_not_end_the_axis_and_its_limits_do(torque_nm, plant, most_rad, most_s):
+    """A test that has lost its bounds: its torque neither ends nor heeds how far the joint is."""
+    session = axis(plant)
+    session.run(0.01)
+    start_rad = session.world.truth().position_rad
+    assert session.send(Op.ENABLE) == Refusal.DONE
+    session.run(0.05)
+    assert session.cycle.axis.state == AxisState.PROVING
+    session.cycle.proof.step = lambda *_: torque_nm
+    session.run(most_s)
+    assert session.cycle.axis.state == AxisState.FAULT
+    assert session.cycle.axis.latched & FAULTS[FaultCode.WIRING_NOT_PROVEN].bit
+    assert session.world.truth().torque_nm == 0.0
+    assert abs(session.world.truth().position_rad - start_rad) < most_rad
+    assert session.proof is not None and session.proof.finding == Finding.INTERRUPTED
+
+
 def test_every_finding_has_a_sentence_and_a_remedy_and_a_document_without_nan():
     proof = proven(JOINT).proof
     for finding in Finding:
