@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
-from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, example, report
+from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, connect, example, report
 
 _ENABLE_HELP = example(
     "Enable the axis and wait until it is; holds where it stands. The first time after a start, polarity, scale and "
@@ -35,9 +36,22 @@ def enable(
     as_json: JsonOption = False,
 ) -> None:
     """Enable the axis."""
-    result = ask(socket, "enable", reset_fault=reset_fault, prove=prove)
+    result = _enable_or_leave_off(socket, reset_fault=reset_fault, prove=prove)
     wiring = result.get("wiring")
     report(result, f"enabled\n{wiring['text']}" if wiring else "enabled", as_json)
+
+
+def _enable_or_leave_off(socket: Path, **arguments: bool) -> dict[str, Any]:
+    """Enable and wait; whatever interrupts it has the axis off before it ends the command."""
+    from servod.demo.processes import sigterm_as_interrupt
+
+    with connect(socket) as client, sigterm_as_interrupt():
+        try:
+            result: dict[str, Any] = client.call("enable", **arguments)
+        except KeyboardInterrupt:
+            client.call("disable")
+            raise
+    return result
 
 
 def disable(socket: SocketOption = DEFAULT_SOCKET, as_json: JsonOption = False) -> None:

@@ -6,6 +6,7 @@ work runs in one slow thread.
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -44,7 +45,10 @@ from servod.recorder import Recorder
 from servod.units import NS_PER_S
 from servod.wiring_proof import document, sentence
 
+log = logging.getLogger("servod.control")
+
 _ON_THE_WAY = (AxisState.ENABLING, AxisState.PROVING)
+_UNDER_WAY = (*_ON_THE_WAY, AxisState.ENABLED)
 _NOT_PROVEN = FAULTS[FaultCode.WIRING_NOT_PROVEN].bit
 _STOPPED = (AxisState.DISABLED, AxisState.FAULT)
 _UNPOWERED = (
@@ -77,6 +81,7 @@ class Verbs:
         self._uploaded = Table()
         self._reference_seq = 0  # the last motion's command
         self._leases_ended = 0
+        self._enabling = 0  # requests to enable an axis that was off, without an answer yet
         self.slow = ThreadPoolExecutor(max_workers=1, thread_name_prefix="slow")
         self._table: dict[Verb, Callable[[Any], Flow]] = {
             Verb.STATUS: self._status,
@@ -110,9 +115,13 @@ class Verbs:
         return record is not None and (record.command_seq < self._reference_seq or bool(record.reference_active))
 
     def lease_ended(self) -> None:
-        """Samples that the client sent ahead are void, and a gain set that it tried is not kept."""
+        """Samples that the client sent ahead are void, a gain set that it tried is not kept, nor is an axis enabled
+        that it waited for."""
         self._uploaded = Table()
         self._leases_ended += 1
+        if self._enabling:
+            log.warning("the client that waited for the axis to be enabled left: disabled again")
+            self._flows.start(self._disable(NoArgs()), Reply(lambda _answer: None, None))
         if self._bank.on_trial:
             self._flows.start(self._gains_rollback(_LEFT), Reply(lambda _answer: None, None))
 
@@ -152,6 +161,15 @@ class Verbs:
         return self._document()
 
     def _enable(self, args: EnableArgs) -> Flow:
+        record = self._loop.latest
+        from_off = int(record is None or record.axis_state not in _UNDER_WAY)
+        self._enabling += from_off
+        try:
+            return (yield from self._enable_and_wait(args))
+        finally:
+            self._enabling -= from_off
+
+    def _enable_and_wait(self, args: EnableArgs) -> Flow:
         tests_before, _ = self._loop.proofs
         yield self._send(Op.ENABLE, (float(args.reset_fault), float(args.prove)))
         timeout_s = self._config.amplifier.enable_timeout_s + self._config.wiring_proof.timeout_s + 1.0

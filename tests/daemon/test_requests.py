@@ -204,12 +204,16 @@ def test_mistake_in_a_flow_ends_the_request_only() -> None:
 class _Loop:
     """What the verbs need of the loop's handle, with a loop that answers when it is told to."""
 
+    proofs = (0, None)
+
     def __init__(self) -> None:
+        self.sent: list[Op] = []
         self.latest = record(1, axis_state=AxisState.ENABLED)
         self.seq = 0
         self.area: list[float] = []
 
-    def send(self, _op: Op, _arguments: Sequence[float] = ()) -> int:
+    def send(self, op: Op, _arguments: Sequence[float] = ()) -> int:
+        self.sent.append(op)
         self.seq += 1
         return self.seq
 
@@ -274,6 +278,33 @@ def test_samples_of_a_client_that_left_are_void(verbs: tuple[Verbs, _Loop]) -> N
     answers = _Answers()
     front.handle(Verb.TRACK, {"kind": "csv", "uploaded": True}, answers.reply())
     assert "found 0 samples" in answers.sent[0]["error"]["message"]
+
+
+@pytest.mark.parametrize("seen", [None, AxisState.ENABLING, AxisState.PROVING])
+def test_axis_is_not_enabled_for_a_client_that_left(verbs: tuple[Verbs, _Loop], seen: AxisState | None) -> None:
+    front, loop = verbs
+    loop.latest = record(1, axis_state=AxisState.DISABLED)
+    front.handle(Verb.ENABLE, {}, _Answers().reply())
+    if seen is not None:
+        loop.latest = record(2, axis_state=seen, command_seq=1)
+        front.tick([loop.latest], time.monotonic_ns())
+    front.lease_ended()
+    assert loop.sent == [Op.ENABLE, Op.DISABLE]
+
+
+def test_axis_stays_enabled_when_its_client_leaves_with_the_answer(verbs: tuple[Verbs, _Loop]) -> None:
+    front, loop = verbs
+    for before in (AxisState.DISABLED, AxisState.ENABLED):
+        answers = _Answers()
+        loop.latest = record(1, axis_state=before)
+        front.handle(Verb.ENABLE, {}, answers.reply())
+        if before is AxisState.DISABLED:
+            loop.latest = record(2, axis_state=AxisState.ENABLED, command_seq=loop.seq)
+            front.tick([loop.latest], time.monotonic_ns())
+            front.tick([], time.monotonic_ns())
+            assert answers.sent[0]["ok"]
+        front.lease_ended()
+    assert loop.sent == [Op.ENABLE, Op.ENABLE]
 
 
 @pytest.mark.parametrize("verb", [Verb.STOP, Verb.DISABLE])
