@@ -19,6 +19,7 @@ _DOUBTFUL = sum(
     FAULTS[code].bit
     for code in (
         FaultCode.SPEED_LIMIT,
+        FaultCode.FOLLOWING_ERROR,
         FaultCode.ENCODER_IMPLAUSIBLE,
         FaultCode.ENCODER_ALARM,
         FaultCode.NOT_FINITE,
