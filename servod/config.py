@@ -128,7 +128,13 @@ class WiringProofConfig(Strict):
     """The bounded test of polarity, scale and directions before the first torque (servod.loop.proof)."""
 
     enabled: bool = Field(True, description="prove at the first enable after a start, and after what makes it doubtful")
-    torque_nm: float | None = Field(None, gt=0.0, le=1e5, description="most torque; none: 0.9 of limits.torque_nm")
+    torque_nm: float | None = Field(
+        None,
+        gt=0.0,
+        le=1e5,
+        description="most torque; none: 0.9 of limits.torque_nm, or 15 times what friction_nm and inertia lead to "
+        "expect and 0.075 of limits.torque_nm, if that is less",
+    )
     ramp_s: float = Field(0.2, ge=0.05, le=10.0, description="from next to no torque to the most, exponentially")
     travel_rad: float | None = Field(
         None, gt=0.0, le=1.0, description="a motion; none: 0.001 rad, or more where the sensors need it"

@@ -51,6 +51,8 @@ class Proof(NamedTuple):
     speed_rad_s: float  # highest
     noise_rad: float  # of the encoder at rest
     duration_s: float
+    expected_nm: float  # friction that was stated or that the model has; NaN where nobody says
+    scale_factor: float  # a torque wrong by less than this would have passed too; infinite where nothing bounds it
 
     @property
     def passed(self) -> bool:
@@ -177,7 +179,7 @@ FINDINGS: dict[Finding, _Row] = {
 def sentence(proof: Proof) -> str:
     """What a test found, in one line: what was measured, or which check failed, found, allowed and remedy."""
     if proof.passed:
-        return f"wiring proven: {_measured(proof)}"
+        return f"wiring proven: {_measured(proof)}; {_scale(proof)}"
     row = FINDINGS[Finding(int(proof.finding))]
     text = row.text.format(found=proof.found, lowest=proof.lowest, highest=proof.highest, **_longer(proof.found))
     return f"wiring not proven ({Finding(int(proof.finding)).name}): {text}; {row.remedy}. Measured: {_measured(proof)}"
@@ -200,6 +202,16 @@ def _longer(ratio: float) -> dict[str, Any]:
     """Which sensor moved further, in words, and how many times; `ratio` is the amplifier's way over the encoder's."""
     first, second = ("amplifier's", "encoder's") if ratio > 1.0 else ("encoder's", "amplifier's")
     return {"longer": first, "shorter": second, "times": max(ratio, 1.0 / ratio) if ratio > 0.0 else math.inf}
+
+
+def _scale(proof: Proof) -> str:
+    """How sharply a test that passed has proven the scale of the torque, and what would make it sharper."""
+    known = math.isfinite(proof.scale_factor)
+    only = "only " if known else ""
+    how = f"to within a factor of {proof.scale_factor:.2g}" if known else "not at all, for nothing bounds it"
+    if math.isfinite(proof.expected_nm) and known:
+        return f"the scale of the torque is proven {how}"
+    return f"the scale of the torque is proven {only}{how}: state {_KNOWN}"
 
 
 def _measured(proof: Proof) -> str:

@@ -30,7 +30,7 @@ from servod.master import Master
 from servod.master.planned import check_names, planned_bus_load
 from servod.notify import Notifier
 from servod.recorder import Recorder
-from servod.wiring_expected import with_expected
+from servod.wiring_expected import warnings, with_expected
 from servod.yaml12 import read_text
 
 log = logging.getLogger("servod")
@@ -82,9 +82,10 @@ def _supervise(config: AxisConfig, nodes: Nodes, bank: GainBank, recorder: Recor
     """Loop and supervisor on nodes that are operational; `undo` is what to do when that fails half-way."""
     gains = bank.newest.gains
     plans = nodes.plans
-    loop = LoopHandle(
-        LoopPlan(with_expected(config), plans.amplifier, plans.encoder, int(gains.law.number), gains.pack())
-    )
+    expected = with_expected(config)
+    for line in warnings(expected):
+        log.warning("%s", line)
+    loop = LoopHandle(LoopPlan(expected, plans.amplifier, plans.encoder, int(gains.law.number), gains.pack()))
     undo.callback(_give_back, nodes, loop)
     _start_loop(loop)
     return Supervisor(config, nodes, loop, bank, recorder, Notifier())

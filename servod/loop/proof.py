@@ -109,6 +109,7 @@ class WiringProof:
             *verdict,
             self._break_away_nm(1.0), self._break_away_nm(-1.0), self._ratio, self._line.slope, self._travel_rad,
             self._encoder_rad - self._start_rad, self._fastest_rad_s, self._noise_rad, self._time_s,
+            self._bounds.friction_nm, judge.scale_factor(self._bounds),
         )  # fmt: skip
 
     # --- one cycle -------------------------------------------------------------------------------------------------
@@ -233,8 +234,13 @@ class WiringProof:
         if len(self._pushes) == 1:
             self._enter(_Stage.SETTLE)
             return None
-        finding = Finding.ONE_WAY if self._pushes[0].moved else Finding.NO_MOTION
-        return judge.actual_torque(self._line, self._bounds) or Verdict(finding, self._bounds.most_nm)
+        first, bounds = self._pushes[0], self._bounds
+        if verdict := judge.actual_torque(self._line, bounds):
+            return verdict
+        if not first.moved:
+            return Verdict(Finding.NO_MOTION, bounds.most_nm)
+        at_least_nm = 0.5 * (first.began_nm + bounds.most_nm)  # friction: the other break-away lies beyond the most
+        return judge.friction(at_least_nm, bounds) or Verdict(Finding.ONE_WAY, bounds.most_nm)
 
     def _settle(self, dt_s: float) -> Verdict | None:
         """Brake what moves, release what stands, and go on when it has stood for its time."""

@@ -35,6 +35,8 @@ FRICTION_RATIO_LOW, FRICTION_RATIO_HIGH = 0.2, 10.0
 LEAST_SHARE = 0.005
 #: An expected friction near nothing is no bound: this share of limits.torque_nm is always allowed.
 ALLOWED_SHARE = 0.05
+#: Most torque over the most friction that passes, where friction is expected: a load comes on top, or too much shows.
+MOST_RATIO = 1.5
 #: Energy of the motion over the work of the torque; gravity may help as much as four times the torque.
 MOST_ENERGY = 30.0
 #: A motion under the very first torque, or up to this multiple of it.
@@ -79,16 +81,14 @@ def proof_bounds(config: AxisConfig, amplifier_facts: Mapping[str, Any]) -> Proo
     encoder_count = TWO_PI / encoder.counts_per_turn
     amplifier_count = TWO_PI / (amplifier.counts_per_turn * amplifier.gear_ratio)
     torque_count = float(amplifier_facts.get("rated_torque_nm", math.nan)) * amplifier.gear_ratio / PER_MILLE
-    most_nm = asked.torque_nm or SHARE * limits.torque_nm
     most_travel = asked.most_travel_rad or max(MOST_TRAVEL_RAD, MOST_TRAVEL_COUNTS * encoder_count)
     travel = max(asked.travel_rad or TRAVEL_RAD, TRAVEL_COUNTS * max(encoder_count, amplifier_count))
     travel = min(travel, most_travel / 3.0)
     lone_travel = max(LONE_TRAVELS * travel, LONE_SHARE * limits.encoder_mismatch_rad)
-    first_nm = max(FIRST_SHARE * most_nm, torque_count) if math.isfinite(torque_count) else FIRST_SHARE * most_nm
-    return ProofBounds(
+    bounds = ProofBounds(
         period_s=config.cycle.period_us * NS_PER_US / NS_PER_S,
-        most_nm=most_nm,
-        first_nm=min(first_nm, most_nm),
+        most_nm=asked.torque_nm or SHARE * limits.torque_nm,
+        first_nm=0.0,
         growth_per_s=-math.log(FIRST_SHARE) / asked.ramp_s,
         rate_nm_per_s=SHARE * limits.torque_rate_nm_per_s,
         travel_rad=travel,
@@ -104,6 +104,16 @@ def proof_bounds(config: AxisConfig, amplifier_facts: Mapping[str, Any]) -> Proo
         inertia=math.nan if asked.inertia is None else asked.inertia,
         friction_nm=math.nan if asked.friction_nm is None else asked.friction_nm,
     )
+    return _with_torques(bounds, asked.torque_nm is None)
+
+
+def _with_torques(bounds: ProofBounds, capped: bool) -> ProofBounds:
+    """First and most torque; `capped`: no more than what is expected of the joint needs, where that is known."""
+    most_nm = min(bounds.most_nm, MOST_RATIO * friction_range(bounds)[1]) if capped else bounds.most_nm
+    first_nm = FIRST_SHARE * most_nm
+    if math.isfinite(bounds.torque_count_nm):
+        first_nm = max(first_nm, bounds.torque_count_nm)
+    return bounds._replace(most_nm=most_nm, first_nm=min(first_nm, most_nm))
 
 
 class Push:
@@ -246,8 +256,25 @@ def friction_range(bounds: ProofBounds) -> tuple[float, float]:
     expected, limit_nm = bounds.friction_nm, bounds.limit_nm
     if math.isnan(expected):
         return LEAST_SHARE * limit_nm, math.inf
+    return FRICTION_RATIO_LOW * expected, FRICTION_RATIO_HIGH * _expected_nm(bounds) + ALLOWED_SHARE * limit_nm
+
+
+def _expected_nm(bounds: ProofBounds) -> float:
+    """Torque of an expected break-away: friction, and what the ramp gets ahead while the inertia yields."""
     heavy_nm = 0.0 if math.isnan(bounds.inertia) else bounds.inertia * bounds.travel_rad * bounds.growth_per_s**2
-    return FRICTION_RATIO_LOW * expected, FRICTION_RATIO_HIGH * (expected + heavy_nm) + ALLOWED_SHARE * limit_nm
+    return bounds.friction_nm + heavy_nm
+
+
+def scale_factor(bounds: ProofBounds) -> float:
+    """By how much the torque may be too strong or too weak and still pass; infinite where nothing bounds it."""
+    lowest_nm, highest_nm = friction_range(bounds)
+    if math.isnan(bounds.friction_nm):
+        return bounds.most_nm / lowest_nm
+    expected_nm = _expected_nm(bounds)
+    by_energy = math.inf if math.isnan(bounds.inertia) else MOST_ENERGY
+    too_strong = expected_nm / lowest_nm if lowest_nm > 0.0 else by_energy
+    too_weak = min(highest_nm, bounds.most_nm) / expected_nm if expected_nm > 0.0 else math.inf
+    return max(too_strong, too_weak)
 
 
 def friction(friction_nm: float, bounds: ProofBounds) -> Verdict | None:

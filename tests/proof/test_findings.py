@@ -163,6 +163,30 @@ def test_what_the_test_does_not_end_the_axis_and_its_limits_do(torque_nm, plant,
     assert session.proof is not None and session.proof.finding == Finding.INTERRUPTED
 
 
+@pytest.mark.parametrize("factor", [1.0, 3.0, 10.0, 40.0])
+def test_a_proof_says_how_sharply_it_has_judged_the_scale_of_the_torque(factor):
+    """Where nothing is stated a joint on a far too strong drive may be a lighter joint: the sentence says so."""
+    blunt = proven(stronger(factor), bought_for=JOINT)
+    assert blunt.enabled
+    assert blunt.proof.scale_factor > 100.0
+    told = document(blunt.proof)
+    assert "only to within a factor of 1.8e+02: state wiring_proof.friction_nm" in told["text"]
+    assert (told["expected_nm"], told["scale_factor"]) == (None, pytest.approx(180.0))
+    sharp = proven(stronger(factor), KNOWN, bought_for=JOINT)
+    assert sharp.enabled is (factor < 5.0)
+    assert sharp.proof.scale_factor < 6.0
+    assert "only" not in sentence(sharp.proof)
+
+
+def test_no_more_torque_is_used_than_the_joint_can_need():
+    """A blocked joint on a strong drive feels no more than that."""
+    limits = {"limits": {"torque_nm": 30.0, "torque_rate_nm_per_s": 30000.0}}
+    stated = axis(BLOCKED, limits | KNOWN, rated_torque_mnm=30000)
+    assert enable(stated).finding == Finding.NO_MOTION
+    most_nm = 15.0 * (0.07 + 0.001 * 0.001 * (math.log(1000.0) / 0.2) ** 2) + 0.075 * 30.0
+    assert max(abs(row.torque_nm) for row in stated.records) == pytest.approx(most_nm, rel=0.01)
+
+
 def test_every_finding_has_a_sentence_and_a_remedy_and_a_document_without_nan():
     proof = proven(JOINT).proof
     for finding in Finding:

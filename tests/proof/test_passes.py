@@ -13,6 +13,7 @@ from servod.axis_model import AxisModel, axis_model_yaml, load_axis_model
 from servod.commands import Op, ReferenceKind, Refusal
 from servod.errors import FAULTS, FaultCode
 from servod.shipped import shipped
+from servod.wiring_expected import warnings, with_expected
 from servod.wiring_proof import Finding, sentence
 from tests.proof.rig import axis, enable, joint, proven
 
@@ -124,10 +125,11 @@ def test_once_proven_it_is_enabled_at_once_and_proven_again_when_asked():
     assert again.proof is not first.proof
 
 
-def test_a_jump_between_the_sensors_makes_it_doubtful_again():
+@pytest.mark.parametrize("code", [FaultCode.ENCODER_IMPLAUSIBLE, FaultCode.FOLLOWING_ERROR])
+def test_a_jump_between_the_sensors_or_a_lost_reference_makes_it_doubtful_again(code):
     session = axis(joint())
     enable(session)
-    session.cycle.axis.note(FAULTS[FaultCode.ENCODER_IMPLAUSIBLE].bit)
+    session.cycle.axis.note(FAULTS[code].bit)
     session.send(Op.DISABLE)
     session.run(0.3)
     before = session.proof
@@ -156,6 +158,7 @@ def test_the_axis_model_says_what_to_expect(tmp_path):
     model = tmp_path / "model.yaml"
     model.write_text(axis_model_yaml(joint()))
     session = axis(joint(), {"model": str(model)})
+    assert warnings(with_expected(session.config)) == []
     assert session.config.wiring_proof.friction_nm == 0.07
     assert session.config.wiring_proof.inertia == 0.001
     assert enable(session).enabled
@@ -163,6 +166,8 @@ def test_the_axis_model_says_what_to_expect(tmp_path):
 
 def test_a_switched_off_test_is_not_run_but_when_asked_for():
     session = axis(joint(), {"wiring_proof": {"enabled": False}})
+    assert "the first torque comes unproven" in warnings(session.config)[0]
+    assert "judge the scale" in warnings(axis(joint()).config)[0]
     session.enable()
     assert session.proof is None
     session.send(Op.DISABLE)
