@@ -63,6 +63,7 @@ def document(axis: SoakedAxis, memories: Mapping[str, Memory], wall_s: float, co
         "moves": dict(tally.moves),
         "endings": dict(tally.endings),
         "gain_sets": dict(tally.laws),
+        "excused": dict(tally.excused),
         "memory": [memory_document(name, memory) for name, memory in memories.items()],
     }
 
@@ -109,7 +110,7 @@ def added(documents: Sequence[dict[str, Any]], exit_codes: Sequence[int | None] 
         "findings": [finding for d in documents for finding in d["findings"]],
         "memory": [memory for d in documents for memory in d["memory"]],
     }
-    for name in ("wrong", "moves", "endings", "gain_sets"):
+    for name in ("wrong", "moves", "endings", "gain_sets", "excused"):
         total[name] = dict(sum((Counter(d[name]) for d in documents), Counter()))
     kinds = sorted({kind for d in documents for kind in d["faults"]})
     total["faults"] = {k: _added_fault([d["faults"][k] for d in documents if k in d["faults"]]) for k in kinds}

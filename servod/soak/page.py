@@ -25,6 +25,9 @@ def verdict(found: dict[str, Any]) -> str:
     said = [f"Wrong in {amount}: {wrong}." if wrong else f"Nothing wrong in {amount}."]
     if found["unproven"]:
         said.append(f"No pass: {', '.join(found['unproven'])}.")
+    if found["excused"]:
+        excused = ", ".join(f"{name} {count:,} times" for name, count in found["excused"].items())
+        said.append(f"This machine was starved, which excused {excused}.")
     if found["untold"]:
         said.append(f"Whether memory grows is not told by so short a watch: {', '.join(found['untold'])}.")
     return " ".join(said)

@@ -18,6 +18,7 @@ from servod.recordings.rows import ROW
 from servod.soak.finding import Findings, Wrong
 
 Rows = NDArray[np.void]
+Bits = int | NDArray[np.int64]
 
 #: The controller's own numbers, and those that stand for something in the world.
 _OWN = (
@@ -67,9 +68,9 @@ class RowCheck:
         self._cycle = self._missed_before = self._astray = 0
         self._origin: tuple[int, int] | None = None  # deadline and number of the session's first cycle
 
-    def check(self, rows: Rows, explained: int, answer_cycles: int = ANSWER_CYCLES) -> None:
-        """One batch, oldest first. `explained`: the faults that may be seen; `answer_cycles`: how long drive and axis
-        may be in states that do not belong together."""
+    def check(self, rows: Rows, explained: Bits, answer_cycles: int = ANSWER_CYCLES) -> None:
+        """One batch, oldest first. `explained`: the faults that may be seen, in all rows or in each;
+        `answer_cycles`: how long drive and axis may be in states that do not belong together."""
         if not len(rows):
             return
         self._numbers(rows)
@@ -118,11 +119,12 @@ class RowCheck:
         uncontrolled = ~np.isin(rows["axis_state"], _CONTROLLED)
         self._first(Wrong.TORQUE, rows, uncontrolled & (torque_nm != 0.0), "torque sent while not controlled")
 
-    def _faults(self, rows: Rows, explained: int) -> None:
+    def _faults(self, rows: Rows, explained: Bits) -> None:
         """No fault is present or latched that the schedule does not explain."""
-        seen = int(np.bitwise_or.reduce(rows["faults"] | rows["faults_latched"])) & ~explained
+        unexplained = (rows["faults"] | rows["faults_latched"]) & ~explained
+        seen = int(np.bitwise_or.reduce(unexplained))
         if seen:
-            at = int(np.argmax((rows["faults"] | rows["faults_latched"]) & seen != 0))
+            at = int(np.argmax(unexplained != 0))
             names = ", ".join(f.code.name for f in faults_in(seen))
             self._add(Wrong.UNEXPLAINED, rows, at, names)
 

@@ -84,6 +84,7 @@ class Tally:
         self.moves: Counter[str] = Counter()
         self.endings: Counter[str] = Counter()
         self.laws: Counter[str] = Counter()
+        self.excused: Counter[str] = Counter()  # what only a starved machine explains
         self.episodes = self.restarts = 0
 
     def of(self, kind: str) -> FaultTally:

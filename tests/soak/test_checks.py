@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+import time
+
 import numpy as np
 import pytest
 
@@ -17,9 +22,12 @@ from servod.hal import DriveState
 from servod.session import SteppedSession
 from servod.shipped import shipped
 from servod.soak.drive import SAMPLE_ROW, DriveCheck, reaction_in
+from servod.soak.explained import Explained
 from servod.soak.finding import Findings, Wrong
+from servod.soak.kinds import fault_bits
 from servod.soak.memory import Growth, Memory
 from servod.soak.rows import RowCheck, Rows, rows_of, run_lengths
+from servod.soak.starved import STARVED, Starved
 from servod.soak.syncs import SyncCheck, SyncListener
 
 PERIOD_NS = 1_000_000
@@ -192,3 +200,29 @@ def test_descriptors_that_are_not_closed_are_found() -> None:
     for number in range(100):
         memory.add(float(number), 1e5, 8 + number // 10)
     assert memory.descriptors_grow()
+
+
+def test_a_fault_is_explained_in_its_time_and_no_longer() -> None:
+    explained = Explained(always=1)
+    explained.add(10, 2, 20)
+    explained.add(15, 4)
+    assert explained.at(np.array([9, 10, 20, 21])).tolist() == [1, 3, 7, 5]
+    explained.end(30)
+    explained.forget(21)
+    assert explained.at(np.array([10, 30, 31])).tolist() == [1, 5, 1]
+
+
+def test_a_process_that_got_no_turn_was_starved() -> None:
+    begun_ns, cpus = time.monotonic_ns(), os.sched_getaffinity(0)
+    starved, one = Starved(begun_ns), {min(cpus)}
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(3)]
+    try:
+        for process in busy:
+            os.sched_setaffinity(process.pid, one)
+        time.sleep(0.5)
+        starved.look([process.pid for process in busy], time.monotonic_ns())
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
+    assert starved.explained.at(np.array([begun_ns]))[0] == fault_bits(STARVED)
