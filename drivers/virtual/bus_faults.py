@@ -37,6 +37,7 @@ class FaultKind(IntEnum):
     DOWN = 13  # the participant's interface is down for `amount` ms
     BABBLE = 14  # somebody sends `can_id` for `amount` ms, `detail` frames each ms (0: as many as the bus takes)
     TWIN = 15  # a second node with the participant's id is switched on
+    CLEAR = 16  # no frame is hit any more
 
 
 #: Kinds that hit the next frames with an identifier; they do not concern a participant.

@@ -25,6 +25,8 @@ def inject(world: World, fault: BusFault, client: Port, time_ns: int) -> None:
     """Let `fault` happen from `time_ns` on; `client` is who asked. A participant that is not there changes nothing."""
     if fault.kind in FRAME_KINDS:
         world.hub.faults.arm(fault.kind, fault.can_id, fault.amount, fault.detail)
+    elif fault.kind is FaultKind.CLEAR:
+        world.hub.faults.clear()
     elif fault.kind is FaultKind.BABBLE:
         _Babbler(world, fault, time_ns)
     elif fault.kind is FaultKind.TWIN:
