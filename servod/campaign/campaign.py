@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 
 from servod.campaign.judge import Reaction
+from servod.campaign.losses import loss_of
 from servod.campaign.run import Outcome, run_scenario
 from servod.campaign.scenario import Runs, Scenario
 from servod.errors import ServodError
@@ -55,7 +56,8 @@ def _not_started(name: str, scenario: Scenario, why: str) -> Outcome:
         0,
         False,
         (why,),
-        scenario.expect.loss,
+        loss_of(scenario),
+        scenario.expect.exempt,
     )
 
 

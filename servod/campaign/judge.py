@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from servod.axis import AxisState
-from servod.campaign.scenario import Expectation
+from servod.campaign.evidence import Watch, motion_complaints, record_complaints
+from servod.campaign.scenario import Expectation, Scenario
 from servod.campaign.under_test import Observation
 from servod.drivers.virtual.drive_record import DriveSample
 from servod.hal import DriveState
@@ -34,15 +35,21 @@ def reaction(samples: list[DriveSample], injected_ns: int) -> Reaction:
     if not after:
         return Reaction(None, None)
     left = next((s.time_ns for s in after if s.state is not DriveState.OPERATION_ENABLED), None)
-    last = max((number for number, s in enumerate(after) if abs(s.torque_nm) > NO_TORQUE_NM), default=-1)
+    last = max((number for number, s in enumerate(after) if not abs(s.torque_nm) <= NO_TORQUE_NM), default=-1)
     gone = after[last + 1].time_ns if last + 1 < len(after) else None
     return Reaction(_ms(left, injected_ns), _ms(gone, injected_ns))
 
 
-def complaints(expected: Expectation, seen: Observation, times: Reaction, injected_ns: int) -> list[str]:
-    """Everything in which the outcome differs from what was expected; empty when it passed."""
-    states = {sample.state.name for sample in seen.samples if sample.time_ns > injected_ns}
-    return [text for text in (*_complaints(expected, seen, times), *_on_the_way(expected, states)) if text]
+def complaints(scenario: Scenario, seen: Observation, times: Reaction, watch: Watch) -> list[str]:
+    """Everything in which the outcome differs from what was expected, or cannot be told; empty when it passed."""
+    states = {sample.state.name for sample in seen.samples if sample.time_ns > watch.injected_ns}
+    found = [
+        *record_complaints(scenario, seen.samples, watch),
+        *_complaints(scenario.expect, seen, times),
+        *_on_the_way(scenario.expect, states),
+        *motion_complaints(scenario, seen.samples, watch),
+    ]
+    return [text for text in found if text]
 
 
 def _complaints(expected: Expectation, seen: Observation, times: Reaction) -> list[str]:
@@ -54,6 +61,7 @@ def _complaints(expected: Expectation, seen: Observation, times: Reaction) -> li
         _in_time("the torque was gone", times.gone_ms, expected.torque_gone_ms),
         _refused(expected.refused, seen.refusal),
         _says(expected.says, seen.says),
+        _error_shown(expected.drive_error, seen.drive_errors),
         "" if seen.lost_records <= expected.lost_records else f"{seen.lost_records} cycle records are missing",
         _commanded(seen),
     ]
@@ -91,6 +99,14 @@ def _says(name: str | None, told: Finding | None) -> str:
     if name is None or (told is not None and told.name == name):
         return ""
     return f"the proof of the wiring says {told.name if told else 'nothing'}, expected {name}"
+
+
+def _error_shown(code: int | None, shown: frozenset[int]) -> str:
+    """The drive's own word for its fault, by which a person looks it up in the manual."""
+    if code is None or shown == {code}:
+        return ""
+    names = ", ".join(f"0x{number:04X}" for number in sorted(shown))
+    return f"the drive's error codes shown are {names or 'none'}, expected 0x{code:04X}"
 
 
 def _commanded(seen: Observation) -> str:

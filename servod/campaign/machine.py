@@ -75,6 +75,10 @@ class Machine:
         arguments = ["--config", str(self.config)]
         return self._stack.enter_context(child("servod.daemon.main", arguments, log, dropped=_PASS_BY_MODES))
 
+    def keep(self, process: contextlib.AbstractContextManager[Popen[bytes]]) -> Popen[bytes]:
+        """Let a further process live until `close` at the latest."""
+        return self._stack.enter_context(process)
+
     def alive(self, who: Process) -> bool:
         """Whether it runs, stopped or not."""
         process = self.daemon if who is Process.DAEMON else self.virtual_axis

@@ -13,7 +13,7 @@ import struct
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from subprocess import TimeoutExpired
+from subprocess import Popen, TimeoutExpired
 from typing import Any
 
 import yaml
@@ -23,8 +23,8 @@ from servod.axis_model import axis_model_yaml
 from servod.campaign.inputs import Nested, config_of, merged, plant_of, shipped_config
 from servod.campaign.machine import Machine, Process, wait_for_state
 from servod.campaign.recorded import lost_records
-from servod.campaign.scenario import Recovery, Scenario, Start
-from servod.campaign.under_test import AMPLIFIER, Observation
+from servod.campaign.scenario import Recovery, Runs, Scenario, Start
+from servod.campaign.under_test import AMPLIFIER, MOTION, Observation
 from servod.campaign.wire import HubWire, Wire
 from servod.cia import SDO_REQUEST_BASE
 from servod.commands import Op
@@ -43,7 +43,7 @@ from servod.shipped import shipped
 from servod.units import NS_PER_US
 from servod.yaml12 import validate
 
-_SINE = {"kind": "sine", "amplitude_rad": 0.2, "frequency_hz": 1.0, "duration_s": 600.0}
+_SINE = {"kind": "sine", **MOTION[Runs.PROCESSES]._asdict(), "duration_s": 600.0}
 #: The joint moves when its torque is so large [N*m]: enough to lose.
 _MOVING_NM, _START_S = 0.01, 20.0
 #: A participant that leaves takes with it what still waits in its queue.
@@ -76,6 +76,7 @@ class ProcessAxis:
         self._hit_ns: int | None = None
         self._asked_to_end = self._off = False
         self.refusal = ""
+        self.stopped_client: Popen[bytes] | None = None
 
     def now_ns(self) -> int:
         """The clock of the drive's record."""

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from servod.campaign.actions import action_of
+from servod.campaign.evidence import Watch
 from servod.campaign.judge import Reaction, complaints, reaction
+from servod.campaign.losses import loss_of
 from servod.campaign.processes import ProcessAxis
-from servod.campaign.scenario import Loss, Recovery, Runs, Scenario
+from servod.campaign.scenario import Injection, Loss, Recovery, Runs, Scenario
 from servod.campaign.stepped import SteppedAxis
 from servod.campaign.under_test import AxisUnderTest
 from servod.errors import FAULTS, Unreachable
@@ -19,7 +21,10 @@ from servod.errors import FAULTS, Unreachable
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a scenario ended; it passed when there are no complaints."""
+    """How a scenario ended; it passed when there are no complaints.
+
+    `loss` is what its actions take from the axis, `exempt` why that loss has another bound than all others.
+    """
 
     name: str
     title: str
@@ -33,6 +38,7 @@ class Outcome:
     recovered: bool
     complaints: tuple[str, ...]
     loss: Loss
+    exempt: str | None = None
 
     @property
     def passed(self) -> bool:
@@ -50,18 +56,19 @@ def axis_of(scenario: Scenario, folder: Path) -> AxisUnderTest:
 def run_scenario(
     name: str, scenario: Scenario, axis_for: Callable[[Scenario, Path], AxisUnderTest] = axis_of
 ) -> Outcome:
-    """Start, inject, watch, judge, recover. Raises ServodError when the axis does not get to the start."""
+    """Start, inject, watch, judge, mend, recover. Raises ServodError when the axis does not get to the start."""
     with (
         tempfile.TemporaryDirectory(prefix="servod-faults-") as folder,
         contextlib.closing(axis_for(scenario, Path(folder))) as axis,
     ):
         axis.start(scenario.start)
-        injected_ns = _inject(axis, scenario)
+        injected_ns = _inject(axis, scenario, scenario.inject)
         axis.run(scenario.watch_ms / 1e3)
+        watch = Watch(injected_ns, axis.now_ns())
         seen = axis.observe()
         times = reaction(seen.samples, injected_ns)
-        found = complaints(scenario.expect, seen, times, injected_ns)
-        recovered = scenario.recover is not Recovery.REPAIR and axis.recover(scenario.recover)
+        found = complaints(scenario, seen, times, watch)
+        recovered = scenario.recover is not Recovery.REPAIR and _recover(axis, scenario)
     if not recovered and scenario.recover is not Recovery.REPAIR:
         found.append(f"the axis was not enabled again by {scenario.recover}")
     codes = sorted(seen.latched)
@@ -77,18 +84,27 @@ def run_scenario(
         seen.lost_records,
         recovered,
         tuple(found),
-        scenario.expect.loss,
+        loss_of(scenario),
+        scenario.expect.exempt,
     )
 
 
-def _inject(axis: AxisUnderTest, scenario: Scenario) -> int:
-    """Apply every injection at its time; returns the time of the first [ns]."""
+def _recover(axis: AxisUnderTest, scenario: Scenario) -> bool:
+    """Take the cause away, where it does not go by itself, and do what the fault's remedy says."""
+    _inject(axis, scenario, scenario.mend)
+    axis.run(scenario.mend_ms / 1e3)
+    return axis.recover(scenario.recover)
+
+
+def _inject(axis: AxisUnderTest, scenario: Scenario, injections: Sequence[Injection]) -> int:
+    """Apply every injection at its time; returns the time [ns] of the timed one, or of the first."""
     started_ns = axis.now_ns()
-    first_ns = 0
-    for number, injection in enumerate(sorted(scenario.inject, key=lambda i: i.at_ms)):
+    counted_ns = started_ns
+    for number, injection in enumerate(sorted(injections, key=lambda i: i.at_ms)):
         wait_s = (started_ns - axis.now_ns()) / 1e9 + injection.at_ms / 1e3
         if wait_s > 0.0:
             axis.run(wait_s)
-        first_ns = first_ns or axis.now_ns()
+        if injection.timed or number == 0:
+            counted_ns = axis.now_ns()
         action_of(injection, f"{scenario.title}: inject.{number}", scenario.runs).apply(axis)
-    return first_ns
+    return counted_ns

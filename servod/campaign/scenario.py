@@ -45,10 +45,15 @@ class Start(StrEnum):
     DISABLED = "disabled"
     ENABLED = "enabled"  # at rest under control
     MOVING = "moving"  # in the middle of a sine, at its fastest, with friction to overcome
+    PROVING = "proving"  # in the test of the wiring, while it pushes the joint
+
+
+#: Starts in which the drive has power, so that there is something to lose.
+POWERED = (Start.ENABLED, Start.MOVING, Start.PROVING)
 
 
 class Loss(StrEnum):
-    """What the scenario takes from the axis; each loss has its bound, whatever else the scenario expects."""
+    """What a scenario takes from the axis. Its actions say so (servod.campaign.losses); each loss has its bound."""
 
     NONE = "none"
     FEEDBACK = "feedback"
@@ -70,6 +75,7 @@ class Injection(Strict):
 
     at_ms: float = Field(0.0, ge=0.0, le=600_000.0)
     do: dict[str, dict[str, Any]]
+    timed: bool = Field(False, description="times count from here, not from the first injection")
 
     @model_validator(mode="after")
     def _one_action(self) -> Injection:
@@ -89,9 +95,9 @@ class Injection(Strict):
 
 
 class Expectation(Strict):
-    """What must happen. Times count from the first injection, on the drive's side, in bus time."""
+    """What must happen. Times count from the timed or first injection, on the drive's side, in bus time."""
 
-    loss: Loss = Loss.NONE
+    exempt: str | None = Field(None, min_length=20, description="why the bound of a loss does not hold here, in words")
     axis: list[str] = Field(min_length=1, description="names of servod.axis.AxisState; one of them at the end")
     faults: list[str] = Field([], description="names of servod.errors.FaultCode; one of them at least is latched")
     reaction_ms: float | None = Field(None, gt=0.0, description="the drive has left the controller's command by then")
@@ -101,6 +107,9 @@ class Expectation(Strict):
         None, description="name of servod.wiring_proof.Finding: what the proof of the wiring tells"
     )
     lost_records: int = Field(0, ge=0, description="cycle records that may be missing")
+    drive_error: int | None = Field(None, gt=0, le=0xFFFF, description="the error code that the user is shown")
+    strays_rad: float = Field(0.03, gt=0.0, description="an axis that stays enabled: distance from its motion")
+    fastest_rad_s: float = Field(2.0, gt=0.0, description="an axis that stays enabled: speed of the joint")
     drive_shows: list[str] = Field([], description="names of servod.hal.DriveState, all seen after the injection")
     drive_never: list[str] = Field([], description="names of servod.hal.DriveState, none seen after the injection")
 
@@ -117,12 +126,15 @@ class Expectation(Strict):
         return self
 
     @model_validator(mode="after")
-    def _losses_have_bounds(self) -> Expectation:
-        if self.loss is Loss.MASTER and not (self.torque_gone_ms and self.torque_gone_ms <= MASTER_LOSS_MS):
-            raise ValueError(f"torque_gone_ms of at most {MASTER_LOSS_MS:g} after a loss of the master")
-        if self.loss is Loss.FEEDBACK and not (self.reaction_ms and self.reaction_ms <= FEEDBACK_LOSS_MS):
-            raise ValueError(f"reaction_ms of at most {FEEDBACK_LOSS_MS:g} after a loss of feedback")
+    def _one_outcome(self) -> Expectation:
+        if self.stays_enabled and len(self.axis) > 1:
+            raise ValueError("either ENABLED alone or the states of an axis that was stopped: a scenario has one end")
         return self
+
+    @property
+    def stays_enabled(self) -> bool:
+        """The axis goes on."""
+        return AxisState.ENABLED.name in self.axis
 
 
 class Scenario(Strict):
@@ -139,7 +151,21 @@ class Scenario(Strict):
     inject: list[Injection] = Field(min_length=1)
     watch_ms: float = Field(1000.0, gt=0.0, le=600_000.0, description="how long the axis is watched afterwards")
     expect: Expectation
+    mend: list[Injection] = Field([], description="what takes the cause away, before one recovers")
+    mend_ms: float = Field(0.0, ge=0.0, le=600_000.0, description="time that passes then")
     recover: Recovery = Recovery.RESET_FAULT
+
+    @model_validator(mode="after")
+    def _torque_has_a_bound(self) -> Scenario:
+        if self.start is not Start.OFF and not self.expect.stays_enabled and self.expect.torque_gone_ms is None:
+            raise ValueError("expect.torque_gone_ms: an axis that does not stay enabled has a time for it")
+        return self
+
+    @model_validator(mode="after")
+    def _runs_can_show_it(self) -> Scenario:
+        if self.runs is not Runs.STEPPED and (self.start is Start.PROVING or self.expect.drive_error is not None):
+            raise ValueError("start: proving and expect.drive_error are for runs: stepped")
+        return self
 
 
 def load_scenarios(path: str | Path) -> dict[str, Scenario]:
@@ -149,8 +175,11 @@ def load_scenarios(path: str | Path) -> dict[str, Scenario]:
 
 def _checked(data: Any, where: str) -> Scenario:
     from servod.campaign.actions import action_of
+    from servod.campaign.losses import check_bounds
 
     scenario = validate(data, Scenario, where)
-    for number, injection in enumerate(scenario.inject):
-        action_of(injection, f"{where}: inject.{number}", scenario.runs)
+    for key, injections in (("inject", scenario.inject), ("mend", scenario.mend)):
+        for number, injection in enumerate(injections):
+            action_of(injection, f"{where}: {key}.{number}", scenario.runs)
+    check_bounds(scenario, where)
     return scenario

@@ -6,15 +6,16 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from servod.axis import AxisState
-from servod.campaign.inputs import config_of, merged, plant_of, shipped_config
-from servod.campaign.scenario import Recovery, Scenario, Start
-from servod.campaign.under_test import Observation
+from servod.campaign.inputs import Nested, config_of, merged, plant_of, shipped_config
+from servod.campaign.scenario import Recovery, Runs, Scenario, Start
+from servod.campaign.under_test import MOTION, Observation
 from servod.commands import REFUSAL_TEXT, Op, ReferenceKind, Refusal
+from servod.config import AxisConfig
 from servod.controllers import LAWS
 from servod.drivers.virtual.bus_faults import BusFault
 from servod.drivers.virtual.drive_record import DriveRecord, read_drive_record
 from servod.drivers.virtual.world import SteppedWorld, VirtualAxisSettings
-from servod.errors import ServodError, faults_in
+from servod.errors import ServodError, Unreachable, faults_in
 from servod.gains import load_gains
 from servod.session import SteppedSession
 from servod.shipped import shipped
@@ -30,8 +31,10 @@ RECORD_NAME = "drive.bin"
 #: The wiring was proven at an enable long ago; a scenario that is about the proof asks for it.
 _PROVEN_BEFORE = {"wiring_proof": {"enabled": False}}
 #: The motion of a start in motion: whole half periods after its begin it is at its fastest, 1.3 rad/s.
-_SINE = (ReferenceKind.SINE, 0.1, 2.0, 600.0)
+_SINE = (ReferenceKind.SINE, *MOTION[Runs.STEPPED], 600.0)
 _TO_THE_FASTEST_S = 0.5
+#: The test of the wiring pushes when the joint feels this torque, about half of what friction takes; it begins by then.
+_PUSHED_NM, _PUSHED_S = 0.03, 5.0
 
 
 class SteppedAxis:
@@ -68,6 +71,9 @@ class SteppedAxis:
         if start is Start.OFF:
             return
         self._bring_up()
+        if start is Start.PROVING:
+            self._begin_proof()
+            return
         if start in (Start.ENABLED, Start.MOVING):
             self.session.enable()
         if start is Start.MOVING:
@@ -118,7 +124,8 @@ class SteppedAxis:
         latched = frozenset(fault.code for fault in faults_in(axis.latched))
         proof = self._session.proof
         says = None if proof is None else Finding(int(proof.finding))
-        return Observation(samples, axis.state.name, latched, self._refusal, lost, says)
+        errors = frozenset(record.drive_error for record in records) - {0}
+        return Observation(samples, axis.state.name, latched, self._refusal, lost, says, errors)
 
     def recover(self, recovery: Recovery) -> bool:
         """Do what a person would do, and hold for a tenth of a second."""
@@ -133,10 +140,24 @@ class SteppedAxis:
         self.session.run(0.1)
         return self.session.cycle.axis.state is AxisState.ENABLED
 
+    def configure(self, over: Nested) -> None:
+        """Lay keys over the configuration; the next bring-up reads them. Raises BadInput."""
+        base = self._config.model_dump(mode="json", exclude_none=True)
+        self._config = validate(merged(base, over), AxisConfig, "configure")
+
     def close(self) -> None:
         """Leave the bus."""
         if self._session is not None:
             self._session.close()
+
+    def _begin_proof(self) -> None:
+        """Enable, up to the moment at which the test of the wiring pushes the joint."""
+        self.command(Op.ENABLE)
+        until_ns = self.now_ns() + round(_PUSHED_S * 1e9)
+        while abs(self.world.truth().torque_nm) < _PUSHED_NM:
+            self.session.run(0.001)
+            if self.now_ns() > until_ns:
+                raise Unreachable("the test of the wiring does not push: is wiring_proof.enabled set?")
 
     def _bring_up(self) -> None:
         self.close()
@@ -146,5 +167,6 @@ class SteppedAxis:
 
 def _samples(scenario: Scenario) -> int:
     """Capacity of the drive's record: all of the scenario, and little more, since it is read as a whole."""
-    longest_ms = max(injection.at_ms for injection in scenario.inject) + scenario.watch_ms + _OTHERWISE_MS
+    all_of_it = [*scenario.inject, *scenario.mend]
+    longest_ms = sum(i.at_ms for i in all_of_it) + scenario.watch_ms + scenario.mend_ms + _OTHERWISE_MS
     return round(longest_ms * _SAMPLES_PER_MS)

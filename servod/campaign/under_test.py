@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
-from servod.campaign.scenario import Recovery, Start
+from servod.campaign.scenario import Recovery, Runs, Start
 from servod.commands import Op
 from servod.drivers.virtual.bus_faults import BusFault
 from servod.drivers.virtual.drive_record import DriveSample
@@ -16,13 +16,25 @@ from servod.wiring_proof import Finding
 AMPLIFIER, ENCODER = 1, 2
 
 
+class Sine(NamedTuple):
+    """The motion of an axis that starts moving."""
+
+    amplitude_rad: float
+    frequency_hz: float
+
+
+#: In virtual time a motion may be faster than on a machine that others use too.
+MOTION = {Runs.STEPPED: Sine(0.1, 2.0), Runs.PROCESSES: Sine(0.2, 1.0), Runs.GUEST: Sine(0.2, 1.0)}
+
+
 @dataclass(frozen=True)
 class Observation:
     """What was seen after a scenario, before anything was done to recover.
 
     `samples`: the drive's own record; `axis`: name of the axis state; `latched`: the faults that the user is shown;
     `refusal`: message with which bring-up or command was refused, "" when none was; `lost_records`: cycles without a
-    record; `says`: how the last proof of the wiring ended, None where none was told.
+    record; `says`: how the last proof of the wiring ended, None where none was told; `drive_errors`: the drive's error
+    codes in the cycle records.
     """
 
     samples: list[DriveSample]
@@ -31,6 +43,7 @@ class Observation:
     refusal: str
     lost_records: int
     says: Finding | None = None
+    drive_errors: frozenset[int] = frozenset()
 
 
 class AxisUnderTest(Protocol):

@@ -1,9 +1,12 @@
 """The judge complains of everything that is not as expected, and of nothing else."""
 
+import math
+
 import pytest
 
+from servod.campaign.evidence import Watch
 from servod.campaign.judge import complaints, reaction
-from servod.campaign.scenario import Expectation
+from servod.campaign.scenario import Scenario
 from servod.campaign.under_test import Observation
 from servod.drivers.virtual.drive_record import DriveSample
 from servod.errors import FaultCode
@@ -19,6 +22,7 @@ def sample(time_ms: float, state: DriveState, torque_nm: float) -> DriveSample:
 
 
 STOPPED = [sample(0, ON, 0.1), sample(10, ON, 0.1), sample(20, OFF, 0.05), sample(30, OFF, 0.0), sample(40, OFF, 0.0)]
+HELD = [sample(time_ms, ON, 0.1) for time_ms in range(-10, 30, 10)]
 RUNAWAY = [sample(0, ON, 0.1), sample(10, ON, 0.1), sample(20, OFF, 0.1)]
 
 
@@ -28,14 +32,16 @@ def seen(
     refusal: str = "",
     lost: int = 0,
     says: Finding | None = None,
+    errors: tuple[int, ...] = (),
 ) -> Observation:
-    return Observation(samples, axis, frozenset({FaultCode.FEEDBACK_STALE}), refusal, lost, says)
+    return Observation(samples, axis, frozenset({FaultCode.FEEDBACK_STALE}), refusal, lost, says, frozenset(errors))
 
 
 def test_times_count_from_the_injection() -> None:
     assert reaction(STOPPED, 5 * MS).left_ms == 15.0
     assert reaction(STOPPED, 5 * MS).gone_ms == 25.0
     assert reaction(RUNAWAY, 0).gone_ms is None
+    assert reaction([*STOPPED[:4], sample(40, OFF, math.nan)], 0).gone_ms is None
     assert reaction(STOPPED, 100 * MS).left_ms is None
 
 
@@ -50,7 +56,7 @@ def test_times_count_from_the_injection() -> None:
         ({"axis": ["FAULT"], "torque_gone_ms": 29}, seen(), "the torque was gone after 30 ms"),
         ({"axis": ["FAULT"], "torque_gone_ms": 300}, seen(RUNAWAY), "the torque was gone never"),
         ({"axis": ["FAULT"]}, seen(RUNAWAY), "0.1000 N*m that nobody commands"),
-        ({"axis": ["ENABLED"]}, seen(RUNAWAY, axis="ENABLED"), ""),
+        ({"axis": ["ENABLED"]}, seen(HELD, axis="ENABLED"), ""),
         ({"axis": ["FAULT"]}, seen(refusal="not now"), "refused: not now"),
         ({"axis": ["FAULT"], "refused": "two"}, seen(refusal="not now"), "the refusal says 'not now'"),
         ({"axis": ["FAULT"]}, seen(lost=1), "1 cycle records are missing"),
@@ -59,10 +65,15 @@ def test_times_count_from_the_injection() -> None:
         ({"axis": ["FAULT"], "says": "ONE_WAY"}, seen(says=Finding.ONE_WAY), ""),
         ({"axis": ["FAULT"], "says": "ONE_WAY"}, seen(says=Finding.NO_MOTION), "says NO_MOTION, expected ONE_WAY"),
         ({"axis": ["FAULT"], "says": "ONE_WAY"}, seen(), "says nothing, expected ONE_WAY"),
+        ({"axis": ["FAULT"], "drive_error": 0x2320}, seen(errors=(0x2320,)), ""),
+        ({"axis": ["FAULT"], "drive_error": 0x2320}, seen(errors=(0x2310,)), "shown are 0x2310, expected 0x2320"),
+        ({"axis": ["FAULT"], "drive_error": 0x2320}, seen(), "shown are none, expected 0x2320"),
     ],
 )
 def test_each_difference_is_a_complaint(expected: dict, observed: Observation, words: str) -> None:
-    times = reaction(observed.samples, 0)
-    found = complaints(Expectation.model_validate(expected), observed, times, 0)
+    head = {"title": "x", "why": "x", "group": "x", "start": "off", "inject": [{"do": {"tell": {"op": "disable"}}}]}
+    scenario = Scenario.model_validate({**head, "expect": expected})
+    times, watch = reaction(observed.samples, 0), Watch(0, observed.samples[-1].time_ns)
+    found = complaints(scenario, observed, times, watch)
     assert bool(found) is bool(words)
     assert words in " ".join(found)

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from servod.campaign.catalogue import load_all
+from servod.campaign.losses import loss_of
 from servod.campaign.scenario import Loss, load_scenarios
 from servod.errors import BadInput
 
@@ -12,7 +13,7 @@ HEAD = "title: $count frames\nwhy: x\ngroup: bus\ninject: [{do: {frames: {of: to
 EXPECT = "expect: $expect\n"
 ROWS = """for_each:
   - {name: one, count: 1, expect: {axis: [ENABLED]}}
-  - {name: 2, count: 2, expect: {axis: [FAULT]}}
+  - {name: 2, count: 2, expect: {axis: [FAULT], torque_gone_ms: 300}}
 """
 
 
@@ -33,7 +34,7 @@ def test_each_row_is_a_scenario_with_its_values(tmp_path: Path) -> None:
 def test_a_file_without_rows_is_one_scenario(tmp_path: Path) -> None:
     text = HEAD.replace("$count", "3") + "expect: {axis: [ENABLED]}\n"
     (scenario,) = load_scenarios(written(tmp_path, text)).values()
-    assert (scenario.title, scenario.expect.loss) == ("3 frames", Loss.NONE)
+    assert (scenario.title, loss_of(scenario)) == ("3 frames", Loss.NONE)
 
 
 @pytest.mark.parametrize(
@@ -49,7 +50,11 @@ def test_a_file_without_rows_is_one_scenario(tmp_path: Path) -> None:
         ("- 1\n", "a mapping of keys"),
         (HEAD.replace("frames:", "frame:") + EXPECT + ROWS, "found 'frame'; allowed: one of"),
         (HEAD + EXPECT + ROWS.replace("[FAULT]", "[BROKEN]"), "instead of BROKEN"),
-        (HEAD + EXPECT + ROWS.replace("{axis: [FAULT]}", "{axis: [FAULT], loss: master}"), "torque_gone_ms of at most"),
+        (HEAD + EXPECT + ROWS.replace("count: 2", "count: 200").replace("300", "301"), "torque_gone_ms of at most 300"),
+        (HEAD + EXPECT + ROWS.replace(", torque_gone_ms: 300", ""), "has a time for it"),
+        (HEAD + EXPECT + ROWS.replace("[FAULT]", "[ENABLED, FAULT]"), "a scenario has one end"),
+        (HEAD + EXPECT + ROWS.replace("300}", f"300, exempt: {'x' * 20}}}"), "no exemption"),
+        (HEAD.replace("group", "start: proving\nruns: processes\ngroup") + EXPECT + ROWS, "for runs: stepped"),
     ],
 )
 def test_what_does_not_fit_is_one_line(tmp_path: Path, text: str, words: str) -> None:

@@ -16,7 +16,7 @@ group: own
 start: disabled
 inject: [{do: {object_write: {who: amplifier, index: 0x2000, subindex: 1, value: 0x2310}}}]
 watch_ms: 20
-expect: {axis: [AXIS]}
+expect: {axis: [AXIS], torque_gone_ms: 5}
 recover: repair
 """
 
@@ -33,7 +33,7 @@ def test_a_scenario_of_ones_own_is_run_told_and_written(mine: Path, capsys: pyte
     assert run(["faults", "--scenario", str(mine), "--out", str(out)]) == 0
     shown = capsys.readouterr()
     assert "1 of 1 passed mine" in shown.err
-    assert "1 of 1 scenarios passed." in shown.out
+    assert "1 of 1 scenarios in 1 files passed." in shown.out
     document = json.loads((out / "faults.json").read_text())
     assert (document["planned"], document["passed"], document["scenarios"][0]["name"]) == (1, 1, "mine")
     page = (out / "report.html").read_text()

@@ -6,7 +6,7 @@ from abc import abstractmethod
 from enum import StrEnum
 from typing import TYPE_CHECKING, ClassVar
 
-from servod.campaign.scenario import Runs
+from servod.campaign.scenario import Loss, Runs
 from servod.campaign.under_test import AMPLIFIER, ENCODER
 from servod.yaml12 import Strict
 
@@ -29,6 +29,10 @@ class Action(Strict):
     """One kind of injection; `runs` says which axes under test can show it."""
 
     runs: ClassVar[frozenset[Runs]] = frozenset({Runs.STEPPED, Runs.PROCESSES})
+
+    def loss(self) -> Loss:
+        """What this takes from an axis with power; most actions leave it everything."""
+        return Loss.NONE
 
     @abstractmethod
     def apply(self, axis: AxisUnderTest) -> None:

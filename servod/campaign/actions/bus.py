@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from pydantic import Field
 
 from servod.campaign.actions.base import NODE_ID, Action, Who
+from servod.campaign.scenario import Loss
 from servod.campaign.under_test import AMPLIFIER, ENCODER
 from servod.cia import HEARTBEAT_BASE, RPDO_BASE, SYNC_ID, TPDO_BASE
 from servod.drivers.virtual.bus_faults import ANY_ID, MYSELF, BusFault, FaultKind
@@ -16,6 +17,11 @@ if TYPE_CHECKING:
     from servod.campaign.under_test import AxisUnderTest
 
 _ALWAYS = 1_000_000_000
+#: Shorter gaps are ridden over: limits.stale_cycles of the shipped configuration, and about what the drive waits for
+#: commands before it looks after itself [ms, and cycles at 1 kHz].
+_FEEDBACK_GAP_MS, MASTER_GAP_MS = 20, 50
+#: So many frames in a row are destroyed until the sender's controller is bus-off (8 each, 256 in all).
+_BUS_OFF_FRAMES = 32
 
 
 class FrameName(StrEnum):
@@ -66,6 +72,18 @@ _KIND = {
 }
 
 
+_TAKEN_AWAY = (FrameFault.DROP, FrameFault.SHORTEN)
+#: What of the axis hangs on a kind of frame, and how many of them may be missing.
+_CARRIES = {
+    FrameName.ANY: (Loss.FEEDBACK, _FEEDBACK_GAP_MS),
+    FrameName.SYNC: (Loss.MASTER, _FEEDBACK_GAP_MS),
+    FrameName.TORQUE: (Loss.MASTER, MASTER_GAP_MS),
+    FrameName.DRIVE_FEEDBACK: (Loss.FEEDBACK, _FEEDBACK_GAP_MS),
+    FrameName.ENCODER_FEEDBACK: (Loss.FEEDBACK, _FEEDBACK_GAP_MS),
+    FrameName.MASTER_HEARTBEAT: (Loss.MASTER, 1),
+}
+
+
 class Frames(Action):
     """The next `count` frames of a kind are hit; without a count all that follow."""
 
@@ -74,9 +92,31 @@ class Frames(Action):
     count: int | None = Field(None, ge=1)
     detail: int = Field(0, ge=0, le=255)
 
+    def loss(self) -> Loss:
+        """Frames that do not arrive take what they carry, when there are enough of them."""
+        loss, gap = _CARRIES.get(self.of, (Loss.NONE, 0))
+        count = self.count or _ALWAYS
+        lost = count > gap if self.fault in _TAKEN_AWAY else False
+        return loss if lost or (self.fault is FrameFault.DESTROY and count >= _BUS_OFF_FRAMES) else Loss.NONE
+
     def apply(self, axis: AxisUnderTest) -> None:
         """Arm the fault in the hub."""
         axis.bus_fault(BusFault(_KIND[self.fault], CAN_ID[self.of], self.count or _ALWAYS, self.detail))
+
+
+class FramesPass(Action):
+    """What hit frames is taken away: all pass unhurt again."""
+
+    def apply(self, axis: AxisUnderTest) -> None:
+        """Disarm the faults in the hub."""
+        axis.bus_fault(BusFault(FaultKind.CLEAR))
+
+
+def _loss_of(who: Who, gap_ms: float) -> Loss:
+    """What is lost with a participant: the encoder's feedback, or the way of commands to the drive."""
+    if who is Who.ENCODER:
+        return Loss.FEEDBACK if gap_ms > _FEEDBACK_GAP_MS else Loss.NONE
+    return Loss.MASTER if gap_ms > MASTER_GAP_MS else Loss.NONE
 
 
 class Silence(Action):
@@ -84,6 +124,10 @@ class Silence(Action):
 
     who: Who
     for_ms: int = Field(ge=1)
+
+    def loss(self) -> Loss:
+        """Of the participant, for its time."""
+        return _loss_of(self.who, self.for_ms)
 
     def apply(self, axis: AxisUnderTest) -> None:
         """Cut it off."""
@@ -94,6 +138,10 @@ class BusOff(Action):
     """A participant's CAN controller goes bus-off."""
 
     who: Who
+
+    def loss(self) -> Loss:
+        """Of the participant; its nodes are not taken up again by themselves."""
+        return _loss_of(self.who, _ALWAYS)
 
     def apply(self, axis: AxisUnderTest) -> None:
         """Drive its error counter over the limit."""
@@ -106,6 +154,10 @@ class QueueStands(Action):
     who: Who
     for_ms: int = Field(ge=1)
 
+    def loss(self) -> Loss:
+        """Of what the participant sends, for its time."""
+        return _loss_of(self.who, self.for_ms)
+
     def apply(self, axis: AxisUnderTest) -> None:
         """Stop its controller from sending."""
         axis.bus_fault(BusFault(FaultKind.STUCK, amount=self.for_ms, participant=NODE_ID.get(self.who, MYSELF)))
@@ -115,6 +167,10 @@ class InterfaceDown(Action):
     """The loop's interface goes down, and is up again after a while."""
 
     for_ms: int = Field(ge=1)
+
+    def loss(self) -> Loss:
+        """However short: the connection is gone with the interface."""
+        return Loss.MASTER
 
     def apply(self, axis: AxisUnderTest) -> None:
         """Take it down."""
@@ -127,6 +183,11 @@ class Babble(Action):
     can_id: int = Field(ge=0, le=0x7FF)
     for_ms: int = Field(ge=1)
     each_ms: int = Field(0, ge=0, le=20)
+
+    def loss(self) -> Loss:
+        """All there is, when it wins every arbitration and leaves no gap."""
+        starves = not self.each_ms and self.can_id < CAN_ID[FrameName.SYNC] and self.for_ms > MASTER_GAP_MS
+        return Loss.MASTER if starves else Loss.NONE
 
     def apply(self, axis: AxisUnderTest) -> None:
         """Let it begin."""
@@ -145,6 +206,7 @@ class SecondNode(Action):
 
 BUS_ACTIONS: dict[str, type[Action]] = {
     "frames": Frames,
+    "frames_pass": FramesPass,
     "silence": Silence,
     "bus_off": BusOff,
     "queue_stands": QueueStands,

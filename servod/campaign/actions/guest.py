@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, ClassVar
 from pydantic import Field
 
 from servod.campaign.actions.processes import ProcessAction
-from servod.campaign.scenario import Runs
+from servod.campaign.scenario import Loss, Runs
 from servod.campaign.wire import CanWire
 from servod.errors import Unreachable
 
@@ -56,6 +56,10 @@ class Interface(GuestAction):
     """Somebody takes the interface down, or pulls its adapter; or brings it back."""
 
     do: InterfaceChange
+
+    def loss(self) -> Loss:
+        """Without an interface there is no bus."""
+        return Loss.MASTER if self.do in (InterfaceChange.DOWN, InterfaceChange.GONE) else Loss.NONE
 
     def act(self, axis: ProcessAxis) -> None:
         """Change it by ip(8)."""
@@ -103,6 +107,10 @@ class CanSend(GuestAction):
     """A stranger sends one frame by cansend(1), for example `080#` or `701#00`."""
 
     frame: str = Field(pattern=r"^[0-9A-F]{3}#[0-9A-F]{0,16}$")
+
+    def loss(self) -> Loss:
+        """NMT commands other than start take a node out of operational."""
+        return Loss.FEEDBACK if self.frame.startswith("000#") and self.frame[4:6] != "01" else Loss.NONE
 
     def act(self, axis: ProcessAxis) -> None:
         """Send it."""

@@ -6,12 +6,13 @@ import math
 import random
 from abc import abstractmethod
 from enum import StrEnum
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import Field
 
 from servod.campaign.actions.base import Action
-from servod.campaign.scenario import Runs
+from servod.campaign.actions.bus import MASTER_GAP_MS
+from servod.campaign.scenario import Loss, Runs
 from servod.commands import Op, ReferenceKind
 from servod.controllers import LAWS
 
@@ -49,10 +50,11 @@ class Tell(SteppedAction):
     """A person gives a command."""
 
     op: OpName
+    reset_fault: bool = Field(False, description="with `enable`: reset the drive's fault first")
 
     def apply_stepped(self, axis: SteppedAxis) -> None:
         """Give it."""
-        axis.command(Op[self.op.name])
+        axis.command(Op[self.op.name], [self.reset_fault])
 
 
 class Sine(SteppedAction):
@@ -73,6 +75,11 @@ class WakesLate(SteppedAction):
     one_in: int = Field(1, ge=1)
     exactly: bool = Field(False, description="always the most, not a random share of it")
     times: int | None = Field(None, ge=1, description="so often, then punctual again")
+
+    def loss(self) -> Loss:
+        """A loop that stands still, once for long or in each second period."""
+        each_second = self.exactly and self.one_in == 1 and self.times is None
+        return Loss.MASTER if each_second or self.most_us > MASTER_GAP_MS * 1000 else Loss.NONE
 
     def apply_stepped(self, axis: SteppedAxis) -> None:
         """Disturb the pace of the loop from now on."""
@@ -101,9 +108,20 @@ class Gains(SteppedAction):
         axis.command(Op.ACTIVATE, [1, LAWS[self.law].number, len(numbers), *numbers])
 
 
+class Configure(SteppedAction):
+    """A person mends the configuration; the next start of the daemon reads it."""
+
+    config: dict[str, Any]
+
+    def apply_stepped(self, axis: SteppedAxis) -> None:
+        """Lay its keys over what is there."""
+        axis.configure(self.config)
+
+
 MACHINE_ACTIONS: dict[str, type[Action]] = {
     "gains": Gains,
     "tell": Tell,
     "sine": Sine,
     "wakes_late": WakesLate,
+    "configure": Configure,
 }

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from pydantic import Field
 
 from servod.campaign.actions.base import NODE_ID, Action, Who
+from servod.campaign.scenario import Loss
 from servod.cia import NMT_ID, NmtCommand
 
 if TYPE_CHECKING:
@@ -30,9 +31,21 @@ class Nmt(Action):
     who: Who
     command: NmtName
 
+    def loss(self) -> Loss:
+        """Outside operational a node sends and takes no PDO; the master hears of it by its silence."""
+        return Loss.NONE if self.command is NmtName.START else Loss.FEEDBACK
+
     def apply(self, axis: AxisUnderTest) -> None:
         """Send it."""
         axis.frame(NMT_ID, bytes([NmtCommand[self.command.name], NODE_ID[self.who]]))
+
+
+#: The vendor's objects that take something from the axis when they are not 0: node, index, subindex.
+_TAKES = {
+    (Who.AMPLIFIER, 0x2000, 4): Loss.MASTER,  # local control: no command from the bus counts
+    (Who.ENCODER, 0x2000, 1): Loss.FEEDBACK,  # its position is declared invalid
+    (Who.ENCODER, 0x2000, 3): Loss.FEEDBACK,  # its position is frozen
+}
 
 
 class ObjectWrite(Action):
@@ -42,6 +55,10 @@ class ObjectWrite(Action):
     index: int = Field(ge=0x1000, le=0xFFFF)
     subindex: int = Field(0, ge=0, le=254)
     value: int
+
+    def loss(self) -> Loss:
+        """By the object, when it is set."""
+        return _TAKES.get((self.who, self.index, self.subindex), Loss.NONE) if self.value else Loss.NONE
 
     def apply(self, axis: AxisUnderTest) -> None:
         """Write it."""

@@ -10,6 +10,7 @@ import signal
 import time
 from abc import abstractmethod
 from enum import StrEnum
+from subprocess import Popen
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import Field
@@ -17,7 +18,7 @@ from pydantic import Field
 from servod.campaign.actions.base import Action
 from servod.campaign.machine import Process
 from servod.campaign.processes import ProcessAxis
-from servod.campaign.scenario import Runs
+from servod.campaign.scenario import Loss, Runs
 from servod.control import Verb
 from servod.demo.axis import last_core
 from servod.demo.processes import child, wait_until
@@ -54,11 +55,25 @@ class SignalName(StrEnum):
     SIGCONT = "SIGCONT"
 
 
+#: Signals after which a process does no more work; the supervisor may stand still for as long as the loop goes on.
+_ENDS = (SignalName.SIGKILL, SignalName.SIGTERM, SignalName.SIGINT)
+_TAKES = {
+    **{(Process.DAEMON, name): Loss.MASTER for name in _ENDS},
+    **{(Process.LOOP, name): Loss.MASTER for name in (*_ENDS, SignalName.SIGSTOP)},
+    **{(Process.VIRTUAL_AXIS, name): Loss.FEEDBACK for name in (*_ENDS, SignalName.SIGSTOP)},
+}
+
+
 class Signal(ProcessAction):
     """Processes get a signal; several that are killed die together, none can act on the other's death."""
 
     who: list[Process] = Field(min_length=1)
     signal: SignalName
+
+    def loss(self) -> Loss:
+        """By who is hit; of loop and supervisor the drive loses its master."""
+        losses = {_TAKES.get((process, self.signal), Loss.NONE) for process in self.who}
+        return next((loss for loss in (Loss.FEEDBACK, Loss.MASTER) if loss in losses), Loss.NONE)
 
     def act(self, axis: ProcessAxis) -> None:
         """Send it."""
@@ -76,6 +91,10 @@ class VirtualAxisBack(ProcessAction):
 
 class RestartDaemon(ProcessAction):
     """Somebody restarts the service."""
+
+    def loss(self) -> Loss:
+        """For the time between."""
+        return Loss.MASTER
 
     def act(self, axis: ProcessAxis) -> None:
         """SIGTERM, wait, start."""
@@ -106,14 +125,28 @@ class ClientKilled(ProcessAction):
 
     def act(self, axis: ProcessAxis) -> None:
         """Start it, wait until the axis moves, kill it."""
-        axis.leave()
-        log = axis.folder / "client.log"
-        motion = ["sine", "--amplitude", "0.2", "--frequency", "1", "--duration", "60"]
-        with child("servod.cli", ["track", *motion, "--socket", str(axis.machine.socket)], log) as client:
-            wait_until(lambda: _moves(axis), client, log, _CLIENT_S)
-            time.sleep(0.3)
-            client.kill()
-            client.wait()
+        client = _moving_client(axis)
+        client.kill()
+        client.wait()
+
+
+class ClientStopped(ProcessAction):
+    """`servoctl track` moves the axis, and stands still in the middle: it keeps its connection, and its command."""
+
+    def act(self, axis: ProcessAxis) -> None:
+        """Start it, wait until the axis moves, stop it."""
+        axis.stopped_client = _moving_client(axis)
+        axis.stopped_client.send_signal(signal.SIGSTOP)
+
+
+class StoppedClientEnds(ProcessAction):
+    """Somebody ends the client that stands still."""
+
+    def act(self, axis: ProcessAxis) -> None:
+        """Kill it."""
+        assert axis.stopped_client is not None
+        axis.stopped_client.kill()
+        axis.stopped_client.wait()
 
 
 class CpuLoad(ProcessAction):
@@ -122,6 +155,10 @@ class CpuLoad(ProcessAction):
     busy_ms: int = Field(ge=1, le=500)
     idle_ms: int = Field(ge=1, le=500)
     for_ms: int = Field(ge=1, le=5000)
+
+    def loss(self) -> Loss:
+        """A loop that gets less than half of its core stands still more than it runs."""
+        return Loss.MASTER if self.busy_ms >= self.idle_ms else Loss.NONE
 
     def act(self, axis: ProcessAxis) -> None:
         """Run it to its end."""
@@ -155,6 +192,17 @@ class RecordingsReadOnly(ProcessAction):
         folder.chmod(0o555)
 
 
+def _moving_client(axis: ProcessAxis) -> Popen[bytes]:
+    """`servoctl track`, while the axis moves by it; it ends with the axis under test at the latest."""
+    axis.leave()
+    log = axis.folder / "client.log"
+    motion = ["sine", "--amplitude", "0.2", "--frequency", "1", "--duration", "60"]
+    client = axis.machine.keep(child("servod.cli", ["track", *motion, "--socket", str(axis.machine.socket)], log))
+    wait_until(lambda: _moves(axis), client, log, _CLIENT_S)
+    time.sleep(0.3)
+    return client
+
+
 def _moves(axis: ProcessAxis) -> bool:
     with axis.machine.client() as client:
         return bool(client.call(Verb.STATUS)["axis"]["motion_running"])
@@ -167,6 +215,8 @@ PROCESS_ACTIONS: dict[str, type[Action]] = {
     "second_daemon": SecondDaemon,
     "ask": Ask,
     "client_killed": ClientKilled,
+    "client_stopped": ClientStopped,
+    "stopped_client_ends": StoppedClientEnds,
     "cpu_load": CpuLoad,
     "disk_full": DiskFull,
     "recordings_read_only": RecordingsReadOnly,
