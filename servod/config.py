@@ -13,6 +13,11 @@ from pydantic import Field, model_validator
 
 from servod.yaml12 import Strict, load_model
 
+#: The test of the wiring stays below the limits by this share where its own bounds are not stated.
+_PROOF_SHARE = 0.9
+#: What it needs besides a ramp each way: at rest, holding, coming to rest [s].
+_PROOF_RESTS_S = 0.1
+
 NodeId = Annotated[int, Field(ge=1, le=127, description="CANopen node id, 1 to 127")]
 
 
@@ -23,7 +28,7 @@ class BusConfig(Strict):
     interface: str = Field("virtual", min_length=1)
     channel: str = Field("/run/servod/vbus0", min_length=1)
     bit_rate: Literal[10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000] = 1_000_000
-    max_load: float = Field(0.7, gt=0.0, le=0.95, description="share of the bit rate the cyclic frames may use")
+    max_load: float = Field(0.7, ge=0.01, le=0.95, description="share of the bit rate the cyclic frames may use")
     options: dict[str, Any] = Field(default_factory=dict, description="further arguments for python-can")
 
 
@@ -84,7 +89,7 @@ class AmplifierConfig(Strict):
     rated_torque_mnm: int | None = Field(None, ge=1, description="what 0x6076 must read; None takes what is there")
     quick_stop_option: Literal[0, 1, 2, 3, 4, 5, 6, 7, 8] = 2
     heartbeat_reaction: Literal[1, 2, 3] = Field(3, description="0x6007: 1 fault, 2 disable voltage, 3 quick stop")
-    enable_timeout_s: float = Field(2.0, gt=0.0, le=60.0)
+    enable_timeout_s: float = Field(2.0, ge=1e-3, le=60.0)
 
 
 class EncoderConfig(Strict):
@@ -98,24 +103,24 @@ class EncoderConfig(Strict):
     measuring_range_counts: int | None = Field(None, ge=4, le=2**32, description="0x6002; None takes what is there")
     direction: Literal[1, -1] = 1
     zero_offset_rad: float = Field(0.0, ge=-1e6, le=1e6)
-    velocity_cutoff_hz: float = Field(120.0, gt=0.0, le=2000.0, description="first-order low-pass of the velocity")
+    velocity_cutoff_hz: float = Field(120.0, ge=0.1, le=2000.0, description="first-order low-pass of the velocity")
 
 
 class LimitsConfig(Strict):
     """The independent last layer before the wire (servod.limits)."""
 
-    torque_nm: float = Field(gt=0.0, le=1e5)
-    torque_rate_nm_per_s: float = Field(gt=0.0, le=1e9)
-    speed_rad_s: float = Field(gt=0.0, le=1e5)
+    torque_nm: float = Field(ge=1e-6, le=1e5)
+    torque_rate_nm_per_s: float = Field(ge=1e-6, le=1e9)
+    speed_rad_s: float = Field(ge=1e-6, le=1e5)
     position_min_rad: float = Field(ge=-1e6, le=1e6)
     position_max_rad: float = Field(ge=-1e6, le=1e6)
-    following_error_rad: float = Field(gt=0.0, le=1e6)
-    encoder_mismatch_rad: float = Field(gt=0.0, le=1e6)
+    following_error_rad: float = Field(ge=1e-9, le=1e6)
+    encoder_mismatch_rad: float = Field(ge=1e-9, le=1e6)
     stale_cycles: int = Field(5, ge=1, le=1000)
     late_cycles: int = Field(
         20, ge=1, le=10_000, description="skipped periods that end the motion; 20 punctual cycles make up for one"
     )
-    ramp_down_s: float = Field(0.05, gt=0.0, le=1.0, description="torque to zero in this time on RAMP_DOWN")
+    ramp_down_s: float = Field(0.05, ge=1e-4, le=1.0, description="torque to zero in this time on RAMP_DOWN")
 
     @model_validator(mode="after")
     def _range_is_a_range(self) -> LimitsConfig:
@@ -137,17 +142,27 @@ class WiringProofConfig(Strict):
     )
     ramp_s: float = Field(0.2, ge=0.05, le=10.0, description="from next to no torque to the most, exponentially")
     travel_rad: float | None = Field(
-        None, gt=0.0, le=1.0, description="a motion; none: 0.001 rad, or more where the sensors need it"
+        None, ge=1e-9, le=1.0, description="a motion; none: 0.001 rad, or more where the sensors need it"
     )
     most_travel_rad: float | None = Field(
-        None, gt=0.0, le=1.0, description="further fails; none: 0.05 rad, or 100 counts of the encoder if that is more"
+        None, ge=1e-9, le=1.0, description="further fails; none: 0.05 rad, or 100 counts of the encoder if that is more"
     )
-    speed_rad_s: float | None = Field(None, gt=0.0, le=1e5, description="faster fails; none: 0.9 of limits.speed_rad_s")
+    speed_rad_s: float | None = Field(
+        None, ge=1e-6, le=1e5, description="faster fails; none: 0.9 of limits.speed_rad_s"
+    )
     timeout_s: float = Field(5.0, ge=0.5, le=60.0)
     friction_nm: float | None = Field(
         None, ge=0.0, le=1e5, description="expected at break-away, 0 for a free joint; none: what `model` says"
     )
-    inertia: float | None = Field(None, gt=0.0, le=1e6, description="expected, kg*m^2; none: what `model` says")
+    inertia: float | None = Field(None, ge=1e-12, le=1e6, description="expected, kg*m^2; none: what `model` says")
+
+    @model_validator(mode="after")
+    def _both_ways_fit(self) -> WiringProofConfig:
+        if self.timeout_s < 2.0 * self.ramp_s + _PROOF_RESTS_S:
+            raise ValueError(f"wiring_proof.timeout_s at least twice ramp_s, and {_PROOF_RESTS_S:g} s of rests")
+        if self.travel_rad and self.most_travel_rad and self.travel_rad > self.most_travel_rad:
+            raise ValueError("wiring_proof.travel_rad at most most_travel_rad")
+        return self
 
 
 class GainsConfig(Strict):
@@ -209,10 +224,20 @@ class AxisConfig(Strict):
 
     @model_validator(mode="after")
     def _proof_fits_limits(self) -> AxisConfig:
-        torque_nm = self.wiring_proof.torque_nm
-        if torque_nm is not None and torque_nm > self.limits.torque_nm:
+        proof, limits = self.wiring_proof, self.limits
+        if proof.torque_nm is not None and proof.torque_nm > limits.torque_nm:
             raise ValueError("wiring_proof.torque_nm at most limits.torque_nm")
+        if proof.speed_rad_s is not None and proof.speed_rad_s > limits.speed_rad_s:
+            raise ValueError("wiring_proof.speed_rad_s at most limits.speed_rad_s")
+        most_nm = self.most_proof_nm
+        if proof.friction_nm is not None and proof.friction_nm >= most_nm:
+            raise ValueError(f"wiring_proof.friction_nm less than the {most_nm:.3g} N*m that the test may use")
         return self
+
+    @property
+    def most_proof_nm(self) -> float:
+        """The largest torque that the test of the wiring may use."""
+        return self.wiring_proof.torque_nm or _PROOF_SHARE * self.limits.torque_nm
 
 
 #: Keys that name a file or folder, by section; `bus.channel` names one only on the virtual bus.

@@ -24,14 +24,14 @@ class VirtualAxisSettings(Strict):
     rated_torque_mnm: int = Field(100, ge=1, le=100_000_000)
     max_torque_permille: int = Field(3000, ge=1, le=32767)
     amplifier_counts_per_turn: int = Field(1_048_576, ge=4, le=2**32 - 1)
-    gear_ratio: float = Field(1.0, gt=0.0, description="turns of the motor for one turn of the joint")
+    gear_ratio: float = Field(1.0, ge=1e-6, le=1e6, description="turns of the motor for one turn of the joint")
     polarity: int = Field(0, ge=0, le=0xE0, description="0x607E as stored in the drive; 0x20 turns round the torque")
     encoder_counts_per_turn: int = Field(1_048_576, ge=4, le=2**32 - 1)
     encoder_measuring_range_counts: int = Field(2**31, ge=4, le=2**32 - 1, description="0x6002; any number")
     encoder_direction: Literal[1, -1] = Field(1, description="-1: mounted the other way round")
     encoder_noise_counts: float = Field(0.0, ge=0.0, le=1e6, description="standard deviation of a reading")
     start_position_rad: float = 0.0
-    cycle_period_s: float = Field(0.001, gt=0.0, le=0.1, description="part of the model's delay that SYNC costs")
+    cycle_period_s: float = Field(0.001, ge=1e-5, le=0.1, description="part of the model's delay that SYNC costs")
     bit_rate: Literal[10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000] = 1_000_000
     queue_depth: int = Field(64, ge=1, le=10_000, description="transmit queue of each client, in frames")
     client_restart_ms: int = Field(0, ge=0, le=60_000, description="a client's return from bus-off; 0: never")

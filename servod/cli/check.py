@@ -71,11 +71,11 @@ def _recognise(file: Path, keys: dict[Any, Any]) -> tuple[str, Callable[[Path], 
 
 def _check_axis(file: Path) -> str:
     """The configuration and everything that it names: drivers, quirks, EDS, gain set, model."""
-    from servod.axis_model import load_axis_model
     from servod.config import load_config
     from servod.drivers.quirks import load_quirks
     from servod.gains import load_gains, require_fit
     from servod.master.planned import check_names, planned_bus_load
+    from servod.wiring_expected import with_expected
 
     config = load_config(file)
     notes = check_names(config, str(file))
@@ -87,8 +87,7 @@ def _check_axis(file: Path) -> str:
         if eds is not None:
             _check_eds(Path(eds))
     require_fit(load_gains(config.gains.initial), config, str(config.gains.initial))
-    if config.model is not None:
-        load_axis_model(config.model)
+    with_expected(config)
     load = planned_bus_load(config, str(file))
     where = f"{config.bus.interface} {config.bus.channel}"
     notes.insert(0, f"axis {config.name} on {where}, bus load {100.0 * load.share:.1f} % at {load.bit_rate} bit/s")
