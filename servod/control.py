@@ -197,4 +197,6 @@ def _result(answer: dict[str, Any]) -> dict[str, Any]:
         raise Unreachable("the daemon refused and gave no reason")
     code = error.get("exit_code")
     kind = _ERRORS.get(code, Unreachable) if isinstance(code, int) else Unreachable
+    if kind is Refused and answer.get("id") is None:  # of the connection: no request was refused
+        kind = Unreachable
     raise kind(one_line(error.get("message", "refused")))

@@ -115,9 +115,10 @@ class ControlServer:
         """Memory of all clients' buffers."""
         return sum(client.held_bytes for client in self._places.clients)
 
-    def close(self) -> None:
-        """Hang up on everyone and remove the socket."""
+    def close(self, why: str = "servod ends") -> None:
+        """Hang up on everyone, with a line that says `why`, and remove the socket."""
         for client in list(self._places.clients):
+            Reply(client.send, None).failed(Unreachable(why))
             self.drop(client)
         self._listen(False)
         self._listener.close()

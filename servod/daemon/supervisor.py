@@ -60,6 +60,7 @@ class Supervisor:
         self._started = time.monotonic()
         self._stopping = self._textfile_failed = False
         self._told_off = False
+        self._why_ends = "servod was asked to end"
         self._relay = FaultRelay(loop.send)
         self._fed_cycle = -1
         self._next_feed_ns = self._next_status_ns = self._next_textfile_ns = 0
@@ -172,6 +173,7 @@ class Supervisor:
         self._take_records(time.monotonic_ns())
         words = " / ".join(self._loop.last_words().strip().splitlines()[-3:])
         detail = "it hung" if hung else f"exit code {exit_code}"
+        self._why_ends = f"servod ends, since the loop was lost: {detail}"
         self._faults.raise_own(FaultCode.LOOP_LOST, f"{detail}{': ' + words if words else ''}")
         self._faults.write_file(FaultCode.LOOP_LOST.name)
         return Unreachable.exit_code
@@ -198,7 +200,7 @@ class Supervisor:
         return motion_s + goodbye_s + _STOP_MARGIN_S
 
     def _close(self) -> None:
-        self._server.close()
+        self._server.close(self._why_ends)
         self._verbs.close()
         self._faults.finish()
         self._recorder.close()

@@ -82,11 +82,12 @@ class Served:
                 reply.done({"late": True})
             self.handler.late.clear()
 
-    def close(self) -> None:
-        """Stop the thread and the server."""
-        self._stop.set()
-        self._thread.join()
-        self.server.close()
+    def close(self, why: str = "enough") -> None:
+        """Stop the thread and the server, once."""
+        if not self._stop.is_set():
+            self._stop.set()
+            self._thread.join()
+            self.server.close(why)
 
 
 def raw(served: Served) -> socket.socket:

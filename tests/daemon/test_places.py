@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import socket
@@ -16,7 +17,7 @@ from typing import cast
 import pytest
 from served import Served, answer_of, raw
 
-from servod.control import ControlClient, Verb
+from servod.control import ControlClient, Refused, Verb
 from servod.daemon.connection import Connection
 from servod.daemon.peer import Peer
 from servod.daemon.places import MAX_CLIENTS, MAX_CLIENTS_OF_A_PROCESS, Places
@@ -268,3 +269,32 @@ def test_who_only_says_no_more_still_gets_the_answers(served: Served) -> None:
         last.shutdown(socket.SHUT_WR)
         with last.makefile("rb") as lines:
             assert len(lines.readlines()) == 20
+
+
+def test_a_commanding_client_is_never_hung_up_on_by_a_crowd(served: Served) -> None:
+    with ControlClient(served.path, 5.0) as client:
+        crowd = textwrap.dedent(f"""
+            import socket
+            held = [socket.socket(socket.AF_UNIX) for _ in range(60)]
+            for one in held:
+                one.connect({str(served.path)!r})
+                one.send(b'{{"id":1,"verb":"track"}}\\n' * 20)
+        """)
+        client.call(Verb.ENABLE)
+        crowds = [subprocess.Popen([sys.executable, "-c", crowd], stderr=subprocess.DEVNULL) for _ in range(6)]
+        while any(process.poll() is None for process in crowds):
+            assert client.call(Verb.ENABLE)["verb"] == Verb.ENABLE
+            time.sleep(0.01)
+        time.sleep(2.1)
+        with contextlib.ExitStack() as others:
+            _ = [others.enter_context(raw(served)) for _ in range(MAX_CLIENTS + 4)]
+            assert client.call(Verb.ENABLE)["verb"] == Verb.ENABLE
+
+
+def test_who_is_hung_up_on_because_the_daemon_ends_is_told_so(served: Served) -> None:
+    with ControlClient(served.path, 5.0) as client:
+        client.call(Verb.ENABLE)
+        served.close("the loop was lost")
+        with pytest.raises(Unreachable, match="the loop was lost") as told:
+            client.call(Verb.STATUS)
+        assert not isinstance(told.value, Refused)
