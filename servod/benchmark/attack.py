@@ -45,6 +45,7 @@ def measure(quiet_s: float, attack_s: float, stops: int) -> dict[str, Any]:
         with running_axis(config, plant_file(None), folder, ["--record", str(record)]) as (client, daemon_pid):
             path = client.call("record_start")["path"]
             quiet = _watch(client, quiet_s)
+            quiet_ms = [_stop(client, record) for _ in range(stops)]
             before_kib = resident_kib(daemon_pid)
             seconds = str(_GATHER_S + attack_s + 60.0)
             log = folder / "attackers.log"
@@ -56,7 +57,11 @@ def measure(quiet_s: float, attack_s: float, stops: int) -> dict[str, Any]:
                     raise AnswerIsNo(f"the attackers ended before the attack: {log.read_text()[-500:]}")
                 growth_mib = (resident_kib(daemon_pid) - before_kib) / _KIB_PER_MIB
             client.call("record_stop")
-            return _figures(path, quiet, attacked) | {"stop_ms": times_ms, "growth_mib": growth_mib}
+            return _figures(path, quiet, attacked) | {
+                "quiet_stop_ms": quiet_ms,
+                "stop_ms": times_ms,
+                "growth_mib": growth_mib,
+            }
 
 
 def _watch(client: ControlClient, duration_s: float) -> _Span:
@@ -112,11 +117,13 @@ def _percentile(values: Sequence[float], share: float) -> float:
 def text(document: dict[str, Any]) -> str:
     """The figures as people read them."""
     quiet, attacked, stops = document["quiet"], document["attacked"], document["stop_ms"]
+    alone = document["quiet_stop_ms"]
     return "\n".join([
         f"wake-up, median:  {quiet['median_us']:.1f} µs alone, {attacked['median_us']:.1f} µs under attack "
         f"({document['median_ratio']:.2f}×)",
         f"wake-up, p99:     {quiet['p99_us']:.0f} µs alone, {attacked['p99_us']:.0f} µs under attack",
         f"skipped cycles:   {quiet['late_share']:.3%} alone, {attacked['late_share']:.3%} under attack",
-        f"time to stop:     median {statistics.median(stops):.0f} ms, longest {max(stops):.0f} ms of {len(stops)}",
+        f"time to stop:     median {statistics.median(stops):.0f} ms, longest {max(stops):.0f} ms of {len(stops)} "
+        f"(alone: {statistics.median(alone):.0f} ms, {max(alone):.0f} ms)",
         f"daemon's memory:  {document['growth_mib']:+.1f} MiB",
     ])  # fmt: skip

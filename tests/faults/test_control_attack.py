@@ -1,6 +1,7 @@
 """The control socket under attack, daemon, drive and attackers each in processes of their own.
 
-`servoctl bench --attack` gives the figures themselves; the bounds here are wide, because a busy machine is no finding.
+`servoctl bench --attack` gives the figures themselves. What a busy machine does to a stop stands in the same run's
+stops without an attack; the bound of 100 ms holds for what goes beyond that.
 """
 
 from __future__ import annotations
@@ -24,8 +25,11 @@ def test_the_loop_wakes_up_as_before(figures: dict[str, Any]) -> None:
 
 
 def test_a_newcomer_stops_the_axis_whoever_commands_it(figures: dict[str, Any]) -> None:
-    """The usual one of several: a single one may have waited for the processor on the way."""
-    assert statistics.median(figures["stop_ms"]) < 100.0
+    """Every one of them, and not only the usual one."""
+    quiet_ms, attacked_ms = figures["quiet_stop_ms"], figures["stop_ms"]
+    assert len(quiet_ms) == len(attacked_ms) == 3
+    assert statistics.median(attacked_ms) < 100.0
+    assert max(attacked_ms) < max(100.0, 2.0 * max(quiet_ms)), (quiet_ms, attacked_ms)
 
 
 def test_what_strangers_send_does_not_fill_the_daemons_memory(figures: dict[str, Any]) -> None:
