@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import pty
@@ -117,6 +118,27 @@ def test_whatever_ends_track_stops_the_axis(servoctl: Servoctl, number: signal.S
     assert track.wait(10) == 130
     os.close(screen)
     assert servoctl.state == "DISABLED"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_whatever_ends_enable_leaves_the_axis_off(tmp_path: Path, number: signal.Signals) -> None:
+    """Also SIGKILL, which leaves the command no time to say anything."""
+    config = demo_config(tmp_path, tmp_path / "recordings")
+    slowly = config.wiring_proof.model_copy(update={"enabled": True, "ramp_s": 10.0, "timeout_s": 40.0})
+    config = config.model_copy(update={"wiring_proof": slowly})
+    with running_axis(config, plant_file(None), tmp_path), ControlClient(config.control.socket) as watcher:
+
+        def comes_to(state: str) -> bool:
+            return any(status["axis"]["state"] == state for status in itertools.islice(watcher.watch(0.05), 400))
+
+        words = ["enable", "--socket", str(config.control.socket)]
+        enable = subprocess.Popen([sys.executable, "-m", "servod.cli", *words], stderr=subprocess.DEVNULL)
+        assert comes_to("PROVING")
+        enable.send_signal(number)
+        assert enable.wait(10) == (130 if number is signal.SIGINT else -number)
+        assert comes_to("DISABLED")
+        with ControlClient(config.control.socket) as client:
+            assert client.call("status")["wiring"]["last"]["finding"] == "INTERRUPTED"
 
 
 def test_what_is_refused_says_why_with_exit_code_3(servoctl: Servoctl) -> None:
