@@ -34,14 +34,21 @@ def outcomes(scenarios: Scenarios, jobs: int = 1) -> Iterator[Outcome]:
 
 
 def outcome_of(name: str, scenario: Scenario) -> Outcome:
-    """How the scenario ended; one whose axis did not get to the start has failed for that."""
+    """How the scenario ended; one whose axis did not get to the start, or that broke off, has failed for that."""
     try:
         return run_scenario(name, scenario)
     except ServodError as error:
-        return _not_started(name, scenario, str(error))
+        return _without_end(name, scenario, "not started", str(error))
+    except Exception as error:  # a mistake of ours: the other scenarios and the report are not lost for it
+        return _broken_off(name, scenario, error)
 
 
-def _not_started(name: str, scenario: Scenario, why: str) -> Outcome:
+def _broken_off(name: str, scenario: Scenario, error: BaseException) -> Outcome:
+    why = " ".join(f"{type(error).__name__}: {error}".split())
+    return _without_end(name, scenario, "broken off", why)
+
+
+def _without_end(name: str, scenario: Scenario, axis: str, why: str) -> Outcome:
     injected = ", ".join(i.action for i in scenario.inject)
     nothing = Reaction(None, None)
     return Outcome(
@@ -51,7 +58,7 @@ def _not_started(name: str, scenario: Scenario, why: str) -> Outcome:
         injected,
         (),
         "",
-        "not started",
+        axis,
         nothing,
         0,
         False,
@@ -71,6 +78,7 @@ def _at_once(scenarios: Scenarios, jobs: int) -> Iterator[Outcome]:
     )
     with contextlib.ExitStack() as stack:
         stack.callback(pool.shutdown, wait=True, cancel_futures=True)
-        running = [pool.submit(outcome_of, name, scenario) for name, scenario in scenarios.items()]
+        running = {pool.submit(outcome_of, name, scenario): name for name, scenario in scenarios.items()}
         for done in as_completed(running):
-            yield done.result()
+            died, name = done.exception(), running[done]
+            yield done.result() if died is None else _broken_off(name, scenarios[name], died)

@@ -54,7 +54,7 @@ def cells(outcome: Outcome) -> tuple[str, ...]:
         milliseconds(outcome.reaction.left_ms),
         milliseconds(outcome.reaction.gone_ms),
         str(outcome.lost_records),
-        "yes" if outcome.recovered else "by repair",
+        "yes" if outcome.recovered else "by repair" if outcome.by_repair else "no",
         outcome.injected,
         ", ".join(outcome.detected) or ("refused" if outcome.axis == "DISABLED" and outcome.remedy else "-"),
     )
@@ -81,8 +81,8 @@ def summary(outcomes: Sequence[Outcome], planned: int) -> list[str]:
                 "at the latest."
             )
     lines += [f"Exempt from the bound: {o.name}: {o.exempt}." for o in outcomes if o.exempt is not None]
-    repairs = sum(not outcome.recovered for outcome in outcomes)
-    lines.append(f"Recovered: {len(outcomes) - repairs}; {repairs} need repair at the hardware.")
+    recovered, repairs = sum(o.recovered for o in outcomes), sum(o.by_repair for o in outcomes)
+    lines.append(f"Recovered: {recovered}; {repairs} need repair at the hardware.")
     lines.append(f"Cycle records lost: {sum(outcome.lost_records for outcome in outcomes)}.")
     return lines
 

@@ -5,26 +5,56 @@ Used by every axis under test before it starts.
 
 from __future__ import annotations
 
+import copy
+from functools import cache
 from typing import Any
 
 from servod.axis_model import AxisModel, load_axis_model
 from servod.campaign.scenario import Scenario
 from servod.config import AxisConfig, load_config
+from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.shipped import shipped
 from servod.yaml12 import validate
 
 Nested = dict[str, Any]
 
 
+#: The wiring was proven at an enable long ago; a scenario that is about the proof asks for it.
+PROVEN_BEFORE = {"wiring_proof": {"enabled": False}}
+
+
 def shipped_config() -> Nested:
     """The shipped configuration of the virtual axis, its paths made absolute."""
+    return copy.deepcopy(_shipped_config())
+
+
+@cache
+def _shipped_config() -> Nested:
     return load_config(shipped("gains/config/virtual.yaml")).model_dump(mode="json", exclude_none=True)
 
 
 def plant_of(scenario: Scenario) -> AxisModel:
     """The joint: the scenario's keys over the demo joint. Raises BadInput."""
-    base = load_axis_model(shipped("gains/axes/demo_joint.yaml")).model_dump(mode="json", exclude_none=True)
-    return validate(merged(base, scenario.plant), AxisModel, f"{scenario.title}: plant")
+    return _plant(scenario, scenario.title)
+
+
+def check_inputs(scenario: Scenario, where: str) -> None:
+    """What the scenario says of settings, configuration and plant, before anything runs. Raises BadInput."""
+    validate(scenario.settings, VirtualAxisSettings, f"{where}: settings")
+    if scenario.config:
+        over = merged(PROVEN_BEFORE, scenario.config)
+        validate(merged(_shipped_config(), over), AxisConfig, f"{where}: config")
+    if scenario.plant:
+        _plant(scenario, where)
+
+
+def _plant(scenario: Scenario, where: str) -> AxisModel:
+    return validate(merged(_demo_joint(), scenario.plant), AxisModel, f"{where}: plant")
+
+
+@cache
+def _demo_joint() -> Nested:
+    return load_axis_model(shipped("gains/axes/demo_joint.yaml")).model_dump(mode="json", exclude_none=True)
 
 
 def config_of(scenario: Scenario, base: Nested) -> AxisConfig:

@@ -39,6 +39,7 @@ class Outcome:
     complaints: tuple[str, ...]
     loss: Loss
     exempt: str | None = None
+    by_repair: bool = False  # nothing but a repair was to bring it back
 
     @property
     def passed(self) -> bool:
@@ -86,6 +87,7 @@ def run_scenario(
         tuple(found),
         loss_of(scenario),
         scenario.expect.exempt,
+        scenario.recover is Recovery.REPAIR,
     )
 
 

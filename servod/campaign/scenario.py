@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from servod.axis import AxisState
 from servod.campaign.variants import variants
@@ -94,36 +94,43 @@ class Injection(Strict):
         return self.do[self.action]
 
 
+def _one_of(names: set[str]) -> AfterValidator:
+    """A word that is one of `names`; the message stands at the word itself."""
+
+    def check(word: str) -> str:
+        if word not in names:
+            raise ValueError(f"one of {', '.join(sorted(names))}")
+        return word
+
+    return AfterValidator(check)
+
+
+AxisWord = Annotated[str, _one_of(AXIS_STATES)]
+FaultWord = Annotated[str, _one_of(FAULT_NAMES)]
+DriveWord = Annotated[str, _one_of(DRIVE_STATES)]
+FindingWord = Annotated[str, _one_of(FINDINGS)]
+
+
 class Expectation(Strict):
     """What must happen. Times count from the timed or first injection, on the drive's side, in bus time."""
 
     exempt: str | None = Field(None, min_length=20, description="why the bound of a loss does not hold here, in words")
-    axis: list[str] = Field(min_length=1, description="names of servod.axis.AxisState; one of them at the end")
-    faults: list[str] = Field([], description="names of servod.errors.FaultCode; one of them at least is latched")
+    axis: list[AxisWord] = Field(min_length=1, description="names of servod.axis.AxisState; one of them at the end")
+    faults: list[FaultWord] = Field([], description="names of servod.errors.FaultCode; one of them at least is latched")
     reaction_ms: float | None = Field(None, gt=0.0, description="the drive has left the controller's command by then")
     torque_gone_ms: float | None = Field(None, gt=0.0, description="the joint feels no torque from then on")
     refused: str | None = Field(None, description="words of the message with which the bring-up or command is refused")
-    says: str | None = Field(
+    says: FindingWord | None = Field(
         None, description="name of servod.wiring_proof.Finding: what the proof of the wiring tells"
     )
     lost_records: int = Field(0, ge=0, description="cycle records that may be missing")
     drive_error: int | None = Field(None, gt=0, le=0xFFFF, description="the error code that the user is shown")
     strays_rad: float = Field(0.03, gt=0.0, description="an axis that stays enabled: distance from its motion")
     fastest_rad_s: float = Field(2.0, gt=0.0, description="an axis that stays enabled: speed of the joint")
-    drive_shows: list[str] = Field([], description="names of servod.hal.DriveState, all seen after the injection")
-    drive_never: list[str] = Field([], description="names of servod.hal.DriveState, none seen after the injection")
-
-    @model_validator(mode="after")
-    def _names_exist(self) -> Expectation:
-        for name in set(self.axis) - AXIS_STATES:
-            raise ValueError(f"one of {', '.join(sorted(AXIS_STATES))} instead of {name}")
-        for name in set(self.faults) - FAULT_NAMES:
-            raise ValueError(f"one of {', '.join(sorted(FAULT_NAMES))} instead of {name}")
-        if self.says is not None and self.says not in FINDINGS:
-            raise ValueError(f"one of {', '.join(sorted(FINDINGS))} instead of {self.says}")
-        for name in {*self.drive_shows, *self.drive_never} - DRIVE_STATES:
-            raise ValueError(f"one of {', '.join(sorted(DRIVE_STATES))} instead of {name}")
-        return self
+    drive_shows: list[DriveWord] = Field([], description="names of servod.hal.DriveState, all seen after the injection")
+    drive_never: list[DriveWord] = Field(
+        [], description="names of servod.hal.DriveState, none seen after the injection"
+    )
 
     @model_validator(mode="after")
     def _one_outcome(self) -> Expectation:
@@ -146,7 +153,10 @@ class Scenario(Strict):
     runs: Runs = Runs.STEPPED
     start: Start = Start.MOVING
     settings: dict[str, Any] = Field({}, description="of the virtual axis, over its defaults")
-    config: dict[str, Any] = Field({}, description="of the axis, over the shipped virtual.yaml; nested")
+    config: dict[str, Any] = Field(
+        {},
+        description="of the axis, over the shipped virtual.yaml; nested; wiring_proof.enabled is false unless stated",
+    )
     plant: dict[str, Any] = Field({}, description="of the plant's axis model, over the demo joint")
     inject: list[Injection] = Field(min_length=1)
     watch_ms: float = Field(1000.0, gt=0.0, le=600_000.0, description="how long the axis is watched afterwards")
@@ -175,9 +185,11 @@ def load_scenarios(path: str | Path) -> dict[str, Scenario]:
 
 def _checked(data: Any, where: str) -> Scenario:
     from servod.campaign.actions import action_of
+    from servod.campaign.inputs import check_inputs
     from servod.campaign.losses import check_bounds
 
     scenario = validate(data, Scenario, where)
+    check_inputs(scenario, where)
     for key, injections in (("inject", scenario.inject), ("mend", scenario.mend)):
         for number, injection in enumerate(injections):
             action_of(injection, f"{where}: {key}.{number}", scenario.runs)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from servod.axis import AxisState
-from servod.campaign.inputs import Nested, config_of, merged, plant_of, shipped_config
+from servod.campaign.inputs import PROVEN_BEFORE, Nested, config_of, merged, plant_of, shipped_config
 from servod.campaign.scenario import Recovery, Runs, Scenario, Start
 from servod.campaign.under_test import MOTION, Observation
 from servod.commands import REFUSAL_TEXT, Op, ReferenceKind, Refusal
@@ -28,8 +28,6 @@ _SAMPLES_PER_MS = 2.5
 _OTHERWISE_MS = 8000.0
 #: The drive's own record in the folder of a stepped axis.
 RECORD_NAME = "drive.bin"
-#: The wiring was proven at an enable long ago; a scenario that is about the proof asks for it.
-_PROVEN_BEFORE = {"wiring_proof": {"enabled": False}}
 #: The motion of a start in motion: whole half periods after its begin it is at its fastest, 1.3 rad/s.
 _SINE = (ReferenceKind.SINE, *MOTION[Runs.STEPPED], 600.0)
 _TO_THE_FASTEST_S = 0.5
@@ -46,7 +44,7 @@ class SteppedAxis:
         settings = validate(scenario.settings, VirtualAxisSettings, f"{where}: settings")
         record = DriveRecord(self._record_path, _samples(scenario))
         self.world = SteppedWorld(settings, plant_of(scenario), record)
-        self._config = config_of(scenario, merged(shipped_config(), _PROVEN_BEFORE))
+        self._config = config_of(scenario, merged(shipped_config(), PROVEN_BEFORE))
         self._foreign = self.world.connect(())
         self._session: SteppedSession | None = None
         self._refusal = ""

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 _HELP = example(
     "Run the fault campaign on the virtual axis: every scenario injects its faults, the drive's own record says when "
     "torque was gone, and the table shows what the user is told. Scenarios in virtual time first, then those of "
-    "daemon, loop and drive as processes on the wall clock, one at a time. Exit code 1 when one did not pass. --codes "
+    "daemon, loop and drive as processes on the wall clock, one at a time. The proof of the wiring is off but where a "
+    "scenario's file states wiring_proof in its `config`. Exit code 1 when one did not pass. --codes "
     "lists every fault instead: what it does to the axis, its cause and its remedy.",
     "servoctl faults",
     "servoctl faults --stepped --group encoder --out out/faults",
@@ -48,6 +49,7 @@ def faults(
 ) -> None:
     """Run the campaign, or print the fault table."""
     if codes:
+        _refuse_beside_codes(only=only, group=group, scenario=scenario, stepped=stepped, out=out)
         _print_codes(as_json)
         return
     chosen = _chosen(scenario, only, group, stepped)
@@ -61,6 +63,13 @@ def faults(
     failed = [outcome.name for outcome in found if not outcome.passed]
     if failed:
         raise AnswerIsNo(f"{len(failed)} of {len(found)} scenarios did not pass: {', '.join(failed)}")
+
+
+def _refuse_beside_codes(**options: object) -> None:
+    """The list is always whole, and nothing runs. Raises BadInput."""
+    for name, value in options.items():
+        if value:
+            raise BadInput("--codes", f"beside --{name}", "alone or with --json: it lists all faults and runs nothing")
 
 
 def _chosen(files: list[Path] | None, only: str | None, group: str | None, stepped: bool) -> dict[str, Scenario]:

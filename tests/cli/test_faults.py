@@ -1,12 +1,17 @@
 """`servoctl faults`: which scenarios run, what is printed and written, and how it ends."""
 
 import json
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from servod.campaign.document import HEADER, cells
+from servod.campaign.judge import Reaction
 from servod.campaign.run import Outcome
+from servod.campaign.scenario import Loss
+from servod.campaign.under_test import Observation
 from servod.cli.app import run
 
 MINE = """
@@ -53,6 +58,7 @@ def test_one_that_does_not_pass_is_exit_code_1_and_says_why(mine: Path, capsys: 
     ("words", "told"),
     [
         (["--only", "no such"], "--only"),
+        (["--codes", "--only", "x"], "--codes: found beside --only"),
         (["--group", "weather"], "--group: found weather; allowed: bus"),
         (["--scenario", "/nowhere.yaml"], "/nowhere.yaml"),
     ],
@@ -61,6 +67,62 @@ def test_bad_input_is_one_line(words: list[str], told: str, capsys: pytest.Captu
     assert run(["faults", *words]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert told in line
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (MINE.replace("0x2000", "0x3333"), "inject.0.do.object_write: (top): found index: 13107"),
+        (MINE.replace("0x2310", "1" + 24 * "0"), "allowed: value 0 to 65535 for 0x2000:1"),
+        (MINE.replace("AXIS", "AWAKE"), "expect.axis.0: found 'AWAKE'; allowed: one of BRAKING"),
+        (MINE.replace("[AXIS]", "[DISABLED], faults: [SHARK]"), "expect.faults.0: found 'SHARK'"),
+        (MINE + "config: {limits: {torque: 1.0}}", "config: limits.torque: found an unknown key"),
+        (MINE + "config: {wiring_proof: {ramp_s: 9.0}}", "config: wiring_proof: found ramp_s: 9.0"),
+        (MINE + "settings: {gear: 1.0}", "settings: gear: found an unknown key"),
+        (MINE + "plant: {inertia: heavy}", "plant: inertia: found 'heavy'"),
+    ],
+)
+def test_a_mistake_in_a_scenario_is_found_when_it_is_read(
+    text: str, told: str, mine: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mine.write_text(text.replace("[AXIS]", "[DISABLED]"))
+    assert run(["faults", "--scenario", str(mine)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"servoctl: {mine}: ")
+    assert told in line
+
+
+def test_one_that_breaks_off_has_failed_and_the_next_one_runs(
+    mine: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from servod.campaign.stepped import SteppedAxis
+
+    sound, broken = mine.with_name("sound.yaml"), []
+    sound.write_text(mine.read_text())
+    observe = SteppedAxis.observe
+
+    def breaks_once(axis: SteppedAxis) -> Observation:
+        if not broken:
+            broken.append(axis)
+            raise struct.error("int too large\nto convert")
+        return observe(axis)
+
+    monkeypatch.setattr(SteppedAxis, "observe", breaks_once)
+    assert run(["faults", "--scenario", str(mine), "--scenario", str(sound)]) == 1
+    shown = capsys.readouterr()
+    assert "1 of 2 FAILED mine: error: int too large to convert" in shown.err.splitlines()
+    rows = [line.split() for line in shown.out.splitlines() if line.startswith(("mine", "sound"))]
+    assert [row[1:4] for row in rows] == [["NO", "broken", "off"], ["yes", "DISABLED", "-"]]
+    assert "1 of 2 scenarios" in shown.out
+
+
+@pytest.mark.parametrize(
+    ("recovered", "by_repair", "told"), [(True, False, "yes"), (False, True, "by repair"), (False, False, "no")]
+)
+def test_only_what_was_to_be_repaired_recovers_by_repair(recovered: bool, by_repair: bool, told: str) -> None:
+    nothing = Reaction(None, None)
+    outcome = Outcome("x", "x", "x", "x", (), "", "FAULT", nothing, 0, recovered, (), Loss.NONE, None, by_repair)
+    assert cells(outcome)[HEADER.index("Recovered")] == told
 
 
 def test_interrupted_it_writes_what_it_has(

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from enum import StrEnum
+from functools import cache
 from typing import TYPE_CHECKING
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from servod.campaign.actions.base import NODE_ID, Action, Who
 from servod.campaign.scenario import Loss
 from servod.cia import NMT_ID, NmtCommand
+from servod.drivers.virtual.amplifier import AMPLIFIER_EDS
+from servod.drivers.virtual.dictionary import Dictionary, Entry
+from servod.drivers.virtual.encoder import ENCODER_EDS
 
 if TYPE_CHECKING:
     from servod.campaign.under_test import AxisUnderTest
@@ -56,6 +60,15 @@ class ObjectWrite(Action):
     subindex: int = Field(0, ge=0, le=254)
     value: int
 
+    @model_validator(mode="after")
+    def _fits(self) -> ObjectWrite:
+        entry = _entry(self.who, self.index, self.subindex)
+        if entry is None:
+            raise ValueError(f"index and subindex of an object in the EDS file of the {self.who}")
+        if not entry.low <= self.value <= entry.high:
+            raise ValueError(f"value {entry.low} to {entry.high} for 0x{self.index:04X}:{self.subindex}")
+        return self
+
     def loss(self) -> Loss:
         """By the object, when it is set."""
         return _TAKES.get((self.who, self.index, self.subindex), Loss.NONE) if self.value else Loss.NONE
@@ -63,6 +76,20 @@ class ObjectWrite(Action):
     def apply(self, axis: AxisUnderTest) -> None:
         """Write it."""
         axis.sdo_write(NODE_ID[self.who], self.index, self.subindex, self.value)
+
+
+@cache
+def _objects(who: Who) -> Dictionary:
+    """The objects of one node as they are before anything is written; not for writing."""
+    return Dictionary(AMPLIFIER_EDS if who is Who.AMPLIFIER else ENCODER_EDS)
+
+
+def _entry(who: Who, index: int, subindex: int) -> Entry | None:
+    """The integer that can be written there."""
+    if who is Who.LOOP or not _objects(who).has(index, subindex):
+        return None
+    entry = _objects(who).entry(index, subindex)
+    return entry if entry.bits else None
 
 
 class ForeignFrame(Action):
