@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,6 +23,7 @@ _HELP = example(
     "servoctl soak --wall --hours 0.1",
 )
 _MS_PER_H = 3_600_000
+_FEWEST_H, _MOST_H = 1e-4, 1e5
 
 
 def register(app: typer.Typer) -> None:
@@ -29,13 +31,24 @@ def register(app: typer.Typer) -> None:
     app.command("soak", help=_HELP)(soak)
 
 
+def _hours(text: str) -> float:
+    """A number of hours; typer's own range takes NaN for too large. Raises typer.BadParameter."""
+    with contextlib.suppress(ValueError):
+        if _FEWEST_H <= float(text) <= _MOST_H:
+            return float(text)
+    raise typer.BadParameter(f"{text} is not a number of hours from {_FEWEST_H:g} to {_MOST_H:g}.")
+
+
 def soak(
-    hours: Annotated[float, typer.Option(min=1e-4, max=1e5, help="Axis time in hours, for each job.")] = 0.5,
+    hours: Annotated[
+        float, typer.Option(parser=_hours, metavar="HOURS", help="Axis time in hours, for each job.")
+    ] = 0.5,
     seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Of schedule and noise.")] = 1,
     cycles: Annotated[int | None, typer.Option(min=1, help="Cycles of the loop instead of --hours.")] = None,
     wall: Annotated[bool, typer.Option("--wall", help="Real processes on the wall clock.")] = False,
     limit_hours: Annotated[
-        float | None, typer.Option("--limit-hours", min=1e-4, max=1e5, help="End after so much wall clock.")
+        float | None,
+        typer.Option("--limit-hours", parser=_hours, metavar="HOURS", help="End after so much wall clock."),
     ] = None,
     jobs: Annotated[int, typer.Option(min=1, max=64, help="Independent axes, each with a seed of its own.")] = 1,
     out: Annotated[Path, typer.Option(help="Folder for state, report and the drive's record.")] = Path("out/soak"),
