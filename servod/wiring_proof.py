@@ -94,12 +94,16 @@ FINDINGS: dict[Finding, _Row] = {
     _F.ENCODER_DIRECTION: _Row(
         "positive torque moves the encoder backwards, and the amplifier's sensor forwards: wrong polarity of the "
         "encoder",
-        "turn round encoder.direction",
+        "turn the joint by hand, the drive disabled, in the direction that shall be positive: if the position of "
+        "`servoctl status` falls, turn round encoder.direction; if it rises, turn round both "
+        "amplifier.torque_direction and amplifier.position_direction (or the drive's 0x607E)",
     ),
     _F.AMPLIFIER_DIRECTION: _Row(
         "positive torque moves the amplifier's sensor backwards, and the encoder forwards: wrong polarity of the "
         "amplifier's position",
-        "turn round amplifier.position_direction",
+        "turn the joint by hand, the drive disabled, in the direction that shall be positive: if the position of "
+        "`servoctl status` rises, turn round amplifier.position_direction; if it falls, turn round both "
+        "encoder.direction and amplifier.torque_direction",
     ),
     _F.ENCODER_STILL: _Row(
         "the amplifier's sensor moved by {found:.3g} rad, the encoder stood still",

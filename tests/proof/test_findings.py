@@ -195,3 +195,22 @@ def test_every_finding_has_a_sentence_and_a_remedy_and_a_document_without_nan():
         assert told["negative_nm"] is None and told["friction_nm"] is None
         assert (finding in FINDINGS) != told["passed"]
         assert "nan" not in told["text"]
+
+
+@pytest.mark.parametrize(
+    ("finding", "one", "other"),
+    [
+        (Finding.ENCODER_DIRECTION, "encoder.direction", "amplifier.torque_direction and amplifier.position_direction"),
+        (
+            Finding.AMPLIFIER_DIRECTION,
+            "amplifier.position_direction",
+            "encoder.direction and amplifier.torque_direction",
+        ),
+    ],
+)
+def test_sensors_that_disagree_are_told_with_both_remedies_and_how_to_choose(
+    finding: Finding, one: str, other: str
+) -> None:
+    remedy = FINDINGS[finding].remedy
+    assert "by hand" in remedy and "that shall be positive" in remedy
+    assert f"turn round {one};" in remedy and f"turn round both {other}" in remedy
