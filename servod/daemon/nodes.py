@@ -58,10 +58,14 @@ class Nodes:
                 "node_id": plan.node_id,
                 "role": role,
                 "driver": plan.driver,
-                "state": nmt_name(self._master.nmt_state(plan.node_id)),
+                "state": self._state(plan.node_id),
             }
             for role, plan in (("amplifier", self.plans.amplifier), ("encoder", self.plans.encoder))
         ]
+
+    def _state(self, node_id: int) -> str:
+        name = nmt_name(self._master.nmt_state(node_id))
+        return f"silent (was {name})" if self._master.silent(node_id) else name
 
 
 class FaultRelay:

@@ -165,13 +165,17 @@ class Status(TypedDict):
     lease: LeaseStatus
 
 
+_PROVING = "wiring is being proven"
+
+
 def axis_status(record: CycleRecord) -> AxisStatus:
     """State, goal and reasons of one cycle."""
+    proving = record.axis_state == AxisState.PROVING  # the drive has its power; the axis is not there yet
     return {
         "state": AxisState(record.axis_state).name,
         "goal": Goal(record.goal).name,
-        "goal_reached": bool(record.goal_reached),
-        "reasons": reason_texts(record.reasons),
+        "goal_reached": bool(record.goal_reached) and not proving,
+        "reasons": [_PROVING] * proving + reason_texts(record.reasons),
         "motion_running": bool(record.reference_active),
     }
 

@@ -181,7 +181,7 @@ class Verbs:
         state = AxisState(record.axis_state).name
         if tested is not None and record.faults_latched & _NOT_PROVEN:
             raise AnswerIsNo(f"the axis is {state}, not enabled: {sentence(tested)}")
-        raise Unreachable(f"the axis is {state}, not enabled: {_why(record)}")
+        raise Unreachable(f"the axis is {state}, not enabled: {_why_not_enabled(record)}")
 
     def _disable(self, _args: NoArgs) -> Flow:
         yield self._send_stop(Op.DISABLE)
@@ -301,6 +301,13 @@ def _state(record: CycleRecord) -> dict[str, Any]:
 def _is_off(record: CycleRecord) -> bool:
     """The axis has stopped, and the drive says so itself, in this cycle."""
     return record.axis_state in _STOPPED and record.amplifier_age == 0 and record.drive_state in _UNPOWERED
+
+
+def _why_not_enabled(record: CycleRecord) -> str:
+    """An axis on its way that is off without a fault was switched off by a command."""
+    if record.axis_state == AxisState.DISABLED and not record.faults_latched:
+        return "somebody stopped it meanwhile (`servoctl stop` or `servoctl disable`)"
+    return _why(record)
 
 
 def _why(record: CycleRecord) -> str:

@@ -127,6 +127,10 @@ class Master:
         """State that the node's last heartbeat showed (servod.cia.NmtState); None before the first."""
         return self._nodes[node_id].watch.nmt_state
 
+    def silent(self, node_id: int) -> bool:
+        """The node's heartbeat has been missing for its time, and has not come back."""
+        return self._nodes[node_id].watch.lost
+
     def nmt(self, command: NmtCommand, node_id: int) -> None:
         """Send an NMT command; node 0 is all nodes. A deliberate reset or stop is not reported as an event."""
         for node in self._nodes.values():

@@ -46,22 +46,22 @@ class NodeWatch:
         self._emcy_fault = emcy_fault
         self._timeout_ns = timeout_ms * 1_000_000
         self._heard_ns: int | None = None
-        self._lost = False
+        self.lost = False  # its heartbeat is missing now
         self._watching = False
         network.subscribe(HEARTBEAT_BASE + node_id, self._on_heartbeat)
         network.subscribe(EMCY_BASE + node_id, self._on_emcy)
 
     def watch(self, on: bool) -> None:
         """Start or end the supervision: only then a boot-up, a stop of heartbeats or another state is an event."""
-        self._heard_ns, self._lost, self._watching = self._clock.now_ns(), False, on
+        self._heard_ns, self.lost, self._watching = self._clock.now_ns(), False, on
 
     def check(self) -> None:
         """Raise an event when the heartbeat has been missing for its time; once for each loss."""
-        if not self._watching or self._lost or self._heard_ns is None:
+        if not self._watching or self.lost or self._heard_ns is None:
             return
         silent_ns = self._clock.now_ns() - self._heard_ns
         if silent_ns > self._timeout_ns:
-            self._lost = True
+            self.lost = True
             text = f"node {self.node_id}: no heartbeat for {silent_ns / 1e6:.0f} ms"
             self._add(FaultCode.NODE_HEARTBEAT_LOST, text, 0)
 
@@ -70,7 +70,7 @@ class NodeWatch:
             return
         state = data[0] & _TOGGLE_MASK
         previous, self.nmt_state = self.nmt_state, state
-        self._heard_ns, self._lost = self._clock.now_ns(), False
+        self._heard_ns, self.lost = self._clock.now_ns(), False
         if state == NmtState.BOOT_UP:
             self.boot_ups += 1
         if not self._watching:

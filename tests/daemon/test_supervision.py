@@ -17,6 +17,7 @@ from servod.daemon.health import Health, Pulse
 from servod.daemon.lock import BusLock, InstanceLock
 from servod.daemon.nodes import FaultRelay, nmt_name
 from servod.daemon.status import axis_status, bus_status, fault_status, motion_status
+from servod.daemon.verbs import _why_not_enabled
 from servod.errors import FaultCode, Unreachable
 from servod.hal import Reason
 from servod.metrics import AxisMetrics
@@ -70,6 +71,17 @@ def test_status_says_why_the_goal_is_not_reached() -> None:
     status = axis_status(record(axis_state=AxisState.ENABLING, goal=2, reasons=Reason.NO_VOLTAGE | Reason.HANDSHAKE))
     assert (status["state"], status["goal"], status["goal_reached"]) == ("ENABLING", "ENABLED", False)
     assert [r.split()[0:3] for r in status["reasons"]] == [["the", "drive", "has"], ["waiting", "for", "the"]]
+
+
+def test_an_axis_whose_wiring_is_being_proven_has_not_reached_its_goal() -> None:
+    status = axis_status(record(axis_state=AxisState.PROVING, goal=2, goal_reached=1))
+    assert (status["goal_reached"], status["reasons"]) == (False, ["wiring is being proven"])
+
+
+def test_an_axis_that_somebody_stopped_is_told_so_and_a_fault_goes_first() -> None:
+    assert "somebody stopped it" in _why_not_enabled(record(axis_state=AxisState.DISABLED))
+    told = _why_not_enabled(record(axis_state=AxisState.FAULT, faults_latched=STALE))
+    assert told.startswith("FEEDBACK_STALE: ")
 
 
 def test_values_that_are_not_finite_are_none() -> None:

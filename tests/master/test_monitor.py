@@ -42,8 +42,10 @@ def test_a_lost_heartbeat_is_one_event_for_each_loss(axis: tuple[Witness, Master
     world.encoder.nmt.stop_heartbeat()
     events = events_until(instance, lambda seen: False, 0.4)
     assert [(event.node_id, event.fault) for event in events] == [(2, FaultCode.NODE_HEARTBEAT_LOST)]
+    assert [instance.silent(node) for node in (1, 2)] == [False, True]
     world.encoder.nmt.start_heartbeat(20)
     assert events_until(instance, bool, 0.2) == []
+    assert not instance.silent(2)
     world.encoder.nmt.stop_heartbeat()
     assert len(events_until(instance, bool)) == 1
 
