@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 import sys
 from collections.abc import Iterator
@@ -66,6 +67,15 @@ def document() -> dict[str, Any]:
     }
 
 
+def main() -> None:
+    """Print the bill; one line on standard error when nobody takes it."""
+    text = json.dumps(document(), indent=2)
+    try:
+        print(text, flush=True)
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the interpreter flushes once more
+        sys.exit(f"sbom: standard output: {error.strerror}")
+
+
 if __name__ == "__main__":
-    json.dump(document(), sys.stdout, indent=2)
-    print()
+    main()

@@ -62,6 +62,7 @@ for _verb in (*_DAEMON, *_LABORATORY, soak, bench, check, faults):
 
 def main() -> None:
     """Entry point of `servoctl`: errors become one line on standard error and an exit code, never a traceback."""
+    _stand_in_for_closed()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal without the character still gets the rest
@@ -73,9 +74,18 @@ def main() -> None:
     sys.exit(code)
 
 
+def _stand_in_for_closed() -> None:
+    """A stream that the caller closed (`>&-`) is None: standard output gets one that refuses what is written to it, and
+    standard error one that takes everything. The lowest free number is theirs, so that no later file gets it."""
+    if sys.stdout is None:
+        sys.stdout = os.fdopen(os.open(os.devnull, os.O_RDONLY), "w")
+    if sys.stderr is None:
+        sys.stderr = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
+
+
 def _output_refused(error: OSError) -> int:
     """The exit code when nobody takes standard output; any other error is raised again."""
-    if error.filename is not None or error.errno not in (errno.ENOSPC, errno.EIO, errno.EPIPE):
+    if error.filename is not None or error.errno not in (errno.ENOSPC, errno.EIO, errno.EPIPE, errno.EBADF):
         raise error
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the interpreter flushes once more
     if error.errno == errno.EPIPE:

@@ -32,6 +32,22 @@ def test_a_reader_that_has_gone_is_silence(words: tuple[str, ...]) -> None:
     assert (done.returncode, done.stderr) == (1, b"")
 
 
+@pytest.mark.parametrize(("closed", "code"), [(">&-", 1), ("2>&-", 0)])
+def test_a_closed_stream_is_no_traceback(closed: str, code: int) -> None:
+    command = ["sh", "-c", f'exec "$0" -m servod.cli faults --codes {closed}', sys.executable]
+    done = subprocess.run(command, capture_output=True, timeout=60, check=False)
+    told = b"servoctl: standard output: Bad file descriptor\n" if code else b""
+    assert (done.returncode, done.stderr) == (code, told)
+    assert (b"TORQUE_CLIPPED" in done.stdout) == (code == 0)
+
+
+def test_a_bill_of_materials_for_a_full_disk_is_one_line() -> None:
+    script = Path(__file__).parents[2] / "scripts/sbom.py"
+    with Path("/dev/full").open("wb") as full:
+        done = subprocess.run([sys.executable, script], stdout=full, stderr=subprocess.PIPE, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (1, b"sbom: standard output: No space left on device\n")
+
+
 def test_a_terminal_without_the_characters_gets_the_rest() -> None:
     plain = {"PATH": os.environ["PATH"], "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONIOENCODING": "ascii"}
     done = servoctl("faults", "--codes", stdout=subprocess.PIPE, env=plain)
