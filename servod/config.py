@@ -135,7 +135,7 @@ class WiringProofConfig(Strict):
     enabled: bool = Field(True, description="prove at the first enable after a start, and after what makes it doubtful")
     torque_nm: float | None = Field(
         None,
-        gt=0.0,
+        ge=1e-6,
         le=1e5,
         description="most torque; none: 0.9 of limits.torque_nm, or 15 times what friction_nm and inertia lead to "
         "expect and 0.075 of limits.torque_nm, if that is less",
