@@ -100,7 +100,9 @@ def test_a_loss_without_its_bound_is_refused_unless_the_file_says_why() -> None:
 
 def outcome(name: str, gone_ms: float, exempt: str | None) -> Outcome:
     times = Reaction(gone_ms, gone_ms)
-    return Outcome(name, "x", "x", "x", (), "", "FAULT", times, 0, exempt is None, (), MASTER, exempt)
+    return Outcome(
+        name, "x", "x", "x", (), "", "FAULT", times, 0, exempt is None, (), MASTER, exempt, exempt is not None
+    )
 
 
 def test_exemptions_are_counted_and_shown_and_leave_the_times_alone() -> None:

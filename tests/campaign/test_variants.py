@@ -49,7 +49,7 @@ def test_a_file_without_rows_is_one_scenario(tmp_path: Path) -> None:
         ("title: x\n", "a value; this key is required"),
         ("- 1\n", "a mapping of keys"),
         (HEAD.replace("frames:", "frame:") + EXPECT + ROWS, "found 'frame'; allowed: one of"),
-        (HEAD + EXPECT + ROWS.replace("[FAULT]", "[BROKEN]"), "instead of BROKEN"),
+        (HEAD + EXPECT + ROWS.replace("[FAULT]", "[BROKEN]"), "axis.0: found 'BROKEN'; allowed: one of BRAKING"),
         (HEAD + EXPECT + ROWS.replace("count: 2", "count: 200").replace("300", "301"), "torque_gone_ms of at most 300"),
         (HEAD + EXPECT + ROWS.replace(", torque_gone_ms: 300", ""), "has a time for it"),
         (HEAD + EXPECT + ROWS.replace("[FAULT]", "[ENABLED, FAULT]"), "a scenario has one end"),

@@ -52,7 +52,7 @@ def names(word: int) -> list[str]:
 @pytest.mark.parametrize("path", SCENARIOS, ids=lambda p: p.stem)
 def test_scenario(path):
     document = parse_yaml(path.read_text(), path.name)
-    axis = Axis(PERIOD_S, document.get("ramp_s", 0.003), document.get("enable_timeout_s", 0.01), Mode(10))
+    axis = Axis(PERIOD_S, document.get("ramp_s", 0.003), document.get("enable_timeout_s", 0.01), Mode(10), 5.0)
     drive = "SWITCH_ON_DISABLED"
     for number, entry in enumerate(document["cycles"], 1):
         drive = entry.get("drive", drive)
