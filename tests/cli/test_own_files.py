@@ -48,6 +48,6 @@ def test_a_set_that_could_never_be_activated_is_not_stored(tmp_path: Path) -> No
     store = GainStore(tmp_path)
     text = good.certified(good.parse_gains(good.PD, "good.yaml")).to_yaml()
     store.load(text, "good.yaml")
-    with pytest.raises(BadInput, match=r"edited\.yaml: certificate: found numbers that were changed"):
+    with pytest.raises(BadInput, match=r"edited\.yaml: seal: found numbers that were changed"):
         store.load(text.replace("position_gain_nm_per_rad: 2.5", "position_gain_nm_per_rad: 2.6"), "edited.yaml")
     assert store.get("bench_pd").version == 1

@@ -68,7 +68,9 @@ def test_a_set_for_another_joint_is_rolled_back(change: dict[str, float], tmp_pa
 
 def test_a_limit_that_is_met_rolls_back(tmp_path: Path) -> None:
     limits = link_to(table1(), tmp_path / "roomy").config.limits.model_copy(update={"torque_nm": 0.075})
-    config = link_to(table1(), tmp_path).config.model_copy(update={"limits": limits})
+    config = link_to(table1(), tmp_path).config
+    proof = config.wiring_proof.model_copy(update={"torque_nm": 0.075})  # just above break-away
+    config = config.model_copy(update={"limits": limits, "wiring_proof": proof})
     link = virtual_link(table1(), tmp_path, certified(), PD, config=config)
     with pytest.raises(BadInput, match=r"certificate\.torque_nm: .* at most 0\.075"):
         deploy(link, certified(), quiet)

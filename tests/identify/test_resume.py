@@ -80,7 +80,7 @@ def test_an_interrupt_anywhere_leaves_the_axis_off_and_the_recordings(tmp_path):
         identify(link, tmp_path / "recordings", lambda _what, _share: None)
     assert link.session.cycle.axis.state == AxisState.DISABLED
     assert link.session.latest.torque_nm == 0.0
-    assert abs(link.session.world.truth().velocity_rad_s) < 1e-4
+    assert abs(link.session.world.truth().velocity_rad_s) < 1e-3  # bristles still relax
     assert len(store.load(tmp_path / "recordings")) == 5
     assert store.Recordings(tmp_path / "recordings", "another axis", resume=True).waiting == 0
     assert len(store.load(tmp_path / "recordings")) == 5
