@@ -15,7 +15,7 @@ from servod.soak.plan import Ending, Episode, Move
 from servod.soak.run import DOCUMENT_NAME, run
 from servod.soak.wall import WallSoak, of_the_wall
 
-pytestmark = pytest.mark.serial
+pytestmark = [pytest.mark.serial, pytest.mark.long]
 
 _KIND = {kind.name: kind for kind in KINDS if of_the_wall(kind)}
 
