@@ -14,7 +14,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from running import Running, at_rest, running, wait_for
 
-from servod.control import ControlClient
+from servod.control import ControlClient, Refused
 from servod.errors import BadInput, Unreachable
 from servod.recorder_read import read_recording
 from servod.shipped import shipped
@@ -181,17 +181,21 @@ def test_daemon_starts_again_after_kill_9(tmp_path: Path) -> None:
         time.sleep(1.0)
         command = [sys.executable, "-m", "servod.daemon.main", "--config", str(tmp_path / "axis.yaml")]
         with subprocess.Popen(command, stderr=subprocess.PIPE) as second:
-            wait_for(lambda: _answers(axis.socket) or second.poll() is not None, 60.0)
-            with ControlClient(axis.socket) as client:
-                assert client.call("status")["axis"]["state"] == "DISABLED"
-            second.send_signal(signal.SIGTERM)
+            try:
+                wait_for(lambda: _answers(axis.socket) or second.poll() is not None, 60.0)
+                with ControlClient(axis.socket) as client:
+                    assert client.call("status")["axis"]["state"] == "DISABLED"
+            finally:
+                second.send_signal(signal.SIGTERM)
             assert second.wait(10) == 0, second.stderr.read() if second.stderr else ""
         assert not axis.socket.exists()
 
 
 def _answers(path: Path) -> bool:
+    """Whether there is a status: the socket is there before the loop has begun."""
     try:
-        ControlClient(path).close()
-    except Unreachable:
+        with ControlClient(path) as client:
+            client.call("status")
+    except (Unreachable, Refused):
         return False
     return True
