@@ -174,6 +174,8 @@ class ControlClient:
             raise Unreachable(f"{self._path}: the daemon hung up") from None
 
     def _answer(self) -> dict[str, Any]:
+        if self._lines.closed:
+            raise Unreachable(f"{self._path}: this connection was closed")
         try:
             line = self._lines.readline(MAX_ANSWER_BYTES)
         except TimeoutError:
