@@ -12,8 +12,9 @@ from subprocess import Popen
 
 import pytest
 
-from servod.control import ControlClient
+from servod.control import ControlClient, Refused
 from servod.demo.processes import child, wait_until
+from servod.errors import Unreachable
 from servod.shipped import shipped
 
 CONFIG = """
@@ -82,8 +83,18 @@ def running(folder: Path, plant: Path | None = None, more: str = "", travel_rad:
         ) as axis:
             wait_until((folder / "bus").exists, axis, folder / "axis.log", 30.0)
             with _told_to(folder / "notify"), child("servod.daemon.main", ["--config", str(config)], log) as daemon:
-                wait_until((folder / "axis.sock").exists, daemon, log, 30.0)
+                wait_until(lambda: answers(folder / "axis.sock"), daemon, log, 30.0)
                 yield Running(folder, daemon, manager)
+
+
+def answers(path: Path) -> bool:
+    """Whether there is a status: the socket is there before the loop has begun."""
+    try:
+        with ControlClient(path) as client:
+            client.call("status")
+    except (Unreachable, Refused):
+        return False
+    return True
 
 
 @contextlib.contextmanager

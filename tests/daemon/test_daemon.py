@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
-from running import Running, at_rest, running, wait_for
+from running import Running, answers, at_rest, running, wait_for
 
-from servod.control import ControlClient, Refused
+from servod.control import ControlClient
 from servod.errors import BadInput, Unreachable
 from servod.recorder_read import read_recording
 from servod.shipped import shipped
@@ -182,20 +182,10 @@ def test_daemon_starts_again_after_kill_9(tmp_path: Path) -> None:
         command = [sys.executable, "-m", "servod.daemon.main", "--config", str(tmp_path / "axis.yaml")]
         with subprocess.Popen(command, stderr=subprocess.PIPE) as second:
             try:
-                wait_for(lambda: _answers(axis.socket) or second.poll() is not None, 60.0)
+                wait_for(lambda: answers(axis.socket) or second.poll() is not None, 60.0)
                 with ControlClient(axis.socket) as client:
                     assert client.call("status")["axis"]["state"] == "DISABLED"
             finally:
                 second.send_signal(signal.SIGTERM)
             assert second.wait(10) == 0, second.stderr.read() if second.stderr else ""
         assert not axis.socket.exists()
-
-
-def _answers(path: Path) -> bool:
-    """Whether there is a status: the socket is there before the loop has begun."""
-    try:
-        with ControlClient(path) as client:
-            client.call("status")
-    except (Unreachable, Refused):
-        return False
-    return True
