@@ -14,7 +14,7 @@ _PACKAGE = Path(__file__).parent
 #: The checks of a set, and what they stand on: simulator, control laws, model and design.
 VERIFIES = (
     *("verify/*.py", "models/*.py", "controllers/*.py", "axis_*.py", "identified.py"),
-    *("gain_design.py", "gain_parameters.py", "gains.py", "references.py"),
+    *("gain_design.py", "gain_parameters.py", "gain_verdict.py", "gains.py", "references.py"),
 )
 #: What computes a design: it judges its choices by the same checks.
 SYNTHESIZES = ("synthesize/*.py", *(pattern for pattern in VERIFIES if pattern != "references.py"))

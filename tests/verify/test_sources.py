@@ -12,7 +12,10 @@ import servod
 from servod.sources import DIAGNOSES, SYNTHESIZES, VERIFIES, sources
 
 #: Reading and writing of files, names and numbers of commands, processes: no figure depends on them.
-NEUTRAL = {"__init__.py", "commands.py", "config.py", "errors.py", "sources.py", "units.py", "workers.py", "yaml12.py"}
+NEUTRAL = {
+    *("__init__.py", "commands.py", "config.py", "errors.py", "files.py"),
+    *("sources.py", "units.py", "workers.py", "yaml12.py"),
+}
 PACKAGE = Path(servod.__file__).parent
 
 
