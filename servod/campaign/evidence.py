@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from itertools import takewhile
 from typing import NamedTuple
 
 from servod.campaign.scenario import POWERED, Runs, Scenario, Start
@@ -79,7 +80,10 @@ def _felt(before: Sequence[DriveSample], watch: Watch) -> bool:
 def _strays_rad(scenario: Scenario, samples: Sequence[DriveSample], injected_ns: int) -> float:
     """Furthest distance after the injection from the motion of before, continued; NaN where there was none."""
     rows = [((s.time_ns - injected_ns) / _NS_PER_S, s.position_rad) for s in samples]
-    held = [row for row, s in zip(rows, samples, strict=True) if s.state is DriveState.OPERATION_ENABLED and row[0] < 0]
+    before = [pair for pair in zip(rows, samples, strict=True) if pair[0][0] < 0]
+    # The drive's record may go on from axis to axis: where it was enabled last, counts.
+    enabled_last = takewhile(lambda pair: pair[1].state is DriveState.OPERATION_ENABLED, reversed(before))
+    held = [row for row, _ in enabled_last][::-1]
     if not held:
         return math.nan
     center_rad, omega, sine, cosine = held[-1][1], 0.0, 0.0, 0.0

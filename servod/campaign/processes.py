@@ -46,6 +46,9 @@ from servod.yaml12 import validate
 _SINE = {"kind": "sine", **MOTION[Runs.PROCESSES]._asdict(), "duration_s": 600.0}
 #: The joint moves when its torque is so large [N*m]: enough to lose.
 _MOVING_NM, _START_S = 0.01, 20.0
+#: The judge continues the motion of before the injection: so many periods it must have seen of it, the first third of
+#: which it leaves out.
+_SHOWN_PERIODS = 1.5
 #: A participant that leaves takes with it what still waits in its queue.
 _SENT_S = 0.01
 _VERBS = {Op.DISABLE: Verb.DISABLE, Op.QUICK_STOP: Verb.STOP, Op.HALT: Verb.HALT}
@@ -95,6 +98,7 @@ class ProcessAxis:
         if start is Start.MOVING:
             self.client.call(Verb.TRACK, **_SINE)
             self._wait_until(self._moves, "the axis does not move")
+            time.sleep(_SHOWN_PERIODS / MOTION[Runs.PROCESSES].frequency_hz)
         self._wait_until(self._recorded, "the recorder writes nothing")
 
     def run(self, duration_s: float) -> None:

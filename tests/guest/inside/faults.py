@@ -48,7 +48,7 @@ class UnitMachine(Machine):
         super().__init__(folder, CanWire(INTERFACE))
         self.config, self.socket = folder / "axis.yaml", Path(SOCKET)
         self._joined = _interface_number()
-        self._cursor = shell("journalctl", "-n", "0", "--show-cursor").rpartition("cursor: ")[2].strip()
+        self._said = len(journal())
 
     def start_virtual_axis(self) -> None:
         """Start it, or leave the one that has its place on the bus."""
@@ -96,8 +96,8 @@ class UnitMachine(Machine):
         return read_drive_record(DRIVE_RECORD)
 
     def daemon_log(self) -> str:
-        """What the unit said since the scenario began."""
-        return shell("journalctl", "-u", UNIT, "--no-pager", "-o", "cat", f"--after-cursor={self._cursor}")
+        """What the unit said since the scenario began; by a cursor, journalctl of systemd 252 leaves out a line."""
+        return journal()[self._said :]
 
     def close(self) -> None:
         """Leave the axis disabled."""
@@ -149,4 +149,6 @@ def _outcome(name: str, scenario: Scenario) -> dict[str, Any]:
     else:
         row = {"detected": outcome.detected, "axis": outcome.axis, "complaints": outcome.complaints}
         row |= {"gone_ms": outcome.reaction.gone_ms, "left_ms": outcome.reaction.left_ms}
+        if outcome.complaints:
+            row["journal_tail"] = shell("journalctl", "--no-pager", "-n", "30", "-o", "cat")[-4000:]
     return {**row, "seconds": round(time.monotonic() - started, 1)}

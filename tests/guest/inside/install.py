@@ -7,7 +7,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from inside.tools import AXIS_UNIT, CONFIG, CONFIG_FILE, DRIVE_RECORD, INTERFACE, drop_in, shell
+import yaml
+
+from inside.tools import AXIS_UNIT, CONFIG, CONFIG_FILE, DRIVE_RECORD, GAINS_FILE, INTERFACE, drop_in, shell
 
 SITE = Path("/usr/local/lib/python3.11/dist-packages")
 PROGRAMS = {
@@ -46,6 +48,7 @@ def install() -> dict[str, Any]:
         shutil.copytree(share / name, f"/opt/servod-source/{name}")
     shell("/opt/servod-source/systemd/install.sh")
     CONFIG_FILE.write_text(CONFIG)
+    GAINS_FILE.write_text(_soft_gains(Path("/etc/servod/demo_pd.yaml")))
     shutil.copy(Path(__file__).with_name("probe.py"), "/usr/local/lib/servod-probe.py")
     drop_in(AXIS_UNIT, VIRTUAL_AXIS_DROP_IN.format(record=DRIVE_RECORD, interface=INTERFACE, plant=PLANT))
     drop_in("servod@.service", DAEMON_DROP_IN)
@@ -57,3 +60,11 @@ def install() -> dict[str, Any]:
     shell("systemctl", "daemon-reload")
     units = map(str, Path("/etc/systemd/system").glob("servod[@-]*.service"))
     return {"verify": shell("systemd-analyze", "verify", *units)}
+
+
+def _soft_gains(shipped: Path) -> str:
+    """The shipped PD for a period twenty times as long: as shipped, the joint rings at 50 Hz by half its motion."""
+    gains = yaml.safe_load(shipped.read_text())
+    gains |= {"name": "guest_pd", "description": "PD for a period of 20 ms."}
+    gains["parameters"] |= {"position_gain_nm_per_rad": 1.0, "velocity_gain_nms_per_rad": 0.06}
+    return yaml.safe_dump(gains)

@@ -12,7 +12,7 @@ from typing import Any
 UNIT, AXIS_UNIT, SOCKET = "servod@guest.service", "servod-virtual-axis.service", "/run/servod/guest.sock"
 INTERFACE = "vcan0"
 DRIVE_RECORD = "/run/servod/drive.bin"
-CONFIG_FILE = Path("/etc/servod/config/guest.yaml")
+CONFIG_FILE, GAINS_FILE = Path("/etc/servod/config/guest.yaml"), Path("/etc/servod/guest_pd.yaml")
 
 #: Slow on purpose: the guest's one CPU is many times slower than any machine that servod is for. One period is twenty
 #: of those that servod is made for, and the heartbeats go with it. A joint that was let go of may turn far.
@@ -25,7 +25,7 @@ amplifier: {enable_timeout_s: 20}
 wiring_proof: {enabled: false}  # at 50 Hz the joint is far away before its first answer comes
 limits: {torque_nm: 0.9, torque_rate_nm_per_s: 400.0, speed_rad_s: 20.0, position_min_rad: -999, position_max_rad: 999,
   following_error_rad: 3.0, encoder_mismatch_rad: 0.5, stale_cycles: 100, late_cycles: 5000}
-gains: {directory: /var/lib/servod/guest/gains, initial: /etc/servod/demo_pd.yaml, accept_uncertified: true}
+gains: {directory: /var/lib/servod/guest/gains, initial: /etc/servod/guest_pd.yaml, accept_uncertified: true}
 control: {socket: /run/servod/guest.sock, group: servod}
 recorder: {directory: /var/lib/servod/guest/recordings, history_s: 5}
 metrics: {textfile: /var/lib/servod/metrics/guest.prom}
