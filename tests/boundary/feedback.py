@@ -1,12 +1,25 @@
-"""Feedback of a sound drive and encoder, to be changed in one value, and numbers beside a limit."""
+"""Feedback of a sound drive and encoder, limits that it may reach, and numbers beside a limit."""
 
 from __future__ import annotations
 
 import math
 from typing import Any
 
+from servod.config import LimitsConfig
 from servod.hal import AmplifierFeedback, DriveState, EncoderFeedback, Reason
 
+#: Powers of two, so that sums and products in here are exact.
+CONFIG = LimitsConfig(
+    torque_nm=0.5,
+    torque_rate_nm_per_s=64.0,
+    speed_rad_s=4.0,
+    position_min_rad=-1.0,
+    position_max_rad=2.0,
+    following_error_rad=0.25,
+    encoder_mismatch_rad=0.125,
+    stale_cycles=3,
+    late_cycles=4,
+)
 NAN, INF = math.nan, math.inf
 NOT_FINITE = (NAN, INF, -INF)
 

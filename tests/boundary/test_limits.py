@@ -11,23 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from servod.config import LimitsConfig
 from servod.errors import FAULTS, FaultCode
 from servod.limits import Limits
-from tests.boundary.feedback import INF, NAN, NOT_FINITE, above, amplifier, below, encoder
+from tests.boundary.feedback import CONFIG, INF, NAN, NOT_FINITE, above, amplifier, below, encoder
 
-#: Powers of two, so that sums and products in here are exact.
-CONFIG = LimitsConfig(
-    torque_nm=0.5,
-    torque_rate_nm_per_s=64.0,
-    speed_rad_s=4.0,
-    position_min_rad=-1.0,
-    position_max_rad=2.0,
-    following_error_rad=0.25,
-    encoder_mismatch_rad=0.125,
-    stale_cycles=3,
-    late_cycles=4,
-)
 DT_S = 2.0**-10
 STEP_NM = 64.0 * DT_S
 BIT = {code: fault.bit for code, fault in FAULTS.items()}

@@ -13,16 +13,7 @@ from servod.config import AxisConfig
 from servod.drivers import load_driver
 from servod.errors import BadInput
 from servod.hal import PdoEntry, PdoMap
-
-LIMITS = {
-    "torque_nm": 1.0,
-    "torque_rate_nm_per_s": 100.0,
-    "speed_rad_s": 10.0,
-    "position_min_rad": -1.0,
-    "position_max_rad": 1.0,
-    "following_error_rad": 0.5,
-    "encoder_mismatch_rad": 0.2,
-}
+from tests.axis_limits import LIMITS
 
 
 def load_of(**sections: Any) -> tuple[AxisConfig, Any]:

@@ -22,20 +22,12 @@ from servod.master.monitor import NodeWatch
 from servod.master.network import BusNetwork
 from servod.master.scan import scan as scan_bus
 from servod.master.sdo import NodeSdo
+from tests.axis_limits import LIMITS
 from tests.fuzz.frames import BentBus, ScriptBus, ScriptClock, frames
 from tests.fuzz.shapes import frame_lists
 from tests.fuzz.target import Target
 from tests.virtual.bench import JOINT
 
-LIMITS = {
-    "torque_nm": 1.0,
-    "torque_rate_nm_per_s": 100.0,
-    "speed_rad_s": 10.0,
-    "position_min_rad": -1.0,
-    "position_max_rad": 1.0,
-    "following_error_rad": 0.5,
-    "encoder_mismatch_rad": 0.2,
-}
 _NODES = (1, 2)
 _SDO_IDS = (*(SDO_ANSWER_BASE + node for node in _NODES), 0x583)
 #: All that a master listens to, and some that it does not.

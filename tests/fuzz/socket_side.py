@@ -23,7 +23,7 @@ from servod.loop.handle import LoopHandle
 from servod.loop.plan import LoopPlan
 from servod.record import FIELDS, CycleRecord
 from servod.recorder import Recorder
-from tests.fuzz.master_side import LIMITS
+from tests.axis_limits import LIMITS
 from tests.fuzz.shapes import JSON_TRICKS, request_lines
 from tests.fuzz.target import Target
 from tests.fuzz.texts import _GAINS

@@ -6,32 +6,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from servod.config import LimitsConfig
 from servod.errors import FAULTS, FaultCode
-from servod.hal import AmplifierFeedback, DriveState, EncoderFeedback
 from servod.limits import Limits
+from tests.boundary.feedback import CONFIG as EXACT
+from tests.boundary.feedback import above, amplifier, encoder
 
-CONFIG = LimitsConfig(
-    torque_nm=0.3,
-    torque_rate_nm_per_s=100.0,
-    speed_rad_s=5.0,
-    position_min_rad=-1.0,
-    position_max_rad=2.0,
-    following_error_rad=0.25,
-    encoder_mismatch_rad=0.125,
-    stale_cycles=3,
-    late_cycles=4,
-)
+CONFIG = EXACT.model_copy(update={"torque_nm": 0.3, "torque_rate_nm_per_s": 100.0, "speed_rad_s": 5.0})
 PERIOD_S = 1e-3
-
-
-def amplifier(**changes) -> AmplifierFeedback:
-    base = AmplifierFeedback(0, 0, DriveState.OPERATION_ENABLED, 0x1637, 10, 0.0, 0.0, 0, True, 0)
-    return base._replace(**changes)
-
-
-def encoder(**changes) -> EncoderFeedback:
-    return EncoderFeedback(0, 0, 0.0, 0.0, 0)._replace(**changes)
 
 
 def armed() -> Limits:
@@ -42,10 +23,6 @@ def armed() -> Limits:
 
 def codes(word: int) -> set[FaultCode]:
     return {c for c, f in FAULTS.items() if word & f.bit}
-
-
-def just_above(x: float) -> float:
-    return math.nextafter(x, math.copysign(math.inf, x))
 
 
 MOTION = [
@@ -76,7 +53,7 @@ def motion_faults(who: str, what) -> set[FaultCode]:
 @pytest.mark.parametrize(("code", "who", "what"), MOTION)
 def test_at_the_limit_is_allowed_and_just_beyond_is_not(code, who, what):
     assert motion_faults(who, what) == set()
-    beyond = just_above(what) if isinstance(what, float) else {k: just_above(v) for k, v in what.items()}
+    beyond = above(what) if isinstance(what, float) else {k: above(v) for k, v in what.items()}
     assert motion_faults(who, beyond) == {code}
 
 

@@ -19,17 +19,9 @@ from servod.bus.python_can import PythonCanBus
 from servod.clock import WallClock
 from servod.config import AxisConfig
 from servod.master import Master
+from tests.axis_limits import LIMITS
 
 EDS = Path(drivers.__file__).parent / "eds"
-LIMITS = {
-    "torque_nm": 1.0,
-    "torque_rate_nm_per_s": 100.0,
-    "speed_rad_s": 10.0,
-    "position_min_rad": -1.0,
-    "position_max_rad": 1.0,
-    "following_error_rad": 0.5,
-    "encoder_mismatch_rad": 0.2,
-}
 
 
 def axis_config(**sections: Any) -> AxisConfig:
