@@ -326,7 +326,8 @@ FAULTS: dict[FaultCode, Fault] = dict(
             _C.NODE_LEFT_OPERATIONAL,
             _R.QUICK_STOP,
             "A node left the NMT state operational: somebody sent it an NMT command, or it did so by itself.",
-            "Find who sends NMT commands (another master, a service tool), then restart the daemon.",
+            "Find who sends NMT commands (another master, a service tool), switch a stopped node off and on, then "
+            "restart the daemon.",
         ),
     ]
 )
