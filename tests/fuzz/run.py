@@ -1,6 +1,7 @@
 """Fuzzes every way into servod for a bounded time; each target in a process of its own, whose death is a finding too.
 
     python -m tests.fuzz.run --seconds 60                  a share for each target
+    python -m tests.fuzz.run --seconds 60 --jobs 2         the same in half the time, on two cores
     python -m tests.fuzz.run --seconds 600 --target mcap   one target, longer
     python -m tests.fuzz.run --seconds 60 --json out.json  the figures, with every crash, for programs
 
@@ -20,6 +21,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -112,19 +114,21 @@ def table(rows: list[Row]) -> Iterator[str]:
     yield f"{sum(row.inputs for row in rows)} inputs to {len({row.target for row in rows})} targets, {crashes} crashes"
 
 
-def run(names: list[str], seconds: float, out: Path) -> list[Row]:
-    """Fuzz the targets one after the other."""
+def run(names: list[str], seconds: float, out: Path, jobs: int) -> list[Row]:
+    """Fuzz the targets, `jobs` at a time; each has its share of the seconds, however many run beside it."""
     ways = ["bytes", "shaped"] if importlib.util.find_spec("atheris") else ["drawn"]
     if ways == ["drawn"]:
         print("atheris is not installed (pip install servod[fuzz]): hypothesis alone draws inputs", file=sys.stderr)
     share_s = seconds / (len(names) * len(ways))
-    rows = []
-    for name in names:
-        shutil.rmtree(out / name, ignore_errors=True)
-        rows += [fuzz(name, way, share_s, out) for way in ways]
-        found = sorted({crash["key"] for row in rows if row.target == name for crash in row.crashes})
-        for key in found:
-            print(f"{name}: {key}", file=sys.stderr)
+    with ThreadPoolExecutor(jobs) as pool:
+        return [row for rows in pool.map(lambda name: _both_ways(name, ways, share_s, out), names) for row in rows]
+
+
+def _both_ways(name: str, ways: list[str], share_s: float, out: Path) -> list[Row]:
+    shutil.rmtree(out / name, ignore_errors=True)
+    rows = [fuzz(name, way, share_s, out) for way in ways]
+    for key in sorted({crash["key"] for row in rows for crash in row.crashes}):
+        print(f"{name}: {key}", file=sys.stderr)
     return rows
 
 
@@ -134,9 +138,10 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=60.0, help="of fuzzing in all; each process starts in a few")
     parser.add_argument("--target", action="append", choices=list(TARGETS), help="this one (again for more)")
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "fuzz", help="folder for crashes and corpora")
+    parser.add_argument("--jobs", type=int, default=1, help="targets at a time")
     parser.add_argument("--json", type=Path, help="write the figures here")
     options = parser.parse_args()
-    rows = run(options.target or list(TARGETS), options.seconds, options.out.resolve())
+    rows = run(options.target or list(TARGETS), options.seconds, options.out.resolve(), max(1, options.jobs))
     print("\n".join(table(rows)))
     if options.json:
         options.json.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n")
