@@ -220,7 +220,7 @@ KINDS: tuple[FaultKind, ...] = (
     _drive("supply too high", 3, Between(61_000, 90_000), 48_000),
     _resettable(
         "encoder alarm",
-        _write("encoder", 0x2000, 1, Between(1, 7)),
+        _write("encoder", 0x2000, 1, Between(1, 3)),
         {_F.ENCODER_ALARM},
         _write("encoder", 0x2000, 1, 0),
     ),
