@@ -82,6 +82,20 @@ def test_what_the_sensors_differ_by_at_enable_belongs_to_them() -> None:
         assert found == fault * BIT[FaultCode.ENCODER_IMPLAUSIBLE]
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_joint_that_is_proven_stays_within_twice_the_travel_of_where_it_began(sign: float) -> None:
+    limits = Limits(CONFIG)
+    assert limits.proving_faults(encoder(position_rad=sign * 0.5), 0.25) == 0, "zero before the first enable"
+    for began in (0.0, 8.0, -8.0):  # whole eighths, so that differences are exact
+        limits.arm(amplifier(), encoder(position_rad=began))
+        for travel, fault in ((0.0, 0), (0.375, 0), (0.5, 0), (0.625, 1), (2.0, 1), (9.0, 1), (INF, 1), (NAN, 1)):
+            found = limits.proving_faults(encoder(position_rad=began + sign * travel), 0.25)
+            assert found == fault * BIT[FaultCode.WIRING_NOT_PROVEN]
+    limits.arm(amplifier(), encoder())
+    assert limits.proving_faults(encoder(position_rad=sign * above(0.5)), 0.25), "to the last bit"
+    assert not limits.proving_faults(encoder(position_rad=sign * 2.0), 1.0), "the travel is the test's own"
+
+
 # --- feedback and deadline --------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(("age", "stale"), [(0, False), (2, False), (3, True), (4, True), (1_000_000, True)])
 def test_feedback_is_stale_from_the_configured_age_of_either(age: int, stale: bool) -> None:
