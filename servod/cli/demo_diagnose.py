@@ -55,6 +55,8 @@ def _print(document: dict[str, Any]) -> None:
     for line in document["broken_promises"]:
         print(f"promise broken: {line}")
     print(f"diagnosed: {found}")
+    if not document["deployment"]["deployed"]:
+        print(f"rolled back: {'; '.join(document['deployment']['reasons'])}")
     back = f"{100.0 * document['recovered_share']:.0f} % of the cost is back"
     print(f"after new design    {rms['after']:.4f} mrad, {share['after']}: {back}")
     print(f"Report: {document['report']}")
