@@ -89,7 +89,8 @@ def _print(found: dict[str, Any], out: Path) -> None:
         counted.add_row(*row)
     console.print(counted)
     for finding in found["findings"][:10]:
-        where = f"episode {finding['episode']}, {finding['time_s']:.3f} s"
+        moment = "" if finding["time_s"] is None else f", {finding['time_s']:.3f} s"
+        where = f"episode {finding['episode']}{moment}"
         console.print(f"{where}: {finding['wrong']}: {finding['text']}", highlight=False, markup=False)
     console.print(verdict(found), highlight=False)
     console.print(f"Report: {out / PAGE_NAME}", highlight=False, soft_wrap=True)

@@ -31,10 +31,10 @@ class Wrong(StrEnum):
 
 
 class Finding(NamedTuple):
-    """One of them; `time_s` is axis time since the beginning."""
+    """One of them; `time_s` is axis time since the beginning, None where it is of no one moment."""
 
     episode: int
-    time_s: float
+    time_s: float | None
     wrong: Wrong
     text: str
 
@@ -52,8 +52,9 @@ class Findings:
         """Axis time at the beginning."""
         self._began_ns = time_ns
 
-    def add(self, wrong: Wrong, time_ns: int, text: str, count: int = 1) -> None:
+    def add(self, wrong: Wrong, time_ns: int | None, text: str, count: int = 1) -> None:
         """Note one, or `count` alike."""
         self.counts[wrong] += count
         if len(self.told) < _TOLD:
-            self.told.append(Finding(self.episode, (time_ns - self._began_ns) / 1e9, wrong, text))
+            time_s = None if time_ns is None else (time_ns - self._began_ns) / 1e9
+            self.told.append(Finding(self.episode, time_s, wrong, text))

@@ -100,7 +100,10 @@ class Memory:
         (slope, level), spread = np.polyfit(hours, resident_kb, 1), hours - hours.mean()
         rest = resident_kb - slope * hours - level
         width = _T95 * math.sqrt(float(rest @ rest) / (_BLOCKS - 2) / float(spread @ spread))
-        return Slope(float(slope), float(slope - width), float(slope + width), _growth(slope, width, points))
+        growth = _growth(slope, width, points)
+        if growth is Growth.GROWS and self.watched_s < LONG_S:  # caches and buffers still fill
+            growth = Growth.TOO_SHORT
+        return Slope(float(slope), float(slope - width), float(slope + width), growth)
 
     @property
     def watched_s(self) -> float:

@@ -90,7 +90,7 @@ def write_page(found: dict[str, Any], folder: Path) -> Path:
         page.heading("What was wrong")
         page.table(
             ("episode", "axis time s", "what", ""),
-            [(str(f["episode"]), f"{f['time_s']:.3f}", f["wrong"], f["text"]) for f in found["findings"]],
+            [(str(f["episode"]), _seconds(f["time_s"]), f["wrong"], f["text"]) for f in found["findings"]],
         )
     page.heading("Faults and reactions")
     page.table(_FAULT_HEADER, fault_rows(found))
@@ -128,3 +128,7 @@ def _memory(found: dict[str, Any]) -> Figure:
         curves.append(Curve(memory["process"], samples[:, 0] / 60.0, samples[:, 1] / 1024.0, colour))
     panel = Panel(Axis("wall clock / min"), Axis("resident / MB"), tuple(curves))
     return Figure("memory", "Resident size", (panel,), caption="Sampled from /proc while the soak ran.")
+
+
+def _seconds(time_s: float | None) -> str:
+    return "" if time_s is None else f"{time_s:.3f}"

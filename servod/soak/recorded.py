@@ -47,7 +47,7 @@ class RecordedRows:
         for path in paths if ended else paths[:-1]:
             recording = read_recording(path)
             if recording.truncated:
-                self._findings.add(Wrong.RECORDER, 0, f"{path.name} has no end")
+                self._findings.add(Wrong.RECORDER, None, f"{path.name} has no end")
             rows = rows_of(recording.rows)
             self.check.check(rows, self._allowed(rows, schedule, starved), _ANSWER_CYCLES)
             self._rows_of_session += len(recording)
@@ -72,5 +72,5 @@ class RecordedRows:
         if may_be_taken and heard < rows:
             self.syncs_taken += rows - heard
         elif heard != rows:
-            self._findings.add(Wrong.SYNC, 0, f"{heard} SYNC frames on the bus, {rows} rows recorded")
+            self._findings.add(Wrong.SYNC, None, f"{heard} SYNC frames on the bus, {rows} rows recorded")
         self.check.new_session()

@@ -65,11 +65,11 @@ def run(
     except KeyboardInterrupt:
         course = Course.INTERRUPTED
     except ServodError as error:
-        axis.findings.add(Wrong.NOT_RECOVERED, 0, str(error))
+        axis.findings.add(Wrong.NOT_RECOVERED, None, str(error))
     try:
         axis.finish()
     except ServodError as error:
-        axis.findings.add(Wrong.STATE, 0, f"at the end: {error}")
+        axis.findings.add(Wrong.STATE, None, f"at the end: {error}")
     _judge_memory(axis, watch)
     found = document(axis, watch.longest, watch.elapsed_s, course)
     save(found, folder)
@@ -109,6 +109,6 @@ def _judge_memory(axis: SoakedAxis, watch: Watch) -> None:
     for name, memory in watch.longest.items():
         slope = memory.slope()
         if slope.growth is Growth.GROWS:
-            axis.findings.add(Wrong.MEMORY, 0, f"{name}: {slope.kb_per_h:.0f} kB/h")
+            axis.findings.add(Wrong.MEMORY, None, f"{name}: {slope.kb_per_h:.0f} kB/h")
         if memory.descriptors_grow():
-            axis.findings.add(Wrong.DESCRIPTORS, 0, name)
+            axis.findings.add(Wrong.DESCRIPTORS, None, name)

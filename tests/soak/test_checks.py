@@ -184,7 +184,7 @@ def test_reaction_times_are_those_of_the_drive() -> None:
 
 @pytest.mark.parametrize(
     ("kb_per_h", "hours", "growth"),
-    [(0.0, 1.0, Growth.FLAT), (5000.0, 2.0, Growth.GROWS), (0.0, 0.01, Growth.TOO_SHORT)],
+    [(0.0, 1.0, Growth.FLAT), (5000.0, 2.0, Growth.GROWS), (0.0, 0.01, Growth.TOO_SHORT), (8e4, 0.1, Growth.TOO_SHORT)],
 )
 def test_a_leak_is_told_from_the_allocator_breathing(kb_per_h: float, hours: float, growth: Growth) -> None:
     chance, memory = np.random.default_rng(1), Memory()
