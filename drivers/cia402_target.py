@@ -116,15 +116,23 @@ class ProfilePositionTarget(PositionTarget):
 
     def __init__(self, facts: dict[str, Any]) -> None:
         super().__init__(facts)
-        self._handed_over: int | None = None
+        self._offered: int | None = None  # what the target was when bit 4 rose, which is what the drive takes
+        self._raised = False
+
+    def idle(self, position_counts: int, torque_per_mille: int, holding: bool) -> int:
+        """The position now present; a drive that comes back gets its target anew."""
+        self._offered, self._raised = None, False
+        return super().idle(position_counts, torque_per_mille, holding)
 
     def control_bits(self, target: int, status_word: int) -> int:
         """Bit 4 rises only while the drive shows no acknowledge, and falls when it does; bit 5: change at once."""
         if status_word & SW_FOLLOWS_COMMAND:
-            self._handed_over = target
+            self._raised = False
             return _CW_CHANGE_AT_ONCE
-        if target == self._handed_over:
-            return _CW_CHANGE_AT_ONCE
+        if not self._raised:
+            if target == self._offered:
+                return _CW_CHANGE_AT_ONCE
+            self._offered, self._raised = target, True
         return _CW_CHANGE_AT_ONCE | _CW_NEW_SET_POINT
 
 

@@ -72,7 +72,7 @@ TARGETS = {
     "cia402_target": Target(
         "drivers/cia402_target.py",
         "servod.drivers.cia402_target",
-        ("tests/conformance/test_modes.py", "tests/conformance/test_amplifiers.py"),
+        ("tests/boundary/test_cia402_target.py", "tests/conformance/test_modes.py"),
     ),
     "cia402": Target(
         "drivers/cia402.py",

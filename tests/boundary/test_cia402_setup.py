@@ -107,8 +107,16 @@ def test_rated_torque_must_be_the_configured_one_to_half_its_unit() -> None:
         else:
             with pytest.raises(BadInput, match="0x6076"):
                 configured(device)
+    device[RATED] = 2001
+    with pytest.raises(BadInput, match=r"0x6076 = 2001 \(2001 mN·m\).*2000 mN·m as configured"):
+        configured(device)
     device[RATED] = 1
     assert configured(device, rated_torque_mnm=None).facts["rated_torque_nm"] == pytest.approx(1e-3)
+
+
+def test_facts_before_the_drive_is_asked_are_in_si_units() -> None:
+    facts = AmplifierSetup(axis_config()).plan().facts
+    assert (facts["period_s"], facts["rated_torque_nm"]) == (pytest.approx(1e-3), pytest.approx(2.0))
 
 
 @pytest.mark.parametrize(("missing", "note"), [(QUICK_STOP, "0x605A"), (ABORT, "0x6007"), (PERIOD, "0x60C2")])
@@ -152,9 +160,10 @@ def test_interpolation_period_is_exact_in_eight_bits(period_us: int) -> None:
     value, exponent = interpolation_period(period_us, load_quirks("none"))
     assert 0 < value <= 255
     assert value * 10 ** (6 + exponent) == period_us
+    assert isinstance(value, int), "a count, as SDO takes it"
 
 
-@pytest.mark.parametrize("period_us", [256, 1001, 256_001])
+@pytest.mark.parametrize("period_us", [0, 256, 1001, 256_001])
 def test_interpolation_period_that_does_not_fit_is_refused(period_us: int) -> None:
     with pytest.raises(BadInput, match="0x60C2"):
         interpolation_period(period_us, load_quirks("none"))
@@ -164,6 +173,8 @@ def test_pdos_are_the_documented_ones() -> None:
     command, feedback, slow = amplifier_pdos(5, Mode.CYCLIC_SYNC_TORQUE, 150)
     assert (command.cob_id, command.event_timer_ms, feedback.cob_id, slow.cob_id) == (0x205, 150, 0x185, 0x285)
     assert [pdo.transmission_type for pdo in (command, feedback, slow)] == [1, 1, 255]
+    assert [(pdo.receive, pdo.number) for pdo in (command, feedback, slow)] == [(True, 1), (False, 1), (False, 2)]
+    assert {entry.subindex for pdo in (command, feedback, slow) for entry in pdo.entries} == {0}
     assert slow.event_timer_ms == 100
     mapped = [[(entry.index, entry.bits) for entry in pdo.entries] for pdo in (command, feedback, slow)]
     assert mapped == [
