@@ -16,6 +16,7 @@ from itertools import pairwise
 
 import typer
 
+from servod import __version__
 from servod.cli import (
     bench,
     check,
@@ -58,6 +59,21 @@ _DAEMON = (demo, scan, status, enable, stop, track, gains, preset, record)
 _LABORATORY = (identify, synthesize, verify, deploy, commission, replay, diagnose, explain, prove, paper)
 for _verb in (*_DAEMON, *_LABORATORY, soak, bench, check, faults):
     _verb.register(app)
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        print(f"servoctl {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    _version: bool = typer.Option(
+        False, "--version", is_eager=True, callback=_print_version, help="Print the version."
+    ),
+) -> None:
+    """What `servoctl` takes before a verb; its help is the app's."""
 
 
 def main() -> None:

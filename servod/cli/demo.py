@@ -146,7 +146,8 @@ def print_document(rows: Sequence[Entry], document: dict[str, Any]) -> None:
     console = Console()
     console.print(table)
     console.print(
-        f"{document['cycles']} cycles, {document['missed']} missed, {document['wall_s']:.1f} s.", highlight=False
+        f"{document['cycles']} cycles of the four controllers, {document['missed']} missed; {document['wall_s']:.1f} s.",
+        highlight=False,
     )
     if document["realtime_refused"]:
         refused = ", ".join(document["realtime_refused"])

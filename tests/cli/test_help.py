@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Iterator
+from importlib.metadata import version
 
 import pytest
 from typer.main import get_command
@@ -71,3 +72,8 @@ def test_bench_refuses_a_folder_that_cannot_be_before_it_measures(
     assert run(["bench", "--out", "/proc/nowhere/bench.json"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "--out /proc/nowhere" in line
+
+
+def test_version_is_the_packages(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["--version"]) == 0
+    assert capsys.readouterr().out == f"servoctl {version('servod')}\n"
