@@ -77,7 +77,12 @@ TARGETS = {
     "cia402": Target(
         "drivers/cia402.py",
         "servod.drivers.cia402",
-        ("tests/boundary/test_cia402.py", "tests/conformance/test_amplifiers.py", "tests/conformance/test_modes.py"),
+        (
+            "tests/boundary/test_cia402.py",
+            "tests/boundary/test_cia402_command.py",
+            "tests/conformance/test_amplifiers.py",
+            "tests/conformance/test_modes.py",
+        ),
     ),
     "cia402_setup": Target(
         "drivers/cia402_setup.py", "servod.drivers.cia402_setup", ("tests/boundary/test_cia402_setup.py",)

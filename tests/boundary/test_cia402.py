@@ -13,7 +13,7 @@ from drivers_under_test import AmplifierBench, encode
 
 from servod.cia import EMCY_BASE, Obj402
 from servod.drivers import load_driver
-from servod.hal import HANDSHAKE_SYNCS, AmplifierCommand, DriveState, Goal, Mode, Reason
+from servod.hal import HANDSHAKE_SYNCS, NEVER_CYCLES, AmplifierCommand, DriveState, Goal, Mode, Reason
 
 S = DriveState
 
@@ -106,3 +106,103 @@ def test_goal_that_is_reached_in_a_wrong_mode_says_so() -> None:
     axis = bench()
     axis.say_mode(Mode.PROFILE_TORQUE)
     assert waited(axis, S.OPERATION_ENABLED, Goal.ENABLED) == Reason.MODE_NOT_SHOWN
+
+
+# --- feedback ---------------------------------------------------------------------------------------------------------
+def test_before_the_first_frame_nothing_is_claimed() -> None:
+    nothing = (0, NEVER_CYCLES, S.UNKNOWN, 0, -1, 0.0, 0.0, 0, False, Reason.NO_FEEDBACK)
+    assert tuple(bench().driver.read()) == nothing
+
+
+def test_zero_of_the_wire_is_zero_and_each_frame_has_its_time() -> None:
+    axis = bench()
+    axis.say(S.SWITCHED_ON)
+    assert axis.driver.read()[:7] == (axis.time_ns, 0, S.SWITCHED_ON, 0x0233, -1, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("start", [0, 1, -(2**31), 2**31 - 1])
+@pytest.mark.parametrize("step", [0, 1, -1, 2**31 - 1, -(2**31), 2**30 + 1])
+def test_motors_position_goes_the_shortest_way_to_the_last_count(start: int, step: int) -> None:
+    axis = bench()
+    axis.say(S.SWITCHED_ON, position=start)
+    first = axis.driver.read().position_rad
+    axis.say(S.SWITCHED_ON, position=start + step)
+    moved = (axis.driver.read().position_rad - first) * 1_000_000 / 6.283185307179586
+    assert moved == pytest.approx(step, abs=1e-5)
+
+
+@pytest.mark.parametrize("state", [S.SWITCHED_ON, S.OPERATION_ENABLED])
+@pytest.mark.parametrize("said", [False, True])
+def test_mode_is_lost_after_three_event_timers_and_ten_cycles(said: bool, state: DriveState) -> None:
+    axis = bench()
+    if said:
+        for _ in range(5):
+            axis.cycle(state, Goal.ENABLED)
+        axis.say_mode(Mode.CYCLIC_SYNC_TORQUE)
+    for _ in range(310):  # of 1 ms
+        axis.cycle(state, Goal.ENABLED)
+    axis.say(state)
+    kept = Mode.CYCLIC_SYNC_TORQUE if said else -1
+    assert axis.driver.read().mode == kept
+    assert bool(axis.driver.read().reasons & Reason.MODE_NOT_SHOWN) is not said
+    axis.cycle(state, Goal.ENABLED)
+    axis.say(state)
+    assert axis.driver.read().mode == (Mode.NONE if state == S.OPERATION_ENABLED else -1)
+    assert axis.driver.read().reasons & Reason.MODE_NOT_SHOWN
+
+
+def test_feedback_counts_until_it_is_as_old_as_the_handshake() -> None:
+    axis, old = bench(), []
+    axis.say(S.SWITCH_ON_DISABLED)
+    for _ in range(HANDSHAKE_SYNCS + 1):
+        old.append(int(axis.driver.read().reasons))
+        axis.ask(Goal.OFF)
+    assert old == [0] * HANDSHAKE_SYNCS + [Reason.NO_FEEDBACK]
+
+
+@pytest.mark.parametrize(
+    ("goal", "state"),
+    [
+        (Goal.OFF, S.SWITCH_ON_DISABLED),
+        (Goal.READY, S.READY_TO_SWITCH_ON),
+        (Goal.QUICK_STOP, S.SWITCH_ON_DISABLED),
+    ],
+)
+def test_mode_matters_to_the_goal_of_being_enabled_alone(goal: Goal, state: DriveState) -> None:
+    axis = bench()
+    axis.say_mode(Mode.PROFILE_TORQUE)
+    assert waited(axis, state, goal) == Reason.NONE
+
+
+def test_reasons_come_beside_each_other() -> None:
+    axis = bench()
+    axis.say_mode(Mode.PROFILE_TORQUE)
+    axis.cycle(S.OPERATION_ENABLED, Goal.ENABLED, halt=True)
+    axis.say_emcy(0x8250)
+    axis.say(S.OPERATION_ENABLED)
+    wanted = Reason.HALTED | Reason.MODE_NOT_SHOWN | Reason.COMMANDS_MISSED
+    assert (axis.driver.read().reasons, axis.driver.read().goal_reached) == (wanted, False)
+
+
+@pytest.mark.parametrize("goal", list(Goal))
+@pytest.mark.parametrize("state", list(S))
+@pytest.mark.parametrize("option", [2, 6])
+def test_every_reason_in_every_state_after_the_handshake(option: int, state: DriveState, goal: Goal) -> None:
+    axis = bench(quick_stop_option=option)
+    axis.say_mode(Mode.PROFILE_TORQUE)
+    still = (S.NOT_READY_TO_SWITCH_ON, S.SWITCH_ON_DISABLED, S.FAULT)
+    there = {Goal.OFF: still, Goal.READY: (S.READY_TO_SWITCH_ON,), Goal.ENABLED: (S.OPERATION_ENABLED,)}
+    there[Goal.QUICK_STOP] = still if option == 2 else (*still, S.QUICK_STOP_ACTIVE)
+    mode = Reason.MODE_NOT_SHOWN if goal == Goal.ENABLED else Reason.NONE
+    beside = {S.NOT_READY_TO_SWITCH_ON: Reason.NOT_READY}
+    if option == 6:
+        beside[S.QUICK_STOP_ACTIVE] = Reason.QUICK_STOP_HOLDS
+    if state == S.UNKNOWN:
+        expected = Reason.STATE_UNKNOWN
+    elif state in there[goal]:
+        expected = mode
+    elif state in (S.FAULT, S.FAULT_REACTION_ACTIVE):
+        expected = Reason.IN_FAULT
+    else:
+        expected = beside.get(state, Reason.NONE) | mode or Reason.HANDSHAKE
+    assert waited(axis, state, goal) == expected
