@@ -146,7 +146,7 @@ def print_document(rows: Sequence[Entry], document: dict[str, Any]) -> None:
     console = Console()
     console.print(table)
     console.print(
-        f"{document['cycles']} cycles of the four controllers, {document['missed']} missed; {document['wall_s']:.1f} s.",
+        f"{document['cycles']} cycles of the four, {document['missed']} missed, {document['wall_s']:.1f} s.",
         highlight=False,
     )
     if document["realtime_refused"]:
