@@ -163,7 +163,7 @@ def test_interpolation_period_is_exact_in_eight_bits(period_us: int) -> None:
     assert isinstance(value, int), "a count, as SDO takes it"
 
 
-@pytest.mark.parametrize("period_us", [0, 256, 1001, 256_001])
+@pytest.mark.parametrize("period_us", [-1000, 0, 256, 1001, 256_001])
 def test_interpolation_period_that_does_not_fit_is_refused(period_us: int) -> None:
     with pytest.raises(BadInput, match="0x60C2"):
         interpolation_period(period_us, load_quirks("none"))
