@@ -33,6 +33,7 @@ class Finding(IntEnum):
     NOT_AT_REST = 16
     TIMEOUT = 17
     INTERRUPTED = 18
+    TORQUE_AT_REST = 19
 
 
 class Proof(NamedTuple):
@@ -122,6 +123,11 @@ FINDINGS: dict[Finding, _Row] = {
         "the torque that the drive shows (0x6077) is {found:.3g} times the demanded one, {lowest:.3g} to {highest:.3g} "
         "are allowed",
         "check the drive's limits (0x6072, 0x60E0, 0x60E1, current), its current controller, and the mapping of 0x6077",
+    ),
+    _F.TORQUE_AT_REST: _Row(
+        "the drive shows {found:.3g} N*m (0x6077) while none is demanded, {lowest:.3g} to {highest:.3g} are allowed: "
+        "the controller goes on from what it shows",
+        "check the drive's torque offset (0x60B2), the zero of its current sensors, and the mapping of 0x6077",
     ),
     _F.RATED_TORQUE: _Row(
         "limits.torque_nm is {found:.3g} times the drive's rated torque at the joint, {lowest:.3g} to {highest:.3g} "

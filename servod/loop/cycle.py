@@ -128,9 +128,9 @@ class Cycle:
         faults = self._faults(amplifier, encoder, skipped)
         output = self.axis.step(amplifier, encoder.age_cycles == 0, faults, self.reference.at_rest)
         torque = self._torque(output, amplifier, encoder, dt_s)
-        self._send(torque.sent, output)
+        sent_nm = self._send(torque.sent, output)
         self._torque_sent_ns = self.clock.now_ns() - deadline_ns
-        self._record(woke_ns - deadline_ns, amplifier, encoder, torque)
+        self._record(woke_ns - deadline_ns, amplifier, encoder, torque._replace(sent=sent_nm))
         self._take_command()
         self._say_goodbye(amplifier)
         self._tick_ns = self.clock.now_ns() - woke_ns - waited_ns
@@ -196,6 +196,7 @@ class Cycle:
         proof = self.proof
         if not proof.running and proof.verdict is None:
             self.limits.arm(amplifier, encoder)
+            self.limits.release()  # what 0x6077 shows is not proven yet
             self.reference.hold(encoder.position_rad)
             proof.begin(encoder.position_rad, amplifier.position_rad)
         wanted_nm = proof.step(amplifier, encoder, self.torque_nm, dt_s)
@@ -230,16 +231,21 @@ class Cycle:
         self.limits.release()
         self.torque_nm = self._ramp_from_nm = 0.0
 
-    def _send(self, torque_nm: float, output: AxisOutput) -> None:
-        """Control word and torque in one frame; the goal is asked anew, since the limits may just have changed it."""
+    def _send(self, wanted_nm: float, output: AxisOutput) -> float:
+        """Control word and torque in one frame; the goal is asked anew, since the limits may just have changed it.
+
+        The torque that went out: none unless the axis is to be enabled.
+        """
         goal = self.axis.goal
-        command = AmplifierCommand(goal, torque_nm if goal == Goal.ENABLED else 0.0, False, output.reset_fault)
+        torque_nm = wanted_nm if goal == Goal.ENABLED else 0.0
+        command = AmplifierCommand(goal, torque_nm, False, output.reset_fault)
         self.exchange.send(*self.amplifier.write(command))
         if self.axis.unheard:
             self._withdraw()
         elif self._number >= self._heartbeat_due:
             self._heartbeat_due = self._number + self._heartbeat_every
             self.exchange.heartbeat()
+        return torque_nm
 
     def _withdraw(self) -> None:
         """The control word does not stop the drive: NMT shall, whose identifier is another, and so shall its own

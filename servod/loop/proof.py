@@ -75,6 +75,7 @@ class WiringProof:
         self._wanted_nm = 0.0
         self._brake_first_nm = self._brake_direction = 0.0
         self._line = TorqueLine()
+        self._shown_nm = 0.0  # sum of 0x6077 over the cycles before the first push
         self._pushes: list[Push] = []  # at most two
         self._signs_known = self._repeat = False
         self._quiet_cycles = 0  # without torque, in a row
@@ -120,6 +121,8 @@ class WiringProof:
         self._fastest_rad_s = max(self._fastest_rad_s, abs(self._sway.speed_rad_s()))
         if self._stage == _Stage.PUSH:
             self._line.add(demand_nm, amplifier.torque_nm)
+        elif not self._pushes:
+            self._shown_nm += amplifier.torque_nm
 
     def _breach(self) -> Verdict | None:
         """Further or faster than allowed; what was seen so far may say why."""
@@ -169,6 +172,8 @@ class WiringProof:
             return verdict
         if self._sway.count <= REST_CYCLES:
             return None
+        if verdict := judge.torque_at_rest(self._shown_nm / self._sway.count, self._bounds):
+            return verdict
         self._noise_rad = self._sway.step_rad()
         late = self._stage_s > _REST_S
         if self._creeps() and not late:

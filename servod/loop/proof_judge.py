@@ -29,6 +29,8 @@ RATED_LOWEST, RATED_HIGHEST = 0.01, 20.0
 SCALE_RATIO, SCALE_COUNTS = 1.4, 3.0
 #: 0x6077 over the demand, and how many of its steps the demand must reach for that to tell anything.
 ACTUAL_LOWEST, ACTUAL_HIGHEST, ACTUAL_COUNTS = 0.5, 2.0, 5.0
+#: 0x6077 while no torque is demanded: this share of limits.torque_nm, and ACTUAL_COUNTS of its steps.
+AT_REST_SHARE = 0.05
 #: Break-away over what was expected: temperature, wear and the ramp's lag change it by less.
 FRICTION_RATIO_LOW, FRICTION_RATIO_HIGH = 0.2, 10.0
 #: Where nothing is expected: less than this share of limits.torque_nm moves no joint.
@@ -239,6 +241,13 @@ def energy(push: Push, encoder_rad: float, bounds: ProofBounds) -> Verdict | Non
     work = push.cut_nm * abs(encoder_rad - push.encoder_rad)
     ratio = 0.5 * bounds.inertia * speed_rad_s * speed_rad_s / work if work > 0.0 else math.inf
     return Verdict(Finding.TOO_FAST, ratio, 0.0, MOST_ENERGY) if ratio > MOST_ENERGY else None
+
+
+def torque_at_rest(shown_nm: float, bounds: ProofBounds) -> Verdict | None:
+    """0x6077 while none is demanded, on the mean: what the controller would go on from at its first cycle."""
+    counts_nm = 0.0 if math.isnan(bounds.torque_count_nm) else ACTUAL_COUNTS * bounds.torque_count_nm
+    allowed_nm = AT_REST_SHARE * bounds.limit_nm + counts_nm
+    return None if abs(shown_nm) <= allowed_nm else Verdict(Finding.TORQUE_AT_REST, shown_nm, -allowed_nm, allowed_nm)
 
 
 def actual_torque(line: TorqueLine, bounds: ProofBounds) -> Verdict | None:

@@ -10,6 +10,7 @@ from servod.axis import AxisState
 from servod.commands import Op, Refusal
 from servod.errors import FAULTS, FaultCode
 from servod.identify.virtual import rated_torque_mnm
+from servod.session import SteppedSession
 from servod.wiring_proof import FINDINGS, Finding, document, sentence
 from tests.proof.rig import Outcome, axis, enable, joint, proven, stronger
 
@@ -98,6 +99,39 @@ def test_a_free_joint_that_is_known_to_be_free_is_enabled_and_its_torque_is_judg
     refused(outcome)
     weak = joint(inertia=1.0, friction={"kind": "coulomb_viscous", "coulomb": 1e-4, "viscous": 1e-4})
     assert proven(weak, FREE_STATED, bought_for=JOINT).finding == Finding.TOO_HEAVY
+
+
+def shows(session: SteppedSession, offset_nm: float) -> SteppedSession:
+    """The drive's 0x6077 has this offset."""
+    amplifier = session.cycle.amplifier
+    truth = amplifier.read
+    amplifier.read = lambda: (seen := truth())._replace(torque_nm=seen.torque_nm + offset_nm)
+    return session
+
+
+@pytest.mark.parametrize("rate", [300.0, 20.0, 2.0])
+@pytest.mark.parametrize("offset_nm", [0.2, -0.03])
+def test_a_torque_that_is_shown_at_rest_is_named_before_any_goes_out(rate, offset_nm):
+    config = {"limits": {"torque_rate_nm_per_s": rate, "torque_nm": 0.3}}
+    outcome = enable(shows(axis(JOINT, config), offset_nm))
+    assert outcome.finding == Finding.TORQUE_AT_REST, sentence(outcome.proof)
+    refused(outcome)
+    assert outcome.furthest_rad < 1e-5
+    assert {record.torque_nm for record in outcome.session.records} == {0.0}
+
+
+def test_a_small_torque_at_rest_passes_and_is_gone_on_from():
+    session = shows(axis(JOINT), 0.005)
+    assert enable(session, watch_s=0.01).enabled
+    first = next(record for record in session.records if record.axis_state == AxisState.ENABLED)
+    assert first.torque_nm == pytest.approx(0.005, abs=2e-3)
+
+
+def test_a_record_tells_the_torque_that_was_sent():
+    """In the cycle in which a proof fails, its last torque is not sent any more."""
+    session = proven(JOINT, {"limits": {"torque_rate_nm_per_s": 2.0}}, polarity=0x20).session
+    failed = next(record for record in session.records if record.axis_state == AxisState.FAULT)
+    assert failed.torque_nm == 0.0
 
 
 @pytest.mark.parametrize("phase", [1.57, -1.57])
