@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import gc
 import os
-import signal
 import sys
 import time
 from pathlib import Path
@@ -20,6 +19,7 @@ from servod.drivers.virtual.on_can import CanServer, open_pair
 from servod.drivers.virtual.server import HubServer, Timing
 from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.drivers.virtual.world import World
+from servod.end_signals import on_end_signals
 from servod.errors import ServodError
 from servod.shipped import shipped
 from servod.yaml12 import load_model, validate
@@ -98,8 +98,7 @@ def main(argv: list[str] | None = None) -> int:
     except ServodError as error:
         print(f"servod-virtual-axis: {error}", file=sys.stderr)
         return error.exit_code
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: server.stop())
+    on_end_signals(server.stop)
     gc.freeze()  # what stands now stays; collections in the loop then have little to look at
     print(f"ready {arguments.can or arguments.socket}{_take_turns_first(arguments.priority)}", flush=True)
     try:

@@ -53,6 +53,7 @@ _SHOWN_PERIODS = 1.5
 _SENT_S = 0.01
 _VERBS = {Op.DISABLE: Verb.DISABLE, Op.QUICK_STOP: Verb.STOP, Op.HALT: Verb.HALT}
 _TOLD = re.compile(r"fault ([A-Z_]+) \(")
+_ASKS_TO_END = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 _DOWNLOAD = struct.Struct("<BHB4s")
 _FAULTED = (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE)
 
@@ -150,7 +151,7 @@ class ProcessAxis:
         """Send a signal; from the first that kills on, records may be missing."""
         if number is not signal.SIGCONT and set(who) & {Process.DAEMON, Process.LOOP}:
             self._hit_ns = self._hit_ns or self.now_ns()
-        self._asked_to_end |= Process.DAEMON in who and number in (signal.SIGTERM, signal.SIGINT)
+        self._asked_to_end |= Process.DAEMON in who and number in _ASKS_TO_END
         self.machine.send(who, number)
 
     def restart_daemon(self) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
 from pathlib import Path
 from typing import NoReturn
@@ -12,6 +11,7 @@ from servod import __version__
 from servod.daemon.journal import print_error, set_up_logging
 from servod.daemon.startup import check, run
 from servod.daemon.supervisor import Supervisor
+from servod.end_signals import on_end_signals
 from servod.errors import BadInput, ServodError
 
 _EXAMPLE = """\
@@ -43,14 +43,17 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
-def _end_start_on_sigterm() -> None:
-    """Until the supervisor takes over, SIGTERM is as Ctrl-C: what was begun is undone."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+def _end_start_on_signals() -> None:
+    """Until the supervisor takes over, they are as Ctrl-C: what was begun is undone."""
+    on_end_signals(_interrupt)
+
+
+def _interrupt() -> None:
+    raise KeyboardInterrupt
 
 
 def _stop_on_signals(supervisor: Supervisor) -> None:
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: supervisor.request_stop())
+    on_end_signals(supervisor.request_stop)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -62,7 +65,7 @@ def main(arguments: list[str] | None = None) -> int:
             config = check(options.config)
             print(f"{options.config}: good; axis {config.name} on {config.bus.interface} {config.bus.channel}")
             return 0
-        _end_start_on_sigterm()
+        _end_start_on_signals()
         return run(options.config, _stop_on_signals)
     except ServodError as error:
         print_error(str(error))

@@ -7,13 +7,13 @@ heartbeat, which the drive watches (0x1016); the death of its parent makes it br
 from __future__ import annotations
 
 import os
-import signal
 import sys
 from collections.abc import Callable
 from typing import Protocol
 
 from servod.bus.open import open_bus
 from servod.clock import Clock, WallClock
+from servod.end_signals import on_end_signals
 from servod.loop.channel import Channel
 from servod.loop.cycle import Cycle
 from servod.loop.plan import LoopPlan
@@ -83,8 +83,7 @@ def main() -> int:
     channel, clock = Channel(int(sys.argv[1])), WallClock()
     bus = open_bus(plan.config.bus)
     cycle = Cycle(plan, bus, clock, channel, supervisor_watch(channel, clock))
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: cycle.shut_down())
+    on_end_signals(cycle.shut_down)
     grants = apply_realtime(plan.config.cycle.cpu, plan.config.cycle.priority)
     channel.publish_ready(grants)
     try:

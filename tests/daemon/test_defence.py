@@ -175,12 +175,14 @@ def _nmt_state(bus: VirtualBus, node_id: int) -> int:
     raise AssertionError("no heartbeat")
 
 
-def test_sigterm_to_both_processes_is_an_orderly_end(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_to_both_processes_is_an_orderly_end(tmp_path: Path, number: signal.Signals) -> None:
+    """By the service manager, and by a terminal that closes."""
     with running(tmp_path) as axis:
         with ControlClient(axis.socket) as client:
             client.call("enable")
             loop = client.call("status")["loop"]["pid"]
-        os.kill(loop, signal.SIGTERM)
-        axis.daemon.send_signal(signal.SIGTERM)
+        os.kill(loop, number)
+        axis.daemon.send_signal(number)
         assert axis.daemon.wait(20) == 0
         assert "LOOP_LOST" not in axis.log

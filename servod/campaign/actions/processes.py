@@ -51,12 +51,13 @@ class SignalName(StrEnum):
     SIGKILL = "SIGKILL"
     SIGTERM = "SIGTERM"
     SIGINT = "SIGINT"
+    SIGHUP = "SIGHUP"
     SIGSTOP = "SIGSTOP"
     SIGCONT = "SIGCONT"
 
 
 #: Signals after which a process does no more work; the supervisor may stand still for as long as the loop goes on.
-_ENDS = (SignalName.SIGKILL, SignalName.SIGTERM, SignalName.SIGINT)
+_ENDS = (SignalName.SIGKILL, SignalName.SIGTERM, SignalName.SIGINT, SignalName.SIGHUP)
 _TAKES = {
     **{(Process.DAEMON, name): Loss.MASTER for name in _ENDS},
     **{(Process.LOOP, name): Loss.MASTER for name in (*_ENDS, SignalName.SIGSTOP)},
