@@ -156,7 +156,9 @@ def parse_yaml(text: str, where: str) -> Any:
         return yaml.load(text, Loader=_Loader)  # noqa: S506  (a SafeLoader)
     except yaml.MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else "?"
-        raise BadInput(f"{where}: line {line}", error.problem or "broken YAML", "a YAML 1.2 mapping") from None
+        problem = (error.problem or "broken YAML").replace("but got ", "but found ")
+        found = problem.rpartition("but found ")[2].removeprefix("found ")
+        raise BadInput(f"{where}: line {line}", found, "a YAML 1.2 mapping") from None
     except (yaml.YAMLError, ValueError) as error:
         raise BadInput(where, (str(error).splitlines() or ["broken YAML"])[0], "a YAML 1.2 mapping") from None
 
