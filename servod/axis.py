@@ -69,7 +69,7 @@ class Axis:
         self._period_s, self._mode = period_s, int(mode)
         self._ramp_cycles = max(1, round(ramp_down_s / period_s))
         self._timeout_cycles = max(1, round(enable_timeout_s / period_s))
-        self._proof_cycles = max(1, round((proof_timeout_s + _PROOF_MARGIN_S) / period_s))
+        self._proof_cycles = round((proof_timeout_s + _PROOF_MARGIN_S) / period_s)
         self._cycles_in_state = self._disobeyed_cycles = 0
         self._obey_cycles = max(4, round(_OBEY_S / period_s))
         self._reset_wanted, self._seen_off, self._seen_remote = False, True, False
