@@ -206,7 +206,7 @@ def acts_when_written(index: int) -> bool:
     """Whether an object is in ACTING_OBJECTS, on any of the eight logical devices of a node (CiA 301: 0x800 apart)."""
     if not _FIRST_PROFILE_OBJECT <= index <= _LAST_PROFILE_OBJECT:
         return False
-    return _FIRST_PROFILE_OBJECT + (index - _FIRST_PROFILE_OBJECT) % _LOGICAL_DEVICE in ACTING_OBJECTS
+    return _FIRST_PROFILE_OBJECT + index % _LOGICAL_DEVICE in ACTING_OBJECTS
 
 
 # --- CiA 402: status word ------------------------------------------------------------------------------------------
