@@ -144,6 +144,9 @@ def test_commands_that_do_not_arrive_matter_to_a_powered_drive(drive: DriveState
     step(axis, state=drive, reasons=Reason.COMMANDS_MISSED | Reason.NO_VOLTAGE)
     powered = drive in (D.OPERATION_ENABLED, D.QUICK_STOP_ACTIVE)
     assert bool(axis.faults & BIT[F.COMMANDS_LOST]) is powered
+    axis = axis_in(S.DISABLED)
+    step(axis, state=drive, reasons=sum(Reason) - Reason.COMMANDS_MISSED)
+    assert not axis.faults & BIT[F.COMMANDS_LOST], "no other reason says so"
 
 
 # --- a drive that does not obey ---------------------------------------------------------------------------------------

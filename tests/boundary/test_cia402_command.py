@@ -80,12 +80,12 @@ def test_set_point_of_profile_position_goes_out_with_its_bits_and_starts_at_zero
 
 
 # --- fault reset ------------------------------------------------------------------------------------------------------
-def resets(pattern: str, states: str = "") -> str:
+def resets(pattern: str, states: str = "", goal: Goal = Goal.OFF) -> str:
     """Bit 7 in each cycle, for requests in `pattern` and a drive in fault, or out of it where `states` has a dot."""
     axis, bits = bench(), ""
     for requested, state in zip(pattern, states or "F" * len(pattern), strict=True):
         drive = S.FAULT if state == "F" else S.SWITCH_ON_DISABLED
-        word, _ = axis.cycle(drive, Goal.OFF, reset_fault=requested == "1")
+        word, _ = axis.cycle(drive, goal, reset_fault=requested == "1")
         bits += "1" if word & CW_FAULT_RESET else "0"
     return bits
 
@@ -101,8 +101,9 @@ def resets(pattern: str, states: str = "") -> str:
         ("10101010" + "0" * 14, "1110111011101110000000"),
     ],
 )
-def test_requests_of_a_reset_give_their_edges(pattern: str, bits: str) -> None:
-    assert resets(pattern) == bits
+@pytest.mark.parametrize("goal", list(Goal))
+def test_requests_of_a_reset_give_their_edges(goal: Goal, pattern: str, bits: str) -> None:
+    assert resets(pattern, goal=goal) == bits
 
 
 def test_reset_holds_its_time_and_is_not_kept_for_the_next_fault() -> None:
