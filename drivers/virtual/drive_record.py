@@ -7,7 +7,9 @@ fixed-size samples behind one header; the kernel owns the pages, so `kill -9` of
 from __future__ import annotations
 
 import mmap
+import os
 import struct
+from io import BufferedRandom
 from pathlib import Path
 from typing import NamedTuple
 
@@ -46,7 +48,7 @@ class DriveRecord:
         size = _HEADER.size + capacity * SAMPLE.size
         try:
             with Path(path).open("wb+") as file:
-                file.truncate(size)
+                _reserve(file, size)
                 self._map = mmap.mmap(file.fileno(), size)
         except OSError as error:
             raise BadInput(str(path), error.strerror or str(error), "a file that can be written") from None
@@ -63,6 +65,15 @@ class DriveRecord:
     def close(self) -> None:
         """Unmap; the file keeps everything."""
         self._map.close()
+
+
+def _reserve(file: BufferedRandom, size: int) -> None:
+    """Take the room now: a page of the map that finds none later ends the process with SIGBUS."""
+    try:
+        os.posix_fallocate(file.fileno(), 0, size)
+    except OSError:
+        Path(file.name).unlink()
+        raise
 
 
 class DriveTail:

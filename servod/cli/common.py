@@ -6,6 +6,7 @@ Imports typer alone, so that `servoctl --help` starts at once.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import os
 import sys
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servod.errors import BadInput
+from servod.errors import BadInput, Unreachable
 
 if TYPE_CHECKING:
     from servod.control import ControlClient
@@ -56,10 +57,15 @@ def print_json(document: Any) -> None:
 
 #: Folders that this command made for its results, outermost first.
 _made: list[Path] = []
+#: Descriptors of locked folders; they end with the command.
+_locks: list[int] = []
 
 
-def need_folder(option: str, folder: Path) -> None:
-    """Make `folder` where it is missing, and see that a file can be written in it. Raises BadInput."""
+def need_folder(option: str, folder: Path, alone: bool = False) -> None:
+    """Make `folder` where it is missing, and see that a file can be written in it. Raises BadInput.
+
+    `alone`: no other command that wants it alone works there as long as this process lives. Raises Unreachable.
+    """
     _made.extend(reversed([path for path in (folder, *folder.parents) if not path.exists()]))
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -67,10 +73,25 @@ def need_folder(option: str, folder: Path) -> None:
             pass
     except OSError as error:
         raise BadInput(f"{option} {folder}", error.strerror or str(error), "a folder that can be written") from None
+    if alone:
+        _lock(option, folder)
+
+
+def _lock(option: str, folder: Path) -> None:
+    """Lock the folder itself (flock(2)): no file is left behind."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        raise Unreachable(f"{option} {folder}: another command is at work there; name a folder of its own") from None
+    _locks.append(descriptor)
 
 
 def drop_empty_folders() -> None:
     """At the end of a command: folders that it made and that nothing came into, as it was refused, go again."""
+    while _locks:
+        os.close(_locks.pop())
     while _made:
         with contextlib.suppress(OSError):  # not empty
             _made.pop().rmdir()

@@ -68,7 +68,7 @@ def demo(
     model, rows = plant_file(plant), entries(further)
     load_rotary_model(model)
     recordings = out / "recordings"
-    need_folder("--out", out if fast else recordings)
+    need_folder("--out", out if fast else recordings, alone=True)
     started = time.monotonic()
     runs, refused = _run(fast, model, seconds, rows, recordings, quiet=as_json)
     elapsed_s = time.monotonic() - started

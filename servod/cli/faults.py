@@ -54,7 +54,7 @@ def faults(
         return
     chosen = _chosen(scenario, only, group, stepped)
     if out is not None:
-        need_folder("--out", out)
+        need_folder("--out", out, alone=True)
     found: list[Outcome] = []
     try:
         _run(chosen, jobs, found, quiet=as_json)

@@ -60,7 +60,7 @@ def prove(
 ) -> None:
     """Run the trial in OUT."""
     one_thread()
-    need_folder("--out", out)
+    need_folder("--out", out, alone=True)
     match only:
         case None:
             drawn = [f"--cases={cases}", f"--seed={seed}", *(["--harder"] if harder else [])]

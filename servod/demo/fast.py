@@ -29,8 +29,12 @@ def run_fast(plant: Path, duration_s: float, rows: Sequence[Entry], progress: Pr
     """Track trajectory (19) for `duration_s` of virtual time under each entry. Raises as the session does."""
     shares = get_context("spawn").Array("d", len(rows), lock=False)
     workers = min(len(rows), len(os.sched_getaffinity(0)))
-    with worker_pool(workers, _start_worker, shares) as pool:
-        results = [pool.submit(_run, index, row, str(plant), duration_s) for index, row in enumerate(rows)]
+    # Outermost, for a worker that is ended cleans nothing up.
+    with (
+        tempfile.TemporaryDirectory(prefix="servod-demo-") as folder,
+        worker_pool(workers, _start_worker, shares) as pool,
+    ):
+        results = [pool.submit(_run, index, row, str(plant), duration_s, folder) for index, row in enumerate(rows)]
         left = set(results)
         while left:
             ended, left = wait(left, _POLL_S, FIRST_COMPLETED)
@@ -47,7 +51,7 @@ def _start_worker(shares: Any) -> None:
     _shares = shares
 
 
-def _run(index: int, row: Entry, plant: str, duration_s: float) -> bytes:
+def _run(index: int, row: Entry, plant: str, duration_s: float, folder: str) -> bytes:
     """One entry in this process: the packed records of its motion."""
     from servod.axis_model import load_axis_model
     from servod.drivers.virtual.world import SteppedWorld, VirtualAxisSettings
@@ -56,14 +60,13 @@ def _run(index: int, row: Entry, plant: str, duration_s: float) -> bytes:
     from servod.tracking.stepped import begin, follow
 
     gains = load_gains(row.gains)
-    with tempfile.TemporaryDirectory(prefix="servod-demo-") as folder:
-        config = demo_config(Path(folder), Path(folder))
-        world = SteppedWorld(VirtualAxisSettings(), load_axis_model(plant))
-        session = SteppedSession(config, world, gains.law.number, gains.pack())
-        session.enable()
-        session.clear()
-        begin(session, ReferenceKind.PAPER, [duration_s])
-        follow(session, lambda seconds: _tell(index, seconds / duration_s), row.name)
+    config = demo_config(Path(folder), Path(folder))
+    world = SteppedWorld(VirtualAxisSettings(), load_axis_model(plant))
+    session = SteppedSession(config, world, gains.law.number, gains.pack())
+    session.enable()
+    session.clear()
+    begin(session, ReferenceKind.PAPER, [duration_s])
+    follow(session, lambda seconds: _tell(index, seconds / duration_s), row.name)
     return session.raw
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -75,3 +77,15 @@ def test_a_damaged_recording_tells_how_much_could_be_read(
     code = run(["record", "export", str(file), "--out", str(table)])
     said = " ".join(capsys.readouterr())
     assert (code, what in said, f"of {file.stat().st_size} bytes" in said) in ((0, True, True), (2, True, True)), said
+
+
+def test_a_folder_that_another_command_works_in_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = os.open(tmp_path, os.O_RDONLY)
+    try:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        for command in (["soak", "--cycles", "1"], ["faults", "--stepped"], ["prove", "--cases", "1"]):
+            assert run([*command, "--out", str(tmp_path)]) == 3
+            assert f"--out {tmp_path}: another command is at work there" in capsys.readouterr().err
+    finally:
+        os.close(other)
+    assert not list(tmp_path.iterdir())

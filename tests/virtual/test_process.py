@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import resource
 import signal
 import socket
 import subprocess
@@ -185,6 +186,18 @@ def test_the_record_is_a_ring(tmp_path: Path) -> None:
     (tmp_path / "other").write_bytes(b"something else entirely")
     with pytest.raises(BadInput):
         read_drive_record(tmp_path / "other")
+
+
+def test_a_record_for_which_there_is_no_room_is_refused_and_leaves_nothing(tmp_path: Path) -> None:
+    """The limit on the size of files stands for the disk's end; a map without room would end the process."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
+    try:
+        with pytest.raises(BadInput, match="File too large"):
+            DriveRecord(tmp_path / "ring")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not list(tmp_path.iterdir())
 
 
 def test_no_hub_is_unreachable(tmp_path: Path) -> None:
