@@ -13,11 +13,12 @@ from servod.errors import BadInput
 
 _HELP = example(
     "Move the virtual axis at random for hours, let faults befall it, recover as a person would, and account for every "
-    "cycle: loop counter, SYNC on the bus and recorded rows agree, every fault is in the log, none is without a cause, "
-    "torque is gone in time by the drive's own record, memory stays flat. SYNC-stepped, so that a day takes two hours; "
-    "--wall runs the real processes on the wall clock. Ctrl-C ends it and still reports. Exit code 1 when anything was "
-    "wrong, and when it did not get through: interrupted, a job that died, half an hour that does not tell of memory. "
-    "The state is in --out all the time: soak.json, and soak.html at the end.",
+    "cycle: loop counter, SYNC on the bus and recorded rows agree, every fault that is due in the log is there, none "
+    "is without a cause, what the axis rides through left its trace on the bus, torque is gone in time by the drive's "
+    "own record, memory stays flat. SYNC-stepped, so that a day takes two hours; --wall runs the real processes on the "
+    "wall clock. Ctrl-C ends it and still reports. Exit code 1 when anything was wrong, and when it did not get "
+    "through: interrupted, a job that died, half an hour that does not tell of memory. The state is in --out all the "
+    "time: soak.json, and soak.html at the end.",
     "servoctl soak --hours 1",
     "servoctl soak --hours 28 --limit-hours 1 --seed 7 --jobs 2 --out out/soak",
     "servoctl soak --wall --hours 0.1",
@@ -57,7 +58,7 @@ def soak(
     """Soak."""
     if wall and jobs > 1:
         raise BadInput("--jobs", jobs, "1 with --wall: the processes of one axis want the machine for themselves")
-    need_folder("--out", out)
+    need_folder("--out", out, alone=True)
     one_thread()
     from servod.cli.progress import progress
     from servod.soak.launch import Order, launch
@@ -80,9 +81,9 @@ def _print(found: dict[str, Any], out: Path) -> None:
     from servod.soak.page import PAGE_NAME, count_rows, fault_rows, verdict
 
     console = Console()
-    faults = Table("Fault", "Times", "In the log", "Recovered", "Detected / ms", "Torque gone / ms")
-    for name, injected, logged, recovered, _latched, _, detected, _, gone in fault_rows(found):
-        faults.add_row(name, injected, logged, recovered, detected, gone)
+    faults = Table("Fault", "Times", "In the log", "Ridden through", "Recovered", "Detected / ms", "Torque gone / ms")
+    for name, injected, logged, ridden, recovered, _latched, _, detected, _, gone in fault_rows(found):
+        faults.add_row(name, injected, logged, ridden, recovered, detected, gone)
     console.print(faults)
     counted = Table("Counted", "", show_header=False)
     for row in count_rows(found):

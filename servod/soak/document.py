@@ -16,7 +16,7 @@ from typing import Any
 
 from servod.soak.counts import SoakedAxis
 from servod.soak.memory import LIMIT_KB_PER_H, LONG_S, Growth, Memory
-from servod.soak.tally import median_ms
+from servod.soak.tally import COUNTED, median_ms
 
 _CURVE_POINTS = 200
 _NS_PER_H = 3.6e12
@@ -24,7 +24,8 @@ _NS_PER_H = 3.6e12
 _SAID = (0, 1, None)
 _ADDED = (
     *("cycles", "rows", "missed", "syncs", "syncs_taken", "drive_samples", "recordings", "rows_read_back", "episodes"),
-    *("cpu_s", "restarts", "faults_injected", "faults_while_proving", "faults_found", "faults_recovered", "axis_hours"),
+    *("cpu_s", "restarts", "axis_hours", "faults_injected", "faults_while_proving", "faults_due", "faults_found"),
+    *("faults_ridden_through", "faults_spoilt_proof", "faults_recovered"),
 )
 
 
@@ -55,7 +56,10 @@ def document(axis: SoakedAxis, memories: Mapping[str, Memory], wall_s: float, co
         "restarts": tally.restarts,
         "faults_injected": sum(f.injected for f in faults),
         "faults_while_proving": sum(f.proving for f in faults),
+        "faults_due": sum(f.due for f in faults),
         "faults_found": sum(f.found for f in faults),
+        "faults_ridden_through": sum(f.ridden for f in faults),
+        "faults_spoilt_proof": sum(f.spoilt for f in faults),
         "faults_recovered": sum(f.recovered for f in faults),
         "wrong": {str(kind): count for kind, count in findings.counts.items()},
         "findings": [{**f._asdict(), "wrong": str(f.wrong)} for f in findings.told],
@@ -119,9 +123,7 @@ def added(documents: Sequence[dict[str, Any]], exit_codes: Sequence[int | None] 
 
 def _added_fault(faults: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """One kind of fault of several runs."""
-    total: dict[str, Any] = {
-        name: sum(f[name] for f in faults) for name in ("injected", "proving", "found", "recovered")
-    }
+    total: dict[str, Any] = {name: sum(f[name] for f in faults) for name in COUNTED}
     total["latched"] = dict(sum((Counter(f["latched"]) for f in faults), Counter()))
     for name in ("detected", "left_command", "torque_gone"):
         bins = sum((Counter({int(place): n for place, n in f[name]["bins_ms"].items()}) for f in faults), Counter())

@@ -22,6 +22,7 @@ class Wrong(StrEnum):
     STATE = "unexplained state"
     UNEXPLAINED = "fault without a cause in the schedule"
     NOT_FOUND = "fault of the schedule not found in the log"
+    NO_TRACE = "fault of the schedule without a trace on the bus"
     LATE = "reaction too late"
     NOT_RECOVERED = "axis not enabled again"
     REFUSED = "motion or command refused"

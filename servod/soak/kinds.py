@@ -44,8 +44,9 @@ class OneOf:
 class FaultKind:
     """One kind. `do` and `undo` are actions of servod.campaign.actions, with ranges where a number is drawn.
 
-    `expects`: one of these at least is latched, within `latched_ms` of the injection; empty: the axis goes on. The
-    drive has left the controller's command within `left_ms`, and the joint feels no torque from `gone_ms` on.
+    `expects`: one of these at least is latched, within `latched_ms` of the injection; empty: the axis rides through it,
+    and its trace on the bus (servod.soak.traces) shows that it happened. Where something is expected, the drive has
+    left the controller's command within `left_ms`, and the joint feels no torque from `gone_ms` on.
     `takes_syncs`: SYNC frames of this axis may be missing on the bus; `deaf_cycles`: so many commands may not reach the
     drive; `of_control`: the controller must act for it to be seen.
     """
@@ -106,6 +107,11 @@ def _frames(of: str | OneOf, fault: str, low: int, high: int, detail: int | Betw
 
 def _write(who: str, index: int, subindex: int, value: Any) -> Action:
     return {"object_write": {"who": who, "index": index, "subindex": subindex, "value": value}}
+
+
+def _warned(warnings: int) -> str:
+    """The download by which a service tool puts warnings into the encoder, as the bytes of its frame."""
+    return f"2B002002{warnings:02X}000000"
 
 
 def _silence(who: str | OneOf, low_ms: int, high_ms: int) -> Action:
@@ -188,13 +194,13 @@ KINDS: tuple[FaultKind, ...] = (
     FaultKind("cyclic frames reordered", _frames(_CYCLIC, "reorder", 1, 50)),
     FaultKind("drive feedback cut short", _frames("drive_feedback", "shorten", 1, 15, Between(1, 7))),
     FaultKind("encoder feedback cut short", _frames("encoder_feedback", "shorten", 1, 15, Between(1, 3))),
-    FaultKind("node away for a moment", _silence(OneOf(("encoder", "amplifier")), 1, 12)),
+    FaultKind("node away for a moment", _silence(OneOf(("encoder", "amplifier")), 2, 12)),
     FaultKind("a stranger talks", {"babble": {"can_id": OneOf((0x100, 0x183, 0x7FF)), "for_ms": 250, "each_ms": 2}}),
     FaultKind("SYNC lost, a few", _frames("sync", "drop", 1, 10), takes_syncs=True),
     FaultKind("frames destroyed", _frames("any", "destroy", 1, 5)),
     FaultKind("torque frame destroyed", _frames("torque", "destroy", 1, 5)),
     FaultKind("master's heartbeat lost", _frames("master_heartbeat", "drop", 1, 1)),
-    FaultKind("encoder warning", _write("encoder", 0x2000, 2, Between(1, 4))),
+    FaultKind("encoder warning", {"foreign_frame": {"can_id": 0x602, "data": OneOf(tuple(map(_warned, range(1, 5))))}}),
     # Stopped, and enabled again after a reset.
     _resettable("drive feedback lost, many", _frames("drive_feedback", "drop", 25, 60), {_F.FEEDBACK_STALE}),
     _resettable("encoder feedback lost, many", _frames("encoder_feedback", "drop", 25, 200), {_F.FEEDBACK_STALE}),

@@ -12,7 +12,8 @@ from servod.report.page import Page
 
 PAGE_NAME = "soak.html"
 _FAULT_HEADER = (
-    *("fault", "times", "in the log", "recovered", "latched", "detected ms", "largest", "torque gone ms", "largest"),
+    *("fault", "times", "in the log", "ridden through", "recovered", "latched"),
+    *("detected ms", "largest", "torque gone ms", "largest"),
 )
 
 
@@ -47,7 +48,10 @@ def count_rows(found: dict[str, Any]) -> list[tuple[str, str]]:
         ("rows without SYNC, or SYNC without row", f"{abs(apart):,}"),
         ("rows read back from recordings, byte by byte", f"{found['rows_read_back']:,}"),
         ("samples of the drive's own record", f"{found['drive_samples']:,}"),
-        ("faults injected / found in the log", f"{found['faults_injected']:,} / {found['faults_found']:,}"),
+        ("faults injected", f"{found['faults_injected']:,}"),
+        ("of these due in the log / found there", f"{found['faults_due']:,} / {found['faults_found']:,}"),
+        ("of these seen on the bus and ridden through", f"{found['faults_ridden_through']:,}"),
+        ("of these seen on the bus, after which the wiring was proven again", f"{found['faults_spoilt_proof']:,}"),
         ("of these while the wiring was being proven", f"{found['faults_while_proving']:,}"),
         ("unexplained states, faults, torques", f"{sum(found['wrong'].values()):,}"),
         ("daemon restarts", f"{found['restarts']:,}"),
@@ -72,7 +76,9 @@ def fault_rows(found: dict[str, Any]) -> list[tuple[str, ...]]:
     for name, fault in found["faults"].items():
         latched = ", ".join(sorted(fault["latched"])) or "none"
         times = [_times(fault[key]) for key in ("detected", "torque_gone")]
-        counts = [str(fault[key]) for key in ("injected", "found", "recovered")]
+        logged = f"{fault['found']} of {fault['due']}" if fault["due"] else ""
+        ridden = f"{fault['ridden']}" if fault["injected"] > fault["due"] else ""
+        counts = [str(fault["injected"]), logged, ridden, str(fault["recovered"])]
         rows.append((name, *counts, latched, *times[0], *times[1]))
     return rows
 

@@ -14,6 +14,12 @@ from servod.soak.rows import Rows
 from servod.soak.tally import FaultTally
 
 
+def check_trace(kind: FaultKind, happened: bool, injected_ns: int, findings: Findings) -> None:
+    """Find a fault that was injected and did not happen: that an axis rides through nothing tells nothing."""
+    if not happened:
+        findings.add(Wrong.NO_TRACE, injected_ns, f"{kind.name}: nothing of it was on the bus")
+
+
 def check_reaction(
     kind: FaultKind, times: Reaction, injected_ns: int, tally: FaultTally, findings: Findings, starved_ms: float = 0.0
 ) -> bool:

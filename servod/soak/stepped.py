@@ -27,12 +27,13 @@ from servod.soak.drive import DriveCheck, Samples, reaction_in, samples_of
 from servod.soak.finding import Findings, Wrong
 from servod.soak.kinds import ALWAYS, FaultKind, fault_bits
 from servod.soak.plan import Ending, Episode, Move, home
-from servod.soak.reactions import check_reaction, detected_after_ms
+from servod.soak.reactions import check_reaction, check_trace, detected_after_ms
 from servod.soak.recording import RecordingCheck
 from servod.soak.rows import ANSWER_CYCLES, RowCheck, Rows, rows_of
 from servod.soak.start import nothing_yet
 from servod.soak.syncs import SyncCheck, SyncListener
-from servod.soak.tally import Tally
+from servod.soak.tally import FaultTally, Tally
+from servod.soak.traces import LISTEN_S, Listener, trace_of
 from servod.units import NS_PER_S
 
 #: Gain sets that the schedule changes between; every restart begins with the first.
@@ -192,50 +193,70 @@ class SteppedSoak:
             left_s -= 0.1
         self._expect(AxisState.ENABLED)
 
-    def _expect(self, state: AxisState) -> None:
+    def _expect(self, state: AxisState) -> bool:
         axis = self._axis.session.cycle.axis
         if axis.state is not state:
             self.findings.add(Wrong.STATE, self._axis.now_ns(), f"axis {axis.state.name} instead of {state.name}")
+        return axis.state is state
 
     # --- faults ------------------------------------------------------------------------------------------------
 
     def _befall(self, kind: FaultKind, chance: random.Random) -> None:
         """Inject, watch, judge, repair, recover."""
-        tally, proving = self.tally.of(kind.name), self._axis.session.cycle.axis.state is AxisState.PROVING
+        tally, injection = self.tally.of(kind.name), kind.injection(chance)
+        listener = None if kind.expects else self._listen(injection)
+        proving = self._axis.session.cycle.axis.state is AxisState.PROVING
         kind = kind.while_proving() if proving else kind
         tally.injected += 1
+        tally.due += bool(kind.expects)
         tally.proving += proving
         injected_ns = self._axis.now_ns()
-        self._act(kind.injection(chance))
+        self._act(injection)
         self._run(kind.watch_ms / 1e3)
         batch = self._settle(kind.explained, kind.takes_syncs, kind.deaf_cycles)
-        self._judge(kind, batch, injected_ns)
+        happened = listener is not None and listener.leave()
+        self._judge(kind, batch, injected_ns, happened)
         repair = kind.repair()
         if repair is not None:
             self._act(repair)
             self._run(_PATIENCE_S)
-        tally.recovered += self._back(kind)
+        if kind.recovery is Recovery.NONE:
+            tally.recovered += self._ride_on(kind, tally, happened)
+        else:
+            tally.recovered += self._recover(kind.recovery, kind.explained)
 
-    def _back(self, kind: FaultKind) -> bool:
-        """Have the axis enabled again; what it rides through may have spoilt a proof, which is then done again."""
-        if kind.recovery is not Recovery.NONE:
-            return self._recover(kind.recovery, kind.explained)
+    def _listen(self, injection: Injection) -> Listener | None:
+        """Listen for what will show that it happened, from some time before; None where nothing would."""
+        trace = trace_of(action_of(injection, "soak", Runs.STEPPED))
+        if trace is None:
+            return None
+        listener = Listener(self._axis.world.hub, trace)
+        self._run(LISTEN_S)
+        return listener
+
+    def _ride_on(self, kind: FaultKind, tally: FaultTally, happened: bool) -> bool:
+        """See the axis go on as it was; what it rides through may spoil a proof, which is then done again."""
         self._wait_out(AxisState.PROVING)
         if self._axis.session.cycle.axis.latched & kind.explained & _NOT_PROVEN:
+            tally.spoilt += happened
             return self._recover(Recovery.RESET_FAULT, kind.explained)
         self._settle(kind.explained)
-        self._expect(AxisState.ENABLED)
-        return True
+        goes_on = self._expect(AxisState.ENABLED)
+        tally.ridden += goes_on and happened
+        return goes_on
 
     def _act(self, injection: Injection) -> None:
         action_of(injection, "soak", Runs.STEPPED).apply(self._axis)
 
-    def _judge(self, kind: FaultKind, batch: Batch, injected_ns: int) -> None:
-        """Was it found in the log in time, and was the torque gone in time by the drive's own record?"""
+    def _judge(self, kind: FaultKind, batch: Batch, injected_ns: int, happened: bool) -> None:
+        """Was it found in the log in time, and was the torque gone in time by the drive's own record?
+
+        Of what is ridden through no fault word tells; there must be its trace.
+        """
         tally, latched = self.tally.of(kind.name), self._axis.session.cycle.axis.latched
         tally.latched.update(f.code.name for f in faults_in(latched & ~fault_bits(ALWAYS)))
         if not kind.expects:
-            tally.found += 1
+            check_trace(kind, happened, injected_ns, self.findings)
             return
         detected_ms = detected_after_ms(batch.rows, injected_ns, fault_bits(kind.expects))
         if detected_ms is None:

@@ -49,13 +49,24 @@ def median_ms(bins: Mapping[int, int]) -> int:
     return 0
 
 
+#: What is counted of a kind of fault.
+COUNTED = ("injected", "proving", "due", "found", "ridden", "spoilt", "recovered")
+
+
 @dataclass
 class FaultTally:
-    """One kind of fault; `proving`: so many came while the wiring was being proven."""
+    """One kind of fault; `proving`: so many came while the wiring was being proven.
+
+    Of those that were injected, `due` must be found in the log, and `found` were. All others left their trace on the
+    bus: `ridden` through, or `spoilt` the proof of the wiring, which was then done again.
+    """
 
     injected: int = 0
     proving: int = 0
+    due: int = 0
     found: int = 0
+    ridden: int = 0
+    spoilt: int = 0
     recovered: int = 0
     latched: Counter[str] = field(default_factory=Counter)
     detected: Times = field(default_factory=Times)
@@ -65,10 +76,7 @@ class FaultTally:
     def document(self) -> dict[str, Any]:
         """As JSON has it."""
         return {
-            "injected": self.injected,
-            "proving": self.proving,
-            "found": self.found,
-            "recovered": self.recovered,
+            **{name: getattr(self, name) for name in COUNTED},
             "latched": dict(self.latched),
             "detected": self.detected.document(),
             "left_command": self.left.document(),

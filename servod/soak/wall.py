@@ -17,6 +17,7 @@ from typing import Any
 
 from servod.axis import AxisState
 from servod.campaign.actions import action_of
+from servod.campaign.actions.bus import FrameFault
 from servod.campaign.machine import Process
 from servod.campaign.processes import ProcessAxis
 from servod.campaign.scenario import Injection, Recovery, Runs, Start
@@ -31,12 +32,13 @@ from servod.soak.explained import Explained
 from servod.soak.finding import Findings, Wrong
 from servod.soak.kinds import ALWAYS, FaultKind, fault_bits
 from servod.soak.plan import Ending, Episode, Move
-from servod.soak.reactions import check_reaction
+from servod.soak.reactions import check_reaction, check_trace
 from servod.soak.recorded import RecordedRows
 from servod.soak.start import nothing_yet
 from servod.soak.starved import Starved
 from servod.soak.syncs import SyncThread
 from servod.soak.tally import Tally
+from servod.soak.traces import LISTEN_S, BusListener, trace_of
 from servod.units import NS_PER_US
 
 #: Actions that happen within the loop's process.
@@ -54,8 +56,12 @@ _GRACE_MS = 60.0
 
 
 def of_the_wall(kind: FaultKind) -> bool:
-    """Whether a fault can be put to a loop in a process of its own: from the bus, not from within."""
-    return all(name not in _INSIDE and arguments.get("who") != "loop" for name, arguments in kind.do.items())
+    """Whether a fault can be put to a loop in a process of its own, from the bus and not from within, and be seen
+    there: a client of the hub hears of no frame that was destroyed."""
+    return all(
+        name not in _INSIDE and arguments.get("who") != "loop" and arguments.get("fault") != FrameFault.DESTROY
+        for name, arguments in kind.do.items()
+    )
 
 
 class WallSoak:
@@ -71,7 +77,8 @@ class WallSoak:
             self._axis = ProcessAxis(nothing_yet(seed, proves=False), folder, over=over)
             stack.callback(self._axis.close)
             self._axis.start(Start.OFF)
-            self._heard = SyncThread(folder / "bus")
+            self._bus = folder / "bus"
+            self._heard = SyncThread(self._bus)
             stack.callback(self._heard.close)
             self._tail = DriveTail(next(folder.glob("*-drive.bin")))
             stack.callback(self._tail.close)
@@ -182,36 +189,54 @@ class WallSoak:
         """Inject, watch, judge, repair, recover."""
         tally = self.tally.of(kind.name)
         tally.injected += 1
+        tally.due += bool(kind.expects)
         self._syncs_taken |= kind.takes_syncs
+        injection = kind.injection(chance)
+        listener = None if kind.expects else self._listen(injection)
         self._starved.look(self._watched(), self._axis.now_ns())
         injected_ns = self._axis.now_ns()
         self._schedule.add(injected_ns, kind.explained)
-        self._act(kind.injection(chance))
-        time.sleep(kind.watch_ms / 1e3)
-        self._judge(kind, injected_ns)
+        self._act(injection)
+        happened = _watch(kind.watch_ms / 1e3, listener)
+        self._judge(kind, injected_ns, happened)
         repair = kind.repair()
         if repair is not None:
             self._act(repair)
             time.sleep(_HEARD_S)
-        tally.recovered += self._recover(kind.recovery)
+        back = self._recover(kind.recovery)
+        tally.recovered += back
+        tally.ridden += back and happened and not kind.expects
         self._schedule.end(self._axis.now_ns())
+
+    def _listen(self, injection: Injection) -> BusListener | None:
+        """Listen for what will show that it happened, from some time before; None where nothing would."""
+        trace = trace_of(action_of(injection, "soak", Runs.PROCESSES))
+        if trace is None:
+            return None
+        listener = BusListener(self._bus, trace)
+        listener.listen(LISTEN_S)
+        return listener
 
     def _act(self, injection: Injection) -> None:
         action_of(injection, "soak", Runs.PROCESSES).apply(self._axis)
 
-    def _judge(self, kind: FaultKind, injected_ns: int) -> None:
-        """Does the user see the fault, and was the torque gone in time by the drive's own record?"""
+    def _judge(self, kind: FaultKind, injected_ns: int, happened: bool) -> None:
+        """Does the user see the fault, and was the torque gone in time by the drive's own record?
+
+        Of what is ridden through no fault word tells; there must be its trace.
+        """
         tally, samples = self.tally.of(kind.name), self._settle()
         seen = {FaultCode[fault["code"]] for fault in self._axis.client.call(Verb.STATUS)["faults"]}
         tally.latched.update(code.name for code in seen)
-        if kind.expects and not seen & kind.expects:
+        if not kind.expects:
+            check_trace(kind, happened, injected_ns, self.findings)
+            return
+        if not seen & kind.expects:
             self.findings.add(
                 Wrong.NOT_FOUND, injected_ns, f"{kind.name}: {', '.join(c.name for c in seen) or 'nothing'}"
             )
             return
         tally.found += 1
-        if not kind.expects:
-            return
         late_ms = _GRACE_MS + self._starved.waited_ms(self._watched())
         times = reaction_in(samples, injected_ns)
         if check_reaction(kind, times, injected_ns, tally, self.findings, late_ms):
@@ -270,6 +295,15 @@ class WallSoak:
         self._syncs_taken = False
         self._schedule.forget(self._axis.now_ns())
         self._starved.explained.forget(self._axis.now_ns())
+
+
+def _watch(duration_s: float, listener: BusListener | None) -> bool:
+    """Let time pass; whether the trace was there that one listened for."""
+    if listener is None:
+        time.sleep(duration_s)
+        return False
+    listener.listen(duration_s)
+    return listener.leave()
 
 
 _NAMES: dict[ReferenceKind, tuple[str, ...]] = {

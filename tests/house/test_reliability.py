@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import pytest
 import reliability
 
 _TIMES = {"count": 2, "median_ms": 3, "largest_ms": 148.6, "bins_ms": {"3": 1, "148": 1}}
 _SOAK = {
     **{"mode": "stepped", "cycles": 3_600_010, "rows": 3_600_000, "missed": 3, "syncs": 3_599_990, "syncs_taken": 6},
     **{"axis_hours": 1.0, "wall_s": 360.0, "faults_injected": 1200, "faults_found": 1199, "restarts": 7},
-    "faults": {"encoder cut off": {"torque_gone": _TIMES}},
+    "faults": {"encoder cut off": {"torque_gone": _TIMES, "injected": 3, "found": 2, "recovered": 3}},
     "wrong": {"lost row": 7, "unexplained state": 1},
     "memory": [{"process": "soak", "growth": "flat", "interval_kb_per_h": [-20.4, 33.6]}],
 }
@@ -23,9 +24,37 @@ _FUZZ = [
 def test_a_soak_is_told_with_what_was_lost() -> None:
     ((_, much, out, command),) = reliability.rows([_SOAK], None, None)
     assert much == "3,600,010 cycles (1.0 h of axis time in 0.10 h), 1,200 faults of 1 kinds, 7 restarts"
-    assert out.startswith("7 rows lost; 4 apart from SYNC on the bus; 1,199 faults in the log; 8 unexplained")
+    assert out.startswith("7 rows lost; 4 apart from SYNC on the bus; 2 of 3 faults that stop the axis in")
     assert out.endswith("torque gone after 149 ms at the latest; memory of soak flat (-20 to 34 kB/h)")
     assert command == "`servoctl soak`"
+
+
+_NONE = {"count": 0, "median_ms": 0, "largest_ms": 0.0, "bins_ms": {}}
+_STOPS = {"injected": 40, "found": 39, "recovered": 40, "torque_gone": _TIMES}
+_RIDDEN = {"injected": 30, "recovered": 30, "torque_gone": _NONE}
+
+
+@pytest.mark.parametrize(
+    ("stops", "rides", "told"),
+    [
+        (
+            {"due": 40, "ridden": 0, "spoilt": 0},
+            {"due": 0, "found": 0, "ridden": 28, "spoilt": 2},
+            [
+                "28 of 30 others seen on the bus and ridden through",
+                "2 of them seen on the bus and the wiring proven again",
+            ],
+        ),
+        ({}, {"found": 30}, ["enabled after 30 of 30 others"]),
+    ],
+)
+def test_what_was_ridden_through_is_told_apart_from_what_the_log_says(
+    stops: dict[str, int], rides: dict[str, int], told: list[str]
+) -> None:
+    """Documents of before there was a trace count all of them as found."""
+    soak = {**_SOAK, "faults": {"safe torque off": {**_STOPS, **stops}, "frames destroyed": {**_RIDDEN, **rides}}}
+    ((_, _, out, _),) = reliability.rows([soak], None, None)
+    assert out.split("; ")[2 : 3 + len(told)] == ["39 of 40 faults that stop the axis in the log", *told]
 
 
 def test_the_campaign_and_fuzzing_are_told_with_what_failed() -> None:

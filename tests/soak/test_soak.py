@@ -29,6 +29,7 @@ from servod.soak.run import DOCUMENT_NAME, run
 from servod.soak.stepped import GAIN_SETS, SteppedSoak
 
 _KIND = {kind.name: kind for kind in KINDS}
+_RIDDEN = [kind for kind in KINDS if not kind.expects]
 _SINE = Move(ReferenceKind.SINE, (0.1, 1.0, 1.0), 1.0)
 
 
@@ -66,7 +67,9 @@ def test_twenty_thousand_cycles_of_faults_leave_nothing_wrong(tmp_path: Path) ->
     soak.close()
     assert found["passed"], found["findings"]
     assert found["cycles"] == found["rows"] == found["syncs"] + found["syncs_taken"] >= 20_000
-    assert found["faults_injected"] == found["faults_found"] == found["faults_recovered"] >= 5
+    assert found["faults_due"] == found["faults_found"] >= 3 and found["faults_ridden_through"] >= 2
+    seen = found["faults_found"] + found["faults_ridden_through"] + found["faults_spoilt_proof"]
+    assert found["faults_injected"] == found["faults_recovered"] == seen
     assert found["recordings"] == 2 and found["rows_read_back"] > 100
     assert json.loads((tmp_path / DOCUMENT_NAME).read_text()) == found
 
@@ -93,6 +96,8 @@ def test_ctrl_c_leaves_a_report_of_what_was_done(axis: SteppedSoak, wrong: Count
     [
         (replace(_KIND["error in the drive"], expects=frozenset({FaultCode.BUS_OFF})), Wrong.NOT_FOUND),
         (replace(_KIND["error in the drive"], expects=frozenset()), Wrong.UNEXPLAINED),
+        (replace(_KIND["error in the drive"], expects=frozenset()), Wrong.NO_TRACE),
+        (replace(_KIND["frames destroyed"], do=_KIND["safe torque off"].undo or {}), Wrong.NO_TRACE),
         (replace(_KIND["encoder feedback lost, many"], gone_ms=1.0), Wrong.LATE),
         (replace(_KIND["encoder feedback lost, many"], latched_ms=1.0), Wrong.LATE),
         (replace(_KIND["encoder feedback lost, many"], left_ms=1.0), Wrong.LATE),
@@ -105,6 +110,20 @@ def test_what_the_schedule_does_not_explain_is_found(
 ) -> None:
     axis.episode(befallen(lie))
     assert finding in wrong
+
+
+@pytest.mark.parametrize("kind", _RIDDEN, ids=lambda kind: kind.name)
+def test_what_is_ridden_through_counts_only_if_it_happened(
+    axis: SteppedSoak, wrong: Counter[Wrong], monkeypatch: pytest.MonkeyPatch, kind: FaultKind
+) -> None:
+    """By the bus itself: the same episode with nothing injected is found out."""
+    before = replace(axis.tally.of(kind.name))
+    axis.episode(replace(befallen(kind), number=2))
+    told = axis.tally.of(kind.name)
+    assert (told.ridden, told.found, told.due) == (before.ridden + 1, 0, 0) and not wrong
+    monkeypatch.setattr(axis, "_act", lambda _injection: None)
+    axis.episode(replace(befallen(kind), number=2))
+    assert wrong == {Wrong.NO_TRACE: 1} and axis.tally.of(kind.name).ridden == before.ridden + 1
 
 
 def test_every_loss_of_feedback_is_held_to_fifty_milliseconds() -> None:
