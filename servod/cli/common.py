@@ -11,6 +11,7 @@ import json
 import os
 import sys
 import tempfile
+import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -49,12 +50,28 @@ def ask(socket: Path, verb: str, **arguments: Any) -> dict[str, Any]:
     return result
 
 
+def ask_to_stop(socket: Path, verb: str) -> dict[str, Any]:
+    """The same for what brings the axis to rest: who stands beside it is told when the answer is late."""
+    late = threading.Timer(
+        _LATE_S, print, [f"servoctl: {verb}: no answer yet; {_BESIDE_THE_AXIS}"], {"file": sys.stderr}
+    )
+    late.daemon = True
+    late.start()
+    try:
+        return ask(socket, verb)
+    finally:
+        late.cancel()
+
+
 def print_json(document: Any) -> None:
     """Print `document` as the one JSON document of a command."""
     json.dump(document, sys.stdout, indent=2, allow_nan=False)
     sys.stdout.write("\n")
 
 
+#: A stop is answered when the drive has stopped. One that takes longer [s] is a slow ramp, or a daemon that hangs.
+_LATE_S = 2.0
+_BESIDE_THE_AXIS = "a loop whose daemon hangs stops the axis by itself; IF IT MOVES ON, USE THE EMERGENCY STOP"
 #: Folders that this command made for its results, outermost first.
 _made: list[Path] = []
 #: Descriptors of locked folders; they end with the command.

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, connect, example, report
+from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask_to_stop, connect, example, report
 
 _ENABLE_HELP = example(
     "Enable the axis and wait until it is; holds where it stands. The first time after a start, polarity, scale and "
@@ -56,4 +56,4 @@ def _enable_or_leave_off(socket: Path, **arguments: bool) -> dict[str, Any]:
 
 def disable(socket: SocketOption = DEFAULT_SOCKET, as_json: JsonOption = False) -> None:
     """Disable the axis."""
-    report(ask(socket, "disable"), "disabled", as_json)
+    report(ask_to_stop(socket, "disable"), "disabled", as_json)

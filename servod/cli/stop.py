@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, example, report
+from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask_to_stop, example, report
 
 _HELP = example("Quick stop: the drive stops the axis by its own option (0x605A) and switches off.", "servoctl stop")
 
@@ -16,4 +16,4 @@ def register(app: typer.Typer) -> None:
 
 def stop(socket: SocketOption = DEFAULT_SOCKET, as_json: JsonOption = False) -> None:
     """Stop the axis."""
-    report(ask(socket, "stop"), "stopped", as_json)
+    report(ask_to_stop(socket, "stop"), "stopped", as_json)

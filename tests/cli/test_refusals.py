@@ -5,6 +5,8 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import socket
+import threading
 from pathlib import Path
 
 import pytest
@@ -89,3 +91,18 @@ def test_a_folder_that_another_command_works_in_is_refused(tmp_path: Path, capsy
     finally:
         os.close(other)
     assert not list(tmp_path.iterdir())
+
+
+def test_who_stops_an_axis_is_told_when_the_answer_is_late(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The kernel takes the connection of a daemon that is stopped; nobody answers."""
+    monkeypatch.setattr("servod.cli.common._LATE_S", 0.05)
+    path = tmp_path / "axis.sock"
+    with socket.socket(socket.AF_UNIX) as hung:
+        hung.bind(str(path))
+        hung.listen(1)
+        threading.Timer(0.5, hung.shutdown, [socket.SHUT_RDWR]).start()
+        assert run(["stop", "--socket", str(path)]) == 3
+    first, *_ = capsys.readouterr().err.splitlines()
+    assert "stop: no answer yet" in first and "EMERGENCY STOP" in first

@@ -5,7 +5,7 @@
     python -m tests.fuzz.run --seconds 600 --target mcap   one target, longer
     python -m tests.fuzz.run --seconds 60 --json out.json  the figures, with every crash, for programs
 
-Where atheris can be had (`pip install servod[fuzz]`), half of each share goes to inputs that atheris changes octet by
+Where atheris can be had (`pip install -e '.[fuzz]'`), half of each share goes to inputs that atheris changes octet by
 octet, and half to choices that it makes for the target's strategy, both guided by coverage. Elsewhere hypothesis draws
 from the strategies alone, and a line says so. Exit code 1 when an input crashed; it is kept in the folder --out.
 """
@@ -25,7 +25,10 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from tests.fuzz.target import TARGETS
+try:
+    from tests.fuzz.target import TARGETS
+except ModuleNotFoundError as error:
+    sys.exit(f"fuzzing needs the tests' tools: pip install -e '.[lab,dev]' ({error.name} is missing)")
 
 ROOT = Path(__file__).resolve().parents[2]
 #: What a process may take beyond its time, for its start and its last input, s.
@@ -118,7 +121,7 @@ def run(names: list[str], seconds: float, out: Path, jobs: int) -> list[Row]:
     """Fuzz the targets, `jobs` at a time; each has its share of the seconds, however many run beside it."""
     ways = ["bytes", "shaped"] if importlib.util.find_spec("atheris") else ["drawn"]
     if ways == ["drawn"]:
-        print("atheris is not installed (pip install servod[fuzz]): hypothesis alone draws inputs", file=sys.stderr)
+        print("atheris is not installed (pip install -e '.[fuzz]'): hypothesis alone draws inputs", file=sys.stderr)
     share_s = seconds / (len(names) * len(ways))
     with ThreadPoolExecutor(jobs) as pool:
         return [row for rows in pool.map(lambda name: _both_ways(name, ways, share_s, out), names) for row in rows]
