@@ -1,15 +1,13 @@
 """Reads a foreign file into named columns of numbers: CSV, CSV.gz, Parquet, MAT v5, and the daemon's MCAP.
 
 The first step behind the file; `columns` names, `recording` checks and repairs. One reader for each format, chosen by
-the file's suffix from one table. Whatever stands in a file, reading it takes bounded memory.
+the file's suffix from one table. Whatever stands in a file, reading it takes bounded memory: `bounds` says how much a
+recording may hold, every reader counts before or while it unpacks, and keeps the columns that are wanted.
 """
 
 from __future__ import annotations
 
-import gzip
-import io
-import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container
 from pathlib import Path
 from typing import Any
 
@@ -18,24 +16,26 @@ from numpy.typing import NDArray
 
 from servod.errors import BadInput
 from servod.files import open_file, require_size
+from servod.recordings import bounds
+from servod.recordings.bounds import MOST_BYTES, require_cells
+from servod.recordings.csv_text import first_line, read_csv, refuse_repeated
 from servod.recordings.mat import BrokenMatError, vectors
 
 Array = NDArray[np.float64]
-#: Columns of the file at a path; what is to be told of it goes to the list.
-Reader = Callable[[Path, list[str]], dict[str, Any]]
+#: Columns of the file at a path, those that are wanted with their content; what is to be told of it goes to the list.
+Reader = Callable[[Path, Container[str], list[str]], dict[str, Any]]
 
-#: Longest header line of a CSV that is looked at to find its separator.
-_HEADER_BYTES = 65536
-#: Largest recording, packed and unpacked, and most numbers in it: a day of three columns at 1 kHz.
-_MOST_BYTES = 1024**3
-_MOST_CELLS = 260_000_000
+#: Cells of text that are parsed at once: each is a Python object meanwhile.
+_CELLS_AT_ONCE = 65_536
+_NS_PER_S = 1e9
 
 
-def read_columns(path: Path) -> tuple[dict[str, Any], list[str]]:
+def read_columns(path: Path, wanted: Container[str]) -> tuple[dict[str, Any], list[str]]:
     """Columns of the file by name, and what is to be told of the file in plain sentences.
 
-    A column is a float array, or an arrow array of text where it is not all numbers; `numbers` turns one into floats.
-    Raises BadInput for a missing, empty, broken or unknown file.
+    A column is a float array, an arrow array of numbers or text, an arrow type in which no number stands, or None
+    where it is not `wanted`; `numbers` turns one into floats. Raises BadInput for a missing, empty, broken, unknown
+    or too large file.
     """
     if not path.is_file():
         raise BadInput(str(path), "no such file" if not path.exists() else "no file", "a recording")
@@ -45,7 +45,7 @@ def read_columns(path: Path) -> tuple[dict[str, Any], list[str]]:
         raise BadInput(str(path), f"suffix {path.suffix!r}", "a recording: " + ", ".join(READERS))
     notes: list[str] = []
     try:
-        columns = reader(path, notes)
+        columns = reader(path, wanted, notes)
     except OSError as error:
         raise BadInput(str(path), error.strerror or str(error), "a readable recording") from None
     if not columns:
@@ -53,126 +53,116 @@ def read_columns(path: Path) -> tuple[dict[str, Any], list[str]]:
     return columns, notes
 
 
-def _bounded(path: Path) -> bytes:
-    """The whole file, unpacked where it is packed. Raises BadInput when that is more than any recording."""
-    with open_file(path) as packed:
-        require_size(path, packed, _MOST_BYTES)
-        stream = gzip.GzipFile(fileobj=packed) if path.name.lower().endswith(".gz") else packed
-        try:
-            content = stream.read(_MOST_BYTES + 1)
-        except (gzip.BadGzipFile, EOFError, zlib.error) as error:
-            raise BadInput(str(path), str(error), "a gzip file that is whole") from None
-    if len(content) > _MOST_BYTES:
-        raise BadInput(str(path), f"more than {_MOST_BYTES} bytes unpacked", "a smaller recording, or one in parts")
-    return content
-
-
 def numbers(column: Any, path: Path, name: str) -> Array:
     """A column as float64, NaN where a cell is empty. Raises BadInput naming the first cell that is no number."""
     if isinstance(column, np.ndarray):
-        return column.astype(np.float64)
+        return column.astype(np.float64, copy=False)
     import pyarrow as pa
 
+    kind = column if isinstance(column, pa.DataType) else column.type
     try:
         return _converted(column, path, name)
     except (pa.ArrowException, ValueError, OverflowError):
-        raise BadInput(f"{path}: column {name}", f"values of type {column.type}", "numbers") from None
+        raise BadInput(f"{path}: column {name}", f"values of type {kind}", "numbers") from None
 
 
 def _converted(column: Any, path: Path, name: str) -> Array:
+    """Raises ValueError for an arrow type alone."""
     import pyarrow as pa
 
+    if isinstance(column, pa.DataType):
+        raise ValueError("no numbers stand in such a column")
     if pa.types.is_boolean(column.type):
         column = column.cast(pa.int8())
-    if pa.types.is_integer(column.type) or pa.types.is_floating(column.type) or pa.types.is_decimal(column.type):
+    if _holds_numbers(column.type):
         return np.asarray(column.cast(pa.float64()).to_numpy(zero_copy_only=False), dtype=np.float64)
-    return _parsed(column.to_pylist(), path, name)
+    return _parsed(column, path, name)
 
 
-def _parsed(cells: Iterable[object], path: Path, name: str) -> Array:
-    values = []
-    for row, cell in enumerate(cells):
-        text = "" if cell is None else str(cell).strip()
-        try:
-            values.append(float(text) if text else np.nan)
-        except ValueError:
-            raise BadInput(f"{path}: column {name}, row {row + 1}", repr(text)[:40], "a number") from None
-    return np.array(values)
-
-
-def _read_csv(path: Path, _notes: list[str]) -> dict[str, Any]:
+def _holds_numbers(kind: Any) -> bool:
     import pyarrow as pa
-    import pyarrow.csv as pc
 
-    content = _bounded(path)
-    header = _header(content, path)
-    separator = max(",;\t", key=header.count)
-    names = [name.strip().strip('"') for name in header.rstrip("\r\n").split(separator)]
-    _refuse_repeated(names, path)
-    try:
-        table = pc.read_csv(
-            pa.BufferReader(content),
-            read_options=pc.ReadOptions(column_names=names, skip_rows=1),
-            parse_options=pc.ParseOptions(delimiter=separator),
-        )
-    except pa.ArrowException as error:
-        raise BadInput(str(path), _first_line(error), "rows with as many cells as the header") from None
-    return {name: table.column(name).combine_chunks() for name in names}
+    if pa.types.is_dictionary(kind):
+        kind = kind.value_type
+    tests = (pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal, pa.types.is_boolean)
+    return any(test(kind) for test in tests)
 
 
-def _header(content: bytes, path: Path) -> str:
-    line = io.BytesIO(content).readline(_HEADER_BYTES)
-    try:
-        text = line.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise BadInput(str(path), "bytes that are not UTF-8", "a text file with a header line") from None
-    if not text.strip():
-        raise BadInput(str(path), "an empty file", "a header line with column names")
-    return text
+def _parsed(column: Any, path: Path, name: str) -> Array:
+    """A column of text, or one that is empty all through."""
+    values = np.full(len(column), np.nan)
+    for start in range(0, len(column) if column.null_count < len(column) else 0, _CELLS_AT_ONCE):
+        for row, cell in enumerate(column.slice(start, _CELLS_AT_ONCE).to_pylist(), start):
+            text = "" if cell is None else str(cell).strip()
+            try:
+                values[row] = float(text) if text else np.nan
+            except ValueError:
+                raise BadInput(f"{path}: column {name}, row {row + 1}", repr(text)[:40], "a number") from None
+    return values
 
 
-def _refuse_repeated(names: list[str], path: Path) -> None:
-    repeated = sorted({name for name in names if names.count(name) > 1})
-    if repeated:
-        raise BadInput(f"{path}: column {repeated[0]}", "the same name twice", "one column of each name")
+def _read_csv(path: Path, wanted: Container[str], _notes: list[str]) -> dict[str, Any]:
+    return read_csv(path, wanted)
 
 
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or ["a broken file"])[0]
-
-
-def _read_parquet(path: Path, _notes: list[str]) -> dict[str, Any]:
+def _read_parquet(path: Path, wanted: Container[str], _notes: list[str]) -> dict[str, Any]:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
-        file = pq.ParquetFile(pa.BufferReader(_bounded(path)))
-        cells = file.metadata.num_rows * file.metadata.num_columns
-        if cells > _MOST_CELLS:
-            raise BadInput(str(path), f"{cells} numbers", f"at most {_MOST_CELLS}")
-        table = file.read()
+        with open_file(path) as stream:
+            file = pq.ParquetFile(stream)
+            names = list(file.schema_arrow.names)
+            refuse_repeated(names, path)
+            read = [name for name in names if name in wanted and _holds_numbers(file.schema_arrow.field(name).type)]
+            _require_parquet(path, file, len(names), read)
+            table = file.read(columns=read)
+            others = {name: file.schema_arrow.field(name).type if name in wanted else None for name in names}
     except (pa.ArrowException, OSError, ValueError) as error:  # ValueError: a name that is no UTF-8
-        raise BadInput(str(path), _first_line(error), "a Parquet file") from None
-    _refuse_repeated(table.column_names, path)
-    return {name: table.column(name).combine_chunks() for name in table.column_names}
+        raise BadInput(str(path), first_line(error), "a Parquet file") from None
+    return others | {name: table.column(name) for name in read}
 
 
-def _read_mat(path: Path, _notes: list[str]) -> dict[str, Any]:
+def _require_parquet(path: Path, file: Any, columns: int, read: list[str]) -> None:
+    """Raises BadInput for more numbers than a recording may hold, by the count that Arrow itself goes by."""
+    require_cells(path, 0, columns)
+    groups = [file.metadata.row_group(n) for n in range(file.metadata.num_row_groups)]
+    chunks = [group.column(n) for group in groups for n in range(group.num_columns)]
+    used = [chunk for chunk in chunks if chunk.path_in_schema in read]
+    if any(chunk.total_uncompressed_size > MOST_BYTES for chunk in used):
+        raise BadInput(str(path), "a column chunk that claims to be larger", f"at most {MOST_BYTES} bytes")
+    require_cells(path, -(-sum(_words(file, chunk) for chunk in used) // max(len(read), 1)), len(read))
+
+
+def _words(file: Any, chunk: Any) -> int:
+    """Numbers in a chunk; one that takes more than eight bytes, as decimals do, counts for as many as it takes."""
+    kind = file.schema_arrow.field(chunk.path_in_schema).type
+    width = kind.bit_width if not hasattr(kind, "value_type") else kind.value_type.bit_width + kind.index_type.bit_width
+    return int(chunk.num_values * max(1, -(-width // 64)))
+
+
+def _read_mat(path: Path, _wanted: Container[str], _notes: list[str]) -> dict[str, Any]:
+    with open_file(path) as stream:
+        require_size(path, stream, MOST_BYTES)
+        content = stream.read(MOST_BYTES)
     try:
-        return dict(vectors(_bounded(path)))
+        return dict(vectors(content, path))
     except BrokenMatError as error:
         raise BadInput(str(path), str(error), "MAT v5: save('file.mat', '-v7')") from None
 
 
-def _read_mcap(path: Path, notes: list[str]) -> dict[str, Any]:
-    from servod.recorder_export import seconds
-    from servod.recorder_read import read_recording
+def _read_mcap(path: Path, wanted: Container[str], notes: list[str]) -> dict[str, Any]:
+    from servod.recorder_read import TIME, read_recording
 
-    recording = read_recording(path)
+    recording = read_recording(path, wanted, bounds.MOST_CELLS)
     if recording.damage:
         notes.append(recording.damage)
-    columns: dict[str, Any] = {name: np.asarray(recording.column(name), dtype=np.float64) for name in recording.names}
-    columns["t_s"] = np.asarray(seconds(recording))
+    cells = np.frombuffer(recording.rows, "<f8").reshape(-1, len(recording.names))
+    columns: dict[str, Any] = dict.fromkeys(recording.left_out)
+    for at, (name, kind) in enumerate(zip(recording.names, recording.kinds, strict=True)):
+        columns[name] = (cells if kind == "d" else cells.view("<i8"))[:, at]
+    times_ns = columns[TIME]
+    columns["t_s"] = (times_ns - times_ns[:1]) / _NS_PER_S
     return columns
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from servod.axis_model import AxisKind
 from servod.errors import BadInput
 from servod.models.replay import Drive
-from servod.recordings.columns import REQUIRED, Quantity, apply_map, axis_of, load_column_map
+from servod.recordings.columns import ALL_NAMES, REQUIRED, Quantity, apply_map, axis_of, load_column_map
 from servod.recordings.readers import numbers, read_columns
 
 Array = NDArray[np.float64]
@@ -102,8 +102,8 @@ def load_recording(path: str | Path, map_path: str | Path | None = None) -> Reco
     Raises BadInput naming file and column.
     """
     path = Path(path)
-    foreign, report = read_columns(path)
     sources = load_column_map(Path(map_path)) if map_path is not None else {}
+    foreign, report = read_columns(path, {*ALL_NAMES, *(source.source for source in sources.values())})
     chosen, unused = apply_map(foreign, sources, str(path))
     axis = axis_of(chosen, foreign, str(path))
     columns = {}
@@ -113,7 +113,9 @@ def load_recording(path: str | Path, map_path: str | Path | None = None) -> Reco
             values = numbers(foreign[source.source], path, source.source)
             with np.errstate(over="ignore", invalid="ignore"):
                 scaled = source.scale * values + source.offset
-            columns[quantity] = np.where(np.abs(scaled) < LARGEST, scaled, np.nan)
+                scaled[~(np.abs(scaled) < LARGEST)] = np.nan
+            columns[quantity] = scaled
+    foreign.clear()  # a large file's columns would stand in memory twice
     if unused:
         report.append(f"columns not used: {', '.join(unused)}")
     return _checked(path, axis, columns, report)

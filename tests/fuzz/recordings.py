@@ -15,6 +15,7 @@ from servod.record import FIELDS, RECORD
 from servod.recorder_mcap import McapFile
 from servod.recorder_read import read_recording
 from servod.recordings import load_recording
+from tests.fuzz.recordings_bombs import csv_bomb, mat_bomb
 from tests.fuzz.shapes import ODD_NUMBERS, csv_texts, mutated
 from tests.fuzz.target import Target
 
@@ -47,7 +48,12 @@ def csv_gz(folder: Path) -> Target:
     """The same, packed: broken gzip, and text that grows a thousandfold."""
     seed = gzip.compress(csv(folder).seeds[0], mtime=0)
     bomb = gzip.compress(b"t_s,torque_nm,position_rad\n" + b"0,0,0\n" * 3_000_000, mtime=0)
-    shape = st.one_of(mutated((seed,)), csv_texts(NAMES).map(lambda text: gzip.compress(text, mtime=0)), st.just(bomb))
+    shape = st.one_of(
+        mutated((seed,)),
+        csv_texts(NAMES).map(lambda text: gzip.compress(text, mtime=0)),
+        st.just(bomb),
+        st.just(csv_bomb()),
+    )
     return Target(lambda data: _read(folder / "run.csv.gz", data), (seed,), shape, (b"\x1f\x8b\x08",))
 
 
@@ -114,7 +120,7 @@ def mat(folder: Path) -> Target:
         *(np.full(_ROWS, n) for n in (1e308, -1e308, 2**63 - 1, 0.0, np.nan)),
     )
     contents = st.dictionaries(st.sampled_from((*NAMES, "x")), st.sampled_from(odd)).map(lambda o: _columns() | o)
-    shape = st.one_of(mutated(seeds), st.builds(packed, contents, st.booleans()))
+    shape = st.one_of(mutated(seeds), st.builds(packed, contents, st.booleans()), st.just(mat_bomb()))
     return Target(lambda data: _read(folder / "run.mat", data), seeds, shape, (b"MATLAB 5.0",), longest=8192)
 
 
