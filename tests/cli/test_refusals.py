@@ -102,7 +102,7 @@ def test_who_stops_an_axis_is_told_when_the_answer_is_late(
     with socket.socket(socket.AF_UNIX) as hung:
         hung.bind(str(path))
         hung.listen(1)
-        threading.Timer(0.5, hung.shutdown, [socket.SHUT_RDWR]).start()
+        threading.Timer(0.5, lambda: hung.accept()[0].close()).start()
         assert run(["stop", "--socket", str(path)]) == 3
     first, *_ = capsys.readouterr().err.splitlines()
     assert "stop: no answer yet" in first and "EMERGENCY STOP" in first
