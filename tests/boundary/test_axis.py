@@ -137,6 +137,34 @@ def test_quick_stop_of_a_motion_that_failed_still_ends_in_fault(way: FaultCode) 
     assert axis.state == S.FAULT
 
 
+@pytest.mark.parametrize("state", CONTROLLED)
+@pytest.mark.parametrize("failed_before", [False, True])
+def test_quick_stop_of_a_sound_motion_ends_disabled(failed_before: bool, state: AxisState) -> None:
+    axis = new()
+    if failed_before:
+        axis = axis_in(S.ENABLED)
+        step(axis, BIT[F.FOLLOWING_ERROR])
+        for _ in range(2 * RAMP):
+            step(axis)
+        assert axis.state == S.FAULT
+    assert axis.enable(reset_fault=failed_before) == Refusal.DONE
+    step(axis, **READY)
+    if state != S.ENABLED:
+        axis.disable()
+        step(axis, at_rest=state == S.RAMPING)
+    assert axis.state == state
+    axis.quick_stop()
+    for _ in range(2 * TIMEOUT):
+        step(axis)
+    assert axis.state == S.DISABLED
+
+
+def test_fault_that_two_have_seen_is_one() -> None:
+    axis = axis_in(S.ENABLED)
+    step(axis, BIT[F.DRIVE_WARNING], status_word=0x0237 | 1 << 7)
+    assert (axis.faults, axis.latched) == (BIT[F.DRIVE_WARNING], BIT[F.DRIVE_WARNING])
+
+
 # --- requests ---------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("reset", [False, True])
 @pytest.mark.parametrize(

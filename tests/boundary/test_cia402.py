@@ -51,11 +51,15 @@ def test_frames_count_from_their_full_length_on(which: str, length: int) -> None
     assert axis.driver.ignored_frames == int(length < whole)  # type: ignore[attr-defined]
 
 
-def test_frames_of_others_are_no_ones() -> None:
+@pytest.mark.parametrize("data", [b"\x50\x82" + bytes(6), b""])
+def test_frames_of_others_are_no_ones(data: bytes) -> None:
     axis = bench()
-    for can_id in (axis.feedback_pdo.cob_id + 1, EMCY_BASE, axis.command_pdo.cob_id):
-        assert axis.driver.on_frame(can_id, bytes(8), 1) is False
+    axis.say(S.SWITCHED_ON)
+    mine = EMCY_BASE + axis.plan.node_id
+    for can_id in (axis.feedback_pdo.cob_id + 1, EMCY_BASE, mine - 1, mine + 1, axis.command_pdo.cob_id, 0x7FF):
+        assert axis.driver.on_frame(can_id, data, 1) is False
     assert axis.driver.ignored_frames == 0  # type: ignore[attr-defined]
+    assert (axis.driver.read().error_code, axis.driver.read().reasons & Reason.COMMANDS_MISSED) == (0, 0)
 
 
 @pytest.mark.parametrize(("code", "missed"), [(0x8250, True), (0x8251, False), (0x8130, False), (0x0000, False)])
@@ -102,9 +106,20 @@ def test_drive_that_takes_no_commands_from_the_bus_is_named() -> None:
     assert axis.driver.read().reasons & wanted == wanted
 
 
-def test_goal_that_is_reached_in_a_wrong_mode_says_so() -> None:
+def test_voltage_is_missed_only_where_it_is_needed_next() -> None:
     axis = bench()
-    axis.say_mode(Mode.PROFILE_TORQUE)
+    data = encode(axis.feedback_pdo, {Obj402.STATUS_WORD: 0x0221})  # ready to switch on; no voltage yet
+    for _ in range(HANDSHAKE_SYNCS + 2):
+        axis.driver.on_frame(axis.feedback_pdo.cob_id, data, 1)
+        found = axis.driver.read().reasons
+        axis.driver.write(AmplifierCommand(Goal.OFF, 0.0))
+    assert found == Reason.HANDSHAKE, "nothing is named that a user could mend"
+
+
+@pytest.mark.parametrize("mode", [-1, 0, Mode.PROFILE_TORQUE, Mode.CYCLIC_SYNC_VELOCITY, 11])
+def test_goal_that_is_reached_in_a_wrong_mode_says_so(mode: int) -> None:
+    axis = bench()
+    axis.say_mode(mode)
     assert waited(axis, S.OPERATION_ENABLED, Goal.ENABLED) == Reason.MODE_NOT_SHOWN
 
 
@@ -131,7 +146,7 @@ def test_motors_position_goes_the_shortest_way_to_the_last_count(start: int, ste
     assert moved == pytest.approx(step, abs=1e-5)
 
 
-@pytest.mark.parametrize("state", [S.SWITCHED_ON, S.OPERATION_ENABLED])
+@pytest.mark.parametrize("state", [S.SWITCHED_ON, S.OPERATION_ENABLED, S.QUICK_STOP_ACTIVE])
 @pytest.mark.parametrize("said", [False, True])
 def test_mode_is_lost_after_three_event_timers_and_ten_cycles(said: bool, state: DriveState) -> None:
     axis = bench()
