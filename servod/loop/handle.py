@@ -127,8 +127,7 @@ class LoopHandle:
                 words = self.last_words().strip().splitlines()
                 raise Unreachable(f"the loop process ended at its start: {words[-1] if words else 'no message'}")
             if time.monotonic() > deadline:
-                raise Unreachable(
-                    f"the loop process did not begin within {START_TIMEOUT_S:.0f} s: is the machine busy with other work?"
-                )
+                late = f"the loop process did not begin within {START_TIMEOUT_S:.0f} s"
+                raise Unreachable(f"{late}: is the machine busy with other work?")
             self.feed()
             time.sleep(0.01)
