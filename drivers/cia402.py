@@ -246,10 +246,10 @@ class Cia402Amplifier:
         self._reset_requested = requested
         if self._reset_hold > 0:
             self._reset_hold -= 1
-        elif self._resets_pending and state == DriveState.FAULT and not self._control_word & CW_FAULT_RESET:
+        elif self._resets_pending and state == DriveState.FAULT:
             self._resets_pending -= 1
             self._reset_hold = HANDSHAKE_SYNCS
-        elif state != DriveState.FAULT:
+        else:
             self._resets_pending = 0  # a request without a fault is not kept for the next one
         return CW_FAULT_RESET if self._reset_hold > 0 else 0
 

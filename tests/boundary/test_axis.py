@@ -137,6 +137,12 @@ def test_quick_stop_of_a_motion_that_failed_still_ends_in_fault(way: FaultCode) 
     assert axis.state == S.FAULT
 
 
+def test_fault_that_lasts_gives_the_quick_stop_no_more_time() -> None:
+    axis = axis_in(S.QUICK_STOPPING)
+    states = [(step(axis, BIT[F.SPEED_LIMIT]), axis.state)[1] for _ in range(TIMEOUT + 1)]
+    assert states == [S.QUICK_STOPPING] * TIMEOUT + [S.FAULT]
+
+
 @pytest.mark.parametrize("state", CONTROLLED)
 @pytest.mark.parametrize("failed_before", [False, True])
 def test_quick_stop_of_a_sound_motion_ends_disabled(failed_before: bool, state: AxisState) -> None:
@@ -157,12 +163,6 @@ def test_quick_stop_of_a_sound_motion_ends_disabled(failed_before: bool, state: 
     for _ in range(2 * TIMEOUT):
         step(axis)
     assert axis.state == S.DISABLED
-
-
-def test_fault_that_two_have_seen_is_one() -> None:
-    axis = axis_in(S.ENABLED)
-    step(axis, BIT[F.DRIVE_WARNING], status_word=0x0237 | 1 << 7)
-    assert (axis.faults, axis.latched) == (BIT[F.DRIVE_WARNING], BIT[F.DRIVE_WARNING])
 
 
 # --- requests ---------------------------------------------------------------------------------------------------------

@@ -99,6 +99,12 @@ def test_bits_of_the_status_word(state: AxisState, bit: int, code: FaultCode) ->
     assert axis.faults == 0
 
 
+def test_fault_that_two_have_seen_is_one() -> None:
+    axis = axis_in(S.ENABLED)
+    step(axis, BIT[F.DRIVE_WARNING], status_word=0x0237 | 1 << 7)
+    assert (axis.faults, axis.latched) == (BIT[F.DRIVE_WARNING], BIT[F.DRIVE_WARNING])
+
+
 @pytest.mark.parametrize("state", [*CONTROLLED, S.PROVING])
 @pytest.mark.parametrize("drive", list(D))
 def test_drive_that_leaves_operation(state: AxisState, drive: DriveState) -> None:

@@ -106,14 +106,22 @@ def test_drive_that_takes_no_commands_from_the_bus_is_named() -> None:
     assert axis.driver.read().reasons & wanted == wanted
 
 
-def test_voltage_is_missed_only_where_it_is_needed_next() -> None:
+@pytest.mark.parametrize(
+    ("word", "goal", "reason"),
+    [
+        (0x0240, Goal.READY, Reason.NO_VOLTAGE),
+        (0x0221, Goal.OFF, Reason.HANDSHAKE),  # ready to switch on: nothing is named that a user could mend
+        (0x0200, Goal.READY, Reason.NOT_READY),
+    ],
+)
+def test_voltage_is_missed_only_where_it_is_needed_next(word: int, goal: Goal, reason: Reason) -> None:
     axis = bench()
-    data = encode(axis.feedback_pdo, {Obj402.STATUS_WORD: 0x0221})  # ready to switch on; no voltage yet
+    data = encode(axis.feedback_pdo, {Obj402.STATUS_WORD: word})
     for _ in range(HANDSHAKE_SYNCS + 2):
         axis.driver.on_frame(axis.feedback_pdo.cob_id, data, 1)
         found = axis.driver.read().reasons
-        axis.driver.write(AmplifierCommand(Goal.OFF, 0.0))
-    assert found == Reason.HANDSHAKE, "nothing is named that a user could mend"
+        axis.driver.write(AmplifierCommand(goal, 0.0))
+    assert found == reason
 
 
 @pytest.mark.parametrize("mode", [-1, 0, Mode.PROFILE_TORQUE, Mode.CYCLIC_SYNC_VELOCITY, 11])
@@ -169,10 +177,10 @@ def test_mode_is_lost_after_three_event_timers_and_ten_cycles(said: bool, state:
 def test_feedback_counts_until_it_is_as_old_as_the_handshake() -> None:
     axis, old = bench(), []
     axis.say(S.SWITCH_ON_DISABLED)
-    for _ in range(HANDSHAKE_SYNCS + 1):
+    for _ in range(HANDSHAKE_SYNCS + 3):
         old.append(int(axis.driver.read().reasons))
         axis.ask(Goal.OFF)
-    assert old == [0] * HANDSHAKE_SYNCS + [Reason.NO_FEEDBACK]
+    assert old == [0] * HANDSHAKE_SYNCS + [Reason.NO_FEEDBACK] * 3
 
 
 @pytest.mark.parametrize(

@@ -142,6 +142,18 @@ def test_handshake_waits_three_cycles_after_each_new_goal_or_word() -> None:
     assert reasons_while(axis, Goal.READY, 5) == [WAIT] * HANDSHAKE_SYNCS + [FAULT] * 2, "a word, the same goal"
 
 
+def test_handshake_waits_for_a_word_that_asks_for_more_too() -> None:
+    axis, found = bench(), []
+    for _ in range(HANDSHAKE_SYNCS + 2):
+        axis.cycle(S.NOT_READY_TO_SWITCH_ON, Goal.READY)
+    data = encode(axis.feedback_pdo, {Obj402.STATUS_WORD: 0x0240})  # switch on disabled, no voltage: shutdown is sent
+    for _ in range(6):
+        axis.driver.on_frame(axis.feedback_pdo.cob_id, data, 1)
+        found.append(axis.driver.read().reasons)
+        axis.ask(Goal.READY)
+    assert found == [Reason.NO_VOLTAGE] + [WAIT] * HANDSHAKE_SYNCS + [Reason.NO_VOLTAGE] * 2
+
+
 def test_no_handshake_is_waited_for_before_the_first_command() -> None:
     axis = bench()
     axis.say(S.FAULT_REACTION_ACTIVE)
