@@ -145,7 +145,65 @@ def test_each_offence_would_be_found(line: str) -> None:
     assert list(offences(ast.parse(line)))
 
 
+# --- nor by the shell -------------------------------------------------------------------------------------------------
+SHELL = re.compile(r"#!\s*\S*(?:/|env\s+(?:-\S+\s+)*)(?:ba|da|k|z)?sh\b")
+#: Turns data into commands: eval, a shell that is fed or handed a text, a text read as a script.
+SHELL_DATA = re.compile(
+    r"(?:^|[;&|(]|\b(?:then|do|else)\b)\s*(?:sudo\s+)?eval\s|\|\s*(?:sudo\s+)?(?:\S*/)?(?:ba|da)?sh\b(?!\.)"
+    r"|(?:^|[\s;&|(])(?:\S*/)?(?:ba|da)?sh\s+-\w*c\s+[^'\n]*\$|(?:^|[\s;&|(])(?:source|\.|(?:ba|da)?sh)\s+<\(",
+    re.MULTILINE,
+)
+
+
+def shell_scripts() -> list[Path]:
+    """Every file of the repository that a shell runs, by its first line or its suffix."""
+    listed = subprocess.run(
+        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
+        cwd=source.ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    files = [source.ROOT / name for name in listed.stdout.split("\0") if name]
+    return [file for file in files if file.is_file() and (file.suffix == ".sh" or SHELL.match(first_line(file)))]
+
+
+def first_line(file: Path) -> str:
+    with file.open("rb") as stream:
+        return stream.readline(200).decode(errors="replace")
+
+
+def code_lines(text: str) -> str:
+    return re.sub(r"^\s*#.*$", "", text, flags=re.MULTILINE)
+
+
 def test_shell_scripts_do_not_execute_data() -> None:
-    scripts = [source.ROOT / name for name in ("demo", "test", "scripts/prepare", "scripts/lock", "systemd/install.sh")]
-    assert [s.name for s in scripts if re.search(r"^\s*eval |curl[^\n]*\| *(ba)?sh", s.read_text(), re.MULTILINE)] == []
-    assert all(isinstance(s, Path) and s.exists() for s in scripts)
+    scripts = shell_scripts()
+    names = {str(script.relative_to(source.ROOT)) for script in scripts}
+    assert {"demo", "test", ".ci/run", "scripts/guest", "scripts/branches", "systemd/install.sh"} <= names
+    found = {script.name: SHELL_DATA.findall(code_lines(script.read_text())) for script in scripts}
+    assert {name: offence for name, offence in found.items() if offence} == {}
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        'eval "$x"',
+        "true && eval $x",
+        "if x; then eval $x; fi",
+        "curl -s https://x | sh",
+        "curl x | sudo bash -s",
+        "cat x | /bin/sh",
+        'bash -c "$x"',
+        "sh -ec $x",
+        "source <(curl x)",
+        "bash <(curl x)",
+    ],
+)
+def test_each_offence_of_a_shell_would_be_found(line: str) -> None:
+    assert SHELL_DATA.search(code_lines(line))
+
+
+@pytest.mark.parametrize("line", ["#!/bin/sh", "#!/usr/bin/env bash", "#! /bin/bash -e", "#!/usr/bin/env -S bash"])
+def test_a_shell_script_is_known_by_its_first_line(line: str) -> None:
+    assert SHELL.match(line) and not SHELL.match("#!/usr/bin/env python3")
