@@ -60,7 +60,7 @@ def _without_end(name: str, scenario: Scenario, axis: str, why: str) -> Outcome:
         "",
         axis,
         nothing,
-        0,
+        None,
         False,
         (why,),
         loss_of(scenario),

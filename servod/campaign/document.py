@@ -22,7 +22,8 @@ def document(outcomes: Sequence[Outcome], planned: int) -> dict[str, Any]:
         "run": len(outcomes),
         "files": _files(outcomes),
         "passed": sum(outcome.passed for outcome in outcomes),
-        "lost_records": sum(outcome.lost_records for outcome in outcomes),
+        "lost_records": sum(lost_records(outcomes)),
+        "recorded": len(lost_records(outcomes)),
         "worst": worst(outcomes),
         "scenarios": [_plain(outcome) for outcome in outcomes],
     }
@@ -53,7 +54,7 @@ def cells(outcome: Outcome) -> tuple[str, ...]:
         ("" if outcome.exempt is None else "exempt: ") + _LOSS_TEXT.get(outcome.loss, "-"),
         milliseconds(outcome.reaction.left_ms),
         milliseconds(outcome.reaction.gone_ms),
-        str(outcome.lost_records),
+        "-" if outcome.lost_records is None else str(outcome.lost_records),
         "yes" if outcome.recovered else "by repair" if outcome.by_repair else "no",
         outcome.injected,
         ", ".join(outcome.detected) or ("refused" if outcome.axis == "DISABLED" and outcome.remedy else "-"),
@@ -83,8 +84,14 @@ def summary(outcomes: Sequence[Outcome], planned: int) -> list[str]:
     lines += [f"Exempt from the bound: {o.name}: {o.exempt}." for o in outcomes if o.exempt is not None]
     recovered, repairs = sum(o.recovered for o in outcomes), sum(o.by_repair for o in outcomes)
     lines.append(f"Recovered: {recovered}; {repairs} need repair at the hardware.")
-    lines.append(f"Cycle records lost: {sum(outcome.lost_records for outcome in outcomes)}.")
+    lost = lost_records(outcomes)
+    lines.append(f"Cycle records lost: {sum(lost)} in {len(lost)} scenarios with a recorder.")
     return lines
+
+
+def lost_records(outcomes: Sequence[Outcome]) -> list[int]:
+    """Of each scenario in which a recorder ran."""
+    return [outcome.lost_records for outcome in outcomes if outcome.lost_records is not None]
 
 
 def _files(outcomes: Sequence[Outcome]) -> int:

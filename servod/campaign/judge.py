@@ -62,7 +62,7 @@ def _complaints(expected: Expectation, seen: Observation, times: Reaction) -> li
         _refused(expected.refused, seen.refusal),
         _says(expected.says, seen.says),
         _error_shown(expected.drive_error, seen.drive_errors),
-        "" if seen.lost_records <= expected.lost_records else f"{seen.lost_records} cycle records are missing",
+        "" if (seen.lost_records or 0) <= expected.lost_records else f"{seen.lost_records} cycle records are missing",
         _commanded(seen),
     ]
 

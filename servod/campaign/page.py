@@ -16,7 +16,8 @@ from servod.report.page import Page
 _TIMES = (
     "Times count from the first injection, in bus time, and come from the virtual drive's own record. Left: the drive "
     "left operation enabled, and with it the controller's command; gone: the joint feels no torque from then on. "
-    "Lost: cycles without a record. Recovered: the axis was enabled again by what the fault's remedy says."
+    "Lost: cycles without a record, where a recorder ran. Recovered: the axis was enabled again by what the fault's "
+    "remedy says."
 )
 
 

@@ -22,7 +22,7 @@ from servod.axis import AxisState
 from servod.axis_model import axis_model_yaml
 from servod.campaign.inputs import Nested, config_of, merged, plant_of, shipped_config
 from servod.campaign.machine import Machine, Process, wait_for_state
-from servod.campaign.recorded import lost_records
+from servod.campaign.recorded import lost_records, wait_for_rows
 from servod.campaign.scenario import Recovery, Runs, Scenario, Start
 from servod.campaign.under_test import AMPLIFIER, MOTION, Observation
 from servod.campaign.wire import HubWire, Wire
@@ -78,7 +78,7 @@ class ProcessAxis:
         self.machine.config.write_text(yaml.safe_dump(self.config.model_dump(mode="json")))
         self._client: ControlClient | None = None
         self._hit_ns: int | None = None
-        self._asked_to_end = self._off = False
+        self._asked_to_end = self._off = self._up = False
         self.refusal = ""
         self.stopped_client: Popen[bytes] | None = None
 
@@ -93,6 +93,7 @@ class ProcessAxis:
         if self._off:
             return
         self.machine.start_daemon()
+        self._up = True
         if start in (Start.ENABLED, Start.MOVING):
             self.client.call(Verb.ENABLE)
             wait_for_state(self.client, AxisState.ENABLED.name)
@@ -108,6 +109,7 @@ class ProcessAxis:
             self._off = False
             try:
                 self.machine.start_daemon()
+                self._up = True
             except ServodError as error:
                 self.refusal = str(error)
         time.sleep(duration_s)
@@ -161,6 +163,7 @@ class ProcessAxis:
         self._asked_to_end = False
         self.leave()
         self.machine.start_daemon()
+        self._hit_ns = None  # the new one is whole
 
     def second_daemon(self) -> None:
         """Start another daemon with the same configuration; what it says and its exit code are the refusal."""
@@ -176,10 +179,8 @@ class ProcessAxis:
         samples = self.machine.drive_samples()
         axis, shown, overrun = self._shown(samples)
         told = {FaultCode[name] for name in _TOLD.findall(self.machine.daemon_log())}
-        recorded_to_the_end = self.config.recorder.always and not self.machine.alive(Process.DAEMON)
-        ended_ns = self._hit_ns if recorded_to_the_end else None
-        lost = lost_records(self.config.recorder.directory, self.config.cycle.period_us * NS_PER_US, ended_ns)
-        return Observation(samples, axis, frozenset(shown | told), self.refusal, lost + overrun)
+        lost = self._lost_records() + overrun if self._up and self.config.recorder.always else None
+        return Observation(samples, axis, frozenset(shown | told), self.refusal, lost)
 
     def recover(self, recovery: Recovery) -> bool:
         """Do what a person would do, and hold for a tenth of a second."""
@@ -223,6 +224,15 @@ class ProcessAxis:
             return (AxisState.FAULT if last in _FAULTED else enabled).name, set(), 0
         faults = {FaultCode[fault["code"]] for fault in status["faults"]}
         return status["axis"]["state"], faults, int(status["timing"]["records_lost"])
+
+    def _lost_records(self) -> int:
+        """Up to now where the daemon lives, and up to where it was hit; one that ended by itself did when it did."""
+        lives = self.machine.alive(Process.DAEMON)
+        due_ns = self.now_ns() if lives and self._hit_ns is None else self._hit_ns
+        folder = self.config.recorder.directory
+        if lives and due_ns is not None:
+            wait_for_rows(folder, due_ns)
+        return lost_records(folder, self.config.cycle.period_us * NS_PER_US, due_ns)
 
     def _expect_end(self) -> None:
         """A daemon that was asked to end does so with 0."""

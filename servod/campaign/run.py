@@ -34,7 +34,7 @@ class Outcome:
     remedy: str
     axis: str
     reaction: Reaction
-    lost_records: int
+    lost_records: int | None
     recovered: bool
     complaints: tuple[str, ...]
     loss: Loss

@@ -116,14 +116,13 @@ class SteppedAxis:
         """What is seen now."""
         samples = read_drive_record(self._record_path)
         if self._session is None:
-            return Observation(samples, AxisState.DISABLED.name, frozenset(), self._refusal, 0)
+            return Observation(samples, AxisState.DISABLED.name, frozenset(), self._refusal)
         axis, records = self._session.cycle.axis, self._session.records
-        lost = records[-1].cycle - records[0].cycle + 1 - len(records) - (records[-1].missed - records[0].missed)
         latched = frozenset(fault.code for fault in faults_in(axis.latched))
         proof = self._session.proof
         says = None if proof is None else Finding(int(proof.finding))
         errors = frozenset(record.drive_error for record in records) - {0}
-        return Observation(samples, axis.state.name, latched, self._refusal, lost, says, errors)
+        return Observation(samples, axis.state.name, latched, self._refusal, says=says, drive_errors=errors)
 
     def recover(self, recovery: Recovery) -> bool:
         """Do what a person would do, and hold for a tenth of a second."""

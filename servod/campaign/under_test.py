@@ -33,15 +33,15 @@ class Observation:
 
     `samples`: the drive's own record; `axis`: name of the axis state; `latched`: the faults that the user is shown;
     `refusal`: message with which bring-up or command was refused, "" when none was; `lost_records`: cycles without a
-    record; `says`: how the last proof of the wiring ended, None where none was told; `drive_errors`: the drive's error
-    codes in the cycle records.
+    record, None where no recorder runs (in virtual time the rows do not leave the process); `says`: how the last proof
+    of the wiring ended, None where none was told; `drive_errors`: the drive's error codes in the cycle records.
     """
 
     samples: list[DriveSample]
     axis: str
     latched: frozenset[FaultCode]
     refusal: str
-    lost_records: int
+    lost_records: int | None = None
     says: Finding | None = None
     drive_errors: frozenset[int] = frozenset()
 

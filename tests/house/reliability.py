@@ -77,6 +77,8 @@ def _memory(memory: dict[str, Any]) -> str:
 def _faults(faults: dict[str, Any]) -> Iterator[Row]:
     """The campaign as a whole, and the worst times of each kind of loss by the drive's own record."""
     lost = f"{faults['lost_records']:,} cycle records lost"
+    if "recorded" in faults:
+        lost += f" in {faults['recorded']:,} with a recorder"
     much = f"{faults['run']:,} of {faults['planned']:,} scenarios"
     yield ["fault campaign", much, f"{faults['passed']:,} passed; {lost}", "`servoctl faults`"]
     for loss, worst in faults["worst"].items():
