@@ -12,7 +12,7 @@ from servod.cli.common import JsonOption, example, need_folder, print_json
 if TYPE_CHECKING:
     from rich.console import Console
 
-_QUIET_S, _ATTACK_S, _STOPS = 8.0, 8.0, 10
+_QUIET_S, _ATTACK_S, _STOPS, _ROUNDS = 4.0, 4.0, 5, 2
 _HELP = example(
     "Measure wake-up (against cyclictest), cycle work, two processes on the wall clock, stepped and simulated "
     "speed, memory, and how long synthesis, certificate and commissioning take. Takes about 18 minutes, most of it "
@@ -64,7 +64,7 @@ def _attack(console: Console, out: Path | None, as_json: bool) -> None:
     from servod.benchmark.table import write_json
 
     with console.status("measuring: wake-up and stops, alone and under attack"):
-        document = attack.measure(_QUIET_S, _ATTACK_S, _STOPS)
+        document = attack.measure(_QUIET_S, _ATTACK_S, _STOPS, _ROUNDS)
     if out is not None:
         write_json(document, out)
     if as_json:
