@@ -78,6 +78,7 @@ class Connection:
         """`connection` does not block; `now_ns` is when it came."""
         self.peer: Peer = peer_of(connection)
         self.active_ns = now_ns  # when it last asked something, or read what it watches
+        self.commanded_ns: int | None = None  # when it last commanded, or stopped the axis
         self.under_way = 0  # requests without an answer yet
         self._connection, self._selector, self._owner = connection, selector, owner
         self._incoming, self._outgoing = bytearray(), bytearray()

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from servod.config import ControlConfig
-from servod.control import Verb, decode_line, encode_line
+from servod.control import READING, Verb, decode_line, encode_line
 from servod.daemon.connection import Connection, Reply
 from servod.daemon.lease import STOPPING, Lease
 from servod.daemon.peer import group_id, may_command, peer_of
@@ -178,6 +178,8 @@ class ControlServer:
             if (holder := self._lease.holder) is not None and holder is not client and holder.has_left():
                 self.drop(holder)
             self._lease.take(client, verb)
+            if verb not in READING:
+                client.commanded_ns = self._now_ns
             if verb is Verb.WATCH:
                 client.start_watch(args, reply)
                 return

@@ -2,7 +2,7 @@
 
 Below the control server. Whoever wants to stop the axis shall find a place, however many idle clients there are: no
 process has more than its share, and of a full house leaves who is idle, else one of the most crowded process. The one
-who commands stays.
+who commands stays; who commanded a moment ago, or stopped the axis, which takes no lease, leaves after all others.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from servod.units import NS_PER_S
 MAX_CLIENTS = 32
 MAX_CLIENTS_OF_A_PROCESS = 16
 _IDLE_NS = 2 * NS_PER_S
+#: Between two commands, a person looks at the machine.
+_COMMANDED_NS = 60 * NS_PER_S
 
 
 class Places:
@@ -41,9 +43,13 @@ class Places:
             return None
         others = [c for c in self.clients if c is not holder and (c.peer.pid == peer.pid or not full)]
         idle_since_ns = now_ns - _IDLE_NS
-        leaves = min(
-            others, key=lambda c: (c.under_way > 0, c.active_ns > idle_since_ns, -crowd[c.peer.pid], c.active_ns)
-        )
+
+        def staying(c: Connection) -> tuple[bool, bool, bool, int, int]:
+            """Who has least of it leaves."""
+            commanded = c.commanded_ns is not None and c.commanded_ns > now_ns - _COMMANDED_NS
+            return commanded, c.under_way > 0, c.active_ns > idle_since_ns, -crowd[c.peer.pid], c.active_ns
+
+        leaves = min(others, key=staying)
         if leaves.active_ns > idle_since_ns and crowd[peer.pid] > crowd[leaves.peer.pid]:
             raise Unreachable(f"all places are taken, {crowd[peer.pid]} of them by process {peer.pid}")
         return leaves

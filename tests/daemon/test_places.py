@@ -65,8 +65,9 @@ if os.geteuid() == 0:  # only root can be somebody else
 class _Guest:
     """As much of a connection as a place needs."""
 
-    def __init__(self, pid: int, active_ns: int = 0, under_way: int = 0) -> None:
+    def __init__(self, pid: int, active_ns: int = 0, under_way: int = 0, commanded_ns: int | None = None) -> None:
         self.peer, self.active_ns, self.under_way = Peer(pid, 0, frozenset()), active_ns, under_way
+        self.commanded_ns = commanded_ns
 
 
 def _full(*guests: _Guest) -> Places:
@@ -94,6 +95,30 @@ def test_who_commands_and_who_waits_for_an_answer_stays() -> None:
     guests = [_Guest(pid, active_ns=pid) for pid in range(MAX_CLIENTS)]
     guests[1].under_way = 1
     assert _leaves(_full(*guests), 999, holder=guests[0]) is guests[2]
+
+
+def test_who_commanded_or_stopped_a_moment_ago_leaves_after_all_others() -> None:
+    """A stop takes no lease, and the lease goes where a client ends it; both may look at the machine for a while."""
+    now_ns = 100_000_000_000
+    others = [_Guest(pid, now_ns, under_way=1) for pid in range(MAX_CLIENTS - 2)]
+    stopped = _Guest(500, active_ns=50_000_000_000, commanded_ns=50_000_000_000)
+    long_ago = _Guest(501, active_ns=39_000_000_000, commanded_ns=39_000_000_000)
+    places = _full(stopped, long_ago, *others)
+    assert _leaves(places, 999) is long_ago
+    long_ago.active_ns, long_ago.under_way = now_ns, 1
+    assert _leaves(places, 999) in [*others, long_ago]
+    places = _full(*(_Guest(pid, now_ns - pid, commanded_ns=now_ns) for pid in range(MAX_CLIENTS)))
+    assert _leaves(places, 999) is not None
+
+
+def test_who_stopped_the_axis_is_not_sent_away_by_a_crowd_that_only_looks(served: Served) -> None:
+    with ControlClient(served.path) as commander, ControlClient(served.path) as own, contextlib.ExitStack() as others:
+        time.sleep(0.05)  # the server knows no time before its first round
+        commander.call(Verb.ENABLE)
+        own.call(Verb.STOP)
+        for _ in range(3 * MAX_CLIENTS_OF_A_PROCESS):
+            others.enter_context(raw(served)).sendall(b'{"id":1,"verb":"status"}\n')
+        assert own.call(Verb.DISABLE) and commander.call(Verb.ENABLE)
 
 
 def test_idle_one_leaves_before_an_active_crowd_and_that_before_an_active_single_one() -> None:
