@@ -21,16 +21,23 @@ def check_trace(kind: FaultKind, happened: bool, injected_ns: int, findings: Fin
 
 
 def check_reaction(
-    kind: FaultKind, times: Reaction, injected_ns: int, tally: FaultTally, findings: Findings, starved_ms: float = 0.0
+    kind: FaultKind,
+    times: Reaction,
+    injected_ns: int,
+    tally: FaultTally,
+    findings: Findings,
+    grace_ms: float = 0.0,
+    starved_ms: float = 0.0,
 ) -> bool:
-    """Count both times, and find what was too late; `starved_ms`: how long the processes had to wait for their turn.
+    """Count both times, and find what was too late. `grace_ms`: what belongs to each bound besides that of the kind;
+    `starved_ms`: how long the processes had to wait for their turn.
 
     Returns whether a time was late, but no later than that wait excuses.
     """
     excused = False
     for what, time_ms, limit_ms, seen in (
-        ("command left", times.left_ms, kind.left_ms, tally.left),
-        ("torque gone", times.gone_ms, kind.gone_ms, tally.gone),
+        ("command left", times.left_ms, kind.left_ms + grace_ms, tally.left),
+        ("torque gone", times.gone_ms, kind.gone_ms + grace_ms, tally.gone),
     ):
         if time_ms is not None:
             seen.add(time_ms)

@@ -6,7 +6,8 @@ Beside everything: looks at /proc. Where a kernel does not count, nothing is exc
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -15,54 +16,64 @@ from servod.soak.explained import Explained
 from servod.soak.kinds import fault_bits
 from servod.units import NS_PER_S
 
-#: What a loop may see whose processes do not get their turn, and what follows from that.
-STARVED = frozenset(
+#: What may be seen where loop or drive do not get their turn: cycles, commands and feedback late, and what follows.
+STARVED_CYCLE = frozenset(
     {
-        *(FaultCode.DEADLINE_LATE, FaultCode.DEADLINE_BUDGET, FaultCode.FEEDBACK_STALE, FaultCode.SUPERVISOR_LOST),
-        *(FaultCode.NODE_HEARTBEAT_LOST, FaultCode.DRIVE_FAULT, FaultCode.FOLLOWING_ERROR, FaultCode.BUS_QUEUE_FULL),
-        *(FaultCode.COMMANDS_LOST, FaultCode.ENCODER_ALARM),
+        *(FaultCode.DEADLINE_LATE, FaultCode.DEADLINE_BUDGET, FaultCode.FEEDBACK_STALE, FaultCode.FOLLOWING_ERROR),
+        *(FaultCode.NODE_HEARTBEAT_LOST, FaultCode.BUS_QUEUE_FULL, FaultCode.COMMANDS_LOST),
     }
 )
-#: Processes that waited for so long in all in a piece of the soak [ns] may have missed what the axis bears; its traces
-#: may come so much later.
+#: What may be seen where the supervisor does not: nobody feeds the loop, nobody reads heartbeats.
+STARVED_SUPERVISOR = frozenset({FaultCode.SUPERVISOR_LOST, FaultCode.NODE_HEARTBEAT_LOST})
+#: A process that waited for so long in a piece of the soak [ns] may have missed what the axis bears; its traces may
+#: come so much later. Many short waits of many processes are none.
 _STARVED_NS, _TRACE_NS = 25_000_000, 500_000_000
 
-
-class Hunger:
-    """Adds up the waiting of changing processes; what a hypervisor takes from the whole machine counts as well."""
-
-    def __init__(self) -> None:
-        self._waited_ns: dict[int, int] = {}
-        self._stolen_ns = stolen_ns()
-        self.total_ns = 0
-
-    def look(self, pids: Iterable[int]) -> int:
-        """Take what `pids` waited since the last look, from their beginning if they are new; the total so far [ns]."""
-        stolen = stolen_ns()
-        self.total_ns += stolen - self._stolen_ns
-        self._stolen_ns, known = stolen, self._waited_ns
-        self._waited_ns = {pid: waited_ns(pid) for pid in pids}
-        self.total_ns += sum(max(0, waited - known.get(pid, 0)) for pid, waited in self._waited_ns.items())
-        return self.total_ns
+#: Processes by their id, each with the faults that its waiting may cause.
+Processes = Mapping[int, frozenset[FaultCode]]
 
 
 class Starved:
-    """The pieces of a soak in which its processes were starved; `explained`: what that may cause, and when."""
+    """The pieces of a soak in which one of its processes was starved; `explained`: what that may cause, and when.
+
+    What a hypervisor takes from the whole machine counts for each.
+    """
 
     def __init__(self, now_ns: int) -> None:
         self.explained = Explained()
-        self._hunger, self._since_ns, self._before_ns = Hunger(), now_ns, 0
+        self._since_ns, self._stolen_ns = now_ns, stolen_ns()
+        self._totals_ns: dict[int, int] = {}
+        self._piece_ns: Counter[int] = Counter()
+        self._causes: dict[int, frozenset[FaultCode]] = {}
 
-    def look(self, pids: Iterable[int], now_ns: int) -> None:
-        """End a piece: were `pids` starved since the last look?"""
-        total_ns = self._hunger.look(pids)
-        if total_ns - self._before_ns > _STARVED_NS:
-            self.explained.add(self._since_ns, fault_bits(STARVED), now_ns + _TRACE_NS)
-        self._since_ns, self._before_ns = now_ns, total_ns
+    def look(self, processes: Processes, now_ns: int) -> None:
+        """End a piece: was one of them starved since the last look?"""
+        if self.hungry(processes):
+            hungry = (pid for pid, waited in self._piece_ns.items() if waited > _STARVED_NS)
+            codes = frozenset[FaultCode]().union(*(self._causes[pid] for pid in hungry))
+            self.explained.add(self._since_ns, fault_bits(codes), now_ns + _TRACE_NS)
+        self._since_ns = now_ns
+        self._piece_ns.clear()
+        self._causes = dict(processes)
 
-    def waited_ms(self, pids: Iterable[int]) -> float:
-        """How long `pids` waited in the piece that goes on."""
-        return (self._hunger.look(pids) - self._before_ns) / 1e6
+    def hungry(self, processes: Processes) -> bool:
+        """Whether one of them waited for long in the piece that goes on."""
+        self._take(processes)
+        return max(self._piece_ns.values(), default=0) > _STARVED_NS
+
+    def waited_ms(self, processes: Processes) -> float:
+        """How long they waited in the piece that goes on, one after the other: a reaction passes through all."""
+        self._take(processes)
+        return sum(self._piece_ns.values()) / 1e6
+
+    def _take(self, processes: Processes) -> None:
+        """Add what each waited since the last time, from its beginning if it is new."""
+        stolen, before = stolen_ns(), self._totals_ns
+        self._totals_ns = {pid: waited_ns(pid) for pid in processes}
+        self._causes.update(processes)
+        for pid, total in self._totals_ns.items():
+            self._piece_ns[pid] += max(0, total - before.get(pid, 0)) + stolen - self._stolen_ns
+        self._stolen_ns = stolen
 
 
 def waited_ns(pid: int) -> int:

@@ -35,7 +35,7 @@ from servod.soak.plan import Ending, Episode, Move
 from servod.soak.reactions import check_reaction, check_trace
 from servod.soak.recorded import RecordedRows
 from servod.soak.start import nothing_yet
-from servod.soak.starved import Starved
+from servod.soak.starved import STARVED_CYCLE, STARVED_SUPERVISOR, Starved
 from servod.soak.syncs import SyncThread
 from servod.soak.tally import Tally
 from servod.soak.traces import LISTEN_S, BusListener, trace_of
@@ -50,8 +50,8 @@ _HEARD_S = 0.2
 _ENDS_AFTER_LOSS = (0, Unreachable.exit_code)
 #: Timers of the virtual axis are stamped with the moment at which they were due, frames with that of the bus [ns].
 _ORDER_NS = 500_000_000
-#: What a reaction may take beyond its bound: feedback is missed after 50 cycles here, not 20, and an injection goes
-#: through a process [ms].
+#: What every bound is longer by: feedback is missed after 50 cycles here, not 20, and an injection goes through a
+#: process [ms].
 _GRACE_MS = 60.0
 
 
@@ -237,22 +237,40 @@ class WallSoak:
             )
             return
         tally.found += 1
-        late_ms = _GRACE_MS + self._starved.waited_ms(self._watched())
+        starved_ms = self._starved.waited_ms(self._watched())
         times = reaction_in(samples, injected_ns)
-        if check_reaction(kind, times, injected_ns, tally, self.findings, late_ms):
+        if check_reaction(kind, times, injected_ns, tally, self.findings, _GRACE_MS, starved_ms):
             self.tally.excused["reaction later than its bound"] += 1
 
     def _recover(self, recovery: Recovery) -> bool:
-        """What a person does; a machine that starves the loop may need another try."""
+        """What a person does; only a machine that starves the processes may need another try without a finding.
+
+        Returns whether the first try did it.
+        """
+        starved, why = False, ""
         for attempt in range(_TRIES):
+            starved = starved or self._starved.hungry(self._watched())
             if recovery is Recovery.RESTART or attempt == _TRIES - 1:
                 self._end_session(_ENDS_AFTER_LOSS)
                 self.tally.restarts += 1
                 self._axis.machine.start_daemon()
             if self._enabled(recovery is not Recovery.NONE or attempt > 0):
-                return True
+                self._tell_tries(recovery, attempt, starved, why)
+                return attempt == 0
+            why = why or self._axis.refusal or self._faults()
         self.findings.add(Wrong.NOT_RECOVERED, self._axis.now_ns(), f"by {recovery}: {self._axis.refusal}")
         raise AnswerIsNo(f"episode {self.findings.episode}: the axis cannot be enabled any more")
+
+    def _tell_tries(self, recovery: Recovery, attempt: int, starved: bool, why: str) -> None:
+        """More than one try is a finding, unless the processes were starved; then it is counted."""
+        if attempt and starved:
+            self.tally.excused["recovered by another try"] += 1
+        elif attempt:
+            text = f"not by {recovery}, but at try {attempt + 1} of {_TRIES}: {why}"
+            self.findings.add(Wrong.NOT_RECOVERED, self._axis.now_ns(), text)
+
+    def _faults(self) -> str:
+        return ", ".join(fault["code"] for fault in self._axis.client.call(Verb.STATUS)["faults"])
 
     def _enabled(self, ask: bool) -> bool:
         done = self._axis.recover(Recovery.RESET_FAULT) if ask else self._state() == AxisState.ENABLED.name
@@ -267,12 +285,13 @@ class WallSoak:
         self._samples.check(samples, self._tail.lost)
         return samples
 
-    def _watched(self) -> list[int]:
-        """All processes, and the loop's while it can be asked for."""
-        pids = list(self.processes().values())
+    def _watched(self) -> dict[int, frozenset[FaultCode]]:
+        """The processes that the axis needs, and the loop's while it can be asked for; what their waiting may cause."""
+        pids = self.processes()
+        watched = {pids["daemon"]: STARVED_SUPERVISOR, pids["virtual axis"]: STARVED_CYCLE}
         with contextlib.suppress(ServodError):
-            pids.append(int(self._axis.client.call(Verb.STATUS)["loop"]["pid"]))
-        return pids
+            watched[int(self._axis.client.call(Verb.STATUS)["loop"]["pid"])] = STARVED_CYCLE
+        return watched
 
     def _end_session(self, codes: tuple[int, ...]) -> None:
         """End the daemon as the service manager does, and hold its rows against what was heard on the bus."""

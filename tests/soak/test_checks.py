@@ -24,11 +24,13 @@ from servod.shipped import shipped
 from servod.soak.drive import SAMPLE_ROW, DriveCheck, reaction_in
 from servod.soak.explained import Explained
 from servod.soak.finding import Findings, Wrong
-from servod.soak.kinds import fault_bits
+from servod.soak.kinds import KINDS, fault_bits
 from servod.soak.memory import Growth, Memory
+from servod.soak.reactions import check_reaction
 from servod.soak.rows import RowCheck, Rows, rows_of, run_lengths
-from servod.soak.starved import STARVED, Starved
+from servod.soak.starved import STARVED_CYCLE, STARVED_SUPERVISOR, Starved
 from servod.soak.syncs import SyncCheck, SyncListener
+from servod.soak.tally import FaultTally
 
 PERIOD_NS = 1_000_000
 LIMIT_NM = 0.3
@@ -220,9 +222,31 @@ def test_a_process_that_got_no_turn_was_starved() -> None:
         for process in busy:
             os.sched_setaffinity(process.pid, one)
         time.sleep(0.5)
-        starved.look([process.pid for process in busy], time.monotonic_ns())
+        starved.look({busy[0].pid: STARVED_CYCLE, busy[1].pid: STARVED_SUPERVISOR}, time.monotonic_ns())
     finally:
         for process in busy:
             process.kill()
             process.wait()
-    assert starved.explained.at(np.array([begun_ns]))[0] == fault_bits(STARVED)
+    assert starved.explained.at(np.array([begun_ns]))[0] == fault_bits(STARVED_CYCLE | STARVED_SUPERVISOR)
+
+
+def test_short_waits_of_many_processes_starve_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    waited_ms = {1: 0, 2: 0, 3: 0}
+    monkeypatch.setattr("servod.soak.starved.waited_ns", lambda pid: waited_ms[pid] * 1_000_000)
+    monkeypatch.setattr("servod.soak.starved.stolen_ns", lambda: 0)
+    starved, watched = Starved(0), {1: STARVED_CYCLE, 2: STARVED_CYCLE, 3: STARVED_SUPERVISOR}
+    waited_ms.update({1: 20, 2: 20, 3: 20})
+    assert starved.waited_ms(watched) == 60.0 and not starved.hungry(watched)
+    starved.look(watched, 10)
+    waited_ms[3] += 26  # a piece of its own: only what the supervisor's waiting may cause
+    starved.look(watched, 20)
+    assert starved.explained.at(np.array([5, 15])).tolist() == [0, fault_bits(STARVED_SUPERVISOR)]
+
+
+def test_what_belongs_to_the_bound_is_told_with_it() -> None:
+    kind, findings = next(k for k in KINDS if k.name == "encoder cut off"), Findings()
+    assert not check_reaction(kind, Reaction(109.0, 359.0), 0, FaultTally(), findings, 60.0)
+    assert check_reaction(kind, Reaction(115.0, 359.0), 0, FaultTally(), findings, 60.0, 10.0)
+    assert not findings.counts
+    check_reaction(kind, Reaction(111.0, 359.0), 0, FaultTally(), findings, 60.0)
+    assert findings.told[0].text == "encoder cut off: command left after 111 ms, 110 ms allowed"
