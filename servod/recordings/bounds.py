@@ -1,4 +1,4 @@
-"""How much a recording may hold: one limit for every format, so that reading takes at most 2.5 GiB of memory.
+"""How much a recording may hold: one limit for every format, so that reading takes at most 3 GiB of memory.
 
 Beneath the readers, which count while they unpack: a few kilobytes can unpack to any amount. A number takes eight bytes
 in the reader's table, eight in the recording, and for a moment some more while its column is scaled and checked.
