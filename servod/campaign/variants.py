@@ -14,7 +14,7 @@ from typing import Any
 from servod.errors import BadInput
 from servod.yaml12 import parse_yaml, read_text
 
-_KEY = "for_each"
+_KEY, _NAME = "for_each", "name"
 _PLACE = re.compile(r"\$([a-z_]+)")
 
 
@@ -33,31 +33,47 @@ def variants(path: Path) -> Iterator[tuple[str, Any, str]]:
         here = f"{where}: {_KEY}.{number}"
         name = _name(row, here, names)
         names.add(name)
-        yield f"{path.stem}/{name}", _filled(common, row, here), f"{where} ({name})"
+        filling = _Filling(row, here)
+        filled = filling.filled(common)
+        filling.check_all_read()
+        yield f"{path.stem}/{name}", filled, f"{where} ({name})"
 
 
 def _name(row: Any, where: str, taken: set[str]) -> str:
-    name = row.get("name") if isinstance(row, dict) else None
+    name = row.get(_NAME) if isinstance(row, dict) else None
     if name is None or str(name) in taken:
         raise BadInput(where, repr(row)[:80], "a mapping with a `name` that no other row has")
     return str(name)
 
 
-def _filled(value: Any, row: dict[str, Any], where: str) -> Any:
-    """`value` with every `$key` replaced from `row`."""
-    if isinstance(value, dict):
-        return {key: _filled(item, row, where) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_filled(item, row, where) for item in value]
-    if not isinstance(value, str):
-        return value
-    whole = _PLACE.fullmatch(value)
-    if whole:
-        return _of(row, whole[1], where)
-    return _PLACE.sub(lambda place: str(_of(row, place[1], where)), value)
+class _Filling:
+    """Puts the values of one row in their places, and knows which were read."""
 
+    def __init__(self, row: dict[str, Any], where: str) -> None:
+        self._row, self._where = row, where
+        self._unread = row.keys() - {_NAME}
 
-def _of(row: dict[str, Any], key: str, where: str) -> Any:
-    if key not in row:
-        raise BadInput(where, f"no {key}", f"a value for ${key}")
-    return row[key]
+    def filled(self, value: Any) -> Any:
+        """`value` with every `$key` replaced from the row. Raises BadInput for one that the row has not."""
+        if isinstance(value, dict):
+            return {key: self.filled(item) for key, item in value.items()}
+        if isinstance(value, list):
+            return [self.filled(item) for item in value]
+        if not isinstance(value, str):
+            return value
+        whole = _PLACE.fullmatch(value)
+        if whole:
+            return self._of(whole[1])
+        return _PLACE.sub(lambda place: str(self._of(place[1])), value)
+
+    def check_all_read(self) -> None:
+        """Raises BadInput for a key of the row that nothing reads."""
+        if self._unread:
+            key = min(self._unread, key=str)
+            raise BadInput(f"{self._where}.{key}", "a value that nothing reads", f"a key that the file has as ${key}")
+
+    def _of(self, key: str) -> Any:
+        if key not in self._row:
+            raise BadInput(self._where, f"no {key}", f"a value for ${key}")
+        self._unread -= {key}
+        return self._row[key]
