@@ -194,7 +194,7 @@ KINDS: tuple[FaultKind, ...] = (
     FaultKind("cyclic frames reordered", _frames(_CYCLIC, "reorder", 1, 50)),
     FaultKind("drive feedback cut short", _frames("drive_feedback", "shorten", 1, 15, Between(1, 7))),
     FaultKind("encoder feedback cut short", _frames("encoder_feedback", "shorten", 1, 15, Between(1, 3))),
-    FaultKind("node away for a moment", _silence(OneOf(("encoder", "amplifier")), 2, 12)),
+    FaultKind("node away for a moment", _silence(OneOf(("encoder", "amplifier")), 5, 12)),
     FaultKind("a stranger talks", {"babble": {"can_id": OneOf((0x100, 0x183, 0x7FF)), "for_ms": 250, "each_ms": 2}}),
     FaultKind("SYNC lost, a few", _frames("sync", "drop", 1, 10), takes_syncs=True),
     FaultKind("frames destroyed", _frames("any", "destroy", 1, 5)),
@@ -202,8 +202,9 @@ KINDS: tuple[FaultKind, ...] = (
     FaultKind("master's heartbeat lost", _frames("master_heartbeat", "drop", 1, 1)),
     FaultKind("encoder warning", {"foreign_frame": {"can_id": 0x602, "data": OneOf(tuple(map(_warned, range(1, 5))))}}),
     # Stopped, and enabled again after a reset.
-    _resettable("drive feedback lost, many", _frames("drive_feedback", "drop", 25, 60), {_F.FEEDBACK_STALE}),
-    _resettable("encoder feedback lost, many", _frames("encoder_feedback", "drop", 25, 200), {_F.FEEDBACK_STALE}),
+    # Feedback is missed after 20 cycles in virtual time, and after 50 on the wall clock.
+    _resettable("drive feedback lost, many", _frames("drive_feedback", "drop", 55, 60), {_F.FEEDBACK_STALE}),
+    _resettable("encoder feedback lost, many", _frames("encoder_feedback", "drop", 55, 200), {_F.FEEDBACK_STALE}),
     replace(
         _resettable("torque frames cut short", _frames("torque", "shorten", 1, 50, Between(1, 3)), {_F.DRIVE_FAULT}),
         latched_ms=70.0,  # told by EMCY, and the monitor of the nodes looks every 20 ms

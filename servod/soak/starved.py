@@ -28,6 +28,8 @@ STARVED_SUPERVISOR = frozenset({FaultCode.SUPERVISOR_LOST, FaultCode.NODE_HEARTB
 #: A process that waited for so long in a piece of the soak [ns] may have missed what the axis bears; its traces may
 #: come so much later. Many short waits of many processes are none.
 _STARVED_NS, _TRACE_NS = 25_000_000, 500_000_000
+#: A loop that waited for a period is late by that alone: it is told, and nothing follows from it [ns].
+_LATE_NS = 1_000_000
 
 #: Processes by their id, each with the faults that its waiting may cause.
 Processes = Mapping[int, frozenset[FaultCode]]
@@ -48,10 +50,13 @@ class Starved:
 
     def look(self, processes: Processes, now_ns: int) -> None:
         """End a piece: was one of them starved since the last look?"""
-        if self.hungry(processes):
-            hungry = (pid for pid, waited in self._piece_ns.items() if waited > _STARVED_NS)
-            codes = frozenset[FaultCode]().union(*(self._causes[pid] for pid in hungry))
-            self.explained.add(self._since_ns, fault_bits(codes), now_ns + _TRACE_NS)
+        self._take(processes)
+        codes: set[FaultCode] = set()
+        for pid, waited in self._piece_ns.items():
+            codes |= self._causes[pid] if waited > _STARVED_NS else set()
+            codes |= self._causes[pid] & {FaultCode.DEADLINE_LATE} if waited > _LATE_NS else set()
+        if codes:
+            self.explained.add(self._since_ns, fault_bits(frozenset(codes)), now_ns + _TRACE_NS)
         self._since_ns = now_ns
         self._piece_ns.clear()
         self._causes = dict(processes)
