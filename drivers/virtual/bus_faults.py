@@ -38,6 +38,7 @@ class FaultKind(IntEnum):
     BABBLE = 14  # somebody sends `can_id` for `amount` ms, `detail` frames each ms (0: as many as the bus takes)
     TWIN = 15  # a second node with the participant's id is switched on
     CLEAR = 16  # no frame is hit any more
+    HAPPENED = 17  # no fault, a question: how often the kind `amount` took effect so far; the answer has it as `amount`
 
 
 #: Kinds that hit the next frames with an identifier; they do not concern a participant.
@@ -52,6 +53,7 @@ FRAME_KINDS = frozenset(
         FaultKind.FLIP,
     }
 )
+_BY_IDENTIFIER = FRAME_KINDS | {FaultKind.BABBLE, FaultKind.CLEAR}
 
 
 class BusFault(NamedTuple):
@@ -67,6 +69,11 @@ class BusFault(NamedTuple):
         """The further number that the kind asks for."""
         return self.participant
 
+    @property
+    def concerns(self) -> tuple[FaultKind, int]:
+        """What its effect is counted by: the kind, and the identifier or the participant that it hits."""
+        return self.kind, self.can_id if self.kind in _BY_IDENTIFIER else self.participant
+
     def encode(self) -> bytes:
         """Eight bytes for an error frame."""
         return _MESSAGE.pack(self.kind, self.participant, self.can_id, self.amount)
@@ -75,6 +82,10 @@ class BusFault(NamedTuple):
     def decode(cls, data: bytes) -> BusFault:
         """The request in eight bytes; kind NONE when it is not one."""
         kind, participant, can_id, amount = _MESSAGE.unpack(data)
-        if kind not in FaultKind.__members__.values():
-            return cls(FaultKind.NONE)
-        return cls(FaultKind(kind), can_id, amount, participant)
+        known = kind_of(kind)
+        return cls(known, can_id, amount, participant) if known else cls(known)
+
+
+def kind_of(number: int) -> FaultKind:
+    """The kind with this number; NONE when there is none."""
+    return FaultKind(number) if number in FaultKind.__members__.values() else FaultKind.NONE

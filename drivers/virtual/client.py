@@ -98,6 +98,21 @@ class VirtualBus:
             return False
         return True
 
+    def happened(self, fault: BusFault, timeout_s: float = 1.0) -> int:
+        """How often what `fault` asks for took effect so far; frames that come before the answer are not kept.
+
+        Raises Unreachable when the hub does not answer.
+        """
+        question = fault._replace(kind=FaultKind.HAPPENED, amount=int(fault.kind))
+        deadline = time.monotonic() + timeout_s
+        self.inject(question)
+        while (left_s := deadline - time.monotonic()) > 0.0 and select.select((self._socket,), (), (), left_s)[0]:
+            can_id, _, data, _ = STAMPED_FRAME.unpack(self._socket.recv(STAMPED_FRAME.size))
+            answer = BusFault.decode(data) if can_id == CAN_ERR_FLAG else question
+            if answer.kind is FaultKind.HAPPENED and answer is not question:
+                return answer.amount
+        raise Unreachable(f"the hub does not say how often {fault.kind.name} happened")
+
     def fileno(self) -> int:
         """The socket's descriptor."""
         return self._socket.fileno()

@@ -5,6 +5,7 @@ Asked by the hub for each frame that ends, while a fault is armed or a frame is 
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -16,10 +17,11 @@ _AGAIN_NS = 150_000
 
 
 class Strike(NamedTuple):
-    """What happens to one frame: its kind of fault and the detail of it."""
+    """What happens to one frame: its kind of fault, the detail of it, the identifier that the fault was armed for."""
 
     kind: FaultKind
     detail: int
+    armed_for: int = ANY_ID
 
 
 class Delivery(NamedTuple):
@@ -40,20 +42,27 @@ UNHURT = Strike(FaultKind.NONE, 0)
 
 
 class FrameFaults:
-    """The armed faults, and the frames that are held back to come out of order."""
+    """The armed faults, and the frames that are held back to come out of order.
+
+    `struck` counts, by kind and identifier that the fault was armed for, the frames that came otherwise than sent;
+    `cleared` the faults that were taken back.
+    """
 
     def __init__(self) -> None:
         self._faults: list[_Armed] = []
         self._held: dict[int, bytes] = {}
         self.armed = False
+        self.struck: Counter[tuple[FaultKind, int]] = Counter()
+        self.cleared = 0
 
     def arm(self, kind: FaultKind, can_id: int = ANY_ID, count: int = 1, detail: int = 0) -> None:
         """Hit the next `count` frames whose identifier is `can_id` (or any)."""
-        self._faults.append(_Armed(Strike(kind, detail), can_id, count))
+        self._faults.append(_Armed(Strike(kind, detail, can_id), can_id, count))
         self.armed = True
 
     def clear(self) -> None:
         """Take all armed faults back; what was held back is lost."""
+        self.cleared += len(self._faults)
         self._faults.clear()
         self._held.clear()
         self.armed = False
@@ -68,12 +77,20 @@ class FrameFaults:
                 if fault.left <= 0:
                     self._faults.remove(fault)
                 self._look()
+                if fault.strike.kind is FaultKind.CORRUPT:
+                    self.struck[FaultKind.CORRUPT, fault.can_id] += 1
                 return fault.strike
         return UNHURT
 
     def deliveries(self, strike: Strike, can_id: int, data: bytes) -> list[Delivery]:
         """What of a frame that was struck reaches the others, and when."""
-        kind, detail = strike
+        found = self._deliveries(strike, can_id, data)
+        if strike.kind is not FaultKind.NONE and found != [Delivery(data, 0)]:
+            self.struck[strike.kind, strike.armed_for] += 1
+        return found
+
+    def _deliveries(self, strike: Strike, can_id: int, data: bytes) -> list[Delivery]:
+        kind, detail, _ = strike
         if kind is FaultKind.DROP:
             return []
         if kind is FaultKind.REORDER:

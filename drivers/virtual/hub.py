@@ -59,9 +59,13 @@ class Hub:
         if port.state is ErrorState.BUS_OFF or len(port.queue) >= port.depth:
             port.dropped += 1
             return False
-        if time_ns >= port.silent_until_ns:
-            port.queue.append((can_id, data, max(time_ns + port.delay_ns, port.stuck_until_ns)))
-            self._waiting += 1
+        if time_ns < port.silent_until_ns:
+            port.silenced += 1
+            return True
+        ready_ns = max(time_ns + port.delay_ns, port.stuck_until_ns)
+        port.held += ready_ns > time_ns
+        port.queue.append((can_id, data, ready_ns))
+        self._waiting += 1
         return True
 
     def next_ns(self) -> int:
@@ -124,6 +128,7 @@ class Hub:
             return
         sender.queue.popleft()
         self._waiting -= 1
+        sender.sent += 1
         self.frames += 1
         if self._errors:
             self._forgive(sender, end_ns)
@@ -135,8 +140,12 @@ class Hub:
 
     def _deliver(self, sender: Port, can_id: int, data: bytes, end_ns: int) -> None:
         for port in self._ports:
-            if port is not sender and port.silent_until_ns <= end_ns and port.state is not ErrorState.BUS_OFF:
+            if port is sender or port.state is ErrorState.BUS_OFF:
+                continue
+            if port.silent_until_ns <= end_ns:
                 port.receive(can_id, data, end_ns)
+            else:
+                port.silenced += 1
 
     def _deliver_later(self, sender: Port, can_id: int, delivery: Delivery, end_ns: int) -> None:
         """Of a frame that a fault hit: now, or when its time has come."""

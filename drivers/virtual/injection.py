@@ -1,6 +1,7 @@
 """Carries out the faults that a client of the bus asks for: on frames, on participants, and by further participants.
 
-Beside the world: `inject` looks up what a kind of fault does; the hub then lets it happen to the frames.
+Beside the world: `inject` looks up what a kind of fault does; the hub then lets it happen to the frames. `happened`
+says how often it did.
 """
 
 from __future__ import annotations
@@ -32,9 +33,29 @@ def inject(world: World, fault: BusFault, client: Port, time_ns: int) -> None:
     elif fault.kind is FaultKind.TWIN:
         world.switch_on_twin(fault.participant, time_ns)
     elif fault.kind in _ON_PORT:
-        port = client if fault.participant == MYSELF else world.port_of(fault.participant)
+        port = _port(world, fault, client)
         if port is not None:
             _ON_PORT[fault.kind](world, port, fault.amount, time_ns)
+
+
+def happened(world: World, fault: BusFault, client: Port) -> int:
+    """How often what `fault` asks for took effect so far, whoever asked for it: frames that were struck, lost, held
+    back or sent by strangers, or times of bus-off and of an interface that went down. Its amount and detail do not
+    matter."""
+    if fault.kind in FRAME_KINDS:
+        return world.hub.faults.struck[fault.kind, fault.can_id]
+    if fault.kind is FaultKind.CLEAR:
+        return world.hub.faults.cleared
+    if fault.kind is FaultKind.BABBLE:
+        return world.babbled[fault.can_id]
+    if fault.kind is FaultKind.TWIN:
+        return sum(port.sent for node_id, port in world.twins if node_id == fault.participant)
+    port = _port(world, fault, client) if fault.kind in _LEFT_ON_PORT else None
+    return 0 if port is None else _LEFT_ON_PORT[fault.kind](port)
+
+
+def _port(world: World, fault: BusFault, client: Port) -> Port | None:
+    return client if fault.participant == MYSELF else world.port_of(fault.participant)
 
 
 def _bus_off(world: World, port: Port, _amount: int, time_ns: int) -> None:
@@ -55,6 +76,7 @@ def _stick(_world: World, port: Port, amount: int, time_ns: int) -> None:
 
 def _take_down(world: World, port: Port, amount: int, time_ns: int) -> None:
     _silence(world, port, amount, time_ns)
+    port.downs += 1
     port.on_link(False, time_ns)
     world.timeline.timer(lambda up_ns: port.on_link(True, up_ns)).arm(port.silent_until_ns)
 
@@ -66,13 +88,20 @@ _ON_PORT: dict[FaultKind, Callable[[World, Port, int, int], None]] = {
     FaultKind.STUCK: _stick,
     FaultKind.DOWN: _take_down,
 }
+_LEFT_ON_PORT: dict[FaultKind, Callable[[Port], int]] = {
+    FaultKind.BUS_OFF: lambda port: port.bus_offs,
+    FaultKind.SILENT: lambda port: port.silenced,
+    FaultKind.DELAY: lambda port: port.held,
+    FaultKind.STUCK: lambda port: port.held,
+    FaultKind.DOWN: lambda port: port.downs,
+}
 
 
 class _Babbler:
     """A further participant that sends one identifier again and again, until its time is over."""
 
     def __init__(self, world: World, fault: BusFault, time_ns: int) -> None:
-        self._hub = world.hub
+        self._hub, self._babbled, self._counted = world.hub, world.babbled, 0
         self._port = world.hub.attach(Port("babbler", _hear_nothing, depth=_FLOOD))
         self._can_id, self._each_ms = fault.can_id, fault.detail or _FLOOD
         self._data = b"" if fault.can_id == SYNC_ID else _BABBLE
@@ -81,6 +110,8 @@ class _Babbler:
         self._timer.arm(time_ns + _MS_NS // 2)
 
     def _send(self, time_ns: int) -> None:
+        self._babbled[self._can_id] += self._port.sent - self._counted
+        self._counted = self._port.sent
         if time_ns >= self._until_ns:
             self._hub.detach(self._port)
             return

@@ -12,12 +12,12 @@ from servod.units import NS_PER_S
 
 
 class Joint:
-    """A plant on the world's time line; SI units in joint coordinates."""
+    """A plant on the world's time line; SI units in joint coordinates. `load_nm` acts on it from outside: a weight."""
 
     def __init__(self, model: AxisModel, seed: int, period_s: float) -> None:
         self.plant = Plant(model, seed, delay_s=max(0.0, model.total_delay_s - period_s))
         self.inertia: float = model.inertia
-        self.torque_nm = 0.0
+        self.torque_nm = self.load_nm = 0.0
         self._now_ns: int | None = None
 
     def advance(self, time_ns: int) -> None:
@@ -25,7 +25,7 @@ class Joint:
         if self._now_ns is None:
             self._now_ns = time_ns
         elif time_ns > self._now_ns:
-            self.plant.advance(self.torque_nm, (time_ns - self._now_ns) / NS_PER_S)
+            self.plant.advance(self.torque_nm, (time_ns - self._now_ns) / NS_PER_S, self.load_nm)
             self._now_ns = time_ns
 
     def command(self, torque_nm: float, time_ns: int) -> None:

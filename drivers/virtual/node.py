@@ -7,6 +7,7 @@ Between the bus and the device (amplifier, encoder), which derives from it. Fram
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
@@ -47,6 +48,7 @@ class Node(ABC):
         self.dictionary.entry(Obj301.IDENTITY, 4).default = serial
         self.timeline = timeline
         self.state = NmtState.BOOT_UP
+        self.nmt_taken: Counter[int] = Counter()  # NMT commands that reached it
         self._put = send
         self.dictionary.reset(*_COMMUNICATION, node_id)
         self.dictionary.reset(*_APPLICATION, node_id)
@@ -147,6 +149,7 @@ class Node(ABC):
         if len(data) != 2 or data[1] not in (0, self.node_id):
             return
         command = data[0]
+        self.nmt_taken[command] += 1
         if command == NmtCommand.START:
             self._enter(NmtState.OPERATIONAL, time_ns)
         elif command == NmtCommand.STOP:

@@ -27,14 +27,20 @@ LinkListener = Callable[[bool, int], None]
 
 
 class Port:
-    """A CAN controller on the hub. `receive(can_id, data, time_ns)` gets every frame of the others at the moment the
-    frame ended; `on_state(state, time_ns)` hears of error passive, bus-off and of the return to error active,
-    `on_link(up, time_ns)` of the interface that goes down and comes back."""
+    """A CAN controller on the hub. It counts what befell it: `sent` frames that the bus carried, `silenced` frames that
+    it neither sent nor heard while silent, `held` frames that had to wait, `bus_offs`, and `downs` of its interface.
+
+    `receive(can_id, data, time_ns)` gets every frame of the others at the moment the frame ended;
+    `on_state(state, time_ns)` hears of error passive, bus-off and of the return to error active, `on_link(up, time_ns)`
+    of the interface that goes down and comes back."""
 
     __slots__ = (
+        "bus_offs",
         "delay_ns",
         "depth",
+        "downs",
         "dropped",
+        "held",
         "name",
         "on_link",
         "on_state",
@@ -42,6 +48,8 @@ class Port:
         "receive",
         "receive_errors",
         "restart_ns",
+        "sent",
+        "silenced",
         "silent_until_ns",
         "state",
         "stuck_until_ns",
@@ -61,6 +69,7 @@ class Port:
         self.silent_until_ns = 0  # neither sends nor hears
         self.stuck_until_ns = 0  # what is sent waits
         self.delay_ns = 0
+        self.sent = self.silenced = self.held = self.bus_offs = self.downs = 0
 
     def count(self, transmit: int, receive: int, time_ns: int) -> bool:
         """Add to the error counters and follow the states; True when this led to bus-off."""
@@ -73,9 +82,11 @@ class Port:
         else:
             new = ErrorState.ACTIVE
         changed, self.state = new != self.state, new
-        if changed:
-            self.on_state(new, time_ns)
-        return changed and new is ErrorState.BUS_OFF
+        if not changed:
+            return False
+        self.bus_offs += new is ErrorState.BUS_OFF
+        self.on_state(new, time_ns)
+        return new is ErrorState.BUS_OFF
 
     def restart(self, time_ns: int) -> None:
         """Return from bus-off with clear counters (128 times 11 recessive bits are taken as passed)."""

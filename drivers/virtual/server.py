@@ -21,7 +21,7 @@ from servod.bus import (
     CAN_ERR_RESTARTED,
     CAN_FRAME,
 )
-from servod.drivers.virtual.bus_faults import BusFault, FaultKind
+from servod.drivers.virtual.bus_faults import BusFault, FaultKind, kind_of
 from servod.drivers.virtual.client import STAMPED_FRAME
 from servod.drivers.virtual.port import ErrorState, Port
 from servod.drivers.virtual.world import World
@@ -99,6 +99,10 @@ class Client:
     def _request(self, fault: BusFault, now_ns: int) -> None:
         if fault.kind is FaultKind.ACCEPT:
             self._accepted = (self._accepted or set()) | {fault.can_id}
+        elif fault.kind is FaultKind.HAPPENED:
+            asked = fault._replace(kind=kind_of(fault.amount))
+            told = fault._replace(amount=self._world.fault_effect(asked, self.port))
+            self.deliver(CAN_ERR_FLAG, told.encode(), now_ns)
         else:
             self._world.apply_fault(fault, self.port, now_ns)
 

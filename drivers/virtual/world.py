@@ -6,7 +6,7 @@ time: a clock whose sleep lets the world run, and connections whose waiting lets
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from typing import NamedTuple
 
 from servod.axis_model import AxisModel, rotary
@@ -16,7 +16,7 @@ from servod.drivers.virtual.bus_faults import BusFault
 from servod.drivers.virtual.drive_record import DriveRecord
 from servod.drivers.virtual.encoder import EncoderNode
 from servod.drivers.virtual.hub import Hub
-from servod.drivers.virtual.injection import inject
+from servod.drivers.virtual.injection import happened, inject
 from servod.drivers.virtual.joint import Joint
 from servod.drivers.virtual.node import Node, Send
 from servod.drivers.virtual.port import ErrorState, Port
@@ -71,12 +71,15 @@ class Devices:
 
 
 class World:
-    """Hub and devices; nothing happens unless `advance` is called."""
+    """Hub and devices; nothing happens unless `advance` is called. `babbled` counts the frames of babblers that the bus
+    carried, by identifier; `twins` are the second nodes that were switched on, by node id."""
 
     def __init__(self, settings: VirtualAxisSettings, model: AxisModel, record: DriveRecord | None = None) -> None:
         self.settings, self._model = settings, model
         self.timeline = Timeline()
         self.hub = Hub(self.timeline, settings.bit_rate)
+        self.babbled: Counter[int] = Counter()
+        self.twins: list[tuple[int, Port]] = []
         self.devices = Devices(settings, model, self.timeline, record)
         self._node_ports = {name: self._node_port(name) for name in ("amplifier", "encoder")}
         sends = [self.sender(port) for port in self._node_ports.values()]
@@ -112,6 +115,10 @@ class World:
         """Carry out a fault that a client asked for."""
         inject(self, fault, client, time_ns)
 
+    def fault_effect(self, fault: BusFault, client: Port) -> int:
+        """How often what a client asks for took effect so far."""
+        return happened(self, fault, client)
+
     def switch_on_twin(self, node_id: int, time_ns: int) -> None:
         """A second node with this id, on a joint of its own, is switched on: somebody set the same address twice."""
         twins = Devices(self.settings, self._model, self.timeline)
@@ -120,6 +127,7 @@ class World:
         for port, twin in zip(ports, twins.nodes, strict=True):
             if twin.node_id == node_id:
                 port.receive, port.on_state = twin.receive, twin.bus_state
+                self.twins.append((node_id, port))
                 twins.joint.advance(time_ns)
                 twin.power_on(time_ns)
             else:
@@ -204,6 +212,10 @@ class SteppedBus:
     def inject(self, fault: BusFault) -> None:
         """Ask the hub for a fault."""
         self._world.apply_fault(fault, self.port, self._clock.now_ns())
+
+    def happened(self, fault: BusFault) -> int:
+        """How often what `fault` asks for took effect so far."""
+        return self._world.fault_effect(fault, self.port)
 
     def fileno(self) -> int:
         """No descriptor: this bus is in the process."""

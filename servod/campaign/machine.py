@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import select
 import signal
 import time
 from collections.abc import Sequence
@@ -81,6 +82,8 @@ class Machine:
 
     def alive(self, who: Process) -> bool:
         """Whether it runs, stopped or not."""
+        if who is Process.LOOP:
+            return self._loop_fd is not None and not select.select((self._loop_fd,), (), (), 0.0)[0]
         process = self.daemon if who is Process.DAEMON else self.virtual_axis
         return process is not None and process.poll() is None
 

@@ -6,12 +6,11 @@ is what `status` says, and the daemon's log, which is left when nobody answers.
 
 from __future__ import annotations
 
-import contextlib
 import re
 import signal
-import struct
 import time
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Hashable, Sequence
 from pathlib import Path
 from subprocess import Popen, TimeoutExpired
 from typing import Any
@@ -23,38 +22,28 @@ from servod.axis_model import axis_model_yaml
 from servod.campaign.inputs import Nested, config_of, merged, plant_of, shipped_config
 from servod.campaign.machine import Machine, Process, wait_for_state
 from servod.campaign.recorded import lost_records, wait_for_rows
-from servod.campaign.scenario import Recovery, Runs, Scenario, Start
-from servod.campaign.under_test import AMPLIFIER, MOTION, Observation
+from servod.campaign.scenario import Recovery, Scenario, Start
+from servod.campaign.stranger import at_the_hub, download, send_heard
+from servod.campaign.under_test import MOTION, Observation
 from servod.campaign.wire import HubWire, Wire
-from servod.cia import SDO_REQUEST_BASE
-from servod.commands import Op
 from servod.control import ControlClient, Verb
 from servod.demo.axis import last_core, own_group
-from servod.drivers.virtual.amplifier import AMPLIFIER_EDS
-from servod.drivers.virtual.bus_faults import FRAME_KINDS, MYSELF, BusFault
-from servod.drivers.virtual.client import VirtualBus
-from servod.drivers.virtual.dictionary import Dictionary
+from servod.drivers.virtual.bus_faults import BusFault
 from servod.drivers.virtual.drive_record import DriveSample
-from servod.drivers.virtual.encoder import ENCODER_EDS
 from servod.drivers.virtual.settings import VirtualAxisSettings
-from servod.errors import BadInput, FaultCode, ServodError, Unreachable
+from servod.errors import FaultCode, ServodError, Unreachable
 from servod.hal import DriveState
 from servod.shipped import shipped
 from servod.units import NS_PER_US
 from servod.yaml12 import validate
 
-_SINE = {"kind": "sine", **MOTION[Runs.PROCESSES]._asdict(), "duration_s": 600.0}
 #: The joint moves when its torque is so large [N*m]: enough to lose.
 _MOVING_NM, _START_S = 0.01, 20.0
 #: The judge continues the motion of before the injection: so many periods it must have seen of it, the first third of
 #: which it leaves out.
 _SHOWN_PERIODS = 1.5
-#: A participant that leaves takes with it what still waits in its queue.
-_SENT_S = 0.01
-_VERBS = {Op.DISABLE: Verb.DISABLE, Op.QUICK_STOP: Verb.STOP, Op.HALT: Verb.HALT}
 _TOLD = re.compile(r"fault ([A-Z_]+) \(")
 _ASKS_TO_END = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
-_DOWNLOAD = struct.Struct("<BHB4s")
 _FAULTED = (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE)
 
 
@@ -76,6 +65,8 @@ class ProcessAxis:
         (folder / "settings.yaml").write_text(yaml.safe_dump(settings.model_dump(mode="json")))
         (folder / "plant.yaml").write_text(axis_model_yaml(plant_of(scenario)))
         self.machine.config.write_text(yaml.safe_dump(self.config.model_dump(mode="json")))
+        self.effects: Counter[Hashable] = Counter()
+        self._motion = MOTION[scenario.runs]
         self._client: ControlClient | None = None
         self._hit_ns: int | None = None
         self._asked_to_end = self._off = self._up = False
@@ -98,9 +89,9 @@ class ProcessAxis:
             self.client.call(Verb.ENABLE)
             wait_for_state(self.client, AxisState.ENABLED.name)
         if start is Start.MOVING:
-            self.client.call(Verb.TRACK, **_SINE)
+            self.client.call(Verb.TRACK, kind="sine", **self._motion._asdict(), duration_s=600.0)
             self._wait_until(self._moves, "the axis does not move")
-            time.sleep(_SHOWN_PERIODS / MOTION[Runs.PROCESSES].frequency_hz)
+            time.sleep(_SHOWN_PERIODS / self._motion.frequency_hz)
         self._wait_until(self._recorded, "the recorder writes nothing")
 
     def run(self, duration_s: float) -> None:
@@ -115,31 +106,26 @@ class ProcessAxis:
         time.sleep(duration_s)
 
     def bus_fault(self, fault: BusFault) -> None:
-        """Ask the hub, as somebody else than the loop: what shall hit the loop's own connection is not to be had."""
-        foreign = self.wire.foreign()
-        with contextlib.closing(foreign):
-            of_the_loop = fault.participant == MYSELF and fault.kind not in FRAME_KINDS
-            if of_the_loop or not isinstance(foreign, VirtualBus):
-                raise BadInput("bus fault", fault.kind.name, "one that another participant of the hub can ask for")
+        """Ask the hub, as somebody else than the loop. Raises BadInput for what only the loop itself could ask for."""
+        with at_the_hub(self.wire, fault) as foreign:
             foreign.inject(fault)
+
+    def fault_effect(self, fault: BusFault) -> int:
+        """Ask the hub, as somebody else than the loop."""
+        with at_the_hub(self.wire, fault) as foreign:
+            return foreign.happened(fault)
 
     def frame(self, can_id: int, data: bytes) -> None:
         """Send as somebody else on the bus."""
-        with contextlib.closing(self.wire.foreign()) as foreign:
-            foreign.send(can_id, data)
-            time.sleep(_SENT_S)
+        self.effects[can_id, data] += send_heard(self.wire, can_id, data)
 
-    def sdo_write(self, node_id: int, index: int, subindex: int, value: int) -> None:
-        """One expedited download, as a service tool on the same bus."""
-        entry = Dictionary(AMPLIFIER_EDS if node_id == AMPLIFIER else ENCODER_EDS).entry(index, subindex)
-        entry.value = value
-        data = entry.encode()
-        head = 0x23 | (4 - len(data)) << 2  # expedited, with its length (CiA 301, 7.2.4.3.3)
-        self.frame(SDO_REQUEST_BASE + node_id, _DOWNLOAD.pack(head, index, subindex, data))
+    def frame_effect(self, can_id: int, data: bytes) -> int:
+        """As it was heard when it was sent."""
+        return self.effects[can_id, data]
 
-    def command(self, op: Op, arguments: Sequence[float] = ()) -> None:
-        """Ask the daemon for it."""
-        self.call(_VERBS[op], **({"on": bool(arguments[0])} if op is Op.HALT else {}))
+    def sdo_write(self, node_id: int, index: int, subindex: int, value: int) -> bool:
+        """As a service tool on the same bus; True when the node confirms it."""
+        return download(self.wire, node_id, index, subindex, value)
 
     def call(self, verb: Verb, **args: Any) -> dict[str, Any]:
         """Ask the daemon for anything; a refusal is kept, and gives nothing."""
@@ -149,12 +135,14 @@ class ProcessAxis:
             self.refusal = str(error)
             return {}
 
-    def signal(self, who: Sequence[Process], number: signal.Signals) -> None:
-        """Send a signal; from the first that kills on, records may be missing."""
+    def signal(self, who: Sequence[Process], number: signal.Signals) -> bool:
+        """Send a signal; from the first that kills on, records may be missing. False when one was gone already."""
+        there = all(map(self.machine.alive, who))
         if number is not signal.SIGCONT and set(who) & {Process.DAEMON, Process.LOOP}:
             self._hit_ns = self._hit_ns or self.now_ns()
         self._asked_to_end |= Process.DAEMON in who and number in _ASKS_TO_END
         self.machine.send(who, number)
+        return there
 
     def restart_daemon(self) -> None:
         """As the service manager does it: SIGTERM, wait, start."""

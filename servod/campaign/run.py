@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from servod.campaign.actions import action_of
+from servod.campaign.effects import Effects
 from servod.campaign.evidence import Watch
 from servod.campaign.judge import Reaction, complaints, reaction
 from servod.campaign.losses import loss_of
@@ -63,12 +64,13 @@ def run_scenario(
         contextlib.closing(axis_for(scenario, Path(folder))) as axis,
     ):
         axis.start(scenario.start)
+        effects = Effects(scenario, axis)
         injected_ns = _inject(axis, scenario, scenario.inject)
         axis.run(scenario.watch_ms / 1e3)
         watch = Watch(injected_ns, axis.now_ns())
         seen = axis.observe()
         times = reaction(seen.samples, injected_ns)
-        found = complaints(scenario, seen, times, watch)
+        found = [*effects.complaints(), *complaints(scenario, seen, times, watch)]
         recovered = scenario.recover is not Recovery.REPAIR and _recover(axis, scenario)
     if not recovered and scenario.recover is not Recovery.REPAIR:
         found.append(f"the axis was not enabled again by {scenario.recover}")

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Hashable, Sequence
 from pathlib import Path
 
 from servod.axis import AxisState
 from servod.campaign.inputs import PROVEN_BEFORE, Nested, config_of, merged, plant_of, shipped_config
 from servod.campaign.scenario import Recovery, Runs, Scenario, Start
 from servod.campaign.under_test import MOTION, Observation
+from servod.cia import NMT_ID
 from servod.commands import REFUSAL_TEXT, Op, ReferenceKind, Refusal
 from servod.config import AxisConfig
 from servod.controllers import LAWS
 from servod.drivers.virtual.bus_faults import BusFault
 from servod.drivers.virtual.drive_record import DriveRecord, read_drive_record
-from servod.drivers.virtual.world import SteppedWorld, VirtualAxisSettings
+from servod.drivers.virtual.world import SteppedBus, SteppedWorld, VirtualAxisSettings
 from servod.errors import ServodError, Unreachable, faults_in
 from servod.gains import load_gains
 from servod.session import SteppedSession
@@ -39,6 +41,7 @@ class SteppedAxis:
     """servod.campaign.under_test.AxisUnderTest in virtual time; `folder` takes the drive's record."""
 
     def __init__(self, scenario: Scenario, folder: Path) -> None:
+        self.effects: Counter[Hashable] = Counter()
         self._record_path = folder / RECORD_NAME
         where = scenario.title
         settings = validate(scenario.settings, VirtualAxisSettings, f"{where}: settings")
@@ -92,25 +95,38 @@ class SteppedAxis:
 
     def bus_fault(self, fault: BusFault) -> None:
         """Ask the hub, as the loop's connection."""
-        (self._foreign if self._session is None else self._session.loop_bus).inject(fault)
+        self._asker.inject(fault)
+
+    def fault_effect(self, fault: BusFault) -> int:
+        """Ask the hub, as the loop's connection."""
+        return self._asker.happened(fault)
 
     def frame(self, can_id: int, data: bytes) -> None:
         """Send as somebody else on the bus."""
         self._foreign.send(can_id, data)
 
-    def sdo_write(self, node_id: int, index: int, subindex: int, value: int) -> None:
+    def frame_effect(self, can_id: int, data: bytes) -> int:
+        """An NMT command is heard by its node, any other frame by all."""
+        if can_id != NMT_ID:
+            return self._foreign.port.sent
+        command, node_id = data
+        return sum(node.nmt_taken[command] for node in self.world.devices.nodes if node.node_id == node_id)
+
+    def sdo_write(self, node_id: int, index: int, subindex: int, value: int) -> bool:
         """Write past the bus, straight into the node's dictionary."""
         (node,) = (n for n in self.world.devices.nodes if n.node_id == node_id)
         entry = node.dictionary.entry(index, subindex)
         entry.value = value
         if entry.written is not None:
             entry.written(value)
+        return entry.value == value
 
-    def command(self, op: Op, arguments: Sequence[float] = ()) -> None:
-        """Give the loop a command."""
+    def command(self, op: Op, arguments: Sequence[float] = ()) -> bool:
+        """Give the loop a command; False when it was refused, which is kept."""
         refusal = self.session.send(op, arguments)
         if refusal != Refusal.DONE:
             self._refusal = REFUSAL_TEXT[refusal]
+        return refusal == Refusal.DONE
 
     def observe(self) -> Observation:
         """What is seen now."""
@@ -137,15 +153,22 @@ class SteppedAxis:
         self.session.run(0.1)
         return self.session.cycle.axis.state is AxisState.ENABLED
 
-    def configure(self, over: Nested) -> None:
-        """Lay keys over the configuration; the next bring-up reads them. Raises BadInput."""
-        base = self._config.model_dump(mode="json", exclude_none=True)
+    def configure(self, over: Nested) -> bool:
+        """Lay keys over the configuration; the next bring-up reads them. True when that changed it. Raises BadInput."""
+        before = self._config
+        base = before.model_dump(mode="json", exclude_none=True)
         self._config = validate(merged(base, over), AxisConfig, "configure")
+        return self._config != before
 
     def close(self) -> None:
         """Leave the bus."""
         if self._session is not None:
             self._session.close()
+
+    @property
+    def _asker(self) -> SteppedBus:
+        """Before the bring-up there is no loop."""
+        return self._foreign if self._session is None else self._session.loop_bus
 
     def _begin_proof(self) -> None:
         """Enable, up to the moment at which the test of the wiring pushes the joint."""

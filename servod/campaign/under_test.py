@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 from servod.campaign.scenario import Recovery, Runs, Start
-from servod.commands import Op
 from servod.drivers.virtual.bus_faults import BusFault
 from servod.drivers.virtual.drive_record import DriveSample
 from servod.errors import FaultCode
@@ -23,8 +23,9 @@ class Sine(NamedTuple):
     frequency_hz: float
 
 
-#: In virtual time a motion may be faster than on a machine that others use too.
-MOTION = {Runs.STEPPED: Sine(0.1, 2.0), Runs.PROCESSES: Sine(0.2, 1.0), Runs.GUEST: Sine(0.2, 1.0)}
+#: In virtual time a motion may be faster than on a machine that others use too. There it is larger: a joint that strays
+#: by what such a machine does to it is far from one that stands.
+MOTION = {Runs.STEPPED: Sine(0.1, 2.0), Runs.PROCESSES: Sine(0.3, 0.7), Runs.GUEST: Sine(0.6, 0.5)}
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,13 @@ class Observation:
 
 
 class AxisUnderTest(Protocol):
-    """One virtual axis with its master; time is that of the drive's record."""
+    """One virtual axis with its master; time is that of the drive's record.
+
+    `effects` counts how often actions that see their effect at once took effect, by their mark
+    (servod.campaign.actions.base).
+    """
+
+    effects: Counter[Hashable]
 
     def now_ns(self) -> int:
         """Present time."""
@@ -61,14 +68,17 @@ class AxisUnderTest(Protocol):
     def bus_fault(self, fault: BusFault) -> None:
         """Ask the hub for a fault of the bus; participant MYSELF is the loop."""
 
+    def fault_effect(self, fault: BusFault) -> int:
+        """How often what `fault` asks for took effect so far, as the hub counts it."""
+
     def frame(self, can_id: int, data: bytes) -> None:
         """Send a frame as a foreign participant, raw."""
 
-    def sdo_write(self, node_id: int, index: int, subindex: int, value: int) -> None:
-        """Write an object of a node, as the vendor's service tool would."""
+    def frame_effect(self, can_id: int, data: bytes) -> int:
+        """How often such a frame of a foreign participant was heard so far."""
 
-    def command(self, op: Op, arguments: Sequence[float] = ()) -> None:
-        """Give the loop a command; a refusal is kept for `observe`."""
+    def sdo_write(self, node_id: int, index: int, subindex: int, value: int) -> bool:
+        """Write an object of a node, as the vendor's service tool would; True when the node has taken it."""
 
     def observe(self) -> Observation:
         """What is seen now."""

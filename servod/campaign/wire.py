@@ -13,6 +13,9 @@ from servod.bus.open import open_bus
 from servod.config import BusConfig
 from servod.drivers.virtual.client import VirtualBus
 
+#: An identifier that nobody sends.
+NOTHING = (0x7FF,)
+
 
 class Wire(Protocol):
     """One bus that processes share."""
@@ -25,8 +28,8 @@ class Wire(Protocol):
         """Section `bus` of the daemon's configuration."""
         ...
 
-    def foreign(self) -> Bus:
-        """A new participant that hears nothing and sends what it likes. Raises Unreachable."""
+    def foreign(self, can_ids: tuple[int, ...] = NOTHING) -> Bus:
+        """A new participant that hears these identifiers and sends what it likes. Raises Unreachable."""
         ...
 
 
@@ -44,9 +47,9 @@ class HubWire:
         """Join at the socket."""
         return {"interface": "virtual", "channel": str(self.path)}
 
-    def foreign(self) -> VirtualBus:
+    def foreign(self, can_ids: tuple[int, ...] = NOTHING) -> VirtualBus:
         """A client of the hub."""
-        return VirtualBus(str(self.path), (0x7FF,))
+        return VirtualBus(str(self.path), can_ids)
 
 
 class CanWire:
@@ -63,6 +66,6 @@ class CanWire:
         """Join the interface."""
         return {"interface": "socketcan", "channel": self.interface}
 
-    def foreign(self) -> Bus:
+    def foreign(self, can_ids: tuple[int, ...] = NOTHING) -> Bus:
         """A raw socket of its own."""
-        return open_bus(BusConfig(interface="socketcan", channel=self.interface), (0x7FF,))
+        return open_bus(BusConfig(interface="socketcan", channel=self.interface), can_ids)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
+from collections.abc import Hashable
 from enum import StrEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from pydantic import Field
 
@@ -72,6 +74,26 @@ _KIND = {
 }
 
 
+class BusAction(Action):
+    """An action that the hub carries out, and counts."""
+
+    @abstractmethod
+    def request(self) -> BusFault:
+        """What the hub is asked for."""
+
+    def mark(self) -> Hashable:
+        """The kind of fault with what it hits."""
+        return self.request().concerns
+
+    def effect(self, axis: AxisUnderTest) -> int:
+        """As the hub counts it."""
+        return axis.fault_effect(self.request())
+
+    def apply(self, axis: AxisUnderTest) -> None:
+        """Ask the hub for it."""
+        axis.bus_fault(self.request())
+
+
 _TAKEN_AWAY = (FrameFault.DROP, FrameFault.SHORTEN)
 #: What of the axis hangs on a kind of frame, and how many of them may be missing.
 _CARRIES = {
@@ -84,13 +106,19 @@ _CARRIES = {
 }
 
 
-class Frames(Action):
+class Frames(BusAction):
     """The next `count` frames of a kind are hit; without a count all that follow."""
+
+    traceless: ClassVar[str] = "no frame was struck"
 
     of: FrameName
     fault: FrameFault
     count: int | None = Field(None, ge=1)
     detail: int = Field(0, ge=0, le=255)
+
+    def wanted(self) -> int:
+        """All of the count."""
+        return self.count or 1
 
     def loss(self) -> Loss:
         """Frames that do not arrive take what they carry, when there are enough of them."""
@@ -99,17 +127,19 @@ class Frames(Action):
         lost = count > gap if self.fault in _TAKEN_AWAY else False
         return loss if lost or (self.fault is FrameFault.DESTROY and count >= _BUS_OFF_FRAMES) else Loss.NONE
 
-    def apply(self, axis: AxisUnderTest) -> None:
+    def request(self) -> BusFault:
         """Arm the fault in the hub."""
-        axis.bus_fault(BusFault(_KIND[self.fault], CAN_ID[self.of], self.count or _ALWAYS, self.detail))
+        return BusFault(_KIND[self.fault], CAN_ID[self.of], self.count or _ALWAYS, self.detail)
 
 
-class FramesPass(Action):
+class FramesPass(BusAction):
     """What hit frames is taken away: all pass unhurt again."""
 
-    def apply(self, axis: AxisUnderTest) -> None:
+    traceless: ClassVar[str] = "no fault was taken back"
+
+    def request(self) -> BusFault:
         """Disarm the faults in the hub."""
-        axis.bus_fault(BusFault(FaultKind.CLEAR))
+        return BusFault(FaultKind.CLEAR)
 
 
 def _loss_of(who: Who, gap_ms: float) -> Loss:
@@ -119,8 +149,10 @@ def _loss_of(who: Who, gap_ms: float) -> Loss:
     return Loss.MASTER if gap_ms > MASTER_GAP_MS else Loss.NONE
 
 
-class Silence(Action):
+class Silence(BusAction):
     """A participant neither sends nor hears for a while: a cut wire, a node without supply."""
+
+    traceless: ClassVar[str] = "no frame was lost"
 
     who: Who
     for_ms: int = Field(ge=1)
@@ -129,13 +161,15 @@ class Silence(Action):
         """Of the participant, for its time."""
         return _loss_of(self.who, self.for_ms)
 
-    def apply(self, axis: AxisUnderTest) -> None:
+    def request(self) -> BusFault:
         """Cut it off."""
-        axis.bus_fault(BusFault(FaultKind.SILENT, amount=self.for_ms, participant=NODE_ID.get(self.who, MYSELF)))
+        return BusFault(FaultKind.SILENT, amount=self.for_ms, participant=NODE_ID.get(self.who, MYSELF))
 
 
-class BusOff(Action):
+class BusOff(BusAction):
     """A participant's CAN controller goes bus-off."""
+
+    traceless: ClassVar[str] = "no controller went bus-off"
 
     who: Who
 
@@ -143,13 +177,15 @@ class BusOff(Action):
         """Of the participant; its nodes are not taken up again by themselves."""
         return _loss_of(self.who, _ALWAYS)
 
-    def apply(self, axis: AxisUnderTest) -> None:
+    def request(self) -> BusFault:
         """Drive its error counter over the limit."""
-        axis.bus_fault(BusFault(FaultKind.BUS_OFF, participant=NODE_ID.get(self.who, MYSELF)))
+        return BusFault(FaultKind.BUS_OFF, participant=NODE_ID.get(self.who, MYSELF))
 
 
-class QueueStands(Action):
+class QueueStands(BusAction):
     """A participant hears, but cannot send: its frames wait in the transmit queue until that is full (ENOBUFS)."""
+
+    traceless: ClassVar[str] = "no frame had to wait"
 
     who: Who
     for_ms: int = Field(ge=1)
@@ -158,13 +194,15 @@ class QueueStands(Action):
         """Of what the participant sends, for its time."""
         return _loss_of(self.who, self.for_ms)
 
-    def apply(self, axis: AxisUnderTest) -> None:
+    def request(self) -> BusFault:
         """Stop its controller from sending."""
-        axis.bus_fault(BusFault(FaultKind.STUCK, amount=self.for_ms, participant=NODE_ID.get(self.who, MYSELF)))
+        return BusFault(FaultKind.STUCK, amount=self.for_ms, participant=NODE_ID.get(self.who, MYSELF))
 
 
-class InterfaceDown(Action):
+class InterfaceDown(BusAction):
     """The loop's interface goes down, and is up again after a while."""
+
+    traceless: ClassVar[str] = "the interface did not go down"
 
     for_ms: int = Field(ge=1)
 
@@ -172,13 +210,15 @@ class InterfaceDown(Action):
         """However short: the connection is gone with the interface."""
         return Loss.MASTER
 
-    def apply(self, axis: AxisUnderTest) -> None:
+    def request(self) -> BusFault:
         """Take it down."""
-        axis.bus_fault(BusFault(FaultKind.DOWN, amount=self.for_ms))
+        return BusFault(FaultKind.DOWN, amount=self.for_ms)
 
 
-class Babble(Action):
+class Babble(BusAction):
     """A further participant sends one identifier again and again; without `each_ms` as often as the bus takes it."""
+
+    traceless: ClassVar[str] = "no frame of the babbler was carried"
 
     can_id: int = Field(ge=0, le=0x7FF)
     for_ms: int = Field(ge=1)
@@ -189,19 +229,21 @@ class Babble(Action):
         starves = not self.each_ms and self.can_id < CAN_ID[FrameName.SYNC] and self.for_ms > MASTER_GAP_MS
         return Loss.MASTER if starves else Loss.NONE
 
-    def apply(self, axis: AxisUnderTest) -> None:
+    def request(self) -> BusFault:
         """Let it begin."""
-        axis.bus_fault(BusFault(FaultKind.BABBLE, self.can_id, self.for_ms, self.each_ms))
+        return BusFault(FaultKind.BABBLE, self.can_id, self.for_ms, self.each_ms)
 
 
-class SecondNode(Action):
+class SecondNode(BusAction):
     """A second node with the same id is switched on."""
+
+    traceless: ClassVar[str] = "the second node sent nothing"
 
     who: Who
 
-    def apply(self, axis: AxisUnderTest) -> None:
+    def request(self) -> BusFault:
         """Switch it on."""
-        axis.bus_fault(BusFault(FaultKind.TWIN, participant=NODE_ID[self.who]))
+        return BusFault(FaultKind.TWIN, participant=NODE_ID[self.who])
 
 
 BUS_ACTIONS: dict[str, type[Action]] = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import yaml
 
@@ -46,17 +46,27 @@ _DAMAGE: dict[Damage, Callable[[Path], None]] = {
 }
 
 
+def _damaged(path: Path, damage: Damage) -> bool:
+    """Damage the file; True when it is gone or another one afterwards."""
+    before = path.read_bytes()
+    _DAMAGE[damage](path)
+    return not path.exists() or path.read_bytes() != before
+
+
 class StoredGains(ProcessAction):
     """A set is loaded, its file in the store is damaged, and then it shall run."""
 
     damage: Damage
 
-    def act(self, axis: ProcessAxis) -> None:
+    traceless: ClassVar[str] = "the file is as it was"
+
+    def act(self, axis: ProcessAxis) -> int:
         """Load, damage, activate."""
         stored = axis.call(Verb.GAINS_LOAD, name=_LOADED.name, text=_LOADED.read_text())
         name, version = stored["name"], stored["version"]
-        _DAMAGE[self.damage](axis.config.gains.directory / "sets" / name / f"{version:04d}.yaml")
+        damaged = _damaged(axis.config.gains.directory / "sets" / name / f"{version:04d}.yaml", self.damage)
         axis.call(Verb.GAINS_ACTIVATE, name=name, version=version)
+        return damaged
 
 
 class ConfiguredGains(ProcessAction):
@@ -64,14 +74,17 @@ class ConfiguredGains(ProcessAction):
 
     damage: Damage
 
-    def act(self, axis: ProcessAxis) -> None:
+    traceless: ClassVar[str] = "the file is as it was"
+
+    def act(self, axis: ProcessAxis) -> int:
         """Damage a copy, and name it in the configuration."""
         copy = axis.folder / "initial.yaml"
         copy.write_bytes(_LOADED.read_bytes())
-        _DAMAGE[self.damage](copy)
+        damaged = _damaged(copy, self.damage)
         data = yaml.safe_load(axis.machine.config.read_text())
         data["gains"]["initial"] = str(copy)
         axis.machine.config.write_text(yaml.safe_dump(data))
+        return damaged
 
 
 GAIN_FILE_ACTIONS: dict[str, type[Action]] = {"stored_gains": StoredGains, "configured_gains": ConfiguredGains}

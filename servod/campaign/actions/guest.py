@@ -5,7 +5,9 @@ They touch the whole machine, so that they run nowhere else (tests/guest).
 
 from __future__ import annotations
 
+import os
 import subprocess
+import time
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
@@ -24,6 +26,10 @@ if TYPE_CHECKING:
 #: Stands on the kernel's command line of the guest, and of no other machine.
 _GUEST_MARK = "servod.share="
 _LONGEST_S = 30.0
+#: netdevice(7): the interface is up.
+_IFF_UP = 0x1
+#: A clock that was set is where it should be, but for the time that setting it takes [s].
+_CLOCK_S = 30.0
 
 
 def _run(*command: str) -> None:
@@ -35,6 +41,10 @@ def _run(*command: str) -> None:
     )
     if done.returncode not in (0, 124):  # timeout(1) has ended it
         raise Unreachable(f"{' '.join(command)}: {done.stderr.strip() or done.returncode}")
+
+
+def _flags(interface: str) -> Path:
+    return Path("/sys/class/net") / interface / "flags"
 
 
 class GuestAction(ProcessAction):
@@ -61,16 +71,17 @@ class Interface(GuestAction):
         """Without an interface there is no bus."""
         return Loss.MASTER if self.do in (InterfaceChange.DOWN, InterfaceChange.GONE) else Loss.NONE
 
-    def act(self, axis: ProcessAxis) -> None:
-        """Change it by ip(8)."""
+    def act(self, axis: ProcessAxis) -> int:
+        """Change it by ip(8), and see what the kernel has then."""
         assert isinstance(axis.wire, CanWire)
-        name = axis.wire.interface
+        name, goes_up = axis.wire.interface, self.do in (InterfaceChange.UP, InterfaceChange.BACK)
         if self.do is InterfaceChange.GONE:
             _run("ip", "link", "delete", name)
-            return
+            return not _flags(name).exists()
         if self.do is InterfaceChange.BACK:
             _run("ip", "link", "add", "dev", name, "type", "vcan")
-        _run("ip", "link", "set", name, "down" if self.do is InterfaceChange.DOWN else "up")
+        _run("ip", "link", "set", name, "up" if goes_up else "down")
+        return bool(int(_flags(name).read_text(), 16) & _IFF_UP) is goes_up
 
 
 class SetClock(GuestAction):
@@ -78,9 +89,11 @@ class SetClock(GuestAction):
 
     by_s: int = Field(ge=-10_000_000, le=10_000_000)
 
-    def act(self, axis: ProcessAxis) -> None:
+    def act(self, axis: ProcessAxis) -> int:
         """Set it by date(1)."""
+        before_s = time.time() - time.monotonic()
         _run("date", "-s", f"{self.by_s:+d} seconds")
+        return abs(time.time() - time.monotonic() - before_s - self.by_s) < _CLOCK_S
 
 
 class SmallDisk(GuestAction):
@@ -88,19 +101,22 @@ class SmallDisk(GuestAction):
 
     kib: int = Field(ge=16)
 
-    def act(self, axis: ProcessAxis) -> None:
+    def act(self, axis: ProcessAxis) -> int:
         """Mount it where the daemon sees it: its folders are shared with the machine's."""
         folder = str(axis.config.recorder.directory)
         _run("install", "-d", "-o", "servod", "-g", "servod", folder)
         _run("mount", "-t", "tmpfs", "-o", f"size={self.kib}k,mode=1777", "none", folder)
+        return os.path.ismount(folder)
 
 
 class DiskBack(GuestAction):
     """The small disk is taken away again."""
 
-    def act(self, axis: ProcessAxis) -> None:
+    def act(self, axis: ProcessAxis) -> int:
         """Unmount it, also from under open files."""
-        _run("umount", "--lazy", str(axis.config.recorder.directory))
+        folder = str(axis.config.recorder.directory)
+        _run("umount", "--lazy", folder)
+        return not os.path.ismount(folder)
 
 
 class CanSend(GuestAction):
@@ -112,10 +128,11 @@ class CanSend(GuestAction):
         """NMT commands other than start take a node out of operational."""
         return Loss.FEEDBACK if self.frame.startswith("000#") and self.frame[4:6] != "01" else Loss.NONE
 
-    def act(self, axis: ProcessAxis) -> None:
-        """Send it."""
+    def act(self, axis: ProcessAxis) -> int:
+        """Send it; cansend(1) fails when the interface does not take it."""
         assert isinstance(axis.wire, CanWire)
         _run("cansend", axis.wire.interface, self.frame)
+        return 1
 
 
 class CanGen(GuestAction):
@@ -126,11 +143,12 @@ class CanGen(GuestAction):
     gap_ms: float = Field(ge=0.0, le=1000.0)
     for_ms: int = Field(ge=100, le=10_000)
 
-    def act(self, axis: ProcessAxis) -> None:
-        """Let it run for its time."""
+    def act(self, axis: ProcessAxis) -> int:
+        """Let it run for its time; cangen(1) fails when the interface does not take its frames."""
         assert isinstance(axis.wire, CanWire)
         frames = ["-I", self.can_id, "-L", str(self.length), "-g", str(self.gap_ms), "-i"]
         _run("timeout", str(self.for_ms / 1e3), "cangen", axis.wire.interface, *frames)
+        return 1
 
 
 GUEST_ACTIONS: dict[str, type[Action]] = {

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
+from collections.abc import Hashable
 from enum import StrEnum
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from pydantic import Field, model_validator
 
@@ -29,7 +31,29 @@ class NmtName(StrEnum):
     RESET_COMMUNICATION = "reset_communication"
 
 
-class Nmt(Action):
+class FrameAction(Action):
+    """An action that is one frame of a stranger."""
+
+    traceless: ClassVar[str] = "nobody heard the frame"
+
+    @abstractmethod
+    def content(self) -> tuple[int, bytes]:
+        """Identifier and data."""
+
+    def mark(self) -> Hashable:
+        """The frame."""
+        return self.content()
+
+    def effect(self, axis: AxisUnderTest) -> int:
+        """How often it was heard."""
+        return axis.frame_effect(*self.content())
+
+    def apply(self, axis: AxisUnderTest) -> None:
+        """Send it."""
+        axis.frame(*self.content())
+
+
+class Nmt(FrameAction):
     """Somebody sends an NMT command: what a node does by itself when its supply fails, or a second master does."""
 
     who: Who
@@ -39,9 +63,9 @@ class Nmt(Action):
         """Outside operational a node sends and takes no PDO; the master hears of it by its silence."""
         return Loss.NONE if self.command is NmtName.START else Loss.FEEDBACK
 
-    def apply(self, axis: AxisUnderTest) -> None:
-        """Send it."""
-        axis.frame(NMT_ID, bytes([NmtCommand[self.command.name], NODE_ID[self.who]]))
+    def content(self) -> tuple[int, bytes]:
+        """CiA 301, 7.2.8.3.1."""
+        return NMT_ID, bytes([NmtCommand[self.command.name], NODE_ID[self.who]])
 
 
 #: The vendor's objects that take something from the axis when they are not 0: node, index, subindex.
@@ -54,6 +78,8 @@ _TAKES = {
 
 class ObjectWrite(Action):
     """An object of a node changes: the vendor's objects 0x2000 put causes of faults into the virtual nodes."""
+
+    traceless: ClassVar[str] = "the node did not take the value"
 
     who: Who
     index: int = Field(ge=0x1000, le=0xFFFF)
@@ -73,9 +99,13 @@ class ObjectWrite(Action):
         """By the object, when it is set."""
         return _TAKES.get((self.who, self.index, self.subindex), Loss.NONE) if self.value else Loss.NONE
 
+    def mark(self) -> Hashable:
+        """The object."""
+        return type(self), self.who, self.index, self.subindex
+
     def apply(self, axis: AxisUnderTest) -> None:
         """Write it."""
-        axis.sdo_write(NODE_ID[self.who], self.index, self.subindex, self.value)
+        self.took(axis, axis.sdo_write(NODE_ID[self.who], self.index, self.subindex, self.value))
 
 
 @cache
@@ -92,15 +122,15 @@ def _entry(who: Who, index: int, subindex: int) -> Entry | None:
     return entry if entry.bits else None
 
 
-class ForeignFrame(Action):
+class ForeignFrame(FrameAction):
     """Somebody sends a frame: `data` is written as hexadecimal bytes."""
 
     can_id: int = Field(ge=0, le=0x7FF)
     data: str = Field("", pattern=r"^([0-9A-Fa-f]{2}){0,8}$")
 
-    def apply(self, axis: AxisUnderTest) -> None:
-        """Send it."""
-        axis.frame(self.can_id, bytes.fromhex(self.data))
+    def content(self) -> tuple[int, bytes]:
+        """As it is written."""
+        return self.can_id, bytes.fromhex(self.data)
 
 
 NODE_ACTIONS: dict[str, type[Action]] = {"nmt": Nmt, "object_write": ObjectWrite, "foreign_frame": ForeignFrame}

@@ -5,6 +5,7 @@ Only axes that are processes can show them.
 
 from __future__ import annotations
 
+import os
 import resource
 import signal
 import time
@@ -38,11 +39,11 @@ class ProcessAction(Action):
     def apply(self, axis: AxisUnderTest) -> None:
         """Let it happen."""
         assert isinstance(axis, ProcessAxis)  # `runs` was checked when the scenario was read
-        self.act(axis)
+        self.took(axis, self.act(axis))
 
     @abstractmethod
-    def act(self, axis: ProcessAxis) -> None:
-        """Let it happen to these processes."""
+    def act(self, axis: ProcessAxis) -> int:
+        """Let it happen to these processes; returns how often it took effect, by what it left."""
 
 
 class SignalName(StrEnum):
@@ -68,6 +69,8 @@ _TAKES = {
 class Signal(ProcessAction):
     """Processes get a signal; several that are killed die together, none can act on the other's death."""
 
+    traceless: ClassVar[str] = "the process was gone already"
+
     who: list[Process] = Field(min_length=1)
     signal: SignalName
 
@@ -76,18 +79,19 @@ class Signal(ProcessAction):
         losses = {_TAKES.get((process, self.signal), Loss.NONE) for process in self.who}
         return next((loss for loss in (Loss.FEEDBACK, Loss.MASTER) if loss in losses), Loss.NONE)
 
-    def act(self, axis: ProcessAxis) -> None:
-        """Send it."""
-        axis.signal(self.who, signal.Signals[self.signal])
+    def act(self, axis: ProcessAxis) -> int:
+        """Send it; who runs cannot refuse it."""
+        return axis.signal(self.who, signal.Signals[self.signal])
 
 
 class VirtualAxisBack(ProcessAction):
     """Amplifier and encoder get their supply back."""
 
-    def act(self, axis: ProcessAxis) -> None:
-        """Start them."""
+    def act(self, axis: ProcessAxis) -> int:
+        """Start them, until they serve."""
         axis.machine.wait(Process.VIRTUAL_AXIS, 5.0)
         axis.machine.start_virtual_axis()
+        return 1
 
 
 class RestartDaemon(ProcessAction):
@@ -97,17 +101,19 @@ class RestartDaemon(ProcessAction):
         """For the time between."""
         return Loss.MASTER
 
-    def act(self, axis: ProcessAxis) -> None:
-        """SIGTERM, wait, start."""
+    def act(self, axis: ProcessAxis) -> int:
+        """SIGTERM, wait, start, until it answers."""
         axis.restart_daemon()
+        return 1
 
 
 class SecondDaemon(ProcessAction):
     """Somebody starts a second daemon for the same axis."""
 
-    def act(self, axis: ProcessAxis) -> None:
+    def act(self, axis: ProcessAxis) -> int:
         """Start it and see how it ends."""
         axis.second_daemon()
+        return 1
 
 
 class Ask(ProcessAction):
@@ -116,38 +122,41 @@ class Ask(ProcessAction):
     verb: Verb
     args: dict[str, Any] = Field({})
 
-    def act(self, axis: ProcessAxis) -> None:
-        """Ask."""
+    def act(self, axis: ProcessAxis) -> int:
+        """Ask; a refusal is an answer, which the judge sees."""
         axis.call(self.verb, **self.args)
+        return 1
 
 
 class ClientKilled(ProcessAction):
     """`servoctl track` moves the axis, and is killed in the middle."""
 
-    def act(self, axis: ProcessAxis) -> None:
+    def act(self, axis: ProcessAxis) -> int:
         """Start it, wait until the axis moves, kill it."""
         client = _moving_client(axis)
         client.kill()
-        client.wait()
+        return client.wait() == -signal.SIGKILL
 
 
 class ClientStopped(ProcessAction):
     """`servoctl track` moves the axis, and stands still in the middle: it keeps its connection, and its command."""
 
-    def act(self, axis: ProcessAxis) -> None:
+    def act(self, axis: ProcessAxis) -> int:
         """Start it, wait until the axis moves, stop it."""
-        axis.stopped_client = _moving_client(axis)
-        axis.stopped_client.send_signal(signal.SIGSTOP)
+        axis.stopped_client = client = _moving_client(axis)
+        client.send_signal(signal.SIGSTOP)
+        changed = os.waitid(os.P_PID, client.pid, os.WSTOPPED | os.WEXITED | os.WNOWAIT)
+        return changed is not None and changed.si_code == os.CLD_STOPPED
 
 
 class StoppedClientEnds(ProcessAction):
     """Somebody ends the client that stands still."""
 
-    def act(self, axis: ProcessAxis) -> None:
+    def act(self, axis: ProcessAxis) -> int:
         """Kill it."""
         assert axis.stopped_client is not None
         axis.stopped_client.kill()
-        axis.stopped_client.wait()
+        return axis.stopped_client.wait() == -signal.SIGKILL
 
 
 class CpuLoad(ProcessAction):
@@ -161,13 +170,13 @@ class CpuLoad(ProcessAction):
         """A loop that gets less than half of its core stands still more than it runs."""
         return Loss.MASTER if self.busy_ms >= self.idle_ms else Loss.NONE
 
-    def act(self, axis: ProcessAxis) -> None:
+    def act(self, axis: ProcessAxis) -> int:
         """Run it to its end."""
         core = axis.config.cycle.cpu
         numbers = (self.busy_ms, self.idle_ms, self.for_ms, last_core() if core is None else core)
         log = axis.folder / "load.log"
         with child("servod.campaign.load", [str(number) for number in numbers if number is not None], log) as load:
-            load.wait(_CLIENT_S)
+            return load.wait(_CLIENT_S) == 0
 
 
 class DiskFull(ProcessAction):
@@ -175,22 +184,24 @@ class DiskFull(ProcessAction):
 
     kib: int = Field(64, ge=16)
 
-    def act(self, axis: ProcessAxis) -> None:
+    def act(self, axis: ProcessAxis) -> int:
         """Limit it."""
         daemon = axis.machine.daemon
         assert daemon is not None
         _, hard = resource.prlimit(daemon.pid, resource.RLIMIT_FSIZE)
         resource.prlimit(daemon.pid, resource.RLIMIT_FSIZE, (self.kib * _KIB, hard))
+        return resource.prlimit(daemon.pid, resource.RLIMIT_FSIZE)[0] == self.kib * _KIB
 
 
 class RecordingsReadOnly(ProcessAction):
     """Somebody took the right to write from the folder of the recordings."""
 
-    def act(self, axis: ProcessAxis) -> None:
+    def act(self, axis: ProcessAxis) -> int:
         """Take it."""
         folder = axis.config.recorder.directory
         folder.mkdir(exist_ok=True)
         folder.chmod(0o555)
+        return not folder.stat().st_mode & 0o222
 
 
 def _moving_client(axis: ProcessAxis) -> Popen[bytes]:
