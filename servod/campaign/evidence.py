@@ -14,6 +14,7 @@ from typing import NamedTuple
 from servod.campaign.scenario import POWERED, Runs, Scenario, Start
 from servod.campaign.under_test import MOTION
 from servod.drivers.virtual.drive_record import DriveSample
+from servod.errors import BadInput
 from servod.hal import DriveState
 
 #: The drive's record is written every 2 ms by its own watch; on the wall clock its process gets the core when others
@@ -33,6 +34,15 @@ class Watch(NamedTuple):
 
     injected_ns: int
     ended_ns: int
+
+
+def check_strays(scenario: Scenario, where: str) -> None:
+    """Raises BadInput for a bound that a joint which stops dead would keep: that one strays by its whole amplitude."""
+    half_rad = MOTION[scenario.runs].amplitude_rad / 2
+    expected = scenario.expect
+    if expected.stays_enabled and scenario.start is Start.MOVING and expected.strays_rad > half_rad:
+        allowed = f"at most {half_rad:g}, half the amplitude of its motion on {scenario.runs}"
+        raise BadInput(f"{where}: expect.strays_rad", expected.strays_rad, allowed)
 
 
 def record_complaints(scenario: Scenario, samples: Sequence[DriveSample], watch: Watch) -> Iterator[str]:

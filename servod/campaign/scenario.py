@@ -127,6 +127,7 @@ class Expectation(Strict):
     drive_error: int | None = Field(None, gt=0, le=0xFFFF, description="the error code that the user is shown")
     strays_rad: float = Field(0.03, gt=0.0, description="an axis that stays enabled: distance from its motion")
     fastest_rad_s: float = Field(2.0, gt=0.0, description="an axis that stays enabled: speed of the joint")
+    most_nm: float | None = Field(None, gt=0.0, description="the joint feels no more torque than this")
     drive_shows: list[DriveWord] = Field([], description="names of servod.hal.DriveState, all seen after the injection")
     drive_never: list[DriveWord] = Field(
         [], description="names of servod.hal.DriveState, none seen after the injection"
@@ -185,6 +186,7 @@ def load_scenarios(path: str | Path) -> dict[str, Scenario]:
 
 def _checked(data: Any, where: str) -> Scenario:
     from servod.campaign.actions import action_of
+    from servod.campaign.evidence import check_strays
     from servod.campaign.inputs import check_inputs
     from servod.campaign.losses import check_bounds
 
@@ -194,4 +196,5 @@ def _checked(data: Any, where: str) -> Scenario:
         for number, injection in enumerate(injections):
             action_of(injection, f"{where}: {key}.{number}", scenario.runs)
     check_bounds(scenario, where)
+    check_strays(scenario, where)
     return scenario

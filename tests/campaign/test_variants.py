@@ -46,6 +46,11 @@ def test_a_file_without_rows_is_one_scenario(tmp_path: Path) -> None:
         (HEAD + EXPECT + ROWS + "  - {name: one, count: 1, expect: {axis: [ENABLED]}}\n", "no other row has"),
         (HEAD + EXPECT + "for_each: [{name: a, count: 1}]\n", "no expect"),
         (HEAD + EXPECT + ROWS.replace("count: 2", "count: many"), "lost.yaml (2): inject.0.do.frames: count"),
+        (HEAD + EXPECT + ROWS.replace("count: 2", "count: 2, loss: x"), "for_each.1.loss: found a value that nothing"),
+        (
+            HEAD + EXPECT + ROWS.replace("[ENABLED]", "[ENABLED], strays_rad: 0.051"),
+            "strays_rad: found 0.051; allowed: at",
+        ),
         ("title: x\n", "a value; this key is required"),
         ("- 1\n", "a mapping of keys"),
         (HEAD.replace("frames:", "frame:") + EXPECT + ROWS, "found 'frame'; allowed: one of"),
