@@ -42,11 +42,13 @@ def reaction(samples: list[DriveSample], injected_ns: int) -> Reaction:
 
 def complaints(scenario: Scenario, seen: Observation, times: Reaction, watch: Watch) -> list[str]:
     """Everything in which the outcome differs from what was expected, or cannot be told; empty when it passed."""
-    states = {sample.state.name for sample in seen.samples if sample.time_ns > watch.injected_ns}
+    after = [sample for sample in seen.samples if sample.time_ns > watch.injected_ns]
+    states = {sample.state.name for sample in after}
     found = [
         *record_complaints(scenario, seen.samples, watch),
         *_complaints(scenario.expect, seen, times),
         *_on_the_way(scenario.expect, states),
+        _limited(scenario.expect.most_nm, after),
         *motion_complaints(scenario, seen.samples, watch),
     ]
     return [text for text in found if text]
@@ -74,6 +76,14 @@ def _on_the_way(expected: Expectation, states: set[str]) -> list[str]:
         f"the drive never showed {', '.join(sorted(missing))}" if missing else "",
         f"the drive showed {', '.join(sorted(unwanted))}" if unwanted else "",
     ]
+
+
+def _limited(most_nm: float | None, after: list[DriveSample]) -> str:
+    """The limit that was to hold."""
+    felt_nm = max((abs(sample.torque_nm) for sample in after), default=0.0)
+    return (
+        f"the joint felt {felt_nm:.3f} N*m, expected {most_nm:g}" if most_nm is not None and felt_nm > most_nm else ""
+    )
 
 
 def _named(expected: set[str], names: set[str]) -> str:

@@ -57,6 +57,8 @@ def test_times_count_from_the_injection() -> None:
         ({"axis": ["FAULT"], "torque_gone_ms": 300}, seen(RUNAWAY), "the torque was gone never"),
         ({"axis": ["FAULT"]}, seen(RUNAWAY), "0.1000 N*m that nobody commands"),
         ({"axis": ["ENABLED"]}, seen(HELD, axis="ENABLED"), ""),
+        ({"axis": ["ENABLED"], "most_nm": 0.1}, seen(HELD, axis="ENABLED"), ""),
+        ({"axis": ["ENABLED"], "most_nm": 0.09}, seen(HELD, axis="ENABLED"), "felt 0.100 N*m, expected 0.09"),
         ({"axis": ["FAULT"]}, seen(refusal="not now"), "refused: not now"),
         ({"axis": ["FAULT"], "refused": "two"}, seen(refusal="not now"), "the refusal says 'not now'"),
         ({"axis": ["FAULT"]}, seen(lost=1), "1 cycle records are missing"),
