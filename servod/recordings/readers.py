@@ -27,6 +27,8 @@ Reader = Callable[[Path, Container[str], list[str]], dict[str, Any]]
 
 #: Cells of text that are parsed at once: each is a Python object meanwhile.
 _CELLS_AT_ONCE = 65_536
+#: Rows of a Parquet file that are read before they are counted.
+_ROWS_AT_ONCE = 1_000_000
 _NS_PER_S = 1e9
 
 
@@ -115,30 +117,31 @@ def _read_parquet(path: Path, wanted: Container[str], _notes: list[str]) -> dict
             names = list(file.schema_arrow.names)
             refuse_repeated(names, path)
             read = [name for name in names if name in wanted and _holds_numbers(file.schema_arrow.field(name).type)]
-            _require_parquet(path, file, len(names), read)
-            table = file.read(columns=read)
+            require_cells(path, 0, len(names))
+            table = _counted(path, file, read)
             others = {name: file.schema_arrow.field(name).type if name in wanted else None for name in names}
     except (pa.ArrowException, OSError, ValueError) as error:  # ValueError: a name that is no UTF-8
         raise BadInput(str(path), first_line(error), "a Parquet file") from None
     return others | {name: table.column(name) for name in read}
 
 
-def _require_parquet(path: Path, file: Any, columns: int, read: list[str]) -> None:
-    """Raises BadInput for more numbers than a recording may hold, by the count that Arrow itself goes by."""
-    require_cells(path, 0, columns)
-    groups = [file.metadata.row_group(n) for n in range(file.metadata.num_row_groups)]
-    chunks = [group.column(n) for group in groups for n in range(group.num_columns)]
-    used = [chunk for chunk in chunks if chunk.path_in_schema in read]
-    if any(chunk.total_uncompressed_size > MOST_BYTES for chunk in used):
-        raise BadInput(str(path), "a column chunk that claims to be larger", f"at most {MOST_BYTES} bytes")
-    require_cells(path, -(-sum(_words(file, chunk) for chunk in used) // max(len(read), 1)), len(read))
+def _counted(path: Path, file: Any, read: list[str]) -> Any:
+    """The table of these columns, batch by batch: what the file says of its own size is asked first, and not believed.
 
+    Not by what it says of single columns: Arrow ends the process where that is bent. Numbers that take more than eight
+    bytes, as decimals do, count for as many as they take.
+    """
+    import pyarrow as pa
 
-def _words(file: Any, chunk: Any) -> int:
-    """Numbers in a chunk; one that takes more than eight bytes, as decimals do, counts for as many as it takes."""
-    kind = file.schema_arrow.field(chunk.path_in_schema).type
-    width = kind.bit_width if not hasattr(kind, "value_type") else kind.value_type.bit_width + kind.index_type.bit_width
-    return int(chunk.num_values * max(1, -(-width // 64)))
+    kinds = [file.schema_arrow.field(name).type for name in read]
+    words = sum(max(1, -(-kind.bit_width // 64)) for kind in kinds)
+    require_cells(path, file.metadata.num_rows, words)
+    batches, rows = [], 0
+    for batch in file.iter_batches(_ROWS_AT_ONCE, columns=read):
+        rows += len(batch)
+        require_cells(path, rows, words)
+        batches.append(batch)
+    return pa.Table.from_batches(batches, pa.schema(list(zip(read, kinds, strict=True))))
 
 
 def _read_mat(path: Path, _wanted: Container[str], _notes: list[str]) -> dict[str, Any]:
