@@ -93,6 +93,10 @@ def test_a_folder_that_another_command_works_in_is_refused(tmp_path: Path, capsy
     assert not list(tmp_path.iterdir())
 
 
+def _hang_up(listening: socket.socket) -> None:
+    listening.accept()[0].close()
+
+
 def test_who_stops_an_axis_is_told_when_the_answer_is_late(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -102,7 +106,7 @@ def test_who_stops_an_axis_is_told_when_the_answer_is_late(
     with socket.socket(socket.AF_UNIX) as hung:
         hung.bind(str(path))
         hung.listen(1)
-        threading.Timer(0.5, lambda: hung.accept()[0].close()).start()
+        threading.Timer(0.5, _hang_up, [hung]).start()
         assert run(["stop", "--socket", str(path)]) == 3
     first, *_ = capsys.readouterr().err.splitlines()
     assert "stop: no answer yet" in first and "EMERGENCY STOP" in first

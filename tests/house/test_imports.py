@@ -10,7 +10,7 @@ import source
 
 #: From the ground up. A module may import its own layer and those below, nothing above.
 LAYERS: list[set[str]] = [
-    {"units", "errors", "files", "yaml12", "shipped", "sources", "notify", "workers"},
+    {"units", "errors", "end_signals", "files", "yaml12", "shipped", "sources", "notify", "workers"},
     {"hal", "cia", "clock", "commands", "config", "record", "realtime", "bus", "wiring_proof"},
     {"identified"},
     {"axis_keys", "axis_friction", "axis_effects", "axis_model", "axis_pack", "models", "controllers"}
