@@ -16,7 +16,7 @@ from servod.campaign.losses import loss_of
 from servod.campaign.processes import ProcessAxis
 from servod.campaign.scenario import Injection, Loss, Recovery, Runs, Scenario
 from servod.campaign.stepped import SteppedAxis
-from servod.campaign.under_test import AxisUnderTest
+from servod.campaign.under_test import AxisUnderTest, Observation
 from servod.errors import FAULTS, Unreachable
 
 
@@ -74,6 +74,12 @@ def run_scenario(
         recovered = scenario.recover is not Recovery.REPAIR and _recover(axis, scenario)
     if not recovered and scenario.recover is not Recovery.REPAIR:
         found.append(f"the axis was not enabled again by {scenario.recover}")
+    return _outcome(name, scenario, seen, times, recovered, found)
+
+
+def _outcome(
+    name: str, scenario: Scenario, seen: Observation, times: Reaction, recovered: bool, found: list[str]
+) -> Outcome:
     codes = sorted(seen.latched)
     return Outcome(
         name,
