@@ -1,12 +1,22 @@
-"""The scenarios that ship: every YAML file under `scenarios/`, by its name without ending."""
+"""Scenarios from their files, checked as a whole: those that ship, every YAML file under `scenarios/`, and others.
+
+Above the schema, for only actions, inputs and judge know what a scenario may ask of them.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
-from servod.campaign.scenario import Scenario, load_scenarios
+from servod.campaign.actions import action_of
+from servod.campaign.evidence import check_strays
+from servod.campaign.inputs import check_inputs
+from servod.campaign.losses import check_bounds
+from servod.campaign.scenario import Scenario
+from servod.campaign.variants import variants
 from servod.errors import BadInput
+from servod.yaml12 import validate
 
 _FOLDER = Path(__file__).parent / "scenarios"
 
@@ -31,3 +41,19 @@ def load_all(paths: Iterable[Path]) -> dict[str, Scenario]:
             raise BadInput(str(path), f"a second scenario {min(twice)}", "a file name that no other folder has")
         found |= more
     return found
+
+
+def load_scenarios(path: str | Path) -> dict[str, Scenario]:
+    """Read the scenarios of one file by name; raises BadInput (file, key, found, allowed), also for a wrong action."""
+    return {name: _checked(data, where) for name, data, where in variants(Path(path))}
+
+
+def _checked(data: Any, where: str) -> Scenario:
+    scenario = validate(data, Scenario, where)
+    check_inputs(scenario, where)
+    for key, injections in (("inject", scenario.inject), ("mend", scenario.mend)):
+        for number, injection in enumerate(injections):
+            action_of(injection, f"{where}: {key}.{number}", scenario.runs)
+    check_bounds(scenario, where)
+    check_strays(scenario, where)
+    return scenario

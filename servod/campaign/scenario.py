@@ -7,17 +7,15 @@ does stands in `servod.campaign.actions`.
 from __future__ import annotations
 
 from enum import StrEnum
-from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field, model_validator
 
 from servod.axis import AxisState
-from servod.campaign.variants import variants
 from servod.errors import FaultCode
 from servod.hal import DriveState
 from servod.wiring_proof import Finding
-from servod.yaml12 import Strict, validate
+from servod.yaml12 import Strict
 
 #: After a loss of the master the torque must be gone within this time [ms].
 MASTER_LOSS_MS = 300.0
@@ -177,24 +175,3 @@ class Scenario(Strict):
         if self.runs is not Runs.STEPPED and (self.start is Start.PROVING or self.expect.drive_error is not None):
             raise ValueError("start: proving and expect.drive_error are for runs: stepped")
         return self
-
-
-def load_scenarios(path: str | Path) -> dict[str, Scenario]:
-    """Read the scenarios of one file by name; raises BadInput (file, key, found, allowed), also for a wrong action."""
-    return {name: _checked(data, where) for name, data, where in variants(Path(path))}
-
-
-def _checked(data: Any, where: str) -> Scenario:
-    from servod.campaign.actions import action_of
-    from servod.campaign.evidence import check_strays
-    from servod.campaign.inputs import check_inputs
-    from servod.campaign.losses import check_bounds
-
-    scenario = validate(data, Scenario, where)
-    check_inputs(scenario, where)
-    for key, injections in (("inject", scenario.inject), ("mend", scenario.mend)):
-        for number, injection in enumerate(injections):
-            action_of(injection, f"{where}: {key}.{number}", scenario.runs)
-    check_bounds(scenario, where)
-    check_strays(scenario, where)
-    return scenario

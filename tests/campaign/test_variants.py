@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from servod.campaign.catalogue import load_all
+from servod.campaign.catalogue import load_all, load_scenarios
 from servod.campaign.losses import loss_of
-from servod.campaign.scenario import Loss, load_scenarios
+from servod.campaign.scenario import Loss
 from servod.errors import BadInput
 
 HEAD = "title: $count frames\nwhy: x\ngroup: bus\ninject: [{do: {frames: {of: torque, fault: drop, count: $count}}}]\n"

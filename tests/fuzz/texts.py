@@ -234,8 +234,7 @@ def motion(folder: Path) -> Target:
 
 def fault_scenarios(folder: Path) -> Target:
     """A file of scenarios of the fault campaign, with its variants."""
-    from servod.campaign.catalogue import scenarios_in
-    from servod.campaign.scenario import load_scenarios
+    from servod.campaign.catalogue import load_scenarios, scenarios_in
 
     shipped = ROOT / "servod" / "campaign" / "scenarios" / "bus"
     assert scenarios_in(shipped)
