@@ -34,6 +34,7 @@ def child(
 
     def prepare() -> None:
         libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)  # ignored where the parent runs under nohup(1)
         if cores:
             os.sched_setaffinity(0, cores)
         for capability in dropped:
