@@ -17,7 +17,7 @@ _HELP = example(
     "is without a cause, what the axis rides through left its trace on the bus, torque is gone in time by the drive's "
     "own record, memory stays flat. SYNC-stepped, so that a day takes two hours; --wall runs the real processes on the "
     "wall clock. Ctrl-C ends it and still reports. Exit code 1 when anything was wrong, and when it did not get "
-    "through: interrupted, a job that died, half an hour that does not tell of memory. The state is in --out all the "
+    "through: interrupted, a job that died, four hours that do not tell of memory. The state is in --out all the "
     "time: soak.json, and soak.html at the end.",
     "servoctl soak --hours 1",
     "servoctl soak --hours 28 --limit-hours 1 --seed 7 --jobs 2 --out out/soak",

@@ -27,8 +27,11 @@ _MOST_SAMPLES = 2048
 _BLOCKS = 12
 #: Student's t for 95 %, two-sided, with _BLOCKS - 2 degrees of freedom.
 _T95 = 2.228
-#: A process that was watched for so long [s] must be told; one that was not cannot be.
-LONG_S = 1800.0
+#: Before so long [s] caches and buffers still fill, and growth is none.
+SETTLED_S = 1800.0
+#: A process that was watched for so long [s] must be told. An hour cannot: resident size breathes by single arenas of
+#: Python's allocator, of 1 MiB each, which makes its interval +-1.5 MB/h.
+LONG_S = 4 * 3600.0
 _PAGE_KB = os.sysconf("SC_PAGE_SIZE") / 1024.0
 
 
@@ -101,7 +104,7 @@ class Memory:
         rest = resident_kb - slope * hours - level
         width = _T95 * math.sqrt(float(rest @ rest) / (_BLOCKS - 2) / float(spread @ spread))
         growth = _growth(slope, width, points)
-        if growth is Growth.GROWS and self.watched_s < LONG_S:  # caches and buffers still fill
+        if growth is Growth.GROWS and self.watched_s < SETTLED_S:
             growth = Growth.TOO_SHORT
         return Slope(float(slope), float(slope - width), float(slope + width), growth)
 
