@@ -59,7 +59,8 @@ def _table(path: Path, text: _Counted, names: list[str], used: list[str], separa
     try:
         return pc.read_csv(
             pa.PythonFile(text, mode="r"),
-            read_options=pc.ReadOptions(column_names=names),
+            # In this thread alone: one that reads ahead goes on in a file that an error has closed, and hangs.
+            read_options=pc.ReadOptions(column_names=names, use_threads=False),
             parse_options=pc.ParseOptions(delimiter=separator),
             convert_options=pc.ConvertOptions(include_columns=used),
             memory_pool=pa.system_memory_pool(),  # gives back what is free; Arrow's own keeps a third more

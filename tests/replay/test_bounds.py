@@ -101,6 +101,17 @@ def test_a_small_file_that_unpacks_to_gigabytes_is_refused_in_bounded_memory(
     assert int(grown_mib) < 1536, done.stdout
 
 
+def test_a_bomb_that_is_cut_short_lets_the_process_end(tmp_path: Path) -> None:
+    """A thread of Arrow's that read ahead once went on behind the error, and the process never ended."""
+    (tmp_path / "r.csv.gz").write_bytes(csv_bomb()[:100_000])
+    for _ in range(2):
+        done = subprocess.run(
+            [sys.executable, "-c", CHILD, tmp_path / "r.csv.gz"],
+            capture_output=True, text=True, check=True, timeout=60,
+        )  # fmt: skip
+        assert "allowed: a gzip file that is whole" in done.stdout
+
+
 def test_columns_that_are_not_used_count_for_nothing_but_are_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
