@@ -63,9 +63,9 @@ class Link(Protocol):
 
 
 class _Torque(NamedTuple):
-    """Torque of one cycle and its parts, N*m."""
+    """Torque of one cycle and its parts, N*m; `limited` is what the limits let through."""
 
-    sent: float = 0.0
+    limited: float = 0.0
     controller: float = 0.0
     feedback: float = 0.0
     friction: float = 0.0
@@ -128,9 +128,9 @@ class Cycle:
         faults = self._faults(amplifier, encoder, skipped)
         output = self.axis.step(amplifier, encoder.age_cycles == 0, faults, self.reference.at_rest)
         torque = self._torque(output, amplifier, encoder, dt_s)
-        sent_nm = self._send(torque.sent, output)
+        sent_nm = self._send(torque.limited, output)
         self._torque_sent_ns = self.clock.now_ns() - deadline_ns
-        self._record(woke_ns - deadline_ns, amplifier, encoder, torque._replace(sent=sent_nm))
+        self._record(woke_ns - deadline_ns, amplifier, encoder, torque, sent_nm)
         self._take_command()
         self._say_goodbye(amplifier)
         self._tick_ns = self.clock.now_ns() - woke_ns - waited_ns
@@ -258,8 +258,10 @@ class Cycle:
             self.exchange.make_drive_answer()
         self._withdrawn += 1
 
-    def _record(self, lag_ns: int, amplifier: AmplifierFeedback, encoder: EncoderFeedback, torque: _Torque) -> None:
-        """Publish the cycle, in the order of servod.record.FIELDS."""
+    def _record(
+        self, lag_ns: int, amplifier: AmplifierFeedback, encoder: EncoderFeedback, torque: _Torque, sent_nm: float
+    ) -> None:
+        """Publish the cycle, in the order of servod.record.FIELDS; `sent_nm` is the torque that went out."""
         axis, reference, controller = self.axis, self.reference, self.controller
         queue_full, error_frames = self.exchange.counts()
         self.link.write_record((
@@ -271,7 +273,7 @@ class Cycle:
             self.exchange.late_frames, self.amplifier.ignored_frames + self.encoder.ignored_frames,
             reference.position_rad, reference.velocity_rad_s, encoder.position_rad, encoder.velocity_rad_s,
             amplifier.position_rad, amplifier.torque_nm,
-            torque.sent, torque.controller, torque.feedback, torque.friction, torque.other,
+            sent_nm, torque.controller, torque.feedback, torque.friction, torque.other,
             controller.friction_state, controller.disturbance,
         ))  # fmt: skip
 
