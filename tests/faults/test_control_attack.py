@@ -1,8 +1,8 @@
 """The control socket under attack, daemon, drive and attackers each in processes of their own.
 
 `servoctl bench --attack` gives the figures themselves. A busy machine stalls for some milliseconds now and then, and
-not longer under attack than without: each round is held against its own part without an attack, and what one of two
-rounds reaches is the daemon's, what the other one misses is the machine's.
+not longer under attack than without: each round is held against its own part without an attack, and what one of three
+rounds reaches is the daemon's, what the others miss is the machine's.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from servod.benchmark.attack import measure, text, told
 from servod.benchmark.attackers import SILENT
 from servod.errors import AnswerIsNo
 
-STOPS, ROUNDS = 3, 2
+STOPS, ROUNDS = 3, 3
 
 
 @pytest.fixture(scope="module")
