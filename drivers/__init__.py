@@ -1,6 +1,7 @@
 """The drivers, by name: one lazy table, extended by the entry-point group `servod.drivers`.
 
-A driver is `servod.hal.Driver`: a set-up face that runs in the supervisor and a cycle face that runs in the loop. The
+A driver is `servod.runtime.fieldbus.devices.Driver`: a set-up face that runs in the supervisor and a cycle face that
+runs in the loop. The
 table names modules as text, so that listing them imports nothing. Import as `servod.drivers`, never the bare folder.
 """
 
@@ -10,10 +11,10 @@ from contextlib import suppress
 from importlib import import_module
 from importlib.metadata import entry_points
 
-from servod.errors import BadInput
-from servod.hal import Driver
+from servod.common.errors import BadInput
+from servod.runtime.fieldbus.devices import Driver
 
-#: name -> "module:attribute" of a servod.hal.Driver.
+#: name -> "module:attribute" of a servod.runtime.fieldbus.devices.Driver.
 DRIVERS: dict[str, str] = {
     "cia402": "servod.drivers.cia402:DRIVER",
     "cia406": "servod.drivers.cia406:DRIVER",
@@ -48,5 +49,5 @@ def load_driver(name: str) -> Driver:
     except (ImportError, AttributeError) as error:
         raise BadInput(f"driver {name}", f"{place} ({error})", "an importable module:attribute") from error
     if not isinstance(driver, Driver):
-        raise BadInput(f"driver {name}", type(driver).__name__, "a servod.hal.Driver")
+        raise BadInput(f"driver {name}", type(driver).__name__, "a servod.runtime.fieldbus.devices.Driver")
     return driver

@@ -1,14 +1,20 @@
 """CiA 402 amplifier: the cycle face. Steps (2) and (5) of the cycle: frames to feedback, command to one RPDO.
 
 The control word follows from the present state and the goal alone (drivers/cia402_state.py); what is remembered here
-is only what the contract in servod.hal asks for: ages, the handshake wait and the edge of a fault reset.
+is only what the contract in servod.runtime.fieldbus.devices asks for: ages, the handshake wait and the edge of a
+fault reset.
 """
 
 from __future__ import annotations
 
 import struct
 
-from servod.cia import (
+from servod.common.units import PER_MILLE, rad_per_count
+from servod.drivers.cia402_setup import AmplifierSetup
+from servod.drivers.cia402_state import STATE_OF_STATUS, control_words, quick_stop_stays, reached_states
+from servod.drivers.cia402_target import TARGETS
+from servod.drivers.pdo_codec import codec, find, lost_after_cycles, slot
+from servod.runtime.fieldbus.cia import (
     CW_DISABLE_VOLTAGE,
     CW_ENABLE_OPERATION,
     CW_FAULT_RESET,
@@ -19,11 +25,7 @@ from servod.cia import (
     Emcy,
     Obj402,
 )
-from servod.drivers.cia402_setup import AmplifierSetup
-from servod.drivers.cia402_state import STATE_OF_STATUS, control_words, quick_stop_stays, reached_states
-from servod.drivers.cia402_target import TARGETS
-from servod.drivers.pdo_codec import codec, find, lost_after_cycles, slot
-from servod.hal import (
+from servod.runtime.fieldbus.devices import (
     HANDSHAKE_SYNCS,
     NEVER_CYCLES,
     AmplifierCommand,
@@ -35,7 +37,6 @@ from servod.hal import (
     NodePlan,
     Reason,
 )
-from servod.units import PER_MILLE, rad_per_count
 
 #: Lengths of the objects that this driver decodes and encodes (CiA 402).
 _FORMATS: dict[int, str] = {
@@ -55,7 +56,7 @@ _MODE_NOT_KNOWN = -1
 
 
 class Cia402Amplifier:
-    """Cycle face of a CiA 402 amplifier; see servod.hal for the behaviour it keeps."""
+    """Cycle face of a CiA 402 amplifier; see servod.runtime.fieldbus.devices for the behaviour it keeps."""
 
     def __init__(self, plan: NodePlan) -> None:
         facts = plan.facts

@@ -8,16 +8,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from servod.cia import RPDO_BASE, TPDO_BASE, Obj402
+from servod.common.errors import BadInput, Unreachable
 from servod.drivers.cia402_state import decode_status_word
 from servod.drivers.cia402_target import target_type
 from servod.drivers.quirks import Presence, Quirks, load_quirks
-from servod.drivers.setup_tools import read_optional, write_checked, write_optional
-from servod.errors import BadInput, Unreachable
-from servod.hal import DriveState, Mode, NodePlan, PdoEntry, PdoMap, SdoAccess
+from servod.runtime.fieldbus.cia import RPDO_BASE, TPDO_BASE, Obj402
+from servod.runtime.fieldbus.devices import DriveState, Mode, NodePlan, PdoEntry, PdoMap, SdoAccess
+from servod.runtime.fieldbus.setup_tools import read_optional, write_checked, write_optional
 
 if TYPE_CHECKING:
-    from servod.config import AxisConfig
+    from servod.formats.config import AxisConfig
 
 #: Bit of 0x6502 for each mode that this driver can run.
 SUPPORTED_MODE_BIT = {
@@ -65,7 +65,7 @@ def interpolation_period(period_us: int, quirks: Quirks) -> tuple[int, int]:
 
 
 class AmplifierSetup:
-    """Set-up face of a CiA 402 amplifier (servod.hal.Setup)."""
+    """Set-up face of a CiA 402 amplifier (servod.runtime.fieldbus.devices.Setup)."""
 
     def __init__(self, config: AxisConfig, mode: Mode = Mode.CYCLIC_SYNC_TORQUE) -> None:
         self._amplifier = config.amplifier

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from servod.cia import (
+from servod.runtime.fieldbus.cia import (
     CW_DISABLE_VOLTAGE,
     CW_ENABLE_OPERATION,
     CW_FAULT_RESET,
@@ -18,7 +18,7 @@ from servod.cia import (
     CW_SWITCH_ON,
     STATUS_WORD_TABLE,
 )
-from servod.hal import DriveState, Goal
+from servod.runtime.fieldbus.devices import DriveState, Goal
 
 _S = DriveState
 

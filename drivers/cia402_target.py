@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 from typing import Any, Protocol
 
-from servod.cia import SW_FOLLOWS_COMMAND, Obj402
-from servod.errors import BadInput
-from servod.hal import AmplifierCommand, Mode
-from servod.units import PER_MILLE, TWO_PI
+from servod.common.errors import BadInput
+from servod.common.units import PER_MILLE, TWO_PI
+from servod.runtime.fieldbus.cia import SW_FOLLOWS_COMMAND, Obj402
+from servod.runtime.fieldbus.devices import AmplifierCommand, Mode
 
 _INT16_MAX = 0x7FFF
 _INT32_MAX = 0x7FFFFFFF

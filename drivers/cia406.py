@@ -10,11 +10,11 @@ from __future__ import annotations
 import math
 import struct
 
-from servod.cia import Obj406
+from servod.common.units import NS_PER_S, TWO_PI, rad_per_count, wrapped_difference
 from servod.drivers.cia406_setup import EncoderSetup
 from servod.drivers.pdo_codec import codec, find, lost_after_cycles, slot
-from servod.hal import ALARMS_STALE, NEVER_CYCLES, Driver, EncoderFeedback, NodePlan
-from servod.units import NS_PER_S, TWO_PI, rad_per_count, wrapped_difference
+from servod.runtime.fieldbus.cia import Obj406
+from servod.runtime.fieldbus.devices import ALARMS_STALE, NEVER_CYCLES, Driver, EncoderFeedback, NodePlan
 
 #: Lengths of the objects that this driver decodes (CiA 406).
 _FORMATS: dict[int, str] = {Obj406.POSITION: "I", Obj406.ALARMS: "H", Obj406.WARNINGS: "H"}
@@ -30,7 +30,7 @@ def velocity_delay_s(period_s: float, cutoff_hz: float) -> float:
 
 
 class Cia406Encoder:
-    """Cycle face of a CiA 406 encoder; see servod.hal for the behaviour it keeps."""
+    """Cycle face of a CiA 406 encoder; see servod.runtime.fieldbus.devices for the behaviour it keeps."""
 
     def __init__(self, plan: NodePlan) -> None:
         facts = plan.facts

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from servod.cia import TPDO_BASE, Obj406
-from servod.drivers.setup_tools import read_optional, write_checked
-from servod.errors import BadInput, Unreachable
-from servod.hal import NodePlan, PdoEntry, PdoMap, SdoAccess
-from servod.units import rad_per_count
+from servod.common.errors import BadInput, Unreachable
+from servod.common.units import rad_per_count
+from servod.runtime.fieldbus.cia import TPDO_BASE, Obj406
+from servod.runtime.fieldbus.devices import NodePlan, PdoEntry, PdoMap, SdoAccess
+from servod.runtime.fieldbus.setup_tools import read_optional, write_checked
 
 if TYPE_CHECKING:
-    from servod.config import AxisConfig
+    from servod.formats.config import AxisConfig
 
 _SLOW_TIMER_MS = 100
 _OPERATING_SCALING = 1 << 2  # 0x6000 bit 2: scaling function on
@@ -30,7 +30,7 @@ def encoder_pdos(node_id: int) -> tuple[PdoMap, ...]:
 
 
 class EncoderSetup:
-    """Set-up face of a CiA 406 encoder (servod.hal.Setup)."""
+    """Set-up face of a CiA 406 encoder (servod.runtime.fieldbus.devices.Setup)."""
 
     def __init__(self, config: AxisConfig) -> None:
         self._encoder = config.encoder

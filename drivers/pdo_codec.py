@@ -10,8 +10,8 @@ import math
 import struct
 from collections.abc import Iterable, Mapping
 
-from servod.errors import BadInput
-from servod.hal import NodePlan, PdoMap
+from servod.common.errors import BadInput
+from servod.runtime.fieldbus.devices import NodePlan, PdoMap
 
 #: How many event timers a PDO may stay away, and the cycles on top for the jitter of bus and loop.
 _EVENT_TIMERS, _MARGIN_CYCLES = 3, 10

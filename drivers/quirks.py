@@ -10,8 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum
 
-from servod.cia import Emcy
-from servod.errors import BadInput
+from servod.common.errors import BadInput
+from servod.runtime.fieldbus.cia import Emcy
 
 
 class Presence(IntEnum):

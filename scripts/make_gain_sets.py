@@ -17,10 +17,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from servod.axis_model import AxisModel, LugreFriction, load_axis_model
-from servod.gain_store import write_atomically
-from servod.gains import GainSet
-from servod.yaml12 import validate
+from servod.common.yaml import validate
+from servod.formats.gains.gain_set import GainSet
+from servod.formats.gains.store import write_atomically
+from servod.formats.model.axis_model import AxisModel, LugreFriction, load_axis_model
 
 GAINS = Path(__file__).resolve().parent.parent / "gains"
 DATE = datetime.date(2026, 11, 21).isoformat()

@@ -39,10 +39,10 @@ _PRELOADED = (
     "yaml",
     "canopen",
     "can",
-    "servod.config",
-    "servod.errors",
-    "servod.hal",
-    "servod.commands",
+    "servod.formats.config",
+    "servod.common.errors",
+    "servod.runtime.fieldbus.devices",
+    "servod.runtime.loop.commands",
 )
 
 
@@ -56,36 +56,44 @@ class Target(NamedTuple):
 
 TARGETS = {
     "limits": Target(
-        "servod/limits.py", "servod.limits", ("tests/boundary/test_limits.py", "tests/loop/test_limits.py")
+        "servod/runtime/loop/limits.py",
+        "servod.runtime.loop.limits",
+        ("tests/runtime/loop/boundary/test_limits.py", "tests/runtime/loop/test_limits.py"),
     ),
     "axis": Target(
-        "servod/axis.py",
-        "servod.axis",
-        ("tests/boundary/test_axis.py", "tests/boundary/test_axis_drive.py", "tests/loop/test_axis_scenarios.py"),
+        "servod/runtime/loop/axis.py",
+        "servod.runtime.loop.axis",
+        (
+            "tests/runtime/loop/boundary/test_axis.py",
+            "tests/runtime/loop/boundary/test_axis_drive.py",
+            "tests/runtime/loop/test_axis_scenarios.py",
+        ),
     ),
-    "cia": Target("servod/cia.py", "servod.cia", ("tests/boundary/test_cia.py",)),
+    "cia": Target(
+        "servod/runtime/fieldbus/cia.py", "servod.runtime.fieldbus.cia", ("tests/runtime/fieldbus/test_cia.py",)
+    ),
     "cia402_state": Target(
         "drivers/cia402_state.py",
         "servod.drivers.cia402_state",
-        ("tests/boundary/test_cia402_state.py", "tests/conformance/test_transitions.py"),
+        ("tests/drivers/test_cia402_state.py", "tests/conformance/test_transitions.py"),
     ),
     "cia402_target": Target(
         "drivers/cia402_target.py",
         "servod.drivers.cia402_target",
-        ("tests/boundary/test_cia402_target.py", "tests/conformance/test_modes.py"),
+        ("tests/drivers/test_cia402_target.py", "tests/conformance/test_modes.py"),
     ),
     "cia402": Target(
         "drivers/cia402.py",
         "servod.drivers.cia402",
         (
-            "tests/boundary/test_cia402.py",
-            "tests/boundary/test_cia402_command.py",
+            "tests/drivers/test_cia402.py",
+            "tests/drivers/test_cia402_command.py",
             "tests/conformance/test_amplifiers.py",
             "tests/conformance/test_modes.py",
         ),
     ),
     "cia402_setup": Target(
-        "drivers/cia402_setup.py", "servod.drivers.cia402_setup", ("tests/boundary/test_cia402_setup.py",)
+        "drivers/cia402_setup.py", "servod.drivers.cia402_setup", ("tests/drivers/test_cia402_setup.py",)
     ),
 }
 

@@ -23,10 +23,10 @@ from typing import Any
 
 import numpy as np
 
-from servod.axis_model import load_axis_model
-from servod.diagnose.intake import taken_in
-from servod.diagnose.predict import Predictor
-from servod.recordings import load_recording
+from servod.formats.model.axis_model import load_axis_model
+from servod.lab.diagnose.data.intake import taken_in
+from servod.lab.diagnose.predict.predict import Predictor
+from servod.lab.recordings import load_recording
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 

@@ -14,7 +14,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 ROOT = Path(__file__).resolve().parent
 
 #: Files (or folders) whose tests start real processes on the wall clock; `./test` runs them alone, after all others.
-SERIAL = ("faults", "daemon/test_daemon.py", "virtual/test_process.py")
+SERIAL = (
+    *("qualify/faults/test_control_attack.py", "qualify/faults/test_reactions.py"),
+    *("runtime/daemon/test_daemon.py", "drivers/virtual/test_process.py"),
+)
 
 # A loaded machine is no finding; the examples are what counts.
 settings.register_profile("house", deadline=None)
@@ -27,7 +30,8 @@ SHARED = {name: ROOT.parents[1] / "shared" / name for name in NAMES}
 
 
 def pytest_report_header() -> str:
-    """Say which recordings of other people are there: without them tests/replay/test_shared_data.py has fewer tests."""
+    """Say which recordings of other people are there: without them tests/lab/simulate/test_shared_data.py has fewer
+    tests."""
     there = (
         f"{name} {'present' if folder.is_dir() else 'ABSENT, its tests do not run'}" for name, folder in SHARED.items()
     )

@@ -9,7 +9,6 @@ from functools import partial
 from importlib.resources import files
 from pathlib import Path
 
-from servod.cia import Abort, Emcy, Obj402
 from servod.drivers.virtual.dictionary import SdoRefusal
 from servod.drivers.virtual.drive_faults import DriveFaults, can_brake
 from servod.drivers.virtual.drive_record import DriveRecord
@@ -22,7 +21,8 @@ from servod.drivers.virtual.power_state import ENERGISED, Command, Ramp
 from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.drivers.virtual.status_word import status_word
 from servod.drivers.virtual.timeline import Timeline
-from servod.hal import DriveState, Mode
+from servod.runtime.fieldbus.cia import Abort, Emcy, Obj402
+from servod.runtime.fieldbus.devices import DriveState, Mode
 
 AMPLIFIER_EDS = Path(str(files("servod.drivers") / "eds" / "amplifier.eds"))
 #: Set-up objects that refuse writing while the drive produces torque (08000022).

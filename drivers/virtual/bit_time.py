@@ -6,7 +6,7 @@ bits of every frame would cost more than everything else that the hub does; a bu
 
 from __future__ import annotations
 
-from servod.bus import CAN_EFF_FLAG, CAN_RTR_FLAG
+from servod.runtime.fieldbus.bus import CAN_EFF_FLAG, CAN_RTR_FLAG
 
 #: Bits of a base-format data frame with n data bytes: 8n+47 (with interframe space) and the stuff bits of 34+8n bits.
 STANDARD_BITS = tuple(8 * n + 47 + (33 + 8 * n) // 4 for n in range(9))

@@ -11,10 +11,10 @@ import socket
 import struct
 import time
 
-from servod.bus import CAN_ERR_FLAG, CAN_FRAME, BusCounters, Frame
-from servod.bus.frames import count_error_frame
+from servod.common.errors import Unreachable
 from servod.drivers.virtual.bus_faults import BusFault, FaultKind
-from servod.errors import Unreachable
+from servod.runtime.fieldbus.bus import CAN_ERR_FLAG, CAN_FRAME, BusCounters, Frame
+from servod.runtime.fieldbus.bus.frames import count_error_frame
 
 #: What the hub delivers: struct can_frame and the moment (CLOCK_MONOTONIC, ns) at which the frame ended on the bus.
 STAMPED_FRAME = struct.Struct("<IB3x8sQ")
@@ -37,7 +37,8 @@ def connect(path: str) -> socket.socket:
 
 
 class VirtualBus:
-    """servod.bus.Bus over the hub's socket at `channel`. With `can_ids`, only these reach this connection
+    """servod.runtime.fieldbus.bus.Bus over the hub's socket at `channel`. With `can_ids`, only these reach this
+    connection
     (frames that the hub carried before it read the filter excepted).
 
 

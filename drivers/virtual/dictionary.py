@@ -14,7 +14,7 @@ from pathlib import Path
 import canopen
 from canopen.objectdictionary import ODVariable, datatypes
 
-from servod.cia import Abort
+from servod.runtime.fieldbus.cia import Abort
 
 #: Bits of the integer types of CiA 301 that the EDS files use; a negative sign marks the signed ones.
 INTEGER_BITS = {

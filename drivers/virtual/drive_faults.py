@@ -6,7 +6,7 @@ Beside the power machine. The objects 0x2000 are the vendor's: they put causes i
 from __future__ import annotations
 
 from servod.drivers.virtual.dictionary import Dictionary
-from servod.hal import DriveState
+from servod.runtime.fieldbus.devices import DriveState
 
 UNDER_VOLTAGE, OVER_VOLTAGE, SAFE_TORQUE_OFF, MOTOR_TEMPERATURE = 0x3220, 0x3210, 0x5441, 0x4310
 _LOWEST_MV, _HIGHEST_MV = 18_000, 60_000
@@ -17,7 +17,8 @@ _UNUSABLE = (0x2, 0x3, 0x5)
 
 class DriveFaults:
     """Reads the causes; `0x2000` sub 1 error code, 2 safe torque off, 3 supply in mV, 4 local control, 5 the state
-    (servod.hal.DriveState) in which control words do nothing, 6 the transition that control words do not cause."""
+    (servod.runtime.fieldbus.devices.DriveState) in which control words do nothing, 6 the transition that control
+    words do not cause."""
 
     def __init__(self, dictionary: Dictionary) -> None:
         self._injected = dictionary.entry(0x2000, 1)

@@ -13,8 +13,8 @@ from io import BufferedRandom
 from pathlib import Path
 from typing import NamedTuple
 
-from servod.errors import BadInput
-from servod.hal import DriveState
+from servod.common.errors import BadInput
+from servod.runtime.fieldbus.devices import DriveState
 
 #: magic, size of a sample, capacity in samples, samples written since the start
 _HEADER = struct.Struct("<8sIIQ")

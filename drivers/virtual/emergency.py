@@ -9,9 +9,9 @@ import struct
 from collections import deque
 from collections.abc import Callable
 
-from servod.cia import Abort, Emcy, Obj301
 from servod.drivers.virtual.dictionary import Dictionary, SdoRefusal
 from servod.drivers.virtual.timeline import Timeline
+from servod.runtime.fieldbus.cia import Abort, Emcy, Obj301
 
 _FRAME = struct.Struct("<HB5s")
 _HISTORY = 8

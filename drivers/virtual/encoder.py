@@ -11,13 +11,13 @@ import random
 from importlib.resources import files
 from pathlib import Path
 
-from servod.cia import Abort, Obj406
+from servod.common.units import NS_PER_S, TWO_PI
 from servod.drivers.virtual.dictionary import SdoRefusal
 from servod.drivers.virtual.joint import Joint
 from servod.drivers.virtual.node import Node, Send
 from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.drivers.virtual.timeline import Timeline
-from servod.units import NS_PER_S, TWO_PI
+from servod.runtime.fieldbus.cia import Abort, Obj406
 
 ENCODER_EDS = Path(str(files("servod.drivers") / "eds" / "encoder.eds"))
 _CODE_SEQUENCE, _SCALING = 0x1, 0x4

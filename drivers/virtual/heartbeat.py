@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from servod.cia import HEARTBEAT_BASE, Abort, NmtState, Obj301
 from servod.drivers.virtual.dictionary import Dictionary, Entry, SdoRefusal
 from servod.drivers.virtual.timeline import Timeline, Timer
+from servod.runtime.fieldbus.cia import HEARTBEAT_BASE, Abort, NmtState, Obj301
 
 NS_PER_MS = 1_000_000
 

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from functools import partial
 
+from servod.common.units import NS_PER_S
 from servod.drivers.virtual.bit_time import ERROR_BITS, arbitration_key, frame_bits
 from servod.drivers.virtual.bus_faults import FaultKind
 from servod.drivers.virtual.frame_faults import UNHURT, Delivery, FrameFaults
 from servod.drivers.virtual.port import ErrorState, Port
 from servod.drivers.virtual.timeline import NEVER, Timeline
-from servod.units import NS_PER_S
 
 #: What a destroyed frame adds to the transmitter's and the receivers' error counters.
 TRANSMIT_ERROR_STEP, RECEIVE_ERROR_STEP = 8, 1

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from servod.cia import SYNC_ID
 from servod.drivers.virtual.bus_faults import FRAME_KINDS, MYSELF, BusFault, FaultKind
 from servod.drivers.virtual.port import Port
+from servod.runtime.fieldbus.cia import SYNC_ID
 
 if TYPE_CHECKING:
     from servod.drivers.virtual.world import World

@@ -6,9 +6,9 @@ one period that the SYNC rules of CANopen already cost.
 
 from __future__ import annotations
 
-from servod.axis_model import AxisModel
-from servod.models.plant import Plant
-from servod.units import NS_PER_S
+from servod.common.units import NS_PER_S
+from servod.formats.model.axis_model import AxisModel
+from servod.kernels.physics.plant import Plant
 
 
 class Joint:

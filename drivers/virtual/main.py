@@ -13,16 +13,16 @@ import time
 from pathlib import Path
 from typing import Any
 
-from servod.axis_model import load_rotary_model
+from servod.common.end_signals import on_end_signals
+from servod.common.errors import ServodError
+from servod.common.shipped import shipped
+from servod.common.yaml import load_model, validate
 from servod.drivers.virtual.drive_record import DriveRecord
 from servod.drivers.virtual.on_can import CanServer, open_pair
 from servod.drivers.virtual.server import HubServer, Timing
 from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.drivers.virtual.world import World
-from servod.end_signals import on_end_signals
-from servod.errors import ServodError
-from servod.shipped import shipped
-from servod.yaml12 import load_model, validate
+from servod.formats.model.axis_model import load_rotary_model
 
 _EXAMPLE = "example: servod-virtual-axis --socket /tmp/vbus0 --plant joint.yaml --record drive.bin --seed 7"
 #: Options that override a key of the settings, with their types.
@@ -91,7 +91,7 @@ def _take_turns_first(priority: int) -> str:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run until told to stop; returns its exit code (servod.errors)."""
+    """Run until told to stop; returns its exit code (servod.common.errors)."""
     arguments = _parser().parse_args(argv)
     try:
         server = _server(arguments)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from servod.cia import Obj402
+from servod.common.units import PER_MILLE
 from servod.drivers.virtual.dictionary import Dictionary
 from servod.drivers.virtual.joint import Joint
 from servod.drivers.virtual.motor_sensor import MotorSensor
@@ -16,8 +16,8 @@ from servod.drivers.virtual.power_state import Ramp
 from servod.drivers.virtual.servo import TICK_NS, TICK_S, Brake, Profile, VelocityLoop, position_to_velocity
 from servod.drivers.virtual.timeline import Timeline
 from servod.drivers.virtual.torque_limits import TorqueLimits
-from servod.hal import Mode
-from servod.units import PER_MILLE
+from servod.runtime.fieldbus.cia import Obj402
+from servod.runtime.fieldbus.devices import Mode
 
 _POLARITY_TORQUE = 0x20
 _HALT, _NEW_SET_POINT, _RELATIVE = 0x100, 0x10, 0x40

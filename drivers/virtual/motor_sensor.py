@@ -5,10 +5,10 @@ Between the joint and everything in the amplifier that needs position or velocit
 
 from __future__ import annotations
 
-from servod.cia import Obj402
+from servod.common.units import NS_PER_S, TWO_PI
 from servod.drivers.virtual.dictionary import Dictionary
 from servod.drivers.virtual.joint import Joint
-from servod.units import NS_PER_S, TWO_PI
+from servod.runtime.fieldbus.cia import Obj402
 
 _CUTOFF_RAD_S = TWO_PI * 200.0
 #: Samples closer together than this keep the velocity that was known [ns].

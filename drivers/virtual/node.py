@@ -11,8 +11,17 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-from servod.bus import CAN_RTR_FLAG
-from servod.cia import (
+from servod.drivers.virtual.dictionary import Dictionary
+from servod.drivers.virtual.emergency import Emergency
+from servod.drivers.virtual.heartbeat import HeartbeatConsumer, HeartbeatProducer
+from servod.drivers.virtual.lss import LssSlave
+from servod.drivers.virtual.pdo_engine import PdoEngine
+from servod.drivers.virtual.port import ErrorState
+from servod.drivers.virtual.sdo_server import SdoServer
+from servod.drivers.virtual.storage import Storage
+from servod.drivers.virtual.timeline import Timeline
+from servod.runtime.fieldbus.bus import CAN_RTR_FLAG
+from servod.runtime.fieldbus.cia import (
     HEARTBEAT_BASE,
     LSS_FROM_SLAVE_ID,
     LSS_TO_SLAVE_ID,
@@ -24,15 +33,6 @@ from servod.cia import (
     NmtState,
     Obj301,
 )
-from servod.drivers.virtual.dictionary import Dictionary
-from servod.drivers.virtual.emergency import Emergency
-from servod.drivers.virtual.heartbeat import HeartbeatConsumer, HeartbeatProducer
-from servod.drivers.virtual.lss import LssSlave
-from servod.drivers.virtual.pdo_engine import PdoEngine
-from servod.drivers.virtual.port import ErrorState
-from servod.drivers.virtual.sdo_server import SdoServer
-from servod.drivers.virtual.storage import Storage
-from servod.drivers.virtual.timeline import Timeline
 
 Send = Callable[[int, bytes, int], object]
 _ERROR_PASSIVE = 0x8120

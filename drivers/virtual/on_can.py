@@ -8,17 +8,17 @@ from __future__ import annotations
 import select
 import time
 
-from servod.axis_model import AxisModel
-from servod.bus import Bus
-from servod.bus.open import open_bus
-from servod.config import BusConfig
+from servod.common.units import NS_PER_S
 from servod.drivers.virtual.drive_record import DriveRecord
 from servod.drivers.virtual.node import Node, Send
 from servod.drivers.virtual.port import ErrorState
 from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.drivers.virtual.timeline import Timeline
 from servod.drivers.virtual.world import Devices
-from servod.units import NS_PER_S
+from servod.formats.config import BusConfig
+from servod.formats.model.axis_model import AxisModel
+from servod.runtime.fieldbus.bus import Bus
+from servod.runtime.fieldbus.bus.open import open_bus
 
 _LONGEST_WAIT_S = 0.1
 _BURST = 64

@@ -11,11 +11,11 @@ import struct
 from collections.abc import Callable
 from typing import Protocol
 
-from servod.cia import PDO_NO_RTR, PDO_NOT_VALID, Emcy
 from servod.drivers.virtual.dictionary import Dictionary, Entry
 from servod.drivers.virtual.emergency import Emergency
 from servod.drivers.virtual.pdo_rules import PdoRules
 from servod.drivers.virtual.timeline import Timeline
+from servod.runtime.fieldbus.cia import PDO_NO_RTR, PDO_NOT_VALID, Emcy
 
 _CODES = {8: "b", 16: "h", 32: "i", 64: "q"}
 _NS_PER_MS, _NS_PER_100US = 1_000_000, 100_000

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from servod.cia import Emcy, Obj301
 from servod.drivers.virtual.dictionary import Dictionary, Entry
 from servod.drivers.virtual.emergency import Emergency
 from servod.drivers.virtual.pdo import Application, Rpdo, Tpdo
 from servod.drivers.virtual.timeline import Timeline
+from servod.runtime.fieldbus.cia import Emcy, Obj301
 
 _PDOS = 4
 

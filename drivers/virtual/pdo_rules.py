@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from servod.cia import PDO_NOT_VALID, Abort
 from servod.drivers.virtual.dictionary import Dictionary, Entry, SdoRefusal
+from servod.runtime.fieldbus.cia import PDO_NOT_VALID, Abort
 
 _MAX_ENTRIES, _MAX_BITS = 8, 64
 #: Identifiers that no PDO may use (CiA 301, table of restricted COB-IDs).

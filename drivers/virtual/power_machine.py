@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from servod.cia import Obj402
 from servod.drivers.virtual.power_state import ENERGISED, TRANSITIONS, Command, Ramp, decode_command
-from servod.hal import DriveState
+from servod.runtime.fieldbus.cia import Obj402
+from servod.runtime.fieldbus.devices import DriveState
 
 _S = DriveState
 _FAULT_RESET = 0x80

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from servod.hal import DriveState as S
+from servod.runtime.fieldbus.devices import DriveState as S
 
 
 class Command(IntEnum):

@@ -11,9 +11,9 @@ from typing import Any
 
 import can
 
-from servod.bus import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_FRAME, CAN_RTR_FLAG
+from servod.common.errors import Unreachable
 from servod.drivers.virtual.client import STAMPED_FRAME, connect
-from servod.errors import Unreachable
+from servod.runtime.fieldbus.bus import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_FRAME, CAN_RTR_FLAG
 
 _ID_MASK = 0x1FFFFFFF
 #: How long `send` waits for a full queue unless told: a full one is empty again within some 10 ms at 1 Mbit/s.

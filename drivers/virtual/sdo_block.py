@@ -9,8 +9,8 @@ import struct
 from binascii import crc_hqx
 from collections.abc import Callable
 
-from servod.cia import Abort
 from servod.drivers.virtual.dictionary import Dictionary, SdoRefusal
+from servod.runtime.fieldbus.cia import Abort
 
 _HEAD = struct.Struct("<BHBI")
 _BLOCK_SEGMENTS = 127

@@ -10,11 +10,11 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from servod.cia import Abort
+from servod.common.units import NS_PER_S
 from servod.drivers.virtual.dictionary import Dictionary, Failure, SdoRefusal
 from servod.drivers.virtual.sdo_block import BlockDownload, BlockUpload
 from servod.drivers.virtual.timeline import Timeline
-from servod.units import NS_PER_S
+from servod.runtime.fieldbus.cia import Abort
 
 _HEAD = struct.Struct("<BHB4s")
 _ABORT = struct.Struct("<BHBI")

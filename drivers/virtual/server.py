@@ -14,19 +14,13 @@ import time
 from enum import Enum
 from pathlib import Path
 
-from servod.bus import (
-    CAN_ERR_BUSOFF,
-    CAN_ERR_CRTL,
-    CAN_ERR_FLAG,
-    CAN_ERR_RESTARTED,
-    CAN_FRAME,
-)
+from servod.common.errors import BadInput, Unreachable
+from servod.common.units import NS_PER_S
 from servod.drivers.virtual.bus_faults import BusFault, FaultKind, kind_of
 from servod.drivers.virtual.client import STAMPED_FRAME
 from servod.drivers.virtual.port import ErrorState, Port
 from servod.drivers.virtual.world import World
-from servod.errors import BadInput, Unreachable
-from servod.units import NS_PER_S
+from servod.runtime.fieldbus.bus import CAN_ERR_BUSOFF, CAN_ERR_CRTL, CAN_ERR_FLAG, CAN_ERR_RESTARTED, CAN_FRAME
 
 _CRTL_RX_OVERFLOW, _CRTL_TX_PASSIVE, _CRTL_ACTIVE = 0x01, 0x20, 0x40
 #: Stamped timing delivers frames at once; the modelled bus may run ahead of the wall clock by this, then frames wait.

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 
+from servod.common.units import NS_PER_S, TWO_PI
 from servod.drivers.virtual.power_state import Ramp
-from servod.units import NS_PER_S, TWO_PI
 
 TICK_NS = 500_000
 TICK_S = TICK_NS / NS_PER_S

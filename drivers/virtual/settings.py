@@ -9,8 +9,8 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from servod.config import NodeId
-from servod.yaml12 import Strict
+from servod.common.yaml import Strict
+from servod.formats.config import NodeId
 
 
 class VirtualAxisSettings(Strict):

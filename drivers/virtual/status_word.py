@@ -5,9 +5,9 @@ Used by the amplifier at each refresh.
 
 from __future__ import annotations
 
-from servod import cia
 from servod.drivers.virtual.power_state import STATUS_BITS
-from servod.hal import DriveState
+from servod.runtime.fieldbus import cia
+from servod.runtime.fieldbus.devices import DriveState
 
 _FOLLOWING_ERROR = 1 << 13
 

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from servod.cia import Abort, Obj301
 from servod.drivers.virtual.dictionary import Dictionary, SdoRefusal
+from servod.runtime.fieldbus.cia import Abort, Obj301
 
 SAVE, LOAD = 0x65766173, 0x64616F6C  # "save", "load"
 #: Sub-index of 0x1010 and 0x1011 -> range of objects.

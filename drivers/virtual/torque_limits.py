@@ -6,8 +6,8 @@ are taken as proportional, as in a synchronous motor below field weakening.
 
 from __future__ import annotations
 
-from servod.cia import Obj402
 from servod.drivers.virtual.dictionary import Dictionary
+from servod.runtime.fieldbus.cia import Obj402
 
 RATED_PERMILLE = 1000
 #: Thermal reserve: (torque/rated)^2 - 1, integrated over time in s; at this much the torque falls back to rated.

@@ -9,8 +9,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from typing import NamedTuple
 
-from servod.axis_model import AxisModel, rotary
-from servod.bus import BusCounters, Frame
+from servod.common.units import NS_PER_S
 from servod.drivers.virtual.amplifier import AmplifierNode
 from servod.drivers.virtual.bus_faults import BusFault
 from servod.drivers.virtual.drive_record import DriveRecord
@@ -22,7 +21,8 @@ from servod.drivers.virtual.node import Node, Send
 from servod.drivers.virtual.port import ErrorState, Port
 from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.drivers.virtual.timeline import Timeline
-from servod.units import NS_PER_S
+from servod.formats.model.axis_model import AxisModel, rotary
+from servod.runtime.fieldbus.bus import BusCounters, Frame
 
 __all__ = ["SteppedBus", "SteppedClock", "SteppedWorld", "Truth", "VirtualAxisSettings", "World"]
 
@@ -151,7 +151,7 @@ class World:
 
 
 class SteppedClock:
-    """servod.clock.Clock of the stepped world: sleeping is what makes time pass."""
+    """servod.common.clock.Clock of the stepped world: sleeping is what makes time pass."""
 
     def __init__(self, world: World, start_ns: int) -> None:
         self._world, self._now_ns = world, start_ns
@@ -172,7 +172,7 @@ class SteppedClock:
 
 
 class SteppedBus:
-    """servod.bus.Bus inside the process; `receive` lets virtual time pass until a frame comes."""
+    """servod.runtime.fieldbus.bus.Bus inside the process; `receive` lets virtual time pass until a frame comes."""
 
     def __init__(self, world: World, clock: SteppedClock, can_ids: tuple[int, ...] | None = None) -> None:
         self._world, self._clock = world, clock

@@ -1,7 +1,8 @@
 """`servoctl`: the command line for commissioning. One file per verb; each imports what it needs only when it runs.
 
 Stands above everything else and holds nothing that acts by itself: it talks to the daemon over its control socket, or
-works on files alone. Exit codes are those of servod.errors: 0 done, 1 the answer is no, 2 bad input, 3 unreachable.
+works on files alone. Exit codes are those of servod.common.errors: 0 done, 1 the answer is no, 2 bad input, 3
+unreachable.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ from servod.cli import (
     verify,
 )
 from servod.cli.common import drop_empty_folders
-from servod.errors import BadInput, ServodError
+from servod.common.errors import BadInput, ServodError
 
 _INTERRUPTED = 130  # as shells count SIGINT
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from servod.cli.common import JsonOption, example, print_json
-from servod.errors import BadInput
+from servod.common.errors import BadInput
 
 _app = typer.Typer(
     help=example("Check files before they are used.", "servoctl config check /etc/servod/axis.yaml"),
@@ -48,7 +48,7 @@ def _config() -> None:
 
 
 def _check(file: Path) -> dict[str, str]:
-    from servod.yaml12 import parse_yaml, plain_name, read_text
+    from servod.common.yaml import parse_yaml, plain_name, read_text
 
     if file.suffix.lower() in (".eds", ".dcf"):
         return {"kind": "EDS", "note": _check_eds(file)}
@@ -71,11 +71,11 @@ def _recognise(file: Path, keys: dict[Any, Any]) -> tuple[str, Callable[[Path], 
 
 def _check_axis(file: Path) -> str:
     """The configuration and everything that it names: drivers, quirks, EDS, gain set, model."""
-    from servod.config import load_config
     from servod.drivers.quirks import load_quirks
-    from servod.gains import load_gains, require_fit
-    from servod.master.planned import check_names, planned_bus_load
-    from servod.wiring_expected import with_expected
+    from servod.formats.config import load_config
+    from servod.formats.gains.gain_set import load_gains, require_fit
+    from servod.formats.wiring import with_expected
+    from servod.runtime.fieldbus.master.planned import check_names, planned_bus_load
 
     config = load_config(file)
     notes = check_names(config, str(file))
@@ -95,7 +95,7 @@ def _check_axis(file: Path) -> str:
 
 
 def _check_gains(file: Path) -> str:
-    from servod.gains import load_gains
+    from servod.formats.gains.gain_set import load_gains
 
     gains = load_gains(file)
     problem = gains.certificate_problem()
@@ -103,21 +103,21 @@ def _check_gains(file: Path) -> str:
 
 
 def _check_model(file: Path) -> str:
-    from servod.axis_model import load_axis_model
+    from servod.formats.model.axis_model import load_axis_model
 
     load_axis_model(file)
     return ""
 
 
 def _check_map(file: Path) -> str:
-    from servod.recordings.columns import load_column_map
+    from servod.lab.recordings.columns import load_column_map
 
     load_column_map(file)
     return ""
 
 
 def _check_eds(file: Path) -> str:
-    from servod.master.eds import load_dictionary
+    from servod.runtime.fieldbus.master.eds import load_dictionary
 
     dictionary = load_dictionary(file, node_id=1)
     mended = f"; mended: {'; '.join(dictionary.report)}" if dictionary.report else ""

@@ -21,10 +21,10 @@ from servod.cli.common import (
     print_json,
 )
 from servod.cli.progress import Tell, progress
-from servod.errors import BadInput
+from servod.common.errors import BadInput
 
 if TYPE_CHECKING:
-    from servod.commission.axis import WalkAxis
+    from servod.client.commission_axis import WalkAxis
 
 _HELP = example(
     "Identify the axis, synthesize and verify a gain set for it, deploy it with proof, compare, and report. "
@@ -62,11 +62,11 @@ def commission(
 ) -> None:
     """Walk from identification to validation in OUT; exit code 1 when a step's answer is no."""
     one_thread()
-    from servod.commission.questions import Questions
-    from servod.commission.result import failure, result
-    from servod.commission.steps import STEPS
-    from servod.commission.walk import Options, StepFailed, Walk, run
-    from servod.demo.processes import sigterm_as_interrupt
+    from servod.client.processes import sigterm_as_interrupt
+    from servod.lab.commission.questions import Questions
+    from servod.lab.commission.result import failure, result
+    from servod.lab.commission.steps import STEPS
+    from servod.lab.commission.walk import Options, StepFailed, Walk, run
 
     axis = _virtual(plant, config, settings, encoder_counts, seed) if plant else _on_daemon(socket, config)
     need_folder("--out", out)
@@ -94,11 +94,11 @@ def commission(
 def _virtual(
     plant: Path, config: Path | None, settings: Path | None, encoder_counts: int | None, seed: int
 ) -> WalkAxis:
-    from servod.axis_model import load_rotary_model
-    from servod.commission.axis import VirtualWalkAxis
-    from servod.config import load_config
+    from servod.client.commission_axis import VirtualWalkAxis
+    from servod.common.yaml import load_model
     from servod.drivers.virtual.settings import VirtualAxisSettings
-    from servod.yaml12 import load_model
+    from servod.formats.config import load_config
+    from servod.formats.model.axis_model import load_rotary_model
 
     chosen = load_config(config) if config is not None else None
     devices = load_model(settings, VirtualAxisSettings) if settings is not None else None
@@ -106,8 +106,8 @@ def _virtual(
 
 
 def _on_daemon(socket: Path, config: Path | None) -> WalkAxis:
-    from servod.commission.axis import DaemonWalkAxis
-    from servod.config import load_config
+    from servod.client.commission_axis import DaemonWalkAxis
+    from servod.formats.config import load_config
 
     if config is None:
         raise BadInput("--config", "nothing", "the configuration that the daemon runs with, or --plant")

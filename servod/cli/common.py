@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servod.errors import BadInput, Unreachable
+from servod.common.errors import BadInput, Unreachable
 
 if TYPE_CHECKING:
-    from servod.control import ControlClient
+    from servod.client.control import ControlClient
 
 DEFAULT_SOCKET = Path("/run/servod/axis.sock")
 
@@ -38,7 +38,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON documen
 
 def connect(socket: Path) -> ControlClient:
     """A client of the daemon at `socket`; raises Unreachable when nobody listens there."""
-    from servod.control import ControlClient
+    from servod.client.control import ControlClient
 
     return ControlClient(socket)
 

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from servod.cli.common import JsonOption, example, need_folder, print_json
-from servod.errors import BadInput
+from servod.common.errors import BadInput
 
 if TYPE_CHECKING:
-    from servod.demo.entries import Entry
-    from servod.demo.runs import Run
+    from servod.qualify.demo.entries import Entry
+    from servod.qualify.demo.runs import Run
 
 _HELP = example(
     "Run daemon and virtual axis, track the paper's trajectory (19) under PD, PD + DOB, PD + LuGre and the local-model "
@@ -57,11 +57,11 @@ def demo(
         return
     if conceal is not None:
         raise BadInput("--conceal", conceal, "only with --diagnose")
-    from servod.axis_model import load_rotary_model
-    from servod.demo.axis import plant_file
-    from servod.demo.entries import entries, further_files
-    from servod.demo.runs import summary
-    from servod.report.demo import Story, write_demo_page
+    from servod.formats.model.axis_model import load_rotary_model
+    from servod.qualify.demo.axis import plant_file
+    from servod.qualify.demo.entries import entries, further_files
+    from servod.qualify.demo.report import Story, write_demo_page
+    from servod.qualify.demo.runs import summary
 
     # Everything that can be refused is refused before anything is started.
     further = gains or (further_files() if fast and plant is None else [])
@@ -88,8 +88,8 @@ def demo(
 def _diagnose(plant: Path | None, conceal: str | None, fast: bool, out: Path, as_json: bool) -> None:
     """The other demo: an axis that conceals something; on Table I's joint unless another is given."""
     from servod.cli.demo_diagnose import demo_diagnose
-    from servod.recovery.concealed import DEFAULT
-    from servod.shipped import shipped
+    from servod.common.shipped import shipped
+    from servod.qualify.demo.recovery.concealed import DEFAULT
 
     joint = plant or shipped("gains/axes/table1_joint.yaml")
     demo_diagnose(joint, conceal or DEFAULT, fast, out, as_json)
@@ -101,10 +101,10 @@ def _run(
     """The runs, and the real-time rights that the loop was refused; none are asked for in virtual time."""
     with _progress(quiet, seconds, rows) as tell:
         if fast:
-            from servod.demo.fast import run_fast
+            from servod.qualify.demo.fast import run_fast
 
             return run_fast(plant, seconds, rows, tell), []
-        from servod.demo.wall import run_wall
+        from servod.qualify.demo.wall import run_wall
 
         return run_wall(plant, seconds, rows, recordings, tell)
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from servod.cli.common import need_folder, one_thread, print_json
 from servod.cli.progress import progress
-from servod.errors import AnswerIsNo
+from servod.common.errors import AnswerIsNo
 
 #: Share of the cost that must come back.
 LEAST_RECOVERED = 0.8
@@ -17,12 +17,12 @@ LEAST_RECOVERED = 0.8
 def demo_diagnose(plant: Path, effect: str, fast: bool, out: Path, as_json: bool) -> None:
     """Run the story on `plant` and print it. Raises AnswerIsNo when less than LEAST_RECOVERED comes back."""
     one_thread()
-    from servod.axis_model import load_rotary_model
-    from servod.demo.processes import sigterm_as_interrupt
-    from servod.recovery.axes import daemon_axis, stepped_axis
-    from servod.recovery.concealed import believed_and_true
-    from servod.recovery.page import write_recovery_page
-    from servod.recovery.walk import recover
+    from servod.client.open import daemon_axis, stepped_axis
+    from servod.client.processes import sigterm_as_interrupt
+    from servod.formats.model.axis_model import load_rotary_model
+    from servod.qualify.demo.recovery.concealed import believed_and_true
+    from servod.qualify.demo.recovery.page import write_recovery_page
+    from servod.qualify.demo.recovery.walk import recover
 
     believed, true = believed_and_true(load_rotary_model(plant), effect)
     need_folder("--out", out)
@@ -47,7 +47,7 @@ def demo_diagnose(plant: Path, effect: str, fast: bool, out: Path, as_json: bool
 def _print(document: dict[str, Any]) -> None:
     rms = document["rms_error_mrad"]
     found = ", ".join(f"{f['effect']} ({f['confidence']:.2f})" for f in document["findings"]) or document["verdict"]
-    from servod.recovery.walk import within
+    from servod.qualify.demo.recovery.walk import within
 
     share = {key: f"certified {within(scale)}" for key, scale in document["uncertainty_scale"].items()}
     print(f"as believed         {rms['before']:.4f} mrad RMS on trajectory (19), {share['before']}")

@@ -13,12 +13,12 @@ import typer
 
 from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, connect, example, one_thread, print_json
 from servod.cli.progress import progress
-from servod.errors import AnswerIsNo, BadInput
+from servod.common.errors import AnswerIsNo, BadInput
 
 if TYPE_CHECKING:
-    from servod.config import AxisConfig
-    from servod.deploy.links import DeployLink
-    from servod.gains import GainSet
+    from servod.client.links import DeployLink
+    from servod.formats.config import AxisConfig
+    from servod.formats.gains.gain_set import GainSet
 
 _HELP = example(
     "Run a validation motion under the present set and under GAINS, and keep GAINS only when it is no worse and does "
@@ -46,8 +46,8 @@ def deploy(
 ) -> None:
     """Deploy GAINS; exit code 1 when the axis was rolled back, or when GAINS ran already and broke its promise."""
     one_thread()
-    from servod.deploy.deployment import admitted, announced, deploy
-    from servod.gains import load_gains, require_certificate
+    from servod.formats.gains.gain_set import load_gains, require_certificate
+    from servod.lab.deploy.deployment import admitted, announced, deploy
 
     wanted = load_gains(gains)
     if present is not None and plant is None:
@@ -71,8 +71,8 @@ def deploy(
 
 @contextmanager
 def _on_daemon(socket: Path) -> Iterator[DeployLink]:
-    from servod.demo.processes import sigterm_as_interrupt
-    from servod.deploy.daemon_link import DaemonDeployLink
+    from servod.client.deploy_daemon import DaemonDeployLink
+    from servod.client.processes import sigterm_as_interrupt
 
     with connect(socket) as client, sigterm_as_interrupt():
         yield DaemonDeployLink(client)
@@ -82,10 +82,10 @@ def _on_daemon(socket: Path) -> Iterator[DeployLink]:
 def _virtual(
     plant: Path, present: Path | None, config: Path | None, wanted: GainSet, seed: int
 ) -> Iterator[DeployLink]:
-    from servod.axis_model import load_axis_model
-    from servod.config import load_config
-    from servod.deploy.virtual import virtual_link
-    from servod.gains import load_gains
+    from servod.client.deploy_virtual import virtual_link
+    from servod.formats.config import load_config
+    from servod.formats.gains.gain_set import load_gains
+    from servod.formats.model.axis_model import load_axis_model
 
     joint = load_axis_model(plant)
     chosen: AxisConfig | None = load_config(config) if config is not None else None

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from servod.cli.common import JsonOption, example, need_folder, one_thread, print_json
-from servod.errors import AnswerIsNo, BadInput
+from servod.common.errors import AnswerIsNo, BadInput
 
 if TYPE_CHECKING:
-    from servod.axis_model import AxisModel
-    from servod.diagnose.engine import Diagnosis
-    from servod.recordings import Recording
+    from servod.formats.model.axis_model import AxisModel
+    from servod.lab.diagnose.engine import Diagnosis
+    from servod.lab.recordings import Recording
 
 EXAMPLE = "servoctl diagnose --model model.yaml run1.csv.gz run2.csv.gz --out diagnosis"
 
@@ -41,9 +41,9 @@ def diagnose(
     if not 1.0 <= time_limit <= 1e5:
         raise BadInput("--time-limit", repr(time_limit), "seconds from 1 to 100000")
     one_thread()
-    from servod.axis_model import load_axis_model
-    from servod.diagnose.engine import diagnose as run
-    from servod.report.diagnosis_files import write_files
+    from servod.formats.model.axis_model import load_axis_model
+    from servod.lab.diagnose.engine import diagnose as run
+    from servod.lab.report.diagnosis_files import write_files
 
     axis = load_axis_model(model)
     _need_own_folder(out, model)
@@ -61,8 +61,8 @@ def diagnose(
 
 def _need_own_folder(out: Path, model: Path) -> None:
     """See that nothing of other origin in `out` would be overwritten. Raises BadInput."""
-    from servod.report.diagnosis import PAGE
-    from servod.report.diagnosis_files import DOCUMENT, MODEL
+    from servod.lab.report.diagnosis import PAGE
+    from servod.lab.report.diagnosis_files import DOCUMENT, MODEL
 
     if model.resolve() == (out / MODEL).resolve():
         raise BadInput("--model", str(model), "a file that the diagnosis in --out does not replace")
@@ -74,7 +74,7 @@ def _need_own_folder(out: Path, model: Path) -> None:
 
 
 def _load(paths: list[Path], map_file: Path | None, axis: AxisModel, model: Path) -> list[Recording]:
-    from servod.recordings import load_recording
+    from servod.lab.recordings import load_recording
 
     recorded = [load_recording(path, map_file) for path in paths]
     for recording in recorded:

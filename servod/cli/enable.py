@@ -43,7 +43,7 @@ def enable(
 
 def _enable_or_leave_off(socket: Path, **arguments: bool) -> dict[str, Any]:
     """Enable and wait; whatever interrupts it has the axis off before it ends the command."""
-    from servod.demo.processes import sigterm_as_interrupt
+    from servod.client.processes import sigterm_as_interrupt
 
     with connect(socket) as client, sigterm_as_interrupt():
         try:

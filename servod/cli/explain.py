@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from servod.cli.common import JsonOption, example, print_json
-from servod.errors import BadInput
+from servod.common.errors import BadInput
 
 EXAMPLE = "servoctl explain stribeck"
 
@@ -26,8 +26,8 @@ def explain(
     as_json: JsonOption = False,
 ) -> None:
     """Print the equation, source, keys (units, ranges), signature and separating experiment of EFFECT."""
-    from servod.diagnose.effects import NAMES
-    from servod.diagnose.explain import explained, listed
+    from servod.lab.diagnose.effects import NAMES
+    from servod.lab.diagnose.explain import explained, listed
 
     if effect is None:
         document: Any = listed()

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from servod.cli.common import JsonOption, example, need_folder, print_json
-from servod.errors import FAULTS, AnswerIsNo, BadInput
+from servod.common.errors import FAULTS, AnswerIsNo, BadInput
 
 if TYPE_CHECKING:
-    from servod.campaign.run import Outcome
-    from servod.campaign.scenario import Scenario
+    from servod.qualify.faults.run import Outcome
+    from servod.qualify.faults.scenario import Scenario
 
 _HELP = example(
     "Run the fault campaign on the virtual axis: every scenario injects its faults, the drive's own record says when "
@@ -74,8 +74,8 @@ def _refuse_beside_codes(**options: object) -> None:
 
 def _chosen(files: list[Path] | None, only: str | None, group: str | None, stepped: bool) -> dict[str, Scenario]:
     """The scenarios to run. Raises BadInput for a broken file, and when nothing is left."""
-    from servod.campaign.catalogue import load_all, shipped_scenarios
-    from servod.campaign.scenario import Runs
+    from servod.qualify.faults.catalogue import load_all, shipped_scenarios
+    from servod.qualify.faults.scenario import Runs
 
     known = load_all(files) if files else shipped_scenarios()
     runs = {Runs.STEPPED} if stepped else {Runs.STEPPED, Runs.PROCESSES}
@@ -92,7 +92,7 @@ def _chosen(files: list[Path] | None, only: str | None, group: str | None, stepp
 
 def _run(chosen: dict[str, Scenario], jobs: int, found: list[Outcome], quiet: bool) -> None:
     """Run them; each goes into `found`, and is told in a line of standard error, as it comes."""
-    from servod.campaign.campaign import outcomes
+    from servod.qualify.faults.campaign import outcomes
 
     for outcome in outcomes(chosen, jobs):
         found.append(outcome)
@@ -103,7 +103,7 @@ def _run(chosen: dict[str, Scenario], jobs: int, found: list[Outcome], quiet: bo
 
 
 def _report(found: list[Outcome], planned: int, out: Path | None, as_json: bool) -> None:
-    from servod.campaign.document import document, summary, text_table
+    from servod.qualify.faults.document import document, summary, text_table
 
     content = document(found, planned)
     if out is not None:
@@ -120,8 +120,8 @@ def _report(found: list[Outcome], planned: int, out: Path | None, as_json: bool)
 def _write(found: list[Outcome], planned: int, content: dict[str, Any], out: Path) -> None:
     import json
 
-    from servod.campaign.page import write_page
-    from servod.report.files import write_bytes
+    from servod.common.report_files import write_bytes
+    from servod.qualify.faults.page import write_page
 
     write_bytes(out / "faults.json", json.dumps(content, indent=2, allow_nan=False).encode())
     write_page(found, planned, out / "report.html")

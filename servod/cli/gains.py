@@ -29,8 +29,8 @@ def load(
     as_json: JsonOption = False,
 ) -> None:
     """Load a gain set."""
-    from servod.gains import load_gains
-    from servod.yaml12 import read_text
+    from servod.common.yaml import read_text
+    from servod.formats.gains.gain_set import load_gains
 
     load_gains(file)  # refuse here, where the file's name is known
     with connect(socket) as client:
@@ -55,8 +55,8 @@ def list_(socket: SocketOption = DEFAULT_SOCKET, as_json: JsonOption = False) ->
 @_app.command(help=example("Check a gain set file and show what is in it.", "servoctl gains show my_axis.yaml"))
 def show(file: Annotated[Path, typer.Argument(help="Gain set, YAML.")], as_json: JsonOption = False) -> None:
     """Show a gain set."""
-    from servod.gain_verdict import seal_fault
-    from servod.gains import load_gains
+    from servod.formats.gains.gain_set import load_gains
+    from servod.formats.gains.gain_verdict import seal_fault
 
     gains = load_gains(file)
     document, problem, seal = gains.model_dump(mode="json"), gains.certificate_problem(), seal_fault(gains)

@@ -21,13 +21,13 @@ from servod.cli.common import (
     one_thread,
     print_json,
 )
-from servod.errors import BadInput
+from servod.common.errors import BadInput
 
 if TYPE_CHECKING:
-    from servod.axis_model import AxisModel
-    from servod.identify.analysis import Analysis
-    from servod.identify.links import Link
-    from servod.identify.walk import Tell
+    from servod.client.axis import Link
+    from servod.formats.model.axis_model import AxisModel
+    from servod.lab.identify.analysis import Analysis
+    from servod.lab.identify.walk import Tell
 
     Job = Callable[["_Walk", Tell], Analysis]
 
@@ -68,8 +68,8 @@ def identify(
 ) -> None:
     """Run or read the experiments, fit, write the model."""
     one_thread()
-    from servod.axis_model import axis_model_yaml
-    from servod.identify.result import document, model_of
+    from servod.formats.model.axis_model import axis_model_yaml
+    from servod.lab.identify.result import document, model_of
 
     need_file("--out", out)
     if recordings is None:
@@ -108,8 +108,8 @@ class _Walk(NamedTuple):
 
     def on(self, link: Link, tell: Tell, subject: str) -> Analysis:
         """Run all experiments on this axis, and switch it off whatever ends them; `subject` says which one it is."""
-        from servod.demo.processes import sigterm_as_interrupt
-        from servod.identify.walk import identify as walk
+        from servod.client.processes import sigterm_as_interrupt
+        from servod.lab.identify.walk import identify as walk
 
         with sigterm_as_interrupt():
             return walk(
@@ -120,20 +120,20 @@ class _Walk(NamedTuple):
 
 def _from_recordings(folder: Path) -> Job:
     """Reads at once, so that a mistake is told before anything begins."""
-    from servod.identify.analysis import analyse
-    from servod.identify.store import load
+    from servod.lab.identify.analysis import analyse
+    from servod.lab.identify.store import load
 
     traces = load(folder)
     return lambda _walk, _tell: analyse(traces)
 
 
 def _virtual(plant: Path, config: Path | None, settings: Path | None, encoder_counts: int | None, seed: int) -> Job:
-    from servod.axis_model import axis_model_yaml, load_rotary_model
-    from servod.config import load_config
+    from servod.client.axis import SteppedLink
+    from servod.client.virtual import virtual_session
+    from servod.common.yaml import load_model
     from servod.drivers.virtual.settings import VirtualAxisSettings
-    from servod.identify.links import SteppedLink
-    from servod.identify.virtual import virtual_session
-    from servod.yaml12 import load_model
+    from servod.formats.config import load_config
+    from servod.formats.model.axis_model import axis_model_yaml, load_rotary_model
 
     joint, chosen = load_rotary_model(plant), load_config(config) if config is not None else None
     devices = load_model(settings, VirtualAxisSettings) if settings is not None else None
@@ -147,8 +147,8 @@ def _virtual(plant: Path, config: Path | None, settings: Path | None, encoder_co
 
 
 def _on_daemon(socket: Path, config: Path | None) -> Job:
-    from servod.config import load_config
-    from servod.identify.daemon_link import DaemonLink
+    from servod.client.daemon_link import DaemonLink
+    from servod.formats.config import load_config
 
     if config is None:
         raise BadInput(
@@ -166,7 +166,7 @@ def _on_daemon(socket: Path, config: Path | None) -> Job:
 def _identified_in(before: Path | None) -> AxisModel | None:
     if before is None:
         return None
-    from servod.axis_model import load_axis_model
+    from servod.formats.model.axis_model import load_axis_model
 
     model = load_axis_model(before)
     if model.identified is None:
@@ -175,7 +175,7 @@ def _identified_in(before: Path | None) -> AxisModel | None:
 
 
 def _changes(old: AxisModel | None, new: AxisModel) -> dict[str, Any]:
-    from servod.identify.changes import changes
+    from servod.lab.identify.changes import changes
 
     if old is None or old.identified is None or new.identified is None:
         return {}

@@ -10,9 +10,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
-from servod.errors import BadInput
-from servod.loop.channel import TRAJECTORY_SAMPLES
-from servod.yaml12 import read_text
+from servod.common.errors import BadInput
+from servod.common.yaml import read_text
+from servod.runtime.loop.channel import TRAJECTORY_SAMPLES
 
 COLUMNS = ("t_s", "reference_rad")
 #: Spreadsheets begin UTF-8 files with it.

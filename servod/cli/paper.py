@@ -36,8 +36,8 @@ def paper(
     from dataclasses import replace
 
     from servod.cli.progress import progress
-    from servod.paper.walk import QUICK, PaperPlan
-    from servod.paper.walk import paper as run
+    from servod.qualify.paper.walk import QUICK, PaperPlan
+    from servod.qualify.paper.walk import paper as run
 
     need_folder("--out", out)
     plan = replace(QUICK if quick else PaperPlan(), seed=seed)
@@ -51,7 +51,7 @@ def paper(
 
 def print_document(document: dict[str, Any], out: Path) -> None:
     """Print the table of numbers, and how many statements of the paper hold here."""
-    from servod.paper.table import numbers
+    from servod.qualify.paper.table import numbers
 
     table = numbers(document)
     widths = [max(len(line[i]) for line in (table.header, *table.rows)) for i in range(len(table.header))]

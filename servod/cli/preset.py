@@ -28,11 +28,11 @@ def preset(
     """Set the encoder's zero."""
     from contextlib import closing
 
-    from servod.bus.open import open_bus
-    from servod.clock import WallClock
-    from servod.config import load_config
-    from servod.daemon.lock import InstanceLock
-    from servod.master import Master
+    from servod.common.clock import WallClock
+    from servod.formats.config import load_config
+    from servod.runtime.daemon.lock import InstanceLock
+    from servod.runtime.fieldbus.bus.open import open_bus
+    from servod.runtime.fieldbus.master import Master
 
     axis = load_config(config)
     lock = InstanceLock(axis)

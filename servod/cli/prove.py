@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from servod.cli.common import JsonOption, example, need_folder, one_thread
-from servod.errors import BadInput
+from servod.common.errors import BadInput
 
 if TYPE_CHECKING:
-    from servod.prove.trial import Trial
+    from servod.qualify.blind.trial import Trial
 
 _HELP = example(
     "Prove the diagnosis on cases that it has not seen: draw axes, conceal physics in them, record them, seal the "
@@ -87,9 +87,9 @@ def _conceal(out: Path, cases: int, seed: int, harder: bool, sealed: bool) -> No
     from dataclasses import replace
 
     from servod.cli.progress import progress
-    from servod.prove.conceal import conceal, open_cases
-    from servod.prove.plan import HARDER, Settings, plans
-    from servod.prove.trial import FILE, Trial, read_trial, write_trial
+    from servod.qualify.blind.conceal import conceal, open_cases
+    from servod.qualify.blind.plan import HARDER, Settings, plans
+    from servod.qualify.blind.trial import FILE, Trial, read_trial, write_trial
 
     trial, there = Trial(cases, seed, harder), read_trial(out)
     if there is not None and not there.same(trial):
@@ -110,7 +110,7 @@ def _conceal(out: Path, cases: int, seed: int, harder: bool, sealed: bool) -> No
 
 
 def _diagnose(out: Path, jobs: int, time_limit: float) -> None:
-    from servod.prove.examine import Examiner
+    from servod.qualify.blind.examine import Examiner
 
     _sealed(out)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # what runs ends with us, whoever ends us
@@ -125,7 +125,7 @@ def _line(name: str, done: int, of: int) -> None:
 def _score(out: Path, as_json: bool) -> None:
     from servod.cli.common import print_json
     from servod.cli.progress import progress
-    from servod.prove.document import score, write
+    from servod.qualify.blind.document import score, write
 
     trial = _sealed(out)
     with progress("score", quiet=as_json) as tell:
@@ -134,7 +134,7 @@ def _score(out: Path, as_json: bool) -> None:
     if as_json:
         print_json(document)
     else:
-        from servod.prove.tables import text
+        from servod.qualify.blind.tables import text
 
         print(text(document))
         print(f"Page: {out / 'prove.html'}; tables: {out / 'prove.md'}; all figures: {out / 'prove.json'}")
@@ -142,7 +142,7 @@ def _score(out: Path, as_json: bool) -> None:
 
 def _sealed(out: Path) -> Trial:
     """The trial that was sealed in `out`. Raises BadInput when there is none."""
-    from servod.prove.trial import FILE, read_trial
+    from servod.qualify.blind.trial import FILE, read_trial
 
     trial = read_trial(out)
     if trial is None:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, connect, example, report
-from servod.errors import AnswerIsNo, BadInput
+from servod.common.errors import AnswerIsNo, BadInput
 
 _app = typer.Typer(
     help=example("Record every cycle; export a recording.", "servoctl record start", "servoctl record stop"),
@@ -56,8 +56,8 @@ def export(
     as_json: JsonOption = False,
 ) -> None:
     """Export a recording."""
-    from servod.recorder_export import export_csv, export_parquet
-    from servod.recorder_read import read_recording
+    from servod.formats.recording.export import export_csv, export_parquet
+    from servod.formats.recording.mcap_reader import read_recording
 
     writers = {".csv": export_csv, ".parquet": export_parquet}
     if out.suffix not in writers:

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from servod.cli.common import JsonOption, example, print_json
-from servod.errors import BadInput
+from servod.common.errors import BadInput
 
 if TYPE_CHECKING:
-    from servod.axis_model import AxisModel
-    from servod.models.replay import Replay
-    from servod.models.start import Start
-    from servod.recordings import Recording
+    from servod.formats.model.axis_model import AxisModel
+    from servod.lab.recordings import Recording
+    from servod.lab.simulate.replay import Replay
+    from servod.lab.simulate.start import Start
 
 EXAMPLE = "servoctl replay --model model.yaml run.csv.gz --horizon 0.25 --out sim.csv"
 
@@ -44,9 +44,9 @@ def replay(
     horizon_s = parse_horizon(horizon)
     check_out(out)
     first = parse_start(start)
-    from servod.axis_model import load_axis_model
-    from servod.models.replay import replay as simulate
-    from servod.recordings import load_recording
+    from servod.formats.model.axis_model import load_axis_model
+    from servod.lab.recordings import load_recording
+    from servod.lab.simulate.replay import replay as simulate
 
     axis = load_axis_model(model)
     recorded = load_recording(recording, map_file).between(from_s, to_s)
@@ -77,7 +77,7 @@ def parse_horizon(text: str) -> float | None:
 
 def parse_start(text: str) -> Start:
     """What the first row is taken for. Raises BadInput."""
-    from servod.models.start import Start
+    from servod.lab.simulate.start import Start
 
     if text not in set(Start):
         raise BadInput("--start", repr(text), ", ".join(Start))
@@ -96,8 +96,8 @@ def check_out(out: Path | None) -> None:
 
 def write_simulation(out: Path, recorded: Recording, result: Replay) -> None:
     """Write the simulated motion, one row for each recorded row, on the recording's own time stamps."""
-    from servod.recordings import Quantity
-    from servod.recordings.export import write_table
+    from servod.formats.recording.export_rows import write_table
+    from servod.lab.recordings import Quantity
 
     axis = recorded.axis
     write_table(
@@ -130,7 +130,7 @@ def summary(recorded: Recording, axis: AxisModel, result: Replay, horizon_s: flo
 
 def gap_report(recorded: Recording, horizon_s: float | None) -> list[str]:
     """What the replay did at long gaps, in a sentence."""
-    from servod.models.replay import RESTART_GAP_S, behind_gaps
+    from servod.lab.simulate.replay import RESTART_GAP_S, behind_gaps
 
     gaps = len(behind_gaps(recorded.t_s))
     if gaps == 0:

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, example, print_json
-from servod.errors import BadInput, Unreachable, one_line
+from servod.common.errors import BadInput, Unreachable, one_line
 
 if TYPE_CHECKING:
-    from servod.config import BusConfig
+    from servod.formats.config import BusConfig
 
 _HELP = example(
     "List the nodes on the bus with identity, NMT state and LSS. Without --channel the daemon is asked; with it the "
@@ -54,9 +54,9 @@ def _through_daemon(socket: Any) -> list[dict[str, Any]]:
 
 
 def _on_bus(interface: str, channel: str, bit_rate: int, socket: Any) -> list[dict[str, Any]]:
-    from servod.config import BusConfig
-    from servod.daemon.lock import BusLock
-    from servod.yaml12 import validate
+    from servod.common.yaml import validate
+    from servod.formats.config import BusConfig
+    from servod.runtime.daemon.lock import BusLock
 
     config = validate({"interface": interface, "channel": channel, "bit_rate": bit_rate}, BusConfig, "servoctl scan")
     try:
@@ -70,9 +70,9 @@ def _on_bus(interface: str, channel: str, bit_rate: int, socket: Any) -> list[di
 def _scan_bus(config: BusConfig) -> list[dict[str, Any]]:
     from dataclasses import asdict
 
-    from servod.bus.open import open_bus
-    from servod.clock import WallClock
-    from servod.master.scan import scan as scan_bus
+    from servod.common.clock import WallClock
+    from servod.runtime.fieldbus.bus.open import open_bus
+    from servod.runtime.fieldbus.master.scan import scan as scan_bus
 
     nodes = scan_bus(open_bus(config), WallClock())  # closes the bus
     return [asdict(node) | {"lss": node.lss and node.lss._asdict()} for node in nodes]

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from servod.cli.common import JsonOption, example, need_folder, one_thread, print_json
-from servod.errors import BadInput
+from servod.common.errors import BadInput
 
 _HELP = example(
     "Move the virtual axis at random for hours, let faults befall it, recover as a person would, and account for every "
@@ -61,7 +61,7 @@ def soak(
     need_folder("--out", out, alone=True)
     one_thread()
     from servod.cli.progress import progress
-    from servod.soak.launch import Order, launch
+    from servod.qualify.soak.launch import Order, launch
 
     order = Order(cycles or round(hours * _MS_PER_H), seed, wall, limit_hours, out)
     with progress("soak", quiet=as_json) as tell:
@@ -78,7 +78,7 @@ def _print(found: dict[str, Any], out: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from servod.soak.page import PAGE_NAME, count_rows, fault_rows, verdict
+    from servod.qualify.soak.page import PAGE_NAME, count_rows, fault_rows, verdict
 
     console = Console()
     faults = Table("Fault", "Times", "In the log", "Ridden through", "Recovered", "Detected / ms", "Torque gone / ms")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, connect, example, print_json
-from servod.errors import one_line
+from servod.common.errors import one_line
 
 if TYPE_CHECKING:
     from rich.console import Group
@@ -57,7 +57,7 @@ def _watch(documents: Any) -> None:
 
 
 def screen(document: dict[str, Any]) -> Group:
-    """The status document (servod.daemon.status.Status) as one screen."""
+    """The status document (servod.runtime.daemon.status.Status) as one screen."""
     from rich.console import Group
 
     document = _plain(document)

@@ -13,14 +13,14 @@ import typer
 
 from servod.cli import synthesis_options as ask
 from servod.cli.common import JsonOption, example, need_file, one_thread, print_json
-from servod.errors import AnswerIsNo, BadInput
+from servod.common.errors import AnswerIsNo, BadInput
 
 if TYPE_CHECKING:
-    from servod.axis_model import AxisModel
-    from servod.gains import GainSet
-    from servod.synthesize.deployed import Wishes
-    from servod.synthesize.gain_set import Options
-    from servod.synthesize.infeasible import Infeasible
+    from servod.formats.gains.gain_set import GainSet
+    from servod.formats.model.axis_model import AxisModel
+    from servod.lab.synthesize.deployed import Wishes
+    from servod.lab.synthesize.gain_set import Options
+    from servod.lab.synthesize.infeasible import Infeasible
 
 EXAMPLES = (
     "servoctl synthesize --model model.yaml --out gains.yaml",
@@ -64,7 +64,7 @@ def synthesize(
 ) -> None:
     """Synthesize a gain set for MODEL; exit code 1 when the demands cannot be met."""
     one_thread()
-    from servod.axis_model import load_axis_model
+    from servod.formats.model.axis_model import load_axis_model
 
     need_order(overlap_from, overlap_to, speed)
     need_file("--out", out)
@@ -88,8 +88,8 @@ def wishes_of(
     overlap: tuple[float, float],
 ) -> Wishes:
     """What is asked of the loop, with the intervals that were identified."""
-    from servod.synthesize.deployed import Wishes
-    from servod.synthesize.intervals import uncertainty_of
+    from servod.lab.synthesize.deployed import Wishes
+    from servod.lab.synthesize.intervals import uncertainty_of
 
     return Wishes(
         uncertainty=uncertainty_of(axis).scaled(uncertainty),
@@ -113,8 +113,8 @@ def options_of(
     gain: float | None,
 ) -> Options:
     """What is asked of the law."""
-    from servod.gain_parameters import VelocitySource, WeightShape
-    from servod.synthesize.gain_set import Options
+    from servod.formats.gains.parameters import VelocitySource, WeightShape
+    from servod.lab.synthesize.gain_set import Options
 
     return Options(
         name,
@@ -131,14 +131,14 @@ def options_of(
 
 def finish(result: GainSet | Infeasible, out: Path, cross_check: bool, as_json: bool) -> None:
     """Write and print the set, or say why there is none. Raises AnswerIsNo."""
-    from servod.gain_store import write_file
-    from servod.synthesize.infeasible import Infeasible
+    from servod.formats.gains.store import write_file
+    from servod.lab.synthesize.infeasible import Infeasible
 
     if isinstance(result, Infeasible):
         refuse(result, as_json)
         return
     if cross_check:
-        from servod.synthesize.crosscheck import cross_checked
+        from servod.lab.synthesize.crosscheck import cross_checked
 
         result = cross_checked(result)
     write_file(out, result.to_yaml())
@@ -177,15 +177,15 @@ def solved(
     path: Path,
 ) -> GainSet | Infeasible:
     """The set of the mode that was chosen, or why there is none."""
-    from servod.synthesize.gain_set import synthesize
+    from servod.lab.synthesize.gain_set import synthesize
 
     if mode is ask.Mode.DEPLOYED:
         if scalar_output:
             raise BadInput("--scalar-output", "the deployed mode", "--mode reference")
         return synthesize(axis, replace(wishes, **asked), options, path)
-    from servod.gain_design import ReferenceOutput
-    from servod.synthesize.lmi_reference import ReferenceWishes
-    from servod.synthesize.reference import reference_set
+    from servod.formats.gains.design import ReferenceOutput
+    from servod.lab.synthesize.lmi_reference import ReferenceWishes
+    from servod.lab.synthesize.reference import reference_set
 
     output = ReferenceOutput.SCALAR if scalar_output else ReferenceOutput.VECTOR
     return reference_set(axis, wishes, options, ReferenceWishes(output=output, **asked), path)
@@ -233,8 +233,8 @@ def summary(gains: GainSet, out: Path) -> dict[str, Any]:
 
 def cited_mismatch(gains: GainSet) -> dict[str, float] | None:
     """What (8) of the paper says of neighbouring sets: cited, not used, for to the letter it wants equal forces."""
-    from servod.gain_parameters import LocalParameters
-    from servod.synthesize.local_sets import FINITE_TIME_S, largest_mismatch
+    from servod.formats.gains.parameters import LocalParameters
+    from servod.lab.synthesize.local_sets import FINITE_TIME_S, largest_mismatch
 
     law = gains.parameters
     found = largest_mismatch(law.friction) if isinstance(law, LocalParameters) else None

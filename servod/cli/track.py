@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, connect, example, report
-from servod.errors import AnswerIsNo
+from servod.common.errors import AnswerIsNo
 
 if TYPE_CHECKING:
-    from servod.control import ControlClient
+    from servod.client.control import ControlClient
 
 #: Told how far a motion is: seconds since its start, and the status document's motion.
 Tell = Callable[[float, dict[str, Any]], None]
 
-#: The longest period that a configuration may have (servod.config.CycleConfig).
+#: The longest period that a configuration may have (servod.formats.config.CycleConfig).
 LONGEST_PERIOD_US = 20_000
 _POLL_S = 0.1
 _app = typer.Typer(
@@ -115,7 +115,7 @@ def _track(socket: Path, motion: dict[str, Any], duration_s: float, wait: bool, 
 
 def _run(client: ControlClient, motion: dict[str, Any], tell: Tell) -> dict[str, Any]:
     """Start the motion and wait for its end; whatever interrupts it stops the axis before it ends the command."""
-    from servod.demo.processes import sigterm_as_interrupt
+    from servod.client.processes import sigterm_as_interrupt
 
     with sigterm_as_interrupt():
         try:

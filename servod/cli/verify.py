@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from servod.cli.common import JsonOption, example, one_thread, print_json
-from servod.errors import AnswerIsNo
+from servod.common.errors import AnswerIsNo
 
 if TYPE_CHECKING:
-    from servod.gains import GainSet
-    from servod.verify.certify import Verification
+    from servod.formats.gains.gain_set import GainSet
+    from servod.lab.verify.certify import Verification
 
 EXAMPLE = "servoctl verify gains.yaml --json"
 
@@ -40,9 +40,9 @@ def verify(
 ) -> None:
     """Verify GAINS; exit code 1 when the set is not valid."""
     one_thread()
-    from servod.gain_store import write_file
-    from servod.gains import load_gains
-    from servod.verify.certify import verify
+    from servod.formats.gains.gain_set import load_gains
+    from servod.formats.gains.store import write_file
+    from servod.lab.verify.certify import verify
 
     checked = load_gains(gains)
     result = verify(checked, plants, seed, processes, str(gains))
@@ -63,7 +63,7 @@ def may_be_written(gains: GainSet, result: Verification) -> bool:
 
     Says so on standard error where it may not.
     """
-    from servod.verify.checks import PLANTS_CHECK
+    from servod.lab.verify.checks import PLANTS_CHECK
 
     against = [check.name for check in result.checks if not check.passed]
     if against != [PLANTS_CHECK] or gains.certificate_problem() is not None:

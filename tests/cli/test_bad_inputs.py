@@ -11,7 +11,7 @@ import yaml
 
 import servod.drivers
 from servod.cli.app import run
-from servod.yaml12 import parse_yaml
+from servod.common.yaml import parse_yaml
 
 TABLE = parse_yaml((Path(__file__).parent / "bad_inputs.yaml").read_text(), "bad_inputs.yaml")
 AMPLIFIER_EDS = Path(servod.drivers.__file__).parent / "eds/amplifier.eds"

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from servod.axis_model import axis_model_yaml, load_axis_model
 from servod.cli.app import run
-from servod.shipped import shipped
-from tests.identify.joints import draw
+from servod.common.shipped import shipped
+from servod.formats.model.axis_model import axis_model_yaml, load_axis_model
+from tests.lab.identify.joints import draw
 
 JOINT = shipped("gains/axes/table1_joint.yaml")
 

@@ -9,8 +9,8 @@ import pytest
 
 import servod.drivers
 from servod.cli.app import run
-from servod.config import load_config
-from servod.shipped import shipped
+from servod.common.shipped import shipped
+from servod.formats.config import load_config
 
 GAINS = shipped("gains")
 EDS = Path(servod.drivers.__file__).parent / "eds"

@@ -15,10 +15,10 @@ import yaml
 
 from servod.cli.app import run
 from servod.cli.demo import print_document
-from servod.demo.entries import entries
-from servod.demo.wall import why
-from servod.errors import FAULTS, FaultCode
-from servod.shipped import shipped
+from servod.common.errors import FAULTS, FaultCode
+from servod.common.shipped import shipped
+from servod.qualify.demo.entries import entries
+from servod.qualify.demo.wall import why
 
 #: Both lines of the paper's story: feedback alone sticks, a friction model removes most of the error.
 STUCK_MRAD, COMPENSATED_MRAD = 10.0, 2.0

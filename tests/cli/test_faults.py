@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from servod.campaign.document import HEADER, cells
-from servod.campaign.judge import Reaction
-from servod.campaign.run import Outcome
-from servod.campaign.scenario import Loss
-from servod.campaign.under_test import Observation
 from servod.cli.app import run
+from servod.qualify.faults.document import HEADER, cells
+from servod.qualify.faults.judge import Reaction
+from servod.qualify.faults.run import Outcome
+from servod.qualify.faults.scenario import Loss
+from servod.qualify.faults.under_test import Observation
 
 MINE = """
 title: "<script>mine</script>"
@@ -95,7 +95,7 @@ def test_a_mistake_in_a_scenario_is_found_when_it_is_read(
 def test_one_that_breaks_off_has_failed_and_the_next_one_runs(
     mine: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from servod.campaign.stepped import SteppedAxis
+    from servod.qualify.faults.stepped import SteppedAxis
 
     sound, broken = mine.with_name("sound.yaml"), []
     sound.write_text(mine.read_text())
@@ -128,7 +128,7 @@ def test_only_what_was_to_be_repaired_recovers_by_repair(recovered: bool, by_rep
 def test_interrupted_it_writes_what_it_has(
     mine: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from servod.campaign import campaign
+    from servod.qualify.faults import campaign
 
     def interrupted(chosen: dict, jobs: int) -> Iterator[Outcome]:
         for name, scenario in chosen.items():

@@ -56,7 +56,7 @@ def test_an_interrupt_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytes
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("servod.demo.fast.run_fast", interrupted)
+    monkeypatch.setattr("servod.qualify.demo.fast.run_fast", interrupted)
     assert run(["demo", "--fast", "--json"]) == 130
     captured = capsys.readouterr()
     assert (captured.out, captured.err) == ("", "servoctl: interrupted\n")
@@ -68,7 +68,7 @@ def test_bench_refuses_a_folder_that_cannot_be_before_it_measures(
     def measured(*_: object) -> None:
         pytest.fail("the benchmark ran")
 
-    monkeypatch.setattr("servod.benchmark.measure", measured)
+    monkeypatch.setattr("servod.qualify.bench.measure", measured)
     assert run(["bench", "--out", "/proc/nowhere/bench.json"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "--out /proc/nowhere" in line

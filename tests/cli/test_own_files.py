@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from servod.cli.diagnose import diagnose
-from servod.errors import BadInput
-from servod.gain_store import GainStore
-from servod.shipped import shipped
+from servod.common.errors import BadInput
+from servod.common.shipped import shipped
+from servod.formats.gains.store import GainStore
 from tests.cli.test_output import servoctl
-from tests.gains import good
+from tests.formats.gains import good
 
 MODEL = shipped("gains/axes/table1_joint.yaml")
 

@@ -13,11 +13,11 @@ import pytest
 import yaml
 
 from servod.cli.app import run
-from servod.commission.state import State
-from servod.errors import BadInput
-from servod.gains import parse_gains
+from servod.common.errors import BadInput
+from servod.formats.gains.gain_set import parse_gains
+from servod.lab.commission.state import State
+from tests.formats.gains import good
 from tests.fuzz.recordings import recorded
-from tests.gains import good
 
 
 def test_deploy_announces_no_motion_before_its_inputs_are_checked(

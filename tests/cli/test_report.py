@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from servod.demo.axis import CONTROLLERS
-from servod.demo.entries import entries
-from servod.demo.runs import Run, cut_motion, summary
-from servod.errors import AnswerIsNo, BadInput
-from servod.recordings.rows import ROW
-from servod.report.curves import thin, time_curves
-from servod.report.demo import Story, write_demo_page
-from servod.shipped import shipped
+from servod.common.errors import AnswerIsNo, BadInput
+from servod.common.shipped import shipped
+from servod.lab.recordings.rows import ROW
+from servod.lab.report.curves import thin, time_curves
+from servod.qualify.demo.axis import CONTROLLERS
+from servod.qualify.demo.entries import entries
+from servod.qualify.demo.report import Story, write_demo_page
+from servod.qualify.demo.runs import Run, cut_motion, summary
 
 PERIOD_NS = 1_000_000
 

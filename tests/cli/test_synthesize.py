@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 from servod.cli.app import run
-from servod.gain_parameters import LocalParameters
-from servod.gains import GainSet, load_gains
-from servod.synthesize import infeasible
-from tests.synthesize.designs import MODEL
+from servod.formats.gains.gain_set import GainSet, load_gains
+from servod.formats.gains.parameters import LocalParameters
+from servod.lab.synthesize import infeasible
+from tests.lab.synthesize.designs import MODEL
 
 AXES = MODEL.parent
 

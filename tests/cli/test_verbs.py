@@ -16,10 +16,10 @@ from typing import Any
 import pytest
 
 from servod.cli.app import run
-from servod.control import ControlClient
-from servod.demo.axis import demo_config, gains_file, plant_file
-from servod.demo.processes import child, wait_until
-from servod.demo.wall import running_axis
+from servod.client.control import ControlClient
+from servod.client.processes import child, wait_until
+from servod.qualify.demo.axis import demo_config, gains_file, plant_file
+from servod.qualify.demo.wall import running_axis
 
 pytestmark = pytest.mark.serial
 

@@ -14,15 +14,15 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from servod.axis_model import AxisModel
-from servod.bus import Bus
-from servod.bus.open import open_bus
-from servod.bus.python_can import PythonCanBus
-from servod.bus.socketcan import SocketCanBus
-from servod.config import BusConfig
 from servod.drivers.virtual.server import HubServer, Timing
 from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.drivers.virtual.world import SteppedWorld, World
+from servod.formats.config import BusConfig
+from servod.formats.model.axis_model import AxisModel
+from servod.runtime.fieldbus.bus import Bus
+from servod.runtime.fieldbus.bus.open import open_bus
+from servod.runtime.fieldbus.bus.python_can import PythonCanBus
+from servod.runtime.fieldbus.bus.socketcan import SocketCanBus
 
 JOINT = {"inertia": 0.001, "friction": {"kind": "coulomb_viscous", "coulomb": 0.01, "viscous": 0.05}}
 

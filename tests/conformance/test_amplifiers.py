@@ -1,4 +1,5 @@
-"""The behaviour contract of an amplifier (servod.hal), for every amplifier driver that is known."""
+"""The behaviour contract of an amplifier (servod.runtime.fieldbus.devices), for every amplifier driver that is
+known."""
 
 from __future__ import annotations
 
@@ -11,9 +12,17 @@ from drivers_under_test import RATED_TORQUE_MNM, STATUS_WORD, AmplifierBench, fi
 from hypothesis import given
 from hypothesis import strategies as st
 
-from servod.cia import CW_DISABLE_VOLTAGE, CW_FAULT_RESET, CW_HALT, Obj402
 from servod.drivers import load_driver
-from servod.hal import HANDSHAKE_SYNCS, NEVER_CYCLES, AmplifierFeedback, DriveState, Goal, Mode, Reason
+from servod.runtime.fieldbus.cia import CW_DISABLE_VOLTAGE, CW_FAULT_RESET, CW_HALT, Obj402
+from servod.runtime.fieldbus.devices import (
+    HANDSHAKE_SYNCS,
+    NEVER_CYCLES,
+    AmplifierFeedback,
+    DriveState,
+    Goal,
+    Mode,
+    Reason,
+)
 
 RATED_NM = RATED_TORQUE_MNM * 1e-3
 ENABLED = DriveState.OPERATION_ENABLED

@@ -1,4 +1,4 @@
-"""The contract of servod.bus.Bus, for every kind of bus."""
+"""The contract of servod.runtime.fieldbus.bus.Bus, for every kind of bus."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ from buses_under_test import BUSES, Wire, hub, stepped
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from servod.bus import (
+from servod.common.errors import Unreachable
+from servod.drivers.virtual.bus_faults import BusFault, FaultKind
+from servod.formats.config import BusConfig
+from servod.runtime.fieldbus.bus import (
     CAN_ERR_BUSOFF,
     CAN_ERR_CRTL,
     CAN_ERR_FLAG,
@@ -21,11 +24,8 @@ from servod.bus import (
     Bus,
     Frame,
 )
-from servod.bus.open import open_bus
-from servod.bus.socketcan import SocketCanBus
-from servod.config import BusConfig
-from servod.drivers.virtual.bus_faults import BusFault, FaultKind
-from servod.errors import Unreachable
+from servod.runtime.fieldbus.bus.open import open_bus
+from servod.runtime.fieldbus.bus.socketcan import SocketCanBus
 
 WAIT_S = 0.5
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from servod.common.errors import BadInput
 from servod.drivers import DRIVERS, driver_table, load_driver
-from servod.errors import BadInput
 
 _METADATA = "Metadata-Version: 2.1\nName: acme-drive\nVersion: 1.0\n"
 _MODULE = "from servod.drivers.cia406 import DRIVER\nNOT_A_DRIVER = 5\n"

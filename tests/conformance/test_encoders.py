@@ -1,4 +1,4 @@
-"""The behaviour contract of an encoder (servod.hal), for every encoder driver that is known."""
+"""The behaviour contract of an encoder (servod.runtime.fieldbus.devices), for every encoder driver that is known."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from servod.drivers import load_driver
-from servod.hal import ALARMS_STALE, NEVER_CYCLES
+from servod.runtime.fieldbus.devices import ALARMS_STALE, NEVER_CYCLES
 
 RAD = 2 * math.pi / COUNTS_PER_TURN
 PERIOD_S = PERIOD_NS * 1e-9

@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 from drivers_under_test import COUNTS_PER_TURN, axis_config, decode, encode, find_pdo
 
-from servod.cia import Obj402
+from servod.common.errors import BadInput
 from servod.drivers.cia402 import Cia402Amplifier
 from servod.drivers.cia402_setup import AmplifierSetup
-from servod.errors import BadInput
-from servod.hal import AmplifierCommand, DriveState, Goal, Mode
+from servod.runtime.fieldbus.cia import Obj402
+from servod.runtime.fieldbus.devices import AmplifierCommand, DriveState, Goal, Mode
 
 STATUS = {DriveState.OPERATION_ENABLED: 0x0237, DriveState.SWITCHED_ON: 0x0233}
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from servod.cia import CW_FAULT_RESET, CW_QUICK_STOP, CW_SHUTDOWN, STATUS_WORD_TABLE
 from servod.drivers.cia402_state import (
     ROUTES,
     STATE_OF_STATUS,
@@ -13,7 +12,8 @@ from servod.drivers.cia402_state import (
     decode_status_word,
     reached_states,
 )
-from servod.hal import DriveState, Goal
+from servod.runtime.fieldbus.cia import CW_FAULT_RESET, CW_QUICK_STOP, CW_SHUTDOWN, STATUS_WORD_TABLE
+from servod.runtime.fieldbus.devices import DriveState, Goal
 
 S = DriveState
 STAYS, LEAVES = 6, 2  # two values of 0x605A

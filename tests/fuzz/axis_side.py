@@ -5,16 +5,23 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
-from servod.axis_model import AxisModel
-from servod.bus import CAN_EFF_FLAG, CAN_RTR_FLAG
-from servod.cia import HEARTBEAT_BASE, LSS_TO_SLAVE_ID, NMT_ID, SDO_ANSWER_BASE, SDO_REQUEST_BASE, NmtCommand
+from servod.common.units import NS_PER_S
 from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.drivers.virtual.world import SteppedBus, SteppedClock, SteppedWorld
-from servod.units import NS_PER_S
+from servod.formats.model.axis_model import AxisModel
+from servod.runtime.fieldbus.bus import CAN_EFF_FLAG, CAN_RTR_FLAG
+from servod.runtime.fieldbus.cia import (
+    HEARTBEAT_BASE,
+    LSS_TO_SLAVE_ID,
+    NMT_ID,
+    SDO_ANSWER_BASE,
+    SDO_REQUEST_BASE,
+    NmtCommand,
+)
+from tests.drivers.virtual.bench import JOINT
 from tests.fuzz.frames import frames
 from tests.fuzz.shapes import frame_lists
 from tests.fuzz.target import Target
-from tests.virtual.bench import JOINT
 
 _IDS = (
     *(SDO_REQUEST_BASE + 1, SDO_REQUEST_BASE + 2, LSS_TO_SLAVE_ID, NMT_ID, 0x080, 0x201, 0x301, 0x401, 0x501),

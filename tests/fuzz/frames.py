@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Sequence
 
-from servod.bus import Bus, BusCounters, Frame
-from servod.units import NS_PER_S
+from servod.common.units import NS_PER_S
+from servod.runtime.fieldbus.bus import Bus, BusCounters, Frame
 
 #: A bus that never falls silent is no bus: the scripts end, or are cut here.
 MOST_FRAMES = 2000
@@ -35,7 +35,7 @@ class ScriptClock:
 
 
 class ScriptBus:
-    """A servod.bus.Bus on which whatever is asked is answered with the next frames of a script.
+    """A servod.runtime.fieldbus.bus.Bus on which whatever is asked is answered with the next frames of a script.
 
     `burst` frames come for each frame that is sent; with none sent, none come.
     """

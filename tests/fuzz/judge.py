@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from servod.errors import ServodError
+from servod.common.errors import ServodError
 from tests.fuzz.target import Target
 
 #: Processor seconds that one input may take; the shared machine's clock tells nothing.

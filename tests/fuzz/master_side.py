@@ -8,25 +8,25 @@ from pathlib import Path
 
 from hypothesis import strategies as st
 
-from servod.bus import CAN_EFF_FLAG, CAN_RTR_FLAG
-from servod.cia import EMCY_BASE, HEARTBEAT_BASE, LSS_FROM_SLAVE_ID, SDO_ANSWER_BASE
-from servod.config import AxisConfig
+from servod.common.errors import FaultCode, ServodError
 from servod.drivers import load_driver
 from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.drivers.virtual.world import SteppedWorld
-from servod.errors import FaultCode, ServodError
-from servod.hal import AmplifierCommand, Goal, SdoAccess
-from servod.master import Master
-from servod.master.eds import dictionary_for
-from servod.master.monitor import NodeWatch
-from servod.master.network import BusNetwork
-from servod.master.scan import scan as scan_bus
-from servod.master.sdo import NodeSdo
+from servod.formats.config import AxisConfig
+from servod.runtime.fieldbus.bus import CAN_EFF_FLAG, CAN_RTR_FLAG
+from servod.runtime.fieldbus.cia import EMCY_BASE, HEARTBEAT_BASE, LSS_FROM_SLAVE_ID, SDO_ANSWER_BASE
+from servod.runtime.fieldbus.devices import AmplifierCommand, Goal, SdoAccess
+from servod.runtime.fieldbus.master import Master
+from servod.runtime.fieldbus.master.eds import dictionary_for
+from servod.runtime.fieldbus.master.monitor import NodeWatch
+from servod.runtime.fieldbus.master.network import BusNetwork
+from servod.runtime.fieldbus.master.scan import scan as scan_bus
+from servod.runtime.fieldbus.master.sdo import NodeSdo
 from tests.axis_limits import LIMITS
+from tests.drivers.virtual.bench import JOINT
 from tests.fuzz.frames import BentBus, ScriptBus, ScriptClock, frames
 from tests.fuzz.shapes import frame_lists
 from tests.fuzz.target import Target
-from tests.virtual.bench import JOINT
 
 _NODES = (1, 2)
 _SDO_IDS = (*(SDO_ANSWER_BASE + node for node in _NODES), 0x583)
@@ -52,7 +52,7 @@ def _config() -> AxisConfig:
 
 
 def _world() -> SteppedWorld:
-    from servod.axis_model import AxisModel
+    from servod.formats.model.axis_model import AxisModel
 
     return SteppedWorld(VirtualAxisSettings(), AxisModel.model_validate(JOINT))
 

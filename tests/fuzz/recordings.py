@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from servod.record import FIELDS, RECORD
-from servod.recorder_mcap import McapFile
-from servod.recorder_read import read_recording
-from servod.recordings import load_recording
+from servod.formats.recording.mcap_reader import read_recording
+from servod.formats.recording.mcap_writer import McapFile
+from servod.formats.recording.record import FIELDS, RECORD
+from servod.lab.recordings import load_recording
 from tests.fuzz.recordings_bombs import csv_bomb, mat_bomb
 from tests.fuzz.shapes import ODD_NUMBERS, csv_texts, mutated
 from tests.fuzz.target import Target

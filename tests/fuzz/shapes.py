@@ -10,7 +10,7 @@ from typing import Any
 import yaml
 from hypothesis import strategies as st
 
-from servod.yaml12 import parse_yaml
+from servod.common.yaml import parse_yaml
 
 #: Numbers at which something might turn over.
 ODD_NUMBERS: tuple[Any, ...] = (

@@ -12,17 +12,17 @@ from itertools import count
 from pathlib import Path
 from typing import Any, cast
 
-from servod.axis import AxisState
-from servod.commands import Op
-from servod.config import AxisConfig
-from servod.control import ControlClient, Verb
-from servod.daemon.control_server import ControlServer
-from servod.daemon.gain_bank import GainBank
-from servod.daemon.verbs import Verbs
-from servod.loop.handle import LoopHandle
-from servod.loop.plan import LoopPlan
-from servod.record import FIELDS, CycleRecord
-from servod.recorder import Recorder
+from servod.client.control import ControlClient, Verb
+from servod.formats.config import AxisConfig
+from servod.formats.recording.record import FIELDS, CycleRecord
+from servod.runtime.daemon.control_server import ControlServer
+from servod.runtime.daemon.gain_bank import GainBank
+from servod.runtime.daemon.recorder import Recorder
+from servod.runtime.daemon.verbs import Verbs
+from servod.runtime.loop.axis import AxisState
+from servod.runtime.loop.commands import Op
+from servod.runtime.loop.handle import LoopHandle
+from servod.runtime.loop.plan import LoopPlan
 from tests.axis_limits import LIMITS
 from tests.fuzz.shapes import JSON_TRICKS, request_lines
 from tests.fuzz.target import Target

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from servod.errors import BadInput
-from servod.gain_store import write_file
-from servod.recorder_export import export_csv, export_parquet
-from servod.recorder_read import read_recording
-from servod.recordings.export import write_table
+from servod.common.errors import BadInput
+from servod.formats.gains.store import write_file
+from servod.formats.recording.export import export_csv, export_parquet
+from servod.formats.recording.export_rows import write_table
+from servod.formats.recording.mcap_reader import read_recording
 from tests.fuzz.recordings import recorded
 
 _MOST_BYTES = 1000

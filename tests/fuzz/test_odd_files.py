@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from servod.axis_model import load_axis_model
 from servod.cli.motion_file import read_motion
-from servod.config import load_config
-from servod.errors import BadInput
-from servod.gains import load_gains
-from servod.master.eds import load_dictionary
-from servod.recorder_read import read_recording
-from servod.recordings import load_column_map, load_recording
+from servod.common.errors import BadInput
+from servod.formats.config import load_config
+from servod.formats.gains.gain_set import load_gains
+from servod.formats.model.axis_model import load_axis_model
+from servod.formats.recording.mcap_reader import read_recording
+from servod.lab.recordings import load_column_map, load_recording
+from servod.runtime.fieldbus.master.eds import load_dictionary
 
 READERS: dict[str, tuple[Callable[[Path], object], str]] = {
     "configuration": (load_config, ".yaml"),

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from servod.commission.files import read_json
-from servod.commission.runs import load_curves
-from servod.commission.state import STATE, State
-from servod.errors import BadInput
-from servod.gain_store import GainStore
-from servod.identify.store import LIST, load
-from servod.prove.trial import FILE, read_trial
+from servod.common.errors import BadInput
+from servod.formats.gains.store import GainStore
+from servod.lab.commission.files import read_json
+from servod.lab.commission.runs import load_curves
+from servod.lab.commission.state import STATE, State
+from servod.lab.identify.store import LIST, load
+from servod.qualify.blind.trial import FILE, read_trial
 
 
 def _packed() -> bytes:

@@ -8,14 +8,14 @@ from pathlib import Path
 import yaml
 
 import servod.drivers
-from servod.axis_model import load_axis_model
-from servod.config import load_config
+from servod.common.yaml import load_model
 from servod.drivers.virtual.settings import VirtualAxisSettings
-from servod.gain_store import GainStore
-from servod.gains import parse_gains
-from servod.master.dcf import left_out, parameters
-from servod.master.eds import load_dictionary
-from servod.yaml12 import load_model
+from servod.formats.config import load_config
+from servod.formats.gains.gain_set import parse_gains
+from servod.formats.gains.store import GainStore
+from servod.formats.model.axis_model import load_axis_model
+from servod.runtime.fieldbus.master.dcf import left_out, parameters
+from servod.runtime.fieldbus.master.eds import load_dictionary
 from tests.fuzz.shapes import csv_texts, mutated, yaml_texts
 from tests.fuzz.target import Target
 
@@ -204,7 +204,7 @@ def axis_model(folder: Path) -> Target:
 
 def column_map(folder: Path) -> Target:
     """A `--map` file."""
-    from servod.recordings import load_column_map
+    from servod.lab.recordings import load_column_map
 
     return _yaml(folder / "map.yaml", load_column_map, _MAP)
 
@@ -234,7 +234,7 @@ def motion(folder: Path) -> Target:
 
 def fault_scenarios(folder: Path) -> Target:
     """A file of scenarios of the fault campaign, with its variants."""
-    from servod.campaign.catalogue import load_scenarios, scenarios_in
+    from servod.qualify.faults.catalogue import load_scenarios, scenarios_in
 
     shipped = ROOT / "servod" / "campaign" / "scenarios" / "bus"
     assert scenarios_in(shipped)

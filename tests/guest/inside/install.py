@@ -13,7 +13,7 @@ from inside.tools import AXIS_UNIT, CONFIG, CONFIG_FILE, DRIVE_RECORD, GAINS_FIL
 
 SITE = Path("/usr/local/lib/python3.11/dist-packages")
 PROGRAMS = {
-    "servod": "servod.daemon.main",
+    "servod": "servod.runtime.daemon.main",
     "servoctl": "servod.cli",
     "servod-virtual-axis": "servod.drivers.virtual.main",
 }
@@ -38,7 +38,7 @@ def install() -> dict[str, Any]:
     """servod from its wheel, units and users by install.sh, vcan0, and two more users."""
     share = Path(sys.argv[1])
     shutil.copytree(share / "site", SITE, dirs_exist_ok=True)
-    modules = ", ".join([*PROGRAMS.values(), "servod.loop.process"])
+    modules = ", ".join([*PROGRAMS.values(), "servod.runtime.loop.process"])
     shell("python3", "-c", f"import {modules}")  # leaves them compiled: users of the guest may not write there
     for name, module in PROGRAMS.items():
         program = Path("/usr/local/bin") / name

@@ -78,7 +78,7 @@ def motion() -> dict[str, Any]:
         wait_for(lambda: not connection.call("status")["axis"]["motion_running"])
         connection.call("record_stop")
     said.append(shell("servoctl", "disable", "--socket", SOCKET, user="fitter"))
-    from servod.recorder_read import read_recording
+    from servod.formats.recording.mcap_reader import read_recording
 
     recording = read_recording(path)
     positions = recording.column("position_rad")
@@ -177,7 +177,7 @@ def how_it_stopped(since_ns: int) -> dict[str, Any]:
 
 def loop_killed() -> dict[str, Any]:
     """kill -9 of the loop: fault, cause and remedy in the journal at level error, the seconds before it in a file."""
-    from servod.errors import FAULTS, FaultCode
+    from servod.common.errors import FAULTS, FaultCode
 
     result = recover(lambda: os.kill(int(status()["loop"]["pid"]), signal.SIGKILL))
     files = list(Path("/var/lib/servod/guest/recordings").glob("*LOOP_LOST*.mcap"))

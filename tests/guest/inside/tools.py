@@ -69,7 +69,7 @@ def wait_for(reached: Callable[[], Any], timeout_s: float = 60.0, what: str = "i
 
 def client() -> Any:
     """A connection to the daemon."""
-    from servod.control import ControlClient
+    from servod.client.control import ControlClient
 
     return ControlClient(SOCKET, timeout_s=60.0)
 

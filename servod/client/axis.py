@@ -1,0 +1,148 @@
+"""How experiments reach an axis: the small protocol, and the SYNC-stepped virtual axis behind it.
+
+Above the session; `daemon_link` has the same for a running daemon. An experiment says gains, positions and torques, and
+gets the recorded cycles of its motion back.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servod.client.stepped import SteppedSession
+from servod.common.errors import AnswerIsNo, faults_in
+from servod.formats.config import AxisConfig
+from servod.formats.recording.record import CycleRecord
+from servod.kernels.laws import LAWS
+from servod.lab.identify.trace import Trace, rows_of
+from servod.runtime.loop.axis import AxisState
+from servod.runtime.loop.commands import REFUSAL_TEXT, Op, ReferenceKind, Refusal
+
+#: Told after every slice of a motion: how many seconds of it have passed.
+Watch = Callable[[float], None]
+
+_SLICE_S = 0.1
+
+
+class MotionEnded(AnswerIsNo):
+    """The axis dropped out of a motion; `rows` are its cycles, and `trace` what an experiment made of them."""
+
+    def __init__(self, message: str, rows: NDArray[np.void]) -> None:
+        super().__init__(message)
+        self.rows = rows
+        self.trace: Trace | None = None
+
+
+class Link(Protocol):
+    """An axis that experiments may move. Every method raises AnswerIsNo when the axis drops out or refuses."""
+
+    @property
+    def config(self) -> AxisConfig:
+        """Limits, period and encoder of the axis."""
+        ...
+
+    @property
+    def offset_ns(self) -> int | None:
+        """What turns the records' time into the time of day; None where they have the monotonic clock's."""
+        ...
+
+    def enable(self) -> float:
+        """Enable under no torque; returns the present position in rad."""
+        ...
+
+    def set_gains(self, position_nm_per_rad: float, velocity_nms_per_rad: float) -> None:
+        """Change the PD feedback under which motions run; bumpless."""
+        ...
+
+    def excite(
+        self, positions_rad: Sequence[float], torques_nm: Sequence[float], window_rad: float
+    ) -> NDArray[np.void]:
+        """Run a motion relative to the present reference with torque on top; returns its cycles.
+
+        It ends by itself when the joint is further than `window_rad` from the reference. Raises MotionEnded when the
+        axis drops out.
+        """
+        ...
+
+    def disable(self) -> None:
+        """Ramp the torque down and switch off; never raises."""
+        ...
+
+
+class SteppedLink:
+    """The virtual axis in virtual time."""
+
+    def __init__(self, session: SteppedSession, watch: Watch | None = None) -> None:
+        self.session = session
+        self._watch = watch or (lambda _seconds: None)
+
+    @property
+    def config(self) -> AxisConfig:
+        """The session's configuration."""
+        return self.session.config
+
+    @property
+    def offset_ns(self) -> int | None:
+        """Virtual time has no time of day: the same walk gives the same files, byte for byte."""
+        return 0
+
+    def enable(self) -> float:
+        """Enable with zero gains."""
+        self.set_gains(0.0, 0.0)
+        self.session.enable()
+        return self.session.latest.position_rad
+
+    def set_gains(self, position_nm_per_rad: float, velocity_nms_per_rad: float) -> None:
+        """PD feedback of the session's controller."""
+        law = LAWS["pd"]
+        gains = [position_nm_per_rad, velocity_nms_per_rad, 0.0]
+        self._must(self.session.send(Op.ACTIVATE, [0, law.number, len(gains), *gains]))
+
+    def excite(
+        self, positions_rad: Sequence[float], torques_nm: Sequence[float], window_rad: float
+    ) -> NDArray[np.void]:
+        """Run the motion as fast as it computes."""
+        session = self.session
+        session.load_trajectory([*positions_rad, *torques_nm])
+        session.clear()
+        extent = [min(positions_rad), max(positions_rad)]
+        self._must(session.send(Op.REFERENCE, [ReferenceKind.EXCITE, len(positions_rad), *extent, window_rad]))
+        passed_s = 0.0
+        while session.cycle.reference.active:
+            session.run(_SLICE_S)
+            passed_s += _SLICE_S
+            self._watch(passed_s)
+        rows = moving(rows_of(session.raw))
+        try:
+            check_state(session.latest)
+        except AnswerIsNo as error:
+            raise MotionEnded(str(error), rows) from None
+        return rows
+
+    def disable(self) -> None:
+        """Switch off and let the drive see it."""
+        with contextlib.suppress(AnswerIsNo):
+            self.session.send(Op.DISABLE)
+            self.session.run(self.config.limits.ramp_down_s + 0.1)
+
+    def _must(self, refusal: Refusal) -> None:
+        if refusal != Refusal.DONE:
+            raise AnswerIsNo(f"the axis refused the experiment: {REFUSAL_TEXT[refusal]}")
+
+
+def moving(rows: NDArray[np.void]) -> NDArray[np.void]:
+    """The cycles of the motion."""
+    active: NDArray[np.void] = rows[rows["reference_active"] == 1]
+    return active
+
+
+def check_state(record: CycleRecord) -> None:
+    """Raise AnswerIsNo, with the faults and their remedies, when the axis is not enabled any more."""
+    if record.axis_state == AxisState.ENABLED:
+        return
+    why = "; ".join(f"{f.code.name}: {f.cause} {f.remedy}" for f in faults_in(record.faults_latched))
+    raise AnswerIsNo(f"the experiment ended with the axis in {AxisState(record.axis_state).name}. {why}")

@@ -1,0 +1,204 @@
+"""The control socket's protocol and its client: one JSON object per line over a Unix stream socket.
+
+Between command line and daemon. Request `{"id": 1, "verb": "status", "args": {}}`, answer `{"id": 1, "ok": true,
+"result": {...}}` or `{"id": 1, "ok": false, "error": {"exit_code": 3, "message": "one line"}}`. Requests are short, so
+that reading one never holds the daemon up: a long table of samples goes ahead of its motion in pieces. The server side
+is servod.runtime.daemon.control_server.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+import struct
+from collections.abc import Iterator, Sequence
+from enum import StrEnum
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from servod.common.errors import AnswerIsNo, BadInput, ServodError, Unreachable, one_line
+
+#: Longest request; a longer one ends the connection. A gain set with its design and proofs takes 100 KiB.
+MAX_LINE_BYTES = 512 * 1024
+#: Longest answer that a client takes.
+MAX_ANSWER_BYTES = 4 * 1024 * 1024
+#: Samples in one request: as text, each takes at most 25 bytes.
+PIECE_SAMPLES = 2000
+
+
+_TIMEVAL = struct.Struct("@ll")
+
+
+class Verb(StrEnum):
+    """What the daemon can be asked."""
+
+    STATUS = "status"
+    WATCH = "watch"
+    ENABLE = "enable"
+    DISABLE = "disable"
+    STOP = "stop"
+    HALT = "halt"
+    TRAJECTORY = "trajectory"
+    TRACK = "track"
+    GAINS_LOAD = "gains_load"
+    GAINS_LIST = "gains_list"
+    GAINS_ACTIVATE = "gains_activate"
+    GAINS_KEEP = "gains_keep"
+    GAINS_ROLLBACK = "gains_rollback"
+    RECORD_START = "record_start"
+    RECORD_STOP = "record_stop"
+    SCAN = "scan"
+
+
+#: Verbs that only look; everything else needs the right to command.
+READING = frozenset({Verb.STATUS, Verb.WATCH, Verb.GAINS_LIST})
+
+
+class SampleKey(StrEnum):
+    """Arguments of `track` that may be long."""
+
+    POSITIONS = "positions_rad"
+    TORQUES = "torques_nm"
+
+
+class RemoteBadInput(BadInput):
+    """Bad input that the daemon found; carries its line as it stands."""
+
+    def __init__(self, line: str) -> None:
+        ServodError.__init__(self, line)
+        self.where, self.found, self.allowed = "daemon", line, ""
+
+
+class Refused(Unreachable):
+    """The daemon answered, and did not do it: a limit, a state, somebody else who commands."""
+
+
+_ERRORS: dict[int, type[ServodError]] = {1: AnswerIsNo, 2: RemoteBadInput, 3: Refused}
+
+
+def encode_line(message: dict[str, Any]) -> bytes:
+    """One JSON object as a line; NaN and infinity are refused, JSON has none. Raises ValueError."""
+    return json.dumps(message, separators=(",", ":"), allow_nan=False).encode() + b"\n"
+
+
+def decode_line(line: bytes) -> dict[str, Any]:
+    """The JSON object of one line. Raises ValueError when it is anything else."""
+    try:
+        message = json.loads(line)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    if not isinstance(message, dict):
+        raise ValueError("not a JSON object")
+    return message
+
+
+class ControlClient:
+    """One connection to a running daemon; holds the right to command, once used, until it is closed."""
+
+    def __init__(self, path: str | Path, timeout_s: float = 30.0) -> None:
+        self._path = str(path)
+        self._id = 0
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
+        # A socket that does not block is refused by a full queue; one that blocks stands in it, for this time.
+        longest = _TIMEVAL.pack(*divmod(int(timeout_s * 1e6), 1_000_000))
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, longest)
+        try:
+            self._socket.connect(self._path)
+            self._socket.settimeout(timeout_s)
+        except PermissionError:
+            self._socket.close()
+            raise Unreachable(f"{path}: permission denied; only members of the control group may connect") from None
+        except OSError as error:
+            self._socket.close()
+            raise Unreachable(f"{path}: no daemon answers ({error.strerror or error}); is servod running?") from None
+        self._lines = self._socket.makefile("rb")
+
+    def __enter__(self) -> ControlClient:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self.close()
+
+    @property
+    def path(self) -> str:
+        """The socket's."""
+        return self._path
+
+    def close(self) -> None:
+        """Leave; gives back the right to command."""
+        self._lines.close()
+        self._socket.close()
+
+    def call(self, verb: Verb | str, **args: Any) -> dict[str, Any]:
+        """Ask and wait for the answer's result. Raises Unreachable, BadInput or AnswerIsNo by its exit code.
+
+        Samples of a motion that are too many for one request are sent ahead in pieces.
+        """
+        self._ask(verb, self._send_ahead(args) if verb == Verb.TRACK else args)
+        while True:
+            answer = self._answer()
+            if answer.get("id") in (self._id, None):  # no number: what the daemon says of the connection itself
+                return _result(answer)
+
+    def watch(self, period_s: float = 0.2) -> Iterator[dict[str, Any]]:
+        """Status after status until the daemon stops or the connection is closed; raises as `call` does."""
+        self._ask(Verb.WATCH, {"period_s": period_s})
+        while True:
+            yield _result(self._answer())
+
+    def _send_ahead(self, args: dict[str, Any]) -> dict[str, Any]:
+        """Upload the samples in `args` when they are many; gives the arguments that remain."""
+        tables = {key: args[key] for key in SampleKey if isinstance(args.get(key), Sequence)}
+        if sum(map(len, tables.values())) <= PIECE_SAMPLES:
+            return args
+        for key, samples in tables.items():
+            for start in range(0, len(samples), PIECE_SAMPLES):
+                self.call(Verb.TRAJECTORY, key=key, start=start, samples=samples[start : start + PIECE_SAMPLES])
+        return {key: value for key, value in args.items() if key not in tables} | {"uploaded": True}
+
+    def _ask(self, verb: Verb | str, args: dict[str, Any]) -> None:
+        self._id += 1
+        try:
+            line = encode_line({"id": self._id, "verb": str(verb), "args": args})
+        except ValueError:
+            raise BadInput(f"{verb}", "a number that is not finite", "finite numbers") from None
+        if len(line) > MAX_LINE_BYTES:
+            raise BadInput(f"{verb}", f"{len(line)} bytes", f"at most {MAX_LINE_BYTES} bytes in a request")
+        try:
+            self._socket.sendall(line)
+        except TimeoutError:
+            raise Unreachable(f"{self._path}: the daemon does not read") from None
+        except OSError:
+            _result(self._answer())  # it hung up; what it said before stands in the socket
+            raise Unreachable(f"{self._path}: the daemon hung up") from None
+
+    def _answer(self) -> dict[str, Any]:
+        if self._lines.closed:
+            raise Unreachable(f"{self._path}: this connection was closed")
+        try:
+            line = self._lines.readline(MAX_ANSWER_BYTES)
+        except TimeoutError:
+            raise Unreachable(f"{self._path}: no answer within {self._socket.gettimeout()} s") from None
+        except OSError as error:
+            raise Unreachable(f"{self._path}: the daemon hung up ({error.strerror or error})") from None
+        if not line.endswith(b"\n"):
+            raise Unreachable(f"{self._path}: the daemon hung up")
+        try:
+            return decode_line(line)
+        except ValueError as error:
+            raise Unreachable(f"{self._path}: answers with something else than servod would ({error})") from None
+
+
+def _result(answer: dict[str, Any]) -> dict[str, Any]:
+    if answer.get("ok"):
+        result = answer.get("result")
+        return result if isinstance(result, dict) else {}
+    error = answer.get("error")
+    if not isinstance(error, dict):
+        raise Unreachable("the daemon refused and gave no reason")
+    code = error.get("exit_code")
+    kind = _ERRORS.get(code, Unreachable) if isinstance(code, int) else Unreachable
+    if kind is Refused and answer.get("id") is None:  # of the connection: no request was refused
+        kind = Unreachable
+    raise kind(one_line(error.get("message", "refused")))

@@ -1,0 +1,96 @@
+"""Child processes that never outlive their parent: daemon and virtual axis of the demo and of the benchmark.
+
+Beside the data path. Each child gets SIGTERM from the kernel when the parent dies in any way (prctl), and is stopped
+and waited for when the block that started it ends, in whatever way it ends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+from servod.common.errors import Unreachable
+
+_PR_SET_PDEATHSIG, _PR_CAPBSET_DROP = 1, 24  # linux/prctl.h
+_STOP_S = 5.0
+
+
+@contextlib.contextmanager
+def child(
+    module: str, arguments: Sequence[str], log: Path, cores: set[int] | None = None, dropped: Sequence[int] = ()
+) -> Iterator[subprocess.Popen[bytes]]:
+    """Run `python -m module arguments` for the time of a `with` block; its output goes to `log`.
+
+    `cores` keeps it to these; `dropped` are capabilities (linux/capability.h) that it shall not have.
+    """
+    libc = ctypes.CDLL(None)
+
+    def prepare() -> None:
+        libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)  # ignored where the parent runs under nohup(1)
+        if cores:
+            os.sched_setaffinity(0, cores)
+        for capability in dropped:
+            libc.prctl(_PR_CAPBSET_DROP, capability)
+
+    with log.open("wb") as output:
+        process = subprocess.Popen(
+            [sys.executable, "-m", module, *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,  # Ctrl-C is for the parent, which stops the axis in the right order
+            preexec_fn=prepare,  # noqa: PLW1509  (one thread; only system calls)
+        )
+    try:
+        yield process
+    finally:
+        _stop(process)
+
+
+def _stop(process: subprocess.Popen[bytes]) -> None:
+    process.terminate()
+    try:
+        process.wait(_STOP_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def wait_until(ready: Callable[[], bool], process: subprocess.Popen[bytes], log: Path, timeout_s: float) -> None:
+    """Wait until `ready()`; raises Unreachable with the last line of `log` when the process ends or time is up."""
+    deadline = time.monotonic() + timeout_s
+    while not ready():
+        if process.poll() is not None or time.monotonic() > deadline:
+            lines = log.read_text(errors="replace").strip().splitlines()
+            raise Unreachable(f"{log.stem} did not start: {lines[-1] if lines else 'no output'}")
+        time.sleep(0.02)
+
+
+@contextlib.contextmanager
+def sigterm_as_interrupt() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP end the block as Ctrl-C does, so that everything in it is cleaned up.
+
+    Once: a terminal that closes sends SIGHUP twice, by the kernel and by the shell; cleaning up must not end half-way.
+    """
+
+    def interrupt(number: int, _frame: object) -> None:
+        for other in before:
+            signal.signal(other, signal.SIG_IGN)
+        raise KeyboardInterrupt(signal.Signals(number).name)
+
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
+    for number in before:
+        signal.signal(number, interrupt)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,96 @@
+"""A virtual axis that suits its joint, SYNC-stepped: drive and limits of the size that somebody would have bought.
+
+Behind `--plant`. Only the size of the drive is taken from the plant; everything else has to be identified.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from servod.client.stepped import SteppedSession
+from servod.common.yaml import validate
+from servod.drivers.virtual.world import SteppedWorld, VirtualAxisSettings
+from servod.formats.config import AxisConfig
+from servod.formats.model.axis_model import AxisModel
+from servod.kernels.laws import LAWS
+
+#: Rated torque of the drive over the joint's static friction, and peak over rated, as of the demo's axis.
+RATED_RATIO, PEAK_RATIO = 1.43, 3.0
+#: The torque limit is reached from zero in a millisecond.
+RATE_PER_S = 1000.0
+#: A configured rated torque within this factor of what suits is taken for the drive's; any other is a wrong scale.
+ALIKE = 5.0
+ENCODER_COUNTS = 1_048_576
+SPEED_RAD_S, TRAVEL_RAD, FOLLOWING_RAD, MISMATCH_RAD = 3.0, 3.0, 0.5, 0.05
+
+
+def rated_torque_mnm(plant: AxisModel) -> int:
+    """Rated torque of a drive for this joint, in mN*m, to two digits."""
+    friction = plant.friction
+    sticks = getattr(friction, "static", None) or getattr(friction, "coulomb", None)
+    static = sticks if sticks is not None else max(abs(t) for t in getattr(friction, "torques", (0.07,)))
+    held = abs(plant.gravity.amplitude) if plant.gravity else 0.0
+    wanted = 1000.0 * RATED_RATIO * (float(static) + held)
+    return max(1, int(float(f"{wanted:.1e}")))
+
+
+def virtual_config(folder: Path, rated_mnm: int, encoder_counts: int) -> AxisConfig:
+    """Configuration of the master's side; `folder` is for sockets and stores, which a stepped axis never opens."""
+    peak_nm = PEAK_RATIO * rated_mnm * 1e-3
+    return validate(
+        {
+            "name": "virtual",
+            "bus": {"interface": "virtual", "channel": str(folder / "bus")},
+            "encoder": {"counts_per_turn": encoder_counts},
+            "limits": {
+                "torque_nm": peak_nm,
+                "torque_rate_nm_per_s": RATE_PER_S * peak_nm,
+                "speed_rad_s": SPEED_RAD_S,
+                "position_min_rad": -TRAVEL_RAD,
+                "position_max_rad": TRAVEL_RAD,
+                "following_error_rad": FOLLOWING_RAD,
+                "encoder_mismatch_rad": MISMATCH_RAD,
+            },
+            "gains": {"directory": str(folder), "initial": str(folder / "pd.yaml"), "accept_uncertified": True},
+            "recorder": {"directory": str(folder)},
+        },
+        AxisConfig,
+        "virtual axis",
+    )
+
+
+def virtual_session(
+    plant: AxisModel,
+    folder: Path,
+    encoder_counts: int | None,
+    seed: int,
+    config: AxisConfig | None = None,
+    settings: VirtualAxisSettings | None = None,
+) -> SteppedSession:
+    """A session on the virtual axis, disabled, zero gains; a `config` of the user's replaces the one that suits.
+
+    `settings` say what drive and encoder really are, right or wrong, as for servod-virtual-axis; without them they are
+    what suits the joint, with `encoder_counts` per turn (None: what the configuration says). Raises BadInput where the
+    configuration does not fit the devices.
+    """
+    rated = rated_torque_mnm(plant)
+    config = config or virtual_config(folder, rated, encoder_counts or ENCODER_COUNTS)
+    settings = settings or _devices(config, rated, encoder_counts, seed)
+    law = LAWS["pd"]
+    return SteppedSession(config, SteppedWorld(settings, plant), law.number, (0.0,) * law.n_parameters)
+
+
+def _devices(config: AxisConfig, rated_mnm: int, encoder_counts: int | None, seed: int) -> VirtualAxisSettings:
+    """Node ids, bus and encoder of the configuration, and a drive that suits the joint."""
+    wanted = config.amplifier.rated_torque_mnm
+    if wanted is not None and rated_mnm / ALIKE <= wanted <= rated_mnm * ALIKE:
+        rated_mnm = wanted
+    return VirtualAxisSettings(
+        amplifier_node_id=config.amplifier.node_id,
+        encoder_node_id=config.encoder.node_id,
+        rated_torque_mnm=rated_mnm,
+        encoder_counts_per_turn=encoder_counts or config.encoder.counts_per_turn,
+        cycle_period_s=config.cycle.period_us * 1e-6,
+        bit_rate=config.bus.bit_rate,
+        seed=seed,
+    )

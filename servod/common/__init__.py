@@ -1,0 +1,1 @@
+"""What every part stands on: errors, the table of faults, units, clock, files, YAML, processes."""

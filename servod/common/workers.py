@@ -1,0 +1,70 @@
+"""Worker processes for long computations: they leave Ctrl-C to their parent and never outlive it.
+
+Ground floor, for the laboratory part. The daemon and the loop have processes of their own and do not come here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import signal
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from functools import cache
+from multiprocessing import get_context, resource_tracker
+from multiprocessing.util import Finalize
+from typing import Any
+
+from servod.common.errors import Unreachable
+
+_PR_SET_PDEATHSIG = 1  # linux/prctl.h
+
+
+@contextlib.contextmanager
+def worker_pool(processes: int, begin: Callable[..., None] | None = None, *given: Any) -> Iterator[Executor]:
+    """`processes` fresh processes for the time of a `with` block; whatever ends the block ends them at once.
+
+    Each calls `begin(*given)` first. Raises Unreachable when one of them dies, which an executor tells to whoever waits
+    for a result: a `multiprocessing.Pool` would replace it in silence and wait for what it had taken.
+    """
+    _tracker_goes_with_us()
+    pool = ProcessPoolExecutor(processes, get_context("spawn"), begin_worker, (os.getpid(), begin, given))
+    try:
+        yield pool
+    except BrokenProcessPool:
+        raise Unreachable(
+            "a worker process ended before its work was done: it could not start, was killed, or memory ran out "
+            "(`dmesg` tells); run the command again, with fewer --processes where it has them"
+        ) from None
+    finally:
+        _end(pool)
+
+
+def _end(pool: ProcessPoolExecutor) -> None:
+    """Kill and wait. The pool's own way out lets every job that has begun come to its end (until Python 3.14)."""
+    for process in list((pool._processes or {}).values()):
+        process.kill()
+    pool.shutdown(wait=True, cancel_futures=True)
+
+
+@cache
+def _tracker_goes_with_us() -> None:
+    """Wait at our own end for the process in which multiprocessing keeps account of semaphores.
+
+    Left alone it ends after us, and stays listed until whoever inherits it looks. Its end must come after that of all
+    semaphores (exit priority 0); that it is waited for in `_stop` alone is why a private name is used.
+    """
+    stop = resource_tracker._resource_tracker._stop  # type: ignore[attr-defined]
+    Finalize(None, stop, exitpriority=-1)
+
+
+def begin_worker(parent: int, begin: Callable[..., None] | None = None, given: tuple[Any, ...] = ()) -> None:
+    """What a worker of `parent` does first."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:  # it died before we asked
+        os._exit(1)
+    if begin is not None:
+        begin(*given)

@@ -1,0 +1,1 @@
+"""Every file and message that crosses a border: its schema and its reader."""

@@ -1,0 +1,1 @@
+"""Gain sets: parameters, design, certificate, store."""

@@ -1,0 +1,296 @@
+"""The gain-set store: a directory with every version of every set, which one is active, and what happened when.
+
+Beside the data path; the supervisor owns it, `servoctl gains` reaches it through the supervisor.
+
+    DIRECTORY/sets/NAME/0001.yaml   text of version 1, never changed after it was written
+    DIRECTORY/active.json           the active version and those before it, replaced as a whole
+    DIRECTORY/history.jsonl         one line for each load, activation, rollback and rejected trial, for people
+    DIRECTORY/lock                  held while something changes
+
+Every file is written aside, flushed to the disk and renamed, so that a kill at any moment leaves the old state or the
+new one. `active.json` alone decides; the history line comes after it and may be the one thing that a kill loses.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import fcntl
+import hashlib
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+from pydantic import Field
+
+from servod.common.errors import BadInput
+from servod.common.yaml import Strict, load_model, read_text
+from servod.formats.gains.gain_set import NAME_PATTERN, GainSet, parse_gains, require_certificate
+
+_VERSION_FILE = re.compile(r"^([0-9]{4,})\.yaml$")
+_NAME = re.compile(NAME_PATTERN)
+MAX_ROLLBACKS = 100
+
+
+class Action(StrEnum):
+    """What a history line tells of."""
+
+    LOAD = "load"
+    ACTIVATE = "activate"
+    ROLLBACK = "rollback"
+    REJECT = "reject"  # a set that was tried and not kept
+
+
+@dataclass(frozen=True, slots=True)
+class StoredSet:
+    """One version of one gain set in the store; `sha256` is of the file's text in UTF-8."""
+
+    name: str
+    version: int
+    sha256: str
+    path: Path
+    gains: GainSet
+
+
+class SetReference(Strict):
+    """Name and version of a stored set."""
+
+    name: str
+    version: int
+
+
+class HistoryEntry(Strict):
+    """One line of the history; `time` is UTC. A deployment leaves its reasons in `note` and what it measured."""
+
+    time: datetime.datetime
+    action: Action
+    name: str
+    version: int
+    sha256: str
+    note: str = ""
+    figures: dict[str, float] = Field(default_factory=dict)
+
+
+class _Active(Strict):
+    """Content of active.json; `previous` has the last one at its end."""
+
+    current: SetReference
+    previous: list[SetReference]
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Replace `path` by `text`: write aside, flush to disk, rename. After a kill there is the old file or the new."""
+    aside = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+    try:
+        with aside.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        aside.replace(path)
+    except OSError:
+        with contextlib.suppress(OSError):  # half a file fills the very disk that took no more
+            aside.unlink(missing_ok=True)
+        raise
+    _flush_directory(path.parent)
+
+
+def write_file(path: Path, text: str) -> None:
+    """`write_atomically` for files that a user named. Raises BadInput."""
+    try:
+        write_atomically(path, text)
+    except OSError as error:
+        raise BadInput(str(path), error.strerror or str(error), "a file that can be written") from None
+
+
+def _flush_directory(directory: Path) -> None:
+    descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+class GainStore:
+    """A directory of gain sets. Raises BadInput when the directory cannot be used or a set is unknown or bad."""
+
+    def __init__(self, directory: Path) -> None:
+        self.directory = directory
+        self._sets, self._active_file = directory / "sets", directory / "active.json"
+        self._history_file = directory / "history.jsonl"
+        self._parsed: dict[Path, tuple[tuple[int, ...], StoredSet]] = {}
+        try:
+            self._sets.mkdir(parents=True, exist_ok=True)
+            with self._locked():
+                self._sweep()
+        except OSError as error:
+            raise BadInput(f"gain store {directory}", error.strerror or str(error), "a writable directory") from None
+
+    @contextlib.contextmanager
+    def _locked(self) -> Iterator[None]:
+        """One writer at a time, also across processes; the lock ends with the process, however it ends."""
+        with (self.directory / "lock").open("w") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            yield
+
+    def _sweep(self) -> None:
+        """Remove what a kill left half-written, and end a history line that it cut."""
+        for leftover in self.directory.rglob("*.tmp"):
+            leftover.unlink()
+        if self._history_file.exists() and not self._history_file.read_bytes().endswith(b"\n"):
+            with self._history_file.open("ab") as file:
+                file.write(b"\n")
+
+    def load(self, text: str, where: str, name: str | None = None) -> StoredSet:
+        """Check a gain set and store it as the next version of its name; the newest text again gets none.
+
+        One whose certificate or seal does not belong to its numbers is not stored: it could never be activated. `name`,
+        when given, must be the name in the file: one set is never known by two names. `where` is for errors.
+        """
+        gains = parse_gains(text, where)
+        if name is not None and name != gains.name:
+            raise BadInput(f"{where}: name", gains.name, f"{name}, the name it shall be loaded as")
+        require_certificate(gains, accept_uncertified=True, where=where)
+        with self._locked():
+            newest = max(self._versions(gains.name), default=0)
+            if newest and self._path(gains.name, newest).read_text(encoding="utf-8") == text:
+                return self.get(gains.name, newest)
+            version = newest + 1
+            path = self._path(gains.name, version)
+            path.parent.mkdir(exist_ok=True)
+            _flush_directory(self._sets)
+            write_atomically(path, text)
+            stored = self.get(gains.name, version)
+            self._log(Action.LOAD, stored)
+            return stored
+
+    def load_file(self, path: str | Path) -> StoredSet:
+        """Store the gain-set file at `path`; see `load`."""
+        return self.load(read_text(path), str(path))
+
+    def get(self, name: str, version: int | None = None) -> StoredSet:
+        """The stored set, by default its newest version; checked again, since somebody may have edited the file.
+
+        It is read once: what is checked is what runs, whatever becomes of the file meanwhile.
+        """
+        versions = self._versions(name)
+        if not versions:
+            raise BadInput("gain set", name, ", ".join(self.names()) or "none is stored yet; `servoctl gains load` one")
+        chosen = versions[-1] if version is None else version
+        if chosen not in versions:
+            raise BadInput(f"gain set {name}: version", version, ", ".join(map(str, versions)))
+        return self._read(name, chosen)
+
+    def _read(self, name: str, version: int) -> StoredSet:
+        """One version; a file is parsed anew only when it was touched since, so that lists are cheap."""
+        path = self._path(name, version)
+        status = path.stat()
+        touched = (status.st_ino, status.st_mtime_ns, status.st_ctime_ns, status.st_size)
+        before, stored = self._parsed.get(path, (None, None))
+        if stored is None or before != touched:
+            text = read_text(path)
+            gains = parse_gains(text, str(path))
+            if gains.name != name:
+                raise BadInput(f"{path}: name", gains.name, f"{name}, under which it was stored; load the set anew")
+            stored = StoredSet(name, version, hashlib.sha256(text.encode()).hexdigest(), path, gains)
+            self._parsed[path] = touched, stored
+        return stored
+
+    def names(self) -> list[str]:
+        """Names of all stored sets, in order."""
+        return sorted(entry.name for entry in self._sets.iterdir() if self._versions(entry.name))
+
+    def stored(self) -> list[StoredSet]:
+        """Every version of every set, by name and version."""
+        return [self.get(name, version) for name in self.names() for version in self._versions(name)]
+
+    def active(self) -> StoredSet | None:
+        """The active set; None before the first activation."""
+        current = self.active_reference()
+        return None if current is None else self.get(current.name, current.version)
+
+    def active_reference(self) -> SetReference | None:
+        """Name and version of the active set, whatever has become of its file; None before the first activation."""
+        state = self._active()
+        return None if state is None else state.current
+
+    def activate(
+        self, name: str, version: int | None = None, note: str = "", figures: dict[str, float] | None = None
+    ) -> StoredSet:
+        """Make a stored set the active one; the present one becomes what `rollback` returns to."""
+        with self._locked():
+            stored = self.get(name, version)
+            state = self._active()
+            new = SetReference(name=stored.name, version=stored.version)
+            if state is None:
+                self._write_active(_Active(current=new, previous=[]))
+            elif state.current != new:
+                previous = [*state.previous, state.current][-MAX_ROLLBACKS:]
+                self._write_active(_Active(current=new, previous=previous))
+            self._log(Action.ACTIVATE, stored, note, figures)
+            return stored
+
+    def reject(self, name: str, version: int, note: str = "", figures: dict[str, float] | None = None) -> StoredSet:
+        """Note that a stored set was tried and not kept; what is active stays so."""
+        with self._locked():
+            stored = self.get(name, version)
+            self._log(Action.REJECT, stored, note, figures)
+            return stored
+
+    def previous(self) -> StoredSet:
+        """What `rollback` would return to. Raises BadInput when there is nothing before the active set."""
+        state = self._active()
+        if state is None or not state.previous:
+            raise BadInput("gain store: rollback", "no set that was active before", "at least two activations")
+        return self.get(state.previous[-1].name, state.previous[-1].version)
+
+    def rollback(self) -> StoredSet:
+        """Make the set active that was so before the present one; again and again, back to the first."""
+        with self._locked():
+            stored, state = self.previous(), self._active()
+            assert state is not None  # `previous` found one
+            self._write_active(_Active(current=state.previous[-1], previous=state.previous[:-1]))
+            self._log(Action.ROLLBACK, stored)
+            return stored
+
+    def history(self) -> list[HistoryEntry]:
+        """What happened, oldest first; a line that a kill cut short is left out."""
+        if not self._history_file.exists():
+            return []
+        entries = []
+        for line in self._history_file.read_text(encoding="utf-8").splitlines():
+            with contextlib.suppress(ValueError):
+                entries.append(HistoryEntry.model_validate_json(line))
+        return entries
+
+    def _versions(self, name: str) -> list[int]:
+        folder = self._sets / name
+        if not _NAME.match(name) or not folder.is_dir():
+            return []
+        return sorted(int(m[1]) for m in (_VERSION_FILE.match(entry.name) for entry in folder.iterdir()) if m)
+
+    def _path(self, name: str, version: int) -> Path:
+        return self._sets / name / f"{version:04d}.yaml"
+
+    def _active(self) -> _Active | None:
+        return load_model(self._active_file, _Active) if self._active_file.exists() else None
+
+    def _write_active(self, state: _Active) -> None:
+        write_atomically(self._active_file, state.model_dump_json(indent=1) + "\n")
+
+    def _log(self, action: Action, stored: StoredSet, note: str = "", figures: dict[str, float] | None = None) -> None:
+        entry = HistoryEntry(
+            time=datetime.datetime.now(datetime.UTC),
+            action=action,
+            name=stored.name,
+            version=stored.version,
+            sha256=stored.sha256,
+            note=note,
+            figures=figures or {},
+        )
+        with self._history_file.open("a", encoding="utf-8") as file:
+            file.write(entry.model_dump_json() + "\n")
+            file.flush()
+            os.fsync(file.fileno())

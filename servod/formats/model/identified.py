@@ -1,0 +1,47 @@
+"""Group of keys of the axis model file: what an identification measured, with 95 % intervals.
+
+Physics does not read it; synthesis takes its vertices from here, reports print it.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from servod.common.yaml import Strict
+
+
+class IdentifiedValue(Strict):
+    """A number with its 95 % interval; `note` says what was hit or assumed."""
+
+    value: float
+    low: float
+    high: float
+    unit: str
+    note: str = ""
+
+
+class IdentifiedMap(Strict):
+    """The friction map's half widths, node by node, of the 95 % interval."""
+
+    velocities: list[float] = Field(min_length=2, max_length=512, description="rad/s, ascending")
+    torques: list[float] = Field(min_length=2, max_length=512, description="N*m, with the velocity's sign")
+    half_widths: list[float] = Field(min_length=2, max_length=512, description="N*m")
+
+    @model_validator(mode="after")
+    def _fits(self) -> IdentifiedMap:
+        if not len(self.velocities) == len(self.torques) == len(self.half_widths):
+            raise ValueError("as many torques and half_widths as velocities")
+        return self
+
+
+class Identified(Strict):
+    """Everything that was measured, by name, and what the experiments could not tell."""
+
+    values: dict[str, IdentifiedValue]
+    friction_map: IdentifiedMap
+    not_identifiable: dict[str, str] = Field(default_factory=dict, description="what, and what would tell it")
+    data_sha256: list[Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]] = Field(
+        default_factory=list, description="hashes of the recordings' files that it was fitted on, in their order"
+    )

@@ -1,0 +1,38 @@
+"""What the keys of an axis model file have in common: ranges of numbers, and sums of sines over position.
+
+Under the groups of keys of friction and of everything else. Torque means force and rad means m when `axis: linear`.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from servod.common.yaml import Strict
+
+Factor = Annotated[float, Field(gt=0.0, le=100.0)]
+NonNegative = Annotated[float, Field(ge=0.0)]
+Positive = Annotated[float, Field(gt=0.0)]
+Phase = Annotated[float, Field(ge=-100.0, le=100.0, description="rad, at position 0")]
+
+
+class Harmonic(Strict):
+    """One sine over position: amplitude*sin(n*x + phase), n = periods_per_turn (2*pi*periods_per_metre when linear)."""
+
+    amplitude: float = Field(description="in the unit of the group it stands in")
+    periods_per_turn: float | None = Field(None, gt=0.0, le=100_000.0, description="rotary axes: periods in 2*pi rad")
+    periods_per_metre: float | None = Field(None, gt=0.0, le=10_000_000.0, description="linear axes: periods in 1 m")
+    phase: Phase = 0.0
+
+    @model_validator(mode="after")
+    def _one_period(self) -> Harmonic:
+        if (self.periods_per_turn is None) == (self.periods_per_metre is None):
+            raise ValueError("exactly one of periods_per_turn and periods_per_metre")
+        return self
+
+
+class Harmonics(Strict):
+    """A sum of sines over position."""
+
+    harmonics: tuple[Harmonic, ...] = Field(min_length=1, max_length=64)

@@ -1,0 +1,84 @@
+"""Turns a recording into CSV (core) or Parquet (pyarrow, lab extra), with the column names of servod.lab.recordings.
+
+Behind recorder_read. The first column is t_s, seconds since the first cycle; the others keep the record's names, which
+carry their units. Files are written aside, synced and renamed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, TextIO
+
+from servod.common.errors import BadInput
+from servod.formats.recording.mcap_reader import Recording
+
+_NS_PER_S = 1e9
+
+
+def export_csv(recording: Recording, path: Path) -> int:
+    """Write `recording` to `path` as CSV; returns the number of rows. Raises BadInput when that cannot be written."""
+    aside = path.with_name(path.name + ".part")
+    try:
+        with aside.open("w", newline="", encoding="utf-8") as stream:
+            _write_csv(recording, stream)
+            stream.flush()
+            os.fsync(stream.fileno())
+        aside.replace(path)
+    except OSError as error:
+        _remove(aside)
+        raise BadInput(str(path), error.strerror or str(error), "a path that can be written") from None
+    return len(recording)
+
+
+def _remove(aside: Path) -> None:
+    """Take away what could not be written whole: on a full disk it is what fills it."""
+    with contextlib.suppress(OSError):
+        aside.unlink(missing_ok=True)
+
+
+def _write_csv(recording: Recording, stream: TextIO) -> None:
+    writer = csv.writer(stream)
+    writer.writerow(["t_s", *recording.names])
+    writer.writerows(_csv_rows(recording))
+
+
+def _csv_rows(recording: Recording) -> Iterator[tuple[Any, ...]]:
+    columns = [recording.column(name) for name in recording.names]
+    times_s = seconds(recording)
+    return zip((f"{t:.9f}" for t in times_s), *columns, strict=True)
+
+
+def seconds(recording: Recording) -> list[float]:
+    """Seconds of each row since the first; empty when there is none."""
+    times_ns = recording.column("time_ns")
+    return [(t - times_ns[0]) / _NS_PER_S for t in times_ns]
+
+
+def export_parquet(recording: Recording, path: Path) -> int:
+    """Write `recording` to `path` as Parquet, with units in the columns' metadata; returns the number of rows.
+
+    Raises BadInput when pyarrow is not installed or the file cannot be written.
+    """
+    try:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+    except ImportError:
+        raise BadInput(str(path), "no pyarrow", "the lab extra (pip install 'servod[lab]'), or CSV") from None
+    types = {"d": pa.float64(), "q": pa.int64()}
+    fields = [pa.field("t_s", pa.float64(), metadata={"unit": "s"})]
+    columns = [pa.array(seconds(recording), pa.float64())]
+    for name, kind, unit in zip(recording.names, recording.kinds, recording.units, strict=True):
+        fields.append(pa.field(name, types[kind], metadata={"unit": unit}))
+        columns.append(pa.array(recording.column(name), types[kind]))
+    aside = path.with_name(path.name + ".part")
+    try:
+        pq.write_table(pa.table(columns, schema=pa.schema(fields)), aside)
+        aside.replace(path)
+    except OSError as error:
+        _remove(aside)
+        raise BadInput(str(path), error.strerror or str(error), "a path that can be written") from None
+    return len(recording)

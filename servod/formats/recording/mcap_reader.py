@@ -1,0 +1,247 @@
+"""Reads a recording back, whole or cut off by a crash, without numpy.
+
+Behind the recorder; export, replay and the physics side start here. A file that ends in the middle of a record gives
+everything before it and says `truncated`.
+"""
+
+from __future__ import annotations
+
+import array
+import json
+import os
+import re
+import struct
+import zlib
+from collections.abc import Container, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO, cast
+
+import zstandard
+from mcap.exceptions import InvalidMagic, McapError
+from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Message, Schema
+from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
+
+from servod.common.errors import BadInput
+from servod.common.files import open_file
+from servod.formats.recording.mcap_writer import CYCLE_TOPIC, EVENT_TOPIC
+from servod.formats.recording.record import CDR_HEADER, CycleRecord
+
+#: The column that every recording has.
+TIME = "time_ns"
+_KINDS = {"float64": "d", "int64": "q"}
+_LINE = re.compile(r"^(float64|int64) (\w+)  # \[([^]]*)\]")
+_RECORD_LIMIT_BYTES = 64 * 1024 * 1024
+#: Most that a file may hold unpacked; a few kilobytes can claim any amount.
+_UNPACKED_LIMIT_BYTES = 4 * 1024**3
+#: Most that is kept beside the cycles: attachments, events, and what the file says of its own form.
+_BESIDE_LIMIT_BYTES = 32 * 1024 * 1024
+_REMEDY = "record in parts: a smaller recorder.max_file_mib"
+_BROKEN = (
+    *(McapError, CRCValidationError, struct.error, zlib.error, zstandard.ZstdError, ValueError, EOFError, KeyError),
+    *(OverflowError, RecursionError),
+)
+
+
+@dataclass
+class Recording:
+    """A recording in memory: `rows` holds the cycle records one behind the other, eight bytes for each name.
+
+    `kinds` has one letter per name, "d" (float64) or "q" (int64), little endian; `truncated` tells that the file
+    ends without its footer, as after kill -9, or is damaged; `damage` says then where, and what could be read.
+    `left_out` are the names in the file that were not wanted.
+    """
+
+    names: tuple[str, ...] = ()
+    kinds: str = ""
+    units: tuple[str, ...] = ()
+    rows: bytearray = field(default_factory=bytearray)
+    attachments: dict[str, bytes] = field(default_factory=dict)
+    events: list[dict[str, Any]] = field(default_factory=list)
+    truncated: bool = True
+    damage: str = ""
+    left_out: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.rows) // self.row_bytes if self.names else 0
+
+    @property
+    def row_bytes(self) -> int:
+        """Length of one row."""
+        return 8 * len(self.names)
+
+    def column(self, name: str) -> array.array[Any]:
+        """One column as array('d') or array('q'). Raises KeyError when the recording has no such name."""
+        if name not in self.names:
+            raise KeyError(name)
+        at = self.names.index(name)
+        rows = memoryview(self.rows)
+        if self.kinds[at] == "d":
+            return array.array("d", rows.cast("d")[at :: len(self.names)])
+        return array.array("q", rows.cast("q")[at :: len(self.names)])
+
+    def records(self) -> list[CycleRecord]:
+        """All rows as cycle records. Raises ValueError when the file was written with other fields than today's."""
+        if self.names != CycleRecord._fields:
+            raise ValueError("the recording has other fields than this version's cycle record")
+        unpack = struct.Struct("<" + self.kinds).iter_unpack
+        return [CycleRecord._make(row) for row in unpack(self.rows)]
+
+
+def read_recording(path: str | Path, wanted: Container[str] | None = None, most_cells: int | None = None) -> Recording:
+    """The recording at `path`; only its time and the names that are `wanted`, where that is given.
+
+    Raises BadInput when it is missing, no recording of servod's at all, or too large: more than `most_cells` numbers
+    in the names that are kept, or over 4 GiB unpacked, 3.4 hours at 1 kHz.
+    """
+    recording = Recording()
+    taker = _Taker(path, recording, wanted, most_cells)
+    try:
+        with open_file(path) as stream:
+            bounded = _Bounded(stream)
+            reader = StreamReader(
+                cast(Any, bounded), validate_crcs=True, emit_chunks=True, record_size_limit=_RECORD_LIMIT_BYTES
+            )
+            _read_stream(reader, taker)
+            _tell_damage(recording, stream.tell(), bounded.size)
+    except InvalidMagic:
+        raise BadInput(str(path), "a file that is not MCAP", "a recording of servod (.mcap)") from None
+    except OSError as error:
+        raise BadInput(str(path), error.strerror or str(error), "a readable recording") from None
+    if not recording.names:
+        found = f"no topic {CYCLE_TOPIC}" + (f" ({recording.damage})" if recording.damage else "")
+        raise BadInput(str(path), found, "a recording of servod (.mcap)")
+    if (TIME, "q") not in zip(recording.names, recording.kinds, strict=True):
+        raise BadInput(f"{path}: {CYCLE_TOPIC}", f"no field int64 {TIME}", "a recording of servod (.mcap)")
+    return recording
+
+
+class _Bounded:
+    """A file that is never asked for more than it has: Python makes room for all that is asked for."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self.size = os.fstat(stream.fileno()).st_size
+        self._stream = stream
+
+    def read(self, count: int) -> bytes:
+        """At most `count` bytes."""
+        return self._stream.read(min(count, self.size))
+
+
+def _tell_damage(recording: Recording, read_bytes: int, all_bytes: int) -> None:
+    """Say where a file that has no end breaks off."""
+    if recording.truncated:
+        what = "cut off" if read_bytes >= all_bytes else "damaged"
+        readable = f"{len(recording)} cycles could be read, from the first {read_bytes} of {all_bytes} bytes"
+        recording.damage = f"the file is {what}: {readable}"
+
+
+def _read_stream(reader: StreamReader, taker: _Taker) -> None:
+    """Read until the footer, or until the file breaks off."""
+    started = False
+    try:
+        for record in _unpacked(reader, taker.path):
+            started = True
+            taker.take(record)
+    except InvalidMagic:
+        if not started:
+            raise
+        taker.recording.truncated = True  # the last eight bytes are missing
+    except _BROKEN:
+        if not started:
+            raise InvalidMagic((0,) * 8) from None
+
+
+def _unpacked(reader: StreamReader, path: str | Path) -> Iterator[McapRecord]:
+    """All records, those in chunks too. Raises ValueError on a chunk that claims more than any of servod's has.
+
+    Raises BadInput when all together are too many to be read at once.
+    """
+    left_bytes = _UNPACKED_LIMIT_BYTES
+    for record in reader.records:
+        if not isinstance(record, Chunk):
+            yield record
+            continue
+        size = max(record.uncompressed_size, _claimed_bytes(record))
+        if size > _RECORD_LIMIT_BYTES:
+            raise ValueError(f"a chunk of {size} bytes")
+        left_bytes -= size
+        if left_bytes < 0:
+            found = f"more than {_UNPACKED_LIMIT_BYTES} bytes unpacked"
+            raise BadInput(str(path), found, f"at most that much at once; {_REMEDY}")
+        yield from breakup_chunk(record, validate_crc=True)
+
+
+def _claimed_bytes(chunk: Chunk) -> int:
+    """How much the packed data says that it unpacks to. Raises ValueError for a packing that servod does not write."""
+    if chunk.compression not in ("", "zstd"):
+        raise ValueError(f"compression {chunk.compression}")
+    return max(zstandard.frame_content_size(chunk.data), 0) if chunk.compression else len(chunk.data)
+
+
+class _Taker:
+    """Puts the records of one file into its recording, and counts what is kept of them."""
+
+    def __init__(
+        self, path: str | Path, recording: Recording, wanted: Container[str] | None, most_cells: int | None
+    ) -> None:
+        self.path, self.recording = path, recording
+        self._wanted, self._most_cells = wanted, most_cells
+        self._schemas: dict[int, Schema] = {}
+        self._topics: dict[int, str] = {}
+        self._row = struct.Struct("")  # splits a row of the file into the cells that are kept
+        self._beside_bytes = 0
+
+    def take(self, record: McapRecord) -> None:
+        """Keep of a record what belongs into the recording. Raises BadInput when that becomes too much."""
+        if isinstance(record, Message):
+            self._take_message(record)
+        elif isinstance(record, Footer):
+            self.recording.truncated = False
+        elif isinstance(record, Schema):
+            self._count_beside(len(record.data))
+            self._schemas[record.id] = record
+        elif isinstance(record, Channel):
+            self._count_beside(len(record.topic))
+            self._topics[record.id] = record.topic
+            self._take_channel(record)
+        elif isinstance(record, Attachment):
+            self._count_beside(len(record.data))
+            self.recording.attachments[record.name] = record.data
+
+    def _take_channel(self, channel: Channel) -> None:
+        if channel.topic != CYCLE_TOPIC or self.recording.names:
+            return
+        fields = [_LINE.match(line) for line in self._schemas[channel.schema_id].data.decode().splitlines()]
+        known = [f.groups() for f in fields if f is not None]
+        kept = [self._wanted is None or name == TIME or name in self._wanted for _, name, _ in known]
+        fields_kept = [field for field, keep in zip(known, kept, strict=True) if keep]
+        self.recording.kinds = "".join(_KINDS[kind] for kind, _, _ in fields_kept)
+        self.recording.names = tuple(name for _, name, _ in fields_kept)
+        self.recording.units = tuple(unit for _, _, unit in fields_kept)
+        self.recording.left_out = tuple(name for (_, name, _), keep in zip(known, kept, strict=True) if not keep)
+        self._row = struct.Struct("".join("8s" if keep else "8x" for keep in kept))
+
+    def _take_message(self, message: Message) -> None:
+        topic = self._topics.get(message.channel_id)
+        if topic == CYCLE_TOPIC and len(message.data) == len(CDR_HEADER) + self._row.size:
+            row = message.data[len(CDR_HEADER) :]
+            self.recording.rows += b"".join(self._row.unpack(row)) if self.recording.left_out else row
+            self._require_cells()
+        elif topic == EVENT_TOPIC:
+            self._count_beside(len(message.data))
+            event = json.loads(message.data)
+            if isinstance(event, dict):
+                self.recording.events.append(event)
+
+    def _require_cells(self) -> None:
+        cells = len(self.recording.rows) // 8
+        if self._most_cells is not None and cells > self._most_cells:
+            found = f"{len(self.recording)} cycles or more of {len(self.recording.names)} columns"
+            raise BadInput(str(self.path), found, f"at most {self._most_cells} numbers; {_REMEDY}")
+
+    def _count_beside(self, count: int) -> None:
+        self._beside_bytes += count
+        if self._beside_bytes > _BESIDE_LIMIT_BYTES:
+            found = f"over {self._beside_bytes} bytes of attachments, events and schemas"
+            raise BadInput(str(self.path), found, f"at most {_BESIDE_LIMIT_BYTES} bytes beside the cycles")

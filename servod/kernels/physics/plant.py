@@ -1,0 +1,140 @@
+"""The plant of a virtual axis: an axis model that moves, with noise, driven by torque over any span of time.
+
+Used by the virtual drive and encoder (`servod.drivers.virtual`), which read it but never its model. Inner steps of a
+fixed length; compiled when numba is installed, the same source in pure Python otherwise, with the same result.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Sequence
+from typing import Any
+
+from servod.formats.model.axis_model import AxisModel
+from servod.kernels.physics import layout as lay
+from servod.kernels.physics.compiled import available, compiled
+from servod.kernels.physics.dynamics import advance
+from servod.kernels.physics.effects import encoder_position
+
+#: Inner step of every simulation, s (stiff bristles and springs of real joints need 50 us or less).
+INNER_STEP_S = 50e-6
+
+
+def delay_line_length(delay_s: float, step_s: float) -> int:
+    """Values that the delay line must hold for a delay: whole steps, one for the fraction, one being written."""
+    return math.ceil(delay_s / step_s + 1e-9) + 2
+
+
+def rest_state(delay_s: float, step_s: float, temperature_c: float) -> list[float]:
+    """The state of an axis at rest at position 0 without torque; `servod.kernels.physics.layout` names its numbers."""
+    state = [0.0] * (lay.S_LINE + delay_line_length(delay_s, step_s))
+    state[lay.S_TEMPERATURE_C] = temperature_c
+    return state
+
+
+class Plant:
+    """One joint in motion; all values SI in joint coordinates.
+
+    `delay_s` overrides the model's command-to-torque time (a drive on a bus has part of it already). The same model,
+    seed and calls give the same motion.
+    """
+
+    def __init__(
+        self, model: AxisModel, seed: int = 0, *, delay_s: float | None = None, compile_kernel: bool | None = None
+    ) -> None:
+        self.model = model
+        self.delay_s = model.total_delay_s if delay_s is None else max(0.0, delay_s)
+        self._random = random.Random(seed)  # noqa: S311  (noise, not secrets)
+        self._noise = model.noise
+        self._noise_torque_nm = 0.0
+        self._owed_s = 0.0
+        state = rest_state(self.delay_s, INNER_STEP_S, model.start_temperature_c)
+        self._bind(model.pack(), state, available() if compile_kernel is None else compile_kernel)
+        self._draw_readings()
+
+    def _bind(self, parameters: Sequence[float], state: list[float], compile_kernel: bool) -> None:
+        self._p: Any = parameters
+        self._s: Any = state
+        self._advance, self._encoder = advance, encoder_position
+        if compile_kernel:
+            import numpy as np
+
+            self._p, self._s = np.array(parameters), np.array(state)
+            self._advance, self._encoder = compiled(advance), compiled(encoder_position)
+            self._advance(self._p, self._s.copy(), 0.0, 0.0, 0, INNER_STEP_S, self.delay_s, math.nan)
+            self._encoder(self._p, 0.0)
+
+    def advance(self, torque_nm: float, duration_s: float, external_nm: float = 0.0) -> None:
+        """Let `duration_s` pass under the held command `torque_nm`; `external_nm` acts beside it without delay.
+
+        Spans that are no multiple of the inner step leave a remainder, which the next call makes up.
+        """
+        self._owed_s += duration_s
+        steps = int(self._owed_s / INNER_STEP_S + 1e-6)
+        self._owed_s -= steps * INNER_STEP_S
+        external_nm += self._next_noise(duration_s)
+        self._advance(self._p, self._s, torque_nm, external_nm, steps, INNER_STEP_S, self.delay_s, math.nan)
+        self._draw_readings()
+
+    def place(self, position_rad: float, velocity_rad_s: float = 0.0) -> None:
+        """Put the joint somewhere, bristle relaxed; motor and load together."""
+        self._s[lay.S_POSITION] = self._s[lay.S_LOAD_POSITION] = position_rad
+        self._s[lay.S_VELOCITY] = self._s[lay.S_LOAD_VELOCITY] = velocity_rad_s
+        self._s[lay.S_BRISTLE] = 0.0
+
+    def _next_noise(self, duration_s: float) -> float:
+        """Low-passed white torque noise (Ornstein-Uhlenbeck, exact over `duration_s`)."""
+        if self._noise is None or self._noise.torque_rms == 0.0:
+            return 0.0
+        kept = math.exp(-2.0 * math.pi * self._noise.torque_bandwidth_hz * duration_s)
+        fresh = self._noise.torque_rms * math.sqrt(1.0 - kept * kept)
+        self._noise_torque_nm = kept * self._noise_torque_nm + fresh * self._random.gauss(0.0, 1.0)
+        return self._noise_torque_nm
+
+    def _draw_readings(self) -> None:
+        """Reading noise, once per span, so that a reading stays the same until time passes."""
+        encoder_rms = self._noise.encoder_rms if self._noise else 0.0
+        temperature_rms = self._noise.temperature_rms_c if self._noise else 0.0
+        self._encoder_noise_rad = self._random.gauss(0.0, encoder_rms) if encoder_rms else 0.0
+        self._temperature_noise_c = self._random.gauss(0.0, temperature_rms) if temperature_rms else 0.0
+
+    @property
+    def position_rad(self) -> float:
+        """True joint position: the load's where the joint is elastic or has a gap."""
+        return float(self._s[lay.S_LOAD_POSITION]) + self._owed_s * float(self._s[lay.S_LOAD_VELOCITY])
+
+    @property
+    def velocity_rad_s(self) -> float:
+        """True joint velocity, load side."""
+        return float(self._s[lay.S_LOAD_VELOCITY])
+
+    @property
+    def motor_position_rad(self) -> float:
+        """True position of the motor side, in joint coordinates."""
+        return float(self._s[lay.S_POSITION]) + self._owed_s * float(self._s[lay.S_VELOCITY])
+
+    @property
+    def motor_velocity_rad_s(self) -> float:
+        """True velocity of the motor side, in joint coordinates."""
+        return float(self._s[lay.S_VELOCITY])
+
+    @property
+    def encoder_position_rad(self) -> float:
+        """What the encoder on the motor side sees before counting: eccentricity and reading noise included."""
+        return float(self._encoder(self._p, self.motor_position_rad)) + self._encoder_noise_rad
+
+    @property
+    def temperature_c(self) -> float:
+        """Measured joint temperature, reading noise included."""
+        return float(self._s[lay.S_TEMPERATURE_C]) + self._temperature_noise_c
+
+    @property
+    def friction_nm(self) -> float:
+        """True friction torque of the last inner step."""
+        return float(self._s[lay.S_FRICTION])
+
+    @property
+    def time_s(self) -> float:
+        """Time that has passed since the start."""
+        return float(self._s[lay.S_TIME_S]) + self._owed_s

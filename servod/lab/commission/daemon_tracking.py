@@ -1,0 +1,95 @@
+"""The tracking comparison on an axis under a daemon: the deployed law alone, as far as the axis's limits allow.
+
+Beside the step that validates.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from servod.client.control import ControlClient, Refused
+from servod.client.daemon_config import require_daemon_config
+from servod.client.deploy_daemon import DaemonDeployLink
+from servod.common.errors import AnswerIsNo
+from servod.formats.config import AxisConfig
+from servod.formats.gains.gain_set import GainSet
+from servod.lab.tracking.metrics import Curves, Tracking, known_noise, tracking
+from servod.lab.tracking.motions import HOLD_S, PAPER_S, STEPS_MRAD
+from servod.lab.tracking.stepped import curves_of
+
+
+def measure_on_daemon(
+    socket: Path,
+    config: AxisConfig,
+    deployed: tuple[str, int],
+    tell: Callable[[float], None],
+    gains: GainSet | None = None,
+) -> tuple[Tracking | None, list[str]]:
+    """Figures of the set `deployed` (name, version), and what the daemon refused; None where it refused (19).
+
+    `gains` is that set, where it is at hand: its design knows the encoder's noise. The axis is left enabled or not, as
+    it was. Raises AnswerIsNo when another set runs or the axis drops out, BadInput when the daemon has another
+    configuration than `config`, Unreachable when it does not answer any more.
+    """
+    with ControlClient(socket) as client:
+        require_daemon_config(client, config)
+        link = DaemonDeployLink(client)
+        _require_active(link, deployed)
+        with _enabled(link):
+            curves, refused = _recorded(client, link, tell)
+    if "paper" not in curves:
+        return None, refused
+    steps = {mrad: curves[f"{mrad:g}"] for mrad in STEPS_MRAD if f"{mrad:g}" in curves}
+    count_rad = 2.0 * math.pi / config.encoder.counts_per_turn
+    noise_rad = known_noise(gains, count_rad) if gains else None
+    return tracking(curves["paper"], steps, count_rad, encoder_rms_rad=noise_rad), refused
+
+
+@contextlib.contextmanager
+def _enabled(link: DaemonDeployLink) -> Iterator[None]:
+    """The axis enabled for what is measured, and as it was behind it; stopped before anything else when that fails."""
+    was_enabled = link.enabled
+    try:
+        if not was_enabled:
+            link.enable()
+        yield
+    except BaseException:
+        link.stop()
+        raise
+    finally:
+        if not was_enabled:
+            link.disable()
+
+
+def _recorded(
+    client: ControlClient, link: DaemonDeployLink, tell: Callable[[float], None]
+) -> tuple[dict[str, Curves], list[str]]:
+    """Curves by motion, "paper" or a step's size in mrad, and the motions that the daemon refused with its reason."""
+    motions = {"paper": {"kind": "paper", "duration_s": PAPER_S}}
+    motions |= {
+        f"{mrad:g}": {"kind": "step", "amplitude_rad": 1e-3 * mrad, "duration_s": HOLD_S} for mrad in STEPS_MRAD
+    }
+    curves: dict[str, Curves] = {}
+    refused: list[str] = []
+    for index, (name, motion) in enumerate(motions.items()):
+        tell(index / len(motions))
+        start_rad = float(client.call("status")["motion"]["reference_rad"])
+        try:
+            curves[name] = curves_of(link.record([motion]).tobytes(), start_rad)
+        except Refused as error:  # of an axis that is enabled: the motion itself is too much for its limits
+            refused.append(f"{name}: {error}")
+    return curves, refused
+
+
+def _require_active(link: DaemonDeployLink, deployed: tuple[str, int]) -> None:
+    """What is measured is what was deployed. Raises AnswerIsNo."""
+    if link.active == deployed:
+        return
+    (runs, runs_version), (name, version) = link.active, deployed
+    raise AnswerIsNo(
+        f"the axis runs {runs} version {runs_version}, but {name} version {version} was deployed; to measure that, "
+        f"`servoctl gains activate {name} --version {version}`"
+    )

@@ -1,0 +1,270 @@
+"""The page of a commissioning and its pictures: from the folder's files alone, so that it can be made anew at any time.
+
+Stands on the figures of servod.lab.report; called by the last step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from servod.client.commission_axis import VirtualWalkAxis
+from servod.formats.gains.gain_set import GainSet, load_gains
+from servod.formats.model.axis_model import AxisModel, load_axis_model
+from servod.lab.commission.comparison import DEPLOYED, run_files
+from servod.lab.commission.files import (
+    AFTER_ROWS,
+    BEFORE_ROWS,
+    CERTIFICATE,
+    DEPLOYMENT,
+    GAINS,
+    IDENTIFIED,
+    MODEL,
+    PICTURES,
+    RECORDINGS,
+    RELAXED,
+    REPORT,
+    TRACKING,
+    TUNING,
+    read_json,
+)
+from servod.lab.commission.runs import load_curves, load_rows
+from servod.lab.commission.walk import Tell, Walk
+from servod.lab.identify import store
+from servod.lab.identify.analysis import analyse
+from servod.lab.report.figure import Figure, Table
+from servod.lab.report.figures import friction, loop, motion, proof, response, sets
+from servod.lab.report.figures.motion import Motion
+from servod.lab.report.page import Page
+from servod.lab.report.pictures import write_pictures
+from servod.lab.tracking.metrics import Curves, curve_key
+from servod.lab.tracking.motions import STEPS_MRAD
+from servod.qualify.demo.axis import LABELS
+
+Part = Figure | Table | str
+#: Laws as people read them.
+NAMES = {**LABELS, DEPLOYED: "Deployed"}
+#: Classes of the comparison as people read them, in the order of the page.
+CLASSES = {
+    "free_feedback": "Every law with feedback of its own",
+    "equal_feedback": "Every law with the same feedback",
+}
+
+
+def write_report(walk: Walk, tell: Tell) -> None:
+    """Write report.html, and every figure as PNG and SVG. Raises BadInput."""
+    page = Page(f"Commissioning of {walk.axis.config.name}")
+    _summary(page, walk)
+    gains, model = load_gains(walk.path(GAINS)), load_axis_model(walk.path(MODEL))
+    shown = sections(walk, gains, model)
+    for index, (title, parts) in enumerate(shown.items()):
+        tell(title.lower(), index / len(shown))
+        page.heading(title)
+        for part in parts():
+            _add(page, walk, part)
+    page.write(walk.path(REPORT))
+
+
+def sections(walk: Walk, gains: GainSet, model: AxisModel) -> dict[str, Callable[[], Iterator[Part]]]:
+    """What makes the parts of each section, by its title, in the order of the page."""
+    return {
+        "The axis as identified": lambda: _identified(walk, model),
+        "The law and its design": lambda: _design(gains, model),
+        "The certificate": lambda: _certificate(gains),
+        "Deployment": lambda: _deployment(walk),
+        "Tracking": lambda: _tracking(walk),
+    }
+
+
+def _add(page: Page, walk: Walk, part: Part) -> None:
+    if isinstance(part, str):
+        page.sentence(part)
+    elif isinstance(part, Table):
+        page.sentence(part.title)
+        page.table(part.header, part.rows)
+    else:
+        page.figure(part)
+        write_pictures(part, walk.path(PICTURES))
+
+
+def _summary(page: Page, walk: Walk) -> None:
+    """What happened, in sentences."""
+    deployment, tracking = read_json(walk.path(DEPLOYMENT)), read_json(walk.path(TRACKING))["tracking"]
+    certificate, relaxed = read_json(walk.path(CERTIFICATE)), read_json(walk.path(RELAXED))
+    page.sentence(
+        "The axis was identified by its own motion; a controller was computed for what was found, judged without "
+        f"trusting the solver ({len(certificate['checks'])} checks, all passed), and tried on the axis."
+    )
+    if relaxed:
+        page.sentence(f"The design was agreed to be relaxed: {relaxed['wish']} {relaxed['enough']:.3g}.")
+    was = f"went from {deployment['before']['slow_mrad']:.4g} to" if deployment["before"] else "was"
+    page.sentence(
+        f"On the validation motion the error {was} {deployment['after']['slow_mrad']:.4g} mrad RMS; "
+        f"{deployment['promised']['slow_mrad']:.4g} mrad was promised."
+    )
+    if "local" in tracking:
+        page.sentence(
+            f"Trajectory (19) is tracked with {tracking['local']['rms_error_mrad']:.4g} mrad RMS, at most "
+            f"{tracking['local']['max_error_mrad']:.4g} mrad{_rough(tracking['local'])}."
+        )
+
+
+def _identified(walk: Walk, model: AxisModel) -> Iterator[Part]:
+    axis = walk.axis
+    truth = axis.joint if isinstance(axis, VirtualWalkAxis) else None
+    found = read_json(walk.path(IDENTIFIED))
+    rows = [
+        (name, f"{v['value']:.5g}", f"{v['low']:.4g} to {v['high']:.4g}", v["unit"], v["note"])
+        for name, v in found["identified"].items()
+    ]
+    yield Table("What was measured", ("quantity", "value", "95 % interval", "unit", "note"), tuple(rows))
+    yield from (f"Not identifiable: {name}. {remedy}." for name, remedy in found["not_identifiable"].items())
+    analysis = analyse(store.load(walk.path(RECORDINGS)))
+    yield friction.dahl_curve(analysis.presliding, truth)
+    yield response.frequency_response(analysis.response)
+    yield friction.friction_map(model, truth)
+
+
+def _design(gains: GainSet, model: AxisModel) -> Iterator[Part]:
+    yield sets.weighting_functions(gains)
+    yield sets.local_friction(gains, model)
+    yield loop.bode(gains)
+    yield loop.impulse_responses(gains)
+
+
+def _certificate(gains: GainSet) -> Iterator[Part]:
+    yield proof.certificate_table(gains)
+    yield proof.observations_table(gains)
+
+
+def _deployment(walk: Walk) -> Iterator[Part]:
+    found = read_json(walk.path(DEPLOYMENT))
+    columns = [run for run in ("before", "after", "promised") if found[run]]
+    rows = [(name.removesuffix("_mrad"), *(f"{found[run][name]:.4g}" for run in columns)) for name in found["promised"]]
+    yield Table("Validation motion, mrad", ("figure", *columns), tuple(rows))
+    if not found["before"]:
+        yield "The set was active already, and nothing was measured before it: its promise alone judged it."
+        return
+    files = {"before": BEFORE_ROWS, "after": AFTER_ROWS}
+    before, after = (motion.motion_of_rows(label, load_rows(walk.path(name))) for label, name in files.items())
+    yield motion.before_after(before, after, title="The validation motion before and after")
+
+
+def _tracking(walk: Walk) -> Iterator[Part]:
+    found = read_json(walk.path(TRACKING))
+    for name, title in CLASSES.items():
+        if not (figures := found[name]):
+            continue
+        yield Table(f"{title}: trajectory (19) and steps, mrad and s", _HEADER, tuple(_rows(figures)))
+        yield from _over_limit(figures)
+        feedback = name.partition("_")[0]
+        yield from _tuned(feedback, title, read_json(walk.path(TUNING)).get(feedback, {}))
+        keys = {law: law if law == DEPLOYED else f"{feedback}_{law}" for law in figures if "failed" not in figures[law]}
+        runs = {law: load_curves(run_files(walk, key)[1]) for law, key in keys.items()}
+        yield from _figures(name, title, runs)
+    yield from (f"Not measured: {line}" for line in found.get("not_measured", []))
+
+
+def _tuned(feedback: str, title: str, tuned: dict[str, Any]) -> Iterator[Table]:
+    """What the tuning of a class reached on simulated plants, with the roughness that bounds every law alike."""
+    if tuned:
+        header = ("controller", "cost / mrad", "simulated plants", "roughness, times that of the paper's PD", "limit")
+        rows = [
+            (
+                _label(law, t),
+                f"{t['cost_mrad']:.4f}",
+                str(t["simulations"]),
+                f"{t['roughness_ratio']:.2f}",
+                f"{t['roughness_limit']:g}",
+            )
+            for law, t in tuned.items()
+        ]
+        yield Table(f"{title}: what tuning reached", header, tuple(rows))
+
+
+def _over_limit(figures: dict[str, Any]) -> Iterator[str]:
+    """What the limit on roughness bounds, where the deployed law stands beside laws that were tuned within it."""
+    found = figures.get(DEPLOYED, {})
+    if "roughness_ratio" not in found:
+        return
+    yield (
+        f"The laws were tuned with the roughness of the torque limited to {found['roughness_limit']:g} times what the "
+        "paper's PD makes of encoder and noise. The deployed law was synthesized, and nothing but its certificate "
+        f"bounds it: it runs{_rough(found).removeprefix(',')}. Law against law is the row of the local models."
+    )
+
+
+def _rough(found: dict[str, Any]) -> str:
+    """A clause on the roughness of a law; empty where it was not compared."""
+    if "roughness_ratio" not in found:
+        return ""
+    return (
+        f", with {found['roughness_ratio']:.3g} times the roughness of the paper's PD, "
+        f"{_against_limit(found) or 'within the limit'}"
+    )
+
+
+def _against_limit(found: dict[str, Any]) -> str:
+    """By how much a law is over the limit on roughness; empty where it is not, or was not compared."""
+    if found.get("within_roughness_limit", True):
+        return ""
+    return f"over the limit (x{found['roughness_ratio'] / found['roughness_limit']:.3g})"
+
+
+def _label(law: str, found: dict[str, Any]) -> str:
+    """A law as people read it, with the mark of one that is rougher than the tuned may be."""
+    return ", ".join(filter(None, (NAMES[law], _against_limit(found))))
+
+
+def _figures(name: str, title: str, runs: dict[str, dict[str, Curves]]) -> Iterator[Figure]:
+    motions = [_motion(law, curves["paper"]) for law, curves in runs.items()]
+    yield motion.tracking_grid(motions, f"tracking_{name}", f"{title}: trajectory (19)", same_error_scale=False)
+    yield motion.errors(motions, f"errors_{name}", f"{title}: errors on trajectory (19)")
+    for step in STEPS_MRAD:
+        key = curve_key(step)
+        stepped = [_motion(law, curves[key]) for law, curves in runs.items() if key in curves]
+        if stepped:
+            yield motion.steps(stepped, f"{key}_{name}", f"{title}: step of {step:g} mrad")
+
+
+def _motion(law: str, curves: Curves) -> Motion:
+    return Motion(
+        NAMES[law], curves.time_s, curves.reference_rad, curves.position_rad, curves.torque_nm, curves.friction_nm
+    )
+
+
+_HEADER = (
+    "controller",
+    "RMS",
+    "largest",
+    "roughness / mN*m per cycle",
+    "times the paper's PD",
+    "step / mrad",
+    "settled after / s",
+    "overshoot",
+    "steady error",
+    "hold",
+)
+
+
+def _rows(figures: dict[str, Any]) -> Iterator[tuple[str, ...]]:
+    """A row for each law and step."""
+    for law, f in figures.items():
+        if "failed" in f:
+            yield (_label(law, f), f["failed"], *[""] * (len(_HEADER) - 2))
+            continue
+        torque = (f"{1e3 * f['roughness_nm']:.3g}", f"{f['roughness_ratio']:.3g}" if "roughness_ratio" in f else "")
+        head = (_label(law, f), f"{f['rms_error_mrad']:.4f}", f"{f['max_error_mrad']:.3f}", *torque)
+        if not f["steps"]:
+            yield (*head, *[""] * 5)
+        for size, s in f["steps"].items():
+            settled = "never" if s["settling_s"] is None else f"{s['settling_s']:.3f}"
+            swing = " (limit cycle)" if s["limit_cycle"] else ""
+            yield (
+                *head,
+                size,
+                settled,
+                f"{s['overshoot']:.1%}",
+                f"{s['steady_error_mrad']:.4f}",
+                f"{s['hold_mrad']:.4f}{swing}",
+            )

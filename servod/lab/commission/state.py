@@ -1,0 +1,183 @@
+"""What is done of a walk: each step by the hash of what it was made from, so that a step is redone when that changes.
+
+Under the walk. A step counts as done only when its files were complete; the record is written after them, as a whole,
+with their hashes: a file that was edited since is neither taken for the step's own nor overwritten in silence.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+
+from servod.common.errors import BadInput, Unreachable
+from servod.common.files import read_json
+from servod.common.yaml import Strict, validate
+from servod.formats.gains.store import write_file
+from servod.lab.commission.files import EARLIER, RUNS
+
+STATE = "state.json"
+LOCK = ".lock"
+
+
+class StepRecord(Strict):
+    """One step that is done: hash of its inputs, how long it took, and the hash of each file that it left."""
+
+    inputs_sha256: str
+    seconds: float
+    files_sha256: dict[str, str] = Field(default_factory=dict)
+
+
+class _Content(Strict):
+    """The file."""
+
+    axis: dict[str, Any] = Field(description="which axis this is the commissioning of")
+    steps: dict[str, StepRecord] = Field(default_factory=dict)
+
+
+class State:
+    """The walk's state in its folder."""
+
+    def __init__(self, folder: Path, axis: dict[str, Any], own_files: Sequence[str]) -> None:
+        """Begin in an empty folder, or take up the walk on the same axis. `own_files`: names that the walk writes.
+
+        Raises BadInput when the folder belongs to another axis or has files of somebody else under these names.
+        """
+        self.folder, self._path = folder, folder / STATE
+        if self._path.exists():
+            self._content = self._load()
+            self._refuse_other_axis(axis)
+        else:
+            self._refuse_foreign_files(own_files)
+            self._content = _Content(axis=axis)
+            self._write()
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """How long each step took that is done."""
+        return {name: record.seconds for name, record in self._content.steps.items()}
+
+    def done(self, step: str, inputs: dict[str, Any], outputs: Sequence[str]) -> bool:
+        """Whether the step was done with these inputs and its files are there.
+
+        Raises BadInput when one of them is not what the step wrote, whatever else speaks for doing the step anew: that
+        would overwrite it.
+        """
+        record = self._content.steps.get(step)
+        if record is None:
+            return False
+        self._refuse_edited_files(step, record)
+        there = all((self.folder / name).exists() for name in {*outputs, *record.files_sha256})
+        return there and record.inputs_sha256 == digest(inputs)
+
+    def begin(self, step: str, outputs: Sequence[str]) -> None:
+        """The step is not done, and nothing in its place says that it is, should it end with a no or not at all.
+
+        What it had left goes to the folder EARLIER, what an interruption left of it goes. Its runs stay: they are data
+        that say themselves what they are of.
+        """
+        record = self._content.steps.get(step)
+        for name in outputs:
+            if (self.folder / name).is_file() and not name.startswith(f"{RUNS}/"):
+                self._clear(name, keep=record is not None)
+        if record:
+            others = {name: record for name, record in self._content.steps.items() if name != step}
+            self._content = self._content.model_copy(update={"steps": others})
+            self._write()
+
+    def record(self, step: str, inputs: dict[str, Any], seconds: float, outputs: Sequence[str]) -> None:
+        """The step is done; its files are complete."""
+        files = {name: file_sha256(self.folder / name) for name in outputs if (self.folder / name).is_file()}
+        done = StepRecord(inputs_sha256=digest(inputs), seconds=round(seconds, 3), files_sha256=files)
+        self._content = self._content.model_copy(update={"steps": self._content.steps | {step: done}})
+        self._write()
+
+    def _clear(self, name: str, keep: bool) -> None:
+        """Take a file out of the way of its successor."""
+        if not keep:
+            (self.folder / name).unlink()
+            return
+        aside = self.folder / EARLIER / name
+        aside.parent.mkdir(parents=True, exist_ok=True)
+        (self.folder / name).replace(aside)
+
+    def _load(self) -> _Content:
+        return validate(read_json(self._path, "the state that servoctl commission wrote"), _Content, str(self._path))
+
+    def _refuse_other_axis(self, axis: dict[str, Any]) -> None:
+        for key in sorted(axis.keys() | self._content.axis.keys()):
+            found, allowed = axis.get(key), self._content.axis.get(key)
+            if found != allowed:
+                inner, found, allowed = _difference(found, allowed)
+                raise BadInput(
+                    f"--out {self.folder}: {key}{inner}",
+                    found,
+                    f"{allowed}, whose commissioning is in this folder, or another folder",
+                )
+
+    def _refuse_edited_files(self, step: str, record: StepRecord) -> None:
+        for name, sha256 in record.files_sha256.items():
+            if file_sha256(self.folder / name) not in ("", sha256):
+                raise BadInput(
+                    f"--out {self.folder}: {name}",
+                    f"a file that was changed after the step {step} had written it",
+                    f"the file as it was; to have it made anew, delete it or use --again {step}. Of a model or a set "
+                    "of your own `servoctl synthesize`, `verify` and `deploy` make the same by single steps",
+                )
+
+    def _refuse_foreign_files(self, own_files: Sequence[str]) -> None:
+        there = [name for name in own_files if (self.folder / name).exists()]
+        if there:
+            raise BadInput(f"--out {self.folder}", f"{', '.join(there)} without {STATE}", "an empty folder")
+
+    def _write(self) -> None:
+        write_file(self._path, self._content.model_dump_json(indent=1) + "\n")
+
+
+@contextlib.contextmanager
+def sole_walk(folder: Path) -> Iterator[None]:
+    """Nobody else works in the folder meanwhile; the lock ends with the process. Raises Unreachable."""
+    with (folder / LOCK).open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise Unreachable(f"--out {folder}: another servoctl commission is at work there") from None
+        yield
+
+
+def digest(value: Any) -> str:
+    """Hash of plain values in canonical form."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def file_sha256(path: Path) -> str:
+    """Hash of a file's bytes; empty when there is none."""
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.exists() else ""
+
+
+#: Characters before the first difference of two texts that are shown with it, and in all.
+_ALIKE_SHOWN, _TEXT_SHOWN = 20, 60
+
+
+def _difference(one: Any, other: Any) -> tuple[str, str, str]:
+    """Where two values that are not equal differ first: its dotted keys, and both sides there."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        key = next(key for key in sorted({*one, *other}) if one.get(key) != other.get(key))
+        inner, *sides = _difference(one.get(key), other.get(key))
+        return f".{key}{inner}", sides[0], sides[1]
+    texts = ["nothing" if value is None else str(value) for value in (one, other)]
+    alike = next((i for i, (a, b) in enumerate(zip(*texts, strict=False)) if a != b), min(map(len, texts)))
+    start = max(alike - _ALIKE_SHOWN, 0)
+    return "", _cut(texts[0], start), _cut(texts[1], start)
+
+
+def _cut(text: str, start: int) -> str:
+    """A text from `start` on, at most _TEXT_SHOWN characters of it."""
+    end = start + _TEXT_SHOWN
+    return ("..." if start else "") + text[start:end] + ("..." if len(text) > end else "")

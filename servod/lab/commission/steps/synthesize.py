@@ -1,0 +1,115 @@
+"""Step 2: the model becomes a gain set with its proofs, or the walk says what would have to be relaxed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+from servod.common.errors import AnswerIsNo
+from servod.common.sources import SYNTHESIZES, source_sha256
+from servod.common.units import NS_PER_S, NS_PER_US
+from servod.formats.gains.gain_set import GainSet
+from servod.formats.model.axis_model import AxisModel, load_axis_model
+from servod.lab.commission.files import DESIGN, INFEASIBLE, MODEL, RELAXED, write_json, write_text
+from servod.lab.commission.walk import Walk
+from servod.lab.synthesize.deployed import Wishes
+from servod.lab.synthesize.gain_set import Options, synthesize
+from servod.lab.synthesize.infeasible import Infeasible, Relaxation
+from servod.lab.synthesize.intervals import uncertainty_of
+
+#: The regions' overlap ends at this share of the speed at most.
+OVERLAP_SHARE = 0.5
+
+
+@dataclass(frozen=True)
+class Synthesize:
+    """Leaves the set without a certificate, and what was relaxed for it."""
+
+    name: str = "synthesize"
+    title: str = "synthesize"
+
+    def outputs(self, _walk: Walk) -> tuple[str, ...]:
+        """Files in the walk's folder."""
+        return (DESIGN, RELAXED)
+
+    def inputs(self, walk: Walk) -> dict[str, Any]:
+        """The model, the loop around the law, the accuracy of the local sets, and by which sources."""
+        loop, accuracy = _loop(walk), walk.options.accuracy
+        return {**walk.hashes(MODEL), "loop": loop, "accuracy": accuracy, "tool": source_sha256(SYNTHESIZES)}
+
+    def run(self, walk: Walk) -> None:
+        """Raises AnswerIsNo when the demands cannot be met and no relaxation was agreed to."""
+        walk.path(INFEASIBLE).unlink(missing_ok=True)
+        model = load_axis_model(walk.path(MODEL))
+        wishes = Wishes(uncertainty=uncertainty_of(model), **_loop(walk))
+        taken: Relaxation | None = None
+        found = self._attempt(walk, model, wishes)
+        if isinstance(found, Infeasible):
+            tell_clashes(walk, found)
+            taken = agreed(walk, found)
+            found = self._attempt(walk, model, relaxed(wishes, taken))
+        if isinstance(found, Infeasible):
+            tell_clashes(walk, found)
+            raise AnswerIsNo(f"synthesize: no design even with {taken}")
+        write_json(walk.path(RELAXED), asdict(taken) if taken else None)
+        write_text(walk.path(DESIGN), found.to_yaml())
+
+    def _attempt(self, walk: Walk, model: AxisModel, wishes: Wishes) -> GainSet | Infeasible:
+        with walk.progress(self.title) as tell:
+            tell("both regions", 0.1)
+            options = Options(name=f"{walk.axis.config.name.lower()}_local", accuracy=walk.options.accuracy)
+            return synthesize(model, wishes, options, walk.path(MODEL))
+
+
+def tell_clashes(walk: Walk, found: Infeasible) -> None:
+    """Which vertices clash, and what would help: for people at once, and as a file for the document of the failure."""
+    write_json(walk.path(INFEASIBLE), asdict(found))
+    for line in found.clashes:
+        walk.say(f"clash: {line}")
+
+
+def _loop(walk: Walk) -> dict[str, Any]:
+    """The loop around the law, and up to which speed it is for: no faster than the axis may move and was identified."""
+    config = walk.axis.config
+    usual = Wishes()
+    speed_max = min(usual.speed_max, config.limits.speed_rad_s, walk.options.speed_rad_s or math.inf)
+    low, high = usual.overlap
+    narrow = min(1.0, OVERLAP_SHARE * speed_max / high)
+    return {
+        "speed_max": speed_max,
+        "overlap": (narrow * low, narrow * high),
+        "period_s": config.cycle.period_us * NS_PER_US / NS_PER_S,
+        "cutoff_hz": walk.axis.cutoff_hz,
+        "counts_per_turn": float(config.encoder.counts_per_turn),
+        "torque_limit_nm": config.limits.torque_nm,
+    }
+
+
+#: Wishes that a relaxation may change, by how the synthesis names them.
+_CHANGES: dict[str, Callable[[Wishes, Relaxation], Wishes]] = {
+    "scale of the uncertainty": lambda w, r: replace(w, uncertainty=w.uncertainty.scaled(r.enough / r.asked)),
+    "least decay [1/s]": lambda w, r: replace(w, least_decay_per_s=r.enough),
+    "least damping ratio": lambda w, r: replace(w, least_damping=r.enough),
+}
+
+
+def relaxed(wishes: Wishes, relaxation: Relaxation) -> Wishes:
+    """The wishes with one of them lowered, a little further than what was found to be just enough."""
+    further = replace(relaxation, enough=0.98 * relaxation.enough)
+    return _CHANGES[relaxation.wish](wishes, further)
+
+
+def agreed(walk: Walk, found: Infeasible) -> Relaxation:
+    """The first relaxation that a person agrees to. Raises AnswerIsNo with all that was offered."""
+    offers = [r for r in found.relaxations if r.wish in _CHANGES]
+    for relaxation in offers:
+        if walk.questions.takes(f"the demands cannot be met together; design with {relaxation}?"):
+            walk.say(f"relaxed: {relaxation}")
+            return relaxation
+    filters = [r for r in found.relaxations if r.wish not in _CHANGES]
+    remedies = [f"set encoder.velocity_cutoff_hz to {r.enough:g} in the configuration" for r in filters]
+    told = [*remedies, *(f"{relaxation} would do by itself (--yes takes the first)" for relaxation in offers)]
+    where = " and ".join(found.regions) or "both regions together"
+    raise AnswerIsNo(f"synthesize: no feedback for {where}; {'; '.join(told) or 'no single relaxation helps'}")

@@ -1,0 +1,211 @@
+"""From a recording as it comes to a trace that may be compared with a model; or the reason why it cannot tell.
+
+Stands between `servod.lab.recordings` (names, units, holes, time) and the predictor. Every repair is a note in the
+report.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servod.formats.model.axis_model import AxisModel
+from servod.lab.diagnose.data.plausible import implausible
+from servod.lab.diagnose.data.trace import Rows, Trace
+from servod.lab.diagnose.predict.predict import SLOWEST, dry_friction
+from servod.lab.recordings import Quantity, Recording
+from servod.lab.simulate.motion import noise_rms
+from servod.lab.simulate.replay import Drive
+
+Array = NDArray[np.float64]
+
+#: Recordings are laid so far apart in time that no instant stands in two of them, s.
+APART_S = 1e5
+
+#: Least that a recording must hold: seconds, rows, distinct positions, share of rows in motion.
+LEAST_S, LEAST_ROWS, LEAST_COUNTS, LEAST_MOVING = 1.5, 300, 40, 0.03
+
+#: Longest time between rows, s.
+COARSEST_S = 0.1
+
+#: Noise that the slowest observer makes of the encoder's, as a share of dry friction, from which nothing can be said; a
+#: share of the command's spread counts for dry friction where it is more.
+MOST_NOISE, NOISE_OF_COMMAND = 0.5, 0.3
+
+#: Share of rows at the end of the command's range from which a recording is saturated; and from which it is told.
+SATURATED, TOLD_SATURATED = 0.4, 0.02
+
+#: A row that leaves its neighbours by so many noises, or so many usual steps, and comes back, is a glitch.
+GLITCH_NOISES, GLITCH_STEPS = 30.0, 8.0
+
+#: Rows of the neighbourhood whose median a glitch leaves; so many names of a list are told.
+NEIGHBOURHOOD, NAMES_TOLD = 7, 6
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A recording that cannot tell, and why."""
+
+    name: str
+    reason: str
+
+
+def taken_in(recordings: Sequence[Recording], model: AxisModel) -> tuple[list[Trace], list[Refusal]]:
+    """Traces of the recordings that can tell, and why the others cannot; names are unique."""
+    traces: list[Trace] = []
+    refused: list[Refusal] = []
+    for index, recording in enumerate(recordings):
+        name = recording.path.name
+        if any(other.path.name == name for other in recordings[:index]):
+            name = f"{recording.path.parent.name}/{name}"
+        trace = trace_of(recording, name, index * APART_S)
+        reason = cannot_tell(trace, model)
+        if reason is None:
+            traces.append(trace)
+        else:
+            refused.append(Refusal(name, reason))
+    return traces, refused
+
+
+def trace_of(recording: Recording, name: str, shift_s: float) -> Trace:
+    """The recording with glitches repaired, on a time of its own."""
+    notes = [_shortened(note) for note in recording.report]
+    drive = recording.drive
+    counts = recording.measured.copy()
+    position = _unwrapped(drive.position, notes)
+    position, torque = (
+        _repaired(values, what, counts, notes) for values, what in ((position, "position"), (drive.torque, "command"))
+    )
+    _tell_saturation(torque, notes)
+    t_s = drive.t_s - drive.t_s[0] + shift_s
+    warm = recording.get(Quantity.TEMPERATURE)
+    has_temperature = warm is not None and bool(np.isfinite(drive.temperature_c).all()) and _warms(drive.temperature_c)
+    moved = Drive(t_s, torque, position, drive.temperature_c)
+    return Trace(name, moved, counts, tuple(notes), has_temperature, shift_s - float(drive.t_s[0]), shift_s)
+
+
+def _shortened(note: str) -> str:
+    """A note whose list of names is cut."""
+    head, colon, names = note.partition(": ")
+    told = names.split(", ")
+    if not head.startswith("columns not used") or len(told) <= NAMES_TOLD:
+        return note
+    return f"{head}{colon}{', '.join(told[:NAMES_TOLD])} and {len(told) - NAMES_TOLD} more"
+
+
+def _warms(temperature_c: Array) -> bool:
+    """Whether the temperature changes by more than its noise."""
+    return float(np.ptp(temperature_c)) > 10.0 * noise_rms(temperature_c) or float(np.ptp(temperature_c)) > 1.0
+
+
+def _unwrapped(position: Array, notes: list[str]) -> Array:
+    """The position without jumps of a whole turn."""
+    jumps = np.abs(np.diff(position)) > 0.9 * 2.0 * math.pi
+    back = np.abs(np.abs(np.diff(position)) - 2.0 * math.pi) < 0.5
+    if not jumps.any() or not back[jumps].all():
+        return position
+    notes.append(f"position: {int(jumps.sum())} jumps of a whole turn, joined")
+    return np.unwrap(position)
+
+
+def _repaired(values: Array, what: str, counts: Rows, notes: list[str]) -> Array:
+    """Single rows that leave both neighbours and come back are replaced by the line between these.
+
+    A position that was replaced is no measurement and does not count; its neighbours do. The row of a command counts:
+    nobody knows whether the drive obeyed it. If it did, a few rows mismatch, which the fit counts by distance only.
+    """
+    bad = glitches(values)
+    if not bad.any():
+        return values
+    kept = np.flatnonzero(~bad)
+    notes.append(f"{what}: {int(bad.sum())} glitches, the first in row {int(np.argmax(bad)) + 1}, replaced")
+    if what == "position":
+        counts &= ~bad
+    return np.interp(np.arange(len(values)), kept, values[kept])
+
+
+def glitches(values: Array) -> Rows:
+    """Rows that leave the median of their neighbourhood far and alone."""
+    from scipy.ndimage import median_filter
+
+    off = np.abs(values - median_filter(values, NEIGHBOURHOOD, mode="nearest"))
+    step = np.abs(np.diff(values))
+    usual = float(np.quantile(step, 0.995)) if len(step) else 0.0
+    return np.asarray(off > max(GLITCH_NOISES * noise_rms(values), GLITCH_STEPS * usual, 1e-300))
+
+
+def _at_limit(torque: Array) -> float:
+    """Share of rows in which the command stands at the very end of its range."""
+    most = float(np.max(np.abs(torque)))
+    return float(np.mean(np.abs(torque) >= most * (1.0 - 1e-9))) if most > 0.0 else 0.0
+
+
+def _tell_saturation(torque: Array, notes: list[str]) -> None:
+    share = _at_limit(torque)
+    if share > TOLD_SATURATED:
+        notes.append(f"command: at its limit in {100.0 * share:.0f} % of the rows")
+
+
+def cannot_tell(trace: Trace, model: AxisModel) -> str | None:
+    """Why this recording cannot tell anything about this model; None when it can."""
+    return (
+        _too_coarse(trace)
+        or _too_short(trace)
+        or _never_changes(trace)
+        or implausible(trace, model)
+        or _too_noisy(trace, model)
+        or _too_still(trace)
+        or _saturated(trace)
+    )
+
+
+def _too_coarse(trace: Trace) -> str | None:
+    """Friction and inertia of a servo axis act within milliseconds; and time may be in other units than seconds."""
+    period_s = trace.period_s
+    if period_s <= COARSEST_S:
+        return None
+    return f"too coarse: {period_s:.3g} s between rows, at most {COARSEST_S:g} s; t_s is in seconds (--map scales it)"
+
+
+def _too_short(trace: Trace) -> str | None:
+    rows = int(trace.counts.sum())
+    if trace.duration_s >= LEAST_S and rows >= LEAST_ROWS:
+        return None
+    return (
+        f"too short: {trace.duration_s:.2f} s and {rows} rows, at least {LEAST_S:g} s and {LEAST_ROWS} rows are needed"
+    )
+
+
+def _too_still(trace: Trace) -> str | None:
+    position = trace.drive.position
+    steps = np.abs(np.diff(position))
+    quantum = float(steps[steps > 0.0].min()) if np.any(steps > 0.0) else 0.0
+    room = float(np.ptp(position))
+    moving = float(np.mean(np.abs(trace.velocity) > 3.0 * trace.drive.motion[:, 3]))
+    if quantum > 0.0 and room >= LEAST_COUNTS * max(quantum, trace.position_noise) and moving >= LEAST_MOVING:
+        return None
+    return f"too still: the axis moves over {room:.3g} in all, and in {100.0 * moving:.0f} % of the rows"
+
+
+def _never_changes(trace: Trace) -> str | None:
+    return "the command never changes" if float(np.ptp(trace.drive.torque)) == 0.0 else None
+
+
+def _saturated(trace: Trace) -> str | None:
+    share = _at_limit(trace.drive.torque)
+    if share < SATURATED:
+        return None
+    return f"saturated: the command stands at its limit in {100.0 * share:.0f} % of the rows"
+
+
+def _too_noisy(trace: Trace, model: AxisModel) -> str | None:
+    dry = dry_friction(model)
+    spoken = NOISE_OF_COMMAND * float(np.std(trace.drive.torque))
+    noise = model.inertia * SLOWEST**2 * trace.position_noise * math.sqrt(SLOWEST * trace.period_s)
+    if noise <= MOST_NOISE * max(dry, spoken):
+        return None
+    return f"too noisy: encoder noise makes {noise:.3g} of torque, dry friction is {dry:.3g}"

@@ -1,0 +1,47 @@
+"""Every effect by its name, one file each; a new effect is a new file and one line in this table."""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib import import_module
+
+from servod.lab.diagnose.effects.effect import Effect
+
+#: Names of the outside contract and our own (offset_drift), in the order in which they are tried and explained.
+NAMES: tuple[str, ...] = (
+    "asymmetry",
+    "stribeck",
+    "presliding",
+    "viscous_nonlinear",
+    "load_dependent_friction",
+    "position_dependent_friction",
+    "cogging",
+    "torque_ripple",
+    "gravity",
+    "spring",
+    "backlash",
+    "joint_elasticity",
+    "torque_gain",
+    "torque_saturation",
+    "delay",
+    "actuator_lag",
+    "thermal",
+    "inertia",
+    "position_dependent_inertia",
+    "encoder_eccentricity",
+    "torque_offset",
+    "disturbance",
+    "offset_drift",
+)
+
+
+@cache
+def effect(name: str) -> Effect:
+    """The effect of this name (one of NAMES)."""
+    found: Effect = import_module(f"servod.lab.diagnose.effects.{name}").EFFECT
+    return found
+
+
+def effects() -> tuple[Effect, ...]:
+    """All effects, in the order of NAMES."""
+    return tuple(effect(name) for name in NAMES)

@@ -1,0 +1,38 @@
+"""Actuator lag: the torque follows the command as a first-order lag, or at a limited rate."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from servod.lab.diagnose.effects.effect import Effect, known_delay, simple
+from servod.lab.diagnose.effects.hypothesis import Term, Unknown
+from servod.lab.diagnose.effects.scene import Scene
+
+#: Time constants to start from, s.
+STARTS_S = (0.002, 0.006, 0.02)
+
+
+def terms(scene: Scene) -> list[Term]:
+    """A lag from some time constants, and a limited rate."""
+    own = known_delay(scene.document)
+    lags = [simple("actuator_lag", "lag", [Unknown("time_constant_s", "s", start, 1e-5, 0.5)]) for start in STARTS_S]
+    step = np.abs(np.diff(scene.torque)) / max(trace.period_s for trace in scene.predictor.traces)
+    fast = max(float(np.quantile(step, 0.98)), 1e-9)
+    rate = Unknown("slew_per_s", f"{scene.force}/s", fast, 0.01 * fast, 20.0 * fast)
+    return [replace(term, opens=own) for term in (*lags, simple("actuator_lag", "rate limit", [rate]))]
+
+
+EFFECT = Effect(
+    name="actuator_lag",
+    group="actuator_lag",
+    equation="dT/dt = (command - T)/time_constant_s, |dT/dt| <= slew_per_s",
+    source="current loop bandwidth; hydraulic and pneumatic drives",
+    statement="The torque follows the command with a lag",
+    shows="a mismatch in proportion to the change of the command, less at the highest frequencies than a delay's",
+    confused=("delay", "joint_elasticity", "torque_saturation"),
+    experiment="steps of command, sampled faster than the lag: dead time waits, lag begins at once",
+    terms=terms,
+    far=True,
+)

@@ -1,0 +1,103 @@
+"""The model's own parameters as unknowns: how far each may be off before it is a finding of its own.
+
+Stands between the nominal model and every hypothesis. The bounds are those of the outside contract: up to 10 % is
+recalibration; the levels from which inertia, Stribeck curve, bristle, offset and delay count as findings bound them
+here, and the terms of those effects open the bounds.
+"""
+
+from __future__ import annotations
+
+import math
+
+from servod.formats.model.axis_model import AxisModel
+from servod.lab.diagnose.effects.hypothesis import Document, Unknown, get
+
+#: A parameter that is off by less is recalibrated, from here on it is physics.
+RECALIBRATION = 0.10
+
+#: What is known beforehand of a known parameter: off by some per cent.
+KNOWN_WITHIN = 0.04
+
+#: Where a known weight hangs: off by so much at most, and known so well, rad. More would soak up offset and asymmetry.
+PHASE_OFF, PHASE_KNOWN = 0.03, 0.008
+
+#: Levels of the contract: static - coulomb and offset as shares of Coulomb friction, bristle as a factor, delay in s.
+STRIBECK_SHARE, OFFSET_SHARE, BRISTLE_FACTOR, DELAY_S = 0.25, 0.03, 2.0, 0.002
+
+#: The Stribeck velocity is known poorly and shows little; a wide bound keeps it from being a finding.
+STRIBECK_VELOCITY_FACTOR = 1.5
+
+
+def document_of(model: AxisModel) -> Document:
+    """The model as a plain document, without what was measured and without noise."""
+    plain = model.model_dump(mode="json", exclude_none=True, exclude_defaults=True)
+    plain.pop("identified", None)
+    plain.pop("noise", None)
+    if plain.get("gravity", {}).get("amplitude", 0.0) == 0.0:
+        plain.pop("gravity", None)
+    return dict(plain)
+
+
+def known(key: str, unit: str, value: float, off: float = RECALIBRATION, spread: float = KNOWN_WITHIN) -> Unknown:
+    """A parameter known to some per cent, as a logarithm."""
+    return Unknown(key, unit, value, value / (1.0 + off), value * (1.0 + off), spread=spread)
+
+
+def base_unknowns(model: AxisModel) -> tuple[Unknown, ...]:
+    """The unknowns of the model's own parameters."""
+    document = document_of(model)
+    axis = "m" if model.axis.value == "linear" else "rad"
+    force = "N" if axis == "m" else "N·m"
+    inertia = known("inertia", "kg" if axis == "m" else "kg·m²", model.inertia)
+    own = (*_friction(document, axis, force), *_gravity(document, force), *_command(model, force))
+    return (inertia, *own, *_drift(document, force))
+
+
+def _friction(document: Document, axis: str, force: str) -> list[Unknown]:
+    """The friction law's parameters; a local map keeps its curve."""
+    found = []
+    coulomb = get(document, "friction.coulomb")
+    for key, unit in (("viscous", f"{force}·s/{axis}"), ("coulomb", force)):
+        value = get(document, f"friction.{key}")
+        if value > 0.0:
+            found.append(known(f"friction.{key}", unit, value))
+    static = get(document, "friction.static")
+    if static > 0.0 and coulomb > 0.0:
+        room = 1.0 + STRIBECK_SHARE * coulomb / static
+        found.append(known("friction.static", force, static, room - 1.0))
+        speed = get(document, "friction.stribeck_velocity", 0.1)
+        factor = STRIBECK_VELOCITY_FACTOR - 1.0
+        found.append(known("friction.stribeck_velocity", f"{axis}/s", speed, factor, math.log(1.2)))
+    for key, unit in (("sigma0", f"{force}/{axis}"), ("sigma1", f"{force}·s/{axis}")):
+        value = get(document, f"friction.{key}")
+        if value > 0.0:
+            found.append(known(f"friction.{key}", unit, value, BRISTLE_FACTOR - 1.0, math.log(1.2)))
+    return found
+
+
+def _gravity(document: Document, force: str) -> list[Unknown]:
+    amplitude = get(document, "gravity.amplitude")
+    if amplitude == 0.0:
+        return []
+    phase = get(document, "gravity.phase")
+    turn = Unknown("gravity.phase", "rad", phase, phase - PHASE_OFF, phase + PHASE_OFF, 1.0, PHASE_KNOWN)
+    return [known("gravity.amplitude", force, amplitude), turn]
+
+
+def _command(model: AxisModel, force: str) -> list[Unknown]:
+    """Offset and delay, each within the level from which it is a finding."""
+    coulomb = get(document_of(model), "friction.coulomb")
+    room = OFFSET_SHARE * coulomb if coulomb > 0.0 else 1e-9
+    own, late = model.torque_offset, model.delay_s
+    offset = Unknown("torque_offset", force, own, own - room, own + room, max(coulomb, 1e-9), OFFSET_SHARE)
+    room_s = 0.5 * DELAY_S  # what is more is for the term to say
+    delay = Unknown("delay_s", "s", late, max(late - room_s, 0.0), late + room_s, 1e-3, 0.3)
+    return [offset, delay]
+
+
+def _drift(document: Document, force: str) -> list[Unknown]:
+    """A drift that the model has from other recordings: anything from none at all to all of it in these."""
+    per_s = get(document, "offset_drift.per_s")
+    if per_s == 0.0:
+        return []
+    return [Unknown("offset_drift.per_s", f"{force}/s", per_s, min(per_s, 0.0), max(per_s, 0.0), abs(per_s), 1.0)]

@@ -1,0 +1,85 @@
+"""Cogging: a torque over position, periodic, whatever the command."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servod.lab.diagnose.effects.effect import Effect, harmonic, sine_term, told_sines
+from servod.lab.diagnose.effects.hypothesis import Document, Reported, Term, Unknown
+from servod.lab.diagnose.effects.scene import Scene
+
+Array = NDArray[np.float64]
+
+#: A motor's slots and poles make whole orders of its turn: way that must be covered (rad), orders searched, most and
+#: least that make a comb, and the share of the mismatch that each must take.
+WHOLE_TURN, HIGHEST_ORDER, MOST_ORDERS, LEAST_ORDERS, LEAST_SHARE = 5.9, 128, 8, 3, 0.01
+
+
+def terms(scene: Scene) -> list[Term]:
+    """Sines whose period is searched, and with the second harmonic; whole orders of a turn where there are several."""
+    peaks = scene.peaks(scene.carried(-np.ones_like(scene.position)), 3)
+    most = 20.0 * max(scene.dry, 0.05 * scene.effort)
+    found = [sine_term("cogging", scene, peak, scene.dry, scene.force, most=most) for peak in peaks]
+    found.append(sine_term("cogging", scene, peaks[0], scene.dry, scene.force, most=most, multiples=2))
+    orders = [] if scene.linear or scene.reach < WHOLE_TURN else whole_orders(scene)
+    return [*found, _comb(scene, orders, most)] if len(orders) >= LEAST_ORDERS else found
+
+
+def whole_orders(scene: Scene) -> list[int]:
+    """Orders of a motor's turn that the mismatch holds beside each other, strongest first: matching pursuit."""
+    columns = scene.carried(-np.ones_like(scene.position))
+    wanted = scene.mismatch[scene.thinned]
+    total, left = max(float(wanted @ wanted), 1e-30), wanted
+    found: list[int] = []
+    for _ in range(MOST_ORDERS):
+        best = max(
+            (n for n in range(1, HIGHEST_ORDER + 1) if n not in found), key=lambda n: taken(columns(float(n)), left)
+        )
+        design = np.column_stack([c for n in (*found, best) for c in columns(float(n))])
+        after = wanted - design @ np.linalg.lstsq(design, wanted, rcond=None)[0]
+        if float(left @ left) - float(after @ after) < LEAST_SHARE * total:
+            break
+        found.append(best)
+        left = after
+    return found
+
+
+def taken(pair: tuple[Array, Array], wanted: Array) -> float:
+    """Power of `wanted` that a sine and a cosine take, as if they were orthogonal."""
+    return sum(float(wanted @ column) ** 2 / max(float(column @ column), 1e-30) for column in pair)
+
+
+def _comb(scene: Scene, orders: list[int], most: float) -> Term:
+    """Sines of whole orders of a turn."""
+    names = [f"{part}_of_{n}" for n in orders for part in ("sine", "cosine")]
+    unknowns = tuple(Unknown(name, scene.force, 0.0, -most, most, scene.dry) for name in names)
+
+    def sines(values: Sequence[float]) -> list[tuple[float, float, float]]:
+        pairs = zip(orders, values[::2], values[1::2], strict=True)
+        return [(float(n), math.hypot(sine, cosine), math.atan2(cosine, sine)) for n, sine, cosine in pairs]
+
+    def write(document: Document, values: Sequence[float]) -> None:
+        rows = document.setdefault("cogging", {}).setdefault("harmonics", [])
+        rows.extend(harmonic(scene, n, amplitude, phase) for n, amplitude, phase in sines(values))
+
+    def tell(_document: Document, values: Sequence[float]) -> list[Reported]:
+        return told_sines(scene, sines(values), scene.force)
+
+    return Term("cogging", "orders of a turn", unknowns, write, tell)
+
+
+EFFECT = Effect(
+    name="cogging",
+    group="cogging",
+    equation="resisting torque += sum amplitude*sin(n*x + phase)",
+    source="Hanselman, Brushless Permanent Magnet Motor Design, 2003",
+    statement="A torque that repeats along the way acts whatever the command is: cogging",
+    shows="a mismatch periodic in position, the same in both directions and at every command",
+    confused=("torque_ripple", "encoder_eccentricity", "gravity", "spring", "position_dependent_friction"),
+    experiment="slow passes in both directions with different loads: what stays the same is cogging",
+    terms=terms,
+)

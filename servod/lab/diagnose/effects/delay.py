@@ -1,0 +1,36 @@
+"""Delay: the torque comes later than the model says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from servod.lab.diagnose.effects.effect import Effect, known_delay, simple
+from servod.lab.diagnose.effects.hypothesis import Term, Unknown, get
+from servod.lab.diagnose.effects.scene import Scene
+
+#: Delays to start from, s.
+STARTS_S = (0.003, 0.008, 0.02)
+
+
+def terms(scene: Scene) -> list[Term]:
+    """Some starts: the cost has a valley for each wave of the excitation."""
+    own = get(scene.document, "delay_s", 0.001)
+    found = []
+    for start in STARTS_S:
+        unknown = Unknown("additional_s", "s", start, -min(own, 0.001), 0.1, 2e-3)
+        found.append(replace(simple("delay", "dead time", [unknown]), opens=known_delay(scene.document)))
+    return found
+
+
+EFFECT = Effect(
+    name="delay",
+    group="delay",
+    equation="torque(t) = command(t - delay_s - additional_s)",
+    source="bus cycles, filters, scheduling in the drive",
+    statement="The torque comes later than the model says: a dead time",
+    shows="a mismatch in proportion to the change of the command, whatever the speed",
+    confused=("actuator_lag", "joint_elasticity", "inertia"),
+    experiment="steps of command, sampled faster than the delay: dead time waits, lag begins at once",
+    terms=terms,
+    far=True,
+)

@@ -1,0 +1,132 @@
+"""The shape of an effect's file, and writers that many of them share.
+
+Every effect is one file with one `EFFECT`: what it is (for people and for `servoctl explain`), and how to look for it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from servod.lab.diagnose.effects.hypothesis import Document, Reported, Teller, Term, Unknown, Writer, get
+from servod.lab.diagnose.effects.scene import Peak, Scene
+
+#: By how much the model's own delay may be off beside a lag or a longer delay, s.
+OWN_DELAY_S = 0.0002
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One effect by its name in the outside contract.
+
+    `group` is its group of keys (or plain keys) in the axis model file. `statement` says in one sentence what was left
+    out; `shows` where its signature is; `confused` what it is mistaken for and `experiment` what tells them apart.
+    `terms` gives its forms with start values for a scene, none where it cannot act. `far` effects are also started from
+    the nominal model, whose refit they distort.
+    """
+
+    name: str
+    group: str
+    equation: str
+    source: str
+    statement: str
+    shows: str
+    confused: tuple[str, ...]
+    experiment: str
+    terms: Callable[[Scene], list[Term]]
+    far: bool = False
+
+
+def share(key: str, start: float, low: float, high: float, size: float, unit: str = "1") -> Unknown:
+    """An unknown whose coordinate is value/size."""
+    return Unknown(key, unit, start, low, high, size)
+
+
+def positive(key: str, unit: str, start: float, factor: float = 1000.0) -> Unknown:
+    """An unknown of one sign whose coordinate is its logarithm, within a factor of its start."""
+    return Unknown(key, unit, start, start / factor, start * factor)
+
+
+def told(unknowns: Sequence[Unknown]) -> Teller:
+    """A term whose unknowns are what is reported."""
+    return lambda _document, values: [Reported(u.key, v, u.unit) for u, v in zip(unknowns, values, strict=True)]
+
+
+def keys(group: str, names: Sequence[str], **fixed: float | str) -> Writer:
+    """A writer of values into keys of one group, beside fixed ones."""
+
+    def write(document: Document, values: Sequence[float]) -> None:
+        found = document.setdefault(group, {})
+        found.update(fixed)
+        found.update(zip(names, values, strict=True))
+
+    return write
+
+
+def simple(effect: str, form: str, unknowns: Sequence[Unknown], **fixed: float | str) -> Term:
+    """A term whose unknowns are keys of the effect's own group."""
+    write = keys(effect, [u.key for u in unknowns], **fixed)
+    return Term(effect, form, tuple(unknowns), write, told(unknowns))
+
+
+def known_delay(document: Document) -> dict[str, tuple[float, float]]:
+    """Bounds of the model's own delay beside an effect that would share a longer one with it."""
+    own = get(document, "delay_s", 0.001)
+    return {"delay_s": (max(own - OWN_DELAY_S, 0.0), own + OWN_DELAY_S)}
+
+
+def harmonic(scene: Scene, n: float, amplitude: float, phase: float) -> Document:
+    """One sine over position as the axis model file has it."""
+    if scene.linear:
+        return {"amplitude": amplitude, "periods_per_metre": n / (2.0 * math.pi), "phase": phase}
+    return {"amplitude": amplitude, "periods_per_turn": n, "phase": phase}
+
+
+def sine_term(
+    effect: str, scene: Scene, peak: Peak, size: float, unit: str, *, most: float, multiples: int = 1, free: bool = True
+) -> Term:
+    """A sum of sines over position: order n (unless not `free`) and a sine and cosine for each multiple of it.
+
+    `size` is the natural size of the amplitudes, `most` their bound.
+    """
+    width = 2.0 * math.pi / scene.reach
+    unknowns = []
+    if free:
+        low = max(peak.n - width, 0.3 * peak.n)
+        unknowns.append(Unknown("n", f"1/{scene.length}", peak.n, low, peak.n + width, 1.0 / scene.reach))
+    for multiple in range(1, multiples + 1):
+        first = multiple == 1
+        for name, start in (("sine", peak.sine if first else 0.0), ("cosine", peak.cosine if first else 0.0)):
+            clipped = min(max(start, -0.7 * most), 0.7 * most)
+            unknowns.append(Unknown(f"{name}_{multiple}", unit, clipped, -most, most, size))
+
+    def sines(values: Sequence[float]) -> list[tuple[float, float, float]]:
+        n = values[0] if free else peak.n
+        pairs = values[1:] if free else values
+        return [
+            ((k // 2 + 1) * n, math.hypot(pairs[k], pairs[k + 1]), math.atan2(pairs[k + 1], pairs[k]))
+            for k in range(0, len(pairs), 2)
+        ]
+
+    def write(document: Document, values: Sequence[float]) -> None:
+        rows = document.setdefault(effect, {}).setdefault("harmonics", [])
+        rows.extend(harmonic(scene, n, a, phase) for n, a, phase in sines(values))
+
+    def tell(_document: Document, values: Sequence[float]) -> list[Reported]:
+        return told_sines(scene, sines(values), unit)
+
+    return Term(effect, f"{multiples} sines" if multiples > 1 else "sine", tuple(unknowns), write, tell)
+
+
+def told_sines(scene: Scene, sines: Sequence[tuple[float, float, float]], unit: str) -> list[Reported]:
+    """What is reported of sines over position: periods, amplitude, phase of each."""
+    found = []
+    for row, (n, amplitude, phase) in enumerate(sines):
+        tail = f"_{row + 1}" if row else ""
+        if scene.linear:
+            found.append(Reported(f"periods_per_metre{tail}", n / (2.0 * math.pi), "1/m"))
+        else:
+            found.append(Reported(f"periods_per_turn{tail}", n, "1"))
+        found += [Reported(f"amplitude{tail}", amplitude, unit), Reported(f"phase{tail}", phase, "rad")]
+    return found

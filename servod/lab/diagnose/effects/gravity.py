@@ -1,0 +1,50 @@
+"""Gravity: a weight off the axis."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from servod.lab.diagnose.effects.effect import Effect, share
+from servod.lab.diagnose.effects.hypothesis import Document, Reported, Term, get
+from servod.lab.diagnose.effects.scene import Scene
+
+
+def _add(document: Document, values: Sequence[float]) -> tuple[float, float]:
+    """Amplitude and phase of the model's gravity and amplitude*(sine, cosine) in `values` together."""
+    own, phase = get(document, "gravity.amplitude"), get(document, "gravity.phase")
+    sine, cosine = own * math.cos(phase) + values[0], own * math.sin(phase) + values[1]
+    return math.hypot(sine, cosine), math.atan2(cosine, sine)
+
+
+def _write(document: Document, values: Sequence[float]) -> None:
+    amplitude, phase = _add(document, values)
+    document["gravity"] = {"amplitude": amplitude, "phase": phase}
+
+
+def terms(scene: Scene) -> list[Term]:
+    """A weight, beside the one that the model has; none on a linear axis, where it would be an offset."""
+    if scene.linear:
+        return []
+    most = 50.0 * max(scene.dry, scene.effort)
+    size = max(scene.dry, 0.1 * scene.effort)
+    unknowns = (share("sine", 0.0, -most, most, size), share("cosine", 0.0, -most, most, size))
+
+    def tell(document: Document, _values: Sequence[float]) -> list[Reported]:
+        units = {"amplitude": scene.force, "phase": "rad"}
+        return [Reported(key, get(document, f"gravity.{key}"), unit) for key, unit in units.items()]
+
+    return [Term("gravity", "weight", unknowns, _write, tell)]
+
+
+EFFECT = Effect(
+    name="gravity",
+    group="gravity",
+    equation="resisting torque += amplitude*sin(x + phase)",
+    source="a mass m at radius r: amplitude = m*g*r",
+    statement="A weight off the axis pulls on it",
+    shows="one slow wave of the mismatch over a turn, the same in both directions and at every speed",
+    confused=("spring", "cogging", "torque_offset"),
+    experiment="slow passes over more than half a turn: a spring goes on growing, gravity turns back",
+    terms=terms,
+)

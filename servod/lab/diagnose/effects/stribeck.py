@@ -1,0 +1,69 @@
+"""Stribeck: friction falls from static to Coulomb as the joint starts to slide."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from servod.lab.diagnose.effects.effect import Effect
+from servod.lab.diagnose.effects.hypothesis import Document, Reported, Teller, Term, Unknown, get, put
+from servod.lab.diagnose.effects.scene import Scene
+
+#: Static friction to start from, as a multiple of Coulomb friction.
+START = 1.4
+
+
+def _tell(scene: Scene) -> Teller:
+    def tell(document: Document, _values: Sequence[float]) -> list[Reported]:
+        found = []
+        for key, unit in (("static", scene.force), ("stribeck_velocity", f"{scene.length}/s"), ("exponent", "1")):
+            value = get(document, f"stribeck.{key}") or get(document, f"friction.{key}")
+            found += [Reported(key, value, unit)] if value else []
+        return found
+
+    return tell
+
+
+def _exponent(document: Document, values: Sequence[float]) -> None:
+    put(document, "stribeck.exponent", values[-1])
+
+
+def _whole(document: Document, values: Sequence[float]) -> None:
+    """The whole curve in its own group, for a model whose friction has none."""
+    static = get(document, "friction.coulomb") * (1.0 + values[0])
+    document["stribeck"] = {"static": static, "stribeck_velocity": values[1]}
+
+
+def terms(scene: Scene) -> list[Term]:
+    """The curve with the paper's exponent, from where it stands and from some velocities; one with a free exponent."""
+    coulomb = get(scene.document, "friction.coulomb")
+    if coulomb <= 0.0:
+        return []
+    own = get(scene.document, "friction.stribeck_velocity", 0.05 * scene.speed)
+    speeds = (own, 0.02 * scene.speed)
+    unit = f"{scene.length}/s"
+    if get(scene.document, "friction.static") <= 0.0:
+        excess = Unknown("excess", "1", START - 1.0, -0.8, 10.0, 1.0)
+        curves = [(excess, Unknown("velocity", unit, v, 1e-4 * scene.speed, scene.speed)) for v in speeds]
+        return [Term("stribeck", "gauss", curve, _whole, _tell(scene)) for curve in curves]
+    opens = {
+        "friction.static": (0.2 * coulomb, 10.0 * coulomb),
+        "friction.stribeck_velocity": (1e-4 * scene.speed, scene.speed),
+    }
+    begins = [{"friction.static": START * coulomb, "friction.stribeck_velocity": v} for v in speeds]
+    found = [Term("stribeck", "gauss", (), lambda _d, _v: None, _tell(scene), opens, begin) for begin in ({}, *begins)]
+    free = Unknown("exponent", "1", 1.0, 0.4, 4.0)
+    return [*found, Term("stribeck", "free exponent", (free,), _exponent, _tell(scene), opens, begins[0])]
+
+
+EFFECT = Effect(
+    name="stribeck",
+    group="stribeck",
+    equation="g(v) = F_C + (F_S - F_C)*exp(-(|v|/v_s)^exponent)",
+    source="Stribeck 1902; Bo and Pavelescu, Wear 82, 1982 (exponent); the paper's (18)",
+    statement="At low speed friction is not the model's: the Stribeck curve from static to sliding friction differs",
+    shows="a mismatch at the lowest speeds, opposed to the motion, gone above some Stribeck velocities",
+    confused=("presliding", "viscous_nonlinear", "thermal"),
+    experiment="slow constant speeds on both sides of the Stribeck velocity, and breakaway ramps",
+    terms=terms,
+    far=True,
+)

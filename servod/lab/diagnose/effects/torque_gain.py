@@ -1,0 +1,27 @@
+"""Torque gain: the drive makes more or less torque of a command than it says."""
+
+from __future__ import annotations
+
+from servod.lab.diagnose.effects.effect import Effect, positive, simple
+from servod.lab.diagnose.effects.hypothesis import Term
+from servod.lab.diagnose.effects.scene import Scene
+
+
+def terms(scene: Scene) -> list[Term]:
+    """One factor, and one for each sign of the command."""
+    factors = [positive("factor", "1", 1.0, 5.0), positive("negative_factor", "1", 1.0, 5.0)]
+    return [simple("torque_gain", "one factor", factors[:1]), simple("torque_gain", "by sign", factors)]
+
+
+EFFECT = Effect(
+    name="torque_gain",
+    group="torque_gain",
+    equation="torque = factor*command (negative_factor*command for negative commands)",
+    source="torque constant, gear ratio or current scale that is not what the command assumes",
+    statement="The drive makes another torque of a command than it says: the torque constant is off",
+    shows="inertia and every friction torque off by the same factor",
+    confused=("inertia", "asymmetry", "torque_saturation"),
+    experiment="a known weight or a torque sensor on the shaft",
+    terms=terms,
+    far=True,
+)

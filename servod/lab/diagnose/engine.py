@@ -1,0 +1,212 @@
+"""The whole diagnosis: recordings and a model in, verdict and evidence out.
+
+Stands between the command line and everything else here; writes nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from time import monotonic
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servod.formats.model.axis_model import AxisModel
+from servod.lab.diagnose.data.intake import Refusal, taken_in
+from servod.lab.diagnose.data.trace import Trace
+from servod.lab.diagnose.judge.held_out import HeldOut, Split, held_out, once, split
+from servod.lab.diagnose.judge.locate import Map, maps
+from servod.lab.diagnose.judge.sorting import Kept, sorted_out
+from servod.lab.diagnose.judge.spread import spread
+from servod.lab.diagnose.judge.unnamed import Unnamed, unnamed
+from servod.lab.diagnose.judge.verdict import Shares, Verdict, drowned, named_terms, shares, verdict
+from servod.lab.diagnose.judge.windows import foretold
+from servod.lab.diagnose.predict.predict import Predictor
+from servod.lab.diagnose.select.choice import Choice
+from servod.lab.diagnose.select.choose import Chooser
+from servod.lab.diagnose.select.detail import detail, much_left
+from servod.lab.diagnose.select.fit import Fit, Weighing
+from servod.lab.diagnose.select.slow import slow
+from servod.lab.diagnose.select.swap import swapped
+from servod.lab.diagnose.select.tidy import tidied
+from servod.lab.recordings import Recording
+
+Array = NDArray[np.float64]
+Tell = Callable[[str], None]
+
+#: Part of the time limit that the search for terms may take; the proof needs the rest.
+SEARCH_SHARE = 0.75
+
+#: Free windows of unseen rows must come out by this factor better with the names than without, unless the mismatch is
+#: within FITTED times the noise floor anyway. A few terms with dynamics of their own can follow nearly any mismatch one
+#: sample ahead, and foretell nothing.
+LEAST_FORETOLD, FITTED = 0.7, 2.0
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What was found; without any recording that can tell there is no evidence."""
+
+    nominal: AxisModel
+    refused: list[Refusal]
+    verdict: Verdict
+    evidence: Evidence | None
+    seconds: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Everything behind a verdict on recordings that can tell.
+
+    `named` are places of terms in the fit and `less` the fits without each of them; `errors` are those of the fits to
+    everything, by which names are judged. `before`, `after` and `without` are by fits that have not seen the rows of
+    `shared`, and `unseen` has the errors of these. `attempt` is the share of the explainable error that known physics
+    removes there, also where its names may not stand. `kept` says of terms in the fit why they are no findings.
+    """
+
+    traces: tuple[Trace, ...]
+    predictor: Predictor
+    choice: Choice
+    named: list[int]
+    errors: Shares
+    spread: Array
+    less: dict[int, Fit]
+    shared: Split
+    unseen: Shares
+    before: HeldOut
+    after: HeldOut
+    without: dict[int, HeldOut]
+    unnamed: Unnamed | None
+    maps_before: list[Map]
+    maps_after: list[Map]
+    attempt: float
+    kept: Mapping[int, Kept] = field(default_factory=dict)
+
+    @property
+    def fit(self) -> Fit:
+        """The fit that stands."""
+        return self.choice.fit
+
+    def carries(self, place: int) -> float:
+        """The share of the explainable error on unseen rows that a named term removes."""
+        unseen = self.unseen
+        without = float(np.mean(self.without[place].mismatch[self.predictor.counts] ** 2))
+        return max(without - unseen.after**2, 0.0) / max(unseen.before**2 - unseen.floor**2, 1e-30)
+
+
+def diagnose(
+    model: AxisModel, recordings: Sequence[Recording], time_limit_s: float = 120.0, tell: Tell | None = None
+) -> Diagnosis:
+    """Diagnose `model` by `recordings`. `tell` is called with a line of progress now and then."""
+    tell = tell or (lambda _line: None)
+    begun = monotonic()
+    traces, refused = taken_in(recordings, model)
+    seconds = {"intake": monotonic() - begun}
+    if not traces:
+        return Diagnosis(model, refused, Verdict.CANNOT_TELL, None, seconds)
+    tell(f"{len(traces)} recordings taken in")
+    predictor = Predictor(traces, model)
+    chooser = Chooser(predictor, model, begun + SEARCH_SHARE * time_limit_s, tell)
+    choice = chooser.run()
+    swapped(chooser, choice)
+    if much_left(chooser, choice):
+        detail(chooser, choice)
+        slow(chooser, choice)
+    seconds["search"] = monotonic() - begun - seconds["intake"]
+    choice.fit = tidied(chooser, choice.fit)
+    chooser.lower_floor(choice.fit.mismatch)
+    choice.floor = chooser.floor
+    evidence = proved(predictor, chooser, choice, tell)
+    while (worse := _worse_unseen(evidence)) is not None:
+        choice.drop(worse, evidence.less[worse])
+        evidence = proved(predictor, chooser, choice, tell)
+    evidence = sorted_out(evidence, chooser)
+    seconds["proof"] = monotonic() - begun - seconds["intake"] - seconds["search"]
+    final = verdict(choice, evidence.named, evidence.errors, predictor.dry)
+    if final is Verdict.MISSING_PHYSICS and _foretells_nothing(evidence):
+        final = Verdict.UNEXPLAINED
+    if final is Verdict.UNEXPLAINED:
+        evidence = _without_names(evidence)
+    untried = final is Verdict.UNEXPLAINED and choice.cut and choice.tried == 0
+    if untried or drowned(final, predictor.encoder_noise, predictor.dry):
+        final = Verdict.CANNOT_TELL
+    return Diagnosis(model, refused, final, evidence, seconds)
+
+
+def proved(predictor: Predictor, chooser: Chooser, choice: Choice, tell: Tell) -> Evidence:
+    """A choice proved on rows that its fits have not seen; names are those of terms at the level of their effect."""
+    fit = choice.fit
+    nominal = chooser.start.document
+    named = named_terms(choice, nominal)
+    counts = predictor.counts
+    tell("held-out recordings")
+    less = {place: chooser.less(fit, place) for place in named}
+    weighing = Weighing(chooser.fitter(fit.mismatch).weighing.scale, chooser.rows)
+    shared = split(predictor, fit)
+    before = held_out(predictor, choice.base, shared)
+    after = held_out(predictor, fit, shared) if fit is not choice.base else before
+    alone = len(named) == 1 and len(fit.hypothesis.terms) == 1
+    without = {p: before if alone else held_out(predictor, f, shared) for p, f in less.items()}
+    unseen = shares((before.mismatch, after.mismatch), counts, choice.floor)
+    return Evidence(
+        traces=predictor.traces,
+        predictor=predictor,
+        choice=choice,
+        named=named,
+        errors=shares((choice.base.mismatch, fit.mismatch), counts, choice.floor),
+        spread=spread(fit, weighing, predictor.traces[0].period_s, after),
+        less=less,
+        shared=shared,
+        unseen=unseen,
+        before=before,
+        after=after,
+        without=without,
+        unnamed=None,
+        maps_before=maps(predictor, choice.base.mismatch),
+        maps_after=maps(predictor, fit.mismatch),
+        attempt=unseen.removed,
+    )
+
+
+def _worse_unseen(evidence: Evidence) -> int | None:
+    """The named term without which unseen rows are foretold best, if better than with it; no event, which none are."""
+    events = once(evidence.fit.hypothesis)
+    others = {
+        place: held.rms
+        for place, held in evidence.without.items()
+        if held.rms <= evidence.after.rms and place not in events
+    }
+    return min(others, key=lambda place: others[place]) if others else None
+
+
+def _foretells_nothing(evidence: Evidence) -> bool:
+    """Whether free windows are hardly better for the names, although something is left: terms that only fit.
+
+    Names of events in one recording alone are not asked, since nobody can foretell them.
+    """
+    if (
+        set(evidence.named) <= set(once(evidence.fit.hypothesis))
+        or evidence.unseen.after < FITTED * evidence.unseen.floor
+    ):
+        return False
+    judged = evidence.shared.judged
+    return foretold(evidence.predictor, evidence.before, evidence.after, judged) > LEAST_FORETOLD
+
+
+def _without_names(evidence: Evidence) -> Evidence:
+    """The evidence when no name may stand: the base, and a table of what is left without a name."""
+    choice, predictor = evidence.choice, evidence.predictor
+    bare = replace(choice, fit=choice.base, merits=[], entries=[])
+    left = unnamed(predictor, choice.base.mismatch)
+    size = len(choice.base.coordinates)
+    shared = split(predictor, choice.base)
+    before = held_out(predictor, choice.base, shared)
+    errors, unseen = (
+        shares((rows, rows), predictor.counts, choice.floor) for rows in (choice.base.mismatch, before.mismatch)
+    )
+    return replace(
+        evidence, choice=bare, named=[], kept={}, errors=errors, less={}, without={}, unnamed=left, shared=shared,
+        before=before, after=before, unseen=unseen, spread=evidence.spread[:size, :size],
+        maps_after=evidence.maps_before,
+    )  # fmt: skip

@@ -1,0 +1,1 @@
+"""The judgement: held-out error, intervals, location, verdict."""

@@ -1,0 +1,112 @@
+"""Which terms of the last fit are findings, and why the others are none: the levels of the outside contract once more.
+
+Stands between the evidence and the verdict. A term comes in by what it takes when it comes; beside those that come
+later it may be worth less, or its numbers may be pushed to an end of their range. It stays in the model then, for the
+others were fitted beside it, and is listed with its values as minor.
+
+The contract counts shares of the error on unseen rows. A drift of the constant torque is next to nothing in any row and
+adds up in every simulation that runs freely: its share is that of the means over a second, where it shows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servod.lab.diagnose.judge.spread import within
+from servod.lab.diagnose.judge.verdict import lesser_twin
+from servod.lab.diagnose.select.at_end import at_end
+from servod.lab.diagnose.select.fit import Fit
+from servod.lab.diagnose.select.level import is_level
+from servod.lab.diagnose.select.merit import of_size
+from servod.lab.diagnose.select.slow import WANTED, power
+
+if TYPE_CHECKING:
+    from servod.lab.diagnose.engine import Evidence
+    from servod.lab.diagnose.select.choose import Chooser
+
+Array = NDArray[np.float64]
+
+#: Numbers that say where or when a term acts, whatever its size.
+WHERE = frozenset(("shift", "torque_at_middle", "start_s", "position"))
+
+#: Sizes that are positive by themselves, so that only their interval tells them from nothing.
+POSITIVE = frozenset(("time_constant_s", "gap"))
+
+#: Half width of a 95 % interval in standard deviations.
+Z95 = 1.96
+
+
+class Kept(StrEnum):
+    """Why a term that stays in the model is no finding."""
+
+    LEVEL = "below the level from which its effect counts"
+    TWIN = "told together with its longer twin"
+    SMALL = "below the smallest size worth a name"
+    UNSURE = "not told from none"
+    AT_END = "a number of it lies at the end of its range"
+
+
+def sorted_out(evidence: Evidence, chooser: Chooser) -> Evidence:
+    """The evidence with those named that are findings beside all others, and why the rest of the terms is none.
+
+    What each term is worth is said anew. Terms of one effect are one finding, if one of them is.
+    """
+    fit, choice = evidence.fit, evidence.choice
+    for place in evidence.named:
+        choice.merits[place] = chooser.merit(evidence.less[place], fit)
+    why = {place: _why(evidence, place) for place in evidence.named}
+    names = {fit.hypothesis.terms[place].effect for place, reason in why.items() if reason is None}
+    named = [place for place in evidence.named if fit.hypothesis.terms[place].effect in names]
+    kept = {place: reason for place, reason in why.items() if reason is not None and place not in named}
+    return replace(evidence, named=named, kept=kept | _under_level(evidence))
+
+
+def _under_level(evidence: Evidence) -> dict[int, Kept]:
+    """Terms with numbers of their own that are under their level; what only opens the model's own is recalibrated."""
+    twin = lesser_twin(evidence.fit)
+    terms = enumerate(evidence.fit.hypothesis.terms)
+    return {
+        place: Kept.TWIN if term.effect == twin else Kept.LEVEL
+        for place, term in terms
+        if place not in evidence.named and term.unknowns
+    }
+
+
+def _why(evidence: Evidence, place: int) -> Kept | None:
+    """Why a term is no finding; None if it is one."""
+    fit = evidence.fit
+    merit = replace(evidence.choice.merits[place], share=_share(evidence, place))
+    if not of_size(merit, is_level(fit.hypothesis.terms[place])):
+        return Kept.SMALL
+    if at_end(fit, place):
+        return Kept.AT_END
+    return None if told_from_none(fit, place, evidence.spread) else Kept.UNSURE
+
+
+def _share(evidence: Evidence, place: int) -> float:
+    """The share of the explainable error on unseen rows that a term takes, where it shows."""
+    rows = evidence.carries(place)
+    if evidence.fit.hypothesis.terms[place].effect != WANTED[0]:
+        return rows
+    parts = (evidence.without[place], evidence.after, evidence.before)
+    without, after, before = (power(evidence.predictor, held.mismatch) for held in parts)
+    return max(rows, (without - after) / max(before, 1e-30))
+
+
+def told_from_none(fit: Fit, place: int, spread: Array) -> bool:
+    """Whether nothing at all lies outside the region of 95 % of what says how large a term is.
+
+    A term whose size has no zero, such as a stiffness or a limit, is told by what it takes alone.
+    """
+    unknowns, share = fit.hypothesis.unknowns, fit.hypothesis.share(place)
+    own = range(share.start, share.stop)
+    deviations = np.sqrt(np.maximum(np.diag(spread), 0.0))
+    if any(unknowns[i].key in POSITIVE and Z95 * deviations[i] >= 1.0 for i in own):
+        return False
+    sizes = [i for i in own if unknowns[i].size != 0.0 and unknowns[i].low <= 0.0 and unknowns[i].key not in WHERE]
+    return not sizes or not within(fit.coordinates[sizes], spread[np.ix_(sizes, sizes)])

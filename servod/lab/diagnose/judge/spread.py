@@ -1,0 +1,87 @@
+"""How far estimates may be off: noise, recordings that disagree, what only prior knowledge fixes, error of the model.
+
+Stands between the fit and the intervals of the document. The noise's share (`fit.covariance`) alone promises too much:
+recordings of 46 000 rows make it tiny, and what is left of a recording is never noise alone.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servod.lab.diagnose.judge.held_out import HeldOut
+from servod.lab.diagnose.select.fit import Fit, Weighing, covariance
+
+Array = NDArray[np.float64]
+
+#: Error of any estimate that steps of a sample and forms that are not quite the axis's make, as a share of it.
+MODEL_ERROR = 0.006
+
+#: By how much worse steps of a sample make the bristle's stiffness and damping, which act for some samples at a time.
+BRISTLE, BRISTLE_ERROR = ("friction.sigma0", "friction.sigma1"), 2.0
+
+#: Probability of the region in which several coordinates lie together.
+REGION = 0.95
+
+#: Torques of the model's own, which no recording tells from a common factor on all of them and on the command.
+TORQUES = (
+    "inertia",
+    "friction.viscous",
+    "friction.coulomb",
+    "friction.static",
+    "friction.sigma0",
+    "friction.sigma1",
+    "gravity.amplitude",
+)
+
+
+def spread(fit: Fit, weighing: Weighing, period_s: float, held: HeldOut) -> Array:
+    """Covariance of the coordinates of `fit`; `held` has the fits without each recording."""
+    return covariance(fit, weighing, period_s) + jackknife(fit, held) + model_error(fit) + common_factor(fit)
+
+
+def jackknife(fit: Fit, held: HeldOut) -> Array:
+    """By how much the fits without each recording disagree (Efron, The Jackknife, 1982)."""
+    count, size = len(held.coordinates), len(fit.coordinates)
+    if count < 2:
+        return np.zeros((size, size))
+    off = np.array([other - fit.coordinates for other in held.coordinates])
+    return np.asarray((count - 1) / count * off.T @ off)
+
+
+def model_error(fit: Fit) -> Array:
+    """MODEL_ERROR of each value, more for the bristle; of a sine by the size of its term, of orders over the range."""
+    sizes = np.array([BRISTLE_ERROR if unknown.key in BRISTLE else 1.0 for unknown in fit.hypothesis.unknowns])
+    linear = np.array([unknown.size != 0.0 for unknown in fit.hypothesis.unknowns])
+    sizes[linear] = np.abs(fit.coordinates[linear])
+    for place, term in enumerate(fit.hypothesis.terms):
+        waves = [u.key.startswith(("sine", "cosine")) for u in term.unknowns]
+        some = np.arange(len(sizes))[fit.hypothesis.share(place)][np.array(waves, dtype=bool)]
+        sizes[some] = np.linalg.norm(fit.coordinates[some])
+        orders = [u.key == "n" for u in term.unknowns]
+        sizes[np.arange(len(sizes))[fit.hypothesis.share(place)][np.array(orders, dtype=bool)]] = 1.0
+    return np.diag((MODEL_ERROR * sizes) ** 2)
+
+
+def common_factor(fit: Fit) -> Array:
+    """With an unknown gain, the common factor on every torque of the axis is as well known as these were beforehand."""
+    size = len(fit.coordinates)
+    unknowns = fit.hypothesis.unknowns
+    scaled = np.array([u.key in TORQUES for u in unknowns[: len(fit.hypothesis.base)]])
+    gains = [p for p, term in enumerate(fit.hypothesis.terms) if term.effect == "torque_gain"]
+    if not gains or not scaled.any():
+        return np.zeros((size, size))
+    along = np.zeros(size)
+    along[: len(scaled)][scaled] = 1.0
+    for place in gains:
+        along[fit.hypothesis.share(place)] = 1.0
+    known = sum(unknowns[i].spread ** -2.0 for i in np.flatnonzero(scaled))
+    return np.asarray(np.outer(along, along) / max(known, 1e-12))
+
+
+def within(off: Array, spread: Array) -> bool:
+    """Whether coordinates that are off by so much lie in the region of 95 % of this covariance."""
+    from scipy.stats import chi2
+
+    distance = float(off @ np.linalg.pinv(spread, hermitian=True) @ off)
+    return distance <= float(chi2.ppf(REGION, len(off)))

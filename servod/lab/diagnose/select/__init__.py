@@ -1,0 +1,1 @@
+"""Selection of effects: candidates, fits, forward selection, backward elimination, swap."""

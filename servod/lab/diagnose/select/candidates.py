@@ -1,0 +1,139 @@
+"""Tries every effect on what the present fit leaves: a step or two for all starts, full fits for the best.
+
+Stands between the effects' files and the selection. First rounds run on shortened data and reuse the Jacobian of the
+present fit for what they have in common with it, so that a start costs a few short simulations only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from time import monotonic
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servod.lab.diagnose.effects import effect, effects
+from servod.lab.diagnose.effects.hypothesis import Term
+from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.predict.parallel import side_by_side
+from servod.lab.diagnose.select.fit import Fit, Fitter
+
+Array = NDArray[np.float64]
+
+#: Starts that go on to the second round and its steps; effects that are fitted to the end and steps of such a fit.
+SECOND_ROUND, SECOND_STEPS, FULL_FITS, FULL_STEPS = 16, 3, 5, 8
+
+#: Starts of a far effect that get a step of their own: those that the model's own parameters can follow best.
+FAR_STARTS = 4
+
+#: A candidate is fitted to the end when it has saved at least 1 - IN_REACH of what the best has saved.
+IN_REACH = 0.4
+
+
+#: What a number more must take of the rest to be worth it.
+PER_NUMBER = 0.02
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect on trial: its fit, and what is left of the cost of the present fit as a share of it.
+
+    `place` is that of its own term in the fit: the last, unless others came in behind it.
+    """
+
+    effect: str
+    fit: Fit
+    left: float
+    place: int = -1
+
+    @property
+    def term(self) -> Term:
+        """The effect in the form that was fitted."""
+        return self.fit.hypothesis.terms[self.place]
+
+    @property
+    def own(self) -> Array:
+        """Coordinates of the term's own unknowns."""
+        return self.fit.coordinates[self.fit.hypothesis.share(self.place)]
+
+
+class Trials:
+    """Fits candidates against one present fit: `short` works on shortened data, `whole` on everything."""
+
+    def __init__(
+        self, whole: Fitter, short: Fitter, present: Fit, scene: Scene, nominal: bool, deadline: float
+    ) -> None:
+        self.whole, self.short, self.present, self.scene, self.deadline = whole, short, present, scene, deadline
+        self.tried = 0
+        self.beside = self._with_jacobian(short.begin(present.hypothesis, present.coordinates))
+        self.from_nominal = self._with_jacobian(short.begin(present.hypothesis)) if nominal else None
+
+    def _with_jacobian(self, fit: Fit | None) -> Fit:
+        if fit is None:
+            raise ValueError("a hypothesis that makes no sense at its start")
+        return replace(fit, jacobian=self.short.derivatives(fit))
+
+    def run(self, skip: Iterable[str] = ()) -> list[Candidate]:
+        """Candidates fitted to the end, best first, then the others; effects in `skip` are not tried."""
+        names = [what.name for what in effects() if what.name not in skip]
+        first = [c for found in side_by_side("starts", self._starts, names) for c in found]
+        first.sort(key=lambda c: c.left)
+        second = side_by_side("starts", self._second, best_of_each(first, SECOND_ROUND, 2))
+        second.sort(key=lambda c: c.left)
+        chosen = best_of_each(second, len(second), 1)
+        limit = chosen[0].left + IN_REACH * max(1.0 - chosen[0].left, 0.0) if chosen else 0.0
+        close = [c for c in chosen if c.left <= limit][:FULL_FITS]
+        fitted = sorted(side_by_side("starts", self._full, close), key=plainly)
+        return fitted + [c for c in chosen if c.effect not in {f.effect for f in fitted}]
+
+    def _starts(self, name: str) -> list[Candidate]:
+        """All starts of an effect after one step each."""
+        what = effect(name)
+        begun = [fit for term in what.terms(self.scene) for fit in self._begun(term, what.far)]
+        self.tried += len(begun)
+        if what.far:
+            begun = sorted(begun, key=self.short.promised)[:FAR_STARTS]
+        begun = [self.short.opened(fit) for fit in begun]
+        return [self._short(name, self.short.refine(fit, 1, fit.jacobian.shape[1], 2), fit) for fit in begun]
+
+    def _begun(self, term: Term, far: bool) -> list[Fit]:
+        """The term beside the present fit, and for far effects beside the nominal model."""
+        froms = [self.beside] + ([self.from_nominal] if far and self.from_nominal is not None else [])
+        fits = []
+        for beside in froms:
+            hypothesis = beside.hypothesis.with_term(term)
+            fits.append(self.short.begin(hypothesis, hypothesis.beside(beside.coordinates), beside.jacobian))
+        return [fit for fit in fits if fit is not None]
+
+    def _short(self, name: str, fit: Fit, begun: Fit) -> Candidate:
+        """A candidate on shortened data; it shares the Jacobian it began with, for many are kept."""
+        return Candidate(name, replace(fit, jacobian=begun.jacobian), fit.cost / max(self.beside.cost, 1e-30))
+
+    def _second(self, candidate: Candidate) -> Candidate:
+        fit = candidate.fit
+        return self._short(candidate.effect, self.short.refine(fit, SECOND_STEPS, fit.jacobian.shape[1]), fit)
+
+    def _full(self, candidate: Candidate) -> Candidate:
+        """Fit on everything, as long as there is time."""
+        begun = self.whole.begin(candidate.fit.hypothesis, candidate.fit.coordinates, self.present.jacobian)
+        if begun is None or monotonic() > self.deadline:
+            return candidate
+        fit = self.whole.refine(self.whole.opened(begun), FULL_STEPS, known=self.present.jacobian.shape[1])
+        return Candidate(candidate.effect, fit, fit.cost / max(self.present.cost, 1e-30))
+
+
+def plainly(candidate: Candidate) -> float:
+    """What is left, a little more for every number that the term needs: the plainest of equals comes first."""
+    return candidate.left * (1.0 + PER_NUMBER * candidate.term.numbers)
+
+
+def best_of_each(sorted_candidates: list[Candidate], count: int, each: int) -> list[Candidate]:
+    """The first `count` candidates with at most `each` of the same effect."""
+    kept: list[Candidate] = []
+    for candidate in sorted_candidates:
+        if sum(other.effect == candidate.effect for other in kept) < each:
+            kept.append(candidate)
+        if len(kept) == count:
+            break
+    return kept

@@ -1,0 +1,286 @@
+"""Decides what is named: terms come in one at a time, the best that is left, and go again when others do their work.
+
+Stands between the candidates and the verdict. A term stays only while it is significant against correlated noise with a
+correction for the number of things tried, and worth naming by the outside contract.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from time import monotonic
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servod.formats.model.axis_model import AxisModel
+from servod.lab.diagnose.data.excited import unseen
+from servod.lab.diagnose.effects.base import base_unknowns, document_of
+from servod.lab.diagnose.effects.hypothesis import Hypothesis
+from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.predict.floor import noise_floor, stretch_means
+from servod.lab.diagnose.predict.predict import Predictor
+from servod.lab.diagnose.predict.shortened import shortened
+from servod.lab.diagnose.select.at_end import at_end
+from servod.lab.diagnose.select.candidates import Candidate, Trials
+from servod.lab.diagnose.select.choice import Choice, Entry
+from servod.lab.diagnose.select.fit import Fit, Fitter, Weighing, long_run, scale_of
+from servod.lab.diagnose.select.level import is_level, on_bound
+from servod.lab.diagnose.select.merit import SURE_SHARE, Merit, acting, worth_naming
+
+Array = NDArray[np.float64]
+Tell = Callable[[str], None]
+
+#: Whether a new term deserves to come in, by what it is worth and the fit with it.
+Deserves = Callable[[Merit, Fit], bool]
+
+#: Robust deviations beyond which a mismatch is a blow, and counts no more for what is left.
+BLOW = 8.0
+
+#: Most terms.
+MOST_TERMS = 5
+
+#: Nothing worth naming is left when the mismatch above the floor, and its mean over any short stretch but this share of
+#: them, are below these shares of dry friction.
+NOTHING_RMS, NOTHING_STRETCH, BUT_SHARE = 0.006, 0.02, 0.005
+
+#: Rivals that saved at least 1 - CLOSE of what the best saved get their chance when the best does not deserve it.
+CLOSE = 0.3
+
+#: Steps of a fit, in each of two scales.
+STEPS = 12
+
+#: Times that such a fit goes on where a term deserves it, and the share of what it takes that is as good as nothing:
+#: blows behind a gap come a sample earlier or later, and no step ends exactly.
+MORE, NEAR = 2, 0.05
+
+#: Blocks whose sums are taken to be independent when a gain is judged, s. Shorter than those of the intervals: what
+#: other missing physics leaves is slow, and must not count as noise as long as it is not named.
+GAIN_MEMORY_S = 0.1
+
+#: Scale of the mismatch is never taken smaller than this share of dry friction.
+LEAST_SCALE = 0.002
+
+
+class Chooser:
+    """Runs the selection on fixed recordings."""
+
+    def __init__(self, predictor: Predictor, nominal: AxisModel, deadline: float, tell: Tell) -> None:
+        self.predictor, self.deadline, self.tell = predictor, deadline, tell
+        self.nominal = nominal
+        self.start = Hypothesis(document_of(nominal), base_unknowns(nominal))
+        self.unseen = unseen(predictor.traces, nominal.inertia)
+        self.rows = predictor.counts.astype(np.float64)
+        self.tried = 0
+        self.base_error = 0.0
+        self.floor = 0.0
+
+    def fitter(self, mismatch: Array) -> Fitter:
+        """A fitter that counts costs in the scale of this mismatch."""
+        least = LEAST_SCALE * self.predictor.dry
+        return Fitter(self.predictor, Weighing(scale_of(mismatch, self.predictor.counts, least), self.rows))
+
+    def error(self, mismatch: Array) -> float:
+        """Mean square of the mismatch over the rows that count."""
+        return float(np.mean(mismatch[self.predictor.counts] ** 2))
+
+    def run(self) -> Choice:
+        """Fit the base, add terms, prune; the outcome."""
+        base = self._fit_base()
+        choice = Choice(base, base, [], [], {}, self.floor, 0)
+        while len(choice.fit.hypothesis.terms) < MOST_TERMS and self._more_to_find(choice.fit):
+            added = monotonic() < self.deadline and self._add(choice)
+            choice.cut = not added and monotonic() >= self.deadline
+            if not added:
+                break
+            if len(choice.fit.hypothesis.terms) >= 2:
+                self.prune(choice)
+        choice.tried, choice.floor = self.tried, self.floor
+        return choice
+
+    def _more_to_find(self, fit: Fit) -> bool:
+        return not self.nothing_left(fit.mismatch) or on_bound(fit)
+
+    def _fit_base(self) -> Fit:
+        mismatch = self.predictor.mismatch(self.start.model(self.start.start))
+        fit = self.settled(self.start, None, mismatch)
+        self.base_error = self.error(fit.mismatch)
+        self.floor = noise_floor(self.predictor, fit.mismatch)
+        return fit
+
+    def settled(
+        self, hypothesis: Hypothesis, coordinates: Array | None, mismatch: Array, jacobian: Array | None = None
+    ) -> Fit:
+        """Fit in the scale of the present mismatch, then in the scale of what is left; its Jacobian is fresh.
+
+        `jacobian` is one to begin with, where one is known.
+        """
+        begun = self.fitter(mismatch).begin(hypothesis, coordinates, jacobian)
+        if begun is None:
+            raise ValueError("a hypothesis that makes no sense at its start")
+        first = self._refined(begun, mismatch, begun.jacobian.shape[1])
+        second = self._refined(first, first.mismatch, len(first.coordinates))
+        return second if second.converged else self.fresh(second)
+
+    def _refined(self, fit: Fit, mismatch: Array, known: int) -> Fit:
+        """The fit refined in the scale of a mismatch, with the first columns of its Jacobian to begin with."""
+        fitter = self.fitter(mismatch)
+        cost = fitter.cost(fit.hypothesis, fit.coordinates, fit.mismatch)
+        return fitter.refine(replace(fit, cost=cost, converged=False), STEPS, known=known)
+
+    def fresh(self, fit: Fit) -> Fit:
+        """The fit with cost and Jacobian in the scale of its own mismatch."""
+        fitter = self.fitter(fit.mismatch)
+        cost = fitter.cost(fit.hypothesis, fit.coordinates, fit.mismatch)
+        return replace(fit, cost=cost, jacobian=fitter.derivatives(fit))
+
+    def _add(self, choice: Choice) -> bool:
+        """Try all effects beside the present fit and take the best if it deserves it.
+
+        A fit behind a gap may improve by being fitted again: what a term is worth counts from there.
+        """
+        present = choice.fit
+        candidates = self.candidates(present)
+        for candidate in candidates:
+            if candidate.left > candidates[0].left + CLOSE * (1.0 - candidates[0].left):
+                break
+            settled, merit = self.to_end(present, self._settled(candidate.fit, present.mismatch), self.deserves)
+            self.lower_floor(settled.mismatch)
+            if self.enters(merit, settled):
+                bare = self.less(settled, len(settled.hypothesis.terms) - 1)
+                if self.error(bare.mismatch) < self.error(present.mismatch):
+                    choice.fit, merit = bare, self.merit(bare, settled)
+            if self.enters(merit, settled):
+                others = [c for c in candidates if c.effect != candidate.effect]
+                choice.fit = settled
+                choice.merits.append(merit)
+                choice.entries.append(Entry(candidate.left, others))
+                return True
+            if self.significant(merit, settled):
+                choice.minor.setdefault(candidate.effect, merit)
+        return False
+
+    def _settled(self, fit: Fit, mismatch: Array) -> Fit:
+        """A candidate's fit settled; its Jacobian serves when it has all rows."""
+        known = fit.jacobian if len(fit.jacobian) == len(mismatch) else None
+        return self.settled(fit.hypothesis, fit.coordinates, mismatch, known)
+
+    def to_end(self, present: Fit, settled: Fit, deserves: Deserves) -> tuple[Fit, Merit]:
+        """A fit that deserves to come in, fitted on until it is at its end or nearly; and what it is worth."""
+        merit = self.merit(present, settled)
+        for _ in range(MORE):
+            if settled.converged or not deserves(merit, settled):
+                break
+            further = self._refined(settled, settled.mismatch, len(settled.coordinates))
+            later = self.merit(present, further)
+            near = later.of_left - merit.of_left < NEAR * later.of_left
+            settled, merit = replace(further, converged=further.converged or near), later
+        return settled, merit
+
+    def lower_floor(self, mismatch: Array) -> None:
+        """Take a mismatch into account that shows a lower floor than those before."""
+        self.floor = min(self.floor, noise_floor(self.predictor, mismatch), self.error(mismatch))
+
+    def candidates(self, present: Fit, fine: bool = False, skip: frozenset[str] = frozenset()) -> list[Candidate]:
+        """All effects but `skip` tried beside the present fit, best first; `fine`: finer forms among them."""
+        whole = self.fitter(present.mismatch)
+        quick = shortened(self.predictor, self.nominal, present.mismatch)
+        short = Fitter(quick, Weighing(whole.weighing.scale, quick.counts.astype(np.float64)))
+        scene = Scene(self.start.document, self.predictor, present.mismatch, fine)
+        trials = Trials(whole, short, present, scene, not present.hypothesis.terms, self.deadline)
+        candidates = trials.run(skip=_once(present.hypothesis) | skip | self.unseen)
+        self.tried += trials.tried
+        self.tell(f"{trials.tried} starts tried; best: " + ", ".join(c.effect for c in candidates[:3]))
+        return candidates
+
+    def nothing_left(self, mismatch: Array) -> bool:
+        """Whether no effect worth naming can hide in this mismatch."""
+        above = math.sqrt(max(self.error(mismatch) - self.floor, 0.0)) / self.predictor.dry
+        stretches = stretch_means(self.predictor, mismatch) / self.predictor.dry
+        return above < NOTHING_RMS and float(np.quantile(np.abs(stretches), 1.0 - BUT_SHARE)) < NOTHING_STRETCH
+
+    def merit(self, without: Fit, with_term: Fit) -> Merit:
+        """What the step from one fit to the other is worth."""
+        explainable = max(self.base_error - self.floor, 1e-30)
+        saved = self.error(without.mismatch) - self.error(with_term.mismatch)
+        torque = self._acting(without.mismatch, with_term.mismatch)
+        fitter = self.fitter(with_term.mismatch)
+        cost = fitter.cost(without.hypothesis, without.coordinates, without.mismatch)
+        gain = 2.0 * (cost - with_term.cost) / self._correlation(with_term.mismatch, fitter.weighing.scale)
+        blow = BLOW * float(np.median(np.abs(with_term.mismatch[self.predictor.counts]))) / 0.6745
+        was, now = (self.error(np.clip(fit.mismatch, -blow, blow)) for fit in (without, with_term))
+        of_left = (was - now) / max(was - self.floor, 1e-30)
+        return Merit(saved / explainable, of_left, torque, gain, self._own(without, with_term))
+
+    def _acting(self, one: Array, other: Array) -> float:
+        """Where two mismatches differ, by how much, as a share of dry friction."""
+        return acting(np.abs(one - other)[self.predictor.counts]) / self.predictor.dry
+
+    def _own(self, without: Fit, with_term: Fit) -> float:
+        """The torque of the term that one fit has more than the other, all else as fitted with it; 0 for a level."""
+        hypothesis = with_term.hypothesis
+        pairs = zip(hypothesis.terms, (*without.hypothesis.terms, None), strict=False)
+        place = next(index for index, (term, other) in enumerate(pairs) if term is not other)
+        if not hypothesis.terms[place].unknowns:
+            return 0.0
+        kept = np.delete(with_term.coordinates, hypothesis.share(place))
+        bare = self.fitter(with_term.mismatch).mismatch(hypothesis.without(place), kept)
+        return 0.0 if bare is None else self._acting(bare, with_term.mismatch)
+
+    def _correlation(self, mismatch: Array, scale: float) -> float:
+        """By how much correlated rows exaggerate a gain: long-run over plain variance, at least 1."""
+        period = self.predictor.traces[0].period_s
+        clipped = np.clip(mismatch / scale, -4.0, 4.0)
+        plain = float(clipped @ clipped)
+        slow = float(long_run(clipped[:, None], max(1, round(GAIN_MEMORY_S / period)))[0, 0])
+        return max(slow / max(plain, 1e-30), 1.0)
+
+    def enters(self, merit: Merit, fit: Fit, place: int = -1) -> bool:
+        """Whether a term (the last one, or the one at `place`) may come in: it deserves it, and its fit is whole."""
+        return self.deserves(merit, fit, place) and whole(merit, fit, place)
+
+    def deserves(self, merit: Merit, fit: Fit, place: int = -1) -> bool:
+        """Whether a term (the last one, or the one at `place`) is significant and worth naming."""
+        return worth_naming(merit, is_level(fit.hypothesis.terms[place])) and self.significant(merit, fit, place)
+
+    def significant(self, merit: Merit, fit: Fit, place: int = -1) -> bool:
+        """Bayesian information criterion with a correction for the number of starts tried."""
+        unknowns = max(len(fit.hypothesis.terms[place].unknowns), 1)
+        rows = float(self.rows.sum())
+        return merit.gain > unknowns * math.log(rows) + 2.0 * math.log(max(self.tried, 1)) + 20.0
+
+    def prune(self, choice: Choice) -> None:
+        """Drop every earlier term whose work the others now do."""
+        index = 0
+        while index < len(choice.fit.hypothesis.terms) - 1:
+            less = self.less(choice.fit, index)
+            merit = self.merit(less, choice.fit)
+            if self.deserves(merit, choice.fit, index):
+                choice.merits[index] = merit
+                index += 1
+                continue
+            choice.drop(index, less)
+
+    def less(self, fit: Fit, index: int) -> Fit:
+        """The fit without one of its terms."""
+        gone = fit.hypothesis.share(index)
+        kept = np.delete(fit.coordinates, gone)
+        return self.settled(fit.hypothesis.without(index), kept, fit.mismatch, np.delete(fit.jacobian, gone, axis=1))
+
+
+def whole(merit: Merit, fit: Fit, place: int = -1) -> bool:
+    """Whether the fit of a term has come to an end, and not to one of a range."""
+    return (fit.converged or merit.share >= SURE_SHARE) and not at_end(fit, place)
+
+
+#: Effects that may come in again with another period or place: a second harmonic is no second effect.
+_REPEATED = (
+    *("cogging", "torque_ripple", "disturbance", "position_dependent_friction"),
+    *("position_dependent_inertia", "encoder_eccentricity"),
+)
+
+
+def _once(hypothesis: Hypothesis) -> set[str]:
+    """Effects that are in already and cannot come in again."""
+    return {term.effect for term in hypothesis.terms} - set(_REPEATED)

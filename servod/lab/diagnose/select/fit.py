@@ -1,0 +1,246 @@
+"""Damped Gauss-Newton on the torque mismatch: robust, within bounds, with what is known beforehand.
+
+Stands between hypotheses and their selection. The residual of the fit is the mismatch of every row in units of its
+present scale; beyond some scales a row counts by its distance only (Huber). Intervals count correlated rows as fewer
+(batch means: Carlstein, Annals of Statistics 14, 1986).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from servod.formats.model.axis_model import AxisModel
+from servod.lab.diagnose.effects.hypothesis import Hypothesis
+from servod.lab.diagnose.predict.parallel import side_by_side
+from servod.lab.diagnose.predict.predict import Predictor
+
+Array = NDArray[np.float64]
+
+#: Scales beyond which a row's mismatch counts by its distance only.
+HUBER = 4.0
+
+#: The scale of a mismatch is at least this share of its root mean square: rare blows must not count by distance alone.
+LEAST_OF_RMS = 0.3
+
+#: A fit has converged when a step improves the cost by less than this share.
+CONVERGED = 1e-3
+
+#: Damping that steps begin with, as a share of the normal matrix's diagonal: so little that where the data say nothing,
+#: what was known beforehand decides.
+LEAST_DAMPING = 1e-8
+
+#: Longest step of one coordinate at once.
+LONGEST = 1.5
+
+#: Length of the blocks whose sums are taken to be independent, s: rows within one may be correlated as they like.
+MEMORY_S = 0.25
+
+
+class Weighing(NamedTuple):
+    """Scale of the mismatch in which costs are counted (N*m), and the rows that take part as weights 0 or 1."""
+
+    scale: float
+    rows: Array
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted hypothesis: coordinates, mismatch of all rows, cost, and the Jacobian where it was last computed."""
+
+    hypothesis: Hypothesis
+    coordinates: Array
+    mismatch: Array
+    cost: float
+    jacobian: Array
+    converged: bool
+
+    @property
+    def model(self) -> AxisModel:
+        """The fitted axis model."""
+        return self.hypothesis.model(self.coordinates)
+
+    @property
+    def values(self) -> list[float]:
+        """Values of the unknowns."""
+        return self.hypothesis.values(self.coordinates)
+
+
+def robust_cost(mismatch: Array, weighing: Weighing) -> float:
+    """Sum of Huber's loss over the rows that take part."""
+    off = np.abs(mismatch) / weighing.scale
+    loss = np.where(off <= HUBER, 0.5 * off * off, HUBER * (off - 0.5 * HUBER))
+    return float(weighing.rows @ loss)
+
+
+def prior_cost(hypothesis: Hypothesis, coordinates: Array, centre: Array) -> float:
+    """What the coordinates cost against what was known beforehand."""
+    off = (coordinates - centre) * hypothesis.prior[1]
+    return 0.5 * float(off @ off)
+
+
+class Fitter:
+    """Fits hypotheses to one set of recordings."""
+
+    def __init__(self, predictor: Predictor, weighing: Weighing) -> None:
+        self.predictor = predictor
+        self.weighing = weighing
+
+    def mismatch(self, hypothesis: Hypothesis, coordinates: Array) -> Array | None:
+        """Mismatch of all rows, or None where the model makes no sense."""
+        try:
+            return self.predictor.mismatch(*hypothesis.models(coordinates, len(self.predictor.traces)))
+        except ValidationError:
+            return None
+
+    def cost(self, hypothesis: Hypothesis, coordinates: Array, mismatch: Array) -> float:
+        """Cost of data and prior."""
+        return robust_cost(mismatch, self.weighing) + prior_cost(hypothesis, coordinates, hypothesis.prior[0])
+
+    def begin(
+        self, hypothesis: Hypothesis, coordinates: Array | None = None, jacobian: Array | None = None
+    ) -> Fit | None:
+        """The hypothesis at its start (or at `coordinates`), with as many columns of a Jacobian as are known."""
+        low, high = hypothesis.bounds
+        at = np.clip(hypothesis.start if coordinates is None else coordinates, low, high)
+        mismatch = self.mismatch(hypothesis, at)
+        if mismatch is None:
+            return None
+        known = np.zeros((len(mismatch), 0)) if jacobian is None else jacobian
+        return Fit(hypothesis, at, mismatch, self.cost(hypothesis, at, mismatch), known, False)
+
+    def promised(self, fit: Fit) -> float:
+        """The cost after one step along the columns of the Jacobian that are known, by the Jacobian alone."""
+        columns = fit.jacobian.shape[1]
+        normal, slope = self._normal(fit, fit.jacobian)
+        return fit.cost - 0.5 * float(slope @ np.linalg.solve(normal + 1e-9 * np.eye(columns), slope))
+
+    def refine(self, fit: Fit, steps: int, keep_columns: int = 0, tries: int = 4, known: int = 0) -> Fit:
+        """Go on fitting for some steps; the first `keep_columns` columns of the Jacobian are taken as they are.
+
+        The first `known` are taken as they are to begin with. The Jacobian follows the steps by secants (Broyden, Math.
+        Comp. 19, 1965) and is taken anew when they stop to help; a fit ends only on a fresh one.
+        """
+        damping, fresh = LEAST_DAMPING, known <= keep_columns
+        jacobian = self.derivatives(fit, max(keep_columns, known))
+        for _ in range(steps):
+            stepped, damping = self._step(fit, jacobian, damping, tries)
+            gained = (fit.cost - stepped.cost) / max(fit.cost, 1.0)
+            if gained > CONVERGED:
+                jacobian, fresh = secant(jacobian, fit, stepped), False
+                fit = replace(stepped, jacobian=jacobian)
+                continue
+            fit = stepped
+            if fresh:
+                return replace(fit, converged=True)
+            jacobian, fresh, damping = self.derivatives(fit, keep_columns), True, LEAST_DAMPING
+        return fit
+
+    def opened(self, fit: Fit) -> Fit:
+        """The fit with those columns of its Jacobian anew that belong to parameters opened by its last term."""
+        keys = fit.hypothesis.terms[-1].opens
+        jacobian = fit.jacobian.copy() if keys else fit.jacobian
+        for index, unknown in enumerate(fit.hypothesis.base):
+            if unknown.key in keys and index < jacobian.shape[1]:
+                jacobian[:, index] = self._column(fit, index)
+        return replace(fit, jacobian=jacobian)
+
+    def derivatives(self, fit: Fit, keep_columns: int = 0) -> Array:
+        """Derivative of the mismatch by each coordinate, N*m; forward differences, backward at an upper bound."""
+        columns = [fit.jacobian[:, i] for i in range(min(keep_columns, fit.jacobian.shape[1]))]
+        left = range(len(columns), len(fit.coordinates))
+        columns += side_by_side("columns", lambda index: self._column(fit, index), left)
+        return np.column_stack(columns)
+
+    def _column(self, fit: Fit, index: int) -> Array:
+        nudged = fit.coordinates.copy()
+        nudge = fit.hypothesis.unknowns[index].nudge
+        nudge = nudge if nudged[index] + nudge <= fit.hypothesis.bounds[1][index] else -nudge
+        nudged[index] += nudge
+        there = self.mismatch(fit.hypothesis, nudged)
+        return np.zeros_like(fit.mismatch) if there is None else (there - fit.mismatch) / nudge
+
+    def _step(self, fit: Fit, jacobian: Array, damping: float, tries: int) -> tuple[Fit, float]:
+        """One damped step that lowers the cost; the fit itself when none does."""
+        normal, slope = self._normal(fit, jacobian)
+        for _ in range(tries):
+            change = _bounded_step(normal, slope, damping, fit)
+            at = fit.coordinates + change
+            mismatch = self.mismatch(fit.hypothesis, at)
+            if mismatch is not None:
+                cost = self.cost(fit.hypothesis, at, mismatch)
+                if cost < fit.cost:
+                    return Fit(fit.hypothesis, at, mismatch, cost, jacobian, False), max(0.2 * damping, LEAST_DAMPING)
+            damping = max(8.0 * damping, 1e-2)
+        return Fit(fit.hypothesis, fit.coordinates, fit.mismatch, fit.cost, jacobian, False), damping
+
+    def _normal(self, fit: Fit, jacobian: Array) -> tuple[Array, Array]:
+        """Normal matrix and slope of the cost, prior included."""
+        off = fit.mismatch / self.weighing.scale
+        weight = self.weighing.rows * np.minimum(1.0, HUBER / np.maximum(np.abs(off), 1e-12))
+        scaled = jacobian / self.weighing.scale
+        some = slice(jacobian.shape[1])
+        centre, precision = (part[some] for part in fit.hypothesis.prior)
+        normal = scaled.T @ (weight[:, None] * scaled) + np.diag(precision**2)
+        return normal, scaled.T @ (weight * off) + precision**2 * (fit.coordinates[some] - centre)
+
+
+def secant(jacobian: Array, old: Fit, new: Fit) -> Array:
+    """The Jacobian with the slope along the last step as it was found there."""
+    step = new.coordinates - old.coordinates
+    length = float(step @ step)
+    if length == 0.0:
+        return jacobian
+    missed = new.mismatch - old.mismatch - jacobian @ step
+    return np.asarray(jacobian + np.outer(missed, step / length))
+
+
+def _bounded_step(normal: Array, slope: Array, damping: float, fit: Fit) -> Array:
+    """Solve for the step; coordinates that would leave their bounds stay on them and the others are solved again."""
+    low, high = fit.hypothesis.bounds
+    free = np.ones(len(slope), dtype=bool)
+    change = np.zeros(len(slope))
+    for _ in range(len(slope)):
+        some = np.flatnonzero(free)
+        if len(some) == 0:
+            break
+        held = normal[np.ix_(some, ~free)] @ change[~free]
+        diagonal = np.diag(normal)[some]
+        damped = normal[np.ix_(some, some)] + np.diag(damping * diagonal + 1e-9 * max(float(diagonal.max()), 1e-12))
+        change[some] = np.clip(-np.linalg.solve(damped, slope[some] + held), -LONGEST, LONGEST)
+        inside = np.clip(fit.coordinates + change, low, high) - fit.coordinates
+        out = free & (np.abs(inside - change) > 1e-12)
+        change = inside
+        if not out.any():
+            break
+        free &= ~out
+    return change
+
+
+def scale_of(mismatch: Array, counts: NDArray[np.bool_], floor: float) -> float:
+    """Robust standard deviation of the mismatch, at least `floor` and LEAST_OF_RMS of its root mean square."""
+    spread = float(np.median(np.abs(mismatch[counts]))) / 0.6745
+    return max(spread, LEAST_OF_RMS * float(np.sqrt(np.mean(mismatch[counts] ** 2))), floor)
+
+
+def covariance(fit: Fit, weighing: Weighing, period_s: float) -> Array:
+    """Covariance of the coordinates: sandwich with correlated rows (batch means, blocks of MEMORY_S)."""
+    off = fit.mismatch / weighing.scale
+    weight = weighing.rows * np.minimum(1.0, HUBER / np.maximum(np.abs(off), 1e-12))
+    scaled = fit.jacobian / weighing.scale
+    precision = fit.hypothesis.prior[1]
+    normal = scaled.T @ (weight[:, None] * scaled) + np.diag(precision**2)
+    meat = long_run(scaled * (weight * off)[:, None], max(1, math.ceil(MEMORY_S / period_s)))
+    bread = np.linalg.pinv(normal)
+    return np.asarray(bread @ (meat + np.diag(precision**2)) @ bread)
+
+
+def long_run(scores: Array, rows: int) -> Array:
+    """Long-run covariance of the sum of `scores`, by sums over blocks of so many rows (batch means)."""
+    blocks = np.add.reduceat(scores, np.arange(0, len(scores), rows), axis=0)
+    return np.asarray(blocks.T @ blocks)

@@ -1,0 +1,116 @@
+"""Bristle damping sigma1 from the joint's ringing on its bristles below break-away.
+
+X/U = 1/(k*(1 + j*eta) + j*w*d - m*w^2): eta is the loss of the Dahl loop, the same at every frequency; d grows with it
+and is sigma1 plus viscous friction. Inertia and delay are known from the sliding joint.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from servod.lab.identify.estimate import Estimate, estimate, jackknife
+from servod.lab.identify.ranges import at_ends, joined
+from servod.lab.identify.trace import Trace
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+#: Images of the sampled spectrum that count, to each side.
+IMAGES = 6
+#: Fewer whole periods have no scatter worth the name.
+LEAST_PERIODS = 3
+#: Wider than this share of its value, the damping counts as not identified.
+WIDEST_SHARE = 0.5
+#: Share for what the periods' scatter does not show: the loop's loss is only nearly the same at every frequency.
+ALLOWANCE = 0.2
+#: Bounds of the search: stiffness over that at the lowest line, loss, damping over the critical one.
+_RANGES = ([0.2, 0.0, 0.0], [5.0, 0.8, 5.0])
+
+
+class _Period(NamedTuple):
+    """Spectra of one period at the excited lines."""
+
+    way: Complex
+    torque: Complex
+
+
+def fit(trace: Trace, inertia: float, delay_s: float, viscous: float, stiffness: float) -> Estimate | None:
+    """sigma1 in N*m*s/rad; None when the recording does not tell it (coarse encoder, too little motion).
+
+    On a bent Dahl curve the bristle moves less than the joint, by the chord's stiffness over that at zero, `stiffness`.
+    """
+    frequency, periods = _spectra(trace)
+    if len(periods) < LEAST_PERIODS:
+        return None
+
+    def damping(parts: Sequence[_Period]) -> Array:
+        chord, _, slope = _solve(frequency, parts, inertia, delay_s, trace.period_s)
+        return np.array([(slope - viscous) * stiffness / chord])
+
+    values, spread = jackknife(damping, periods)
+    note = _note(_searched(frequency, periods, inertia, delay_s, trace.period_s)[0])
+    found = estimate(float(values[0]), float(spread[0]), len(periods) - 1, "N*m*s/rad", share=ALLOWANCE, note=note)
+    told = found.value > 0.0 and found.half_width < WIDEST_SHARE * found.value
+    return found if told else None
+
+
+def response(
+    frequency: Array, inertia: float, stiffness: float, loss: float, damping: float, delay_s: float, period_s: float
+) -> Complex:
+    """Sampled position over the held command, images of the spectrum included."""
+    total = np.zeros(len(frequency), dtype=np.complex128)
+    for image in range(-IMAGES, IMAGES + 1):
+        w = 2.0 * np.pi * (frequency + image / period_s)
+        spring = stiffness * (1.0 + 1j * loss * np.sign(w))
+        joint = 1.0 / (spring + 1j * w * damping - inertia * w * w)
+        total += joint * (1.0 - np.exp(-1j * w * period_s)) / (1j * w) / period_s * np.exp(-1j * w * delay_s)
+    return total
+
+
+def _spectra(trace: Trace) -> tuple[Array, list[_Period]]:
+    """Lines in Hz, and the spectra of all whole periods but the first."""
+    s = trace.settings
+    count = int(s["count"])
+    lines = np.array([int(s[f"line_{i}"]) for i in range(sum(key.startswith("line_") for key in s))])
+    periods = []
+    for i in range(1, int(s["periods"])):
+        cut = slice(i * count, (i + 1) * count)
+        if len(trace) < (i + 1) * count:
+            break
+        way = trace.position_rad[cut]
+        way = way - np.linspace(0.0, 1.0, count) * (way[-1] - way[0])
+        periods.append(_Period(np.fft.rfft(way)[lines], np.fft.rfft(trace.torque_nm[cut])[lines]))
+    return lines / (count * trace.period_s), periods
+
+
+def _solve(frequency: Array, periods: Sequence[_Period], inertia: float, delay_s: float, period_s: float) -> Array:
+    """(stiffness, loss, damping) that fit the periods' mean response."""
+    (chord, loss, damping), first, critical = _searched(frequency, periods, inertia, delay_s, period_s)
+    return np.array([first * chord, loss, critical * damping])
+
+
+def _note(x: Array) -> str:
+    """What of the search stands at the end of its range."""
+    names = ("the chord's stiffness", "the loop's loss", "the damping")
+    return joined(*(f"{name} {note}" for name, note in zip(names, at_ends(x.tolist(), *_RANGES), strict=True) if note))
+
+
+def _searched(
+    frequency: Array, periods: Sequence[_Period], inertia: float, delay_s: float, period_s: float
+) -> tuple[Array, float, float]:
+    """(stiffness, loss, damping) as the search has them, and the units of stiffness and damping."""
+    measured = np.asarray(sum(p.way for p in periods) / sum(p.torque for p in periods))
+    first = float(1.0 / np.abs(measured[0]))
+    critical = 2.0 * np.sqrt(first * inertia)
+
+    def misfit(x: Array) -> Array:
+        model = response(frequency, inertia, first * x[0], x[1], critical * x[2], delay_s, period_s)
+        error = (model - measured) * first
+        return np.concatenate([error.real, error.imag])
+
+    return least_squares(misfit, [1.0, 0.05, 0.5], bounds=_RANGES).x, first, float(critical)

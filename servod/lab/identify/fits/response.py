@@ -1,0 +1,280 @@
+"""Frequency response of the sliding joint: inertia, viscous slope, delay, lag, first resonance, torque noise.
+
+The multisine is the instrument: position and torque are both correlated with it, stroke by stroke, so that feedback,
+quantisation and friction's own torque do not bias the response (joint input-output method; Pintelon and Schoukens,
+System Identification, 2012, 2.7 and 7). The model is the exact sampled response of command, hold, delay and joint.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+from scipy.optimize import least_squares
+
+from servod.common.errors import AnswerIsNo
+from servod.lab.identify.estimate import LEVEL, Estimate, estimate, jackknife
+from servod.lab.identify.fits import elastic
+from servod.lab.identify.fits.rigid import Rigid, response_of
+from servod.lab.identify.fits.strokes import Stroke, coherence_of, deviation_of, position_over_torque, ratio_of, spectra
+from servod.lab.identify.ranges import at_ends, joined
+from servod.lab.identify.trace import Trace
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+#: Lines with less coherence than this carry no weight.
+LEAST_COHERENCE = 0.6
+#: Longest delay and lag that are looked for, s.
+LONGEST_DELAY_S = LONGEST_LAG_S = elastic.LONGEST_DELAY_S
+#: The lag must lower the misfit this significantly before it counts as one.
+LAG_SIGNIFICANCE = 1e-3
+#: A rigid joint that leaves this misfit per line is not all; two masses must leave at most this share of it.
+UNEXPLAINED, SPRUNG_COST = 1.5, 0.2
+#: Half widths that the scatter does not show: inertia by share, delay in s. The same joint started ten milliseconds
+#: later is told a delay that differs by 25 us.
+INERTIA_ALLOWANCE, DELAY_ALLOWANCE_S = 0.01, 5e-5
+#: Torque noise is told up to here: above, the encoder's own shows more.
+NOISE_HZ = 40.0
+
+
+class Resonance(NamedTuple):
+    """A first resonance: of both masses against each other, and the inertia behind the spring."""
+
+    frequency_hz: Estimate
+    load_inertia: Estimate
+    joint: elastic.Elastic
+
+
+class ResponseFit(NamedTuple):
+    """Estimates, and the response itself.
+
+    At the lines `frequency_hz`: position over torque in rad/(N*m), the relative standard deviation of its mean over the
+    strokes, and the coherence of motion and excitation.
+    """
+
+    inertia: Estimate
+    viscous_slope: Estimate
+    delay_s: Estimate
+    lag_s: Estimate
+    resonance: Resonance | None
+    torque_noise_rms: Estimate
+    frequency_hz: Array
+    response: Complex
+    deviation: Array
+    coherence: Array
+    period_s: float
+
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """Lines that the estimates rest on."""
+        return self.coherence >= LEAST_COHERENCE
+
+    def model(self, frequency_hz: Array) -> Complex:
+        """Position over torque of what was fitted, rad/(N*m)."""
+        if self.resonance is not None:
+            ratio = elastic.response_of(self.resonance.joint, frequency_hz, self.period_s)
+        else:
+            rigid = Rigid(self.inertia.value, self.viscous_slope.value, self.delay_s.value, self.lag_s.value)
+            ratio = response_of(rigid, frequency_hz, self.period_s)
+        return position_over_torque(frequency_hz, ratio, self.period_s)
+
+    def phase_rad(self, of: Complex) -> Array:
+        """Phase of a response at the lines, each on the turn that is nearest to the fitted one.
+
+        The lowest lines, which cogging disturbs, do not tell by themselves how it goes from one to the next.
+        """
+        fitted = self.model(self.frequency_hz)
+        phase: Array = falling_phase_rad(fitted) + np.angle(of / fitted)
+        return phase
+
+
+def falling_phase_rad(response: Complex) -> Array:
+    """Phase of a smooth response from torque to position, which begins below zero and goes on without turns."""
+    phase = np.unwrap(np.angle(response))
+    falling: Array = phase - 2.0 * np.pi if phase[0] > 0.0 else phase
+    return falling
+
+
+class _Lines(NamedTuple):
+    """What the models are fitted to: lines in Hz, relative deviation of the strokes' mean at each, period in s."""
+
+    frequency: Array
+    deviation: Array
+    period_s: float
+
+
+class _Found(NamedTuple):
+    """The chosen model: inertia, viscous, delay, lag; its deviations and notes; the spring, where there is one."""
+
+    values: Array
+    spread: Array
+    notes: Sequence[str]
+    lag: Estimate
+    resonance: Resonance | None
+
+
+def fit(trace: Trace, inertia: float) -> ResponseFit:
+    """Fit one multisine recording; `inertia` is the first idea of it. Raises AnswerIsNo without coherence."""
+    frequency, strokes = spectra(trace)
+    coherence = coherence_of(strokes)
+    used = coherence >= LEAST_COHERENCE
+    if np.count_nonzero(used) < 6:
+        raise AnswerIsNo(
+            "inertia and delay are not identifiable from this multisine: the motion is not coherent with it; allow "
+            "more torque or speed, or a finer encoder"
+        )
+    deviation, period = deviation_of(strokes), trace.period_s
+    seen = [Stroke(s.velocity[used], s.torque[used], s.excitation[used]) for s in strokes]
+    found = _choose(_Lines(frequency[used], deviation[used], period), seen, inertia)
+    values, spread, notes, freedom = found.values, found.spread, found.notes, len(strokes) - 1
+    slope = joined("slope of the friction map at the sliding speed", notes[1])
+    return ResponseFit(
+        estimate(values[0], spread[0], freedom, "kg*m^2", share=INERTIA_ALLOWANCE, note=notes[0]),
+        estimate(values[1], spread[1], freedom, "N*m*s/rad", note=slope),
+        _delay(values[2], spread[2], freedom, notes[2], found.lag),
+        found.lag,
+        found.resonance,
+        _torque_noise(_Lines(frequency, deviation, period), strokes, trace, values),
+        frequency,
+        position_over_torque(frequency, ratio_of(strokes), period),
+        deviation,
+        coherence,
+        period,
+    )
+
+
+def _choose(lines: _Lines, strokes: Sequence[Stroke], inertia: float) -> _Found:
+    """The simplest model that explains the response: rigid, rigid behind a lag, two masses."""
+    start = np.log([inertia, max(inertia * 10.0, 1e-12)])
+
+    def solve(parts: Sequence[Stroke], lag: bool) -> Array:
+        return _solve(lines.frequency, ratio_of(parts), lines.deviation, lines.period_s, start, lag)
+
+    ratio = ratio_of(strokes)
+    plain, with_lag = solve(strokes, False), solve(strokes, True)
+    costs = [_cost(lines, ratio, values) for values in (plain, with_lag)]
+    if sprung := _sprung(lines, strokes, inertia, (plain, with_lag)):
+        return sprung
+    lagged, lag_spread = jackknife(lambda parts: solve(parts, True), strokes)
+    freedom = len(strokes) - 1
+    if _worse(costs, lines, len(strokes), with_lag):
+        notes = _notes(lagged, start)
+        lag = estimate(lagged[3], lag_spread[3], freedom, "s", floor=DELAY_ALLOWANCE_S, note=notes[3])
+        return _Found(lagged, lag_spread, notes, lag, None)
+    unseen = lagged[3] + float(stats.t.ppf(LEVEL, freedom)) * lag_spread[3]
+    note = "none that could be told from the delay; what there is, is part of the delay"
+    lag = Estimate(0.0, 0.0, min(max(1e-4, unseen), float(plain[2])), "s", note)
+    values, spread = jackknife(lambda parts: solve(parts, False), strokes)
+    return _Found(values, spread, _notes(values, start), lag, None)
+
+
+def _sprung(lines: _Lines, strokes: Sequence[Stroke], inertia: float, rigid: Sequence[Array]) -> _Found | None:
+    """Two masses with a spring, if they explain what the `rigid` joints leave, beyond where cogging disturbs."""
+    upper, ratio = lines.frequency >= elastic.LOWEST_HZ, ratio_of(strokes)
+    seen = _Lines(lines.frequency[upper], lines.deviation[upper], lines.period_s)
+    rigid_cost = min(_cost(seen, ratio[upper], values) for values in rigid)
+    if rigid_cost < UNEXPLAINED * np.count_nonzero(upper):
+        return None
+    joint = elastic.solve(lines.frequency, ratio, lines.deviation, lines.period_s, inertia)
+    error = elastic.response_of(joint, seen.frequency, seen.period_s) / ratio[upper] - 1.0
+    if float(np.sum(np.abs(error / seen.deviation) ** 2)) > SPRUNG_COST * rigid_cost:
+        return None
+
+    def solve(parts: Sequence[Stroke]) -> Array:
+        return np.array(elastic.solve_from(joint, lines.frequency, ratio_of(parts), lines.deviation, lines.period_s))
+
+    values, spread = jackknife(solve, strokes)
+    freedom, notes = len(strokes) - 1, elastic.notes(elastic.Elastic(*values), inertia, float(lines.frequency[-1]))
+    damping = f"its damping {notes.damping_ratio}" if notes.damping_ratio else ""
+    load_spread = float(np.hypot(spread[4] * values[0], spread[0] * values[4]))
+    resonance = Resonance(
+        estimate(
+            values[3], spread[3], freedom, "Hz", share=2.0 * INERTIA_ALLOWANCE, note=joined(notes.resonance_hz, damping)
+        ),
+        estimate(
+            values[4] * values[0], load_spread, freedom, "kg*m^2", share=3.0 * INERTIA_ALLOWANCE, note=notes.load_share
+        ),
+        elastic.Elastic(*values),
+    )
+    unseen = min(lines.period_s, float(values[2]))
+    lag = Estimate(0.0, 0.0, unseen, "s", "not told beside a resonance; what there is, is part of the delay")
+    return _Found(np.array([*values[:3], 0.0]), np.array([*spread[:3], 0.0]), notes[:3], lag, resonance)
+
+
+def _model(frequency: Array, values: Array, period_s: float) -> Complex:
+    """Way per period over torque of the rigid joint with (inertia, viscous, delay, lag)."""
+    rigid = Rigid(*(float(v) for v in values))
+    return response_of(rigid, frequency, period_s)
+
+
+def _solve(frequency: Array, ratio: Complex, deviation: Array, period: float, start: Array, lag: bool) -> Array:
+    """(inertia, viscous, delay, lag) that fit the ratio; relative misfit, weighted."""
+
+    def misfit(x: Array) -> Array:
+        values = np.array([np.exp(x[0]), x[1] * np.exp(start[0]), x[2] * 1e-3, x[3] * 1e-3 if lag else 0.0])
+        error = (_model(frequency, values, period) / ratio - 1.0) / deviation
+        return np.concatenate([error.real, error.imag])
+
+    best = None
+    for delay in (0.5, 2.0, 5.0):
+        first = np.array([start[0], 50.0, delay] + ([0.3] if lag else []))
+        bounds = [bound[: len(first)] for bound in _ranges(start)]
+        found = least_squares(misfit, first, bounds=bounds, loss="soft_l1", x_scale="jac")
+        best = found if best is None or found.cost < best.cost else best
+    assert best is not None
+    x = best.x
+    return np.array([np.exp(x[0]), x[1] * np.exp(start[0]), x[2] * 1e-3, x[3] * 1e-3 if lag else 0.0])
+
+
+def _ranges(start: Array) -> tuple[list[float], list[float]]:
+    """Bounds of log inertia, viscous slope over inertia's first idea in 1/s, delay and lag in ms."""
+    low = [start[0] - 3.0, -2000.0, 0.0, 0.0]
+    return low, [start[0] + 3.0, 1e5, 1e3 * LONGEST_DELAY_S, 1e3 * LONGEST_LAG_S]
+
+
+def _notes(values: Array, start: Array) -> tuple[str, ...]:
+    """What of (inertia, viscous, delay, lag) stands at the end of its range."""
+    inertia, viscous, delay_s, lag_s = values.tolist()
+    return at_ends([np.log(inertia), viscous / np.exp(start[0]), 1e3 * delay_s, 1e3 * lag_s], *_ranges(start))
+
+
+def _cost(lines: _Lines, ratio: Complex, values: Array) -> float:
+    """Misfit of the rigid joint: sum of squares, relative to the deviation of the strokes' mean."""
+    error = (_model(lines.frequency, values, lines.period_s) / ratio - 1.0) / lines.deviation
+    return float(np.sum(np.abs(error) ** 2))
+
+
+def _worse(costs: Sequence[float], lines: _Lines, strokes: int, with_lag: Array) -> bool:
+    """Whether the response without lag is significantly worse than with one (F test on one more parameter)."""
+    freedom = 2 * len(lines.frequency) - 4
+    gain = (costs[0] - costs[1]) / max(costs[1] / freedom, 1.0 / strokes)
+    return with_lag[3] > 1e-4 and float(stats.f.sf(gain, 1, freedom)) < LAG_SIGNIFICANCE
+
+
+def _delay(value_s: float, spread_s: float, freedom: int, note: str, lag: Estimate) -> Estimate:
+    """The delay; where a lag could not be told from it, it may be shorter by that."""
+    found = estimate(value_s, spread_s, freedom, "s", floor=DELAY_ALLOWANCE_S, note=note)
+    return found if lag.value > 0.0 else replace(found, low=found.low - lag.high)
+
+
+def _torque_noise(lines: _Lines, strokes: Sequence[Stroke], trace: Trace, values: Array) -> Estimate:
+    """Torque disturbance below `NOISE_HZ`, from what the motion does beyond the torque; by the scatter of strokes.
+
+    `lines` and `strokes` are all that were excited, coherent or not.
+    """
+    ratio = _model(lines.frequency, values, lines.period_s)
+    low = lines.frequency < NOISE_HZ
+    bandwidth_lines = NOISE_HZ * trace.settings["count"] * lines.period_s
+
+    def rms(parts: Sequence[Stroke]) -> Array:
+        errors = np.array([np.abs((s.velocity - ratio * s.torque) / ratio)[low] for s in parts])
+        return np.sqrt(np.atleast_1d(np.mean(2.0 * errors**2) * bandwidth_lines))
+
+    found, spread = jackknife(rms, strokes)
+    note = f"below {NOISE_HZ:g} Hz while sliding, cogging included"
+    return estimate(found[0], spread[0], len(strokes) - 1, "N*m", share=INERTIA_ALLOWANCE, note=note)

@@ -1,0 +1,179 @@
+"""Reads a foreign file into named columns of numbers: CSV, CSV.gz, Parquet, MAT v5, and the daemon's MCAP.
+
+The first step behind the file; `columns` names, `recording` checks and repairs. One reader for each format, chosen by
+the file's suffix from one table. Whatever stands in a file, reading it takes bounded memory: `bounds` says how much a
+recording may hold, every reader counts before or while it unpacks, and keeps the columns that are wanted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Container
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servod.common.errors import BadInput
+from servod.common.files import open_file, require_size
+from servod.lab.recordings import bounds
+from servod.lab.recordings.bounds import MOST_BYTES, require_cells
+from servod.lab.recordings.csv_text import first_line, read_csv, refuse_repeated
+from servod.lab.recordings.mat import BrokenMatError, vectors
+
+Array = NDArray[np.float64]
+#: Columns of the file at a path, those that are wanted with their content; what is to be told of it goes to the list.
+Reader = Callable[[Path, Container[str], list[str]], dict[str, Any]]
+
+#: Cells of text that are parsed at once: each is a Python object meanwhile.
+_CELLS_AT_ONCE = 65_536
+#: Rows of a Parquet file that are read before they are counted.
+_ROWS_AT_ONCE = 1_000_000
+_NS_PER_S = 1e9
+
+
+def read_columns(path: Path, wanted: Container[str]) -> tuple[dict[str, Any], list[str]]:
+    """Columns of the file by name, and what is to be told of the file in plain sentences.
+
+    A column is a float array, an arrow array of numbers or text, an arrow type in which no number stands, or None
+    where it is not `wanted`; `numbers` turns one into floats. Raises BadInput for a missing, empty, broken, unknown
+    or too large file.
+    """
+    if not path.is_file():
+        raise BadInput(str(path), "no such file" if not path.exists() else "no file", "a recording")
+    name = path.name.lower()
+    reader = next((reader for suffix, reader in READERS.items() if name.endswith(suffix)), None)
+    if reader is None:
+        raise BadInput(str(path), f"suffix {path.suffix!r}", "a recording: " + ", ".join(READERS))
+    notes: list[str] = []
+    try:
+        columns = reader(path, wanted, notes)
+    except OSError as error:
+        raise BadInput(str(path), error.strerror or str(error), "a readable recording") from None
+    if not columns:
+        raise BadInput(str(path), "no columns", "a recording with named columns")
+    return columns, notes
+
+
+def numbers(column: Any, path: Path, name: str) -> Array:
+    """A column as float64, NaN where a cell is empty. Raises BadInput naming the first cell that is no number."""
+    if isinstance(column, np.ndarray):
+        return column.astype(np.float64, copy=False)
+    import pyarrow as pa
+
+    kind = column if isinstance(column, pa.DataType) else column.type
+    try:
+        return _converted(column, path, name)
+    except (pa.ArrowException, ValueError, OverflowError):
+        raise BadInput(f"{path}: column {name}", f"values of type {kind}", "numbers") from None
+
+
+def _converted(column: Any, path: Path, name: str) -> Array:
+    """Raises ValueError for an arrow type alone."""
+    import pyarrow as pa
+
+    if isinstance(column, pa.DataType):
+        raise ValueError("no numbers stand in such a column")
+    if pa.types.is_boolean(column.type):
+        column = column.cast(pa.int8())
+    if _holds_numbers(column.type):
+        return np.asarray(column.cast(pa.float64()).to_numpy(zero_copy_only=False), dtype=np.float64)
+    return _parsed(column, path, name)
+
+
+def _holds_numbers(kind: Any) -> bool:
+    import pyarrow as pa
+
+    if pa.types.is_dictionary(kind):
+        kind = kind.value_type
+    tests = (pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal, pa.types.is_boolean)
+    return any(test(kind) for test in tests)
+
+
+def _parsed(column: Any, path: Path, name: str) -> Array:
+    """A column of text, or one that is empty all through."""
+    values = np.full(len(column), np.nan)
+    for start in range(0, len(column) if column.null_count < len(column) else 0, _CELLS_AT_ONCE):
+        for row, cell in enumerate(column.slice(start, _CELLS_AT_ONCE).to_pylist(), start):
+            text = "" if cell is None else str(cell).strip()
+            try:
+                values[row] = float(text) if text else np.nan
+            except ValueError:
+                raise BadInput(f"{path}: column {name}, row {row + 1}", repr(text)[:40], "a number") from None
+    return values
+
+
+def _read_csv(path: Path, wanted: Container[str], _notes: list[str]) -> dict[str, Any]:
+    return read_csv(path, wanted)
+
+
+def _read_parquet(path: Path, wanted: Container[str], _notes: list[str]) -> dict[str, Any]:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        with open_file(path) as stream:
+            file = pq.ParquetFile(stream)
+            names = list(file.schema_arrow.names)
+            refuse_repeated(names, path)
+            read = [name for name in names if name in wanted and _holds_numbers(file.schema_arrow.field(name).type)]
+            require_cells(path, 0, len(names))
+            table = _counted(path, file, read)
+            others = {name: file.schema_arrow.field(name).type if name in wanted else None for name in names}
+    except (pa.ArrowException, OSError, ValueError) as error:  # ValueError: a name that is no UTF-8
+        raise BadInput(str(path), first_line(error), "a Parquet file") from None
+    return others | {name: table.column(name) for name in read}
+
+
+def _counted(path: Path, file: Any, read: list[str]) -> Any:
+    """The table of these columns, batch by batch: what the file says of its own size is asked first, and not believed.
+
+    Not by what it says of single columns: Arrow ends the process where that is bent. Numbers that take more than eight
+    bytes, as decimals do, count for as many as they take.
+    """
+    import pyarrow as pa
+
+    kinds = [file.schema_arrow.field(name).type for name in read]
+    words = sum(max(1, -(-kind.bit_width // 64)) for kind in kinds)
+    require_cells(path, file.metadata.num_rows, words)
+    batches, rows = [], 0
+    for batch in file.iter_batches(_ROWS_AT_ONCE, columns=read):
+        rows += len(batch)
+        require_cells(path, rows, words)
+        batches.append(batch)
+    return pa.Table.from_batches(batches, pa.schema(list(zip(read, kinds, strict=True))))
+
+
+def _read_mat(path: Path, _wanted: Container[str], _notes: list[str]) -> dict[str, Any]:
+    with open_file(path) as stream:
+        require_size(path, stream, MOST_BYTES)
+        content = stream.read(MOST_BYTES)
+    try:
+        return dict(vectors(content, path))
+    except BrokenMatError as error:
+        raise BadInput(str(path), str(error), "MAT v5: save('file.mat', '-v7')") from None
+
+
+def _read_mcap(path: Path, wanted: Container[str], notes: list[str]) -> dict[str, Any]:
+    from servod.formats.recording.mcap_reader import TIME, read_recording
+
+    recording = read_recording(path, wanted, bounds.MOST_CELLS)
+    if recording.damage:
+        notes.append(recording.damage)
+    cells = np.frombuffer(recording.rows, "<f8").reshape(-1, len(recording.names))
+    columns: dict[str, Any] = dict.fromkeys(recording.left_out)
+    for at, (name, kind) in enumerate(zip(recording.names, recording.kinds, strict=True)):
+        columns[name] = (cells if kind == "d" else cells.view("<i8"))[:, at]
+    times_ns = columns[TIME]
+    columns["t_s"] = (times_ns - times_ns[:1]) / _NS_PER_S
+    return columns
+
+
+#: Reader for each suffix.
+READERS: dict[str, Reader] = {
+    ".csv": _read_csv,
+    ".csv.gz": _read_csv,
+    ".parquet": _read_parquet,
+    ".mat": _read_mat,
+    ".mcap": _read_mcap,
+}

@@ -1,0 +1,212 @@
+"""The page of a diagnosis and its pictures: plain sentences first, where before what, mathematics folded behind.
+
+Stands on the evidence of a diagnosis and on its document, whose numbers it shows; nothing is decided here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from servod.lab.diagnose.engine import Diagnosis, Evidence
+from servod.lab.diagnose.explain import explained
+from servod.lab.diagnose.judge.locate import bands
+from servod.lab.diagnose.judge.windows import WindowErrors
+from servod.lab.diagnose.sentences import MATHEMATICS, REMEDIES, certainty, next_experiments, remains, verdict_sentence
+from servod.lab.report.figure import Figure
+from servod.lab.report.figures import mismatch as figures
+from servod.lab.report.figures.signature import signature, table_figure
+from servod.lab.report.page import Page
+from servod.lab.report.pictures import write_pictures
+
+Document = dict[str, Any]
+
+#: Names of page and folder of pictures beside diagnosis.json.
+PAGE, PICTURES = "report.html", "pictures"
+
+
+class Report:
+    """The page in the making; every figure is written as PNG too."""
+
+    def __init__(self, folder: Path, title: str) -> None:
+        self.page, self._pictures = Page(title), folder / PICTURES
+        self._path = folder / PAGE
+
+    def figure(self, shown: Figure) -> None:
+        """Add a figure with its caption, and write its picture. Raises BadInput when that is not possible."""
+        self.page.figure(shown)
+        write_pictures(shown, self._pictures, ("png",))
+
+    def write(self) -> Path:
+        """Write the page. Raises BadInput when that is not possible."""
+        self.page.write(self._path)
+        return self._path
+
+
+def write_report(
+    folder: Path, diagnosis: Diagnosis, document: Document, windows: Sequence[WindowErrors], title: str = "the model"
+) -> Path:
+    """Write `report.html` and `pictures/*.png` into `folder`; `document` and `windows` are those of the diagnosis."""
+    report = Report(folder, f"Diagnosis: what {title} leaves out")
+    _answer(report.page, document)
+    if diagnosis.evidence is not None:
+        _where(report, diagnosis.evidence)
+        _what(report, diagnosis.evidence, document)
+        _fit(report, diagnosis.evidence, document)
+        _remains(report, diagnosis.evidence, document, windows)
+    _experiments(report.page, document)
+    _recordings(report.page, document)
+    _work(report.page, document)
+    return report.write()
+
+
+def _answer(page: Page, document: Document) -> None:
+    """Verdict, what was left out, how sure: everything that fits into a few sentences."""
+    page.lead(verdict_sentence(document))
+    page.points([f["statement"] for f in document["findings"]])
+    page.points([line for f in document["findings"] for line in certainty(f)])
+
+
+def _where(report: Report, evidence: Evidence) -> None:
+    report.page.heading("Where the model is off")
+    report.page.sentence(
+        "Before any physics is named: the model's own parameters were fitted to the recordings, and what it still "
+        "gets wrong is looked at, as a torque in every row, over everything that the axis did."
+    )
+    report.figure(figures.where(evidence.maps_before, evidence.predictor))
+    band = bands(evidence.predictor, evidence.choice.base.mismatch)
+    report.page.sentence(
+        f"By frequency: {100.0 * max(band['shares']):.0f} % of it lies between {band['from']:g} and {band['to']:g} Hz."
+    )
+
+
+def _what(report: Report, evidence: Evidence, document: Document) -> None:
+    terms = evidence.fit.hypothesis.terms
+    for number, finding in enumerate(document["findings"], 1):
+        report.page.heading(f"Finding {number}: {finding['effect'].replace('_', ' ')}")
+        report.page.sentence(finding["statement"])
+        places = [place for place in evidence.named if terms[place].effect == finding["effect"]]
+        for place in places:
+            report.figure(signature(evidence, finding["effect"], place))
+        _parameters(report.page, finding["parameters"])
+        report.page.points(certainty(finding))
+        known = explained(finding["effect"])
+        keys = [f"{key['key']}: {key['meaning']} ({key['range']})" for key in known["keys"]]
+        report.page.folded(
+            "The mathematics of this finding",
+            [f"Equation: {known['equation']}.", f"Source: {known['source']}.", "Keys in the axis model file:", *keys],
+        )
+    if evidence.unnamed is not None:
+        report.page.heading("What is left has no name")
+        report.figure(table_figure(evidence.unnamed, evidence.predictor))
+    _recalibrated(report.page, document)
+
+
+def _parameters(page: Page, parameters: Document) -> None:
+    rows = [
+        (name, f"{v['value']:.5g}", f"{v['interval'][0]:.4g} to {v['interval'][1]:.4g}", v["unit"])
+        for name, v in parameters.items()
+    ]
+    page.table(("parameter", "value", "95 % interval", "unit"), rows)
+
+
+def _recalibrated(page: Page, document: Document) -> None:
+    """Own parameters that were off by little, and effects that are there but small."""
+    if document["recalibrated"]:
+        page.heading("Parameters that were merely off")
+        rows = [
+            (name, f"{v['from']:.5g}", f"{v['to']:.5g}", f"{v['interval'][0]:.4g} to {v['interval'][1]:.4g}", v["unit"])
+            for name, v in document["recalibrated"].items()
+        ]
+        page.table(("parameter", "model", "fitted", "95 % interval", "unit"), rows)
+    if document["minor"]:
+        small = "; ".join(_small(name, size) for name, size in document["minor"].items())
+        page.sentence(f"Seen, but no finding: {small}. Every real axis has some.")
+
+
+def _small(name: str, size: Document) -> str:
+    """An effect that is no finding: how large, and what it is if it stands in the model all the same."""
+    torque = f"{100.0 * size['torque_over_coulomb']:.1f} % of dry friction"
+    if "why" not in size:
+        return f"{name.replace('_', ' ')} ({torque}, too small to be worth a name)"
+    values = ", ".join(f"{key} {told['value']:.3g} {told['unit']}" for key, told in size["parameters"].items())
+    return f"{name.replace('_', ' ')} ({torque}, {size['why']}; in the model with {values})"
+
+
+def _fit(report: Report, evidence: Evidence, document: Document) -> None:
+    fit, unit, held = document["fit"], document["units"], document["fit"]["held_out"]
+    report.page.heading("The fit before and after")
+    report.page.sentence(
+        f"On rows that the fit has not seen ({held['left_out']} was left out) the torque error went from "
+        f"{held['before']:.3g} to {held['after']:.3g} {fit['unit']}; the noise floor is {fit['noise_floor']:.3g} "
+        f"{fit['unit']}. {100.0 * fit['explainable_removed']:.0f} % of what could be explained is gone."
+    )
+    if held["not_judged_s"]:
+        report.page.sentence(
+            f"Errors leave out {held['not_judged_s']:.2g} s in and behind an external torque that came once: nothing "
+            "foretells it. The share that it carries is that of the fit itself."
+        )
+    rows = [
+        (f"{horizon} s", f"{w['before']:.4g}", f"{w['recalibrated']:.4g}", f"{w['after']:.4g}", w["unit"])
+        for horizon, w in fit["windows"].items()
+    ]
+    header = ("simulated freely for", "model as it came", "recalibrated only", "with what was found", "unit")
+    report.page.table(header, rows)
+    torque = {r["name"]: (r["mismatch_before"], r["mismatch_after"]) for r in document["recordings"] if r["taken"]}
+    panels = [figures.before_after(torque, unit["torque"], "torque error")]
+    for horizon, window in fit["windows"].items():
+        errors = {name: (w["before"], w["after"]) for name, w in window["recordings"].items()}
+        panels.append(figures.before_after(errors, unit["position"], f"position after {horizon} s", named=False))
+    report.figure(figures.bars(panels, _left_out(evidence)))
+    report.figure(figures.over_time(evidence.predictor, evidence.before.mismatch, evidence.after.mismatch))
+
+
+def _left_out(evidence: Evidence) -> str | None:
+    """What was left out of the fits in turn; None where what has no name was fitted to everything."""
+    return evidence.shared.left_out if evidence.unnamed is None else None
+
+
+def _remains(report: Report, evidence: Evidence, document: Document, windows: Sequence[WindowErrors]) -> None:
+    report.page.heading("What remains")
+    report.page.sentence(remains(document))
+    report.figure(figures.map_grid(evidence.maps_before, evidence.maps_after, evidence.predictor))
+    report.figure(figures.spectrum(evidence.predictor, evidence.before.mismatch, evidence.after.mismatch))
+    if windows:
+        report.figure(figures.window_course(evidence.predictor, windows, _left_out(evidence)))
+
+
+def _experiments(page: Page, document: Document) -> None:
+    lines = next_experiments(document)
+    if lines:
+        page.heading("Which experiment next")
+        page.points(lines)
+
+
+def _recordings(page: Page, document: Document) -> None:
+    """What was taken in, repaired and refused."""
+    page.heading("The recordings")
+    force, length = document["units"]["torque"], document["units"]["position"]
+    rows = [
+        (
+            r["name"], f"{r['duration_s']:.2f}", f"{1.0 / r['period_s']:.0f}", f"{r['rows']}",
+            f"{r['position_noise']:.2g}", f"{r['noise_floor']:.2g}",
+        )
+        for r in document["recordings"]
+        if r["taken"]
+    ]  # fmt: skip
+    if rows:
+        header = ("recording", "length / s", "rate / Hz", "rows compared", f"encoder noise / {length}")
+        page.table((*header, f"noise floor / {force}"), rows)
+    repaired = [f"{r['name']}: {note}." for r in document["recordings"] if r["taken"] for note in r["notes"]]
+    refused = [f"{r['name']} was not used: {r['reason']}." for r in document["recordings"] if not r["taken"]]
+    page.points([*refused, *repaired] or ["Nothing had to be repaired or refused."])
+    if refused:
+        page.points(sorted({REMEDIES[word] for word in REMEDIES for line in refused if word in line}))
+
+
+def _work(page: Page, document: Document) -> None:
+    """How it was found, folded."""
+    page.folded("How it was found", MATHEMATICS)
+    spent = [f"{stage}: {seconds:.1f} s" for stage, seconds in document["seconds"].items()]
+    page.folded("Time by stage", spent)

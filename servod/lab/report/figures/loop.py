@@ -1,0 +1,155 @@
+"""Figures of the linear loop: the axis before and after compensation (Fig. 4), impulse responses w -> xi (Fig. 6).
+
+Stands on the stored design of a gain set and the linearised loop of verification; no solver.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from servod.common.errors import BadInput
+from servod.formats.gains.design import Design, RegionProof
+from servod.formats.gains.gain_set import GainSet
+from servod.lab.report.figure import Axis, Colour, Curve, Figure, Panel, Scale, Style, curve
+from servod.lab.report.figures.sets import local_law
+from servod.lab.report.responses import Complex, Loop, after, before, frequency_response, rigid, vertex_impulse
+
+#: Velocities of both halves of Fig. 4 [rad/s]: creeping (and at rest), and where trajectory (19) is fast.
+LOW_VELOCITIES, HIGH_VELOCITIES = (0.0, 0.001), (0.05, 0.2)
+_POINTS = 400
+_ANCHOR_HZ, _ANCHOR_DEGREES = 100.0, -220.0
+#: Impulse responses are drawn until the slowest has come down to this share of its peak, at most this long.
+_FADED, _LONGEST_S = 0.02, 1.0
+
+
+def design_of(gains: GainSet) -> Design:
+    """The design in the set. Raises BadInput when it has none."""
+    if gains.design is None:
+        raise BadInput(f"gain set {gains.name}: design", "nothing", "a design, as `servoctl synthesize` writes it")
+    return gains.design
+
+
+def bode(
+    gains: GainSet,
+    low: tuple[float, ...] = LOW_VELOCITIES,
+    high: tuple[float, ...] = HIGH_VELOCITIES,
+    name: str = "bode",
+) -> Figure:
+    """Position over torque command before and after compensation, very low velocities and higher ones (Fig. 4).
+
+    Raises BadInput for a set without a design, or for another law than the local one.
+    """
+    design, law = design_of(gains), local_law(gains)
+    frequencies = np.geomspace(0.1, 0.45 / design.period_s, _POINTS)
+
+    def drawn(label: str, loop: Loop, colour: Colour, style: Style) -> tuple[Curve, Curve]:
+        return curve_pair(label, frequency_response(*loop, design.period_s, frequencies), frequencies, colour, style)
+
+    columns = []
+    for velocities in (low, high):
+        ideal = rigid(design, frequencies)
+        pairs = [curve_pair("rigid joint without friction", ideal, frequencies, Colour.ORANGE, Style.DOTTED)]
+        for v, style in zip(velocities, (Style.LINE, Style.DASHED), strict=False):
+            pairs.append(drawn("before", before(design, v), Colour.GREY, style))
+            pairs.append(drawn("after (9)", after(design, law, v, False), Colour.BLACK, style))
+            if law.disturbance_observer is not None:
+                observed = after(design, law, v, True)
+                pairs.append(drawn("after, with the output observer", observed, Colour.BLUE, style))
+        columns.append(pairs)
+    return _bode_figure(name, columns, (low, high))
+
+
+def _bode_figure(
+    name: str, columns: list[list[tuple[Curve, Curve]]], velocities: tuple[tuple[float, ...], ...]
+) -> Figure:
+    """Magnitudes above phases, a column for each range of velocities."""
+    x = Axis("frequency in Hz", Scale.LOG)
+    labels = (Axis("position/torque in rad/(N·m)", Scale.LOG), Axis("phase in degrees"))
+    titles = [
+        f"{kind}: " + ", ".join(f"{v:g}" for v in speeds) + " rad/s (solid, dashed)"
+        for kind, speeds in zip(("very low", "higher"), velocities, strict=True)
+    ]
+    panels = [
+        Panel(x, label, tuple(pair[part] for pair in pairs), title if part == 0 else "")
+        for part, label in enumerate(labels)
+        for pairs, title in zip(columns, titles, strict=True)
+    ]
+    caption = (
+        "Sampled joint with its delay, from torque command to position. Compensation with the measured velocity, "
+        "feedback and l_i left out."
+    )
+    return Figure(name, "Frequency response before and after compensation", tuple(panels), 2, caption)
+
+
+def curve_pair(
+    label: str, response: Complex, frequencies: np.ndarray, colour: Colour, style: Style
+) -> tuple[Curve, Curve]:
+    """Magnitude and phase in degrees, unwrapped, so that all are near each other where only the inertia counts."""
+    phase = np.degrees(np.unwrap(np.angle(response)))
+    middle = int(np.searchsorted(frequencies, _ANCHOR_HZ))
+    phase -= 360.0 * np.round((phase[middle] - _ANCHOR_DEGREES) / 360.0)
+    return (
+        curve(label, frequencies, np.abs(response), colour, style),
+        curve(label, frequencies, phase, colour, style),
+    )
+
+
+#: Colour and legend of a vertex by how its name begins.
+_KINDS = {
+    "sliding falling": ("sliding, friction falls with speed", Colour.ORANGE),
+    "sliding rising": ("sliding, friction rises with speed", Colour.BLUE),
+    "sticking": ("sticking on the bristle", Colour.GREEN),
+}
+
+
+def impulse_responses(gains: GainSet, name: str = "impulse_responses") -> Figure:
+    """w -> xi = [alpha*x, beta*u] at every vertex of both regions under their feedback (Fig. 6), scaled units.
+
+    Raises BadInput for a set without a design.
+    """
+    design = design_of(gains)
+    if not design.regions:
+        raise BadInput(f"gain set {gains.name}: design.regions", "none", "the proofs of both regions")
+    columns = [_impulses(region, design.period_s) for region in design.regions]
+    panels = [
+        Panel(
+            Axis("time in s"),
+            Axis(label),
+            tuple(curves[part] for curves in drawn),
+            _region_title(region) if part == 0 else "",
+        )
+        for part, label in enumerate(("α·x, scaled", "β·u, scaled"))
+        for region, drawn in zip(design.regions, columns, strict=True)
+    ]
+    caption = "A torque pulse of one cycle at the joint. " + " ".join(
+        _norms(r, design.period_s) for r in design.regions
+    )
+    return Figure(name, "Impulse responses w → ξ at every vertex", tuple(panels), 2, caption)
+
+
+def _region_title(region: RegionProof) -> str:
+    symbol = {"low": "Ω_L", "high": "Ω_H"}.get(region.name, region.name)
+    return f"{symbol}: {region.speed_from_rad_s:g} to {region.speed_to_rad_s:g} rad/s, {len(region.vertices)} vertices"
+
+
+def _impulses(region: RegionProof, period_s: float) -> list[tuple[Curve, Curve]]:
+    """Both outputs of every vertex, cut where all have faded."""
+    responses = [vertex_impulse(region, vertex, round(_LONGEST_S / period_s)) for vertex in region.vertices]
+    alive = [np.flatnonzero(np.abs(r[:, 0]) > _FADED * np.abs(r[:, 0]).max())[-1] for r in responses]
+    end = min(len(responses[0]), 1 + int(max(alive)))
+    t = np.arange(end) * period_s
+    drawn = []
+    for vertex, response in zip(region.vertices, responses, strict=True):
+        label, colour = next(k for start, k in _KINDS.items() if vertex.name.startswith(start))
+        x, u = (curve(label, t, response[:end, i], colour, width=1.0, detail=vertex.name) for i in (0, 1))
+        drawn.append((x, u))
+    return drawn
+
+
+def _norms(region: RegionProof, period_s: float) -> str:
+    """The largest H2 norm among the vertices where it counts, beside the proven bound."""
+    counted = [v for v in region.vertices if v.output is not None]
+    samples = round(_LONGEST_S / period_s)
+    largest = max(float(np.sqrt(np.sum(vertex_impulse(region, v, samples) ** 2))) for v in counted)
+    bound = max(float(np.sqrt(np.trace(np.array(v.output)))) for v in counted)
+    return f"Region {region.name}: norm of the worst response {largest:.3g}, proven bound {bound:.3g}."

@@ -1,0 +1,114 @@
+"""Draws a figure with plotly, for the page.
+
+Between the description of a figure and the page; `pictures` draws the same with matplotlib.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import plotly.graph_objects as go
+from plotly.subplots import make_subplots
+
+from servod.lab.report.curves import thin
+from servod.lab.report.figure import Array, Axis, Curve, Figure, Panel, Scale, Style
+
+_DASHES = {Style.LINE: "solid", Style.DASHED: "dash", Style.DOTTED: "dot", Style.POINTS: "solid"}
+_ROW_PX, _GAP_PX = 270, 85
+#: Room above the panels for title and legend.
+HEAD_PX = 110
+_FOOT_PX = 50
+
+
+def plotly_figure(figure: Figure) -> go.Figure:
+    """The figure as plotly draws it: panels in a grid, one legend above all of them."""
+    height = HEAD_PX + _FOOT_PX + round(_ROW_PX * figure.row_height) * figure.rows + _GAP_PX * (figure.rows - 1)
+    drawn = make_subplots(
+        rows=figure.rows,
+        cols=figure.columns,
+        subplot_titles=[panel.title for panel in figure.panels],
+        vertical_spacing=_GAP_PX / (height - HEAD_PX - _FOOT_PX) if figure.rows > 1 else 0.0,
+        horizontal_spacing=0.22 / figure.columns,
+    )
+    named: set[str] = set()
+    for index, panel in enumerate(figure.panels):
+        _draw(drawn, panel, 1 + index // figure.columns, 1 + index % figure.columns, named)
+    drawn.update_layout(
+        title={"text": figure.title, "y": 1.0, "yref": "container", "yanchor": "top", "pad": {"t": 12}},
+        height=height,
+        legend={"orientation": "h", "x": 0.0, "y": 1.0, "yref": "container", "yanchor": "top", "xanchor": "left"},
+    )
+    drawn.update_layout(legend={"y": 1.0 - 38.0 / height})
+    return drawn
+
+
+def _draw(drawn: go.Figure, panel: Panel, row: int, column: int, named: set[str]) -> None:
+    for curve in panel.curves:
+        if curve.bounds is not None and curve.style is not Style.POINTS:
+            drawn.add_trace(_band(curve, *curve.bounds), row=row, col=column)
+        trace = _bars if curve.style is Style.BARS else _trace
+        drawn.add_trace(trace(curve, bool(curve.label) and curve.label not in named), row=row, col=column)
+        named.add(curve.label)
+    drawn.update_xaxes(**_axis(panel.x), row=row, col=column)
+    drawn.update_yaxes(**_axis(panel.y), row=row, col=column)
+
+
+def _axis(axis: Axis) -> dict[str, object]:
+    settings: dict[str, object] = {"title": {"text": axis.label, "standoff": 6}, "type": axis.scale.value}
+    if axis.scale is Scale.LOG:
+        settings |= {"exponentformat": "power", "dtick": 1}
+    if axis.names:
+        settings |= {"tickvals": list(range(len(axis.names))), "ticktext": list(axis.names), "automargin": True}
+    if axis.span is not None:
+        settings["range"] = [float(np.log10(v)) if axis.scale is Scale.LOG else v for v in axis.span]
+    return settings
+
+
+def _trace(curve: Curve, first: bool) -> go.Scatter:
+    """One curve, thinned for the eye; points are drawn as they are, with their intervals as bars."""
+    points = curve.style is Style.POINTS
+    x, y = (curve.x, curve.y) if points else thin(curve.x, curve.y)
+    bars = None
+    if points and curve.bounds is not None:
+        low, high = curve.bounds
+        bars = {"type": "data", "symmetric": False, "array": high - curve.y, "arrayminus": curve.y - low}
+    return go.Scatter(
+        x=x.astype(np.float32),
+        y=y.astype(np.float32),
+        name=curve.label or curve.detail,
+        legendgroup=curve.label,
+        showlegend=first,
+        mode="markers" if points else "lines",
+        line={"color": curve.colour.value, "width": curve.width, "dash": _DASHES[curve.style]},
+        marker={"color": curve.colour.value, "size": 6},
+        error_y=bars,
+        hovertext=curve.detail or None,
+    )
+
+
+def _bars(curve: Curve, first: bool) -> go.Bar:
+    """Lying bars."""
+    return go.Bar(
+        x=curve.x.astype(np.float32),
+        y=curve.y.astype(np.float32),
+        orientation="h",
+        width=curve.width,
+        name=curve.label or curve.detail,
+        legendgroup=curve.label,
+        showlegend=first,
+        marker={"color": curve.colour.value},
+    )
+
+
+def _band(curve: Curve, low: Array, high: Array) -> go.Scatter:
+    """The area between both bounds, in a pale shade of the curve."""
+    red, green, blue = (int(curve.colour.value[i : i + 2], 16) for i in (1, 3, 5))
+    return go.Scatter(
+        x=np.concatenate([curve.x, curve.x[::-1]]),
+        y=np.concatenate([high, low[::-1]]),
+        fill="toself",
+        fillcolor=f"rgba({red},{green},{blue},0.18)",
+        line={"width": 0},
+        hoverinfo="skip",
+        legendgroup=curve.label,
+        showlegend=False,
+    )

@@ -1,0 +1,1 @@
+"""The axis model in time: replay of recordings, closed loop, open loop."""

@@ -1,0 +1,143 @@
+"""Replays a recording: the model under the recorded torque, restarted from the recorded motion as often as wished.
+
+Used by `servoctl replay`, identification and diagnosis (numpy, scipy, numba where installed). The start state of a
+window comes from the recording alone: position and velocity from a local cubic over the recorded position, the rest
+(bristle, load, actuator) from running the model's own hidden part along the recorded motion.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servod.formats.model.axis_model import AxisModel
+from servod.kernels.physics.compiled import Kernel, available, compiled
+from servod.kernels.physics.layout import P_DELAY_S, P_START_C, S_FIRST_S
+from servod.kernels.physics.plant import INNER_STEP_S, rest_state
+from servod.lab.simulate import open_loop
+from servod.lab.simulate.motion import smoothed_motion
+from servod.lab.simulate.start import FirstRow, Start, first_row
+
+Array = NDArray[np.float64]
+
+#: A gap longer than this and than ten samples restarts the simulation: nobody knows the torque in it.
+RESTART_GAP_S = 0.02
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What a replay needs of a recording: rows of time, torque command, position, temperature (NaN = not recorded).
+
+    SI units of the axis (rad or m). Time must not run backwards; torque and position must be finite.
+    """
+
+    t_s: Array
+    torque: Array
+    position: Array
+    temperature_c: Array
+
+    @cached_property
+    def motion(self) -> Array:
+        """Rows of position, velocity, acceleration, error of velocity (servod.lab.simulate.motion) at the rows'
+        times."""
+        return smoothed_motion(self.t_s, self.position)
+
+    @cached_property
+    def period_s(self) -> float:
+        """Median time between rows."""
+        return float(np.median(np.diff(self.t_s)))
+
+
+@dataclass(frozen=True, slots=True)
+class Replay:
+    """What the model did: one value for each recorded row.
+
+    `starts` are the rows where the motion restarted from the recording, `at_rest` whether it began at rest.
+    """
+
+    position: Array
+    velocity: Array
+    load_position: Array
+    starts: NDArray[np.int64]
+    at_rest: bool
+    error: Array
+
+    def over(self, rows: NDArray[np.bool_]) -> Replay:
+        """The same replay with its error over some rows only."""
+        return replace(self, error=self.error[rows])
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of simulated minus recorded position, rad or m."""
+        return float(np.sqrt(np.mean(self.error**2)))
+
+    @property
+    def max(self) -> float:
+        """Largest distance between simulated and recorded position, rad or m."""
+        return float(np.max(np.abs(self.error)))
+
+
+def behind_gaps(t_s: Array) -> NDArray[np.int64]:
+    """Rows that follow a gap longer than RESTART_GAP_S and than ten samples: nobody knows the command in it."""
+    steps = np.diff(t_s)
+    if len(steps) == 0:
+        return np.zeros(0, dtype=np.int64)
+    return np.flatnonzero(steps > max(RESTART_GAP_S, 10.0 * float(np.median(steps)))) + 1
+
+
+def window_starts(t_s: Array, horizon_s: float | None) -> NDArray[np.int64]:
+    """First rows of the windows: every `horizon_s` and behind every long gap; None = the first row only, whatever."""
+    if horizon_s is None:
+        return np.zeros(1, dtype=np.int64)
+    count = math.floor((t_s[-1] - t_s[0]) / horizon_s + 1e-9)
+    edges = np.searchsorted(t_s, t_s[0] + horizon_s * np.arange(1, count + 1) - 1e-6)
+    rows = {0, *edges.tolist(), *behind_gaps(t_s).tolist()}
+    return np.array(sorted(row for row in rows if row < len(t_s)), dtype=np.int64)
+
+
+def _kernel(function: Kernel) -> Kernel:
+    return compiled(function) if available() else function
+
+
+def _hidden_motion(parameters: Array, drive: Drive, first: FirstRow, state: Array, starts: NDArray[np.int64]) -> Array:
+    """State at the rows `starts`: position, velocity, bristle, load position, load velocity, actuator torque."""
+    motion = drive.motion[:, :3].copy()
+    motion[0] = first.motion
+    _kernel(open_loop.recorded_motion)(parameters, motion)
+    hidden = np.zeros((len(drive.t_s), 4))
+    step_s = min(4.0 * INNER_STEP_S, drive.period_s)
+    rows = drive.t_s, motion, drive.torque, first.command_before, drive.temperature_c
+    _kernel(open_loop.follow)(parameters, state, *rows, hidden, step_s)
+    return np.column_stack([motion[starts, :2], hidden[starts]])
+
+
+def replay(
+    model: AxisModel | Sequence[float],
+    drive: Drive,
+    horizon_s: float | None,
+    *,
+    start: Start = Start.AUTO,
+    inner_step_s: float = INNER_STEP_S,
+) -> Replay:
+    """Simulate `model` (or its packed parameters) under the recorded torque, restarting every `horizon_s` seconds.
+
+    `horizon_s` None is one free run from the first row, gaps and all. `start` says how the first row is understood; an
+    axis that was just set off counts as at rest in a free run only (`first_row`). Without numba
+    the same source runs in pure Python.
+    """
+    parameters = np.array(model.pack() if isinstance(model, AxisModel) else model, dtype=np.float64)
+    starts = window_starts(drive.t_s, horizon_s)
+    rows = drive.t_s, drive.torque, drive.position, drive.motion
+    first = first_row(start, *rows, float(parameters[P_DELAY_S]), free=horizon_s is None)
+    state = np.array(rest_state(0.0, inner_step_s, parameters[P_START_C]))
+    states = _hidden_motion(parameters, drive, first, state.copy(), starts)
+    state[S_FIRST_S] = drive.t_s[0]
+    out = np.zeros((len(drive.t_s), 3))
+    held = drive.t_s, drive.torque, first.command_before, drive.temperature_c
+    _kernel(open_loop.run)(parameters, state, *held, starts, states, out, inner_step_s)
+    return Replay(out[:, 0], out[:, 1], out[:, 2], starts, first.at_rest, out[:, 0] - drive.position)

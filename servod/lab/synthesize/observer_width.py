@@ -1,0 +1,164 @@
+"""How fast the output observer may be: the widest bandwidth that the full sampled loop stands, in either region.
+
+Stands on the sweep that verification uses, between the feedback that the LMIs gave and the gain set. A search judges
+all corners at few speeds, and at many speeds those corners that were the worst somewhere; verification judges all.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+from servod.formats.gains.design import Design
+from servod.formats.gains.parameters import LocalParameters
+from servod.kernels.laws import LAWS
+from servod.lab.verify.checks import CORNER_DISK, CORNER_SPEEDS, DISK_LIMIT, speeds_of
+from servod.lab.verify.closed_loop import Deviation, corners
+from servod.lab.verify.effect_checks import late_effects
+from servod.lab.verify.margins import Judgement, Sweep, arrival_of
+from servod.lab.verify.sampled import timing_of
+from servod.lab.verify.steady_friction import SteadyFriction
+
+#: Bandwidths, best first: the first is taken with which every corner of the intervals stands with CORNER_WANTED, and
+#: the axis as modelled with the wanted disk margin, or else with the one of the certificate.
+OBSERVERS_RAD_S = (80.0, 60.0, 45.0, 34.0, 25.0, 18.0, 12.0, 7.0)
+ENOUGH_RAD_S = 20.0  # from this bandwidth on no other choice of filter, poles and weights is tried
+DISK_WANTED, CORNER_WANTED = 0.15, 1.25 * CORNER_DISK
+FEW_SPEEDS = 12  # per direction
+STABLE = 0.9999  # largest pole: the certificate looks between the corners and between these speeds as well
+#: Bandwidth in Omega_L over that in Omega_H, best first: on its bristle a joint rests the sooner the more it is ...
+LOW_FACTORS = (10.0, 8.0, 6.0, 4.5, 3.0)
+#: ... up to this rate, bandwidth*k_x/c0, with which the error on the bristle goes: rest within a quarter of a second.
+REST_RATE_PER_S = 20.0
+#: ... and as far as one step of the encoder, which it takes for an acceleration, moves the torque by this share of the
+#: largest friction: with coarse encoders a fast observer makes slow ramps stick and slip.
+COUNT_SHARE = 0.05
+WORTH = 1.2  # a bandwidth less than this times the least one is not worth a judgement
+
+
+@dataclass
+class Search:
+    """Laws of one design that are tried one after the other, each first at the speeds where others failed."""
+
+    design: Design
+    friction: SteadyFriction
+    refused_at: list[float] = field(default_factory=list)
+
+    def stands(self, law: LocalParameters, disk_wanted: float, below_rad_s: float = math.inf) -> bool:
+        """Whether `law` is stable at every corner with CORNER_WANTED, and has `disk_wanted` as modelled.
+
+        And stable at the ends of what the model's own effects make of the joint; at speeds below `below_rad_s`, where
+        that is all that has changed. Corners with the shorter delay count too: with two cycles they can be the worst.
+        """
+        cases: Sequence[Deviation] = corners(self.design.uncertainty)
+        counts = FEW_SPEEDS, CORNER_SPEEDS
+        few, many = ([v for v in speeds_of(self.design, count) if v < below_rad_s] for count in counts)
+        hard = sorted(v for v in self.refused_at if v < below_rad_s)
+        if hard and self._judged(law, hard, cases, disk_wanted) is None:
+            return False
+        found = self._judged(law, few, cases, disk_wanted)
+        if found is None or self._judged(law, many, found.hardest, disk_wanted) is None:
+            return False
+        own = late_effects(self.design)
+        return not own or self._sweep(law, many).worst(own).radius < STABLE
+
+    def stands_everywhere(self, law: LocalParameters, disk_wanted: float) -> bool:
+        """Whether `law` stands at all corners and all the speeds of the certificate, also where others did not fail."""
+        many = speeds_of(self.design, CORNER_SPEEDS)
+        return self._judged(law, many, corners(self.design.uncertainty), disk_wanted) is not None
+
+    def _sweep(self, law: LocalParameters, speeds: list[float]) -> Sweep:
+        return Sweep(LAWS["local"], law.pack(), self.friction, timing_of(self.design), speeds, arrival_of(law))
+
+    def _judged(
+        self, law: LocalParameters, speeds: list[float], cases: Sequence[Deviation], disk_wanted: float
+    ) -> Judgement | None:
+        """How `cases` stand under `law` at `speeds`; None where they do not, and the speed is kept."""
+        sweep = self._sweep(law, speeds)
+        margin, at = sweep.disk_margin()
+        found = None if margin < disk_wanted else sweep.judge(cases)
+        if found is not None and found.disk_margin >= CORNER_WANTED:
+            if found.radius < STABLE:
+                return found
+            at = found.radius_at_rad_s
+        elif found is not None:
+            at = found.disk_at_rad_s
+        self._refuse(abs(at))
+        return None
+
+    def _refuse(self, speed_rad_s: float) -> None:
+        if speed_rad_s > 0.0 and speed_rad_s not in self.refused_at:
+            self.refused_at.append(speed_rad_s)
+
+
+def with_observer(
+    law: LocalParameters, high_rad_s: float, low_rad_s: float | None, moving_rad_s: float | None = None
+) -> LocalParameters:
+    """`law` with other bandwidths of the observer that it has: in Omega_H, and in Omega_L at rest and moving.
+
+    None: the same as in Omega_H, which is written down where it is not the one at rest.
+    """
+    assert law.disturbance_observer is not None
+    bandwidths = {
+        "bandwidth_rad_s": high_rad_s,
+        "low_bandwidth_rad_s": low_rad_s,
+        "low_moving_bandwidth_rad_s": moving_rad_s or (high_rad_s if low_rad_s else None),
+    }
+    return law.model_copy(update={"disturbance_observer": law.disturbance_observer.model_copy(update=bandwidths)})
+
+
+def with_widest_observer(
+    design: Design, friction: SteadyFriction, law: LocalParameters, beyond_rad_s: float = 0.0
+) -> LocalParameters:
+    """`law` with the widest observer beyond `beyond_rad_s` that it stands; without one where it stands none.
+
+    A slow one gives way to one that is enough but has no bandwidth of its own for coming to rest: where the feedback
+    of the regions differs much, the blend of both adds to it what no faster observer stands.
+    """
+    search = Search(design, friction)
+    found = widest(search, law, beyond_rad_s, LOW_FACTORS[-1])
+    if bandwidth_of(found) >= ENOUGH_RAD_S:
+        return found
+    even = widest(search, law, max(beyond_rad_s, ENOUGH_RAD_S), None)
+    return even if bandwidth_of(even) else found
+
+
+def widest(search: Search, law: LocalParameters, beyond_rad_s: float, low_factor: float | None) -> LocalParameters:
+    """The same with one relation of the bandwidths; `low_factor`: in Omega_L over that in Omega_H, None: no own."""
+    for disk in (DISK_WANTED, DISK_LIMIT):
+        for bandwidth in (g for g in OBSERVERS_RAD_S if g > beyond_rad_s):
+            slow = with_observer(law, bandwidth, low_factor and low_factor * bandwidth)
+            if search.stands(slow, disk):
+                fast = with_fastest_rest(search, slow, disk) if low_factor else slow
+                if search.stands_everywhere(fast, disk):
+                    return fast
+    return law.model_copy(update={"disturbance_observer": None})
+
+
+def bandwidth_of(law: LocalParameters) -> float:
+    """Bandwidth of the observer in Omega_H [rad/s]; 0 without one."""
+    return law.disturbance_observer.bandwidth_rad_s if law.disturbance_observer else 0.0
+
+
+def with_fastest_rest(search: Search, law: LocalParameters, disk_wanted: float) -> LocalParameters:
+    """`law`, which stands, with the widest bandwidth in Omega_L that also stands."""
+    assert law.disturbance_observer is not None
+    high = law.disturbance_observer.bandwidth_rad_s
+    for low in low_bandwidths(search.design, search.friction, law):
+        faster = with_observer(law, high, low)
+        if search.stands(faster, disk_wanted, law.regions.overlap_to_rad_s):
+            return faster
+    return law
+
+
+def low_bandwidths(design: Design, friction: SteadyFriction, law: LocalParameters) -> Iterable[float]:
+    """Bandwidths in Omega_L that are worth a try beyond the least one, best first [rad/s]."""
+    assert law.disturbance_observer is not None
+    high = law.disturbance_observer.bandwidth_rad_s
+    enough = REST_RATE_PER_S * friction.stiffness / (law.input_scale_nm * law.regions.low.k_x_per_rad)
+    if design.counts_per_turn:
+        step_nm_s = friction.inertia * 2.0 * math.pi / design.counts_per_turn / design.period_s
+        enough = min(enough, COUNT_SHARE * friction.largest(design.speed_max_rad_s) / step_nm_s)
+    wanted = sorted({min(factor * high, enough) for factor in LOW_FACTORS[:-1]}, reverse=True)
+    return [low for low in wanted if low > WORTH * LOW_FACTORS[-1] * high]

@@ -1,0 +1,18 @@
+"""Fair tuning of all laws: one optimiser, one budget, one set of plants, one limit on roughness, two classes.
+
+plan.py       class, budget and limits of a tuning, and its result
+laws.py       what is tuned of each law, and the axis it is for
+symmetric.py  the one friction curve that the LuGre observer can hold
+trial.py      what a gain set costs on the plants of a tuning
+search.py     the bounded optimiser
+tuning.py     one law in one class
+rivals.py     all of them, over worker processes
+"""
+
+from __future__ import annotations
+
+from servod.lab.tune.plan import Feedback, Tuned, TunePlan
+from servod.lab.tune.rivals import rivals
+from servod.lab.tune.tuning import tune
+
+__all__ = ["Feedback", "TunePlan", "Tuned", "rivals", "tune"]

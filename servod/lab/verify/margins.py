@@ -1,0 +1,233 @@
+"""What the full sampled loop tolerates: worst poles over points and intervals, disk margin, delay, friction, inertia.
+
+Stands on `closed_loop`. A sweep linearises the law once per velocity and judges many joints under it at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servod.formats.gains.parameters import LocalParameters
+from servod.kernels.laws import Law
+from servod.lab.verify.closed_loop import (
+    Bristle,
+    Deviation,
+    joint_points,
+    loops_around,
+    sampled_points,
+    spectral_radius,
+)
+from servod.lab.verify.law_slopes import LawSlopes, arriving_slopes, law_slopes
+from servod.lab.verify.sampled import Array, Timing
+from servod.lab.verify.steady_friction import SteadyFriction
+
+FREQUENCIES = 200
+ON_CIRCLE = np.exp(1j * np.geomspace(1e-3, np.pi, FREQUENCIES))
+SEARCH_STEPS = 14
+NOMINAL = (Deviation(),)
+BEYOND_HOLD = 4.0  # widths of holding, at which a joint has not arrived yet
+LEAST_ERROR_RAD = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Worst:
+    """The worst pole of a sweep, and where it is; `coupled_radius` leaves out what goes by itself, as z_hat's leak."""
+
+    radius: float
+    coupled_radius: float
+    velocity_rad_s: float
+    bristle: str
+    case: int
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """Largest pole and least disk margin of a sweep; `hardest` are the cases worst in either at some velocity."""
+
+    radius: float
+    radius_at_rad_s: float
+    disk_margin: float
+    disk_at_rad_s: float
+    hardest: list[Deviation]
+
+
+@lru_cache(maxsize=1024)
+def joints_at(
+    friction: SteadyFriction, velocity: float, bristle: Bristle, cases: tuple[Deviation, ...], timing: Timing
+) -> tuple[Array, Array, int]:
+    """`sampled_points` in each case: the same for every law, and most of the work of a sweep."""
+    return sampled_points(joint_points(friction, velocity, bristle, cases), timing)
+
+
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """How a joint arrives where its law is another one then: this far from its resting reference, slower than this."""
+
+    error_rad: float
+    below_rad_s: float
+
+
+def arrival_of(law: LocalParameters) -> Arrival | None:
+    """Arrival under a law with an observer of its own for it; None where a joint arrives as it moves."""
+    observer = law.disturbance_observer
+    if observer is None or observer.low_bandwidth_rad_s in (None, observer.bandwidth_rad_s):
+        return None
+    beyond = BEYOND_HOLD * max(law.hold_within_rad, law.rest_within_rad or 0.0, LEAST_ERROR_RAD)
+    return Arrival(beyond, law.regions.overlap_to_rad_s)
+
+
+class Sweep:
+    """One law on one axis, to be judged at many velocities; `speeds` ascend, both directions are taken."""
+
+    def __init__(
+        self,
+        law: Law,
+        gains: tuple[float, ...],
+        friction: SteadyFriction,
+        timing: Timing,
+        speeds: Sequence[float],
+        arrival: Arrival | None = None,
+    ) -> None:
+        self.law, self.gains, self.friction, self.timing = law, gains, friction, timing
+        self.speeds, self.arrival = tuple(speeds), arrival
+
+    def at(self, speeds: Sequence[float]) -> Sweep:
+        """The same law on the same axis at other speeds."""
+        return Sweep(self.law, self.gains, self.friction, self.timing, speeds, self.arrival)
+
+    @cached_property
+    def slopes(self) -> list[tuple[float, LawSlopes]]:
+        """The linearised law: moving through zero, holding, at every velocity in both directions, and arriving."""
+        rest = [(0.0, law_slopes(self.law, self.gains, 0.0, moves, self.timing)) for moves in (True, False)]
+        velocities = [side * v for side in (1.0, -1.0) for v in self.speeds]
+        moving = [(v, law_slopes(self.law, self.gains, v, True, self.timing)) for v in velocities]
+        return rest + moving + self._arriving(velocities)
+
+    def _arriving(self, velocities: Sequence[float]) -> list[tuple[float, LawSlopes]]:
+        """The same where the joint comes to rest: sticking, and creeping at every velocity that is slow enough."""
+        if self.arrival is None:
+            return []
+        slow = [0.0, *(v for v in velocities if abs(v) < self.arrival.below_rad_s)]
+        return [(v, arriving_slopes(self.law, self.gains, v, self.arrival.error_rad, self.timing)) for v in slow]
+
+    @cached_property
+    def coupled(self) -> list[tuple[float, LawSlopes]]:
+        """The same without the states of the law that go by themselves."""
+        return [(velocity, slopes.coupled()) for velocity, slopes in self.slopes]
+
+    @cached_property
+    def own_radius(self) -> float:
+        """Largest pole of what goes by itself in the law; 0.0 where nothing does."""
+        return max((abs(pole) for _, slopes in self.slopes for pole in slopes.autonomous.values()), default=0.0)
+
+    def systems(
+        self, cases: Sequence[Deviation], timing: Timing | None = None, *, transient: bool = True
+    ) -> Iterator[tuple[float, Bristle, tuple[Array, Array, Array]]]:
+        """Closed loops of `cases` of one delay at each velocity; `transient`: also with the bristle not yet following.
+
+        Without the states of the law that go by themselves; `own_radius` has their poles.
+        """
+        own = timing or self.timing
+        late, known = replace(own, delay_s=own.delay_s + cases[0].delay_s), tuple(cases)
+        for velocity, slopes in self.coupled:
+            kinds = [Bristle.STICKS] if velocity == 0.0 else [Bristle.SLIDES]
+            if transient and velocity != 0.0:
+                kinds += [Bristle.STICKS, Bristle.TURNS]
+            for kind in kinds:
+                yield velocity, kind, loops_around(*joints_at(self.friction, velocity, kind, known, late), slopes)
+
+    def worst(self, cases: Sequence[Deviation], timing: Timing | None = None) -> Worst:
+        """The worst pole over all velocities, bristle states and cases."""
+        found = Worst(self.own_radius, 0.0, 0.0, "", 0)
+        for group in by_delay(cases):
+            for velocity, kind, (closed, _, _) in self.systems([cases[i] for i in group], timing):
+                radius = spectral_radius(closed)
+                i = int(radius.argmax())
+                if radius[i] > found.coupled_radius:
+                    largest = max(float(radius[i]), self.own_radius)
+                    found = Worst(largest, float(radius[i]), velocity, kind.name.lower(), group[i])
+        return found
+
+    def disk_margin(self, cases: Sequence[Deviation] = NOMINAL) -> tuple[float, float]:
+        """(symmetric disk margin, velocity where it is least), least over `cases`; the joint as modelled by default.
+
+        alpha = 2/max|S - T| over the frequencies: gain may change by (2 + alpha)/(2 - alpha) and phase by
+        2*atan(alpha/2) at the drive. Source: Seiler, Packard, Gahinet, IEEE Control Systems 40(5), 2020.
+        """
+        least, where = np.inf, 0.0
+        for group in by_delay(cases):
+            for velocity, _, (closed, column, row) in self.systems([cases[i] for i in group], transient=False):
+                margin = float(disk_margins(sensitivity(closed, column, row)).min())
+                if margin < least:
+                    least, where = margin, velocity
+        return least, where
+
+    def judge(self, cases: Sequence[Deviation]) -> Judgement:
+        """Poles and disk margin of `cases` at once, for a search: what `worst` and `disk_margin` say."""
+        found, hardest = Judgement(self.own_radius, 0.0, np.inf, 0.0, []), set()
+        for group in by_delay(cases):
+            for velocity, kind, (closed, column, row) in self.systems([cases[i] for i in group]):
+                poles = np.linalg.eigvals(closed)
+                radius = np.abs(poles).max(axis=-1)
+                hardest.add(group[int(radius.argmax())])
+                if radius.max() > found.radius:
+                    found = replace(found, radius=float(radius.max()), radius_at_rad_s=velocity)
+                if kind is Bristle.SLIDES or velocity == 0.0:
+                    margin = disk_margins(sensitivity(closed, column, row, poles))
+                    hardest.add(group[int(margin.argmin())])
+                    if margin.min() < found.disk_margin:
+                        found = replace(found, disk_margin=float(margin.min()), disk_at_rad_s=velocity)
+        return replace(found, hardest=[cases[i] for i in sorted(hardest)])
+
+    def stable(self, case: Deviation, extra_delay_s: float = 0.0) -> bool:
+        """Whether all poles are inside, steady sliding and sticking, for one case and a longer delay."""
+        timing = replace(self.timing, delay_s=self.timing.delay_s + extra_delay_s)
+        systems = self.systems((case,), timing, transient=False)
+        return self.own_radius < 1.0 and all(spectral_radius(closed)[0] < 1.0 for _, _, (closed, _, _) in systems)
+
+
+def by_delay(cases: Sequence[Deviation]) -> list[list[int]]:
+    """Numbers of the cases in groups of one delay, with a spring or without: only these have the same states."""
+    kinds = [(case.delay_s, case.behind is None) for case in cases]
+    return [[i for i, kind in enumerate(kinds) if kind == one] for one in dict.fromkeys(kinds)]
+
+
+def sensitivity(closed: Array, column: Array, row: Array, poles: NDArray[Any] | None = None) -> NDArray[np.complex128]:
+    """S of each closed loop at the drive over FREQUENCIES up to half the sample rate, from its `poles` if known.
+
+    S(z) = det(z - A_open)/det(z - A_closed): the zeros of S are the poles of the open loop.
+    """
+    known = np.linalg.eigvals(closed) if poles is None else poles
+    zeros = np.linalg.eigvals(closed - column[:, :, None] * row)
+    above = np.ones((len(closed), FREQUENCIES), dtype=np.complex128)
+    below = np.ones_like(above)
+    for zero, pole in zip(zeros.T, known.T, strict=True):  # one root of all loops at a time: no array in all three
+        above *= ON_CIRCLE - zero[:, None]
+        below *= ON_CIRCLE - pole[:, None]
+    response: NDArray[np.complex128] = above / below
+    return response
+
+
+def disk_margins(response: NDArray[np.complex128]) -> Array:
+    """Symmetric disk margin 1/max|S - 1/2| of each response of S."""
+    margins: Array = 1.0 / np.abs(response - 0.5).max(axis=1)
+    return margins
+
+
+def largest_tolerated(stable: Callable[[float], bool], start: float, end: float) -> float:
+    """Largest value between `start` and `end` with all stable from `start` on, by bisection; `start` if none."""
+    if not stable(start):
+        return start
+    if stable(end):
+        return end
+    good, bad = start, end
+    for _ in range(SEARCH_STEPS):
+        middle = 0.5 * (good + bad)
+        good, bad = (middle, bad) if stable(middle) else (good, middle)
+    return good

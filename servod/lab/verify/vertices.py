@@ -1,0 +1,154 @@
+"""Vertices of a region: the ends of the identified intervals as linear joints, ready for the LMIs of the deployed mode.
+
+Stands on the steady friction; synthesis solves over these vertices, verification makes them anew from the model and
+compares. A frozen a_i would imply the damping g/v; what acts on a small deviation is the true slope g'(v), below zero
+where the Stribeck curve falls, and sigma1 makes it act at once. Near rest the bristle sticks (stiffness c0,
+damping sigma1) or has broken away and slides: both are vertices of Omega_L.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from servod.formats.gains.design import Uncertainty
+from servod.kernels.laws.local import COMMANDS
+from servod.lab.verify.closed_loop import Bristle, Deviation, joint_point
+from servod.lab.verify.sampled import Array, Timing, with_delay_and_filter
+from servod.lab.verify.steady_friction import SteadyFriction
+
+GRID = 40  # speeds that are compared, in each direction
+LEAST_SPEED = 0.1  # share of the upper speed of Omega_L from which on it counts: below it the bristle only creeps
+
+
+@dataclass(frozen=True, slots=True)
+class Joint:
+    """One vertex: dx/dt = A x + B u + E w with states position, velocity, bristle.
+
+    `mode` is the polytope that it is a corner of: the bristle slides or sticks. `performs` says whether the H2
+    norm counts here: not where the Stribeck curve falls.
+    """
+
+    name: str
+    mode: str
+    performs: bool
+    a: Array
+    b: Array
+    e: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """The speeds of one region; Omega_L holds rest, where the bristle may stick."""
+
+    name: str
+    from_rad_s: float
+    to_rad_s: float
+
+    @property
+    def holds_rest(self) -> bool:
+        """Whether zero velocity lies in the region."""
+        return self.from_rad_s == 0.0
+
+
+def ends(share: float) -> tuple[float, float]:
+    """Both ends of the interval of half width `share`, as factors."""
+    return 1.0 - share, 1.0 + share
+
+
+def extremes(friction: SteadyFriction, span: Span, u: Uncertainty) -> tuple[float, float]:
+    """Velocities of the region at which the joint is least and most stable by itself, over both directions [rad/s].
+
+    Least stable is not where friction falls most: the slower the joint, the longer its bristle takes to follow.
+    """
+    lowest = LEAST_SPEED * span.to_rad_s if span.holds_rest else span.from_rad_s
+    velocities = [side * float(v) for side in (1.0, -1.0) for v in np.geomspace(lowest, span.to_rad_s, GRID)]
+    worse = Deviation(dry=1.0 + u.dry, slope=1.0 + u.slope, viscous=1.0 - u.viscous)
+    joints = np.array([joint_point(friction, v, Bristle.SLIDES, worse).matrices()[0] for v in velocities])
+    growth = np.linalg.eigvals(joints[:, 1:, 1:]).real.max(axis=1)
+    slopes = [friction.dry_slope(v) + friction.viscous(v) for v in velocities]
+    return velocities[int(np.argmax(growth))], velocities[int(np.argmax(slopes))]
+
+
+def sliding(friction: SteadyFriction, span: Span, u: Uncertainty) -> list[Joint]:
+    """The joint where friction falls most (every end of what makes that worse) and where it rises most."""
+    falls, rises = extremes(friction, span, u)
+    slope = friction.dry_slope(falls) * (1.0 + u.slope) * (1.0 + u.dry) + friction.viscous(falls) * (1.0 - u.viscous)
+    found = []
+    for mass, damping in itertools.product(ends(u.inertia), ends(u.damping)):
+        gain = 1.0 + u.torque_gain if mass < 1.0 else 1.0 - u.torque_gain
+        shared: dict[str, Any] = {"inertia": mass, "torque_gain": gain, "damping": damping}
+        size = f"{'light' if mass < 1.0 else 'heavy'} {'ringing' if damping < 1.0 else 'damped'}"
+        worse = Deviation(**shared, dry=1.0 + u.dry, slope=1.0 + u.slope, viscous=1.0 - u.viscous)
+        better = Deviation(**shared, dry=1.0 - u.dry, viscous=1.0 + u.viscous)
+        for name, velocity, deviation, performs in (
+            ("falling", falls, worse, slope >= 0.0),
+            ("rising", rises, better, True),
+        ):
+            matrices = joint_point(friction, velocity, Bristle.SLIDES, deviation).matrices()
+            found.append(Joint(f"sliding {name} {size}", "sliding", performs, *matrices))
+    return found
+
+
+def sticking(friction: SteadyFriction, u: Uncertainty) -> list[Joint]:
+    """The joint on its bristle: every end of stiffness, damping and inertia."""
+    found = []
+    for stiff, damped, mass in itertools.product(ends(u.stiffness), ends(u.damping), ends(u.inertia)):
+        gain = 1.0 + u.torque_gain if mass < 1.0 else 1.0 - u.torque_gain
+        corner = Deviation(mass, gain, stiff, damped, viscous=1.0 - u.viscous)
+        name = f"sticking {'soft' if stiff < 1.0 else 'stiff'} {'ringing' if damped < 1.0 else 'damped'}"
+        matrices = joint_point(friction, 0.0, Bristle.STICKS, corner).matrices()
+        found.append(Joint(f"{name} {'light' if mass < 1.0 else 'heavy'}", "sticking", True, *matrices))
+    return found
+
+
+def joints(friction: SteadyFriction, span: Span, uncertainty: Uncertainty) -> list[Joint]:
+    """All vertices of the region: sliding, and sticking where it holds rest."""
+    stuck = sticking(friction, uncertainty) if span.holds_rest else []
+    return sliding(friction, span, uncertainty) + stuck
+
+
+def fed_commands(timing: Timing) -> int:
+    """Number of past commands that are fed back: those that still act or wait, and one that the velocity lags."""
+    return min(max(timing.kept_commands, round(timing.delay_s / timing.period_s) + 1), COMMANDS)
+
+
+def known_commands(timing: Timing) -> int:
+    """Number of past commands among the states: those that are fed back, and those of a longer delay that still act."""
+    return max(fed_commands(timing), timing.kept_commands)
+
+
+def sampled_vertices(found: list[Joint], timing: Timing) -> tuple[Array, Array, Array]:
+    """(A, B, E) of all vertices, states [x, v_f, u_(k-1), ..., v - v_f, z]: what the law feeds back comes first."""
+    a, b, e = (np.array([getattr(joint, name) for joint in found]) for name in ("a", "b", "e"))
+    full_a, full_b, full_e = _with_memory(*with_delay_and_filter(a, b, e, timing), timing)
+    change = _to_feedback_first(full_a.shape[-1])
+    back = np.linalg.inv(change)
+    return change @ full_a @ back, full_b @ change.T, full_e @ change.T
+
+
+def _with_memory(a: Array, b: Array, e: Array, timing: Timing) -> tuple[Array, Array, Array]:
+    """The same systems with the commands that are only remembered as further states at the end."""
+    size, more = a.shape[-1], known_commands(timing) - timing.kept_commands
+    full_a = np.pad(a, ((0, 0), (0, more), (0, more)))
+    full_b, full_e = np.pad(b, ((0, 0), (0, more))), np.pad(e, ((0, 0), (0, more)))
+    for i in range(size, size + more):
+        if i > size or timing.kept_commands:
+            full_a[:, i, i - 1] = 1.0
+        else:
+            full_b[:, i] = 1.0
+    return full_a, full_b, full_e
+
+
+def _to_feedback_first(size: int) -> Array:
+    """From [x, v, z, v_f, u_(k-1), ...] to [x, v_f, u_(k-1), ..., v - v_f, z]."""
+    change = np.zeros((size, size))
+    change[0, 0] = 1.0
+    for row in range(1, size - 2):
+        change[row, row + 2] = 1.0
+    change[size - 2, 1], change[size - 2, 3] = 1.0, -1.0
+    change[size - 1, 2] = 1.0
+    return change

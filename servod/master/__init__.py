@@ -1,8 +1,0 @@
-"""CANopen master: set-up, supervision and scan of the nodes, off the control path; canopen on a servod Bus."""
-
-from __future__ import annotations
-
-from servod.master.master import BringUp, Master
-from servod.master.monitor import NodeEvent
-
-__all__ = ["BringUp", "Master", "NodeEvent"]

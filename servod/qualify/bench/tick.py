@@ -1,0 +1,98 @@
+"""The work of one cycle without waiting: decode, axis, controller, limits, encode, record; and the controller alone.
+
+The loop's own Cycle runs in a stepped session; what its calls to the bus take, where the virtual world computes, is
+measured too and left out. On a real bus the system calls for sending and receiving come on top.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from servod.common.clock import Clock
+from servod.common.units import NS_PER_US
+from servod.qualify.bench.axis import stepped_session
+from servod.qualify.bench.benchmark import controller_benchmark
+from servod.runtime.fieldbus.bus import Bus, Frame
+from servod.runtime.loop.commands import Op, ReferenceKind
+
+_WARM_UP = 500
+
+
+class _Stopwatch:
+    """A world whose buses add up the time spent in them."""
+
+    def __init__(self, world: Any) -> None:
+        self._world = world
+        self.clock: Clock = world.clock
+        self.spent_ns = 0
+
+    def connect(self) -> _TimedBus:
+        """A connection whose time counts."""
+        return _TimedBus(self._world.connect(), self)
+
+
+class _TimedBus:
+    """Passes everything on and adds the time that it takes to its stopwatch."""
+
+    def __init__(self, bus: Bus, stopwatch: _Stopwatch) -> None:
+        self._bus, self._stopwatch = bus, stopwatch
+        self.counters = bus.counters
+
+    def send(self, can_id: int, data: bytes) -> bool:
+        """As Bus.send."""
+        started = time.perf_counter_ns()
+        done = self._bus.send(can_id, data)
+        self._stopwatch.spent_ns += time.perf_counter_ns() - started
+        return done
+
+    def receive(self, timeout_s: float = 0.0) -> Frame | None:
+        """As Bus.receive."""
+        started = time.perf_counter_ns()
+        frame = self._bus.receive(timeout_s)
+        self._stopwatch.spent_ns += time.perf_counter_ns() - started
+        return frame
+
+    def fileno(self) -> int:
+        """As Bus.fileno."""
+        return self._bus.fileno()
+
+    def close(self) -> None:
+        """As Bus.close."""
+        self._bus.close()
+
+
+def measure(ticks: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Median and p99 in us of the whole tick, and of the controller's step alone, over `ticks` cycles each."""
+    return _whole_tick(ticks), _controller(ticks)
+
+
+def _whole_tick(ticks: int) -> dict[str, Any]:
+    with stepped_session(_Stopwatch) as session:
+        stopwatch: Any = session.world
+        session.send(Op.REFERENCE, [ReferenceKind.SINE, 0.05, 0.5, 3600.0])
+        cycle, clock, period_ns = session.cycle, session.clock, session.cycle.period_ns
+        session.run(0.1)
+        deadline_ns, times_ns = clock.now_ns() + period_ns, []
+        for _ in range(ticks + _WARM_UP):
+            clock.sleep_until(deadline_ns)
+            stopwatch.spent_ns = 0
+            started = time.perf_counter_ns()
+            cycle.step(deadline_ns, deadline_ns, 0)
+            times_ns.append(time.perf_counter_ns() - started - stopwatch.spent_ns)
+            deadline_ns += period_ns
+        session.clear()
+    return _figures(times_ns)
+
+
+def _controller(ticks: int) -> dict[str, Any]:
+    """The local-model law with the paper's nine sets; the other laws beside it."""
+    timings = {timing.law: timing for timing in controller_benchmark(ticks)}
+    medians = {law: timing.median_us for law, timing in timings.items()}
+    return {"median": medians["local"], "p99": timings["local"].p99_us, "cycles": ticks, "median_by_law": medians}
+
+
+def _figures(times_ns: list[int]) -> dict[str, Any]:
+    times_us = sorted(t / NS_PER_US for t in times_ns[_WARM_UP:])
+    count = len(times_us)
+    return {"median": times_us[count // 2], "p99": times_us[int(0.99 * count)], "cycles": count}

@@ -1,0 +1,156 @@
+"""The mix of a trial: how many cases of which kind, with which effects, hidden in which way; shuffled.
+
+Stands above the drawings and below the cases.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from itertools import cycle, islice
+
+import numpy as np
+
+from servod.qualify.blind.axes import Kind
+from servod.qualify.blind.hidden import HIDE, UNLISTED
+
+
+class Sort(StrEnum):
+    """What kind of answer is right."""
+
+    SINGLE = "single"
+    PAIR = "pair"
+    NOTHING = "nothing"
+    UNKNOWN = "unknown"
+
+
+class Cover(StrEnum):
+    """What hides an effect beside noise and a model that is a little off."""
+
+    NONE = "none"
+    INTEGRATOR = "integrator"  # the controller has one
+    BAND = "band"  # acts at the highest tones alone
+    NOISE = "noise"  # smaller than the noise of a single run
+    ABSORBED = "absorbed"  # the model's friction has taken up what it could
+
+
+#: Shares of the cases.
+MIX = {Sort.SINGLE: 0.5, Sort.PAIR: 0.2, Sort.NOTHING: 0.18, Sort.UNKNOWN: 0.12}
+
+#: Covers in turn, and the effects that some of them suit.
+COVERS = (Cover.NONE, Cover.INTEGRATOR, Cover.NONE, Cover.BAND, Cover.NONE, Cover.NOISE, Cover.NONE, Cover.ABSORBED)
+IN_A_BAND = {"joint_elasticity", "delay", "actuator_lag"}
+ABSORBABLE = {
+    "viscous_nonlinear", "load_dependent_friction", "position_dependent_friction", "thermal", "torque_gain", "asymmetry"
+}  # fmt: skip
+
+#: Effects that act in the same way, so that no data tell two of them apart; pairs take theirs from different rows.
+FAMILIES = (
+    ("stribeck", "presliding"),
+    ("asymmetry", "torque_offset", "disturbance"),
+    ("viscous_nonlinear", "torque_saturation", "thermal"),
+    ("load_dependent_friction", "position_dependent_friction"),
+    ("cogging", "torque_ripple"),
+    ("gravity", "spring"),
+    ("delay", "actuator_lag", "joint_elasticity", "backlash"),
+    ("inertia", "torque_gain", "position_dependent_inertia", "encoder_eccentricity"),
+)
+
+#: Pairs of different rows that act alike all the same.
+ALIKE = (
+    {"torque_gain", "viscous_nonlinear"},
+    {"torque_gain", "torque_saturation"},
+    {"torque_gain", "load_dependent_friction"},
+    {"position_dependent_inertia", "joint_elasticity"},
+    {"position_dependent_inertia", "backlash"},
+    {"inertia", "joint_elasticity"},
+    {"inertia", "backlash"},
+    {"encoder_eccentricity", "joint_elasticity"},
+    {"encoder_eccentricity", "backlash"},
+    {"presliding", "backlash"},
+    {"presliding", "joint_elasticity"},
+    {"torque_ripple", "position_dependent_inertia"},
+    {"gravity", "torque_offset"},
+    {"spring", "torque_offset"},
+    {"load_dependent_friction", "torque_saturation"},
+)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How hard a trial is: share of cases whose plant has other forms, 1 % of other effects, factor on the noise."""
+
+    other_forms: float = 0.25
+    clutter: bool = False
+    noise: float = 1.0
+
+
+HARDER = Settings(other_forms=1.0, clutter=True, noise=4.0)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """One case to be made."""
+
+    sort: Sort
+    effects: tuple[str, ...]
+    kind: Kind
+    cover: Cover
+    off: bool
+    other: bool
+    weight: bool
+    seed: int
+
+
+def plans(cases: int, seed: int, settings: Settings) -> list[Plan]:
+    """The cases of a trial, in an order that tells nothing."""
+    rng = np.random.default_rng(seed)
+    covers = islice(cycle(COVERS), int(rng.integers(len(COVERS))), None)
+    made = []
+    for number, (sort, effects) in enumerate(contents(cases, rng)):
+        other = sort in {Sort.SINGLE, Sort.PAIR} and bool(rng.uniform() < settings.other_forms)
+        kind, weight = list(Kind)[int(rng.integers(3))], bool(rng.uniform() < 0.3)
+        cover = suited(next(covers), sort, effects)
+        made.append(Plan(sort, effects, kind, cover, number % 2 == 1, other, weight, int(rng.integers(2**31))))
+    return [made[i] for i in rng.permutation(len(made))]
+
+
+def contents(cases: int, rng: np.random.Generator) -> Iterator[tuple[Sort, tuple[str, ...]]]:
+    """Kind and effects of every case; names come in turn, so that none is missed."""
+    counts = {sort: round(share * cases) for sort, share in MIX.items()}
+    counts[Sort.SINGLE] += cases - sum(counts.values())
+    singles, unlisted = _in_turn(list(HIDE), rng), _in_turn(list(UNLISTED), rng)
+    for _ in range(counts[Sort.SINGLE]):
+        yield Sort.SINGLE, (next(singles),)
+    for _ in range(counts[Sort.PAIR]):
+        yield Sort.PAIR, pair(rng)
+    for _ in range(counts[Sort.NOTHING]):
+        yield Sort.NOTHING, ()
+    for _ in range(counts[Sort.UNKNOWN]):
+        yield Sort.UNKNOWN, (next(unlisted),)
+
+
+def _in_turn(names: Sequence[str], rng: np.random.Generator) -> Iterator[str]:
+    while True:
+        yield from (names[i] for i in rng.permutation(len(names)))
+
+
+def pair(rng: np.random.Generator) -> tuple[str, str]:
+    """Two effects that good data can tell apart."""
+    while True:
+        first, second = rng.choice(len(FAMILIES), 2, replace=False)
+        one, other = (str(rng.choice(FAMILIES[i])) for i in (first, second))
+        if {one, other} not in ALIKE:
+            return one, other
+
+
+def suited(cover: Cover, sort: Sort, effects: tuple[str, ...]) -> Cover:
+    """The cover if it can hide these effects; an integrator hides anything."""
+    if cover is Cover.BAND and not set(effects) & IN_A_BAND:
+        return Cover.NONE
+    if cover is Cover.ABSORBED and not set(effects) & ABSORBABLE:
+        return Cover.INTEGRATOR
+    if cover is Cover.NOISE and sort is not Sort.SINGLE:
+        return Cover.NONE
+    return cover

@@ -1,0 +1,170 @@
+"""The tables of a trial for terminal, README and page.
+
+Made from the JSON document alone, so that a kept document gives the same tables.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+from servod.lab.report.figure import Table
+from servod.qualify.blind.count import (
+    GOALS,
+    HARDER_GOALS,
+    LEAST_COVERED,
+    MOST_ERROR,
+    MOST_HELD_OUT,
+    MOST_OVER_TRUE,
+    TELLING,
+)
+from servod.qualify.blind.plan import Sort
+
+RESULT, EFFECTS, CONFIDENCE, HIDDEN, CASES = (
+    "Results", "By effect", "Confidence", "By what hid the effect", "Every case",
+)  # fmt: skip
+
+_SORTS = {
+    Sort.SINGLE: "one effect: named, and nothing else",
+    Sort.PAIR: "two effects: both named, and nothing else",
+    Sort.NOTHING: "nothing hidden: adequate",
+    Sort.UNKNOWN: "physics on nobody's list: given no known name",
+}
+
+_SPENT = {"wall_s": "time of a diagnosis, s", "cpu_s": "processor time, s", "memory_mib": "memory, MiB"}
+
+
+def all_tables(found: Mapping[str, Any]) -> list[Table]:
+    """All tables, the results first."""
+    return [results(found), effects(found), confidences(found), hidden(found), every_case(found)]
+
+
+def sentences(found: Mapping[str, Any]) -> Iterator[str]:
+    """What was done, in sentences."""
+    harder = ", with 1 % of other effects, four times the noise and other forms in the plant" if found["harder"] else ""
+    diagnosed = f"servod {found['version']}" + (f", sources {found['sources'][:12]}," if found["sources"] else "")
+    yield (
+        f"{found['cases']} cases of seed {found['seed']}{harder}: axes drawn by an independent plant, recorded in a "
+        f"closed loop, diagnosed by {diagnosed} from their folders alone. SHA-256 of the truth, told "
+        f"before: {found['sha256']}."
+    )
+    if found["times"]["hurried"]:
+        yield f"The time limit may have ended {found['times']['hurried']} diagnoses early: too little of the processor."
+    for case, named in found["false_alarms"].items():
+        yield f"False alarm: {', '.join(named)} in {case}, where nothing is hidden."
+
+
+def results(found: Mapping[str, Any]) -> Table:
+    """What a trial is judged by, with the goals."""
+    goals = HARDER_GOALS if found["harder"] else GOALS
+    rows = [
+        _counted(_SORTS[sort], found["table"][sort.value], goals.get(sort)) for sort in Sort if sort in found["table"]
+    ]
+    if found["unexplained"]["cases"]:
+        rows.append(_counted("of these: found, and called unexplained", found["unexplained"], None))
+    told = found["parameters"]["all"]
+    size = f"{told['parameters']} values, {told['missing']} of them not told"
+    rows.append(_figure("parameters: median error", told["median_error"], size, MOST_ERROR, percent))
+    rows.append(_figure("parameters: 95 % intervals that cover", told["covered"], size, LEAST_COVERED, percent, "≥"))
+    rows += _held_out(found["held_out"])
+    for key, text in _SPENT.items():
+        spread = found["times"][key]
+        rows.append((f"{text}: median, max", f"{number(spread['median'])}, {number(spread['max'])}", "", ""))
+    return Table(RESULT, ("", "found", "of", "goal"), tuple(rows))
+
+
+def _held_out(spreads: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+    """Errors of windows that no diagnosis saw; what is left out of a median stands beside it."""
+    every, telling, true = (spreads[k] for k in ("after_over_before_all", "after_over_before", "after_over_true"))
+    ratio = "held-out windows of 0.25 s: error after / before, median"
+    some = (
+        f"{telling['count']} of {every['count']} cases: believed model {TELLING:g} times the true one's, or no true one"
+    )
+    yield _figure(ratio, telling["median"], some, MOST_HELD_OUT, number)
+    yield ratio, number(every["median"]), f"all {every['count']} cases with an effect", ""
+    ratio = "held-out windows of 0.25 s: error after / true model's, median"
+    yield _figure(ratio, true["median"], f"{true['count']} cases", MOST_OVER_TRUE, number)
+
+
+def _counted(text: str, counted: Mapping[str, Any], goal: float | None) -> tuple[str, ...]:
+    low, high = counted["interval"]
+    of = f"{counted['right']}/{counted['cases']} [{100 * low:.0f}, {100 * high:.0f}] %"
+    return text, percent(counted["share"]), of, "" if goal is None else f"≥ {100 * goal:.0f} %"
+
+
+def _figure(
+    text: str, value: float | None, of: str, goal: float, shown: Callable[[float | None], str], sign: str = "≤"
+) -> tuple[str, ...]:
+    return text, shown(value), of, f"{sign} {shown(goal)}"
+
+
+def effects(found: Mapping[str, Any]) -> Table:
+    """For each effect: named how often, parameters, and as what it was mistaken."""
+    rows = []
+    for effect, counted in found["by_effect"].items():
+        told = found["parameters"]["by_effect"].get(effect, {"median_error": None, "covered": None})
+        others = {name: n for name, n in found["confusion"][effect].items() if name != effect}
+        mistaken = ", ".join(f"{name} {n}" for name, n in sorted(others.items(), key=lambda item: -item[1]))
+        named = f"{counted['right']}/{counted['cases']}"
+        rows.append((effect, named, percent(told["median_error"]), percent(told["covered"]), mistaken))
+    header = ("effect", "named", "median error of parameters", "intervals that cover", "beside it or instead")
+    return Table(EFFECTS, header, tuple(rows))
+
+
+def confidences(found: Mapping[str, Any]) -> Table:
+    """What findings state and how many are right."""
+    rows = []
+    for part in found["calibration"]:
+        span = f"{part['low']:g} to {part['high']:g}"
+        rows.append((span, str(part["cases"]), percent(part["stated"]), percent(part["share"])))
+    return Table(CONFIDENCE, ("stated confidence", "findings", "stated on average", "right"), tuple(rows))
+
+
+def hidden(found: Mapping[str, Any]) -> Table:
+    """Right answers by cover, form and joint."""
+    rows: list[tuple[str, ...]] = []
+    for key, text in (("by_cover", "cover"), ("by_form", "form"), ("by_joint", "joint")):
+        rows += [_counted(f"{text}: {name}", counted, None)[:3] for name, counted in found[key].items()]
+    return Table(HIDDEN, ("", "right", "of"), tuple(rows))
+
+
+def every_case(found: Mapping[str, Any]) -> Table:
+    """One row a case."""
+    rows = []
+    for case in found["results"]:
+        named = ", ".join(f"{name} ({sure:.2f})" for name, sure in case["named"].items())
+        concealed = ", ".join(case["concealed"]) or "nothing"
+        more = ", ".join(filter(None, (case["joint"], case["cover"], "other form" if case["other_form"] else "")))
+        rows.append((case["case"], concealed, more, case["verdict"], named, "right" if case["right"] else "wrong"))
+    return Table(CASES, ("case", "concealed", "axis", "verdict", "named", ""), tuple(rows))
+
+
+def markdown(found: Mapping[str, Any]) -> str:
+    """prove.md: sentences and all tables."""
+    parts = ["# A blind trial of the diagnosis", *sentences(found)]
+    for table in all_tables(found):
+        parts += [f"## {table.title}", table.markdown()]
+    return "\n\n".join(parts) + "\n"
+
+
+def text(found: Mapping[str, Any]) -> str:
+    """What the terminal shows: results, and what each effect was mistaken for."""
+    return "\n\n".join([*sentences(found), *(_aligned(table) for table in (results(found), effects(found)))])
+
+
+def _aligned(table: Table) -> str:
+    lines: Sequence[Sequence[str]] = (table.header, *table.rows)
+    widths = [max(len(line[i]) for line in lines) for i in range(len(table.header))]
+    return "\n".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines
+    )
+
+
+def percent(value: float | None) -> str:
+    """A share as percent; a dash where there is none."""
+    return "–" if value is None else f"{100.0 * value:.3g} %"
+
+
+def number(value: float | None) -> str:
+    """A number with three digits; a dash where there is none."""
+    return "–" if value is None else f"{value:.3g}"

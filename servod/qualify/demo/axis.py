@@ -1,0 +1,81 @@
+"""The demo's axis: one configuration for daemon, loop and stepped session, the four gain sets, and the default plant.
+
+Beside the data path. Everything that acts is the product's own; only these values are the demo's.
+"""
+
+from __future__ import annotations
+
+import grp
+import os
+from pathlib import Path
+
+from servod.common.shipped import shipped
+from servod.common.yaml import validate
+from servod.formats.config import AxisConfig
+
+#: The four laws of the comparison, in the order of the table; each has its gain set `gains/demo_<law>.yaml`.
+CONTROLLERS = ("pd", "pd_dob", "pd_lugre", "local")
+
+#: What each law is called where people read it.
+LABELS = {"pd": "PD", "pd_dob": "PD + DOB", "pd_lugre": "PD + LuGre", "local": "Local models"}
+
+
+def gains_file(controller: str) -> Path:
+    """The shipped gain set of one law."""
+    return shipped(f"gains/demo_{controller}.yaml")
+
+
+def plant_file(plant: Path | None) -> Path:
+    """The axis model that the virtual axis is to be: the one given, or the shipped demo joint."""
+    return plant if plant is not None else shipped("gains/axes/demo_joint.yaml")
+
+
+def demo_config(folder: Path, recordings: Path) -> AxisConfig:
+    """Configuration of the demo's axis; sockets and gain store under `folder`, recordings where they shall stay."""
+    return validate(
+        {
+            "name": "demo",
+            "bus": {"interface": "virtual", "channel": str(folder / "bus")},
+            "cycle": {"cpu": last_core(), "priority": 80},
+            "limits": {
+                "torque_nm": 0.3,
+                "torque_rate_nm_per_s": 200.0,
+                "speed_rad_s": 3.0,
+                "position_min_rad": -0.6,
+                "position_max_rad": 0.6,
+                "following_error_rad": 0.15,
+                "encoder_mismatch_rad": 0.05,
+                # Without real-time rights the virtual axis may wait for its turn; a real drive never does.
+                "stale_cycles": 50,
+                "late_cycles": 100,
+            },
+            "gains": {
+                "directory": str(folder / "gains"),
+                "initial": str(gains_file(CONTROLLERS[0])),
+                "accept_uncertified": True,
+            },
+            "control": {"socket": str(folder / "axis.sock"), "group": own_group()},
+            "recorder": {"directory": str(recordings.resolve()), "history_s": 5.0},
+        },
+        AxisConfig,
+        "demo",
+    )
+
+
+def last_core() -> int | None:
+    """The core farthest from where the system puts its interrupts; None where there is only one."""
+    cores = sorted(os.sched_getaffinity(0))
+    return cores[-1] if len(cores) > 1 else None
+
+
+def other_cores() -> set[int] | None:
+    """All cores but the loop's; None where there is only one."""
+    return os.sched_getaffinity(0) - {last_core()} or None
+
+
+def own_group() -> str:
+    """The group of this process, by name where it has one."""
+    try:
+        return grp.getgrgid(os.getgid()).gr_name
+    except KeyError:
+        return str(os.getgid())

@@ -1,0 +1,185 @@
+"""A fault scenario as its file states it: what is injected when, what must happen, and how one recovers.
+
+One YAML file is one scenario, or several that differ in a few values (`servod.qualify.faults.variants`). What an
+injection
+does stands in `servod.qualify.faults.actions`.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, Field, model_validator
+
+from servod.common.errors import FaultCode
+from servod.common.yaml import Strict
+from servod.runtime.fieldbus.devices import DriveState
+from servod.runtime.loop.axis import AxisState
+from servod.runtime.loop.wiring.findings import Finding
+
+#: After a loss of the master the torque must be gone within this time [ms].
+MASTER_LOSS_MS = 300.0
+#: After a loss of feedback the drive must have left the controller's command within this time [ms].
+FEEDBACK_LOSS_MS = 50.0
+
+AXIS_STATES = {state.name for state in AxisState}
+FAULT_NAMES = {code.name for code in FaultCode}
+DRIVE_STATES = {state.name for state in DriveState}
+FINDINGS = {finding.name for finding in Finding}
+
+
+class Runs(StrEnum):
+    """Which axis under test shows the scenario."""
+
+    STEPPED = "stepped"  # one process, virtual time, exact
+    PROCESSES = "processes"  # daemon, loop and virtual axis as processes, wall clock
+    GUEST = "guest"  # systemd and a real vcan in the guest machine
+
+
+class Start(StrEnum):
+    """What the axis is doing when the first injection comes."""
+
+    OFF = "off"  # before the bring-up, which is then tried
+    DISABLED = "disabled"
+    ENABLED = "enabled"  # at rest under control
+    MOVING = "moving"  # in the middle of a sine, at its fastest, with friction to overcome
+    PROVING = "proving"  # in the test of the wiring, while it pushes the joint
+
+
+#: Starts in which the drive has power, so that there is something to lose.
+POWERED = (Start.ENABLED, Start.MOVING, Start.PROVING)
+
+
+class Loss(StrEnum):
+    """What a scenario takes from the axis. Its actions say so (servod.qualify.faults.losses); each loss has its
+    bound."""
+
+    NONE = "none"
+    FEEDBACK = "feedback"
+    MASTER = "master"
+
+
+class Recovery(StrEnum):
+    """What a person does afterwards, so that the axis can be enabled again."""
+
+    NONE = "none"  # nothing to do: it never stopped
+    ENABLE = "enable"
+    RESET_FAULT = "reset_fault"  # enable with --reset-fault
+    RESTART = "restart"  # restart the daemon, then enable
+    REPAIR = "repair"  # only a person at the hardware or the configuration mends it
+
+
+class Injection(Strict):
+    """One thing that goes wrong: `do` has one key, the name of an action, with its arguments."""
+
+    at_ms: float = Field(0.0, ge=0.0, le=600_000.0)
+    do: dict[str, dict[str, Any]]
+    timed: bool = Field(False, description="times count from here, not from the first injection")
+
+    @model_validator(mode="after")
+    def _one_action(self) -> Injection:
+        if len(self.do) != 1:
+            raise ValueError("one action for each injection")
+        return self
+
+    @property
+    def action(self) -> str:
+        """Name of the action."""
+        return next(iter(self.do))
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """What the action is told."""
+        return self.do[self.action]
+
+
+def _one_of(names: set[str]) -> AfterValidator:
+    """A word that is one of `names`; the message stands at the word itself."""
+
+    def check(word: str) -> str:
+        if word not in names:
+            raise ValueError(f"one of {', '.join(sorted(names))}")
+        return word
+
+    return AfterValidator(check)
+
+
+AxisWord = Annotated[str, _one_of(AXIS_STATES)]
+FaultWord = Annotated[str, _one_of(FAULT_NAMES)]
+DriveWord = Annotated[str, _one_of(DRIVE_STATES)]
+FindingWord = Annotated[str, _one_of(FINDINGS)]
+
+
+class Expectation(Strict):
+    """What must happen. Times count from the timed or first injection, on the drive's side, in bus time."""
+
+    exempt: str | None = Field(None, min_length=20, description="why the bound of a loss does not hold here, in words")
+    axis: list[AxisWord] = Field(
+        min_length=1, description="names of servod.runtime.loop.axis.AxisState; one of them at the end"
+    )
+    faults: list[FaultWord] = Field(
+        [], description="names of servod.common.errors.FaultCode; one of them at least is latched"
+    )
+    reaction_ms: float | None = Field(None, gt=0.0, description="the drive has left the controller's command by then")
+    torque_gone_ms: float | None = Field(None, gt=0.0, description="the joint feels no torque from then on")
+    refused: str | None = Field(None, description="words of the message with which the bring-up or command is refused")
+    says: FindingWord | None = Field(
+        None, description="name of servod.runtime.loop.wiring.findings.Finding: what the proof of the wiring tells"
+    )
+    lost_records: int = Field(0, ge=0, description="cycle records that may be missing")
+    drive_error: int | None = Field(None, gt=0, le=0xFFFF, description="the error code that the user is shown")
+    strays_rad: float = Field(0.03, gt=0.0, description="an axis that stays enabled: distance from its motion")
+    fastest_rad_s: float = Field(2.0, gt=0.0, description="an axis that stays enabled: speed of the joint")
+    most_nm: float | None = Field(None, gt=0.0, description="the joint feels no more torque than this")
+    drive_shows: list[DriveWord] = Field(
+        [], description="names of servod.runtime.fieldbus.devices.DriveState, all seen after the injection"
+    )
+    drive_never: list[DriveWord] = Field(
+        [], description="names of servod.runtime.fieldbus.devices.DriveState, none seen after the injection"
+    )
+
+    @model_validator(mode="after")
+    def _one_outcome(self) -> Expectation:
+        if self.stays_enabled and len(self.axis) > 1:
+            raise ValueError("either ENABLED alone or the states of an axis that was stopped: a scenario has one end")
+        return self
+
+    @property
+    def stays_enabled(self) -> bool:
+        """The axis goes on."""
+        return AxisState.ENABLED.name in self.axis
+
+
+class Scenario(Strict):
+    """One scenario."""
+
+    title: str = Field(min_length=1, max_length=100)
+    why: str = Field(min_length=1, description="when this happens to a machine, in a sentence")
+    group: str = Field(min_length=1, description="heading in the table: bus, drive, encoder, process, ...")
+    runs: Runs = Runs.STEPPED
+    start: Start = Start.MOVING
+    settings: dict[str, Any] = Field({}, description="of the virtual axis, over its defaults")
+    config: dict[str, Any] = Field(
+        {},
+        description="of the axis, over the shipped virtual.yaml; nested; wiring_proof.enabled is false unless stated",
+    )
+    plant: dict[str, Any] = Field({}, description="of the plant's axis model, over the demo joint")
+    inject: list[Injection] = Field(min_length=1)
+    watch_ms: float = Field(1000.0, gt=0.0, le=600_000.0, description="how long the axis is watched afterwards")
+    expect: Expectation
+    mend: list[Injection] = Field([], description="what takes the cause away, before one recovers")
+    mend_ms: float = Field(0.0, ge=0.0, le=600_000.0, description="time that passes then")
+    recover: Recovery = Recovery.RESET_FAULT
+
+    @model_validator(mode="after")
+    def _torque_has_a_bound(self) -> Scenario:
+        if self.start is not Start.OFF and not self.expect.stays_enabled and self.expect.torque_gone_ms is None:
+            raise ValueError("expect.torque_gone_ms: an axis that does not stay enabled has a time for it")
+        return self
+
+    @model_validator(mode="after")
+    def _runs_can_show_it(self) -> Scenario:
+        if self.runs is not Runs.STEPPED and (self.start is Start.PROVING or self.expect.drive_error is not None):
+            raise ValueError("start: proving and expect.drive_error are for runs: stepped")
+        return self

@@ -1,0 +1,192 @@
+"""The stepped axis under test: one process, virtual time, every run the same."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Hashable, Sequence
+from pathlib import Path
+
+from servod.client.stepped import SteppedSession
+from servod.common.errors import ServodError, Unreachable, faults_in
+from servod.common.shipped import shipped
+from servod.common.yaml import validate
+from servod.drivers.virtual.bus_faults import BusFault
+from servod.drivers.virtual.drive_record import DriveRecord, read_drive_record
+from servod.drivers.virtual.world import SteppedBus, SteppedWorld, VirtualAxisSettings
+from servod.formats.config import AxisConfig
+from servod.formats.gains.gain_set import load_gains
+from servod.kernels.laws import LAWS
+from servod.qualify.faults.inputs import PROVEN_BEFORE, Nested, config_of, merged, plant_of, shipped_config
+from servod.qualify.faults.scenario import Recovery, Runs, Scenario, Start
+from servod.qualify.faults.under_test import MOTION, Observation
+from servod.runtime.fieldbus.cia import NMT_ID
+from servod.runtime.loop.axis import AxisState
+from servod.runtime.loop.commands import REFUSAL_TEXT, Op, ReferenceKind, Refusal
+from servod.runtime.loop.wiring.findings import Finding
+
+#: Samples of the drive's record for each millisecond: its commands, its own watch, its events.
+_SAMPLES_PER_MS = 2.5
+#: What a scenario takes besides its injections and its watch: bring-up, enabling, motion.
+_OTHERWISE_MS = 8000.0
+#: The drive's own record in the folder of a stepped axis.
+RECORD_NAME = "drive.bin"
+#: The motion of a start in motion: whole half periods after its begin it is at its fastest, 1.3 rad/s.
+_SINE = (ReferenceKind.SINE, *MOTION[Runs.STEPPED], 600.0)
+_TO_THE_FASTEST_S = 0.5
+#: The test of the wiring pushes when the joint feels this torque, about half of what friction takes; it begins by then.
+_PUSHED_NM, _PUSHED_S = 0.03, 5.0
+
+
+class SteppedAxis:
+    """servod.qualify.faults.under_test.AxisUnderTest in virtual time; `folder` takes the drive's record."""
+
+    def __init__(self, scenario: Scenario, folder: Path) -> None:
+        self.effects: Counter[Hashable] = Counter()
+        self._record_path = folder / RECORD_NAME
+        where = scenario.title
+        settings = validate(scenario.settings, VirtualAxisSettings, f"{where}: settings")
+        record = DriveRecord(self._record_path, _samples(scenario))
+        self.world = SteppedWorld(settings, plant_of(scenario), record)
+        self._config = config_of(scenario, merged(shipped_config(), PROVEN_BEFORE))
+        self._foreign = self.world.connect(())
+        self._session: SteppedSession | None = None
+        self._refusal = ""
+
+    @property
+    def session(self) -> SteppedSession:
+        """The master with its loop; it exists from the bring-up on."""
+        assert self._session is not None
+        return self._session
+
+    @property
+    def refusal(self) -> str:
+        """Why a bring-up or a command was refused last; empty when none was."""
+        return self._refusal
+
+    def now_ns(self) -> int:
+        """Virtual time."""
+        return self.world.clock.now_ns()
+
+    def start(self, start: Start) -> None:
+        """Bring up, enable and move, as far as `start` says."""
+        if start is Start.OFF:
+            return
+        self._bring_up()
+        if start is Start.PROVING:
+            self._begin_proof()
+            return
+        if start in (Start.ENABLED, Start.MOVING):
+            self.session.enable()
+        if start is Start.MOVING:
+            self.command(Op.REFERENCE, _SINE)
+        self.session.run(_TO_THE_FASTEST_S if start is Start.MOVING else 0.1)
+
+    def run(self, duration_s: float) -> None:
+        """Advance; an axis that is off is brought up first, and a refusal is kept."""
+        if self._session is None and not self._refusal:
+            try:
+                self._bring_up()
+            except ServodError as error:
+                self._refusal = str(error)
+        if self._session is None:
+            self.world.clock.sleep_until(self.now_ns() + round(duration_s * 1e9))
+        else:
+            self._session.run(duration_s)
+
+    def bus_fault(self, fault: BusFault) -> None:
+        """Ask the hub, as the loop's connection."""
+        self._asker.inject(fault)
+
+    def fault_effect(self, fault: BusFault) -> int:
+        """Ask the hub, as the loop's connection."""
+        return self._asker.happened(fault)
+
+    def frame(self, can_id: int, data: bytes) -> None:
+        """Send as somebody else on the bus."""
+        self._foreign.send(can_id, data)
+
+    def frame_effect(self, can_id: int, data: bytes) -> int:
+        """An NMT command is heard by its node, any other frame by all."""
+        if can_id != NMT_ID:
+            return self._foreign.port.sent
+        command, node_id = data
+        return sum(node.nmt_taken[command] for node in self.world.devices.nodes if node.node_id == node_id)
+
+    def sdo_write(self, node_id: int, index: int, subindex: int, value: int) -> bool:
+        """Write past the bus, straight into the node's dictionary."""
+        (node,) = (n for n in self.world.devices.nodes if n.node_id == node_id)
+        entry = node.dictionary.entry(index, subindex)
+        entry.value = value
+        if entry.written is not None:
+            entry.written(value)
+        return entry.value == value
+
+    def command(self, op: Op, arguments: Sequence[float] = ()) -> bool:
+        """Give the loop a command; False when it was refused, which is kept."""
+        refusal = self.session.send(op, arguments)
+        if refusal != Refusal.DONE:
+            self._refusal = REFUSAL_TEXT[refusal]
+        return refusal == Refusal.DONE
+
+    def observe(self) -> Observation:
+        """What is seen now."""
+        samples = read_drive_record(self._record_path)
+        if self._session is None:
+            return Observation(samples, AxisState.DISABLED.name, frozenset(), self._refusal)
+        axis, records = self._session.cycle.axis, self._session.records
+        latched = frozenset(fault.code for fault in faults_in(axis.latched))
+        proof = self._session.proof
+        says = None if proof is None else Finding(int(proof.finding))
+        errors = frozenset(record.drive_error for record in records) - {0}
+        return Observation(samples, axis.state.name, latched, self._refusal, says=says, drive_errors=errors)
+
+    def recover(self, recovery: Recovery) -> bool:
+        """Do what a person would do, and hold for a tenth of a second."""
+        try:
+            if recovery is Recovery.RESTART:
+                self._bring_up()
+            if recovery is not Recovery.NONE:
+                self.session.enable(recovery is Recovery.RESET_FAULT)
+        except ServodError as error:
+            self._refusal = str(error)
+            return False
+        self.session.run(0.1)
+        return self.session.cycle.axis.state is AxisState.ENABLED
+
+    def configure(self, over: Nested) -> bool:
+        """Lay keys over the configuration; the next bring-up reads them. True when that changed it. Raises BadInput."""
+        before = self._config
+        base = before.model_dump(mode="json", exclude_none=True)
+        self._config = validate(merged(base, over), AxisConfig, "configure")
+        return self._config != before
+
+    def close(self) -> None:
+        """Leave the bus."""
+        if self._session is not None:
+            self._session.close()
+
+    @property
+    def _asker(self) -> SteppedBus:
+        """Before the bring-up there is no loop."""
+        return self._foreign if self._session is None else self._session.loop_bus
+
+    def _begin_proof(self) -> None:
+        """Enable, up to the moment at which the test of the wiring pushes the joint."""
+        self.command(Op.ENABLE)
+        until_ns = self.now_ns() + round(_PUSHED_S * 1e9)
+        while abs(self.world.truth().torque_nm) < _PUSHED_NM:
+            self.session.run(0.001)
+            if self.now_ns() > until_ns:
+                raise Unreachable("the test of the wiring does not push: is wiring_proof.enabled set?")
+
+    def _bring_up(self) -> None:
+        self.close()
+        gains = load_gains(shipped("gains/demo_pd.yaml"))
+        self._session = SteppedSession(self._config, self.world, LAWS[gains.law.name].number, gains.pack())
+
+
+def _samples(scenario: Scenario) -> int:
+    """Capacity of the drive's record: all of the scenario, and little more, since it is read as a whole."""
+    all_of_it = [*scenario.inject, *scenario.mend]
+    longest_ms = sum(i.at_ms for i in all_of_it) + scenario.watch_ms + scenario.mend_ms + _OTHERWISE_MS
+    return round(longest_ms * _SAMPLES_PER_MS)

@@ -1,0 +1,90 @@
+"""An axis under test: what every world (stepped, processes, guest) offers to scenarios, actions and judge."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Hashable
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+from servod.common.errors import FaultCode
+from servod.drivers.virtual.bus_faults import BusFault
+from servod.drivers.virtual.drive_record import DriveSample
+from servod.qualify.faults.scenario import Recovery, Runs, Start
+from servod.runtime.loop.wiring.findings import Finding
+
+AMPLIFIER, ENCODER = 1, 2
+
+
+class Sine(NamedTuple):
+    """The motion of an axis that starts moving."""
+
+    amplitude_rad: float
+    frequency_hz: float
+
+
+#: In virtual time a motion may be faster than on a machine that others use too. There it is larger: a joint that strays
+#: by what such a machine does to it is far from one that stands.
+MOTION = {Runs.STEPPED: Sine(0.1, 2.0), Runs.PROCESSES: Sine(0.3, 0.7), Runs.GUEST: Sine(0.6, 0.5)}
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What was seen after a scenario, before anything was done to recover.
+
+    `samples`: the drive's own record; `axis`: name of the axis state; `latched`: the faults that the user is shown;
+    `refusal`: message with which bring-up or command was refused, "" when none was; `lost_records`: cycles without a
+    record, None where no recorder runs (in virtual time the rows do not leave the process); `says`: how the last proof
+    of the wiring ended, None where none was told; `drive_errors`: the drive's error codes in the cycle records.
+    """
+
+    samples: list[DriveSample]
+    axis: str
+    latched: frozenset[FaultCode]
+    refusal: str
+    lost_records: int | None = None
+    says: Finding | None = None
+    drive_errors: frozenset[int] = frozenset()
+
+
+class AxisUnderTest(Protocol):
+    """One virtual axis with its master; time is that of the drive's record.
+
+    `effects` counts how often actions that see their effect at once took effect, by their mark
+    (servod.qualify.faults.actions.base).
+    """
+
+    effects: Counter[Hashable]
+
+    def now_ns(self) -> int:
+        """Present time."""
+
+    def start(self, start: Start) -> None:
+        """Bring the axis to where the scenario begins. Raises ServodError when it does not get there."""
+
+    def run(self, duration_s: float) -> None:
+        """Let time pass; an axis that is still off tries its bring-up at the beginning of the first run."""
+
+    def bus_fault(self, fault: BusFault) -> None:
+        """Ask the hub for a fault of the bus; participant MYSELF is the loop."""
+
+    def fault_effect(self, fault: BusFault) -> int:
+        """How often what `fault` asks for took effect so far, as the hub counts it."""
+
+    def frame(self, can_id: int, data: bytes) -> None:
+        """Send a frame as a foreign participant, raw."""
+
+    def frame_effect(self, can_id: int, data: bytes) -> int:
+        """How often such a frame of a foreign participant was heard so far."""
+
+    def sdo_write(self, node_id: int, index: int, subindex: int, value: int) -> bool:
+        """Write an object of a node, as the vendor's service tool would; True when the node has taken it."""
+
+    def observe(self) -> Observation:
+        """What is seen now."""
+
+    def recover(self, recovery: Recovery) -> bool:
+        """Do what a person would do; True when the axis is enabled and holds without a fault afterwards."""
+
+    def close(self) -> None:
+        """End everything that runs."""

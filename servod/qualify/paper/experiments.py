@@ -1,0 +1,144 @@
+"""What is done on a virtual axis over the whole CAN loop, SYNC-stepped: identify, design, track and step.
+
+Jobs of the crew: plain values in and out. An axis that refuses or faults is a result, not an error: the paper's own
+numbers may trip it.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from servod.client.axis import SteppedLink
+from servod.client.stepped import SteppedSession
+from servod.common.errors import AnswerIsNo, Reaction, faults_in
+from servod.formats.gains.gain_set import GainSet
+from servod.formats.model.axis_model import AxisModel
+from servod.lab.identify.fits.presliding import PreslidingFit
+from servod.lab.identify.result import model_of
+from servod.lab.identify.walk import identify
+from servod.lab.report.figures.motion import Motion
+from servod.lab.synthesize.deployed import Wishes
+from servod.lab.synthesize.gain_set import Options, synthesize
+from servod.lab.synthesize.infeasible import Infeasible
+from servod.lab.synthesize.intervals import uncertainty_of
+from servod.lab.tracking.metrics import Curves, StepResponse, Tracking, roughness, score, step_response
+from servod.lab.tracking.stepped import activate, run_motion
+from servod.qualify.paper.joints import CUTOFF_HZ, ENCODER_COUNTS, Joint, open_for_tracking, open_session
+from servod.qualify.paper.printed import STEPS_MRAD
+from servod.runtime.loop.commands import ReferenceKind
+
+COUNT_RAD = 2.0 * np.pi / ENCODER_COUNTS
+
+
+@dataclass(frozen=True)
+class Found:
+    """One joint identified and designed for; `presliding` is None where it was not identified but told."""
+
+    model: AxisModel
+    gains: GainSet
+    presliding: PreslidingFit | None
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Motions of one gain set on one joint. What the axis stopped is missing; `stops` says why, by motion."""
+
+    label: str
+    followed: Motion | None
+    steps: dict[float, Motion]
+    responses: dict[float, StepResponse]
+    stops: dict[str, str]
+
+    def tracking(self) -> Tracking | None:
+        """Figures of merit, by the rules of servod.lab.tracking; None where (19) was not followed to its end."""
+        if self.followed is None:
+            return None
+        error = score(self.followed.time_s, self.followed.error_mrad)
+        rough = roughness(self.followed.time_s, self.followed.torque_nm)
+        return Tracking(error.rms_error_mrad, error.max_error_mrad, rough, self.responses)
+
+
+def identify_and_design(joint: Joint, seed: int) -> Found:
+    """Walk through the identification of `joint`, then synthesize for what was found. Raises AnswerIsNo."""
+    with tempfile.TemporaryDirectory(prefix="servod-paper-") as folder:
+        link = SteppedLink(open_session(joint, Path(folder), seed))
+        analysis = identify(link, Path(folder) / "recordings", lambda _what, _share: None, seed=seed)
+    model = model_of(analysis)
+    return Found(model, design(model), analysis.presliding)
+
+
+def design_as_told(joint: Joint) -> Found:
+    """`joint` designed for by its own model, without an identification: what a quick look takes. Raises AnswerIsNo."""
+    model = joint.model()
+    return Found(model, design(model), None)
+
+
+def design(model: AxisModel) -> GainSet:
+    """The gain set that a deployment would begin with, designed for `model`; it is measured here, not certified.
+
+    Raises AnswerIsNo when there is none.
+    """
+    wishes = Wishes(uncertainty=uncertainty_of(model), counts_per_turn=ENCODER_COUNTS)
+    gains = synthesize(model, wishes, Options("deployed"))
+    if isinstance(gains, Infeasible):
+        raise AnswerIsNo("no design for the identified joint: " + "; ".join(gains.clashes or gains.regions))
+    return gains
+
+
+def cutoff_of(gains: GainSet) -> float:
+    """The velocity filter that a set was designed for, or the paper's sets' own."""
+    return gains.design.velocity_cutoff_hz if gains.design else CUTOFF_HZ
+
+
+def measure(
+    joint: Joint, label: str, gains: GainSet, cutoff_hz: float, seed: int, seconds: float, hold_s: float
+) -> Measured:
+    """Trajectory (19) for `seconds`, then each step on an axis of its own, held for `hold_s` (0: no steps)."""
+    stops: dict[str, str] = {}
+    followed = _motion(joint, label, gains, cutoff_hz, seed, ReferenceKind.PAPER, [seconds], "(19)", stops)
+    steps = {
+        size: _motion(
+            joint, label, gains, cutoff_hz, seed, ReferenceKind.STEP, [size * 1e-3, hold_s], f"{size:g} mrad", stops
+        )
+        for size in (STEPS_MRAD if hold_s else ())
+    }
+    done = {size: motion for size, motion in steps.items() if motion is not None}
+    responses = {s: step_response(m.time_s, m.position_rad, s * 1e-3, COUNT_RAD) for s, m in done.items()}
+    return Measured(label, followed, done, responses, stops)
+
+
+def _motion(
+    joint: Joint,
+    label: str,
+    gains: GainSet,
+    cutoff_hz: float,
+    seed: int,
+    kind: ReferenceKind,
+    arguments: list[float],
+    name: str,
+    stops: dict[str, str],
+) -> Motion | None:
+    """One motion on a fresh axis; None, and the reason in `stops`, when the axis did not stand it."""
+    with tempfile.TemporaryDirectory(prefix="servod-paper-") as folder:
+        session = open_for_tracking(joint, Path(folder), seed, cutoff_hz)
+        try:
+            activate(session, gains)
+            return motion_of_curves(label, run_motion(session, kind, arguments))
+        except AnswerIsNo as error:
+            stops[name] = _why(session) or str(error)
+            return None
+
+
+def _why(session: SteppedSession) -> str:
+    """The faults that stopped the axis, by name; not those that only clip or tell."""
+    found = faults_in(session.latest.faults_latched)
+    return ", ".join(fault.code.name for fault in found if fault.reaction > Reaction.CLIP)
+
+
+def motion_of_curves(label: str, c: Curves) -> Motion:
+    """A measured motion as the figures take it."""
+    return Motion(label, c.time_s, c.reference_rad, c.position_rad, c.torque_nm, c.friction_nm)

@@ -1,0 +1,208 @@
+"""The whole of `servoctl paper`: identify, design, track, sweep, draw, in as little time as the cores allow.
+
+Above everything of `paper`; its jobs go to the crew, what they found is gathered here.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from concurrent.futures import Future
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from servod.formats.gains.gain_set import GainSet
+from servod.lab.report.figure import Figure
+from servod.lab.report.figures.sets import local_law
+from servod.lab.report.pictures import write_pictures
+from servod.lab.tune.plan import Feedback
+from servod.qualify.paper import beyond, document, equations, experiments, motions, programme, rivals, sweeps
+from servod.qualify.paper.crew import Crew, Tell
+from servod.qualify.paper.experiments import Found, Measured, cutoff_of
+from servod.qualify.paper.joints import Joint
+from servod.qualify.paper.printed import FRICTION
+from servod.qualify.paper.results import Results, Row
+from servod.qualify.paper.rivals import Contender
+from servod.qualify.paper.sets import at_paper_feedback, printed_l, shipped_set, with_l, without_options
+
+#: l_i of the local law at the paper's PD gains without options, in all its sets; as the demo's plain set.
+PLAIN_L = 0.1
+#: RMS of the noise on friction in Fig. 11 and 12, as a share of F_C.
+NOISE_SHARE = 0.1
+#: What tuning the rivals of one law takes, and scoring one in one class, in seconds of one core.
+_TUNE_S, _SCORE_S = 18.0, 3.0
+#: Shipped sets by row.
+_SHIPPED = {
+    Row.PD: "paper_pd",
+    Row.DOB: "paper_pd_dob",
+    Row.LUGRE: "paper_pd_lugre",
+    Row.LUGRE_BETTER: "paper_pd_lugre_lf025",
+    Row.LUGRE_OSCILLATES: "paper_pd_lugre_lf035",
+    Row.TABLE1: "table1_kz_kv_kx",
+    Row.TABLE1_OTHER: "table1_kx_kv_kz",
+}
+
+
+@dataclass(frozen=True)
+class PaperPlan:
+    """How much is done. `identify` False takes the plants' own models, which leaves out Fig. 7 and 8."""
+
+    seed: int = 1
+    joints: tuple[Joint, ...] = (Joint.TABLE1, Joint.REAL)
+    seconds: float = 30.0
+    hold_s: float = 3.0
+    identify: bool = True
+    factors: tuple[float, ...] = sweeps.FACTORS
+    pictures: bool = True
+    tune: tuple[Joint, ...] = (Joint.REAL,)
+
+
+#: A look at everything that needs no identification, on Table I's joint alone.
+QUICK = PaperPlan(
+    joints=(Joint.TABLE1,),
+    seconds=4.0,
+    hold_s=1.2,
+    identify=False,
+    factors=(0.01, 0.1, 1.0),
+    pictures=False,
+    tune=(),
+)
+
+
+def paper(plan: PaperPlan, out: Path, tell: Tell) -> dict[str, Any]:
+    """Do the paper into the folder `out` and return its document. Raises BadInput and AnswerIsNo."""
+    started = time.monotonic()
+    with Crew(tell, expected_s(plan)) as crew:
+        results = gather(plan, crew)
+        figures = document.shown(results)
+        if plan.pictures:
+            drawn = [crew.submit(f"{s.figure.name}", 1.5, draw, s.figure, out / document.PICTURES) for s in figures]
+            for picture in drawn:
+                crew.result(picture)
+    found = document.document(results, figures, time.monotonic() - started)
+    document.write(out, figures, found)
+    return found
+
+
+def expected_s(plan: PaperPlan) -> float:
+    """Sum of all weights below, for the progress."""
+    tracked = len(Row) * len(plan.joints) * _track_s(plan)
+    drawn = 1.5 * (14 + 8 * len(plan.joints)) if plan.pictures else 0.0
+    tuned = len(plan.tune) * (len(rivals.FAMILIES) * _TUNE_S + len(rivals.LABELS) * 2.0 * _SCORE_S)
+    return tracked + drawn + tuned + (45.0 if plan.identify else 6.0) * len(plan.joints) + 20.0
+
+
+def _track_s(plan: PaperPlan) -> float:
+    return 0.12 * (plan.seconds + 2.0 * plan.hold_s)
+
+
+def draw(figure: Figure, folder: Path) -> None:
+    """One figure as pictures: a job of the crew."""
+    write_pictures(figure, folder)
+
+
+def gather(plan: PaperPlan, crew: Crew) -> Results:
+    """Everything that is run; what needs an identification waits for it, all else goes on meanwhile."""
+    found = {joint: _found(plan, crew, joint) for joint in plan.joints}
+    tracked = {key: job for joint in plan.joints for key, job in _track_shipped(plan, crew, joint)}
+    swept = _sweep(plan, crew)
+    noise = crew.submit(
+        "noise on friction", 3.0, sweeps.under_noise, _noise_sets(), FRICTION.coulomb, plan.seconds, plan.seed
+    )
+    slips = {
+        beyond.EXPONENT: crew.submit("(18)", 1.0, equations.exponent_of_18, plan.seconds),
+        beyond.LITERAL_8: crew.submit("(8)", 1.0, equations.literal_8, plan.seconds),
+    }
+    solved = crew.submit("(12) to (15)", 3.0, programme.answers, plan.seconds)
+    sines = _sines(plan, crew)
+    designed = {joint: crew.result(job) for joint, job in found.items()}
+    tracked |= {key: job for joint, it in designed.items() for key, job in _track_found(plan, crew, joint, it)}
+    return Results(
+        plan.seed,
+        plan.seconds,
+        designed,
+        {key: crew.result(job) for key, job in tracked.items()},
+        {name: crew.result(job) for name, job in sines.items()},
+        {name: crew.result(job) for name, job in swept.items()},
+        crew.result(noise),
+        {name: crew.result(job) for name, job in slips.items()},
+        crew.result(solved),
+        {joint: _contenders(plan, crew, joint, designed[joint]) for joint in plan.tune if joint in designed},
+    )
+
+
+def _found(plan: PaperPlan, crew: Crew, joint: Joint) -> Future[Found]:
+    if plan.identify:
+        return crew.submit(f"{joint.label} identified", 45.0, experiments.identify_and_design, joint, plan.seed)
+    return crew.submit(f"{joint.label} designed for", 6.0, experiments.design_as_told, joint)
+
+
+def _contenders(plan: PaperPlan, crew: Crew, joint: Joint, found: Found) -> list[Contender]:
+    """Every rival tuned on what was found of the joint, each scored as soon as its law is done."""
+    cutoff_hz = cutoff_of(found.gains)
+    tuned = [
+        crew.submit(f"{names[0]} tuned", _TUNE_S, rivals.tuned_sets, found.model, names, cutoff_hz, plan.seed)
+        for names in rivals.FAMILIES
+    ]
+    scored = {
+        (feedback, name): crew.submit(
+            f"{name} scored", _SCORE_S, rivals.score, joint, name, feedback, gains, cutoff_hz, plan.seed, plan.seconds
+        )
+        for job in tuned
+        for (feedback, name), gains in crew.result(job).items()
+    }
+    return [crew.result(scored[feedback, name]) for feedback in Feedback for name in rivals.LABELS]
+
+
+Tracked = tuple[tuple[Joint, Row], Future[Measured]]
+
+
+def _track_shipped(plan: PaperPlan, crew: Crew, joint: Joint) -> Iterator[Tracked]:
+    """The paper's sets in all readings."""
+    sets = {row: shipped_set(name) for row, name in _SHIPPED.items()}
+    sets[Row.TABLE1_PRINTED_L] = printed_l(sets[Row.TABLE1])
+    yield from _track(plan, crew, joint, sets)
+
+
+def _track_found(plan: PaperPlan, crew: Crew, joint: Joint, found: Found) -> Iterator[Tracked]:
+    """The identified joint's sets: at the paper's feedback without options and with them, and as synthesized."""
+    equal = at_paper_feedback(found.gains, "equal")
+    plain = without_options(equal, "plain")
+    plain = with_l(plain, "plain", [PLAIN_L] * len(local_law(plain).friction.sets))
+    sets = {Row.LOCAL_PLAIN: plain, Row.LOCAL_EQUAL: equal, Row.DEPLOYED: found.gains}
+    yield from _track(plan, crew, joint, sets, cutoff_of(found.gains))
+
+
+def _track(
+    plan: PaperPlan, crew: Crew, joint: Joint, sets: dict[Row, GainSet], cutoff_hz: float | None = None
+) -> Iterator[Tracked]:
+    for row, gains in sets.items():
+        what = f"{row.label} on {joint.label}"
+        settings = (cutoff_hz or cutoff_of(gains), plan.seed, plan.seconds, plan.hold_s)
+        yield (joint, row), crew.submit(what, _track_s(plan), experiments.measure, joint, row.label, gains, *settings)
+
+
+def _sweep(plan: PaperPlan, crew: Crew) -> dict[str, Future[sweeps.SweepOfL]]:
+    table1 = shipped_set("table1_kz_kv_kx")
+    bases = {beyond.TABLE1_GAINS: table1, beyond.PD_GAINS: at_paper_feedback(table1, "pd_gains")}
+    return {
+        name: crew.submit(f"l with {name}", 3.0, sweeps.sweep_of_l, gains, plan.seconds, plan.factors)
+        for name, gains in bases.items()
+    }
+
+
+def _noise_sets() -> dict[str, GainSet]:
+    return {row.label: shipped_set(_SHIPPED[row]) for row in (Row.DOB, Row.LUGRE, Row.LUGRE_BETTER, Row.TABLE1)}
+
+
+def _sines(plan: PaperPlan, crew: Crew) -> dict[str, Future[Any]]:
+    """Fig. 9 to 12."""
+    table1, pd = shipped_set("table1_kz_kv_kx"), shipped_set("paper_pd")
+    noise_nm = NOISE_SHARE * FRICTION.coulomb
+    disturbed = motions.DISTURBED
+    return {
+        motions.PROPOSED: crew.submit("Fig. 9", 0.5, sweeps.on_sine, motions.PROPOSED, table1, plan.seconds),
+        motions.PD: crew.submit("Fig. 10", 0.5, sweeps.on_sine, motions.PD, pd, plan.seconds),
+        disturbed: crew.submit("Fig. 11", 0.5, sweeps.on_sine, disturbed, table1, plan.seconds, noise_nm, plan.seed),
+    }

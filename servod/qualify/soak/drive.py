@@ -1,0 +1,66 @@
+"""Checks of the drive's own record: torque only where a drive may have it, and how soon it was gone after a fault.
+
+Behind the virtual drive, which writes the record by itself; nothing here comes from the loop.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servod.drivers.virtual.drive_record import SAMPLE, DriveSample
+from servod.qualify.faults.judge import NO_TORQUE_NM, Reaction, reaction
+from servod.qualify.soak.finding import Findings, Wrong
+from servod.runtime.fieldbus.devices import DriveState
+
+Samples = NDArray[np.void]
+
+_CODES = {"q": "<i8", "H": "<u2", "h": "<i2", "d": "<f8"}
+SAMPLE_ROW = np.dtype(
+    [(name, _CODES[code]) for name, code in zip(DriveSample._fields, SAMPLE.format.lstrip("<"), strict=True)]
+)
+_ENERGISED = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE, DriveState.FAULT_REACTION_ACTIVE)
+
+
+def samples_of(raw: bytes) -> Samples:
+    """Packed samples of the drive's record."""
+    return np.frombuffer(raw, dtype=SAMPLE_ROW)
+
+
+def reaction_in(samples: Samples, injected_ns: int) -> Reaction:
+    """What the drive did after `injected_ns`, as the fault campaign judges it."""
+    after = samples[samples["time_ns"] >= injected_ns].tolist()
+    return reaction([DriveSample(time_ns, DriveState(state), *rest) for time_ns, state, *rest in after], injected_ns)
+
+
+class DriveCheck:
+    """Checks the samples of one drive; `samples` counts them."""
+
+    def __init__(self, torque_limit_nm: float, findings: Findings, order_ns: int = 0) -> None:
+        """`order_ns`: how far samples may stand out of order, where timers and frames are served on the wall clock."""
+        self._order_ns = order_ns
+        self._limit_nm, self._findings = torque_limit_nm * (1.0 + 1e-9), findings
+        self.samples = 0
+        self._time_ns = self._lost = 0
+
+    def check(self, samples: Samples, lost: int) -> None:
+        """One batch; `lost` samples so far were overwritten unread."""
+        self.samples += len(samples)
+        if lost > self._lost:
+            self._findings.add(Wrong.RECORDER, self._time_ns, f"{lost} samples of the drive's record were not read")
+            self._lost = lost
+        if not len(samples):
+            return
+        times_ns, torque_nm = samples["time_ns"], np.abs(samples["torque_nm"])
+        back = np.diff(times_ns, prepend=max(self._time_ns, int(times_ns[0]) - self._order_ns)) < -self._order_ns
+        self._first(Wrong.TIME, samples, back, "the drive's record goes back in time")
+        energised = np.isin(samples["state"], _ENERGISED)
+        self._first(Wrong.TORQUE, samples, ~energised & (torque_nm > NO_TORQUE_NM), "torque in a drive that is off")
+        self._first(Wrong.LIMIT, samples, torque_nm > self._limit_nm, "torque above the drive's maximum")
+        finite = np.isfinite(samples["position_rad"]) & np.isfinite(samples["velocity_rad_s"])
+        self._first(Wrong.NOT_FINITE, samples, ~finite, "the joint's motion is not finite")
+        self._time_ns = int(times_ns[-1])
+
+    def _first(self, wrong: Wrong, samples: Samples, where: NDArray[np.bool_], text: str) -> None:
+        if where.any():
+            self._findings.add(wrong, int(samples["time_ns"][int(np.argmax(where))]), text, int(where.sum()))

@@ -1,0 +1,168 @@
+"""Arguments of the control verbs as models: every key checked, one line for the first mistake.
+
+Between control server and verbs.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated, Any
+
+from pydantic import Field, model_validator
+
+from servod.client.control import PIECE_SAMPLES, SampleKey, Verb
+from servod.common.yaml import Strict, validate
+from servod.runtime.daemon.trajectory import Table
+from servod.runtime.loop.commands import ReferenceKind
+
+_Duration = Annotated[float, Field(gt=0.0, le=86_400.0)]
+
+
+class MotionKind(StrEnum):
+    """Reference motions by the names of the command line."""
+
+    SINE = "sine"
+    PAPER = "paper"
+    STEP = "step"
+    CSV = "csv"
+    EXCITE = "excite"
+
+
+#: Samples that stand in the request itself; more come ahead, with the verb `trajectory`.
+_Samples = Annotated[list[float], Field(min_length=1, max_length=PIECE_SAMPLES)]
+
+_NEEDS: dict[MotionKind, tuple[str, ...]] = {
+    MotionKind.SINE: ("amplitude_rad", "frequency_hz", "duration_s"),
+    MotionKind.PAPER: ("duration_s",),
+    MotionKind.STEP: ("amplitude_rad", "duration_s"),
+    MotionKind.CSV: ("positions_rad",),
+    MotionKind.EXCITE: ("positions_rad", "torques_nm", "window_rad"),
+}
+
+
+class NoArgs(Strict):
+    """Verbs without arguments."""
+
+
+class EnableArgs(Strict):
+    """`enable`; with `prove` the test of the wiring is repeated although it was passed."""
+
+    reset_fault: bool = False
+    prove: bool = False
+
+
+class HaltArgs(Strict):
+    """`halt`: true holds the reference, false goes on."""
+
+    on: bool = True
+
+
+class TrajectoryArgs(Strict):
+    """`trajectory`: a piece of the samples of the motion that comes next; `start` 0 begins the column anew."""
+
+    key: SampleKey
+    start: int = Field(ge=0)
+    samples: _Samples
+
+
+class TrackArgs(Strict):
+    """`track`: one motion, relative to the present reference; positions are one for each period of the loop.
+
+    With `uploaded: true` the samples are those that came ahead. With `start_immediately: false` the motion is only
+    checked against the limits.
+    """
+
+    kind: MotionKind
+    amplitude_rad: float | None = Field(None, ge=-1e4, le=1e4)
+    frequency_hz: float | None = Field(None, gt=0.0, le=500.0)
+    duration_s: _Duration | None = None
+    positions_rad: _Samples | None = None
+    torques_nm: _Samples | None = None
+    window_rad: float | None = Field(None, gt=0.0, le=1e4)
+    uploaded: bool = False
+    start_immediately: bool = True
+
+    @model_validator(mode="after")
+    def _has_what_its_kind_needs(self) -> TrackArgs:
+        ahead = tuple(SampleKey) if self.uploaded else ()
+        missing = [key for key in _NEEDS[self.kind] if key not in ahead and getattr(self, key) is None]
+        if missing:
+            raise ValueError(f"track {self.kind} with {', '.join(missing)}")
+        return self
+
+    @property
+    def has_table(self) -> bool:
+        """The motion reads samples."""
+        return self.kind in (MotionKind.CSV, MotionKind.EXCITE)
+
+    def table(self, uploaded: Table) -> Table:
+        """The motion's samples, or `uploaded` when they came ahead. Raises BadInput when they do not fit the kind."""
+        if not self.has_table:
+            return Table()
+        table = uploaded if self.uploaded else Table(self.positions_rad, self.torques_nm)
+        table.require(torques=self.kind is MotionKind.EXCITE)
+        return table
+
+    def reference(self, table: Table) -> list[float]:
+        """The arguments of Op.REFERENCE; the samples of `table` must stand in the trajectory area already."""
+        if not self.has_table:
+            return [ReferenceKind[self.kind.name], *(float(getattr(self, key)) for key in _NEEDS[self.kind])]
+        positions = table.positions
+        extent = [len(positions.values), positions.lowest, positions.highest]
+        if self.kind is MotionKind.CSV:
+            return [ReferenceKind.TABLE, *extent]
+        return [ReferenceKind.EXCITE, *extent, self.window_rad or 0.0]
+
+
+class GainsLoadArgs(Strict):
+    """`gains_load`: the YAML text of a gain set; `name` says in errors which one."""
+
+    name: str = Field(min_length=1, max_length=200)
+    text: str
+
+
+class GainsActivateArgs(Strict):
+    """`gains_activate`: a stored set, its newest version unless given.
+
+    With `trial` it runs only until its client says `gains_keep`; else, or when that client leaves, the set that was
+    active before runs again.
+    """
+
+    name: str = Field(min_length=1, max_length=200)
+    version: int | None = Field(None, ge=1)
+    trial: bool = False
+
+
+class GainsVerdictArgs(Strict):
+    """`gains_keep` and `gains_rollback`: what was measured and why, for the history of the store.
+
+    A `gains_rollback` with `trial` ends a trial and does nothing else.
+    """
+
+    note: str = Field("", max_length=4000)
+    figures: dict[str, float] = Field(default_factory=dict, max_length=64)
+    trial: bool = False
+
+
+class RecordStartArgs(Strict):
+    """`record_start`: a file in the recordings' directory, or a new name."""
+
+    path: str | None = Field(None, min_length=1, max_length=4096)
+
+
+_MODELS: dict[Verb, type[Strict]] = {
+    Verb.ENABLE: EnableArgs,
+    Verb.HALT: HaltArgs,
+    Verb.TRAJECTORY: TrajectoryArgs,
+    Verb.TRACK: TrackArgs,
+    Verb.GAINS_LOAD: GainsLoadArgs,
+    Verb.GAINS_ACTIVATE: GainsActivateArgs,
+    Verb.GAINS_KEEP: GainsVerdictArgs,
+    Verb.GAINS_ROLLBACK: GainsVerdictArgs,
+    Verb.RECORD_START: RecordStartArgs,
+}
+
+
+def check_arguments(verb: Verb, args: dict[str, Any]) -> Any:
+    """The verb's arguments as its model. Raises BadInput naming verb and key."""
+    return validate(args, _MODELS.get(verb, NoArgs), verb)

@@ -1,0 +1,265 @@
+"""Server side of the control socket: clients in, requests out, answers back, and never a moment of waiting.
+
+Runs inside the supervisor's event loop; sockets do not block. A client that is slow, broken or malicious loses its own
+connection and nothing else: lines, buffers, requests under way and the number of clients are bounded, in all and for
+each process, and so is what one round of the supervisor does for each client. Who may ask what:
+servod.runtime.daemon.lease.
+Protocol: servod.client.control.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import logging
+import os
+import selectors
+import socket
+import stat
+from pathlib import Path
+from typing import Any, Protocol
+
+from servod.client.control import READING, Verb, decode_line, encode_line
+from servod.common.errors import BadInput, ServodError, Unreachable
+from servod.formats.config import ControlConfig
+from servod.runtime.daemon.connection import Connection, Reply
+from servod.runtime.daemon.lease import STOPPING, Lease
+from servod.runtime.daemon.peer import group_id, may_command, peer_of
+from servod.runtime.daemon.places import Places
+from servod.runtime.daemon.status import LeaseStatus
+
+log = logging.getLogger("servod.control")
+
+_BACKLOG = 24
+#: Connections taken in one round: whoever wants to stop the axis stands behind no longer a queue.
+_ACCEPT_IN_A_ROUND = _BACKLOG
+#: Requests without an answer yet, of one client and of all; a stop has room beyond them.
+_UNDER_WAY_OF_A_CLIENT, _UNDER_WAY = 8, 64
+_STOPS_BEYOND = 32
+#: What is answered at once and never under way.
+_AT_ONCE = frozenset({Verb.STATUS, Verb.TRAJECTORY})
+_ROUND_NS = 20_000_000
+_LONGEST_NUMBER = 64
+
+
+class Handler(Protocol):
+    """What carries requests out; all methods return at once."""
+
+    def handle(self, verb: Verb, args: dict[str, Any], reply: Reply) -> None:
+        """Carry out one request; answers through `reply`, at once or later. May raise ServodError."""
+        ...
+
+    def status(self) -> dict[str, Any]:
+        """The status document for watchers."""
+        ...
+
+    def motion_running(self) -> bool:
+        """Whether a motion runs, or is on its way to the loop."""
+        ...
+
+    def lease_ended(self) -> None:
+        """The commanding client has gone: what it began and did not finish is void."""
+        ...
+
+
+class ControlServer:
+    """The listening socket and its clients."""
+
+    def __init__(self, config: ControlConfig, selector: selectors.BaseSelector, handler: Handler) -> None:
+        """Bind and listen. Raises Unreachable when that is refused. The caller holds the instance lock."""
+        self._path, self._selector, self._handler = config.socket, selector, handler
+        self._group = group_id(config.group)
+        self._places = Places()
+        self._lease = Lease(handler.motion_running)
+        self._under_way = self._accepted = 0
+        self._now_ns = self._next_round_ns = 0
+        self._listening = self._status_failed = False
+        self._listener = _listen(config.socket, self._group)
+        self._listen(True)
+
+    def tick(self, now_ns: int) -> None:
+        """A new round for every client, and what watchers are due; call it in every round of the event loop."""
+        self._now_ns = now_ns
+        if now_ns >= self._next_round_ns:
+            self._next_round_ns, self._accepted = now_ns + _ROUND_NS, 0
+            self._listen(True)
+            for client in list(self._places.clients):
+                client.begin_round(now_ns)
+        self._tell_watchers(now_ns)
+
+    def _tell_watchers(self, now_ns: int) -> None:
+        due = [c for c in self._places.clients if c.watch_due(now_ns)]
+        if not due:
+            return
+        try:
+            status = self._handler.status()
+        except Exception as error:  # whatever is wrong with the status, the event loop goes on
+            self._status_broke(due, error, now_ns)
+        else:
+            for client in due:
+                client.send_watch(lambda reply: reply.done(status), now_ns)
+
+    def _status_broke(self, due: list[Connection], error: Exception, now_ns: int) -> None:
+        """Tell the watchers; an error that is none of ours is logged, once."""
+        if not isinstance(error, ServodError) and not self._status_failed:
+            self._status_failed = True
+            log.error("the status cannot be made", exc_info=error)
+        for client in due:
+            client.send_watch(lambda reply: reply.failed(error), now_ns)
+
+    def lease(self) -> LeaseStatus:
+        """Who commands; pid 0 when nobody does."""
+        return self._lease.status()
+
+    @property
+    def held_bytes(self) -> int:
+        """Memory of all clients' buffers."""
+        return sum(client.held_bytes for client in self._places.clients)
+
+    def close(self, why: str = "servod ends") -> None:
+        """Hang up on everyone, with a line that says `why`, and remove the socket."""
+        for client in list(self._places.clients):
+            Reply(client.send, None).failed(Unreachable(why))
+            self.drop(client)
+        self._listen(False)
+        self._listener.close()
+        self._path.unlink(missing_ok=True)
+
+    def drop(self, client: Connection) -> None:
+        """Forget a client that has gone or must go; gives its lease back."""
+        self._places.leave(client)
+        client.close()
+        if self._lease.left(client):
+            self._handler.lease_ended()
+
+    def _listen(self, listening: bool) -> None:
+        """Hear of new clients, or let them queue."""
+        if listening and not self._listening:
+            self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
+        elif self._listening and not listening:
+            self._selector.unregister(self._listener)
+        self._listening = listening
+
+    def _accept(self, _events: int) -> None:
+        while self._accepted < _ACCEPT_IN_A_ROUND:
+            self._accepted += 1
+            try:
+                connection, _address = self._listener.accept()
+            except OSError:
+                return  # nobody waits, or descriptors ran out: nothing to hold against the axis
+            connection.setblocking(False)
+            self._admit(connection)
+        self._listen(False)
+
+    def _admit(self, connection: socket.socket) -> None:
+        """A place for a new client, or one line that says why not; what it sent with its connection is served now."""
+        peer = peer_of(connection)
+        try:
+            if not may_command(peer, self._group):
+                raise Unreachable(f"user {peer.uid} may not connect: not in the control group")
+            if leaves := self._places.make_room(peer, self._lease.holder, self._now_ns):
+                Reply(leaves.send, None).failed(Unreachable("idle for longest when others wanted its place"))
+                self.drop(leaves)
+        except Unreachable as error:
+            with contextlib.suppress(OSError):
+                Reply(lambda message: _send_once(connection, message), None).failed(error)
+            connection.close()
+            return
+        client = Connection(connection, self._selector, self, self._now_ns)
+        self._places.take(client)
+        client.read()
+
+    def dispatch(self, client: Connection, line: bytes) -> None:
+        """One request line: check it, check the right to ask it, and hand it on."""
+        reply = Reply(client.send, None)
+        try:
+            message = decode_line(line)
+            reply = Reply(client.send, _number(message))
+            verb, args = _request(message)
+            if (holder := self._lease.holder) is not None and holder is not client and holder.has_left():
+                self.drop(holder)
+            self._lease.take(client, verb)
+            if verb not in READING:
+                client.commanded_ns = self._now_ns
+            if verb is Verb.WATCH:
+                client.start_watch(args, reply)
+                return
+            reply = self._begin(client, verb, _number(message))
+            self._handler.handle(verb, args, reply)
+        except ServodError as error:
+            reply.failed(error)
+        except ValueError as error:
+            reply.failed(BadInput("request", str(error)[:200], "one JSON object per line"))
+        except Exception as error:  # one request ends, never the supervisor
+            log.error("a request failed", exc_info=error)
+            reply.failed(error)
+
+    def _begin(self, client: Connection, verb: Verb, number: int | str | None) -> Reply:
+        """The reply of a request that is now under way. Raises Unreachable when too many are."""
+        if verb in _AT_ONCE:
+            return Reply(client.send, number)
+        beyond = _STOPS_BEYOND if verb in STOPPING else 0
+        if client.under_way >= _UNDER_WAY_OF_A_CLIENT + beyond or self._under_way >= _UNDER_WAY + beyond:
+            raise Unreachable(f"{self._under_way} requests are under way; wait for their answers")
+        client.under_way += 1
+        self._under_way += 1
+
+        def ended() -> None:
+            client.under_way -= 1
+            self._under_way -= 1
+
+        return Reply(client.send, number, ended)
+
+
+def _send_once(connection: socket.socket, message: dict[str, Any]) -> None:
+    """One short line to somebody who gets no place; it fits into the empty buffer of a new connection."""
+    connection.send(encode_line(message))
+
+
+def _number(message: dict[str, Any]) -> int | str | None:
+    """The request's number, which goes back with the answer. Raises BadInput for anything else."""
+    number = message.get("id")
+    if number is None or (isinstance(number, int | str) and len(str(number)) <= _LONGEST_NUMBER):
+        return number
+    raise BadInput(
+        "request: id", repr(number)[:80], f"a whole number or a text of at most {_LONGEST_NUMBER} characters"
+    )
+
+
+def _request(message: dict[str, Any]) -> tuple[Verb, dict[str, Any]]:
+    name, args = message.get("verb"), message.get("args", {})
+    if not isinstance(args, dict):
+        raise BadInput("request: args", type(args).__name__, "an object")
+    try:
+        return Verb(str(name)), args
+    except ValueError:
+        raise BadInput("request: verb", repr(name)[:80], ", ".join(Verb)) from None
+
+
+def _listen(path: Path, group: int | None) -> socket.socket:
+    """Listen at `path`, for owner and group only, in place of a stale socket; whoever sees it can connect."""
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK)
+    aside = path.with_name(f"{path.name}+")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        aside.unlink(missing_ok=True)
+        _bind(listener, aside, group)
+        listener.listen(_BACKLOG)
+        if path.exists() and not stat.S_ISSOCK(path.stat().st_mode):
+            raise FileExistsError(errno.EEXIST, "a file that is no socket stands there")
+        aside.replace(path)
+    except OSError as error:
+        listener.close()
+        aside.unlink(missing_ok=True)
+        raise Unreachable(f"{path}: cannot listen there ({error.strerror or error})") from None
+    return listener
+
+
+def _bind(listener: socket.socket, path: Path, group: int | None) -> None:
+    before = os.umask(0o117)
+    try:
+        listener.bind(str(path))
+    finally:
+        os.umask(before)
+    if group not in (None, path.stat().st_gid) and (os.geteuid() == 0 or group in os.getgroups()):
+        os.chown(path, -1, group)

@@ -1,0 +1,175 @@
+"""The gain sets of a running axis: which stands behind the serial number in the cycle record, and changes between sets.
+
+Around the loop. The store (servod.formats.gains.store) keeps files; the bank knows what the loop runs now. A set
+becomes the
+store's active one only after the loop has taken it.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+from servod.common.errors import AnswerIsNo, BadInput, ServodError
+from servod.formats.config import AxisConfig
+from servod.formats.gains.gain_set import require_fit
+from servod.formats.gains.store import GainStore, StoredSet
+from servod.runtime.daemon.arguments import GainsActivateArgs, GainsLoadArgs, GainsVerdictArgs
+from servod.runtime.daemon.flows import Flow, FutureWait, Wait
+from servod.runtime.daemon.status import ControllerStatus
+from servod.runtime.loop.commands import Op
+
+log = logging.getLogger("servod.gains")
+
+_NO_TRIAL = "no gain set is on trial"
+#: Sends a command to the loop and gives what to wait for.
+SendOrder = Callable[[Op, Sequence[float]], Wait]
+
+
+class GainBank:
+    """The sets that ran since the daemon's start, by serial number."""
+
+    def __init__(self, config: AxisConfig) -> None:
+        """Open the store and choose the first set: the one active last, or gains.initial. Raises BadInput.
+
+        A set that this axis may not run any more, whatever the reason, gives way to gains.initial: the configuration
+        or the version of servod may have changed since it was activated, and the axis shall start all the same.
+        """
+        self._config = config
+        self._store = GainStore(config.gains.directory)
+        initial = self._store.load_file(config.gains.initial)
+        active = self._active_or(initial)
+        require_fit(active.gains, config)
+        log.info("gain set %s version %d (%s)", active.name, active.version, active.gains.law.name)
+        if warning := active.gains.certificate_warning():
+            log.warning("gain set %s version %d: %s", active.name, active.version, warning)
+        self._sets = {0: active}
+        self._last_serial = 0
+        self._tried: StoredSet | None = None
+
+    @property
+    def on_trial(self) -> bool:
+        """Whether the set that runs is only tried: the store's active one is another."""
+        return self._tried is not None
+
+    @property
+    def newest(self) -> StoredSet:
+        """The set that was sent to the loop last; before that the one it starts with, as serial 0."""
+        return self._sets[self._last_serial]
+
+    def describe(self, serial: int) -> ControllerStatus:
+        """The part of the status document."""
+        stored = self._sets.get(serial)
+        return {
+            "serial": serial,
+            "name": stored.name if stored else "unknown",
+            "law": stored.gains.law.name if stored else "unknown",
+        }
+
+    def load(self, args: GainsLoadArgs, slow: ThreadPoolExecutor) -> Flow:
+        """Check and store a set."""
+        stored = yield FutureWait(slow.submit(self._store.load, args.text, args.name))
+        return _row(stored)
+
+    def list(self, serial: int, slow: ThreadPoolExecutor) -> Flow:
+        """All stored versions, and which one runs."""
+        running = self._sets.get(serial)
+        stored = yield FutureWait(slow.submit(self._store.stored))
+        now = (running.name, running.version) if running else None
+        return {"gains": [{**_row(s), "active": (s.name, s.version) == now} for s in stored]}
+
+    def activate(self, args: GainsActivateArgs, send: SendOrder, slow: ThreadPoolExecutor) -> Flow:
+        """Change the running controller to a stored set, without a bump."""
+        stored: StoredSet = yield FutureWait(slow.submit(self._store.get, args.name, args.version))
+        yield from self._deploy(stored, send)
+        self._tried = stored if args.trial else None
+        if not args.trial:
+            yield from self._write(slow.submit(self._store.activate, stored.name, stored.version), stored, send, slow)
+        return _row(stored)
+
+    def keep(self, args: GainsVerdictArgs, send: SendOrder, slow: ThreadPoolExecutor) -> Flow:
+        """Make the set on trial the active one. Where the store cannot be written, the active one runs again."""
+        tried, self._tried = self._tried, None  # from here on nobody else ends the trial
+        if tried is None:
+            raise AnswerIsNo(_NO_TRIAL)
+        written = slow.submit(self._store.activate, tried.name, tried.version, args.note, args.figures)
+        yield from self._write(written, tried, send, slow)
+        return _row(tried)
+
+    def rollback(self, args: GainsVerdictArgs, send: SendOrder, slow: ThreadPoolExecutor) -> Flow:
+        """Go back to the set that was active before; from a trial, to the one that is."""
+        if self._tried is None and args.trial:
+            raise AnswerIsNo(_NO_TRIAL)
+        if self._tried is not None:
+            return (yield from self._reject(self._tried, args, send, slow))
+        stored: StoredSet = yield FutureWait(slow.submit(self._store.previous))
+        yield from self._deploy(stored, send)
+        yield from self._write(slow.submit(self._store.rollback), stored, send, slow)
+        return _row(stored)
+
+    def _active_or(self, initial: StoredSet) -> StoredSet:
+        """The stored active set where the axis may run it; else `initial`, which is active from then on."""
+        last = self._store.active_reference()
+        if last is None:
+            return self._store.activate(initial.name, initial.version)
+        try:
+            active = self._store.get(last.name, last.version)
+            require_fit(active.gains, self._config)
+        except BadInput as error:
+            log.warning(
+                "%s; %s version %d (gains.initial) runs in place of %s version %d. Set back what was changed and "
+                "`servoctl gains activate %s`, or make a set anew: `servoctl synthesize`, `verify`, `deploy`",
+                *(error, initial.name, initial.version, last.name, last.version, last.name),
+            )
+            return self._store.activate(initial.name, initial.version, f"in place of {last.name}: {error}")
+        return active
+
+    def _reject(self, tried: StoredSet, args: GainsVerdictArgs, send: SendOrder, slow: ThreadPoolExecutor) -> Flow:
+        """End a trial: the active set runs again."""
+        active = yield from self._back(send, slow)
+        yield FutureWait(slow.submit(self._store.reject, tried.name, tried.version, args.note, args.figures))
+        return active
+
+    def _write(self, written: Future[StoredSet], runs: StoredSet, send: SendOrder, slow: ThreadPoolExecutor) -> Flow:
+        """Wait until the store has the set that runs as its active one; when it cannot, the active one runs again.
+
+        Should that fail too, the set that runs is on trial, so that whoever leaves or rolls back goes back.
+        """
+        try:
+            yield FutureWait(written)
+        except (ServodError, OSError) as error:
+            log.error("gain set %s version %d runs and cannot be stored as active: %s", runs.name, runs.version, error)
+            self._tried = runs
+            yield from self._back(send, slow)
+            raise
+        return {}
+
+    def _back(self, send: SendOrder, slow: ThreadPoolExecutor) -> Flow:
+        """The store's active set runs again, and none is on trial."""
+        active: StoredSet | None = yield FutureWait(slow.submit(self._store.active))
+        assert active is not None  # the bank activated one when it began
+        yield from self._deploy(active, send)
+        self._tried = None
+        return _row(active)
+
+    def _deploy(self, stored: StoredSet, send: SendOrder) -> Flow:
+        """Send a set to the loop and wait until its records show that it runs."""
+        require_fit(stored.gains, self._config)
+        serial, parameters = self._last_serial + 1, stored.gains.pack()
+        yield send(Op.ACTIVATE, (serial, stored.gains.law.number, len(parameters), *parameters))
+        self._last_serial, self._sets[serial] = serial, stored
+        log.info("gain set %s version %d (%s) runs", stored.name, stored.version, stored.gains.law.name)
+        return {}
+
+
+def _row(stored: StoredSet) -> dict[str, Any]:
+    return {
+        "name": stored.name,
+        "version": stored.version,
+        "law": stored.gains.law.name,
+        "certified": stored.gains.certificate_problem() is None,
+        "sha256": stored.sha256,
+        "warning": stored.gains.certificate_warning() or "",
+    }

@@ -1,0 +1,247 @@
+"""The recorder: every cycle to a file on demand, and the last seconds before a fault without being asked.
+
+Beside the loop, fed by the supervisor with the records it drained. All file work happens in one thread of its own, so
+that a slow or full disk never holds up the supervisor; the way there is a bounded queue, and what does not fit is
+dropped, counted and reported as RECORDER_FAILED.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any, TypedDict, TypeVar
+
+from servod.common.errors import ServodError, Unreachable
+from servod.formats.config import RecorderConfig
+from servod.formats.recording.mcap_writer import McapFile, split_rows, wall_offset_ns
+from servod.runtime.daemon.recorder_files import RecordingFiles
+from servod.runtime.daemon.recorder_history import HistoryRing
+
+T = TypeVar("T")
+
+#: A file on disk is never older than this; kill -9 loses no more.
+SYNC_PERIOD_S = 0.5
+_QUEUE_BATCHES = 1024
+_KEPT_EVENTS = 256
+
+
+class RecorderState(TypedDict):
+    """What is being recorded: the file written now, and how much in all its parts; `failure` is empty while all is
+    well."""
+
+    recording: bool
+    path: str
+    records: int
+    bytes: int
+    dropped: int
+    history_s: float
+    failure: str
+
+
+class Recorder:
+    """Recordings of one axis; all methods are for the supervisor's thread and return at once."""
+
+    def __init__(self, config: RecorderConfig, axis_name: str, period_us: int) -> None:
+        self._files, self._history_s = RecordingFiles(config, axis_name), config.history_s
+        self._history = HistoryRing(round(config.history_s * 1e6 / period_us))
+        self._events: deque[dict[str, Any]] = deque(maxlen=_KEPT_EVENTS)
+        self._attachments: dict[str, bytes] = {}
+        self._attached: dict[str, bytes] = {}  # the same, in the writing thread
+        self._offset_ns = wall_offset_ns()
+        self._file: McapFile | None = None
+        self._first_part, self._full_records, self._full_bytes = Path(), 0, 0
+        self._path, self._records, self._bytes, self._dropped = "", 0, 0, 0
+        self._failure, self._new_failure = "", ""
+        self._jobs: queue.Queue[Callable[[], None] | None] = queue.Queue(_QUEUE_BATCHES)
+        self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
+        self._thread.start()
+
+    # --- supervisor's thread -------------------------------------------------------------------------------------
+    def add_rows(self, rows: Sequence[bytes]) -> None:
+        """Take packed cycle records, oldest first: into the history, and into the file when one is open."""
+        self._history.add(rows)
+        if rows and self._file is not None and not self._put(lambda: self._write_rows(rows)):
+            self._dropped += len(rows)
+            self._fail("the disk does not keep up; cycles were dropped")
+
+    def add_event(self, kind: str, text: str, **details: Any) -> None:
+        """Note something that happened (fault, command, node event); kept for fault files too."""
+        event = {"time_ns": time.monotonic_ns(), "kind": kind, "text": text, **details}
+        self._events.append(event)
+        self._put(lambda: self._write_event(event))
+
+    def set_attachment(self, name: str, data: bytes) -> None:
+        """Attach a file (config.yaml, gains.yaml, model.yaml) to every recording, the running one included."""
+        self._attachments[name] = data
+        self._put(lambda: self._attach(name, data))
+
+    def start(self, name: str | None = None) -> Future[Path]:
+        """Begin a recording in the configured directory; the future gives its path, or BadInput or Unreachable."""
+        attachments = dict(self._attachments)
+        return self._ask(lambda: self._open(self._files.recording(name), attachments))
+
+    def stop(self) -> Future[RecorderState]:
+        """End the recording; the future gives what was written."""
+        return self._ask(self._stop)
+
+    def write_fault_file(self, label: str) -> Future[Path]:
+        """Write the history, and the events so far, to a file of their own named after `label`."""
+        rows, events, attachments = self._history.snapshot(), list(self._events), dict(self._attachments)
+        return self._ask(lambda: self._write_history(label, rows, events, attachments))
+
+    def take_failure(self) -> str:
+        """Why recording failed since the last call; empty when it did not."""
+        failure, self._new_failure = self._new_failure, ""
+        return failure
+
+    def state(self) -> RecorderState:
+        """What `status` shows."""
+        return {
+            "recording": self._file is not None,
+            "path": self._path,
+            "records": self._records,
+            "bytes": self._bytes,
+            "dropped": self._dropped,
+            "history_s": self._history_s,
+            "failure": self._failure,
+        }
+
+    def close(self, timeout_s: float = 2.0) -> None:
+        """Finish what is queued and close the file; gives up on a disk that hangs after `timeout_s`."""
+        deadline = time.monotonic() + timeout_s
+        while not self._put(None) and time.monotonic() < deadline:
+            time.sleep(0.01)
+        self._thread.join(max(0.0, deadline - time.monotonic()))
+
+    def _put(self, job: Callable[[], None] | None) -> bool:
+        try:
+            self._jobs.put_nowait(job)
+        except queue.Full:
+            return False
+        return True
+
+    def _ask(self, job: Callable[[], T]) -> Future[T]:
+        future: Future[T] = Future()
+        if not self._put(lambda: _resolve(future, job)):
+            future.set_exception(Unreachable("recorder: the disk does not keep up"))
+        return future
+
+    def _fail(self, text: str) -> None:
+        if text != self._failure:
+            self._failure = self._new_failure = text
+
+    # --- writing thread ------------------------------------------------------------------------------------------
+    def _work(self) -> None:
+        synced = time.monotonic()
+        while True:
+            try:
+                job = self._jobs.get(timeout=SYNC_PERIOD_S)
+            except queue.Empty:
+                job = _nothing
+            if job is None:
+                break
+            self._guard(job)
+            if time.monotonic() - synced >= SYNC_PERIOD_S:
+                self._guard(self._sync)
+                synced = time.monotonic()
+        self._guard(self._finish)
+
+    def _guard(self, job: Callable[[], None]) -> None:
+        """Run one job; a disk that fails ends the recording, never the thread."""
+        try:
+            job()
+        except (OSError, ValueError) as error:
+            self._fail(f"{self._path}: {getattr(error, 'strerror', None) or error}")
+            if self._file is not None:
+                self._file.abandon()
+                self._file = None
+
+    def _write_rows(self, rows: Sequence[bytes]) -> None:
+        if self._file is not None:
+            self._file.write_rows(rows)
+
+    def _write_event(self, event: dict[str, Any]) -> None:
+        if self._file is not None:
+            self._file.write_event(event)
+
+    def _attach(self, name: str, data: bytes) -> None:
+        self._attached[name] = data
+        if self._file is not None:
+            self._file.attach(name, data)
+
+    def _sync(self) -> None:
+        if self._file is not None:
+            self._file.sync()
+            size = self._file.size_bytes()
+            self._records, self._bytes = self._full_records + self._file.records, self._full_bytes + size
+            if size >= self._files.max_bytes:
+                self._go_on_in_a_new_file(self._file)
+
+    def _go_on_in_a_new_file(self, full: McapFile) -> None:
+        path = self._files.next_part(self._first_part)
+        full.close()
+        self._full_records, self._full_bytes = self._records, self._full_bytes + full.path.stat().st_size
+        self._file = McapFile(path, self._attached, self._offset_ns)
+        self._path = str(path)
+
+    def _finish(self) -> None:
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def _open(self, path: Path, attachments: dict[str, bytes]) -> Path:
+        if self._file is not None:
+            raise Unreachable(f"recorder: already records to {self._path}; `servoctl record stop` ends it")
+        self._file = _create(path, attachments, self._offset_ns)
+        self._first_part, self._full_records, self._full_bytes = path, 0, 0
+        self._path, self._records, self._bytes, self._dropped, self._failure = str(path), 0, 0, 0, ""
+        return path
+
+    def _stop(self) -> RecorderState:
+        if self._file is not None:
+            self._sync()
+            self._finish()
+        return self.state()
+
+    def _write_history(
+        self, label: str, rows: bytes, events: list[dict[str, Any]], attachments: dict[str, bytes]
+    ) -> Path:
+        path = self._files.fault(label)
+        file = _create(path, attachments, self._offset_ns)
+        try:
+            file.write_rows(split_rows(rows))
+            for event in events:
+                file.write_event(event)
+            file.close()
+        except OSError as error:
+            file.abandon()
+            raise Unreachable(f"{path}: {error.strerror or error}") from None
+        self._files.drop_old_fault_files()
+        return path
+
+
+def _create(path: Path, attachments: dict[str, bytes], offset_ns: int) -> McapFile:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return McapFile(path, attachments, offset_ns)
+    except OSError as error:
+        raise Unreachable(f"{path}: {error.strerror or error}") from None
+
+
+def _resolve(future: Future[T], job: Callable[[], T]) -> None:
+    try:
+        future.set_result(job())
+    except ServodError as error:
+        future.set_exception(error)
+    except (OSError, ValueError) as error:
+        future.set_exception(Unreachable(f"recorder: {error}"))
+        raise
+
+
+def _nothing() -> None:
+    """Stands for a job when the queue was empty."""

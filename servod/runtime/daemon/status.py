@@ -1,0 +1,249 @@
+"""The status document: state, goal, reasons and health of the axis in one dictionary, as `status` and `watch` give it.
+
+Around the loop: reads the newest cycle record and what the supervisor knows. Enums become their names here and faults
+their rows of the fault table, so that readers need no tables of their own.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, TypedDict
+
+from servod.common.errors import Fault, faults_in
+from servod.formats.config import BusConfig
+from servod.formats.recording.record import CycleRecord
+from servod.runtime.daemon.recorder import RecorderState
+from servod.runtime.fieldbus.devices import REASON_TEXT, DriveState, Goal, Reason
+from servod.runtime.loop.axis import AxisState
+
+
+class AxisStatus(TypedDict):
+    """What the axis is, what it shall be, and why it is not there yet."""
+
+    state: str
+    goal: str
+    goal_reached: bool
+    reasons: list[str]
+    motion_running: bool
+
+
+class DriveStatus(TypedDict):
+    """The amplifier as its status word and error code say; ages in cycles."""
+
+    state: str
+    status_word: str
+    mode: int
+    error_code: str
+    feedback_age_cycles: int
+    encoder_age_cycles: int
+
+
+class MotionStatus(TypedDict):
+    """Positions in rad, velocity in rad/s, torques in N*m, all at the joint; None is not finite (JSON has no NaN)."""
+
+    reference_rad: float | None
+    position_rad: float | None
+    following_error_rad: float | None
+    velocity_rad_s: float | None
+    motor_position_rad: float | None
+    torque_nm: float | None
+    torque_actual_nm: float | None
+    torque_feedback_nm: float | None
+    torque_friction_nm: float | None
+    torque_other_nm: float | None
+    friction_state_rad: float | None
+    disturbance_nm: float | None
+
+
+class FaultStatus(TypedDict):
+    """One latched fault with its row of the fault table; `present` when its cause still stands."""
+
+    code: str
+    present: bool
+    reaction: str
+    cause: str
+    remedy: str
+
+
+class Percentiles(TypedDict):
+    """Distribution over the last seconds, in microseconds."""
+
+    p50_us: float
+    p99_us: float
+    max_us: float
+
+
+class TimingStatus(TypedDict):
+    """How the loop keeps time: `lag` wake-up after the deadline, `tick` its work, `torque` deadline to torque frame."""
+
+    period_us: int
+    window_s: float
+    cycle: int
+    missed: int
+    records_lost: int
+    lag: Percentiles
+    tick: Percentiles
+    torque: Percentiles
+
+
+class ControllerStatus(TypedDict):
+    """The active gain set."""
+
+    serial: int
+    name: str
+    law: str
+
+
+class BusStatus(TypedDict):
+    """The bus as configured and as it does; `load` is the computed share of the bit rate."""
+
+    interface: str
+    channel: str
+    load: float
+    max_load: float
+    queue_full: int
+    error_frames: int
+    late_frames: int
+    ignored_frames: int
+
+
+class NodeStatus(TypedDict):
+    """One node and the last thing it was seen to do."""
+
+    node_id: int
+    role: str
+    driver: str
+    state: str
+
+
+class GrantStatus(TypedDict):
+    """One thing asked of the operating system for real time, and whether it was given."""
+
+    name: str
+    granted: bool
+    reason: str
+
+
+class LoopStatus(TypedDict):
+    """The loop process."""
+
+    pid: int
+
+
+class LeaseStatus(TypedDict):
+    """The client that commands; pid 0 when none does."""
+
+    pid: int
+    uid: int
+
+
+class WiringStatus(TypedDict):
+    """Tests of the wiring since the start; `last` is servod.runtime.loop.wiring.findings.document, None before the
+    first enable."""
+
+    tests: int
+    last: dict[str, Any] | None
+
+
+class Status(TypedDict):
+    """The whole document."""
+
+    name: str
+    version: str
+    uptime_s: float
+    axis: AxisStatus
+    drive: DriveStatus
+    motion: MotionStatus
+    faults: list[FaultStatus]
+    wiring: WiringStatus
+    controller: ControllerStatus
+    loop: LoopStatus
+    timing: TimingStatus
+    bus: BusStatus
+    nodes: list[NodeStatus]
+    grants: list[GrantStatus]
+    recorder: RecorderState
+    lease: LeaseStatus
+
+
+_PROVING = "wiring is being proven"
+
+
+def axis_status(record: CycleRecord) -> AxisStatus:
+    """State, goal and reasons of one cycle."""
+    proving = record.axis_state == AxisState.PROVING  # the drive has its power; the axis is not there yet
+    return {
+        "state": AxisState(record.axis_state).name,
+        "goal": Goal(record.goal).name,
+        "goal_reached": bool(record.goal_reached) and not proving,
+        "reasons": [_PROVING] * proving + reason_texts(record.reasons),
+        "motion_running": bool(record.reference_active),
+    }
+
+
+def reason_texts(reasons: int) -> list[str]:
+    """The sentences of the bits in `reasons` (servod.runtime.fieldbus.devices.Reason)."""
+    return [text for bit, text in REASON_TEXT.items() if Reason(reasons) & bit]
+
+
+def drive_status(record: CycleRecord) -> DriveStatus:
+    """What the amplifier said, with the ages of both feedbacks."""
+    return {
+        "state": DriveState(record.drive_state).name,
+        "status_word": f"0x{record.status_word & 0xFFFF:04X}",
+        "mode": record.mode,
+        "error_code": f"0x{record.drive_error & 0xFFFF:04X}",
+        "feedback_age_cycles": record.amplifier_age,
+        "encoder_age_cycles": record.encoder_age,
+    }
+
+
+def motion_status(record: CycleRecord) -> MotionStatus:
+    """Reference, feedback and the parts of the torque."""
+    return {
+        "reference_rad": _finite(record.reference_rad),
+        "position_rad": _finite(record.position_rad),
+        "following_error_rad": _finite(record.reference_rad - record.position_rad),
+        "velocity_rad_s": _finite(record.velocity_rad_s),
+        "motor_position_rad": _finite(record.motor_position_rad),
+        "torque_nm": _finite(record.torque_nm),
+        "torque_actual_nm": _finite(record.torque_actual_nm),
+        "torque_feedback_nm": _finite(record.torque_feedback_nm),
+        "torque_friction_nm": _finite(record.torque_friction_nm),
+        "torque_other_nm": _finite(record.torque_other_nm),
+        "friction_state_rad": _finite(record.friction_state),
+        "disturbance_nm": _finite(record.disturbance_nm),
+    }
+
+
+def bus_status(bus: BusConfig, load: float, record: CycleRecord) -> BusStatus:
+    """The bus as configured, and its counters."""
+    return {
+        "interface": bus.interface,
+        "channel": bus.channel,
+        "load": load,
+        "max_load": bus.max_load,
+        "queue_full": record.bus_queue_full,
+        "error_frames": record.bus_error_frames,
+        "late_frames": record.late_frames,
+        "ignored_frames": record.ignored_frames,
+    }
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def fault_status(record: CycleRecord) -> list[FaultStatus]:
+    """The latched faults, in table order."""
+    return [_fault_row(f, record.faults) for f in faults_in(record.faults_latched | record.faults)]
+
+
+def _fault_row(fault: Fault, present: int) -> FaultStatus:
+    return {
+        "code": fault.code.name,
+        "present": bool(present & fault.bit),
+        "reaction": fault.reaction.name,
+        "cause": fault.cause,
+        "remedy": fault.remedy,
+    }

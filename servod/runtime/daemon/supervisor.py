@@ -1,0 +1,233 @@
+"""The supervisor's event loop: what the loop process wrote comes in, what people want goes out, nothing ever waits.
+
+Around the loop. One round every TICK_S: records to recorder, metrics, health and faults; node events to the loop;
+requests a step further; watchdog and status line to systemd, fed only while the loop's cycle counter advances.
+"""
+
+from __future__ import annotations
+
+import logging
+import selectors
+import time
+from concurrent.futures import Future
+from typing import Any
+
+from servod import __version__
+from servod.common.errors import FAULTS, FaultCode, Unreachable
+from servod.common.units import NS_PER_S
+from servod.formats.config import AxisConfig
+from servod.formats.recording.record import RECORD, CycleRecord
+from servod.runtime.daemon.control_server import ControlServer
+from servod.runtime.daemon.fault_watch import FaultWatch
+from servod.runtime.daemon.gain_bank import GainBank
+from servod.runtime.daemon.health import Health, Pulse
+from servod.runtime.daemon.metrics import AxisMetrics, MetricsServer
+from servod.runtime.daemon.nodes import FaultRelay, Nodes
+from servod.runtime.daemon.notify import Notifier
+from servod.runtime.daemon.proof_watch import ProofWatch
+from servod.runtime.daemon.recorder import Recorder
+from servod.runtime.daemon.status import Status, axis_status, bus_status, drive_status, fault_status, motion_status
+from servod.runtime.daemon.verbs import Verbs
+from servod.runtime.loop.axis import AxisState
+from servod.runtime.loop.cycle import GOODBYE_TIMEOUT_CYCLES
+from servod.runtime.loop.handle import LoopHandle
+
+log = logging.getLogger("servod")
+
+TICK_S = 0.02
+#: For an orderly end, on top of what loop and drive may take.
+_STOP_MARGIN_S = 2.0
+_STATUS_NS = NS_PER_S
+_TEXTFILE_NS = 5 * NS_PER_S
+_STAYS_POWERED = FAULTS[FaultCode.DRIVE_STAYS_POWERED].bit
+
+
+class Supervisor:
+    """One running axis; `run` returns the exit code."""
+
+    def __init__(
+        self,
+        config: AxisConfig,
+        nodes: Nodes,
+        loop: LoopHandle,
+        bank: GainBank,
+        recorder: Recorder,
+        notifier: Notifier,
+    ) -> None:
+        """The nodes are up and the loop runs. Raises Unreachable or BadInput when a socket cannot be opened."""
+        self._config, self._nodes, self._loop = config, nodes, loop
+        self._bank, self._recorder, self._notifier = bank, recorder, notifier
+        self._started = time.monotonic()
+        self._stopping = self._textfile_failed = False
+        self._told_off = False
+        self._why_ends = "servod was asked to end"
+        self._relay = FaultRelay(loop.send)
+        self._fed_cycle = -1
+        self._next_feed_ns = self._next_status_ns = self._next_textfile_ns = 0
+        self._pulse = Pulse(config.cycle.period_us)
+        self._health = Health(config.cycle.period_us, nodes.plans.bus_load)
+        self._metrics = AxisMetrics(config.name, nodes.plans.bus_load)
+        self._faults = FaultWatch(recorder, self._health, self._metrics)
+        self._proofs = ProofWatch(loop, recorder)
+        self._verbs = Verbs(config, loop, bank, recorder, self._document)
+        self._selector = selectors.DefaultSelector()
+        self._server = ControlServer(config.control, self._selector, self._verbs)
+        self._metrics_server = MetricsServer(config.metrics, self._metrics)
+
+    def request_stop(self) -> None:
+        """Ask for an orderly end; for signal handlers."""
+        self._stopping = True
+
+    def run(self) -> int:
+        """Supervise until asked to stop (0) or until the loop is lost (3)."""
+        self._notifier.ready(f"{self._config.name}: the loop runs, the axis is disabled")
+        try:
+            while not self._stopping:
+                for key, events in self._selector.select(TICK_S):
+                    key.data(events)
+                    self._loop.feed()  # many clients at once are no sign of a supervisor that hangs
+                self._round(time.monotonic_ns())
+                if self._loop_is_lost():
+                    return self._lose_loop()
+            return self._stop()
+        finally:
+            self._close()
+
+    def _round(self, now_ns: int) -> None:
+        """Everything that is done once per round."""
+        self._loop.feed()
+        records = self._take_records(now_ns)
+        self._pulse.look(bool(records), now_ns)
+        self._take_node_events()
+        self._switch_off_if_disobeyed(records)
+        self._verbs.tick(records, now_ns)
+        self._faults.tick(now_ns)
+        self._proofs.see()
+        self._server.tick(now_ns)
+        self._tell_manager(now_ns)
+        self._write_textfile(now_ns)
+
+    def _take_records(self, now_ns: int) -> list[CycleRecord]:
+        rows = self._loop.drain()
+        records = [CycleRecord._make(values) for values in RECORD.iter_unpack(b"".join(rows))]
+        self._recorder.add_rows(rows)
+        self._health.add(records)
+        self._metrics.count(records)
+        self._metrics.records_lost = self._loop.lost
+        self._faults.see(records, now_ns)
+        if failure := self._recorder.take_failure():
+            self._faults.raise_own(FaultCode.RECORDER_FAILED, failure)
+        return records
+
+    def _take_node_events(self) -> None:
+        """Node events become faults of the loop, which reacts in its next cycle."""
+        for event in self._nodes.events():
+            log.error("%s (%s)", event.text, event.fault.name)
+            self._recorder.add_event("node", event.text, node_id=event.node_id, fault=event.fault.name)
+            self._relay.add(event.fault)
+        self._relay.flush()
+
+    def _switch_off_if_disobeyed(self, records: list[CycleRecord]) -> None:
+        """The loop's goal OFF did not reach the drive: by SDO and NMT, once. A drive that answers neither holds this
+        up for longer than the loop waits for us; it then ends, which is all that is left to do."""
+        if self._told_off or not any(record.faults & _STAYS_POWERED for record in records):
+            return
+        self._told_off = True
+        log.error("the drive stays powered: switching it off by SDO and NMT pre-operational")
+        self._nodes.switch_off()
+
+    def _tell_manager(self, now_ns: int) -> None:
+        """Feed the watchdog only when the loop has gone on since the last time."""
+        latest = self._loop.latest
+        if self._notifier.watchdog_ns and now_ns >= self._next_feed_ns and latest and latest.cycle != self._fed_cycle:
+            self._fed_cycle = latest.cycle
+            self._next_feed_ns = now_ns + self._notifier.watchdog_ns // 4
+            self._notifier.alive()
+        if now_ns >= self._next_status_ns and latest:
+            self._next_status_ns = now_ns + _STATUS_NS
+            self._notifier.status(f"{AxisState(latest.axis_state).name}; {self._health.line()}")
+
+    def _write_textfile(self, now_ns: int) -> None:
+        if self._config.metrics.textfile is not None and now_ns >= self._next_textfile_ns:
+            self._next_textfile_ns = now_ns + _TEXTFILE_NS
+            self._verbs.slow.submit(self._metrics_server.write_textfile).add_done_callback(self._textfile_written)
+
+    def _textfile_written(self, future: Future[None]) -> None:
+        """Tell of a textfile that cannot be written, once."""
+        error = None if future.cancelled() else future.exception()
+        if error and not self._textfile_failed:
+            log.warning("metrics.textfile %s: %s", self._config.metrics.textfile, error)
+        self._textfile_failed = error is not None
+
+    def _loop_is_lost(self) -> bool:
+        """It died or hangs. The service manager's SIGTERM reaches both of us: then an orderly end is none."""
+        if self._stopping and self._loop.exit_code == 0:
+            return False
+        return not self._loop.alive() or self._pulse.stopped
+
+    def _lose_loop(self) -> int:
+        """The loop died or hangs: the drive off before anything else, then tell, then end for systemd to restart."""
+        hung = self._loop.alive()
+        self._nodes.switch_off()
+        exit_code = self._loop.stop(0.0)
+        self._take_records(time.monotonic_ns())
+        words = " / ".join(self._loop.last_words().strip().splitlines()[-3:])
+        detail = "it hung" if hung else f"exit code {exit_code}"
+        self._why_ends = f"servod ends, since the loop was lost: {detail}"
+        self._faults.raise_own(FaultCode.LOOP_LOST, f"{detail}{': ' + words if words else ''}")
+        self._faults.write_file(FaultCode.LOOP_LOST.name)
+        return Unreachable.exit_code
+
+    def _stop(self) -> int:
+        """Orderly end: the loop brakes, ramps down and disables, the nodes go pre-operational."""
+        log.info("stopping: braking, ramping down and disabling")
+        timeout_s = self._stop_timeout_s()
+        self._notifier.stopping(timeout_s + _STOP_MARGIN_S)
+        exit_code = self._loop.stop(timeout_s)
+        self._take_records(time.monotonic_ns())
+        if exit_code != 0:
+            self._nodes.switch_off()
+            log.error("the loop did not see the drive off (exit code %d); 0x1016 is left as it is", exit_code)
+            return Unreachable.exit_code
+        self._nodes.stand_down()
+        log.info("stopped; the axis is disabled")
+        return 0
+
+    def _stop_timeout_s(self) -> float:
+        """Braking and ramping, or the drive's quick stop, and then the wait for a drive that shall show it is off."""
+        goodbye_s = GOODBYE_TIMEOUT_CYCLES * self._config.cycle.period_us * 1e-6
+        motion_s = 2.0 * self._config.limits.ramp_down_s + self._config.amplifier.enable_timeout_s
+        return motion_s + goodbye_s + _STOP_MARGIN_S
+
+    def _close(self) -> None:
+        self._server.close(self._why_ends)
+        self._verbs.close()
+        self._faults.finish()
+        self._recorder.close()
+        self._metrics_server.close()
+        self._selector.close()
+
+    def _document(self) -> dict[str, Any]:
+        """The status document (servod.runtime.daemon.status.Status)."""
+        latest = self._loop.latest
+        if latest is None:
+            raise Unreachable("the loop has not begun")
+        document: Status = {
+            "name": self._config.name,
+            "version": __version__,
+            "uptime_s": time.monotonic() - self._started,
+            "axis": axis_status(latest),
+            "drive": drive_status(latest),
+            "motion": motion_status(latest),
+            "faults": fault_status(latest),
+            "wiring": self._proofs.status(),
+            "controller": self._bank.describe(latest.controller),
+            "loop": {"pid": self._loop.pid},
+            "timing": self._health.timing(self._loop.lost),
+            "bus": bus_status(self._config.bus, self._nodes.plans.bus_load, latest),
+            "nodes": self._nodes.status(),
+            "grants": [{"name": g.name, "granted": g.granted, "reason": g.reason} for g in self._loop.grants],
+            "recorder": self._recorder.state(),
+            "lease": self._server.lease(),
+        }
+        return dict(document)

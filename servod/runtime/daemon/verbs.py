@@ -1,0 +1,316 @@
+"""What each verb of the control socket does: arguments checked, commands sent to the loop, the answer awaited.
+
+Around the loop, between control server and loop handle. Nothing here blocks: what takes time is a flow, and disk or bus
+work runs in one slow thread.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
+from typing import Any
+
+from servod.client.control import Verb
+from servod.common.clock import WallClock
+from servod.common.errors import FAULTS, AnswerIsNo, FaultCode, Unreachable, faults_in
+from servod.common.units import NS_PER_S
+from servod.formats.config import AxisConfig
+from servod.formats.recording.record import CycleRecord
+from servod.runtime.daemon.arguments import (
+    EnableArgs,
+    GainsActivateArgs,
+    GainsLoadArgs,
+    GainsVerdictArgs,
+    HaltArgs,
+    NoArgs,
+    RecordStartArgs,
+    TrackArgs,
+    TrajectoryArgs,
+    check_arguments,
+)
+from servod.runtime.daemon.connection import Reply
+from servod.runtime.daemon.flows import Flow, Flows, FutureWait, Orders, OrderWait, StateWait
+from servod.runtime.daemon.gain_bank import GainBank
+from servod.runtime.daemon.recorder import Recorder
+from servod.runtime.daemon.status import reason_texts
+from servod.runtime.daemon.trajectory import Table, check_motion
+from servod.runtime.fieldbus.bus.open import open_bus
+from servod.runtime.fieldbus.devices import DriveState
+from servod.runtime.fieldbus.master.scan import scan
+from servod.runtime.loop.axis import AxisState
+from servod.runtime.loop.commands import REFUSAL_TEXT, Op, Refusal
+from servod.runtime.loop.handle import LoopHandle
+from servod.runtime.loop.wiring.findings import document, sentence
+
+log = logging.getLogger("servod.control")
+
+_ON_THE_WAY = (AxisState.ENABLING, AxisState.PROVING)
+_UNDER_WAY = (*_ON_THE_WAY, AxisState.ENABLED)
+_NOT_PROVEN = FAULTS[FaultCode.WIRING_NOT_PROVEN].bit
+_STOPPED = (AxisState.DISABLED, AxisState.FAULT)
+_UNPOWERED = (
+    DriveState.NOT_READY_TO_SWITCH_ON,
+    DriveState.SWITCH_ON_DISABLED,
+    DriveState.READY_TO_SWITCH_ON,
+    DriveState.SWITCHED_ON,
+    DriveState.FAULT,
+)
+_STOP_TIMEOUT_S = 5.0
+_LEFT = GainsVerdictArgs(note="the client that tried it left", trial=True)
+
+
+class Verbs:
+    """Carries out requests on one running axis."""
+
+    def __init__(
+        self,
+        config: AxisConfig,
+        loop: LoopHandle,
+        bank: GainBank,
+        recorder: Recorder,
+        document: Callable[[], dict[str, Any]],
+    ) -> None:
+        """`document` makes the status document."""
+        self._config, self._loop, self._bank, self._recorder = config, loop, bank, recorder
+        self._document = document
+        self._orders, self._flows = Orders(), Flows()
+        self._last: tuple[Op, OrderWait] | None = None
+        self._uploaded = Table()
+        self._reference_seq = 0  # the last motion's command
+        self._leases_ended = 0
+        self._enabling = 0  # requests to enable an axis that was off, without an answer yet
+        self.slow = ThreadPoolExecutor(max_workers=1, thread_name_prefix="slow")
+        self._table: dict[Verb, Callable[[Any], Flow]] = {
+            Verb.STATUS: self._status,
+            Verb.ENABLE: self._enable,
+            Verb.DISABLE: self._disable,
+            Verb.STOP: self._stop,
+            Verb.HALT: self._halt,
+            Verb.TRAJECTORY: self._trajectory,
+            Verb.TRACK: self._track,
+            Verb.GAINS_LOAD: self._gains_load,
+            Verb.GAINS_LIST: self._gains_list,
+            Verb.GAINS_ACTIVATE: self._gains_activate,
+            Verb.GAINS_KEEP: self._gains_keep,
+            Verb.GAINS_ROLLBACK: self._gains_rollback,
+            Verb.RECORD_START: self._record_start,
+            Verb.RECORD_STOP: self._record_stop,
+            Verb.SCAN: self._scan,
+        }
+
+    def handle(self, verb: Verb, args: dict[str, Any], reply: Reply) -> None:
+        """Begin one request; raises BadInput on arguments that do not fit."""
+        self._flows.start(self._table[verb](check_arguments(verb, args)), reply)
+
+    def status(self) -> dict[str, Any]:
+        """The status document."""
+        return self._document()
+
+    def motion_running(self) -> bool:
+        """A motion runs, or its command is on the way; until then the trajectory area must not change."""
+        record = self._loop.latest
+        return record is not None and (record.command_seq < self._reference_seq or bool(record.reference_active))
+
+    def lease_ended(self) -> None:
+        """Samples that the client sent ahead are void, a gain set that it tried is not kept, nor is an axis enabled
+        that it waited for."""
+        self._uploaded = Table()
+        self._leases_ended += 1
+        if self._enabling:
+            log.warning("the client that waited for the axis to be enabled left: disabled again")
+            self._flows.start(self._disable(NoArgs()), Reply(lambda _answer: None, None))
+        if self._bank.on_trial:
+            self._flows.start(self._gains_rollback(_LEFT), Reply(lambda _answer: None, None))
+
+    def tick(self, records: list[CycleRecord], now_ns: int) -> None:
+        """Go on with everything that waited for these records, or for time."""
+        self._orders.see(records, now_ns)
+        self._flows.poll(now_ns)
+
+    def close(self) -> None:
+        """Give up what has not begun."""
+        self.slow.shutdown(wait=False, cancel_futures=True)
+
+    # --- small tools of the flows --------------------------------------------------------------------------------
+    def _send(self, op: Op, arguments: Sequence[float] = ()) -> OrderWait:
+        seq = self._loop.send(op, arguments)
+        self._recorder.add_event("command", op.name.lower(), arguments=list(arguments[:8]))
+        self._last = op, self._orders.expect(seq, time.monotonic_ns())
+        return self._last[1]
+
+    def _send_stop(self, op: Op) -> OrderWait:
+        """Of stops one after the other one is enough: nobody fills the queue so that another finds no room."""
+        if self._last is not None:
+            op_before, wait = self._last
+            if op is op_before and not wait.ready(time.monotonic_ns()):
+                return wait
+        return self._send(op)
+
+    def _latest(self) -> CycleRecord | None:
+        return self._loop.latest
+
+    def _until(self, reached: Callable[[CycleRecord], bool], timeout_s: float) -> StateWait:
+        return StateWait(self._latest, reached, time.monotonic_ns() + int(timeout_s * NS_PER_S))
+
+    # --- the verbs -----------------------------------------------------------------------------------------------
+    def _status(self, _args: NoArgs) -> Flow:
+        yield from ()
+        return self._document()
+
+    def _enable(self, args: EnableArgs) -> Flow:
+        record = self._loop.latest
+        from_off = int(record is None or record.axis_state not in _UNDER_WAY)
+        self._enabling += from_off
+        try:
+            return (yield from self._enable_and_wait(args))
+        finally:
+            self._enabling -= from_off
+
+    def _enable_and_wait(self, args: EnableArgs) -> Flow:
+        tests_before, _ = self._loop.proofs
+        yield self._send(Op.ENABLE, (float(args.reset_fault), float(args.prove)))
+        timeout_s = self._config.amplifier.enable_timeout_s + self._config.wiring_proof.timeout_s + 1.0
+        record: CycleRecord = yield self._until(lambda r: r.axis_state not in _ON_THE_WAY, timeout_s)
+        tests, proof = self._loop.proofs
+        tested = proof if tests != tests_before else None
+        if record.axis_state == AxisState.ENABLED:
+            return {**_state(record), "wiring": document(tested) if tested else None}
+        state = AxisState(record.axis_state).name
+        if tested is not None and record.faults_latched & _NOT_PROVEN:
+            raise AnswerIsNo(f"the axis is {state}, not enabled: {sentence(tested)}")
+        raise Unreachable(f"the axis is {state}, not enabled: {_why_not_enabled(record)}")
+
+    def _disable(self, _args: NoArgs) -> Flow:
+        yield self._send_stop(Op.DISABLE)
+        return (yield from self._until_off(2.0 * self._config.limits.ramp_down_s))
+
+    def _stop(self, _args: NoArgs) -> Flow:
+        yield self._send_stop(Op.QUICK_STOP)
+        return (yield from self._until_off(self._config.amplifier.enable_timeout_s))
+
+    def _until_off(self, usual_s: float) -> Flow:
+        """Done only when the axis has stopped and the drive itself was seen without power."""
+        record: CycleRecord = yield self._until(_is_off, usual_s + _STOP_TIMEOUT_S)
+        if not _is_off(record):
+            axis, drive = AxisState(record.axis_state).name, DriveState(record.drive_state).name
+            heard = f"heard {record.amplifier_age} cycles ago" if record.amplifier_age else "heard now"
+            raise Unreachable(f"not off: the axis is {axis}, the drive {drive} ({heard}): {_why(record)}")
+        return _state(record)
+
+    def _halt(self, args: HaltArgs) -> Flow:
+        record = yield self._send(Op.HALT, (float(args.on),))
+        return _state(record)
+
+    def _trajectory(self, args: TrajectoryArgs) -> Flow:
+        yield from ()
+        self._uploaded.add(args.key, args.start, args.samples)
+        return {"samples": args.start + len(args.samples)}
+
+    def _track(self, args: TrackArgs) -> Flow:
+        table = args.table(self._uploaded)
+        reference = args.reference(table)
+        duration_s = self._duration_s(args, table)
+        if not args.start_immediately:
+            check_motion(reference, table, self._config, self._must_run())
+            return {"kind": args.kind, "duration_s": duration_s}
+        self._refuse_if_not_free()
+        check_motion(reference, table, self._config, self._must_run())
+        if args.has_table:
+            self._loop.write_trajectory(table.area())
+        wait = self._send(Op.REFERENCE, reference)
+        self._reference_seq = wait.seq
+        record = yield wait
+        return {**_state(record), "kind": args.kind, "duration_s": duration_s}
+
+    def _must_run(self) -> CycleRecord:
+        """The newest record."""
+        record = self._loop.latest
+        if record is None:
+            raise Unreachable("the loop has not begun")
+        return record
+
+    def _refuse_if_not_free(self) -> None:
+        """The trajectory area must not change under a motion that runs or is about to; the loop checks the rest."""
+        if self._must_run().axis_state != AxisState.ENABLED:
+            raise Unreachable(f"refused: {REFUSAL_TEXT[Refusal.NOT_ENABLED]}")
+        if self.motion_running():
+            raise Unreachable(f"refused: {REFUSAL_TEXT[Refusal.MOTION_RUNNING]}")
+
+    def _duration_s(self, args: TrackArgs, table: Table) -> float:
+        if args.has_table:
+            return (len(table.positions.values) - 1) * self._config.cycle.period_us * 1e-6
+        return args.duration_s or 0.0
+
+    def _gains_load(self, args: GainsLoadArgs) -> Flow:
+        return self._bank.load(args, self.slow)
+
+    def _gains_list(self, _args: NoArgs) -> Flow:
+        record = self._loop.latest
+        return self._bank.list(record.controller if record else 0, self.slow)
+
+    def _gains_activate(self, args: GainsActivateArgs) -> Flow:
+        """A trial whose client left before it began ends at once."""
+        leases = self._leases_ended
+        result = yield from self._attach_gains(self._bank.activate(args, self._send, self.slow))
+        if args.trial and self._leases_ended != leases:
+            yield from self._gains_rollback(_LEFT)
+        return result
+
+    def _gains_keep(self, args: GainsVerdictArgs) -> Flow:
+        return self._attach_gains(self._bank.keep(args, self._send, self.slow))
+
+    def _gains_rollback(self, args: GainsVerdictArgs) -> Flow:
+        return self._attach_gains(self._bank.rollback(args, self._send, self.slow))
+
+    def _attach_gains(self, change: Flow) -> Flow:
+        """After a change of the gain set, also one back when it failed, the recording gets the one that runs."""
+        before = self._bank.newest
+        try:
+            return (yield from change)
+        finally:
+            if self._bank.newest is not before:
+                self._recorder.set_attachment("gains.yaml", self._bank.newest.path.read_bytes())
+
+    def _record_start(self, args: RecordStartArgs) -> Flow:
+        path = yield FutureWait(self._recorder.start(args.path))
+        return {"path": str(path)}
+
+    def _record_stop(self, _args: NoArgs) -> Flow:
+        state = yield FutureWait(self._recorder.stop())
+        return dict(state)
+
+    def _scan(self, _args: NoArgs) -> Flow:
+        record = self._loop.latest
+        if record is None or record.axis_state not in _STOPPED:
+            raise Unreachable("refused: scanning needs the axis disabled; run `servoctl disable` first")
+        nodes = yield FutureWait(self.slow.submit(self._scan_bus))
+        return {"nodes": nodes}
+
+    def _scan_bus(self) -> list[dict[str, Any]]:
+        """In the slow thread, on a connection of its own, which `scan` closes; no LSS beside a running loop."""
+        return [asdict(node) for node in scan(open_bus(self._config.bus), WallClock(), lss=False)]
+
+
+def _state(record: CycleRecord) -> dict[str, Any]:
+    return {"state": AxisState(record.axis_state).name}
+
+
+def _is_off(record: CycleRecord) -> bool:
+    """The axis has stopped, and the drive says so itself, in this cycle."""
+    return record.axis_state in _STOPPED and record.amplifier_age == 0 and record.drive_state in _UNPOWERED
+
+
+def _why_not_enabled(record: CycleRecord) -> str:
+    """An axis on its way that is off without a fault was switched off by a command."""
+    if record.axis_state == AxisState.DISABLED and not record.faults_latched:
+        return "somebody stopped it meanwhile (`servoctl stop` or `servoctl disable`)"
+    return _why(record)
+
+
+def _why(record: CycleRecord) -> str:
+    """Faults, or else what the drive waits for."""
+    faults = [f"{f.code.name}: {f.cause} {f.remedy}" for f in faults_in(record.faults_latched)]
+    return " ".join(faults or reason_texts(record.reasons) or ["no reason given"])

@@ -1,0 +1,8 @@
+"""CANopen master: set-up, supervision and scan of the nodes, off the control path; canopen on a servod Bus."""
+
+from __future__ import annotations
+
+from servod.runtime.fieldbus.master.master import BringUp, Master
+from servod.runtime.fieldbus.master.monitor import NodeEvent
+
+__all__ = ["BringUp", "Master", "NodeEvent"]

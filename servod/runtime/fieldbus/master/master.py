@@ -1,0 +1,143 @@
+"""The CANopen master of one axis: brings amplifier and encoder up, and watches them. Off the control path.
+
+The order of the bring-up is its safety. By reads alone, so that a wrong node id harms nobody: who both nodes are
+(0x1018) and whether they may be touched (not powered, no alarms). The bus load is refused before anything is sent. Then
+pre-operational; parameters, then mapping, read back and compared; then the drive is made to watch us (0x1016), and
+only then NMT start. SYNC, PDOs and the master's heartbeat are the loop's, not ours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from servod.common.clock import Clock
+from servod.common.errors import BadInput, Unreachable
+from servod.formats.config import AxisConfig
+from servod.runtime.fieldbus.bus import Bus
+from servod.runtime.fieldbus.cia import NmtCommand
+from servod.runtime.fieldbus.devices import NodePlan, PresetSetup, SdoAccess
+from servod.runtime.fieldbus.master.monitor import NodeEvent
+from servod.runtime.fieldbus.master.network import BusNetwork
+from servod.runtime.fieldbus.master.node import Node, send_nmt
+from servod.runtime.fieldbus.master.planned import checked_load
+
+
+@dataclass(frozen=True)
+class BringUp:
+    """What a successful bring-up gives: the plans for the loop, the share of the bus, and lines for people."""
+
+    amplifier: NodePlan
+    encoder: NodePlan
+    bus_load: float
+    report: list[str] = field(default_factory=list)
+
+
+class Master:
+    """Master of one axis on its own bus connection, which it owns from now on.
+
+    `threaded`: with a wall clock, a reader thread of ours takes the frames; without, every wait and `poll` takes them,
+    and on the stepped world that is what lets time advance.
+    """
+
+    def __init__(self, config: AxisConfig, bus: Bus, clock: Clock, threaded: bool) -> None:
+        self._config = config
+        self._network = BusNetwork(bus, clock, threaded)
+        try:
+            self._amplifier = Node(self._network, config, "amplifier")
+            self._encoder = Node(self._network, config, "encoder")
+        except BaseException:
+            self._network.disconnect()
+            raise
+        self._nodes = {node.node_id: node for node in (self._amplifier, self._encoder)}
+
+    def bring_up(self) -> BringUp:
+        """Bring both nodes to operational; raises BadInput, Unreachable or SdoAbort with one line that says where."""
+        nodes = (self._amplifier, self._encoder)
+        report = [line for node in nodes for line in node.report_dictionary()]
+        wanted = [node.setup.plan() for node in nodes]
+        load = checked_load(self._config, wanted)
+        report.append(f"bus load {load.describe()}")
+        for node in nodes:
+            node.watch.watch(False)
+            report += node.identify()
+        for node in nodes:
+            node.inspect()
+        for node in nodes:
+            node.stop_operation()
+        plans = []
+        for node, plan in zip(nodes, wanted, strict=True):
+            report += node.reset_as_quirks_ask(plan)
+            configured, lines = node.configure()
+            plans.append(configured)
+            report += lines
+        for node in nodes:
+            node.start_heartbeats()
+        for node in nodes:
+            node.start()
+        return BringUp(plans[0], plans[1], load.share, report)
+
+    def preset_encoder(self, position_rad: float) -> int:
+        """Make the joint's present position read `position_rad` in the encoder; the counts that it holds then.
+
+        Instead of a bring-up, while no loop runs. Raises Unreachable where a node is not the configured one, the
+        amplifier is powered or the joint moves, BadInput when the encoder's driver knows no preset.
+        """
+        nodes, setup = (self._amplifier, self._encoder), self._encoder.setup
+        if not isinstance(setup, PresetSetup):
+            raise BadInput("encoder.driver", self._config.encoder.driver, "a driver with preset")
+        for node in nodes:
+            node.identify()
+        for node in nodes:
+            node.inspect()
+        return setup.preset(self._encoder.sdo, position_rad)
+
+    def stand_down(self) -> None:
+        """Orderly end: nodes pre-operational and the drive no longer watching us. Only when the drive has no torque."""
+        for node in self._nodes.values():
+            node.watch.watch(False)
+            send_nmt(self._network, NmtCommand.PRE_OPERATIONAL, node.node_id)
+            node.stop_watching_master()
+
+    def poll(self) -> None:
+        """Take waiting frames and check the heartbeats; call at least every 20 ms.
+
+        Raises Unreachable when the reader thread ended.
+        """
+        if self._network.broken is not None:
+            raise Unreachable(f"bus reader ended: {self._network.broken}")
+        self._network.drain()
+        for node in self._nodes.values():
+            node.watch.check()
+
+    def events(self) -> list[NodeEvent]:
+        """What the nodes did since the last call, oldest first."""
+        found: list[NodeEvent] = []
+        for node in self._nodes.values():
+            while node.watch.events:
+                found.append(node.watch.events.popleft())
+        return sorted(found, key=lambda event: event.time_ns)
+
+    def sdo(self, node_id: int) -> SdoAccess:
+        """SDO access to one of the two nodes."""
+        if node_id not in self._nodes:
+            raise BadInput("node id", node_id, " or ".join(str(known) for known in self._nodes))
+        return self._nodes[node_id].sdo
+
+    def nmt_state(self, node_id: int) -> int | None:
+        """State that the node's last heartbeat showed (servod.runtime.fieldbus.cia.NmtState); None before the first."""
+        return self._nodes[node_id].watch.nmt_state
+
+    def silent(self, node_id: int) -> bool:
+        """The node's heartbeat has been missing for its time, and has not come back."""
+        return self._nodes[node_id].watch.lost
+
+    def nmt(self, command: NmtCommand, node_id: int) -> None:
+        """Send an NMT command; node 0 is all nodes. A deliberate reset or stop is not reported as an event."""
+        for node in self._nodes.values():
+            if node_id in (0, node.node_id):
+                node.watch.watch(command == NmtCommand.START)
+        send_nmt(self._network, command, node_id)
+
+    def close(self) -> None:
+        """Leave the bus; nothing is sent."""
+        self._network.disconnect()

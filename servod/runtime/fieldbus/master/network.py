@@ -1,0 +1,88 @@
+"""The canopen library on a servod Bus: frames go out through the bus, and come in because we pump them.
+
+No python-can Notifier and no periodic tasks. With a wall clock one reader thread of our own pumps; with a virtual
+clock nobody else runs, so every wait pumps the bus itself, and time advances by that. Off the control path.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable
+
+import canopen
+
+from servod.common.clock import Clock
+from servod.common.errors import Unreachable
+from servod.common.units import NS_PER_S
+from servod.runtime.fieldbus.bus import CAN_EFF_FLAG, CAN_RTR_FLAG, Bus
+from servod.runtime.fieldbus.cia import LSS_FROM_SLAVE_ID
+
+_READER_WAIT_S = 0.05  # how long the reader thread stays in one receive: bounds the time that closing takes
+
+
+class BusNetwork(canopen.Network):
+    """canopen.Network over servod.runtime.fieldbus.bus.Bus; see the module for who pumps it."""
+
+    def __init__(self, bus: Bus, clock: Clock, threaded: bool) -> None:
+        super().__init__()
+        self.unsubscribe(LSS_FROM_SLAVE_ID)  # canopen's own LSS master, which nobody asks, would keep every answer
+        self._servod_bus = bus
+        self.clock = clock
+        self._arrived = threading.Condition()
+        self._closing = False
+        self.broken: Exception | None = None  # what ended the reader thread, if anything did
+        self._reader = threading.Thread(target=self._read, name="canopen-reader", daemon=True) if threaded else None
+        if self._reader is not None:
+            self._reader.start()
+
+    def send_message(self, can_id: int, data: bytes | Iterable[int], remote: bool = False) -> None:
+        """Queue one frame; raises Unreachable when the bus does not take it."""
+        with self.send_lock:
+            sent = self._servod_bus.send(can_id | (CAN_RTR_FLAG if remote else 0), bytes(data))
+        if not sent:
+            counters = self._servod_bus.counters
+            state = "bus-off" if counters.bus_off else "down" if counters.down else "full queue"
+            raise Unreachable(f"bus: frame 0x{can_id:03X} could not be sent ({state})")
+
+    def pump(self, timeout_s: float) -> bool:
+        """Take one frame from the bus and hand it to whoever listens; False when none came in time."""
+        frame = self._servod_bus.receive(timeout_s)
+        if frame is None:
+            return False
+        if not frame.can_id & (CAN_RTR_FLAG | CAN_EFF_FLAG):
+            self.notify(frame.can_id, bytearray(frame.data), frame.time_ns)
+        return True
+
+    def wait(self, done: Callable[[], bool], timeout_s: float) -> bool:
+        """Wait until `done()` holds, at most `timeout_s` on this network's clock; False when the time ran out."""
+        if self._reader is not None:
+            with self._arrived:
+                return self._arrived.wait_for(done, timeout_s)
+        deadline_ns = self.clock.now_ns() + round(timeout_s * NS_PER_S)
+        while not done():
+            remaining_ns = deadline_ns - self.clock.now_ns()
+            if remaining_ns <= 0:
+                return False
+            self.pump(remaining_ns / NS_PER_S)
+        return True
+
+    def drain(self) -> None:
+        """Take all frames that wait, without waiting for more; a no-op when the reader thread does it."""
+        while self._reader is None and self.pump(0.0):
+            pass
+
+    def _read(self) -> None:
+        try:
+            while not self._closing:
+                if self.pump(_READER_WAIT_S):
+                    with self._arrived:
+                        self._arrived.notify_all()
+        except Exception as error:  # kept and shown by Master.poll: a thread must never die silently
+            self.broken = error
+
+    def disconnect(self) -> None:
+        """Stop the reader and leave the bus."""
+        self._closing = True
+        if self._reader is not None and self._reader is not threading.current_thread():
+            self._reader.join(timeout=20 * _READER_WAIT_S)
+        self._servod_bus.close()

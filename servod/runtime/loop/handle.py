@@ -1,0 +1,133 @@
+"""The supervisor's handle on the loop process: start, commands in, records out, and how it ended."""
+
+from __future__ import annotations
+
+import contextlib
+import subprocess
+import sys
+import time
+from array import array
+from collections.abc import Sequence
+
+from servod.common.errors import BadInput, Unreachable
+from servod.formats.recording.record import CycleRecord
+from servod.runtime.loop.channel import MAX_ARGUMENTS, Channel
+from servod.runtime.loop.commands import Command, Op
+from servod.runtime.loop.plan import LoopPlan
+from servod.runtime.loop.realtime import Grant
+from servod.runtime.loop.wiring.findings import Proof
+
+START_TIMEOUT_S = 10.0
+
+
+class LoopHandle:
+    """One loop process. Not thread-safe; `feed` must be called at least ten times a second while it runs."""
+
+    def __init__(self, plan: LoopPlan) -> None:
+        """Nothing is started yet."""
+        self.plan = plan
+        self.latest: CycleRecord | None = None
+        self._channel = Channel()
+        self._process: subprocess.Popen[str] | None = None
+        self._seq = 0
+
+    def start(self) -> None:
+        """Start the process and wait for its first cycle; raises Unreachable with its last words when it dies."""
+        fd = self._channel.fd
+        self._channel.beat()
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "servod.runtime.loop.process", str(fd)],
+            stdin=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            pass_fds=(fd,),
+            text=True,
+        )
+        assert self._process.stdin is not None
+        self._process.stdin.write(self.plan.to_json())
+        self._process.stdin.close()
+        self._wait_until_ready()
+
+    @property
+    def pid(self) -> int:
+        """Process id of the loop; 0 before the start."""
+        return self._process.pid if self._process else 0
+
+    @property
+    def grants(self) -> list[Grant]:
+        """What the operating system granted the loop."""
+        return self._channel.grants()
+
+    @property
+    def proofs(self) -> tuple[int, Proof | None]:
+        """How many tests of the wiring have ended since the start, and how the last one did."""
+        return self._channel.proofs()
+
+    @property
+    def lost(self) -> int:
+        """Records that were overwritten before they were read."""
+        return self._channel.lost
+
+    @property
+    def exit_code(self) -> int | None:
+        """None while the process runs."""
+        return self._process.poll() if self._process else None
+
+    def alive(self) -> bool:
+        """The process runs."""
+        return self._process is not None and self._process.poll() is None
+
+    def feed(self) -> None:
+        """The supervisor lives; the loop stops the axis when this stays away."""
+        self._channel.beat()
+
+    def send(self, op: Op, arguments: Sequence[float] = ()) -> int:
+        """Queue a command and return its number; the record's `command_seq` shows when it was carried out."""
+        if len(arguments) > MAX_ARGUMENTS:
+            raise BadInput(f"command {op.name}", f"{len(arguments)} arguments", f"at most {MAX_ARGUMENTS}")
+        if not self._channel.send(Command(self._seq + 1, op, tuple(map(float, arguments)))):
+            raise Unreachable("the loop does not take commands: its queue is full")
+        self._seq += 1
+        return self._seq
+
+    def write_trajectory(self, positions_rad: Sequence[float]) -> None:
+        """Fill the shared area that ReferenceKind.TABLE reads; only while no table motion runs."""
+        if len(positions_rad) > len(self._channel.trajectory):
+            raise BadInput("trajectory", f"{len(positions_rad)} samples", f"at most {len(self._channel.trajectory)}")
+        self._channel.trajectory[: len(positions_rad)] = array("d", positions_rad)
+
+    def drain(self) -> list[bytes]:
+        """All cycle records since the last call, raw (servod.formats.recording.record.RECORD)."""
+        records = self._channel.drain()
+        if records:
+            self.latest = CycleRecord.unpack(records[-1])
+        return records
+
+    def stop(self, timeout_s: float = 1.0) -> int:
+        """Ask for a shutdown, wait, and kill what does not end; returns the exit code."""
+        assert self._process is not None
+        if self.alive():
+            with contextlib.suppress(Unreachable):  # a loop that takes no commands is killed below
+                self.send(Op.SHUTDOWN)
+        deadline = time.monotonic() + timeout_s
+        while self.alive() and time.monotonic() < deadline:
+            self.feed()
+            time.sleep(0.005)
+        self._process.kill()
+        return self._process.wait()
+
+    def last_words(self) -> str:
+        """What the process wrote on standard error; call after it ended."""
+        stream = self._process.stderr if self._process else None
+        return stream.read() if stream and not stream.closed else ""
+
+    def _wait_until_ready(self) -> None:
+        deadline = time.monotonic() + START_TIMEOUT_S
+        while not self._channel.ready:
+            if not self.alive():
+                words = self.last_words().strip().splitlines()
+                raise Unreachable(f"the loop process ended at its start: {words[-1] if words else 'no message'}")
+            if time.monotonic() > deadline:
+                late = f"the loop process did not begin within {START_TIMEOUT_S:.0f} s"
+                raise Unreachable(f"{late}: is the machine busy with other work?")
+            self.feed()
+            time.sleep(0.01)

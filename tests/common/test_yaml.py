@@ -1,0 +1,52 @@
+"""YAML 1.2 as every file is read: numbers are numbers, words are words, and what is neither is one line."""
+
+import pytest
+
+from servod.common.errors import BadInput
+from servod.common.yaml import parse_yaml, validate
+from servod.formats.config import AxisConfig
+
+LIMITS = (
+    "limits: {torque_nm: 0.3, torque_rate_nm_per_s: 3e2, speed_rad_s: 20, position_min_rad: -3, position_max_rad: 3, "
+    "following_error_rad: 0.5, encoder_mismatch_rad: 5e-2}\ngains: {initial: a.yaml}\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("1e-3", 0.001),
+        ("0x10", 16),
+        ("0o17", 15),
+        ("010", 10),
+        ("on", "on"),
+        ("yes", "yes"),
+        ("true", True),
+        ("~", None),
+    ],
+)
+def test_scalars_are_of_version_1_2(text, value):
+    assert parse_yaml(f"a: {text}", "f.yaml") == {"a": value}
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["a: 1\na: 2", "? [a, b]\n: 1", "a: [", "\ta: 1", "a: " + "[" * 5000, "- 1", "a: !!python/object:os.system x"],
+    ids=["twice", "list as key", "open", "tab", "nested", "list", "object"],
+)
+def test_broken_text_is_one_line_with_the_file(text):
+    with pytest.raises(BadInput) as caught:
+        validate(parse_yaml(text, "f.yaml"), AxisConfig, "f.yaml")
+    assert str(caught.value).startswith("f.yaml")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("value", ["true", '"0.3"', "[0.3]", ".nan", ".inf", "on"])
+def test_only_finite_numbers_are_numbers(value):
+    with pytest.raises(BadInput, match=r"f\.yaml: limits\.torque_nm"):
+        validate(parse_yaml(LIMITS.replace("torque_nm: 0.3", f"torque_nm: {value}"), "f.yaml"), AxisConfig, "f.yaml")
+
+
+def test_a_good_file_is_taken_with_whole_numbers_for_reals():
+    config = validate(parse_yaml(LIMITS, "f.yaml"), AxisConfig, "f.yaml")
+    assert (config.limits.speed_rad_s, config.limits.encoder_mismatch_rad) == (20.0, 0.05)

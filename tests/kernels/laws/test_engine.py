@@ -1,0 +1,127 @@
+"""The engine: bumpless change between every pair of laws, states carried over, bad parameters refused."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import pytest
+
+from servod.kernels.laws import LAWS, MAX_PARAMETERS, MAX_SETS, LawNumber, local, pd_lugre
+from servod.runtime.loop.controller import BUMPLESS_TIME_S, Controller
+from tests.kernels.laws.cases import PARAMETERS, SIGMA0, local_parameters
+
+DT = 0.001
+
+
+def running(name: str) -> tuple[Controller, float]:
+    """A controller that has run for a while with motion and error, and its last torque."""
+    controller = Controller()
+    assert controller.activate(LAWS[name].number, PARAMETERS[name], 0.0)
+    torque = 0.0
+    for k in range(300):
+        torque = controller.step(1e-4 * k, 0.1, 0.0, 1e-4 * k - 2e-3, 0.09, torque, DT).u
+    return controller, torque
+
+
+@pytest.mark.parametrize(("old", "new"), list(itertools.product(LAWS, repeat=2)))
+def test_change_is_bumpless(old: str, new: str) -> None:
+    controller, torque = running(old)
+    assert controller.activate(LAWS[new].number, PARAMETERS[new], torque)
+    first = controller.step(0.03, 0.1, 0.0, 0.028, 0.09, torque, DT)
+    assert first.u == pytest.approx(torque, abs=1e-9)
+    assert first.u == pytest.approx(first.feedback + first.friction + first.other, abs=1e-12)
+
+
+def test_offset_decays_with_the_stated_time_constant() -> None:
+    controller = Controller()
+    controller.activate(LawNumber.PD, (2.5, 0.12, 0.0), 0.05)
+    outputs = [controller.step(0.0, 0.0, 0.0, 0.0, 0.0, 0.05, DT).u for _ in range(3001)]
+    assert outputs[0] == 0.05
+    assert outputs[100] == pytest.approx(0.05 * math.exp(-0.1 / BUMPLESS_TIME_S), rel=1e-9)
+    assert outputs[-1] == 0.0
+
+
+@pytest.mark.parametrize(("old", "new"), [("local", "pd_lugre"), ("pd_lugre", "local"), ("local", "local")])
+def test_friction_state_is_carried_over(old: str, new: str) -> None:
+    controller, torque = running(old)
+    before = controller.friction_state
+    assert before != 0.0
+    controller.activate(LAWS[new].number, PARAMETERS[new], torque)
+    assert controller.friction_state == pytest.approx(before)
+
+
+def test_friction_state_is_carried_as_torque_when_the_stiffness_differs() -> None:
+    controller, torque = running("local")
+    before = controller.friction_state * SIGMA0
+    softer = list(local_parameters())
+    softer[local.STIFFNESS] = 0.8 * SIGMA0
+    controller.activate(LawNumber.LOCAL, softer, torque)
+    assert controller.friction_state * 0.8 * SIGMA0 == pytest.approx(before)
+
+
+def test_disturbance_estimate_is_carried_within_a_law_only() -> None:
+    controller, torque = running("pd_dob")
+    before = controller.disturbance
+    assert before != 0.0
+    controller.activate(LawNumber.PD_DOB, PARAMETERS["pd_dob"], torque)
+    assert controller.disturbance == before
+    controller.activate(LawNumber.LOCAL, PARAMETERS["local"], torque)
+    assert controller.disturbance == 0.0
+
+
+def test_nan_does_not_outlive_a_change_of_gains() -> None:
+    controller, torque = running("local")
+    assert math.isnan(controller.step(0.0, 0.0, 0.0, math.nan, math.nan, torque, DT).u)
+    controller.activate(LawNumber.LOCAL, PARAMETERS["local"], 0.0)
+    assert math.isfinite(controller.step(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, DT).u)
+
+
+def test_reset_forgets_and_starts_from_the_given_torque() -> None:
+    controller, _ = running("local")
+    controller.reset(0.012)
+    assert (controller.friction_state, controller.disturbance) == (0.0, 0.0)
+    assert controller.step(0.0, 0.0, 0.0, 0.001, 0.0, 0.012, DT).u == pytest.approx(0.012, abs=1e-12)
+
+
+def test_starts_without_torque() -> None:
+    assert Controller().step(1.0, 1.0, 1.0, 0.0, 0.0, 0.0, DT).u == 0.0
+
+
+def test_a_bumpless_offset_is_no_limit_to_the_anti_windup() -> None:
+    controller = Controller()
+    controller.activate(LawNumber.LOCAL, local_parameters(gain=0.04), -0.05)
+    applied, states = -0.05, [0.0]
+    for _ in range(3):  # asked and applied agree all the time, so l goes on from the first step
+        applied = controller.step(1e-3, 0.0, 0.0, 0.0, 0.0, applied, DT).u
+        states.append(controller.friction_state)
+    assert states == sorted(set(states))
+
+
+@pytest.mark.parametrize(
+    ("number", "parameters"),
+    [
+        (0, PARAMETERS["pd"]),
+        (5, PARAMETERS["pd"]),
+        (LawNumber.PD, PARAMETERS["pd"][:-1]),
+        (LawNumber.PD_DOB, (*PARAMETERS["pd_dob"], 0.0)),
+        (LawNumber.PD_LUGRE, PARAMETERS["pd_lugre"][: pd_lugre.STATE_LIMIT]),
+        (LawNumber.LOCAL, PARAMETERS["local"][:-1]),
+        (LawNumber.LOCAL, PARAMETERS["local"][: local.N_SETS]),
+        (LawNumber.LOCAL, (*PARAMETERS["local"][: local.N_SETS], math.nan, *PARAMETERS["local"][local.FIRST_NODE :])),
+    ],
+)
+def test_wrong_law_or_length_is_refused_and_changes_nothing(number: int, parameters: tuple[float, ...]) -> None:
+    controller, torque = running("pd")
+    twin, _ = running("pd")
+    assert not controller.activate(number, parameters, 0.5)
+    arguments = (0.03, 0.1, 0.0, 0.028, 0.09, torque, DT)
+    assert controller.step(*arguments) == twin.step(*arguments)
+    assert controller.law.name == "pd"
+
+
+def test_registry_numbers_are_stable_and_sizes_bounded() -> None:
+    assert {name: int(law.number) for name, law in LAWS.items()} == {"pd": 1, "pd_dob": 2, "pd_lugre": 3, "local": 4}
+    nodes = tuple(-1.0 + k / 32 for k in range(MAX_SETS))
+    assert len(local_parameters(nodes)) <= MAX_PARAMETERS
+    assert LAWS["local"].accepts(local_parameters(nodes))

@@ -1,0 +1,219 @@
+"""Real steps from a known model to a deployed set: bit for bit the same after interruptions, and told on one page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from servod.client.commission_axis import VirtualWalkAxis
+from servod.common.errors import AnswerIsNo
+from servod.formats.gains.gain_set import load_gains
+from servod.formats.model.axis_model import axis_model_yaml
+from servod.lab.commission.files import (
+    DEPLOYMENT,
+    GAINS,
+    MODEL,
+    RELAXED,
+    RUNS,
+    TRACKING,
+    TUNING,
+    read_json,
+    write_json,
+    write_text,
+)
+from servod.lab.commission.questions import Questions
+from servod.lab.commission.report import sections
+from servod.lab.commission.result import failure
+from servod.lab.commission.runs import load_curves, load_rows, save_curves
+from servod.lab.commission.state import file_sha256
+from servod.lab.commission.steps.deploy import Deploy
+from servod.lab.commission.steps.synthesize import Synthesize, agreed, relaxed, tell_clashes
+from servod.lab.commission.steps.validate import document as comparison
+from servod.lab.commission.steps.verify import Verify
+from servod.lab.commission.walk import Options, Step, StepFailed, Tell, Walk, run
+from servod.lab.deploy.deployment import announced
+from servod.lab.report.figure import Figure, Table
+from servod.lab.synthesize.deployed import Wishes
+from servod.lab.synthesize.infeasible import Infeasible, Relaxation
+from servod.lab.tracking import simulated
+from tests.lab.synthesize.designs import table1
+
+AXIS = VirtualWalkAxis(table1(), seed=1)
+
+
+@dataclass(frozen=True)
+class Known:
+    """In place of an identification: the model is known, as when it came from a file."""
+
+    name: str = "known"
+    title: str = "known"
+
+    def outputs(self, _walk: Walk) -> tuple[str, ...]:
+        return (MODEL,)
+
+    def inputs(self, _walk: Walk) -> dict[str, Any]:
+        return {}
+
+    def run(self, walk: Walk) -> None:
+        write_text(walk.path(MODEL), axis_model_yaml(table1()))
+
+
+STEPS: tuple[Step, ...] = (Known(), Synthesize(), Verify(), Deploy())
+
+
+def walk_in(folder: Path, interrupted: str = "") -> Walk:
+    """A walk with few plants; `interrupted` names the step whose progress brings Ctrl-C."""
+
+    @contextmanager
+    def progress(title: str) -> Iterator[Tell]:
+        def tell(_what: str, share: float) -> None:
+            if title == interrupted and share > 0.05:
+                raise KeyboardInterrupt
+
+        yield tell
+
+    options = Options(plants=2, processes=1, least_plants=2)
+    return Walk(folder, AXIS, options, Questions(True, lambda _q: True), progress, lambda _line: None)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder whose walk was interrupted in every step and taken up."""
+    folder = tmp_path_factory.mktemp("walk")
+    for step in STEPS[1:]:
+        with pytest.raises(KeyboardInterrupt):
+            run(walk_in(folder, interrupted=step.title), STEPS)
+    run(walk_in(folder), STEPS)
+    return folder
+
+
+def test_the_set_is_deployed_and_its_runs_are_kept(folder: Path) -> None:
+    found = read_json(folder / DEPLOYMENT)
+    assert found["deployed"] and found["present"]["name"] == "identification"
+    assert found["after"]["slow_mrad"] < found["before"]["slow_mrad"]
+    assert len(load_rows(folder / RUNS / "deploy_after.mcap")) > 12_000
+    assert read_json(folder / RELAXED) is None
+
+
+def test_made_again_every_file_is_the_same_byte_for_byte(folder: Path) -> None:
+    names = [GAINS, DEPLOYMENT]
+    before = [file_sha256(folder / name) for name in names]
+    for name in names:
+        (folder / name).unlink()
+    run(walk_in(folder), STEPS)
+    assert [file_sha256(folder / name) for name in names] == before
+
+
+def test_a_relaxation_changes_its_own_wish_alone() -> None:
+    wishes = Wishes()
+    smaller = relaxed(wishes, Relaxation("scale of the uncertainty", 1.0, 0.5))
+    assert smaller.uncertainty == wishes.uncertainty.scaled(0.49)
+    slower = relaxed(wishes, Relaxation("least decay [1/s]", wishes.least_decay_per_s, 2.0))
+    assert slower.least_decay_per_s == pytest.approx(1.96) and slower.uncertainty == wishes.uncertainty
+
+
+def test_no_design_is_for_more_speed_than_the_axis_may_have_or_was_identified_with(tmp_path: Path) -> None:
+    def loop(options: Options, limit_rad_s: float) -> dict[str, Any]:
+        limits = AXIS.config.limits.model_copy(update={"speed_rad_s": limit_rad_s})
+        axis = replace(AXIS, chosen=AXIS.config.model_copy(update={"limits": limits}))
+        found: dict[str, Any] = Synthesize().inputs(replace(walk_in(tmp_path), axis=axis, options=options))["loop"]
+        assert found["overlap"][0] < found["overlap"][1] < found["speed_max"]
+        return found
+
+    assert loop(Options(), 3.0)["speed_max"] == 0.5
+    assert loop(Options(), 0.2)["speed_max"] == 0.2
+    assert loop(Options(speed_rad_s=0.1), 0.2)["speed_max"] == 0.1
+    assert loop(Options(speed_rad_s=0.02), 0.2)["speed_max"] == 0.02
+
+
+def test_what_is_announced_of_a_trial_goes_with_the_design(folder: Path) -> None:
+    gains = load_gains(folder / GAINS)
+    assert gains.design is not None
+    assert announced(gains).startswith("sines and steps of up to 20.1 mrad to each side, sines at up to 0.25 rad/s")
+    slower = gains.model_copy(update={"design": gains.design.model_copy(update={"speed_max_rad_s": 0.1})})
+    assert announced(slower).startswith("sines and steps of up to 4.01 mrad to each side, sines at up to 0.05 rad/s")
+
+
+def test_what_is_offered_is_taken_by_yes_or_a_person_alone_also_on_a_virtual_axis(tmp_path: Path) -> None:
+    offer = Relaxation("least decay [1/s]", 5.0, 2.0)
+    clash = Infeasible(("low",), (), (offer,))
+    nobody = Questions(False, lambda _q: True, person=lambda: False)
+    with pytest.raises(AnswerIsNo, match=r"least decay.*--yes"):
+        agreed(replace(walk_in(tmp_path), questions=nobody), clash)
+    for questions in (Questions(True, lambda _q: False), Questions(False, lambda _q: True, person=lambda: True)):
+        assert agreed(replace(walk_in(tmp_path), questions=questions), clash) == offer
+
+
+def test_a_step_that_says_no_is_named_in_the_document(folder: Path) -> None:
+    document = failure(walk_in(folder), StepFailed("deploy", "rolled back"))
+    assert document["failed"] == {"step": "deploy", "message": "rolled back"}
+    assert document["deployment"] == read_json(folder / DEPLOYMENT)
+
+
+def test_clashing_vertices_are_told_and_stand_in_the_document(tmp_path: Path) -> None:
+    told: list[str] = []
+    here = replace(walk_in(tmp_path), say=told.append)
+    clashes = ("low: sticking soft: poles at 1.200 of the disc (1 allowed)", "low: sliding falling: poles at 1.1")
+    tell_clashes(here, Infeasible(("low",), clashes, (Relaxation("least decay [1/s]", 5.0, 2.0),)))
+    assert told == [f"clash: {line}" for line in clashes]
+    found = failure(here, StepFailed("synthesize", "no feedback"))["infeasible"]
+    assert found["regions"] == ["low"] and found["clashes"] == list(clashes)
+    assert found["relaxations"] == [{"wish": "least decay [1/s]", "asked": 5.0, "enough": 2.0}]
+
+
+def test_curves_come_back_from_disk_and_stand_on_the_page(folder: Path) -> None:
+    gains = load_gains(folder / GAINS)
+    assert gains.design is not None
+    cutoff_hz = gains.design.velocity_cutoff_hz
+    run_of = simulated.measure(table1(), gains, counts_per_turn=2.0**20, cutoff_hz=cutoff_hz, seed=7)
+    save_curves(folder / RUNS / "deployed.npz", run_of.curves)
+    save_curves(folder / RUNS / "free_local.npz", run_of.curves)
+    again = load_curves(folder / RUNS / "deployed.npz")
+    assert again["paper"].error_mrad == pytest.approx(run_of.curves["paper"].error_mrad, abs=1e-3)
+    cost = {"cost_mrad": 0.1, "simulations": 3}
+    tuning = {"free": {"local": cost | judged(4.2), "deployed": cost | judged(10.0)}}
+    write_json(folder / TRACKING, comparison({"free_local": run_of.document()}, run_of.document(), tuning))
+    write_json(folder / TUNING, tuning)
+    walk = walk_in(folder)
+    made = {title: list(parts()) for title, parts in sections(walk, gains, table1()).items() if title in SHOWN}
+    assert set(made) == SHOWN
+    figures = {part.name for parts in made.values() for part in parts if isinstance(part, Figure)}
+    assert {"bode", "impulse_responses", "weighting_functions", "before_after", "step_100_free_feedback"} <= figures
+    (reached,) = (p for p in made["Tracking"] if isinstance(p, Table) and "tuning reached" in p.title)
+    over = "Deployed, over the limit (x2)"
+    assert [(row[0], *row[3:]) for row in reached.rows] == [("Local models", "4.20", "5"), (over, "10.00", "5")]
+    (compared,) = (p for p in made["Tracking"] if isinstance(p, Table) and "mrad and s" in p.title)
+    assert {(row[0], row[4]) for row in compared.rows} == {("Local models", "4.2"), (over, "10")}
+    (said,) = (p for p in made["Tracking"] if isinstance(p, str))
+    assert "10 times the roughness of the paper's PD, over the limit (x2)" in said
+    assert any(isinstance(part, Table) and "Certificate" in part.title for part in made["The certificate"])
+
+
+def judged(ratio: float) -> dict[str, Any]:
+    """What tuning tells of a law with `ratio` times the roughness of the paper's PD."""
+    return {"roughness_ratio": ratio, "roughness_limit": 5.0, "within_roughness_limit": ratio <= 5.0}
+
+
+def test_the_deployed_law_is_never_taken_for_one_that_was_tuned_within_the_limit() -> None:
+    figures = {"free_local": {"rms_error_mrad": 0.01}, "equal_local": {"rms_error_mrad": 0.03}}
+    tuning = {"free": {"local": judged(4.9), "deployed": judged(10.0)}, "equal": {"local": judged(3.0)}}
+    found = comparison(figures, {"rms_error_mrad": 0.005}, tuning)
+    tuned = {"rms_error_mrad": 0.01, "tuned": True, **judged(4.9)}
+    deployed = {"rms_error_mrad": 0.005, "tuned": False, **judged(10.0)}
+    assert found["free_feedback"] == {"local": tuned, "deployed": deployed}
+    assert found["tracking"] == {"local": deployed}
+    assert found["equal_feedback"]["local"]["within_roughness_limit"]
+
+
+def test_a_law_that_stands_alone_says_no_roughness_limit() -> None:
+    found = comparison({}, {"rms_error_mrad": 0.005}, {})
+    assert found["tracking"] == {"local": {"rms_error_mrad": 0.005, "tuned": False}}
+
+
+#: Sections that need no recordings of an identification.
+SHOWN = {"The law and its design", "The certificate", "Deployment", "Tracking"}

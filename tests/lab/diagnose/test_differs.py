@@ -1,0 +1,37 @@
+"""The sentence of what differs in other recordings, and a drift that another day need not have."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from servod.lab.diagnose.effects.base import base_unknowns
+from servod.lab.diagnose.judge.spread import within
+from servod.lab.diagnose.recalibrated import differs
+from tests.lab.diagnose.axes import believed
+
+
+def test_what_differs_is_said_with_its_share() -> None:
+    changes = {
+        "friction.viscous": {"from": 200.0, "to": 210.0, "unit": "N·s/m"},
+        "torque_offset": {"from": 0.0, "to": -0.5, "unit": "N"},
+    }
+    said = differs(changes)
+    assert "viscous is 210 instead of 200 N·s/m (+5 %)" in said
+    assert "torque offset is -0.5 instead of 0 N" in said
+    assert differs({}) == ""
+
+
+@pytest.mark.parametrize("per_s", [0.02, -0.02])
+def test_a_drift_of_the_model_may_be_none_in_other_recordings(per_s: float) -> None:
+    drift = next(u for u in base_unknowns(believed(offset_drift={"per_s": per_s})) if u.key == "offset_drift.per_s")
+    assert (drift.low, drift.high) == (min(per_s, 0.0), max(per_s, 0.0))
+    assert drift.value(drift.coordinate(drift.start)) == per_s
+    assert all(u.key != "offset_drift.per_s" for u in base_unknowns(believed()))
+
+
+def test_several_small_changes_together_may_be_told() -> None:
+    """Half a standard deviation each: together one in four such by chance, unless they are known to go together."""
+    off = np.array([0.5, -0.5])
+    assert within(off, np.eye(2))
+    assert not within(off, np.array([[1.0, 0.99], [0.99, 1.0]]))

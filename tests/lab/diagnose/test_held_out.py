@@ -1,0 +1,156 @@
+"""Rows that a fit has not seen: no number of it may come from them, and what nothing foretells is not judged."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from servod.lab.diagnose.effects import effect
+from servod.lab.diagnose.effects.disturbance import EVERY
+from servod.lab.diagnose.effects.hypothesis import Term
+from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.judge.held_out import RECORDING, STRETCH, TAIL_S, Fold, held_out, once, split
+from servod.lab.diagnose.judge.windows import foretold, window_errors
+from servod.lab.diagnose.predict.predict import Predictor
+from servod.lab.diagnose.select.fit import Fit, Fitter, Weighing
+from servod.lab.simulate.replay import replay
+from tests.lab.diagnose.axes import believed
+from tests.lab.diagnose.test_between import colder
+
+
+@pytest.fixture(scope="module")
+def levels() -> tuple[Predictor, Fit]:
+    """Two recordings, the second with 1.3 times the friction, and a fit with a level of friction of its own for it."""
+    predictor, fit = colder(1.0, 1.3)
+    return predictor, with_jacobian(predictor, fit)
+
+
+def with_jacobian(predictor: Predictor, fit: Fit) -> Fit:
+    """The fit with the slopes at where it stands."""
+    fitter = Fitter(predictor, Weighing(0.001, predictor.counts.astype(np.float64)))
+    return replace(fit, jacobian=fitter.derivatives(fit))
+
+
+def with_term(predictor: Predictor, fit: Fit, term: Term) -> Fit:
+    """The base of a fit with another term in place of its own, at that term's start."""
+    hypothesis = replace(fit.hypothesis, terms=(term,))
+    mismatch = predictor.mismatch(*hypothesis.models(hypothesis.start, len(predictor.traces)))
+    return with_jacobian(predictor, Fit(hypothesis, hypothesis.start, mismatch, 0.0, np.zeros((0, 0)), True))
+
+
+def bare(fit: Fit) -> Fit:
+    """The start of the base alone."""
+    hypothesis = fit.hypothesis.without(0)
+    jacobian = fit.jacobian[:, : len(hypothesis.base)]
+    return replace(fit, hypothesis=hypothesis, coordinates=hypothesis.start, jacobian=jacobian)
+
+
+def pushes(predictor: Predictor) -> list[Term]:
+    """Windows in which a torque would act, were half a second of both recordings off."""
+    trace, mismatch = predictor.traces[0], np.zeros(len(predictor.counts))
+    for part in predictor.slices:
+        first = part.start + round(2.0 / trace.period_s)
+        mismatch[first : first + round(0.5 / trace.period_s)] = 0.05
+    return effect("disturbance").terms(Scene({}, predictor, mismatch))
+
+
+def test_a_level_is_not_that_of_the_rows_that_it_is_judged_by(levels: tuple[Predictor, Fit]) -> None:
+    """Wherever it stood before: a recording left out as a whole would keep the level that was fitted to it."""
+    predictor, fit = levels
+    elsewhere = fit.coordinates.copy()
+    elsewhere[fit.hypothesis.share(0)] += [0.0, 0.0, 0.1, 0.1]
+    mismatch = predictor.mismatch(*fit.hypothesis.models(elsewhere, 2))
+    moved = with_jacobian(predictor, replace(fit, coordinates=elsewhere, mismatch=mismatch))
+    shared = split(predictor, fit)
+    near, far = (held_out(predictor, one, shared) for one in (fit, moved))
+    assert shared.left_out == STRETCH
+    assert float(np.sqrt(np.mean(mismatch[predictor.counts] ** 2))) > 3.0 * near.rms
+    assert far.rms == pytest.approx(near.rms, rel=0.15)
+    for one, other in zip(near.coordinates, far.coordinates, strict=True):
+        assert other[fit.hypothesis.share(0)] == pytest.approx(one[fit.hypothesis.share(0)], abs=0.03)
+
+
+def test_every_row_is_left_out_once(levels: tuple[Predictor, Fit]) -> None:
+    predictor, fit = levels
+    for shared in (split(predictor, fit), split(predictor, bare(fit))):
+        assert np.all(np.sum(shared.folds, axis=0) == 1)
+    assert shared.left_out == RECORDING
+    assert len(shared.folds) == 2
+
+
+def test_models_of_a_fold_have_the_levels_of_their_recordings(levels: tuple[Predictor, Fit]) -> None:
+    predictor, fit = levels
+    held = held_out(predictor, fit, split(predictor, fit))
+    for fold in held.folds:
+        ratio = fold.of(1).friction.viscous / fold.of(0).friction.viscous
+        assert ratio == pytest.approx(1.3, rel=0.03)
+
+
+def test_windows_are_judged_by_the_model_that_has_not_seen_them(levels: tuple[Predictor, Fit]) -> None:
+    predictor, fit = levels
+    light, heavy = (believed(inertia=0.02 * factor) for factor in (0.9, 1.2))
+    folds = [
+        Fold(rows, (model,)) for rows, model in zip(split(predictor, bare(fit)).folds, (light, heavy), strict=True)
+    ]
+    window = window_errors(predictor, believed(), folds, folds)[0]
+    for part, trace, model in zip(predictor.slices, predictor.traces, (light, heavy), strict=True):
+        drive = replace(trace.drive, t_s=trace.drive.t_s - trace.shift_s)
+        for error, judge in ((window.recalibrated, model), (window.nominal, believed())):
+            assert np.allclose(error[part], replay(judge, drive, window.horizon_s).error, atol=1e-12)
+
+
+def test_no_number_of_a_fold_comes_from_the_rows_left_out(levels: tuple[Predictor, Fit]) -> None:
+    """With another command in the first recording: what was fitted without it is the same to the last bit."""
+    predictor, fit = levels
+    drive = predictor.traces[0].drive
+    spoiled = replace(predictor.traces[0], drive=replace(drive, torque=1.2 * drive.torque))
+    other = Predictor((spoiled, *predictor.traces[1:]), believed(), predictor.rate)
+    found = []
+    for one in (predictor, other):
+        start = replace(bare(fit), mismatch=one.mismatch(believed()))
+        found.append(held_out(one, start, split(one, start)))
+    assert np.array_equal(found[0].coordinates[0], found[1].coordinates[0])
+    assert not np.allclose(found[0].coordinates[1], found[1].coordinates[1], atol=1e-3)
+    assert not np.allclose(found[0].mismatch, found[1].mismatch, atol=1e-3)
+
+
+def test_an_event_in_one_recording_is_not_judged(levels: tuple[Predictor, Fit]) -> None:
+    predictor, fit = levels
+    term = next(term for term in pushes(predictor) if term.form != EVERY)
+    event = with_term(predictor, fit, term)
+    shared, t_s = split(predictor, event), predictor.over("t_s")
+    document: dict[str, Any] = {}
+    term.write(document, event.values[event.hypothesis.share(0)])
+    (window,) = document["disturbance"]["windows"]
+    inside = (t_s >= window["start_s"]) & (t_s <= window["end_s"] + TAIL_S)
+    assert once(event.hypothesis) == [0]
+    assert not shared.judged[inside].any()
+    assert np.array_equal(shared.judged[~inside], predictor.counts[~inside])
+    held = held_out(predictor, event, shared)
+    assert held.rms == pytest.approx(float(np.sqrt(np.mean(held.mismatch[shared.judged] ** 2))))
+    for coordinates in held.coordinates:
+        assert np.array_equal(coordinates[event.hypothesis.share(0)], event.coordinates[event.hypothesis.share(0)])
+
+
+def test_an_event_of_every_recording_is_foretold_by_the_others(levels: tuple[Predictor, Fit]) -> None:
+    """A torque that is not there goes by the first recording, which is exactly the model's."""
+    predictor, fit = levels
+    event = with_term(predictor, fit, next(term for term in pushes(predictor) if term.form == EVERY))
+    shared = split(predictor, event)
+    held = held_out(predictor, event, shared)
+    assert np.array_equal(shared.judged, predictor.counts)
+    torque = event.hypothesis.share(0).stop - 1
+    assert abs(event.coordinates[torque]) > 0.2
+    assert abs(held.coordinates[1][torque]) < 0.01
+
+
+def test_names_foretell_by_how_much_free_windows_of_unseen_rows_come_nearer(levels: tuple[Predictor, Fit]) -> None:
+    predictor, fit = levels
+    shared = split(predictor, fit)
+    without, with_it = held_out(predictor, bare(fit), shared), held_out(predictor, fit, shared)
+    assert foretold(predictor, without, without, shared.judged) == pytest.approx(1.0)
+    assert foretold(predictor, without, with_it, shared.judged) < 0.3
+    assert foretold(predictor, with_it, without, shared.judged) > 3.0

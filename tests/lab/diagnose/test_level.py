@@ -1,0 +1,84 @@
+"""Parameters with a level of their own: on their bound they are looked at, however little is left."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from servod.lab.diagnose.data.intake import taken_in
+from servod.lab.diagnose.effects import effect
+from servod.lab.diagnose.effects.base import base_unknowns, document_of
+from servod.lab.diagnose.effects.hypothesis import Document, Hypothesis
+from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.predict.predict import Predictor
+from servod.lab.diagnose.select.fit import Fit
+from servod.lab.diagnose.select.level import is_level, on_bound
+from tests.lab.diagnose.axes import believed, record
+
+
+def fit_with(key: str, factor: float) -> Fit:
+    """A fit of the base alone in which one parameter has been pulled by a factor, as far as its bound lets it."""
+    hypothesis = Hypothesis(document_of(believed()), base_unknowns(believed()))
+    at = hypothesis.start.copy()
+    place = [unknown.key for unknown in hypothesis.base].index(key)
+    at[place] += np.log(factor)
+    nothing = np.zeros(0)
+    return Fit(hypothesis, np.clip(at, *hypothesis.bounds), nothing, 0.0, np.zeros((0, len(at))), True)
+
+
+@pytest.mark.parametrize("key", ["friction.sigma0", "friction.sigma1", "friction.static", "inertia"])
+@pytest.mark.parametrize("factor", [0.2, 5.0])
+def test_a_parameter_pulled_beyond_its_level_stands_on_its_bound(key: str, factor: float) -> None:
+    assert on_bound(fit_with(key, factor))
+    assert not on_bound(fit_with(key, 1.05 if factor > 1.0 else 0.95))
+
+
+def test_what_has_no_level_is_recalibrated_only() -> None:
+    assert not on_bound(fit_with("friction.viscous", 2.0))
+    assert not on_bound(fit_with("friction.stribeck_velocity", 3.0))
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """An axis with nothing left."""
+    model = believed()
+    predictor = Predictor(taken_in(record(model, seconds=3.0), model)[0], model)
+    return Scene(document_of(model), predictor, np.zeros(len(predictor.counts)))
+
+
+def test_levels_are_what_opens_the_models_own(scene: Scene) -> None:
+    for name in ("stribeck", "presliding", "torque_offset", "inertia"):
+        terms = effect(name).terms(scene)
+        assert all(is_level(term) is (term.form != "fading damping") for term in terms) and len(terms) > 0
+    for name in ("cogging", "delay", "actuator_lag", "viscous_nonlinear"):
+        assert not any(is_level(term) for term in effect(name).terms(scene))
+
+
+@pytest.mark.parametrize("name", ["stribeck", "presliding", "torque_offset", "inertia"])
+def test_a_level_is_released_from_where_it_stands_too(scene: Scene, name: str) -> None:
+    """Beside other effects the refit has gone most of the way: far starts must not be the only ones."""
+    assert any(not term.begins and not term.unknowns for term in effect(name).terms(scene))
+
+
+def test_friction_of_one_direction_alone_may_differ(scene: Scene) -> None:
+    """Dry and viscous friction 0.72 of the model's backwards and the model's own forwards: both means are off."""
+    term = next(t for t in effect("asymmetry").terms(scene) if t.form == "both, another level")
+    document: Document = {}
+    term.write(document, (0.28 / 1.72, 0.28 / 1.72, 0.86))
+    expected = {"positive_dry": 1.0, "negative_dry": 0.72, "positive_viscous": 1.0, "negative_viscous": 0.72}
+    assert document["asymmetry"] == pytest.approx(expected)
+
+
+def test_beside_a_longer_delay_the_models_own_is_as_well_known_as_before(scene: Scene) -> None:
+    """The two add up: without what is known of the model's own, nothing tells the share of either."""
+    base = Hypothesis(scene.document, base_unknowns(believed()))
+    for name in ("delay", "actuator_lag"):
+        term = effect(name).terms(scene)[0]
+        own = next(u for u in base.with_term(term).unknowns if u.key == "delay_s")
+        assert own.spread == next(u for u in base.base if u.key == "delay_s").spread
+
+
+def test_a_level_that_is_released_is_known_no_more(scene: Scene) -> None:
+    base = Hypothesis(scene.document, base_unknowns(believed()))
+    released = base.with_term(next(t for t in effect("inertia").terms(scene) if t.opens))
+    assert np.isinf(next(u for u in released.unknowns if u.key == "inertia").spread)

@@ -1,0 +1,99 @@
+"""The speed bound: no experiment is faster than it, and where nothing can be told below it, that is said."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from servod.client.axis import SteppedLink
+from servod.client.virtual import virtual_session
+from servod.common.errors import AnswerIsNo
+from servod.lab.identify.bounds import bounds_from
+from servod.lab.identify.experiments import kick
+from servod.lab.identify.experiments.common import SPEED_SPAN_S, Bench, peak_speed
+from servod.lab.identify.fits import kick as kick_fit
+from servod.lab.identify.store import load
+from servod.lab.identify.trace import Trace
+from tests.lab.identify.conftest import Identification
+from tests.lab.identify.joints import Drawn, draw
+
+
+class Unkept:
+    """A keeper that keeps nothing."""
+
+    def recorded(self, _kind, _motion) -> None:
+        return None
+
+    def keep(self, _rows, trace: Trace, _motion: str) -> Trace:
+        return trace
+
+
+class Truth:
+    """The highest true speed of a virtual joint, cycle by cycle."""
+
+    def __init__(self, session) -> None:
+        self.peak_rad_s, self._session, self._step = 0.0, session, session.cycle.step
+        session.cycle.step = self._watched
+
+    def _watched(self, *arguments) -> None:
+        self._step(*arguments)
+        self.peak_rad_s = max(self.peak_rad_s, abs(self._session.world.truth().velocity_rad_s))
+
+
+def bench_of(joint: Drawn, folder, speed_rad_s: float) -> tuple[Bench, Truth]:
+    session = virtual_session(joint.model, folder, joint.encoder_counts, 1)
+    link = SteppedLink(session)
+    bounds = bounds_from(link.config.limits, link.enable(), None, speed_rad_s)
+    return Bench(link, bounds, Unkept(), np.random.default_rng(1)), Truth(session)
+
+
+def break_away(joint: Drawn) -> tuple[float, float]:
+    """True static friction of both directions, N*m."""
+    sides, static = joint.model.asymmetry, joint.model.friction.static
+    return static * sides.positive_dry, static * sides.negative_dry
+
+
+@pytest.mark.parametrize(("bits", "speed_rad_s"), [(20, 0.35), (17, 0.5), (20, 1.0)])
+def test_kicks_keep_to_the_speed_and_tell_inertia(bits, speed_rad_s, tmp_path):
+    joint = draw(31, bits=bits)
+    bench, truth = bench_of(joint, tmp_path, speed_rad_s)
+    kicks = kick.run(bench, break_away(joint))
+    assert truth.peak_rad_s <= speed_rad_s
+    assert kick_fit.fit(kicks).inertia == pytest.approx(joint.model.inertia, rel=0.4)
+
+
+@pytest.mark.parametrize(
+    ("bits", "speed_rad_s", "said"),
+    [
+        (17, 0.1, "at this speed with this encoder: it shows kicks from 0.19 rad/s on"),
+        (20, 0.15, "at this speed: a kick of"),
+        (17, 0.2, "at this speed: a kick of"),
+    ],
+)
+def test_where_no_kick_below_the_speed_tells_it_is_said(bits, speed_rad_s, said, tmp_path):
+    joint = draw(31, bits=bits)
+    bench, truth = bench_of(joint, tmp_path, speed_rad_s)
+    with pytest.raises(AnswerIsNo, match=f"inertia is not identifiable {said}"):
+        kick.run(bench, break_away(joint))
+    assert truth.peak_rad_s <= speed_rad_s
+
+
+def test_a_joint_that_is_faster_than_allowed_ends_the_walk(tmp_path):
+    bench, truth = bench_of(draw(31, bits=20), tmp_path, 0.1)
+    torque = np.where(np.arange(100) < 20, 0.1, 0.0)
+    with pytest.raises(AnswerIsNo, match=r"went at .* rad/s in the experiment kick, 0.1 are allowed"):
+        bench.run(kick.Kind.KICK, np.zeros(100), torque, 0.1, {})
+    assert truth.peak_rad_s > 0.1
+
+
+def test_a_path_that_is_faster_than_allowed_is_not_begun(tmp_path):
+    bench, truth = bench_of(draw(31, bits=20), tmp_path, 0.1)
+    with pytest.raises(AnswerIsNo, match="would go at"):
+        bench.run(kick.Kind.FRICTION_MAP, np.linspace(0.0, 0.02, 100), np.zeros(100), 0.1, {})
+    assert truth.peak_rad_s < 0.01
+
+
+@pytest.mark.timeout(600)
+def test_no_experiment_of_a_whole_walk_is_faster_than_planned(fine: Identification):
+    allowed = bounds_from(fine.link.config.limits, 0.0, None, None)
+    assert max(peak_speed(trace, SPEED_SPAN_S) for trace in load(fine.recordings)) <= allowed.speed_rad_s * 1.05

@@ -1,0 +1,118 @@
+"""What the scenarios of the fault campaign (servod/qualify/faults/scenarios) cannot say of the stepped axis and its
+faults.
+
+The virtual drive's truth is the judge, not what the loop believes. Times are virtual and exact.
+"""
+
+from itertools import pairwise
+
+import pytest
+
+from servod.client.stepped import SteppedSession
+from servod.common.errors import FAULTS, FaultCode
+from servod.common.shipped import shipped
+from servod.drivers.virtual.bus_faults import BusFault
+from servod.drivers.virtual.world import SteppedWorld, VirtualAxisSettings
+from servod.formats.config import AxisConfig, load_config
+from servod.formats.gains.gain_set import load_gains
+from servod.formats.model.axis_model import AxisModel, load_axis_model
+from servod.kernels.laws import LAWS
+from servod.runtime.fieldbus.bus import Frame
+from servod.runtime.fieldbus.cia import NmtCommand
+from servod.runtime.loop.axis import AxisState
+from servod.runtime.loop.commands import Op, ReferenceKind, Refusal
+
+AMPLIFIER, ENCODER = 1, 2
+
+
+def session(config: AxisConfig | None = None, plant: AxisModel | None = None) -> SteppedSession:
+    gains = load_gains(shipped("gains/demo_pd.yaml"))
+    world = SteppedWorld(VirtualAxisSettings(), plant or load_axis_model(shipped("gains/axes/demo_joint.yaml")))
+    config = config or load_config(shipped("gains/config/virtual.yaml"))
+    return SteppedSession(config, world, LAWS[gains.law.name].number, gains.pack())
+
+
+def moving(axis: SteppedSession) -> SteppedSession:
+    """In the middle of a sine, at its fastest, with friction to overcome."""
+    axis.enable()
+    assert axis.send(Op.REFERENCE, [ReferenceKind.SINE, 0.2, 0.5, 60.0]) == Refusal.DONE
+    axis.run(2.0)
+    assert abs(axis.world.truth().torque_nm) > 0.02
+    return axis
+
+
+def latched(axis: SteppedSession) -> set[FaultCode]:
+    return {code for code, fault in FAULTS.items() if axis.cycle.axis.latched & fault.bit}
+
+
+def inject(axis: SteppedSession, fault: BusFault) -> None:
+    axis.loop_bus.inject(fault)
+
+
+def nmt(axis: SteppedSession, command: NmtCommand, node_id: int) -> None:
+    axis.loop_bus.send(0, bytes([command, node_id]))
+
+
+def limited(name: str, value: float) -> AxisConfig:
+    config = load_config(shipped("gains/config/virtual.yaml"))
+    return config.model_copy(update={"limits": config.limits.model_copy(update={name: value})})
+
+
+@pytest.mark.parametrize("node_id", [AMPLIFIER, ENCODER])
+def test_a_node_that_was_reset_needs_a_new_bring_up(node_id):
+    axis = moving(session())
+    nmt(axis, NmtCommand.RESET_NODE, node_id)
+    axis.run(0.5)
+    nmt(axis, NmtCommand.START, node_id)
+    axis.run(0.5)
+    assert FaultCode.DRIVE_RESET in latched(axis)
+    assert axis.send(Op.ENABLE, [1]) == Refusal.NEEDS_RESTART
+    assert axis.cycle.axis.state != AxisState.ENABLED
+
+
+def test_limits_hold_while_the_torque_ramps_down():
+    config = limited("ramp_down_s", 1.0)
+    limits = config.limits.model_copy(update={"following_error_rad": 0.05, "speed_rad_s": 1.0})
+    axis = session(config.model_copy(update={"limits": limits}))
+    axis.enable()
+    axis.send(Op.ACTIVATE, [1, LAWS["pd"].number, 3, -8.0, 0.0, 0.0])
+    axis.send(Op.REFERENCE, [ReferenceKind.STEP, 0.02, 10.0])
+    fastest = 0.0
+    for _ in range(3000):
+        axis.run(0.001)
+        fastest = max(fastest, abs(axis.world.truth().velocity_rad_s))
+    assert axis.cycle.axis.state == AxisState.FAULT
+    assert fastest < 3.0
+
+
+def test_changing_gains_while_braking_keeps_the_torque_continuous():
+    axis = moving(session())
+    axis.send(Op.DISABLE)
+    before = axis.latest.torque_nm
+    axis.send(Op.ACTIVATE, [2, LAWS["pd"].number, 3, 2.0, 0.1, 0.0])
+    steps = [b.torque_nm - a.torque_nm for a, b in pairwise(axis.records[-6:])]
+    assert max(map(abs, steps)) < 0.1 * abs(before)
+
+
+def test_a_joint_outside_its_range_is_not_enabled():
+    axis = session(limited("position_max_rad", -0.5))
+    axis.run(0.1)
+    assert axis.send(Op.ENABLE, [0]) == Refusal.OUTSIDE_LIMITS
+
+
+def test_motions_beyond_speed_or_range_are_refused():
+    axis = session()
+    axis.enable()
+    assert axis.send(Op.REFERENCE, [ReferenceKind.SINE, 1.0, 10.0, 1.0]) == Refusal.TOO_FAST
+    assert axis.send(Op.REFERENCE, [ReferenceKind.STEP, 4.0, 1.0]) == Refusal.OUT_OF_RANGE
+
+
+def test_a_node_that_babbles_with_low_priority_does_not_hold_the_loop():
+    axis = moving(session())
+    intruder = axis.world.connect()
+    for _ in range(50):
+        for _ in range(4):
+            intruder.send(0x7F0, bytes(8))
+        axis.run(0.001)
+    assert axis.cycle.axis.state == AxisState.ENABLED
+    assert isinstance(intruder.receive(0.0), Frame)

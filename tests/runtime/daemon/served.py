@@ -1,0 +1,104 @@
+"""A control server in a thread of its own, with a handler that answers with what it was asked."""
+
+from __future__ import annotations
+
+import json
+import selectors
+import socket
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from servod.client.control import Verb
+from servod.common.errors import AnswerIsNo, BadInput, Unreachable
+from servod.formats.config import ControlConfig
+from servod.runtime.daemon.connection import Reply
+from servod.runtime.daemon.control_server import ControlServer
+
+
+class Echo:
+    """A handler that answers with what it was asked; `late_verbs` wait, while `patient`; `scan` fails as told."""
+
+    def __init__(self) -> None:
+        self.late: list[Reply] = []
+        self.late_verbs = {Verb.STOP}
+        self.answer: dict[str, Any] | None = None  # to what is not late
+        self.moves = self.broken = self.patient = False
+        self.ended_leases = 0
+        self.pieces: list[tuple[str, int, list[float]]] = []
+
+    def handle(self, verb: Verb, args: dict[str, Any], reply: Reply) -> None:
+        if verb in self.late_verbs:
+            self.late.append(reply)
+        elif self.answer is not None:
+            reply.done(self.answer)
+        elif verb is Verb.SCAN:
+            raise {1: AnswerIsNo("no"), 2: BadInput("scan", 1, "2"), 3: Unreachable("gone\nreally")}[args["code"]]
+        elif verb is Verb.TRAJECTORY:
+            self.pieces.append((args["key"], args["start"], args["samples"]))
+            reply.done({})
+        elif verb is Verb.GAINS_LIST:
+            raise KeyError("nobody foresaw this")
+        else:
+            reply.done({"verb": verb, "args": args})
+
+    def status(self) -> dict[str, Any]:
+        if self.broken:
+            raise ZeroDivisionError("a bad byte")
+        return {"now": time.monotonic()}
+
+    def motion_running(self) -> bool:
+        return self.moves
+
+    def lease_ended(self) -> None:
+        self.ended_leases += 1
+
+
+class Served:
+    """A control server in a thread of its own."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.handler = path, Echo()
+        self._selector = selectors.DefaultSelector()
+        self.server = ControlServer(ControlConfig(socket=path), self._selector, self.handler)
+        self._stop = threading.Event()
+        self.longest_round_s = 0.0
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            for key, events in self._selector.select(0.01):
+                began = time.monotonic()
+                key.data(events)
+                self.longest_round_s = max(self.longest_round_s, time.monotonic() - began)
+            self.server.tick(time.monotonic_ns())
+            self._answer_late()
+
+    def _answer_late(self) -> None:
+        if not self.handler.patient:
+            for reply in self.handler.late:
+                reply.done({"late": True})
+            self.handler.late.clear()
+
+    def close(self, why: str = "enough") -> None:
+        """Stop the thread and the server, once."""
+        if not self._stop.is_set():
+            self._stop.set()
+            self._thread.join()
+            self.server.close(why)
+
+
+def raw(served: Served) -> socket.socket:
+    """A bare connection."""
+    connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    connection.connect(str(served.path))
+    connection.settimeout(5)
+    return connection
+
+
+def answer_of(connection: socket.socket) -> dict[str, Any]:
+    """The next line."""
+    with connection.makefile("rb") as lines:
+        return json.loads(lines.readline())  # type: ignore[no-any-return]

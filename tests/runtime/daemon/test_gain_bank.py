@@ -1,0 +1,127 @@
+"""What runs and what is stored as active are the same set, also when the store cannot be written."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from servod.common.errors import AnswerIsNo
+from servod.common.shipped import shipped
+from servod.formats.config import load_config
+from servod.formats.gains.store import Action, GainStore
+from servod.runtime.daemon.arguments import GainsActivateArgs, GainsVerdictArgs
+from servod.runtime.daemon.flows import Flow, OrderWait, Wait
+from servod.runtime.daemon.gain_bank import GainBank
+from servod.runtime.loop.commands import Op
+from tests.runtime.daemon.daemon_rows import record
+
+FIRST, TRIED = "demo_pd", "demo_pd_dob"
+
+
+class Loop:
+    """Takes every set at once; knows by its serial number which one runs."""
+
+    def __init__(self) -> None:
+        self.serial = 0
+
+    def send(self, op: Op, arguments: Sequence[float]) -> OrderWait:
+        assert op is Op.ACTIVATE
+        self.serial = int(arguments[0])
+        wait = OrderWait(self.serial, 0)
+        wait.record = record(1)
+        return wait
+
+
+class Bench:
+    """A bank with its store and a loop."""
+
+    def __init__(self, folder: Path, slow: ThreadPoolExecutor) -> None:
+        config = load_config(shipped("gains/config/virtual.yaml"))
+        gains = config.gains.model_copy(update={"directory": folder})
+        self.bank, self.loop, self.slow = GainBank(config.model_copy(update={"gains": gains})), Loop(), slow
+        self.store, self.blocked = GainStore(folder), folder / f"active.json.{os.getpid()}.tmp"
+        self.store.load_file(shipped(f"gains/{TRIED}.yaml"))
+
+    @property
+    def runs(self) -> str:
+        return self.bank.describe(self.loop.serial)["name"]
+
+    @property
+    def active(self) -> str:
+        stored = self.store.active()
+        assert stored is not None
+        return stored.name
+
+    def activate(self, trial: bool) -> dict[str, Any]:
+        return driven(self.bank.activate(GainsActivateArgs(name=TRIED, trial=trial), self.loop.send, self.slow))
+
+    def keep(self) -> dict[str, Any]:
+        return driven(self.bank.keep(GainsVerdictArgs(), self.loop.send, self.slow))
+
+    def rollback(self, trial: bool) -> dict[str, Any]:
+        return driven(self.bank.rollback(GainsVerdictArgs(trial=trial), self.loop.send, self.slow))
+
+
+def driven(flow: Flow) -> dict[str, Any]:
+    """Run a flow to its end; what it waits for comes at once."""
+    try:
+        wait = next(flow)
+        while True:
+            wait = answered(flow, wait)
+    except StopIteration as end:
+        return dict(end.value)
+
+
+def answered(flow: Flow, wait: Wait) -> Wait:
+    """Give a flow what it waited for, or throw it; what it waits for next."""
+    try:
+        value = wait.result()
+    except OSError as error:
+        return flow.throw(error)
+    return flow.send(value)
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    with ThreadPoolExecutor(1) as slow:
+        yield Bench(tmp_path, slow)
+
+
+def test_a_trial_that_cannot_be_kept_is_undone(bench: Bench) -> None:
+    bench.activate(trial=True)
+    assert (bench.runs, bench.active) == (TRIED, FIRST)
+    bench.blocked.mkdir()  # as a disk that is full: the new active.json cannot be written
+    with pytest.raises(OSError, match=r"active\.json"):
+        bench.keep()
+    assert (bench.runs, bench.active, bench.bank.on_trial) == (FIRST, FIRST, False)
+    with pytest.raises(AnswerIsNo, match="no gain set is on trial"):
+        bench.rollback(trial=True)
+    bench.blocked.rmdir()
+    bench.activate(trial=True)
+    bench.keep()
+    assert (bench.runs, bench.active, bench.bank.on_trial) == (TRIED, TRIED, False)
+
+
+def test_a_set_that_cannot_be_stored_as_active_does_not_run_on(bench: Bench) -> None:
+    bench.blocked.mkdir()
+    with pytest.raises(OSError, match=r"active\.json"):
+        bench.activate(trial=False)
+    assert (bench.runs, bench.active) == (FIRST, FIRST)
+    bench.blocked.rmdir()
+    bench.activate(trial=False)
+    bench.blocked.mkdir()
+    with pytest.raises(OSError, match=r"active\.json"):
+        bench.rollback(trial=False)
+    assert (bench.runs, bench.active) == (TRIED, TRIED)
+
+
+def test_a_trial_is_given_up(bench: Bench) -> None:
+    bench.activate(trial=True)
+    bench.rollback(trial=True)
+    assert (bench.runs, bench.active, bench.bank.on_trial) == (FIRST, FIRST, False)
+    assert bench.store.history()[-1].action is Action.REJECT

@@ -1,0 +1,350 @@
+"""Requests: their arguments, trajectories, flows, and what the verbs make of them."""
+
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+from daemon_rows import axis_config, record
+
+from servod.client.control import SampleKey, Verb
+from servod.common.errors import BadInput, Unreachable
+from servod.runtime.daemon.arguments import check_arguments
+from servod.runtime.daemon.connection import Reply
+from servod.runtime.daemon.flows import Flow, Flows, FutureWait, Orders, StateWait
+from servod.runtime.daemon.gain_bank import GainBank
+from servod.runtime.daemon.recorder import Recorder
+from servod.runtime.daemon.trajectory import Table, check_motion
+from servod.runtime.daemon.verbs import Verbs
+from servod.runtime.fieldbus.devices import DriveState
+from servod.runtime.loop.axis import AxisState
+from servod.runtime.loop.channel import Channel
+from servod.runtime.loop.commands import Command, Op, ReferenceKind, Refusal
+from servod.runtime.loop.handle import LoopHandle
+
+
+# --- arguments --------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("args", "reference"),
+    [
+        ({"kind": "paper", "duration_s": 10}, [ReferenceKind.PAPER, 10.0]),
+        ({"kind": "step", "amplitude_rad": 0.01, "duration_s": 2}, [ReferenceKind.STEP, 0.01, 2.0]),
+        (
+            {"kind": "sine", "amplitude_rad": 0.1, "frequency_hz": 0.5, "duration_s": 4},
+            [ReferenceKind.SINE, 0.1, 0.5, 4.0],
+        ),
+        ({"kind": "csv", "positions_rad": [0.0, 0.2, -0.1]}, [ReferenceKind.TABLE, 3, -0.1, 0.2]),
+    ],
+)
+def test_motions_become_the_loops_arguments(args: dict[str, Any], reference: list[float]) -> None:
+    track = check_arguments(Verb.TRACK, args)
+    assert track.reference(track.table(Table())) == reference
+
+
+@pytest.mark.parametrize(
+    ("verb", "args", "says"),
+    [
+        (Verb.TRACK, {}, "track: kind"),
+        (Verb.TRACK, {"kind": "fly"}, "'fly'"),
+        (Verb.TRACK, {"kind": "sine", "amplitude_rad": 0.1}, "frequency_hz, duration_s"),
+        (Verb.TRACK, {"kind": "paper", "duration_s": -1}, "duration_s"),
+        (Verb.TRACK, {"kind": "paper", "duration_s": float("nan")}, "duration_s"),
+        (Verb.TRACK, {"kind": "csv", "positions_rad": []}, "positions_rad"),
+        (Verb.TRACK, {"kind": "excite", "uploaded": True}, "window_rad"),
+        (Verb.TRACK, {"kind": "csv", "positions_rad": [0.0, float("inf")]}, "positions_rad.1"),
+        (Verb.TRACK, {"kind": "csv", "positions_rad": [0.0] * 2001}, "2000"),
+        (Verb.TRAJECTORY, {"key": "positions", "start": 0, "samples": [1.0]}, "torques_nm"),
+        (Verb.TRAJECTORY, {"key": "positions_rad", "start": -1, "samples": [1.0]}, "start"),
+        (Verb.TRAJECTORY, {"key": "positions_rad", "start": 0, "samples": [float("nan")]}, "samples.0"),
+        (Verb.TRACK, {"kind": "paper", "duration_s": 1, "speed": 2}, "speed"),
+        (Verb.ENABLE, {"reset": True}, "did you mean reset_fault"),
+        (Verb.ENABLE, {"reset_fault": "perhaps"}, "reset_fault"),
+        (Verb.GAINS_LOAD, {"name": "x"}, "text"),
+        (Verb.GAINS_ACTIVATE, {"name": ""}, "name"),
+        (Verb.STATUS, {"x": 1}, "unknown key"),
+    ],
+)
+def test_bad_arguments_are_one_line(verb: Verb, args: dict[str, Any], says: str) -> None:
+    with pytest.raises(BadInput) as caught:
+        check_arguments(verb, args)
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 400
+
+
+# --- trajectories -----------------------------------------------------------------------------------------------------
+def test_pieces_become_one_column_with_its_extent_and_steps() -> None:
+    table = Table()
+    table.add(SampleKey.POSITIONS, 0, [9.0])
+    for start, piece in ((0, [0.0, 0.1]), (2, [0.4, 0.3])):
+        table.add(SampleKey.POSITIONS, start, piece)
+    positions = table.positions
+    assert list(table.area()) == [0.0, 0.1, 0.4, 0.3]
+    assert (positions.lowest, positions.highest, positions.largest_step) == (0.0, 0.4, pytest.approx(0.3))
+    with pytest.raises(BadInput, match="or 4 to go on"):
+        table.add(SampleKey.POSITIONS, 5, [0.0])
+    with pytest.raises(BadInput, match="found 0 samples; allowed: 4"):
+        table.require(torques=True)
+    with pytest.raises(BadInput, match="at most 300000"):
+        table.add(SampleKey.TORQUES, 0, [0.0] * 300_001)
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        ({"kind": "step", "amplitude_rad": 0.6, "duration_s": 1}, "from 0.5 to 1.1 rad"),
+        ({"kind": "sine", "amplitude_rad": 0.4, "frequency_hz": 2, "duration_s": 1}, "5.02655 rad/s"),
+        ({"kind": "csv", "positions_rad": [0.0, 0.0051]}, "5.1 rad/s; limits.speed_rad_s allows 5"),
+        ({"kind": "csv", "positions_rad": [0.0, -2.0]}, "-1.5 to 0.5 rad"),
+        ({"kind": "paper", "duration_s": 40}, "out of range"),
+    ],
+)
+def test_motion_is_checked_with_figures_before_the_loop_is_asked(args: dict[str, Any], says: str) -> None:
+    track = check_arguments(Verb.TRACK, args)
+    table = track.table(Table())
+    config = axis_config(Path("s"), Path("c"))
+    limits = config.limits.model_copy(update={"speed_rad_s": 5.0})
+    with pytest.raises(Unreachable) as caught:
+        check_motion(
+            track.reference(table), table, config.model_copy(update={"limits": limits}), record(reference_rad=0.5)
+        )
+    assert says in str(caught.value)
+
+
+# --- flows ------------------------------------------------------------------------------------------------------------
+class _Answers:
+    def __init__(self) -> None:
+        self.sent: list[dict[str, Any]] = []
+
+    def reply(self) -> Reply:
+        return Reply(self.sent.append, 1)
+
+
+def test_flow_goes_on_when_its_order_comes_back() -> None:
+    orders, flows, answers = Orders(), Flows(), _Answers()
+
+    def flow() -> Flow:
+        done = yield orders.expect(7, 0)
+        return {"cycle": done.cycle}
+
+    flows.start(flow(), answers.reply())
+    orders.see([record(5, command_seq=6)], 1)
+    flows.poll(1)
+    assert answers.sent == []
+    orders.see([record(6, command_seq=7), record(7, command_seq=8)], 2)
+    flows.poll(2)
+    assert answers.sent == [{"id": 1, "ok": True, "result": {"cycle": 6}}]
+
+
+def test_refusal_and_silence_end_a_flow_with_the_reason() -> None:
+    orders, flows, answers = Orders(), Flows(), _Answers()
+
+    def flow(seq: int) -> Flow:
+        yield orders.expect(seq, 0)
+        return {}
+
+    flows.start(flow(1), answers.reply())
+    flows.start(flow(2), answers.reply())
+    orders.see([record(1, command_seq=1, command_result=Refusal.NOT_ENABLED)], 1)
+    flows.poll(1)
+    flows.poll(Orders.TIMEOUT_NS)
+    messages = [a["error"]["message"] for a in answers.sent]
+    assert ["not enabled" in messages[0], "did not answer" in messages[1]] == [True, True]
+
+
+def test_flow_waits_for_threads_and_states_and_may_catch_errors() -> None:
+    flows, answers, future = Flows(), _Answers(), Future[int]()
+    now = record(axis_state=AxisState.ENABLING)
+
+    def flow() -> Flow:
+        try:
+            yield FutureWait(future)
+        except Unreachable:
+            seen = yield StateWait(lambda: now, lambda r: r.axis_state == AxisState.ENABLED, 100)
+        return {"state": seen.axis_state}
+
+    flows.start(flow(), answers.reply())
+    flows.poll(1)
+    future.set_exception(Unreachable("no"))
+    flows.poll(2)
+    flows.poll(3)
+    assert answers.sent == []
+    now = record(axis_state=AxisState.ENABLED)
+    flows.poll(4)
+    assert answers.sent[0]["result"] == {"state": AxisState.ENABLED}
+
+
+def test_full_disk_ends_the_request_only() -> None:
+    flows, answers, future = Flows(), _Answers(), Future[int]()
+
+    def flow() -> Flow:
+        yield FutureWait(future)
+        return {}
+
+    flows.start(flow(), answers.reply())
+    future.set_exception(OSError(28, "No space left on device", "active.json"))
+    flows.poll(1)
+    assert answers.sent[0]["error"] == {"exit_code": 3, "message": "active.json: No space left on device"}
+
+
+def test_mistake_in_a_flow_ends_the_request_only() -> None:
+    flows, answers = Flows(), _Answers()
+
+    def flow() -> Flow:
+        yield from ()
+        raise KeyError("nobody foresaw this")
+
+    flows.start(flow(), answers.reply())
+    assert "nobody foresaw" in answers.sent[0]["error"]["message"]
+
+
+# --- verbs ------------------------------------------------------------------------------------------------------------
+class _Loop:
+    """What the verbs need of the loop's handle, with a loop that answers when it is told to."""
+
+    proofs = (0, None)
+
+    def __init__(self) -> None:
+        self.sent: list[Op] = []
+        self.latest = record(1, axis_state=AxisState.ENABLED)
+        self.seq = 0
+        self.area: list[float] = []
+
+    def send(self, op: Op, _arguments: Sequence[float] = ()) -> int:
+        self.sent.append(op)
+        self.seq += 1
+        return self.seq
+
+    def write_trajectory(self, positions_rad: Sequence[float]) -> None:
+        self.area = list(positions_rad)
+
+
+class _Events:
+    def add_event(self, *_: Any, **__: Any) -> None:
+        """Nothing is recorded here."""
+
+
+class _Bank:
+    on_trial = False
+
+
+@pytest.fixture
+def verbs(tmp_path: Path) -> Iterator[tuple[Verbs, _Loop]]:
+    loop, config = _Loop(), axis_config(tmp_path / "s", tmp_path / "c")
+    config = config.model_copy(update={"limits": config.limits.model_copy(update={"speed_rad_s": 1e3})})
+    verbs = Verbs(config, cast(LoopHandle, loop), cast(GainBank, _Bank()), cast(Recorder, _Events()), dict)
+    yield verbs, loop
+    verbs.close()
+
+
+def _csv(verbs: Verbs, positions: list[float], **more: Any) -> list[dict[str, Any]]:
+    answers = _Answers()
+    verbs.handle(Verb.TRACK, {"kind": "csv", "positions_rad": positions, **more}, answers.reply())
+    return answers.sent
+
+
+def test_trajectory_is_in_use_from_its_command_to_the_motions_end(verbs: tuple[Verbs, _Loop]) -> None:
+    front, loop = verbs
+    assert _csv(front, [0.0, 0.1, 0.2]) == []
+    first = loop.area
+    for seen in ({}, {"command_seq": 1, "reference_active": 1}):
+        loop.latest = record(2, axis_state=AxisState.ENABLED, **seen)
+        assert front.motion_running()
+        (answer,) = _csv(front, [0.3, 0.3, 0.3])
+        assert "a motion is running" in answer["error"]["message"]
+        assert (loop.area, loop.seq) == (first, 1)
+    loop.latest = record(3, axis_state=AxisState.ENABLED, command_seq=1)
+    assert _csv(front, [0.3, 0.3, 0.3]) == []
+    assert loop.area == [0.3, 0.3, 0.3]
+
+
+def test_check_alone_moves_nothing_and_tells_what_is_wrong(verbs: tuple[Verbs, _Loop]) -> None:
+    front, loop = verbs
+    loop.latest = record(1, axis_state=AxisState.DISABLED)
+    (good,) = _csv(front, [0.0, 0.1], start_immediately=False)
+    assert good["result"]["duration_s"] == pytest.approx(0.001)
+    (bad,) = _csv(front, [0.0, 2.0], start_immediately=False)
+    assert "position_max_rad" in bad["error"]["message"]
+    assert (loop.area, loop.seq) == ([], 0)
+
+
+def test_samples_of_a_client_that_left_are_void(verbs: tuple[Verbs, _Loop]) -> None:
+    front, _ = verbs
+    args = {"key": "positions_rad", "start": 0, "samples": [0.0, 0.1]}
+    front.handle(Verb.TRAJECTORY, args, _Answers().reply())
+    front.lease_ended()
+    answers = _Answers()
+    front.handle(Verb.TRACK, {"kind": "csv", "uploaded": True}, answers.reply())
+    assert "found 0 samples" in answers.sent[0]["error"]["message"]
+
+
+@pytest.mark.parametrize("before", [AxisState.DISABLED, AxisState.ENABLED])
+@pytest.mark.parametrize("seen", [AxisState.ENABLING, AxisState.PROVING, AxisState.ENABLED])
+def test_axis_that_was_off_is_not_enabled_for_a_client_that_left(
+    verbs: tuple[Verbs, _Loop], seen: AxisState, before: AxisState
+) -> None:
+    front, loop = verbs
+    loop.latest = record(1, axis_state=before)
+    front.handle(Verb.ENABLE, {}, _Answers().reply())
+    loop.latest = record(2, axis_state=seen, command_seq=1)
+    for _ in range(2):
+        front.tick([loop.latest], time.monotonic_ns())
+    front.lease_ended()
+    assert loop.sent == [Op.ENABLE, Op.DISABLE][: 1 if AxisState.ENABLED in (seen, before) else 2]
+
+
+@pytest.mark.parametrize("verb", [Verb.STOP, Verb.DISABLE])
+@pytest.mark.parametrize(
+    ("now", "says"),
+    [
+        ({"axis_state": AxisState.QUICK_STOPPING, "drive_state": DriveState.QUICK_STOP_ACTIVE}, "QUICK_STOPPING"),
+        ({"axis_state": AxisState.DISABLED, "drive_state": DriveState.OPERATION_ENABLED}, "OPERATION_ENABLED"),
+        (
+            {"axis_state": AxisState.FAULT, "drive_state": DriveState.SWITCH_ON_DISABLED, "amplifier_age": 99},
+            "99 cycles ago",
+        ),
+    ],
+)
+def test_stop_that_stopped_nothing_is_no_success(
+    verbs: tuple[Verbs, _Loop], verb: Verb, now: dict[str, int], says: str
+) -> None:
+    front, loop = verbs
+    answers = _Answers()
+    front.handle(verb, {}, answers.reply())
+    loop.latest = record(2, command_seq=1, **now)
+    front.tick([loop.latest], time.monotonic_ns())
+    front.tick([], time.monotonic_ns())
+    assert answers.sent == []
+    front.tick([], time.monotonic_ns() + 60_000_000_000)
+    assert answers.sent[0]["error"]["exit_code"] == 3
+    assert says in answers.sent[0]["error"]["message"]
+
+
+def test_stops_one_after_the_other_are_one_command_until_the_loop_has_taken_it(verbs: tuple[Verbs, _Loop]) -> None:
+    front, loop = verbs
+    answers = _Answers()
+    for _ in range(20):
+        front.handle(Verb.STOP, {}, answers.reply())
+    assert loop.seq == 1
+    front.handle(Verb.HALT, {"on": True}, answers.reply())
+    front.handle(Verb.STOP, {}, answers.reply())  # something came between: this one counts anew
+    assert loop.seq == 3
+    off = {"axis_state": AxisState.DISABLED, "drive_state": DriveState.SWITCH_ON_DISABLED}
+    loop.latest = record(2, command_seq=3, **off)
+    front.tick([record(1, command_seq=1), record(2, command_seq=2), loop.latest], time.monotonic_ns())
+    front.tick([], time.monotonic_ns())
+    assert [a["ok"] for a in answers.sent] == [True] * 22
+    front.handle(Verb.STOP, {}, answers.reply())
+    assert loop.seq == 4
+
+
+def test_queue_that_a_client_floods_leaves_room_for_stops_and_node_events() -> None:
+    channel = Channel()
+    taken = {op: [channel.send(Command(n, op, ())) for n in range(16)].count(True) for op in _FLOOD}
+    assert taken == {Op.HALT: 8, Op.DISABLE: 2, Op.QUICK_STOP: 2, Op.NODE_EVENT: 4}
+    channel.close()
+
+
+_FLOOD = (Op.HALT, Op.DISABLE, Op.QUICK_STOP, Op.NODE_EVENT)

@@ -1,0 +1,59 @@
+import os
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from servod.formats.config import LimitsConfig, load_config
+from servod.runtime.loop.cycle import GOODBYE_TIMEOUT_CYCLES
+
+SYSTEMD = Path(__file__).parents[3] / "systemd"
+UNITS = sorted(SYSTEMD.glob("*.service"))
+
+
+def test_verify_prints_nothing() -> None:
+    done = subprocess.run(["systemd-analyze", "verify", *map(str, UNITS)], capture_output=True, text=True)
+    assert (done.stdout + done.stderr, done.returncode) == ("", 0)
+
+
+@pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.name)
+def test_exposure_is_at_most_3(unit: Path) -> None:
+    command = ["systemd-analyze", "security", "--offline=true", "--no-pager", str(unit)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    found = re.search(r"Overall exposure level for \S+: ([0-9.]+)", done.stdout)
+    assert found is not None, done.stderr
+    assert float(found[1]) <= 3.0
+
+
+def test_address_families_are_can_and_unix_only() -> None:
+    for unit in UNITS:
+        assert re.findall(r"^RestrictAddressFamilies=(.*)$", unit.read_text(), re.M) == ["AF_CAN AF_UNIX"]
+
+
+def test_no_signal_kills_the_loop_before_it_has_stopped_the_axis() -> None:
+    unit = (SYSTEMD / "servod@.service").read_text()
+    assert _key(unit, "KillMode") == "control-group"  # SIGTERM to the loop also when the supervisor is gone
+    assert _key(unit, "WatchdogSignal") == "SIGTERM"  # it too goes to the whole group
+    (longest,) = [m.le for m in LimitsConfig.model_fields["ramp_down_s"].metadata if hasattr(m, "le")]
+    goodbye_s = GOODBYE_TIMEOUT_CYCLES * 0.02
+    assert float(_key(unit, "TimeoutStopSec")) > 2.0 * longest + goodbye_s
+
+
+def _key(unit: str, name: str) -> str:
+    (value,) = re.findall(rf"^{name}=(.*)$", unit, re.M)
+    return str(value)
+
+
+def test_install_puts_everything_where_the_units_look(tmp_path: Path) -> None:
+    subprocess.run([SYSTEMD / "install.sh"], env={**os.environ, "DESTDIR": str(tmp_path)}, check=True)
+    assert {u.name for u in UNITS} <= {p.name for p in (tmp_path / "etc/systemd/system").iterdir()}
+    config = load_config(tmp_path / "etc/servod/config/virtual.yaml")
+    assert config.gains.initial.exists()
+    command = re.search(r"--plant (\S+)", (SYSTEMD / "servod-virtual-axis.service").read_text())
+    assert command is not None
+    assert (tmp_path / command[1].lstrip("/")).exists()
+    mine = tmp_path / "etc/servod/config/can0.yaml"
+    mine.write_text("mine")
+    subprocess.run([SYSTEMD / "install.sh"], env={**os.environ, "DESTDIR": str(tmp_path)}, check=True)
+    assert mine.read_text() == "mine"

@@ -1,0 +1,55 @@
+"""The bus load that a configuration makes is refused without a bus, by the daemon's check and the command line's."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rig import Rig
+from witness import axis_config
+
+from servod.cli.app import run
+from servod.common.errors import BadInput
+from servod.common.shipped import shipped
+from servod.formats.config import load_config
+from servod.runtime.daemon.startup import check
+from servod.runtime.fieldbus.master.planned import planned_bus_load
+
+CONFIG = shipped("gains") / "config" / "virtual.yaml"
+
+
+def configured(folder: Path, bit_rate: int) -> Path:
+    """The shipped configuration at another bit rate."""
+    sections: dict[str, Any] = load_config(CONFIG).model_dump(mode="json")
+    sections["bus"]["bit_rate"] = bit_rate
+    file = folder / "axis.yaml"
+    file.write_text(json.dumps(sections))
+    return file
+
+
+def test_the_plan_alone_gives_the_load_of_the_bring_up() -> None:
+    rig = Rig()
+    rig.start()
+    assert planned_bus_load(rig.config, "axis.yaml").share == rig.up.bus_load
+
+
+def test_a_driver_of_the_other_kind_is_refused() -> None:
+    with pytest.raises(BadInput, match=r"axis.yaml: amplifier.driver.*allowed: cia402$"):
+        planned_bus_load(axis_config(amplifier={"driver": "cia406"}), "axis.yaml")
+
+
+def test_the_daemons_check_refuses_too_slow_a_bus(tmp_path: Path) -> None:
+    check(configured(tmp_path, 1_000_000))
+    with pytest.raises(BadInput, match=r"axis.yaml: bus load: .*77\.\d % of 500000 bit/s.*at most bus.max_load = 70 %"):
+        check(configured(tmp_path, 500_000))
+
+
+def test_config_check_shows_the_load_and_refuses_too_slow_a_bus(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["config", "check", str(configured(tmp_path, 1_000_000))]) == 0
+    assert "bus load 38.6 % at 1000000 bit/s" in capsys.readouterr().out
+    assert run(["config", "check", str(configured(tmp_path, 500_000))]) == 2
+    assert "% of 500000 bit/s" in capsys.readouterr().err

@@ -1,0 +1,138 @@
+"""SDO access alone: time-out with an abort on the wire, late answers, lengths, one transfer at a time."""
+
+from __future__ import annotations
+
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import can
+import pytest
+from witness import EDS, Witness, witness
+
+from servod.common.clock import WallClock
+from servod.common.errors import BadInput, Unreachable
+from servod.runtime.fieldbus.devices import SdoAbort
+from servod.runtime.fieldbus.master.eds import load_dictionary
+from servod.runtime.fieldbus.master.network import BusNetwork
+from servod.runtime.fieldbus.master.sdo import SDO_TIMEOUT_S, NodeSdo, abort_text
+
+
+@pytest.fixture
+def world() -> Iterator[Witness]:
+    with witness() as instance:
+        yield instance
+
+
+@pytest.fixture(params=[True, False], ids=["threaded", "pumped"])
+def network(world: Witness, request: pytest.FixtureRequest) -> Iterator[BusNetwork]:
+    instance = BusNetwork(world.bus(), WallClock(), request.param)
+    yield instance
+    instance.disconnect()
+
+
+def access(network: BusNetwork, node_id: int = 1) -> NodeSdo:
+    return NodeSdo(network, node_id, load_dictionary(EDS / "amplifier.eds", node_id).objects)
+
+
+def test_signed_and_unsigned_values_come_back(network: BusNetwork) -> None:
+    sdo = access(network)
+    for index, value in ((0x6060, -3), (0x607C, -(2**31)), (0x1017, 65535), (0x6085, 2**32 - 1)):
+        sdo.write(index, 0, value)
+        assert sdo.read(index) == value
+
+
+def test_strings_come_segmented(network: BusNetwork, world: Witness) -> None:
+    assert access(network).read_text(0x1008) == world.amplifier.sdo[0x1008].raw
+    assert len(world.amplifier.sdo[0x1008].raw) > 4
+
+
+def test_a_time_out_is_told_to_the_node_by_an_abort(network: BusNetwork, world: Witness) -> None:
+    listener = world.raw()
+    started = time.monotonic()
+    with pytest.raises(Unreachable, match=r"node 5 object 0x6041:0: read failed, No SDO response"):
+        access(network, 5).read(0x6041)
+    assert SDO_TIMEOUT_S <= time.monotonic() - started < 3 * SDO_TIMEOUT_S
+    frames = [message for message in iter(lambda: listener.recv(0.05), None) if message.arbitration_id == 0x605]
+    assert bytes(frames[-1].data) == struct.pack("<BHBL", 0x80, 0x6041, 0, 0x05040000)
+    listener.shutdown()
+
+
+def answer_late(bus: can.BusABC, stop: threading.Event) -> None:
+    """A node that answers the first request only after the client gave up, then answers at once."""
+    first = True
+    while not stop.is_set():
+        message = bus.recv(0.05)
+        if message is None or message.arbitration_id != 0x605 or message.data[0] != 0x40:
+            continue
+        if first:
+            time.sleep(1.3 * SDO_TIMEOUT_S)
+        value = 111 if first else 222
+        first = False
+        data = struct.pack("<BHBL", 0x43, 0x6076, 0, value)
+        bus.send(can.Message(arbitration_id=0x585, data=data, is_extended_id=False))
+
+
+def test_an_answer_that_came_too_late_is_not_taken_for_the_next(network: BusNetwork, world: Witness) -> None:
+    stop, bus = threading.Event(), world.raw()
+    slow = threading.Thread(target=answer_late, args=(bus, stop))
+    slow.start()
+    try:
+        sdo = access(network, 5)
+        with pytest.raises(Unreachable):
+            sdo.read(0x6076)
+        time.sleep(SDO_TIMEOUT_S)
+        assert sdo.read(0x6076) == 222
+    finally:
+        stop.set()
+        slow.join()
+        bus.shutdown()
+
+
+def test_a_value_that_does_not_fit_never_goes_out(network: BusNetwork) -> None:
+    with pytest.raises(BadInput, match="found 256; allowed: a value of 8 bits"):
+        access(network).write(0x60C2, 1, 256)
+
+
+def test_an_object_that_the_eds_lacks_is_as_absent_as_the_device_says(network: BusNetwork) -> None:
+    with pytest.raises(SdoAbort, match="the EDS has no such object") as abort:
+        access(network).write(0x5FFF, 0, 1)
+    assert abort.value.code == 0x06020000
+
+
+def test_two_threads_on_one_node_never_mix_answers(world: Witness) -> None:
+    network = BusNetwork(world.bus(), WallClock(), threaded=True)
+    sdo = access(network)
+    sdo.write(0x6080, 0, 11)
+    sdo.write(0x6085, 0, 22)
+    seen: dict[int, set[int]] = {0x6080: set(), 0x6085: set()}
+
+    def read_many(index: int) -> None:
+        for _ in range(40):
+            seen[index].add(sdo.read(index))
+
+    threads = [threading.Thread(target=read_many, args=(index,)) for index in seen]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    network.disconnect()
+    assert seen == {0x6080: {11}, 0x6085: {22}}
+
+
+@pytest.mark.parametrize(
+    ("code", "text"), [(0x06070010, "length"), (0x05040000, "time out"), (0x12345678, "unknown abort code")]
+)
+def test_every_abort_code_has_words(code: int, text: str) -> None:
+    assert text in abort_text(code)
+
+
+def test_a_bus_that_takes_no_frame_is_unreachable(network: BusNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any, **__: Any) -> None:
+        raise can.CanOperationError("queue full")
+
+    monkeypatch.setattr(network._servod_bus._bus, "send", refuse)  # type: ignore[attr-defined]
+    with pytest.raises(Unreachable, match=r"frame 0x601 could not be sent \(full queue\)"):
+        access(network).read(0x1000)

@@ -1,0 +1,89 @@
+"""The axis, cycle by cycle: every YAML file in tests/cycles is a scenario that someone who knows no Python can read.
+
+Each entry is one cycle (or `repeat` of them): what happens (`ask`, `drive`, `faults`) and what the axis then shows.
+"""
+
+from pathlib import Path
+
+import pytest
+
+from servod.common.errors import FAULTS, FaultCode
+from servod.common.yaml import parse_yaml
+from servod.runtime.fieldbus.devices import AmplifierFeedback, DriveState, Mode, Reason
+from servod.runtime.loop.axis import Axis, AxisState
+from servod.runtime.loop.commands import Refusal
+
+SCENARIOS = sorted((Path(__file__).parents[2] / "cycles").glob("*.yaml"))
+PERIOD_S = 1e-3
+
+
+def feedback(text: str) -> AmplifierFeedback:
+    """`text`: a drive state, optionally followed by words: stale, warning, limit, remote, mode=N, "misses
+    commands"."""
+    name, *words = text.split()
+    state = DriveState[name]
+    mode = next((int(w[5:]) for w in words if w.startswith("mode=")), 10)
+    status = (1 << 7 if "warning" in words else 0) | (1 << 11 if "limit" in words else 0)
+    status |= 1 << 9 if "remote" in words else 0
+    reached = state == DriveState.OPERATION_ENABLED
+    reasons = Reason.IN_FAULT if state == DriveState.FAULT else Reason.NONE
+    reasons |= Reason.COMMANDS_MISSED if "misses" in words else Reason.NONE
+    return AmplifierFeedback(0, int("stale" in words), state, status, mode, 0.0, 0.0, 0, reached, reasons)
+
+
+def ask(axis: Axis, request: str) -> Refusal | None:
+    actions = {
+        "enable": lambda: axis.enable(False),
+        "enable with reset": lambda: axis.enable(True),
+        "enable with proof": lambda: axis.enable(False, prove=True),
+        "enable with proof and reset": lambda: axis.enable(True, prove=True),
+        "tell it is proven": axis.proven,
+        "disable": axis.disable,
+        "quick stop": axis.quick_stop,
+        "reset fault": axis.reset_fault,
+    }
+    return actions[request]()
+
+
+def names(word: int) -> list[str]:
+    return [c.name for c, f in FAULTS.items() if word & f.bit]
+
+
+@pytest.mark.parametrize("path", SCENARIOS, ids=lambda p: p.stem)
+def test_scenario(path):
+    document = parse_yaml(path.read_text(), path.name)
+    axis = Axis(PERIOD_S, document.get("ramp_s", 0.003), document.get("enable_timeout_s", 0.01), Mode(10), 5.0)
+    drive = "SWITCH_ON_DISABLED"
+    for number, entry in enumerate(document["cycles"], 1):
+        drive = entry.get("drive", drive)
+        if "ask" in entry:
+            refusal = ask(axis, entry["ask"])
+            assert (refusal or Refusal.DONE).name == entry.get("answer", "DONE"), f"{path.name}, entry {number}"
+        bits = sum(FAULTS[FaultCode[name]].bit for name in entry.get("faults", []))
+        for _ in range(entry.get("repeat", 1)):
+            output = axis.step(
+                feedback(drive), "encoder stale" not in entry, bits, entry.get("reference at rest", False)
+            )
+        shown = {
+            "axis": axis.state.name,
+            "goal": axis.goal.name,
+            "torque share": output.torque_share,
+            "just enabled": output.just_enabled,
+            "brake": output.brake,
+            "reset": output.reset_fault,
+            "present": names(axis.faults),
+            "latched": names(axis.latched),
+        }
+        expected = entry["shows"]
+        assert set(expected) <= set(shown), f"{path.name}, entry {number}: unknown key in shows"
+        got = {key: shown[key] for key in expected}
+        assert _same(got, expected), f"{path.name}, entry {number}: {got} != {expected}"
+
+
+def _same(got: dict, expected: dict) -> bool:
+    return all(got[k] == (pytest.approx(v) if isinstance(v, float) else v) for k, v in expected.items())
+
+
+def test_there_are_scenarios():
+    assert len(SCENARIOS) >= 8
+    assert {s.name for s in AxisState} >= {"ENABLED", "FAULT"}

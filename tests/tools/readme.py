@@ -1,0 +1,212 @@
+"""The README's tables that come from the code. `python tests/tools/readme.py` writes them anew.
+
+`--measure` first runs `servoctl bench`, `servoctl paper` and `servoctl demo --fast` with the README's gain sets (twenty
+minutes on an idle machine) and writes what they print; `--bench FILE`, `--paper FILE` and `--demo FILE` take documents
+that were kept (--json). `--soak FILE` (again for more), `--faults FILE` and `--fuzz FILE`, given together, write the
+table of reliability from the documents of `servoctl soak`, `servoctl faults` and `python -m tests.fuzz.run`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import reliability
+
+from servod.common.errors import FAULTS
+from servod.common.shipped import shipped
+from servod.drivers.quirks import QUIRKS
+from servod.formats.config import AxisConfig
+from servod.qualify.bench.table import GOALS
+from servod.qualify.bench.table import shown as shown_figure
+from servod.qualify.demo.entries import entries
+from servod.qualify.paper.table import quotation
+
+#: Gain sets beside the four controllers in the README: the local law without each option and without any, with
+#: scheduled feedback, and Table I in both readings of its gain labels.
+BESIDE = (
+    "demo_local_no_observer",
+    "demo_local_measured",
+    "demo_local_plain",
+    "demo_local_stiff",
+    "table1_kz_kv_kx",
+    "table1_kx_kv_kz",
+)
+#: What the paper measured on its laboratory joint.
+PAPER_MRAD = {
+    "pd_dob": "0.6916",
+    "pd_lugre": "0.5006",
+    "local": "0.3781",
+    "table1_kz_kv_kx": "0.3781",
+    "table1_kx_kv_kz": "0.3781",
+}
+
+README = Path(__file__).resolve().parents[2] / "README.md"
+
+
+def markdown(header: list[str], rows: list[list[str]]) -> str:
+    """A Markdown table."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+
+
+def faults() -> str:
+    """Every fault, its reaction, cause and remedy."""
+    rows = [[f"`{f.code.name}`", f.reaction.name.lower().replace("_", " "), f.cause, f.remedy] for f in FAULTS.values()]
+    return markdown(["Fault", "Reaction", "Cause", "Remedy"], rows)
+
+
+def quirks() -> str:
+    """Every documented deviation of a real drive, with its source."""
+    rows = [
+        [f"`{name}`", row.maker, deviation.text, deviation.source]
+        for name, row in QUIRKS.items()
+        for deviation in row.deviations
+    ]
+    return markdown(["`amplifier.quirks`", "Maker", "Deviation", "Source"], rows)
+
+
+def config() -> str:
+    """Every key of the axis configuration with its type and range, default and meaning."""
+    schema = AxisConfig.model_json_schema()
+    return markdown(["Key", "Allowed", "Default", "Meaning"], list(config_rows(schema, schema, "")))
+
+
+def config_rows(schema: dict[str, Any], here: dict[str, Any], prefix: str) -> Iterator[list[str]]:
+    """The rows of one level, groups followed by their keys."""
+    for name, field in here["properties"].items():
+        group = field.get("$ref")
+        if group:
+            yield from config_rows(schema, schema["$defs"][group.rsplit("/", 1)[1]], f"{prefix}{name}.")
+            continue
+        default = "required" if name in here.get("required", []) else f"`{shown(field)}`"
+        yield [f"`{prefix}{name}`", allowed(field), default, field.get("description", "")]
+
+
+def shown(field: dict[str, Any]) -> str:
+    """A default as it would stand in the file."""
+    default = field.get("default", {})
+    if isinstance(default, bool):
+        return str(default).lower()
+    return "none" if default is None else str(default)
+
+
+def allowed(field: dict[str, Any]) -> str:
+    """Type and range of one key in words."""
+    if "anyOf" in field:
+        return " or ".join(allowed(option) for option in field["anyOf"])
+    if "enum" in field:
+        return ", ".join(str(value) for value in field["enum"])
+    bounds = [f"{sign} {field[key]}" for key, sign in BOUNDS.items() if key in field]
+    kind = {"null": "none", "string": "text", "object": "mapping"}.get(field.get("type", ""), field.get("type", ""))
+    return " ".join([kind, ", ".join(bounds)]).strip()
+
+
+BOUNDS = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
+TABLES: dict[str, Callable[[], str]] = {"faults": faults, "quirks": quirks, "config": config}
+
+
+def with_tables(text: str) -> str:
+    """The README's text with all tables as the code has them now."""
+    for name, table in TABLES.items():
+        text = with_section(text, name, table())
+    return text
+
+
+def measured(document: dict[str, Any]) -> str:
+    """The benchmark's figures beside their goals, and the machine they were measured on."""
+    machine = document["machine"]
+    rows = []
+    for goal in GOALS:
+        rows.append([goal.label, shown_figure(document, goal), goal.goal, goal.verdict(document)])
+    wall_s, memory_s = document["wall_clock"]["seconds"], document["memory"]["seconds"]
+    return (
+        f"Measured by `servoctl bench` on {machine['cpu']}, {machine['cores']} cores, Linux {machine['kernel']}, "
+        f"Python {machine['python']}; wall clock over {wall_s:.0f} s, memory over {memory_s:.0f} s.\n\n"
+        + markdown(["Figure", "Measured", "Goal", ""], rows)
+    )
+
+
+def with_section(text: str, name: str, content: str) -> str:
+    """`text` with the part between the marks of `name` replaced."""
+    pattern = re.compile(rf"(<!-- {name}: from the code -->\n).*?(<!-- {name}: end -->)", re.DOTALL)
+    assert pattern.search(text), f"README.md has no part {name}"
+    return pattern.sub(lambda m: f"{m[1]}{content}\n{m[2]}", text)
+
+
+def demo_arguments() -> list[str]:
+    """The demo that the README's table of tracking errors comes from."""
+    return ["demo", "--fast", *(word for name in BESIDE for word in ("--gains", f"gains/{name}.yaml"))]
+
+
+def tracking(document: dict[str, Any]) -> str:
+    """Every row of the demo's table with the options of its law, beside what the paper measured on its joint."""
+    scores = document["controllers"] | document["others"]
+    rows = []
+    for row in entries([shipped(f"gains/{name}.yaml") for name in BESIDE]):
+        score = scores[row.name]
+        rms, largest = (f"{score[f'{kind}_error_mrad']:.3f}" for kind in ("rms", "max"))
+        name = row.name if row.name in document["others"] else f"demo_{row.name}"
+        rows.append([row.label if row.label != row.name else "", f"`{name}`", row.options, rms, largest])
+        rows[-1].append(PAPER_MRAD.get(row.name, ""))
+    header = ["Controller", "Gain set", "Options", "RMS / mrad", "Largest / mrad", "Paper, RMS / mrad"]
+    return f"    servoctl {' '.join(demo_arguments())}\n\n{markdown(header, rows)}"
+
+
+def printed(arguments: list[str], folder: str) -> dict[str, Any]:
+    """The JSON document of one command of servoctl."""
+    command = [sys.executable, "-m", "servod.cli", *arguments, "--json"]
+    if arguments[0] in ("demo", "paper"):
+        command += ["--out", folder]
+    document: dict[str, Any] = json.loads(
+        subprocess.run(command, stdout=subprocess.PIPE, cwd=README.parent, check=True).stdout
+    )
+    return document
+
+
+def main() -> None:
+    """Write the tables, and what was measured when that is asked for or given."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--measure", action="store_true", help="run the commands and write what they print")
+    parser.add_argument("--bench", type=Path, help="document of `servoctl bench --json`")
+    parser.add_argument("--demo", type=Path, help="document of the README's `servoctl demo --json`")
+    parser.add_argument("--paper", type=Path, help="paper.json of `servoctl paper`")
+    parser.add_argument("--soak", type=Path, action="append", default=[], help="soak.json of `servoctl soak`")
+    parser.add_argument("--faults", type=Path, help="document of `servoctl faults --json`")
+    parser.add_argument("--fuzz", type=Path, help="document of `python -m tests.fuzz.run --json`")
+    options = parser.parse_args()
+    documents = {name: json.loads(file.read_text()) for name in MEASURED if (file := getattr(options, name))}
+    if options.measure:
+        with tempfile.TemporaryDirectory(prefix="servod-readme-") as folder:
+            commands = {"demo": demo_arguments(), "bench": ["bench"], "paper": ["paper"]}
+            documents = {name: printed(arguments, folder) for name, arguments in commands.items()}
+    text = with_tables(README.read_text())
+    for name, document in documents.items():
+        text = with_section(text, name, MEASURED[name](document))
+    tried = reliability_rows(options.soak, options.faults, options.fuzz)
+    if tried:
+        text = with_section(text, "reliability", markdown(reliability.HEADER, tried))
+    README.write_text(text)
+
+
+def reliability_rows(soaks: list[Path], faults: Path | None, fuzz: Path | None) -> list[list[str]]:
+    """The rows of the table of reliability from the documents that are given."""
+    campaign, fuzzed = (None if file is None else json.loads(file.read_text()) for file in (faults, fuzz))
+    return reliability.rows([json.loads(file.read_text()) for file in soaks], campaign, fuzzed)
+
+
+MEASURED: dict[str, Callable[[dict[str, Any]], str]] = {
+    "bench": measured,
+    "demo": tracking,
+    "paper": quotation,
+}
+
+if __name__ == "__main__":
+    main()
