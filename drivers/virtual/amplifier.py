@@ -17,9 +17,8 @@ from servod.drivers.virtual.motion import Motion
 from servod.drivers.virtual.motor_sensor import MotorSensor
 from servod.drivers.virtual.node import Node, Send
 from servod.drivers.virtual.power_machine import PowerMachine
-from servod.drivers.virtual.power_state import ENERGISED, Command, Ramp
+from servod.drivers.virtual.power_state import ENERGISED, Command, Ramp, status_word
 from servod.drivers.virtual.settings import VirtualAxisSettings
-from servod.drivers.virtual.status_word import status_word
 from servod.drivers.virtual.timeline import Timeline
 from servod.runtime.fieldbus.cia import Abort, Emcy, Obj402
 from servod.runtime.fieldbus.devices import DriveState, Mode

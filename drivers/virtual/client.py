@@ -14,7 +14,7 @@ import time
 from servod.common.errors import Unreachable
 from servod.drivers.virtual.bus_faults import BusFault, FaultKind
 from servod.runtime.fieldbus.bus import CAN_ERR_FLAG, CAN_FRAME, BusCounters, Frame
-from servod.runtime.fieldbus.bus.frames import count_error_frame
+from servod.runtime.fieldbus.bus.socketcan import count_error_frame
 
 #: What the hub delivers: struct can_frame and the moment (CLOCK_MONOTONIC, ns) at which the frame ended on the bus.
 STAMPED_FRAME = struct.Struct("<IB3x8sQ")

@@ -11,14 +11,13 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-from servod.drivers.virtual.dictionary import Dictionary
+from servod.drivers.virtual.dictionary import Dictionary, Storage
 from servod.drivers.virtual.emergency import Emergency
 from servod.drivers.virtual.heartbeat import HeartbeatConsumer, HeartbeatProducer
 from servod.drivers.virtual.lss import LssSlave
 from servod.drivers.virtual.pdo_engine import PdoEngine
 from servod.drivers.virtual.port import ErrorState
 from servod.drivers.virtual.sdo_server import SdoServer
-from servod.drivers.virtual.storage import Storage
 from servod.drivers.virtual.timeline import Timeline
 from servod.runtime.fieldbus.bus import CAN_RTR_FLAG
 from servod.runtime.fieldbus.cia import (

@@ -15,16 +15,17 @@ from servod.cli.common import (
     DEFAULT_SOCKET,
     JsonOption,
     SocketOption,
+    Tell,
     example,
     need_folder,
     one_thread,
     print_json,
+    progress,
 )
-from servod.cli.progress import Tell, progress
 from servod.common.errors import BadInput
 
 if TYPE_CHECKING:
-    from servod.client.commission_axis import WalkAxis
+    from servod.client.open import WalkAxis
 
 _HELP = example(
     "Identify the axis, synthesize and verify a gain set for it, deploy it with proof, compare, and report. "
@@ -63,10 +64,9 @@ def commission(
     """Walk from identification to validation in OUT; exit code 1 when a step's answer is no."""
     one_thread()
     from servod.client.processes import sigterm_as_interrupt
-    from servod.lab.commission.questions import Questions
-    from servod.lab.commission.result import failure, result
+    from servod.lab.commission.report import failure, result
     from servod.lab.commission.steps import STEPS
-    from servod.lab.commission.walk import Options, StepFailed, Walk, run
+    from servod.lab.commission.walk import Options, Questions, StepFailed, Walk, run
 
     axis = _virtual(plant, config, settings, encoder_counts, seed) if plant else _on_daemon(socket, config)
     need_folder("--out", out)
@@ -94,7 +94,7 @@ def commission(
 def _virtual(
     plant: Path, config: Path | None, settings: Path | None, encoder_counts: int | None, seed: int
 ) -> WalkAxis:
-    from servod.client.commission_axis import VirtualWalkAxis
+    from servod.client.open import VirtualWalkAxis
     from servod.common.yaml import load_model
     from servod.drivers.virtual.settings import VirtualAxisSettings
     from servod.formats.config import load_config
@@ -106,7 +106,7 @@ def _virtual(
 
 
 def _on_daemon(socket: Path, config: Path | None) -> WalkAxis:
-    from servod.client.commission_axis import DaemonWalkAxis
+    from servod.client.open import DaemonWalkAxis
     from servod.formats.config import load_config
 
     if config is None:

@@ -6,8 +6,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from servod.cli.common import need_folder, one_thread, print_json
-from servod.cli.progress import progress
+from servod.cli.common import need_folder, one_thread, print_json, progress
 from servod.common.errors import AnswerIsNo
 
 #: Share of the cost that must come back.

@@ -11,12 +11,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, connect, example, one_thread, print_json
-from servod.cli.progress import progress
+from servod.cli.common import (
+    DEFAULT_SOCKET,
+    JsonOption,
+    SocketOption,
+    connect,
+    example,
+    one_thread,
+    print_json,
+    progress,
+)
 from servod.common.errors import AnswerIsNo, BadInput
 
 if TYPE_CHECKING:
-    from servod.client.links import DeployLink
+    from servod.client.stepped import DeployLink
     from servod.formats.config import AxisConfig
     from servod.formats.gains.gain_set import GainSet
 
@@ -71,8 +79,8 @@ def deploy(
 
 @contextmanager
 def _on_daemon(socket: Path) -> Iterator[DeployLink]:
-    from servod.client.deploy_daemon import DaemonDeployLink
     from servod.client.processes import sigterm_as_interrupt
+    from servod.client.under_daemon import DaemonDeployLink
 
     with connect(socket) as client, sigterm_as_interrupt():
         yield DaemonDeployLink(client)
@@ -82,7 +90,7 @@ def _on_daemon(socket: Path) -> Iterator[DeployLink]:
 def _virtual(
     plant: Path, present: Path | None, config: Path | None, wanted: GainSet, seed: int
 ) -> Iterator[DeployLink]:
-    from servod.client.deploy_virtual import virtual_link
+    from servod.client.virtual import virtual_link
     from servod.formats.config import load_config
     from servod.formats.gains.gain_set import load_gains
     from servod.formats.model.axis_model import load_axis_model

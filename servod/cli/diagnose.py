@@ -16,7 +16,7 @@ from servod.common.errors import AnswerIsNo, BadInput
 
 if TYPE_CHECKING:
     from servod.formats.model.axis_model import AxisModel
-    from servod.lab.diagnose.engine import Diagnosis
+    from servod.lab.diagnose.judge.evidence import Diagnosis
     from servod.lab.recordings import Recording
 
 EXAMPLE = "servoctl diagnose --model model.yaml run1.csv.gz run2.csv.gz --out diagnosis"
@@ -43,7 +43,7 @@ def diagnose(
     one_thread()
     from servod.formats.model.axis_model import load_axis_model
     from servod.lab.diagnose.engine import diagnose as run
-    from servod.lab.report.diagnosis_files import write_files
+    from servod.lab.report.diagnosis import write_files
 
     axis = load_axis_model(model)
     _need_own_folder(out, model)
@@ -61,8 +61,7 @@ def diagnose(
 
 def _need_own_folder(out: Path, model: Path) -> None:
     """See that nothing of other origin in `out` would be overwritten. Raises BadInput."""
-    from servod.lab.report.diagnosis import PAGE
-    from servod.lab.report.diagnosis_files import DOCUMENT, MODEL
+    from servod.lab.report.diagnosis import DOCUMENT, MODEL, PAGE
 
     if model.resolve() == (out / MODEL).resolve():
         raise BadInput("--model", str(model), "a file that the diagnosis in --out does not replace")

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from servod.cli.common import JsonOption, example, need_folder, print_json
-from servod.common.errors import FAULTS, AnswerIsNo, BadInput
+from servod.common.errors import AnswerIsNo, BadInput
+from servod.common.faults import FAULTS
 
 if TYPE_CHECKING:
     from servod.qualify.faults.run import Outcome
@@ -74,8 +75,8 @@ def _refuse_beside_codes(**options: object) -> None:
 
 def _chosen(files: list[Path] | None, only: str | None, group: str | None, stepped: bool) -> dict[str, Scenario]:
     """The scenarios to run. Raises BadInput for a broken file, and when nothing is left."""
-    from servod.qualify.faults.catalogue import load_all, shipped_scenarios
     from servod.qualify.faults.scenario import Runs
+    from servod.qualify.faults.variants import load_all, shipped_scenarios
 
     known = load_all(files) if files else shipped_scenarios()
     runs = {Runs.STEPPED} if stepped else {Runs.STEPPED, Runs.PROCESSES}
@@ -92,7 +93,7 @@ def _chosen(files: list[Path] | None, only: str | None, group: str | None, stepp
 
 def _run(chosen: dict[str, Scenario], jobs: int, found: list[Outcome], quiet: bool) -> None:
     """Run them; each goes into `found`, and is told in a line of standard error, as it comes."""
-    from servod.qualify.faults.campaign import outcomes
+    from servod.qualify.faults.run import outcomes
 
     for outcome in outcomes(chosen, jobs):
         found.append(outcome)
@@ -120,8 +121,8 @@ def _report(found: list[Outcome], planned: int, out: Path | None, as_json: bool)
 def _write(found: list[Outcome], planned: int, content: dict[str, Any], out: Path) -> None:
     import json
 
-    from servod.common.report_files import write_bytes
-    from servod.qualify.faults.page import write_page
+    from servod.common.files import write_bytes
+    from servod.qualify.faults.document import write_page
 
     write_bytes(out / "faults.json", json.dumps(content, indent=2, allow_nan=False).encode())
     write_page(found, planned, out / "report.html")

@@ -55,8 +55,7 @@ def list_(socket: SocketOption = DEFAULT_SOCKET, as_json: JsonOption = False) ->
 @_app.command(help=example("Check a gain set file and show what is in it.", "servoctl gains show my_axis.yaml"))
 def show(file: Annotated[Path, typer.Argument(help="Gain set, YAML.")], as_json: JsonOption = False) -> None:
     """Show a gain set."""
-    from servod.formats.gains.gain_set import load_gains
-    from servod.formats.gains.gain_verdict import seal_fault
+    from servod.formats.gains.gain_set import load_gains, seal_fault
 
     gains = load_gains(file)
     document, problem, seal = gains.model_dump(mode="json"), gains.certificate_problem(), seal_fault(gains)

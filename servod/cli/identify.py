@@ -128,7 +128,7 @@ def _from_recordings(folder: Path) -> Job:
 
 
 def _virtual(plant: Path, config: Path | None, settings: Path | None, encoder_counts: int | None, seed: int) -> Job:
-    from servod.client.axis import SteppedLink
+    from servod.client.stepped import SteppedLink
     from servod.client.virtual import virtual_session
     from servod.common.yaml import load_model
     from servod.drivers.virtual.settings import VirtualAxisSettings
@@ -147,7 +147,7 @@ def _virtual(plant: Path, config: Path | None, settings: Path | None, encoder_co
 
 
 def _on_daemon(socket: Path, config: Path | None) -> Job:
-    from servod.client.daemon_link import DaemonLink
+    from servod.client.under_daemon import DaemonLink
     from servod.formats.config import load_config
 
     if config is None:

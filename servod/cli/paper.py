@@ -35,7 +35,7 @@ def paper(
     one_thread()
     from dataclasses import replace
 
-    from servod.cli.progress import progress
+    from servod.cli.common import progress
     from servod.qualify.paper.walk import QUICK, PaperPlan
     from servod.qualify.paper.walk import paper as run
 

@@ -19,7 +19,7 @@ from servod.cli.common import JsonOption, example, need_folder, one_thread
 from servod.common.errors import BadInput
 
 if TYPE_CHECKING:
-    from servod.qualify.blind.trial import Trial
+    from servod.qualify.blind.conceal import Trial
 
 _HELP = example(
     "Prove the diagnosis on cases that it has not seen: draw axes, conceal physics in them, record them, seal the "
@@ -86,10 +86,9 @@ def _in_processes(out: Path, drawn: list[str], diagnosed: list[str], scored: lis
 def _conceal(out: Path, cases: int, seed: int, harder: bool, sealed: bool) -> None:
     from dataclasses import replace
 
-    from servod.cli.progress import progress
-    from servod.qualify.blind.conceal import conceal, open_cases
+    from servod.cli.common import progress
+    from servod.qualify.blind.conceal import FILE, Trial, conceal, open_cases, read_trial, write_trial
     from servod.qualify.blind.plan import HARDER, Settings, plans
-    from servod.qualify.blind.trial import FILE, Trial, read_trial, write_trial
 
     trial, there = Trial(cases, seed, harder), read_trial(out)
     if there is not None and not there.same(trial):
@@ -123,8 +122,7 @@ def _line(name: str, done: int, of: int) -> None:
 
 
 def _score(out: Path, as_json: bool) -> None:
-    from servod.cli.common import print_json
-    from servod.cli.progress import progress
+    from servod.cli.common import print_json, progress
     from servod.qualify.blind.document import score, write
 
     trial = _sealed(out)
@@ -142,7 +140,7 @@ def _score(out: Path, as_json: bool) -> None:
 
 def _sealed(out: Path) -> Trial:
     """The trial that was sealed in `out`. Raises BadInput when there is none."""
-    from servod.qualify.blind.trial import FILE, read_trial
+    from servod.qualify.blind.conceal import FILE, read_trial
 
     trial = read_trial(out)
     if trial is None:

@@ -16,8 +16,8 @@ from servod.common.errors import BadInput
 if TYPE_CHECKING:
     from servod.formats.model.axis_model import AxisModel
     from servod.lab.recordings import Recording
+    from servod.lab.simulate.motion import Start
     from servod.lab.simulate.replay import Replay
-    from servod.lab.simulate.start import Start
 
 EXAMPLE = "servoctl replay --model model.yaml run.csv.gz --horizon 0.25 --out sim.csv"
 
@@ -77,7 +77,7 @@ def parse_horizon(text: str) -> float | None:
 
 def parse_start(text: str) -> Start:
     """What the first row is taken for. Raises BadInput."""
-    from servod.lab.simulate.start import Start
+    from servod.lab.simulate.motion import Start
 
     if text not in set(Start):
         raise BadInput("--start", repr(text), ", ".join(Start))
@@ -96,7 +96,7 @@ def check_out(out: Path | None) -> None:
 
 def write_simulation(out: Path, recorded: Recording, result: Replay) -> None:
     """Write the simulated motion, one row for each recorded row, on the recording's own time stamps."""
-    from servod.formats.recording.export_rows import write_table
+    from servod.formats.recording.export import write_table
     from servod.lab.recordings import Quantity
 
     axis = recorded.axis

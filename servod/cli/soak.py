@@ -60,7 +60,7 @@ def soak(
         raise BadInput("--jobs", jobs, "1 with --wall: the processes of one axis want the machine for themselves")
     need_folder("--out", out, alone=True)
     one_thread()
-    from servod.cli.progress import progress
+    from servod.cli.common import progress
     from servod.qualify.soak.launch import Order, launch
 
     order = Order(cycles or round(hours * _MS_PER_H), seed, wall, limit_hours, out)
@@ -78,7 +78,7 @@ def _print(found: dict[str, Any], out: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from servod.qualify.soak.page import PAGE_NAME, count_rows, fault_rows, verdict
+    from servod.qualify.soak.document import PAGE_NAME, count_rows, fault_rows, verdict
 
     console = Console()
     faults = Table("Fault", "Times", "In the log", "Ridden through", "Recovered", "Detected / ms", "Torque gone / ms")

@@ -6,12 +6,12 @@ Works on files alone; needs the lab extra (cvxpy). The set comes out without a c
 from __future__ import annotations
 
 from dataclasses import replace
+from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servod.cli import synthesis_options as ask
 from servod.cli.common import JsonOption, example, need_file, one_thread, print_json
 from servod.common.errors import AnswerIsNo, BadInput
 
@@ -21,6 +21,65 @@ if TYPE_CHECKING:
     from servod.lab.synthesize.deployed import Wishes
     from servod.lab.synthesize.gain_set import Options
     from servod.lab.synthesize.infeasible import Infeasible
+
+# Options of `servoctl synthesize`: every one with its range and a line of help; a default of None is the mode's own.
+#
+# Imports typer alone, as all verbs do.
+
+
+class Mode(StrEnum):
+    """The programme that is solved."""
+
+    DEPLOYED = "deployed"
+    REFERENCE = "reference"
+
+
+class Weights(StrEnum):
+    """Shapes of the weighting functions."""
+
+    LINEAR = "linear"
+    COSINE = "cosine"
+    GAUSSIAN = "gaussian"
+
+
+class Velocity(StrEnum):
+    """Whose velocity drives the friction state."""
+
+    REFERENCE = "reference"
+    MEASURED = "measured"
+
+
+Model = Annotated[Path, typer.Option(help="Axis model (YAML).")]
+Out = Annotated[Path, typer.Option(help="Gain set to write (YAML).")]
+Name = Annotated[str, typer.Option(help="Name of the gain set.")]
+ModeOption = Annotated[Mode, typer.Option(help="Sampled, with delay and filter; or the paper's own programme.")]
+ScalarOutput = Annotated[bool, typer.Option("--scalar-output", help="Reference mode: the literal alpha*x + beta*u*.")]
+CrossCheck = Annotated[bool, typer.Option("--cross-check", help="Solve again with SCS, and compare; half a minute.")]
+
+Alpha = Annotated[float | None, typer.Option(min=1e-3, max=1e3, help="Weight alpha of the position error.")]
+Beta = Annotated[float | None, typer.Option(min=1e-4, max=1e2, help="Weight beta of the torque.")]
+Decay = Annotated[float | None, typer.Option(min=0.1, max=500.0, help="Least decay, 1/s.")]
+ZetaMin = Annotated[
+    float | None, typer.Option("--zeta-min", "--damping", min=0.001, max=0.85, help="Least damping ratio.")
+]
+Uncertainty = Annotated[float, typer.Option(min=0.0, max=10.0, help="Scale of all intervals.")]
+Delay = Annotated[float | None, typer.Option(min=0.0, max=0.02, help="Command to torque, s, instead of the model's.")]
+Period = Annotated[int, typer.Option(min=250, max=10_000, help="Cycle, microseconds.")]
+Cutoff = Annotated[float | None, typer.Option(min=10.0, max=2000.0, help="Velocity filter, Hz, instead of the best.")]
+Counts = Annotated[int, typer.Option(min=0, max=2**40, help="Encoder counts per turn; 0 is no steps.")]
+
+Speed = Annotated[float, typer.Option(min=0.01, max=100.0, help="Highest speed of the map, rad/s.")]
+OverlapFrom = Annotated[float, typer.Option(min=1e-5, max=10.0, help="Omega_H begins at this speed, rad/s.")]
+OverlapTo = Annotated[float, typer.Option(min=1e-5, max=10.0, help="Omega_L ends at this speed, rad/s.")]
+Accuracy = Annotated[float, typer.Option(min=0.001, max=0.5, help="Force tolerance between local sets, a share.")]
+PaperNodes = Annotated[bool, typer.Option("--paper-nodes", help="The paper's nine local sets.")]
+WeightsOption = Annotated[Weights, typer.Option(help="Shape of the weighting functions.")]
+VelocityOption = Annotated[Velocity, typer.Option(help="Whose velocity drives the friction state.")]
+Observer = Annotated[bool, typer.Option(help="Output disturbance observer.")]
+PositionTorque = Annotated[bool, typer.Option(help="Feed known torques over position forward.")]
+Leak = Annotated[float, typer.Option(min=0.0, max=100.0, help="Least decay of the friction state, 1/s.")]
+GainL = Annotated[float | None, typer.Option("--l", min=-1.0, max=1.0, help="l of all local sets; else designed.")]
+
 
 EXAMPLES = (
     "servoctl synthesize --model model.yaml --out gains.yaml",
@@ -34,32 +93,32 @@ def register(app: typer.Typer) -> None:
 
 
 def synthesize(
-    model: ask.Model,
-    out: ask.Out,
-    name: ask.Name = "synthesized",
-    mode: ask.ModeOption = ask.Mode.DEPLOYED,
-    scalar_output: ask.ScalarOutput = False,
-    cross_check: ask.CrossCheck = False,
-    alpha: ask.Alpha = None,
-    beta: ask.Beta = None,
-    decay: ask.Decay = None,
-    zeta_min: ask.ZetaMin = None,
-    uncertainty: ask.Uncertainty = 1.0,
-    delay_s: ask.Delay = None,
-    period_us: ask.Period = 1000,
-    cutoff_hz: ask.Cutoff = None,
-    encoder_counts: ask.Counts = 2**20,
-    speed: ask.Speed = 0.5,
-    overlap_from: ask.OverlapFrom = 0.005,
-    overlap_to: ask.OverlapTo = 0.02,
-    accuracy: ask.Accuracy = 0.02,
-    paper_nodes: ask.PaperNodes = False,
-    weights: ask.WeightsOption = ask.Weights.LINEAR,
-    velocity: ask.VelocityOption = ask.Velocity.REFERENCE,
-    observer: ask.Observer = True,
-    position_torque: ask.PositionTorque = True,
-    leak: ask.Leak = 2.0,
-    gain_l: ask.GainL = None,
+    model: Model,
+    out: Out,
+    name: Name = "synthesized",
+    mode: ModeOption = Mode.DEPLOYED,
+    scalar_output: ScalarOutput = False,
+    cross_check: CrossCheck = False,
+    alpha: Alpha = None,
+    beta: Beta = None,
+    decay: Decay = None,
+    zeta_min: ZetaMin = None,
+    uncertainty: Uncertainty = 1.0,
+    delay_s: Delay = None,
+    period_us: Period = 1000,
+    cutoff_hz: Cutoff = None,
+    encoder_counts: Counts = 2**20,
+    speed: Speed = 0.5,
+    overlap_from: OverlapFrom = 0.005,
+    overlap_to: OverlapTo = 0.02,
+    accuracy: Accuracy = 0.02,
+    paper_nodes: PaperNodes = False,
+    weights: WeightsOption = Weights.LINEAR,
+    velocity: VelocityOption = Velocity.REFERENCE,
+    observer: Observer = True,
+    position_torque: PositionTorque = True,
+    leak: Leak = 2.0,
+    gain_l: GainL = None,
     as_json: JsonOption = False,
 ) -> None:
     """Synthesize a gain set for MODEL; exit code 1 when the demands cannot be met."""
@@ -89,7 +148,7 @@ def wishes_of(
 ) -> Wishes:
     """What is asked of the loop, with the intervals that were identified."""
     from servod.lab.synthesize.deployed import Wishes
-    from servod.lab.synthesize.intervals import uncertainty_of
+    from servod.lab.synthesize.regions import uncertainty_of
 
     return Wishes(
         uncertainty=uncertainty_of(axis).scaled(uncertainty),
@@ -105,8 +164,8 @@ def options_of(
     name: str,
     accuracy: float,
     paper_nodes: bool,
-    weights: ask.Weights,
-    velocity: ask.Velocity,
+    weights: Weights,
+    velocity: Velocity,
     observer: bool,
     position_torque: bool,
     leak_per_s: float,
@@ -168,7 +227,7 @@ def given(**values: float | None) -> dict[str, Any]:
 
 
 def solved(
-    mode: ask.Mode,
+    mode: Mode,
     axis: AxisModel,
     wishes: Wishes,
     options: Options,
@@ -179,7 +238,7 @@ def solved(
     """The set of the mode that was chosen, or why there is none."""
     from servod.lab.synthesize.gain_set import synthesize
 
-    if mode is ask.Mode.DEPLOYED:
+    if mode is Mode.DEPLOYED:
         if scalar_output:
             raise BadInput("--scalar-output", "the deployed mode", "--mode reference")
         return synthesize(axis, replace(wishes, **asked), options, path)

@@ -6,26 +6,21 @@ gets the recorded cycles of its motion back.
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from servod.client.stepped import SteppedSession
-from servod.common.errors import AnswerIsNo, faults_in
+from servod.common.errors import AnswerIsNo
+from servod.common.faults import faults_in
 from servod.formats.config import AxisConfig
 from servod.formats.recording.record import CycleRecord
-from servod.kernels.laws import LAWS
-from servod.lab.identify.trace import Trace, rows_of
+from servod.lab.identify.trace import Trace
 from servod.runtime.loop.axis import AxisState
-from servod.runtime.loop.commands import REFUSAL_TEXT, Op, ReferenceKind, Refusal
 
 #: Told after every slice of a motion: how many seconds of it have passed.
 Watch = Callable[[float], None]
-
-_SLICE_S = 0.1
 
 
 class MotionEnded(AnswerIsNo):
@@ -71,67 +66,6 @@ class Link(Protocol):
     def disable(self) -> None:
         """Ramp the torque down and switch off; never raises."""
         ...
-
-
-class SteppedLink:
-    """The virtual axis in virtual time."""
-
-    def __init__(self, session: SteppedSession, watch: Watch | None = None) -> None:
-        self.session = session
-        self._watch = watch or (lambda _seconds: None)
-
-    @property
-    def config(self) -> AxisConfig:
-        """The session's configuration."""
-        return self.session.config
-
-    @property
-    def offset_ns(self) -> int | None:
-        """Virtual time has no time of day: the same walk gives the same files, byte for byte."""
-        return 0
-
-    def enable(self) -> float:
-        """Enable with zero gains."""
-        self.set_gains(0.0, 0.0)
-        self.session.enable()
-        return self.session.latest.position_rad
-
-    def set_gains(self, position_nm_per_rad: float, velocity_nms_per_rad: float) -> None:
-        """PD feedback of the session's controller."""
-        law = LAWS["pd"]
-        gains = [position_nm_per_rad, velocity_nms_per_rad, 0.0]
-        self._must(self.session.send(Op.ACTIVATE, [0, law.number, len(gains), *gains]))
-
-    def excite(
-        self, positions_rad: Sequence[float], torques_nm: Sequence[float], window_rad: float
-    ) -> NDArray[np.void]:
-        """Run the motion as fast as it computes."""
-        session = self.session
-        session.load_trajectory([*positions_rad, *torques_nm])
-        session.clear()
-        extent = [min(positions_rad), max(positions_rad)]
-        self._must(session.send(Op.REFERENCE, [ReferenceKind.EXCITE, len(positions_rad), *extent, window_rad]))
-        passed_s = 0.0
-        while session.cycle.reference.active:
-            session.run(_SLICE_S)
-            passed_s += _SLICE_S
-            self._watch(passed_s)
-        rows = moving(rows_of(session.raw))
-        try:
-            check_state(session.latest)
-        except AnswerIsNo as error:
-            raise MotionEnded(str(error), rows) from None
-        return rows
-
-    def disable(self) -> None:
-        """Switch off and let the drive see it."""
-        with contextlib.suppress(AnswerIsNo):
-            self.session.send(Op.DISABLE)
-            self.session.run(self.config.limits.ramp_down_s + 0.1)
-
-    def _must(self, refusal: Refusal) -> None:
-        if refusal != Refusal.DONE:
-            raise AnswerIsNo(f"the axis refused the experiment: {REFUSAL_TEXT[refusal]}")
 
 
 def moving(rows: NDArray[np.void]) -> NDArray[np.void]:

@@ -8,58 +8,25 @@ is servod.runtime.daemon.control_server.
 
 from __future__ import annotations
 
-import json
 import socket
 import struct
 from collections.abc import Iterator, Sequence
-from enum import StrEnum
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from servod.common.errors import AnswerIsNo, BadInput, ServodError, Unreachable, one_line
-
-#: Longest request; a longer one ends the connection. A gain set with its design and proofs takes 100 KiB.
-MAX_LINE_BYTES = 512 * 1024
-#: Longest answer that a client takes.
-MAX_ANSWER_BYTES = 4 * 1024 * 1024
-#: Samples in one request: as text, each takes at most 25 bytes.
-PIECE_SAMPLES = 2000
-
+from servod.formats.protocol import (
+    MAX_ANSWER_BYTES,
+    MAX_LINE_BYTES,
+    PIECE_SAMPLES,
+    SampleKey,
+    Verb,
+    decode_line,
+    encode_line,
+)
 
 _TIMEVAL = struct.Struct("@ll")
-
-
-class Verb(StrEnum):
-    """What the daemon can be asked."""
-
-    STATUS = "status"
-    WATCH = "watch"
-    ENABLE = "enable"
-    DISABLE = "disable"
-    STOP = "stop"
-    HALT = "halt"
-    TRAJECTORY = "trajectory"
-    TRACK = "track"
-    GAINS_LOAD = "gains_load"
-    GAINS_LIST = "gains_list"
-    GAINS_ACTIVATE = "gains_activate"
-    GAINS_KEEP = "gains_keep"
-    GAINS_ROLLBACK = "gains_rollback"
-    RECORD_START = "record_start"
-    RECORD_STOP = "record_stop"
-    SCAN = "scan"
-
-
-#: Verbs that only look; everything else needs the right to command.
-READING = frozenset({Verb.STATUS, Verb.WATCH, Verb.GAINS_LIST})
-
-
-class SampleKey(StrEnum):
-    """Arguments of `track` that may be long."""
-
-    POSITIONS = "positions_rad"
-    TORQUES = "torques_nm"
 
 
 class RemoteBadInput(BadInput):
@@ -75,22 +42,6 @@ class Refused(Unreachable):
 
 
 _ERRORS: dict[int, type[ServodError]] = {1: AnswerIsNo, 2: RemoteBadInput, 3: Refused}
-
-
-def encode_line(message: dict[str, Any]) -> bytes:
-    """One JSON object as a line; NaN and infinity are refused, JSON has none. Raises ValueError."""
-    return json.dumps(message, separators=(",", ":"), allow_nan=False).encode() + b"\n"
-
-
-def decode_line(line: bytes) -> dict[str, Any]:
-    """The JSON object of one line. Raises ValueError when it is anything else."""
-    try:
-        message = json.loads(line)
-    except RecursionError:
-        raise ValueError("nested too deeply") from None
-    if not isinstance(message, dict):
-        raise ValueError("not a JSON object")
-    return message
 
 
 class ControlClient:

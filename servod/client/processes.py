@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import grp
 import os
 import signal
 import subprocess
@@ -15,8 +16,13 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
+import yaml
+
+from servod.client.control import ControlClient
 from servod.common.errors import Unreachable
+from servod.formats.config import AxisConfig
 
 _PR_SET_PDEATHSIG, _PR_CAPBSET_DROP = 1, 24  # linux/prctl.h
 _STOP_S = 5.0
@@ -94,3 +100,69 @@ def sigterm_as_interrupt() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+_START_S = 20.0
+
+
+class RunningAxis(NamedTuple):
+    """A client that may command, and the daemon's process id."""
+
+    client: ControlClient
+    daemon_pid: int
+
+
+@contextlib.contextmanager
+def running_axis(
+    config: AxisConfig, plant: Path, folder: Path, axis_options: Sequence[str] = ()
+) -> Iterator[RunningAxis]:
+    """Virtual axis and daemon for the time of a `with` block. Raises Unreachable when one does not start.
+
+    `axis_options` are further arguments of servod-virtual-axis.
+    """
+    file = folder / "axis.yaml"
+    file.write_text(yaml.safe_dump(config.model_dump(mode="json")))
+    bus, control = Path(config.bus.channel), config.control.socket
+    with contextlib.ExitStack() as stack:
+        log = folder / "virtual-axis.log"
+        axis = stack.enter_context(
+            child(
+                "servod.drivers.virtual.main",
+                ["--socket", str(bus), "--plant", str(plant), *axis_options],
+                log,
+                cores=other_cores(),
+            )
+        )
+        wait_until(bus.exists, axis, log, _START_S)
+        log = folder / "servod.log"
+        daemon = stack.enter_context(child("servod.runtime.daemon.main", ["--config", str(file)], log))
+        wait_until(lambda: _answers(control), daemon, log, _START_S)
+        yield RunningAxis(stack.enter_context(ControlClient(control)), daemon.pid)
+
+
+def _answers(control: Path) -> bool:
+    """The daemon listens, and its loop turns."""
+    try:
+        with ControlClient(control) as client:
+            return bool(client.call("status"))
+    except Unreachable:
+        return False
+
+
+def last_core() -> int | None:
+    """The core farthest from where the system puts its interrupts; None where there is only one."""
+    cores = sorted(os.sched_getaffinity(0))
+    return cores[-1] if len(cores) > 1 else None
+
+
+def other_cores() -> set[int] | None:
+    """All cores but the loop's; None where there is only one."""
+    return os.sched_getaffinity(0) - {last_core()} or None
+
+
+def own_group() -> str:
+    """The group of this process, by name where it has one."""
+    try:
+        return grp.getgrgid(os.getgid()).gr_name
+    except KeyError:
+        return str(os.getgid())

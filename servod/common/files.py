@@ -63,3 +63,23 @@ def open_file(path: str | Path) -> BinaryIO:
         return os.fdopen(descriptor, "rb")
     os.close(descriptor)
     raise OSError(errno.EISDIR if kind == stat.S_IFDIR else errno.EINVAL, _KINDS.get(kind, "no regular file"))
+
+
+# Writes the files of a report: aside first, flushed, then renamed, so that an interrupted run leaves no half file.
+#
+# Under page and pictures.
+
+
+def write_bytes(path: Path, content: bytes) -> Path:
+    """Replace `path` by `content`, make its folder where it is missing, and return `path`. Raises BadInput."""
+    aside = path.with_name(path.name + ".part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with aside.open("wb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        aside.replace(path)
+    except OSError as error:
+        raise BadInput(str(path), error.strerror or str(error), "a path that can be written") from None
+    return path

@@ -68,3 +68,13 @@ def begin_worker(parent: int, begin: Callable[..., None] | None = None, given: t
         os._exit(1)
     if begin is not None:
         begin(*given)
+
+
+# The signals that ask a process of servod to end in order. Ground floor.
+
+
+def on_end_signals(act: Callable[[], None]) -> None:
+    """Let SIGTERM, SIGINT and SIGHUP (its terminal closes) call `act`; under nohup(1), SIGHUP stays ignored."""
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, lambda *_: act())

@@ -15,7 +15,7 @@ import yaml
 
 from servod.cli.app import run
 from servod.cli.demo import print_document
-from servod.common.errors import FAULTS, FaultCode
+from servod.common.faults import FAULTS, FaultCode
 from servod.common.shipped import shipped
 from servod.qualify.demo.entries import entries
 from servod.qualify.demo.wall import why

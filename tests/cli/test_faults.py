@@ -128,7 +128,7 @@ def test_only_what_was_to_be_repaired_recovers_by_repair(recovered: bool, by_rep
 def test_interrupted_it_writes_what_it_has(
     mine: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from servod.qualify.faults import campaign
+    from servod.qualify.faults import run as campaign
 
     def interrupted(chosen: dict, jobs: int) -> Iterator[Outcome]:
         for name, scenario in chosen.items():

@@ -10,8 +10,8 @@ import pytest
 
 from servod.common.errors import AnswerIsNo, BadInput
 from servod.common.shipped import shipped
-from servod.lab.recordings.rows import ROW
-from servod.lab.report.curves import thin, time_curves
+from servod.lab.recordings.recording import ROW
+from servod.lab.report.figure import thin, time_curves
 from servod.qualify.demo.axis import CONTROLLERS
 from servod.qualify.demo.entries import entries
 from servod.qualify.demo.report import Story, write_demo_page

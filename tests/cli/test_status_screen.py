@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from servod.cli.status import screen
-from servod.common.errors import FAULTS, FaultCode
+from servod.common.faults import FAULTS, FaultCode
 
 FAULT = FAULTS[FaultCode.FOLLOWING_ERROR]
 

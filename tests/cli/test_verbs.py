@@ -17,9 +17,8 @@ import pytest
 
 from servod.cli.app import run
 from servod.client.control import ControlClient
-from servod.client.processes import child, wait_until
+from servod.client.processes import child, running_axis, wait_until
 from servod.qualify.demo.axis import demo_config, gains_file, plant_file
-from servod.qualify.demo.wall import running_axis
 
 pytestmark = pytest.mark.serial
 

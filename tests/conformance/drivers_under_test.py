@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from servod.drivers import driver_table, load_driver
 from servod.formats.config import AxisConfig
 from servod.runtime.fieldbus.cia import EMCY_BASE, Obj402, Obj406
 from servod.runtime.fieldbus.devices import Amplifier, AmplifierCommand, DriveState, Encoder, Goal, NodePlan, PdoMap
+from servod.runtime.fieldbus.registry import driver_table, load_driver
 
 PERIOD_NS = 1_000_000
 MEASURING_RANGE = 3_000_001  # not a power of two, not a multiple of a turn

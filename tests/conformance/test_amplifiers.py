@@ -12,7 +12,6 @@ from drivers_under_test import RATED_TORQUE_MNM, STATUS_WORD, AmplifierBench, fi
 from hypothesis import given
 from hypothesis import strategies as st
 
-from servod.drivers import load_driver
 from servod.runtime.fieldbus.cia import CW_DISABLE_VOLTAGE, CW_FAULT_RESET, CW_HALT, Obj402
 from servod.runtime.fieldbus.devices import (
     HANDSHAKE_SYNCS,
@@ -23,6 +22,7 @@ from servod.runtime.fieldbus.devices import (
     Mode,
     Reason,
 )
+from servod.runtime.fieldbus.registry import load_driver
 
 RATED_NM = RATED_TORQUE_MNM * 1e-3
 ENABLED = DriveState.OPERATION_ENABLED

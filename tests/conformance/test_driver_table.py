@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from servod.common.errors import BadInput
-from servod.drivers import DRIVERS, driver_table, load_driver
+from servod.runtime.fieldbus.registry import DRIVERS, driver_table, load_driver
 
 _METADATA = "Metadata-Version: 2.1\nName: acme-drive\nVersion: 1.0\n"
 _MODULE = "from servod.drivers.cia406 import DRIVER\nNOT_A_DRIVER = 5\n"
@@ -51,7 +51,7 @@ def test_an_unknown_name_says_the_known_ones() -> None:
 
 def test_the_cycle_faces_load_neither_canopen_nor_numpy() -> None:
     code = (
-        "import sys; from servod.drivers import load_driver; "
+        "import sys; from servod.runtime.fieldbus.registry import load_driver; "
         "[load_driver(name).cyclic for name in ('cia402', 'cia406')]; "
         "print([m for m in ('canopen', 'can', 'numpy', 'pydantic') if m in sys.modules])"
     )

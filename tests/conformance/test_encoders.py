@@ -10,8 +10,8 @@ from drivers_under_test import COUNTS_PER_TURN, MEASURING_RANGE, PERIOD_NS, Enco
 from hypothesis import given
 from hypothesis import strategies as st
 
-from servod.drivers import load_driver
 from servod.runtime.fieldbus.devices import ALARMS_STALE, NEVER_CYCLES
+from servod.runtime.fieldbus.registry import load_driver
 
 RAD = 2 * math.pi / COUNTS_PER_TURN
 PERIOD_S = PERIOD_NS * 1e-9

@@ -11,7 +11,6 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1] / "conformance"))
 from drivers_under_test import AmplifierBench, encode
 
-from servod.drivers import load_driver
 from servod.runtime.fieldbus.cia import EMCY_BASE, Obj402
 from servod.runtime.fieldbus.devices import (
     HANDSHAKE_SYNCS,
@@ -22,6 +21,7 @@ from servod.runtime.fieldbus.devices import (
     Mode,
     Reason,
 )
+from servod.runtime.fieldbus.registry import load_driver
 
 S = DriveState
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from hypothesis import strategies as st
 
-from servod.common.errors import FaultCode, ServodError
-from servod.drivers import load_driver
+from servod.common.errors import ServodError
+from servod.common.faults import FaultCode
 from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.drivers.virtual.world import SteppedWorld
 from servod.formats.config import AxisConfig
@@ -22,6 +22,7 @@ from servod.runtime.fieldbus.master.monitor import NodeWatch
 from servod.runtime.fieldbus.master.network import BusNetwork
 from servod.runtime.fieldbus.master.scan import scan as scan_bus
 from servod.runtime.fieldbus.master.sdo import NodeSdo
+from servod.runtime.fieldbus.registry import load_driver
 from tests.axis_limits import LIMITS
 from tests.drivers.virtual.bench import JOINT
 from tests.fuzz.frames import BentBus, ScriptBus, ScriptClock, frames

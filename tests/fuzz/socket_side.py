@@ -12,8 +12,9 @@ from itertools import count
 from pathlib import Path
 from typing import Any, cast
 
-from servod.client.control import ControlClient, Verb
+from servod.client.control import ControlClient
 from servod.formats.config import AxisConfig
+from servod.formats.protocol import Verb
 from servod.formats.recording.record import FIELDS, CycleRecord
 from servod.runtime.daemon.control_server import ControlServer
 from servod.runtime.daemon.gain_bank import GainBank

@@ -11,11 +11,11 @@ import pytest
 
 from servod.common.errors import BadInput
 from servod.formats.gains.store import GainStore
-from servod.lab.commission.files import read_json
-from servod.lab.commission.runs import load_curves
+from servod.lab.commission.comparison import load_curves
 from servod.lab.commission.state import STATE, State
+from servod.lab.commission.state import read_walk_json as read_json
 from servod.lab.identify.store import LIST, load
-from servod.qualify.blind.trial import FILE, read_trial
+from servod.qualify.blind.conceal import FILE, read_trial
 
 
 def _packed() -> bytes:

@@ -14,8 +14,8 @@ from servod.formats.config import load_config
 from servod.formats.gains.gain_set import parse_gains
 from servod.formats.gains.store import GainStore
 from servod.formats.model.axis_model import load_axis_model
-from servod.runtime.fieldbus.master.dcf import left_out, parameters
 from servod.runtime.fieldbus.master.eds import load_dictionary
+from servod.runtime.fieldbus.master.node import left_out, parameters
 from tests.fuzz.shapes import csv_texts, mutated, yaml_texts
 from tests.fuzz.target import Target
 
@@ -234,7 +234,7 @@ def motion(folder: Path) -> Target:
 
 def fault_scenarios(folder: Path) -> Target:
     """A file of scenarios of the fault campaign, with its variants."""
-    from servod.qualify.faults.catalogue import load_scenarios, scenarios_in
+    from servod.qualify.faults.variants import load_scenarios, scenarios_in
 
     shipped = ROOT / "servod" / "campaign" / "scenarios" / "bus"
     assert scenarios_in(shipped)

@@ -20,7 +20,7 @@ from typing import Any
 
 import reliability
 
-from servod.common.errors import FAULTS
+from servod.common.faults import FAULTS
 from servod.common.shipped import shipped
 from servod.drivers.quirks import QUIRKS
 from servod.formats.config import AxisConfig

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import source
 
-MOST_FILE_LINES = 350
+# Joined is better than cut: a limit against heaps, not a goal.
+MOST_FILE_LINES = 500
 MOST_FUNCTION_LINES = 60
 UNFINISHED = re.compile(
     r"\b(TO" r"DO|FIX" r"ME|X" r"XX)\b|raise NotImplemented" r"Error|pytest\.(skip|xfail)|mark\.(skip|xfail)"

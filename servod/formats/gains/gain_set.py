@@ -11,7 +11,7 @@ import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import yaml
 from pydantic import Field, model_validator
@@ -22,10 +22,57 @@ from servod.common.units import NS_PER_S, NS_PER_US
 from servod.common.yaml import Dumper, Strict, parse_yaml, read_text, validate
 from servod.formats.config import AxisConfig
 from servod.formats.gains.design import Design
-from servod.formats.gains.gain_verdict import certificate_fault, seal_fault
 from servod.formats.gains.parameters import LocalSet, Parameters
 from servod.formats.model.axis_model import load_axis_model
 from servod.kernels.laws import LAWS, Law
+
+# Whether a gain set counts as certified, and if not: which key says so, what stands there, and what helps.
+#
+# Beside servod.formats.gains.gain_set, which every refusal of a set comes from.
+
+
+class GainFault(NamedTuple):
+    """Why a set does not count: the key of its file, what was found there in a few words, and what is wanted."""
+
+    key: str
+    problem: str
+    remedy: str
+
+
+_VERIFY = "a valid one (`servoctl verify` issues it)"
+_REMAKE = "the file as servoctl wrote it; for other numbers make the set anew (`servoctl synthesize`, then `verify`)"
+
+
+def seal_fault(gains: GainSet) -> GainFault | None:
+    """Why the seal does not count; None when it fits, or when there is neither seal nor design."""
+    if gains.seal is None:
+        return None if gains.design is None else GainFault("seal", "no seal, although the set has a design", _REMAKE)
+    if gains.seal == gains.content_sha256():
+        return None
+    what = "numbers that were changed after the set was sealed"
+    return GainFault("seal", what if gains.certificate else f"{what}, or a certificate that was taken out", _REMAKE)
+
+
+def certificate_fault(gains: GainSet) -> GainFault | None:
+    """Why the set does not count as certified; None when it does."""
+    certificate = gains.certificate
+    if fault := seal_fault(gains):
+        return fault
+    if certificate is None:
+        return GainFault("certificate", "no certificate", _VERIFY)
+    if gains.design is None or gains.seal is None:
+        missing = "design" if gains.design is None else "seal"
+        return GainFault(missing, "a certificate without the design that it is of and its seal", _REMAKE)
+    if not certificate.valid:
+        return GainFault("certificate", "a certificate that says valid: false", _VERIFY)
+    if certificate.parameters_sha256 != gains.parameters_sha256():
+        what = "a certificate for other parameters (they were changed after it was issued)"
+        return GainFault("certificate.parameters_sha256", what, _VERIFY)
+    if certificate.model_sha256 not in (None, gains.provenance.model_sha256):
+        what = "a certificate for another axis model than provenance.model_sha256 says"
+        return GainFault("certificate.model_sha256", what, _VERIFY)
+    return None
+
 
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 #: Lower case only: names become file names, also on systems that do not tell case apart.

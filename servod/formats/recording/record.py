@@ -35,7 +35,7 @@ FIELDS: tuple[Field, ...] = (
     Field("goal", "q", "enum", "servod.runtime.fieldbus.devices.Goal"),
     Field("goal_reached", "q", "bool", "the drive is where it shall be"),
     Field("reasons", "q", "bits", "servod.runtime.fieldbus.devices.Reason, why not"),
-    Field("faults", "q", "bits", "faults present now, servod.common.errors.FaultCode"),
+    Field("faults", "q", "bits", "faults present now, servod.common.faults.FaultCode"),
     Field("faults_latched", "q", "bits", "faults since the last enable or reset"),
     Field("drive_error", "q", "code", "0x603F or EMCY code"),
     Field("amplifier_age", "q", "cycles", "age of the amplifier's feedback"),

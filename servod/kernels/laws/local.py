@@ -30,12 +30,10 @@ from __future__ import annotations
 import math
 from collections.abc import MutableSequence, Sequence
 
-from servod.kernels.laws.exact import decayed, limited
-from servod.kernels.laws.observer import observe, remember
+from servod.kernels.laws.observer import decayed, limited, observe, remember, winds_up
 from servod.kernels.laws.position import position_torque
 from servod.kernels.laws.state import ASKED, COMMAND_1, COMMAND_2, COMMAND_3, DISTURBANCE, FRICTION_STATE, REST
 from servod.kernels.laws.weights import blended
-from servod.kernels.laws.windup import winds_up
 
 INPUT_SCALE = 0  # K [N*m per unit of u*]
 LOW_K_Z, LOW_K_X, LOW_K_V = 1, 2, 3  # gains of Omega_L [1/rad, 1/rad, s/rad]

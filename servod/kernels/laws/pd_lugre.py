@@ -13,9 +13,8 @@ from __future__ import annotations
 import math
 from collections.abc import MutableSequence, Sequence
 
-from servod.kernels.laws.exact import decayed, limited
+from servod.kernels.laws.observer import decayed, limited, winds_up
 from servod.kernels.laws.state import ASKED, FRICTION_STATE
-from servod.kernels.laws.windup import winds_up
 
 K_P = 0  # position gain [N*m/rad]
 K_D = 1  # velocity gain [N*m*s/rad]

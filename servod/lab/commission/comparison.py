@@ -6,19 +6,106 @@ Under the step that validates. Figures and curves of a run are kept with the has
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+from zipfile import BadZipFile
 
-from servod.client.commission_axis import VirtualWalkAxis
-from servod.common.errors import AnswerIsNo
+import numpy as np
+from numpy.typing import NDArray
+
+from servod.client.open import VirtualWalkAxis
+from servod.common.errors import AnswerIsNo, BadInput
+from servod.common.workers import worker_pool
 from servod.formats.gains.gain_set import load_gains
-from servod.lab.commission.files import RUNS, read_json, write_json
-from servod.lab.commission.pooled import run_jobs
-from servod.lab.commission.runs import save_curves
-from servod.lab.commission.state import digest
+from servod.formats.recording.mcap_reader import read_recording
+from servod.formats.recording.mcap_writer import McapFile, split_rows
+from servod.lab.commission.state import RUNS, digest, write_json
+from servod.lab.commission.state import read_walk_json as read_json
 from servod.lab.commission.walk import Tell, Walk
+from servod.lab.recordings.recording import ROW
+from servod.lab.tracking.metrics import Curves
 from servod.lab.tracking.stepped import measure
+
+# Independent jobs of a step, side by side in worker processes, with progress by the jobs that are done.
+#
+# Under the steps that tune and measure.
+
+
+T = TypeVar("T")
+
+
+def run_jobs(
+    work: Callable[..., T], jobs: Sequence[tuple[Any, ...]], names: Sequence[str], processes: int, tell: Tell
+) -> list[T]:
+    """`work(*job)` for every job, in their order. Raises what the first job that fails raises."""
+    tell(", ".join(names[:processes]), 0.0)
+    with worker_pool(min(processes, len(jobs))) as pool:
+        pending = [pool.submit(work, *job) for job in jobs]
+        results = []
+        for index, result in enumerate(pending):
+            results.append(result.result())
+            tell(", ".join(names[index + 1 : index + 1 + processes]) or names[-1], (index + 1) / len(jobs))
+    return results
+
+
+# Runs of deployments and comparisons on disk: recordings as MCAP, curves of the comparison as arrays.
+#
+# Under the steps; the report reads them back.
+
+
+def save_rows(path: Path, rows: NDArray[np.void]) -> None:
+    """Cycle records as a recording, in place of an earlier one. Raises BadInput."""
+    aside = path.with_name(path.name + ".part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        aside.unlink(missing_ok=True)
+        file = McapFile(aside, {}, 0)
+        file.write_rows(split_rows(rows.tobytes()))
+        file.close()
+        aside.replace(path)
+    except OSError as error:
+        raise BadInput(str(path), error.strerror or str(error), "a file that can be written") from None
+
+
+def load_rows(path: Path) -> NDArray[np.void]:
+    """Cycle records of a recording. Raises BadInput."""
+    return np.frombuffer(read_recording(path).rows, dtype=ROW)
+
+
+def save_curves(path: Path, curves: dict[str, Curves]) -> None:
+    """Curves by motion, in single precision: they are for pictures. Raises BadInput."""
+    arrays = {
+        f"{motion}.{f.name}": getattr(run, f.name).astype(np.float32)
+        for motion, run in curves.items()
+        for f in fields(run)
+    }
+    aside = path.with_name(path.name + ".part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with aside.open("wb") as stream:
+            np.savez_compressed(stream, **arrays)
+        aside.replace(path)
+    except OSError as error:
+        raise BadInput(str(path), error.strerror or str(error), "a file that can be written") from None
+
+
+def load_curves(path: Path) -> dict[str, Curves]:
+    """Curves by motion. Raises BadInput."""
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            motions = {name.partition(".")[0] for name in arrays.files}
+            return {
+                motion: Curves(**{f.name: arrays[f"{motion}.{f.name}"].astype(np.float64) for f in fields(Curves)})
+                for motion in sorted(motions)
+            }
+    except OSError as error:
+        raise BadInput(str(path), error.strerror or "a broken file", "runs that servoctl commission wrote") from None
+    except (ValueError, KeyError, EOFError, BadZipFile, zlib.error):
+        raise BadInput(str(path), "a broken file", "runs that servoctl commission wrote") from None
+
 
 #: The law that was synthesized and not tuned, by its row in the comparison.
 DEPLOYED = "deployed"

@@ -11,13 +11,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from servod.client.control import ControlClient, Refused
-from servod.client.daemon_config import require_daemon_config
-from servod.client.deploy_daemon import DaemonDeployLink
+from servod.client.under_daemon import DaemonDeployLink, require_daemon_config
 from servod.common.errors import AnswerIsNo
 from servod.formats.config import AxisConfig
 from servod.formats.gains.gain_set import GainSet
-from servod.lab.tracking.metrics import Curves, Tracking, known_noise, tracking
-from servod.lab.tracking.motions import HOLD_S, PAPER_S, STEPS_MRAD
+from servod.lab.tracking.metrics import HOLD_S, PAPER_S, STEPS_MRAD, Curves, Tracking, known_noise, tracking
 from servod.lab.tracking.stepped import curves_of
 
 

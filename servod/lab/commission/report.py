@@ -8,37 +8,39 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from servod.client.commission_axis import VirtualWalkAxis
+from servod.client.open import VirtualWalkAxis
 from servod.formats.gains.gain_set import GainSet, load_gains
 from servod.formats.model.axis_model import AxisModel, load_axis_model
-from servod.lab.commission.comparison import DEPLOYED, run_files
-from servod.lab.commission.files import (
+from servod.lab.commission.comparison import DEPLOYED, load_curves, load_rows, run_files
+from servod.lab.commission.state import (
     AFTER_ROWS,
     BEFORE_ROWS,
     CERTIFICATE,
     DEPLOYMENT,
     GAINS,
     IDENTIFIED,
+    INFEASIBLE,
     MODEL,
     PICTURES,
     RECORDINGS,
     RELAXED,
     REPORT,
+    RESULT,
     TRACKING,
     TUNING,
-    read_json,
+    State,
+    write_json,
 )
-from servod.lab.commission.runs import load_curves, load_rows
-from servod.lab.commission.walk import Tell, Walk
+from servod.lab.commission.state import read_walk_json as read_json
+from servod.lab.commission.walk import StepFailed, Tell, Walk
 from servod.lab.identify import store
 from servod.lab.identify.analysis import analyse
 from servod.lab.report.figure import Figure, Table
-from servod.lab.report.figures import friction, loop, motion, proof, response, sets
+from servod.lab.report.figures import friction, loop, motion, sets
 from servod.lab.report.figures.motion import Motion
 from servod.lab.report.page import Page
 from servod.lab.report.pictures import write_pictures
-from servod.lab.tracking.metrics import Curves, curve_key
-from servod.lab.tracking.motions import STEPS_MRAD
+from servod.lab.tracking.metrics import STEPS_MRAD, Curves, curve_key
 from servod.qualify.demo.axis import LABELS
 
 Part = Figure | Table | str
@@ -121,7 +123,7 @@ def _identified(walk: Walk, model: AxisModel) -> Iterator[Part]:
     yield from (f"Not identifiable: {name}. {remedy}." for name, remedy in found["not_identifiable"].items())
     analysis = analyse(store.load(walk.path(RECORDINGS)))
     yield friction.dahl_curve(analysis.presliding, truth)
-    yield response.frequency_response(analysis.response)
+    yield loop.measured_response(analysis.response)
     yield friction.friction_map(model, truth)
 
 
@@ -133,8 +135,8 @@ def _design(gains: GainSet, model: AxisModel) -> Iterator[Part]:
 
 
 def _certificate(gains: GainSet) -> Iterator[Part]:
-    yield proof.certificate_table(gains)
-    yield proof.observations_table(gains)
+    yield loop.certificate_table(gains)
+    yield loop.observations_table(gains)
 
 
 def _deployment(walk: Walk) -> Iterator[Part]:
@@ -268,3 +270,50 @@ def _rows(figures: dict[str, Any]) -> Iterator[tuple[str, ...]]:
                 f"{s['steady_error_mrad']:.4f}",
                 f"{s['hold_mrad']:.4f}{swing}",
             )
+
+
+# The one document of a commissioning: what was identified, certified, deployed and measured, and how long it took.
+#
+# Above the steps' files; `servoctl commission --json` prints it.
+
+
+def failure(walk: Walk, failed: StepFailed) -> dict[str, Any]:
+    """The document of a walk that a step ended with a no: which one and why, and its own document where it has one."""
+    own = {
+        "synthesize": ("infeasible", INFEASIBLE),
+        "verify": ("certificate", CERTIFICATE),
+        "deploy": ("deployment", DEPLOYMENT),
+    }
+    key, name = own.get(failed.step, ("", ""))
+    document: dict[str, Any] = {
+        "axis": walk.axis.config.name,
+        "failed": {"step": failed.step, "message": str(failed)},
+    }
+    if name and walk.path(name).exists():
+        document[key] = read_json(walk.path(name))
+    return document
+
+
+def result(walk: Walk, state: State) -> dict[str, Any]:
+    """Put the document together from the files of a walk that is complete, and keep it in the folder."""
+    gains = load_gains(walk.path(GAINS))
+    assert gains.design is not None  # a certified set has one
+    document = {
+        "axis": walk.axis.config.name,
+        **read_json(walk.path(IDENTIFIED)),
+        "relaxed": read_json(walk.path(RELAXED)),
+        "velocity_cutoff_hz": gains.design.velocity_cutoff_hz,
+        "certificate": read_json(walk.path(CERTIFICATE)),
+        "deployment": read_json(walk.path(DEPLOYMENT)),
+        "tuning": read_json(walk.path(TUNING)),
+        **read_json(walk.path(TRACKING)),
+        "seconds": state.seconds | {"total": round(sum(state.seconds.values()), 3)},
+        "files": {
+            "model": str(walk.path(MODEL)),
+            "gains": str(walk.path(GAINS)),
+            "report": str(walk.path(REPORT)),
+            "pictures": str(walk.path(PICTURES)),
+        },
+    }
+    write_json(walk.path(RESULT), document)
+    return document

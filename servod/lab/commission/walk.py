@@ -6,6 +6,7 @@ that the walk can be taken up by another process.
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -13,10 +14,40 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from servod.client.commission_axis import WalkAxis
+from servod.client.open import WalkAxis
 from servod.common.errors import AnswerIsNo, BadInput
-from servod.lab.commission.questions import Questions
 from servod.lab.commission.state import State, file_sha256, sole_walk
+
+# What a person must decide, and who answers when nobody is there.
+#
+# Beside the walk; a step asks before it does what cannot be undone or was not asked for.
+
+
+#: Puts a yes-or-no question to a person.
+Put = Callable[[str], bool]
+
+
+@dataclass(frozen=True)
+class Questions:
+    """`yes` answers everything with yes. Without it a person is asked, when there is one."""
+
+    yes: bool
+    put: Put
+    person: Callable[[], bool] = lambda: sys.stdin.isatty() and sys.stderr.isatty()
+
+    def agree(self, question: str) -> None:
+        """Go on only with a yes. Raises AnswerIsNo on a no, BadInput when nobody can answer."""
+        if self.yes:
+            return
+        if not self.person():
+            raise BadInput("standard input", "no terminal to ask at", f"--yes, which agrees to: {question}")
+        if not self.put(question):
+            raise AnswerIsNo(f"not agreed: {question}")
+
+    def takes(self, offer: str) -> bool:
+        """Whether an offer is taken; with nobody to ask it is not."""
+        return self.yes or (self.person() and self.put(offer))
+
 
 #: Told what a step does, and the share of it that is done.
 Tell = Callable[[str, float], None]

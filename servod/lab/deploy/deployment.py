@@ -11,13 +11,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from servod.client.links import DeployLink, Rows
+from servod.client.stepped import DeployLink, Rows
 from servod.common.errors import AnswerIsNo, BadInput, ServodError
 from servod.formats.config import AxisConfig
 from servod.formats.gains.design import Design
 from servod.formats.gains.gain_set import GainSet, Promise, require_certificate, require_same_loop
-from servod.lab.deploy.cycles import every_cycle, limits_met, motions_in, skipped
-from servod.lab.deploy.judge import complaints
+from servod.lab.deploy.judge import complaints, every_cycle, limits_met, motions_in, skipped
 from servod.lab.deploy.outcome import Before, Deployment, Ending
 from servod.lab.verify.validation import Figures, ValidationMotion, motion_for
 

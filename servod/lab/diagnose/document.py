@@ -6,7 +6,7 @@ The last step before the files: plain numbers, sentences for people, nothing dec
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,17 +16,71 @@ from servod.formats.model.axis_model import AxisModel
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.disturbance import EVERY
 from servod.lab.diagnose.effects.hypothesis import Document, Reported
-from servod.lab.diagnose.engine import Diagnosis, Evidence
-from servod.lab.diagnose.judge.held_out import Fold
+from servod.lab.diagnose.judge.evidence import Diagnosis, Evidence
+from servod.lab.diagnose.judge.held_out import Fold, WindowErrors, window_errors, windows_document
 from servod.lab.diagnose.judge.locate import places
+from servod.lab.diagnose.judge.spread import within
 from servod.lab.diagnose.judge.verdict import alternatives, confidence
-from servod.lab.diagnose.judge.windows import WindowErrors, window_errors, windows_document
-from servod.lab.diagnose.predict.coordinates import units
+from servod.lab.diagnose.predict.coordinates import units, where
 from servod.lab.diagnose.predict.floor import trace_floor
-from servod.lab.diagnose.predict.signature import where
-from servod.lab.diagnose.recalibrated import Z95, differs, recalibrated, told_coordinates
 from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.select.merit import Merit
+
+# What these recordings say of the model's own parameters: which have changed, in numbers, in a sentence, in the model.
+#
+# Stands between the evidence and the document.
+
+
+#: Half width of a 95 % interval in standard deviations.
+Z95 = 1.96
+
+#: A change of a parameter below this share is none.
+LEAST_CHANGE = 0.002
+
+
+def recalibrated(evidence: Evidence) -> dict[str, Any]:
+    """Parameters of the model itself that were off: from, to, 95 % interval. Those of a finding are not here."""
+    fit = evidence.fit
+    opened = {key for place in evidence.named for key in fit.hypothesis.terms[place].opens}
+    found = {}
+    for index, (unknown, nominal) in enumerate(zip(fit.hypothesis.unknowns, fit.hypothesis.base, strict=False)):
+        value = fit.values[index]
+        deviation = math.sqrt(max(float(evidence.spread[index, index]), 0.0))
+        size = unknown.size if unknown.size else abs(value)
+        if unknown.key in opened or abs(value - nominal.start) <= max(LEAST_CHANGE, Z95 * deviation) * size:
+            continue
+        half = Z95 * deviation * size
+        entry = {"from": nominal.start, "to": value, "unit": unknown.unit, "interval": [value - half, value + half]}
+        found[unknown.key] = entry
+    return found
+
+
+def told_coordinates(evidence: Evidence) -> Array:
+    """Coordinates of the model to hand out: what the report says, as long as that can be said.
+
+    Where nothing has a name, parameters that are not told from what they were stay what they were: those of an axis
+    that was identified are worth more than what one short recording makes of them. That holds as long as all of them
+    together lie in the region of 95 % around the fit; beyond it, the fit.
+    """
+    fit = evidence.fit
+    if fit.hypothesis.terms or evidence.unnamed is not None:
+        return fit.coordinates
+    changed = recalibrated(evidence)
+    told = [unknown.key in changed for unknown in fit.hypothesis.base]
+    back = np.where(told, 0.0, fit.coordinates - fit.hypothesis.start)
+    return fit.coordinates - back if within(back, evidence.spread) else fit.coordinates
+
+
+def differs(changes: Mapping[str, Any]) -> str:
+    """What was recalibrated, as a sentence about these recordings; empty where nothing was."""
+    said = []
+    for name, change in changes.items():
+        words = name.removeprefix("friction.").removesuffix(".per_s").removesuffix("_s").replace("_", " ")
+        was, now, unit = change["from"], change["to"], change["unit"]
+        share = f" ({100.0 * (now - was) / abs(was):+.2g} %)" if was != 0.0 else ""
+        said.append(f"{words} is {now:.4g} instead of {was:.4g} {unit}{share}")
+    return f"What differs from the model in these recordings: {'; '.join(said)}." if said else ""
+
 
 Array = NDArray[np.float64]
 
@@ -274,3 +328,85 @@ def extended_model(diagnosis: Diagnosis) -> AxisModel | None:
     if diagnosis.nominal.noise is not None:
         document["noise"] = diagnosis.nominal.noise.model_dump(mode="json", exclude_none=True)
     return AxisModel.model_validate(document)
+
+
+# What the report says in plain sentences: the verdict, how sure, what remains, and what to record next.
+#
+# Stands on the document of a diagnosis alone.
+
+
+#: What to do about a refused recording, by a word of the reason.
+REMEDIES = {
+    "too short": "Record for at least some seconds; three recordings of 15 s are usual.",
+    "too still": "Let the axis move: slow sines, a mix of frequencies, and moves with rests in between.",
+    "too noisy": "The encoder's noise hides what friction does: use a finer encoder, or move faster and further.",
+    "saturated": "The drive was at its limit: ask for slower motions, so that the command is what acts.",
+    "opposite signs": "Turn the sign of the command or of the position in a --map file (scale: -1).",
+    "another unit": "Give the unit in a --map file (scale: 0.001 turns mN·m into N·m).",
+    "degrees": "Give the unit in a --map file (scale: 0.0174533 turns degrees into rad).",
+    "counts": "Give the unit in a --map file (scale: 2*pi over the counts of a turn).",
+    "never changes": "Record the command that goes to the drive, not a constant.",
+}
+
+#: How the diagnosis works, for those who want to know.
+MATHEMATICS = (
+    "Prediction. The model is simulated under the recorded command and pulled to the recorded position by an observer "
+    "of fixed gains. The pull, as a torque, is the error shown here: where the model is right it is noise (Ljung, "
+    "System Identification, 1999, ch. 7).",
+    "Recalibration. The model's own parameters are fitted first, each within what a good model is known to (10 %), by "
+    "damped Gauss-Newton with Huber's loss.",
+    "Search. Every known effect is added in several forms and from many starts, together with all parameters of the "
+    "model. It stays when the gain is significant against correlated noise with a correction for the number of things "
+    "tried (Bayesian information criterion), and when it is large enough to be worth naming.",
+    "Proof. Each recording in turn is left out, the rest is fitted again, and the one left out is predicted; a quarter "
+    "of every recording where there is only one, or where recordings differ in a number of their own. Intervals "
+    "count correlated rows as fewer (sums over blocks of a quarter of a second: Carlstein, Annals of Statistics 14, "
+    "1986).",
+)
+
+
+def verdict_sentence(document: Document) -> str:
+    """The answer in one or two sentences."""
+    return str(document["summary"])
+
+
+def certainty(finding: Document) -> list[str]:
+    """How sure a finding is, and what it cannot be told apart from."""
+    name = finding["effect"].replace("_", " ")
+    lines = [f"How sure that it is {name}: {100.0 * finding['confidence']:.0f} %."]
+    for other in finding["alternatives"]:
+        lines.append(
+            f"These data cannot tell {name} from {other['effect'].replace('_', ' ')}; this would: "
+            f"{other['experiment']}."
+        )
+    return lines
+
+
+def remains(document: Document) -> str:
+    """What is left, and where it lives."""
+    fit, left = document["fit"], [m for m in document["remaining"] if m["chance"] < 1e-3 and m["share"] > 0.01]
+    times = fit["held_out"]["after"] / max(fit["noise_floor"], 1e-30)
+    if not left or times < 1.1:
+        return "What is left is noise: no coordinate orders it any more."
+    most = left[0]
+    return (
+        f"What is left is {times:.1f} times the noise floor; most of what is ordered in it lies over "
+        f"{most['coordinate']} ({100.0 * most['share']:.0f} % of it)."
+    )
+
+
+def next_experiments(document: Document) -> list[str]:
+    """What to record next: what separates the alternatives, and what would make a finding surer."""
+    lines = []
+    for finding in document["findings"]:
+        name = finding["effect"].replace("_", " ")
+        for other in finding["alternatives"]:
+            lines.append(f"To tell {name} from {other['effect'].replace('_', ' ')}: {other['experiment']}.")
+        lines.append(f"To see {name} by itself: {finding['experiment']}.")
+    if document["verdict"] == "unexplained":
+        where = document["located"][0]["coordinate"]
+        lines.append(
+            f"Repeat the recordings slower and faster, over the same range of {where}: what stays tied to the place is "
+            "the axis, what stays tied to the time is its surroundings."
+        )
+    return list(dict.fromkeys(lines))

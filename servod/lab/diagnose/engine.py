@@ -5,34 +5,26 @@ Stands between the command line and everything else here; writes nothing.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from time import monotonic
 
-import numpy as np
-from numpy.typing import NDArray
-
 from servod.formats.model.axis_model import AxisModel
-from servod.lab.diagnose.data.intake import Refusal, taken_in
-from servod.lab.diagnose.data.trace import Trace
-from servod.lab.diagnose.judge.held_out import HeldOut, Split, held_out, once, split
-from servod.lab.diagnose.judge.locate import Map, maps
-from servod.lab.diagnose.judge.sorting import Kept, sorted_out
+from servod.lab.diagnose.data.intake import taken_in
+from servod.lab.diagnose.judge.evidence import Diagnosis, Evidence
+from servod.lab.diagnose.judge.held_out import foretold, held_out, once, split
+from servod.lab.diagnose.judge.locate import maps
+from servod.lab.diagnose.judge.sorting import sorted_out
 from servod.lab.diagnose.judge.spread import spread
-from servod.lab.diagnose.judge.unnamed import Unnamed, unnamed
-from servod.lab.diagnose.judge.verdict import Shares, Verdict, drowned, named_terms, shares, verdict
-from servod.lab.diagnose.judge.windows import foretold
+from servod.lab.diagnose.judge.unnamed import unnamed
+from servod.lab.diagnose.judge.verdict import Verdict, drowned, named_terms, shares, verdict
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.choice import Choice
 from servod.lab.diagnose.select.choose import Chooser
-from servod.lab.diagnose.select.detail import detail, much_left
-from servod.lab.diagnose.select.fit import Fit, Weighing
-from servod.lab.diagnose.select.slow import slow
-from servod.lab.diagnose.select.swap import swapped
-from servod.lab.diagnose.select.tidy import tidied
+from servod.lab.diagnose.select.detail import detail, much_left, slow, swapped, tidied
+from servod.lab.diagnose.select.fit import Weighing
 from servod.lab.recordings import Recording
 
-Array = NDArray[np.float64]
 Tell = Callable[[str], None]
 
 #: Part of the time limit that the search for terms may take; the proof needs the rest.
@@ -42,57 +34,6 @@ SEARCH_SHARE = 0.75
 #: within FITTED times the noise floor anyway. A few terms with dynamics of their own can follow nearly any mismatch one
 #: sample ahead, and foretell nothing.
 LEAST_FORETOLD, FITTED = 0.7, 2.0
-
-
-@dataclass(frozen=True)
-class Diagnosis:
-    """What was found; without any recording that can tell there is no evidence."""
-
-    nominal: AxisModel
-    refused: list[Refusal]
-    verdict: Verdict
-    evidence: Evidence | None
-    seconds: dict[str, float]
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """Everything behind a verdict on recordings that can tell.
-
-    `named` are places of terms in the fit and `less` the fits without each of them; `errors` are those of the fits to
-    everything, by which names are judged. `before`, `after` and `without` are by fits that have not seen the rows of
-    `shared`, and `unseen` has the errors of these. `attempt` is the share of the explainable error that known physics
-    removes there, also where its names may not stand. `kept` says of terms in the fit why they are no findings.
-    """
-
-    traces: tuple[Trace, ...]
-    predictor: Predictor
-    choice: Choice
-    named: list[int]
-    errors: Shares
-    spread: Array
-    less: dict[int, Fit]
-    shared: Split
-    unseen: Shares
-    before: HeldOut
-    after: HeldOut
-    without: dict[int, HeldOut]
-    unnamed: Unnamed | None
-    maps_before: list[Map]
-    maps_after: list[Map]
-    attempt: float
-    kept: Mapping[int, Kept] = field(default_factory=dict)
-
-    @property
-    def fit(self) -> Fit:
-        """The fit that stands."""
-        return self.choice.fit
-
-    def carries(self, place: int) -> float:
-        """The share of the explainable error on unseen rows that a named term removes."""
-        unseen = self.unseen
-        without = float(np.mean(self.without[place].mismatch[self.predictor.counts] ** 2))
-        return max(without - unseen.after**2, 0.0) / max(unseen.before**2 - unseen.floor**2, 1e-30)
 
 
 def diagnose(

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from servod.common.errors import AnswerIsNo
 from servod.lab.identify.estimate import Estimate
 from servod.lab.identify.fits import break_away, bristle, curve, friction_map, kick, noise, presliding, response
-from servod.lab.identify.fits.bristle_lag import Bristle
+from servod.lab.identify.fits.bristle import Bristle
 from servod.lab.identify.trace import Kind, Trace
 
 #: Bristle damping against the critical one of inertia on the bristle, taken where it is not measured.

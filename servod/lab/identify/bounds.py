@@ -8,7 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from servod.common.errors import AnswerIsNo
-from servod.formats.config import LimitsConfig
+from servod.drivers.cia406 import velocity_delay_s
+from servod.formats.config import AxisConfig, LimitsConfig
 
 #: Share of each configured limit that experiments use.
 SHARE = 0.85
@@ -51,3 +52,28 @@ def bounds_from(
     most = min(SHARE * limits.speed_rad_s, speed_rad_s or limits.speed_rad_s)
     speed = min(SPEED_SHARE * limits.speed_rad_s, SHARE * most)
     return Bounds(half, centre, speed, most, SHARE * limits.torque_nm, SHARE * limits.following_error_rad)
+
+
+# PD feedback for the experiments, from what is known of the joint so far.
+#
+# Under the walk. The crossover is a share of what the loop's whole lag (delay, hold, velocity filter) allows, so that
+# the
+# same rule holds for every size of axis.
+
+
+#: Crossover times lag: careful while only the kicks are known, stiff once the delay is.
+CAREFUL, STIFF = 0.42, 0.62
+#: Position gain over velocity gain, against the crossover.
+POSITION_SHARE = 0.25
+
+
+def loop_lag_s(config: AxisConfig, delay_s: float) -> float:
+    """From velocity to the torque that answers it: encoder filter, half a hold, command to torque."""
+    period_s = config.cycle.period_us * 1e-6
+    return velocity_delay_s(period_s, config.encoder.velocity_cutoff_hz) + 0.5 * period_s + delay_s
+
+
+def feedback(config: AxisConfig, inertia: float, delay_s: float, share: float) -> tuple[float, float]:
+    """(position gain, velocity gain) in N*m/rad and N*m*s/rad."""
+    crossover = share / loop_lag_s(config, delay_s)
+    return POSITION_SHARE * inertia * crossover**2, inertia * crossover

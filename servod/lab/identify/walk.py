@@ -17,10 +17,9 @@ from servod.client.axis import Link
 from servod.formats.config import AxisConfig
 from servod.lab.identify import store
 from servod.lab.identify.analysis import Analysis, analyse, break_away_rad, of_kind
-from servod.lab.identify.bounds import bounds_from
-from servod.lab.identify.experiments import break_away, bristle, friction_map, kick, noise, presliding, response
+from servod.lab.identify.bounds import CAREFUL, STIFF, bounds_from, feedback
+from servod.lab.identify.experiments import break_away, friction_map, kick, presliding, response
 from servod.lab.identify.experiments.common import Bench
-from servod.lab.identify.feedback import CAREFUL, STIFF, feedback
 from servod.lab.identify.fits import break_away as break_away_fit
 from servod.lab.identify.fits import kick as kick_fit
 from servod.lab.identify.fits import presliding as presliding_fit
@@ -82,7 +81,7 @@ def _conditions(
 
 def _experiments(bench: Bench, tell: Tell) -> None:
     tell("noise at rest", 0.0)
-    noise.run(bench)
+    kick.run_noise(bench)
     tell("break-away", 0.02)
     found = [abs(break_away_fit.torque_of(break_away.search(bench, sign))) for sign in (1.0, -1.0)]
     tell("presliding", 0.07)
@@ -96,7 +95,7 @@ def _experiments(bench: Bench, tell: Tell) -> None:
     gains = feedback(config, first.inertia, first.delay_s + UNKNOWN_DELAY_S, CAREFUL)
     answer = response_fit.fit(response.run(bench, first.inertia, gains), first.inertia)
     tell("bristle damping", 0.38)
-    bristle.run(bench, min(found))
+    presliding.run(bench, min(found))
     tell("friction map", 0.42)
     gains = feedback(config, answer.inertia.value, answer.delay_s.value + answer.lag_s.value, STIFF)
     friction_map.run(bench, gains, slides, break_away_rad(slides, rocked))

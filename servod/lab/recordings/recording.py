@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from servod.common.errors import BadInput
 from servod.formats.model.axis_model import AxisKind
+from servod.formats.recording.record import FIELDS
 from servod.lab.recordings.columns import ALL_NAMES, REQUIRED, Quantity, apply_map, axis_of, load_column_map
 from servod.lab.recordings.readers import numbers, read_columns
 from servod.lab.simulate.replay import Drive
@@ -199,3 +200,10 @@ def _check_time(path: Path, t_s: Array, report: list[str]) -> None:
             f"t_s: uneven, steps from {steps.min():.4g} to {steps.max():.4g} s around {period:.4g} s "
             f"({share:.0f} % differ by over 10 %); simulated on the recorded stamps"
         )
+
+
+# Cycle records as rows of a numpy structured array: the same bytes as `servod.formats.recording.record.RECORD`.
+
+
+#: One cycle record as a row of a structured array.
+ROW = np.dtype([(f.name, "<f8" if f.kind == "d" else "<i8") for f in FIELDS])

@@ -5,15 +5,29 @@ Stands on the evidence of a diagnosis and on its document, whose numbers it show
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
-from servod.lab.diagnose.engine import Diagnosis, Evidence
+from servod.common.files import write_bytes
+from servod.formats.model.axis_model import axis_model_yaml
+from servod.lab.diagnose.document import (
+    MATHEMATICS,
+    REMEDIES,
+    certainty,
+    diagnosis_document,
+    extended_model,
+    next_experiments,
+    remains,
+    verdict_sentence,
+    window_evidence,
+)
 from servod.lab.diagnose.explain import explained
+from servod.lab.diagnose.judge.evidence import Diagnosis, Evidence
+from servod.lab.diagnose.judge.held_out import WindowErrors
 from servod.lab.diagnose.judge.locate import bands
-from servod.lab.diagnose.judge.windows import WindowErrors
-from servod.lab.diagnose.sentences import MATHEMATICS, REMEDIES, certainty, next_experiments, remains, verdict_sentence
 from servod.lab.report.figure import Figure
 from servod.lab.report.figures import mismatch as figures
 from servod.lab.report.figures.signature import signature, table_figure
@@ -210,3 +224,30 @@ def _work(page: Page, document: Document) -> None:
     page.folded("How it was found", MATHEMATICS)
     spent = [f"{stage}: {seconds:.1f} s" for stage, seconds in document["seconds"].items()]
     page.folded("Time by stage", spent)
+
+
+# Writes what a diagnosis leaves in its folder: diagnosis.json, model.yaml, report.html and the pictures.
+#
+# Behind `servoctl diagnose` and `servoctl demo --diagnose`; every file is written aside and renamed.
+
+
+#: Names of the files of the outside contract.
+DOCUMENT, MODEL = "diagnosis.json", "model.yaml"
+
+
+def write_files(folder: Path, diagnosis: Diagnosis, title: str) -> dict[str, Any]:
+    """Write all files into `folder` and return the document. Without an answer there is no model. Raises BadInput."""
+    begun = monotonic()
+    evidence = diagnosis.evidence
+    windows = window_evidence(diagnosis, evidence) if evidence else []
+    document = diagnosis_document(diagnosis, windows)
+    document["seconds"]["windows"] = round(monotonic() - begun, 2)
+    extended = extended_model(diagnosis)
+    if extended is None:
+        (folder / MODEL).unlink(missing_ok=True)
+    else:
+        write_bytes(folder / MODEL, axis_model_yaml(extended).encode())
+    write_report(folder, diagnosis, document, windows, title)
+    document["seconds"]["report"] = round(monotonic() - begun - document["seconds"]["windows"], 2)
+    write_bytes(folder / DOCUMENT, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
+    return document

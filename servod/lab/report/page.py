@@ -14,7 +14,7 @@ import plotly.io
 from plotly.offline import get_plotlyjs
 
 from servod import __version__
-from servod.common.report_files import write_bytes
+from servod.common.files import write_bytes
 from servod.lab.report.figure import Figure
 from servod.lab.report.page_figure import HEAD_PX, plotly_figure
 

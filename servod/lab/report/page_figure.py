@@ -9,8 +9,7 @@ import numpy as np
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from servod.lab.report.curves import thin
-from servod.lab.report.figure import Array, Axis, Curve, Figure, Panel, Scale, Style
+from servod.lab.report.figure import Array, Axis, Curve, Figure, Panel, Scale, Style, thin
 
 _DASHES = {Style.LINE: "solid", Style.DASHED: "dash", Style.DOTTED: "dot", Style.POINTS: "solid"}
 _ROW_PX, _GAP_PX = 270, 85

@@ -15,9 +15,8 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure as Canvas
 
-from servod.common.report_files import write_bytes
-from servod.lab.report.curves import thin
-from servod.lab.report.figure import Axis, Curve, Figure, Panel, Scale, Style
+from servod.common.files import write_bytes
+from servod.lab.report.figure import Axis, Curve, Figure, Panel, Scale, Style, thin
 
 FORMATS = ("png", "svg")
 _DASHES = {Style.LINE: "-", Style.DASHED: (0, (5, 2)), Style.DOTTED: (0, (1, 1.5)), Style.POINTS: "-"}

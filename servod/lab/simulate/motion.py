@@ -6,6 +6,8 @@ breakaway a short one (bias); the span is chosen for each row by Lepski's rule.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from enum import StrEnum
 from functools import cache
 
 import numpy as np
@@ -86,3 +88,127 @@ def _gain_table(span: int, order: int) -> tuple[float, tuple[float, ...]]:
 
     gains = [float(np.linalg.norm(savgol_coeffs(span, 3, deriv=order, pos=place))) for place in range(span // 2 + 1)]
     return gains[-1], tuple(gains[:-1])
+
+
+# How a recording starts: at rest or in motion, and under which command; judged from its first rows alone.
+#
+# Stands between the smoothed motion and replay. The first row is the poorest of all (nothing before it), and a free run
+# carries its error to the end; so what is known of rests counts more there than the slope of a few samples.
+
+
+#: An axis whose motion, extrapolated backward, began at most so long before the first row was just set off, s.
+MOTION_BEGAN_S = 0.01
+
+#: ... or so many rows, for windows that start from what was recorded: the smoothing errs by no more.
+MOTION_BEGAN_ROWS = 2.0
+
+#: ... provided that its command began at most so long before: mid-motion, friction keeps the command up all the time.
+COMMAND_BEGAN_S = 0.05
+
+#: Within this time an axis leaves its rest when the first recorded command is new to it, s.
+LEAVES_S = 0.05
+
+#: For so long before the first row, at most, the command is taken to have changed as it then goes on to, s.
+TREND_HOLDS_S = 0.05
+
+#: Standard deviations of the position's noise that make a motion, and the growth of the command that could cause it.
+LEFT, GROWN = 5.0, 1.05
+
+#: Rows that a parabola through the first rows needs.
+LEAST_ROWS = 5
+
+
+class Start(StrEnum):
+    """Where a replay takes its first velocity from."""
+
+    AUTO = "auto"  # rest where the first rows say so, else as recorded
+    REST = "rest"
+    RECORDED = "recorded"
+
+
+@dataclass(frozen=True, slots=True)
+class FirstRow:
+    """Motion (position, velocity, acceleration) at the first row, and the commands before it; SI units of the axis.
+
+    `command_before` acts until the first recorded one arrives.
+    """
+
+    motion: tuple[float, float, float]
+    command_before: float
+    at_rest: bool
+
+
+def first_row(
+    start: Start, t_s: Array, torque: Array, position: Array, motion: Array, delay_s: float = 0.0, *, free: bool = True
+) -> FirstRow:
+    """How the motion begins; `motion` has the rows of `smoothed_motion`, a command acts `delay_s` after its row.
+
+    AUTO is rest when the first row's speed is within its error of zero, or when the axis was just set off: motion and
+    command both extrapolate to nothing within MOTION_BEGAN_S and COMMAND_BEGAN_S before the first row. People start
+    recorder and motion together; the recorder's first rows then lag the start, and such a recording is understood as
+    one from rest (EMPS: 7 and 45 ms) where the model runs on freely from there (`free`); the first of many windows
+    starts as recorded unless its motion began with its first rows. A recording cut out of a motion keeps its speed.
+    """
+    place, speed, acceleration = (float(value) for value in motion[0, :3])
+    still = stands(t_s, position, motion)
+    within_s = MOTION_BEGAN_S if free else MOTION_BEGAN_ROWS * float(t_s[1] - t_s[0])
+    begun = still or just_set_off(t_s, torque, position, within_s)
+    rest = start is Start.REST or (start is Start.AUTO and begun)
+    if still and rest:
+        acceleration = 0.0
+    moved = place, 0.0 if rest else speed, acceleration
+    if still:
+        before = 0.0 if command_is_new(t_s, torque, position, delay_s) else float(torque[0])
+    else:
+        before = float(torque[0]) - trend(t_s, torque) * min(0.5 * delay_s, TREND_HOLDS_S)
+    return FirstRow(moved, before, rest)
+
+
+def stands(t_s: Array, position: Array, motion: Array) -> bool:
+    """Whether the first row's speed is within two standard errors of zero.
+
+    Where smoothing is no surer than the first difference (an axis that breaks away leaves only short spans), the first
+    difference counts as well: it alone is free of what comes later.
+    """
+    if abs(motion[0, 1]) <= AGREE * motion[0, 3]:
+        return True
+    step_error = np.sqrt(2.0) * noise_rms(position)
+    poor = step_error <= motion[0, 3] * (t_s[1] - t_s[0])
+    return bool(poor and abs(position[1] - position[0]) <= AGREE * step_error)
+
+
+def first_rows(t_s: Array) -> int:
+    """Number of rows of the first MOTION_BEGAN_S, LEAST_ROWS at least."""
+    return max(LEAST_ROWS, int(np.searchsorted(t_s, t_s[0] + MOTION_BEGAN_S, side="right")))
+
+
+def trend(t_s: Array, torque: Array) -> float:
+    """Growth of the command over the first rows, 1/s of its unit."""
+    since = t_s[: first_rows(t_s)] - t_s[0]
+    return float(np.polyfit(since, torque[: len(since)], 1)[0]) if len(np.unique(since)) >= LEAST_ROWS else 0.0
+
+
+def just_set_off(t_s: Array, torque: Array, position: Array, within_s: float = MOTION_BEGAN_S) -> bool:
+    """Whether both motion and command, extrapolated backward, began only just (`within_s`) before the first row."""
+    rows = first_rows(t_s)
+    since = t_s[:rows] - t_s[0]
+    if len(np.unique(since)) < LEAST_ROWS:
+        return False
+    bend, speed, _ = np.polyfit(since, position[:rows], 2)
+    growth, command = np.polyfit(since, torque[:rows], 1)
+    moves_on = speed * bend > 0.0 and abs(speed) <= within_s * abs(2.0 * bend)
+    grows = command * growth > 0.0 and abs(command) <= COMMAND_BEGAN_S * abs(growth)
+    return bool(moves_on and grows and command * speed > 0.0)
+
+
+def command_is_new(t_s: Array, torque: Array, position: Array, delay_s: float) -> bool:
+    """Whether an axis that stands at the first row leaves though the command does not grow: it was not under it before.
+
+    An axis that rests under the first row's command stays where it is, until the command grows.
+    """
+    early = int(np.searchsorted(t_s, t_s[0] + LEAVES_S, side="right"))
+    away = np.flatnonzero(np.abs(position[:early] - position[0]) > LEFT * noise_rms(position))
+    if len(away) == 0:
+        return False
+    acted = max(1, int(np.searchsorted(t_s, t_s[away[0]] - delay_s, side="right")))
+    return bool(np.max(np.abs(torque[:acted])) <= GROWN * abs(torque[0]))

@@ -20,8 +20,7 @@ from servod.kernels.physics.compiled import Kernel, available, compiled
 from servod.kernels.physics.layout import P_DELAY_S, P_START_C, S_FIRST_S
 from servod.kernels.physics.plant import INNER_STEP_S, rest_state
 from servod.lab.simulate import open_loop
-from servod.lab.simulate.motion import smoothed_motion
-from servod.lab.simulate.start import FirstRow, Start, first_row
+from servod.lab.simulate.motion import FirstRow, Start, first_row, smoothed_motion
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from servod.formats.gains.gain_set import CrossCheck, GainSet
 from servod.lab.synthesize import lmi_deployed, lmi_reference
 from servod.lab.synthesize.lmi_deployed import Programme, Solution
 from servod.lab.synthesize.lmi_reference import PARTS, ReferenceWishes
-from servod.lab.verify.reference_vertices import Polytope
+from servod.lab.verify.reference_proof import Polytope
 from servod.lab.verify.steady_friction import steady_friction
 from servod.lab.verify.vertices import Span
 

@@ -14,10 +14,8 @@ import numpy as np
 from servod.formats.gains.design import Design, DesignMode, RegionProof, Uncertainty, Vertex
 from servod.formats.gains.parameters import RegionGains
 from servod.formats.model.axis_model import AxisModel
-from servod.lab.synthesize.guides import TURNING_DISC, turning
-from servod.lab.synthesize.late import too_late
-from servod.lab.synthesize.lmi_deployed import Programme, Solution, synthesise
-from servod.lab.synthesize.regions import OVERLAP_RAD_S, pole_disc
+from servod.lab.synthesize.lmi_deployed import TURNING_DISC, Programme, Solution, synthesise, turning
+from servod.lab.synthesize.regions import OVERLAP_RAD_S, pole_disc, too_late
 from servod.lab.verify.proof import region_margin, scaled, scaled_vertices
 from servod.lab.verify.sampled import Array, timing_of
 from servod.lab.verify.steady_friction import SteadyFriction, steady_friction

@@ -6,11 +6,15 @@ verification uses.
 
 from __future__ import annotations
 
+import datetime
+import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
+import servod
+from servod.common.sources import SYNTHESIZES, source_sha256
 from servod.formats.gains.design import Design
-from servod.formats.gains.gain_set import GainSet
+from servod.formats.gains.gain_set import GainSet, Provenance
 from servod.formats.gains.parameters import (
     LocalFriction,
     LocalParameters,
@@ -22,9 +26,7 @@ from servod.formats.gains.parameters import (
 )
 from servod.formats.model.axis_model import AxisModel
 from servod.lab.synthesize.deployed import Wishes, designs, region_gains
-from servod.lab.synthesize.feedforward import position_feedforward
 from servod.lab.synthesize.infeasible import Infeasible, explain
-from servod.lab.synthesize.integral_gain import designed
 from servod.lab.synthesize.local_sets import (
     ACCURACY,
     LIMIT_SHARE,
@@ -33,20 +35,41 @@ from servod.lab.synthesize.local_sets import (
     compensator,
     input_scale,
     local_sets,
+    position_feedforward,
     sets_at,
 )
-from servod.lab.synthesize.moving_observer import with_moving_observer
 from servod.lab.synthesize.observer_width import (
     ENOUGH_RAD_S,
     OBSERVERS_RAD_S,
+    SHARES,
     bandwidth_of,
+    designed,
+    with_moving_observer,
     with_observer,
+    with_share_at_rest,
     with_widest_observer,
 )
-from servod.lab.synthesize.origin import provenance
-from servod.lab.synthesize.resting_share import SHARES, with_share_at_rest
-from servod.lab.verify.rest import hold_width, rest_width
+from servod.lab.verify.rounding import hold_width, rest_width
 from servod.lab.verify.steady_friction import SteadyFriction, steady_friction
+
+# Where a synthesized set comes from: hashes of the model's file, of the recordings behind it, and of this tool.
+#
+# Beside the synthesis. The recordings' hashes stand in the model that an identification wrote; the tool's hash is over
+# the sources that compute, so that two versions of one number are told apart.
+
+
+def provenance(model: AxisModel, model_path: Path | None, note: str) -> Provenance:
+    """The provenance of a set for `model`, which was read from `model_path`. Raises OSError when it cannot be read."""
+    return Provenance(
+        author="servod",
+        date=datetime.datetime.now(datetime.UTC).date(),
+        tool=f"servod {servod.__version__} synthesize",
+        tool_sha256=source_sha256(SYNTHESIZES),
+        model_sha256=hashlib.sha256(model_path.read_bytes()).hexdigest() if model_path else None,
+        data_sha256=list(model.identified.data_sha256) if model.identified else [],
+        note=note,
+    )
+
 
 OBSERVER_SHARE = 2.5  # bound of the estimate: friction that turned against a z_hat that a step leaves as it was
 APPROACH = 3.0  # speed with which a step is approached, as a factor on the map's highest

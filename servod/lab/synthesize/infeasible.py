@@ -22,8 +22,8 @@ from servod.lab.synthesize.deployed import (
     region,
     regions,
 )
-from servod.lab.synthesize.late import too_late
 from servod.lab.synthesize.lmi_deployed import first_feedback
+from servod.lab.synthesize.regions import too_late
 from servod.lab.verify.proof import scaled_vertices
 from servod.lab.verify.vertices import Span
 

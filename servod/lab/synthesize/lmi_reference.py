@@ -18,7 +18,7 @@ import numpy as np
 
 from servod.formats.gains.design import ReferenceForm, ReferenceOutput, ReferenceProof
 from servod.lab.synthesize.solvers import solved
-from servod.lab.verify.reference_vertices import ContinuousVertex, Polytope, vertices
+from servod.lab.verify.reference_proof import ContinuousVertex, Polytope, vertices
 from servod.lab.verify.sampled import Array
 from servod.lab.verify.steady_friction import SteadyFriction
 from servod.lab.verify.vertices import Span

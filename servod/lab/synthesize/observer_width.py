@@ -6,19 +6,25 @@ all corners at few speeds, and at many speeds those corners that were the worst 
 
 from __future__ import annotations
 
+import bisect
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from servod.formats.gains.design import Design
+from servod.formats.gains.gain_set import GainSet
 from servod.formats.gains.parameters import LocalParameters
 from servod.kernels.laws import LAWS
-from servod.lab.verify.checks import CORNER_DISK, CORNER_SPEEDS, DISK_LIMIT, speeds_of
-from servod.lab.verify.closed_loop import Deviation, corners
+from servod.lab.verify.checks import CORNER_DISK, CORNER_SPEEDS, DISK_LIMIT, Subject, speeds_of
+from servod.lab.verify.closed_loop import Deviation, corners, late_corners
 from servod.lab.verify.effect_checks import late_effects
 from servod.lab.verify.margins import Judgement, Sweep, arrival_of
+from servod.lab.verify.rest_checks import RESTING_POLE, resting_radius, resting_speed
 from servod.lab.verify.sampled import timing_of
 from servod.lab.verify.steady_friction import SteadyFriction
+from servod.lab.verify.trials import ERROR_SHARE, monte_carlo
 
 #: Bandwidths, best first: the first is taken with which every corner of the intervals stands with CORNER_WANTED, and
 #: the axis as modelled with the wanted disk margin, or else with the one of the certificate.
@@ -162,3 +168,121 @@ def low_bandwidths(design: Design, friction: SteadyFriction, law: LocalParameter
         enough = min(enough, COUNT_SHARE * friction.largest(design.speed_max_rad_s) / step_nm_s)
     wanted = sorted({min(factor * high, enough) for factor in LOW_FACTORS[:-1]}, reverse=True)
     return [low for low in wanted if low > WORTH * LOW_FACTORS[-1] * high]
+
+
+# The local compensating gains l_i of (9), designed: the largest that the sampled loop stands with a stated margin.
+#
+# Stands on the sweep that verification uses. l_i is integral action through the friction state, and the only one of a
+# law without output observer. Its sign makes z_hat push the way the feedback pushes; with the other one the loop is
+# unstable at every size (positive feedback around an integrator), so only l > 0 is looked for. How much a set may have
+# depends on its speed: creeping, where z_hat hardly leaks, 0.03 is the limit on the paper's joint, ten times that where
+# friction settles fast. One common gain would be that of the slowest set, and tracks a quarter worse.
+
+
+#: Candidates [rad/s per unit of u* = u/K].
+GAINS = (0.005, 0.007, 0.01, 0.014, 0.02, 0.028, 0.04, 0.056, 0.08, 0.11, 0.16, 0.23)
+SPEEDS = 12  # per direction at which the largest gain is looked for; between them the smaller neighbour holds
+MARGIN = 1.5 * DISK_LIMIT  # disk margin that is left
+SHRINK, SHRINKS = 0.85, 12  # of all gains together, until the whole set stands
+
+
+def with_gains(law: LocalParameters, speeds: list[float], gains: list[float]) -> LocalParameters:
+    """`law` with l_i by the speed of each set, linear between `speeds` [rad/s] and held beyond them."""
+    sets = [
+        s.model_copy(update={"gain": float(np.interp(abs(s.velocity_rad_s), speeds, gains))}) for s in law.friction.sets
+    ]
+    return law.model_copy(update={"friction": law.friction.model_copy(update={"sets": sets})})
+
+
+def stands(design: Design, friction: SteadyFriction, law: LocalParameters, speeds: list[float]) -> bool:
+    """Whether the sampled loop is stable at every corner of the intervals with the margin, at rest and at `speeds`."""
+    sweep = Sweep(LAWS["local"], law.pack(), friction, timing_of(design), speeds)
+    late = late_corners(design.uncertainty)
+    wide = sweep.disk_margin()[0] >= MARGIN and sweep.disk_margin(late)[0] >= CORNER_DISK
+    return wide and sweep.worst(late).radius < 1.0
+
+
+def largest_gain(design: Design, friction: SteadyFriction, law: LocalParameters, speed: float) -> float:
+    """Largest common l of the candidates that the loop stands at `speed`; 0 when it stands none."""
+
+    def too_much(index: int) -> bool:
+        return not stands(design, friction, with_gains(law, [speed], [GAINS[index]]), [speed])
+
+    index = bisect.bisect_left(range(len(GAINS)), True, key=too_much)
+    return GAINS[index - 1] if index else 0.0
+
+
+def designed(design: Design, friction: SteadyFriction, law: LocalParameters) -> LocalParameters:
+    """`law` with its l_i designed: per speed the largest that stands, and all together still with the margin."""
+    speeds = speeds_of(design, SPEEDS)
+    largest = [largest_gain(design, friction, law, speed) for speed in speeds]
+    held = [min(largest[max(i - 1, 0) : i + 2]) for i in range(SPEEDS)]
+    dense = speeds_of(design, 2 * SPEEDS)
+    for step in range(SHRINKS):
+        candidate = with_gains(law, speeds, [SHRINK**step * gain for gain in held])
+        if stands(design, friction, candidate, dense):
+            return candidate
+    return with_gains(law, speeds, [0.0] * SPEEDS)
+
+
+# How fast the output observer may be in Omega_L while the reference moves, tried on simulated plants.
+#
+# Stands after the search for bandwidths that are stable. A fast observer tracks best, yet where friction turns over it
+# has taken the old direction for a disturbance, and may throw the joint forward: no pole shows that, a slow sine does.
+
+
+PLANTS, SEED = 20, 11  # of the trial; the certificate draws others, and many more
+#: Largest error of the sine on these plants as a share of what the certificate allows: it meets worse ones.
+TRIED_SHARE = 0.5
+
+
+def with_moving_observer(gains: GainSet, friction: SteadyFriction) -> GainSet:
+    """`gains` with the bandwidth of coming to rest also in motion where that stands and follows; sealed."""
+    law, design = gains.parameters, gains.design
+    assert isinstance(law, LocalParameters) and law.disturbance_observer is not None and design is not None
+    high, rest = law.disturbance_observer.bandwidth_rad_s, law.disturbance_observer.low_bandwidth_rad_s
+    search = Search(design, friction)
+    for moving in [rest, math.sqrt(rest * high)] if rest else []:
+        faster = with_observer(law, high, rest, moving)
+        found = gains.model_copy(update={"parameters": faster}).sealed()
+        if follows(found) and search.stands(faster, DISK_LIMIT, law.regions.overlap_to_rad_s):
+            return found
+    return gains
+
+
+def follows(gains: GainSet) -> bool:
+    """Whether every plant of the trial follows the slow sine with something to spare."""
+    tried = monte_carlo(gains, PLANTS, SEED, processes=1)
+    return max(trial.error_share for trial in tried) < TRIED_SHARE * ERROR_SHARE
+
+
+# How much of feedback and observer is left of a joint at rest: as little as its loops at rest stand.
+#
+# Stands after the search for an observer. At rest a joint stands on its bristle, and what feedback adds is the
+# encoder's
+# noise: less of it keeps the joint where it is, yet where friction falls steeply with speed too little lets it hunt.
+
+
+#: Best first: at 20 bit the first holds a joint within 5 urad, all of the feedback within 15 to 45.
+SHARES = (0.3, 0.45, 0.6, 0.8, 1.0)
+
+
+def with_share_at_rest(gains: GainSet) -> GainSet:
+    """`gains` with the least share at rest with which every corner stands, or else with all of it; sealed."""
+    for share in SHARES:
+        found = gains.model_copy(
+            update={"parameters": gains.parameters.model_copy(update={"rest_share": share})}
+        ).sealed()
+        if stands_at_rest(found):
+            break
+    return found
+
+
+def stands_at_rest(gains: GainSet) -> bool:
+    """Whether the loops at rest are inside by what verification asks of them."""
+    law, design = gains.parameters, gains.design
+    assert isinstance(law, LocalParameters) and design is not None
+    if not law.rest_within_rad:
+        return True
+    subject = Subject(gains, design, plants=0, seed=0, processes=1)
+    return resting_radius(subject, law, resting_speed(law.rest_within_rad)) <= RESTING_POLE

@@ -18,8 +18,7 @@ from servod.lab.synthesize.deployed import Wishes, empty_design
 from servod.lab.synthesize.gain_set import Options, gain_set, parameters
 from servod.lab.synthesize.infeasible import Infeasible, Relaxation, largest_factor
 from servod.lab.synthesize.lmi_reference import PARTS, ReferenceAnswer, ReferenceWishes, programme, reference, solve
-from servod.lab.verify.reference_proof import gain_numbers, reference_gains, reference_margin
-from servod.lab.verify.reference_vertices import polytope
+from servod.lab.verify.reference_proof import gain_numbers, polytope, reference_gains, reference_margin
 from servod.lab.verify.steady_friction import SteadyFriction, steady_friction
 from servod.lab.verify.vertices import Span
 

@@ -18,7 +18,10 @@ from numpy.typing import NDArray
 
 from servod.common.errors import AnswerIsNo
 from servod.formats.gains.gain_set import GainSet
-from servod.lab.simulate.noise import noise_of
+from servod.formats.model.axis_model import AxisModel
+from servod.kernels.motions import paper
+from servod.lab.simulate.noise import noise_of, noise_series
+from servod.lab.simulate.simulate import ClosedLoopRun, LoopSettings, simulate_closed_loop
 
 Array = NDArray[np.float64]
 
@@ -275,3 +278,89 @@ def swings(position_rad: Array, width_rad: float) -> int:
         elif rising >= 0 and highest - x > width_rad:
             rising, count, lowest = -1, count + 1, x
     return count
+
+
+# The motions under which gain sets are compared: trajectory (19), then two steps that are held for a long time.
+#
+# Stands on the loop's own reference functions, so that simulator and axis follow the same numbers.
+
+
+PAPER_S = 30.0
+#: Steps one after the other, in this order and the same direction, each from where the last is held.
+STEPS_MRAD = (100.0, 10.0)
+HOLD_S = 20.0
+#: Rest before the first motion: a change of gains fades out.
+REST_S = 1.0
+
+
+def paper_rows(period_s: float, duration_s: float = PAPER_S) -> Array:
+    """Trajectory (19) as the simulator reads it: rows of position, velocity and acceleration, from rest."""
+    samples = round(duration_s / period_s)
+    return np.array([paper((k + 1) * period_s) for k in range(samples)])
+
+
+def step_rows(period_s: float, step_mrad: float, duration_s: float = HOLD_S) -> Array:
+    """A step from 0, held from the first sample on."""
+    rows = np.zeros((round(duration_s / period_s), 3))
+    rows[:, 0] = step_mrad * 1e-3
+    return rows
+
+
+# Tracking on the compiled simulator: the same motions and rules as over the CAN loop, hundreds of times faster.
+#
+# Stands on `servod.lab.simulate.simulate`. What the simulator leaves out: the drive's steps of torque and its rate
+# limit.
+
+
+def measure(
+    model: AxisModel,
+    gains: GainSet,
+    *,
+    counts_per_turn: float,
+    cutoff_hz: float,
+    seed: int,
+    torque_limit_nm: float = math.inf,
+    period_s: float = 0.001,
+) -> Tracking:
+    """Simulate `model` under `gains` on (19) and on steps of 100 and 10 mrad held for 20 s, each from rest.
+
+    `seed` begins the model's torque and encoder noise. Curves hold what the encoder showed.
+    """
+    settings = LoopSettings(period_s, counts_per_turn, cutoff_hz, torque_limit_nm)
+    followed = run(model, gains, paper_rows(period_s, PAPER_S), settings, seed)
+    runs = {
+        size: run(model, gains, step_rows(period_s, size, HOLD_S), settings, seed + 1 + i)
+        for i, size in enumerate(STEPS_MRAD)
+    }
+    swings = {size: float(np.ptp(r.position_rad[r.t_s >= HOLD_FROM_S])) for size, r in runs.items()}
+    steps = {size: curves_of(r) for size, r in runs.items()}
+    heard_rad = model.noise.encoder_rms if model.noise else 0.0
+    return tracking(curves_of(followed), steps, settings.resolution_rad, swings, heard_rad)
+
+
+def run(model: AxisModel, gains: GainSet, rows: Array, settings: LoopSettings, seed: int) -> ClosedLoopRun:
+    """One motion from rest at 0, with the model's own noise."""
+    torque, reading = noise_series(model.noise, len(rows), settings.period_s, seed)
+    return simulate_closed_loop(
+        model,
+        gains.law.step,
+        gains.pack(),
+        rows,
+        settings,
+        external_nm=torque,
+        reading_rad=reading,
+        start=(0.0, 0.0, 0.0),
+    )
+
+
+def curves_of(motion: ClosedLoopRun) -> Curves:
+    """What an encoder and a recorder would have shown of `motion`."""
+    return Curves(
+        time_s=motion.t_s,
+        reference_rad=motion.reference_rad,
+        position_rad=motion.encoder_rad,
+        torque_nm=motion.torque_nm,
+        feedback_nm=motion.feedback_nm,
+        friction_nm=motion.friction_nm,
+        other_nm=motion.other_nm,
+    )

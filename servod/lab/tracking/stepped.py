@@ -13,9 +13,18 @@ import numpy as np
 from servod.client.stepped import SteppedSession
 from servod.common.errors import AnswerIsNo
 from servod.formats.gains.gain_set import GainSet
-from servod.lab.recordings.rows import ROW
-from servod.lab.tracking.metrics import HOLD_FROM_S, Curves, Tracking, known_noise, tracking
-from servod.lab.tracking.motions import HOLD_S, PAPER_S, REST_S, STEPS_MRAD
+from servod.lab.recordings.recording import ROW
+from servod.lab.tracking.metrics import (
+    HOLD_FROM_S,
+    HOLD_S,
+    PAPER_S,
+    REST_S,
+    STEPS_MRAD,
+    Curves,
+    Tracking,
+    known_noise,
+    tracking,
+)
 from servod.runtime.loop.axis import AxisState
 from servod.runtime.loop.commands import REFUSAL_TEXT, Op, ReferenceKind, Refusal
 

@@ -19,9 +19,8 @@ from servod.formats.model.axis_model import AxisModel
 from servod.kernels.laws import LAWS
 from servod.lab.simulate.noise import noise_of, noise_series
 from servod.lab.simulate.simulate import simulate_closed_loop
-from servod.lab.synthesize.intervals import uncertainty_of
-from servod.lab.tracking.metrics import SETTLE_S, Array
-from servod.lab.tracking.motions import STEPS_MRAD, paper_rows
+from servod.lab.synthesize.regions import uncertainty_of
+from servod.lab.tracking.metrics import SETTLE_S, STEPS_MRAD, Array, paper_rows
 from servod.lab.tune.laws import Axis
 from servod.lab.tune.plan import TunePlan
 from servod.lab.verify.plants import drawn

@@ -15,10 +15,10 @@ from servod.common.sources import VERIFIES, source_sha256
 from servod.formats.gains.gain_set import Certificate, CertificateCheck, GainSet, Promise
 from servod.lab.verify.checks import LEAST_PLANTS, SIMULATED, STATIC, Subject, at_most, observations
 from servod.lab.verify.effect_checks import check_effects
-from servod.lab.verify.promise import promise
-from servod.lab.verify.reference_checks import check_reference
+from servod.lab.verify.reference_proof import check_reference
 from servod.lab.verify.rest_checks import check_loads, check_rest
 from servod.lab.verify.trials import scale_of
+from servod.lab.verify.validation import promise
 
 SEED, PROCESSES = 1, 2
 

@@ -18,13 +18,11 @@ from servod.formats.model.axis_model import AxisModel
 from servod.kernels.laws.state import MAY_STAY, STATE_NAMES
 from servod.lab.verify.closed_loop import Deviation, corners, inner_points
 from servod.lab.verify.margins import NOMINAL, Sweep, arrival_of, largest_tolerated
-from servod.lab.verify.measured import least_widths, measured_widths
 from servod.lab.verify.plants import drawn
-from servod.lab.verify.position_slope import position_slopes
 from servod.lab.verify.proof import disc_reach, gain_difference, region_margin, stored_deviation, unproven_rad_s
 from servod.lab.verify.rounding import LEAST_COUNTS, NOISE_SWING, count_rad, gives_way_rad, rounding_rad
 from servod.lab.verify.sampled import Timing, timing_of
-from servod.lab.verify.steady_friction import steady_friction
+from servod.lab.verify.steady_friction import position_slopes, steady_friction
 from servod.lab.verify.trials import (
     ERROR_SHARE,
     RAMP_SHARES,
@@ -37,6 +35,7 @@ from servod.lab.verify.trials import (
     ramp_ripples,
     scale_of,
 )
+from servod.lab.verify.vertices import least_widths, measured_widths
 
 CORNER_SPEEDS, DENSE_SPEEDS, INNER_POINTS = 30, 60, 24
 SLOWEST = 1e-3  # share of the top speed

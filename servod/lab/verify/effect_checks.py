@@ -21,9 +21,32 @@ from servod.kernels.physics.effects import static_stretch
 from servod.lab.verify.checks import CORNER_DISK, MOST_NAME, POLE_LIMIT, Subject, at_least, at_most
 from servod.lab.verify.closed_loop import Behind, Deviation, corners
 from servod.lab.verify.effect_reach import Effect, Level, effects_of, level_of
-from servod.lab.verify.known_physics import unknown_physics
-from servod.lab.verify.position_slope import position_slopes
-from servod.lab.verify.steady_friction import SteadyFriction, steady_friction
+from servod.lab.verify.sampled import LONGEST_LAG
+from servod.lab.verify.steady_friction import SteadyFriction, position_slopes, steady_friction
+
+# What of an axis model no check of the sampled loop can carry.
+#
+# Stands on the axis model, under the checks of effects. Drawn plants are simulated with every effect, but poles and
+# margins are of a joint that is linearised: a certificate must not pass over the rest in silence.
+
+
+#: Periods in which the torque must get from one end to the other: slower, its rate limit is a lag that grows.
+SLEW_PERIODS = 5.0
+
+
+def unknown_physics(model: AxisModel, period_s: float, level: Level) -> Iterator[str]:
+    """Keys of the model that stay out of the loop, and why; what acts from outside closes no loop and is none."""
+    lag, limit, load = model.actuator_lag, model.torque_saturation, model.load_dependent_friction
+    if lag is not None and lag.time_constant_s > LONGEST_LAG * period_s:
+        yield "actuator_lag.time_constant_s is longer than a cycle"
+    slew = lag.slew_per_s if lag is not None else None
+    if slew is not None and slew * SLEW_PERIODS * period_s < 2.0 * level.torque_nm:
+        yield f"actuator_lag.slew_per_s turns the torque around in more than {SLEW_PERIODS:g} cycles"
+    if limit is not None and min(limit.limit, limit.negative_limit or limit.limit) < level.torque_nm:
+        yield f"torque_saturation.limit is below the {level.torque_nm:.3g} N*m of friction and load"
+    if load is not None and load.per_command >= 0.9:
+        yield "load_dependent_friction.per_command lets friction take what is commanded"
+
 
 #: Shares of the contact's stiffness that a gap is judged with; without any, the motor is alone.
 GAP_SHARES = (0.03, 0.1, 0.3, 1.0)

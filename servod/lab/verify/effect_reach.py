@@ -18,8 +18,7 @@ from servod.formats.model.friction import ThermalShape
 from servod.formats.model.keys import Harmonic
 from servod.kernels.physics.effects import SMALLEST_FACTOR
 from servod.lab.verify.closed_loop import Reach
-from servod.lab.verify.position_slope import SPRING_STRETCH_RAD
-from servod.lab.verify.steady_friction import SteadyFriction
+from servod.lab.verify.steady_friction import SPRING_STRETCH_RAD, SteadyFriction
 
 Ends = tuple[float, float]
 ONE: Ends = (1.0, 1.0)

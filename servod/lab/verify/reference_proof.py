@@ -6,17 +6,100 @@ paper proves: the continuous loop without delay or filter. Whether the sampled l
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
-from servod.formats.gains.design import Design, ReferenceOutput, ReferenceProof
-from servod.formats.gains.parameters import LocalFriction, RegionGains
+from servod.formats.gains.design import Design, ReferenceForm, ReferenceOutput, ReferenceProof, Uncertainty
+from servod.formats.gains.gain_set import CertificateCheck
+from servod.formats.gains.parameters import LocalFriction, LocalParameters, RegionGains
+from servod.kernels.laws.weights import Shape, blended
+from servod.lab.verify.checks import SAME, Subject, at_least, at_most
 from servod.lab.verify.proof import relative_margin
-from servod.lab.verify.reference_vertices import ContinuousVertex, Polytope, polytope, vertices
 from servod.lab.verify.sampled import Array
-from servod.lab.verify.steady_friction import steady_friction
-from servod.lab.verify.vertices import Span
+from servod.lab.verify.steady_friction import SteadyFriction, steady_friction
+from servod.lab.verify.vertices import Span, ends
+
+# Vertices of the paper's polytope (15): what the reference mode solves over and its proof is evaluated on.
+#
+# Stands on the steady friction and the law's own local sets. Physically consistent with (12), states (z_hat, x, v):
+#
+#     A_i = [-a, 0, 1; 0, 0, 1; -dc/m, -kappa/m, -dd/m],  B_2i = [l, 0, K/m],  B_1 = [1, 0; 0, 0; 0, 1/m].
+#
+# Printed, row 3 is (dc, kappa, dd) with B_2 = [l, 0, K] and B_1 = [1, 0, 1]: wrong in sign, without the inertia, and
+# with
+# one disturbance that enters in two places.
+
+
+KAPPA_SHARE = 0.01  # kappa of (15), the small gain that provides a solution, as a share of c0
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Polytope:
+    """Intervals of a_i [1/s], dc_i [N*m/rad], dd_i [N*m*s/rad] and l_i over one region."""
+
+    decays: Interval
+    stiffness: Interval
+    viscous: Interval
+    gains_l: Interval
+
+    @staticmethod
+    def stored(proof: ReferenceProof) -> Polytope:
+        """The polytope that a proof says it is about."""
+        rows = (
+            proof.decays_per_s,
+            proof.stiffness_mismatch_nm_per_rad,
+            proof.viscous_mismatch_nms_per_rad,
+            proof.gains_l,
+        )
+        return Polytope(*((row[0], row[1]) for row in rows))
+
+
+@dataclass(frozen=True, slots=True)
+class ContinuousVertex:
+    """One vertex of (15), in SI units."""
+
+    name: str
+    a: Array
+    b1: Array
+    b2: Array
+
+
+def polytope(friction: SteadyFriction, law: LocalFriction, span: Span, u: Uncertainty) -> Polytope:
+    """The polytope of a region: what the law's local sets do there, against the model within its intervals."""
+    nodes = [s.velocity_rad_s for s in law.sets]
+    packed = [*nodes, *(s.decay_per_s for s in law.sets), *(s.gain for s in law.sets)]
+    edges = [side * speed for side in (1.0, -1.0) for speed in (span.from_rad_s, span.to_rad_s)]
+    inside = [v for v in nodes if span.from_rad_s <= abs(v) <= span.to_rad_s]
+    shape = float(Shape[law.weights.name])
+    at = [blended(packed, 0, len(nodes), shape, v) for v in (*edges, *inside)]
+    decays = [max(decay, law.leak_per_s) for decay, _ in at]
+    stiff = [friction.stiffness * end - law.stiffness_nm_per_rad for end in ends(u.stiffness)]
+    viscous = [friction.viscous(v) * end - law.viscous_nms_per_rad for v in edges for end in ends(u.viscous)]
+    gains = [gain for _, gain in at]
+    return Polytope(*((min(values), max(values)) for values in (decays, stiff, viscous, gains)))
+
+
+def vertices(
+    name: str, p: Polytope, inertia: float, stiffness: float, input_scale_nm: float, form: ReferenceForm
+) -> list[ContinuousVertex]:
+    """All corners of the polytope as the matrices of (15); an interval without width has one end."""
+    found = []
+    for a, dc, dd, gain in itertools.product(*(sorted(set(i)) for i in (p.decays, p.stiffness, p.viscous, p.gains_l))):
+        last, kappa = np.array([-dc, -KAPPA_SHARE * stiffness, -dd]), KAPPA_SHARE * stiffness
+        if form is ReferenceForm.PRINTED:
+            matrix = np.array([[-a, 0.0, 1.0], [0.0, 0.0, 1.0], [dc, kappa, dd]])
+            b1, b2 = np.array([[1.0], [0.0], [1.0]]), np.array([[gain], [0.0], [input_scale_nm]])
+        else:
+            matrix = np.array([[-a, 0.0, 1.0], [0.0, 0.0, 1.0], last / inertia])
+            b1 = np.array([[1.0, 0.0], [0.0, 0.0], [0.0, 1.0 / inertia]])
+            b2 = np.array([[gain], [0.0], [input_scale_nm / inertia]])
+        found.append(ContinuousVertex(f"{name}: a={a:.3g} dc={dc:.3g} dd={dd:.3g} l={gain:g}", matrix, b1, b2))
+    return found
 
 
 def output_rows(proof: ReferenceProof, lyapunov: Array, y: Array) -> Array:
@@ -78,3 +161,32 @@ def reference_gains(proof: ReferenceProof) -> RegionGains:
     """The law's gains of the region; position and velocity feedback must not be negative."""
     k_z, k_x, k_v = gain_numbers(proof)
     return RegionGains(k_z_per_rad=k_z, k_x_per_rad=k_x, k_v_s_per_rad=k_v)
+
+
+# Checks of a set's proofs that hold for both modes: that every region has one, and the paper's own inequalities.
+#
+# Stands beside `checks`. What the reference mode proves says nothing of the sampled loop; the other checks judge that.
+
+
+REGIONS = 2
+
+
+def check_reference(s: Subject) -> Iterator[CertificateCheck]:
+    """A proof for each region; (14) by eigenvalues; its polytope as model and law say; the law's gains as proven."""
+    proofs = s.design.reference
+    proven = {proof.name for proof in s.design.regions} | {proof.name for proof in proofs}
+    yield at_least("regions with a proof", float(len(proven & {"low", "high"})), REGIONS)
+    local = s.gains.parameters
+    for proof in proofs:
+        yield at_least(
+            f"(14) of region {proof.name}, least relative eigenvalue", reference_margin(s.design, proof), 0.0
+        )
+        if isinstance(local, LocalParameters):
+            away = stored_polytope_deviation(s.design, local.friction, proof)
+            yield at_most(f"polytope of region {proof.name} against model and law", away, SAME)
+            own = getattr(local.regions, proof.name)
+            used = (own.k_z_per_rad, own.k_x_per_rad, own.k_v_s_per_rad)
+            pairs = list(zip(used, gain_numbers(proof), strict=True))
+            worst = float(np.max([abs(x - y) / max(abs(x), abs(y), 1e-12) for x, y in pairs]))
+            away = worst + sum(map(abs, own.pack_memory()))
+            yield at_most(f"gains of region {proof.name} against the proven ones", away, SAME)

@@ -26,8 +26,7 @@ from servod.lab.verify.closed_loop import Bristle, corners, loops_around, spectr
 from servod.lab.verify.law_slopes import LawSlopes, arriving_slopes
 from servod.lab.verify.margins import by_delay, joints_at
 from servod.lab.verify.plants import drawn
-from servod.lab.verify.rest import LEAST_SHARE, hold_width, rest_width
-from servod.lab.verify.rounding import count_rad
+from servod.lab.verify.rounding import LEAST_SHARE, count_rad, hold_width, rest_width
 from servod.lab.verify.sampled import Array
 from servod.lab.verify.steady_friction import steady_friction
 from servod.lab.verify.trials import quiet, scale_of

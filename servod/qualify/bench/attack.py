@@ -17,14 +17,13 @@ from pathlib import Path
 from typing import Any
 
 from servod.client.control import ControlClient
-from servod.client.processes import child, sigterm_as_interrupt, wait_until
+from servod.client.processes import RunningAxis, child, running_axis, sigterm_as_interrupt, wait_until
 from servod.common.errors import AnswerIsNo
 from servod.drivers.virtual.drive_record import read_drive_record
 from servod.formats.recording.mcap_reader import read_recording
 from servod.qualify.bench.attackers import AT_WORK, Tally, failed
 from servod.qualify.bench.wall import resident_kib
 from servod.qualify.demo.axis import demo_config, plant_file
-from servod.qualify.demo.wall import RunningAxis, running_axis
 from servod.runtime.fieldbus.devices import DriveState
 
 _GATHER_S = 30.0  # at most, until every attack is under way

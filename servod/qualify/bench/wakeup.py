@@ -17,9 +17,9 @@ from array import array
 from pathlib import Path
 from typing import Any
 
+from servod.client.processes import last_core
 from servod.common.clock import WallClock
 from servod.common.units import NS_PER_US
-from servod.qualify.demo.axis import last_core
 from servod.runtime.loop.process import run
 from servod.runtime.loop.realtime import apply_realtime
 

@@ -12,6 +12,7 @@ import io
 import json
 import secrets
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,9 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from servod.common.report_files import write_bytes
+from servod import __version__
+from servod.common.errors import BadInput
+from servod.common.files import read_json, write_bytes
 from servod.qualify.blind.case import Case, make_case
 from servod.qualify.blind.plan import Plan, Settings
 
@@ -107,3 +110,43 @@ def read_truth(out: Path, digest: str) -> dict[str, Any]:
         raise ValueError(f"{out / SEALED / TRUTH} has SHA-256 {found}, sealed was {digest}")
     cases: dict[str, Any] = json.loads(content)["cases"]
     return cases
+
+
+# What a trial is: its settings and the hash of its sealed truth, in one file of its folder.
+#
+# Under the three processes; each reads it, only the first writes it.
+
+
+FILE = "trial.json"
+_ALLOWED = "what `servoctl prove` wrote"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """The cases of a trial: how many, by which seed, whether the harder ones; and the hash of the sealed truth."""
+
+    cases: int
+    seed: int
+    harder: bool
+    sha256: str = ""
+    version: str = __version__
+
+    def same(self, other: Trial) -> bool:
+        """Whether both draw the same cases."""
+        return (self.cases, self.seed, self.harder) == (other.cases, other.seed, other.harder)
+
+
+def write_trial(out: Path, trial: Trial) -> None:
+    """Write the trial's file. Raises BadInput."""
+    write_bytes(out / FILE, (json.dumps(asdict(trial)) + "\n").encode())
+
+
+def read_trial(out: Path) -> Trial | None:
+    """The trial in a folder, if any. Raises BadInput when its file is no such file."""
+    path = out / FILE
+    if not path.exists():
+        return None
+    try:
+        return Trial(**read_json(path, _ALLOWED))
+    except TypeError:
+        raise BadInput(str(path), "other keys than a trial has", _ALLOWED) from None

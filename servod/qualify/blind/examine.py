@@ -21,8 +21,7 @@ from tempfile import TemporaryDirectory
 from threading import Lock
 
 from servod.common.errors import BadInput
-from servod.common.files import read_json
-from servod.common.report_files import write_bytes
+from servod.common.files import read_json, write_bytes
 from servod.common.sources import DIAGNOSES, sha256_on_disk
 from servod.qualify.blind.conceal import CASES, lock
 

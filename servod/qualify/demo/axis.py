@@ -5,10 +5,9 @@ Beside the data path. Everything that acts is the product's own; only these valu
 
 from __future__ import annotations
 
-import grp
-import os
 from pathlib import Path
 
+from servod.client.processes import last_core, own_group
 from servod.common.shipped import shipped
 from servod.common.yaml import validate
 from servod.formats.config import AxisConfig
@@ -60,22 +59,3 @@ def demo_config(folder: Path, recordings: Path) -> AxisConfig:
         AxisConfig,
         "demo",
     )
-
-
-def last_core() -> int | None:
-    """The core farthest from where the system puts its interrupts; None where there is only one."""
-    cores = sorted(os.sched_getaffinity(0))
-    return cores[-1] if len(cores) > 1 else None
-
-
-def other_cores() -> set[int] | None:
-    """All cores but the loop's; None where there is only one."""
-    return os.sched_getaffinity(0) - {last_core()} or None
-
-
-def own_group() -> str:
-    """The group of this process, by name where it has one."""
-    try:
-        return grp.getgrgid(os.getgid()).gr_name
-    except KeyError:
-        return str(os.getgid())

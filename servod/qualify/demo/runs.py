@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.common.errors import AnswerIsNo
-from servod.lab.recordings.rows import ROW
+from servod.lab.recordings.recording import ROW
 from servod.lab.tracking.metrics import Score, score
 from servod.qualify.demo.axis import CONTROLLERS
 

@@ -5,75 +5,27 @@ Beside the data path; a client like `servoctl`. The virtual axis is the only one
 
 from __future__ import annotations
 
-import contextlib
 import math
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import yaml
-
 from servod.client.control import ControlClient
-from servod.client.processes import child, sigterm_as_interrupt, wait_until
-from servod.common.errors import AnswerIsNo, FaultCode, Unreachable
-from servod.formats.config import AxisConfig
+from servod.client.processes import running_axis, sigterm_as_interrupt
+from servod.common.errors import AnswerIsNo
+from servod.common.faults import FaultCode
 from servod.formats.recording.mcap_reader import read_recording
-from servod.qualify.demo.axis import demo_config, other_cores
+from servod.qualify.demo.axis import demo_config
 from servod.qualify.demo.entries import Entry
 from servod.qualify.demo.runs import Run, cut_motion
 
 #: Told how far a run is: controller and share from 0 to 1.
 Progress = Callable[[str, float], None]
 
-_START_S = 20.0
 _POLL_S = 0.1
 _HOME_S = 2.0
-
-
-class RunningAxis(NamedTuple):
-    """A client that may command, and the daemon's process id."""
-
-    client: ControlClient
-    daemon_pid: int
-
-
-@contextlib.contextmanager
-def running_axis(
-    config: AxisConfig, plant: Path, folder: Path, axis_options: Sequence[str] = ()
-) -> Iterator[RunningAxis]:
-    """Virtual axis and daemon for the time of a `with` block. Raises Unreachable when one does not start.
-
-    `axis_options` are further arguments of servod-virtual-axis.
-    """
-    file = folder / "axis.yaml"
-    file.write_text(yaml.safe_dump(config.model_dump(mode="json")))
-    bus, control = Path(config.bus.channel), config.control.socket
-    with contextlib.ExitStack() as stack:
-        log = folder / "virtual-axis.log"
-        axis = stack.enter_context(
-            child(
-                "servod.drivers.virtual.main",
-                ["--socket", str(bus), "--plant", str(plant), *axis_options],
-                log,
-                cores=other_cores(),
-            )
-        )
-        wait_until(bus.exists, axis, log, _START_S)
-        log = folder / "servod.log"
-        daemon = stack.enter_context(child("servod.runtime.daemon.main", ["--config", str(file)], log))
-        wait_until(lambda: _answers(control), daemon, log, _START_S)
-        yield RunningAxis(stack.enter_context(ControlClient(control)), daemon.pid)
-
-
-def _answers(control: Path) -> bool:
-    """The daemon listens, and its loop turns."""
-    try:
-        with ControlClient(control) as client:
-            return bool(client.call("status"))
-    except Unreachable:
-        return False
 
 
 class WallRuns(NamedTuple):

@@ -17,8 +17,10 @@ from typing import Any
 
 import yaml
 
-from servod.client.control import ControlClient, Verb
-from servod.common.errors import FaultCode, ServodError, Unreachable
+from servod.client.control import ControlClient
+from servod.client.processes import last_core, own_group
+from servod.common.errors import ServodError, Unreachable
+from servod.common.faults import FaultCode
 from servod.common.shipped import shipped
 from servod.common.units import NS_PER_US
 from servod.common.yaml import validate
@@ -26,14 +28,21 @@ from servod.drivers.virtual.bus_faults import BusFault
 from servod.drivers.virtual.drive_record import DriveSample
 from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.formats.model.axis_model import axis_model_yaml
-from servod.qualify.demo.axis import last_core, own_group
-from servod.qualify.faults.inputs import Nested, config_of, merged, plant_of, shipped_config
+from servod.formats.protocol import Verb
+from servod.qualify.faults.evidence import lost_records, wait_for_rows
 from servod.qualify.faults.machine import Machine, Process, wait_for_state
-from servod.qualify.faults.recorded import lost_records, wait_for_rows
-from servod.qualify.faults.scenario import Recovery, Scenario, Start
-from servod.qualify.faults.stranger import at_the_hub, download, send_heard
+from servod.qualify.faults.scenario import (
+    Nested,
+    Recovery,
+    Scenario,
+    Start,
+    config_of,
+    merged,
+    plant_of,
+    shipped_config,
+)
 from servod.qualify.faults.under_test import MOTION, Observation
-from servod.qualify.faults.wire import HubWire, Wire
+from servod.qualify.faults.wire import HubWire, Wire, at_the_hub, download, send_heard
 from servod.runtime.fieldbus.devices import DriveState
 from servod.runtime.loop.axis import AxisState
 

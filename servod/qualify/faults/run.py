@@ -3,21 +3,50 @@
 from __future__ import annotations
 
 import contextlib
+import multiprocessing
+import signal
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
-from servod.common.errors import FAULTS, Unreachable
-from servod.qualify.faults.actions import action_of
-from servod.qualify.faults.effects import Effects
+from servod.common.errors import ServodError, Unreachable
+from servod.common.faults import FAULTS
+from servod.qualify.faults.actions import Action, action_of
 from servod.qualify.faults.evidence import Watch
-from servod.qualify.faults.judge import Reaction, complaints, reaction
-from servod.qualify.faults.losses import loss_of
+from servod.qualify.faults.judge import Reaction, complaints, loss_of, reaction
 from servod.qualify.faults.processes import ProcessAxis
 from servod.qualify.faults.scenario import Injection, Loss, Recovery, Runs, Scenario
 from servod.qualify.faults.stepped import SteppedAxis
 from servod.qualify.faults.under_test import AxisUnderTest, Observation
+
+# Whether what a scenario injects really happened: a fault that hits nothing proves nothing.
+#
+# Part of the judge. Each action knows its trace: frames that the hub struck, a node that took a value, a process that
+# got
+# its signal. Beside the injection on purpose: an injection that does nothing cannot say that it did.
+
+
+class Effects:
+    """Counts the effects of a scenario's injections on `axis`, from the moment at which this is made."""
+
+    def __init__(self, scenario: Scenario, axis: AxisUnderTest) -> None:
+        self._axis = axis
+        self._actions: dict[Hashable, list[Action]] = {}
+        for injection in scenario.inject:
+            action = action_of(injection, scenario.title, scenario.runs)
+            self._actions.setdefault(action.mark(), []).append(action)
+        self._before = {mark: actions[0].effect(axis) for mark, actions in self._actions.items()}
+
+    def complaints(self) -> Iterator[str]:
+        """What did not happen, or not as often as it should have."""
+        for mark, actions in self._actions.items():
+            wanted = sum(action.wanted() for action in actions)
+            seen = actions[0].effect(self._axis) - self._before[mark]
+            if seen < wanted:
+                often = "" if not seen else f" ({seen} of {wanted} times)"
+                yield f"the fault did not happen: {actions[0].traceless}{often}"
 
 
 @dataclass(frozen=True)
@@ -118,3 +147,75 @@ def _inject(axis: AxisUnderTest, scenario: Scenario, injections: Sequence[Inject
             counted_ns = axis.now_ns()
         action_of(injection, f"{scenario.title}: inject.{number}", scenario.runs).apply(axis)
     return counted_ns
+
+
+# The whole campaign: scenarios one after the other, or several of those in virtual time at once.
+#
+# Above `run`; used by `servoctl faults`. Whoever takes the outcomes may stop in between and keeps what came so far.
+
+
+Scenarios = Mapping[str, Scenario]
+
+
+def outcomes(scenarios: Scenarios, jobs: int = 1) -> Iterator[Outcome]:
+    """Each outcome as it comes: first those in virtual time, `jobs` at once, then those on the wall clock one by one.
+
+    Those of the guest machine are left out: its own script runs them.
+    """
+    stepped = {name: s for name, s in scenarios.items() if s.runs is Runs.STEPPED}
+    if jobs > 1:
+        yield from _at_once(stepped, jobs)
+    else:
+        yield from (outcome_of(name, scenario) for name, scenario in stepped.items())
+    yield from (outcome_of(name, s) for name, s in scenarios.items() if s.runs is Runs.PROCESSES)
+
+
+def outcome_of(name: str, scenario: Scenario) -> Outcome:
+    """How the scenario ended; one whose axis did not get to the start, or that broke off, has failed for that."""
+    try:
+        return run_scenario(name, scenario)
+    except ServodError as error:
+        return _without_end(name, scenario, "not started", str(error))
+    except Exception as error:  # a mistake of ours: the other scenarios and the report are not lost for it
+        return _broken_off(name, scenario, error)
+
+
+def _broken_off(name: str, scenario: Scenario, error: BaseException) -> Outcome:
+    why = " ".join(f"{type(error).__name__}: {error}".split())
+    return _without_end(name, scenario, "broken off", why)
+
+
+def _without_end(name: str, scenario: Scenario, axis: str, why: str) -> Outcome:
+    injected = ", ".join(i.action for i in scenario.inject)
+    nothing = Reaction(None, None)
+    return Outcome(
+        name,
+        scenario.title,
+        scenario.group,
+        injected,
+        (),
+        "",
+        axis,
+        nothing,
+        None,
+        False,
+        (why,),
+        loss_of(scenario),
+        scenario.expect.exempt,
+    )
+
+
+def _at_once(scenarios: Scenarios, jobs: int) -> Iterator[Outcome]:
+    """In processes of their own; what has not begun when the taker stops never begins."""
+    pool = ProcessPoolExecutor(
+        jobs,
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=signal.signal,
+        initargs=(signal.SIGINT, signal.SIG_IGN),  # Ctrl-C is for the one who takes the outcomes
+    )
+    with contextlib.ExitStack() as stack:
+        stack.callback(pool.shutdown, wait=True, cancel_futures=True)
+        running = {pool.submit(outcome_of, name, scenario): name for name, scenario in scenarios.items()}
+        for done in as_completed(running):
+            died, name = done.exception(), running[done]
+            yield done.result() if died is None else _broken_off(name, scenarios[name], died)

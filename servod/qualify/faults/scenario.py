@@ -7,13 +7,19 @@ does stands in `servod.qualify.faults.actions`.
 
 from __future__ import annotations
 
+import copy
 from enum import StrEnum
+from functools import cache
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field, model_validator
 
-from servod.common.errors import FaultCode
-from servod.common.yaml import Strict
+from servod.common.faults import FaultCode
+from servod.common.shipped import shipped
+from servod.common.yaml import Strict, validate
+from servod.drivers.virtual.settings import VirtualAxisSettings
+from servod.formats.config import AxisConfig, load_config
+from servod.formats.model.axis_model import AxisModel, load_axis_model
 from servod.runtime.fieldbus.devices import DriveState
 from servod.runtime.loop.axis import AxisState
 from servod.runtime.loop.wiring.findings import Finding
@@ -52,7 +58,7 @@ POWERED = (Start.ENABLED, Start.MOVING, Start.PROVING)
 
 
 class Loss(StrEnum):
-    """What a scenario takes from the axis. Its actions say so (servod.qualify.faults.losses); each loss has its
+    """What a scenario takes from the axis. Its actions say so (servod.qualify.faults.judge); each loss has its
     bound."""
 
     NONE = "none"
@@ -119,7 +125,7 @@ class Expectation(Strict):
         min_length=1, description="names of servod.runtime.loop.axis.AxisState; one of them at the end"
     )
     faults: list[FaultWord] = Field(
-        [], description="names of servod.common.errors.FaultCode; one of them at least is latched"
+        [], description="names of servod.common.faults.FaultCode; one of them at least is latched"
     )
     reaction_ms: float | None = Field(None, gt=0.0, description="the drive has left the controller's command by then")
     torque_gone_ms: float | None = Field(None, gt=0.0, description="the joint feels no torque from then on")
@@ -183,3 +189,63 @@ class Scenario(Strict):
         if self.runs is not Runs.STEPPED and (self.start is Start.PROVING or self.expect.drive_error is not None):
             raise ValueError("start: proving and expect.drive_error are for runs: stepped")
         return self
+
+
+# Plant and configuration of a scenario: what its file states, laid over what ships.
+#
+# Used by every axis under test before it starts.
+
+
+Nested = dict[str, Any]
+
+
+#: The wiring was proven at an enable long ago; a scenario that is about the proof asks for it.
+PROVEN_BEFORE = {"wiring_proof": {"enabled": False}}
+
+
+def shipped_config() -> Nested:
+    """The shipped configuration of the virtual axis, its paths made absolute."""
+    return copy.deepcopy(_shipped_config())
+
+
+@cache
+def _shipped_config() -> Nested:
+    return load_config(shipped("gains/config/virtual.yaml")).model_dump(mode="json", exclude_none=True)
+
+
+def plant_of(scenario: Scenario) -> AxisModel:
+    """The joint: the scenario's keys over the demo joint. Raises BadInput."""
+    return _plant(scenario, scenario.title)
+
+
+def check_inputs(scenario: Scenario, where: str) -> None:
+    """What the scenario says of settings, configuration and plant, before anything runs. Raises BadInput."""
+    validate(scenario.settings, VirtualAxisSettings, f"{where}: settings")
+    if scenario.config:
+        over = merged(PROVEN_BEFORE, scenario.config)
+        validate(merged(_shipped_config(), over), AxisConfig, f"{where}: config")
+    if scenario.plant:
+        _plant(scenario, where)
+
+
+def _plant(scenario: Scenario, where: str) -> AxisModel:
+    return validate(merged(_demo_joint(), scenario.plant), AxisModel, f"{where}: plant")
+
+
+@cache
+def _demo_joint() -> Nested:
+    return load_axis_model(shipped("gains/axes/demo_joint.yaml")).model_dump(mode="json", exclude_none=True)
+
+
+def config_of(scenario: Scenario, base: Nested) -> AxisConfig:
+    """The axis: the scenario's keys over `base`. Raises BadInput."""
+    return validate(merged(base, scenario.config), AxisConfig, f"{scenario.title}: config")
+
+
+def merged(base: Nested, over: Nested) -> Nested:
+    """`over` laid over `base`, mapping by mapping."""
+    result = dict(base)
+    for key, value in over.items():
+        old = base.get(key)
+        result[key] = merged(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
+    return result

@@ -7,7 +7,8 @@ from collections.abc import Hashable, Sequence
 from pathlib import Path
 
 from servod.client.stepped import SteppedSession
-from servod.common.errors import ServodError, Unreachable, faults_in
+from servod.common.errors import ServodError, Unreachable
+from servod.common.faults import faults_in
 from servod.common.shipped import shipped
 from servod.common.yaml import validate
 from servod.drivers.virtual.bus_faults import BusFault
@@ -16,8 +17,18 @@ from servod.drivers.virtual.world import SteppedBus, SteppedWorld, VirtualAxisSe
 from servod.formats.config import AxisConfig
 from servod.formats.gains.gain_set import load_gains
 from servod.kernels.laws import LAWS
-from servod.qualify.faults.inputs import PROVEN_BEFORE, Nested, config_of, merged, plant_of, shipped_config
-from servod.qualify.faults.scenario import Recovery, Runs, Scenario, Start
+from servod.qualify.faults.scenario import (
+    PROVEN_BEFORE,
+    Nested,
+    Recovery,
+    Runs,
+    Scenario,
+    Start,
+    config_of,
+    merged,
+    plant_of,
+    shipped_config,
+)
 from servod.qualify.faults.under_test import MOTION, Observation
 from servod.runtime.fieldbus.cia import NMT_ID
 from servod.runtime.loop.axis import AxisState

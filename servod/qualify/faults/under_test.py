@@ -7,7 +7,7 @@ from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
-from servod.common.errors import FaultCode
+from servod.common.faults import FaultCode
 from servod.drivers.virtual.bus_faults import BusFault
 from servod.drivers.virtual.drive_record import DriveSample
 from servod.qualify.faults.scenario import Recovery, Runs, Start

@@ -12,10 +12,10 @@ from servod.lab.report.figures.motion import errors
 from servod.lab.tune.plan import Feedback
 from servod.qualify.paper.claims import Claim, Shown, least
 from servod.qualify.paper.equations import TwoForms
+from servod.qualify.paper.experiments import LABELS
 from servod.qualify.paper.joints import Joint
 from servod.qualify.paper.programme import ProgrammeAnswer
 from servod.qualify.paper.results import Results, Row
-from servod.qualify.paper.rivals import LABELS
 from servod.qualify.paper.sweeps import NOISE_SHARES, SweepOfL
 
 #: Names of the sweeps in Results.sweeps, and of the slips in Results.slips.

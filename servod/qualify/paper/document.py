@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from servod import __version__
-from servod.common.report_files import write_bytes
+from servod.common.files import write_bytes
 from servod.formats.gains.parameters import LocalParameters
 from servod.lab.report.figure import Table
 from servod.lab.report.page import Page

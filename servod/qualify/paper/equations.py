@@ -13,9 +13,8 @@ from scipy.optimize import brentq
 
 from servod.formats.gains.gain_set import GainSet
 from servod.lab.synthesize.local_sets import STIFFNESS_SHARE, Compensator, force_after
-from servod.qualify.paper.joints import Joint
+from servod.qualify.paper.joints import Joint, at_paper_feedback, consistent_g, printed_g, shipped_set, with_decays
 from servod.qualify.paper.printed import FRICTION
-from servod.qualify.paper.sets import at_paper_feedback, consistent_g, printed_g, shipped_set, with_decays
 from servod.qualify.paper.sweeps import rms_mrad
 
 #: t_f of (8); the paper prints none. Long against 1/a_i, as its slow sines are.

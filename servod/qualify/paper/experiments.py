@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from servod.client.axis import SteppedLink
-from servod.client.stepped import SteppedSession
-from servod.common.errors import AnswerIsNo, Reaction, faults_in
+from servod.client.stepped import SteppedLink, SteppedSession
+from servod.common.errors import AnswerIsNo
+from servod.common.faults import Reaction, faults_in
 from servod.formats.gains.gain_set import GainSet
 from servod.formats.model.axis_model import AxisModel
 from servod.lab.identify.fits.presliding import PreslidingFit
@@ -24,9 +24,11 @@ from servod.lab.report.figures.motion import Motion
 from servod.lab.synthesize.deployed import Wishes
 from servod.lab.synthesize.gain_set import Options, synthesize
 from servod.lab.synthesize.infeasible import Infeasible
-from servod.lab.synthesize.intervals import uncertainty_of
+from servod.lab.synthesize.regions import uncertainty_of
 from servod.lab.tracking.metrics import Curves, StepResponse, Tracking, roughness, score, step_response
 from servod.lab.tracking.stepped import activate, run_motion
+from servod.lab.tune.plan import Feedback, TunePlan
+from servod.lab.tune.rivals import tuned_in_turn
 from servod.qualify.paper.joints import CUTOFF_HZ, ENCODER_COUNTS, Joint, open_for_tracking, open_session
 from servod.qualify.paper.printed import STEPS_MRAD
 from servod.runtime.loop.commands import ReferenceKind
@@ -142,3 +144,50 @@ def _why(session: SteppedSession) -> str:
 def motion_of_curves(label: str, c: Curves) -> Motion:
     """A measured motion as the figures take it."""
     return Motion(label, c.time_s, c.reference_rad, c.position_rad, c.torque_nm, c.friction_nm)
+
+
+# Every law tuned by the same rules on the identified joint, then measured on the joint itself: the fair comparison.
+#
+# Jobs of the crew; stands on servod.lab.tune. Tuning sees the model and its intervals, scoring the plant, with other
+# seeds.
+
+
+#: What people read, by the rival's key in servod.lab.tune.laws.RIVALS.
+LABELS = {
+    "pd": "PD",
+    "pd_dob": "PD + DOB",
+    "pd_lugre": "PD + LuGre, l_f tuned",
+    "pd_lugre_025": "PD + LuGre, l_f 0.25",
+    "pd_lugre_035": "PD + LuGre, l_f 0.35",
+    "local": "local",
+}
+#: Rivals by the law that they run: one job tunes those of a law, for they start from each other.
+FAMILIES = (("pd",), ("pd_dob",), ("pd_lugre", "pd_lugre_025", "pd_lugre_035"), ("local",))
+#: Between the seeds of tuning and of scoring.
+SCORING_SEED_OFFSET = 100
+
+
+@dataclass(frozen=True)
+class Contender:
+    """One tuned law: what people read of it, its class, and what it did on the joint."""
+
+    law: str
+    feedback: Feedback
+    measured: Measured
+
+
+def tuned_sets(
+    model: AxisModel, names: tuple[str, ...], cutoff_hz: float, seed: int
+) -> dict[tuple[Feedback, str], GainSet]:
+    """The rivals `names`, which share one law and its budget, in both classes, tuned for `model` in its intervals."""
+    plan = TunePlan(seed=seed, counts_per_turn=float(ENCODER_COUNTS), cutoff_hz=cutoff_hz)
+    return {key: found.gains for key, found in tuned_in_turn(model, names, plan).items()}
+
+
+def score_rival(
+    joint: Joint, name: str, feedback: Feedback, gains: GainSet, cutoff_hz: float, seed: int, seconds: float
+) -> Contender:
+    """Track (19) with one tuned set over the whole CAN loop."""
+    label = f"{LABELS[name]}, {feedback.value} feedback"
+    found = measure(joint, label, gains, cutoff_hz, seed + SCORING_SEED_OFFSET, seconds, 0.0)
+    return Contender(LABELS[name], feedback, found)

@@ -22,10 +22,9 @@ from servod.lab.report.figures.sets import (
 from servod.lab.verify.steady_friction import steady_friction
 from servod.qualify.paper.claims import Claim, Shown
 from servod.qualify.paper.experiments import Found
-from servod.qualify.paper.joints import Joint
+from servod.qualify.paper.joints import Joint, shipped_set
 from servod.qualify.paper.printed import FRICTION, NODES_RAD_S
 from servod.qualify.paper.results import Results
-from servod.qualify.paper.sets import shipped_set
 
 #: "Very low velocities" of the paper's partition, and the slowest speed at which its map can be judged [rad/s].
 VERY_LOW, SLOWEST = 0.01, 0.005

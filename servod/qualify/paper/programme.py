@@ -18,8 +18,7 @@ from servod.lab.verify.checks import CORNER_SPEEDS, speeds_of
 from servod.lab.verify.margins import NOMINAL, Sweep
 from servod.lab.verify.reference_proof import gain_numbers, reference_gains
 from servod.lab.verify.sampled import Timing
-from servod.qualify.paper.joints import Joint
-from servod.qualify.paper.sets import shipped_set, with_law
+from servod.qualify.paper.joints import Joint, shipped_set, with_law
 from servod.qualify.paper.sweeps import rms_mrad
 
 #: Both ends of a useful l, in rad/s per unit of u*.

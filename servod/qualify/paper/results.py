@@ -10,11 +10,10 @@ from enum import Enum
 
 from servod.lab.report.figures.motion import Motion
 from servod.qualify.paper.equations import TwoForms
-from servod.qualify.paper.experiments import Found, Measured
+from servod.qualify.paper.experiments import Contender, Found, Measured
 from servod.qualify.paper.joints import Joint
 from servod.qualify.paper.printed import RMS_MRAD
 from servod.qualify.paper.programme import ProgrammeAnswer
-from servod.qualify.paper.rivals import Contender
 from servod.qualify.paper.sweeps import SweepOfL
 
 

@@ -14,15 +14,14 @@ import numpy as np
 from servod.client.virtual import PEAK_RATIO, rated_torque_mnm
 from servod.formats.gains.gain_set import GainSet
 from servod.formats.model.axis_model import AxisModel
+from servod.kernels.motions import sine
 from servod.lab.report.figure import Array, array
 from servod.lab.report.figures.motion import SETTLE_S, Motion, motion_of_run
 from servod.lab.simulate.simulate import ClosedLoopRun, LoopSettings, simulate_closed_loop
-from servod.lab.tracking.motions import paper_rows
+from servod.lab.tracking.metrics import paper_rows
 from servod.qualify.paper.experiments import cutoff_of
-from servod.qualify.paper.joints import ENCODER_COUNTS, Joint
+from servod.qualify.paper.joints import ENCODER_COUNTS, Joint, with_l
 from servod.qualify.paper.printed import L_I, SINE_HZ, SINE_RAD
-from servod.qualify.paper.sets import with_l
-from servod.runtime.loop.references import sine
 
 PERIOD_S = 0.001
 #: What counts for a joint that runs away: a hundred times the trajectory.

@@ -17,14 +17,12 @@ from servod.lab.report.figure import Figure
 from servod.lab.report.figures.sets import local_law
 from servod.lab.report.pictures import write_pictures
 from servod.lab.tune.plan import Feedback
-from servod.qualify.paper import beyond, document, equations, experiments, motions, programme, rivals, sweeps
+from servod.qualify.paper import beyond, document, equations, experiments, motions, programme, sweeps
 from servod.qualify.paper.crew import Crew, Tell
-from servod.qualify.paper.experiments import Found, Measured, cutoff_of
-from servod.qualify.paper.joints import Joint
+from servod.qualify.paper.experiments import Contender, Found, Measured, cutoff_of
+from servod.qualify.paper.joints import Joint, at_paper_feedback, printed_l, shipped_set, with_l, without_options
 from servod.qualify.paper.printed import FRICTION
 from servod.qualify.paper.results import Results, Row
-from servod.qualify.paper.rivals import Contender
-from servod.qualify.paper.sets import at_paper_feedback, printed_l, shipped_set, with_l, without_options
 
 #: l_i of the local law at the paper's PD gains without options, in all its sets; as the demo's plain set.
 PLAIN_L = 0.1
@@ -89,7 +87,7 @@ def expected_s(plan: PaperPlan) -> float:
     """Sum of all weights below, for the progress."""
     tracked = len(Row) * len(plan.joints) * _track_s(plan)
     drawn = 1.5 * (14 + 8 * len(plan.joints)) if plan.pictures else 0.0
-    tuned = len(plan.tune) * (len(rivals.FAMILIES) * _TUNE_S + len(rivals.LABELS) * 2.0 * _SCORE_S)
+    tuned = len(plan.tune) * (len(experiments.FAMILIES) * _TUNE_S + len(experiments.LABELS) * 2.0 * _SCORE_S)
     return tracked + drawn + tuned + (45.0 if plan.identify else 6.0) * len(plan.joints) + 20.0
 
 
@@ -142,17 +140,26 @@ def _contenders(plan: PaperPlan, crew: Crew, joint: Joint, found: Found) -> list
     """Every rival tuned on what was found of the joint, each scored as soon as its law is done."""
     cutoff_hz = cutoff_of(found.gains)
     tuned = [
-        crew.submit(f"{names[0]} tuned", _TUNE_S, rivals.tuned_sets, found.model, names, cutoff_hz, plan.seed)
-        for names in rivals.FAMILIES
+        crew.submit(f"{names[0]} tuned", _TUNE_S, experiments.tuned_sets, found.model, names, cutoff_hz, plan.seed)
+        for names in experiments.FAMILIES
     ]
     scored = {
         (feedback, name): crew.submit(
-            f"{name} scored", _SCORE_S, rivals.score, joint, name, feedback, gains, cutoff_hz, plan.seed, plan.seconds
+            f"{name} scored",
+            _SCORE_S,
+            experiments.score_rival,
+            joint,
+            name,
+            feedback,
+            gains,
+            cutoff_hz,
+            plan.seed,
+            plan.seconds,
         )
         for job in tuned
         for (feedback, name), gains in crew.result(job).items()
     }
-    return [crew.result(scored[feedback, name]) for feedback in Feedback for name in rivals.LABELS]
+    return [crew.result(scored[feedback, name]) for feedback in Feedback for name in experiments.LABELS]
 
 
 Tracked = tuple[tuple[Joint, Row], Future[Measured]]

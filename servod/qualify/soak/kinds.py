@@ -10,7 +10,7 @@ import random
 from dataclasses import dataclass, replace
 from typing import Any
 
-from servod.common.errors import FAULTS, FaultCode
+from servod.common.faults import FAULTS, FaultCode
 from servod.qualify.faults.scenario import FEEDBACK_LOSS_MS, MASTER_LOSS_MS, Injection, Recovery
 
 _F = FaultCode

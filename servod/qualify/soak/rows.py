@@ -6,14 +6,22 @@ On the recording side of the data path. Batches of rows as numpy sees them; what
 from __future__ import annotations
 
 import functools
+from collections import Counter
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from servod.common.errors import FAULTS, FaultCode, faults_in
+from servod.common.faults import FAULTS, FaultCode, faults_in
+from servod.common.units import NS_PER_US
+from servod.formats.config import AxisConfig, RecorderConfig
+from servod.formats.recording.mcap_reader import read_recording
+from servod.formats.recording.mcap_writer import split_rows
 from servod.formats.recording.record import FIELDS
-from servod.lab.recordings.rows import ROW
-from servod.qualify.soak.finding import Findings, Wrong
+from servod.lab.recordings.recording import ROW
+from servod.qualify.soak.starved import Explained
+from servod.qualify.soak.tally import Findings, Wrong
+from servod.runtime.daemon.recorder import Recorder
 from servod.runtime.fieldbus.devices import DriveState
 from servod.runtime.loop.axis import AxisState
 
@@ -158,3 +166,112 @@ def run_lengths(flags: NDArray[np.bool_], before: int) -> NDArray[np.int64]:
     places = np.arange(1, len(flags) + 1)
     last_false = np.maximum.accumulate(np.where(flags, -before, places))
     return np.where(flags, places - last_false, 0)
+
+
+# The rows that a daemon recorded, file by file, held against the SYNC frames of the same time.
+#
+# Behind the recorder of a running daemon. A file that is complete is read, checked and removed, so that a soak of days
+# fits a disk.
+
+
+#: The deadlines of a loop on the wall clock may seem so far off, by what a wake-up costs beyond its lag.
+_TOLERANCE_NS = 2_000_000
+#: How long, in cycles, drive and axis may disagree where processes wait for their turn.
+_ANSWER_CYCLES = 100
+
+
+class RecordedRows:
+    """Checks all recordings of one axis; `files` counts them, `check` holds the counts of rows and cycles."""
+
+    def __init__(self, config: AxisConfig, findings: Findings) -> None:
+        period_ns = config.cycle.period_us * NS_PER_US
+        self._folder, self._findings = config.recorder.directory, findings
+        self.check = RowCheck(period_ns, config.limits.torque_nm, findings, _TOLERANCE_NS)
+        self.files = self.syncs = self.syncs_taken = 0
+        self._rows_of_session = self._latched = 0
+        self.excused: Counter[str] = Counter()
+
+    def take(self, schedule: Explained, starved: Explained, ended: bool) -> None:
+        """Check every complete file; with `ended` the daemon is gone and all are.
+
+        A fault has its cause in the schedule, or in a machine that starved the processes at that time; the second are
+        counted in `excused`. What is latched stays so, and is judged once.
+        """
+        paths = [path for path in self._folder.glob("*.mcap") if "-fault-" not in path.name]
+        paths.sort(key=lambda path: path.stat().st_mtime_ns)
+        for path in paths if ended else paths[:-1]:
+            recording = read_recording(path)
+            if recording.truncated:
+                self._findings.add(Wrong.RECORDER, None, f"{path.name} has no end")
+            rows = rows_of(recording.rows)
+            self.check.check(rows, self._allowed(rows, schedule, starved), _ANSWER_CYCLES)
+            self._rows_of_session += len(recording)
+            self.files += 1
+            path.unlink()
+
+    def _allowed(self, rows: Rows, schedule: Explained, starved: Explained) -> NDArray[np.int64]:
+        """The fault bits that each row may have; counts those that only a starved machine explains."""
+        latched = rows["faults_latched"]
+        before = np.concatenate(([self._latched], latched[:-1]))[: len(latched)]
+        strict = schedule.at(rows["time_ns"])
+        allowed = strict | starved.at(rows["time_ns"])
+        for bits in (latched & ~before & allowed & ~strict).tolist():
+            self.excused.update(fault.code.name for fault in faults_in(bits))
+        self._latched = int(latched[-1]) if len(latched) else self._latched
+        return allowed | before
+
+    def end_session(self, heard: int, may_be_taken: bool) -> None:
+        """The daemon ended: the SYNC frames that were `heard` while it ran are as many as its rows."""
+        rows, self._rows_of_session, self._latched = self._rows_of_session, 0, 0
+        self.syncs += heard
+        if may_be_taken and heard < rows:
+            self.syncs_taken += rows - heard
+        elif heard != rows:
+            self._findings.add(Wrong.SYNC, None, f"{heard} SYNC frames on the bus, {rows} rows recorded")
+        self.check.new_session()
+
+
+# Whether the recorder keeps every row: what it wrote is read back and held against what it was given, byte by byte.
+#
+# Behind the loop's rows; the same recorder as the daemon's.
+
+
+class RecordingCheck:
+    """Recordings of single episodes in `folder`, each removed once it was found whole; `rows` counts what was."""
+
+    def __init__(self, config: AxisConfig, folder: Path, findings: Findings) -> None:
+        recorder = RecorderConfig(directory=folder, history_s=1.0)
+        self._recorder, self._findings = Recorder(recorder, "soak", config.cycle.period_us), findings
+        self._given: bytearray | None = None
+        self._path = Path()
+        self.recordings = self.rows = 0
+
+    def start(self) -> None:
+        """Record from now on."""
+        self._path = self._recorder.start().result()
+        self._given = bytearray()
+
+    def add(self, raw: bytes) -> None:
+        """Rows of the loop, when something is being recorded."""
+        if self._given is not None:
+            self._given += raw
+            self._recorder.add_rows(list(split_rows(raw)))
+
+    def stop(self, time_ns: int) -> None:
+        """End the recording, if there is one, and compare."""
+        given, self._given = self._given, None
+        if given is None:
+            return
+        state = self._recorder.stop().result()
+        found = read_recording(self._path)
+        if found.rows == given and not found.truncated and not state["failure"]:
+            self._path.unlink()
+            self.recordings += 1
+            self.rows += len(found)
+            return
+        text = f"{self._path}: {len(found)} rows, {state['dropped']} dropped. {state['failure']}"
+        self._findings.add(Wrong.RECORDER, time_ns, text)
+
+    def close(self) -> None:
+        """End the recorder."""
+        self._recorder.close()

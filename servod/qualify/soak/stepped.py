@@ -12,7 +12,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from servod.common.errors import FAULTS, AnswerIsNo, FaultCode, fault_text, faults_in
+from servod.common.errors import AnswerIsNo
+from servod.common.faults import FAULTS, FaultCode, fault_text, faults_in
 from servod.common.shipped import shipped
 from servod.common.units import NS_PER_S
 from servod.drivers.virtual.drive_record import DriveTail
@@ -21,17 +22,20 @@ from servod.kernels.laws import LAWS
 from servod.qualify.faults.actions import action_of
 from servod.qualify.faults.scenario import Injection, Recovery, Runs, Start
 from servod.qualify.faults.stepped import RECORD_NAME, SteppedAxis
-from servod.qualify.soak.counts import Counts
-from servod.qualify.soak.drive import DriveCheck, Samples, reaction_in, samples_of
-from servod.qualify.soak.finding import Findings, Wrong
+from servod.qualify.soak.drive import (
+    DriveCheck,
+    Samples,
+    check_reaction,
+    check_trace,
+    detected_after_ms,
+    reaction_in,
+    samples_of,
+)
 from servod.qualify.soak.kinds import ALWAYS, FaultKind, fault_bits
-from servod.qualify.soak.plan import Ending, Episode, Move, home
-from servod.qualify.soak.reactions import check_reaction, check_trace, detected_after_ms
-from servod.qualify.soak.recording import RecordingCheck
-from servod.qualify.soak.rows import ANSWER_CYCLES, RowCheck, Rows, rows_of
-from servod.qualify.soak.start import nothing_yet
+from servod.qualify.soak.plan import Ending, Episode, Move, home, nothing_yet
+from servod.qualify.soak.rows import ANSWER_CYCLES, RecordingCheck, RowCheck, Rows, rows_of
 from servod.qualify.soak.syncs import SyncCheck, SyncListener
-from servod.qualify.soak.tally import FaultTally, Tally
+from servod.qualify.soak.tally import Counts, FaultTally, Findings, Tally, Wrong
 from servod.qualify.soak.traces import LISTEN_S, Listener, trace_of
 from servod.runtime.loop.axis import AxisState
 from servod.runtime.loop.commands import REFUSAL_TEXT, Op, Refusal

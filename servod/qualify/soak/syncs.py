@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from servod.drivers.virtual.client import VirtualBus
 from servod.drivers.virtual.hub import Hub
 from servod.drivers.virtual.port import Port
-from servod.qualify.soak.finding import Findings, Wrong
 from servod.qualify.soak.rows import Rows
+from servod.qualify.soak.tally import Findings, Wrong
 from servod.runtime.fieldbus.cia import SYNC_ID
 
 _LISTEN_S = 0.1

@@ -8,10 +8,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from enum import StrEnum
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from servod.qualify.soak.plan import Episode
 
 _BINS_MS = 1000
 
@@ -98,3 +101,111 @@ class Tally:
     def of(self, kind: str) -> FaultTally:
         """The tally of one kind of fault."""
         return self.faults.setdefault(kind, FaultTally())
+
+
+# What a soak may find wrong, and where it is kept: every kind counted, the first ones told in full.
+
+
+_TOLD = 50
+
+
+class Wrong(StrEnum):
+    """Everything that ends a soak with "no"."""
+
+    LOST_ROW = "lost row"
+    DOUBLE_ROW = "row recorded twice"
+    TIME = "time stamp off its cycle"
+    SYNC = "SYNC and rows differ"
+    NOT_FINITE = "number that is not finite"
+    TORQUE = "torque that nobody commands"
+    LIMIT = "torque above its limit"
+    STATE = "unexplained state"
+    UNEXPLAINED = "fault without a cause in the schedule"
+    NOT_FOUND = "fault of the schedule not found in the log"
+    NO_TRACE = "fault of the schedule without a trace on the bus"
+    LATE = "reaction too late"
+    NOT_RECOVERED = "axis not enabled again"
+    REFUSED = "motion or command refused"
+    RECORDER = "recording differs from the rows"
+    MEMORY = "memory grows"
+    DESCRIPTORS = "open descriptors grow"
+
+
+class Finding(NamedTuple):
+    """One of them; `time_s` is axis time since the beginning, None where it is of no one moment."""
+
+    episode: int
+    time_s: float | None
+    wrong: Wrong
+    text: str
+
+
+class Findings:
+    """All findings of a soak: bounded in memory, whatever goes wrong how often."""
+
+    def __init__(self) -> None:
+        self.counts: Counter[Wrong] = Counter()
+        self.told: list[Finding] = []
+        self.episode = 0
+        self._began_ns = 0
+
+    def begin(self, time_ns: int) -> None:
+        """Axis time at the beginning."""
+        self._began_ns = time_ns
+
+    def add(self, wrong: Wrong, time_ns: int | None, text: str, count: int = 1) -> None:
+        """Note one, or `count` alike."""
+        self.counts[wrong] += count
+        if len(self.told) < _TOLD:
+            time_s = None if time_ns is None else (time_ns - self._began_ns) / 1e9
+            self.told.append(Finding(self.episode, time_s, wrong, text))
+
+
+# What a soak counts on its axis, and what it asks of one, whatever the axis runs on.
+
+
+class Counts(NamedTuple):
+    """Three counters of the same cycles by three witnesses, and what else was checked.
+
+    `cycles`: as the loop numbers them, `rows`: as they were recorded, `missed`: periods that the loop skipped; `syncs`:
+    SYNC frames that an independent listener heard, `syncs_taken`: those that a fault of the schedule took. `recordings`
+    of the recorder were read back and had all `rows_read_back`.
+    """
+
+    period_ns: int
+    cycles: int
+    rows: int
+    missed: int
+    syncs: int
+    syncs_taken: int
+    drive_samples: int
+    recordings: int
+    rows_read_back: int
+
+
+class SoakedAxis(Protocol):
+    """An axis in a soak."""
+
+    findings: Findings
+    tally: Tally
+
+    @property
+    def counts(self) -> Counts:
+        """What was counted so far."""
+        ...
+
+    def processes(self) -> dict[str, int]:
+        """Processes whose memory is watched: name and process id."""
+        ...
+
+    def episode(self, episode: Episode) -> None:
+        """Let one episode happen. Raises AnswerIsNo when the axis cannot be enabled any more, by nothing."""
+        ...
+
+    def finish(self) -> None:
+        """Check what is left to check. Raises ServodError when the axis does not come to its end."""
+        ...
+
+    def close(self) -> None:
+        """Leave everything."""
+        ...

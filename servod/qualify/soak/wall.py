@@ -15,28 +15,24 @@ import time
 from pathlib import Path
 from typing import Any
 
-from servod.client.control import Verb
-from servod.common.errors import AnswerIsNo, FaultCode, ServodError, Unreachable
+from servod.common.errors import AnswerIsNo, ServodError, Unreachable
+from servod.common.faults import FaultCode
 from servod.common.shipped import shipped
 from servod.common.units import NS_PER_US
 from servod.drivers.virtual.drive_record import DriveTail
+from servod.formats.protocol import Verb
 from servod.qualify.faults.actions import action_of
 from servod.qualify.faults.actions.bus import FrameFault
 from servod.qualify.faults.machine import Process
 from servod.qualify.faults.processes import ProcessAxis
 from servod.qualify.faults.scenario import Injection, Recovery, Runs, Start
-from servod.qualify.soak.counts import Counts
-from servod.qualify.soak.drive import DriveCheck, reaction_in, samples_of
-from servod.qualify.soak.explained import Explained
-from servod.qualify.soak.finding import Findings, Wrong
+from servod.qualify.soak.drive import DriveCheck, check_reaction, check_trace, reaction_in, samples_of
 from servod.qualify.soak.kinds import ALWAYS, FaultKind, fault_bits
-from servod.qualify.soak.plan import Ending, Episode, Move
-from servod.qualify.soak.reactions import check_reaction, check_trace
-from servod.qualify.soak.recorded import RecordedRows
-from servod.qualify.soak.start import nothing_yet
-from servod.qualify.soak.starved import STARVED_CYCLE, STARVED_SUPERVISOR, Starved
+from servod.qualify.soak.plan import Ending, Episode, Move, nothing_yet
+from servod.qualify.soak.rows import RecordedRows
+from servod.qualify.soak.starved import STARVED_CYCLE, STARVED_SUPERVISOR, Explained, Starved
 from servod.qualify.soak.syncs import SyncThread
-from servod.qualify.soak.tally import Tally
+from servod.qualify.soak.tally import Counts, Findings, Tally, Wrong
 from servod.qualify.soak.traces import LISTEN_S, BusListener, trace_of
 from servod.runtime.loop.axis import AxisState
 from servod.runtime.loop.commands import ReferenceKind

@@ -10,8 +10,8 @@ from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
-from servod.client.control import PIECE_SAMPLES, SampleKey, Verb
 from servod.common.yaml import Strict, validate
+from servod.formats.protocol import PIECE_SAMPLES, SampleKey, Verb
 from servod.runtime.daemon.trajectory import Table
 from servod.runtime.loop.commands import ReferenceKind
 

@@ -13,9 +13,9 @@ import socket
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from servod.client.control import MAX_LINE_BYTES, encode_line
 from servod.common.errors import BadInput, ServodError, Unreachable
 from servod.common.units import NS_PER_S
+from servod.formats.protocol import MAX_LINE_BYTES, encode_line
 from servod.runtime.daemon.peer import Peer, peer_of
 
 _READ_BYTES = 65_536

@@ -19,13 +19,12 @@ import stat
 from pathlib import Path
 from typing import Any, Protocol
 
-from servod.client.control import READING, Verb, decode_line, encode_line
 from servod.common.errors import BadInput, ServodError, Unreachable
 from servod.formats.config import ControlConfig
+from servod.formats.protocol import READING, Verb, decode_line, encode_line
 from servod.runtime.daemon.connection import Connection, Reply
-from servod.runtime.daemon.lease import STOPPING, Lease
+from servod.runtime.daemon.lease import STOPPING, Lease, Places
 from servod.runtime.daemon.peer import group_id, may_command, peer_of
-from servod.runtime.daemon.places import Places
 from servod.runtime.daemon.status import LeaseStatus
 
 log = logging.getLogger("servod.control")

@@ -15,7 +15,8 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Histo
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
-from servod.common.errors import FAULTS, BadInput, FaultCode
+from servod.common.errors import BadInput
+from servod.common.faults import FAULTS, FaultCode
 from servod.formats.config import MetricsConfig
 from servod.formats.recording.record import CycleRecord
 from servod.runtime.fieldbus.devices import DriveState

@@ -8,7 +8,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 
-from servod.common.errors import FaultCode, ServodError, Unreachable
+from servod.common.errors import ServodError, Unreachable
+from servod.common.faults import FaultCode
 from servod.runtime.daemon.status import NodeStatus
 from servod.runtime.fieldbus.cia import CW_DISABLE_VOLTAGE, NmtCommand, NmtState, Obj402
 from servod.runtime.fieldbus.master import BringUp, Master

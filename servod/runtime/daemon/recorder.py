@@ -7,20 +7,121 @@ dropped, counted and reported as RECORDER_FAILED.
 
 from __future__ import annotations
 
+import contextlib
 import queue
+import re
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
+from datetime import datetime
 from pathlib import Path
 from typing import Any, TypedDict, TypeVar
 
-from servod.common.errors import ServodError, Unreachable
+from servod.common.errors import BadInput, ServodError, Unreachable
 from servod.formats.config import RecorderConfig
 from servod.formats.recording.mcap_writer import McapFile, split_rows, wall_offset_ns
-from servod.runtime.daemon.recorder_files import RecordingFiles
-from servod.runtime.daemon.recorder_history import HistoryRing
+from servod.formats.recording.record import RECORD
+
+# Where recordings stand and how many of them: names, rotation, and how many fault files are kept.
+#
+# Below the recorder, in its writing thread, so that a slow disk holds up nobody.
+
+
+MIB = 1024 * 1024
+#: Names are shown in logs, on terminals and on pages: nothing in them may act there, or look like an option.
+_FILE_NAME = re.compile(r"\w[\w .,+()-]{0,200}\.mcap")
+_STAMP = "%Y%m%d-%H%M%S"
+
+
+class RecordingFiles:
+    """The recordings' directory of one axis."""
+
+    def __init__(self, config: RecorderConfig, axis_name: str) -> None:
+        self._directory, self._axis_name = config.directory, axis_name
+        self._max_fault_files = config.max_fault_files
+        self._fault_name = re.compile(rf"{re.escape(axis_name)}-fault-\d{{8}}-\d{{6}}-\w+(-\d+)?\.mcap")
+        self.max_bytes = config.max_file_mib * MIB
+
+    def recording(self, name: str | None) -> Path:
+        """A path in the directory, and nowhere else: clients must not write where they please. Raises BadInput."""
+        if name is None:
+            return self._unused(f"{self._axis_name}-{_now()}")
+        path = (self._directory / name).resolve()
+        if path.parent != self._directory.resolve() or not _FILE_NAME.fullmatch(path.name):
+            allowed = "a file name of letters, digits, spaces and any of . , + ( ) - that ends in .mcap, in"
+            raise BadInput("record_start: path", repr(name), f"{allowed} {self._directory}")
+        return path
+
+    def next_part(self, first: Path) -> Path:
+        """Where a recording goes on that began in `first` and is full: the same name with a number."""
+        return self._unused(first.stem)
+
+    def fault(self, label: str) -> Path:
+        """A new path for the seconds before a fault."""
+        return self._unused(f"{self._axis_name}-fault-{_now()}-{label}")
+
+    def drop_old_fault_files(self) -> None:
+        """Remove the oldest fault files beyond recorder.max_fault_files; whoever wants one for good copies it."""
+        found = [path for path in self._directory.glob("*.mcap") if self._fault_name.fullmatch(path.name)]
+        found.sort(key=lambda path: path.stat().st_mtime_ns)
+        for path in found[: -self._max_fault_files]:
+            with contextlib.suppress(OSError):
+                path.unlink()
+
+    def _unused(self, stem: str) -> Path:
+        path, number = self._directory / f"{stem}.mcap", 1
+        while path.exists():
+            number += 1
+            path = self._directory / f"{stem}-{number}.mcap"
+        return path
+
+
+def _now() -> str:
+    return datetime.now().astimezone().strftime(_STAMP)
+
+
+# The last seconds of cycle records in a ring of fixed memory, so that a fault's recording starts before the fault.
+#
+# Filled by the supervisor, read when a fault file is written.
+
+
+class HistoryRing:
+    """The newest `capacity` packed records; all memory is taken at the start and never grows."""
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+        self._data = bytearray(b"\xff") * (
+            capacity * RECORD.size
+        )  # written, so that the pages are resident from now on
+        self._next = 0
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    def add(self, rows: Iterable[bytes]) -> None:
+        """Add records, oldest first; the oldest in the ring make room."""
+        if self.capacity == 0:
+            return
+        size, data, capacity, at, count = RECORD.size, self._data, self.capacity, self._next, self._count
+        for row in rows:
+            data[at * size : (at + 1) * size] = row
+            at += 1
+            count += 1
+            if at == capacity:
+                at = 0
+        self._next, self._count = at, min(count, capacity)
+
+    def snapshot(self) -> bytes:
+        """A copy of all records, oldest first."""
+        size = RECORD.size
+        if self._count < self.capacity:
+            return bytes(self._data[: self._count * size])
+        cut = self._next * size
+        return bytes(self._data[cut:]) + bytes(self._data[:cut])
+
 
 T = TypeVar("T")
 

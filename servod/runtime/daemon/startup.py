@@ -14,7 +14,8 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from servod.common.clock import WallClock
-from servod.common.errors import FaultCode, ServodError
+from servod.common.errors import ServodError
+from servod.common.faults import FaultCode
 from servod.common.yaml import read_text
 from servod.formats.config import AxisConfig, load_config
 from servod.formats.gains.gain_set import load_gains, require_fit

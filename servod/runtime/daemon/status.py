@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import Any, TypedDict
 
-from servod.common.errors import Fault, faults_in
+from servod.common.faults import Fault, faults_in
 from servod.formats.config import BusConfig
 from servod.formats.recording.record import CycleRecord
 from servod.runtime.daemon.recorder import RecorderState

@@ -13,18 +13,18 @@ from concurrent.futures import Future
 from typing import Any
 
 from servod import __version__
-from servod.common.errors import FAULTS, FaultCode, Unreachable
+from servod.common.errors import Unreachable
+from servod.common.faults import FAULTS, FaultCode
 from servod.common.units import NS_PER_S
 from servod.formats.config import AxisConfig
 from servod.formats.recording.record import RECORD, CycleRecord
 from servod.runtime.daemon.control_server import ControlServer
-from servod.runtime.daemon.fault_watch import FaultWatch
+from servod.runtime.daemon.fault_watch import FaultWatch, ProofWatch
 from servod.runtime.daemon.gain_bank import GainBank
 from servod.runtime.daemon.health import Health, Pulse
 from servod.runtime.daemon.metrics import AxisMetrics, MetricsServer
 from servod.runtime.daemon.nodes import FaultRelay, Nodes
 from servod.runtime.daemon.notify import Notifier
-from servod.runtime.daemon.proof_watch import ProofWatch
 from servod.runtime.daemon.recorder import Recorder
 from servod.runtime.daemon.status import Status, axis_status, bus_status, drive_status, fault_status, motion_status
 from servod.runtime.daemon.verbs import Verbs

@@ -10,9 +10,9 @@ from array import array
 from collections.abc import Sequence
 from itertools import pairwise
 
-from servod.client.control import SampleKey
 from servod.common.errors import BadInput, Unreachable
 from servod.formats.config import AxisConfig
+from servod.formats.protocol import SampleKey
 from servod.formats.recording.record import CycleRecord
 from servod.runtime.loop.channel import TRAJECTORY_SAMPLES
 from servod.runtime.loop.commands import REFUSAL_TEXT, Refusal

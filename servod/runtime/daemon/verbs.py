@@ -13,11 +13,12 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from typing import Any
 
-from servod.client.control import Verb
 from servod.common.clock import WallClock
-from servod.common.errors import FAULTS, AnswerIsNo, FaultCode, Unreachable, faults_in
+from servod.common.errors import AnswerIsNo, Unreachable
+from servod.common.faults import FAULTS, FaultCode, faults_in
 from servod.common.units import NS_PER_S
 from servod.formats.config import AxisConfig
+from servod.formats.protocol import Verb
 from servod.formats.recording.record import CycleRecord
 from servod.runtime.daemon.arguments import (
     EnableArgs,

@@ -1,7 +1,7 @@
 """The axis: from what is wanted and what the drive says to a goal for the drive and a share of torque, each cycle.
 
 Stands between drivers and controller on the data path. It enables only on an explicit request, turns each fault into
-its reaction (servod.common.errors.FAULTS), and brings the axis to rest by one of three ways: braking the reference
+its reaction (servod.common.faults.FAULTS), and brings the axis to rest by one of three ways: braking the reference
 and then
 ramping the torque down (DISABLE, SHUTDOWN, a lost supervisor), the drive's quick stop, or voltage off at once.
 """
@@ -11,7 +11,7 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import NamedTuple
 
-from servod.common.errors import FAULTS, NEEDS_RESTART, FaultCode, Reaction
+from servod.common.faults import FAULTS, NEEDS_RESTART, FaultCode, Reaction
 from servod.runtime.fieldbus.devices import AmplifierFeedback, DriveState, Goal, Mode, Reason
 from servod.runtime.loop.commands import Refusal
 

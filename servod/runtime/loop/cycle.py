@@ -12,11 +12,12 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
 
 from servod.common.clock import Clock
-from servod.common.errors import FAULTS, FaultCode
+from servod.common.faults import FAULTS, FaultCode
 from servod.common.units import NS_PER_S, NS_PER_US
-from servod.drivers import load_driver
+from servod.kernels.motions import Samples
 from servod.runtime.fieldbus.bus import Bus
 from servod.runtime.fieldbus.devices import AmplifierCommand, AmplifierFeedback, DriveState, EncoderFeedback, Goal, Mode
+from servod.runtime.fieldbus.registry import load_driver
 from servod.runtime.loop.axis import Axis, AxisOutput, AxisState
 from servod.runtime.loop.commands import Command
 from servod.runtime.loop.controller import Controller
@@ -24,7 +25,7 @@ from servod.runtime.loop.exchange import Exchange
 from servod.runtime.loop.limits import Limits
 from servod.runtime.loop.orders import carry_out
 from servod.runtime.loop.plan import LoopPlan
-from servod.runtime.loop.references import Reference, Samples
+from servod.runtime.loop.references import Reference
 from servod.runtime.loop.wiring.checks import proof_bounds
 from servod.runtime.loop.wiring.findings import Proof
 from servod.runtime.loop.wiring.test import WiringProof

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from servod.common.clock import Clock
-from servod.common.errors import FAULTS, FaultCode
+from servod.common.faults import FAULTS, FaultCode
 from servod.common.units import NS_PER_S
 from servod.runtime.fieldbus.bus import Bus
 from servod.runtime.fieldbus.cia import HEARTBEAT_BASE, NMT_ID, SYNC_ID, NmtCommand, NmtState

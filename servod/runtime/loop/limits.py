@@ -2,14 +2,14 @@
 
 One call per cycle, after the controller and before the driver. Finite numbers are checked before anything is clamped,
 because min() and max() turn NaN into a limit value. What each fault does to the axis stands in
-servod.common.errors.FAULTS.
+servod.common.faults.FAULTS.
 """
 
 from __future__ import annotations
 
 import math
 
-from servod.common.errors import FAULTS, FaultCode
+from servod.common.faults import FAULTS, FaultCode
 from servod.formats.config import LimitsConfig
 from servod.runtime.fieldbus.devices import AmplifierFeedback, EncoderFeedback
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from servod.common.errors import FAULTS, FaultCode
+from servod.common.faults import FAULTS, FaultCode
 from servod.common.units import NS_PER_S
 from servod.runtime.loop.axis import AxisState
 from servod.runtime.loop.commands import Command, Op, Refusal

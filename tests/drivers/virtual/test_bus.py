@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from servod.drivers.virtual.bit_time import arbitration_key, frame_bits
 from servod.drivers.virtual.bus_faults import BusFault, FaultKind
-from servod.drivers.virtual.hub import Hub
+from servod.drivers.virtual.hub import Hub, arbitration_key, frame_bits
 from servod.drivers.virtual.port import ErrorState, Port
 from servod.drivers.virtual.timeline import Timeline
 from servod.runtime.fieldbus.bus import CAN_EFF_FLAG, CAN_RTR_FLAG

@@ -24,7 +24,7 @@ from servod.common.shipped import shipped
 from servod.drivers.virtual.bus_faults import BusFault, FaultKind
 from servod.drivers.virtual.client import VirtualBus
 from servod.drivers.virtual.drive_record import DriveRecord, read_drive_record
-from servod.drivers.virtual.on_can import CanServer
+from servod.drivers.virtual.main import CanServer
 from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.formats.model.axis_model import load_axis_model
 from servod.runtime.fieldbus.bus.socketcan import SocketCanBus

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from servod.drivers.virtual.torque_limits import THERMAL_RESERVE_S, TorqueLimits
+from servod.drivers.virtual.motion import THERMAL_RESERVE_S, TorqueLimits
 from servod.runtime.fieldbus.cia import SW_FOLLOWS_COMMAND, SW_INTERNAL_LIMIT, SW_TARGET_REACHED, Obj402
 from servod.runtime.fieldbus.devices import DriveState
 from tests.drivers.virtual.bench import AMPLIFIER, Bench

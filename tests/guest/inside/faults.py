@@ -27,14 +27,14 @@ from inside.tools import (
     status,
     wait_for,
 )
-from servod.client.control import Verb
 from servod.common.errors import ServodError
 from servod.drivers.virtual.drive_record import DriveSample, read_drive_record
-from servod.qualify.faults.catalogue import shipped_scenarios
+from servod.formats.protocol import Verb
 from servod.qualify.faults.machine import Machine, Process
 from servod.qualify.faults.processes import ProcessAxis
 from servod.qualify.faults.run import run_scenario
 from servod.qualify.faults.scenario import Runs, Scenario
+from servod.qualify.faults.variants import shipped_scenarios
 from servod.qualify.faults.wire import CanWire
 
 #: The longest that a daemon may take to come back by itself or by hand.

@@ -177,7 +177,7 @@ def how_it_stopped(since_ns: int) -> dict[str, Any]:
 
 def loop_killed() -> dict[str, Any]:
     """kill -9 of the loop: fault, cause and remedy in the journal at level error, the seconds before it in a file."""
-    from servod.common.errors import FAULTS, FaultCode
+    from servod.common.faults import FAULTS, FaultCode
 
     result = recover(lambda: os.kill(int(status()["loop"]["pid"]), signal.SIGKILL))
     files = list(Path("/var/lib/servod/guest/recordings").glob("*LOOP_LOST*.mcap"))

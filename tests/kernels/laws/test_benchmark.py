@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from servod.kernels.laws import LAWS, local
-from servod.qualify.bench.benchmark import PARAMETERS, controller_benchmark
+from servod.qualify.bench.tick import PARAMETERS, controller_benchmark
 
 
 def test_times_every_law() -> None:

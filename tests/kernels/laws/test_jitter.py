@@ -10,9 +10,9 @@ import pytest
 
 from servod.formats.gains.gain_set import load_gains
 from servod.formats.model.axis_model import load_axis_model
+from servod.kernels.motions import paper
 from servod.kernels.physics.plant import Plant
 from servod.runtime.loop.controller import Controller
-from servod.runtime.loop.references import paper
 
 GAINS = Path(__file__).resolve().parents[3] / "gains"
 PERIOD_S, JITTER_S, COUNT_RAD, CUTOFF_HZ = 0.001, 1e-4, 2.0 * math.pi / 2**20, 120.0

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from servod.formats.gains.gain_set import load_gains
 from servod.formats.model.axis_model import AxisModel, load_axis_model
+from servod.kernels.motions import paper
 from servod.lab.simulate.simulate import ClosedLoopRun, LoopSettings, simulate_closed_loop
-from servod.runtime.loop.references import paper
 
 GAINS = Path(__file__).resolve().parents[3] / "gains"
 SETTINGS = LoopSettings(torque_limit_nm=0.5)

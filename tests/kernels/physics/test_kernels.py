@@ -15,8 +15,7 @@ from servod.formats.model.axis_model import AxisModel
 from servod.kernels.laws import LAWS
 from servod.kernels.physics.compiled import bound
 from servod.kernels.physics.plant import Plant
-from servod.lab.simulate.closed_loop import run
-from servod.lab.simulate.simulate import LoopSettings, simulate_closed_loop
+from servod.lab.simulate.simulate import LoopSettings, run, simulate_closed_loop
 from tests.kernels.physics.models import LUGRE, joint, plant
 
 EVERYTHING: dict[str, Any] = {

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from servod.client.commission_axis import VirtualWalkAxis
-from servod.client.deploy_virtual import pd_set
+from servod.client.open import VirtualWalkAxis
+from servod.client.virtual import pd_set
 from servod.lab.commission.comparison import measured, run_files
-from servod.lab.commission.files import read_json, write_json, write_text
+from servod.lab.commission.state import read_walk_json as read_json
+from servod.lab.commission.state import write_json, write_text
 from servod.lab.commission.walk import Options
 from servod.lab.tune.plan import TunePlan
 from servod.lab.tune.trial import noise_seeds
-from servod.qualify.paper.rivals import SCORING_SEED_OFFSET
+from servod.qualify.paper.experiments import SCORING_SEED_OFFSET
 from tests.lab.commission.test_state import walk
 from tests.lab.synthesize.designs import table1
 

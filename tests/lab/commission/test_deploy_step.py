@@ -10,18 +10,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from servod.client.commission_axis import VirtualWalkAxis
-from servod.client.links import DeployLink, Rows, Tell
+from servod.client.open import VirtualWalkAxis
+from servod.client.stepped import DeployLink, Rows, Tell
 from servod.formats.config import AxisConfig
 from servod.formats.gains.gain_set import GainSet, Promise, parse_gains
 from servod.formats.gains.store import GainStore
 from servod.formats.model.axis_model import axis_model_yaml
-from servod.lab.commission.files import AFTER_ROWS, BEFORE, BEFORE_ROWS, DEPLOYMENT, GAINS, MODEL, read_json, write_text
+from servod.lab.commission.comparison import load_rows
 from servod.lab.commission.report import sections
-from servod.lab.commission.runs import load_rows
+from servod.lab.commission.state import AFTER_ROWS, BEFORE, BEFORE_ROWS, DEPLOYMENT, GAINS, MODEL, write_text
+from servod.lab.commission.state import read_walk_json as read_json
 from servod.lab.commission.steps.deploy import Deploy, remembered
 from servod.lab.commission.walk import run
-from servod.lab.recordings.rows import ROW
+from servod.lab.recordings.recording import ROW
 from servod.lab.report.figure import Table
 from servod.lab.verify.validation import STEP_S, Array, ValidationMotion
 from tests.formats.gains import good

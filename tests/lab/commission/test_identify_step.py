@@ -10,9 +10,10 @@ from typing import Any
 
 import pytest
 
-from servod.client.axis import Link, SteppedLink
-from servod.client.commission_axis import VirtualWalkAxis
-from servod.lab.commission.files import RECORDINGS
+from servod.client.axis import Link
+from servod.client.open import VirtualWalkAxis
+from servod.client.stepped import SteppedLink
+from servod.lab.commission.state import RECORDINGS
 from servod.lab.commission.steps.identify import Identify
 from servod.lab.commission.walk import run
 from servod.lab.identify.store import load

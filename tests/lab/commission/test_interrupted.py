@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from servod.client.commission_axis import VirtualWalkAxis
-from servod.lab.commission import result
-from servod.lab.commission.files import (
+from servod.client.open import VirtualWalkAxis
+from servod.lab.commission import report
+from servod.lab.commission.state import (
     AFTER_ROWS,
     BEFORE_ROWS,
     CERTIFICATE,
@@ -24,11 +24,10 @@ from servod.lab.commission.files import (
     REPORT,
     TRACKING,
     TUNING,
+    file_sha256,
 )
-from servod.lab.commission.questions import Questions
-from servod.lab.commission.state import file_sha256
 from servod.lab.commission.steps import STEPS, rivals, validate
-from servod.lab.commission.walk import Options, Step, Tell, Walk, run
+from servod.lab.commission.walk import Options, Questions, Step, Tell, Walk, run
 from tests.lab.synthesize.designs import table1
 
 AXIS = VirtualWalkAxis(table1(), seed=1)
@@ -69,12 +68,12 @@ def test_cut_in_every_step_the_walk_ends_in_the_same_place(tmp_path: Path) -> No
     whole = walk_in(tmp_path / "whole", told)
     run(whole, STEPS[:1])
     shutil.copytree(whole.folder, tmp_path / "cut")
-    document = result.result(whole, run(whole, STEPS))
+    document = report.result(whole, run(whole, STEPS))
     assert [line.partition(":")[0] for line in told if line.endswith(" s")] == [step.title for step in STEPS]
     for step in STEPS[1:]:
         cut_off(tmp_path / "cut", step)
     again = walk_in(tmp_path / "cut", told)
-    taken_up = result.result(again, run(again, STEPS))
+    taken_up = report.result(again, run(again, STEPS))
     assert told[-len(STEPS) : -1] == [f"{step.title}: done before" for step in STEPS[:-1]]
     assert answers(again.folder) == answers(whole.folder)
     assert without_times(taken_up) == without_times(document)

@@ -8,8 +8,7 @@ import pytest
 
 from servod.common.errors import BadInput
 from servod.lab.commission.comparison import DEPLOYED, run_files
-from servod.lab.commission.files import TRACKING, TUNING, write_text
-from servod.lab.commission.state import State
+from servod.lab.commission.state import TRACKING, TUNING, State, write_text
 from servod.lab.commission.steps.rivals import Rivals, contenders, rival_file
 from servod.lab.commission.steps.validate import Validate
 from servod.lab.commission.walk import Step, Walk

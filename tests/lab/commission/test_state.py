@@ -12,12 +12,10 @@ from typing import Any
 
 import pytest
 
-from servod.client.commission_axis import VirtualWalkAxis
+from servod.client.open import VirtualWalkAxis
 from servod.common.errors import AnswerIsNo, BadInput, Unreachable
-from servod.lab.commission.files import write_text
-from servod.lab.commission.questions import Questions
-from servod.lab.commission.state import State, sole_walk
-from servod.lab.commission.walk import Options, Tell, Walk, run
+from servod.lab.commission.state import State, sole_walk, write_text
+from servod.lab.commission.walk import Options, Questions, Tell, Walk, run
 from tests.lab.synthesize.designs import table1
 
 AXIS = VirtualWalkAxis(table1(), seed=1)

@@ -10,11 +10,13 @@ from typing import Any
 
 import pytest
 
-from servod.client.commission_axis import VirtualWalkAxis
+from servod.client.open import VirtualWalkAxis
 from servod.common.errors import AnswerIsNo
 from servod.formats.gains.gain_set import load_gains
 from servod.formats.model.axis_model import axis_model_yaml
-from servod.lab.commission.files import (
+from servod.lab.commission.comparison import load_curves, load_rows, save_curves
+from servod.lab.commission.report import failure, sections
+from servod.lab.commission.state import (
     DEPLOYMENT,
     GAINS,
     MODEL,
@@ -22,25 +24,21 @@ from servod.lab.commission.files import (
     RUNS,
     TRACKING,
     TUNING,
-    read_json,
+    file_sha256,
     write_json,
     write_text,
 )
-from servod.lab.commission.questions import Questions
-from servod.lab.commission.report import sections
-from servod.lab.commission.result import failure
-from servod.lab.commission.runs import load_curves, load_rows, save_curves
-from servod.lab.commission.state import file_sha256
+from servod.lab.commission.state import read_walk_json as read_json
 from servod.lab.commission.steps.deploy import Deploy
 from servod.lab.commission.steps.synthesize import Synthesize, agreed, relaxed, tell_clashes
 from servod.lab.commission.steps.validate import document as comparison
 from servod.lab.commission.steps.verify import Verify
-from servod.lab.commission.walk import Options, Step, StepFailed, Tell, Walk, run
+from servod.lab.commission.walk import Options, Questions, Step, StepFailed, Tell, Walk, run
 from servod.lab.deploy.deployment import announced
 from servod.lab.report.figure import Figure, Table
 from servod.lab.synthesize.deployed import Wishes
 from servod.lab.synthesize.infeasible import Infeasible, Relaxation
-from servod.lab.tracking import simulated
+from servod.lab.tracking import metrics
 from tests.lab.synthesize.designs import table1
 
 AXIS = VirtualWalkAxis(table1(), seed=1)
@@ -170,7 +168,7 @@ def test_curves_come_back_from_disk_and_stand_on_the_page(folder: Path) -> None:
     gains = load_gains(folder / GAINS)
     assert gains.design is not None
     cutoff_hz = gains.design.velocity_cutoff_hz
-    run_of = simulated.measure(table1(), gains, counts_per_turn=2.0**20, cutoff_hz=cutoff_hz, seed=7)
+    run_of = metrics.measure(table1(), gains, counts_per_turn=2.0**20, cutoff_hz=cutoff_hz, seed=7)
     save_curves(folder / RUNS / "deployed.npz", run_of.curves)
     save_curves(folder / RUNS / "free_local.npz", run_of.curves)
     again = load_curves(folder / RUNS / "deployed.npz")

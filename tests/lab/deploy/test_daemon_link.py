@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from servod.client.control import ControlClient
-from servod.client.deploy_daemon import DaemonDeployLink
-from servod.client.deploy_virtual import pd_set
+from servod.client.under_daemon import DaemonDeployLink
+from servod.client.virtual import pd_set
 from servod.common.errors import AnswerIsNo
 from servod.common.shipped import shipped
 from servod.formats.gains.gain_set import load_gains
 from servod.formats.gains.store import Action, GainStore
-from servod.lab.deploy.cycles import motions_in
+from servod.lab.deploy.judge import motions_in
 from servod.lab.verify.validation import Array, ValidationMotion
 from tests.runtime.daemon.running import running, wait_for
 

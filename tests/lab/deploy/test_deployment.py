@@ -7,15 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from servod.client.deploy_virtual import pd_set, virtual_link, with_cutoff
-from servod.client.links import Rows, SteppedDeployLink, Tell, cut
-from servod.common.errors import FAULTS, BadInput, FaultCode
+from servod.client.stepped import Rows, SteppedDeployLink, Tell, cut
+from servod.client.virtual import pd_set, virtual_link, with_cutoff
+from servod.common.errors import BadInput
+from servod.common.faults import FAULTS, FaultCode
 from servod.formats.gains.store import Action, GainStore
 from servod.formats.model.axis_model import AxisModel
-from servod.lab.deploy.cycles import limits_met, motions_in
 from servod.lab.deploy.deployment import deploy
+from servod.lab.deploy.judge import limits_met, motions_in
 from servod.lab.deploy.outcome import Before, Ending
-from servod.lab.recordings.rows import ROW
+from servod.lab.recordings.recording import ROW
 from servod.lab.verify.plants import scaled
 from servod.lab.verify.validation import ValidationMotion, motion_for
 from servod.runtime.loop.axis import AxisState

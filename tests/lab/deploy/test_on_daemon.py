@@ -9,19 +9,19 @@ from pathlib import Path
 
 import pytest
 
-from servod.client.commission_axis import DaemonWalkAxis
 from servod.client.control import ControlClient
-from servod.client.links import DeployLink, Rows
+from servod.client.open import DaemonWalkAxis
+from servod.client.stepped import DeployLink, Rows
 from servod.common.shipped import shipped
 from servod.formats.config import load_config
 from servod.formats.gains.gain_set import GainSet
 from servod.formats.gains.store import Action, GainStore
 from servod.formats.model.axis_model import axis_model_yaml
-from servod.lab.deploy.cycles import motions_in
 from servod.lab.deploy.deployment import deploy
+from servod.lab.deploy.judge import motions_in
 from servod.lab.deploy.outcome import Deployment
 from servod.lab.verify import validation
-from servod.lab.verify.promise import promise
+from servod.lab.verify.validation import promise
 from tests.lab.deploy.sets import certified
 from tests.lab.synthesize.designs import table1
 from tests.runtime.daemon.running import at_rest, running, wait_for
@@ -32,7 +32,7 @@ pytestmark = pytest.mark.serial
 TRIES = """
 import sys
 from servod.client.control import ControlClient
-from servod.client.deploy_daemon import DaemonDeployLink
+from servod.client.under_daemon import DaemonDeployLink
 from servod.formats.gains.gain_set import load_gains
 
 link = DaemonDeployLink(ControlClient(sys.argv[1]))

@@ -16,10 +16,9 @@ from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.candidates import Candidate
 from servod.lab.diagnose.select.choice import Choice, Entry
 from servod.lab.diagnose.select.choose import Chooser
-from servod.lab.diagnose.select.detail import take_first
+from servod.lab.diagnose.select.detail import swapped, take_first
 from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.select.merit import Merit
-from servod.lab.diagnose.select.swap import swapped
 from tests.lab.diagnose.axes import believed, record
 
 #: What a term is said to be worth before anybody has looked.

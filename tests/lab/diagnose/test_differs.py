@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from servod.lab.diagnose.document import differs
 from servod.lab.diagnose.effects.base import base_unknowns
 from servod.lab.diagnose.judge.spread import within
-from servod.lab.diagnose.recalibrated import differs
 from tests.lab.diagnose.axes import believed
 
 

@@ -12,8 +12,17 @@ from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.disturbance import EVERY
 from servod.lab.diagnose.effects.hypothesis import Term
 from servod.lab.diagnose.effects.scene import Scene
-from servod.lab.diagnose.judge.held_out import RECORDING, STRETCH, TAIL_S, Fold, held_out, once, split
-from servod.lab.diagnose.judge.windows import foretold, window_errors
+from servod.lab.diagnose.judge.held_out import (
+    RECORDING,
+    STRETCH,
+    TAIL_S,
+    Fold,
+    foretold,
+    held_out,
+    once,
+    split,
+    window_errors,
+)
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.fit import Fit, Fitter, Weighing
 from servod.lab.simulate.replay import replay

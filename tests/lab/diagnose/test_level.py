@@ -12,7 +12,7 @@ from servod.lab.diagnose.effects.hypothesis import Document, Hypothesis
 from servod.lab.diagnose.effects.scene import Scene
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.fit import Fit
-from servod.lab.diagnose.select.level import is_level, on_bound
+from servod.lab.diagnose.select.merit import is_level, on_bound
 from tests.lab.diagnose.axes import believed, record
 
 

@@ -17,8 +17,7 @@ from servod.lab.diagnose.engine import diagnose
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.choice import Choice
 from servod.lab.diagnose.select.choose import Chooser
-from servod.lab.diagnose.select.detail import LEAST_TORQUE
-from servod.lab.diagnose.select.slow import slow
+from servod.lab.diagnose.select.detail import LEAST_TORQUE, slow
 from tests.lab.diagnose.axes import believed, record
 
 

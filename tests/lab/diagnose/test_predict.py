@@ -17,7 +17,7 @@ from servod.lab.diagnose.effects.scene import Scene
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.choose import Chooser
 from servod.lab.simulate.simulate import LoopSettings, simulate_closed_loop
-from servod.lab.tracking.motions import paper_rows
+from servod.lab.tracking.metrics import paper_rows
 from tests.lab.diagnose.axes import believed, record, recording
 
 #: A weight that pulls nearly the same way wherever the joint stands.

@@ -15,10 +15,10 @@ from servod.formats.model.axis_model import AxisKind, axis_model_yaml, load_axis
 from servod.lab.diagnose.data.intake import taken_in
 from servod.lab.diagnose.engine import diagnose
 from servod.lab.diagnose.judge.locate import maps
+from servod.lab.diagnose.predict.coordinates import LOOKS, where
 from servod.lab.diagnose.predict.predict import Predictor
-from servod.lab.diagnose.predict.signature import LOOKS, where
 from servod.lab.recordings import Quantity, Recording
-from servod.lab.report.diagnosis_files import write_files
+from servod.lab.report.diagnosis import write_files
 from tests.lab.diagnose.axes import BELIEVED, believed, record, recording, write_csv
 
 #: Keys of the outside contract.

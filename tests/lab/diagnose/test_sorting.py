@@ -14,8 +14,9 @@ from servod.lab.diagnose.document import minor
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.hypothesis import Term
 from servod.lab.diagnose.effects.scene import Scene
-from servod.lab.diagnose.engine import Evidence, proved
-from servod.lab.diagnose.judge.sorting import Kept, sorted_out, told_from_none
+from servod.lab.diagnose.engine import proved
+from servod.lab.diagnose.judge.evidence import Evidence, Kept
+from servod.lab.diagnose.judge.sorting import sorted_out, told_from_none
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.choice import Choice, Entry
 from servod.lab.diagnose.select.choose import Chooser

@@ -17,10 +17,9 @@ from servod.lab.diagnose.effects.hypothesis import Hypothesis
 from servod.lab.diagnose.effects.scene import Peak, Scene
 from servod.lab.diagnose.judge.verdict import Shares, Verdict, alternatives, named_terms, verdict
 from servod.lab.diagnose.predict.predict import Predictor
-from servod.lab.diagnose.select.at_end import at_end
 from servod.lab.diagnose.select.choice import Choice, Entry
 from servod.lab.diagnose.select.fit import Fit
-from servod.lab.diagnose.select.merit import LEAST_TORQUE, Merit, acting, worth_naming
+from servod.lab.diagnose.select.merit import LEAST_TORQUE, Merit, acting, at_end, worth_naming
 from tests.lab.diagnose.axes import believed, record
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import pytest
 
-from servod.client.axis import SteppedLink
+from servod.client.stepped import SteppedLink
 from servod.client.virtual import virtual_session
 from servod.lab.identify.analysis import Analysis
 from servod.lab.identify.walk import identify

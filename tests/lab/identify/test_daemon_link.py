@@ -11,7 +11,7 @@ import pytest
 
 from servod.cli.app import run
 from servod.client.control import ControlClient
-from servod.client.daemon_link import DaemonLink
+from servod.client.under_daemon import DaemonLink
 from servod.common.errors import BadInput
 from servod.formats.config import load_config
 from servod.formats.gains.store import GainStore

@@ -9,18 +9,16 @@ from servod.common.errors import AnswerIsNo
 from servod.common.yaml import validate
 from servod.formats.model.axis_model import AxisModel
 from servod.kernels.physics.plant import Plant
-from servod.lab.identify.estimate import Estimate, estimate, jackknife, sandwich
+from servod.lab.identify.estimate import AT_END, Estimate, at_ends, estimate, jackknife, sandwich
 from servod.lab.identify.fits import bristle, cogging, curve, elastic, noise, presliding, response
 from servod.lab.identify.fits.break_away import BreakAwayFit
-from servod.lab.identify.fits.bristle_lag import Bristle, dry_columns, follow
+from servod.lab.identify.fits.bristle import Bristle, dry_columns, follow
 from servod.lab.identify.fits.elastic import Elastic
 from servod.lab.identify.fits.friction_map import Side
 from servod.lab.identify.fits.presliding import bend_factor, fundamental
-from servod.lab.identify.fits.rigid import Rigid, response_of
-from servod.lab.identify.ranges import AT_END, at_ends
+from servod.lab.identify.fits.strokes import Rigid, response_of
 from servod.lab.identify.shapes import multisine
-from servod.lab.identify.signals import acting_torque, smooth
-from servod.lab.identify.trace import Kind, Trace
+from servod.lab.identify.trace import Kind, Trace, acting_torque, smooth
 
 PERIOD_S = 1e-3
 

@@ -8,7 +8,7 @@ import shutil
 import numpy as np
 import pytest
 
-from servod.client.axis import SteppedLink
+from servod.client.stepped import SteppedLink
 from servod.client.virtual import virtual_session
 from servod.common.errors import AnswerIsNo, BadInput
 from servod.lab.identify import store

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from servod.client.axis import SteppedLink
+from servod.client.stepped import SteppedLink
 from servod.client.virtual import virtual_session
 from servod.common.errors import AnswerIsNo
 from servod.common.yaml import parse_yaml, validate

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from servod.cli.app import run
-from servod.client.axis import SteppedLink
+from servod.client.stepped import SteppedLink
 from servod.client.virtual import rated_torque_mnm, virtual_config, virtual_session
 from servod.common.errors import AnswerIsNo, BadInput
 from servod.drivers.virtual.settings import VirtualAxisSettings

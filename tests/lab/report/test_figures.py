@@ -18,7 +18,8 @@ from servod.lab.identify.fits.presliding import PreslidingFit
 from servod.lab.identify.fits.response import ResponseFit
 from servod.lab.report.figure import Figure, Style
 from servod.lab.report.figures.friction import dahl_curve, friction_map
-from servod.lab.report.figures.loop import bode
+from servod.lab.report.figures.loop import bode, certificate_table, observations_table
+from servod.lab.report.figures.loop import measured_response as frequency_response
 from servod.lab.report.figures.motion import (
     Motion,
     before_after,
@@ -29,8 +30,6 @@ from servod.lab.report.figures.motion import (
     tracking,
     tracking_grid,
 )
-from servod.lab.report.figures.proof import certificate_table, observations_table
-from servod.lab.report.figures.response import frequency_response
 from servod.lab.report.figures.sets import (
     local_friction,
     local_law,

@@ -15,10 +15,9 @@ from servod.common.yaml import parse_yaml
 from servod.formats.model.axis_model import AxisModel
 from servod.kernels.physics.effects import encoder_position
 from servod.kernels.physics.plant import Plant
-from servod.lab.simulate.motion import smoothed_motion
+from servod.lab.simulate.motion import Start, first_row, smoothed_motion
 from servod.lab.simulate.open_loop import recorded_motion
 from servod.lab.simulate.replay import Drive, replay, window_starts
-from servod.lab.simulate.start import Start, first_row
 from tests.kernels.physics.models import joint
 from tests.lab.simulate.slide import SLIDE, set_off
 

@@ -15,8 +15,8 @@ import pytest
 from servod.common.yaml import parse_yaml
 from servod.formats.model.axis_model import AxisModel, load_axis_model
 from servod.lab.recordings import load_recording
+from servod.lab.simulate.motion import Start
 from servod.lab.simulate.replay import replay
-from servod.lab.simulate.start import Start
 
 SHARED = Path(__file__).parents[4] / "shared"
 EMPS_FOLDER = SHARED / "recordings" / "emps"

@@ -11,6 +11,7 @@ from servod.formats.gains.design import Uncertainty
 from servod.formats.gains.gain_set import GainSet, parse_gains
 from servod.formats.gains.parameters import LocalParameters
 from servod.formats.model.axis_model import LugreFriction
+from servod.kernels.motions import paper
 from servod.lab.simulate.simulate import LoopSettings, simulate_closed_loop
 from servod.lab.synthesize import deployed, infeasible
 from servod.lab.synthesize.deployed import Wishes
@@ -21,7 +22,6 @@ from servod.lab.verify.margins import Sweep
 from servod.lab.verify.proof import closed, region_margin
 from servod.lab.verify.sampled import Timing
 from servod.lab.verify.steady_friction import steady_friction
-from servod.runtime.loop.references import paper
 from tests.lab.synthesize.designs import table1, table1_set
 
 

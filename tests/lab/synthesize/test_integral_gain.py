@@ -10,15 +10,15 @@ import pytest
 from servod.formats.gains.gain_set import GainSet
 from servod.formats.gains.parameters import LocalParameters
 from servod.kernels.laws import LAWS
+from servod.kernels.motions import paper
 from servod.lab.simulate.simulate import LoopSettings, simulate_closed_loop
 from servod.lab.synthesize.gain_set import Options, synthesize
-from servod.lab.synthesize.integral_gain import GAINS, MARGIN, with_gains
+from servod.lab.synthesize.observer_width import GAINS, MARGIN, with_gains
 from servod.lab.verify.checks import speeds_of
 from servod.lab.verify.closed_loop import corners
 from servod.lab.verify.margins import NOMINAL, Sweep
 from servod.lab.verify.sampled import Timing
 from servod.lab.verify.steady_friction import steady_friction
-from servod.runtime.loop.references import paper
 from tests.lab.synthesize.designs import table1
 
 

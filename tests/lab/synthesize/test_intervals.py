@@ -8,10 +8,10 @@ from servod.common.yaml import validate
 from servod.formats.gains.design import Uncertainty
 from servod.formats.model.axis_model import AxisModel
 from servod.formats.model.identified import IdentifiedValue
-from servod.lab.synthesize.intervals import uncertainty_of
+from servod.lab.synthesize.regions import uncertainty_of
 from servod.lab.verify.checks import Subject, check_intervals
-from servod.lab.verify.measured import ASSUMED_DAMPING, FLOORS
 from servod.lab.verify.steady_friction import steady_friction
+from servod.lab.verify.vertices import ASSUMED_DAMPING, FLOORS
 from tests.lab.synthesize.designs import table1, table1_set
 
 SPEEDS = (0.005, 0.02, 0.05, 0.1, 0.2, 0.5)

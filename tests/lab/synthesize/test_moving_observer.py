@@ -6,8 +6,7 @@ import pytest
 
 from servod.formats.gains.gain_set import GainSet
 from servod.formats.gains.parameters import LocalParameters
-from servod.lab.synthesize.moving_observer import follows, with_moving_observer
-from servod.lab.synthesize.observer_width import with_observer
+from servod.lab.synthesize.observer_width import follows, with_moving_observer, with_observer
 from servod.lab.verify.steady_friction import steady_friction
 from tests.lab.synthesize.designs import table1_set
 

@@ -19,9 +19,14 @@ from servod.lab.synthesize.lmi_reference import ReferenceWishes, programme, refe
 from servod.lab.synthesize.reference import frame, reference_set
 from servod.lab.verify.certify import verify
 from servod.lab.verify.checks import Subject
-from servod.lab.verify.reference_checks import check_reference
-from servod.lab.verify.reference_proof import gain_numbers, reference_margin
-from servod.lab.verify.reference_vertices import Polytope, polytope, vertices
+from servod.lab.verify.reference_proof import (
+    Polytope,
+    check_reference,
+    gain_numbers,
+    polytope,
+    reference_margin,
+    vertices,
+)
 from tests.lab.synthesize.designs import table1
 
 

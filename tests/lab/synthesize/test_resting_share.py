@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from servod.formats.gains.gain_set import GainSet
 from servod.formats.gains.parameters import LocalParameters
-from servod.lab.synthesize.resting_share import SHARES, stands_at_rest, with_share_at_rest
+from servod.lab.synthesize.observer_width import SHARES, stands_at_rest, with_share_at_rest
 from tests.lab.synthesize.designs import table1_set
 
 

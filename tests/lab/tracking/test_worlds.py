@@ -14,9 +14,8 @@ from servod.common.shipped import shipped
 from servod.formats.gains.gain_set import GainSet, load_gains
 from servod.formats.model.axis_model import AxisModel, load_axis_model
 from servod.lab.simulate.simulate import LoopSettings
-from servod.lab.tracking import simulated, stepped
-from servod.lab.tracking.metrics import roughness, score
-from servod.lab.tracking.motions import paper_rows
+from servod.lab.tracking import metrics, stepped
+from servod.lab.tracking.metrics import paper_rows, roughness, score
 from servod.runtime.loop.commands import ReferenceKind
 
 COUNTS = 2**20
@@ -42,7 +41,7 @@ def test_the_simulator_tracks_as_the_can_loop_does(plant: AxisModel, tmp_path: P
     stepped.activate(axis, set_of(law))
     measured = stepped.run_motion(axis, ReferenceKind.PAPER, [5.0])
     loop = LoopSettings(0.001, COUNTS, CUTOFF_HZ, 0.3)
-    followed = simulated.curves_of(simulated.run(plant, set_of(law), paper_rows(0.001, 5.0), loop, 7))
+    followed = metrics.curves_of(metrics.run(plant, set_of(law), paper_rows(0.001, 5.0), loop, 7))
     assert len(measured.time_s) == pytest.approx(len(followed.time_s), abs=2)
     on_can, alone = (score(c.time_s, c.error_mrad).rms_error_mrad for c in (measured, followed))
     assert on_can == pytest.approx(alone, rel=0.05)

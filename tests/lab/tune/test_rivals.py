@@ -9,9 +9,7 @@ import pytest
 from servod.common.errors import BadInput
 from servod.formats.gains.gain_set import load_gains, require_certificate
 from servod.lab.simulate.simulate import LoopSettings
-from servod.lab.tracking.metrics import score
-from servod.lab.tracking.motions import paper_rows
-from servod.lab.tracking.simulated import curves_of, run
+from servod.lab.tracking.metrics import curves_of, paper_rows, run, score
 from servod.lab.tune import Feedback, Tuned, rivals, tune
 from servod.lab.tune.laws import RIVALS
 from servod.lab.tune.rivals import before_it, needed

@@ -11,7 +11,7 @@ from servod.formats.model.keys import Harmonic
 from servod.lab.verify.checks import Subject, check_loop
 from servod.lab.verify.closed_loop import Deviation
 from servod.lab.verify.plants import drawn
-from servod.lab.verify.position_slope import position_slopes
+from servod.lab.verify.steady_friction import position_slopes
 from tests.lab.synthesize.designs import table1, table1_set
 
 COGGING = Cogging(harmonics=(Harmonic(amplitude=0.004, periods_per_turn=36.0),))

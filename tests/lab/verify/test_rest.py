@@ -9,8 +9,8 @@ import pytest
 from servod.formats.gains.gain_set import CertificateCheck
 from servod.formats.gains.parameters import LocalParameters
 from servod.lab.verify.checks import Subject
-from servod.lab.verify.rest import LEAST_SHARE, REST_SIGMAS, hold_width, rest_width
 from servod.lab.verify.rest_checks import check_loads, check_rest, resting_radius, resting_speed
+from servod.lab.verify.rounding import LEAST_SHARE, REST_SIGMAS, hold_width, rest_width
 from tests.lab.synthesize.designs import table1_set
 from tests.lab.verify.test_trials import noisy
 

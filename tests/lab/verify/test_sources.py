@@ -33,7 +33,7 @@ def imported(*modules: str) -> set[str]:
     ("patterns", "modules"),
     [
         (VERIFIES, ["servod.lab.verify.certify"]),
-        (DIAGNOSES, ["servod.lab.diagnose.document", "servod.lab.recordings.rows"]),
+        (DIAGNOSES, ["servod.lab.diagnose.document", "servod.lab.recordings.recording"]),
         (
             SYNTHESIZES,
             [f"servod.lab.synthesize.{name}" for name in ("gain_set", "reference", "intervals", "crosscheck")],

@@ -16,10 +16,9 @@ import pytest
 from servod.common.errors import BadInput
 from servod.common.sources import DIAGNOSES, sha256_on_disk
 from servod.qualify.blind.case import make_case
-from servod.qualify.blind.conceal import CASES, SEALED, TRUTH, write_case
+from servod.qualify.blind.conceal import CASES, SEALED, TRUTH, Trial, write_case, write_trial
 from servod.qualify.blind.examine import ANSWERS, RUN, SAID, Examiner
 from servod.qualify.blind.plan import Settings, plans
-from servod.qualify.blind.trial import Trial, write_trial
 
 
 def short_case(out: Path, name: str) -> None:

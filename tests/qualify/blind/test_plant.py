@@ -12,11 +12,11 @@ from servod.formats.model.axis_model import AxisModel
 from servod.lab.simulate.replay import Drive
 from servod.lab.simulate.replay import replay as replayed
 from servod.qualify.blind.axes import Axis, Kind, draw_axis
+from servod.qualify.blind.case import plain_model, true_model
 from servod.qualify.blind.concealed import Draw
 from servod.qualify.blind.hidden import HIDE
 from servod.qualify.blind.physics import Physics
 from servod.qualify.blind.plant import rest, run
-from servod.qualify.blind.truth import plain_model, true_model
 
 Array = NDArray[np.float64]
 

@@ -14,12 +14,11 @@ from typer.testing import CliRunner
 from servod.cli.app import app
 from servod.common.errors import BadInput
 from servod.qualify.blind import count, tables
-from servod.qualify.blind.conceal import CASES, SEALED, TRUTH, conceal, read_truth, unlock
+from servod.qualify.blind.conceal import CASES, FILE, SEALED, TRUTH, Trial, conceal, read_truth, unlock, write_trial
 from servod.qualify.blind.document import document, score, write
 from servod.qualify.blind.examine import ANSWERS, DIAGNOSIS, MODEL, RUN
 from servod.qualify.blind.plan import Cover, Plan, Settings, Sort, plans
 from servod.qualify.blind.score import HeldOut, Scored, is_right, matches, parameters_of
-from servod.qualify.blind.trial import FILE, Trial, write_trial
 
 RAN = {"exit_code": 0, "wall_s": 10.0, "cpu_s": 15.0, "memory_mib": 300.0, "time_limit_s": 12.0, "sources": "ab" * 32}
 

@@ -7,10 +7,10 @@ import pytest
 
 from servod.qualify.faults import run
 from servod.qualify.faults.actions import Action, action_of
-from servod.qualify.faults.catalogue import shipped_scenarios
-from servod.qualify.faults.effects import Effects
+from servod.qualify.faults.run import Effects
 from servod.qualify.faults.scenario import Injection, Runs, Scenario
 from servod.qualify.faults.stepped import SteppedAxis
+from servod.qualify.faults.variants import shipped_scenarios
 
 #: One of each kind of trace; all of these end ENABLED, so that nothing else would tell.
 KINDS = (

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from servod.common.errors import FaultCode
+from servod.common.faults import FaultCode
 from servod.drivers.virtual.drive_record import DriveSample
 from servod.qualify.faults.evidence import Watch, motion_complaints, record_complaints
 from servod.qualify.faults.judge import complaints, reaction

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from servod.common.errors import FaultCode
+from servod.common.faults import FaultCode
 from servod.drivers.virtual.drive_record import DriveSample
 from servod.qualify.faults.evidence import Watch
 from servod.qualify.faults.judge import complaints, reaction

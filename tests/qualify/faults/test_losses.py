@@ -7,8 +7,7 @@ import pytest
 
 from servod.common.errors import BadInput
 from servod.qualify.faults.document import document, summary
-from servod.qualify.faults.judge import Reaction
-from servod.qualify.faults.losses import check_bounds, loss_of
+from servod.qualify.faults.judge import Reaction, check_bounds, loss_of
 from servod.qualify.faults.run import Outcome
 from servod.qualify.faults.scenario import Loss, Scenario
 

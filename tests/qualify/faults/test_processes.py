@@ -5,9 +5,9 @@ The deaths are tried with all other tests; the rest takes some minutes and stand
 
 import pytest
 
-from servod.qualify.faults.catalogue import shipped_scenarios
 from servod.qualify.faults.run import run_scenario
 from servod.qualify.faults.scenario import Runs
+from servod.qualify.faults.variants import shipped_scenarios
 
 SCENARIOS = {name: s for name, s in shipped_scenarios().items() if s.runs is Runs.PROCESSES}
 

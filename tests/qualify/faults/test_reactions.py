@@ -9,7 +9,7 @@ from itertools import pairwise
 import pytest
 
 from servod.client.stepped import SteppedSession
-from servod.common.errors import FAULTS, FaultCode
+from servod.common.faults import FAULTS, FaultCode
 from servod.common.shipped import shipped
 from servod.drivers.virtual.bus_faults import BusFault
 from servod.drivers.virtual.world import SteppedWorld, VirtualAxisSettings

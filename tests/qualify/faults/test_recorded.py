@@ -13,8 +13,8 @@ from servod.common.errors import AnswerIsNo
 from servod.formats.config import RecorderConfig
 from servod.formats.recording.record import FIELDS, RECORD
 from servod.qualify.faults.document import document
+from servod.qualify.faults.evidence import lost_records, wait_for_rows
 from servod.qualify.faults.judge import Reaction
-from servod.qualify.faults.recorded import lost_records, wait_for_rows
 from servod.qualify.faults.run import Outcome
 from servod.qualify.faults.scenario import Loss
 from servod.runtime.daemon.recorder import Recorder

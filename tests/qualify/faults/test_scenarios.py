@@ -2,9 +2,9 @@
 
 import pytest
 
-from servod.qualify.faults.catalogue import shipped_scenarios
 from servod.qualify.faults.run import run_scenario
 from servod.qualify.faults.scenario import Runs
+from servod.qualify.faults.variants import shipped_scenarios
 
 SCENARIOS = {name: s for name, s in shipped_scenarios().items() if s.runs is Runs.STEPPED}
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 from servod.common.errors import BadInput
-from servod.qualify.faults.catalogue import load_all, load_scenarios
-from servod.qualify.faults.losses import loss_of
+from servod.qualify.faults.judge import loss_of
 from servod.qualify.faults.scenario import Loss
+from servod.qualify.faults.variants import load_all, load_scenarios
 
 HEAD = "title: $count frames\nwhy: x\ngroup: bus\ninject: [{do: {frames: {of: torque, fault: drop, count: $count}}}]\n"
 EXPECT = "expect: $expect\n"

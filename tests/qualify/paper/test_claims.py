@@ -11,15 +11,22 @@ import pytest
 from servod.lab.report.figures.motion import Motion
 from servod.lab.report.figures.sets import local_law
 from servod.lab.synthesize.local_sets import force_after
-from servod.lab.tracking.motions import paper_rows
+from servod.lab.tracking.metrics import paper_rows
 from servod.qualify.paper import table
 from servod.qualify.paper.claims import Claim, ordered
 from servod.qualify.paper.equations import compensator, equal_force_decay, exponent_of_18
-from servod.qualify.paper.joints import Joint
+from servod.qualify.paper.joints import (
+    Joint,
+    at_paper_feedback,
+    consistent_g,
+    printed_g,
+    printed_l,
+    shipped_set,
+    with_l,
+)
 from servod.qualify.paper.motions import SLOW_RAD_S, around_zero
 from servod.qualify.paper.printed import L_I, NODES_RAD_S, RMS_MRAD
 from servod.qualify.paper.results import Row
-from servod.qualify.paper.sets import at_paper_feedback, consistent_g, printed_g, printed_l, shipped_set, with_l
 from servod.qualify.paper.sweeps import filtered_noise, joint_friction, on_sine, rms_mrad, simulate, sweep_of_l
 
 PD, TABLE1 = shipped_set("paper_pd"), shipped_set("table1_kz_kv_kx")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from servod.client.stepped import SteppedSession
-from servod.common.errors import FAULTS, FaultCode
+from servod.common.faults import FAULTS, FaultCode
 from servod.common.shipped import shipped
 from servod.drivers.virtual.world import SteppedWorld, VirtualAxisSettings
 from servod.formats.config import load_config
@@ -19,16 +19,13 @@ from servod.formats.gains.gain_set import load_gains
 from servod.formats.model.axis_model import load_axis_model
 from servod.kernels.laws import LAWS
 from servod.qualify.faults.judge import Reaction
-from servod.qualify.soak.drive import SAMPLE_ROW, DriveCheck, reaction_in
-from servod.qualify.soak.explained import Explained
-from servod.qualify.soak.finding import Findings, Wrong
+from servod.qualify.soak.drive import SAMPLE_ROW, DriveCheck, check_reaction, reaction_in
 from servod.qualify.soak.kinds import KINDS, fault_bits
 from servod.qualify.soak.memory import Growth, Memory
-from servod.qualify.soak.reactions import check_reaction
 from servod.qualify.soak.rows import RowCheck, Rows, rows_of, run_lengths
-from servod.qualify.soak.starved import STARVED_CYCLE, STARVED_SUPERVISOR, Starved
+from servod.qualify.soak.starved import STARVED_CYCLE, STARVED_SUPERVISOR, Explained, Starved
 from servod.qualify.soak.syncs import SyncCheck, SyncListener
-from servod.qualify.soak.tally import FaultTally
+from servod.qualify.soak.tally import FaultTally, Findings, Wrong
 from servod.runtime.fieldbus.devices import DriveState
 from servod.runtime.loop.axis import AxisState
 

@@ -6,10 +6,9 @@ from typing import Any
 
 import pytest
 
-from servod.client.control import Verb
+from servod.formats.protocol import Verb
 from servod.qualify.faults.scenario import Recovery
-from servod.qualify.soak.finding import Findings, Wrong
-from servod.qualify.soak.tally import Tally
+from servod.qualify.soak.tally import Findings, Tally, Wrong
 from servod.qualify.soak.wall import WallSoak
 
 

@@ -15,17 +15,16 @@ import numpy as np
 import pytest
 
 from servod.cli.app import run as servoctl
-from servod.common.errors import FaultCode, Unreachable
+from servod.common.errors import Unreachable
+from servod.common.faults import FaultCode
 from servod.qualify.faults.scenario import Recovery
-from servod.qualify.soak.document import Course, added, document
-from servod.qualify.soak.finding import Wrong
+from servod.qualify.soak.document import Course, added, document, verdict
 from servod.qualify.soak.kinds import KINDS, FaultKind
-from servod.qualify.soak.launch import Order, launch
+from servod.qualify.soak.launch import DOCUMENT_NAME, Order, launch, run
 from servod.qualify.soak.memory import Memory
-from servod.qualify.soak.page import verdict
 from servod.qualify.soak.plan import Ending, Episode, Move, schedule
-from servod.qualify.soak.run import DOCUMENT_NAME, run
 from servod.qualify.soak.stepped import GAIN_SETS, SteppedSoak
+from servod.qualify.soak.tally import Wrong
 from servod.runtime.loop.commands import ReferenceKind
 
 _KIND = {kind.name: kind for kind in KINDS}

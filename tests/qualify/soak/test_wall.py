@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from servod.qualify.soak.finding import Wrong
 from servod.qualify.soak.kinds import KINDS
+from servod.qualify.soak.launch import DOCUMENT_NAME, run
 from servod.qualify.soak.plan import Ending, Episode, Move
-from servod.qualify.soak.run import DOCUMENT_NAME, run
+from servod.qualify.soak.tally import Wrong
 from servod.qualify.soak.wall import WallSoak, of_the_wall
 from servod.runtime.loop.commands import ReferenceKind
 

@@ -10,9 +10,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from servod.client.control import Verb
 from servod.common.errors import AnswerIsNo, BadInput, Unreachable
 from servod.formats.config import ControlConfig
+from servod.formats.protocol import Verb
 from servod.runtime.daemon.connection import Reply
 from servod.runtime.daemon.control_server import ControlServer
 

@@ -12,9 +12,10 @@ from pathlib import Path
 import pytest
 from served import Echo, Served, answer_of, raw
 
-from servod.client.control import MAX_LINE_BYTES, PIECE_SAMPLES, ControlClient, Verb
+from servod.client.control import ControlClient
 from servod.common.errors import AnswerIsNo, BadInput, ServodError, Unreachable
 from servod.formats.config import ControlConfig
+from servod.formats.protocol import MAX_LINE_BYTES, PIECE_SAMPLES, Verb
 from servod.runtime.daemon.control_server import ControlServer
 from servod.runtime.daemon.peer import Peer, may_command, peer_of
 

@@ -16,8 +16,8 @@ from servod.cli.status import _plain
 from servod.common.errors import BadInput
 from servod.formats.config import RecorderConfig
 from servod.lab.report.page import Page
-from servod.runtime.daemon.journal import harmless, print_error, set_up_logging
-from servod.runtime.daemon.recorder_files import RecordingFiles
+from servod.runtime.daemon.main import harmless, print_error, set_up_logging
+from servod.runtime.daemon.recorder import RecordingFiles
 
 #: Newlines of every kind, a forged entry, terminal sequences, a text that runs backwards, markup of rich and of HTML.
 HOSTILE = (

@@ -6,7 +6,8 @@ import pytest
 from daemon_rows import record
 from prometheus_client.parser import text_string_to_metric_families
 
-from servod.common.errors import BadInput, FaultCode
+from servod.common.errors import BadInput
+from servod.common.faults import FaultCode
 from servod.formats.config import MetricsConfig
 from servod.runtime.daemon.metrics import AxisMetrics, MetricsServer
 from servod.runtime.loop.axis import AxisState

@@ -17,11 +17,12 @@ from typing import cast
 import pytest
 from served import Served, answer_of, raw
 
-from servod.client.control import ControlClient, Refused, Verb
+from servod.client.control import ControlClient, Refused
 from servod.common.errors import Unreachable
+from servod.formats.protocol import Verb
 from servod.runtime.daemon.connection import Connection
+from servod.runtime.daemon.lease import MAX_CLIENTS, MAX_CLIENTS_OF_A_PROCESS, Places
 from servod.runtime.daemon.peer import Peer
-from servod.runtime.daemon.places import MAX_CLIENTS, MAX_CLIENTS_OF_A_PROCESS, Places
 
 
 @pytest.fixture

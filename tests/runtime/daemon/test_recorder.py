@@ -17,8 +17,7 @@ from servod.formats.config import RecorderConfig
 from servod.formats.recording.mcap_reader import read_recording
 from servod.formats.recording.mcap_writer import CYCLE_TOPIC, McapFile, split_rows
 from servod.formats.recording.record import CycleRecord
-from servod.runtime.daemon.recorder import Recorder
-from servod.runtime.daemon.recorder_history import HistoryRing
+from servod.runtime.daemon.recorder import HistoryRing, Recorder
 
 
 def _recorder(directory: Path, history_s: float = 1.0) -> Recorder:

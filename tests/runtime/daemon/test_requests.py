@@ -9,8 +9,8 @@ from typing import Any, cast
 import pytest
 from daemon_rows import axis_config, record
 
-from servod.client.control import SampleKey, Verb
 from servod.common.errors import BadInput, Unreachable
+from servod.formats.protocol import SampleKey, Verb
 from servod.runtime.daemon.arguments import check_arguments
 from servod.runtime.daemon.connection import Reply
 from servod.runtime.daemon.flows import Flow, Flows, FutureWait, Orders, StateWait

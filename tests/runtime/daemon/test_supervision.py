@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 from daemon_rows import axis_config, record, rows
 
-from servod.common.errors import FaultCode, Unreachable
+from servod.common.errors import Unreachable
+from servod.common.faults import FaultCode
 from servod.formats.config import BusConfig, RecorderConfig
 from servod.formats.recording.mcap_reader import read_recording
 from servod.runtime.daemon.fault_watch import FaultWatch

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from servod.common.errors import FAULTS, FaultCode
+from servod.common.faults import FAULTS, FaultCode
 from servod.common.yaml import parse_yaml
 from servod.runtime.fieldbus.devices import AmplifierFeedback, DriveState, Mode, Reason
 from servod.runtime.loop.axis import Axis, AxisState

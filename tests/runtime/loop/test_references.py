@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from servod.kernels.motions import paper, sine
 from servod.runtime.loop.commands import ReferenceKind, Refusal
-from servod.runtime.loop.references import Motion, Reference, make_motion, paper, sine
+from servod.runtime.loop.references import Motion, Reference, make_motion
 
 PERIOD_S = 1e-3
 

@@ -5,26 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from servod.client.deploy_virtual import pd_set
+from servod.client.virtual import pd_set
 from servod.common.errors import AnswerIsNo
 from servod.formats.gains.gain_set import GainSet, load_gains
 from servod.formats.model.axis_model import load_axis_model
-from servod.lab.commission.files import (
-    AFTER_ROWS,
-    BEFORE,
-    BEFORE_ROWS,
-    DEPLOYMENT,
-    GAINS,
-    MODEL,
-    STORE,
-    read_json,
-    write_json,
-)
-from servod.lab.commission.runs import load_rows, save_rows
+from servod.lab.commission.comparison import load_rows, save_rows
+from servod.lab.commission.state import AFTER_ROWS, BEFORE, BEFORE_ROWS, DEPLOYMENT, GAINS, MODEL, STORE, write_json
+from servod.lab.commission.state import read_walk_json as read_json
 from servod.lab.commission.walk import Walk
 from servod.lab.deploy.deployment import announced, deploy
 from servod.lab.deploy.outcome import Before, Deployment
-from servod.lab.identify.feedback import STIFF, feedback
+from servod.lab.identify.bounds import STIFF, feedback
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from servod.formats.model.axis_model import axis_model_yaml
-from servod.lab.commission.files import IDENTIFIED, MODEL, RECORDINGS, write_json, write_text
-from servod.lab.commission.state import digest
+from servod.lab.commission.state import IDENTIFIED, MODEL, RECORDINGS, digest, write_json, write_text
 from servod.lab.commission.walk import Walk
 from servod.lab.identify.bounds import LONGEST_TRAVEL_RAD
 from servod.lab.identify.result import document, model_of

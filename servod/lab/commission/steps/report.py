@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from servod import __version__
-from servod.lab.commission.files import DEPLOYMENT, GAINS, IDENTIFIED, MODEL, PICTURES, REPORT, TRACKING, TUNING
 from servod.lab.commission.report import write_report
+from servod.lab.commission.state import DEPLOYMENT, GAINS, IDENTIFIED, MODEL, PICTURES, REPORT, TRACKING, TUNING
 from servod.lab.commission.walk import Walk
 
 

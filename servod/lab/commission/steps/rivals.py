@@ -9,7 +9,7 @@ from typing import Any
 from servod.formats.gains.gain_set import load_gains
 from servod.formats.model.axis_model import load_axis_model
 from servod.lab.commission.comparison import DEPLOYED
-from servod.lab.commission.files import GAINS, MODEL, RIVALS, TUNING, write_json, write_text
+from servod.lab.commission.state import GAINS, MODEL, RIVALS, TUNING, write_json, write_text
 from servod.lab.commission.walk import Walk
 from servod.lab.tune.plan import BUDGET, ROUGHNESS_TOLERANCE, Feedback, Tuned, TunePlan
 from servod.lab.tune.rivals import rivals

@@ -12,12 +12,12 @@ from servod.common.sources import SYNTHESIZES, source_sha256
 from servod.common.units import NS_PER_S, NS_PER_US
 from servod.formats.gains.gain_set import GainSet
 from servod.formats.model.axis_model import AxisModel, load_axis_model
-from servod.lab.commission.files import DESIGN, INFEASIBLE, MODEL, RELAXED, write_json, write_text
+from servod.lab.commission.state import DESIGN, INFEASIBLE, MODEL, RELAXED, write_json, write_text
 from servod.lab.commission.walk import Walk
 from servod.lab.synthesize.deployed import Wishes
 from servod.lab.synthesize.gain_set import Options, synthesize
 from servod.lab.synthesize.infeasible import Infeasible, Relaxation
-from servod.lab.synthesize.intervals import uncertainty_of
+from servod.lab.synthesize.regions import uncertainty_of
 
 #: The regions' overlap ends at this share of the speed at most.
 OVERLAP_SHARE = 0.5

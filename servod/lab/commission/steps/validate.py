@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from servod.client.commission_axis import DaemonWalkAxis, VirtualWalkAxis
+from servod.client.open import DaemonWalkAxis, VirtualWalkAxis
 from servod.common.errors import AnswerIsNo
 from servod.formats.gains.gain_set import load_gains
-from servod.lab.commission.comparison import DEPLOYED, measured, run_files
+from servod.lab.commission.comparison import DEPLOYED, measured, run_files, save_curves
 from servod.lab.commission.daemon_tracking import measure_on_daemon
-from servod.lab.commission.files import DEPLOYMENT, GAINS, RIVALS, RUNS, TRACKING, TUNING, read_json, write_json
-from servod.lab.commission.runs import save_curves
+from servod.lab.commission.state import DEPLOYMENT, GAINS, RIVALS, RUNS, TRACKING, TUNING, write_json
+from servod.lab.commission.state import read_walk_json as read_json
 from servod.lab.commission.steps.rivals import CONTENDERS, compared, contenders, rival_file
 from servod.lab.commission.walk import Walk
 from servod.lab.tune.plan import Feedback

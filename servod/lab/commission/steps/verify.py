@@ -8,7 +8,7 @@ from typing import Any
 from servod.common.errors import AnswerIsNo
 from servod.common.sources import VERIFIES, source_sha256
 from servod.formats.gains.gain_set import load_gains
-from servod.lab.commission.files import CERTIFICATE, DESIGN, GAINS, write_json, write_text
+from servod.lab.commission.state import CERTIFICATE, DESIGN, GAINS, write_json, write_text
 from servod.lab.commission.walk import Walk
 from servod.lab.verify.certify import SEED, verify
 

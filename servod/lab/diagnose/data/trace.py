@@ -11,9 +11,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from servod.lab.simulate.motion import noise_rms
+from servod.formats.model.axis_model import AxisModel
+from servod.lab.simulate.motion import FirstRow, Start, first_row, noise_rms
 from servod.lab.simulate.replay import Drive, behind_gaps
-from servod.lab.simulate.start import FirstRow, Start, first_row
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
@@ -78,3 +78,15 @@ class Trace:
     @cached_property
     def _first(self) -> dict[float, FirstRow]:
         return {}
+
+
+#: Bandwidth of the observer, rad/s: what the noise allows within these bounds, and a share of the sampling rate.
+SLOWEST, FASTEST, SHARE_OF_SAMPLING = 25.0, 200.0, 0.1
+
+
+def dry_friction(model: AxisModel) -> float:
+    """The model's Coulomb friction, N*m: the scale of every mismatch. Of a local map, the least; never nothing."""
+    law = model.friction
+    if law.kind == "local":
+        return min(abs(torque) for torque in law.torques)
+    return max(law.coulomb, 1e-9)

@@ -11,22 +11,20 @@ adds up in every simulation that runs freely: its share is that of the means ove
 from __future__ import annotations
 
 from dataclasses import replace
-from enum import StrEnum
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from servod.lab.diagnose.judge.evidence import Kept
 from servod.lab.diagnose.judge.spread import within
 from servod.lab.diagnose.judge.verdict import lesser_twin
-from servod.lab.diagnose.select.at_end import at_end
+from servod.lab.diagnose.select.detail import WANTED, power
 from servod.lab.diagnose.select.fit import Fit
-from servod.lab.diagnose.select.level import is_level
-from servod.lab.diagnose.select.merit import of_size
-from servod.lab.diagnose.select.slow import WANTED, power
+from servod.lab.diagnose.select.merit import at_end, is_level, of_size
 
 if TYPE_CHECKING:
-    from servod.lab.diagnose.engine import Evidence
+    from servod.lab.diagnose.judge.evidence import Evidence
     from servod.lab.diagnose.select.choose import Chooser
 
 Array = NDArray[np.float64]
@@ -39,16 +37,6 @@ POSITIVE = frozenset(("time_constant_s", "gap"))
 
 #: Half width of a 95 % interval in standard deviations.
 Z95 = 1.96
-
-
-class Kept(StrEnum):
-    """Why a term that stays in the model is no finding."""
-
-    LEVEL = "below the level from which its effect counts"
-    TWIN = "told together with its longer twin"
-    SMALL = "below the smallest size worth a name"
-    UNSURE = "not told from none"
-    AT_END = "a number of it lies at the end of its range"
 
 
 def sorted_out(evidence: Evidence, chooser: Chooser) -> Evidence:

@@ -8,27 +8,76 @@ a low-pass of the observer's bandwidth. Where a model is right it is noise.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
+import os
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from servod.formats.model.axis_model import AxisKind, AxisModel
+from servod.kernels.physics.compiled import Kernel, available, compiled
 from servod.kernels.physics.layout import P_DELAY_S, P_GAP, P_START_C, S_FIRST_S
 from servod.kernels.physics.plant import rest_state
 from servod.lab.diagnose.data.excited import creeps
-from servod.lab.diagnose.data.trace import Trace
+from servod.lab.diagnose.data.trace import FASTEST, SHARE_OF_SAMPLING, SLOWEST, Trace, dry_friction
 from servod.lab.diagnose.predict.innovation_kernel import innovate
-from servod.lab.diagnose.predict.parallel import released
 from servod.lab.simulate import open_loop
-from servod.lab.simulate.start import FirstRow
+from servod.lab.simulate.motion import FirstRow
+from servod.lab.simulate.replay import Drive
+
+# Runs simulations on both cores: kernels that let go of the interpreter's lock, and threads that call them.
+#
+# Stands between the predictor and the fit. Threads, not processes: recordings and Jacobians are large and shared.
+
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+#: Cores that a diagnosis uses, at most.
+MOST_CORES = 2
+
+
+@cache
+def released(function: Kernel) -> Kernel:
+    """`function` compiled, and called without the interpreter's lock; in pure Python where there is no compiler."""
+    if not available():
+        return function
+    import numba
+
+    kernel = compiled(function)
+
+    def call(*arguments: Any) -> None:
+        kernel(*arguments)
+
+    outer: Kernel = numba.njit(nogil=True)(call)
+    return outer
+
+
+@cache
+def cores() -> int:
+    """Cores that this process may use, MOST_CORES at most; SERVOD_CORES overrides."""
+    asked = os.environ.get("SERVOD_CORES", "")
+    return int(asked) if asked.isdigit() and int(asked) > 0 else min(MOST_CORES, len(os.sched_getaffinity(0)))
+
+
+@cache
+def _pool(level: str) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(max_workers=cores(), thread_name_prefix=level)
+
+
+def side_by_side(level: str, function: Callable[[T], R], items: Iterable[T]) -> list[R]:
+    """`function` of every item, in order. Calls within calls need another `level`, lest they wait for each other."""
+    if cores() == 1:
+        return [function(item) for item in items]
+    return list(_pool(level).map(function, items))
+
 
 Array = NDArray[np.float64]
 
-#: Bandwidth of the observer, rad/s: what the noise allows within these bounds, and a share of the sampling rate.
-SLOWEST, FASTEST, SHARE_OF_SAMPLING = 25.0, 200.0, 0.1
 
 #: The share of the sampling rate where the axis creeps: a slower observer carries a model along that sticks and slips.
 SHARE_CREEPING = 0.35
@@ -172,9 +221,30 @@ class Predictor:
         return np.array([motion[0], motion[1], *hidden[0]])
 
 
-def dry_friction(model: AxisModel) -> float:
-    """The model's Coulomb friction, N*m: the scale of every mismatch. Of a local map, the least; never nothing."""
-    law = model.friction
-    if law.kind == "local":
-        return min(abs(torque) for torque in law.torques)
-    return max(law.coulomb, 1e-9)
+# A shorter set of data for first rounds: of every recording the stretch where most is left to explain.
+#
+# Stands between the predictor and the trials; what is tried on it and promises anything is fitted on everything after.
+
+
+#: Share of each recording that is kept, and the least that is, s.
+KEPT, LEAST_S = 0.35, 4.0
+
+
+def shortened(predictor: Predictor, nominal: AxisModel, mismatch: Array) -> Predictor:
+    """A predictor on the stretch of each recording with the greatest power of `mismatch`; the same observer."""
+    traces = [
+        _cut(trace, mismatch[part], SETTLING / predictor.rate)
+        for trace, part in zip(predictor.traces, predictor.slices, strict=True)
+    ]
+    return Predictor(traces, nominal, predictor.rate)
+
+
+def _cut(trace: Trace, mismatch: Array, settling_s: float) -> Trace:
+    length = max(KEPT * trace.duration_s, LEAST_S) + settling_s
+    rows = min(round(length / trace.period_s), len(mismatch))
+    power = np.concatenate([[0.0], np.cumsum(mismatch**2)])
+    first = int(np.argmax(power[rows:] - power[: len(power) - rows]))
+    part = slice(first, first + rows)
+    drive = trace.drive
+    short = Drive(drive.t_s[part], drive.torque[part], drive.position[part], drive.temperature_c[part])
+    return replace(trace, drive=short, counts=trace.counts[part])

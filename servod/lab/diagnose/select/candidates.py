@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from servod.lab.diagnose.effects import effect, effects
 from servod.lab.diagnose.effects.hypothesis import Term
 from servod.lab.diagnose.effects.scene import Scene
-from servod.lab.diagnose.predict.parallel import side_by_side
+from servod.lab.diagnose.predict.predict import side_by_side
 from servod.lab.diagnose.select.fit import Fit, Fitter
 
 Array = NDArray[np.float64]

@@ -20,14 +20,11 @@ from servod.lab.diagnose.effects.base import base_unknowns, document_of
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
 from servod.lab.diagnose.effects.scene import Scene
 from servod.lab.diagnose.predict.floor import noise_floor, stretch_means
-from servod.lab.diagnose.predict.predict import Predictor
-from servod.lab.diagnose.predict.shortened import shortened
-from servod.lab.diagnose.select.at_end import at_end
+from servod.lab.diagnose.predict.predict import Predictor, shortened
 from servod.lab.diagnose.select.candidates import Candidate, Trials
 from servod.lab.diagnose.select.choice import Choice, Entry
 from servod.lab.diagnose.select.fit import Fit, Fitter, Weighing, long_run, scale_of
-from servod.lab.diagnose.select.level import is_level, on_bound
-from servod.lab.diagnose.select.merit import SURE_SHARE, Merit, acting, worth_naming
+from servod.lab.diagnose.select.merit import SURE_SHARE, Merit, acting, at_end, is_level, on_bound, worth_naming
 
 Array = NDArray[np.float64]
 Tell = Callable[[str], None]

@@ -17,8 +17,7 @@ from pydantic import ValidationError
 
 from servod.formats.model.axis_model import AxisModel
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
-from servod.lab.diagnose.predict.parallel import side_by_side
-from servod.lab.diagnose.predict.predict import Predictor
+from servod.lab.diagnose.predict.predict import Predictor, side_by_side
 
 Array = NDArray[np.float64]
 

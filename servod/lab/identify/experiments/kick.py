@@ -89,3 +89,18 @@ def _kick(bench: Bench, torque_nm: float, pulse: int) -> Trace:
     torque[lead : lead + pulse] = size
     window = min(TRAVEL_SHARE * bench.bounds.travel_rad, bench.bounds.window_rad)
     return bench.run(Kind.KICK, np.zeros(len(torque)), torque, window, {"pulse_nm": size, "pulse_s": pulse_s})
+
+
+# Noise at rest: what encoder and torque reading show while nothing moves and no torque is asked for.
+#
+# Reason: the noise floor bounds what all other experiments can see. Bounds: no torque, no motion.
+
+
+DURATION_S = 1.5
+
+
+def run_noise(bench: Bench) -> Trace:
+    """Record a rest under zero gains."""
+    still = np.zeros(samples(DURATION_S, bench.period_s))
+    bench.set_gains(0.0, 0.0)
+    return bench.run(Kind.NOISE, still, still, bench.bounds.window_rad, {})

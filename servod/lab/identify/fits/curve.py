@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.optimize import least_squares
 
-from servod.lab.identify.estimate import LEVEL, Estimate, estimate
+from servod.lab.identify.estimate import LEVEL, Estimate, at_ends, estimate
 from servod.lab.identify.fits.friction_map import Side
-from servod.lab.identify.ranges import at_ends
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.optimize import least_squares
 
-from servod.lab.identify.ranges import at_ends
+from servod.lab.identify.estimate import at_ends
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

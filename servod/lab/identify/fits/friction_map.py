@@ -17,7 +17,7 @@ from scipy.interpolate import BSpline
 from servod.common.errors import AnswerIsNo
 from servod.lab.identify.estimate import LEVEL, Estimate, estimate, sandwich
 from servod.lab.identify.fits import cogging
-from servod.lab.identify.fits.bristle_lag import Bristle, dry_columns, follow
+from servod.lab.identify.fits.bristle import Bristle, dry_columns, follow
 from servod.lab.identify.fits.map_rows import Motion, coarse_rad_s, motions_from, slowest_rad_s
 from servod.lab.identify.trace import Trace
 

@@ -8,8 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from servod.common.errors import AnswerIsNo
-from servod.lab.identify.signals import smooth
-from servod.lab.identify.trace import Trace
+from servod.lab.identify.trace import Trace, smooth
 
 WIDTH_S = 0.0025
 #: Delays that are tried, in periods.

@@ -11,8 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from servod.lab.identify.signals import Smooth, smooth
-from servod.lab.identify.trace import Trace
+from servod.lab.identify.trace import Smooth, Trace, smooth
 
 Array = NDArray[np.float64]
 

@@ -17,11 +17,18 @@ from scipy import stats
 from scipy.optimize import least_squares
 
 from servod.common.errors import AnswerIsNo
-from servod.lab.identify.estimate import LEVEL, Estimate, estimate, jackknife
+from servod.lab.identify.estimate import LEVEL, Estimate, at_ends, estimate, jackknife, joined
 from servod.lab.identify.fits import elastic
-from servod.lab.identify.fits.rigid import Rigid, response_of
-from servod.lab.identify.fits.strokes import Stroke, coherence_of, deviation_of, position_over_torque, ratio_of, spectra
-from servod.lab.identify.ranges import at_ends, joined
+from servod.lab.identify.fits.strokes import (
+    Rigid,
+    Stroke,
+    coherence_of,
+    deviation_of,
+    position_over_torque,
+    ratio_of,
+    response_of,
+    spectra,
+)
 from servod.lab.identify.trace import Trace
 
 Array = NDArray[np.float64]

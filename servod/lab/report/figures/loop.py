@@ -9,8 +9,9 @@ import numpy as np
 
 from servod.common.errors import BadInput
 from servod.formats.gains.design import Design, RegionProof
-from servod.formats.gains.gain_set import GainSet
-from servod.lab.report.figure import Axis, Colour, Curve, Figure, Panel, Scale, Style, curve
+from servod.formats.gains.gain_set import Certificate, GainSet
+from servod.lab.identify.fits.response import LEAST_COHERENCE, ResponseFit, falling_phase_rad
+from servod.lab.report.figure import Array, Axis, Colour, Curve, Figure, Panel, Scale, Style, Table, curve
 from servod.lab.report.figures.sets import local_law
 from servod.lab.report.responses import Complex, Loop, after, before, frequency_response, rigid, vertex_impulse
 
@@ -153,3 +154,87 @@ def _norms(region: RegionProof, period_s: float) -> str:
     largest = max(float(np.sqrt(np.sum(vertex_impulse(region, v, samples) ** 2))) for v in counted)
     bound = max(float(np.sqrt(np.trace(np.array(v.output)))) for v in counted)
     return f"Region {region.name}: norm of the worst response {largest:.3g}, proven bound {bound:.3g}."
+
+
+# The certificate of a gain set as a table: every check with its figure, limit and margin.
+#
+# Stands on the gain set alone.
+
+
+def certificate_table(gains: GainSet) -> Table:
+    """All checks in their order. Raises BadInput for a set without a certificate."""
+    certificate = _certificate(gains)
+    rows = [
+        (c.name, f"{c.value:.4g}", f"{c.limit:.4g}", f"{c.margin:.3g}", _verdict(c.passed)) for c in certificate.checks
+    ]
+    verdict = "valid" if certificate.valid else "not valid"
+    return Table(f"Certificate: {verdict}", ("check", "figure", "limit", "margin", "verdict"), tuple(rows))
+
+
+def observations_table(gains: GainSet) -> Table:
+    """What was observed beside the checks, told and not judged. Raises BadInput for a set without a certificate."""
+    told = _certificate(gains).observations
+    return Table("Told, not judged", ("figure", "value"), tuple((k, f"{v:.4g}") for k, v in told.items()))
+
+
+def _certificate(gains: GainSet) -> Certificate:
+    if gains.certificate is None:
+        raise BadInput(f"gain set {gains.name}: certificate", "nothing", "one that `servoctl verify` wrote")
+    return gains.certificate
+
+
+def _verdict(passed: bool) -> str:
+    return "passed" if passed else "failed"
+
+
+# Figure of an identification's frequency response: what the multisine showed, and the model that was put to it.
+#
+# Stands on the response fit alone.
+
+
+_RESPONSE_POINTS = 300
+#: Half width of a 95 % interval over the standard deviation.
+_HALF = 1.96
+
+
+def measured_response(found: ResponseFit, name: str = "frequency_response") -> Figure:
+    """Position over torque command of the sliding joint, measured line by line and fitted, and the coherence."""
+    fine = np.geomspace(found.frequency_hz[0], found.frequency_hz[-1], _RESPONSE_POINTS)
+    gain, error, fitted = np.abs(found.response), _HALF * found.deviation, found.model(fine)
+    phase, model_phase = np.degrees(found.phase_rad(found.response)), np.degrees(falling_phase_rad(fitted))
+    hz = Axis("frequency in Hz", Scale.LOG)
+    panels = (
+        Panel(
+            hz,
+            Axis("position/torque in rad/(N·m)", Scale.LOG),
+            _panel(found, gain, (gain * (1.0 - np.minimum(error, 0.99)), gain * (1.0 + error)), fine, np.abs(fitted)),
+            "gain",
+        ),
+        Panel(
+            hz,
+            Axis("phase in degrees"),
+            _panel(found, phase, (phase - np.degrees(error), phase + np.degrees(error)), fine, model_phase),
+            "phase",
+        ),
+        Panel(hz, Axis("coherence in %", span=(0.0, 105.0)), _coherence(found), "coherence"),
+    )
+    caption = (
+        "Torque command to position while the joint slides; bars are 95 % intervals by the scatter of the strokes. "
+        f"Lines with less coherence than {LEAST_COHERENCE:.0%} count for nothing."
+    )
+    return Figure(name, "Frequency response", panels, 3, caption)
+
+
+def _panel(
+    found: ResponseFit, values: Array, bounds: tuple[Array, Array], fine: Array, fitted: Array
+) -> tuple[Curve, ...]:
+    """The measured lines with their intervals, and the model."""
+    measured = curve("measured", found.frequency_hz, values, Colour.BLUE, Style.POINTS, bounds=bounds)
+    what = "two masses and a spring" if found.resonance is not None else "rigid joint"
+    return measured, curve(f"fitted, {what}", fine, fitted, Colour.ORANGE)
+
+
+def _coherence(found: ResponseFit) -> tuple[Curve, ...]:
+    ends, least = found.frequency_hz[[0, -1]], np.full(2, 100.0 * LEAST_COHERENCE)
+    line = curve("least that counts", ends, least, Colour.GREY, Style.DASHED, width=1.0)
+    return curve("measured", found.frequency_hz, 100.0 * found.coherence, Colour.BLUE, Style.POINTS), line

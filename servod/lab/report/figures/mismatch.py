@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from servod.lab.diagnose.judge.held_out import WindowErrors
 from servod.lab.diagnose.judge.locate import LEAST_IN_BIN, SEEN, Map
-from servod.lab.diagnose.judge.windows import WindowErrors
 from servod.lab.diagnose.predict.coordinates import units
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.report.figure import Array, Axis, Colour, Curve, Figure, Panel, Scale, Style, array, curve

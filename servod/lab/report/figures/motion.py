@@ -57,7 +57,7 @@ class Motion:
 
 
 def motion_of_rows(label: str, rows: NDArray[np.void]) -> Motion:
-    """A motion from cycle records (dtype servod.lab.recordings.rows.ROW); positions are the encoder's."""
+    """A motion from cycle records (dtype servod.lab.recordings.recording.ROW); positions are the encoder's."""
     time_s = (rows["time_ns"] - rows["time_ns"][0]) * 1e-9
     columns = ("reference_rad", "position_rad", "torque_nm", "torque_friction_nm")
     return Motion(label, array(time_s), *(array(rows[c]) for c in columns))

@@ -11,12 +11,11 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from servod.lab.diagnose.engine import Evidence
+from servod.lab.diagnose.judge.evidence import Evidence
 from servod.lab.diagnose.judge.locate import LEAST_IN_BIN
 from servod.lab.diagnose.judge.unnamed import Unnamed
-from servod.lab.diagnose.predict.coordinates import coordinates, units
+from servod.lab.diagnose.predict.coordinates import Look, Split, coordinates, look, units
 from servod.lab.diagnose.predict.predict import Predictor
-from servod.lab.diagnose.predict.signature import Look, Split, look
 from servod.lab.report.figure import Array, Axis, Colour, Curve, Figure, Panel, Style, curve
 
 #: Bins of a signature; periods in the range from which a periodic one is drawn over one period only.

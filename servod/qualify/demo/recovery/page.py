@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from servod.lab.diagnose.sentences import certainty
+from servod.lab.diagnose.document import certainty
 from servod.lab.report.diagnosis import Report
 from servod.lab.report.figure import Axis, Colour, Curve, Figure, Panel, curve
 from servod.lab.report.figures import mismatch

@@ -16,29 +16,29 @@ from typing import Any
 
 import numpy as np
 
-from servod.client.links import Rows
 from servod.client.open import RecoveryAxis
+from servod.client.stepped import Rows
 from servod.common.errors import AnswerIsNo
-from servod.common.report_files import write_bytes
+from servod.common.files import write_bytes
 from servod.formats.gains.design import Uncertainty
 from servod.formats.gains.gain_set import GainSet
 from servod.formats.model.axis_model import AxisModel, axis_model_yaml, load_axis_model
-from servod.lab.commission.runs import save_rows
-from servod.lab.deploy.cycles import skipped
+from servod.lab.commission.comparison import save_rows
 from servod.lab.deploy.deployment import deploy
-from servod.lab.deploy.judge import broken
+from servod.lab.deploy.judge import broken, skipped
 from servod.lab.deploy.outcome import Deployment
-from servod.lab.diagnose.engine import Diagnosis, diagnose
+from servod.lab.diagnose.engine import diagnose
+from servod.lab.diagnose.judge.evidence import Diagnosis
 from servod.lab.diagnose.judge.verdict import Verdict
 from servod.lab.recordings import load_recording
-from servod.lab.report.diagnosis_files import MODEL, write_files
+from servod.lab.report.diagnosis import MODEL, write_files
 from servod.lab.synthesize.deployed import Wishes
 from servod.lab.synthesize.gain_set import Options, synthesize
 from servod.lab.synthesize.infeasible import Infeasible
 from servod.lab.tracking.metrics import Array, score
 from servod.lab.verify.certify import verify
 from servod.lab.verify.checks import LEAST_PLANTS
-from servod.lab.verify.measured import least_widths
+from servod.lab.verify.vertices import least_widths
 
 #: Told what is done, and the share of the whole that is.
 Tell = Callable[[str, float], None]

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 import yaml
 
-from servod.client.control import Verb
 from servod.common.shipped import shipped
+from servod.formats.protocol import Verb
 from servod.qualify.faults.actions.processes import ProcessAction
 
 if TYPE_CHECKING:

@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import Field
 
-from servod.client.control import Verb
-from servod.client.processes import child, wait_until
-from servod.qualify.demo.axis import last_core
+from servod.client.processes import child, last_core, wait_until
+from servod.formats.protocol import Verb
 from servod.qualify.faults.actions.base import Action
 from servod.qualify.faults.machine import Process
 from servod.qualify.faults.processes import ProcessAxis
@@ -176,7 +175,7 @@ class CpuLoad(ProcessAction):
         numbers = (self.busy_ms, self.idle_ms, self.for_ms, last_core() if core is None else core)
         log = axis.folder / "load.log"
         with child(
-            "servod.qualify.faults.load", [str(number) for number in numbers if number is not None], log
+            "servod.qualify.faults.machine", [str(number) for number in numbers if number is not None], log
         ) as load:
             return load.wait(_CLIENT_S) == 0
 

@@ -17,7 +17,7 @@ import can
 
 from servod.common.errors import Unreachable
 from servod.runtime.fieldbus.bus import BusCounters, Frame
-from servod.runtime.fieldbus.bus.frames import count_error_frame
+from servod.runtime.fieldbus.bus.socketcan import count_error_frame
 
 _SEND_AT_ONCE = 0.0  # python-can: do not wait for room in the queue
 #: Interfaces whose error frames are those of linux/can/error.h (gs_usb's firmware speaks that format).

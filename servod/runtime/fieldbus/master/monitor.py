@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from canopen.emcy import EmcyError
 
-from servod.common.errors import FaultCode
+from servod.common.faults import FaultCode
 from servod.runtime.fieldbus.cia import EMCY_BASE, HEARTBEAT_BASE, NmtState
 from servod.runtime.fieldbus.master.network import BusNetwork
 

@@ -5,19 +5,119 @@ The steps are kept apart, because their order is the safety of the bring-up: see
 
 from __future__ import annotations
 
-from servod.common.errors import FaultCode, Unreachable
-from servod.formats.config import AmplifierConfig, AxisConfig, EncoderConfig
-from servod.runtime.fieldbus.cia import NmtCommand, NmtState, Obj301
-from servod.runtime.fieldbus.devices import NodePlan, Setup
-from servod.runtime.fieldbus.master.dcf import left_out, write_parameters
-from servod.runtime.fieldbus.master.eds import dictionary_for
-from servod.runtime.fieldbus.master.identity import check_identity, read_identity
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from canopen.objectdictionary import ODVariable, datatypes
+
+from servod.common.errors import Unreachable
+from servod.common.faults import FaultCode
+from servod.formats.config import AmplifierConfig, AxisConfig, EncoderConfig, Identity
+from servod.runtime.fieldbus.cia import NmtCommand, NmtState, Obj301, acts_when_written
+from servod.runtime.fieldbus.devices import NodePlan, SdoAbort, SdoAccess, Setup
+from servod.runtime.fieldbus.master.eds import Dictionary, dictionary_for
 from servod.runtime.fieldbus.master.monitor import NodeWatch
 from servod.runtime.fieldbus.master.network import BusNetwork
 from servod.runtime.fieldbus.master.pdo import configure_pdos
 from servod.runtime.fieldbus.master.planned import Kind, load_setup
 from servod.runtime.fieldbus.master.sdo import NoAnswer, NodeSdo
 from servod.runtime.fieldbus.setup_tools import read_optional, write_checked
+
+# Writes the parameter values of a DCF to a node. Off the control path.
+#
+# A DCF is an EDS with ParameterValue keys: how somebody configured this device with the maker's tool. Only the device's
+# own parameters (0x2000 and up) are taken from it: communication objects are the bring-up's, which verifies them, and
+# what acts when it is written (control word, set-points, outputs, presets) is nobody's to write from a file.
+
+
+_FIRST_DEVICE_OBJECT = 0x2000
+_WRITABLE = ("rw", "rww", "rwr")  # CiA 306; write-only objects are commands, not parameters
+
+
+def parameters(dictionary: Dictionary) -> Iterator[tuple[int, int, int]]:
+    """(index, subindex, value) of the device's parameters that the file gives a value, by rising index."""
+    return (row for row in _values(dictionary) if not acts_when_written(row[0]))
+
+
+def left_out(dictionary: Dictionary) -> list[int]:
+    """Indices of the objects that the file gives a value, but that act when they are written."""
+    return sorted({index for index, _, _ in _values(dictionary) if acts_when_written(index)})
+
+
+def _values(dictionary: Dictionary) -> Iterator[tuple[int, int, int]]:
+    """All writable integers of the device that the file gives a value."""
+    for index in sorted(dictionary.objects):
+        entry = dictionary.objects[index]
+        for variable in (entry,) if isinstance(entry, ODVariable) else entry.values():
+            writable = variable.access_type in _WRITABLE and variable.data_type in datatypes.INTEGER_TYPES
+            if index >= _FIRST_DEVICE_OBJECT and writable and variable.value is not None:
+                yield index, variable.subindex, variable.value
+
+
+def write_parameters(sdo: SdoAccess, dictionary: Dictionary) -> int:
+    """Write each value that the node does not have yet and read it back; how many were written. Raises as SDO does."""
+    written = 0
+    for index, subindex, value in parameters(dictionary):
+        if sdo.read(index, subindex) != value:
+            write_checked(sdo, index, subindex, value)
+            written += 1
+    return written
+
+
+# The identity of a node (0x1018), checked before anything is written to it. Off the control path.
+
+
+#: Sub-index of 0x1018 for each number that the configuration may state.
+_SUBINDEX = {"vendor_id": 1, "product_code": 2, "revision": 3, "serial": 4}
+_PROFILE_MASK = 0xFFFF
+
+
+@dataclass(frozen=True, slots=True)
+class NodeIdentity:
+    """What a node says of itself; numbers that it does not have are None."""
+
+    device_type: int
+    vendor_id: int
+    product_code: int | None
+    revision: int | None
+    serial: int | None
+
+    @property
+    def profile(self) -> int:
+        """Number of the device profile: 402 for drives, 406 for encoders (low word of 0x1000)."""
+        return self.device_type & _PROFILE_MASK
+
+
+def read_identity(sdo: NodeSdo) -> NodeIdentity:
+    """Read 0x1000 and 0x1018; only sub-index 1 is mandatory."""
+
+    def optional(subindex: int) -> int | None:
+        try:
+            return sdo.read(Obj301.IDENTITY, subindex)
+        except SdoAbort:
+            return None
+
+    return NodeIdentity(
+        sdo.read(Obj301.DEVICE_TYPE), sdo.read(Obj301.IDENTITY, 1), optional(2), optional(3), optional(4)
+    )
+
+
+def check_identity(node_id: int, found: NodeIdentity, wanted: Identity, profile: int | None) -> None:
+    """Raise Unreachable when the node is not the configured device, naming each number that differs."""
+    wrong = [
+        f"{name} (0x1018:{subindex}) is {_hex(getattr(found, name))}, configured is {_hex(getattr(wanted, name))}"
+        for name, subindex in _SUBINDEX.items()
+        if getattr(wanted, name) is not None and getattr(wanted, name) != getattr(found, name)
+    ]
+    if profile is not None and found.profile != profile:
+        wrong.append(f"device profile (0x1000) is {found.profile}, the driver needs {profile}")
+    if wrong:
+        raise Unreachable(f"node {node_id} is another device: {'; '.join(wrong)}; nothing was written to it")
+
+
+def _hex(value: int | None) -> str:
+    return "absent" if value is None else f"0x{value:08X}"
+
 
 #: Device profile (0x1000, low word) that a driver kind needs.
 PROFILE = {"amplifier": 402, "encoder": 406}

@@ -7,13 +7,108 @@ from __future__ import annotations
 
 import grp
 import os
+from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Literal
 
 from servod.common.errors import BadInput
-from servod.drivers import driver_table, drivers_of, load_driver
 from servod.formats.config import AxisConfig
-from servod.runtime.fieldbus.devices import Driver, NodePlan, Setup
-from servod.runtime.fieldbus.master.load import BusLoad, bus_load, check_bus_load
+from servod.runtime.fieldbus.cia import HEARTBEAT_BASE, SYNC_ID
+from servod.runtime.fieldbus.devices import Driver, NodePlan, PdoMap, Setup
+from servod.runtime.fieldbus.registry import driver_table, drivers_of, load_driver
+
+# The bus load of an axis, computed from the mapping that will be written, before anything is started.
+#
+# Worst case: every frame with the most stuff bits its length allows. The items are kept apart, so that a refusal can
+# say
+# what uses the bus. Stands on servod.runtime.fieldbus.devices and servod.formats.config; the virtual bus models the
+# same bits by its own code.
+
+
+_LAST_SYNCHRONOUS_TYPE = 240  # CiA 301: 1 to 240 is every n-th SYNC, 0 acyclic synchronous
+_INHIBIT_S = 100e-6
+
+
+def worst_case_bits(data_bytes: int) -> int:
+    """Bits of an 11-bit-identifier data frame with interframe space and the most stuff bits possible.
+
+    8n + 47 + floor((33 + 8n) / 4): of the 47 + 8n bits, 34 + 8n are stuffed, after the first at most every fourth.
+    """
+    return 8 * data_bytes + 47 + (33 + 8 * data_bytes) // 4
+
+
+@dataclass(frozen=True, slots=True)
+class LoadItem:
+    """One cyclic frame on the bus."""
+
+    name: str
+    can_id: int
+    data_bytes: int
+    frames_per_s: float
+
+    @property
+    def bits_per_s(self) -> float:
+        """Bits that this frame takes per second, worst case."""
+        return worst_case_bits(self.data_bytes) * self.frames_per_s
+
+
+@dataclass(frozen=True, slots=True)
+class BusLoad:
+    """All cyclic frames of an axis on a bus of `bit_rate` bit/s."""
+
+    bit_rate: int
+    items: tuple[LoadItem, ...]
+
+    @property
+    def share(self) -> float:
+        """Share of the bit rate, 0 to 1 and beyond."""
+        return sum(item.bits_per_s for item in self.items) / self.bit_rate
+
+    def describe(self) -> str:
+        """The figures in one line, largest first."""
+        largest_first = sorted(self.items, key=lambda item: -item.bits_per_s)
+        parts = [
+            f"{item.name} {worst_case_bits(item.data_bytes)} bit x {item.frames_per_s:g}/s = "
+            f"{100.0 * item.bits_per_s / self.bit_rate:.1f} %"
+            for item in largest_first
+        ]
+        return f"{100.0 * self.share:.1f} % of {self.bit_rate} bit/s ({', '.join(parts)})"
+
+
+def pdo_rate_per_s(pdo: PdoMap, period_s: float) -> float:
+    """Frames per second of a PDO: by SYNC, by its event timer, or, with neither, as its inhibit time allows."""
+    if pdo.receive:
+        return 1.0 / period_s  # the loop sends it every cycle, whatever its type
+    if pdo.transmission_type <= _LAST_SYNCHRONOUS_TYPE:
+        return 1.0 / (period_s * max(1, pdo.transmission_type))
+    if pdo.event_timer_ms:
+        return 1000.0 / pdo.event_timer_ms
+    return 1.0 / max(period_s, pdo.inhibit_100us * _INHIBIT_S)
+
+
+def bus_load(config: AxisConfig, plans: Iterable[NodePlan]) -> BusLoad:
+    """The load of SYNC, all planned PDOs and the heartbeats of master and nodes."""
+    period_s = config.cycle.period_us * 1e-6
+    heartbeat = config.heartbeat
+    master_id = HEARTBEAT_BASE + heartbeat.master_node_id
+    items = [
+        LoadItem("SYNC", SYNC_ID, 0, 1.0 / period_s),
+        LoadItem("heartbeat of the master", master_id, 1, 1000.0 / heartbeat.master_period_ms),
+    ]
+    for plan in plans:
+        node_rate = 1000.0 / heartbeat.node_period_ms
+        items.append(LoadItem(f"heartbeat of node {plan.node_id}", HEARTBEAT_BASE + plan.node_id, 1, node_rate))
+        for pdo in plan.pdos:
+            name = f"node {plan.node_id} {'R' if pdo.receive else 'T'}PDO{pdo.number}"
+            items.append(LoadItem(name, pdo.cob_id, pdo.data_bytes, pdo_rate_per_s(pdo, period_s)))
+    return BusLoad(config.bus.bit_rate, tuple(items))
+
+
+def check_bus_load(load: BusLoad, max_load: float) -> None:
+    """Raise BadInput with all figures when the load exceeds the configured share."""
+    if load.share > max_load:
+        raise BadInput("bus load", load.describe(), f"at most bus.max_load = {100.0 * max_load:g} %")
+
 
 #: What a Unix socket's path may be long (sockaddr_un.sun_path with its end, unix(7)).
 SOCKET_PATH_BYTES = 107

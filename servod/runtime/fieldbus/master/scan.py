@@ -11,9 +11,9 @@ from servod.common.errors import Unreachable
 from servod.runtime.fieldbus.bus import Bus
 from servod.runtime.fieldbus.cia import SDO_ANSWER_BASE, SDO_REQUEST_BASE, Obj301
 from servod.runtime.fieldbus.devices import SdoAbort
-from servod.runtime.fieldbus.master.identity import NodeIdentity, read_identity
 from servod.runtime.fieldbus.master.lss import LssIdentity, LssMaster
 from servod.runtime.fieldbus.master.network import BusNetwork
+from servod.runtime.fieldbus.master.node import NodeIdentity, read_identity
 from servod.runtime.fieldbus.master.sdo import NodeSdo
 
 _READ_DEVICE_TYPE = b"\x40\x00\x10\x00\x00\x00\x00\x00"

@@ -15,9 +15,8 @@ from enum import IntEnum
 
 from servod.runtime.fieldbus.devices import AmplifierFeedback, EncoderFeedback
 from servod.runtime.loop.wiring import checks as judge
-from servod.runtime.loop.wiring.checks import ProofBounds, Push, TorqueLine, Verdict
+from servod.runtime.loop.wiring.checks import REST_CYCLES, SPEED_CYCLES, ProofBounds, Push, Sway, TorqueLine, Verdict
 from servod.runtime.loop.wiring.findings import Finding, Proof
-from servod.runtime.loop.wiring.sway import REST_CYCLES, SPEED_CYCLES, Sway
 
 #: The joint must stand within this time, before the first push and after each.
 _REST_S, _SETTLE_S = 0.5, 0.5

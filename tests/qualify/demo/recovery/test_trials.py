@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from servod.lab.deploy.outcome import Ending
-from servod.lab.recordings.rows import ROW
+from servod.lab.recordings.recording import ROW
 from servod.qualify.demo.recovery import walk
 
 

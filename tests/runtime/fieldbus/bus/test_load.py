@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from servod.common.errors import BadInput
-from servod.drivers import load_driver
 from servod.formats.config import AxisConfig
 from servod.runtime.fieldbus.devices import PdoEntry, PdoMap
-from servod.runtime.fieldbus.master.load import bus_load, check_bus_load, pdo_rate_per_s, worst_case_bits
+from servod.runtime.fieldbus.master.planned import bus_load, check_bus_load, pdo_rate_per_s, worst_case_bits
+from servod.runtime.fieldbus.registry import load_driver
 from tests.axis_limits import LIMITS
 
 

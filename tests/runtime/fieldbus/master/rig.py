@@ -6,7 +6,6 @@ from typing import Any
 
 from witness import axis_config
 
-from servod.drivers import load_driver
 from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.drivers.virtual.world import SteppedWorld
 from servod.formats.model.axis_model import AxisModel
@@ -14,6 +13,7 @@ from servod.runtime.fieldbus.bus import Frame
 from servod.runtime.fieldbus.cia import HEARTBEAT_BASE, SYNC_ID
 from servod.runtime.fieldbus.devices import AmplifierCommand, AmplifierFeedback, EncoderFeedback, Goal
 from servod.runtime.fieldbus.master import Master, NodeEvent
+from servod.runtime.fieldbus.registry import load_driver
 
 JOINT = {"inertia": 0.001, "friction": {"kind": "coulomb_viscous", "coulomb": 0.01, "viscous": 0.05}}
 PERIOD_NS = 1_000_000

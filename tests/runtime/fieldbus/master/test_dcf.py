@@ -14,8 +14,8 @@ from servod.common.errors import Unreachable
 from servod.drivers.cia402_state import decode_status_word
 from servod.runtime.fieldbus.cia import Obj402, acts_when_written
 from servod.runtime.fieldbus.devices import DriveState
-from servod.runtime.fieldbus.master.dcf import parameters
 from servod.runtime.fieldbus.master.eds import load_dictionary
+from servod.runtime.fieldbus.master.node import parameters
 
 
 @pytest.fixture

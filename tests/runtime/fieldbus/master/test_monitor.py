@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterator
 import pytest
 from witness import Witness, axis_config, master, witness
 
-from servod.common.errors import FaultCode, Unreachable
+from servod.common.errors import Unreachable
+from servod.common.faults import FaultCode
 from servod.runtime.fieldbus.cia import NmtCommand
 from servod.runtime.fieldbus.master import Master, NodeEvent
 

@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 from rig import Rig, stepped_world
 
-from servod.common.errors import FaultCode, Unreachable
+from servod.common.errors import Unreachable
+from servod.common.faults import FaultCode
 from servod.common.units import NS_PER_S
 from servod.drivers.virtual.bus_faults import BusFault, FaultKind
 from servod.drivers.virtual.world import SteppedBus

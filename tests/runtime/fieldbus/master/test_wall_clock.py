@@ -15,7 +15,8 @@ from witness import axis_config
 
 from servod.cli.app import run
 from servod.common.clock import WallClock
-from servod.common.errors import FaultCode, Unreachable
+from servod.common.errors import Unreachable
+from servod.common.faults import FaultCode
 from servod.drivers.virtual.bus_faults import BusFault, FaultKind
 from servod.drivers.virtual.server import HubServer, Timing
 from servod.drivers.virtual.settings import VirtualAxisSettings

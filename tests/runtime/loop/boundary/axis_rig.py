@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from servod.common.errors import FAULTS, FaultCode
+from servod.common.faults import FAULTS, FaultCode
 from servod.runtime.fieldbus.devices import DriveState, Mode
 from servod.runtime.loop.axis import Axis, AxisState
 from servod.runtime.loop.commands import Refusal

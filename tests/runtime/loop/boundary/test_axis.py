@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import pytest
 
-from servod.common.errors import FAULTS, NEEDS_RESTART, FaultCode, Reaction
+from servod.common.faults import FAULTS, NEEDS_RESTART, FaultCode, Reaction
 from servod.runtime.fieldbus.devices import DriveState, Goal, Mode, Reason
 from servod.runtime.loop.axis import Axis, AxisState
 from servod.runtime.loop.commands import Refusal

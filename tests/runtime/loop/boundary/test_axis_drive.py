@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from servod.common.errors import FaultCode
+from servod.common.faults import FaultCode
 from servod.runtime.fieldbus.devices import DriveState, Mode, Reason
 from servod.runtime.loop.axis import Axis, AxisState
 from tests.runtime.loop.boundary.axis_rig import (

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from servod.common.errors import FAULTS, FaultCode
+from servod.common.faults import FAULTS, FaultCode
 from servod.runtime.loop.limits import Limits
 from tests.runtime.loop.boundary.feedback import CONFIG, INF, NAN, NOT_FINITE, above, amplifier, below, encoder
 

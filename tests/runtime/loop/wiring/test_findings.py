@@ -8,7 +8,7 @@ import pytest
 
 from servod.client.stepped import SteppedSession
 from servod.client.virtual import rated_torque_mnm
-from servod.common.errors import FAULTS, FaultCode
+from servod.common.faults import FAULTS, FaultCode
 from servod.runtime.loop.axis import AxisState
 from servod.runtime.loop.commands import Op, Refusal
 from servod.runtime.loop.wiring.findings import FINDINGS, Finding, document, sentence

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from servod.common.errors import FAULTS, FaultCode
+from servod.common.faults import FAULTS, FaultCode
 from servod.common.shipped import shipped
 from servod.formats.model.axis_model import AxisModel, axis_model_yaml, load_axis_model
 from servod.formats.wiring import warnings, with_expected
