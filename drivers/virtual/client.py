@@ -38,8 +38,7 @@ def connect(path: str) -> socket.socket:
 
 class VirtualBus:
     """servod.runtime.fieldbus.bus.Bus over the hub's socket at `channel`. With `can_ids`, only these reach this
-    connection
-    (frames that the hub carried before it read the filter excepted).
+    connection (frames that the hub carried before it read the filter excepted).
 
 
     Raises Unreachable when no hub serves there.

@@ -1,8 +1,7 @@
 """A motion under a running daemon's recorder, for clients: whatever ends it, the axis is stopped before all else.
 
 Beside servod.client.control. An interrupt may cut a request in the middle, and with it the connection that the client
-commands
-on; the daemon takes a stop from anybody, so that it goes out on a connection of its own.
+commands on; the daemon takes a stop from anybody, so that it goes out on a connection of its own.
 """
 
 from __future__ import annotations

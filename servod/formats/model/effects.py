@@ -1,8 +1,7 @@
 """Groups of keys of the axis model file for drive, joint, load and encoder, one for each effect; friction's are beside.
 
 Stands between the axis model file and the physics kernels (`servod.kernels.physics`), which obey every group. Torque
-means
-force and rad means m when `axis: linear`. Every group says its equation and source; `servoctl explain` prints it.
+means force and rad means m when `axis: linear`. Every group says its equation and source; `servoctl explain` prints it.
 """
 
 from __future__ import annotations

@@ -1,10 +1,8 @@
 """Where each number stands in the flat parameter tuple and the flat state list that the physics kernels work on.
 
-Stands under every kernel of `servod.kernels.physics`: the kernels are plain functions on `p[i]` and `s[i]`, so that
-the same
-source runs in pure Python (tuple, list) and compiled (float64 arrays). `servod.formats.model.pack` fills `p` from an
-axis model.
-SI units in joint coordinates throughout; for a linear axis read N for N*m, m for rad, kg for kg*m^2.
+Stands under every kernel of `servod.kernels.physics`: the kernels are plain functions on `p[i]` and `s[i]`, so that the
+same source runs in pure Python (tuple, list) and compiled (float64 arrays). `servod.formats.model.pack` fills `p` from
+an axis model. SI units in joint coordinates throughout; for a linear axis read N for N*m, m for rad, kg for kg*m^2.
 """
 
 from __future__ import annotations

@@ -57,8 +57,7 @@ def bounds_from(
 # PD feedback for the experiments, from what is known of the joint so far.
 #
 # Under the walk. The crossover is a share of what the loop's whole lag (delay, hold, velocity filter) allows, so that
-# the
-# same rule holds for every size of axis.
+# the same rule holds for every size of axis.
 
 
 #: Crossover times lag: careful while only the kicks are known, stiff once the delay is.

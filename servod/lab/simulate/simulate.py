@@ -25,8 +25,7 @@ from servod.kernels.physics.plant import INNER_STEP_S, rest_state
 # The closed loop as a kernel: axis, encoder, velocity filter, delay and any control law, sample by sample.
 #
 # Compiled by `servod.lab.simulate.simulate`, which puts the law in place of `control_law`. The velocity filter is that
-# of the
-# encoder driver (difference over the measured time, exact first-order low-pass), so simulator and axis agree.
+# of the encoder driver (difference over the measured time, exact first-order low-pass), so simulator and axis agree.
 
 
 #: A row of the kernel's output, in this order.

@@ -1,13 +1,11 @@
 """The LMI programme of the deployed mode: sampled polytopic H2 with a pole disc, one Lyapunov matrix per vertex.
 
 Stands on cvxpy; in: scaled vertices (servod.lab.verify.vertices), out: feedback of [x, v_f, u_(k-1), ...] and the
-matrices
-that prove it.
-The bristle either sticks or slides: two polytopes, each with its own slack, one feedback for both (one slack for both
-was infeasible for every gain). Neither the joint's true velocity nor its bristle is fed back, so the slack needs a
-structure that lets R = K G be linear: G = [G1 M, G1 X; G2, G3] and R = [R1 M, R1 X] with M and X fixed gives
-K = R1 inv(G1). Block triangular slack (M = 1, X = 0) was tried first and loses most of Omega_H. Here M and X come from
-an analysis with the last feedback and full slack, in turn: neither step can lose what the other has won.
+matrices that prove it. The bristle either sticks or slides: two polytopes, each with its own slack, one feedback for
+both (one slack for both was infeasible for every gain). Neither the joint's true velocity nor its bristle is fed back,
+so the slack needs a structure that lets R = K G be linear: G = [G1 M, G1 X; G2, G3] and R = [R1 M, R1 X] with M and X
+fixed gives K = R1 inv(G1). Block triangular slack (M = 1, X = 0) was tried first and loses most of Omega_H. Here M and
+X come from an analysis with the last feedback and full slack, in turn: neither step can lose what the other has won.
 
 H2 norm, decay and damping count where the axis performs. Where the Stribeck curve falls, the joint is unstable with
 poles beyond 150 1/s, and the velocity filter and the delay leave room for stability alone (a slow disc): asking for

@@ -26,9 +26,8 @@ from servod.lab.tune.trial import Trial
 #
 # Derivative-free: costs of simulated plants with stiction and encoder steps have no useful slope. Sobol points look for
 # a better valley than that of the start, Nelder-Mead (with bounds, adaptive to the dimension) walks down in it. On
-# these
-# costs that beat differential evolution by up to 40 % at equal budget, and two descents by 10 %. All numbers are shares
-# (0 to 1) of their ranges. Deterministic for a given seed.
+# these costs that beat differential evolution by up to 40 % at equal budget, and two descents by 10 %. All numbers are
+# shares (0 to 1) of their ranges. Deterministic for a given seed.
 
 
 Array = NDArray[np.float64]

@@ -30,8 +30,7 @@ from servod.lab.verify.vertices import Span, ends
 #     A_i = [-a, 0, 1; 0, 0, 1; -dc/m, -kappa/m, -dd/m],  B_2i = [l, 0, K/m],  B_1 = [1, 0; 0, 0; 0, 1/m].
 #
 # Printed, row 3 is (dc, kappa, dd) with B_2 = [l, 0, K] and B_1 = [1, 0, 1]: wrong in sign, without the inertia, and
-# with
-# one disturbance that enters in two places.
+# with one disturbance that enters in two places.
 
 
 KAPPA_SHARE = 0.01  # kappa of (15), the small gain that provides a solution, as a share of c0

@@ -1,8 +1,7 @@
 """The validation motion of a deployment, and what is read from it: short, of small travel, the same before and after.
 
-Under the promise (which simulates it) and under servod.lab.deploy (which runs it). A slow sine passes through the
-fall of
-the Stribeck curve, a brisk one shows inertia and delay, a small step and back shows how the joint is held.
+Under the promise (which simulates it) and under servod.lab.deploy (which runs it). A slow sine passes through the fall
+of the Stribeck curve, a brisk one shows inertia and delay, a small step and back shows how the joint is held.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Wake-up of the loop against cyclictest: same core, priority and interval, one straight after the other.
 
-The loop's own waiting is what is measured: servod.runtime.loop.process.run with a cycle that only notes its lag,
-under the same
-real-time grants, in a process of its own (`python -m servod.qualify.bench.wakeup CORE PRIORITY CYCLES`).
+The loop's own waiting is what is measured: servod.runtime.loop.process.run with a cycle that only notes its lag, under
+the same real-time grants, in a process of its own (`python -m servod.qualify.bench.wakeup CORE PRIORITY CYCLES`).
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """All that an axis of the trial can do, as plain numbers; zero (or one for factors) is absent.
 
-Stands under the trial's plant. Deliberately not the axis model of `servod.formats.model.axis_model`: other
-quantities, other forms,
-so that the trial does not ask the diagnosis for its own equations.
+Stands under the trial's plant. Deliberately not the axis model of `servod.formats.model.axis_model`: other quantities,
+other forms, so that the trial does not ask the diagnosis for its own equations.
 """
 
 from __future__ import annotations

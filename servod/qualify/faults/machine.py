@@ -177,8 +177,7 @@ def _child_of(pid: int) -> int:
 # CORE`.
 #
 # Beside everything; what an interrupt storm, a backup or a badly written driver does to the core of the loop. Without
-# the
-# right to real-time scheduling it is an ordinary program, as the loop is then one too.
+# the right to real-time scheduling it is an ordinary program, as the loop is then one too.
 
 
 _PRIORITY = 95

@@ -24,8 +24,7 @@ from servod.qualify.faults.under_test import AxisUnderTest, Observation
 # Whether what a scenario injects really happened: a fault that hits nothing proves nothing.
 #
 # Part of the judge. Each action knows its trace: frames that the hub struck, a node that took a value, a process that
-# got
-# its signal. Beside the injection on purpose: an injection that does nothing cannot say that it did.
+# got its signal. Beside the injection on purpose: an injection that does nothing cannot say that it did.
 
 
 class Effects:

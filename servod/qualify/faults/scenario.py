@@ -1,8 +1,7 @@
 """A fault scenario as its file states it: what is injected when, what must happen, and how one recovers.
 
 One YAML file is one scenario, or several that differ in a few values (`servod.qualify.faults.variants`). What an
-injection
-does stands in `servod.qualify.faults.actions`.
+injection does stands in `servod.qualify.faults.actions`.
 """
 
 from __future__ import annotations

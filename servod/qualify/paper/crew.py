@@ -1,8 +1,7 @@
 """Work on several processes: jobs with a weight each, progress by what is done, and a clean end at Ctrl-C.
 
 Under the walk; the processes are those of servod.common.workers. Jobs are plain functions on plain values; a worker
-never
-leaves files that count.
+never leaves files that count.
 """
 
 from __future__ import annotations

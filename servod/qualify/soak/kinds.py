@@ -45,11 +45,10 @@ class FaultKind:
     """One kind. `do` and `undo` are actions of servod.qualify.faults.actions, with ranges where a number is drawn.
 
     `expects`: one of these at least is latched, within `latched_ms` of the injection; empty: the axis rides through it,
-    and its trace on the bus (servod.qualify.soak.traces) shows that it happened. Where something is expected, the
-    drive has
-    left the controller's command within `left_ms`, and the joint feels no torque from `gone_ms` on.
-    `takes_syncs`: SYNC frames of this axis may be missing on the bus; `deaf_cycles`: so many commands may not reach the
-    drive; `of_control`: the controller must act for it to be seen.
+    and its trace on the bus (servod.qualify.soak.traces) shows that it happened. Where something is expected, the drive
+    has left the controller's command within `left_ms`, and the joint feels no torque from `gone_ms` on. `takes_syncs`:
+    SYNC frames of this axis may be missing on the bus; `deaf_cycles`: so many commands may not reach the drive;
+    `of_control`: the controller must act for it to be seen.
     """
 
     name: str

@@ -1,8 +1,7 @@
 """The gain sets of a running axis: which stands behind the serial number in the cycle record, and changes between sets.
 
 Around the loop. The store (servod.formats.gains.store) keeps files; the bank knows what the loop runs now. A set
-becomes the
-store's active one only after the loop has taken it.
+becomes the store's active one only after the loop has taken it.
 """
 
 from __future__ import annotations

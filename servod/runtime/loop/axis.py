@@ -1,9 +1,8 @@
 """The axis: from what is wanted and what the drive says to a goal for the drive and a share of torque, each cycle.
 
 Stands between drivers and controller on the data path. It enables only on an explicit request, turns each fault into
-its reaction (servod.common.faults.FAULTS), and brings the axis to rest by one of three ways: braking the reference
-and then
-ramping the torque down (DISABLE, SHUTDOWN, a lost supervisor), the drive's quick stop, or voltage off at once.
+its reaction (servod.common.faults.FAULTS), and brings the axis to rest by one of three ways: braking the reference and
+then ramping the torque down (DISABLE, SHUTDOWN, a lost supervisor), the drive's quick stop, or voltage off at once.
 """
 
 from __future__ import annotations

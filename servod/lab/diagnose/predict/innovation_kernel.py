@@ -1,9 +1,8 @@
 """One-step predictions of a recorded motion, as a kernel: the model under the recorded command, pulled to the encoder.
 
 Compiled by `servod.lab.diagnose.predict.predict`. Between two rows the model runs freely; at each row its motion is
-corrected by
-fixed gains. What is left at a row before the correction is the innovation: noise when the model is right (Ljung,
-System Identification, 1999, ch. 7: prediction-error methods).
+corrected by fixed gains. What is left at a row before the correction is the innovation: noise when the model is right
+(Ljung, System Identification, 1999, ch. 7: prediction-error methods).
 """
 
 from __future__ import annotations

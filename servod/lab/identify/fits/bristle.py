@@ -119,10 +119,8 @@ def _searched(
 # Friction that follows its steady curve over a way: the LuGre bristle along a recorded motion, linear in the curve.
 #
 # Under the friction map. Of dz/dt = v - s0*|v|/g(v)*z follows, over the way s, d(s0*z)/ds = (sign(v)*g(v) - s0*z)/L
-# with
-# L = g/s0: the bristle's force is the steady curve behind a first-order low-pass over way. Given L, which an earlier
-# fit
-# knows well enough, it is linear in g (the paper's (1), (7) and (18)).
+# with L = g/s0: the bristle's force is the steady curve behind a first-order low-pass over way. Given L, which an
+# earlier fit knows well enough, it is linear in g (the paper's (1), (7) and (18)).
 
 
 class Bristle(NamedTuple):

@@ -20,8 +20,7 @@ from servod.runtime.fieldbus.registry import driver_table, drivers_of, load_driv
 # The bus load of an axis, computed from the mapping that will be written, before anything is started.
 #
 # Worst case: every frame with the most stuff bits its length allows. The items are kept apart, so that a refusal can
-# say
-# what uses the bus. Stands on servod.runtime.fieldbus.devices and servod.formats.config; the virtual bus models the
+# say what uses the bus. Stands on servod.runtime.fieldbus.devices and servod.formats.config; the virtual bus models the
 # same bits by its own code.
 
 
