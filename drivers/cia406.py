@@ -7,26 +7,17 @@ sample changes the step of the filter, never its time constant.
 
 from __future__ import annotations
 
-import math
 import struct
 
-from servod.common.units import NS_PER_S, TWO_PI, rad_per_count, wrapped_difference
+from servod.common.units import NS_PER_S, rad_per_count, wrapped_difference
 from servod.drivers.cia406_setup import EncoderSetup
 from servod.drivers.pdo_codec import codec, find, lost_after_cycles, slot
+from servod.kernels.filters import low_pass_share, velocity_delay_s
 from servod.runtime.fieldbus.cia import Obj406
 from servod.runtime.fieldbus.devices import ALARMS_STALE, NEVER_CYCLES, Driver, EncoderFeedback, NodePlan
 
 #: Lengths of the objects that this driver decodes (CiA 406).
 _FORMATS: dict[int, str] = {Obj406.POSITION: "I", Obj406.ALARMS: "H", Obj406.WARNINGS: "H"}
-
-
-def velocity_delay_s(period_s: float, cutoff_hz: float) -> float:
-    """How far the low-passed difference lags the true velocity at low frequency, in s.
-
-    Half the differentiation span plus the group delay at DC of y += a (x - y), a = 1 - exp(-2 pi f T): T (1 - a) / a.
-    """
-    kept = math.exp(-TWO_PI * cutoff_hz * period_s)
-    return period_s * (0.5 + kept / (1.0 - kept))
 
 
 class Cia406Encoder:
@@ -47,10 +38,10 @@ class Cia406Encoder:
         self._rad_per_count = int(facts["direction"]) * rad_per_count(int(facts["counts_per_turn"]))
         self._zero_offset_rad = float(facts["zero_offset_rad"])
         self._zero_counts = round(self._zero_offset_rad / self._rad_per_count)
-        self._cutoff_rad_s = TWO_PI * float(facts["velocity_cutoff_hz"])
+        self._cutoff_hz = float(facts["velocity_cutoff_hz"])
         self.receive_ids: tuple[int, ...] = (self._position_id,) + (() if alarm_pdo is None else (self._alarm_id,))
         self.sync_frames = 1
-        self.delay_s = velocity_delay_s(float(facts["period_s"]), float(facts["velocity_cutoff_hz"]))
+        self.delay_s = velocity_delay_s(float(facts["period_s"]), self._cutoff_hz)
         self.ignored_frames = 0
         self._raw = -1  # before the first sample
         self._unwrapped = 0
@@ -96,7 +87,7 @@ class Cia406Encoder:
             return
         elapsed_s = elapsed_ns / NS_PER_S
         velocity = counts * self._rad_per_count / elapsed_s
-        self._velocity_rad_s += (1.0 - math.exp(-self._cutoff_rad_s * elapsed_s)) * (velocity - self._velocity_rad_s)
+        self._velocity_rad_s += low_pass_share(self._cutoff_hz, elapsed_s) * (velocity - self._velocity_rad_s)
 
     def read(self) -> EncoderFeedback:
         """The feedback of this cycle; each call is one cycle, so the age grows by one when no sample came."""

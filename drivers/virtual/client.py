@@ -13,6 +13,7 @@ import time
 
 from servod.common.errors import Unreachable
 from servod.drivers.virtual.bus_faults import BusFault, FaultKind
+from servod.formats.config import BusConfig
 from servod.runtime.fieldbus.bus import CAN_ERR_FLAG, CAN_FRAME, BusCounters, Frame
 from servod.runtime.fieldbus.bus.socketcan import count_error_frame
 
@@ -40,7 +41,6 @@ class VirtualBus:
     """servod.runtime.fieldbus.bus.Bus over the hub's socket at `channel`. With `can_ids`, only these reach this
     connection (frames that the hub carried before it read the filter excepted).
 
-
     Raises Unreachable when no hub serves there.
     """
 
@@ -49,6 +49,11 @@ class VirtualBus:
         self._socket = connect(channel)
         for can_id in can_ids or ():
             self.inject(BusFault(FaultKind.ACCEPT, can_id))
+
+    @classmethod
+    def configured(cls, config: BusConfig, can_ids: tuple[int, ...] | None = None) -> VirtualBus:
+        """The bus that a configuration names; the hub filters. Raises Unreachable."""
+        return cls(config.channel, can_ids)
 
     def send(self, can_id: int, data: bytes) -> bool:
         """Queue one frame; False and counted when the hub does not take it, the bus is off or the hub is gone."""

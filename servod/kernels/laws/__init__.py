@@ -71,3 +71,6 @@ LAWS: dict[str, Law] = {
 }
 
 LAW_BY_NUMBER: dict[int, Law] = {int(law.number): law for law in LAWS.values()}
+
+#: What each law is called where people read it.
+LABELS = {"pd": "PD", "pd_dob": "PD + DOB", "pd_lugre": "PD + LuGre", "local": "Local models"}

@@ -9,9 +9,8 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol
 
-from servod.formats.model.axis_model import AxisModel
 from servod.kernels.physics import layout as lay
 from servod.kernels.physics.compiled import available, compiled
 from servod.kernels.physics.dynamics import advance
@@ -33,6 +32,45 @@ def rest_state(delay_s: float, step_s: float, temperature_c: float) -> list[floa
     return state
 
 
+class PlantNoise(Protocol):
+    """What disturbs a plant, as RMS; the torque's noise is low-passed."""
+
+    @property
+    def torque_rms(self) -> float:
+        """N*m."""
+
+    @property
+    def torque_bandwidth_hz(self) -> float:
+        """Hz."""
+
+    @property
+    def encoder_rms(self) -> float:
+        """rad, at each reading."""
+
+    @property
+    def temperature_rms_c(self) -> float:
+        """degC, at each reading."""
+
+
+class PlantModel(Protocol):
+    """What a plant asks of an axis model: its flat parameters, and what is not among them."""
+
+    @property
+    def noise(self) -> PlantNoise | None:
+        """Noise of torque and readings; None for a plant without."""
+
+    @property
+    def total_delay_s(self) -> float:
+        """Command to torque, s."""
+
+    @property
+    def start_temperature_c(self) -> float:
+        """Temperature of the joint before it moves, degC."""
+
+    def pack(self) -> Sequence[float]:
+        """The parameters in the order of `servod.kernels.physics.layout`."""
+
+
 class Plant:
     """One joint in motion; all values SI in joint coordinates.
 
@@ -41,7 +79,7 @@ class Plant:
     """
 
     def __init__(
-        self, model: AxisModel, seed: int = 0, *, delay_s: float | None = None, compile_kernel: bool | None = None
+        self, model: PlantModel, seed: int = 0, *, delay_s: float | None = None, compile_kernel: bool | None = None
     ) -> None:
         self.model = model
         self.delay_s = model.total_delay_s if delay_s is None else max(0.0, delay_s)

@@ -11,6 +11,7 @@ from typing import Any
 from servod.client.open import VirtualWalkAxis
 from servod.formats.gains.gain_set import GainSet, load_gains
 from servod.formats.model.axis_model import AxisModel, load_axis_model
+from servod.kernels.laws import LABELS
 from servod.lab.commission.comparison import DEPLOYED, load_curves, load_rows, run_files
 from servod.lab.commission.state import (
     AFTER_ROWS,
@@ -41,7 +42,6 @@ from servod.lab.report.figures.motion import Motion
 from servod.lab.report.page import Page
 from servod.lab.report.pictures import write_pictures
 from servod.lab.tracking.metrics import STEPS_MRAD, Curves, curve_key
-from servod.qualify.demo.axis import LABELS
 
 Part = Figure | Table | str
 #: Laws as people read them.

@@ -8,8 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from servod.common.errors import AnswerIsNo
-from servod.drivers.cia406 import velocity_delay_s
 from servod.formats.config import AxisConfig, LimitsConfig
+from servod.kernels.filters import velocity_delay_s
 
 #: Share of each configured limit that experiments use.
 SHARE = 0.85

@@ -15,9 +15,6 @@ from servod.formats.config import AxisConfig
 #: The four laws of the comparison, in the order of the table; each has its gain set `gains/demo_<law>.yaml`.
 CONTROLLERS = ("pd", "pd_dob", "pd_lugre", "local")
 
-#: What each law is called where people read it.
-LABELS = {"pd": "PD", "pd_dob": "PD + DOB", "pd_lugre": "PD + LuGre", "local": "Local models"}
-
 
 def gains_file(controller: str) -> Path:
     """The shipped gain set of one law."""

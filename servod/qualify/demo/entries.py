@@ -14,7 +14,8 @@ from servod.common.errors import BadInput
 from servod.common.shipped import shipped
 from servod.formats.gains.gain_set import GainSet, load_gains
 from servod.formats.gains.parameters import LocalParameters, PdDobParameters, PdLugreParameters
-from servod.qualify.demo.axis import CONTROLLERS, LABELS, gains_file
+from servod.kernels.laws import LABELS
+from servod.qualify.demo.axis import CONTROLLERS, gains_file
 
 #: Gain sets that run beside the four controllers where that is cheap: the local law without options, and the paper's
 #: Table I in both readings of its gain labels.

@@ -18,8 +18,6 @@ DRIVERS: dict[str, str] = {
     "cia402": "servod.drivers.cia402:DRIVER",
     "cia406": "servod.drivers.cia406:DRIVER",
 }
-
-
 ENTRY_POINT_GROUP = "servod.drivers"
 
 

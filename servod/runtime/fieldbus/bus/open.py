@@ -1,12 +1,22 @@
 """Opens the bus that the configuration names; the only place that knows which class stands behind which interface.
 
-The classes are imported here on demand: the loop on SocketCAN loads neither python-can nor the virtual world.
+The classes are named as text and imported on demand: the loop on SocketCAN loads neither python-can nor the virtual
+world. An interface that is not in the table is one of python-can's.
 """
 
 from __future__ import annotations
 
+from importlib import import_module
+
 from servod.formats.config import BusConfig
 from servod.runtime.fieldbus.bus import Bus
+
+#: interface -> (module, class with `configured(BusConfig, can_ids)`).
+BUSES: dict[str, tuple[str, str]] = {
+    "socketcan": ("servod.runtime.fieldbus.bus.socketcan", "SocketCanBus"),
+    "virtual": ("servod.drivers.virtual.client", "VirtualBus"),
+}
+_OTHERS = ("servod.runtime.fieldbus.bus.python_can", "PythonCanBus")
 
 
 def open_bus(config: BusConfig, can_ids: tuple[int, ...] | None = None) -> Bus:
@@ -14,15 +24,6 @@ def open_bus(config: BusConfig, can_ids: tuple[int, ...] | None = None) -> Bus:
 
     Raises Unreachable when the interface, the hub's socket or python-can's driver is not there.
     """
-    if config.interface == "socketcan":
-        from servod.runtime.fieldbus.bus.socketcan import SocketCanBus
-
-        return SocketCanBus.open(config.channel, can_ids)
-    if config.interface == "virtual":
-        from servod.drivers.virtual.client import VirtualBus
-
-        bus: Bus = VirtualBus(config.channel, can_ids)
-        return bus
-    from servod.runtime.fieldbus.bus.python_can import PythonCanBus
-
-    return PythonCanBus.open(config.interface, config.channel, config.bit_rate, config.options)
+    module, name = BUSES.get(config.interface, _OTHERS)
+    bus: Bus = getattr(import_module(module), name).configured(config, can_ids)
+    return bus

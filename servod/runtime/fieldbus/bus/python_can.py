@@ -16,6 +16,7 @@ from typing import Any
 import can
 
 from servod.common.errors import Unreachable
+from servod.formats.config import BusConfig
 from servod.runtime.fieldbus.bus import BusCounters, Frame
 from servod.runtime.fieldbus.bus.socketcan import count_error_frame
 
@@ -33,6 +34,11 @@ class PythonCanBus:
         self.counters = BusCounters()
         self._bus = bus
         self._kernel_errors = kernel_errors
+
+    @classmethod
+    def configured(cls, config: BusConfig, can_ids: tuple[int, ...] | None = None) -> PythonCanBus:
+        """The bus that a configuration names; python-can filters nothing for us. Raises Unreachable."""
+        return cls.open(config.interface, config.channel, config.bit_rate, config.options)
 
     @classmethod
     def open(cls, interface: str, channel: str, bit_rate: int, options: dict[str, Any]) -> PythonCanBus:

@@ -17,6 +17,7 @@ import time
 
 from servod.common.errors import Unreachable
 from servod.common.units import NS_PER_S
+from servod.formats.config import BusConfig
 from servod.runtime.fieldbus.bus import (
     CAN_EFF_FLAG,
     CAN_ERR_BUSOFF,
@@ -104,6 +105,11 @@ class SocketCanBus:
         sock.setblocking(False)
         self._poll = select.poll()
         self._poll.register(sock, select.POLLIN)
+
+    @classmethod
+    def configured(cls, config: BusConfig, can_ids: tuple[int, ...] | None = None) -> SocketCanBus:
+        """The bus that a configuration names; the kernel filters. Raises Unreachable."""
+        return cls.open(config.channel, can_ids)
 
     @classmethod
     def open(cls, interface: str, can_ids: tuple[int, ...] | None = None) -> SocketCanBus:

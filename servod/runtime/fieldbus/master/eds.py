@@ -12,6 +12,7 @@ import logging
 import re
 from dataclasses import dataclass, field
 from functools import lru_cache
+from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any
 
@@ -132,6 +133,6 @@ def dictionary_for(driver: str, eds: str | None, node_id: int) -> Dictionary:
 @lru_cache(maxsize=16)
 def _generic(driver: str, node_id: int) -> Dictionary:
     """A dictionary that ships; whoever brings up many axes in one process reads it once."""
-    from servod import drivers
-
-    return load_dictionary(Path(drivers.__file__).parent / "eds" / GENERIC_EDS[driver], node_id)
+    shipped = files("servod") / "drivers" / "eds" / GENERIC_EDS[driver]
+    with as_file(shipped) as path:
+        return load_dictionary(path, node_id)
