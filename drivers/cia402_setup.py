@@ -13,7 +13,7 @@ from servod.drivers.cia402_state import decode_status_word
 from servod.drivers.cia402_target import target_type
 from servod.drivers.quirks import Presence, Quirks, load_quirks
 from servod.runtime.fieldbus.cia import RPDO_BASE, TPDO_BASE, Obj402
-from servod.runtime.fieldbus.devices import DriveState, Mode, NodePlan, PdoEntry, PdoMap, SdoAccess
+from servod.runtime.fieldbus.devices import Mode, NodePlan, PdoEntry, PdoMap, SdoAccess
 from servod.runtime.fieldbus.setup_tools import read_optional, write_checked, write_optional
 
 if TYPE_CHECKING:
@@ -27,7 +27,6 @@ SUPPORTED_MODE_BIT = {
     Mode.CYCLIC_SYNC_TORQUE: 9,
 }
 _SLOW_TIMER_MS = 100
-_POWERED = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE, DriveState.FAULT_REACTION_ACTIVE)
 
 
 def amplifier_pdos(node_id: int, mode: Mode, command_deadline_ms: int) -> tuple[PdoMap, ...]:
@@ -102,7 +101,7 @@ class AmplifierSetup:
     def inspect(self, sdo: SdoAccess) -> None:
         """Refuse a powered drive: it may be another axis's, or this one's whose heartbeat time-out still runs."""
         state = decode_status_word(sdo.read(Obj402.STATUS_WORD))
-        if state in _POWERED:
+        if state.powered:
             raise Unreachable(
                 f"amplifier node {self._amplifier.node_id} is powered ({state.name}): "
                 "nothing is sent to it; disable it or wait for its heartbeat time-out, then start again"

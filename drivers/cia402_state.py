@@ -69,8 +69,8 @@ _HOLD: dict[Goal, tuple[DriveState, int, int]] = {
     Goal.QUICK_STOP: (_S.QUICK_STOP_ACTIVE, CW_QUICK_STOP, CW_QUICK_STOP),
 }
 
-#: States without torque: there a goal of OFF or QUICK_STOP has nothing left to do.
-UNPOWERED = frozenset({_S.NOT_READY_TO_SWITCH_ON, _S.SWITCH_ON_DISABLED, _S.FAULT})
+#: There a goal of OFF or QUICK_STOP has nothing left to do; from the other states without power OFF goes on to these.
+_AT_OFF = frozenset({_S.NOT_READY_TO_SWITCH_ON, _S.SWITCH_ON_DISABLED, _S.FAULT})
 
 
 def quick_stop_stays(quick_stop_option: int) -> bool:
@@ -112,9 +112,9 @@ def reached_states(quick_stop_option: int) -> tuple[tuple[bool, ...], ...]:
     A quick stop that the drive leaves by itself (0x605A 0 to 4) is reached only when it has left: cutting it short by
     disable voltage would let the axis coast.
     """
-    stopped = UNPOWERED | ({_S.QUICK_STOP_ACTIVE} if quick_stop_stays(quick_stop_option) else set())
+    stopped = _AT_OFF | ({_S.QUICK_STOP_ACTIVE} if quick_stop_stays(quick_stop_option) else set())
     wanted = {
-        Goal.OFF: UNPOWERED,
+        Goal.OFF: _AT_OFF,
         Goal.READY: {_S.READY_TO_SWITCH_ON},
         Goal.ENABLED: {_S.OPERATION_ENABLED},
         Goal.QUICK_STOP: stopped,

@@ -142,7 +142,7 @@ class SteppedSession:
         timeout_s = self.config.amplifier.enable_timeout_s + self.config.wiring_proof.timeout_s
         for _ in range(round(timeout_s / _ENABLE_STEP_S)):
             self.run(_ENABLE_STEP_S)
-            if self.cycle.axis.state not in (AxisState.ENABLING, AxisState.PROVING):
+            if not self.cycle.axis.state.starting:
                 break
         if self.cycle.axis.state != AxisState.ENABLED:
             raise AnswerIsNo(f"the axis is {self.cycle.axis.state.name}, not enabled. {self.why}")

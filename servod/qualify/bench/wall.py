@@ -77,10 +77,9 @@ def _watch_memory(client: ControlClient, pids: dict[str, int], duration_s: float
 
 
 def _processes(daemon_pid: int) -> dict[str, int]:
-    """The supervisor and its child, the loop."""
-    children = Path(f"/proc/{daemon_pid}/task/{daemon_pid}/children").read_text().split()
-    loops = [int(pid) for pid in children if b"servod.runtime.loop" in Path(f"/proc/{pid}/cmdline").read_bytes()]
-    return {"supervisor": daemon_pid, "loop": loops[0]}
+    """The supervisor and its only child, the loop (proc(5), task/children)."""
+    (loop,) = Path(f"/proc/{daemon_pid}/task/{daemon_pid}/children").read_text().split()
+    return {"supervisor": daemon_pid, "loop": int(loop)}
 
 
 def _growth_mib(samples_kib: list[int]) -> float:

@@ -18,7 +18,7 @@ from servod.common.errors import AnswerIsNo, BadInput
 from servod.drivers.virtual.drive_record import DriveSample
 from servod.formats.recording.mcap_reader import read_recording
 from servod.formats.recording.record import CycleRecord
-from servod.qualify.faults.scenario import POWERED, Runs, Scenario, Start
+from servod.qualify.faults.scenario import Runs, Scenario, Start
 from servod.qualify.faults.under_test import MOTION
 from servod.runtime.fieldbus.devices import DriveState
 
@@ -62,7 +62,7 @@ def record_complaints(scenario: Scenario, samples: Sequence[DriveSample], watch:
     elif (short_ms := (watch.ended_ns - samples[-1].time_ns) / _NS_PER_MS) > _REACHES_MS[scenario.runs]:
         yield f"the drive's record ends {short_ms:.0f} ms before the end of the watch"
     settled = [s.state for s in before if s.time_ns < watch.injected_ns - _SAME_NS]
-    if settled and scenario.start in POWERED and settled[-1] is not DriveState.OPERATION_ENABLED:
+    if settled and scenario.start.powered and settled[-1] is not DriveState.OPERATION_ENABLED:
         yield f"the drive was in {settled[-1].name} at the injection, not in operation enabled"
     if scenario.start in (Start.MOVING, Start.PROVING) and not _felt(before, watch):
         yield "the joint felt no torque before the injection: a time until it is gone tells nothing"
@@ -72,7 +72,7 @@ def motion_complaints(scenario: Scenario, samples: Sequence[DriveSample], watch:
     """What an axis that should go on did otherwise: by itself, an ENABLED at the end says little."""
     expected = scenario.expect
     after = [s for s in samples if s.time_ns > watch.injected_ns]
-    if not expected.stays_enabled or scenario.start not in POWERED or not after:
+    if not expected.stays_enabled or not scenario.start.powered or not after:
         return
     for state in sorted({s.state.name for s in after} - {DriveState.OPERATION_ENABLED.name}):
         yield f"the drive went to {state} on the way"

@@ -8,7 +8,7 @@ from servod.common.errors import BadInput
 from servod.drivers.virtual.drive_record import DriveSample
 from servod.qualify.faults.actions import action_of
 from servod.qualify.faults.evidence import Watch, motion_complaints, record_complaints
-from servod.qualify.faults.scenario import FEEDBACK_LOSS_MS, MASTER_LOSS_MS, POWERED, Expectation, Loss, Scenario
+from servod.qualify.faults.scenario import FEEDBACK_LOSS_MS, MASTER_LOSS_MS, Expectation, Loss, Scenario
 from servod.qualify.faults.under_test import Observation
 from servod.runtime.fieldbus.devices import DriveState
 from servod.runtime.loop.axis import AxisState
@@ -141,7 +141,7 @@ def _ms(time_ns: int | None, since_ns: int) -> float | None:
 
 def loss_of(scenario: Scenario) -> Loss:
     """The loss with the tightest bound among those of its actions; an axis without power has nothing to lose."""
-    if scenario.start not in POWERED:
+    if not scenario.start.powered:
         return Loss.NONE
     losses = {action_of(i, scenario.title, scenario.runs).loss() for i in scenario.inject}
     return next((loss for loss in (Loss.FEEDBACK, Loss.MASTER) if loss in losses), Loss.NONE)

@@ -51,9 +51,10 @@ class Start(StrEnum):
     MOVING = "moving"  # in the middle of a sine, at its fastest, with friction to overcome
     PROVING = "proving"  # in the test of the wiring, while it pushes the joint
 
-
-#: Starts in which the drive has power, so that there is something to lose.
-POWERED = (Start.ENABLED, Start.MOVING, Start.PROVING)
+    @property
+    def powered(self) -> bool:
+        """The drive has power, so that there is something to lose."""
+        return self in (Start.ENABLED, Start.MOVING, Start.PROVING)
 
 
 class Loss(StrEnum):

@@ -21,7 +21,7 @@ _CODES = {"q": "<i8", "H": "<u2", "h": "<i2", "d": "<f8"}
 SAMPLE_ROW = np.dtype(
     [(name, _CODES[code]) for name, code in zip(DriveSample._fields, SAMPLE.format.lstrip("<"), strict=True)]
 )
-_ENERGISED = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE, DriveState.FAULT_REACTION_ACTIVE)
+_POWERED = [state for state in DriveState if state.powered]
 
 
 def samples_of(raw: bytes) -> Samples:
@@ -56,7 +56,7 @@ class DriveCheck:
         times_ns, torque_nm = samples["time_ns"], np.abs(samples["torque_nm"])
         back = np.diff(times_ns, prepend=max(self._time_ns, int(times_ns[0]) - self._order_ns)) < -self._order_ns
         self._first(Wrong.TIME, samples, back, "the drive's record goes back in time")
-        energised = np.isin(samples["state"], _ENERGISED)
+        energised = np.isin(samples["state"], _POWERED)
         self._first(Wrong.TORQUE, samples, ~energised & (torque_nm > NO_TORQUE_NM), "torque in a drive that is off")
         self._first(Wrong.LIMIT, samples, torque_nm > self._limit_nm, "torque above the drive's maximum")
         finite = np.isfinite(samples["position_rad"]) & np.isfinite(samples["velocity_rad_s"])

@@ -39,7 +39,7 @@ _OWN = (
 )
 _REAL = tuple(f.name for f in FIELDS if f.kind == "d" and f.name not in _OWN)
 #: Where torque is commanded.
-_CONTROLLED = (AxisState.PROVING, AxisState.ENABLED, AxisState.BRAKING, AxisState.RAMPING)
+_POWERED = [state for state in AxisState if state.powered]
 _OFF = (
     *(DriveState.NOT_READY_TO_SWITCH_ON, DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON),
     *(DriveState.FAULT_REACTION_ACTIVE, DriveState.FAULT),
@@ -48,7 +48,7 @@ _OFF = (
 _SETTLED: dict[AxisState, tuple[DriveState, ...]] = {
     AxisState.DISABLED: _OFF,
     AxisState.ENABLING: (*_OFF, DriveState.SWITCHED_ON, DriveState.OPERATION_ENABLED),
-    **dict.fromkeys(_CONTROLLED, (DriveState.OPERATION_ENABLED,)),
+    **dict.fromkeys(_POWERED, (DriveState.OPERATION_ENABLED,)),
     AxisState.QUICK_STOPPING: (*_OFF, DriveState.QUICK_STOP_ACTIVE),
     AxisState.FAULT: _OFF,
 }
@@ -124,7 +124,7 @@ class RowCheck:
         self._first(Wrong.NOT_FINITE, rows, bad | (own & ~told), "a number that is not finite")
         torque_nm = rows["torque_nm"]
         self._first(Wrong.LIMIT, rows, np.abs(torque_nm) > self._limit_nm, "torque above limits.torque_nm")
-        uncontrolled = ~np.isin(rows["axis_state"], _CONTROLLED)
+        uncontrolled = ~np.isin(rows["axis_state"], _POWERED)
         self._first(Wrong.TORQUE, rows, uncontrolled & (torque_nm != 0.0), "torque sent while not controlled")
 
     def _faults(self, rows: Rows, explained: Bits) -> None:

@@ -48,17 +48,7 @@ from servod.runtime.loop.wiring.findings import document, sentence
 
 log = logging.getLogger("servod.control")
 
-_ON_THE_WAY = (AxisState.ENABLING, AxisState.PROVING)
-_UNDER_WAY = (*_ON_THE_WAY, AxisState.ENABLED)
 _NOT_PROVEN = FAULTS[FaultCode.WIRING_NOT_PROVEN].bit
-_STOPPED = (AxisState.DISABLED, AxisState.FAULT)
-_UNPOWERED = (
-    DriveState.NOT_READY_TO_SWITCH_ON,
-    DriveState.SWITCH_ON_DISABLED,
-    DriveState.READY_TO_SWITCH_ON,
-    DriveState.SWITCHED_ON,
-    DriveState.FAULT,
-)
 _STOP_TIMEOUT_S = 5.0
 _LEFT = GainsVerdictArgs(note="the client that tried it left", trial=True)
 
@@ -163,7 +153,7 @@ class Verbs:
 
     def _enable(self, args: EnableArgs) -> Flow:
         record = self._loop.latest
-        from_off = int(record is None or record.axis_state not in _UNDER_WAY)
+        from_off = int(record is None or not AxisState(record.axis_state).under_way)
         self._enabling += from_off
         try:
             return (yield from self._enable_and_wait(args))
@@ -174,7 +164,7 @@ class Verbs:
         tests_before, _ = self._loop.proofs
         yield self._send(Op.ENABLE, (float(args.reset_fault), float(args.prove)))
         timeout_s = self._config.amplifier.enable_timeout_s + self._config.wiring_proof.timeout_s + 1.0
-        record: CycleRecord = yield self._until(lambda r: r.axis_state not in _ON_THE_WAY, timeout_s)
+        record: CycleRecord = yield self._until(lambda r: not AxisState(r.axis_state).starting, timeout_s)
         tests, proof = self._loop.proofs
         tested = proof if tests != tests_before else None
         if record.axis_state == AxisState.ENABLED:
@@ -285,7 +275,7 @@ class Verbs:
 
     def _scan(self, _args: NoArgs) -> Flow:
         record = self._loop.latest
-        if record is None or record.axis_state not in _STOPPED:
+        if record is None or not AxisState(record.axis_state).stopped:
             raise Unreachable("refused: scanning needs the axis disabled; run `servoctl disable` first")
         nodes = yield FutureWait(self.slow.submit(self._scan_bus))
         return {"nodes": nodes}
@@ -301,7 +291,8 @@ def _state(record: CycleRecord) -> dict[str, Any]:
 
 def _is_off(record: CycleRecord) -> bool:
     """The axis has stopped, and the drive says so itself, in this cycle."""
-    return record.axis_state in _STOPPED and record.amplifier_age == 0 and record.drive_state in _UNPOWERED
+    stopped, drive = AxisState(record.axis_state).stopped, DriveState(record.drive_state)
+    return stopped and record.amplifier_age == 0 and drive.unpowered
 
 
 def _why_not_enabled(record: CycleRecord) -> str:

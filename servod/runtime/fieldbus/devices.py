@@ -30,11 +30,15 @@ Both
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 from servod.common.errors import Unreachable
+
+if TYPE_CHECKING:
+    from servod.formats.config import AxisConfig
 
 #: A control word in a synchronous RPDO acts at the next SYNC and is seen in the TPDO of the SYNC after it.
 HANDSHAKE_SYNCS = 3
@@ -56,6 +60,25 @@ class DriveState(IntEnum):
     QUICK_STOP_ACTIVE = 6
     FAULT_REACTION_ACTIVE = 7
     FAULT = 8
+
+    @property
+    def powered(self) -> bool:
+        """The drive function is enabled, so that torque may act: by command, or in the drive's own fault reaction."""
+        return self in _POWERED
+
+    @property
+    def commanded(self) -> bool:
+        """Powered, and by command: told to switch off or to stop, the drive has to leave these."""
+        return self in _COMMANDED
+
+    @property
+    def unpowered(self) -> bool:
+        """No torque can act. UNKNOWN is neither powered nor unpowered."""
+        return not (self in _POWERED or self is DriveState.UNKNOWN)
+
+
+_COMMANDED = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
+_POWERED = (*_COMMANDED, DriveState.FAULT_REACTION_ACTIVE)
 
 
 class Goal(IntEnum):
@@ -154,6 +177,7 @@ class Amplifier(Protocol):
 
     receive_ids: tuple[int, ...]  # COB-IDs of its frames
     sync_frames: int  # synchronous frames it sends per SYNC
+    ignored_frames: int  # too short, or not of this device; only grows
 
     def on_frame(self, can_id: int, data: bytes, time_ns: int) -> bool:
         """Take one frame; True when it was this cycle's synchronous feedback. Short frames are ignored and counted."""
@@ -173,6 +197,7 @@ class Encoder(Protocol):
 
     receive_ids: tuple[int, ...]
     sync_frames: int
+    ignored_frames: int
     delay_s: float  # of the velocity against the position: half the differentiation span plus the filter's group delay
 
     def on_frame(self, can_id: int, data: bytes, time_ns: int) -> bool:
@@ -285,5 +310,5 @@ class Driver:
     """One row of the driver table: how to build both faces of a device."""
 
     kind: str  # "amplifier" or "encoder"
-    setup: Any  # (servod.formats.config.AxisConfig) -> Setup
-    cyclic: Any  # (NodePlan) -> Amplifier | Encoder
+    setup: Callable[[AxisConfig], Setup]
+    cyclic: Callable[[NodePlan], Amplifier | Encoder]

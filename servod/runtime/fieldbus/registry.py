@@ -9,9 +9,10 @@ from __future__ import annotations
 from contextlib import suppress
 from importlib import import_module
 from importlib.metadata import entry_points
+from typing import cast
 
 from servod.common.errors import BadInput
-from servod.runtime.fieldbus.devices import Driver
+from servod.runtime.fieldbus.devices import Amplifier, Driver, Encoder, NodePlan
 
 #: name -> "module:attribute" of a servod.runtime.fieldbus.devices.Driver.
 DRIVERS: dict[str, str] = {
@@ -50,3 +51,20 @@ def load_driver(name: str) -> Driver:
     if not isinstance(driver, Driver):
         raise BadInput(f"driver {name}", type(driver).__name__, "a servod.runtime.fieldbus.devices.Driver")
     return driver
+
+
+def amplifier_of(plan: NodePlan) -> Amplifier:
+    """The cycle face of the amplifier that a node's plan names. Raises BadInput."""
+    return cast(Amplifier, _cyclic(plan, "amplifier"))
+
+
+def encoder_of(plan: NodePlan) -> Encoder:
+    """The cycle face of the encoder that a node's plan names. Raises BadInput."""
+    return cast(Encoder, _cyclic(plan, "encoder"))
+
+
+def _cyclic(plan: NodePlan, kind: str) -> Amplifier | Encoder:
+    driver = load_driver(plan.driver)
+    if driver.kind != kind:
+        raise BadInput(f"driver {plan.driver}", f"a driver of an {driver.kind}", f"one of an {kind}")
+    return driver.cyclic(plan)

@@ -31,19 +31,44 @@ class AxisState(IntEnum):
     FAULT = 6
     PROVING = 7  # before the first torque: the bounded test of the wiring (servod.runtime.loop.wiring.test)
 
+    @property
+    def stopped(self) -> bool:
+        """Nothing is commanded; what asks for a standing axis may begin."""
+        return self in (AxisState.DISABLED, AxisState.FAULT)
 
+    @property
+    def starting(self) -> bool:
+        """Nothing is moved under control yet: whatever ends these states switches off at once."""
+        return self in (AxisState.ENABLING, AxisState.PROVING)
+
+    @property
+    def under_way(self) -> bool:
+        """On the way to ENABLED, or there."""
+        return self.starting or self is AxisState.ENABLED
+
+    @property
+    def controlled(self) -> bool:
+        """The controller has the torque, or had it and its torque goes to zero."""
+        return self in _CONTROLLED
+
+    @property
+    def following(self) -> bool:
+        """The joint is to follow a reference."""
+        return self in (AxisState.ENABLED, AxisState.BRAKING)
+
+    @property
+    def powered(self) -> bool:
+        """The loop commands torque: under control, or in the test of the wiring."""
+        return self in _CONTROLLED or self is AxisState.PROVING
+
+
+_CONTROLLED = (AxisState.ENABLED, AxisState.BRAKING, AxisState.RAMPING)
 _UNHEARD_MASK = _BIT[FaultCode.DRIVE_STAYS_POWERED] | _BIT[FaultCode.COMMANDS_LOST]
 _OFF_MASK = sum(FAULTS[code].bit for code in NEEDS_RESTART)
-#: A drive that is told to switch off, or to stop, and still shows this after this time does not obey.
-_POWERED = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
+#: A drive that is told to switch off, or to stop, and is still commanded after this time does not obey.
 _OBEY_S = 0.1
 #: The test of the wiring ends by itself after its time-out; one that does not is ended so much later.
 _PROOF_MARGIN_S = 0.25
-_CONTROLLED = (AxisState.ENABLED, AxisState.BRAKING, AxisState.RAMPING)
-#: On the way to ENABLED, or there.
-_UNDER_WAY = (AxisState.ENABLING, AxisState.PROVING, AxisState.ENABLED)
-#: Nothing is moved under control yet: whatever ends these states switches off at once.
-_BEFORE_CONTROL = (AxisState.ENABLING, AxisState.PROVING)
 
 
 class AxisOutput(NamedTuple):
@@ -91,8 +116,8 @@ class Axis:
 
         With `prove` the drive's power is followed by the state PROVING, which `proven` ends.
         """
-        if self.state not in (AxisState.DISABLED, AxisState.FAULT):
-            return Refusal.DONE if self.state in _UNDER_WAY else Refusal.MOTION_RUNNING
+        if not self.state.stopped:
+            return Refusal.DONE if self.state.under_way else Refusal.MOTION_RUNNING
         if self.latched & _OFF_MASK:
             return Refusal.NEEDS_RESTART
         if reset_fault:
@@ -110,7 +135,7 @@ class Axis:
 
     def reset_fault(self) -> Refusal:
         """Forget latched faults, but for those that need a restart, and ask the drive once to reset its own."""
-        if self.state in _CONTROLLED or self.state == AxisState.PROVING:
+        if self.state.powered:
             return Refusal.MOTION_RUNNING
         self.latched, self._reset_wanted = self.latched & _OFF_MASK, True
         if self.state == AxisState.FAULT:
@@ -121,15 +146,15 @@ class Axis:
         """Bring the axis to rest under control, then switch off."""
         if self.state == AxisState.ENABLED:
             self._stop(AxisState.BRAKING, AxisState.DISABLED)
-        elif self.state in _BEFORE_CONTROL:
+        elif self.state.starting:
             self._enter(AxisState.DISABLED)
 
     def quick_stop(self) -> None:
         """Let the drive stop the axis by its quick-stop option."""
-        if self.state in _CONTROLLED:
+        if self.state.controlled:
             failed = self.state != AxisState.ENABLED and self._end_state == AxisState.FAULT
             self._stop(AxisState.QUICK_STOPPING, AxisState.FAULT if failed else AxisState.DISABLED)
-        elif self.state in _BEFORE_CONTROL:
+        elif self.state.starting:
             self._enter(AxisState.DISABLED)
 
     def note(self, fault_bits: int) -> None:
@@ -144,7 +169,7 @@ class Axis:
         self._cycles_in_state += 1
         self.faults = faults | self._drive_faults(amplifier)
         self.latched |= self.faults & _OFF_MASK
-        if self.state not in (AxisState.DISABLED, AxisState.FAULT):
+        if not self.state.stopped:
             self._react()
         elif self.faults & _UNHEARD_MASK:
             self._enter(AxisState.FAULT)
@@ -152,7 +177,7 @@ class Axis:
         reset, self._reset_wanted = self._reset_wanted, False
         return AxisOutput(
             self._torque_share(),
-            self.state in _CONTROLLED,
+            self.state.controlled,
             just_enabled,
             self.state == AxisState.BRAKING,
             reset,
@@ -161,7 +186,7 @@ class Axis:
     def raise_fault(self, fault_bits: int) -> None:
         """A fault found after `step` in the same cycle (the torque limits): react at once."""
         self.faults |= fault_bits
-        if self.state not in (AxisState.DISABLED, AxisState.FAULT):
+        if not self.state.stopped:
             self._react()
 
     def _enter(self, state: AxisState) -> None:
@@ -180,7 +205,7 @@ class Axis:
         if faults & _MASK[Reaction.DISABLE]:
             self._enter(AxisState.FAULT)
         elif faults & _MASK[Reaction.QUICK_STOP]:
-            if state in _BEFORE_CONTROL:
+            if state.starting:
                 self._enter(AxisState.FAULT)
             elif state != AxisState.QUICK_STOPPING:
                 self._stop(AxisState.QUICK_STOPPING, AxisState.FAULT)
@@ -190,7 +215,7 @@ class Axis:
 
     def _react_ramp_down(self, faults: int) -> None:
         self._end_state = AxisState.FAULT
-        if self.state in _BEFORE_CONTROL:
+        if self.state.starting:
             self._enter(AxisState.FAULT)
         elif self.state == AxisState.ENABLED:
             # A lost supervisor leaves a sound controller: brake first. A following error does not: ramp at once.
@@ -202,13 +227,13 @@ class Axis:
         faults, state = self._disobedience(amplifier), amplifier.state
         if amplifier.age_cycles > 0:
             return faults
-        if amplifier.reasons & Reason.COMMANDS_MISSED and state in _POWERED:
+        if amplifier.reasons & Reason.COMMANDS_MISSED and state.commanded:
             faults |= _BIT[FaultCode.COMMANDS_LOST]
         if state in (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE) and not self._being_reset():
             faults |= _BIT[FaultCode.DRIVE_FAULT]
         if amplifier.status_word & _STATUS_WARNING:
             faults |= _BIT[FaultCode.DRIVE_WARNING]
-        if self.state in _CONTROLLED or self.state == AxisState.PROVING:
+        if self.state.powered:
             faults |= self._operation_faults(amplifier)
         return faults
 
@@ -217,7 +242,7 @@ class Axis:
 
         While it quick-stops it may be in quick stop active for as long as its ramp takes.
         """
-        heard, powered = amplifier.age_cycles == 0, amplifier.state in _POWERED
+        heard, powered = amplifier.age_cycles == 0, amplifier.state.commanded
         if self.goal not in (Goal.OFF, Goal.QUICK_STOP):
             self._seen_off, self._disobeyed_cycles = False, 0
             return 0
@@ -296,7 +321,7 @@ class Axis:
     def _torque_share(self) -> float:
         if self.state == AxisState.RAMPING:
             return max(0.0, 1.0 - self._cycles_in_state / self._ramp_cycles)
-        return 1.0 if self.state in _CONTROLLED else 0.0
+        return 1.0 if self.state.controlled else 0.0
 
 
 _GOAL: dict[AxisState, Goal] = {

@@ -9,7 +9,7 @@ A synchronous RPDO acts at the next SYNC: one cycle of delay belongs to the loop
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 from servod.common.clock import Clock
 from servod.common.faults import FAULTS, FaultCode
@@ -17,7 +17,7 @@ from servod.common.units import NS_PER_S, NS_PER_US
 from servod.kernels.motions import Samples
 from servod.runtime.fieldbus.bus import Bus
 from servod.runtime.fieldbus.devices import AmplifierCommand, AmplifierFeedback, DriveState, EncoderFeedback, Goal, Mode
-from servod.runtime.fieldbus.registry import load_driver
+from servod.runtime.fieldbus.registry import amplifier_of, encoder_of
 from servod.runtime.loop.axis import Axis, AxisOutput, AxisState
 from servod.runtime.loop.commands import Command
 from servod.runtime.loop.controller import Controller
@@ -37,9 +37,6 @@ GOODBYE_CYCLES = 20
 GOODBYE_TIMEOUT_CYCLES = 1000
 #: How long a drive stays in NMT stopped before it is asked to be pre-operational.
 _STOPPED_CYCLES = 5
-_POWERED = (AxisState.ENABLED, AxisState.BRAKING, AxisState.RAMPING, AxisState.PROVING)
-_FOLLOWING = (AxisState.ENABLED, AxisState.BRAKING)
-_UNPOWERED = (DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON, DriveState.FAULT)
 
 
 class Link(Protocol):
@@ -88,8 +85,8 @@ class Cycle:
         self.period_ns = config.cycle.period_us * NS_PER_US
         self._period_s = self.period_ns / NS_PER_S
         self._feedback_timeout_ns = config.cycle.feedback_timeout_us * NS_PER_US
-        self.amplifier: Any = load_driver(plan.amplifier.driver).cyclic(plan.amplifier)
-        self.encoder: Any = load_driver(plan.encoder.driver).cyclic(plan.encoder)
+        self.amplifier = amplifier_of(plan.amplifier)
+        self.encoder = encoder_of(plan.encoder)
         self.exchange = Exchange(bus, clock, self.amplifier, self.encoder, plan)
         self.axis = Axis(
             self._period_s, config.limits.ramp_down_s, config.amplifier.enable_timeout_s, Mode.CYCLIC_SYNC_TORQUE,
@@ -150,8 +147,8 @@ class Cycle:
     def _faults(self, amplifier: AmplifierFeedback, encoder: EncoderFeedback, skipped: int) -> int:
         faults = self.limits.feedback_faults(amplifier, encoder, skipped) | self.exchange.faults() | self.event_faults
         self.event_faults = 0
-        if self.axis.state in _POWERED:
-            followed = self.reference.position_rad if self.axis.state in _FOLLOWING else None
+        if self.axis.state.powered:
+            followed = self.reference.position_rad if self.axis.state.following else None
             faults |= self.limits.motion_faults(amplifier, encoder, followed)
         if self.proof.running:
             faults |= self.limits.proving_faults(encoder, self._proof_travel_rad)
@@ -290,11 +287,12 @@ class Cycle:
         if not self.shutting_down:
             return
         self.axis.disable()
-        if self.axis.state not in (AxisState.DISABLED, AxisState.FAULT):
+        if not self.axis.state.stopped:
             return
         self._resting += 1
         if amplifier.age_cycles == 0:  # a cycle without an answer says nothing, neither good nor bad
-            self._goodbye = self._goodbye + 1 if amplifier.state in _UNPOWERED else 0
+            off = amplifier.state.unpowered and amplifier.state is not DriveState.SWITCHED_ON
+            self._goodbye = self._goodbye + 1 if off else 0
         self.seen_off = self._goodbye >= GOODBYE_CYCLES
         self.finished = self.seen_off or self._resting >= GOODBYE_TIMEOUT_CYCLES
 

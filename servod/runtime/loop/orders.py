@@ -41,7 +41,7 @@ def _enable(cycle: Cycle, arguments: Sequence[float]) -> Refusal:
     if not cycle.limits.position_min_rad <= position_rad <= cycle.limits.position_max_rad:
         return Refusal.OUTSIDE_LIMITS
     reset_fault, asked = ([bool(value) for value in arguments] + [False, False])[:2]
-    if cycle.axis.state not in (AxisState.DISABLED, AxisState.FAULT):
+    if not cycle.axis.state.stopped:
         return Refusal.PROVES_ONLY_FROM_OFF if asked else cycle.axis.enable(reset_fault)
     doubtful = not cycle.proof.proven or bool(cycle.axis.latched & _DOUBTFUL)
     prove = asked or (cycle.proof_wanted and doubtful)

@@ -175,7 +175,7 @@ class CpuLoad(ProcessAction):
         numbers = (self.busy_ms, self.idle_ms, self.for_ms, last_core() if core is None else core)
         log = axis.folder / "load.log"
         with child(
-            "servod.qualify.faults.machine", [str(number) for number in numbers if number is not None], log
+            "servod.qualify.faults.cpu_load", [str(number) for number in numbers if number is not None], log
         ) as load:
             return load.wait(_CLIENT_S) == 0
 
