@@ -5,9 +5,9 @@ are of that session, and its row says so. Its second session is told apart, befo
 
     python scripts/real_machines.py --recordings ../shared/recordings --out out/machines
 
-`--recordings` holds `emps`, `odrive_cogging` and `bam_xl330` (sources in the README); models and maps are in
-`examples`. Diagnoses and windows run through `servoctl diagnose` and `servoctl replay`, as one would by hand; the
-torque mismatch is what the predictor of `servoctl diagnose` leaves with each model as it is.
+`--recordings` holds `emps`, `odrive_cogging` and `bam_xl330` (sources in docs/explanation/real-machines.md); models and
+maps are in `examples`. Diagnoses and windows run through `servoctl diagnose` and `servoctl replay`, as one would by
+hand; the torque mismatch is what the predictor of `servoctl diagnose` leaves with each model as it is.
 """
 
 from __future__ import annotations

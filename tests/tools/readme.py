@@ -1,9 +1,10 @@
-"""The README's tables that come from the code. `python tests/tools/readme.py` writes them anew.
+"""The manual's tables that come from the code. `python tests/tools/readme.py` writes them anew.
 
-`--measure` first runs `servoctl bench`, `servoctl paper` and `servoctl demo --fast` with the README's gain sets (twenty
-minutes on an idle machine) and writes what they print; `--bench FILE`, `--paper FILE` and `--demo FILE` take documents
-that were kept (--json). `--soak FILE` (again for more), `--faults FILE` and `--fuzz FILE`, given together, write the
-table of reliability from the documents of `servoctl soak`, `servoctl faults` and `python -m tests.fuzz.run`.
+Each stands between two marks in one page of `docs`. `--measure` first runs `servoctl bench`, `servoctl paper` and
+`servoctl demo --fast` with the manual's gain sets (twenty minutes on an idle machine) and writes what they print;
+`--bench FILE`, `--paper FILE` and `--demo FILE` take documents that were kept (--json). `--soak FILE` (again for more),
+`--faults FILE` and `--fuzz FILE`, given together, write the table of reliability from the documents of `servoctl soak`,
+`servoctl faults` and `python -m tests.fuzz.run`.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from servod.qualify.bench.table import shown as shown_figure
 from servod.qualify.demo.entries import entries
 from servod.qualify.paper.table import quotation
 
-#: Gain sets beside the four controllers in the README: the local law without each option and without any, with
+#: Gain sets beside the four controllers in the manual: the local law without each option and without any, with
 #: scheduled feedback, and Table I in both readings of its gain labels.
 BESIDE = (
     "demo_local_no_observer",
@@ -48,7 +49,24 @@ PAPER_MRAD = {
     "table1_kx_kv_kz": "0.3781",
 }
 
-README = Path(__file__).resolve().parents[2] / "README.md"
+ROOT = Path(__file__).resolve().parents[2]
+README = ROOT / "README.md"
+DOCS = ROOT / "docs"
+#: The page of each table.
+PAGES = {
+    "faults": DOCS / "reference/faults.md",
+    "quirks": DOCS / "reference/drives.md",
+    "config": DOCS / "reference/configuration.md",
+    "bench": DOCS / "reference/measured.md",
+    "demo": DOCS / "reference/measured.md",
+    "paper": DOCS / "explanation/paper.md",
+    "reliability": DOCS / "explanation/reliability.md",
+}
+
+
+def texts() -> list[Path]:
+    """Everything that is written for people: the front door and every page of the manual."""
+    return [*sorted(ROOT.glob("*.md")), *sorted(DOCS.rglob("*.md"))]
 
 
 def markdown(header: list[str], rows: list[list[str]]) -> str:
@@ -113,11 +131,12 @@ BOUNDS = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "m
 TABLES: dict[str, Callable[[], str]] = {"faults": faults, "quirks": quirks, "config": config}
 
 
-def with_tables(text: str) -> str:
-    """The README's text with all tables as the code has them now."""
+def written() -> dict[Path, str]:
+    """The pages of the tables of the code, each with its tables as the code has them now."""
+    pages: dict[Path, str] = {}
     for name, table in TABLES.items():
-        text = with_section(text, name, table())
-    return text
+        pages[PAGES[name]] = with_section(pages.get(PAGES[name]) or PAGES[name].read_text(), name, table())
+    return pages
 
 
 def measured(document: dict[str, Any]) -> str:
@@ -137,12 +156,12 @@ def measured(document: dict[str, Any]) -> str:
 def with_section(text: str, name: str, content: str) -> str:
     """`text` with the part between the marks of `name` replaced."""
     pattern = re.compile(rf"(<!-- {name}: from the code -->\n).*?(<!-- {name}: end -->)", re.DOTALL)
-    assert pattern.search(text), f"README.md has no part {name}"
+    assert pattern.search(text), f"{PAGES[name]} has no part {name}"
     return pattern.sub(lambda m: f"{m[1]}{content}\n{m[2]}", text)
 
 
 def demo_arguments() -> list[str]:
-    """The demo that the README's table of tracking errors comes from."""
+    """The demo that the manual's table of tracking errors comes from."""
     return ["demo", "--fast", *(word for name in BESIDE for word in ("--gains", f"gains/{name}.yaml"))]
 
 
@@ -157,7 +176,7 @@ def tracking(document: dict[str, Any]) -> str:
         rows.append([row.label if row.label != row.name else "", f"`{name}`", row.options, rms, largest])
         rows[-1].append(PAPER_MRAD.get(row.name, ""))
     header = ["Controller", "Gain set", "Options", "RMS / mrad", "Largest / mrad", "Paper, RMS / mrad"]
-    return f"    servoctl {' '.join(demo_arguments())}\n\n{markdown(header, rows)}"
+    return f"```sh\nservoctl {' '.join(demo_arguments())}\n```\n\n{markdown(header, rows)}"
 
 
 def printed(arguments: list[str], folder: str) -> dict[str, Any]:
@@ -165,9 +184,7 @@ def printed(arguments: list[str], folder: str) -> dict[str, Any]:
     command = [sys.executable, "-m", "servod.cli", *arguments, "--json"]
     if arguments[0] in ("demo", "paper"):
         command += ["--out", folder]
-    document: dict[str, Any] = json.loads(
-        subprocess.run(command, stdout=subprocess.PIPE, cwd=README.parent, check=True).stdout
-    )
+    document: dict[str, Any] = json.loads(subprocess.run(command, stdout=subprocess.PIPE, cwd=ROOT, check=True).stdout)
     return document
 
 
@@ -176,7 +193,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--measure", action="store_true", help="run the commands and write what they print")
     parser.add_argument("--bench", type=Path, help="document of `servoctl bench --json`")
-    parser.add_argument("--demo", type=Path, help="document of the README's `servoctl demo --json`")
+    parser.add_argument("--demo", type=Path, help="document of the manual's `servoctl demo --json`")
     parser.add_argument("--paper", type=Path, help="paper.json of `servoctl paper`")
     parser.add_argument("--soak", type=Path, action="append", default=[], help="soak.json of `servoctl soak`")
     parser.add_argument("--faults", type=Path, help="document of `servoctl faults --json`")
@@ -187,13 +204,18 @@ def main() -> None:
         with tempfile.TemporaryDirectory(prefix="servod-readme-") as folder:
             commands = {"demo": demo_arguments(), "bench": ["bench"], "paper": ["paper"]}
             documents = {name: printed(arguments, folder) for name, arguments in commands.items()}
-    text = with_tables(README.read_text())
+    for page, text in written().items():
+        page.write_text(text)
     for name, document in documents.items():
-        text = with_section(text, name, MEASURED[name](document))
+        write(name, MEASURED[name](document))
     tried = reliability_rows(options.soak, options.faults, options.fuzz)
     if tried:
-        text = with_section(text, "reliability", markdown(reliability.HEADER, tried))
-    README.write_text(text)
+        write("reliability", markdown(reliability.HEADER, tried))
+
+
+def write(name: str, content: str) -> None:
+    """Put `content` between the marks of `name` in its page."""
+    PAGES[name].write_text(with_section(PAGES[name].read_text(), name, content))
 
 
 def reliability_rows(soaks: list[Path], faults: Path | None, fuzz: Path | None) -> list[list[str]]:

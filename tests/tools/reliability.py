@@ -1,4 +1,4 @@
-"""The README's table of what the axis was put through: soak, fault campaign and fuzzing, from their JSON documents."""
+"""The manual's table of what the axis was put through: soak, fault campaign and fuzzing, from their JSON documents."""
 
 from __future__ import annotations
 

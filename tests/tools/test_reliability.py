@@ -1,4 +1,4 @@
-"""The README's table of reliability says what the documents say, also what is bad."""
+"""The manual's table of reliability says what the documents say, also what is bad."""
 
 from __future__ import annotations
 

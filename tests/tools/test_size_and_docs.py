@@ -95,12 +95,13 @@ def test_nothing_is_unfinished_or_skipped() -> None:
 
 
 def shipped_texts() -> Iterator[Path]:
-    folders = ("servod", "drivers", "tests", "gains", "systemd", "scripts", ".ci")
+    folders = ("servod", "drivers", "tests", "gains", "systemd", "scripts", ".ci", "docs", "changelog.d")
     for folder in folders:
         for f in (source.ROOT / folder).rglob("*"):
             if f.is_file() and f.suffix in TEXT_SUFFIXES and "__pycache__" not in f.parts:
                 yield f
-    yield from (source.ROOT / name for name in ("README.md", "pyproject.toml", "demo", "test"))
+    yield from sorted(source.ROOT.glob("*.md"))
+    yield from (source.ROOT / name for name in ("pyproject.toml", "demo", "test"))
 
 
 def test_no_file_names_a_folder_of_somebodys_machine() -> None:
