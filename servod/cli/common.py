@@ -12,7 +12,7 @@ import os
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -78,6 +78,8 @@ _BESIDE_THE_AXIS = "a loop whose daemon hangs stops the axis by itself; IF IT MO
 _made: list[Path] = []
 #: Descriptors of locked folders; they end with the command.
 _locks: list[int] = []
+#: The environment variable that tells a stage of a command which descriptors these are.
+_HANDED_DOWN = "SERVOCTL_LOCKED_FOLDERS"
 
 
 def need_folder(option: str, folder: Path, alone: bool = False) -> None:
@@ -97,14 +99,39 @@ def need_folder(option: str, folder: Path, alone: bool = False) -> None:
 
 
 def _lock(option: str, folder: Path) -> None:
-    """Lock the folder itself (flock(2)): no file is left behind."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    """Lock the folder itself (flock(2)): no file is left behind. A stage has its command's lock."""
+    descriptor = _handed_down(folder)
+    if descriptor is None:
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
         os.close(descriptor)
         raise Unreachable(f"{option} {folder}: another command is at work there; name a folder of its own") from None
     _locks.append(descriptor)
+
+
+def run_stage(arguments: Sequence[str]) -> int:
+    """Run `servoctl` with `arguments` as a stage of this command, in a process of its own; its exit code.
+
+    The stage works in the folders that this command has locked: it gets their descriptors, and a lock belongs to the
+    open file, not to the process.
+    """
+    import subprocess
+
+    environment = os.environ | {_HANDED_DOWN: " ".join(str(descriptor) for descriptor in _locks)}
+    command = [sys.executable, "-m", "servod.cli", *arguments]
+    return subprocess.run(command, pass_fds=_locks, env=environment, check=False).returncode
+
+
+def _handed_down(folder: Path) -> int | None:
+    """The descriptor of `folder` that the command handed to this stage, if it did."""
+    wanted = folder.stat()
+    for text in os.environ.get(_HANDED_DOWN, "").split():
+        with contextlib.suppress(OSError, ValueError):  # not handed on to what a stage starts
+            if os.path.samestat(os.fstat(int(text)), wanted):
+                return int(text)
+    return None
 
 
 def drop_empty_folders() -> None:

@@ -7,7 +7,6 @@ folders, the third opens the seal.
 from __future__ import annotations
 
 import signal
-import subprocess
 import sys
 from enum import StrEnum
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from servod.cli.common import JsonOption, example, need_folder, one_thread
+from servod.cli.common import JsonOption, example, need_folder, one_thread, run_stage
 from servod.common.errors import BadInput
 
 if TYPE_CHECKING:
@@ -77,8 +76,7 @@ def _in_processes(out: Path, drawn: list[str], diagnosed: list[str], scored: lis
     """Each stage in a process of its own; a stage that fails ends the trial as it ended."""
     stages = {Stage.CONCEAL: drawn, Stage.DIAGNOSE: diagnosed, Stage.SCORE: scored}
     for stage, options in stages.items():
-        arguments = ["prove", f"--out={out}", f"--only={stage}", *options]
-        code = subprocess.run([sys.executable, "-m", "servod.cli", *arguments], check=False).returncode
+        code = run_stage(["prove", f"--out={out}", f"--only={stage}", *options])
         if code != 0:
             raise typer.Exit(code)
 

@@ -1,0 +1,44 @@
+"""`servoctl prove` as it is typed: its stages are processes of their own, and work in the folder that it has locked."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import subprocess
+from pathlib import Path
+
+from servod.qualify.blind.conceal import Trial, write_trial
+from tests.cli.test_output import servoctl
+
+_OPTIONS = ("--cases", "1", "--seed", "1")
+
+
+def prove(out: Path) -> subprocess.CompletedProcess[bytes]:
+    return servoctl("prove", *_OPTIONS, "--out", str(out), stdout=subprocess.PIPE)
+
+
+def test_a_stage_comes_to_its_work_in_the_folder_of_its_command(tmp_path: Path) -> None:
+    write_trial(tmp_path, Trial(3, 9, harder=True))  # the first stage looks into it, and refuses
+    done = prove(tmp_path)
+    assert done.stderr.decode() == (
+        f"servoctl: {tmp_path}/trial.json: found 3 cases of seed 9, harder; "
+        "allowed: the same trial, or another folder\n"
+    )
+    assert done.returncode == 2
+
+
+def test_another_command_in_the_folder_keeps_this_one_out(tmp_path: Path) -> None:
+    """Also one that claims a lock which it was not given: the number of some open file is not enough."""
+    held = os.open(tmp_path, os.O_RDONLY)
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        other = os.open(tmp_path, os.O_RDONLY)
+        claims = os.environ | {"SERVOCTL_LOCKED_FOLDERS": f"{other} 0 999 x"}
+        done = prove(tmp_path)
+        claimed = servoctl("prove", *_OPTIONS, "--out", str(tmp_path), env=claims, pass_fds=[other])
+        os.close(other)
+    finally:
+        os.close(held)
+    for refused in (done, claimed):
+        assert (refused.returncode, refused.stderr.count(b"another command is at work there")) == (3, 1)
+    assert list(tmp_path.iterdir()) == []
