@@ -249,8 +249,8 @@ class DaemonDeployLink:
     def record(self, motions: Sequence[dict[str, Any]], tell: Callable[[], None] = lambda: None) -> Rows:
         """Run motions (arguments of the verb `track`) one after the other; all cycles from the daemon's recording.
 
-        Raises AnswerIsNo when the axis drops out or has done so, Refused when the daemon does not take on a motion of
-        an axis that is enabled. An interrupt stops the axis before anything else is waited for.
+        Raises AnswerIsNo when the axis drops out or has done so, Refused or BadInput when the daemon does not take on
+        a motion of an axis that is enabled. An interrupt stops the axis before anything else is waited for.
         """
         with recording(self._client) as path:
             for motion in motions:

@@ -144,6 +144,8 @@ def test_what_is_refused_says_why_with_exit_code_3(servoctl: Servoctl) -> None:
     assert "not enabled" in servoctl("track", "paper", code=3)
     servoctl("enable")
     assert "position_min_rad" in servoctl("track", "step", "--amplitude", "5", code=3)
+    assert "limits.following_error_rad" in servoctl("track", "step", "--amplitude", "0.35", code=2)
+    assert servoctl.state == "ENABLED"
 
 
 def test_one_commands_and_others_watch(servoctl: Servoctl) -> None:

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from servod.client.control import ControlClient, Refused
+from servod.client.control import ControlClient, Refused, RemoteBadInput
 from servod.client.under_daemon import DaemonDeployLink, require_daemon_config
 from servod.common.errors import AnswerIsNo
 from servod.formats.config import AxisConfig
@@ -77,7 +77,10 @@ def _recorded(
         start_rad = float(client.call("status")["motion"]["reference_rad"])
         try:
             curves[name] = curves_of(link.record([motion]).tobytes(), start_rad)
-        except Refused as error:  # of an axis that is enabled: the motion itself is too much for its limits
+        except (
+            Refused,
+            RemoteBadInput,
+        ) as error:  # of an axis that is enabled: the motion itself is too much for its limits
             refused.append(f"{name}: {error}")
     return curves, refused
 

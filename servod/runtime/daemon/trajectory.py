@@ -15,8 +15,16 @@ from servod.formats.config import AxisConfig
 from servod.formats.protocol import SampleKey
 from servod.formats.recording.record import CycleRecord
 from servod.runtime.loop.channel import TRAJECTORY_SAMPLES
-from servod.runtime.loop.commands import REFUSAL_TEXT, Refusal
-from servod.runtime.loop.references import make_motion
+from servod.runtime.loop.commands import REFUSAL_TEXT, ReferenceKind, Refusal
+from servod.runtime.loop.references import Motion, make_motion
+
+#: Which argument of `track` makes a motion jump.
+_JUMPS_BY = {
+    ReferenceKind.SINE: "sine: frequency_hz",
+    ReferenceKind.STEP: "step: amplitude_rad",
+    ReferenceKind.TABLE: "csv: positions_rad",
+    ReferenceKind.EXCITE: "excite: positions_rad",
+}
 
 
 class Samples:
@@ -81,9 +89,10 @@ class Table:
 
 
 def check_motion(reference: Sequence[float], table: Table, config: AxisConfig, now: CycleRecord) -> None:
-    """Check the arguments of Op.REFERENCE and their table against range and speed, from the present reference on.
+    """Check the arguments of Op.REFERENCE and their table against range, speed and following error, from the present
+    reference on.
 
-    Raises Unreachable with the figures; the loop judges again, without them.
+    Raises Unreachable with the figures, and BadInput where the reference jumps; the loop judges again, without them.
     """
     limits, period_s = config.limits, config.cycle.period_us * 1e-6
     motion = make_motion(reference, period_s, table.area())
@@ -99,3 +108,19 @@ def check_motion(reference: Sequence[float], table: Table, config: AxisConfig, n
     if not speed_rad_s <= limits.speed_rad_s:
         allowed = f"limits.speed_rad_s allows {limits.speed_rad_s:.6g} rad/s"
         raise Unreachable(f"refused: the motion would be as fast as {speed_rad_s:.6g} rad/s; {allowed}")
+    _check_jumps(ReferenceKind(int(reference[0])), motion, speed_rad_s * period_s, config, now)
+
+
+def _check_jumps(kind: ReferenceKind, motion: Motion, row_rad: float, config: AxisConfig, now: CycleRecord) -> None:
+    """No jump of the reference may end in a following error at once, neither at the start nor from row to row, where
+    the largest is `row_rad`. Raises BadInput."""
+    window_rad = config.limits.following_error_rad
+    start_rad = abs(now.reference_rad + motion.first_rad(config.cycle.period_us * 1e-6) - now.position_rad)
+    if start_rad <= window_rad and row_rad <= window_rad:
+        return
+    found = f"a reference {start_rad:.6g} rad from the joint at once"
+    if start_rad <= window_rad:
+        found = f"a reference that jumps by {row_rad:.6g} rad in one cycle"
+    allowed = f"at most limits.following_error_rad, {window_rad:.6g} rad"
+    remedy = "take a smaller step, or a ramp from a file (`servoctl track csv`)"
+    raise BadInput(f"track {_JUMPS_BY.get(kind, kind.name.lower())}", found, f"{allowed}; {remedy}")

@@ -49,6 +49,7 @@ class Refusal(IntEnum):
     OUTSIDE_LIMITS = 7
     TOO_FAST = 8
     PROVES_ONLY_FROM_OFF = 9
+    JUMPS = 10
 
 
 REFUSAL_TEXT: dict[Refusal, str] = {
@@ -61,6 +62,7 @@ REFUSAL_TEXT: dict[Refusal, str] = {
     Refusal.OUTSIDE_LIMITS: "the joint is outside limits.position_min_rad to position_max_rad; move it back by hand",
     Refusal.TOO_FAST: "the motion would be faster than limits.speed_rad_s",
     Refusal.PROVES_ONLY_FROM_OFF: "the wiring is proven on the way from off to on; run `servoctl disable` first",
+    Refusal.JUMPS: "the reference would jump further from the joint than limits.following_error_rad",
 }
 
 

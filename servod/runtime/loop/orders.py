@@ -81,7 +81,8 @@ def _reference(cycle: Cycle, arguments: Sequence[float]) -> Refusal:
         return Refusal.NOT_ENABLED
     if cycle.reference.active:
         return Refusal.MOTION_RUNNING
-    motion = make_motion(arguments, cycle.period_ns / NS_PER_S, cycle.link.trajectory)
+    period_s = cycle.period_ns / NS_PER_S
+    motion = make_motion(arguments, period_s, cycle.link.trajectory)
     if isinstance(motion, Refusal):
         return motion
     here, limits = cycle.reference.position_rad, cycle.limits
@@ -89,6 +90,8 @@ def _reference(cycle: Cycle, arguments: Sequence[float]) -> Refusal:
         return Refusal.OUT_OF_RANGE
     if motion.speed_rad_s > limits.speed_rad_s:
         return Refusal.TOO_FAST
+    if not abs(here + motion.first_rad(period_s) - cycle.encoder_position_rad) <= limits.following_error_rad:
+        return Refusal.JUMPS
     cycle.reference.start(motion)
     return Refusal.DONE
 

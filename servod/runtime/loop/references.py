@@ -39,6 +39,10 @@ class Motion(NamedTuple):
     window_rad: float = math.inf
     speed_rad_s: float = 0.0  # fastest of the path where it is known; the sender of a table checks it
 
+    def first_rad(self, period_s: float) -> float:
+        """How far the reference goes in the first cycle, rad: all of a step."""
+        return self.path(min(period_s, self.duration_s))[0]
+
 
 def make_motion(arguments: Sequence[float], period_s: float, trajectory: Samples) -> Motion | Refusal:
     """The motion that Op.REFERENCE's arguments describe; `trajectory` is the shared area that TABLE reads from."""

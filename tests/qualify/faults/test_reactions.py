@@ -107,6 +107,26 @@ def test_motions_beyond_speed_or_range_are_refused():
     assert axis.send(Op.REFERENCE, [ReferenceKind.STEP, 4.0, 1.0]) == Refusal.OUT_OF_RANGE
 
 
+@pytest.mark.parametrize(("share", "refusal"), [(0.95, Refusal.DONE), (1.05, Refusal.JUMPS), (-1.05, Refusal.JUMPS)])
+def test_a_jump_that_must_end_in_a_following_error_is_refused(share: float, refusal: Refusal) -> None:
+    axis = session(limited("following_error_rad", 0.1))
+    axis.enable()
+    assert axis.send(Op.REFERENCE, [ReferenceKind.STEP, 0.1 * share, 1.0]) == refusal
+    axis.run(0.01)
+    assert not latched(axis)
+
+
+def test_the_error_that_is_there_counts_with_the_jump() -> None:
+    """Without torque the joint stays where it is: the second step of 60 mrad would put it 120 mrad away."""
+    axis = session(limited("following_error_rad", 0.1))
+    axis.enable()
+    axis.send(Op.ACTIVATE, [1, LAWS["pd"].number, 3, 0.0, 0.0, 0.0])
+    for amplitude_rad, refusal in ((0.06, Refusal.DONE), (0.06, Refusal.JUMPS), (-0.15, Refusal.DONE)):
+        assert axis.send(Op.REFERENCE, [ReferenceKind.STEP, amplitude_rad, 0.05]) == refusal
+        axis.run(0.1)
+    assert not latched(axis)
+
+
 def test_a_node_that_babbles_with_low_priority_does_not_hold_the_loop():
     axis = moving(session())
     intruder = axis.world.connect()

@@ -1,4 +1,4 @@
-"""Requests: their arguments, trajectories, flows, and what the verbs make of them."""
+"""Requests: their arguments, flows, and what the verbs make of them."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -10,13 +10,13 @@ import pytest
 from daemon_rows import axis_config, record
 
 from servod.common.errors import BadInput, Unreachable
-from servod.formats.protocol import SampleKey, Verb
+from servod.formats.protocol import Verb
 from servod.runtime.daemon.arguments import check_arguments
 from servod.runtime.daemon.connection import Reply
 from servod.runtime.daemon.flows import Flow, Flows, FutureWait, Orders, StateWait
 from servod.runtime.daemon.gain_bank import GainBank
 from servod.runtime.daemon.recorder import Recorder
-from servod.runtime.daemon.trajectory import Table, check_motion
+from servod.runtime.daemon.trajectory import Table
 from servod.runtime.daemon.verbs import Verbs
 from servod.runtime.fieldbus.devices import DriveState
 from servod.runtime.loop.axis import AxisState
@@ -72,45 +72,6 @@ def test_bad_arguments_are_one_line(verb: Verb, args: dict[str, Any], says: str)
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 400
-
-
-# --- trajectories -----------------------------------------------------------------------------------------------------
-def test_pieces_become_one_column_with_its_extent_and_steps() -> None:
-    table = Table()
-    table.add(SampleKey.POSITIONS, 0, [9.0])
-    for start, piece in ((0, [0.0, 0.1]), (2, [0.4, 0.3])):
-        table.add(SampleKey.POSITIONS, start, piece)
-    positions = table.positions
-    assert list(table.area()) == [0.0, 0.1, 0.4, 0.3]
-    assert (positions.lowest, positions.highest, positions.largest_step) == (0.0, 0.4, pytest.approx(0.3))
-    with pytest.raises(BadInput, match="or 4 to go on"):
-        table.add(SampleKey.POSITIONS, 5, [0.0])
-    with pytest.raises(BadInput, match="found 0 samples; allowed: 4"):
-        table.require(torques=True)
-    with pytest.raises(BadInput, match="at most 300000"):
-        table.add(SampleKey.TORQUES, 0, [0.0] * 300_001)
-
-
-@pytest.mark.parametrize(
-    ("args", "says"),
-    [
-        ({"kind": "step", "amplitude_rad": 0.6, "duration_s": 1}, "from 0.5 to 1.1 rad"),
-        ({"kind": "sine", "amplitude_rad": 0.4, "frequency_hz": 2, "duration_s": 1}, "5.02655 rad/s"),
-        ({"kind": "csv", "positions_rad": [0.0, 0.0051]}, "5.1 rad/s; limits.speed_rad_s allows 5"),
-        ({"kind": "csv", "positions_rad": [0.0, -2.0]}, "-1.5 to 0.5 rad"),
-        ({"kind": "paper", "duration_s": 40}, "out of range"),
-    ],
-)
-def test_motion_is_checked_with_figures_before_the_loop_is_asked(args: dict[str, Any], says: str) -> None:
-    track = check_arguments(Verb.TRACK, args)
-    table = track.table(Table())
-    config = axis_config(Path("s"), Path("c"))
-    limits = config.limits.model_copy(update={"speed_rad_s": 5.0})
-    with pytest.raises(Unreachable) as caught:
-        check_motion(
-            track.reference(table), table, config.model_copy(update={"limits": limits}), record(reference_rad=0.5)
-        )
-    assert says in str(caught.value)
 
 
 # --- flows ------------------------------------------------------------------------------------------------------------
