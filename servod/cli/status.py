@@ -1,7 +1,14 @@
-"""`servoctl status`: state, goal, reasons and health of the axis in one screen."""
+"""`servoctl status`: state, goal, reasons and health of the axis in one screen.
+
+What tells nothing of now is grey and says its age: feedback and heartbeats that stay away, a loop that writes no cycle,
+a daemon that sends no status.
+"""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -10,9 +17,11 @@ from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, connect,
 from servod.common.errors import one_line
 
 if TYPE_CHECKING:
-    from rich.console import Group
+    from rich.console import Group, RenderableType
     from rich.table import Table
 
+#: A daemon that sends five times a second is silent after this time.
+_SILENT_S = 1.0
 _HELP = example(
     "Show state, goal, reasons and health of the axis in one screen.",
     "servoctl status",
@@ -34,7 +43,8 @@ def status(
     """Show the status."""
     with connect(socket) as client:
         if watch and not as_json:
-            _watch(client.watch())
+            with suppress(KeyboardInterrupt):
+                _watch(client.watch())
             return
         document = client.call("status")
     if as_json:
@@ -45,15 +55,51 @@ def status(
     Console().print(screen(document))
 
 
-def _watch(documents: Any) -> None:
+def _watch(documents: Iterator[dict[str, Any]]) -> None:
     from rich.live import Live
 
-    with Live(auto_refresh=False) as live:
-        try:
-            for document in documents:
-                live.update(screen(document), refresh=True)
-        except KeyboardInterrupt:
-            return
+    view = WatchView()
+    with Live(view, refresh_per_second=5):
+        for document in documents:
+            view.see(document)
+
+
+class WatchView:
+    """The newest status on the screen; it grows old there when the next one does not come."""
+
+    def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._now_s, self._heard_s = now_s, 0.0
+        self._document: dict[str, Any] | None = None
+
+    def see(self, document: dict[str, Any]) -> None:
+        """A status came."""
+        self._document, self._heard_s = document, self._now_s()
+
+    def __rich__(self) -> RenderableType:
+        """Called by rich at every refresh."""
+        from rich.console import Group
+        from rich.styled import Styled
+
+        if self._document is None:
+            return ""
+        silent_s = self._now_s() - self._heard_s
+        if silent_s <= _SILENT_S:
+            return screen(self._document)
+        text = f"[red]no status from the daemon for {silent_s:.1f} s; everything below is old[/red]"
+        return Group(text, Styled(screen(_older(self._document, silent_s)), "dim"))
+
+
+def _older(value: Any, by_s: float) -> Any:
+    """The document when it has grown old by so much: all of it is stale."""
+    if isinstance(value, list):
+        return [_older(inner, by_s) for inner in value]
+    if not isinstance(value, dict):
+        return value
+    older = {key: _older(inner, by_s) for key, inner in value.items()}
+    if "stale" in older:
+        older["stale"] = True
+        older["age_s"] = None if value["age_s"] is None else value["age_s"] + by_s
+    return older
 
 
 def screen(document: dict[str, Any]) -> Group:
@@ -86,11 +132,22 @@ def _headline(document: dict[str, Any]) -> str:
     axis, drive = document["axis"], document["drive"]
     reached = "reached" if axis["goal_reached"] else "not reached"
     why = f": {'; '.join(axis['reasons'])}" if axis["reasons"] else ""
-    return (
-        f"[bold]{document['name']}[/bold] is [bold]{axis['state']}[/bold], goal {axis['goal']} {reached}{why}\n"
-        f"drive {drive['state']} (status word {drive['status_word']}, error {drive['error_code']}, "
-        f"mode {drive['mode']})"
-    )
+    state = _aged(f"is [bold]{axis['state']}[/bold], goal {axis['goal']} {reached}{why}", document["loop"])
+    words = f"(status word {drive['status_word']}, error {drive['error_code']}, mode {drive['mode']})"
+    return f"[bold]{document['name']}[/bold] {state}\n" + _aged(f"drive {drive['state']} {words}", drive)
+
+
+def _aged(text: str, age: dict[str, Any]) -> str:
+    """The text; grey and with its age where it tells nothing of now."""
+    if not age["stale"]:
+        return text
+    since = "never heard" if age["age_s"] is None else f"stale {age['age_s']:.1f} s"
+    return f"[dim]{', '.join(filter(None, (text, since)))}[/dim]"
+
+
+def _heard(age: dict[str, Any]) -> str:
+    """When it was heard last."""
+    return _aged("" if age["stale"] else f"heard {age['age_s']:.3f} s ago", age)
 
 
 def _fault_lines(document: dict[str, Any]) -> list[str]:
@@ -108,42 +165,51 @@ def _wiring_lines(document: dict[str, Any]) -> list[str]:
 
 
 def _values(document: dict[str, Any]) -> Table:
+    """Position, velocity and error are as old as the encoder's feedback, and so is a reference that only follows the
+    joint; what the loop makes is as old as its cycle."""
     from rich.table import Table
 
-    motion, controller, bus, recorder = (document[k] for k in ("motion", "controller", "bus", "recorder"))
+    motion, controller, bus, loop = (document[k] for k in ("motion", "controller", "bus", "loop"))
+    enabled = document["axis"]["state"] == "ENABLED"
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
-    table.add_row("position", _rad(motion["position_rad"]), "reference", _rad(motion["reference_rad"]))
+
+    def measured(label: str, key: str, scale: float, unit: str) -> tuple[str, str]:
+        return label, _aged(_number(motion[key], scale, unit), motion)
+
+    def made(label: str, key: str, scale: float, unit: str) -> tuple[str, str]:
+        return label, _aged(_number(motion[key], scale, unit), loop)
+
     table.add_row(
-        "error",
-        _number(motion["following_error_rad"], 1e3, "mrad"),
-        "velocity",
-        _number(motion["velocity_rad_s"], 1.0, "rad/s"),
+        *measured("position", "position_rad", 1.0, "rad"),
+        *(made if enabled else measured)("reference", "reference_rad", 1.0, "rad"),
     )
     table.add_row(
-        "torque",
-        _number(motion["torque_nm"], 1.0, "N·m"),
-        "of it friction",
-        _number(motion["torque_friction_nm"], 1.0, "N·m"),
+        *measured("error", "following_error_rad", 1e3, "mrad"), *measured("velocity", "velocity_rad_s", 1.0, "rad/s")
     )
-    table.add_row("controller", f"{controller['name']} ({controller['law']})", "recording", _recording(recorder))
-    table.add_row(
-        "bus", f"{bus['interface']} {bus['channel']}", "load", f"{bus['load']:.0%} of {bus['max_load']:.0%} allowed"
-    )
-    table.add_row("queue full", str(bus["queue_full"]), "error frames", str(bus["error_frames"]))
+    table.add_row(*made("torque", "torque_nm", 1.0, "N·m"), *made("of it friction", "torque_friction_nm", 1.0, "N·m"))
+    table.add_row("encoder", _heard(motion), "drive", _heard(document["drive"]))
+    law = _aged(f"{controller['name']} ({controller['law']})", loop)
+    table.add_row("controller", law, "recording", _recording(document["recorder"]))
+    load = f"{bus['load']:.0%} of {bus['max_load']:.0%} allowed"
+    table.add_row("bus", f"{bus['interface']} {bus['channel']}", "load", load)
+    queue_full, error_frames = (_aged(str(bus[key]), loop) for key in ("queue_full", "error_frames"))
+    table.add_row("queue full", queue_full, "error frames", error_frames)
     for node in document["nodes"]:
-        table.add_row(f"node {node['node_id']}", node["role"], node["driver"], node["state"])
+        state = node["state"] if node["stale"] else f"{node['state']}, {_heard(node)}"
+        table.add_row(f"node {node['node_id']}", node["role"], node["driver"], _aged(state, node))
     return table
 
 
 def _timing(document: dict[str, Any]) -> Table:
     from rich.table import Table
 
-    timing = document["timing"]
+    timing, loop = document["timing"], document["loop"]
     title = f"cycle {timing['cycle']}, {timing['missed']} missed; last {timing['window_s']:.0f} s in µs"
-    table = Table("", "median", "p99", "max", title=title, title_justify="left", box=None)
+    style = "dim" if loop["stale"] else ""
+    table = Table("", "median", "p99", "max", title=_aged(title, loop), title_justify="left", box=None, style=style)
     for key, label in (("lag", "wake-up"), ("tick", "work"), ("torque", "deadline to torque")):
         row = timing[key]
-        table.add_row(label, *(f"{row[name]:.0f}" for name in ("p50_us", "p99_us", "max_us")))
+        table.add_row(label, *(f"{row[name]:.0f}" for name in ("p50_us", "p99_us", "max_us")), style=style)
     return table
 
 
@@ -156,10 +222,6 @@ def _recording(recorder: dict[str, Any]) -> str:
     if recorder["failure"]:
         return f"failed: {recorder['failure']}"
     return f"{recorder['path']} ({recorder['records']} cycles)" if recorder["recording"] else "off"
-
-
-def _rad(value: float | None) -> str:
-    return _number(value, 1.0, "rad")
 
 
 def _number(value: float | None, scale: float, unit: str) -> str:

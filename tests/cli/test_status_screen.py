@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import io
 from typing import Any
 
 import pytest
 from rich.console import Console
 
-from servod.cli.status import screen
+from servod.cli.status import WatchView, screen
 from servod.common.faults import FAULTS, FaultCode
 
 FAULT = FAULTS[FaultCode.FOLLOWING_ERROR]
+FRESH = {"age_s": 0.002, "stale": False}
+STALE = {"age_s": 3.21, "stale": True}
+NEVER = {"age_s": None, "stale": True}
+GREY = "\x1b[2m"
 
 
 def document() -> dict[str, Any]:
@@ -25,7 +30,7 @@ def document() -> dict[str, Any]:
             "reasons": ["the drive is not ready"],
             "motion_running": False,
         },
-        "drive": {"state": "SWITCH_ON_DISABLED", "status_word": "0x0240", "error_code": "0x0000", "mode": 10},
+        "drive": {"state": "SWITCH_ON_DISABLED", "status_word": "0x0240", "error_code": "0x0000", "mode": 10} | FRESH,
         "motion": {
             "position_rad": 0.25,
             "reference_rad": 0.2,
@@ -33,7 +38,9 @@ def document() -> dict[str, Any]:
             "velocity_rad_s": None,
             "torque_nm": 0.0123,
             "torque_friction_nm": 0.0,
-        },
+        }
+        | FRESH,
+        "loop": {"pid": 17} | FRESH,
         "wiring": {"tests": 1, "last": {"passed": False, "text": "wiring not proven (TORQUE_POLARITY): turn it"}},
         "faults": [
             {
@@ -54,7 +61,7 @@ def document() -> dict[str, Any]:
             "queue_full": 0,
             "error_frames": 2,
         },
-        "nodes": [{"node_id": 1, "role": "amplifier", "driver": "cia402", "state": "OPERATIONAL"}],
+        "nodes": [{"node_id": 1, "role": "amplifier", "driver": "cia402", "state": "OPERATIONAL"} | FRESH],
         "grants": [
             {"name": "memory_lock", "granted": True, "reason": ""},
             {"name": "sched_fifo", "granted": False, "reason": "priority 80: Operation not permitted"},
@@ -63,10 +70,10 @@ def document() -> dict[str, Any]:
     }
 
 
-def shown(status: dict[str, Any]) -> str:
-    console = Console(width=120, record=True, file=open("/dev/null", "w"))  # noqa: PTH123, SIM115
-    console.print(screen(status))
-    return console.export_text()
+def shown(view: Any, styles: bool = False) -> str:
+    console = Console(width=140, record=True, force_terminal=styles, file=io.StringIO())
+    console.print(screen(view) if isinstance(view, dict) else view)
+    return console.export_text(styles=styles)
 
 
 @pytest.mark.parametrize(
@@ -80,6 +87,7 @@ def shown(status: dict[str, Any]) -> str:
         "not finite",
         "trial (pd)",
         "39% of 70% allowed",
+        "OPERATIONAL, heard 0.002 s ago",
         "cycle 12345, 3 missed",
         "not granted sched_fifo: priority 80: Operation not permitted",
     ],
@@ -94,3 +102,45 @@ def test_it_is_one_screen() -> None:
 
 def test_granted_requests_are_not_shown() -> None:
     assert "memory_lock" not in shown(document())
+
+
+def test_what_is_fresh_is_not_called_stale() -> None:
+    assert "stale" not in shown(document())
+    assert GREY not in shown(document(), styles=True)
+
+
+@pytest.mark.parametrize(
+    ("part", "age", "lines"),
+    [
+        ("motion", STALE, ["+0.2500 rad, stale 3.2 s", "+0.2000 rad, stale 3.2 s", "-50.0000 mrad, stale 3.2 s"]),
+        ("motion", NEVER, ["+0.2500 rad, never heard"]),
+        ("drive", STALE, ["SWITCH_ON_DISABLED (status word 0x0240, error 0x0000, mode 10), stale 3.2 s"]),
+        ("loop", STALE, ["the drive is not ready, stale 3.2 s", "+0.0123 N·m, stale 3.2 s", "3 missed; last 10 s"]),
+    ],
+)
+def test_what_is_stale_is_grey_and_says_its_age(part: str, age: dict[str, Any], lines: list[str]) -> None:
+    status = document()
+    status[part] |= age
+    assert [line for line in lines if line not in shown(status)] == []
+    assert GREY in shown(status, styles=True)
+
+
+def test_a_node_that_is_silent_is_grey_and_says_since_when() -> None:
+    status = document()
+    status["nodes"][0] |= {"state": "silent (was OPERATIONAL)"} | STALE
+    assert "silent (was OPERATIONAL), stale 3.2 s" in shown(status)
+
+
+def test_a_watched_status_grows_old_while_the_daemon_is_silent() -> None:
+    now_s = 100.0
+    view = WatchView(lambda: now_s)
+    assert shown(view).strip() == ""
+    view.see(document())
+    now_s += 0.5
+    assert "stale" not in shown(view)
+    now_s += 2.5
+    text = shown(view)
+    assert "no status from the daemon for 3.0 s" in text
+    assert "+0.2500 rad, stale 3.0 s" in text and "OPERATIONAL, stale 3.0 s" in text
+    view.see(document())
+    assert "stale" not in shown(view)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 from servod.common.errors import ServodError, Unreachable
 from servod.common.faults import FaultCode
-from servod.runtime.daemon.status import NodeStatus
+from servod.runtime.daemon.status import Age, NodeStatus
 from servod.runtime.fieldbus.cia import CW_DISABLE_VOLTAGE, NmtCommand, NmtState, Obj402
 from servod.runtime.fieldbus.master import BringUp, Master
 from servod.runtime.fieldbus.master.monitor import NodeEvent
@@ -60,9 +60,14 @@ class Nodes:
                 "role": role,
                 "driver": plan.driver,
                 "state": self._state(plan.node_id),
+                **self._age(plan.node_id),
             }
             for role, plan in (("amplifier", self.plans.amplifier), ("encoder", self.plans.encoder))
         ]
+
+    def _age(self, node_id: int) -> Age:
+        age_s = self._master.heartbeat_age_s(node_id)
+        return {"age_s": age_s, "stale": age_s is None or age_s > self._master.heartbeat_limit_s(node_id)}
 
     def _state(self, node_id: int) -> str:
         name = nmt_name(self._master.nmt_state(node_id))

@@ -7,14 +7,25 @@ their rows of the fault table, so that readers need no tables of their own.
 from __future__ import annotations
 
 import math
-from typing import Any, TypedDict
+from typing import Any, NamedTuple, TypedDict
 
 from servod.common.faults import Fault, faults_in
-from servod.formats.config import BusConfig
+from servod.common.units import NS_PER_S
+from servod.formats.config import AxisConfig, BusConfig
 from servod.formats.recording.record import CycleRecord
 from servod.runtime.daemon.recorder import RecorderState
-from servod.runtime.fieldbus.devices import REASON_TEXT, DriveState, Goal, Reason
+from servod.runtime.fieldbus.devices import NEVER_CYCLES, REASON_TEXT, DriveState, Goal, Reason
 from servod.runtime.loop.axis import AxisState
+
+#: A loop that writes its record in every cycle, read every 20 ms, is stale after this time.
+_RECORD_STALE_S = 0.2
+
+
+class Age(TypedDict):
+    """How long ago the values beside it were heard, in s; None is never. What is `stale` tells nothing of now."""
+
+    age_s: float | None
+    stale: bool
 
 
 class AxisStatus(TypedDict):
@@ -27,8 +38,8 @@ class AxisStatus(TypedDict):
     motion_running: bool
 
 
-class DriveStatus(TypedDict):
-    """The amplifier as its status word and error code say; ages in cycles."""
+class DriveStatus(Age):
+    """The amplifier as its status word and error code say, and how old that is; ages in cycles too."""
 
     state: str
     status_word: str
@@ -38,8 +49,12 @@ class DriveStatus(TypedDict):
     encoder_age_cycles: int
 
 
-class MotionStatus(TypedDict):
-    """Positions in rad, velocity in rad/s, torques in N*m, all at the joint; None is not finite (JSON has no NaN)."""
+class MotionStatus(Age):
+    """Positions in rad, velocity in rad/s, torques in N*m, all at the joint; None is not finite (JSON has no NaN).
+
+    The age is that of the encoder's feedback: position, velocity, following error. The drive's own position and torque
+    (`motor_position_rad`, `torque_actual_nm`) are as old as the drive's status, everything else as the loop's.
+    """
 
     reference_rad: float | None
     position_rad: float | None
@@ -107,8 +122,8 @@ class BusStatus(TypedDict):
     ignored_frames: int
 
 
-class NodeStatus(TypedDict):
-    """One node and the last thing it was seen to do."""
+class NodeStatus(Age):
+    """One node and the state that its last heartbeat told; the age is that heartbeat's."""
 
     node_id: int
     role: str
@@ -124,8 +139,8 @@ class GrantStatus(TypedDict):
     reason: str
 
 
-class LoopStatus(TypedDict):
-    """The loop process."""
+class LoopStatus(Age):
+    """The loop process; the age is that of its newest cycle, from which all of the status comes but nodes and lease."""
 
     pid: int
 
@@ -186,9 +201,38 @@ def reason_texts(reasons: int) -> list[str]:
     return [text for bit, text in REASON_TEXT.items() if Reason(reasons) & bit]
 
 
-def drive_status(record: CycleRecord) -> DriveStatus:
+class Freshness(NamedTuple):
+    """How old what a cycle record tells is: the age of its feedback, and its own."""
+
+    period_s: float
+    stale_cycles: int
+    record_age_s: float
+
+    @classmethod
+    def of(cls, config: AxisConfig, record: CycleRecord, now_ns: int) -> Freshness:
+        """By the axis's period and limits.stale_cycles, at `now_ns` on the loop's clock (CLOCK_MONOTONIC)."""
+        age_s = max(0, now_ns - record.time_ns) / NS_PER_S
+        return cls(config.cycle.period_us * 1e-6, config.limits.stale_cycles, age_s)
+
+    def record(self) -> Age:
+        """The record itself."""
+        return {"age_s": self.record_age_s, "stale": self.record_age_s > self._record_limit_s}
+
+    def feedback(self, age_cycles: int) -> Age:
+        """Feedback that was `age_cycles` old in the record: stale where the loop would stop an axis for it."""
+        stale = age_cycles >= self.stale_cycles or self.record_age_s > self._record_limit_s
+        never = age_cycles >= NEVER_CYCLES
+        return {"age_s": None if never else age_cycles * self.period_s + self.record_age_s, "stale": stale}
+
+    @property
+    def _record_limit_s(self) -> float:
+        return max(_RECORD_STALE_S, self.stale_cycles * self.period_s)
+
+
+def drive_status(record: CycleRecord, fresh: Freshness) -> DriveStatus:
     """What the amplifier said, with the ages of both feedbacks."""
     return {
+        **fresh.feedback(record.amplifier_age),
         "state": DriveState(record.drive_state).name,
         "status_word": f"0x{record.status_word & 0xFFFF:04X}",
         "mode": record.mode,
@@ -198,9 +242,10 @@ def drive_status(record: CycleRecord) -> DriveStatus:
     }
 
 
-def motion_status(record: CycleRecord) -> MotionStatus:
+def motion_status(record: CycleRecord, fresh: Freshness) -> MotionStatus:
     """Reference, feedback and the parts of the torque."""
     return {
+        **fresh.feedback(record.encoder_age),
         "reference_rad": _finite(record.reference_rad),
         "position_rad": _finite(record.position_rad),
         "following_error_rad": _finite(record.reference_rad - record.position_rad),

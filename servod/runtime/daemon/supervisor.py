@@ -26,7 +26,15 @@ from servod.runtime.daemon.metrics import AxisMetrics, MetricsServer
 from servod.runtime.daemon.nodes import FaultRelay, Nodes
 from servod.runtime.daemon.notify import Notifier
 from servod.runtime.daemon.recorder import Recorder
-from servod.runtime.daemon.status import Status, axis_status, bus_status, drive_status, fault_status, motion_status
+from servod.runtime.daemon.status import (
+    Freshness,
+    Status,
+    axis_status,
+    bus_status,
+    drive_status,
+    fault_status,
+    motion_status,
+)
 from servod.runtime.daemon.verbs import Verbs
 from servod.runtime.loop.axis import AxisState
 from servod.runtime.loop.cycle import GOODBYE_TIMEOUT_CYCLES
@@ -212,17 +220,18 @@ class Supervisor:
         latest = self._loop.latest
         if latest is None:
             raise Unreachable("the loop has not begun")
+        fresh = Freshness.of(self._config, latest, time.monotonic_ns())
         document: Status = {
             "name": self._config.name,
             "version": __version__,
             "uptime_s": time.monotonic() - self._started,
             "axis": axis_status(latest),
-            "drive": drive_status(latest),
-            "motion": motion_status(latest),
+            "drive": drive_status(latest, fresh),
+            "motion": motion_status(latest, fresh),
             "faults": fault_status(latest),
             "wiring": self._proofs.status(),
             "controller": self._bank.describe(latest.controller),
-            "loop": {"pid": self._loop.pid},
+            "loop": {"pid": self._loop.pid, **fresh.record()},
             "timing": self._health.timing(self._loop.lost),
             "bus": bus_status(self._config.bus, self._nodes.plans.bus_load, latest),
             "nodes": self._nodes.status(),

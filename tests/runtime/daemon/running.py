@@ -43,6 +43,7 @@ class Running:
     """Both processes, and what the daemon told the service manager."""
 
     folder: Path
+    axis: Popen[bytes]
     daemon: Popen[bytes]
     manager: socket.socket
 
@@ -87,7 +88,7 @@ def running(folder: Path, plant: Path | None = None, more: str = "", travel_rad:
                 child("servod.runtime.daemon.main", ["--config", str(config)], log) as daemon,
             ):
                 wait_until(lambda: answers(folder / "axis.sock"), daemon, log, 30.0)
-                yield Running(folder, daemon, manager)
+                yield Running(folder, axis, daemon, manager)
 
 
 def answers(path: Path) -> bool:

@@ -19,7 +19,7 @@ from servod.runtime.daemon.lock import BusLock, InstanceLock
 from servod.runtime.daemon.metrics import AxisMetrics
 from servod.runtime.daemon.nodes import FaultRelay, nmt_name
 from servod.runtime.daemon.recorder import Recorder
-from servod.runtime.daemon.status import axis_status, bus_status, fault_status, motion_status
+from servod.runtime.daemon.status import Freshness, axis_status, bus_status, fault_status, motion_status
 from servod.runtime.daemon.verbs import _why_not_enabled
 from servod.runtime.fieldbus.devices import Reason
 from servod.runtime.loop.axis import AxisState
@@ -86,7 +86,9 @@ def test_an_axis_that_somebody_stopped_is_told_so_and_a_fault_goes_first() -> No
 
 
 def test_values_that_are_not_finite_are_none() -> None:
-    motion = motion_status(record(position_rad=float("nan"), torque_nm=float("inf"), reference_rad=1.0))
+    motion = motion_status(
+        record(position_rad=float("nan"), torque_nm=float("inf"), reference_rad=1.0), Freshness(0.001, 5, 0.0)
+    )
     assert (motion["position_rad"], motion["following_error_rad"], motion["torque_nm"]) == (None, None, None)
     assert motion["reference_rad"] == 1.0
 

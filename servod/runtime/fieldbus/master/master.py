@@ -131,6 +131,14 @@ class Master:
         """The node's heartbeat has been missing for its time, and has not come back."""
         return self._nodes[node_id].watch.lost
 
+    def heartbeat_age_s(self, node_id: int) -> float | None:
+        """How long ago the node's last heartbeat came, in s; None before the first."""
+        return self._nodes[node_id].watch.heartbeat_age_s()
+
+    def heartbeat_limit_s(self, node_id: int) -> float:
+        """A heartbeat older than this, in s, is missing."""
+        return self._nodes[node_id].watch.limit_s
+
     def nmt(self, command: NmtCommand, node_id: int) -> None:
         """Send an NMT command; node 0 is all nodes. A deliberate reset or stop is not reported as an event."""
         for node in self._nodes.values():

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from canopen.emcy import EmcyError
 
 from servod.common.faults import FaultCode
+from servod.common.units import NS_PER_S
 from servod.runtime.fieldbus.cia import EMCY_BASE, HEARTBEAT_BASE, NmtState
 from servod.runtime.fieldbus.master.network import BusNetwork
 
@@ -45,7 +46,8 @@ class NodeWatch:
         self._clock = network.clock
         self._emcy_fault = emcy_fault
         self._timeout_ns = timeout_ms * 1_000_000
-        self._heard_ns: int | None = None
+        self._heard_ns: int | None = None  # the watch began, or a heartbeat came
+        self._heartbeat_ns: int | None = None
         self.lost = False  # its heartbeat is missing now
         self._watching = False
         network.subscribe(HEARTBEAT_BASE + node_id, self._on_heartbeat)
@@ -54,6 +56,15 @@ class NodeWatch:
     def watch(self, on: bool) -> None:
         """Start or end the supervision: only then a boot-up, a stop of heartbeats or another state is an event."""
         self._heard_ns, self.lost, self._watching = self._clock.now_ns(), False, on
+
+    @property
+    def limit_s(self) -> float:
+        """A heartbeat older than this is missing."""
+        return self._timeout_ns / NS_PER_S
+
+    def heartbeat_age_s(self) -> float | None:
+        """How long ago the last heartbeat came, in s; None before the first."""
+        return None if self._heartbeat_ns is None else (self._clock.now_ns() - self._heartbeat_ns) / NS_PER_S
 
     def check(self) -> None:
         """Raise an event when the heartbeat has been missing for its time; once for each loss."""
@@ -70,7 +81,8 @@ class NodeWatch:
             return
         state = data[0] & _TOGGLE_MASK
         previous, self.nmt_state = self.nmt_state, state
-        self._heard_ns, self.lost = self._clock.now_ns(), False
+        self._heard_ns = self._heartbeat_ns = self._clock.now_ns()
+        self.lost = False
         if state == NmtState.BOOT_UP:
             self.boot_ups += 1
         if not self._watching:
