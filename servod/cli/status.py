@@ -6,6 +6,7 @@ a daemon that sends no status.
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, connect, example, print_json
+from servod.cli.common import DEFAULT_SOCKET, SocketOption, connect, example, print_json
 from servod.common.errors import one_line
 
 if TYPE_CHECKING:
@@ -27,6 +28,7 @@ _HELP = example(
     "servoctl status",
     "servoctl status --watch",
     "servoctl status --json",
+    "servoctl status --watch --json",
 )
 
 
@@ -38,13 +40,15 @@ def register(app: typer.Typer) -> None:
 def status(
     watch: Annotated[bool, typer.Option("--watch", help="Keep showing until Ctrl-C.")] = False,
     socket: SocketOption = DEFAULT_SOCKET,
-    as_json: JsonOption = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON document and nothing else; with --watch one for each line.")
+    ] = False,
 ) -> None:
     """Show the status."""
     with connect(socket) as client:
-        if watch and not as_json:
+        if watch:
             with suppress(KeyboardInterrupt):
-                _watch(client.watch())
+                (_print_lines if as_json else _watch)(client.watch())
             return
         document = client.call("status")
     if as_json:
@@ -53,6 +57,12 @@ def status(
     from rich.console import Console
 
     Console().print(screen(document))
+
+
+def _print_lines(documents: Iterator[dict[str, Any]]) -> None:
+    """JSON Lines; each is complete when it goes out, also into a pipe."""
+    for document in documents:
+        print(json.dumps(document, allow_nan=False), flush=True)
 
 
 def _watch(documents: Iterator[dict[str, Any]]) -> None:
