@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, connect, example, print_json, report
 
+if TYPE_CHECKING:
+    from rich.table import Table
+
+#: Wide enough for every table, so that what reads a pipe finds a row in a line.
+_PIPE_COLUMNS = 200
 _app = typer.Typer(
     help=example("Load, list, show, activate and roll back gain sets.", "servoctl gains load my_axis.yaml"),
     rich_markup_mode=None,
@@ -62,15 +67,15 @@ def show(file: Annotated[Path, typer.Argument(help="Gain set, YAML.")], as_json:
     if as_json:
         print_json(document | {"certificate_problem": problem, "seal_problem": seal and seal.problem})
         return
-    from rich.console import Console
-    from rich.pretty import Pretty
+    from servod.cli import gains_view
 
-    document["design"] = None if gains.design is None else f"{gains.design.mode.value}, see --json"
-    console = Console()
-    console.print(Pretty(document))
     fits = "fits" if gains.seal else "none (the set has no design)"
-    console.print(f"seal: {seal.problem if seal else fits}", highlight=False)
-    console.print(f"certificate: {problem or 'valid'}", highlight=False)
+    print(*gains_view.headline(gains), sep="\n")
+    print(f"verdict: {gains_view.verdict(gains)}")
+    print(f"seal: {seal.problem if seal else fits}")
+    _print_tables(
+        gains_view.parameter_table(gains), *gains_view.list_tables(gains), gains_view.certificate_table(gains)
+    )
 
 
 @_app.command(help=example("Change to a stored gain set without a bump.", "servoctl gains activate my_axis"))
@@ -107,15 +112,26 @@ def _title(stored: dict[str, Any]) -> str:
 
 
 def _print(result: dict[str, Any]) -> None:
-    from rich.console import Console
-    from rich.table import Table
+    from servod.cli.gains_view import stored_table
 
     rows: list[dict[str, Any]] = result["gains"]
     if not rows:
         print("no gain set is stored")
         return
-    columns = [key for key in rows[0] if key != "warning"]
-    table = Table(*columns)
+    _print_tables(stored_table(rows))
     for row in rows:
-        table.add_row(*(str(row[key]) for key in columns))
-    Console().print(table)
+        if row["refused"]:
+            print(f"refused: {row['name']} version {row['version']}: {row['refused']}")
+
+
+def _print_tables(*tables: Table | None) -> None:
+    """Texts of a file are shown as they stand, wrapped where the terminal ends and never in a pipe."""
+    from rich.console import Console
+
+    console = Console(markup=False, highlight=False)
+    if not console.is_terminal:
+        console.width = _PIPE_COLUMNS
+    for table in tables:
+        if table is not None:
+            console.print()
+            console.print(table)

@@ -75,9 +75,22 @@ class GainBank:
     def list(self, serial: int, slow: ThreadPoolExecutor) -> Flow:
         """All stored versions, and which one runs."""
         running = self._sets.get(serial)
-        stored = yield FutureWait(slow.submit(self._store.stored))
         now = (running.name, running.version) if running else None
-        return {"gains": [{**_row(s), "active": (s.name, s.version) == now} for s in stored]}
+        rows = yield FutureWait(slow.submit(self._rows, now))
+        return {"gains": rows}
+
+    def _rows(self, now: tuple[str, int] | None) -> Sequence[dict[str, Any]]:
+        """All stored versions: which one runs, and why the axis may not run one (`refused`, else empty)."""
+        return [
+            {**_row(s), "active": (s.name, s.version) == now, "refused": self._refusal(s)} for s in self._store.stored()
+        ]
+
+    def _refusal(self, stored: StoredSet) -> str:
+        try:
+            require_fit(stored.gains, self._config)
+        except BadInput as refusal:
+            return str(refusal)
+        return ""
 
     def activate(self, args: GainsActivateArgs, send: SendOrder, slow: ThreadPoolExecutor) -> Flow:
         """Change the running controller to a stored set, without a bump."""

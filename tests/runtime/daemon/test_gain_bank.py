@@ -41,7 +41,7 @@ class Bench:
     """A bank with its store and a loop."""
 
     def __init__(self, folder: Path, slow: ThreadPoolExecutor) -> None:
-        config = load_config(shipped("gains/config/virtual.yaml"))
+        config = self.config = load_config(shipped("gains/config/virtual.yaml"))
         gains = config.gains.model_copy(update={"directory": folder})
         self.bank, self.loop, self.slow = GainBank(config.model_copy(update={"gains": gains})), Loop(), slow
         self.store, self.blocked = GainStore(folder), folder / f"active.json.{os.getpid()}.tmp"
@@ -125,3 +125,15 @@ def test_a_trial_is_given_up(bench: Bench) -> None:
     bench.rollback(trial=True)
     assert (bench.runs, bench.active, bench.bank.on_trial) == (FIRST, FIRST, False)
     assert bench.store.history()[-1].action is Action.REJECT
+
+
+@pytest.mark.parametrize(("accepts", "says"), [(True, ""), (False, "no certificate")])
+def test_the_list_says_what_this_axis_may_not_run(
+    accepts: bool, says: str, bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The configuration may have changed since the set was stored."""
+    gains = bench.config.gains.model_copy(update={"accept_uncertified": accepts})
+    monkeypatch.setattr(bench.bank, "_config", bench.config.model_copy(update={"gains": gains}))
+    rows = driven(bench.bank.list(bench.loop.serial, bench.slow))["gains"]
+    assert sorted((row["name"], row["active"]) for row in rows) == sorted([(FIRST, True), (TRIED, False)])
+    assert all(says in row["refused"] and bool(row["refused"]) != accepts for row in rows)
