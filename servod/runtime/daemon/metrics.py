@@ -107,6 +107,10 @@ class AxisMetrics(Collector):
         yield CounterMetricFamily("servod_bus_ignored_frames", "Frames that fit no mapping", record.ignored_frames)
         yield _state("servod_axis_state", "1 for the state of the axis", AxisState(record.axis_state), AxisState)
         yield _state("servod_drive_state", "1 for the drive's state", DriveState(record.drive_state), DriveState)
+        ages = GaugeMetricFamily("servod_feedback_age_cycles", "Cycles since the device's last feedback", labels=["of"])
+        ages.add_metric(["amplifier"], float(record.amplifier_age))
+        ages.add_metric(["encoder"], float(record.encoder_age))
+        yield ages
         yield GaugeMetricFamily("servod_position_radians", "Joint position", record.position_rad)
         yield GaugeMetricFamily("servod_torque_newton_metres", "Commanded torque after limits", record.torque_nm)
 

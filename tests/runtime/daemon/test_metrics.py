@@ -25,7 +25,9 @@ def _filled() -> AxisMetrics:
     metrics = AxisMetrics("axis", 0.42)
     lags_us = [5, 60, 60, 600, 30_000]
     metrics.count([record(n, lag_ns=lag * 1000, missed=3, bus_error_frames=7) for n, lag in enumerate(lags_us)])
-    metrics.count([record(n, lag_ns=1000, faults=CLIP * (n % 2), axis_state=AxisState.ENABLED) for n in range(4)])
+    metrics.count(
+        [record(n, lag_ns=1000, encoder_age=n, faults=CLIP * (n % 2), axis_state=AxisState.ENABLED) for n in range(4)]
+    )
     return metrics
 
 
@@ -46,6 +48,8 @@ def test_textfile_has_histograms_counters_and_states(tmp_path: Path) -> None:
     assert values["servod_faults_total", "TORQUE_CLIPPED"] == 2
     assert values["servod_axis_state", "enabled"] == 1
     assert values["servod_axis_state", "disabled"] == 0
+    assert values["servod_feedback_age_cycles", "encoder"] == 3  # the position below is so old
+    assert values["servod_feedback_age_cycles", "amplifier"] == 0
     assert values["servod_bus_load_ratio", ""] == 0.42
     assert [f.name for f in path.parent.iterdir()] == ["axis.prom"]
 
