@@ -110,7 +110,7 @@ def _cells(node: dict[str, Any]) -> list[str]:
         "none yet (LSS)" if node["node_id"] is None else str(node["node_id"]),
         f"CiA {profile}" if profile else "-",
         *(_hex(identity.get(key)) for key in ("vendor_id", "product_code", "revision")),
-        str(identity.get("serial", "-")),
+        "-" if identity.get("serial") is None else str(identity["serial"]),
         one_line(node["name"]),
     ]
 

@@ -159,6 +159,8 @@ def _progress(duration_s: float, quiet: bool) -> Iterator[Tell]:
 
 def _where(motion: dict[str, Any]) -> str:
     """Reference and error of the status document in words; either is None while it is not finite."""
+    if motion["stale"]:
+        return "no feedback of the joint"
     reference, error = motion["reference_rad"], motion["following_error_rad"]
     if reference is None or error is None:
         return ""
