@@ -21,6 +21,7 @@ from servod.cli.common import (
     one_thread,
     print_json,
     progress,
+    table_console,
 )
 from servod.common.errors import BadInput
 
@@ -127,13 +128,12 @@ def _bar(title: str, quiet: bool) -> Iterator[Tell]:
 
 
 def _print(document: dict[str, Any]) -> None:
-    from rich.console import Console
     from rich.table import Table
 
     table = Table("Controller", "RMS / mrad", "Largest / mrad", "Roughness / PD's", "", title="Trajectory (19)")
     for law, found in document["tracking"].items():
         table.add_row(*_cells(law, found))
-    console = Console()
+    console = table_console()
     console.print(table)
     deployed = document["deployment"]["gains"]
     lines = [

@@ -22,6 +22,8 @@ import typer
 from servod.common.errors import BadInput, Unreachable
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from servod.client.control import ControlClient
 
 DEFAULT_SOCKET = Path("/run/servod/axis.sock")
@@ -74,6 +76,7 @@ def print_json(document: Any) -> None:
 #: A stop is answered when the drive has stopped. One that takes longer [s] is a slow ramp, or a daemon that hangs.
 _LATE_S = 2.0
 _BESIDE_THE_AXIS = "a loop whose daemon hangs stops the axis by itself; IF IT MOVES ON, USE THE EMERGENCY STOP"
+_PIPE_COLUMNS = 200
 #: Folders that this command made for its results, outermost first.
 _made: list[Path] = []
 #: Descriptors of locked folders; they end with the command.
@@ -148,6 +151,16 @@ def need_file(option: str, file: Path) -> None:
     if file.is_dir():
         raise BadInput(f"{option} {file}", "a folder", "a file that can be written")
     need_folder(option, file.resolve().parent)
+
+
+def table_console(markup: bool = True) -> Console:
+    """Where tables are printed: as wide as the terminal, and in a pipe so wide that no key and no figure is cut off."""
+    from rich.console import Console
+
+    console = Console(markup=markup, highlight=markup)
+    if not console.is_terminal and "COLUMNS" not in os.environ:
+        console.width = _PIPE_COLUMNS
+    return console
 
 
 def one_thread() -> None:

@@ -20,6 +20,7 @@ from servod.cli.common import (
     one_thread,
     print_json,
     progress,
+    table_console,
 )
 from servod.common.errors import AnswerIsNo, BadInput
 
@@ -103,11 +104,10 @@ def _virtual(
 
 
 def _print(document: dict[str, Any]) -> None:
-    from rich.console import Console
     from rich.table import Table
 
     table = Table("Figure", "Before", "After", "Promised", title="Validation motion, mrad")
     for name in document["promised"]:
         runs = (document[run] for run in ("before", "after", "promised"))
         table.add_row(name.removesuffix("_mrad"), *(f"{run[name]:.4g}" if run else "none" for run in runs))
-    Console().print(table)
+    table_console().print(table)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servod.cli.common import JsonOption, example, need_folder, print_json
+from servod.cli.common import JsonOption, example, need_folder, print_json, table_console
 from servod.common.errors import AnswerIsNo, BadInput
 from servod.common.faults import FAULTS
 
@@ -144,10 +144,10 @@ def _print_codes(as_json: bool) -> None:
             ]
         )
         return
-    from rich.console import Console
-    from rich.table import Table
+    from rich.table import Column, Table
 
-    table = Table("Fault", "Reaction", "Cause", "Remedy")
+    cause, remedy = (Column(head, overflow="fold") for head in ("Cause", "Remedy"))
+    table = Table("Fault", "Reaction", cause, remedy)
     for fault in rows:
         table.add_row(fault.code.name, fault.reaction.name, fault.cause, fault.remedy)
-    Console().print(table)
+    table_console().print(table)

@@ -8,13 +8,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, connect, example, print_json, report
+from servod.cli.common import (
+    DEFAULT_SOCKET,
+    JsonOption,
+    SocketOption,
+    ask,
+    connect,
+    example,
+    print_json,
+    report,
+    table_console,
+)
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-#: Wide enough for every table, so that what reads a pipe finds a row in a line.
-_PIPE_COLUMNS = 200
 _app = typer.Typer(
     help=example("Load, list, show, activate and roll back gain sets.", "servoctl gains load my_axis.yaml"),
     rich_markup_mode=None,
@@ -125,12 +133,8 @@ def _print(result: dict[str, Any]) -> None:
 
 
 def _print_tables(*tables: Table | None) -> None:
-    """Texts of a file are shown as they stand, wrapped where the terminal ends and never in a pipe."""
-    from rich.console import Console
-
-    console = Console(markup=False, highlight=False)
-    if not console.is_terminal:
-        console.width = _PIPE_COLUMNS
+    """One after the other; texts of a file are shown as they stand."""
+    console = table_console(markup=False)
     for table in tables:
         if table is not None:
             console.print()

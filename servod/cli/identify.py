@@ -20,6 +20,7 @@ from servod.cli.common import (
     need_folder,
     one_thread,
     print_json,
+    table_console,
 )
 from servod.common.errors import BadInput
 
@@ -205,14 +206,13 @@ def _progress(quiet: bool) -> Iterator[Callable[[str, float], None]]:
 
 
 def _print(found: dict[str, Any]) -> None:
-    from rich.console import Console
     from rich.table import Table
 
     table = Table("Quantity", "Value", "95 % interval", "Unit", title="Identified")
     for name, number in found["identified"].items():
         interval = f"{number['low']:.4g} to {number['high']:.4g}"
         table.add_row(name, f"{number['value']:.5g}", interval, number["unit"])
-    console = Console()
+    console = table_console()
     console.print(table)
     for name, number in found["identified"].items():
         if number["note"]:

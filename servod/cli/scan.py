@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, example, print_json
+from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, example, print_json, table_console
 from servod.common.errors import BadInput, Unreachable, one_line
 
 if TYPE_CHECKING:
@@ -90,7 +90,6 @@ def _through_owner(socket: Any, config: BusConfig, owned: Unreachable) -> list[d
 
 
 def _print(nodes: list[dict[str, Any]]) -> None:
-    from rich.console import Console
     from rich.table import Table
 
     if not nodes:
@@ -99,7 +98,7 @@ def _print(nodes: list[dict[str, Any]]) -> None:
     table = Table("Node", "Profile", "Vendor", "Product", "Revision", "Serial", "Name")
     for node in nodes:
         table.add_row(*_cells(node))
-    Console(markup=False).print(table)  # names are the devices' own words
+    table_console(markup=False).print(table)  # names are the devices' own words
 
 
 def _cells(node: dict[str, Any]) -> list[str]:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servod.cli.common import DEFAULT_SOCKET, SocketOption, connect, example, print_json
+from servod.cli.common import DEFAULT_SOCKET, SocketOption, connect, example, print_json, table_console
 from servod.common.errors import one_line
 
 if TYPE_CHECKING:
@@ -54,9 +54,7 @@ def status(
     if as_json:
         print_json(document)
         return
-    from rich.console import Console
-
-    Console().print(screen(document))
+    table_console().print(screen(document))
 
 
 def _print_lines(documents: Iterator[dict[str, Any]]) -> None:

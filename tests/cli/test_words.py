@@ -39,3 +39,11 @@ def test_a_node_without_a_serial_number_has_a_dash(
 )
 def test_the_progress_of_a_motion_shows_no_old_error(motion: dict[str, Any], says: str) -> None:
     assert _where(motion) == says
+
+
+def test_no_table_in_a_pipe_cuts_off_a_key(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.delenv("COLUMNS", raising=False)
+    assert run(["faults", "--codes"]) == 0
+    text = capsys.readouterr().out
+    assert "…" not in text
+    assert "limits.torque_rate_nm_per_s" in text and "limits.position_min_rad" in text
