@@ -1,4 +1,4 @@
-"""`servoctl config check`: configurations, gain sets, axis models, EDS files and column maps, before they are used."""
+"""`servoctl config`: `check` reads files of every kind before they are used, `keys` says what each key means."""
 
 from __future__ import annotations
 
@@ -9,10 +9,15 @@ from typing import Annotated, Any
 import typer
 
 from servod.cli.common import JsonOption, example, print_json
+from servod.cli.config_keys import keys
 from servod.common.errors import BadInput
 
 _app = typer.Typer(
-    help=example("Check files before they are used.", "servoctl config check /etc/servod/axis.yaml"),
+    help=example(
+        "Check files before they are used; explain the keys of an axis configuration.",
+        "servoctl config check /etc/servod/axis.yaml",
+        "servoctl config keys amplifier",
+    ),
     rich_markup_mode=None,
 )
 
@@ -42,9 +47,14 @@ def check(
         print(f"{row['file']}: {row['kind']}, no mistakes" + (f"; {row['note']}" if row["note"] else ""))
 
 
-@_app.callback()
-def _config() -> None:
-    """Keep `check` a sub-command, although it is the only one."""
+_app.command(
+    "keys",
+    help=example(
+        "Explain the keys of an axis configuration: type, unit, default, range and meaning.",
+        "servoctl config keys",
+        "servoctl config keys gear_ratio",
+    ),
+)(keys)
 
 
 def _check(file: Path) -> dict[str, str]:

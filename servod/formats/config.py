@@ -1,126 +1,98 @@
 """The axis configuration file: everything about bus, nodes, limits and services of one axis. Gains live elsewhere.
 
-Every key has its unit in its name and its range here; an unknown key is an error (servod.common.yaml). The daemon, the
-command line and the virtual axis read the same file, the virtual axis only for node ids and bus.
+Every key has its unit in its name, its range and its meaning here; an unknown key is an error (servod.common.yaml). The
+daemon, the command line and the virtual axis read the same file, the virtual axis only for node ids and bus. What is on
+the wire stands in servod.formats.config_nodes; `servoctl config keys` prints every key.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 from pydantic import Field, model_validator
 
 from servod.common.yaml import Strict, load_model
+from servod.formats.config_nodes import (
+    AmplifierConfig,
+    BusConfig,
+    CycleConfig,
+    EncoderConfig,
+    HeartbeatConfig,
+    Identity,
+    NodeId,
+)
+
+__all__ = [
+    "AmplifierConfig",
+    "AxisConfig",
+    "BusConfig",
+    "ControlConfig",
+    "CycleConfig",
+    "EncoderConfig",
+    "GainsConfig",
+    "HeartbeatConfig",
+    "Identity",
+    "LimitsConfig",
+    "MetricsConfig",
+    "NodeId",
+    "RecorderConfig",
+    "WiringProofConfig",
+    "load_config",
+]
 
 #: The test of the wiring stays below the limits by this share where its own bounds are not stated.
 _PROOF_SHARE = 0.9
 #: What it needs besides a ramp each way: at rest, holding, coming to rest [s].
 _PROOF_RESTS_S = 0.1
 
-NodeId = Annotated[int, Field(ge=1, le=127, description="CANopen node id, 1 to 127")]
-
-
-class BusConfig(Strict):
-    """How to reach the bus. `virtual`: channel is the hub's Unix socket; `socketcan`: an interface name; any other
-    name goes to python-can with `options`."""
-
-    interface: str = Field("virtual", min_length=1)
-    channel: str = Field("/run/servod/vbus0", min_length=1)
-    bit_rate: Literal[10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000] = 1_000_000
-    max_load: float = Field(0.7, ge=0.01, le=0.95, description="share of the bit rate the cyclic frames may use")
-    options: dict[str, Any] = Field(default_factory=dict, description="further arguments for python-can")
-
-
-class CycleConfig(Strict):
-    """The 1 kHz cycle and what it asks of the operating system."""
-
-    period_us: int = Field(1000, ge=500, le=20_000)
-    feedback_timeout_us: int = Field(600, ge=50, le=19_000, description="how long to wait for the TPDOs after SYNC")
-    cpu: int | None = Field(None, ge=0, le=1023, description="core to pin the loop to")
-    priority: int = Field(80, ge=0, le=98, description="SCHED_FIFO priority; 0 leaves the default scheduler")
-
-    @model_validator(mode="after")
-    def _timeout_fits(self) -> CycleConfig:
-        if self.feedback_timeout_us >= self.period_us:
-            raise ValueError("cycle.feedback_timeout_us less than cycle.period_us")
-        return self
-
-
-class HeartbeatConfig(Strict):
-    """Heartbeats both ways (CiA 301: 0x1016, 0x1017)."""
-
-    master_node_id: NodeId = 126
-    master_period_ms: int = Field(50, ge=10, le=1000)
-    drive_timeout_ms: int = Field(150, ge=20, le=5000, description="0x1016 in the drive: the last line of defence")
-    node_period_ms: int = Field(50, ge=10, le=1000, description="0x1017 in the nodes")
-    node_timeout_ms: int = Field(150, ge=20, le=5000)
-
-    @model_validator(mode="after")
-    def _timeouts_exceed_periods(self) -> HeartbeatConfig:
-        if self.drive_timeout_ms < 2 * self.master_period_ms:
-            raise ValueError("heartbeat.drive_timeout_ms at least twice master_period_ms")
-        if self.node_timeout_ms < 2 * self.node_period_ms:
-            raise ValueError("heartbeat.node_timeout_ms at least twice node_period_ms")
-        return self
-
-
-class Identity(Strict):
-    """Identity object 0x1018; every number that is given is checked before anything else is written."""
-
-    vendor_id: int | None = Field(None, ge=0, le=0xFFFFFFFF)
-    product_code: int | None = Field(None, ge=0, le=0xFFFFFFFF)
-    revision: int | None = Field(None, ge=0, le=0xFFFFFFFF)
-    serial: int | None = Field(None, ge=0, le=0xFFFFFFFF)
-
-
-class AmplifierConfig(Strict):
-    """The servo amplifier. Positions of 0x6064 are counts of the motor encoder; the joint turns 1/gear_ratio of it."""
-
-    driver: str = Field("cia402", min_length=1)
-    node_id: NodeId = 1
-    eds: str | None = Field(None, description="EDS or DCF file; without it the driver's generic dictionary is used")
-    identity: Identity = Identity()
-    quirks: str = Field("none", description="row of the quirks table, e.g. epos4, elmo, copley, nanotec, technosoft")
-    counts_per_turn: int = Field(1_048_576, ge=4, le=2**32 - 1)
-    gear_ratio: float = Field(1.0, ge=1e-6, le=1e6)
-    position_direction: Literal[1, -1] = 1
-    torque_direction: Literal[1, -1] = 1
-    rated_torque_mnm: int | None = Field(None, ge=1, description="what 0x6076 must read; None takes what is there")
-    quick_stop_option: Literal[0, 1, 2, 3, 4, 5, 6, 7, 8] = 2
-    heartbeat_reaction: Literal[1, 2, 3] = Field(3, description="0x6007: 1 fault, 2 disable voltage, 3 quick stop")
-    enable_timeout_s: float = Field(2.0, ge=1e-3, le=60.0)
-
-
-class EncoderConfig(Strict):
-    """The joint's encoder and how its velocity is made."""
-
-    driver: str = Field("cia406", min_length=1)
-    node_id: NodeId = 2
-    eds: str | None = None
-    identity: Identity = Identity()
-    counts_per_turn: int = Field(1_048_576, ge=4, le=2**32 - 1, description="0x6001, checked against the device")
-    measuring_range_counts: int | None = Field(None, ge=4, le=2**32, description="0x6002; None takes what is there")
-    direction: Literal[1, -1] = 1
-    zero_offset_rad: float = Field(0.0, ge=-1e6, le=1e6)
-    velocity_cutoff_hz: float = Field(120.0, ge=0.1, le=2000.0, description="first-order low-pass of the velocity")
-
 
 class LimitsConfig(Strict):
     """The independent last layer before the wire (servod.runtime.loop.limits)."""
 
-    torque_nm: float = Field(ge=1e-6, le=1e5)
-    torque_rate_nm_per_s: float = Field(ge=1e-6, le=1e9)
-    speed_rad_s: float = Field(ge=1e-6, le=1e5)
-    position_min_rad: float = Field(ge=-1e6, le=1e6)
-    position_max_rad: float = Field(ge=-1e6, le=1e6)
-    following_error_rad: float = Field(ge=1e-9, le=1e6)
-    encoder_mismatch_rad: float = Field(ge=1e-9, le=1e6)
-    stale_cycles: int = Field(5, ge=1, le=1000)
-    late_cycles: int = Field(
-        20, ge=1, le=10_000, description="skipped periods that end the motion; 20 punctual cycles make up for one"
+    torque_nm: float = Field(
+        ge=1e-6,
+        le=1e5,
+        description="most torque at the joint, after the gear, either way; more is cut (TORQUE_CLIPPED)",
     )
-    ramp_down_s: float = Field(0.05, ge=1e-4, le=1.0, description="torque to zero in this time on RAMP_DOWN")
+    torque_rate_nm_per_s: float = Field(
+        ge=1e-6, le=1e9, description="fastest change of the torque; a faster one is slowed (TORQUE_RATE_CLIPPED)"
+    )
+    speed_rad_s: float = Field(
+        ge=1e-6, le=1e5, description="most speed of the joint either way; beyond: quick stop (SPEED_LIMIT)"
+    )
+    position_min_rad: float = Field(
+        ge=-1e6, le=1e6, description="least position of the joint, in the encoder's zero; beyond: quick stop"
+    )
+    position_max_rad: float = Field(
+        ge=-1e6,
+        le=1e6,
+        description="greatest position, more than position_min_rad; beyond: quick stop (POSITION_LIMIT)",
+    )
+    following_error_rad: float = Field(
+        ge=1e-9, le=1e6, description="most distance of position and reference; beyond: ramp-down (FOLLOWING_ERROR)"
+    )
+    encoder_mismatch_rad: float = Field(
+        ge=1e-9,
+        le=1e6,
+        description="most distance that drive's and encoder's position of the joint may drift apart since the enable; "
+        "beyond: disabled (ENCODER_IMPLAUSIBLE)",
+    )
+    stale_cycles: int = Field(
+        5, ge=1, le=1000, description="cycles in a row without fresh feedback; as many: quick stop (FEEDBACK_STALE)"
+    )
+    late_cycles: int = Field(
+        20,
+        ge=1,
+        le=10_000,
+        description="skipped periods, more: quick stop (DEADLINE_BUDGET); 20 punctual cycles make up for one",
+    )
+    ramp_down_s: float = Field(
+        0.05,
+        ge=1e-4,
+        le=1.0,
+        description="time in which a ramp-down takes the torque to zero; a disable brakes for at most as long before",
+    )
 
     @model_validator(mode="after")
     def _range_is_a_range(self) -> LimitsConfig:
@@ -150,7 +122,9 @@ class WiringProofConfig(Strict):
     speed_rad_s: float | None = Field(
         None, ge=1e-6, le=1e5, description="faster fails; none: 0.9 of limits.speed_rad_s"
     )
-    timeout_s: float = Field(5.0, ge=0.5, le=60.0)
+    timeout_s: float = Field(
+        5.0, ge=0.5, le=60.0, description="the whole test; longer fails; at least twice ramp_s and 0.1 s"
+    )
     friction_nm: float | None = Field(
         None, ge=0.0, le=1e5, description="expected at break-away, 0 for a free joint; none: what `model` says"
     )
@@ -168,24 +142,28 @@ class WiringProofConfig(Strict):
 class GainsConfig(Strict):
     """Where gain sets are kept and which one is active at start."""
 
-    directory: Path = Path("/var/lib/servod/gains")
-    initial: Path
-    accept_uncertified: bool = Field(False, description="run gain sets that carry no certificate")
+    directory: Path = Field(Path("/var/lib/servod/gains"), description="where versions and the active set are kept")
+    initial: Path = Field(description="gain set of the first start; later the one that was activated last counts")
+    accept_uncertified: bool = Field(
+        False, description="run gain sets that carry no certificate; one that says no, or is broken, never runs"
+    )
 
 
 class ControlConfig(Strict):
     """The control socket: whose members of which group may command (root always may)."""
 
-    socket: Path = Path("/run/servod/axis.sock")
-    group: str = "servod"
+    socket: Path = Field(
+        Path("/run/servod/axis.sock"), description="Unix socket that the daemon takes commands on; --socket of servoctl"
+    )
+    group: str = Field("servod", description="members of this group of the system may command, and root")
 
 
 class RecorderConfig(Strict):
     """Recordings and the history kept before a fault."""
 
-    directory: Path = Path("/var/lib/servod/recordings")
-    history_s: float = Field(10.0, ge=0.0, le=600.0, description="kept in memory, written at a fault")
-    always: bool = Field(False, description="record from start to stop")
+    directory: Path = Field(Path("/var/lib/servod/recordings"), description="where recordings and fault files go")
+    history_s: float = Field(10.0, ge=0.0, le=600.0, description="kept in memory, written to a file at a fault")
+    always: bool = Field(False, description="record from the daemon's start to its stop")
     max_file_mib: int = Field(1024, ge=1, le=1_048_576, description="a recording that is larger goes on in a new file")
     max_fault_files: int = Field(50, ge=1, le=100_000, description="the oldest fault files beyond this are removed")
 
@@ -193,15 +171,21 @@ class RecorderConfig(Strict):
 class MetricsConfig(Strict):
     """Prometheus metrics: a local HTTP port, a textfile for the node exporter, both or none."""
 
-    http_port: int | None = Field(None, ge=1, le=65535)
-    http_address: str = "127.0.0.1"
-    textfile: Path | None = None
+    http_port: int | None = Field(None, ge=1, le=65535, description="TCP port of the metrics; left out: none is opened")
+    http_address: str = Field("127.0.0.1", description="address that http_port listens on; 0.0.0.0: all of the machine")
+    textfile: Path | None = Field(
+        None, description="file for the node exporter's textfile collector, *.prom; left out: none is written"
+    )
 
 
 class AxisConfig(Strict):
     """One axis: the whole configuration file."""
 
-    name: str = Field("axis", pattern=r"^[A-Za-z0-9_.-]{1,64}$")
+    name: str = Field(
+        "axis",
+        pattern=r"^[A-Za-z0-9_.-]{1,64}$",
+        description="name of the axis: in the status, as a label of the metrics, and in front of its recordings' names",
+    )
     bus: BusConfig = BusConfig()
     cycle: CycleConfig = CycleConfig()
     heartbeat: HeartbeatConfig = HeartbeatConfig()
@@ -210,7 +194,11 @@ class AxisConfig(Strict):
     limits: LimitsConfig
     wiring_proof: WiringProofConfig = WiringProofConfig()
     gains: GainsConfig
-    model: Path | None = Field(None, description="axis model file, attached to every recording")
+    model: Path | None = Field(
+        None,
+        description="axis model: friction and inertia that the test of the wiring expects, the delay that a gain set "
+        "must be designed for, attached to every recording; left out: none of these",
+    )
     control: ControlConfig = ControlConfig()
     recorder: RecorderConfig = RecorderConfig()
     metrics: MetricsConfig = MetricsConfig()

@@ -15,7 +15,7 @@ import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,6 @@ import reliability
 from servod.common.faults import FAULTS
 from servod.common.shipped import shipped
 from servod.drivers.quirks import QUIRKS
-from servod.formats.config import AxisConfig
 from servod.qualify.bench.table import GOALS
 from servod.qualify.bench.table import shown as shown_figure
 from servod.qualify.demo.entries import entries
@@ -91,44 +90,12 @@ def quirks() -> str:
     return markdown(["`amplifier.quirks`", "Maker", "Deviation", "Source"], rows)
 
 
-def config() -> str:
-    """Every key of the axis configuration with its type and range, default and meaning."""
-    schema = AxisConfig.model_json_schema()
-    return markdown(["Key", "Allowed", "Default", "Meaning"], list(config_rows(schema, schema, "")))
+def code(default: str) -> str:
+    """A default as it would stand in the file; not of a key that has none."""
+    return default if default == "required" else f"`{default}`"
 
 
-def config_rows(schema: dict[str, Any], here: dict[str, Any], prefix: str) -> Iterator[list[str]]:
-    """The rows of one level, groups followed by their keys."""
-    for name, field in here["properties"].items():
-        group = field.get("$ref")
-        if group:
-            yield from config_rows(schema, schema["$defs"][group.rsplit("/", 1)[1]], f"{prefix}{name}.")
-            continue
-        default = "required" if name in here.get("required", []) else f"`{shown(field)}`"
-        yield [f"`{prefix}{name}`", allowed(field), default, field.get("description", "")]
-
-
-def shown(field: dict[str, Any]) -> str:
-    """A default as it would stand in the file."""
-    default = field.get("default", {})
-    if isinstance(default, bool):
-        return str(default).lower()
-    return "none" if default is None else str(default)
-
-
-def allowed(field: dict[str, Any]) -> str:
-    """Type and range of one key in words."""
-    if "anyOf" in field:
-        return " or ".join(allowed(option) for option in field["anyOf"])
-    if "enum" in field:
-        return ", ".join(str(value) for value in field["enum"])
-    bounds = [f"{sign} {field[key]}" for key, sign in BOUNDS.items() if key in field]
-    kind = {"null": "none", "string": "text", "object": "mapping"}.get(field.get("type", ""), field.get("type", ""))
-    return " ".join([kind, ", ".join(bounds)]).strip()
-
-
-BOUNDS = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
-TABLES: dict[str, Callable[[], str]] = {"faults": faults, "quirks": quirks, "config": config}
+TABLES: dict[str, Callable[[], str]] = {"faults": faults, "quirks": quirks}
 
 
 def written() -> dict[Path, str]:
