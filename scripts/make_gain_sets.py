@@ -3,6 +3,11 @@
 The paper's sets are Table I read as the project reads it. The demo sets stand for an identification and a tuning on
 the demo joint: its steady friction at the nodes, each value with an error of a few per cent, without cogging,
 warming and noise, which the map cannot hold. With `--check` nothing is written; exit code 1 when a file is stale.
+
+`--certified` makes the last set, demo_local_certified, and the identified model that it is of, by the product's own
+commands in two minutes: `servoctl identify` on a virtual axis that is the demo joint, `servoctl synthesize` for the
+demo's velocity filter, `servoctl verify` with its full number of plants. Run it after changing the joint or the file
+formats; a certificate of an earlier version of the checks stays valid, and says of itself which version that was.
 """
 
 from __future__ import annotations
@@ -12,17 +17,26 @@ import datetime
 import hashlib
 import math
 import random
+import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from servod.common.yaml import validate
-from servod.formats.gains.gain_set import GainSet
+from servod.formats.config import EncoderConfig
+from servod.formats.gains.gain_set import GainSet, load_gains
 from servod.formats.gains.store import write_atomically
 from servod.formats.model.axis_model import AxisModel, LugreFriction, load_axis_model
 
 GAINS = Path(__file__).resolve().parent.parent / "gains"
+AXES = GAINS / "axes"
+MADE = "# Made by scripts/make_gain_sets.py.\n"
+MADE_CERTIFIED = "# Made by scripts/make_gain_sets.py --certified.\n"
+#: The set that is certified, the model that it is of, and the plant that this was identified on.
+CERTIFIED = GAINS / "demo_local_certified.yaml"
+IDENTIFIED, PLANT = AXES / "demo_joint_identified.yaml", AXES / "demo_joint.yaml"
 DATE = datetime.date(2026, 11, 21).isoformat()
 MAP_ERROR, MAP_SEED = 0.03, 3
 
@@ -257,20 +271,75 @@ def all_sets() -> list[GainSet]:
     return [*paper_sets(), *table1_sets(table1), *demo_rivals(), *demo_local_sets(demo)]
 
 
+def servoctl(*words: str) -> None:
+    """Run one command of the product; its exit code ends this program when it is not 0."""
+    print("servoctl", *words, flush=True)
+    subprocess.run([sys.executable, "-m", "servod.cli", *words], check=True, stdout=subprocess.DEVNULL)
+
+
+def sha256(file: Path) -> str:
+    """Hash of a file."""
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+def identified_text(model: str) -> str:
+    """The identified model as it ships: what it was identified on, so that a changed plant shows."""
+    return (
+        f"{MADE_CERTIFIED[:-2]}: what `servoctl identify` finds of demo_joint.yaml, each value with\n"
+        f"# its 95 % interval. That plant's hash: {sha256(PLANT)}\n{model}"
+    )
+
+
+def certify() -> None:
+    """Identify the demo joint, synthesize for what was found, verify, and keep model and certified set."""
+    with tempfile.TemporaryDirectory(prefix="servod-gains-") as name:
+        model, gains = Path(name) / "model.yaml", Path(name) / "gains.yaml"
+        servoctl("identify", "--plant", str(PLANT), "--out", str(model))
+        write_atomically(IDENTIFIED, identified_text(model.read_text(encoding="utf-8")))
+        cutoff = f"{EncoderConfig().velocity_cutoff_hz:g}"  # the demo's axis has the filter that is the default
+        servoctl(
+            *("synthesize", "--model", str(IDENTIFIED), "--out", str(gains), "--name", CERTIFIED.stem),
+            *("--cutoff-hz", cutoff),
+        )
+        servoctl("verify", str(gains))
+        write_atomically(CERTIFIED, MADE_CERTIFIED + gains.read_text(encoding="utf-8"))
+
+
+def certified_problem() -> str | None:
+    """Why the certified set must be made anew; None when it is certified, for this model and this plant."""
+    if not CERTIFIED.exists() or not IDENTIFIED.exists():
+        return "missing"
+    gains = load_gains(CERTIFIED)
+    if problem := gains.certificate_problem():
+        return problem
+    if gains.provenance.model_sha256 != sha256(IDENTIFIED):
+        return f"of another model than {IDENTIFIED.name}"
+    if sha256(PLANT) not in IDENTIFIED.read_text(encoding="utf-8"):
+        return f"identified on another {PLANT.name}"
+    return None
+
+
 def main() -> int:
     """Write the files, or compare them with `--check`."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true", help="write nothing, exit 1 when a file is stale")
-    check = parser.parse_args().check
+    parser.add_argument("--certified", action="store_true", help=f"make {CERTIFIED.stem} anew as well, in two minutes")
+    options = parser.parse_args()
+    check = options.check
+    if options.certified and not check:
+        certify()
     stale = 0
+    if problem := certified_problem():
+        stale += 1
+        print(f"{CERTIFIED.name}: {problem}; --certified makes it")
     for gains in all_sets():
-        path, text = GAINS / f"{gains.name}.yaml", f"# Made by scripts/make_gain_sets.py.\n{gains.to_yaml()}"
+        path, text = GAINS / f"{gains.name}.yaml", f"{MADE}{gains.to_yaml()}"
         if not path.exists() or path.read_text(encoding="utf-8") != text:
             stale += 1
             print(f"{path.name}: {'stale' if check else 'written'}")
             if not check:
                 write_atomically(path, text)
-    return 1 if check and stale else 0
+    return 1 if stale and (check or problem) else 0
 
 
 if __name__ == "__main__":
