@@ -1,4 +1,4 @@
-"""`servoctl demo`: the virtual axis under four controllers, with a table of errors and a report."""
+"""`servoctl demo`: the virtual axis under four controllers and a certified set, with a table of errors and a report."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ if TYPE_CHECKING:
 
 _HELP = example(
     "Run daemon and virtual axis, track the paper's trajectory (19) under PD, PD + DOB, PD + LuGre and the local-model "
-    "law, and compare. --gains adds rows; --fast adds three by itself on the shipped joint: the local law without "
-    "options, and Table I in both readings. Everything that is started is stopped again.",
+    "law, and compare. On the shipped joint the last row is a gain set that was synthesized and certified for it as "
+    "identified. --gains adds rows; --fast adds three by itself there: the local law without options, and Table I "
+    "in both readings. Everything that is started is stopped again.",
     "servoctl demo",
     "servoctl demo --fast --gains gains/demo_local_plain.yaml",
     "servoctl demo --plant my_axis.yaml --json",
@@ -65,7 +66,7 @@ def demo(
 
     # Everything that can be refused is refused before anything is started.
     further = gains or (further_files() if fast and plant is None else [])
-    model, rows = plant_file(plant), entries(further)
+    model, rows = plant_file(plant), entries(further, certified=plant is None)
     load_rotary_model(model)
     recordings = out / "recordings"
     need_folder("--out", out if fast else recordings, alone=True)
@@ -78,6 +79,7 @@ def demo(
         "mode": "stepped" if fast else "wall",
         "realtime_refused": refused,
         "report": str(report),
+        "certified": {row.name: row.margins._asdict() for row in rows if row.margins},
     }
     if as_json:
         print_json(document)
@@ -149,6 +151,9 @@ def print_document(rows: Sequence[Entry], document: dict[str, Any]) -> None:
         f"{document['cycles']} cycles of the four, {document['missed']} missed, {document['wall_s']:.1f} s.",
         highlight=False,
     )
+    for row in rows:
+        if row.margins:
+            console.print(f"{row.label}: {row.margins}.", highlight=False)
     if document["realtime_refused"]:
         refused = ", ".join(document["realtime_refused"])
         console.print(f"Refused by the system, so timing may suffer: {refused}.", highlight=False)

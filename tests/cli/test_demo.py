@@ -45,7 +45,10 @@ def test_the_fast_demo_prints_one_document(tmp_path: Path, capsys: pytest.Captur
     document = json.loads(captured.out)
     check(document, tmp_path)
     assert captured.err == ""
-    assert list(document["others"]) == ["demo_local_plain", "table1_kz_kv_kx", "table1_kx_kv_kz"]
+    assert list(document["others"]) == ["demo_local_plain", "table1_kz_kv_kx", "table1_kx_kv_kz", "local_certified"]
+    assert document["others"]["local_certified"]["rms_error_mrad"] < document["controllers"]["local"]["rms_error_mrad"]
+    assert list(document["certified"]) == ["local_certified"]
+    assert document["certified"]["local_certified"]["plants"] >= 1000
     assert document["missed"] == 0
     assert document["cycles"] == pytest.approx(4 * 5000, abs=8)
 
@@ -55,7 +58,7 @@ def test_further_gain_sets_run_beside_the_four(tmp_path: Path, capsys: pytest.Ca
     assert run(["demo", "--fast", "--seconds", "3", "--out", str(tmp_path), "--gains", plain, "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     check(document, tmp_path)
-    assert list(document["others"]) == ["demo_local_plain"]
+    assert list(document["others"]) == ["demo_local_plain", "local_certified"]
     assert document["others"]["demo_local_plain"]["rms_error_mrad"] < COMPENSATED_MRAD
 
 
@@ -91,7 +94,7 @@ def test_the_plant_can_be_another_joint(tmp_path: Path, capsys: pytest.CaptureFi
     assert run(["demo", "--fast", "--seconds", "3", "--json", "--out", str(tmp_path), "--plant", str(plant)]) == 0
     document = json.loads(capsys.readouterr().out)
     scores = document["controllers"]
-    assert "others" not in document
+    assert "others" not in document and document["certified"] == {}
     assert scores["pd"]["rms_error_mrad"] < STUCK_MRAD
 
 
@@ -162,7 +165,9 @@ def test_the_demo_on_the_wall_clock(tmp_path: Path) -> None:
     out, err = demo.communicate(timeout=100)
     assert (demo.returncode, err) == (0, "")
     check(json.loads(out), tmp_path / "out")
-    assert sorted(f.stem for f in (tmp_path / "out/recordings").glob("*.mcap")) == ["local", "pd", "pd_dob", "pd_lugre"]
+    assert sorted(f.stem for f in (tmp_path / "out/recordings").glob("*.mcap")) == [
+        *("local", "local_certified", "pd", "pd_dob", "pd_lugre")
+    ]
     assert started_by(tmp_path) == []
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from servod.common.errors import AnswerIsNo, BadInput
 from servod.common.shipped import shipped
+from servod.formats.gains.gain_set import load_gains
 from servod.lab.recordings.recording import ROW
 from servod.lab.report.figure import thin, time_curves
 from servod.qualify.demo.axis import CONTROLLERS
@@ -84,6 +85,29 @@ def test_every_row_says_what_its_law_had() -> None:
     assert rows["pd_dob"] == "observer 50 rad/s"
     assert rows["local"] == "friction map of 23 velocities, reference velocity, observer 50 rad/s, equal feedback"
     assert rows["demo_local_plain"] == "friction map of 23 velocities, measured velocity, no observer, equal feedback"
+
+
+def test_the_certified_set_is_the_last_row_and_says_what_it_stands(tmp_path: Path) -> None:
+    rows = entries([shipped("gains/demo_local_plain.yaml")], certified=True)
+    last = rows[-1]
+    assert [row.name for row in rows[-2:]] == ["demo_local_plain", "local_certified"]
+    assert "certified" in last.label and "torque over position fed forward" in last.options
+    assert last.margins is not None and all(row.margins is None for row in rows[:-1])
+    runs = [cut_motion(row.name, recorded(0.001).tobytes()) for row in rows]
+    write_demo_page(rows, runs, tmp_path / "report.html", Story("joint", True))
+    assert f"{last.label}: {last.margins}." in (tmp_path / "report.html").read_text()
+
+
+def test_a_set_of_another_loop_is_refused_before_anything_runs(tmp_path: Path) -> None:
+    """The stepped demo ran it with a velocity filter that it was not designed for; the daemon refuses it."""
+    gains = load_gains(shipped("gains/demo_local_certified.yaml"))
+    assert gains.design is not None
+    design = gains.design.model_copy(update={"velocity_cutoff_hz": 300.0})
+    other = gains.model_copy(update={"name": "other", "certificate": None, "design": design})
+    file = tmp_path / "other.yaml"
+    file.write_text(other.sealed().to_yaml())
+    with pytest.raises(BadInput, match="velocity_cutoff_hz"):
+        entries([file])
 
 
 def test_a_row_is_not_given_twice() -> None:

@@ -26,6 +26,7 @@ from servod.common.shipped import shipped
 from servod.drivers.quirks import QUIRKS
 from servod.qualify.bench.table import GOALS
 from servod.qualify.bench.table import shown as shown_figure
+from servod.qualify.demo.axis import CERTIFIED
 from servod.qualify.demo.entries import entries
 from servod.qualify.paper.table import quotation
 
@@ -136,11 +137,11 @@ def tracking(document: dict[str, Any]) -> str:
     """Every row of the demo's table with the options of its law, beside what the paper measured on its joint."""
     scores = document["controllers"] | document["others"]
     rows = []
-    for row in entries([shipped(f"gains/{name}.yaml") for name in BESIDE]):
+    beside = [shipped(f"gains/{name}.yaml") for name in BESIDE]
+    for row in entries(beside, certified=CERTIFIED in document["others"]):
         score = scores[row.name]
         rms, largest = (f"{score[f'{kind}_error_mrad']:.3f}" for kind in ("rms", "max"))
-        name = row.name if row.name in document["others"] else f"demo_{row.name}"
-        rows.append([row.label if row.label != row.name else "", f"`{name}`", row.options, rms, largest])
+        rows.append([row.label if row.label != row.name else "", f"`{row.gains.stem}`", row.options, rms, largest])
         rows[-1].append(PAPER_MRAD.get(row.name, ""))
     header = ["Controller", "Gain set", "Options", "RMS / mrad", "Largest / mrad", "Paper, RMS / mrad"]
     return f"```sh\nservoctl {' '.join(demo_arguments())}\n```\n\n{markdown(header, rows)}"

@@ -1,4 +1,4 @@
-"""The demo's axis: one configuration for daemon, loop and stepped session, the four gain sets, and the default plant.
+"""The demo's axis: one configuration for daemon, loop and stepped session, shipped gain sets, default plant.
 
 Beside the data path. Everything that acts is the product's own; only these values are the demo's.
 """
@@ -15,6 +15,8 @@ from servod.formats.config import AxisConfig
 #: The four laws of the comparison, in the order of the table; each has its gain set `gains/demo_<law>.yaml`.
 CONTROLLERS = ("pd", "pd_dob", "pd_lugre", "local")
 
+#: The row after all others on the shipped joint: what identify, synthesize and verify make of it.
+CERTIFIED, CERTIFIED_LABEL = "local_certified", "Local models, synthesized and certified"
 
 def gains_file(controller: str) -> Path:
     """The shipped gain set of one law."""

@@ -100,6 +100,9 @@ def _compare(page: Page, rows: Sequence[Entry], runs: Sequence[Run]) -> None:
                 f"{run.missed}",
             ]
         )
+    for row in rows:
+        if row.margins:
+            page.sentence(f"{row.label}: {row.margins}.")
     page.table(["controller", "options", "RMS error / mrad", "largest error / mrad", "cycles", "missed"], cells)
 
 

@@ -62,7 +62,8 @@ def cut_motion(controller: str, raw: bytes | bytearray) -> Run:
 def summary(runs: list[Run], wall_s: float) -> dict[str, Any]:
     """The demo's JSON document: the score of each controller, their cycles and missed periods, and elapsed time.
 
-    Runs under gain sets beside the four controllers stand under `others`, which is there only when there are any.
+    Runs under gain sets beside the four controllers, the certified one included, stand under `others`, which is there
+    only when there are any.
     """
     scores = {run.controller: asdict(run.score()) for run in runs}
     others = {name: scores.pop(name) for name in list(scores) if name not in CONTROLLERS}
