@@ -93,8 +93,8 @@ def at_paper_feedback(gains: GainSet, name: str, observer_rad_s: float | None = 
     return with_feedback(gains, name, K_P, K_D, observer_rad_s)
 
 
-def without_options(gains: GainSet, name: str) -> GainSet:
-    """The set without its disturbance observer, driven by the measured velocity: (9), (13) and (16) alone."""
+def without_observer(gains: GainSet, name: str) -> GainSet:
+    """The set without its disturbance observer, driven by the measured velocity; its feed-forwards and widths stay."""
     from servod.formats.gains.parameters import VelocitySource
 
     law = local_law(gains)

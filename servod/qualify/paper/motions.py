@@ -194,7 +194,7 @@ def _order(results: Results, joint: Joint) -> tuple[Claim, ...]:
     claims = []
     for local, who in (
         (Row.TABLE1, ""),
-        (Row.LOCAL_PLAIN, ", the local law at the same PD gains, without options"),
+        (Row.LOCAL_PLAIN, ", the local law at the same PD gains, no observer, measured velocity"),
         (Row.DEPLOYED, ", with the synthesized law"),
     ):
         rows: Sequence[Row] = (Row.DOB, Row.LUGRE_BETTER, local)

@@ -20,11 +20,11 @@ from servod.lab.tune.plan import Feedback
 from servod.qualify.paper import beyond, document, equations, experiments, motions, programme, sweeps
 from servod.qualify.paper.crew import Crew, Tell
 from servod.qualify.paper.experiments import Contender, Found, Measured, cutoff_of
-from servod.qualify.paper.joints import Joint, at_paper_feedback, printed_l, shipped_set, with_l, without_options
+from servod.qualify.paper.joints import Joint, at_paper_feedback, printed_l, shipped_set, with_l, without_observer
 from servod.qualify.paper.printed import FRICTION
 from servod.qualify.paper.results import Results, Row
 
-#: l_i of the local law at the paper's PD gains without options, in all its sets; as the demo's plain set.
+#: l_i of the local law at the paper's PD gains without observer, in all its sets; as the demo's plain set.
 PLAIN_L = 0.1
 #: RMS of the noise on friction in Fig. 11 and 12, as a share of F_C.
 NOISE_SHARE = 0.1
@@ -167,18 +167,26 @@ Tracked = tuple[tuple[Joint, Row], Future[Measured]]
 
 def _track_shipped(plan: PaperPlan, crew: Crew, joint: Joint) -> Iterator[Tracked]:
     """The paper's sets in all readings."""
+    yield from _track(plan, crew, joint, paper_sets())
+
+
+def paper_sets() -> dict[Row, GainSet]:
+    """The shipped sets of the paper in all readings, by their rows."""
     sets = {row: shipped_set(name) for row, name in _SHIPPED.items()}
-    sets[Row.TABLE1_PRINTED_L] = printed_l(sets[Row.TABLE1])
-    yield from _track(plan, crew, joint, sets)
+    return sets | {Row.TABLE1_PRINTED_L: printed_l(sets[Row.TABLE1])}
 
 
 def _track_found(plan: PaperPlan, crew: Crew, joint: Joint, found: Found) -> Iterator[Tracked]:
-    """The identified joint's sets: at the paper's feedback without options and with them, and as synthesized."""
-    equal = at_paper_feedback(found.gains, "equal")
-    plain = without_options(equal, "plain")
+    """The identified joint's sets."""
+    yield from _track(plan, crew, joint, designed_sets(found.gains), cutoff_of(found.gains))
+
+
+def designed_sets(gains: GainSet) -> dict[Row, GainSet]:
+    """A synthesized set at the paper's feedback, without observer and with it, and as it is, by their rows."""
+    equal = at_paper_feedback(gains, "equal")
+    plain = without_observer(equal, "plain")
     plain = with_l(plain, "plain", [PLAIN_L] * len(local_law(plain).friction.sets))
-    sets = {Row.LOCAL_PLAIN: plain, Row.LOCAL_EQUAL: equal, Row.DEPLOYED: found.gains}
-    yield from _track(plan, crew, joint, sets, cutoff_of(found.gains))
+    return {Row.LOCAL_PLAIN: plain, Row.LOCAL_EQUAL: equal, Row.DEPLOYED: gains}
 
 
 def _track(
