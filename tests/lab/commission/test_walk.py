@@ -41,6 +41,7 @@ from servod.lab.synthesize.infeasible import Infeasible, Relaxation
 from servod.lab.tracking import metrics
 from tests.lab.synthesize.designs import table1
 
+pytestmark = pytest.mark.timeout(400)  # some 16 s on a quiet core; a busy machine is no finding
 AXIS = VirtualWalkAxis(table1(), seed=1)
 
 

@@ -21,6 +21,8 @@ from servod.lab.recordings import Quantity, Recording
 from servod.lab.report.diagnosis import write_files
 from tests.lab.diagnose.axes import BELIEVED, believed, record, recording, write_csv
 
+pytestmark = pytest.mark.timeout(400)  # some 10 s on a quiet core; a busy machine is no finding
+
 #: Keys of the outside contract.
 FINDING = {"effect", "statement", "located", "parameters", "confidence", "alternatives", "held_out"}
 TOP = {"verdict", "findings", "recalibrated", "minor", "fit", "recordings"}
