@@ -47,6 +47,9 @@ from servod.cli.common import drop_empty_folders
 from servod.common.errors import BadInput, ServodError
 
 _INTERRUPTED = 130  # as shells count SIGINT
+#: Windows says EINVAL of a pipe whose reader has gone.
+_GONE = {errno.EPIPE, errno.EINVAL} if sys.platform == "win32" else {errno.EPIPE}
+_NOBODY_TAKES = {errno.ENOSPC, errno.EIO, errno.EBADF, *_GONE}
 
 app = typer.Typer(
     name="servoctl",
@@ -102,10 +105,10 @@ def _stand_in_for_closed() -> None:
 
 def _output_refused(error: OSError) -> int:
     """The exit code when nobody takes standard output; any other error is raised again."""
-    if error.filename is not None or error.errno not in (errno.ENOSPC, errno.EIO, errno.EPIPE, errno.EBADF):
+    if error.filename is not None or error.errno not in _NOBODY_TAKES:
         raise error
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the interpreter flushes once more
-    if error.errno == errno.EPIPE:
+    if error.errno in _GONE:
         return 1  # the reader of a pipe has gone; nothing is left to say
     return _complain(f"standard output: {error.strerror}", 1)
 

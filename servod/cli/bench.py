@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from servod.cli.common import JsonOption, example, need_folder, print_json
+from servod.common.portable import need_linux
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -38,6 +39,7 @@ def bench(
     as_json: JsonOption = False,
 ) -> None:
     """Run the benchmark."""
+    need_linux("servoctl bench")
     from rich.console import Console
 
     from servod.qualify.bench import QUICK, THOROUGH, measure

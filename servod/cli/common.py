@@ -6,7 +6,6 @@ Imports typer alone, so that `servoctl --help` starts at once.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import os
 import sys
@@ -20,6 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from servod.common.errors import BadInput, Unreachable
+from servod.common.portable import lock_again, lock_folder
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -102,16 +102,14 @@ def need_folder(option: str, folder: Path, alone: bool = False) -> None:
 
 
 def _lock(option: str, folder: Path) -> None:
-    """Lock the folder itself (flock(2)): no file is left behind. A stage has its command's lock."""
-    descriptor = _handed_down(folder)
-    if descriptor is None:
-        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    """Lock the folder for as long as this command lives. A stage has its command's lock."""
+    if sys.platform == "win32" and _HANDED_DOWN in os.environ:
+        return  # descriptors are not handed on there; the command that waits for this stage holds the lock
+    held = _handed_down(folder)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        _locks.append(lock_folder(folder) if held is None else lock_again(held))
     except OSError:
-        os.close(descriptor)
         raise Unreachable(f"{option} {folder}: another command is at work there; name a folder of its own") from None
-    _locks.append(descriptor)
 
 
 def run_stage(arguments: Sequence[str]) -> int:
@@ -124,7 +122,8 @@ def run_stage(arguments: Sequence[str]) -> int:
 
     environment = os.environ | {_HANDED_DOWN: " ".join(str(descriptor) for descriptor in _locks)}
     command = [sys.executable, "-m", "servod.cli", *arguments]
-    return subprocess.run(command, pass_fds=_locks, env=environment, check=False).returncode
+    handed = () if sys.platform == "win32" else _locks
+    return subprocess.run(command, pass_fds=handed, env=environment, check=False).returncode
 
 
 def _handed_down(folder: Path) -> int | None:

@@ -12,6 +12,7 @@ import typer
 
 from servod.cli.common import JsonOption, example, need_folder, print_json
 from servod.common.errors import BadInput
+from servod.common.portable import need_linux
 
 if TYPE_CHECKING:
     from servod.qualify.demo.entries import Entry
@@ -58,6 +59,8 @@ def demo(
         return
     if conceal is not None:
         raise BadInput("--conceal", conceal, "only with --diagnose")
+    if not fast:
+        need_linux("servoctl demo without --fast")
     from servod.formats.model.axis_model import load_rotary_model
     from servod.qualify.demo.axis import plant_file
     from servod.qualify.demo.entries import entries, further_files

@@ -12,6 +12,7 @@ import typer
 from servod.cli.common import JsonOption, example, need_folder, print_json, table_console
 from servod.common.errors import AnswerIsNo, BadInput
 from servod.common.faults import FAULTS
+from servod.common.portable import need_linux
 
 if TYPE_CHECKING:
     from servod.qualify.faults.run import Outcome
@@ -53,6 +54,7 @@ def faults(
         _refuse_beside_codes(only=only, group=group, scenario=scenario, stepped=stepped, out=out)
         _print_codes(as_json)
         return
+    need_linux("servoctl faults")
     chosen = _chosen(scenario, only, group, stepped)
     if out is not None:
         need_folder("--out", out, alone=True)

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from servod.cli.common import example
+from servod.common.portable import need_linux
 
 _HELP = example(
     "Make the joint's present position read --position-rad in the encoder. Only while no daemon runs the axis, the "
@@ -26,6 +27,7 @@ def preset(
     position_rad: Annotated[float, typer.Option(help="What the present position shall read, in rad.")],
 ) -> None:
     """Set the encoder's zero."""
+    need_linux("servoctl preset")
     from contextlib import closing
 
     from servod.common.clock import WallClock

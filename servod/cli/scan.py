@@ -8,6 +8,7 @@ import typer
 
 from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, example, print_json, table_console
 from servod.common.errors import BadInput, Unreachable, one_line
+from servod.common.portable import need_linux
 
 if TYPE_CHECKING:
     from servod.formats.config import BusConfig
@@ -54,6 +55,7 @@ def _through_daemon(socket: Any) -> list[dict[str, Any]]:
 
 
 def _on_bus(interface: str, channel: str, bit_rate: int, socket: Any) -> list[dict[str, Any]]:
+    need_linux("servoctl scan")
     from servod.common.yaml import validate
     from servod.formats.config import BusConfig
     from servod.runtime.daemon.lock import BusLock

@@ -10,6 +10,7 @@ import typer
 
 from servod.cli.common import JsonOption, example, need_folder, one_thread, print_json
 from servod.common.errors import BadInput
+from servod.common.portable import need_linux
 
 _HELP = example(
     "Move the virtual axis at random for hours, let faults befall it, recover as a person would, and account for every "
@@ -58,6 +59,7 @@ def soak(
     """Soak."""
     if wall and jobs > 1:
         raise BadInput("--jobs", jobs, "1 with --wall: the processes of one axis want the machine for themselves")
+    need_linux("servoctl soak")
     need_folder("--out", out, alone=True)
     one_thread()
     from servod.cli.common import progress

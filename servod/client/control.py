@@ -16,6 +16,7 @@ from types import TracebackType
 from typing import Any
 
 from servod.common.errors import AnswerIsNo, BadInput, ServodError, Unreachable, one_line
+from servod.common.portable import need_linux
 from servod.formats.protocol import (
     MAX_ANSWER_BYTES,
     MAX_LINE_BYTES,
@@ -50,6 +51,7 @@ class ControlClient:
     def __init__(self, path: str | Path, timeout_s: float = 30.0) -> None:
         self._path = str(path)
         self._id = 0
+        need_linux(f"{path}: to talk to a daemon")
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
         # A socket that does not block is refused by a full queue; one that blocks stands in it, for this time.
         longest = _TIMEVAL.pack(*divmod(int(timeout_s * 1e6), 1_000_000))

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import grp
 import os
 import signal
 import subprocess
@@ -22,6 +21,8 @@ import yaml
 
 from servod.client.control import ControlClient
 from servod.common.errors import Unreachable
+from servod.common.portable import need_linux
+from servod.common.workers import END_SIGNALS
 from servod.formats.config import AxisConfig
 
 _PR_SET_PDEATHSIG, _PR_CAPBSET_DROP = 1, 24  # linux/prctl.h
@@ -36,6 +37,7 @@ def child(
 
     `cores` keeps it to these; `dropped` are capabilities (linux/capability.h) that it shall not have.
     """
+    need_linux(f"python -m {module}")
     libc = ctypes.CDLL(None)
 
     def prepare() -> None:
@@ -92,7 +94,7 @@ def sigterm_as_interrupt() -> Iterator[None]:
             signal.signal(other, signal.SIG_IGN)
         raise KeyboardInterrupt(signal.Signals(number).name)
 
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
+    before = {number: signal.getsignal(number) for number in END_SIGNALS}
     for number in before:
         signal.signal(number, interrupt)
     try:
@@ -151,17 +153,25 @@ def _answers(control: Path) -> bool:
 
 def last_core() -> int | None:
     """The core farthest from where the system puts its interrupts; None where there is only one."""
+    if sys.platform != "linux":
+        return None
     cores = sorted(os.sched_getaffinity(0))
     return cores[-1] if len(cores) > 1 else None
 
 
 def other_cores() -> set[int] | None:
     """All cores but the loop's; None where there is only one."""
+    if sys.platform != "linux":
+        return None
     return os.sched_getaffinity(0) - {last_core()} or None
 
 
 def own_group() -> str:
     """The group of this process, by name where it has one."""
+    if sys.platform == "win32":
+        return "servod"
+    import grp
+
     try:
         return grp.getgrgid(os.getgid()).gr_name
     except KeyError:

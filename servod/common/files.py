@@ -16,6 +16,8 @@ from servod.common.errors import BadInput
 
 #: Largest file that is read as a whole.
 MOST_BYTES = 64 * 1024 * 1024
+#: A pipe without a writer would wait; Windows, which has no such pipes, would change line ends.
+_READING = os.O_RDONLY | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 _KINDS = {stat.S_IFDIR: "Is a directory", stat.S_IFIFO: "a pipe", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device"}
 
 
@@ -57,7 +59,7 @@ def require_size(path: str | Path, stream: BinaryIO, most_bytes: int) -> None:
 
 def open_file(path: str | Path) -> BinaryIO:
     """A file to read from, which is no pipe and no device. Raises OSError."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # a pipe without a writer would wait
+    descriptor = os.open(path, _READING)
     kind = stat.S_IFMT(os.fstat(descriptor).st_mode)
     if kind == stat.S_IFREG:
         return os.fdopen(descriptor, "rb")

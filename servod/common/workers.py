@@ -6,9 +6,9 @@ Ground floor, for the laboratory part. The daemon and the loop have processes of
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -18,8 +18,10 @@ from multiprocessing.util import Finalize
 from typing import Any
 
 from servod.common.errors import Unreachable
+from servod.common.portable import end_with_parent
 
-_PR_SET_PDEATHSIG = 1  # linux/prctl.h
+#: What Windows can wait for at once, less what the executor itself needs.
+_MOST_ON_WINDOWS = 61
 
 
 @contextlib.contextmanager
@@ -29,6 +31,8 @@ def worker_pool(processes: int, begin: Callable[..., None] | None = None, *given
     Each calls `begin(*given)` first. Raises Unreachable when one of them dies, which an executor tells to whoever waits
     for a result: a `multiprocessing.Pool` would replace it in silence and wait for what it had taken.
     """
+    if sys.platform == "win32":
+        processes = min(processes, _MOST_ON_WINDOWS)
     _tracker_goes_with_us()
     pool = ProcessPoolExecutor(processes, get_context("spawn"), begin_worker, (os.getpid(), begin, given))
     try:
@@ -63,9 +67,7 @@ def _tracker_goes_with_us() -> None:
 def begin_worker(parent: int, begin: Callable[..., None] | None = None, given: tuple[Any, ...] = ()) -> None:
     """What a worker of `parent` does first."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:  # it died before we asked
-        os._exit(1)
+    end_with_parent(parent)
     if begin is not None:
         begin(*given)
 
@@ -73,8 +75,12 @@ def begin_worker(parent: int, begin: Callable[..., None] | None = None, given: t
 # The signals that ask a process of servod to end in order. Ground floor.
 
 
+#: What ends a process from outside: SIGTERM, and SIGHUP where a terminal sends one.
+END_SIGNALS = tuple(s for s in signal.Signals if s.name in ("SIGTERM", "SIGHUP"))
+
+
 def on_end_signals(act: Callable[[], None]) -> None:
     """Let SIGTERM, SIGINT and SIGHUP (its terminal closes) call `act`; under nohup(1), SIGHUP stays ignored."""
-    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+    for number in (*END_SIGNALS, signal.SIGINT):
+        if number.name != "SIGHUP" or signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, lambda *_: act())

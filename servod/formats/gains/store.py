@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import contextlib
 import datetime
-import fcntl
 import hashlib
 import os
 import re
@@ -27,6 +26,7 @@ from pathlib import Path
 from pydantic import Field
 
 from servod.common.errors import BadInput
+from servod.common.portable import flush_folder, lock_file
 from servod.common.yaml import Strict, load_model, read_text
 from servod.formats.gains.gain_set import NAME_PATTERN, GainSet, parse_gains, require_certificate
 
@@ -85,7 +85,7 @@ def write_atomically(path: Path, text: str) -> None:
     """Replace `path` by `text`: write aside, flush to disk, rename. After a kill there is the old file or the new."""
     aside = path.with_name(f"{path.name}.{os.getpid()}.tmp")
     try:
-        with aside.open("w", encoding="utf-8") as file:
+        with aside.open("w", encoding="utf-8", newline="\n") as file:
             file.write(text)
             file.flush()
             os.fsync(file.fileno())
@@ -94,7 +94,7 @@ def write_atomically(path: Path, text: str) -> None:
         with contextlib.suppress(OSError):  # half a file fills the very disk that took no more
             aside.unlink(missing_ok=True)
         raise
-    _flush_directory(path.parent)
+    flush_folder(path.parent)
 
 
 def write_file(path: Path, text: str) -> None:
@@ -103,14 +103,6 @@ def write_file(path: Path, text: str) -> None:
         write_atomically(path, text)
     except OSError as error:
         raise BadInput(str(path), error.strerror or str(error), "a file that can be written") from None
-
-
-def _flush_directory(directory: Path) -> None:
-    descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 class GainStore:
@@ -132,7 +124,7 @@ class GainStore:
     def _locked(self) -> Iterator[None]:
         """One writer at a time, also across processes; the lock ends with the process, however it ends."""
         with (self.directory / "lock").open("w") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
+            lock_file(file, wait=True)
             yield
 
     def _sweep(self) -> None:
@@ -160,7 +152,7 @@ class GainStore:
             version = newest + 1
             path = self._path(gains.name, version)
             path.parent.mkdir(exist_ok=True)
-            _flush_directory(self._sets)
+            flush_folder(self._sets)
             write_atomically(path, text)
             stored = self.get(gains.name, version)
             self._log(Action.LOAD, stored)

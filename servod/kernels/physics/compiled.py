@@ -101,9 +101,11 @@ def _user_cache() -> Path:
     """A folder that this user may write: XDG cache, else one under the temporary folder."""
     import tempfile
 
+    who = str(os.getuid()) if hasattr(os, "getuid") else "own"  # Windows gives each user a temporary folder
+    other = Path(tempfile.gettempdir()) / f"servod-kernels-{who}"
     wanted = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "servod" / "kernels"
     try:
         wanted.mkdir(parents=True, exist_ok=True)
     except OSError:
-        return Path(tempfile.gettempdir()) / f"servod-kernels-{os.getuid()}"
-    return wanted if os.access(wanted, os.W_OK) else Path(tempfile.gettempdir()) / f"servod-kernels-{os.getuid()}"
+        return other
+    return wanted if os.access(wanted, os.W_OK) else other

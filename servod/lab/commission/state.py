@@ -7,7 +7,6 @@ with their hashes: a file that was edited since is neither taken for the step's 
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
@@ -19,6 +18,7 @@ from pydantic import Field
 from servod.common import files
 from servod.common.errors import BadInput, Unreachable
 from servod.common.files import read_json
+from servod.common.portable import lock_file
 from servod.common.yaml import Strict, validate
 from servod.formats.gains.store import write_file
 
@@ -183,7 +183,7 @@ def sole_walk(folder: Path) -> Iterator[None]:
     """Nobody else works in the folder meanwhile; the lock ends with the process. Raises Unreachable."""
     with (folder / LOCK).open("w") as file:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock_file(file, wait=False)
         except OSError:
             raise Unreachable(f"--out {folder}: another servoctl commission is at work there") from None
         yield

@@ -6,12 +6,12 @@ some of its numbers fixed, so that more freedom is never worse.
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import replace
 
+from servod.common.portable import usable_cores
 from servod.common.workers import worker_pool
 from servod.formats.model.axis_model import AxisModel
 from servod.lab.tune.laws import RIVALS
@@ -42,7 +42,7 @@ def rivals(
     BadInput when the model has no bristle stiffness to compensate.
     """
     plan = replace(plan or TunePlan(), seed=seed, budget=budget)
-    with worker_pool(processes or len(os.sched_getaffinity(0))) as pool:
+    with worker_pool(processes or usable_cores()) as pool:
         found = _Field(pool, model, names, plan, tell).tuned()
     return {feedback: {name: found[feedback, name] for name in names} for feedback in Feedback}
 

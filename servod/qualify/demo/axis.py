@@ -18,6 +18,7 @@ CONTROLLERS = ("pd", "pd_dob", "pd_lugre", "local")
 #: The row after all others on the shipped joint: what identify, synthesize and verify make of it.
 CERTIFIED, CERTIFIED_LABEL = "local_certified", "Local models, synthesized and certified"
 
+
 def gains_file(controller: str) -> Path:
     """The shipped gain set of one law."""
     return shipped(f"gains/demo_{controller}.yaml")

@@ -5,7 +5,6 @@ Beside the data path. Each run is a session of its own (servod.client.stepped) i
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, wait
@@ -13,6 +12,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+from servod.common.portable import usable_cores
 from servod.common.workers import worker_pool
 from servod.qualify.demo.axis import demo_config
 from servod.qualify.demo.entries import Entry
@@ -28,7 +28,7 @@ _shares: Any = None  # one share of progress for each entry, in memory that the 
 def run_fast(plant: Path, duration_s: float, rows: Sequence[Entry], progress: Progress) -> list[Run]:
     """Track trajectory (19) for `duration_s` of virtual time under each entry. Raises as the session does."""
     shares = get_context("spawn").Array("d", len(rows), lock=False)
-    workers = min(len(rows), len(os.sched_getaffinity(0)))
+    workers = min(len(rows), usable_cores())
     # Outermost, for a worker that is ended cleans nothing up.
     with (
         tempfile.TemporaryDirectory(prefix="servod-demo-") as folder,

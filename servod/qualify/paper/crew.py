@@ -6,7 +6,6 @@ never leaves files that count.
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -14,6 +13,7 @@ from contextlib import ExitStack
 from types import TracebackType
 from typing import Any, ParamSpec, TypeVar
 
+from servod.common.portable import usable_cores
 from servod.common.workers import worker_pool
 
 P = ParamSpec("P")
@@ -36,7 +36,7 @@ class Crew:
         self._open: dict[Future[Any], tuple[str, float]] = {}
 
     def __enter__(self) -> Crew:
-        workers = min(MOST_WORKERS, max(2, len(os.sched_getaffinity(0))))
+        workers = min(MOST_WORKERS, max(2, usable_cores()))
         self._pool = self._stack.enter_context(worker_pool(workers))
         return self
 

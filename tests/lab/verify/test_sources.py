@@ -13,7 +13,7 @@ from servod.common.sources import DIAGNOSES, SYNTHESIZES, VERIFIES, sources
 
 #: Reading and writing of files, names and numbers of commands, processes: no figure depends on them.
 NEUTRAL = {
-    *("__init__.py", "commands.py", "config.py", "config_nodes.py", "errors.py", "files.py"),
+    *("__init__.py", "commands.py", "config.py", "config_nodes.py", "errors.py", "files.py", "portable.py"),
     *("sources.py", "units.py", "workers.py", "yaml.py"),
 }
 PACKAGE = Path(servod.__file__).parent

@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from servod.common.portable import usable_cores
 from servod.formats.model.axis_model import AxisKind, AxisModel
 from servod.kernels.physics.compiled import Kernel, available, compiled
 from servod.kernels.physics.layout import P_DELAY_S, P_GAP, P_START_C, S_FIRST_S
@@ -61,7 +62,7 @@ def released(function: Kernel) -> Kernel:
 def cores() -> int:
     """Cores that this process may use, MOST_CORES at most; SERVOD_CORES overrides."""
     asked = os.environ.get("SERVOD_CORES", "")
-    return int(asked) if asked.isdigit() and int(asked) > 0 else min(MOST_CORES, len(os.sched_getaffinity(0)))
+    return int(asked) if asked.isdigit() and int(asked) > 0 else min(MOST_CORES, usable_cores())
 
 
 @cache

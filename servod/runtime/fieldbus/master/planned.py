@@ -5,13 +5,13 @@ Off the control path. `servod --check` and `servoctl config check` refuse by it 
 
 from __future__ import annotations
 
-import grp
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
 from servod.common.errors import BadInput
+from servod.common.portable import has_group
 from servod.formats.config import AxisConfig
 from servod.runtime.fieldbus.cia import HEARTBEAT_BASE, SYNC_ID
 from servod.runtime.fieldbus.devices import Driver, NodePlan, PdoMap, Setup
@@ -141,9 +141,7 @@ def check_names(config: AxisConfig, source: str) -> list[str]:
         length = len(os.fsencode(path))
         if length > SOCKET_PATH_BYTES:
             raise BadInput(f"{source}: {key}", f"{path} ({length} bytes)", f"at most {SOCKET_PATH_BYTES} bytes")
-    try:
-        grp.getgrnam(config.control.group)
-    except KeyError:
+    if not has_group(config.control.group):
         return [
             f"this machine has no group {config.control.group} (control.group): only root and the daemon's user command"
         ]
