@@ -12,6 +12,7 @@ import struct
 import time
 
 from servod.common.errors import Unreachable
+from servod.common.files import reason
 from servod.drivers.virtual.bus_faults import BusFault, FaultKind
 from servod.formats.config import BusConfig
 from servod.runtime.fieldbus.bus import CAN_ERR_FLAG, CAN_FRAME, BusCounters, Frame
@@ -31,8 +32,8 @@ def connect(path: str) -> socket.socket:
         sock.connect(path)
     except OSError as error:
         sock.close()
-        reason = error.strerror or str(error)
-        raise Unreachable(f"virtual bus {path}: {reason}; is servod-virtual-axis running?") from None
+        why = "there is no such socket" if isinstance(error, FileNotFoundError) else reason(error)
+        raise Unreachable(f"virtual bus {path}: {why}; is servod-virtual-axis running?") from None
     sock.setblocking(False)
     return sock
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from servod.common.errors import BadInput
+from servod.common.files import unreadable, unwritable
 from servod.runtime.fieldbus.devices import DriveState
 
 #: magic, size of a sample, capacity in samples, samples written since the start
@@ -51,7 +52,7 @@ class DriveRecord:
                 _reserve(file, size)
                 self._map = mmap.mmap(file.fileno(), size)
         except OSError as error:
-            raise BadInput(str(path), error.strerror or str(error), "a file that can be written") from None
+            raise unwritable(path, error) from None
         self._capacity, self._count = capacity, 0
         self._map[: _HEADER.size] = _HEADER.pack(_MAGIC, SAMPLE.size, capacity, 0)
 
@@ -108,7 +109,7 @@ def read_drive_record(path: str | Path) -> list[DriveSample]:
     try:
         raw = Path(path).read_bytes()
     except OSError as error:
-        raise BadInput(str(path), error.strerror or str(error), "a readable file") from None
+        raise unreadable(path, error) from None
     if len(raw) < _HEADER.size or not raw.startswith(_MAGIC):
         raise BadInput(str(path), "no drive record", "a file written by servod-virtual-axis --record")
     _, size, capacity, count = _HEADER.unpack_from(raw)

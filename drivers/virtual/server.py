@@ -15,6 +15,7 @@ from enum import Enum
 from pathlib import Path
 
 from servod.common.errors import BadInput, Unreachable
+from servod.common.files import reason
 from servod.common.units import NS_PER_S
 from servod.drivers.virtual.bus_faults import BusFault, FaultKind, kind_of
 from servod.drivers.virtual.client import STAMPED_FRAME
@@ -189,7 +190,7 @@ def _listen(path: Path) -> socket.socket:
         listener.listen(16)
     except OSError as error:
         listener.close()
-        found = error.strerror or str(error)
+        found = reason(error)
         if not path.parent.is_dir():
             found = f"no folder {path.parent}"
         raise BadInput(f"--socket {path}", found, "a path for a new socket in a folder that is there") from None

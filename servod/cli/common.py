@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servod.common.errors import BadInput, Unreachable
+from servod.common.errors import Unreachable
+from servod.common.files import BadFile, reason
 from servod.common.portable import lock_again, lock_folder
 
 if TYPE_CHECKING:
@@ -96,9 +97,16 @@ def need_folder(option: str, folder: Path, alone: bool = False) -> None:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        raise BadInput(f"{option} {folder}", error.strerror or str(error), "a folder that can be written") from None
+        raise _no_folder(option, folder, error) from None
     if alone:
         _lock(option, folder)
+
+
+def _no_folder(option: str, folder: Path, error: OSError) -> BadFile:
+    wanted = "a folder that can be written"
+    if isinstance(error, FileExistsError | NotADirectoryError):
+        return BadFile(f"{option} {folder}", "a file stands where a folder is needed", wanted)
+    return BadFile(f"{option} {folder}", f"no file can be written in this folder ({reason(error)})", wanted)
 
 
 def _lock(option: str, folder: Path) -> None:
@@ -148,7 +156,7 @@ def drop_empty_folders() -> None:
 def need_file(option: str, file: Path) -> None:
     """See that `file` can be written before any work is done for it. Raises BadInput."""
     if file.is_dir():
-        raise BadInput(f"{option} {file}", "a folder", "a file that can be written")
+        raise BadFile(f"{option} {file}", "is a folder, a file is needed", "a file that can be written")
     need_folder(option, file.resolve().parent)
 
 

@@ -23,6 +23,7 @@ from servod.cli.common import (
     table_console,
 )
 from servod.common.errors import BadInput
+from servod.common.files import unwritable
 
 if TYPE_CHECKING:
     from servod.client.axis import Link
@@ -190,7 +191,7 @@ def _write(path: Path, text: str) -> None:
         aside.write_text(text, encoding="utf-8")
         aside.replace(path)
     except OSError as error:
-        raise BadInput(str(path), error.strerror or str(error), "a file that can be written") from None
+        raise unwritable(path, error) from None
 
 
 @contextmanager

@@ -16,6 +16,7 @@ import typer
 
 from servod.cli.common import JsonOption, example, need_folder, one_thread, run_stage
 from servod.common.errors import BadInput
+from servod.common.files import BadFile
 
 if TYPE_CHECKING:
     from servod.qualify.blind.conceal import Trial
@@ -142,5 +143,6 @@ def _sealed(out: Path) -> Trial:
 
     trial = read_trial(out)
     if trial is None:
-        raise BadInput(str(out / FILE), "no such file", "a folder in which `servoctl prove --only conceal` was done")
+        needed = "a folder in which `servoctl prove --only conceal` was done"
+        raise BadFile(str(out / FILE), "there is no such file", needed, more=needed)
     return trial

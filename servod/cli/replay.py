@@ -12,6 +12,7 @@ import typer
 
 from servod.cli.common import JsonOption, example, print_json
 from servod.common.errors import BadInput
+from servod.common.files import BadFile
 
 if TYPE_CHECKING:
     from servod.formats.model.axis_model import AxisModel
@@ -91,7 +92,7 @@ def check_out(out: Path | None) -> None:
     if out.suffix not in {".csv", ".parquet"}:
         raise BadInput(f"--out {out}", repr(out.suffix), ".csv or .parquet")
     if not out.resolve().parent.is_dir():
-        raise BadInput(f"--out {out}", "no such folder", "a file in a folder that exists")
+        raise BadFile(f"--out {out}", "there is no such folder to write it in", "a file in a folder that exists")
 
 
 def write_simulation(out: Path, recorded: Recording, result: Replay) -> None:

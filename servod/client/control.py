@@ -16,6 +16,7 @@ from types import TracebackType
 from typing import Any
 
 from servod.common.errors import AnswerIsNo, BadInput, ServodError, Unreachable, one_line
+from servod.common.files import reason
 from servod.common.portable import need_linux
 from servod.formats.protocol import (
     MAX_ANSWER_BYTES,
@@ -64,7 +65,7 @@ class ControlClient:
             raise Unreachable(f"{path}: permission denied; only members of the control group may connect") from None
         except OSError as error:
             self._socket.close()
-            raise Unreachable(f"{path}: no daemon answers ({error.strerror or error}); is servod running?") from None
+            raise Unreachable(f"{path}: no daemon answers ({_why(error)}); is servod running?") from None
         self._lines = self._socket.makefile("rb")
 
     def __enter__(self) -> ControlClient:
@@ -134,13 +135,20 @@ class ControlClient:
         except TimeoutError:
             raise Unreachable(f"{self._path}: no answer within {self._socket.gettimeout()} s") from None
         except OSError as error:
-            raise Unreachable(f"{self._path}: the daemon hung up ({error.strerror or error})") from None
+            raise Unreachable(f"{self._path}: the daemon hung up ({reason(error)})") from None
         if not line.endswith(b"\n"):
             raise Unreachable(f"{self._path}: the daemon hung up")
         try:
             return decode_line(line)
         except ValueError as error:
             raise Unreachable(f"{self._path}: answers with something else than servod would ({error})") from None
+
+
+def _why(error: OSError) -> str:
+    """What a socket that nobody answers at means."""
+    if isinstance(error, FileNotFoundError):
+        return "there is no such socket"
+    return "nobody listens there" if isinstance(error, ConnectionRefusedError) else reason(error)
 
 
 def _result(answer: dict[str, Any]) -> dict[str, Any]:

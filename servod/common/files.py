@@ -12,13 +12,65 @@ import stat
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from servod.common.errors import BadInput
+from servod.common.errors import BadInput, ServodError, one_line
 
 #: Largest file that is read as a whole.
 MOST_BYTES = 64 * 1024 * 1024
 #: A pipe without a writer would wait; Windows, which has no such pipes, would change line ends.
 _READING = os.O_RDONLY | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-_KINDS = {stat.S_IFDIR: "Is a directory", stat.S_IFIFO: "a pipe", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device"}
+_KINDS = {stat.S_IFIFO: "pipe", stat.S_IFCHR: "device", stat.S_IFBLK: "device"}
+_FOLDER = "is a folder, a file is needed"
+#: What the system says of a file, in words for people; the second is of one that shall be written.
+_SENTENCES = {
+    errno.ENOENT: ("there is no such file", "there is no such folder to write it in"),
+    errno.ENOTDIR: ("there is no such file, for a part of this path is a file itself", "a part of this path is a file"),
+    errno.EISDIR: (_FOLDER, _FOLDER),
+    errno.EACCES: ("may not be read (permission denied)", "may not be written (permission denied)"),
+    errno.EPERM: ("may not be read (permission denied)", "may not be written (permission denied)"),
+    errno.EROFS: ("may not be read", "may not be written (the file system is read-only)"),
+    errno.EEXIST: ("is in the way", "a file stands where a folder is needed"),
+    errno.ENOSPC: ("the disk is full", "cannot be written: the disk is full"),
+    errno.EDQUOT: ("the quota is used up", "cannot be written: the quota of this user is used up"),
+    errno.ELOOP: ("its links go round in a circle", "its links go round in a circle"),
+    errno.ENAMETOOLONG: ("the name is too long", "the name is too long"),
+}
+
+
+class BadFile(BadInput):
+    """A file that cannot be had: says it in a sentence, for nobody asks which files are allowed."""
+
+    def __init__(self, where: str, sentence: str, allowed: str, more: str = "") -> None:
+        """`more` says what would help where the sentence alone does not."""
+        self.where, self.found, self.allowed = where, sentence, allowed
+        end = f"; needed: {one_line(more)}" if more else ""
+        ServodError.__init__(self, f"{one_line(where)}: {one_line(sentence)}{end}")
+
+
+def unreadable(where: str | Path, error: Exception, needed: str = "") -> BadFile:
+    """The refusal of a file that could not be read; `needed` tells what it should be, where that is not plain."""
+    return BadFile(str(where), _sentence(where, error, writing=False), needed or "a readable file", needed)
+
+
+def unwritable(where: str | Path, error: Exception) -> BadFile:
+    """The refusal of a file that could not be written."""
+    return BadFile(str(where), _sentence(where, error, writing=True), "a file that can be written")
+
+
+def reason(error: OSError) -> str:
+    """What the system says, to stand in a sentence: "no such device", "permission denied"."""
+    text = error.strerror or str(error)
+    return text[:1].lower() + text[1:]
+
+
+def _sentence(where: str | Path, error: Exception, writing: bool) -> str:
+    number = getattr(error, "errno", None)
+    if number == errno.EACCES and os.path.isdir(where):  # noqa: PTH112  (so Windows says it; never raises)
+        number = errno.EISDIR
+    if number in _SENTENCES:
+        return _SENTENCES[number][writing]
+    if isinstance(error, OSError):
+        return f"cannot be {'written' if writing else 'read'} ({reason(error)})"
+    return f"is no name of a file ({error})"
 
 
 def read_text(path: str | Path) -> str:
@@ -39,15 +91,17 @@ def read_json(path: str | Path, allowed: str) -> Any:
         raise BadInput(str(path), "brackets nested without end", allowed) from None
 
 
-def read_bytes(path: str | Path, allowed: str = "a readable file") -> bytes:
-    """The file's bytes; raises BadInput when it is missing, unreadable, too large, or no file: pipes may never end."""
+def read_bytes(path: str | Path, needed: str = "") -> bytes:
+    """The file's bytes; raises BadInput when it is missing, unreadable, too large, or no file: pipes may never end.
+
+    `needed` says what file it should be, where its name does not.
+    """
     try:
         with open_file(path) as stream:
             require_size(path, stream, MOST_BYTES)
             return stream.read(MOST_BYTES)
     except (OSError, ValueError) as error:  # ValueError: a name with a null character
-        found = getattr(error, "strerror", None) or str(error)
-        raise BadInput(str(path), found, allowed) from None
+        raise unreadable(path, error, needed) from None
 
 
 def require_size(path: str | Path, stream: BinaryIO, most_bytes: int) -> None:
@@ -64,7 +118,9 @@ def open_file(path: str | Path) -> BinaryIO:
     if kind == stat.S_IFREG:
         return os.fdopen(descriptor, "rb")
     os.close(descriptor)
-    raise OSError(errno.EISDIR if kind == stat.S_IFDIR else errno.EINVAL, _KINDS.get(kind, "no regular file"))
+    if kind == stat.S_IFDIR:
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+    raise OSError(errno.EINVAL, f"a {_KINDS.get(kind, 'special file')}, which might not end")
 
 
 # Writes the files of a report: aside first, flushed, then renamed, so that an interrupted run leaves no half file.
@@ -83,5 +139,5 @@ def write_bytes(path: Path, content: bytes) -> Path:
             os.fsync(stream.fileno())
         aside.replace(path)
     except OSError as error:
-        raise BadInput(str(path), error.strerror or str(error), "a path that can be written") from None
+        raise unwritable(path, error) from None
     return path

@@ -41,7 +41,7 @@ def test_a_diagnosis_replaces_nothing_that_is_not_its_own(
 def test_a_folder_is_no_file_and_said_before_the_axis_moves(words: tuple[str, ...], tmp_path: Path) -> None:
     done = servoctl(*words, "--out", str(tmp_path))
     assert done.returncode == 2 and list(tmp_path.parent.glob("*.part")) == [] and list(tmp_path.iterdir()) == []
-    assert done.stderr.decode() == f"servoctl: --out {tmp_path}: found a folder; allowed: a file that can be written\n"
+    assert done.stderr.decode() == f"servoctl: --out {tmp_path}: is a folder, a file is needed\n"
 
 
 def test_a_set_that_could_never_be_activated_is_not_stored(tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ from pathlib import Path
 from pydantic import Field
 
 from servod.common.errors import BadInput
+from servod.common.files import unwritable
 from servod.common.portable import flush_folder, lock_file
 from servod.common.yaml import Strict, load_model, read_text
 from servod.formats.gains.gain_set import NAME_PATTERN, GainSet, parse_gains, require_certificate
@@ -102,7 +103,7 @@ def write_file(path: Path, text: str) -> None:
     try:
         write_atomically(path, text)
     except OSError as error:
-        raise BadInput(str(path), error.strerror or str(error), "a file that can be written") from None
+        raise unwritable(path, error) from None
 
 
 class GainStore:
@@ -118,7 +119,7 @@ class GainStore:
             with self._locked():
                 self._sweep()
         except OSError as error:
-            raise BadInput(f"gain store {directory}", error.strerror or str(error), "a writable directory") from None
+            raise unwritable(f"gain store {directory}", error) from None
 
     @contextlib.contextmanager
     def _locked(self) -> Iterator[None]:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.common.errors import BadInput
+from servod.common.files import unwritable
 from servod.formats.recording.mcap_reader import Recording
 
 _NS_PER_S = 1e9
@@ -33,7 +34,7 @@ def export_csv(recording: Recording, path: Path) -> int:
         aside.replace(path)
     except OSError as error:
         _remove(aside)
-        raise BadInput(str(path), error.strerror or str(error), "a path that can be written") from None
+        raise unwritable(path, error) from None
     return len(recording)
 
 
@@ -83,7 +84,7 @@ def export_parquet(recording: Recording, path: Path) -> int:
         aside.replace(path)
     except OSError as error:
         _remove(aside)
-        raise BadInput(str(path), error.strerror or str(error), "a path that can be written") from None
+        raise unwritable(path, error) from None
     return len(recording)
 
 
@@ -116,4 +117,4 @@ def write_table(path: Path, columns: Mapping[str, NDArray[np.float64]]) -> None:
     except OSError as error:
         with contextlib.suppress(OSError):  # half a file fills the very disk that took no more
             aside.unlink(missing_ok=True)
-        raise BadInput(str(path), error.strerror or str(error), "a file that can be written") from None
+        raise unwritable(path, error) from None

@@ -23,7 +23,7 @@ from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Message
 from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 
 from servod.common.errors import BadInput
-from servod.common.files import open_file
+from servod.common.files import open_file, unreadable
 from servod.formats.recording.mcap_writer import CYCLE_TOPIC, EVENT_TOPIC
 from servod.formats.recording.record import CDR_HEADER, CycleRecord
 
@@ -107,7 +107,7 @@ def read_recording(path: str | Path, wanted: Container[str] | None = None, most_
     except InvalidMagic:
         raise BadInput(str(path), "a file that is not MCAP", "a recording of servod (.mcap)") from None
     except OSError as error:
-        raise BadInput(str(path), error.strerror or str(error), "a readable recording") from None
+        raise unreadable(path, error) from None
     if not recording.names:
         found = f"no topic {CYCLE_TOPIC}" + (f" ({recording.damage})" if recording.damage else "")
         raise BadInput(str(path), found, "a recording of servod (.mcap)")

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from servod.client.open import VirtualWalkAxis
 from servod.common.errors import AnswerIsNo, BadInput
+from servod.common.files import unreadable, unwritable
 from servod.common.workers import worker_pool
 from servod.formats.gains.gain_set import load_gains
 from servod.formats.recording.mcap_reader import read_recording
@@ -67,7 +68,7 @@ def save_rows(path: Path, rows: NDArray[np.void]) -> None:
         file.close()
         aside.replace(path)
     except OSError as error:
-        raise BadInput(str(path), error.strerror or str(error), "a file that can be written") from None
+        raise unwritable(path, error) from None
 
 
 def load_rows(path: Path) -> NDArray[np.void]:
@@ -89,7 +90,7 @@ def save_curves(path: Path, curves: dict[str, Curves]) -> None:
             np.savez_compressed(stream, **arrays)
         aside.replace(path)
     except OSError as error:
-        raise BadInput(str(path), error.strerror or str(error), "a file that can be written") from None
+        raise unwritable(path, error) from None
 
 
 def load_curves(path: Path) -> dict[str, Curves]:
@@ -102,7 +103,7 @@ def load_curves(path: Path) -> dict[str, Curves]:
                 for motion in sorted(motions)
             }
     except OSError as error:
-        raise BadInput(str(path), error.strerror or "a broken file", "runs that servoctl commission wrote") from None
+        raise unreadable(path, error, "runs that servoctl commission wrote") from None
     except (ValueError, KeyError, EOFError, BadZipFile, zlib.error):
         raise BadInput(str(path), "a broken file", "runs that servoctl commission wrote") from None
 

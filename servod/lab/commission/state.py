@@ -17,7 +17,7 @@ from pydantic import Field
 
 from servod.common import files
 from servod.common.errors import BadInput, Unreachable
-from servod.common.files import read_json
+from servod.common.files import read_json, unwritable
 from servod.common.portable import lock_file
 from servod.common.yaml import Strict, validate
 from servod.formats.gains.store import write_file
@@ -46,7 +46,7 @@ def write_text(path: Path, text: str) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise BadInput(str(path), error.strerror or str(error), "a file that can be written") from None
+        raise unwritable(path, error) from None
     write_file(path, text)
 
 

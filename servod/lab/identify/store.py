@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from servod.common.errors import BadInput
-from servod.common.files import read_json
+from servod.common.files import read_json, unreadable, unwritable
 from servod.common.yaml import Strict, validate
 from servod.formats.recording.mcap_reader import read_recording
 from servod.formats.recording.mcap_writer import McapFile, split_rows, wall_offset_ns
@@ -189,7 +189,7 @@ def _require_same(path: Path, entry: _Entry) -> str:
     try:
         found = file_sha256(path)
     except OSError as error:
-        raise BadInput(str(path), error.strerror or str(error), f"the recording that {LIST} lists") from None
+        raise unreadable(path, error, f"the recording that {LIST} lists") from None
     if entry.sha256 not in (None, found):
         why = "a file that was changed or cut short after it was recorded"
         raise BadInput(str(path), why, f"the recording that {LIST} lists; without {LIST} the axis is identified anew")
@@ -210,4 +210,4 @@ def file_sha256(path: Path) -> str:
 
 
 def _unwritable(path: Path, error: OSError) -> BadInput:
-    return BadInput(str(path), error.strerror or str(error), "a file or folder that can be written")
+    return unwritable(path, error)

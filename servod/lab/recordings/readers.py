@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.common.errors import BadInput
-from servod.common.files import open_file, require_size
+from servod.common.files import open_file, require_size, unreadable
 from servod.lab.recordings import bounds
 from servod.lab.recordings.bounds import MOST_BYTES, require_bytes, require_cells
 from servod.lab.recordings.mat import BrokenMatError, vectors
@@ -139,8 +139,10 @@ def read_columns(path: Path, wanted: Container[str]) -> tuple[dict[str, Any], li
     where it is not `wanted`; `numbers` turns one into floats. Raises BadInput for a missing, empty, broken, unknown
     or too large file.
     """
-    if not path.is_file():
-        raise BadInput(str(path), "no such file" if not path.exists() else "no file", "a recording")
+    try:
+        open_file(path).close()
+    except (OSError, ValueError) as error:
+        raise unreadable(path, error) from None
     name = path.name.lower()
     reader = next((reader for suffix, reader in READERS.items() if name.endswith(suffix)), None)
     if reader is None:
@@ -149,7 +151,7 @@ def read_columns(path: Path, wanted: Container[str]) -> tuple[dict[str, Any], li
     try:
         columns = reader(path, wanted, notes)
     except OSError as error:
-        raise BadInput(str(path), error.strerror or str(error), "a readable recording") from None
+        raise unreadable(path, error) from None
     if not columns:
         raise BadInput(str(path), "no columns", "a recording with named columns")
     return columns, notes

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from servod.common.errors import BadInput
+from servod.common.files import unwritable
 
 
 class Goal(NamedTuple):
@@ -113,4 +113,4 @@ def write_json(document: dict[str, Any], path: Path) -> None:
             os.fsync(stream.fileno())
         aside.replace(path)
     except OSError as error:
-        raise BadInput(str(path), error.strerror or str(error), "a path that can be written") from None
+        raise unwritable(path, error) from None

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 from servod.client.processes import sigterm_as_interrupt
 from servod.common.errors import ServodError, Unreachable
-from servod.common.files import write_bytes
+from servod.common.files import reason, write_bytes
 from servod.qualify.soak.document import Course, added, document, write_page
 from servod.qualify.soak.kinds import KINDS
 from servod.qualify.soak.memory import Growth, Memory
@@ -215,5 +215,5 @@ def _read(folder: Path) -> dict[str, Any]:
     try:
         found: dict[str, Any] = json.loads((folder / DOCUMENT_NAME).read_text())
     except OSError as error:
-        raise Unreachable(f"{folder}: the job left no {DOCUMENT_NAME} ({error.strerror})") from None
+        raise Unreachable(f"{folder}: the job left no {DOCUMENT_NAME} ({reason(error)})") from None
     return found

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from servod.common.errors import BadInput, ServodError, Unreachable
+from servod.common.files import reason
 from servod.formats.config import ControlConfig
 from servod.formats.protocol import READING, Verb, decode_line, encode_line
 from servod.runtime.daemon.connection import Connection, Reply
@@ -250,7 +251,7 @@ def _listen(path: Path, group: int | None) -> socket.socket:
     except OSError as error:
         listener.close()
         aside.unlink(missing_ok=True)
-        raise Unreachable(f"{path}: cannot listen there ({error.strerror or error})") from None
+        raise Unreachable(f"{path}: cannot listen there ({reason(error)})") from None
     return listener
 
 

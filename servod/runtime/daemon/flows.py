@@ -12,6 +12,7 @@ from concurrent.futures import Future
 from typing import Any, Protocol
 
 from servod.common.errors import ServodError, Unreachable
+from servod.common.files import reason
 from servod.common.units import NS_PER_S
 from servod.formats.recording.record import CycleRecord
 from servod.runtime.daemon.connection import Reply
@@ -147,7 +148,7 @@ class Flows:
         except ServodError as error:
             reply.failed(error)
         except OSError as error:  # a disk that is full or gone ends the request, never the supervisor
-            reply.failed(Unreachable(f"{error.filename or 'disk'}: {error.strerror or error}"))
+            reply.failed(Unreachable(f"{error.filename or 'disk'}: {reason(error)}"))
         except Exception as error:  # and so does what nobody foresaw
             log.error("a request failed", exc_info=error)
             reply.failed(error)

@@ -17,6 +17,7 @@ from prometheus_client.registry import Collector
 
 from servod.common.errors import BadInput
 from servod.common.faults import FAULTS, FaultCode
+from servod.common.files import reason
 from servod.formats.config import MetricsConfig
 from servod.formats.recording.record import CycleRecord
 from servod.runtime.fieldbus.devices import DriveState
@@ -136,7 +137,7 @@ class MetricsServer:
                 self._server, self._thread = start_http_server(config.http_port, config.http_address, metrics.registry)
             except OSError as error:
                 where = f"metrics.http_port: {config.http_address}:{config.http_port}"
-                raise BadInput(where, error.strerror or str(error), "a free local port") from None
+                raise BadInput(where, reason(error), "a free local port") from None
 
     def write_textfile(self) -> None:
         """Replace the textfile, if one is configured. Raises OSError."""

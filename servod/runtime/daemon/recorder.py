@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, TypedDict, TypeVar
 
 from servod.common.errors import BadInput, ServodError, Unreachable
+from servod.common.files import reason
 from servod.formats.config import RecorderConfig
 from servod.formats.recording.mcap_writer import McapFile, split_rows, wall_offset_ns
 from servod.formats.recording.record import RECORD
@@ -321,7 +322,7 @@ class Recorder:
             file.close()
         except OSError as error:
             file.abandon()
-            raise Unreachable(f"{path}: {error.strerror or error}") from None
+            raise Unreachable(f"{path}: cannot be written ({reason(error)})") from None
         self._files.drop_old_fault_files()
         return path
 
@@ -331,7 +332,7 @@ def _create(path: Path, attachments: dict[str, bytes], offset_ns: int) -> McapFi
         path.parent.mkdir(parents=True, exist_ok=True)
         return McapFile(path, attachments, offset_ns)
     except OSError as error:
-        raise Unreachable(f"{path}: {error.strerror or error}") from None
+        raise Unreachable(f"{path}: cannot be written ({reason(error)})") from None
 
 
 def _resolve(future: Future[T], job: Callable[[], T]) -> None:

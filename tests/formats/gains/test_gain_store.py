@@ -119,7 +119,7 @@ def test_a_stored_file_that_somebody_broke_is_named(store: GainStore) -> None:
 
 def test_unusable_directory_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("", encoding="utf-8")
-    with pytest.raises(BadInput, match=r"gain store .*: found Not a directory; allowed: a writable directory"):
+    with pytest.raises(BadInput, match=r"gain store .*: a part of this path is a file"):
         GainStore(tmp_path / "file" / "gains")
 
 

@@ -60,7 +60,7 @@ def test_bad_input_is_one_line(options, said, tmp_path, capsys):
         (
             '{"conditions": "", "start_rad": 0, "experiments": [{"file": "00_noise.mcap", "kind": "noise", '
             '"motion": "", "settings": {}}]}',
-            "00_noise.mcap: found No such file or directory",
+            "00_noise.mcap: there is no such file; needed: the recording",
         ),
     ],
 )

@@ -162,5 +162,5 @@ def test_the_document_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     write_json(document(), file)
     assert json.loads(file.read_text()) == document()
     assert list(tmp_path.iterdir()) == [file]
-    with pytest.raises(BadInput, match="a path that can be written"):
+    with pytest.raises(BadInput, match="there is no such folder to write it in"):
         write_json(document(), tmp_path / "nowhere" / "bench.json")

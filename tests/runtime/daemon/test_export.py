@@ -38,7 +38,7 @@ def test_parquet_has_the_same_and_the_units(recording: Recording, tmp_path: Path
 
 
 def test_target_that_cannot_be_written_is_bad_input(recording: Recording, tmp_path: Path) -> None:
-    with pytest.raises(BadInput, match="No such file"):
+    with pytest.raises(BadInput, match="there is no such folder to write it in"):
         export_csv(recording, tmp_path / "nowhere" / "a.csv")
 
 
@@ -48,6 +48,6 @@ def test_what_cannot_be_written_whole_leaves_nothing(
 ) -> None:
     target = tmp_path / "out" / "a.table"
     target.mkdir(parents=True)  # the last step, the renaming, fails
-    with pytest.raises(BadInput, match="a path that can be written"):
+    with pytest.raises(BadInput, match="is a folder, a file is needed"):
         export(recording, target)
     assert list(target.parent.iterdir()) == [target]

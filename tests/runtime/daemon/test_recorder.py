@@ -131,7 +131,7 @@ def test_what_is_no_recording_is_bad_input(tmp_path: Path, content: bytes) -> No
     path.write_bytes(content)
     with pytest.raises(BadInput, match=r"x\.mcap"):
         read_recording(path)
-    with pytest.raises(BadInput, match="No such file"):
+    with pytest.raises(BadInput, match="there is no such file"):
         read_recording(tmp_path / "missing.mcap")
 
 

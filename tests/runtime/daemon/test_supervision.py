@@ -190,7 +190,7 @@ def test_second_daemon_on_socket_or_bus_is_refused(tmp_path: Path) -> None:
     ("arguments", "says"),
     [
         ([], "--config"),
-        (["--config", "missing.yaml"], "missing.yaml: found No such file"),
+        (["--config", "missing.yaml"], "missing.yaml: there is no such file"),
         (["--config", "x", "--fast"], "--fast"),
     ],
 )

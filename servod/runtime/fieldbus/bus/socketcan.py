@@ -16,6 +16,7 @@ import struct
 import time
 
 from servod.common.errors import Unreachable
+from servod.common.files import reason
 from servod.common.units import NS_PER_S
 from servod.formats.config import BusConfig
 from servod.runtime.fieldbus.bus import (
@@ -79,7 +80,7 @@ def open_raw(interface: str, can_ids: tuple[int, ...] | None) -> socket.socket:
     try:
         sock = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
     except OSError as error:
-        raise Unreachable(f"bus {interface}: this system has no SocketCAN ({error.strerror})") from error
+        raise Unreachable(f"bus {interface}: this system has no SocketCAN ({reason(error)})") from error
     try:
         sock.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, CAN_ERR_MASK)
         if can_ids is not None:
@@ -88,7 +89,7 @@ def open_raw(interface: str, can_ids: tuple[int, ...] | None) -> socket.socket:
         sock.bind((interface,))
     except OSError as error:
         sock.close()
-        raise Unreachable(f"bus {interface}: {error.strerror}; is the interface there and up?") from error
+        raise Unreachable(f"bus {interface}: {reason(error)}; is the interface there and up?") from error
     return sock
 
 

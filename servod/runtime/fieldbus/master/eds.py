@@ -88,7 +88,7 @@ class _Warnings(logging.Handler):
 
 def load_dictionary(path: str | Path, node_id: int) -> Dictionary:
     """Read an EDS or DCF for a node ($NODEID is replaced). Raises BadInput when it is no dictionary."""
-    text, report = mend(_decode(read_bytes(path, "a readable EDS or DCF file")))
+    text, report = mend(_decode(read_bytes(path, "an EDS or DCF file")))
     warnings, parser_log = _Warnings(), logging.getLogger("canopen.objectdictionary.eds")
     parser_log.addHandler(warnings)
     try:

@@ -92,7 +92,7 @@ def test_what_is_no_dictionary_is_bad_input(tmp_path: Path, text: str | bytes) -
 
 
 def test_a_file_that_is_not_there_is_bad_input(tmp_path: Path) -> None:
-    with pytest.raises(BadInput, match="No such file"):
+    with pytest.raises(BadInput, match="there is no such file"):
         load_dictionary(tmp_path / "missing.eds", 1)
 
 
