@@ -10,8 +10,6 @@ from __future__ import annotations
 import errno
 import io
 import os
-import re
-import shlex
 import sys
 from itertools import pairwise
 
@@ -43,10 +41,10 @@ from servod.cli import (
     track,
     verify,
 )
-from servod.cli.common import drop_empty_folders
-from servod.common.errors import BadInput, ServodError
+from servod.cli.common import begin_command, drop_empty_folders
+from servod.cli.errors import INTERRUPTED, complain, say
+from servod.common.errors import BadInput
 
-_INTERRUPTED = 130  # as shells count SIGINT
 #: Windows says EINVAL of a pipe whose reader has gone.
 _GONE = {errno.EPIPE, errno.EINVAL} if sys.platform == "win32" else {errno.EPIPE}
 _NOBODY_TAKES = {errno.ENOSPC, errno.EIO, errno.EBADF, *_GONE}
@@ -105,34 +103,33 @@ def _stand_in_for_closed() -> None:
 
 def _output_refused(error: OSError) -> int:
     """The exit code when nobody takes standard output; any other error is raised again."""
-    if error.filename is not None or error.errno not in _NOBODY_TAKES:
+    if not _is_of_output(error):
         raise error
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the interpreter flushes once more
     if error.errno in _GONE:
         return 1  # the reader of a pipe has gone; nothing is left to say
-    return _complain(f"standard output: {error.strerror}", 1)
+    say(f"standard output: {error.strerror}")
+    return 1
+
+
+def _is_of_output(error: OSError) -> bool:
+    return error.filename is None and error.errno in _NOBODY_TAKES
 
 
 def run(arguments: list[str]) -> int:
     """Run one command line and return its exit code."""
+    begin_command()
     try:
         _refuse_empty(arguments)
         code = app(args=arguments, prog_name="servoctl", standalone_mode=False)
-    except ServodError as error:
-        return _complain(str(error), error.exit_code)
-    except ImportError as error:
-        if not _of_the_lab(error):
+        if code == INTERRUPTED:  # typer turns Ctrl-C within a command into this
+            raise KeyboardInterrupt
+    except (Exception, KeyboardInterrupt) as error:
+        if isinstance(error, OSError) and _is_of_output(error):
             raise
-        command = shlex.join(["servoctl", *arguments])
-        return _complain(f"`{command}` needs servod[lab]: pip install 'servod[lab]' ({error.name} is missing)", 2)
-    except typer.TyperException as error:
-        return _complain(f"{error.format_message()} Found: `{shlex.join(['servoctl', *arguments])}`; see --help.", 2)
-    except (KeyboardInterrupt, typer.Abort):
-        code = _INTERRUPTED
+        return complain(error, arguments)
     finally:
         drop_empty_folders()
-    if code == _INTERRUPTED:  # typer turns Ctrl-C within a command into this
-        return _complain("interrupted", _INTERRUPTED)
     return code if isinstance(code, int) else 0
 
 
@@ -142,16 +139,3 @@ def _refuse_empty(arguments: list[str]) -> None:
         option = before if not text else text[:-1] if text.startswith("--") and text.endswith("=") else None
         if option is not None:
             raise BadInput(option, "an empty text", "a value")
-
-
-def _of_the_lab(error: ImportError) -> bool:
-    """Whether the missing package is one that only the extra `lab` installs, as servod's own metadata says."""
-    from importlib.metadata import requires
-
-    package = re.escape((error.name or "?").partition(".")[0])
-    return any(re.match(rf"{package}\b.*\bextra == .lab\b", line) for line in requires("servod") or ())
-
-
-def _complain(message: str, exit_code: int) -> int:
-    print("servoctl: " + " ".join(message.split()), file=sys.stderr)
-    return exit_code

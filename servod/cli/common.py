@@ -70,14 +70,27 @@ def ask_to_stop(socket: Path, verb: str) -> dict[str, Any]:
 
 def print_json(document: Any) -> None:
     """Print `document` as the one JSON document of a command."""
-    json.dump(document, sys.stdout, indent=2, allow_nan=False)
-    sys.stdout.write("\n")
+    text = json.dumps(document, indent=2, allow_nan=False)
+    _printed.append(True)
+    sys.stdout.write(text + "\n")
+
+
+def json_is_printed() -> bool:
+    """Whether this command has printed its document."""
+    return bool(_printed)
+
+
+def begin_command() -> None:
+    """Forget what an earlier command of this process printed."""
+    _printed.clear()
 
 
 #: A stop is answered when the drive has stopped. One that takes longer [s] is a slow ramp, or a daemon that hangs.
 _LATE_S = 2.0
 _BESIDE_THE_AXIS = "a loop whose daemon hangs stops the axis by itself; IF IT MOVES ON, USE THE EMERGENCY STOP"
 _PIPE_COLUMNS = 200
+#: One entry for each document that this command printed.
+_printed: list[bool] = []
 #: Folders that this command made for its results, outermost first.
 _made: list[Path] = []
 #: Descriptors of locked folders; they end with the command.
@@ -120,8 +133,10 @@ def _lock(option: str, folder: Path) -> None:
         raise Unreachable(f"{option} {folder}: another command is at work there; name a folder of its own") from None
 
 
-def run_stage(arguments: Sequence[str]) -> int:
-    """Run `servoctl` with `arguments` as a stage of this command, in a process of its own; its exit code.
+def run_stage(arguments: Sequence[str], *, capture: bool = False) -> tuple[int, bytes]:
+    """Run `servoctl` with `arguments` as a stage of this command, in a process of its own.
+
+    Returns its exit code, and with `capture` what it printed on standard output.
 
     The stage works in the folders that this command has locked: it gets their descriptors, and a lock belongs to the
     open file, not to the process.
@@ -131,7 +146,9 @@ def run_stage(arguments: Sequence[str]) -> int:
     environment = os.environ | {_HANDED_DOWN: " ".join(str(descriptor) for descriptor in _locks)}
     command = [sys.executable, "-m", "servod.cli", *arguments]
     handed = () if sys.platform == "win32" else _locks
-    return subprocess.run(command, pass_fds=handed, env=environment, check=False).returncode
+    out = subprocess.PIPE if capture else None
+    done = subprocess.run(command, pass_fds=handed, env=environment, stdout=out, check=False)
+    return done.returncode, done.stdout or b""
 
 
 def _handed_down(folder: Path) -> int | None:

@@ -6,6 +6,7 @@ folders, the third opens the seal.
 
 from __future__ import annotations
 
+import json
 import signal
 import sys
 from enum import StrEnum
@@ -64,7 +65,7 @@ def prove(
     match only:
         case None:
             drawn = [f"--cases={cases}", f"--seed={seed}", *(["--harder"] if harder else [])]
-            _in_processes(out, drawn, [f"--jobs={jobs}", f"--time-limit={time_limit}"], ["--json"] if as_json else [])
+            _in_processes(out, drawn, [f"--jobs={jobs}", f"--time-limit={time_limit}"], as_json)
         case Stage.CONCEAL | Stage.CASES:
             _conceal(out, cases, seed, harder, sealed=only is Stage.CONCEAL)
         case Stage.DIAGNOSE:
@@ -73,11 +74,16 @@ def prove(
             _score(out, as_json)
 
 
-def _in_processes(out: Path, drawn: list[str], diagnosed: list[str], scored: list[str]) -> None:
-    """Each stage in a process of its own; a stage that fails ends the trial as it ended."""
-    stages = {Stage.CONCEAL: drawn, Stage.DIAGNOSE: diagnosed, Stage.SCORE: scored}
+def _in_processes(out: Path, drawn: list[str], diagnosed: list[str], as_json: bool) -> None:
+    """Each stage in a process of its own; a stage that fails ends the trial as it ended, with its document."""
+    from servod.cli.common import print_json
+
+    stages: dict[Stage, list[str]] = {Stage.CONCEAL: drawn, Stage.DIAGNOSE: diagnosed, Stage.SCORE: []}
     for stage, options in stages.items():
-        code = run_stage(["prove", f"--out={out}", f"--only={stage}", *options])
+        as_asked = ["--json"] if as_json else []
+        code, document = run_stage(["prove", f"--out={out}", f"--only={stage}", *options, *as_asked], capture=as_json)
+        if document:
+            print_json(json.loads(document))
         if code != 0:
             raise typer.Exit(code)
 

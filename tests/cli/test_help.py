@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 from collections.abc import Iterator
@@ -59,7 +60,9 @@ def test_an_interrupt_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytes
     monkeypatch.setattr("servod.qualify.demo.fast.run_fast", interrupted)
     assert run(["demo", "--fast", "--json"]) == 130
     captured = capsys.readouterr()
-    assert (captured.out, captured.err) == ("", "servoctl: interrupted\n")
+    assert captured.err == "servoctl: interrupted\n"
+    told = {"code": "interrupted", "exit_code": 130, "message": "interrupted"}
+    assert json.loads(captured.out) == {"error": told}
 
 
 def test_bench_refuses_a_folder_that_cannot_be_before_it_measures(

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 
 import pytest
 
+from servod.cli import installed
+from servod.cli.app import run
 from servod.cli.installed import command_for, extra_of
 
 EDITABLE = {"dir_info": {"editable": True}}
@@ -63,3 +66,17 @@ def test_another_python_on_the_path_is_not_meant(tmp_path: Path, monkeypatch: py
 def test_which_extra_has_a_package() -> None:
     assert (extra_of("pyarrow.csv"), extra_of("cvxpy"), extra_of("hypothesis")) == ("lab", "lab", "dev")
     assert extra_of("pydantic") is None and extra_of("no_such_thing") is None
+
+
+def test_the_line_and_the_document(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(installed, "how_to_get", lambda extra: f"get {extra}")
+    monkeypatch.setattr("servod.cli.errors.how_to_get", lambda extra: f"get {extra}")
+    monkeypatch.setitem(sys.modules, "servod.lab.diagnose.effects", None)
+    monkeypatch.setattr("servod.cli.errors.extra_of", lambda name: "lab")
+    assert run(["explain", "--json"]) == 2
+    shown = capsys.readouterr()
+    error = json.loads(shown.out)["error"]
+    assert error["code"] == "missing_extra"
+    assert error["message"].startswith("`servoctl explain --json` needs servod[lab] (")
+    assert error["message"].endswith("; to get it: get lab")
+    assert shown.err == f"servoctl: {error['message']}\n"

@@ -115,4 +115,5 @@ def test_a_command_that_needs_the_laboratory_says_so_in_one_line(python: Path, t
     result = run(python, "-c", code, folder=tmp_path)
     assert (result.returncode, result.stdout) == (2, "")
     (line,) = result.stderr.splitlines()
-    assert line.startswith(f"servoctl: `servoctl {command}` needs servod[lab]: pip install 'servod[lab]'")
+    assert line.startswith(f"servoctl: `servoctl {command}` needs servod[lab] (")
+    assert "pip install" in line and "servod[lab] @ file://" in line

@@ -16,7 +16,6 @@ from typing import Any, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from servod.common.errors import BadInput
 from servod.common.files import unwritable
 from servod.formats.recording.mcap_reader import Recording
 
@@ -65,13 +64,11 @@ def seconds(recording: Recording) -> list[float]:
 def export_parquet(recording: Recording, path: Path) -> int:
     """Write `recording` to `path` as Parquet, with units in the columns' metadata; returns the number of rows.
 
-    Raises BadInput when pyarrow is not installed or the file cannot be written.
+    Raises BadInput when the file cannot be written, ImportError without pyarrow.
     """
-    try:
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-    except ImportError:
-        raise BadInput(str(path), "no pyarrow", "the lab extra (pip install 'servod[lab]'), or CSV") from None
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
     types = {"d": pa.float64(), "q": pa.int64()}
     fields = [pa.field("t_s", pa.float64(), metadata={"unit": "s"})]
     columns = [pa.array(seconds(recording), pa.float64())]
