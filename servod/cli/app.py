@@ -28,13 +28,12 @@ from servod.cli import (
     faults,
     gains,
     identify,
-    paper,
     preset,
     prove,
+    qualify,
     record,
     replay,
     scan,
-    soak,
     status,
     stop,
     synthesize,
@@ -58,8 +57,8 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 _DAEMON = (demo, scan, status, enable, stop, track, gains, preset, record)
-_LABORATORY = (identify, synthesize, verify, deploy, commission, replay, diagnose, explain, prove, paper)
-for _verb in (*_DAEMON, *_LABORATORY, soak, bench, check, faults):
+_LABORATORY = (identify, synthesize, verify, deploy, commission, replay, diagnose, explain, prove)
+for _verb in (*_DAEMON, *_LABORATORY, qualify, bench, check, faults):
     _verb.register(app)
 
 

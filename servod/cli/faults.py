@@ -1,35 +1,41 @@
-"""`servoctl faults`: put every fault to the virtual axis and time what the drive does; or list the faults."""
+"""`servoctl faults`: what happened on this axis, first cause first; or the table of all faults."""
 
 from __future__ import annotations
 
-import sys
-from fnmatch import fnmatchcase
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from servod.cli.common import JsonOption, example, need_folder, print_json, table_console
-from servod.common.errors import AnswerIsNo, BadInput
+from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, example, print_json, table_console
+from servod.common.errors import BadInput, Unreachable, one_line
 from servod.common.faults import FAULTS
-from servod.common.portable import need_linux
+from servod.common.files import BadFile
 
 if TYPE_CHECKING:
-    from servod.qualify.faults.run import Outcome
-    from servod.qualify.faults.scenario import Scenario
+    from servod.formats.recording.incidents import Incident
 
 _HELP = example(
-    "Run the fault campaign on the virtual axis: every scenario injects its faults, the drive's own record says when "
-    "torque was gone, and the table shows what the user is told. Scenarios in virtual time first, then those of "
-    "daemon, loop and drive as processes on the wall clock, one at a time. The proof of the wiring is off but where a "
-    "scenario's file states wiring_proof in its `config`. Exit code 1 when one did not pass. --codes "
-    "lists every fault instead: what it does to the axis, its cause and its remedy.",
+    "Tell what happened on this axis: the first cause of each stop, what followed it, when, and which file has the "
+    "seconds before. The daemon is asked; what it does not know any more, or where none runs, is read from the fault "
+    "files in the recordings folder. --journal reads saved log lines, REC... recordings. --codes prints the table of "
+    "faults with cause and remedy.",
     "servoctl faults",
-    "servoctl faults --stepped --group encoder --out out/faults",
-    "servoctl faults --only 'torque_frames*' --json",
-    "servoctl faults --scenario my_fault.yaml",
+    "servoctl faults --config /etc/servod/config/can0.yaml --last 3",
+    "servoctl faults axis-fault-20260115-093000-BUS_OFF.mcap --json",
     "servoctl faults --codes",
 )
+_FOLDER = Path("/var/lib/servod/recordings")
+
+
+class _Asked(NamedTuple):
+    """Where to look."""
+
+    socket: Path
+    folder: Path | None
+    axis: str | None
+    most: int
 
 
 def register(app: typer.Typer) -> None:
@@ -38,96 +44,148 @@ def register(app: typer.Typer) -> None:
 
 
 def faults(
-    only: Annotated[str | None, typer.Option(help="Run the scenarios whose name fits this pattern (*, ?).")] = None,
-    group: Annotated[str | None, typer.Option(help="Run the scenarios of this group.")] = None,
-    scenario: Annotated[
-        list[Path] | None, typer.Option(help="Run the scenarios of this file instead; may be given again.")
+    recordings: Annotated[
+        list[Path] | None, typer.Argument(metavar="[REC...]", help="Recordings (.mcap) to look into instead.")
     ] = None,
-    stepped: Annotated[bool, typer.Option("--stepped", help="Leave out the scenarios on the wall clock.")] = False,
-    jobs: Annotated[int, typer.Option(min=1, max=256, help="Scenarios in virtual time that run at once.")] = 1,
-    out: Annotated[Path | None, typer.Option(help="Folder for the page and the document of the outcomes.")] = None,
-    codes: Annotated[bool, typer.Option("--codes", help="List the faults and run nothing.")] = False,
+    folder: Annotated[Path | None, typer.Option("--recordings", help="Folder with fault files; no daemon.")] = None,
+    journal: Annotated[
+        Path | None, typer.Option(help="Log lines instead: `journalctl -o short-iso` of the unit, in a file.")
+    ] = None,
+    config: Annotated[Path | None, typer.Option(help="Axis configuration: names socket and recordings folder.")] = None,
+    last: Annotated[int, typer.Option(min=1, max=1000, help="So many incidents, the newest.")] = 10,
+    codes: Annotated[bool, typer.Option("--codes", help="The table of all faults, and nothing else.")] = False,
+    socket: SocketOption = DEFAULT_SOCKET,
     as_json: JsonOption = False,
 ) -> None:
-    """Run the campaign, or print the fault table."""
+    """Tell what happened, or print the fault table."""
+    given = {"REC": recordings, "--recordings": folder, "--journal": journal, "--config": config}
+    _refuse_together({name for name, value in given.items() if value}, codes)
     if codes:
-        _refuse_beside_codes(only=only, group=group, scenario=scenario, stepped=stepped, out=out)
         _print_codes(as_json)
         return
-    need_linux("servoctl faults")
-    chosen = _chosen(scenario, only, group, stepped)
-    if out is not None:
-        need_folder("--out", out, alone=True)
-    found: list[Outcome] = []
-    try:
-        _run(chosen, jobs, found, quiet=as_json)
-    finally:  # interrupted, what came so far is shown and written
-        _report(found, len(chosen), out, as_json)
-    failed = [outcome.name for outcome in found if not outcome.passed]
-    if failed:
-        raise AnswerIsNo(f"{len(failed)} of {len(found)} scenarios did not pass: {', '.join(failed)}")
+    asked = _Asked(socket, folder, None, last)
+    if config is not None:
+        from servod.formats.config import load_config
 
-
-def _refuse_beside_codes(**options: object) -> None:
-    """The list is always whole, and nothing runs. Raises BadInput."""
-    for name, value in options.items():
-        if value:
-            raise BadInput("--codes", f"beside --{name}", "alone or with --json: it lists all faults and runs nothing")
-
-
-def _chosen(files: list[Path] | None, only: str | None, group: str | None, stepped: bool) -> dict[str, Scenario]:
-    """The scenarios to run. Raises BadInput for a broken file, and when nothing is left."""
-    from servod.qualify.faults.scenario import Runs
-    from servod.qualify.faults.variants import load_all, shipped_scenarios
-
-    known = load_all(files) if files else shipped_scenarios()
-    runs = {Runs.STEPPED} if stepped else {Runs.STEPPED, Runs.PROCESSES}
-    here = {name: s for name, s in known.items() if s.runs in runs}
-    groups = sorted({s.group for s in here.values()})
-    if group is not None and group not in groups:
-        raise BadInput("--group", group, ", ".join(groups))
-    chosen = {name: s for name, s in here.items() if group in (None, s.group) and fnmatchcase(name, only or "*")}
-    if not chosen:
-        found = f"{only or 'all'}, which fits none of {len(here)} scenarios"
-        raise BadInput("--only", found, "a pattern that fits a name, as in 'torque_frames*'")
-    return chosen
-
-
-def _run(chosen: dict[str, Scenario], jobs: int, found: list[Outcome], quiet: bool) -> None:
-    """Run them; each goes into `found`, and is told in a line of standard error, as it comes."""
-    from servod.qualify.faults.run import outcomes
-
-    for outcome in outcomes(chosen, jobs):
-        found.append(outcome)
-        if not quiet:
-            why = "" if outcome.passed else f": {'; '.join(outcome.complaints)}"
-            word = "passed" if outcome.passed else "FAILED"
-            print(f"{len(found)} of {len(chosen)} {word} {outcome.name}{why}", file=sys.stderr, flush=True)
-
-
-def _report(found: list[Outcome], planned: int, out: Path | None, as_json: bool) -> None:
-    from servod.qualify.faults.document import document, summary, text_table
-
-    content = document(found, planned)
-    if out is not None:
-        _write(found, planned, content, out)
+        axis = load_config(config)
+        asked = _Asked(axis.control.socket, axis.recorder.directory, axis.name, last)
+    if recordings or journal:
+        document = _of_files(recordings or [], journal, last)
+    else:
+        document = _of_folder(asked) if folder is not None else _of_axis(asked)
     if as_json:
-        print_json(content)
-        return
-    print(text_table(found))
-    print("\n".join(summary(found, planned)))
-    if out is not None:
-        print(f"Page: {out / 'report.html'}; all figures: {out / 'faults.json'}")
+        print_json(document)
+    else:
+        _print(document)
 
 
-def _write(found: list[Outcome], planned: int, content: dict[str, Any], out: Path) -> None:
-    import json
+def _refuse_together(given: set[str], codes: bool) -> None:
+    """One place to look at, or the table. Raises BadInput."""
+    if codes and given:
+        raise BadInput("--codes", f"beside {sorted(given)[0]}", "alone or with --json: it lists all faults")
+    if len(given) > 1:
+        first, second, *_ = sorted(given)
+        raise BadInput(first, f"beside {second}", "one of REC, --recordings, --journal and --config")
 
-    from servod.common.files import write_bytes
-    from servod.qualify.faults.document import write_page
 
-    write_bytes(out / "faults.json", json.dumps(content, indent=2, allow_nan=False).encode())
-    write_page(found, planned, out / "report.html")
+def _of_files(recordings: list[Path], journal: Path | None, most: int) -> dict[str, Any]:
+    from servod.formats.recording.incidents import newest, of_file, of_journal
+
+    found = [incident for path in recordings for incident in of_file(path)]
+    if journal is not None:
+        found = of_journal(journal)
+    return _document("journal" if journal else "recordings", None, [i.document() for i in newest(found, most)])
+
+
+def _of_folder(asked: _Asked) -> dict[str, Any]:
+    """What the fault files of a folder tell."""
+    folder = asked.folder or _FOLDER
+    if not folder.is_dir():
+        raise BadFile(str(folder), "there is no such folder", "the folder of the recordings")
+    rows, unread = _read(folder, asked.axis, asked.most, set())
+    return _document("recordings", None, rows, unread) | {"folder": str(folder)}
+
+
+def _of_axis(asked: _Asked) -> dict[str, Any]:
+    """The daemon's incidents and, from before its start, the fault files. Raises Unreachable where neither is there."""
+    from servod.formats.protocol import Verb
+
+    try:
+        told = ask(asked.socket, Verb.FAULTS)
+        now = [fault["code"] for fault in ask(asked.socket, Verb.STATUS)["faults"]]
+    except Unreachable as error:
+        if not (asked.folder or _FOLDER).is_dir():
+            raise Unreachable(f"{error} And there is no folder of recordings, {asked.folder or _FOLDER}.") from None
+        return _of_folder(asked) | {"daemon": str(error)}
+    rows: list[dict[str, Any]] = told["incidents"][::-1][: asked.most]
+    folder = Path(told["directory"])
+    unread: list[str] = []
+    if len(rows) < asked.most:
+        with suppress(OSError):
+            earlier, unread = _read(folder, told["name"], asked.most, {row["file"] for row in rows})
+            rows = [*rows, *(row for row in earlier if not _told(row, rows))][: asked.most]
+    return _document("daemon", now, rows, unread) | {"folder": str(folder)}
+
+
+def _told(row: dict[str, Any], rows: list[dict[str, Any]]) -> bool:
+    """Whether the daemon has told of this file's incident already, before the file was written."""
+    return any(row["time"] == other["time"] and row["code"] == other["code"] for other in rows)
+
+
+def _read(folder: Path, axis: str | None, most: int, known: set[str]) -> tuple[list[dict[str, Any]], list[str]]:
+    """The newest incidents of the fault files, and which of these cannot be read and why."""
+    from servod.formats.recording.incidents import fault_files, newest, of_file
+
+    found: list[Incident] = []
+    unread: list[str] = []
+    for path in fault_files(folder, axis):
+        if len(found) >= most:
+            break
+        if str(path) in known:
+            continue
+        try:
+            found += of_file(path)
+        except BadInput as error:
+            unread.append(str(error))
+    return [incident.document() for incident in newest(found, most)], unread
+
+
+def _document(
+    source: str, now: list[str] | None, rows: list[dict[str, Any]], unread: list[str] | None = None
+) -> dict[str, Any]:
+    """`now`: faults that are latched, which only a daemon knows."""
+    return {"source": source, "now": now, "incidents": rows, "not_read": unread or []}
+
+
+def _print(document: dict[str, Any]) -> None:
+    if "daemon" in document:
+        print(f"{document['daemon']} From the fault files in {document['folder']}:")
+    if document["now"]:
+        print(f"latched now: {', '.join(document['now'])}")
+    for row in document["incidents"]:
+        _print_incident(row)
+    for line in document["not_read"]:
+        print(f"not read: {one_line(line)}")
+    if not document["incidents"]:
+        print("no fault is on record")
+
+
+def _print_incident(row: dict[str, Any]) -> None:
+    """A line of when and what, and indented what followed, what helps, and where to look."""
+    name = f" {one_line(row['axis'])}" if row["axis"] else ""
+    detail = f" [{one_line(row['detail'])}]" if row["detail"] else ""
+    print(f"{row['time']}{name}: {row['code']} ({_words(row['reaction'])}). {row['cause']}{detail}")
+    for other in row["faults"]:
+        if other["code"] != row["code"]:
+            when = f"{abs(other['after_s']):.3f} s {'before' if other['after_s'] < 0 else 'later'}"
+            print(f"    {when}: {other['code']} ({_words(other['reaction'])})")
+    print(f"    to do: {row['remedy']}")
+    if row["file"]:
+        print(f"    the seconds before: {one_line(row['file'])}")
+
+
+def _words(reaction: str) -> str:
+    return reaction.lower().replace("_", " ")
 
 
 def _print_codes(as_json: bool) -> None:

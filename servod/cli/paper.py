@@ -1,4 +1,4 @@
-"""`servoctl paper`: the paper's figures and numbers from this software on the virtual axis, and what agrees."""
+"""`servoctl qualify paper`: the paper's figures and numbers from this software on the virtual axis, and what agrees."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ _HELP = example(
     "Reproduce the paper on the virtual axis: identify Table I's joint and an asymmetric one, track trajectory (19) "
     "and steps under every controller over the whole CAN loop, sweep what the paper leaves open, and write figures, a "
     "page and the paper's numbers beside ours. Takes some minutes; --quick, without identification, a fraction of one.",
-    "servoctl paper --out out/paper",
-    "servoctl paper --out out/paper --quick --json",
+    "servoctl qualify paper --out out/paper",
+    "servoctl qualify paper --out out/paper --quick --json",
 )
 
 

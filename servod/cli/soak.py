@@ -1,4 +1,4 @@
-"""`servoctl soak`: hours of random moves and faults on the virtual axis, with every cycle accounted for."""
+"""`servoctl qualify soak`: hours of random moves and faults on the virtual axis, with every cycle accounted for."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ _HELP = example(
     "wall clock. Ctrl-C ends it and still reports. Exit code 1 when anything was wrong, and when it did not get "
     "through: interrupted, a job that died, four hours that do not tell of memory. The state is in --out all the "
     "time: soak.json, and soak.html at the end.",
-    "servoctl soak --hours 1",
-    "servoctl soak --hours 28 --limit-hours 1 --seed 7 --jobs 2 --out out/soak",
-    "servoctl soak --wall --hours 0.1",
+    "servoctl qualify soak --hours 1",
+    "servoctl qualify soak --hours 28 --limit-hours 1 --seed 7 --jobs 2 --out out/soak",
+    "servoctl qualify soak --wall --hours 0.1",
 )
 _MS_PER_H = 3_600_000
 _FEWEST_H, _MOST_H = 1e-4, 1e5
@@ -59,7 +59,7 @@ def soak(
     """Soak."""
     if wall and jobs > 1:
         raise BadInput("--jobs", jobs, "1 with --wall: the processes of one axis want the machine for themselves")
-    need_linux("servoctl soak")
+    need_linux("servoctl qualify soak")
     need_folder("--out", out, alone=True)
     one_thread()
     from servod.cli.common import progress

@@ -40,10 +40,11 @@ class Verb(StrEnum):
     RECORD_START = "record_start"
     RECORD_STOP = "record_stop"
     SCAN = "scan"
+    FAULTS = "faults"
 
 
 #: Verbs that only look; everything else needs the right to command.
-READING = frozenset({Verb.STATUS, Verb.WATCH, Verb.GAINS_LIST})
+READING = frozenset({Verb.STATUS, Verb.WATCH, Verb.GAINS_LIST, Verb.FAULTS})
 
 
 class SampleKey(StrEnum):

@@ -1,4 +1,4 @@
-"""`servoctl faults`: which scenarios run, what is printed and written, and how it ends."""
+"""`servoctl qualify faults`: which scenarios run, what is printed and written, and how it ends."""
 
 import json
 import struct
@@ -35,7 +35,7 @@ def mine(tmp_path: Path) -> Path:
 
 def test_a_scenario_of_ones_own_is_run_told_and_written(mine: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = mine.parent / "out"
-    assert run(["faults", "--scenario", str(mine), "--out", str(out)]) == 0
+    assert run(["qualify", "faults", "--scenario", str(mine), "--out", str(out)]) == 0
     shown = capsys.readouterr()
     assert "1 of 1 passed mine" in shown.err
     assert "1 of 1 scenarios in 1 files passed." in shown.out
@@ -48,7 +48,7 @@ def test_a_scenario_of_ones_own_is_run_told_and_written(mine: Path, capsys: pyte
 
 def test_one_that_does_not_pass_is_exit_code_1_and_says_why(mine: Path, capsys: pytest.CaptureFixture[str]) -> None:
     mine.write_text(MINE.replace("AXIS", "ENABLED"))
-    assert run(["faults", "--scenario", str(mine), "--json"]) == 1
+    assert run(["qualify", "faults", "--scenario", str(mine), "--json"]) == 1
     shown = capsys.readouterr()
     assert json.loads(shown.out)["scenarios"][0]["complaints"] == ["the axis ended DISABLED, expected ENABLED"]
     assert shown.err.splitlines()[-1] == "servoctl: 1 of 1 scenarios did not pass: mine"
@@ -58,13 +58,12 @@ def test_one_that_does_not_pass_is_exit_code_1_and_says_why(mine: Path, capsys: 
     ("words", "told"),
     [
         (["--only", "no such"], "--only"),
-        (["--codes", "--only", "x"], "--codes: found beside --only"),
         (["--group", "weather"], "--group: found weather; allowed: bus"),
         (["--scenario", "/nowhere.yaml"], "/nowhere.yaml"),
     ],
 )
 def test_bad_input_is_one_line(words: list[str], told: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["faults", *words]) == 2
+    assert run(["qualify", "faults", *words]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert told in line
 
@@ -86,7 +85,7 @@ def test_a_mistake_in_a_scenario_is_found_when_it_is_read(
     text: str, told: str, mine: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     mine.write_text(text.replace("[AXIS]", "[DISABLED]"))
-    assert run(["faults", "--scenario", str(mine)]) == 2
+    assert run(["qualify", "faults", "--scenario", str(mine)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f"servoctl: {mine}: ")
     assert told in line
@@ -108,7 +107,7 @@ def test_one_that_breaks_off_has_failed_and_the_next_one_runs(
         return observe(axis)
 
     monkeypatch.setattr(SteppedAxis, "observe", breaks_once)
-    assert run(["faults", "--scenario", str(mine), "--scenario", str(sound)]) == 1
+    assert run(["qualify", "faults", "--scenario", str(mine), "--scenario", str(sound)]) == 1
     shown = capsys.readouterr()
     assert "1 of 2 FAILED mine: error: int too large to convert" in shown.err.splitlines()
     rows = [line.split() for line in shown.out.splitlines() if line.startswith(("mine", "sound"))]
@@ -140,14 +139,14 @@ def test_interrupted_it_writes_what_it_has(
     monkeypatch.setattr(campaign, "outcomes", interrupted)
     out = mine.parent / "out"
     files = ["--scenario", str(mine), "--scenario", str(second)]
-    assert run(["faults", *files, "--out", str(out)]) == 130
+    assert run(["qualify", "faults", *files, "--out", str(out)]) == 130
     assert json.loads((out / "faults.json").read_text())["run"] == 1
     assert "1 of 2 were not run." in capsys.readouterr().out
 
 
 def test_what_does_not_get_to_the_start_has_failed(mine: Path, capsys: pytest.CaptureFixture[str]) -> None:
     mine.write_text(mine.read_text() + "config: {amplifier: {identity: {serial: 77}}}\n")
-    assert run(["faults", "--scenario", str(mine), "--json"]) == 1
+    assert run(["qualify", "faults", "--scenario", str(mine), "--json"]) == 1
     (row,) = json.loads(capsys.readouterr().out)["scenarios"]
     assert row["axis"] == "not started"
     assert "is another device" in row["complaints"][0]

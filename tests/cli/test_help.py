@@ -17,6 +17,8 @@ from servod.cli.app import app, run
 def commands(node: object, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
     """The path of every command below a group, the groups included."""
     for name, child in getattr(node, "commands", {}).items():
+        if child.hidden:
+            continue
         yield (*path, name)
         yield from commands(child, (*path, name))
 

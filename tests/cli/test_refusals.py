@@ -85,7 +85,11 @@ def test_a_folder_that_another_command_works_in_is_refused(tmp_path: Path, capsy
     other = os.open(tmp_path, os.O_RDONLY)
     try:
         fcntl.flock(other, fcntl.LOCK_EX)
-        for command in (["soak", "--cycles", "1"], ["faults", "--stepped"], ["prove", "--cases", "1"]):
+        for command in (
+            ["qualify", "soak", "--cycles", "1"],
+            ["qualify", "faults", "--stepped"],
+            ["prove", "--cases", "1"],
+        ):
             assert run([*command, "--out", str(tmp_path)]) == 3
             assert f"--out {tmp_path}: another command is at work there" in capsys.readouterr().err
     finally:

@@ -89,7 +89,7 @@ class _Desk:
         self.selector, self.loop = selectors.DefaultSelector(), _Loop()
         recorder = Recorder(self.config.recorder, self.config.name, 1000)
         bank = GainBank(self.config)
-        self.verbs = Verbs(self.config, self.loop, bank, recorder, dict)
+        self.verbs = Verbs(self.config, self.loop, bank, recorder, dict, dict)
         self.server = ControlServer(self.config.control, self.selector, self.verbs)
 
     def rounds(self, until: Callable[[], bool]) -> None:

@@ -1,10 +1,10 @@
 """The manual's tables that come from the code. `python tests/tools/readme.py` writes them anew.
 
-Each stands between two marks in one page of `docs`. `--measure` first runs `servoctl bench`, `servoctl paper` and
+Each stands between two marks in one page of `docs`. `--measure` first runs `servoctl bench`, `servoctl qualify paper` and
 `servoctl demo --fast` with the manual's gain sets (twenty minutes on an idle machine) and writes what they print;
 `--bench FILE`, `--paper FILE` and `--demo FILE` take documents that were kept (--json). `--soak FILE` (again for more),
-`--faults FILE` and `--fuzz FILE`, given together, write the table of reliability from the documents of `servoctl soak`,
-`servoctl faults` and `python -m tests.fuzz.run`.
+`--faults FILE` and `--fuzz FILE`, given together, write the table of reliability from the documents of `servoctl qualify soak`,
+`servoctl qualify faults` and `python -m tests.fuzz.run`.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ def tracking(document: dict[str, Any]) -> str:
 def printed(arguments: list[str], folder: str) -> dict[str, Any]:
     """The JSON document of one command of servoctl."""
     command = [sys.executable, "-m", "servod.cli", *arguments, "--json"]
-    if arguments[0] in ("demo", "paper"):
+    if {"demo", "paper"} & {*arguments[:2]}:
         command += ["--out", folder]
     document: dict[str, Any] = json.loads(subprocess.run(command, stdout=subprocess.PIPE, cwd=ROOT, check=True).stdout)
     return document
@@ -162,15 +162,15 @@ def main() -> None:
     parser.add_argument("--measure", action="store_true", help="run the commands and write what they print")
     parser.add_argument("--bench", type=Path, help="document of `servoctl bench --json`")
     parser.add_argument("--demo", type=Path, help="document of the manual's `servoctl demo --json`")
-    parser.add_argument("--paper", type=Path, help="paper.json of `servoctl paper`")
-    parser.add_argument("--soak", type=Path, action="append", default=[], help="soak.json of `servoctl soak`")
-    parser.add_argument("--faults", type=Path, help="document of `servoctl faults --json`")
+    parser.add_argument("--paper", type=Path, help="paper.json of `servoctl qualify paper`")
+    parser.add_argument("--soak", type=Path, action="append", default=[], help="soak.json of `servoctl qualify soak`")
+    parser.add_argument("--faults", type=Path, help="document of `servoctl qualify faults --json`")
     parser.add_argument("--fuzz", type=Path, help="document of `python -m tests.fuzz.run --json`")
     options = parser.parse_args()
     documents = {name: json.loads(file.read_text()) for name in MEASURED if (file := getattr(options, name))}
     if options.measure:
         with tempfile.TemporaryDirectory(prefix="servod-readme-") as folder:
-            commands = {"demo": demo_arguments(), "bench": ["bench"], "paper": ["paper"]}
+            commands = {"demo": demo_arguments(), "bench": ["bench"], "paper": ["qualify", "paper"]}
             documents = {name: printed(arguments, folder) for name, arguments in commands.items()}
     for page, text in written().items():
         page.write_text(text)

@@ -38,7 +38,7 @@ def _soak(soak: dict[str, Any]) -> Row:
         *(f"memory of {memory['process']} {_memory(memory)}" for memory in soak["memory"]),
         *(f"no pass: {reason}" for reason in soak.get("unproven", ())),
     ]
-    command = "servoctl soak" + (" --wall" if soak["mode"] == "wall" else "")
+    command = "servoctl qualify soak" + (" --wall" if soak["mode"] == "wall" else "")
     return [f"random moves and faults, {how}", much, "; ".join(out), f"`{command}`"]
 
 
@@ -80,7 +80,7 @@ def _faults(faults: dict[str, Any]) -> Iterator[Row]:
     if "recorded" in faults:
         lost += f" in {faults['recorded']:,} with a recorder"
     much = f"{faults['run']:,} of {faults['planned']:,} scenarios"
-    yield ["fault campaign", much, f"{faults['passed']:,} passed; {lost}", "`servoctl faults`"]
+    yield ["fault campaign", much, f"{faults['passed']:,} passed; {lost}", "`servoctl qualify faults`"]
     for loss, worst in faults["worst"].items():
         if worst["scenarios"]:
             times = [

@@ -26,7 +26,7 @@ def test_a_soak_is_told_with_what_was_lost() -> None:
     assert much == "3,600,010 cycles (1.0 h of axis time in 0.10 h), 1,200 faults of 1 kinds, 7 restarts"
     assert out.startswith("7 rows lost; 4 apart from SYNC on the bus; 2 of 3 faults that stop the axis in")
     assert out.endswith("torque gone after 149 ms at the latest; memory of soak flat (-20 to 34 kB/h)")
-    assert command == "`servoctl soak`"
+    assert command == "`servoctl qualify soak`"
 
 
 _NONE = {"count": 0, "median_ms": 0, "largest_ms": 0.0, "bins_ms": {}}

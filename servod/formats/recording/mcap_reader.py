@@ -19,7 +19,7 @@ from typing import Any, BinaryIO, cast
 
 import zstandard
 from mcap.exceptions import InvalidMagic, McapError
-from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Message, Schema
+from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 
 from servod.common.errors import BadInput
@@ -31,6 +31,7 @@ from servod.formats.recording.record import CDR_HEADER, CycleRecord
 TIME = "time_ns"
 _KINDS = {"float64": "d", "int64": "q"}
 _LINE = re.compile(r"^(float64|int64) (\w+)  # \[([^]]*)\]")
+_WHOLE = re.compile(r"-?\d{1,19}")
 _RECORD_LIMIT_BYTES = 64 * 1024 * 1024
 #: Most that a file may hold unpacked; a few kilobytes can claim any amount.
 _UNPACKED_LIMIT_BYTES = 4 * 1024**3
@@ -49,7 +50,7 @@ class Recording:
 
     `kinds` has one letter per name, "d" (float64) or "q" (int64), little endian; `truncated` tells that the file
     ends without its footer, as after kill -9, or is damaged; `damage` says then where, and what could be read.
-    `left_out` are the names in the file that were not wanted.
+    `left_out` are the names in the file that were not wanted; `wall_offset_ns` turns its times into the time of day.
     """
 
     names: tuple[str, ...] = ()
@@ -61,6 +62,7 @@ class Recording:
     truncated: bool = True
     damage: str = ""
     left_out: tuple[str, ...] = ()
+    wall_offset_ns: int = 0
 
     def __len__(self) -> int:
         return len(self.rows) // self.row_bytes if self.names else 0
@@ -205,6 +207,11 @@ class _Taker:
             self._count_beside(len(record.topic))
             self._topics[record.id] = record.topic
             self._take_channel(record)
+        elif isinstance(record, Metadata):
+            self._count_beside(sum(map(len, record.metadata.values())))
+            if record.name == "servod":
+                offset = record.metadata.get("wall_minus_monotonic_ns", "")
+                self.recording.wall_offset_ns = int(offset) if _WHOLE.fullmatch(offset) else 0
         elif isinstance(record, Attachment):
             self._count_beside(len(record.data))
             self.recording.attachments[record.name] = record.data

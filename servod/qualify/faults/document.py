@@ -127,7 +127,7 @@ def _plain(outcome: Outcome) -> dict[str, Any]:
     }
 
 
-# The page of `servoctl faults`: what was injected, what the drive did, and what the user was told.
+# The page of `servoctl qualify faults`: what was injected, what the drive did, and what the user was told.
 #
 # Behind the campaign; needs the lab part. All text is escaped by the page.
 

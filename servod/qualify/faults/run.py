@@ -150,7 +150,8 @@ def _inject(axis: AxisUnderTest, scenario: Scenario, injections: Sequence[Inject
 
 # The whole campaign: scenarios one after the other, or several of those in virtual time at once.
 #
-# Above `run`; used by `servoctl faults`. Whoever takes the outcomes may stop in between and keeps what came so far.
+# Above `run`; used by `servoctl qualify faults`. Whoever takes the outcomes may stop in between and keeps what came so
+# far.
 
 
 Scenarios = Mapping[str, Scenario]

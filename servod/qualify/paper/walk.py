@@ -1,4 +1,4 @@
-"""The whole of `servoctl paper`: identify, design, track, sweep, draw, in as little time as the cores allow.
+"""The whole of `servoctl qualify paper`: identify, design, track, sweep, draw, in as little time as the cores allow.
 
 Above everything of `paper`; its jobs go to the crew, what they found is gathered here.
 """

@@ -24,7 +24,7 @@ from servod.qualify.soak.tally import COUNTED, SoakedAxis, median_ms
 
 _CURVE_POINTS = 200
 _NS_PER_H = 3.6e12
-#: Exit codes with which `servoctl soak` says what it found; None: still running.
+#: Exit codes with which `servoctl qualify soak` says what it found; None: still running.
 _SAID = (0, 1, None)
 _ADDED = (
     *("cycles", "rows", "missed", "syncs", "syncs_taken", "drive_samples", "recordings", "rows_read_back", "episodes"),

@@ -1,4 +1,4 @@
-"""Starts what `servoctl soak` was asked for: one axis in this process, or several in processes of their own."""
+"""Starts what `servoctl qualify soak` was asked for: one axis in this process, or several in processes of their own."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from servod.qualify.soak.wall import WallSoak, of_the_wall
 
 # Runs a soak: episode after episode until the amount, the time or the person says enough; the state goes to disk.
 #
-# Above the axis (stepped or wall); called by `servoctl soak`.
+# Above the axis (stepped or wall); called by `servoctl qualify soak`.
 
 
 #: Told one line on how it goes, and the share that is done.
@@ -192,7 +192,17 @@ def _ended(process: subprocess.Popen[bytes]) -> int:
 
 def _start(order: Order) -> subprocess.Popen[bytes]:
     (order.out / DOCUMENT_NAME).unlink(missing_ok=True)
-    command = ["soak", "--json", "--cycles", str(order.cycles), "--seed", str(order.seed), "--out", str(order.out)]
+    command = [
+        "qualify",
+        "soak",
+        "--json",
+        "--cycles",
+        str(order.cycles),
+        "--seed",
+        str(order.seed),
+        "--out",
+        str(order.out),
+    ]
     if order.limit_hours is not None:
         command += ["--limit-hours", str(order.limit_hours)]
     return subprocess.Popen(

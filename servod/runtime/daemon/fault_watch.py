@@ -6,11 +6,16 @@ Around the loop. The reaction was the loop's, in the cycle of the fault; this on
 from __future__ import annotations
 
 import logging
+import time
+from collections import deque
 from concurrent.futures import Future
 from pathlib import Path
+from typing import Any
 
 from servod.common.faults import FAULTS, Fault, FaultCode, Reaction, faults_in
 from servod.common.units import NS_PER_S
+from servod.formats.recording.incidents import Incident, Seen
+from servod.formats.recording.mcap_writer import wall_offset_ns
 from servod.formats.recording.record import CycleRecord
 from servod.runtime.daemon.health import Health
 from servod.runtime.daemon.metrics import AxisMetrics
@@ -24,18 +29,23 @@ log = logging.getLogger("servod.faults")
 
 #: The fault file is written this long after the fault, so that it shows the reaction too.
 _AFTER_FAULT_NS = NS_PER_S // 2
+#: What is kept of the past in memory; fault files reach farther back.
+_MOST_INCIDENTS = 50
 _LEVEL = {Reaction.NONE: logging.WARNING, Reaction.CLIP: logging.WARNING}
 
 
 class FaultWatch:
     """Edge detector over the records' fault words."""
 
-    def __init__(self, recorder: Recorder, health: Health, metrics: AxisMetrics) -> None:
-        self._recorder, self._health, self._metrics = recorder, health, metrics
+    def __init__(self, recorder: Recorder, health: Health, metrics: AxisMetrics, axis: str = "") -> None:
+        self._recorder, self._health, self._metrics, self._axis = recorder, health, metrics, axis
+        self._incidents: deque[Incident] = deque(maxlen=_MOST_INCIDENTS)
+        self._begins = True
+        self._offset_ns = wall_offset_ns()
         self._known = 0
         self._state = int(AxisState.DISABLED)
         self._file_due_ns, self._file_label = 0, ""
-        self._files: list[Future[Path]] = []
+        self._files: list[tuple[Future[Path], Incident | None]] = []
 
     def see(self, records: list[CycleRecord], now_ns: int) -> None:
         """Report faults that were not there before; an enable makes them new again."""
@@ -44,13 +54,27 @@ class FaultWatch:
             if record.axis_state != self._state:
                 if record.axis_state == AxisState.ENABLING:
                     self._known &= word
+                    self._begins = True
                 self._state = record.axis_state
             if word & ~self._known:
-                self._report(word & ~self._known, now_ns)
+                self._report(word & ~self._known, record.time_ns, now_ns)
                 self._known |= word
 
-    def _report(self, word: int, now_ns: int) -> None:
+    def incidents(self) -> list[dict[str, Any]]:
+        """What befell the axis since the start, oldest first."""
+        return [incident.document() for incident in self._incidents]
+
+    def _note(self, code: FaultCode, time_ns: int, detail: str = "") -> None:
+        """Into the incident that goes on, or a new one; `time_ns` is CLOCK_MONOTONIC."""
+        seen = Seen(time_ns + self._offset_ns, code, detail)
+        if self._begins or not self._incidents[-1].goes_on(seen.time_ns):
+            self._incidents.append(Incident(self._axis))
+            self._begins = False
+        self._incidents[-1].add(seen)
+
+    def _report(self, word: int, time_ns: int, now_ns: int) -> None:
         for fault in faults_in(word):
+            self._note(fault.code, time_ns)
             self.tell(fault)
             if fault.reaction > Reaction.CLIP and not self._file_due_ns:
                 self._file_due_ns, self._file_label = now_ns + _AFTER_FAULT_NS, fault.code.name
@@ -58,6 +82,7 @@ class FaultWatch:
     def raise_own(self, code: FaultCode, detail: str) -> None:
         """A fault that the supervisor found itself."""
         self._metrics.count_fault(code)
+        self._note(code, time.monotonic_ns(), detail)
         self.tell(FAULTS[code], detail)
 
     def tell(self, fault: Fault, detail: str = "") -> None:
@@ -73,16 +98,19 @@ class FaultWatch:
         if self._file_due_ns and now_ns >= self._file_due_ns:
             self.write_file(self._file_label)
             self._file_due_ns = 0
-        for future in [f for f in self._files if f.done()]:
-            self._files.remove(future)
+        for future, incident in [entry for entry in self._files if entry[0].done()]:
+            self._files.remove((future, incident))
             if error := future.exception():
                 self.raise_own(FaultCode.RECORDER_FAILED, str(error))
             else:
                 log.warning("the seconds before the fault are in %s", future.result())
+                if incident is not None:
+                    incident.file = str(future.result())
 
     def write_file(self, label: str) -> None:
         """Hand the history to the recorder's thread."""
-        self._files.append(self._recorder.write_fault_file(label))
+        incident = self._incidents[-1] if self._incidents else None
+        self._files.append((self._recorder.write_fault_file(label), incident))
 
     def finish(self) -> None:
         """Write a file that is still due, at the end of the daemon."""

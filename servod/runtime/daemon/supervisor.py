@@ -75,9 +75,9 @@ class Supervisor:
         self._pulse = Pulse(config.cycle.period_us)
         self._health = Health(config.cycle.period_us, nodes.plans.bus_load)
         self._metrics = AxisMetrics(config.name, nodes.plans.bus_load)
-        self._faults = FaultWatch(recorder, self._health, self._metrics)
+        self._faults = FaultWatch(recorder, self._health, self._metrics, config.name)
         self._proofs = ProofWatch(loop, recorder)
-        self._verbs = Verbs(config, loop, bank, recorder, self._document)
+        self._verbs = Verbs(config, loop, bank, recorder, self._document, self._tell_faults)
         self._selector = selectors.DefaultSelector()
         self._server = ControlServer(config.control, self._selector, self._verbs)
         self._metrics_server = MetricsServer(config.metrics, self._metrics)
@@ -214,6 +214,11 @@ class Supervisor:
         self._recorder.close()
         self._metrics_server.close()
         self._selector.close()
+
+    def _tell_faults(self) -> dict[str, Any]:
+        """What befell the axis since the daemon started, and where the files of earlier times are."""
+        directory = str(self._config.recorder.directory.resolve())
+        return {"name": self._config.name, "directory": directory, "incidents": self._faults.incidents()}
 
     def _document(self) -> dict[str, Any]:
         """The status document (servod.runtime.daemon.status.Status)."""

@@ -63,10 +63,11 @@ class Verbs:
         bank: GainBank,
         recorder: Recorder,
         document: Callable[[], dict[str, Any]],
+        faults: Callable[[], dict[str, Any]],
     ) -> None:
-        """`document` makes the status document."""
+        """`document` makes the status document, `faults` that of what befell the axis."""
         self._config, self._loop, self._bank, self._recorder = config, loop, bank, recorder
-        self._document = document
+        self._document, self._faults = document, faults
         self._orders, self._flows = Orders(), Flows()
         self._last: tuple[Op, OrderWait] | None = None
         self._uploaded = Table()
@@ -90,6 +91,7 @@ class Verbs:
             Verb.RECORD_START: self._record_start,
             Verb.RECORD_STOP: self._record_stop,
             Verb.SCAN: self._scan,
+            Verb.FAULTS: self._tell_faults,
         }
 
     def handle(self, verb: Verb, args: dict[str, Any], reply: Reply) -> None:
@@ -150,6 +152,10 @@ class Verbs:
     def _status(self, _args: NoArgs) -> Flow:
         yield from ()
         return self._document()
+
+    def _tell_faults(self, _args: NoArgs) -> Flow:
+        yield from ()
+        return self._faults()
 
     def _enable(self, args: EnableArgs) -> Flow:
         record = self._loop.latest

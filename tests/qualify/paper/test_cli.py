@@ -1,4 +1,4 @@
-"""`servoctl paper --quick` as a whole: files, document, tables, and statements that follow the figures."""
+"""`servoctl qualify paper --quick` as a whole: files, document, tables, and statements that follow the figures."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.timeout(400)  # some 15 s on two quiet cores; a busy ma
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("paper")
-    assert run(["paper", "--out", str(out), "--quick", "--json"]) == 0
+    assert run(["qualify", "paper", "--out", str(out), "--quick", "--json"]) == 0
     return out
 
 
@@ -60,4 +60,4 @@ def test_the_statements_follow_the_figures(found: dict[str, Any]) -> None:
 def test_a_folder_that_cannot_be_written_is_refused_before_anything_runs(tmp_path: Path) -> None:
     taken = tmp_path / "taken"
     taken.write_text("a file")
-    assert run(["paper", "--out", str(taken / "below"), "--quick"]) == 2
+    assert run(["qualify", "paper", "--out", str(taken / "below"), "--quick"]) == 2

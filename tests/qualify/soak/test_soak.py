@@ -207,7 +207,7 @@ def test_several_runs_add_up(axis: SteppedSoak, tmp_path: Path) -> None:
 
 
 def test_the_command_writes_its_document_and_its_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert servoctl(["soak", "--cycles", "1500", "--seed", "2", "--out", str(tmp_path), "--json"]) == 0
+    assert servoctl(["qualify", "soak", "--cycles", "1500", "--seed", "2", "--out", str(tmp_path), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["mode"] == "stepped" and found["seeds"] == [2] and found["cycles"] >= 1500
     assert "Nothing wrong" in (tmp_path / "soak.html").read_text()

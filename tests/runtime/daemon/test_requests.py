@@ -147,7 +147,7 @@ def test_full_disk_ends_the_request_only() -> None:
     flows.start(flow(), answers.reply())
     future.set_exception(OSError(28, "No space left on device", "active.json"))
     flows.poll(1)
-    assert answers.sent[0]["error"] == {"exit_code": 3, "message": "active.json: No space left on device"}
+    assert answers.sent[0]["error"] == {"exit_code": 3, "message": "active.json: no space left on device"}
 
 
 def test_mistake_in_a_flow_ends_the_request_only() -> None:
@@ -195,7 +195,7 @@ class _Bank:
 def verbs(tmp_path: Path) -> Iterator[tuple[Verbs, _Loop]]:
     loop, config = _Loop(), axis_config(tmp_path / "s", tmp_path / "c")
     config = config.model_copy(update={"limits": config.limits.model_copy(update={"speed_rad_s": 1e3})})
-    verbs = Verbs(config, cast(LoopHandle, loop), cast(GainBank, _Bank()), cast(Recorder, _Events()), dict)
+    verbs = Verbs(config, cast(LoopHandle, loop), cast(GainBank, _Bank()), cast(Recorder, _Events()), dict, dict)
     yield verbs, loop
     verbs.close()
 

@@ -1,0 +1,192 @@
+"""`servoctl faults`: what befell this axis, from the daemon, from fault files, from log lines."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from servod.cli.app import run
+from servod.common.faults import FAULTS, FaultCode
+from servod.formats.config import RecorderConfig
+from servod.formats.recording.incidents import Incident, Seen
+from servod.runtime.daemon.fault_watch import FaultWatch
+from servod.runtime.daemon.health import Health
+from servod.runtime.daemon.metrics import AxisMetrics
+from servod.runtime.daemon.recorder import Recorder
+from servod.runtime.loop.axis import AxisState
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "daemon"))
+from daemon_rows import record, row
+
+BLOCKED, LATE = FaultCode.FOLLOWING_ERROR, FaultCode.DEADLINE_LATE
+CLIPPED, LEFT = FaultCode.TORQUE_CLIPPED, FaultCode.DRIVE_LEFT_OPERATION
+
+
+def word(*codes: FaultCode) -> int:
+    return sum(FAULTS[code].bit for code in codes)
+
+
+def story(watch: FaultWatch, recorder: Recorder, start: int = 0) -> None:
+    """An old fault, an enable, a clip 100 ms before the axis is blocked, and a drive that gives up 20 ms later."""
+    faults = {0: word(LATE), 900: word(CLIPPED), 1000: word(CLIPPED, BLOCKED), 1020: word(BLOCKED, LEFT)}
+    latched, now = word(LATE), 0
+    for cycle in range(1500):
+        now = faults.get(cycle, now)
+        state = AxisState.ENABLING if 300 <= cycle < 320 else AxisState.ENABLED
+        latched = 0 if cycle == 300 else latched | now
+        if cycle == 300:
+            now = 0
+        values = {"faults": now, "faults_latched": latched, "axis_state": state}
+        time_ns = time.monotonic_ns() + (cycle - 1500) * 1_000_000 if start == 0 else start + cycle * 1_000_000
+        recorder.add_rows([row(cycle, **values, time_ns=time_ns)])
+        watch.see([record(cycle, **values, time_ns=time_ns)], cycle * 1_000_000)
+        watch.tick(cycle * 1_000_000)
+    watch.tick(10**10)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """The recordings of an axis that was stopped once."""
+    recorder = Recorder(RecorderConfig(directory=tmp_path, history_s=2.0), "joint", 1000)
+    story(FaultWatch(recorder, Health(1000, 0.4), AxisMetrics("joint", 0.4), "joint"), recorder, time.monotonic_ns())
+    recorder.close()
+    return tmp_path
+
+
+def told(words: list[str], capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    assert run(["faults", *words, "--json"]) == 0
+    document: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return document
+
+
+def test_a_fault_file_tells_the_first_cause_and_what_followed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    document = told(["--recordings", str(folder)], capsys)
+    (row,) = document["incidents"]
+    (file,) = folder.glob("joint-fault-*-FOLLOWING_ERROR.mcap")
+    assert (row["axis"], row["code"], row["file"]) == ("joint", "FOLLOWING_ERROR", str(file))
+    assert row["cause"] == FAULTS[BLOCKED].cause and row["remedy"] == FAULTS[BLOCKED].remedy
+    followed = {other["code"]: other["after_s"] for other in row["faults"]}
+    assert followed == pytest.approx({"TORQUE_CLIPPED": -0.1, "FOLLOWING_ERROR": 0.0, "DRIVE_LEFT_OPERATION": 0.02})
+    assert row["time"][:10] == time.strftime("%Y-%m-%d") and document["now"] is None
+    assert told([str(file)], capsys)["incidents"] == document["incidents"]
+
+
+def test_people_read_when_what_and_where(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["faults", "--recordings", str(folder)]) == 0
+    first, *rest = capsys.readouterr().out.splitlines()
+    assert f"joint: FOLLOWING_ERROR (ramp down). {FAULTS[BLOCKED].cause}" in first
+    assert rest[0].strip() == "0.100 s before: TORQUE_CLIPPED (clip)"
+    assert rest[1].strip() == "0.020 s later: DRIVE_LEFT_OPERATION (disable)"
+    assert rest[2].strip() == f"to do: {FAULTS[BLOCKED].remedy}"
+    assert rest[3].strip().startswith("the seconds before: ")
+
+
+def test_a_file_that_cannot_be_read_hides_no_other(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    broken = folder / "joint-fault-29990101-000000-BUS_OFF.mcap"
+    broken.write_bytes(b"nothing")
+    (folder / "joint-20260101-000000.mcap").write_bytes(b"a recording, no fault file")
+    document = told(["--recordings", str(folder)], capsys)
+    assert len(document["incidents"]) == 1 and str(broken) in document["not_read"][0]
+
+
+def test_no_fault_is_an_answer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["faults", "--recordings", str(tmp_path)]) == 0
+    assert capsys.readouterr().out == "no fault is on record\n"
+
+
+LINES = f"""\
+2026-03-01T10:00:00.250000+01:00 host servod[7]: fault TORQUE_CLIPPED (CLIP): {FAULTS[CLIPPED].cause} x | lag
+2026-03-01T10:00:00.500000+01:00 host servod[7]: fault BUS_OFF (DISABLE): {FAULTS[FaultCode.BUS_OFF].cause} [32 sent] y
+2026-03-01T10:00:01+0100 host servod[7]: somebody else's line
+2026-03-01T12:00:00+0100 host servod[7]: fault RECORDER_FAILED (NONE): The recording could not be written. [full] z
+"""
+
+
+def test_saved_log_lines_tell_it_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    journal = tmp_path / "journal.txt"
+    journal.write_text(LINES)
+    later, first = told(["--journal", str(journal)], capsys)["incidents"]
+    assert (first["code"], first["detail"]) == ("BUS_OFF", "32 sent")
+    assert [(f["code"], f["after_s"]) for f in first["faults"]] == [("TORQUE_CLIPPED", -0.25), ("BUS_OFF", 0.0)]
+    assert (later["code"], later["detail"]) == ("RECORDER_FAILED", "full")
+    assert len(told(["--journal", str(journal), "--last", "1"], capsys)["incidents"]) == 1
+    journal.write_text("Mar 01 10:00:00 host servod[7]: fault BUS_OFF (DISABLE): x\n")
+    assert run(["faults", "--journal", str(journal)]) == 2
+    assert "a line without its date" in capsys.readouterr().err
+
+
+def test_the_daemons_own_log_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    logger, log = logging.getLogger("servod.faults"), tmp_path / "servod.log"
+    handler = logging.FileHandler(log)
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    logger.addHandler(handler)
+    recorder = Recorder(RecorderConfig(directory=tmp_path, history_s=0.1), "joint", 1000)
+    try:
+        FaultWatch(recorder, Health(1000, 0.4), AxisMetrics("joint", 0.4)).see([record(1, faults=word(BLOCKED))], 0)
+    finally:
+        logger.removeHandler(handler)
+        recorder.close()
+    (row,) = told(["--journal", str(log)], capsys)["incidents"]
+    assert row["code"] == "FOLLOWING_ERROR" and row["detail"] == ""
+
+
+def test_the_daemon_remembers_incidents_and_their_files(tmp_path: Path) -> None:
+    recorder = Recorder(RecorderConfig(directory=tmp_path, history_s=2.0), "joint", 1000)
+    watch = FaultWatch(recorder, Health(1000, 0.4), AxisMetrics("joint", 0.4), "joint")
+    story(watch, recorder)
+    deadline = time.monotonic() + 10.0
+    while not any(row["file"] for row in watch.incidents()) and time.monotonic() < deadline:
+        watch.tick(10**11)
+        threading.Event().wait(0.02)
+    late, blocked = watch.incidents()
+    (file,) = tmp_path.glob("joint-fault-*.mcap")
+    assert (late["code"], late["file"], blocked["code"], blocked["file"]) == (
+        "DEADLINE_LATE", "", "FOLLOWING_ERROR", str(file),
+    )  # fmt: skip
+    assert [f["code"] for f in blocked["faults"]] == ["TORQUE_CLIPPED", "FOLLOWING_ERROR", "DRIVE_LEFT_OPERATION"]
+    watch.raise_own(FaultCode.RECORDER_FAILED, "no space")
+    assert watch.incidents()[-1]["faults"][-1]["detail"] == "no space"
+    recorder.close()
+
+
+def test_the_first_cause_is_the_strongest_of_its_cycle() -> None:
+    seen = [Seen(5, CLIPPED), Seen(10, BLOCKED), Seen(10, LEFT), Seen(20, FaultCode.BUS_OFF)]
+    assert Incident("", seen).first.code is LEFT
+    assert Incident("", seen[:1]).first.code is CLIPPED
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "line"),
+    [
+        (["--socket", "none"], 3, "there is no folder of recordings"),
+        (["--recordings", "none"], 2, "none: there is no such folder"),
+        (["--codes", "--journal", "x"], 2, "--codes: found beside --journal"),
+        (["--recordings", "a", "--journal", "x"], 2, "--journal: found beside --recordings"),
+        (["none.mcap"], 2, "none.mcap: there is no such file"),
+    ],
+)
+def test_nowhere_to_look_is_one_line(
+    words: list[str], code: int, line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("servod.cli.faults._FOLDER", tmp_path / "nowhere")
+    assert run(["faults", *words]) == code
+    (shown,) = capsys.readouterr().err.splitlines()
+    assert line in shown
+
+
+@pytest.mark.parametrize("name", ["soak", "paper"])
+def test_the_old_names_say_where_they_are_now(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run([name, "--out", "/proc/nowhere"]) == 2
+    moved, refused = capsys.readouterr().err.splitlines()
+    assert f"`servoctl {name}` is `servoctl qualify {name}` now" in moved and "--out /proc/nowhere" in refused
+    assert run(["--help"]) == 0
+    assert f"\n  {name} " not in capsys.readouterr().out
