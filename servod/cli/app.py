@@ -42,6 +42,7 @@ from servod.cli import (
 )
 from servod.cli.common import begin_command, drop_empty_folders
 from servod.cli.errors import INTERRUPTED, complain, say
+from servod.cli.groups import Grouped
 from servod.common.errors import BadInput
 
 #: Windows says EINVAL of a pipe whose reader has gone.
@@ -50,6 +51,7 @@ _NOBODY_TAKES = {errno.ENOSPC, errno.EIO, errno.EBADF, *_GONE}
 
 app = typer.Typer(
     name="servoctl",
+    cls=Grouped,
     help="Commission and run servo axes under servod. Every command's --help shows an example.",
     no_args_is_help=False,
     rich_markup_mode=None,

@@ -28,11 +28,12 @@ def register(app: typer.Typer) -> None:
 
 
 @_app.command(
+    short_help="Check files, each recognised by its content.",
     help=example(
         "Check axis configurations, gain sets, axis models, column maps and EDS files, each recognised by its content, "
         "with everything that they name.",
         "servoctl config check /etc/servod/axis.yaml gains.yaml model.yaml drive.eds",
-    )
+    ),
 )
 def check(
     files: Annotated[list[Path], typer.Argument(help="Files to check.", metavar="FILE...")],

@@ -23,6 +23,7 @@ from servod.cli.common import (
     progress,
     table_console,
 )
+from servod.cli.groups import walk_steps
 from servod.common.errors import BadInput
 
 if TYPE_CHECKING:
@@ -54,7 +55,10 @@ def commission(
     budget: Annotated[int | None, typer.Option(min=1, help="Simulated plants for each rival's tuning.")] = None,
     rivals: Annotated[bool, typer.Option(help="Tune rivals and compare, on a virtual axis.")] = True,
     processes: Annotated[int, typer.Option(min=1, max=64, help="Worker processes.")] = 2,
-    again: Annotated[list[str] | None, typer.Option(help="Do this step anew, though it was done; repeatable.")] = None,
+    again: Annotated[
+        list[str] | None,
+        typer.Option(help="Do this step anew, though it was done; repeatable.", autocompletion=walk_steps),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of excitation, tuning and virtual noise.")] = 1,
     yes: Annotated[
         bool, typer.Option("--yes", help="Agree to every question, and take what is offered where demands clash.")

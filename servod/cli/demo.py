@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from servod.cli.common import JsonOption, example, need_folder, print_json
+from servod.cli.groups import effects
 from servod.common.errors import BadInput
 from servod.common.portable import need_linux
 
@@ -49,7 +50,10 @@ def demo(
         bool, typer.Option("--diagnose", help="Conceal an effect, diagnose it from the axis's recordings, and cure it.")
     ] = False,
     conceal: Annotated[
-        str | None, typer.Option(help="Effect that --diagnose conceals, or takes out of what is believed of --plant.")
+        str | None,
+        typer.Option(
+            help="Effect that --diagnose conceals, or takes out of what is believed of --plant.", autocompletion=effects
+        ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from servod.cli.common import JsonOption, example, print_json
+from servod.cli.groups import effects
 from servod.common.errors import BadInput
 
 EXAMPLE = "servoctl explain stribeck"
@@ -22,7 +23,9 @@ def register(app: typer.Typer) -> None:
 
 
 def explain(
-    effect: Annotated[str | None, typer.Argument(help="Name of an effect; none lists them all.")] = None,
+    effect: Annotated[
+        str | None, typer.Argument(help="Name of an effect; none lists them all.", autocompletion=effects)
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Print the equation, source, keys (units, ranges), signature and separating experiment of EFFECT."""

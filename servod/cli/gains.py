@@ -19,6 +19,7 @@ from servod.cli.common import (
     report,
     table_console,
 )
+from servod.cli.groups import stored_sets
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -88,7 +89,7 @@ def show(file: Annotated[Path, typer.Argument(help="Gain set, YAML.")], as_json:
 
 @_app.command(help=example("Change to a stored gain set without a bump.", "servoctl gains activate my_axis"))
 def activate(
-    name: Annotated[str, typer.Argument(help="Name in the store.")],
+    name: Annotated[str, typer.Argument(help="Name in the store.", autocompletion=stored_sets)],
     version: Annotated[int | None, typer.Option(min=1, help="Version; the newest unless given.")] = None,
     socket: SocketOption = DEFAULT_SOCKET,
     as_json: JsonOption = False,

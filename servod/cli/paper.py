@@ -20,7 +20,7 @@ _HELP = example(
 
 def register(app: typer.Typer) -> None:
     """Add the verb to `app`."""
-    app.command("paper", help=_HELP)(paper)
+    app.command("paper", help=_HELP, short_help="The paper's figures and numbers on the virtual axis.")(paper)
 
 
 def paper(

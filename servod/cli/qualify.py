@@ -16,6 +16,7 @@ import typer
 
 from servod.cli import paper, soak
 from servod.cli.common import JsonOption, example, need_folder, print_json
+from servod.cli.groups import scenario_groups
 from servod.common.errors import AnswerIsNo, BadInput
 from servod.common.portable import need_linux
 
@@ -42,7 +43,7 @@ _app = typer.Typer(
 
 def register(app: typer.Typer) -> None:
     """Add the verb to `app`."""
-    _app.command("faults", help=_HELP)(faults)
+    _app.command("faults", help=_HELP, short_help="Put every fault to the virtual axis and time the drive.")(faults)
     soak.register(_app)
     paper.register(_app)
     app.add_typer(_app, name="qualify")
@@ -63,7 +64,9 @@ def _moved(name: str, verb: Callable[..., None]) -> Callable[..., None]:
 
 def faults(
     only: Annotated[str | None, typer.Option(help="Run the scenarios whose name fits this pattern (*, ?).")] = None,
-    group: Annotated[str | None, typer.Option(help="Run the scenarios of this group.")] = None,
+    group: Annotated[
+        str | None, typer.Option(help="Run the scenarios of this group.", autocompletion=scenario_groups)
+    ] = None,
     scenario: Annotated[
         list[Path] | None, typer.Option(help="Run the scenarios of this file instead; may be given again.")
     ] = None,

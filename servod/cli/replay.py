@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from servod.cli.common import JsonOption, example, print_json
+from servod.cli.groups import horizons, starts
 from servod.common.errors import BadInput
 from servod.common.files import BadFile
 
@@ -31,11 +32,17 @@ def register(app: typer.Typer) -> None:
 def replay(
     recording: Annotated[Path, typer.Argument(metavar="REC", help="CSV, CSV.gz, Parquet, MAT v5 or MCAP.")],
     model: Annotated[Path, typer.Option(help="Axis model (YAML).")],
-    horizon: Annotated[str, typer.Option(help="Restart from the recording every so many seconds, or `full`.")] = "full",
+    horizon: Annotated[
+        str, typer.Option(help="Restart from the recording every so many seconds, or `full`.", autocompletion=horizons)
+    ] = "full",
     map_file: Annotated[Path | None, typer.Option("--map", help="Renames and scales foreign columns (YAML).")] = None,
     out: Annotated[Path | None, typer.Option(help="Write t_s, position and velocity here (.csv or .parquet).")] = None,
     start: Annotated[
-        str, typer.Option(help="First row: rest, recorded, or auto (at rest where it stands; just set off: free runs).")
+        str,
+        typer.Option(
+            help="First row: rest, recorded, or auto (at rest where it stands; just set off: free runs).",
+            autocompletion=starts,
+        ),
     ] = "auto",
     from_s: Annotated[float | None, typer.Option(help="First time of REC to use, s.")] = None,
     to_s: Annotated[float | None, typer.Option(help="Time of REC to stop before, s.")] = None,

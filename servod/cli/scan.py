@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, example, print_json, table_console
+from servod.cli.groups import bus_interfaces
 from servod.common.errors import BadInput, Unreachable, one_line
 from servod.common.portable import need_linux
 
@@ -32,7 +33,10 @@ def register(app: typer.Typer) -> None:
 def scan(
     interface: Annotated[
         str | None,
-        typer.Option(help="virtual, socketcan (with --channel the default), or a name that python-can knows."),
+        typer.Option(
+            help="virtual, socketcan (with --channel the default), or a name that python-can knows.",
+            autocompletion=bus_interfaces,
+        ),
     ] = None,
     channel: Annotated[str | None, typer.Option(help="Interface name, or the virtual bus's socket.")] = None,
     bit_rate: Annotated[int, typer.Option(help="Bit rate, for buses that python-can opens.")] = 1_000_000,

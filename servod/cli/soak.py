@@ -30,7 +30,7 @@ _FEWEST_H, _MOST_H = 1e-4, 1e5
 
 def register(app: typer.Typer) -> None:
     """Add the verb to `app`."""
-    app.command("soak", help=_HELP)(soak)
+    app.command("soak", help=_HELP, short_help="Hours of random moves and faults, every cycle told.")(soak)
 
 
 def _hours(text: str) -> float:

@@ -52,7 +52,8 @@ def sine(
 
 
 @_app.command(
-    help=example("Trajectory (19) of the paper, x = (0.1 - 0.0033 t) sin(0.2 pi t) rad.", "servoctl track paper")
+    short_help="Trajectory (19) of the paper.",
+    help=example("Trajectory (19) of the paper, x = (0.1 - 0.0033 t) sin(0.2 pi t) rad.", "servoctl track paper"),
 )
 def paper(
     duration: _Duration = 30.0,
@@ -77,10 +78,11 @@ def step(
 
 
 @_app.command(
+    short_help="Positions from a CSV file.",
     help=example(
         "Positions from a CSV file with the columns t_s and reference_rad, relative to where the axis stands.",
         "servoctl track csv motion.csv",
-    )
+    ),
 )
 def csv(
     file: Annotated[Path, typer.Argument(help="CSV file with the columns t_s and reference_rad.")],

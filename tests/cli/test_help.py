@@ -7,11 +7,13 @@ import re
 import shlex
 from collections.abc import Iterator
 from importlib.metadata import version
+from typing import Any
 
 import pytest
 from typer.main import get_command
 
 from servod.cli.app import app, run
+from servod.cli.groups import VERBS as VERBS_SHOWN
 
 
 def commands(node: object, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
@@ -21,6 +23,14 @@ def commands(node: object, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ..
             continue
         yield (*path, name)
         yield from commands(child, (*path, name))
+
+
+def at(path: tuple[str, ...]) -> Any:
+    """The command or group at a path."""
+    node: Any = get_command(app)
+    for name in path:
+        node = node.commands[name]
+    return node
 
 
 COMMANDS = sorted(commands(get_command(app)))
@@ -82,3 +92,73 @@ def test_bench_refuses_a_folder_that_cannot_be_before_it_measures(
 def test_version_is_the_packages(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["--version"]) == 0
     assert capsys.readouterr().out == f"servoctl {version('servod')}\n"
+
+
+@pytest.mark.parametrize("path", [(), *(p for p in COMMANDS if hasattr(at(p), "commands"))], ids=" ".join)
+def test_every_verb_has_a_whole_line(path: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
+    text = help_of(path, capsys)
+    assert max(map(len, text.splitlines())) <= 80
+    for name in (p[len(path)] for p in COMMANDS if len(p) == len(path) + 1 and p[: len(path)] == path):
+        (line,) = re.findall(rf"^  {name} +(\S.*)$", text, re.MULTILINE)
+        assert len(line) > 10 and not line.endswith("...")
+
+
+def test_verbs_stand_in_groups(capsys: pytest.CaptureFixture[str]) -> None:
+    text = help_of((), capsys)
+    assert re.findall(r"^(\w+):$", text, re.MULTILINE) == ["Options", "Operate", "Commission", "Analyse", "Qualify"]
+    listed = {name for lines in VERBS_SHOWN.values() for name in lines}
+    assert listed == {path[0] for path in COMMANDS}
+
+
+def complete(line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> list[str]:
+    """What bash is offered at the end of the line."""
+    monkeypatch.setenv("_SERVOCTL_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", line)
+    monkeypatch.setenv("COMP_CWORD", str(len(line.split(" ")) - 1))
+    with pytest.raises(SystemExit):
+        run([])
+    return capsys.readouterr().out.split()
+
+
+@pytest.mark.parametrize(
+    ("line", "offered"),
+    [
+        ("servoctl di", ["disable", "diagnose"]),
+        ("servoctl explain strib", ["stribeck"]),
+        ("servoctl demo --conceal cogg", ["cogging"]),
+        ("servoctl synthesize --mode ", ["deployed", "reference"]),
+        ("servoctl synthesize --weights ", ["linear", "cosine", "gaussian"]),
+        ("servoctl replay --start re", ["rest", "recorded"]),
+        ("servoctl replay --horizon f", ["full"]),
+        ("servoctl scan --interface socketcan", ["socketcan", "socketcand"]),
+        ("servoctl track s", ["sine", "step"]),
+        ("servoctl qualify ", ["faults", "soak", "paper"]),
+        ("servoctl qualify faults --group enc", ["encoder"]),
+        ("servoctl commission --again ver", ["verify"]),
+        ("servoctl prove --only c", ["conceal", "cases"]),
+        ("servoctl gains activate --socket /nowhere ", []),
+    ],
+)
+def test_the_shell_completes_closed_sets(
+    line: str, offered: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert complete(line, monkeypatch, capsys) == offered
+
+
+def test_the_shell_completes_names_of_stored_sets(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Daemon:
+        def __init__(self, path: object, timeout_s: float) -> None:
+            assert str(path) == "here.sock" and timeout_s <= 1.0
+
+        def __enter__(self) -> Daemon:
+            return self
+
+        def __exit__(self, *_: object) -> None: ...
+
+        def call(self, _verb: str) -> dict[str, list[dict[str, str]]]:
+            return {"gains": [{"name": name} for name in ("stiff", "soft", "plain", "soft")]}
+
+    monkeypatch.setattr("servod.client.control.ControlClient", Daemon)
+    assert complete("servoctl gains activate --socket here.sock s", monkeypatch, capsys) == ["soft", "stiff"]

@@ -221,6 +221,13 @@ def test_preset_leaves_an_axis_alone_that_a_daemon_runs(axis: Path, capsys: pyte
     assert "another servod" in capsys.readouterr().err
 
 
+def test_faults_are_told_by_the_daemon(servoctl: Servoctl) -> None:
+    document = servoctl.json("faults", "--last", "1000")
+    assert (document["source"], document["now"], document["not_read"]) == ("daemon", [], [])
+    assert Path(document["folder"]).name == "recordings"
+    assert "REC" not in servoctl("faults")
+
+
 def test_status_is_one_screen(servoctl: Servoctl) -> None:
     text = servoctl("status")
     assert "demo is DISABLED" in text and "deadline to torque" in text

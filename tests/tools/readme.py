@@ -1,10 +1,10 @@
 """The manual's tables that come from the code. `python tests/tools/readme.py` writes them anew.
 
-Each stands between two marks in one page of `docs`. `--measure` first runs `servoctl bench`, `servoctl qualify paper` and
-`servoctl demo --fast` with the manual's gain sets (twenty minutes on an idle machine) and writes what they print;
+Each stands between two marks in one page of `docs`. `--measure` first runs `servoctl bench`, `servoctl qualify paper`
+and `servoctl demo --fast` with the manual's gain sets (twenty minutes on an idle machine) and writes what they print;
 `--bench FILE`, `--paper FILE` and `--demo FILE` take documents that were kept (--json). `--soak FILE` (again for more),
-`--faults FILE` and `--fuzz FILE`, given together, write the table of reliability from the documents of `servoctl qualify soak`,
-`servoctl qualify faults` and `python -m tests.fuzz.run`.
+`--faults FILE` and `--fuzz FILE`, given together, write the table of reliability from the documents of
+`servoctl qualify soak`, `servoctl qualify faults` and `python -m tests.fuzz.run`.
 """
 
 from __future__ import annotations
