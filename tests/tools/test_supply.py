@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import itertools
 import json
 import re
 import subprocess
@@ -15,29 +16,41 @@ import pytest
 import source
 from packaging.requirements import Requirement
 
-LOCKS = ("deploy", "build")
+#: Each lock and the extras of pyproject.toml in it.
+EXTRAS = {"deploy": (), "lab": ("lab",), "dev": ("lab", "dev"), "fuzz": ("lab", "dev", "fuzz")}
+LOCKS = (*EXTRAS, "build")
+COMMANDS = ("demo", "test")
 
 
-def locked(name: str) -> dict[str, str]:
-    """Project and version of every entry of a lock."""
+def locked(name: str) -> list[Requirement]:
+    """Every entry of a lock: project, version and where it is installed."""
     text = (source.ROOT / f"requirements/{name}.txt").read_text()
-    return {m[1].lower(): m[2] for m in re.finditer(r"^([\w.-]+)==([^ ;\\]+)", text, re.MULTILINE)}
+    return [Requirement(entry) for entry in re.findall(r"^(\w[^\\\n]*)", text, re.MULTILINE)]
+
+
+def versions(name: str) -> dict[str, set[str]]:
+    """The versions of each project in a lock: one, or one for some Pythons and another for others."""
+    found: dict[str, set[str]] = {}
+    for entry in locked(name):
+        (pin,) = entry.specifier
+        found.setdefault(entry.name.lower(), set()).add(pin.version)
+    return found
 
 
 def wanted(name: str) -> list[Requirement]:
     if name == "build":
-        lines = (source.ROOT / "requirements/build.in").read_text().split()
-    else:
-        lines = tomllib.loads((source.ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+        return [Requirement(line) for line in (source.ROOT / "requirements/build.in").read_text().split()]
+    project = tomllib.loads((source.ROOT / "pyproject.toml").read_text())["project"]
+    lines = [*project["dependencies"], *(line for e in EXTRAS[name] for line in project["optional-dependencies"][e])]
     return [Requirement(line) for line in lines]
 
 
 @pytest.mark.parametrize("name", LOCKS)
 def test_every_dependency_is_locked_within_its_range(name: str) -> None:
     """`scripts/lock` writes them anew."""
-    versions = locked(name)
-    for requirement in wanted(name):
-        assert requirement.specifier.contains(versions[requirement.name.lower()]), requirement
+    found = versions(name)
+    outside = [r for r in wanted(name) if not list(r.specifier.filter(found.get(r.name.lower(), ())))]
+    assert outside == []
 
 
 @pytest.mark.parametrize("name", LOCKS)
@@ -46,6 +59,32 @@ def test_every_locked_file_has_its_hashes(name: str) -> None:
     entries = [entry for entry in entries if entry.strip()]
     assert len(entries) == len(locked(name)) >= len(wanted(name))
     assert [entry.split()[0] for entry in entries if "--hash=sha256:" not in entry] == []
+
+
+@pytest.mark.parametrize(("smaller", "larger"), [*itertools.pairwise(EXTRAS), ("build", "dev")])
+def test_what_two_locks_share_has_one_version(smaller: str, larger: str) -> None:
+    """One can be installed upon the other: ./demo, then ./test, then the fuzzing."""
+    lesser, greater = versions(smaller), versions(larger)
+    assert {p: v for p, v in lesser.items() if p in greater and greater[p] != v} == {}
+    assert smaller == "build" or lesser.keys() <= greater.keys()
+
+
+@pytest.mark.parametrize("name", ["deploy", "lab", "dev", "build"])
+def test_every_machine_gets_the_same_versions(name: str) -> None:
+    every = {str(entry).partition(";")[0] for entry in locked(name)}
+    for python, machine in itertools.product(("3.11", "3.12", "3.13", "3.14"), ("x86_64", "aarch64")):
+        here = {"python_version": python, "python_full_version": f"{python}.1", "platform_machine": machine}
+        here |= {"sys_platform": "linux", "platform_python_implementation": "CPython"}
+        got = {str(e).partition(";")[0] for e in locked(name) if e.marker is None or e.marker.evaluate(here)}
+        assert got == every, (python, machine)
+
+
+def test_the_two_commands_install_from_the_locks() -> None:
+    asked = {name: re.findall(r"^prepare (\w+)$", (source.ROOT / name).read_text(), re.MULTILINE) for name in COMMANDS}
+    assert asked == {"demo": ["lab"], "test": ["dev"]}
+    script = (source.ROOT / "scripts/prepare").read_text()
+    installs = [line for line in script.splitlines() if "install --no-user" in line]
+    assert len(installs) == 2 and all("--require-hashes" in line or "--no-deps" in line for line in installs)
 
 
 def test_build_backend_is_the_locked_one() -> None:
