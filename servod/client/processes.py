@@ -12,6 +12,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -27,6 +28,16 @@ from servod.formats.config import AxisConfig
 
 _PR_SET_PDEATHSIG, _PR_CAPBSET_DROP = 1, 24  # linux/prctl.h
 _STOP_S = 5.0
+#: A socket's path (sockaddr_un.sun_path, unix(7)), and what of it the letters of a temporary folder's name and the
+#: name of a socket in it take.
+_SOCKET_PATH_BYTES, _ENDING_BYTES = 107, len("/12345678/axis.socket")
+
+
+def socket_folder(prefix: str) -> tempfile.TemporaryDirectory[str]:
+    """A temporary folder for sockets: where TMPDIR is too long for a socket's path, it is in /tmp."""
+    usual = tempfile.gettempdir()
+    fits = len(os.fsencode(f"{usual}{prefix}")) + _ENDING_BYTES <= _SOCKET_PATH_BYTES
+    return tempfile.TemporaryDirectory(prefix=prefix, dir=usual if fits else "/tmp")  # noqa: S108 - made for its owner
 
 
 @contextlib.contextmanager
@@ -87,6 +98,7 @@ def sigterm_as_interrupt() -> Iterator[None]:
     """Let SIGTERM and SIGHUP end the block as Ctrl-C does, so that everything in it is cleaned up.
 
     Once: a terminal that closes sends SIGHUP twice, by the kernel and by the shell; cleaning up must not end half-way.
+    Under nohup(1), SIGHUP stays ignored.
     """
 
     def interrupt(number: int, _frame: object) -> None:
@@ -94,7 +106,8 @@ def sigterm_as_interrupt() -> Iterator[None]:
             signal.signal(other, signal.SIG_IGN)
         raise KeyboardInterrupt(signal.Signals(number).name)
 
-    before = {number: signal.getsignal(number) for number in END_SIGNALS}
+    handlers = {number: signal.getsignal(number) for number in END_SIGNALS}
+    before = {n: h for n, h in handlers.items() if not (n.name == "SIGHUP" and h == signal.SIG_IGN)}
     for number in before:
         signal.signal(number, interrupt)
     try:

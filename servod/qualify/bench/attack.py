@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import statistics
-import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from servod.client.control import ControlClient
-from servod.client.processes import RunningAxis, child, running_axis, sigterm_as_interrupt, wait_until
+from servod.client.processes import RunningAxis, child, running_axis, sigterm_as_interrupt, socket_folder, wait_until
 from servod.common.errors import AnswerIsNo
 from servod.drivers.virtual.drive_record import read_drive_record
 from servod.formats.recording.mcap_reader import read_recording
@@ -58,7 +57,7 @@ def measure(quiet_s: float, attack_s: float, stops: int, rounds: int) -> dict[st
     Raises AnswerIsNo when a kind of attack did not take place, or the axis did not get through; Unreachable when a
     process or the attack does not begin.
     """
-    with sigterm_as_interrupt(), tempfile.TemporaryDirectory(prefix="servod-attack-") as name:
+    with sigterm_as_interrupt(), socket_folder("servod-attack-") as name:
         folder = Path(name)
         config, record = demo_config(folder, folder / "recordings"), folder / "drive.bin"
         with running_axis(config, plant_file(None), folder, ["--record", str(record)]) as axis:

@@ -6,13 +6,12 @@ A client of the control socket, like the demo. The figures of the loop come from
 from __future__ import annotations
 
 import statistics
-import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
 from servod.client.control import ControlClient
-from servod.client.processes import running_axis, sigterm_as_interrupt
+from servod.client.processes import running_axis, sigterm_as_interrupt, socket_folder
 from servod.common.errors import AnswerIsNo
 from servod.formats.recording.mcap_reader import read_recording
 from servod.qualify.demo.axis import demo_config, gains_file, plant_file
@@ -28,7 +27,7 @@ _KIB_PER_MIB = 1024.0
 
 def measure(wall_clock_s: float, memory_s: float) -> tuple[dict[str, Any], dict[str, Any]]:
     """The figures of `wall_clock_s` and, after it, the growth of memory over `memory_s`, recording all the time."""
-    with sigterm_as_interrupt(), tempfile.TemporaryDirectory(prefix="servod-bench-") as name:
+    with sigterm_as_interrupt(), socket_folder("servod-bench-") as name:
         folder = Path(name)
         with running_axis(demo_config(folder, folder / "recordings"), plant_file(None), folder) as (client, daemon_pid):
             activate(client, gains_file("local"))

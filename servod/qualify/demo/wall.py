@@ -6,14 +6,13 @@ Beside the data path; a client like `servoctl`. The virtual axis is the only one
 from __future__ import annotations
 
 import math
-import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from servod.client.control import ControlClient
-from servod.client.processes import running_axis, sigterm_as_interrupt
+from servod.client.processes import running_axis, sigterm_as_interrupt, socket_folder
 from servod.common.errors import AnswerIsNo
 from servod.common.faults import FaultCode
 from servod.formats.recording.mcap_reader import read_recording
@@ -40,7 +39,7 @@ def run_wall(plant: Path, duration_s: float, rows: Sequence[Entry], recordings: 
 
     Raises AnswerIsNo when the axis does not get through, Unreachable when a process does not start.
     """
-    with sigterm_as_interrupt(), tempfile.TemporaryDirectory(prefix="servod-demo-") as name:
+    with sigterm_as_interrupt(), socket_folder("servod-demo-") as name:
         folder = Path(name)
         with running_axis(demo_config(folder, recordings), plant, folder) as (client, _):
             client.call("enable")

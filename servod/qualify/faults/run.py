@@ -5,12 +5,12 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import signal
-import tempfile
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
+from servod.client.processes import socket_folder
 from servod.common.errors import ServodError, Unreachable
 from servod.common.faults import FAULTS
 from servod.qualify.faults.actions import Action, action_of
@@ -88,7 +88,7 @@ def run_scenario(
 ) -> Outcome:
     """Start, inject, watch, judge, mend, recover. Raises ServodError when the axis does not get to the start."""
     with (
-        tempfile.TemporaryDirectory(prefix="servod-faults-") as folder,
+        socket_folder("servod-faults-") as folder,
         contextlib.closing(axis_for(scenario, Path(folder))) as axis,
     ):
         axis.start(scenario.start)

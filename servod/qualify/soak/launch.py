@@ -12,10 +12,9 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
-from servod.client.processes import sigterm_as_interrupt
+from servod.client.processes import sigterm_as_interrupt, socket_folder
 from servod.common.errors import ServodError, Unreachable
 from servod.common.files import reason, write_bytes
 from servod.qualify.soak.document import Course, added, document, write_page
@@ -162,7 +161,7 @@ def _wall(order: Order, limit_s: float, tell: Tell) -> dict[str, Any]:
     """Cycles take their time on the wall clock; sockets want a short path."""
     kinds = tuple(filter(of_the_wall, KINDS))
     limit_s = min(limit_s, order.cycles / _CYCLES_PER_S)
-    with TemporaryDirectory(prefix="servod-soak-") as folder, closing(WallSoak(order.seed, Path(folder))) as axis:
+    with socket_folder("servod-soak-") as folder, closing(WallSoak(order.seed, Path(folder))) as axis:
         return run(axis, schedule(order.seed, GAIN_SETS, kinds), sys.maxsize, limit_s, order.out, tell)
 
 

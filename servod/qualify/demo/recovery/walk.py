@@ -7,7 +7,6 @@ is the product's own.
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from servod.client.open import RecoveryAxis
+from servod.client.processes import socket_folder
 from servod.client.stepped import Rows
 from servod.common.errors import AnswerIsNo
 from servod.common.files import write_bytes
@@ -174,7 +174,7 @@ def recover(
     tell("design for what is believed", 0.02)
     write_bytes(out / "believed.yaml", axis_model_yaml(believed).encode())
     first = designed(believed, out / "believed.yaml", out / "gains_before.yaml", None, effort.plants)
-    with tempfile.TemporaryDirectory(prefix="servod-demo-") as folder:
+    with socket_folder("servod-demo-") as folder:
         tell("the axis as it is believed to be", 0.2)
         with open_axis(believed, first.gains, _folder(folder, "believed"), seed) as axis:
             before = axis.paper(effort.paper_s)
