@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import getpass
 import os
+import signal
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -10,6 +14,31 @@ from hypothesis import settings
 
 # As the commands do, and before numpy is imported: threads on small matrices cost a factor of ten on a shared machine.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# Tables and logs are compared as text: screen, colours and service manager of whoever runs the tests are no part of it.
+for name in ("COLUMNS", "LINES", "NO_COLOR", "FORCE_COLOR", "JOURNAL_STREAM", "NOTIFY_SOCKET", "WATCHDOG_USEC"):
+    os.environ.pop(name, None)
+
+#: The longest path of a socket, and what pytest, a test's name and the socket's own add to the temporary folder.
+SOCKET_PATH_BYTES = 107
+ADDED_BYTES = len("/pytest-of-/pytest-999/popen-gw99/and_the_first_thirty_letters_12/folder/axis.socket")
+
+
+def temporary_folder() -> str:
+    """The usual one, or /tmp where the paths of sockets would be too long in it."""
+    usual = tempfile.gettempdir()
+    return usual if len(os.fsencode(usual + user())) + ADDED_BYTES <= SOCKET_PATH_BYTES else "/tmp"
+
+
+def user() -> str:
+    """Who runs the tests, as pytest names its folder."""
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError):  # no name for this number
+        return "unknown"
+
+
+os.environ["TMPDIR"] = tempfile.tempdir = temporary_folder()
 
 ROOT = Path(__file__).resolve().parent
 
@@ -45,3 +74,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         relative = item.path.relative_to(ROOT) if item.path.is_relative_to(ROOT) else item.path
         if any(relative.is_relative_to(entry) for entry in SERIAL):
             item.add_marker(pytest.mark.serial)
+
+
+@pytest.fixture
+def hangup_ends() -> Iterator[None]:
+    """Children get SIGHUP as under a terminal: what is ignored, as by nohup(1), they would inherit; a handler not."""
+    before = signal.signal(signal.SIGHUP, lambda *_: None)
+    yield
+    signal.signal(signal.SIGHUP, before)

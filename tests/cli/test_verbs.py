@@ -102,6 +102,7 @@ def test_a_motion_from_a_spreadsheet_has_a_byte_order_mark(servoctl: Servoctl, t
     assert servoctl.json("status")["timing"]["period_us"] == 1000
 
 
+@pytest.mark.usefixtures("hangup_ends")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_whatever_ends_track_stops_the_axis(servoctl: Servoctl, number: signal.Signals) -> None:
     servoctl("enable")
