@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from tests.starved import Judge
+
 # As the commands do, and before numpy is imported: threads on small matrices cost a factor of ten on a shared machine.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -65,6 +67,11 @@ def pytest_report_header() -> str:
         f"{name} {'present' if folder.is_dir() else 'ABSENT, its tests do not run'}" for name, folder in SHARED.items()
     )
     return "shared data: " + "; ".join(there)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Let failures on the wall clock be held against the machine's load."""
+    config.pluginmanager.register(Judge(), "starved")
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -13,8 +13,15 @@ import source
 MOST_FILE_LINES = 500
 MOST_FUNCTION_LINES = 60
 UNFINISHED = re.compile(
-    r"\b(TO" r"DO|FIX" r"ME|X" r"XX)\b|raise NotImplemented" r"Error|pytest\.(skip|xfail)|mark\.(skip|xfail)"
+    r"\b(TO"
+    r"DO|FIX"
+    r"ME|X"
+    r"XX)\b|raise NotImplemented"
+    r"Error|pytest\.(skip|xfail)|mark\.(skip|xfail)"
+    r"|outcome\s*=\s*[\"']skipped"
 )
+#: The one place where a failure may become a skip, by evidence and never by opinion; test_starved.py holds it to that.
+JUDGE = "tests/starved.py"
 FOREIGN_PATH = re.compile(r"[\"'`\s(=](/wo" r"rk/|/ho" r"me/|/ro" r"ot/|/Us" r"ers/)")
 TEXT_SUFFIXES = {".py", ".md", ".yaml", ".toml", ".service", ".conf", ".link", ".network", ""}
 
@@ -91,7 +98,8 @@ def test_nothing_is_unfinished_or_skipped() -> None:
         for i, line in enumerate(f.read_text().splitlines(), 1)
         if UNFINISHED.search(line)
     ]
-    assert marks == []
+    assert [mark for mark in marks if not mark.startswith(f"{JUDGE}:")] == []
+    assert len(marks) == 1
 
 
 def shipped_texts() -> Iterator[Path]:

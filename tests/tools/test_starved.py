@@ -1,0 +1,158 @@
+"""The judge of tests that fail on a busy machine: what it excuses, and above all what it does not."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import source
+
+from servod.client.control import Refused
+from servod.common.errors import BadInput, Unreachable
+from tests.starved import Reading, Span, between, by_lateness, read
+
+TESTS = """
+import pytest
+from servod.common.errors import Unreachable
+
+pytestmark = pytest.mark.serial
+
+@pytest.fixture(scope="module")
+def measured():
+    return 7
+
+def test_torque_is_limited():
+    assert 1.3 <= 0.9
+
+def test_it_came_in_time():
+    raise TimeoutError("it did not come")
+
+@pytest.mark.wall_clock
+def test_it_was_fast(measured):
+    assert measured < 5
+
+def test_the_loop_had_its_turn():
+    raise Unreachable("the axis stopped: FEEDBACK_STALE: no feedback")
+
+def test_the_axis_did_not_run_away():
+    raise Unreachable("the axis stopped: SPEED_LIMIT: too fast; FEEDBACK_STALE: no feedback")
+
+def test_it_passes():
+    pass
+"""
+CONFTEST = """
+import itertools
+from tests import starved
+
+def pytest_configure(config):
+    count = itertools.count()
+    starved.read = lambda: starved.Reading(n := next(count), n * {busy}, 0.0, n * {waited})
+    config.pluginmanager.register(starved.Judge(), "starved")
+"""
+
+
+def outcomes(folder: Path, busy: float, waited: float, text: str = TESTS) -> tuple[dict[str, str], str]:
+    """Outcome of every test in a run of its own, on a machine with these counts in each second; and what was said."""
+    (folder / "test_axis.py").write_text(text)
+    (folder / "conftest.py").write_text(CONFTEST.format(busy=busy * (os.cpu_count() or 1), waited=waited))
+    (folder / "pytest.ini").write_text("[pytest]\nmarkers =\n  serial\n  wall_clock\n")
+    command = [sys.executable, "-m", "pytest", "-v", "-rs", "-p", "no:cacheprovider", "-p", "no:xdist", str(folder)]
+    environment = os.environ | {"PYTHONPATH": str(source.ROOT), "COLUMNS": "300"}
+    said = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=60).stdout
+    return dict(re.findall(r"::(test_\w+) (PASSED|FAILED|SKIPPED|ERROR)", said)), said
+
+
+FAILED_ALWAYS = {"test_torque_is_limited": "FAILED", "test_the_axis_did_not_run_away": "FAILED"}
+OF_TIME = ("test_it_came_in_time", "test_it_was_fast", "test_the_loop_had_its_turn")
+
+
+def test_on_a_starved_machine_lateness_is_told_and_all_else_fails(tmp_path: Path) -> None:
+    found, said = outcomes(tmp_path, busy=0.9, waited=0.8)
+    assert found == FAILED_ALWAYS | dict.fromkeys(OF_TIME, "SKIPPED") | {"test_it_passes": "PASSED"}, said
+    assert "the machine was starved: other programs had 90% of" in said
+
+
+@pytest.mark.parametrize(("busy", "waited"), [(0.0, 0.0), (0.2, 0.9), (0.9, 0.05)])
+def test_on_an_idle_machine_every_failure_stays_one(tmp_path: Path, busy: float, waited: float) -> None:
+    found, said = outcomes(tmp_path, busy, waited)
+    assert found == FAILED_ALWAYS | dict.fromkeys(OF_TIME, "FAILED") | {"test_it_passes": "PASSED"}, said
+
+
+def test_a_test_that_is_not_of_the_wall_clock_is_never_excused(tmp_path: Path) -> None:
+    plain = TESTS.replace("pytestmark = pytest.mark.serial", "").replace("@pytest.mark.wall_clock", "")
+    found, said = outcomes(tmp_path, 0.9, 0.8, plain)
+    assert found == FAILED_ALWAYS | dict.fromkeys(OF_TIME, "FAILED") | {"test_it_passes": "PASSED"}, said
+
+
+@pytest.mark.parametrize(
+    ("error", "excused"),
+    [
+        (TimeoutError("it did not come"), True),
+        (subprocess.TimeoutExpired("demo", 10.0), True),
+        (Unreachable("DEADLINE_BUDGET: late; SUPERVISOR_LOST: nobody feeds the loop"), True),
+        (Refused("not enabled: FEEDBACK_STALE: no feedback"), True),
+        (Unreachable("not enabled: TORQUE_CLIPPED"), False),
+        (Unreachable("FOLLOWING_ERROR: too far, FEEDBACK_STALE: no feedback"), False),
+        (Unreachable("no daemon answers"), False),
+        (BadInput("cycle", 1, "2"), False),
+        (AssertionError("FEEDBACK_STALE"), False),
+        (ValueError("FEEDBACK_STALE"), False),
+    ],
+)
+def test_only_time_is_excused(error: BaseException, excused: bool) -> None:
+    assert by_lateness(error, times_alone=False) == excused
+
+
+def test_comparisons_of_times_are_excused_where_the_test_says_that_it_makes_no_others() -> None:
+    assert by_lateness(AssertionError("12 ms < 10 ms"), times_alone=True)
+    assert not by_lateness(ZeroDivisionError(), times_alone=True)
+
+
+def test_what_the_tests_use_themselves_is_taken_off() -> None:
+    before = Reading(10.0, 100.0, 20.0, 5.0)
+    assert between(before, Reading(20.0, 118.0, 38.0, 14.0)).others_s == 0.0
+    assert between(before, Reading(20.0, 118.0, 21.0, 14.0)).others_s == pytest.approx(17.0)
+    assert between(before, Reading(20.0, 118.0, 20.0, None)).waited_s is None
+
+
+@pytest.mark.parametrize(
+    ("others_s", "waited_s", "starved"),
+    [
+        *((12.0, 5.0, True), (4.0, 5.0, False), (12.0, 0.5, False), (0.0, 10.0, False)),
+        *((12.0, None, True), (8.0, None, False)),
+    ],
+)
+def test_both_counts_are_wanted_and_more_of_one_where_there_is_one(
+    others_s: float, waited_s: float | None, starved: bool
+) -> None:
+    assert bool(Span(10.0, 2, others_s, waited_s).starved) == starved
+
+
+def test_a_span_of_no_time_is_no_evidence() -> None:
+    assert Span(0.0, 2, 0.0, 0.0).starved == "" and Span(0.0, 2, 0.0, None).starved == ""
+
+
+BURN = "import time\nwhile time.process_time() < 0.4: pass\n"
+
+
+@pytest.mark.parametrize("lives", [False, True])
+def test_processor_time_of_children_is_the_tests_own(lives: bool) -> None:
+    """Of those that have ended, and of those that live, in a session of their own and whoever is their parent."""
+    code = BURN + ("print(flush=True)\ntime.sleep(60)" if lives else "print(flush=True)")
+    shell = ["sh", "-c", f'"{sys.executable}" -c "$1" & wait', "sh", code]
+    first = read()
+    child = subprocess.Popen(shell, stdout=subprocess.PIPE, start_new_session=True)
+    assert child.stdout is not None and child.stdout.readline() == b"\n"
+    if not lives:
+        child.wait(30)
+    last = read()
+    if lives:
+        os.killpg(child.pid, 9)
+        child.wait(30)
+    assert last.own_s - first.own_s > 0.35
+    assert last.now_s >= first.now_s and time.monotonic() >= last.now_s
