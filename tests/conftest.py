@@ -50,6 +50,10 @@ SERIAL = (
     *("runtime/daemon/test_daemon.py", "drivers/virtual/test_process.py"),
 )
 
+#: More whose tests start real processes, beside others.
+PROCESSES = ("daemon", "cli", "identify/test_daemon_link.py", "deploy/test_on_daemon.py", "deploy/test_daemon_link.py")
+PROCESSES += ("commission/test_daemon_tracking.py", "campaign/test_processes.py", "soak/test_wall.py", "conformance")
+
 # A loaded machine is no finding; the examples are what counts.
 settings.register_profile("house", deadline=None)
 settings.load_profile("house")
@@ -76,11 +80,13 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests of SERIAL files, before the selection by marker."""
+    """Mark the tests of SERIAL and PROCESSES, before the selection by marker."""
     for item in items:
         relative = item.path.relative_to(ROOT) if item.path.is_relative_to(ROOT) else item.path
         if any(relative.is_relative_to(entry) for entry in SERIAL):
             item.add_marker(pytest.mark.serial)
+        if any(relative.is_relative_to(entry) for entry in PROCESSES):
+            item.add_marker(pytest.mark.processes)
 
 
 @pytest.fixture

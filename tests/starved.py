@@ -1,12 +1,13 @@
 """Tells a test that failed because other programs held the processors from one that failed.
 
-A failure of a test of real processes on the wall clock (mark `serial`) becomes a skip with figures when both hold:
+A failure of a test of real processes (mark `serial` or `processes`) becomes a skip with figures when both hold:
 
 - While it ran, or while a fixture of it was made, programs that the tests did not start took the processors, and the
   kernel counted that programs waited for them. What the tests and their children use themselves never counts, so code
   that burns time excuses nothing.
-- Time is what failed: a time-out, a fault of lateness and none beside it, or a comparison in a test that compares
-  times alone (mark `wall_clock`). What a drive did, a torque, a limit or a state fails on any machine.
+- Time is what failed: a time-out, a fault of lateness and none beside it in the message or in the daemon's log, or a
+  comparison in a test that compares times alone (mark `wall_clock`). What a drive did, a torque, a limit or another
+  fault fails on any machine.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import os
 import re
 import subprocess
 import time
-from collections.abc import Generator, Iterable
+from collections.abc import Collection, Generator, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,6 +34,9 @@ LATENESS = {
     *(FaultCode.DEADLINE_LATE, FaultCode.DEADLINE_BUDGET, FaultCode.FEEDBACK_STALE, FaultCode.SUPERVISOR_LOST),
     *(FaultCode.NODE_HEARTBEAT_LOST, FaultCode.COMMANDS_LOST, FaultCode.BUS_QUEUE_FULL),
 }
+#: Logs of the daemons that the tests of this file started.
+LOGS: list[Path] = []
+_LOGGED, _FOLLOWS = re.compile(r"fault (\w+) \("), re.compile(r"a fault is latched|'FAULT'")
 _OURS = "SERVOD_TEST_RUN"
 _TICKS = os.sysconf("SC_CLK_TCK")
 _WAITED = re.compile(r"some .*total=(\d+)")
@@ -103,8 +107,15 @@ def _waited_s() -> float | None:
     return int(found[1]) / 1e6 if found else None
 
 
-def by_lateness(error: BaseException, times_alone: bool) -> bool:
-    """Whether time is what failed; `times_alone`: the test compares nothing but times."""
+def logged(logs: Iterable[Path]) -> set[str]:
+    """The faults that daemons wrote down."""
+    return {name for log in logs if log.exists() for name in _LOGGED.findall(log.read_text(errors="replace"))}
+
+
+def by_lateness(error: BaseException, times_alone: bool, faults: Collection[str] = ()) -> bool:
+    """Whether time is what failed; `times_alone`: the test compares nothing but times, `faults`: those of its axis."""
+    if faults and {FaultCode[name] for name in faults} <= LATENESS and _FOLLOWS.search(str(error)):
+        return isinstance(error, ServodError | AssertionError)
     if isinstance(error, TimeoutError | subprocess.TimeoutExpired):
         return True
     if isinstance(error, AssertionError):
@@ -119,12 +130,15 @@ class Judge:
     def __init__(self) -> None:
         os.environ.setdefault(_OURS, str(os.getpid()))
         self._began: Reading | None = None
+        self._file: Path | None = None
         self._fixtures: dict[str, Span] = {}
 
     @pytest.hookimpl(wrapper=True, tryfirst=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Generator[None, Any, Any]:
         """Read before its fixtures are made."""
-        self._began = read() if _judged(item) else None
+        if item.path != self._file:
+            LOGS.clear()
+        self._file, self._began = item.path, read() if _judged(item) else None
         return (yield)
 
     @pytest.hookimpl(wrapper=True)
@@ -147,7 +161,8 @@ class Judge:
         if report.failed and call.excinfo is not None and self._began is not None:
             spans = [between(self._began, read()), *self._of_fixtures(item)]
             evidence = next((span.starved for span in spans if span.starved), "")
-            if evidence and by_lateness(call.excinfo.value, item.get_closest_marker("wall_clock") is not None):
+            times_alone = item.get_closest_marker("wall_clock") is not None
+            if evidence and by_lateness(call.excinfo.value, times_alone, logged(LOGS)):
                 report.outcome = "skipped"
                 said = f"Skipped: the machine was starved: {evidence} ({call.excinfo.exconly()[:200]})"
                 report.longrepr = (str(item.path), (item.location[1] or 0) + 1, said)
@@ -159,7 +174,7 @@ class Judge:
 
 
 def _judged(item: pytest.Item) -> bool:
-    return any(item.get_closest_marker(name) for name in ("serial", "wall_clock"))
+    return any(item.get_closest_marker(name) for name in ("serial", "processes", "wall_clock"))
 
 
 def _belongs(item: pytest.Item, key: str, name: str) -> bool:

@@ -14,7 +14,7 @@ import source
 
 from servod.client.control import Refused
 from servod.common.errors import BadInput, Unreachable
-from tests.starved import Reading, Span, between, by_lateness, read
+from tests.starved import Reading, Span, between, by_lateness, logged, read
 
 TESTS = """
 import pytest
@@ -106,6 +106,22 @@ def test_a_test_that_is_not_of_the_wall_clock_is_never_excused(tmp_path: Path) -
 )
 def test_only_time_is_excused(error: BaseException, excused: bool) -> None:
     assert by_lateness(error, times_alone=False) == excused
+
+
+@pytest.mark.parametrize(
+    ("faults", "excused"),
+    [(["DEADLINE_LATE", "DEADLINE_BUDGET"], True), (["DEADLINE_BUDGET", "SPEED_LIMIT"], False), ([], False)],
+)
+def test_what_follows_from_a_latched_fault_has_the_excuse_of_that_fault(
+    tmp_path: Path, faults: list[str], excused: bool
+) -> None:
+    (tmp_path / "log").write_text("".join(f"ERROR fault {name} (RAMP_DOWN): why | timing\n" for name in faults))
+    found = logged([tmp_path / "log", tmp_path / "none"])
+    assert found == set(faults)
+    for error in (Refused("refused: a fault is latched; see"), AssertionError("assert 'FAULT' == 'ENABLED'")):
+        assert by_lateness(error, times_alone=False, faults=found) == excused
+    assert not by_lateness(AssertionError("assert 1.2 <= 0.9"), times_alone=False, faults=found)
+    assert not by_lateness(KeyError("'FAULT'"), times_alone=False, faults=found)
 
 
 def test_comparisons_of_times_are_excused_where_the_test_says_that_it_makes_no_others() -> None:

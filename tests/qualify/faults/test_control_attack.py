@@ -32,6 +32,7 @@ def best(figures: dict[str, Any], key: str) -> float:
     return float(min(one[key] for one in figures["rounds"]))
 
 
+@pytest.mark.wall_clock
 def test_the_loop_wakes_up_as_before(figures: dict[str, Any]) -> None:
     """Median, tail, and cycles that were late by more than a period."""
     assert len(figures["rounds"]) == ROUNDS
@@ -40,6 +41,7 @@ def test_the_loop_wakes_up_as_before(figures: dict[str, Any]) -> None:
     assert best(figures, "more_late_share") < 0.01, text(figures)
 
 
+@pytest.mark.wall_clock
 def test_a_newcomer_stops_the_axis_whoever_commands_it(figures: dict[str, Any]) -> None:
     """The usual stop of all, and every stop of one round."""
     rounds = [one["stop_ms"] for one in figures["rounds"]]

@@ -16,6 +16,7 @@ from servod.client.control import ControlClient, Refused
 from servod.client.processes import child, wait_until
 from servod.common.errors import Unreachable
 from servod.common.shipped import shipped
+from tests.starved import LOGS
 
 CONFIG = """
 name: tried
@@ -77,6 +78,7 @@ def running(folder: Path, plant: Path | None = None, more: str = "", travel_rad:
     config.write_text(CONFIG.format(folder=folder, gains=initial, travel_rad=travel_rad) + more)
     joint = ["--plant", str(plant)] if plant else []
     log = folder / "daemon.log"
+    LOGS.append(log)
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as manager:
         manager.bind(str(folder / "notify"))
         with child(
@@ -120,5 +122,12 @@ def wait_for(reached: Callable[[], bool], timeout_s: float = 10.0) -> None:
 
 
 def at_rest(client: ControlClient) -> Callable[[], bool]:
-    """Whether no motion runs any more."""
-    return lambda: not client.call("status")["axis"]["motion_running"]
+    """Whether no motion runs any more; raises Unreachable with the faults when one of them ended it."""
+
+    def rests() -> bool:
+        status = client.call("status")
+        if status["axis"]["state"] == "FAULT":
+            raise Unreachable("the axis stopped: " + ", ".join(fault["code"] for fault in status["faults"]))
+        return not status["axis"]["motion_running"]
+
+    return rests

@@ -56,8 +56,10 @@ def test_a_motion_moves_the_axis_and_the_recording_shows_it(axis: Running, clien
     client.call("track", kind="csv", positions_rad=way)
     wait_for(at_rest(client))
     assert 0.005 < _position(client) - start_rad < 0.06  # the joint sticks, and PD leaves an error
-    assert client.call("record_stop")["records"] > 400
+    records = client.call("record_stop")["records"]
     recording = read_recording(path)
+    times_ns = recording.column("time_ns")
+    assert records == len(times_ns) and times_ns[-1] - times_ns[0] > 400_000_000  # a busy machine skips cycles
     assert set(recording.attachments) == {"config.yaml", "gains.yaml"}
     assert max(recording.column("reference_rad")) == pytest.approx(start_rad + 0.05, abs=1e-3)
     assert [e["text"] for e in recording.events if e["kind"] == "command"] == ["reference"]
