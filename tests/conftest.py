@@ -51,8 +51,11 @@ SERIAL = (
 )
 
 #: More whose tests start real processes, beside others.
-PROCESSES = ("daemon", "cli", "identify/test_daemon_link.py", "deploy/test_on_daemon.py", "deploy/test_daemon_link.py")
-PROCESSES += ("commission/test_daemon_tracking.py", "campaign/test_processes.py", "soak/test_wall.py", "conformance")
+PROCESSES = (
+    *("runtime/daemon", "cli", "conformance", "lab/commission/test_daemon_tracking.py"),
+    *("lab/identify/test_daemon_link.py", "lab/deploy/test_on_daemon.py", "lab/deploy/test_daemon_link.py"),
+    *("qualify/faults/test_processes.py", "qualify/soak/test_wall.py"),
+)
 
 # A loaded machine is no finding; the examples are what counts.
 settings.register_profile("house", deadline=None)
