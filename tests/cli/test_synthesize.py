@@ -117,7 +117,8 @@ def test_options_out_of_range_are_one_line(
 ) -> None:
     assert synthesize(tmp_path, *options)[0] == 2
     captured = capsys.readouterr()
-    assert named in captured.err and captured.err.count("\n") == 1 and captured.out == ""
+    assert named in captured.err and captured.err.count("\n") == 1
+    assert json.loads(captured.out)["error"]["exit_code"] == 2
 
 
 def test_the_papers_literal_output_is_an_option_of_the_reference_mode(tmp_path: Path) -> None:
