@@ -15,7 +15,7 @@ from servod.drivers.virtual.dictionary import Dictionary, Storage
 from servod.drivers.virtual.emergency import Emergency
 from servod.drivers.virtual.heartbeat import HeartbeatConsumer, HeartbeatProducer
 from servod.drivers.virtual.lss import LssSlave
-from servod.drivers.virtual.pdo_engine import PdoEngine
+from servod.drivers.virtual.pdo import PdoEngine
 from servod.drivers.virtual.port import ErrorState
 from servod.drivers.virtual.sdo_server import SdoServer
 from servod.drivers.virtual.timeline import Timeline

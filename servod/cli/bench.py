@@ -43,7 +43,7 @@ def bench(
     from rich.console import Console
 
     from servod.qualify.bench import QUICK, THOROUGH, measure
-    from servod.qualify.bench.table import print_table, write_json
+    from servod.qualify.bench.plan import print_table, write_json
 
     if out is not None:
         need_folder("--out", out.parent)  # said now, not after a quarter of an hour
@@ -63,7 +63,7 @@ def bench(
 
 def _attack(console: Console, out: Path | None, as_json: bool) -> None:
     from servod.qualify.bench import attack
-    from servod.qualify.bench.table import write_json
+    from servod.qualify.bench.plan import write_json
 
     with console.status("measuring: wake-up and stops, alone and under attack"):
         document = attack.measure(_QUIET_S, _ATTACK_S, _STOPS, _ROUNDS)

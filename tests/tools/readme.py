@@ -24,8 +24,8 @@ import reliability
 from servod.common.faults import FAULTS
 from servod.common.shipped import shipped
 from servod.drivers.quirks import QUIRKS
-from servod.qualify.bench.table import GOALS
-from servod.qualify.bench.table import shown as shown_figure
+from servod.qualify.bench.plan import GOALS
+from servod.qualify.bench.plan import shown as shown_figure
 from servod.qualify.demo.axis import CERTIFIED
 from servod.qualify.demo.entries import entries
 from servod.qualify.paper.table import quotation

@@ -1,8 +1,7 @@
 """What befell an axis: faults that belong together, in the order of their times, from a fault file or from the journal.
 
-Behind the recorder. The daemon keeps its own incidents in the same form (servod.runtime.daemon.fault_watch);
-`servoctl faults`
-prints them. All times are of the clock on the wall, in ns since 1970.
+Behind the recorder. The daemon keeps its own incidents in the same form (servod.runtime.daemon.fault_watch); `servoctl
+faults` prints them. All times are of the clock on the wall, in ns since 1970.
 """
 
 from __future__ import annotations

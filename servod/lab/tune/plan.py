@@ -64,7 +64,7 @@ class TunePlan:
 
 @dataclass(frozen=True, slots=True)
 class Tuned:
-    """A tuned gain set, not certified. `cost` is what the search made least, in mrad (servod.lab.tune.trial).
+    """A tuned gain set, not certified. `cost` is what the search made least, in mrad (servod.lab.tune.tuning).
 
     `simulations` is what its search spent; `roughness` a multiple of the paper's PD, beyond the plan's limit only where
     even the smoothest set of the law is. `values` are the numbers it was built from, by the names of

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import platform
 import subprocess
 import sys
@@ -11,8 +12,9 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+from servod.common.files import unwritable
 from servod.common.shipped import shipped
 from servod.qualify.bench import speed, tick, wakeup, wall
 
@@ -118,3 +120,111 @@ def machine() -> dict[str, Any]:
     model = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
     cores = sum(line.startswith("processor") for line in lines)
     return {"cpu": model, "cores": cores, "kernel": platform.release(), "python": sys.version.split()[0]}
+
+
+# The benchmark's figures as a table beside what they shall reach, and as a file.
+
+
+class Goal(NamedTuple):
+    """One row: where the figure stands in the document, how it is written, and what it shall be."""
+
+    label: str
+    keys: tuple[str, ...]
+    text: str
+    goal: str
+    met: Callable[[float], bool]
+    seconds: float = 0.0  # how long the goal wants to be watched; the document says how long it was
+    plants: int = 0  # how many plants the goal is for; the document says how many there were
+
+    def verdict(self, document: dict[str, Any]) -> str:
+        """Empty when the goal is met; else "missed", or why it could not be judged."""
+        value = figure(document, self)
+        if value is None:
+            return str(document["wakeup"].get("note", "not measured"))
+        if self.seconds:
+            measured_s = float(document[self.keys[0]]["seconds"])
+            if round(measured_s) < self.seconds:
+                return f"not judged (measured {measured_s:g} s)"
+        if self.plants and document[self.keys[0]]["plants"] < self.plants:
+            return f"not judged (measured with {document[self.keys[0]]['plants']} plants)"
+        return "" if self.met(value) else "missed"
+
+
+GOALS = (
+    Goal("wake-up, median against cyclictest", ("wakeup", "median_ratio"), "{:.2f}", "at most 1.3", lambda x: x <= 1.3),
+    Goal("wake-up, p99 against cyclictest", ("wakeup", "p99_ratio"), "{:.2f}", "at most 2", lambda x: x <= 2.0),
+    Goal("whole tick, median", ("tick_us", "median"), "{:.1f} µs", "at most 60 µs", lambda x: x <= 60.0),
+    Goal("whole tick, p99", ("tick_us", "p99"), "{:.1f} µs", "", lambda _: True),
+    Goal("controller alone, median", ("controller_us", "median"), "{:.1f} µs", "at most 10 µs", lambda x: x <= 10.0),
+    Goal("controller alone, p99", ("controller_us", "p99"), "{:.1f} µs", "", lambda _: True),
+    Goal(
+        "missed periods", ("wall_clock", "missed_share"), "{:.3%}", "at most 0.3 % in 60 s", lambda x: x <= 0.003, 60.0
+    ),
+    Goal(
+        "deadline to torque frame, median",
+        ("wall_clock", "deadline_to_torque_us"),
+        "{:.0f} µs",
+        "at most 250 µs",
+        lambda x: x <= 250.0,
+    ),
+    Goal("stepped, against real time", ("stepped_speed",), "{:.1f}×", "at least 5×", lambda x: x >= 5.0),
+    Goal("simulator, against real time", ("simulator_speed",), "{:.0f}×", "at least 500×", lambda x: x >= 500.0),
+    Goal("growth of memory", ("memory", "growth_mib"), "{:.2f} MiB", "below 1 MiB in 10 min", lambda x: x < 1.0, 600.0),
+    Goal("synthesis of both regions", ("synthesis", "seconds"), "{:.1f} s", "at most 2 s", lambda x: x <= 2.0),
+    Goal(
+        "verification with 1000 plants",
+        ("verification", "seconds"),
+        "{:.0f} s",
+        "at most 60 s",
+        lambda x: x <= 60.0,
+        plants=1000,
+    ),
+    Goal("commission", ("commission", "seconds"), "{:.0f} s", "at most 240 s", lambda x: x <= 240.0),
+)
+
+
+def figure(document: dict[str, Any], goal: Goal) -> float | None:
+    """The figure of one row; None when it could not be measured."""
+    value: Any = document
+    for key in goal.keys:
+        value = None if value is None else value.get(key)
+    return None if value is None else float(value)
+
+
+def shown(document: dict[str, Any], goal: Goal) -> str:
+    """The figure of one row as people read it."""
+    value = figure(document, goal)
+    return "not measured" if value is None else goal.text.format(value)
+
+
+def print_table(document: dict[str, Any]) -> None:
+    """Print every figure beside its goal, and what it was measured on."""
+    from rich.console import Console
+    from rich.table import Table
+
+    machine = document["machine"]
+    title = f"{machine['cpu']}, {machine['cores']} cores, Linux {machine['kernel']}, Python {machine['python']}"
+    table = Table("Figure", "Measured", "Goal", "", title=title, title_justify="left")
+    for goal in GOALS:
+        table.add_row(goal.label, shown(document, goal), goal.goal, goal.verdict(document))
+    console = Console()
+    console.print(table)
+    wall, memory = document["wall_clock"], document["memory"]
+    console.print(
+        f"Wall clock over {wall['seconds']:.0f} s, memory over {memory['seconds']:.0f} s, wake-up best of "
+        f"{len(document['wakeup']['rounds'])} rounds of {document['wakeup']['seconds']:.0f} s.",
+        highlight=False,
+    )
+
+
+def write_json(document: dict[str, Any], path: Path) -> None:
+    """Write the document aside and rename it to `path`. Raises BadInput when that is not possible."""
+    aside = path.with_name(path.name + ".part")
+    try:
+        with aside.open("w", encoding="utf-8") as stream:
+            json.dump(document, stream, indent=2)
+            stream.flush()
+            os.fsync(stream.fileno())
+        aside.replace(path)
+    except OSError as error:
+        raise unwritable(path, error) from None

@@ -6,14 +6,247 @@ Stands on axes and physics. `HIDE` maps a name to the function that draws it; th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 
-from servod.qualify.blind import hidden_drive, hidden_place
-from servod.qualify.blind.concealed import NO_THERMOMETER, Concealed, Draw
+from servod.qualify.blind.concealed import NO_THERMOMETER, Concealed, Document, Draw
+
+# Draws what is concealed between command and load: the drive's faults, elasticity, inertia, and torques from outside.
+#
+
+
+def backlash(draw: Draw) -> Concealed:
+    """A gap before a stiff contact; otherwise a contact that stiffens and hardly damps."""
+    p = draw.physics
+    load = draw.between(0.45, 0.7) * p.inertia
+    motor = p.inertia - load
+    gap = draw.size(0.003, 0.008) * draw.axis.motions.travel
+    stiffness = (2.0 * math.pi * draw.between(60.0, 110.0)) ** 2 * load * motor / p.inertia
+    damping = (0.15 if draw.other else 0.5) * 2.0 * math.sqrt(stiffness * load * motor / p.inertia)
+    changes = _split(draw, load) | {"joint_gap": gap, "joint_stiffness": stiffness, "joint_damping": damping}
+    if draw.other:
+        changes["joint_cubic"] = 2.0 * stiffness / gap**2
+    group = {"gap": gap, "load_inertia": load, "stiffness": stiffness, "damping": damping}
+    told = {"gap": gap, "load_inertia": load}
+    believed = {"inertia": p.inertia, "viscous": p.viscous}
+    model = None if draw.other else {"backlash": group | {"load_viscous": changes["load_viscous"]}}
+    return Concealed(changes, told, model, believed)
+
+
+def joint_elasticity(draw: Draw) -> Concealed:
+    """A soft joint; otherwise one that stiffens with its stretch."""
+    p = draw.physics
+    load = draw.between(0.4, 0.7) * p.inertia
+    motor = p.inertia - load
+    weak = 2.0 * math.pi * max(14.0 / math.sqrt(draw.strength), 5.0) * draw.between(0.8, 1.5)
+    stiffness = weak**2 * load
+    damping = draw.between(0.02, 0.06) * 2.0 * math.sqrt(stiffness * load * motor / p.inertia)
+    bend = 0.2 * draw.axis.effort / stiffness
+    cubic = 0.5 * stiffness / bend**2 if draw.other else 0.0
+    changes = _split(draw, load) | {"joint_stiffness": stiffness, "joint_damping": damping, "joint_cubic": cubic}
+    group = {"load_inertia": load, "stiffness": stiffness, "damping": damping, "cubic": cubic}
+    told = {"load_inertia": load, "stiffness": stiffness}
+    believed = {"inertia": p.inertia, "viscous": p.viscous}
+    model = {"joint_elasticity": group | {"load_viscous": changes["load_viscous"]}}
+    return Concealed(changes, told, model, believed)
+
+
+def _split(draw: Draw, load: float) -> dict[str, float]:
+    """One mass made two: `load` of the inertia and a tenth to a fifth of the viscous friction behind the joint."""
+    p, share = draw.physics, draw.between(0.1, 0.2)
+    return {
+        "inertia": p.inertia - load,
+        "load_inertia": load,
+        "viscous": (1.0 - share) * p.viscous,
+        "load_viscous": share * p.viscous,
+    }
+
+
+def torque_gain(draw: Draw) -> Concealed:
+    """More or less torque than the command says; otherwise by the command's sign."""
+    off = 0.12 + min(draw.size(0.03, 0.15), 0.4)
+    factor = 1.0 + off if draw.flip() else 1.0 / (1.0 + off)
+    back = factor * draw.one_of(0.94, 1.06) if draw.other else factor
+    group = {"factor": factor} | ({"negative_factor": back} if draw.other else {})
+    return Concealed({"gain_front": factor, "gain_back": back}, group, {"torque_gain": group})
+
+
+def torque_saturation(draw: Draw) -> Concealed:
+    """A hard limit that the faster motions meet; otherwise iron that saturates."""
+    share = max(0.62 / draw.strength**0.5, 0.25) * draw.between(0.85, 1.15)
+    limit = share * draw.axis.effort * (1.25 if draw.other else 1.0)
+    group = {"limit": limit}
+    model = {"torque_saturation": {"limit": limit, "shape": "tanh" if draw.other else "hard"}}
+    return Concealed({"limit": limit, "limit_shape": float(draw.other)}, group, model)
+
+
+def delay(draw: Draw) -> Concealed:
+    """A longer dead time; otherwise with a little lag as well."""
+    more = round(1e3 * (0.0025 + min(draw.size(0.001, 0.004), 0.009)), 1) * 1e-3
+    lag = 0.1 * more if draw.other else 0.0
+    changes = {"delay_s": draw.physics.delay_s + more, "lag_s": lag}
+    model = {"delay": {"additional_s": more}} | ({"actuator_lag": {"time_constant_s": lag}} if draw.other else {})
+    return Concealed(changes, {"additional_s": more + lag}, model)
+
+
+def actuator_lag(draw: Draw) -> Concealed:
+    """A lag of first order; otherwise of second order or a limited rate."""
+    lag = min(draw.size(0.003, 0.008), 0.02)
+    if draw.other and draw.flip():
+        slew = draw.axis.effort * 2.0 * math.pi * 2.0 * draw.axis.motions.tempo / max(draw.strength, 1.0)
+        return Concealed({"slew": slew}, {"slew_per_s": slew}, {"actuator_lag": {"slew_per_s": slew}})
+    found = {"time_constant_s": lag}
+    order = 2.0 if draw.other else 1.0
+    return Concealed({"lag_s": lag, "lag_order": order}, found, None if draw.other else {"actuator_lag": found})
+
+
+def inertia(draw: Draw) -> Concealed:
+    """Another mass than believed, by more than a tenth."""
+    off = 0.15 + min(draw.size(0.05, 0.3), 0.8)
+    own = draw.physics.inertia
+    there = own * (1.0 + off) if draw.flip() else own / (1.0 + off)
+    return Concealed({"inertia": there}, {"inertia": there}, {}, {"inertia": own})
+
+
+def torque_offset(draw: Draw) -> Concealed:
+    """A constant torque beside the command."""
+    torque = draw.size(0.08, 0.35) * draw.physics.coulomb * draw.sign()
+    return Concealed({"offset": torque}, {"torque_offset": torque}, {"torque_offset": torque})
+
+
+def disturbance(draw: Draw) -> Concealed:
+    """A push for a second or two in one recording; otherwise one that swells."""
+    torque, start = draw.size(0.3, 1.0) * draw.physics.coulomb * draw.sign(), draw.between(2.0, 9.0)
+    lasts, shape = draw.between(0.8, 3.0), draw.one_of(1.0, 2.0) if draw.other else 0.0
+    changes = {"push": torque, "push_start_s": start, "push_end_s": start + lasts, "push_shape": shape}
+    told = {} if draw.other else {"start_s": start, "end_s": start + lasts, "torque": torque}
+    return Concealed(changes, told, None if draw.other else {}, only=int(draw.one_of(0.0, 1.0, 2.0)))
+
+
+# Draws what is concealed over position: periodic torques, weights, springs, inertia, and an encoder off its axis.
+#
+# What repeats along the way repeats at least PERIODS times in the range.
+
+
+#: Least periods in the range of whatever is periodic in position.
+PERIODS = 1.6
+
+
+def position_dependent_friction(draw: Draw) -> Concealed:
+    """A sine over position; otherwise a tight spot or a triangle."""
+    share = min(draw.size(0.12, 0.35), 0.8)
+    if draw.other and draw.flip():
+        travel = draw.axis.motions.travel
+        spot = {"factor": min(2.0 * share, 2.0), "position": draw.between(-0.4, 0.4) * travel, "width": 0.13 * travel}
+        changes = {"spot_share": spot["factor"], "spot_place": spot["position"], "spot_width": spot["width"]}
+        return Concealed(changes, spot, {"position_dependent_friction": {"bumps": [spot]}})
+    order, phase = _order(draw, 2.0, 6.0), draw.between(0.0, 6.28)
+    changes = {"grip_share": share, "grip_order": order, "grip_phase": phase, "grip_shape": _shape(draw)}
+    return _periodic(draw, "position_dependent_friction", changes, order, share, phase)
+
+
+def cogging(draw: Draw) -> Concealed:
+    """A sine of some order with a weak second; otherwise a triangle or a leaning wave."""
+    torque = draw.size(0.1, 0.5) * draw.physics.coulomb
+    order, phase = _order(draw, 3.0, 9.0), draw.between(0.0, 6.28)
+    second = torque * draw.between(0.0, 0.15)
+    changes = {"cogging": torque, "cogging_order": order, "cogging_phase": phase}
+    changes |= {"cogging_second": second, "cogging_shape": _shape(draw)}
+    return _periodic(draw, "cogging", changes, order, torque, phase, second)
+
+
+def torque_ripple(draw: Draw) -> Concealed:
+    """A share of the torque that goes with a sine of position; otherwise with another wave."""
+    share = min(draw.size(0.06, 0.2), 0.45)
+    order, phase = _order(draw, 2.5, 8.0), draw.between(0.0, 6.28)
+    changes = {"ripple_share": share, "ripple_order": order, "ripple_phase": phase, "ripple_shape": _shape(draw)}
+    return _periodic(draw, "torque_ripple", changes, order, share, phase)
+
+
+def gravity(draw: Draw) -> Concealed:
+    """A weight that nobody told of; otherwise on a linkage. Beside a known weight, the sum of both is to be found."""
+    p = draw.physics
+    torque, phase = draw.size(0.3, 1.5) * p.coulomb, draw.between(0.0, 6.28)
+    sine = p.gravity * math.cos(p.gravity_phase) + torque * math.cos(phase)
+    cosine = p.gravity * math.sin(p.gravity_phase) + torque * math.sin(phase)
+    amplitude, turned = math.hypot(sine, cosine), math.atan2(cosine, sine)
+    second = 0.12 * torque if draw.other else 0.0
+    changes = {"gravity": amplitude, "gravity_phase": turned, "gravity_second": second}
+    found = {"amplitude": amplitude, "phase": turned}
+    believed = {"gravity": p.gravity, "gravity_phase": p.gravity_phase}
+    return Concealed(changes, found, None if draw.other else {"gravity": found}, believed, travel=0.9)
+
+
+def spring(draw: Draw) -> Concealed:
+    """A straight spring; otherwise one that stiffens or has some slack in the middle."""
+    travel = draw.axis.motions.travel
+    torque, rest = draw.size(0.4, 1.8) * draw.physics.coulomb, draw.between(-0.4, 0.4) * travel
+    stiffness = torque / travel
+    if draw.other and draw.flip():
+        return Concealed({"spring": stiffness, "spring_rest": rest, "spring_slack": 0.1 * travel}, travel=1.2)
+    cubic = 0.8 * stiffness / travel**2 if draw.other else 0.0
+    found = {"stiffness": stiffness, "rest": rest, "cubic": cubic}
+    changes = {"spring": stiffness, "spring_rest": rest, "spring_cubic": cubic}
+    told = found if draw.other else {key: found[key] for key in ("stiffness", "rest")}
+    return Concealed(changes, told, {"spring": found}, travel=0.9 if draw.other else 1.2)
+
+
+def position_dependent_inertia(draw: Draw) -> Concealed:
+    """Inertia with a sine of some periods a turn; otherwise a crank's, with a second harmonic."""
+    share, order = min(draw.size(0.15, 0.35), 0.6), draw.one_of(2.0, 3.0)
+    phase, second = draw.between(0.0, 6.28), 0.2 * share if draw.other else 0.0
+    changes = {"swing_share": share, "swing_order": order, "swing_phase": phase, "swing_second": second}
+    rows = _rows(order, share, phase, second)
+    travel = PERIODS * math.pi / order
+    return Concealed(changes, _first(rows), {"position_dependent_inertia": {"harmonics": rows}}, travel=travel)
+
+
+def encoder_eccentricity(draw: Draw) -> Concealed:
+    """A disc off its axis or oval; otherwise both."""
+    order, phase = draw.one_of(1.0, 2.0), draw.between(0.0, 6.28)
+    amplitude = min(draw.size(0.01, 0.03), 0.12) / order
+    second = 0.15 * amplitude if draw.other else 0.0
+    changes = {"eccentricity": amplitude, "eccentricity_order": order, "eccentricity_phase": phase}
+    changes["eccentricity_second"] = second
+    rows = _rows(order, amplitude, phase, second)
+    travel = PERIODS * math.pi / order
+    return Concealed(changes, _first(rows), {"encoder_eccentricity": {"harmonics": rows}}, travel=travel)
+
+
+def _order(draw: Draw, least: float, most: float) -> float:
+    """Whole periods in a turn, of which between `least` and `most` are in the range."""
+    turns = 2.0 * draw.axis.motions.travel / (2.0 * math.pi)
+    return max(float(round(draw.between(least, most) / turns)), math.ceil(PERIODS / turns))
+
+
+def _shape(draw: Draw) -> float:
+    return draw.one_of(1.0, 2.0) if draw.other else 0.0
+
+
+def _periodic(
+    draw: Draw, group: str, changes: dict[str, float], order: float, amplitude: float, phase: float, second: float = 0.0
+) -> Concealed:
+    """A wave over position; the first harmonic of another wave than a sine is all that a model could say of it."""
+    first = amplitude * (8.0 / math.pi**2 if changes[_SHAPES[group]] == 1.0 else 1.0)
+    rows = _rows(order, first, phase, second)
+    return Concealed(changes, _first(rows), None if draw.other else {group: {"harmonics": rows}})
+
+
+_SHAPES = {"position_dependent_friction": "grip_shape", "cogging": "cogging_shape", "torque_ripple": "ripple_shape"}
+
+
+def _rows(order: float, amplitude: float, phase: float, second: float) -> list[Document]:
+    rows = [{"amplitude": amplitude, "periods_per_turn": order, "phase": phase}]
+    return rows + ([{"amplitude": second, "periods_per_turn": 2.0 * order, "phase": 2.0 * phase}] if second else [])
+
+
+def _first(rows: list[Document]) -> dict[str, float]:
+    return dict(rows[0])
+
 
 # Draws concealed friction: by direction, near rest, over speed, load and temperature.
 #
-# Beside `hidden_place` and `hidden_drive`; sizes are shares of Coulomb friction.
+# Sizes are shares of Coulomb friction.
 
 
 def asymmetry(draw: Draw) -> Concealed:
@@ -90,7 +323,6 @@ def thermal(draw: Draw) -> Concealed:
 
 # Draws physics that is on nobody's list: the right answer is that something unexplained is there, and where.
 #
-# Beside the drawings of `hidden_friction`, `hidden_place` and `hidden_drive`.
 
 
 def cage_resonance(draw: Draw) -> Concealed:
@@ -135,23 +367,23 @@ HIDE: Mapping[str, Hide] = {
     "presliding": presliding,
     "viscous_nonlinear": viscous_nonlinear,
     "load_dependent_friction": load_dependent_friction,
-    "position_dependent_friction": hidden_place.position_dependent_friction,
-    "cogging": hidden_place.cogging,
-    "torque_ripple": hidden_place.torque_ripple,
-    "gravity": hidden_place.gravity,
-    "spring": hidden_place.spring,
-    "backlash": hidden_drive.backlash,
-    "joint_elasticity": hidden_drive.joint_elasticity,
-    "torque_gain": hidden_drive.torque_gain,
-    "torque_saturation": hidden_drive.torque_saturation,
-    "delay": hidden_drive.delay,
-    "actuator_lag": hidden_drive.actuator_lag,
+    "position_dependent_friction": position_dependent_friction,
+    "cogging": cogging,
+    "torque_ripple": torque_ripple,
+    "gravity": gravity,
+    "spring": spring,
+    "backlash": backlash,
+    "joint_elasticity": joint_elasticity,
+    "torque_gain": torque_gain,
+    "torque_saturation": torque_saturation,
+    "delay": delay,
+    "actuator_lag": actuator_lag,
     "thermal": thermal,
-    "inertia": hidden_drive.inertia,
-    "position_dependent_inertia": hidden_place.position_dependent_inertia,
-    "encoder_eccentricity": hidden_place.encoder_eccentricity,
-    "torque_offset": hidden_drive.torque_offset,
-    "disturbance": hidden_drive.disturbance,
+    "inertia": inertia,
+    "position_dependent_inertia": position_dependent_inertia,
+    "encoder_eccentricity": encoder_eccentricity,
+    "torque_offset": torque_offset,
+    "disturbance": disturbance,
 }
 
 UNLISTED: Mapping[str, Hide] = {

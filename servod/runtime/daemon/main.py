@@ -6,14 +6,149 @@ import argparse
 import logging
 import os
 import sys
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import NoReturn
 
 from servod import __version__
+from servod.common.clock import WallClock
 from servod.common.errors import BadInput, ServodError
+from servod.common.faults import FaultCode
 from servod.common.workers import on_end_signals
-from servod.runtime.daemon.startup import check, run
+from servod.common.yaml import read_text
+from servod.formats.config import AxisConfig, load_config
+from servod.formats.gains.gain_set import load_gains, require_fit
+from servod.formats.model.axis_model import load_axis_model
+from servod.formats.wiring import warnings, with_expected
+from servod.runtime.daemon.gain_bank import GainBank
+from servod.runtime.daemon.lock import InstanceLock
+from servod.runtime.daemon.nodes import Nodes
+from servod.runtime.daemon.notify import Notifier
+from servod.runtime.daemon.recorder import Recorder
 from servod.runtime.daemon.supervisor import Supervisor
+from servod.runtime.fieldbus.bus.open import open_bus
+from servod.runtime.fieldbus.cia import EMCY_BASE, HEARTBEAT_BASE, SDO_ANSWER_BASE
+from servod.runtime.fieldbus.master import Master
+from servod.runtime.fieldbus.master.planned import check_names, planned_bus_load
+from servod.runtime.loop.handle import LoopHandle
+from servod.runtime.loop.plan import LoopPlan
+
+# From a configuration file to a supervised axis, step by step, and back again in reverse whatever happens.
+#
+# Around the loop; runs once. The order is: read and check every file, take the locks, reach the bus, bring the nodes
+# up, start the loop, open the sockets. What fails says so in one line, and nothing that was begun is left behind.
+
+
+log = logging.getLogger("servod")
+
+_RECORDER_START_S = 5.0
+#: How long a thread that works on files may hold the interpreter while the supervisor wants it (Python's own: 5 ms, and
+#: that for each system call of the supervisor).
+_SWITCH_S = 2e-4
+
+
+def check(path: Path) -> AxisConfig:
+    """Read and check the configuration and every file that it names. Raises BadInput."""
+    config = load_config(path)
+    for note in check_names(config, str(path)):
+        log.warning("%s", note)
+    require_fit(load_gains(config.gains.initial), config, str(config.gains.initial))
+    if config.model is not None:
+        load_axis_model(config.model)
+    planned_bus_load(config, str(path))
+    return config
+
+
+def run(path: Path, on_ready: Callable[[Supervisor], None]) -> int:
+    """Run the axis that `path` configures until it ends; returns the exit code.
+
+    Raises ServodError when it cannot begin. `on_ready` is told the supervisor before it begins, for signals.
+    """
+    config = check(path)
+    with ExitStack() as stack:
+        stack.callback(InstanceLock(config).release)
+        _leave_core_to_loop(config.cycle.cpu)
+        sys.setswitchinterval(_SWITCH_S)
+        bank = GainBank(config)
+        recorder = _recorder(config, path, bank)
+        stack.callback(recorder.close)
+        master = Master(config, open_bus(config.bus, _master_ids(config)), WallClock(), threaded=False)
+        stack.callback(master.close)
+        plans = master.bring_up()
+        for line in plans.report:
+            log.info("%s", line)
+        with ExitStack() as undo:
+            supervisor = _supervise(config, Nodes(master, plans), bank, recorder, undo)
+            on_ready(supervisor)
+            undo.pop_all()
+        return supervisor.run()
+
+
+def _supervise(config: AxisConfig, nodes: Nodes, bank: GainBank, recorder: Recorder, undo: ExitStack) -> Supervisor:
+    """Loop and supervisor on nodes that are operational; `undo` is what to do when that fails half-way."""
+    gains = bank.newest.gains
+    plans = nodes.plans
+    expected = with_expected(config)
+    for line in warnings(expected):
+        log.warning("%s", line)
+    loop = LoopHandle(LoopPlan(expected, plans.amplifier, plans.encoder, int(gains.law.number), gains.pack()))
+    undo.callback(_give_back, nodes, loop)
+    _start_loop(loop)
+    return Supervisor(config, nodes, loop, bank, recorder, Notifier())
+
+
+def _give_back(nodes: Nodes, loop: LoopHandle) -> None:
+    """The axis was never enabled; still only a drive that the loop saw off may forget the master's heartbeat."""
+    if loop.alive() and loop.stop() != 0:
+        nodes.switch_off()
+    else:
+        nodes.stand_down()
+
+
+def _leave_core_to_loop(cpu: int | None) -> None:
+    """Keep the supervisor off the core that the loop pins itself to, where there is another one."""
+    others = os.sched_getaffinity(0) - {cpu}
+    if others:
+        os.sched_setaffinity(0, others)
+
+
+def _recorder(config: AxisConfig, path: Path, bank: GainBank) -> Recorder:
+    recorder = Recorder(config.recorder, config.name, config.cycle.period_us)
+    recorder.set_attachment("config.yaml", read_text(path).encode())
+    recorder.set_attachment("gains.yaml", bank.newest.path.read_bytes())
+    if config.model is not None:
+        recorder.set_attachment("model.yaml", read_text(config.model).encode())
+    if config.recorder.always:
+        _record_from_the_start(recorder)
+    return recorder
+
+
+def _record_from_the_start(recorder: Recorder) -> None:
+    """A recording that cannot begin is told, and no reason for the axis not to run."""
+    try:
+        log.info("recording to %s", recorder.start().result(_RECORDER_START_S))
+    except (ServodError, TimeoutError) as error:
+        log.error("fault %s: %s", FaultCode.RECORDER_FAILED.name, error or "the disk does not answer")
+
+
+def _start_loop(loop: LoopHandle) -> None:
+    loop.start()
+    for grant in loop.grants:
+        log.log(
+            logging.INFO if grant.granted else logging.WARNING,
+            "real time: %s %s: %s",
+            grant.name,
+            "granted" if grant.granted else "refused",
+            grant.reason,
+        )
+
+
+def _master_ids(config: AxisConfig) -> tuple[int, ...]:
+    """What the master listens to; the cyclic frames are the loop's, and the kernel keeps them away where it can."""
+    bases = (EMCY_BASE, SDO_ANSWER_BASE, HEARTBEAT_BASE)
+    return tuple(base + node.node_id for node in (config.amplifier, config.encoder) for base in bases)
+
 
 # Log lines for the journal: to standard error, with systemd's level prefix where the journal reads it.
 

@@ -11,7 +11,7 @@ from servod.lab.commission.state import read_walk_json as read_json
 from servod.lab.commission.state import write_json, write_text
 from servod.lab.commission.walk import Options
 from servod.lab.tune.plan import TunePlan
-from servod.lab.tune.trial import noise_seeds
+from servod.lab.tune.tuning import noise_seeds
 from servod.qualify.paper.experiments import SCORING_SEED_OFFSET
 from tests.lab.commission.test_state import walk
 from tests.lab.synthesize.designs import table1

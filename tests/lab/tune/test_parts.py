@@ -9,8 +9,7 @@ import pytest
 
 from servod.lab.tune.laws import RIVALS, Axis, Range, symmetric
 from servod.lab.tune.plan import Feedback
-from servod.lab.tune.trial import Trial, with_noise
-from servod.lab.tune.tuning import least
+from servod.lab.tune.tuning import Trial, least, with_noise
 from servod.lab.verify.steady_friction import steady_friction
 from tests.lab.tune.axis import joint, small
 

@@ -15,8 +15,7 @@ from servod.kernels.physics import layout as lay
 from servod.kernels.physics.effects import dry_factor, ripple, thermal_factors
 from servod.lab.verify.checks import Subject
 from servod.lab.verify.closed_loop import Behind, Bristle, Deviation, Reach, corners, joint_point
-from servod.lab.verify.effect_checks import check_effects, covered
-from servod.lab.verify.effect_reach import effects_of, level_of
+from servod.lab.verify.effect_checks import check_effects, covered, effects_of, level_of
 from servod.lab.verify.margins import Sweep, by_delay
 from servod.lab.verify.steady_friction import steady_friction
 from tests.lab.synthesize.designs import table1, table1_set

@@ -8,7 +8,7 @@ import math
 import pytest
 
 from servod.qualify.bench import QUICK, THOROUGH, Plan, measure
-from servod.qualify.bench.table import GOALS, figure, print_table
+from servod.qualify.bench.plan import GOALS, figure, print_table
 
 pytestmark = pytest.mark.serial
 

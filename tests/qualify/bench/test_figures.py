@@ -12,7 +12,7 @@ import pytest
 
 from servod.common.errors import BadInput
 from servod.qualify.bench import tick, wakeup, wall
-from servod.qualify.bench.table import GOALS, figure, print_table, write_json
+from servod.qualify.bench.plan import GOALS, figure, print_table, write_json
 
 
 def document(**changes: Any) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from servod.qualify.paper.crew import Crew
+from servod.qualify.paper.walk import Crew
 
 
 def test_results_come_and_progress_is_what_is_done() -> None:

@@ -21,7 +21,7 @@ from servod.client.control import ControlClient, Refused
 from servod.common.errors import Unreachable
 from servod.formats.protocol import Verb
 from servod.runtime.daemon.connection import Connection
-from servod.runtime.daemon.lease import MAX_CLIENTS, MAX_CLIENTS_OF_A_PROCESS, Places
+from servod.runtime.daemon.control_server import MAX_CLIENTS, MAX_CLIENTS_OF_A_PROCESS, Places
 from servod.runtime.daemon.peer import Peer
 
 

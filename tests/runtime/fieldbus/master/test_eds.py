@@ -10,7 +10,7 @@ from witness import EDS
 from servod.common.errors import BadInput
 from servod.runtime.fieldbus.devices import NodePlan, PdoEntry, PdoMap
 from servod.runtime.fieldbus.master.eds import dictionary_for, load_dictionary
-from servod.runtime.fieldbus.master.pdo import check_lengths
+from servod.runtime.fieldbus.master.node import check_lengths
 
 HEAD = "[FileInfo]\nFileName=x.eds\n[DeviceInfo]\nVendorName=Acme\n"
 

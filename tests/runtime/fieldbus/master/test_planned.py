@@ -14,7 +14,7 @@ from servod.cli.app import run
 from servod.common.errors import BadInput
 from servod.common.shipped import shipped
 from servod.formats.config import load_config
-from servod.runtime.daemon.startup import check
+from servod.runtime.daemon.main import check
 from servod.runtime.fieldbus.master.planned import planned_bus_load
 
 CONFIG = shipped("gains") / "config" / "virtual.yaml"

@@ -9,9 +9,8 @@ from rig import stepped_world
 from servod.drivers.virtual.bus_faults import BusFault, FaultKind
 from servod.drivers.virtual.world import SteppedWorld
 from servod.runtime.fieldbus.cia import LSS_TO_SLAVE_ID, NmtCommand
-from servod.runtime.fieldbus.master.lss import LssIdentity, LssMaster
 from servod.runtime.fieldbus.master.network import BusNetwork
-from servod.runtime.fieldbus.master.scan import scan
+from servod.runtime.fieldbus.master.scan import LssIdentity, LssMaster, scan
 
 _CONFIGURE_NODE_ID, _UNCONFIGURED = 0x11, 0xFF
 
