@@ -11,38 +11,15 @@ import errno
 import io
 import os
 import sys
+from importlib import import_module
 from itertools import pairwise
 
 import typer
 
 from servod import __version__
-from servod.cli import (
-    bench,
-    check,
-    commission,
-    demo,
-    deploy,
-    diagnose,
-    enable,
-    explain,
-    faults,
-    gains,
-    identify,
-    preset,
-    prove,
-    qualify,
-    record,
-    replay,
-    scan,
-    status,
-    stop,
-    synthesize,
-    track,
-    verify,
-)
 from servod.cli.common import begin_command, drop_empty_folders
 from servod.cli.errors import INTERRUPTED, complain, say
-from servod.cli.groups import Grouped
+from servod.cli.groups import Grouped, modules
 from servod.common.errors import BadInput
 
 #: Windows says EINVAL of a pipe whose reader has gone.
@@ -58,10 +35,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-_DAEMON = (demo, scan, status, enable, stop, track, gains, preset, record)
-_LABORATORY = (identify, synthesize, verify, deploy, commission, replay, diagnose, explain, prove)
-for _verb in (*_DAEMON, *_LABORATORY, qualify, bench, check, faults):
-    _verb.register(app)
+for _module in modules():
+    import_module(f"servod.cli.{_module}").register(app)
 
 
 def _print_version(asked: bool) -> None:

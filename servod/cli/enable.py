@@ -1,4 +1,4 @@
-"""`servoctl enable` and `servoctl disable`: switch the axis on and off, each only on explicit request."""
+"""`servoctl enable`, `disable` and `stop`: switch the axis on and off, each only on explicit request."""
 
 from __future__ import annotations
 
@@ -17,12 +17,16 @@ _ENABLE_HELP = example(
     "servoctl enable --prove",
 )
 _DISABLE_HELP = example("Bring the axis to rest, ramp the torque down and switch the drive off.", "servoctl disable")
+_STOP_HELP = example(
+    "Quick stop: the drive stops the axis by its own option (0x605A) and switches off.", "servoctl stop"
+)
 
 
 def register(app: typer.Typer) -> None:
-    """Add both verbs to `app`."""
+    """Add the verbs to `app`."""
     app.command("enable", help=_ENABLE_HELP)(enable)
     app.command("disable", help=_DISABLE_HELP)(disable)
+    app.command("stop", help=_STOP_HELP)(stop)
 
 
 def enable(
@@ -57,3 +61,8 @@ def _enable_or_leave_off(socket: Path, **arguments: bool) -> dict[str, Any]:
 def disable(socket: SocketOption = DEFAULT_SOCKET, as_json: JsonOption = False) -> None:
     """Disable the axis."""
     report(ask_to_stop(socket, "disable"), "disabled", as_json)
+
+
+def stop(socket: SocketOption = DEFAULT_SOCKET, as_json: JsonOption = False) -> None:
+    """Stop the axis by the drive's quick stop, at once."""
+    report(ask_to_stop(socket, "stop"), "stopped", as_json)

@@ -60,6 +60,14 @@ VERBS: dict[Panel, dict[str, str]] = {
     },
 }
 
+#: Verbs that stand in the file of another one; every other verb has the file of its name.
+_BESIDE = {"disable": "enable", "stop": "enable"}
+
+
+def modules() -> list[str]:
+    """The files of the verbs, in the order of the screen; each has a `register(app)`."""
+    return list(dict.fromkeys(_BESIDE.get(name, name) for lines in VERBS.values() for name in lines))
+
 
 class Grouped(TyperGroup):
     """Verbs below the title of their panel; a verb that VERBS does not know stands below the others."""

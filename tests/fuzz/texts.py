@@ -217,7 +217,7 @@ def virtual_axis_settings(folder: Path) -> Target:
 
 def config_check(folder: Path) -> Target:
     """`servoctl config check`, which recognises a YAML file by its keys and follows the files that it names."""
-    from servod.cli.check import check
+    from servod.cli.config import check
 
     (folder / "gains.yaml").write_bytes(_GAINS)
     return _yaml(folder / "odd.yaml", lambda path: check([path], True), _CONFIGURATION, _GAINS, _MODEL, _MAP)

@@ -1,7 +1,7 @@
 """What an axis of the trial may conceal: every name of the outside contract, in a textbook form and in another one.
 
-Stands on axes and physics. `HIDE` maps a name to the function that draws it; the drawings stand in `hidden_friction`,
-`hidden_place` and `hidden_drive`, physics that is on nobody's list in `unlisted`.
+Stands on axes and physics. `HIDE` maps a name to the function that draws it; physics that is on nobody's list stands in
+`unlisted`.
 """
 
 from __future__ import annotations
