@@ -23,7 +23,7 @@ from servod.runtime.loop.commands import Command
 from servod.runtime.loop.controller import Controller
 from servod.runtime.loop.exchange import Exchange
 from servod.runtime.loop.limits import Limits
-from servod.runtime.loop.orders import carry_out
+from servod.runtime.loop.orders import Orders
 from servod.runtime.loop.plan import LoopPlan
 from servod.runtime.loop.references import Reference
 from servod.runtime.loop.wiring.checks import proof_bounds
@@ -95,12 +95,13 @@ class Cycle:
         self.limits = Limits(config.limits)
         bounds = proof_bounds(config, plan.amplifier.facts)
         self.proof, self._proof_travel_rad = WiringProof(bounds), bounds.most_travel_rad
-        self.proof_wanted = config.wiring_proof.enabled
         self.controller = Controller()
         self.controller.activate(plan.law, plan.parameters, 0.0)
-        self.controller_serial = plan.serial
         self.reference = Reference(config.limits.ramp_down_s)
-        self.event_faults = 0  # raised by the supervisor for one cycle
+        self.orders = Orders(
+            self.axis, self.reference, self.controller, self.limits, self.proof, config.wiring_proof.enabled,
+            link.trajectory, self._period_s, plan.serial, self.shut_down,
+        )  # fmt: skip
         self.shutting_down = self.finished = self.seen_off = False
         self.torque_nm = self.encoder_position_rad = 0.0
         self._ramp_from_nm = 0.0
@@ -145,8 +146,9 @@ class Cycle:
         return min(max(interval_s, 0.2 * self._period_s), 20.0 * self._period_s)
 
     def _faults(self, amplifier: AmplifierFeedback, encoder: EncoderFeedback, skipped: int) -> int:
-        faults = self.limits.feedback_faults(amplifier, encoder, skipped) | self.exchange.faults() | self.event_faults
-        self.event_faults = 0
+        faults = self.limits.feedback_faults(amplifier, encoder, skipped) | self.exchange.faults()
+        faults |= self.orders.event_faults
+        self.orders.event_faults = 0
         if self.axis.state.powered:
             followed = self.reference.position_rad if self.axis.state.following else None
             faults |= self.limits.motion_faults(amplifier, encoder, followed)
@@ -267,7 +269,8 @@ class Cycle:
             self.exchange.sync_ns, self._number, self._missed, lag_ns, self._tick_ns, self._torque_sent_ns,
             axis.state, amplifier.state, amplifier.status_word, amplifier.mode, axis.goal, amplifier.goal_reached,
             amplifier.reasons, axis.faults, axis.latched, amplifier.error_code,
-            amplifier.age_cycles, encoder.age_cycles, self.controller_serial, self._command_seq, self._command_result,
+            amplifier.age_cycles, encoder.age_cycles,
+            self.orders.controller_serial, self._command_seq, self._command_result,
             reference.active, queue_full, error_frames,
             self.exchange.late_frames, self.amplifier.ignored_frames + self.encoder.ignored_frames,
             reference.position_rad, reference.velocity_rad_s, encoder.position_rad, encoder.velocity_rad_s,
@@ -279,7 +282,7 @@ class Cycle:
     def _take_command(self) -> None:
         command = self.link.next_command()
         if command is not None:
-            self._command_result = carry_out(self, command)
+            self._command_result = self.orders.carry_out(command, self.encoder_position_rad, self.torque_nm)
             self._command_seq = command.seq
 
     def _say_goodbye(self, amplifier: AmplifierFeedback) -> None:

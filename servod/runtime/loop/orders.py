@@ -1,18 +1,17 @@
-"""The supervisor's commands, carried out by the loop between two cycles. One small function for each."""
+"""The supervisor's commands, carried out by the loop between two cycles. One small method for each."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
 from servod.common.faults import FAULTS, FaultCode
-from servod.common.units import NS_PER_S
-from servod.runtime.loop.axis import AxisState
+from servod.kernels.motions import Samples
+from servod.runtime.loop.axis import Axis, AxisState
 from servod.runtime.loop.commands import Command, Op, Refusal
-from servod.runtime.loop.references import make_motion
-
-if TYPE_CHECKING:
-    from servod.runtime.loop.cycle import Cycle
+from servod.runtime.loop.controller import Controller
+from servod.runtime.loop.limits import Limits
+from servod.runtime.loop.references import Reference, make_motion
+from servod.runtime.loop.wiring.test import WiringProof
 
 #: Faults that make what was proven doubtful: a sensor or a scale may not be what it was.
 _DOUBTFUL = sum(
@@ -27,94 +26,109 @@ _DOUBTFUL = sum(
     )
 )
 
-Order = Callable[["Cycle", Sequence[float]], Refusal]
 
+class Orders:
+    """The parts of the loop that a command may touch, and what it leaves for the cycle to read.
 
-def carry_out(cycle: Cycle, command: Command) -> Refusal:
-    """Carry out one command; the answer goes into the cycle record."""
-    order = _ORDERS.get(command.op)
-    return Refusal.BAD_ARGUMENT if order is None else order(cycle, command.arguments)
+    `controller_serial` is the number of the gain set that runs; `event_faults` are what the supervisor raised for one
+    cycle, which takes them.
+    """
 
+    def __init__(
+        self,
+        axis: Axis,
+        reference: Reference,
+        controller: Controller,
+        limits: Limits,
+        proof: WiringProof,
+        proof_wanted: bool,
+        trajectory: Samples,
+        period_s: float,
+        controller_serial: int,
+        shut_down: Callable[[], None],
+    ) -> None:
+        """`trajectory` is the area that table motions read, `shut_down` begins the end of the loop."""
+        self._axis, self._reference, self._controller, self._limits = axis, reference, controller, limits
+        self._proof, self._proof_wanted = proof, proof_wanted
+        self._trajectory, self._period_s, self._shut_down = trajectory, period_s, shut_down
+        self.controller_serial = controller_serial
+        self.event_faults = 0
+        self._position_rad = self._torque_nm = 0.0
+        self._table: dict[int, Callable[[Sequence[float]], Refusal]] = {
+            Op.ENABLE: self._enable,
+            Op.DISABLE: self._disable,
+            Op.QUICK_STOP: self._quick_stop,
+            Op.HALT: self._halt,
+            Op.ACTIVATE: self._activate,
+            Op.REFERENCE: self._start_motion,
+            Op.SHUTDOWN: self._end,
+            Op.NODE_EVENT: self._raise_event,
+        }
 
-def _enable(cycle: Cycle, arguments: Sequence[float]) -> Refusal:
-    position_rad = cycle.encoder_position_rad
-    if not cycle.limits.position_min_rad <= position_rad <= cycle.limits.position_max_rad:
-        return Refusal.OUTSIDE_LIMITS
-    reset_fault, asked = ([bool(value) for value in arguments] + [False, False])[:2]
-    if not cycle.axis.state.stopped:
-        return Refusal.PROVES_ONLY_FROM_OFF if asked else cycle.axis.enable(reset_fault)
-    doubtful = not cycle.proof.proven or bool(cycle.axis.latched & _DOUBTFUL)
-    prove = asked or (cycle.proof_wanted and doubtful)
-    refusal = cycle.axis.enable(reset_fault, prove)
-    if refusal == Refusal.DONE and prove:
-        cycle.proof.forget()
-    return refusal
+    def carry_out(self, command: Command, position_rad: float, torque_nm: float) -> Refusal:
+        """Carry out one command, with joint and torque as they are now; the answer goes into the cycle record."""
+        self._position_rad, self._torque_nm = position_rad, torque_nm
+        order = self._table.get(command.op)
+        return Refusal.BAD_ARGUMENT if order is None else order(command.arguments)
 
+    def _enable(self, arguments: Sequence[float]) -> Refusal:
+        if not self._limits.position_min_rad <= self._position_rad <= self._limits.position_max_rad:
+            return Refusal.OUTSIDE_LIMITS
+        reset_fault, asked = ([bool(value) for value in arguments] + [False, False])[:2]
+        if not self._axis.state.stopped:
+            return Refusal.PROVES_ONLY_FROM_OFF if asked else self._axis.enable(reset_fault)
+        doubtful = not self._proof.proven or bool(self._axis.latched & _DOUBTFUL)
+        prove = asked or (self._proof_wanted and doubtful)
+        refusal = self._axis.enable(reset_fault, prove)
+        if refusal == Refusal.DONE and prove:
+            self._proof.forget()
+        return refusal
 
-def _disable(cycle: Cycle, _arguments: Sequence[float]) -> Refusal:
-    cycle.axis.disable()
-    return Refusal.DONE
+    def _disable(self, _arguments: Sequence[float]) -> Refusal:
+        self._axis.disable()
+        return Refusal.DONE
 
+    def _quick_stop(self, _arguments: Sequence[float]) -> Refusal:
+        self._axis.quick_stop()
+        return Refusal.DONE
 
-def _quick_stop(cycle: Cycle, _arguments: Sequence[float]) -> Refusal:
-    cycle.axis.quick_stop()
-    return Refusal.DONE
+    def _halt(self, arguments: Sequence[float]) -> Refusal:
+        self._reference.halt(bool(arguments and arguments[0]))
+        return Refusal.DONE
 
+    def _activate(self, arguments: Sequence[float]) -> Refusal:
+        serial, law, count, *parameters = arguments
+        if len(parameters) != int(count):
+            return Refusal.BAD_ARGUMENT
+        if not self._controller.activate(int(law), parameters, self._torque_nm):
+            return Refusal.BAD_ARGUMENT
+        self.controller_serial = int(serial)
+        return Refusal.DONE
 
-def _halt(cycle: Cycle, arguments: Sequence[float]) -> Refusal:
-    cycle.reference.halt(bool(arguments and arguments[0]))
-    return Refusal.DONE
+    def _start_motion(self, arguments: Sequence[float]) -> Refusal:
+        if self._axis.state != AxisState.ENABLED:
+            return Refusal.NOT_ENABLED
+        if self._reference.active:
+            return Refusal.MOTION_RUNNING
+        motion = make_motion(arguments, self._period_s, self._trajectory)
+        if isinstance(motion, Refusal):
+            return motion
+        here, limits = self._reference.position_rad, self._limits
+        if here + motion.lowest_rad < limits.position_min_rad or here + motion.highest_rad > limits.position_max_rad:
+            return Refusal.OUT_OF_RANGE
+        if motion.speed_rad_s > limits.speed_rad_s:
+            return Refusal.TOO_FAST
+        if not abs(here + motion.first_rad(self._period_s) - self._position_rad) <= limits.following_error_rad:
+            return Refusal.JUMPS
+        self._reference.start(motion)
+        return Refusal.DONE
 
+    def _end(self, _arguments: Sequence[float]) -> Refusal:
+        self._shut_down()
+        return Refusal.DONE
 
-def _activate(cycle: Cycle, arguments: Sequence[float]) -> Refusal:
-    serial, law, count, *parameters = arguments
-    if len(parameters) != int(count):
-        return Refusal.BAD_ARGUMENT
-    if not cycle.controller.activate(int(law), parameters, cycle.torque_nm):
-        return Refusal.BAD_ARGUMENT
-    cycle.controller_serial = int(serial)
-    return Refusal.DONE
-
-
-def _reference(cycle: Cycle, arguments: Sequence[float]) -> Refusal:
-    if cycle.axis.state != AxisState.ENABLED:
-        return Refusal.NOT_ENABLED
-    if cycle.reference.active:
-        return Refusal.MOTION_RUNNING
-    period_s = cycle.period_ns / NS_PER_S
-    motion = make_motion(arguments, period_s, cycle.link.trajectory)
-    if isinstance(motion, Refusal):
-        return motion
-    here, limits = cycle.reference.position_rad, cycle.limits
-    if here + motion.lowest_rad < limits.position_min_rad or here + motion.highest_rad > limits.position_max_rad:
-        return Refusal.OUT_OF_RANGE
-    if motion.speed_rad_s > limits.speed_rad_s:
-        return Refusal.TOO_FAST
-    if not abs(here + motion.first_rad(period_s) - cycle.encoder_position_rad) <= limits.following_error_rad:
-        return Refusal.JUMPS
-    cycle.reference.start(motion)
-    return Refusal.DONE
-
-
-def _shutdown(cycle: Cycle, _arguments: Sequence[float]) -> Refusal:
-    cycle.shut_down()
-    return Refusal.DONE
-
-
-def _node_event(cycle: Cycle, arguments: Sequence[float]) -> Refusal:
-    bit = FAULTS[FaultCode(int(arguments[0]))].bit
-    cycle.event_faults |= bit
-    cycle.axis.note(bit)
-    return Refusal.DONE
-
-
-_ORDERS: dict[int, Order] = {
-    Op.ENABLE: _enable,
-    Op.DISABLE: _disable,
-    Op.QUICK_STOP: _quick_stop,
-    Op.HALT: _halt,
-    Op.ACTIVATE: _activate,
-    Op.REFERENCE: _reference,
-    Op.SHUTDOWN: _shutdown,
-    Op.NODE_EVENT: _node_event,
-}
+    def _raise_event(self, arguments: Sequence[float]) -> Refusal:
+        bit = FAULTS[FaultCode(int(arguments[0]))].bit
+        self.event_faults |= bit
+        self._axis.note(bit)
+        return Refusal.DONE
