@@ -25,7 +25,7 @@ from servod.cli.common import (
 from servod.common.errors import AnswerIsNo, BadInput
 
 if TYPE_CHECKING:
-    from servod.client.stepped import DeployLink
+    from servod.client.axis import AxisClient
     from servod.formats.config import AxisConfig
     from servod.formats.gains.gain_set import GainSet
 
@@ -62,12 +62,12 @@ def deploy(
     if present is not None and plant is None:
         raise BadInput("--present", str(present), "only with --plant: a daemon knows what runs")
     require_certificate(wanted, accept_uncertified=None, where=str(gains))
-    axis = _on_daemon(socket) if plant is None else _virtual(plant, present, config, wanted, seed)
-    with axis as link, progress("deploy", quiet=as_json) as tell:
-        admitted(wanted, link.config, str(gains))
+    opened = _on_daemon(socket) if plant is None else _virtual(plant, present, config, wanted, seed)
+    with opened as axis, progress("deploy", quiet=as_json) as tell:
+        admitted(wanted, axis.config, str(gains))
         if not as_json:
             print(f"{wanted.name}: {announced(wanted)}", file=sys.stderr, flush=True)
-        done = deploy(link, wanted, tell)
+        done = deploy(axis, wanted, tell)
     if as_json:
         print_json(done.document())
     else:
@@ -79,19 +79,19 @@ def deploy(
 
 
 @contextmanager
-def _on_daemon(socket: Path) -> Iterator[DeployLink]:
+def _on_daemon(socket: Path) -> Iterator[AxisClient]:
     from servod.client.processes import sigterm_as_interrupt
-    from servod.client.under_daemon import DaemonDeployLink
+    from servod.client.under_daemon import DaemonAxis
 
     with connect(socket) as client, sigterm_as_interrupt():
-        yield DaemonDeployLink(client)
+        yield DaemonAxis(client)
 
 
 @contextmanager
 def _virtual(
     plant: Path, present: Path | None, config: Path | None, wanted: GainSet, seed: int
-) -> Iterator[DeployLink]:
-    from servod.client.virtual import virtual_link
+) -> Iterator[AxisClient]:
+    from servod.client.virtual import axis_for_set
     from servod.formats.config import load_config
     from servod.formats.gains.gain_set import load_gains
     from servod.formats.model.axis_model import load_axis_model
@@ -100,7 +100,7 @@ def _virtual(
     chosen: AxisConfig | None = load_config(config) if config is not None else None
     before = load_gains(present) if present is not None else None
     with tempfile.TemporaryDirectory(prefix="servod-deploy-") as folder:
-        yield virtual_link(joint, Path(folder), wanted, before, seed, chosen)
+        yield axis_for_set(joint, Path(folder), wanted, before, seed, chosen)
 
 
 def _print(document: dict[str, Any]) -> None:

@@ -26,7 +26,7 @@ from servod.common.errors import BadInput
 from servod.common.files import unwritable
 
 if TYPE_CHECKING:
-    from servod.client.axis import Link
+    from servod.client.axis import AxisClient
     from servod.formats.model.axis_model import AxisModel
     from servod.lab.identify.analysis import Analysis
     from servod.lab.identify.walk import Tell
@@ -108,14 +108,14 @@ class _Walk(NamedTuple):
     seed: int
     resume: bool
 
-    def on(self, link: Link, tell: Tell, subject: str) -> Analysis:
+    def on(self, axis: AxisClient, tell: Tell, subject: str) -> Analysis:
         """Run all experiments on this axis, and switch it off whatever ends them; `subject` says which one it is."""
         from servod.client.processes import sigterm_as_interrupt
         from servod.lab.identify.walk import identify as walk
 
         with sigterm_as_interrupt():
             return walk(
-                link, self.folder, tell, travel_rad=self.travel, speed_rad_s=self.speed, seed=self.seed,
+                axis, self.folder, tell, travel_rad=self.travel, speed_rad_s=self.speed, seed=self.seed,
                 resume=self.resume, subject=subject,
             )  # fmt: skip
 
@@ -130,7 +130,7 @@ def _from_recordings(folder: Path) -> Job:
 
 
 def _virtual(plant: Path, config: Path | None, settings: Path | None, encoder_counts: int | None, seed: int) -> Job:
-    from servod.client.stepped import SteppedLink
+    from servod.client.stepped import SteppedAxis
     from servod.client.virtual import virtual_session
     from servod.common.yaml import load_model
     from servod.drivers.virtual.settings import VirtualAxisSettings
@@ -143,13 +143,13 @@ def _virtual(plant: Path, config: Path | None, settings: Path | None, encoder_co
     def job(walk: _Walk, tell: Tell) -> Analysis:
         with tempfile.TemporaryDirectory(prefix="servod-identify-") as folder:
             session = virtual_session(joint, Path(folder), encoder_counts, seed, chosen, devices)
-            return walk.on(SteppedLink(session), tell, axis_model_yaml(joint))
+            return walk.on(SteppedAxis(session, Path(folder)), tell, axis_model_yaml(joint))
 
     return job
 
 
 def _on_daemon(socket: Path, config: Path | None) -> Job:
-    from servod.client.under_daemon import DaemonLink
+    from servod.client.under_daemon import DaemonAxis
     from servod.formats.config import load_config
 
     if config is None:
@@ -160,7 +160,7 @@ def _on_daemon(socket: Path, config: Path | None) -> Job:
 
     def job(walk: _Walk, tell: Tell) -> Analysis:
         with connect(socket) as client:
-            return walk.on(DaemonLink(client, chosen), tell, chosen.name)
+            return walk.on(DaemonAxis(client, chosen), tell, chosen.name)
 
     return job
 

@@ -1,43 +1,96 @@
-"""How experiments reach an axis: the small protocol, and the SYNC-stepped virtual axis behind it.
+"""An axis that can be commanded: the one protocol, whatever is behind it.
 
-Above the session; `daemon_link` has the same for a running daemon. An experiment says gains, positions and torques, and
-gets the recorded cycles of its motion back.
+Between all that works on an axis (experiments, deployment, comparison, faults) and the two ways to it: `stepped` has it
+in this process and in virtual time, `under_daemon` reaches it over the control socket. Cycles come as packed records
+(servod.formats.recording.record): what is made of them is for those who asked.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Protocol
-
-import numpy as np
-from numpy.typing import NDArray
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
 
 from servod.common.errors import AnswerIsNo
-from servod.common.faults import faults_in
 from servod.formats.config import AxisConfig
-from servod.formats.recording.record import CycleRecord
-from servod.lab.identify.trace import Trace
-from servod.runtime.loop.axis import AxisState
+from servod.formats.gains.gain_set import GainSet
 
-#: Told after every slice of a motion: how many seconds of it have passed.
+#: Told at every look at a motion that runs: how many seconds of it have passed.
 Watch = Callable[[float], None]
+#: In virtual time a motion is looked at so often, unless somebody wants it otherwise.
+LOOK_S = 0.1
 
 
-class MotionEnded(AnswerIsNo):
-    """The axis dropped out of a motion; `rows` are its cycles, and `trace` what an experiment made of them."""
+class AxisDropped(AnswerIsNo):
+    """The axis is not enabled any more; `raw` are the cycles of the motion that it dropped out of."""
 
-    def __init__(self, message: str, rows: NDArray[np.void]) -> None:
-        super().__init__(message)
-        self.rows = rows
-        self.trace: Trace | None = None
+    def __init__(self, state: str, why: str, raw: bytes = b"") -> None:
+        super().__init__(f"the axis went to {state}. {why}")
+        self.state, self.why, self.raw = state, why, raw
 
 
-class Link(Protocol):
-    """An axis that experiments may move. Every method raises AnswerIsNo when the axis drops out or refuses."""
+@dataclass(frozen=True)
+class ReferenceMotion:
+    """A motion from where the reference stands, in the arguments of the verb `track`."""
+
+    arguments: dict[str, Any]
+
+    @classmethod
+    def sine(cls, amplitude_rad: float, frequency_hz: float, duration_s: float) -> ReferenceMotion:
+        """A sine."""
+        return cls({
+            "kind": "sine", "amplitude_rad": amplitude_rad, "frequency_hz": frequency_hz, "duration_s": duration_s,
+        })  # fmt: skip
+
+    @classmethod
+    def paper(cls, duration_s: float) -> ReferenceMotion:
+        """Trajectory (19)."""
+        return cls({"kind": "paper", "duration_s": duration_s})
+
+    @classmethod
+    def step(cls, amplitude_rad: float, duration_s: float) -> ReferenceMotion:
+        """A step that is held."""
+        return cls({"kind": "step", "amplitude_rad": amplitude_rad, "duration_s": duration_s})
+
+    @classmethod
+    def table(cls, positions_rad: Sequence[float]) -> ReferenceMotion:
+        """Positions, one for each cycle, relative to the first."""
+        return cls({"kind": "csv", "positions_rad": list(positions_rad)})
+
+    @classmethod
+    def excite(cls, positions_rad: Sequence[float], torques_nm: Sequence[float], window_rad: float) -> ReferenceMotion:
+        """Positions with torque on top; it ends by itself further than `window_rad` from the reference."""
+        return cls({
+            "kind": "excite", "positions_rad": list(positions_rad), "torques_nm": list(torques_nm),
+            "window_rad": window_rad,
+        })  # fmt: skip
+
+
+class AxisStatus(NamedTuple):
+    """The axis now; `state` is the name of its servod.runtime.loop.axis.AxisState."""
+
+    state: str
+    moves: bool
+    position_rad: float
+    reference_rad: float
+
+    @property
+    def enabled(self) -> bool:
+        """Whether it holds and takes motions."""
+        return self.state == "ENABLED"
+
+
+class AxisClient(Protocol):
+    """An axis with a store of gain sets, under one client that commands it.
+
+    `begin`, `run` and `wait` raise AxisDropped, with the faults and their remedies, when the axis drops out or has done
+    so, `enable` AnswerIsNo when it does not get there. In virtual time what is refused raises AnswerIsNo as well; under
+    a daemon what is refused on an axis that stays enabled raises Refused, what does not reach it at all Unreachable.
+    """
 
     @property
     def config(self) -> AxisConfig:
-        """Limits, period and encoder of the axis."""
+        """Limits, period, filter and encoder of the axis."""
         ...
 
     @property
@@ -45,38 +98,55 @@ class Link(Protocol):
         """What turns the records' time into the time of day; None where they have the monotonic clock's."""
         ...
 
-    def enable(self) -> float:
-        """Enable under no torque; returns the present position in rad."""
+    @property
+    def active(self) -> tuple[str, int]:
+        """Name and version of the set that runs, on trial or not."""
         ...
 
-    def set_gains(self, position_nm_per_rad: float, velocity_nms_per_rad: float) -> None:
-        """Change the PD feedback under which motions run; bumpless."""
+    def status(self) -> AxisStatus:
+        """The axis now."""
         ...
 
-    def excite(
-        self, positions_rad: Sequence[float], torques_nm: Sequence[float], window_rad: float
-    ) -> NDArray[np.void]:
-        """Run a motion relative to the present reference with torque on top; returns its cycles.
-
-        It ends by itself when the joint is further than `window_rad` from the reference. Raises MotionEnded when the
-        axis drops out.
-        """
+    def enable(self, reset_fault: bool = False) -> None:
+        """Enable under the set that runs."""
         ...
 
     def disable(self) -> None:
-        """Ramp the torque down and switch off; never raises."""
+        """Bring to rest and switch off; never raises."""
         ...
 
+    def stop(self) -> None:
+        """Stop at once, whatever runs; never raises."""
+        ...
 
-def moving(rows: NDArray[np.void]) -> NDArray[np.void]:
-    """The cycles of the motion."""
-    active: NDArray[np.void] = rows[rows["reference_active"] == 1]
-    return active
+    def load(self, gains: GainSet) -> tuple[str, int]:
+        """Put a set into the store; its name and version there."""
+        ...
 
+    def activate(self, name: str, version: int) -> None:
+        """Change to a stored set on trial, without a bump: what is stored as active stays so."""
+        ...
 
-def check_state(record: CycleRecord) -> None:
-    """Raise AnswerIsNo, with the faults and their remedies, when the axis is not enabled any more."""
-    if record.axis_state == AxisState.ENABLED:
-        return
-    why = "; ".join(f"{f.code.name}: {f.cause} {f.remedy}" for f in faults_in(record.faults_latched))
-    raise AnswerIsNo(f"the experiment ended with the axis in {AxisState(record.axis_state).name}. {why}")
+    def keep(self, note: str, figures: dict[str, float]) -> None:
+        """Make the set on trial the active one. Raises AnswerIsNo when none is."""
+        ...
+
+    def give_up(self, note: str, figures: dict[str, float]) -> None:
+        """Change back from the set on trial to the active one. Raises AnswerIsNo when none is."""
+        ...
+
+    def begin(self, motion: ReferenceMotion) -> None:
+        """Start a motion and let it run."""
+        ...
+
+    def run(self, motion: ReferenceMotion, watch: Watch | None = None, look_s: float = LOOK_S) -> bytes:
+        """Run a motion to its end; all cycles meanwhile, with some of rest before and behind it.
+
+        In virtual time the axis is looked at every `look_s`: what follows the motion follows it so much later at most.
+        AxisDropped brings the cycles until then.
+        """
+        ...
+
+    def wait(self, duration_s: float) -> None:
+        """Let time pass."""
+        ...

@@ -1,6 +1,6 @@
-"""The axis of `servoctl demo --diagnose`: tracks (19) and motions for a diagnosis, SYNC-stepped or under a daemon.
+"""How an axis is opened: for `servoctl demo --diagnose`, and for each step of a commissioning.
 
-Beside the data path; a client like any other. Both kinds leave their cycles in the daemon's own recording format.
+Above both ways to an axis, which they give as servod.client.axis.AxisClient.
 """
 
 from __future__ import annotations
@@ -9,24 +9,22 @@ import contextlib
 import hashlib
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
-
-from servod.client.axis import Link
+from servod.client.axis import AxisClient
 from servod.client.control import ControlClient
-from servod.client.processes import last_core, own_group
-from servod.client.stepped import DeployLink, Rows, SteppedDeployLink, SteppedLink, SteppedSession
-from servod.client.under_daemon import DaemonDeployLink, DaemonLink, require_daemon_config
+from servod.client.processes import last_core, own_group, running_axis
+from servod.client.stepped import SteppedAxis
+from servod.client.under_daemon import DaemonAxis, require_daemon_config
 from servod.client.virtual import (
     ENCODER_COUNTS,
+    axis_for_set,
     rated_torque_mnm,
     virtual_config,
-    virtual_link,
     virtual_session,
     with_cutoff,
 )
@@ -34,70 +32,9 @@ from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.formats.config import AxisConfig
 from servod.formats.gains.gain_set import GainSet
 from servod.formats.model.axis_model import AxisModel, axis_model_yaml
-from servod.lab.recordings.recording import ROW
-from servod.lab.tracking.metrics import REST_S
-from servod.runtime.loop.commands import ReferenceKind
 
-
-class RecoveryAxis(Protocol):
-    """An enabled axis under one gain set."""
-
-    @property
-    def link(self) -> DeployLink:
-        """The axis as a deployment sees it."""
-        ...
-
-    def paper(self, duration_s: float) -> Rows:
-        """Track trajectory (19); the cycles of the motion. Raises AnswerIsNo when the axis drops out."""
-        ...
-
-    def follow(self, positions_rad: Sequence[float]) -> Rows:
-        """Follow positions, one for each cycle; the cycles of the motion. Raises AnswerIsNo."""
-        ...
-
-
-class SteppedAxis:
-    """In virtual time."""
-
-    def __init__(self, link: SteppedDeployLink) -> None:
-        self.link = link
-
-    def paper(self, duration_s: float) -> Rows:
-        """Trajectory (19)."""
-        return self._move(ReferenceKind.PAPER, [duration_s])
-
-    def follow(self, positions_rad: Sequence[float]) -> Rows:
-        """Positions from the table that the loop shares."""
-        self.link.session.load_trajectory(positions_rad)
-        return self._move(ReferenceKind.TABLE, [len(positions_rad), min(positions_rad), max(positions_rad)])
-
-    def _move(self, kind: ReferenceKind, arguments: Sequence[float]) -> Rows:
-        session = self.link.session
-        session.run(REST_S)
-        session.clear()
-        session.move(kind, arguments)
-        return moving(np.frombuffer(session.raw, dtype=ROW))
-
-
-class DaemonAxis:
-    """On the wall clock, over the control socket."""
-
-    def __init__(self, link: DaemonDeployLink) -> None:
-        self.link = link
-
-    def paper(self, duration_s: float) -> Rows:
-        """Trajectory (19), as the daemon recorded it."""
-        return moving(self.link.record([{"kind": "paper", "duration_s": duration_s}]))
-
-    def follow(self, positions_rad: Sequence[float]) -> Rows:
-        """Positions, as the daemon recorded them."""
-        return moving(self.link.record([{"kind": "csv", "positions_rad": list(positions_rad)}]))
-
-
-def moving(rows: Rows) -> Rows:
-    """The cycles in which a motion ran."""
-    motion: Rows = rows[rows["reference_active"] == 1]
-    return motion
+#: After an axis was enabled, until what is held has come to rest.
+_SETTLE_S = 1.0
 
 
 def config_for(plant: AxisModel, gains: GainSet, folder: Path) -> AxisConfig:
@@ -108,18 +45,17 @@ def config_for(plant: AxisModel, gains: GainSet, folder: Path) -> AxisConfig:
 
 
 @contextlib.contextmanager
-def stepped_axis(plant: AxisModel, gains: GainSet, folder: Path, seed: int) -> Iterator[RecoveryAxis]:
+def stepped_axis(plant: AxisModel, gains: GainSet, folder: Path, seed: int) -> Iterator[AxisClient]:
     """A stepped axis, enabled under `gains`; its store is in `folder`."""
-    link = virtual_link(plant, folder, gains, gains, seed, config_for(plant, gains, folder))
-    link.enable()
-    yield SteppedAxis(link)
+    axis = axis_for_set(plant, folder, gains, gains, seed, config_for(plant, gains, folder))
+    axis.enable()
+    axis.wait(_SETTLE_S)
+    yield axis
 
 
 @contextlib.contextmanager
-def daemon_axis(plant: AxisModel, gains: GainSet, folder: Path, _seed: int) -> Iterator[RecoveryAxis]:
+def daemon_axis(plant: AxisModel, gains: GainSet, folder: Path, _seed: int) -> Iterator[AxisClient]:
     """Daemon and virtual axis as processes, enabled under `gains`. Raises Unreachable when one does not start."""
-    from servod.client.processes import running_axis
-
     config = config_for(plant, gains, folder)
     joint, initial = folder / "plant.yaml", folder / "initial.yaml"
     joint.write_text(axis_model_yaml(plant))
@@ -131,15 +67,16 @@ def daemon_axis(plant: AxisModel, gains: GainSet, folder: Path, _seed: int) -> I
     changed = {"cycle": cycle, "limits": limits, "gains": kept, "control": control}
     drive = ("--rated-torque-mnm", str(rated_torque_mnm(plant)))
     with running_axis(config.model_copy(update=changed), joint, folder, drive) as (client, _):
-        link = DaemonDeployLink(client)
-        link.enable()
-        yield DaemonAxis(link)
-        link.disable()
+        axis = DaemonAxis(client)
+        axis.enable()
+        axis.wait(_SETTLE_S)
+        yield axis
+        axis.disable()
 
 
-# The axis that a walk is on: how experiments, deployments and comparisons reach it, and what tells it from others.
+# The axis of a commissioning: how its experiments, deployments and comparisons open it, and what tells it from others.
 #
-# Under the steps. The virtual axis is SYNC-stepped and gets the velocity filter that a set was designed for; the axis
+# The virtual axis is SYNC-stepped and gets the velocity filter that a set was designed for; the axis
 # under a daemon keeps what its configuration says.
 
 
@@ -170,13 +107,13 @@ class WalkAxis(Protocol):
         """Whether nobody can be hurt."""
         ...
 
-    def experiments(self) -> contextlib.AbstractContextManager[Link]:
+    def experiments(self) -> contextlib.AbstractContextManager[AxisClient]:
         """The axis for an identification."""
         ...
 
     def deployment(
         self, folder: Path, gains: GainSet, present: GainSet
-    ) -> contextlib.AbstractContextManager[DeployLink]:
+    ) -> contextlib.AbstractContextManager[AxisClient]:
         """The axis for a deployment; a virtual one runs `present` before, and keeps its sets in `folder`."""
         ...
 
@@ -211,32 +148,33 @@ class VirtualWalkAxis:
         return None
 
     @contextlib.contextmanager
-    def experiments(self) -> Iterator[Link]:
+    def experiments(self) -> Iterator[AxisClient]:
         """A new session."""
         with tempfile.TemporaryDirectory(prefix="servod-commission-") as folder:
-            yield SteppedLink(self._session(Path(folder), self.config))
+            session = virtual_session(
+                self.joint, Path(folder), self.encoder_counts, self.seed, self.config, self.settings
+            )
+            yield SteppedAxis(session, Path(folder))
 
     @contextlib.contextmanager
-    def deployment(self, folder: Path, gains: GainSet, present: GainSet) -> Iterator[DeployLink]:
+    def deployment(self, folder: Path, gains: GainSet, present: GainSet) -> Iterator[AxisClient]:
         """A new session with the filter of `gains`, and an empty store in `folder`."""
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-        yield virtual_link(self.joint, folder, gains, present, self.seed, self.configured_for(gains), self.settings)
+        yield axis_for_set(self.joint, folder, gains, present, self.seed, self.configured_for(gains), self.settings)
 
     def configured_for(self, gains: GainSet) -> AxisConfig:
         """The configuration with the velocity filter that the set was designed for."""
         return with_cutoff(self.config, gains.design.velocity_cutoff_hz) if gains.design else self.config
 
-    def open_session(self, folder: Path, cutoff_hz: float, seed: int) -> SteppedSession:
-        """A disabled session with this velocity filter for a comparison of laws; `seed` begins its noise."""
+    def for_tracking(self, folder: Path, cutoff_hz: float, seed: int) -> SteppedAxis:
+        """A disabled axis with this velocity filter for a comparison of laws; `seed` begins its noise."""
         config = with_cutoff(self.config, cutoff_hz)
         if self.chosen is None:
             limits = config.limits.model_copy(update={"speed_rad_s": STEP_SPEEDS * config.limits.speed_rad_s})
             config = config.model_copy(update={"limits": limits})
-        return virtual_session(self.joint, folder, self.encoder_counts, seed, config, self.settings)
-
-    def _session(self, folder: Path, config: AxisConfig) -> SteppedSession:
-        return virtual_session(self.joint, folder, self.encoder_counts, self.seed, config, self.settings)
+        session = virtual_session(self.joint, folder, self.encoder_counts, seed, config, self.settings)
+        return SteppedAxis(session, folder)
 
 
 @dataclass(frozen=True)
@@ -258,17 +196,17 @@ class DaemonWalkAxis:
         return self.config.encoder.velocity_cutoff_hz
 
     @contextlib.contextmanager
-    def experiments(self) -> Iterator[Link]:
+    def experiments(self) -> Iterator[AxisClient]:
         """Over the daemon's control socket."""
         with ControlClient(self.socket) as client:
-            yield DaemonLink(client, self.config)
+            yield DaemonAxis(client, self.config)
 
     @contextlib.contextmanager
-    def deployment(self, folder: Path, gains: GainSet, present: GainSet) -> Iterator[DeployLink]:
+    def deployment(self, folder: Path, gains: GainSet, present: GainSet) -> Iterator[AxisClient]:
         """Over the daemon's control socket; the sets are in its own store. Raises BadInput on another configuration."""
         with ControlClient(self.socket) as client:
             require_daemon_config(client, self.config)
-            yield DaemonDeployLink(client)
+            yield DaemonAxis(client)
 
 
 def configured(config: AxisConfig) -> dict[str, Any]:

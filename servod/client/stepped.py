@@ -10,34 +10,42 @@ import contextlib
 from array import array
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Protocol
+from concurrent.futures import Executor, Future
+from pathlib import Path
+from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
-from servod.client.axis import MotionEnded, Watch, check_state, moving
+from servod.client.axis import LOOK_S, AxisDropped, AxisStatus, ReferenceMotion, Watch
 from servod.common.errors import AnswerIsNo
 from servod.common.faults import fault_text
 from servod.common.units import NS_PER_S
 from servod.formats.config import AxisConfig
-from servod.formats.gains.gain_set import GainSet
-from servod.formats.gains.store import GainStore, StoredSet
+from servod.formats.gains.gain_set import GainSet, pd_set
+from servod.formats.protocol import SampleKey, Verb
 from servod.formats.recording.record import RECORD, CycleRecord
 from servod.formats.wiring import with_expected
-from servod.kernels.laws import LAWS
-from servod.lab.identify.trace import rows_of
-from servod.lab.recordings.recording import ROW
-from servod.lab.verify.validation import STEP_S, ValidationMotion
+from servod.runtime.daemon.arguments import (
+    GainsActivateArgs,
+    GainsLoadArgs,
+    GainsVerdictArgs,
+    TrackArgs,
+    check_arguments,
+)
+from servod.runtime.daemon.flows import OrderWait, finish
+from servod.runtime.daemon.gain_bank import GainBank
+from servod.runtime.daemon.trajectory import Table
 from servod.runtime.fieldbus.master import BringUp, Master
 from servod.runtime.loop.axis import AxisState
 from servod.runtime.loop.channel import TRAJECTORY_SAMPLES
-from servod.runtime.loop.commands import REFUSAL_TEXT, Command, Op, ReferenceKind, Refusal
+from servod.runtime.loop.commands import REFUSAL_TEXT, Command, Op, Refusal
 from servod.runtime.loop.cycle import Cycle
 from servod.runtime.loop.plan import LoopPlan
 from servod.runtime.loop.wiring.findings import Proof, sentence
 
 if TYPE_CHECKING:
-    from servod.drivers.virtual.world import SteppedWorld
+    from servod.drivers.virtual.world import SteppedWorld, Truth
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 #: Virtual time between two looks at an axis that is being enabled.
 _ENABLE_STEP_S = 0.02
@@ -147,16 +155,6 @@ class SteppedSession:
         if self.cycle.axis.state != AxisState.ENABLED:
             raise AnswerIsNo(f"the axis is {self.cycle.axis.state.name}, not enabled. {self.why}")
 
-    def move(self, kind: ReferenceKind, arguments: Sequence[float], timeout_s: float = 600.0) -> None:
-        """Start a motion and run until it is over; raises AnswerIsNo when it is refused or ends in a fault."""
-        self._must(self.send(Op.REFERENCE, [kind, *arguments]))
-        for _ in range(round(timeout_s / 0.1)):
-            if not self.cycle.reference.active:
-                break
-            self.run(0.1)
-        if self.cycle.axis.state.name != "ENABLED":
-            raise AnswerIsNo(f"the motion ended with the axis in {self.cycle.axis.state.name}. {self.why}")
-
     def close(self) -> None:
         """Leave the bus: for a new session on the same world, as a restarted daemon is one."""
         self.master.close()
@@ -193,156 +191,26 @@ class SteppedSession:
             self._link.commands.append(Command(self._seq, Op.NODE_EVENT, (float(event.fault),)))
 
 
-_SLICE_S = 0.1
+class SteppedAxis:
+    """servod.client.axis.AxisClient in virtual time, around the gain bank of the daemon.
 
-
-class SteppedLink:
-    """The virtual axis in virtual time."""
-
-    def __init__(self, session: SteppedSession, watch: Watch | None = None) -> None:
-        self.session = session
-        self._watch = watch or (lambda _seconds: None)
-
-    @property
-    def config(self) -> AxisConfig:
-        """The session's configuration."""
-        return self.session.config
-
-    @property
-    def offset_ns(self) -> int | None:
-        """Virtual time has no time of day: the same walk gives the same files, byte for byte."""
-        return 0
-
-    def enable(self) -> float:
-        """Enable with zero gains."""
-        self.set_gains(0.0, 0.0)
-        self.session.enable()
-        return self.session.latest.position_rad
-
-    def set_gains(self, position_nm_per_rad: float, velocity_nms_per_rad: float) -> None:
-        """PD feedback of the session's controller."""
-        law = LAWS["pd"]
-        gains = [position_nm_per_rad, velocity_nms_per_rad, 0.0]
-        self._must(self.session.send(Op.ACTIVATE, [0, law.number, len(gains), *gains]))
-
-    def excite(
-        self, positions_rad: Sequence[float], torques_nm: Sequence[float], window_rad: float
-    ) -> NDArray[np.void]:
-        """Run the motion as fast as it computes."""
-        session = self.session
-        session.load_trajectory([*positions_rad, *torques_nm])
-        session.clear()
-        extent = [min(positions_rad), max(positions_rad)]
-        self._must(session.send(Op.REFERENCE, [ReferenceKind.EXCITE, len(positions_rad), *extent, window_rad]))
-        passed_s = 0.0
-        while session.cycle.reference.active:
-            session.run(_SLICE_S)
-            passed_s += _SLICE_S
-            self._watch(passed_s)
-        rows = moving(rows_of(session.raw))
-        try:
-            check_state(session.latest)
-        except AnswerIsNo as error:
-            raise MotionEnded(str(error), rows) from None
-        return rows
-
-    def disable(self) -> None:
-        """Switch off and let the drive see it."""
-        with contextlib.suppress(AnswerIsNo):
-            self.session.send(Op.DISABLE)
-            self.session.run(self.config.limits.ramp_down_s + 0.1)
-
-    def _must(self, refusal: Refusal) -> None:
-        if refusal != Refusal.DONE:
-            raise AnswerIsNo(f"the axis refused the experiment: {REFUSAL_TEXT[refusal]}")
-
-
-# The axis that a set is tried on: a small protocol, and the SYNC-stepped axis behind it.
-#
-# Under the deployment; `daemon_link` has the same for an axis under a running daemon.
-
-
-Rows = NDArray[np.void]
-#: Told how far a motion is, from 0 to 1.
-Tell = Callable[[float], None]
-
-#: After a change of the set, until its offset has faded out.
-FADE_S = 1.0
-_TRIAL_SLICE_S = 0.25
-#: The sines may be short by so many cycles at their ends and still be whole: a record of the first may be late.
-_CUT_CYCLES = 50
-
-
-class DeployLink(Protocol):
-    """An axis with a store of gain sets.
-
-    `attempt` and `run` raise AnswerIsNo when the axis drops out: that is an answer to the set that runs. Under a daemon
-    what is refused on an axis that stays enabled, and what does not reach it at all, raises Unreachable.
+    The sets are in the store `folder`/gains. The session was brought up with `initial`, or else without torque; where
+    the store has an active set already, `run_active` gives it to the loop.
     """
 
-    @property
-    def config(self) -> AxisConfig:
-        """Limits, period, filter and encoder of the axis."""
-        ...
+    #: Virtual time has no time of day: the same walk gives the same files, byte for byte.
+    offset_ns: int | None = 0
 
-    @property
-    def active(self) -> tuple[str, int]:
-        """Name and version of the set that runs."""
-        ...
-
-    @property
-    def enabled(self) -> bool:
-        """Whether the axis is enabled."""
-        ...
-
-    def enable(self) -> None:
-        """Enable under the active set."""
-        ...
-
-    def disable(self) -> None:
-        """Bring to rest and switch off; never raises."""
-        ...
-
-    def stop(self) -> None:
-        """Stop at once, whatever runs; never raises."""
-        ...
-
-    def run(self, motion: ValidationMotion, window_rad: float, tell: Tell) -> Rows:
-        """Run the motion from where the axis stands; all its cycles.
-
-        The sines end when the joint is further than `window_rad` from the reference. Nothing follows them then: a law
-        that lost the joint on a sine is given no step.
-        """
-        ...
-
-    def load(self, gains: GainSet) -> tuple[str, int]:
-        """Put a set into the store; its name and version there."""
-        ...
-
-    def attempt(self, name: str, version: int) -> None:
-        """Change to a stored set on trial: what is stored as active stays so. Back when its offset has faded out."""
-        ...
-
-    def keep(self, note: str, figures: dict[str, float]) -> None:
-        """Make the set on trial the active one."""
-        ...
-
-    def give_up(self, note: str, figures: dict[str, float]) -> None:
-        """Change back to the active set; nothing where no set is on trial."""
-        ...
-
-
-class SteppedDeployLink:
-    """The virtual axis in virtual time, with a store in a folder; `present` runs when the store has none active."""
-
-    def __init__(self, session: SteppedSession, store: GainStore, present: GainSet) -> None:
-        self.session, self._store = session, store
-        if store.active() is None:
-            stored = store.load(present.to_yaml(), present.name)
-            store.activate(stored.name, stored.version)
-        self._serial = 0
-        self._tried: StoredSet | None = None
-        self._change(self._active())
+    def __init__(self, session: SteppedSession, folder: Path, initial: GainSet | None = None) -> None:
+        """Raises BadInput when the folder cannot be used."""
+        self.session, self._slow = session, _InPlace()
+        folder.mkdir(parents=True, exist_ok=True)
+        file = folder / "initial.yaml"
+        file.write_text((initial or powerless()).to_yaml())
+        gains = session.config.gains.model_copy(update={"directory": folder / "gains", "initial": file})
+        # Nobody can be hurt: any set may run here, as with gains.accept_uncertified, also one of another loop.
+        self._bank = GainBank(session.config.model_copy(update={"gains": gains}), lambda _gains, _config: None)
+        file.unlink()  # it is in the store now
 
     @property
     def config(self) -> AxisConfig:
@@ -351,19 +219,27 @@ class SteppedDeployLink:
 
     @property
     def active(self) -> tuple[str, int]:
-        """The set on trial, or the store's active one."""
-        stored = self._tried or self._active()
-        return stored.name, stored.version
+        """The set that the loop was given last."""
+        return self._bank.newest.name, self._bank.newest.version
 
-    @property
-    def enabled(self) -> bool:
-        """Whether the axis is enabled."""
-        return self.session.cycle.axis.state == AxisState.ENABLED
+    def run_active(self) -> None:
+        """Give the loop the store's active set, as the one that it began with."""
+        gains, parameters = self._bank.newest.gains, self._bank.newest.gains.pack()
+        self._send(Op.ACTIVATE, (0, gains.law.number, len(parameters), *parameters)).result()
 
-    def enable(self) -> None:
-        """Enable, and let what is held come to rest."""
-        self.session.enable()
-        self.session.run(FADE_S)
+    def status(self) -> AxisStatus:
+        """As of the last cycle."""
+        cycle = self.session.cycle
+        moves, reference_rad = cycle.reference.active, cycle.reference.position_rad
+        return AxisStatus(cycle.axis.state.name, bool(moves), cycle.encoder_position_rad, reference_rad)
+
+    def truth(self) -> Truth:
+        """The joint itself, which no encoder shows."""
+        return self.session.world.truth()
+
+    def enable(self, reset_fault: bool = False) -> None:
+        """Enable, and wait for it."""
+        self.session.enable(reset_fault)
 
     def disable(self) -> None:
         """Ramp down and let the drive see it."""
@@ -373,68 +249,82 @@ class SteppedDeployLink:
         """The drive's quick stop."""
         self._off(Op.QUICK_STOP)
 
-    def run(self, motion: ValidationMotion, window_rad: float, tell: Tell) -> Rows:
-        """Run the motion as fast as it computes."""
-        self._must_be_enabled()
-        session, sines = self.session, motion.sines.tolist()
-        session.clear()
-        session.load_trajectory([*sines, *[0.0] * len(sines)])
-        self._move(ReferenceKind.EXCITE, [len(sines), min(sines), max(sines), window_rad], tell, motion)
-        if cut(np.frombuffer(session.raw, dtype=ROW), motion):
-            return np.frombuffer(session.raw, dtype=ROW)
-        for step_rad in (motion.step_rad, -motion.step_rad):
-            self._move(ReferenceKind.STEP, [step_rad, STEP_S], tell, motion)
-        return np.frombuffer(session.raw, dtype=ROW)
-
     def load(self, gains: GainSet) -> tuple[str, int]:
         """Put a set into the store."""
-        stored = self._store.load(gains.to_yaml(), gains.name)
-        return stored.name, stored.version
+        stored = finish(self._bank.load(GainsLoadArgs(name=gains.name, text=gains.to_yaml()), self._slow))
+        return stored["name"], stored["version"]
 
-    def attempt(self, name: str, version: int) -> None:
+    def activate(self, name: str, version: int) -> None:
         """Change to the set in the loop alone."""
-        self._tried = self._store.get(name, version)
-        self._change(self._tried)
-        self.session.run(FADE_S)
-        self._must_be_enabled()
+        args = GainsActivateArgs(name=name, version=version, trial=True)
+        finish(self._bank.activate(args, self._send, self._slow))
 
     def keep(self, note: str, figures: dict[str, float]) -> None:
         """Make the set on trial the store's active one."""
-        tried = self._tried
-        assert tried is not None  # `attempt` came before
-        self._store.activate(tried.name, tried.version, note, figures)
-        self._tried = None
+        finish(self._bank.keep(GainsVerdictArgs(note=note, figures=figures), self._send, self._slow))
 
     def give_up(self, note: str, figures: dict[str, float]) -> None:
         """The store's active set runs again."""
-        tried, self._tried = self._tried, None
-        if tried is None:
+        args = GainsVerdictArgs(note=note, figures=figures, trial=True)
+        finish(self._bank.rollback(args, self._send, self._slow))
+
+    def begin(self, motion: ReferenceMotion) -> None:
+        """Give the loop the command that the daemon would; the loop alone judges it."""
+        words = dict(motion.arguments)
+        positions_rad, torques_nm = words.pop(SampleKey.POSITIONS, None), words.pop(SampleKey.TORQUES, None)
+        args: TrackArgs = check_arguments(Verb.TRACK, words | {"uploaded": True})
+        table = args.table(Table(positions_rad, torques_nm))
+        self.session.load_trajectory(table.area())
+        refusal = self.session.send(Op.REFERENCE, args.reference(table))
+        if refusal != Refusal.DONE:
+            self._require_enabled()
+            raise AnswerIsNo(REFUSAL_TEXT[refusal])
+
+    def run(
+        self,
+        motion: ReferenceMotion,
+        watch: Watch | None = None,
+        look_s: float = LOOK_S,
+        each_cycle: Watch | None = None,
+    ) -> bytes:
+        """Run the motion as fast as it computes; `each_cycle` is told of every cycle."""
+        self.session.clear()
+        self.begin(motion)
+        passed_s = 0.0
+        while self.session.cycle.reference.active:
+            self._pass(passed_s, look_s, each_cycle)
+            passed_s += look_s
+            if watch:
+                watch(passed_s)
+        raw = self.session.raw
+        self._require_enabled(raw)
+        return raw
+
+    def wait(self, duration_s: float) -> None:
+        """Advance virtual time."""
+        self.session.run(duration_s)
+        self._require_enabled()
+
+    def _pass(self, passed_s: float, duration_s: float, each_cycle: Watch | None) -> None:
+        if each_cycle is None:
+            self.session.run(duration_s)
             return
-        self._change(self._active())
-        self._store.reject(tried.name, tried.version, note, figures)
+        period_s = self.session.cycle.period_ns / NS_PER_S
+        for count in range(1, round(duration_s / period_s) + 1):
+            self.session.run(period_s)
+            each_cycle(passed_s + count * period_s)
 
-    def _active(self) -> StoredSet:
-        stored = self._store.active()
-        assert stored is not None  # from the beginning on
-        return stored
+    def _send(self, op: Op, arguments: Sequence[float]) -> OrderWait:
+        """The bank's way to the loop, which has answered when this is back."""
+        self.session.send(op, arguments)
+        answer = OrderWait(int(self.session.latest.command_seq), 0)
+        answer.record = self.session.latest
+        return answer
 
-    def _change(self, stored: StoredSet) -> None:
-        self._serial += 1
-        parameters = stored.gains.pack()
-        _must(self.session.send(Op.ACTIVATE, [self._serial, stored.gains.law.number, len(parameters), *parameters]))
-
-    def _move(self, kind: ReferenceKind, arguments: Sequence[float], tell: Tell, motion: ValidationMotion) -> None:
-        session = self.session
-        _must(session.send(Op.REFERENCE, [kind, *arguments]))
-        while session.cycle.reference.active:
-            session.run(_TRIAL_SLICE_S)
-            tell(min(1.0, len(session.raw) // RECORD.size * motion.period_s / motion.duration_s))
-        self._must_be_enabled()
-
-    def _must_be_enabled(self) -> None:
+    def _require_enabled(self, raw: bytes = b"") -> None:
         state = self.session.cycle.axis.state
         if state != AxisState.ENABLED:
-            raise AnswerIsNo(f"the axis went to {state.name}. {self.session.why}")
+            raise AxisDropped(state.name, self.session.why, raw)
 
     def _off(self, op: Op) -> None:
         with contextlib.suppress(AnswerIsNo):
@@ -442,12 +332,19 @@ class SteppedDeployLink:
             self.session.run(self.config.limits.ramp_down_s + 0.1)
 
 
-def cut(rows: Rows, motion: ValidationMotion) -> bool:
-    """Whether the reference of `rows`, which hold the sines alone, ended before the sines did."""
-    ran = rows["cycle"][rows["reference_active"] == 1]
-    return len(ran) == 0 or int(ran[-1]) - int(ran[0]) < len(motion.sines) - _CUT_CYCLES
+class _InPlace(Executor):
+    """The bank's work on disk, done in the caller's thread."""
+
+    def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
+        """Do it now."""
+        future: Future[T] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
 
 
-def _must(refusal: Refusal) -> None:
-    if refusal != Refusal.DONE:
-        raise AnswerIsNo(f"the axis refused: {REFUSAL_TEXT[refusal]}")
+def powerless() -> GainSet:
+    """A PD controller with zero gains: what an axis without any tuning runs."""
+    return pd_set("powerless", 0.0, 0.0)

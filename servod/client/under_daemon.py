@@ -1,34 +1,25 @@
-"""A motion under a running daemon's recorder, for clients: whatever ends it, the axis is stopped before all else.
+"""The axis under a running daemon, over its socket: whatever ends a motion, the axis is stopped before all else.
 
-Beside servod.client.control. An interrupt may cut a request in the middle, and with it the connection that the client
+Above servod.client.control. An interrupt may cut a request in the middle, and with it the connection that the client
 commands on; the daemon takes a stop from anybody, so that it goes out on a connection of its own.
 """
 
 from __future__ import annotations
 
 import contextlib
-import datetime
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from servod.client.axis import MotionEnded, moving
+from servod.client.axis import LOOK_S, AxisDropped, AxisStatus, ReferenceMotion, Watch
 from servod.client.control import ControlClient, Refused
-from servod.client.stepped import FADE_S, Rows, Tell, cut
 from servod.common.errors import AnswerIsNo, BadInput, ServodError, Unreachable
 from servod.common.yaml import parse_yaml, validate
 from servod.formats.config import AxisConfig
-from servod.formats.gains.gain_set import GainSet, Provenance
-from servod.formats.gains.parameters import PdParameters
+from servod.formats.gains.gain_set import GainSet
 from servod.formats.protocol import Verb
 from servod.formats.recording.mcap_reader import read_recording
-from servod.lab.identify.trace import rows_of
-from servod.lab.recordings.recording import ROW
-from servod.lab.verify.validation import STEP_S, ValidationMotion
 
 
 def quick_stop(client: ControlClient) -> None:
@@ -106,104 +97,33 @@ def _values(section: dict[str, Any], above: str = "") -> Iterator[tuple[str, Any
             yield f"{above}{key}", value
 
 
-# The link to an axis under a running daemon: its verbs over the control socket, its recordings from disk.
+# The axis under a running daemon: its verbs over the control socket, its recordings from disk.
 #
-# Beside `links`, which states the protocol. The daemon's own limits, lease and heartbeats guard everything that is
-# done.
+# The daemon's own limits, lease and heartbeats guard everything that is done. The trial is its own as well: when this
+# client dies in the middle, the daemon goes back to the set of before by itself.
 
 
-#: Name of the gain set that experiments run under, in the daemon's store.
-GAIN_NAME = "identify_pd"
 _POLL_S = 0.05
 
 
-class DaemonLink:
-    """An axis on the wall clock. The feedback of the experiments is only on trial: afterwards, also when this client
-    dies, the gain set of before runs again and is still the stored active one.
-    """
+class DaemonAxis:
+    """servod.client.axis.AxisClient on the wall clock."""
 
     offset_ns: int | None = None
 
-    def __init__(self, client: ControlClient, config: AxisConfig) -> None:
-        """`config` must be the file that the daemon was started with. Raises BadInput, naming the first other key."""
-        require_daemon_config(client, config)
-        self._client, self.config = client, config
-
-    def enable(self) -> float:
-        """Enable with zero gains."""
-        self.set_gains(0.0, 0.0)
-        self._client.call(Verb.ENABLE)
-        return float(self._client.call(Verb.STATUS)["motion"]["position_rad"])
-
-    def set_gains(self, position_nm_per_rad: float, velocity_nms_per_rad: float) -> None:
-        """Load a PD set and run it on trial; the daemon must accept sets without a certificate for this."""
-        parameters = PdParameters(
-            law="pd",
-            position_gain_nm_per_rad=position_nm_per_rad,
-            velocity_gain_nms_per_rad=velocity_nms_per_rad,
-            feedforward_inertia_kg_m2=0.0,
-        )
-        source = Provenance(
-            author="servod", date=datetime.datetime.now(tz=datetime.UTC).date(), tool="servoctl identify"
-        )
-        gains = GainSet(schema_version=1, name=GAIN_NAME, parameters=parameters, provenance=source)
-        self._client.call(Verb.GAINS_LOAD, name=GAIN_NAME, text=gains.to_yaml())
-        self._client.call(Verb.GAINS_ACTIVATE, name=GAIN_NAME, trial=True)
-
-    def excite(
-        self, positions_rad: Sequence[float], torques_nm: Sequence[float], window_rad: float
-    ) -> NDArray[np.void]:
-        """Run the motion under the daemon's recorder and read its cycles back.
-
-        An interrupt stops the axis before anything else is waited for.
+    def __init__(self, client: ControlClient, config: AxisConfig | None = None) -> None:
+        """`config` must be the file that the daemon was started with; without one its own is asked for when it is
+        wanted. Raises BadInput, naming the first other key.
         """
-        with recording(self._client) as path:
-            self._client.call(
-                Verb.TRACK,
-                kind="excite",
-                positions_rad=list(positions_rad),
-                torques_nm=list(torques_nm),
-                window_rad=window_rad,
-            )
-            ended = self._wait()
-        rows = moving(rows_of(read_recording(path).rows))
-        if ended:
-            raise MotionEnded(ended, rows)
-        return rows
+        self._client, self._config = client, config
+        if config is not None:
+            require_daemon_config(client, config)
 
-    def disable(self) -> None:
-        """Ask for it, and for the set of before; an axis that is off already, or a daemon that is gone, needs none."""
-        switch_off(self._client)
-        with contextlib.suppress(ServodError):
-            self._client.call(Verb.GAINS_ROLLBACK, trial=True, note="the feedback of experiments, which are over")
-
-    def _wait(self) -> str:
-        """Wait for the end of the motion; returns why it ended early, empty when it did not."""
-        while True:
-            time.sleep(_POLL_S)
-            status = self._client.call(Verb.STATUS)
-            if status["axis"]["state"] != "ENABLED":
-                return f"the experiment ended with the axis in {status['axis']['state']}. {_why(status)}"
-            if not status["axis"]["motion_running"]:
-                return ""
-
-
-def _why(status: dict[str, Any]) -> str:
-    return "; ".join(f"{f['code']}: {f['cause']} {f['remedy']}" for f in status["faults"])
-
-
-# The link to an axis under a running daemon: its verbs over the control socket, its recordings from disk.
-#
-# Beside `links`, which states the protocol. The trial is the daemon's own: when this client dies in the middle, the
-# daemon goes back to the set of before by itself.
-
-
-class DaemonDeployLink:
-    """An axis on the wall clock; its configuration is what the daemon attaches to its recordings."""
-
-    def __init__(self, client: ControlClient) -> None:
-        self._client = client
-        self.config = daemon_config(client)
+    @property
+    def config(self) -> AxisConfig:
+        """The file's, or what the daemon attaches to its recordings."""
+        self._config = self._config or daemon_config(self._client)
+        return self._config
 
     @property
     def active(self) -> tuple[str, int]:
@@ -213,15 +133,16 @@ class DaemonDeployLink:
             raise AnswerIsNo("the daemon's gain set is not in its store")
         return str(running["name"]), int(running["version"])
 
-    @property
-    def enabled(self) -> bool:
-        """Whether the axis is enabled."""
-        return bool(self._client.call(Verb.STATUS)["axis"]["state"] == "ENABLED")
+    def status(self) -> AxisStatus:
+        """What `status` says."""
+        document = self._client.call(Verb.STATUS)
+        axis, motion = document["axis"], document["motion"]
+        at_rad, reference_rad = float(motion["position_rad"]), float(motion["reference_rad"])
+        return AxisStatus(str(axis["state"]), bool(axis["motion_running"]), at_rad, reference_rad)
 
-    def enable(self) -> None:
-        """Enable, and let what is held come to rest."""
-        self._client.call(Verb.ENABLE)
-        time.sleep(FADE_S)
+    def enable(self, reset_fault: bool = False) -> None:
+        """Enable, and wait for it."""
+        self._client.call(Verb.ENABLE, reset_fault=reset_fault)
 
     def disable(self) -> None:
         """Ask for it; an axis that is off already, or a daemon that is gone, needs none."""
@@ -231,45 +152,14 @@ class DaemonDeployLink:
         """The drive's quick stop, on a connection of its own: an interrupt may have cut a request on the other."""
         quick_stop(self._client)
 
-    def run(self, motion: ValidationMotion, window_rad: float, tell: Tell) -> Rows:
-        """Run the motion under the daemon's recorder and read its cycles back."""
-        sines, started = motion.sines.tolist(), time.monotonic()
-        excite = {"kind": "excite", "positions_rad": sines, "torques_nm": [0.0] * len(sines), "window_rad": window_rad}
-        steps = [
-            {"kind": "step", "amplitude_rad": step_rad, "duration_s": STEP_S}
-            for step_rad in (motion.step_rad, -motion.step_rad)
-        ]
-
-        def told() -> None:
-            tell(min(1.0, (time.monotonic() - started) / motion.duration_s))
-
-        rows = self.record([excite], told)
-        return rows if cut(rows, motion) else np.concatenate([rows, self.record(steps, told)])
-
-    def record(self, motions: Sequence[dict[str, Any]], tell: Callable[[], None] = lambda: None) -> Rows:
-        """Run motions (arguments of the verb `track`) one after the other; all cycles from the daemon's recording.
-
-        Raises AnswerIsNo when the axis drops out or has done so, Refused or BadInput when the daemon does not take on
-        a motion of an axis that is enabled. An interrupt stops the axis before anything else is waited for.
-        """
-        with recording(self._client) as path:
-            for motion in motions:
-                self._begin(motion)
-                while self._moves():
-                    tell()
-        return np.frombuffer(read_recording(path).rows, dtype=ROW)
-
     def load(self, gains: GainSet) -> tuple[str, int]:
         """Put a set into the daemon's store."""
         stored = self._client.call(Verb.GAINS_LOAD, name=gains.name, text=gains.to_yaml())
         return str(stored["name"]), int(stored["version"])
 
-    def attempt(self, name: str, version: int) -> None:
-        """Change to a stored set on trial. Raises AnswerIsNo when the axis drops out under it at once."""
+    def activate(self, name: str, version: int) -> None:
+        """Change to a stored set on trial; one without a certificate must be accepted by the daemon."""
         self._client.call(Verb.GAINS_ACTIVATE, name=name, version=version, trial=True)
-        faded = time.monotonic() + FADE_S
-        while time.monotonic() < faded:
-            self._moves()
 
     def keep(self, note: str, figures: dict[str, float]) -> None:
         """Make the set on trial the active one."""
@@ -279,23 +169,48 @@ class DaemonDeployLink:
         """Change back to the active set."""
         self._client.call(Verb.GAINS_ROLLBACK, note=note, figures=figures, trial=True)
 
-    def _begin(self, motion: dict[str, Any]) -> None:
+    def begin(self, motion: ReferenceMotion) -> None:
         """Start a motion. What the daemon refuses because the axis has dropped out is the axis's answer."""
         try:
-            self._client.call(Verb.TRACK, **motion)
+            self._client.call(Verb.TRACK, **motion.arguments)
         except Refused:
-            self._status_while_enabled()
+            self._moves()
             raise
 
-    def _moves(self) -> bool:
-        """Wait a little; whether the motion still runs. Raises AnswerIsNo when the axis is not enabled any more."""
-        time.sleep(_POLL_S)
-        return bool(self._status_while_enabled()["axis"]["motion_running"])
+    def run(self, motion: ReferenceMotion, watch: Watch | None = None, look_s: float = LOOK_S) -> bytes:
+        """Run the motion under the daemon's recorder and read its cycles back; it is looked at more often than asked.
 
-    def _status_while_enabled(self) -> dict[str, Any]:
-        """The status document. Raises AnswerIsNo with the faults when the axis is not enabled any more."""
+        An interrupt stops the axis before anything else is waited for.
+        """
+        started, dropped = time.monotonic(), None
+        with recording(self._client) as path:
+            try:
+                self.begin(motion)
+                while self._moves_on():
+                    if watch:
+                        watch(time.monotonic() - started)
+            except AxisDropped as error:
+                dropped = error
+        raw = bytes(read_recording(path).rows)
+        if dropped:
+            raise AxisDropped(dropped.state, dropped.why, raw)
+        return raw
+
+    def wait(self, duration_s: float) -> None:
+        """Let time pass, and look on."""
+        until = time.monotonic() + duration_s
+        while time.monotonic() < until:
+            self._moves_on()
+
+    def _moves_on(self) -> bool:
+        """Wait a little; then as `_moves`."""
+        time.sleep(_POLL_S)
+        return self._moves()
+
+    def _moves(self) -> bool:
+        """Whether a motion runs. Raises AxisDropped with the faults when the axis is not enabled any more."""
         status = self._client.call(Verb.STATUS)
         if status["axis"]["state"] != "ENABLED":
             why = "; ".join(f"{f['code']}: {f['cause']} {f['remedy']}" for f in status["faults"])
-            raise AnswerIsNo(f"the axis went to {status['axis']['state']}. {why}")
-        return status
+            raise AxisDropped(status["axis"]["state"], why)
+        return bool(status["axis"]["motion_running"])

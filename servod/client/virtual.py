@@ -5,17 +5,14 @@ Behind `--plant`. Only the size of the drive is taken from the plant; everything
 
 from __future__ import annotations
 
-import datetime
 from pathlib import Path
 
-from servod.client.stepped import SteppedDeployLink, SteppedSession
+from servod.client.stepped import SteppedAxis, SteppedSession
 from servod.common.yaml import validate
 from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.drivers.virtual.world import SteppedWorld
 from servod.formats.config import AxisConfig
-from servod.formats.gains.gain_set import GainSet, Provenance
-from servod.formats.gains.parameters import PdParameters
-from servod.formats.gains.store import GainStore
+from servod.formats.gains.gain_set import GainSet
 from servod.formats.model.axis_model import AxisModel
 from servod.kernels.laws import LAWS
 
@@ -101,12 +98,7 @@ def _devices(config: AxisConfig, rated_mnm: int, encoder_counts: int | None, see
     )
 
 
-# A virtual axis to deploy on, SYNC-stepped, with the encoder and the velocity filter that the set was designed for.
-#
-# Beside `links`; behind `servoctl deploy --plant`, the commissioning walk and tests.
-
-
-def virtual_link(
+def axis_for_set(
     plant: AxisModel,
     folder: Path,
     wanted: GainSet,
@@ -114,7 +106,7 @@ def virtual_link(
     seed: int = 1,
     config: AxisConfig | None = None,
     settings: VirtualAxisSettings | None = None,
-) -> SteppedDeployLink:
+) -> SteppedAxis:
     """A disabled axis whose store in `folder` holds `present` (a controller without torque unless given).
 
     A `config` of the user's stays as it is; without one the axis gets the encoder and filter of `wanted`. `settings`
@@ -126,28 +118,12 @@ def virtual_link(
         config = virtual_config(folder, rated_torque_mnm(plant), counts)
         config = with_cutoff(config, design.velocity_cutoff_hz) if design else config
     session = virtual_session(plant, folder, config.encoder.counts_per_turn, seed, config, settings)
-    return SteppedDeployLink(session, GainStore(folder / "gains"), present or powerless())
+    axis = SteppedAxis(session, folder, present)
+    axis.run_active()
+    return axis
 
 
 def with_cutoff(config: AxisConfig, cutoff_hz: float) -> AxisConfig:
     """The configuration with another velocity filter."""
     encoder = config.encoder.model_copy(update={"velocity_cutoff_hz": cutoff_hz})
     return config.model_copy(update={"encoder": encoder})
-
-
-def powerless() -> GainSet:
-    """A PD controller with zero gains: what an axis without any tuning runs."""
-    return pd_set("powerless", 0.0, 0.0)
-
-
-def pd_set(name: str, position_nm_per_rad: float, velocity_nms_per_rad: float) -> GainSet:
-    """A PD gain set made by the tool."""
-    parameters = PdParameters(
-        law="pd",
-        position_gain_nm_per_rad=position_nm_per_rad,
-        velocity_gain_nms_per_rad=velocity_nms_per_rad,
-        feedforward_inertia_kg_m2=0.0,
-    )
-    today = datetime.datetime.now(tz=datetime.UTC).date()
-    source = Provenance(author="servod", date=today, tool="servoctl deploy")
-    return GainSet(schema_version=1, name=name, parameters=parameters, provenance=source)

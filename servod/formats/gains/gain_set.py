@@ -22,7 +22,7 @@ from servod.common.units import NS_PER_S, NS_PER_US
 from servod.common.yaml import Dumper, Strict, parse_yaml, read_text, validate
 from servod.formats.config import AxisConfig
 from servod.formats.gains.design import Design
-from servod.formats.gains.parameters import LocalSet, Parameters
+from servod.formats.gains.parameters import LocalSet, Parameters, PdParameters
 from servod.formats.model.axis_model import load_axis_model
 from servod.kernels.laws import LAWS, Law
 
@@ -326,3 +326,17 @@ def _require_delay(where: str, design: Design, config: AxisConfig) -> None:
             design.model.total_delay_s,
             f"{found:g}, as in {config.model}",
         )
+
+
+def pd_set(
+    name: str, position_nm_per_rad: float, velocity_nms_per_rad: float, tool: str = "servoctl deploy"
+) -> GainSet:
+    """A PD gain set made by a tool, without a design."""
+    parameters = PdParameters(
+        law="pd",
+        position_gain_nm_per_rad=position_nm_per_rad,
+        velocity_gain_nms_per_rad=velocity_nms_per_rad,
+        feedforward_inertia_kg_m2=0.0,
+    )
+    source = Provenance(author="servod", date=datetime.datetime.now(tz=datetime.UTC).date(), tool=tool)
+    return GainSet(schema_version=1, name=name, parameters=parameters, provenance=source)

@@ -14,7 +14,6 @@ from typing import Any, TypeVar
 from zipfile import BadZipFile
 
 import numpy as np
-from numpy.typing import NDArray
 
 from servod.client.open import VirtualWalkAxis
 from servod.common.errors import AnswerIsNo, BadInput
@@ -26,7 +25,7 @@ from servod.formats.recording.mcap_writer import McapFile, split_rows
 from servod.lab.commission.state import RUNS, digest, write_json
 from servod.lab.commission.state import read_walk_json as read_json
 from servod.lab.commission.walk import Tell, Walk
-from servod.lab.recordings.recording import ROW
+from servod.lab.recordings.recording import Rows, rows_of
 from servod.lab.tracking.metrics import Curves
 from servod.lab.tracking.stepped import measure
 
@@ -57,7 +56,7 @@ def run_jobs(
 # Under the steps; the report reads them back.
 
 
-def save_rows(path: Path, rows: NDArray[np.void]) -> None:
+def save_rows(path: Path, rows: Rows) -> None:
     """Cycle records as a recording, in place of an earlier one. Raises BadInput."""
     aside = path.with_name(path.name + ".part")
     try:
@@ -71,9 +70,9 @@ def save_rows(path: Path, rows: NDArray[np.void]) -> None:
         raise unwritable(path, error) from None
 
 
-def load_rows(path: Path) -> NDArray[np.void]:
+def load_rows(path: Path) -> Rows:
     """Cycle records of a recording. Raises BadInput."""
-    return np.frombuffer(read_recording(path).rows, dtype=ROW)
+    return rows_of(read_recording(path).rows)
 
 
 def save_curves(path: Path, curves: dict[str, Curves]) -> None:
@@ -150,7 +149,7 @@ def _measure(
     """In a worker: one law over the whole CAN loop; of one that the axis drops out under only that is told."""
     with tempfile.TemporaryDirectory(prefix="servod-commission-") as folder:
         try:
-            found = measure(lambda: axis.open_session(Path(folder), cutoff_hz, seed), load_gains(gains))
+            found = measure(lambda: axis.for_tracking(Path(folder), cutoff_hz, seed), load_gains(gains))
         except AnswerIsNo as error:
             document: dict[str, Any] = {
                 "rms_error_mrad": None,

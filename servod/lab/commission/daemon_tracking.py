@@ -10,12 +10,13 @@ import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from servod.client.axis import AxisClient, ReferenceMotion
 from servod.client.control import ControlClient, Refused, RemoteBadInput
-from servod.client.under_daemon import DaemonDeployLink, require_daemon_config
+from servod.client.under_daemon import DaemonAxis, require_daemon_config
 from servod.common.errors import AnswerIsNo
 from servod.formats.config import AxisConfig
 from servod.formats.gains.gain_set import GainSet
-from servod.lab.tracking.metrics import HOLD_S, PAPER_S, STEPS_MRAD, Curves, Tracking, known_noise, tracking
+from servod.lab.tracking.metrics import HOLD_S, PAPER_S, REST_S, STEPS_MRAD, Curves, Tracking, known_noise, tracking
 from servod.lab.tracking.stepped import curves_of
 
 
@@ -34,10 +35,10 @@ def measure_on_daemon(
     """
     with ControlClient(socket) as client:
         require_daemon_config(client, config)
-        link = DaemonDeployLink(client)
-        _require_active(link, deployed)
-        with _enabled(link):
-            curves, refused = _recorded(client, link, tell)
+        axis = DaemonAxis(client)
+        _require_active(axis, deployed)
+        with _enabled(axis):
+            curves, refused = _recorded(axis, tell)
     if "paper" not in curves:
         return None, refused
     steps = {mrad: curves[f"{mrad:g}"] for mrad in STEPS_MRAD if f"{mrad:g}" in curves}
@@ -47,36 +48,33 @@ def measure_on_daemon(
 
 
 @contextlib.contextmanager
-def _enabled(link: DaemonDeployLink) -> Iterator[None]:
+def _enabled(axis: AxisClient) -> Iterator[None]:
     """The axis enabled for what is measured, and as it was behind it; stopped before anything else when that fails."""
-    was_enabled = link.enabled
+    was_enabled = axis.status().enabled
     try:
         if not was_enabled:
-            link.enable()
+            axis.enable()
+            axis.wait(REST_S)
         yield
     except BaseException:
-        link.stop()
+        axis.stop()
         raise
     finally:
         if not was_enabled:
-            link.disable()
+            axis.disable()
 
 
-def _recorded(
-    client: ControlClient, link: DaemonDeployLink, tell: Callable[[float], None]
-) -> tuple[dict[str, Curves], list[str]]:
+def _recorded(axis: AxisClient, tell: Callable[[float], None]) -> tuple[dict[str, Curves], list[str]]:
     """Curves by motion, "paper" or a step's size in mrad, and the motions that the daemon refused with its reason."""
-    motions = {"paper": {"kind": "paper", "duration_s": PAPER_S}}
-    motions |= {
-        f"{mrad:g}": {"kind": "step", "amplitude_rad": 1e-3 * mrad, "duration_s": HOLD_S} for mrad in STEPS_MRAD
-    }
+    motions = {"paper": ReferenceMotion.paper(PAPER_S)}
+    motions |= {f"{mrad:g}": ReferenceMotion.step(1e-3 * mrad, HOLD_S) for mrad in STEPS_MRAD}
     curves: dict[str, Curves] = {}
     refused: list[str] = []
     for index, (name, motion) in enumerate(motions.items()):
         tell(index / len(motions))
-        start_rad = float(client.call("status")["motion"]["reference_rad"])
+        start_rad = axis.status().reference_rad
         try:
-            curves[name] = curves_of(link.record([motion]).tobytes(), start_rad)
+            curves[name] = curves_of(axis.run(motion), start_rad)
         except (
             Refused,
             RemoteBadInput,
@@ -85,11 +83,11 @@ def _recorded(
     return curves, refused
 
 
-def _require_active(link: DaemonDeployLink, deployed: tuple[str, int]) -> None:
+def _require_active(axis: AxisClient, deployed: tuple[str, int]) -> None:
     """What is measured is what was deployed. Raises AnswerIsNo."""
-    if link.active == deployed:
+    if axis.active == deployed:
         return
-    (runs, runs_version), (name, version) = link.active, deployed
+    (runs, runs_version), (name, version) = axis.active, deployed
     raise AnswerIsNo(
         f"the axis runs {runs} version {runs_version}, but {name} version {version} was deployed; to measure that, "
         f"`servoctl gains activate {name} --version {version}`"

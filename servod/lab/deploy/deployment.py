@@ -1,7 +1,7 @@
 """The trial of a gain set on an axis: the same motion before and after the change, a verdict, and the way back.
 
-Above link and judge. However it ends (verdict, fault, Ctrl-C), the set that runs afterwards is one that was meant to:
-the new one when it proved itself, else the one of before.
+Above the axis and the judge. However it ends (verdict, fault, Ctrl-C), the set that runs afterwards is one that was
+meant to: the new one when it proved itself, else the one of before.
 """
 
 from __future__ import annotations
@@ -11,14 +11,15 @@ from collections.abc import Callable
 
 import numpy as np
 
-from servod.client.stepped import DeployLink, Rows
+from servod.client.axis import AxisClient, ReferenceMotion
 from servod.common.errors import AnswerIsNo, BadInput, ServodError
 from servod.formats.config import AxisConfig
 from servod.formats.gains.design import Design
 from servod.formats.gains.gain_set import GainSet, Promise, require_certificate, require_same_loop
 from servod.lab.deploy.judge import complaints, every_cycle, limits_met, motions_in, skipped
 from servod.lab.deploy.outcome import Before, Deployment, Ending
-from servod.lab.verify.validation import Figures, ValidationMotion, motion_for
+from servod.lab.recordings.recording import Rows, rows_of
+from servod.lab.verify.validation import STEP_S, Figures, ValidationMotion, motion_for
 
 #: Told what is done, and the share of the whole that is.
 Tell = Callable[[str, float], None]
@@ -30,6 +31,12 @@ _ENDINGS = {
     (True, True): Ending.CONFIRMED,
     (True, False): Ending.DOUBTED,
 }
+#: After a change of the set, until its offset has faded out.
+FADE_S = 1.0
+#: Between two looks at a motion in virtual time.
+_LOOK_S = 0.25
+#: The sines may be short by so many cycles at their ends and still be whole: a record of the first may be late.
+_CUT_CYCLES = 50
 #: Characters of a note in the store's history.
 _LONGEST_NOTE = 4000
 #: The joint may be so many times the motion's travel away from the reference; at most this share of the limit.
@@ -37,7 +44,7 @@ WINDOW_TRAVELS, WINDOW_SHARE = 3.0, 0.85
 
 
 def deploy(
-    link: DeployLink,
+    axis: AxisClient,
     gains: GainSet,
     tell: Tell,
     earlier: Before | None = None,
@@ -53,23 +60,24 @@ def deploy(
     does not get through the motion under its present set. An interrupt stops the axis, leaves it off and the present
     set active.
     """
-    design, promised = admitted(gains, link.config)
+    design, promised = admitted(gains, axis.config)
     motion = motion_for(design)
-    window_rad = min(WINDOW_TRAVELS * motion.travel_rad, WINDOW_SHARE * link.config.limits.following_error_rad)
-    was_enabled = link.enabled
-    trial = _Trial(link, motion, window_rad, promised, tell)
+    window_rad = min(WINDOW_TRAVELS * motion.travel_rad, WINDOW_SHARE * axis.config.limits.following_error_rad)
+    was_enabled = axis.status().enabled
+    trial = _Trial(axis, motion, window_rad, promised, tell)
     try:
         if not was_enabled:
             tell("enable", 0.0)
-            link.enable()
+            axis.enable()
+            axis.wait(FADE_S)
         return trial.run(gains, earlier, remember)
     except BaseException as error:
-        link.stop()
+        axis.stop()
         trial.abandon(str(error) if isinstance(error, ServodError) else "it was interrupted")
         raise
     finally:
         if not was_enabled:
-            link.disable()
+            axis.disable()
 
 
 def admitted(gains: GainSet, config: AxisConfig, where: str | None = None) -> tuple[Design, Promise]:
@@ -102,16 +110,16 @@ class _Trial:
     """One trial: what it has done so far, so that it can be undone at any moment."""
 
     def __init__(
-        self, link: DeployLink, motion: ValidationMotion, window_rad: float, promised: Promise, tell: Tell
+        self, axis: AxisClient, motion: ValidationMotion, window_rad: float, promised: Promise, tell: Tell
     ) -> None:
-        self._link, self._motion, self._window_rad = link, motion, window_rad
+        self._axis, self._motion, self._window_rad = axis, motion, window_rad
         self._promised, self._tell = promised, tell
-        self._count_rad = 2.0 * np.pi / link.config.encoder.counts_per_turn
+        self._count_rad = 2.0 * np.pi / axis.config.encoder.counts_per_turn
         self._on_trial = False
 
     def run(self, gains: GainSet, earlier: Before | None, remember: Callable[[Before], None]) -> Deployment:
         """Before, change, after, verdict."""
-        present, (name, version) = self._link.active, self._link.load(gains)
+        present, (name, version) = self._axis.active, self._axis.load(gains)
         ran_already = present == (name, version)
         ran_before, before = self._before(present, earlier, ran_already)
         if ran_before and not ran_already:
@@ -136,7 +144,7 @@ class _Trial:
         if self._on_trial:
             self._on_trial = False
             with contextlib.suppress(ServodError):
-                self._link.give_up(why[:_LONGEST_NOTE], {})
+                self._axis.give_up(why[:_LONGEST_NOTE], {})
 
     def _before(
         self, present: tuple[str, int], earlier: Before | None, ran_already: bool
@@ -153,7 +161,8 @@ class _Trial:
             if change:
                 self._tell("change of the set", 0.48)
                 self._on_trial = True
-                self._link.attempt(*change)
+                self._axis.activate(*change)
+                self._axis.wait(FADE_S)
             rows = self._move("under the new set", 0.52)
         except AnswerIsNo as error:
             return None, None, [str(error)]
@@ -172,14 +181,16 @@ class _Trial:
         if not self._on_trial:
             return
         if reasons:
-            self._link.give_up("; ".join(reasons)[:_LONGEST_NOTE], figures)
+            self._axis.give_up("; ".join(reasons)[:_LONGEST_NOTE], figures)
         else:
-            self._link.keep("proven by the validation motion", figures)
+            self._axis.keep("proven by the validation motion", figures)
         self._on_trial = False
 
     def _move(self, what: str, share: float) -> Rows:
         self._tell(what, share)
-        return self._link.run(self._motion, self._window_rad, lambda done: self._tell(what, share + 0.43 * done))
+        return run_validation(
+            self._axis, self._motion, self._window_rad, lambda done: self._tell(what, share + 0.43 * done)
+        )
 
     def _figures(self, rows: Rows) -> Figures:
         """Raises AnswerIsNo when the motion was not run to its end."""
@@ -191,3 +202,32 @@ class _Trial:
             raise AnswerIsNo(
                 f"the joint left its window of {1e3 * self._window_rad:.3g} mrad around the reference"
             ) from None
+
+
+def run_validation(
+    axis: AxisClient, motion: ValidationMotion, window_rad: float, tell: Callable[[float], None] = lambda _done: None
+) -> Rows:
+    """Run the motion from where the axis stands; all its cycles. `tell` gets the share that is done.
+
+    The sines end when the joint is further than `window_rad` from the reference. Nothing follows them then: a law that
+    lost the joint on a sine is given no step.
+    """
+    before_s = 0.0
+
+    def watch(passed_s: float) -> None:
+        tell(min(1.0, (before_s + passed_s) / motion.duration_s))
+
+    sines = motion.sines.tolist()
+    rows = rows_of(axis.run(ReferenceMotion.excite(sines, [0.0] * len(sines), window_rad), watch, _LOOK_S))
+    if cut(rows, motion):
+        return rows
+    for step_rad in (motion.step_rad, -motion.step_rad):
+        before_s = len(rows) * motion.period_s
+        rows = np.concatenate([rows, rows_of(axis.run(ReferenceMotion.step(step_rad, STEP_S), watch, _LOOK_S))])
+    return rows
+
+
+def cut(rows: Rows, motion: ValidationMotion) -> bool:
+    """Whether the reference of `rows`, which hold the sines alone, ended before the sines did."""
+    ran = rows["cycle"][rows["reference_active"] == 1]
+    return len(ran) == 0 or int(ran[-1]) - int(ran[0]) < len(motion.sines) - _CUT_CYCLES

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from servod.client.stepped import Rows
 from servod.common.faults import FAULTS, Reaction, faults_in
 from servod.formats.gains.gain_set import Promise
+from servod.lab.recordings.recording import Rows
 from servod.lab.verify.validation import PART_TEXT, Figures, Part
 
 #: Worse than before: above its mean by this share, by so many of its standard errors, and by some encoder counts. The
@@ -85,7 +85,7 @@ def _mrad(value_rad: float) -> str:
 
 # What the cycles of a trial say beside its figures: where motions ran, what was limited, what the loop skipped.
 #
-# Between a link's rows and the verdict.
+# Between an axis's rows and the verdict.
 
 
 #: A value that is limited in no more than this share of the sines' cycles says nothing against a set: one cycle in a

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
-from servod.client.stepped import Rows
 from servod.formats.gains.gain_set import Promise
 from servod.lab.deploy.judge import promise_document
+from servod.lab.recordings.recording import Rows
 from servod.lab.verify.validation import Figures
 
 

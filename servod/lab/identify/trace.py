@@ -1,6 +1,6 @@
 """One experiment's recording as arrays, and the list of all of them: what every fit takes.
 
-Between the links (which move the axis), the recordings on disk, and the fits.
+Between the axis, the recordings on disk, and the fits.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import convolve1d
 
-from servod.lab.recordings.recording import ROW
+from servod.lab.recordings.recording import Rows
 
 Array = NDArray[np.float64]
 
@@ -57,7 +57,7 @@ class Trace:
         return len(self.t_s)
 
 
-def trace_of(kind: Kind, rows: NDArray[np.void], settings: dict[str, float]) -> Trace:
+def trace_of(kind: Kind, rows: Rows, settings: dict[str, float]) -> Trace:
     """The trace in cycle records (dtype servod.lab.recordings.recording.ROW)."""
     time_ns = rows["time_ns"]
     return Trace(
@@ -71,11 +71,6 @@ def trace_of(kind: Kind, rows: NDArray[np.void], settings: dict[str, float]) -> 
         rows["motor_position_rad"].copy(),
         settings,
     )
-
-
-def rows_of(raw: bytes | bytearray) -> NDArray[np.void]:
-    """Packed cycle records as structured rows."""
-    return np.frombuffer(bytes(raw), dtype=ROW)
 
 
 # Recorded signals made ready for regressions: torque shifted by the delay, position smoothed and differentiated.

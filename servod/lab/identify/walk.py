@@ -5,6 +5,7 @@ Above experiments and fits. The axis is switched off however the walk ends, Ctrl
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 from collections.abc import Callable
@@ -13,13 +14,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from servod.client.axis import Link
+from servod.client.axis import AxisClient
+from servod.common.errors import ServodError
 from servod.formats.config import AxisConfig
 from servod.lab.identify import store
 from servod.lab.identify.analysis import Analysis, analyse, break_away_rad, of_kind
 from servod.lab.identify.bounds import CAREFUL, STIFF, bounds_from, feedback
 from servod.lab.identify.experiments import break_away, friction_map, kick, presliding, response
-from servod.lab.identify.experiments.common import Bench
+from servod.lab.identify.experiments.common import Bench, enable_powerless
 from servod.lab.identify.fits import break_away as break_away_fit
 from servod.lab.identify.fits import kick as kick_fit
 from servod.lab.identify.fits import presliding as presliding_fit
@@ -37,7 +39,7 @@ UNKNOWN_DELAY_S = 1e-3
 
 
 def identify(
-    link: Link,
+    axis: AxisClient,
     out: Path,
     tell: Tell,
     *,
@@ -54,18 +56,20 @@ def identify(
     is identified, too; what is not taken up again the first new recording sets aside within `out`. Raises AnswerIsNo
     when the axis refuses, faults, is wired wrongly, or tells nothing.
     """
-    conditions = _conditions(link.config, travel_rad, speed_rad_s, seed, subject)
-    recordings = store.Recordings(out, conditions, resume, link.offset_ns)
+    conditions = _conditions(axis.config, travel_rad, speed_rad_s, seed, subject)
+    recordings = store.Recordings(out, conditions, resume, axis.offset_ns)
     taken_up = recordings.start_rad is not None
     try:
-        start_rad = link.enable() if recordings.start_rad is None else recordings.start_rad
+        start_rad = enable_powerless(axis) if recordings.start_rad is None else recordings.start_rad
         recordings.begin(start_rad)
-        bounds = bounds_from(link.config.limits, start_rad, travel_rad, speed_rad_s)
+        bounds = bounds_from(axis.config.limits, start_rad, travel_rad, speed_rad_s)
         rng = np.random.default_rng(seed)
-        bench = Bench(link, bounds, recordings, rng, start_rad=start_rad, enabled=not taken_up)
+        bench = Bench(axis, bounds, recordings, rng, start_rad=start_rad, enabled=not taken_up)
         _experiments(bench, tell)
     finally:
-        link.disable()
+        axis.disable()
+        with contextlib.suppress(ServodError):  # a daemon that is gone, or no experiment was run
+            axis.give_up("the feedback of experiments, which are over", {})
     tell("fits", 0.97)
     return analyse(bench.traces)
 
@@ -91,7 +95,7 @@ def _experiments(bench: Bench, tell: Tell) -> None:
     tell("kicks", 0.2)
     first = kick_fit.fit(kick.run(bench, (found[0], found[1])))
     tell("frequency response", 0.25)
-    config = bench.link.config
+    config = bench.axis.config
     gains = feedback(config, first.inertia, first.delay_s + UNKNOWN_DELAY_S, CAREFUL)
     answer = response_fit.fit(response.run(bench, first.inertia, gains), first.inertia)
     tell("bristle damping", 0.38)

@@ -207,3 +207,15 @@ def _check_time(path: Path, t_s: Array, report: list[str]) -> None:
 
 #: One cycle record as a row of a structured array.
 ROW = np.dtype([(f.name, "<f8" if f.kind == "d" else "<i8") for f in FIELDS])
+Rows = NDArray[np.void]
+
+
+def rows_of(raw: bytes | bytearray) -> Rows:
+    """Packed cycle records as structured rows."""
+    return np.frombuffer(bytes(raw), dtype=ROW)
+
+
+def moving(rows: Rows) -> Rows:
+    """The cycles in which a reference motion ran."""
+    active: Rows = rows[rows["reference_active"] == 1]
+    return active

@@ -17,7 +17,6 @@ from servod.common.workers import worker_pool
 from servod.qualify.demo.axis import demo_config
 from servod.qualify.demo.entries import Entry
 from servod.qualify.demo.runs import Run, cut_motion
-from servod.runtime.loop.commands import ReferenceKind
 
 Progress = Callable[[str, float], None]
 
@@ -53,21 +52,19 @@ def _start_worker(shares: Any) -> None:
 
 def _run(index: int, row: Entry, plant: str, duration_s: float, folder: str) -> bytes:
     """One entry in this process: the packed records of its motion."""
-    from servod.client.stepped import SteppedSession
+    from servod.client.axis import ReferenceMotion
+    from servod.client.stepped import SteppedAxis, SteppedSession
     from servod.drivers.virtual.world import SteppedWorld, VirtualAxisSettings
     from servod.formats.gains.gain_set import load_gains
     from servod.formats.model.axis_model import load_axis_model
-    from servod.lab.tracking.stepped import begin, follow
 
-    gains = load_gains(row.gains)
-    config = demo_config(Path(folder), Path(folder))
+    gains, own = load_gains(row.gains), Path(folder) / str(index)
+    own.mkdir()
     world = SteppedWorld(VirtualAxisSettings(), load_axis_model(plant))
-    session = SteppedSession(config, world, gains.law.number, gains.pack())
-    session.enable()
-    session.clear()
-    begin(session, ReferenceKind.PAPER, [duration_s])
-    follow(session, lambda seconds: _tell(index, seconds / duration_s), row.name)
-    return session.raw
+    session = SteppedSession(demo_config(own, own), world, gains.law.number, gains.pack())
+    axis = SteppedAxis(session, own, gains)
+    axis.enable()
+    return axis.run(ReferenceMotion.paper(duration_s), lambda passed_s: _tell(index, passed_s / duration_s), 0.5)
 
 
 def _tell(index: int, share: float) -> None:

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from servod.client.stepped import SteppedLink, SteppedSession
+from servod.client.axis import ReferenceMotion
+from servod.client.stepped import SteppedAxis
 from servod.common.errors import AnswerIsNo
 from servod.common.faults import Reaction, faults_in
 from servod.formats.gains.gain_set import GainSet
@@ -29,9 +30,8 @@ from servod.lab.tracking.metrics import Curves, StepResponse, Tracking, roughnes
 from servod.lab.tracking.stepped import activate, run_motion
 from servod.lab.tune.plan import Feedback, TunePlan
 from servod.lab.tune.rivals import tuned_in_turn
-from servod.qualify.paper.joints import CUTOFF_HZ, ENCODER_COUNTS, Joint, open_for_tracking, open_session
+from servod.qualify.paper.joints import CUTOFF_HZ, ENCODER_COUNTS, Joint, open_axis, open_for_tracking
 from servod.qualify.paper.printed import STEPS_MRAD
-from servod.runtime.loop.commands import ReferenceKind
 
 COUNT_RAD = 2.0 * np.pi / ENCODER_COUNTS
 
@@ -67,8 +67,8 @@ class Measured:
 def identify_and_design(joint: Joint, seed: int) -> Found:
     """Walk through the identification of `joint`, then synthesize for what was found. Raises AnswerIsNo."""
     with tempfile.TemporaryDirectory(prefix="servod-paper-") as folder:
-        link = SteppedLink(open_session(joint, Path(folder), seed))
-        analysis = identify(link, Path(folder) / "recordings", lambda _what, _share: None, seed=seed)
+        axis = open_axis(joint, Path(folder), seed)
+        analysis = identify(axis, Path(folder) / "recordings", lambda _what, _share: None, seed=seed)
     model = model_of(analysis)
     return Found(model, design(model), analysis.presliding)
 
@@ -101,10 +101,10 @@ def measure(
 ) -> Measured:
     """Trajectory (19) for `seconds`, then each step on an axis of its own, held for `hold_s` (0: no steps)."""
     stops: dict[str, str] = {}
-    followed = _motion(joint, label, gains, cutoff_hz, seed, ReferenceKind.PAPER, [seconds], "(19)", stops)
+    followed = _motion(joint, label, gains, cutoff_hz, seed, ReferenceMotion.paper(seconds), "(19)", stops)
     steps = {
         size: _motion(
-            joint, label, gains, cutoff_hz, seed, ReferenceKind.STEP, [size * 1e-3, hold_s], f"{size:g} mrad", stops
+            joint, label, gains, cutoff_hz, seed, ReferenceMotion.step(size * 1e-3, hold_s), f"{size:g} mrad", stops
         )
         for size in (STEPS_MRAD if hold_s else ())
     }
@@ -119,25 +119,24 @@ def _motion(
     gains: GainSet,
     cutoff_hz: float,
     seed: int,
-    kind: ReferenceKind,
-    arguments: list[float],
+    motion: ReferenceMotion,
     name: str,
     stops: dict[str, str],
 ) -> Motion | None:
     """One motion on a fresh axis; None, and the reason in `stops`, when the axis did not stand it."""
     with tempfile.TemporaryDirectory(prefix="servod-paper-") as folder:
-        session = open_for_tracking(joint, Path(folder), seed, cutoff_hz)
+        axis = open_for_tracking(joint, Path(folder), seed, cutoff_hz)
         try:
-            activate(session, gains)
-            return motion_of_curves(label, run_motion(session, kind, arguments))
+            activate(axis, gains)
+            return motion_of_curves(label, run_motion(axis, motion))
         except AnswerIsNo as error:
-            stops[name] = _why(session) or str(error)
+            stops[name] = _why(axis) or str(error)
             return None
 
 
-def _why(session: SteppedSession) -> str:
+def _why(axis: SteppedAxis) -> str:
     """The faults that stopped the axis, by name; not those that only clip or tell."""
-    found = faults_in(session.latest.faults_latched)
+    found = faults_in(axis.session.latest.faults_latched)
     return ", ".join(fault.code.name for fault in found if fault.reaction > Reaction.CLIP)
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from enum import Enum
 from pathlib import Path
 
-from servod.client.stepped import SteppedSession
+from servod.client.stepped import SteppedAxis
 from servod.client.virtual import rated_torque_mnm, virtual_config, virtual_session
 from servod.common.shipped import shipped
 from servod.formats.gains.gain_set import GainSet, load_gains
@@ -45,19 +45,19 @@ class Joint(Enum):
         return load_axis_model(shipped(f"gains/axes/{self.value}.yaml"))
 
 
-def open_session(joint: Joint, folder: Path, seed: int) -> SteppedSession:
-    """A session on the virtual axis for its identification, SYNC-stepped and disabled."""
-    return virtual_session(joint.model(), folder, ENCODER_COUNTS, seed)
+def open_axis(joint: Joint, folder: Path, seed: int) -> SteppedAxis:
+    """The virtual axis for its identification, SYNC-stepped and disabled."""
+    return SteppedAxis(virtual_session(joint.model(), folder, ENCODER_COUNTS, seed), folder)
 
 
-def open_for_tracking(joint: Joint, folder: Path, seed: int, cutoff_hz: float) -> SteppedSession:
+def open_for_tracking(joint: Joint, folder: Path, seed: int, cutoff_hz: float) -> SteppedAxis:
     """The same axis with the velocity filter of the gain set that is to run, and room for the steps of section V."""
     plant = joint.model()
     found = virtual_config(folder, rated_torque_mnm(plant), ENCODER_COUNTS)
     encoder = found.encoder.model_copy(update={"velocity_cutoff_hz": cutoff_hz})
     limits = found.limits.model_copy(update={"speed_rad_s": STEP_SPEED_RAD_S})
     config = found.model_copy(update={"encoder": encoder, "limits": limits})
-    return virtual_session(plant, folder, ENCODER_COUNTS, seed, config)
+    return SteppedAxis(virtual_session(plant, folder, ENCODER_COUNTS, seed, config), folder)
 
 
 # Gain sets of the paper in every reading, and variants of them for the sweeps.

@@ -163,3 +163,13 @@ def _step(flow: Flow, wait: Wait | None) -> Wait:
     except Exception as error:
         return flow.throw(error)
     return flow.send(value)
+
+
+def finish(flow: Flow) -> dict[str, Any]:
+    """Run a flow to its end where nothing is waited for that has not come: in virtual time, and in tests."""
+    wait: Wait | None = None
+    while True:
+        try:
+            wait = _step(flow, wait)
+        except StopIteration as end:
+            return dict(end.value)

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future
 from typing import Any
 
 from servod.common.errors import AnswerIsNo, BadInput, ServodError
 from servod.formats.config import AxisConfig
-from servod.formats.gains.gain_set import require_fit
+from servod.formats.gains.gain_set import GainSet, require_fit
 from servod.formats.gains.store import GainStore, StoredSet
 from servod.runtime.daemon.arguments import GainsActivateArgs, GainsLoadArgs, GainsVerdictArgs
 from servod.runtime.daemon.flows import Flow, FutureWait, Wait
@@ -25,22 +25,24 @@ log = logging.getLogger("servod.gains")
 _NO_TRIAL = "no gain set is on trial"
 #: Sends a command to the loop and gives what to wait for.
 SendOrder = Callable[[Op, Sequence[float]], Wait]
+#: Refuses a set that an axis may not run, by raising BadInput.
+Fits = Callable[[GainSet, AxisConfig], None]
 
 
 class GainBank:
     """The sets that ran since the daemon's start, by serial number."""
 
-    def __init__(self, config: AxisConfig) -> None:
+    def __init__(self, config: AxisConfig, fits: Fits = require_fit) -> None:
         """Open the store and choose the first set: the one active last, or gains.initial. Raises BadInput.
 
         A set that this axis may not run any more, whatever the reason, gives way to gains.initial: the configuration
         or the version of servod may have changed since it was activated, and the axis shall start all the same.
         """
-        self._config = config
+        self._config, self._fits = config, fits
         self._store = GainStore(config.gains.directory)
         initial = self._store.load_file(config.gains.initial)
         active = self._active_or(initial)
-        require_fit(active.gains, config)
+        fits(active.gains, config)
         log.info("gain set %s version %d (%s)", active.name, active.version, active.gains.law.name)
         if warning := active.gains.certificate_warning():
             log.warning("gain set %s version %d: %s", active.name, active.version, warning)
@@ -67,12 +69,12 @@ class GainBank:
             "law": stored.gains.law.name if stored else "unknown",
         }
 
-    def load(self, args: GainsLoadArgs, slow: ThreadPoolExecutor) -> Flow:
+    def load(self, args: GainsLoadArgs, slow: Executor) -> Flow:
         """Check and store a set."""
         stored = yield FutureWait(slow.submit(self._store.load, args.text, args.name))
         return _row(stored)
 
-    def list(self, serial: int, slow: ThreadPoolExecutor) -> Flow:
+    def list(self, serial: int, slow: Executor) -> Flow:
         """All stored versions, and which one runs."""
         running = self._sets.get(serial)
         now = (running.name, running.version) if running else None
@@ -92,7 +94,7 @@ class GainBank:
             return str(refusal)
         return ""
 
-    def activate(self, args: GainsActivateArgs, send: SendOrder, slow: ThreadPoolExecutor) -> Flow:
+    def activate(self, args: GainsActivateArgs, send: SendOrder, slow: Executor) -> Flow:
         """Change the running controller to a stored set, without a bump."""
         stored: StoredSet = yield FutureWait(slow.submit(self._store.get, args.name, args.version))
         yield from self._deploy(stored, send)
@@ -101,7 +103,7 @@ class GainBank:
             yield from self._write(slow.submit(self._store.activate, stored.name, stored.version), stored, send, slow)
         return _row(stored)
 
-    def keep(self, args: GainsVerdictArgs, send: SendOrder, slow: ThreadPoolExecutor) -> Flow:
+    def keep(self, args: GainsVerdictArgs, send: SendOrder, slow: Executor) -> Flow:
         """Make the set on trial the active one. Where the store cannot be written, the active one runs again."""
         tried, self._tried = self._tried, None  # from here on nobody else ends the trial
         if tried is None:
@@ -110,7 +112,7 @@ class GainBank:
         yield from self._write(written, tried, send, slow)
         return _row(tried)
 
-    def rollback(self, args: GainsVerdictArgs, send: SendOrder, slow: ThreadPoolExecutor) -> Flow:
+    def rollback(self, args: GainsVerdictArgs, send: SendOrder, slow: Executor) -> Flow:
         """Go back to the set that was active before; from a trial, to the one that is."""
         if self._tried is None and args.trial:
             raise AnswerIsNo(_NO_TRIAL)
@@ -128,7 +130,7 @@ class GainBank:
             return self._store.activate(initial.name, initial.version)
         try:
             active = self._store.get(last.name, last.version)
-            require_fit(active.gains, self._config)
+            self._fits(active.gains, self._config)
         except BadInput as error:
             log.warning(
                 "%s; %s version %d (gains.initial) runs in place of %s version %d. Set back what was changed and "
@@ -138,13 +140,13 @@ class GainBank:
             return self._store.activate(initial.name, initial.version, f"in place of {last.name}: {error}")
         return active
 
-    def _reject(self, tried: StoredSet, args: GainsVerdictArgs, send: SendOrder, slow: ThreadPoolExecutor) -> Flow:
+    def _reject(self, tried: StoredSet, args: GainsVerdictArgs, send: SendOrder, slow: Executor) -> Flow:
         """End a trial: the active set runs again."""
         active = yield from self._back(send, slow)
         yield FutureWait(slow.submit(self._store.reject, tried.name, tried.version, args.note, args.figures))
         return active
 
-    def _write(self, written: Future[StoredSet], runs: StoredSet, send: SendOrder, slow: ThreadPoolExecutor) -> Flow:
+    def _write(self, written: Future[StoredSet], runs: StoredSet, send: SendOrder, slow: Executor) -> Flow:
         """Wait until the store has the set that runs as its active one; when it cannot, the active one runs again.
 
         Should that fail too, the set that runs is on trial, so that whoever leaves or rolls back goes back.
@@ -158,7 +160,7 @@ class GainBank:
             raise
         return {}
 
-    def _back(self, send: SendOrder, slow: ThreadPoolExecutor) -> Flow:
+    def _back(self, send: SendOrder, slow: Executor) -> Flow:
         """The store's active set runs again, and none is on trial."""
         active: StoredSet | None = yield FutureWait(slow.submit(self._store.active))
         assert active is not None  # the bank activated one when it began
@@ -168,7 +170,7 @@ class GainBank:
 
     def _deploy(self, stored: StoredSet, send: SendOrder) -> Flow:
         """Send a set to the loop and wait until its records show that it runs."""
-        require_fit(stored.gains, self._config)
+        self._fits(stored.gains, self._config)
         serial, parameters = self._last_serial + 1, stored.gains.pack()
         yield send(Op.ACTIVATE, (serial, stored.gains.law.number, len(parameters), *parameters))
         self._last_serial, self._sets[serial] = serial, stored

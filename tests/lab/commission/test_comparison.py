@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from servod.client.open import VirtualWalkAxis
-from servod.client.virtual import pd_set
+from servod.formats.gains.gain_set import pd_set
 from servod.lab.commission.comparison import measured, run_files
 from servod.lab.commission.state import read_walk_json as read_json
 from servod.lab.commission.state import write_json, write_text

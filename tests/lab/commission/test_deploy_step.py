@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from servod.client.axis import LOOK_S, AxisClient, AxisStatus, ReferenceMotion, Watch
 from servod.client.open import VirtualWalkAxis
-from servod.client.stepped import DeployLink, Rows, Tell
 from servod.formats.config import AxisConfig
 from servod.formats.gains.gain_set import GainSet, Promise, parse_gains
 from servod.formats.gains.store import GainStore
@@ -22,9 +22,9 @@ from servod.lab.commission.state import AFTER_ROWS, BEFORE, BEFORE_ROWS, DEPLOYM
 from servod.lab.commission.state import read_walk_json as read_json
 from servod.lab.commission.steps.deploy import Deploy, remembered
 from servod.lab.commission.walk import run
-from servod.lab.recordings.recording import ROW
+from servod.lab.recordings.recording import ROW, Rows
 from servod.lab.report.figure import Table
-from servod.lab.verify.validation import STEP_S, Array, ValidationMotion
+from servod.lab.verify.validation import STEP_S, Array
 from tests.formats.gains import good
 from tests.lab.commission.test_state import walk
 from tests.lab.synthesize.designs import table1
@@ -55,6 +55,7 @@ class Remembers:
     cut: bool
     enabled: bool = True
     tried: tuple[str, int] | None = None
+    offset_ns: int | None = 0
 
     @property
     def active(self) -> tuple[str, int]:
@@ -62,16 +63,26 @@ class Remembers:
         assert stored is not None
         return self.tried or (stored.name, stored.version)
 
-    def run(self, motion: ValidationMotion, _window_rad: float, _tell: Tell) -> Rows:
-        error_rad = 6e-6 if self.active[0] == NEW.name else 6e-3
-        held = np.full(round(STEP_S / motion.period_s), motion.step_rad)
-        return np.concatenate([rows_of(part, error_rad) for part in (motion.sines, held, 0.0 * held)])
+    def status(self) -> AxisStatus:
+        return AxisStatus("ENABLED" if self.enabled else "DISABLED", False, 0.0, 0.0)
+
+    def run(self, motion: ReferenceMotion, watch: Watch | None = None, look_s: float = LOOK_S) -> bytes:
+        words = motion.arguments
+        held = np.full(round(1000 * STEP_S), max(0.0, words.get("amplitude_rad", 0.0)))
+        path = np.array(words["positions_rad"]) if "positions_rad" in words else held
+        return rows_of(path, 6e-6 if self.active[0] == NEW.name else 6e-3).tobytes()
+
+    def begin(self, motion: ReferenceMotion) -> None:
+        raise NotImplementedError
+
+    def wait(self, duration_s: float) -> None:
+        """Nothing moves meanwhile."""
 
     def load(self, gains: GainSet) -> tuple[str, int]:
         stored = self.store.load(gains.to_yaml(), gains.name)
         return stored.name, stored.version
 
-    def attempt(self, name: str, version: int) -> None:
+    def activate(self, name: str, version: int) -> None:
         self.tried = (name, version)
 
     def keep(self, note: str, figures: dict[str, float]) -> None:
@@ -83,7 +94,7 @@ class Remembers:
     def give_up(self, note: str, figures: dict[str, float]) -> None:
         assert self.tried is None, (note, figures)
 
-    def enable(self) -> None:
+    def enable(self, reset_fault: bool = False) -> None:
         self.enabled = True
 
     def disable(self) -> None:
@@ -110,7 +121,7 @@ class Lasting(VirtualWalkAxis):
     virtual: bool = False
 
     @contextlib.contextmanager
-    def deployment(self, folder: Path, gains: GainSet, present: GainSet) -> Iterator[DeployLink]:
+    def deployment(self, folder: Path, gains: GainSet, present: GainSet) -> Iterator[AxisClient]:
         store = GainStore(folder)
         if store.active() is None:
             store.load(present.to_yaml(), present.name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from servod.client.axis import Link
+from servod.client.axis import AxisClient
 from servod.client.open import VirtualWalkAxis
-from servod.client.stepped import SteppedLink
+from servod.client.stepped import SteppedAxis
 from servod.lab.commission.state import RECORDINGS
 from servod.lab.commission.steps.identify import Identify
 from servod.lab.commission.walk import run
@@ -21,16 +22,16 @@ from tests.lab.commission.test_state import walk
 from tests.lab.synthesize.designs import table1
 
 
-class Cut(SteppedLink):
+class Cut(SteppedAxis):
     """Brings Ctrl-C when so many motions have run."""
 
     motions = 0
 
-    def excite(self, *arguments: Any) -> Any:
+    def run(self, *arguments: Any) -> Any:
         if self.motions == 0:
             raise KeyboardInterrupt
         self.motions -= 1
-        return super().excite(*arguments)
+        return super().run(*arguments)
 
 
 @dataclass(frozen=True)
@@ -45,10 +46,10 @@ class Real(VirtualWalkAxis):
         return {"axis": "real"}
 
     @contextlib.contextmanager
-    def experiments(self) -> Iterator[Link]:
-        with super().experiments() as link:
-            assert isinstance(link, SteppedLink)
-            cut = Cut(link.session)
+    def experiments(self) -> Iterator[AxisClient]:
+        with super().experiments() as axis, tempfile.TemporaryDirectory() as folder:
+            assert isinstance(axis, SteppedAxis)
+            cut = Cut(axis.session, Path(folder))
             cut.motions = self.motions
             yield cut
 

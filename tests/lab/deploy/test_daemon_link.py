@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from servod.client.axis import ReferenceMotion
 from servod.client.control import ControlClient
-from servod.client.under_daemon import DaemonDeployLink
-from servod.client.virtual import pd_set
+from servod.client.under_daemon import DaemonAxis
 from servod.common.errors import AnswerIsNo
 from servod.common.shipped import shipped
-from servod.formats.gains.gain_set import load_gains
+from servod.formats.gains.gain_set import load_gains, pd_set
 from servod.formats.gains.store import Action, GainStore
+from servod.lab.deploy.deployment import FADE_S, run_validation
 from servod.lab.deploy.judge import motions_in
 from servod.lab.verify.validation import Array, ValidationMotion
 from tests.runtime.daemon.running import running, wait_for
@@ -38,24 +39,25 @@ def test_a_trial_is_run_kept_and_undone(tmp_path: Path) -> None:
     local = load_gains(shipped("gains/demo_local.yaml"))
     with running(tmp_path, travel_rad=0.013) as axis:
         with ControlClient(axis.socket) as client:
-            link = DaemonDeployLink(client)
+            link = DaemonAxis(client)
             assert link.config.name == "tried"
             with pytest.raises(AnswerIsNo, match="trial"):
                 link.keep("nothing to keep", {})
             with pytest.raises(AnswerIsNo, match="trial"):
                 link.give_up("nothing to give up", {})
             link.enable()
-            link.attempt(*link.load(local))
-            parts = motions_in(link.run(motion, 0.1, lambda _share: None))
+            link.activate(*link.load(local))
+            parts = motions_in(run_validation(link, motion, 0.1))
             assert [round(len(part), -2) for part in parts] == [500, 1000, 1000]
             assert link.active == ("demo_local", 1)
             link.keep("good", {"after_slow_mrad": 0.1})
-            link.attempt(*link.load(load_gains(shipped("gains/demo_pd_dob.yaml"))))
+            link.activate(*link.load(load_gains(shipped("gains/demo_pd_dob.yaml"))))
             assert link.active == ("demo_pd_dob", 1)
             with pytest.raises(AnswerIsNo, match=r"the axis went to .*POSITION_LIMIT"):
-                link.attempt(*link.load(WILD))
+                link.activate(*link.load(WILD))
+                link.wait(FADE_S)
             with pytest.raises(AnswerIsNo, match="the axis went to"):
-                link.record([{"kind": "step", "amplitude_rad": 0.01, "duration_s": 0.5}])
+                link.run(ReferenceMotion.step(0.01, 0.5))
         with ControlClient(axis.socket) as watcher:  # the client of the trial has gone
             wait_for(lambda: watcher.call("status")["controller"]["name"] == "demo_local")
             assert watcher.call("gains_rollback")["name"] == "demo_pd"
@@ -70,18 +72,18 @@ def test_a_trial_is_run_kept_and_undone(tmp_path: Path) -> None:
 
 def test_an_interrupt_stops_the_axis_before_the_recorder(tmp_path: Path) -> None:
     """Also when it cut a request on the link's own connection."""
-    motion = {"kind": "sine", "amplitude_rad": 0.05, "frequency_hz": 0.5, "duration_s": 10.0}
+    motion = ReferenceMotion.sine(0.05, 0.5, 10.0)
     with running(tmp_path) as axis, ControlClient(axis.socket) as watcher:
         with ControlClient(axis.socket) as client:
-            link = DaemonDeployLink(client)
+            link = DaemonAxis(client)
             link.enable()
 
-            def interrupt() -> None:
+            def interrupt(_passed_s: float) -> None:
                 client.close()
                 raise KeyboardInterrupt
 
             with pytest.raises(KeyboardInterrupt):
-                link.record([motion], interrupt)
+                link.run(motion, interrupt)
         status = watcher.call("status")
         assert (status["axis"]["state"], status["motion"]["torque_nm"]) == ("DISABLED", 0.0)
         assert status["controller"]["name"] == "demo_pd"

@@ -7,18 +7,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from servod.client.stepped import Rows, SteppedDeployLink, Tell, cut
-from servod.client.virtual import pd_set, virtual_link, with_cutoff
+from servod.client.axis import LOOK_S, ReferenceMotion, Watch
+from servod.client.stepped import SteppedAxis
+from servod.client.virtual import axis_for_set, with_cutoff
 from servod.common.errors import BadInput
 from servod.common.faults import FAULTS, FaultCode
+from servod.formats.gains.gain_set import pd_set
 from servod.formats.gains.store import Action, GainStore
 from servod.formats.model.axis_model import AxisModel
-from servod.lab.deploy.deployment import deploy
+from servod.lab.deploy.deployment import cut, deploy, run_validation
 from servod.lab.deploy.judge import limits_met, motions_in
 from servod.lab.deploy.outcome import Before, Ending
-from servod.lab.recordings.recording import ROW
+from servod.lab.recordings.recording import ROW, Rows
 from servod.lab.verify.plants import scaled
-from servod.lab.verify.validation import ValidationMotion, motion_for
+from servod.lab.verify.validation import motion_for
 from servod.runtime.loop.axis import AxisState
 from servod.runtime.loop.commands import Op
 from tests.lab.deploy.sets import certified
@@ -27,8 +29,8 @@ from tests.lab.synthesize.designs import table1
 PD = pd_set("present", 2.5, 0.12)
 
 
-def link_to(plant: AxisModel, folder: Path) -> SteppedDeployLink:
-    return virtual_link(plant, folder, certified(), PD)
+def axis_of(plant: AxisModel, folder: Path) -> SteppedAxis:
+    return axis_for_set(plant, folder, certified(), PD)
 
 
 def quiet(_what: str, _share: float) -> None:
@@ -36,17 +38,17 @@ def quiet(_what: str, _share: float) -> None:
 
 
 def test_a_good_set_stays_and_is_compared_with_what_was_before_also_once_it_runs(tmp_path: Path) -> None:
-    link = link_to(table1(), tmp_path)
+    axis = axis_of(table1(), tmp_path)
     told: list[Before] = []
-    done = deploy(link, certified(), quiet, remember=told.append)
+    done = deploy(axis, certified(), quiet, remember=told.append)
     assert done.proven, done.reasons
-    assert link.active == (certified().name, 1) and done.ending is Ending.KEPT
+    assert axis.active == (certified().name, 1) and done.ending is Ending.KEPT
     assert done.ran_before is told[0] and told[0].present == ("present", 1)
     entry = GainStore(tmp_path / "gains").history()[-1]
     assert (entry.action, entry.name) == (Action.ACTIVATE, certified().name)
     assert entry.figures["after_slow_mrad"] < 0.2 * entry.figures["before_slow_mrad"]
-    assert link.session.cycle.axis.state == AxisState.DISABLED  # as it was found
-    again = deploy(link, certified(), quiet, *told, told.append)
+    assert axis.session.cycle.axis.state == AxisState.DISABLED  # as it was found
+    again = deploy(axis, certified(), quiet, *told, told.append)
     assert again.ending is Ending.CONFIRMED and len(told) == 1
     assert (again.before, again.document()["present"]) == (done.before, {"name": "present", "version": 1})
     assert GainStore(tmp_path / "gains").rollback().name == "present"
@@ -54,13 +56,13 @@ def test_a_good_set_stays_and_is_compared_with_what_was_before_also_once_it_runs
 
 @pytest.mark.parametrize("change", [{"dry": 2.0, "viscous": 2.0}, {"inertia": 2.0}], ids=["friction", "inertia"])
 def test_a_set_for_another_joint_is_rolled_back(change: dict[str, float], tmp_path: Path) -> None:
-    link = link_to(scaled(table1(), change), tmp_path)
-    done = deploy(link, certified(), quiet)
+    axis = axis_of(scaled(table1(), change), tmp_path)
+    done = deploy(axis, certified(), quiet)
     assert not done.proven and done.said.startswith("rolled back to present version 1: ")
     assert any("promised" in reason for reason in done.reasons)
     store = GainStore(tmp_path / "gains")
     active = store.active()
-    assert link.active == ("present", 1)
+    assert axis.active == ("present", 1)
     assert active is not None and active.name == "present"
     entry = store.history()[-1]
     assert (entry.action, entry.name) == (Action.REJECT, certified().name)
@@ -68,15 +70,15 @@ def test_a_set_for_another_joint_is_rolled_back(change: dict[str, float], tmp_pa
 
 
 def test_a_limit_that_is_met_rolls_back(tmp_path: Path) -> None:
-    limits = link_to(table1(), tmp_path / "roomy").config.limits.model_copy(update={"torque_nm": 0.075})
-    config = link_to(table1(), tmp_path).config
+    limits = axis_of(table1(), tmp_path / "roomy").config.limits.model_copy(update={"torque_nm": 0.075})
+    config = axis_of(table1(), tmp_path).config
     proof = config.wiring_proof.model_copy(update={"torque_nm": 0.075})  # just above break-away
     config = config.model_copy(update={"limits": limits, "wiring_proof": proof})
-    link = virtual_link(table1(), tmp_path, certified(), PD, config=config)
+    axis = axis_for_set(table1(), tmp_path, certified(), PD, config=config)
     with pytest.raises(BadInput, match=r"certificate\.torque_nm: .* at most 0\.075"):
-        deploy(link, certified(), quiet)
+        deploy(axis, certified(), quiet)
     earlier = certified().certificate.model_copy(update={"torque_nm": None})  # issued before torque was stated
-    done = deploy(link, certified().model_copy(update={"certificate": earlier}).sealed(), quiet)
+    done = deploy(axis, certified().model_copy(update={"certificate": earlier}).sealed(), quiet)
     assert not done.proven and any(reason.startswith("TORQUE_CLIPPED") for reason in done.reasons)
 
 
@@ -97,80 +99,88 @@ def test_few_limited_cycles_and_those_that_the_set_before_met_as_well_are_not_he
 
 
 def test_a_set_that_loses_the_joint_on_a_sine_is_given_no_step(tmp_path: Path) -> None:
-    link = link_to(scaled(table1(), {"dry": 3.0, "viscous": 3.0}), tmp_path)
-    link.enable()
+    axis = axis_of(scaled(table1(), {"dry": 3.0, "viscous": 3.0}), tmp_path)
+    axis.enable()
     motion = motion_for(certified().design or pytest.fail("designed"))
-    rows = link.run(motion, 2e-4, lambda _share: None)
+    rows = run_validation(axis, motion, 2e-4)
     (sines,) = motions_in(rows)
     assert len(sines) < len(motion.sines) and cut(rows, motion)
     assert np.ptp(sines["reference_rad"]) < motion.travel_rad
-    assert len(motions_in(link.run(motion, 0.4, lambda _share: None))) == 3
+    assert len(motions_in(run_validation(axis, motion, 0.4))) == 3
 
 
-class Narrow(SteppedDeployLink):
+class Narrow(SteppedAxis):
     """An axis whose window is too narrow for any set but the present one."""
 
-    def run(self, motion: ValidationMotion, window_rad: float, tell: Tell) -> Rows:
-        return super().run(motion, window_rad if self.active[0] == PD.name else 1e-5, tell)
+    def run(
+        self,
+        motion: ReferenceMotion,
+        watch: Watch | None = None,
+        look_s: float = LOOK_S,
+        each_cycle: Watch | None = None,
+    ) -> bytes:
+        if self.active[0] != PD.name and "window_rad" in motion.arguments:
+            motion = ReferenceMotion(motion.arguments | {"window_rad": 1e-5})
+        return super().run(motion, watch, look_s, each_cycle)
 
 
 def test_a_cut_sine_rolls_back(tmp_path: Path) -> None:
-    link = Narrow(link_to(table1(), tmp_path).session, GainStore(tmp_path / "gains"), PD)
-    done = deploy(link, certified(), quiet)
+    axis = Narrow(axis_of(table1(), tmp_path).session, tmp_path, PD)
+    done = deploy(axis, certified(), quiet)
     assert not done.proven and done.after is None and "window" in done.reasons[0]
     assert done.rows_after is not None and len(motions_in(done.rows_after)) == 1
-    assert link.active == ("present", 1)
+    assert axis.active == ("present", 1)
 
 
 def test_a_set_that_runs_already_and_fails_is_never_said_to_be_rolled_back(tmp_path: Path) -> None:
-    session = virtual_link(table1(), tmp_path, certified(), certified()).session
-    link = Narrow(session, GainStore(tmp_path / "gains"), certified())
-    done = deploy(link, certified(), quiet)
+    session = axis_for_set(table1(), tmp_path, certified(), certified()).session
+    axis = Narrow(session, tmp_path, certified())
+    done = deploy(axis, certified(), quiet)
     assert (done.ending, done.before, done.document()["present"]) == (Ending.DOUBTED, None, None)
     assert "STILL RUNS" in done.said and "rolled back" not in done.said and "window" in done.said
-    assert link.active == (certified().name, 1)
+    assert axis.active == (certified().name, 1)
     assert [h.action for h in GainStore(tmp_path / "gains").history()] == [Action.LOAD, Action.ACTIVATE]
 
 
 @pytest.mark.parametrize("when", [("change of the set", 0.48), ("under the new set", 0.52)])
 def test_a_fault_under_the_new_set_rolls_back_and_is_not_reset(when: tuple[str, float], tmp_path: Path) -> None:
-    link = link_to(table1(), tmp_path)
+    axis = axis_of(table1(), tmp_path)
 
     def drop_out(what: str, share: float) -> None:
         if (what, share) == when:
-            link.session.send(Op.NODE_EVENT, [FaultCode.DRIVE_RESET])
+            axis.session.send(Op.NODE_EVENT, [FaultCode.DRIVE_RESET])
 
-    done = deploy(link, certified(), drop_out)
-    assert not done.proven and done.after is None and link.active == ("present", 1)
+    done = deploy(axis, certified(), drop_out)
+    assert not done.proven and done.after is None and axis.active == ("present", 1)
     assert done.reasons[0].startswith("the axis went to FAULT")
-    assert link.session.cycle.axis.state == AxisState.FAULT
+    assert axis.session.cycle.axis.state == AxisState.FAULT
 
 
 @pytest.mark.parametrize("when", ["under the present set", "under the new set"])
 def test_an_interrupt_leaves_the_old_set_active_and_the_axis_off(when: str, tmp_path: Path) -> None:
-    link = link_to(table1(), tmp_path)
+    axis = axis_of(table1(), tmp_path)
 
     def interrupt(what: str, share: float) -> None:
         if what == when and share % 0.45 > 0.2:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        deploy(link, certified(), interrupt)
-    assert link.active == ("present", 1)
-    link.session.run(1.0)
-    assert link.session.cycle.axis.state == AxisState.DISABLED
-    assert abs(link.session.world.truth().velocity_rad_s) < 1e-3
-    assert link.session.latest.torque_nm == 0.0
+        deploy(axis, certified(), interrupt)
+    assert axis.active == ("present", 1)
+    axis.session.run(1.0)
+    assert axis.session.cycle.axis.state == AxisState.DISABLED
+    assert abs(axis.session.world.truth().velocity_rad_s) < 1e-3
+    assert axis.session.latest.torque_nm == 0.0
 
 
 def test_a_set_without_certificate_and_one_for_another_filter_are_refused_before_anything_moves(tmp_path: Path) -> None:
-    link = link_to(table1(), tmp_path)
+    axis = axis_of(table1(), tmp_path)
     with pytest.raises(BadInput, match="certificate"):
-        deploy(link, PD, quiet)
+        deploy(axis, PD, quiet)
     promised_nothing = certified().certificate.model_copy(update={"promised": None})
     with pytest.raises(BadInput, match="promised"):
-        deploy(link, certified().model_copy(update={"certificate": promised_nothing}).sealed(), quiet)
-    link.session.config = with_cutoff(link.config, 77.0)
+        deploy(axis, certified().model_copy(update={"certificate": promised_nothing}).sealed(), quiet)
+    axis.session.config = with_cutoff(axis.config, 77.0)
     with pytest.raises(BadInput, match="velocity_cutoff_hz"):
-        deploy(link, certified(), quiet)
-    assert link.session.cycle.axis.state == AxisState.DISABLED
+        deploy(axis, certified(), quiet)
+    assert axis.session.cycle.axis.state == AxisState.DISABLED

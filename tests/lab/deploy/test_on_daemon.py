@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from servod.client.axis import AxisClient
 from servod.client.control import ControlClient
 from servod.client.open import DaemonWalkAxis
-from servod.client.stepped import DeployLink, Rows
 from servod.common.shipped import shipped
 from servod.formats.config import load_config
 from servod.formats.gains.gain_set import GainSet
@@ -20,6 +20,7 @@ from servod.formats.model.axis_model import axis_model_yaml
 from servod.lab.deploy.deployment import deploy
 from servod.lab.deploy.judge import motions_in
 from servod.lab.deploy.outcome import Deployment
+from servod.lab.recordings.recording import Rows
 from servod.lab.verify import validation
 from servod.lab.verify.validation import promise
 from tests.lab.deploy.sets import certified
@@ -31,14 +32,15 @@ pytestmark = pytest.mark.serial
 #: A client that tries a set and moves; it is killed and cleans nothing up.
 TRIES = """
 import sys
+from servod.client.axis import ReferenceMotion
 from servod.client.control import ControlClient
-from servod.client.under_daemon import DaemonDeployLink
+from servod.client.under_daemon import DaemonAxis
 from servod.formats.gains.gain_set import load_gains
 
-link = DaemonDeployLink(ControlClient(sys.argv[1]))
-link.enable()
-link.attempt(*link.load(load_gains(sys.argv[2])))
-link.record([{"kind": "sine", "amplitude_rad": 0.05, "frequency_hz": 0.5, "duration_s": 4.0}])
+axis = DaemonAxis(ControlClient(sys.argv[1]))
+axis.enable()
+axis.activate(*axis.load(load_gains(sys.argv[2])))
+axis.run(ReferenceMotion.sine(0.05, 0.5, 4.0))
 """
 
 
@@ -63,7 +65,7 @@ def skipped_share(rows: Rows) -> float:
     return float(rows["missed"][-1] - rows["missed"][0]) / float(rows["cycle"][-1] - rows["cycle"][0])
 
 
-def tried(link: DeployLink, gains: GainSet) -> tuple[Deployment, bool]:
+def tried(link: AxisClient, gains: GainSet) -> tuple[Deployment, bool]:
     """How a trial ended, and whether the loop kept time in it; the last of some chances where it did not."""
     for _ in range(CHANCES):
         done = deploy(link, gains, lambda _what, _share: None)
@@ -86,7 +88,7 @@ def test_a_set_is_deployed_on_a_daemon(gains: GainSet, tmp_path: Path) -> None:
         with walk_axis.deployment(tmp_path, gains, gains) as link:
             done, kept_time = tried(link, gains)
             assert link.active == ((gains.name, 1) if done.proven else ("demo_pd", 1))
-            assert not link.enabled  # as it was found
+            assert not link.status().enabled  # as it was found
     assert done.proven or (not kept_time and "skipped" in done.reasons[-1]), done.reasons
     assert done.ran_before is not None and done.ran_before.present == ("demo_pd", 1)
     assert done.rows_after is not None

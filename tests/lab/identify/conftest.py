@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import pytest
 
-from servod.client.stepped import SteppedLink
+from servod.client.stepped import SteppedAxis
 from servod.client.virtual import virtual_session
 from servod.lab.identify.analysis import Analysis
 from servod.lab.identify.walk import identify
@@ -18,15 +18,15 @@ class Identification(NamedTuple):
     joint: Drawn
     analysis: Analysis
     recordings: Path
-    link: SteppedLink
+    axis: SteppedAxis
     told: list[tuple[str, float]]
 
 
 def identify_joint(joint: Drawn, folder: Path, seed: int = 1) -> Identification:
-    link = SteppedLink(virtual_session(joint.model, folder, joint.encoder_counts, seed))
+    axis = SteppedAxis(virtual_session(joint.model, folder, joint.encoder_counts, seed), folder)
     told: list[tuple[str, float]] = []
-    analysis = identify(link, folder / "recordings", lambda what, share: told.append((what, share)), seed=seed)
-    return Identification(joint, analysis, folder / "recordings", link, told)
+    analysis = identify(axis, folder / "recordings", lambda what, share: told.append((what, share)), seed=seed)
+    return Identification(joint, analysis, folder / "recordings", axis, told)
 
 
 @pytest.fixture(scope="session")

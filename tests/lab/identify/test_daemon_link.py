@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 
 from servod.cli.app import run
+from servod.client.axis import ReferenceMotion
 from servod.client.control import ControlClient
-from servod.client.under_daemon import DaemonLink
+from servod.client.under_daemon import DaemonAxis
 from servod.common.errors import BadInput
 from servod.formats.config import load_config
 from servod.formats.gains.store import GainStore
 from servod.lab.identify.bounds import bounds_from
 from servod.lab.identify.experiments import break_away
-from servod.lab.identify.experiments.common import Bench
+from servod.lab.identify.experiments.common import Bench, enable_powerless
 from servod.lab.identify.fits.break_away import torque_of
 from servod.lab.identify.store import Recordings, load
 from servod.lab.identify.walk import identify
@@ -28,8 +29,8 @@ pytestmark = pytest.mark.serial
 
 def test_break_away_is_measured_through_the_daemon(tmp_path):
     with running(tmp_path) as axis, ControlClient(axis.socket) as client:
-        link = DaemonLink(client, load_config(axis.folder / "axis.yaml"))
-        bounds = bounds_from(link.config.limits, link.enable(), None, None)
+        link = DaemonAxis(client, load_config(axis.folder / "axis.yaml"))
+        bounds = bounds_from(link.config.limits, enable_powerless(link), None, None)
         bench = Bench(link, bounds, Recordings(tmp_path / "recordings"), np.random.default_rng(1))
         ramp = break_away.search(bench, 1.0)
         assert torque_of(ramp) == pytest.approx(0.0805, rel=0.1)  # the demo joint, forwards
@@ -38,6 +39,7 @@ def test_break_away_is_measured_through_the_daemon(tmp_path):
         assert client.call("status")["controller"]["name"] == "identify_pd"
         link.disable()
         assert client.call("status")["axis"]["state"] == "DISABLED"
+        link.give_up("over", {})
         undone(axis, client)
 
 
@@ -83,7 +85,7 @@ def test_whatever_ends_the_command_switches_the_axis_off_and_gives_the_gains_bac
 
 def test_ctrl_c_in_the_middle_of_an_experiment_switches_the_axis_off(tmp_path):
     with running(tmp_path) as axis, ControlClient(axis.socket) as client:
-        link = DaemonLink(client, load_config(axis.folder / "axis.yaml"))
+        link = DaemonAxis(client, load_config(axis.folder / "axis.yaml"))
         ramping = []
 
         def tell(what: str, _share: float) -> None:
@@ -119,10 +121,10 @@ class _Cut(ControlClient):
 def test_an_interrupt_stops_the_axis_before_the_recorder(tmp_path):
     """Also when it cut a request on the link's own connection."""
     with running(tmp_path) as axis, ControlClient(axis.socket) as watcher:
-        link = DaemonLink(_Cut(axis.socket), load_config(axis.folder / "axis.yaml"))
-        link.enable()
+        link = DaemonAxis(_Cut(axis.socket), load_config(axis.folder / "axis.yaml"))
+        enable_powerless(link)
         with pytest.raises(KeyboardInterrupt):
-            link.excite([0.0] * 10_000, [0.0] * 10_000, 0.1)
+            link.run(ReferenceMotion.excite([0.0] * 10_000, [0.0] * 10_000, 0.1))
         status = watcher.call("status")
         assert (status["axis"]["state"], status["motion"]["torque_nm"]) == ("DISABLED", 0.0)
         undone(axis, watcher)
@@ -131,8 +133,8 @@ def test_an_interrupt_stops_the_axis_before_the_recorder(tmp_path):
 def test_an_axis_whose_connection_is_cut_is_switched_off_all_the_same(tmp_path):
     with running(tmp_path) as axis, ControlClient(axis.socket) as watcher:
         client = ControlClient(axis.socket)
-        link = DaemonLink(client, load_config(axis.folder / "axis.yaml"))
-        link.enable()
+        link = DaemonAxis(client, load_config(axis.folder / "axis.yaml"))
+        enable_powerless(link)
         client.close()
         link.disable()
         assert watcher.call("status")["axis"]["state"] == "DISABLED"

@@ -8,13 +8,16 @@ import shutil
 import numpy as np
 import pytest
 
-from servod.client.stepped import SteppedLink
+from servod.client.axis import ReferenceMotion
+from servod.client.stepped import SteppedAxis
 from servod.client.virtual import virtual_session
 from servod.common.errors import AnswerIsNo, BadInput
 from servod.lab.identify import store
+from servod.lab.identify.experiments.common import enable_powerless
 from servod.lab.identify.result import document
 from servod.lab.identify.trace import Kind, trace_of
 from servod.lab.identify.walk import identify
+from servod.lab.recordings.recording import moving, rows_of
 from servod.runtime.loop.axis import AxisState
 from tests.lab.identify.conftest import Identification
 from tests.lab.identify.joints import draw
@@ -22,26 +25,26 @@ from tests.lab.identify.joints import draw
 pytestmark = pytest.mark.timeout(600)  # a whole identification is part of the first test that needs it
 
 
-class CountingLink(SteppedLink):
+class CountingAxis(SteppedAxis):
     """Counts the motions that are really run."""
 
     motions = 0
 
-    def excite(self, *arguments):
+    def run(self, *arguments):
         self.motions += 1
-        return super().excite(*arguments)
+        return super().run(*arguments)
 
 
-def again(fine: Identification, folder, **options) -> tuple[CountingLink, object]:
+def again(fine: Identification, folder, **options) -> tuple[CountingAxis, object]:
     joint = fine.joint
-    link = CountingLink(virtual_session(joint.model, folder, joint.encoder_counts, 7))
-    return link, identify(link, folder / "recordings", lambda _what, _share: None, resume=True, **options)
+    axis = CountingAxis(virtual_session(joint.model, folder, joint.encoder_counts, 7), folder)
+    return axis, identify(axis, folder / "recordings", lambda _what, _share: None, resume=True, **options)
 
 
 def test_a_complete_walk_is_not_run_again(fine: Identification, tmp_path):
     shutil.copytree(fine.recordings, tmp_path / "recordings")
-    link, analysis = again(fine, tmp_path)
-    assert link.motions == 0
+    axis, analysis = again(fine, tmp_path)
+    assert axis.motions == 0
     assert document(analysis) == document(fine.analysis)
 
 
@@ -50,9 +53,9 @@ def test_the_missing_experiment_is_run_and_ends_in_the_same_place(fine: Identifi
     listed = json.loads((tmp_path / "recordings" / store.LIST).read_text())
     listed["experiments"] = listed["experiments"][:-2]
     (tmp_path / "recordings" / store.LIST).write_text(json.dumps(listed))
-    link, analysis = again(fine, tmp_path)
-    assert link.motions == 5  # two moves to the start, two motions, and home
-    assert link.session.cycle.axis.state == AxisState.DISABLED
+    axis, analysis = again(fine, tmp_path)
+    assert axis.motions == 5  # two moves to the start, two motions, and home
+    assert axis.session.cycle.axis.state == AxisState.DISABLED
     assert analysis.data_sha256[:-2] == fine.analysis.data_sha256[:-2]
     assert analysis.data_sha256[-1] != fine.analysis.data_sha256[-1]
     assert analysis.response.inertia == fine.analysis.response.inertia
@@ -64,36 +67,39 @@ def test_the_missing_experiment_is_run_and_ends_in_the_same_place(fine: Identifi
 def test_an_interrupt_anywhere_leaves_the_axis_off_and_the_recordings(tmp_path):
     joint = draw(3)
 
-    class Interrupted(CountingLink):
+    class Interrupted(CountingAxis):
         """Ctrl-C in the middle of the fifth motion."""
 
-        def excite(self, *arguments):
-            if self.motions == 5:
-                self._watch = self.interrupt
-            return super().excite(*arguments)
+        def run(self, motion):
+            return super().run(motion, *([self.interrupt] if self.motions == 5 else []))
 
         def interrupt(self, _passed_s):
             raise KeyboardInterrupt
 
-    link = Interrupted(virtual_session(joint.model, tmp_path, joint.encoder_counts, 1))
+    axis = Interrupted(virtual_session(joint.model, tmp_path, joint.encoder_counts, 1), tmp_path)
     with pytest.raises(KeyboardInterrupt):
-        identify(link, tmp_path / "recordings", lambda _what, _share: None)
-    assert link.session.cycle.axis.state == AxisState.DISABLED
-    assert link.session.latest.torque_nm == 0.0
-    assert abs(link.session.world.truth().velocity_rad_s) < 1e-3  # bristles still relax
+        identify(axis, tmp_path / "recordings", lambda _what, _share: None)
+    assert axis.session.cycle.axis.state == AxisState.DISABLED
+    assert axis.session.latest.torque_nm == 0.0
+    assert abs(axis.session.world.truth().velocity_rad_s) < 1e-3  # bristles still relax
     assert len(store.load(tmp_path / "recordings")) == 5
     assert store.Recordings(tmp_path / "recordings", "another axis", resume=True).waiting == 0
     assert len(store.load(tmp_path / "recordings")) == 5
 
 
+def rested(axis: SteppedAxis, cycles: int):
+    """The cycles of a rest."""
+    return moving(rows_of(axis.run(ReferenceMotion.excite([0.0] * cycles, [0.0] * cycles, 0.1))))
+
+
 def recorded(folder, session, *durations_s: float) -> None:
     """Rests of these durations, recorded anew in `folder`."""
-    link = SteppedLink(session)
-    link.enable()
+    axis = SteppedAxis(session, folder)
+    enable_powerless(axis)
     made = store.Recordings(folder, "this axis")
     made.begin(0.0)
     for seconds in durations_s:
-        rows = link.excite([0.0] * round(1000 * seconds), [0.0] * round(1000 * seconds), 0.1)
+        rows = rested(axis, round(1000 * seconds))
         made.keep(rows, trace_of(Kind.NOISE, rows, {}), f"motion of {seconds} s")
 
 
@@ -102,12 +108,12 @@ def test_a_walk_that_is_refused_leaves_the_recordings_of_the_model_that_stands(t
     recorded(tmp_path / "recordings", session, 0.1, 0.2)
     before = [trace.sha256 for trace in store.load(tmp_path / "recordings")]
 
-    class Refused(CountingLink):
-        def enable(self) -> float:
+    class Refused(CountingAxis):
+        def enable(self, reset_fault: bool = False) -> None:
             raise AnswerIsNo("a fault is latched")
 
     with pytest.raises(AnswerIsNo, match="latched"):
-        identify(Refused(session), tmp_path / "recordings", lambda _what, _share: None)
+        identify(Refused(session, tmp_path), tmp_path / "recordings", lambda _what, _share: None)
     assert [trace.sha256 for trace in store.load(tmp_path / "recordings")] == before
 
 
@@ -129,7 +135,7 @@ def test_a_walk_that_leaves_the_recorded_one_halfway_sets_all_of_it_aside(tmp_pa
     first = again.recorded(Kind.NOISE, "motion of 0.1 s")
     assert again.recorded(Kind.NOISE, "another motion") is None
     assert [trace.sha256 for trace in store.load(tmp_path)] == before
-    rows = SteppedLink(session).excite([0.0] * 50, [0.0] * 50, 0.1)
+    rows = rested(SteppedAxis(session, tmp_path), 50)
     new = again.keep(rows, trace_of(Kind.NOISE, rows, {}), "another motion")
     assert [trace.sha256 for trace in store.load(tmp_path)] == [first.sha256, new.sha256]
     assert [trace.sha256 for trace in store.load(tmp_path / "before_01")] == before

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from servod.client.stepped import SteppedLink
+from servod.client.stepped import SteppedAxis
 from servod.client.virtual import virtual_session
 from servod.common.errors import AnswerIsNo
 from servod.lab.identify.bounds import bounds_from
 from servod.lab.identify.experiments import kick
-from servod.lab.identify.experiments.common import SPEED_SPAN_S, Bench, peak_speed
+from servod.lab.identify.experiments.common import SPEED_SPAN_S, Bench, enable_powerless, peak_speed
 from servod.lab.identify.fits import kick as kick_fit
 from servod.lab.identify.store import load
 from servod.lab.identify.trace import Trace
@@ -42,9 +42,9 @@ class Truth:
 
 def bench_of(joint: Drawn, folder, speed_rad_s: float) -> tuple[Bench, Truth]:
     session = virtual_session(joint.model, folder, joint.encoder_counts, 1)
-    link = SteppedLink(session)
-    bounds = bounds_from(link.config.limits, link.enable(), None, speed_rad_s)
-    return Bench(link, bounds, Unkept(), np.random.default_rng(1)), Truth(session)
+    axis = SteppedAxis(session, folder)
+    bounds = bounds_from(axis.config.limits, enable_powerless(axis), None, speed_rad_s)
+    return Bench(axis, bounds, Unkept(), np.random.default_rng(1)), Truth(session)
 
 
 def break_away(joint: Drawn) -> tuple[float, float]:
@@ -95,5 +95,5 @@ def test_a_path_that_is_faster_than_allowed_is_not_begun(tmp_path):
 
 @pytest.mark.timeout(600)
 def test_no_experiment_of_a_whole_walk_is_faster_than_planned(fine: Identification):
-    allowed = bounds_from(fine.link.config.limits, 0.0, None, None)
+    allowed = bounds_from(fine.axis.config.limits, 0.0, None, None)
     assert max(peak_speed(trace, SPEED_SPAN_S) for trace in load(fine.recordings)) <= allowed.speed_rad_s * 1.05

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from servod.client.stepped import SteppedLink
+from servod.client.stepped import SteppedAxis
 from servod.client.virtual import virtual_session
 from servod.common.errors import AnswerIsNo
 from servod.common.yaml import parse_yaml, validate
@@ -110,23 +110,23 @@ def test_recordings_alone_give_the_same_numbers(fine):
 
 
 def test_the_axis_is_off_afterwards_and_progress_was_told(fine):
-    assert fine.link.session.cycle.axis.state == AxisState.DISABLED
+    assert fine.axis.session.cycle.axis.state == AxisState.DISABLED
     shares = [share for _, share in fine.told]
     assert shares == sorted(shares)
 
 
 def test_an_interrupt_leaves_the_axis_off(tmp_path):
     joint = draw(3)
-    link = SteppedLink(virtual_session(joint.model, tmp_path, joint.encoder_counts, 1))
+    axis = SteppedAxis(virtual_session(joint.model, tmp_path, joint.encoder_counts, 1), tmp_path)
 
     def interrupt(what: str, _share: float) -> None:
         if what == "presliding":
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        identify(link, tmp_path / "recordings", interrupt)
-    assert link.session.cycle.axis.state == AxisState.DISABLED
-    assert abs(link.session.world.truth().velocity_rad_s) < 1e-4
+        identify(axis, tmp_path / "recordings", interrupt)
+    assert axis.session.cycle.axis.state == AxisState.DISABLED
+    assert abs(axis.session.world.truth().velocity_rad_s) < 1e-4
     assert [t.kind.value for t in store.load(tmp_path / "recordings")] == ["noise", "break_away", "break_away"]
 
 
@@ -137,7 +137,7 @@ def test_a_blocked_joint_is_said_to_be_blocked(tmp_path):
     session = virtual_session(joint.model, tmp_path, joint.encoder_counts, 1)
     session = virtual_session(blocked, tmp_path, joint.encoder_counts, 1, session.config)
     with pytest.raises(AnswerIsNo, match="did not move"):
-        identify(SteppedLink(session), tmp_path / "recordings", lambda _what, _share: None)
+        identify(SteppedAxis(session, tmp_path), tmp_path / "recordings", lambda _what, _share: None)
 
 
 def test_changes_are_those_beyond_both_intervals(fine):

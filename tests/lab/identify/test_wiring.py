@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from servod.cli.app import run
-from servod.client.stepped import SteppedLink
+from servod.client.stepped import SteppedAxis
 from servod.client.virtual import rated_torque_mnm, virtual_config, virtual_session
 from servod.common.errors import AnswerIsNo, BadInput
 from servod.drivers.virtual.settings import VirtualAxisSettings
@@ -25,7 +25,7 @@ def refused(folder, plant, config, settings) -> str:
     """What identification says of this axis, which must be off afterwards and not have moved far."""
     session = virtual_session(plant, folder, None, 1, config, settings)
     with pytest.raises(AnswerIsNo) as error:
-        identify(SteppedLink(session), folder / "recordings", lambda _what, _share: None)
+        identify(SteppedAxis(session, folder), folder / "recordings", lambda _what, _share: None)
     assert session.cycle.axis.state != AxisState.ENABLED
     session.run(0.2)
     assert abs(session.world.truth().position_rad) < MOST_TRAVEL_RAD

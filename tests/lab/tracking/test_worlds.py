@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from servod.client.stepped import SteppedSession
+from servod.client.axis import ReferenceMotion
+from servod.client.stepped import SteppedAxis
 from servod.client.virtual import virtual_session
 from servod.common.errors import AnswerIsNo
 from servod.common.shipped import shipped
@@ -16,7 +17,6 @@ from servod.formats.model.axis_model import AxisModel, load_axis_model
 from servod.lab.simulate.simulate import LoopSettings
 from servod.lab.tracking import metrics, stepped
 from servod.lab.tracking.metrics import paper_rows, roughness, score
-from servod.runtime.loop.commands import ReferenceKind
 
 COUNTS = 2**20
 CUTOFF_HZ = 120.0  # the default of the configuration
@@ -27,8 +27,8 @@ def plant() -> AxisModel:
     return load_axis_model(shipped("gains/axes/demo_joint.yaml")).model_copy(update={"thermal": None})
 
 
-def session(plant: AxisModel, folder: Path) -> SteppedSession:
-    return virtual_session(plant, folder, COUNTS, 7)
+def axis_of(plant: AxisModel, folder: Path) -> SteppedAxis:
+    return SteppedAxis(virtual_session(plant, folder, COUNTS, 7), folder)
 
 
 def set_of(law: str) -> GainSet:
@@ -37,9 +37,9 @@ def set_of(law: str) -> GainSet:
 
 @pytest.mark.parametrize("law", ["pd_dob", "local"])
 def test_the_simulator_tracks_as_the_can_loop_does(plant: AxisModel, tmp_path: Path, law: str) -> None:
-    axis = session(plant, tmp_path)
+    axis = axis_of(plant, tmp_path)
     stepped.activate(axis, set_of(law))
-    measured = stepped.run_motion(axis, ReferenceKind.PAPER, [5.0])
+    measured = stepped.run_motion(axis, ReferenceMotion.paper(5.0))
     loop = LoopSettings(0.001, COUNTS, CUTOFF_HZ, 0.3)
     followed = metrics.curves_of(metrics.run(plant, set_of(law), paper_rows(0.001, 5.0), loop, 7))
     assert len(measured.time_s) == pytest.approx(len(followed.time_s), abs=2)
@@ -55,7 +55,7 @@ def test_a_whole_measurement_has_trajectory_steps_and_curves(
     monkeypatch.setattr(stepped, "PAPER_S", 3.0)
     monkeypatch.setattr(stepped, "HOLD_S", 2.5)
     told: list[float] = []
-    found = stepped.measure(lambda: session(plant, tmp_path), set_of("local"), told.append)
+    found = stepped.measure(lambda: axis_of(plant, tmp_path), set_of("local"), told.append)
     assert told == sorted(told) and told[-1] == pytest.approx(1.0)
     assert found.rms_error_mrad < found.max_error_mrad < 1.0
     assert list(found.steps) == [100.0, 10.0]
@@ -72,10 +72,10 @@ def test_a_whole_measurement_has_trajectory_steps_and_curves(
 
 
 def test_a_motion_that_the_axis_refuses_is_told(plant: AxisModel, tmp_path: Path) -> None:
-    axis = session(plant, tmp_path)
+    axis = axis_of(plant, tmp_path)
     stepped.activate(axis, set_of("pd"))
     with pytest.raises(AnswerIsNo, match="would leave limits"):
-        stepped.run_motion(axis, ReferenceKind.STEP, [5.0, 1.0])
+        stepped.run_motion(axis, ReferenceMotion.step(5.0, 1.0))
 
 
 class Watch(stepped.Swing):
@@ -85,15 +85,15 @@ class Watch(stepped.Swing):
         super().__init__()
         self.looks_s: list[float] = []
 
-    def look(self, session: SteppedSession, passed_s: float) -> None:
+    def look(self, axis: SteppedAxis, passed_s: float) -> None:
         self.looks_s.append(passed_s)
-        super().look(session, passed_s)
+        super().look(axis, passed_s)
 
 
 def test_a_hold_is_looked_at_in_every_cycle(plant: AxisModel, tmp_path: Path) -> None:
     """A slower look sees nothing of a joint that swings at a multiple of its rate."""
-    axis, watch = session(plant, tmp_path), Watch()
+    axis, watch = axis_of(plant, tmp_path), Watch()
     stepped.activate(axis, set_of("local"))
-    stepped.run_motion(axis, ReferenceKind.STEP, [0.01, 0.6], swing=watch)
+    stepped.run_motion(axis, ReferenceMotion.step(0.01, 0.6), swing=watch)
     apart_s = [after - before for before, after in pairwise(watch.looks_s)]
-    assert max(apart_s) == pytest.approx(axis.cycle.period_ns * 1e-9)
+    assert max(apart_s) == pytest.approx(axis.session.cycle.period_ns * 1e-9)

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from servod.client.virtual import pd_set
 from servod.common.errors import AnswerIsNo
-from servod.formats.gains.gain_set import GainSet, load_gains
+from servod.formats.gains.gain_set import GainSet, load_gains, pd_set
 from servod.formats.model.axis_model import load_axis_model
 from servod.lab.commission.comparison import load_rows, save_rows
 from servod.lab.commission.state import AFTER_ROWS, BEFORE, BEFORE_ROWS, DEPLOYMENT, GAINS, MODEL, STORE, write_json
@@ -44,10 +43,10 @@ class Deploy:
             name = walk.axis.config.name
             walk.questions.agree(f"try the certified set {gains.name} on {name}: {announced(gains)}; is its way free?")
         with (
-            walk.axis.deployment(walk.path(STORE), gains, _present(walk)) as link,
+            walk.axis.deployment(walk.path(STORE), gains, _present(walk)) as axis,
             walk.progress(self.title) as tell,
         ):
-            done = deploy(link, gains, tell, remembered(walk), lambda before: remember(walk, before))
+            done = deploy(axis, gains, tell, remembered(walk), lambda before: remember(walk, before))
         _keep(walk, done)
         if not done.proven:
             raise AnswerIsNo(f"deploy: {done.said}")

@@ -34,19 +34,19 @@ class Identify:
 
         Otherwise a real one goes on where it was interrupted.
         """
-        options, axis = walk.options, walk.axis
-        if not axis.virtual:
+        options, opened = walk.options, walk.axis
+        if not opened.virtual:
             walk.questions.agree(_free_travel(walk))
-        with axis.experiments() as link, walk.progress(self.title) as tell:
+        with opened.experiments() as axis, walk.progress(self.title) as tell:
             analysis = identify(
-                link,
+                axis,
                 walk.path(RECORDINGS),
                 tell,
                 travel_rad=options.travel_rad,
                 speed_rad_s=options.speed_rad_s,
                 seed=options.seed,
-                resume=not axis.virtual and self.name not in options.again,
-                subject=digest(axis.identity),
+                resume=not opened.virtual and self.name not in options.again,
+                subject=digest(opened.identity),
             )
         write_json(walk.path(IDENTIFIED), document(analysis))
         write_text(walk.path(MODEL), axis_model_yaml(model_of(analysis)))

@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from servod.client.axis import MotionEnded
 from servod.common.errors import AnswerIsNo
 from servod.lab.identify.experiments import wiring
-from servod.lab.identify.experiments.common import Bench
+from servod.lab.identify.experiments.common import Bench, ExperimentEnded
 from servod.lab.identify.fits.break_away import torque_of
 from servod.lab.identify.shapes import growing, samples
 from servod.lab.identify.trace import Kind, Trace
@@ -31,10 +30,10 @@ WINDOW_RAD, WINDOW_COUNTS = 1.2e-3, 25.0
 def search(bench: Bench, direction: float) -> Trace:
     """The exponential ramp. Raises AnswerIsNo when nothing moves, or when signs or scales of the wiring are wrong."""
     ramp = direction * growing(FIRST_SHARE * bench.bounds.torque_nm, bench.bounds.torque_nm, SEARCH_S, bench.period_s)
-    config, moved_rad = bench.link.config, 0.5 * window_rad(bench)
+    config, moved_rad = bench.axis.config, 0.5 * window_rad(bench)
     try:
         trace = _ramp(bench, ramp, direction, True)
-    except MotionEnded as ended:
+    except ExperimentEnded as ended:
         if ended.trace is not None:
             wiring.check_motion(ended.trace, config, moved_rad)
         raise

@@ -1,6 +1,6 @@
 """What the experiments share: the axis, the bounds, where recordings go, and how a motion is run.
 
-Between the walk and the links. A motion that an interrupted walk has recorded already is not run again: the axis is
+Between the walk and the axis. A motion that an interrupted walk has recorded already is not run again: the axis is
 enabled, and moved to where it has to be, only before the first motion that is missing.
 """
 
@@ -12,19 +12,31 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from servod.client.axis import Link, MotionEnded
+from servod.client.axis import AxisClient, AxisDropped, ReferenceMotion
 from servod.common.errors import AnswerIsNo
+from servod.formats.gains.gain_set import pd_set
 from servod.lab.identify.bounds import Bounds
 from servod.lab.identify.shapes import samples
 from servod.lab.identify.store import motion_hash
 from servod.lab.identify.trace import Kind, Trace, trace_of
+from servod.lab.recordings.recording import Rows, moving, rows_of
 
 Array = NDArray[np.float64]
 
+#: Name of the gain set that experiments run under, in the store of the axis.
+GAIN_NAME = "identify_pd"
 #: What rounding may add to a planned way or speed.
 ROUNDING = 1.02
 #: Speed is looked at over this time: long enough for the encoder's steps, short against any motion that matters.
 SPEED_SPAN_S = 0.004
+
+
+class ExperimentEnded(AnswerIsNo):
+    """The axis dropped out of an experiment; `trace` is what it recorded until then, None where there is nothing."""
+
+    def __init__(self, message: str, trace: Trace | None) -> None:
+        super().__init__(message)
+        self.trace = trace
 
 
 class Keeper(Protocol):
@@ -34,7 +46,7 @@ class Keeper(Protocol):
         """The earlier recording of this motion, if there is one."""
         ...
 
-    def keep(self, rows: NDArray[np.void], trace: Trace, motion: str) -> Trace:
+    def keep(self, rows: Rows, trace: Trace, motion: str) -> Trace:
         """Keep a motion; returns its trace with the recording's hash."""
         ...
 
@@ -51,7 +63,7 @@ class _Move(NamedTuple):
 class Bench:
     """The axis on the test bench: what every experiment is given."""
 
-    link: Link
+    axis: AxisClient
     bounds: Bounds
     keeper: Keeper
     rng: np.random.Generator
@@ -65,18 +77,18 @@ class Bench:
     @property
     def period_s(self) -> float:
         """The loop's period."""
-        return self.link.config.cycle.period_us * 1e-6
+        return self.axis.config.cycle.period_us * 1e-6
 
     @property
     def resolution_rad(self) -> float:
         """Angle of one count of the joint's encoder."""
-        return 2.0 * np.pi / self.link.config.encoder.counts_per_turn
+        return 2.0 * np.pi / self.axis.config.encoder.counts_per_turn
 
     def set_gains(self, position_nm_per_rad: float, velocity_nms_per_rad: float) -> None:
         """PD feedback of the motions to come."""
         self._gains = (position_nm_per_rad, velocity_nms_per_rad)
         if self.enabled:
-            self.link.set_gains(*self._gains)
+            change_feedback(self.axis, *self._gains)
 
     def run(self, kind: Kind, positions: Array, torques: Array, window_rad: float, settings: dict[str, float]) -> Trace:
         """Run one motion, keep its recording, return its trace.
@@ -103,7 +115,7 @@ class Bench:
             t = np.linspace(0.0, 1.0, max(2, round(duration_s / self.period_s)))
             path = way * (0.5 - 0.5 * np.cos(np.pi * t))
             self._check_plan(path)
-            self._excite(path, np.zeros(len(t)))
+            self._excite(path, np.zeros(len(t)), self.bounds.window_rad)
         else:
             self._missed = _Move(position_rad, gains, speed_rad_s)
         self.position_rad = position_rad
@@ -112,7 +124,7 @@ class Bench:
         """Wait under the present gains, without recording it."""
         if self.enabled:
             still = np.zeros(samples(duration_s, self.period_s))
-            self._excite(still, still)
+            self._excite(still, still, self.bounds.window_rad)
 
     def of(self, *kinds: Kind) -> list[Trace]:
         """Traces of these kinds so far."""
@@ -121,14 +133,14 @@ class Bench:
     def _record(
         self, kind: Kind, motion: str, positions: Array, torques: Array, window_rad: float, settings: dict[str, float]
     ) -> Trace:
-        """Run the motion on the axis. Raises MotionEnded, with its trace, when the axis drops out."""
+        """Run the motion on the axis. Raises ExperimentEnded, with its trace, when the axis drops out."""
         self._wake()
         settings = {"resolution_rad": self.resolution_rad, **settings}
         try:
-            rows = self.link.excite(positions.tolist(), torques.tolist(), window_rad)
-        except MotionEnded as ended:
-            ended.trace = trace_of(kind, ended.rows, settings) if len(ended.rows) else None
-            raise
+            rows = self._excite(positions, torques, window_rad)
+        except AxisDropped as dropped:
+            rows = moving(rows_of(dropped.raw))
+            raise ExperimentEnded(str(dropped), trace_of(kind, rows, settings) if len(rows) else None) from None
         return self.keeper.keep(rows, trace_of(kind, rows, settings), motion)
 
     def _wake(self) -> None:
@@ -136,13 +148,14 @@ class Bench:
         if self.enabled:
             return
         gains, self.enabled = self._gains, True
-        self.position_rad = self.link.enable() - self.start_rad
+        self.position_rad = enable_powerless(self.axis) - self.start_rad
         if self._missed is not None:
             self.go_to(*self._missed)
         self.set_gains(*gains)
 
-    def _excite(self, positions: Array, torques: Array) -> None:
-        self.link.excite(positions.tolist(), torques.tolist(), self.bounds.window_rad)
+    def _excite(self, positions: Array, torques: Array, window_rad: float) -> Rows:
+        motion = ReferenceMotion.excite(positions.tolist(), torques.tolist(), window_rad)
+        return moving(rows_of(self.axis.run(motion)))
 
     def _check(self, positions: Array, torques: Array) -> None:
         self._check_plan(positions)
@@ -170,6 +183,19 @@ class Bench:
                 f"{self.bounds.most_rad_s:.3g} are allowed: by its own friction it is faster as soon as it slides; "
                 f"allow {2.0 * seen:.2g} rad/s (--speed, limits.speed_rad_s)"
             )
+
+
+def enable_powerless(axis: AxisClient) -> float:
+    """Enable under no torque; the present position in rad."""
+    change_feedback(axis, 0.0, 0.0)
+    axis.enable()
+    return axis.status().position_rad
+
+
+def change_feedback(axis: AxisClient, position_nm_per_rad: float, velocity_nms_per_rad: float) -> None:
+    """Run this PD feedback on trial: whatever ends the experiments, the set of before comes back."""
+    gains = pd_set(GAIN_NAME, position_nm_per_rad, velocity_nms_per_rad, tool="servoctl identify")
+    axis.activate(*axis.load(gains))
 
 
 def peak_speed(trace: Trace, span_s: float) -> float:

@@ -15,9 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from servod.client.open import RecoveryAxis
+from servod.client.axis import AxisClient, ReferenceMotion
 from servod.client.processes import socket_folder
-from servod.client.stepped import Rows
 from servod.common.errors import AnswerIsNo
 from servod.common.files import write_bytes
 from servod.formats.gains.design import Uncertainty
@@ -31,11 +30,12 @@ from servod.lab.diagnose.engine import diagnose
 from servod.lab.diagnose.judge.evidence import Diagnosis
 from servod.lab.diagnose.judge.verdict import Verdict
 from servod.lab.recordings import load_recording
+from servod.lab.recordings.recording import Rows, moving, rows_of
 from servod.lab.report.diagnosis import MODEL, write_files
 from servod.lab.synthesize.deployed import Wishes
 from servod.lab.synthesize.gain_set import Options, synthesize
 from servod.lab.synthesize.infeasible import Infeasible
-from servod.lab.tracking.metrics import Array, score
+from servod.lab.tracking.metrics import REST_S, Array, score
 from servod.lab.verify.certify import verify
 from servod.lab.verify.checks import LEAST_PLANTS
 from servod.lab.verify.vertices import least_widths
@@ -44,7 +44,7 @@ from servod.lab.verify.vertices import least_widths
 Tell = Callable[[str, float], None]
 
 #: Opens an enabled axis: joint, gain set, folder, seed of its noise.
-OpenAxis = Callable[[AxisModel, GainSet, Path, int], AbstractContextManager[RecoveryAxis]]
+OpenAxis = Callable[[AxisModel, GainSet, Path, int], AbstractContextManager[AxisClient]]
 
 #: Shares of the usual uncertainty that a design is tried with: what recordings fitted is known better.
 SCALES = (1.0, 0.5, 0.25)
@@ -171,16 +171,17 @@ def recover(
     effort: Effort = Effort(),
 ) -> Recovery:
     """Run the whole story; files stay in `out`. Raises AnswerIsNo when a step's answer is no."""
+    paper = ReferenceMotion.paper(effort.paper_s)
     tell("design for what is believed", 0.02)
     write_bytes(out / "believed.yaml", axis_model_yaml(believed).encode())
     first = designed(believed, out / "believed.yaml", out / "gains_before.yaml", None, effort.plants)
     with socket_folder("servod-demo-") as folder:
         tell("the axis as it is believed to be", 0.2)
         with open_axis(believed, first.gains, _folder(folder, "believed"), seed) as axis:
-            before = axis.paper(effort.paper_s)
+            before = moved(axis, paper)
         with open_axis(true, first.gains, _folder(folder, "true"), seed) as axis:
             tell("the axis as it is", 0.25)
-            concealed = axis.paper(effort.paper_s)
+            concealed = moved(axis, paper)
             recordings = _recorded(axis, concealed, out, tell, effort)
             tell("diagnosis", 0.4)
             found, document = _diagnosed(believed, recordings, out / DIAGNOSIS)
@@ -189,14 +190,20 @@ def recover(
             second = designed(load_axis_model(extended), extended, out / "gains_after.yaml", first.gains, effort.plants)
             done = _deployed(axis, second.gains, tell)
             tell("the axis under what was found", 0.95)
-            after = axis.paper(effort.paper_s)
+            after = moved(axis, paper)
     return Recovery(effect, before, concealed, after, found, document, first, second, done)
 
 
-def _deployed(axis: RecoveryAxis, gains: GainSet, tell: Tell) -> Deployment:
+def moved(axis: AxisClient, motion: ReferenceMotion) -> Rows:
+    """The cycles of a motion that begins at rest. Raises AnswerIsNo when the axis drops out."""
+    axis.wait(REST_S)
+    return moving(rows_of(axis.run(motion)))
+
+
+def _deployed(axis: AxisClient, gains: GainSet, tell: Tell) -> Deployment:
     """Put the set on trial; again where it was turned down and the loop had skipped cycles, as deploy advises then."""
     for _ in range(_TRIALS):
-        done = deploy(axis.link, gains, lambda what, share: tell(f"deploy: {what}", 0.85 + 0.08 * share))
+        done = deploy(axis, gains, lambda what, share: tell(f"deploy: {what}", 0.85 + 0.08 * share))
         if done.proven or done.rows_after is None or not skipped(done.rows_after):
             break
     return done
@@ -239,12 +246,12 @@ def _narrowed(model: AxisModel, scale: float) -> Uncertainty:
     return scaled.model_copy(update=least)
 
 
-def _recorded(axis: RecoveryAxis, tracked: Rows, out: Path, tell: Tell, effort: Effort) -> list[Path]:
+def _recorded(axis: AxisClient, tracked: Rows, out: Path, tell: Tell, effort: Effort) -> list[Path]:
     """The axis's own recordings: a part of (19), and motions that show more."""
     runs = {"paper": tracked[time_s(tracked) < effort.diagnosed_s]}
     for index, (name, positions) in enumerate(motions(effort.motion_s).items()):
         tell(f"recording: {name}", 0.3 + 0.03 * index)
-        runs[name] = axis.follow(positions.tolist())
+        runs[name] = moved(axis, ReferenceMotion.table(positions.tolist()))
     paths = [out / "recordings" / f"{name}.mcap" for name in runs]
     for path, rows in zip(paths, runs.values(), strict=True):
         save_rows(path, rows)

@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from servod.client.stepped import Rows
 from servod.formats.gains.design import Design
 from servod.formats.gains.gain_set import Certificate, GainSet, Promise
 from servod.lab.deploy.outcome import Deployment, Ending
-from servod.lab.recordings.recording import ROW
+from servod.lab.recordings.recording import ROW, Rows
 from servod.lab.verify.validation import Figures, Part
 from servod.qualify.demo.recovery.page import story
 from servod.qualify.demo.recovery.walk import Designed, Recovery

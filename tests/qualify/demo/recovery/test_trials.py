@@ -23,10 +23,6 @@ class Trial:
             self.rows_after["missed"][1] = missed
 
 
-class Axis:
-    link = None
-
-
 @pytest.mark.parametrize(
     ("trials", "used"),
     [
@@ -40,12 +36,12 @@ class Axis:
 def test_only_lateness_earns_another_trial(trials: list[Trial], used: int, monkeypatch: pytest.MonkeyPatch) -> None:
     left = iter(trials)
 
-    def deploy(_link: Any, _gains: Any, tell: walk.Tell) -> Trial:
+    def deploy(_axis: Any, _gains: Any, tell: walk.Tell) -> Trial:
         tell("verdict", 1.0)
         return next(left)
 
     monkeypatch.setattr(walk, "deploy", deploy)
     told: list[str] = []
-    done = walk._deployed(Axis(), None, lambda what, _share: told.append(what))  # type: ignore[arg-type]
+    done = walk._deployed(None, None, lambda what, _share: told.append(what))  # type: ignore[arg-type]
     assert done is trials[used - 1]
     assert len(told) == used
