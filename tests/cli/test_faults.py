@@ -94,19 +94,19 @@ def test_a_mistake_in_a_scenario_is_found_when_it_is_read(
 def test_one_that_breaks_off_has_failed_and_the_next_one_runs(
     mine: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from servod.qualify.faults.stepped import SteppedAxis
+    from servod.qualify.faults.stepped import SteppedUnderTest
 
     sound, broken = mine.with_name("sound.yaml"), []
     sound.write_text(mine.read_text())
-    observe = SteppedAxis.observe
+    observe = SteppedUnderTest.observe
 
-    def breaks_once(axis: SteppedAxis) -> Observation:
+    def breaks_once(axis: SteppedUnderTest) -> Observation:
         if not broken:
             broken.append(axis)
             raise struct.error("int too large\nto convert")
         return observe(axis)
 
-    monkeypatch.setattr(SteppedAxis, "observe", breaks_once)
+    monkeypatch.setattr(SteppedUnderTest, "observe", breaks_once)
     assert run(["qualify", "faults", "--scenario", str(mine), "--scenario", str(sound)]) == 1
     shown = capsys.readouterr()
     assert "1 of 2 FAILED mine: error: int too large to convert" in shown.err.splitlines()

@@ -78,7 +78,7 @@ def _recorded(axis: AxisClient, tell: Callable[[float], None]) -> tuple[dict[str
         except (
             Refused,
             RemoteBadInput,
-        ) as error:  # of an axis that is enabled: the motion itself is too much for its limits
+        ) as error:  # of an enabled axis: the motion is too much for its limits
             refused.append(f"{name}: {error}")
     return curves, refused
 

@@ -17,7 +17,7 @@ from subprocess import Popen
 
 from servod.client.control import ControlClient
 from servod.client.processes import child, other_cores, wait_until
-from servod.common.errors import ServodError, Unreachable
+from servod.common.errors import ServodError
 from servod.drivers.virtual.drive_record import DriveSample, read_drive_record
 from servod.formats.protocol import Verb
 from servod.qualify.faults.wire import Wire
@@ -155,15 +155,6 @@ class Machine:
 
     def _all(self, name: str) -> list[Path]:
         return sorted(self.folder.glob(f"[0-9][0-9]-{name}"))
-
-
-def wait_for_state(client: ControlClient, state: str, timeout_s: float = 10.0) -> None:
-    """Poll the status until the axis is in `state`. Raises Unreachable."""
-    deadline = time.monotonic() + timeout_s
-    while (axis := client.call(Verb.STATUS)["axis"])["state"] != state:
-        if time.monotonic() > deadline:
-            raise Unreachable(f"the axis is {axis['state']} after {timeout_s:g} s, not {state}")
-        time.sleep(0.02)
 
 
 def _child_of(pid: int) -> int:

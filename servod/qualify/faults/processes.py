@@ -19,6 +19,7 @@ import yaml
 
 from servod.client.control import ControlClient
 from servod.client.processes import last_core, own_group
+from servod.client.under_daemon import DaemonAxis
 from servod.common.errors import ServodError, Unreachable
 from servod.common.faults import FaultCode
 from servod.common.shipped import shipped
@@ -30,7 +31,7 @@ from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.formats.model.axis_model import axis_model_yaml
 from servod.formats.protocol import Verb
 from servod.qualify.faults.evidence import lost_records, wait_for_rows
-from servod.qualify.faults.machine import Machine, Process, wait_for_state
+from servod.qualify.faults.machine import Machine, Process
 from servod.qualify.faults.scenario import (
     Nested,
     Recovery,
@@ -95,10 +96,9 @@ class ProcessAxis:
         self.machine.start_daemon()
         self._up = True
         if start in (Start.ENABLED, Start.MOVING):
-            self.client.call(Verb.ENABLE)
-            wait_for_state(self.client, AxisState.ENABLED.name)
+            self.axis.enable()
         if start is Start.MOVING:
-            self.client.call(Verb.TRACK, kind="sine", **self._motion._asdict(), duration_s=600.0)
+            self.axis.begin(self._motion.reference)
             self._wait_until(self._moves, "the axis does not move")
             time.sleep(_SHOWN_PERIODS / self._motion.frequency_hz)
         self._wait_until(self._recorded, "the recorder writes nothing")
@@ -185,9 +185,9 @@ class ProcessAxis:
             if recovery is Recovery.RESTART:
                 self._restart_what_ended()
             if recovery is not Recovery.NONE:
-                self.client.call(Verb.ENABLE, reset_fault=recovery is Recovery.RESET_FAULT)
+                self.axis.enable(recovery is Recovery.RESET_FAULT)
             time.sleep(0.1)
-            return bool(self.client.call(Verb.STATUS)["axis"]["state"] == AxisState.ENABLED.name)
+            return self.axis.status().enabled
         except ServodError as error:
             self.refusal = str(error)
             return False
@@ -196,6 +196,11 @@ class ProcessAxis:
         """End all processes."""
         self.leave()
         self.machine.close()
+
+    @property
+    def axis(self) -> DaemonAxis:
+        """The axis as a client has it. Raises Unreachable."""
+        return DaemonAxis(self.client)
 
     @property
     def client(self) -> ControlClient:

@@ -18,7 +18,7 @@ from servod.qualify.faults.evidence import Watch
 from servod.qualify.faults.judge import Reaction, complaints, loss_of, reaction
 from servod.qualify.faults.processes import ProcessAxis
 from servod.qualify.faults.scenario import Injection, Loss, Recovery, Runs, Scenario
-from servod.qualify.faults.stepped import SteppedAxis
+from servod.qualify.faults.stepped import SteppedUnderTest
 from servod.qualify.faults.under_test import AxisUnderTest, Observation
 
 # Whether what a scenario injects really happened: a fault that hits nothing proves nothing.
@@ -80,7 +80,7 @@ def axis_of(scenario: Scenario, folder: Path) -> AxisUnderTest:
     """The axis under test that the scenario names. Raises BadInput for its keys, Unreachable for one of the guest."""
     if scenario.runs is Runs.GUEST:
         raise Unreachable(f"{scenario.title}: needs the guest machine (scripts/guest)")
-    return SteppedAxis(scenario, folder) if scenario.runs is Runs.STEPPED else ProcessAxis(scenario, folder)
+    return SteppedUnderTest(scenario, folder) if scenario.runs is Runs.STEPPED else ProcessAxis(scenario, folder)
 
 
 def run_scenario(

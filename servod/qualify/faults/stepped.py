@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Hashable, Sequence
 from pathlib import Path
 
-from servod.client.stepped import SteppedSession
+from servod.client.stepped import SteppedAxis, SteppedSession
 from servod.common.errors import ServodError, Unreachable
 from servod.common.faults import faults_in
 from servod.common.shipped import shipped
@@ -16,7 +16,6 @@ from servod.drivers.virtual.drive_record import DriveRecord, read_drive_record
 from servod.drivers.virtual.world import SteppedBus, SteppedWorld, VirtualAxisSettings
 from servod.formats.config import AxisConfig
 from servod.formats.gains.gain_set import load_gains
-from servod.kernels.laws import LAWS
 from servod.qualify.faults.scenario import (
     PROVEN_BEFORE,
     Nested,
@@ -32,7 +31,7 @@ from servod.qualify.faults.scenario import (
 from servod.qualify.faults.under_test import MOTION, Observation
 from servod.runtime.fieldbus.cia import NMT_ID
 from servod.runtime.loop.axis import AxisState
-from servod.runtime.loop.commands import REFUSAL_TEXT, Op, ReferenceKind, Refusal
+from servod.runtime.loop.commands import REFUSAL_TEXT, Op, Refusal
 from servod.runtime.loop.wiring.findings import Finding
 
 #: Samples of the drive's record for each millisecond: its commands, its own watch, its events.
@@ -41,33 +40,37 @@ _SAMPLES_PER_MS = 2.5
 _OTHERWISE_MS = 8000.0
 #: The drive's own record in the folder of a stepped axis.
 RECORD_NAME = "drive.bin"
-#: The motion of a start in motion: whole half periods after its begin it is at its fastest, 1.3 rad/s.
-_SINE = (ReferenceKind.SINE, *MOTION[Runs.STEPPED], 600.0)
+#: Whole half periods after the begin of its motion an axis is at its fastest, 1.3 rad/s.
 _TO_THE_FASTEST_S = 0.5
 #: The test of the wiring pushes when the joint feels this torque, about half of what friction takes; it begins by then.
 _PUSHED_NM, _PUSHED_S = 0.03, 5.0
 
 
-class SteppedAxis:
-    """servod.qualify.faults.under_test.AxisUnderTest in virtual time; `folder` takes the drive's record."""
+class SteppedUnderTest:
+    """servod.qualify.faults.under_test.AxisUnderTest in virtual time; `folder` takes drive record and gain sets."""
 
     def __init__(self, scenario: Scenario, folder: Path) -> None:
         self.effects: Counter[Hashable] = Counter()
-        self._record_path = folder / RECORD_NAME
+        self._folder, self._record_path = folder, folder / RECORD_NAME
         where = scenario.title
         settings = validate(scenario.settings, VirtualAxisSettings, f"{where}: settings")
         record = DriveRecord(self._record_path, _samples(scenario))
         self.world = SteppedWorld(settings, plant_of(scenario), record)
         self._config = config_of(scenario, merged(shipped_config(), PROVEN_BEFORE))
         self._foreign = self.world.connect(())
-        self._session: SteppedSession | None = None
+        self._axis: SteppedAxis | None = None
         self._refusal = ""
 
     @property
+    def axis(self) -> SteppedAxis:
+        """The axis as a client has it; it exists from the bring-up on."""
+        assert self._axis is not None
+        return self._axis
+
+    @property
     def session(self) -> SteppedSession:
-        """The master with its loop; it exists from the bring-up on."""
-        assert self._session is not None
-        return self._session
+        """The master with its loop."""
+        return self.axis.session
 
     @property
     def refusal(self) -> str:
@@ -87,22 +90,22 @@ class SteppedAxis:
             self._begin_proof()
             return
         if start in (Start.ENABLED, Start.MOVING):
-            self.session.enable()
+            self.axis.enable()
         if start is Start.MOVING:
-            self.command(Op.REFERENCE, _SINE)
+            self.axis.begin(MOTION[Runs.STEPPED].reference)
         self.session.run(_TO_THE_FASTEST_S if start is Start.MOVING else 0.1)
 
     def run(self, duration_s: float) -> None:
         """Advance; an axis that is off is brought up first, and a refusal is kept."""
-        if self._session is None and not self._refusal:
+        if self._axis is None and not self._refusal:
             try:
                 self._bring_up()
             except ServodError as error:
                 self._refusal = str(error)
-        if self._session is None:
+        if self._axis is None:
             self.world.clock.sleep_until(self.now_ns() + round(duration_s * 1e9))
         else:
-            self._session.run(duration_s)
+            self.session.run(duration_s)
 
     def bus_fault(self, fault: BusFault) -> None:
         """Ask the hub, as the loop's connection."""
@@ -142,11 +145,11 @@ class SteppedAxis:
     def observe(self) -> Observation:
         """What is seen now."""
         samples = read_drive_record(self._record_path)
-        if self._session is None:
+        if self._axis is None:
             return Observation(samples, AxisState.DISABLED.name, frozenset(), self._refusal)
-        axis, records = self._session.cycle.axis, self._session.records
+        axis, records = self.session.cycle.axis, self.session.records
         latched = frozenset(fault.code for fault in faults_in(axis.latched))
-        proof = self._session.proof
+        proof = self.session.proof
         says = None if proof is None else Finding(int(proof.finding))
         errors = frozenset(record.drive_error for record in records) - {0}
         return Observation(samples, axis.state.name, latched, self._refusal, says=says, drive_errors=errors)
@@ -157,12 +160,12 @@ class SteppedAxis:
             if recovery is Recovery.RESTART:
                 self._bring_up()
             if recovery is not Recovery.NONE:
-                self.session.enable(recovery is Recovery.RESET_FAULT)
+                self.axis.enable(recovery is Recovery.RESET_FAULT)
         except ServodError as error:
             self._refusal = str(error)
             return False
         self.session.run(0.1)
-        return self.session.cycle.axis.state is AxisState.ENABLED
+        return self.axis.status().enabled
 
     def configure(self, over: Nested) -> bool:
         """Lay keys over the configuration; the next bring-up reads them. True when that changed it. Raises BadInput."""
@@ -173,13 +176,13 @@ class SteppedAxis:
 
     def close(self) -> None:
         """Leave the bus."""
-        if self._session is not None:
-            self._session.close()
+        if self._axis is not None:
+            self.session.close()
 
     @property
     def _asker(self) -> SteppedBus:
         """Before the bring-up there is no loop."""
-        return self._foreign if self._session is None else self._session.loop_bus
+        return self._foreign if self._axis is None else self.session.loop_bus
 
     def _begin_proof(self) -> None:
         """Enable, up to the moment at which the test of the wiring pushes the joint."""
@@ -193,7 +196,8 @@ class SteppedAxis:
     def _bring_up(self) -> None:
         self.close()
         gains = load_gains(shipped("gains/demo_pd.yaml"))
-        self._session = SteppedSession(self._config, self.world, LAWS[gains.law.name].number, gains.pack())
+        session = SteppedSession(self._config, self.world, gains.law.number, gains.pack())
+        self._axis = SteppedAxis(session, self._folder, gains)
 
 
 def _samples(scenario: Scenario) -> int:

@@ -1,4 +1,4 @@
-"""An axis under test: what every world (stepped, processes, guest) offers to scenarios, actions and judge."""
+"""An axis under test: the axis as any client has it, and what a scenario may do to it in every world."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
+from servod.client.axis import AxisClient, ReferenceMotion
 from servod.common.faults import FaultCode
 from servod.drivers.virtual.bus_faults import BusFault
 from servod.drivers.virtual.drive_record import DriveSample
@@ -16,16 +17,25 @@ from servod.runtime.loop.wiring.findings import Finding
 AMPLIFIER, ENCODER = 1, 2
 
 
-class Sine(NamedTuple):
-    """The motion of an axis that starts moving."""
+class StartMotion(NamedTuple):
+    """The sine of an axis that starts moving."""
 
     amplitude_rad: float
     frequency_hz: float
 
+    @property
+    def reference(self) -> ReferenceMotion:
+        """For longer than any scenario."""
+        return ReferenceMotion.sine(self.amplitude_rad, self.frequency_hz, 600.0)
+
 
 #: In virtual time a motion may be faster than on a machine that others use too. There it is larger: a joint that strays
 #: by what such a machine does to it is far from one that stands.
-MOTION = {Runs.STEPPED: Sine(0.1, 2.0), Runs.PROCESSES: Sine(0.3, 0.7), Runs.GUEST: Sine(0.6, 0.5)}
+MOTION = {
+    Runs.STEPPED: StartMotion(0.1, 2.0),
+    Runs.PROCESSES: StartMotion(0.3, 0.7),
+    Runs.GUEST: StartMotion(0.6, 0.5),
+}
 
 
 @dataclass(frozen=True)
@@ -55,6 +65,10 @@ class AxisUnderTest(Protocol):
     """
 
     effects: Counter[Hashable]
+
+    @property
+    def axis(self) -> AxisClient:
+        """The axis as a client has it; it exists from the bring-up on."""
 
     def now_ns(self) -> int:
         """Present time."""

@@ -21,7 +21,7 @@ from servod.formats.gains.gain_set import load_gains
 from servod.kernels.laws import LAWS
 from servod.qualify.faults.actions import action_of
 from servod.qualify.faults.scenario import Injection, Recovery, Runs, Start
-from servod.qualify.faults.stepped import RECORD_NAME, SteppedAxis
+from servod.qualify.faults.stepped import RECORD_NAME, SteppedUnderTest
 from servod.qualify.soak.drive import (
     DriveCheck,
     Samples,
@@ -64,7 +64,7 @@ class SteppedSoak:
 
     def __init__(self, seed: int, folder: Path) -> None:
         self.findings, self.tally = Findings(), Tally()
-        self._axis = SteppedAxis(nothing_yet(seed, proves=True), folder)
+        self._axis = SteppedUnderTest(nothing_yet(seed, proves=True), folder)
         self._heard, self._drive = SyncListener(self._axis.world.hub), DriveTail(folder / RECORD_NAME)
         self._axis.start(Start.ENABLED)
         config = self._axis.session.config
@@ -317,6 +317,6 @@ class SteppedSoak:
         return Batch(rows, samples)
 
 
-def _drive_limit_nm(axis: SteppedAxis) -> float:
+def _drive_limit_nm(axis: SteppedUnderTest) -> float:
     settings = axis.world.settings
     return settings.rated_torque_mnm * settings.max_torque_permille * 1e-6 * settings.gear_ratio

@@ -9,7 +9,7 @@ from servod.qualify.faults import run
 from servod.qualify.faults.actions import Action, action_of
 from servod.qualify.faults.run import Effects
 from servod.qualify.faults.scenario import Injection, Runs, Scenario
-from servod.qualify.faults.stepped import SteppedAxis
+from servod.qualify.faults.stepped import SteppedUnderTest
 from servod.qualify.faults.variants import shipped_scenarios
 
 #: One of each kind of trace; all of these end ENABLED, so that nothing else would tell.
@@ -25,16 +25,9 @@ KINDS = (
 )
 
 
-class Nothing:
-    """In the place of an action."""
-
-    def apply(self, axis: SteppedAxis) -> None:
-        """Do nothing."""
-
-
 @pytest.mark.parametrize(("name", "trace"), KINDS)
 def test_an_injection_that_does_nothing_is_found(name: str, trace: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run, "action_of", lambda *_: Nothing())
+    monkeypatch.setattr(run, "_inject", lambda axis, *_: axis.now_ns())
     outcome = run.run_scenario(name, shipped_scenarios()[name])
     assert f"the fault did not happen: {trace}" in outcome.complaints
     assert outcome.axis == "ENABLED"
@@ -51,7 +44,7 @@ def frames(fault: str, count: int | None = None, detail: int = 0) -> dict[str, A
 
 def told(folder: Path, injected: Scenario, applied: Scenario) -> list[str]:
     """Complaints after `applied` where `injected` should have been, with a quarter of a second on the bus."""
-    axis = SteppedAxis(injected, folder)
+    axis = SteppedUnderTest(injected, folder)
     effects = Effects(injected, axis)
     for injection in applied.inject:
         action_of(injection, "x", Runs.STEPPED).apply(axis)

@@ -18,7 +18,7 @@ from servod.qualify.faults.scenario import Loss, Runs
 from servod.runtime.loop.commands import Op, ReferenceKind
 
 if TYPE_CHECKING:
-    from servod.qualify.faults.stepped import SteppedAxis
+    from servod.qualify.faults.stepped import SteppedUnderTest
     from servod.qualify.faults.under_test import AxisUnderTest
 
 
@@ -37,13 +37,13 @@ class SteppedAction(Action):
 
     def apply(self, axis: AxisUnderTest) -> None:
         """Hand over to `act`."""
-        from servod.qualify.faults.stepped import SteppedAxis
+        from servod.qualify.faults.stepped import SteppedUnderTest
 
-        assert isinstance(axis, SteppedAxis)  # `runs` is checked when the scenario is read
+        assert isinstance(axis, SteppedUnderTest)  # `runs` is checked when the scenario is read
         self.took(axis, self.act(axis))
 
     @abstractmethod
-    def act(self, axis: SteppedAxis) -> int:
+    def act(self, axis: SteppedUnderTest) -> int:
         """Let it happen to `axis` now; returns how often it took effect already."""
 
 
@@ -53,7 +53,7 @@ class Tell(SteppedAction):
     op: OpName
     reset_fault: bool = Field(False, description="with `enable`: reset the drive's fault first")
 
-    def act(self, axis: SteppedAxis) -> int:
+    def act(self, axis: SteppedUnderTest) -> int:
         """Give it; a refusal is an answer, which the judge sees."""
         axis.command(Op[self.op.name], [self.reset_fault])
         return 1
@@ -65,7 +65,7 @@ class Sine(SteppedAction):
     amplitude_rad: float
     frequency_hz: float
 
-    def act(self, axis: SteppedAxis) -> int:
+    def act(self, axis: SteppedUnderTest) -> int:
         """Start it, for as long as the scenario lasts."""
         return axis.command(Op.REFERENCE, [ReferenceKind.SINE, self.amplitude_rad, self.frequency_hz, 600.0])
 
@@ -89,7 +89,7 @@ class WakesLate(SteppedAction):
         """All of the times."""
         return self.times or 1
 
-    def act(self, axis: SteppedAxis) -> int:
+    def act(self, axis: SteppedUnderTest) -> int:
         """Disturb the pace of the loop from now on; each cycle that the session wakes late counts by itself."""
         chance = random.Random(1)  # noqa: S311  (a disturbance, no secret)
         left = self.times if self.times is not None else math.inf
@@ -112,7 +112,7 @@ class Gains(SteppedAction):
     law: str
     parameters: list[float | str]
 
-    def act(self, axis: SteppedAxis) -> int:
+    def act(self, axis: SteppedUnderTest) -> int:
         """Activate them ("nan" and "inf" are written as text)."""
         numbers = [float(p) for p in self.parameters]
         return axis.command(Op.ACTIVATE, [1, LAWS[self.law].number, len(numbers), *numbers])
@@ -123,7 +123,7 @@ class Configure(SteppedAction):
 
     config: dict[str, Any]
 
-    def act(self, axis: SteppedAxis) -> int:
+    def act(self, axis: SteppedUnderTest) -> int:
         """Lay its keys over what is there."""
         return axis.configure(self.config)
 
@@ -135,7 +135,7 @@ class Load(SteppedAction):
 
     torque_nm: float = Field(ge=-10.0, le=10.0)
 
-    def act(self, axis: SteppedAxis) -> int:
+    def act(self, axis: SteppedUnderTest) -> int:
         """Hang it on."""
         joint = axis.world.devices.joint
         joint.advance(axis.now_ns())
@@ -149,7 +149,7 @@ class CounterWraps(SteppedAction):
 
     traceless: ClassVar[str] = "the counter never wrapped"
 
-    def act(self, axis: SteppedAxis) -> int:
+    def act(self, axis: SteppedUnderTest) -> int:
         """Listen to the encoder from now on."""
         half_range = axis.world.settings.encoder_measuring_range_counts / 2
         before: int | None = None
