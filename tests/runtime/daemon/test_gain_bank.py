@@ -15,7 +15,7 @@ from servod.common.shipped import shipped
 from servod.formats.config import load_config
 from servod.formats.gains.store import Action, GainStore
 from servod.runtime.daemon.arguments import GainsActivateArgs, GainsVerdictArgs
-from servod.runtime.daemon.flows import Flow, OrderWait, Wait
+from servod.runtime.daemon.flows import OrderWait, finish
 from servod.runtime.daemon.gain_bank import GainBank
 from servod.runtime.loop.commands import Op
 from tests.runtime.daemon.daemon_rows import record
@@ -58,32 +58,13 @@ class Bench:
         return stored.name
 
     def activate(self, trial: bool) -> dict[str, Any]:
-        return driven(self.bank.activate(GainsActivateArgs(name=TRIED, trial=trial), self.loop.send, self.slow))
+        return finish(self.bank.activate(GainsActivateArgs(name=TRIED, trial=trial), self.loop.send, self.slow))
 
     def keep(self) -> dict[str, Any]:
-        return driven(self.bank.keep(GainsVerdictArgs(), self.loop.send, self.slow))
+        return finish(self.bank.keep(GainsVerdictArgs(), self.loop.send, self.slow))
 
     def rollback(self, trial: bool) -> dict[str, Any]:
-        return driven(self.bank.rollback(GainsVerdictArgs(trial=trial), self.loop.send, self.slow))
-
-
-def driven(flow: Flow) -> dict[str, Any]:
-    """Run a flow to its end; what it waits for comes at once."""
-    try:
-        wait = next(flow)
-        while True:
-            wait = answered(flow, wait)
-    except StopIteration as end:
-        return dict(end.value)
-
-
-def answered(flow: Flow, wait: Wait) -> Wait:
-    """Give a flow what it waited for, or throw it; what it waits for next."""
-    try:
-        value = wait.result()
-    except OSError as error:
-        return flow.throw(error)
-    return flow.send(value)
+        return finish(self.bank.rollback(GainsVerdictArgs(trial=trial), self.loop.send, self.slow))
 
 
 @pytest.fixture
