@@ -9,7 +9,6 @@ import contextlib
 import os
 import select
 import signal
-import time
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path

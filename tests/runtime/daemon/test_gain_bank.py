@@ -115,6 +115,6 @@ def test_the_list_says_what_this_axis_may_not_run(
     """The configuration may have changed since the set was stored."""
     gains = bench.config.gains.model_copy(update={"accept_uncertified": accepts})
     monkeypatch.setattr(bench.bank, "_config", bench.config.model_copy(update={"gains": gains}))
-    rows = driven(bench.bank.list(bench.loop.serial, bench.slow))["gains"]
+    rows = finish(bench.bank.list(bench.loop.serial, bench.slow))["gains"]
     assert sorted((row["name"], row["active"]) for row in rows) == sorted([(FIRST, True), (TRIED, False)])
     assert all(says in row["refused"] and bool(row["refused"]) != accepts for row in rows)
