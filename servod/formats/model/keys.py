@@ -5,7 +5,7 @@ Under the groups of keys of friction and of everything else. Torque means force 
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from pydantic import Field, model_validator
 
@@ -15,6 +15,16 @@ Factor = Annotated[float, Field(gt=0.0, le=100.0)]
 NonNegative = Annotated[float, Field(ge=0.0)]
 Positive = Annotated[float, Field(gt=0.0)]
 Phase = Annotated[float, Field(ge=-100.0, le=100.0, description="rad, at position 0")]
+
+
+class Group(Strict):
+    """One optional group of keys: the record of an effect for whoever reads, checks or packs a model.
+
+    `plain`: the kernels' plain loop obeys the group, or it is not in the dynamics at all; beside any other the full
+    loop runs.
+    """
+
+    plain: ClassVar[bool] = False
 
 
 class Harmonic(Strict):
@@ -32,7 +42,12 @@ class Harmonic(Strict):
         return self
 
 
-class Harmonics(Strict):
-    """A sum of sines over position."""
+class Harmonics(Group):
+    """A sum of sines over position.
+
+    `under_one`: the power of n with which |amplitude|*n^power must sum to less than 1 (0: shares, 1: slopes), if any.
+    """
+
+    under_one: ClassVar[int | None] = None
 
     harmonics: tuple[Harmonic, ...] = Field(min_length=1, max_length=64)
