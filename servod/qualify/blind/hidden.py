@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from servod.qualify.blind import hidden_drive, hidden_place
+from servod.qualify.blind import hidden_drive, hidden_place, listed
 from servod.qualify.blind.concealed import NO_THERMOMETER, Concealed, Draw
 
 # Draws concealed friction: by direction, near rest, over speed, load and temperature.
@@ -26,7 +26,7 @@ def asymmetry(draw: Draw) -> Concealed:
     names = {"positive_dry": "front_dry", "negative_dry": "back_dry"}
     names |= {"positive_viscous": "front_viscous", "negative_viscous": "back_viscous"}
     group = {key: changes[own] for key, own in names.items()}
-    return Concealed(changes, {"negative_over_positive": back / front}, {"asymmetry": group})
+    return Concealed(changes, {"negative_over_positive": back / front}, {listed.ASYMMETRY: group})
 
 
 def stribeck(draw: Draw) -> Concealed:
@@ -38,7 +38,7 @@ def stribeck(draw: Draw) -> Concealed:
     changes = {"static": static, "stribeck_velocity": velocity, "stribeck_exponent": exponent}
     group = {"static": static, "stribeck_velocity": velocity, "exponent": exponent}
     parameters = {"static": static, "stribeck_velocity": velocity} | ({"exponent": exponent} if draw.other else {})
-    return Concealed(changes, parameters, {"stribeck": group}, {"static": p.coulomb})
+    return Concealed(changes, parameters, {listed.STRIBECK: group}, {"static": p.coulomb})
 
 
 def presliding(draw: Draw) -> Concealed:
@@ -51,7 +51,7 @@ def presliding(draw: Draw) -> Concealed:
     changes = {"sigma0": sigma0, "sigma1": sigma1, "elastic_share": 0.6 if draw.other else 0.0}
     found = {"sigma0": sigma0, "sigma1": sigma1}
     believed = {"sigma0": p.sigma0, "sigma1": p.sigma1}
-    return Concealed(changes, found, None if draw.other else {"presliding": found}, believed)
+    return Concealed(changes, found, None if draw.other else {listed.PRESLIDING: found}, believed)
 
 
 def viscous_nonlinear(draw: Draw) -> Concealed:
@@ -63,7 +63,7 @@ def viscous_nonlinear(draw: Draw) -> Concealed:
     coefficient = torque / speed**exponent
     key = {2.0: "quadratic", 3.0: "cubic"}.get(exponent, "power")
     group = {key: coefficient} | ({"exponent": exponent} if key == "power" else {})
-    return Concealed(changes, group, {"viscous_nonlinear": group})
+    return Concealed(changes, group, {listed.VISCOUS_NONLINEAR: group})
 
 
 def load_dependent_friction(draw: Draw) -> Concealed:
@@ -71,9 +71,11 @@ def load_dependent_friction(draw: Draw) -> Concealed:
     share = min(draw.size(0.05, 0.2), 0.6)
     if draw.other and draw.physics.gravity > 0.0:
         share = min(2.0 * share, 0.8)
-        return Concealed({"dry_per_load": share}, {"per_load": share}, {"load_dependent_friction": {"per_load": share}})
+        return Concealed(
+            {"dry_per_load": share}, {"per_load": share}, {listed.LOAD_DEPENDENT_FRICTION: {"per_load": share}}
+        )
     found = {"per_command": share}
-    return Concealed({"dry_per_torque": share}, found, {"load_dependent_friction": found})
+    return Concealed({"dry_per_torque": share}, found, {listed.LOAD_DEPENDENT_FRICTION: found})
 
 
 def thermal(draw: Draw) -> Concealed:
@@ -85,7 +87,7 @@ def thermal(draw: Draw) -> Concealed:
     found = {"dry_per_c": -dry, "viscous_per_c": -viscous}
     if blind:
         return Concealed(changes, {}, None, thermometer=False, cold=draw.flip())
-    return Concealed(changes, found, {"thermal": {**found, "shape": shape}}, thermometer=True)
+    return Concealed(changes, found, {listed.THERMAL: {**found, "shape": shape}}, thermometer=True)
 
 
 # Draws physics that is on nobody's list: the right answer is that something unexplained is there, and where.
@@ -130,28 +132,28 @@ def patchy_friction(draw: Draw) -> Concealed:
 Hide = Callable[[Draw], Concealed]
 
 HIDE: Mapping[str, Hide] = {
-    "asymmetry": asymmetry,
-    "stribeck": stribeck,
-    "presliding": presliding,
-    "viscous_nonlinear": viscous_nonlinear,
-    "load_dependent_friction": load_dependent_friction,
-    "position_dependent_friction": hidden_place.position_dependent_friction,
-    "cogging": hidden_place.cogging,
-    "torque_ripple": hidden_place.torque_ripple,
-    "gravity": hidden_place.gravity,
-    "spring": hidden_place.spring,
-    "backlash": hidden_drive.backlash,
-    "joint_elasticity": hidden_drive.joint_elasticity,
-    "torque_gain": hidden_drive.torque_gain,
-    "torque_saturation": hidden_drive.torque_saturation,
-    "delay": hidden_drive.delay,
-    "actuator_lag": hidden_drive.actuator_lag,
-    "thermal": thermal,
-    "inertia": hidden_drive.inertia,
-    "position_dependent_inertia": hidden_place.position_dependent_inertia,
-    "encoder_eccentricity": hidden_place.encoder_eccentricity,
-    "torque_offset": hidden_drive.torque_offset,
-    "disturbance": hidden_drive.disturbance,
+    listed.ASYMMETRY: asymmetry,
+    listed.STRIBECK: stribeck,
+    listed.PRESLIDING: presliding,
+    listed.VISCOUS_NONLINEAR: viscous_nonlinear,
+    listed.LOAD_DEPENDENT_FRICTION: load_dependent_friction,
+    listed.POSITION_DEPENDENT_FRICTION: hidden_place.position_dependent_friction,
+    listed.COGGING: hidden_place.cogging,
+    listed.TORQUE_RIPPLE: hidden_place.torque_ripple,
+    listed.GRAVITY: hidden_place.gravity,
+    listed.SPRING: hidden_place.spring,
+    listed.BACKLASH: hidden_drive.backlash,
+    listed.JOINT_ELASTICITY: hidden_drive.joint_elasticity,
+    listed.TORQUE_GAIN: hidden_drive.torque_gain,
+    listed.TORQUE_SATURATION: hidden_drive.torque_saturation,
+    listed.DELAY: hidden_drive.delay,
+    listed.ACTUATOR_LAG: hidden_drive.actuator_lag,
+    listed.THERMAL: thermal,
+    listed.INERTIA: hidden_drive.inertia,
+    listed.POSITION_DEPENDENT_INERTIA: hidden_place.position_dependent_inertia,
+    listed.ENCODER_ECCENTRICITY: hidden_place.encoder_eccentricity,
+    listed.TORQUE_OFFSET: hidden_drive.torque_offset,
+    listed.DISTURBANCE: hidden_drive.disturbance,
 }
 
 UNLISTED: Mapping[str, Hide] = {

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 
+from servod.qualify.blind import listed
 from servod.qualify.blind.concealed import Concealed, Draw
 
 
@@ -24,7 +25,7 @@ def backlash(draw: Draw) -> Concealed:
     group = {"gap": gap, "load_inertia": load, "stiffness": stiffness, "damping": damping}
     told = {"gap": gap, "load_inertia": load}
     believed = {"inertia": p.inertia, "viscous": p.viscous}
-    model = None if draw.other else {"backlash": group | {"load_viscous": changes["load_viscous"]}}
+    model = None if draw.other else {listed.BACKLASH: group | {"load_viscous": changes["load_viscous"]}}
     return Concealed(changes, told, model, believed)
 
 
@@ -42,7 +43,7 @@ def joint_elasticity(draw: Draw) -> Concealed:
     group = {"load_inertia": load, "stiffness": stiffness, "damping": damping, "cubic": cubic}
     told = {"load_inertia": load, "stiffness": stiffness}
     believed = {"inertia": p.inertia, "viscous": p.viscous}
-    model = {"joint_elasticity": group | {"load_viscous": changes["load_viscous"]}}
+    model = {listed.JOINT_ELASTICITY: group | {"load_viscous": changes["load_viscous"]}}
     return Concealed(changes, told, model, believed)
 
 
@@ -63,7 +64,7 @@ def torque_gain(draw: Draw) -> Concealed:
     factor = 1.0 + off if draw.flip() else 1.0 / (1.0 + off)
     back = factor * draw.one_of(0.94, 1.06) if draw.other else factor
     group = {"factor": factor} | ({"negative_factor": back} if draw.other else {})
-    return Concealed({"gain_front": factor, "gain_back": back}, group, {"torque_gain": group})
+    return Concealed({"gain_front": factor, "gain_back": back}, group, {listed.TORQUE_GAIN: group})
 
 
 def torque_saturation(draw: Draw) -> Concealed:
@@ -71,7 +72,7 @@ def torque_saturation(draw: Draw) -> Concealed:
     share = max(0.62 / draw.strength**0.5, 0.25) * draw.between(0.85, 1.15)
     limit = share * draw.axis.effort * (1.25 if draw.other else 1.0)
     group = {"limit": limit}
-    model = {"torque_saturation": {"limit": limit, "shape": "tanh" if draw.other else "hard"}}
+    model = {listed.TORQUE_SATURATION: {"limit": limit, "shape": "tanh" if draw.other else "hard"}}
     return Concealed({"limit": limit, "limit_shape": float(draw.other)}, group, model)
 
 
@@ -80,7 +81,9 @@ def delay(draw: Draw) -> Concealed:
     more = round(1e3 * (0.0025 + min(draw.size(0.001, 0.004), 0.009)), 1) * 1e-3
     lag = 0.1 * more if draw.other else 0.0
     changes = {"delay_s": draw.physics.delay_s + more, "lag_s": lag}
-    model = {"delay": {"additional_s": more}} | ({"actuator_lag": {"time_constant_s": lag}} if draw.other else {})
+    model = {listed.DELAY: {"additional_s": more}} | (
+        {listed.ACTUATOR_LAG: {"time_constant_s": lag}} if draw.other else {}
+    )
     return Concealed(changes, {"additional_s": more + lag}, model)
 
 
@@ -89,10 +92,10 @@ def actuator_lag(draw: Draw) -> Concealed:
     lag = min(draw.size(0.003, 0.008), 0.02)
     if draw.other and draw.flip():
         slew = draw.axis.effort * 2.0 * math.pi * 2.0 * draw.axis.motions.tempo / max(draw.strength, 1.0)
-        return Concealed({"slew": slew}, {"slew_per_s": slew}, {"actuator_lag": {"slew_per_s": slew}})
+        return Concealed({"slew": slew}, {"slew_per_s": slew}, {listed.ACTUATOR_LAG: {"slew_per_s": slew}})
     found = {"time_constant_s": lag}
     order = 2.0 if draw.other else 1.0
-    return Concealed({"lag_s": lag, "lag_order": order}, found, None if draw.other else {"actuator_lag": found})
+    return Concealed({"lag_s": lag, "lag_order": order}, found, None if draw.other else {listed.ACTUATOR_LAG: found})
 
 
 def inertia(draw: Draw) -> Concealed:
@@ -106,7 +109,7 @@ def inertia(draw: Draw) -> Concealed:
 def torque_offset(draw: Draw) -> Concealed:
     """A constant torque beside the command."""
     torque = draw.size(0.08, 0.35) * draw.physics.coulomb * draw.sign()
-    return Concealed({"offset": torque}, {"torque_offset": torque}, {"torque_offset": torque})
+    return Concealed({"offset": torque}, {listed.TORQUE_OFFSET: torque}, {listed.TORQUE_OFFSET: torque})
 
 
 def disturbance(draw: Draw) -> Concealed:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 
+from servod.qualify.blind import listed
 from servod.qualify.blind.concealed import Concealed, Document, Draw
 
 #: Least periods in the range of whatever is periodic in position.
@@ -20,10 +21,10 @@ def position_dependent_friction(draw: Draw) -> Concealed:
         travel = draw.axis.motions.travel
         spot = {"factor": min(2.0 * share, 2.0), "position": draw.between(-0.4, 0.4) * travel, "width": 0.13 * travel}
         changes = {"spot_share": spot["factor"], "spot_place": spot["position"], "spot_width": spot["width"]}
-        return Concealed(changes, spot, {"position_dependent_friction": {"bumps": [spot]}})
+        return Concealed(changes, spot, {listed.POSITION_DEPENDENT_FRICTION: {"bumps": [spot]}})
     order, phase = _order(draw, 2.0, 6.0), draw.between(0.0, 6.28)
     changes = {"grip_share": share, "grip_order": order, "grip_phase": phase, "grip_shape": _shape(draw)}
-    return _periodic(draw, "position_dependent_friction", changes, order, share, phase)
+    return _periodic(draw, listed.POSITION_DEPENDENT_FRICTION, changes, order, share, phase)
 
 
 def cogging(draw: Draw) -> Concealed:
@@ -33,7 +34,7 @@ def cogging(draw: Draw) -> Concealed:
     second = torque * draw.between(0.0, 0.15)
     changes = {"cogging": torque, "cogging_order": order, "cogging_phase": phase}
     changes |= {"cogging_second": second, "cogging_shape": _shape(draw)}
-    return _periodic(draw, "cogging", changes, order, torque, phase, second)
+    return _periodic(draw, listed.COGGING, changes, order, torque, phase, second)
 
 
 def torque_ripple(draw: Draw) -> Concealed:
@@ -41,7 +42,7 @@ def torque_ripple(draw: Draw) -> Concealed:
     share = min(draw.size(0.06, 0.2), 0.45)
     order, phase = _order(draw, 2.5, 8.0), draw.between(0.0, 6.28)
     changes = {"ripple_share": share, "ripple_order": order, "ripple_phase": phase, "ripple_shape": _shape(draw)}
-    return _periodic(draw, "torque_ripple", changes, order, share, phase)
+    return _periodic(draw, listed.TORQUE_RIPPLE, changes, order, share, phase)
 
 
 def gravity(draw: Draw) -> Concealed:
@@ -55,7 +56,7 @@ def gravity(draw: Draw) -> Concealed:
     changes = {"gravity": amplitude, "gravity_phase": turned, "gravity_second": second}
     found = {"amplitude": amplitude, "phase": turned}
     believed = {"gravity": p.gravity, "gravity_phase": p.gravity_phase}
-    return Concealed(changes, found, None if draw.other else {"gravity": found}, believed, travel=0.9)
+    return Concealed(changes, found, None if draw.other else {listed.GRAVITY: found}, believed, travel=0.9)
 
 
 def spring(draw: Draw) -> Concealed:
@@ -69,7 +70,7 @@ def spring(draw: Draw) -> Concealed:
     found = {"stiffness": stiffness, "rest": rest, "cubic": cubic}
     changes = {"spring": stiffness, "spring_rest": rest, "spring_cubic": cubic}
     told = found if draw.other else {key: found[key] for key in ("stiffness", "rest")}
-    return Concealed(changes, told, {"spring": found}, travel=0.9 if draw.other else 1.2)
+    return Concealed(changes, told, {listed.SPRING: found}, travel=0.9 if draw.other else 1.2)
 
 
 def position_dependent_inertia(draw: Draw) -> Concealed:
@@ -79,7 +80,7 @@ def position_dependent_inertia(draw: Draw) -> Concealed:
     changes = {"swing_share": share, "swing_order": order, "swing_phase": phase, "swing_second": second}
     rows = _rows(order, share, phase, second)
     travel = PERIODS * math.pi / order
-    return Concealed(changes, _first(rows), {"position_dependent_inertia": {"harmonics": rows}}, travel=travel)
+    return Concealed(changes, _first(rows), {listed.POSITION_DEPENDENT_INERTIA: {"harmonics": rows}}, travel=travel)
 
 
 def encoder_eccentricity(draw: Draw) -> Concealed:
@@ -91,7 +92,7 @@ def encoder_eccentricity(draw: Draw) -> Concealed:
     changes["eccentricity_second"] = second
     rows = _rows(order, amplitude, phase, second)
     travel = PERIODS * math.pi / order
-    return Concealed(changes, _first(rows), {"encoder_eccentricity": {"harmonics": rows}}, travel=travel)
+    return Concealed(changes, _first(rows), {listed.ENCODER_ECCENTRICITY: {"harmonics": rows}}, travel=travel)
 
 
 def _order(draw: Draw, least: float, most: float) -> float:
@@ -113,7 +114,11 @@ def _periodic(
     return Concealed(changes, _first(rows), None if draw.other else {group: {"harmonics": rows}})
 
 
-_SHAPES = {"position_dependent_friction": "grip_shape", "cogging": "cogging_shape", "torque_ripple": "ripple_shape"}
+_SHAPES = {
+    listed.POSITION_DEPENDENT_FRICTION: "grip_shape",
+    listed.COGGING: "cogging_shape",
+    listed.TORQUE_RIPPLE: "ripple_shape",
+}
 
 
 def _rows(order: float, amplitude: float, phase: float, second: float) -> list[Document]:
