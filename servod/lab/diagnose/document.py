@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from servod.formats.model.axis_model import AxisModel
 from servod.lab.diagnose.effects import effect
-from servod.lab.diagnose.effects.disturbance import EVERY
+from servod.lab.diagnose.effects.disturbance import EVERY, NAME
 from servod.lab.diagnose.effects.hypothesis import Document, Reported
 from servod.lab.diagnose.judge.evidence import Diagnosis, Evidence
 from servod.lab.diagnose.judge.held_out import Fold, WindowErrors, window_errors, windows_document
@@ -167,7 +167,7 @@ def _finding(evidence: Evidence, name: str, named: list[int]) -> dict[str, Any]:
     statement = (
         f"{what.statement}. It carries {100.0 * evidence.carries(first):.0f} % of the explainable mismatch and "
         f"{100.0 * merit.torque:.1f} % of dry friction where it acts. It shows as {what.shows}; it is strongest "
-        f"{where(name, located)}."
+        f"{where(effect(name).look.coordinate, located)}."
     )
     others = [
         {"effect": other, "experiment": effect(other).experiment} for other in alternatives(evidence.choice, first)
@@ -316,12 +316,12 @@ def extended_model(diagnosis: Diagnosis) -> AxisModel | None:
         return None
     fit = evidence.fit
     document: Document = fit.hypothesis.written(told_coordinates(evidence))
-    document.pop("disturbance", None)
+    document.pop(NAME, None)
     values = fit.values
     for place, term in enumerate(fit.hypothesis.terms):
-        if term.effect == "disturbance" and term.form == EVERY:
+        if term.effect == NAME and term.form == EVERY:
             start, length, torque = values[fit.hypothesis.share(place)]
-            rows = document.setdefault("disturbance", {}).setdefault("windows", [])
+            rows = document.setdefault(NAME, {}).setdefault("windows", [])
             rows.append({"start_s": start, "end_s": start + length, "torque": torque})
     if evidence.unnamed is not None:
         evidence.unnamed.write(document)

@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from servod.formats.model.axis_model import AxisModel, load_axis_model
-from servod.lab.diagnose.data.excited import DIRECTED, SWIFT, unseen
 from servod.lab.diagnose.data.intake import taken_in
 from servod.lab.diagnose.data.trace import Trace
-from servod.lab.diagnose.effects import effect
+from servod.lab.diagnose.effects import effect, names, unseen
 from servod.lab.diagnose.effects.base import document_of
 from servod.lab.diagnose.effects.cogging import whole_orders
 from servod.lab.diagnose.effects.scene import Scene
@@ -42,7 +41,7 @@ def test_an_axis_in_swift_motion_shows_every_effect() -> None:
     model = believed()
     traces, _ = taken_in(record(model), model)
     assert unseen(traces, model.inertia) == frozenset()
-    assert unseen(traces, 1e-4 * model.inertia) >= SWIFT
+    assert unseen(traces, 1e-4 * model.inertia) >= names(lambda what: what.swift)
 
 
 if ODRIVE.is_dir():
@@ -50,7 +49,7 @@ if ODRIVE.is_dir():
     def test_a_slow_turn_shows_the_orders_of_its_cogging() -> None:
         """Of the five strongest orders in the map of holding currents, at least three."""
         traces, model = traces_of("odrive", ODRIVE / "slow_turn_nocomp_0.csv.gz")
-        assert unseen(traces, model.inertia) == SWIFT | DIRECTED
+        assert unseen(traces, model.inertia) == names(lambda what: what.swift or what.directed)
         predictor = Predictor(traces, model)
         orders = whole_orders(Scene(document_of(model), predictor, predictor.mismatch(model)))
         held = np.loadtxt(ODRIVE / "static_hold_map.csv.gz", delimiter=",", skiprows=1)[:, 1]

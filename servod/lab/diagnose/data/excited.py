@@ -13,32 +13,18 @@ import numpy as np
 
 from servod.lab.diagnose.data.trace import Trace
 
-#: Inertia must take this share of the command (root mean squares) before effects of SWIFT can be told; on an axis that
+#: Inertia must take this share of the command (root mean squares) before swift effects can be told; on an axis that
 #: goes both ways, whose command swings with its friction, less will do.
 LEAST_INERTIAL, LEAST_BOTH_WAYS = 0.15, 0.02
 
 #: Share of the rows, at most, in which an axis that creeps may do otherwise: it had to get there.
 OTHERWISE = 0.05
 
-#: Effects that show against the inertia of the axis alone.
-SWIFT = frozenset(
-    (
-        *("inertia", "torque_gain", "torque_saturation", "actuator_lag", "delay", "torque_ripple", "backlash"),
-        *("load_dependent_friction", "encoder_eccentricity", "position_dependent_inertia", "joint_elasticity"),
-        "viscous_nonlinear",
-    )
-)
-
-#: Effects that tell one direction from the other, and the share of rows that must go either way.
-DIRECTED, LEAST_EITHER_WAY = frozenset(("asymmetry", "torque_offset")), 0.05
+#: Share of rows that must go either way before effects that tell one direction from the other can be told.
+LEAST_EITHER_WAY = 0.05
 
 #: Share of a high speed from which a row goes a way.
 GOES = 0.1
-
-
-def unseen(traces: Sequence[Trace], inertia: float) -> frozenset[str]:
-    """Effects that these recordings of an axis of this inertia cannot show."""
-    return (SWIFT if creeps(traces, inertia) else frozenset()) | (DIRECTED if one_way(traces) else frozenset())
 
 
 def one_way(traces: Sequence[Trace]) -> bool:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from functools import cache
 from importlib import import_module
 
+from servod.lab.diagnose.data.excited import creeps, one_way
+from servod.lab.diagnose.data.trace import Trace
 from servod.lab.diagnose.effects.effect import Effect
 
 #: Names of the outside contract and our own (offset_drift), in the order in which they are tried and explained.
@@ -45,3 +48,14 @@ def effect(name: str) -> Effect:
 def effects() -> tuple[Effect, ...]:
     """All effects, in the order of NAMES."""
     return tuple(effect(name) for name in NAMES)
+
+
+def names(which: Callable[[Effect], bool]) -> frozenset[str]:
+    """Names of the effects of which `which` is true."""
+    return frozenset(found.name for found in effects() if which(found))
+
+
+def unseen(traces: Sequence[Trace], inertia: float) -> frozenset[str]:
+    """Effects that these recordings of an axis of this inertia cannot show."""
+    slow, straight = creeps(traces, inertia), one_way(traces)
+    return names(lambda found: (slow and found.swift) or (straight and found.directed))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from servod.formats.model.axis_model import AxisModel
 from servod.lab.diagnose.data.trace import Trace
-from servod.lab.diagnose.effects.disturbance import EVERY
+from servod.lab.diagnose.effects.disturbance import EVERY, NAME
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.fit import Fit, Fitter, Weighing, scale_of
@@ -106,7 +106,7 @@ def _events(predictor: Predictor, fit: Fit) -> Rows:
     for place in once(fit.hypothesis):
         document: dict[str, Any] = {}
         fit.hypothesis.terms[place].write(document, fit.values[fit.hypothesis.share(place)])
-        for window in document["disturbance"]["windows"]:
+        for window in document[NAME]["windows"]:
             found |= (t_s >= window["start_s"]) & (t_s <= window["end_s"] + TAIL_S)
     return found
 
@@ -116,7 +116,7 @@ def once(hypothesis: Hypothesis) -> list[int]:
     return [
         place
         for place, term in enumerate(hypothesis.terms)
-        if term.effect == "disturbance" and term.form != EVERY
+        if term.effect == NAME and term.form != EVERY
     ]  # fmt: skip
 
 

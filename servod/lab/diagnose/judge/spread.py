@@ -9,6 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from servod.lab.diagnose.effects import effect
+from servod.lab.diagnose.effects.base import TORQUES
 from servod.lab.diagnose.judge.held_out import HeldOut
 from servod.lab.diagnose.select.fit import Fit, Weighing, covariance
 
@@ -22,17 +24,6 @@ BRISTLE, BRISTLE_ERROR = ("friction.sigma0", "friction.sigma1"), 2.0
 
 #: Probability of the region in which several coordinates lie together.
 REGION = 0.95
-
-#: Torques of the model's own, which no recording tells from a common factor on all of them and on the command.
-TORQUES = (
-    "inertia",
-    "friction.viscous",
-    "friction.coulomb",
-    "friction.static",
-    "friction.sigma0",
-    "friction.sigma1",
-    "gravity.amplitude",
-)
 
 
 def spread(fit: Fit, weighing: Weighing, period_s: float, held: HeldOut) -> Array:
@@ -68,7 +59,7 @@ def common_factor(fit: Fit) -> Array:
     size = len(fit.coordinates)
     unknowns = fit.hypothesis.unknowns
     scaled = np.array([u.key in TORQUES for u in unknowns[: len(fit.hypothesis.base)]])
-    gains = [p for p, term in enumerate(fit.hypothesis.terms) if term.effect == "torque_gain"]
+    gains = [p for p, term in enumerate(fit.hypothesis.terms) if effect(term.effect).scales_torques]
     if not gains or not scaled.any():
         return np.zeros((size, size))
     along = np.zeros(size)

@@ -13,7 +13,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from servod.lab.diagnose.effects.base import BRISTLE_FACTOR, DELAY_S, OFFSET_SHARE, RECALIBRATION, STRIBECK_SHARE
+from servod.lab.diagnose.effects import effect, effects
 from servod.lab.diagnose.effects.hypothesis import Document, get
 from servod.lab.diagnose.select.candidates import Candidate
 from servod.lab.diagnose.select.choice import Choice
@@ -33,18 +33,12 @@ LEFT_TORQUE, LEFT_SHARE = 0.02, 0.05
 #: Shares of dry friction from which the encoder's noise in the mismatch hides what is left, and hides everything.
 HIDES_REST, HIDES_ALL = 0.15, 0.5
 
-#: A delay and a lag that are in together are one finding, by the name of the longer.
-TWINS = {"delay": "actuator_lag", "actuator_lag": "delay"}
-
 #: A rival that leaves at most this many times what the finding leaves cannot be told apart.
 ALIKE = 1.2
 
 #: Confidence 0.5 + 0.49*(1 - exp(-gap/GAP)); gap: logarithm of what the best rival leaves over what the finding leaves.
 GAP = 0.15
 
-
-#: Torque ripple below this share of the command is what every motor has.
-RIPPLE_SHARE = 0.02
 
 #: From this share of the explainable error removed on, what is left says nothing against the names.
 FULLY = 0.95
@@ -101,48 +95,20 @@ def named_terms(choice: Choice, nominal: Document) -> list[int]:
     """Places of the terms whose effect is at least at its level."""
     fitted = choice.fit.hypothesis.written(choice.fit.coordinates)
     terms, lesser = choice.fit.hypothesis.terms, lesser_twin(choice.fit)
-    return [i for i, term in enumerate(terms) if term.effect != lesser and _at_level(term.effect, nominal, fitted)]
+    return [
+        i for i, term in enumerate(terms) if term.effect != lesser and effect(term.effect).at_level(nominal, fitted)
+    ]
 
 
 def lesser_twin(fit: Fit) -> str:
     """The shorter of a delay and a lag that are both in: together they are one drive that is late, of higher order."""
-    if not {term.effect for term in fit.hypothesis.terms} >= set(TWINS):
+    there = {term.effect for term in fit.hypothesis.terms}
+    pairs = [(found, effect(found.twin)) for found in effects() if found.name in there and found.twin in there]
+    if not pairs:
         return ""
-    fitted = fit.hypothesis.written(fit.coordinates)
-    late, lag = get(fitted, "delay.additional_s"), get(fitted, "actuator_lag.time_constant_s")
-    return "delay" if late < lag else "actuator_lag" if lag > 0.0 else ""  # a limited rate is no twin
-
-
-def _at_level(effect: str, nominal: Document, fitted: Document) -> bool:
-    """Whether an effect that is a level of the model's own parameters has left its band."""
-    coulomb = get(nominal, "friction.coulomb")
-    if effect == "inertia":
-        return _factor(nominal, fitted, "inertia") >= 1.0 + RECALIBRATION
-    if effect == "torque_offset":
-        return abs(get(fitted, "torque_offset") - get(nominal, "torque_offset")) >= OFFSET_SHARE * coulomb
-    if effect == "delay":
-        return abs(get(fitted, "delay.additional_s") + get(fitted, "delay_s") - get(nominal, "delay_s")) >= DELAY_S
-    if effect == "presliding" and get(nominal, "friction.sigma0") > 0.0 and "presliding" not in fitted:
-        return max(_factor(nominal, fitted, f"friction.{key}") for key in ("sigma0", "sigma1")) >= BRISTLE_FACTOR
-    if effect == "stribeck" and "stribeck" not in fitted:
-        was, now = (get(d, "friction.static") - get(d, "friction.coulomb") for d in (nominal, fitted))
-        return abs(now - was) >= STRIBECK_SHARE * coulomb
-    if effect == "torque_gain":
-        factors = [get(fitted, f"torque_gain.{key}", 1.0) for key in ("factor", "negative_factor")]
-        return max(max(f, 1.0 / f) for f in factors) >= 1.0 + RECALIBRATION
-    if effect == "torque_ripple":
-        return _largest_wave(fitted, effect) >= RIPPLE_SHARE
-    return True
-
-
-def _largest_wave(fitted: Document, effect: str) -> float:
-    """Amplitude of the largest sine over position of an effect."""
-    return max((float(row["amplitude"]) for row in fitted.get(effect, {}).get("harmonics", [])), default=0.0)
-
-
-def _factor(nominal: Document, fitted: Document, key: str) -> float:
-    was, now = get(nominal, key), get(fitted, key)
-    return max(was, now) / min(was, now) if min(was, now) > 0.0 else 1.0
+    fitted, (one, other) = fit.hypothesis.written(fit.coordinates), pairs[0]
+    late, later = get(fitted, one.lateness), get(fitted, other.lateness)
+    return one.name if late < later else other.name if later > 0.0 else ""  # a limited rate is no twin
 
 
 def confidence(choice: Choice, index: int, removed: float) -> float:
@@ -164,7 +130,7 @@ def _more_unknowns(rival: Candidate, own: int) -> int:
 def alternatives(choice: Choice, index: int) -> list[str]:
     """Effects that these data cannot tell apart from a term; its twin too where that is in beside it."""
     terms = choice.fit.hypothesis.terms
-    twin = TWINS.get(terms[index].effect)
+    twin = effect(terms[index].effect).twin
     beside = [term.effect for term in terms if term.effect == twin]
     return beside + [rival.effect for rival, ratio in _rivals(choice, index) if ratio <= ALIKE and rival.effect != twin]
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.formats.model.axis_model import AxisModel
-from servod.lab.diagnose.data.excited import unseen
+from servod.lab.diagnose.effects import effect, unseen
 from servod.lab.diagnose.effects.base import base_unknowns, document_of
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
 from servod.lab.diagnose.effects.scene import Scene
@@ -271,13 +271,6 @@ def whole(merit: Merit, fit: Fit, place: int = -1) -> bool:
     return (fit.converged or merit.share >= SURE_SHARE) and not at_end(fit, place)
 
 
-#: Effects that may come in again with another period or place: a second harmonic is no second effect.
-_REPEATED = (
-    *("cogging", "torque_ripple", "disturbance", "position_dependent_friction"),
-    *("position_dependent_inertia", "encoder_eccentricity"),
-)
-
-
 def _once(hypothesis: Hypothesis) -> set[str]:
     """Effects that are in already and cannot come in again."""
-    return {term.effect for term in hypothesis.terms} - set(_REPEATED)
+    return {term.effect for term in hypothesis.terms if not effect(term.effect).repeatable}

@@ -14,7 +14,7 @@ from time import monotonic
 import numpy as np
 from numpy.typing import NDArray
 
-from servod.lab.diagnose.effects import effect
+from servod.lab.diagnose.effects import effect, names
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
 from servod.lab.diagnose.effects.scene import Scene
 from servod.lab.diagnose.predict.predict import Predictor
@@ -36,11 +36,6 @@ LEAST_EACH, LEAST_TOGETHER = 0.06, 0.35
 #: A term acts with at least this share of dry friction, seen through the observer's low-pass.
 LEAST_TORQUE = 0.025
 
-#: Effects that soak up what others leave, and are too plain to be a detail where they are real.
-SOAK_UP = frozenset(
-    ("encoder_eccentricity", "position_dependent_inertia", "disturbance", "torque_saturation", "torque_ripple", "delay")
-)
-
 #: Candidates of a round that are tried until one deserves to come in.
 TRIED = 3
 
@@ -51,7 +46,7 @@ def detail(chooser: Chooser, choice: Choice) -> None:
     while len(refined.fit.hypothesis.terms) < MOST_TERMS and monotonic() < chooser.deadline:
         if chooser.nothing_left(refined.fit.mismatch):
             break
-        if not take_first(chooser, refined, chooser.candidates(refined.fit, True, SOAK_UP)):
+        if not take_first(chooser, refined, chooser.candidates(refined.fit, True, names(lambda what: what.soaks_up))):
             break
     if refined.fit is choice.fit or chooser.merit(choice.fit, refined.fit).of_left < LEAST_TOGETHER:
         return

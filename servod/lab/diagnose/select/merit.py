@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from servod.lab.diagnose.effects.base import LEVELS
 from servod.lab.diagnose.effects.hypothesis import Term
 from servod.lab.diagnose.select.fit import Fit
 
@@ -83,11 +84,6 @@ def acting(changed: Array) -> float:
 # Stands beside the selection (`choose`), which else looks for more only while something worth naming is left. A softer
 # bristle or a steeper Stribeck curve acts for some milliseconds behind each reversal and is nothing on average.
 
-
-#: Parameters that the outside contract gives a level, which is their bound until a term opens it.
-LEVELS = frozenset(
-    ("friction.static", "friction.stribeck_velocity", "friction.sigma0", "friction.sigma1", "torque_offset", "inertia")
-)
 
 #: Own numbers of such terms that have no level: damping that fades with speed is judged by the torque that it makes.
 NO_LEVEL = frozenset(("damping_velocity",))

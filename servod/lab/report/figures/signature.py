@@ -11,10 +11,12 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from servod.lab.diagnose import effects
+from servod.lab.diagnose.effects.looks import Look, Split
 from servod.lab.diagnose.judge.evidence import Evidence
 from servod.lab.diagnose.judge.locate import LEAST_IN_BIN
 from servod.lab.diagnose.judge.unnamed import Unnamed
-from servod.lab.diagnose.predict.coordinates import Look, Split, coordinates, look, units
+from servod.lab.diagnose.predict.coordinates import coordinates, units
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.report.figure import Array, Axis, Colour, Curve, Figure, Panel, Style, curve
 
@@ -29,7 +31,7 @@ _HALVES = {Split.DIRECTION: ("forward", "back"), Split.LOAD: ("command above zer
 
 def signature(evidence: Evidence, effect: str, place: int) -> Figure:
     """Error without the term at `place` over the coordinate of `effect`, the fitted term, and a stretch of time."""
-    shown = look(effect)
+    shown = effects.effect(effect).look
     panels = (_over_coordinate(evidence, place, shown), _over_time(evidence, place))
     caption = (
         "Points: the error of the model without this effect, with twice its standard error. Line: what the fitted "
