@@ -1,4 +1,9 @@
-"""Every effect by its name, one file each; a new effect is a new file and one line in this table."""
+"""Every effect by its name, one file each; a new effect is a new file and one line in this table.
+
+Lists of effects that search, verdict and report need are drawn from the records (`names`). Physics that the axis model
+file cannot say yet also needs its group of keys there (`servod.formats.model`), which says how it is checked and
+packed, and its torque in `servod.kernels.physics`.
+"""
 
 from __future__ import annotations
 

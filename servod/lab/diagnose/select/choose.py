@@ -186,7 +186,7 @@ class Chooser:
         short = Fitter(quick, Weighing(whole.weighing.scale, quick.counts.astype(np.float64)))
         scene = Scene(self.start.document, self.predictor, present.mismatch, fine)
         trials = Trials(whole, short, present, scene, not present.hypothesis.terms, self.deadline)
-        candidates = trials.run(skip=_once(present.hypothesis) | skip | self.unseen)
+        candidates = trials.run(skip=once_only(present.hypothesis) | skip | self.unseen)
         self.tried += trials.tried
         self.tell(f"{trials.tried} starts tried; best: " + ", ".join(c.effect for c in candidates[:3]))
         return candidates
@@ -271,6 +271,6 @@ def whole(merit: Merit, fit: Fit, place: int = -1) -> bool:
     return (fit.converged or merit.share >= SURE_SHARE) and not at_end(fit, place)
 
 
-def _once(hypothesis: Hypothesis) -> set[str]:
+def once_only(hypothesis: Hypothesis) -> set[str]:
     """Effects that are in already and cannot come in again."""
     return {term.effect for term in hypothesis.terms if not effect(term.effect).repeatable}

@@ -27,6 +27,7 @@ from servod.lab.commission.comparison import save_rows
 from servod.lab.deploy.deployment import deploy
 from servod.lab.deploy.judge import broken, skipped
 from servod.lab.deploy.outcome import Deployment
+from servod.lab.diagnose.effects import names
 from servod.lab.diagnose.engine import diagnose
 from servod.lab.diagnose.judge.evidence import Diagnosis
 from servod.lab.diagnose.judge.verdict import Verdict
@@ -57,9 +58,6 @@ TIME_LIMIT_S = 300.0
 
 #: A trial in which the loop skipped cycles says nothing of the set; on a machine with other work there is one more.
 _TRIALS = 3
-
-#: Effects whose names say how late the torque comes.
-LATE = frozenset(("delay", "actuator_lag"))
 
 
 @dataclass(frozen=True)
@@ -268,7 +266,8 @@ def _extended(believed: AxisModel, document: dict[str, Any], out: Path) -> Path:
     gives away stiffness. A delay that has a name stands.
     """
     model, path = load_axis_model(out / DIAGNOSIS / MODEL), out / "extended.yaml"
-    if not LATE.intersection(finding["effect"] for finding in document["findings"]):
+    late = names(lambda what: bool(what.lateness))
+    if not late.intersection(finding["effect"] for finding in document["findings"]):
         model = model.model_copy(update={"delay_s": believed.delay_s})
     write_bytes(path, axis_model_yaml(model).encode())
     return path
