@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from enum import StrEnum
+from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import yaml
 from pydantic import Field, model_validator
@@ -20,7 +21,7 @@ from servod.common.yaml import Dumper, Strict, load_model
 from servod.formats.model import effects as fx
 from servod.formats.model import friction as fr
 from servod.formats.model.identified import Identified
-from servod.formats.model.keys import Group, Harmonic, Harmonics
+from servod.formats.model.keys import Group, Harmonic
 
 NonNegative = Annotated[float, Field(ge=0.0)]
 Positive = Annotated[float, Field(gt=0.0)]
@@ -157,8 +158,7 @@ class AxisModel(Strict):
     def _harmonics_fit(self) -> AxisModel:
         wrong = "periods_per_metre" if self.axis is AxisKind.ROTARY else "periods_per_turn"
         for name, group in self.groups():
-            waves = group.harmonics if isinstance(group, Harmonics | fr.PositionDependentFriction) else ()
-            if any(getattr(harmonic, wrong) is not None for harmonic in waves):
+            if any(getattr(wave, wrong) is not None for wave in group.waves):
                 raise ValueError(f"{name}: no {wrong} on a {self.axis.value} axis")
         self._sums_under_one(1, "slopes amplitude*n")
         return self
@@ -172,16 +172,16 @@ class AxisModel(Strict):
 
     def _sums_under_one(self, power: int, what: str) -> None:
         for name, group in self.groups():
-            if not isinstance(group, Harmonics) or group.under_one != power:
+            if group.under_one != power:
                 continue
-            if sum(abs(h.amplitude) * wave_number(h) ** power for h in group.harmonics) >= 1.0:
+            if sum(abs(wave.amplitude) * wave_number(wave) ** power for wave in group.waves) >= 1.0:
                 raise ValueError(f"{name}: {what} that sum to less than 1")
 
     def groups(self) -> Iterator[tuple[str, Group]]:
         """The groups of keys that this model has, each with its name, in the order of the file."""
-        for name in type(self).model_fields:
+        for name in _group_names(type(self)):
             found = getattr(self, name)
-            if isinstance(found, Group):
+            if found is not None:
                 yield name, found
 
     @property
@@ -216,6 +216,13 @@ class AxisModel(Strict):
         from servod.formats.model.pack import pack
 
         return pack(self)
+
+
+@cache
+def _group_names(model: type[AxisModel]) -> tuple[str, ...]:
+    """Keys of a model under which a group may stand."""
+    kinds = {name: get_args(field.annotation) for name, field in model.model_fields.items()}
+    return tuple(n for n, found in kinds.items() if any(isinstance(k, type) and issubclass(k, Group) for k in found))
 
 
 def axis_model_yaml(model: AxisModel) -> str:

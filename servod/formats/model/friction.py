@@ -96,6 +96,11 @@ class PositionDependentFriction(Group):
     harmonics: tuple[Harmonic, ...] = Field((), max_length=64)
     bumps: tuple[Bump, ...] = Field((), max_length=64)
 
+    @property
+    def waves(self) -> tuple[Harmonic, ...]:
+        """Those of its factor."""
+        return self.harmonics
+
 
 class ThermalShape(StrEnum):
     """How friction depends on temperature."""

@@ -17,16 +17,6 @@ Positive = Annotated[float, Field(gt=0.0)]
 Phase = Annotated[float, Field(ge=-100.0, le=100.0, description="rad, at position 0")]
 
 
-class Group(Strict):
-    """One optional group of keys: the record of an effect for whoever reads, checks or packs a model.
-
-    `plain`: the kernels' plain loop obeys the group, or it is not in the dynamics at all; beside any other the full
-    loop runs.
-    """
-
-    plain: ClassVar[bool] = False
-
-
 class Harmonic(Strict):
     """One sine over position: amplitude*sin(n*x + phase), n = periods_per_turn (2*pi*periods_per_metre when linear)."""
 
@@ -42,12 +32,29 @@ class Harmonic(Strict):
         return self
 
 
-class Harmonics(Group):
-    """A sum of sines over position.
+class Group(Strict):
+    """One optional group of keys: the record of an effect for whoever reads, checks or packs a model.
 
-    `under_one`: the power of n with which |amplitude|*n^power must sum to less than 1 (0: shares, 1: slopes), if any.
+    `plain`: the kernels' plain loop obeys the group, or it is not in the dynamics at all; beside any other the full
+    loop runs. `under_one`: the power of n with which |amplitude|*n^power of its waves must sum to less than 1 (0:
+    shares, 1: slopes), if any.
     """
 
+    plain: ClassVar[bool] = False
     under_one: ClassVar[int | None] = None
 
+    @property
+    def waves(self) -> tuple[Harmonic, ...]:
+        """Its sines over position."""
+        return ()
+
+
+class Harmonics(Group):
+    """A sum of sines over position."""
+
     harmonics: tuple[Harmonic, ...] = Field(min_length=1, max_length=64)
+
+    @property
+    def waves(self) -> tuple[Harmonic, ...]:
+        """All of them."""
+        return self.harmonics
