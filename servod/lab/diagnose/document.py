@@ -25,17 +25,11 @@ from servod.lab.diagnose.predict.coordinates import units, where
 from servod.lab.diagnose.predict.floor import trace_floor
 from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.select.merit import Merit
+from servod.lab.diagnose.settings import SETTINGS
 
 # What these recordings say of the model's own parameters: which have changed, in numbers, in a sentence, in the model.
 #
 # Stands between the evidence and the document.
-
-
-#: Half width of a 95 % interval in standard deviations.
-Z95 = 1.96
-
-#: A change of a parameter below this share is none.
-LEAST_CHANGE = 0.002
 
 
 def recalibrated(evidence: Evidence) -> dict[str, Any]:
@@ -47,9 +41,10 @@ def recalibrated(evidence: Evidence) -> dict[str, Any]:
         value = fit.values[index]
         deviation = math.sqrt(max(float(evidence.spread[index, index]), 0.0))
         size = unknown.size if unknown.size else abs(value)
-        if unknown.key in opened or abs(value - nominal.start) <= max(LEAST_CHANGE, Z95 * deviation) * size:
+        half = SETTINGS.intervals.z95 * deviation
+        if unknown.key in opened or abs(value - nominal.start) <= max(SETTINGS.intervals.least_change, half) * size:
             continue
-        half = Z95 * deviation * size
+        half *= size
         entry = {"from": nominal.start, "to": value, "unit": unknown.unit, "interval": [value - half, value + half]}
         found[unknown.key] = entry
     return found
@@ -194,7 +189,8 @@ def _parameters(evidence: Evidence, named: list[int]) -> dict[str, Any]:
         spread = _spread(evidence, place, told)
         for reported, deviation in zip(told, spread, strict=True):
             name = reported.name if count == 0 else f"{reported.name}_term{count + 1}"
-            low, high = reported.value - Z95 * deviation, reported.value + Z95 * deviation
+            half = SETTINGS.intervals.z95 * deviation
+            low, high = reported.value - half, reported.value + half
             found[name] = {"value": reported.value, "unit": reported.unit, "interval": [low, high]}
     return found
 

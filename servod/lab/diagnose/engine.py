@@ -23,17 +23,10 @@ from servod.lab.diagnose.select.choice import Choice
 from servod.lab.diagnose.select.choose import Chooser
 from servod.lab.diagnose.select.detail import detail, much_left, slow, swapped, tidied
 from servod.lab.diagnose.select.fit import Weighing
+from servod.lab.diagnose.settings import SETTINGS
 from servod.lab.recordings import Recording
 
 Tell = Callable[[str], None]
-
-#: Part of the time limit that the search for terms may take; the proof needs the rest.
-SEARCH_SHARE = 0.75
-
-#: Free windows of unseen rows must come out by this factor better with the names than without, unless the mismatch is
-#: within FITTED times the noise floor anyway. A few terms with dynamics of their own can follow nearly any mismatch one
-#: sample ahead, and foretell nothing.
-LEAST_FORETOLD, FITTED = 0.7, 2.0
 
 
 def diagnose(
@@ -48,7 +41,7 @@ def diagnose(
         return Diagnosis(model, refused, Verdict.CANNOT_TELL, None, seconds)
     tell(f"{len(traces)} recordings taken in")
     predictor = Predictor(traces, model)
-    chooser = Chooser(predictor, model, begun + SEARCH_SHARE * time_limit_s, tell)
+    chooser = Chooser(predictor, model, begun + SETTINGS.forward.search_share * time_limit_s, tell)
     choice = chooser.run()
     swapped(chooser, choice)
     if much_left(chooser, choice):
@@ -128,11 +121,13 @@ def _foretells_nothing(evidence: Evidence) -> bool:
     """
     if (
         set(evidence.named) <= set(once(evidence.fit.hypothesis))
-        or evidence.unseen.after < FITTED * evidence.unseen.floor
+        or evidence.unseen.after < SETTINGS.validation.fitted_floors * evidence.unseen.floor
     ):
         return False
     judged = evidence.shared.judged
-    return foretold(evidence.predictor, evidence.before, evidence.after, judged) > LEAST_FORETOLD
+    return (
+        foretold(evidence.predictor, evidence.before, evidence.after, judged) > SETTINGS.validation.most_free_run_error
+    )
 
 
 def _without_names(evidence: Evidence) -> Evidence:

@@ -15,7 +15,6 @@ from servod.lab.diagnose.effects.scene import Scene
 from servod.lab.diagnose.judge.held_out import (
     RECORDING,
     STRETCH,
-    TAIL_S,
     Fold,
     foretold,
     held_out,
@@ -25,6 +24,7 @@ from servod.lab.diagnose.judge.held_out import (
 )
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.fit import Fit, Fitter, Weighing
+from servod.lab.diagnose.settings import SETTINGS
 from servod.lab.simulate.replay import replay
 from tests.lab.diagnose.axes import believed
 from tests.lab.diagnose.test_between import colder
@@ -134,7 +134,7 @@ def test_an_event_in_one_recording_is_not_judged(levels: tuple[Predictor, Fit]) 
     document: dict[str, Any] = {}
     term.write(document, event.values[event.hypothesis.share(0)])
     (window,) = document["disturbance"]["windows"]
-    inside = (t_s >= window["start_s"]) & (t_s <= window["end_s"] + TAIL_S)
+    inside = (t_s >= window["start_s"]) & (t_s <= window["end_s"] + SETTINGS.validation.tail_s)
     assert once(event.hypothesis) == [0]
     assert not shared.judged[inside].any()
     assert np.array_equal(shared.judged[~inside], predictor.counts[~inside])

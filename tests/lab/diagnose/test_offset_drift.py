@@ -17,7 +17,8 @@ from servod.lab.diagnose.engine import diagnose
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.choice import Choice
 from servod.lab.diagnose.select.choose import Chooser
-from servod.lab.diagnose.select.detail import LEAST_TORQUE, slow
+from servod.lab.diagnose.select.detail import slow
+from servod.lab.diagnose.settings import SETTINGS
 from tests.lab.diagnose.axes import believed, record
 
 
@@ -66,4 +67,4 @@ def test_a_small_drift_is_found_over_seconds(hidden: dict[str, Any], terms: list
     assert [term.effect for term in choice.fit.hypothesis.terms] == terms
     if terms:
         assert choice.fit.values[-1] / traces[0].duration_s == pytest.approx(0.0006, rel=0.15)
-        assert choice.merits[0].torque < LEAST_TORQUE
+        assert choice.merits[0].torque < SETTINGS.group.least_torque

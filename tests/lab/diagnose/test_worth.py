@@ -19,7 +19,8 @@ from servod.lab.diagnose.judge.verdict import Shares, Verdict, alternatives, nam
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.choice import Choice, Entry
 from servod.lab.diagnose.select.fit import Fit
-from servod.lab.diagnose.select.merit import LEAST_TORQUE, Merit, acting, at_end, worth_naming
+from servod.lab.diagnose.select.merit import Merit, acting, at_end, worth_naming
+from servod.lab.diagnose.settings import SETTINGS
 from tests.lab.diagnose.axes import believed, record
 
 
@@ -42,7 +43,7 @@ def with_ripple(scene: Scene, amplitude: float) -> Choice:
 
 def test_torque_is_judged_where_it_acts() -> None:
     t = np.linspace(0.0, 50.0, 20_001)
-    assert acting(0.01 * np.abs(np.sin(t))) < LEAST_TORQUE
+    assert acting(0.01 * np.abs(np.sin(t))) < SETTINGS.worth.least_torque
     blows = np.where(t % 5.0 < 0.04, 0.03, 0.0)
     assert np.quantile(blows, 0.98) == 0.0
     assert acting(blows) == pytest.approx(0.03)

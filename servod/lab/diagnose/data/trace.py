@@ -80,10 +80,6 @@ class Trace:
         return {}
 
 
-#: Bandwidth of the observer, rad/s: what the noise allows within these bounds, and a share of the sampling rate.
-SLOWEST, FASTEST, SHARE_OF_SAMPLING = 25.0, 200.0, 0.1
-
-
 def dry_friction(model: AxisModel) -> float:
     """The model's Coulomb friction, N*m: the scale of every mismatch. Of a local map, the least; never nothing."""
     law = model.friction

@@ -21,19 +21,11 @@ from servod.lab.diagnose.effects.disturbance import EVERY
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.fit import Fit, Fitter, Weighing, scale_of
+from servod.lab.diagnose.settings import SETTINGS
 from servod.lab.simulate.replay import Drive, replay
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
-
-#: Steps of each new fit; it starts from the one that has seen everything.
-STEPS = 3
-
-#: Stretches of each recording.
-STRETCHES = 4
-
-#: Rows so long behind an event are not judged either, s: a window that simulates freely carries it that far.
-TAIL_S = 1.0
 
 #: What is left out, as the report says it.
 RECORDING, STRETCH = "one recording after the other", "one quarter of every recording after the other"
@@ -77,7 +69,7 @@ def split(predictor: Predictor, fit: Fit) -> Split:
     """How the rows are shared out so that nothing of `fit` is judged by rows that it was fitted to."""
     own_levels = any(term.each is not None for term in fit.hypothesis.terms)
     whole = len(predictor.slices) > 1 and not own_levels
-    parts = [_edges(part, 1 if whole else STRETCHES) for part in predictor.slices]
+    parts = [_edges(part, 1 if whole else SETTINGS.validation.stretches) for part in predictor.slices]
     groups = [[part[0]] for part in parts] if whole else [list(group) for group in zip(*parts, strict=True)]
     judged = predictor.counts & ~_events(predictor, fit)
     return Split(
@@ -107,7 +99,7 @@ def _events(predictor: Predictor, fit: Fit) -> Rows:
         document: dict[str, Any] = {}
         fit.hypothesis.terms[place].write(document, fit.values[fit.hypothesis.share(place)])
         for window in document["disturbance"]["windows"]:
-            found |= (t_s >= window["start_s"]) & (t_s <= window["end_s"] + TAIL_S)
+            found |= (t_s >= window["start_s"]) & (t_s <= window["end_s"] + SETTINGS.validation.tail_s)
     return found
 
 
@@ -144,17 +136,13 @@ def _again(predictor: Predictor, fit: Fit, seen: Rows) -> Fit:
     scale = scale_of(fit.mismatch, seen, 1e-3 * predictor.dry)
     fitter = Fitter(predictor, Weighing(scale, seen.astype(np.float64)))
     begun = fitter.begin(fit.hypothesis, fit.coordinates, jacobian)
-    return fit if begun is None else fitter.refine(begun, STEPS, len(fit.coordinates))
+    return fit if begun is None else fitter.refine(begun, SETTINGS.validation.steps, len(fit.coordinates))
 
 
 # Errors of windows that are simulated freely from the recorded state: how far a model is off after a while.
 #
 # Stands beside the mismatch in the report; the same replay that `servoctl replay` runs. Every row is judged by a model
 # that was fitted without it.
-
-
-#: Lengths of the windows, s.
-HORIZONS_S = (0.25, 1.0)
 
 
 @dataclass(frozen=True)
@@ -183,13 +171,15 @@ def window_errors(
     whole = [Fold(np.ones(len(predictor.counts), dtype=bool), (nominal,))]
     return [
         WindowErrors(horizon, *(_errors(predictor, folds, horizon) for folds in (whole, base, after)))
-        for horizon in HORIZONS_S
+        for horizon in SETTINGS.validation.horizons_s
     ]
 
 
 def foretold(predictor: Predictor, before: HeldOut, after: HeldOut, judged: NDArray[np.bool_]) -> float:
     """RMS of the shortest windows by fits with the physics added, as a multiple of that by fits without it."""
-    with_it, without = (_errors(predictor, held.folds, HORIZONS_S[0])[judged] for held in (after, before))
+    with_it, without = (
+        _errors(predictor, held.folds, SETTINGS.validation.horizons_s[0])[judged] for held in (after, before)
+    )
     return float(np.sqrt(np.mean(with_it**2) / max(float(np.mean(without**2)), 1e-30)))
 
 

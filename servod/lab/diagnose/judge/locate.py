@@ -17,20 +17,9 @@ from numpy.typing import NDArray
 from servod.lab.diagnose.effects.scene import Scene
 from servod.lab.diagnose.predict.coordinates import coordinates, units
 from servod.lab.diagnose.predict.predict import Predictor
+from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
-
-#: Bins of a map, and rows that a bin needs.
-BINS, TIME_BINS, LEAST_IN_BIN = 24, 96, 30
-
-#: Probability under noise below which a map counts as seen.
-SEEN = 1e-3
-
-#: A place carries the mismatch where its power is over this share of the strongest place's.
-STRONG = 0.5
-
-#: Bands of frequency, Hz.
-BANDS: tuple[tuple[float, float], ...] = ((0.0, 0.5), (0.5, 2.0), (2.0, 5.0), (5.0, 10.0), (10.0, 20.0), (20.0, 50.0))
 
 
 @dataclass(frozen=True)
@@ -52,7 +41,7 @@ class Map:
 
     def document(self) -> dict[str, Any]:
         """Plain numbers for JSON; bins without rows are left out."""
-        full = self.rows >= LEAST_IN_BIN
+        full = self.rows >= SETTINGS.maps.least_in_bin
         middles = 0.5 * (self.edges[:-1] + self.edges[1:])
         return {
             "coordinate": self.coordinate,
@@ -69,9 +58,17 @@ def maps(predictor: Predictor, mismatch: Array) -> list[Map]:
     """Maps over all coordinates, the one that carries most first, and at the end what is everywhere alike."""
     memory = max(1, round(2.0 / (predictor.rate * predictor.traces[0].period_s)))
     found = [
-        map_over(name, unit, values, mismatch, predictor.counts, memory, TIME_BINS if name == "time" else BINS)
+        map_over(
+            name,
+            unit,
+            values,
+            mismatch,
+            predictor.counts,
+            memory,
+            SETTINGS.maps.time_bins if name == "time" else SETTINGS.maps.bins,
+        )
         for name, (unit, values) in coordinates(predictor).items()
-        if int(np.sum(predictor.counts & np.isfinite(values))) >= 2 * LEAST_IN_BIN
+        if int(np.sum(predictor.counts & np.isfinite(values))) >= 2 * SETTINGS.maps.least_in_bin
     ]
     found.append(modulo_period(predictor, mismatch, memory))
     return [*sorted(found, key=lambda m: -m.share), everywhere(predictor, mismatch, memory)]
@@ -103,7 +100,13 @@ def modulo_period(predictor: Predictor, mismatch: Array, memory: int) -> Map:
 
 
 def map_over(
-    name: str, unit: str, values: Array, mismatch: Array, counts: NDArray[np.bool_], memory: int, bins: int = BINS
+    name: str,
+    unit: str,
+    values: Array,
+    mismatch: Array,
+    counts: NDArray[np.bool_],
+    memory: int,
+    bins: int = SETTINGS.maps.bins,
 ) -> Map:
     """Means of the mismatch over bins of `values` with as many rows each; `memory` rows count as one.
 
@@ -157,9 +160,9 @@ def _windows(name: str, t_s: Array, effect: Array, length_s: float = 0.5) -> lis
     power = (effect[: count * rows].reshape(count, rows) ** 2).mean(axis=1)
     best = int(np.argmax(power))
     low, high = best, best
-    while low > 0 and power[low - 1] > STRONG * power[best]:
+    while low > 0 and power[low - 1] > SETTINGS.maps.strong * power[best]:
         low -= 1
-    while high + 1 < count and power[high + 1] > STRONG * power[best]:
+    while high + 1 < count and power[high + 1] > SETTINGS.maps.strong * power[best]:
         high += 1
     return [{"recording": name, "start_s": float(t_s[low * rows]), "end_s": float(t_s[(high + 1) * rows - 1])}]
 
@@ -173,7 +176,7 @@ def _strong(values: Array, effect: Array, counts: NDArray[np.bool_]) -> dict[str
     place = np.clip(np.searchsorted(edges, values[rows], side="right") - 1, 0, len(edges) - 2)
     count = np.maximum(np.bincount(place, minlength=len(edges) - 1), 1)
     power = np.bincount(place, effect[rows] ** 2, len(edges) - 1) / count
-    strong = np.flatnonzero(power > STRONG * power.max())
+    strong = np.flatnonzero(power > SETTINGS.maps.strong * power.max())
     return {"from": float(edges[strong[0]]), "to": float(edges[strong[-1] + 1])}
 
 
@@ -181,13 +184,13 @@ def bands(predictor: Predictor, effect: Array) -> dict[str, Any]:
     """The band of frequencies that carries most, and the share of each."""
     from scipy.signal import periodogram
 
-    power = np.zeros(len(BANDS))
+    power = np.zeros(len(SETTINGS.maps.bands_hz))
     for part, trace in zip(predictor.slices, predictor.traces, strict=True):
         frequency, density = periodogram(effect[part], 1.0 / trace.period_s)
-        power += [float(density[(frequency >= low) & (frequency < high)].sum()) for low, high in BANDS]
+        power += [float(density[(frequency >= low) & (frequency < high)].sum()) for low, high in SETTINGS.maps.bands_hz]
     shares = power / max(float(power.sum()), 1e-30)
     best = int(np.argmax(shares))
-    return {"from": BANDS[best][0], "to": BANDS[best][1], "shares": _rounded(shares)}
+    return {"from": SETTINGS.maps.bands_hz[best][0], "to": SETTINGS.maps.bands_hz[best][1], "shares": _rounded(shares)}
 
 
 def _rounded(values: Sequence[float] | Array) -> list[float]:

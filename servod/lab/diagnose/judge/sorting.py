@@ -22,6 +22,7 @@ from servod.lab.diagnose.judge.verdict import lesser_twin
 from servod.lab.diagnose.select.detail import WANTED, power
 from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.select.merit import at_end, is_level, of_size
+from servod.lab.diagnose.settings import SETTINGS
 
 if TYPE_CHECKING:
     from servod.lab.diagnose.judge.evidence import Evidence
@@ -34,9 +35,6 @@ WHERE = frozenset(("shift", "torque_at_middle", "start_s", "position"))
 
 #: Sizes that are positive by themselves, so that only their interval tells them from nothing.
 POSITIVE = frozenset(("time_constant_s", "gap"))
-
-#: Half width of a 95 % interval in standard deviations.
-Z95 = 1.96
 
 
 def sorted_out(evidence: Evidence, chooser: Chooser) -> Evidence:
@@ -94,7 +92,7 @@ def told_from_none(fit: Fit, place: int, spread: Array) -> bool:
     unknowns, share = fit.hypothesis.unknowns, fit.hypothesis.share(place)
     own = range(share.start, share.stop)
     deviations = np.sqrt(np.maximum(np.diag(spread), 0.0))
-    if any(unknowns[i].key in POSITIVE and Z95 * deviations[i] >= 1.0 for i in own):
+    if any(unknowns[i].key in POSITIVE and SETTINGS.intervals.z95 * deviations[i] >= 1.0 for i in own):
         return False
     sizes = [i for i in own if unknowns[i].size != 0.0 and unknowns[i].low <= 0.0 and unknowns[i].key not in WHERE]
     return not sizes or not within(fit.coordinates[sizes], spread[np.ix_(sizes, sizes)])

@@ -18,36 +18,12 @@ from servod.lab.diagnose.effects.hypothesis import Document, get
 from servod.lab.diagnose.select.candidates import Candidate
 from servod.lab.diagnose.select.choice import Choice
 from servod.lab.diagnose.select.fit import Fit
+from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
 
-#: Below this share of the explainable error no known name may stand: what is there is something else. Real machines
-#: keep some of theirs above it, so that it is no nearer to 1; confidence falls with what is left instead. It is nearer
-#: where what is left is worth a name itself, from this share of dry friction on.
-LEAST_EXPLAINED, LEAST_BESIDE_MUCH, MUCH_TORQUE = 0.85, 0.925, 0.05
-
-#: What is left above the noise floor counts as unexplained from this share of dry friction, if it is also this share of
-#: what could be explained.
-LEFT_TORQUE, LEFT_SHARE = 0.02, 0.05
-
-#: Shares of dry friction from which the encoder's noise in the mismatch hides what is left, and hides everything.
-HIDES_REST, HIDES_ALL = 0.15, 0.5
-
 #: A delay and a lag that are in together are one finding, by the name of the longer.
 TWINS = {"delay": "actuator_lag", "actuator_lag": "delay"}
-
-#: A rival that leaves at most this many times what the finding leaves cannot be told apart.
-ALIKE = 1.2
-
-#: Confidence 0.5 + 0.49*(1 - exp(-gap/GAP)); gap: logarithm of what the best rival leaves over what the finding leaves.
-GAP = 0.15
-
-
-#: Torque ripple below this share of the command is what every motor has.
-RIPPLE_SHARE = 0.02
-
-#: From this share of the explainable error removed on, what is left says nothing against the names.
-FULLY = 0.95
 
 
 class Verdict(StrEnum):
@@ -84,8 +60,10 @@ def shares(mismatch: tuple[Array, Array], counts: NDArray[np.bool_], floor: floa
 def verdict(choice: Choice, named: list[int], errors: Shares, dry: float) -> Verdict:
     """The verdict on what was named (places of terms) and what is left."""
     left = errors.left / dry
-    much = left > LEFT_TORQUE and 1.0 - errors.removed > LEFT_SHARE
-    least = LEAST_BESIDE_MUCH if left > MUCH_TORQUE else LEAST_EXPLAINED
+    much = left > SETTINGS.verdict.left_torque and 1.0 - errors.removed > SETTINGS.verdict.left_share
+    least = (
+        SETTINGS.verdict.least_beside_much if left > SETTINGS.verdict.much_torque else SETTINGS.verdict.least_explained
+    )
     if much and (not named or errors.removed < least):
         return Verdict.UNEXPLAINED
     return Verdict.MISSING_PHYSICS if named else Verdict.ADEQUATE
@@ -93,7 +71,7 @@ def verdict(choice: Choice, named: list[int], errors: Shares, dry: float) -> Ver
 
 def drowned(found: Verdict, encoder_noise: float, dry: float) -> bool:
     """Whether a verdict without a name says nothing, because the encoder's noise is as large as what it is about."""
-    hides = {Verdict.UNEXPLAINED: HIDES_REST, Verdict.ADEQUATE: HIDES_ALL}
+    hides = {Verdict.UNEXPLAINED: SETTINGS.verdict.hides_rest, Verdict.ADEQUATE: SETTINGS.verdict.hides_all}
     return found in hides and encoder_noise > hides[found] * dry
 
 
@@ -131,7 +109,7 @@ def _at_level(effect: str, nominal: Document, fitted: Document) -> bool:
         factors = [get(fitted, f"torque_gain.{key}", 1.0) for key in ("factor", "negative_factor")]
         return max(max(f, 1.0 / f) for f in factors) >= 1.0 + RECALIBRATION
     if effect == "torque_ripple":
-        return _largest_wave(fitted, effect) >= RIPPLE_SHARE
+        return _largest_wave(fitted, effect) >= SETTINGS.verdict.ripple_share
     return True
 
 
@@ -151,9 +129,12 @@ def confidence(choice: Choice, index: int, removed: float) -> float:
     `removed` is the share of the explainable error that all names together remove: what they leave may be their fault.
     """
     own = len(choice.fit.hypothesis.terms[index].unknowns)
-    gaps = [math.log(max(ratio, 1.0)) + GAP * _more_unknowns(rival, own) for rival, ratio in _rivals(choice, index)]
-    sure = 0.5 + 0.49 * (1.0 - math.exp(-min(gaps, default=math.inf) / GAP))
-    return round(sure * min(1.0, removed / FULLY), 3)
+    gaps = [
+        math.log(max(ratio, 1.0)) + SETTINGS.verdict.gap_scale * _more_unknowns(rival, own)
+        for rival, ratio in _rivals(choice, index)
+    ]
+    sure = 0.5 + 0.49 * (1.0 - math.exp(-min(gaps, default=math.inf) / SETTINGS.verdict.gap_scale))
+    return round(sure * min(1.0, removed / SETTINGS.verdict.fully), 3)
 
 
 def _more_unknowns(rival: Candidate, own: int) -> int:
@@ -166,7 +147,11 @@ def alternatives(choice: Choice, index: int) -> list[str]:
     terms = choice.fit.hypothesis.terms
     twin = TWINS.get(terms[index].effect)
     beside = [term.effect for term in terms if term.effect == twin]
-    return beside + [rival.effect for rival, ratio in _rivals(choice, index) if ratio <= ALIKE and rival.effect != twin]
+    return beside + [
+        rival.effect
+        for rival, ratio in _rivals(choice, index)
+        if ratio <= SETTINGS.verdict.alike and rival.effect != twin
+    ]
 
 
 def _rivals(choice: Choice, index: int) -> list[tuple[Candidate, float]]:

@@ -16,17 +16,9 @@ from numpy.typing import NDArray
 from servod.formats.model.axis_model import AxisKind, AxisModel
 from servod.lab.diagnose.data.trace import Trace
 from servod.lab.diagnose.predict.predict import Predictor
+from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
-
-#: Times since a reversal, and at rest, are told up to here, s.
-LONGEST_S = 1.0
-
-#: The joint rests where its speed is below this many of its own errors; a map of rest needs this share of the rows.
-REST_ERRORS, LEAST_RESTING = 3.0, 0.02
-
-#: The change of the command is taken over so long, s.
-CHANGE_S = 0.01
 
 
 @dataclass(frozen=True)
@@ -62,7 +54,7 @@ def coordinates(predictor: Predictor) -> dict[str, tuple[str, Array]]:
         "load, moving back": (unit.force, np.where(v < 0.0, u, np.nan)),
     }
     rest = np.concatenate([at_rest(trace) for trace in traces])
-    if float(np.mean(np.isfinite(rest[predictor.counts]))) >= LEAST_RESTING:
+    if float(np.mean(np.isfinite(rest[predictor.counts]))) >= SETTINGS.coordinates.least_resting:
         found["time at rest"] = ("s", rest)
     if all(trace.has_temperature for trace in traces):
         found["temperature"] = ("°C", predictor.over("temperature_c"))
@@ -79,16 +71,16 @@ def running_time(predictor: Predictor) -> Array:
 
 
 def since_reversal(t_s: Array, velocity: Array) -> Array:
-    """Time since the velocity last changed its sign, s, at most LONGEST_S."""
+    """Time since the velocity last changed its sign, s, up to a longest time."""
     turned = np.concatenate([[True], np.diff(np.sign(velocity)) != 0.0])
-    return np.minimum(t_s - t_s[_last(turned)], LONGEST_S)
+    return np.minimum(t_s - t_s[_last(turned)], SETTINGS.coordinates.longest_s)
 
 
 def at_rest(trace: Trace) -> Array:
-    """For how long the joint has been at rest, s, at most LONGEST_S; NaN in rows in which it moves."""
-    rests = np.abs(trace.velocity) < REST_ERRORS * trace.drive.motion[:, 3]
+    """For how long the joint has been at rest, s, up to a longest time; NaN in rows in which it moves."""
+    rests = np.abs(trace.velocity) < SETTINGS.coordinates.rest_errors * trace.drive.motion[:, 3]
     begun = _last(np.concatenate([[True], rests[1:] & ~rests[:-1]]))
-    held = np.minimum(trace.drive.t_s - trace.drive.t_s[begun], LONGEST_S)
+    held = np.minimum(trace.drive.t_s - trace.drive.t_s[begun], SETTINGS.coordinates.longest_s)
     return np.where(rests, held, np.nan)
 
 
@@ -98,10 +90,10 @@ def _last(marked: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 def _change(trace: Trace) -> Array:
-    """Change of the command per second, over CHANGE_S around each row."""
+    """Change of the command per second, over a short time around each row."""
     from scipy.ndimage import uniform_filter1d
 
-    rows = max(3, round(CHANGE_S / trace.period_s))
+    rows = max(3, round(SETTINGS.coordinates.change_s / trace.period_s))
     smooth = uniform_filter1d(trace.drive.torque, rows, mode="nearest")
     return np.asarray(np.gradient(smooth) / trace.period_s)
 

@@ -18,21 +18,9 @@ from servod.lab.diagnose.effects.hypothesis import Term
 from servod.lab.diagnose.effects.scene import Scene
 from servod.lab.diagnose.predict.predict import side_by_side
 from servod.lab.diagnose.select.fit import Fit, Fitter
+from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
-
-#: Starts that go on to the second round and its steps; effects that are fitted to the end and steps of such a fit.
-SECOND_ROUND, SECOND_STEPS, FULL_FITS, FULL_STEPS = 16, 3, 5, 8
-
-#: Starts of a far effect that get a step of their own: those that the model's own parameters can follow best.
-FAR_STARTS = 4
-
-#: A candidate is fitted to the end when it has saved at least 1 - IN_REACH of what the best has saved.
-IN_REACH = 0.4
-
-
-#: What a number more must take of the rest to be worth it.
-PER_NUMBER = 0.02
 
 
 @dataclass(frozen=True)
@@ -79,11 +67,11 @@ class Trials:
         names = [what.name for what in effects() if what.name not in skip]
         first = [c for found in side_by_side("starts", self._starts, names) for c in found]
         first.sort(key=lambda c: c.left)
-        second = side_by_side("starts", self._second, best_of_each(first, SECOND_ROUND, 2))
+        second = side_by_side("starts", self._second, best_of_each(first, SETTINGS.trials.second_round, 2))
         second.sort(key=lambda c: c.left)
         chosen = best_of_each(second, len(second), 1)
-        limit = chosen[0].left + IN_REACH * max(1.0 - chosen[0].left, 0.0) if chosen else 0.0
-        close = [c for c in chosen if c.left <= limit][:FULL_FITS]
+        limit = chosen[0].left + SETTINGS.trials.in_reach * max(1.0 - chosen[0].left, 0.0) if chosen else 0.0
+        close = [c for c in chosen if c.left <= limit][: SETTINGS.trials.full_fits]
         fitted = sorted(side_by_side("starts", self._full, close), key=plainly)
         return fitted + [c for c in chosen if c.effect not in {f.effect for f in fitted}]
 
@@ -93,7 +81,7 @@ class Trials:
         begun = [fit for term in what.terms(self.scene) for fit in self._begun(term, what.far)]
         self.tried += len(begun)
         if what.far:
-            begun = sorted(begun, key=self.short.promised)[:FAR_STARTS]
+            begun = sorted(begun, key=self.short.promised)[: SETTINGS.trials.far_starts]
         begun = [self.short.opened(fit) for fit in begun]
         return [self._short(name, self.short.refine(fit, 1, fit.jacobian.shape[1], 2), fit) for fit in begun]
 
@@ -112,20 +100,24 @@ class Trials:
 
     def _second(self, candidate: Candidate) -> Candidate:
         fit = candidate.fit
-        return self._short(candidate.effect, self.short.refine(fit, SECOND_STEPS, fit.jacobian.shape[1]), fit)
+        return self._short(
+            candidate.effect, self.short.refine(fit, SETTINGS.trials.second_steps, fit.jacobian.shape[1]), fit
+        )
 
     def _full(self, candidate: Candidate) -> Candidate:
         """Fit on everything, as long as there is time."""
         begun = self.whole.begin(candidate.fit.hypothesis, candidate.fit.coordinates, self.present.jacobian)
         if begun is None or monotonic() > self.deadline:
             return candidate
-        fit = self.whole.refine(self.whole.opened(begun), FULL_STEPS, known=self.present.jacobian.shape[1])
+        fit = self.whole.refine(
+            self.whole.opened(begun), SETTINGS.trials.full_steps, known=self.present.jacobian.shape[1]
+        )
         return Candidate(candidate.effect, fit, fit.cost / max(self.present.cost, 1e-30))
 
 
 def plainly(candidate: Candidate) -> float:
     """What is left, a little more for every number that the term needs: the plainest of equals comes first."""
-    return candidate.left * (1.0 + PER_NUMBER * candidate.term.numbers)
+    return candidate.left * (1.0 + SETTINGS.trials.per_number * candidate.term.numbers)
 
 
 def best_of_each(sorted_candidates: list[Candidate], count: int, each: int) -> list[Candidate]:

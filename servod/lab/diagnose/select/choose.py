@@ -24,40 +24,14 @@ from servod.lab.diagnose.predict.predict import Predictor, shortened
 from servod.lab.diagnose.select.candidates import Candidate, Trials
 from servod.lab.diagnose.select.choice import Choice, Entry
 from servod.lab.diagnose.select.fit import Fit, Fitter, Weighing, long_run, scale_of
-from servod.lab.diagnose.select.merit import SURE_SHARE, Merit, acting, at_end, is_level, on_bound, worth_naming
+from servod.lab.diagnose.select.merit import Merit, acting, at_end, is_level, on_bound, worth_naming
+from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
 Tell = Callable[[str], None]
 
 #: Whether a new term deserves to come in, by what it is worth and the fit with it.
 Deserves = Callable[[Merit, Fit], bool]
-
-#: Robust deviations beyond which a mismatch is a blow, and counts no more for what is left.
-BLOW = 8.0
-
-#: Most terms.
-MOST_TERMS = 5
-
-#: Nothing worth naming is left when the mismatch above the floor, and its mean over any short stretch but this share of
-#: them, are below these shares of dry friction.
-NOTHING_RMS, NOTHING_STRETCH, BUT_SHARE = 0.006, 0.02, 0.005
-
-#: Rivals that saved at least 1 - CLOSE of what the best saved get their chance when the best does not deserve it.
-CLOSE = 0.3
-
-#: Steps of a fit, in each of two scales.
-STEPS = 12
-
-#: Times that such a fit goes on where a term deserves it, and the share of what it takes that is as good as nothing:
-#: blows behind a gap come a sample earlier or later, and no step ends exactly.
-MORE, NEAR = 2, 0.05
-
-#: Blocks whose sums are taken to be independent when a gain is judged, s. Shorter than those of the intervals: what
-#: other missing physics leaves is slow, and must not count as noise as long as it is not named.
-GAIN_MEMORY_S = 0.1
-
-#: Scale of the mismatch is never taken smaller than this share of dry friction.
-LEAST_SCALE = 0.002
 
 
 class Chooser:
@@ -75,7 +49,7 @@ class Chooser:
 
     def fitter(self, mismatch: Array) -> Fitter:
         """A fitter that counts costs in the scale of this mismatch."""
-        least = LEAST_SCALE * self.predictor.dry
+        least = SETTINGS.fit.least_scale * self.predictor.dry
         return Fitter(self.predictor, Weighing(scale_of(mismatch, self.predictor.counts, least), self.rows))
 
     def error(self, mismatch: Array) -> float:
@@ -86,7 +60,7 @@ class Chooser:
         """Fit the base, add terms, prune; the outcome."""
         base = self._fit_base()
         choice = Choice(base, base, [], [], {}, self.floor, 0)
-        while len(choice.fit.hypothesis.terms) < MOST_TERMS and self._more_to_find(choice.fit):
+        while len(choice.fit.hypothesis.terms) < SETTINGS.forward.most_terms and self._more_to_find(choice.fit):
             added = monotonic() < self.deadline and self._add(choice)
             choice.cut = not added and monotonic() >= self.deadline
             if not added:
@@ -124,7 +98,7 @@ class Chooser:
         """The fit refined in the scale of a mismatch, with the first columns of its Jacobian to begin with."""
         fitter = self.fitter(mismatch)
         cost = fitter.cost(fit.hypothesis, fit.coordinates, fit.mismatch)
-        return fitter.refine(replace(fit, cost=cost, converged=False), STEPS, known=known)
+        return fitter.refine(replace(fit, cost=cost, converged=False), SETTINGS.fit.steps, known=known)
 
     def fresh(self, fit: Fit) -> Fit:
         """The fit with cost and Jacobian in the scale of its own mismatch."""
@@ -140,7 +114,7 @@ class Chooser:
         present = choice.fit
         candidates = self.candidates(present)
         for candidate in candidates:
-            if candidate.left > candidates[0].left + CLOSE * (1.0 - candidates[0].left):
+            if candidate.left > candidates[0].left + SETTINGS.forward.close * (1.0 - candidates[0].left):
                 break
             settled, merit = self.to_end(present, self._settled(candidate.fit, present.mismatch), self.deserves)
             self.lower_floor(settled.mismatch)
@@ -166,12 +140,12 @@ class Chooser:
     def to_end(self, present: Fit, settled: Fit, deserves: Deserves) -> tuple[Fit, Merit]:
         """A fit that deserves to come in, fitted on until it is at its end or nearly; and what it is worth."""
         merit = self.merit(present, settled)
-        for _ in range(MORE):
+        for _ in range(SETTINGS.forward.refits):
             if settled.converged or not deserves(merit, settled):
                 break
             further = self._refined(settled, settled.mismatch, len(settled.coordinates))
             later = self.merit(present, further)
-            near = later.of_left - merit.of_left < NEAR * later.of_left
+            near = later.of_left - merit.of_left < SETTINGS.forward.near * later.of_left
             settled, merit = replace(further, converged=further.converged or near), later
         return settled, merit
 
@@ -195,7 +169,11 @@ class Chooser:
         """Whether no effect worth naming can hide in this mismatch."""
         above = math.sqrt(max(self.error(mismatch) - self.floor, 0.0)) / self.predictor.dry
         stretches = stretch_means(self.predictor, mismatch) / self.predictor.dry
-        return above < NOTHING_RMS and float(np.quantile(np.abs(stretches), 1.0 - BUT_SHARE)) < NOTHING_STRETCH
+        return (
+            above < SETTINGS.forward.nothing_rms
+            and float(np.quantile(np.abs(stretches), 1.0 - SETTINGS.forward.but_share))
+            < SETTINGS.forward.nothing_stretch
+        )
 
     def merit(self, without: Fit, with_term: Fit) -> Merit:
         """What the step from one fit to the other is worth."""
@@ -205,7 +183,7 @@ class Chooser:
         fitter = self.fitter(with_term.mismatch)
         cost = fitter.cost(without.hypothesis, without.coordinates, without.mismatch)
         gain = 2.0 * (cost - with_term.cost) / self._correlation(with_term.mismatch, fitter.weighing.scale)
-        blow = BLOW * float(np.median(np.abs(with_term.mismatch[self.predictor.counts]))) / 0.6745
+        blow = SETTINGS.worth.blow * float(np.median(np.abs(with_term.mismatch[self.predictor.counts]))) / 0.6745
         was, now = (self.error(np.clip(fit.mismatch, -blow, blow)) for fit in (without, with_term))
         of_left = (was - now) / max(was - self.floor, 1e-30)
         return Merit(saved / explainable, of_left, torque, gain, self._own(without, with_term))
@@ -230,7 +208,7 @@ class Chooser:
         period = self.predictor.traces[0].period_s
         clipped = np.clip(mismatch / scale, -4.0, 4.0)
         plain = float(clipped @ clipped)
-        slow = float(long_run(clipped[:, None], max(1, round(GAIN_MEMORY_S / period)))[0, 0])
+        slow = float(long_run(clipped[:, None], max(1, round(SETTINGS.worth.gain_memory_s / period)))[0, 0])
         return max(slow / max(plain, 1e-30), 1.0)
 
     def enters(self, merit: Merit, fit: Fit, place: int = -1) -> bool:
@@ -268,7 +246,7 @@ class Chooser:
 
 def whole(merit: Merit, fit: Fit, place: int = -1) -> bool:
     """Whether the fit of a term has come to an end, and not to one of a range."""
-    return (fit.converged or merit.share >= SURE_SHARE) and not at_end(fit, place)
+    return (fit.converged or merit.share >= SETTINGS.worth.sure_share) and not at_end(fit, place)
 
 
 #: Effects that may come in again with another period or place: a second harmonic is no second effect.

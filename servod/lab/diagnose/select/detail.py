@@ -23,37 +23,23 @@ from servod.lab.diagnose.select.choice import Choice, Entry
 from servod.lab.diagnose.select.choose import Chooser, whole
 from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.select.merit import Merit
-
-#: Only where what is left above the noise floor is this share of dry friction, and this share of what was explainable.
-MUCH_LEFT, LEFT_SHARE = 0.025, 0.08
-
-#: Most terms, those of the selection included.
-MOST_TERMS = 9
-
-#: A term takes at least this share of what is left when it comes in; all of them together at least that share.
-LEAST_EACH, LEAST_TOGETHER = 0.06, 0.35
-
-#: A term acts with at least this share of dry friction, seen through the observer's low-pass.
-LEAST_TORQUE = 0.025
+from servod.lab.diagnose.settings import SETTINGS
 
 #: Effects that soak up what others leave, and are too plain to be a detail where they are real.
 SOAK_UP = frozenset(
     ("encoder_eccentricity", "position_dependent_inertia", "disturbance", "torque_saturation", "torque_ripple", "delay")
 )
 
-#: Candidates of a round that are tried until one deserves to come in.
-TRIED = 3
-
 
 def detail(chooser: Chooser, choice: Choice) -> None:
     """Add terms to `choice`, all or none of them."""
     refined = replace(choice, merits=list(choice.merits), entries=list(choice.entries))
-    while len(refined.fit.hypothesis.terms) < MOST_TERMS and monotonic() < chooser.deadline:
+    while len(refined.fit.hypothesis.terms) < SETTINGS.group.most_terms and monotonic() < chooser.deadline:
         if chooser.nothing_left(refined.fit.mismatch):
             break
         if not take_first(chooser, refined, chooser.candidates(refined.fit, True, SOAK_UP)):
             break
-    if refined.fit is choice.fit or chooser.merit(choice.fit, refined.fit).of_left < LEAST_TOGETHER:
+    if refined.fit is choice.fit or chooser.merit(choice.fit, refined.fit).of_left < SETTINGS.group.least_together:
         return
     choice.fit, choice.merits, choice.entries = refined.fit, refined.merits, refined.entries
     choice.tried, choice.floor = chooser.tried, chooser.floor
@@ -65,14 +51,17 @@ def much_left(chooser: Chooser, choice: Choice) -> bool:
         return False
     left = chooser.error(choice.fit.mismatch) - chooser.floor
     explainable = max(chooser.base_error - chooser.floor, 1e-30)
-    return left > LEFT_SHARE * explainable and math.sqrt(max(left, 0.0)) > MUCH_LEFT * chooser.predictor.dry
+    return (
+        left > SETTINGS.group.left_share * explainable
+        and math.sqrt(max(left, 0.0)) > SETTINGS.group.much_left * chooser.predictor.dry
+    )
 
 
 def take_first(chooser: Chooser, choice: Choice, candidates: list[Candidate]) -> bool:
     """Take in the first of the best candidates that deserves it and whose fit is whole; whether one did."""
     present = choice.fit
     deserves = partial(_deserves, chooser)
-    for candidate in candidates[:TRIED]:
+    for candidate in candidates[: SETTINGS.group.tried]:
         begun = chooser.settled(candidate.fit.hypothesis, candidate.fit.coordinates, present.mismatch)
         settled, merit = chooser.to_end(present, begun, deserves)
         chooser.lower_floor(settled.mismatch)
@@ -91,7 +80,11 @@ def _take(choice: Choice, candidate: Candidate, candidates: list[Candidate], set
 
 def _deserves(chooser: Chooser, merit: Merit, fit: Fit) -> bool:
     """Whether a term is significant and of some size."""
-    return merit.of_left >= LEAST_EACH and merit.torque >= LEAST_TORQUE and chooser.significant(merit, fit)
+    return (
+        merit.of_left >= SETTINGS.group.least_each
+        and merit.torque >= SETTINGS.group.least_torque
+        and chooser.significant(merit, fit)
+    )
 
 
 # Puts rivals in the place of terms that came in before others: what was best alone need not be best in company.
@@ -100,12 +93,6 @@ def _deserves(chooser: Chooser, merit: Merit, fit: Fit) -> bool:
 
 
 Array = NDArray[np.float64]
-
-#: Rivals of a term that are tried: so many at most, which left at most so many times what the term left.
-SWAPS_TRIED, WITHIN = 2, 2.5
-
-#: A rival takes the place when the cost falls by more than this share of it, or with fewer unknowns rises by less.
-BETTER = 0.01
 
 
 def swapped(chooser: Chooser, choice: Choice) -> None:
@@ -146,7 +133,9 @@ def _judge_anew(chooser: Chooser, choice: Choice) -> None:
 def _rivals(choice: Choice, index: int) -> list[Candidate]:
     """Rivals of a term that stood close when it came in and are not in by now."""
     entry, there = choice.entries[index], {term.effect for term in choice.fit.hypothesis.terms}
-    return [c for c in entry.rivals if c.left <= WITHIN * entry.left and c.effect not in there][:SWAPS_TRIED]
+    return [c for c in entry.rivals if c.left <= SETTINGS.swap.within * entry.left and c.effect not in there][
+        : SETTINGS.swap.most_tried
+    ]
 
 
 def _instead(chooser: Chooser, fit: Fit, index: int, rival: Candidate) -> Fit | None:
@@ -177,7 +166,7 @@ def _better(chooser: Chooser, old: Fit, new: Fit) -> bool:
     fitter = chooser.fitter(old.mismatch)
     was, now = (fitter.cost(fit.hypothesis, fit.coordinates, fit.mismatch) for fit in (old, new))
     fewer = _size(new) < _size(old)
-    return math.log(max(now, 1e-30) / max(was, 1e-30)) < (BETTER if fewer else -BETTER)
+    return math.log(max(now, 1e-30) / max(was, 1e-30)) < (SETTINGS.swap.better if fewer else -SETTINGS.swap.better)
 
 
 def _size(fit: Fit) -> int:
@@ -189,12 +178,6 @@ def _size(fit: Fit) -> int:
 # Stands behind `detail`, for real machines with several effects at once: what is left of the mismatch is judged by its
 # means over a second, as a simulation that runs freely for a second adds it up.
 
-
-#: Length over which the mismatch is averaged, s; and the share of the means' power that a drift must take.
-SPAN_S, LEAST_TAKEN = 1.0, 0.15
-
-#: What it must gain beyond the Bayesian information criterion, in units of noise; one thing is tried, not hundreds.
-LEAST_GAIN = 20.0
 
 #: The effect and its form, and what it must be told from: friction that drifts, which turns with the direction.
 WANTED, RIVAL = ("offset_drift", "straight"), ("thermal", "drift")
@@ -208,7 +191,7 @@ def slow(chooser: Chooser, choice: Choice) -> None:
         return
     drift, merit = _with(chooser, present, *WANTED)
     left = _left(chooser, present, drift)
-    if left > 1.0 - LEAST_TAKEN or not _gains(chooser, merit) or not whole(merit, drift):
+    if left > 1.0 - SETTINGS.drift.least_taken or not _gains(chooser, merit) or not whole(merit, drift):
         return
     other, _ = _with(chooser, present, *RIVAL)
     choice.fit = drift
@@ -218,7 +201,7 @@ def slow(chooser: Chooser, choice: Choice) -> None:
 
 def _gains(chooser: Chooser, merit: Merit) -> bool:
     """Whether a term of one number is significant."""
-    return merit.gain >= LEAST_GAIN + math.log(float(chooser.rows.sum()))
+    return merit.gain >= SETTINGS.drift.least_gain + math.log(float(chooser.rows.sum()))
 
 
 def _with(chooser: Chooser, present: Fit, name: str, form: str) -> tuple[Fit, Merit]:
@@ -247,10 +230,10 @@ def power(predictor: Predictor, mismatch: Array) -> float:
 
 
 def means(predictor: Predictor, mismatch: Array) -> Array:
-    """Means of the mismatch over each span of SPAN_S of all recordings, N*m."""
+    """Means of the mismatch over each second of all recordings, N*m."""
     found = []
     for part, trace in zip(predictor.slices, predictor.traces, strict=True):
-        rows = max(8, round(SPAN_S / trace.period_s))
+        rows = max(8, round(SETTINGS.drift.span_s / trace.period_s))
         count = (part.stop - part.start) // rows
         found.append(mismatch[part][: count * rows].reshape(count, rows).mean(axis=1))
     return np.concatenate(found)
@@ -272,12 +255,6 @@ LEVELS = (
     "delay_s",
 )
 
-#: They mind when the torque that changes is over this share of dry friction in some rows, or the error grows by this.
-MINDS, GROWS = 0.01, 0.02
-
-#: Belief so firm that a parameter stays.
-FIRM = 1e-6
-
 
 def tidied(chooser: Chooser, fit: Fit) -> Fit:
     """The fit with as many of LEVELS at their nominal values as the data do not mind; those that a term opens stay.
@@ -298,7 +275,7 @@ def tidied(chooser: Chooser, fit: Fit) -> Fit:
 
 def _held(chooser: Chooser, fit: Fit, keys: list[str]) -> Fit | None:
     """The fit with `keys` at their nominal values, None where the data mind."""
-    base = tuple(replace(u, spread=FIRM) if u.key in keys else u for u in fit.hypothesis.base)
+    base = tuple(replace(u, spread=SETTINGS.reset.firm) if u.key in keys else u for u in fit.hypothesis.base)
     hypothesis = Hypothesis(fit.hypothesis.document, base, fit.hypothesis.terms)
     at = fit.coordinates.copy()
     for index, unknown in enumerate(base):
@@ -310,6 +287,6 @@ def _held(chooser: Chooser, fit: Fit, keys: list[str]) -> Fit | None:
         return None
     held = fitter.refine(begun, 3, len(at))
     changed = np.abs(held.mismatch - fit.mismatch)[chooser.predictor.counts]
-    if float(np.quantile(changed, 0.99)) > MINDS * chooser.predictor.dry:
+    if float(np.quantile(changed, 0.99)) > SETTINGS.reset.torque * chooser.predictor.dry:
         return None
-    return held if chooser.error(held.mismatch) <= (1.0 + GROWS) * chooser.error(fit.mismatch) else None
+    return held if chooser.error(held.mismatch) <= (1.0 + SETTINGS.reset.error) * chooser.error(fit.mismatch) else None

@@ -13,29 +13,9 @@ from numpy.typing import NDArray
 
 from servod.lab.diagnose.effects.hypothesis import Term
 from servod.lab.diagnose.select.fit import Fit
+from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
-
-#: Worth naming (outside contract): share of the explainable error, or share of Coulomb friction where it acts; and the
-#: least torque that any finding must carry there, which several effects of one per cent each stay below.
-WORTH_SHARE, WORTH_TORQUE, LEAST_TORQUE = 0.05, 0.03, 0.018
-
-#: The least torque of a parameter beyond its own level, which acts for some milliseconds behind a reversal.
-LEVEL_TORQUE = 0.003
-
-#: A term that takes less than SURE_SHARE must take this share of what is left above the floor: a name that leaves most
-#: of the rest as it was is not what the rest is made of.
-LEAST_OF_LEFT = 0.25
-
-#: A term that takes this share of what is left is what the rest is made of: then the torque that it stands for counts,
-#: for what a scale on the model's own friction and inertia cannot take up of it may be little.
-NEARLY_ALL = 0.8
-
-#: Rows that show where an effect acts: its torque there is at least this quantile of what it changes.
-ACTS_AT = 0.98
-
-#: A fit that takes so much of the explainable error counts though its last steps still improved it.
-SURE_SHARE = 0.3
 
 
 @dataclass(frozen=True)
@@ -56,16 +36,18 @@ class Merit:
 
 def worth_naming(merit: Merit, level: bool) -> bool:
     """Whether a term is worth a name; `level`: it is a parameter of the model's own beyond its level."""
-    least = LEVEL_TORQUE if level else LEAST_TORQUE
-    rest = merit.of_left >= LEAST_OF_LEFT or merit.share >= SURE_SHARE
+    least = SETTINGS.worth.level_torque if level else SETTINGS.worth.least_torque
+    rest = merit.of_left >= SETTINGS.worth.least_of_left or merit.share >= SETTINGS.worth.sure_share
     return of_size(merit, level) and merit.torque >= least and rest
 
 
 def of_size(merit: Merit, level: bool) -> bool:
     """Whether a term has the size from which the outside contract calls it worth naming; `level` as above."""
-    if merit.share >= WORTH_SHARE or merit.torque >= (LEVEL_TORQUE if level else WORTH_TORQUE):
+    if merit.share >= SETTINGS.worth.share or merit.torque >= (
+        SETTINGS.worth.level_torque if level else SETTINGS.worth.torque
+    ):
         return True
-    return merit.own >= WORTH_TORQUE and merit.of_left >= NEARLY_ALL
+    return merit.own >= SETTINGS.worth.torque and merit.of_left >= SETTINGS.worth.nearly_all
 
 
 def acting(changed: Array) -> float:
@@ -75,7 +57,7 @@ def acting(changed: Array) -> float:
     """
     power = float(changed @ changed)
     weighted = math.sqrt(float(np.sum(changed**4)) / power) if power > 0.0 else 0.0
-    return max(float(np.quantile(changed, ACTS_AT)), weighted)
+    return max(float(np.quantile(changed, SETTINGS.worth.acts_at)), weighted)
 
 
 # Parameters of the model that have a level of their own: pulled beyond it they are findings, however little they move.
@@ -92,9 +74,6 @@ LEVELS = frozenset(
 #: Own numbers of such terms that have no level: damping that fades with speed is judged by the torque that it makes.
 NO_LEVEL = frozenset(("damping_velocity",))
 
-#: A coordinate so near to its bound stands on it.
-ON_BOUND = 1e-6
-
 
 def on_bound(fit: Fit) -> bool:
     """Whether a parameter with a level stands on its bound: the data pull it further.
@@ -104,7 +83,7 @@ def on_bound(fit: Fit) -> bool:
     low, high = fit.hypothesis.bounds
     watched = LEVELS - {"friction.stribeck_velocity"}
     places = [i for i, unknown in enumerate(fit.hypothesis.base) if unknown.key in watched]
-    return any(min(fit.coordinates[i] - low[i], high[i] - fit.coordinates[i]) < ON_BOUND for i in places)
+    return any(min(fit.coordinates[i] - low[i], high[i] - fit.coordinates[i]) < SETTINGS.worth.on_bound for i in places)
 
 
 def is_level(term: Term) -> bool:
@@ -128,9 +107,6 @@ MAY_END = frozenset(
     )
 )
 
-#: Coordinates that are so close to an end lie on it.
-CLOSE = 1e-6
-
 
 def at_end(fit: Fit, place: int = -1) -> bool:
     """Whether a number of a term (the last), or one of the model's own that it opens, lies at an end of its range.
@@ -145,6 +121,6 @@ def at_end(fit: Fit, place: int = -1) -> bool:
         if not own or unknown.key in MAY_END:
             continue
         ends = [end for end, value in ((low[index], unknown.low), (high[index], unknown.high)) if value != 0.0]
-        if any(abs(float(at) - float(end)) < CLOSE for end in ends):
+        if any(abs(float(at) - float(end)) < SETTINGS.worth.on_bound for end in ends):
             return True
     return False

@@ -11,9 +11,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from servod.lab.diagnose.judge.held_out import WindowErrors
-from servod.lab.diagnose.judge.locate import LEAST_IN_BIN, SEEN, Map
+from servod.lab.diagnose.judge.locate import Map
 from servod.lab.diagnose.predict.coordinates import units
 from servod.lab.diagnose.predict.predict import Predictor
+from servod.lab.diagnose.settings import SETTINGS
 from servod.lab.report.figure import Array, Axis, Colour, Curve, Figure, Panel, Scale, Style, array, curve
 
 #: Maps that are shown, and length of a stretch whose root mean square is one point over time, s.
@@ -35,7 +36,7 @@ def shares(maps: Sequence[Map]) -> dict[str, float]:
     for seen in maps:
         name, _, both = seen.coordinate.partition(",")
         name = f"{name}, by direction" if both else name
-        found[name] = found.get(name, 0.0) + (seen.share if seen.chance < SEEN else 0.0)
+        found[name] = found.get(name, 0.0) + (seen.share if seen.chance < SETTINGS.maps.seen else 0.0)
     return dict(sorted(found.items(), key=lambda item: -item[1]))
 
 
@@ -67,7 +68,7 @@ def map_panel(seen: Map, predictor: Predictor, after: Map | None = None) -> Pane
 
 
 def _mean(seen: Map, label: str, colour: Colour) -> Curve:
-    full = seen.rows >= LEAST_IN_BIN
+    full = seen.rows >= SETTINGS.maps.least_in_bin
     middles = (0.5 * (seen.edges[:-1] + seen.edges[1:]))[full]
     mean, half = seen.mean[full], 2.0 * seen.error[full]
     style = Style.POINTS if len(middles) < 4 else Style.LINE

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.lab.diagnose.judge.evidence import Evidence
-from servod.lab.diagnose.judge.locate import LEAST_IN_BIN
 from servod.lab.diagnose.judge.unnamed import Unnamed
 from servod.lab.diagnose.predict.coordinates import Look, Split, coordinates, look, units
 from servod.lab.diagnose.predict.predict import Predictor
+from servod.lab.diagnose.settings import SETTINGS
 from servod.lab.report.figure import Array, Axis, Colour, Curve, Figure, Panel, Style, curve
 
 #: Bins of a signature; periods in the range from which a periodic one is drawn over one period only.
@@ -74,12 +74,12 @@ def _binned(
     values: Array, without: Array, term: Array, rows: NDArray[np.bool_], name: str, colour: Colour
 ) -> Iterator[Curve]:
     """Means over bins with as many rows each: points of the error, and a line of the term."""
-    if int(rows.sum()) < 2 * LEAST_IN_BIN:
+    if int(rows.sum()) < 2 * SETTINGS.maps.least_in_bin:
         return
     edges = np.unique(np.quantile(values[rows], np.linspace(0.0, 1.0, BINS + 1)))
     place = np.clip(np.searchsorted(edges, values[rows], side="right") - 1, 0, max(len(edges) - 2, 0))
     count = np.bincount(place)
-    full = count >= min(LEAST_IN_BIN, count.max())
+    full = count >= min(SETTINGS.maps.least_in_bin, count.max())
     middle, left, made = (
         (np.bincount(place, part[rows]) / np.maximum(count, 1))[full] for part in (values, without, term)
     )
