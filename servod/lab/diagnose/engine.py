@@ -11,14 +11,17 @@ from time import monotonic
 
 from servod.formats.model.axis_model import AxisModel
 from servod.lab.diagnose.data.intake import taken_in
-from servod.lab.diagnose.judge.evidence import Diagnosis, Evidence
+from servod.lab.diagnose.judge.conclude import conclude, extended_model, free_windows
 from servod.lab.diagnose.judge.held_out import foretold, held_out, once, split
+from servod.lab.diagnose.judge.judgement import Judgement
 from servod.lab.diagnose.judge.locate import maps
 from servod.lab.diagnose.judge.sorting import sorted_out
 from servod.lab.diagnose.judge.spread import spread
 from servod.lab.diagnose.judge.unnamed import unnamed
-from servod.lab.diagnose.judge.verdict import Verdict, drowned, named_terms, shares, verdict
+from servod.lab.diagnose.judge.verdict import drowned, named_terms, shares, verdict
+from servod.lab.diagnose.predict.coordinates import units
 from servod.lab.diagnose.predict.predict import Predictor
+from servod.lab.diagnose.result import Diagnosis, Verdict
 from servod.lab.diagnose.select.choice import Choice
 from servod.lab.diagnose.select.choose import Chooser
 from servod.lab.diagnose.select.detail import detail, much_left, slow, swapped, tidied
@@ -38,7 +41,7 @@ def diagnose(
     traces, refused = taken_in(recordings, model)
     seconds = {"intake": monotonic() - begun}
     if not traces:
-        return Diagnosis(model, refused, Verdict.CANNOT_TELL, None, seconds)
+        return Diagnosis(units(model), tuple(refused), Verdict.CANNOT_TELL, None, seconds | {"windows": 0.0})
     tell(f"{len(traces)} recordings taken in")
     predictor = Predictor(traces, model)
     chooser = Chooser(predictor, model, begun + SETTINGS.forward.search_share * time_limit_s, tell)
@@ -51,24 +54,28 @@ def diagnose(
     choice.fit = tidied(chooser, choice.fit)
     chooser.lower_floor(choice.fit.mismatch)
     choice.floor = chooser.floor
-    evidence = proved(predictor, chooser, choice, tell)
-    while (worse := _worse_unseen(evidence)) is not None:
-        choice.drop(worse, evidence.less[worse])
-        evidence = proved(predictor, chooser, choice, tell)
-    evidence = sorted_out(evidence, chooser)
+    judgement = proved(predictor, chooser, choice, tell)
+    while (worse := _worse_unseen(judgement)) is not None:
+        choice.drop(worse, judgement.less[worse])
+        judgement = proved(predictor, chooser, choice, tell)
+    judgement = sorted_out(judgement, chooser)
     seconds["proof"] = monotonic() - begun - seconds["intake"] - seconds["search"]
-    final = verdict(choice, evidence.named, evidence.errors, predictor.dry)
-    if final is Verdict.MISSING_PHYSICS and _foretells_nothing(evidence):
+    final = verdict(choice, judgement.named, judgement.errors, predictor.dry)
+    if final is Verdict.MISSING_PHYSICS and _foretells_nothing(judgement):
         final = Verdict.UNEXPLAINED
     if final is Verdict.UNEXPLAINED:
-        evidence = _without_names(evidence)
+        judgement = _without_names(judgement)
     untried = final is Verdict.UNEXPLAINED and choice.cut and choice.tried == 0
     if untried or drowned(final, predictor.encoder_noise, predictor.dry):
         final = Verdict.CANNOT_TELL
-    return Diagnosis(model, refused, final, evidence, seconds)
+    judged = monotonic()
+    extended = extended_model(judgement, model)
+    free = free_windows(judgement, model, extended)
+    seconds["windows"] = monotonic() - judged
+    return Diagnosis(units(model), tuple(refused), final, conclude(judgement, model, extended, free), seconds)
 
 
-def proved(predictor: Predictor, chooser: Chooser, choice: Choice, tell: Tell) -> Evidence:
+def proved(predictor: Predictor, chooser: Chooser, choice: Choice, tell: Tell) -> Judgement:
     """A choice proved on rows that its fits have not seen; names are those of terms at the level of their effect."""
     fit = choice.fit
     nominal = chooser.start.document
@@ -83,8 +90,7 @@ def proved(predictor: Predictor, chooser: Chooser, choice: Choice, tell: Tell) -
     alone = len(named) == 1 and len(fit.hypothesis.terms) == 1
     without = {p: before if alone else held_out(predictor, f, shared) for p, f in less.items()}
     unseen = shares((before.mismatch, after.mismatch), counts, choice.floor)
-    return Evidence(
-        traces=predictor.traces,
+    return Judgement(
         predictor=predictor,
         choice=choice,
         named=named,
@@ -103,36 +109,37 @@ def proved(predictor: Predictor, chooser: Chooser, choice: Choice, tell: Tell) -
     )
 
 
-def _worse_unseen(evidence: Evidence) -> int | None:
+def _worse_unseen(judgement: Judgement) -> int | None:
     """The named term without which unseen rows are foretold best, if better than with it; no event, which none are."""
-    events = once(evidence.fit.hypothesis)
+    events = once(judgement.fit.hypothesis)
     others = {
         place: held.rms
-        for place, held in evidence.without.items()
-        if held.rms <= evidence.after.rms and place not in events
+        for place, held in judgement.without.items()
+        if held.rms <= judgement.after.rms and place not in events
     }
     return min(others, key=lambda place: others[place]) if others else None
 
 
-def _foretells_nothing(evidence: Evidence) -> bool:
+def _foretells_nothing(judgement: Judgement) -> bool:
     """Whether free windows are hardly better for the names, although something is left: terms that only fit.
 
     Names of events in one recording alone are not asked, since nobody can foretell them.
     """
     if (
-        set(evidence.named) <= set(once(evidence.fit.hypothesis))
-        or evidence.unseen.after < SETTINGS.validation.fitted_floors * evidence.unseen.floor
+        set(judgement.named) <= set(once(judgement.fit.hypothesis))
+        or judgement.unseen.after < SETTINGS.validation.fitted_floors * judgement.unseen.floor
     ):
         return False
-    judged = evidence.shared.judged
+    judged = judgement.shared.judged
     return (
-        foretold(evidence.predictor, evidence.before, evidence.after, judged) > SETTINGS.validation.most_free_run_error
+        foretold(judgement.predictor, judgement.before, judgement.after, judged)
+        > SETTINGS.validation.most_free_run_error
     )
 
 
-def _without_names(evidence: Evidence) -> Evidence:
-    """The evidence when no name may stand: the base, and a table of what is left without a name."""
-    choice, predictor = evidence.choice, evidence.predictor
+def _without_names(judgement: Judgement) -> Judgement:
+    """The judgement when no name may stand: the base, and a table of what is left without a name."""
+    choice, predictor = judgement.choice, judgement.predictor
     bare = replace(choice, fit=choice.base, merits=[], entries=[])
     left = unnamed(predictor, choice.base.mismatch)
     size = len(choice.base.coordinates)
@@ -142,7 +149,7 @@ def _without_names(evidence: Evidence) -> Evidence:
         shares((rows, rows), predictor.counts, choice.floor) for rows in (choice.base.mismatch, before.mismatch)
     )
     return replace(
-        evidence, choice=bare, named=[], kept={}, errors=errors, less={}, without={}, unnamed=left, shared=shared,
-        before=before, after=before, unseen=unseen, spread=evidence.spread[:size, :size],
-        maps_after=evidence.maps_before,
+        judgement, choice=bare, named=[], kept={}, errors=errors, less={}, without={}, unnamed=left, shared=shared,
+        before=before, after=before, unseen=unseen, spread=judgement.spread[:size, :size],
+        maps_after=judgement.maps_before,
     )  # fmt: skip

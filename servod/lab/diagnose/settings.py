@@ -344,6 +344,27 @@ class MapSettings:
 
 
 @dataclass(frozen=True)
+class CurveSettings:
+    """What is drawn of a mismatch: signatures of terms, courses over time, spectra."""
+
+    #: Bins of a signature.
+    signature_bins: int = 60
+    #: Periods in the range of positions from which a periodic signature is drawn over one period only.
+    fold_from: float = 4.0
+    #: The stretch of time in which a term acts most lasts so long, s.
+    stretch_s: float = 3.0
+    #: So many rows of a signature count as one independent row in its standard errors.
+    correlated_rows: float = 20.0
+    #: Length of a stretch whose root mean square is one point over time, s.
+    course_s: float = 0.1
+    #: Lowest and highest frequency of a spectrum, Hz, its bands, and the length of its windows, s.
+    lowest_hz: float = 0.2
+    highest_hz: float = 60.0
+    bands: int = 60
+    window_s: float = 8.0
+
+
+@dataclass(frozen=True)
 class VerdictSettings:
     """From what is named and what is left to a verdict, and how sure a name is."""
 
@@ -391,6 +412,7 @@ class Settings:
     validation: ValidationSettings = ValidationSettings()
     intervals: IntervalSettings = IntervalSettings()
     maps: MapSettings = MapSettings()
+    curves: CurveSettings = CurveSettings()
     verdict: VerdictSettings = VerdictSettings()
 
 

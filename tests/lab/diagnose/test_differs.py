@@ -8,13 +8,14 @@ import pytest
 from servod.lab.diagnose.document import differs
 from servod.lab.diagnose.effects.base import base_unknowns
 from servod.lab.diagnose.judge.spread import within
+from servod.lab.diagnose.result import FittedValue
 from tests.lab.diagnose.axes import believed
 
 
 def test_what_differs_is_said_with_its_share() -> None:
     changes = {
-        "friction.viscous": {"from": 200.0, "to": 210.0, "unit": "N·s/m"},
-        "torque_offset": {"from": 0.0, "to": -0.5, "unit": "N"},
+        "friction.viscous": FittedValue(210.0, "N·s/m", 205.0, 215.0, 200.0),
+        "torque_offset": FittedValue(-0.5, "N", -0.6, -0.4, 0.0),
     }
     said = differs(changes)
     assert "viscous is 210 instead of 200 N·s/m (+5 %)" in said

@@ -7,8 +7,9 @@ import pytest
 
 from servod.lab.diagnose.data.intake import taken_in
 from servod.lab.diagnose.engine import diagnose
-from servod.lab.diagnose.judge.verdict import Verdict, drowned
+from servod.lab.diagnose.judge.verdict import drowned
 from servod.lab.diagnose.predict.predict import Predictor
+from servod.lab.diagnose.result import Verdict
 from servod.lab.recordings import Recording
 from tests.lab.diagnose.axes import believed, record, recording
 

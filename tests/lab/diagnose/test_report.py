@@ -13,9 +13,10 @@ import pytest
 from servod.cli.app import run
 from servod.formats.model.axis_model import AxisKind, axis_model_yaml, load_axis_model
 from servod.lab.diagnose.data.intake import taken_in
+from servod.lab.diagnose.document import where
+from servod.lab.diagnose.effects.looks import LOOKS
 from servod.lab.diagnose.engine import diagnose
 from servod.lab.diagnose.judge.locate import maps
-from servod.lab.diagnose.predict.coordinates import LOOKS, where
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.recordings import Quantity, Recording
 from servod.lab.report.diagnosis import write_files

@@ -10,14 +10,15 @@ import pytest
 
 from servod.formats.model.axis_model import AxisModel
 from servod.lab.diagnose.data.intake import taken_in
-from servod.lab.diagnose.document import minor
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.hypothesis import Term
 from servod.lab.diagnose.effects.scene import Scene
 from servod.lab.diagnose.engine import proved
-from servod.lab.diagnose.judge.evidence import Evidence, Kept
+from servod.lab.diagnose.judge.conclude import minor
+from servod.lab.diagnose.judge.judgement import Judgement
 from servod.lab.diagnose.judge.sorting import sorted_out, told_from_none
 from servod.lab.diagnose.predict.predict import Predictor
+from servod.lab.diagnose.result import Kept
 from servod.lab.diagnose.select.choice import Choice, Entry
 from servod.lab.diagnose.select.choose import Chooser
 from servod.lab.diagnose.select.fit import Fit
@@ -48,8 +49,8 @@ def form(chooser: Chooser, name: str) -> Term:
     return effect(name).terms(Scene(chooser.start.document, chooser.predictor, mismatch))[0]
 
 
-def sorted_with(chooser: Chooser, *terms: Term) -> Evidence:
-    """The evidence on these terms, fitted together."""
+def sorted_with(chooser: Chooser, *terms: Term) -> Judgement:
+    """The judgement of these terms, fitted together."""
     base = chooser.settled(chooser.start, None, chooser.predictor.mismatch(believed()))
     fit = base
     for term in terms:
@@ -61,23 +62,24 @@ def sorted_with(chooser: Chooser, *terms: Term) -> Evidence:
 
 def test_what_is_small_or_under_its_level_stays_in_the_model_and_is_told(chooser: Chooser) -> None:
     terms = [form(chooser, name) for name in ("gravity", "torque_gain", "viscous_nonlinear")]
-    evidence = sorted_with(chooser, *terms)
-    assert evidence.named == [0]
-    assert evidence.kept == {1: Kept.LEVEL, 2: Kept.SMALL}
-    told = minor(evidence)
+    judgement = sorted_with(chooser, *terms)
+    assert judgement.named == [0]
+    assert judgement.kept == {1: Kept.LEVEL, 2: Kept.SMALL}
+    told = minor(judgement)
     assert list(told) == ["viscous_nonlinear", "torque_gain"]
-    factor = told["torque_gain"]["parameters"]["factor"]
-    assert factor["interval"][0] < factor["value"] < factor["interval"][1]
-    assert evidence.choice.merits[0].share > 0.7
+    parameters = told["torque_gain"].parameters
+    assert parameters is not None
+    assert parameters["factor"].low < parameters["factor"].value < parameters["factor"].high
+    assert judgement.choice.merits[0].share > 0.7
 
 
 def test_what_ends_at_the_end_of_a_range_is_no_finding(chooser: Chooser) -> None:
     sine, cosine = form(chooser, "gravity").unknowns
     narrow = replace(form(chooser, "gravity"), unknowns=(replace(sine, low=-0.03, high=0.03), cosine))
-    evidence = sorted_with(chooser, narrow)
-    assert evidence.named == []
-    assert evidence.kept == {0: Kept.AT_END}
-    assert minor(evidence)["gravity"]["why"] == Kept.AT_END.value
+    judgement = sorted_with(chooser, narrow)
+    assert judgement.named == []
+    assert judgement.kept == {0: Kept.AT_END}
+    assert minor(judgement)["gravity"].why is Kept.AT_END
 
 
 @pytest.mark.parametrize(("deviation", "told"), [(0.4, True), (0.6, False)])

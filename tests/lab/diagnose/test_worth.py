@@ -15,8 +15,9 @@ from servod.lab.diagnose.effects.disturbance import terms as windows_of
 from servod.lab.diagnose.effects.effect import sine_term
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
 from servod.lab.diagnose.effects.scene import Peak, Scene
-from servod.lab.diagnose.judge.verdict import Shares, Verdict, alternatives, named_terms, verdict
+from servod.lab.diagnose.judge.verdict import Shares, alternatives, named_terms, verdict
 from servod.lab.diagnose.predict.predict import Predictor
+from servod.lab.diagnose.result import Verdict
 from servod.lab.diagnose.select.choice import Choice, Entry
 from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.select.merit import Merit, acting, at_end, worth_naming

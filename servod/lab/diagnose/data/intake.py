@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from servod.formats.model.axis_model import AxisKind, AxisModel
 from servod.lab.diagnose.data.trace import Rows, Trace, dry_friction
+from servod.lab.diagnose.result import RefusedRecording
 from servod.lab.diagnose.settings import SETTINGS
 from servod.lab.recordings import Quantity, Recording
 from servod.lab.simulate.motion import noise_rms
@@ -96,18 +97,10 @@ def factors(trace: Trace, model: AxisModel) -> tuple[Factor, Factor, float]:
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Refusal:
-    """A recording that cannot tell, and why."""
-
-    name: str
-    reason: str
-
-
-def taken_in(recordings: Sequence[Recording], model: AxisModel) -> tuple[list[Trace], list[Refusal]]:
+def taken_in(recordings: Sequence[Recording], model: AxisModel) -> tuple[list[Trace], list[RefusedRecording]]:
     """Traces of the recordings that can tell, and why the others cannot; names are unique."""
     traces: list[Trace] = []
-    refused: list[Refusal] = []
+    refused: list[RefusedRecording] = []
     for index, recording in enumerate(recordings):
         name = recording.path.name
         if any(other.path.name == name for other in recordings[:index]):
@@ -117,7 +110,7 @@ def taken_in(recordings: Sequence[Recording], model: AxisModel) -> tuple[list[Tr
         if reason is None:
             traces.append(trace)
         else:
-            refused.append(Refusal(name, reason))
+            refused.append(RefusedRecording(name, reason))
     return traces, refused
 
 

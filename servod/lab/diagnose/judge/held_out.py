@@ -20,6 +20,7 @@ from servod.lab.diagnose.data.trace import Trace
 from servod.lab.diagnose.effects.disturbance import EVERY
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
 from servod.lab.diagnose.predict.predict import Predictor
+from servod.lab.diagnose.result import FreeRun, Windows
 from servod.lab.diagnose.select.fit import Fit, Fitter, Weighing, scale_of
 from servod.lab.diagnose.settings import SETTINGS
 from servod.lab.simulate.replay import Drive, replay
@@ -158,11 +159,6 @@ class WindowErrors:
     recalibrated: Array
     after: Array
 
-    def document(self, judged: NDArray[np.bool_]) -> dict[str, float]:
-        """RMS over the rows that are judged."""
-        values = {"before": self.nominal, "recalibrated": self.recalibrated, "after": self.after}
-        return {name: float(np.sqrt(np.mean(error[judged] ** 2))) for name, error in values.items()}
-
 
 def window_errors(
     predictor: Predictor, nominal: AxisModel, base: Sequence[Fold], after: Sequence[Fold]
@@ -183,24 +179,36 @@ def foretold(predictor: Predictor, before: HeldOut, after: HeldOut, judged: NDAr
     return float(np.sqrt(np.mean(with_it**2) / max(float(np.mean(without**2)), 1e-30)))
 
 
-def windows_document(errors: Sequence[WindowErrors], predictor: Predictor, judged: NDArray[np.bool_]) -> dict[str, Any]:
-    """RMS errors by horizon over the rows that are judged, of all recordings and of each."""
-    found: dict[str, Any] = {}
-    for window in errors:
-        entry: dict[str, Any] = {"unit": "m" if predictor.linear else "rad", **window.document(judged)}
-        entry["recordings"] = {
-            trace.name: window.document(_within(judged, part))
-            for trace, part in zip(predictor.traces, predictor.slices, strict=True)
-            if judged[part].any()
-        }
-        found[f"{window.horizon_s:g}"] = entry
+def windows(errors: Sequence[WindowErrors], predictor: Predictor, judged: NDArray[np.bool_]) -> tuple[Windows, ...]:
+    """Errors by length of the windows over the rows that are judged, and row by row where the model strays most."""
+    longest = errors[-1].nominal
+    worst = max(range(len(predictor.slices)), key=lambda i: float(np.mean(longest[predictor.slices[i]] ** 2)))
+    trace, part = predictor.traces[worst], predictor.slices[worst]
+    t_s = trace.drive.t_s - trace.shift_s
+    return tuple(
+        Windows(
+            window.horizon_s, _free_run(window, judged), _each(window, predictor, judged), trace.name, t_s,
+            window.nominal[part], window.after[part],
+        )
+        for window in errors
+    )  # fmt: skip
+
+
+def _each(window: WindowErrors, predictor: Predictor, judged: NDArray[np.bool_]) -> dict[str, FreeRun]:
+    """Errors of each recording that has rows to judge by."""
+    found = {}
+    for trace, part in zip(predictor.traces, predictor.slices, strict=True):
+        if judged[part].any():
+            inside = np.zeros_like(judged)
+            inside[part] = judged[part]
+            found[trace.name] = _free_run(window, inside)
     return found
 
 
-def _within(judged: NDArray[np.bool_], part: slice) -> NDArray[np.bool_]:
-    inside = np.zeros_like(judged)
-    inside[part] = judged[part]
-    return inside
+def _free_run(window: WindowErrors, judged: NDArray[np.bool_]) -> FreeRun:
+    """Root mean squares over the rows that are judged."""
+    errors = (window.nominal, window.recalibrated, window.after)
+    return FreeRun(*(float(np.sqrt(np.mean(error[judged] ** 2))) for error in errors))
 
 
 def _errors(predictor: Predictor, folds: Sequence[Fold], horizon_s: float) -> Array:

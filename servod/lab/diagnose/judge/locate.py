@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,56 +17,18 @@ from numpy.typing import NDArray
 from servod.lab.diagnose.effects.scene import Scene
 from servod.lab.diagnose.predict.coordinates import coordinates, units
 from servod.lab.diagnose.predict.predict import Predictor
+from servod.lab.diagnose.result import Map
 from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Map:
-    """Mean of the mismatch over one coordinate: bin edges, means and standard errors (N*m), rows in each bin.
-
-    `share` is the part of the mismatch's power over all rows that the means carry beyond chance, `chance` the
-    probability that noise makes them.
-    """
-
-    coordinate: str
-    unit: str
-    edges: Array
-    mean: Array
-    error: Array
-    rows: NDArray[np.int64]
-    share: float
-    chance: float
-
-    def document(self) -> dict[str, Any]:
-        """Plain numbers for JSON; bins without rows are left out."""
-        full = self.rows >= SETTINGS.maps.least_in_bin
-        middles = 0.5 * (self.edges[:-1] + self.edges[1:])
-        return {
-            "coordinate": self.coordinate,
-            "unit": self.unit,
-            "share": round(self.share, 4),
-            "chance": self.chance,
-            "at": middles[full].tolist(),
-            "mean": self.mean[full].tolist(),
-            "error": self.error[full].tolist(),
-        }
-
-
 def maps(predictor: Predictor, mismatch: Array) -> list[Map]:
     """Maps over all coordinates, the one that carries most first, and at the end what is everywhere alike."""
     memory = max(1, round(2.0 / (predictor.rate * predictor.traces[0].period_s)))
+    bins = {"time": SETTINGS.maps.time_bins}
     found = [
-        map_over(
-            name,
-            unit,
-            values,
-            mismatch,
-            predictor.counts,
-            memory,
-            SETTINGS.maps.time_bins if name == "time" else SETTINGS.maps.bins,
-        )
+        map_over(name, unit, values, mismatch, predictor.counts, memory, bins.get(name, SETTINGS.maps.bins))
         for name, (unit, values) in coordinates(predictor).items()
         if int(np.sum(predictor.counts & np.isfinite(values))) >= 2 * SETTINGS.maps.least_in_bin
     ]
@@ -82,10 +44,17 @@ def everywhere(predictor: Predictor, mismatch: Array, memory: int) -> Map:
     mean, power, rows = float(np.mean(here)), max(float(np.mean(here**2)), 1e-30), max(len(here) / memory, 2.0)
     spread = max(power - mean**2, 1e-30) / rows
     chance = float(fisher.sf(mean**2 / spread, 1, rows - 1.0))
-    edges, one = np.array([0.0, 1.0]), np.array([len(here)])
-    return Map(
-        "everywhere alike", "1", edges, np.array([mean]), np.array([math.sqrt(spread)]), one, mean**2 / power, chance
-    )
+    bins = np.array([0.0, 1.0]), np.array([mean]), np.array([math.sqrt(spread)]), np.array([len(here)])
+    return _map("everywhere alike", "1", *bins, mean**2 / power, chance)
+
+
+def _map(
+    name: str, unit: str, edges: Array, mean: Array, error: Array, rows: NDArray[Any], share: float, chance: float
+) -> Map:
+    """The map of those bins that hold rows enough."""
+    full = rows >= SETTINGS.maps.least_in_bin
+    middles = 0.5 * (edges[:-1] + edges[1:])
+    return Map(name, unit, middles[full], mean[full], error[full], len(rows), share, chance)
 
 
 def modulo_period(predictor: Predictor, mismatch: Array, memory: int) -> Map:
@@ -95,7 +64,7 @@ def modulo_period(predictor: Predictor, mismatch: Array, memory: int) -> Map:
     best = scene.peaks(scene.carried(np.ones_like(scene.position)), 1)[0]
     period, unit = 2.0 * math.pi / best.n, units(predictor).length
     name = f"position modulo {period:.4g} {unit}"
-    found = map_over(name, unit, scene.lagged_position % period, mismatch, predictor.counts, memory)
+    found = map_over(name, unit, scene.lagged_position % period, mismatch, predictor.counts, memory, SETTINGS.maps.bins)
     return replace(found, chance=min(1.0, found.chance * len(scene.orders)))
 
 
@@ -106,7 +75,7 @@ def map_over(
     mismatch: Array,
     counts: NDArray[np.bool_],
     memory: int,
-    bins: int = SETTINGS.maps.bins,
+    bins: int,
 ) -> Map:
     """Means of the mismatch over bins of `values` with as many rows each; `memory` rows count as one.
 
@@ -130,7 +99,7 @@ def map_over(
     ratio = (between / free) / max((total - between) / rest, 1e-30) / memory
     carried = max(between - free * memory * (total - between) / max(len(here), 1), 0.0)
     share = carried / max(float(np.sum(mismatch[counts] ** 2)), 1e-30)
-    return Map(name, unit, edges, mean, error, count, share, float(fisher.sf(ratio, free, rest)))
+    return _map(name, unit, edges, mean, error, count, share, float(fisher.sf(ratio, free, rest)))
 
 
 def places(predictor: Predictor, effect: Array, scale: float) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """Which terms of the last fit are findings, and why the others are none: the levels of the outside contract once more.
 
-Stands between the evidence and the verdict. A term comes in by what it takes when it comes; beside those that come
+Stands between the judgement and the verdict. A term comes in by what it takes when it comes; beside those that come
 later it may be worth less, or its numbers may be pushed to an end of their range. It stays in the model then, for the
 others were fitted beside it, and is listed with its values as minor.
 
@@ -11,22 +11,19 @@ adds up in every simulation that runs freely: its share is that of the means ove
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from servod.lab.diagnose.judge.evidence import Kept
+from servod.lab.diagnose.judge.judgement import Judgement
 from servod.lab.diagnose.judge.spread import within
 from servod.lab.diagnose.judge.verdict import lesser_twin
+from servod.lab.diagnose.result import Kept
+from servod.lab.diagnose.select.choose import Chooser
 from servod.lab.diagnose.select.detail import WANTED, power
 from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.select.merit import at_end, is_level, of_size
 from servod.lab.diagnose.settings import SETTINGS
-
-if TYPE_CHECKING:
-    from servod.lab.diagnose.judge.evidence import Evidence
-    from servod.lab.diagnose.select.choose import Chooser
 
 Array = NDArray[np.float64]
 
@@ -37,50 +34,50 @@ WHERE = frozenset(("shift", "torque_at_middle", "start_s", "position"))
 POSITIVE = frozenset(("time_constant_s", "gap"))
 
 
-def sorted_out(evidence: Evidence, chooser: Chooser) -> Evidence:
-    """The evidence with those named that are findings beside all others, and why the rest of the terms is none.
+def sorted_out(judgement: Judgement, chooser: Chooser) -> Judgement:
+    """The judgement with those named that are findings beside all others, and why the rest of the terms is none.
 
     What each term is worth is said anew. Terms of one effect are one finding, if one of them is.
     """
-    fit, choice = evidence.fit, evidence.choice
-    for place in evidence.named:
-        choice.merits[place] = chooser.merit(evidence.less[place], fit)
-    why = {place: _why(evidence, place) for place in evidence.named}
+    fit, choice = judgement.fit, judgement.choice
+    for place in judgement.named:
+        choice.merits[place] = chooser.merit(judgement.less[place], fit)
+    why = {place: _why(judgement, place) for place in judgement.named}
     names = {fit.hypothesis.terms[place].effect for place, reason in why.items() if reason is None}
-    named = [place for place in evidence.named if fit.hypothesis.terms[place].effect in names]
+    named = [place for place in judgement.named if fit.hypothesis.terms[place].effect in names]
     kept = {place: reason for place, reason in why.items() if reason is not None and place not in named}
-    return replace(evidence, named=named, kept=kept | _under_level(evidence))
+    return replace(judgement, named=named, kept=kept | _under_level(judgement))
 
 
-def _under_level(evidence: Evidence) -> dict[int, Kept]:
+def _under_level(judgement: Judgement) -> dict[int, Kept]:
     """Terms with numbers of their own that are under their level; what only opens the model's own is recalibrated."""
-    twin = lesser_twin(evidence.fit)
-    terms = enumerate(evidence.fit.hypothesis.terms)
+    twin = lesser_twin(judgement.fit)
+    terms = enumerate(judgement.fit.hypothesis.terms)
     return {
         place: Kept.TWIN if term.effect == twin else Kept.LEVEL
         for place, term in terms
-        if place not in evidence.named and term.unknowns
+        if place not in judgement.named and term.unknowns
     }
 
 
-def _why(evidence: Evidence, place: int) -> Kept | None:
+def _why(judgement: Judgement, place: int) -> Kept | None:
     """Why a term is no finding; None if it is one."""
-    fit = evidence.fit
-    merit = replace(evidence.choice.merits[place], share=_share(evidence, place))
+    fit = judgement.fit
+    merit = replace(judgement.choice.merits[place], share=_share(judgement, place))
     if not of_size(merit, is_level(fit.hypothesis.terms[place])):
         return Kept.SMALL
     if at_end(fit, place):
         return Kept.AT_END
-    return None if told_from_none(fit, place, evidence.spread) else Kept.UNSURE
+    return None if told_from_none(fit, place, judgement.spread) else Kept.UNSURE
 
 
-def _share(evidence: Evidence, place: int) -> float:
+def _share(judgement: Judgement, place: int) -> float:
     """The share of the explainable error on unseen rows that a term takes, where it shows."""
-    rows = evidence.carries(place)
-    if evidence.fit.hypothesis.terms[place].effect != WANTED[0]:
+    rows = judgement.carries(place)
+    if judgement.fit.hypothesis.terms[place].effect != WANTED[0]:
         return rows
-    parts = (evidence.without[place], evidence.after, evidence.before)
-    without, after, before = (power(evidence.predictor, held.mismatch) for held in parts)
+    parts = (judgement.without[place], judgement.after, judgement.before)
+    without, after, before = (power(judgement.predictor, held.mismatch) for held in parts)
     return max(rows, (without - after) / max(before, 1e-30))
 
 

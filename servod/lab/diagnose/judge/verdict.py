@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from servod.lab.diagnose.effects.base import BRISTLE_FACTOR, DELAY_S, OFFSET_SHARE, RECALIBRATION, STRIBECK_SHARE
 from servod.lab.diagnose.effects.hypothesis import Document, get
+from servod.lab.diagnose.result import Verdict
 from servod.lab.diagnose.select.candidates import Candidate
 from servod.lab.diagnose.select.choice import Choice
 from servod.lab.diagnose.select.fit import Fit
@@ -24,15 +24,6 @@ Array = NDArray[np.float64]
 
 #: A delay and a lag that are in together are one finding, by the name of the longer.
 TWINS = {"delay": "actuator_lag", "actuator_lag": "delay"}
-
-
-class Verdict(StrEnum):
-    """The outside contract's verdicts, and one for data that can tell nothing."""
-
-    ADEQUATE = "adequate"
-    MISSING_PHYSICS = "missing_physics"
-    UNEXPLAINED = "unexplained"
-    CANNOT_TELL = "cannot_tell"
 
 
 @dataclass(frozen=True)

@@ -5,31 +5,14 @@ Stands behind the selection: the table becomes `residual` in the axis model file
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
-from servod.lab.diagnose.effects.hypothesis import Document
 from servod.lab.diagnose.predict.predict import Predictor
+from servod.lab.diagnose.result import Unnamed
 from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Unnamed:
-    """A resisting torque over one coordinate: grid, torque (N*m), and the share it takes of unseen rows' power."""
-
-    coordinate: str
-    grid: Array
-    torque: Array
-    share: float
-
-    def write(self, document: Document) -> None:
-        """Put the table into a model document."""
-        table = {"grid": self.grid.tolist(), "torque": self.torque.tolist()}
-        document.setdefault("residual", {})[self.coordinate] = table
 
 
 def unnamed(predictor: Predictor, mismatch: Array) -> Unnamed | None:
