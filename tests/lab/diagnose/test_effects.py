@@ -9,7 +9,7 @@ import pytest
 
 from servod.common.yaml import parse_yaml, validate
 from servod.formats.model.axis_model import AxisModel, axis_model_yaml
-from servod.lab.diagnose.data.intake import taken_in
+from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.effects import NAMES, effect
 from servod.lab.diagnose.effects.base import base_unknowns, document_of
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
@@ -22,7 +22,7 @@ from tests.lab.diagnose.axes import believed, record
 @functools.cache
 def scene() -> Scene:
     model = believed(gravity={"amplitude": 0.1, "phase": 0.2})
-    traces, _ = taken_in(record(model), model)
+    traces, _ = load_traces(record(model), model)
     predictor = Predictor(traces, model)
     return Scene(document_of(model), predictor, predictor.mismatch(believed()))
 

@@ -12,7 +12,7 @@ import pytest
 
 from servod.cli.app import run
 from servod.formats.model.axis_model import AxisKind, axis_model_yaml, load_axis_model
-from servod.lab.diagnose.data.intake import taken_in
+from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.document import where
 from servod.lab.diagnose.effects.looks import LOOKS
 from servod.lab.diagnose.engine import diagnose
@@ -163,7 +163,7 @@ def test_every_look_can_be_said() -> None:
 
 def test_maps_tell_a_curve_from_a_constant() -> None:
     made = record(believed(), seconds=4.0)
-    traces, _ = taken_in(made, believed())
+    traces, _ = load_traces(made, believed())
     predictor = Predictor(traces, believed())
     rng = np.random.default_rng(1)
     noise = 0.01 * rng.normal(size=len(predictor.counts))

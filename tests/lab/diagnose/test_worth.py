@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from servod.lab.diagnose.data.intake import taken_in
+from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.base import base_unknowns, document_of
 from servod.lab.diagnose.effects.disturbance import SHORTEST_S, windows
@@ -15,12 +15,13 @@ from servod.lab.diagnose.effects.disturbance import terms as windows_of
 from servod.lab.diagnose.effects.effect import sine_term
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
 from servod.lab.diagnose.effects.scene import Peak, Scene
-from servod.lab.diagnose.judge.verdict import Shares, alternatives, named_terms, verdict
+from servod.lab.diagnose.judge.verdict import Shares, alternatives, verdict
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.result import Verdict
-from servod.lab.diagnose.select.choice import Choice, Entry
 from servod.lab.diagnose.select.fit import Fit
-from servod.lab.diagnose.select.merit import Merit, acting, at_end, worth_naming
+from servod.lab.diagnose.select.levels import at_end, named_terms
+from servod.lab.diagnose.select.merit import Merit, acting, worth_naming
+from servod.lab.diagnose.select.selection import Entry, Selection
 from servod.lab.diagnose.settings import SETTINGS
 from tests.lab.diagnose.axes import believed, record
 
@@ -29,17 +30,16 @@ from tests.lab.diagnose.axes import believed, record
 def scene() -> Scene:
     """An axis with nothing left but a push in the last tenth of a second of its last recording."""
     model = believed()
-    predictor = Predictor(taken_in(record(model, seconds=3.0), model)[0], model)
+    predictor = Predictor(load_traces(record(model, seconds=3.0), model)[0], model)
     mismatch = np.zeros(len(predictor.counts))
     mismatch[-100:] = 0.05
     return Scene(document_of(model), predictor, mismatch)
 
 
-def with_ripple(scene: Scene, amplitude: float) -> Choice:
+def with_ripple(scene: Scene, amplitude: float) -> Fit:
     term = sine_term("torque_ripple", scene, Peak(5.0, amplitude, 0.0, 0.0), 0.1, "1", most=0.45)
     hypothesis = Hypothesis(scene.document, base_unknowns(believed()), (term,))
-    fit = Fit(hypothesis, hypothesis.start, scene.mismatch, 0.0, np.zeros((0, 0)), True)
-    return Choice(fit, fit, [], [], {}, 0.0, 1)
+    return Fit(hypothesis, hypothesis.start, scene.mismatch, 0.0, np.zeros((0, 0)), True)
 
 
 def test_torque_is_judged_where_it_acts() -> None:
@@ -52,8 +52,8 @@ def test_torque_is_judged_where_it_acts() -> None:
 
 
 def test_ripple_that_every_motor_has_is_no_finding(scene: Scene) -> None:
-    assert named_terms(with_ripple(scene, 0.01), scene.document) == []
-    assert named_terms(with_ripple(scene, 0.04), scene.document) == [0]
+    assert named_terms(with_ripple(scene, 0.01), scene.document) == ()
+    assert named_terms(with_ripple(scene, 0.04), scene.document) == (0,)
 
 
 def test_a_push_lies_within_its_recording(scene: Scene) -> None:
@@ -75,13 +75,13 @@ def test_a_push_lies_within_its_recording(scene: Scene) -> None:
         (0.60, 0.01, Verdict.MISSING_PHYSICS),
     ],
 )
-def test_names_must_explain_most_of_what_is_left(scene: Scene, removed: float, left: float, answer: Verdict) -> None:
+def test_names_must_explain_most_of_what_is_left(removed: float, left: float, answer: Verdict) -> None:
     """Names that leave a sixth of the explainable error are somebody else's, unless what they leave is next to none.
 
     `left` is a share of dry friction.
     """
     after = float(np.sqrt(1.0 - removed))
-    assert verdict(with_ripple(scene, 0.1), [0], Shares(1.0, after, 0.0, removed), dry=after / left) is answer
+    assert verdict((0,), Shares(1.0, after, 0.0, removed), dry=after / left) is answer
 
 
 def test_a_number_at_an_end_of_its_range_is_somebody_elses(scene: Scene) -> None:
@@ -123,13 +123,13 @@ def test_a_drive_that_is_late_has_one_name(scene: Scene) -> None:
     terms = (effect("delay").terms(scene)[0], effect("actuator_lag").terms(scene)[0])
     hypothesis = Hypothesis(scene.document, base_unknowns(believed()), terms)
     coordinates = hypothesis.start.copy()
-    for late, lag, places in ((0.002, 0.003, [1]), (0.006, 0.001, [0])):
+    for late, lag, places in ((0.002, 0.003, (1,)), (0.006, 0.001, (0,))):
         for place, value in ((0, late), (1, lag)):
             coordinates[hypothesis.share(place)] = terms[place].unknowns[0].coordinate(value)
         fit = Fit(hypothesis, coordinates, scene.mismatch, 0.0, np.zeros((0, 0)), True)
-        choice = Choice(fit, fit, [], [Entry(0.1, []), Entry(0.1, [])], {}, 0.0, 1)
-        assert named_terms(choice, scene.document) == places
-        assert alternatives(choice, places[0]) == [terms[1 - places[0]].effect]
+        selection = Selection(fit, fit, 0.0, 0.0, (), (Entry(0.1, ()), Entry(0.1, ())))
+        assert named_terms(fit, scene.document) == places
+        assert alternatives(selection, places[0]) == [terms[1 - places[0]].effect]
 
 
 @pytest.mark.parametrize(

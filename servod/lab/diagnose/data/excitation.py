@@ -27,7 +27,7 @@ SWIFT = frozenset(
 DIRECTED = frozenset(("asymmetry", "torque_offset"))
 
 
-def unseen(traces: Sequence[Trace], inertia: float) -> frozenset[str]:
+def unexcited_effects(traces: Sequence[Trace], inertia: float) -> frozenset[str]:
     """Effects that these recordings of an axis of this inertia cannot show."""
     return (SWIFT if creeps(traces, inertia) else frozenset()) | (DIRECTED if one_way(traces) else frozenset())
 

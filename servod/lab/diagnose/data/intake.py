@@ -97,7 +97,7 @@ def factors(trace: Trace, model: AxisModel) -> tuple[Factor, Factor, float]:
 Array = NDArray[np.float64]
 
 
-def taken_in(recordings: Sequence[Recording], model: AxisModel) -> tuple[list[Trace], list[RefusedRecording]]:
+def load_traces(recordings: Sequence[Recording], model: AxisModel) -> tuple[list[Trace], list[RefusedRecording]]:
     """Traces of the recordings that can tell, and why the others cannot; names are unique."""
     traces: list[Trace] = []
     refused: list[RefusedRecording] = []

@@ -15,7 +15,7 @@ from servod.formats.model.axis_model import AxisModel
 from servod.lab.diagnose.effects.disturbance import EVERY
 from servod.lab.diagnose.effects.hypothesis import Document, Reported
 from servod.lab.diagnose.judge.curves import course, signature, spectrum
-from servod.lab.diagnose.judge.held_out import Fold, window_errors, windows
+from servod.lab.diagnose.judge.free_run import window_errors, windows
 from servod.lab.diagnose.judge.judgement import Judgement
 from servod.lab.diagnose.judge.locate import bands, places
 from servod.lab.diagnose.judge.spread import within
@@ -33,14 +33,15 @@ from servod.lab.diagnose.result import (
 )
 from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.select.merit import Merit
+from servod.lab.diagnose.select.selection import Fold
 from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
 
 
-def conclude(judgement: Judgement, nominal: AxisModel, model: AxisModel, free: tuple[Windows, ...]) -> Evidence:
+def conclude(judgement: Judgement, model: AxisModel, free: tuple[Windows, ...]) -> Evidence:
     """The plain result; `model` is that of `extended_model` and `free` the errors of `free_windows`."""
-    predictor, choice = judgement.predictor, judgement.choice
+    predictor, selection = judgement.predictor, judgement.selection
     return Evidence(
         findings=findings(judgement),
         recalibrated=recalibrated(judgement),
@@ -50,9 +51,9 @@ def conclude(judgement: Judgement, nominal: AxisModel, model: AxisModel, free: t
         quality=_quality(judgement, free),
         maps_before=tuple(judgement.maps_before),
         maps_after=tuple(judgement.maps_after),
-        bands=bands(predictor, choice.base.mismatch),
+        bands=bands(predictor, selection.base.mismatch),
         recordings=tuple(_recording(judgement, index) for index in range(len(predictor.traces))),
-        search=SearchEffort(predictor.rate, choice.tried, choice.cut),
+        search=SearchEffort(predictor.rate, selection.tried, selection.cut),
         encoder_noise=predictor.encoder_noise,
         dry_friction=predictor.dry,
     )
@@ -66,19 +67,19 @@ def findings(judgement: Judgement) -> tuple[NamedEffect, ...]:
 
 
 def _finding(judgement: Judgement, name: str, named: Sequence[int]) -> NamedEffect:
-    fit, first, choice = judgement.fit, named[0], judgement.choice
-    contribution = judgement.less[first].mismatch - fit.mismatch
+    fit, first, selection = judgement.fit, named[0], judgement.selection
+    contribution = judgement.validation.reduced[first].mismatch - fit.mismatch
     return NamedEffect(
         effect=name,
         forms=tuple(fit.hypothesis.terms[place].form for place in named),
         parameters=parameters(judgement, named),
-        confidence=min(confidence(choice, place, judgement.errors.removed) for place in named),
-        alternatives=tuple(alternatives(choice, first)),
+        confidence=min(confidence(selection, place, judgement.errors.removed) for place in named),
+        alternatives=tuple(alternatives(selection, first)),
         located=places(judgement.predictor, contribution, judgement.predictor.dry),
         carries=judgement.carries(first),
-        torque=choice.merits[first].torque,
-        without=judgement.without[first].rms,
-        after=judgement.after.rms,
+        torque=selection.merits[first].torque,
+        without=judgement.validation.without[first].rms,
+        after=judgement.validation.after.rms,
         signatures=tuple(signature(judgement, place) for place in named),
     )
 
@@ -110,15 +111,15 @@ def _deviations(judgement: Judgement, place: int, values: Sequence[Reported]) ->
         nudged[index] += 1e-5
         there = _reported(fit, place, nudged)
         slopes[:, index] = [(b.value - a.value) / 1e-5 for a, b in zip(values, there, strict=True)]
-    variances = np.einsum("ij,jk,ik->i", slopes, judgement.spread, slopes)
+    variances = np.einsum("ij,jk,ik->i", slopes, judgement.covariance, slopes)
     return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
 
 
 def minor(judgement: Judgement) -> dict[str, Minor]:
     """Effects that are there but not worth naming, and those that stand in the model and are no findings."""
-    terms, merits = judgement.fit.hypothesis.terms, judgement.choice.merits
+    terms, merits = judgement.fit.hypothesis.terms, judgement.selection.merits
     named = {terms[place].effect for place in judgement.named}
-    seen = {name: _minor(merit) for name, merit in judgement.choice.minor.items() if name not in named}
+    seen = {name: _minor(merit) for name, merit in judgement.selection.minor.items() if name not in named}
     for name in dict.fromkeys(terms[place].effect for place in judgement.kept):
         those = [place for place in judgement.kept if terms[place].effect == name]
         largest = _minor(max((merits[place] for place in those), key=lambda merit: merit.torque))
@@ -137,7 +138,7 @@ def recalibrated(judgement: Judgement) -> dict[str, FittedValue]:
     found = {}
     for index, (unknown, nominal) in enumerate(zip(fit.hypothesis.unknowns, fit.hypothesis.base, strict=False)):
         value = fit.values[index]
-        half = SETTINGS.intervals.z95 * math.sqrt(max(float(judgement.spread[index, index]), 0.0))
+        half = SETTINGS.intervals.z95 * math.sqrt(max(float(judgement.covariance[index, index]), 0.0))
         size = unknown.size if unknown.size else abs(value)
         if unknown.key in opened or abs(value - nominal.start) <= max(SETTINGS.intervals.least_change, half) * size:
             continue
@@ -182,37 +183,37 @@ def _model_coordinates(judgement: Judgement) -> Array:
     changed = recalibrated(judgement)
     moved = [unknown.key in changed for unknown in fit.hypothesis.base]
     back = np.where(moved, 0.0, fit.coordinates - fit.hypothesis.start)
-    return fit.coordinates - back if within(back, judgement.spread) else fit.coordinates
+    return fit.coordinates - back if within(back, judgement.covariance) else fit.coordinates
 
 
 def free_windows(judgement: Judgement, nominal: AxisModel, model: AxisModel) -> tuple[Windows, ...]:
     """Errors of free windows. What has no name is a table over everything, so that its rows have been seen."""
-    predictor, after = judgement.predictor, judgement.after.folds
+    predictor, after = judgement.predictor, judgement.validation.after.folds
     if judgement.unnamed is not None:
         after = (Fold(np.ones(len(predictor.counts), dtype=bool), (model,)),)
-    errors = window_errors(predictor, nominal, judgement.before.folds, after)
-    return windows(errors, predictor, judgement.shared.judged)
+    errors = window_errors(predictor, nominal, judgement.validation.before.folds, after)
+    return windows(errors, predictor, judgement.validation.folds.judged)
 
 
 def _quality(judgement: Judgement, free: tuple[Windows, ...]) -> Quality:
     """Errors before and after, and for how long the recordings are not judged since only an event stands there."""
-    predictor, shared = judgement.predictor, judgement.shared
+    predictor, shared = judgement.predictor, judgement.validation.folds
     events = predictor.counts & ~shared.judged
     seconds = sum(
         trace.period_s * int(events[part].sum())
         for trace, part in zip(predictor.traces, predictor.slices, strict=True)
     )  # fmt: skip
     return Quality(
-        before=judgement.before.rms,
-        after=judgement.after.rms,
+        before=judgement.validation.before.rms,
+        after=judgement.validation.after.rms,
         noise_floor=judgement.unseen.floor,
         removed=judgement.unseen.removed,
         removed_by_known=judgement.attempt,
         left_out=shared.left_out,
         not_judged_s=seconds,
         windows=free,
-        spectrum_before=spectrum(predictor, judgement.before.mismatch),
-        spectrum_after=spectrum(predictor, judgement.after.mismatch),
+        spectrum_before=spectrum(predictor, judgement.validation.before.mismatch),
+        spectrum_after=spectrum(predictor, judgement.validation.after.mismatch),
     )
 
 
@@ -220,8 +221,8 @@ def _recording(judgement: Judgement, index: int) -> RecordingErrors:
     """One recording by fits that have not seen the rows."""
     predictor = judgement.predictor
     trace, part = predictor.traces[index], predictor.slices[index]
-    before, after = judgement.before.mismatch[part], judgement.after.mismatch[part]
-    judged, curves = judgement.shared.judged[part], course(trace, before, after)
+    before, after = judgement.validation.before.mismatch[part], judgement.validation.after.mismatch[part]
+    judged, curves = judgement.validation.folds.judged[part], course(trace, before, after)
     floor = math.sqrt(trace_floor(predictor, index, judgement.fit.mismatch))
     return RecordingErrors(
         trace.name, trace.duration_s, int(predictor.counts[part].sum()), trace.period_s, trace.position_noise,

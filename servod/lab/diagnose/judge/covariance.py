@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from servod.lab.diagnose.judge.held_out import HeldOut
 from servod.lab.diagnose.select.fit import Fit, Weighing, covariance
+from servod.lab.diagnose.select.selection import HeldOut
 from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
@@ -30,7 +30,7 @@ TORQUES = (
 )
 
 
-def spread(fit: Fit, weighing: Weighing, period_s: float, held: HeldOut) -> Array:
+def total_covariance(fit: Fit, weighing: Weighing, period_s: float, held: HeldOut) -> Array:
     """Covariance of the coordinates of `fit`; `held` has the fits without each recording."""
     return covariance(fit, weighing, period_s) + jackknife(fit, held) + model_error(fit) + common_factor(fit)
 

@@ -26,7 +26,7 @@ _HALVES = {Split.DIRECTION: ("forward", "back"), Split.LOAD: ("command above zer
 def signature(judgement: Judgement, place: int) -> Signature:
     """What is left without the term at `place`, and what it makes of it, over its coordinate and over time."""
     predictor, shown = judgement.predictor, look(judgement.fit.hypothesis.terms[place].effect)
-    without, left = judgement.less[place].mismatch, judgement.fit.mismatch
+    without, left = judgement.validation.reduced[place].mismatch, judgement.fit.mismatch
     term = without - left
     known = coordinates(predictor)
     unit, values = known.get(shown.coordinate, known["position"])

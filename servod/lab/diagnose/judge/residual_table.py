@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 def unnamed(predictor: Predictor, mismatch: Array) -> Unnamed | None:
-    """The table that foretells most of the mismatch of unseen stretches; None where none foretells enough."""
+    """The table that predicts most of the mismatch of unseen stretches; None where none predicts enough."""
     late = 2.0 * SETTINGS.observer.poles_damping / predictor.rate
     velocity = predictor.over("velocity")
     places = {
@@ -36,8 +36,8 @@ def _table(name: str, values: Array, predictor: Predictor, mismatch: Array) -> U
     stretch = (rows // max(1, round(1.0 / predictor.traces[0].period_s))) % 2 == 0
     share = 0.0
     for part in (stretch, ~stretch):
-        foretold = design[~part] @ _ridge(design[part], mismatch[rows][part])
-        left = mismatch[rows][~part] - foretold
+        predicted = design[~part] @ _ridge(design[part], mismatch[rows][part])
+        left = mismatch[rows][~part] - predicted
         share += 0.5 * (1.0 - float(left @ left) / max(float(np.sum(mismatch[rows][~part] ** 2)), 1e-30))
     return Unnamed(name, grid, -_ridge(design, mismatch[rows]), share)
 

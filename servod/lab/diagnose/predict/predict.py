@@ -40,7 +40,7 @@ R = TypeVar("R")
 
 
 @cache
-def released(function: Kernel) -> Kernel:
+def without_lock(function: Kernel) -> Kernel:
     """`function` compiled, and called without the interpreter's lock; in pure Python where there is no compiler."""
     if not available():
         return function
@@ -71,7 +71,7 @@ def _pool(level: str) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max_workers=cores(), thread_name_prefix=level)
 
 
-def side_by_side(level: str, function: Callable[[T], R], items: Iterable[T]) -> list[R]:
+def in_parallel(level: str, function: Callable[[T], R], items: Iterable[T]) -> list[R]:
     """`function` of every item, in order. Calls within calls need another `level`, lest they wait for each other."""
     if cores() == 1:
         return [function(item) for item in items]
@@ -137,7 +137,7 @@ class Predictor:
         self.slices = tuple(slice(int(a), int(b)) for a, b in zip([0, *ends[:-1]], ends, strict=True))
         self.counts = np.concatenate([self._counting(trace) for trace in self.traces])
         self.evaluations = 0
-        self._run, self._follow = released(innovate), released(open_loop.follow)
+        self._run, self._follow = without_lock(innovate), without_lock(open_loop.follow)
 
     def _counting(self, trace: Trace) -> NDArray[np.bool_]:
         """Rows that count: those of the trace, once the observer has settled behind each start."""

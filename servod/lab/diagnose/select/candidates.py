@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from servod.lab.diagnose.effects import effect, effects
 from servod.lab.diagnose.effects.hypothesis import Term
 from servod.lab.diagnose.effects.scene import Scene
-from servod.lab.diagnose.predict.predict import side_by_side
+from servod.lab.diagnose.predict.predict import in_parallel
 from servod.lab.diagnose.select.fit import Fit, Fitter
 from servod.lab.diagnose.settings import SETTINGS
 
@@ -65,14 +65,14 @@ class Trials:
     def run(self, skip: Iterable[str] = ()) -> list[Candidate]:
         """Candidates fitted to the end, best first, then the others; effects in `skip` are not tried."""
         names = [what.name for what in effects() if what.name not in skip]
-        first = [c for found in side_by_side("starts", self._starts, names) for c in found]
+        first = [c for found in in_parallel("starts", self._starts, names) for c in found]
         first.sort(key=lambda c: c.left)
-        second = side_by_side("starts", self._second, best_of_each(first, SETTINGS.trials.second_round, 2))
+        second = in_parallel("starts", self._second, best_of_each(first, SETTINGS.trials.second_round, 2))
         second.sort(key=lambda c: c.left)
         chosen = best_of_each(second, len(second), 1)
         limit = chosen[0].left + SETTINGS.trials.in_reach * max(1.0 - chosen[0].left, 0.0) if chosen else 0.0
         close = [c for c in chosen if c.left <= limit][: SETTINGS.trials.full_fits]
-        fitted = sorted(side_by_side("starts", self._full, close), key=plainly)
+        fitted = sorted(in_parallel("starts", self._full, close), key=plainest_first)
         return fitted + [c for c in chosen if c.effect not in {f.effect for f in fitted}]
 
     def _starts(self, name: str) -> list[Candidate]:
@@ -115,7 +115,7 @@ class Trials:
         return Candidate(candidate.effect, fit, fit.cost / max(self.present.cost, 1e-30))
 
 
-def plainly(candidate: Candidate) -> float:
+def plainest_first(candidate: Candidate) -> float:
     """What is left, a little more for every number that the term needs: the plainest of equals comes first."""
     return candidate.left * (1.0 + SETTINGS.trials.per_number * candidate.term.numbers)
 

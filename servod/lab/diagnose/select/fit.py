@@ -17,7 +17,7 @@ from pydantic import ValidationError
 
 from servod.formats.model.axis_model import AxisModel
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
-from servod.lab.diagnose.predict.predict import Predictor, side_by_side
+from servod.lab.diagnose.predict.predict import Predictor, in_parallel
 from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
@@ -135,7 +135,7 @@ class Fitter:
         """Derivative of the mismatch by each coordinate, N*m; forward differences, backward at an upper bound."""
         columns = [fit.jacobian[:, i] for i in range(min(keep_columns, fit.jacobian.shape[1]))]
         left = range(len(columns), len(fit.coordinates))
-        columns += side_by_side("columns", lambda index: self._column(fit, index), left)
+        columns += in_parallel("columns", lambda index: self._column(fit, index), left)
         return np.column_stack(columns)
 
     def _column(self, fit: Fit, index: int) -> Array:

@@ -11,8 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from servod.lab.diagnose.effects.hypothesis import Term
-from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
@@ -58,69 +56,3 @@ def acting(changed: Array) -> float:
     power = float(changed @ changed)
     weighted = math.sqrt(float(np.sum(changed**4)) / power) if power > 0.0 else 0.0
     return max(float(np.quantile(changed, SETTINGS.worth.acts_at)), weighted)
-
-
-# Parameters of the model that have a level of their own: pulled beyond it they are findings, however little they move.
-#
-# Stands beside the selection (`choose`), which else looks for more only while something worth naming is left. A softer
-# bristle or a steeper Stribeck curve acts for some milliseconds behind each reversal and is nothing on average.
-
-
-#: Parameters that the outside contract gives a level, which is their bound until a term opens it.
-LEVELS = frozenset(
-    ("friction.static", "friction.stribeck_velocity", "friction.sigma0", "friction.sigma1", "torque_offset", "inertia")
-)
-
-#: Own numbers of such terms that have no level: damping that fades with speed is judged by the torque that it makes.
-NO_LEVEL = frozenset(("damping_velocity",))
-
-
-def on_bound(fit: Fit) -> bool:
-    """Whether a parameter with a level stands on its bound: the data pull it further.
-
-    The Stribeck velocity has none; it opens together with static friction.
-    """
-    low, high = fit.hypothesis.bounds
-    watched = LEVELS - {"friction.stribeck_velocity"}
-    places = [i for i, unknown in enumerate(fit.hypothesis.base) if unknown.key in watched]
-    return any(min(fit.coordinates[i] - low[i], high[i] - fit.coordinates[i]) < SETTINGS.worth.on_bound for i in places)
-
-
-def is_level(term: Term) -> bool:
-    """Whether a term opens parameters that have a level, and no others."""
-    own = {unknown.key for unknown in term.unknowns}
-    return bool(term.opens) and LEVELS.issuperset(term.opens) and not own & NO_LEVEL
-
-
-# Whether a fitted effect says itself that it is something else: one of its own numbers lies at an end of its range.
-#
-# Stands between the fit and the selection. Ranges are wide, what is physical lies within: an optimum at an end, twenty
-# times the mass or ten times the friction at rest, borrows a shape from an effect that is not there.
-
-
-#: Numbers that may lie at an end of their range: where they do not matter, or are known beforehand to a narrow one.
-#: A bristle's damping is one of them, the model's own as well as that of a bristle that the model does not have.
-MAY_END = frozenset(
-    (
-        *("damping", "cubic", "exponent", "delay_s", "sigma1", "friction.sigma1"),
-        *("friction.stribeck_velocity", "damping_velocity"),
-    )
-)
-
-
-def at_end(fit: Fit, place: int = -1) -> bool:
-    """Whether a number of a term (the last), or one of the model's own that it opens, lies at an end of its range.
-
-    An end where the number is zero is none: there the effect is just absent.
-    """
-    term, unknowns = fit.hypothesis.terms[place], fit.hypothesis.unknowns
-    low, high = fit.hypothesis.bounds
-    share = fit.hypothesis.share(place)
-    for index, (unknown, at) in enumerate(zip(unknowns, fit.coordinates, strict=True)):
-        own = share.start <= index < share.stop or unknown.key in term.opens
-        if not own or unknown.key in MAY_END:
-            continue
-        ends = [end for end, value in ((low[index], unknown.low), (high[index], unknown.high)) if value != 0.0]
-        if any(abs(float(at) - float(end)) < SETTINGS.worth.on_bound for end in ends):
-            return True
-    return False

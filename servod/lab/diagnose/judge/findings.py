@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from servod.lab.diagnose.judge.judgement import Judgement
 from servod.lab.diagnose.judge.spread import within
-from servod.lab.diagnose.judge.verdict import lesser_twin
 from servod.lab.diagnose.result import Kept
-from servod.lab.diagnose.select.choose import Chooser
-from servod.lab.diagnose.select.detail import WANTED, power
 from servod.lab.diagnose.select.fit import Fit
-from servod.lab.diagnose.select.merit import at_end, is_level, of_size
+from servod.lab.diagnose.select.levels import at_end, is_level, lesser_twin
+from servod.lab.diagnose.select.merit import of_size
+from servod.lab.diagnose.select.refine import DRIFT, power_of_means
+from servod.lab.diagnose.select.selector import Selector
 from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
@@ -34,17 +34,19 @@ WHERE = frozenset(("shift", "torque_at_middle", "start_s", "position"))
 POSITIVE = frozenset(("time_constant_s", "gap"))
 
 
-def sorted_out(judgement: Judgement, chooser: Chooser) -> Judgement:
+def name_findings(selector: Selector, judgement: Judgement) -> Judgement:
     """The judgement with those named that are findings beside all others, and why the rest of the terms is none.
 
     What each term is worth is said anew. Terms of one effect are one finding, if one of them is.
     """
-    fit, choice = judgement.fit, judgement.choice
+    fit, selection = judgement.fit, judgement.selection
     for place in judgement.named:
-        choice.merits[place] = chooser.merit(judgement.less[place], fit)
+        merit = selector.merit(selection, judgement.validation.reduced[place], fit)
+        selection = selection.with_merit(place, merit)
+    judgement = replace(judgement, selection=selection)
     why = {place: _why(judgement, place) for place in judgement.named}
     names = {fit.hypothesis.terms[place].effect for place, reason in why.items() if reason is None}
-    named = [place for place in judgement.named if fit.hypothesis.terms[place].effect in names]
+    named = tuple(place for place in judgement.named if fit.hypothesis.terms[place].effect in names)
     kept = {place: reason for place, reason in why.items() if reason is not None and place not in named}
     return replace(judgement, named=named, kept=kept | _under_level(judgement))
 
@@ -63,33 +65,34 @@ def _under_level(judgement: Judgement) -> dict[int, Kept]:
 def _why(judgement: Judgement, place: int) -> Kept | None:
     """Why a term is no finding; None if it is one."""
     fit = judgement.fit
-    merit = replace(judgement.choice.merits[place], share=_share(judgement, place))
+    merit = replace(judgement.selection.merits[place], share=_share(judgement, place))
     if not of_size(merit, is_level(fit.hypothesis.terms[place])):
         return Kept.SMALL
     if at_end(fit, place):
         return Kept.AT_END
-    return None if told_from_none(fit, place, judgement.spread) else Kept.UNSURE
+    return None if differs_from_zero(fit, place, judgement.covariance) else Kept.UNSURE
 
 
 def _share(judgement: Judgement, place: int) -> float:
     """The share of the explainable error on unseen rows that a term takes, where it shows."""
     rows = judgement.carries(place)
-    if judgement.fit.hypothesis.terms[place].effect != WANTED[0]:
+    if judgement.fit.hypothesis.terms[place].effect != DRIFT[0]:
         return rows
-    parts = (judgement.without[place], judgement.after, judgement.before)
-    without, after, before = (power(judgement.predictor, held.mismatch) for held in parts)
+    validation = judgement.validation
+    parts = (validation.without[place], validation.after, validation.before)
+    without, after, before = (power_of_means(judgement.predictor, held.mismatch) for held in parts)
     return max(rows, (without - after) / max(before, 1e-30))
 
 
-def told_from_none(fit: Fit, place: int, spread: Array) -> bool:
+def differs_from_zero(fit: Fit, place: int, covariance: Array) -> bool:
     """Whether nothing at all lies outside the region of 95 % of what says how large a term is.
 
     A term whose size has no zero, such as a stiffness or a limit, is told by what it takes alone.
     """
     unknowns, share = fit.hypothesis.unknowns, fit.hypothesis.share(place)
     own = range(share.start, share.stop)
-    deviations = np.sqrt(np.maximum(np.diag(spread), 0.0))
+    deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     if any(unknowns[i].key in POSITIVE and SETTINGS.intervals.z95 * deviations[i] >= 1.0 for i in own):
         return False
     sizes = [i for i in own if unknowns[i].size != 0.0 and unknowns[i].low <= 0.0 and unknowns[i].key not in WHERE]
-    return not sizes or not within(fit.coordinates[sizes], spread[np.ix_(sizes, sizes)])
+    return not sizes or not within(fit.coordinates[sizes], covariance[np.ix_(sizes, sizes)])
