@@ -34,8 +34,8 @@ def diagnosis_document(diagnosis: Diagnosis) -> Document:
     found["recalibrated"] = _recalibrated(evidence.recalibrated) if evidence else {}
     found["minor"] = {name: _minor(one) for name, one in evidence.minor.items()} if evidence else {}
     found["fit"] = _fit(diagnosis, evidence) if evidence else {}
-    if evidence is not None and evidence.unnamed is not None:
-        left = evidence.unnamed
+    if evidence is not None and evidence.residual is not None:
+        left = evidence.residual
         table = {"grid": left.grid.tolist(), "torque": left.torque.tolist()}
         found["unexplained"] = {"coordinate": left.coordinate, "share": left.share, **table}
     if evidence is not None:
@@ -54,18 +54,20 @@ def summary(diagnosis: Diagnosis) -> str:
     if evidence is None:
         reasons = "; ".join(f"{r.name}: {r.reason}" for r in diagnosis.refused)
         return f"These data cannot tell: {reasons}."
-    cut = cut_short(evidence.search.starts_tried) if evidence.search.cut_by_time else ""
-    return " ".join(part for part in (_found(diagnosis, evidence), cut, differs(evidence.recalibrated)) if part)
+    cut = describe_cut(evidence.search.starts_tried) if evidence.search.cut_by_time else ""
+    return " ".join(
+        part for part in (_found(diagnosis, evidence), cut, describe_changes(evidence.recalibrated)) if part
+    )
 
 
-def cut_short(tried: int) -> str:
+def describe_cut(tried: int) -> str:
     """That time ended the search while something was left, after so many starts of effects."""
     if tried == 0:
         return "The time limit was over before any physics was tried: give more time (--time-limit)."
     return f"The time limit ended the search after {tried} starts: with more time (--time-limit) the answer may change."
 
 
-def differs(changes: Mapping[str, FittedValue]) -> str:
+def describe_changes(changes: Mapping[str, FittedValue]) -> str:
     """What was recalibrated, as a sentence about these recordings; empty where nothing was."""
     said = []
     for name, change in changes.items():
@@ -103,9 +105,9 @@ def _too_little(diagnosis: Diagnosis, evidence: Evidence) -> str:
 def _finding(found: NamedEffect, force: str) -> Document:
     what = effect(found.effect)
     statement = (
-        f"{what.statement}. It carries {100.0 * found.carries:.0f} % of the explainable mismatch and "
+        f"{what.statement}. It carries {100.0 * found.removed_share:.0f} % of the explainable mismatch and "
         f"{100.0 * found.torque:.1f} % of dry friction where it acts. It shows as {what.shows}; it is strongest "
-        f"{where(found.effect, found.located)}."
+        f"{describe_place(found.effect, found.located)}."
     )
     return {
         "effect": found.effect,
@@ -207,7 +209,7 @@ _SAID = {
 }
 
 
-def where(effect: str, located: Mapping[str, Any]) -> str:
+def describe_place(effect: str, located: Mapping[str, Any]) -> str:
     """Where the effect is strongest, as the end of a sentence: its own coordinate, and recording and time."""
     said = []
     coordinate = look(effect).coordinate
@@ -215,8 +217,8 @@ def where(effect: str, located: Mapping[str, Any]) -> str:
     if found is not None and coordinate in _SAID:
         ends = {"low": f"{found['from']:.3g}", "high": f"{found['to']:.3g}", "unit": found["unit"]}
         said.append(_SAID[coordinate].format(**ends))
-    carries: Mapping[str, float] = located["recordings"]
-    most = max(carries, key=lambda name: carries[name])
+    shares: Mapping[str, float] = located["recordings"]
+    most = max(shares, key=lambda name: shares[name])
     window = next((w for w in located["time_windows"] if w["recording"] == most), None)
     if window is not None:
         said.append(f"in {most} from {window['start_s']:.2f} to {window['end_s']:.2f} s")
@@ -263,7 +265,7 @@ def verdict_sentence(document: Document) -> str:
     return str(document["summary"])
 
 
-def certainty(finding: Document) -> list[str]:
+def describe_certainty(finding: Document) -> list[str]:
     """How sure a finding is, and what it cannot be told apart from."""
     name = finding["effect"].replace("_", " ")
     lines = [f"How sure that it is {name}: {100.0 * finding['confidence']:.0f} %."]
@@ -275,7 +277,7 @@ def certainty(finding: Document) -> list[str]:
     return lines
 
 
-def remains(document: Document) -> str:
+def describe_rest(document: Document) -> str:
     """What is left, and where it lives."""
     fit, left = document["fit"], [m for m in document["remaining"] if m["chance"] < 1e-3 and m["share"] > 0.01]
     times = fit["held_out"]["after"] / max(fit["noise_floor"], 1e-30)

@@ -29,7 +29,7 @@ class Verdict(StrEnum):
     CANNOT_TELL = "cannot_tell"
 
 
-class Kept(StrEnum):
+class MinorReason(StrEnum):
     """Why a term that stays in the model is no finding."""
 
     LEVEL = "below the level from which its effect counts"
@@ -90,7 +90,7 @@ class Map:
 
 
 @dataclass(frozen=True)
-class Unnamed:
+class ResidualTable:
     """What fits no known physics: a resisting torque over one coordinate, and the share it takes of unseen rows."""
 
     coordinate: str
@@ -136,9 +136,9 @@ class Signature:
 class NamedEffect:
     """One effect that is named, with all its terms.
 
-    `carries` is the share of the explainable error that it removes on unseen rows, `torque` its size as a share of dry
-    friction where it acts. `without` and `after` are the errors on unseen rows without and with it. `alternatives` are
-    effects that these data cannot tell it from; `located` says where it acts, by recording, time and coordinate.
+    `removed_share` is the part of the explainable error that it removes on unseen rows, `torque` its size as a share of
+    dry friction where it acts. `without` and `after` are the errors on unseen rows without and with it. `alternatives`
+    are effects that these data cannot tell it from; `located` says where it acts, by recording, time and coordinate.
     """
 
     effect: str
@@ -147,7 +147,7 @@ class NamedEffect:
     confidence: float
     alternatives: tuple[str, ...]
     located: Mapping[str, Any]
-    carries: float
+    removed_share: float
     torque: float
     without: float
     after: float
@@ -163,7 +163,7 @@ class Minor:
 
     torque: float
     share: float
-    why: Kept | None = None
+    why: MinorReason | None = None
     parameters: Mapping[str, FittedValue] | None = None
 
 
@@ -262,7 +262,7 @@ class Evidence:
     findings: tuple[NamedEffect, ...]
     recalibrated: Mapping[str, FittedValue]
     minor: Mapping[str, Minor]
-    unnamed: Unnamed | None
+    residual: ResidualTable | None
     model: AxisModel
     quality: Quality
     maps_before: tuple[Map, ...]
@@ -276,7 +276,7 @@ class Evidence:
     @property
     def left_out(self) -> str | None:
         """What was left out of the fits in turn; None where what has no name was fitted to everything."""
-        return self.quality.left_out if self.unnamed is None else None
+        return self.quality.left_out if self.residual is None else None
 
 
 @dataclass(frozen=True)

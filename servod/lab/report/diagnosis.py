@@ -15,13 +15,13 @@ from servod.formats.model.axis_model import axis_model_yaml
 from servod.lab.diagnose.document import (
     MATHEMATICS,
     REMEDIES,
-    certainty,
+    describe_certainty,
+    describe_rest,
     diagnosis_document,
     next_experiments,
-    remains,
     verdict_sentence,
 )
-from servod.lab.diagnose.explain import explained
+from servod.lab.diagnose.explain import explain_effect
 from servod.lab.diagnose.result import Diagnosis, Evidence, Units
 from servod.lab.report.figure import Figure
 from servod.lab.report.figures import mismatch as figures
@@ -72,7 +72,7 @@ def _answer(page: Page, document: Document) -> None:
     """Verdict, what was left out, how sure: everything that fits into a few sentences."""
     page.lead(verdict_sentence(document))
     page.points([f["statement"] for f in document["findings"]])
-    page.points([line for f in document["findings"] for line in certainty(f)])
+    page.points([line for f in document["findings"] for line in describe_certainty(f)])
 
 
 def _where(report: Report, evidence: Evidence, units: Units) -> None:
@@ -95,16 +95,16 @@ def _what(report: Report, evidence: Evidence, document: Document, units: Units) 
         for one in found.signatures:
             report.figure(signature_figure(one, found.effect, units))
         _parameters(report.page, finding["parameters"])
-        report.page.points(certainty(finding))
-        known = explained(finding["effect"])
+        report.page.points(describe_certainty(finding))
+        known = explain_effect(finding["effect"])
         keys = [f"{key['key']}: {key['meaning']} ({key['range']})" for key in known["keys"]]
         report.page.folded(
             "The mathematics of this finding",
             [f"Equation: {known['equation']}.", f"Source: {known['source']}.", "Keys in the axis model file:", *keys],
         )
-    if evidence.unnamed is not None:
+    if evidence.residual is not None:
         report.page.heading("What is left has no name")
-        report.figure(table_figure(evidence.unnamed, units))
+        report.figure(table_figure(evidence.residual, units))
     _recalibrated(report.page, document)
 
 
@@ -169,7 +169,7 @@ def _fit(report: Report, evidence: Evidence, document: Document, units: Units) -
 
 def _remains(report: Report, evidence: Evidence, document: Document, units: Units) -> None:
     report.page.heading("What remains")
-    report.page.sentence(remains(document))
+    report.page.sentence(describe_rest(document))
     report.figure(figures.map_grid(evidence.maps_before, evidence.maps_after, units))
     report.figure(figures.spectrum(evidence.quality.spectrum_before, evidence.quality.spectrum_after, units))
     if evidence.quality.windows:

@@ -10,7 +10,7 @@ from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.base import base_unknowns, document_of
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
 from servod.lab.diagnose.effects.scene import Scene
-from servod.lab.diagnose.judge.spread import common_factor, jackknife, model_error
+from servod.lab.diagnose.judge.covariance import common_factor, jackknife, model_error
 from servod.lab.diagnose.predict.innovation_kernel import mean_command
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.fit import Fit

@@ -14,7 +14,7 @@ from servod.lab.diagnose.effects import NAMES, effect
 from servod.lab.diagnose.effects.base import base_unknowns, document_of
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
 from servod.lab.diagnose.effects.scene import Scene
-from servod.lab.diagnose.explain import explained
+from servod.lab.diagnose.explain import explain_effect
 from servod.lab.diagnose.predict.predict import Predictor
 from tests.lab.diagnose.axes import believed, record
 
@@ -46,7 +46,7 @@ def test_starts_are_models(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_explained(name: str) -> None:
-    found = explained(name)
+    found = explain_effect(name)
     assert found["keys"]
     assert all(found[key] for key in ("statement", "equation", "source", "shows", "experiment"))
     assert set(found["confused_with"]) <= set(NAMES)

@@ -17,10 +17,10 @@ from servod.lab.diagnose.judge.conclude import minor
 from servod.lab.diagnose.judge.findings import differs_from_zero, name_findings
 from servod.lab.diagnose.judge.judgement import Judgement, judge
 from servod.lab.diagnose.predict.predict import Predictor
-from servod.lab.diagnose.result import Kept
+from servod.lab.diagnose.result import MinorReason
 from servod.lab.diagnose.select.cross_validation import cross_validate
 from servod.lab.diagnose.select.fit import Fit
-from servod.lab.diagnose.select.merit import Merit, of_size
+from servod.lab.diagnose.select.merit import Merit, large_enough
 from servod.lab.diagnose.select.selection import Entry, Selection
 from servod.lab.diagnose.select.selector import Selector
 from tests.lab.diagnose.axes import believed, record
@@ -64,7 +64,7 @@ def test_what_is_small_or_under_its_level_stays_in_the_model_and_is_told(selecto
     terms = [form(selector, name) for name in ("gravity", "torque_gain", "viscous_nonlinear")]
     judgement = sorted_with(selector, *terms)
     assert judgement.named == (0,)
-    assert judgement.kept == {1: Kept.LEVEL, 2: Kept.SMALL}
+    assert judgement.kept == {1: MinorReason.LEVEL, 2: MinorReason.SMALL}
     told = minor(judgement)
     assert list(told) == ["viscous_nonlinear", "torque_gain"]
     parameters = told["torque_gain"].parameters
@@ -78,8 +78,8 @@ def test_what_ends_at_the_end_of_a_range_is_no_finding(selector: Selector) -> No
     narrow = replace(form(selector, "gravity"), unknowns=(replace(sine, low=-0.03, high=0.03), cosine))
     judgement = sorted_with(selector, narrow)
     assert judgement.named == ()
-    assert judgement.kept == {0: Kept.AT_END}
-    assert minor(judgement)["gravity"].why is Kept.AT_END
+    assert judgement.kept == {0: MinorReason.AT_END}
+    assert minor(judgement)["gravity"].why is MinorReason.AT_END
 
 
 @pytest.mark.parametrize(("deviation", "told"), [(0.4, True), (0.6, False)])
@@ -99,4 +99,4 @@ def test_a_stiffness_whose_interval_holds_zero_is_not_differs_from_zero(
     ("share", "torque", "worth"), [(0.04, 0.028, False), (0.01, 0.029, False), (0.05, 0.02, True), (0.0, 0.03, True)]
 )
 def test_a_finding_has_the_contracts_size(share: float, torque: float, worth: bool) -> None:
-    assert of_size(Merit(share, 0.5, torque, 1e4), level=False) is worth
+    assert large_enough(Merit(share, 0.5, torque, 1e4), level=False) is worth

@@ -12,7 +12,7 @@ from servod.lab.diagnose.effects.hypothesis import Document, Hypothesis
 from servod.lab.diagnose.effects.scene import Scene
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.fit import Fit
-from servod.lab.diagnose.select.levels import is_level, on_bound
+from servod.lab.diagnose.select.levels import is_level_change, on_bound
 from tests.lab.diagnose.axes import believed, record
 
 
@@ -49,9 +49,9 @@ def scene() -> Scene:
 def test_levels_are_what_opens_the_models_own(scene: Scene) -> None:
     for name in ("stribeck", "presliding", "torque_offset", "inertia"):
         terms = effect(name).terms(scene)
-        assert all(is_level(term) is (term.form != "fading damping") for term in terms) and len(terms) > 0
+        assert all(is_level_change(term) is (term.form != "fading damping") for term in terms) and len(terms) > 0
     for name in ("cogging", "delay", "actuator_lag", "viscous_nonlinear"):
-        assert not any(is_level(term) for term in effect(name).terms(scene))
+        assert not any(is_level_change(term) for term in effect(name).terms(scene))
 
 
 @pytest.mark.parametrize("name", ["stribeck", "presliding", "torque_offset", "inertia"])

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from servod.formats.model.axis_model import AxisModel, load_axis_model
-from servod.lab.diagnose.data.excited import DIRECTED, SWIFT, unexcited_effects
+from servod.lab.diagnose.data.excitation import DIRECTED, SWIFT, unexcited_effects
 from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.data.trace import Trace
 from servod.lab.diagnose.effects import effect

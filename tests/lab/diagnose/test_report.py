@@ -13,7 +13,7 @@ import pytest
 from servod.cli.app import run
 from servod.formats.model.axis_model import AxisKind, axis_model_yaml, load_axis_model
 from servod.lab.diagnose.data.intake import load_traces
-from servod.lab.diagnose.document import where
+from servod.lab.diagnose.document import describe_place
 from servod.lab.diagnose.effects.looks import LOOKS
 from servod.lab.diagnose.engine import diagnose
 from servod.lab.diagnose.judge.locate import maps
@@ -158,7 +158,7 @@ def test_every_look_can_be_said() -> None:
         key = look.coordinate.replace(" ", "_")
         located = {"recordings": {"a.csv": 1.0}, "time_windows": [], key: {"from": 0.0, "to": 1.0, "unit": "rad"}}
         located["time_windows"] = [{"recording": "a.csv", "start_s": 1.0, "end_s": 2.0}]
-        assert where(effect, located).endswith("in a.csv from 1.00 to 2.00 s")
+        assert describe_place(effect, located).endswith("in a.csv from 1.00 to 2.00 s")
 
 
 def test_maps_tell_a_curve_from_a_constant() -> None:

@@ -19,8 +19,8 @@ from servod.lab.diagnose.judge.verdict import Shares, alternatives, verdict
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.result import Verdict
 from servod.lab.diagnose.select.fit import Fit
-from servod.lab.diagnose.select.levels import at_end, named_terms
-from servod.lab.diagnose.select.merit import Merit, acting, worth_naming
+from servod.lab.diagnose.select.levels import at_end_of_range, named_terms
+from servod.lab.diagnose.select.merit import Merit, acting_torque, worth_naming
 from servod.lab.diagnose.select.selection import Entry, Selection
 from servod.lab.diagnose.settings import SETTINGS
 from tests.lab.diagnose.axes import believed, record
@@ -44,11 +44,11 @@ def with_ripple(scene: Scene, amplitude: float) -> Fit:
 
 def test_torque_is_judged_where_it_acts() -> None:
     t = np.linspace(0.0, 50.0, 20_001)
-    assert acting(0.01 * np.abs(np.sin(t))) < SETTINGS.worth.least_torque
+    assert acting_torque(0.01 * np.abs(np.sin(t))) < SETTINGS.worth.least_torque
     blows = np.where(t % 5.0 < 0.04, 0.03, 0.0)
     assert np.quantile(blows, 0.98) == 0.0
-    assert acting(blows) == pytest.approx(0.03)
-    assert acting(np.zeros(3)) == 0.0
+    assert acting_torque(blows) == pytest.approx(0.03)
+    assert acting_torque(np.zeros(3)) == 0.0
 
 
 def test_ripple_that_every_motor_has_is_no_finding(scene: Scene) -> None:
@@ -93,7 +93,7 @@ def test_a_number_at_an_end_of_its_range_is_somebody_elses(scene: Scene) -> None
         unknown = hypothesis.unknowns[place]
         coordinates = hypothesis.start.copy()
         coordinates[place] = unknown.coordinate(at * 0.02 if hypothesis is mass else at)
-        assert at_end(Fit(hypothesis, coordinates, scene.mismatch, 0.0, np.zeros((0, 0)), True)) is answer
+        assert at_end_of_range(Fit(hypothesis, coordinates, scene.mismatch, 0.0, np.zeros((0, 0)), True)) is answer
 
 
 def test_a_bristle_may_have_no_damping_and_must_have_a_stiffness(scene: Scene) -> None:
@@ -105,7 +105,7 @@ def test_a_bristle_may_have_no_damping_and_must_have_a_stiffness(scene: Scene) -
     for place, answer in ((0, True), (1, False)):
         coordinates = hypothesis.start.copy()
         coordinates[hypothesis.share(0).start + place] = term.unknowns[place].coordinate(term.unknowns[place].low)
-        assert at_end(Fit(hypothesis, coordinates, scene.mismatch, 0.0, np.zeros((0, 0)), True)) is answer
+        assert at_end_of_range(Fit(hypothesis, coordinates, scene.mismatch, 0.0, np.zeros((0, 0)), True)) is answer
 
 
 def test_a_window_is_found_where_it_begins_and_ends() -> None:

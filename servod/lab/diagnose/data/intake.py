@@ -45,7 +45,7 @@ class Factor:
         return abs(self.value) > SETTINGS.intake.certain_errors * self.error
 
 
-def implausible(trace: Trace, model: AxisModel) -> str | None:
+def wrong_sign_or_unit(trace: Trace, model: AxisModel) -> str | None:
     """A sign or a unit that cannot be, in one line; None when nothing speaks against the recording."""
     moved, dry, understood = factors(trace, model)
     if understood < SETTINGS.intake.understood:
@@ -105,8 +105,8 @@ def load_traces(recordings: Sequence[Recording], model: AxisModel) -> tuple[list
         name = recording.path.name
         if any(other.path.name == name for other in recordings[:index]):
             name = f"{recording.path.parent.name}/{name}"
-        trace = trace_of(recording, name, index * SETTINGS.intake.apart_s)
-        reason = cannot_tell(trace, model)
+        trace = make_trace(recording, name, index * SETTINGS.intake.apart_s)
+        reason = refusal_reason(trace, model)
         if reason is None:
             traces.append(trace)
         else:
@@ -114,24 +114,27 @@ def load_traces(recordings: Sequence[Recording], model: AxisModel) -> tuple[list
     return traces, refused
 
 
-def trace_of(recording: Recording, name: str, shift_s: float) -> Trace:
+def make_trace(recording: Recording, name: str, shift_s: float) -> Trace:
     """The recording with glitches repaired, on a time of its own."""
-    notes = [_shortened(note) for note in recording.report]
+    notes = [_shorten_note(note) for note in recording.report]
     drive = recording.drive
     counts = recording.measured.copy()
-    position = _unwrapped(drive.position, notes)
+    position = _unwrap(drive.position, notes)
     position, torque = (
-        _repaired(values, what, counts, notes) for values, what in ((position, "position"), (drive.torque, "command"))
+        _remove_glitches(values, what, counts, notes)
+        for values, what in ((position, "position"), (drive.torque, "command"))
     )
-    _tell_saturation(torque, notes)
+    _note_saturation(torque, notes)
     t_s = drive.t_s - drive.t_s[0] + shift_s
     warm = recording.get(Quantity.TEMPERATURE)
-    has_temperature = warm is not None and bool(np.isfinite(drive.temperature_c).all()) and _warms(drive.temperature_c)
+    has_temperature = (
+        warm is not None and bool(np.isfinite(drive.temperature_c).all()) and _temperature_changes(drive.temperature_c)
+    )
     moved = Drive(t_s, torque, position, drive.temperature_c)
     return Trace(name, moved, counts, tuple(notes), has_temperature, shift_s - float(drive.t_s[0]), shift_s)
 
 
-def _shortened(note: str) -> str:
+def _shorten_note(note: str) -> str:
     """A note whose list of names is cut."""
     head, colon, names = note.partition(": ")
     told = names.split(", ")
@@ -141,12 +144,12 @@ def _shortened(note: str) -> str:
     return f"{head}{colon}{', '.join(told[:most])} and {len(told) - most} more"
 
 
-def _warms(temperature_c: Array) -> bool:
+def _temperature_changes(temperature_c: Array) -> bool:
     """Whether the temperature changes by more than its noise."""
     return float(np.ptp(temperature_c)) > 10.0 * noise_rms(temperature_c) or float(np.ptp(temperature_c)) > 1.0
 
 
-def _unwrapped(position: Array, notes: list[str]) -> Array:
+def _unwrap(position: Array, notes: list[str]) -> Array:
     """The position without jumps of a whole turn."""
     jumps = np.abs(np.diff(position)) > 0.9 * 2.0 * math.pi
     back = np.abs(np.abs(np.diff(position)) - 2.0 * math.pi) < 0.5
@@ -156,13 +159,13 @@ def _unwrapped(position: Array, notes: list[str]) -> Array:
     return np.unwrap(position)
 
 
-def _repaired(values: Array, what: str, counts: Rows, notes: list[str]) -> Array:
+def _remove_glitches(values: Array, what: str, counts: Rows, notes: list[str]) -> Array:
     """Single rows that leave both neighbours and come back are replaced by the line between these.
 
     A position that was replaced is no measurement and does not count; its neighbours do. The row of a command counts:
     nobody knows whether the drive obeyed it. If it did, a few rows mismatch, which the fit counts by distance only.
     """
-    bad = glitches(values)
+    bad = find_glitches(values)
     if not bad.any():
         return values
     kept = np.flatnonzero(~bad)
@@ -172,7 +175,7 @@ def _repaired(values: Array, what: str, counts: Rows, notes: list[str]) -> Array
     return np.interp(np.arange(len(values)), kept, values[kept])
 
 
-def glitches(values: Array) -> Rows:
+def find_glitches(values: Array) -> Rows:
     """Rows that leave the median of their neighbourhood far and alone."""
     from scipy.ndimage import median_filter
 
@@ -190,19 +193,19 @@ def _at_limit(torque: Array) -> float:
     return float(np.mean(np.abs(torque) >= most * (1.0 - 1e-9))) if most > 0.0 else 0.0
 
 
-def _tell_saturation(torque: Array, notes: list[str]) -> None:
+def _note_saturation(torque: Array, notes: list[str]) -> None:
     share = _at_limit(torque)
     if share > SETTINGS.intake.noted_saturated:
         notes.append(f"command: at its limit in {100.0 * share:.0f} % of the rows")
 
 
-def cannot_tell(trace: Trace, model: AxisModel) -> str | None:
+def refusal_reason(trace: Trace, model: AxisModel) -> str | None:
     """Why this recording cannot tell anything about this model; None when it can."""
     return (
         _too_coarse(trace)
         or _too_short(trace)
         or _never_changes(trace)
-        or implausible(trace, model)
+        or wrong_sign_or_unit(trace, model)
         or _too_noisy(trace, model)
         or _too_still(trace)
         or _saturated(trace)

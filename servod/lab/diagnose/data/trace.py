@@ -66,7 +66,7 @@ class Trace:
         """Median time between rows."""
         return self.drive.period_s
 
-    def first(self, delay_s: float) -> FirstRow:
+    def first_row(self, delay_s: float) -> FirstRow:
         """How the motion begins under a command that acts `delay_s` late."""
         known = self._first.get(delay_s)
         if known is None:

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from servod.formats.model.axis_model import AxisModel
 from servod.lab.diagnose.effects.disturbance import EVERY
 from servod.lab.diagnose.effects.hypothesis import Document, Reported
+from servod.lab.diagnose.judge.covariance import inside_region
 from servod.lab.diagnose.judge.curves import course, signature, spectrum
 from servod.lab.diagnose.judge.free_run import window_errors, windows
 from servod.lab.diagnose.judge.judgement import Judgement
-from servod.lab.diagnose.judge.locate import bands, places
-from servod.lab.diagnose.judge.spread import within
+from servod.lab.diagnose.judge.locate import bands, locate
 from servod.lab.diagnose.judge.verdict import alternatives, confidence
 from servod.lab.diagnose.predict.floor import trace_floor
 from servod.lab.diagnose.result import (
@@ -46,7 +46,7 @@ def conclude(judgement: Judgement, model: AxisModel, free: tuple[Windows, ...]) 
         findings=findings(judgement),
         recalibrated=recalibrated(judgement),
         minor=minor(judgement),
-        unnamed=judgement.unnamed,
+        residual=judgement.residual,
         model=model,
         quality=_quality(judgement, free),
         maps_before=tuple(judgement.maps_before),
@@ -75,8 +75,8 @@ def _finding(judgement: Judgement, name: str, named: Sequence[int]) -> NamedEffe
         parameters=parameters(judgement, named),
         confidence=min(confidence(selection, place, judgement.errors.removed) for place in named),
         alternatives=tuple(alternatives(selection, first)),
-        located=places(judgement.predictor, contribution, judgement.predictor.dry),
-        carries=judgement.carries(first),
+        located=locate(judgement.predictor, contribution, judgement.predictor.dry),
+        removed_share=judgement.removed_share(first),
         torque=selection.merits[first].torque,
         without=judgement.validation.without[first].rms,
         after=judgement.validation.after.rms,
@@ -161,7 +161,7 @@ def extended_model(judgement: Judgement, nominal: AxisModel) -> AxisModel:
             start, length, torque = values[fit.hypothesis.share(place)]
             rows = document.setdefault("disturbance", {}).setdefault("windows", [])
             rows.append({"start_s": start, "end_s": start + length, "torque": torque})
-    left = judgement.unnamed
+    left = judgement.residual
     if left is not None:
         table = {"grid": left.grid.tolist(), "torque": left.torque.tolist()}
         document.setdefault("residual", {})[left.coordinate] = table
@@ -178,18 +178,18 @@ def _model_coordinates(judgement: Judgement) -> Array:
     together lie in the region of 95 % around the fit; beyond it, the fit.
     """
     fit = judgement.fit
-    if fit.hypothesis.terms or judgement.unnamed is not None:
+    if fit.hypothesis.terms or judgement.residual is not None:
         return fit.coordinates
     changed = recalibrated(judgement)
     moved = [unknown.key in changed for unknown in fit.hypothesis.base]
     back = np.where(moved, 0.0, fit.coordinates - fit.hypothesis.start)
-    return fit.coordinates - back if within(back, judgement.covariance) else fit.coordinates
+    return fit.coordinates - back if inside_region(back, judgement.covariance) else fit.coordinates
 
 
 def free_windows(judgement: Judgement, nominal: AxisModel, model: AxisModel) -> tuple[Windows, ...]:
     """Errors of free windows. What has no name is a table over everything, so that its rows have been seen."""
     predictor, after = judgement.predictor, judgement.validation.after.folds
-    if judgement.unnamed is not None:
+    if judgement.residual is not None:
         after = (Fold(np.ones(len(predictor.counts), dtype=bool), (model,)),)
     errors = window_errors(predictor, nominal, judgement.validation.before.folds, after)
     return windows(errors, predictor, judgement.validation.folds.judged)
@@ -208,7 +208,7 @@ def _quality(judgement: Judgement, free: tuple[Windows, ...]) -> Quality:
         after=judgement.validation.after.rms,
         noise_floor=judgement.unseen.floor,
         removed=judgement.unseen.removed,
-        removed_by_known=judgement.attempt,
+        removed_by_known=judgement.removed_by_known,
         left_out=shared.left_out,
         not_judged_s=seconds,
         windows=free,

@@ -76,7 +76,7 @@ def common_factor(fit: Fit) -> Array:
     return np.asarray(np.outer(along, along) / max(known, 1e-12))
 
 
-def within(off: Array, spread: Array) -> bool:
+def inside_region(off: Array, spread: Array) -> bool:
     """Whether coordinates that are off by so much lie in the region of 95 % of this covariance."""
     from scipy.stats import chi2
 

@@ -15,12 +15,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from servod.lab.diagnose.judge.covariance import inside_region
 from servod.lab.diagnose.judge.judgement import Judgement
-from servod.lab.diagnose.judge.spread import within
-from servod.lab.diagnose.result import Kept
+from servod.lab.diagnose.result import MinorReason
 from servod.lab.diagnose.select.fit import Fit
-from servod.lab.diagnose.select.levels import at_end, is_level, lesser_twin
-from servod.lab.diagnose.select.merit import of_size
+from servod.lab.diagnose.select.levels import at_end_of_range, is_level_change, shorter_twin
+from servod.lab.diagnose.select.merit import large_enough
 from servod.lab.diagnose.select.refine import DRIFT, power_of_means
 from servod.lab.diagnose.select.selector import Selector
 from servod.lab.diagnose.settings import SETTINGS
@@ -44,38 +44,38 @@ def name_findings(selector: Selector, judgement: Judgement) -> Judgement:
         merit = selector.merit(selection, judgement.validation.reduced[place], fit)
         selection = selection.with_merit(place, merit)
     judgement = replace(judgement, selection=selection)
-    why = {place: _why(judgement, place) for place in judgement.named}
+    why = {place: _reason(judgement, place) for place in judgement.named}
     names = {fit.hypothesis.terms[place].effect for place, reason in why.items() if reason is None}
     named = tuple(place for place in judgement.named if fit.hypothesis.terms[place].effect in names)
     kept = {place: reason for place, reason in why.items() if reason is not None and place not in named}
     return replace(judgement, named=named, kept=kept | _under_level(judgement))
 
 
-def _under_level(judgement: Judgement) -> dict[int, Kept]:
+def _under_level(judgement: Judgement) -> dict[int, MinorReason]:
     """Terms with numbers of their own that are under their level; what only opens the model's own is recalibrated."""
-    twin = lesser_twin(judgement.fit)
+    twin = shorter_twin(judgement.fit)
     terms = enumerate(judgement.fit.hypothesis.terms)
     return {
-        place: Kept.TWIN if term.effect == twin else Kept.LEVEL
+        place: MinorReason.TWIN if term.effect == twin else MinorReason.LEVEL
         for place, term in terms
         if place not in judgement.named and term.unknowns
     }
 
 
-def _why(judgement: Judgement, place: int) -> Kept | None:
+def _reason(judgement: Judgement, place: int) -> MinorReason | None:
     """Why a term is no finding; None if it is one."""
     fit = judgement.fit
     merit = replace(judgement.selection.merits[place], share=_share(judgement, place))
-    if not of_size(merit, is_level(fit.hypothesis.terms[place])):
-        return Kept.SMALL
-    if at_end(fit, place):
-        return Kept.AT_END
-    return None if differs_from_zero(fit, place, judgement.covariance) else Kept.UNSURE
+    if not large_enough(merit, is_level_change(fit.hypothesis.terms[place])):
+        return MinorReason.SMALL
+    if at_end_of_range(fit, place):
+        return MinorReason.AT_END
+    return None if differs_from_zero(fit, place, judgement.covariance) else MinorReason.UNSURE
 
 
 def _share(judgement: Judgement, place: int) -> float:
     """The share of the explainable error on unseen rows that a term takes, where it shows."""
-    rows = judgement.carries(place)
+    rows = judgement.removed_share(place)
     if judgement.fit.hypothesis.terms[place].effect != DRIFT[0]:
         return rows
     validation = judgement.validation
@@ -95,4 +95,4 @@ def differs_from_zero(fit: Fit, place: int, covariance: Array) -> bool:
     if any(unknowns[i].key in POSITIVE and SETTINGS.intervals.z95 * deviations[i] >= 1.0 for i in own):
         return False
     sizes = [i for i in own if unknowns[i].size != 0.0 and unknowns[i].low <= 0.0 and unknowns[i].key not in WHERE]
-    return not sizes or not within(fit.coordinates[sizes], covariance[np.ix_(sizes, sizes)])
+    return not sizes or not inside_region(fit.coordinates[sizes], covariance[np.ix_(sizes, sizes)])

@@ -12,14 +12,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from servod.lab.diagnose.judge.covariance import total_covariance
 from servod.lab.diagnose.judge.free_run import free_run_gain
 from servod.lab.diagnose.judge.locate import maps
-from servod.lab.diagnose.judge.spread import total_covariance
-from servod.lab.diagnose.judge.unnamed import unnamed
+from servod.lab.diagnose.judge.residual_table import residual_table
 from servod.lab.diagnose.judge.verdict import Shares, shares
 from servod.lab.diagnose.predict.predict import Predictor
-from servod.lab.diagnose.result import Kept, Map, Unnamed
-from servod.lab.diagnose.select.cross_validation import held_out, single_events, split
+from servod.lab.diagnose.result import Map, MinorReason, ResidualTable
+from servod.lab.diagnose.select.cross_validation import make_folds, predict_held_out, single_events
 from servod.lab.diagnose.select.fit import Fit, Weighing
 from servod.lab.diagnose.select.selection import CrossValidation, Selection
 from servod.lab.diagnose.select.selector import Selector
@@ -33,8 +33,9 @@ class Judgement:
     """Everything that was judged of a selection, on recordings that can tell.
 
     `named` are places of terms in the fit; `errors` are those of the fits to everything, by which names are judged,
-    `unseen` those on rows that the fits have not seen. `attempt` is the share of the explainable error that known
-    physics removes there, also where its names may not stand. `kept` says of terms in the fit why they are no findings.
+    `unseen` those on rows that the fits have not seen. `removed_by_known` is the share of the explainable error that
+    known physics removes there, also where its names may not stand. `kept` says of terms in the fit why they are no
+    findings.
     """
 
     predictor: Predictor
@@ -43,19 +44,19 @@ class Judgement:
     named: tuple[int, ...]
     errors: Shares
     unseen: Shares
-    attempt: float
+    removed_by_known: float
     covariance: Array
-    unnamed: Unnamed | None
+    residual: ResidualTable | None
     maps_before: list[Map]
     maps_after: list[Map]
-    kept: Mapping[int, Kept] = field(default_factory=dict)
+    kept: Mapping[int, MinorReason] = field(default_factory=dict)
 
     @property
     def fit(self) -> Fit:
         """The fit that stands."""
         return self.selection.fit
 
-    def carries(self, place: int) -> float:
+    def removed_share(self, place: int) -> float:
         """The share of the explainable error on unseen rows that a named term removes."""
         unseen = self.unseen
         without = float(np.mean(self.validation.without[place].mismatch[self.predictor.counts] ** 2))
@@ -79,9 +80,9 @@ def judge(selector: Selector, selection: Selection) -> Judgement:
         named=validation.named,
         errors=seen,
         unseen=unseen,
-        attempt=unseen.removed,
+        removed_by_known=unseen.removed,
         covariance=total_covariance(fit, weighing, predictor.traces[0].period_s, validation.after),
-        unnamed=None,
+        residual=None,
         maps_before=maps(predictor, base.mismatch),
         maps_after=maps(predictor, fit.mismatch),
     )
@@ -103,14 +104,14 @@ def predicts_nothing(judgement: Judgement) -> bool:
 def without_names(judgement: Judgement) -> Judgement:
     """The judgement when no name may stand: the base, and a table of what is left without a name."""
     predictor, base, floor = judgement.predictor, judgement.selection.base, judgement.selection.floor
-    left = unnamed(predictor, base.mismatch)
+    left = residual_table(predictor, base.mismatch)
     size = len(base.coordinates)
-    folds = split(predictor, base)
-    before = held_out(predictor, base, folds)
+    folds = make_folds(predictor, base)
+    before = predict_held_out(predictor, base, folds)
     errors, unseen = (shares((rows, rows), predictor.counts, floor) for rows in (base.mismatch, before.mismatch))
     validation = CrossValidation((), {}, folds, before, before, {})
     bare = replace(judgement.selection, fit=base, merits=(), entries=(), validation=validation)
     return replace(
         judgement, selection=bare, validation=validation, named=(), kept={}, errors=errors, unseen=unseen,
-        covariance=judgement.covariance[:size, :size], unnamed=left, maps_after=judgement.maps_before,
+        covariance=judgement.covariance[:size, :size], residual=left, maps_after=judgement.maps_before,
     )  # fmt: skip

@@ -32,11 +32,11 @@ def maps(predictor: Predictor, mismatch: Array) -> list[Map]:
         for name, (unit, values) in coordinates(predictor).items()
         if int(np.sum(predictor.counts & np.isfinite(values))) >= 2 * SETTINGS.maps.least_in_bin
     ]
-    found.append(modulo_period(predictor, mismatch, memory))
-    return [*sorted(found, key=lambda m: -m.share), everywhere(predictor, mismatch, memory)]
+    found.append(map_modulo_period(predictor, mismatch, memory))
+    return [*sorted(found, key=lambda m: -m.share), constant_part(predictor, mismatch, memory)]
 
 
-def everywhere(predictor: Predictor, mismatch: Array, memory: int) -> Map:
+def constant_part(predictor: Predictor, mismatch: Array, memory: int) -> Map:
     """The part of the mismatch that is the same in all rows, as a map of one bin."""
     from scipy.stats import f as fisher
 
@@ -57,7 +57,7 @@ def _map(
     return Map(name, unit, middles[full], mean[full], error[full], len(rows), share, chance)
 
 
-def modulo_period(predictor: Predictor, mismatch: Array, memory: int) -> Map:
+def map_modulo_period(predictor: Predictor, mismatch: Array, memory: int) -> Map:
     """The map over the position modulo the period that takes most; its chance counts all periods that were tried."""
     axis = "linear" if predictor.linear else "rotary"
     scene = Scene({"axis": axis}, predictor, mismatch)
@@ -102,7 +102,7 @@ def map_over(
     return _map(name, unit, edges, mean, error, count, share, float(fisher.sf(ratio, free, rest)))
 
 
-def places(predictor: Predictor, effect: Array, scale: float) -> dict[str, Any]:
+def locate(predictor: Predictor, effect: Array, scale: float) -> dict[str, Any]:
     """Where an effect acts: what it changes of the mismatch (`effect`, N*m), recording by recording and by coordinate.
 
     `scale` is dry friction; sizes are told as shares of it.

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.lab.diagnose.predict.predict import Predictor
-from servod.lab.diagnose.result import Unnamed
+from servod.lab.diagnose.result import ResidualTable
 from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
 
 
-def unnamed(predictor: Predictor, mismatch: Array) -> Unnamed | None:
+def residual_table(predictor: Predictor, mismatch: Array) -> ResidualTable | None:
     """The table that predicts most of the mismatch of unseen stretches; None where none predicts enough."""
     late = 2.0 * SETTINGS.observer.poles_damping / predictor.rate
     velocity = predictor.over("velocity")
@@ -28,7 +28,7 @@ def unnamed(predictor: Predictor, mismatch: Array) -> Unnamed | None:
     return best if best.share >= SETTINGS.maps.table_least_share else None
 
 
-def _table(name: str, values: Array, predictor: Predictor, mismatch: Array) -> Unnamed:
+def _table(name: str, values: Array, predictor: Predictor, mismatch: Array) -> ResidualTable:
     """Least squares of a piecewise linear function, and its share on every second stretch from the others."""
     rows = np.flatnonzero(predictor.counts)
     grid = np.unique(np.quantile(values[rows], np.linspace(0.002, 0.998, SETTINGS.maps.table_points)))
@@ -39,7 +39,7 @@ def _table(name: str, values: Array, predictor: Predictor, mismatch: Array) -> U
         predicted = design[~part] @ _ridge(design[part], mismatch[rows][part])
         left = mismatch[rows][~part] - predicted
         share += 0.5 * (1.0 - float(left @ left) / max(float(np.sum(mismatch[rows][~part] ** 2)), 1e-30))
-    return Unnamed(name, grid, -_ridge(design, mismatch[rows]), share)
+    return ResidualTable(name, grid, -_ridge(design, mismatch[rows]), share)
 
 
 def _ridge(design: Array, wanted: Array) -> Array:

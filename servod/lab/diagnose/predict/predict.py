@@ -22,7 +22,7 @@ from servod.formats.model.axis_model import AxisKind, AxisModel
 from servod.kernels.physics.compiled import Kernel, available, compiled
 from servod.kernels.physics.layout import P_DELAY_S, P_GAP, P_START_C, S_FIRST_S
 from servod.kernels.physics.plant import rest_state
-from servod.lab.diagnose.data.excited import creeps
+from servod.lab.diagnose.data.excitation import creeps
 from servod.lab.diagnose.data.trace import Trace, dry_friction
 from servod.lab.diagnose.predict.innovation_kernel import innovate
 from servod.lab.diagnose.settings import SETTINGS
@@ -135,11 +135,11 @@ class Predictor:
         self.observers = tuple(observer(trace, nominal.inertia, self.rate) for trace in self.traces)
         ends = np.cumsum([len(trace.drive.t_s) for trace in self.traces])
         self.slices = tuple(slice(int(a), int(b)) for a, b in zip([0, *ends[:-1]], ends, strict=True))
-        self.counts = np.concatenate([self._counting(trace) for trace in self.traces])
+        self.counts = np.concatenate([self._rows_that_count(trace) for trace in self.traces])
         self.evaluations = 0
         self._run, self._follow = without_lock(innovate), without_lock(open_loop.follow)
 
-    def _counting(self, trace: Trace) -> NDArray[np.bool_]:
+    def _rows_that_count(self, trace: Trace) -> NDArray[np.bool_]:
         """Rows that count: those of the trace, once the observer has settled behind each start."""
         counts = trace.counts.copy()
         for row in trace.starts:
@@ -169,14 +169,17 @@ class Predictor:
         packed = [np.array(model.pack()) for model in models]
         each = packed if len(packed) > 1 else packed * len(self.traces)
         self.evaluations += 1
-        parts = [self._one(p, trace, seen) for p, trace, seen in zip(each, self.traces, self.observers, strict=True)]
+        parts = [
+            self._trace_mismatch(p, trace, seen)
+            for p, trace, seen in zip(each, self.traces, self.observers, strict=True)
+        ]
         limit = SETTINGS.observer.worst * self.dry
         clean = np.nan_to_num(np.concatenate(parts), nan=limit, posinf=limit, neginf=-limit)
         return np.where(self.counts, np.clip(clean, -limit, limit), 0.0)
 
-    def _one(self, p: Array, trace: Trace, seen: Observer) -> Array:
+    def _trace_mismatch(self, p: Array, trace: Trace, seen: Observer) -> Array:
         drive = trace.drive
-        first = trace.first(float(p[P_DELAY_S]))
+        first = trace.first_row(float(p[P_DELAY_S]))
         state = np.array(rest_state(0.0, 5e-5, float(p[P_START_C])))
         state[S_FIRST_S] = trace.begun_s
         states = np.array([self._start(p, trace, int(row), first) for row in trace.starts])
@@ -212,7 +215,7 @@ class Predictor:
 # Stands between the predictor and the trials; what is tried on it and promises anything is fitted on everything after.
 
 
-def shortened(predictor: Predictor, nominal: AxisModel, mismatch: Array) -> Predictor:
+def shorten(predictor: Predictor, nominal: AxisModel, mismatch: Array) -> Predictor:
     """A predictor on the stretch of each recording with the greatest power of `mismatch`; the same observer."""
     traces = [
         _cut(trace, mismatch[part], SETTINGS.observer.settling / predictor.rate)

@@ -67,25 +67,25 @@ class Trials:
         names = [what.name for what in effects() if what.name not in skip]
         first = [c for found in in_parallel("starts", self._starts, names) for c in found]
         first.sort(key=lambda c: c.left)
-        second = in_parallel("starts", self._second, best_of_each(first, SETTINGS.trials.second_round, 2))
+        second = in_parallel("starts", self._second_round, best_of_each(first, SETTINGS.trials.second_round, 2))
         second.sort(key=lambda c: c.left)
         chosen = best_of_each(second, len(second), 1)
         limit = chosen[0].left + SETTINGS.trials.in_reach * max(1.0 - chosen[0].left, 0.0) if chosen else 0.0
         close = [c for c in chosen if c.left <= limit][: SETTINGS.trials.full_fits]
-        fitted = sorted(in_parallel("starts", self._full, close), key=plainest_first)
+        fitted = sorted(in_parallel("starts", self._fit_fully, close), key=penalised_left)
         return fitted + [c for c in chosen if c.effect not in {f.effect for f in fitted}]
 
     def _starts(self, name: str) -> list[Candidate]:
         """All starts of an effect after one step each."""
         what = effect(name)
-        begun = [fit for term in what.terms(self.scene) for fit in self._begun(term, what.far)]
+        begun = [fit for term in what.terms(self.scene) for fit in self._begin(term, what.far)]
         self.tried += len(begun)
         if what.far:
-            begun = sorted(begun, key=self.short.promised)[: SETTINGS.trials.far_starts]
-        begun = [self.short.opened(fit) for fit in begun]
-        return [self._short(name, self.short.refine(fit, 1, fit.jacobian.shape[1], 2), fit) for fit in begun]
+            begun = sorted(begun, key=self.short.predicted_cost)[: SETTINGS.trials.far_starts]
+        begun = [self.short.refresh_opened(fit) for fit in begun]
+        return [self._on_short_data(name, self.short.refine(fit, 1, fit.jacobian.shape[1], 2), fit) for fit in begun]
 
-    def _begun(self, term: Term, far: bool) -> list[Fit]:
+    def _begin(self, term: Term, far: bool) -> list[Fit]:
         """The term beside the present fit, and for far effects beside the nominal model."""
         froms = [self.beside] + ([self.from_nominal] if far and self.from_nominal is not None else [])
         fits = []
@@ -94,28 +94,28 @@ class Trials:
             fits.append(self.short.begin(hypothesis, hypothesis.beside(beside.coordinates), beside.jacobian))
         return [fit for fit in fits if fit is not None]
 
-    def _short(self, name: str, fit: Fit, begun: Fit) -> Candidate:
+    def _on_short_data(self, name: str, fit: Fit, begun: Fit) -> Candidate:
         """A candidate on shortened data; it shares the Jacobian it began with, for many are kept."""
         return Candidate(name, replace(fit, jacobian=begun.jacobian), fit.cost / max(self.beside.cost, 1e-30))
 
-    def _second(self, candidate: Candidate) -> Candidate:
+    def _second_round(self, candidate: Candidate) -> Candidate:
         fit = candidate.fit
-        return self._short(
+        return self._on_short_data(
             candidate.effect, self.short.refine(fit, SETTINGS.trials.second_steps, fit.jacobian.shape[1]), fit
         )
 
-    def _full(self, candidate: Candidate) -> Candidate:
+    def _fit_fully(self, candidate: Candidate) -> Candidate:
         """Fit on everything, as long as there is time."""
         begun = self.whole.begin(candidate.fit.hypothesis, candidate.fit.coordinates, self.present.jacobian)
         if begun is None or monotonic() > self.deadline:
             return candidate
         fit = self.whole.refine(
-            self.whole.opened(begun), SETTINGS.trials.full_steps, known=self.present.jacobian.shape[1]
+            self.whole.refresh_opened(begun), SETTINGS.trials.full_steps, known=self.present.jacobian.shape[1]
         )
         return Candidate(candidate.effect, fit, fit.cost / max(self.present.cost, 1e-30))
 
 
-def plainest_first(candidate: Candidate) -> float:
+def penalised_left(candidate: Candidate) -> float:
     """What is left, a little more for every number that the term needs: the plainest of equals comes first."""
     return candidate.left * (1.0 + SETTINGS.trials.per_number * candidate.term.numbers)
 

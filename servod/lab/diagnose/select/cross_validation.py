@@ -45,11 +45,11 @@ def _validated(selector: Selector, selection: Selection) -> CrossValidation:
     named = named_terms(fit, selector.start.document)
     selector.tell("held-out recordings")
     reduced = {place: selector.settle_without(fit, place) for place in named}
-    folds = split(predictor, fit)
-    before = held_out(predictor, base, folds)
-    after = held_out(predictor, fit, folds) if fit is not base else before
+    folds = make_folds(predictor, fit)
+    before = predict_held_out(predictor, base, folds)
+    after = predict_held_out(predictor, fit, folds) if fit is not base else before
     alone = len(named) == 1 and selection.terms == 1
-    without = {place: before if alone else held_out(predictor, one, folds) for place, one in reduced.items()}
+    without = {place: before if alone else predict_held_out(predictor, one, folds) for place, one in reduced.items()}
     return CrossValidation(named, reduced, folds, before, after, without)
 
 
@@ -64,7 +64,7 @@ def _worst(selection: Selection, validation: CrossValidation) -> int | None:
     return min(others, key=lambda place: others[place]) if others else None
 
 
-def split(predictor: Predictor, fit: Fit) -> Folds:
+def make_folds(predictor: Predictor, fit: Fit) -> Folds:
     """How the rows are shared out so that nothing of `fit` is judged by rows that it was fitted to."""
     own_levels = any(term.each is not None for term in fit.hypothesis.terms)
     whole = len(predictor.slices) > 1 and not own_levels
@@ -111,13 +111,13 @@ def single_events(hypothesis: Hypothesis) -> list[int]:
     ]  # fmt: skip
 
 
-def held_out(predictor: Predictor, fit: Fit, folds: Folds) -> HeldOut:
+def predict_held_out(predictor: Predictor, fit: Fit, folds: Folds) -> HeldOut:
     """Mismatch of each fold under `fit` estimated again without it; events in one recording keep their values."""
     mismatch = np.zeros_like(fit.mismatch)
     models: list[Fold] = []
     coordinates: list[Array] = []
     for out in folds.parts:
-        again = _again(predictor, fit, predictor.counts & ~out)
+        again = _refit(predictor, fit, predictor.counts & ~out)
         mismatch[out] = again.mismatch[out]
         models.append(Fold(out, tuple(again.hypothesis.models(again.coordinates, len(predictor.slices)))))
         coordinates.append(again.coordinates)
@@ -125,7 +125,7 @@ def held_out(predictor: Predictor, fit: Fit, folds: Folds) -> HeldOut:
     return HeldOut(mismatch, rms, tuple(models), tuple(coordinates))
 
 
-def _again(predictor: Predictor, fit: Fit, seen: Rows) -> Fit:
+def _refit(predictor: Predictor, fit: Fit, seen: Rows) -> Fit:
     """The fit estimated anew on the rows that are seen, along its own Jacobian."""
     if seen.sum() < len(fit.coordinates):
         return fit

@@ -95,7 +95,7 @@ class Fitter:
         known = np.zeros((len(mismatch), 0)) if jacobian is None else jacobian
         return Fit(hypothesis, at, mismatch, self.cost(hypothesis, at, mismatch), known, False)
 
-    def promised(self, fit: Fit) -> float:
+    def predicted_cost(self, fit: Fit) -> float:
         """The cost after one step along the columns of the Jacobian that are known, by the Jacobian alone."""
         columns = fit.jacobian.shape[1]
         normal, slope = self._normal(fit, fit.jacobian)
@@ -122,7 +122,7 @@ class Fitter:
             jacobian, fresh, damping = self.derivatives(fit, keep_columns), True, SETTINGS.fit.least_damping
         return fit
 
-    def opened(self, fit: Fit) -> Fit:
+    def refresh_opened(self, fit: Fit) -> Fit:
         """The fit with those columns of its Jacobian anew that belong to parameters opened by its last term."""
         keys = fit.hypothesis.terms[-1].opens
         jacobian = fit.jacobian.copy() if keys else fit.jacobian

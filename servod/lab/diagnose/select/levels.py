@@ -35,7 +35,7 @@ def on_bound(fit: Fit) -> bool:
     return any(min(fit.coordinates[i] - low[i], high[i] - fit.coordinates[i]) < SETTINGS.worth.on_bound for i in places)
 
 
-def is_level(term: Term) -> bool:
+def is_level_change(term: Term) -> bool:
     """Whether a term opens parameters that have a level, and no others."""
     own = {unknown.key for unknown in term.unknowns}
     return bool(term.opens) and LEVELS.issuperset(term.opens) and not own & NO_LEVEL
@@ -51,7 +51,7 @@ MAY_END = frozenset(
 )
 
 
-def at_end(fit: Fit, place: int = -1) -> bool:
+def at_end_of_range(fit: Fit, place: int = -1) -> bool:
     """Whether a number of a term (the last), or one of the model's own that it opens, lies at an end of its range.
 
     Then the effect says itself that it is something else: ranges are wide, and an optimum at an end, twenty times the
@@ -74,11 +74,11 @@ def at_end(fit: Fit, place: int = -1) -> bool:
 def named_terms(fit: Fit, nominal: Document) -> tuple[int, ...]:
     """Places of the terms whose effect is at least at its level."""
     fitted = fit.hypothesis.written(fit.coordinates)
-    terms, lesser = fit.hypothesis.terms, lesser_twin(fit)
+    terms, lesser = fit.hypothesis.terms, shorter_twin(fit)
     return tuple(i for i, term in enumerate(terms) if term.effect != lesser and _at_level(term.effect, nominal, fitted))
 
 
-def lesser_twin(fit: Fit) -> str:
+def shorter_twin(fit: Fit) -> str:
     """The shorter of a delay and a lag that are both in: together they are one drive that is late, of higher order."""
     if not {term.effect for term in fit.hypothesis.terms} >= set(TWINS):
         return ""

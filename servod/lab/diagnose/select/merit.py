@@ -36,10 +36,10 @@ def worth_naming(merit: Merit, level: bool) -> bool:
     """Whether a term is worth a name; `level`: it is a parameter of the model's own beyond its level."""
     least = SETTINGS.worth.level_torque if level else SETTINGS.worth.least_torque
     rest = merit.of_left >= SETTINGS.worth.least_of_left or merit.share >= SETTINGS.worth.sure_share
-    return of_size(merit, level) and merit.torque >= least and rest
+    return large_enough(merit, level) and merit.torque >= least and rest
 
 
-def of_size(merit: Merit, level: bool) -> bool:
+def large_enough(merit: Merit, level: bool) -> bool:
     """Whether a term has the size from which the outside contract calls it worth naming; `level` as above."""
     if merit.share >= SETTINGS.worth.share or merit.torque >= (
         SETTINGS.worth.level_torque if level else SETTINGS.worth.torque
@@ -48,7 +48,7 @@ def of_size(merit: Merit, level: bool) -> bool:
     return merit.own >= SETTINGS.worth.torque and merit.of_left >= SETTINGS.worth.nearly_all
 
 
-def acting(changed: Array) -> float:
+def acting_torque(changed: Array) -> float:
     """What an effect changes where it acts, N*m: a high quantile, or the root mean square weighted by power.
 
     A wave has as much of both; a push of a second, or blows behind reversals, have next to nothing at a quantile.

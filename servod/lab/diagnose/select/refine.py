@@ -23,7 +23,7 @@ from servod.lab.diagnose.select.candidates import Candidate
 from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.select.merit import Merit
 from servod.lab.diagnose.select.selection import Entry, Selection
-from servod.lab.diagnose.select.selector import Selector, sound
+from servod.lab.diagnose.select.selector import Selector, is_sound
 from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
@@ -88,7 +88,7 @@ def add_first(selector: Selector, selection: Selection, candidates: list[Candida
         begun = selector.settle(candidate.fit.hypothesis, candidate.fit.coordinates, present.mismatch)
         fit, merit = selector.fit_on(selection, present, begun, deserves)
         selection = selector.lower_floor(selection, fit.mismatch)
-        if deserves(merit, fit) and sound(merit, fit):
+        if deserves(merit, fit) and is_sound(merit, fit):
             others = tuple(c for c in candidates if c.effect != candidate.effect)
             return selection.with_term(fit, merit, Entry(candidate.left, others))
     return selection
@@ -110,28 +110,28 @@ def add_drift(selector: Selector, selection: Selection) -> Selection:
     there = {term.effect for term in present.hypothesis.terms}
     if there & {DRIFT[0], DRIFT_RIVAL[0]} or not effect(DRIFT[0]).terms(_scene(selector, present)):
         return selection
-    drift, merit = _with(selector, selection, *DRIFT)
+    drift, merit = _fit_with(selector, selection, *DRIFT)
     left = _left(selector, present, drift)
-    if left > 1.0 - SETTINGS.drift.least_taken or not _gains(selector, merit) or not sound(merit, drift):
+    if left > 1.0 - SETTINGS.drift.least_taken or not _is_significant(selector, merit) or not is_sound(merit, drift):
         return selection
-    other, _ = _with(selector, selection, *DRIFT_RIVAL)
+    other, _ = _fit_with(selector, selection, *DRIFT_RIVAL)
     rival = Candidate(DRIFT_RIVAL[0], other, _left(selector, present, other))
     return selection.with_term(drift, merit, Entry(left, (rival,)))
 
 
-def _gains(selector: Selector, merit: Merit) -> bool:
+def _is_significant(selector: Selector, merit: Merit) -> bool:
     """Whether a term of one number is significant."""
     return merit.gain >= SETTINGS.drift.least_gain + math.log(float(selector.rows.sum()))
 
 
-def _with(selector: Selector, selection: Selection, name: str, form: str) -> tuple[Fit, Merit]:
+def _fit_with(selector: Selector, selection: Selection, name: str, form: str) -> tuple[Fit, Merit]:
     """The fit with a form of an effect beside all that is in, fitted to its end, and what the effect is worth."""
     present = selection.fit
     term = next(term for term in effect(name).terms(_scene(selector, present)) if term.form == form)
     hypothesis = present.hypothesis.with_term(term)
     at = hypothesis.beside(present.coordinates)
     begun = selector.settle(hypothesis, at, present.mismatch, present.jacobian)
-    return selector.fit_on(selection, present, begun, lambda merit, _fit: _gains(selector, merit))
+    return selector.fit_on(selection, present, begun, lambda merit, _fit: _is_significant(selector, merit))
 
 
 def _scene(selector: Selector, present: Fit) -> Scene:
@@ -170,7 +170,7 @@ def restore_nominal(selector: Selector, selection: Selection) -> Selection:
             if keys is candidates:
                 break
     if restored is not fit:
-        fit = selector.fresh(replace(restored, hypothesis=fit.hypothesis))
+        fit = selector.refresh(replace(restored, hypothesis=fit.hypothesis))
     return selector.lower_floor(replace(selection, fit=fit), fit.mismatch)
 
 

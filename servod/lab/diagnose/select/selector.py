@@ -15,16 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.formats.model.axis_model import AxisModel
-from servod.lab.diagnose.data.excited import unexcited_effects
+from servod.lab.diagnose.data.excitation import unexcited_effects
 from servod.lab.diagnose.effects.base import base_unknowns, document_of
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
 from servod.lab.diagnose.effects.scene import Scene
 from servod.lab.diagnose.predict.floor import noise_floor, stretch_means
-from servod.lab.diagnose.predict.predict import Predictor, shortened
+from servod.lab.diagnose.predict.predict import Predictor, shorten
 from servod.lab.diagnose.select.candidates import Candidate, Trials
 from servod.lab.diagnose.select.fit import Fit, Fitter, Weighing, long_run, scale_of
-from servod.lab.diagnose.select.levels import at_end, is_level
-from servod.lab.diagnose.select.merit import Merit, acting, worth_naming
+from servod.lab.diagnose.select.levels import at_end_of_range, is_level_change
+from servod.lab.diagnose.select.merit import Merit, acting_torque, worth_naming
 from servod.lab.diagnose.select.selection import Selection
 from servod.lab.diagnose.settings import SETTINGS
 
@@ -71,7 +71,7 @@ class Selector:
             raise ValueError("a hypothesis that makes no sense at its start")
         first = self._refined(begun, mismatch, begun.jacobian.shape[1])
         second = self._refined(first, first.mismatch, len(first.coordinates))
-        return second if second.converged else self.fresh(second)
+        return second if second.converged else self.refresh(second)
 
     def settle_candidate(self, candidate: Candidate, mismatch: Array) -> Fit:
         """A candidate's fit settled; its Jacobian serves when it has all rows."""
@@ -85,7 +85,7 @@ class Selector:
         kept = np.delete(fit.coordinates, gone)
         return self.settle(fit.hypothesis.without(index), kept, fit.mismatch, np.delete(fit.jacobian, gone, axis=1))
 
-    def fresh(self, fit: Fit) -> Fit:
+    def refresh(self, fit: Fit) -> Fit:
         """The fit with cost and Jacobian in the scale of its own mismatch."""
         fitter = self.fitter(fit.mismatch)
         cost = fitter.cost(fit.hypothesis, fit.coordinates, fit.mismatch)
@@ -117,7 +117,7 @@ class Selector:
         `fine`: finer forms among them.
         """
         whole = self.fitter(present.mismatch)
-        quick = shortened(self.predictor, self.nominal, present.mismatch)
+        quick = shorten(self.predictor, self.nominal, present.mismatch)
         short = Fitter(quick, Weighing(whole.weighing.scale, quick.counts.astype(np.float64)))
         scene = Scene(self.start.document, self.predictor, present.mismatch, fine)
         trials = Trials(whole, short, present, scene, not present.hypothesis.terms, self.deadline)
@@ -149,13 +149,13 @@ class Selector:
         blow = SETTINGS.worth.blow * float(np.median(np.abs(with_term.mismatch[self.predictor.counts]))) / 0.6745
         was, now = (self.error(np.clip(fit.mismatch, -blow, blow)) for fit in (without, with_term))
         of_left = (was - now) / max(was - selection.floor, 1e-30)
-        return Merit(saved / explainable, of_left, torque, gain, self._own(without, with_term))
+        return Merit(saved / explainable, of_left, torque, gain, self._own_torque(without, with_term))
 
     def _acting(self, one: Array, other: Array) -> float:
         """Where two mismatches differ, by how much, as a share of dry friction."""
-        return acting(np.abs(one - other)[self.predictor.counts]) / self.predictor.dry
+        return acting_torque(np.abs(one - other)[self.predictor.counts]) / self.predictor.dry
 
-    def _own(self, without: Fit, with_term: Fit) -> float:
+    def _own_torque(self, without: Fit, with_term: Fit) -> float:
         """The torque of the term that one fit has more than the other, all else as fitted with it; 0 for a level."""
         hypothesis = with_term.hypothesis
         pairs = zip(hypothesis.terms, (*without.hypothesis.terms, None), strict=False)
@@ -174,13 +174,13 @@ class Selector:
         slow = float(long_run(clipped[:, None], max(1, round(SETTINGS.worth.gain_memory_s / period)))[0, 0])
         return max(slow / max(plain, 1e-30), 1.0)
 
-    def enters(self, selection: Selection, merit: Merit, fit: Fit, place: int = -1) -> bool:
+    def may_enter(self, selection: Selection, merit: Merit, fit: Fit, place: int = -1) -> bool:
         """Whether a term (the last one, or the one at `place`) may come in: it deserves it, and its fit is sound."""
-        return self.deserves(selection, merit, fit, place) and sound(merit, fit, place)
+        return self.deserves(selection, merit, fit, place) and is_sound(merit, fit, place)
 
     def deserves(self, selection: Selection, merit: Merit, fit: Fit, place: int = -1) -> bool:
         """Whether a term (the last one, or the one at `place`) is significant and worth naming."""
-        worth = worth_naming(merit, is_level(fit.hypothesis.terms[place]))
+        worth = worth_naming(merit, is_level_change(fit.hypothesis.terms[place]))
         return worth and self.significant(selection, merit, fit, place)
 
     def significant(self, selection: Selection, merit: Merit, fit: Fit, place: int = -1) -> bool:
@@ -190,9 +190,9 @@ class Selector:
         return merit.gain > unknowns * math.log(rows) + 2.0 * math.log(max(selection.tried, 1)) + 20.0
 
 
-def sound(merit: Merit, fit: Fit, place: int = -1) -> bool:
+def is_sound(merit: Merit, fit: Fit, place: int = -1) -> bool:
     """Whether the fit of a term has come to an end, and not to one of a range."""
-    return (fit.converged or merit.share >= SETTINGS.worth.sure_share) and not at_end(fit, place)
+    return (fit.converged or merit.share >= SETTINGS.worth.sure_share) and not at_end_of_range(fit, place)
 
 
 #: Effects that may come in again with another period or place: a second harmonic is no second effect.

@@ -57,11 +57,11 @@ def _add_best(selector: Selector, selection: Selection) -> Selection:
         begun = selector.settle_candidate(candidate, present.mismatch)
         fit, merit = selector.fit_on(selection, present, begun, deserves)
         selection = selector.lower_floor(selection, fit.mismatch)
-        if selector.enters(selection, merit, fit):
+        if selector.may_enter(selection, merit, fit):
             bare = selector.settle_without(fit, len(fit.hypothesis.terms) - 1)
             if selector.error(bare.mismatch) < selector.error(present.mismatch):
                 selection, merit = replace(selection, fit=bare), selector.merit(selection, bare, fit)
-        if selector.enters(selection, merit, fit):
+        if selector.may_enter(selection, merit, fit):
             others = tuple(c for c in candidates if c.effect != candidate.effect)
             return selection.with_term(fit, merit, Entry(candidate.left, others))
         if selector.significant(selection, merit, fit):
@@ -112,7 +112,7 @@ def _swap(selector: Selector, selection: Selection, index: int, rival: Candidate
     if fit is None or not _better(selector, selection.fit, fit):
         return None
     merit = selector.merit(selection, selector.settle_without(fit, index), fit)
-    if not selector.enters(selection, merit, fit, index):
+    if not selector.may_enter(selection, merit, fit, index):
         return None
     entry = selection.entries[index]
     old = Candidate(selection.fit.hypothesis.terms[index].effect, selection.fit, entry.left, index)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from servod.lab.diagnose.result import Signature, SignaturePart, Units, Unnamed
+from servod.lab.diagnose.result import ResidualTable, Signature, SignaturePart, Units
 from servod.lab.report.figure import Axis, Colour, Curve, Figure, Panel, Style, curve
 
 #: Colours of the fitted effect and of the error without it, for the first part of the rows and for the second.
@@ -54,7 +54,7 @@ def _over_time(found: Signature, units: Units) -> Panel:
     return Panel(Axis("time in s"), Axis(f"error in {units.force}"), curves, found.recording)
 
 
-def table_figure(left: Unnamed, units: Units) -> Figure:
+def table_figure(left: ResidualTable, units: Units) -> Figure:
     """What was left without a name, as a table over the coordinate where it lives."""
     per = {"position": units.length, "velocity": f"{units.length}/s"}.get(left.coordinate, "s")
     drawn = curve("torque that resists", left.grid, left.torque, Colour.BLUE, width=2.0)

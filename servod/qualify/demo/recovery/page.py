@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from servod.lab.diagnose.document import certainty
+from servod.lab.diagnose.document import describe_certainty
 from servod.lab.report.diagnosis import Report
 from servod.lab.report.figure import Axis, Colour, Curve, Figure, Panel, curve
 from servod.lab.report.figures import mismatch
@@ -37,7 +37,7 @@ def write_recovery_page(found: Recovery, out: Path) -> Path:
     _figures(report, found)
     page.heading("What the diagnosis found in the axis's own recordings")
     page.points([f["statement"] for f in found.document["findings"]])
-    page.points([line for f in found.document["findings"] for line in certainty(f)])
+    page.points([line for f in found.document["findings"] for line in describe_certainty(f)])
     evidence, units = found.diagnosis.evidence, found.diagnosis.units
     if evidence is not None:
         report.figure(mismatch.where(evidence.maps_before, units))
