@@ -35,8 +35,9 @@ class IntakeSettings:
     saturated: float = 0.4
     #: The same share from which it is noted.
     noted_saturated: float = 0.02
-    #: A row that leaves its neighbours by so many noises, or so many usual steps, and comes back, is a glitch.
+    #: A row that leaves its neighbours by so many noises and comes back is a glitch,
     glitch_noises: float = 30.0
+    #: if it is as many usual steps as well: a fast motion is none.
     glitch_steps: float = 8.0
     #: Rows of the neighbourhood whose median a glitch leaves.
     neighbourhood: int = 7
@@ -74,8 +75,9 @@ class ExcitationSettings:
 class ObserverSettings:
     """The observer that pulls a model to the encoder: fast enough to see friction, slow enough for the noise."""
 
-    #: Bandwidth within these bounds, rad/s; what the noise allows between them.
+    #: Lowest bandwidth, rad/s: a slower observer shows no friction any more.
     slowest: float = 25.0
+    #: Highest bandwidth, rad/s: from here on more shows noise only. What the encoder allows lies between the two.
     fastest: float = 200.0
     #: The bandwidth's share of the sampling rate, at most.
     share_of_sampling: float = 0.1
@@ -101,8 +103,9 @@ class ObserverSettings:
     settling: float = 30.0
     #: Mismatches beyond this many dry frictions say no more: a model that has run away counts as that bad.
     worst: float = 1e6
-    #: Share of each recording that first rounds run on, and the least that is, s.
+    #: Share of each recording that first rounds run on: the stretch where most is left shows most of any effect.
     shortened_share: float = 0.35
+    #: The least that this is, s.
     shortened_least_s: float = 4.0
     #: Cores that a diagnosis uses, at most.
     most_cores: int = 2
@@ -114,8 +117,9 @@ class FloorSettings:
 
     #: Length of a stretch in time constants of the observer.
     stretch: float = 8.0
-    #: The quantile of the stretches' power that is taken for noise, and the standard score of that quantile.
+    #: The quantile of the stretches' power that is taken for noise: missing physics acts here and there only.
     quantile: float = 0.25
+    #: The standard score of that quantile, by which it is corrected for having been picked as quiet.
     score: float = -0.674
     #: By how much slow torque noise may exceed the white part of the mismatch, in power.
     slow_over_white: float = 6.0
@@ -163,11 +167,13 @@ class FitSettings:
 class TrialSettings:
     """How many starts of effects are tried, and how far each is fitted."""
 
-    #: Starts that go on to the second round, and its steps.
+    #: Starts that go on to the second round.
     second_round: int = 16
+    #: Steps of each there.
     second_steps: int = 3
-    #: Effects that are fitted on everything, and steps of such a fit.
+    #: Effects that are fitted on everything.
     full_fits: int = 5
+    #: Steps of such a fit.
     full_steps: int = 8
     #: Starts of a far effect that get a step of their own: those that the model's own parameters can follow best.
     far_starts: int = 4
@@ -181,8 +187,9 @@ class TrialSettings:
 class WorthSettings:
     """From when on a term is worth a name: levels of the outside contract, and what experience added."""
 
-    #: Worth naming: share of the explainable error, or share of Coulomb friction where it acts.
+    #: Worth naming by the outside contract: share of the explainable error,
     share: float = 0.05
+    #: or share of Coulomb friction where it acts.
     torque: float = 0.03
     #: The least torque that any finding must carry there, which several effects of one per cent each stay below.
     least_torque: float = 0.018
@@ -215,10 +222,11 @@ class ForwardSettings:
     search_share: float = 0.75
     #: Most terms.
     most_terms: int = 5
-    #: Nothing worth naming is left when the mismatch above the floor, and its mean over any short stretch but this
-    #: share of them, are below these shares of dry friction.
+    #: Nothing worth naming is left when the mismatch above the floor is below this share of dry friction,
     nothing_rms: float = 0.006
+    #: and its means over short stretches are below this share of it,
     nothing_stretch: float = 0.02
+    #: but for this share of the stretches.
     but_share: float = 0.005
     #: Rivals that saved at least 1 - close of what the best saved get their chance when the best does not deserve it.
     close: float = 0.3
@@ -325,9 +333,11 @@ class IntervalSettings:
 class MapSettings:
     """Where a mismatch lives: maps over coordinates, and what is drawn of them."""
 
-    #: Bins of a map, of one over time, and rows that a bin needs.
+    #: Bins of a map.
     bins: int = 24
+    #: Bins of a map over time, which has more to show than a curve.
     time_bins: int = 96
+    #: Rows that a bin needs before its mean is shown.
     least_in_bin: int = 30
     #: Probability under noise below which a map counts as seen.
     seen: float = 1e-3
@@ -357,10 +367,13 @@ class CurveSettings:
     correlated_rows: float = 20.0
     #: Length of a stretch whose root mean square is one point over time, s.
     course_s: float = 0.1
-    #: Lowest and highest frequency of a spectrum, Hz, its bands, and the length of its windows, s.
+    #: Lowest frequency of a spectrum, Hz.
     lowest_hz: float = 0.2
+    #: Highest frequency of a spectrum, Hz: the observer shows nothing beyond.
     highest_hz: float = 60.0
+    #: Bands of a spectrum, alike in width on a logarithmic scale.
     bands: int = 60
+    #: Length of the windows that a spectrum is averaged over, s: what it resolves at the low end.
     window_s: float = 8.0
 
 
@@ -371,15 +384,17 @@ class VerdictSettings:
     #: Below this share of the explainable error no known name may stand: what is there is something else. Real machines
     #: keep some of theirs above it, so that it is no nearer to 1; confidence falls with what is left instead.
     least_explained: float = 0.85
-    #: It is nearer where what is left is worth a name itself, from this share of dry friction on.
+    #: The same where what is left is worth a name itself.
     least_beside_much: float = 0.925
+    #: What is left is worth a name itself from this share of dry friction on.
     much_torque: float = 0.05
     #: What is left above the noise floor counts as unexplained from this share of dry friction,
     left_torque: float = 0.02
     #: if it is also this share of what could be explained.
     left_share: float = 0.05
-    #: Shares of dry friction from which the encoder's noise in the mismatch hides what is left, and hides everything.
+    #: Share of dry friction from which the encoder's noise in the mismatch hides what is left.
     hides_rest: float = 0.15
+    #: The same from which it hides everything.
     hides_all: float = 0.5
     #: A rival that leaves at most this many times what the finding leaves cannot be told apart.
     alike: float = 1.2

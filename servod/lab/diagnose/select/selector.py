@@ -132,11 +132,11 @@ class Selector:
 
     def nothing_left(self, selection: Selection) -> bool:
         """Whether no effect worth naming can hide in what the selection leaves."""
-        mismatch, least = selection.fit.mismatch, SETTINGS.forward
+        mismatch = selection.fit.mismatch
         above = math.sqrt(max(self.error(mismatch) - selection.floor, 0.0)) / self.predictor.dry
         stretches = np.abs(stretch_means(self.predictor, mismatch) / self.predictor.dry)
-        mean = float(np.quantile(stretches, 1.0 - least.but_share))
-        return above < least.nothing_rms and mean < least.nothing_stretch
+        quiet = float(np.quantile(stretches, 1.0 - SETTINGS.forward.but_share)) < SETTINGS.forward.nothing_stretch
+        return above < SETTINGS.forward.nothing_rms and quiet
 
     def merit(self, selection: Selection, without: Fit, with_term: Fit) -> Merit:
         """What the step from one fit to the other is worth, by floor and base of the selection."""
