@@ -19,12 +19,12 @@ from servod.lab.diagnose.effects.effect import Effect
 _SIGNS = {Ge: (">=", "ge"), Gt: (">", "gt"), Le: ("<=", "le"), Lt: ("<", "lt")}
 
 
-def listed() -> dict[str, str]:
+def list_effects() -> dict[str, str]:
     """Name -> statement of every effect."""
     return {found.name: found.statement for found in effects()}
 
 
-def explained(name: str) -> dict[str, Any]:
+def explain_effect(name: str) -> dict[str, Any]:
     """Equation, source, keys, signature and separating experiment of the effect `name`."""
     found = effect(name)
     return {

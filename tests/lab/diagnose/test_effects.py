@@ -14,27 +14,28 @@ import pytest
 from servod.common.yaml import parse_yaml, validate
 from servod.formats.model.axis_model import AxisModel, axis_model_yaml
 from servod.lab.diagnose import effects as package
-from servod.lab.diagnose.data.intake import taken_in
-from servod.lab.diagnose.effects import NAMES, effect, effects, names, unseen
+from servod.lab.diagnose.data.intake import load_traces
+from servod.lab.diagnose.effects import NAMES, effect, effects, names, unexcited_effects
 from servod.lab.diagnose.effects.base import base_unknowns, document_of
 from servod.lab.diagnose.effects.effect import Effect, simple
 from servod.lab.diagnose.effects.hypothesis import Hypothesis, Unknown
 from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.scene import Scene
-from servod.lab.diagnose.explain import explained, listed
-from servod.lab.diagnose.judge.spread import common_factor
-from servod.lab.diagnose.judge.verdict import alternatives, named_terms
+from servod.lab.diagnose.explain import explain_effect, list_effects
+from servod.lab.diagnose.judge.covariance import common_factor
+from servod.lab.diagnose.judge.verdict import alternatives
 from servod.lab.diagnose.predict.predict import Predictor
-from servod.lab.diagnose.select.choice import Choice, Entry
-from servod.lab.diagnose.select.choose import once_only
 from servod.lab.diagnose.select.fit import Fit
+from servod.lab.diagnose.select.levels import named_terms
+from servod.lab.diagnose.select.selection import Entry, Selection
+from servod.lab.diagnose.select.selector import once_only
 from tests.lab.diagnose.axes import believed, record
 
 
 @functools.cache
 def scene() -> Scene:
     model = believed(gravity={"amplitude": 0.1, "phase": 0.2})
-    traces, _ = taken_in(record(model), model)
+    traces, _ = load_traces(record(model), model)
     predictor = Predictor(traces, model)
     return Scene(document_of(model), predictor, predictor.mismatch(believed()))
 
@@ -58,7 +59,7 @@ def test_starts_are_models(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_explained(name: str) -> None:
-    found = explained(name)
+    found = explain_effect(name)
     assert found["keys"]
     assert all(found[key] for key in ("statement", "equation", "source", "shows", "experiment"))
     assert set(found["confused_with"]) <= set(NAMES)
@@ -104,20 +105,22 @@ def test_a_new_record_is_in_every_list(add: Callable[[Effect], None]) -> None:
     levels = {"at_level": lambda _nominal, fitted: fitted["toy"]["stiffness"] > 0.5, "twin": "spring"}
     add(replace(record, friction_keys=("sigma0",), lateness="toy.stiffness", **flags, **levels))
 
-    assert effects()[-1] is effect("toy") and "toy" in listed()
-    keys = [key["key"] for key in explained("toy")["keys"]]
+    assert effects()[-1] is effect("toy") and "toy" in list_effects()
+    keys = [key["key"] for key in explain_effect("toy")["keys"]]
     assert keys == ["toy.stiffness", "toy.rest", "toy.cubic", "friction.sigma0"]
     assert all("toy" in names(lambda what, flag=flag: getattr(what, flag)) for flag in flags)
     predictor = scene().predictor
-    assert "toy" in unseen(predictor.traces, 1e-4) and "toy" not in unseen(predictor.traces, scene().inertia)
+    assert "toy" in unexcited_effects(predictor.traces, 1e-4) and "toy" not in unexcited_effects(
+        predictor.traces, scene().inertia
+    )
 
     hypothesis = Hypothesis(scene().document, base_unknowns(believed()), (stiffness, twin))
     assert once_only(hypothesis) == {"spring"}
-    for value, named in ((0.2, [1]), (0.9, [0, 1])):
+    for value, named in ((0.2, (1,)), (0.9, (0, 1))):
         coordinates = hypothesis.start.copy()
         coordinates[hypothesis.share(0)] = stiffness.unknowns[0].coordinate(value)
         fit = Fit(hypothesis, coordinates, scene().mismatch, 0.0, np.zeros((0, 0)), True)
-        choice = Choice(fit, fit, [], [Entry(0.1, []), Entry(0.1, [])], {}, 0.0, 1)
-        assert named_terms(choice, scene().document) == named
-        assert alternatives(choice, 0) == ["spring"]
+        selection = Selection(fit, fit, 0.0, 0.0, (), (Entry(0.1, ()), Entry(0.1, ())))
+        assert named_terms(fit, scene().document) == named
+        assert alternatives(selection, 0) == ["spring"]
         assert common_factor(fit)[hypothesis.share(0)].any()

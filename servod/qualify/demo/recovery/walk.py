@@ -29,8 +29,7 @@ from servod.lab.deploy.judge import broken, skipped
 from servod.lab.deploy.outcome import Deployment
 from servod.lab.diagnose.effects import names
 from servod.lab.diagnose.engine import diagnose
-from servod.lab.diagnose.judge.evidence import Diagnosis
-from servod.lab.diagnose.judge.verdict import Verdict
+from servod.lab.diagnose.result import Diagnosis, Verdict
 from servod.lab.recordings import load_recording
 from servod.lab.report.diagnosis import MODEL, write_files
 from servod.lab.synthesize.deployed import Wishes
