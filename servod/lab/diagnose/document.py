@@ -12,6 +12,7 @@ from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.looks import look
 from servod.lab.diagnose.result import (
     Diagnosis,
+    DiagnosisVerdict,
     Evidence,
     FittedValue,
     FreeRun,
@@ -20,7 +21,6 @@ from servod.lab.diagnose.result import (
     NamedEffect,
     Quality,
     RecordingErrors,
-    Verdict,
 )
 
 Document = dict[str, Any]
@@ -83,9 +83,9 @@ def _found(diagnosis: Diagnosis, evidence: Evidence) -> str:
     if evidence.findings:
         sentences = " ".join(f"{effect(one.effect).statement}." for one in evidence.findings)
         return f"{sentences} {100.0 * evidence.quality.removed:.0f} % of the explainable mismatch is gone."
-    if diagnosis.verdict is Verdict.CANNOT_TELL:
+    if diagnosis.verdict is DiagnosisVerdict.CANNOT_TELL:
         return _too_little(diagnosis, evidence)
-    if diagnosis.verdict is Verdict.UNEXPLAINED:
+    if diagnosis.verdict is DiagnosisVerdict.UNEXPLAINED:
         where = evidence.maps_before[0].coordinate
         return f"Something is left that no known physics explains; it shows most over {where}."
     return "The model is adequate: nothing worth naming is left beyond the noise."

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from servod.lab.diagnose.data.trace import Trace
+from servod.lab.diagnose.data.trace import CheckedTrace
 from servod.lab.diagnose.settings import SETTINGS
 
 #: Effects that show against the inertia of the axis alone.
@@ -27,19 +27,19 @@ SWIFT = frozenset(
 DIRECTED = frozenset(("asymmetry", "torque_offset"))
 
 
-def unexcited_effects(traces: Sequence[Trace], inertia: float) -> frozenset[str]:
+def unexcited_effects(traces: Sequence[CheckedTrace], inertia: float) -> frozenset[str]:
     """Effects that these recordings of an axis of this inertia cannot show."""
     return (SWIFT if creeps(traces, inertia) else frozenset()) | (DIRECTED if one_way(traces) else frozenset())
 
 
-def one_way(traces: Sequence[Trace]) -> bool:
+def one_way(traces: Sequence[CheckedTrace]) -> bool:
     """Whether the axis hardly goes one of its two ways."""
     speed = np.concatenate([trace.velocity[trace.counts] for trace in traces])
     goes = SETTINGS.excitation.moving_speed * float(np.quantile(np.abs(speed), 0.98))
     return min(float(np.mean(speed > goes)), float(np.mean(speed < -goes))) < SETTINGS.excitation.least_either_way
 
 
-def creeps(traces: Sequence[Trace], inertia: float) -> bool:
+def creeps(traces: Sequence[CheckedTrace], inertia: float) -> bool:
     """Whether the command of an axis of this inertia goes into friction and cogging alone."""
     needed = np.abs(np.concatenate([inertia * trace.acceleration[trace.counts] for trace in traces]))
     needed = np.minimum(needed, np.quantile(needed, 1.0 - SETTINGS.excitation.otherwise))
