@@ -11,6 +11,7 @@ from typing import Any
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.result import (
     Diagnosis,
+    DiagnosisVerdict,
     Evidence,
     FittedValue,
     FreeRun,
@@ -19,7 +20,6 @@ from servod.lab.diagnose.result import (
     NamedEffect,
     Quality,
     RecordingErrors,
-    Verdict,
 )
 
 Document = dict[str, Any]
@@ -82,9 +82,9 @@ def _found(diagnosis: Diagnosis, evidence: Evidence) -> str:
     if evidence.findings:
         sentences = " ".join(f"{effect(one.effect).statement}." for one in evidence.findings)
         return f"{sentences} {100.0 * evidence.quality.removed:.0f} % of the explainable mismatch is gone."
-    if diagnosis.verdict is Verdict.CANNOT_TELL:
+    if diagnosis.verdict is DiagnosisVerdict.CANNOT_TELL:
         return _too_little(diagnosis, evidence)
-    if diagnosis.verdict is Verdict.UNEXPLAINED:
+    if diagnosis.verdict is DiagnosisVerdict.UNEXPLAINED:
         where = evidence.maps_before[0].coordinate
         return f"Something is left that no known physics explains; it shows most over {where}."
     return "The model is adequate: nothing worth naming is left beyond the noise."

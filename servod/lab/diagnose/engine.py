@@ -14,11 +14,11 @@ from servod.formats.model.axis_model import AxisModel
 from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.judge.conclude import conclude, extended_model, free_windows
 from servod.lab.diagnose.judge.findings import name_findings
-from servod.lab.diagnose.judge.judgement import Judgement, judge, predicts_nothing, without_names
+from servod.lab.diagnose.judge.judgement import JudgedSelection, judge, predicts_nothing, without_names
 from servod.lab.diagnose.judge.verdict import below_noise, verdict
 from servod.lab.diagnose.predict.coordinates import units
 from servod.lab.diagnose.predict.predict import Predictor
-from servod.lab.diagnose.result import Diagnosis, Verdict
+from servod.lab.diagnose.result import Diagnosis, DiagnosisVerdict
 from servod.lab.diagnose.select.cross_validation import cross_validate
 from servod.lab.diagnose.select.refine import add_drift, add_group, much_left, restore_nominal
 from servod.lab.diagnose.select.selector import Selector
@@ -46,7 +46,7 @@ def diagnose(
     traces, refused = load_traces(recordings, model)
     seconds = {"intake": monotonic() - begun}
     if not traces:
-        return Diagnosis(units(model), tuple(refused), Verdict.CANNOT_TELL, None, seconds | {"windows": 0.0})
+        return Diagnosis(units(model), tuple(refused), DiagnosisVerdict.CANNOT_TELL, None, seconds | {"windows": 0.0})
     tell(f"{len(traces)} recordings taken in")
     selector = Selector(Predictor(traces, model), model, begun + SETTINGS.forward.search_share * time_limit_s, tell)
     selection = swap_terms(selector, forward_selection(selector, selector.fit_base()))
@@ -63,15 +63,15 @@ def diagnose(
     return Diagnosis(units(model), tuple(refused), final, conclude(judgement, extended, free), seconds)
 
 
-def _verdict(judgement: Judgement) -> tuple[Verdict, Judgement]:
+def _verdict(judgement: JudgedSelection) -> tuple[DiagnosisVerdict, JudgedSelection]:
     """The verdict, and the judgement without names where none may stand."""
     predictor, selection = judgement.predictor, judgement.selection
     found = verdict(judgement.named, judgement.errors, predictor.dry)
-    if found is Verdict.MISSING_PHYSICS and predicts_nothing(judgement):
-        found = Verdict.UNEXPLAINED
-    if found is Verdict.UNEXPLAINED:
+    if found is DiagnosisVerdict.MISSING_PHYSICS and predicts_nothing(judgement):
+        found = DiagnosisVerdict.UNEXPLAINED
+    if found is DiagnosisVerdict.UNEXPLAINED:
         judgement = without_names(judgement)
-    untried = found is Verdict.UNEXPLAINED and selection.cut and selection.tried == 0
+    untried = found is DiagnosisVerdict.UNEXPLAINED and selection.cut and selection.tried == 0
     if untried or below_noise(found, predictor.encoder_noise, predictor.dry):
-        found = Verdict.CANNOT_TELL
+        found = DiagnosisVerdict.CANNOT_TELL
     return found, judgement

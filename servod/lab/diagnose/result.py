@@ -20,7 +20,7 @@ from servod.lab.diagnose.settings import SETTINGS
 Array = NDArray[np.float64]
 
 
-class Verdict(StrEnum):
+class DiagnosisVerdict(StrEnum):
     """The outside contract's verdicts, and one for data that can tell nothing."""
 
     ADEQUATE = "adequate"
@@ -285,6 +285,6 @@ class Diagnosis:
 
     units: Units
     refused: tuple[RefusedRecording, ...]
-    verdict: Verdict
+    verdict: DiagnosisVerdict
     evidence: Evidence | None
     seconds: Mapping[str, float]

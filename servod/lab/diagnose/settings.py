@@ -406,7 +406,7 @@ class VerdictSettings:
 
 
 @dataclass(frozen=True)
-class Settings:
+class DiagnosisSettings:
     """All of them, in the order in which the stages read them."""
 
     intake: IntakeSettings = IntakeSettings()
@@ -430,4 +430,4 @@ class Settings:
 
 
 #: The settings of every diagnosis.
-SETTINGS = Settings()
+SETTINGS = DiagnosisSettings()

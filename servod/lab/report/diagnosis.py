@@ -150,7 +150,7 @@ def _fit(report: Report, evidence: Evidence, document: Document, units: Units) -
     if held["not_judged_s"]:
         report.page.sentence(
             f"Errors leave out {held['not_judged_s']:.2g} s in and behind an external torque that came once: nothing "
-            "foretells it. The share that it carries is that of the fit itself."
+            "predicts it. The share that it carries is that of the fit itself."
         )
     rows = [
         (f"{horizon} s", f"{w['before']:.4g}", f"{w['recalibrated']:.4g}", f"{w['after']:.4g}", w["unit"])

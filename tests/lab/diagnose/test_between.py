@@ -14,7 +14,7 @@ from servod.lab.diagnose.judge.covariance import common_factor, jackknife, model
 from servod.lab.diagnose.predict.innovation_kernel import mean_command
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.fit import Fit
-from servod.lab.diagnose.select.selection import HeldOut
+from servod.lab.diagnose.select.selection import HeldOutErrors
 from tests.lab.diagnose.axes import believed, record
 
 
@@ -44,7 +44,7 @@ def test_estimates_are_as_sure_as_recordings_agree() -> None:
     _, fit = colder(1.0, 1.3)
     off = np.zeros_like(fit.coordinates)
     off[0] = 0.02
-    held = HeldOut(fit.mismatch, 0.0, (), (fit.coordinates + off, fit.coordinates - off))
+    held = HeldOutErrors(fit.mismatch, 0.0, (), (fit.coordinates + off, fit.coordinates - off))
     assert jackknife(fit, held)[0, 0] == pytest.approx(0.5 * 2 * 0.02**2)
     assert np.all(np.diag(model_error(fit))[:2] > 0.0)
     assert not common_factor(fit).any()

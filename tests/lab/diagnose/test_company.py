@@ -17,7 +17,7 @@ from servod.lab.diagnose.select.candidates import Candidate
 from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.select.merit import Merit
 from servod.lab.diagnose.select.refine import add_first
-from servod.lab.diagnose.select.selection import Entry, Selection
+from servod.lab.diagnose.select.selection import Selection, TermEntry
 from servod.lab.diagnose.select.selector import Selector
 from servod.lab.diagnose.select.stepwise import swap_terms
 from tests.lab.diagnose.axes import believed, record
@@ -51,7 +51,7 @@ def mistaken(selector: Selector) -> tuple[Selection, Candidate]:
     base = selector.settle(selector.start, None, mismatch)
     weight = Candidate("gravity", added(selector, base, "gravity"), 0.5)
     both = added(selector, added(selector, base, "spring"), "asymmetry")
-    entries = (Entry(0.5, (weight,)), Entry(0.1, ()))
+    entries = (TermEntry(0.5, (weight,)), TermEntry(0.1, ()))
     return Selection(base, both, selector.error(mismatch), 0.0, (UNKNOWN,) * 2, entries, tried=1), weight
 
 
@@ -83,7 +83,7 @@ def test_a_rival_that_ends_at_the_end_of_a_range_is_not_put_in(
     selector: Selector, mistaken: tuple[Selection, Candidate]
 ) -> None:
     given, weight = mistaken
-    selection = replace(given, entries=(Entry(0.5, (bounded(weight),)), given.entries[1]))
+    selection = replace(given, entries=(TermEntry(0.5, (bounded(weight),)), given.entries[1]))
     assert swap_terms(selector, selection).fit is given.fit
 
 

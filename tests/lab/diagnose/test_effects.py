@@ -27,7 +27,7 @@ from servod.lab.diagnose.judge.verdict import alternatives
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.select.levels import named_terms
-from servod.lab.diagnose.select.selection import Entry, Selection
+from servod.lab.diagnose.select.selection import Selection, TermEntry
 from servod.lab.diagnose.select.selector import once_only
 from tests.lab.diagnose.axes import believed, record
 
@@ -120,7 +120,7 @@ def test_a_new_record_is_in_every_list(add: Callable[[Effect], None]) -> None:
         coordinates = hypothesis.start.copy()
         coordinates[hypothesis.share(0)] = stiffness.unknowns[0].coordinate(value)
         fit = Fit(hypothesis, coordinates, scene().mismatch, 0.0, np.zeros((0, 0)), True)
-        selection = Selection(fit, fit, 0.0, 0.0, (), (Entry(0.1, ()), Entry(0.1, ())))
+        selection = Selection(fit, fit, 0.0, 0.0, (), (TermEntry(0.1, ()), TermEntry(0.1, ())))
         assert named_terms(fit, scene().document) == named
         assert alternatives(selection, 0) == ["spring"]
         assert common_factor(fit)[hypothesis.share(0)].any()

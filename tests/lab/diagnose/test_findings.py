@@ -15,13 +15,13 @@ from servod.lab.diagnose.effects.hypothesis import Term
 from servod.lab.diagnose.effects.scene import Scene
 from servod.lab.diagnose.judge.conclude import minor
 from servod.lab.diagnose.judge.findings import differs_from_zero, name_findings
-from servod.lab.diagnose.judge.judgement import Judgement, judge
+from servod.lab.diagnose.judge.judgement import JudgedSelection, judge
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.result import MinorReason
 from servod.lab.diagnose.select.cross_validation import cross_validate
 from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.select.merit import Merit, large_enough
-from servod.lab.diagnose.select.selection import Entry, Selection
+from servod.lab.diagnose.select.selection import Selection, TermEntry
 from servod.lab.diagnose.select.selector import Selector
 from tests.lab.diagnose.axes import believed, record
 
@@ -47,7 +47,7 @@ def form(selector: Selector, name: str) -> Term:
     return effect(name).terms(Scene(selector.start.document, selector.predictor, mismatch))[0]
 
 
-def sorted_with(selector: Selector, *terms: Term) -> Judgement:
+def sorted_with(selector: Selector, *terms: Term) -> JudgedSelection:
     """The judgement of these terms, fitted together."""
     base = selector.settle(selector.start, None, selector.predictor.mismatch(believed()))
     fit = base
@@ -55,7 +55,7 @@ def sorted_with(selector: Selector, *terms: Term) -> Judgement:
         hypothesis = fit.hypothesis.with_term(term)
         fit = selector.settle(hypothesis, hypothesis.beside(fit.coordinates), fit.mismatch)
     error = selector.error(selector.predictor.mismatch(believed()))
-    merits, entries = (UNKNOWN,) * len(terms), (Entry(0.1, ()),) * len(terms)
+    merits, entries = (UNKNOWN,) * len(terms), (TermEntry(0.1, ()),) * len(terms)
     selection = Selection(base, fit, error, 0.0, merits, entries, {"gravity": UNKNOWN}, 1)
     return name_findings(selector, judge(selector, cross_validate(selector, selection)))
 

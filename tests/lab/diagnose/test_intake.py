@@ -9,7 +9,7 @@ from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.engine import diagnose
 from servod.lab.diagnose.judge.verdict import below_noise
 from servod.lab.diagnose.predict.predict import Predictor
-from servod.lab.diagnose.result import Verdict
+from servod.lab.diagnose.result import DiagnosisVerdict
 from servod.lab.recordings import Recording
 from tests.lab.diagnose.axes import believed, record, recording
 
@@ -75,7 +75,7 @@ def test_glitches_and_turns_are_repaired(made: Recording) -> None:
 
 def test_nothing_that_can_tell_is_said_so(made: Recording) -> None:
     found = diagnose(believed(), [recording(made.t_s[:900], made.torque[:900], made.position[:900])])
-    assert found.verdict is Verdict.CANNOT_TELL
+    assert found.verdict is DiagnosisVerdict.CANNOT_TELL
     assert found.evidence is None
 
 
@@ -136,7 +136,7 @@ def test_noise_that_hides_what_is_left_is_no_finding_of_physics(made: Recording)
     model = believed()
     predictor = Predictor(load_traces([recording(made.t_s, made.torque, made.position + noise)], model)[0], model)
     assert predictor.encoder_noise == pytest.approx(model.inertia * predictor.rate**2 * 0.01, rel=0.1)
-    assert below_noise(Verdict.UNEXPLAINED, predictor.encoder_noise, predictor.dry)
-    assert not below_noise(Verdict.MISSING_PHYSICS, predictor.encoder_noise, predictor.dry)
+    assert below_noise(DiagnosisVerdict.UNEXPLAINED, predictor.encoder_noise, predictor.dry)
+    assert not below_noise(DiagnosisVerdict.MISSING_PHYSICS, predictor.encoder_noise, predictor.dry)
     quiet = Predictor(load_traces([made], model)[0], model)
-    assert not below_noise(Verdict.UNEXPLAINED, quiet.encoder_noise, quiet.dry)
+    assert not below_noise(DiagnosisVerdict.UNEXPLAINED, quiet.encoder_noise, quiet.dry)

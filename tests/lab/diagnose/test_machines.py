@@ -9,7 +9,7 @@ import numpy as np
 
 from servod.formats.model.axis_model import AxisModel, load_axis_model
 from servod.lab.diagnose.data.intake import load_traces
-from servod.lab.diagnose.data.trace import Trace
+from servod.lab.diagnose.data.trace import CheckedTrace
 from servod.lab.diagnose.effects import effect, names, unexcited_effects
 from servod.lab.diagnose.effects.base import document_of
 from servod.lab.diagnose.effects.cogging import whole_orders
@@ -29,7 +29,7 @@ ODRIVE = SHARED["recordings/odrive_cogging"]
 XL330 = SHARED["recordings/bam_xl330"]
 
 
-def traces_of(machine: str, path: Path, to_s: float | None = None) -> tuple[list[Trace], AxisModel]:
+def traces_of(machine: str, path: Path, to_s: float | None = None) -> tuple[list[CheckedTrace], AxisModel]:
     """The traces of one recording of a machine in `examples`, and its model."""
     model = load_axis_model(EXAMPLES / f"{machine}.yaml")
     traces, refused = load_traces([load_recording(path, EXAMPLES / f"{machine}_map.yaml").between(None, to_s)], model)

@@ -17,11 +17,11 @@ from servod.lab.diagnose.effects.hypothesis import Hypothesis
 from servod.lab.diagnose.effects.scene import Peak, Scene
 from servod.lab.diagnose.judge.verdict import Shares, alternatives, verdict
 from servod.lab.diagnose.predict.predict import Predictor
-from servod.lab.diagnose.result import Verdict
+from servod.lab.diagnose.result import DiagnosisVerdict
 from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.select.levels import at_end_of_range, named_terms
 from servod.lab.diagnose.select.merit import Merit, acting_torque, worth_naming
-from servod.lab.diagnose.select.selection import Entry, Selection
+from servod.lab.diagnose.select.selection import Selection, TermEntry
 from servod.lab.diagnose.settings import SETTINGS
 from tests.lab.diagnose.axes import believed, record
 
@@ -68,14 +68,14 @@ def test_a_push_lies_within_its_recording(scene: Scene) -> None:
 @pytest.mark.parametrize(
     ("removed", "left", "answer"),
     [
-        (0.83, 0.04, Verdict.UNEXPLAINED),
-        (0.88, 0.04, Verdict.MISSING_PHYSICS),
-        (0.91, 0.15, Verdict.UNEXPLAINED),
-        (0.94, 0.15, Verdict.MISSING_PHYSICS),
-        (0.60, 0.01, Verdict.MISSING_PHYSICS),
+        (0.83, 0.04, DiagnosisVerdict.UNEXPLAINED),
+        (0.88, 0.04, DiagnosisVerdict.MISSING_PHYSICS),
+        (0.91, 0.15, DiagnosisVerdict.UNEXPLAINED),
+        (0.94, 0.15, DiagnosisVerdict.MISSING_PHYSICS),
+        (0.60, 0.01, DiagnosisVerdict.MISSING_PHYSICS),
     ],
 )
-def test_names_must_explain_most_of_what_is_left(removed: float, left: float, answer: Verdict) -> None:
+def test_names_must_explain_most_of_what_is_left(removed: float, left: float, answer: DiagnosisVerdict) -> None:
     """Names that leave a sixth of the explainable error are somebody else's, unless what they leave is next to none.
 
     `left` is a share of dry friction.
@@ -127,7 +127,7 @@ def test_a_drive_that_is_late_has_one_name(scene: Scene) -> None:
         for place, value in ((0, late), (1, lag)):
             coordinates[hypothesis.share(place)] = terms[place].unknowns[0].coordinate(value)
         fit = Fit(hypothesis, coordinates, scene.mismatch, 0.0, np.zeros((0, 0)), True)
-        selection = Selection(fit, fit, 0.0, 0.0, (), (Entry(0.1, ()), Entry(0.1, ())))
+        selection = Selection(fit, fit, 0.0, 0.0, (), (TermEntry(0.1, ()), TermEntry(0.1, ())))
         assert named_terms(fit, scene.document) == places
         assert alternatives(selection, places[0]) == [terms[1 - places[0]].effect]
 

@@ -11,18 +11,18 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from servod.lab.diagnose.data.trace import Trace
+from servod.lab.diagnose.data.trace import CheckedTrace
 from servod.lab.diagnose.settings import SETTINGS
 
 
-def one_way(traces: Sequence[Trace]) -> bool:
+def one_way(traces: Sequence[CheckedTrace]) -> bool:
     """Whether the axis hardly goes one of its two ways."""
     speed = np.concatenate([trace.velocity[trace.counts] for trace in traces])
     goes = SETTINGS.excitation.moving_speed * float(np.quantile(np.abs(speed), 0.98))
     return min(float(np.mean(speed > goes)), float(np.mean(speed < -goes))) < SETTINGS.excitation.least_either_way
 
 
-def creeps(traces: Sequence[Trace], inertia: float) -> bool:
+def creeps(traces: Sequence[CheckedTrace], inertia: float) -> bool:
     """Whether the command of an axis of this inertia goes into friction and cogging alone."""
     needed = np.abs(np.concatenate([inertia * trace.acceleration[trace.counts] for trace in traces]))
     needed = np.minimum(needed, np.quantile(needed, 1.0 - SETTINGS.excitation.otherwise))

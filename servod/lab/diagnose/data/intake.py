@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.formats.model.axis_model import AxisKind, AxisModel
-from servod.lab.diagnose.data.trace import Rows, Trace, dry_friction
+from servod.lab.diagnose.data.trace import CheckedTrace, Rows, dry_friction
 from servod.lab.diagnose.result import RefusedRecording
 from servod.lab.diagnose.settings import SETTINGS
 from servod.lab.recordings import Quantity, Recording
@@ -45,7 +45,7 @@ class Factor:
         return abs(self.value) > SETTINGS.intake.certain_errors * self.error
 
 
-def wrong_sign_or_unit(trace: Trace, model: AxisModel) -> str | None:
+def wrong_sign_or_unit(trace: CheckedTrace, model: AxisModel) -> str | None:
     """A sign or a unit that cannot be, in one line; None when nothing speaks against the recording."""
     moved, dry, understood = factors(trace, model)
     if understood < SETTINGS.intake.understood:
@@ -72,7 +72,7 @@ def _position_unit(moved: float, model: AxisModel) -> str | None:
     return None
 
 
-def factors(trace: Trace, model: AxisModel) -> tuple[Factor, Factor, float]:
+def factors(trace: CheckedTrace, model: AxisModel) -> tuple[Factor, Factor, float]:
     """Factors of motion (inertia and viscous friction) and of dry friction in the command, and the share understood."""
     x, v = trace.drive.position, trace.velocity
     rows = trace.counts & np.isfinite(v)
@@ -97,9 +97,9 @@ def factors(trace: Trace, model: AxisModel) -> tuple[Factor, Factor, float]:
 Array = NDArray[np.float64]
 
 
-def load_traces(recordings: Sequence[Recording], model: AxisModel) -> tuple[list[Trace], list[RefusedRecording]]:
+def load_traces(recordings: Sequence[Recording], model: AxisModel) -> tuple[list[CheckedTrace], list[RefusedRecording]]:
     """Traces of the recordings that can tell, and why the others cannot; names are unique."""
-    traces: list[Trace] = []
+    traces: list[CheckedTrace] = []
     refused: list[RefusedRecording] = []
     for index, recording in enumerate(recordings):
         name = recording.path.name
@@ -114,7 +114,7 @@ def load_traces(recordings: Sequence[Recording], model: AxisModel) -> tuple[list
     return traces, refused
 
 
-def make_trace(recording: Recording, name: str, shift_s: float) -> Trace:
+def make_trace(recording: Recording, name: str, shift_s: float) -> CheckedTrace:
     """The recording with glitches repaired, on a time of its own."""
     notes = [_shorten_note(note) for note in recording.report]
     drive = recording.drive
@@ -131,7 +131,7 @@ def make_trace(recording: Recording, name: str, shift_s: float) -> Trace:
         warm is not None and bool(np.isfinite(drive.temperature_c).all()) and _temperature_changes(drive.temperature_c)
     )
     moved = Drive(t_s, torque, position, drive.temperature_c)
-    return Trace(name, moved, counts, tuple(notes), has_temperature, shift_s - float(drive.t_s[0]), shift_s)
+    return CheckedTrace(name, moved, counts, tuple(notes), has_temperature, shift_s - float(drive.t_s[0]), shift_s)
 
 
 def _shorten_note(note: str) -> str:
@@ -199,7 +199,7 @@ def _note_saturation(torque: Array, notes: list[str]) -> None:
         notes.append(f"command: at its limit in {100.0 * share:.0f} % of the rows")
 
 
-def refusal_reason(trace: Trace, model: AxisModel) -> str | None:
+def refusal_reason(trace: CheckedTrace, model: AxisModel) -> str | None:
     """Why this recording cannot tell anything about this model; None when it can."""
     return (
         _too_coarse(trace)
@@ -212,7 +212,7 @@ def refusal_reason(trace: Trace, model: AxisModel) -> str | None:
     )
 
 
-def _too_coarse(trace: Trace) -> str | None:
+def _too_coarse(trace: CheckedTrace) -> str | None:
     """Friction and inertia of a servo axis act within milliseconds; and time may be in other units than seconds."""
     period_s = trace.period_s
     if period_s <= SETTINGS.intake.coarsest_s:
@@ -221,7 +221,7 @@ def _too_coarse(trace: Trace) -> str | None:
     return f"too coarse: {period_s:.3g} s between rows, at most {most_s:g} s; t_s is in seconds (--map scales it)"
 
 
-def _too_short(trace: Trace) -> str | None:
+def _too_short(trace: CheckedTrace) -> str | None:
     rows, least_s, least_rows = int(trace.counts.sum()), SETTINGS.intake.least_s, SETTINGS.intake.least_rows
     if trace.duration_s >= least_s and rows >= least_rows:
         return None
@@ -230,7 +230,7 @@ def _too_short(trace: Trace) -> str | None:
     )
 
 
-def _too_still(trace: Trace) -> str | None:
+def _too_still(trace: CheckedTrace) -> str | None:
     position = trace.drive.position
     steps = np.abs(np.diff(position))
     quantum = float(steps[steps > 0.0].min()) if np.any(steps > 0.0) else 0.0
@@ -245,18 +245,18 @@ def _too_still(trace: Trace) -> str | None:
     return f"too still: the axis moves over {room:.3g} in all, and in {100.0 * moving:.0f} % of the rows"
 
 
-def _never_changes(trace: Trace) -> str | None:
+def _never_changes(trace: CheckedTrace) -> str | None:
     return "the command never changes" if float(np.ptp(trace.drive.torque)) == 0.0 else None
 
 
-def _saturated(trace: Trace) -> str | None:
+def _saturated(trace: CheckedTrace) -> str | None:
     share = _at_limit(trace.drive.torque)
     if share < SETTINGS.intake.saturated:
         return None
     return f"saturated: the command stands at its limit in {100.0 * share:.0f} % of the rows"
 
 
-def _too_noisy(trace: Trace, model: AxisModel) -> str | None:
+def _too_noisy(trace: CheckedTrace, model: AxisModel) -> str | None:
     dry = dry_friction(model)
     spoken = SETTINGS.intake.noise_of_command * float(np.std(trace.drive.torque))
     noise = (

@@ -20,7 +20,7 @@ Rows = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Trace:
+class CheckedTrace:
     """A checked recording: `drive` (SI units of the axis), `counts` marks the rows that may be compared with a model.
 
     `notes` say in plain sentences what was found wrong and what was done about it. `shift_s` was added to the recorded

@@ -12,7 +12,7 @@ from functools import cache
 from importlib import import_module
 
 from servod.lab.diagnose.data.excitation import creeps, one_way
-from servod.lab.diagnose.data.trace import Trace
+from servod.lab.diagnose.data.trace import CheckedTrace
 from servod.lab.diagnose.effects.effect import Effect
 
 #: Names of the outside contract and our own (offset_drift), in the order in which they are tried and explained.
@@ -60,7 +60,7 @@ def names(which: Callable[[Effect], bool]) -> frozenset[str]:
     return frozenset(found.name for found in effects() if which(found))
 
 
-def unexcited_effects(traces: Sequence[Trace], inertia: float) -> frozenset[str]:
+def unexcited_effects(traces: Sequence[CheckedTrace], inertia: float) -> frozenset[str]:
     """Effects that these recordings of an axis of this inertia cannot show."""
     slow, straight = creeps(traces, inertia), one_way(traces)
     return names(lambda found: (slow and found.swift) or (straight and found.directed))

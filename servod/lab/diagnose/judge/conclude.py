@@ -17,7 +17,7 @@ from servod.lab.diagnose.effects.hypothesis import Document, Reported
 from servod.lab.diagnose.judge.covariance import inside_region
 from servod.lab.diagnose.judge.curves import course, signature, spectrum
 from servod.lab.diagnose.judge.free_run import window_errors, windows
-from servod.lab.diagnose.judge.judgement import Judgement
+from servod.lab.diagnose.judge.judgement import JudgedSelection
 from servod.lab.diagnose.judge.locate import bands, locate
 from servod.lab.diagnose.judge.verdict import alternatives, confidence
 from servod.lab.diagnose.predict.floor import trace_floor
@@ -39,7 +39,7 @@ from servod.lab.diagnose.settings import SETTINGS
 Array = NDArray[np.float64]
 
 
-def conclude(judgement: Judgement, model: AxisModel, free: tuple[Windows, ...]) -> Evidence:
+def conclude(judgement: JudgedSelection, model: AxisModel, free: tuple[Windows, ...]) -> Evidence:
     """The plain result; `model` is that of `extended_model` and `free` the errors of `free_windows`."""
     predictor, selection = judgement.predictor, judgement.selection
     return Evidence(
@@ -59,14 +59,14 @@ def conclude(judgement: Judgement, model: AxisModel, free: tuple[Windows, ...]) 
     )
 
 
-def findings(judgement: Judgement) -> tuple[NamedEffect, ...]:
+def findings(judgement: JudgedSelection) -> tuple[NamedEffect, ...]:
     """One for each effect; terms of the same effect are one finding."""
     terms = judgement.fit.hypothesis.terms
     names = list(dict.fromkeys(terms[place].effect for place in judgement.named))
     return tuple(_finding(judgement, name, [p for p in judgement.named if terms[p].effect == name]) for name in names)
 
 
-def _finding(judgement: Judgement, name: str, named: Sequence[int]) -> NamedEffect:
+def _finding(judgement: JudgedSelection, name: str, named: Sequence[int]) -> NamedEffect:
     fit, first, selection = judgement.fit, named[0], judgement.selection
     contribution = judgement.validation.reduced[first].mismatch - fit.mismatch
     return NamedEffect(
@@ -84,7 +84,7 @@ def _finding(judgement: Judgement, name: str, named: Sequence[int]) -> NamedEffe
     )
 
 
-def parameters(judgement: Judgement, named: Sequence[int]) -> dict[str, FittedValue]:
+def parameters(judgement: JudgedSelection, named: Sequence[int]) -> dict[str, FittedValue]:
     """Reported values of the terms with their 95 % intervals; later terms of the same effect are numbered."""
     found: dict[str, FittedValue] = {}
     for count, place in enumerate(named):
@@ -102,7 +102,7 @@ def _reported(fit: Fit, place: int, coordinates: Array) -> list[Reported]:
     return fit.hypothesis.terms[place].tell(document, fit.hypothesis.values(coordinates)[fit.hypothesis.share(place)])
 
 
-def _deviations(judgement: Judgement, place: int, values: Sequence[Reported]) -> Array:
+def _deviations(judgement: JudgedSelection, place: int, values: Sequence[Reported]) -> Array:
     """Standard deviations of reported values, by their derivatives."""
     fit = judgement.fit
     slopes = np.zeros((len(values), len(fit.coordinates)))
@@ -115,7 +115,7 @@ def _deviations(judgement: Judgement, place: int, values: Sequence[Reported]) ->
     return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
 
 
-def minor(judgement: Judgement) -> dict[str, Minor]:
+def minor(judgement: JudgedSelection) -> dict[str, Minor]:
     """Effects that are there but not worth naming, and those that stand in the model and are no findings."""
     terms, merits = judgement.fit.hypothesis.terms, judgement.selection.merits
     named = {terms[place].effect for place in judgement.named}
@@ -131,7 +131,7 @@ def _minor(merit: Merit) -> Minor:
     return Minor(merit.torque, max(merit.share, 0.0))
 
 
-def recalibrated(judgement: Judgement) -> dict[str, FittedValue]:
+def recalibrated(judgement: JudgedSelection) -> dict[str, FittedValue]:
     """Parameters of the model itself that were off, with their 95 % intervals. Those of a finding are not here."""
     fit = judgement.fit
     opened = {key for place in judgement.named for key in fit.hypothesis.terms[place].opens}
@@ -147,7 +147,7 @@ def recalibrated(judgement: Judgement) -> dict[str, FittedValue]:
     return found
 
 
-def extended_model(judgement: Judgement, nominal: AxisModel) -> AxisModel:
+def extended_model(judgement: JudgedSelection, nominal: AxisModel) -> AxisModel:
     """The axis model with the physics added.
 
     A disturbance that stood in one recording is an event, no physics of the axis, and stays out.
@@ -170,7 +170,7 @@ def extended_model(judgement: Judgement, nominal: AxisModel) -> AxisModel:
     return AxisModel.model_validate(document)
 
 
-def _model_coordinates(judgement: Judgement) -> Array:
+def _model_coordinates(judgement: JudgedSelection) -> Array:
     """Coordinates of the model to hand out: what the report says, as long as that can be said.
 
     Where nothing has a name, parameters that are not told from what they were stay what they were: those of an axis
@@ -186,7 +186,7 @@ def _model_coordinates(judgement: Judgement) -> Array:
     return fit.coordinates - back if inside_region(back, judgement.covariance) else fit.coordinates
 
 
-def free_windows(judgement: Judgement, nominal: AxisModel, model: AxisModel) -> tuple[Windows, ...]:
+def free_windows(judgement: JudgedSelection, nominal: AxisModel, model: AxisModel) -> tuple[Windows, ...]:
     """Errors of free windows. What has no name is a table over everything, so that its rows have been seen."""
     predictor, after = judgement.predictor, judgement.validation.after.folds
     if judgement.residual is not None:
@@ -195,7 +195,7 @@ def free_windows(judgement: Judgement, nominal: AxisModel, model: AxisModel) -> 
     return windows(errors, predictor, judgement.validation.folds.judged)
 
 
-def _quality(judgement: Judgement, free: tuple[Windows, ...]) -> Quality:
+def _quality(judgement: JudgedSelection, free: tuple[Windows, ...]) -> Quality:
     """Errors before and after, and for how long the recordings are not judged since only an event stands there."""
     predictor, shared = judgement.predictor, judgement.validation.folds
     events = predictor.counts & ~shared.judged
@@ -217,7 +217,7 @@ def _quality(judgement: Judgement, free: tuple[Windows, ...]) -> Quality:
     )
 
 
-def _recording(judgement: Judgement, index: int) -> RecordingErrors:
+def _recording(judgement: JudgedSelection, index: int) -> RecordingErrors:
     """One recording by fits that have not seen the rows."""
     predictor = judgement.predictor
     trace, part = predictor.traces[index], predictor.slices[index]

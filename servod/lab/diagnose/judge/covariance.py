@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.base import TORQUES
 from servod.lab.diagnose.select.fit import Fit, Weighing, covariance
-from servod.lab.diagnose.select.selection import HeldOut
+from servod.lab.diagnose.select.selection import HeldOutErrors
 from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
@@ -21,12 +21,12 @@ Array = NDArray[np.float64]
 BRISTLE = ("friction.sigma0", "friction.sigma1")
 
 
-def total_covariance(fit: Fit, weighing: Weighing, period_s: float, held: HeldOut) -> Array:
+def total_covariance(fit: Fit, weighing: Weighing, period_s: float, held: HeldOutErrors) -> Array:
     """Covariance of the coordinates of `fit`; `held` has the fits without each recording."""
     return covariance(fit, weighing, period_s) + jackknife(fit, held) + model_error(fit) + common_factor(fit)
 
 
-def jackknife(fit: Fit, held: HeldOut) -> Array:
+def jackknife(fit: Fit, held: HeldOutErrors) -> Array:
     """By how much the fits without each recording disagree (Efron, The Jackknife, 1982)."""
     count, size = len(held.coordinates), len(fit.coordinates)
     if count < 2:

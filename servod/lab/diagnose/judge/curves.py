@@ -10,10 +10,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from servod.lab.diagnose.data.trace import Trace
+from servod.lab.diagnose.data.trace import CheckedTrace
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.looks import Look, Split
-from servod.lab.diagnose.judge.judgement import Judgement
+from servod.lab.diagnose.judge.judgement import JudgedSelection
 from servod.lab.diagnose.predict.coordinates import coordinates
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.result import Signature, SignaturePart, Spectrum
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 _HALVES = {Split.DIRECTION: ("forward", "back"), Split.LOAD: ("command above zero", "command below zero")}
 
 
-def signature(judgement: Judgement, place: int) -> Signature:
+def signature(judgement: JudgedSelection, place: int) -> Signature:
     """What is left without the term at `place`, and what it makes of it, over its coordinate and over time."""
     predictor, shown = judgement.predictor, effect(judgement.fit.hypothesis.terms[place].effect).look
     without, left = judgement.validation.reduced[place].mismatch, judgement.fit.mismatch
@@ -71,7 +71,7 @@ def _part(name: str, values: Array, without: Array, term: Array, rows: NDArray[n
     return SignaturePart(name, middle, left, 2.0 * np.sqrt(np.maximum(square - left**2, 0.0) / independent), made)
 
 
-def _period(judgement: Judgement, place: int, values: Array) -> float | None:
+def _period(judgement: JudgedSelection, place: int, values: Array) -> float | None:
     """The period of a periodic term where many of them lie in the range."""
     fit = judgement.fit
     reported = fit.hypothesis.terms[place].tell(
@@ -99,7 +99,7 @@ def _stretch(predictor: Predictor, term: Array) -> tuple[int, int, int]:
     return best[1:]
 
 
-def course(trace: Trace, *errors: Array) -> tuple[Array, ...]:
+def course(trace: CheckedTrace, *errors: Array) -> tuple[Array, ...]:
     """Begins of short stretches of a recording, s, and the root mean square of each error in them."""
     rows = max(1, round(SETTINGS.curves.course_s / trace.period_s))
     count = len(trace.drive.t_s) // rows

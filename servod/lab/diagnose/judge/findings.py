@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.lab.diagnose.judge.covariance import inside_region
-from servod.lab.diagnose.judge.judgement import Judgement
+from servod.lab.diagnose.judge.judgement import JudgedSelection
 from servod.lab.diagnose.result import MinorReason
 from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.select.levels import at_end_of_range, is_level_change, shorter_twin
@@ -34,7 +34,7 @@ WHERE = frozenset(("shift", "torque_at_middle", "start_s", "position"))
 POSITIVE = frozenset(("time_constant_s", "gap"))
 
 
-def name_findings(selector: Selector, judgement: Judgement) -> Judgement:
+def name_findings(selector: Selector, judgement: JudgedSelection) -> JudgedSelection:
     """The judgement with those named that are findings beside all others, and why the rest of the terms is none.
 
     What each term is worth is said anew. Terms of one effect are one finding, if one of them is.
@@ -51,7 +51,7 @@ def name_findings(selector: Selector, judgement: Judgement) -> Judgement:
     return replace(judgement, named=named, kept=kept | _under_level(judgement))
 
 
-def _under_level(judgement: Judgement) -> dict[int, MinorReason]:
+def _under_level(judgement: JudgedSelection) -> dict[int, MinorReason]:
     """Terms with numbers of their own that are under their level; what only opens the model's own is recalibrated."""
     twin = shorter_twin(judgement.fit)
     terms = enumerate(judgement.fit.hypothesis.terms)
@@ -62,7 +62,7 @@ def _under_level(judgement: Judgement) -> dict[int, MinorReason]:
     }
 
 
-def _reason(judgement: Judgement, place: int) -> MinorReason | None:
+def _reason(judgement: JudgedSelection, place: int) -> MinorReason | None:
     """Why a term is no finding; None if it is one."""
     fit = judgement.fit
     merit = replace(judgement.selection.merits[place], share=_share(judgement, place))
@@ -73,7 +73,7 @@ def _reason(judgement: Judgement, place: int) -> MinorReason | None:
     return None if differs_from_zero(fit, place, judgement.covariance) else MinorReason.UNSURE
 
 
-def _share(judgement: Judgement, place: int) -> float:
+def _share(judgement: JudgedSelection, place: int) -> float:
     """The share of the explainable error on unseen rows that a term takes, where it shows."""
     rows = judgement.removed_share(place)
     if judgement.fit.hypothesis.terms[place].effect != DRIFT[0]:

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.formats.model.axis_model import AxisModel
-from servod.lab.diagnose.data.trace import Trace
+from servod.lab.diagnose.data.trace import CheckedTrace
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.result import FreeRun, Windows
-from servod.lab.diagnose.select.selection import Fold, HeldOut
+from servod.lab.diagnose.select.selection import Fold, HeldOutErrors
 from servod.lab.diagnose.settings import SETTINGS
 from servod.lab.simulate.replay import Drive, replay
 
@@ -48,7 +48,9 @@ def window_errors(
     ]
 
 
-def free_run_gain(predictor: Predictor, before: HeldOut, after: HeldOut, judged: NDArray[np.bool_]) -> float:
+def free_run_gain(
+    predictor: Predictor, before: HeldOutErrors, after: HeldOutErrors, judged: NDArray[np.bool_]
+) -> float:
     """RMS of the shortest windows by fits with the physics added, as a multiple of that by fits without it."""
     with_it, without = (
         _errors(predictor, held.folds, SETTINGS.validation.horizons_s[0])[judged] for held in (after, before)
@@ -98,7 +100,7 @@ def _errors(predictor: Predictor, folds: Sequence[Fold], horizon_s: float) -> Ar
     return error
 
 
-def _drive(trace: Trace, model: AxisModel) -> Drive:
+def _drive(trace: CheckedTrace, model: AxisModel) -> Drive:
     """The recording on the time that the model's windows of disturbance are in: shifted, where one was fitted."""
     if model.disturbance is not None and model.disturbance.windows:
         return trace.drive

@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Judgement:
+class JudgedSelection:
     """Everything that was judged of a selection, on recordings that can tell.
 
     `named` are places of terms in the fit; `errors` are those of the fits to everything, by which names are judged,
@@ -63,7 +63,7 @@ class Judgement:
         return max(without - unseen.after**2, 0.0) / max(unseen.before**2 - unseen.floor**2, 1e-30)
 
 
-def judge(selector: Selector, selection: Selection) -> Judgement:
+def judge(selector: Selector, selection: Selection) -> JudgedSelection:
     """A selection that was cross-validated, judged; every term at the level of its effect has its name as yet."""
     predictor, fit, base, validation = selector.predictor, selection.fit, selection.base, selection.validation
     if validation is None:
@@ -73,7 +73,7 @@ def judge(selector: Selector, selection: Selection) -> Judgement:
         shares(pair, predictor.counts, selection.floor)
         for pair in ((base.mismatch, fit.mismatch), (validation.before.mismatch, validation.after.mismatch))
     )
-    return Judgement(
+    return JudgedSelection(
         predictor=predictor,
         selection=selection,
         validation=validation,
@@ -88,7 +88,7 @@ def judge(selector: Selector, selection: Selection) -> Judgement:
     )
 
 
-def predicts_nothing(judgement: Judgement) -> bool:
+def predicts_nothing(judgement: JudgedSelection) -> bool:
     """Whether free windows are hardly better for the names, although something is left: terms that only fit.
 
     Names of events in one recording alone are not asked, since no other recording predicts them.
@@ -101,7 +101,7 @@ def predicts_nothing(judgement: Judgement) -> bool:
     return gain > SETTINGS.validation.most_free_run_error
 
 
-def without_names(judgement: Judgement) -> Judgement:
+def without_names(judgement: JudgedSelection) -> JudgedSelection:
     """The judgement when no name may stand: the base, and a table of what is left without a name."""
     predictor, base, floor = judgement.predictor, judgement.selection.base, judgement.selection.floor
     left = residual_table(predictor, base.mismatch)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.lab.diagnose.effects import effect
-from servod.lab.diagnose.result import Verdict
+from servod.lab.diagnose.result import DiagnosisVerdict
 from servod.lab.diagnose.select.candidates import Candidate
 from servod.lab.diagnose.select.selection import Selection
 from servod.lab.diagnose.settings import SETTINGS
@@ -43,7 +43,7 @@ def shares(mismatch: tuple[Array, Array], counts: NDArray[np.bool_], floor: floa
     return Shares(math.sqrt(before), math.sqrt(after), math.sqrt(floor), min(max(removed, 0.0), 1.0))
 
 
-def verdict(named: Sequence[int], errors: Shares, dry: float) -> Verdict:
+def verdict(named: Sequence[int], errors: Shares, dry: float) -> DiagnosisVerdict:
     """The verdict on what was named (places of terms) and what is left."""
     left = errors.left / dry
     much = left > SETTINGS.verdict.left_torque and 1.0 - errors.removed > SETTINGS.verdict.left_share
@@ -51,13 +51,16 @@ def verdict(named: Sequence[int], errors: Shares, dry: float) -> Verdict:
         SETTINGS.verdict.least_beside_much if left > SETTINGS.verdict.much_torque else SETTINGS.verdict.least_explained
     )
     if much and (not named or errors.removed < least):
-        return Verdict.UNEXPLAINED
-    return Verdict.MISSING_PHYSICS if named else Verdict.ADEQUATE
+        return DiagnosisVerdict.UNEXPLAINED
+    return DiagnosisVerdict.MISSING_PHYSICS if named else DiagnosisVerdict.ADEQUATE
 
 
-def below_noise(found: Verdict, encoder_noise: float, dry: float) -> bool:
+def below_noise(found: DiagnosisVerdict, encoder_noise: float, dry: float) -> bool:
     """Whether a verdict without a name says nothing, because the encoder's noise is as large as what it is about."""
-    hides = {Verdict.UNEXPLAINED: SETTINGS.verdict.hides_rest, Verdict.ADEQUATE: SETTINGS.verdict.hides_all}
+    hides = {
+        DiagnosisVerdict.UNEXPLAINED: SETTINGS.verdict.hides_rest,
+        DiagnosisVerdict.ADEQUATE: SETTINGS.verdict.hides_all,
+    }
     return found in hides and encoder_noise > hides[found] * dry
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.formats.model.axis_model import AxisKind, AxisModel
-from servod.lab.diagnose.data.trace import Trace
+from servod.lab.diagnose.data.trace import CheckedTrace
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.result import Units
 from servod.lab.diagnose.settings import SETTINGS
@@ -64,7 +64,7 @@ def since_reversal(t_s: Array, velocity: Array) -> Array:
     return np.minimum(t_s - t_s[_last(turned)], SETTINGS.coordinates.longest_s)
 
 
-def at_rest(trace: Trace) -> Array:
+def at_rest(trace: CheckedTrace) -> Array:
     """For how long the joint has been at rest, s, up to a longest time; NaN in rows in which it moves."""
     rests = np.abs(trace.velocity) < SETTINGS.coordinates.rest_errors * trace.drive.motion[:, 3]
     begun = _last(np.concatenate([[True], rests[1:] & ~rests[:-1]]))
@@ -77,7 +77,7 @@ def _last(marked: NDArray[np.bool_]) -> NDArray[np.int64]:
     return np.asarray(np.maximum.accumulate(np.where(marked, np.arange(len(marked)), 0)), dtype=np.int64)
 
 
-def _change(trace: Trace) -> Array:
+def _change(trace: CheckedTrace) -> Array:
     """Change of the command per second, over a short time around each row."""
     from scipy.ndimage import uniform_filter1d
 

@@ -23,7 +23,7 @@ from servod.kernels.physics.compiled import Kernel, available, compiled
 from servod.kernels.physics.layout import P_DELAY_S, P_GAP, P_START_C, S_FIRST_S
 from servod.kernels.physics.plant import rest_state
 from servod.lab.diagnose.data.excitation import creeps
-from servod.lab.diagnose.data.trace import Trace, dry_friction
+from servod.lab.diagnose.data.trace import CheckedTrace, dry_friction
 from servod.lab.diagnose.predict.innovation_kernel import innovate
 from servod.lab.diagnose.settings import SETTINGS
 from servod.lab.simulate import open_loop
@@ -92,7 +92,7 @@ class Observer:
     steps: NDArray[np.int64]
 
 
-def bandwidth(inertia: float, dry: float, traces: Sequence[Trace]) -> float:
+def bandwidth(inertia: float, dry: float, traces: Sequence[CheckedTrace]) -> float:
     """Observer bandwidth in rad/s for an axis of this inertia and dry friction: as fast as the encoder noise allows."""
     noise = max(trace.position_noise for trace in traces)
     period = max(trace.period_s for trace in traces)
@@ -106,7 +106,7 @@ def bandwidth(inertia: float, dry: float, traces: Sequence[Trace]) -> float:
     return min(max(allowed, SETTINGS.observer.slowest), SETTINGS.observer.fastest, share / period)
 
 
-def observer(trace: Trace, inertia: float, rate: float) -> Observer:
+def observer(trace: CheckedTrace, inertia: float, rate: float) -> Observer:
     """Gains that put both poles of the correction at `rate` rad/s, for each row's own step."""
     t_s = trace.drive.t_s
     step = np.append(np.diff(t_s), trace.period_s)
@@ -117,7 +117,7 @@ def observer(trace: Trace, inertia: float, rate: float) -> Observer:
     return Observer(rate, 1.0 - decay**2, velocity_gain, inertia * velocity_gain / step, _steps(trace, step))
 
 
-def _steps(trace: Trace, step: Array) -> NDArray[np.int64]:
+def _steps(trace: CheckedTrace, step: Array) -> NDArray[np.int64]:
     """Inner steps of each row: more around reversals, where friction turns over within a sample or two."""
     base = np.ceil(step / SETTINGS.observer.longest_step_s).astype(np.int64)
     slow = np.abs(trace.velocity) < 2.5 * np.abs(trace.acceleration) * step
@@ -127,7 +127,7 @@ def _steps(trace: Trace, step: Array) -> NDArray[np.int64]:
 class Predictor:
     """Mismatch of any model with fixed recordings; the scale of torque is that of the nominal model."""
 
-    def __init__(self, traces: Sequence[Trace], nominal: AxisModel, rate: float | None = None) -> None:
+    def __init__(self, traces: Sequence[CheckedTrace], nominal: AxisModel, rate: float | None = None) -> None:
         self.traces = tuple(traces)
         self.dry = dry_friction(nominal)
         self.linear = nominal.axis is AxisKind.LINEAR
@@ -139,7 +139,7 @@ class Predictor:
         self.evaluations = 0
         self._run, self._follow = without_lock(innovate), without_lock(open_loop.follow)
 
-    def _rows_that_count(self, trace: Trace) -> NDArray[np.bool_]:
+    def _rows_that_count(self, trace: CheckedTrace) -> NDArray[np.bool_]:
         """Rows that count: those of the trace, once the observer has settled behind each start."""
         counts = trace.counts.copy()
         for row in trace.starts:
@@ -148,7 +148,7 @@ class Predictor:
         return counts
 
     def over(self, name: str) -> Array:
-        """A column of `Drive` or `Trace` over the rows of all traces."""
+        """A column of `Drive` or `CheckedTrace` over the rows of all traces."""
         return np.concatenate(
             [np.asarray(getattr(trace, name, getattr(trace.drive, name, None))) for trace in self.traces]
         )
@@ -177,7 +177,7 @@ class Predictor:
         clean = np.nan_to_num(np.concatenate(parts), nan=limit, posinf=limit, neginf=-limit)
         return np.where(self.counts, np.clip(clean, -limit, limit), 0.0)
 
-    def _trace_mismatch(self, p: Array, trace: Trace, seen: Observer) -> Array:
+    def _trace_mismatch(self, p: Array, trace: CheckedTrace, seen: Observer) -> Array:
         drive = trace.drive
         first = trace.first_row(float(p[P_DELAY_S]))
         state = np.array(rest_state(0.0, 5e-5, float(p[P_START_C])))
@@ -197,7 +197,7 @@ class Predictor:
         self._run(p, state, *held, *gains, trace.starts, states, out)
         return seen.to_torque * out
 
-    def _start(self, p: Array, trace: Trace, row: int, known: FirstRow) -> Array:
+    def _start(self, p: Array, trace: CheckedTrace, row: int, known: FirstRow) -> Array:
         """Position, velocity and hidden states in balance with the recorded motion of one row."""
         drive = trace.drive
         motion = known.motion if row == 0 else tuple(drive.motion[row, :3])
@@ -224,7 +224,7 @@ def shorten(predictor: Predictor, nominal: AxisModel, mismatch: Array) -> Predic
     return Predictor(traces, nominal, predictor.rate)
 
 
-def _cut(trace: Trace, mismatch: Array, settling_s: float) -> Trace:
+def _cut(trace: CheckedTrace, mismatch: Array, settling_s: float) -> CheckedTrace:
     length = max(SETTINGS.observer.shortened_share * trace.duration_s, SETTINGS.observer.shortened_least_s) + settling_s
     rows = min(round(length / trace.period_s), len(mismatch))
     power = np.concatenate([[0.0], np.cumsum(mismatch**2)])

@@ -19,7 +19,7 @@ from servod.lab.diagnose.effects.hypothesis import Hypothesis
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.fit import Fit, Fitter, Weighing, scale_of
 from servod.lab.diagnose.select.levels import named_terms
-from servod.lab.diagnose.select.selection import CrossValidation, Fold, Folds, HeldOut, Selection
+from servod.lab.diagnose.select.selection import CrossValidation, Fold, Folds, HeldOutErrors, Selection
 from servod.lab.diagnose.select.selector import Selector
 from servod.lab.diagnose.settings import SETTINGS
 
@@ -111,7 +111,7 @@ def single_events(hypothesis: Hypothesis) -> list[int]:
     ]  # fmt: skip
 
 
-def predict_held_out(predictor: Predictor, fit: Fit, folds: Folds) -> HeldOut:
+def predict_held_out(predictor: Predictor, fit: Fit, folds: Folds) -> HeldOutErrors:
     """Mismatch of each fold under `fit` estimated again without it; events in one recording keep their values."""
     mismatch = np.zeros_like(fit.mismatch)
     models: list[Fold] = []
@@ -122,7 +122,7 @@ def predict_held_out(predictor: Predictor, fit: Fit, folds: Folds) -> HeldOut:
         models.append(Fold(out, tuple(again.hypothesis.models(again.coordinates, len(predictor.slices)))))
         coordinates.append(again.coordinates)
     rms = float(np.sqrt(np.mean(mismatch[folds.judged] ** 2)))
-    return HeldOut(mismatch, rms, tuple(models), tuple(coordinates))
+    return HeldOutErrors(mismatch, rms, tuple(models), tuple(coordinates))
 
 
 def _refit(predictor: Predictor, fit: Fit, seen: Rows) -> Fit:

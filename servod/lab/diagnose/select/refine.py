@@ -22,7 +22,7 @@ from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.candidates import Candidate
 from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.select.merit import Merit
-from servod.lab.diagnose.select.selection import Entry, Selection
+from servod.lab.diagnose.select.selection import Selection, TermEntry
 from servod.lab.diagnose.select.selector import Selector, is_sound
 from servod.lab.diagnose.settings import SETTINGS
 
@@ -85,7 +85,7 @@ def add_first(selector: Selector, selection: Selection, candidates: list[Candida
         selection = selector.lower_floor(selection, fit.mismatch)
         if deserves(merit, fit) and is_sound(merit, fit):
             others = tuple(c for c in candidates if c.effect != candidate.effect)
-            return selection.with_term(fit, merit, Entry(candidate.left, others))
+            return selection.with_term(fit, merit, TermEntry(candidate.left, others))
     return selection
 
 
@@ -111,7 +111,7 @@ def add_drift(selector: Selector, selection: Selection) -> Selection:
         return selection
     other, _ = _fit_with(selector, selection, *DRIFT_RIVAL)
     rival = Candidate(DRIFT_RIVAL[0], other, _left(selector, present, other))
-    return selection.with_term(drift, merit, Entry(left, (rival,)))
+    return selection.with_term(drift, merit, TermEntry(left, (rival,)))
 
 
 def _is_significant(selector: Selector, merit: Merit) -> bool:

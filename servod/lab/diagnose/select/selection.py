@@ -21,7 +21,7 @@ Rows = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Entry:
+class TermEntry:
     """How a term came in: what it left of the cost as a share, and the other candidates."""
 
     left: float
@@ -50,7 +50,7 @@ class Fold:
 
 
 @dataclass(frozen=True)
-class HeldOut:
+class HeldOutErrors:
     """Mismatch (N*m) of every row by a fit that has not seen it; `rms` is over the rows that are judged.
 
     `coordinates` are those of each fold's fit.
@@ -72,9 +72,9 @@ class CrossValidation:
     named: tuple[int, ...]
     reduced: Mapping[int, Fit]
     folds: Folds
-    before: HeldOut
-    after: HeldOut
-    without: Mapping[int, HeldOut]
+    before: HeldOutErrors
+    after: HeldOutErrors
+    without: Mapping[int, HeldOutErrors]
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Selection:
     base_error: float
     floor: float
     merits: tuple[Merit, ...] = ()
-    entries: tuple[Entry, ...] = ()
+    entries: tuple[TermEntry, ...] = ()
     minor: Mapping[str, Merit] = field(default_factory=dict)
     tried: int = 0
     cut: bool = False
@@ -102,7 +102,7 @@ class Selection:
         """How many terms are in."""
         return len(self.fit.hypothesis.terms)
 
-    def with_term(self, fit: Fit, merit: Merit, entry: Entry) -> Selection:
+    def with_term(self, fit: Fit, merit: Merit, entry: TermEntry) -> Selection:
         """This selection and one term more, the last of `fit`."""
         return replace(self, fit=fit, merits=(*self.merits, merit), entries=(*self.entries, entry))
 

@@ -18,7 +18,7 @@ from servod.lab.diagnose.effects.hypothesis import Hypothesis
 from servod.lab.diagnose.select.candidates import Candidate
 from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.select.levels import on_bound
-from servod.lab.diagnose.select.selection import Entry, Selection
+from servod.lab.diagnose.select.selection import Selection, TermEntry
 from servod.lab.diagnose.select.selector import Selector
 from servod.lab.diagnose.settings import SETTINGS
 
@@ -63,7 +63,7 @@ def _add_best(selector: Selector, selection: Selection) -> Selection:
                 selection, merit = replace(selection, fit=bare), selector.merit(selection, bare, fit)
         if selector.may_enter(selection, merit, fit):
             others = tuple(c for c in candidates if c.effect != candidate.effect)
-            return selection.with_term(fit, merit, Entry(candidate.left, others))
+            return selection.with_term(fit, merit, TermEntry(candidate.left, others))
         if selector.significant(selection, merit, fit):
             first = selection.minor.get(candidate.effect, merit)
             selection = replace(selection, minor={**selection.minor, candidate.effect: first})
@@ -117,7 +117,7 @@ def _swap(selector: Selector, selection: Selection, index: int, rival: Candidate
     entry = selection.entries[index]
     old = Candidate(selection.fit.hypothesis.terms[index].effect, selection.fit, entry.left, index)
     others = (old, *(c for c in entry.rivals if c.effect != rival.effect))
-    entries = (*selection.entries[:index], Entry(entry.left, others), *selection.entries[index + 1 :])
+    entries = (*selection.entries[:index], TermEntry(entry.left, others), *selection.entries[index + 1 :])
     return replace(selection.with_merit(index, merit), fit=fit, entries=entries)
 
 

@@ -29,7 +29,7 @@ from servod.lab.deploy.judge import broken, skipped
 from servod.lab.deploy.outcome import Deployment
 from servod.lab.diagnose.effects import names
 from servod.lab.diagnose.engine import diagnose
-from servod.lab.diagnose.result import Diagnosis, Verdict
+from servod.lab.diagnose.result import Diagnosis, DiagnosisVerdict
 from servod.lab.recordings import load_recording
 from servod.lab.report.diagnosis import MODEL, write_files
 from servod.lab.synthesize.deployed import Wishes
@@ -253,7 +253,7 @@ def _diagnosed(believed: AxisModel, recordings: list[Path], out: Path) -> tuple[
     found = diagnose(believed, [load_recording(path) for path in recordings], TIME_LIMIT_S)
     out.mkdir(parents=True, exist_ok=True)
     document = write_files(out, found, "believed.yaml")
-    if found.verdict is Verdict.CANNOT_TELL:
+    if found.verdict is DiagnosisVerdict.CANNOT_TELL:
         raise AnswerIsNo(document["summary"])
     return found, document
 
