@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from servod.formats.model.axis_model import load_axis_model
-from servod.lab.diagnose.data.intake import taken_in
+from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.recordings import load_recording
 
@@ -112,7 +112,7 @@ def mismatch(machine: Machine, model: Path, recording: Path, from_s: str | None)
     """Torque mismatch of a recording, mN*m or N RMS, as the observer of the plain model shows it."""
     plain = load_axis_model(EXAMPLES / f"{machine.example}.yaml")
     loaded = load_recording(recording, EXAMPLES / f"{machine.example}_map.yaml")
-    traces, refused = taken_in([loaded.between(None if from_s is None else float(from_s), None)], plain)
+    traces, refused = load_traces([loaded.between(None if from_s is None else float(from_s), None)], plain)
     if refused:
         raise SystemExit(f"{recording}: {refused[0].reason}")
     predictor = Predictor(traces, plain)

@@ -16,7 +16,7 @@ from servod.common.errors import AnswerIsNo, BadInput
 
 if TYPE_CHECKING:
     from servod.formats.model.axis_model import AxisModel
-    from servod.lab.diagnose.judge.evidence import Diagnosis
+    from servod.lab.diagnose.result import Diagnosis
     from servod.lab.recordings import Recording
 
 EXAMPLE = "servoctl diagnose --model model.yaml run1.csv.gz run2.csv.gz --out diagnosis"

@@ -30,12 +30,12 @@ def explain(
 ) -> None:
     """Print the equation, source, keys (units, ranges), signature and separating experiment of EFFECT."""
     from servod.lab.diagnose.effects import NAMES
-    from servod.lab.diagnose.explain import explained, listed
+    from servod.lab.diagnose.explain import explain_effect, list_effects
 
     if effect is None:
-        document: Any = listed()
+        document: Any = list_effects()
     elif effect in NAMES:
-        document = explained(effect)
+        document = explain_effect(effect)
     else:
         near = difflib.get_close_matches(effect, NAMES, n=1)
         hint = f" (did you mean {near[0]}?)" if near else ""

@@ -147,16 +147,41 @@ def _twice() -> Figure:
     return Figure("public class names that exist twice", len(twice), 5, twice)
 
 
-def _effects() -> Figure:
+def effects() -> Figure:
+    """How far the name of an effect is spread: files that have it as a string, outside the folder of the records."""
     folder = source.ROOT / "servod/lab/diagnose/effects"
-    names = sorted(f.stem for f in folder.glob("*.py") if re.search(r"^EFFECT\b", f.read_text(), re.MULTILINE))
-    files = [f for f in source.files("servod", "drivers") if folder not in f.parents]
-    spread = {}
-    for name in names:
-        quoted = re.compile(rf"[\"'.]{name}\b(?!\()")
-        spread[name] = sum(bool(quoted.search(f.read_text())) for f in files)
-    worst = max(spread.values(), default=0)
-    return Figure("files that name one effect, outside its own", worst, 6, [f"{n}: {c}" for n, c in spread.items()])
+    records = {f.stem: f.read_text() for f in sorted(folder.glob("*.py"))}
+    names = {name: "group=None" in text for name, text in records.items() if re.search(r"^EFFECT\b", text, re.M)}
+    where: dict[str, set[str]] = {name: set() for name in names}
+    for file in source.files("servod", "drivers"):
+        if folder not in file.parents:
+            for name in named(source.tree(file), names):
+                where[name].add(str(file.relative_to(source.ROOT)))
+    told = [f"{name}: {len(files)} {', '.join(sorted(files))}".rstrip() for name, files in where.items()]
+    return Figure("files that name one effect, outside its own", max(map(len, where.values()), default=0), 6, told)
+
+
+def named(tree: ast.AST, names: dict[str, bool]) -> Iterator[str]:
+    """Strings of a file that are an effect's name; of the `names`, those with True are a number of every model too.
+
+    Such a number (inertia, torque_offset) beside others that are no effects, in one list or as keys or values of one
+    table, is what it says and names no effect.
+    """
+    lists: list[list[ast.expr | None]] = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Tuple | ast.List | ast.Set):
+            lists.append(list(node.elts))
+        elif isinstance(node, ast.Dict):
+            lists += [list(node.keys), list(node.values)]
+    quantities = set()
+    for members in lists:
+        texts = [member for member in members if isinstance(member, ast.Constant) and isinstance(member.value, str)]
+        if any(text.value not in names for text in texts):
+            quantities |= {id(text) for text in texts}
+    for node in ast.walk(tree):
+        word = node.value if isinstance(node, ast.Constant) and isinstance(node.value, str) else ""
+        if word in names and not (names[word] and id(node) in quantities):
+            yield word
 
 
 def _private() -> Figure:
@@ -201,7 +226,7 @@ def figures() -> list[Figure]:
         _floors(graph),
         _one_importer(graph),
         _twice(),
-        _effects(),
+        effects(),
         _private(),
         _lines(),
     ]

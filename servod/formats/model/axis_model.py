@@ -7,9 +7,11 @@ SI units in joint coordinates: rotary rad and N*m, linear m and N. A model omits
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from enum import StrEnum
+from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import yaml
 from pydantic import Field, model_validator
@@ -19,7 +21,7 @@ from servod.common.yaml import Dumper, Strict, load_model
 from servod.formats.model import effects as fx
 from servod.formats.model import friction as fr
 from servod.formats.model.identified import Identified
-from servod.formats.model.keys import Harmonic, Harmonics
+from servod.formats.model.keys import Group, Harmonic
 
 NonNegative = Annotated[float, Field(ge=0.0)]
 Positive = Annotated[float, Field(gt=0.0)]
@@ -94,13 +96,6 @@ Friction = Annotated[
 ]
 
 
-#: Groups with sines over position.
-_PERIODIC = (
-    *("cogging", "torque_ripple", "position_dependent_friction", "position_dependent_inertia"),
-    "encoder_eccentricity",
-)
-
-
 class AxisModel(Strict):
     """One axis as physics: its basic keys, and one optional group of keys for each effect."""
 
@@ -162,24 +157,32 @@ class AxisModel(Strict):
     @model_validator(mode="after")
     def _harmonics_fit(self) -> AxisModel:
         wrong = "periods_per_metre" if self.axis is AxisKind.ROTARY else "periods_per_turn"
-        for name in _PERIODIC:
-            group: Harmonics | fr.PositionDependentFriction | None = getattr(self, name)
-            if any(getattr(harmonic, wrong) is not None for harmonic in (group.harmonics if group else ())):
+        for name, group in self.groups():
+            if any(getattr(wave, wrong) is not None for wave in group.waves):
                 raise ValueError(f"{name}: no {wrong} on a {self.axis.value} axis")
-        shown = self.encoder_eccentricity
-        if shown is not None and sum(abs(h.amplitude) * wave_number(h) for h in shown.harmonics) >= 1.0:
-            raise ValueError("encoder_eccentricity: slopes amplitude*n that sum to less than 1")
+        self._sums_under_one(1, "slopes amplitude*n")
         return self
 
     @model_validator(mode="after")
     def _numbers_make_sense(self) -> AxisModel:
         if self.total_delay_s < 0.0:
             raise ValueError("delay_s + delay.additional_s at least 0")
-        for share in ("torque_ripple", "position_dependent_inertia"):
-            group: Harmonics | None = getattr(self, share)
-            if group is not None and sum(abs(h.amplitude) for h in group.harmonics) >= 1.0:
-                raise ValueError(f"{share}: amplitudes that sum to less than 1")
+        self._sums_under_one(0, "amplitudes")
         return self
+
+    def _sums_under_one(self, power: int, what: str) -> None:
+        for name, group in self.groups():
+            if group.under_one != power:
+                continue
+            if sum(abs(wave.amplitude) * wave_number(wave) ** power for wave in group.waves) >= 1.0:
+                raise ValueError(f"{name}: {what} that sum to less than 1")
+
+    def groups(self) -> Iterator[tuple[str, Group]]:
+        """The groups of keys that this model has, each with its name, in the order of the file."""
+        for name in _group_names(type(self)):
+            found = getattr(self, name)
+            if found is not None:
+                yield name, found
 
     @property
     def total_delay_s(self) -> float:
@@ -213,6 +216,13 @@ class AxisModel(Strict):
         from servod.formats.model.pack import pack
 
         return pack(self)
+
+
+@cache
+def _group_names(model: type[AxisModel]) -> tuple[str, ...]:
+    """Keys of a model under which a group may stand."""
+    kinds = {name: get_args(field.annotation) for name, field in model.model_fields.items()}
+    return tuple(n for n, found in kinds.items() if any(isinstance(k, type) and issubclass(k, Group) for k in found))
 
 
 def axis_model_yaml(model: AxisModel) -> str:

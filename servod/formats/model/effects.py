@@ -11,7 +11,7 @@ from enum import StrEnum
 from pydantic import Field, model_validator
 
 from servod.common.yaml import Strict
-from servod.formats.model.keys import Factor, Harmonics, NonNegative, Phase, Positive
+from servod.formats.model.keys import Factor, Group, Harmonics, NonNegative, Phase, Positive
 
 
 class Cogging(Harmonics):
@@ -20,6 +20,8 @@ class Cogging(Harmonics):
     Source: reluctance of slots against magnets; Hanselman, Brushless Permanent Magnet Motor Design, 2003.
     """
 
+    plain = True
+
 
 class TorqueRipple(Harmonics):
     """Torque applied = torque*(1 + sum amplitude*sin(n*x + phase)), amplitudes are shares of the torque.
@@ -27,15 +29,19 @@ class TorqueRipple(Harmonics):
     Source: back-EMF harmonics and gear transmission error; Jahns and Soong, IEEE TIE 43(2), 1996.
     """
 
+    under_one = 0
 
-class Gravity(Strict):
+
+class Gravity(Group):
     """Resisting torque amplitude*sin(x + phase): a pendulum. amplitude = m*g*l."""
+
+    plain = True
 
     amplitude: float = Field(0.0, description="N*m")
     phase: Phase = 0.0
 
 
-class Spring(Strict):
+class Spring(Group):
     """Resisting torque stiffness*(x - rest) + cubic*(x - rest)^3: cable, hose, counterbalance, flexure."""
 
     stiffness: NonNegative = Field(0.0, description="N*m/rad")
@@ -52,7 +58,7 @@ class TwoMass(Strict):
     load_viscous: NonNegative = Field(0.0, description="N*m*s/rad, the part of friction.viscous behind the spring")
 
 
-class JointElasticity(TwoMass):
+class JointElasticity(TwoMass, Group):
     """Motor and load with a spring: tau = k*d + cubic*d^3 + damping*dd/dt, d = x_motor - x_load.
 
     (J - J_L)*a_motor = u - F(v_motor) - tau; J_L*a_load = tau - load_viscous*v_load - gravity - spring + disturbance.
@@ -62,7 +68,7 @@ class JointElasticity(TwoMass):
     cubic: NonNegative = Field(0.0, description="N*m/rad^3, stiffening")
 
 
-class Backlash(Strict):
+class Backlash(Group):
     """Dead zone before the joint's spring: tau = 0 while |d| < gap/2, else k*(d - sign(d)*gap/2) + damping*dd/dt.
 
     The other keys say what is behind the gap; beside `joint_elasticity`, which says it, they must not stand.
@@ -76,7 +82,7 @@ class Backlash(Strict):
     load_viscous: NonNegative = Field(0.0, description="N*m*s/rad, the part of friction.viscous behind the gap")
 
 
-class TorqueGain(Strict):
+class TorqueGain(Group):
     """Torque = factor*command (k_t, gear or amplifier scale is not what the command assumes)."""
 
     factor: Factor = 1.0
@@ -90,7 +96,7 @@ class LimitShape(StrEnum):
     TANH = "tanh"
 
 
-class TorqueSaturation(Strict):
+class TorqueSaturation(Group):
     """Torque = clip(torque, -negative_limit, limit), or limit*tanh(torque/limit): current limit, iron saturation."""
 
     limit: Positive = Field(description="N*m")
@@ -98,13 +104,15 @@ class TorqueSaturation(Strict):
     shape: LimitShape = LimitShape.HARD
 
 
-class Delay(Strict):
+class Delay(Group):
     """Command to torque takes delay_s + additional_s: bus cycles, filters, drive scheduling."""
+
+    plain = True
 
     additional_s: float = Field(ge=-0.001, le=0.25)
 
 
-class ActuatorLag(Strict):
+class ActuatorLag(Group):
     """Torque follows the delayed command by dT/dt = (command - T)/time_constant_s, at most slew_per_s."""
 
     time_constant_s: NonNegative = Field(0.0, le=1.0)
@@ -118,9 +126,14 @@ class PositionDependentInertia(Harmonics):
     Source: Lagrange's equation of a linkage, crank or eccentric load.
     """
 
+    under_one = 0
+
 
 class EncoderEccentricity(Harmonics):
     """Encoder = x + sum amplitude*sin(n*x + phase), amplitudes in rad: the disc is off its axis (n = 1) or oval."""
+
+    plain = True
+    under_one = 1
 
 
 class DisturbanceWindow(Strict):
@@ -139,18 +152,20 @@ class DisturbanceWindow(Strict):
         return self
 
 
-class Disturbance(Strict):
+class Disturbance(Group):
     """External torques, each in a time window of the recording (t_s): somebody leans on the axis, a cable catches."""
 
     windows: tuple[DisturbanceWindow, ...] = Field(min_length=1, max_length=64)
 
 
-class OffsetDrift(Strict):
+class OffsetDrift(Group):
     """The torque offset drifts: torque += per_s*t, or per_s*time_s*(1 - exp(-t/time_s)) when time_s is given.
 
     t counts from the first row of a recording, from power-on in a virtual axis. Source: offset of a current sensor or
     amplifier that warms up (data sheets: offset drift); a counterbalance that leaks; a cable that settles.
     """
+
+    plain = True
 
     per_s: float = Field(description="N*m/s at the first row, with the command's sign")
     time_s: Positive | None = Field(None, description="s in which the drift ends; None = it goes on")
@@ -171,7 +186,7 @@ class Table(Strict):
         return self
 
 
-class Residual(Strict):
+class Residual(Group):
     """A resisting torque that fits no known physics, kept as a table over position, velocity or time where it lives."""
 
     position: Table | None = None

@@ -10,15 +10,17 @@ from enum import StrEnum
 from pydantic import Field
 
 from servod.common.yaml import Strict
-from servod.formats.model.keys import Factor, Harmonic, NonNegative, Positive
+from servod.formats.model.keys import Factor, Group, Harmonic, NonNegative, Positive
 
 
-class Asymmetry(Strict):
+class Asymmetry(Group):
     """Friction differs by direction: g(v) and the viscous term are multiplied by a factor for the sign of v.
 
     g(v) -> k(sign v)*g(v), F_v -> k_v(sign v)*F_v. Source: the paper's II-B, maps signed per direction;
     Armstrong-Helouvry, Dupont, Canudas de Wit, Automatica 30(7), 1994.
     """
+
+    plain = True
 
     positive_dry: Factor = Field(1.0, description="factor of Coulomb and static friction for v > 0")
     negative_dry: Factor = Field(1.0, description="factor of Coulomb and static friction for v < 0")
@@ -26,31 +28,35 @@ class Asymmetry(Strict):
     negative_viscous: Factor = Field(1.0, description="factor of viscous friction for v < 0")
 
 
-class Stribeck(Strict):
+class Stribeck(Group):
     """Stribeck curve: g(v) = F_C + (F_S - F_C)*exp(-(|v|/v_s)^exponent); keys given here replace those of `friction`.
 
     Not with friction of kind local, whose map has the curve in it.
     Source: the paper's (18) with the exponent's sign mended; exponent by Bo and Pavelescu, Wear 82, 1982.
     """
 
+    plain = True
+
     static: NonNegative | None = Field(None, description="F_S, N*m")
     stribeck_velocity: Positive | None = Field(None, description="v_s, rad/s")
     exponent: float = Field(2.0, ge=0.2, le=10.0, description="shape; 2 is the paper's, 1 is Tustin's")
 
 
-class Presliding(Strict):
+class Presliding(Group):
     """Bristle: dz/dt = v - sigma0*|v|/g(v)*z, F = sigma0*z + sigma1(v)*dz/dt; keys given here replace `friction`'s.
 
     sigma1(v) = sigma1*exp(-(v/damping_velocity)^2) when damping_velocity is given. Source: Canudas de Wit et al.,
     IEEE TAC 40(3), 1995 (LuGre); Olsson 1996 for the fading damping.
     """
 
+    plain = True
+
     sigma0: Positive | None = Field(None, description="stiffness, N*m/rad")
     sigma1: NonNegative | None = Field(None, description="damping, N*m*s/rad")
     damping_velocity: Positive | None = Field(None, description="rad/s at which the damping fades")
 
 
-class ViscousNonlinear(Strict):
+class ViscousNonlinear(Group):
     """Viscous friction that is not a line: + quadratic*|v|*v + cubic*v^3 + power*sign(v)*|v|^exponent.
 
     Source: Kruif, Gautier and others fit drives with |v|^n; churning losses are quadratic, greases thin (n < 1).
@@ -62,7 +68,7 @@ class ViscousNonlinear(Strict):
     exponent: float = Field(0.5, gt=0.0, le=5.0)
 
 
-class LoadDependentFriction(Strict):
+class LoadDependentFriction(Group):
     """Dry friction grows with what the gears carry: g -> g + per_command*|torque| + per_load*|load torque|.
 
     Load torque is gravity + spring + disturbance. Source: Hamon, Gautier, Garrec, IROS 2010; BAM (Duclusaud 2024).
@@ -80,7 +86,7 @@ class Bump(Strict):
     factor: float = Field(ge=-1.0, le=100.0, description="share of dry friction at the centre")
 
 
-class PositionDependentFriction(Strict):
+class PositionDependentFriction(Group):
     """Dry friction times 1 + sum amplitude*sin(n*x + phase) + sum factor*exp(-(x - position)^2/(2*width^2)).
 
     Never below 5 % of its plain value. Amplitudes are shares (1 = 100 %). Source: gear mesh and bearing preload;
@@ -90,6 +96,11 @@ class PositionDependentFriction(Strict):
     harmonics: tuple[Harmonic, ...] = Field((), max_length=64)
     bumps: tuple[Bump, ...] = Field((), max_length=64)
 
+    @property
+    def waves(self) -> tuple[Harmonic, ...]:
+        """Those of its factor."""
+        return self.harmonics
+
 
 class ThermalShape(StrEnum):
     """How friction depends on temperature."""
@@ -98,7 +109,7 @@ class ThermalShape(StrEnum):
     EXPONENTIAL = "exponential"
 
 
-class Thermal(Strict):
+class Thermal(Group):
     """Friction changes with temperature T or time t: dry and viscous friction are multiplied by a factor each.
 
     linear: 1 + k*(T - reference_c); exponential: exp(k*(T - reference_c)); k is negative for a joint that loosens when
@@ -107,6 +118,8 @@ class Thermal(Strict):
     T is the recorded temperature where there is one, else dT/dt = heating_c_per_j*|F*v| - (T - ambient_c)/cooling_s.
     Source: Bittencourt and Gunnarsson, ASME JDSMC 134(5), 2012; Simoni et al., IROS 2015.
     """
+
+    plain = True
 
     dry_per_c: float = Field(0.0, ge=-1.0, le=1.0, description="1/degC")
     viscous_per_c: float = Field(0.0, ge=-1.0, le=1.0, description="1/degC")

@@ -5,7 +5,7 @@ Under the groups of keys of friction and of everything else. Torque means force 
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from pydantic import Field, model_validator
 
@@ -32,7 +32,29 @@ class Harmonic(Strict):
         return self
 
 
-class Harmonics(Strict):
+class Group(Strict):
+    """One optional group of keys: the record of an effect for whoever reads, checks or packs a model.
+
+    `plain`: the kernels' plain loop obeys the group, or it is not in the dynamics at all; beside any other the full
+    loop runs. `under_one`: the power of n with which |amplitude|*n^power of its waves must sum to less than 1 (0:
+    shares, 1: slopes), if any.
+    """
+
+    plain: ClassVar[bool] = False
+    under_one: ClassVar[int | None] = None
+
+    @property
+    def waves(self) -> tuple[Harmonic, ...]:
+        """Its sines over position."""
+        return ()
+
+
+class Harmonics(Group):
     """A sum of sines over position."""
 
     harmonics: tuple[Harmonic, ...] = Field(min_length=1, max_length=64)
+
+    @property
+    def waves(self) -> tuple[Harmonic, ...]:
+        """All of them."""
+        return self.harmonics

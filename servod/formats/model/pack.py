@@ -20,13 +20,6 @@ if TYPE_CHECKING:
 #: Friction torque below which the bristle equation divides by nothing sensible; far under any real joint's.
 SMALLEST_DRY_FRICTION = 1e-12
 
-#: Groups of keys that the kernels' plain loop leaves out; the others are in every loop or not in the dynamics at all.
-_OUTSIDE_PLAIN = (
-    *("viscous_nonlinear", "load_dependent_friction", "position_dependent_friction", "torque_ripple"),
-    *("spring", "backlash", "joint_elasticity", "torque_gain", "torque_saturation", "actuator_lag"),
-    *("position_dependent_inertia", "disturbance", "residual"),
-)
-
 
 class _Packer:
     """The parameter list while it is filled; tables go behind the fixed part."""
@@ -53,7 +46,7 @@ def pack(model: AxisModel) -> tuple[float, ...]:
     packer.put(delay_s=model.total_delay_s, offset=model.torque_offset)
     if model.offset_drift is not None:
         packer.put(offset_per_s=model.offset_drift.per_s, offset_time_s=model.offset_drift.time_s or 0.0)
-    packer.put(complex=any(getattr(model, name) is not None for name in _OUTSIDE_PLAIN))
+    packer.put(complex=any(not group.plain for _, group in model.groups()))
     _friction(packer, model)
     _friction_effects(packer, model)
     _load(packer, model)

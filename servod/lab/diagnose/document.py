@@ -1,333 +1,227 @@
-"""The outside contract's `diagnosis.json` and `model.yaml` from a diagnosis.
+"""The outside contract's `diagnosis.json` from a diagnosis, and what is said of it in sentences.
 
-The last step before the files: plain numbers, sentences for people, nothing decided here.
+The last step before the files: it formats a finished result and computes nothing.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from servod.formats.model.axis_model import AxisModel
 from servod.lab.diagnose.effects import effect
-from servod.lab.diagnose.effects.disturbance import EVERY
-from servod.lab.diagnose.effects.hypothesis import Document, Reported
-from servod.lab.diagnose.judge.evidence import Diagnosis, Evidence
-from servod.lab.diagnose.judge.held_out import Fold, WindowErrors, window_errors, windows_document
-from servod.lab.diagnose.judge.locate import places
-from servod.lab.diagnose.judge.spread import within
-from servod.lab.diagnose.judge.verdict import alternatives, confidence
-from servod.lab.diagnose.predict.coordinates import units, where
-from servod.lab.diagnose.predict.floor import trace_floor
-from servod.lab.diagnose.select.fit import Fit
-from servod.lab.diagnose.select.merit import Merit
+from servod.lab.diagnose.result import (
+    Diagnosis,
+    DiagnosisVerdict,
+    Evidence,
+    FittedValue,
+    FreeRun,
+    Map,
+    Minor,
+    NamedEffect,
+    Quality,
+    RecordingErrors,
+)
 
-# What these recordings say of the model's own parameters: which have changed, in numbers, in a sentence, in the model.
-#
-# Stands between the evidence and the document.
-
-
-#: Half width of a 95 % interval in standard deviations.
-Z95 = 1.96
-
-#: A change of a parameter below this share is none.
-LEAST_CHANGE = 0.002
+Document = dict[str, Any]
 
 
-def recalibrated(evidence: Evidence) -> dict[str, Any]:
-    """Parameters of the model itself that were off: from, to, 95 % interval. Those of a finding are not here."""
-    fit = evidence.fit
-    opened = {key for place in evidence.named for key in fit.hypothesis.terms[place].opens}
-    found = {}
-    for index, (unknown, nominal) in enumerate(zip(fit.hypothesis.unknowns, fit.hypothesis.base, strict=False)):
-        value = fit.values[index]
-        deviation = math.sqrt(max(float(evidence.spread[index, index]), 0.0))
-        size = unknown.size if unknown.size else abs(value)
-        if unknown.key in opened or abs(value - nominal.start) <= max(LEAST_CHANGE, Z95 * deviation) * size:
-            continue
-        half = Z95 * deviation * size
-        entry = {"from": nominal.start, "to": value, "unit": unknown.unit, "interval": [value - half, value + half]}
-        found[unknown.key] = entry
-    return found
-
-
-def told_coordinates(evidence: Evidence) -> Array:
-    """Coordinates of the model to hand out: what the report says, as long as that can be said.
-
-    Where nothing has a name, parameters that are not told from what they were stay what they were: those of an axis
-    that was identified are worth more than what one short recording makes of them. That holds as long as all of them
-    together lie in the region of 95 % around the fit; beyond it, the fit.
-    """
-    fit = evidence.fit
-    if fit.hypothesis.terms or evidence.unnamed is not None:
-        return fit.coordinates
-    changed = recalibrated(evidence)
-    told = [unknown.key in changed for unknown in fit.hypothesis.base]
-    back = np.where(told, 0.0, fit.coordinates - fit.hypothesis.start)
-    return fit.coordinates - back if within(back, evidence.spread) else fit.coordinates
-
-
-def differs(changes: Mapping[str, Any]) -> str:
-    """What was recalibrated, as a sentence about these recordings; empty where nothing was."""
-    said = []
-    for name, change in changes.items():
-        words = name.removeprefix("friction.").removesuffix(".per_s").removesuffix("_s").replace("_", " ")
-        was, now, unit = change["from"], change["to"], change["unit"]
-        share = f" ({100.0 * (now - was) / abs(was):+.2g} %)" if was != 0.0 else ""
-        said.append(f"{words} is {now:.4g} instead of {was:.4g} {unit}{share}")
-    return f"What differs from the model in these recordings: {'; '.join(said)}." if said else ""
-
-
-Array = NDArray[np.float64]
-
-
-def diagnosis_document(diagnosis: Diagnosis, windows: Sequence[WindowErrors] | None = None) -> dict[str, Any]:
-    """The JSON document; `windows` are those of `window_evidence` where they have been computed already."""
+def diagnosis_document(diagnosis: Diagnosis) -> Document:
+    """The JSON document."""
     evidence = diagnosis.evidence
-    told = units(diagnosis.nominal)
-    found: dict[str, Any] = {"verdict": diagnosis.verdict.value, "summary": summary(diagnosis)}
-    found["findings"] = findings(evidence) if evidence else []
-    found["recalibrated"] = recalibrated(evidence) if evidence else {}
-    found["summary"] = " ".join(part for part in (found["summary"], differs(found["recalibrated"])) if part)
-    found["minor"] = minor(evidence) if evidence else {}
-    found["fit"] = fit_document(diagnosis, evidence, windows) if evidence else {}
-    if evidence is not None and evidence.unnamed is not None:
-        left = evidence.unnamed
+    found: Document = {"verdict": diagnosis.verdict.value, "summary": summary(diagnosis)}
+    found["findings"] = [_finding(one, diagnosis.units.force) for one in evidence.findings] if evidence else []
+    found["recalibrated"] = _recalibrated(evidence.recalibrated) if evidence else {}
+    found["minor"] = {name: _minor(one) for name, one in evidence.minor.items()} if evidence else {}
+    found["fit"] = _fit(diagnosis, evidence) if evidence else {}
+    if evidence is not None and evidence.residual is not None:
+        left = evidence.residual
         table = {"grid": left.grid.tolist(), "torque": left.torque.tolist()}
         found["unexplained"] = {"coordinate": left.coordinate, "share": left.share, **table}
     if evidence is not None:
-        found["located"] = [m.document() for m in evidence.maps_before]
-        found["remaining"] = [m.document() for m in evidence.maps_after]
-    found["recordings"] = recordings(diagnosis)
-    found["units"] = {"position": told.length, "torque": told.force}
+        found["located"] = [_map(one) for one in evidence.maps_before]
+        found["remaining"] = [_map(one) for one in evidence.maps_after]
+    found["recordings"] = [_recording(one) for one in evidence.recordings] if evidence else []
+    found["recordings"] += [{"name": r.name, "taken": False, "reason": r.reason} for r in diagnosis.refused]
+    found["units"] = {"position": diagnosis.units.length, "torque": diagnosis.units.force}
     found["seconds"] = {stage: round(value, 2) for stage, value in diagnosis.seconds.items()}
     return found
 
 
 def summary(diagnosis: Diagnosis) -> str:
-    """One or two plain sentences."""
+    """A few plain sentences."""
     evidence = diagnosis.evidence
     if evidence is None:
         reasons = "; ".join(f"{r.name}: {r.reason}" for r in diagnosis.refused)
         return f"These data cannot tell: {reasons}."
-    found = _found(diagnosis, evidence)
-    return f"{found} {cut_short(evidence.choice.tried)}" if evidence.choice.cut else found
+    cut = describe_cut(evidence.search.starts_tried) if evidence.search.cut_by_time else ""
+    return " ".join(
+        part for part in (_found(diagnosis, evidence), cut, describe_changes(evidence.recalibrated)) if part
+    )
 
 
-def cut_short(tried: int) -> str:
+def describe_cut(tried: int) -> str:
     """That time ended the search while something was left, after so many starts of effects."""
     if tried == 0:
         return "The time limit was over before any physics was tried: give more time (--time-limit)."
     return f"The time limit ended the search after {tried} starts: with more time (--time-limit) the answer may change."
 
 
+def describe_changes(changes: Mapping[str, FittedValue]) -> str:
+    """What was recalibrated, as a sentence about these recordings; empty where nothing was."""
+    said = []
+    for name, change in changes.items():
+        words = name.removeprefix("friction.").removesuffix(".per_s").removesuffix("_s").replace("_", " ")
+        was, now = change.nominal or 0.0, change.value
+        share = f" ({100.0 * (now - was) / abs(was):+.2g} %)" if was != 0.0 else ""
+        said.append(f"{words} is {now:.4g} instead of {was:.4g} {change.unit}{share}")
+    return f"What differs from the model in these recordings: {'; '.join(said)}." if said else ""
+
+
 def _found(diagnosis: Diagnosis, evidence: Evidence) -> str:
     """What was found, when there was time for it."""
-    names = list(dict.fromkeys(evidence.fit.hypothesis.terms[place].effect for place in evidence.named))
-    if names:
-        sentences = " ".join(f"{effect(name).statement}." for name in names)
-        return f"{sentences} {100.0 * evidence.unseen.removed:.0f} % of the explainable mismatch is gone."
-    if diagnosis.verdict.value == "cannot_tell":
-        return _too_little(evidence)
-    if diagnosis.verdict.value == "unexplained":
+    if evidence.findings:
+        sentences = " ".join(f"{effect(one.effect).statement}." for one in evidence.findings)
+        return f"{sentences} {100.0 * evidence.quality.removed:.0f} % of the explainable mismatch is gone."
+    if diagnosis.verdict is DiagnosisVerdict.CANNOT_TELL:
+        return _too_little(diagnosis, evidence)
+    if diagnosis.verdict is DiagnosisVerdict.UNEXPLAINED:
         where = evidence.maps_before[0].coordinate
         return f"Something is left that no known physics explains; it shows most over {where}."
     return "The model is adequate: nothing worth naming is left beyond the noise."
 
 
-def _too_little(evidence: Evidence) -> str:
+def _too_little(diagnosis: Diagnosis, evidence: Evidence) -> str:
     """Why recordings that were taken in cannot tell after all."""
-    if evidence.choice.cut:
+    if evidence.search.cut_by_time:
         return "Something is left, and nothing can be told of it yet."
-    noise, dry, force = evidence.predictor.encoder_noise, evidence.predictor.dry, units(evidence.predictor).force
+    noise, dry, force = evidence.encoder_noise, evidence.dry_friction, diagnosis.units.force
     return (
         f"These data cannot tell: too noisy: noise and steps of the encoder make {noise:.3g} {force} of torque in each "
         f"row, dry friction is {dry:.3g} {force}."
     )
 
 
-def findings(evidence: Evidence) -> list[dict[str, Any]]:
-    """One entry for each effect; terms of the same effect are one finding."""
-    terms = evidence.fit.hypothesis.terms
-    names = list(dict.fromkeys(terms[place].effect for place in evidence.named))
-    return [_finding(evidence, name, [p for p in evidence.named if terms[p].effect == name]) for name in names]
-
-
-def _finding(evidence: Evidence, name: str, named: list[int]) -> dict[str, Any]:
-    fit, first = evidence.fit, named[0]
-    force = units(evidence.predictor).force
-    what = effect(name)
-    contribution = evidence.less[first].mismatch - fit.mismatch
-    merit = evidence.choice.merits[first]
-    located = places(evidence.predictor, contribution, evidence.predictor.dry)
+def _finding(found: NamedEffect, force: str) -> Document:
+    what = effect(found.effect)
     statement = (
-        f"{what.statement}. It carries {100.0 * evidence.carries(first):.0f} % of the explainable mismatch and "
-        f"{100.0 * merit.torque:.1f} % of dry friction where it acts. It shows as {what.shows}; it is strongest "
-        f"{where(name, located)}."
+        f"{what.statement}. It carries {100.0 * found.removed_share:.0f} % of the explainable mismatch and "
+        f"{100.0 * found.torque:.1f} % of dry friction where it acts. It shows as {what.shows}; it is strongest "
+        f"{describe_place(found.effect, found.located)}."
     )
-    others = [
-        {"effect": other, "experiment": effect(other).experiment} for other in alternatives(evidence.choice, first)
-    ]
     return {
-        "effect": name,
+        "effect": found.effect,
         "statement": statement,
-        "located": located,
-        "form": [fit.hypothesis.terms[place].form for place in named],
-        "parameters": _parameters(evidence, named),
-        "confidence": min(confidence(evidence.choice, place, evidence.errors.removed) for place in named),
-        "alternatives": others,
+        "located": dict(found.located),
+        "form": list(found.forms),
+        "parameters": _parameters(found.parameters),
+        "confidence": found.confidence,
+        "alternatives": [{"effect": other, "experiment": effect(other).experiment} for other in found.alternatives],
         "confused_with": list(what.confused),
         "experiment": what.experiment,
-        "held_out": {"before": evidence.without[first].rms, "after": evidence.after.rms, "unit": force},
+        "held_out": {"before": found.without, "after": found.after, "unit": force},
     }
 
 
-def _parameters(evidence: Evidence, named: list[int]) -> dict[str, Any]:
-    """Reported values of the terms with their 95 % intervals; later terms of the same effect are numbered."""
-    found: dict[str, Any] = {}
-    for count, place in enumerate(named):
-        told = _told(evidence.fit, place, evidence.fit.coordinates)
-        spread = _spread(evidence, place, told)
-        for reported, deviation in zip(told, spread, strict=True):
-            name = reported.name if count == 0 else f"{reported.name}_term{count + 1}"
-            low, high = reported.value - Z95 * deviation, reported.value + Z95 * deviation
-            found[name] = {"value": reported.value, "unit": reported.unit, "interval": [low, high]}
+def _parameters(found: Mapping[str, FittedValue]) -> Document:
+    return {name: {"value": p.value, "unit": p.unit, "interval": [p.low, p.high]} for name, p in found.items()}
+
+
+def _recalibrated(found: Mapping[str, FittedValue]) -> Document:
+    return {
+        name: {"from": p.nominal, "to": p.value, "unit": p.unit, "interval": [p.low, p.high]}
+        for name, p in found.items()
+    }
+
+
+def _minor(found: Minor) -> Document:
+    size: Document = {"torque_over_coulomb": round(found.torque, 5), "share": round(found.share, 5)}
+    if found.why is None or found.parameters is None:
+        return size
+    return {**size, "why": found.why.value, "parameters": _parameters(found.parameters)}
+
+
+def _fit(diagnosis: Diagnosis, evidence: Evidence) -> Document:
+    """Errors before and after on data that a fit has not seen, the floor, and windows simulated from the recording."""
+    quality, search = evidence.quality, evidence.search
+    left_out = {"left_out": quality.left_out, "not_judged_s": round(quality.not_judged_s, 3)}
+    return {
+        "unit": diagnosis.units.force,
+        "held_out": {"before": quality.before, "after": quality.after, **left_out},
+        "noise_floor": quality.noise_floor,
+        "explainable_removed": round(quality.removed, 4),
+        "removed_by_known_physics": round(quality.removed_by_known, 4),
+        "windows": _windows(quality, diagnosis.units.length),
+        "observer_rad_s": search.observer_rad_s,
+        "starts_tried": search.starts_tried,
+        "cut_by_time": search.cut_by_time,
+    }
+
+
+def _windows(quality: Quality, unit: str) -> Document:
+    found: Document = {}
+    for window in quality.windows:
+        each = {name: _free_run(errors) for name, errors in window.recordings.items()}
+        found[f"{window.horizon_s:g}"] = {"unit": unit, **_free_run(window.errors), "recordings": each}
     return found
 
 
-def _told(fit: Fit, place: int, coordinates: Array) -> list[Reported]:
-    document = fit.hypothesis.written(coordinates)
-    return fit.hypothesis.terms[place].tell(document, fit.hypothesis.values(coordinates)[fit.hypothesis.share(place)])
+def _free_run(errors: FreeRun) -> Document:
+    return {"before": errors.before, "recalibrated": errors.recalibrated, "after": errors.after}
 
 
-def _spread(evidence: Evidence, place: int, told: list[Reported]) -> Array:
-    """Standard deviations of reported values, by their derivatives."""
-    fit = evidence.fit
-    slopes = np.zeros((len(told), len(fit.coordinates)))
-    for index in range(len(fit.coordinates)):
-        nudged = fit.coordinates.copy()
-        nudged[index] += 1e-5
-        there = _told(fit, place, nudged)
-        slopes[:, index] = [(b.value - a.value) / 1e-5 for a, b in zip(told, there, strict=True)]
-    variances = np.einsum("ij,jk,ik->i", slopes, evidence.spread, slopes)
-    return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
-
-
-def minor(evidence: Evidence) -> dict[str, Any]:
-    """Effects that are there but not worth naming: torque as a share of dry friction, share of the error.
-
-    Those that stand in the model have their parameters too, and why they are no findings.
-    """
-    terms = evidence.fit.hypothesis.terms
-    named = {terms[place].effect for place in evidence.named}
-    seen = {name: _size(merit) for name, merit in evidence.choice.minor.items() if name not in named}
-    for name in dict.fromkeys(terms[place].effect for place in evidence.kept):
-        those = [place for place in evidence.kept if terms[place].effect == name]
-        largest = max((evidence.choice.merits[place] for place in those), key=lambda merit: merit.torque)
-        why = evidence.kept[those[0]].value
-        seen[name] = {**_size(largest), "why": why, "parameters": _parameters(evidence, those)}
-    return seen
-
-
-def _size(merit: Merit) -> dict[str, Any]:
-    return {"torque_over_coulomb": round(merit.torque, 5), "share": round(max(merit.share, 0.0), 5)}
-
-
-def fit_document(
-    diagnosis: Diagnosis, evidence: Evidence, windows: Sequence[WindowErrors] | None = None
-) -> dict[str, Any]:
-    """Errors before and after on data that a fit has not seen, the floor, and windows simulated from the recording."""
-    if windows is None:
-        windows = window_evidence(diagnosis, evidence)
+def _map(found: Map) -> Document:
     return {
-        "unit": units(evidence.predictor).force,
-        "held_out": {"before": evidence.before.rms, "after": evidence.after.rms, **_shared(evidence)},
-        "noise_floor": evidence.unseen.floor,
-        "explainable_removed": round(evidence.unseen.removed, 4),
-        "removed_by_known_physics": round(evidence.attempt, 4),
-        "windows": windows_document(windows, evidence.predictor, evidence.shared.judged),
-        "observer_rad_s": evidence.predictor.rate,
-        "starts_tried": evidence.choice.tried,
-        "cut_by_time": evidence.choice.cut,
+        "coordinate": found.coordinate,
+        "unit": found.unit,
+        "share": round(found.share, 4),
+        "chance": found.chance,
+        "at": found.at.tolist(),
+        "mean": found.mean.tolist(),
+        "error": found.error.tolist(),
     }
 
 
-def _shared(evidence: Evidence) -> dict[str, Any]:
-    """What was left out in turn, and for how long the recordings are not judged since only an event stands there."""
-    predictor = evidence.predictor
-    events = predictor.counts & ~evidence.shared.judged
-    seconds = sum(
-        trace.period_s * int(events[part].sum())
-        for trace, part in zip(predictor.traces, predictor.slices, strict=True)
-    )  # fmt: skip
-    return {"left_out": evidence.shared.left_out, "not_judged_s": round(seconds, 3)}
-
-
-def window_evidence(diagnosis: Diagnosis, evidence: Evidence) -> list[WindowErrors]:
-    """Errors of free windows. What has no name is a table over everything, so that its rows have been seen."""
-    after = evidence.after.folds
-    if evidence.unnamed is not None:
-        extended = extended_model(diagnosis)
-        assert extended is not None  # there is evidence
-        after = (Fold(np.ones(len(evidence.predictor.counts), dtype=bool), (extended,)),)
-    return window_errors(evidence.predictor, diagnosis.nominal, evidence.before.folds, after)
-
-
-def recordings(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """What was taken in and refused, with notes."""
-    evidence = diagnosis.evidence
-    taken = [_recording(evidence, index) for index in range(len(evidence.traces))] if evidence else []
-    return taken + [{"name": r.name, "taken": False, "reason": r.reason} for r in diagnosis.refused]
-
-
-def _recording(evidence: Evidence, index: int) -> dict[str, Any]:
-    """One recording: what was repaired, its noise, and its mismatch by fits that have not seen the rows."""
-    trace, part, predictor = evidence.traces[index], evidence.predictor.slices[index], evidence.predictor
-    rows, judged = predictor.counts[part], evidence.shared.judged[part]
+def _recording(found: RecordingErrors) -> Document:
     return {
-        "name": trace.name,
+        "name": found.name,
         "taken": True,
-        "duration_s": trace.duration_s,
-        "rows": int(rows.sum()),
-        "period_s": trace.period_s,
-        "position_noise": trace.position_noise,
-        "notes": list(trace.notes),
-        "noise_floor": math.sqrt(trace_floor(predictor, index, evidence.fit.mismatch)),
-        "mismatch_before": _rms(evidence.before.mismatch[part][judged]),
-        "mismatch_after": _rms(evidence.after.mismatch[part][judged]),
+        "duration_s": found.duration_s,
+        "rows": found.rows,
+        "period_s": found.period_s,
+        "position_noise": found.position_noise,
+        "notes": list(found.notes),
+        "noise_floor": found.noise_floor,
+        "mismatch_before": found.before,
+        "mismatch_after": found.after,
     }
 
 
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0
+#: How a range of a coordinate is said.
+_SAID = {
+    "position": "at positions from {low} to {high} {unit}",
+    "velocity": "at velocities from {low} to {high} {unit}",
+    "acceleration": "at accelerations from {low} to {high} {unit}",
+    "load": "at commands from {low} to {high} {unit}",
+    "change of the command": "where the command changes by {low} to {high} {unit}",
+    "time since reversal": "from {low} to {high} {unit} after a reversal",
+    "temperature": "from {low} to {high} {unit}",
+}
 
 
-def extended_model(diagnosis: Diagnosis) -> AxisModel | None:
-    """The axis model with the physics added; None when nothing could be told.
-
-    A disturbance that stood in one recording is an event, no physics of the axis, and stays out.
-    """
-    evidence = diagnosis.evidence
-    if evidence is None:
-        return None
-    fit = evidence.fit
-    document: Document = fit.hypothesis.written(told_coordinates(evidence))
-    document.pop("disturbance", None)
-    values = fit.values
-    for place, term in enumerate(fit.hypothesis.terms):
-        if term.effect == "disturbance" and term.form == EVERY:
-            start, length, torque = values[fit.hypothesis.share(place)]
-            rows = document.setdefault("disturbance", {}).setdefault("windows", [])
-            rows.append({"start_s": start, "end_s": start + length, "torque": torque})
-    if evidence.unnamed is not None:
-        evidence.unnamed.write(document)
-    if diagnosis.nominal.noise is not None:
-        document["noise"] = diagnosis.nominal.noise.model_dump(mode="json", exclude_none=True)
-    return AxisModel.model_validate(document)
+def describe_place(name: str, located: Mapping[str, Any]) -> str:
+    """Where the effect is strongest, as the end of a sentence: its own coordinate, and recording and time."""
+    said = []
+    coordinate = effect(name).look.coordinate
+    found = located.get(coordinate.replace(" ", "_"))
+    if found is not None and coordinate in _SAID:
+        ends = {"low": f"{found['from']:.3g}", "high": f"{found['to']:.3g}", "unit": found["unit"]}
+        said.append(_SAID[coordinate].format(**ends))
+    shares: Mapping[str, float] = located["recordings"]
+    most = max(shares, key=lambda name: shares[name])
+    window = next((w for w in located["time_windows"] if w["recording"] == most), None)
+    if window is not None:
+        said.append(f"in {most} from {window['start_s']:.2f} to {window['end_s']:.2f} s")
+    return ", most of all ".join(said)
 
 
 # What the report says in plain sentences: the verdict, how sure, what remains, and what to record next.
@@ -370,7 +264,7 @@ def verdict_sentence(document: Document) -> str:
     return str(document["summary"])
 
 
-def certainty(finding: Document) -> list[str]:
+def describe_certainty(finding: Document) -> list[str]:
     """How sure a finding is, and what it cannot be told apart from."""
     name = finding["effect"].replace("_", " ")
     lines = [f"How sure that it is {name}: {100.0 * finding['confidence']:.0f} %."]
@@ -382,7 +276,7 @@ def certainty(finding: Document) -> list[str]:
     return lines
 
 
-def remains(document: Document) -> str:
+def describe_rest(document: Document) -> str:
     """What is left, and where it lives."""
     fit, left = document["fit"], [m for m in document["remaining"] if m["chance"] < 1e-3 and m["share"] > 0.01]
     times = fit["held_out"]["after"] / max(fit["noise_floor"], 1e-30)

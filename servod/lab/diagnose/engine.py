@@ -1,153 +1,77 @@
-"""The whole diagnosis: recordings and a model in, verdict and evidence out.
+"""The whole diagnosis: recordings and a model in, a finished result out.
 
-Stands between the command line and everything else here; writes nothing.
+Stands between the command line and everything else here; writes nothing. The stages, in their order: recordings are
+loaded as traces, terms are selected (forward selection with backward elimination, swap, a group of small terms, a
+drift, nominal values restored, cross-validation), what is selected is judged, and the result is concluded.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from time import monotonic
 
 from servod.formats.model.axis_model import AxisModel
-from servod.lab.diagnose.data.intake import taken_in
-from servod.lab.diagnose.judge.evidence import Diagnosis, Evidence
-from servod.lab.diagnose.judge.held_out import foretold, held_out, once, split
-from servod.lab.diagnose.judge.locate import maps
-from servod.lab.diagnose.judge.sorting import sorted_out
-from servod.lab.diagnose.judge.spread import spread
-from servod.lab.diagnose.judge.unnamed import unnamed
-from servod.lab.diagnose.judge.verdict import Verdict, drowned, named_terms, shares, verdict
+from servod.lab.diagnose.data.intake import load_traces
+from servod.lab.diagnose.judge.conclude import conclude, extended_model, free_windows
+from servod.lab.diagnose.judge.findings import name_findings
+from servod.lab.diagnose.judge.judgement import JudgedSelection, judge, predicts_nothing, without_names
+from servod.lab.diagnose.judge.verdict import below_noise, verdict
+from servod.lab.diagnose.predict.coordinates import units
 from servod.lab.diagnose.predict.predict import Predictor
-from servod.lab.diagnose.select.choice import Choice
-from servod.lab.diagnose.select.choose import Chooser
-from servod.lab.diagnose.select.detail import detail, much_left, slow, swapped, tidied
-from servod.lab.diagnose.select.fit import Weighing
+from servod.lab.diagnose.result import Diagnosis, DiagnosisVerdict
+from servod.lab.diagnose.select.cross_validation import cross_validate
+from servod.lab.diagnose.select.refine import add_drift, add_group, much_left, restore_nominal
+from servod.lab.diagnose.select.selector import Selector
+from servod.lab.diagnose.select.stepwise import forward_selection, swap_terms
+from servod.lab.diagnose.settings import SETTINGS
 from servod.lab.recordings import Recording
 
 Tell = Callable[[str], None]
-
-#: Part of the time limit that the search for terms may take; the proof needs the rest.
-SEARCH_SHARE = 0.75
-
-#: Free windows of unseen rows must come out by this factor better with the names than without, unless the mismatch is
-#: within FITTED times the noise floor anyway. A few terms with dynamics of their own can follow nearly any mismatch one
-#: sample ahead, and foretell nothing.
-LEAST_FORETOLD, FITTED = 0.7, 2.0
 
 
 def diagnose(
     model: AxisModel, recordings: Sequence[Recording], time_limit_s: float = 120.0, tell: Tell | None = None
 ) -> Diagnosis:
-    """Diagnose `model` by `recordings`. `tell` is called with a line of progress now and then."""
+    """What `model` leaves out of the axis that the recordings are of.
+
+    The search for terms ends after three quarters of `time_limit_s` with what it has; `tell` is called with a line of
+    progress now and then. Recordings that cannot tell are refused with a reason each, and without any other there is no
+    evidence. Computed on up to two cores.
+
+        found = diagnose(load_axis_model(path), [load_recording(run) for run in runs])
+        for effect in found.evidence.findings if found.evidence else (): print(effect.effect, effect.parameters)
+    """
     tell = tell or (lambda _line: None)
     begun = monotonic()
-    traces, refused = taken_in(recordings, model)
+    traces, refused = load_traces(recordings, model)
     seconds = {"intake": monotonic() - begun}
     if not traces:
-        return Diagnosis(model, refused, Verdict.CANNOT_TELL, None, seconds)
+        return Diagnosis(units(model), tuple(refused), DiagnosisVerdict.CANNOT_TELL, None, seconds | {"windows": 0.0})
     tell(f"{len(traces)} recordings taken in")
-    predictor = Predictor(traces, model)
-    chooser = Chooser(predictor, model, begun + SEARCH_SHARE * time_limit_s, tell)
-    choice = chooser.run()
-    swapped(chooser, choice)
-    if much_left(chooser, choice):
-        detail(chooser, choice)
-        slow(chooser, choice)
+    selector = Selector(Predictor(traces, model), model, begun + SETTINGS.forward.search_share * time_limit_s, tell)
+    selection = swap_terms(selector, forward_selection(selector, selector.fit_base()))
+    if much_left(selector, selection):
+        selection = add_drift(selector, add_group(selector, selection))
     seconds["search"] = monotonic() - begun - seconds["intake"]
-    choice.fit = tidied(chooser, choice.fit)
-    chooser.lower_floor(choice.fit.mismatch)
-    choice.floor = chooser.floor
-    evidence = proved(predictor, chooser, choice, tell)
-    while (worse := _worse_unseen(evidence)) is not None:
-        choice.drop(worse, evidence.less[worse])
-        evidence = proved(predictor, chooser, choice, tell)
-    evidence = sorted_out(evidence, chooser)
+    selection = cross_validate(selector, restore_nominal(selector, selection))
+    judgement = name_findings(selector, judge(selector, selection))
+    final, judgement = _verdict(judgement)
     seconds["proof"] = monotonic() - begun - seconds["intake"] - seconds["search"]
-    final = verdict(choice, evidence.named, evidence.errors, predictor.dry)
-    if final is Verdict.MISSING_PHYSICS and _foretells_nothing(evidence):
-        final = Verdict.UNEXPLAINED
-    if final is Verdict.UNEXPLAINED:
-        evidence = _without_names(evidence)
-    untried = final is Verdict.UNEXPLAINED and choice.cut and choice.tried == 0
-    if untried or drowned(final, predictor.encoder_noise, predictor.dry):
-        final = Verdict.CANNOT_TELL
-    return Diagnosis(model, refused, final, evidence, seconds)
+    extended = extended_model(judgement, model)
+    free = free_windows(judgement, model, extended)
+    seconds["windows"] = monotonic() - begun - sum(seconds.values())
+    return Diagnosis(units(model), tuple(refused), final, conclude(judgement, extended, free), seconds)
 
 
-def proved(predictor: Predictor, chooser: Chooser, choice: Choice, tell: Tell) -> Evidence:
-    """A choice proved on rows that its fits have not seen; names are those of terms at the level of their effect."""
-    fit = choice.fit
-    nominal = chooser.start.document
-    named = named_terms(choice, nominal)
-    counts = predictor.counts
-    tell("held-out recordings")
-    less = {place: chooser.less(fit, place) for place in named}
-    weighing = Weighing(chooser.fitter(fit.mismatch).weighing.scale, chooser.rows)
-    shared = split(predictor, fit)
-    before = held_out(predictor, choice.base, shared)
-    after = held_out(predictor, fit, shared) if fit is not choice.base else before
-    alone = len(named) == 1 and len(fit.hypothesis.terms) == 1
-    without = {p: before if alone else held_out(predictor, f, shared) for p, f in less.items()}
-    unseen = shares((before.mismatch, after.mismatch), counts, choice.floor)
-    return Evidence(
-        traces=predictor.traces,
-        predictor=predictor,
-        choice=choice,
-        named=named,
-        errors=shares((choice.base.mismatch, fit.mismatch), counts, choice.floor),
-        spread=spread(fit, weighing, predictor.traces[0].period_s, after),
-        less=less,
-        shared=shared,
-        unseen=unseen,
-        before=before,
-        after=after,
-        without=without,
-        unnamed=None,
-        maps_before=maps(predictor, choice.base.mismatch),
-        maps_after=maps(predictor, fit.mismatch),
-        attempt=unseen.removed,
-    )
-
-
-def _worse_unseen(evidence: Evidence) -> int | None:
-    """The named term without which unseen rows are foretold best, if better than with it; no event, which none are."""
-    events = once(evidence.fit.hypothesis)
-    others = {
-        place: held.rms
-        for place, held in evidence.without.items()
-        if held.rms <= evidence.after.rms and place not in events
-    }
-    return min(others, key=lambda place: others[place]) if others else None
-
-
-def _foretells_nothing(evidence: Evidence) -> bool:
-    """Whether free windows are hardly better for the names, although something is left: terms that only fit.
-
-    Names of events in one recording alone are not asked, since nobody can foretell them.
-    """
-    if (
-        set(evidence.named) <= set(once(evidence.fit.hypothesis))
-        or evidence.unseen.after < FITTED * evidence.unseen.floor
-    ):
-        return False
-    judged = evidence.shared.judged
-    return foretold(evidence.predictor, evidence.before, evidence.after, judged) > LEAST_FORETOLD
-
-
-def _without_names(evidence: Evidence) -> Evidence:
-    """The evidence when no name may stand: the base, and a table of what is left without a name."""
-    choice, predictor = evidence.choice, evidence.predictor
-    bare = replace(choice, fit=choice.base, merits=[], entries=[])
-    left = unnamed(predictor, choice.base.mismatch)
-    size = len(choice.base.coordinates)
-    shared = split(predictor, choice.base)
-    before = held_out(predictor, choice.base, shared)
-    errors, unseen = (
-        shares((rows, rows), predictor.counts, choice.floor) for rows in (choice.base.mismatch, before.mismatch)
-    )
-    return replace(
-        evidence, choice=bare, named=[], kept={}, errors=errors, less={}, without={}, unnamed=left, shared=shared,
-        before=before, after=before, unseen=unseen, spread=evidence.spread[:size, :size],
-        maps_after=evidence.maps_before,
-    )  # fmt: skip
+def _verdict(judgement: JudgedSelection) -> tuple[DiagnosisVerdict, JudgedSelection]:
+    """The verdict, and the judgement without names where none may stand."""
+    predictor, selection = judgement.predictor, judgement.selection
+    found = verdict(judgement.named, judgement.errors, predictor.dry)
+    if found is DiagnosisVerdict.MISSING_PHYSICS and predicts_nothing(judgement):
+        found = DiagnosisVerdict.UNEXPLAINED
+    if found is DiagnosisVerdict.UNEXPLAINED:
+        judgement = without_names(judgement)
+    untried = found is DiagnosisVerdict.UNEXPLAINED and selection.cut and selection.tried == 0
+    if untried or below_noise(found, predictor.encoder_noise, predictor.dry):
+        found = DiagnosisVerdict.CANNOT_TELL
+    return found, judgement

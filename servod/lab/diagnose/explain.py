@@ -13,20 +13,18 @@ from pydantic.fields import FieldInfo
 
 from servod.formats.model.axis_model import AxisModel, LugreFriction
 from servod.lab.diagnose.effects import effect, effects
+from servod.lab.diagnose.effects.effect import Effect
 
 #: Signs of bounds in text.
 _SIGNS = {Ge: (">=", "ge"), Gt: (">", "gt"), Le: ("<=", "le"), Lt: ("<", "lt")}
 
-#: Keys of the model's own friction that an effect works on beside its group.
-_OWN_KEYS = {"stribeck": ("static", "stribeck_velocity"), "presliding": ("sigma0", "sigma1")}
 
-
-def listed() -> dict[str, str]:
+def list_effects() -> dict[str, str]:
     """Name -> statement of every effect."""
     return {found.name: found.statement for found in effects()}
 
 
-def explained(name: str) -> dict[str, Any]:
+def explain_effect(name: str) -> dict[str, Any]:
     """Equation, source, keys, signature and separating experiment of the effect `name`."""
     found = effect(name)
     return {
@@ -37,19 +35,19 @@ def explained(name: str) -> dict[str, Any]:
         "shows": found.shows,
         "confused_with": list(found.confused),
         "experiment": found.experiment,
-        "keys": [*_keys(found.group), *_own(found.name)],
+        "keys": [*_keys(found), *(_friction_key(key) for key in found.friction_keys)],
     }
 
 
-def _keys(group: str) -> list[dict[str, str]]:
-    """Keys of a group of the axis model, or the plain key itself."""
-    field = AxisModel.model_fields[group]
-    model = _model_of(field.annotation)
-    return [_key(group, field)] if model is None else _fields(group, model)
+def _keys(found: Effect) -> list[dict[str, str]]:
+    """Keys of the effect's group of the axis model, or the plain key itself."""
+    if found.group is None:
+        return [_key(found.name, AxisModel.model_fields[found.name])]
+    return _fields(found.name, found.group)
 
 
-def _own(name: str) -> list[dict[str, str]]:
-    return [_key(f"friction.{key}", LugreFriction.model_fields[key]) for key in _OWN_KEYS.get(name, ())]
+def _friction_key(key: str) -> dict[str, str]:
+    return _key(f"friction.{key}", LugreFriction.model_fields[key])
 
 
 def _fields(path: str, model: type[BaseModel]) -> list[dict[str, str]]:

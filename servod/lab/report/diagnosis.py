@@ -1,12 +1,11 @@
 """The page of a diagnosis and its pictures: plain sentences first, where before what, mathematics folded behind.
 
-Stands on the evidence of a diagnosis and on its document, whose numbers it shows; nothing is decided here.
+Stands on the result of a diagnosis and on its document, whose numbers it shows; nothing is decided here.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -16,21 +15,17 @@ from servod.formats.model.axis_model import axis_model_yaml
 from servod.lab.diagnose.document import (
     MATHEMATICS,
     REMEDIES,
-    certainty,
+    describe_certainty,
+    describe_rest,
     diagnosis_document,
-    extended_model,
     next_experiments,
-    remains,
     verdict_sentence,
-    window_evidence,
 )
-from servod.lab.diagnose.explain import explained
-from servod.lab.diagnose.judge.evidence import Diagnosis, Evidence
-from servod.lab.diagnose.judge.held_out import WindowErrors
-from servod.lab.diagnose.judge.locate import bands
+from servod.lab.diagnose.explain import explain_effect
+from servod.lab.diagnose.result import Diagnosis, Evidence, Units
 from servod.lab.report.figure import Figure
 from servod.lab.report.figures import mismatch as figures
-from servod.lab.report.figures.signature import signature, table_figure
+from servod.lab.report.figures.signature import signature_figure, table_figure
 from servod.lab.report.page import Page
 from servod.lab.report.pictures import write_pictures
 
@@ -58,17 +53,15 @@ class Report:
         return self._path
 
 
-def write_report(
-    folder: Path, diagnosis: Diagnosis, document: Document, windows: Sequence[WindowErrors], title: str = "the model"
-) -> Path:
-    """Write `report.html` and `pictures/*.png` into `folder`; `document` and `windows` are those of the diagnosis."""
+def write_report(folder: Path, diagnosis: Diagnosis, document: Document, title: str = "the model") -> Path:
+    """Write `report.html` and `pictures/*.png` into `folder`; `document` is that of the diagnosis."""
     report = Report(folder, f"Diagnosis: what {title} leaves out")
     _answer(report.page, document)
     if diagnosis.evidence is not None:
-        _where(report, diagnosis.evidence)
-        _what(report, diagnosis.evidence, document)
-        _fit(report, diagnosis.evidence, document)
-        _remains(report, diagnosis.evidence, document, windows)
+        _where(report, diagnosis.evidence, diagnosis.units)
+        _what(report, diagnosis.evidence, document, diagnosis.units)
+        _fit(report, diagnosis.evidence, document, diagnosis.units)
+        _remains(report, diagnosis.evidence, document, diagnosis.units)
     _experiments(report.page, document)
     _recordings(report.page, document)
     _work(report.page, document)
@@ -79,41 +72,39 @@ def _answer(page: Page, document: Document) -> None:
     """Verdict, what was left out, how sure: everything that fits into a few sentences."""
     page.lead(verdict_sentence(document))
     page.points([f["statement"] for f in document["findings"]])
-    page.points([line for f in document["findings"] for line in certainty(f)])
+    page.points([line for f in document["findings"] for line in describe_certainty(f)])
 
 
-def _where(report: Report, evidence: Evidence) -> None:
+def _where(report: Report, evidence: Evidence, units: Units) -> None:
     report.page.heading("Where the model is off")
     report.page.sentence(
         "Before any physics is named: the model's own parameters were fitted to the recordings, and what it still "
         "gets wrong is looked at, as a torque in every row, over everything that the axis did."
     )
-    report.figure(figures.where(evidence.maps_before, evidence.predictor))
-    band = bands(evidence.predictor, evidence.choice.base.mismatch)
+    report.figure(figures.where(evidence.maps_before, units))
+    band = evidence.bands
     report.page.sentence(
         f"By frequency: {100.0 * max(band['shares']):.0f} % of it lies between {band['from']:g} and {band['to']:g} Hz."
     )
 
 
-def _what(report: Report, evidence: Evidence, document: Document) -> None:
-    terms = evidence.fit.hypothesis.terms
-    for number, finding in enumerate(document["findings"], 1):
+def _what(report: Report, evidence: Evidence, document: Document, units: Units) -> None:
+    for number, (found, finding) in enumerate(zip(evidence.findings, document["findings"], strict=True), 1):
         report.page.heading(f"Finding {number}: {finding['effect'].replace('_', ' ')}")
         report.page.sentence(finding["statement"])
-        places = [place for place in evidence.named if terms[place].effect == finding["effect"]]
-        for place in places:
-            report.figure(signature(evidence, finding["effect"], place))
+        for one in found.signatures:
+            report.figure(signature_figure(one, found.effect, units))
         _parameters(report.page, finding["parameters"])
-        report.page.points(certainty(finding))
-        known = explained(finding["effect"])
+        report.page.points(describe_certainty(finding))
+        known = explain_effect(finding["effect"])
         keys = [f"{key['key']}: {key['meaning']} ({key['range']})" for key in known["keys"]]
         report.page.folded(
             "The mathematics of this finding",
             [f"Equation: {known['equation']}.", f"Source: {known['source']}.", "Keys in the axis model file:", *keys],
         )
-    if evidence.unnamed is not None:
+    if evidence.residual is not None:
         report.page.heading("What is left has no name")
-        report.figure(table_figure(evidence.unnamed, evidence.predictor))
+        report.figure(table_figure(evidence.residual, units))
     _recalibrated(report.page, document)
 
 
@@ -148,8 +139,8 @@ def _small(name: str, size: Document) -> str:
     return f"{name.replace('_', ' ')} ({torque}, {size['why']}; in the model with {values})"
 
 
-def _fit(report: Report, evidence: Evidence, document: Document) -> None:
-    fit, unit, held = document["fit"], document["units"], document["fit"]["held_out"]
+def _fit(report: Report, evidence: Evidence, document: Document, units: Units) -> None:
+    fit, held = document["fit"], document["fit"]["held_out"]
     report.page.heading("The fit before and after")
     report.page.sentence(
         f"On rows that the fit has not seen ({held['left_out']} was left out) the torque error went from "
@@ -159,7 +150,7 @@ def _fit(report: Report, evidence: Evidence, document: Document) -> None:
     if held["not_judged_s"]:
         report.page.sentence(
             f"Errors leave out {held['not_judged_s']:.2g} s in and behind an external torque that came once: nothing "
-            "foretells it. The share that it carries is that of the fit itself."
+            "predicts it. The share that it carries is that of the fit itself."
         )
     rows = [
         (f"{horizon} s", f"{w['before']:.4g}", f"{w['recalibrated']:.4g}", f"{w['after']:.4g}", w["unit"])
@@ -168,26 +159,21 @@ def _fit(report: Report, evidence: Evidence, document: Document) -> None:
     header = ("simulated freely for", "model as it came", "recalibrated only", "with what was found", "unit")
     report.page.table(header, rows)
     torque = {r["name"]: (r["mismatch_before"], r["mismatch_after"]) for r in document["recordings"] if r["taken"]}
-    panels = [figures.before_after(torque, unit["torque"], "torque error")]
+    panels = [figures.before_after(torque, units.force, "torque error")]
     for horizon, window in fit["windows"].items():
         errors = {name: (w["before"], w["after"]) for name, w in window["recordings"].items()}
-        panels.append(figures.before_after(errors, unit["position"], f"position after {horizon} s", named=False))
-    report.figure(figures.bars(panels, _left_out(evidence)))
-    report.figure(figures.over_time(evidence.predictor, evidence.before.mismatch, evidence.after.mismatch))
+        panels.append(figures.before_after(errors, units.length, f"position after {horizon} s", named=False))
+    report.figure(figures.bars(panels, evidence.left_out))
+    report.figure(figures.over_time(evidence.recordings, units))
 
 
-def _left_out(evidence: Evidence) -> str | None:
-    """What was left out of the fits in turn; None where what has no name was fitted to everything."""
-    return evidence.shared.left_out if evidence.unnamed is None else None
-
-
-def _remains(report: Report, evidence: Evidence, document: Document, windows: Sequence[WindowErrors]) -> None:
+def _remains(report: Report, evidence: Evidence, document: Document, units: Units) -> None:
     report.page.heading("What remains")
-    report.page.sentence(remains(document))
-    report.figure(figures.map_grid(evidence.maps_before, evidence.maps_after, evidence.predictor))
-    report.figure(figures.spectrum(evidence.predictor, evidence.before.mismatch, evidence.after.mismatch))
-    if windows:
-        report.figure(figures.window_course(evidence.predictor, windows, _left_out(evidence)))
+    report.page.sentence(describe_rest(document))
+    report.figure(figures.map_grid(evidence.maps_before, evidence.maps_after, units))
+    report.figure(figures.spectrum(evidence.quality.spectrum_before, evidence.quality.spectrum_after, units))
+    if evidence.quality.windows:
+        report.figure(figures.window_course(evidence.quality.windows, evidence.left_out, units))
 
 
 def _experiments(page: Page, document: Document) -> None:
@@ -238,16 +224,12 @@ DOCUMENT, MODEL = "diagnosis.json", "model.yaml"
 def write_files(folder: Path, diagnosis: Diagnosis, title: str) -> dict[str, Any]:
     """Write all files into `folder` and return the document. Without an answer there is no model. Raises BadInput."""
     begun = monotonic()
-    evidence = diagnosis.evidence
-    windows = window_evidence(diagnosis, evidence) if evidence else []
-    document = diagnosis_document(diagnosis, windows)
-    document["seconds"]["windows"] = round(monotonic() - begun, 2)
-    extended = extended_model(diagnosis)
-    if extended is None:
+    document = diagnosis_document(diagnosis)
+    if diagnosis.evidence is None:
         (folder / MODEL).unlink(missing_ok=True)
     else:
-        write_bytes(folder / MODEL, axis_model_yaml(extended).encode())
-    write_report(folder, diagnosis, document, windows, title)
-    document["seconds"]["report"] = round(monotonic() - begun - document["seconds"]["windows"], 2)
+        write_bytes(folder / MODEL, axis_model_yaml(diagnosis.evidence.model).encode())
+    write_report(folder, diagnosis, document, title)
+    document["seconds"]["report"] = round(monotonic() - begun, 2)
     write_bytes(folder / DOCUMENT, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
     return document

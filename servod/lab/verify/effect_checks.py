@@ -17,10 +17,10 @@ from itertools import pairwise
 
 from servod.formats.gains.design import Design
 from servod.formats.gains.gain_set import CertificateCheck
+from servod.formats.model import effects as fx
+from servod.formats.model import friction as fr
 from servod.formats.model.axis_model import AxisModel, wave_number
-from servod.formats.model.effects import Table
-from servod.formats.model.friction import ThermalShape
-from servod.formats.model.keys import Harmonic
+from servod.formats.model.keys import Group, Harmonic
 from servod.kernels.physics.effects import SMALLEST_FACTOR, static_stretch
 from servod.lab.verify.checks import CORNER_DISK, MOST_NAME, POLE_LIMIT, Subject, at_least, at_most
 from servod.lab.verify.closed_loop import Behind, Deviation, Reach, corners
@@ -30,7 +30,7 @@ from servod.lab.verify.steady_friction import SPRING_STRETCH_RAD, SteadyFriction
 # What effects of the axis model do to the values of the joint: how far each value goes over travel and temperature.
 #
 # Stands on axis model and steady friction, under the checks of effects. The loop check linearises a plain joint; an
-# effect that scales a value, or adds a slope, is in it as the ends of an interval. One function for each effect, in the
+# effect that scales a value, or adds a slope, is in it as the ends of an interval. One function for each group, in the
 # table at the end; each gives bounds: amplitudes are summed as if they met in one place.
 
 
@@ -139,7 +139,7 @@ def _thermal(model: AxisModel, level: Level) -> Effect:
 
     def ends(per_c: float, per_s: float) -> Ends:
         by_warmth = [per_c * (at - t.reference_c) for at in (cold, warm)]
-        if t.shape is ThermalShape.EXPONENTIAL:
+        if t.shape is fr.ThermalShape.EXPONENTIAL:
             by_warmth = [math.exp(share) - 1.0 for share in by_warmth]
         drift = _drift(per_s, t.drift_time_s)
         found = [1.0 + share + more for share in by_warmth for more in (0.0, drift)]
@@ -240,7 +240,7 @@ def _residual(model: AxisModel, _level: Level) -> Effect:
     return Effect(position_slope=_steepest(r.position), more_viscous=_steepest(r.velocity))
 
 
-def _steepest(table: Table | None) -> Ends:
+def _steepest(table: fx.Table | None) -> Ends:
     if table is None:
         return NONE
     rows = zip(pairwise(table.grid), pairwise(table.torque), strict=True)
@@ -248,32 +248,33 @@ def _steepest(table: Table | None) -> Ends:
     return min(0.0, *slopes), max(0.0, *slopes)
 
 
-#: Effects that scale or shift what the loop has in it, by their key in the model.
-EFFECTS: dict[str, Callable[[AxisModel, Level], Effect]] = {
-    "thermal": _thermal,
-    "load_dependent_friction": _load_dependent,
-    "position_dependent_friction": _position_dependent,
-    "torque_ripple": _ripple,
-    "position_dependent_inertia": _inertia,
-    "encoder_eccentricity": _eccentricity,
-    "torque_saturation": _saturation,
-    "torque_gain": _gain_by_sign,
-    "offset_drift": _offset_drift,
-    "residual": _residual,
+#: Groups that scale or shift what the loop has in it.
+EFFECTS: dict[type[Group], Callable[[AxisModel, Level], Effect]] = {
+    fr.Thermal: _thermal,
+    fr.LoadDependentFriction: _load_dependent,
+    fr.PositionDependentFriction: _position_dependent,
+    fx.TorqueRipple: _ripple,
+    fx.PositionDependentInertia: _inertia,
+    fx.EncoderEccentricity: _eccentricity,
+    fx.TorqueSaturation: _saturation,
+    fx.TorqueGain: _gain_by_sign,
+    fx.OffsetDrift: _offset_drift,
+    fx.Residual: _residual,
 }
 
 
 def effects_of(model: AxisModel, level: Level) -> dict[str, Effect]:
     """Every effect that `model` has and that changes something, by its key; torques per unit of torque gain."""
     gain, found = level.friction.gain, {}
-    for name, effect in EFFECTS.items():
-        if getattr(model, name) is None:
+    names = {type(group): name for name, group in model.groups()}
+    for group, effect in EFFECTS.items():
+        if group not in names:
             continue
         e = effect(model, level)
         slope, viscous = ((low / gain, high / gain) for low, high in (e.position_slope, e.more_viscous))
         e = Effect(e.inertia, e.torque_gain, e.dry, e.viscous, slope, viscous, e.told)
         if e != Effect():
-            found[name] = e
+            found[names[group]] = e
     return found
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from servod.qualify.blind import listed
 from servod.qualify.blind.axes import Axis, draw_axis
 from servod.qualify.blind.concealed import NO_THERMOMETER, Concealed, Document, Draw
 from servod.qualify.blind.hidden import HIDE, UNLISTED
@@ -34,7 +35,7 @@ def believed_model(physics: Physics, off: Sequence[float]) -> Document:
     if physics.static == physics.coulomb:
         friction["static"] = friction["coulomb"]
     model["inertia"] *= 1.0 + off[0]
-    model["gravity"]["amplitude"] *= 1.0 + off[7]
+    model[listed.GRAVITY]["amplitude"] *= 1.0 + off[7]
     return model
 
 
@@ -62,7 +63,7 @@ def plain_model(physics: Physics) -> Document:
             "sigma0": physics.sigma0,
             "sigma1": physics.sigma1,
         },
-        "gravity": {"amplitude": physics.gravity, "phase": physics.gravity_phase},
+        listed.GRAVITY: {"amplitude": physics.gravity, "phase": physics.gravity_phase},
     }
 
 
@@ -253,12 +254,16 @@ def _cluttered(physics: Physics, axis: Axis, rng: np.random.Generator, effects: 
     torque = CLUTTER * axis.physics.coulomb
     turns = 2.0 * axis.motions.travel / 6.283
     little: Mapping[str, dict[str, float]] = {
-        "cogging": {"cogging": torque, "cogging_order": round(7.0 / turns), "cogging_phase": 1.0},
-        "asymmetry": {"front_dry": 1.0 + CLUTTER, "back_dry": 1.0 - CLUTTER},
-        "position_dependent_friction": {"grip_share": CLUTTER, "grip_order": round(3.0 / turns), "grip_phase": 2.0},
-        "torque_offset": {"offset": torque},
-        "viscous_nonlinear": {"drag_torque": torque, "drag_speed": axis.speed},
-        "torque_ripple": {"ripple_share": CLUTTER, "ripple_order": round(5.0 / turns)},
+        listed.COGGING: {"cogging": torque, "cogging_order": round(7.0 / turns), "cogging_phase": 1.0},
+        listed.ASYMMETRY: {"front_dry": 1.0 + CLUTTER, "back_dry": 1.0 - CLUTTER},
+        listed.POSITION_DEPENDENT_FRICTION: {
+            "grip_share": CLUTTER,
+            "grip_order": round(3.0 / turns),
+            "grip_phase": 2.0,
+        },
+        listed.TORQUE_OFFSET: {"offset": torque},
+        listed.VISCOUS_NONLINEAR: {"drag_torque": torque, "drag_speed": axis.speed},
+        listed.TORQUE_RIPPLE: {"ripple_share": CLUTTER, "ripple_order": round(5.0 / turns)},
     }
     for name in rng.permutation([name for name in little if name not in effects])[:3]:
         physics = physics._replace(**little[str(name)])

@@ -1,7 +1,7 @@
 """What an axis of the trial may conceal: every name of the outside contract, in a textbook form and in another one.
 
-Stands on axes and physics. `HIDE` maps a name to the function that draws it; physics that is on nobody's list stands in
-`unlisted`.
+Stands on axes and physics. `HIDE` maps a name to the function that draws it; the drawings stand in `hidden_friction`,
+`hidden_place` and `hidden_drive`, physics that is on nobody's list in `unlisted`.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 
+from servod.qualify.blind import listed
 from servod.qualify.blind.concealed import NO_THERMOMETER, Concealed, Document, Draw
 
 # Draws what is concealed between command and load: the drive's faults, elasticity, inertia, and torques from outside.
@@ -29,7 +30,7 @@ def backlash(draw: Draw) -> Concealed:
     group = {"gap": gap, "load_inertia": load, "stiffness": stiffness, "damping": damping}
     told = {"gap": gap, "load_inertia": load}
     believed = {"inertia": p.inertia, "viscous": p.viscous}
-    model = None if draw.other else {"backlash": group | {"load_viscous": changes["load_viscous"]}}
+    model = None if draw.other else {listed.BACKLASH: group | {"load_viscous": changes["load_viscous"]}}
     return Concealed(changes, told, model, believed)
 
 
@@ -47,7 +48,7 @@ def joint_elasticity(draw: Draw) -> Concealed:
     group = {"load_inertia": load, "stiffness": stiffness, "damping": damping, "cubic": cubic}
     told = {"load_inertia": load, "stiffness": stiffness}
     believed = {"inertia": p.inertia, "viscous": p.viscous}
-    model = {"joint_elasticity": group | {"load_viscous": changes["load_viscous"]}}
+    model = {listed.JOINT_ELASTICITY: group | {"load_viscous": changes["load_viscous"]}}
     return Concealed(changes, told, model, believed)
 
 
@@ -68,7 +69,7 @@ def torque_gain(draw: Draw) -> Concealed:
     factor = 1.0 + off if draw.flip() else 1.0 / (1.0 + off)
     back = factor * draw.one_of(0.94, 1.06) if draw.other else factor
     group = {"factor": factor} | ({"negative_factor": back} if draw.other else {})
-    return Concealed({"gain_front": factor, "gain_back": back}, group, {"torque_gain": group})
+    return Concealed({"gain_front": factor, "gain_back": back}, group, {listed.TORQUE_GAIN: group})
 
 
 def torque_saturation(draw: Draw) -> Concealed:
@@ -76,7 +77,7 @@ def torque_saturation(draw: Draw) -> Concealed:
     share = max(0.62 / draw.strength**0.5, 0.25) * draw.between(0.85, 1.15)
     limit = share * draw.axis.effort * (1.25 if draw.other else 1.0)
     group = {"limit": limit}
-    model = {"torque_saturation": {"limit": limit, "shape": "tanh" if draw.other else "hard"}}
+    model = {listed.TORQUE_SATURATION: {"limit": limit, "shape": "tanh" if draw.other else "hard"}}
     return Concealed({"limit": limit, "limit_shape": float(draw.other)}, group, model)
 
 
@@ -85,7 +86,9 @@ def delay(draw: Draw) -> Concealed:
     more = round(1e3 * (0.0025 + min(draw.size(0.001, 0.004), 0.009)), 1) * 1e-3
     lag = 0.1 * more if draw.other else 0.0
     changes = {"delay_s": draw.physics.delay_s + more, "lag_s": lag}
-    model = {"delay": {"additional_s": more}} | ({"actuator_lag": {"time_constant_s": lag}} if draw.other else {})
+    model = {listed.DELAY: {"additional_s": more}} | (
+        {listed.ACTUATOR_LAG: {"time_constant_s": lag}} if draw.other else {}
+    )
     return Concealed(changes, {"additional_s": more + lag}, model)
 
 
@@ -94,10 +97,10 @@ def actuator_lag(draw: Draw) -> Concealed:
     lag = min(draw.size(0.003, 0.008), 0.02)
     if draw.other and draw.flip():
         slew = draw.axis.effort * 2.0 * math.pi * 2.0 * draw.axis.motions.tempo / max(draw.strength, 1.0)
-        return Concealed({"slew": slew}, {"slew_per_s": slew}, {"actuator_lag": {"slew_per_s": slew}})
+        return Concealed({"slew": slew}, {"slew_per_s": slew}, {listed.ACTUATOR_LAG: {"slew_per_s": slew}})
     found = {"time_constant_s": lag}
     order = 2.0 if draw.other else 1.0
-    return Concealed({"lag_s": lag, "lag_order": order}, found, None if draw.other else {"actuator_lag": found})
+    return Concealed({"lag_s": lag, "lag_order": order}, found, None if draw.other else {listed.ACTUATOR_LAG: found})
 
 
 def inertia(draw: Draw) -> Concealed:
@@ -111,7 +114,7 @@ def inertia(draw: Draw) -> Concealed:
 def torque_offset(draw: Draw) -> Concealed:
     """A constant torque beside the command."""
     torque = draw.size(0.08, 0.35) * draw.physics.coulomb * draw.sign()
-    return Concealed({"offset": torque}, {"torque_offset": torque}, {"torque_offset": torque})
+    return Concealed({"offset": torque}, {listed.TORQUE_OFFSET: torque}, {listed.TORQUE_OFFSET: torque})
 
 
 def disturbance(draw: Draw) -> Concealed:
@@ -139,10 +142,10 @@ def position_dependent_friction(draw: Draw) -> Concealed:
         travel = draw.axis.motions.travel
         spot = {"factor": min(2.0 * share, 2.0), "position": draw.between(-0.4, 0.4) * travel, "width": 0.13 * travel}
         changes = {"spot_share": spot["factor"], "spot_place": spot["position"], "spot_width": spot["width"]}
-        return Concealed(changes, spot, {"position_dependent_friction": {"bumps": [spot]}})
+        return Concealed(changes, spot, {listed.POSITION_DEPENDENT_FRICTION: {"bumps": [spot]}})
     order, phase = _order(draw, 2.0, 6.0), draw.between(0.0, 6.28)
     changes = {"grip_share": share, "grip_order": order, "grip_phase": phase, "grip_shape": _shape(draw)}
-    return _periodic(draw, "position_dependent_friction", changes, order, share, phase)
+    return _periodic(draw, listed.POSITION_DEPENDENT_FRICTION, changes, order, share, phase)
 
 
 def cogging(draw: Draw) -> Concealed:
@@ -152,7 +155,7 @@ def cogging(draw: Draw) -> Concealed:
     second = torque * draw.between(0.0, 0.15)
     changes = {"cogging": torque, "cogging_order": order, "cogging_phase": phase}
     changes |= {"cogging_second": second, "cogging_shape": _shape(draw)}
-    return _periodic(draw, "cogging", changes, order, torque, phase, second)
+    return _periodic(draw, listed.COGGING, changes, order, torque, phase, second)
 
 
 def torque_ripple(draw: Draw) -> Concealed:
@@ -160,7 +163,7 @@ def torque_ripple(draw: Draw) -> Concealed:
     share = min(draw.size(0.06, 0.2), 0.45)
     order, phase = _order(draw, 2.5, 8.0), draw.between(0.0, 6.28)
     changes = {"ripple_share": share, "ripple_order": order, "ripple_phase": phase, "ripple_shape": _shape(draw)}
-    return _periodic(draw, "torque_ripple", changes, order, share, phase)
+    return _periodic(draw, listed.TORQUE_RIPPLE, changes, order, share, phase)
 
 
 def gravity(draw: Draw) -> Concealed:
@@ -174,7 +177,7 @@ def gravity(draw: Draw) -> Concealed:
     changes = {"gravity": amplitude, "gravity_phase": turned, "gravity_second": second}
     found = {"amplitude": amplitude, "phase": turned}
     believed = {"gravity": p.gravity, "gravity_phase": p.gravity_phase}
-    return Concealed(changes, found, None if draw.other else {"gravity": found}, believed, travel=0.9)
+    return Concealed(changes, found, None if draw.other else {listed.GRAVITY: found}, believed, travel=0.9)
 
 
 def spring(draw: Draw) -> Concealed:
@@ -188,7 +191,7 @@ def spring(draw: Draw) -> Concealed:
     found = {"stiffness": stiffness, "rest": rest, "cubic": cubic}
     changes = {"spring": stiffness, "spring_rest": rest, "spring_cubic": cubic}
     told = found if draw.other else {key: found[key] for key in ("stiffness", "rest")}
-    return Concealed(changes, told, {"spring": found}, travel=0.9 if draw.other else 1.2)
+    return Concealed(changes, told, {listed.SPRING: found}, travel=0.9 if draw.other else 1.2)
 
 
 def position_dependent_inertia(draw: Draw) -> Concealed:
@@ -198,7 +201,7 @@ def position_dependent_inertia(draw: Draw) -> Concealed:
     changes = {"swing_share": share, "swing_order": order, "swing_phase": phase, "swing_second": second}
     rows = _rows(order, share, phase, second)
     travel = PERIODS * math.pi / order
-    return Concealed(changes, _first(rows), {"position_dependent_inertia": {"harmonics": rows}}, travel=travel)
+    return Concealed(changes, _first(rows), {listed.POSITION_DEPENDENT_INERTIA: {"harmonics": rows}}, travel=travel)
 
 
 def encoder_eccentricity(draw: Draw) -> Concealed:
@@ -210,7 +213,7 @@ def encoder_eccentricity(draw: Draw) -> Concealed:
     changes["eccentricity_second"] = second
     rows = _rows(order, amplitude, phase, second)
     travel = PERIODS * math.pi / order
-    return Concealed(changes, _first(rows), {"encoder_eccentricity": {"harmonics": rows}}, travel=travel)
+    return Concealed(changes, _first(rows), {listed.ENCODER_ECCENTRICITY: {"harmonics": rows}}, travel=travel)
 
 
 def _order(draw: Draw, least: float, most: float) -> float:
@@ -232,7 +235,11 @@ def _periodic(
     return Concealed(changes, _first(rows), None if draw.other else {group: {"harmonics": rows}})
 
 
-_SHAPES = {"position_dependent_friction": "grip_shape", "cogging": "cogging_shape", "torque_ripple": "ripple_shape"}
+_SHAPES = {
+    listed.POSITION_DEPENDENT_FRICTION: "grip_shape",
+    listed.COGGING: "cogging_shape",
+    listed.TORQUE_RIPPLE: "ripple_shape",
+}
 
 
 def _rows(order: float, amplitude: float, phase: float, second: float) -> list[Document]:
@@ -259,7 +266,7 @@ def asymmetry(draw: Draw) -> Concealed:
     names = {"positive_dry": "front_dry", "negative_dry": "back_dry"}
     names |= {"positive_viscous": "front_viscous", "negative_viscous": "back_viscous"}
     group = {key: changes[own] for key, own in names.items()}
-    return Concealed(changes, {"negative_over_positive": back / front}, {"asymmetry": group})
+    return Concealed(changes, {"negative_over_positive": back / front}, {listed.ASYMMETRY: group})
 
 
 def stribeck(draw: Draw) -> Concealed:
@@ -271,7 +278,7 @@ def stribeck(draw: Draw) -> Concealed:
     changes = {"static": static, "stribeck_velocity": velocity, "stribeck_exponent": exponent}
     group = {"static": static, "stribeck_velocity": velocity, "exponent": exponent}
     parameters = {"static": static, "stribeck_velocity": velocity} | ({"exponent": exponent} if draw.other else {})
-    return Concealed(changes, parameters, {"stribeck": group}, {"static": p.coulomb})
+    return Concealed(changes, parameters, {listed.STRIBECK: group}, {"static": p.coulomb})
 
 
 def presliding(draw: Draw) -> Concealed:
@@ -284,7 +291,7 @@ def presliding(draw: Draw) -> Concealed:
     changes = {"sigma0": sigma0, "sigma1": sigma1, "elastic_share": 0.6 if draw.other else 0.0}
     found = {"sigma0": sigma0, "sigma1": sigma1}
     believed = {"sigma0": p.sigma0, "sigma1": p.sigma1}
-    return Concealed(changes, found, None if draw.other else {"presliding": found}, believed)
+    return Concealed(changes, found, None if draw.other else {listed.PRESLIDING: found}, believed)
 
 
 def viscous_nonlinear(draw: Draw) -> Concealed:
@@ -296,7 +303,7 @@ def viscous_nonlinear(draw: Draw) -> Concealed:
     coefficient = torque / speed**exponent
     key = {2.0: "quadratic", 3.0: "cubic"}.get(exponent, "power")
     group = {key: coefficient} | ({"exponent": exponent} if key == "power" else {})
-    return Concealed(changes, group, {"viscous_nonlinear": group})
+    return Concealed(changes, group, {listed.VISCOUS_NONLINEAR: group})
 
 
 def load_dependent_friction(draw: Draw) -> Concealed:
@@ -304,9 +311,11 @@ def load_dependent_friction(draw: Draw) -> Concealed:
     share = min(draw.size(0.05, 0.2), 0.6)
     if draw.other and draw.physics.gravity > 0.0:
         share = min(2.0 * share, 0.8)
-        return Concealed({"dry_per_load": share}, {"per_load": share}, {"load_dependent_friction": {"per_load": share}})
+        return Concealed(
+            {"dry_per_load": share}, {"per_load": share}, {listed.LOAD_DEPENDENT_FRICTION: {"per_load": share}}
+        )
     found = {"per_command": share}
-    return Concealed({"dry_per_torque": share}, found, {"load_dependent_friction": found})
+    return Concealed({"dry_per_torque": share}, found, {listed.LOAD_DEPENDENT_FRICTION: found})
 
 
 def thermal(draw: Draw) -> Concealed:
@@ -318,7 +327,7 @@ def thermal(draw: Draw) -> Concealed:
     found = {"dry_per_c": -dry, "viscous_per_c": -viscous}
     if blind:
         return Concealed(changes, {}, None, thermometer=False, cold=draw.flip())
-    return Concealed(changes, found, {"thermal": {**found, "shape": shape}}, thermometer=True)
+    return Concealed(changes, found, {listed.THERMAL: {**found, "shape": shape}}, thermometer=True)
 
 
 # Draws physics that is on nobody's list: the right answer is that something unexplained is there, and where.
@@ -362,28 +371,28 @@ def patchy_friction(draw: Draw) -> Concealed:
 Hide = Callable[[Draw], Concealed]
 
 HIDE: Mapping[str, Hide] = {
-    "asymmetry": asymmetry,
-    "stribeck": stribeck,
-    "presliding": presliding,
-    "viscous_nonlinear": viscous_nonlinear,
-    "load_dependent_friction": load_dependent_friction,
-    "position_dependent_friction": position_dependent_friction,
-    "cogging": cogging,
-    "torque_ripple": torque_ripple,
-    "gravity": gravity,
-    "spring": spring,
-    "backlash": backlash,
-    "joint_elasticity": joint_elasticity,
-    "torque_gain": torque_gain,
-    "torque_saturation": torque_saturation,
-    "delay": delay,
-    "actuator_lag": actuator_lag,
-    "thermal": thermal,
-    "inertia": inertia,
-    "position_dependent_inertia": position_dependent_inertia,
-    "encoder_eccentricity": encoder_eccentricity,
-    "torque_offset": torque_offset,
-    "disturbance": disturbance,
+    listed.ASYMMETRY: asymmetry,
+    listed.STRIBECK: stribeck,
+    listed.PRESLIDING: presliding,
+    listed.VISCOUS_NONLINEAR: viscous_nonlinear,
+    listed.LOAD_DEPENDENT_FRICTION: load_dependent_friction,
+    listed.POSITION_DEPENDENT_FRICTION: position_dependent_friction,
+    listed.COGGING: cogging,
+    listed.TORQUE_RIPPLE: torque_ripple,
+    listed.GRAVITY: gravity,
+    listed.SPRING: spring,
+    listed.BACKLASH: backlash,
+    listed.JOINT_ELASTICITY: joint_elasticity,
+    listed.TORQUE_GAIN: torque_gain,
+    listed.TORQUE_SATURATION: torque_saturation,
+    listed.DELAY: delay,
+    listed.ACTUATOR_LAG: actuator_lag,
+    listed.THERMAL: thermal,
+    listed.INERTIA: inertia,
+    listed.POSITION_DEPENDENT_INERTIA: position_dependent_inertia,
+    listed.ENCODER_ECCENTRICITY: encoder_eccentricity,
+    listed.TORQUE_OFFSET: torque_offset,
+    listed.DISTURBANCE: disturbance,
 }
 
 UNLISTED: Mapping[str, Hide] = {

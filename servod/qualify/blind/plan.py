@@ -12,6 +12,7 @@ from itertools import cycle, islice
 
 import numpy as np
 
+from servod.qualify.blind import listed
 from servod.qualify.blind.axes import Kind
 from servod.qualify.blind.hidden import HIDE, UNLISTED
 
@@ -40,40 +41,41 @@ MIX = {Sort.SINGLE: 0.5, Sort.PAIR: 0.2, Sort.NOTHING: 0.18, Sort.UNKNOWN: 0.12}
 
 #: Covers in turn, and the effects that some of them suit.
 COVERS = (Cover.NONE, Cover.INTEGRATOR, Cover.NONE, Cover.BAND, Cover.NONE, Cover.NOISE, Cover.NONE, Cover.ABSORBED)
-IN_A_BAND = {"joint_elasticity", "delay", "actuator_lag"}
+IN_A_BAND = {listed.JOINT_ELASTICITY, listed.DELAY, listed.ACTUATOR_LAG}
 ABSORBABLE = {
-    "viscous_nonlinear", "load_dependent_friction", "position_dependent_friction", "thermal", "torque_gain", "asymmetry"
-}  # fmt: skip
+    *(listed.VISCOUS_NONLINEAR, listed.LOAD_DEPENDENT_FRICTION, listed.POSITION_DEPENDENT_FRICTION),
+    *(listed.THERMAL, listed.TORQUE_GAIN, listed.ASYMMETRY),
+}
 
 #: Effects that act in the same way, so that no data tell two of them apart; pairs take theirs from different rows.
 FAMILIES = (
-    ("stribeck", "presliding"),
-    ("asymmetry", "torque_offset", "disturbance"),
-    ("viscous_nonlinear", "torque_saturation", "thermal"),
-    ("load_dependent_friction", "position_dependent_friction"),
-    ("cogging", "torque_ripple"),
-    ("gravity", "spring"),
-    ("delay", "actuator_lag", "joint_elasticity", "backlash"),
-    ("inertia", "torque_gain", "position_dependent_inertia", "encoder_eccentricity"),
+    (listed.STRIBECK, listed.PRESLIDING),
+    (listed.ASYMMETRY, listed.TORQUE_OFFSET, listed.DISTURBANCE),
+    (listed.VISCOUS_NONLINEAR, listed.TORQUE_SATURATION, listed.THERMAL),
+    (listed.LOAD_DEPENDENT_FRICTION, listed.POSITION_DEPENDENT_FRICTION),
+    (listed.COGGING, listed.TORQUE_RIPPLE),
+    (listed.GRAVITY, listed.SPRING),
+    (listed.DELAY, listed.ACTUATOR_LAG, listed.JOINT_ELASTICITY, listed.BACKLASH),
+    (listed.INERTIA, listed.TORQUE_GAIN, listed.POSITION_DEPENDENT_INERTIA, listed.ENCODER_ECCENTRICITY),
 )
 
 #: Pairs of different rows that act alike all the same.
 ALIKE = (
-    {"torque_gain", "viscous_nonlinear"},
-    {"torque_gain", "torque_saturation"},
-    {"torque_gain", "load_dependent_friction"},
-    {"position_dependent_inertia", "joint_elasticity"},
-    {"position_dependent_inertia", "backlash"},
-    {"inertia", "joint_elasticity"},
-    {"inertia", "backlash"},
-    {"encoder_eccentricity", "joint_elasticity"},
-    {"encoder_eccentricity", "backlash"},
-    {"presliding", "backlash"},
-    {"presliding", "joint_elasticity"},
-    {"torque_ripple", "position_dependent_inertia"},
-    {"gravity", "torque_offset"},
-    {"spring", "torque_offset"},
-    {"load_dependent_friction", "torque_saturation"},
+    {listed.TORQUE_GAIN, listed.VISCOUS_NONLINEAR},
+    {listed.TORQUE_GAIN, listed.TORQUE_SATURATION},
+    {listed.TORQUE_GAIN, listed.LOAD_DEPENDENT_FRICTION},
+    {listed.POSITION_DEPENDENT_INERTIA, listed.JOINT_ELASTICITY},
+    {listed.POSITION_DEPENDENT_INERTIA, listed.BACKLASH},
+    {listed.INERTIA, listed.JOINT_ELASTICITY},
+    {listed.INERTIA, listed.BACKLASH},
+    {listed.ENCODER_ECCENTRICITY, listed.JOINT_ELASTICITY},
+    {listed.ENCODER_ECCENTRICITY, listed.BACKLASH},
+    {listed.PRESLIDING, listed.BACKLASH},
+    {listed.PRESLIDING, listed.JOINT_ELASTICITY},
+    {listed.TORQUE_RIPPLE, listed.POSITION_DEPENDENT_INERTIA},
+    {listed.GRAVITY, listed.TORQUE_OFFSET},
+    {listed.SPRING, listed.TORQUE_OFFSET},
+    {listed.LOAD_DEPENDENT_FRICTION, listed.TORQUE_SATURATION},
 )
 
 

@@ -18,6 +18,7 @@ from servod.common.files import read_json
 from servod.formats.model.axis_model import AxisModel, load_axis_model
 from servod.lab.recordings import load_recording
 from servod.lab.simulate.replay import Drive, replay
+from servod.qualify.blind import listed
 from servod.qualify.blind.conceal import CASES, HOLDOUT, SEALED
 from servod.qualify.blind.examine import ANSWERS, DIAGNOSIS, MODEL, RUN
 from servod.qualify.blind.plan import Sort
@@ -26,7 +27,7 @@ from servod.qualify.blind.plan import Sort
 HORIZON_S = 0.25
 
 #: Names that count as one where the answer gives one and calls the other an alternative.
-TWINS = {"delay": "actuator_lag", "actuator_lag": "delay"}
+TWINS = {listed.DELAY: listed.ACTUATOR_LAG, listed.ACTUATOR_LAG: listed.DELAY}
 
 #: An answer that never came.
 NO_ANSWER = "no answer"

@@ -11,6 +11,7 @@ import yaml
 from servod.common.errors import BadInput
 from servod.common.yaml import load_model, parse_yaml, validate
 from servod.formats.model.axis_model import AxisModel, load_axis_model
+from servod.formats.model.keys import Harmonics
 
 HERE = Path(__file__).parent
 AXES = sorted((HERE.parents[2] / "gains" / "axes").glob("*.yaml"))
@@ -56,3 +57,28 @@ def test_a_model_may_omit_what_it_does_not_have(tmp_path: Path) -> None:
     model = load_model(path, AxisModel)
     assert (model.inertia, model.total_delay_s, model.torque_offset) == (95.11, 0.001, 0.0)
     assert len(model.pack()) > 70
+
+
+class Toy(Harmonics):
+    """A group that no list knows."""
+
+    under_one = 0
+
+
+class WithToy(AxisModel):
+    """An axis model with one group more."""
+
+    toy: Toy | None = None
+
+
+def test_a_new_group_is_checked_and_packed_by_what_its_record_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    wave = {"amplitude": 0.6, "periods_per_turn": 3.0}
+    without, beside = (validate({**GOOD, **more}, WithToy, "toy") for more in ({}, {"toy": {"harmonics": [wave]}}))
+    assert [name for name, _ in beside.groups()] == ["toy"]
+    changed = [b - a for a, b in zip(without.pack(), beside.pack(), strict=True) if a != b]
+    assert changed == [1.0]  # the full loop runs, as for all that is not plain
+    monkeypatch.setattr(Toy, "plain", True)
+    assert beside.pack() == without.pack()
+    for rows, word in (([wave, wave], "amplitudes that sum"), ([{"amplitude": 0.1, "periods_per_metre": 3.0}], "no ")):
+        with pytest.raises(BadInput, match=f"toy: {word}"):
+            validate({**GOOD, "toy": {"harmonics": rows}}, WithToy, "toy")

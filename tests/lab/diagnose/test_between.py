@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from servod.lab.diagnose.data.intake import taken_in
+from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.base import base_unknowns, document_of
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
 from servod.lab.diagnose.effects.scene import Scene
-from servod.lab.diagnose.judge.held_out import HeldOut
-from servod.lab.diagnose.judge.spread import common_factor, jackknife, model_error
+from servod.lab.diagnose.judge.covariance import common_factor, jackknife, model_error
 from servod.lab.diagnose.predict.innovation_kernel import mean_command
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.fit import Fit
+from servod.lab.diagnose.select.selection import HeldOutErrors
 from tests.lab.diagnose.axes import believed, record
 
 
@@ -23,7 +23,7 @@ def colder(first: float, second: float) -> tuple[Predictor, Fit]:
     friction = believed().friction.model_dump()
     more = friction | {key: friction[key] * second / first for key in ("coulomb", "static", "viscous")}
     made = [record(believed())[0], record(believed(friction=more))[0]]
-    predictor = Predictor(taken_in(made, believed())[0], believed())
+    predictor = Predictor(load_traces(made, believed())[0], believed())
     scene = Scene(document_of(believed()), predictor, predictor.mismatch(believed()))
     term = next(term for term in effect("thermal").terms(scene) if term.form == "between recordings")
     hypothesis = Hypothesis(document_of(believed()), base_unknowns(believed())).with_term(term)
@@ -44,7 +44,7 @@ def test_estimates_are_as_sure_as_recordings_agree() -> None:
     _, fit = colder(1.0, 1.3)
     off = np.zeros_like(fit.coordinates)
     off[0] = 0.02
-    held = HeldOut(fit.mismatch, 0.0, (), (fit.coordinates + off, fit.coordinates - off))
+    held = HeldOutErrors(fit.mismatch, 0.0, (), (fit.coordinates + off, fit.coordinates - off))
     assert jackknife(fit, held)[0, 0] == pytest.approx(0.5 * 2 * 0.02**2)
     assert np.all(np.diag(model_error(fit))[:2] > 0.0)
     assert not common_factor(fit).any()

@@ -8,17 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from servod.lab.diagnose.data.intake import taken_in
+from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.scene import Scene
 from servod.lab.diagnose.judge.verdict import confidence
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.candidates import Candidate
-from servod.lab.diagnose.select.choice import Choice, Entry
-from servod.lab.diagnose.select.choose import Chooser
-from servod.lab.diagnose.select.detail import swapped, take_first
 from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.select.merit import Merit
+from servod.lab.diagnose.select.refine import add_first
+from servod.lab.diagnose.select.selection import Selection, TermEntry
+from servod.lab.diagnose.select.selector import Selector
+from servod.lab.diagnose.select.stepwise import swap_terms
 from tests.lab.diagnose.axes import believed, record
 
 #: What a term is said to be worth before anybody has looked.
@@ -26,46 +27,46 @@ UNKNOWN = Merit(math.nan, math.nan, math.nan, math.nan)
 
 
 @pytest.fixture(scope="module")
-def chooser() -> Chooser:
-    """The choice on an axis with a weight and friction that differs by direction."""
+def selector() -> Selector:
+    """The selection on an axis with a weight and friction that differs by direction."""
     hidden = believed(
         gravity={"amplitude": 0.1, "phase": 0.5},
         asymmetry={"positive_dry": 1.15, "negative_dry": 0.85, "positive_viscous": 1.0, "negative_viscous": 1.0},
     )
-    predictor = Predictor(taken_in(record(hidden, seconds=2.0), believed())[0], believed())
-    return Chooser(predictor, believed(), math.inf, lambda _line: None)
+    predictor = Predictor(load_traces(record(hidden, seconds=2.0), believed())[0], believed())
+    return Selector(predictor, believed(), math.inf, lambda _line: None)
 
 
-def added(chooser: Chooser, present: Fit, name: str) -> Fit:
+def added(selector: Selector, present: Fit, name: str) -> Fit:
     """The fit with the first form of an effect beside what is in."""
-    scene = Scene(chooser.start.document, chooser.predictor, present.mismatch)
+    scene = Scene(selector.start.document, selector.predictor, present.mismatch)
     hypothesis = present.hypothesis.with_term(effect(name).terms(scene)[0])
-    return chooser.settled(hypothesis, hypothesis.beside(present.coordinates), present.mismatch)
+    return selector.settle(hypothesis, hypothesis.beside(present.coordinates), present.mismatch)
 
 
 @pytest.fixture(scope="module")
-def mistaken(chooser: Chooser) -> tuple[Choice, Candidate]:
+def mistaken(selector: Selector) -> tuple[Selection, Candidate]:
     """A spring came in where a weight stood as close, and the friction behind it; and that weight."""
-    mismatch = chooser.predictor.mismatch(believed())
-    base = chooser.settled(chooser.start, None, mismatch)
-    chooser.base_error, chooser.floor = chooser.error(mismatch), 0.0
-    weight = Candidate("gravity", added(chooser, base, "gravity"), 0.5)
-    both = added(chooser, added(chooser, base, "spring"), "asymmetry")
-    return Choice(base, both, [UNKNOWN] * 2, [Entry(0.5, [weight]), Entry(0.1, [])], {}, 0.0, 1), weight
+    mismatch = selector.predictor.mismatch(believed())
+    base = selector.settle(selector.start, None, mismatch)
+    weight = Candidate("gravity", added(selector, base, "gravity"), 0.5)
+    both = added(selector, added(selector, base, "spring"), "asymmetry")
+    entries = (TermEntry(0.5, (weight,)), TermEntry(0.1, ()))
+    return Selection(base, both, selector.error(mismatch), 0.0, (UNKNOWN,) * 2, entries, tried=1), weight
 
 
 def test_what_is_said_of_a_term_that_was_put_in_is_its_own(
-    chooser: Chooser, mistaken: tuple[Choice, Candidate]
+    selector: Selector, mistaken: tuple[Selection, Candidate]
 ) -> None:
     given, _ = mistaken
-    choice = replace(given, merits=list(given.merits), entries=list(given.entries))
-    swapped(chooser, choice)
-    assert [term.effect for term in choice.fit.hypothesis.terms] == ["gravity", "asymmetry"]
-    for place, merit in enumerate(choice.merits):
-        assert merit == chooser.merit(chooser.less(choice.fit, place), choice.fit)
-    old = choice.entries[0].rivals[0]
+    selection = swap_terms(selector, given)
+    assert [term.effect for term in selection.fit.hypothesis.terms] == ["gravity", "asymmetry"]
+    for place, merit in enumerate(selection.merits):
+        reduced = selector.settle_without(selection.fit, place)
+        assert merit == selector.merit(selection, reduced, selection.fit)
+    old = selection.entries[0].rivals[0]
     assert (old.effect, old.term.effect) == ("spring", "spring")
-    assert confidence(choice, 0, 1.0) == pytest.approx(0.5)
+    assert confidence(selection, 0, 1.0) == pytest.approx(0.5)
 
 
 def bounded(weight: Candidate) -> Candidate:
@@ -79,20 +80,18 @@ def bounded(weight: Candidate) -> Candidate:
 
 
 def test_a_rival_that_ends_at_the_end_of_a_range_is_not_put_in(
-    chooser: Chooser, mistaken: tuple[Choice, Candidate]
+    selector: Selector, mistaken: tuple[Selection, Candidate]
 ) -> None:
     given, weight = mistaken
-    entries = [Entry(0.5, [bounded(weight)]), given.entries[1]]
-    choice = replace(given, merits=list(given.merits), entries=entries)
-    swapped(chooser, choice)
-    assert choice.fit is given.fit
+    selection = replace(given, entries=(TermEntry(0.5, (bounded(weight),)), given.entries[1]))
+    assert swap_terms(selector, selection).fit is given.fit
 
 
 def test_a_detail_that_ends_at_the_end_of_a_range_does_not_come_in(
-    chooser: Chooser, mistaken: tuple[Choice, Candidate]
+    selector: Selector, mistaken: tuple[Selection, Candidate]
 ) -> None:
     given, weight = mistaken
     for candidate, comes_in in ((bounded(weight), False), (weight, True)):
-        choice = replace(given, fit=given.base, merits=[], entries=[])
-        assert take_first(chooser, choice, [candidate]) is comes_in
-        assert len(choice.fit.hypothesis.terms) == len(choice.merits) == len(choice.entries) == int(comes_in)
+        bare = replace(given, fit=given.base, merits=(), entries=())
+        selection = add_first(selector, bare, [candidate])
+        assert selection.terms == len(selection.merits) == len(selection.entries) == int(comes_in)

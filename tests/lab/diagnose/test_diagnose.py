@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from servod.cli.app import app
 from servod.formats.model.axis_model import axis_model_yaml, load_axis_model
-from servod.lab.diagnose.document import diagnosis_document, extended_model
+from servod.lab.diagnose.document import diagnosis_document
 from servod.lab.diagnose.engine import diagnose
 from tests.lab.diagnose.axes import believed, record, write_csv
 
@@ -20,19 +20,19 @@ def found_in(seed: int = 1, off: float = 1.0, **hidden: Any) -> dict[str, Any]:
     """The document of a diagnosis of an axis with `hidden`; the model's inertia is `off` by a factor."""
     model = believed(inertia=0.02 * off)
     found = diagnose(model, record(believed(**hidden), seed=seed))
-    assert extended_model(found) is not None
+    assert found.evidence is not None
     return diagnosis_document(found)
 
 
 def test_nothing_hidden_is_adequate_and_the_model_holds_what_is_told() -> None:
     model = believed(inertia=0.02 * 1.03)
     found = diagnose(model, record(believed()))
-    document, extended = diagnosis_document(found), extended_model(found)
+    assert found.evidence is not None
+    document, extended = diagnosis_document(found), found.evidence.model
     assert document["verdict"] == "adequate"
     assert document["findings"] == []
     changed = document["recalibrated"]
     assert changed["inertia"]["to"] == pytest.approx(0.02, rel=0.005)
-    assert extended is not None
     assert extended.inertia == changed["inertia"]["to"]
     for key, value in model.friction.model_dump().items():
         to = changed.get(f"friction.{key}", {"to": value})["to"]

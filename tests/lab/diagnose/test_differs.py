@@ -5,21 +5,22 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from servod.lab.diagnose.document import differs
+from servod.lab.diagnose.document import describe_changes
 from servod.lab.diagnose.effects.base import base_unknowns
-from servod.lab.diagnose.judge.spread import within
+from servod.lab.diagnose.judge.covariance import inside_region
+from servod.lab.diagnose.result import FittedValue
 from tests.lab.diagnose.axes import believed
 
 
 def test_what_differs_is_said_with_its_share() -> None:
     changes = {
-        "friction.viscous": {"from": 200.0, "to": 210.0, "unit": "N·s/m"},
-        "torque_offset": {"from": 0.0, "to": -0.5, "unit": "N"},
+        "friction.viscous": FittedValue(210.0, "N·s/m", 205.0, 215.0, 200.0),
+        "torque_offset": FittedValue(-0.5, "N", -0.6, -0.4, 0.0),
     }
-    said = differs(changes)
+    said = describe_changes(changes)
     assert "viscous is 210 instead of 200 N·s/m (+5 %)" in said
     assert "torque offset is -0.5 instead of 0 N" in said
-    assert differs({}) == ""
+    assert describe_changes({}) == ""
 
 
 @pytest.mark.parametrize("per_s", [0.02, -0.02])
@@ -33,5 +34,5 @@ def test_a_drift_of_the_model_may_be_none_in_other_recordings(per_s: float) -> N
 def test_several_small_changes_together_may_be_told() -> None:
     """Half a standard deviation each: together one in four such by chance, unless they are known to go together."""
     off = np.array([0.5, -0.5])
-    assert within(off, np.eye(2))
-    assert not within(off, np.array([[1.0, 0.99], [0.99, 1.0]]))
+    assert inside_region(off, np.eye(2))
+    assert not inside_region(off, np.array([[1.0, 0.99], [0.99, 1.0]]))

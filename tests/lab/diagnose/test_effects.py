@@ -3,26 +3,39 @@
 from __future__ import annotations
 
 import functools
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from types import ModuleType
 
 import numpy as np
 import pytest
 
 from servod.common.yaml import parse_yaml, validate
 from servod.formats.model.axis_model import AxisModel, axis_model_yaml
-from servod.lab.diagnose.data.intake import taken_in
-from servod.lab.diagnose.effects import NAMES, effect
+from servod.lab.diagnose import effects as package
+from servod.lab.diagnose.data.intake import load_traces
+from servod.lab.diagnose.effects import NAMES, effect, effects, names, unexcited_effects
 from servod.lab.diagnose.effects.base import base_unknowns, document_of
-from servod.lab.diagnose.effects.hypothesis import Hypothesis
+from servod.lab.diagnose.effects.effect import Effect, simple
+from servod.lab.diagnose.effects.hypothesis import Hypothesis, Unknown
+from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.scene import Scene
-from servod.lab.diagnose.explain import explained
+from servod.lab.diagnose.explain import explain_effect, list_effects
+from servod.lab.diagnose.judge.covariance import common_factor
+from servod.lab.diagnose.judge.verdict import alternatives
 from servod.lab.diagnose.predict.predict import Predictor
+from servod.lab.diagnose.select.fit import Fit
+from servod.lab.diagnose.select.levels import named_terms
+from servod.lab.diagnose.select.selection import Selection, TermEntry
+from servod.lab.diagnose.select.selector import once_only
 from tests.lab.diagnose.axes import believed, record
 
 
 @functools.cache
 def scene() -> Scene:
     model = believed(gravity={"amplitude": 0.1, "phase": 0.2})
-    traces, _ = taken_in(record(model), model)
+    traces, _ = load_traces(record(model), model)
     predictor = Predictor(traces, model)
     return Scene(document_of(model), predictor, predictor.mismatch(believed()))
 
@@ -46,7 +59,7 @@ def test_starts_are_models(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_explained(name: str) -> None:
-    found = explained(name)
+    found = explain_effect(name)
     assert found["keys"]
     assert all(found[key] for key in ("statement", "equation", "source", "shows", "experiment"))
     assert set(found["confused_with"]) <= set(NAMES)
@@ -59,3 +72,55 @@ def test_every_number_of_a_spring_has_its_own_unit() -> None:
         assert told["stiffness"] == "N·m/rad"
         assert told["rest"] == "rad"
         assert told.get("cubic", "N·m/rad·1/rad²") == "N·m/rad·1/rad²"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_record_has_the_name_of_its_file_and_the_group_of_its_key(name: str) -> None:
+    found = effect(name)
+    assert found.name == name
+    assert found.twin in {"", *NAMES} and bool(found.twin) == bool(found.lateness)
+    annotation = AxisModel.model_fields[name].annotation
+    assert annotation is float if found.group is None else annotation == found.group | None
+
+
+@pytest.fixture
+def add(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Effect], None]]:
+    """Adds a record as a new file and one line would."""
+
+    def added(record: Effect) -> None:
+        module = ModuleType(f"{package.__name__}.{record.name}")
+        module.EFFECT = record  # type: ignore[attr-defined]
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+        monkeypatch.setattr(package, "NAMES", (*NAMES, record.name))
+
+    yield added
+    effect.cache_clear()
+
+
+def test_a_new_record_is_in_every_list(add: Callable[[Effect], None]) -> None:
+    stiffness = simple("toy", "straight", [Unknown("stiffness", "N·m/rad", 0.1, 0.0, 1.0, 0.1)])
+    twin = simple("spring", "straight", stiffness.unknowns)
+    record = replace(effect("spring"), name="toy", terms=lambda _scene: [stiffness], look=Look("load"))
+    flags = {"swift": True, "directed": True, "repeatable": True, "soaks_up": True, "scales_torques": True}
+    levels = {"at_level": lambda _nominal, fitted: fitted["toy"]["stiffness"] > 0.5, "twin": "spring"}
+    add(replace(record, friction_keys=("sigma0",), lateness="toy.stiffness", **flags, **levels))
+
+    assert effects()[-1] is effect("toy") and "toy" in list_effects()
+    keys = [key["key"] for key in explain_effect("toy")["keys"]]
+    assert keys == ["toy.stiffness", "toy.rest", "toy.cubic", "friction.sigma0"]
+    assert all("toy" in names(lambda what, flag=flag: getattr(what, flag)) for flag in flags)
+    predictor = scene().predictor
+    assert "toy" in unexcited_effects(predictor.traces, 1e-4) and "toy" not in unexcited_effects(
+        predictor.traces, scene().inertia
+    )
+
+    hypothesis = Hypothesis(scene().document, base_unknowns(believed()), (stiffness, twin))
+    assert once_only(hypothesis) == {"spring"}
+    for value, named in ((0.2, (1,)), (0.9, (0, 1))):
+        coordinates = hypothesis.start.copy()
+        coordinates[hypothesis.share(0)] = stiffness.unknowns[0].coordinate(value)
+        fit = Fit(hypothesis, coordinates, scene().mismatch, 0.0, np.zeros((0, 0)), True)
+        selection = Selection(fit, fit, 0.0, 0.0, (), (TermEntry(0.1, ()), TermEntry(0.1, ())))
+        assert named_terms(fit, scene().document) == named
+        assert alternatives(selection, 0) == ["spring"]
+        assert common_factor(fit)[hypothesis.share(0)].any()

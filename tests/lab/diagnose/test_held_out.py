@@ -1,4 +1,4 @@
-"""Rows that a fit has not seen: no number of it may come from them, and what nothing foretells is not judged."""
+"""Rows that a fit has not seen: no number of it may come from them, and what nothing predicts is not judged."""
 
 from __future__ import annotations
 
@@ -12,19 +12,12 @@ from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.disturbance import EVERY
 from servod.lab.diagnose.effects.hypothesis import Term
 from servod.lab.diagnose.effects.scene import Scene
-from servod.lab.diagnose.judge.held_out import (
-    RECORDING,
-    STRETCH,
-    TAIL_S,
-    Fold,
-    foretold,
-    held_out,
-    once,
-    split,
-    window_errors,
-)
+from servod.lab.diagnose.judge.free_run import free_run_gain, window_errors
 from servod.lab.diagnose.predict.predict import Predictor
+from servod.lab.diagnose.select.cross_validation import RECORDING, STRETCH, make_folds, predict_held_out, single_events
 from servod.lab.diagnose.select.fit import Fit, Fitter, Weighing
+from servod.lab.diagnose.select.selection import Fold
+from servod.lab.diagnose.settings import SETTINGS
 from servod.lab.simulate.replay import replay
 from tests.lab.diagnose.axes import believed
 from tests.lab.diagnose.test_between import colder
@@ -73,8 +66,8 @@ def test_a_level_is_not_that_of_the_rows_that_it_is_judged_by(levels: tuple[Pred
     elsewhere[fit.hypothesis.share(0)] += [0.0, 0.0, 0.1, 0.1]
     mismatch = predictor.mismatch(*fit.hypothesis.models(elsewhere, 2))
     moved = with_jacobian(predictor, replace(fit, coordinates=elsewhere, mismatch=mismatch))
-    shared = split(predictor, fit)
-    near, far = (held_out(predictor, one, shared) for one in (fit, moved))
+    shared = make_folds(predictor, fit)
+    near, far = (predict_held_out(predictor, one, shared) for one in (fit, moved))
     assert shared.left_out == STRETCH
     assert float(np.sqrt(np.mean(mismatch[predictor.counts] ** 2))) > 3.0 * near.rms
     assert far.rms == pytest.approx(near.rms, rel=0.15)
@@ -82,17 +75,17 @@ def test_a_level_is_not_that_of_the_rows_that_it_is_judged_by(levels: tuple[Pred
         assert other[fit.hypothesis.share(0)] == pytest.approx(one[fit.hypothesis.share(0)], abs=0.03)
 
 
-def test_every_row_is_left_out_once(levels: tuple[Predictor, Fit]) -> None:
+def test_every_row_is_left_out_single_events(levels: tuple[Predictor, Fit]) -> None:
     predictor, fit = levels
-    for shared in (split(predictor, fit), split(predictor, bare(fit))):
-        assert np.all(np.sum(shared.folds, axis=0) == 1)
+    for shared in (make_folds(predictor, fit), make_folds(predictor, bare(fit))):
+        assert np.all(np.sum(shared.parts, axis=0) == 1)
     assert shared.left_out == RECORDING
-    assert len(shared.folds) == 2
+    assert len(shared.parts) == 2
 
 
 def test_models_of_a_fold_have_the_levels_of_their_recordings(levels: tuple[Predictor, Fit]) -> None:
     predictor, fit = levels
-    held = held_out(predictor, fit, split(predictor, fit))
+    held = predict_held_out(predictor, fit, make_folds(predictor, fit))
     for fold in held.folds:
         ratio = fold.of(1).friction.viscous / fold.of(0).friction.viscous
         assert ratio == pytest.approx(1.3, rel=0.03)
@@ -102,7 +95,7 @@ def test_windows_are_judged_by_the_model_that_has_not_seen_them(levels: tuple[Pr
     predictor, fit = levels
     light, heavy = (believed(inertia=0.02 * factor) for factor in (0.9, 1.2))
     folds = [
-        Fold(rows, (model,)) for rows, model in zip(split(predictor, bare(fit)).folds, (light, heavy), strict=True)
+        Fold(rows, (model,)) for rows, model in zip(make_folds(predictor, bare(fit)).parts, (light, heavy), strict=True)
     ]
     window = window_errors(predictor, believed(), folds, folds)[0]
     for part, trace, model in zip(predictor.slices, predictor.traces, (light, heavy), strict=True):
@@ -120,7 +113,7 @@ def test_no_number_of_a_fold_comes_from_the_rows_left_out(levels: tuple[Predicto
     found = []
     for one in (predictor, other):
         start = replace(bare(fit), mismatch=one.mismatch(believed()))
-        found.append(held_out(one, start, split(one, start)))
+        found.append(predict_held_out(one, start, make_folds(one, start)))
     assert np.array_equal(found[0].coordinates[0], found[1].coordinates[0])
     assert not np.allclose(found[0].coordinates[1], found[1].coordinates[1], atol=1e-3)
     assert not np.allclose(found[0].mismatch, found[1].mismatch, atol=1e-3)
@@ -130,36 +123,36 @@ def test_an_event_in_one_recording_is_not_judged(levels: tuple[Predictor, Fit]) 
     predictor, fit = levels
     term = next(term for term in pushes(predictor) if term.form != EVERY)
     event = with_term(predictor, fit, term)
-    shared, t_s = split(predictor, event), predictor.over("t_s")
+    shared, t_s = make_folds(predictor, event), predictor.over("t_s")
     document: dict[str, Any] = {}
     term.write(document, event.values[event.hypothesis.share(0)])
     (window,) = document["disturbance"]["windows"]
-    inside = (t_s >= window["start_s"]) & (t_s <= window["end_s"] + TAIL_S)
-    assert once(event.hypothesis) == [0]
+    inside = (t_s >= window["start_s"]) & (t_s <= window["end_s"] + SETTINGS.validation.tail_s)
+    assert single_events(event.hypothesis) == [0]
     assert not shared.judged[inside].any()
     assert np.array_equal(shared.judged[~inside], predictor.counts[~inside])
-    held = held_out(predictor, event, shared)
+    held = predict_held_out(predictor, event, shared)
     assert held.rms == pytest.approx(float(np.sqrt(np.mean(held.mismatch[shared.judged] ** 2))))
     for coordinates in held.coordinates:
         assert np.array_equal(coordinates[event.hypothesis.share(0)], event.coordinates[event.hypothesis.share(0)])
 
 
-def test_an_event_of_every_recording_is_foretold_by_the_others(levels: tuple[Predictor, Fit]) -> None:
+def test_an_event_of_every_recording_is_predicted_by_the_others(levels: tuple[Predictor, Fit]) -> None:
     """A torque that is not there goes by the first recording, which is exactly the model's."""
     predictor, fit = levels
     event = with_term(predictor, fit, next(term for term in pushes(predictor) if term.form == EVERY))
-    shared = split(predictor, event)
-    held = held_out(predictor, event, shared)
+    shared = make_folds(predictor, event)
+    held = predict_held_out(predictor, event, shared)
     assert np.array_equal(shared.judged, predictor.counts)
     torque = event.hypothesis.share(0).stop - 1
     assert abs(event.coordinates[torque]) > 0.2
     assert abs(held.coordinates[1][torque]) < 0.01
 
 
-def test_names_foretell_by_how_much_free_windows_of_unseen_rows_come_nearer(levels: tuple[Predictor, Fit]) -> None:
+def test_free_windows_of_unseen_rows_come_nearer_with_the_terms(levels: tuple[Predictor, Fit]) -> None:
     predictor, fit = levels
-    shared = split(predictor, fit)
-    without, with_it = held_out(predictor, bare(fit), shared), held_out(predictor, fit, shared)
-    assert foretold(predictor, without, without, shared.judged) == pytest.approx(1.0)
-    assert foretold(predictor, without, with_it, shared.judged) < 0.3
-    assert foretold(predictor, with_it, without, shared.judged) > 3.0
+    shared = make_folds(predictor, fit)
+    without, with_it = predict_held_out(predictor, bare(fit), shared), predict_held_out(predictor, fit, shared)
+    assert free_run_gain(predictor, without, without, shared.judged) == pytest.approx(1.0)
+    assert free_run_gain(predictor, without, with_it, shared.judged) < 0.3
+    assert free_run_gain(predictor, with_it, without, shared.judged) > 3.0

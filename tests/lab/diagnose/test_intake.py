@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from servod.lab.diagnose.data.intake import taken_in
+from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.engine import diagnose
-from servod.lab.diagnose.judge.verdict import Verdict, drowned
+from servod.lab.diagnose.judge.verdict import below_noise
 from servod.lab.diagnose.predict.predict import Predictor
+from servod.lab.diagnose.result import DiagnosisVerdict
 from servod.lab.recordings import Recording
 from tests.lab.diagnose.axes import believed, record, recording
 
@@ -19,13 +20,13 @@ def made() -> Recording:
 
 
 def refused_for(bad: Recording) -> str:
-    traces, refused = taken_in([bad], believed())
+    traces, refused = load_traces([bad], believed())
     assert traces == []
     return refused[0].reason
 
 
 def test_good_recording_is_taken(made: Recording) -> None:
-    traces, refused = taken_in([made], believed())
+    traces, refused = load_traces([made], believed())
     assert refused == []
     assert traces[0].notes == ()
 
@@ -63,18 +64,18 @@ def test_glitches_and_turns_are_repaired(made: Recording) -> None:
     position, torque = made.position.copy(), made.torque.copy()
     position[1200] += 3.0
     torque[2000] = 65535.0
-    traces, _ = taken_in([recording(made.t_s, torque, position)], believed())
+    traces, _ = load_traces([recording(made.t_s, torque, position)], believed())
     assert [note.split(":")[0] for note in traces[0].notes] == ["position", "command"]
     assert abs(traces[0].drive.position[1200] - made.position[1200]) < 1e-3
     assert not traces[0].counts[1200]
     turned = made.position + 2.0 * np.pi * (made.t_s > 2.5)
-    traces, _ = taken_in([recording(made.t_s, made.torque, turned)], believed())
+    traces, _ = load_traces([recording(made.t_s, made.torque, turned)], believed())
     assert "whole turn" in traces[0].notes[0]
 
 
 def test_nothing_that_can_tell_is_said_so(made: Recording) -> None:
     found = diagnose(believed(), [recording(made.t_s[:900], made.torque[:900], made.position[:900])])
-    assert found.verdict is Verdict.CANNOT_TELL
+    assert found.verdict is DiagnosisVerdict.CANNOT_TELL
     assert found.evidence is None
 
 
@@ -93,13 +94,13 @@ def test_physics_that_is_missing_is_no_wrong_unit() -> None:
     heavy = believed(gravity={"amplitude": 1.2, "phase": 0.3})
     weak, light = believed(torque_gain={"factor": 0.5}), believed(inertia=0.007)
     for true in (heavy, weak, light):
-        assert taken_in(record(true)[1:2], believed())[1] == []
+        assert load_traces(record(true)[1:2], believed())[1] == []
 
 
 def test_several_rows_of_telemetry_that_lies(made: Recording) -> None:
     torque = made.torque.copy()
     torque[1500:1502] = torque[3000] = 65535.0
-    traces, refused = taken_in([recording(made.t_s, torque, made.position)], believed())
+    traces, refused = load_traces([recording(made.t_s, torque, made.position)], believed())
     assert refused == []
     assert traces[0].notes == ("command: 3 glitches, the first in row 1501, replaced",)
     assert np.max(np.abs(traces[0].drive.torque - made.torque)) < 0.5 * np.ptp(made.torque)
@@ -111,7 +112,9 @@ def test_slow_and_uneven_sampling_is_taken(made: Recording, every: int) -> None:
     rows = np.arange(0, len(made), every)
     rows = rows[(rows < 2000) | (rows > 2300)]
     jitter = np.random.default_rng(1).uniform(-2e-4, 2e-4, len(rows))
-    traces, refused = taken_in([recording(made.t_s[rows] + jitter, made.torque[rows], made.position[rows])], believed())
+    traces, refused = load_traces(
+        [recording(made.t_s[rows] + jitter, made.torque[rows], made.position[rows])], believed()
+    )
     assert refused == []
     assert len(traces[0].starts) == 2
 
@@ -119,7 +122,7 @@ def test_slow_and_uneven_sampling_is_taken(made: Recording, every: int) -> None:
 def test_long_list_of_unused_columns_is_cut(made: Recording) -> None:
     names = ", ".join(f"column{i}" for i in range(30))
     told = Recording(made.path, made.axis, made.columns, made.measured, (f"columns not used: {names}",))
-    note = taken_in([told], believed())[0][0].notes[0]
+    note = load_traces([told], believed())[0][0].notes[0]
     assert note.endswith("column5 and 24 more")
 
 
@@ -131,9 +134,9 @@ def test_noise_that_hides_what_is_left_is_no_finding_of_physics(made: Recording)
     """Noise of 10 mrad: too little to refuse the recording, too much to say what is left."""
     noise = np.random.default_rng(1).normal(size=len(made.t_s)) * 0.01
     model = believed()
-    predictor = Predictor(taken_in([recording(made.t_s, made.torque, made.position + noise)], model)[0], model)
+    predictor = Predictor(load_traces([recording(made.t_s, made.torque, made.position + noise)], model)[0], model)
     assert predictor.encoder_noise == pytest.approx(model.inertia * predictor.rate**2 * 0.01, rel=0.1)
-    assert drowned(Verdict.UNEXPLAINED, predictor.encoder_noise, predictor.dry)
-    assert not drowned(Verdict.MISSING_PHYSICS, predictor.encoder_noise, predictor.dry)
-    quiet = Predictor(taken_in([made], model)[0], model)
-    assert not drowned(Verdict.UNEXPLAINED, quiet.encoder_noise, quiet.dry)
+    assert below_noise(DiagnosisVerdict.UNEXPLAINED, predictor.encoder_noise, predictor.dry)
+    assert not below_noise(DiagnosisVerdict.MISSING_PHYSICS, predictor.encoder_noise, predictor.dry)
+    quiet = Predictor(load_traces([made], model)[0], model)
+    assert not below_noise(DiagnosisVerdict.UNEXPLAINED, quiet.encoder_noise, quiet.dry)

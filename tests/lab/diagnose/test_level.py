@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from servod.lab.diagnose.data.intake import taken_in
+from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.base import base_unknowns, document_of
 from servod.lab.diagnose.effects.hypothesis import Document, Hypothesis
 from servod.lab.diagnose.effects.scene import Scene
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.fit import Fit
-from servod.lab.diagnose.select.merit import is_level, on_bound
+from servod.lab.diagnose.select.levels import is_level_change, on_bound
 from tests.lab.diagnose.axes import believed, record
 
 
@@ -42,16 +42,16 @@ def test_what_has_no_level_is_recalibrated_only() -> None:
 def scene() -> Scene:
     """An axis with nothing left."""
     model = believed()
-    predictor = Predictor(taken_in(record(model, seconds=3.0), model)[0], model)
+    predictor = Predictor(load_traces(record(model, seconds=3.0), model)[0], model)
     return Scene(document_of(model), predictor, np.zeros(len(predictor.counts)))
 
 
 def test_levels_are_what_opens_the_models_own(scene: Scene) -> None:
     for name in ("stribeck", "presliding", "torque_offset", "inertia"):
         terms = effect(name).terms(scene)
-        assert all(is_level(term) is (term.form != "fading damping") for term in terms) and len(terms) > 0
+        assert all(is_level_change(term) is (term.form != "fading damping") for term in terms) and len(terms) > 0
     for name in ("cogging", "delay", "actuator_lag", "viscous_nonlinear"):
-        assert not any(is_level(term) for term in effect(name).terms(scene))
+        assert not any(is_level_change(term) for term in effect(name).terms(scene))
 
 
 @pytest.mark.parametrize("name", ["stribeck", "presliding", "torque_offset", "inertia"])

@@ -8,15 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from servod.formats.model.axis_model import AxisModel, load_axis_model
-from servod.lab.diagnose.data.excited import DIRECTED, SWIFT, unseen
-from servod.lab.diagnose.data.intake import taken_in
-from servod.lab.diagnose.data.trace import Trace
-from servod.lab.diagnose.effects import effect
+from servod.lab.diagnose.data.intake import load_traces
+from servod.lab.diagnose.data.trace import CheckedTrace
+from servod.lab.diagnose.effects import effect, names, unexcited_effects
 from servod.lab.diagnose.effects.base import document_of
 from servod.lab.diagnose.effects.cogging import whole_orders
 from servod.lab.diagnose.effects.scene import Scene
 from servod.lab.diagnose.predict.predict import Predictor
-from servod.lab.diagnose.select.choose import Chooser
+from servod.lab.diagnose.select.selector import Selector
 from servod.lab.recordings import load_recording
 from tests.conftest import SHARED
 from tests.lab.diagnose.axes import believed, record
@@ -30,19 +29,19 @@ ODRIVE = SHARED["recordings/odrive_cogging"]
 XL330 = SHARED["recordings/bam_xl330"]
 
 
-def traces_of(machine: str, path: Path, to_s: float | None = None) -> tuple[list[Trace], AxisModel]:
+def traces_of(machine: str, path: Path, to_s: float | None = None) -> tuple[list[CheckedTrace], AxisModel]:
     """The traces of one recording of a machine in `examples`, and its model."""
     model = load_axis_model(EXAMPLES / f"{machine}.yaml")
-    traces, refused = taken_in([load_recording(path, EXAMPLES / f"{machine}_map.yaml").between(None, to_s)], model)
+    traces, refused = load_traces([load_recording(path, EXAMPLES / f"{machine}_map.yaml").between(None, to_s)], model)
     assert not refused
     return traces, model
 
 
 def test_an_axis_in_swift_motion_shows_every_effect() -> None:
     model = believed()
-    traces, _ = taken_in(record(model), model)
-    assert unseen(traces, model.inertia) == frozenset()
-    assert unseen(traces, 1e-4 * model.inertia) >= SWIFT
+    traces, _ = load_traces(record(model), model)
+    assert unexcited_effects(traces, model.inertia) == frozenset()
+    assert unexcited_effects(traces, 1e-4 * model.inertia) >= names(lambda what: what.swift)
 
 
 if ODRIVE.is_dir():
@@ -50,7 +49,7 @@ if ODRIVE.is_dir():
     def test_a_slow_turn_shows_the_orders_of_its_cogging() -> None:
         """Of the five strongest orders in the map of holding currents, at least three."""
         traces, model = traces_of("odrive", ODRIVE / "slow_turn_nocomp_0.csv.gz")
-        assert unseen(traces, model.inertia) == SWIFT | DIRECTED
+        assert unexcited_effects(traces, model.inertia) == names(lambda what: what.swift or what.directed)
         predictor = Predictor(traces, model)
         orders = whole_orders(Scene(document_of(model), predictor, predictor.mismatch(model)))
         held = np.loadtxt(ODRIVE / "static_hold_map.csv.gz", delimiter=",", skiprows=1)[:, 1]
@@ -74,12 +73,12 @@ if EMPS.is_dir():
         """One lap of six seconds shows it: viscous friction above all."""
         traces, model = traces_of("emps", EMPS / "DATA_EMPS.mat", to_s=6.24)
         predictor = Predictor(traces, model)
-        chooser = Chooser(predictor, model, math.inf, lambda _line: None)
-        base = chooser.settled(chooser.start, None, predictor.mismatch(model))
+        selector = Selector(predictor, model, math.inf, lambda _line: None)
+        base = selector.settle(selector.start, None, predictor.mismatch(model))
         term = effect("asymmetry").terms(Scene(document_of(model), predictor, base.mismatch))[0]
         hypothesis = base.hypothesis.with_term(term)
-        fit = chooser.settled(hypothesis, hypothesis.beside(base.coordinates), base.mismatch)
-        assert chooser.error(fit.mismatch) < 0.6 * chooser.error(base.mismatch)
+        fit = selector.settle(hypothesis, hypothesis.beside(base.coordinates), base.mismatch)
+        assert selector.error(fit.mismatch) < 0.6 * selector.error(base.mismatch)
         asymmetry = fit.model.asymmetry
         assert asymmetry is not None
         assert 1.2 < asymmetry.negative_viscous / asymmetry.positive_viscous < 2.0

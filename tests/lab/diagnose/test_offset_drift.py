@@ -8,16 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from servod.lab.diagnose.data.intake import taken_in
+from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.document import diagnosis_document
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.base import document_of
 from servod.lab.diagnose.effects.scene import Scene
 from servod.lab.diagnose.engine import diagnose
 from servod.lab.diagnose.predict.predict import Predictor
-from servod.lab.diagnose.select.choice import Choice
-from servod.lab.diagnose.select.choose import Chooser
-from servod.lab.diagnose.select.detail import LEAST_TORQUE, slow
+from servod.lab.diagnose.select.refine import add_drift
+from servod.lab.diagnose.select.selection import Selection
+from servod.lab.diagnose.select.selector import Selector
+from servod.lab.diagnose.settings import SETTINGS
 from tests.lab.diagnose.axes import believed, record
 
 
@@ -42,7 +43,7 @@ def test_friction_that_drifts_is_none() -> None:
 def test_a_drift_starts_near_its_size() -> None:
     """Least squares on the mismatch gives its rate before any fit, beside a constant offset."""
     model = believed()
-    traces, _ = taken_in(record(believed(offset_drift={"per_s": 0.006}, torque_offset=-0.01)), model)
+    traces, _ = load_traces(record(believed(offset_drift={"per_s": 0.006}, torque_offset=-0.01)), model)
     predictor = Predictor(traces, model)
     straight, ending = effect("offset_drift").terms(Scene(document_of(model), predictor, predictor.mismatch(model)))
     (change,), (changes, time_s) = straight.unknowns, ending.unknowns
@@ -57,13 +58,12 @@ def test_a_drift_starts_near_its_size() -> None:
 def test_a_small_drift_is_found_over_seconds(hidden: dict[str, Any], terms: list[str]) -> None:
     """2.5 % of dry friction over the recording: under what any row shows of an effect worth naming."""
     model = believed()
-    traces, _ = taken_in(record(believed(**hidden)), model)
+    traces, _ = load_traces(record(believed(**hidden)), model)
     predictor = Predictor(traces, model)
-    chooser = Chooser(predictor, model, math.inf, lambda _line: None)
-    base = chooser.settled(chooser.start, None, predictor.mismatch(model))
-    choice = Choice(base, base, [], [], {}, 0.0, 0)
-    slow(chooser, choice)
-    assert [term.effect for term in choice.fit.hypothesis.terms] == terms
+    selector = Selector(predictor, model, math.inf, lambda _line: None)
+    base = selector.settle(selector.start, None, predictor.mismatch(model))
+    selection = add_drift(selector, Selection(base, base, 0.0, 0.0))
+    assert [term.effect for term in selection.fit.hypothesis.terms] == terms
     if terms:
-        assert choice.fit.values[-1] / traces[0].duration_s == pytest.approx(0.0006, rel=0.15)
-        assert choice.merits[0].torque < LEAST_TORQUE
+        assert selection.fit.values[-1] / traces[0].duration_s == pytest.approx(0.0006, rel=0.15)
+        assert selection.merits[0].torque < SETTINGS.group.least_torque

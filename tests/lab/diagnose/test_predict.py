@@ -11,11 +11,12 @@ from servod.common.shipped import shipped
 from servod.formats.model.axis_model import AxisModel, load_axis_model
 from servod.formats.model.effects import Gravity
 from servod.kernels.laws import pd
-from servod.lab.diagnose.data.intake import taken_in
+from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.scene import Scene
 from servod.lab.diagnose.predict.predict import Predictor
-from servod.lab.diagnose.select.choose import Chooser
+from servod.lab.diagnose.select.selection import Selection
+from servod.lab.diagnose.select.selector import Selector
 from servod.lab.simulate.simulate import LoopSettings, simulate_closed_loop
 from servod.lab.tracking.metrics import paper_rows
 from tests.lab.diagnose.axes import believed, record, recording
@@ -40,7 +41,7 @@ HIDDEN: list[dict[str, Any]] = [
 @pytest.mark.parametrize("hidden", HIDDEN, ids=lambda h: "+".join(h) or "nothing")
 def test_true_model_leaves_noise(hidden: dict[str, Any]) -> None:
     true = believed(**hidden)
-    traces, refused = taken_in(record(true), believed())
+    traces, refused = load_traces(record(true), believed())
     assert refused == []
     predictor = Predictor(traces, believed())
     left = rms(predictor, true)
@@ -55,7 +56,7 @@ def rms(predictor: Predictor, model: AxisModel) -> float:
 
 def test_mismatch_is_the_missing_torque() -> None:
     true = believed(spring={"stiffness": 0.2, "rest": 0.0})
-    traces, _ = taken_in(record(true)[:1], believed())
+    traces, _ = load_traces(record(true)[:1], believed())
     predictor = Predictor(traces, believed())
     mismatch = predictor.mismatch(believed())
     late = traces[0].drive.position - 1.6 / predictor.rate * traces[0].velocity
@@ -68,7 +69,7 @@ def test_rows_after_a_gap_begin_anew() -> None:
     keep = (made.t_s < 2.0) | (made.t_s > 2.6)
     columns = {quantity: values[keep] for quantity, values in made.columns.items()}
     cut = type(made)(made.path, made.axis, columns, made.measured[keep], ())
-    traces, _ = taken_in([cut], believed())
+    traces, _ = load_traces([cut], believed())
     predictor = Predictor(traces, believed())
     assert len(traces[0].starts) == 2
     assert rms(predictor, believed()) < 0.015
@@ -80,7 +81,7 @@ def test_a_model_never_sticks_where_the_joint_slides_slowly() -> None:
     settings = LoopSettings(counts_per_turn=2.0**20)
     run = simulate_closed_loop(true, pd.step, (30.0, 0.3, 0.0), paper_rows(1e-3, 14.0), settings)
     believed_without = true.model_copy(update={"gravity": None})
-    traces, refused = taken_in([recording(run.t_s, run.torque_nm, run.encoder_rad)], believed_without)
+    traces, refused = load_traces([recording(run.t_s, run.torque_nm, run.encoder_rad)], believed_without)
     assert refused == []
     predictor = Predictor(traces, believed_without)
     assert rms(predictor, true) < 0.03
@@ -91,13 +92,14 @@ def test_a_model_never_sticks_where_the_joint_slides_slowly() -> None:
 def test_own_torque_is_what_the_term_stands_for() -> None:
     """Friction of 6 % of the command beside parameters that have not moved."""
     model = believed()
-    chooser = Chooser(Predictor(taken_in(record(model, seconds=3.0), model)[0], model), model, 1e9, print)
-    term = effect("load_dependent_friction").terms(Scene(chooser.start.document, chooser.predictor, np.zeros(0)))[0]
-    mismatch = chooser.predictor.mismatch(model)
-    base = chooser.fitter(mismatch).begin(chooser.start)
-    hypothesis = chooser.start.with_term(term)
-    beside = chooser.fitter(mismatch).begin(hypothesis, np.append(chooser.start.start, 0.6))
+    selector = Selector(Predictor(load_traces(record(model, seconds=3.0), model)[0], model), model, 1e9, print)
+    term = effect("load_dependent_friction").terms(Scene(selector.start.document, selector.predictor, np.zeros(0)))[0]
+    mismatch = selector.predictor.mismatch(model)
+    base = selector.fitter(mismatch).begin(selector.start)
+    hypothesis = selector.start.with_term(term)
+    beside = selector.fitter(mismatch).begin(hypothesis, np.append(selector.start.start, 0.6))
     assert base is not None and beside is not None
-    merit = chooser.merit(base, beside)
+    selection = Selection(base, base, selector.error(base.mismatch), 0.0)
+    merit = selector.merit(selection, base, beside)
     assert merit.own == pytest.approx(merit.torque)
     assert merit.own > 0.06

@@ -12,10 +12,11 @@ import pytest
 
 from servod.cli.app import run
 from servod.formats.model.axis_model import AxisKind, axis_model_yaml, load_axis_model
-from servod.lab.diagnose.data.intake import taken_in
+from servod.lab.diagnose.data.intake import load_traces
+from servod.lab.diagnose.document import describe_place
+from servod.lab.diagnose.effects import effects
 from servod.lab.diagnose.engine import diagnose
 from servod.lab.diagnose.judge.locate import maps
-from servod.lab.diagnose.predict.coordinates import LOOKS, where
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.recordings import Quantity, Recording
 from servod.lab.report.diagnosis import write_files
@@ -155,16 +156,16 @@ def test_command_ends_with_no_when_nothing_can_be_told(tmp_path: Path, capsys: p
 
 
 def test_every_look_can_be_said() -> None:
-    for effect, look in LOOKS.items():
-        key = look.coordinate.replace(" ", "_")
+    for effect in effects():
+        key = effect.look.coordinate.replace(" ", "_")
         located = {"recordings": {"a.csv": 1.0}, "time_windows": [], key: {"from": 0.0, "to": 1.0, "unit": "rad"}}
         located["time_windows"] = [{"recording": "a.csv", "start_s": 1.0, "end_s": 2.0}]
-        assert where(effect, located).endswith("in a.csv from 1.00 to 2.00 s")
+        assert describe_place(effect.name, located).endswith("in a.csv from 1.00 to 2.00 s")
 
 
 def test_maps_tell_a_curve_from_a_constant() -> None:
     made = record(believed(), seconds=4.0)
-    traces, _ = taken_in(made, believed())
+    traces, _ = load_traces(made, believed())
     predictor = Predictor(traces, believed())
     rng = np.random.default_rng(1)
     noise = 0.01 * rng.normal(size=len(predictor.counts))

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from servod.lab.diagnose.data.intake import taken_in
+from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.base import base_unknowns, document_of
 from servod.lab.diagnose.effects.disturbance import SHORTEST_S, windows
@@ -15,11 +15,14 @@ from servod.lab.diagnose.effects.disturbance import terms as windows_of
 from servod.lab.diagnose.effects.effect import sine_term
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
 from servod.lab.diagnose.effects.scene import Peak, Scene
-from servod.lab.diagnose.judge.verdict import Shares, Verdict, alternatives, named_terms, verdict
+from servod.lab.diagnose.judge.verdict import Shares, alternatives, verdict
 from servod.lab.diagnose.predict.predict import Predictor
-from servod.lab.diagnose.select.choice import Choice, Entry
+from servod.lab.diagnose.result import DiagnosisVerdict
 from servod.lab.diagnose.select.fit import Fit
-from servod.lab.diagnose.select.merit import LEAST_TORQUE, Merit, acting, at_end, worth_naming
+from servod.lab.diagnose.select.levels import at_end_of_range, named_terms
+from servod.lab.diagnose.select.merit import Merit, acting_torque, worth_naming
+from servod.lab.diagnose.select.selection import Selection, TermEntry
+from servod.lab.diagnose.settings import SETTINGS
 from tests.lab.diagnose.axes import believed, record
 
 
@@ -27,31 +30,30 @@ from tests.lab.diagnose.axes import believed, record
 def scene() -> Scene:
     """An axis with nothing left but a push in the last tenth of a second of its last recording."""
     model = believed()
-    predictor = Predictor(taken_in(record(model, seconds=3.0), model)[0], model)
+    predictor = Predictor(load_traces(record(model, seconds=3.0), model)[0], model)
     mismatch = np.zeros(len(predictor.counts))
     mismatch[-100:] = 0.05
     return Scene(document_of(model), predictor, mismatch)
 
 
-def with_ripple(scene: Scene, amplitude: float) -> Choice:
+def with_ripple(scene: Scene, amplitude: float) -> Fit:
     term = sine_term("torque_ripple", scene, Peak(5.0, amplitude, 0.0, 0.0), 0.1, "1", most=0.45)
     hypothesis = Hypothesis(scene.document, base_unknowns(believed()), (term,))
-    fit = Fit(hypothesis, hypothesis.start, scene.mismatch, 0.0, np.zeros((0, 0)), True)
-    return Choice(fit, fit, [], [], {}, 0.0, 1)
+    return Fit(hypothesis, hypothesis.start, scene.mismatch, 0.0, np.zeros((0, 0)), True)
 
 
 def test_torque_is_judged_where_it_acts() -> None:
     t = np.linspace(0.0, 50.0, 20_001)
-    assert acting(0.01 * np.abs(np.sin(t))) < LEAST_TORQUE
+    assert acting_torque(0.01 * np.abs(np.sin(t))) < SETTINGS.worth.least_torque
     blows = np.where(t % 5.0 < 0.04, 0.03, 0.0)
     assert np.quantile(blows, 0.98) == 0.0
-    assert acting(blows) == pytest.approx(0.03)
-    assert acting(np.zeros(3)) == 0.0
+    assert acting_torque(blows) == pytest.approx(0.03)
+    assert acting_torque(np.zeros(3)) == 0.0
 
 
 def test_ripple_that_every_motor_has_is_no_finding(scene: Scene) -> None:
-    assert named_terms(with_ripple(scene, 0.01), scene.document) == []
-    assert named_terms(with_ripple(scene, 0.04), scene.document) == [0]
+    assert named_terms(with_ripple(scene, 0.01), scene.document) == ()
+    assert named_terms(with_ripple(scene, 0.04), scene.document) == (0,)
 
 
 def test_a_push_lies_within_its_recording(scene: Scene) -> None:
@@ -66,20 +68,20 @@ def test_a_push_lies_within_its_recording(scene: Scene) -> None:
 @pytest.mark.parametrize(
     ("removed", "left", "answer"),
     [
-        (0.83, 0.04, Verdict.UNEXPLAINED),
-        (0.88, 0.04, Verdict.MISSING_PHYSICS),
-        (0.91, 0.15, Verdict.UNEXPLAINED),
-        (0.94, 0.15, Verdict.MISSING_PHYSICS),
-        (0.60, 0.01, Verdict.MISSING_PHYSICS),
+        (0.83, 0.04, DiagnosisVerdict.UNEXPLAINED),
+        (0.88, 0.04, DiagnosisVerdict.MISSING_PHYSICS),
+        (0.91, 0.15, DiagnosisVerdict.UNEXPLAINED),
+        (0.94, 0.15, DiagnosisVerdict.MISSING_PHYSICS),
+        (0.60, 0.01, DiagnosisVerdict.MISSING_PHYSICS),
     ],
 )
-def test_names_must_explain_most_of_what_is_left(scene: Scene, removed: float, left: float, answer: Verdict) -> None:
+def test_names_must_explain_most_of_what_is_left(removed: float, left: float, answer: DiagnosisVerdict) -> None:
     """Names that leave a sixth of the explainable error are somebody else's, unless what they leave is next to none.
 
     `left` is a share of dry friction.
     """
     after = float(np.sqrt(1.0 - removed))
-    assert verdict(with_ripple(scene, 0.1), [0], Shares(1.0, after, 0.0, removed), dry=after / left) is answer
+    assert verdict((0,), Shares(1.0, after, 0.0, removed), dry=after / left) is answer
 
 
 def test_a_number_at_an_end_of_its_range_is_somebody_elses(scene: Scene) -> None:
@@ -91,7 +93,7 @@ def test_a_number_at_an_end_of_its_range_is_somebody_elses(scene: Scene) -> None
         unknown = hypothesis.unknowns[place]
         coordinates = hypothesis.start.copy()
         coordinates[place] = unknown.coordinate(at * 0.02 if hypothesis is mass else at)
-        assert at_end(Fit(hypothesis, coordinates, scene.mismatch, 0.0, np.zeros((0, 0)), True)) is answer
+        assert at_end_of_range(Fit(hypothesis, coordinates, scene.mismatch, 0.0, np.zeros((0, 0)), True)) is answer
 
 
 def test_a_bristle_may_have_no_damping_and_must_have_a_stiffness(scene: Scene) -> None:
@@ -103,7 +105,7 @@ def test_a_bristle_may_have_no_damping_and_must_have_a_stiffness(scene: Scene) -
     for place, answer in ((0, True), (1, False)):
         coordinates = hypothesis.start.copy()
         coordinates[hypothesis.share(0).start + place] = term.unknowns[place].coordinate(term.unknowns[place].low)
-        assert at_end(Fit(hypothesis, coordinates, scene.mismatch, 0.0, np.zeros((0, 0)), True)) is answer
+        assert at_end_of_range(Fit(hypothesis, coordinates, scene.mismatch, 0.0, np.zeros((0, 0)), True)) is answer
 
 
 def test_a_window_is_found_where_it_begins_and_ends() -> None:
@@ -121,13 +123,13 @@ def test_a_drive_that_is_late_has_one_name(scene: Scene) -> None:
     terms = (effect("delay").terms(scene)[0], effect("actuator_lag").terms(scene)[0])
     hypothesis = Hypothesis(scene.document, base_unknowns(believed()), terms)
     coordinates = hypothesis.start.copy()
-    for late, lag, places in ((0.002, 0.003, [1]), (0.006, 0.001, [0])):
+    for late, lag, places in ((0.002, 0.003, (1,)), (0.006, 0.001, (0,))):
         for place, value in ((0, late), (1, lag)):
             coordinates[hypothesis.share(place)] = terms[place].unknowns[0].coordinate(value)
         fit = Fit(hypothesis, coordinates, scene.mismatch, 0.0, np.zeros((0, 0)), True)
-        choice = Choice(fit, fit, [], [Entry(0.1, []), Entry(0.1, [])], {}, 0.0, 1)
-        assert named_terms(choice, scene.document) == places
-        assert alternatives(choice, places[0]) == [terms[1 - places[0]].effect]
+        selection = Selection(fit, fit, 0.0, 0.0, (), (TermEntry(0.1, ()), TermEntry(0.1, ())))
+        assert named_terms(fit, scene.document) == places
+        assert alternatives(selection, places[0]) == [terms[1 - places[0]].effect]
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ def imported(*modules: str) -> set[str]:
     ("patterns", "modules"),
     [
         (VERIFIES, ["servod.lab.verify.certify"]),
-        (DIAGNOSES, ["servod.lab.diagnose.document", "servod.lab.recordings.recording"]),
+        (DIAGNOSES, ["servod.lab.diagnose.engine", "servod.lab.diagnose.document"]),
         (
             SYNTHESIZES,
             [f"servod.lab.synthesize.{name}" for name in ("gain_set", "reference", "intervals", "crosscheck")],

@@ -14,26 +14,190 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.formats.model.axis_model import AxisKind, AxisModel
-from servod.lab.diagnose.data.trace import SLOWEST, Rows, Trace, dry_friction
+from servod.lab.diagnose.data.trace import CheckedTrace, Rows, dry_friction
+from servod.lab.diagnose.result import RefusedRecording
+from servod.lab.diagnose.settings import SETTINGS
 from servod.lab.recordings import Quantity, Recording
 from servod.lab.simulate.motion import noise_rms
 from servod.lab.simulate.replay import Drive
 
-# Whether sign and units of a recording can be right: the command against the torque that the model's motion needs.
-#
-# Stands beside `intake`. The command is split by least squares into the model's inertial and viscous part, its dry
-# friction, and what may be missing anywhere (a constant, and slow curves over position), so that physics that was left
-# out is not taken for a wrong unit.
-
-
-#: A factor by which a unit is off at least, and by how much the factors of two parts may differ and be one unit.
-WRONG_UNIT, ALIKE = 5.0, 3.0
-
-#: Standard errors, rows that count as one, and the share of the command that must be understood.
-SURE, MEMORY, UNDERSTOOD = 8.0, 20.0, 0.5
+Array = NDArray[np.float64]
 
 #: Degrees in a radian.
 DEGREES = 180.0 / math.pi
+
+
+def load_traces(recordings: Sequence[Recording], model: AxisModel) -> tuple[list[CheckedTrace], list[RefusedRecording]]:
+    """Traces of the recordings that can tell, and why the others cannot; names are unique."""
+    traces: list[CheckedTrace] = []
+    refused: list[RefusedRecording] = []
+    for index, recording in enumerate(recordings):
+        name = recording.path.name
+        if any(other.path.name == name for other in recordings[:index]):
+            name = f"{recording.path.parent.name}/{name}"
+        trace = make_trace(recording, name, index * SETTINGS.intake.apart_s)
+        reason = refusal_reason(trace, model)
+        if reason is None:
+            traces.append(trace)
+        else:
+            refused.append(RefusedRecording(name, reason))
+    return traces, refused
+
+
+def make_trace(recording: Recording, name: str, shift_s: float) -> CheckedTrace:
+    """The recording with glitches repaired, on a time of its own."""
+    notes = [_shorten_note(note) for note in recording.report]
+    drive = recording.drive
+    counts = recording.measured.copy()
+    position = _unwrap(drive.position, notes)
+    position, torque = (
+        _remove_glitches(values, what, counts, notes)
+        for values, what in ((position, "position"), (drive.torque, "command"))
+    )
+    _note_saturation(torque, notes)
+    t_s = drive.t_s - drive.t_s[0] + shift_s
+    warm = recording.get(Quantity.TEMPERATURE)
+    has_temperature = (
+        warm is not None and bool(np.isfinite(drive.temperature_c).all()) and _temperature_changes(drive.temperature_c)
+    )
+    moved = Drive(t_s, torque, position, drive.temperature_c)
+    return CheckedTrace(name, moved, counts, tuple(notes), has_temperature, shift_s - float(drive.t_s[0]), shift_s)
+
+
+def _shorten_note(note: str) -> str:
+    """A note whose list of names is cut."""
+    head, colon, names = note.partition(": ")
+    told = names.split(", ")
+    if not head.startswith("columns not used") or len(told) <= SETTINGS.intake.names_listed:
+        return note
+    most = SETTINGS.intake.names_listed
+    return f"{head}{colon}{', '.join(told[:most])} and {len(told) - most} more"
+
+
+def _temperature_changes(temperature_c: Array) -> bool:
+    """Whether the temperature changes by more than its noise."""
+    return float(np.ptp(temperature_c)) > 10.0 * noise_rms(temperature_c) or float(np.ptp(temperature_c)) > 1.0
+
+
+def _unwrap(position: Array, notes: list[str]) -> Array:
+    """The position without jumps of a whole turn."""
+    jumps = np.abs(np.diff(position)) > 0.9 * 2.0 * math.pi
+    back = np.abs(np.abs(np.diff(position)) - 2.0 * math.pi) < 0.5
+    if not jumps.any() or not back[jumps].all():
+        return position
+    notes.append(f"position: {int(jumps.sum())} jumps of a whole turn, joined")
+    return np.unwrap(position)
+
+
+def _remove_glitches(values: Array, what: str, counts: Rows, notes: list[str]) -> Array:
+    """Single rows that leave both neighbours and come back are replaced by the line between these.
+
+    A position that was replaced is no measurement and does not count; its neighbours do. The row of a command counts:
+    nobody knows whether the drive obeyed it. If it did, a few rows mismatch, which the fit counts by distance only.
+    """
+    bad = find_glitches(values)
+    if not bad.any():
+        return values
+    kept = np.flatnonzero(~bad)
+    notes.append(f"{what}: {int(bad.sum())} glitches, the first in row {int(np.argmax(bad)) + 1}, replaced")
+    if what == "position":
+        counts &= ~bad
+    return np.interp(np.arange(len(values)), kept, values[kept])
+
+
+def find_glitches(values: Array) -> Rows:
+    """Rows that leave the median of their neighbourhood far and alone."""
+    from scipy.ndimage import median_filter
+
+    off = np.abs(values - median_filter(values, SETTINGS.intake.neighbourhood, mode="nearest"))
+    step = np.abs(np.diff(values))
+    usual = float(np.quantile(step, 0.995)) if len(step) else 0.0
+    return np.asarray(
+        off > max(SETTINGS.intake.glitch_noises * noise_rms(values), SETTINGS.intake.glitch_steps * usual, 1e-300)
+    )
+
+
+def _at_limit(torque: Array) -> float:
+    """Share of rows in which the command stands at the very end of its range."""
+    most = float(np.max(np.abs(torque)))
+    return float(np.mean(np.abs(torque) >= most * (1.0 - 1e-9))) if most > 0.0 else 0.0
+
+
+def _note_saturation(torque: Array, notes: list[str]) -> None:
+    share = _at_limit(torque)
+    if share > SETTINGS.intake.noted_saturated:
+        notes.append(f"command: at its limit in {100.0 * share:.0f} % of the rows")
+
+
+def refusal_reason(trace: CheckedTrace, model: AxisModel) -> str | None:
+    """Why this recording cannot tell anything about this model; None when it can."""
+    return (
+        _too_coarse(trace)
+        or _too_short(trace)
+        or _never_changes(trace)
+        or wrong_sign_or_unit(trace, model)
+        or _too_noisy(trace, model)
+        or _too_still(trace)
+        or _saturated(trace)
+    )
+
+
+def _too_coarse(trace: CheckedTrace) -> str | None:
+    """Friction and inertia of a servo axis act within milliseconds; and time may be in other units than seconds."""
+    period_s = trace.period_s
+    if period_s <= SETTINGS.intake.coarsest_s:
+        return None
+    most_s = SETTINGS.intake.coarsest_s
+    return f"too coarse: {period_s:.3g} s between rows, at most {most_s:g} s; t_s is in seconds (--map scales it)"
+
+
+def _too_short(trace: CheckedTrace) -> str | None:
+    rows, least_s, least_rows = int(trace.counts.sum()), SETTINGS.intake.least_s, SETTINGS.intake.least_rows
+    if trace.duration_s >= least_s and rows >= least_rows:
+        return None
+    return (
+        f"too short: {trace.duration_s:.2f} s and {rows} rows, at least {least_s:g} s and {least_rows} rows are needed"
+    )
+
+
+def _too_still(trace: CheckedTrace) -> str | None:
+    position = trace.drive.position
+    steps = np.abs(np.diff(position))
+    quantum = float(steps[steps > 0.0].min()) if np.any(steps > 0.0) else 0.0
+    room = float(np.ptp(position))
+    moving = float(np.mean(np.abs(trace.velocity) > 3.0 * trace.drive.motion[:, 3]))
+    if (
+        quantum > 0.0
+        and room >= SETTINGS.intake.least_counts * max(quantum, trace.position_noise)
+        and moving >= SETTINGS.intake.least_moving
+    ):
+        return None
+    return f"too still: the axis moves over {room:.3g} in all, and in {100.0 * moving:.0f} % of the rows"
+
+
+def _never_changes(trace: CheckedTrace) -> str | None:
+    return "the command never changes" if float(np.ptp(trace.drive.torque)) == 0.0 else None
+
+
+def _saturated(trace: CheckedTrace) -> str | None:
+    share = _at_limit(trace.drive.torque)
+    if share < SETTINGS.intake.saturated:
+        return None
+    return f"saturated: the command stands at its limit in {100.0 * share:.0f} % of the rows"
+
+
+def _too_noisy(trace: CheckedTrace, model: AxisModel) -> str | None:
+    dry = dry_friction(model)
+    spoken = SETTINGS.intake.noise_of_command * float(np.std(trace.drive.torque))
+    noise = (
+        model.inertia
+        * SETTINGS.observer.slowest**2
+        * trace.position_noise
+        * math.sqrt(SETTINGS.observer.slowest * trace.period_s)
+    )
+    if noise <= SETTINGS.intake.most_noise * max(dry, spoken):
+        return None
+    return f"too noisy: encoder noise makes {noise:.3g} of torque, dry friction is {dry:.3g}"
 
 
 @dataclass(frozen=True)
@@ -46,13 +210,18 @@ class Factor:
     @property
     def sure(self) -> bool:
         """Whether it differs from nothing for certain."""
-        return abs(self.value) > SURE * self.error
+        return abs(self.value) > SETTINGS.intake.certain_errors * self.error
 
 
-def implausible(trace: Trace, model: AxisModel) -> str | None:
-    """A sign or a unit that cannot be, in one line; None when nothing speaks against the recording."""
+def wrong_sign_or_unit(trace: CheckedTrace, model: AxisModel) -> str | None:
+    """A sign or a unit that cannot be, in one line; None when nothing speaks against the recording.
+
+    The command against the torque that the model's motion needs. It is split by least squares into the model's inertial
+    and viscous part, its dry friction, and what may be missing anywhere (a constant, and slow curves over position), so
+    that physics that was left out is not taken for a wrong unit.
+    """
     moved, dry, understood = factors(trace, model)
-    if understood < UNDERSTOOD:
+    if understood < SETTINGS.intake.understood:
         return None
     if dry.sure and dry.value < 0.0 and (moved.value < 0.0 or not moved.sure):
         return f"command and motion have opposite signs (friction stands in the command times {dry.value:.3g})"
@@ -60,23 +229,23 @@ def implausible(trace: Trace, model: AxisModel) -> str | None:
         return None
     apart = max(moved.value / dry.value, dry.value / moved.value) if moved.value * dry.value > 0.0 else math.inf
     scale = math.sqrt(abs(moved.value * dry.value))
-    if apart < ALIKE and not 1.0 / WRONG_UNIT < scale < WRONG_UNIT:
+    if apart < SETTINGS.intake.same_unit and not 1.0 / SETTINGS.intake.wrong_unit < scale < SETTINGS.intake.wrong_unit:
         return f"the command is {scale:.3g} times what the model needs: another unit, or another axis"
-    if moved.value > 0.0 and 1.0 / ALIKE < dry.value < ALIKE:
+    if moved.value > 0.0 and 1.0 / SETTINGS.intake.same_unit < dry.value < SETTINGS.intake.same_unit:
         return _position_unit(moved.value, model)
     return None
 
 
 def _position_unit(moved: float, model: AxisModel) -> str | None:
     """Friction is as it should be, and what goes with the size of the motion is not."""
-    if model.axis is AxisKind.ROTARY and 1.0 / ALIKE < moved * DEGREES < ALIKE:
+    if model.axis is AxisKind.ROTARY and 1.0 / SETTINGS.intake.same_unit < moved * DEGREES < SETTINGS.intake.same_unit:
         return f"the position looks like degrees: the motion needs {1.0 / moved:.3g} times the command"
     if moved < 0.25 / DEGREES:
         return f"the position looks like counts or another unit: the motion needs {1.0 / moved:.3g} times the command"
     return None
 
 
-def factors(trace: Trace, model: AxisModel) -> tuple[Factor, Factor, float]:
+def factors(trace: CheckedTrace, model: AxisModel) -> tuple[Factor, Factor, float]:
     """Factors of motion (inertia and viscous friction) and of dry friction in the command, and the share understood."""
     x, v = trace.drive.position, trace.velocity
     rows = trace.counts & np.isfinite(v)
@@ -90,199 +259,9 @@ def factors(trace: Trace, model: AxisModel) -> tuple[Factor, Factor, float]:
     size = np.maximum(np.sqrt(np.mean(design**2, axis=0)), 1e-30)
     found, *_ = np.linalg.lstsq(design / size, command, rcond=None)
     left = command - design / size @ found
-    free = max(len(command) / MEMORY - len(found), 1.0)
+    free = max(len(command) / SETTINGS.intake.correlated_rows - len(found), 1.0)
     spread = np.linalg.pinv((design / size).T @ (design / size)) * len(command)
     errors = np.sqrt(np.maximum(np.diag(spread), 0.0) * float(np.mean(left**2)) / free) / size
     values = found / size
     understood = 1.0 - float(np.var(left)) / max(float(np.var(command)), 1e-30)
     return Factor(float(values[0]), float(errors[0])), Factor(float(values[1]), float(errors[1])), understood
-
-
-Array = NDArray[np.float64]
-
-#: Recordings are laid so far apart in time that no instant stands in two of them, s.
-APART_S = 1e5
-
-#: Least that a recording must hold: seconds, rows, distinct positions, share of rows in motion.
-LEAST_S, LEAST_ROWS, LEAST_COUNTS, LEAST_MOVING = 1.5, 300, 40, 0.03
-
-#: Longest time between rows, s.
-COARSEST_S = 0.1
-
-#: Noise that the slowest observer makes of the encoder's, as a share of dry friction, from which nothing can be said; a
-#: share of the command's spread counts for dry friction where it is more.
-MOST_NOISE, NOISE_OF_COMMAND = 0.5, 0.3
-
-#: Share of rows at the end of the command's range from which a recording is saturated; and from which it is told.
-SATURATED, TOLD_SATURATED = 0.4, 0.02
-
-#: A row that leaves its neighbours by so many noises, or so many usual steps, and comes back, is a glitch.
-GLITCH_NOISES, GLITCH_STEPS = 30.0, 8.0
-
-#: Rows of the neighbourhood whose median a glitch leaves; so many names of a list are told.
-NEIGHBOURHOOD, NAMES_TOLD = 7, 6
-
-
-@dataclass(frozen=True)
-class Refusal:
-    """A recording that cannot tell, and why."""
-
-    name: str
-    reason: str
-
-
-def taken_in(recordings: Sequence[Recording], model: AxisModel) -> tuple[list[Trace], list[Refusal]]:
-    """Traces of the recordings that can tell, and why the others cannot; names are unique."""
-    traces: list[Trace] = []
-    refused: list[Refusal] = []
-    for index, recording in enumerate(recordings):
-        name = recording.path.name
-        if any(other.path.name == name for other in recordings[:index]):
-            name = f"{recording.path.parent.name}/{name}"
-        trace = trace_of(recording, name, index * APART_S)
-        reason = cannot_tell(trace, model)
-        if reason is None:
-            traces.append(trace)
-        else:
-            refused.append(Refusal(name, reason))
-    return traces, refused
-
-
-def trace_of(recording: Recording, name: str, shift_s: float) -> Trace:
-    """The recording with glitches repaired, on a time of its own."""
-    notes = [_shortened(note) for note in recording.report]
-    drive = recording.drive
-    counts = recording.measured.copy()
-    position = _unwrapped(drive.position, notes)
-    position, torque = (
-        _repaired(values, what, counts, notes) for values, what in ((position, "position"), (drive.torque, "command"))
-    )
-    _tell_saturation(torque, notes)
-    t_s = drive.t_s - drive.t_s[0] + shift_s
-    warm = recording.get(Quantity.TEMPERATURE)
-    has_temperature = warm is not None and bool(np.isfinite(drive.temperature_c).all()) and _warms(drive.temperature_c)
-    moved = Drive(t_s, torque, position, drive.temperature_c)
-    return Trace(name, moved, counts, tuple(notes), has_temperature, shift_s - float(drive.t_s[0]), shift_s)
-
-
-def _shortened(note: str) -> str:
-    """A note whose list of names is cut."""
-    head, colon, names = note.partition(": ")
-    told = names.split(", ")
-    if not head.startswith("columns not used") or len(told) <= NAMES_TOLD:
-        return note
-    return f"{head}{colon}{', '.join(told[:NAMES_TOLD])} and {len(told) - NAMES_TOLD} more"
-
-
-def _warms(temperature_c: Array) -> bool:
-    """Whether the temperature changes by more than its noise."""
-    return float(np.ptp(temperature_c)) > 10.0 * noise_rms(temperature_c) or float(np.ptp(temperature_c)) > 1.0
-
-
-def _unwrapped(position: Array, notes: list[str]) -> Array:
-    """The position without jumps of a whole turn."""
-    jumps = np.abs(np.diff(position)) > 0.9 * 2.0 * math.pi
-    back = np.abs(np.abs(np.diff(position)) - 2.0 * math.pi) < 0.5
-    if not jumps.any() or not back[jumps].all():
-        return position
-    notes.append(f"position: {int(jumps.sum())} jumps of a whole turn, joined")
-    return np.unwrap(position)
-
-
-def _repaired(values: Array, what: str, counts: Rows, notes: list[str]) -> Array:
-    """Single rows that leave both neighbours and come back are replaced by the line between these.
-
-    A position that was replaced is no measurement and does not count; its neighbours do. The row of a command counts:
-    nobody knows whether the drive obeyed it. If it did, a few rows mismatch, which the fit counts by distance only.
-    """
-    bad = glitches(values)
-    if not bad.any():
-        return values
-    kept = np.flatnonzero(~bad)
-    notes.append(f"{what}: {int(bad.sum())} glitches, the first in row {int(np.argmax(bad)) + 1}, replaced")
-    if what == "position":
-        counts &= ~bad
-    return np.interp(np.arange(len(values)), kept, values[kept])
-
-
-def glitches(values: Array) -> Rows:
-    """Rows that leave the median of their neighbourhood far and alone."""
-    from scipy.ndimage import median_filter
-
-    off = np.abs(values - median_filter(values, NEIGHBOURHOOD, mode="nearest"))
-    step = np.abs(np.diff(values))
-    usual = float(np.quantile(step, 0.995)) if len(step) else 0.0
-    return np.asarray(off > max(GLITCH_NOISES * noise_rms(values), GLITCH_STEPS * usual, 1e-300))
-
-
-def _at_limit(torque: Array) -> float:
-    """Share of rows in which the command stands at the very end of its range."""
-    most = float(np.max(np.abs(torque)))
-    return float(np.mean(np.abs(torque) >= most * (1.0 - 1e-9))) if most > 0.0 else 0.0
-
-
-def _tell_saturation(torque: Array, notes: list[str]) -> None:
-    share = _at_limit(torque)
-    if share > TOLD_SATURATED:
-        notes.append(f"command: at its limit in {100.0 * share:.0f} % of the rows")
-
-
-def cannot_tell(trace: Trace, model: AxisModel) -> str | None:
-    """Why this recording cannot tell anything about this model; None when it can."""
-    return (
-        _too_coarse(trace)
-        or _too_short(trace)
-        or _never_changes(trace)
-        or implausible(trace, model)
-        or _too_noisy(trace, model)
-        or _too_still(trace)
-        or _saturated(trace)
-    )
-
-
-def _too_coarse(trace: Trace) -> str | None:
-    """Friction and inertia of a servo axis act within milliseconds; and time may be in other units than seconds."""
-    period_s = trace.period_s
-    if period_s <= COARSEST_S:
-        return None
-    return f"too coarse: {period_s:.3g} s between rows, at most {COARSEST_S:g} s; t_s is in seconds (--map scales it)"
-
-
-def _too_short(trace: Trace) -> str | None:
-    rows = int(trace.counts.sum())
-    if trace.duration_s >= LEAST_S and rows >= LEAST_ROWS:
-        return None
-    return (
-        f"too short: {trace.duration_s:.2f} s and {rows} rows, at least {LEAST_S:g} s and {LEAST_ROWS} rows are needed"
-    )
-
-
-def _too_still(trace: Trace) -> str | None:
-    position = trace.drive.position
-    steps = np.abs(np.diff(position))
-    quantum = float(steps[steps > 0.0].min()) if np.any(steps > 0.0) else 0.0
-    room = float(np.ptp(position))
-    moving = float(np.mean(np.abs(trace.velocity) > 3.0 * trace.drive.motion[:, 3]))
-    if quantum > 0.0 and room >= LEAST_COUNTS * max(quantum, trace.position_noise) and moving >= LEAST_MOVING:
-        return None
-    return f"too still: the axis moves over {room:.3g} in all, and in {100.0 * moving:.0f} % of the rows"
-
-
-def _never_changes(trace: Trace) -> str | None:
-    return "the command never changes" if float(np.ptp(trace.drive.torque)) == 0.0 else None
-
-
-def _saturated(trace: Trace) -> str | None:
-    share = _at_limit(trace.drive.torque)
-    if share < SATURATED:
-        return None
-    return f"saturated: the command stands at its limit in {100.0 * share:.0f} % of the rows"
-
-
-def _too_noisy(trace: Trace, model: AxisModel) -> str | None:
-    dry = dry_friction(model)
-    spoken = NOISE_OF_COMMAND * float(np.std(trace.drive.torque))
-    noise = model.inertia * SLOWEST**2 * trace.position_noise * math.sqrt(SLOWEST * trace.period_s)
-    if noise <= MOST_NOISE * max(dry, spoken):
-        return None
-    return f"too noisy: encoder noise makes {noise:.3g} of torque, dry friction is {dry:.3g}"

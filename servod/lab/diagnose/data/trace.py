@@ -20,7 +20,7 @@ Rows = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Trace:
+class CheckedTrace:
     """A checked recording: `drive` (SI units of the axis), `counts` marks the rows that may be compared with a model.
 
     `notes` say in plain sentences what was found wrong and what was done about it. `shift_s` was added to the recorded
@@ -66,7 +66,7 @@ class Trace:
         """Median time between rows."""
         return self.drive.period_s
 
-    def first(self, delay_s: float) -> FirstRow:
+    def first_row(self, delay_s: float) -> FirstRow:
         """How the motion begins under a command that acts `delay_s` late."""
         known = self._first.get(delay_s)
         if known is None:
@@ -78,10 +78,6 @@ class Trace:
     @cached_property
     def _first(self) -> dict[float, FirstRow]:
         return {}
-
-
-#: Bandwidth of the observer, rad/s: what the noise allows within these bounds, and a share of the sampling rate.
-SLOWEST, FASTEST, SHARE_OF_SAMPLING = 25.0, 200.0, 0.1
 
 
 def dry_friction(model: AxisModel) -> float:

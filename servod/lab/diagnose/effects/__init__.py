@@ -1,10 +1,18 @@
-"""Every effect by its name, one file each; a new effect is a new file and one line in this table."""
+"""Every effect by its name, one file each; a new effect is a new file and one line in this table.
+
+Lists of effects that search, verdict and report need are drawn from the records (`names`). Physics that the axis model
+file cannot say yet also needs its group of keys there (`servod.formats.model`), which says how it is checked and
+packed, and its torque in `servod.kernels.physics`.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from functools import cache
 from importlib import import_module
 
+from servod.lab.diagnose.data.excitation import creeps, one_way
+from servod.lab.diagnose.data.trace import CheckedTrace
 from servod.lab.diagnose.effects.effect import Effect
 
 #: Names of the outside contract and our own (offset_drift), in the order in which they are tried and explained.
@@ -45,3 +53,14 @@ def effect(name: str) -> Effect:
 def effects() -> tuple[Effect, ...]:
     """All effects, in the order of NAMES."""
     return tuple(effect(name) for name in NAMES)
+
+
+def names(which: Callable[[Effect], bool]) -> frozenset[str]:
+    """Names of the effects of which `which` is true."""
+    return frozenset(found.name for found in effects() if which(found))
+
+
+def unexcited_effects(traces: Sequence[CheckedTrace], inertia: float) -> frozenset[str]:
+    """Effects that these recordings of an axis of this inertia cannot show."""
+    slow, straight = creeps(traces, inertia), one_way(traces)
+    return names(lambda found: (slow and found.swift) or (straight and found.directed))

@@ -6,8 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from servod.formats.model.effects import ActuatorLag
 from servod.lab.diagnose.effects.effect import Effect, known_delay, simple
 from servod.lab.diagnose.effects.hypothesis import Term, Unknown
+from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.scene import Scene
 
 #: Time constants to start from, s.
@@ -26,7 +28,7 @@ def terms(scene: Scene) -> list[Term]:
 
 EFFECT = Effect(
     name="actuator_lag",
-    group="actuator_lag",
+    group=ActuatorLag,
     equation="dT/dt = (command - T)/time_constant_s, |dT/dt| <= slew_per_s",
     source="current loop bandwidth; hydraulic and pneumatic drives",
     statement="The torque follows the command with a lag",
@@ -34,5 +36,9 @@ EFFECT = Effect(
     confused=("delay", "joint_elasticity", "torque_saturation"),
     experiment="steps of command, sampled faster than the lag: dead time waits, lag begins at once",
     terms=terms,
+    look=Look("change of the command"),
     far=True,
+    swift=True,
+    twin="delay",
+    lateness="actuator_lag.time_constant_s",
 )

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from servod.formats.model.friction import Asymmetry
 from servod.lab.diagnose.effects.effect import Effect, positive, share
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Teller, Term, Writer
+from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.scene import Scene
 
 
@@ -58,7 +60,7 @@ def terms(_scene: Scene) -> list[Term]:
 
 EFFECT = Effect(
     name="asymmetry",
-    group="asymmetry",
+    group=Asymmetry,
     equation="g(v) -> k(sign v)*g(v),  F_v -> k_v(sign v)*F_v",
     source="Armstrong-Helouvry, Dupont, Canudas de Wit, Automatica 30(7), 1994; maps signed per direction",
     statement="Friction differs by direction",
@@ -66,4 +68,6 @@ EFFECT = Effect(
     confused=("torque_offset", "torque_gain", "spring"),
     experiment="constant speeds in both directions over the same range: half the difference of the torques",
     terms=terms,
+    look=Look("velocity"),
+    directed=True,
 )

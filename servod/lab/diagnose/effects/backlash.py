@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from servod.formats.model.effects import Backlash
 from servod.lab.diagnose.effects.effect import Effect
 from servod.lab.diagnose.effects.hypothesis import Term
+from servod.lab.diagnose.effects.looks import Look, Split
 from servod.lab.diagnose.effects.scene import Scene
 from servod.lab.diagnose.effects.two_mass import two_mass_term
 
@@ -23,7 +25,7 @@ def terms(scene: Scene) -> list[Term]:
 
 EFFECT = Effect(
     name="backlash",
-    group="backlash",
+    group=Backlash,
     equation="tau = 0 while |d| < gap/2, else k*(d - sign(d)*gap/2) + damping*dd/dt,  d = x_motor - x_load",
     source="Nordin, Galic, Gutman, Int. J. Adaptive Control 11, 1997",
     statement="There is a gap between motor and load: backlash",
@@ -31,5 +33,7 @@ EFFECT = Effect(
     confused=("joint_elasticity", "presliding", "delay"),
     experiment="small fast reversals around rest, and the motor's way when the load is held",
     terms=terms,
+    look=Look("time since reversal", Split.DIRECTION),
     far=True,
+    swift=True,
 )

@@ -27,6 +27,22 @@ STRIBECK_SHARE, OFFSET_SHARE, BRISTLE_FACTOR, DELAY_S = 0.25, 0.03, 2.0, 0.002
 #: The Stribeck velocity is known poorly and shows little; a wide bound keeps it from being a finding.
 STRIBECK_VELOCITY_FACTOR = 1.5
 
+#: Parameters that the outside contract gives a level, which is their bound until a term opens it.
+LEVELS = frozenset(
+    ("friction.static", "friction.stribeck_velocity", "friction.sigma0", "friction.sigma1", "torque_offset", "inertia")
+)
+
+#: Torques of the model's own, which no recording tells from a common factor on all of them and on the command.
+TORQUES = (
+    "inertia",
+    "friction.viscous",
+    "friction.coulomb",
+    "friction.static",
+    "friction.sigma0",
+    "friction.sigma1",
+    "gravity.amplitude",
+)
+
 
 def document_of(model: AxisModel) -> Document:
     """The model as a plain document, without what was measured and without noise."""
@@ -101,3 +117,9 @@ def _drift(document: Document, force: str) -> list[Unknown]:
     if per_s == 0.0:
         return []
     return [Unknown("offset_drift.per_s", f"{force}/s", per_s, min(per_s, 0.0), max(per_s, 0.0), abs(per_s), 1.0)]
+
+
+def factor(nominal: Document, fitted: Document, key: str) -> float:
+    """By which factor, never below 1, a parameter is off; 1 where one of the two has none."""
+    was, now = get(nominal, key), get(fitted, key)
+    return max(was, now) / min(was, now) if min(was, now) > 0.0 else 1.0

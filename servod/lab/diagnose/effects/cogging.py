@@ -8,8 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from servod.formats.model.effects import Cogging
 from servod.lab.diagnose.effects.effect import Effect, harmonic, sine_term, told_sines
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Term, Unknown
+from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.scene import Scene
 
 Array = NDArray[np.float64]
@@ -74,7 +76,7 @@ def _comb(scene: Scene, orders: list[int], most: float) -> Term:
 
 EFFECT = Effect(
     name="cogging",
-    group="cogging",
+    group=Cogging,
     equation="resisting torque += sum amplitude*sin(n*x + phase)",
     source="Hanselman, Brushless Permanent Magnet Motor Design, 2003",
     statement="A torque that repeats along the way acts whatever the command is: cogging",
@@ -82,4 +84,6 @@ EFFECT = Effect(
     confused=("torque_ripple", "encoder_eccentricity", "gravity", "spring", "position_dependent_friction"),
     experiment="slow passes in both directions with different loads: what stays the same is cogging",
     terms=terms,
+    look=Look("position", periodic=True),
+    repeatable=True,
 )

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from servod.formats.model.effects import Delay
+from servod.lab.diagnose.effects.base import DELAY_S
 from servod.lab.diagnose.effects.effect import Effect, known_delay, simple
-from servod.lab.diagnose.effects.hypothesis import Term, Unknown, get
+from servod.lab.diagnose.effects.hypothesis import Document, Term, Unknown, get
+from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.scene import Scene
 
 #: Delays to start from, s.
@@ -22,9 +25,13 @@ def terms(scene: Scene) -> list[Term]:
     return found
 
 
+def _at_level(nominal: Document, fitted: Document) -> bool:
+    return abs(get(fitted, "delay.additional_s") + get(fitted, "delay_s") - get(nominal, "delay_s")) >= DELAY_S
+
+
 EFFECT = Effect(
     name="delay",
-    group="delay",
+    group=Delay,
     equation="torque(t) = command(t - delay_s - additional_s)",
     source="bus cycles, filters, scheduling in the drive",
     statement="The torque comes later than the model says: a dead time",
@@ -32,5 +39,11 @@ EFFECT = Effect(
     confused=("actuator_lag", "joint_elasticity", "inertia"),
     experiment="steps of command, sampled faster than the delay: dead time waits, lag begins at once",
     terms=terms,
+    look=Look("change of the command"),
     far=True,
+    swift=True,
+    soaks_up=True,
+    twin="actuator_lag",
+    lateness="delay.additional_s",
+    at_level=_at_level,
 )

@@ -7,8 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from servod.formats.model.effects import Disturbance
 from servod.lab.diagnose.effects.effect import Effect
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Term, Unknown
+from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.scene import Scene
 
 Array = NDArray[np.float64]
@@ -19,8 +21,8 @@ GRID_S, LONGEST, KEPT = 0.05, 0.5, 2
 #: A shorter push is a blow that any mass behind a gap or spring can make, or a contact that has aged at rest, s.
 SHORTEST_S = 0.3
 
-#: The form of a window that comes at the same time after the start of every recording.
-EVERY = "in every recording"
+#: The effect, and the form of a window that comes at the same time after the start of every recording.
+NAME, EVERY = "disturbance", "in every recording"
 
 
 def windows(mismatch: Array, period_s: float) -> list[tuple[float, int, int]]:
@@ -79,7 +81,7 @@ def _term(scene: Scene, t_s: Array, rows: tuple[int, int], torque: float, shifts
     )
 
     def write(document: Document, values: Sequence[float]) -> None:
-        group = document.setdefault("disturbance", {}).setdefault("windows", [])
+        group = document.setdefault(NAME, {}).setdefault("windows", [])
         for shift in shifts:
             start_s = shift + values[0]
             group.append({"start_s": start_s, "end_s": start_s + values[1], "torque": values[2]})
@@ -88,12 +90,12 @@ def _term(scene: Scene, t_s: Array, rows: tuple[int, int], torque: float, shifts
         found = [Reported("start_s", values[0], "s"), Reported("end_s", values[0] + values[1], "s")]
         return [*found, Reported("torque", values[2], scene.force)]
 
-    return Term("disturbance", EVERY if len(shifts) > 1 else "in one recording", unknowns, write, tell)
+    return Term(NAME, EVERY if len(shifts) > 1 else "in one recording", unknowns, write, tell)
 
 
 EFFECT = Effect(
-    name="disturbance",
-    group="disturbance",
+    name=NAME,
+    group=Disturbance,
     equation="torque += torque*cos(2*pi*frequency_hz*(t - start_s) + phase) from start_s to end_s",
     source="somebody leans on the axis, a cable catches, a tool cuts",
     statement="An external torque acts for a while",
@@ -101,4 +103,7 @@ EFFECT = Effect(
     confused=("torque_offset", "thermal"),
     experiment="the same motion again: what does not come back was a disturbance",
     terms=terms,
+    look=Look("time"),
+    repeatable=True,
+    soaks_up=True,
 )

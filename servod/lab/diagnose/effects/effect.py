@@ -9,7 +9,9 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from servod.formats.model.keys import Group
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Teller, Term, Unknown, Writer, get
+from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.scene import Peak, Scene
 
 #: By how much the model's own delay may be off beside a lag or a longer delay, s.
@@ -20,14 +22,25 @@ OWN_DELAY_S = 0.0002
 class Effect:
     """One effect by its name in the outside contract.
 
-    `group` is its group of keys (or plain keys) in the axis model file. `statement` says in one sentence what was left
-    out; `shows` where its signature is; `confused` what it is mistaken for and `experiment` what tells them apart.
-    `terms` gives its forms with start values for a scene, none where it cannot act. `far` effects are also started from
-    the nominal model, whose refit they distort.
+    `group` is its group of keys in the axis model file, under its name; None where the name is a plain key of every
+    model. `friction_keys` are keys of the model's own friction that it works on beside. `statement` says in one
+    sentence what was left out; `shows` where its signature is and `look` how that is drawn; `confused` what it is
+    mistaken for and `experiment` what tells them apart. `terms` gives its forms with start values for a scene, none
+    where it cannot act.
+
+    For the search: `far` effects are also started from the nominal model, whose refit they distort; `swift` ones show
+    against the inertia alone, not on an axis that creeps; `directed` ones tell one direction from the other;
+    `repeatable` ones may come in again with another period or place (a second harmonic is no second effect); those
+    that `soaks_up` take what others leave, and are too plain to be a detail where they are real.
+
+    For the verdict: `at_level` says of the nominal and the fitted model whether the effect is more than recalibration;
+    with one that `scales_torques`, no recording tells the common factor on all torques of the axis. An effect and its
+    `twin` that are in together are one finding, by the name of the one that makes the torque later: `lateness` is the
+    key that says by how much.
     """
 
     name: str
-    group: str
+    group: type[Group] | None
     equation: str
     source: str
     statement: str
@@ -35,7 +48,17 @@ class Effect:
     confused: tuple[str, ...]
     experiment: str
     terms: Callable[[Scene], list[Term]]
+    look: Look
+    friction_keys: tuple[str, ...] = ()
     far: bool = False
+    swift: bool = False
+    directed: bool = False
+    repeatable: bool = False
+    soaks_up: bool = False
+    at_level: Callable[[Document, Document], bool] = lambda _nominal, _fitted: True
+    scales_torques: bool = False
+    twin: str = ""
+    lateness: str = ""
 
 
 def share(key: str, start: float, low: float, high: float, size: float, unit: str = "1") -> Unknown:

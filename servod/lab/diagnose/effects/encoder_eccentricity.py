@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from servod.formats.model.effects import EncoderEccentricity
 from servod.lab.diagnose.effects.effect import Effect, sine_term
 from servod.lab.diagnose.effects.hypothesis import Term
+from servod.lab.diagnose.effects.looks import Look, Split
 from servod.lab.diagnose.effects.scene import Columns, Peak, Scene
 
 Array = NDArray[np.float64]
@@ -42,7 +44,7 @@ def terms(scene: Scene) -> list[Term]:
 
 EFFECT = Effect(
     name="encoder_eccentricity",
-    group="encoder_eccentricity",
+    group=EncoderEccentricity,
     equation="encoder = x + sum amplitude*sin(n*x + phase)",
     source="a disc off its axis (n = 1) or oval (n = 2); interpolation errors of the encoder (high n)",
     statement="The encoder shows a wave over position that the joint does not make",
@@ -50,4 +52,8 @@ EFFECT = Effect(
     confused=("position_dependent_inertia", "cogging", "torque_ripple"),
     experiment="the same way at several speeds: the wave of torque grows with the speed squared",
     terms=terms,
+    look=Look("position", Split.DIRECTION, periodic=True),
+    swift=True,
+    repeatable=True,
+    soaks_up=True,
 )

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from servod.formats.model.effects import Gravity
 from servod.lab.diagnose.effects.effect import Effect, share
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Term, get
+from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.scene import Scene
 
 
@@ -39,7 +41,7 @@ def terms(scene: Scene) -> list[Term]:
 
 EFFECT = Effect(
     name="gravity",
-    group="gravity",
+    group=Gravity,
     equation="resisting torque += amplitude*sin(x + phase)",
     source="a mass m at radius r: amplitude = m*g*r",
     statement="A weight off the axis pulls on it",
@@ -47,4 +49,5 @@ EFFECT = Effect(
     confused=("spring", "cogging", "torque_offset"),
     experiment="slow passes over more than half a turn: a spring goes on growing, gravity turns back",
     terms=terms,
+    look=Look("position"),
 )

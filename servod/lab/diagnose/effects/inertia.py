@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from servod.lab.diagnose.effects.base import RECALIBRATION, factor
 from servod.lab.diagnose.effects.effect import Effect
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Term, get
+from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.scene import Scene
 
 
@@ -23,9 +25,13 @@ def terms(scene: Scene) -> list[Term]:
     return [Term("inertia", "released", (), _write, tell, {"inertia": (0.05 * scene.inertia, 20.0 * scene.inertia)})]
 
 
+def _at_level(nominal: Document, fitted: Document) -> bool:
+    return factor(nominal, fitted, "inertia") >= 1.0 + RECALIBRATION
+
+
 EFFECT = Effect(
     name="inertia",
-    group="inertia",
+    group=None,
     equation="inertia*a = torque - friction - load",
     source="Newton",
     statement="More or less mass moves than the model says: the inertia is off",
@@ -33,5 +39,8 @@ EFFECT = Effect(
     confused=("torque_gain", "joint_elasticity", "actuator_lag"),
     experiment="fast reversals with and without a known mass",
     terms=terms,
+    look=Look("acceleration"),
     far=True,
+    swift=True,
+    at_level=_at_level,
 )

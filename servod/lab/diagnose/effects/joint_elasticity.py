@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from servod.formats.model.effects import JointElasticity
 from servod.lab.diagnose.effects.effect import Effect
 from servod.lab.diagnose.effects.hypothesis import Term
+from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.scene import Scene
 from servod.lab.diagnose.effects.two_mass import two_mass_term
 
@@ -24,7 +26,7 @@ def terms(scene: Scene) -> list[Term]:
 
 EFFECT = Effect(
     name="joint_elasticity",
-    group="joint_elasticity",
+    group=JointElasticity,
     equation="J_M*a_M = u - F(v_M) - tau,  J_L*a_L = tau - load,  tau = k*d + cubic*d^3 + damping*dd/dt",
     source="Spong, ASME JDSMC 109(4), 1987; Tuttle and Seering, IEEE Trans. Robotics 12(3), 1996 (stiffening)",
     statement="The load hangs on the motor by a spring: the joint is elastic",
@@ -32,5 +34,7 @@ EFFECT = Effect(
     confused=("inertia", "delay", "actuator_lag", "backlash", "presliding"),
     experiment="a sweep of frequencies through the resonance, or a blow with the motor held",
     terms=terms,
+    look=Look("acceleration"),
     far=True,
+    swift=True,
 )

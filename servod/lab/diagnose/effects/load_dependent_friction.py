@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from servod.formats.model.friction import LoadDependentFriction
 from servod.lab.diagnose.effects.effect import Effect, share, simple
 from servod.lab.diagnose.effects.hypothesis import Term, get
+from servod.lab.diagnose.effects.looks import Look, Split
 from servod.lab.diagnose.effects.scene import Scene
 
 
@@ -20,7 +22,7 @@ def terms(scene: Scene) -> list[Term]:
 
 EFFECT = Effect(
     name="load_dependent_friction",
-    group="load_dependent_friction",
+    group=LoadDependentFriction,
     equation="g -> g + per_command*|torque| + per_load*|load torque|",
     source="Hamon, Gautier, Garrec, IROS 2010; Duclusaud et al. (BAM), 2024",
     statement="Dry friction grows with the torque that the transmission carries",
@@ -28,4 +30,6 @@ EFFECT = Effect(
     confused=("position_dependent_friction", "torque_gain", "viscous_nonlinear"),
     experiment="the same slow motion with and without a weight, or at accelerations of both signs",
     terms=terms,
+    look=Look("load", Split.DIRECTION),
+    swift=True,
 )

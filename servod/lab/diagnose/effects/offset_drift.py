@@ -7,8 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from servod.formats.model.effects import OffsetDrift
 from servod.lab.diagnose.effects.effect import Effect
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Term, Unknown
+from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.scene import Scene
 
 Array = NDArray[np.float64]
@@ -77,7 +79,7 @@ def _ending(scene: Scene) -> Term:
 
 EFFECT = Effect(
     name="offset_drift",
-    group="offset_drift",
+    group=OffsetDrift,
     equation="torque = command + torque_offset + per_s*t, or per_s*time_s*(1 - exp(-t/time_s)); t from the first row",
     source="offset of a current sensor or amplifier that warms up; a counterbalance that leaks, a cable that settles",
     statement="The constant torque beside the command drifts as time passes",
@@ -85,4 +87,5 @@ EFFECT = Effect(
     confused=("torque_offset", "disturbance", "thermal"),
     experiment="the same motion for some minutes: a drift goes on or ends, and begins anew after power-on",
     terms=terms,
+    look=Look("time"),
 )

@@ -6,8 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from servod.formats.model.friction import PositionDependentFriction
 from servod.lab.diagnose.effects.effect import Effect, harmonic, sine_term, told
 from servod.lab.diagnose.effects.hypothesis import Document, Term, Unknown
+from servod.lab.diagnose.effects.looks import Look, Split
 from servod.lab.diagnose.effects.scene import Peak, Scene
 
 #: Half waves along the way that make a profile.
@@ -68,7 +70,7 @@ def _profile(scene: Scene) -> Term:
 
 EFFECT = Effect(
     name="position_dependent_friction",
-    group="position_dependent_friction",
+    group=PositionDependentFriction,
     equation="g -> g*(1 + sum amplitude*sin(n*x + phase) + sum factor*exp(-(x - position)^2/(2*width^2)))",
     source="gear mesh and bearing preload; Armstrong-Helouvry, Control of Machines with Friction, 1991",
     statement="Dry friction changes along the way",
@@ -76,4 +78,6 @@ EFFECT = Effect(
     confused=("load_dependent_friction", "cogging", "gravity"),
     experiment="slow passes over the whole range in both directions, with and without a weight",
     terms=terms,
+    look=Look("position", Split.DIRECTION),
+    repeatable=True,
 )

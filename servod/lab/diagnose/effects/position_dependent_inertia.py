@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 
+from servod.formats.model.effects import PositionDependentInertia
 from servod.lab.diagnose.effects.effect import Effect, sine_term
 from servod.lab.diagnose.effects.hypothesis import Term
+from servod.lab.diagnose.effects.looks import Look, Split
 from servod.lab.diagnose.effects.scene import Peak, Scene
 
 
@@ -21,7 +23,7 @@ def terms(scene: Scene) -> list[Term]:
 
 EFFECT = Effect(
     name="position_dependent_inertia",
-    group="position_dependent_inertia",
+    group=PositionDependentInertia,
     equation="M(x)*a + M'(x)*v^2/2 = torque,  M(x) = inertia*(1 + sum amplitude*sin(n*x + phase))",
     source="Lagrange's equation of a linkage, crank or eccentric load",
     statement="The inertia changes along the way",
@@ -29,4 +31,8 @@ EFFECT = Effect(
     confused=("encoder_eccentricity", "torque_ripple", "gravity"),
     experiment="the same fast reversal at several positions",
     terms=terms,
+    look=Look("position", Split.LOAD),
+    swift=True,
+    repeatable=True,
+    soaks_up=True,
 )

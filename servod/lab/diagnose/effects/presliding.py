@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from servod.formats.model.friction import Presliding
+from servod.lab.diagnose.effects.base import BRISTLE_FACTOR, factor
 from servod.lab.diagnose.effects.effect import Effect, keys, positive, simple
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Teller, Term, Unknown, get
+from servod.lab.diagnose.effects.looks import Look, Split
 from servod.lab.diagnose.effects.scene import Scene
 
 #: Factors on the model's own stiffness and damping to start from, and by which they may be off.
@@ -51,9 +54,16 @@ def _new(scene: Scene, stiffness: float) -> Term:
     return simple("presliding", "bristle", unknowns)
 
 
+def _at_level(nominal: Document, fitted: Document) -> bool:
+    """A bristle that the model has must be off by a factor; a new one, or damping that fades, has no level."""
+    if get(nominal, "friction.sigma0") <= 0.0 or "presliding" in fitted:
+        return True
+    return max(factor(nominal, fitted, f"friction.{key}") for key in ("sigma0", "sigma1")) >= BRISTLE_FACTOR
+
+
 EFFECT = Effect(
     name="presliding",
-    group="presliding",
+    group=Presliding,
     equation="dz/dt = v - sigma0*|v|/g(v)*z,  F = sigma0*z + sigma1(v)*dz/dt",
     source="Canudas de Wit, Olsson, Astrom, Lischinsky, IEEE TAC 40(3), 1995; Olsson 1996",
     statement="Before it slides the joint gives way like a spring of another stiffness or damping than the model's",
@@ -61,5 +71,8 @@ EFFECT = Effect(
     confused=("stribeck", "joint_elasticity", "backlash", "delay"),
     experiment="small slow forces below breakaway, up and down: the hysteresis loop",
     terms=terms,
+    look=Look("time since reversal", Split.DIRECTION),
+    friction_keys=("sigma0", "sigma1"),
     far=True,
+    at_level=_at_level,
 )

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.lab.diagnose.effects.hypothesis import Document, get
-from servod.lab.diagnose.predict.predict import POLES_DAMPING, Predictor
+from servod.lab.diagnose.predict.predict import Predictor
+from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
 
@@ -198,7 +199,7 @@ class Scene:
     @cached_property
     def lagged_position(self) -> Array:
         """Position at the time at which the observer shows its torque: its low-pass delays by 2*damping/rate."""
-        late = 2.0 * POLES_DAMPING / self.predictor.rate
+        late = 2.0 * SETTINGS.observer.poles_damping / self.predictor.rate
         return self.position - late * self.velocity
 
     @cached_property
@@ -229,8 +230,8 @@ def observed(torque: Array, rate: float, period_s: float) -> Array:
     """A torque through the observer: second-order low-pass of its poles, exact for one held over each row."""
     from scipy.signal import lfilter
 
-    decay = math.exp(-POLES_DAMPING * rate * period_s)
-    turn = math.cos(rate * period_s * math.sqrt(1.0 - POLES_DAMPING**2))
+    decay = math.exp(-SETTINGS.observer.poles_damping * rate * period_s)
+    turn = math.cos(rate * period_s * math.sqrt(1.0 - SETTINGS.observer.poles_damping**2))
     poles = [1.0, -2.0 * decay * turn, decay**2]
     gain = sum(poles)
     return np.asarray(lfilter([0.0, 0.5 * gain, 0.5 * gain], poles, torque))

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from servod.formats.model.effects import Spring
 from servod.lab.diagnose.effects.effect import Effect, share
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Term
+from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.scene import Scene
 
 
@@ -50,7 +52,7 @@ def terms(scene: Scene) -> list[Term]:
 
 EFFECT = Effect(
     name="spring",
-    group="spring",
+    group=Spring,
     equation="resisting torque += stiffness*(x - rest) + cubic*(x - rest)^3",
     source="cables, hoses, gravity balancers, flexure bearings",
     statement="Something pulls the axis back like a spring",
@@ -58,4 +60,5 @@ EFFECT = Effect(
     confused=("gravity", "torque_offset", "cogging"),
     experiment="slow passes over the whole range: gravity turns back, a spring goes on",
     terms=terms,
+    look=Look("position"),
 )

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from servod.formats.model.friction import Stribeck
+from servod.lab.diagnose.effects.base import STRIBECK_SHARE
 from servod.lab.diagnose.effects.effect import Effect
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Teller, Term, Unknown, get, put
+from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.scene import Scene
 
 #: Static friction to start from, as a multiple of Coulomb friction.
@@ -55,9 +58,17 @@ def terms(scene: Scene) -> list[Term]:
     return [*found, Term("stribeck", "free exponent", (free,), _exponent, _tell(scene), opens, begins[0])]
 
 
+def _at_level(nominal: Document, fitted: Document) -> bool:
+    """The model's own curve must rise by a share of Coulomb friction; another curve has no level."""
+    if "stribeck" in fitted:
+        return True
+    was, now = (get(d, "friction.static") - get(d, "friction.coulomb") for d in (nominal, fitted))
+    return abs(now - was) >= STRIBECK_SHARE * get(nominal, "friction.coulomb")
+
+
 EFFECT = Effect(
     name="stribeck",
-    group="stribeck",
+    group=Stribeck,
     equation="g(v) = F_C + (F_S - F_C)*exp(-(|v|/v_s)^exponent)",
     source="Stribeck 1902; Bo and Pavelescu, Wear 82, 1982 (exponent); the paper's (18)",
     statement="At low speed friction is not the model's: the Stribeck curve from static to sliding friction differs",
@@ -65,5 +76,8 @@ EFFECT = Effect(
     confused=("presliding", "viscous_nonlinear", "thermal"),
     experiment="slow constant speeds on both sides of the Stribeck velocity, and breakaway ramps",
     terms=terms,
+    look=Look("velocity"),
+    friction_keys=("static", "stribeck_velocity"),
     far=True,
+    at_level=_at_level,
 )

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from servod.formats.model.friction import Thermal
 from servod.lab.diagnose.effects.effect import Effect, share, simple, told
 from servod.lab.diagnose.effects.hypothesis import Document, Term, Unknown
+from servod.lab.diagnose.effects.looks import Look, Split
 from servod.lab.diagnose.effects.scene import Scene
 
 
@@ -49,7 +51,7 @@ def _between(drifts: list[Unknown], recordings: int) -> Term:
 
 EFFECT = Effect(
     name="thermal",
-    group="thermal",
+    group=Thermal,
     equation="dry and viscous friction times 1 + k*(T - reference_c), exp(k*(T - reference_c)) or 1 + k_t*t",
     source="Bittencourt and Gunnarsson, ASME JDSMC 134(5), 2012; Simoni et al., IROS 2015",
     statement="Friction changes as the joint warms up or as time passes",
@@ -57,4 +59,5 @@ EFFECT = Effect(
     confused=("viscous_nonlinear", "load_dependent_friction", "stribeck"),
     experiment="the same motion cold and warm",
     terms=terms,
+    look=Look("time", Split.DIRECTION),
 )

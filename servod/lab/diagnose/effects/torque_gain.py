@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from servod.formats.model.effects import TorqueGain
+from servod.lab.diagnose.effects.base import RECALIBRATION
 from servod.lab.diagnose.effects.effect import Effect, positive, simple
-from servod.lab.diagnose.effects.hypothesis import Term
+from servod.lab.diagnose.effects.hypothesis import Document, Term, get
+from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.scene import Scene
 
 
@@ -13,9 +16,14 @@ def terms(scene: Scene) -> list[Term]:
     return [simple("torque_gain", "one factor", factors[:1]), simple("torque_gain", "by sign", factors)]
 
 
+def _at_level(_nominal: Document, fitted: Document) -> bool:
+    factors = [get(fitted, f"torque_gain.{key}", 1.0) for key in ("factor", "negative_factor")]
+    return max(max(f, 1.0 / f) for f in factors) >= 1.0 + RECALIBRATION
+
+
 EFFECT = Effect(
     name="torque_gain",
-    group="torque_gain",
+    group=TorqueGain,
     equation="torque = factor*command (negative_factor*command for negative commands)",
     source="torque constant, gear ratio or current scale that is not what the command assumes",
     statement="The drive makes another torque of a command than it says: the torque constant is off",
@@ -23,5 +31,9 @@ EFFECT = Effect(
     confused=("inertia", "asymmetry", "torque_saturation"),
     experiment="a known weight or a torque sensor on the shaft",
     terms=terms,
+    look=Look("load"),
     far=True,
+    swift=True,
+    scales_torques=True,
+    at_level=_at_level,
 )

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from servod.lab.diagnose.effects.base import OFFSET_SHARE
 from servod.lab.diagnose.effects.effect import Effect
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Term, get
+from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.scene import Scene
 
 
@@ -23,9 +25,14 @@ def terms(scene: Scene) -> list[Term]:
     return [Term("torque_offset", "released", (), _write, tell, {"torque_offset": (-most, most)})]
 
 
+def _at_level(nominal: Document, fitted: Document) -> bool:
+    off = abs(get(fitted, "torque_offset") - get(nominal, "torque_offset"))
+    return off >= OFFSET_SHARE * get(nominal, "friction.coulomb")
+
+
 EFFECT = Effect(
     name="torque_offset",
-    group="torque_offset",
+    group=None,
     equation="torque = command + torque_offset",
     source="current sensor offset, unbalanced hydraulic area, a constant weight on a linear axis",
     statement="A constant torque acts beside the command",
@@ -33,4 +40,7 @@ EFFECT = Effect(
     confused=("asymmetry", "spring", "gravity", "disturbance"),
     experiment="rest at several positions, approached from both sides",
     terms=terms,
+    look=Look("time"),
+    directed=True,
+    at_level=_at_level,
 )

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from servod.formats.model.effects import TorqueSaturation
 from servod.lab.diagnose.effects.effect import Effect, simple
 from servod.lab.diagnose.effects.hypothesis import Term, Unknown
+from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.scene import Scene
 
 #: Quantiles of the command at which a limit is looked for.
@@ -32,7 +34,7 @@ def terms(scene: Scene) -> list[Term]:
 
 EFFECT = Effect(
     name="torque_saturation",
-    group="torque_saturation",
+    group=TorqueSaturation,
     equation="torque = clip(torque, -limit, limit), or limit*tanh(torque/limit)",
     source="current limits; saturation of the iron: Krause et al., Analysis of Electric Machinery, 2013",
     statement="Large commands make less torque than they ask for: the torque saturates",
@@ -40,5 +42,8 @@ EFFECT = Effect(
     confused=("viscous_nonlinear", "torque_gain", "actuator_lag"),
     experiment="short steps of growing command at rest or low speed",
     terms=terms,
+    look=Look("load"),
     far=True,
+    swift=True,
+    soaks_up=True,
 )

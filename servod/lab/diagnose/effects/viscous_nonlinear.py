@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from servod.formats.model.friction import ViscousNonlinear
 from servod.lab.diagnose.effects.effect import Effect, share, simple
 from servod.lab.diagnose.effects.hypothesis import Term, Unknown
+from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.scene import Scene
 
 #: Bound of the terms: so many times the model's own viscous torque, or dry friction, at high speed.
@@ -32,7 +34,7 @@ def terms(scene: Scene) -> list[Term]:
 
 EFFECT = Effect(
     name="viscous_nonlinear",
-    group="viscous_nonlinear",
+    group=ViscousNonlinear,
     equation="F += quadratic*|v|*v + cubic*v^3 + power*sign(v)*|v|^exponent",
     source="churning losses (quadratic), thinning greases (exponent < 1); Kermani et al., IEEE TCST 15(3), 2007",
     statement="Viscous friction does not grow in a straight line with speed",
@@ -40,4 +42,6 @@ EFFECT = Effect(
     confused=("torque_saturation", "stribeck", "thermal"),
     experiment="constant speeds from slow to the fastest, in both directions",
     terms=terms,
+    look=Look("velocity"),
+    swift=True,
 )

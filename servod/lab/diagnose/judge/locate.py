@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,67 +17,26 @@ from numpy.typing import NDArray
 from servod.lab.diagnose.effects.scene import Scene
 from servod.lab.diagnose.predict.coordinates import coordinates, units
 from servod.lab.diagnose.predict.predict import Predictor
+from servod.lab.diagnose.result import Map
+from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
-
-#: Bins of a map, and rows that a bin needs.
-BINS, TIME_BINS, LEAST_IN_BIN = 24, 96, 30
-
-#: Probability under noise below which a map counts as seen.
-SEEN = 1e-3
-
-#: A place carries the mismatch where its power is over this share of the strongest place's.
-STRONG = 0.5
-
-#: Bands of frequency, Hz.
-BANDS: tuple[tuple[float, float], ...] = ((0.0, 0.5), (0.5, 2.0), (2.0, 5.0), (5.0, 10.0), (10.0, 20.0), (20.0, 50.0))
-
-
-@dataclass(frozen=True)
-class Map:
-    """Mean of the mismatch over one coordinate: bin edges, means and standard errors (N*m), rows in each bin.
-
-    `share` is the part of the mismatch's power over all rows that the means carry beyond chance, `chance` the
-    probability that noise makes them.
-    """
-
-    coordinate: str
-    unit: str
-    edges: Array
-    mean: Array
-    error: Array
-    rows: NDArray[np.int64]
-    share: float
-    chance: float
-
-    def document(self) -> dict[str, Any]:
-        """Plain numbers for JSON; bins without rows are left out."""
-        full = self.rows >= LEAST_IN_BIN
-        middles = 0.5 * (self.edges[:-1] + self.edges[1:])
-        return {
-            "coordinate": self.coordinate,
-            "unit": self.unit,
-            "share": round(self.share, 4),
-            "chance": self.chance,
-            "at": middles[full].tolist(),
-            "mean": self.mean[full].tolist(),
-            "error": self.error[full].tolist(),
-        }
 
 
 def maps(predictor: Predictor, mismatch: Array) -> list[Map]:
     """Maps over all coordinates, the one that carries most first, and at the end what is everywhere alike."""
     memory = max(1, round(2.0 / (predictor.rate * predictor.traces[0].period_s)))
+    bins = {"time": SETTINGS.maps.time_bins}
     found = [
-        map_over(name, unit, values, mismatch, predictor.counts, memory, TIME_BINS if name == "time" else BINS)
+        map_over(name, unit, values, mismatch, predictor.counts, memory, bins.get(name, SETTINGS.maps.bins))
         for name, (unit, values) in coordinates(predictor).items()
-        if int(np.sum(predictor.counts & np.isfinite(values))) >= 2 * LEAST_IN_BIN
+        if int(np.sum(predictor.counts & np.isfinite(values))) >= 2 * SETTINGS.maps.least_in_bin
     ]
-    found.append(modulo_period(predictor, mismatch, memory))
-    return [*sorted(found, key=lambda m: -m.share), everywhere(predictor, mismatch, memory)]
+    found.append(map_modulo_period(predictor, mismatch, memory))
+    return [*sorted(found, key=lambda m: -m.share), constant_part(predictor, mismatch, memory)]
 
 
-def everywhere(predictor: Predictor, mismatch: Array, memory: int) -> Map:
+def constant_part(predictor: Predictor, mismatch: Array, memory: int) -> Map:
     """The part of the mismatch that is the same in all rows, as a map of one bin."""
     from scipy.stats import f as fisher
 
@@ -85,25 +44,38 @@ def everywhere(predictor: Predictor, mismatch: Array, memory: int) -> Map:
     mean, power, rows = float(np.mean(here)), max(float(np.mean(here**2)), 1e-30), max(len(here) / memory, 2.0)
     spread = max(power - mean**2, 1e-30) / rows
     chance = float(fisher.sf(mean**2 / spread, 1, rows - 1.0))
-    edges, one = np.array([0.0, 1.0]), np.array([len(here)])
-    return Map(
-        "everywhere alike", "1", edges, np.array([mean]), np.array([math.sqrt(spread)]), one, mean**2 / power, chance
-    )
+    bins = np.array([0.0, 1.0]), np.array([mean]), np.array([math.sqrt(spread)]), np.array([len(here)])
+    return _map("everywhere alike", "1", *bins, mean**2 / power, chance)
 
 
-def modulo_period(predictor: Predictor, mismatch: Array, memory: int) -> Map:
+def _map(
+    name: str, unit: str, edges: Array, mean: Array, error: Array, rows: NDArray[Any], share: float, chance: float
+) -> Map:
+    """The map of those bins that hold rows enough."""
+    full = rows >= SETTINGS.maps.least_in_bin
+    middles = 0.5 * (edges[:-1] + edges[1:])
+    return Map(name, unit, middles[full], mean[full], error[full], len(rows), share, chance)
+
+
+def map_modulo_period(predictor: Predictor, mismatch: Array, memory: int) -> Map:
     """The map over the position modulo the period that takes most; its chance counts all periods that were tried."""
     axis = "linear" if predictor.linear else "rotary"
     scene = Scene({"axis": axis}, predictor, mismatch)
     best = scene.peaks(scene.carried(np.ones_like(scene.position)), 1)[0]
     period, unit = 2.0 * math.pi / best.n, units(predictor).length
     name = f"position modulo {period:.4g} {unit}"
-    found = map_over(name, unit, scene.lagged_position % period, mismatch, predictor.counts, memory)
+    found = map_over(name, unit, scene.lagged_position % period, mismatch, predictor.counts, memory, SETTINGS.maps.bins)
     return replace(found, chance=min(1.0, found.chance * len(scene.orders)))
 
 
 def map_over(
-    name: str, unit: str, values: Array, mismatch: Array, counts: NDArray[np.bool_], memory: int, bins: int = BINS
+    name: str,
+    unit: str,
+    values: Array,
+    mismatch: Array,
+    counts: NDArray[np.bool_],
+    memory: int,
+    bins: int,
 ) -> Map:
     """Means of the mismatch over bins of `values` with as many rows each; `memory` rows count as one.
 
@@ -127,10 +99,10 @@ def map_over(
     ratio = (between / free) / max((total - between) / rest, 1e-30) / memory
     carried = max(between - free * memory * (total - between) / max(len(here), 1), 0.0)
     share = carried / max(float(np.sum(mismatch[counts] ** 2)), 1e-30)
-    return Map(name, unit, edges, mean, error, count, share, float(fisher.sf(ratio, free, rest)))
+    return _map(name, unit, edges, mean, error, count, share, float(fisher.sf(ratio, free, rest)))
 
 
-def places(predictor: Predictor, effect: Array, scale: float) -> dict[str, Any]:
+def locate(predictor: Predictor, effect: Array, scale: float) -> dict[str, Any]:
     """Where an effect acts: what it changes of the mismatch (`effect`, N*m), recording by recording and by coordinate.
 
     `scale` is dry friction; sizes are told as shares of it.
@@ -157,9 +129,9 @@ def _windows(name: str, t_s: Array, effect: Array, length_s: float = 0.5) -> lis
     power = (effect[: count * rows].reshape(count, rows) ** 2).mean(axis=1)
     best = int(np.argmax(power))
     low, high = best, best
-    while low > 0 and power[low - 1] > STRONG * power[best]:
+    while low > 0 and power[low - 1] > SETTINGS.maps.strong * power[best]:
         low -= 1
-    while high + 1 < count and power[high + 1] > STRONG * power[best]:
+    while high + 1 < count and power[high + 1] > SETTINGS.maps.strong * power[best]:
         high += 1
     return [{"recording": name, "start_s": float(t_s[low * rows]), "end_s": float(t_s[(high + 1) * rows - 1])}]
 
@@ -173,7 +145,7 @@ def _strong(values: Array, effect: Array, counts: NDArray[np.bool_]) -> dict[str
     place = np.clip(np.searchsorted(edges, values[rows], side="right") - 1, 0, len(edges) - 2)
     count = np.maximum(np.bincount(place, minlength=len(edges) - 1), 1)
     power = np.bincount(place, effect[rows] ** 2, len(edges) - 1) / count
-    strong = np.flatnonzero(power > STRONG * power.max())
+    strong = np.flatnonzero(power > SETTINGS.maps.strong * power.max())
     return {"from": float(edges[strong[0]]), "to": float(edges[strong[-1] + 1])}
 
 
@@ -181,13 +153,13 @@ def bands(predictor: Predictor, effect: Array) -> dict[str, Any]:
     """The band of frequencies that carries most, and the share of each."""
     from scipy.signal import periodogram
 
-    power = np.zeros(len(BANDS))
+    power = np.zeros(len(SETTINGS.maps.bands_hz))
     for part, trace in zip(predictor.slices, predictor.traces, strict=True):
         frequency, density = periodogram(effect[part], 1.0 / trace.period_s)
-        power += [float(density[(frequency >= low) & (frequency < high)].sum()) for low, high in BANDS]
+        power += [float(density[(frequency >= low) & (frequency < high)].sum()) for low, high in SETTINGS.maps.bands_hz]
     shares = power / max(float(power.sum()), 1e-30)
     best = int(np.argmax(shares))
-    return {"from": BANDS[best][0], "to": BANDS[best][1], "shares": _rounded(shares)}
+    return {"from": SETTINGS.maps.bands_hz[best][0], "to": SETTINGS.maps.bands_hz[best][1], "shares": _rounded(shares)}
 
 
 def _rounded(values: Sequence[float] | Array) -> list[float]:

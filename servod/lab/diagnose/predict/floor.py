@@ -13,17 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.lab.diagnose.predict.predict import Predictor
+from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
-
-#: Length of a stretch in time constants of the observer, and the quantile of the stretches taken for noise.
-STRETCH, QUIET = 8.0, 0.25
-
-#: Standard score of that quantile.
-_SCORE = -0.674
-
-#: By how much slow torque noise may exceed the white part of the mismatch, in power.
-SLOW_OVER_WHITE = 6.0
 
 
 def noise_floor(predictor: Predictor, mismatch: Array) -> float:
@@ -36,14 +28,14 @@ def trace_floor(predictor: Predictor, index: int, mismatch: Array) -> float:
     """Mean square of the noise in one recording's mismatch."""
     part, trace = predictor.slices[index], predictor.traces[index]
     values = mismatch[part][predictor.counts[part]]
-    rows = max(8, round(STRETCH / (predictor.rate * trace.period_s)))
+    rows = max(8, round(SETTINGS.floor.stretch / (predictor.rate * trace.period_s)))
     count = len(values) // rows
     if count < 4:
         return float(np.mean(values**2)) if len(values) else 0.0
     powers = np.mean(values[: count * rows].reshape(count, rows) ** 2, axis=1)
     spread = math.sqrt(2.0 / rows)
-    quiet = float(np.quantile(powers, QUIET)) / max(1.0 + _SCORE * spread, 0.3)
-    return min(quiet, SLOW_OVER_WHITE * white_power(values))
+    quiet = float(np.quantile(powers, SETTINGS.floor.quantile)) / max(1.0 + SETTINGS.floor.score * spread, 0.3)
+    return min(quiet, SETTINGS.floor.slow_over_white * white_power(values))
 
 
 def white_power(values: Array) -> float:
@@ -56,7 +48,7 @@ def stretch_means(predictor: Predictor, mismatch: Array) -> Array:
     """Means of the mismatch over short stretches of all recordings, N*m."""
     means = []
     for part, trace in zip(predictor.slices, predictor.traces, strict=True):
-        rows = max(8, round(STRETCH / (predictor.rate * trace.period_s)))
+        rows = max(8, round(SETTINGS.floor.stretch / (predictor.rate * trace.period_s)))
         count = len(mismatch[part]) // rows
         means.append(mismatch[part][: count * rows].reshape(count, rows).mean(axis=1))
     return np.concatenate(means)

@@ -23,9 +23,10 @@ from servod.formats.model.axis_model import AxisKind, AxisModel
 from servod.kernels.physics.compiled import Kernel, available, compiled
 from servod.kernels.physics.layout import P_DELAY_S, P_GAP, P_START_C, S_FIRST_S
 from servod.kernels.physics.plant import rest_state
-from servod.lab.diagnose.data.excited import creeps
-from servod.lab.diagnose.data.trace import FASTEST, SHARE_OF_SAMPLING, SLOWEST, Trace, dry_friction
+from servod.lab.diagnose.data.excitation import creeps
+from servod.lab.diagnose.data.trace import CheckedTrace, dry_friction
 from servod.lab.diagnose.predict.innovation_kernel import innovate
+from servod.lab.diagnose.settings import SETTINGS
 from servod.lab.simulate import open_loop
 from servod.lab.simulate.motion import FirstRow
 from servod.lab.simulate.replay import Drive
@@ -38,12 +39,9 @@ from servod.lab.simulate.replay import Drive
 T = TypeVar("T")
 R = TypeVar("R")
 
-#: Cores that a diagnosis uses, at most.
-MOST_CORES = 2
-
 
 @cache
-def released(function: Kernel) -> Kernel:
+def without_lock(function: Kernel) -> Kernel:
     """`function` compiled, and called without the interpreter's lock; in pure Python where there is no compiler."""
     if not available():
         return function
@@ -60,9 +58,10 @@ def released(function: Kernel) -> Kernel:
 
 @cache
 def cores() -> int:
-    """Cores that this process may use, MOST_CORES at most; SERVOD_CORES overrides."""
+    """Cores that this process may use, within the settings; SERVOD_CORES overrides."""
     asked = os.environ.get("SERVOD_CORES", "")
-    return int(asked) if asked.isdigit() and int(asked) > 0 else min(MOST_CORES, usable_cores())
+    most = SETTINGS.observer.most_cores
+    return int(asked) if asked.isdigit() and int(asked) > 0 else min(most, usable_cores())
 
 
 @cache
@@ -70,7 +69,7 @@ def _pool(level: str) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max_workers=cores(), thread_name_prefix=level)
 
 
-def side_by_side(level: str, function: Callable[[T], R], items: Iterable[T]) -> list[R]:
+def in_parallel(level: str, function: Callable[[T], R], items: Iterable[T]) -> list[R]:
     """`function` of every item, in order. Calls within calls need another `level`, lest they wait for each other."""
     if cores() == 1:
         return [function(item) for item in items]
@@ -78,32 +77,6 @@ def side_by_side(level: str, function: Callable[[T], R], items: Iterable[T]) -> 
 
 
 Array = NDArray[np.float64]
-
-
-#: The share of the sampling rate where the axis creeps: a slower observer carries a model along that sticks and slips.
-SHARE_CREEPING = 0.35
-
-#: Share of dry friction that encoder noise may make of the mismatch; sets the bandwidth.
-WANTED_NOISE = 0.006
-
-#: Damping of the observer's poles.
-POLES_DAMPING = 0.8
-
-#: Longest step of the model, s; and the factor on the number of steps for reversals and for a gap.
-LONGEST_STEP_S = 0.0013
-STEPS_AT_REVERSAL, STEPS_IN_GAP = 4, 2
-
-#: Share of the motor's correction that the load gets: all behind a gap, less behind a spring, which it would ring.
-LOAD_SHARE, LOAD_SHARE_IN_GAP = 0.6, 1.0
-
-#: Innovations below this many noises of the encoder carry the model's friction nowhere.
-QUIET = 5.0
-
-#: Bandwidths (time constants of the observer) that pass before a row behind a start counts.
-SETTLING = 30.0
-
-#: Mismatches beyond this many dry frictions say no more: a model that has run away counts as that bad.
-WORST = 1e6
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,38 +90,42 @@ class Observer:
     steps: NDArray[np.int64]
 
 
-def bandwidth(inertia: float, dry: float, traces: Sequence[Trace]) -> float:
+def bandwidth(inertia: float, dry: float, traces: Sequence[CheckedTrace]) -> float:
     """Observer bandwidth in rad/s for an axis of this inertia and dry friction: as fast as the encoder noise allows."""
     noise = max(trace.position_noise for trace in traces)
     period = max(trace.period_s for trace in traces)
-    allowed = math.sqrt(WANTED_NOISE * dry / (inertia * noise)) if noise > 0.0 else FASTEST
+    allowed = (
+        math.sqrt(SETTINGS.observer.wanted_noise * dry / (inertia * noise))
+        if noise > 0.0
+        else SETTINGS.observer.fastest
+    )
     allowed *= math.sqrt(1.0 / math.sqrt(allowed * period))  # a slow observer averages over more rows
-    share = SHARE_CREEPING if creeps(traces, inertia) else SHARE_OF_SAMPLING
-    return min(max(allowed, SLOWEST), FASTEST, share / period)
+    share = SETTINGS.observer.share_creeping if creeps(traces, inertia) else SETTINGS.observer.share_of_sampling
+    return min(max(allowed, SETTINGS.observer.slowest), SETTINGS.observer.fastest, share / period)
 
 
-def observer(trace: Trace, inertia: float, rate: float) -> Observer:
+def observer(trace: CheckedTrace, inertia: float, rate: float) -> Observer:
     """Gains that put both poles of the correction at `rate` rad/s, for each row's own step."""
     t_s = trace.drive.t_s
     step = np.append(np.diff(t_s), trace.period_s)
     step = np.clip(step, 1e-6, 3.0 * trace.period_s)
-    decay = np.exp(-POLES_DAMPING * rate * step)
-    turn = np.cos(rate * step * math.sqrt(1.0 - POLES_DAMPING**2))
+    decay = np.exp(-SETTINGS.observer.poles_damping * rate * step)
+    turn = np.cos(rate * step * math.sqrt(1.0 - SETTINGS.observer.poles_damping**2))
     velocity_gain = (1.0 - 2.0 * decay * turn + decay**2) / step
     return Observer(rate, 1.0 - decay**2, velocity_gain, inertia * velocity_gain / step, _steps(trace, step))
 
 
-def _steps(trace: Trace, step: Array) -> NDArray[np.int64]:
+def _steps(trace: CheckedTrace, step: Array) -> NDArray[np.int64]:
     """Inner steps of each row: more around reversals, where friction turns over within a sample or two."""
-    base = np.ceil(step / LONGEST_STEP_S).astype(np.int64)
+    base = np.ceil(step / SETTINGS.observer.longest_step_s).astype(np.int64)
     slow = np.abs(trace.velocity) < 2.5 * np.abs(trace.acceleration) * step
-    return np.where(slow, np.maximum(base, STEPS_AT_REVERSAL), base)
+    return np.where(slow, np.maximum(base, SETTINGS.observer.steps_at_reversal), base)
 
 
 class Predictor:
     """Mismatch of any model with fixed recordings; the scale of torque is that of the nominal model."""
 
-    def __init__(self, traces: Sequence[Trace], nominal: AxisModel, rate: float | None = None) -> None:
+    def __init__(self, traces: Sequence[CheckedTrace], nominal: AxisModel, rate: float | None = None) -> None:
         self.traces = tuple(traces)
         self.dry = dry_friction(nominal)
         self.linear = nominal.axis is AxisKind.LINEAR
@@ -156,20 +133,20 @@ class Predictor:
         self.observers = tuple(observer(trace, nominal.inertia, self.rate) for trace in self.traces)
         ends = np.cumsum([len(trace.drive.t_s) for trace in self.traces])
         self.slices = tuple(slice(int(a), int(b)) for a, b in zip([0, *ends[:-1]], ends, strict=True))
-        self.counts = np.concatenate([self._counting(trace) for trace in self.traces])
+        self.counts = np.concatenate([self._rows_that_count(trace) for trace in self.traces])
         self.evaluations = 0
-        self._run, self._follow = released(innovate), released(open_loop.follow)
+        self._run, self._follow = without_lock(innovate), without_lock(open_loop.follow)
 
-    def _counting(self, trace: Trace) -> NDArray[np.bool_]:
+    def _rows_that_count(self, trace: CheckedTrace) -> NDArray[np.bool_]:
         """Rows that count: those of the trace, once the observer has settled behind each start."""
         counts = trace.counts.copy()
         for row in trace.starts:
             begun = trace.drive.t_s[row]
-            counts &= ~((trace.drive.t_s >= begun) & (trace.drive.t_s < begun + SETTLING / self.rate))
+            counts &= ~((trace.drive.t_s >= begun) & (trace.drive.t_s < begun + SETTINGS.observer.settling / self.rate))
         return counts
 
     def over(self, name: str) -> Array:
-        """A column of `Drive` or `Trace` over the rows of all traces."""
+        """A column of `Drive` or `CheckedTrace` over the rows of all traces."""
         return np.concatenate(
             [np.asarray(getattr(trace, name, getattr(trace.drive, name, None))) for trace in self.traces]
         )
@@ -190,26 +167,35 @@ class Predictor:
         packed = [np.array(model.pack()) for model in models]
         each = packed if len(packed) > 1 else packed * len(self.traces)
         self.evaluations += 1
-        parts = [self._one(p, trace, seen) for p, trace, seen in zip(each, self.traces, self.observers, strict=True)]
-        limit = WORST * self.dry
+        parts = [
+            self._trace_mismatch(p, trace, seen)
+            for p, trace, seen in zip(each, self.traces, self.observers, strict=True)
+        ]
+        limit = SETTINGS.observer.worst * self.dry
         clean = np.nan_to_num(np.concatenate(parts), nan=limit, posinf=limit, neginf=-limit)
         return np.where(self.counts, np.clip(clean, -limit, limit), 0.0)
 
-    def _one(self, p: Array, trace: Trace, seen: Observer) -> Array:
+    def _trace_mismatch(self, p: Array, trace: CheckedTrace, seen: Observer) -> Array:
         drive = trace.drive
-        first = trace.first(float(p[P_DELAY_S]))
+        first = trace.first_row(float(p[P_DELAY_S]))
         state = np.array(rest_state(0.0, 5e-5, float(p[P_START_C])))
         state[S_FIRST_S] = trace.begun_s
         states = np.array([self._start(p, trace, int(row), first) for row in trace.starts])
         out = np.zeros(len(drive.t_s))
-        steps = seen.steps * STEPS_IN_GAP if p[P_GAP] > 0.0 else seen.steps
+        steps = seen.steps * SETTINGS.observer.steps_in_gap if p[P_GAP] > 0.0 else seen.steps
         held = drive.t_s, drive.torque, first.command_before, drive.temperature_c, drive.position
-        share = LOAD_SHARE_IN_GAP if p[P_GAP] > 0.0 else LOAD_SHARE
-        gains = steps, seen.position_gain, seen.velocity_gain, share, QUIET * trace.position_noise
+        share = SETTINGS.observer.load_share_in_gap if p[P_GAP] > 0.0 else SETTINGS.observer.load_share
+        gains = (
+            steps,
+            seen.position_gain,
+            seen.velocity_gain,
+            share,
+            SETTINGS.observer.quiet_noises * trace.position_noise,
+        )
         self._run(p, state, *held, *gains, trace.starts, states, out)
         return seen.to_torque * out
 
-    def _start(self, p: Array, trace: Trace, row: int, known: FirstRow) -> Array:
+    def _start(self, p: Array, trace: CheckedTrace, row: int, known: FirstRow) -> Array:
         """Position, velocity and hidden states in balance with the recorded motion of one row."""
         drive = trace.drive
         motion = known.motion if row == 0 else tuple(drive.motion[row, :3])
@@ -227,21 +213,17 @@ class Predictor:
 # Stands between the predictor and the trials; what is tried on it and promises anything is fitted on everything after.
 
 
-#: Share of each recording that is kept, and the least that is, s.
-KEPT, LEAST_S = 0.35, 4.0
-
-
-def shortened(predictor: Predictor, nominal: AxisModel, mismatch: Array) -> Predictor:
+def shorten(predictor: Predictor, nominal: AxisModel, mismatch: Array) -> Predictor:
     """A predictor on the stretch of each recording with the greatest power of `mismatch`; the same observer."""
     traces = [
-        _cut(trace, mismatch[part], SETTLING / predictor.rate)
+        _cut(trace, mismatch[part], SETTINGS.observer.settling / predictor.rate)
         for trace, part in zip(predictor.traces, predictor.slices, strict=True)
     ]
     return Predictor(traces, nominal, predictor.rate)
 
 
-def _cut(trace: Trace, mismatch: Array, settling_s: float) -> Trace:
-    length = max(KEPT * trace.duration_s, LEAST_S) + settling_s
+def _cut(trace: CheckedTrace, mismatch: Array, settling_s: float) -> CheckedTrace:
+    length = max(SETTINGS.observer.shortened_share * trace.duration_s, SETTINGS.observer.shortened_least_s) + settling_s
     rows = min(round(length / trace.period_s), len(mismatch))
     power = np.concatenate([[0.0], np.cumsum(mismatch**2)])
     first = int(np.argmax(power[rows:] - power[: len(power) - rows]))

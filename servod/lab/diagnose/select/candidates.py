@@ -16,23 +16,11 @@ from numpy.typing import NDArray
 from servod.lab.diagnose.effects import effect, effects
 from servod.lab.diagnose.effects.hypothesis import Term
 from servod.lab.diagnose.effects.scene import Scene
-from servod.lab.diagnose.predict.predict import side_by_side
+from servod.lab.diagnose.predict.predict import in_parallel
 from servod.lab.diagnose.select.fit import Fit, Fitter
+from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
-
-#: Starts that go on to the second round and its steps; effects that are fitted to the end and steps of such a fit.
-SECOND_ROUND, SECOND_STEPS, FULL_FITS, FULL_STEPS = 16, 3, 5, 8
-
-#: Starts of a far effect that get a step of their own: those that the model's own parameters can follow best.
-FAR_STARTS = 4
-
-#: A candidate is fitted to the end when it has saved at least 1 - IN_REACH of what the best has saved.
-IN_REACH = 0.4
-
-
-#: What a number more must take of the rest to be worth it.
-PER_NUMBER = 0.02
 
 
 @dataclass(frozen=True)
@@ -77,27 +65,27 @@ class Trials:
     def run(self, skip: Iterable[str] = ()) -> list[Candidate]:
         """Candidates fitted to the end, best first, then the others; effects in `skip` are not tried."""
         names = [what.name for what in effects() if what.name not in skip]
-        first = [c for found in side_by_side("starts", self._starts, names) for c in found]
+        first = [c for found in in_parallel("starts", self._starts, names) for c in found]
         first.sort(key=lambda c: c.left)
-        second = side_by_side("starts", self._second, best_of_each(first, SECOND_ROUND, 2))
+        second = in_parallel("starts", self._second_round, best_of_each(first, SETTINGS.trials.second_round, 2))
         second.sort(key=lambda c: c.left)
         chosen = best_of_each(second, len(second), 1)
-        limit = chosen[0].left + IN_REACH * max(1.0 - chosen[0].left, 0.0) if chosen else 0.0
-        close = [c for c in chosen if c.left <= limit][:FULL_FITS]
-        fitted = sorted(side_by_side("starts", self._full, close), key=plainly)
+        limit = chosen[0].left + SETTINGS.trials.in_reach * max(1.0 - chosen[0].left, 0.0) if chosen else 0.0
+        close = [c for c in chosen if c.left <= limit][: SETTINGS.trials.full_fits]
+        fitted = sorted(in_parallel("starts", self._fit_fully, close), key=penalised_left)
         return fitted + [c for c in chosen if c.effect not in {f.effect for f in fitted}]
 
     def _starts(self, name: str) -> list[Candidate]:
         """All starts of an effect after one step each."""
         what = effect(name)
-        begun = [fit for term in what.terms(self.scene) for fit in self._begun(term, what.far)]
+        begun = [fit for term in what.terms(self.scene) for fit in self._begin(term, what.far)]
         self.tried += len(begun)
         if what.far:
-            begun = sorted(begun, key=self.short.promised)[:FAR_STARTS]
-        begun = [self.short.opened(fit) for fit in begun]
-        return [self._short(name, self.short.refine(fit, 1, fit.jacobian.shape[1], 2), fit) for fit in begun]
+            begun = sorted(begun, key=self.short.predicted_cost)[: SETTINGS.trials.far_starts]
+        begun = [self.short.refresh_opened(fit) for fit in begun]
+        return [self._on_short_data(name, self.short.refine(fit, 1, fit.jacobian.shape[1], 2), fit) for fit in begun]
 
-    def _begun(self, term: Term, far: bool) -> list[Fit]:
+    def _begin(self, term: Term, far: bool) -> list[Fit]:
         """The term beside the present fit, and for far effects beside the nominal model."""
         froms = [self.beside] + ([self.from_nominal] if far and self.from_nominal is not None else [])
         fits = []
@@ -106,26 +94,30 @@ class Trials:
             fits.append(self.short.begin(hypothesis, hypothesis.beside(beside.coordinates), beside.jacobian))
         return [fit for fit in fits if fit is not None]
 
-    def _short(self, name: str, fit: Fit, begun: Fit) -> Candidate:
+    def _on_short_data(self, name: str, fit: Fit, begun: Fit) -> Candidate:
         """A candidate on shortened data; it shares the Jacobian it began with, for many are kept."""
         return Candidate(name, replace(fit, jacobian=begun.jacobian), fit.cost / max(self.beside.cost, 1e-30))
 
-    def _second(self, candidate: Candidate) -> Candidate:
+    def _second_round(self, candidate: Candidate) -> Candidate:
         fit = candidate.fit
-        return self._short(candidate.effect, self.short.refine(fit, SECOND_STEPS, fit.jacobian.shape[1]), fit)
+        return self._on_short_data(
+            candidate.effect, self.short.refine(fit, SETTINGS.trials.second_steps, fit.jacobian.shape[1]), fit
+        )
 
-    def _full(self, candidate: Candidate) -> Candidate:
+    def _fit_fully(self, candidate: Candidate) -> Candidate:
         """Fit on everything, as long as there is time."""
         begun = self.whole.begin(candidate.fit.hypothesis, candidate.fit.coordinates, self.present.jacobian)
         if begun is None or monotonic() > self.deadline:
             return candidate
-        fit = self.whole.refine(self.whole.opened(begun), FULL_STEPS, known=self.present.jacobian.shape[1])
+        fit = self.whole.refine(
+            self.whole.refresh_opened(begun), SETTINGS.trials.full_steps, known=self.present.jacobian.shape[1]
+        )
         return Candidate(candidate.effect, fit, fit.cost / max(self.present.cost, 1e-30))
 
 
-def plainly(candidate: Candidate) -> float:
+def penalised_left(candidate: Candidate) -> float:
     """What is left, a little more for every number that the term needs: the plainest of equals comes first."""
-    return candidate.left * (1.0 + PER_NUMBER * candidate.term.numbers)
+    return candidate.left * (1.0 + SETTINGS.trials.per_number * candidate.term.numbers)
 
 
 def best_of_each(sorted_candidates: list[Candidate], count: int, each: int) -> list[Candidate]:

@@ -17,28 +17,10 @@ from pydantic import ValidationError
 
 from servod.formats.model.axis_model import AxisModel
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
-from servod.lab.diagnose.predict.predict import Predictor, side_by_side
+from servod.lab.diagnose.predict.predict import Predictor, in_parallel
+from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
-
-#: Scales beyond which a row's mismatch counts by its distance only.
-HUBER = 4.0
-
-#: The scale of a mismatch is at least this share of its root mean square: rare blows must not count by distance alone.
-LEAST_OF_RMS = 0.3
-
-#: A fit has converged when a step improves the cost by less than this share.
-CONVERGED = 1e-3
-
-#: Damping that steps begin with, as a share of the normal matrix's diagonal: so little that where the data say nothing,
-#: what was known beforehand decides.
-LEAST_DAMPING = 1e-8
-
-#: Longest step of one coordinate at once.
-LONGEST = 1.5
-
-#: Length of the blocks whose sums are taken to be independent, s: rows within one may be correlated as they like.
-MEMORY_S = 0.25
 
 
 class Weighing(NamedTuple):
@@ -73,7 +55,7 @@ class Fit:
 def robust_cost(mismatch: Array, weighing: Weighing) -> float:
     """Sum of Huber's loss over the rows that take part."""
     off = np.abs(mismatch) / weighing.scale
-    loss = np.where(off <= HUBER, 0.5 * off * off, HUBER * (off - 0.5 * HUBER))
+    loss = np.where(off <= SETTINGS.fit.huber, 0.5 * off * off, SETTINGS.fit.huber * (off - 0.5 * SETTINGS.fit.huber))
     return float(weighing.rows @ loss)
 
 
@@ -113,7 +95,7 @@ class Fitter:
         known = np.zeros((len(mismatch), 0)) if jacobian is None else jacobian
         return Fit(hypothesis, at, mismatch, self.cost(hypothesis, at, mismatch), known, False)
 
-    def promised(self, fit: Fit) -> float:
+    def predicted_cost(self, fit: Fit) -> float:
         """The cost after one step along the columns of the Jacobian that are known, by the Jacobian alone."""
         columns = fit.jacobian.shape[1]
         normal, slope = self._normal(fit, fit.jacobian)
@@ -125,22 +107,22 @@ class Fitter:
         The first `known` are taken as they are to begin with. The Jacobian follows the steps by secants (Broyden, Math.
         Comp. 19, 1965) and is taken anew when they stop to help; a fit ends only on a fresh one.
         """
-        damping, fresh = LEAST_DAMPING, known <= keep_columns
+        damping, fresh = SETTINGS.fit.least_damping, known <= keep_columns
         jacobian = self.derivatives(fit, max(keep_columns, known))
         for _ in range(steps):
             stepped, damping = self._step(fit, jacobian, damping, tries)
             gained = (fit.cost - stepped.cost) / max(fit.cost, 1.0)
-            if gained > CONVERGED:
+            if gained > SETTINGS.fit.converged:
                 jacobian, fresh = secant(jacobian, fit, stepped), False
                 fit = replace(stepped, jacobian=jacobian)
                 continue
             fit = stepped
             if fresh:
                 return replace(fit, converged=True)
-            jacobian, fresh, damping = self.derivatives(fit, keep_columns), True, LEAST_DAMPING
+            jacobian, fresh, damping = self.derivatives(fit, keep_columns), True, SETTINGS.fit.least_damping
         return fit
 
-    def opened(self, fit: Fit) -> Fit:
+    def refresh_opened(self, fit: Fit) -> Fit:
         """The fit with those columns of its Jacobian anew that belong to parameters opened by its last term."""
         keys = fit.hypothesis.terms[-1].opens
         jacobian = fit.jacobian.copy() if keys else fit.jacobian
@@ -153,7 +135,7 @@ class Fitter:
         """Derivative of the mismatch by each coordinate, N*m; forward differences, backward at an upper bound."""
         columns = [fit.jacobian[:, i] for i in range(min(keep_columns, fit.jacobian.shape[1]))]
         left = range(len(columns), len(fit.coordinates))
-        columns += side_by_side("columns", lambda index: self._column(fit, index), left)
+        columns += in_parallel("columns", lambda index: self._column(fit, index), left)
         return np.column_stack(columns)
 
     def _column(self, fit: Fit, index: int) -> Array:
@@ -174,14 +156,16 @@ class Fitter:
             if mismatch is not None:
                 cost = self.cost(fit.hypothesis, at, mismatch)
                 if cost < fit.cost:
-                    return Fit(fit.hypothesis, at, mismatch, cost, jacobian, False), max(0.2 * damping, LEAST_DAMPING)
+                    return Fit(fit.hypothesis, at, mismatch, cost, jacobian, False), max(
+                        0.2 * damping, SETTINGS.fit.least_damping
+                    )
             damping = max(8.0 * damping, 1e-2)
         return Fit(fit.hypothesis, fit.coordinates, fit.mismatch, fit.cost, jacobian, False), damping
 
     def _normal(self, fit: Fit, jacobian: Array) -> tuple[Array, Array]:
         """Normal matrix and slope of the cost, prior included."""
         off = fit.mismatch / self.weighing.scale
-        weight = self.weighing.rows * np.minimum(1.0, HUBER / np.maximum(np.abs(off), 1e-12))
+        weight = self.weighing.rows * np.minimum(1.0, SETTINGS.fit.huber / np.maximum(np.abs(off), 1e-12))
         scaled = jacobian / self.weighing.scale
         some = slice(jacobian.shape[1])
         centre, precision = (part[some] for part in fit.hypothesis.prior)
@@ -211,7 +195,9 @@ def _bounded_step(normal: Array, slope: Array, damping: float, fit: Fit) -> Arra
         held = normal[np.ix_(some, ~free)] @ change[~free]
         diagonal = np.diag(normal)[some]
         damped = normal[np.ix_(some, some)] + np.diag(damping * diagonal + 1e-9 * max(float(diagonal.max()), 1e-12))
-        change[some] = np.clip(-np.linalg.solve(damped, slope[some] + held), -LONGEST, LONGEST)
+        change[some] = np.clip(
+            -np.linalg.solve(damped, slope[some] + held), -SETTINGS.fit.longest_step, SETTINGS.fit.longest_step
+        )
         inside = np.clip(fit.coordinates + change, low, high) - fit.coordinates
         out = free & (np.abs(inside - change) > 1e-12)
         change = inside
@@ -222,19 +208,19 @@ def _bounded_step(normal: Array, slope: Array, damping: float, fit: Fit) -> Arra
 
 
 def scale_of(mismatch: Array, counts: NDArray[np.bool_], floor: float) -> float:
-    """Robust standard deviation of the mismatch, at least `floor` and LEAST_OF_RMS of its root mean square."""
+    """Robust standard deviation of the mismatch, at least `floor` and a share of its root mean square."""
     spread = float(np.median(np.abs(mismatch[counts]))) / 0.6745
-    return max(spread, LEAST_OF_RMS * float(np.sqrt(np.mean(mismatch[counts] ** 2))), floor)
+    return max(spread, SETTINGS.fit.least_of_rms * float(np.sqrt(np.mean(mismatch[counts] ** 2))), floor)
 
 
 def covariance(fit: Fit, weighing: Weighing, period_s: float) -> Array:
-    """Covariance of the coordinates: sandwich with correlated rows (batch means, blocks of MEMORY_S)."""
+    """Covariance of the coordinates: sandwich with correlated rows (batch means)."""
     off = fit.mismatch / weighing.scale
-    weight = weighing.rows * np.minimum(1.0, HUBER / np.maximum(np.abs(off), 1e-12))
+    weight = weighing.rows * np.minimum(1.0, SETTINGS.fit.huber / np.maximum(np.abs(off), 1e-12))
     scaled = fit.jacobian / weighing.scale
     precision = fit.hypothesis.prior[1]
     normal = scaled.T @ (weight[:, None] * scaled) + np.diag(precision**2)
-    meat = long_run(scaled * (weight * off)[:, None], max(1, math.ceil(MEMORY_S / period_s)))
+    meat = long_run(scaled * (weight * off)[:, None], max(1, math.ceil(SETTINGS.fit.memory_s / period_s)))
     bread = np.linalg.pinv(normal)
     return np.asarray(bread @ (meat + np.diag(precision**2)) @ bread)
 

@@ -1,6 +1,6 @@
 """Figures of where a mismatch lives: shares over coordinates, maps, course over time, and spectrum.
 
-Stands on the maps of `servod.lab.diagnose.judge.locate`; nothing here names any physics.
+Stands on the result of a diagnosis; nothing here names any physics.
 """
 
 from __future__ import annotations
@@ -10,20 +10,15 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from servod.lab.diagnose.judge.held_out import WindowErrors
-from servod.lab.diagnose.judge.locate import LEAST_IN_BIN, SEEN, Map
-from servod.lab.diagnose.predict.coordinates import units
-from servod.lab.diagnose.predict.predict import Predictor
-from servod.lab.report.figure import Array, Axis, Colour, Curve, Figure, Panel, Scale, Style, array, curve
+from servod.lab.diagnose.result import Map, RecordingErrors, Spectrum, Units, Windows
+from servod.lab.diagnose.settings import SETTINGS
+from servod.lab.report.figure import Axis, Colour, Curve, Figure, Panel, Scale, Style, curve
 
-#: Maps that are shown, and length of a stretch whose root mean square is one point over time, s.
-SHOWN, STRETCH_S = 6, 0.1
+#: Maps that are shown.
+SHOWN = 6
 
 #: Recordings that get a panel over time.
 MOST_RECORDINGS = 6
-
-#: Highest frequency of a spectrum, Hz.
-HIGHEST_HZ = 60.0
 
 #: Thickness of a bar that stands alone at its place, and of one of two beside each other.
 BAR, HALF_BAR = 0.62, 0.36
@@ -35,11 +30,11 @@ def shares(maps: Sequence[Map]) -> dict[str, float]:
     for seen in maps:
         name, _, both = seen.coordinate.partition(",")
         name = f"{name}, by direction" if both else name
-        found[name] = found.get(name, 0.0) + (seen.share if seen.chance < SEEN else 0.0)
+        found[name] = found.get(name, 0.0) + (seen.share if seen.seen else 0.0)
     return dict(sorted(found.items(), key=lambda item: -item[1]))
 
 
-def where(maps: Sequence[Map], predictor: Predictor) -> Figure:
+def where(maps: Sequence[Map], units: Units) -> Figure:
     """The first picture: the share of the error that each coordinate orders, and the map that orders most of it."""
     found = shares(maps)
     names = tuple(reversed(found))
@@ -53,32 +48,29 @@ def where(maps: Sequence[Map], predictor: Predictor) -> Figure:
         "would make; the shares overlap, as velocity and direction do. Right: the error over the coordinate that "
         "orders most of it, with twice its standard error."
     )
-    return Figure("where", "Where the model is off", (left, map_panel(maps[0], predictor)), 2, caption, 1.5)
+    return Figure("where", "Where the model is off", (left, map_panel(maps[0], units)), 2, caption, 1.5)
 
 
-def map_panel(seen: Map, predictor: Predictor, after: Map | None = None) -> Panel:
+def map_panel(seen: Map, units: Units, after: Map | None = None) -> Panel:
     """One map as a curve with its band; `after` in another colour beside it."""
-    force = units(predictor).force
     curves = [_mean(seen, "before", Colour.ORANGE)]
     if after is not None:
         curves.append(_mean(after, "after", Colour.BLUE))
     unit = "" if seen.unit == "1" or "modulo" in seen.coordinate else f" in {seen.unit}"
-    return Panel(Axis(f"{seen.coordinate}{unit}"), Axis(f"error in {force}"), tuple(curves))
+    return Panel(Axis(f"{seen.coordinate}{unit}"), Axis(f"error in {units.force}"), tuple(curves))
 
 
 def _mean(seen: Map, label: str, colour: Colour) -> Curve:
-    full = seen.rows >= LEAST_IN_BIN
-    middles = (0.5 * (seen.edges[:-1] + seen.edges[1:]))[full]
-    mean, half = seen.mean[full], 2.0 * seen.error[full]
-    style = Style.POINTS if len(middles) < 4 else Style.LINE
-    return curve(label, middles, mean, colour, style, bounds=(mean - half, mean + half))
+    half = 2.0 * seen.error
+    style = Style.POINTS if len(seen.at) < 4 else Style.LINE
+    return curve(label, seen.at, seen.mean, colour, style, bounds=(seen.mean - half, seen.mean + half))
 
 
-def map_grid(before: Sequence[Map], after: Sequence[Map], predictor: Predictor) -> Figure:
+def map_grid(before: Sequence[Map], after: Sequence[Map], units: Units) -> Figure:
     """The maps that carry most, before and after on the same scale."""
     later = {seen.coordinate: seen for seen in after}
-    chosen = [seen for seen in before if seen.coordinate in later and len(seen.rows) > 1][:SHOWN]
-    panels = [map_panel(seen, predictor, later[seen.coordinate]) for seen in chosen]
+    chosen = [seen for seen in before if seen.coordinate in later and seen.bins > 1][:SHOWN]
+    panels = [map_panel(seen, units, later[seen.coordinate]) for seen in chosen]
     caption = (
         "Mean error over each coordinate with twice its standard error, before and after. Where the physics was "
         "found, the curve after lies on zero."
@@ -86,58 +78,34 @@ def map_grid(before: Sequence[Map], after: Sequence[Map], predictor: Predictor) 
     return Figure("maps", "The error over what the axis did, before and after", tuple(panels), 2, caption)
 
 
-def over_time(predictor: Predictor, before: Array, after: Array) -> Figure:
+def over_time(recordings: Sequence[RecordingErrors], units: Units) -> Figure:
     """Root mean square of the error over time, a panel for each recording."""
-    force, panels = units(predictor).force, []
-    for trace, part in list(zip(predictor.traces, predictor.slices, strict=True))[:MOST_RECORDINGS]:
-        t_s = trace.drive.t_s - trace.shift_s
-        rows = max(1, round(STRETCH_S / trace.period_s))
-        shown = ((before, "before", Colour.ORANGE), (after, "after", Colour.BLUE))
-        curves = [curve(label, *_stretches(t_s, error[part], rows), colour) for error, label, colour in shown]
-        panels.append(Panel(Axis("time in s"), Axis(f"error in {force}"), tuple(curves), trace.name))
+    panels = []
+    for one in recordings[:MOST_RECORDINGS]:
+        curves = (
+            curve("before", one.t_s, one.before_curve, Colour.ORANGE),
+            curve("after", one.t_s, one.after_curve, Colour.BLUE),
+        )
+        panels.append(Panel(Axis("time in s"), Axis(f"error in {units.force}"), curves, one.name))
     caption = (
-        f"Root mean square of the error in stretches of {STRETCH_S:g} s, by models fitted to the other recordings."
+        f"Root mean square of the error in stretches of {SETTINGS.curves.course_s:g} s, by models fitted to the other "
+        "recordings."
     )
     columns = 2 if len(panels) > 1 else 1
     return Figure("over_time", "The error over time, recording by recording", tuple(panels), columns, caption, 0.85)
 
 
-def _stretches(t_s: Array, error: Array, rows: int) -> tuple[Array, Array]:
-    count = len(error) // rows
-    power = (error[: count * rows].reshape(count, rows) ** 2).mean(axis=1)
-    return t_s[: count * rows : rows], np.sqrt(power)
-
-
-def spectrum(predictor: Predictor, before: Array, after: Array) -> Figure:
+def spectrum(before: Spectrum, after: Spectrum, units: Units) -> Figure:
     """Power of the error over frequency, before and after."""
     shown = ((before, "before", Colour.ORANGE), (after, "after", Colour.BLUE))
-    curves = [curve(label, *_density(predictor, error), colour) for error, label, colour in shown]
-    unit = units(predictor).force
+    curves = [curve(label, error.frequency_hz, error.amplitude, colour) for error, label, colour in shown]
     panel = Panel(
         Axis("frequency in Hz", Scale.LOG),
-        Axis(f"error in {unit}/√Hz", Scale.LOG),
+        Axis(f"error in {units.force}/√Hz", Scale.LOG),
         tuple(c for c in curves if c.x.size),
     )
     caption = "Amplitude of the error by frequency: a narrow peak is a resonance or a period, a broad rise is noise."
     return Figure("spectrum", "The error over frequency", (panel,), 1, caption)
-
-
-def _density(predictor: Predictor, error: Array) -> tuple[Array, Array]:
-    """Amplitude density over frequency, averaged over the recordings on common bands."""
-    from scipy.signal import welch
-
-    edges = np.geomspace(0.2, HIGHEST_HZ, 61)
-    power, rows = np.zeros(60), np.zeros(60)
-    for trace, part in zip(predictor.traces, predictor.slices, strict=True):
-        length = min(len(error[part]), round(8.0 / trace.period_s))
-        frequency, density = welch(error[part], 1.0 / trace.period_s, nperseg=length)
-        place = np.digitize(frequency, edges) - 1
-        inside = (place >= 0) & (place < 60)
-        power += np.bincount(place[inside], density[inside], 60)
-        rows += np.bincount(place[inside], minlength=60)
-    full = rows > 0
-    middles = np.sqrt(edges[:-1] * edges[1:])[full]
-    return array(middles), array(np.sqrt(np.maximum(power[full] / rows[full], 1e-300)))
 
 
 def seen_by(left_out: str | None) -> str:
@@ -147,19 +115,17 @@ def seen_by(left_out: str | None) -> str:
     return f"Each row is judged by a model that was fitted without it: {left_out} was left out."
 
 
-def window_course(predictor: Predictor, windows: Sequence[WindowErrors], left_out: str | None) -> Figure:
+def window_course(windows: Sequence[Windows], left_out: str | None, units: Units) -> Figure:
     """Error of windows that are simulated freely, over time, in the recording where it was largest."""
-    worst = max(predictor.slices, key=lambda part: float(np.mean(windows[-1].nominal[part] ** 2)))
-    trace = predictor.traces[predictor.slices.index(worst)]
-    t_s, unit, panels = trace.drive.t_s - trace.shift_s, units(predictor).length, []
+    panels = []
     for window in windows:
-        factor, prefix = _prefix(float(np.max(np.abs(window.nominal[worst]), initial=0.0)))
+        factor, prefix = _prefix(float(np.max(np.abs(window.before), initial=0.0)))
         curves = (
-            curve("before", t_s, factor * window.nominal[worst], Colour.ORANGE, width=1.0),
-            curve("after", t_s, factor * window.after[worst], Colour.BLUE, width=1.0),
+            curve("before", window.t_s, factor * window.before, Colour.ORANGE, width=1.0),
+            curve("after", window.t_s, factor * window.after, Colour.BLUE, width=1.0),
         )
-        title = f"{trace.name}, windows of {window.horizon_s:g} s"
-        panels.append(Panel(Axis("time in s"), Axis(f"position error in {prefix}{unit}"), curves, title))
+        title = f"{window.worst}, windows of {window.horizon_s:g} s"
+        panels.append(Panel(Axis("time in s"), Axis(f"position error in {prefix}{units.length}"), curves, title))
     caption = (
         "Simulated minus recorded position; the simulation begins anew from the recording at every window. "
         f"{seen_by(left_out)}"

@@ -11,15 +11,13 @@ from typing import Any
 from servod.common.errors import BadInput
 from servod.formats.model.axis_model import AxisModel
 
-Groups = dict[str, Any]
-
-#: Groups of the axis model file by effect, for a joint of some dry friction in N*m.
-CONCEALED: dict[str, Callable[[float], Groups]] = {
-    "cogging": lambda dry: {"cogging": {"harmonics": [_sine(0.3 * dry, 22.0, 0.7), _sine(0.1 * dry, 44.0, 2.1)]}},
-    "gravity": lambda dry: {"gravity": {"amplitude": 1.3 * dry, "phase": 0.3}},
-    "asymmetry": lambda _dry: {"asymmetry": {"positive_dry": 1.3, "negative_dry": 0.7}},
-    "spring": lambda dry: {"spring": {"stiffness": 7.0 * dry, "rest": 0.1}},
-    "torque_offset": lambda dry: {"torque_offset": 0.5 * dry},
+#: What stands under the effect's key in the axis model file, for a joint of some dry friction in N*m.
+CONCEALED: dict[str, Callable[[float], Any]] = {
+    "cogging": lambda dry: {"harmonics": [_sine(0.3 * dry, 22.0, 0.7), _sine(0.1 * dry, 44.0, 2.1)]},
+    "gravity": lambda dry: {"amplitude": 1.3 * dry, "phase": 0.3},
+    "asymmetry": lambda _dry: {"positive_dry": 1.3, "negative_dry": 0.7},
+    "spring": lambda dry: {"stiffness": 7.0 * dry, "rest": 0.1},
+    "torque_offset": lambda dry: 0.5 * dry,
 }
 
 #: What is concealed when nobody says what.
@@ -46,4 +44,4 @@ def believed_and_true(plant: AxisModel, effect: str) -> tuple[AxisModel, AxisMod
     if effect not in CONCEALED:
         raise BadInput("--conceal", repr(effect), ", ".join(CONCEALED) + ", or an effect that --plant has")
     dry = getattr(plant.friction, "coulomb", 0.0) or 0.05
-    return AxisModel.model_validate(document), AxisModel.model_validate(document | CONCEALED[effect](dry))
+    return AxisModel.model_validate(document), AxisModel.model_validate(document | {effect: CONCEALED[effect](dry)})

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from servod.lab.diagnose.document import certainty
+from servod.lab.diagnose.document import describe_certainty
 from servod.lab.report.diagnosis import Report
 from servod.lab.report.figure import Axis, Colour, Curve, Figure, Panel, curve
 from servod.lab.report.figures import mismatch
-from servod.lab.report.figures.signature import signature
+from servod.lab.report.figures.signature import signature_figure
 from servod.lab.tracking.metrics import SETTLE_S
 from servod.qualify.demo.recovery.walk import DIAGNOSIS, Recovery, error_mrad, time_s, within
 
@@ -37,12 +37,13 @@ def write_recovery_page(found: Recovery, out: Path) -> Path:
     _figures(report, found)
     page.heading("What the diagnosis found in the axis's own recordings")
     page.points([f["statement"] for f in found.document["findings"]])
-    page.points([line for f in found.document["findings"] for line in certainty(f)])
-    evidence = found.diagnosis.evidence
+    page.points([line for f in found.document["findings"] for line in describe_certainty(f)])
+    evidence, units = found.diagnosis.evidence, found.diagnosis.units
     if evidence is not None:
-        report.figure(mismatch.where(evidence.maps_before, evidence.predictor))
-        for place in evidence.named:
-            report.figure(signature(evidence, evidence.fit.hypothesis.terms[place].effect, place))
+        report.figure(mismatch.where(evidence.maps_before, units))
+        terms = [(one, named.effect) for named in evidence.findings for one in named.signatures]
+        for one, effect in sorted(terms, key=lambda term: term[0].number):
+            report.figure(signature_figure(one, effect, units))
     page.sentence(f"All of it: {DIAGNOSIS}/report.html, {DIAGNOSIS}/diagnosis.json and {DIAGNOSIS}/model.yaml.")
     return report.write()
 

@@ -26,9 +26,9 @@ from servod.lab.commission.comparison import save_rows
 from servod.lab.deploy.deployment import deploy
 from servod.lab.deploy.judge import broken, skipped
 from servod.lab.deploy.outcome import Deployment
+from servod.lab.diagnose.effects import names
 from servod.lab.diagnose.engine import diagnose
-from servod.lab.diagnose.judge.evidence import Diagnosis
-from servod.lab.diagnose.judge.verdict import Verdict
+from servod.lab.diagnose.result import Diagnosis, DiagnosisVerdict
 from servod.lab.recordings import load_recording
 from servod.lab.recordings.recording import Rows, moving, rows_of
 from servod.lab.report.diagnosis import MODEL, write_files
@@ -57,9 +57,6 @@ TIME_LIMIT_S = 300.0
 
 #: A trial in which the loop skipped cycles says nothing of the set; on a machine with other work there is one more.
 _TRIALS = 3
-
-#: Effects whose names say how late the torque comes.
-LATE = frozenset(("delay", "actuator_lag"))
 
 
 @dataclass(frozen=True)
@@ -263,7 +260,7 @@ def _diagnosed(believed: AxisModel, recordings: list[Path], out: Path) -> tuple[
     found = diagnose(believed, [load_recording(path) for path in recordings], TIME_LIMIT_S)
     out.mkdir(parents=True, exist_ok=True)
     document = write_files(out, found, "believed.yaml")
-    if found.verdict is Verdict.CANNOT_TELL:
+    if found.verdict is DiagnosisVerdict.CANNOT_TELL:
         raise AnswerIsNo(document["summary"])
     return found, document
 
@@ -275,7 +272,8 @@ def _extended(believed: AxisModel, document: dict[str, Any], out: Path) -> Path:
     gives away stiffness. A delay that has a name stands.
     """
     model, path = load_axis_model(out / DIAGNOSIS / MODEL), out / "extended.yaml"
-    if not LATE.intersection(finding["effect"] for finding in document["findings"]):
+    late = names(lambda what: bool(what.lateness))
+    if not late.intersection(finding["effect"] for finding in document["findings"]):
         model = model.model_copy(update={"delay_s": believed.delay_s})
     write_bytes(path, axis_model_yaml(model).encode())
     return path

@@ -5,38 +5,19 @@ Stands behind the selection: the table becomes `residual` in the axis model file
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
-from servod.lab.diagnose.effects.hypothesis import Document
-from servod.lab.diagnose.predict.predict import POLES_DAMPING, Predictor
+from servod.lab.diagnose.predict.predict import Predictor
+from servod.lab.diagnose.result import ResidualTable
+from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
 
-#: Points of a table, and the share of the mismatch that it must take of rows it has not seen.
-POINTS, LEAST_SHARE = 33, 0.05
 
-
-@dataclass(frozen=True)
-class Unnamed:
-    """A resisting torque over one coordinate: grid, torque (N*m), and the share it takes of unseen rows' power."""
-
-    coordinate: str
-    grid: Array
-    torque: Array
-    share: float
-
-    def write(self, document: Document) -> None:
-        """Put the table into a model document."""
-        table = {"grid": self.grid.tolist(), "torque": self.torque.tolist()}
-        document.setdefault("residual", {})[self.coordinate] = table
-
-
-def unnamed(predictor: Predictor, mismatch: Array) -> Unnamed | None:
-    """The table that foretells most of the mismatch of unseen stretches; None where none foretells enough."""
-    late = 2.0 * POLES_DAMPING / predictor.rate
+def residual_table(predictor: Predictor, mismatch: Array) -> ResidualTable | None:
+    """The table that predicts most of the mismatch of unseen stretches; None where none predicts enough."""
+    late = 2.0 * SETTINGS.observer.poles_damping / predictor.rate
     velocity = predictor.over("velocity")
     places = {
         "position": predictor.over("position") - late * velocity,
@@ -44,21 +25,21 @@ def unnamed(predictor: Predictor, mismatch: Array) -> Unnamed | None:
     }
     found = [_table(name, values, predictor, mismatch) for name, values in places.items()]
     best = max(found, key=lambda table: table.share)
-    return best if best.share >= LEAST_SHARE else None
+    return best if best.share >= SETTINGS.maps.table_least_share else None
 
 
-def _table(name: str, values: Array, predictor: Predictor, mismatch: Array) -> Unnamed:
+def _table(name: str, values: Array, predictor: Predictor, mismatch: Array) -> ResidualTable:
     """Least squares of a piecewise linear function, and its share on every second stretch from the others."""
     rows = np.flatnonzero(predictor.counts)
-    grid = np.unique(np.quantile(values[rows], np.linspace(0.002, 0.998, POINTS)))
+    grid = np.unique(np.quantile(values[rows], np.linspace(0.002, 0.998, SETTINGS.maps.table_points)))
     design = hats(values[rows], grid)
     stretch = (rows // max(1, round(1.0 / predictor.traces[0].period_s))) % 2 == 0
     share = 0.0
     for part in (stretch, ~stretch):
-        foretold = design[~part] @ _ridge(design[part], mismatch[rows][part])
-        left = mismatch[rows][~part] - foretold
+        predicted = design[~part] @ _ridge(design[part], mismatch[rows][part])
+        left = mismatch[rows][~part] - predicted
         share += 0.5 * (1.0 - float(left @ left) / max(float(np.sum(mismatch[rows][~part] ** 2)), 1e-30))
-    return Unnamed(name, grid, -_ridge(design, mismatch[rows]), share)
+    return ResidualTable(name, grid, -_ridge(design, mismatch[rows]), share)
 
 
 def _ridge(design: Array, wanted: Array) -> Array:

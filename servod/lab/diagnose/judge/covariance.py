@@ -9,38 +9,24 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from servod.lab.diagnose.judge.held_out import HeldOut
+from servod.lab.diagnose.effects import effect
+from servod.lab.diagnose.effects.base import TORQUES
 from servod.lab.diagnose.select.fit import Fit, Weighing, covariance
+from servod.lab.diagnose.select.selection import HeldOutErrors
+from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
 
-#: Error of any estimate that steps of a sample and forms that are not quite the axis's make, as a share of it.
-MODEL_ERROR = 0.006
-
-#: By how much worse steps of a sample make the bristle's stiffness and damping, which act for some samples at a time.
-BRISTLE, BRISTLE_ERROR = ("friction.sigma0", "friction.sigma1"), 2.0
-
-#: Probability of the region in which several coordinates lie together.
-REGION = 0.95
-
-#: Torques of the model's own, which no recording tells from a common factor on all of them and on the command.
-TORQUES = (
-    "inertia",
-    "friction.viscous",
-    "friction.coulomb",
-    "friction.static",
-    "friction.sigma0",
-    "friction.sigma1",
-    "gravity.amplitude",
-)
+#: The bristle's stiffness and damping, which act for some samples at a time.
+BRISTLE = ("friction.sigma0", "friction.sigma1")
 
 
-def spread(fit: Fit, weighing: Weighing, period_s: float, held: HeldOut) -> Array:
+def total_covariance(fit: Fit, weighing: Weighing, period_s: float, held: HeldOutErrors) -> Array:
     """Covariance of the coordinates of `fit`; `held` has the fits without each recording."""
     return covariance(fit, weighing, period_s) + jackknife(fit, held) + model_error(fit) + common_factor(fit)
 
 
-def jackknife(fit: Fit, held: HeldOut) -> Array:
+def jackknife(fit: Fit, held: HeldOutErrors) -> Array:
     """By how much the fits without each recording disagree (Efron, The Jackknife, 1982)."""
     count, size = len(held.coordinates), len(fit.coordinates)
     if count < 2:
@@ -50,8 +36,10 @@ def jackknife(fit: Fit, held: HeldOut) -> Array:
 
 
 def model_error(fit: Fit) -> Array:
-    """MODEL_ERROR of each value, more for the bristle; of a sine by the size of its term, of orders over the range."""
-    sizes = np.array([BRISTLE_ERROR if unknown.key in BRISTLE else 1.0 for unknown in fit.hypothesis.unknowns])
+    """Error of the model in each value, more for the bristle; of a sine by its term's size, of orders by the range."""
+    sizes = np.array(
+        [SETTINGS.intervals.bristle_error if unknown.key in BRISTLE else 1.0 for unknown in fit.hypothesis.unknowns]
+    )
     linear = np.array([unknown.size != 0.0 for unknown in fit.hypothesis.unknowns])
     sizes[linear] = np.abs(fit.coordinates[linear])
     for place, term in enumerate(fit.hypothesis.terms):
@@ -60,7 +48,7 @@ def model_error(fit: Fit) -> Array:
         sizes[some] = np.linalg.norm(fit.coordinates[some])
         orders = [u.key == "n" for u in term.unknowns]
         sizes[np.arange(len(sizes))[fit.hypothesis.share(place)][np.array(orders, dtype=bool)]] = 1.0
-    return np.diag((MODEL_ERROR * sizes) ** 2)
+    return np.diag((SETTINGS.intervals.model_error * sizes) ** 2)
 
 
 def common_factor(fit: Fit) -> Array:
@@ -68,7 +56,7 @@ def common_factor(fit: Fit) -> Array:
     size = len(fit.coordinates)
     unknowns = fit.hypothesis.unknowns
     scaled = np.array([u.key in TORQUES for u in unknowns[: len(fit.hypothesis.base)]])
-    gains = [p for p, term in enumerate(fit.hypothesis.terms) if term.effect == "torque_gain"]
+    gains = [p for p, term in enumerate(fit.hypothesis.terms) if effect(term.effect).scales_torques]
     if not gains or not scaled.any():
         return np.zeros((size, size))
     along = np.zeros(size)
@@ -79,9 +67,9 @@ def common_factor(fit: Fit) -> Array:
     return np.asarray(np.outer(along, along) / max(known, 1e-12))
 
 
-def within(off: Array, spread: Array) -> bool:
+def inside_region(off: Array, spread: Array) -> bool:
     """Whether coordinates that are off by so much lie in the region of 95 % of this covariance."""
     from scipy.stats import chi2
 
     distance = float(off @ np.linalg.pinv(spread, hermitian=True) @ off)
-    return distance <= float(chi2.ppf(REGION, len(off)))
+    return distance <= float(chi2.ppf(SETTINGS.intervals.region, len(off)))

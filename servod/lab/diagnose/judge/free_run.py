@@ -1,0 +1,108 @@
+"""Errors of windows that are simulated freely from the recorded state: how far a model is off after a while.
+
+Stands beside the mismatch in the result; the same replay that `servoctl replay` runs. Every row is judged by a model
+that was fitted without it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servod.formats.model.axis_model import AxisModel
+from servod.lab.diagnose.data.trace import CheckedTrace
+from servod.lab.diagnose.predict.predict import Predictor
+from servod.lab.diagnose.result import FreeRun, Windows
+from servod.lab.diagnose.select.selection import Fold, HeldOutErrors
+from servod.lab.diagnose.settings import SETTINGS
+from servod.lab.simulate.replay import Drive, replay
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class WindowErrors:
+    """Simulated minus recorded position (rad or m) of every row, in windows of `horizon_s`.
+
+    `nominal` is by the model as it came, `recalibrated` by its own parameters fitted elsewhere, `after` by the model
+    with the physics added, fitted elsewhere.
+    """
+
+    horizon_s: float
+    nominal: Array
+    recalibrated: Array
+    after: Array
+
+
+def window_errors(
+    predictor: Predictor, nominal: AxisModel, base: Sequence[Fold], after: Sequence[Fold]
+) -> list[WindowErrors]:
+    """Errors for every horizon; each fold's model judges the rows that it has not seen."""
+    whole = [Fold(np.ones(len(predictor.counts), dtype=bool), (nominal,))]
+    return [
+        WindowErrors(horizon, *(_errors(predictor, folds, horizon) for folds in (whole, base, after)))
+        for horizon in SETTINGS.validation.horizons_s
+    ]
+
+
+def free_run_gain(
+    predictor: Predictor, before: HeldOutErrors, after: HeldOutErrors, judged: NDArray[np.bool_]
+) -> float:
+    """RMS of the shortest windows by fits with the physics added, as a multiple of that by fits without it."""
+    with_it, without = (
+        _errors(predictor, held.folds, SETTINGS.validation.horizons_s[0])[judged] for held in (after, before)
+    )
+    return float(np.sqrt(np.mean(with_it**2) / max(float(np.mean(without**2)), 1e-30)))
+
+
+def windows(errors: Sequence[WindowErrors], predictor: Predictor, judged: NDArray[np.bool_]) -> tuple[Windows, ...]:
+    """Errors by length of the windows over the rows that are judged, and row by row where the model strays most."""
+    longest = errors[-1].nominal
+    worst = max(range(len(predictor.slices)), key=lambda i: float(np.mean(longest[predictor.slices[i]] ** 2)))
+    trace, part = predictor.traces[worst], predictor.slices[worst]
+    t_s = trace.drive.t_s - trace.shift_s
+    return tuple(
+        Windows(
+            window.horizon_s, _free_run(window, judged), _each(window, predictor, judged), trace.name, t_s,
+            window.nominal[part], window.after[part],
+        )
+        for window in errors
+    )  # fmt: skip
+
+
+def _each(window: WindowErrors, predictor: Predictor, judged: NDArray[np.bool_]) -> dict[str, FreeRun]:
+    """Errors of each recording that has rows to judge by."""
+    found = {}
+    for trace, part in zip(predictor.traces, predictor.slices, strict=True):
+        if judged[part].any():
+            inside = np.zeros_like(judged)
+            inside[part] = judged[part]
+            found[trace.name] = _free_run(window, inside)
+    return found
+
+
+def _free_run(window: WindowErrors, judged: NDArray[np.bool_]) -> FreeRun:
+    """Root mean squares over the rows that are judged."""
+    errors = (window.nominal, window.recalibrated, window.after)
+    return FreeRun(*(float(np.sqrt(np.mean(error[judged] ** 2))) for error in errors))
+
+
+def _errors(predictor: Predictor, folds: Sequence[Fold], horizon_s: float) -> Array:
+    error = np.zeros(len(predictor.counts))
+    for fold in folds:
+        for index, (trace, part) in enumerate(zip(predictor.traces, predictor.slices, strict=True)):
+            rows, model = fold.rows[part], fold.of(index)
+            if rows.any():
+                error[part][rows] = replay(model, _drive(trace, model), horizon_s).error[rows]
+    return error
+
+
+def _drive(trace: CheckedTrace, model: AxisModel) -> Drive:
+    """The recording on the time that the model's windows of disturbance are in: shifted, where one was fitted."""
+    if model.disturbance is not None and model.disturbance.windows:
+        return trace.drive
+    drive = trace.drive
+    return Drive(drive.t_s - trace.shift_s, drive.torque, drive.position, drive.temperature_c)

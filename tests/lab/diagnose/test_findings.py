@@ -1,0 +1,102 @@
+"""Terms that stay in the model and are no findings: too small, under their level, at an end, not told from none."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from servod.formats.model.axis_model import AxisModel
+from servod.lab.diagnose.data.intake import load_traces
+from servod.lab.diagnose.effects import effect
+from servod.lab.diagnose.effects.hypothesis import Term
+from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.judge.conclude import minor
+from servod.lab.diagnose.judge.findings import differs_from_zero, name_findings
+from servod.lab.diagnose.judge.judgement import JudgedSelection, judge
+from servod.lab.diagnose.predict.predict import Predictor
+from servod.lab.diagnose.result import MinorReason
+from servod.lab.diagnose.select.cross_validation import cross_validate
+from servod.lab.diagnose.select.fit import Fit
+from servod.lab.diagnose.select.merit import Merit, large_enough
+from servod.lab.diagnose.select.selection import Selection, TermEntry
+from servod.lab.diagnose.select.selector import Selector
+from tests.lab.diagnose.axes import believed, record
+
+#: What a term is said to be worth before anybody has looked.
+UNKNOWN = Merit(math.nan, math.nan, math.nan, math.nan)
+
+
+def selecting(hidden: AxisModel) -> Selector:
+    """The selection on an axis that conceals something."""
+    predictor = Predictor(load_traces(record(hidden, seconds=2.0)[:2], believed())[0], believed())
+    return Selector(predictor, believed(), math.inf, lambda _line: None)
+
+
+@pytest.fixture(scope="module")
+def selector() -> Selector:
+    """An axis with a weight."""
+    return selecting(believed(gravity={"amplitude": 0.1, "phase": 0.5}))
+
+
+def form(selector: Selector, name: str) -> Term:
+    """The first form of an effect."""
+    mismatch = selector.predictor.mismatch(believed())
+    return effect(name).terms(Scene(selector.start.document, selector.predictor, mismatch))[0]
+
+
+def sorted_with(selector: Selector, *terms: Term) -> JudgedSelection:
+    """The judgement of these terms, fitted together."""
+    base = selector.settle(selector.start, None, selector.predictor.mismatch(believed()))
+    fit = base
+    for term in terms:
+        hypothesis = fit.hypothesis.with_term(term)
+        fit = selector.settle(hypothesis, hypothesis.beside(fit.coordinates), fit.mismatch)
+    error = selector.error(selector.predictor.mismatch(believed()))
+    merits, entries = (UNKNOWN,) * len(terms), (TermEntry(0.1, ()),) * len(terms)
+    selection = Selection(base, fit, error, 0.0, merits, entries, {"gravity": UNKNOWN}, 1)
+    return name_findings(selector, judge(selector, cross_validate(selector, selection)))
+
+
+def test_what_is_small_or_under_its_level_stays_in_the_model_and_is_told(selector: Selector) -> None:
+    terms = [form(selector, name) for name in ("gravity", "torque_gain", "viscous_nonlinear")]
+    judgement = sorted_with(selector, *terms)
+    assert judgement.named == (0,)
+    assert judgement.kept == {1: MinorReason.LEVEL, 2: MinorReason.SMALL}
+    told = minor(judgement)
+    assert list(told) == ["viscous_nonlinear", "torque_gain"]
+    parameters = told["torque_gain"].parameters
+    assert parameters is not None
+    assert parameters["factor"].low < parameters["factor"].value < parameters["factor"].high
+    assert judgement.selection.merits[0].share > 0.7
+
+
+def test_what_ends_at_the_end_of_a_range_is_no_finding(selector: Selector) -> None:
+    sine, cosine = form(selector, "gravity").unknowns
+    narrow = replace(form(selector, "gravity"), unknowns=(replace(sine, low=-0.03, high=0.03), cosine))
+    judgement = sorted_with(selector, narrow)
+    assert judgement.named == ()
+    assert judgement.kept == {0: MinorReason.AT_END}
+    assert minor(judgement)["gravity"].why is MinorReason.AT_END
+
+
+@pytest.mark.parametrize(("deviation", "told"), [(0.4, True), (0.6, False)])
+def test_a_stiffness_whose_interval_holds_zero_is_not_differs_from_zero(
+    selector: Selector, deviation: float, told: bool
+) -> None:
+    """Wherever its rest position may be."""
+    spring = form(selector, "spring")
+    hypothesis = selector.start.with_term(spring)
+    at = hypothesis.start.copy()
+    at[hypothesis.share(0)] = (1.0, 30.0)
+    fit = Fit(hypothesis, at, np.zeros(0), 0.0, np.zeros((0, 0)), True)
+    assert differs_from_zero(fit, 0, np.diag(np.full(len(at), deviation**2))) is told
+
+
+@pytest.mark.parametrize(
+    ("share", "torque", "worth"), [(0.04, 0.028, False), (0.01, 0.029, False), (0.05, 0.02, True), (0.0, 0.03, True)]
+)
+def test_a_finding_has_the_contracts_size(share: float, torque: float, worth: bool) -> None:
+    assert large_enough(Merit(share, 0.5, torque, 1e4), level=False) is worth
