@@ -8,6 +8,7 @@ a kernel, or a new numba, compiles anew (numba by itself watches only the callin
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import inspect
 import os
@@ -35,9 +36,30 @@ def available() -> bool:
 def compiled(function: Kernel, **swap: Kernel) -> Kernel:
     """`function` as machine code, with the functions it calls; `swap` replaces names that it looks up.
 
-    Parameters and states must then be float64 arrays. Give functions that call a control law the law by `swap`.
+    Sequences must then be float64 arrays (`arrays`) and states records (`record`). Give functions that call a control
+    law the law by `swap`.
     """
     return _compiled(function, tuple(sorted(swap.items(), key=lambda item: item[0])))
+
+
+def record(state: Any) -> Any:
+    """A dataclass of floats as a numpy record of the same names, which a compiled kernel changes in place as Python
+    changes the dataclass."""
+    import numpy as np
+
+    fields = [(field.name, np.float64) for field in dataclasses.fields(state)]
+    return np.array([dataclasses.astuple(state)], dtype=np.dtype(fields, align=True)).view(np.recarray)[0]
+
+
+def arrays(parameters: Any) -> Any:
+    """A NamedTuple of numbers with every plain tuple in it a float64 array, as a compiled kernel takes it."""
+    import numpy as np
+
+    if not isinstance(parameters, tuple):
+        return parameters
+    if not hasattr(parameters, "_fields"):
+        return np.array(parameters, dtype=np.float64)
+    return type(parameters)(*map(arrays, parameters))
 
 
 def bound(function: Kernel, **swap: Kernel) -> Kernel:

@@ -15,7 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.formats.model.axis_model import AxisModel
-from servod.kernels.physics.compiled import Kernel, available, bound, compiled
+from servod.kernels.laws import Law
+from servod.kernels.laws.state import LawState
+from servod.kernels.physics.compiled import arrays, available, bound, compiled, record
 from servod.kernels.physics.dynamics import advance
 from servod.kernels.physics.effects import encoder_position
 from servod.kernels.physics.friction import Params
@@ -103,9 +105,6 @@ def quantised(position_rad: float, resolution_rad: float) -> float:
 
 Array = NDArray[np.float64]
 
-#: Room for a law's state, which no law fills.
-LAW_STATES = 16
-
 
 @dataclass(frozen=True, slots=True)
 class LoopSettings:
@@ -151,7 +150,7 @@ class ClosedLoopRun:
 
 def simulate_closed_loop(
     model: AxisModel,
-    law: Kernel,
+    law: Law,
     gains: Sequence[float],
     reference: Array,
     settings: LoopSettings | None = None,
@@ -162,7 +161,7 @@ def simulate_closed_loop(
 ) -> ClosedLoopRun:
     """Run `model` under `law` along `reference` (rows of position, velocity, acceleration, one for each sample).
 
-    `law` is a step function of `servod.kernels.laws`; `gains` its flat parameters. `external_nm` acts beside the
+    `gains` are the flat parameters of `law`, as a gain set packs them. `external_nm` acts beside the
     command, `reading_rad` is the error of each encoder reading; `start` is (position, velocity, bristle deflection), by
     default at rest on the reference's first position.
     """
@@ -173,8 +172,11 @@ def simulate_closed_loop(
     steps = max(1, math.ceil(settings.period_s / settings.inner_step_s - 1e-9))
     state = _start_state(model, start or (float(reference[0, 0]), 0.0, 0.0), delay_s, settings.period_s / steps)
     out = np.zeros((len(reference), len(OUTPUTS)))
-    kernel = compiled(run, control_law=law) if available() else bound(run, control_law=law)
-    loop = np.array(gains, dtype=np.float64), np.zeros(LAW_STATES)
+    named, law_state = law.named(tuple(float(value) for value in gains)), LawState()
+    if available():
+        kernel, loop = compiled(run, control_law=law.step), (arrays(named), record(law_state))
+    else:
+        kernel, loop = bound(run, control_law=law.step), (named, law_state)
     around = settings.resolution_rad, settings.velocity_cutoff_hz, settings.torque_limit_nm
     kernel(np.array(model.pack()), state, *loop, reference, *disturbed, out, settings.period_s, steps, delay_s, *around)
     columns = {name: out[:, i] for i, name in enumerate(OUTPUTS)}

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import astuple
 
-import numpy as np
 import pytest
 
 from servod.kernels.laws import LAWS
-from servod.kernels.laws.state import ASKED
+from servod.kernels.laws.state import LawState
 from servod.kernels.laws.weights import Shape
-from servod.kernels.physics.compiled import compiled
-from tests.kernels.laws.cases import PARAMETERS, fresh_state, local_parameters
+from servod.kernels.physics.compiled import arrays, compiled, record
+from tests.kernels.laws.cases import GAINS, PARAMETERS, local_parameters
 
 CASES = {
     **PARAMETERS,
@@ -22,21 +22,19 @@ CASES = {
 
 @pytest.mark.parametrize("case", list(CASES))
 def test_compiled_equals_plain(case: str) -> None:
-    law, p = LAWS[case.split(maxsplit=1)[0]], CASES[case]
-    kernel, packed = compiled(law.step), np.array(p)
-    plain_state, state = fresh_state(law.name), np.zeros(law.n_states)
+    law = LAWS[case.split(maxsplit=1)[0]]
+    kernel, p = compiled(law.step), law.named(CASES[case])
+    plain_state, state = LawState(), record(LawState())
     for k in range(400):
         t = k * 0.01
         v = 0.7 * math.sin(3.0 * t) ** 3
         arguments = (math.sin(t), math.cos(t), -math.sin(t), math.sin(t) - 1e-3 * math.cos(9 * t), v)
-        plain = law.step(p, plain_state, *arguments, plain_state[ASKED], 0.001)
-        assert kernel(packed, state, *arguments, state[ASKED], 0.001) == pytest.approx(plain, rel=1e-9, abs=1e-13)
-    assert list(state) == pytest.approx(plain_state, rel=1e-9, abs=1e-13)
+        plain = law.step(p, plain_state, *arguments, plain_state.asked, 0.001)
+        assert kernel(arrays(p), state, *arguments, state.asked, 0.001) == pytest.approx(plain, rel=1e-9, abs=1e-13)
+    assert state.tolist() == pytest.approx(astuple(plain_state), rel=1e-9, abs=1e-13)
 
 
 def test_nan_comes_through_the_compiled_kernels_too() -> None:
-    for name, p in PARAMETERS.items():
-        torque = compiled(LAWS[name].step)(
-            np.array(p), np.zeros(LAWS[name].n_states), 0.0, 0.0, 0.0, 0.0, math.nan, 0.0, 0.001
-        )[0]
+    for name, p in GAINS.items():
+        torque = compiled(LAWS[name].step)(arrays(p), record(LawState()), 0.0, 0.0, 0.0, 0.0, math.nan, 0.0, 0.001)[0]
         assert math.isnan(torque)

@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 
 from servod.formats.model.axis_model import AxisModel
 from servod.kernels.laws import LAWS
+from servod.kernels.laws.state import LawState
 from servod.kernels.physics.compiled import bound
 from servod.kernels.physics.plant import Plant
 from servod.lab.simulate.simulate import LoopSettings, run, simulate_closed_loop
@@ -183,7 +184,7 @@ def reference(duration_s: float) -> np.ndarray:
 def test_closed_loop_is_the_same_loop_in_pure_python() -> None:
     """The compiled simulator is the source around the law that the control loop runs."""
     law, gains, rows = LAWS["pd"], (2.5, 0.12, 0.0), reference(0.3)
-    fast = simulate_closed_loop(joint(delay_s=0.001), law.step, gains, rows)
+    fast = simulate_closed_loop(joint(delay_s=0.001), law, gains, rows)
     from servod.kernels.physics.plant import INNER_STEP_S, rest_state
 
     out = np.zeros((len(rows), 8))
@@ -193,8 +194,8 @@ def test_closed_loop_is_the_same_loop_in_pure_python() -> None:
     pure(
         model.pack(),
         rest_state(0.001, INNER_STEP_S, 25.0),
-        gains,
-        [0.0] * 16,
+        law.named(gains),
+        LawState(),
         rows,
         np.zeros(len(rows)),
         np.zeros(len(rows)),
@@ -213,10 +214,10 @@ def test_closed_loop_is_the_same_loop_in_pure_python() -> None:
 def test_closed_loop_tracks_limits_and_counts() -> None:
     rows = reference(2.0)
     run_ = simulate_closed_loop(
-        joint(delay_s=0.001), LAWS["pd"].step, (2.5, 0.12, 0.0), rows, LoopSettings(torque_limit_nm=0.05)
+        joint(delay_s=0.001), LAWS["pd"], (2.5, 0.12, 0.0), rows, LoopSettings(torque_limit_nm=0.05)
     )
     assert np.max(np.abs(run_.torque_nm)) <= 0.05
     counts = run_.encoder_rad / (2.0 * math.pi / 2.0**20)
     assert np.allclose(counts, np.round(counts), atol=1e-6)
-    free = simulate_closed_loop(joint(delay_s=0.001), LAWS["pd"].step, (2.5, 0.12, 0.0), rows)
+    free = simulate_closed_loop(joint(delay_s=0.001), LAWS["pd"], (2.5, 0.12, 0.0), rows)
     assert 0.005 < np.sqrt(np.mean(free.tracking_error_rad(1.0) ** 2)) < 0.04
