@@ -55,4 +55,4 @@ def test_a_model_may_omit_what_it_does_not_have(tmp_path: Path) -> None:
     )
     model = load_model(path, AxisModel)
     assert (model.inertia, model.total_delay_s, model.torque_offset) == (95.11, 0.001, 0.0)
-    assert len(model.pack()) > 70
+    assert len(model.pack().p) > 70

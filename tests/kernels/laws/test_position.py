@@ -55,11 +55,11 @@ def test_the_observer_takes_what_is_fed_forward_for_known() -> None:
 
 def test_compiled_equals_plain() -> None:
     p = local_gains(gain=0.04, bandwidth=50.0)._replace(**FED)
-    kernel, state, plain_state = compiled(LAWS["local"].step), record(LawState()), LawState()
+    kernel, (state, memory), plain_state = compiled(LAWS["local"].step), record(LawState()), LawState()
     for k in range(200):
         x, v = math.sin(0.05 * k), math.cos(0.05 * k)
         plain = LAWS["local"].step(p, plain_state, x, v, 0.0, x - 1e-3, v, plain_state.asked, 0.001)
-        assert kernel(arrays(p), state, x, v, 0.0, x - 1e-3, v, state.asked, 0.001) == pytest.approx(plain)
+        assert kernel(arrays(p), memory[0], x, v, 0.0, x - 1e-3, v, state.asked, 0.001) == pytest.approx(plain)
 
 
 def test_only_whole_blocks_are_accepted() -> None:

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from servod.formats.model.axis_model import AxisKind, AxisModel
 from servod.kernels.physics.compiled import Kernel, available, compiled
-from servod.kernels.physics.layout import P_DELAY_S, P_GAP, P_START_C, S_FIRST_S
-from servod.kernels.physics.plant import rest_state
+from servod.kernels.physics.layout import PackedPlant, PlantState
+from servod.kernels.physics.plant import inputs
 from servod.lab.diagnose.data.excited import creeps
 from servod.lab.diagnose.data.trace import FASTEST, SHARE_OF_SAMPLING, SLOWEST, Trace, dry_friction
 from servod.lab.diagnose.predict.innovation_kernel import innovate
@@ -50,8 +50,8 @@ def released(function: Kernel) -> Kernel:
 
     kernel = compiled(function)
 
-    def call(*arguments: Any) -> None:
-        kernel(*arguments)
+    def call(p: Any, tables: Any, s: Any, *rest: Any) -> None:
+        kernel(p[0], tables, s[0], *rest)
 
     outer: Kernel = numba.njit(nogil=True)(call)
     return outer
@@ -186,38 +186,37 @@ class Predictor:
 
         One model for all traces, or one for each.
         """
-        packed = [np.array(model.pack()) for model in models]
+        packed = [model.pack() for model in models]
         each = packed if len(packed) > 1 else packed * len(self.traces)
         self.evaluations += 1
-        parts = [self._one(p, trace, seen) for p, trace, seen in zip(each, self.traces, self.observers, strict=True)]
+        parts = [self._one(*one) for one in zip(each, self.traces, self.observers, strict=True)]
         limit = WORST * self.dry
         clean = np.nan_to_num(np.concatenate(parts), nan=limit, posinf=limit, neginf=-limit)
         return np.where(self.counts, np.clip(clean, -limit, limit), 0.0)
 
-    def _one(self, p: Array, trace: Trace, seen: Observer) -> Array:
+    def _one(self, packed: PackedPlant, trace: Trace, seen: Observer) -> Array:
         drive = trace.drive
-        first = trace.first(float(p[P_DELAY_S]))
-        state = np.array(rest_state(0.0, 5e-5, float(p[P_START_C])))
-        state[S_FIRST_S] = trace.begun_s
-        states = np.array([self._start(p, trace, int(row), first) for row in trace.starts])
+        gap, first = packed.p.gap > 0.0, trace.first(packed.p.delay_s)
+        axis = inputs(packed, PlantState(temperature_c=packed.p.start_c, first_s=trace.begun_s))
+        states = np.array([self._start(packed, trace, int(row), first) for row in trace.starts])
         out = np.zeros(len(drive.t_s))
-        steps = seen.steps * STEPS_IN_GAP if p[P_GAP] > 0.0 else seen.steps
+        steps = seen.steps * STEPS_IN_GAP if gap else seen.steps
         held = drive.t_s, drive.torque, first.command_before, drive.temperature_c, drive.position
-        share = LOAD_SHARE_IN_GAP if p[P_GAP] > 0.0 else LOAD_SHARE
+        share = LOAD_SHARE_IN_GAP if gap else LOAD_SHARE
         gains = steps, seen.position_gain, seen.velocity_gain, share, QUIET * trace.position_noise
-        self._run(p, state, *held, *gains, trace.starts, states, out)
+        self._run(*axis, *held, *gains, trace.starts, states, out)
         return seen.to_torque * out
 
-    def _start(self, p: Array, trace: Trace, row: int, known: FirstRow) -> Array:
+    def _start(self, packed: PackedPlant, trace: Trace, row: int, known: FirstRow) -> Array:
         """Position, velocity and hidden states in balance with the recorded motion of one row."""
         drive = trace.drive
         motion = known.motion if row == 0 else tuple(drive.motion[row, :3])
         before = known.command_before if row == 0 else float(drive.torque[row - 1])
         hidden = np.zeros((1, 4))
-        state = np.array(rest_state(0.0, 5e-5, float(p[P_START_C])))
+        axis = inputs(packed, PlantState(temperature_c=packed.p.start_c))
         one = slice(row, row + 1)
         moved = np.array([motion])
-        self._follow(p, state, drive.t_s[one], moved, drive.torque[one], before, drive.temperature_c[one], hidden, 1e-3)
+        self._follow(*axis, drive.t_s[one], moved, drive.torque[one], before, drive.temperature_c[one], hidden, 1e-3)
         return np.array([motion[0], motion[1], *hidden[0]])
 
 
