@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.formats.model.axis_model import AxisModel
-from servod.kernels.physics.compiled import Kernel, available, entry
+from servod.kernels.physics.compiled import Kernel, available, compiled
 from servod.kernels.physics.layout import PackedPlant, PlantState
 from servod.kernels.physics.plant import INNER_STEP_S, delay_line, inputs
 from servod.lab.simulate import open_loop
@@ -99,14 +99,14 @@ def window_starts(t_s: Array, horizon_s: float | None) -> NDArray[np.int64]:
 
 
 def _kernel(function: Kernel) -> Kernel:
-    return entry(function) if available() else function
+    return compiled(function) if available() else function
 
 
 def _hidden_motion(packed: PackedPlant, drive: Drive, first: FirstRow, starts: NDArray[np.int64]) -> Array:
     """State at the rows `starts`: position, velocity, bristle, load position, load velocity, actuator torque."""
     motion = drive.motion[:, :3].copy()
     motion[0] = first.motion
-    at_rest = inputs(packed, PlantState(temperature_c=packed.p.start_c))
+    at_rest = inputs(packed, PlantState(temperature_c=packed.p.start_c), bare=True)
     _kernel(open_loop.recorded_motion)(*at_rest, motion)
     hidden = np.zeros((len(drive.t_s), 4))
     step_s = min(4.0 * INNER_STEP_S, drive.period_s)
@@ -134,7 +134,7 @@ def replay(
     rows = drive.t_s, drive.torque, drive.position, drive.motion
     first = first_row(start, *rows, packed.p.delay_s, free=horizon_s is None)
     states = _hidden_motion(packed, drive, first, starts)
-    begun = inputs(packed, PlantState(temperature_c=packed.p.start_c, first_s=float(drive.t_s[0])))
+    begun = inputs(packed, PlantState(temperature_c=packed.p.start_c, first_s=float(drive.t_s[0])), bare=True)
     line = np.array(delay_line(0.0, inner_step_s))
     out = np.zeros((len(drive.t_s), 3))
     held = drive.t_s, drive.torque, first.command_before, drive.temperature_c

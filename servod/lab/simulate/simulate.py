@@ -21,7 +21,7 @@ from servod.kernels.physics.compiled import arrays, available, bound, compiled, 
 from servod.kernels.physics.dynamics import advance
 from servod.kernels.physics.effects import encoder_position
 from servod.kernels.physics.layout import PlantParameters, PlantState, Tables
-from servod.kernels.physics.plant import INNER_STEP_S, Inputs, delay_line, inputs
+from servod.kernels.physics.plant import INNER_STEP_S, delay_line, inputs
 
 # The closed loop as a kernel: axis, encoder, velocity filter, delay and any control law, sample by sample.
 #
@@ -170,13 +170,12 @@ def simulate_closed_loop(
     disturbed = _samples(external_nm, len(reference)), _samples(reading_rad, len(reference))
     delay_s = model.total_delay_s if settings.delay_s is None else settings.delay_s
     steps = max(1, math.ceil(settings.period_s / settings.inner_step_s - 1e-9))
-    axis = inputs(model.pack(), _start_state(model, start or (float(reference[0, 0]), 0.0, 0.0)))
+    axis = inputs(model.pack(), _start_state(model, start or (float(reference[0, 0]), 0.0, 0.0)), bare=True)
     line = np.array(delay_line(delay_s, settings.period_s / steps))
     out = np.zeros((len(reference), len(OUTPUTS)))
     named, law_state = law.named(tuple(float(value) for value in gains)), LawState()
     if available():
         kernel, loop = compiled(run, control_law=law.step), (arrays(named), record(law_state).memory[0])
-        axis = Inputs(axis.p[0], axis.tables, axis.s[0])
     else:
         kernel, loop = bound(run, control_law=law.step), (named, law_state)
     around = settings.resolution_rad, settings.velocity_cutoff_hz, settings.torque_limit_nm
