@@ -1,7 +1,7 @@
 """Kernels of the effects beside plain friction; each equation stands in the docstring of its group in `axis_effects`.
 
 Called by `servod.kernels.physics.dynamics` in every inner step of a model that has such an effect. An absent effect
-costs one comparison. Plain functions on floats and flat parameters; the same source is compiled.
+costs one comparison. Plain functions on floats and numbers by name; the same source is compiled.
 """
 
 from __future__ import annotations

@@ -81,6 +81,7 @@ def test_pack_of_the_local_law_is_what_the_kernel_reads() -> None:
     )
     flat = parse_gains(text, "good.yaml").pack()
     p = local.LocalGains.from_flat(flat)
+    assert p.flat() == flat
     assert p.input_scale == 0.1
     assert flat[1:7] == (p.low_k_z, p.low_k_x, p.low_k_v, p.high_k_z, p.high_k_x, p.high_k_v)
     assert flat[1:7] == (0.0, 1574.9, 0.241, 0.0, 197.0, 2.104)

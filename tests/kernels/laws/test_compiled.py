@@ -8,7 +8,8 @@ from dataclasses import astuple
 import pytest
 
 from servod.kernels.laws import LAWS
-from servod.kernels.laws.state import LawState
+from servod.kernels.laws.position import PositionTorques
+from servod.kernels.laws.state import STATES, LawState
 from servod.kernels.laws.weights import Shape
 from servod.kernels.physics.compiled import arrays, compiled, record
 from tests.kernels.laws.cases import GAINS, PARAMETERS, local_parameters
@@ -40,3 +41,17 @@ def test_nan_comes_through_the_compiled_kernels_too() -> None:
             arrays(p), record(LawState()).memory[0], 0.0, 0.0, 0.0, 0.0, math.nan, 0.0, 0.001
         )[0]
         assert math.isnan(torque)
+
+
+def test_a_record_is_one_memory_seen_from_both_sides() -> None:
+    names, memory = record(LawState(z_hat=0.25, rest=1.0))
+    assert memory.dtype.names == STATES
+    names.d_hat = 0.5
+    memory["asked"] = 0.125
+    assert (memory["z_hat"][0], memory["d_hat"][0], names.asked, names.rest) == (0.25, 0.5, 0.125, 1.0)
+
+
+def test_position_goes_flat_and_back() -> None:
+    p = GAINS["local"]._replace(knows_position=True, position=PositionTorques(lead=0.001, waves=(0.1, 36.0, 0.2)))
+    assert LAWS["local"].accepts(p.flat())
+    assert LAWS["local"].named(p.flat()) == p
