@@ -13,8 +13,11 @@ from pydantic import Field, model_validator
 
 from servod.common.yaml import Strict
 from servod.kernels.laws import MAX_SETS, local
-from servod.kernels.laws.position import MAX_WAVES
-from servod.kernels.laws.weights import Shape
+from servod.kernels.laws.pd import PdGains
+from servod.kernels.laws.pd_dob import PdDobGains
+from servod.kernels.laws.pd_lugre import PdLugreGains
+from servod.kernels.laws.position import MAX_WAVES, PositionTorques
+from servod.kernels.laws.weights import Sets, Shape
 
 Gain = Annotated[float, Field(ge=0.0, le=1e6)]
 Inertia = Annotated[float, Field(gt=0.0, le=1e4)]
@@ -52,7 +55,11 @@ class PdParameters(Strict):
 
     def pack(self) -> tuple[float, ...]:
         """Parameters in the order that the kernel reads."""
-        return (self.position_gain_nm_per_rad, self.velocity_gain_nms_per_rad, self.feedforward_inertia_kg_m2)
+        return PdGains(
+            k_p=self.position_gain_nm_per_rad,
+            k_d=self.velocity_gain_nms_per_rad,
+            feedforward_inertia=self.feedforward_inertia_kg_m2,
+        )
 
 
 class PdDobParameters(Strict):
@@ -70,15 +77,15 @@ class PdDobParameters(Strict):
 
     def pack(self) -> tuple[float, ...]:
         """Parameters in the order that the kernel reads."""
-        return (
-            self.position_gain_nm_per_rad,
-            self.velocity_gain_nms_per_rad,
-            self.feedforward_inertia_kg_m2,
-            self.bandwidth_rad_s,
-            self.inertia_kg_m2,
-            self.viscous_nms_per_rad,
-            self.disturbance_limit_nm,
-            self.hold_within_rad,
+        return PdDobGains(
+            k_p=self.position_gain_nm_per_rad,
+            k_d=self.velocity_gain_nms_per_rad,
+            feedforward_inertia=self.feedforward_inertia_kg_m2,
+            bandwidth=self.bandwidth_rad_s,
+            inertia=self.inertia_kg_m2,
+            viscous=self.viscous_nms_per_rad,
+            limit=self.disturbance_limit_nm,
+            hold_within=self.hold_within_rad,
         )
 
 
@@ -108,20 +115,20 @@ class PdLugreParameters(Strict):
 
     def pack(self) -> tuple[float, ...]:
         """Parameters in the order that the kernel reads."""
-        return (
-            self.position_gain_nm_per_rad,
-            self.velocity_gain_nms_per_rad,
-            self.feedforward_inertia_kg_m2,
-            self.stiffness_nm_per_rad,
-            self.damping_nms_per_rad,
-            self.viscous_nms_per_rad,
-            self.coulomb_nm,
-            self.static_nm,
-            self.stribeck_velocity_rad_s,
-            self.observer_gain,
-            self.input_scale_nm,
-            self.hold_within_rad,
-            self.friction_limit_nm / self.stiffness_nm_per_rad,
+        return PdLugreGains(
+            k_p=self.position_gain_nm_per_rad,
+            k_d=self.velocity_gain_nms_per_rad,
+            feedforward_inertia=self.feedforward_inertia_kg_m2,
+            stiffness=self.stiffness_nm_per_rad,
+            damping=self.damping_nms_per_rad,
+            viscous=self.viscous_nms_per_rad,
+            coulomb=self.coulomb_nm,
+            static=self.static_nm,
+            stribeck_velocity=self.stribeck_velocity_rad_s,
+            observer_gain=self.observer_gain,
+            input_scale=self.input_scale_nm,
+            hold_within=self.hold_within_rad,
+            state_limit=self.friction_limit_nm / self.stiffness_nm_per_rad,
         )
 
 
@@ -135,14 +142,11 @@ class RegionGains(Strict):
         None, max_length=local.COMMANDS, description="of the last commands u*, newest first"
     )
 
-    def pack(self) -> tuple[float, ...]:
-        """Gains of state and error in the order that the kernel reads."""
-        return (self.k_z_per_rad, self.k_x_per_rad, self.k_v_s_per_rad)
-
-    def pack_memory(self) -> tuple[float, ...]:
-        """Gains of the last commands in the order that the kernel reads."""
-        known = self.k_u or []
-        return (*known, *[0.0] * (local.COMMANDS - len(known)))
+    @property
+    def memory(self) -> tuple[float, float, float]:
+        """Gains of the last three commands, newest first; 0.0 where none is given."""
+        first, second, third, *_ = (*(self.k_u or []), 0.0, 0.0, 0.0)
+        return first, second, third
 
 
 class Regions(Strict):
@@ -158,10 +162,6 @@ class Regions(Strict):
         if self.overlap_from_rad_s >= self.overlap_to_rad_s:
             raise ValueError("overlap_from_rad_s less than overlap_to_rad_s")
         return self
-
-    def pack(self) -> tuple[float, ...]:
-        """Gains and overlap in the order that the kernel reads."""
-        return (*self.low.pack(), *self.high.pack(), self.overlap_from_rad_s, self.overlap_to_rad_s)
 
 
 class LocalSet(Strict):
@@ -214,6 +214,14 @@ class LocalFriction(Strict):
             raise ValueError("lead_s only with velocity: reference")
         return self
 
+    def named(self) -> Sets:
+        """The sets as the kernel reads them."""
+        return Sets(
+            nodes=tuple(s.velocity_rad_s for s in self.sets),
+            decays=tuple(s.decay_per_s for s in self.sets),
+            gains=tuple(s.gain for s in self.sets),
+        )
+
 
 class PositionWave(Strict):
     """One wave of torque over position: amplitude*sin(n*x + phase)."""
@@ -235,11 +243,16 @@ class PositionFeedforward(Strict):
         default_factory=list, max_length=MAX_WAVES, description="cogging by its harmonics; gravity is one wave a turn"
     )
 
-    def pack(self) -> tuple[float, ...]:
-        """Numbers in the order that the kernel reads."""
-        spring = (self.spring_nm_per_rad, self.spring_rest_rad, self.spring_cubic_nm_per_rad3)
-        waves = (value for w in self.waves for value in (w.amplitude_nm, w.waves_per_turn, w.phase_rad))
-        return (self.lead_s, self.offset_nm, *spring, *waves)
+    def named(self) -> PositionTorques:
+        """The same as the kernel reads it."""
+        return PositionTorques(
+            lead=self.lead_s,
+            offset=self.offset_nm,
+            spring=self.spring_nm_per_rad,
+            spring_rest=self.spring_rest_rad,
+            spring_cubic=self.spring_cubic_nm_per_rad3,
+            waves=tuple(value for w in self.waves for value in (w.amplitude_nm, w.waves_per_turn, w.phase_rad)),
+        )
 
 
 class LocalParameters(Strict):
@@ -265,34 +278,49 @@ class LocalParameters(Strict):
 
     def pack(self) -> tuple[float, ...]:
         """Parameters in the order that the kernel reads: head, then all v_i, all a_i, all l_i, then position."""
+        return self.named().flat()
+
+    def named(self) -> local.LocalGains:
+        """Parameters by the names that the kernel reads."""
         f, observer = self.friction, self.disturbance_observer
-        return (
-            self.input_scale_nm,
-            *self.regions.pack(),
-            f.stiffness_nm_per_rad,
-            f.viscous_nms_per_rad,
-            f.leak_per_s,
-            f.friction_limit_nm / f.stiffness_nm_per_rad,
-            local.REFERENCE if f.velocity is VelocitySource.REFERENCE else local.MEASURED,
-            f.lead_s,
-            float(Shape[f.weights.name]),
-            self.hold_within_rad,
-            self.feedforward_inertia_kg_m2,
-            observer.bandwidth_rad_s if observer else 0.0,
-            observer.inertia_kg_m2 if observer else 0.0,
-            observer.disturbance_limit_nm if observer else 0.0,
-            *self.regions.low.pack_memory(),
-            *self.regions.high.pack_memory(),
-            (observer.low_bandwidth_rad_s or observer.bandwidth_rad_s) if observer else 0.0,
-            self.error_limit_rad or 0.0,
-            self.rest_within_rad or 0.0,
-            self.rest_share or 1.0,
-            observer.moving_rad_s if observer else 0.0,
-            float(len(f.sets)),
-            *(s.velocity_rad_s for s in f.sets),
-            *(s.decay_per_s for s in f.sets),
-            *(s.gain for s in f.sets),
-            *(self.position_feedforward.pack() if self.position_feedforward else ()),
+        low, high = self.regions.low, self.regions.high
+        position = self.position_feedforward
+        return local.LocalGains(
+            input_scale=self.input_scale_nm,
+            low_k_z=low.k_z_per_rad,
+            low_k_x=low.k_x_per_rad,
+            low_k_v=low.k_v_s_per_rad,
+            high_k_z=high.k_z_per_rad,
+            high_k_x=high.k_x_per_rad,
+            high_k_v=high.k_v_s_per_rad,
+            blend_from=self.regions.overlap_from_rad_s,
+            blend_to=self.regions.overlap_to_rad_s,
+            stiffness=f.stiffness_nm_per_rad,
+            viscous=f.viscous_nms_per_rad,
+            leak=f.leak_per_s,
+            state_limit=f.friction_limit_nm / f.stiffness_nm_per_rad,
+            source=local.REFERENCE if f.velocity is VelocitySource.REFERENCE else local.MEASURED,
+            lead=f.lead_s,
+            shape=float(Shape[f.weights.name]),
+            hold_within=self.hold_within_rad,
+            feedforward_inertia=self.feedforward_inertia_kg_m2,
+            observer_bandwidth=observer.bandwidth_rad_s if observer else 0.0,
+            observer_inertia=observer.inertia_kg_m2 if observer else 0.0,
+            observer_limit=observer.disturbance_limit_nm if observer else 0.0,
+            low_k_u1=low.memory[0],
+            low_k_u2=low.memory[1],
+            low_k_u3=low.memory[2],
+            high_k_u1=high.memory[0],
+            high_k_u2=high.memory[1],
+            high_k_u3=high.memory[2],
+            observer_low=(observer.low_bandwidth_rad_s or observer.bandwidth_rad_s) if observer else 0.0,
+            error_limit=self.error_limit_rad or 0.0,
+            rest_within=self.rest_within_rad or 0.0,
+            rest_share=self.rest_share or 1.0,
+            observer_moving=observer.moving_rad_s if observer else 0.0,
+            sets=f.named(),
+            knows_position=position is not None,
+            position=position.named() if position else PositionTorques(),
         )
 
 

@@ -22,6 +22,7 @@ from servod.formats.model import effects as fx
 from servod.formats.model import friction as fr
 from servod.formats.model.identified import Identified
 from servod.formats.model.keys import Group, Harmonic
+from servod.kernels.physics.layout import PackedPlant
 
 NonNegative = Annotated[float, Field(ge=0.0)]
 Positive = Annotated[float, Field(gt=0.0)]
@@ -211,8 +212,8 @@ class AxisModel(Strict):
             load_viscous=gap.load_viscous,
         )
 
-    def pack(self) -> tuple[float, ...]:
-        """The model as the kernels' flat parameters (`servod.kernels.physics.layout`)."""
+    def pack(self) -> PackedPlant:
+        """The model as the kernels take it (`servod.kernels.physics.layout`)."""
         from servod.formats.model.pack import pack
 
         return pack(self)

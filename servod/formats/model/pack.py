@@ -1,4 +1,4 @@
-"""Turns an axis model into the flat parameters of the physics kernels (`servod.kernels.physics.layout`).
+"""Turns an axis model into the parameters of the physics kernels (`servod.kernels.physics.layout`).
 
 Stands between `servod.formats.model.axis_model` (what is in the file) and `servod.kernels.physics` (what is
 computed); off the control path.
@@ -6,13 +6,13 @@ computed); off the control path.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_type_hints
 
 from servod.formats.model import effects as fx
 from servod.formats.model import friction as fr
 from servod.formats.model.axis_model import AxisModel, CoulombViscousFriction, LocalFriction, LugreFriction, wave_number
 from servod.formats.model.keys import Harmonic, Harmonics
-from servod.kernels.physics import layout as lay
+from servod.kernels.physics.layout import PackedPlant, PlantParameters
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -20,28 +20,32 @@ if TYPE_CHECKING:
 #: Friction torque below which the bristle equation divides by nothing sensible; far under any real joint's.
 SMALLEST_DRY_FRICTION = 1e-12
 
+#: The parameters and their types: float, int for places in tables, bool.
+KINDS: dict[str, type[float]] = get_type_hints(PlantParameters)
+
 
 class _Packer:
-    """The parameter list while it is filled; tables go behind the fixed part."""
+    """The parameters while they are filled; tables go one behind the other."""
 
     def __init__(self) -> None:
-        self.values = [0.0] * lay.P_SIZE
+        self.values: dict[str, float] = {}
+        self.tables: list[float] = []
 
     def put(self, **numbers: float) -> None:
-        """Set fixed parameters by their name in the layout, without `P_` and in lower case."""
+        """Set parameters by their name."""
         for name, value in numbers.items():
-            self.values[getattr(lay, f"P_{name.upper()}")] = float(value)
+            self.values[name] = KINDS[name](value)
 
     def table(self, name: str, rows: Iterable[Sequence[float]]) -> None:
         """Append a table and note its start and its number of rows under `name`."""
         kept = list(rows)
-        self.put(**{name: len(self.values), f"{name}_n": len(kept)})
+        self.put(**{name: len(self.tables), f"{name}_n": len(kept)})
         for row in kept:
-            self.values.extend(float(number) for number in row)
+            self.tables.extend(float(number) for number in row)
 
 
-def pack(model: AxisModel) -> tuple[float, ...]:
-    """The flat parameters of `model`, SI units, in the order of `servod.kernels.physics.layout`."""
+def pack(model: AxisModel) -> PackedPlant:
+    """The parameters of `model` as the kernels take them, SI units."""
     packer = _Packer()
     packer.put(delay_s=model.total_delay_s, offset=model.torque_offset)
     if model.offset_drift is not None:
@@ -55,7 +59,8 @@ def pack(model: AxisModel) -> tuple[float, ...]:
     _thermal(packer, model.thermal)
     _position(packer, model)
     _time(packer, model)
-    return tuple(packer.values)
+    numbers = (packer.values.get(name, kind()) for name, kind in KINDS.items())
+    return PackedPlant(PlantParameters._make(numbers), tuple(packer.tables))
 
 
 def _friction(packer: _Packer, model: AxisModel) -> None:

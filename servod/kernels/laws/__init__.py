@@ -1,21 +1,24 @@
 """Control laws: plain functions on floats, called by the loop as they are and compiled by the simulator.
 
 Step (4) of the cycle. `LAWS` is the one table of laws; the numbers are stable, gain sets and the loop's ACTIVATE
-command carry them. `engine.Controller` is what the loop holds.
+command carry them. What crosses a border (gain set, command) is a flat sequence of numbers; `Law.named` gives them the
+names by which the kernels read them. `runtime.loop.controller.Controller` is what the loop holds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, MutableSequence, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Any
 
 from servod.kernels.laws import local, pd, pd_dob, pd_lugre, position
-from servod.kernels.laws.state import N_STATES
+from servod.kernels.laws.state import LawState
 
-#: step(p, s, x_ref, v_ref, a_ref, x, v, u_applied, dt) -> (torque, feedback, friction, other), SI units.
+#: step(p, s, x_ref, v_ref, a_ref, x, v, u_applied, dt) -> (torque, feedback, friction, other), SI units; every law has
+#: numbers `p` of its own kind, what its `Law.named` gives.
 Step = Callable[
-    [Sequence[float], MutableSequence[float], float, float, float, float, float, float, float],
+    [Any, LawState, float, float, float, float, float, float, float],
     tuple[float, float, float, float],
 ]
 
@@ -38,20 +41,21 @@ class LawNumber(IntEnum):
 class Law:
     """One row of the table of laws.
 
-    `n_parameters` is the length of `p`; for `local` without its sets (three floats each) and what is known of position.
-    `stiffness_index` is where c0 [N*m/rad] stands in `p`, None for a law without friction state; the engine uses it
+    `named` gives names to flat numbers that it `accepts`: the NamedTuple that `step` reads. `n_parameters` is how many
+    numbers there are; for `local` without its sets (three floats each) and what is known of position.
+    `has_friction_state` says that z_hat means something, times the number `stiffness` a torque; the controller uses it
     to carry the friction *torque* over when two laws scale their state differently.
     """
 
     name: str
     number: LawNumber
     step: Step
+    named: Callable[[Sequence[float]], Any]
     n_parameters: int
-    stiffness_index: int | None = None
-    n_states: int = N_STATES
+    has_friction_state: bool = False
 
     def accepts(self, parameters: Sequence[float]) -> bool:
-        """Whether `parameters` has the length that this law reads, so that no index can fail inside the cycle."""
+        """Whether `parameters` has the length that this law reads, so that no name can be missing inside the cycle."""
         if self.number is not LawNumber.LOCAL:
             return len(parameters) == self.n_parameters
         if len(parameters) <= local.N_SETS:
@@ -60,13 +64,18 @@ class Law:
         return 2 <= n <= MAX_SETS and position.fits(len(parameters) - self.n_parameters - 3 * int(n))
 
 
+def _row(name: str, number: LawNumber, step: Step, gains: Any, *, has_friction_state: bool = False) -> Law:
+    """The row of a law whose numbers are all in `gains`, one behind the other."""
+    return Law(name, number, step, gains._make, len(gains._fields), has_friction_state)
+
+
 LAWS: dict[str, Law] = {
     law.name: law
     for law in (
-        Law("pd", LawNumber.PD, pd.step, pd.N_PARAMETERS),
-        Law("pd_dob", LawNumber.PD_DOB, pd_dob.step, pd_dob.N_PARAMETERS),
-        Law("pd_lugre", LawNumber.PD_LUGRE, pd_lugre.step, pd_lugre.N_PARAMETERS, pd_lugre.STIFFNESS),
-        Law("local", LawNumber.LOCAL, local.step, local.FIRST_NODE, local.STIFFNESS),
+        _row("pd", LawNumber.PD, pd.step, pd.PdGains),
+        _row("pd_dob", LawNumber.PD_DOB, pd_dob.step, pd_dob.PdDobGains),
+        _row("pd_lugre", LawNumber.PD_LUGRE, pd_lugre.step, pd_lugre.PdLugreGains, has_friction_state=True),
+        Law("local", LawNumber.LOCAL, local.step, local.LocalGains.from_flat, local.FIRST_NODE, True),
     )
 }
 

@@ -28,38 +28,76 @@ milliseconds when the error grows beyond what the encoder may show of a joint th
 from __future__ import annotations
 
 import math
-from collections.abc import MutableSequence, Sequence
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 from servod.kernels.laws.observer import decayed, limited, observe, remember, winds_up
-from servod.kernels.laws.position import position_torque
-from servod.kernels.laws.state import ASKED, COMMAND_1, COMMAND_2, COMMAND_3, DISTURBANCE, FRICTION_STATE, REST
-from servod.kernels.laws.weights import blended
+from servod.kernels.laws.position import PositionTorques, position_torque
+from servod.kernels.laws.state import LawState
+from servod.kernels.laws.weights import Sets, blended
 
-INPUT_SCALE = 0  # K [N*m per unit of u*]
-LOW_K_Z, LOW_K_X, LOW_K_V = 1, 2, 3  # gains of Omega_L [1/rad, 1/rad, s/rad]
-HIGH_K_Z, HIGH_K_X, HIGH_K_V = 4, 5, 6  # gains of Omega_H
-BLEND_FROM = 7  # speed up to which Omega_L holds alone [rad/s]
-BLEND_TO = 8  # speed from which Omega_H holds alone [rad/s]
-STIFFNESS = 9  # c0_hat [N*m/rad]
-VISCOUS = 10  # d0_hat [N*m*s/rad]
-LEAK = 11  # least decay of z_hat [1/s]
-STATE_LIMIT = 12  # bound of |z_hat| [rad], F_max/c0 as below (8)
-SOURCE = 13  # VelocitySource
-LEAD = 14  # time by which the reference velocity is led [s]
-SHAPE = 15  # servod.kernels.laws.weights.Shape
-HOLD_WITHIN = 16  # hold width [rad]
-FEEDFORWARD_INERTIA = 17  # m_ff [kg*m^2]
-OBSERVER_BANDWIDTH = 18  # g of the output disturbance observer in Omega_H [rad/s], 0: none
-OBSERVER_INERTIA = 19  # nominal m of the observer [kg*m^2]
-OBSERVER_LIMIT = 20  # bound of |d_hat| [N*m]
-LOW_K_U, HIGH_K_U = 21, 24  # gains of the last three commands u* in Omega_L and Omega_H
-OBSERVER_LOW = 27  # g in Omega_L under a resting reference [rad/s]: on its bristle the estimate would take seconds
-ERROR_LIMIT = 28  # the feedback sees no more error than this, which bounds the speed of a step [rad], 0: none
-REST_WITHIN = 29  # error within which a joint under a resting reference counts as at rest [rad], 0: never
-REST_SHARE = 30  # of feedback and observer that is left at rest
-OBSERVER_MOVING = 31  # g in Omega_L under a moving reference [rad/s]
-N_SETS = 32  # number n of local sets
-FIRST_NODE = 33  # then n nodes v_i [rad/s], n decays a_i [1/s], n gains l_i; then `position`, or nothing
+
+class LocalGains(NamedTuple):
+    """Numbers of the law, in the order in which a gain set packs them; the number of sets goes before the sets."""
+
+    input_scale: float  # K [N*m per unit of u*]
+    low_k_z: float  # gains of Omega_L [1/rad, 1/rad, s/rad]
+    low_k_x: float
+    low_k_v: float
+    high_k_z: float  # gains of Omega_H
+    high_k_x: float
+    high_k_v: float
+    blend_from: float  # speed up to which Omega_L holds alone [rad/s]
+    blend_to: float  # speed from which Omega_H holds alone [rad/s]
+    stiffness: float  # c0_hat [N*m/rad]
+    viscous: float  # d0_hat [N*m*s/rad]
+    leak: float  # least decay of z_hat [1/s]
+    state_limit: float  # bound of |z_hat| [rad], F_max/c0 as below (8)
+    source: float  # MEASURED or REFERENCE: whose velocity drives z_hat, d0 and the sets
+    lead: float  # time by which the reference velocity is led [s]
+    shape: float  # servod.kernels.laws.weights.Shape
+    hold_within: float  # hold width [rad]
+    feedforward_inertia: float  # m_ff [kg*m^2]
+    observer_bandwidth: float  # g of the output disturbance observer in Omega_H [rad/s], 0: none
+    observer_inertia: float  # nominal m of the observer [kg*m^2]
+    observer_limit: float  # bound of |d_hat| [N*m]
+    low_k_u1: float  # gains of the last three commands u* in Omega_L and Omega_H
+    low_k_u2: float
+    low_k_u3: float
+    high_k_u1: float
+    high_k_u2: float
+    high_k_u3: float
+    observer_low: float  # g in Omega_L under a resting reference [rad/s]: on its bristle it would take seconds
+    error_limit: float  # the feedback sees no more error than this, which bounds the speed of a step [rad], 0: none
+    rest_within: float  # error within which a joint under a resting reference counts as at rest [rad], 0: never
+    rest_share: float  # of feedback and observer that is left at rest
+    observer_moving: float  # g in Omega_L under a moving reference [rad/s]
+    sets: Sets
+    knows_position: bool = False  # whether `position` says anything
+    position: PositionTorques = PositionTorques()
+
+    @classmethod
+    def from_flat(cls, values: Sequence[float]) -> LocalGains:
+        """Name the numbers that `flat` gives; `Law.accepts` says whether they are as many as it takes."""
+        n = int(values[N_SETS])
+        nodes, decays, gains = (tuple(values[FIRST_NODE + k * n : FIRST_NODE + (k + 1) * n]) for k in range(3))
+        beyond = values[FIRST_NODE + 3 * n :]
+        known = len(beyond) > 0, PositionTorques.from_flat(beyond)
+        return cls._make((*values[:N_SETS], Sets(nodes, decays, gains), *known))
+
+    def flat(self) -> tuple[float, ...]:
+        """The numbers one behind the other: head, number of sets, all v_i, all a_i, all l_i, what is known of position.
+
+        So a gain set is packed and sent to the loop.
+        """
+        head: tuple[Any, ...] = self[:N_SETS]
+        sets = self.sets
+        known = self.position.flat() if self.knows_position else ()
+        return (*head, float(len(sets.nodes)), *sets.nodes, *sets.decays, *sets.gains, *known)
+
+
+N_SETS = 32  # where `flat` has the number of sets ...
+FIRST_NODE = 33  # ... and the first of them
 
 MEASURED = 0.0
 REFERENCE = 1.0
@@ -67,46 +105,41 @@ REST_TO_S, REST_FROM_S = 0.02, 0.004  # time constants with which a joint comes 
 COMMANDS = 3  # past commands that may be fed back: those of two cycles of delay, and one that the velocity lags behind
 
 
-def remembered(p: Sequence[float], s: Sequence[float], first: int) -> float:
-    """Sum of k_u(i)*u*(k-i) with the gains from p[first] on."""
-    return p[first] * s[COMMAND_1] + p[first + 1] * s[COMMAND_2] + p[first + 2] * s[COMMAND_3]
-
-
-def awake(p: Sequence[float], s: MutableSequence[float], stands: bool, error: float, dt: float) -> float:
+def awake(p: LocalGains, s: LawState, stands: bool, error: float, dt: float) -> float:
     """Share of feedback and observer that acts: 1, and going towards REST_SHARE while the joint is at rest."""
-    if p[REST_WITHIN] == 0.0:
-        s[REST] = 0.0
-    elif stands and abs(error) <= p[REST_WITHIN]:
-        s[REST] = 1.0 + (s[REST] - 1.0) * math.exp(-dt / REST_TO_S)
+    if p.rest_within == 0.0:
+        s.rest = 0.0
+    elif stands and abs(error) <= p.rest_within:
+        s.rest = 1.0 + (s.rest - 1.0) * math.exp(-dt / REST_TO_S)
     else:
-        s[REST] *= math.exp(-dt / REST_FROM_S)
-    return 1.0 - s[REST] * (1.0 - p[REST_SHARE])
+        s.rest *= math.exp(-dt / REST_FROM_S)
+    return 1.0 - s.rest * (1.0 - p.rest_share)
 
 
-def high_share(p: Sequence[float], speed: float) -> float:
+def high_share(p: LocalGains, speed: float) -> float:
     """Share of Omega_H at `speed` [rad/s]: 0 in Omega_L, 1 in Omega_H, linear over the overlap."""
-    if speed <= p[BLEND_FROM]:
+    if speed <= p.blend_from:
         return 0.0
-    if speed >= p[BLEND_TO]:
+    if speed >= p.blend_to:
         return 1.0
-    return (speed - p[BLEND_FROM]) / (p[BLEND_TO] - p[BLEND_FROM])
+    return (speed - p.blend_from) / (p.blend_to - p.blend_from)
 
 
-def scheduled(p: Sequence[float], s: Sequence[float], share: float, error: float, error_rate: float) -> float:
-    """u* of (13), blended with `share` of Omega_H."""
-    z, star = s[FRICTION_STATE], 0.0
+def scheduled(p: LocalGains, s: LawState, share: float, error: float, error_rate: float) -> float:
+    """u* of (13), blended with `share` of Omega_H, less what the last commands have still to show."""
+    z, star = s.z_hat, 0.0
     if share < 1.0:
-        low = p[LOW_K_X] * error + p[LOW_K_V] * error_rate - p[LOW_K_Z] * z - remembered(p, s, LOW_K_U)
-        star += (1.0 - share) * low
+        memory = p.low_k_u1 * s.command_1 + p.low_k_u2 * s.command_2 + p.low_k_u3 * s.command_3
+        star += (1.0 - share) * (p.low_k_x * error + p.low_k_v * error_rate - p.low_k_z * z - memory)
     if share > 0.0:
-        high = p[HIGH_K_X] * error + p[HIGH_K_V] * error_rate - p[HIGH_K_Z] * z - remembered(p, s, HIGH_K_U)
-        star += share * high
+        memory = p.high_k_u1 * s.command_1 + p.high_k_u2 * s.command_2 + p.high_k_u3 * s.command_3
+        star += share * (p.high_k_x * error + p.high_k_v * error_rate - p.high_k_z * z - memory)
     return star
 
 
 def step(
-    p: Sequence[float],
-    s: MutableSequence[float],
+    p: LocalGains,
+    s: LawState,
     x_ref: float,
     v_ref: float,
     a_ref: float,
@@ -116,35 +149,33 @@ def step(
     dt: float,
 ) -> tuple[float, float, float, float]:
     """One cycle: (torque, of it feedback K*u*, friction compensation, other) in N*m."""
-    w = v_ref + p[LEAD] * a_ref if p[SOURCE] == REFERENCE else v
+    w = v_ref + p.lead * a_ref if p.source == REFERENCE else v
     error = x_ref - x
-    s[COMMAND_1] -= (s[ASKED] - u_applied) / p[INPUT_SCALE]  # what the limits cut never acts
+    s.command_1 -= (s.asked - u_applied) / p.input_scale  # what the limits cut never acts
     share = high_share(p, max(abs(w), abs(v)))
-    seen = limited(error, p[ERROR_LIMIT]) if p[ERROR_LIMIT] > 0.0 else error
+    seen = limited(error, p.error_limit) if p.error_limit > 0.0 else error
     stands = v_ref == 0.0 and a_ref == 0.0
     acts = awake(p, s, stands, error, dt)
     u_star = acts * scheduled(p, s, share, seen, v_ref - v)
-    s[COMMAND_3], s[COMMAND_2], s[COMMAND_1] = s[COMMAND_2], s[COMMAND_1], u_star
-    moves = not (stands and abs(error) <= p[HOLD_WITHIN])
-    n = int(p[N_SETS])
-    decay, gain = blended(p, FIRST_NODE, n, p[SHAPE], w)
+    s.command_3, s.command_2, s.command_1 = s.command_2, s.command_1, u_star
+    moves = not (stands and abs(error) <= p.hold_within)
+    decay, gain = blended(p.sets, p.shape, w)
     drive = w
     if moves and gain != 0.0 and not winds_up(s, u_star, u_applied):
         drive += gain * u_star
-    if moves or p[SOURCE] != REFERENCE:
-        s[FRICTION_STATE] = limited(decayed(s[FRICTION_STATE], max(decay, p[LEAK]), drive, dt), p[STATE_LIMIT])
-    friction = p[STIFFNESS] * s[FRICTION_STATE] + p[VISCOUS] * w
-    beyond = FIRST_NODE + 3 * n
-    known = position_torque(p, beyond, x_ref, v_ref) if len(p) > beyond else 0.0
-    other = p[FEEDFORWARD_INERTIA] * a_ref + known
-    if p[OBSERVER_BANDWIDTH] > 0.0:
+    if moves or p.source != REFERENCE:
+        s.z_hat = limited(decayed(s.z_hat, max(decay, p.leak), drive, dt), p.state_limit)
+    friction = p.stiffness * s.z_hat + p.viscous * w
+    known = position_torque(p.position, x_ref, v_ref) if p.knows_position else 0.0
+    other = p.feedforward_inertia * a_ref + known
+    if p.observer_bandwidth > 0.0:
         if moves:
-            low = p[OBSERVER_LOW] if stands else p[OBSERVER_MOVING]
-            bandwidth = low + share * (p[OBSERVER_BANDWIDTH] - low)
-            observe(s, acts * bandwidth, p[OBSERVER_INERTIA], p[OBSERVER_LIMIT], v, u_applied, dt)
+            low = p.observer_low if stands else p.observer_moving
+            bandwidth = low + share * (p.observer_bandwidth - low)
+            observe(s, acts * bandwidth, p.observer_inertia, p.observer_limit, v, u_applied, dt)
         remember(s, v, friction + known, u_applied)
-        other += s[DISTURBANCE]
-    feedback = p[INPUT_SCALE] * u_star
+        other += s.d_hat
+    feedback = p.input_scale * u_star
     torque = feedback + friction + other
-    s[ASKED] = torque
+    s.asked = torque
     return torque, feedback, friction, other

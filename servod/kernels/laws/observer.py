@@ -6,9 +6,8 @@ Stands under `pd_dob` and `local`. Because it works with the torque after limits
 from __future__ import annotations
 
 import math
-from collections.abc import MutableSequence, Sequence
 
-from servod.kernels.laws.state import ACTED, ASKED, DISTURBANCE, LAST_VELOCITY, MODELLED, STARTED
+from servod.kernels.laws.state import LawState
 
 # Exact step of the friction state: what explicit Euler gets wrong at 1 ms, where the decay reaches 10 000 1/s.
 #
@@ -40,7 +39,7 @@ def limited(value: float, bound: float) -> float:
 
 
 def observe(
-    s: MutableSequence[float],
+    s: LawState,
     bandwidth_rad_s: float,
     inertia: float,
     limit_nm: float,
@@ -52,21 +51,21 @@ def observe(
 
     d_hat' = g*(u - F_hat - m*v' - d_hat), the observer of [22] in the paper. A torque of cycle k acts from sample k+1
     on, so the torque behind the step from the last sample to this one is the one that was given two calls ago:
-    `s[ACTED]`. At the first step there is no last sample, and the estimate stays.
+    `s.acted`. At the first step there is no last sample, and the estimate stays.
     """
-    if s[STARTED] > 0.0 and dt > 0.0:
-        residual = s[ACTED] - s[MODELLED] - inertia * (v - s[LAST_VELOCITY]) / dt
-        estimate = s[DISTURBANCE] - (residual - s[DISTURBANCE]) * math.expm1(-bandwidth_rad_s * dt)
-        s[DISTURBANCE] = limited(estimate, limit_nm)
-    return s[DISTURBANCE]
+    if s.started > 0.0 and dt > 0.0:
+        residual = s.acted - s.modelled - inertia * (v - s.last_velocity) / dt
+        estimate = s.d_hat - (residual - s.d_hat) * math.expm1(-bandwidth_rad_s * dt)
+        s.d_hat = limited(estimate, limit_nm)
+    return s.d_hat
 
 
-def remember(s: MutableSequence[float], v: float, modelled_nm: float, u_applied: float) -> None:
+def remember(s: LawState, v: float, modelled_nm: float, u_applied: float) -> None:
     """Keep what the next step's `observe` compares with; to be called once in every step, also in those that hold."""
-    s[ACTED] = u_applied
-    s[LAST_VELOCITY] = v
-    s[MODELLED] = modelled_nm
-    s[STARTED] = 1.0
+    s.acted = u_applied
+    s.last_velocity = v
+    s.modelled = modelled_nm
+    s.started = 1.0
 
 
 # Anti-windup of the friction state: no integral action into a limit that already holds.
@@ -77,7 +76,7 @@ def remember(s: MutableSequence[float], v: float, modelled_nm: float, u_applied:
 LIMITED_NM = 1e-9  # less difference than this between asked and applied is rounding
 
 
-def winds_up(s: Sequence[float], push: float, u_applied: float) -> bool:
+def winds_up(s: LawState, push: float, u_applied: float) -> bool:
     """Whether the limits cut the last torque (asked against applied) and `push` would ask for still more of it."""
-    cut = s[ASKED] - u_applied
+    cut = s.asked - u_applied
     return (cut > LIMITED_NM and push > 0.0) or (cut < -LIMITED_NM and push < 0.0)

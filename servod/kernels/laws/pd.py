@@ -5,19 +5,22 @@ u = K_P*(x_ref - x) + K_D*(v_ref - v) + m_ff*a_ref
 
 from __future__ import annotations
 
-from collections.abc import MutableSequence, Sequence
+from typing import NamedTuple
 
-from servod.kernels.laws.state import ASKED
+from servod.kernels.laws.state import LawState
 
-K_P = 0  # position gain [N*m/rad]
-K_D = 1  # velocity gain [N*m*s/rad]
-FEEDFORWARD_INERTIA = 2  # m_ff [kg*m^2], 0 switches the feed-forward off
-N_PARAMETERS = 3
+
+class PdGains(NamedTuple):
+    """Numbers of the PD law, in the order in which a gain set packs them."""
+
+    k_p: float  # position gain [N*m/rad]
+    k_d: float  # velocity gain [N*m*s/rad]
+    feedforward_inertia: float  # m_ff [kg*m^2], 0 switches the feed-forward off
 
 
 def step(
-    p: Sequence[float],
-    s: MutableSequence[float],
+    p: PdGains,
+    s: LawState,
     x_ref: float,
     v_ref: float,
     a_ref: float,
@@ -27,8 +30,8 @@ def step(
     dt: float,
 ) -> tuple[float, float, float, float]:
     """One cycle: (torque, of it feedback, friction compensation, other) in N*m. No state but the torque asked for."""
-    feedback = p[K_P] * (x_ref - x) + p[K_D] * (v_ref - v)
-    other = p[FEEDFORWARD_INERTIA] * a_ref
+    feedback = p.k_p * (x_ref - x) + p.k_d * (v_ref - v)
+    other = p.feedforward_inertia * a_ref
     torque = feedback + other
-    s[ASKED] = torque
+    s.asked = torque
     return torque, feedback, 0.0, other

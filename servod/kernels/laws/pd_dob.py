@@ -8,25 +8,28 @@ A reference at rest and an error within the hold width freeze d_hat: an integrat
 
 from __future__ import annotations
 
-from collections.abc import MutableSequence, Sequence
+from typing import NamedTuple
 
 from servod.kernels.laws.observer import observe, remember
-from servod.kernels.laws.state import ASKED, DISTURBANCE
+from servod.kernels.laws.state import LawState
 
-K_P = 0  # position gain [N*m/rad]
-K_D = 1  # velocity gain [N*m*s/rad]
-FEEDFORWARD_INERTIA = 2  # m_ff [kg*m^2]
-BANDWIDTH = 3  # g [rad/s]
-INERTIA = 4  # nominal m [kg*m^2]
-VISCOUS = 5  # nominal b [N*m*s/rad]
-LIMIT = 6  # bound of |d_hat| [N*m]
-HOLD_WITHIN = 7  # hold width [rad]
-N_PARAMETERS = 8
+
+class PdDobGains(NamedTuple):
+    """Numbers of the law, in the order in which a gain set packs them."""
+
+    k_p: float  # position gain [N*m/rad]
+    k_d: float  # velocity gain [N*m*s/rad]
+    feedforward_inertia: float  # m_ff [kg*m^2]
+    bandwidth: float  # g [rad/s]
+    inertia: float  # nominal m [kg*m^2]
+    viscous: float  # nominal b [N*m*s/rad]
+    limit: float  # bound of |d_hat| [N*m]
+    hold_within: float  # hold width [rad]
 
 
 def step(
-    p: Sequence[float],
-    s: MutableSequence[float],
+    p: PdDobGains,
+    s: LawState,
     x_ref: float,
     v_ref: float,
     a_ref: float,
@@ -37,12 +40,12 @@ def step(
 ) -> tuple[float, float, float, float]:
     """One cycle: (torque, of it feedback, friction compensation, other) in N*m; d_hat counts as other."""
     error = x_ref - x
-    feedback = p[K_P] * error + p[K_D] * (v_ref - v)
-    at_rest = v_ref == 0.0 and a_ref == 0.0 and abs(error) <= p[HOLD_WITHIN]
+    feedback = p.k_p * error + p.k_d * (v_ref - v)
+    at_rest = v_ref == 0.0 and a_ref == 0.0 and abs(error) <= p.hold_within
     if not at_rest:
-        observe(s, p[BANDWIDTH], p[INERTIA], p[LIMIT], v, u_applied, dt)
-    remember(s, v, p[VISCOUS] * v, u_applied)
-    other = p[FEEDFORWARD_INERTIA] * a_ref + s[DISTURBANCE]
+        observe(s, p.bandwidth, p.inertia, p.limit, v, u_applied, dt)
+    remember(s, v, p.viscous * v, u_applied)
+    other = p.feedforward_inertia * a_ref + s.d_hat
     torque = feedback + other
-    s[ASKED] = torque
+    s.asked = torque
     return torque, feedback, 0.0, other

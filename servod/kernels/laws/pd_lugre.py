@@ -11,30 +11,33 @@ that makes z_hat push the way the feedback pushes. z_hat is stepped exactly and 
 from __future__ import annotations
 
 import math
-from collections.abc import MutableSequence, Sequence
+from typing import NamedTuple
 
 from servod.kernels.laws.observer import decayed, limited, winds_up
-from servod.kernels.laws.state import ASKED, FRICTION_STATE
+from servod.kernels.laws.state import LawState
 
-K_P = 0  # position gain [N*m/rad]
-K_D = 1  # velocity gain [N*m*s/rad]
-FEEDFORWARD_INERTIA = 2  # m_ff [kg*m^2]
-STIFFNESS = 3  # c0 = sigma0 [N*m/rad]
-DAMPING = 4  # sigma1 [N*m*s/rad]
-VISCOUS = 5  # F_v [N*m*s/rad]
-COULOMB = 6  # F_C [N*m]
-STATIC = 7  # F_S [N*m]
-STRIBECK_VELOCITY = 8  # v_s [rad/s]
-OBSERVER_GAIN = 9  # l_f [rad/s per unit of u*]
-INPUT_SCALE = 10  # K [N*m per unit of u*]
-HOLD_WITHIN = 11  # below this error, with the reference at rest, l_f does not act [rad]
-STATE_LIMIT = 12  # bound of |z_hat| [rad]
-N_PARAMETERS = 13
+
+class PdLugreGains(NamedTuple):
+    """Numbers of the law, in the order in which a gain set packs them."""
+
+    k_p: float  # position gain [N*m/rad]
+    k_d: float  # velocity gain [N*m*s/rad]
+    feedforward_inertia: float  # m_ff [kg*m^2]
+    stiffness: float  # c0 = sigma0 [N*m/rad]
+    damping: float  # sigma1 [N*m*s/rad]
+    viscous: float  # F_v [N*m*s/rad]
+    coulomb: float  # F_C [N*m]
+    static: float  # F_S [N*m]
+    stribeck_velocity: float  # v_s [rad/s]
+    observer_gain: float  # l_f [rad/s per unit of u*]
+    input_scale: float  # K [N*m per unit of u*]
+    hold_within: float  # below this error, with the reference at rest, l_f does not act [rad]
+    state_limit: float  # bound of |z_hat| [rad]
 
 
 def step(
-    p: Sequence[float],
-    s: MutableSequence[float],
+    p: PdLugreGains,
+    s: LawState,
     x_ref: float,
     v_ref: float,
     a_ref: float,
@@ -45,18 +48,18 @@ def step(
 ) -> tuple[float, float, float, float]:
     """One cycle: (torque, of it feedback, friction compensation, other) in N*m."""
     error = x_ref - x
-    feedback = p[K_P] * error + p[K_D] * (v_ref - v)
-    level = p[COULOMB] + (p[STATIC] - p[COULOMB]) * math.exp(-((v / p[STRIBECK_VELOCITY]) ** 2))
+    feedback = p.k_p * error + p.k_d * (v_ref - v)
+    level = p.coulomb + (p.static - p.coulomb) * math.exp(-((v / p.stribeck_velocity) ** 2))
     drive = v
-    at_rest = v_ref == 0.0 and a_ref == 0.0 and abs(error) <= p[HOLD_WITHIN]
+    at_rest = v_ref == 0.0 and a_ref == 0.0 and abs(error) <= p.hold_within
     if not (at_rest or winds_up(s, feedback, u_applied)):
-        drive += p[OBSERVER_GAIN] * feedback / p[INPUT_SCALE]
-    before = s[FRICTION_STATE]
-    z = limited(decayed(before, p[STIFFNESS] * abs(v) / level, drive, dt), p[STATE_LIMIT])
-    s[FRICTION_STATE] = z
+        drive += p.observer_gain * feedback / p.input_scale
+    before = s.z_hat
+    z = limited(decayed(before, p.stiffness * abs(v) / level, drive, dt), p.state_limit)
+    s.z_hat = z
     rate = (z - before) / dt if dt > 0.0 else 0.0
-    friction = p[STIFFNESS] * z + p[DAMPING] * rate + p[VISCOUS] * v
-    other = p[FEEDFORWARD_INERTIA] * a_ref
+    friction = p.stiffness * z + p.damping * rate + p.viscous * v
+    other = p.feedforward_inertia * a_ref
     torque = feedback + friction + other
-    s[ASKED] = torque
+    s.asked = torque
     return torque, feedback, friction, other

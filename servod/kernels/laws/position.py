@@ -13,14 +13,31 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any, NamedTuple
 
-# Where each number stands, counted from the first one behind the law's own parameters.
-LEAD = 0  # time by which the reference position is led [s]
-OFFSET = 1  # constant torque [N*m]
-SPRING = 2  # stiffness [N*m/rad]
-SPRING_REST = 3  # position without torque [rad]
-SPRING_CUBIC = 4  # [N*m/rad^3]
-FIRST_WAVE = 5  # then, to the end, amplitude [N*m], n [1/rad] and phase [rad] of amplitude*sin(n*x + phase)
+
+class PositionTorques(NamedTuple):
+    """What is known over position, in the order in which a gain set packs it behind the law's own numbers."""
+
+    lead: float = 0.0  # time by which the reference position is led [s]
+    offset: float = 0.0  # constant torque [N*m]
+    spring: float = 0.0  # stiffness [N*m/rad]
+    spring_rest: float = 0.0  # position without torque [rad]
+    spring_cubic: float = 0.0  # [N*m/rad^3]
+    waves: Sequence[float] = ()  # amplitude [N*m], n [1/rad] and phase [rad] of each amplitude*sin(n*x + phase)
+
+    @classmethod
+    def from_flat(cls, values: Sequence[float]) -> PositionTorques:
+        """Name the numbers that `flat` gives."""
+        return cls._make((*values[:FIRST_WAVE], tuple(values[FIRST_WAVE:]))) if values else cls()
+
+    def flat(self) -> tuple[float, ...]:
+        """The numbers one behind the other."""
+        head: tuple[Any, ...] = self[:FIRST_WAVE]
+        return (*head, *self.waves)
+
+
+FIRST_WAVE = 5  # numbers before the waves
 
 #: Most waves of one gain set, gravity included; keeps the ACTIVATE command and the cycle bounded.
 MAX_WAVES = 17
@@ -32,11 +49,12 @@ def fits(size: int) -> bool:
     return size == 0 or (FIRST_WAVE <= size <= MAX_SIZE and (size - FIRST_WAVE) % 3 == 0)
 
 
-def position_torque(p: Sequence[float], first: int, x_ref: float, v_ref: float) -> float:
-    """Torque that holds against everything known at the reference position [N*m]; its numbers start at p[first]."""
-    x = x_ref + p[first + LEAD] * v_ref
-    stretch = x - p[first + SPRING_REST]
-    torque = p[first + OFFSET] + (p[first + SPRING] + p[first + SPRING_CUBIC] * stretch * stretch) * stretch
-    for i in range(first + FIRST_WAVE, len(p), 3):
-        torque += p[i] * math.sin(p[i + 1] * x + p[i + 2])
+def position_torque(p: PositionTorques, x_ref: float, v_ref: float) -> float:
+    """Torque that holds against everything known at the reference position [N*m]."""
+    x = x_ref + p.lead * v_ref
+    stretch = x - p.spring_rest
+    torque = p.offset + (p.spring + p.spring_cubic * stretch * stretch) * stretch
+    waves = p.waves
+    for i in range(0, len(waves), 3):
+        torque += waves[i] * math.sin(waves[i + 1] * x + waves[i + 2])
     return torque

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from enum import IntEnum
+from typing import NamedTuple
 
 
 class Shape(IntEnum):
@@ -32,12 +33,20 @@ BELL_RATE = 0.5 / GAUSSIAN_WIDTH**2
 BELL_END = math.exp(-BELL_RATE)  # what a whole bell would still have at the neighbour's node
 
 
-def lower_node(p: Sequence[float], first: int, n: int, v: float) -> int:
-    """Index k (0 to n-2) with p[first+k] <= v < p[first+k+1], clamped to the ends; the nodes ascend."""
-    low, high = 0, n - 1
+class Sets(NamedTuple):
+    """The local sets of (9), at least two, by ascending node."""
+
+    nodes: Sequence[float]  # v_i [rad/s]
+    decays: Sequence[float]  # a_i [1/s]
+    gains: Sequence[float]  # l_i
+
+
+def lower_node(nodes: Sequence[float], v: float) -> int:
+    """Index k (0 to n-2) with nodes[k] <= v < nodes[k+1], clamped to the ends; the nodes ascend."""
+    low, high = 0, len(nodes) - 1
     while high - low > 1:
         middle = (low + high) >> 1
-        if v < p[first + middle]:
+        if v < nodes[middle]:
             high = middle
         else:
             low = middle
@@ -55,15 +64,16 @@ def upper_share(shape: float, share: float) -> float:
     return share
 
 
-def blended(p: Sequence[float], first: int, n: int, shape: float, v: float) -> tuple[float, float]:
-    """Decay a(v) [1/s] and gain l(v) of (9) at velocity `v` [rad/s]; `p` has n nodes, n a_i, n l_i from `first` on."""
-    held = min(max(v, p[first]), p[first + n - 1])
+def blended(sets: Sets, shape: float, v: float) -> tuple[float, float]:
+    """Decay a(v) [1/s] and gain l(v) of (9) at velocity `v` [rad/s]."""
+    nodes, decays, gains = sets.nodes, sets.decays, sets.gains
+    held = min(max(v, nodes[0]), nodes[len(nodes) - 1])
     beyond = v / held if v != held else 1.0
-    k = first + lower_node(p, first, n, held)
-    share = (held - p[k]) / (p[k + 1] - p[k])
+    k = lower_node(nodes, held)
+    share = (held - nodes[k]) / (nodes[k + 1] - nodes[k])
     upper = upper_share(shape, share)
-    decay = blended_decay(p[k], p[k + 1], p[k + n], p[k + n + 1], share, upper)
-    return decay * beyond, p[k + 2 * n] + upper * (p[k + 2 * n + 1] - p[k + 2 * n])
+    decay = blended_decay(nodes[k], nodes[k + 1], decays[k], decays[k + 1], share, upper)
+    return decay * beyond, gains[k] + upper * (gains[k + 1] - gains[k])
 
 
 def blended_decay(low: float, high: float, a_low: float, a_high: float, share: float, upper: float) -> float:
@@ -86,6 +96,6 @@ def weights(shape: Shape, nodes_rad_s: Sequence[float], v: float) -> list[float]
     """Weights mu_i at velocity `v` [rad/s] for ascending nodes (at least two); not negative, and their sum is one."""
     n = len(nodes_rad_s)
     held = min(max(v, nodes_rad_s[0]), nodes_rad_s[-1])
-    k = lower_node(nodes_rad_s, 0, n, held)
+    k = lower_node(nodes_rad_s, held)
     upper = upper_share(float(shape), (held - nodes_rad_s[k]) / (nodes_rad_s[k + 1] - nodes_rad_s[k]))
     return [1.0 - upper if i == k else upper if i == k + 1 else 0.0 for i in range(n)]

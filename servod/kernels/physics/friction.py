@@ -7,73 +7,58 @@ from __future__ import annotations
 
 import math
 
-from servod.kernels.physics.layout import (
-    P_COULOMB,
-    P_LOAD_VISCOUS,
-    P_LOCAL_NEGATIVE,
-    P_LOCAL_NEGATIVE_N,
-    P_LOCAL_POSITIVE,
-    P_LOCAL_POSITIVE_N,
-    P_NEGATIVE_DRY,
-    P_POSITIVE_DRY,
-    P_STATIC,
-    P_STRIBECK_EXPONENT,
-    P_STRIBECK_VELOCITY,
-    P_VISCOUS,
-)
-
-Params = tuple[float, ...]
+from servod.kernels.physics.layout import PlantParameters, Tables
 
 #: exp(-x) is under the last digit of a sum with 1 beyond this x.
 EXP_IS_NOTHING = 40.0
 
 
-def interpolate(p: Params, start: int, rows: int, x: float, hold: bool) -> float:
-    """Piecewise linear table of (x, y) rows at `p[start]`; outside it, the end values when `hold`, else 0."""
+def interpolate(tables: Tables, start: int, rows: int, x: float, hold: bool) -> float:
+    """Piecewise linear table of (x, y) rows at `tables[start]`; outside it, the end values when `hold`, else 0."""
     last = start + 2 * (rows - 1)
-    if x <= p[start]:
-        return p[start + 1] if hold or x == p[start] else 0.0
-    if x >= p[last]:
-        return p[last + 1] if hold or x == p[last] else 0.0
+    if x <= tables[start]:
+        return tables[start + 1] if hold or x == tables[start] else 0.0
+    if x >= tables[last]:
+        return tables[last + 1] if hold or x == tables[last] else 0.0
     low, high = 0, rows - 1
     while high - low > 1:
         middle = (low + high) // 2
-        if p[start + 2 * middle] <= x:
+        if tables[start + 2 * middle] <= x:
             low = middle
         else:
             high = middle
-    x0, y0 = p[start + 2 * low], p[start + 2 * low + 1]
-    x1, y1 = p[start + 2 * high], p[start + 2 * high + 1]
+    x0, y0 = tables[start + 2 * low], tables[start + 2 * low + 1]
+    x1, y1 = tables[start + 2 * high], tables[start + 2 * high + 1]
     return y0 + (y1 - y0) * (x - x0) / (x1 - x0)
 
 
-def stribeck_curve(p: Params, velocity: float) -> float:
+def stribeck_curve(p: PlantParameters, tables: Tables, velocity: float) -> float:
     """Dry friction torque g(v) > 0 at steady sliding, without asymmetry: the paper's (18), exponent's sign mended."""
     speed = abs(velocity)
-    if p[P_LOCAL_POSITIVE_N] > 0.0:
-        return _local_curve(p, velocity, speed)
-    extra = p[P_STATIC] - p[P_COULOMB]
+    if p.local_positive_n > 0:
+        return _local_curve(p, tables, velocity, speed)
+    extra = p.static - p.coulomb
     if extra == 0.0:
-        return p[P_COULOMB]
-    ratio = speed / p[P_STRIBECK_VELOCITY]
-    power = ratio * ratio if p[P_STRIBECK_EXPONENT] == 2.0 else ratio ** p[P_STRIBECK_EXPONENT]
+        return p.coulomb
+    ratio = speed / p.stribeck_velocity
+    power = ratio * ratio if p.stribeck_exponent == 2.0 else ratio**p.stribeck_exponent
     if power > EXP_IS_NOTHING:
-        return p[P_COULOMB]
-    return p[P_COULOMB] + extra * math.exp(-power)
+        return p.coulomb
+    return p.coulomb + extra * math.exp(-power)
 
 
-def _local_curve(p: Params, velocity: float, speed: float) -> float:
+def _local_curve(p: PlantParameters, tables: Tables, velocity: float, speed: float) -> float:
     """Local sets: the map (7) less its viscous part on both sides of the joint, never below a hundredth of the map."""
     if velocity >= 0.0:
-        steady = interpolate(p, int(p[P_LOCAL_POSITIVE]), int(p[P_LOCAL_POSITIVE_N]), speed, True)
+        steady = interpolate(tables, p.local_positive, p.local_positive_n, speed, True)
     else:
-        steady = interpolate(p, int(p[P_LOCAL_NEGATIVE]), int(p[P_LOCAL_NEGATIVE_N]), speed, True)
-    return max(steady - (p[P_VISCOUS] + p[P_LOAD_VISCOUS]) * speed, 0.01 * steady)
+        steady = interpolate(tables, p.local_negative, p.local_negative_n, speed, True)
+    return max(steady - (p.viscous + p.load_viscous) * speed, 0.01 * steady)
 
 
-def directed_curve(p: Params, velocity: float) -> float:
+def directed_curve(p: PlantParameters, tables: Tables, velocity: float) -> float:
     """g(v) with asymmetry: what the bristle settles to at steady velocity, sigma0*|z| = g(v)."""
-    return stribeck_curve(p, velocity) * (p[P_POSITIVE_DRY] if velocity >= 0.0 else p[P_NEGATIVE_DRY])
+    return stribeck_curve(p, tables, velocity) * (p.positive_dry if velocity >= 0.0 else p.negative_dry)
 
 
 def bristle_step(

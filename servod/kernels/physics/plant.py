@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
-from servod.kernels.physics import layout as lay
-from servod.kernels.physics.compiled import available, compiled
+from servod.kernels.physics.compiled import arrays, available, entry, record
 from servod.kernels.physics.dynamics import advance
 from servod.kernels.physics.effects import encoder_position
+from servod.kernels.physics.layout import PackedPlant, PlantParameters, PlantState, Tables
 
 #: Inner step of every simulation, s (stiff bristles and springs of real joints need 50 us or less).
 INNER_STEP_S = 50e-6
@@ -25,11 +24,29 @@ def delay_line_length(delay_s: float, step_s: float) -> int:
     return math.ceil(delay_s / step_s + 1e-9) + 2
 
 
-def rest_state(delay_s: float, step_s: float, temperature_c: float) -> list[float]:
-    """The state of an axis at rest at position 0 without torque; `servod.kernels.physics.layout` names its numbers."""
-    state = [0.0] * (lay.S_LINE + delay_line_length(delay_s, step_s))
-    state[lay.S_TEMPERATURE_C] = temperature_c
-    return state
+def delay_line(delay_s: float, step_s: float) -> list[float]:
+    """The command delay line of an axis without torque."""
+    return [0.0] * delay_line_length(delay_s, step_s)
+
+
+class Inputs(NamedTuple):
+    """What every kernel takes first, in this order: as it stands in pure Python, numpy's where it is compiled."""
+
+    p: Any
+    tables: Any
+    s: Any
+
+
+def inputs(packed: PackedPlant, state: PlantState, *, bare: bool = False) -> Inputs:
+    """A packed model and a state for kernels that are compiled where they can be.
+
+    Records come in arrays of one, as `compiled.entry` wants them; `bare` for a kernel that is called once for a whole
+    motion: it takes 26 us more to call, and no second kernel around it to compile.
+    """
+    if not available():
+        return Inputs(packed.p, packed.tables, state)
+    p, s = record(packed.p).memory, record(state).memory
+    return Inputs(p[0] if bare else p, arrays(packed.tables), s[0] if bare else s)
 
 
 class PlantNoise(Protocol):
@@ -53,7 +70,7 @@ class PlantNoise(Protocol):
 
 
 class PlantModel(Protocol):
-    """What a plant asks of an axis model: its flat parameters, and what is not among them."""
+    """What a plant asks of an axis model: its parameters, and what is not among them."""
 
     @property
     def noise(self) -> PlantNoise | None:
@@ -67,8 +84,13 @@ class PlantModel(Protocol):
     def start_temperature_c(self) -> float:
         """Temperature of the joint before it moves, degC."""
 
-    def pack(self) -> Sequence[float]:
-        """The parameters in the order of `servod.kernels.physics.layout`."""
+    def pack(self) -> PackedPlant:
+        """The parameters by name, and the rows of their tables."""
+
+
+def encoder_reading(p: PlantParameters, tables: Tables, s: PlantState, owed_s: float) -> float:
+    """What an ideal encoder shows `owed_s` after the last inner step."""
+    return encoder_position(p, tables, s.position + owed_s * s.velocity)
 
 
 class Plant:
@@ -87,21 +109,23 @@ class Plant:
         self._noise = model.noise
         self._noise_torque_nm = 0.0
         self._owed_s = 0.0
-        state = rest_state(self.delay_s, INNER_STEP_S, model.start_temperature_c)
-        self._bind(model.pack(), state, available() if compile_kernel is None else compile_kernel)
+        self._bind(model.pack(), available() if compile_kernel is None else compile_kernel)
         self._draw_readings()
 
-    def _bind(self, parameters: Sequence[float], state: list[float], compile_kernel: bool) -> None:
-        self._p: Any = parameters
-        self._s: Any = state
-        self._advance, self._encoder = advance, encoder_position
+    def _bind(self, packed: PackedPlant, compile_kernel: bool) -> None:
+        self._s: Any = PlantState(temperature_c=self.model.start_temperature_c)
+        self._inputs = Inputs(packed.p, packed.tables, self._s)
+        self._line: Any = delay_line(self.delay_s, INNER_STEP_S)
+        self._advance, self._encoder = advance, encoder_reading
         if compile_kernel:
             import numpy as np
 
-            self._p, self._s = np.array(parameters), np.array(state)
-            self._advance, self._encoder = compiled(advance), compiled(encoder_position)
-            self._advance(self._p, self._s.copy(), 0.0, 0.0, 0, INNER_STEP_S, self.delay_s, math.nan)
-            self._encoder(self._p, 0.0)
+            self._s, state = record(self._s)
+            self._inputs = Inputs(record(packed.p).memory, arrays(packed.tables), state)
+            self._line = np.array(self._line)
+            self._advance, self._encoder = entry(advance), entry(encoder_reading)
+            self._advance(*self._inputs, self._line, 0.0, 0.0, 0, INNER_STEP_S, self.delay_s, math.nan)
+            self._encoder(*self._inputs, 0.0)
 
     def advance(self, torque_nm: float, duration_s: float, external_nm: float = 0.0) -> None:
         """Let `duration_s` pass under the held command `torque_nm`; `external_nm` acts beside it without delay.
@@ -112,14 +136,14 @@ class Plant:
         steps = int(self._owed_s / INNER_STEP_S + 1e-6)
         self._owed_s -= steps * INNER_STEP_S
         external_nm += self._next_noise(duration_s)
-        self._advance(self._p, self._s, torque_nm, external_nm, steps, INNER_STEP_S, self.delay_s, math.nan)
+        self._advance(*self._inputs, self._line, torque_nm, external_nm, steps, INNER_STEP_S, self.delay_s, math.nan)
         self._draw_readings()
 
     def place(self, position_rad: float, velocity_rad_s: float = 0.0) -> None:
         """Put the joint somewhere, bristle relaxed; motor and load together."""
-        self._s[lay.S_POSITION] = self._s[lay.S_LOAD_POSITION] = position_rad
-        self._s[lay.S_VELOCITY] = self._s[lay.S_LOAD_VELOCITY] = velocity_rad_s
-        self._s[lay.S_BRISTLE] = 0.0
+        self._s.position = self._s.load_position = position_rad
+        self._s.velocity = self._s.load_velocity = velocity_rad_s
+        self._s.bristle = 0.0
 
     def _next_noise(self, duration_s: float) -> float:
         """Low-passed white torque noise (Ornstein-Uhlenbeck, exact over `duration_s`)."""
@@ -140,39 +164,39 @@ class Plant:
     @property
     def position_rad(self) -> float:
         """True joint position: the load's where the joint is elastic or has a gap."""
-        return float(self._s[lay.S_LOAD_POSITION]) + self._owed_s * float(self._s[lay.S_LOAD_VELOCITY])
+        return float(self._s.load_position) + self._owed_s * float(self._s.load_velocity)
 
     @property
     def velocity_rad_s(self) -> float:
         """True joint velocity, load side."""
-        return float(self._s[lay.S_LOAD_VELOCITY])
+        return float(self._s.load_velocity)
 
     @property
     def motor_position_rad(self) -> float:
         """True position of the motor side, in joint coordinates."""
-        return float(self._s[lay.S_POSITION]) + self._owed_s * float(self._s[lay.S_VELOCITY])
+        return float(self._s.position) + self._owed_s * float(self._s.velocity)
 
     @property
     def motor_velocity_rad_s(self) -> float:
         """True velocity of the motor side, in joint coordinates."""
-        return float(self._s[lay.S_VELOCITY])
+        return float(self._s.velocity)
 
     @property
     def encoder_position_rad(self) -> float:
         """What the encoder on the motor side sees before counting: eccentricity and reading noise included."""
-        return float(self._encoder(self._p, self.motor_position_rad)) + self._encoder_noise_rad
+        return float(self._encoder(*self._inputs, self._owed_s)) + self._encoder_noise_rad
 
     @property
     def temperature_c(self) -> float:
         """Measured joint temperature, reading noise included."""
-        return float(self._s[lay.S_TEMPERATURE_C]) + self._temperature_noise_c
+        return float(self._s.temperature_c) + self._temperature_noise_c
 
     @property
     def friction_nm(self) -> float:
         """True friction torque of the last inner step."""
-        return float(self._s[lay.S_FRICTION])
+        return float(self._s.friction)
 
     @property
     def time_s(self) -> float:
         """Time that has passed since the start."""
-        return float(self._s[lay.S_TIME_S]) + self._owed_s
+        return float(self._s.time_s) + self._owed_s

@@ -8,7 +8,6 @@ window comes from the recording alone: position and velocity from a local cubic 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -17,8 +16,8 @@ from numpy.typing import NDArray
 
 from servod.formats.model.axis_model import AxisModel
 from servod.kernels.physics.compiled import Kernel, available, compiled
-from servod.kernels.physics.layout import P_DELAY_S, P_START_C, S_FIRST_S
-from servod.kernels.physics.plant import INNER_STEP_S, rest_state
+from servod.kernels.physics.layout import PackedPlant, PlantState
+from servod.kernels.physics.plant import INNER_STEP_S, delay_line, inputs
 from servod.lab.simulate import open_loop
 from servod.lab.simulate.motion import FirstRow, Start, first_row, smoothed_motion
 
@@ -103,20 +102,21 @@ def _kernel(function: Kernel) -> Kernel:
     return compiled(function) if available() else function
 
 
-def _hidden_motion(parameters: Array, drive: Drive, first: FirstRow, state: Array, starts: NDArray[np.int64]) -> Array:
+def _hidden_motion(packed: PackedPlant, drive: Drive, first: FirstRow, starts: NDArray[np.int64]) -> Array:
     """State at the rows `starts`: position, velocity, bristle, load position, load velocity, actuator torque."""
     motion = drive.motion[:, :3].copy()
     motion[0] = first.motion
-    _kernel(open_loop.recorded_motion)(parameters, motion)
+    at_rest = inputs(packed, PlantState(temperature_c=packed.p.start_c), bare=True)
+    _kernel(open_loop.recorded_motion)(*at_rest, motion)
     hidden = np.zeros((len(drive.t_s), 4))
     step_s = min(4.0 * INNER_STEP_S, drive.period_s)
     rows = drive.t_s, motion, drive.torque, first.command_before, drive.temperature_c
-    _kernel(open_loop.follow)(parameters, state, *rows, hidden, step_s)
+    _kernel(open_loop.follow)(*at_rest, *rows, hidden, step_s)
     return np.column_stack([motion[starts, :2], hidden[starts]])
 
 
 def replay(
-    model: AxisModel | Sequence[float],
+    model: AxisModel | PackedPlant,
     drive: Drive,
     horizon_s: float | None,
     *,
@@ -129,14 +129,14 @@ def replay(
     axis that was just set off counts as at rest in a free run only (`first_row`). Without numba
     the same source runs in pure Python.
     """
-    parameters = np.array(model.pack() if isinstance(model, AxisModel) else model, dtype=np.float64)
+    packed = model.pack() if isinstance(model, AxisModel) else model
     starts = window_starts(drive.t_s, horizon_s)
     rows = drive.t_s, drive.torque, drive.position, drive.motion
-    first = first_row(start, *rows, float(parameters[P_DELAY_S]), free=horizon_s is None)
-    state = np.array(rest_state(0.0, inner_step_s, parameters[P_START_C]))
-    states = _hidden_motion(parameters, drive, first, state.copy(), starts)
-    state[S_FIRST_S] = drive.t_s[0]
+    first = first_row(start, *rows, packed.p.delay_s, free=horizon_s is None)
+    states = _hidden_motion(packed, drive, first, starts)
+    begun = inputs(packed, PlantState(temperature_c=packed.p.start_c, first_s=float(drive.t_s[0])), bare=True)
+    line = np.array(delay_line(0.0, inner_step_s))
     out = np.zeros((len(drive.t_s), 3))
     held = drive.t_s, drive.torque, first.command_before, drive.temperature_c
-    _kernel(open_loop.run)(parameters, state, *held, starts, states, out, inner_step_s)
+    _kernel(open_loop.run)(*begun, line, *held, starts, states, out, inner_step_s)
     return Replay(out[:, 0], out[:, 1], out[:, 2], starts, first.at_rest, out[:, 0] - drive.position)

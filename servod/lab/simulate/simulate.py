@@ -15,12 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.formats.model.axis_model import AxisModel
-from servod.kernels.physics.compiled import Kernel, available, bound, compiled
+from servod.kernels.laws import Law
+from servod.kernels.laws.state import LawState
+from servod.kernels.physics.compiled import arrays, available, bound, compiled, record
 from servod.kernels.physics.dynamics import advance
 from servod.kernels.physics.effects import encoder_position
-from servod.kernels.physics.friction import Params
-from servod.kernels.physics.layout import S_BRISTLE, S_LOAD_POSITION, S_LOAD_VELOCITY, S_POSITION, S_VELOCITY
-from servod.kernels.physics.plant import INNER_STEP_S, rest_state
+from servod.kernels.physics.layout import PlantParameters, PlantState, Tables
+from servod.kernels.physics.plant import INNER_STEP_S, delay_line, inputs
 
 # The closed loop as a kernel: axis, encoder, velocity filter, delay and any control law, sample by sample.
 #
@@ -57,8 +58,10 @@ def control_law(
 
 
 def run(
-    p: Params,
-    s: Any,
+    p: PlantParameters,
+    tables: Tables,
+    s: PlantState,
+    line: Any,
     gains: Any,
     law_state: Any,
     reference: Any,
@@ -79,19 +82,19 @@ def run(
     torque that was applied after `limit_nm`.
     """
     kept = math.exp(-2.0 * math.pi * cutoff_hz * dt)
-    applied, filtered = 0.0, s[S_VELOCITY]
-    seen = quantised(encoder_position(p, s[S_POSITION]) + reading[0], resolution_rad)
+    applied, filtered = 0.0, s.velocity
+    seen = quantised(encoder_position(p, tables, s.position) + reading[0], resolution_rad)
     for k in range(len(reference)):
-        last, seen = seen, quantised(encoder_position(p, s[S_POSITION]) + reading[k], resolution_rad)
+        last, seen = seen, quantised(encoder_position(p, tables, s.position) + reading[k], resolution_rad)
         if k > 0:
             filtered = kept * filtered + (1.0 - kept) * (seen - last) / dt
         x_ref, v_ref, a_ref = reference[k][0], reference[k][1], reference[k][2]
         asked = control_law(gains, law_state, x_ref, v_ref, a_ref, seen, filtered, applied, dt)
         applied = min(max(asked[0], -limit_nm), limit_nm)
         row = out[k]
-        row[0], row[1], row[2], row[3] = s[S_LOAD_POSITION], seen, filtered, s[S_VELOCITY]
+        row[0], row[1], row[2], row[3] = s.load_position, seen, filtered, s.velocity
         row[4], row[5], row[6], row[7] = applied, asked[1], asked[2], asked[3]
-        advance(p, s, applied, external[k], steps, dt / steps, delay_s, math.nan)
+        advance(p, tables, s, line, applied, external[k], steps, dt / steps, delay_s, math.nan)
 
 
 def quantised(position_rad: float, resolution_rad: float) -> float:
@@ -102,9 +105,6 @@ def quantised(position_rad: float, resolution_rad: float) -> float:
 
 
 Array = NDArray[np.float64]
-
-#: Room for a law's state, which no law fills.
-LAW_STATES = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +129,7 @@ class ClosedLoopRun:
     """One simulated motion, a value for each sample; torques in N*m, positions in rad.
 
     `position_rad` is the true joint (load) position, `encoder_rad` what the law saw, `velocity_rad_s` the filtered
-    velocity that it saw. `state` is the plant's at the end (`servod.kernels.physics.layout`).
+    velocity that it saw.
     """
 
     t_s: Array
@@ -142,7 +142,6 @@ class ClosedLoopRun:
     feedback_nm: Array
     friction_nm: Array
     other_nm: Array
-    state: Array
 
     def tracking_error_rad(self, after_s: float = 0.0) -> Array:
         """Reference minus true position, from `after_s` on."""
@@ -151,7 +150,7 @@ class ClosedLoopRun:
 
 def simulate_closed_loop(
     model: AxisModel,
-    law: Kernel,
+    law: Law,
     gains: Sequence[float],
     reference: Array,
     settings: LoopSettings | None = None,
@@ -162,7 +161,7 @@ def simulate_closed_loop(
 ) -> ClosedLoopRun:
     """Run `model` under `law` along `reference` (rows of position, velocity, acceleration, one for each sample).
 
-    `law` is a step function of `servod.kernels.laws`; `gains` its flat parameters. `external_nm` acts beside the
+    `gains` are the flat parameters of `law`, as a gain set packs them. `external_nm` acts beside the
     command, `reading_rad` is the error of each encoder reading; `start` is (position, velocity, bristle deflection), by
     default at rest on the reference's first position.
     """
@@ -171,15 +170,19 @@ def simulate_closed_loop(
     disturbed = _samples(external_nm, len(reference)), _samples(reading_rad, len(reference))
     delay_s = model.total_delay_s if settings.delay_s is None else settings.delay_s
     steps = max(1, math.ceil(settings.period_s / settings.inner_step_s - 1e-9))
-    state = _start_state(model, start or (float(reference[0, 0]), 0.0, 0.0), delay_s, settings.period_s / steps)
+    axis = inputs(model.pack(), _start_state(model, start or (float(reference[0, 0]), 0.0, 0.0)), bare=True)
+    line = np.array(delay_line(delay_s, settings.period_s / steps))
     out = np.zeros((len(reference), len(OUTPUTS)))
-    kernel = compiled(run, control_law=law) if available() else bound(run, control_law=law)
-    loop = np.array(gains, dtype=np.float64), np.zeros(LAW_STATES)
+    named, law_state = law.named(tuple(float(value) for value in gains)), LawState()
+    if available():
+        kernel, loop = compiled(run, control_law=law.step), (arrays(named), record(law_state).memory[0])
+    else:
+        kernel, loop = bound(run, control_law=law.step), (named, law_state)
     around = settings.resolution_rad, settings.velocity_cutoff_hz, settings.torque_limit_nm
-    kernel(np.array(model.pack()), state, *loop, reference, *disturbed, out, settings.period_s, steps, delay_s, *around)
+    kernel(*axis, line, *loop, reference, *disturbed, out, settings.period_s, steps, delay_s, *around)
     columns = {name: out[:, i] for i, name in enumerate(OUTPUTS)}
     t_s: Array = np.arange(len(reference), dtype=np.float64) * settings.period_s
-    return ClosedLoopRun(t_s=t_s, reference_rad=reference[:, 0], state=state, **columns)
+    return ClosedLoopRun(t_s=t_s, reference_rad=reference[:, 0], **columns)
 
 
 def _samples(values: Array | None, count: int) -> Array:
@@ -187,10 +190,14 @@ def _samples(values: Array | None, count: int) -> Array:
     return np.zeros(count) if values is None else np.asarray(values, dtype=np.float64)
 
 
-def _start_state(model: AxisModel, start: tuple[float, float, float], delay_s: float, step_s: float) -> Array:
+def _start_state(model: AxisModel, start: tuple[float, float, float]) -> PlantState:
     """The plant's state at (position, velocity, bristle deflection), motor and load together."""
-    state = np.array(rest_state(delay_s, step_s, model.start_temperature_c))
-    state[[S_POSITION, S_LOAD_POSITION]] = start[0]
-    state[[S_VELOCITY, S_LOAD_VELOCITY]] = start[1]
-    state[S_BRISTLE] = start[2]
-    return state
+    position, velocity, bristle = start
+    return PlantState(
+        position=position,
+        velocity=velocity,
+        bristle=bristle,
+        load_position=position,
+        load_velocity=velocity,
+        temperature_c=model.start_temperature_c,
+    )

@@ -343,7 +343,7 @@ def run(model: AxisModel, gains: GainSet, rows: Array, settings: LoopSettings, s
     torque, reading = noise_series(model.noise, len(rows), settings.period_s, seed)
     return simulate_closed_loop(
         model,
-        gains.law.step,
+        gains.law,
         gains.pack(),
         rows,
         settings,

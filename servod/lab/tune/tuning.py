@@ -128,7 +128,7 @@ class Trial:
         plant, (torque, reading), law = self.plants[index], self.noise[index], LAWS[parameters.law]
         run = simulate_closed_loop(
             plant,
-            law.step,
+            law,
             parameters.pack(),
             self.motion,
             self.axis.plan.loop,

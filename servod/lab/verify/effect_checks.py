@@ -382,7 +382,7 @@ def _loads(model: AxisModel, level: Level) -> Iterator[Behind]:
     assert spring is not None
     stiffnesses = [share * spring.stiffness for share in (GAP_SHARES if gap else (1.0,))]
     if elastic is not None and elastic.cubic > 0.0:
-        into = static_stretch(level.friction.packed, level.torque_nm) - (0.5 * gap.gap if gap else 0.0)
+        into = static_stretch(level.friction.packed.p, level.torque_nm) - (0.5 * gap.gap if gap else 0.0)
         stiffnesses.append(spring.stiffness + 3.0 * elastic.cubic * into**2)
     for stiffness in stiffnesses:
         damping = spring.damping * min(stiffness / spring.stiffness, 1.0)

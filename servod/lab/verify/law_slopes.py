@@ -5,12 +5,12 @@ Under the closed loop; whatever a law has in it is in its slopes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
 from servod.kernels.laws import Law
-from servod.kernels.laws.state import ASKED, FRICTION_STATE, LAST_VELOCITY, N_STATES, REST, STARTED
+from servod.kernels.laws.state import N_STATES, STATES, LawState
 from servod.lab.verify.sampled import Array, Timing
 
 SETTLE_CYCLES = 100  # at most, after the first long one
@@ -44,16 +44,15 @@ class LawSlopes:
         return replace(self, frozen=(*self.frozen, *self.autonomous))
 
 
-def settled_state(law: Law, gains: tuple[float, ...], velocity: float, moves: bool, period_s: float) -> list[float]:
+def settled_state(law: Law, gains: tuple[float, ...], velocity: float, moves: bool, period_s: float) -> LawState:
     """State of the law in steady motion without error: what it settles to when fed its own torque."""
-    state = [0.0] * N_STATES
-    state[LAST_VELOCITY] = velocity
+    p, state = law.named(gains), LawState(last_velocity=velocity)
     nudge = np.finfo(float).tiny if moves else 0.0
     for cycle in range(SETTLE_CYCLES):
-        before = list(state)
+        before = astuple(state)
         dt = period_s if cycle else LONG_S
-        law.step(gains, state, 0.0, velocity, nudge, 0.0, velocity, state[ASKED], dt)
-        if max(abs(x - y) for x, y in zip(before, state, strict=True)) < 1e-15:
+        law.step(p, state, 0.0, velocity, nudge, 0.0, velocity, state.asked, dt)
+        if max(abs(x - y) for x, y in zip(before, astuple(state), strict=True)) < 1e-15:
             break
     return state
 
@@ -72,23 +71,23 @@ def arriving_slopes(
 
     `rest`: how far it counts as at rest, from 0, as on its way there, to 1, as when it stood and was pushed.
     """
-    base = [0.0] * N_STATES
-    base[LAST_VELOCITY], base[STARTED], base[REST] = velocity, 1.0, rest
+    base = LawState(last_velocity=velocity, started=1.0, rest=rest)
     return _differences(law, gains, base, (error_rad, 0.0, 0.0, velocity), timing)
 
 
 def _differences(
-    law: Law, gains: tuple[float, ...], base: list[float], around: tuple[float, float, float, float], timing: Timing
+    law: Law, gains: tuple[float, ...], base: LawState, around: tuple[float, float, float, float], timing: Timing
 ) -> LawSlopes:
     """Central differences of the law's step around (error, reference's velocity and acceleration, velocity)."""
     error, v_ref, a_ref, velocity = around
+    p, start = law.named(gains), astuple(base)
     scale = np.full(N_STATES, NUDGE)
-    scale[FRICTION_STATE] = NUDGE * max(abs(base[FRICTION_STATE]), 1e-4)
+    scale[STATES.index("z_hat")] = NUDGE * max(abs(base.z_hat), 1e-4)
 
     def stepped(x: float, v: float, shift: Array) -> Array:
-        state = [value + float(extra) for value, extra in zip(base, shift, strict=True)]
-        u = law.step(gains, state, error, v_ref, a_ref, x, velocity + v, state[ASKED], timing.period_s)[0]
-        return np.array([u, *state])
+        state = LawState(*(value + float(extra) for value, extra in zip(start, shift, strict=True)))
+        u = law.step(p, state, error, v_ref, a_ref, x, velocity + v, state.asked, timing.period_s)[0]
+        return np.array([u, *astuple(state)])
 
     still, dx = np.zeros(N_STATES), max(1e-10, NUDGE * abs(error))
     columns = [

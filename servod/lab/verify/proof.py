@@ -119,7 +119,7 @@ def gain_difference(own: RegionGains, proof: RegionProof, input_scale_nm: float)
     """Largest relative difference of the law's gains from the proven feedback; k_z, which no proof has, is to be 0."""
     size = len(proof.feedback)
     proven = -np.array(proof.feedback) * proof.torque_scale_nm / np.array(proof.scale[:size])
-    used = np.array([own.k_x_per_rad * input_scale_nm, own.k_v_s_per_rad * input_scale_nm, *own.pack_memory()])
+    used = np.array([own.k_x_per_rad * input_scale_nm, own.k_v_s_per_rad * input_scale_nm, *own.memory])
     rest = abs(own.k_z_per_rad) + float(np.abs(used[size:]).sum())
     return float(np.abs(used[:size] / proven - 1.0).max()) + rest
 

@@ -71,11 +71,11 @@ class ContinuousVertex:
 def polytope(friction: SteadyFriction, law: LocalFriction, span: Span, u: Uncertainty) -> Polytope:
     """The polytope of a region: what the law's local sets do there, against the model within its intervals."""
     nodes = [s.velocity_rad_s for s in law.sets]
-    packed = [*nodes, *(s.decay_per_s for s in law.sets), *(s.gain for s in law.sets)]
+    sets = law.named()
     edges = [side * speed for side in (1.0, -1.0) for speed in (span.from_rad_s, span.to_rad_s)]
     inside = [v for v in nodes if span.from_rad_s <= abs(v) <= span.to_rad_s]
     shape = float(Shape[law.weights.name])
-    at = [blended(packed, 0, len(nodes), shape, v) for v in (*edges, *inside)]
+    at = [blended(sets, shape, v) for v in (*edges, *inside)]
     decays = [max(decay, law.leak_per_s) for decay, _ in at]
     stiff = [friction.stiffness * end - law.stiffness_nm_per_rad for end in ends(u.stiffness)]
     viscous = [friction.viscous(v) * end - law.viscous_nms_per_rad for v in edges for end in ends(u.viscous)]

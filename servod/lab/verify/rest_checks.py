@@ -134,7 +134,7 @@ def loaded(s: Subject, gains: GainSet, plant: AxisModel, load_nm: Array) -> Arra
     torque, reading = noise_series(noise_of(plant, settings.resolution_rad), n, design.period_s, s.seed)
     run = simulate_closed_loop(
         plant,
-        gains.law.step,
+        gains.law,
         gains.pack(),
         np.zeros((n, 3)),
         settings,

@@ -14,16 +14,7 @@ from servod.formats.model.axis_model import AxisModel, wave_number
 from servod.formats.model.identified import IdentifiedValue
 from servod.kernels.physics.effects import nonlinear_viscous
 from servod.kernels.physics.friction import directed_curve
-from servod.kernels.physics.layout import (
-    P_INERTIA,
-    P_LOAD_INERTIA,
-    P_NEGATIVE_VISCOUS,
-    P_POSITIVE_VISCOUS,
-    P_SIGMA0,
-    P_SIGMA1,
-    P_SIGMA1_VELOCITY,
-    P_VISCOUS,
-)
+from servod.kernels.physics.layout import PackedPlant
 
 SLOPE_STEP = 1e-3  # share of the velocity over which slopes are taken
 
@@ -52,29 +43,29 @@ class FittedCurve:
 class SteadyFriction:
     """The friction of one axis model over velocity; torques in N*m of command, slopes in N*m*s/rad."""
 
-    packed: tuple[float, ...]
+    packed: PackedPlant
     gain: float
     fitted: tuple[FittedCurve, FittedCurve] | None = None  # of positive and negative velocity, in torques of the joint
 
     @property
     def inertia(self) -> float:
         """All that moves, per unit of torque gain [kg*m^2]."""
-        return (self.packed[P_INERTIA] + self.packed[P_LOAD_INERTIA]) / self.gain
+        return (self.packed.p.inertia + self.packed.p.load_inertia) / self.gain
 
     @property
     def stiffness(self) -> float:
         """Bristle stiffness c0 = sigma0 [N*m/rad]."""
-        return self.packed[P_SIGMA0] / self.gain
+        return self.packed.p.sigma0 / self.gain
 
     def dry(self, velocity: float) -> float:
         """g(v) > 0 of (18) with asymmetry: what the bristle settles to at steady velocity."""
-        return directed_curve(self.packed, velocity) / self.gain
+        return directed_curve(*self.packed, velocity) / self.gain
 
     def viscous(self, velocity: float) -> float:
         """Viscous coefficient at `velocity`, with asymmetry and what is not a line in it."""
-        p = self.packed
-        side = p[P_POSITIVE_VISCOUS] if velocity >= 0.0 else p[P_NEGATIVE_VISCOUS]
-        return max(p[P_VISCOUS] * side + nonlinear_viscous(p, velocity), 0.0) / self.gain
+        p = self.packed.p
+        side = p.positive_viscous if velocity >= 0.0 else p.negative_viscous
+        return max(p.viscous * side + nonlinear_viscous(p, velocity), 0.0) / self.gain
 
     def torque(self, velocity: float) -> float:
         """Steady friction with the velocity's sign: the friction-velocity map (7)."""
@@ -95,10 +86,10 @@ class SteadyFriction:
 
     def damping(self, velocity: float) -> float:
         """Bristle damping sigma1 at `velocity`, as the simulator has it."""
-        p = self.packed
-        sigma1 = p[P_SIGMA1]
-        if p[P_SIGMA1_VELOCITY] > 0.0:
-            sigma1 *= math.exp(-((velocity / p[P_SIGMA1_VELOCITY]) ** 2))
+        p = self.packed.p
+        sigma1 = p.sigma1
+        if p.sigma1_velocity > 0.0:
+            sigma1 *= math.exp(-((velocity / p.sigma1_velocity) ** 2))
         return sigma1 / self.gain
 
     def largest(self, speed: float) -> float:
@@ -110,7 +101,7 @@ class SteadyFriction:
 def steady_friction(model: AxisModel, where: str = "model") -> SteadyFriction:
     """The steady friction of `model`. Raises BadInput when the model has no bristle stiffness to compensate."""
     packed = model.pack()
-    if packed[P_SIGMA0] <= 0.0:
+    if packed.p.sigma0 <= 0.0:
         raise BadInput(f"{where}: friction.kind", model.friction.kind, "a kind with bristle stiffness: lugre or local")
     gain = model.torque_gain
     factor = 1.0 if gain is None else math.sqrt(gain.factor * (gain.negative_factor or gain.factor))

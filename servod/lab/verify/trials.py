@@ -145,7 +145,7 @@ def simulated(gains: GainSet, design: Design, plant: AxisModel, motion: Array, s
     torque, reading = noise_series(noise, len(motion), design.period_s, seed)
     run = simulate_closed_loop(
         plant,
-        gains.law.step,
+        gains.law,
         gains.pack(),
         motion,
         settings,

@@ -191,7 +191,7 @@ def simulated(
     torque, reading = noise_series(plant.noise, len(rest) + len(rows), design.period_s, seed)
     run = simulate_closed_loop(
         plant,
-        gains.law.step,
+        gains.law,
         gains.pack(),
         np.concatenate([rest, rows]),
         LoopSettings(design.period_s, design.counts_per_turn, design.velocity_cutoff_hz, scale_of(design).torque_nm),

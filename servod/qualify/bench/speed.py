@@ -66,7 +66,7 @@ def simulated(duration_s: float) -> float:
     reference = np.stack(
         [0.05 * np.sin(w * time_s), 0.05 * w * np.cos(w * time_s), -0.05 * w * w * np.sin(w * time_s)], 1
     )
-    simulate_closed_loop(model, gains.law.step, gains.pack(), reference[:1000])
+    simulate_closed_loop(model, gains.law, gains.pack(), reference[:1000])
     started = time.perf_counter()
-    simulate_closed_loop(model, gains.law.step, gains.pack(), reference)
+    simulate_closed_loop(model, gains.law, gains.pack(), reference)
     return duration_s / (time.perf_counter() - started)

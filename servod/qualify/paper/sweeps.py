@@ -53,7 +53,7 @@ def simulate(plant: AxisModel, gains: GainSet, rows: Array, external_nm: Array |
     """One motion on the compiled simulator, with encoder, velocity filter and torque limit of the virtual axis."""
     limit_nm = PEAK_RATIO * rated_torque_mnm(plant) * 1e-3
     settings = LoopSettings(PERIOD_S, ENCODER_COUNTS, cutoff_of(gains), limit_nm)
-    return simulate_closed_loop(plant, gains.law.step, gains.pack(), rows, settings, external_nm=external_nm)
+    return simulate_closed_loop(plant, gains.law, gains.pack(), rows, settings, external_nm=external_nm)
 
 
 def rms_mrad(plant: AxisModel, gains: GainSet, seconds: float, external_nm: Array | None = None) -> float:

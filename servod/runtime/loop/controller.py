@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from servod.kernels.laws import LAW_BY_NUMBER, LAWS, Law
-from servod.kernels.laws.state import ASKED, DISTURBANCE, FRICTION_STATE
+from servod.kernels.laws.state import LawState
 
 #: Time constant of the additive offset that makes a change of controller bumpless [s].
 BUMPLESS_TIME_S = 0.1
@@ -32,8 +32,8 @@ class Controller:
     def __init__(self, bumpless_time_s: float = BUMPLESS_TIME_S) -> None:
         self._bumpless_time_s = bumpless_time_s
         self._law = LAWS["pd"]
-        self._parameters: tuple[float, ...] = (0.0,) * self._law.n_parameters
-        self._state = [0.0] * self._law.n_states
+        self._parameters = self._law.named((0.0,) * self._law.n_parameters)
+        self._state = LawState()
         self._offset_nm = 0.0
         self._hand_over_nm: float | None = None
 
@@ -45,12 +45,12 @@ class Controller:
     @property
     def friction_state(self) -> float:
         """Estimated bristle deflection z_hat in rad; 0.0 where the law has none."""
-        return self._state[FRICTION_STATE]
+        return self._state.z_hat
 
     @property
     def disturbance(self) -> float:
         """Estimated disturbance in N*m; 0.0 where the law has none."""
-        return self._state[DISTURBANCE]
+        return self._state.d_hat
 
     def activate(self, law_number: int, parameters: Sequence[float], torque_now_nm: float) -> bool:
         """Change law or gains between two cycles; the next output is `torque_now_nm`, the torque that acts now.
@@ -62,26 +62,23 @@ class Controller:
         law = LAW_BY_NUMBER.get(law_number)
         if law is None or not law.accepts(parameters):
             return False
-        values = tuple(float(value) for value in parameters)
-        state = [0.0] * law.n_states
-        state[FRICTION_STATE] = self._carried_friction_state(law, values)
-        if law is self._law and math.isfinite(self._state[DISTURBANCE]):
-            state[DISTURBANCE] = self._state[DISTURBANCE]
-        state[ASKED] = torque_now_nm
-        self._law, self._parameters, self._state = law, values, state
+        named = law.named(tuple(float(value) for value in parameters))
+        state = LawState(z_hat=self._carried_friction_state(law, named), asked=torque_now_nm)
+        if law is self._law and math.isfinite(self._state.d_hat):
+            state.d_hat = self._state.d_hat
+        self._law, self._parameters, self._state = law, named, state
         self._offset_nm, self._hand_over_nm = 0.0, torque_now_nm
         return True
 
-    def _carried_friction_state(self, law: Law, parameters: Sequence[float]) -> float:
-        old, new = self._law.stiffness_index, law.stiffness_index
-        if old is None or new is None or not math.isfinite(self._state[FRICTION_STATE]) or parameters[new] == 0.0:
+    def _carried_friction_state(self, law: Law, parameters: Any) -> float:
+        z_hat, both = self._state.z_hat, self._law.has_friction_state and law.has_friction_state
+        if not both or not math.isfinite(z_hat) or parameters.stiffness == 0.0:
             return 0.0
-        return self._state[FRICTION_STATE] * self._parameters[old] / parameters[new]
+        return float(z_hat * self._parameters.stiffness / parameters.stiffness)
 
     def reset(self, torque_now_nm: float = 0.0) -> None:
         """Forget all states, e.g. at enable; the next output is `torque_now_nm`, as after `activate`."""
-        self._state = [0.0] * self._law.n_states
-        self._state[ASKED] = torque_now_nm
+        self._state = LawState(asked=torque_now_nm)
         self._offset_nm, self._hand_over_nm = 0.0, torque_now_nm
 
     def step(
@@ -111,5 +108,5 @@ class Controller:
             if abs(self._offset_nm) < NEGLIGIBLE_OFFSET_NM:
                 self._offset_nm = 0.0
         torque += self._offset_nm + added_nm
-        self._state[ASKED] = torque
+        self._state.asked = torque
         return ControllerOutput(torque, feedback, friction, other + self._offset_nm + added_nm)

@@ -79,15 +79,18 @@ def test_pack_of_the_local_law_is_what_the_kernel_reads() -> None:
     text = good.LOCAL.replace(
         "    sets:", "    velocity: reference\n    lead_s: 0.002\n    weights: gaussian\n    sets:"
     )
-    p = parse_gains(text, "good.yaml").pack()
-    assert p[local.INPUT_SCALE] == 0.1
-    assert p[local.LOW_K_Z : local.HIGH_K_V + 1] == (0.0, 1574.9, 0.241, 0.0, 197.0, 2.104)
-    assert (p[local.BLEND_FROM], p[local.BLEND_TO]) == (0.005, 0.02)
-    assert (p[local.STIFFNESS], p[local.VISCOUS], p[local.LEAK]) == (760.0, 0.056, 2.0)
-    assert p[local.STATE_LIMIT] == 0.12 / 760.0
-    assert (p[local.SOURCE], p[local.LEAD], p[local.SHAPE]) == (local.REFERENCE, 0.002, 2.0)
-    assert (p[local.HOLD_WITHIN], p[local.FEEDFORWARD_INERTIA], p[local.OBSERVER_BANDWIDTH]) == (0.0, 0.0, 0.0)
-    assert p[local.N_SETS :] == (3.0, -0.5, 0.0, 0.5, 8000.0, 0.0, 7000.0, 0.04, 0.0, 0.0)
+    flat = parse_gains(text, "good.yaml").pack()
+    p = local.LocalGains.from_flat(flat)
+    assert p.flat() == flat
+    assert p.input_scale == 0.1
+    assert flat[1:7] == (p.low_k_z, p.low_k_x, p.low_k_v, p.high_k_z, p.high_k_x, p.high_k_v)
+    assert flat[1:7] == (0.0, 1574.9, 0.241, 0.0, 197.0, 2.104)
+    assert (p.blend_from, p.blend_to) == (0.005, 0.02)
+    assert (p.stiffness, p.viscous, p.leak) == (760.0, 0.056, 2.0)
+    assert p.state_limit == 0.12 / 760.0
+    assert (p.source, p.lead, p.shape) == (local.REFERENCE, 0.002, 2.0)
+    assert (p.hold_within, p.feedforward_inertia, p.observer_bandwidth) == (0.0, 0.0, 0.0)
+    assert flat[local.N_SETS :] == (3.0, -0.5, 0.0, 0.5, 8000.0, 0.0, 7000.0, 0.04, 0.0, 0.0)
 
 
 def test_hash_sees_numbers_not_spelling() -> None:
@@ -240,8 +243,8 @@ def test_a_set_that_an_earlier_version_sealed_is_what_it_was() -> None:
     gains = parse_gains(text, "earlier")
     assert gains.certificate_problem() is None
     assert gains.to_yaml() == text
-    packed = gains.pack()
-    assert (packed[local.REST_WITHIN], packed[local.REST_SHARE]) == (0.0, 1.0)
+    p = local.LocalGains.from_flat(gains.pack())
+    assert (p.rest_within, p.rest_share) == (0.0, 1.0)
     require_fit(gains, load_config(shipped("gains/config/virtual.yaml")))
 
 
@@ -253,8 +256,8 @@ def test_an_observer_of_an_earlier_version_keeps_its_bandwidth_in_slow_motion(
     assert isinstance(parameters, LocalParameters) and parameters.disturbance_observer is not None
     bandwidths = {"low_bandwidth_rad_s": low, "low_moving_bandwidth_rad_s": moving}
     observer = parameters.disturbance_observer.model_copy(update=bandwidths)
-    pack = parameters.model_copy(update={"disturbance_observer": observer}).pack()
-    assert (pack[local.OBSERVER_BANDWIDTH], pack[local.OBSERVER_MOVING]) == (50.0, packed)
+    p = parameters.model_copy(update={"disturbance_observer": observer}).named()
+    assert (p.observer_bandwidth, p.observer_moving) == (50.0, packed)
 
 
 @pytest.mark.parametrize(

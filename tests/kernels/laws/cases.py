@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from servod.kernels.laws import LAWS, local
 
@@ -44,7 +45,10 @@ PARAMETERS: dict[str, tuple[float, ...]] = {
     "local": local_parameters(gain=0.04, bandwidth=50.0, leak=2.0),
 }
 
+#: The same by the names that the kernels read.
+GAINS: dict[str, Any] = {name: LAWS[name].named(p) for name, p in PARAMETERS.items()}
 
-def fresh_state(name: str) -> list[float]:
-    """State of a law before its first step."""
-    return [0.0] * LAWS[name].n_states
+
+def local_gains(**options: Any) -> local.LocalGains:
+    """`local_parameters` by name."""
+    return local.LocalGains.from_flat(local_parameters(**options))

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import astuple
 
-import numpy as np
 import pytest
 
 from servod.kernels.laws import LAWS
-from servod.kernels.laws.state import ASKED
+from servod.kernels.laws.position import PositionTorques
+from servod.kernels.laws.state import STATES, LawState
 from servod.kernels.laws.weights import Shape
-from servod.kernels.physics.compiled import compiled
-from tests.kernels.laws.cases import PARAMETERS, fresh_state, local_parameters
+from servod.kernels.physics.compiled import arrays, compiled, record
+from tests.kernels.laws.cases import GAINS, PARAMETERS, local_parameters
 
 CASES = {
     **PARAMETERS,
@@ -22,21 +23,35 @@ CASES = {
 
 @pytest.mark.parametrize("case", list(CASES))
 def test_compiled_equals_plain(case: str) -> None:
-    law, p = LAWS[case.split(maxsplit=1)[0]], CASES[case]
-    kernel, packed = compiled(law.step), np.array(p)
-    plain_state, state = fresh_state(law.name), np.zeros(law.n_states)
+    law = LAWS[case.split(maxsplit=1)[0]]
+    kernel, p = compiled(law.step), law.named(CASES[case])
+    plain_state, (state, memory) = LawState(), record(LawState())
     for k in range(400):
         t = k * 0.01
         v = 0.7 * math.sin(3.0 * t) ** 3
         arguments = (math.sin(t), math.cos(t), -math.sin(t), math.sin(t) - 1e-3 * math.cos(9 * t), v)
-        plain = law.step(p, plain_state, *arguments, plain_state[ASKED], 0.001)
-        assert kernel(packed, state, *arguments, state[ASKED], 0.001) == pytest.approx(plain, rel=1e-9, abs=1e-13)
-    assert list(state) == pytest.approx(plain_state, rel=1e-9, abs=1e-13)
+        plain = law.step(p, plain_state, *arguments, plain_state.asked, 0.001)
+        assert kernel(arrays(p), memory[0], *arguments, state.asked, 0.001) == pytest.approx(plain, rel=1e-9, abs=1e-13)
+    assert memory.tolist()[0] == pytest.approx(astuple(plain_state), rel=1e-9, abs=1e-13)
 
 
 def test_nan_comes_through_the_compiled_kernels_too() -> None:
-    for name, p in PARAMETERS.items():
+    for name, p in GAINS.items():
         torque = compiled(LAWS[name].step)(
-            np.array(p), np.zeros(LAWS[name].n_states), 0.0, 0.0, 0.0, 0.0, math.nan, 0.0, 0.001
+            arrays(p), record(LawState()).memory[0], 0.0, 0.0, 0.0, 0.0, math.nan, 0.0, 0.001
         )[0]
         assert math.isnan(torque)
+
+
+def test_a_record_is_one_memory_seen_from_both_sides() -> None:
+    names, memory = record(LawState(z_hat=0.25, rest=1.0))
+    assert memory.dtype.names == STATES
+    names.d_hat = 0.5
+    memory["asked"] = 0.125
+    assert (memory["z_hat"][0], memory["d_hat"][0], names.asked, names.rest) == (0.25, 0.5, 0.125, 1.0)
+
+
+def test_position_goes_flat_and_back() -> None:
+    p = GAINS["local"]._replace(knows_position=True, position=PositionTorques(lead=0.001, waves=(0.1, 36.0, 0.2)))
+    assert LAWS["local"].accepts(p.flat())
+    assert LAWS["local"].named(p.flat()) == p

@@ -7,9 +7,9 @@ import math
 
 import pytest
 
-from servod.kernels.laws import LAWS, MAX_PARAMETERS, MAX_SETS, LawNumber, local, pd_lugre
+from servod.kernels.laws import LAWS, MAX_PARAMETERS, MAX_SETS, LawNumber, local
 from servod.runtime.loop.controller import BUMPLESS_TIME_S, Controller
-from tests.kernels.laws.cases import PARAMETERS, SIGMA0, local_parameters
+from tests.kernels.laws.cases import PARAMETERS, SIGMA0, local_gains, local_parameters
 
 DT = 0.001
 
@@ -54,8 +54,7 @@ def test_friction_state_is_carried_over(old: str, new: str) -> None:
 def test_friction_state_is_carried_as_torque_when_the_stiffness_differs() -> None:
     controller, torque = running("local")
     before = controller.friction_state * SIGMA0
-    softer = list(local_parameters())
-    softer[local.STIFFNESS] = 0.8 * SIGMA0
+    softer = local_gains()._replace(stiffness=0.8 * SIGMA0).flat()
     controller.activate(LawNumber.LOCAL, softer, torque)
     assert controller.friction_state * 0.8 * SIGMA0 == pytest.approx(before)
 
@@ -105,7 +104,7 @@ def test_a_bumpless_offset_is_no_limit_to_the_anti_windup() -> None:
         (5, PARAMETERS["pd"]),
         (LawNumber.PD, PARAMETERS["pd"][:-1]),
         (LawNumber.PD_DOB, (*PARAMETERS["pd_dob"], 0.0)),
-        (LawNumber.PD_LUGRE, PARAMETERS["pd_lugre"][: pd_lugre.STATE_LIMIT]),
+        (LawNumber.PD_LUGRE, PARAMETERS["pd_lugre"][:-1]),
         (LawNumber.LOCAL, PARAMETERS["local"][:-1]),
         (LawNumber.LOCAL, PARAMETERS["local"][: local.N_SETS]),
         (LawNumber.LOCAL, (*PARAMETERS["local"][: local.N_SETS], math.nan, *PARAMETERS["local"][local.FIRST_NODE :])),

@@ -28,7 +28,7 @@ def trajectory_19(seconds: float = 30.0) -> Array:
 
 def run(gain_set: str, model: AxisModel, reference: Array, settings: LoopSettings = SETTINGS) -> ClosedLoopRun:
     gains = load_gains(GAINS / f"{gain_set}.yaml")
-    return simulate_closed_loop(model, gains.law.step, gains.pack(), reference, settings)
+    return simulate_closed_loop(model, gains.law, gains.pack(), reference, settings)
 
 
 def rms_mrad(gain_set: str, model: AxisModel, settings: LoopSettings = SETTINGS) -> float:

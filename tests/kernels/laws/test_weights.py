@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from servod.common.shipped import shipped
 from servod.formats.gains.gain_set import load_gains
-from servod.kernels.laws import local
-from servod.kernels.laws.weights import Shape, blended, weights
+from servod.kernels.laws.local import LocalGains
+from servod.kernels.laws.weights import Sets, Shape, blended, weights
 from tests.kernels.laws.cases import NODES
 
 shapes = st.sampled_from(list(Shape))
@@ -21,9 +21,9 @@ node_lists = st.lists(st.floats(1e-4, 1.0), min_size=1, max_size=6, unique_by=la
 )
 
 
-def shipped_set(name: str) -> tuple[float, ...]:
+def shipped_set(name: str) -> LocalGains:
     """Parameters of a local law that ships."""
-    return load_gains(shipped(f"gains/{name}.yaml")).pack()
+    return LocalGains.from_flat(load_gains(shipped(f"gains/{name}.yaml")).pack())
 
 
 @given(shape=shapes, nodes=node_lists, v=speeds)
@@ -45,14 +45,13 @@ def test_a_node_belongs_to_its_set_alone(shape: Shape, index: int) -> None:
 @pytest.mark.parametrize("index", range(len(NODES)))
 def test_nothing_jumps_at_a_node(shape: Shape, index: int) -> None:
     """Weights, decay and gain on both sides of a node, 1 nrad/s away, are those of the node."""
-    p = shipped_set("demo_local")
-    nodes = p[local.FIRST_NODE :][: int(p[local.N_SETS])]
-    node = nodes[index]
-    at = blended(p, local.FIRST_NODE, len(nodes), float(shape), node)
-    assert at == pytest.approx((p[local.FIRST_NODE + len(nodes) + index], p[local.FIRST_NODE + 2 * len(nodes) + index]))
+    sets = shipped_set("demo_local").sets
+    node = sets.nodes[index]
+    at = blended(sets, float(shape), node)
+    assert at == pytest.approx((sets.decays[index], sets.gains[index]))
     for side in (node - 1e-9, node + 1e-9):
-        assert weights(shape, nodes, side)[index] == pytest.approx(1.0, abs=1e-5)
-        assert blended(p, local.FIRST_NODE, len(nodes), float(shape), side) == pytest.approx(at, rel=1e-5, abs=1e-5)
+        assert weights(shape, sets.nodes, side)[index] == pytest.approx(1.0, abs=1e-5)
+        assert blended(sets, float(shape), side) == pytest.approx(at, rel=1e-5, abs=1e-5)
 
 
 @pytest.mark.parametrize("shape", list(Shape))
@@ -60,13 +59,11 @@ def test_nothing_jumps_at_a_node(shape: Shape, index: int) -> None:
 def test_the_compensated_friction_runs_between_the_values_of_the_map(name: str, shape: Shape) -> None:
     """c0*|v|/a(v) lies between the values at both neighbouring nodes, and moves from one to the other."""
     p = shipped_set(name)
-    n, first = int(p[local.N_SETS]), local.FIRST_NODE
-    nodes = p[first : first + n]
 
     def friction(v: float) -> float:
-        return p[local.STIFFNESS] * abs(v) / blended(p, first, n, float(shape), v)[0]
+        return p.stiffness * abs(v) / blended(p.sets, float(shape), v)[0]
 
-    for low, high in itertools.pairwise(nodes):
+    for low, high in itertools.pairwise(p.sets.nodes):
         if 0.0 in (low, high):
             continue
         steps = [friction(low + k / 50 * (high - low)) for k in range(51)]
@@ -78,9 +75,9 @@ def test_the_compensated_friction_runs_between_the_values_of_the_map(name: str, 
 @pytest.mark.parametrize("shape", list(Shape))
 def test_next_to_standstill_the_friction_of_the_slowest_set_holds(shape: Shape) -> None:
     """A node at rest with a decay of 0 takes nothing from the friction of its neighbour."""
-    p = (-0.01, 0.0, 0.01, 8.0, 0.0, 8.0, 0.0, 0.0, 0.0)
+    sets = Sets((-0.01, 0.0, 0.01), (8.0, 0.0, 8.0), (0.0, 0.0, 0.0))
     for v in (-0.009, -0.001, 1e-6, 0.002, 0.008):
-        assert abs(v) / blended(p, 0, 3, float(shape), v)[0] == pytest.approx(0.01 / 8.0)
+        assert abs(v) / blended(sets, float(shape), v)[0] == pytest.approx(0.01 / 8.0)
 
 
 @pytest.mark.parametrize("shape", list(Shape))
@@ -97,7 +94,7 @@ def test_blended_is_the_weighted_sum(shape: Shape, v: float) -> None:
     decays = [float(3 + i * i) for i in range(len(NODES))]
     gains = [0.1 * i - 0.3 for i in range(len(NODES))]
     mu = weights(shape, NODES, v)
-    decay, gain = blended((*NODES, *decays, *gains), 0, len(NODES), float(shape), v)
+    decay, gain = blended(Sets(NODES, decays, gains), float(shape), v)
     assert gain == pytest.approx(sum(m * g for m, g in zip(mu, gains, strict=True)), rel=1e-9, abs=1e-12)
     if shape is Shape.LINEAR:
         assert decay == pytest.approx(sum(m * a for m, a in zip(mu, decays, strict=True)), rel=1e-9)
@@ -106,12 +103,12 @@ def test_blended_is_the_weighted_sum(shape: Shape, v: float) -> None:
 @pytest.mark.parametrize("shape", list(Shape))
 @pytest.mark.parametrize(("v", "end"), [(-1.5, -0.5), (1.5, 0.5)])
 def test_beyond_the_last_node_the_friction_keeps_its_level(v: float, end: float, shape: Shape) -> None:
-    p = (*NODES, *(700.0 * abs(node) for node in NODES), *([0.0] * len(NODES)))
-    at_the_end, _ = blended(p, 0, len(NODES), float(shape), end)
-    beyond, _ = blended(p, 0, len(NODES), float(shape), v)
+    sets = Sets(NODES, [700.0 * abs(node) for node in NODES], [0.0] * len(NODES))
+    at_the_end, _ = blended(sets, float(shape), end)
+    beyond, _ = blended(sets, float(shape), v)
     assert abs(v) / beyond == pytest.approx(abs(end) / at_the_end)
 
 
 def test_nan_velocity_gives_nan_decay() -> None:
-    decay, _ = blended((*NODES, *([1.0] * 18)), 0, len(NODES), 0.0, float("nan"))
+    decay, _ = blended(Sets(NODES, [1.0] * 9, [1.0] * 9), 0.0, float("nan"))
     assert decay != decay  # noqa: PLR0124  (only NaN differs from itself)

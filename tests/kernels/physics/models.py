@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from servod.formats.model.axis_model import AxisModel
-from servod.kernels.physics import layout as lay
 from servod.kernels.physics.plant import Plant
 
 LUGRE: dict[str, Any] = {
@@ -48,7 +47,7 @@ def states(axis: Plant, torque_nm: float, duration_s: float, every_s: float = 1e
     for _ in range(round(duration_s / every_s)):
         axis.advance(torque_nm, every_s)
         s = axis._s
-        rows.append((s[lay.S_POSITION], s[lay.S_VELOCITY], s[lay.S_BRISTLE], s[lay.S_LOAD_POSITION]))
+        rows.append((s.position, s.velocity, s.bristle, s.load_position))
     return np.array(rows)
 
 

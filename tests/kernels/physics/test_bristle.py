@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from servod.kernels.physics import layout as lay
 from servod.kernels.physics.friction import bristle_step, coulomb_step, stribeck_curve
 from tests.kernels.physics.models import g, joint, plant, states
 
@@ -88,7 +87,7 @@ def test_bristle_stays_bounded(torques: list[float], h: float) -> None:
     p = joint().pack()
     for torque in torques:
         for _ in range(20):
-            dry = stribeck_curve(p, v)
+            dry = stribeck_curve(*p, v)
             v, z, _ = bristle_step(v, z, torque, 0.001, h, dry, 950.0, 1.0, 0.056)
             assert math.isfinite(v) and math.isfinite(z)
             assert abs(v) <= 3.0 / 0.056
@@ -152,4 +151,4 @@ def test_delay_line_delays_by_any_time() -> None:
         axis = plant(joint(friction={"kind": "coulomb_viscous"}, delay_s=delay))
         axis.advance(0.01, 0.05)
         assert axis.velocity_rad_s == pytest.approx(0.01 / 0.001 * (0.05 - delay), rel=1e-9)
-        assert len(axis._s) == lay.S_LINE + math.ceil(delay / 5e-5 + 1e-9) + 2
+        assert len(axis._line) == math.ceil(delay / 5e-5 + 1e-9) + 2

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from servod.kernels.physics import layout as lay
 from tests.kernels.physics.models import g, joint, period_s, plant, smooth, states
 
 SLIDER = {"inertia": 1e9}  # so heavy that it keeps its velocity: friction can be read off
@@ -50,7 +49,7 @@ def test_spring_oscillates_and_stiffens() -> None:
 def test_two_masses_resonate_and_keep_momentum() -> None:
     """omega = sqrt(k*(1/J_m + 1/J_l)); the centre of mass stays; the spring adds no numerical damping."""
     axis = plant(smooth(joint_elasticity={"load_inertia": 0.0004, "stiffness": 3.0}))
-    axis._s[lay.S_POSITION], axis._s[lay.S_LOAD_POSITION] = 0.02, -0.03
+    axis._s.position, axis._s.load_position = 0.02, -0.03
     rows = states(axis, 0.0, 2.0)
     stretch = rows[:, 0] - rows[:, 3]
     assert period_s(stretch, 1e-3) == pytest.approx(
@@ -128,10 +127,10 @@ def test_gain_limit_and_offset() -> None:
 def test_actuator_lag_and_slew() -> None:
     lag = plant(smooth(actuator_lag={"time_constant_s": 0.01}))
     lag.advance(0.02, 0.01)
-    assert lag._s[lay.S_TORQUE] == pytest.approx(0.02 * (1.0 - math.exp(-1.0)), rel=1e-9)
+    assert lag._s.torque == pytest.approx(0.02 * (1.0 - math.exp(-1.0)), rel=1e-9)
     slew = plant(smooth(actuator_lag={"slew_per_s": 0.5}))
     slew.advance(1.0, 0.01)
-    assert slew._s[lay.S_TORQUE] == pytest.approx(0.005, rel=1e-9)
+    assert slew._s.torque == pytest.approx(0.005, rel=1e-9)
 
 
 def test_friction_by_load_and_position() -> None:

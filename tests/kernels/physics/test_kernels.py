@@ -13,7 +13,9 @@ from scipy.integrate import solve_ivp
 
 from servod.formats.model.axis_model import AxisModel
 from servod.kernels.laws import LAWS
+from servod.kernels.laws.state import LawState
 from servod.kernels.physics.compiled import bound
+from servod.kernels.physics.layout import PlantState
 from servod.kernels.physics.plant import Plant
 from servod.lab.simulate.simulate import LoopSettings, run, simulate_closed_loop
 from tests.kernels.physics.models import LUGRE, joint, plant
@@ -183,18 +185,19 @@ def reference(duration_s: float) -> np.ndarray:
 def test_closed_loop_is_the_same_loop_in_pure_python() -> None:
     """The compiled simulator is the source around the law that the control loop runs."""
     law, gains, rows = LAWS["pd"], (2.5, 0.12, 0.0), reference(0.3)
-    fast = simulate_closed_loop(joint(delay_s=0.001), law.step, gains, rows)
-    from servod.kernels.physics.plant import INNER_STEP_S, rest_state
+    fast = simulate_closed_loop(joint(delay_s=0.001), law, gains, rows)
+    from servod.kernels.physics.plant import INNER_STEP_S, delay_line
 
     out = np.zeros((len(rows), 8))
     pure = bound(run, control_law=law.step)
     model = joint(delay_s=0.001)
     step = 2.0 * math.pi / 2.0**20
     pure(
-        model.pack(),
-        rest_state(0.001, INNER_STEP_S, 25.0),
-        gains,
-        [0.0] * 16,
+        *model.pack(),
+        PlantState(temperature_c=25.0),
+        delay_line(0.001, INNER_STEP_S),
+        law.named(gains),
+        LawState(),
         rows,
         np.zeros(len(rows)),
         np.zeros(len(rows)),
@@ -213,10 +216,10 @@ def test_closed_loop_is_the_same_loop_in_pure_python() -> None:
 def test_closed_loop_tracks_limits_and_counts() -> None:
     rows = reference(2.0)
     run_ = simulate_closed_loop(
-        joint(delay_s=0.001), LAWS["pd"].step, (2.5, 0.12, 0.0), rows, LoopSettings(torque_limit_nm=0.05)
+        joint(delay_s=0.001), LAWS["pd"], (2.5, 0.12, 0.0), rows, LoopSettings(torque_limit_nm=0.05)
     )
     assert np.max(np.abs(run_.torque_nm)) <= 0.05
     counts = run_.encoder_rad / (2.0 * math.pi / 2.0**20)
     assert np.allclose(counts, np.round(counts), atol=1e-6)
-    free = simulate_closed_loop(joint(delay_s=0.001), LAWS["pd"].step, (2.5, 0.12, 0.0), rows)
+    free = simulate_closed_loop(joint(delay_s=0.001), LAWS["pd"], (2.5, 0.12, 0.0), rows)
     assert 0.005 < np.sqrt(np.mean(free.tracking_error_rad(1.0) ** 2)) < 0.04

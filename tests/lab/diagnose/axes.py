@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.formats.model.axis_model import AxisKind, AxisModel
-from servod.kernels.laws import pd
+from servod.kernels.laws import LAWS
 from servod.lab.recordings import Quantity, Recording
 from servod.lab.simulate.simulate import LoopSettings, simulate_closed_loop
 
@@ -59,7 +59,7 @@ def record(model: AxisModel, seconds: float = 5.0, seed: int = 1, noise: float =
     for index, reference in enumerate(references(seconds)):
         external = noise * np.convolve(rng.normal(size=len(reference)), np.ones(5) / np.sqrt(5.0), mode="same")
         settings = LoopSettings(counts_per_turn=2.0**20)
-        run = simulate_closed_loop(model, pd.step, GAINS, reference, settings, external_nm=external)
+        run = simulate_closed_loop(model, LAWS["pd"], GAINS, reference, settings, external_nm=external)
         found.append(recording(run.t_s, run.torque_nm, run.encoder_rad, f"run{index}.csv"))
     return found
 

@@ -10,7 +10,7 @@ import pytest
 from servod.common.shipped import shipped
 from servod.formats.model.axis_model import AxisModel, load_axis_model
 from servod.formats.model.effects import Gravity
-from servod.kernels.laws import pd
+from servod.kernels.laws import LAWS
 from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.scene import Scene
@@ -79,7 +79,7 @@ def test_a_model_never_sticks_where_the_joint_slides_slowly() -> None:
     """Within the Stribeck curve of a stiff bristle an observer could hold a sticking model along for good."""
     true = load_axis_model(shipped("gains/axes/table1_joint.yaml")).model_copy(update={"gravity": GRAVITY})
     settings = LoopSettings(counts_per_turn=2.0**20)
-    run = simulate_closed_loop(true, pd.step, (30.0, 0.3, 0.0), paper_rows(1e-3, 14.0), settings)
+    run = simulate_closed_loop(true, LAWS["pd"], (30.0, 0.3, 0.0), paper_rows(1e-3, 14.0), settings)
     believed_without = true.model_copy(update={"gravity": None})
     traces, refused = load_traces([recording(run.t_s, run.torque_nm, run.encoder_rad)], believed_without)
     assert refused == []

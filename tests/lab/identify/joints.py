@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from servod.common.yaml import validate
 from servod.formats.model.axis_model import AxisModel
 from servod.kernels.physics.friction import directed_curve
-from servod.kernels.physics.layout import P_NEGATIVE_VISCOUS, P_POSITIVE_VISCOUS, P_VISCOUS
 
 
 class Drawn(NamedTuple):
@@ -64,7 +63,7 @@ def draw(seed: int, size: float = 1.0, bits: int | None = None) -> Drawn:
 
 def steady_friction(model: AxisModel, velocity: NDArray[np.float64]) -> NDArray[np.float64]:
     """True friction at steady sliding, with the velocity's sign."""
-    p = model.pack()
-    viscous = p[P_VISCOUS] * np.where(velocity > 0.0, p[P_POSITIVE_VISCOUS], p[P_NEGATIVE_VISCOUS])
-    dry = np.array([directed_curve(p, float(v)) for v in velocity])
+    p, tables = model.pack()
+    viscous = p.viscous * np.where(velocity > 0.0, p.positive_viscous, p.negative_viscous)
+    dry = np.array([directed_curve(p, tables, float(v)) for v in velocity])
     return np.sign(velocity) * dry + viscous * velocity

@@ -14,6 +14,7 @@ from servod.cli.app import run
 from servod.common.yaml import parse_yaml
 from servod.formats.model.axis_model import AxisModel
 from servod.kernels.physics.effects import encoder_position
+from servod.kernels.physics.layout import PlantState
 from servod.kernels.physics.plant import Plant
 from servod.lab.simulate.motion import Start, first_row, smoothed_motion
 from servod.lab.simulate.open_loop import recorded_motion
@@ -69,10 +70,10 @@ def test_an_eccentric_encoder_is_looked_through() -> None:
     packed = joint(**EFFECTS["encoder_eccentricity"]).pack()
     t = np.linspace(0.0, 1.0, 2001)
     true = np.column_stack([np.sin(3.0 * t), 3.0 * np.cos(3.0 * t), -9.0 * np.sin(3.0 * t)])
-    shown = np.array([encoder_position(packed, x) for x in true[:, 0]])
+    shown = np.array([encoder_position(*packed, x) for x in true[:, 0]])
     rate = np.gradient(shown, t, edge_order=2)
     motion = np.column_stack([shown, rate, np.gradient(rate, t, edge_order=2)])
-    recorded_motion(packed, motion)
+    recorded_motion(*packed, PlantState(), motion)
     assert np.allclose(motion[5:-5], true[5:-5], atol=1e-3)
     assert np.allclose(motion[:, 0], true[:, 0], atol=1e-12)
 

@@ -55,14 +55,14 @@ def test_the_deployed_law_tracks_the_papers_trajectory() -> None:
     assert gains.design is not None
     motion = np.array([paper(k * 1e-3) for k in range(12_000)])
     settings = LoopSettings(velocity_cutoff_hz=gains.design.velocity_cutoff_hz)
-    run = simulate_closed_loop(table1(), gains.law.step, gains.pack(), motion, settings)
+    run = simulate_closed_loop(table1(), gains.law, gains.pack(), motion, settings)
     assert np.sqrt(np.mean(run.tracking_error_rad(1.0) ** 2)) < 0.03e-3
 
 
 def test_at_the_papers_pd_gains_the_compensation_alone_tracks_within_a_fifth_of_a_milliradian() -> None:
     equal = with_feedback(table1_set(), "equal", 2.5, 0.12)
     motion = np.array([paper(k * 1e-3) for k in range(12_000)])
-    run = simulate_closed_loop(table1(), equal.law.step, equal.pack(), motion)
+    run = simulate_closed_loop(table1(), equal.law, equal.pack(), motion)
     assert np.sqrt(np.mean(run.tracking_error_rad(1.0) ** 2)) < 0.2e-3
     assert equal.certificate_problem() == "no certificate" and not equal.seal_broken
 
@@ -74,7 +74,7 @@ def test_a_step_settles_without_overshoot(amplitude_rad: float) -> None:
     motion = np.zeros((1000, 3))
     motion[:, 0] = amplitude_rad
     settings = LoopSettings(velocity_cutoff_hz=gains.design.velocity_cutoff_hz, torque_limit_nm=0.5)
-    run = simulate_closed_loop(table1(), gains.law.step, gains.pack(), motion, settings, start=(0.0, 0.0, 0.0))
+    run = simulate_closed_loop(table1(), gains.law, gains.pack(), motion, settings, start=(0.0, 0.0, 0.0))
     assert run.position_rad.max() < 1.03 * amplitude_rad
     assert np.abs(run.position_rad[150:] - amplitude_rad).max() < 0.02 * amplitude_rad
 
@@ -140,7 +140,7 @@ def test_friction_that_changes_after_the_design_hardly_shows(factor: float) -> N
     motion = np.array([paper(k * 1e-3) for k in range(12_000)])
     settings = LoopSettings(velocity_cutoff_hz=gains.design.velocity_cutoff_hz)
     changed = joint.model_copy(update={"friction": f.model_copy(update=update)})
-    run = simulate_closed_loop(changed, gains.law.step, gains.pack(), motion, settings)
+    run = simulate_closed_loop(changed, gains.law, gains.pack(), motion, settings)
     assert np.sqrt(np.mean(run.tracking_error_rad(1.0) ** 2)) < 0.025e-3
 
 
@@ -151,7 +151,7 @@ def test_a_step_comes_to_rest_within_two_hundredths_of_a_milliradian(amplitude_r
     motion = np.zeros((8000, 3))
     motion[:, 0] = amplitude_rad
     settings = LoopSettings(velocity_cutoff_hz=gains.design.velocity_cutoff_hz, torque_limit_nm=0.3)
-    run = simulate_closed_loop(table1(), gains.law.step, gains.pack(), motion, settings, start=(0.0, 0.0, 0.0))
+    run = simulate_closed_loop(table1(), gains.law, gains.pack(), motion, settings, start=(0.0, 0.0, 0.0))
     assert np.ptp(run.position_rad[1000:]) < 2e-5
     assert np.abs(run.true_velocity_rad_s).max() < 2.0
 

@@ -46,7 +46,7 @@ def rms_mrad(law: LocalParameters) -> float:
     assert design is not None
     motion = np.array([paper(k * 1e-3) for k in range(12_000)])
     settings = LoopSettings(velocity_cutoff_hz=design.velocity_cutoff_hz)
-    run = simulate_closed_loop(table1(), LAWS["local"].step, law.pack(), motion, settings)
+    run = simulate_closed_loop(table1(), LAWS["local"], law.pack(), motion, settings)
     return 1e3 * float(np.sqrt(np.mean(run.tracking_error_rad(1.0) ** 2)))
 
 

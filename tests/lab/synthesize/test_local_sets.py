@@ -7,7 +7,7 @@ import pytest
 
 from servod.common.errors import BadInput
 from servod.formats.gains.parameters import LocalParameters
-from servod.kernels.laws.weights import blended
+from servod.kernels.laws.weights import Sets, blended
 from servod.lab.synthesize.local_sets import (
     PAPER_NODES,
     adjacent_mismatch,
@@ -26,9 +26,9 @@ COMPENSATOR = compensator(FRICTION, 0.5, 0.8)
 @pytest.mark.parametrize("accuracy", [0.005, 0.02, 0.1])
 def test_the_force_between_nodes_is_within_the_tolerance(accuracy: float) -> None:
     sets = local_sets(FRICTION, COMPENSATOR, 0.5, accuracy, 0.0)
-    packed = [s.velocity_rad_s for s in sets] + [s.decay_per_s for s in sets] + [0.0] * len(sets)
+    at = Sets([s.velocity_rad_s for s in sets], [s.decay_per_s for s in sets], [0.0] * len(sets))
     for v in [side * v for side in (1, -1) for v in np.geomspace(0.0006, 0.5, 301)]:
-        decay, _ = blended(packed, 0, len(sets), 0.0, v)
+        decay, _ = blended(at, 0.0, v)
         assert COMPENSATOR.torque(decay, abs(v)) == pytest.approx(abs(FRICTION.torque(v)), rel=1.02 * accuracy)
 
 

@@ -11,8 +11,8 @@ import pytest
 from servod.formats.gains.gain_set import CertificateCheck
 from servod.formats.model.axis_model import AxisModel
 from servod.formats.model.keys import Harmonic
-from servod.kernels.physics import layout as lay
 from servod.kernels.physics.effects import dry_factor, ripple, thermal_factors
+from servod.kernels.physics.layout import PlantState
 from servod.lab.verify.checks import Subject
 from servod.lab.verify.closed_loop import Behind, Bristle, Deviation, Reach, corners, joint_point
 from servod.lab.verify.effect_checks import check_effects, covered, effects_of, level_of
@@ -68,12 +68,12 @@ def test_the_ends_hold_what_the_kernels_do_over_travel_and_temperature() -> None
         position_dependent_friction={"harmonics": [WAVE], "bumps": [{"position": 0.3, "width": 0.1, "factor": 0.4}]},
         thermal={"dry_per_c": -0.02, "viscous_per_c": -0.03, "shape": "exponential"},
     )
-    effects, p = effects_of(found, level_of(found, steady_friction(found), 0.5)), found.pack()
+    effects, plant = effects_of(found, level_of(found, steady_friction(found), 0.5)), found.pack()
     positions = [float(x) for x in np.linspace(-math.pi, math.pi, 2000)]
     seen = {
-        "torque_ripple": [ripple(p, x) for x in positions],
-        "position_dependent_friction": [dry_factor(p, x) for x in positions],
-        "thermal": [thermal_factors(p, [0.0] * lay.S_LINE, c)[0] for c in (15.0, 25.0, 35.0)],
+        "torque_ripple": [ripple(*plant, x) for x in positions],
+        "position_dependent_friction": [dry_factor(*plant, x) for x in positions],
+        "thermal": [thermal_factors(plant.p, PlantState(), c)[0] for c in (15.0, 25.0, 35.0)],
     }
     for name, values in seen.items():
         low, high = effects[name].torque_gain if name == "torque_ripple" else effects[name].dry

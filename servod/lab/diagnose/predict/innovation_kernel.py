@@ -12,23 +12,15 @@ from collections.abc import Sequence
 from typing import Any
 
 from servod.kernels.physics.effects import encoder_position, heat, thermal_factors
-from servod.kernels.physics.friction import Params
-from servod.kernels.physics.layout import (
-    P_DELAY_S,
-    S_FRICTION,
-    S_LOAD_POSITION,
-    S_LOAD_VELOCITY,
-    S_POSITION,
-    S_TIME_S,
-    S_VELOCITY,
-)
+from servod.kernels.physics.layout import PlantParameters, PlantState, Tables
 from servod.lab.diagnose.predict.sample_step import step
 from servod.lab.simulate.open_loop import acting, begin, piece_end, switch_row
 
 
 def innovate(
-    p: Params,
-    s: Any,
+    p: PlantParameters,
+    tables: Tables,
+    s: PlantState,
     t: Any,
     torque: Sequence[float],
     before: float,
@@ -53,11 +45,11 @@ def innovate(
     """
     window, row, last, acceleration = 0, -1, len(t) - 1, 0.0
     for k in range(len(t)):
-        s[S_TIME_S] = t[k]
+        s.time_s = t[k]
         if window < len(starts) and starts[window] == k:
             begin(s, start_states[window])
             window += 1
-        off = position[k] - encoder_position(p, s[S_POSITION])
+        off = position[k] - encoder_position(p, tables, s.position)
         out[k] = off
         if k == last:
             break
@@ -68,17 +60,17 @@ def innovate(
         beyond = max(abs(off) - quiet, 0.0)
         pull = math.copysign(position_gain[k] * beyond / whole, off) if whole > 0.0 else 0.0
         if steps[k] == 1:
-            row, command = mean_command(t, torque, before, row, p[P_DELAY_S], now, t[k + 1])
-            acceleration = step(p, s, command, whole, acceleration, dry, viscous, pull)
-            loss, now = s[S_FRICTION] * s[S_VELOCITY] * whole, t[k + 1]
+            row, command = mean_command(t, torque, before, row, p.delay_s, now, t[k + 1])
+            acceleration = step(p, tables, s, command, whole, acceleration, dry, viscous, pull)
+            loss, now = s.friction * s.velocity * whole, t[k + 1]
         while now < t[k + 1]:
-            row = switch_row(t, row, now, p[P_DELAY_S])
-            end = piece_end(t, row, p[P_DELAY_S], t[k + 1])
+            row = switch_row(t, row, now, p.delay_s)
+            end = piece_end(t, row, p.delay_s, t[k + 1])
             count = max(1, round(steps[k] * (end - now) / whole))
             command, h = acting(torque, row, before), (end - now) / count
             for _ in range(count):
-                acceleration = step(p, s, command, h, acceleration, dry, viscous, pull)
-                loss += s[S_FRICTION] * s[S_VELOCITY] * h
+                acceleration = step(p, tables, s, command, h, acceleration, dry, viscous, pull)
+                loss += s.friction * s.velocity * h
             now = end
         heat(p, s, loss, whole, temperature[k])
 
@@ -99,9 +91,9 @@ def mean_command(
     return row, push / (end - begun)
 
 
-def correct(s: Any, shift: float, push: float, load_share: float) -> None:
+def correct(s: PlantState, shift: float, push: float, load_share: float) -> None:
     """Correct the motion of the motor, and by `load_share` of it that of the load."""
-    s[S_POSITION] += shift
-    s[S_LOAD_POSITION] += load_share * shift
-    s[S_VELOCITY] += push
-    s[S_LOAD_VELOCITY] += load_share * push
+    s.position += shift
+    s.load_position += load_share * shift
+    s.velocity += push
+    s.load_velocity += load_share * push

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from servod.common.portable import usable_cores
 from servod.formats.model.axis_model import AxisKind, AxisModel
 from servod.kernels.physics.compiled import Kernel, available, compiled
-from servod.kernels.physics.layout import P_DELAY_S, P_GAP, P_START_C, S_FIRST_S
-from servod.kernels.physics.plant import rest_state
+from servod.kernels.physics.layout import PackedPlant, PlantState
+from servod.kernels.physics.plant import inputs
 from servod.lab.diagnose.data.excitation import creeps
 from servod.lab.diagnose.data.trace import CheckedTrace, dry_friction
 from servod.lab.diagnose.predict.innovation_kernel import innovate
@@ -49,8 +49,8 @@ def without_lock(function: Kernel) -> Kernel:
 
     kernel = compiled(function)
 
-    def call(*arguments: Any) -> None:
-        kernel(*arguments)
+    def call(p: Any, tables: Any, s: Any, *rest: Any) -> None:
+        kernel(p[0], tables, s[0], *rest)
 
     outer: Kernel = numba.njit(nogil=True)(call)
     return outer
@@ -164,47 +164,40 @@ class Predictor:
 
         One model for all traces, or one for each.
         """
-        packed = [np.array(model.pack()) for model in models]
+        packed = [model.pack() for model in models]
         each = packed if len(packed) > 1 else packed * len(self.traces)
         self.evaluations += 1
         parts = [
-            self._trace_mismatch(p, trace, seen)
-            for p, trace, seen in zip(each, self.traces, self.observers, strict=True)
+            self._trace_mismatch(packed, trace, seen)
+            for packed, trace, seen in zip(each, self.traces, self.observers, strict=True)
         ]
         limit = SETTINGS.observer.worst * self.dry
         clean = np.nan_to_num(np.concatenate(parts), nan=limit, posinf=limit, neginf=-limit)
         return np.where(self.counts, np.clip(clean, -limit, limit), 0.0)
 
-    def _trace_mismatch(self, p: Array, trace: CheckedTrace, seen: Observer) -> Array:
-        drive = trace.drive
-        first = trace.first_row(float(p[P_DELAY_S]))
-        state = np.array(rest_state(0.0, 5e-5, float(p[P_START_C])))
-        state[S_FIRST_S] = trace.begun_s
-        states = np.array([self._start(p, trace, int(row), first) for row in trace.starts])
+    def _trace_mismatch(self, packed: PackedPlant, trace: CheckedTrace, seen: Observer) -> Array:
+        drive, observer = trace.drive, SETTINGS.observer
+        gap, first = packed.p.gap > 0.0, trace.first_row(packed.p.delay_s)
+        axis = inputs(packed, PlantState(temperature_c=packed.p.start_c, first_s=trace.begun_s))
+        states = np.array([self._start(packed, trace, int(row), first) for row in trace.starts])
         out = np.zeros(len(drive.t_s))
-        steps = seen.steps * SETTINGS.observer.steps_in_gap if p[P_GAP] > 0.0 else seen.steps
+        steps = seen.steps * observer.steps_in_gap if gap else seen.steps
         held = drive.t_s, drive.torque, first.command_before, drive.temperature_c, drive.position
-        share = SETTINGS.observer.load_share_in_gap if p[P_GAP] > 0.0 else SETTINGS.observer.load_share
-        gains = (
-            steps,
-            seen.position_gain,
-            seen.velocity_gain,
-            share,
-            SETTINGS.observer.quiet_noises * trace.position_noise,
-        )
-        self._run(p, state, *held, *gains, trace.starts, states, out)
+        share = observer.load_share_in_gap if gap else observer.load_share
+        gains = steps, seen.position_gain, seen.velocity_gain, share, observer.quiet_noises * trace.position_noise
+        self._run(*axis, *held, *gains, trace.starts, states, out)
         return seen.to_torque * out
 
-    def _start(self, p: Array, trace: CheckedTrace, row: int, known: FirstRow) -> Array:
+    def _start(self, packed: PackedPlant, trace: CheckedTrace, row: int, known: FirstRow) -> Array:
         """Position, velocity and hidden states in balance with the recorded motion of one row."""
         drive = trace.drive
         motion = known.motion if row == 0 else tuple(drive.motion[row, :3])
         before = known.command_before if row == 0 else float(drive.torque[row - 1])
         hidden = np.zeros((1, 4))
-        state = np.array(rest_state(0.0, 5e-5, float(p[P_START_C])))
+        axis = inputs(packed, PlantState(temperature_c=packed.p.start_c))
         one = slice(row, row + 1)
         moved = np.array([motion])
-        self._follow(p, state, drive.t_s[one], moved, drive.torque[one], before, drive.temperature_c[one], hidden, 1e-3)
+        self._follow(*axis, drive.t_s[one], moved, drive.torque[one], before, drive.temperature_c[one], hidden, 1e-3)
         return np.array([motion[0], motion[1], *hidden[0]])
 
 

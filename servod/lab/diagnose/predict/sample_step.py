@@ -22,90 +22,73 @@ from servod.kernels.physics.effects import (
     resisting_torque,
     ripple,
 )
-from servod.kernels.physics.friction import Params, directed_curve
-from servod.kernels.physics.layout import (
-    P_COMPLEX,
-    P_FRICTION_PER_COMMAND,
-    P_FRICTION_PER_LOAD,
-    P_INERTIA,
-    P_LAG_S,
-    P_LOAD_INERTIA,
-    P_LOAD_VISCOUS,
-    P_NEGATIVE_VISCOUS,
-    P_POSITIVE_VISCOUS,
-    P_SIGMA0,
-    P_SIGMA1,
-    P_SIGMA1_VELOCITY,
-    P_SLEW,
-    P_VISCOUS,
-    S_BRISTLE,
-    S_FRICTION,
-    S_LOAD_POSITION,
-    S_LOAD_VELOCITY,
-    S_POSITION,
-    S_TIME_S,
-    S_TORQUE,
-    S_VELOCITY,
-)
-
-State = list[float]
+from servod.kernels.physics.friction import directed_curve
+from servod.kernels.physics.layout import PlantParameters, PlantState, Tables
 
 
 def step(
-    p: Params, s: State, command: float, h: float, acceleration: float, dry: float, viscous: float, pull: float
+    p: PlantParameters,
+    tables: Tables,
+    s: PlantState,
+    command: float,
+    h: float,
+    acceleration: float,
+    dry: float,
+    viscous: float,
+    pull: float,
 ) -> float:
     """Advance `s` by `h` seconds under a command that has arrived; returns the acceleration.
 
     `acceleration` is the last step's, `dry` and `viscous` are the friction's factors of warmth. `pull` is the speed
     with which an observer carries the model along beside its own: friction is that of both together.
     """
-    old = s[S_VELOCITY]
+    old = s.velocity
     velocity = old + 0.5 * h * acceleration + pull
-    position = s[S_POSITION] + 0.5 * h * old
-    load_speed = s[S_LOAD_VELOCITY]
-    load_position = s[S_LOAD_POSITION] + 0.5 * h * load_speed
-    drive = mean_drive(p, s, command, h) * ripple(p, position)
-    load = load_torque(p, load_position, s[S_TIME_S] + 0.5 * h)
-    push = drive + offset(p, s) - resisting_torque(p, position, velocity, s[S_TIME_S] + 0.5 * h)
-    grip = directed_curve(p, velocity) * dry_factor(p, position) * dry
-    grip += p[P_FRICTION_PER_COMMAND] * abs(drive) + p[P_FRICTION_PER_LOAD] * abs(load)
-    slide = p[P_VISCOUS] * (p[P_POSITIVE_VISCOUS] if velocity >= 0.0 else p[P_NEGATIVE_VISCOUS])
-    if p[P_COMPLEX] != 0.0:
+    position = s.position + 0.5 * h * old
+    load_speed = s.load_velocity
+    load_position = s.load_position + 0.5 * h * load_speed
+    drive = mean_drive(p, s, command, h) * ripple(p, tables, position)
+    load = load_torque(p, tables, load_position, s.time_s + 0.5 * h)
+    push = drive + offset(p, s) - resisting_torque(p, tables, position, velocity, s.time_s + 0.5 * h)
+    grip = directed_curve(p, tables, velocity) * dry_factor(p, tables, position) * dry
+    grip += p.friction_per_command * abs(drive) + p.friction_per_load * abs(load)
+    slide = p.viscous * (p.positive_viscous if velocity >= 0.0 else p.negative_viscous)
+    if p.complex:
         slide = max(slide + nonlinear_viscous(p, velocity), 0.0)
     slide *= viscous
-    inertia, slope = inertia_at(p, load_position)
-    if p[P_LOAD_INERTIA] > 0.0:
+    inertia, slope = inertia_at(p, tables, load_position)
+    if p.load_inertia > 0.0:
         tau, extra, base, share = load_step(p, s, load, inertia, slope, h)
-        mean = mid_velocity(p, s, velocity, push - tau, p[P_INERTIA], h, grip, slide, extra, pull)
+        mean = mid_velocity(p, s, velocity, push - tau, p.inertia, h, grip, slide, extra, pull)
         load_mean = base + share * mean
-        s[S_LOAD_POSITION] += h * load_mean
-        s[S_LOAD_VELOCITY] = 2.0 * load_mean - load_speed
-        s[S_POSITION] += h * mean
+        s.load_position += h * load_mean
+        s.load_velocity = 2.0 * load_mean - load_speed
+        s.position += h * mean
     else:
         push -= load + 0.5 * slope * velocity * velocity
         mean = mid_velocity(p, s, velocity, push, inertia, h, grip, slide, 0.0, pull)
-        s[S_POSITION] += h * mean
-        s[S_LOAD_POSITION], s[S_LOAD_VELOCITY] = s[S_POSITION], 2.0 * mean - old
-    s[S_VELOCITY] = 2.0 * mean - old
-    s[S_TIME_S] += h
+        s.position += h * mean
+        s.load_position, s.load_velocity = s.position, 2.0 * mean - old
+    s.velocity = 2.0 * mean - old
+    s.time_s += h
     return 2.0 * (mean - old) / h
 
 
-def mean_drive(p: Params, s: State, command: float, h: float) -> float:
+def mean_drive(p: PlantParameters, s: PlantState, command: float, h: float) -> float:
     """Mean torque of the actuator over the step, before ripple; its state moves on."""
-    if p[P_COMPLEX] == 0.0:
+    if not p.complex:
         return command
-    old = s[S_TORQUE]
+    old = s.torque
     new = actuator(p, old, command, h)
-    s[S_TORQUE] = new
-    if p[P_SLEW] > 0.0:
+    s.torque = new
+    if p.slew > 0.0:
         return 0.5 * (old + new)
-    return actuator_goal(p, command) + (old - new) * p[P_LAG_S] / h
+    return actuator_goal(p, command) + (old - new) * p.lag_s / h
 
 
 def mid_velocity(
-    p: Params,
-    s: State,
+    p: PlantParameters,
+    s: PlantState,
     velocity: float,
     torque: float,
     inertia: float,
@@ -121,26 +104,26 @@ def mid_velocity(
     is taken at the expected mid-step `velocity`. Moves the bristle on.
     """
     impulse = 2.0 * inertia / h
-    pushed = torque + impulse * s[S_VELOCITY]
-    if p[P_SIGMA0] == 0.0:
+    pushed = torque + impulse * s.velocity
+    if p.sigma0 == 0.0:
         free = impulse + extra
         mean = sliding_or_held(pushed + free * pull, free + viscous, grip) - pull
-        s[S_FRICTION] = pushed - free * mean
+        s.friction = pushed - free * mean
         return mean
     speed = abs(velocity)
     damping = bristle_damping(p, velocity)
-    y = p[P_SIGMA0] * speed * h / grip
+    y = p.sigma0 * speed * h / grip
     whole = 1.0 + y + 0.5 * y * y
     held = (1.0 + 0.5 * y) / whole  # share of the old deflection in the step's mean
     follow = h * 0.5 * (1.0 + y) / whole  # mean deflection per mean velocity
     kept, gained = 1.0 / whole, h * (1.0 + 0.5 * y) / whole
-    bristle = s[S_BRISTLE]
-    memory = (p[P_SIGMA0] * held + damping * (kept - 1.0) / h) * bristle
-    slope = p[P_SIGMA0] * follow + damping * gained / h
+    bristle = s.bristle
+    memory = (p.sigma0 * held + damping * (kept - 1.0) / h) * bristle
+    slope = p.sigma0 * follow + damping * gained / h
     memory += (slope + viscous) * pull
     mean = (pushed - memory) / (impulse + slope + viscous + extra)
-    s[S_BRISTLE] = kept * bristle + gained * (mean + pull)
-    s[S_FRICTION] = memory + (slope + viscous) * mean
+    s.bristle = kept * bristle + gained * (mean + pull)
+    s.friction = memory + (slope + viscous) * mean
     return mean
 
 
@@ -151,27 +134,27 @@ def sliding_or_held(pushed: float, resist: float, grip: float) -> float:
     return (pushed - math.copysign(grip, pushed)) / resist
 
 
-def bristle_damping(p: Params, velocity: float) -> float:
+def bristle_damping(p: PlantParameters, velocity: float) -> float:
     """sigma1 at this velocity."""
-    if p[P_SIGMA1_VELOCITY] == 0.0:
-        return p[P_SIGMA1]
-    ratio = velocity / p[P_SIGMA1_VELOCITY]
-    return p[P_SIGMA1] * math.exp(-ratio * ratio)
+    if p.sigma1_velocity == 0.0:
+        return p.sigma1
+    ratio = velocity / p.sigma1_velocity
+    return p.sigma1 * math.exp(-ratio * ratio)
 
 
 def load_step(
-    p: Params, s: State, load: float, inertia: float, slope: float, h: float
+    p: PlantParameters, s: PlantState, load: float, inertia: float, slope: float, h: float
 ) -> tuple[float, float, float, float]:
     """Eliminate the load from the step: (torque on the motor, extra viscous of the motor, base, share).
 
     Implicit midpoint; the load's mean velocity is base + share*(motor's mean velocity).
     """
-    speed = s[S_LOAD_VELOCITY]
-    stretch = s[S_POSITION] - s[S_LOAD_POSITION]
-    tau, stiffness, damping = joint_spring(p, stretch, stretch + 0.5 * h * (s[S_VELOCITY] - speed))
+    speed = s.load_velocity
+    stretch = s.position - s.load_position
+    tau, stiffness, damping = joint_spring(p, stretch, stretch + 0.5 * h * (s.velocity - speed))
     coupling = 0.5 * h * stiffness + damping
     impulse = 2.0 * inertia / h
-    whole = impulse + coupling + p[P_LOAD_VISCOUS]
+    whole = impulse + coupling + p.load_viscous
     base = (impulse * speed + tau - load - 0.5 * slope * speed * speed) / whole
     share = coupling / whole
     return tau - coupling * base, coupling * (1.0 - share), base, share

@@ -11,7 +11,6 @@ from servod.common.errors import BadInput
 from servod.formats.gains.gain_set import GainSet
 from servod.formats.gains.parameters import LocalParameters
 from servod.formats.model.axis_model import AxisModel
-from servod.kernels.laws.local import FIRST_NODE, N_SETS, SHAPE
 from servod.kernels.laws.weights import Shape, blended, weights
 from servod.lab.report.figure import COLOURS, Array, Axis, Colour, Curve, Figure, Panel, Scale, Style, array, curve
 from servod.lab.verify.steady_friction import SteadyFriction, steady_friction
@@ -68,9 +67,8 @@ def weight_table(law: LocalParameters, velocity: Array) -> Array:
 
 def steady_compensation(law: LocalParameters, velocity: Array) -> Array:
     """Torque in N*m that the compensator settles to at each velocity: c0*v/a(v) + d0*v, within its bound."""
-    packed, friction = law.pack(), law.friction
-    n, shape = int(packed[N_SETS]), packed[SHAPE]
-    decay = array([max(blended(packed, FIRST_NODE, n, shape, float(v))[0], friction.leak_per_s) for v in velocity])
+    friction, p = law.friction, law.named()
+    decay = array([max(blended(p.sets, p.shape, float(v))[0], p.leak) for v in velocity])
     bristle = np.clip(friction.stiffness_nm_per_rad * velocity / decay, -friction.friction_limit_nm, None)
     held: Array = np.minimum(bristle, friction.friction_limit_nm) + friction.viscous_nms_per_rad * velocity
     return held
