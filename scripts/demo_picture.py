@@ -18,9 +18,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from servod.qualify.demo.axis import plant_file
-from servod.qualify.demo.entries import Entry, entries
-from servod.qualify.demo.fast import run_fast
-from servod.qualify.demo.runs import Run
+from servod.qualify.demo.entries import DemoRow, entries
+from servod.qualify.demo.runs import Run, run_fast
 
 DURATION_S = 30.0
 SIZE_INCHES, DOTS_PER_INCH = (8.0, 5.2), 100
@@ -42,7 +41,7 @@ def main() -> None:
     print(out)
 
 
-def draw(rows: Sequence[Entry], runs: Sequence[Run], out: Path) -> None:
+def draw(rows: Sequence[DemoRow], runs: Sequence[Run], out: Path) -> None:
     """All errors on one scale, and below them the small ones on theirs."""
     figure = Figure(figsize=SIZE_INCHES, dpi=DOTS_PER_INCH, layout="constrained")
     FigureCanvasAgg(figure)

@@ -9,13 +9,13 @@ from functools import partial
 from importlib.resources import files
 from pathlib import Path
 
-from servod.drivers.virtual.dictionary import Dictionary, SdoRefusal
+from servod.drivers.virtual.dictionary import DeviceDictionary, SdoRefusal
 from servod.drivers.virtual.drive_record import DriveRecord
 from servod.drivers.virtual.joint import Joint
-from servod.drivers.virtual.motion import Motion
+from servod.drivers.virtual.motion import TorqueStage
 from servod.drivers.virtual.motor_sensor import MotorSensor
-from servod.drivers.virtual.node import Node, Send
-from servod.drivers.virtual.power_state import ENERGISED, Command, PowerMachine, Ramp, status_word
+from servod.drivers.virtual.node import Send, VirtualNode
+from servod.drivers.virtual.power_state import ENERGISED, DriveCommand, PowerMachine, Ramp, status_word
 from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.drivers.virtual.timeline import Timeline
 from servod.runtime.fieldbus.cia import Abort, Emcy, Obj402
@@ -38,7 +38,7 @@ class DriveFaults:
     (servod.runtime.fieldbus.devices.DriveState) in which control words do nothing, 6 the transition that control
     words do not cause."""
 
-    def __init__(self, dictionary: Dictionary) -> None:
+    def __init__(self, dictionary: DeviceDictionary) -> None:
         self._injected = dictionary.entry(0x2000, 1)
         self._safe_torque_off = dictionary.entry(0x2000, 2)
         self._supply_mv = dictionary.entry(0x2000, 3)
@@ -104,7 +104,7 @@ def wrap_i32(value: int) -> int:
     return (value + 0x80000000 & 0xFFFFFFFF) - 0x80000000
 
 
-class AmplifierNode(Node):
+class AmplifierNode(VirtualNode):
     """The node; `record` gets a sample at every command, tick of the watch and change of state."""
 
     def __init__(
@@ -116,7 +116,7 @@ class AmplifierNode(Node):
         self._apply_settings()
         self.sensor = MotorSensor(self.dictionary, joint, settings.amplifier_counts_per_turn, settings.gear_ratio)
         self.machine = PowerMachine(self)
-        self.motion = Motion(self.dictionary, joint, self.sensor, timeline, self.machine.stopped)
+        self.motion = TorqueStage(self.dictionary, joint, self.sensor, timeline, self.machine.stopped)
         self.faults = DriveFaults(self.dictionary)
         self._error = 0
         self._too_far_since_ns: int | None = None
@@ -203,9 +203,9 @@ class AmplifierNode(Node):
         if option == _ABORT_FAULT:
             self._fault(Emcy.HEARTBEAT_LOST, time_ns)
         elif option == _ABORT_DISABLE:
-            self.machine.command(Command.DISABLE_VOLTAGE, time_ns)
+            self.machine.command(DriveCommand.DISABLE_VOLTAGE, time_ns)
         elif option == _ABORT_QUICK_STOP:
-            self.machine.command(Command.QUICK_STOP, time_ns)
+            self.machine.command(DriveCommand.QUICK_STOP, time_ns)
         self._write_record(time_ns)
 
     def refresh(self, time_ns: int) -> None:
@@ -266,7 +266,7 @@ class AmplifierNode(Node):
         if code:
             self._fault(code, time_ns)
         elif state is DriveState.READY_TO_SWITCH_ON and not self.has_power():
-            self.machine.command(Command.DISABLE_VOLTAGE, time_ns)
+            self.machine.command(DriveCommand.DISABLE_VOLTAGE, time_ns)
 
     def _fault(self, code: int, time_ns: int) -> None:
         if self._error == code:

@@ -137,7 +137,7 @@ class Entry:
         return self.value.to_bytes(self.bits // 8, "little", signed=self.signed)
 
 
-class Dictionary:
+class DeviceDictionary:
     """All entries of one node. `write_lock` is set while the drive is enabled: locked entries then refuse."""
 
     def __init__(self, eds: Path) -> None:
@@ -261,7 +261,7 @@ _RANGES = {1: (0x1000, 0x9FFF), 2: (0x1000, 0x1FFF), 3: (0x2000, 0x9FFF)}
 class Storage:
     """The node's non-volatile memory, and the entries that fill and empty it."""
 
-    def __init__(self, dictionary: Dictionary) -> None:
+    def __init__(self, dictionary: DeviceDictionary) -> None:
         self._dictionary = dictionary
         self._stored: dict[tuple[int, int], int] = {}
         for subindex, (first, last) in _RANGES.items():

@@ -9,7 +9,7 @@ import struct
 from collections import deque
 from collections.abc import Callable
 
-from servod.drivers.virtual.dictionary import Dictionary, SdoRefusal
+from servod.drivers.virtual.dictionary import DeviceDictionary, SdoRefusal
 from servod.drivers.virtual.timeline import Timeline
 from servod.runtime.fieldbus.cia import Abort, Emcy, Obj301
 
@@ -23,7 +23,7 @@ _REGISTER_BIT = {0x2: 0x02, 0x3: 0x04, 0x4: 0x08, 0x8: 0x10, 0xF: 0x80}
 class Emergency:
     """Errors that are present, and what the bus hears of them. `send(can_id, data)`; False when it may not be sent."""
 
-    def __init__(self, dictionary: Dictionary, send: Callable[[int, bytes], object], timeline: Timeline) -> None:
+    def __init__(self, dictionary: DeviceDictionary, send: Callable[[int, bytes], object], timeline: Timeline) -> None:
         self._dictionary, self._send = dictionary, send
         self._present: dict[int, int] = {}
         self._waiting: deque[bytes] = deque(maxlen=_WAITING_LIMIT)

@@ -14,7 +14,7 @@ from pathlib import Path
 from servod.common.units import NS_PER_S, TWO_PI
 from servod.drivers.virtual.dictionary import SdoRefusal
 from servod.drivers.virtual.joint import Joint
-from servod.drivers.virtual.node import Node, Send
+from servod.drivers.virtual.node import Send, VirtualNode
 from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.drivers.virtual.timeline import Timeline
 from servod.runtime.fieldbus.cia import Abort, Obj406
@@ -34,7 +34,7 @@ def _clip_i16(value: float) -> int:
     return min(max(round(value), -32768), 32767)
 
 
-class EncoderNode(Node):
+class EncoderNode(VirtualNode):
     """The node."""
 
     def __init__(self, settings: VirtualAxisSettings, joint: Joint, timeline: Timeline, send: Send) -> None:

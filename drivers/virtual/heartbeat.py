@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from servod.drivers.virtual.dictionary import Dictionary, Entry, SdoRefusal
+from servod.drivers.virtual.dictionary import DeviceDictionary, Entry, SdoRefusal
 from servod.drivers.virtual.timeline import Timeline, Timer
 from servod.runtime.fieldbus.cia import HEARTBEAT_BASE, Abort, NmtState, Obj301
 
@@ -18,7 +18,7 @@ NS_PER_MS = 1_000_000
 class HeartbeatProducer:
     """Sends the NMT state every 0x1017 ms through `send(time_ns)`."""
 
-    def __init__(self, dictionary: Dictionary, send: Callable[[int], None], timeline: Timeline) -> None:
+    def __init__(self, dictionary: DeviceDictionary, send: Callable[[int], None], timeline: Timeline) -> None:
         self._entry = dictionary.entry(Obj301.HEARTBEAT_PRODUCER)
         self._send = send
         self._timer = timeline.timer(self._due)
@@ -46,7 +46,7 @@ class HeartbeatConsumer:
 
     def __init__(
         self,
-        dictionary: Dictionary,
+        dictionary: DeviceDictionary,
         timeline: Timeline,
         lost: Callable[[int, int], None],
         found: Callable[[int, int], None],

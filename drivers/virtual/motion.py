@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 
 from servod.common.units import NS_PER_S, PER_MILLE, TWO_PI
-from servod.drivers.virtual.dictionary import Dictionary
+from servod.drivers.virtual.dictionary import DeviceDictionary
 from servod.drivers.virtual.joint import Joint
 from servod.drivers.virtual.motor_sensor import MotorSensor
 from servod.drivers.virtual.power_state import Ramp
@@ -122,7 +122,7 @@ THERMAL_RESERVE_S = 20.0
 class TorqueLimits:
     """Clamps a demand; `limited` says whether the last one was changed (status word bit 11)."""
 
-    def __init__(self, dictionary: Dictionary) -> None:
+    def __init__(self, dictionary: DeviceDictionary) -> None:
         entry = dictionary.entry
         self._max_torque = entry(Obj402.MAX_TORQUE)
         self._positive = entry(Obj402.POSITIVE_TORQUE_LIMIT)
@@ -174,12 +174,12 @@ _MNM_PER_NM = 1000.0
 CYCLIC = (Mode.CYCLIC_SYNC_TORQUE, Mode.CYCLIC_SYNC_VELOCITY, Mode.CYCLIC_SYNC_POSITION)
 
 
-class Motion:
+class TorqueStage:
     """Torque production. `stopped(time_ns)` is called once when a stop that was asked for is done."""
 
     def __init__(
         self,
-        dictionary: Dictionary,
+        dictionary: DeviceDictionary,
         joint: Joint,
         sensor: MotorSensor,
         timeline: Timeline,

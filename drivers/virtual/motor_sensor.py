@@ -6,7 +6,7 @@ Between the joint and everything in the amplifier that needs position or velocit
 from __future__ import annotations
 
 from servod.common.units import NS_PER_S, TWO_PI
-from servod.drivers.virtual.dictionary import Dictionary
+from servod.drivers.virtual.dictionary import DeviceDictionary
 from servod.drivers.virtual.joint import Joint
 from servod.runtime.fieldbus.cia import Obj402
 
@@ -19,7 +19,7 @@ _POLARITY_POSITION = 0x80
 class MotorSensor:
     """Counts of the motor's encoder; velocity by difference and first-order low-pass."""
 
-    def __init__(self, dictionary: Dictionary, joint: Joint, counts_per_turn: int, gear_ratio: float) -> None:
+    def __init__(self, dictionary: DeviceDictionary, joint: Joint, counts_per_turn: int, gear_ratio: float) -> None:
         self._dictionary, self._joint, self.gear_ratio = dictionary, joint, gear_ratio
         self.counts_per_rad = counts_per_turn * gear_ratio / TWO_PI  # of the joint
         self.counts = 0

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-from servod.drivers.virtual.dictionary import Dictionary, Storage
+from servod.drivers.virtual.dictionary import DeviceDictionary, Storage
 from servod.drivers.virtual.emergency import Emergency
 from servod.drivers.virtual.heartbeat import HeartbeatConsumer, HeartbeatProducer
 from servod.drivers.virtual.lss import LssSlave
@@ -39,11 +39,11 @@ _COMMUNICATION = (0x1000, 0x1FFF)
 _APPLICATION = (0x2000, 0x9FFF)
 
 
-class Node(ABC):
+class VirtualNode(ABC):
     """One node. Derived devices fill in `refresh`, `commanded`, `reset_application`, `connection_lost`."""
 
     def __init__(self, eds: Path, node_id: int, serial: int, timeline: Timeline, send: Send) -> None:
-        self.dictionary = Dictionary(eds)
+        self.dictionary = DeviceDictionary(eds)
         self.dictionary.entry(Obj301.IDENTITY, 4).default = serial
         self.timeline = timeline
         self.state = NmtState.BOOT_UP

@@ -11,7 +11,7 @@ import struct
 from collections.abc import Callable
 from typing import Protocol
 
-from servod.drivers.virtual.dictionary import Dictionary, Entry, SdoRefusal
+from servod.drivers.virtual.dictionary import DeviceDictionary, Entry, SdoRefusal
 from servod.drivers.virtual.emergency import Emergency
 from servod.drivers.virtual.timeline import Timeline
 from servod.runtime.fieldbus.cia import PDO_NO_RTR, PDO_NOT_VALID, Abort, Emcy, Obj301
@@ -31,7 +31,7 @@ class PdoRules:
     """The rules of one PDO: `parameter` is 0x1400.. or 0x1800.., `mapping` 0x1600.. or 0x1A00...
     `changed()` is called after each accepted write."""
 
-    def __init__(self, dictionary: Dictionary, parameter: int, mapping: int, changed: Callable[[], None]) -> None:
+    def __init__(self, dictionary: DeviceDictionary, parameter: int, mapping: int, changed: Callable[[], None]) -> None:
         self._dictionary = dictionary
         self._receive = parameter < 0x1800
         self._cob = dictionary.entry(parameter, 1)
@@ -117,7 +117,7 @@ class Application(Protocol):
 class Pdo:
     """What both directions share: parameters and the packing of the mapping, rebuilt after each change."""
 
-    def __init__(self, dictionary: Dictionary, parameter: int, mapping: int) -> None:
+    def __init__(self, dictionary: DeviceDictionary, parameter: int, mapping: int) -> None:
         self._dictionary, self._parameter = dictionary, parameter
         self._rules = PdoRules(dictionary, parameter, mapping, self._rebuild)
         self.valid = False
@@ -146,7 +146,7 @@ class Pdo:
 class Rpdo(Pdo):
     """One PDO that the node receives."""
 
-    def __init__(self, number: int, dictionary: Dictionary, emergency: Emergency, timeline: Timeline) -> None:
+    def __init__(self, number: int, dictionary: DeviceDictionary, emergency: Emergency, timeline: Timeline) -> None:
         super().__init__(dictionary, 0x1400 + number, 0x1600 + number)
         self._emergency = emergency
         self._deadline = timeline.timer(self._missed)
@@ -201,7 +201,7 @@ class Tpdo(Pdo):
     """One PDO that the node sends through `send(can_id, data, time_ns)`."""
 
     def __init__(
-        self, number: int, dictionary: Dictionary, timeline: Timeline, send: Callable[[int, bytes, int], object]
+        self, number: int, dictionary: DeviceDictionary, timeline: Timeline, send: Callable[[int, bytes, int], object]
     ) -> None:
         super().__init__(dictionary, 0x1800 + number, 0x1A00 + number)
         self._send = send
@@ -306,7 +306,7 @@ class PdoEngine:
 
     def __init__(
         self,
-        dictionary: Dictionary,
+        dictionary: DeviceDictionary,
         timeline: Timeline,
         emergency: Emergency,
         send: Callable[[int, bytes, int], object],

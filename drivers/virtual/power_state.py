@@ -14,7 +14,7 @@ from servod.runtime.fieldbus.devices import DriveState
 from servod.runtime.fieldbus.devices import DriveState as S
 
 
-class Command(IntEnum):
+class DriveCommand(IntEnum):
     """What a control word asks for (bits 0 to 3; the fault reset is an edge and stands apart)."""
 
     DISABLE_VOLTAGE = 0
@@ -24,10 +24,10 @@ class Command(IntEnum):
     ENABLE_OPERATION = 4
 
 
-_C = Command
+_C = DriveCommand
 
 #: (state, command) -> (number of the transition, new state). What is not here is refused: the state stays.
-TRANSITIONS: dict[tuple[S, Command], tuple[int, S]] = {
+TRANSITIONS: dict[tuple[S, DriveCommand], tuple[int, S]] = {
     (S.SWITCH_ON_DISABLED, _C.SHUTDOWN): (2, S.READY_TO_SWITCH_ON),
     (S.READY_TO_SWITCH_ON, _C.SWITCH_ON): (3, S.SWITCHED_ON),
     (S.READY_TO_SWITCH_ON, _C.ENABLE_OPERATION): (3, S.SWITCHED_ON),  # and 4 follows by itself
@@ -71,15 +71,15 @@ class Ramp(IntEnum):
     VOLTAGE_LIMIT = 4
 
 
-def decode_command(control_word: int) -> Command:
+def decode_command(control_word: int) -> DriveCommand:
     """The command in bits 0 to 3 of a control word; every word is exactly one."""
     if not control_word & 0x2:
-        return Command.DISABLE_VOLTAGE
+        return DriveCommand.DISABLE_VOLTAGE
     if not control_word & 0x4:
-        return Command.QUICK_STOP
+        return DriveCommand.QUICK_STOP
     if not control_word & 0x1:
-        return Command.SHUTDOWN
-    return Command.ENABLE_OPERATION if control_word & 0x8 else Command.SWITCH_ON
+        return DriveCommand.SHUTDOWN
+    return DriveCommand.ENABLE_OPERATION if control_word & 0x8 else DriveCommand.SWITCH_ON
 
 
 # The status word 0x6041, put together from everything that it tells.
@@ -134,7 +134,7 @@ _FAULT_RESET = 0x80
 _STAY = 5
 
 
-class Drive(Protocol):
+class PowerStage(Protocol):
     """What the machine asks of the drive."""
 
     def option(self, obj: Obj402) -> int:
@@ -165,7 +165,7 @@ class Drive(Protocol):
 class PowerMachine:
     """State of the power drive system; `state` is read for the status word."""
 
-    def __init__(self, drive: Drive) -> None:
+    def __init__(self, drive: PowerStage) -> None:
         self._drive = drive
         self.state = _S.NOT_READY_TO_SWITCH_ON
         self.last_transition = 0
@@ -193,7 +193,7 @@ class PowerMachine:
             if not self._drive.ignores(self.state, number):
                 self._command(command, time_ns)
 
-    def command(self, command: Command, time_ns: int) -> None:
+    def command(self, command: DriveCommand, time_ns: int) -> None:
         """A command from inside the drive (abort of the connection)."""
         if self.state not in (_S.FAULT, _S.FAULT_REACTION_ACTIVE):
             self._command(command, time_ns)
@@ -224,7 +224,7 @@ class PowerMachine:
             target, self._after_stop = self._after_stop, None
             self._disable(5 if target is _S.SWITCHED_ON else 8, target, time_ns)
 
-    def _command(self, command: Command, time_ns: int) -> None:
+    def _command(self, command: DriveCommand, time_ns: int) -> None:
         row = TRANSITIONS.get((self.state, command))
         if row is None:
             return
@@ -241,7 +241,7 @@ class PowerMachine:
             self._disable(number, target, time_ns)
         else:
             self._go(number, target)
-            if number == 3 and command is Command.ENABLE_OPERATION:
+            if number == 3 and command is DriveCommand.ENABLE_OPERATION:
                 self._enable(4, time_ns)
 
     def _enable(self, number: int, time_ns: int) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from servod.common.units import NS_PER_S
-from servod.drivers.virtual.dictionary import Dictionary, Failure, SdoRefusal
+from servod.drivers.virtual.dictionary import DeviceDictionary, Failure, SdoRefusal
 from servod.drivers.virtual.timeline import Timeline
 from servod.runtime.fieldbus.cia import Abort
 
@@ -30,7 +30,7 @@ Send = Callable[[bytes], object]
 class BlockDownload:
     """Client to node. The first frame is the initiate request; SdoRefusal ends the transfer."""
 
-    def __init__(self, dictionary: Dictionary, request: bytes, send: Send) -> None:
+    def __init__(self, dictionary: DeviceDictionary, request: bytes, send: Send) -> None:
         command, self._index, self._subindex, size = _SDO_BLOCK_HEAD.unpack(request)
         if not dictionary.entry(self._index, self._subindex).writable:
             raise SdoRefusal(Abort.WRITE_OF_READ_ONLY)
@@ -84,7 +84,7 @@ class BlockUpload:
 
     abortable = True
 
-    def __init__(self, dictionary: Dictionary, request: bytes, send: Send) -> None:
+    def __init__(self, dictionary: DeviceDictionary, request: bytes, send: Send) -> None:
         _, index, subindex, parameters = _SDO_BLOCK_HEAD.unpack(request)
         self._block = self._block_size(parameters & 0xFF)
         self._value = dictionary.upload(index, subindex)
@@ -155,7 +155,7 @@ class _Segments:
 class SdoServer:
     """Answers requests on 0x600+id through `send`, which puts 8 bytes on 0x580+id."""
 
-    def __init__(self, dictionary: Dictionary, send: Callable[[bytes], object], timeline: Timeline) -> None:
+    def __init__(self, dictionary: DeviceDictionary, send: Callable[[bytes], object], timeline: Timeline) -> None:
         self._dictionary, self._send = dictionary, send
         self._segments: _Segments | None = None
         self._block: BlockDownload | BlockUpload | None = None

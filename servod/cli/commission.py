@@ -71,14 +71,14 @@ def commission(
     from servod.client.processes import sigterm_as_interrupt
     from servod.lab.commission.report import failure, result
     from servod.lab.commission.steps import STEPS
-    from servod.lab.commission.walk import Options, Questions, StepFailed, Walk, run
+    from servod.lab.commission.walk import Questions, StepFailed, Walk, WalkOptions, run
 
     axis = _virtual(plant, config, settings, encoder_counts, seed) if plant else _on_daemon(socket, config)
     need_folder("--out", out)
     walk = Walk(
         out,
         axis,
-        Options(seed, travel, speed, accuracy, plants, budget, rivals, processes, again=tuple(again or ())),
+        WalkOptions(seed, travel, speed, accuracy, plants, budget, rivals, processes, again=tuple(again or ())),
         Questions(yes, _put),
         lambda title: _bar(title, as_json),
         lambda line: None if as_json else print(line, file=sys.stderr, flush=True),

@@ -16,7 +16,7 @@ from servod.common.errors import AnswerIsNo, BadInput
 from servod.common.portable import need_linux
 
 if TYPE_CHECKING:
-    from servod.qualify.demo.entries import Entry
+    from servod.qualify.demo.entries import DemoRow
     from servod.qualify.demo.runs import Run
 
 _HELP = example(
@@ -97,19 +97,19 @@ def demo(
 def _diagnose(plant: Path | None, conceal: str | None, fast: bool, out: Path, as_json: bool) -> None:
     """The other demo: an axis that conceals something; on Table I's joint unless another is given."""
     from servod.common.shipped import shipped
-    from servod.qualify.demo.recovery.concealed import DEFAULT
+    from servod.qualify.demo.recovery.walk import DEFAULT
 
     joint = plant or shipped("gains/axes/table1_joint.yaml")
     demo_diagnose(joint, conceal or DEFAULT, fast, out, as_json)
 
 
 def _run(
-    fast: bool, plant: Path, seconds: float, rows: Sequence[Entry], recordings: Path, quiet: bool
+    fast: bool, plant: Path, seconds: float, rows: Sequence[DemoRow], recordings: Path, quiet: bool
 ) -> tuple[list[Run], list[str]]:
     """The runs, and the real-time rights that the loop was refused; none are asked for in virtual time."""
     with _progress(quiet, seconds, rows) as tell:
         if fast:
-            from servod.qualify.demo.fast import run_fast
+            from servod.qualify.demo.runs import run_fast
 
             return run_fast(plant, seconds, rows, tell), []
         from servod.qualify.demo.wall import run_wall
@@ -118,7 +118,7 @@ def _run(
 
 
 @contextmanager
-def _progress(quiet: bool, seconds: float, rows: Sequence[Entry]) -> Iterator[Callable[[str, float], None]]:
+def _progress(quiet: bool, seconds: float, rows: Sequence[DemoRow]) -> Iterator[Callable[[str, float], None]]:
     """A bar for each controller on standard error; nothing at all when quiet."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
@@ -139,7 +139,7 @@ def _progress(quiet: bool, seconds: float, rows: Sequence[Entry]) -> Iterator[Ca
         yield tell
 
 
-def print_document(rows: Sequence[Entry], document: dict[str, Any]) -> None:
+def print_document(rows: Sequence[DemoRow], document: dict[str, Any]) -> None:
     """Print the demo's document as a table for people, with what each law had and what the system refused."""
     from rich.console import Console
     from rich.table import Table
@@ -179,9 +179,7 @@ def demo_diagnose(plant: Path, effect: str, fast: bool, out: Path, as_json: bool
     from servod.client.open import daemon_axis, stepped_axis
     from servod.client.processes import sigterm_as_interrupt
     from servod.formats.model.axis_model import load_rotary_model
-    from servod.qualify.demo.recovery.concealed import believed_and_true
-    from servod.qualify.demo.recovery.page import write_recovery_page
-    from servod.qualify.demo.recovery.walk import recover
+    from servod.qualify.demo.recovery.walk import believed_and_true, recover, write_recovery_page
 
     believed, true = believed_and_true(load_rotary_model(plant), effect)
     need_folder("--out", out)

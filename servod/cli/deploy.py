@@ -56,7 +56,7 @@ def deploy(
     """Deploy GAINS; exit code 1 when the axis was rolled back, or when GAINS ran already and broke its promise."""
     one_thread()
     from servod.formats.gains.gain_set import load_gains, require_certificate
-    from servod.lab.deploy.deployment import admitted, announced, deploy
+    from servod.lab.deploy.deployment import check_admissible, deploy, motion_notice
 
     wanted = load_gains(gains)
     if present is not None and plant is None:
@@ -64,9 +64,9 @@ def deploy(
     require_certificate(wanted, accept_uncertified=None, where=str(gains))
     opened = _on_daemon(socket) if plant is None else _virtual(plant, present, config, wanted, seed)
     with opened as axis, progress("deploy", quiet=as_json) as tell:
-        admitted(wanted, axis.config, str(gains))
+        check_admissible(wanted, axis.config, str(gains))
         if not as_json:
-            print(f"{wanted.name}: {announced(wanted)}", file=sys.stderr, flush=True)
+            print(f"{wanted.name}: {motion_notice(wanted)}", file=sys.stderr, flush=True)
         done = deploy(axis, wanted, tell)
     if as_json:
         print_json(done.document())

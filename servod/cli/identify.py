@@ -177,7 +177,7 @@ def _identified_in(before: Path | None) -> AxisModel | None:
 
 
 def _changes(old: AxisModel | None, new: AxisModel) -> dict[str, Any]:
-    from servod.lab.identify.changes import changes
+    from servod.lab.identify.result import changes
 
     if old is None or old.identified is None or new.identified is None:
         return {}

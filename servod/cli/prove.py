@@ -20,7 +20,7 @@ from servod.common.errors import BadInput
 from servod.common.files import BadFile
 
 if TYPE_CHECKING:
-    from servod.qualify.blind.conceal import Trial
+    from servod.qualify.blind.conceal import BlindTrial
 
 _HELP = example(
     "Prove the diagnosis on cases that it has not seen: draw axes, conceal physics in them, record them, seal the "
@@ -92,10 +92,10 @@ def _conceal(out: Path, cases: int, seed: int, harder: bool, sealed: bool) -> No
     from dataclasses import replace
 
     from servod.cli.common import progress
-    from servod.qualify.blind.conceal import FILE, Trial, conceal, open_cases, read_trial, write_trial
+    from servod.qualify.blind.conceal import FILE, BlindTrial, conceal, open_cases, read_trial, write_trial
     from servod.qualify.blind.plan import HARDER, Settings, plans
 
-    trial, there = Trial(cases, seed, harder), read_trial(out)
+    trial, there = BlindTrial(cases, seed, harder), read_trial(out)
     if there is not None and not there.same(trial):
         found = f"{there.cases} cases of seed {there.seed}" + (", harder" if there.harder else "")
         raise BadInput(str(out / FILE), found, "the same trial, or another folder")
@@ -143,7 +143,7 @@ def _score(out: Path, as_json: bool) -> None:
         print(f"Page: {out / 'prove.html'}; tables: {out / 'prove.md'}; all figures: {out / 'prove.json'}")
 
 
-def _sealed(out: Path) -> Trial:
+def _sealed(out: Path) -> BlindTrial:
     """The trial that was sealed in `out`. Raises BadInput when there is none."""
     from servod.qualify.blind.conceal import FILE, read_trial
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from servod.formats.gains.gain_set import GainSet
     from servod.formats.model.axis_model import AxisModel
     from servod.lab.synthesize.deployed import Wishes
-    from servod.lab.synthesize.gain_set import Options
+    from servod.lab.synthesize.gain_set import DesignOptions
     from servod.lab.synthesize.infeasible import Infeasible
 
 # Options of `servoctl synthesize`: every one with its range and a line of help; a default of None is the mode's own.
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 # Imports typer alone, as all verbs do.
 
 
-class Mode(StrEnum):
+class SynthesisMode(StrEnum):
     """The programme that is solved."""
 
     DEPLOYED = "deployed"
@@ -52,7 +52,9 @@ class Velocity(StrEnum):
 Model = Annotated[Path, typer.Option(help="Axis model (YAML).")]
 Out = Annotated[Path, typer.Option(help="Gain set to write (YAML).")]
 Name = Annotated[str, typer.Option(help="Name of the gain set.")]
-ModeOption = Annotated[Mode, typer.Option(help="Sampled, with delay and filter; or the paper's own programme.")]
+ModeOption = Annotated[
+    SynthesisMode, typer.Option(help="Sampled, with delay and filter; or the paper's own programme.")
+]
 ScalarOutput = Annotated[bool, typer.Option("--scalar-output", help="Reference mode: the literal alpha*x + beta*u*.")]
 CrossCheck = Annotated[bool, typer.Option("--cross-check", help="Solve again with SCS, and compare; half a minute.")]
 
@@ -96,7 +98,7 @@ def synthesize(
     model: Model,
     out: Out,
     name: Name = "synthesized",
-    mode: ModeOption = Mode.DEPLOYED,
+    mode: ModeOption = SynthesisMode.DEPLOYED,
     scalar_output: ScalarOutput = False,
     cross_check: CrossCheck = False,
     alpha: Alpha = None,
@@ -170,12 +172,12 @@ def options_of(
     position_torque: bool,
     leak_per_s: float,
     gain: float | None,
-) -> Options:
+) -> DesignOptions:
     """What is asked of the law."""
     from servod.formats.gains.parameters import VelocitySource, WeightShape
-    from servod.lab.synthesize.gain_set import Options
+    from servod.lab.synthesize.gain_set import DesignOptions
 
-    return Options(
+    return DesignOptions(
         name,
         accuracy,
         paper_nodes,
@@ -227,10 +229,10 @@ def given(**values: float | None) -> dict[str, Any]:
 
 
 def solved(
-    mode: Mode,
+    mode: SynthesisMode,
     axis: AxisModel,
     wishes: Wishes,
-    options: Options,
+    options: DesignOptions,
     asked: dict[str, Any],
     scalar_output: bool,
     path: Path,
@@ -238,7 +240,7 @@ def solved(
     """The set of the mode that was chosen, or why there is none."""
     from servod.lab.synthesize.gain_set import synthesize
 
-    if mode is Mode.DEPLOYED:
+    if mode is SynthesisMode.DEPLOYED:
         if scalar_output:
             raise BadInput("--scalar-output", "the deployed mode", "--mode reference")
         return synthesize(axis, replace(wishes, **asked), options, path)

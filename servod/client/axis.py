@@ -66,7 +66,7 @@ class ReferenceMotion:
         })  # fmt: skip
 
 
-class AxisStatus(NamedTuple):
+class AxisReading(NamedTuple):
     """The axis now; `state` is the name of its servod.runtime.loop.axis.AxisState."""
 
     state: str
@@ -103,7 +103,7 @@ class AxisClient(Protocol):
         """Name and version of the set that runs, on trial or not."""
         ...
 
-    def status(self) -> AxisStatus:
+    def status(self) -> AxisReading:
         """The axis now."""
         ...
 

@@ -14,7 +14,7 @@ from concurrent.futures import Executor, Future
 from pathlib import Path
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
-from servod.client.axis import LOOK_S, AxisDropped, AxisStatus, ReferenceMotion, Watch
+from servod.client.axis import LOOK_S, AxisDropped, AxisReading, ReferenceMotion, Watch
 from servod.common.errors import AnswerIsNo
 from servod.common.faults import fault_text
 from servod.common.units import NS_PER_S
@@ -32,14 +32,14 @@ from servod.runtime.daemon.arguments import (
 )
 from servod.runtime.daemon.flows import OrderWait, finish
 from servod.runtime.daemon.gain_bank import GainBank
-from servod.runtime.daemon.trajectory import Table
+from servod.runtime.daemon.trajectory import MotionTable
 from servod.runtime.fieldbus.master import BringUp, Master
 from servod.runtime.loop.axis import AxisState
 from servod.runtime.loop.channel import TRAJECTORY_SAMPLES
 from servod.runtime.loop.commands import REFUSAL_TEXT, Command, Op, Refusal
 from servod.runtime.loop.cycle import Cycle
 from servod.runtime.loop.plan import LoopPlan
-from servod.runtime.loop.wiring.findings import Proof, sentence
+from servod.runtime.loop.wiring.findings import WiringReport, wiring_sentence
 
 if TYPE_CHECKING:
     from servod.drivers.virtual.world import SteppedWorld, Truth
@@ -62,12 +62,12 @@ class _ListLink:
         self.trajectory = array("d", bytes(8 * TRAJECTORY_SAMPLES))
         self.commands: deque[Command] = deque()
         self.raw = bytearray()
-        self.proof: Proof | None = None
+        self.proof: WiringReport | None = None
 
     def write_record(self, values: Sequence[float]) -> None:
         self.raw += RECORD.pack(*values)
 
-    def write_proof(self, proof: Proof) -> None:
+    def write_proof(self, proof: WiringReport) -> None:
         self.proof = proof
 
     def next_command(self) -> Command | None:
@@ -164,10 +164,10 @@ class SteppedSession:
     def why(self) -> str:
         """The latched faults with cause and remedy, for the person who reads the message."""
         text = fault_text(self.latest.faults_latched)
-        return f"{sentence(self.proof)} {text}" if self.proof and not self.proof.passed else text
+        return f"{wiring_sentence(self.proof)} {text}" if self.proof and not self.proof.passed else text
 
     @property
-    def proof(self) -> Proof | None:
+    def proof(self) -> WiringReport | None:
         """How the last test of the wiring ended; None before there was one."""
         return self._link.proof
 
@@ -227,11 +227,11 @@ class SteppedAxis:
         gains, parameters = self._bank.newest.gains, self._bank.newest.gains.pack()
         self._send(Op.ACTIVATE, (0, gains.law.number, len(parameters), *parameters)).result()
 
-    def status(self) -> AxisStatus:
+    def status(self) -> AxisReading:
         """As of the last cycle."""
         cycle = self.session.cycle
         moves, reference_rad = cycle.reference.active, cycle.reference.position_rad
-        return AxisStatus(cycle.axis.state.name, bool(moves), cycle.encoder_position_rad, reference_rad)
+        return AxisReading(cycle.axis.state.name, bool(moves), cycle.encoder_position_rad, reference_rad)
 
     def truth(self) -> Truth:
         """The joint itself, which no encoder shows."""
@@ -273,7 +273,7 @@ class SteppedAxis:
         words = dict(motion.arguments)
         positions_rad, torques_nm = words.pop(SampleKey.POSITIONS, None), words.pop(SampleKey.TORQUES, None)
         args: TrackArgs = check_arguments(Verb.TRACK, words | {"uploaded": True})
-        table = args.table(Table(positions_rad, torques_nm))
+        table = args.table(MotionTable(positions_rad, torques_nm))
         self.session.load_trajectory(table.area())
         refusal = self.session.send(Op.REFERENCE, args.reference(table))
         if refusal != Refusal.DONE:

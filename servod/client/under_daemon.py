@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from servod.client.axis import LOOK_S, AxisDropped, AxisStatus, ReferenceMotion, Watch
+from servod.client.axis import LOOK_S, AxisDropped, AxisReading, ReferenceMotion, Watch
 from servod.client.control import ControlClient, Refused
 from servod.common.errors import AnswerIsNo, BadInput, ServodError, Unreachable
 from servod.common.yaml import parse_yaml, validate
@@ -133,12 +133,12 @@ class DaemonAxis:
             raise AnswerIsNo("the daemon's gain set is not in its store")
         return str(running["name"]), int(running["version"])
 
-    def status(self) -> AxisStatus:
+    def status(self) -> AxisReading:
         """What `status` says."""
         document = self._client.call(Verb.STATUS)
         axis, motion = document["axis"], document["motion"]
         at_rad, reference_rad = float(motion["position_rad"]), float(motion["reference_rad"])
-        return AxisStatus(str(axis["state"]), bool(axis["motion_running"]), at_rad, reference_rad)
+        return AxisReading(str(axis["state"]), bool(axis["motion_running"]), at_rad, reference_rad)
 
     def enable(self, reset_fault: bool = False) -> None:
         """Enable, and wait for it."""

@@ -13,16 +13,15 @@ _PACKAGE = Path(__file__).parents[1]
 
 #: The checks of a set, and what they stand on: simulator, control laws, model and design.
 VERIFIES = (
-    *("lab/verify/*.py", "lab/simulate/*.py", "kernels/*/*.py", "formats/model/*.py"),
-    *(f"formats/gains/{name}.py" for name in ("design", "parameters", "gain_verdict", "gain_set")),
-    "runtime/loop/references.py",
+    *("lab/verify/*.py", "lab/simulate/*.py", "kernels/**/*.py", "formats/model/*.py"),
+    *(f"formats/gains/{name}.py" for name in ("design", "parameters", "gain_set")),
 )
 #: What computes a design: it judges its choices by the same checks.
-SYNTHESIZES = ("lab/synthesize/*.py", *(pattern for pattern in VERIFIES if pattern != "runtime/loop/references.py"))
+SYNTHESIZES = ("lab/synthesize/*.py", *VERIFIES)
 #: What a diagnosis comes from, intake and simulator included.
 DIAGNOSES = (
     *("lab/diagnose/**/*.py", "lab/recordings/*.py", "lab/simulate/*.py", "formats/recording/record.py"),
-    *("kernels/physics/*.py", "formats/model/*.py"),
+    *("kernels/**/*.py", "formats/model/*.py"),
 )
 
 

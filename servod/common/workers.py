@@ -9,11 +9,13 @@ import contextlib
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import cache
-from multiprocessing import get_context, resource_tracker
+from multiprocessing import active_children, get_context, resource_tracker
+from multiprocessing.process import BaseProcess
 from multiprocessing.util import Finalize
 from typing import Any
 
@@ -22,6 +24,8 @@ from servod.common.portable import end_with_parent
 
 #: What Windows can wait for at once, less what the executor itself needs.
 _MOST_ON_WINDOWS = 61
+#: How long the account of semaphores may take to close [s].
+_TRACKER_S = 2.0
 
 
 @contextlib.contextmanager
@@ -34,6 +38,7 @@ def worker_pool(processes: int, begin: Callable[..., None] | None = None, *given
     if sys.platform == "win32":
         processes = min(processes, _MOST_ON_WINDOWS)
     _tracker_goes_with_us()
+    before = active_children()
     pool = ProcessPoolExecutor(processes, get_context("spawn"), begin_worker, (os.getpid(), begin, given))
     try:
         yield pool
@@ -43,12 +48,12 @@ def worker_pool(processes: int, begin: Callable[..., None] | None = None, *given
             "(`dmesg` tells); run the command again, with fewer --processes where it has them"
         ) from None
     finally:
-        _end(pool)
+        _end(pool, [p for p in active_children() if p not in before])
 
 
-def _end(pool: ProcessPoolExecutor) -> None:
+def _end(pool: ProcessPoolExecutor, workers: Iterable[BaseProcess]) -> None:
     """Kill and wait. The pool's own way out lets every job that has begun come to its end (until Python 3.14)."""
-    for process in list((pool._processes or {}).values()):
+    for process in workers:
         process.kill()
     pool.shutdown(wait=True, cancel_futures=True)
 
@@ -58,10 +63,22 @@ def _tracker_goes_with_us() -> None:
     """Wait at our own end for the process in which multiprocessing keeps account of semaphores.
 
     Left alone it ends after us, and stays listed until whoever inherits it looks. Its end must come after that of all
-    semaphores (exit priority 0); that it is waited for in `_stop` alone is why a private name is used.
+    semaphores (exit priority 0). Newer Pythons wait for it themselves.
     """
-    stop = resource_tracker._resource_tracker._stop  # type: ignore[attr-defined]
-    Finalize(None, stop, exitpriority=-1)
+    if not hasattr(resource_tracker.ResourceTracker, "__del__"):
+        Finalize(None, _end_tracker, exitpriority=-1)
+
+
+def _end_tracker() -> None:
+    """Close the pipe on which the tracker lives, and reap it; whatever else we started has ended by then."""
+    descriptor = resource_tracker.getfd()
+    if descriptor is not None:
+        os.close(descriptor)
+    deadline = time.monotonic() + _TRACKER_S
+    with contextlib.suppress(ChildProcessError):  # none is left
+        while time.monotonic() < deadline:
+            if os.waitpid(-1, os.WNOHANG) == (0, 0):
+                time.sleep(0.005)
 
 
 def begin_worker(parent: int, begin: Callable[..., None] | None = None, given: tuple[Any, ...] = ()) -> None:

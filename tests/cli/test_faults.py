@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 
 from servod.cli.app import run
-from servod.qualify.faults.document import HEADER, cells
-from servod.qualify.faults.judge import Reaction
-from servod.qualify.faults.run import Outcome
+from servod.qualify.faults.judge import ReactionTimes
+from servod.qualify.faults.run import HEADER, Outcome, cells
 from servod.qualify.faults.scenario import Loss
 from servod.qualify.faults.under_test import Observation
 
@@ -119,7 +118,7 @@ def test_one_that_breaks_off_has_failed_and_the_next_one_runs(
     ("recovered", "by_repair", "told"), [(True, False, "yes"), (False, True, "by repair"), (False, False, "no")]
 )
 def test_only_what_was_to_be_repaired_recovers_by_repair(recovered: bool, by_repair: bool, told: str) -> None:
-    nothing = Reaction(None, None)
+    nothing = ReactionTimes(None, None)
     outcome = Outcome("x", "x", "x", "x", (), "", "FAULT", nothing, 0, recovered, (), Loss.NONE, None, by_repair)
     assert cells(outcome)[HEADER.index("Recovered")] == told
 

@@ -69,7 +69,7 @@ def test_an_interrupt_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytes
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("servod.qualify.demo.fast.run_fast", interrupted)
+    monkeypatch.setattr("servod.qualify.demo.runs.run_fast", interrupted)
     assert run(["demo", "--fast", "--json"]) == 130
     captured = capsys.readouterr()
     assert captured.err == "servoctl: interrupted\n"

@@ -7,7 +7,7 @@ import os
 import subprocess
 from pathlib import Path
 
-from servod.qualify.blind.conceal import Trial, write_trial
+from servod.qualify.blind.conceal import BlindTrial, write_trial
 from tests.cli.test_output import servoctl
 
 _OPTIONS = ("--cases", "1", "--seed", "1")
@@ -18,7 +18,7 @@ def prove(out: Path) -> subprocess.CompletedProcess[bytes]:
 
 
 def test_a_stage_comes_to_its_work_in_the_folder_of_its_command(tmp_path: Path) -> None:
-    write_trial(tmp_path, Trial(3, 9, harder=True))  # the first stage looks into it, and refuses
+    write_trial(tmp_path, BlindTrial(3, 9, harder=True))  # the first stage looks into it, and refuses
     done = prove(tmp_path)
     assert done.stderr.decode() == (
         f"servoctl: {tmp_path}/trial.json: found 3 cases of seed 9, harder; "

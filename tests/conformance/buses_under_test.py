@@ -14,7 +14,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from servod.drivers.virtual.server import HubServer, Timing
+from servod.drivers.virtual.main import HubServer, Timing
 from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.drivers.virtual.world import SteppedWorld, World
 from servod.formats.config import BusConfig

@@ -19,8 +19,8 @@ import source
 FLOORS = ("common", "kernels", "formats", "runtime", "client", "lab", "qualify", "cli")
 FOLDERS = {*FLOORS, "drivers"}
 DIAGNOSE = "servod.lab.diagnose"
-#: Attributes with one underscore that are no library's own secret: of our own objects, and documented protocols.
-_OWN = re.compile(r"^(self|cls|_\w*|other)$")
+#: A name with two underscores of another class, as Python mangles it.
+_MANGLED = re.compile(r"_[A-Za-z]\w*__\w")
 _DOCUMENTED = {"_fields", "_replace", "_asdict", "_make", "_exit", "_MEIPASS", "_getframe"}
 
 
@@ -200,7 +200,9 @@ def _private() -> Figure:
                 found += [
                     f"{file.relative_to(source.ROOT)}:{node.lineno} {a.name}" for a in node.names if _secret(a.name)
                 ]
-            if isinstance(node, ast.Attribute) and _secret(node.attr):
+            if isinstance(node, ast.Attribute) and _MANGLED.match(node.attr):
+                found.append(f"{file.relative_to(source.ROOT)}:{node.lineno} {ast.unparse(node)}")
+            elif isinstance(node, ast.Attribute) and _secret(node.attr):
                 root = ast.unparse(node.value).split(".")[0].split("(")[0]
                 if root in outside:
                     found.append(f"{file.relative_to(source.ROOT)}:{node.lineno} {ast.unparse(node)}")

@@ -191,7 +191,7 @@ class OutputObserver(Strict):
         return self.low_moving_bandwidth_rad_s or self.low_bandwidth_rad_s or self.bandwidth_rad_s
 
 
-class LocalFriction(Strict):
+class LocalFrictionSets(Strict):
     """The compensator of (9): one stiffness for all sets, a decay and a gain for each."""
 
     stiffness_nm_per_rad: float = Field(gt=0.0, le=1e8, description="c0_hat")
@@ -204,7 +204,7 @@ class LocalFriction(Strict):
     sets: list[LocalSet] = Field(min_length=3, max_length=MAX_SETS)
 
     @model_validator(mode="after")
-    def _nodes_are_ordered(self) -> LocalFriction:
+    def _nodes_are_ordered(self) -> LocalFrictionSets:
         nodes = [s.velocity_rad_s for s in self.sets]
         if any(lower >= upper for lower, upper in itertools.pairwise(nodes)):
             raise ValueError("sets in ascending order of velocity_rad_s, none twice")
@@ -261,7 +261,7 @@ class LocalParameters(Strict):
     law: Literal["local"]
     input_scale_nm: Torque = Field(0.1, description="K, u* = u/K")
     regions: Regions
-    friction: LocalFriction
+    friction: LocalFrictionSets
     disturbance_observer: OutputObserver | None = None
     feedforward_inertia_kg_m2: float = Field(0.0, ge=0.0, le=1e4)
     hold_within_rad: Width = 0.0

@@ -171,14 +171,14 @@ class OffsetDrift(Group):
     time_s: Positive | None = Field(None, description="s in which the drift ends; None = it goes on")
 
 
-class Table(Strict):
+class TorqueMap(Strict):
     """A resisting torque as a piecewise linear function, zero outside its grid."""
 
     grid: tuple[float, ...] = Field(min_length=2, max_length=2048, description="ascending: rad, rad/s or s")
     torque: tuple[float, ...] = Field(min_length=2, max_length=2048, description="N*m")
 
     @model_validator(mode="after")
-    def _is_a_function(self) -> Table:
+    def _is_a_function(self) -> TorqueMap:
         if len(self.grid) != len(self.torque):
             raise ValueError("as many torques as grid points")
         if any(a >= b for a, b in zip(self.grid, self.grid[1:], strict=False)):
@@ -189,9 +189,9 @@ class Table(Strict):
 class Residual(Group):
     """A resisting torque that fits no known physics, kept as a table over position, velocity or time where it lives."""
 
-    position: Table | None = None
-    velocity: Table | None = None
-    time: Table | None = None
+    position: TorqueMap | None = None
+    velocity: TorqueMap | None = None
+    time: TorqueMap | None = None
 
 
 class Noise(Strict):

@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.common.files import unwritable
-from servod.formats.recording.mcap_reader import Recording
+from servod.formats.recording.mcap_reader import McapRecording
 
 _NS_PER_S = 1e9
 
 
-def export_csv(recording: Recording, path: Path) -> int:
+def export_csv(recording: McapRecording, path: Path) -> int:
     """Write `recording` to `path` as CSV; returns the number of rows. Raises BadInput when that cannot be written."""
     aside = path.with_name(path.name + ".part")
     try:
@@ -43,25 +43,25 @@ def _remove(aside: Path) -> None:
         aside.unlink(missing_ok=True)
 
 
-def _write_csv(recording: Recording, stream: TextIO) -> None:
+def _write_csv(recording: McapRecording, stream: TextIO) -> None:
     writer = csv.writer(stream)
     writer.writerow(["t_s", *recording.names])
     writer.writerows(_csv_rows(recording))
 
 
-def _csv_rows(recording: Recording) -> Iterator[tuple[Any, ...]]:
+def _csv_rows(recording: McapRecording) -> Iterator[tuple[Any, ...]]:
     columns = [recording.column(name) for name in recording.names]
     times_s = seconds(recording)
     return zip((f"{t:.9f}" for t in times_s), *columns, strict=True)
 
 
-def seconds(recording: Recording) -> list[float]:
+def seconds(recording: McapRecording) -> list[float]:
     """Seconds of each row since the first; empty when there is none."""
     times_ns = recording.column("time_ns")
     return [(t - times_ns[0]) / _NS_PER_S for t in times_ns]
 
 
-def export_parquet(recording: Recording, path: Path) -> int:
+def export_parquet(recording: McapRecording, path: Path) -> int:
     """Write `recording` to `path` as Parquet, with units in the columns' metadata; returns the number of rows.
 
     Raises BadInput when the file cannot be written, ImportError without pyarrow.

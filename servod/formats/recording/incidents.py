@@ -17,7 +17,7 @@ from servod.common.errors import BadInput
 from servod.common.faults import FAULTS, FaultCode, Reaction, faults_in
 from servod.common.files import read_text
 from servod.common.units import NS_PER_S
-from servod.formats.recording.mcap_reader import Recording, read_recording
+from servod.formats.recording.mcap_reader import McapRecording, read_recording
 
 #: A fault that comes later than this after the one before it has a cause of its own.
 QUIET_NS = 10 * NS_PER_S
@@ -121,7 +121,7 @@ def of_file(path: Path) -> list[Incident]:
     return found[-1:] if match else found
 
 
-def _appeared(recording: Recording) -> list[Seen]:
+def _appeared(recording: McapRecording) -> list[Seen]:
     """Every fault when it came up, in the cycles and, where the supervisor found it, in the events."""
     try:
         times, present = recording.column("time_ns"), recording.column("faults")

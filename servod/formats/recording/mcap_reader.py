@@ -45,7 +45,7 @@ _BROKEN = (
 
 
 @dataclass
-class Recording:
+class McapRecording:
     """A recording in memory: `rows` holds the cycle records one behind the other, eight bytes for each name.
 
     `kinds` has one letter per name, "d" (float64) or "q" (int64), little endian; `truncated` tells that the file
@@ -90,13 +90,15 @@ class Recording:
         return [CycleRecord._make(row) for row in unpack(self.rows)]
 
 
-def read_recording(path: str | Path, wanted: Container[str] | None = None, most_cells: int | None = None) -> Recording:
+def read_recording(
+    path: str | Path, wanted: Container[str] | None = None, most_cells: int | None = None
+) -> McapRecording:
     """The recording at `path`; only its time and the names that are `wanted`, where that is given.
 
     Raises BadInput when it is missing, no recording of servod's at all, or too large: more than `most_cells` numbers
     in the names that are kept, or over 4 GiB unpacked, 3.4 hours at 1 kHz.
     """
-    recording = Recording()
+    recording = McapRecording()
     taker = _Taker(path, recording, wanted, most_cells)
     try:
         with open_file(path) as stream:
@@ -130,7 +132,7 @@ class _Bounded:
         return self._stream.read(min(count, self.size))
 
 
-def _tell_damage(recording: Recording, read_bytes: int, all_bytes: int) -> None:
+def _tell_damage(recording: McapRecording, read_bytes: int, all_bytes: int) -> None:
     """Say where a file that has no end breaks off."""
     if recording.truncated:
         what = "cut off" if read_bytes >= all_bytes else "damaged"
@@ -185,7 +187,7 @@ class _Taker:
     """Puts the records of one file into its recording, and counts what is kept of them."""
 
     def __init__(
-        self, path: str | Path, recording: Recording, wanted: Container[str] | None, most_cells: int | None
+        self, path: str | Path, recording: McapRecording, wanted: Container[str] | None, most_cells: int | None
     ) -> None:
         self.path, self.recording = path, recording
         self._wanted, self._most_cells = wanted, most_cells

@@ -31,7 +31,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from servod.kernels.laws.observer import decayed, limited, observe, remember, winds_up
+from servod.kernels.laws.observer import decayed, limited, observe, remember, winding_up
 from servod.kernels.laws.position import PositionTorques, position_torque
 from servod.kernels.laws.state import LawState
 from servod.kernels.laws.weights import Sets, blended
@@ -161,7 +161,7 @@ def step(
     moves = not (stands and abs(error) <= p.hold_within)
     decay, gain = blended(p.sets, p.shape, w)
     drive = w
-    if moves and gain != 0.0 and not winds_up(s, u_star, u_applied):
+    if moves and gain != 0.0 and not winding_up(s, u_star, u_applied):
         drive += gain * u_star
     if moves or p.source != REFERENCE:
         s.z_hat = limited(decayed(s.z_hat, max(decay, p.leak), drive, dt), p.state_limit)

@@ -76,7 +76,7 @@ def remember(s: LawState, v: float, modelled_nm: float, u_applied: float) -> Non
 LIMITED_NM = 1e-9  # less difference than this between asked and applied is rounding
 
 
-def winds_up(s: LawState, push: float, u_applied: float) -> bool:
+def winding_up(s: LawState, push: float, u_applied: float) -> bool:
     """Whether the limits cut the last torque (asked against applied) and `push` would ask for still more of it."""
     cut = s.asked - u_applied
     return (cut > LIMITED_NM and push > 0.0) or (cut < -LIMITED_NM and push < 0.0)

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from servod.kernels.laws.observer import decayed, limited, winds_up
+from servod.kernels.laws.observer import decayed, limited, winding_up
 from servod.kernels.laws.state import LawState
 
 
@@ -52,7 +52,7 @@ def step(
     level = p.coulomb + (p.static - p.coulomb) * math.exp(-((v / p.stribeck_velocity) ** 2))
     drive = v
     at_rest = v_ref == 0.0 and a_ref == 0.0 and abs(error) <= p.hold_within
-    if not (at_rest or winds_up(s, feedback, u_applied)):
+    if not (at_rest or winding_up(s, feedback, u_applied)):
         drive += p.observer_gain * feedback / p.input_scale
     before = s.z_hat
     z = limited(decayed(before, p.stiffness * abs(v) / level, drive, dt), p.state_limit)

@@ -2,8 +2,8 @@
 
 Stands under every kernel of `servod.kernels.physics`, which take them as `p`, `s` and `tables`. In pure Python `p` and
 `s` are the classes below, compiled they are records of the same names (`servod.kernels.physics.compiled.record`), so
-that one source runs on both. `servod.formats.model.pack` fills `p` and `tables` from an axis model. SI units in joint
-coordinates throughout; for a linear axis read N for N*m, m for rad, kg for kg*m^2.
+that one source runs on both. `servod.formats.model.axis_model` fills `p` and `tables` from an axis model. SI units in
+joint coordinates throughout; for a linear axis read N for N*m, m for rad, kg for kg*m^2.
 
 A record goes from kernel to kernel as one pointer, and an inner step takes what it took with flat arrays (41 ns plain,
 136 with every effect). A NamedTuple of 54 floats and 12 tables would go by value, and numba takes 8 to 14 us to accept

@@ -36,14 +36,14 @@ from servod.lab.commission.state import read_walk_json as read_json
 from servod.lab.commission.walk import StepFailed, Tell, Walk
 from servod.lab.identify import store
 from servod.lab.identify.analysis import analyse
-from servod.lab.report.figure import Figure, Table
+from servod.lab.report.figure import Figure, PageTable
 from servod.lab.report.figures import friction, loop, motion, sets
-from servod.lab.report.figures.motion import Motion
+from servod.lab.report.figures.motion import PlottedMotion
 from servod.lab.report.page import Page
 from servod.lab.report.pictures import write_pictures
 from servod.lab.tracking.metrics import STEPS_MRAD, Curves, curve_key
 
-Part = Figure | Table | str
+Part = Figure | PageTable | str
 #: Laws as people read them.
 NAMES = {**LABELS, DEPLOYED: "Deployed"}
 #: Classes of the comparison as people read them, in the order of the page.
@@ -81,7 +81,7 @@ def sections(walk: Walk, gains: GainSet, model: AxisModel) -> dict[str, Callable
 def _add(page: Page, walk: Walk, part: Part) -> None:
     if isinstance(part, str):
         page.sentence(part)
-    elif isinstance(part, Table):
+    elif isinstance(part, PageTable):
         page.sentence(part.title)
         page.table(part.header, part.rows)
     else:
@@ -119,7 +119,7 @@ def _identified(walk: Walk, model: AxisModel) -> Iterator[Part]:
         (name, f"{v['value']:.5g}", f"{v['low']:.4g} to {v['high']:.4g}", v["unit"], v["note"])
         for name, v in found["identified"].items()
     ]
-    yield Table("What was measured", ("quantity", "value", "95 % interval", "unit", "note"), tuple(rows))
+    yield PageTable("What was measured", ("quantity", "value", "95 % interval", "unit", "note"), tuple(rows))
     yield from (f"Not identifiable: {name}. {remedy}." for name, remedy in found["not_identifiable"].items())
     analysis = analyse(store.load(walk.path(RECORDINGS)))
     yield friction.dahl_curve(analysis.presliding, truth)
@@ -143,7 +143,7 @@ def _deployment(walk: Walk) -> Iterator[Part]:
     found = read_json(walk.path(DEPLOYMENT))
     columns = [run for run in ("before", "after", "promised") if found[run]]
     rows = [(name.removesuffix("_mrad"), *(f"{found[run][name]:.4g}" for run in columns)) for name in found["promised"]]
-    yield Table("Validation motion, mrad", ("figure", *columns), tuple(rows))
+    yield PageTable("Validation motion, mrad", ("figure", *columns), tuple(rows))
     if not found["before"]:
         yield "The set was active already, and nothing was measured before it: its promise alone judged it."
         return
@@ -157,7 +157,7 @@ def _tracking(walk: Walk) -> Iterator[Part]:
     for name, title in CLASSES.items():
         if not (figures := found[name]):
             continue
-        yield Table(f"{title}: trajectory (19) and steps, mrad and s", _HEADER, tuple(_rows(figures)))
+        yield PageTable(f"{title}: trajectory (19) and steps, mrad and s", _HEADER, tuple(_rows(figures)))
         yield from _over_limit(figures)
         feedback = name.partition("_")[0]
         yield from _tuned(feedback, title, read_json(walk.path(TUNING)).get(feedback, {}))
@@ -167,7 +167,7 @@ def _tracking(walk: Walk) -> Iterator[Part]:
     yield from (f"Not measured: {line}" for line in found.get("not_measured", []))
 
 
-def _tuned(feedback: str, title: str, tuned: dict[str, Any]) -> Iterator[Table]:
+def _tuned(feedback: str, title: str, tuned: dict[str, Any]) -> Iterator[PageTable]:
     """What the tuning of a class reached on simulated plants, with the roughness that bounds every law alike."""
     if tuned:
         header = ("controller", "cost / mrad", "simulated plants", "roughness, times that of the paper's PD", "limit")
@@ -181,7 +181,7 @@ def _tuned(feedback: str, title: str, tuned: dict[str, Any]) -> Iterator[Table]:
             )
             for law, t in tuned.items()
         ]
-        yield Table(f"{title}: what tuning reached", header, tuple(rows))
+        yield PageTable(f"{title}: what tuning reached", header, tuple(rows))
 
 
 def _over_limit(figures: dict[str, Any]) -> Iterator[str]:
@@ -229,8 +229,8 @@ def _figures(name: str, title: str, runs: dict[str, dict[str, Curves]]) -> Itera
             yield motion.steps(stepped, f"{key}_{name}", f"{title}: step of {step:g} mrad")
 
 
-def _motion(law: str, curves: Curves) -> Motion:
-    return Motion(
+def _motion(law: str, curves: Curves) -> PlottedMotion:
+    return PlottedMotion(
         NAMES[law], curves.time_s, curves.reference_rad, curves.position_rad, curves.torque_nm, curves.friction_nm
     )
 

@@ -61,7 +61,7 @@ SCORING_SEED, TUNING_SEED = 100, 200
 
 
 @dataclass(frozen=True)
-class Options:
+class WalkOptions:
     """What may be chosen of a walk. No law is scored under noise that it was tuned in, or identified for."""
 
     seed: int = 1
@@ -92,7 +92,7 @@ class Walk:
 
     folder: Path
     axis: WalkAxis
-    options: Options
+    options: WalkOptions
     questions: Questions
     progress: Progress
     say: Callable[[str], None]

@@ -16,8 +16,8 @@ from servod.common.errors import AnswerIsNo, BadInput, ServodError
 from servod.formats.config import AxisConfig
 from servod.formats.gains.design import Design
 from servod.formats.gains.gain_set import GainSet, Promise, require_certificate, require_same_loop
-from servod.lab.deploy.judge import complaints, every_cycle, limits_met, motions_in, skipped
-from servod.lab.deploy.outcome import Before, Deployment, Ending
+from servod.lab.deploy.judge import doubtful_timing, every_cycle, limits_met, motions_in, rejections
+from servod.lab.deploy.outcome import Baseline, Deployment, Ending
 from servod.lab.recordings.recording import Rows, rows_of
 from servod.lab.verify.validation import STEP_S, Figures, ValidationMotion, motion_for
 
@@ -47,8 +47,8 @@ def deploy(
     axis: AxisClient,
     gains: GainSet,
     tell: Tell,
-    earlier: Before | None = None,
-    remember: Callable[[Before], None] = lambda _before: None,
+    earlier: Baseline | None = None,
+    remember: Callable[[Baseline], None] = lambda _before: None,
 ) -> Deployment:
     """Try `gains` on the axis and keep it when it proves itself; the axis is left enabled or not, as it was.
 
@@ -60,7 +60,7 @@ def deploy(
     does not get through the motion under its present set. An interrupt stops the axis, leaves it off and the present
     set active.
     """
-    design, promised = admitted(gains, axis.config)
+    design, promised = check_admissible(gains, axis.config)
     motion = motion_for(design)
     window_rad = min(WINDOW_TRAVELS * motion.travel_rad, WINDOW_SHARE * axis.config.limits.following_error_rad)
     was_enabled = axis.status().enabled
@@ -80,7 +80,7 @@ def deploy(
             axis.disable()
 
 
-def admitted(gains: GainSet, config: AxisConfig, where: str | None = None) -> tuple[Design, Promise]:
+def check_admissible(gains: GainSet, config: AxisConfig, where: str | None = None) -> tuple[Design, Promise]:
     """Design and promise of a set that may be tried on this axis. Raises BadInput; `where` is the file, if any."""
     require_certificate(gains, accept_uncertified=None, where=where)
     require_same_loop(gains, config, where)
@@ -94,7 +94,7 @@ def admitted(gains: GainSet, config: AxisConfig, where: str | None = None) -> tu
     return gains.design, gains.certificate.promised
 
 
-def announced(gains: GainSet) -> str:
+def motion_notice(gains: GainSet) -> str:
     """How far, how fast and how long the axis will move in the trial of a set, for people. Raises BadInput."""
     if gains.design is None:
         raise BadInput(f"gain set {gains.name}: design", "nothing", "a design; `servoctl synthesize` makes it")
@@ -117,7 +117,7 @@ class _Trial:
         self._count_rad = 2.0 * np.pi / axis.config.encoder.counts_per_turn
         self._on_trial = False
 
-    def run(self, gains: GainSet, earlier: Before | None, remember: Callable[[Before], None]) -> Deployment:
+    def run(self, gains: GainSet, earlier: Baseline | None, remember: Callable[[Baseline], None]) -> Deployment:
         """Before, change, after, verdict."""
         present, (name, version) = self._axis.active, self._axis.load(gains)
         ran_already = present == (name, version)
@@ -147,14 +147,14 @@ class _Trial:
                 self._axis.give_up(why[:_LONGEST_NOTE], {})
 
     def _before(
-        self, present: tuple[str, int], earlier: Before | None, ran_already: bool
-    ) -> tuple[Before | None, Figures | None]:
+        self, present: tuple[str, int], earlier: Baseline | None, ran_already: bool
+    ) -> tuple[Baseline | None, Figures | None]:
         """The motion before the change and its figures: run now, or `earlier` when the change is past."""
-        ran = earlier if ran_already else Before(present, self._move("under the present set", 0.05))
+        ran = earlier if ran_already else Baseline(present, self._move("under the present set", 0.05))
         return (ran, self._figures(ran.rows)) if ran else (None, None)
 
     def _after(
-        self, change: tuple[str, int] | None, ran_before: Before | None, before: Figures | None
+        self, change: tuple[str, int] | None, ran_before: Baseline | None, before: Figures | None
     ) -> tuple[Rows | None, Figures | None, list[str]]:
         """Change to the new set, unless it runs, and its motion: cycles, figures, and what speaks against it."""
         try:
@@ -171,8 +171,8 @@ class _Trial:
         except AnswerIsNo as error:
             return rows, None, [str(error)]
         limited = limits_met(motions_in(rows)[0], motions_in(ran_before.rows)[0] if ran_before else None)
-        reasons = [*limited, *complaints(before, after, self._promised, self._count_rad)]
-        return rows, after, [*reasons, *(skipped(rows) if reasons else [])]
+        reasons = [*limited, *rejections(before, after, self._promised, self._count_rad)]
+        return rows, after, [*reasons, *(doubtful_timing(rows) if reasons else [])]
 
     def _end(self, before: Figures | None, after: Figures | None, reasons: list[str]) -> None:
         told = {"before": before, "after": after}
@@ -219,7 +219,7 @@ def run_validation(
 
     sines = motion.sines.tolist()
     rows = rows_of(axis.run(ReferenceMotion.excite(sines, [0.0] * len(sines), window_rad), watch, _LOOK_S))
-    if cut(rows, motion):
+    if interrupted(rows, motion):
         return rows
     for step_rad in (motion.step_rad, -motion.step_rad):
         before_s = len(rows) * motion.period_s
@@ -227,7 +227,7 @@ def run_validation(
     return rows
 
 
-def cut(rows: Rows, motion: ValidationMotion) -> bool:
+def interrupted(rows: Rows, motion: ValidationMotion) -> bool:
     """Whether the reference of `rows`, which hold the sines alone, ended before the sines did."""
     ran = rows["cycle"][rows["reference_active"] == 1]
     return len(ran) == 0 or int(ran[-1]) - int(ran[0]) < len(motion.sines) - _CUT_CYCLES

@@ -27,12 +27,12 @@ PROMISE_SHARE = 0.3
 COUNTS = {Part.SLOW: 1.0, Part.BRISK: 1.0, Part.HOLD: 4.0}
 
 
-def complaints(before: Figures | None, after: Figures, promised: Promise, count_rad: float) -> list[str]:
+def rejections(before: Figures | None, after: Figures, promised: Promise, count_rad: float) -> list[str]:
     """Every reason against the set, one sentence each; empty when it stays. `count_rad`: the encoder's resolution.
 
     Without figures of `before` its promise alone counts.
     """
-    return [*(worse(before, after, count_rad) if before else ()), *broken(after, promised, count_rad)]
+    return [*(worse(before, after, count_rad) if before else ()), *broken_promises(after, promised, count_rad)]
 
 
 def worse(before: Figures, after: Figures, count_rad: float) -> Iterator[str]:
@@ -53,7 +53,7 @@ def worse_limit(before: Figures, part: Part, count_rad: float) -> float:
     return (1.0 + WORSE_SHARE) * before.mean(part) + chance + sticks + COUNTS[part] * count_rad
 
 
-def broken(after: Figures, promised: Promise, count_rad: float) -> Iterator[str]:
+def broken_promises(after: Figures, promised: Promise, count_rad: float) -> Iterator[str]:
     """Figures beyond what the certificate promised."""
     for part, limit in promise_limits(promised, count_rad).items():
         if after.mean(part) > limit:
@@ -128,7 +128,7 @@ def limited_at_most(earlier: float) -> float:
     return max(FEW_LIMITED, earlier, min(2.0 * earlier, earlier + MORE_LIMITED, MOST_LIMITED))
 
 
-def skipped(rows: Rows) -> list[str]:
+def doubtful_timing(rows: Rows) -> list[str]:
     """What a loop that does not keep time makes doubtful."""
     missed, cycles = int(rows["missed"][-1] - rows["missed"][0]), int(rows["cycle"][-1] - rows["cycle"][0])
     if not missed:

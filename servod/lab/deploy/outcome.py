@@ -25,7 +25,7 @@ class Ending(Enum):
 
 
 @dataclass(frozen=True)
-class Before:
+class Baseline:
     """The cycles of the motion as it ran under the set `present` (name, version) before the change to another one."""
 
     present: tuple[str, int]
@@ -43,7 +43,7 @@ class Deployment:
     promised: Promise
     before: Figures | None
     after: Figures | None
-    ran_before: Before | None
+    ran_before: Baseline | None
     rows_after: Rows | None
 
     @property

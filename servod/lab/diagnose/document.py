@@ -15,8 +15,8 @@ from servod.lab.diagnose.result import (
     Evidence,
     FittedValue,
     FreeRun,
-    Map,
     Minor,
+    MismatchMap,
     NamedEffect,
     Quality,
     RecordingErrors,
@@ -169,7 +169,7 @@ def _free_run(errors: FreeRun) -> Document:
     return {"before": errors.before, "recalibrated": errors.recalibrated, "after": errors.after}
 
 
-def _map(found: Map) -> Document:
+def _map(found: MismatchMap) -> Document:
     return {
         "coordinate": found.coordinate,
         "unit": found.unit,

@@ -12,15 +12,14 @@ from time import monotonic
 
 from servod.formats.model.axis_model import AxisModel
 from servod.lab.diagnose.data.intake import load_traces
-from servod.lab.diagnose.judge.conclude import conclude, extended_model, free_windows
-from servod.lab.diagnose.judge.findings import name_findings
+from servod.lab.diagnose.judge.conclude import conclude, extended_model, free_windows, name_findings
 from servod.lab.diagnose.judge.judgement import JudgedSelection, judge, predicts_nothing, without_names
 from servod.lab.diagnose.judge.verdict import below_noise, verdict
 from servod.lab.diagnose.predict.coordinates import units
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.result import Diagnosis, DiagnosisVerdict
 from servod.lab.diagnose.select.cross_validation import cross_validate
-from servod.lab.diagnose.select.refine import add_drift, add_group, much_left, restore_nominal
+from servod.lab.diagnose.select.refine import above_floor, add_drift, add_group, restore_nominal
 from servod.lab.diagnose.select.selector import Selector
 from servod.lab.diagnose.select.stepwise import forward_selection, swap_terms
 from servod.lab.diagnose.settings import SETTINGS
@@ -50,7 +49,7 @@ def diagnose(
     tell(f"{len(traces)} recordings taken in")
     selector = Selector(Predictor(traces, model), model, begun + SETTINGS.forward.search_share * time_limit_s, tell)
     selection = swap_terms(selector, forward_selection(selector, selector.fit_base()))
-    if much_left(selector, selection):
+    if above_floor(selector, selection):
         selection = add_drift(selector, add_group(selector, selection))
     seconds["search"] = monotonic() - begun - seconds["intake"]
     selection = cross_validate(selector, restore_nominal(selector, selection))

@@ -67,7 +67,7 @@ class FittedValue:
 
 
 @dataclass(frozen=True)
-class Map:
+class MismatchMap:
     """Mean of the mismatch over one coordinate, in bins with rows enough: their middles, means and standard errors.
 
     `share` is the part of the mismatch's power over all rows that the means carry beyond chance, `chance` the
@@ -265,8 +265,8 @@ class Evidence:
     residual: ResidualTable | None
     model: AxisModel
     quality: Quality
-    maps_before: tuple[Map, ...]
-    maps_after: tuple[Map, ...]
+    maps_before: tuple[MismatchMap, ...]
+    maps_after: tuple[MismatchMap, ...]
     bands: Mapping[str, Any]
     recordings: tuple[RecordingErrors, ...]
     search: SearchEffort

@@ -22,7 +22,7 @@ from servod.common.files import read_json, unreadable, unwritable
 from servod.common.yaml import Strict, validate
 from servod.formats.recording.mcap_reader import read_recording
 from servod.formats.recording.mcap_writer import McapFile, split_rows, wall_offset_ns
-from servod.lab.identify.trace import Kind, Trace
+from servod.lab.identify.trace import ExperimentKind, RecordedMotion
 
 LIST = "experiments.json"
 #: Folders within the recordings' own, counted up, that earlier walks are set aside in.
@@ -36,7 +36,7 @@ class _Entry(Strict):
     """One recording; `motion` is the hash of what was asked for, `sha256` the file's (None: an earlier version's)."""
 
     file: str = Field(pattern=r"^[0-9]{2,}_[a-z_]+\.mcap$")
-    kind: Kind
+    kind: ExperimentKind
     motion: str
     sha256: str | None = None
     settings: dict[str, float]
@@ -81,7 +81,7 @@ class Recordings:
         """The walk begins with the axis at `start_rad`."""
         self.start_rad = start_rad
 
-    def recorded(self, kind: Kind, motion: str) -> Trace | None:
+    def recorded(self, kind: ExperimentKind, motion: str) -> RecordedMotion | None:
         """The earlier recording of the next motion; None when there is none, and then no later one is given either.
 
         Raises BadInput when its file is not the one that was recorded.
@@ -95,7 +95,7 @@ class Recordings:
         self._done.append(entry)
         return _trace(self.folder, entry)
 
-    def keep(self, rows: NDArray[np.void], trace: Trace, motion: str = "") -> Trace:
+    def keep(self, rows: NDArray[np.void], trace: RecordedMotion, motion: str = "") -> RecordedMotion:
         """Write one motion and the list with it; returns the trace with the file's hash. Raises BadInput."""
         name = f"{len(self._done):02d}_{trace.kind.value}.mcap"
         try:
@@ -155,7 +155,7 @@ def motion_hash(positions: NDArray[np.float64], torques: NDArray[np.float64], wi
     return asked.hexdigest()
 
 
-def load(folder: Path) -> list[Trace]:
+def load(folder: Path) -> list[RecordedMotion]:
     """All traces that `Recordings` wrote to `folder`. Raises BadInput."""
     return [_trace(folder, entry) for entry in _read_list(folder).experiments]
 
@@ -168,7 +168,7 @@ def _read_list(folder: Path) -> _List:
     return validate(document, _List, str(path))
 
 
-def _trace(folder: Path, entry: _Entry) -> Trace:
+def _trace(folder: Path, entry: _Entry) -> RecordedMotion:
     path = folder / entry.file
     sha256 = _require_same(path, entry)
     recording = read_recording(path)
@@ -181,7 +181,9 @@ def _trace(folder: Path, entry: _Entry) -> Trace:
         np.asarray(recording.column(column), dtype=np.float64) for column in _COLUMNS
     )
     t_s = (time_ns - time_ns[0]) * 1e-9
-    return Trace(entry.kind, t_s, torque, position, reference, excitation, actual, motor, entry.settings, sha256)
+    return RecordedMotion(
+        entry.kind, t_s, torque, position, reference, excitation, actual, motor, entry.settings, sha256
+    )
 
 
 def _require_same(path: Path, entry: _Entry) -> str:

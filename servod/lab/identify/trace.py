@@ -18,7 +18,7 @@ from servod.lab.recordings.recording import Rows
 Array = NDArray[np.float64]
 
 
-class Kind(StrEnum):
+class ExperimentKind(StrEnum):
     """What a recording was made for; each has its file in `experiments`."""
 
     NOISE = "noise"
@@ -31,13 +31,13 @@ class Kind(StrEnum):
 
 
 @dataclass(frozen=True)
-class Trace:
+class RecordedMotion:
     """One motion, a value for each cycle in SI units; `settings` are what the fit must know of the experiment.
 
     `motor_rad` is the joint's position by the amplifier's own sensor; `sha256` is the hash of the recording's file.
     """
 
-    kind: Kind
+    kind: ExperimentKind
     t_s: Array
     torque_nm: Array
     position_rad: Array
@@ -57,10 +57,10 @@ class Trace:
         return len(self.t_s)
 
 
-def trace_of(kind: Kind, rows: Rows, settings: dict[str, float]) -> Trace:
+def trace_of(kind: ExperimentKind, rows: Rows, settings: dict[str, float]) -> RecordedMotion:
     """The trace in cycle records (dtype servod.lab.recordings.recording.ROW)."""
     time_ns = rows["time_ns"]
-    return Trace(
+    return RecordedMotion(
         kind,
         (time_ns - time_ns[0]) * 1e-9,
         rows["torque_nm"].copy(),

@@ -26,7 +26,7 @@ from servod.lab.identify.fits import break_away as break_away_fit
 from servod.lab.identify.fits import kick as kick_fit
 from servod.lab.identify.fits import presliding as presliding_fit
 from servod.lab.identify.fits import response as response_fit
-from servod.lab.identify.trace import Kind, Trace
+from servod.lab.identify.trace import ExperimentKind, RecordedMotion
 
 #: Told at every step: what is being done, and the share of the walk that is done.
 Tell = Callable[[str, float], None]
@@ -90,8 +90,8 @@ def _experiments(bench: Bench, tell: Tell) -> None:
     found = [abs(break_away_fit.torque_of(break_away.search(bench, sign))) for sign in (1.0, -1.0)]
     tell("presliding", 0.07)
     _rock(bench, (found[0], found[1]))
-    slides = break_away_fit.fit([ramp for ramp in bench.of(Kind.BREAK_AWAY) if not ramp.settings["search"]])
-    rocked = presliding_fit.fit(of_kind(bench.traces, Kind.PRESLIDING), slides)
+    slides = break_away_fit.fit([ramp for ramp in bench.of(ExperimentKind.BREAK_AWAY) if not ramp.settings["search"]])
+    rocked = presliding_fit.fit(of_kind(bench.traces, ExperimentKind.PRESLIDING), slides)
     tell("kicks", 0.2)
     first = kick_fit.fit(kick.run(bench, (found[0], found[1])))
     tell("frequency response", 0.25)
@@ -109,7 +109,7 @@ def _experiments(bench: Bench, tell: Tell) -> None:
 def _rock(bench: Bench, found_nm: tuple[float, float]) -> None:
     """Bursts below break-away; the ramps between them measure it, and put the joint somewhere else."""
     weaker = min(found_nm)
-    trial: Trace = presliding.burst(bench, weaker, presliding.SHARE)
+    trial: RecordedMotion = presliding.burst(bench, weaker, presliding.SHARE)
     share = presliding.share_for(bench, _extent(trial.position_rad))
     for _ in range(PAIRS):
         for sign, torque in zip((1.0, -1.0), found_nm, strict=True):

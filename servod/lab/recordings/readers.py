@@ -22,8 +22,38 @@ from numpy.typing import NDArray
 
 from servod.common.errors import BadInput
 from servod.common.files import open_file, require_size, unreadable
-from servod.lab.recordings import bounds
-from servod.lab.recordings.bounds import MOST_BYTES, require_bytes, require_cells
+
+# How much a recording may hold: one limit for every format, so that reading takes at most 3 GiB of memory.
+#
+# Beneath the readers, which count while they unpack: a few kilobytes can unpack to any amount. A number takes eight
+# bytes
+# in the reader's table, eight in the recording, and for a moment some more while its column is scaled and checked.
+
+
+#: Most numbers in the columns that are used: 20 million rows of three columns, five and a half hours at 1 kHz.
+MOST_CELLS = 60_000_000
+#: Most bytes of text or of a MAT file, packed and unpacked.
+MOST_BYTES = 1024**3
+#: Most columns of a file, used or not.
+MOST_COLUMNS = 4096
+
+_REMEDY = "a shorter stretch, or fewer columns, in a file of its own"
+
+
+def require_cells(path: Path, rows: int, columns: int) -> None:
+    """Refuse a table of more numbers than a recording may hold. Raises BadInput."""
+    if columns > MOST_COLUMNS:
+        raise BadInput(str(path), f"{columns} columns", f"at most {MOST_COLUMNS}")
+    if rows * columns > MOST_CELLS:
+        found = f"{rows} rows or more of {columns} columns"
+        raise BadInput(str(path), found, f"at most {MOST_CELLS} numbers: {_REMEDY}")
+
+
+def require_bytes(path: Path, unpacked: int) -> None:
+    """Refuse a file that unpacks to more than a recording may. Raises BadInput."""
+    if unpacked > MOST_BYTES:
+        raise BadInput(str(path), f"{unpacked} bytes or more unpacked", f"at most {MOST_BYTES} bytes: {_REMEDY}")
+
 
 # Reads the numeric vectors of a MAT file of version 5: MathWorks' "MAT-File Format", Level 5.
 #
@@ -425,7 +455,7 @@ def _read_mat(path: Path, _wanted: Container[str], _notes: list[str]) -> dict[st
 def _read_mcap(path: Path, wanted: Container[str], notes: list[str]) -> dict[str, Any]:
     from servod.formats.recording.mcap_reader import TIME, read_recording
 
-    recording = read_recording(path, wanted, bounds.MOST_CELLS)
+    recording = read_recording(path, wanted, MOST_CELLS)
     if recording.damage:
         notes.append(recording.damage)
     cells = np.frombuffer(recording.rows, "<f8").reshape(-1, len(recording.names))

@@ -35,7 +35,7 @@ Document = dict[str, Any]
 PAGE, PICTURES = "report.html", "pictures"
 
 
-class Report:
+class DiagnosisReport:
     """The page in the making; every figure is written as PNG too."""
 
     def __init__(self, folder: Path, title: str) -> None:
@@ -55,7 +55,7 @@ class Report:
 
 def write_report(folder: Path, diagnosis: Diagnosis, document: Document, title: str = "the model") -> Path:
     """Write `report.html` and `pictures/*.png` into `folder`; `document` is that of the diagnosis."""
-    report = Report(folder, f"Diagnosis: what {title} leaves out")
+    report = DiagnosisReport(folder, f"Diagnosis: what {title} leaves out")
     _answer(report.page, document)
     if diagnosis.evidence is not None:
         _where(report, diagnosis.evidence, diagnosis.units)
@@ -75,7 +75,7 @@ def _answer(page: Page, document: Document) -> None:
     page.points([line for f in document["findings"] for line in describe_certainty(f)])
 
 
-def _where(report: Report, evidence: Evidence, units: Units) -> None:
+def _where(report: DiagnosisReport, evidence: Evidence, units: Units) -> None:
     report.page.heading("Where the model is off")
     report.page.sentence(
         "Before any physics is named: the model's own parameters were fitted to the recordings, and what it still "
@@ -88,7 +88,7 @@ def _where(report: Report, evidence: Evidence, units: Units) -> None:
     )
 
 
-def _what(report: Report, evidence: Evidence, document: Document, units: Units) -> None:
+def _what(report: DiagnosisReport, evidence: Evidence, document: Document, units: Units) -> None:
     for number, (found, finding) in enumerate(zip(evidence.findings, document["findings"], strict=True), 1):
         report.page.heading(f"Finding {number}: {finding['effect'].replace('_', ' ')}")
         report.page.sentence(finding["statement"])
@@ -139,7 +139,7 @@ def _small(name: str, size: Document) -> str:
     return f"{name.replace('_', ' ')} ({torque}, {size['why']}; in the model with {values})"
 
 
-def _fit(report: Report, evidence: Evidence, document: Document, units: Units) -> None:
+def _fit(report: DiagnosisReport, evidence: Evidence, document: Document, units: Units) -> None:
     fit, held = document["fit"], document["fit"]["held_out"]
     report.page.heading("The fit before and after")
     report.page.sentence(
@@ -167,7 +167,7 @@ def _fit(report: Report, evidence: Evidence, document: Document, units: Units) -
     report.figure(figures.over_time(evidence.recordings, units))
 
 
-def _remains(report: Report, evidence: Evidence, document: Document, units: Units) -> None:
+def _remains(report: DiagnosisReport, evidence: Evidence, document: Document, units: Units) -> None:
     report.page.heading("What remains")
     report.page.sentence(describe_rest(document))
     report.figure(figures.map_grid(evidence.maps_before, evidence.maps_after, units))

@@ -46,7 +46,7 @@ class Style(Enum):
     BARS = "bars"  # lying: x is their length, y their place
 
 
-class Scale(Enum):
+class ScaleKind(Enum):
     """Scale of an axis; the values are what both plotting libraries call it."""
 
     LINEAR = "linear"
@@ -73,24 +73,24 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Axis:
+class PlotAxis:
     """One axis: its label with the unit, its scale, and its range where the data should not choose it.
 
     `names` stand at 0, 1, 2, ... in place of numbers.
     """
 
     label: str
-    scale: Scale = Scale.LINEAR
+    scale: ScaleKind = ScaleKind.LINEAR
     span: tuple[float, float] | None = None
     names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
-class Panel:
+class PlotPanel:
     """One pair of axes with its curves."""
 
-    x: Axis
-    y: Axis
+    x: PlotAxis
+    y: PlotAxis
     curves: tuple[Curve, ...]
     title: str = ""
 
@@ -101,7 +101,7 @@ class Figure:
 
     name: str
     title: str
-    panels: tuple[Panel, ...]
+    panels: tuple[PlotPanel, ...]
     columns: int = 1
     caption: str = ""
     row_height: float = 1.0
@@ -113,7 +113,7 @@ class Figure:
 
 
 @dataclass(frozen=True)
-class Table:
+class PageTable:
     """A table of plain cells; the first column is text, the others are aligned as numbers."""
 
     title: str

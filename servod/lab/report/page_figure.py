@@ -9,7 +9,7 @@ import numpy as np
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from servod.lab.report.figure import Array, Axis, Curve, Figure, Panel, Scale, Style, thin
+from servod.lab.report.figure import Array, Curve, Figure, PlotAxis, PlotPanel, ScaleKind, Style, thin
 
 _DASHES = {Style.LINE: "solid", Style.DASHED: "dash", Style.DOTTED: "dot", Style.POINTS: "solid"}
 _ROW_PX, _GAP_PX = 270, 85
@@ -40,7 +40,7 @@ def plotly_figure(figure: Figure) -> go.Figure:
     return drawn
 
 
-def _draw(drawn: go.Figure, panel: Panel, row: int, column: int, named: set[str]) -> None:
+def _draw(drawn: go.Figure, panel: PlotPanel, row: int, column: int, named: set[str]) -> None:
     for curve in panel.curves:
         if curve.bounds is not None and curve.style is not Style.POINTS:
             drawn.add_trace(_band(curve, *curve.bounds), row=row, col=column)
@@ -51,14 +51,14 @@ def _draw(drawn: go.Figure, panel: Panel, row: int, column: int, named: set[str]
     drawn.update_yaxes(**_axis(panel.y), row=row, col=column)
 
 
-def _axis(axis: Axis) -> dict[str, object]:
+def _axis(axis: PlotAxis) -> dict[str, object]:
     settings: dict[str, object] = {"title": {"text": axis.label, "standoff": 6}, "type": axis.scale.value}
-    if axis.scale is Scale.LOG:
+    if axis.scale is ScaleKind.LOG:
         settings |= {"exponentformat": "power", "dtick": 1}
     if axis.names:
         settings |= {"tickvals": list(range(len(axis.names))), "ticktext": list(axis.names), "automargin": True}
     if axis.span is not None:
-        settings["range"] = [float(np.log10(v)) if axis.scale is Scale.LOG else v for v in axis.span]
+        settings["range"] = [float(np.log10(v)) if axis.scale is ScaleKind.LOG else v for v in axis.span]
     return settings
 
 

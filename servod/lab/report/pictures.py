@@ -16,7 +16,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure as Canvas
 
 from servod.common.files import write_bytes
-from servod.lab.report.figure import Axis, Curve, Figure, Panel, Scale, Style, thin
+from servod.lab.report.figure import Curve, Figure, PlotAxis, PlotPanel, ScaleKind, Style, thin
 
 FORMATS = ("png", "svg")
 _DASHES = {Style.LINE: "-", Style.DASHED: (0, (5, 2)), Style.DOTTED: (0, (1, 1.5)), Style.POINTS: "-"}
@@ -80,7 +80,7 @@ def _legend(canvas: Canvas, axes: Any) -> None:
         canvas.legend(list(entries.values()), list(entries), loc="outside lower center", ncols=columns, frameon=False)
 
 
-def _draw(drawn: Any, panel: Panel) -> None:
+def _draw(drawn: Any, panel: PlotPanel) -> None:
     for curve in panel.curves:
         _curve(drawn, curve)
     drawn.set_title(panel.title, loc="left")
@@ -88,12 +88,12 @@ def _draw(drawn: Any, panel: Panel) -> None:
         _axis(drawn, axis, name)
 
 
-def _axis(drawn: Any, axis: Axis, name: str) -> None:
+def _axis(drawn: Any, axis: PlotAxis, name: str) -> None:
     getattr(drawn, f"set_{name}label")(axis.label)
     getattr(drawn, f"set_{name}scale")(axis.scale.value)
     if axis.names:
         getattr(drawn, f"set_{name}ticks")(range(len(axis.names)), axis.names)
-    elif axis.scale is Scale.LINEAR:
+    elif axis.scale is ScaleKind.LINEAR:
         drawn.ticklabel_format(axis=name, style="sci", scilimits=(-4, 5), useMathText=True)
     if axis.span is not None:
         getattr(drawn, f"set_{name}lim")(*axis.span)

@@ -13,7 +13,7 @@ from servod.formats.gains.parameters import LocalParameters, OutputObserver, Reg
 from servod.kernels.laws import LAWS
 from servod.kernels.laws.state import N_STATES
 from servod.lab.report.figure import Array
-from servod.lab.verify.closed_loop import Bristle, Deviation, JointPoint, joint_point, loops
+from servod.lab.verify.closed_loop import JointPoint, LinearBristle, LoopDeviation, joint_point, loops
 from servod.lab.verify.law_slopes import LawSlopes, law_slopes
 from servod.lab.verify.proof import closed
 from servod.lab.verify.sampled import timing_of
@@ -52,7 +52,7 @@ def before(design: Design, velocity: float) -> Loop:
     return _position(*loops([_point(design, velocity)], nothing, timing_of(design))[:2])
 
 
-def after(design: Design, law: LocalParameters, velocity: float, observer: bool) -> Loop:
+def closed_loop_response(design: Design, law: LocalParameters, velocity: float, observer: bool) -> Loop:
     """The joint with the compensator (9) around it and no feedback; `observer`: with the law's output observer too.
 
     The friction state goes by the measured velocity here whatever the law chooses: driven by the reference it is a
@@ -95,5 +95,5 @@ def rigid(design: Design, frequencies_hz: Array) -> Complex:
 
 
 def _point(design: Design, velocity: float) -> JointPoint:
-    kind = Bristle.SLIDES if velocity else Bristle.STICKS
-    return joint_point(steady_friction(design.model), velocity, kind, Deviation())
+    kind = LinearBristle.SLIDES if velocity else LinearBristle.STICKS
+    return joint_point(steady_friction(design.model), velocity, kind, LoopDeviation())

@@ -14,8 +14,8 @@ import numpy as np
 from servod.formats.gains.design import Design, DesignMode, RegionProof, Uncertainty, Vertex
 from servod.formats.gains.parameters import RegionGains
 from servod.formats.model.axis_model import AxisModel
-from servod.lab.synthesize.lmi_deployed import TURNING_DISC, Programme, Solution, synthesise, turning
-from servod.lab.synthesize.regions import OVERLAP_RAD_S, pole_disc, too_late
+from servod.lab.synthesize.lmi_deployed import TURNING_DISC, Programme, Solution, synthesise, turned_bristle
+from servod.lab.synthesize.regions import OVERLAP_RAD_S, delay_refusal, pole_disc
 from servod.lab.verify.proof import region_margin, scaled, scaled_vertices
 from servod.lab.verify.sampled import Array, timing_of
 from servod.lab.verify.steady_friction import SteadyFriction, steady_friction
@@ -109,7 +109,7 @@ def programme(design: Design, proof: RegionProof, wishes: Wishes) -> Programme:
     found = joints(friction, span, wishes.uncertainty)
     a, b, e = scaled(found, design, proof)
     if wishes.h2_where_it_falls and not span.holds_rest:
-        guides, *beside = turning(design, proof, wishes.overlap[1])
+        guides, *beside = turned_bristle(design, proof, wishes.overlap[1])
         found, (a, b, e) = found + guides, [np.concatenate(pair) for pair in zip((a, b, e), beside, strict=True)]
     disc = pole_disc(wishes.least_decay_per_s, wishes.least_damping, wishes.period_s)
     ringing = 0.0, math.exp(-wishes.least_decay_per_s * wishes.period_s)  # its bristle's damping is the joint's own
@@ -191,7 +191,7 @@ def region(design: Design, span: Span, wishes: Wishes) -> RegionProof | None:
 def regions(model: AxisModel, wishes: Wishes) -> Design | None:
     """Both regions at the first feasible choice of what `wishes` leaves open; None when there is none."""
     low, high = wishes.spans
-    for choice in () if too_late(model, wishes.period_s) else wishes.choices():
+    for choice in () if delay_refusal(model, wishes.period_s) else wishes.choices():
         assert choice.cutoff_hz is not None
         design = empty_design(model, choice, choice.cutoff_hz)
         hard = region(design, high, choice)

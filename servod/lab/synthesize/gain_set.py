@@ -16,7 +16,7 @@ from servod.common.sources import SYNTHESIZES, source_sha256
 from servod.formats.gains.design import Design
 from servod.formats.gains.gain_set import GainSet, Provenance
 from servod.formats.gains.parameters import (
-    LocalFriction,
+    LocalFrictionSets,
     LocalParameters,
     OutputObserver,
     RegionGains,
@@ -76,7 +76,7 @@ APPROACH = 3.0  # speed with which a step is approached, as a factor on the map'
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
+class DesignOptions:
     """Named options of the law and of its local sets."""
 
     name: str = "synthesized"
@@ -102,7 +102,7 @@ def feedback_of(design: Design, scale: float) -> Regions:
 
 
 def parameters(
-    design: Design, friction: SteadyFriction, options: Options, bandwidth: float, feedback: Regions | None = None
+    design: Design, friction: SteadyFriction, options: DesignOptions, bandwidth: float, feedback: Regions | None = None
 ) -> LocalParameters:
     """The law's parameters with an output observer of `bandwidth` rad/s (0: none); `feedback`: None = as proven."""
     speed, largest = design.speed_max_rad_s, friction.largest(design.speed_max_rad_s)
@@ -131,7 +131,7 @@ def parameters(
     )
 
 
-def compensation(design: Design, friction: SteadyFriction, options: Options) -> LocalFriction:
+def compensation(design: Design, friction: SteadyFriction, options: DesignOptions) -> LocalFrictionSets:
     """The local sets with what all of them share."""
     speed = design.speed_max_rad_s
     c = compensator(friction, speed, STIFFNESS_SHARE * (1.0 - design.uncertainty.stiffness))
@@ -140,7 +140,7 @@ def compensation(design: Design, friction: SteadyFriction, options: Options) -> 
         if options.paper_nodes
         else local_sets(friction, c, speed, options.accuracy, options.gain or 0.0)
     )
-    return LocalFriction(
+    return LocalFrictionSets(
         stiffness_nm_per_rad=c.stiffness,
         viscous_nms_per_rad=c.viscous,
         friction_limit_nm=LIMIT_SHARE * friction.largest(speed),
@@ -157,10 +157,10 @@ def approach_error(high: RegionGains, speed: float) -> float | None:
 
 
 def synthesize(
-    model: AxisModel, wishes: Wishes | None = None, options: Options | None = None, model_path: Path | None = None
+    model: AxisModel, wishes: Wishes | None = None, options: DesignOptions | None = None, model_path: Path | None = None
 ) -> GainSet | Infeasible:
     """The gain set for `model`, sealed and not yet certified; or why there is none and what would help."""
-    wishes, options = wishes or Wishes(), options or Options()
+    wishes, options = wishes or Wishes(), options or DesignOptions()
     friction = steady_friction(model)
     best: tuple[float, Design, LocalParameters] | None = None
     for design in designs(model, wishes):
@@ -181,7 +181,7 @@ def synthesize(
     return found if law.disturbance_observer is None else with_moving_observer(found, friction)
 
 
-def gain_set(design: Design, law: LocalParameters, options: Options, model_path: Path | None) -> GainSet:
+def gain_set(design: Design, law: LocalParameters, options: DesignOptions, model_path: Path | None) -> GainSet:
     """The sealed set with its provenance."""
     observer = law.disturbance_observer
     note = (

@@ -23,7 +23,7 @@ from servod.lab.synthesize.deployed import (
     regions,
 )
 from servod.lab.synthesize.lmi_deployed import first_feedback
-from servod.lab.synthesize.regions import too_late
+from servod.lab.synthesize.regions import delay_refusal
 from servod.lab.verify.proof import scaled_vertices
 from servod.lab.verify.vertices import Span
 
@@ -67,7 +67,7 @@ def clashing_vertices(design: Design, span: Span, wishes: Wishes) -> Iterator[st
 
 def explain(model: AxisModel, wishes: Wishes) -> Infeasible:
     """Why there is no design, and the smallest relaxation of each wish that alone makes one."""
-    late = too_late(model, wishes.period_s)
+    late = delay_refusal(model, wishes.period_s)
     if late is not None:
         return Infeasible(tuple(span.name for span in wishes.spans), (late,), ())
     design = empty_design(model, wishes, wishes.cutoff_hz or CUTOFFS_HZ[-1])

@@ -30,11 +30,11 @@ import numpy as np
 
 from servod.formats.gains.design import Design, RegionProof
 from servod.lab.synthesize.solvers import solved
-from servod.lab.verify.closed_loop import Bristle, Deviation, joint_point
+from servod.lab.verify.closed_loop import LinearBristle, LoopDeviation, joint_point
 from servod.lab.verify.proof import scaled
 from servod.lab.verify.sampled import Array, timing_of
 from servod.lab.verify.steady_friction import steady_friction
-from servod.lab.verify.vertices import Joint, ends, known_commands
+from servod.lab.verify.vertices import VertexJoint, ends, known_commands
 
 EPSILON = 1e-8  # strictness of the inequalities in scaled states
 PROOF_EPSILON = 1e-5  # of the proof that is kept: what rounding in a file cannot turn
@@ -301,13 +301,17 @@ def both(p: Programme, sliding: Solution, sticking: Solution) -> Solution:
 TURNING_DISC = 0.0, 0.999
 
 
-def turning(design: Design, proof: RegionProof, speed_rad_s: float) -> tuple[list[Joint], Array, Array, Array]:
+def turned_bristle(
+    design: Design, proof: RegionProof, speed_rad_s: float
+) -> tuple[list[VertexJoint], Array, Array, Array]:
     """The turned bristle at `speed_rad_s` both ways, where it rings most, with its scaled (A, B, E)."""
     friction, u, found = steady_friction(design.model), design.uncertainty, []
     for side, damping in itertools.product((1.0, -1.0), ends(u.damping)):
-        corner = Deviation(1.0 - u.inertia, 1.0 + u.torque_gain, 1.0 + u.stiffness, damping, viscous=1.0 - u.viscous)
-        matrices = joint_point(friction, side * speed_rad_s, Bristle.TURNS, corner).matrices()
-        found.append(Joint(f"turning {side * speed_rad_s:g} {damping:g}", "turning", False, *matrices))
+        corner = LoopDeviation(
+            1.0 - u.inertia, 1.0 + u.torque_gain, 1.0 + u.stiffness, damping, viscous=1.0 - u.viscous
+        )
+        matrices = joint_point(friction, side * speed_rad_s, LinearBristle.TURNS, corner).matrices()
+        found.append(VertexJoint(f"turning {side * speed_rad_s:g} {damping:g}", "turning", False, *matrices))
     return found, *scaled(found, with_shortest_delay(design), proof)
 
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from servod.common.errors import BadInput
-from servod.formats.gains.parameters import LocalFriction, LocalSet, PositionFeedforward, PositionWave
+from servod.formats.gains.parameters import LocalFrictionSets, LocalSet, PositionFeedforward, PositionWave
 from servod.formats.model.axis_model import AxisModel, wave_number
 from servod.formats.model.effects import Spring
 from servod.kernels.laws import MAX_SETS
@@ -143,7 +143,7 @@ class Mismatch(NamedTuple):
     share: float
 
 
-def largest_mismatch(law: LocalFriction, time_s: float = FINITE_TIME_S) -> Mismatch | None:
+def largest_mismatch(law: LocalFrictionSets, time_s: float = FINITE_TIME_S) -> Mismatch | None:
     """The neighbours of one direction that (8) finds furthest apart, as a share of the larger force; or None."""
     c, sets = Compensator(law.stiffness_nm_per_rad, law.viscous_nms_per_rad), law.sets
     pairs = zip(itertools.pairwise(sets), adjacent_mismatch(c, sets, time_s), strict=True)

@@ -18,7 +18,7 @@ from servod.formats.gains.gain_set import GainSet
 from servod.formats.gains.parameters import LocalParameters
 from servod.kernels.laws import LAWS
 from servod.lab.verify.checks import CORNER_DISK, CORNER_SPEEDS, DISK_LIMIT, Subject, speeds_of
-from servod.lab.verify.closed_loop import Deviation, corners, late_corners
+from servod.lab.verify.closed_loop import LoopDeviation, corners, late_corners
 from servod.lab.verify.effect_checks import late_effects
 from servod.lab.verify.margins import Judgement, Sweep, arrival_of
 from servod.lab.verify.rest_checks import RESTING_POLE, resting_radius, resting_speed
@@ -57,7 +57,7 @@ class Search:
         And stable at the ends of what the model's own effects make of the joint; at speeds below `below_rad_s`, where
         that is all that has changed. Corners with the shorter delay count too: with two cycles they can be the worst.
         """
-        cases: Sequence[Deviation] = corners(self.design.uncertainty)
+        cases: Sequence[LoopDeviation] = corners(self.design.uncertainty)
         counts = FEW_SPEEDS, CORNER_SPEEDS
         few, many = ([v for v in speeds_of(self.design, count) if v < below_rad_s] for count in counts)
         hard = sorted(v for v in self.refused_at if v < below_rad_s)
@@ -78,7 +78,7 @@ class Search:
         return Sweep(LAWS["local"], law.pack(), self.friction, timing_of(self.design), speeds, arrival_of(law))
 
     def _judged(
-        self, law: LocalParameters, speeds: list[float], cases: Sequence[Deviation], disk_wanted: float
+        self, law: LocalParameters, speeds: list[float], cases: Sequence[LoopDeviation], disk_wanted: float
     ) -> Judgement | None:
         """How `cases` stand under `law` at `speeds`; None where they do not, and the speed is kept."""
         sweep = self._sweep(law, speeds)

@@ -15,7 +15,7 @@ from servod.formats.gains.gain_set import GainSet
 from servod.formats.gains.parameters import LocalParameters, RegionGains, Regions
 from servod.formats.model.axis_model import AxisModel
 from servod.lab.synthesize.deployed import Wishes, empty_design
-from servod.lab.synthesize.gain_set import Options, gain_set, parameters
+from servod.lab.synthesize.gain_set import DesignOptions, gain_set, parameters
 from servod.lab.synthesize.infeasible import Infeasible, Relaxation, largest_factor
 from servod.lab.synthesize.lmi_reference import PARTS, ReferenceAnswer, ReferenceWishes, programme, reference, solve
 from servod.lab.verify.reference_proof import gain_numbers, polytope, reference_gains, reference_margin
@@ -28,7 +28,7 @@ STRICTNESS = (1e-6, 1e-5, 1e-4)  # tried in turn until the solution also holds b
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class ReferenceFrame:
     """Everything but the feedback: the axis, the law around it, and what is asked."""
 
     friction: SteadyFriction
@@ -69,7 +69,7 @@ def usable(design: Design, proof: ReferenceProof) -> list[str]:
     return []
 
 
-def frame(model: AxisModel, wishes: Wishes, options: Options, asked: ReferenceWishes) -> Frame:
+def frame(model: AxisModel, wishes: Wishes, options: DesignOptions, asked: ReferenceWishes) -> ReferenceFrame:
     """The law without feedback, as the deployed mode makes it, and the intervals around it."""
     friction = steady_friction(model)
     design = empty_design(model, wishes, wishes.cutoff_hz or CUTOFF_HZ).model_copy(
@@ -79,18 +79,18 @@ def frame(model: AxisModel, wishes: Wishes, options: Options, asked: ReferenceWi
     low, high = wishes.spans
     bare = Regions(low=none, high=none, overlap_from_rad_s=high.from_rad_s, overlap_to_rad_s=low.to_rad_s)
     law = parameters(design, friction, options, 0.0, bare)
-    return Frame(friction, design, law, wishes.spans, replace(asked, input_scale_nm=law.input_scale_nm))
+    return ReferenceFrame(friction, design, law, wishes.spans, replace(asked, input_scale_nm=law.input_scale_nm))
 
 
 def reference_set(
     model: AxisModel,
     wishes: Wishes | None = None,
-    options: Options | None = None,
+    options: DesignOptions | None = None,
     asked: ReferenceWishes | None = None,
     model_path: Path | None = None,
 ) -> GainSet | Infeasible:
     """The gain set of the reference mode, sealed and not yet certified; or which vertices and constraints clash."""
-    wishes, options, asked = wishes or Wishes(), options or Options(), asked or ReferenceWishes()
+    wishes, options, asked = wishes or Wishes(), options or DesignOptions(), asked or ReferenceWishes()
     made = frame(model, wishes, options, asked)
     answers = [made.answer(span) for span in made.spans]
     proofs = [answer.proof for answer in answers if answer.proof is not None]
@@ -103,10 +103,12 @@ def reference_set(
     return gain_set(made.design.model_copy(update={"reference": proofs}), law, options, model_path)
 
 
-def relaxations(model: AxisModel, wishes: Wishes, options: Options, asked: ReferenceWishes) -> Iterator[Relaxation]:
+def relaxations(
+    model: AxisModel, wishes: Wishes, options: DesignOptions, asked: ReferenceWishes
+) -> Iterator[Relaxation]:
     """Each wish lowered by itself until both regions have a solution; those that do not help are left out."""
 
-    def feasible(w: Wishes, o: Options, a: ReferenceWishes) -> bool:
+    def feasible(w: Wishes, o: DesignOptions, a: ReferenceWishes) -> bool:
         made = frame(model, w, o, a)
         return all(made.feasible(span) for span in made.spans)
 

@@ -67,7 +67,7 @@ def uncertainty_of(model: AxisModel) -> Uncertainty:
 LONGEST_CYCLES = 5.0
 
 
-def too_late(model: AxisModel, period_s: float) -> str | None:
+def delay_refusal(model: AxisModel, period_s: float) -> str | None:
     """Why no design is tried for the delay of `model` at this cycle; None where it is short enough."""
     cycles = model.total_delay_s / period_s
     if cycles <= LONGEST_CYCLES + WHOLE:

@@ -11,8 +11,8 @@ rivals.py     all of them, over worker processes
 
 from __future__ import annotations
 
-from servod.lab.tune.plan import Feedback, Tuned, TunePlan
+from servod.lab.tune.plan import Feedback, Tuned, TuningSettings
 from servod.lab.tune.rivals import rivals
 from servod.lab.tune.tuning import tune
 
-__all__ = ["Feedback", "TunePlan", "Tuned", "rivals", "tune"]
+__all__ = ["Feedback", "Tuned", "TuningSettings", "rivals", "tune"]

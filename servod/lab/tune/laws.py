@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.formats.gains.parameters import (
-    LocalFriction,
+    LocalFrictionSets,
     LocalParameters,
     OutputObserver,
     Parameters,
@@ -38,7 +38,7 @@ from servod.lab.synthesize.local_sets import (
     position_feedforward,
 )
 from servod.lab.synthesize.regions import OVERLAP_RAD_S
-from servod.lab.tune.plan import Feedback, TunePlan
+from servod.lab.tune.plan import Feedback, TuningSettings
 from servod.lab.verify.steady_friction import SteadyFriction, steady_friction
 
 # One friction curve for both directions, fitted to the axis model's map: what the LuGre observer (18) can hold.
@@ -97,11 +97,11 @@ Values = Mapping[str, float]
 
 
 @dataclass(frozen=True)
-class Axis:
+class AxisFacts:
     """The facts of one axis that the laws are built from."""
 
     model: AxisModel
-    plan: TunePlan
+    plan: TuningSettings
 
     @cached_property
     def friction(self) -> SteadyFriction:
@@ -192,7 +192,7 @@ class Rival:
 
     law: str
     ranges: Mapping[str, Range]
-    build: Callable[[Axis, Values], Parameters]
+    build: Callable[[AxisFacts, Values], Parameters]
     fixed: Mapping[str, float] = field(default_factory=dict)
     forerunners: tuple[str, ...] = ()
     searches: int = 1
@@ -202,11 +202,11 @@ class Rival:
         return dict(self.ranges) | (FREE_FEEDBACK if feedback is Feedback.FREE else {})
 
 
-def _pd(axis: Axis, values: Values) -> PdParameters:
+def _pd(axis: AxisFacts, values: Values) -> PdParameters:
     return PdParameters.model_validate({"law": "pd", **axis.feedback(values)})
 
 
-def _pd_dob(axis: Axis, values: Values) -> PdDobParameters:
+def _pd_dob(axis: AxisFacts, values: Values) -> PdDobParameters:
     return PdDobParameters.model_validate(
         {
             "law": "pd_dob",
@@ -219,7 +219,7 @@ def _pd_dob(axis: Axis, values: Values) -> PdDobParameters:
     )
 
 
-def _pd_lugre(axis: Axis, values: Values) -> PdLugreParameters:
+def _pd_lugre(axis: AxisFacts, values: Values) -> PdLugreParameters:
     curve = axis.one_curve
     return PdLugreParameters.model_validate(
         {
@@ -239,7 +239,7 @@ def _pd_lugre(axis: Axis, values: Values) -> PdLugreParameters:
     )
 
 
-def _local(axis: Axis, values: Values) -> LocalParameters:
+def _local(axis: AxisFacts, values: Values) -> LocalParameters:
     """Velocity of the reference in the friction state, output observer, feed-forward over position; equal regions."""
     friction, speed, scale = axis.friction, axis.plan.speed_max_rad_s, axis.scale_nm
     c, pd = compensator(friction, speed, values["stiffness"]), axis.feedback(values)
@@ -250,7 +250,7 @@ def _local(axis: Axis, values: Values) -> LocalParameters:
         law="local",
         input_scale_nm=scale,
         regions=Regions(low=gains, high=gains, overlap_from_rad_s=OVERLAP_RAD_S[0], overlap_to_rad_s=OVERLAP_RAD_S[1]),
-        friction=LocalFriction(
+        friction=LocalFrictionSets(
             stiffness_nm_per_rad=c.stiffness,
             viscous_nms_per_rad=c.viscous,
             friction_limit_nm=LIMIT_SHARE * axis.largest_nm,

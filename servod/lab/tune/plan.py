@@ -33,7 +33,7 @@ class Feedback(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class TunePlan:
+class TuningSettings:
     """What is the same for every law of a comparison; defaults are the paper's axis.
 
     `budget` is the number of plants that one law may simulate in one class in all its searches together, `plants` of

@@ -15,7 +15,7 @@ from servod.common.portable import usable_cores
 from servod.common.workers import worker_pool
 from servod.formats.model.axis_model import AxisModel
 from servod.lab.tune.laws import RIVALS
-from servod.lab.tune.plan import BUDGET, Feedback, Tuned, TunePlan
+from servod.lab.tune.plan import BUDGET, Feedback, Tuned, TuningSettings
 from servod.lab.tune.tuning import Values, tune
 
 #: Told what has just been tuned ("pd_dob, equal feedback"), and how much of everything is done, from 0 to 1.
@@ -32,7 +32,7 @@ def rivals(
     seed: int = 1,
     budget: int = BUDGET,
     tell: Tell | None = None,
-    plan: TunePlan | None = None,
+    plan: TuningSettings | None = None,
     processes: int | None = None,
 ) -> dict[Feedback, dict[str, Tuned]]:
     """The rivals `names` of servod.lab.tune.laws.RIVALS tuned in both classes on `model`'s intervals.
@@ -41,21 +41,21 @@ def rivals(
     number of `processes` (default: one for each core) nor on their timing. Ctrl-C ends the workers at once. Raises
     BadInput when the model has no bristle stiffness to compensate.
     """
-    plan = replace(plan or TunePlan(), seed=seed, budget=budget)
+    plan = replace(plan or TuningSettings(), seed=seed, budget=budget)
     with worker_pool(processes or usable_cores()) as pool:
         found = _Field(pool, model, names, plan, tell).tuned()
     return {feedback: {name: found[feedback, name] for name in names} for feedback in Feedback}
 
 
-def tuned_in_turn(model: AxisModel, names: Sequence[str], plan: TunePlan) -> dict[Key, Tuned]:
+def tuned_in_turn(model: AxisModel, names: Sequence[str], plan: TuningSettings) -> dict[Key, Tuned]:
     """The rivals `names` in both classes by the same rules, one after the other in this process, without workers."""
     found: dict[Key, Tuned] = {}
     for key in needed(names):
-        found[key] = tune(model, key[1], key[0], plan, [found[before].values for before in before_it(key)])
+        found[key] = tune(model, key[1], key[0], plan, [found[before].values for before in start_points(key)])
     return found
 
 
-def before_it(key: Key) -> list[Key]:
+def start_points(key: Key) -> list[Key]:
     """Whose best sets a search starts from: its forerunners in the same class, and its own equal class."""
     feedback, name = key
     own = [(Feedback.EQUAL, name)] if feedback is Feedback.FREE else []
@@ -67,7 +67,7 @@ def needed(names: Sequence[str]) -> list[Key]:
     every: list[Key] = []
 
     def add(key: Key) -> None:
-        for before in before_it(key):
+        for before in start_points(key):
             add(before)
         if key not in every:
             every.append(key)
@@ -82,7 +82,7 @@ class _Field:
     """The running tasks and what they have found."""
 
     def __init__(
-        self, pool: Executor, model: AxisModel, names: Sequence[str], plan: TunePlan, tell: Tell | None
+        self, pool: Executor, model: AxisModel, names: Sequence[str], plan: TuningSettings, tell: Tell | None
     ) -> None:
         self._waiting = needed(names)
         self._all = len(self._waiting)
@@ -93,7 +93,7 @@ class _Field:
     def tuned(self) -> dict[Key, Tuned]:
         """Wait for everything; the first failure is raised."""
         while self._waiting or self._tasks:
-            for key in [key for key in self._waiting if all(before in self._found for before in before_it(key))]:
+            for key in [key for key in self._waiting if all(before in self._found for before in start_points(key))]:
                 self._begin(key)
             for key in [key for key, task in self._tasks.items() if task.done()]:
                 self._take(key)
@@ -102,7 +102,7 @@ class _Field:
 
     def _begin(self, key: Key) -> None:
         self._waiting.remove(key)
-        starts = [self._found[before].values for before in before_it(key)]
+        starts = [self._found[before].values for before in start_points(key)]
         self._tasks[key] = self._pool.submit(_task, self._text, key, self._plan, starts)
 
     def _take(self, key: Key) -> None:
@@ -112,5 +112,5 @@ class _Field:
             self._tell(f"{name}, {feedback.value} feedback", len(self._found) / self._all)
 
 
-def _task(model: str, key: Key, plan: TunePlan, starts: Sequence[Values]) -> Tuned:
+def _task(model: str, key: Key, plan: TuningSettings, starts: Sequence[Values]) -> Tuned:
     return tune(AxisModel.model_validate_json(model), key[1], key[0], plan, starts)

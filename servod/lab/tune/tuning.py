@@ -24,8 +24,8 @@ from servod.lab.simulate.noise import noise_of, noise_series
 from servod.lab.simulate.simulate import simulate_closed_loop
 from servod.lab.synthesize.regions import uncertainty_of
 from servod.lab.tracking.metrics import SETTLE_S, STEPS_MRAD, Array, paper_rows
-from servod.lab.tune.laws import PAPER_FEEDBACK, RIVALS, Axis, Range, Rival
-from servod.lab.tune.plan import Feedback, Tuned, TunePlan
+from servod.lab.tune.laws import PAPER_FEEDBACK, RIVALS, AxisFacts, Range, Rival
+from servod.lab.tune.plan import Feedback, Tuned, TuningSettings
 from servod.lab.verify.plants import drawn
 from servod.lab.verify.trials import RIPPLE_LIMIT_RAD
 
@@ -68,10 +68,10 @@ class Followed(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Trial:
+class TuningObjective:
     """The plants of one tuning and the motion; judges gain sets by their law and packed parameters."""
 
-    axis: Axis
+    axis: AxisFacts
 
     @cached_property
     def plants(self) -> list[AxisModel]:
@@ -154,7 +154,7 @@ class Trial:
         )
 
 
-def noise_seeds(plan: TunePlan) -> list[int]:
+def noise_seeds(plan: TuningSettings) -> list[int]:
     """What begins the noise of each plant."""
     return [1000 * plan.seed + i for i in range(plan.plants)]
 
@@ -219,7 +219,7 @@ class _Counted:
         return min(self.tried, key=lambda pair: pair[0])[1]
 
 
-def least(objective: Objective, starts: Sequence[Array], budget: int, seed: int) -> Array:
+def minimise(objective: Objective, starts: Sequence[Array], budget: int, seed: int) -> Array:
     """Shares (0 to 1 each) where `objective` is least, after at most `budget` calls; `starts` are the first of them."""
     counted = _Counted(objective, max(budget, len(starts)))
     for start in starts:
@@ -262,7 +262,7 @@ def tune(
     model: AxisModel,
     name: str,
     feedback: Feedback,
-    plan: TunePlan,
+    plan: TuningSettings,
     starts: Sequence[Values] = (),
     tell: Tell | None = None,
 ) -> Tuned:
@@ -272,7 +272,7 @@ def tune(
     its forerunners, make sure that more freedom is never worse. Raises BadInput when the model has no bristle stiffness
     to compensate.
     """
-    rival, trial = RIVALS[name], Trial(Axis(model, plan))
+    rival, trial = RIVALS[name], TuningObjective(AxisFacts(model, plan))
     ranges, candidates = rival.space(feedback), candidates_of(rival, feedback, plan)
     done = 0
 
@@ -286,14 +286,14 @@ def tune(
             tell(done / candidates)
         return trial.cost(rival.build(trial.axis, values(shares))).value
 
-    best = values(least(cost, _shares(ranges, starts), candidates, plan.seed))
+    best = values(minimise(cost, _shares(ranges, starts), candidates, plan.seed))
     parameters = rival.build(trial.axis, best)
     reached = trial.cost(parameters)
     gains = gain_set(name, rival, feedback, plan, parameters)
     return Tuned(gains, reached.value, done * plan.plants, reached.roughness, best)
 
 
-def candidates_of(rival: Rival, feedback: Feedback, plan: TunePlan) -> int:
+def candidates_of(rival: Rival, feedback: Feedback, plan: TuningSettings) -> int:
     """How many sets one search of a rival may try: its part of the law's budget, or one where nothing is tuned."""
     return plan.budget // (plan.plants * rival.searches) if rival.space(feedback) else 1
 
@@ -304,13 +304,13 @@ def _shares(ranges: Mapping[str, Range], starts: Sequence[Values]) -> list[Array
     return [np.array([r.share(point[key]) for key, r in ranges.items()]) for point in points]
 
 
-def as_tuned(model: AxisModel, gains: GainSet, plan: TunePlan) -> Tuned:
+def as_tuned(model: AxisModel, gains: GainSet, plan: TuningSettings) -> Tuned:
     """A set that came in another way, by the measures of a tuning: its cost and its roughness on the same plants."""
-    reached = Trial(Axis(model, plan)).cost(gains.parameters)
+    reached = TuningObjective(AxisFacts(model, plan)).cost(gains.parameters)
     return Tuned(gains, reached.value, plan.plants, reached.roughness, {})
 
 
-def gain_set(name: str, rival: Rival, feedback: Feedback, plan: TunePlan, parameters: Parameters) -> GainSet:
+def gain_set(name: str, rival: Rival, feedback: Feedback, plan: TuningSettings, parameters: Parameters) -> GainSet:
     """The tuned numbers as a gain set with their provenance, uncertified."""
     tuned = ", ".join(rival.space(feedback)) or "nothing"
     return GainSet(

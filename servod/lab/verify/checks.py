@@ -16,19 +16,19 @@ from servod.formats.gains.gain_set import CertificateCheck, GainSet
 from servod.formats.gains.parameters import LocalParameters
 from servod.formats.model.axis_model import AxisModel
 from servod.kernels.laws.state import MAY_STAY, STATE_NAMES
-from servod.lab.verify.closed_loop import Deviation, corners, inner_points
+from servod.lab.verify.closed_loop import LoopDeviation, corners, inner_points
 from servod.lab.verify.margins import NOMINAL, Sweep, arrival_of, largest_tolerated
 from servod.lab.verify.plants import drawn
 from servod.lab.verify.proof import disc_reach, gain_difference, region_margin, stored_deviation, unproven_rad_s
 from servod.lab.verify.rounding import LEAST_COUNTS, NOISE_SWING, count_rad, gives_way_rad, rounding_rad
-from servod.lab.verify.sampled import Timing, timing_of
+from servod.lab.verify.sampled import SampledTiming, timing_of
 from servod.lab.verify.steady_friction import position_slopes, steady_friction
 from servod.lab.verify.trials import (
     ERROR_SHARE,
     RAMP_SHARES,
     RIPPLE_LIMIT_RAD,
     SETTLED_SHARE,
-    Trial,
+    Sample,
     hold_ripple,
     monte_carlo,
     quiet,
@@ -72,7 +72,7 @@ class Subject:
     least_plants: int = LEAST_PLANTS
 
     @property
-    def timing(self) -> Timing:
+    def timing(self) -> SampledTiming:
         """Period, delay and filter that the design states."""
         return timing_of(self.design)
 
@@ -81,7 +81,7 @@ class Subject:
         """The axis's own delay in cycles."""
         return self.timing.delay_s / self.timing.period_s
 
-    def cycles(self, count: float) -> Timing:
+    def cycles(self, count: float) -> SampledTiming:
         """The same loop with a delay of `count` cycles."""
         return replace(self.timing, delay_s=count * self.timing.period_s)
 
@@ -92,7 +92,7 @@ class Subject:
         return Sweep(self.gains.law, self.gains.pack(), friction, self.timing, speeds_of(self.design, speeds), arrival)
 
     @cached_property
-    def trials(self) -> list[Trial]:
+    def trials(self) -> list[Sample]:
         """The Monte-Carlo's plants, simulated."""
         shaken_rad = self.rounding_rad + self.gives_way_rad
         return monte_carlo(self.gains, self.plants, self.seed, self.processes, shaken_rad)
@@ -213,7 +213,7 @@ def check_loop(s: Subject) -> Iterator[CertificateCheck]:
         yield at_most(name, s.dense.worst(NOMINAL).radius, POLE_LIMIT)
     slopes = position_slopes(s.design.model, s.coarse.friction.gain)
     if any(slopes):
-        steepest = [Deviation(position_slope=slope) for slope in slopes]
+        steepest = [LoopDeviation(position_slope=slope) for slope in slopes]
         yield at_most("largest pole, steepest torque over position", s.coarse.worst(steepest).radius, POLE_LIMIT)
     yield at_least("symmetric disk margin", s.coarse.disk_margin()[0], DISK_LIMIT)
     yield at_least("symmetric disk margin, worst corner of the intervals", s.coarse.disk_margin(cases)[0], CORNER_DISK)
@@ -268,7 +268,7 @@ def observations(s: Subject) -> dict[str, float]:
     sweep, period = s.coarse, s.design.period_s
     told = {"two cycles": 2.0} | ({"one cycle": 1.0} if s.own_cycles > ONE_CYCLE else {})
     delays = {f"largest pole, {name} of delay": s.dense.worst(NOMINAL, s.cycles(n)).radius for name, n in told.items()}
-    longest = largest_tolerated(lambda d: sweep.stable(Deviation(), d), 0.0, EXTRA_DELAY_CYCLES * period)
+    longest = largest_tolerated(lambda d: sweep.stable(LoopDeviation(), d), 0.0, EXTRA_DELAY_CYCLES * period)
     return {
         **delays,
         "largest error on the sine over the plants [share]": max(trial.error_share for trial in s.trials),
@@ -276,12 +276,12 @@ def observations(s: Subject) -> dict[str, float]:
         "largest swing at rest over the plants [share of the step]": max(trial.ripple_share for trial in s.trials),
         "largest tolerated delay [s]": s.timing.delay_s + longest,
         "largest tolerated friction scale": largest_tolerated(
-            lambda f: sweep.stable(Deviation(dry=f, viscous=f)), 1.0, FACTOR_LIMIT
+            lambda f: sweep.stable(LoopDeviation(dry=f, viscous=f)), 1.0, FACTOR_LIMIT
         ),
         "largest tolerated inertia scale": largest_tolerated(
-            lambda f: sweep.stable(Deviation(inertia=f)), 1.0, FACTOR_LIMIT
+            lambda f: sweep.stable(LoopDeviation(inertia=f)), 1.0, FACTOR_LIMIT
         ),
-        "least tolerated inertia scale": largest_tolerated(lambda f: sweep.stable(Deviation(inertia=f)), 1.0, 0.1),
+        "least tolerated inertia scale": largest_tolerated(lambda f: sweep.stable(LoopDeviation(inertia=f)), 1.0, 0.1),
     }
 
 

@@ -19,13 +19,13 @@ import numpy as np
 from servod.formats.gains.design import SHARES, Uncertainty
 from servod.kernels.laws.state import N_STATES
 from servod.lab.verify.law_slopes import LawSlopes
-from servod.lab.verify.sampled import Array, Timing, with_delay_and_filter
+from servod.lab.verify.sampled import Array, SampledTiming, with_delay_and_filter
 from servod.lab.verify.steady_friction import SteadyFriction
 
 STUCK_DECAY_PER_S = 1000.0  # of the bristle state where the stiffness acts on the position and the state does nothing
 
 
-class Bristle(Enum):
+class LinearBristle(Enum):
     """What the bristle does in a linearisation: value is z over its steady value, which gives dz'/dv = 1 - value."""
 
     SLIDES = 1.0
@@ -62,7 +62,7 @@ class JointPoint:
     """
 
     velocity: float
-    bristle: Bristle
+    bristle: LinearBristle
     inertia: float
     gain: float
     decay: float
@@ -98,7 +98,7 @@ class JointPoint:
 
 
 @dataclass(frozen=True, slots=True)
-class Deviation:
+class LoopDeviation:
     """Factors on the model's values: one corner, or an inner point, of the intervals.
 
     `dry` scales g(v) with its slope; `slope` makes the slope steeper than that. No factors are `position_slope`, what
@@ -140,7 +140,7 @@ NO_REACH = Reach()
 DELAY_STEPS = (-1.0, -0.5, 0.0, 0.5, 1.0)
 
 
-def corners(u: Uncertainty, reach: Reach = NO_REACH) -> list[Deviation]:
+def corners(u: Uncertainty, reach: Reach = NO_REACH) -> list[LoopDeviation]:
     """Every corner of the intervals that matter to small deviations; the level of dry friction moves with its slope.
 
     `reach` widens them by what the model's own effects make of a value.
@@ -152,17 +152,17 @@ def corners(u: Uncertainty, reach: Reach = NO_REACH) -> list[Deviation]:
             n: (1.0 + s * getattr(u, n)) * reach.end(n, s) for n, s in zip(names, signs, strict=True)
         }
         gain = (1.0 - signs[0] * u.torque_gain) * reach.end("torque_gain", -signs[0])
-        corner = Deviation(**factors, torque_gain=gain, dry=(1.0 + signs[3] * u.dry) * reach.end("dry", signs[3]))
+        corner = LoopDeviation(**factors, torque_gain=gain, dry=(1.0 + signs[3] * u.dry) * reach.end("dry", signs[3]))
         found += [replace(corner, delay_s=delay) for delay in sorted({-u.delay_s, u.delay_s})]
     return found
 
 
-def late_corners(u: Uncertainty) -> list[Deviation]:
+def late_corners(u: Uncertainty) -> list[LoopDeviation]:
     """The corners with the longest delay: where a design is looked for, before all are judged."""
     return [corner for corner in corners(u) if corner.delay_s == u.delay_s]
 
 
-def inner_points(u: Uncertainty, count: int, seed: int) -> list[Deviation]:
+def inner_points(u: Uncertainty, count: int, seed: int) -> list[LoopDeviation]:
     """`count` points of the intervals, uniformly at random."""
     random = np.random.default_rng(seed)
     draws = random.uniform(-1.0, 1.0, (count, len(SHARES)))
@@ -170,11 +170,11 @@ def inner_points(u: Uncertainty, count: int, seed: int) -> list[Deviation]:
     factors: list[dict[str, Any]] = [
         {n: float(1.0 + d * getattr(u, n)) for n, d in zip(SHARES, row, strict=True)} for row in draws
     ]
-    return [Deviation(**own, delay_s=float(delay)) for own, delay in zip(factors, delays, strict=True)]
+    return [LoopDeviation(**own, delay_s=float(delay)) for own, delay in zip(factors, delays, strict=True)]
 
 
 def joint_points(
-    friction: SteadyFriction, velocity: float, bristle: Bristle, cases: Sequence[Deviation]
+    friction: SteadyFriction, velocity: float, bristle: LinearBristle, cases: Sequence[LoopDeviation]
 ) -> list[JointPoint]:
     """The joint at `velocity` [rad/s] in each case, with the true Stribeck slope in how the bristle builds up."""
     speed, dry, damping = abs(velocity), friction.dry(velocity), friction.damping(velocity)
@@ -201,12 +201,12 @@ def joint_points(
     return points
 
 
-def joint_point(friction: SteadyFriction, velocity: float, bristle: Bristle, d: Deviation) -> JointPoint:
+def joint_point(friction: SteadyFriction, velocity: float, bristle: LinearBristle, d: LoopDeviation) -> JointPoint:
     """The joint at `velocity` [rad/s] in one case."""
     return joint_points(friction, velocity, bristle, (d,))[0]
 
 
-def sampled_points(points: Sequence[JointPoint], timing: Timing) -> tuple[Array, Array, int]:
+def sampled_points(points: Sequence[JointPoint], timing: SampledTiming) -> tuple[Array, Array, int]:
     """(A, B) of each joint, sampled with delay and velocity filter, and which state is the filtered velocity.
 
     It is what every law closes its loop around.
@@ -217,7 +217,7 @@ def sampled_points(points: Sequence[JointPoint], timing: Timing) -> tuple[Array,
     return plant_a, plant_b, a.shape[-1]
 
 
-def loops(points: Sequence[JointPoint], law: LawSlopes, timing: Timing) -> tuple[Array, Array, Array]:
+def loops(points: Sequence[JointPoint], law: LawSlopes, timing: SampledTiming) -> tuple[Array, Array, Array]:
     """(closed loops, torque input column, row that gives the law's torque) for joints under one linearised law."""
     return loops_around(*sampled_points(points, timing), law)
 

@@ -23,7 +23,7 @@ from servod.formats.model.axis_model import AxisModel, wave_number
 from servod.formats.model.keys import Group, Harmonic
 from servod.kernels.physics.effects import SMALLEST_FACTOR, static_stretch
 from servod.lab.verify.checks import CORNER_DISK, MOST_NAME, POLE_LIMIT, Subject, at_least, at_most
-from servod.lab.verify.closed_loop import Behind, Deviation, Reach, corners
+from servod.lab.verify.closed_loop import Behind, LoopDeviation, Reach, corners
 from servod.lab.verify.sampled import LONGEST_LAG
 from servod.lab.verify.steady_friction import SPRING_STRETCH_RAD, SteadyFriction, position_slopes, steady_friction
 
@@ -45,7 +45,7 @@ STEEPEST_OF_BELL = math.exp(-0.5)  # slope of a Gaussian bump at one standard de
 
 
 @dataclass(frozen=True, slots=True)
-class Level:
+class ReachLevel:
     """Where an effect is judged: friction, top speed, and the largest torques of the motor and of the load [N*m].
 
     Torques of the joint, not of the command. The motor's is what holds the load and slides at top speed.
@@ -68,7 +68,7 @@ class Level:
 
 
 @dataclass(frozen=True, slots=True)
-class Effect:
+class EffectReach:
     """One effect on the joint: ends of factors, ends of added stiffness [N*m/rad] and viscous friction [N*m*s/rad].
 
     `told` says over what, where that is no plain sum of amplitudes.
@@ -87,7 +87,7 @@ class Effect:
         """The factors alone."""
         return Reach(self.inertia, self.torque_gain, self.dry, self.viscous)
 
-    def and_also(self, other: Effect) -> Effect:
+    def and_also(self, other: EffectReach) -> EffectReach:
         """Both effects at once: factors multiply, what is added adds up."""
 
         def both(name: str) -> Ends:
@@ -96,20 +96,20 @@ class Effect:
                 return a[0] + b[0], a[1] + b[1]
             return a[0] * b[0], a[1] * b[1]
 
-        ends = {f.name: both(f.name) for f in fields(Effect) if f.name != "told"}
-        return Effect(**ends, told=", ".join(part for part in (self.told, other.told) if part))
+        ends = {f.name: both(f.name) for f in fields(EffectReach) if f.name != "told"}
+        return EffectReach(**ends, told=", ".join(part for part in (self.told, other.told) if part))
 
 
-def level_of(model: AxisModel, friction: SteadyFriction, top_rad_s: float) -> Level:
+def level_of(model: AxisModel, friction: SteadyFriction, top_rad_s: float) -> ReachLevel:
     """The level of a model; a spring is judged where the position slopes judge it."""
     spring, load = model.spring, abs(model.gravity.amplitude) if model.gravity else 0.0
     if spring is not None:
         load += (spring.stiffness + spring.cubic * SPRING_STRETCH_RAD**2) * SPRING_STRETCH_RAD
-    offset = drifted_offset(model, Level(friction, top_rad_s, load))
-    return Level(friction, top_rad_s, load + abs(offset))
+    offset = drifted_offset(model, ReachLevel(friction, top_rad_s, load))
+    return ReachLevel(friction, top_rad_s, load + abs(offset))
 
 
-def drifted_offset(model: AxisModel, level: Level) -> float:
+def drifted_offset(model: AxisModel, level: ReachLevel) -> float:
     """What the drift of the offset adds to the load at its end, N*m; one without an end is followed as a factor is."""
     drift = model.offset_drift
     if drift is None or drift.per_s == 0.0:
@@ -119,7 +119,7 @@ def drifted_offset(model: AxisModel, level: Level) -> float:
     return math.copysign((DRIFT[1] - 1.0) * level.least_dry_nm, drift.per_s)
 
 
-def around(share: float) -> Ends:
+def factor_range(share: float) -> Ends:
     """Factors of so much to both sides, above what a factor never falls below."""
     return max(1.0 - share, SMALLEST_FACTOR), 1.0 + share
 
@@ -129,7 +129,7 @@ def sums(harmonics: Sequence[Harmonic], power: int) -> float:
     return sum(abs(h.amplitude) * wave_number(h) ** power for h in harmonics)
 
 
-def _thermal(model: AxisModel, level: Level) -> Effect:
+def _thermal(model: AxisModel, level: ReachLevel) -> EffectReach:
     """From the coldest to the warmest that the model knows, DAY_C around its reference at least."""
     t = model.thermal
     assert t is not None
@@ -147,7 +147,7 @@ def _thermal(model: AxisModel, level: Level) -> Effect:
 
     lasts = _lasts(max(abs(t.dry_per_s), abs(t.viscous_per_s))) if t.drift_time_s is None else ""
     told = f"{cold:.3g} to {warm:.3g} degC{lasts}"
-    return Effect(dry=ends(t.dry_per_c, t.dry_per_s), viscous=ends(t.viscous_per_c, t.viscous_per_s), told=told)
+    return EffectReach(dry=ends(t.dry_per_c, t.dry_per_s), viscous=ends(t.viscous_per_c, t.viscous_per_s), told=told)
 
 
 def _drift(per_s: float, ends_after_s: float | None) -> float:
@@ -161,16 +161,16 @@ def _lasts(per_s: float) -> str:
     return f", drift for {(DRIFT[1] - 1.0) / per_s:.3g} s" if per_s else ""
 
 
-def _load_dependent(model: AxisModel, level: Level) -> Effect:
+def _load_dependent(model: AxisModel, level: ReachLevel) -> EffectReach:
     """More dry friction by what is carried; and a part of each change of the command goes into friction at once."""
     f = model.load_dependent_friction
     assert f is not None
     share = min(f.per_command, 0.9)
     more = (share * level.torque_nm + f.per_load * level.load_nm) / (1.0 - share)
-    return Effect(dry=(1.0, 1.0 + more / level.least_dry_nm), torque_gain=around(share))
+    return EffectReach(dry=(1.0, 1.0 + more / level.least_dry_nm), torque_gain=factor_range(share))
 
 
-def _position_dependent(model: AxisModel, level: Level) -> Effect:
+def _position_dependent(model: AxisModel, level: ReachLevel) -> EffectReach:
     """Friction over position; its slope is a stiffness, of either sign by the direction of motion."""
     f = model.position_dependent_friction
     assert f is not None
@@ -178,18 +178,20 @@ def _position_dependent(model: AxisModel, level: Level) -> Effect:
     highs = sum(max(b.factor, 0.0) for b in f.bumps)
     steep = sums(f.harmonics, 1) + sum(abs(b.factor) * STEEPEST_OF_BELL / b.width for b in f.bumps)
     slope = steep * level.friction.gain * level.friction.largest(level.top_rad_s)
-    return Effect(dry=(max(1.0 - waves + lows, SMALLEST_FACTOR), 1.0 + waves + highs), position_slope=(-slope, slope))
+    return EffectReach(
+        dry=(max(1.0 - waves + lows, SMALLEST_FACTOR), 1.0 + waves + highs), position_slope=(-slope, slope)
+    )
 
 
-def _ripple(model: AxisModel, level: Level) -> Effect:
+def _ripple(model: AxisModel, level: ReachLevel) -> EffectReach:
     """A gain over position; with the torque that is asked for it is a stiffness as well."""
     assert model.torque_ripple is not None
     waves = model.torque_ripple.harmonics
     slope = sums(waves, 1) * level.torque_nm
-    return Effect(torque_gain=around(sums(waves, 0)), position_slope=(-slope, slope))
+    return EffectReach(torque_gain=factor_range(sums(waves, 0)), position_slope=(-slope, slope))
 
 
-def _inertia(model: AxisModel, level: Level) -> Effect:
+def _inertia(model: AxisModel, level: ReachLevel) -> EffectReach:
     """M(x), and dM/dx*v^2/2 at top speed with its slopes over position and velocity."""
     assert model.position_dependent_inertia is not None
     waves, behind = model.position_dependent_inertia.harmonics, model.two_mass
@@ -197,50 +199,50 @@ def _inertia(model: AxisModel, level: Level) -> Effect:
     slope = 0.5 * mass * sums(waves, 2) * level.top_rad_s**2
     viscous = mass * sums(waves, 1) * level.top_rad_s
     share = sums(waves, 0) * mass / model.inertia
-    return Effect(inertia=around(share), position_slope=(-slope, slope), more_viscous=(-viscous, viscous))
+    return EffectReach(inertia=factor_range(share), position_slope=(-slope, slope), more_viscous=(-viscous, viscous))
 
 
-def _eccentricity(model: AxisModel, _level: Level) -> Effect:
+def _eccentricity(model: AxisModel, _level: ReachLevel) -> EffectReach:
     """Position and velocity are read by the same factor, which the loop cannot tell from torque gain."""
     assert model.encoder_eccentricity is not None
-    return Effect(torque_gain=around(sums(model.encoder_eccentricity.harmonics, 1)))
+    return EffectReach(torque_gain=factor_range(sums(model.encoder_eccentricity.harmonics, 1)))
 
 
-def _saturation(model: AxisModel, level: Level) -> Effect:
+def _saturation(model: AxisModel, level: ReachLevel) -> EffectReach:
     """A soft limit lowers the gain near it: of limit*tanh(u/limit) 1 - (torque/limit)^2 is left."""
     s = model.torque_saturation
     assert s is not None
     share = min(level.torque_nm / min(s.limit, s.negative_limit or s.limit), 1.0)
-    return Effect(torque_gain=(max(1.0 - share**2, SMALLEST_FACTOR), 1.0)) if s.shape == "tanh" else Effect()
+    return EffectReach(torque_gain=(max(1.0 - share**2, SMALLEST_FACTOR), 1.0)) if s.shape == "tanh" else EffectReach()
 
 
-def _gain_by_sign(model: AxisModel, level: Level) -> Effect:
+def _gain_by_sign(model: AxisModel, level: ReachLevel) -> EffectReach:
     """Commands of one sign do more than those of the other; the loop stands on the mean of both."""
     g = model.torque_gain
     assert g is not None
     ends = sorted((g.factor / level.friction.gain, (g.negative_factor or g.factor) / level.friction.gain))
-    return Effect(torque_gain=(ends[0], ends[1]))
+    return EffectReach(torque_gain=(ends[0], ends[1]))
 
 
-def _offset_drift(model: AxisModel, level: Level) -> Effect:
+def _offset_drift(model: AxisModel, level: ReachLevel) -> EffectReach:
     """A constant torque closes no loop: it is load, and until when a drift without an end is followed is told."""
     drift = model.offset_drift
     assert drift is not None
     end_nm = drifted_offset(model, level)
     if end_nm == 0.0:
-        return Effect()
+        return EffectReach()
     lasts = f" after {end_nm / drift.per_s:.3g} s" if drift.time_s is None else ""
-    return Effect(told=f"offset drifts by {end_nm:.2g} N*m{lasts}")
+    return EffectReach(told=f"offset drifts by {end_nm:.2g} N*m{lasts}")
 
 
-def _residual(model: AxisModel, _level: Level) -> Effect:
+def _residual(model: AxisModel, _level: ReachLevel) -> EffectReach:
     """Tables over position and velocity by their steepest pieces; one over time acts from outside."""
     r = model.residual
     assert r is not None
-    return Effect(position_slope=_steepest(r.position), more_viscous=_steepest(r.velocity))
+    return EffectReach(position_slope=_steepest(r.position), more_viscous=_steepest(r.velocity))
 
 
-def _steepest(table: fx.Table | None) -> Ends:
+def _steepest(table: fx.TorqueMap | None) -> Ends:
     if table is None:
         return NONE
     rows = zip(pairwise(table.grid), pairwise(table.torque), strict=True)
@@ -249,7 +251,7 @@ def _steepest(table: fx.Table | None) -> Ends:
 
 
 #: Groups that scale or shift what the loop has in it.
-EFFECTS: dict[type[Group], Callable[[AxisModel, Level], Effect]] = {
+EFFECTS: dict[type[Group], Callable[[AxisModel, ReachLevel], EffectReach]] = {
     fr.Thermal: _thermal,
     fr.LoadDependentFriction: _load_dependent,
     fr.PositionDependentFriction: _position_dependent,
@@ -263,7 +265,7 @@ EFFECTS: dict[type[Group], Callable[[AxisModel, Level], Effect]] = {
 }
 
 
-def effects_of(model: AxisModel, level: Level) -> dict[str, Effect]:
+def effects_of(model: AxisModel, level: ReachLevel) -> dict[str, EffectReach]:
     """Every effect that `model` has and that changes something, by its key; torques per unit of torque gain."""
     gain, found = level.friction.gain, {}
     names = {type(group): name for name, group in model.groups()}
@@ -272,8 +274,8 @@ def effects_of(model: AxisModel, level: Level) -> dict[str, Effect]:
             continue
         e = effect(model, level)
         slope, viscous = ((low / gain, high / gain) for low, high in (e.position_slope, e.more_viscous))
-        e = Effect(e.inertia, e.torque_gain, e.dry, e.viscous, slope, viscous, e.told)
-        if e != Effect():
+        e = EffectReach(e.inertia, e.torque_gain, e.dry, e.viscous, slope, viscous, e.told)
+        if e != EffectReach():
             found[names[group]] = e
     return found
 
@@ -288,7 +290,7 @@ def effects_of(model: AxisModel, level: Level) -> dict[str, Effect]:
 SLEW_PERIODS = 5.0
 
 
-def unknown_physics(model: AxisModel, period_s: float, level: Level) -> Iterator[str]:
+def unknown_physics(model: AxisModel, period_s: float, level: ReachLevel) -> Iterator[str]:
     """Keys of the model that stay out of the loop, and why; what acts from outside closes no loop and is none."""
     lag, limit, load = model.actuator_lag, model.torque_saturation, model.load_dependent_friction
     if lag is not None and lag.time_constant_s > LONGEST_LAG * period_s:
@@ -325,12 +327,12 @@ def check_effects(s: Subject) -> Iterator[CertificateCheck]:
         yield at_most(f"largest pole, {resonance(model)}", s.coarse.worst(cases).radius, POLE_LIMIT)
 
 
-def late_effects(design: Design) -> list[Deviation]:
+def late_effects(design: Design) -> list[LoopDeviation]:
     """Joints with the longest delay of the intervals at the ends of the model's effects: for who looks for a design."""
     model, friction = design.model, steady_friction(design.model)
     level = level_of(model, friction, design.speed_max_rad_s)
     effects = effects_of(model, level)
-    cases: list[Deviation] = []
+    cases: list[LoopDeviation] = []
     if effects:
         cases += [*corners(design.uncertainty, together(effects).reach), *ends(model, friction, effects)]
     if model.two_mass is not None:
@@ -339,19 +341,19 @@ def late_effects(design: Design) -> list[Deviation]:
     return [replace(case, delay_s=late) for case in cases if case.delay_s >= 0.0]
 
 
-def together(effects: dict[str, Effect]) -> Effect:
+def together(effects: dict[str, EffectReach]) -> EffectReach:
     """All effects at once."""
-    return reduce(Effect.and_also, effects.values(), Effect())
+    return reduce(EffectReach.and_also, effects.values(), EffectReach())
 
 
-def ends(model: AxisModel, friction: SteadyFriction, effects: dict[str, Effect]) -> list[Deviation]:
+def ends(model: AxisModel, friction: SteadyFriction, effects: dict[str, EffectReach]) -> list[LoopDeviation]:
     """The joint as modelled at every end of its effects, with the slopes over position and velocity."""
     own = together(effects)
     falls, rises = position_slopes(model, friction.gain)
     found = []
     for mass, dry, viscous, slope in itertools.product((0, 1), repeat=4):
         found.append(
-            Deviation(
+            LoopDeviation(
                 inertia=own.inertia[mass],
                 torque_gain=own.torque_gain[1 - mass],
                 dry=own.dry[dry],
@@ -363,7 +365,7 @@ def ends(model: AxisModel, friction: SteadyFriction, effects: dict[str, Effect])
     return found
 
 
-def sprung(model: AxisModel, level: Level, cases: list[Deviation]) -> list[Deviation]:
+def sprung(model: AxisModel, level: ReachLevel, cases: list[LoopDeviation]) -> list[LoopDeviation]:
     """`cases` with the load behind its spring: soft, stiffened, and with a gap."""
     found = [
         replace(case, behind=replace(load, inertia=case.inertia * load.inertia))
@@ -376,7 +378,7 @@ def sprung(model: AxisModel, level: Level, cases: list[Deviation]) -> list[Devia
     return found
 
 
-def _loads(model: AxisModel, level: Level) -> Iterator[Behind]:
+def _loads(model: AxisModel, level: ReachLevel) -> Iterator[Behind]:
     """The load behind every stiffness that its spring can have."""
     spring, gap, elastic, gain = model.two_mass, model.backlash, model.joint_elasticity, level.friction.gain
     assert spring is not None
@@ -389,7 +391,7 @@ def _loads(model: AxisModel, level: Level) -> Iterator[Behind]:
         yield Behind(spring.load_inertia / gain, stiffness / gain, damping / gain, spring.load_viscous / gain)
 
 
-def covered(effects: dict[str, Effect]) -> str:
+def covered(effects: dict[str, EffectReach]) -> str:
     """The ranges in words: what each value is multiplied with, and which effects do it."""
     own = together(effects)
     factors = [f"{word} {_range(getattr(own, key))}" for key, word in _WORDS.items() if _range(getattr(own, key))]

@@ -11,7 +11,7 @@ import numpy as np
 
 from servod.kernels.laws import Law
 from servod.kernels.laws.state import N_STATES, STATES, LawState
-from servod.lab.verify.sampled import Array, Timing
+from servod.lab.verify.sampled import Array, SampledTiming
 
 SETTLE_CYCLES = 100  # at most, after the first long one
 LONG_S = 1e4  # the friction state's step is exact, so one long cycle settles it
@@ -57,7 +57,7 @@ def settled_state(law: Law, gains: tuple[float, ...], velocity: float, moves: bo
     return state
 
 
-def law_slopes(law: Law, gains: tuple[float, ...], velocity: float, moves: bool, timing: Timing) -> LawSlopes:
+def law_slopes(law: Law, gains: tuple[float, ...], velocity: float, moves: bool, timing: SampledTiming) -> LawSlopes:
     """Slopes at steady motion with the reference; at rest `moves` tells crossing zero from holding."""
     base = settled_state(law, gains, velocity, moves, timing.period_s)
     nudge = np.finfo(float).tiny if moves else 0.0
@@ -65,7 +65,7 @@ def law_slopes(law: Law, gains: tuple[float, ...], velocity: float, moves: bool,
 
 
 def arriving_slopes(
-    law: Law, gains: tuple[float, ...], velocity: float, error_rad: float, timing: Timing, rest: float = 0.0
+    law: Law, gains: tuple[float, ...], velocity: float, error_rad: float, timing: SampledTiming, rest: float = 0.0
 ) -> LawSlopes:
     """Slopes where the reference rests and the joint slides `error_rad` away from it.
 
@@ -76,7 +76,7 @@ def arriving_slopes(
 
 
 def _differences(
-    law: Law, gains: tuple[float, ...], base: LawState, around: tuple[float, float, float, float], timing: Timing
+    law: Law, gains: tuple[float, ...], base: LawState, around: tuple[float, float, float, float], timing: SampledTiming
 ) -> LawSlopes:
     """Central differences of the law's step around (error, reference's velocity and acceleration, velocity)."""
     error, v_ref, a_ref, velocity = around

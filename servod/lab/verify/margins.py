@@ -16,21 +16,21 @@ from numpy.typing import NDArray
 from servod.formats.gains.parameters import LocalParameters
 from servod.kernels.laws import Law
 from servod.lab.verify.closed_loop import (
-    Bristle,
-    Deviation,
+    LinearBristle,
+    LoopDeviation,
     joint_points,
     loops_around,
     sampled_points,
     spectral_radius,
 )
 from servod.lab.verify.law_slopes import LawSlopes, arriving_slopes, law_slopes
-from servod.lab.verify.sampled import Array, Timing
+from servod.lab.verify.sampled import Array, SampledTiming
 from servod.lab.verify.steady_friction import SteadyFriction
 
 FREQUENCIES = 200
 ON_CIRCLE = np.exp(1j * np.geomspace(1e-3, np.pi, FREQUENCIES))
 SEARCH_STEPS = 14
-NOMINAL = (Deviation(),)
+NOMINAL = (LoopDeviation(),)
 BEYOND_HOLD = 4.0  # widths of holding, at which a joint has not arrived yet
 LEAST_ERROR_RAD = 1e-9
 
@@ -54,12 +54,16 @@ class Judgement:
     radius_at_rad_s: float
     disk_margin: float
     disk_at_rad_s: float
-    hardest: list[Deviation]
+    hardest: list[LoopDeviation]
 
 
 @lru_cache(maxsize=1024)
 def joints_at(
-    friction: SteadyFriction, velocity: float, bristle: Bristle, cases: tuple[Deviation, ...], timing: Timing
+    friction: SteadyFriction,
+    velocity: float,
+    bristle: LinearBristle,
+    cases: tuple[LoopDeviation, ...],
+    timing: SampledTiming,
 ) -> tuple[Array, Array, int]:
     """`sampled_points` in each case: the same for every law, and most of the work of a sweep."""
     return sampled_points(joint_points(friction, velocity, bristle, cases), timing)
@@ -90,7 +94,7 @@ class Sweep:
         law: Law,
         gains: tuple[float, ...],
         friction: SteadyFriction,
-        timing: Timing,
+        timing: SampledTiming,
         speeds: Sequence[float],
         arrival: Arrival | None = None,
     ) -> None:
@@ -127,8 +131,8 @@ class Sweep:
         return max((abs(pole) for _, slopes in self.slopes for pole in slopes.autonomous.values()), default=0.0)
 
     def systems(
-        self, cases: Sequence[Deviation], timing: Timing | None = None, *, transient: bool = True
-    ) -> Iterator[tuple[float, Bristle, tuple[Array, Array, Array]]]:
+        self, cases: Sequence[LoopDeviation], timing: SampledTiming | None = None, *, transient: bool = True
+    ) -> Iterator[tuple[float, LinearBristle, tuple[Array, Array, Array]]]:
         """Closed loops of `cases` of one delay at each velocity; `transient`: also with the bristle not yet following.
 
         Without the states of the law that go by themselves; `own_radius` has their poles.
@@ -136,13 +140,13 @@ class Sweep:
         own = timing or self.timing
         late, known = replace(own, delay_s=own.delay_s + cases[0].delay_s), tuple(cases)
         for velocity, slopes in self.coupled:
-            kinds = [Bristle.STICKS] if velocity == 0.0 else [Bristle.SLIDES]
+            kinds = [LinearBristle.STICKS] if velocity == 0.0 else [LinearBristle.SLIDES]
             if transient and velocity != 0.0:
-                kinds += [Bristle.STICKS, Bristle.TURNS]
+                kinds += [LinearBristle.STICKS, LinearBristle.TURNS]
             for kind in kinds:
                 yield velocity, kind, loops_around(*joints_at(self.friction, velocity, kind, known, late), slopes)
 
-    def worst(self, cases: Sequence[Deviation], timing: Timing | None = None) -> Worst:
+    def worst(self, cases: Sequence[LoopDeviation], timing: SampledTiming | None = None) -> Worst:
         """The worst pole over all velocities, bristle states and cases."""
         found = Worst(self.own_radius, 0.0, 0.0, "", 0)
         for group in by_delay(cases):
@@ -154,7 +158,7 @@ class Sweep:
                     found = Worst(largest, float(radius[i]), velocity, kind.name.lower(), group[i])
         return found
 
-    def disk_margin(self, cases: Sequence[Deviation] = NOMINAL) -> tuple[float, float]:
+    def disk_margin(self, cases: Sequence[LoopDeviation] = NOMINAL) -> tuple[float, float]:
         """(symmetric disk margin, velocity where it is least), least over `cases`; the joint as modelled by default.
 
         alpha = 2/max|S - T| over the frequencies: gain may change by (2 + alpha)/(2 - alpha) and phase by
@@ -168,7 +172,7 @@ class Sweep:
                     least, where = margin, velocity
         return least, where
 
-    def judge(self, cases: Sequence[Deviation]) -> Judgement:
+    def judge(self, cases: Sequence[LoopDeviation]) -> Judgement:
         """Poles and disk margin of `cases` at once, for a search: what `worst` and `disk_margin` say."""
         found, hardest = Judgement(self.own_radius, 0.0, np.inf, 0.0, []), set()
         for group in by_delay(cases):
@@ -178,21 +182,21 @@ class Sweep:
                 hardest.add(group[int(radius.argmax())])
                 if radius.max() > found.radius:
                     found = replace(found, radius=float(radius.max()), radius_at_rad_s=velocity)
-                if kind is Bristle.SLIDES or velocity == 0.0:
+                if kind is LinearBristle.SLIDES or velocity == 0.0:
                     margin = disk_margins(sensitivity(closed, column, row, poles))
                     hardest.add(group[int(margin.argmin())])
                     if margin.min() < found.disk_margin:
                         found = replace(found, disk_margin=float(margin.min()), disk_at_rad_s=velocity)
         return replace(found, hardest=[cases[i] for i in sorted(hardest)])
 
-    def stable(self, case: Deviation, extra_delay_s: float = 0.0) -> bool:
+    def stable(self, case: LoopDeviation, extra_delay_s: float = 0.0) -> bool:
         """Whether all poles are inside, steady sliding and sticking, for one case and a longer delay."""
         timing = replace(self.timing, delay_s=self.timing.delay_s + extra_delay_s)
         systems = self.systems((case,), timing, transient=False)
         return self.own_radius < 1.0 and all(spectral_radius(closed)[0] < 1.0 for _, _, (closed, _, _) in systems)
 
 
-def by_delay(cases: Sequence[Deviation]) -> list[list[int]]:
+def by_delay(cases: Sequence[LoopDeviation]) -> list[list[int]]:
     """Numbers of the cases in groups of one delay, with a spring or without: only these have the same states."""
     kinds = [(case.delay_s, case.behind is None) for case in cases]
     return [[i for i, kind in enumerate(kinds) if kind == one] for one in dict.fromkeys(kinds)]

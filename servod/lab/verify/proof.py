@@ -14,7 +14,7 @@ from servod.formats.gains.design import Design, RegionProof, Vertex
 from servod.formats.gains.parameters import LocalParameters, RegionGains
 from servod.lab.verify.sampled import Array, timing_of
 from servod.lab.verify.steady_friction import steady_friction
-from servod.lab.verify.vertices import Joint, Span, joints, sampled_vertices
+from servod.lab.verify.vertices import Span, VertexJoint, joints, sampled_vertices
 
 
 def relative_margin(matrix: Array) -> float:
@@ -81,14 +81,14 @@ def disc_reach(region: RegionProof) -> float:
     return float(np.max([abs(vertex.disc_centre) + vertex.disc_radius for vertex in region.vertices]))
 
 
-def scaled_vertices(design: Design, region: RegionProof) -> tuple[list[Joint], Array, Array, Array]:
+def scaled_vertices(design: Design, region: RegionProof) -> tuple[list[VertexJoint], Array, Array, Array]:
     """Joints and scaled (A, B, E) of the region's vertices, made anew from the design's model and intervals."""
     span = Span(region.name, region.speed_from_rad_s, region.speed_to_rad_s)
     found = joints(steady_friction(design.model), span, design.uncertainty)
     return found, *scaled(found, design, region)
 
 
-def scaled(found: list[Joint], design: Design, region: RegionProof) -> tuple[Array, Array, Array]:
+def scaled(found: list[VertexJoint], design: Design, region: RegionProof) -> tuple[Array, Array, Array]:
     """(A, B, E) of joints in the region's scaled states."""
     a, b, e = sampled_vertices(found, timing_of(design))
     scale = np.array(region.scale)

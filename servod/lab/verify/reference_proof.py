@@ -15,7 +15,7 @@ import numpy as np
 
 from servod.formats.gains.design import Design, ReferenceForm, ReferenceOutput, ReferenceProof, Uncertainty
 from servod.formats.gains.gain_set import CertificateCheck
-from servod.formats.gains.parameters import LocalFriction, LocalParameters, RegionGains
+from servod.formats.gains.parameters import LocalFrictionSets, LocalParameters, RegionGains
 from servod.kernels.laws.weights import Shape, blended
 from servod.lab.verify.checks import SAME, Subject, at_least, at_most
 from servod.lab.verify.proof import relative_margin
@@ -68,7 +68,7 @@ class ContinuousVertex:
     b2: Array
 
 
-def polytope(friction: SteadyFriction, law: LocalFriction, span: Span, u: Uncertainty) -> Polytope:
+def polytope(friction: SteadyFriction, law: LocalFrictionSets, span: Span, u: Uncertainty) -> Polytope:
     """The polytope of a region: what the law's local sets do there, against the model within its intervals."""
     nodes = [s.velocity_rad_s for s in law.sets]
     sets = law.named()
@@ -140,7 +140,7 @@ def _balanced_margin(matrix: Array) -> float:
     return relative_margin(matrix / np.outer(size, size))
 
 
-def stored_polytope_deviation(design: Design, law: LocalFriction, proof: ReferenceProof) -> float:
+def stored_polytope_deviation(design: Design, law: LocalFrictionSets, proof: ReferenceProof) -> float:
     """Largest relative difference between the stored intervals and those made anew from model and law."""
     span = Span(proof.name, proof.speed_from_rad_s, proof.speed_to_rad_s)
     made = polytope(steady_friction(design.model), law, span, design.uncertainty)

@@ -22,7 +22,7 @@ from servod.kernels.laws.local import REST_FROM_S
 from servod.lab.simulate.noise import noise_of, noise_series
 from servod.lab.simulate.simulate import LoopSettings, simulate_closed_loop
 from servod.lab.verify.checks import HOLD_LIMIT_RAD, SAME, Subject, at_least, at_most, speeds_of
-from servod.lab.verify.closed_loop import Bristle, corners, loops_around, spectral_radius
+from servod.lab.verify.closed_loop import LinearBristle, corners, loops_around, spectral_radius
 from servod.lab.verify.law_slopes import LawSlopes, arriving_slopes
 from servod.lab.verify.margins import by_delay, joints_at
 from servod.lab.verify.plants import drawn
@@ -73,7 +73,7 @@ def resting_radius(s: Subject, local: LocalParameters, below_rad_s: float) -> fl
         for group in by_delay(cases):
             own = tuple(cases[i] for i in group)
             timing = replace(s.timing, delay_s=s.timing.delay_s + own[0].delay_s)
-            for kind in Bristle if velocity else (Bristle.STICKS,):
+            for kind in LinearBristle if velocity else (LinearBristle.STICKS,):
                 joints = joints_at(s.coarse.friction, velocity, kind, own, timing)
                 worst = max(worst, float(spectral_radius(loops_around(*joints, slopes)[0]).max()))
     return worst

@@ -13,7 +13,7 @@ import numpy as np
 from servod.formats.gains.design import Design
 from servod.formats.gains.parameters import LocalParameters
 from servod.lab.simulate.noise import noise_of
-from servod.lab.verify.closed_loop import Bristle, Deviation, late_corners, loops_around
+from servod.lab.verify.closed_loop import LinearBristle, LoopDeviation, late_corners, loops_around
 from servod.lab.verify.law_slopes import LawSlopes
 from servod.lab.verify.margins import Sweep, joints_at
 from servod.lab.verify.sampled import Array
@@ -47,7 +47,7 @@ def gives_way_rad(law: LocalParameters, design: Design) -> float:
     return NOISE_SWING * noise.torque_rms / max(stiffness, LEAST_STIFFNESS)
 
 
-def swing_per_count(sweep: Sweep, cases: Sequence[Deviation]) -> float:
+def swing_per_count(sweep: Sweep, cases: Sequence[LoopDeviation]) -> float:
     """Largest peak to peak position per count of the encoder, over `cases` of one delay sliding at the sweep's speeds.
 
     A reading is off by half a count to either side at most, whatever its course in time; a linear loop then moves by
@@ -57,10 +57,10 @@ def swing_per_count(sweep: Sweep, cases: Sequence[Deviation]) -> float:
     return max(float(_l1_norms(sweep, v, slopes, tuple(cases)).max()) for v, slopes in kinds)
 
 
-def _l1_norms(sweep: Sweep, velocity: float, slopes: LawSlopes, cases: tuple[Deviation, ...]) -> Array:
+def _l1_norms(sweep: Sweep, velocity: float, slopes: LawSlopes, cases: tuple[LoopDeviation, ...]) -> Array:
     """Sum of |position| after one reading that is off by 1, in each case."""
     timing = sweep.timing
-    plant_a, plant_b, filtered = joints_at(sweep.friction, velocity, Bristle.SLIDES, cases, timing)
+    plant_a, plant_b, filtered = joints_at(sweep.friction, velocity, LinearBristle.SLIDES, cases, timing)
     closed, column, row = loops_around(plant_a, plant_b, filtered, slopes)
     n, law = plant_a.shape[-1], np.zeros_like(closed)
     law[:, n:] = closed[:, n:]

@@ -24,7 +24,7 @@ LONGEST_LAG = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Timing:
+class SampledTiming:
     """Sample period, command-to-torque delay and the cut-off of the velocity filter."""
 
     period_s: float
@@ -53,7 +53,7 @@ class Timing:
         return self.whole + (1 if self.part else 0)
 
 
-def timing_of(design: Design) -> Timing:
+def timing_of(design: Design) -> SampledTiming:
     """Period, delay and filter that the design states, with the actuator's lag as delay.
 
     A lag tau turns the phase by atan(w*tau), a delay of tau by w*tau, which is more at every frequency, so the loop is
@@ -61,7 +61,7 @@ def timing_of(design: Design) -> Timing:
     """
     model = design.model
     lag_s = model.actuator_lag.time_constant_s if model.actuator_lag else 0.0
-    return Timing(design.period_s, model.total_delay_s + lag_s, design.velocity_cutoff_hz)
+    return SampledTiming(design.period_s, model.total_delay_s + lag_s, design.velocity_cutoff_hz)
 
 
 def exponential(stack: Array) -> Array:
@@ -89,7 +89,7 @@ def exponential(stack: Array) -> Array:
     return np.asarray(result, dtype=np.float64)
 
 
-def sample_joint(a: Array, b: Array, e: Array, timing: Timing) -> tuple[Array, Array, Array, Array]:
+def sample_joint(a: Array, b: Array, e: Array, timing: SampledTiming) -> tuple[Array, Array, Array, Array]:
     """(A, B_now, B_before, E) over one period for stacks of joints: a (..., n, n), b and e (..., n).
 
     B_now takes u_(k-whole), B_before u_(k-whole-1), which acts until the part of the delay is over.
@@ -103,7 +103,7 @@ def sample_joint(a: Array, b: Array, e: Array, timing: Timing) -> tuple[Array, A
     return over[..., :n, :n], now, over[..., :n, n] - now, over[..., :n, n + 1]
 
 
-def with_delay_and_filter(a: Array, b: Array, e: Array, timing: Timing) -> tuple[Array, Array, Array]:
+def with_delay_and_filter(a: Array, b: Array, e: Array, timing: SampledTiming) -> tuple[Array, Array, Array]:
     """Sampled (A, B, E) of stacks of joints with states [joint, v_f, u_(k-1), ..., u_(k-n)], input u_k, torque w."""
     joint, now, before, force = sample_joint(a, b, e, timing)
     n, commands = a.shape[-1], timing.kept_commands
@@ -124,7 +124,7 @@ def with_delay_and_filter(a: Array, b: Array, e: Array, timing: Timing) -> tuple
     return full_a, full_b, full_e
 
 
-def _filter_row(a: Array, b: Array, e: Array, n: int, timing: Timing) -> None:
+def _filter_row(a: Array, b: Array, e: Array, n: int, timing: SampledTiming) -> None:
     """v_f(k+1) = kept*v_f(k) + (1 - kept)*(x(k+1) - x(k))/T, written into row n."""
     gain = (1.0 - timing.kept) / timing.period_s
     a[..., n, :], b[..., n], e[..., n] = gain * a[..., 0, :], gain * b[..., 0], gain * e[..., 0]

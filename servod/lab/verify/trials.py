@@ -83,7 +83,7 @@ def scale_of(design: Design) -> Scale:
 
 
 @dataclass(frozen=True, slots=True)
-class Trial:
+class Sample:
     """One plant's figures: largest error as a share of the sine; ripple and rest as shares of the large step."""
 
     index: int
@@ -155,18 +155,18 @@ def simulated(gains: GainSet, design: Design, plant: AxisModel, motion: Array, s
     return run.tracking_error_rad(), run.position_rad
 
 
-def run_trial(gains: GainSet, design: Design, motion: Array, seed: int, index: int, shaken_rad: float = 0.0) -> Trial:
+def run_sample(gains: GainSet, design: Design, motion: Array, seed: int, index: int, shaken_rad: float = 0.0) -> Sample:
     """One plant of the Monte-Carlo; a plant that runs away counts with infinite figures.
 
     `shaken_rad`: how far counts and noise alone may move a joint, peak to peak; no part of the ripple.
     """
     error, position = simulated(gains, design, drawn(design.model, design.uncertainty, seed, index), motion, index)
     if not np.isfinite(position).all():
-        return Trial(index, math.inf, math.inf, math.inf)
+        return Sample(index, math.inf, math.inf, math.inf)
     scale, ends, last = scale_of(design), np.cumsum(counts(design.period_s)), round(RIPPLE_S / design.period_s)
     sine = error[ends[1] + last : ends[2]]  # the sine starts with a jump of velocity
     rests = [np.ptp(position[end - last : end]) for end in (ends[3], ends[4])]
-    return Trial(
+    return Sample(
         index,
         float(np.abs(sine).max()) / scale.sine_rad,
         max(float(max(rests)) - shaken_rad, 0.0) / scale.large_rad,
@@ -174,19 +174,19 @@ def run_trial(gains: GainSet, design: Design, motion: Array, seed: int, index: i
     )
 
 
-def _trials(gains: GainSet, seed: int, shaken_rad: float, first: int, last: int) -> list[Trial]:
+def _trials(gains: GainSet, seed: int, shaken_rad: float, first: int, last: int) -> list[Sample]:
     assert gains.design is not None
     motion = trial_motion(gains.design.period_s, scale_of(gains.design))
-    return [run_trial(gains, gains.design, motion, seed, i, shaken_rad) for i in range(first, last)]
+    return [run_sample(gains, gains.design, motion, seed, i, shaken_rad) for i in range(first, last)]
 
 
-def _worker(text: str, seed: int, shaken_rad: float, first: int, last: int) -> list[Trial]:
+def _worker(text: str, seed: int, shaken_rad: float, first: int, last: int) -> list[Sample]:
     from servod.formats.gains.gain_set import parse_gains
 
     return _trials(parse_gains(text, "gain set"), seed, shaken_rad, first, last)
 
 
-def monte_carlo(gains: GainSet, plants: int, seed: int, processes: int, shaken_rad: float = 0.0) -> list[Trial]:
+def monte_carlo(gains: GainSet, plants: int, seed: int, processes: int, shaken_rad: float = 0.0) -> list[Sample]:
     """`plants` trials over worker processes; the same seed gives the same plants whatever the number of processes."""
     if processes <= 1:
         return _trials(gains, seed, shaken_rad, 0, plants)

@@ -19,8 +19,8 @@ from servod.formats.gains.design import Uncertainty
 from servod.formats.model.axis_model import AxisModel
 from servod.formats.model.identified import Identified, IdentifiedValue
 from servod.kernels.laws.local import COMMANDS
-from servod.lab.verify.closed_loop import Bristle, Deviation, joint_point
-from servod.lab.verify.sampled import Array, Timing, with_delay_and_filter
+from servod.lab.verify.closed_loop import LinearBristle, LoopDeviation, joint_point
+from servod.lab.verify.sampled import Array, SampledTiming, with_delay_and_filter
 from servod.lab.verify.steady_friction import SteadyFriction
 
 GRID = 40  # speeds that are compared, in each direction
@@ -28,7 +28,7 @@ LEAST_SPEED = 0.1  # share of the upper speed of Omega_L from which on it counts
 
 
 @dataclass(frozen=True, slots=True)
-class Joint:
+class VertexJoint:
     """One vertex: dx/dt = A x + B u + E w with states position, velocity, bristle.
 
     `mode` is the polytope that it is a corner of: the bristle slides or sticks. `performs` says whether the H2
@@ -69,14 +69,14 @@ def extremes(friction: SteadyFriction, span: Span, u: Uncertainty) -> tuple[floa
     """
     lowest = LEAST_SPEED * span.to_rad_s if span.holds_rest else span.from_rad_s
     velocities = [side * float(v) for side in (1.0, -1.0) for v in np.geomspace(lowest, span.to_rad_s, GRID)]
-    worse = Deviation(dry=1.0 + u.dry, slope=1.0 + u.slope, viscous=1.0 - u.viscous)
-    joints = np.array([joint_point(friction, v, Bristle.SLIDES, worse).matrices()[0] for v in velocities])
+    worse = LoopDeviation(dry=1.0 + u.dry, slope=1.0 + u.slope, viscous=1.0 - u.viscous)
+    joints = np.array([joint_point(friction, v, LinearBristle.SLIDES, worse).matrices()[0] for v in velocities])
     growth = np.linalg.eigvals(joints[:, 1:, 1:]).real.max(axis=1)
     slopes = [friction.dry_slope(v) + friction.viscous(v) for v in velocities]
     return velocities[int(np.argmax(growth))], velocities[int(np.argmax(slopes))]
 
 
-def sliding(friction: SteadyFriction, span: Span, u: Uncertainty) -> list[Joint]:
+def sliding(friction: SteadyFriction, span: Span, u: Uncertainty) -> list[VertexJoint]:
     """The joint where friction falls most (every end of what makes that worse) and where it rises most."""
     falls, rises = extremes(friction, span, u)
     slope = friction.dry_slope(falls) * (1.0 + u.slope) * (1.0 + u.dry) + friction.viscous(falls) * (1.0 - u.viscous)
@@ -85,46 +85,46 @@ def sliding(friction: SteadyFriction, span: Span, u: Uncertainty) -> list[Joint]
         gain = 1.0 + u.torque_gain if mass < 1.0 else 1.0 - u.torque_gain
         shared: dict[str, Any] = {"inertia": mass, "torque_gain": gain, "damping": damping}
         size = f"{'light' if mass < 1.0 else 'heavy'} {'ringing' if damping < 1.0 else 'damped'}"
-        worse = Deviation(**shared, dry=1.0 + u.dry, slope=1.0 + u.slope, viscous=1.0 - u.viscous)
-        better = Deviation(**shared, dry=1.0 - u.dry, viscous=1.0 + u.viscous)
+        worse = LoopDeviation(**shared, dry=1.0 + u.dry, slope=1.0 + u.slope, viscous=1.0 - u.viscous)
+        better = LoopDeviation(**shared, dry=1.0 - u.dry, viscous=1.0 + u.viscous)
         for name, velocity, deviation, performs in (
             ("falling", falls, worse, slope >= 0.0),
             ("rising", rises, better, True),
         ):
-            matrices = joint_point(friction, velocity, Bristle.SLIDES, deviation).matrices()
-            found.append(Joint(f"sliding {name} {size}", "sliding", performs, *matrices))
+            matrices = joint_point(friction, velocity, LinearBristle.SLIDES, deviation).matrices()
+            found.append(VertexJoint(f"sliding {name} {size}", "sliding", performs, *matrices))
     return found
 
 
-def sticking(friction: SteadyFriction, u: Uncertainty) -> list[Joint]:
+def sticking(friction: SteadyFriction, u: Uncertainty) -> list[VertexJoint]:
     """The joint on its bristle: every end of stiffness, damping and inertia."""
     found = []
     for stiff, damped, mass in itertools.product(ends(u.stiffness), ends(u.damping), ends(u.inertia)):
         gain = 1.0 + u.torque_gain if mass < 1.0 else 1.0 - u.torque_gain
-        corner = Deviation(mass, gain, stiff, damped, viscous=1.0 - u.viscous)
+        corner = LoopDeviation(mass, gain, stiff, damped, viscous=1.0 - u.viscous)
         name = f"sticking {'soft' if stiff < 1.0 else 'stiff'} {'ringing' if damped < 1.0 else 'damped'}"
-        matrices = joint_point(friction, 0.0, Bristle.STICKS, corner).matrices()
-        found.append(Joint(f"{name} {'light' if mass < 1.0 else 'heavy'}", "sticking", True, *matrices))
+        matrices = joint_point(friction, 0.0, LinearBristle.STICKS, corner).matrices()
+        found.append(VertexJoint(f"{name} {'light' if mass < 1.0 else 'heavy'}", "sticking", True, *matrices))
     return found
 
 
-def joints(friction: SteadyFriction, span: Span, uncertainty: Uncertainty) -> list[Joint]:
+def joints(friction: SteadyFriction, span: Span, uncertainty: Uncertainty) -> list[VertexJoint]:
     """All vertices of the region: sliding, and sticking where it holds rest."""
     stuck = sticking(friction, uncertainty) if span.holds_rest else []
     return sliding(friction, span, uncertainty) + stuck
 
 
-def fed_commands(timing: Timing) -> int:
+def fed_commands(timing: SampledTiming) -> int:
     """Number of past commands that are fed back: those that still act or wait, and one that the velocity lags."""
     return min(max(timing.kept_commands, round(timing.delay_s / timing.period_s) + 1), COMMANDS)
 
 
-def known_commands(timing: Timing) -> int:
+def known_commands(timing: SampledTiming) -> int:
     """Number of past commands among the states: those that are fed back, and those of a longer delay that still act."""
     return max(fed_commands(timing), timing.kept_commands)
 
 
-def sampled_vertices(found: list[Joint], timing: Timing) -> tuple[Array, Array, Array]:
+def sampled_vertices(found: list[VertexJoint], timing: SampledTiming) -> tuple[Array, Array, Array]:
     """(A, B, E) of all vertices, states [x, v_f, u_(k-1), ..., v - v_f, z]: what the law feeds back comes first."""
     a, b, e = (np.array([getattr(joint, name) for joint in found]) for name in ("a", "b", "e"))
     full_a, full_b, full_e = _with_memory(*with_delay_and_filter(a, b, e, timing), timing)
@@ -133,7 +133,7 @@ def sampled_vertices(found: list[Joint], timing: Timing) -> tuple[Array, Array, 
     return change @ full_a @ back, full_b @ change.T, full_e @ change.T
 
 
-def _with_memory(a: Array, b: Array, e: Array, timing: Timing) -> tuple[Array, Array, Array]:
+def _with_memory(a: Array, b: Array, e: Array, timing: SampledTiming) -> tuple[Array, Array, Array]:
     """The same systems with the commands that are only remembered as further states at the end."""
     size, more = a.shape[-1], known_commands(timing) - timing.kept_commands
     full_a = np.pad(a, ((0, 0), (0, more), (0, more)))

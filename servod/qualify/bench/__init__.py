@@ -8,6 +8,6 @@ speed.py    SYNC-stepped and simulated time against real time
 table.py    the figures as a table and as a file
 """
 
-from servod.qualify.bench.plan import QUICK, THOROUGH, Plan, measure
+from servod.qualify.bench.plan import QUICK, THOROUGH, BenchSettings, measure
 
-__all__ = ["QUICK", "THOROUGH", "Plan", "measure"]
+__all__ = ["QUICK", "THOROUGH", "BenchSettings", "measure"]

@@ -20,7 +20,7 @@ from servod.client.processes import RunningAxis, child, running_axis, sigterm_as
 from servod.common.errors import AnswerIsNo
 from servod.drivers.virtual.drive_record import read_drive_record
 from servod.formats.recording.mcap_reader import read_recording
-from servod.qualify.bench.attackers import AT_WORK, Tally, failed
+from servod.qualify.bench.attackers import AT_WORK, AttackTally, failed
 from servod.qualify.bench.wall import resident_kib
 from servod.qualify.demo.axis import demo_config, plant_file
 from servod.runtime.fieldbus.devices import DriveState
@@ -48,7 +48,7 @@ class _Round:
     quiet_stop_ms: list[float]
     stop_ms: list[float]
     growth_mib: float
-    tallies: dict[str, Tally]
+    tallies: dict[str, AttackTally]
 
 
 def measure(quiet_s: float, attack_s: float, stops: int, rounds: int) -> dict[str, Any]:
@@ -83,7 +83,7 @@ def _round(axis: RunningAxis, record: Path, log: Path, quiet_s: float, attack_s:
     return _Round(quiet, attacked, quiet_ms, times_ms, growth_mib, told(log))
 
 
-def told(log: Path) -> dict[str, Tally]:
+def told(log: Path) -> dict[str, AttackTally]:
     """What each kind of attack did, from what the attackers said at their end.
 
     Raises AnswerIsNo when they said nothing, or when an attack did not take place.
@@ -91,7 +91,7 @@ def told(log: Path) -> dict[str, Tally]:
     lines = log.read_text(errors="replace").splitlines()
     if not lines or not lines[-1].startswith("{"):
         raise AnswerIsNo(f"the attackers did not tell what they did: {' '.join(lines)[-500:]}")
-    tallies = {name: Tally(**did) for name, did in json.loads(lines[-1]).items()}
+    tallies = {name: AttackTally(**did) for name, did in json.loads(lines[-1]).items()}
     if missing := failed(tallies):
         raise AnswerIsNo(f"no attack of these kinds took place: {', '.join(missing)}")
     return tallies

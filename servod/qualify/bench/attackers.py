@@ -31,7 +31,7 @@ _LEASELESS = b'{"id":1,"verb":"track","args":{"kind":"paper","duration_s":1}}\n'
 _NESTED = b"[" * 400_000 + b"\n"
 
 
-class Tally(NamedTuple):
+class AttackTally(NamedTuple):
     """What one kind of attack did."""
 
     connections: int
@@ -177,10 +177,10 @@ def kind(attack: Attack) -> str:
     return attack.__name__.strip("_")
 
 
-def failed(tallies: Mapping[str, Tally]) -> list[str]:
+def failed(tallies: Mapping[str, AttackTally]) -> list[str]:
     """The kinds of attack that never took place: no connection, or nothing said on it."""
     kinds = dict.fromkeys(map(kind, _WORKS))
-    found = {name: tallies.get(name, Tally(0, 0)) for name in kinds}
+    found = {name: tallies.get(name, AttackTally(0, 0)) for name in kinds}
     return [name for name, did in found.items() if not did.connections or not (did.bytes or name in SILENT)]
 
 
@@ -210,12 +210,12 @@ def _none_has_ended() -> bool:
     return os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
 
 
-def _summed(numbers: Sequence[int]) -> dict[str, Tally]:
+def _summed(numbers: Sequence[int]) -> dict[str, AttackTally]:
     connections, sent = Counter[str](), Counter[str]()
     for number, attack in enumerate(_WORKS):
         connections[kind(attack)] += numbers[2 * number]
         sent[kind(attack)] += numbers[2 * number + 1]
-    return {name: Tally(count, sent[name]) for name, count in connections.items()}
+    return {name: AttackTally(count, sent[name]) for name, count in connections.items()}
 
 
 def main(path: str, seconds: float) -> int:

@@ -57,7 +57,7 @@ def commission() -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class Plan:
+class BenchSettings:
     """Lengths of the measurements, in s unless the name says otherwise; no `plants`: the laboratory is left out."""
 
     wakeup_s: float
@@ -71,11 +71,11 @@ class Plan:
     commission: bool = False
 
 
-THOROUGH = Plan(3.0, 10, 20_000, 60.0, 600.0, 20.0, 300.0, plants=1000, commission=True)
-QUICK = Plan(1.5, 6, 5_000, 10.0, 20.0, 4.0, 60.0, plants=100)
+THOROUGH = BenchSettings(3.0, 10, 20_000, 60.0, 600.0, 20.0, 300.0, plants=1000, commission=True)
+QUICK = BenchSettings(1.5, 6, 5_000, 10.0, 20.0, 4.0, 60.0, plants=100)
 
 
-def measure(plan: Plan, tell: Callable[[str], None]) -> dict[str, Any]:
+def measure(plan: BenchSettings, tell: Callable[[str], None]) -> dict[str, Any]:
     """Measure everything, one after the other, so that nothing disturbs anything; `tell` hears what is going on."""
     tell("wake-up against cyclictest")
     woken = wakeup.measure(plan.wakeup_s, plan.wakeup_rounds)
@@ -100,14 +100,16 @@ def measure(plan: Plan, tell: Callable[[str], None]) -> dict[str, Any]:
     }
 
 
-def _laboratory(plan: Plan, tell: Callable[[str], None]) -> tuple[dict[str, Any] | None, dict[str, Any] | None]:
+def _laboratory(
+    plan: BenchSettings, tell: Callable[[str], None]
+) -> tuple[dict[str, Any] | None, dict[str, Any] | None]:
     if not plan.plants:
         return None, None
     tell(f"synthesis, and a certificate with {plan.plants} plants")
     return measure_lab(plan.plants)
 
 
-def _commission(plan: Plan, tell: Callable[[str], None]) -> dict[str, Any] | None:
+def _commission(plan: BenchSettings, tell: Callable[[str], None]) -> dict[str, Any] | None:
     if not plan.commission:
         return None
     tell("a whole commissioning, four minutes")
@@ -125,7 +127,7 @@ def machine() -> dict[str, Any]:
 # The benchmark's figures as a table beside what they shall reach, and as a file.
 
 
-class Goal(NamedTuple):
+class Target(NamedTuple):
     """One row: where the figure stands in the document, how it is written, and what it shall be."""
 
     label: str
@@ -151,27 +153,31 @@ class Goal(NamedTuple):
 
 
 GOALS = (
-    Goal("wake-up, median against cyclictest", ("wakeup", "median_ratio"), "{:.2f}", "at most 1.3", lambda x: x <= 1.3),
-    Goal("wake-up, p99 against cyclictest", ("wakeup", "p99_ratio"), "{:.2f}", "at most 2", lambda x: x <= 2.0),
-    Goal("whole tick, median", ("tick_us", "median"), "{:.1f} µs", "at most 60 µs", lambda x: x <= 60.0),
-    Goal("whole tick, p99", ("tick_us", "p99"), "{:.1f} µs", "", lambda _: True),
-    Goal("controller alone, median", ("controller_us", "median"), "{:.1f} µs", "at most 10 µs", lambda x: x <= 10.0),
-    Goal("controller alone, p99", ("controller_us", "p99"), "{:.1f} µs", "", lambda _: True),
-    Goal(
+    Target(
+        "wake-up, median against cyclictest", ("wakeup", "median_ratio"), "{:.2f}", "at most 1.3", lambda x: x <= 1.3
+    ),
+    Target("wake-up, p99 against cyclictest", ("wakeup", "p99_ratio"), "{:.2f}", "at most 2", lambda x: x <= 2.0),
+    Target("whole tick, median", ("tick_us", "median"), "{:.1f} µs", "at most 60 µs", lambda x: x <= 60.0),
+    Target("whole tick, p99", ("tick_us", "p99"), "{:.1f} µs", "", lambda _: True),
+    Target("controller alone, median", ("controller_us", "median"), "{:.1f} µs", "at most 10 µs", lambda x: x <= 10.0),
+    Target("controller alone, p99", ("controller_us", "p99"), "{:.1f} µs", "", lambda _: True),
+    Target(
         "missed periods", ("wall_clock", "missed_share"), "{:.3%}", "at most 0.3 % in 60 s", lambda x: x <= 0.003, 60.0
     ),
-    Goal(
+    Target(
         "deadline to torque frame, median",
         ("wall_clock", "deadline_to_torque_us"),
         "{:.0f} µs",
         "at most 250 µs",
         lambda x: x <= 250.0,
     ),
-    Goal("stepped, against real time", ("stepped_speed",), "{:.1f}×", "at least 5×", lambda x: x >= 5.0),
-    Goal("simulator, against real time", ("simulator_speed",), "{:.0f}×", "at least 500×", lambda x: x >= 500.0),
-    Goal("growth of memory", ("memory", "growth_mib"), "{:.2f} MiB", "below 1 MiB in 10 min", lambda x: x < 1.0, 600.0),
-    Goal("synthesis of both regions", ("synthesis", "seconds"), "{:.1f} s", "at most 2 s", lambda x: x <= 2.0),
-    Goal(
+    Target("stepped, against real time", ("stepped_speed",), "{:.1f}×", "at least 5×", lambda x: x >= 5.0),
+    Target("simulator, against real time", ("simulator_speed",), "{:.0f}×", "at least 500×", lambda x: x >= 500.0),
+    Target(
+        "growth of memory", ("memory", "growth_mib"), "{:.2f} MiB", "below 1 MiB in 10 min", lambda x: x < 1.0, 600.0
+    ),
+    Target("synthesis of both regions", ("synthesis", "seconds"), "{:.1f} s", "at most 2 s", lambda x: x <= 2.0),
+    Target(
         "verification with 1000 plants",
         ("verification", "seconds"),
         "{:.0f} s",
@@ -179,11 +185,11 @@ GOALS = (
         lambda x: x <= 60.0,
         plants=1000,
     ),
-    Goal("commission", ("commission", "seconds"), "{:.0f} s", "at most 240 s", lambda x: x <= 240.0),
+    Target("commission", ("commission", "seconds"), "{:.0f} s", "at most 240 s", lambda x: x <= 240.0),
 )
 
 
-def figure(document: dict[str, Any], goal: Goal) -> float | None:
+def figure(document: dict[str, Any], goal: Target) -> float | None:
     """The figure of one row; None when it could not be measured."""
     value: Any = document
     for key in goal.keys:
@@ -191,7 +197,7 @@ def figure(document: dict[str, Any], goal: Goal) -> float | None:
     return None if value is None else float(value)
 
 
-def shown(document: dict[str, Any], goal: Goal) -> str:
+def shown(document: dict[str, Any], goal: Target) -> str:
     """The figure of one row as people read it."""
     value = figure(document, goal)
     return "not measured" if value is None else goal.text.format(value)

@@ -94,7 +94,7 @@ def grown(t: Array, motion: Array) -> Array:
 Rng = np.random.Generator
 
 
-class Kind(StrEnum):
+class CaseKind(StrEnum):
     """Kinds of joints."""
 
     LAB_JOINT = "lab_joint"
@@ -103,13 +103,13 @@ class Kind(StrEnum):
 
 
 @dataclass(frozen=True)
-class Axis:
+class CaseAxis:
     """An axis with nothing concealed: physics, controller, motions, and the scales that effects are drawn by.
 
     `speed` is what its motions reach (rad/s), `effort` the torque that its controller asks for then (N*m).
     """
 
-    kind: Kind
+    kind: CaseKind
     physics: Physics
     loop: Loop
     motions: Motions
@@ -125,7 +125,7 @@ class Axis:
         p = self.physics
         return p.coulomb + p.viscous * self.speed + p.inertia * 8.0 * self.motions.tempo * self.speed + p.gravity
 
-    def with_travel(self, least: float) -> Axis:
+    def with_travel(self, least: float) -> CaseAxis:
         """The axis with at least so much travel (rad), at the same speed."""
         if self.motions.travel >= least:
             return self
@@ -134,17 +134,17 @@ class Axis:
 
 
 _KINDS = {
-    Kind.LAB_JOINT: (
+    CaseKind.LAB_JOINT: (
         Physics(0.001, coulomb=0.045, static=0.07, viscous=0.056, stribeck_velocity=0.1, sigma0=950.0, sigma1=1.0),
         Loop(2.5, 0.05, 12.0, 1.0, 2.0**17),
         Motions(0.6, 1.0),
     ),
-    Kind.HARMONIC_DRIVE: (
+    CaseKind.HARMONIC_DRIVE: (
         Physics(0.8, coulomb=6.0, static=8.0, viscous=9.0, stribeck_velocity=0.08, sigma0=9000.0, sigma1=60.0),
         Loop(900.0, 45.0, 3500.0, 120.0, 2.0**19),
         Motions(1.0, 1.0),
     ),
-    Kind.DIRECT_DRIVE: (
+    CaseKind.DIRECT_DRIVE: (
         Physics(0.02, coulomb=0.12, static=0.15, viscous=0.02, stribeck_velocity=0.05, sigma0=400.0, sigma1=1.5),
         Loop(36.0, 1.45, 180.0, 8.0, 2.0**20),
         Motions(1.5, 1.0),
@@ -158,14 +158,14 @@ DECADES = 0.6
 HEATS_C = 6.0
 
 
-def draw_axis(rng: Rng, kind: Kind, weight: bool) -> Axis:
+def draw_axis(rng: Rng, kind: CaseKind, weight: bool) -> CaseAxis:
     """An axis of a kind; with `weight`, a known weight hangs on it."""
     physics, loop, motions = _KINDS[kind]
     torque = 10.0 ** rng.uniform(-DECADES, DECADES)
     spread = {key: float(rng.uniform(0.8, 1.25)) for key in ("inertia", "viscous", "coulomb", "sigma0", "sigma1")}
     changed = {key: getattr(physics, key) * torque * factor for key, factor in spread.items()}
     excess = float(rng.choice([0.0, 1.0])) * (physics.static / physics.coulomb - 1.0) * rng.uniform(0.6, 1.2)
-    axis = Axis(
+    axis = CaseAxis(
         kind,
         physics._replace(
             **changed,
@@ -181,7 +181,7 @@ def draw_axis(rng: Rng, kind: Kind, weight: bool) -> Axis:
     return replace(axis, physics=axis.physics._replace(heating=_heating(axis)))
 
 
-def _heating(axis: Axis) -> float:
+def _heating(axis: CaseAxis) -> float:
     """Warming per joule that makes HEATS_C of the losses of 16 s of slow motion."""
     p, speed = axis.physics, axis.motions.travel * axis.motions.tempo
     loss_j = 16.0 * (0.8 * p.coulomb + 0.6 * p.viscous * speed) * 1.1 * speed

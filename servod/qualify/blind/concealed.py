@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from servod.qualify.blind.axes import Axis
+from servod.qualify.blind.axes import CaseAxis
 from servod.qualify.blind.physics import Physics
 
 Document = dict[str, Any]
@@ -45,7 +45,7 @@ class Concealed:
 class Draw:
     """With what an effect is drawn: the axis, chance, a factor on the usual size, and whether in another form."""
 
-    axis: Axis
+    axis: CaseAxis
     rng: np.random.Generator
     strength: float
     other: bool

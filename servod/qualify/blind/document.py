@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 
 from servod.common.errors import BadInput
 from servod.common.files import write_bytes
-from servod.lab.report.figure import Axis, Colour, Figure, Panel, Style, curve
+from servod.lab.report.figure import Colour, Figure, PlotAxis, PlotPanel, Style, curve
 from servod.lab.report.page import Page
 from servod.lab.report.page_figure import plotly_figure
 from servod.lab.report.pictures import write_pictures
 from servod.qualify.blind import count, tables
-from servod.qualify.blind.conceal import SEALED, TRUTH, Trial, read_truth
+from servod.qualify.blind.conceal import SEALED, TRUTH, BlindTrial, read_truth
 from servod.qualify.blind.examine import ANSWERS, RUN, one_diagnosis
 from servod.qualify.blind.plan import Sort
 from servod.qualify.blind.score import Scored, score_case
@@ -135,7 +135,9 @@ def calibration(found: Mapping[str, Any]) -> Drawn:
         curve("as good as stated", [0.0, 1.0], [0.0, 1.0], Colour.GREY, Style.DASHED),
         curve("findings", stated, right, Colour.BLUE, Style.POINTS, bounds=(low, high)),
     )
-    panel = Panel(Axis("stated confidence", span=(0.0, 1.02)), Axis("share that is right", span=(0.0, 1.02)), curves)
+    panel = PlotPanel(
+        PlotAxis("stated confidence", span=(0.0, 1.02)), PlotAxis("share that is right", span=(0.0, 1.02)), curves
+    )
     caption = (
         "Each point is a bin of findings with the 95 % interval of its share; on the line, confidence is calibrated."
     )
@@ -148,7 +150,7 @@ Tell = Callable[[int, int], None]
 PICTURES = "pictures"
 
 
-def score(trial: Trial, out: Path, tell: Tell) -> dict[str, Any]:
+def score(trial: BlindTrial, out: Path, tell: Tell) -> dict[str, Any]:
     """Open the seal of the trial in `out` and score all answers.
 
     Raises BadInput when it is not what was sealed, or when not all answers are of one diagnosis.
@@ -165,7 +167,7 @@ def score(trial: Trial, out: Path, tell: Tell) -> dict[str, Any]:
     return document(trial, cases)
 
 
-def document(trial: Trial, cases: list[Scored]) -> dict[str, Any]:
+def document(trial: BlindTrial, cases: list[Scored]) -> dict[str, Any]:
     """The JSON document."""
     concealed = [case for case in cases if case.sort in (Sort.SINGLE, Sort.PAIR)]
     alarmed = [case for case in cases if case.sort is Sort.NOTHING and case.guesses]

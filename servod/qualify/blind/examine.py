@@ -32,7 +32,7 @@ ANSWERS, RUN, DIAGNOSIS, MODEL, SAID = "answers", "run.json", "diagnosis.json", 
 
 
 @dataclass(frozen=True)
-class Run:
+class DiagnosisRun:
     """How one diagnosis went: exit code, seconds of wall clock and of all cores, its largest memory, its time limit.
 
     `sources` is the hash of the diagnosis that answered.
@@ -102,7 +102,7 @@ class Examiner:
                 shutil.copytree(answer, answers, dirs_exist_ok=True)
                 write_bytes(answers / RUN, (json.dumps(asdict(run)) + "\n").encode())
 
-    def _spend(self, command: Sequence[str], where: Path, said: int) -> Run | None:
+    def _spend(self, command: Sequence[str], where: Path, said: int) -> DiagnosisRun | None:
         """Run a command to its end; None when we were told to stop meanwhile."""
         begun = time.monotonic()
         with self._lock:
@@ -118,7 +118,7 @@ class Examiner:
                 return None
         cpu_s = used.ru_utime + used.ru_stime
         wall_s, memory_mib = time.monotonic() - begun, used.ru_maxrss / 1024.0
-        return Run(process.returncode, wall_s, cpu_s, memory_mib, self._time_limit_s, self._sources)
+        return DiagnosisRun(process.returncode, wall_s, cpu_s, memory_mib, self._time_limit_s, self._sources)
 
 
 def one_diagnosis(out: Path, names: Sequence[str], sources: str | None = None) -> str | None:

@@ -13,7 +13,7 @@ from itertools import cycle, islice
 import numpy as np
 
 from servod.qualify.blind import listed
-from servod.qualify.blind.axes import Kind
+from servod.qualify.blind.axes import CaseKind
 from servod.qualify.blind.hidden import HIDE, UNLISTED
 
 
@@ -92,12 +92,12 @@ HARDER = Settings(other_forms=1.0, clutter=True, noise=4.0)
 
 
 @dataclass(frozen=True)
-class Plan:
+class CaseSpec:
     """One case to be made."""
 
     sort: Sort
     effects: tuple[str, ...]
-    kind: Kind
+    kind: CaseKind
     cover: Cover
     off: bool
     other: bool
@@ -105,16 +105,16 @@ class Plan:
     seed: int
 
 
-def plans(cases: int, seed: int, settings: Settings) -> list[Plan]:
+def plans(cases: int, seed: int, settings: Settings) -> list[CaseSpec]:
     """The cases of a trial, in an order that tells nothing."""
     rng = np.random.default_rng(seed)
     covers = islice(cycle(COVERS), int(rng.integers(len(COVERS))), None)
     made = []
     for number, (sort, effects) in enumerate(contents(cases, rng)):
         other = sort in {Sort.SINGLE, Sort.PAIR} and bool(rng.uniform() < settings.other_forms)
-        kind, weight = list(Kind)[int(rng.integers(3))], bool(rng.uniform() < 0.3)
+        kind, weight = list(CaseKind)[int(rng.integers(3))], bool(rng.uniform() < 0.3)
         cover = suited(next(covers), sort, effects)
-        made.append(Plan(sort, effects, kind, cover, number % 2 == 1, other, weight, int(rng.integers(2**31))))
+        made.append(CaseSpec(sort, effects, kind, cover, number % 2 == 1, other, weight, int(rng.integers(2**31))))
     return [made[i] for i in rng.permutation(len(made))]
 
 

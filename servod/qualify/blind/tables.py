@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-from servod.lab.report.figure import Table
+from servod.lab.report.figure import PageTable
 from servod.qualify.blind.count import (
     GOALS,
     HARDER_GOALS,
@@ -34,7 +34,7 @@ _SORTS = {
 _SPENT = {"wall_s": "time of a diagnosis, s", "cpu_s": "processor time, s", "memory_mib": "memory, MiB"}
 
 
-def all_tables(found: Mapping[str, Any]) -> list[Table]:
+def all_tables(found: Mapping[str, Any]) -> list[PageTable]:
     """All tables, the results first."""
     return [results(found), effects(found), confidences(found), hidden(found), every_case(found)]
 
@@ -54,7 +54,7 @@ def sentences(found: Mapping[str, Any]) -> Iterator[str]:
         yield f"False alarm: {', '.join(named)} in {case}, where nothing is hidden."
 
 
-def results(found: Mapping[str, Any]) -> Table:
+def results(found: Mapping[str, Any]) -> PageTable:
     """What a trial is judged by, with the goals."""
     goals = HARDER_GOALS if found["harder"] else GOALS
     rows = [
@@ -70,7 +70,7 @@ def results(found: Mapping[str, Any]) -> Table:
     for key, text in _SPENT.items():
         spread = found["times"][key]
         rows.append((f"{text}: median, max", f"{number(spread['median'])}, {number(spread['max'])}", "", ""))
-    return Table(RESULT, ("", "found", "of", "goal"), tuple(rows))
+    return PageTable(RESULT, ("", "found", "of", "goal"), tuple(rows))
 
 
 def _held_out(spreads: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
@@ -98,7 +98,7 @@ def _figure(
     return text, shown(value), of, f"{sign} {shown(goal)}"
 
 
-def effects(found: Mapping[str, Any]) -> Table:
+def effects(found: Mapping[str, Any]) -> PageTable:
     """For each effect: named how often, parameters, and as what it was mistaken."""
     rows = []
     for effect, counted in found["by_effect"].items():
@@ -108,27 +108,27 @@ def effects(found: Mapping[str, Any]) -> Table:
         named = f"{counted['right']}/{counted['cases']}"
         rows.append((effect, named, percent(told["median_error"]), percent(told["covered"]), mistaken))
     header = ("effect", "named", "median error of parameters", "intervals that cover", "beside it or instead")
-    return Table(EFFECTS, header, tuple(rows))
+    return PageTable(EFFECTS, header, tuple(rows))
 
 
-def confidences(found: Mapping[str, Any]) -> Table:
+def confidences(found: Mapping[str, Any]) -> PageTable:
     """What findings state and how many are right."""
     rows = []
     for part in found["calibration"]:
         span = f"{part['low']:g} to {part['high']:g}"
         rows.append((span, str(part["cases"]), percent(part["stated"]), percent(part["share"])))
-    return Table(CONFIDENCE, ("stated confidence", "findings", "stated on average", "right"), tuple(rows))
+    return PageTable(CONFIDENCE, ("stated confidence", "findings", "stated on average", "right"), tuple(rows))
 
 
-def hidden(found: Mapping[str, Any]) -> Table:
+def hidden(found: Mapping[str, Any]) -> PageTable:
     """Right answers by cover, form and joint."""
     rows: list[tuple[str, ...]] = []
     for key, text in (("by_cover", "cover"), ("by_form", "form"), ("by_joint", "joint")):
         rows += [_counted(f"{text}: {name}", counted, None)[:3] for name, counted in found[key].items()]
-    return Table(HIDDEN, ("", "right", "of"), tuple(rows))
+    return PageTable(HIDDEN, ("", "right", "of"), tuple(rows))
 
 
-def every_case(found: Mapping[str, Any]) -> Table:
+def every_case(found: Mapping[str, Any]) -> PageTable:
     """One row a case."""
     rows = []
     for case in found["results"]:
@@ -136,7 +136,7 @@ def every_case(found: Mapping[str, Any]) -> Table:
         concealed = ", ".join(case["concealed"]) or "nothing"
         more = ", ".join(filter(None, (case["joint"], case["cover"], "other form" if case["other_form"] else "")))
         rows.append((case["case"], concealed, more, case["verdict"], named, "right" if case["right"] else "wrong"))
-    return Table(CASES, ("case", "concealed", "axis", "verdict", "named", ""), tuple(rows))
+    return PageTable(CASES, ("case", "concealed", "axis", "verdict", "named", ""), tuple(rows))
 
 
 def markdown(found: Mapping[str, Any]) -> str:
@@ -152,7 +152,7 @@ def text(found: Mapping[str, Any]) -> str:
     return "\n\n".join([*sentences(found), *(_aligned(table) for table in (results(found), effects(found)))])
 
 
-def _aligned(table: Table) -> str:
+def _aligned(table: PageTable) -> str:
     lines: Sequence[Sequence[str]] = (table.header, *table.rows)
     widths = [max(len(line[i]) for line in lines) for i in range(len(table.header))]
     return "\n".join(

@@ -17,7 +17,7 @@ from plotly.colors import qualitative
 from servod.lab.report.figure import histogram, time_curves
 from servod.lab.report.page import Page
 from servod.lab.tracking.metrics import SETTLE_S
-from servod.qualify.demo.entries import Entry
+from servod.qualify.demo.entries import DemoRow
 from servod.qualify.demo.runs import Run
 
 Labels = Mapping[str, str]
@@ -42,7 +42,7 @@ class Story(NamedTuple):
     refused: Sequence[str] = ()
 
 
-def write_demo_page(rows: Sequence[Entry], runs: Sequence[Run], path: Path, story: Story) -> None:
+def write_demo_page(rows: Sequence[DemoRow], runs: Sequence[Run], path: Path, story: Story) -> None:
     """Write the demo's report to `path`, one run for each row; raises BadInput when that is not possible."""
     page = Page("servod demo: trajectory (19) under four controllers")
     labels = {row.name: row.label for row in rows}
@@ -82,7 +82,7 @@ def _say(page: Page, labels: Labels, runs: Sequence[Run], story: Story) -> None:
         page.sentence(f"The system refused the loop real-time rights: {', '.join(story.refused)}.")
 
 
-def _compare(page: Page, rows: Sequence[Entry], runs: Sequence[Run]) -> None:
+def _compare(page: Page, rows: Sequence[DemoRow], runs: Sequence[Run]) -> None:
     page.sentence(
         "The four controllers have the same PD feedback. What else each law had stands in the table; what a single "
         "option is worth shows when gain sets without it run beside them (servoctl demo --gains FILE)."
@@ -106,7 +106,7 @@ def _compare(page: Page, rows: Sequence[Entry], runs: Sequence[Run]) -> None:
     page.table(["controller", "options", "RMS error / mrad", "largest error / mrad", "cycles", "missed"], cells)
 
 
-def _show_errors(page: Page, rows: Sequence[Entry], runs: Sequence[Run]) -> None:
+def _show_errors(page: Page, rows: Sequence[DemoRow], runs: Sequence[Run]) -> None:
     """All errors on one scale, and then the small ones on theirs; a controller keeps its colour."""
     page.heading("Tracking errors")
     shown = list(zip(rows, runs, strict=True))
@@ -120,7 +120,7 @@ def _show_errors(page: Page, rows: Sequence[Entry], runs: Sequence[Run]) -> None
         page.figure(_errors(fine, f"The same without {left_out}", colours))
 
 
-def _errors(shown: Sequence[tuple[Entry, Run]], title: str, colours: Mapping[str, str]) -> go.Figure:
+def _errors(shown: Sequence[tuple[DemoRow, Run]], title: str, colours: Mapping[str, str]) -> go.Figure:
     figure = time_curves(shown[0][1].time_s, {}, title, "mrad")
     for row, run in shown:
         figure.add_traces(time_curves(run.time_s, {row.label: run.error_mrad}, "", "").data)

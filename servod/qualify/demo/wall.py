@@ -17,7 +17,7 @@ from servod.common.errors import AnswerIsNo
 from servod.common.faults import FaultCode
 from servod.formats.recording.mcap_reader import read_recording
 from servod.qualify.demo.axis import demo_config
-from servod.qualify.demo.entries import Entry
+from servod.qualify.demo.entries import DemoRow
 from servod.qualify.demo.runs import Run, cut_motion
 
 #: Told how far a run is: controller and share from 0 to 1.
@@ -34,7 +34,7 @@ class WallRuns(NamedTuple):
     refused: list[str]
 
 
-def run_wall(plant: Path, duration_s: float, rows: Sequence[Entry], recordings: Path, progress: Progress) -> WallRuns:
+def run_wall(plant: Path, duration_s: float, rows: Sequence[DemoRow], recordings: Path, progress: Progress) -> WallRuns:
     """Track trajectory (19) for `duration_s` under each entry; one recording each stays in `recordings`, which exists.
 
     Raises AnswerIsNo when the axis does not get through, Unreachable when a process does not start.
@@ -53,7 +53,7 @@ def run_wall(plant: Path, duration_s: float, rows: Sequence[Entry], recordings: 
     return WallRuns(runs, [f"{g['name']} ({g['reason']})" for g in status["grants"] if not g["granted"]])
 
 
-def _run(client: ControlClient, row: Entry, duration_s: float, recordings: Path, progress: Progress) -> Run:
+def _run(client: ControlClient, row: DemoRow, duration_s: float, recordings: Path, progress: Progress) -> Run:
     """One entry: activate it, record trajectory (19), and cut the motion from the recording."""
     activate(client, row.gains)
     (recordings / f"{row.name}.mcap").unlink(missing_ok=True)

@@ -18,7 +18,7 @@ from servod.common.errors import AnswerIsNo, BadInput
 from servod.drivers.virtual.drive_record import DriveSample
 from servod.formats.recording.mcap_reader import read_recording
 from servod.formats.recording.record import CycleRecord
-from servod.qualify.faults.scenario import Runs, Scenario, Start
+from servod.qualify.faults.scenario import Runs, Scenario, ScenarioStart
 from servod.qualify.faults.under_test import MOTION
 from servod.runtime.fieldbus.devices import DriveState
 
@@ -45,14 +45,14 @@ def check_strays(scenario: Scenario, where: str) -> None:
     """Raises BadInput for a bound that a joint which stops dead would keep: that one strays by its whole amplitude."""
     half_rad = MOTION[scenario.runs].amplitude_rad / 2
     expected = scenario.expect
-    if expected.stays_enabled and scenario.start is Start.MOVING and expected.strays_rad > half_rad:
+    if expected.stays_enabled and scenario.start is ScenarioStart.MOVING and expected.strays_rad > half_rad:
         allowed = f"at most {half_rad:g}, half the amplitude of its motion on {scenario.runs}"
         raise BadInput(f"{where}: expect.strays_rad", expected.strays_rad, allowed)
 
 
 def record_complaints(scenario: Scenario, samples: Sequence[DriveSample], watch: Watch) -> Iterator[str]:
     """What is missing in the record; a scenario that starts off has nothing to show before its bring-up."""
-    if scenario.start is Start.OFF:
+    if scenario.start is ScenarioStart.OFF:
         return
     before = [s for s in samples if s.time_ns < watch.injected_ns]
     if not before:
@@ -64,7 +64,7 @@ def record_complaints(scenario: Scenario, samples: Sequence[DriveSample], watch:
     settled = [s.state for s in before if s.time_ns < watch.injected_ns - _SAME_NS]
     if settled and scenario.start.powered and settled[-1] is not DriveState.OPERATION_ENABLED:
         yield f"the drive was in {settled[-1].name} at the injection, not in operation enabled"
-    if scenario.start in (Start.MOVING, Start.PROVING) and not _felt(before, watch):
+    if scenario.start in (ScenarioStart.MOVING, ScenarioStart.PROVING) and not _felt(before, watch):
         yield "the joint felt no torque before the injection: a time until it is gone tells nothing"
 
 
@@ -102,7 +102,7 @@ def _strays_rad(scenario: Scenario, samples: Sequence[DriveSample], injected_ns:
     if not held:
         return math.nan
     center_rad, omega, sine, cosine = held[-1][1], 0.0, 0.0, 0.0
-    if scenario.start is Start.MOVING:
+    if scenario.start is ScenarioStart.MOVING:
         center_rad, omega = held[0][1], 2.0 * math.pi * MOTION[scenario.runs].frequency_hz
         sine, cosine = _fitted(held, center_rad, omega)
     return max(

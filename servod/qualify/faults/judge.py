@@ -12,7 +12,7 @@ from servod.qualify.faults.scenario import FEEDBACK_LOSS_MS, MASTER_LOSS_MS, Exp
 from servod.qualify.faults.under_test import Observation
 from servod.runtime.fieldbus.devices import DriveState
 from servod.runtime.loop.axis import AxisState
-from servod.runtime.loop.wiring.findings import Finding
+from servod.runtime.loop.wiring.findings import WiringOutcome
 
 #: The drive counts its torque in per mille of the rated torque: less than one count is none.
 NO_TORQUE_NM = 1e-9
@@ -20,7 +20,7 @@ _NS_PER_MS = 1e6
 
 
 @dataclass(frozen=True)
-class Reaction:
+class ReactionTimes:
     """Times of the reaction after the first injection, in ms of bus time; None: it did not happen.
 
     `left_ms`: the drive left operation enabled, by command or by itself; `gone_ms`: the joint feels no torque any more,
@@ -31,18 +31,18 @@ class Reaction:
     gone_ms: float | None
 
 
-def reaction(samples: list[DriveSample], injected_ns: int) -> Reaction:
+def reaction(samples: list[DriveSample], injected_ns: int) -> ReactionTimes:
     """What the drive did after `injected_ns`."""
     after = [s for s in samples if s.time_ns >= injected_ns]
     if not after:
-        return Reaction(None, None)
+        return ReactionTimes(None, None)
     left = next((s.time_ns for s in after if s.state is not DriveState.OPERATION_ENABLED), None)
     last = max((number for number, s in enumerate(after) if not abs(s.torque_nm) <= NO_TORQUE_NM), default=-1)
     gone = after[last + 1].time_ns if last + 1 < len(after) else None
-    return Reaction(_ms(left, injected_ns), _ms(gone, injected_ns))
+    return ReactionTimes(_ms(left, injected_ns), _ms(gone, injected_ns))
 
 
-def complaints(scenario: Scenario, seen: Observation, times: Reaction, watch: Watch) -> list[str]:
+def complaints(scenario: Scenario, seen: Observation, times: ReactionTimes, watch: Watch) -> list[str]:
     """Everything in which the outcome differs from what was expected, or cannot be told; empty when it passed."""
     after = [sample for sample in seen.samples if sample.time_ns > watch.injected_ns]
     states = {sample.state.name for sample in after}
@@ -56,7 +56,7 @@ def complaints(scenario: Scenario, seen: Observation, times: Reaction, watch: Wa
     return [text for text in found if text]
 
 
-def _complaints(expected: Expectation, seen: Observation, times: Reaction) -> list[str]:
+def _complaints(expected: Expectation, seen: Observation, times: ReactionTimes) -> list[str]:
     names = {code.name for code in seen.latched}
     return [
         "" if seen.axis in expected.axis else f"the axis ended {seen.axis}, expected {' or '.join(expected.axis)}",
@@ -106,7 +106,7 @@ def _refused(words: str | None, refusal: str) -> str:
     return "" if words in refusal else f"the refusal says {refusal or 'nothing'!r}, expected {words!r}"
 
 
-def _says(name: str | None, told: Finding | None) -> str:
+def _says(name: str | None, told: WiringOutcome | None) -> str:
     """The proof of the wiring names what is wrong: each finding has a remedy of its own."""
     if name is None or (told is not None and told.name == name):
         return ""

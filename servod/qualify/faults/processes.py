@@ -36,7 +36,7 @@ from servod.qualify.faults.scenario import (
     Nested,
     Recovery,
     Scenario,
-    Start,
+    ScenarioStart,
     config_of,
     merged,
     plant_of,
@@ -87,17 +87,17 @@ class ProcessAxis:
         """The clock of the drive's record."""
         return time.monotonic_ns()
 
-    def start(self, start: Start) -> None:
+    def start(self, start: ScenarioStart) -> None:
         """Start the processes, enable and move, as far as `start` says."""
         self.machine.start_virtual_axis()
-        self._off = start is Start.OFF
+        self._off = start is ScenarioStart.OFF
         if self._off:
             return
         self.machine.start_daemon()
         self._up = True
-        if start in (Start.ENABLED, Start.MOVING):
+        if start in (ScenarioStart.ENABLED, ScenarioStart.MOVING):
             self.axis.enable()
-        if start is Start.MOVING:
+        if start is ScenarioStart.MOVING:
             self.axis.begin(self._motion.reference)
             self._wait_until(self._moves, "the axis does not move")
             time.sleep(_SHOWN_PERIODS / self._motion.frequency_hz)

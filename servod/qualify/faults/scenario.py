@@ -21,7 +21,7 @@ from servod.formats.config import AxisConfig, load_config
 from servod.formats.model.axis_model import AxisModel, load_axis_model
 from servod.runtime.fieldbus.devices import DriveState
 from servod.runtime.loop.axis import AxisState
-from servod.runtime.loop.wiring.findings import Finding
+from servod.runtime.loop.wiring.findings import WiringOutcome
 
 #: After a loss of the master the torque must be gone within this time [ms].
 MASTER_LOSS_MS = 300.0
@@ -31,7 +31,7 @@ FEEDBACK_LOSS_MS = 50.0
 AXIS_STATES = {state.name for state in AxisState}
 FAULT_NAMES = {code.name for code in FaultCode}
 DRIVE_STATES = {state.name for state in DriveState}
-FINDINGS = {finding.name for finding in Finding}
+FINDINGS = {finding.name for finding in WiringOutcome}
 
 
 class Runs(StrEnum):
@@ -42,7 +42,7 @@ class Runs(StrEnum):
     GUEST = "guest"  # systemd and a real vcan in the guest machine
 
 
-class Start(StrEnum):
+class ScenarioStart(StrEnum):
     """What the axis is doing when the first injection comes."""
 
     OFF = "off"  # before the bring-up, which is then tried
@@ -54,7 +54,7 @@ class Start(StrEnum):
     @property
     def powered(self) -> bool:
         """The drive has power, so that there is something to lose."""
-        return self in (Start.ENABLED, Start.MOVING, Start.PROVING)
+        return self in (ScenarioStart.ENABLED, ScenarioStart.MOVING, ScenarioStart.PROVING)
 
 
 class Loss(StrEnum):
@@ -164,7 +164,7 @@ class Scenario(Strict):
     why: str = Field(min_length=1, description="when this happens to a machine, in a sentence")
     group: str = Field(min_length=1, description="heading in the table: bus, drive, encoder, process, ...")
     runs: Runs = Runs.STEPPED
-    start: Start = Start.MOVING
+    start: ScenarioStart = ScenarioStart.MOVING
     settings: dict[str, Any] = Field({}, description="of the virtual axis, over its defaults")
     config: dict[str, Any] = Field(
         {},
@@ -180,13 +180,15 @@ class Scenario(Strict):
 
     @model_validator(mode="after")
     def _torque_has_a_bound(self) -> Scenario:
-        if self.start is not Start.OFF and not self.expect.stays_enabled and self.expect.torque_gone_ms is None:
+        if self.start is not ScenarioStart.OFF and not self.expect.stays_enabled and self.expect.torque_gone_ms is None:
             raise ValueError("expect.torque_gone_ms: an axis that does not stay enabled has a time for it")
         return self
 
     @model_validator(mode="after")
     def _runs_can_show_it(self) -> Scenario:
-        if self.runs is not Runs.STEPPED and (self.start is Start.PROVING or self.expect.drive_error is not None):
+        if self.runs is not Runs.STEPPED and (
+            self.start is ScenarioStart.PROVING or self.expect.drive_error is not None
+        ):
             raise ValueError("start: proving and expect.drive_error are for runs: stepped")
         return self
 

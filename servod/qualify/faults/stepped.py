@@ -22,7 +22,7 @@ from servod.qualify.faults.scenario import (
     Recovery,
     Runs,
     Scenario,
-    Start,
+    ScenarioStart,
     config_of,
     merged,
     plant_of,
@@ -32,7 +32,7 @@ from servod.qualify.faults.under_test import MOTION, Observation
 from servod.runtime.fieldbus.cia import NMT_ID
 from servod.runtime.loop.axis import AxisState
 from servod.runtime.loop.commands import REFUSAL_TEXT, Op, Refusal
-from servod.runtime.loop.wiring.findings import Finding
+from servod.runtime.loop.wiring.findings import WiringOutcome
 
 #: Samples of the drive's record for each millisecond: its commands, its own watch, its events.
 _SAMPLES_PER_MS = 2.5
@@ -81,19 +81,19 @@ class SteppedUnderTest:
         """Virtual time."""
         return self.world.clock.now_ns()
 
-    def start(self, start: Start) -> None:
+    def start(self, start: ScenarioStart) -> None:
         """Bring up, enable and move, as far as `start` says."""
-        if start is Start.OFF:
+        if start is ScenarioStart.OFF:
             return
         self._bring_up()
-        if start is Start.PROVING:
+        if start is ScenarioStart.PROVING:
             self._begin_proof()
             return
-        if start in (Start.ENABLED, Start.MOVING):
+        if start in (ScenarioStart.ENABLED, ScenarioStart.MOVING):
             self.axis.enable()
-        if start is Start.MOVING:
+        if start is ScenarioStart.MOVING:
             self.axis.begin(MOTION[Runs.STEPPED].reference)
-        self.session.run(_TO_THE_FASTEST_S if start is Start.MOVING else 0.1)
+        self.session.run(_TO_THE_FASTEST_S if start is ScenarioStart.MOVING else 0.1)
 
     def run(self, duration_s: float) -> None:
         """Advance; an axis that is off is brought up first, and a refusal is kept."""
@@ -150,7 +150,7 @@ class SteppedUnderTest:
         axis, records = self.session.cycle.axis, self.session.records
         latched = frozenset(fault.code for fault in faults_in(axis.latched))
         proof = self.session.proof
-        says = None if proof is None else Finding(int(proof.finding))
+        says = None if proof is None else WiringOutcome(int(proof.finding))
         errors = frozenset(record.drive_error for record in records) - {0}
         return Observation(samples, axis.state.name, latched, self._refusal, says=says, drive_errors=errors)
 

@@ -11,8 +11,8 @@ from servod.client.axis import AxisClient, ReferenceMotion
 from servod.common.faults import FaultCode
 from servod.drivers.virtual.bus_faults import BusFault
 from servod.drivers.virtual.drive_record import DriveSample
-from servod.qualify.faults.scenario import Recovery, Runs, Start
-from servod.runtime.loop.wiring.findings import Finding
+from servod.qualify.faults.scenario import Recovery, Runs, ScenarioStart
+from servod.runtime.loop.wiring.findings import WiringOutcome
 
 AMPLIFIER, ENCODER = 1, 2
 
@@ -53,7 +53,7 @@ class Observation:
     latched: frozenset[FaultCode]
     refusal: str
     lost_records: int | None = None
-    says: Finding | None = None
+    says: WiringOutcome | None = None
     drive_errors: frozenset[int] = frozenset()
 
 
@@ -73,7 +73,7 @@ class AxisUnderTest(Protocol):
     def now_ns(self) -> int:
         """Present time."""
 
-    def start(self, start: Start) -> None:
+    def start(self, start: ScenarioStart) -> None:
         """Bring the axis to where the scenario begins. Raises ServodError when it does not get there."""
 
     def run(self, duration_s: float) -> None:

@@ -16,7 +16,7 @@ from servod.common.errors import BadInput
 from servod.drivers.virtual.amplifier import AMPLIFIER_EDS
 from servod.drivers.virtual.bus_faults import FRAME_KINDS, MYSELF, BusFault, FaultKind
 from servod.drivers.virtual.client import VirtualBus
-from servod.drivers.virtual.dictionary import Dictionary
+from servod.drivers.virtual.dictionary import DeviceDictionary
 from servod.drivers.virtual.encoder import ENCODER_EDS
 from servod.formats.config import BusConfig
 from servod.qualify.faults.under_test import AMPLIFIER
@@ -109,7 +109,7 @@ def send_heard(wire: Wire, can_id: int, data: bytes) -> int:
 
 def download(wire: Wire, node_id: int, index: int, subindex: int, value: int) -> bool:
     """One expedited SDO download; True when the node confirms it. Raises Unreachable."""
-    entry = Dictionary(AMPLIFIER_EDS if node_id == AMPLIFIER else ENCODER_EDS).entry(index, subindex)
+    entry = DeviceDictionary(AMPLIFIER_EDS if node_id == AMPLIFIER else ENCODER_EDS).entry(index, subindex)
     entry.value = value
     data = entry.encode()
     head = 0x23 | (4 - len(data)) << 2  # expedited, with its length (CiA 301, 7.2.4.3.3)

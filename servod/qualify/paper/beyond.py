@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from servod.lab.report.figure import COLOURS, Axis, Colour, Figure, Panel, Scale, Style, curve
+from servod.lab.report.figure import COLOURS, Colour, Figure, PlotAxis, PlotPanel, ScaleKind, Style, curve
 from servod.lab.report.figures.motion import errors
 from servod.lab.tune.plan import Feedback
 from servod.qualify.paper.claims import Claim, Shown, least
 from servod.qualify.paper.equations import TwoForms
 from servod.qualify.paper.experiments import LABELS
-from servod.qualify.paper.joints import Joint
+from servod.qualify.paper.joints import PaperJoint
 from servod.qualify.paper.programme import ProgrammeAnswer
 from servod.qualify.paper.results import Results, Row
 from servod.qualify.paper.sweeps import NOISE_SHARES, SweepOfL
@@ -42,7 +42,7 @@ def statements(results: Results) -> Iterator[tuple[str, Claim]]:
     yield from (("rivals", claim) for joint in results.tuned for claim in _rivals(results, joint))
 
 
-def _rivals(results: Results, joint: Joint) -> Iterator[Claim]:
+def _rivals(results: Results, joint: PaperJoint) -> Iterator[Claim]:
     """The paper's order once every law is tuned by the same rules, in both classes."""
     for feedback in Feedback:
         found = {
@@ -107,8 +107,8 @@ def _sweep_figure(results: Results) -> Figure:
         ]
         ends = [sweep.factors[0], sweep.factors[-1]]
         curves.append(curve("l = 0", ends, [sweep.without] * 2, Colour.BLACK, width=1.0))
-        x = Axis("l_i as a multiple of the printed K_i", Scale.LOG)
-        panels.append(Panel(x, Axis("RMS error on (19) in mrad", Scale.LOG), tuple(curves), name))
+        x = PlotAxis("l_i as a multiple of the printed K_i", ScaleKind.LOG)
+        panels.append(PlotPanel(x, PlotAxis("RMS error on (19) in mrad", ScaleKind.LOG), tuple(curves), name))
     return Figure("table1_sweep_of_l", "Sign and size of l", tuple(panels), len(panels), row_height=1.4)
 
 
@@ -129,7 +129,7 @@ def _best(sweep: SweepOfL) -> tuple[str, float, float]:
     return min(rows, key=lambda row: row[2])
 
 
-def _readings(results: Results, joint: Joint) -> Iterator[Claim]:
+def _readings(results: Results, joint: PaperJoint) -> Iterator[Claim]:
     for row, reading in ((Row.TABLE1, "(K_z, K_v, K_x)"), (Row.TABLE1_OTHER, "(K_x, K_v, K_z)")):
         rms = results.rms(joint, row)
         paper = f"{row.paper_mrad} mrad RMS with the gains of Table I, read as {reading}"
@@ -152,7 +152,9 @@ def _noise_figure(results: Results) -> Figure:
         for i, (label, rms) in enumerate(results.noise.items())
         for colour, style in ((COLOURS[i % len(COLOURS)], Style.LINE if i % 2 == 0 else Style.DASHED),)
     ]
-    panel = Panel(
-        Axis("RMS of the noise on friction in % of F_C"), Axis("RMS error on (19) in mrad", Scale.LOG), tuple(curves)
+    panel = PlotPanel(
+        PlotAxis("RMS of the noise on friction in % of F_C"),
+        PlotAxis("RMS error on (19) in mrad", ScaleKind.LOG),
+        tuple(curves),
     )
     return Figure("figure_11_errors_over_noise", "Errors over the noise on friction", (panel,), row_height=1.4)

@@ -15,12 +15,12 @@ from typing import Any
 from servod import __version__
 from servod.common.files import write_bytes
 from servod.formats.gains.parameters import LocalParameters
-from servod.lab.report.figure import Table
+from servod.lab.report.figure import PageTable
 from servod.lab.report.page import Page
 from servod.qualify.paper import beyond, friction, loops, motions, table
 from servod.qualify.paper.claims import Claim, Shown
 from servod.qualify.paper.experiments import Found, Measured
-from servod.qualify.paper.joints import Joint
+from servod.qualify.paper.joints import PaperJoint
 from servod.qualify.paper.results import Results, Row
 
 #: Folder of the pictures below the run's.
@@ -55,7 +55,7 @@ def document(results: Results, figures: Sequence[Shown], elapsed_s: float) -> di
     }
 
 
-def _joint(results: Results, joint: Joint) -> dict[str, Any]:
+def _joint(results: Results, joint: PaperJoint) -> dict[str, Any]:
     found = results.found[joint]
     identified = found.model.identified
     return {
@@ -91,9 +91,9 @@ def tracking_of(measured: Measured) -> dict[str, Any]:
     return {**whole, "steps": steps, "stops": measured.stops}
 
 
-def tables(found: dict[str, Any]) -> list[Table]:
+def tables(found: dict[str, Any]) -> list[PageTable]:
     """All tables of a document, the paper's numbers first."""
-    joints = [Joint(name) for name in found["joints"]]
+    joints = [PaperJoint(name) for name in found["joints"]]
     tuned = [table.tuned(found, joint) for joint in joints if found["joints"][joint.value]["tuned"]]
     return [table.numbers(found), *tuned, *(table.steps(found, joint) for joint in joints)]
 

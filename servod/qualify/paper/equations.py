@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 
 from servod.formats.gains.gain_set import GainSet
 from servod.lab.synthesize.local_sets import STIFFNESS_SHARE, Compensator, force_after
-from servod.qualify.paper.joints import Joint, at_paper_feedback, consistent_g, printed_g, shipped_set, with_decays
+from servod.qualify.paper.joints import PaperJoint, at_paper_feedback, consistent_g, printed_g, shipped_set, with_decays
 from servod.qualify.paper.printed import FRICTION
 from servod.qualify.paper.sweeps import rms_mrad
 
@@ -42,7 +42,7 @@ def compensator() -> Compensator:
 
 def exponent_of_18(seconds: float) -> TwoForms:
     """The local law at the paper's PD gains, its sets made from g(v) as printed and with the exponent's sign mended."""
-    c, plant = compensator(), Joint.TABLE1.model()
+    c, plant = compensator(), PaperJoint.TABLE1.model()
     nodes, base = _both_directions(FINE_SPEEDS), _plain()
 
     def tracked(name: str, g_of_speed: Callable[[float], float]) -> float:
@@ -63,7 +63,7 @@ def literal_8(seconds: float) -> TwoForms:
 
     On sets dense enough that what the nine of Table I leave between them does not count.
     """
-    c, plant, base = compensator(), Joint.TABLE1.model(), _plain()
+    c, plant, base = compensator(), PaperJoint.TABLE1.model(), _plain()
     nodes = _both_directions(FINE_SPEEDS)
     force = consistent_g(FINE_SPEEDS[0]) + FRICTION.viscous * FINE_SPEEDS[0]
     literal = {v: equal_force_decay(c, force, abs(v)) for v in (*nodes, *SPEEDS_TOLD) if v}

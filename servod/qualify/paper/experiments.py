@@ -21,16 +21,16 @@ from servod.formats.model.axis_model import AxisModel
 from servod.lab.identify.fits.presliding import PreslidingFit
 from servod.lab.identify.result import model_of
 from servod.lab.identify.walk import identify
-from servod.lab.report.figures.motion import Motion
+from servod.lab.report.figures.motion import PlottedMotion
 from servod.lab.synthesize.deployed import Wishes
-from servod.lab.synthesize.gain_set import Options, synthesize
+from servod.lab.synthesize.gain_set import DesignOptions, synthesize
 from servod.lab.synthesize.infeasible import Infeasible
 from servod.lab.synthesize.regions import uncertainty_of
 from servod.lab.tracking.metrics import Curves, StepResponse, Tracking, roughness, score, step_response
 from servod.lab.tracking.stepped import activate, run_motion
-from servod.lab.tune.plan import Feedback, TunePlan
+from servod.lab.tune.plan import Feedback, TuningSettings
 from servod.lab.tune.rivals import tuned_in_turn
-from servod.qualify.paper.joints import CUTOFF_HZ, ENCODER_COUNTS, Joint, open_axis, open_for_tracking
+from servod.qualify.paper.joints import CUTOFF_HZ, ENCODER_COUNTS, PaperJoint, open_axis, open_for_tracking
 from servod.qualify.paper.printed import STEPS_MRAD
 
 COUNT_RAD = 2.0 * np.pi / ENCODER_COUNTS
@@ -50,8 +50,8 @@ class Measured:
     """Motions of one gain set on one joint. What the axis stopped is missing; `stops` says why, by motion."""
 
     label: str
-    followed: Motion | None
-    steps: dict[float, Motion]
+    followed: PlottedMotion | None
+    steps: dict[float, PlottedMotion]
     responses: dict[float, StepResponse]
     stops: dict[str, str]
 
@@ -64,7 +64,7 @@ class Measured:
         return Tracking(error.rms_error_mrad, error.max_error_mrad, rough, self.responses)
 
 
-def identify_and_design(joint: Joint, seed: int) -> Found:
+def identify_and_design(joint: PaperJoint, seed: int) -> Found:
     """Walk through the identification of `joint`, then synthesize for what was found. Raises AnswerIsNo."""
     with tempfile.TemporaryDirectory(prefix="servod-paper-") as folder:
         axis = open_axis(joint, Path(folder), seed)
@@ -73,7 +73,7 @@ def identify_and_design(joint: Joint, seed: int) -> Found:
     return Found(model, design(model), analysis.presliding)
 
 
-def design_as_told(joint: Joint) -> Found:
+def design_as_told(joint: PaperJoint) -> Found:
     """`joint` designed for by its own model, without an identification: what a quick look takes. Raises AnswerIsNo."""
     model = joint.model()
     return Found(model, design(model), None)
@@ -85,7 +85,7 @@ def design(model: AxisModel) -> GainSet:
     Raises AnswerIsNo when there is none.
     """
     wishes = Wishes(uncertainty=uncertainty_of(model), counts_per_turn=ENCODER_COUNTS)
-    gains = synthesize(model, wishes, Options("deployed"))
+    gains = synthesize(model, wishes, DesignOptions("deployed"))
     if isinstance(gains, Infeasible):
         raise AnswerIsNo("no design for the identified joint: " + "; ".join(gains.clashes or gains.regions))
     return gains
@@ -97,7 +97,7 @@ def cutoff_of(gains: GainSet) -> float:
 
 
 def measure(
-    joint: Joint, label: str, gains: GainSet, cutoff_hz: float, seed: int, seconds: float, hold_s: float
+    joint: PaperJoint, label: str, gains: GainSet, cutoff_hz: float, seed: int, seconds: float, hold_s: float
 ) -> Measured:
     """Trajectory (19) for `seconds`, then each step on an axis of its own, held for `hold_s` (0: no steps)."""
     stops: dict[str, str] = {}
@@ -114,7 +114,7 @@ def measure(
 
 
 def _motion(
-    joint: Joint,
+    joint: PaperJoint,
     label: str,
     gains: GainSet,
     cutoff_hz: float,
@@ -122,7 +122,7 @@ def _motion(
     motion: ReferenceMotion,
     name: str,
     stops: dict[str, str],
-) -> Motion | None:
+) -> PlottedMotion | None:
     """One motion on a fresh axis; None, and the reason in `stops`, when the axis did not stand it."""
     with tempfile.TemporaryDirectory(prefix="servod-paper-") as folder:
         axis = open_for_tracking(joint, Path(folder), seed, cutoff_hz)
@@ -140,9 +140,9 @@ def _why(axis: SteppedAxis) -> str:
     return ", ".join(fault.code.name for fault in found if fault.reaction > Reaction.CLIP)
 
 
-def motion_of_curves(label: str, c: Curves) -> Motion:
+def motion_of_curves(label: str, c: Curves) -> PlottedMotion:
     """A measured motion as the figures take it."""
-    return Motion(label, c.time_s, c.reference_rad, c.position_rad, c.torque_nm, c.friction_nm)
+    return PlottedMotion(label, c.time_s, c.reference_rad, c.position_rad, c.torque_nm, c.friction_nm)
 
 
 # Every law tuned by the same rules on the identified joint, then measured on the joint itself: the fair comparison.
@@ -179,12 +179,12 @@ def tuned_sets(
     model: AxisModel, names: tuple[str, ...], cutoff_hz: float, seed: int
 ) -> dict[tuple[Feedback, str], GainSet]:
     """The rivals `names`, which share one law and its budget, in both classes, tuned for `model` in its intervals."""
-    plan = TunePlan(seed=seed, counts_per_turn=float(ENCODER_COUNTS), cutoff_hz=cutoff_hz)
+    plan = TuningSettings(seed=seed, counts_per_turn=float(ENCODER_COUNTS), cutoff_hz=cutoff_hz)
     return {key: found.gains for key, found in tuned_in_turn(model, names, plan).items()}
 
 
 def score_rival(
-    joint: Joint, name: str, feedback: Feedback, gains: GainSet, cutoff_hz: float, seed: int, seconds: float
+    joint: PaperJoint, name: str, feedback: Feedback, gains: GainSet, cutoff_hz: float, seed: int, seconds: float
 ) -> Contender:
     """Track (19) with one tuned set over the whole CAN loop."""
     label = f"{LABELS[name]}, {feedback.value} feedback"

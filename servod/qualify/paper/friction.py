@@ -22,7 +22,7 @@ from servod.lab.report.figures.sets import (
 from servod.lab.verify.steady_friction import steady_friction
 from servod.qualify.paper.claims import Claim, Shown
 from servod.qualify.paper.experiments import Found
-from servod.qualify.paper.joints import Joint, shipped_set
+from servod.qualify.paper.joints import PaperJoint, shipped_set
 from servod.qualify.paper.printed import FRICTION, NODES_RAD_S
 from servod.qualify.paper.results import Results
 
@@ -35,9 +35,9 @@ _SPEEDS = np.geomspace(SLOWEST, 0.5, 60)
 
 def figures(results: Results) -> Iterator[Shown]:
     """Weights first, as in the paper; Dahl curve and map only of joints that were identified."""
-    table1, deployed = shipped_set("table1_kz_kv_kx"), results.found[Joint.TABLE1].gains
+    table1, deployed = shipped_set("table1_kz_kv_kx"), results.found[PaperJoint.TABLE1].gains
     yield Shown("2", weighting_functions(table1, "figure_02_weighting_functions"), (_unity(table1), _density(deployed)))
-    friction = local_friction(table1, Joint.TABLE1.model(), "figure_02_friction_of_nine_sets")
+    friction = local_friction(table1, PaperJoint.TABLE1.model(), "figure_02_friction_of_nine_sets")
     yield Shown("2", friction, (_nine_sets(table1),))
     placed = local_friction(deployed, name="figure_02_friction_of_placed_sets")
     yield Shown("2", placed, (_placed_sets(deployed),))
@@ -70,7 +70,7 @@ def _density(gains: GainSet) -> Claim:
 
 def _worst_share(gains: GainSet) -> tuple[float, float]:
     """(largest relative error of the sets' steady friction against Table I's joint, velocity of it)."""
-    friction = steady_friction(Joint.TABLE1.model())
+    friction = steady_friction(PaperJoint.TABLE1.model())
     velocity = np.concatenate([-_SPEEDS[::-1], _SPEEDS])
     truth = array([friction.torque(float(v)) for v in velocity])
     share = np.abs(steady_compensation(local_law(gains), velocity) / truth - 1.0)
@@ -90,7 +90,7 @@ def _placed_sets(gains: GainSet) -> Claim:
     return Claim("local sets can describe the friction of the whole range", here, worst <= MAP_SHARE)
 
 
-def _stiffness(found: Found, joint: Joint) -> Claim:
+def _stiffness(found: Found, joint: PaperJoint) -> Claim:
     assert found.presliding is not None
     c0 = found.presliding.stiffness
     here = f"{joint.label} gives {c0.value:.0f} N·m/rad (95 %: {c0.low:.0f} to {c0.high:.0f})"
@@ -98,7 +98,7 @@ def _stiffness(found: Found, joint: Joint) -> Claim:
     return Claim(paper, here, c0.holds(FRICTION.sigma0))
 
 
-def _map_error(found: Found, joint: Joint) -> Claim:
+def _map_error(found: Found, joint: PaperJoint) -> Claim:
     assert found.model.identified is not None
     nodes = found.model.identified.friction_map
     truth = steady_friction(joint.model())
@@ -110,7 +110,7 @@ def _map_error(found: Found, joint: Joint) -> Claim:
     return Claim("slow sines under PD give the friction-velocity map", here, abs(worst) <= MAP_SHARE)
 
 
-def _asymmetry(found: Found, joint: Joint) -> Claim:
+def _asymmetry(found: Found, joint: PaperJoint) -> Claim:
     """Judged at the speed where both directions differ most against their intervals."""
     assert found.model.identified is not None
     nodes = found.model.identified.friction_map

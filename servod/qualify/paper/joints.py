@@ -29,7 +29,7 @@ CUTOFF_HZ = 120.0
 STEP_SPEED_RAD_S = 10.0
 
 
-class Joint(Enum):
+class PaperJoint(Enum):
     """A virtual joint by the file of its model."""
 
     TABLE1 = "table1_joint"
@@ -45,12 +45,12 @@ class Joint(Enum):
         return load_axis_model(shipped(f"gains/axes/{self.value}.yaml"))
 
 
-def open_axis(joint: Joint, folder: Path, seed: int) -> SteppedAxis:
+def open_axis(joint: PaperJoint, folder: Path, seed: int) -> SteppedAxis:
     """The virtual axis for its identification, SYNC-stepped and disabled."""
     return SteppedAxis(virtual_session(joint.model(), folder, ENCODER_COUNTS, seed), folder)
 
 
-def open_for_tracking(joint: Joint, folder: Path, seed: int, cutoff_hz: float) -> SteppedAxis:
+def open_for_tracking(joint: PaperJoint, folder: Path, seed: int, cutoff_hz: float) -> SteppedAxis:
     """The same axis with the velocity filter of the gain set that is to run, and room for the steps of section V."""
     plant = joint.model()
     found = virtual_config(folder, rated_torque_mnm(plant), ENCODER_COUNTS)

@@ -13,10 +13,10 @@ from servod.formats.gains.design import Design, RegionProof
 from servod.formats.gains.gain_set import GainSet
 from servod.lab.report.figures.loop import HIGH_VELOCITIES, LOW_VELOCITIES, bode, design_of, impulse_responses
 from servod.lab.report.figures.sets import local_law
-from servod.lab.report.responses import Loop, after, before, frequency_response, rigid, vertex_impulse
+from servod.lab.report.responses import Loop, before, closed_loop_response, frequency_response, rigid, vertex_impulse
 from servod.lab.verify.closed_loop import spectral_radius
 from servod.qualify.paper.claims import Claim, Shown
-from servod.qualify.paper.joints import Joint
+from servod.qualify.paper.joints import PaperJoint
 from servod.qualify.paper.results import Results
 
 #: Where the axis is compared with a rigid joint [Hz]: what a position loop uses.
@@ -28,7 +28,7 @@ _SAMPLES = 2000
 
 def figures(results: Results) -> Iterator[Shown]:
     """Both figures of Table I's joint, as it was identified."""
-    gains = results.found[Joint.TABLE1].gains
+    gains = results.found[PaperJoint.TABLE1].gains
     design = design_of(gains)
     claims = (_nearer(gains, LOW_VELOCITIES, "very low"), _nearer(gains, HIGH_VELOCITIES, "higher"), _flat(gains))
     yield Shown("4", bode(gains, name="figure_04_bode"), claims)
@@ -43,7 +43,7 @@ def _nearer(gains: GainSet, velocities: Sequence[float], what: str) -> Claim:
     told, better = [], []
     for v in velocities:
         alone = _distance_db(design, before(design, v))
-        plain, whole = after(design, law, v, False), after(design, law, v, with_observer)
+        plain, whole = closed_loop_response(design, law, v, False), closed_loop_response(design, law, v, with_observer)
         text = f"at {v:g} rad/s {alone:.1f} dB before, {_distance_db(design, plain):.1f} after (9)"
         if with_observer:
             text += f", {_distance_db(design, whole):.1f} with the output observer"
@@ -66,7 +66,7 @@ def _distance_db(design: Design, loop: Loop) -> float:
 def _flat(gains: GainSet) -> Claim:
     """At rest the axis is a spring before and after: its response over the low frequencies."""
     design, law = design_of(gains), local_law(gains)
-    loop = after(design, law, 0.0, False)
+    loop = closed_loop_response(design, law, 0.0, False)
     seen = 20.0 * np.log10(np.abs(frequency_response(*loop, design.period_s, FLAT_HZ)))
     spread = float(np.ptp(seen))
     here = (

@@ -13,7 +13,7 @@ import numpy as np
 from servod.lab.report.figure import Array
 from servod.lab.report.figures.motion import (
     SETTLE_S,
-    Motion,
+    PlottedMotion,
     disturbed_friction,
     errors,
     position_and_friction,
@@ -23,7 +23,7 @@ from servod.lab.report.figures.motion import (
 )
 from servod.lab.tracking.metrics import StepResponse
 from servod.qualify.paper.claims import Claim, Shown, ordered
-from servod.qualify.paper.joints import Joint
+from servod.qualify.paper.joints import PaperJoint
 from servod.qualify.paper.printed import FRICTION, STEPS_MRAD
 from servod.qualify.paper.results import Results, Row
 from servod.qualify.paper.sweeps import NOISE_SHARES
@@ -66,7 +66,7 @@ def _simulated(results: Results) -> Iterator[Shown]:
     yield Shown("11, 12", disturbed_friction(proposed, disturbed, "figure_11_12_disturbed"), (_robust(results),))
 
 
-def _standing(motion: Motion) -> float:
+def _standing(motion: PlottedMotion) -> float:
     """Share of the cycles in which the joint moves slower than a twentieth of its mean speed."""
     speed = np.abs(np.diff(motion.position_rad))
     return float(np.mean(speed < 0.05 * np.mean(speed)))
@@ -81,7 +81,7 @@ def _robust(results: Results) -> Claim:
     return Claim("the proposed law stands friction that leaves its nominal level", here, own[-1] < NET * own[0])
 
 
-def _measured(results: Results, joint: Joint) -> Iterator[Shown]:
+def _measured(results: Results, joint: PaperJoint) -> Iterator[Shown]:
     by_row = {row: results.measured[joint, row] for row in Row}
     tail, where = joint.value, f" ({joint.label})"
     pd = by_row[Row.PD].followed
@@ -106,7 +106,7 @@ def _measured(results: Results, joint: Joint) -> Iterator[Shown]:
     yield Shown("18", drawn, (around_zero(columns[Row.DOB]),) if Row.DOB in columns else (), joint.label)
 
 
-def around_zero(motion: Motion) -> Claim:
+def around_zero(motion: PlottedMotion) -> Claim:
     """The observer's error where the reference is slow, against the rest; without the first second."""
     period_s = float(motion.time_s[1] - motion.time_s[0])
     speed = np.abs(np.gradient(motion.reference_rad, period_s))
@@ -120,7 +120,7 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0
 
 
-def _large_error(results: Results, joint: Joint) -> Claim:
+def _large_error(results: Results, joint: PaperJoint) -> Claim:
     pd, proposed = results.rms(joint, Row.PD), results.rms(joint, Row.TABLE1)
     if pd is None or proposed is None:
         return Claim("PD alone has large tracking errors", "an axis stopped", False)
@@ -131,11 +131,11 @@ def _large_error(results: Results, joint: Joint) -> Claim:
     )
 
 
-def _response(results: Results, joint: Joint, row: Row, size: float) -> StepResponse | None:
+def _response(results: Results, joint: PaperJoint, row: Row, size: float) -> StepResponse | None:
     return results.measured[joint, row].responses.get(size)
 
 
-def _told(results: Results, joint: Joint, row: Row, size: float) -> str:
+def _told(results: Results, joint: PaperJoint, row: Row, size: float) -> str:
     """One step in words."""
     found = _response(results, joint, row, size)
     if found is None:
@@ -147,7 +147,7 @@ def _told(results: Results, joint: Joint, row: Row, size: float) -> str:
     return f"{row.label} {settled}, overshoot {found.overshoot:.1%}, {steady}, torque swinging by {swing_mnm:.2g} mN·m"
 
 
-def _torque_swing(motion: Motion) -> float:
+def _torque_swing(motion: PlottedMotion) -> float:
     """Peak to peak of the torque within SWING_S, its slow course taken off [N*m]."""
     from_s, to_s = SWING_S
     part = motion.part(from_s, to_s)
@@ -155,7 +155,7 @@ def _torque_swing(motion: Motion) -> float:
     return float(np.ptp(part.torque_nm - trend))
 
 
-def _faster(results: Results, joint: Joint, size: float, better: Row, worse: Row, paper: str) -> Claim:
+def _faster(results: Results, joint: PaperJoint, size: float, better: Row, worse: Row, paper: str) -> Claim:
     """Whether `better` settles sooner than `worse`, and settles at all."""
     one, other = (_response(results, joint, row, size) for row in (better, worse))
     here = "; ".join(_told(results, joint, row, size) for row in (better, worse))
@@ -164,7 +164,7 @@ def _faster(results: Results, joint: Joint, size: float, better: Row, worse: Row
     return Claim(paper, here, other is None or other.settling_s is None or one.settling_s < other.settling_s)
 
 
-def _step_claims(results: Results, joint: Joint, size: float) -> tuple[Claim, ...]:
+def _step_claims(results: Results, joint: PaperJoint, size: float) -> tuple[Claim, ...]:
     ours = "the local law, synthesized here, is faster than PD + LuGre"
     mine = _faster(results, joint, size, Row.DEPLOYED, Row.LUGRE_BETTER, ours)
     if size == STEPS_MRAD[0]:
@@ -177,7 +177,7 @@ def _step_claims(results: Results, joint: Joint, size: float) -> tuple[Claim, ..
     return *_oscillation(results, joint, size), still, mine
 
 
-def _oscillation(results: Results, joint: Joint, size: float) -> tuple[Claim, Claim]:
+def _oscillation(results: Results, joint: PaperJoint, size: float) -> tuple[Claim, Claim]:
     """Both l_f, by how far the torque swings once the step is over."""
     steps = results.measured[joint, Row.LUGRE_OSCILLATES].steps, results.measured[joint, Row.LUGRE_BETTER].steps
     high, low = (_torque_swing(found[size]) if size in found else math.inf for found in steps)
@@ -188,7 +188,7 @@ def _oscillation(results: Results, joint: Joint, size: float) -> tuple[Claim, Cl
     )
 
 
-def _order(results: Results, joint: Joint) -> tuple[Claim, ...]:
+def _order(results: Results, joint: PaperJoint) -> tuple[Claim, ...]:
     """The paper's order of RMS errors, with its own gains and with ours at its feedback."""
     said = "the errors fall from PD + DOB to PD + LuGre to the proposed law (0.6916, 0.5006, 0.3781)"
     claims = []

@@ -40,7 +40,7 @@ FRICTION = Friction(0.07, 0.045, 0.056, 0.1, 950.0, 1.0)
 INERTIA = 0.001
 
 
-class Gains(NamedTuple):
+class PrintedGains(NamedTuple):
     """Three gains as printed for one region, in the printed order."""
 
     first: float
@@ -49,4 +49,4 @@ class Gains(NamedTuple):
 
 
 #: "K_v, K_v, K_z" of Table I.
-GAINS_LOW, GAINS_HIGH = Gains(0.017, 0.241, 1574.9), Gains(21.615, 2.104, 197.0)
+GAINS_LOW, GAINS_HIGH = PrintedGains(0.017, 0.241, 1574.9), PrintedGains(21.615, 2.104, 197.0)

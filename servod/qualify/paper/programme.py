@@ -11,14 +11,14 @@ from dataclasses import dataclass
 from servod.formats.gains.design import ReferenceForm
 from servod.kernels.laws import LAWS
 from servod.lab.synthesize.deployed import Wishes
-from servod.lab.synthesize.gain_set import Options
+from servod.lab.synthesize.gain_set import DesignOptions
 from servod.lab.synthesize.lmi_reference import ReferenceWishes
-from servod.lab.synthesize.reference import Frame, frame
+from servod.lab.synthesize.reference import ReferenceFrame, frame
 from servod.lab.verify.checks import CORNER_SPEEDS, speeds_of
 from servod.lab.verify.margins import NOMINAL, Sweep
 from servod.lab.verify.reference_proof import gain_numbers, reference_gains
-from servod.lab.verify.sampled import Timing
-from servod.qualify.paper.joints import Joint, shipped_set, with_law
+from servod.lab.verify.sampled import SampledTiming
+from servod.qualify.paper.joints import PaperJoint, shipped_set, with_law
 from servod.qualify.paper.sweeps import rms_mrad
 
 #: Both ends of a useful l, in rad/s per unit of u*.
@@ -52,8 +52,8 @@ def answers(seconds: float) -> list[ProgrammeAnswer]:
 
 def answer(form: ReferenceForm, l_i: float, seconds: float) -> ProgrammeAnswer:
     """Solve both regions, and run what comes out."""
-    model = Joint.TABLE1.model()
-    made = frame(model, Wishes(), Options(gain=l_i, observer=False), ReferenceWishes(form=form))
+    model = PaperJoint.TABLE1.model()
+    made = frame(model, Wishes(), DesignOptions(gain=l_i, observer=False), ReferenceWishes(form=form))
     found = {span.name: made.answer(span) for span in made.spans}
     scale, regions, gains = made.law.input_scale_nm, {}, {}
     for name, region in found.items():
@@ -72,8 +72,8 @@ def answer(form: ReferenceForm, l_i: float, seconds: float) -> ProgrammeAnswer:
     )
 
 
-def _largest_pole(made: Frame, packed: tuple[float, ...]) -> float:
+def _largest_pole(made: ReferenceFrame, packed: tuple[float, ...]) -> float:
     """Of the nominal sampled loop over all velocities, with its delay and velocity filter."""
     d = made.design
-    timing = Timing(d.period_s, d.model.total_delay_s, d.velocity_cutoff_hz)
+    timing = SampledTiming(d.period_s, d.model.total_delay_s, d.velocity_cutoff_hz)
     return Sweep(LAWS["local"], packed, made.friction, timing, speeds_of(d, CORNER_SPEEDS)).worst(NOMINAL).radius

@@ -8,10 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import Enum
 
-from servod.lab.report.figures.motion import Motion
+from servod.lab.report.figures.motion import PlottedMotion
 from servod.qualify.paper.equations import TwoForms
 from servod.qualify.paper.experiments import Contender, Found, Measured
-from servod.qualify.paper.joints import Joint
+from servod.qualify.paper.joints import PaperJoint
 from servod.qualify.paper.printed import RMS_MRAD
 from servod.qualify.paper.programme import ProgrammeAnswer
 from servod.qualify.paper.sweeps import SweepOfL
@@ -43,16 +43,16 @@ class Results:
 
     seed: int
     seconds: float
-    found: dict[Joint, Found]
-    measured: dict[tuple[Joint, Row], Measured]
-    sines: dict[str, Motion]
+    found: dict[PaperJoint, Found]
+    measured: dict[tuple[PaperJoint, Row], Measured]
+    sines: dict[str, PlottedMotion]
     sweeps: dict[str, SweepOfL]
     noise: dict[str, list[float]]
     slips: dict[str, TwoForms]
     programme: list[ProgrammeAnswer]
-    tuned: dict[Joint, list[Contender]] = field(default_factory=dict)
+    tuned: dict[PaperJoint, list[Contender]] = field(default_factory=dict)
 
-    def rms(self, joint: Joint, row: Row) -> float | None:
+    def rms(self, joint: PaperJoint, row: Row) -> float | None:
         """RMS error of (19) in mrad; None where the axis stopped."""
         tracking = self.measured[joint, row].tracking()
         return None if tracking is None else tracking.rms_error_mrad

@@ -16,11 +16,11 @@ from servod.formats.gains.gain_set import GainSet
 from servod.formats.model.axis_model import AxisModel
 from servod.kernels.motions import sine
 from servod.lab.report.figure import Array, array
-from servod.lab.report.figures.motion import SETTLE_S, Motion, motion_of_run
+from servod.lab.report.figures.motion import SETTLE_S, PlottedMotion, motion_of_run
 from servod.lab.simulate.simulate import ClosedLoopRun, LoopSettings, simulate_closed_loop
 from servod.lab.tracking.metrics import paper_rows
 from servod.qualify.paper.experiments import cutoff_of
-from servod.qualify.paper.joints import ENCODER_COUNTS, Joint, with_l
+from servod.qualify.paper.joints import ENCODER_COUNTS, PaperJoint, with_l
 from servod.qualify.paper.printed import L_I, SINE_HZ, SINE_RAD
 
 PERIOD_S = 0.001
@@ -65,7 +65,7 @@ def rms_mrad(plant: AxisModel, gains: GainSet, seconds: float, external_nm: Arra
 
 def sweep_of_l(gains: GainSet, seconds: float, factors: Sequence[float] = FACTORS) -> SweepOfL:
     """Track (19) with each sign and size of l_i."""
-    plant = Joint.TABLE1.model()
+    plant = PaperJoint.TABLE1.model()
     found = {
         sign: tuple(rms_mrad(plant, with_l(gains, "sweep", [f * l_i for l_i in values]), seconds) for f in factors)
         for sign, values in SIGNS.items()
@@ -86,7 +86,7 @@ def filtered_noise(rms_nm: float, samples: int, seed: int) -> Array:
 
 def under_noise(sets: Mapping[str, GainSet], coulomb_nm: float, seconds: float, seed: int) -> dict[str, list[float]]:
     """RMS error of (19) in mrad for no noise and each of NOISE_SHARES, by label."""
-    plant, samples = Joint.TABLE1.model(), round(seconds / PERIOD_S)
+    plant, samples = PaperJoint.TABLE1.model(), round(seconds / PERIOD_S)
     pushes = [-filtered_noise(share * coulomb_nm, samples, seed) for share in NOISE_SHARES]
     return {
         label: [rms_mrad(plant, gains, seconds), *(rms_mrad(plant, gains, seconds, push) for push in pushes)]
@@ -94,9 +94,9 @@ def under_noise(sets: Mapping[str, GainSet], coulomb_nm: float, seconds: float, 
     }
 
 
-def on_sine(label: str, gains: GainSet, seconds: float, noise_nm: float = 0.0, seed: int = 0) -> Motion:
+def on_sine(label: str, gains: GainSet, seconds: float, noise_nm: float = 0.0, seed: int = 0) -> PlottedMotion:
     """The sine of Fig. 9 to 12 with the joint's own friction; `noise_nm` is the RMS of what is added to it."""
-    plant, path = Joint.TABLE1.model(), sine(SINE_RAD, SINE_HZ)
+    plant, path = PaperJoint.TABLE1.model(), sine(SINE_RAD, SINE_HZ)
     rows = array([path((k + 1) * PERIOD_S) for k in range(round(seconds / PERIOD_S))])
     push = -filtered_noise(noise_nm, len(rows), seed) if noise_nm else None
     run = simulate(plant, gains, rows, push)

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from servod.lab.report.figure import Table
-from servod.qualify.paper.joints import Joint
+from servod.lab.report.figure import PageTable
+from servod.qualify.paper.joints import PaperJoint
 from servod.qualify.paper.printed import FRICTION, GAINS_HIGH, GAINS_LOW, INERTIA
 from servod.qualify.paper.results import Row
 
@@ -48,9 +48,9 @@ QUANTITIES: tuple[str, ...] = (
 )
 
 
-def numbers(document: dict[str, Any]) -> Table:
+def numbers(document: dict[str, Any]) -> PageTable:
     """Every number that the paper prints beside ours on each joint, and the RMS errors of all rows."""
-    joints = [Joint(name) for name in document["joints"]]
+    joints = [PaperJoint(name) for name in document["joints"]]
     header = ("quantity", "paper", *(joint.label for joint in joints))
     rows = [
         (_RMS + row.label, "" if row.paper_mrad is None else f"{row.paper_mrad:g}", *_cells(document, joints, row))
@@ -62,10 +62,10 @@ def numbers(document: dict[str, Any]) -> Table:
     for quantity, region, key, printed in _FEEDBACK:
         found = (document["joints"][joint.value]["feedback"] for joint in joints)
         rows.append((quantity, f"{printed:.4g}", *(f"{values[region][key]:.4g}" for values in found)))
-    return Table("The paper's numbers beside ours", header, tuple(rows))
+    return PageTable("The paper's numbers beside ours", header, tuple(rows))
 
 
-def _cells(document: dict[str, Any], joints: list[Joint], row: Row) -> list[str]:
+def _cells(document: dict[str, Any], joints: list[PaperJoint], row: Row) -> list[str]:
     cells = []
     for joint in joints:
         found = document["joints"][joint.value]["tracking"][row.name.lower()]
@@ -85,7 +85,7 @@ def _interval(found: dict[str, Any] | None, factor: float) -> str:
     return f"{value:.4g} ({low:.4g} to {high:.4g})"
 
 
-def steps(document: dict[str, Any], joint: Joint) -> Table:
+def steps(document: dict[str, Any], joint: PaperJoint) -> PageTable:
     """Settling, overshoot, steady error and what is held of every row's steps on one joint."""
     header = ("controller", *(f"{size} mrad: {what}" for size in ("100", "10") for what in _STEP))
     rows = []
@@ -93,7 +93,7 @@ def steps(document: dict[str, Any], joint: Joint) -> Table:
         found = document["joints"][joint.value]["tracking"][row.name.lower()]
         cells = [cell for size in ("100", "10") for cell in _step(found, size)]
         rows.append((row.label, *cells))
-    return Table(f"Steps on {joint.label}", header, tuple(rows))
+    return PageTable(f"Steps on {joint.label}", header, tuple(rows))
 
 
 _STEP = ("settles / ms", "overshoot", "steady error / mrad")
@@ -107,13 +107,13 @@ def _step(found: dict[str, Any], size: str) -> tuple[str, str, str]:
     return settled, f"{response['overshoot']:.1%}", f"{response['steady_error_mrad']:.3g}"
 
 
-def tuned(document: dict[str, Any], joint: Joint) -> Table:
+def tuned(document: dict[str, Any], joint: PaperJoint) -> PageTable:
     """The rivals after a fair tuning on one joint, by class; then the law as synthesized, of no limited roughness."""
     header = ("controller", "feedback", "RMS on (19) / mrad", "largest / mrad", "roughness / mN·m")
     found = document["joints"][joint.value]
     rows = [(r["law"], r["feedback"], *_tracked(r)) for r in found["tuned"]]
     rows.append((Row.DEPLOYED.label, UNLIMITED, *_tracked(found["tracking"][Row.DEPLOYED.name.lower()])))
-    return Table(f"Rivals tuned by the same rules on {joint.label}", header, tuple(rows))
+    return PageTable(f"Rivals tuned by the same rules on {joint.label}", header, tuple(rows))
 
 
 def _tracked(found: dict[str, Any]) -> tuple[str, str, str]:
@@ -123,7 +123,7 @@ def _tracked(found: dict[str, Any]) -> tuple[str, str, str]:
     return f"{found['rms_error_mrad']:.4f}", f"{found['max_error_mrad']:.3f}", f"{1e3 * found['roughness_nm']:.3g}"
 
 
-def claims(document: dict[str, Any]) -> Table:
+def claims(document: dict[str, Any]) -> PageTable:
     """Every claim by its figure, and whether it agrees."""
     rows = [
         (", ".join(filter(None, (figure["number"], figure["where"]))), claim["paper"], claim["here"], _verdict(claim))
@@ -131,7 +131,7 @@ def claims(document: dict[str, Any]) -> Table:
         for claim in figure["claims"]
     ]
     rows += [(said["about"], said["paper"], said["here"], _verdict(said)) for said in document["statements"]]
-    return Table("What agrees and what does not", ("figure", "the paper", "here", ""), tuple(rows))
+    return PageTable("What agrees and what does not", ("figure", "the paper", "here", ""), tuple(rows))
 
 
 def _verdict(claim: dict[str, Any]) -> str:
@@ -140,5 +140,5 @@ def _verdict(claim: dict[str, Any]) -> str:
 
 def quotation(document: dict[str, Any]) -> str:
     """What the README quotes: the numbers, and the rivals where they were tuned, as paper.md has them."""
-    joints = [Joint(name) for name in document["joints"] if document["joints"][name]["tuned"]]
+    joints = [PaperJoint(name) for name in document["joints"] if document["joints"][name]["tuned"]]
     return "\n\n".join(each.markdown() for each in (numbers(document), *(tuned(document, joint) for joint in joints)))

@@ -23,7 +23,7 @@ from servod.lab.report.pictures import write_pictures
 from servod.lab.tune.plan import Feedback
 from servod.qualify.paper import beyond, document, equations, experiments, motions, programme, sweeps
 from servod.qualify.paper.experiments import Contender, Found, Measured, cutoff_of
-from servod.qualify.paper.joints import Joint, at_paper_feedback, printed_l, shipped_set, with_l, without_observer
+from servod.qualify.paper.joints import PaperJoint, at_paper_feedback, printed_l, shipped_set, with_l, without_observer
 from servod.qualify.paper.printed import FRICTION
 from servod.qualify.paper.results import Results, Row
 
@@ -108,18 +108,18 @@ class PaperPlan:
     """How much is done. `identify` False takes the plants' own models, which leaves out Fig. 7 and 8."""
 
     seed: int = 1
-    joints: tuple[Joint, ...] = (Joint.TABLE1, Joint.REAL)
+    joints: tuple[PaperJoint, ...] = (PaperJoint.TABLE1, PaperJoint.REAL)
     seconds: float = 30.0
     hold_s: float = 3.0
     identify: bool = True
     factors: tuple[float, ...] = sweeps.FACTORS
     pictures: bool = True
-    tune: tuple[Joint, ...] = (Joint.REAL,)
+    tune: tuple[PaperJoint, ...] = (PaperJoint.REAL,)
 
 
 #: A look at everything that needs no identification, on Table I's joint alone.
 QUICK = PaperPlan(
-    joints=(Joint.TABLE1,),
+    joints=(PaperJoint.TABLE1,),
     seconds=4.0,
     hold_s=1.2,
     identify=False,
@@ -191,13 +191,13 @@ def gather(plan: PaperPlan, crew: Crew) -> Results:
     )
 
 
-def _found(plan: PaperPlan, crew: Crew, joint: Joint) -> Future[Found]:
+def _found(plan: PaperPlan, crew: Crew, joint: PaperJoint) -> Future[Found]:
     if plan.identify:
         return crew.submit(f"{joint.label} identified", 45.0, experiments.identify_and_design, joint, plan.seed)
     return crew.submit(f"{joint.label} designed for", 6.0, experiments.design_as_told, joint)
 
 
-def _contenders(plan: PaperPlan, crew: Crew, joint: Joint, found: Found) -> list[Contender]:
+def _contenders(plan: PaperPlan, crew: Crew, joint: PaperJoint, found: Found) -> list[Contender]:
     """Every rival tuned on what was found of the joint, each scored as soon as its law is done."""
     cutoff_hz = cutoff_of(found.gains)
     tuned = [
@@ -223,10 +223,10 @@ def _contenders(plan: PaperPlan, crew: Crew, joint: Joint, found: Found) -> list
     return [crew.result(scored[feedback, name]) for feedback in Feedback for name in experiments.LABELS]
 
 
-Tracked = tuple[tuple[Joint, Row], Future[Measured]]
+Tracked = tuple[tuple[PaperJoint, Row], Future[Measured]]
 
 
-def _track_shipped(plan: PaperPlan, crew: Crew, joint: Joint) -> Iterator[Tracked]:
+def _track_shipped(plan: PaperPlan, crew: Crew, joint: PaperJoint) -> Iterator[Tracked]:
     """The paper's sets in all readings."""
     yield from _track(plan, crew, joint, paper_sets())
 
@@ -237,7 +237,7 @@ def paper_sets() -> dict[Row, GainSet]:
     return sets | {Row.TABLE1_PRINTED_L: printed_l(sets[Row.TABLE1])}
 
 
-def _track_found(plan: PaperPlan, crew: Crew, joint: Joint, found: Found) -> Iterator[Tracked]:
+def _track_found(plan: PaperPlan, crew: Crew, joint: PaperJoint, found: Found) -> Iterator[Tracked]:
     """The identified joint's sets."""
     yield from _track(plan, crew, joint, designed_sets(found.gains), cutoff_of(found.gains))
 
@@ -251,7 +251,7 @@ def designed_sets(gains: GainSet) -> dict[Row, GainSet]:
 
 
 def _track(
-    plan: PaperPlan, crew: Crew, joint: Joint, sets: dict[Row, GainSet], cutoff_hz: float | None = None
+    plan: PaperPlan, crew: Crew, joint: PaperJoint, sets: dict[Row, GainSet], cutoff_hz: float | None = None
 ) -> Iterator[Tracked]:
     for row, gains in sets.items():
         what = f"{row.label} on {joint.label}"

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from servod.lab.report.figure import COLOURS, Axis, Curve, Figure, Panel, Style
+from servod.lab.report.figure import COLOURS, Curve, Figure, PlotAxis, PlotPanel, Style
 from servod.lab.report.page import Page
 from servod.qualify.soak.memory import LIMIT_KB_PER_H, LONG_S, Growth, Memory
 from servod.qualify.soak.tally import COUNTED, SoakedAxis, median_ms
@@ -259,7 +259,7 @@ def _reactions(found: dict[str, Any]) -> Figure:
             continue
         x, counts = np.array(sorted(bins), dtype=float), np.array([bins[p] for p in sorted(bins)], dtype=float)
         curve = Curve("", x, counts, style=Style.POINTS)
-        panels.append(Panel(Axis("ms", span=(0.0, 310.0)), Axis("times"), (curve,), name))
+        panels.append(PlotPanel(PlotAxis("ms", span=(0.0, 310.0)), PlotAxis("times"), (curve,), name))
     caption = "From the injection until the joint feels no torque, by the drive's own record, in bins of a millisecond."
     return Figure("reactions", "Time until the torque is gone", tuple(panels), 3, caption, row_height=0.5)
 
@@ -269,7 +269,7 @@ def _memory(found: dict[str, Any]) -> Figure:
     for colour, memory in zip(COLOURS, found["memory"], strict=False):
         samples = np.array(memory["curve"], dtype=float).reshape(-1, 3)
         curves.append(Curve(memory["process"], samples[:, 0] / 60.0, samples[:, 1] / 1024.0, colour))
-    panel = Panel(Axis("wall clock / min"), Axis("resident / MB"), tuple(curves))
+    panel = PlotPanel(PlotAxis("wall clock / min"), PlotAxis("resident / MB"), tuple(curves))
     return Figure("memory", "Resident size", (panel,), caption="Sampled from /proc while the soak ran.")
 
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.drivers.virtual.drive_record import SAMPLE, DriveSample
-from servod.qualify.faults.judge import NO_TORQUE_NM, Reaction, reaction
-from servod.qualify.soak.kinds import FaultKind
+from servod.qualify.faults.judge import NO_TORQUE_NM, ReactionTimes, reaction
+from servod.qualify.soak.kinds import InjectionKind
 from servod.qualify.soak.rows import Rows
 from servod.qualify.soak.tally import FaultTally, Findings, Wrong
 from servod.runtime.fieldbus.devices import DriveState
@@ -29,7 +29,7 @@ def samples_of(raw: bytes) -> Samples:
     return np.frombuffer(raw, dtype=SAMPLE_ROW)
 
 
-def reaction_in(samples: Samples, injected_ns: int) -> Reaction:
+def reaction_in(samples: Samples, injected_ns: int) -> ReactionTimes:
     """What the drive did after `injected_ns`, as the fault campaign judges it."""
     after = samples[samples["time_ns"] >= injected_ns].tolist()
     return reaction([DriveSample(time_ns, DriveState(state), *rest) for time_ns, state, *rest in after], injected_ns)
@@ -73,15 +73,15 @@ class DriveCheck:
 # Between rows, the drive's record and the findings; the bounds are those of the fault's kind.
 
 
-def check_trace(kind: FaultKind, happened: bool, injected_ns: int, findings: Findings) -> None:
+def check_trace(kind: InjectionKind, happened: bool, injected_ns: int, findings: Findings) -> None:
     """Find a fault that was injected and did not happen: that an axis rides through nothing tells nothing."""
     if not happened:
         findings.add(Wrong.NO_TRACE, injected_ns, f"{kind.name}: nothing of it was on the bus")
 
 
 def check_reaction(
-    kind: FaultKind,
-    times: Reaction,
+    kind: InjectionKind,
+    times: ReactionTimes,
     injected_ns: int,
     tally: FaultTally,
     findings: Findings,

@@ -41,7 +41,7 @@ class OneOf:
 
 
 @dataclass(frozen=True)
-class FaultKind:
+class InjectionKind:
     """One kind. `do` and `undo` are actions of servod.qualify.faults.actions, with ranges where a number is drawn.
 
     `expects`: one of these at least is latched, within `latched_ms` of the injection; empty: the axis rides through it,
@@ -73,7 +73,7 @@ class FaultKind:
         """What takes the cause away; None when it goes by itself."""
         return None if self.undo is None else Injection(at_ms=0.0, do=self.undo)
 
-    def while_proving(self) -> FaultKind:
+    def while_proving(self) -> InjectionKind:
         """The same when the wiring is being proven: whatever spoils the proof may end it."""
         spoilt = frozenset({_F.WIRING_NOT_PROVEN})
         expects = self.expects | spoilt if self.expects else self.expects
@@ -124,7 +124,7 @@ def _nmt(who: str, *commands: str) -> Action:
 
 def _node(
     name: str, do: Action, undo: Action | None = None, takes_syncs: bool = False, left_ms: float = MASTER_LOSS_MS
-) -> FaultKind:
+) -> InjectionKind:
     """A participant that is reset, stopped or away for long: it must be configured anew."""
     expects = frozenset(
         {
@@ -132,7 +132,7 @@ def _node(
             *(_F.BUS_OFF, _F.BUS_DOWN, _F.NODE_LEFT_OPERATIONAL),
         }
     )
-    return FaultKind(
+    return InjectionKind(
         name,
         do,
         expects,
@@ -147,16 +147,16 @@ def _node(
     )
 
 
-def _encoder(name: str, do: Action, undo: Action | None = None) -> FaultKind:
+def _encoder(name: str, do: Action, undo: Action | None = None) -> InjectionKind:
     """The encoder does not answer any more, which is a loss of feedback."""
     return _node(name, do, undo, left_ms=FEEDBACK_LOSS_MS)
 
 
 def _resettable(
     name: str, do: Action, expects: set[FaultCode], undo: Action | None = None, latched_ms: float = FEEDBACK_LOSS_MS
-) -> FaultKind:
+) -> InjectionKind:
     """A fault after which the axis can be enabled again once its cause is gone; the drive's ramps need their time."""
-    return FaultKind(
+    return InjectionKind(
         name,
         do,
         frozenset(expects),
@@ -170,7 +170,7 @@ def _resettable(
     )
 
 
-def _drive(name: str, subindex: int, value: Any, normal: int) -> FaultKind:
+def _drive(name: str, subindex: int, value: Any, normal: int) -> InjectionKind:
     """A cause of a fault inside the drive, and its end."""
     do, undo = (_write("amplifier", 0x2000, subindex, v) for v in (value, normal))
     return _resettable(name, do, {_F.DRIVE_FAULT, _F.DRIVE_LEFT_OPERATION}, undo)
@@ -182,25 +182,29 @@ _DRIVE_ERRORS = (0x2310, 0x3210, 0x4310, 0x5441, 0x6320, 0x7300, 0x8611, 0xFF01)
 _NAN_GAINS: Action = {"gains": {"law": "pd", "parameters": ["nan", "nan", 0.0]}}
 _GOOD_GAINS: Action = {"gains": {"law": "pd", "parameters": [2.5, 0.12, 0.0]}}
 
-KINDS: tuple[FaultKind, ...] = (
+KINDS: tuple[InjectionKind, ...] = (
     # Ridden through.
-    FaultKind("drive feedback lost, a few", _frames("drive_feedback", "drop", 1, 15)),
-    FaultKind("encoder feedback lost, a few", _frames("encoder_feedback", "drop", 1, 15)),
-    FaultKind("torque frames lost", _frames("torque", "drop", 1, 50)),
-    FaultKind("torque frames late", _frames("torque", "late", 1, 10, 20)),
-    FaultKind("drive feedback late", _frames("drive_feedback", "late", 1, 5, 12)),
-    FaultKind("encoder feedback late", _frames("encoder_feedback", "late", 1, 5, 12)),
-    FaultKind("cyclic frames twice", _frames(_CYCLIC, "duplicate", 1, 50)),
-    FaultKind("cyclic frames reordered", _frames(_CYCLIC, "reorder", 1, 50)),
-    FaultKind("drive feedback cut short", _frames("drive_feedback", "shorten", 1, 15, Between(1, 7))),
-    FaultKind("encoder feedback cut short", _frames("encoder_feedback", "shorten", 1, 15, Between(1, 3))),
-    FaultKind("node away for a moment", _silence(OneOf(("encoder", "amplifier")), 5, 12)),
-    FaultKind("a stranger talks", {"babble": {"can_id": OneOf((0x100, 0x183, 0x7FF)), "for_ms": 250, "each_ms": 2}}),
-    FaultKind("SYNC lost, a few", _frames("sync", "drop", 1, 10), takes_syncs=True),
-    FaultKind("frames destroyed", _frames("any", "destroy", 1, 5)),
-    FaultKind("torque frame destroyed", _frames("torque", "destroy", 1, 5)),
-    FaultKind("master's heartbeat lost", _frames("master_heartbeat", "drop", 1, 1)),
-    FaultKind("encoder warning", {"foreign_frame": {"can_id": 0x602, "data": OneOf(tuple(map(_warned, range(1, 5))))}}),
+    InjectionKind("drive feedback lost, a few", _frames("drive_feedback", "drop", 1, 15)),
+    InjectionKind("encoder feedback lost, a few", _frames("encoder_feedback", "drop", 1, 15)),
+    InjectionKind("torque frames lost", _frames("torque", "drop", 1, 50)),
+    InjectionKind("torque frames late", _frames("torque", "late", 1, 10, 20)),
+    InjectionKind("drive feedback late", _frames("drive_feedback", "late", 1, 5, 12)),
+    InjectionKind("encoder feedback late", _frames("encoder_feedback", "late", 1, 5, 12)),
+    InjectionKind("cyclic frames twice", _frames(_CYCLIC, "duplicate", 1, 50)),
+    InjectionKind("cyclic frames reordered", _frames(_CYCLIC, "reorder", 1, 50)),
+    InjectionKind("drive feedback cut short", _frames("drive_feedback", "shorten", 1, 15, Between(1, 7))),
+    InjectionKind("encoder feedback cut short", _frames("encoder_feedback", "shorten", 1, 15, Between(1, 3))),
+    InjectionKind("node away for a moment", _silence(OneOf(("encoder", "amplifier")), 5, 12)),
+    InjectionKind(
+        "a stranger talks", {"babble": {"can_id": OneOf((0x100, 0x183, 0x7FF)), "for_ms": 250, "each_ms": 2}}
+    ),
+    InjectionKind("SYNC lost, a few", _frames("sync", "drop", 1, 10), takes_syncs=True),
+    InjectionKind("frames destroyed", _frames("any", "destroy", 1, 5)),
+    InjectionKind("torque frame destroyed", _frames("torque", "destroy", 1, 5)),
+    InjectionKind("master's heartbeat lost", _frames("master_heartbeat", "drop", 1, 1)),
+    InjectionKind(
+        "encoder warning", {"foreign_frame": {"can_id": 0x602, "data": OneOf(tuple(map(_warned, range(1, 5))))}}
+    ),
     # Stopped, and enabled again after a reset.
     # Feedback is missed after 20 cycles in virtual time, and after 50 on the wall clock.
     _resettable("drive feedback lost, many", _frames("drive_feedback", "drop", 55, 60), {_F.FEEDBACK_STALE}),

@@ -37,7 +37,7 @@ _SAVE_S = 10.0
 
 
 @dataclass
-class Watch:
+class SoakWatch:
     """The clock on the wall, and the memory of every process that belongs to the soak."""
 
     limit_s: float
@@ -68,7 +68,7 @@ def run(
 
     The document is in `folder` all the time.
     """
-    watch, course = Watch(limit_s), Course.CUT_SHORT
+    watch, course = SoakWatch(limit_s), Course.CUT_SHORT
     try:
         _go_through(axis, episodes, cycles, watch, folder, tell)
         course = Course.COMPLETE
@@ -92,7 +92,7 @@ def save(found: dict[str, Any], folder: Path) -> None:
 
 
 def _go_through(
-    axis: SoakedAxis, episodes: Iterable[Episode], cycles: int, watch: Watch, folder: Path, tell: Tell
+    axis: SoakedAxis, episodes: Iterable[Episode], cycles: int, watch: SoakWatch, folder: Path, tell: Tell
 ) -> None:
     next_save_s = 0.0
     watch.look(axis.processes())
@@ -115,7 +115,7 @@ def _line(axis: SoakedAxis, elapsed_s: float) -> str:
     return f"{counts.cycles / 1e6:.2f} M cycles, {speed:.1f}x, {sum(f.injected for f in faults)} faults, {wrong} wrong"
 
 
-def _judge_memory(axis: SoakedAxis, watch: Watch) -> None:
+def _judge_memory(axis: SoakedAxis, watch: SoakWatch) -> None:
     for name, memory in watch.longest.items():
         slope = memory.slope()
         if slope.growth is Growth.GROWS:

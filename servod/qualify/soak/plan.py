@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from servod.qualify.faults.scenario import Scenario
-from servod.qualify.soak.kinds import KINDS, FaultKind
+from servod.qualify.soak.kinds import KINDS, InjectionKind
 from servod.runtime.loop.commands import ReferenceKind
 
 #: Share of the episodes in which something goes wrong.
@@ -24,7 +24,7 @@ _FASTEST_RAD_S, _LARGEST_RAD = 1.2, 0.3
 _SAMPLES_PER_S = 1000
 
 
-class Ending(StrEnum):
+class SoakEnding(StrEnum):
     """How an episode whose motion still runs goes on."""
 
     FINISH = "the motion comes to its end"
@@ -52,16 +52,16 @@ class Episode:
     law: str | None
     move: Move
     before_s: float
-    fault: FaultKind | None
-    ending: Ending
+    fault: InjectionKind | None
+    ending: SoakEnding
     seed: int
     proves: bool = False
 
 
-def schedule(seed: int, gain_sets: tuple[str, ...], kinds: tuple[FaultKind, ...] = KINDS) -> Iterator[Episode]:
+def schedule(seed: int, gain_sets: tuple[str, ...], kinds: tuple[InjectionKind, ...] = KINDS) -> Iterator[Episode]:
     """Episodes without end. Each kind of fault comes once before any comes again."""
     chance = random.Random(seed)  # noqa: S311  (a schedule, not a secret)
-    waiting: list[FaultKind] = []
+    waiting: list[InjectionKind] = []
     number = 0
     while True:
         number += 1
@@ -74,7 +74,9 @@ def schedule(seed: int, gain_sets: tuple[str, ...], kinds: tuple[FaultKind, ...]
         law = chance.choice(gain_sets) if chance.random() < 0.3 else None
         proves = fault is not None and not fault.of_control and chance.random() < _PROVING_SHARE
         before_s = chance.uniform(0.02, 0.9) * (_PROOF_S if proves else min(move.duration_s, 1.5))
-        yield Episode(number, law, move, before_s, fault, chance.choice(tuple(Ending)), chance.getrandbits(32), proves)
+        yield Episode(
+            number, law, move, before_s, fault, chance.choice(tuple(SoakEnding)), chance.getrandbits(32), proves
+        )
 
 
 def home(from_rad: float) -> Move:

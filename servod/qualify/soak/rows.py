@@ -19,7 +19,7 @@ from servod.formats.recording.mcap_reader import read_recording
 from servod.formats.recording.mcap_writer import split_rows
 from servod.formats.recording.record import FIELDS
 from servod.lab.recordings.recording import ROW
-from servod.qualify.soak.starved import Explained
+from servod.qualify.soak.starved import ExcusedFaults
 from servod.qualify.soak.tally import Findings, Wrong
 from servod.runtime.daemon.recorder import Recorder
 from servod.runtime.fieldbus.devices import DriveState
@@ -191,7 +191,7 @@ class RecordedRows:
         self._rows_of_session = self._latched = 0
         self.excused: Counter[str] = Counter()
 
-    def take(self, schedule: Explained, starved: Explained, ended: bool) -> None:
+    def take(self, schedule: ExcusedFaults, starved: ExcusedFaults, ended: bool) -> None:
         """Check every complete file; with `ended` the daemon is gone and all are.
 
         A fault has its cause in the schedule, or in a machine that starved the processes at that time; the second are
@@ -209,7 +209,7 @@ class RecordedRows:
             self.files += 1
             path.unlink()
 
-    def _allowed(self, rows: Rows, schedule: Explained, starved: Explained) -> NDArray[np.int64]:
+    def _allowed(self, rows: Rows, schedule: ExcusedFaults, starved: ExcusedFaults) -> NDArray[np.int64]:
         """The fault bits that each row may have; counts those that only a starved machine explains."""
         latched = rows["faults_latched"]
         before = np.concatenate(([self._latched], latched[:-1]))[: len(latched)]

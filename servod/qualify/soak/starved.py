@@ -33,7 +33,7 @@ class _Span(NamedTuple):
     bits: int
 
 
-class Explained:
+class ExcusedFaults:
     """Spans of time with the fault bits that may be seen in them; `always`: those that may be seen at any time."""
 
     def __init__(self, always: int = 0) -> None:
@@ -79,14 +79,14 @@ _LATE_NS = 1_000_000
 Processes = Mapping[int, frozenset[FaultCode]]
 
 
-class Starved:
+class Starvation:
     """The pieces of a soak in which one of its processes was starved; `explained`: what that may cause, and when.
 
     What a hypervisor takes from the whole machine counts for each.
     """
 
     def __init__(self, now_ns: int) -> None:
-        self.explained = Explained()
+        self.explained = ExcusedFaults()
         self._since_ns, self._stolen_ns = now_ns, stolen_ns()
         self._totals_ns: dict[int, int] = {}
         self._piece_ns: Counter[int] = Counter()

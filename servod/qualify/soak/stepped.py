@@ -20,7 +20,7 @@ from servod.drivers.virtual.drive_record import DriveTail
 from servod.formats.gains.gain_set import load_gains
 from servod.kernels.laws import LAWS
 from servod.qualify.faults.actions import action_of
-from servod.qualify.faults.scenario import Injection, Recovery, Runs, Start
+from servod.qualify.faults.scenario import Injection, Recovery, Runs, ScenarioStart
 from servod.qualify.faults.stepped import RECORD_NAME, SteppedUnderTest
 from servod.qualify.soak.drive import (
     DriveCheck,
@@ -31,8 +31,8 @@ from servod.qualify.soak.drive import (
     reaction_in,
     samples_of,
 )
-from servod.qualify.soak.kinds import ALWAYS, FaultKind, fault_bits
-from servod.qualify.soak.plan import Ending, Episode, Move, home, nothing_yet
+from servod.qualify.soak.kinds import ALWAYS, InjectionKind, fault_bits
+from servod.qualify.soak.plan import Episode, Move, SoakEnding, home, nothing_yet
 from servod.qualify.soak.rows import ANSWER_CYCLES, RecordingCheck, RowCheck, Rows, rows_of
 from servod.qualify.soak.syncs import SyncCheck, SyncListener
 from servod.qualify.soak.tally import Counts, FaultTally, Findings, Tally, Wrong
@@ -66,7 +66,7 @@ class SteppedSoak:
         self.findings, self.tally = Findings(), Tally()
         self._axis = SteppedUnderTest(nothing_yet(seed, proves=True), folder)
         self._heard, self._drive = SyncListener(self._axis.world.hub), DriveTail(folder / RECORD_NAME)
-        self._axis.start(Start.ENABLED)
+        self._axis.start(ScenarioStart.ENABLED)
         config = self._axis.session.config
         self._period_ns = self._axis.session.cycle.period_ns
         self._rows = RowCheck(self._period_ns, config.limits.torque_nm, self.findings)
@@ -178,11 +178,11 @@ class SteppedSoak:
 
     def _end(self, episode: Episode) -> None:
         self.tally.endings[episode.ending.name] += 1
-        if episode.ending in (Ending.DISABLE, Ending.QUICK_STOP):
-            self._switch_off(Op.DISABLE if episode.ending is Ending.DISABLE else Op.QUICK_STOP)
+        if episode.ending in (SoakEnding.DISABLE, SoakEnding.QUICK_STOP):
+            self._switch_off(Op.DISABLE if episode.ending is SoakEnding.DISABLE else Op.QUICK_STOP)
             self._recover(Recovery.ENABLE, 0)
             return
-        if episode.ending is Ending.HALT:
+        if episode.ending is SoakEnding.HALT:
             self._send(Op.HALT, [1.0])
             self._run(0.2)
             self._send(Op.HALT, [0.0])
@@ -205,7 +205,7 @@ class SteppedSoak:
 
     # --- faults ------------------------------------------------------------------------------------------------
 
-    def _befall(self, kind: FaultKind, chance: random.Random) -> None:
+    def _befall(self, kind: InjectionKind, chance: random.Random) -> None:
         """Inject, watch, judge, repair, recover."""
         tally, injection = self.tally.of(kind.name), kind.injection(chance)
         listener = None if kind.expects else self._listen(injection)
@@ -238,7 +238,7 @@ class SteppedSoak:
         self._run(LISTEN_S)
         return listener
 
-    def _ride_on(self, kind: FaultKind, tally: FaultTally, happened: bool) -> bool:
+    def _ride_on(self, kind: InjectionKind, tally: FaultTally, happened: bool) -> bool:
         """See the axis go on as it was; what it rides through may spoil a proof, which is then done again."""
         self._wait_out(AxisState.PROVING)
         if self._axis.session.cycle.axis.latched & kind.explained & _NOT_PROVEN:
@@ -252,7 +252,7 @@ class SteppedSoak:
     def _act(self, injection: Injection) -> None:
         action_of(injection, "soak", Runs.STEPPED).apply(self._axis)
 
-    def _judge(self, kind: FaultKind, batch: Batch, injected_ns: int, happened: bool) -> None:
+    def _judge(self, kind: InjectionKind, batch: Batch, injected_ns: int, happened: bool) -> None:
         """Was it found in the log in time, and was the torque gone in time by the drive's own record?
 
         Of what is ridden through no fault word tells; there must be its trace.

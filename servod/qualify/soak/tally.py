@@ -131,7 +131,7 @@ class Wrong(StrEnum):
     DESCRIPTORS = "open descriptors grow"
 
 
-class Finding(NamedTuple):
+class Anomaly(NamedTuple):
     """One of them; `time_s` is axis time since the beginning, None where it is of no one moment."""
 
     episode: int
@@ -145,7 +145,7 @@ class Findings:
 
     def __init__(self) -> None:
         self.counts: Counter[Wrong] = Counter()
-        self.told: list[Finding] = []
+        self.told: list[Anomaly] = []
         self.episode = 0
         self._began_ns = 0
 
@@ -158,7 +158,7 @@ class Findings:
         self.counts[wrong] += count
         if len(self.told) < _TOLD:
             time_s = None if time_ns is None else (time_ns - self._began_ns) / 1e9
-            self.told.append(Finding(self.episode, time_s, wrong, text))
+            self.told.append(Anomaly(self.episode, time_s, wrong, text))
 
 
 # What a soak counts on its axis, and what it asks of one, whatever the axis runs on.

@@ -18,7 +18,7 @@ from typing import NamedTuple
 from servod.drivers.virtual.client import VirtualBus
 from servod.drivers.virtual.hub import Hub
 from servod.drivers.virtual.port import Port
-from servod.qualify.faults.actions import Action
+from servod.qualify.faults.actions import InjectionAction
 from servod.qualify.faults.actions.base import Who
 from servod.qualify.faults.actions.bus import CAN_ID, Babble, FrameFault, FrameName, Frames, Silence
 from servod.qualify.faults.actions.nodes import ForeignFrame
@@ -40,7 +40,7 @@ class Sign(StrEnum):
     DESTROYED = "an error frame"
 
 
-class Trace(NamedTuple):
+class BusSign(NamedTuple):
     """A sign, and the frames that bear it; `begins`: how the data of the frame begins that is to be heard."""
 
     sign: Sign
@@ -68,24 +68,24 @@ _ANSWERS = {Who.AMPLIFIER: FrameName.DRIVE_FEEDBACK, Who.ENCODER: FrameName.ENCO
 _CONFIRMED = b"\x60"
 
 
-def trace_of(action: Action) -> Trace | None:
+def trace_of(action: InjectionAction) -> BusSign | None:
     """What shows that `action` happened; None where only a fault word does."""
     match action:
         case Frames(of=FrameName.SYNC, fault=FrameFault.DROP):
-            return Trace(Sign.CROWD, CAN_ID[FrameName.TORQUE])  # the loop goes on: two torques from SYNC to SYNC
+            return BusSign(Sign.CROWD, CAN_ID[FrameName.TORQUE])  # the loop goes on: two torques from SYNC to SYNC
         case Frames(of=name, fault=fault):
-            return Trace(_SIGNS[fault], CAN_ID[name]) if fault in _SIGNS else None
+            return BusSign(_SIGNS[fault], CAN_ID[name]) if fault in _SIGNS else None
         case Silence(who=who):
-            return Trace(Sign.GAP, CAN_ID[_ANSWERS[who]]) if who in _ANSWERS else None
+            return BusSign(Sign.GAP, CAN_ID[_ANSWERS[who]]) if who in _ANSWERS else None
         case Babble(can_id=can_id):
-            return Trace(Sign.HEARD, can_id)
+            return BusSign(Sign.HEARD, can_id)
         case ForeignFrame(can_id=can_id, data=data) if can_id > SDO_REQUEST_BASE:
             answer = can_id - SDO_REQUEST_BASE + SDO_ANSWER_BASE
-            return Trace(Sign.HEARD, answer, _CONFIRMED + bytes.fromhex(data)[1:4])
+            return BusSign(Sign.HEARD, answer, _CONFIRMED + bytes.fromhex(data)[1:4])
     return None
 
 
-def shows(trace: Trace, heard: Sequence[Heard], destroyed: int) -> bool:
+def shows(trace: BusSign, heard: Sequence[Heard], destroyed: int) -> bool:
     """Whether the frames that were `heard` from before the injection on, or the error frames, bear the trace."""
     if trace.sign is Sign.DESTROYED:
         return destroyed > 0
@@ -117,7 +117,7 @@ class Listener(Port):
 
     __slots__ = ("_destroyed", "_heard", "_hub", "_trace")
 
-    def __init__(self, hub: Hub, trace: Trace) -> None:
+    def __init__(self, hub: Hub, trace: BusSign) -> None:
         super().__init__("trace", self._hear)
         self._hub, self._trace = hub, trace
         self._heard: list[Heard] = []
@@ -142,7 +142,7 @@ class Listener(Port):
 class BusListener:
     """A client of the hub's socket at `path` that listens for one trace."""
 
-    def __init__(self, path: Path, trace: Trace) -> None:
+    def __init__(self, path: Path, trace: BusSign) -> None:
         """Raises Unreachable when no hub serves there."""
         self._trace = trace
         self._bus = VirtualBus(str(path), (trace.can_id, SYNC_ID))

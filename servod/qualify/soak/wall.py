@@ -25,12 +25,12 @@ from servod.qualify.faults.actions import action_of
 from servod.qualify.faults.actions.bus import FrameFault
 from servod.qualify.faults.machine import Process
 from servod.qualify.faults.processes import ProcessAxis
-from servod.qualify.faults.scenario import Injection, Recovery, Runs, Start
+from servod.qualify.faults.scenario import Injection, Recovery, Runs, ScenarioStart
 from servod.qualify.soak.drive import DriveCheck, check_reaction, check_trace, reaction_in, samples_of
-from servod.qualify.soak.kinds import ALWAYS, FaultKind, fault_bits
-from servod.qualify.soak.plan import Ending, Episode, Move, nothing_yet
+from servod.qualify.soak.kinds import ALWAYS, InjectionKind, fault_bits
+from servod.qualify.soak.plan import Episode, Move, SoakEnding, nothing_yet
 from servod.qualify.soak.rows import RecordedRows
-from servod.qualify.soak.starved import STARVED_CYCLE, STARVED_SUPERVISOR, Explained, Starved
+from servod.qualify.soak.starved import STARVED_CYCLE, STARVED_SUPERVISOR, ExcusedFaults, Starvation
 from servod.qualify.soak.syncs import SyncThread
 from servod.qualify.soak.tally import Counts, Findings, Tally, Wrong
 from servod.qualify.soak.traces import LISTEN_S, BusListener, trace_of
@@ -51,7 +51,7 @@ _ORDER_NS = 500_000_000
 _GRACE_MS = 60.0
 
 
-def of_the_wall(kind: FaultKind) -> bool:
+def of_the_wall(kind: InjectionKind) -> bool:
     """Whether a fault can be put to a loop in a process of its own, from the bus and not from within, and be seen
     there: a client of the hub hears of no frame that was destroyed."""
     return all(
@@ -67,12 +67,12 @@ class WallSoak:
         """Raises Unreachable when the processes do not start."""
         folder.mkdir(parents=True, exist_ok=True)
         self.findings, self.tally = Findings(), Tally()
-        self._schedule, self._starved = Explained(fault_bits(ALWAYS)), Starved(time.monotonic_ns())
+        self._schedule, self._starved = ExcusedFaults(fault_bits(ALWAYS)), Starvation(time.monotonic_ns())
         over = {"recorder": {"always": True, "max_file_mib": 16}}
         with contextlib.ExitStack() as stack:
             self._axis = ProcessAxis(nothing_yet(seed, proves=False), folder, over=over)
             stack.callback(self._axis.close)
-            self._axis.start(Start.OFF)
+            self._axis.start(ScenarioStart.OFF)
             self._bus = folder / "bus"
             self._heard = SyncThread(self._bus)
             stack.callback(self._heard.close)
@@ -162,12 +162,12 @@ class WallSoak:
 
     def _end(self, episode: Episode) -> None:
         self.tally.endings[episode.ending.name] += 1
-        if episode.ending in (Ending.DISABLE, Ending.QUICK_STOP):
-            self._ask(Verb.DISABLE if episode.ending is Ending.DISABLE else Verb.STOP)
+        if episode.ending in (SoakEnding.DISABLE, SoakEnding.QUICK_STOP):
+            self._ask(Verb.DISABLE if episode.ending is SoakEnding.DISABLE else Verb.STOP)
             self._wait_while(lambda status: status["axis"]["state"] not in ("DISABLED", "FAULT"))
             self._recover(Recovery.ENABLE)
             return
-        if episode.ending is Ending.HALT:
+        if episode.ending is SoakEnding.HALT:
             self._ask(Verb.HALT, on=True)
             time.sleep(0.2)
             self._ask(Verb.HALT, on=False)
@@ -181,7 +181,7 @@ class WallSoak:
 
     # --- faults ------------------------------------------------------------------------------------------------
 
-    def _befall(self, kind: FaultKind, chance: random.Random) -> None:
+    def _befall(self, kind: InjectionKind, chance: random.Random) -> None:
         """Inject, watch, judge, repair, recover."""
         tally = self.tally.of(kind.name)
         tally.injected += 1
@@ -216,7 +216,7 @@ class WallSoak:
     def _act(self, injection: Injection) -> None:
         action_of(injection, "soak", Runs.PROCESSES).apply(self._axis)
 
-    def _judge(self, kind: FaultKind, injected_ns: int, happened: bool) -> None:
+    def _judge(self, kind: InjectionKind, injected_ns: int, happened: bool) -> None:
         """Does the user see the fault, and was the torque gone in time by the drive's own record?
 
         Of what is ridden through no fault word tells; there must be its trace.

@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from servod.common.yaml import Strict, validate
 from servod.formats.protocol import PIECE_SAMPLES, SampleKey, Verb
-from servod.runtime.daemon.trajectory import Table
+from servod.runtime.daemon.trajectory import MotionTable
 from servod.runtime.loop.commands import ReferenceKind
 
 _Duration = Annotated[float, Field(gt=0.0, le=86_400.0)]
@@ -95,15 +95,15 @@ class TrackArgs(Strict):
         """The motion reads samples."""
         return self.kind in (MotionKind.CSV, MotionKind.EXCITE)
 
-    def table(self, uploaded: Table) -> Table:
+    def table(self, uploaded: MotionTable) -> MotionTable:
         """The motion's samples, or `uploaded` when they came ahead. Raises BadInput when they do not fit the kind."""
         if not self.has_table:
-            return Table()
-        table = uploaded if self.uploaded else Table(self.positions_rad, self.torques_nm)
+            return MotionTable()
+        table = uploaded if self.uploaded else MotionTable(self.positions_rad, self.torques_nm)
         table.require(torques=self.kind is MotionKind.EXCITE)
         return table
 
-    def reference(self, table: Table) -> list[float]:
+    def reference(self, table: MotionTable) -> list[float]:
         """The arguments of Op.REFERENCE; the samples of `table` must stand in the trajectory area already."""
         if not self.has_table:
             return [ReferenceKind[self.kind.name], *(float(getattr(self, key)) for key in _NEEDS[self.kind])]

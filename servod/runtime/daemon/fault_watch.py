@@ -23,7 +23,7 @@ from servod.runtime.daemon.recorder import Recorder
 from servod.runtime.daemon.status import WiringStatus
 from servod.runtime.loop.axis import AxisState
 from servod.runtime.loop.handle import LoopHandle
-from servod.runtime.loop.wiring.findings import Finding, document, sentence
+from servod.runtime.loop.wiring.findings import WiringOutcome, wiring_document, wiring_sentence
 
 log = logging.getLogger("servod.faults")
 
@@ -127,7 +127,7 @@ class FaultWatch:
 wiring_log = logging.getLogger("servod.wiring")
 
 
-class ProofWatch:
+class WiringTestWatch:
     """Looks whether another test has ended; `see` once per round."""
 
     def __init__(self, loop: LoopHandle, recorder: Recorder) -> None:
@@ -140,11 +140,11 @@ class ProofWatch:
         if proof is None or count == self._told:
             return
         self._told = count
-        text = sentence(proof)
+        text = wiring_sentence(proof)
         wiring_log.log(logging.INFO if proof.passed else logging.ERROR, "%s", text)
-        self._recorder.add_event("wiring", text, finding=Finding(int(proof.finding)).name)
+        self._recorder.add_event("wiring", text, finding=WiringOutcome(int(proof.finding)).name)
 
     def status(self) -> WiringStatus:
         """How many tests there were since the start, and how the last one ended."""
         count, proof = self._loop.proofs
-        return {"tests": count, "last": None if proof is None else document(proof)}
+        return {"tests": count, "last": None if proof is None else wiring_document(proof)}

@@ -97,7 +97,7 @@ class StateWait:
         return record
 
 
-class Orders:
+class OrderSender:
     """Commands on their way to the loop, by number."""
 
     TIMEOUT_NS = 2 * NS_PER_S

@@ -19,7 +19,7 @@ from servod.common.units import NS_PER_S
 from servod.formats.config import AxisConfig
 from servod.formats.recording.record import RECORD, CycleRecord
 from servod.runtime.daemon.control_server import ControlServer
-from servod.runtime.daemon.fault_watch import FaultWatch, ProofWatch
+from servod.runtime.daemon.fault_watch import FaultWatch, WiringTestWatch
 from servod.runtime.daemon.gain_bank import GainBank
 from servod.runtime.daemon.health import Health, Pulse
 from servod.runtime.daemon.metrics import AxisMetrics, MetricsServer
@@ -76,7 +76,7 @@ class Supervisor:
         self._health = Health(config.cycle.period_us, nodes.plans.bus_load)
         self._metrics = AxisMetrics(config.name, nodes.plans.bus_load)
         self._faults = FaultWatch(recorder, self._health, self._metrics, config.name)
-        self._proofs = ProofWatch(loop, recorder)
+        self._proofs = WiringTestWatch(loop, recorder)
         self._verbs = Verbs(config, loop, bank, recorder, self._document, self._tell_faults)
         self._selector = selectors.DefaultSelector()
         self._server = ControlServer(config.control, self._selector, self._verbs)

@@ -27,7 +27,7 @@ _JUMPS_BY = {
 }
 
 
-class Samples:
+class MotionSamples:
     """One column of samples, with its extent and its largest step."""
 
     def __init__(self, values: Sequence[float] = ()) -> None:
@@ -45,29 +45,29 @@ class Samples:
         self.values.extend(piece)
 
 
-class Table:
+class MotionTable:
     """What a table motion reads: positions in rad, and for an excitation as many torques in N*m."""
 
     def __init__(self, positions_rad: Sequence[float] | None = None, torques_nm: Sequence[float] | None = None) -> None:
         self._columns = {
-            SampleKey.POSITIONS: Samples(positions_rad or ()),
-            SampleKey.TORQUES: Samples(torques_nm or ()),
+            SampleKey.POSITIONS: MotionSamples(positions_rad or ()),
+            SampleKey.TORQUES: MotionSamples(torques_nm or ()),
         }
 
     @property
-    def positions(self) -> Samples:
+    def positions(self) -> MotionSamples:
         """The positions."""
         return self._columns[SampleKey.POSITIONS]
 
     @property
-    def torques(self) -> Samples:
+    def torques(self) -> MotionSamples:
         """The torques."""
         return self._columns[SampleKey.TORQUES]
 
     def add(self, key: SampleKey, start: int, piece: Sequence[float]) -> None:
         """Add a piece of a column; `start` 0 begins the column anew. Raises BadInput on a gap or too much."""
         if start == 0:
-            self._columns[key] = Samples()
+            self._columns[key] = MotionSamples()
         column = self._columns[key]
         if start != len(column.values):
             raise BadInput("trajectory: start", start, f"0, or {len(column.values)} to go on")
@@ -88,7 +88,7 @@ class Table:
         return self.positions.values + self.torques.values
 
 
-def check_motion(reference: Sequence[float], table: Table, config: AxisConfig, now: CycleRecord) -> None:
+def check_motion(reference: Sequence[float], table: MotionTable, config: AxisConfig, now: CycleRecord) -> None:
     """Check the arguments of Op.REFERENCE and their table against range, speed and following error, from the present
     reference on.
 

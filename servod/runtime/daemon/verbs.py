@@ -33,18 +33,18 @@ from servod.runtime.daemon.arguments import (
     check_arguments,
 )
 from servod.runtime.daemon.connection import Reply
-from servod.runtime.daemon.flows import Flow, Flows, FutureWait, Orders, OrderWait, StateWait
+from servod.runtime.daemon.flows import Flow, Flows, FutureWait, OrderSender, OrderWait, StateWait
 from servod.runtime.daemon.gain_bank import GainBank
 from servod.runtime.daemon.recorder import Recorder
 from servod.runtime.daemon.status import reason_texts
-from servod.runtime.daemon.trajectory import Table, check_motion
+from servod.runtime.daemon.trajectory import MotionTable, check_motion
 from servod.runtime.fieldbus.bus.open import open_bus
 from servod.runtime.fieldbus.devices import DriveState
 from servod.runtime.fieldbus.master.scan import scan
 from servod.runtime.loop.axis import AxisState
 from servod.runtime.loop.commands import REFUSAL_TEXT, Op, Refusal
 from servod.runtime.loop.handle import LoopHandle
-from servod.runtime.loop.wiring.findings import document, sentence
+from servod.runtime.loop.wiring.findings import wiring_document, wiring_sentence
 
 log = logging.getLogger("servod.control")
 
@@ -68,9 +68,9 @@ class Verbs:
         """`document` makes the status document, `faults` that of what befell the axis."""
         self._config, self._loop, self._bank, self._recorder = config, loop, bank, recorder
         self._document, self._faults = document, faults
-        self._orders, self._flows = Orders(), Flows()
+        self._orders, self._flows = OrderSender(), Flows()
         self._last: tuple[Op, OrderWait] | None = None
-        self._uploaded = Table()
+        self._uploaded = MotionTable()
         self._reference_seq = 0  # the last motion's command
         self._leases_ended = 0
         self._enabling = 0  # requests to enable an axis that was off, without an answer yet
@@ -110,7 +110,7 @@ class Verbs:
     def lease_ended(self) -> None:
         """Samples that the client sent ahead are void, a gain set that it tried is not kept, nor is an axis enabled
         that it waited for."""
-        self._uploaded = Table()
+        self._uploaded = MotionTable()
         self._leases_ended += 1
         if self._enabling:
             log.warning("the client that waited for the axis to be enabled left: disabled again")
@@ -174,10 +174,10 @@ class Verbs:
         tests, proof = self._loop.proofs
         tested = proof if tests != tests_before else None
         if record.axis_state == AxisState.ENABLED:
-            return {**_state(record), "wiring": document(tested) if tested else None}
+            return {**_state(record), "wiring": wiring_document(tested) if tested else None}
         state = AxisState(record.axis_state).name
         if tested is not None and record.faults_latched & _NOT_PROVEN:
-            raise AnswerIsNo(f"the axis is {state}, not enabled: {sentence(tested)}")
+            raise AnswerIsNo(f"the axis is {state}, not enabled: {wiring_sentence(tested)}")
         raise Unreachable(f"the axis is {state}, not enabled: {_why_not_enabled(record)}")
 
     def _disable(self, _args: NoArgs) -> Flow:
@@ -236,7 +236,7 @@ class Verbs:
         if self.motion_running():
             raise Unreachable(f"refused: {REFUSAL_TEXT[Refusal.MOTION_RUNNING]}")
 
-    def _duration_s(self, args: TrackArgs, table: Table) -> float:
+    def _duration_s(self, args: TrackArgs, table: MotionTable) -> float:
         if args.has_table:
             return (len(table.positions.values) - 1) * self._config.cycle.period_us * 1e-6
         return args.duration_s or 0.0

@@ -16,7 +16,7 @@ from enum import IntEnum
 from servod.formats.recording.record import RECORD
 from servod.runtime.loop.commands import Command, Op
 from servod.runtime.loop.realtime import Grant
-from servod.runtime.loop.wiring.findings import Proof
+from servod.runtime.loop.wiring.findings import WiringReport
 
 RECORD_SLOTS = 8192  # eight seconds at 1 kHz for a supervisor that hangs
 COMMAND_SLOTS = 16
@@ -41,7 +41,7 @@ _TRAJECTORY_AT = _RECORDS_AT + RECORD_SLOTS * RECORD.size
 _SIZE = _TRAJECTORY_AT + TRAJECTORY_SAMPLES * 8
 _COMMAND_HEAD = struct.Struct("<qqq")
 _PROOF_AT = _HEADER_BYTES // 2  # behind the words, in the same page
-_PROOF = struct.Struct(f"<{len(Proof._fields)}d")
+_PROOF = struct.Struct(f"<{len(WiringReport._fields)}d")
 
 
 class _Word(IntEnum):
@@ -87,7 +87,7 @@ class Channel:
         self._head = head + 1
         self._words[0] = head + 1
 
-    def write_proof(self, proof: Proof) -> None:
+    def write_proof(self, proof: WiringReport) -> None:
         """Publish how a test of the wiring ended; they are seconds apart."""
         _PROOF.pack_into(self._memory, _PROOF_AT, *proof)
         self._words[_Word.PROOFS] += 1
@@ -132,10 +132,10 @@ class Channel:
         text = bytes(self._view[_HEADER_BYTES + 8 : _HEADER_BYTES + 8 + length])
         return [Grant(*row) for row in json.loads(text)]
 
-    def proofs(self) -> tuple[int, Proof | None]:
+    def proofs(self) -> tuple[int, WiringReport | None]:
         """How many tests of the wiring have ended, and how the last one did."""
         count = self._words[_Word.PROOFS]
-        return count, Proof._make(_PROOF.unpack_from(self._memory, _PROOF_AT)) if count else None
+        return count, WiringReport._make(_PROOF.unpack_from(self._memory, _PROOF_AT)) if count else None
 
     def send(self, command: Command) -> bool:
         """Queue one command; False when the slots that are open to its kind are taken."""

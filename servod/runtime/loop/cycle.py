@@ -26,9 +26,9 @@ from servod.runtime.loop.limits import Limits
 from servod.runtime.loop.orders import Orders
 from servod.runtime.loop.plan import LoopPlan
 from servod.runtime.loop.references import Reference
-from servod.runtime.loop.wiring.checks import proof_bounds
-from servod.runtime.loop.wiring.findings import Proof
-from servod.runtime.loop.wiring.test import WiringProof
+from servod.runtime.loop.wiring.checks import wiring_test_bounds
+from servod.runtime.loop.wiring.findings import WiringReport
+from servod.runtime.loop.wiring.test import WiringTest
 
 _SUPERVISOR_LOST = FAULTS[FaultCode.SUPERVISOR_LOST].bit
 _NOT_PROVEN = FAULTS[FaultCode.WIRING_NOT_PROVEN].bit
@@ -39,7 +39,7 @@ GOODBYE_TIMEOUT_CYCLES = 1000
 _STOPPED_CYCLES = 5
 
 
-class Link(Protocol):
+class LoopPort(Protocol):
     """The loop's side of its supervisor: shared memory in a process of its own, plain lists when stepped."""
 
     @property
@@ -55,7 +55,7 @@ class Link(Protocol):
         """The next command, or None."""
         ...
 
-    def write_proof(self, proof: Proof) -> None:
+    def write_proof(self, proof: WiringReport) -> None:
         """Publish how a test of the wiring ended."""
         ...
 
@@ -77,7 +77,7 @@ class Cycle:
     """Everything that one cycle touches. `finished` turns true when a shutdown is complete."""
 
     def __init__(
-        self, plan: LoopPlan, bus: Bus, clock: Clock, link: Link, supervisor_alive: Callable[[], bool]
+        self, plan: LoopPlan, bus: Bus, clock: Clock, link: LoopPort, supervisor_alive: Callable[[], bool]
     ) -> None:
         """Build the cycle of `plan` on `bus`; all configuration is copied into plain values here."""
         config = plan.config
@@ -93,8 +93,8 @@ class Cycle:
             config.wiring_proof.timeout_s,
         )  # fmt: skip
         self.limits = Limits(config.limits)
-        bounds = proof_bounds(config, plan.amplifier.facts)
-        self.proof, self._proof_travel_rad = WiringProof(bounds), bounds.most_travel_rad
+        bounds = wiring_test_bounds(config, plan.amplifier.facts)
+        self.proof, self._proof_travel_rad = WiringTest(bounds), bounds.most_travel_rad
         self.controller = Controller()
         self.controller.activate(plan.law, plan.parameters, 0.0)
         self.reference = Reference(config.limits.ramp_down_s)

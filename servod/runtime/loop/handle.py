@@ -15,7 +15,7 @@ from servod.runtime.loop.channel import MAX_ARGUMENTS, Channel
 from servod.runtime.loop.commands import Command, Op
 from servod.runtime.loop.plan import LoopPlan
 from servod.runtime.loop.realtime import Grant
-from servod.runtime.loop.wiring.findings import Proof
+from servod.runtime.loop.wiring.findings import WiringReport
 
 START_TIMEOUT_S = 10.0
 
@@ -58,7 +58,7 @@ class LoopHandle:
         return self._channel.grants()
 
     @property
-    def proofs(self) -> tuple[int, Proof | None]:
+    def proofs(self) -> tuple[int, WiringReport | None]:
         """How many tests of the wiring have ended since the start, and how the last one did."""
         return self._channel.proofs()
 

@@ -7,18 +7,18 @@ from collections.abc import Callable
 
 import pytest
 
-from servod.drivers.virtual.power_state import TRANSITIONS, Command, decode_command
+from servod.drivers.virtual.power_state import TRANSITIONS, DriveCommand, decode_command
 from servod.runtime.fieldbus.cia import STATUS_WORD_TABLE, Obj402
 from servod.runtime.fieldbus.devices import DriveState
 from tests.drivers.virtual.bench import AMPLIFIER, Bench
 
 S = DriveState
 WORDS = {
-    Command.DISABLE_VOLTAGE: 0x00,
-    Command.QUICK_STOP: 0x02,
-    Command.SHUTDOWN: 0x06,
-    Command.SWITCH_ON: 0x07,
-    Command.ENABLE_OPERATION: 0x0F,
+    DriveCommand.DISABLE_VOLTAGE: 0x00,
+    DriveCommand.QUICK_STOP: 0x02,
+    DriveCommand.SHUTDOWN: 0x06,
+    DriveCommand.SWITCH_ON: 0x07,
+    DriveCommand.ENABLE_OPERATION: 0x0F,
 }
 PATHS = {
     S.SWITCH_ON_DISABLED: (0x00,),
@@ -48,8 +48,8 @@ def shown(bench: Bench) -> DriveState:
 
 @pytest.mark.parametrize("order", [by_sdo, by_pdo])
 @pytest.mark.parametrize("state", PATHS)
-@pytest.mark.parametrize("command", Command)
-def test_every_pair_of_state_and_command(state: DriveState, command: Command, order: Order) -> None:
+@pytest.mark.parametrize("command", DriveCommand)
+def test_every_pair_of_state_and_command(state: DriveState, command: DriveCommand, order: Order) -> None:
     bench = Bench()
     bench.write(AMPLIFIER, Obj402.QUICK_STOP_OPTION, 0, 6, 2)  # stay in quick stop active
     bench.operational()
@@ -58,7 +58,7 @@ def test_every_pair_of_state_and_command(state: DriveState, command: Command, or
     assert shown(bench) is state
     order(bench, WORDS[command])
     expected = TRANSITIONS.get((state, command), (0, state))[1]
-    if state is S.READY_TO_SWITCH_ON and command is Command.ENABLE_OPERATION:
+    if state is S.READY_TO_SWITCH_ON and command is DriveCommand.ENABLE_OPERATION:
         expected = S.OPERATION_ENABLED  # 3, and 4 follows by itself
     assert shown(bench) is expected
 
@@ -203,4 +203,4 @@ def test_fault_reaction_by_every_option(bench: Bench, option: int) -> None:
 @pytest.mark.parametrize("word", range(16))
 def test_every_word_is_one_command(word: int) -> None:
     assert decode_command(word | 0xFF00) is decode_command(word)
-    assert (decode_command(word) is Command.DISABLE_VOLTAGE) is not bool(word & 2)
+    assert (decode_command(word) is DriveCommand.DISABLE_VOLTAGE) is not bool(word & 2)

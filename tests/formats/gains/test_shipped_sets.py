@@ -13,7 +13,7 @@ import pytest
 from servod.common.errors import BadInput
 from servod.formats.gains.gain_set import load_gains, require_fit
 from servod.qualify.demo.axis import CERTIFIED, demo_config, gains_file
-from servod.qualify.demo.certified import margins
+from servod.qualify.demo.entries import margins
 from servod.runtime.daemon.gain_bank import GainBank
 
 ROOT = Path(__file__).resolve().parents[3]

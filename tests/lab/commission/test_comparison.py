@@ -9,8 +9,8 @@ from servod.formats.gains.gain_set import pd_set
 from servod.lab.commission.comparison import measured, run_files
 from servod.lab.commission.state import read_walk_json as read_json
 from servod.lab.commission.state import write_json, write_text
-from servod.lab.commission.walk import Options
-from servod.lab.tune.plan import TunePlan
+from servod.lab.commission.walk import WalkOptions
+from servod.lab.tune.plan import TuningSettings
 from servod.lab.tune.tuning import noise_seeds
 from servod.qualify.paper.experiments import SCORING_SEED_OFFSET
 from tests.lab.commission.test_state import walk
@@ -40,15 +40,15 @@ def test_nothing_is_measured_twice(tmp_path: Path) -> None:
 
 
 def test_scoring_tuning_and_identification_share_no_noise() -> None:
-    assert (Options().seed, Options().scoring_seed, Options().tuning_seed) == (1, 101, 201)
+    assert (WalkOptions().seed, WalkOptions().scoring_seed, WalkOptions().tuning_seed) == (1, 101, 201)
     for seed in (*range(1200), 10**6, 10**6 + 199):
-        options = Options(seed=seed)
-        tuning = TunePlan(seed=options.tuning_seed)
+        options = WalkOptions(seed=seed)
+        tuning = TuningSettings(seed=options.tuning_seed)
         ranges = (
             {seed, seed + 1},  # joint and encoder of the virtual axis
             {options.scoring_seed, options.scoring_seed + 1},
             {tuning.seed, *noise_seeds(tuning)},
         )
         assert sum(map(len, ranges)) == len(set.union(*ranges)), seed
-    paper = TunePlan(seed=1)
+    paper = TuningSettings(seed=1)
     assert {1 + SCORING_SEED_OFFSET, 2 + SCORING_SEED_OFFSET}.isdisjoint({1, 2, *noise_seeds(paper)})

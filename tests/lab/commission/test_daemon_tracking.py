@@ -9,7 +9,7 @@ import pytest
 from servod.client.control import ControlClient
 from servod.common.errors import AnswerIsNo, BadInput, Unreachable
 from servod.formats.config import load_config
-from servod.lab.commission.daemon_tracking import measure_on_daemon
+from servod.lab.commission.steps.validate import measure_on_daemon
 from servod.lab.tracking.metrics import STEPS_MRAD
 from tests.runtime.daemon.running import running
 

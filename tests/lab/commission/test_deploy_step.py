@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from servod.client.axis import LOOK_S, AxisClient, AxisStatus, ReferenceMotion, Watch
+from servod.client.axis import LOOK_S, AxisClient, AxisReading, ReferenceMotion, Watch
 from servod.client.open import VirtualWalkAxis
 from servod.formats.config import AxisConfig
 from servod.formats.gains.gain_set import GainSet, Promise, parse_gains
@@ -23,7 +23,7 @@ from servod.lab.commission.state import read_walk_json as read_json
 from servod.lab.commission.steps.deploy import Deploy, remembered
 from servod.lab.commission.walk import run
 from servod.lab.recordings.recording import ROW, Rows
-from servod.lab.report.figure import Table
+from servod.lab.report.figure import PageTable
 from servod.lab.verify.validation import STEP_S, Array
 from tests.formats.gains import good
 from tests.lab.commission.test_state import walk
@@ -63,8 +63,8 @@ class Remembers:
         assert stored is not None
         return self.tried or (stored.name, stored.version)
 
-    def status(self) -> AxisStatus:
-        return AxisStatus("ENABLED" if self.enabled else "DISABLED", False, 0.0, 0.0)
+    def status(self) -> AxisReading:
+        return AxisReading("ENABLED" if self.enabled else "DISABLED", False, 0.0, 0.0)
 
     def run(self, motion: ReferenceMotion, watch: Watch | None = None, look_s: float = LOOK_S) -> bytes:
         words = motion.arguments
@@ -161,5 +161,5 @@ def test_a_set_that_was_active_before_the_walk_has_nothing_before_it(folder: Pat
     run(here, (Deploy(),))
     assert not (folder / BEFORE).exists() and not (folder / BEFORE_ROWS).exists()
     table, said = sections(here, NEW, table1())["Deployment"]()
-    assert isinstance(table, Table) and table.header == ("figure", "after", "promised")
+    assert isinstance(table, PageTable) and table.header == ("figure", "after", "promised")
     assert isinstance(said, str) and "promise alone" in said

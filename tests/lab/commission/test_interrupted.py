@@ -27,7 +27,7 @@ from servod.lab.commission.state import (
     file_sha256,
 )
 from servod.lab.commission.steps import STEPS, rivals, validate
-from servod.lab.commission.walk import Options, Questions, Step, Tell, Walk, run
+from servod.lab.commission.walk import Questions, Step, Tell, Walk, WalkOptions, run
 from tests.lab.synthesize.designs import table1
 
 AXIS = VirtualWalkAxis(table1(), seed=1)
@@ -47,7 +47,7 @@ def walk_in(folder: Path, told: list[str], cut: str = "") -> Walk:
         yield tell
 
     folder.mkdir(exist_ok=True)
-    options = Options(plants=2, processes=1, least_plants=2, budget=6)
+    options = WalkOptions(plants=2, processes=1, least_plants=2, budget=6)
     return Walk(folder, AXIS, options, Questions(True, lambda _q: True), progress, told.append)
 
 

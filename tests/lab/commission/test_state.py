@@ -15,7 +15,7 @@ import pytest
 from servod.client.open import VirtualWalkAxis
 from servod.common.errors import AnswerIsNo, BadInput, Unreachable
 from servod.lab.commission.state import State, sole_walk, write_text
-from servod.lab.commission.walk import Options, Questions, Tell, Walk, run
+from servod.lab.commission.walk import Questions, Tell, Walk, WalkOptions, run
 from tests.lab.synthesize.designs import table1
 
 AXIS = VirtualWalkAxis(table1(), seed=1)
@@ -29,7 +29,7 @@ def silent(_title: str) -> Iterator[Tell]:
 
 def walk(folder: Path, axis: VirtualWalkAxis = AXIS, **options: Any) -> Walk:
     folder.mkdir(exist_ok=True)
-    return Walk(folder, axis, Options(**options), Questions(True, lambda _q: True), silent, lambda _line: None)
+    return Walk(folder, axis, WalkOptions(**options), Questions(True, lambda _q: True), silent, lambda _line: None)
 
 
 @dataclass(frozen=True)

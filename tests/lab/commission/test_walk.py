@@ -33,9 +33,9 @@ from servod.lab.commission.steps.deploy import Deploy
 from servod.lab.commission.steps.synthesize import Synthesize, agreed, relaxed, tell_clashes
 from servod.lab.commission.steps.validate import document as comparison
 from servod.lab.commission.steps.verify import Verify
-from servod.lab.commission.walk import Options, Questions, Step, StepFailed, Tell, Walk, run
-from servod.lab.deploy.deployment import announced
-from servod.lab.report.figure import Figure, Table
+from servod.lab.commission.walk import Questions, Step, StepFailed, Tell, Walk, WalkOptions, run
+from servod.lab.deploy.deployment import motion_notice
+from servod.lab.report.figure import Figure, PageTable
 from servod.lab.synthesize.deployed import Wishes
 from servod.lab.synthesize.infeasible import Infeasible, Relaxation
 from servod.lab.tracking import metrics
@@ -76,7 +76,7 @@ def walk_in(folder: Path, interrupted: str = "") -> Walk:
 
         yield tell
 
-    options = Options(plants=2, processes=1, least_plants=2)
+    options = WalkOptions(plants=2, processes=1, least_plants=2)
     return Walk(folder, AXIS, options, Questions(True, lambda _q: True), progress, lambda _line: None)
 
 
@@ -117,25 +117,27 @@ def test_a_relaxation_changes_its_own_wish_alone() -> None:
 
 
 def test_no_design_is_for_more_speed_than_the_axis_may_have_or_was_identified_with(tmp_path: Path) -> None:
-    def loop(options: Options, limit_rad_s: float) -> dict[str, Any]:
+    def loop(options: WalkOptions, limit_rad_s: float) -> dict[str, Any]:
         limits = AXIS.config.limits.model_copy(update={"speed_rad_s": limit_rad_s})
         axis = replace(AXIS, chosen=AXIS.config.model_copy(update={"limits": limits}))
         found: dict[str, Any] = Synthesize().inputs(replace(walk_in(tmp_path), axis=axis, options=options))["loop"]
         assert found["overlap"][0] < found["overlap"][1] < found["speed_max"]
         return found
 
-    assert loop(Options(), 3.0)["speed_max"] == 0.5
-    assert loop(Options(), 0.2)["speed_max"] == 0.2
-    assert loop(Options(speed_rad_s=0.1), 0.2)["speed_max"] == 0.1
-    assert loop(Options(speed_rad_s=0.02), 0.2)["speed_max"] == 0.02
+    assert loop(WalkOptions(), 3.0)["speed_max"] == 0.5
+    assert loop(WalkOptions(), 0.2)["speed_max"] == 0.2
+    assert loop(WalkOptions(speed_rad_s=0.1), 0.2)["speed_max"] == 0.1
+    assert loop(WalkOptions(speed_rad_s=0.02), 0.2)["speed_max"] == 0.02
 
 
 def test_what_is_announced_of_a_trial_goes_with_the_design(folder: Path) -> None:
     gains = load_gains(folder / GAINS)
     assert gains.design is not None
-    assert announced(gains).startswith("sines and steps of up to 20.1 mrad to each side, sines at up to 0.25 rad/s")
+    assert motion_notice(gains).startswith("sines and steps of up to 20.1 mrad to each side, sines at up to 0.25 rad/s")
     slower = gains.model_copy(update={"design": gains.design.model_copy(update={"speed_max_rad_s": 0.1})})
-    assert announced(slower).startswith("sines and steps of up to 4.01 mrad to each side, sines at up to 0.05 rad/s")
+    assert motion_notice(slower).startswith(
+        "sines and steps of up to 4.01 mrad to each side, sines at up to 0.05 rad/s"
+    )
 
 
 def test_what_is_offered_is_taken_by_yes_or_a_person_alone_also_on_a_virtual_axis(tmp_path: Path) -> None:
@@ -183,14 +185,14 @@ def test_curves_come_back_from_disk_and_stand_on_the_page(folder: Path) -> None:
     assert set(made) == SHOWN
     figures = {part.name for parts in made.values() for part in parts if isinstance(part, Figure)}
     assert {"bode", "impulse_responses", "weighting_functions", "before_after", "step_100_free_feedback"} <= figures
-    (reached,) = (p for p in made["Tracking"] if isinstance(p, Table) and "tuning reached" in p.title)
+    (reached,) = (p for p in made["Tracking"] if isinstance(p, PageTable) and "tuning reached" in p.title)
     over = "Deployed, over the limit (x2)"
     assert [(row[0], *row[3:]) for row in reached.rows] == [("Local models", "4.20", "5"), (over, "10.00", "5")]
-    (compared,) = (p for p in made["Tracking"] if isinstance(p, Table) and "mrad and s" in p.title)
+    (compared,) = (p for p in made["Tracking"] if isinstance(p, PageTable) and "mrad and s" in p.title)
     assert {(row[0], row[4]) for row in compared.rows} == {("Local models", "4.2"), (over, "10")}
     (said,) = (p for p in made["Tracking"] if isinstance(p, str))
     assert "10 times the roughness of the paper's PD, over the limit (x2)" in said
-    assert any(isinstance(part, Table) and "Certificate" in part.title for part in made["The certificate"])
+    assert any(isinstance(part, PageTable) and "Certificate" in part.title for part in made["The certificate"])
 
 
 def judged(ratio: float) -> dict[str, Any]:

@@ -15,9 +15,9 @@ from servod.common.faults import FAULTS, FaultCode
 from servod.formats.gains.gain_set import pd_set
 from servod.formats.gains.store import Action, GainStore
 from servod.formats.model.axis_model import AxisModel
-from servod.lab.deploy.deployment import cut, deploy, run_validation
+from servod.lab.deploy.deployment import deploy, interrupted, run_validation
 from servod.lab.deploy.judge import limits_met, motions_in
-from servod.lab.deploy.outcome import Before, Ending
+from servod.lab.deploy.outcome import Baseline, Ending
 from servod.lab.recordings.recording import ROW, Rows
 from servod.lab.verify.plants import scaled
 from servod.lab.verify.validation import motion_for
@@ -39,7 +39,7 @@ def quiet(_what: str, _share: float) -> None:
 
 def test_a_good_set_stays_and_is_compared_with_what_was_before_also_once_it_runs(tmp_path: Path) -> None:
     axis = axis_of(table1(), tmp_path)
-    told: list[Before] = []
+    told: list[Baseline] = []
     done = deploy(axis, certified(), quiet, remember=told.append)
     assert done.proven, done.reasons
     assert axis.active == (certified().name, 1) and done.ending is Ending.KEPT
@@ -104,7 +104,7 @@ def test_a_set_that_loses_the_joint_on_a_sine_is_given_no_step(tmp_path: Path) -
     motion = motion_for(certified().design or pytest.fail("designed"))
     rows = run_validation(axis, motion, 2e-4)
     (sines,) = motions_in(rows)
-    assert len(sines) < len(motion.sines) and cut(rows, motion)
+    assert len(sines) < len(motion.sines) and interrupted(rows, motion)
     assert np.ptp(sines["reference_rad"]) < motion.travel_rad
     assert len(motions_in(run_validation(axis, motion, 0.4))) == 3
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from servod.formats.gains.gain_set import Promise
-from servod.lab.deploy.judge import complaints, promise_limits
+from servod.lab.deploy.judge import promise_limits, rejections
 from servod.lab.verify.validation import Figures, Part, ValidationMotion
 
 PROMISE = Promise(slow_rad=2e-5, brisk_rad=1e-4, hold_rad=1e-5, plants=25)
@@ -19,30 +19,30 @@ def figures(slow: float = 2e-5, brisk: float = 1e-4, hold: float = 1e-5, scatter
 
 
 def test_the_same_again_is_no_worse() -> None:
-    assert complaints(figures(), figures(), PROMISE, COUNT_RAD) == []
+    assert rejections(figures(), figures(), PROMISE, COUNT_RAD) == []
 
 
 def test_worse_within_the_scatter_stays_and_beyond_it_goes() -> None:
     before = figures(slow=1e-5, scatter=4e-6)
-    assert complaints(before, figures(slow=2.5e-5 - 2e-6), PROMISE, COUNT_RAD) == []
-    (said,) = complaints(figures(slow=1e-5), figures(slow=2.5e-5), PROMISE, COUNT_RAD)
+    assert rejections(before, figures(slow=2.5e-5 - 2e-6), PROMISE, COUNT_RAD) == []
+    (said,) = rejections(figures(slow=1e-5), figures(slow=2.5e-5), PROMISE, COUNT_RAD)
     assert "slow sine went from 0.01 to 0.025 mrad" in said
 
 
 def test_a_restless_set_does_not_widen_its_own_limit() -> None:
     before = figures(slow=1e-5)
     calm, restless = figures(slow=2.5e-5), figures(slow=2.5e-5, scatter=2.4e-5)
-    assert complaints(before, restless, PROMISE, COUNT_RAD) == complaints(before, calm, PROMISE, COUNT_RAD) != []
+    assert rejections(before, restless, PROMISE, COUNT_RAD) == rejections(before, calm, PROMISE, COUNT_RAD) != []
 
 
 def test_a_hold_that_swings_more_than_before_goes_though_it_was_promised() -> None:
     promised = PROMISE.model_copy(update={"hold_rad": 1e-4})
     before, limit = figures(hold=1e-5), 1.1e-5 + 4.0 * COUNT_RAD + 0.05 * 2e-5
-    assert complaints(before, figures(hold=0.99 * limit), promised, COUNT_RAD) == []
-    (said,) = complaints(before, figures(hold=1.01 * limit), promised, COUNT_RAD)
+    assert rejections(before, figures(hold=0.99 * limit), promised, COUNT_RAD) == []
+    (said,) = rejections(before, figures(hold=1.01 * limit), promised, COUNT_RAD)
     assert said.startswith("swing while it holds")
     stuck = figures(slow=8e-3, hold=1e-5)  # milliradians away, and still
-    assert complaints(stuck, figures(hold=1.3e-4), promised, COUNT_RAD) == []
+    assert rejections(stuck, figures(hold=1.3e-4), promised, COUNT_RAD) == []
 
 
 @pytest.mark.parametrize("part", list(Part))
@@ -50,8 +50,8 @@ def test_a_broken_promise_is_named(part: Part) -> None:
     limit = promise_limits(PROMISE, COUNT_RAD)[part]
     poor = figures(slow=1.0, brisk=1.0, hold=1.0)
     kept, broken = (figures(**{part.value: factor * limit}) for factor in (0.99, 1.01))
-    assert complaints(poor, kept, PROMISE, COUNT_RAD) == []
-    (said,) = complaints(poor, broken, PROMISE, COUNT_RAD)
+    assert rejections(poor, kept, PROMISE, COUNT_RAD) == []
+    (said,) = rejections(poor, broken, PROMISE, COUNT_RAD)
     assert "the certificate promised" in said
 
 

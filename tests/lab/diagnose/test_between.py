@@ -9,7 +9,7 @@ from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.base import base_unknowns, document_of
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 from servod.lab.diagnose.judge.covariance import common_factor, jackknife, model_error
 from servod.lab.diagnose.predict.innovation_kernel import mean_command
 from servod.lab.diagnose.predict.predict import Predictor
@@ -24,7 +24,7 @@ def colder(first: float, second: float) -> tuple[Predictor, Fit]:
     more = friction | {key: friction[key] * second / first for key in ("coulomb", "static", "viscous")}
     made = [record(believed())[0], record(believed(friction=more))[0]]
     predictor = Predictor(load_traces(made, believed())[0], believed())
-    scene = Scene(document_of(believed()), predictor, predictor.mismatch(believed()))
+    scene = SearchContext(document_of(believed()), predictor, predictor.mismatch(believed()))
     term = next(term for term in effect("thermal").terms(scene) if term.form == "between recordings")
     hypothesis = Hypothesis(document_of(believed()), base_unknowns(believed())).with_term(term)
     at = hypothesis.start.copy()
@@ -52,7 +52,7 @@ def test_estimates_are_as_sure_as_recordings_agree() -> None:
 
 def test_an_unknown_gain_leaves_the_scale_to_what_was_known() -> None:
     scene_predictor, plain = colder(1.0, 1.1)
-    scene = Scene(document_of(believed()), scene_predictor, plain.mismatch)
+    scene = SearchContext(document_of(believed()), scene_predictor, plain.mismatch)
     hypothesis = Hypothesis(document_of(believed()), base_unknowns(believed()))
     hypothesis = hypothesis.with_term(effect("torque_gain").terms(scene)[0])
     fit = Fit(hypothesis, hypothesis.start, plain.mismatch, 0.0, plain.jacobian[:, : len(hypothesis.start)], True)

@@ -10,7 +10,7 @@ import pytest
 
 from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.effects import effect
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 from servod.lab.diagnose.judge.verdict import confidence
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.candidates import Candidate
@@ -39,7 +39,7 @@ def selector() -> Selector:
 
 def added(selector: Selector, present: Fit, name: str) -> Fit:
     """The fit with the first form of an effect beside what is in."""
-    scene = Scene(selector.start.document, selector.predictor, present.mismatch)
+    scene = SearchContext(selector.start.document, selector.predictor, present.mismatch)
     hypothesis = present.hypothesis.with_term(effect(name).terms(scene)[0])
     return selector.settle(hypothesis, hypothesis.beside(present.coordinates), present.mismatch)
 

@@ -20,7 +20,7 @@ from servod.lab.diagnose.effects.base import base_unknowns, document_of
 from servod.lab.diagnose.effects.effect import Effect, simple
 from servod.lab.diagnose.effects.hypothesis import Hypothesis, Unknown
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 from servod.lab.diagnose.explain import explain_effect, list_effects
 from servod.lab.diagnose.judge.covariance import common_factor
 from servod.lab.diagnose.judge.verdict import alternatives
@@ -33,11 +33,11 @@ from tests.lab.diagnose.axes import believed, record
 
 
 @functools.cache
-def scene() -> Scene:
+def scene() -> SearchContext:
     model = believed(gravity={"amplitude": 0.1, "phase": 0.2})
     traces, _ = load_traces(record(model), model)
     predictor = Predictor(traces, model)
-    return Scene(document_of(model), predictor, predictor.mismatch(believed()))
+    return SearchContext(document_of(model), predictor, predictor.mismatch(believed()))
 
 
 @pytest.mark.parametrize("name", NAMES)

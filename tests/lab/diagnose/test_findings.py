@@ -12,9 +12,8 @@ from servod.formats.model.axis_model import AxisModel
 from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.hypothesis import Term
-from servod.lab.diagnose.effects.scene import Scene
-from servod.lab.diagnose.judge.conclude import minor
-from servod.lab.diagnose.judge.findings import differs_from_zero, name_findings
+from servod.lab.diagnose.effects.scene import SearchContext
+from servod.lab.diagnose.judge.conclude import differs_from_zero, minor, name_findings
 from servod.lab.diagnose.judge.judgement import JudgedSelection, judge
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.result import MinorReason
@@ -44,7 +43,7 @@ def selector() -> Selector:
 def form(selector: Selector, name: str) -> Term:
     """The first form of an effect."""
     mismatch = selector.predictor.mismatch(believed())
-    return effect(name).terms(Scene(selector.start.document, selector.predictor, mismatch))[0]
+    return effect(name).terms(SearchContext(selector.start.document, selector.predictor, mismatch))[0]
 
 
 def sorted_with(selector: Selector, *terms: Term) -> JudgedSelection:

@@ -11,7 +11,7 @@ import pytest
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.disturbance import EVERY
 from servod.lab.diagnose.effects.hypothesis import Term
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 from servod.lab.diagnose.judge.free_run import free_run_gain, window_errors
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.cross_validation import RECORDING, STRETCH, make_folds, predict_held_out, single_events
@@ -56,7 +56,7 @@ def pushes(predictor: Predictor) -> list[Term]:
     for part in predictor.slices:
         first = part.start + round(2.0 / trace.period_s)
         mismatch[first : first + round(0.5 / trace.period_s)] = 0.05
-    return effect("disturbance").terms(Scene({}, predictor, mismatch))
+    return effect("disturbance").terms(SearchContext({}, predictor, mismatch))
 
 
 def test_a_level_is_not_that_of_the_rows_that_it_is_judged_by(levels: tuple[Predictor, Fit]) -> None:

@@ -9,10 +9,10 @@ from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.base import base_unknowns, document_of
 from servod.lab.diagnose.effects.hypothesis import Document, Hypothesis
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.fit import Fit
-from servod.lab.diagnose.select.levels import is_level_change, on_bound
+from servod.lab.diagnose.select.levels import is_level_change, level_at_bound
 from tests.lab.diagnose.axes import believed, record
 
 
@@ -29,24 +29,24 @@ def fit_with(key: str, factor: float) -> Fit:
 @pytest.mark.parametrize("key", ["friction.sigma0", "friction.sigma1", "friction.static", "inertia"])
 @pytest.mark.parametrize("factor", [0.2, 5.0])
 def test_a_parameter_pulled_beyond_its_level_stands_on_its_bound(key: str, factor: float) -> None:
-    assert on_bound(fit_with(key, factor))
-    assert not on_bound(fit_with(key, 1.05 if factor > 1.0 else 0.95))
+    assert level_at_bound(fit_with(key, factor))
+    assert not level_at_bound(fit_with(key, 1.05 if factor > 1.0 else 0.95))
 
 
 def test_what_has_no_level_is_recalibrated_only() -> None:
-    assert not on_bound(fit_with("friction.viscous", 2.0))
-    assert not on_bound(fit_with("friction.stribeck_velocity", 3.0))
+    assert not level_at_bound(fit_with("friction.viscous", 2.0))
+    assert not level_at_bound(fit_with("friction.stribeck_velocity", 3.0))
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
+def scene() -> SearchContext:
     """An axis with nothing left."""
     model = believed()
     predictor = Predictor(load_traces(record(model, seconds=3.0), model)[0], model)
-    return Scene(document_of(model), predictor, np.zeros(len(predictor.counts)))
+    return SearchContext(document_of(model), predictor, np.zeros(len(predictor.counts)))
 
 
-def test_levels_are_what_opens_the_models_own(scene: Scene) -> None:
+def test_levels_are_what_opens_the_models_own(scene: SearchContext) -> None:
     for name in ("stribeck", "presliding", "torque_offset", "inertia"):
         terms = effect(name).terms(scene)
         assert all(is_level_change(term) is (term.form != "fading damping") for term in terms) and len(terms) > 0
@@ -55,12 +55,12 @@ def test_levels_are_what_opens_the_models_own(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("name", ["stribeck", "presliding", "torque_offset", "inertia"])
-def test_a_level_is_released_from_where_it_stands_too(scene: Scene, name: str) -> None:
+def test_a_level_is_released_from_where_it_stands_too(scene: SearchContext, name: str) -> None:
     """Beside other effects the refit has gone most of the way: far starts must not be the only ones."""
     assert any(not term.begins and not term.unknowns for term in effect(name).terms(scene))
 
 
-def test_friction_of_one_direction_alone_may_differ(scene: Scene) -> None:
+def test_friction_of_one_direction_alone_may_differ(scene: SearchContext) -> None:
     """Dry and viscous friction 0.72 of the model's backwards and the model's own forwards: both means are off."""
     term = next(t for t in effect("asymmetry").terms(scene) if t.form == "both, another level")
     document: Document = {}
@@ -69,7 +69,7 @@ def test_friction_of_one_direction_alone_may_differ(scene: Scene) -> None:
     assert document["asymmetry"] == pytest.approx(expected)
 
 
-def test_beside_a_longer_delay_the_models_own_is_as_well_known_as_before(scene: Scene) -> None:
+def test_beside_a_longer_delay_the_models_own_is_as_well_known_as_before(scene: SearchContext) -> None:
     """The two add up: without what is known of the model's own, nothing tells the share of either."""
     base = Hypothesis(scene.document, base_unknowns(believed()))
     for name in ("delay", "actuator_lag"):
@@ -78,7 +78,7 @@ def test_beside_a_longer_delay_the_models_own_is_as_well_known_as_before(scene: 
         assert own.spread == next(u for u in base.base if u.key == "delay_s").spread
 
 
-def test_a_level_that_is_released_is_known_no_more(scene: Scene) -> None:
+def test_a_level_that_is_released_is_known_no_more(scene: SearchContext) -> None:
     base = Hypothesis(scene.document, base_unknowns(believed()))
     released = base.with_term(next(t for t in effect("inertia").terms(scene) if t.opens))
     assert np.isinf(next(u for u in released.unknowns if u.key == "inertia").spread)

@@ -13,7 +13,7 @@ from servod.lab.diagnose.data.trace import CheckedTrace
 from servod.lab.diagnose.effects import effect, names, unexcited_effects
 from servod.lab.diagnose.effects.base import document_of
 from servod.lab.diagnose.effects.cogging import whole_orders
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.selector import Selector
 from servod.lab.recordings import load_recording
@@ -51,7 +51,7 @@ if ODRIVE.is_dir():
         traces, model = traces_of("odrive", ODRIVE / "slow_turn_nocomp_0.csv.gz")
         assert unexcited_effects(traces, model.inertia) == names(lambda what: what.swift or what.directed)
         predictor = Predictor(traces, model)
-        orders = whole_orders(Scene(document_of(model), predictor, predictor.mismatch(model)))
+        orders = whole_orders(SearchContext(document_of(model), predictor, predictor.mismatch(model)))
         held = np.loadtxt(ODRIVE / "static_hold_map.csv.gz", delimiter=",", skiprows=1)[:, 1]
         strongest = np.argsort(-np.abs(np.fft.rfft(held - held.mean())))[:5]
         assert len({*strongest.tolist()} & set(orders)) >= 3
@@ -75,7 +75,7 @@ if EMPS.is_dir():
         predictor = Predictor(traces, model)
         selector = Selector(predictor, model, math.inf, lambda _line: None)
         base = selector.settle(selector.start, None, predictor.mismatch(model))
-        term = effect("asymmetry").terms(Scene(document_of(model), predictor, base.mismatch))[0]
+        term = effect("asymmetry").terms(SearchContext(document_of(model), predictor, base.mismatch))[0]
         hypothesis = base.hypothesis.with_term(term)
         fit = selector.settle(hypothesis, hypothesis.beside(base.coordinates), base.mismatch)
         assert selector.error(fit.mismatch) < 0.6 * selector.error(base.mismatch)
@@ -87,5 +87,7 @@ if EMPS.is_dir():
         """Before any fit, beside whatever else the published model leaves out."""
         traces, model = traces_of("emps", EMPS / "DATA_EMPS.mat")
         predictor = Predictor(traces, model)
-        straight = effect("offset_drift").terms(Scene(document_of(model), predictor, predictor.mismatch(model)))[0]
+        straight = effect("offset_drift").terms(
+            SearchContext(document_of(model), predictor, predictor.mismatch(model))
+        )[0]
         assert 0.3 < straight.unknowns[0].start < 0.8

@@ -12,7 +12,7 @@ from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.document import diagnosis_document
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.base import document_of
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 from servod.lab.diagnose.engine import diagnose
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.refine import add_drift
@@ -45,7 +45,9 @@ def test_a_drift_starts_near_its_size() -> None:
     model = believed()
     traces, _ = load_traces(record(believed(offset_drift={"per_s": 0.006}, torque_offset=-0.01)), model)
     predictor = Predictor(traces, model)
-    straight, ending = effect("offset_drift").terms(Scene(document_of(model), predictor, predictor.mismatch(model)))
+    straight, ending = effect("offset_drift").terms(
+        SearchContext(document_of(model), predictor, predictor.mismatch(model))
+    )
     (change,), (changes, time_s) = straight.unknowns, ending.unknowns
     assert change.start == pytest.approx(0.006 * traces[0].duration_s, rel=0.2)
     late = 1.0 - np.exp(-traces[0].duration_s / time_s.start)

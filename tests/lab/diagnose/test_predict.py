@@ -13,7 +13,7 @@ from servod.formats.model.effects import Gravity
 from servod.kernels.laws import LAWS
 from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.effects import effect
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.selection import Selection
 from servod.lab.diagnose.select.selector import Selector
@@ -93,7 +93,9 @@ def test_own_torque_is_what_the_term_stands_for() -> None:
     """Friction of 6 % of the command beside parameters that have not moved."""
     model = believed()
     selector = Selector(Predictor(load_traces(record(model, seconds=3.0), model)[0], model), model, 1e9, print)
-    term = effect("load_dependent_friction").terms(Scene(selector.start.document, selector.predictor, np.zeros(0)))[0]
+    term = effect("load_dependent_friction").terms(
+        SearchContext(selector.start.document, selector.predictor, np.zeros(0))
+    )[0]
     mismatch = selector.predictor.mismatch(model)
     base = selector.fitter(mismatch).begin(selector.start)
     hypothesis = selector.start.with_term(term)

@@ -14,7 +14,7 @@ from servod.lab.diagnose.effects.disturbance import SHORTEST_S, windows
 from servod.lab.diagnose.effects.disturbance import terms as windows_of
 from servod.lab.diagnose.effects.effect import sine_term
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
-from servod.lab.diagnose.effects.scene import Peak, Scene
+from servod.lab.diagnose.effects.scene import Peak, SearchContext
 from servod.lab.diagnose.judge.verdict import Shares, alternatives, verdict
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.result import DiagnosisVerdict
@@ -27,16 +27,16 @@ from tests.lab.diagnose.axes import believed, record
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
+def scene() -> SearchContext:
     """An axis with nothing left but a push in the last tenth of a second of its last recording."""
     model = believed()
     predictor = Predictor(load_traces(record(model, seconds=3.0), model)[0], model)
     mismatch = np.zeros(len(predictor.counts))
     mismatch[-100:] = 0.05
-    return Scene(document_of(model), predictor, mismatch)
+    return SearchContext(document_of(model), predictor, mismatch)
 
 
-def with_ripple(scene: Scene, amplitude: float) -> Fit:
+def with_ripple(scene: SearchContext, amplitude: float) -> Fit:
     term = sine_term("torque_ripple", scene, Peak(5.0, amplitude, 0.0, 0.0), 0.1, "1", most=0.45)
     hypothesis = Hypothesis(scene.document, base_unknowns(believed()), (term,))
     return Fit(hypothesis, hypothesis.start, scene.mismatch, 0.0, np.zeros((0, 0)), True)
@@ -51,12 +51,12 @@ def test_torque_is_judged_where_it_acts() -> None:
     assert acting_torque(np.zeros(3)) == 0.0
 
 
-def test_ripple_that_every_motor_has_is_no_finding(scene: Scene) -> None:
+def test_ripple_that_every_motor_has_is_no_finding(scene: SearchContext) -> None:
     assert named_terms(with_ripple(scene, 0.01), scene.document) == ()
     assert named_terms(with_ripple(scene, 0.04), scene.document) == (0,)
 
 
-def test_a_push_lies_within_its_recording(scene: Scene) -> None:
+def test_a_push_lies_within_its_recording(scene: SearchContext) -> None:
     """One that begins shortly before the end could be any blow, and nobody has seen how long it lasts."""
     last = scene.predictor.traces[-1].drive.t_s[-1] - scene.predictor.traces[-1].shift_s
     for term in windows_of(scene):
@@ -84,7 +84,7 @@ def test_names_must_explain_most_of_what_is_left(removed: float, left: float, an
     assert verdict((0,), Shares(1.0, after, 0.0, removed), dry=after / left) is answer
 
 
-def test_a_number_at_an_end_of_its_range_is_somebody_elses(scene: Scene) -> None:
+def test_a_number_at_an_end_of_its_range_is_somebody_elses(scene: SearchContext) -> None:
     """Twenty times the mass; but no stiffness at all is just no spring."""
     mass = Hypothesis(scene.document, base_unknowns(believed()), tuple(effect("inertia").terms(scene)))
     spring = Hypothesis(scene.document, base_unknowns(believed()), (effect("spring").terms(scene)[0],))
@@ -96,7 +96,7 @@ def test_a_number_at_an_end_of_its_range_is_somebody_elses(scene: Scene) -> None
         assert at_end_of_range(Fit(hypothesis, coordinates, scene.mismatch, 0.0, np.zeros((0, 0)), True)) is answer
 
 
-def test_a_bristle_may_have_no_damping_and_must_have_a_stiffness(scene: Scene) -> None:
+def test_a_bristle_may_have_no_damping_and_must_have_a_stiffness(scene: SearchContext) -> None:
     """Whether the model has it already or not."""
     friction = {"kind": "coulomb_viscous", "coulomb": 0.12, "viscous": 0.02}
     plain = replace(scene, document=document_of(believed(friction=friction)))
@@ -118,7 +118,7 @@ def test_a_window_is_found_where_it_begins_and_ends() -> None:
     assert windows(left[:100], 1e-3) == []
 
 
-def test_a_drive_that_is_late_has_one_name(scene: Scene) -> None:
+def test_a_drive_that_is_late_has_one_name(scene: SearchContext) -> None:
     """A lag of second order is a delay and a lag to a model of first order: the longer names both."""
     terms = (effect("delay").terms(scene)[0], effect("actuator_lag").terms(scene)[0])
     hypothesis = Hypothesis(scene.document, base_unknowns(believed()), terms)

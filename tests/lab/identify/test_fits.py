@@ -9,8 +9,9 @@ from servod.common.errors import AnswerIsNo
 from servod.common.yaml import validate
 from servod.formats.model.axis_model import AxisModel
 from servod.kernels.physics.plant import Plant
+from servod.lab.identify import analysis
 from servod.lab.identify.estimate import AT_END, Estimate, at_ends, estimate, jackknife, sandwich
-from servod.lab.identify.fits import bristle, cogging, curve, elastic, noise, presliding, response
+from servod.lab.identify.fits import bristle, cogging, curve, elastic, presliding, response
 from servod.lab.identify.fits.break_away import BreakAwayFit
 from servod.lab.identify.fits.bristle import Bristle, dry_columns, follow
 from servod.lab.identify.fits.elastic import Elastic
@@ -18,7 +19,7 @@ from servod.lab.identify.fits.friction_map import Side
 from servod.lab.identify.fits.presliding import bend_factor, fundamental
 from servod.lab.identify.fits.strokes import Rigid, response_of
 from servod.lab.identify.shapes import multisine
-from servod.lab.identify.trace import Kind, Trace, acting_torque, smooth
+from servod.lab.identify.trace import ExperimentKind, RecordedMotion, acting_torque, smooth
 
 PERIOD_S = 1e-3
 
@@ -173,7 +174,7 @@ def test_cogging_seen_through_smoothing_is_given_back_whole():
     assert seen == pytest.approx(np.exp(-0.08) * cogging.columns(x, [40]))
 
 
-def excited(disturbance_nm: list[float]) -> Trace:
+def excited(disturbance_nm: list[float]) -> RecordedMotion:
     """Strokes of a rigid joint under a multisine, each with its disturbance (RMS below 40 Hz), without gaps."""
     joint, count, rng = Rigid(1e-3, 0.06, 0.0015, 0.0), 1000, np.random.default_rng(3)
     lines = np.unique(np.round(np.geomspace(3.0, 160.0, 26))).astype(int)
@@ -190,7 +191,7 @@ def excited(disturbance_nm: list[float]) -> Trace:
     settings = {"first": 0.0, "stride": float(count), "count": float(count), "strokes": float(len(ways))}
     settings |= {f"line_{i}": float(line) for i, line in enumerate(lines)}
     t = np.arange(len(torque)) * PERIOD_S
-    return Trace(Kind.RESPONSE, t, torque, position, position, torque, torque, position, settings)
+    return RecordedMotion(ExperimentKind.RESPONSE, t, torque, position, position, torque, torque, position, settings)
 
 
 def test_the_interval_of_the_torque_noise_is_the_scatter_of_the_strokes():
@@ -219,7 +220,7 @@ def test_the_intervals_of_the_curve_are_the_scatter_of_its_nodes():
     assert np.all(np.mean(np.abs(values - known) <= halves, axis=0)[told] >= 0.85)
 
 
-def bursts(counts_per_turn: int, rng: np.random.Generator) -> list[Trace]:
+def bursts(counts_per_turn: int, rng: np.random.Generator) -> list[RecordedMotion]:
     """Presliding of a joint of 950 N*m/rad at the share for coarse encoders, each burst anywhere within a count."""
     friction = {"kind": "lugre", "sigma0": 950.0, "sigma1": 1.0, "coulomb": 0.045, "static": 0.07}
     plant = Plant(validate({"inertia": 1e-3, "delay_s": 0.0, "friction": friction}, AxisModel, "joint"))
@@ -233,7 +234,7 @@ def bursts(counts_per_turn: int, rng: np.random.Generator) -> list[Trace]:
     made = []
     for place in rng.uniform(0.0, resolution_rad, 11):
         x = np.round((np.array(way) + place) / resolution_rad) * resolution_rad
-        made.append(Trace(Kind.PRESLIDING, t, torque, x, x, torque, torque, x, settings))
+        made.append(RecordedMotion(ExperimentKind.PRESLIDING, t, torque, x, x, torque, torque, x, settings))
     return made
 
 
@@ -262,7 +263,9 @@ def test_the_interval_of_the_encoder_noise_holds_it_beside_the_rounding(counts):
         torque, zeros = rng.normal(0.0, 1e-3, 1500), np.zeros(1500)
         x = readings * resolution_rad
         settings = {"resolution_rad": resolution_rad}
-        found = noise.fit(Trace(Kind.NOISE, np.arange(1500) * PERIOD_S, zeros, x, x, zeros, torque, x, settings))
+        found = analysis.fit(
+            RecordedMotion(ExperimentKind.NOISE, np.arange(1500) * PERIOD_S, zeros, x, x, zeros, torque, x, settings)
+        )
         held.append((found.encoder_rms.holds(counts * resolution_rad), found.torque_reading_rms.holds(1e-3)))
         widths.append(found.encoder_rms.half_width / resolution_rad)
     assert np.all(np.mean(held, axis=0) >= 0.88)
@@ -293,7 +296,11 @@ def test_bristle_damping_beyond_its_range_says_so(damping, noted):
     settings |= {f"line_{i}": float(line) for i, line in enumerate(lines)}
     t = np.arange(5 * count) * PERIOD_S
     found = bristle.fit(
-        Trace(Kind.BRISTLE, t, torque, way, way, torque, torque, way, settings), inertia, 1e-3, 0.0, 950.0
+        RecordedMotion(ExperimentKind.BRISTLE, t, torque, way, way, torque, torque, way, settings),
+        inertia,
+        1e-3,
+        0.0,
+        950.0,
     )
     assert found is not None
     assert (AT_END in found.note) == noted

@@ -15,7 +15,7 @@ from servod.common.errors import AnswerIsNo, BadInput
 from servod.lab.identify import store
 from servod.lab.identify.experiments.common import enable_powerless
 from servod.lab.identify.result import document
-from servod.lab.identify.trace import Kind, trace_of
+from servod.lab.identify.trace import ExperimentKind, trace_of
 from servod.lab.identify.walk import identify
 from servod.lab.recordings.recording import moving, rows_of
 from servod.runtime.loop.axis import AxisState
@@ -100,7 +100,7 @@ def recorded(folder, session, *durations_s: float) -> None:
     made.begin(0.0)
     for seconds in durations_s:
         rows = rested(axis, round(1000 * seconds))
-        made.keep(rows, trace_of(Kind.NOISE, rows, {}), f"motion of {seconds} s")
+        made.keep(rows, trace_of(ExperimentKind.NOISE, rows, {}), f"motion of {seconds} s")
 
 
 def test_a_walk_that_is_refused_leaves_the_recordings_of_the_model_that_stands(tmp_path):
@@ -132,11 +132,11 @@ def test_a_walk_that_leaves_the_recorded_one_halfway_sets_all_of_it_aside(tmp_pa
     recorded(tmp_path, session, 0.1, 0.2, 0.3)
     before = [trace.sha256 for trace in store.load(tmp_path)]
     again = store.Recordings(tmp_path, "this axis", resume=True)
-    first = again.recorded(Kind.NOISE, "motion of 0.1 s")
-    assert again.recorded(Kind.NOISE, "another motion") is None
+    first = again.recorded(ExperimentKind.NOISE, "motion of 0.1 s")
+    assert again.recorded(ExperimentKind.NOISE, "another motion") is None
     assert [trace.sha256 for trace in store.load(tmp_path)] == before
     rows = rested(SteppedAxis(session, tmp_path), 50)
-    new = again.keep(rows, trace_of(Kind.NOISE, rows, {}), "another motion")
+    new = again.keep(rows, trace_of(ExperimentKind.NOISE, rows, {}), "another motion")
     assert [trace.sha256 for trace in store.load(tmp_path)] == [first.sha256, new.sha256]
     assert [trace.sha256 for trace in store.load(tmp_path / "before_01")] == before
 
@@ -158,6 +158,6 @@ def test_a_recording_that_is_not_the_one_that_was_made_is_refused(meddle, tmp_pa
         first.write_bytes(first.read_bytes()[:-2000])
     again = store.Recordings(tmp_path, "this axis", resume=True)
     with pytest.raises(BadInput, match=rf"{first.name}: found a file that was changed or cut short"):
-        again.recorded(Kind.NOISE, "motion of 0.2 s")
+        again.recorded(ExperimentKind.NOISE, "motion of 0.2 s")
     with pytest.raises(BadInput, match=first.name):
         store.load(tmp_path)

@@ -13,7 +13,7 @@ from servod.lab.identify.experiments import kick
 from servod.lab.identify.experiments.common import SPEED_SPAN_S, Bench, enable_powerless, peak_speed
 from servod.lab.identify.fits import kick as kick_fit
 from servod.lab.identify.store import load
-from servod.lab.identify.trace import Trace
+from servod.lab.identify.trace import RecordedMotion
 from tests.lab.identify.conftest import Identification
 from tests.lab.identify.joints import Drawn, draw
 
@@ -24,7 +24,7 @@ class Unkept:
     def recorded(self, _kind, _motion) -> None:
         return None
 
-    def keep(self, _rows, trace: Trace, _motion: str) -> Trace:
+    def keep(self, _rows, trace: RecordedMotion, _motion: str) -> RecordedMotion:
         return trace
 
 

@@ -12,9 +12,8 @@ from servod.common.yaml import parse_yaml, validate
 from servod.formats.model.axis_model import AxisModel, axis_model_yaml
 from servod.lab.identify import store
 from servod.lab.identify.analysis import Analysis, analyse
-from servod.lab.identify.changes import changes
 from servod.lab.identify.fits.cogging import GRAVITY
-from servod.lab.identify.result import document, identified, model_of
+from servod.lab.identify.result import changes, document, identified, model_of
 from servod.lab.identify.walk import identify
 from servod.runtime.loop.axis import AxisState
 from tests.lab.identify.conftest import Identification

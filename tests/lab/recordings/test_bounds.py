@@ -17,7 +17,7 @@ from scipy.io import savemat
 from servod.common.errors import BadInput
 from servod.formats.recording.mcap_reader import TIME, read_recording
 from servod.formats.recording.record import FIELDS, CycleRecord
-from servod.lab.recordings import bounds, load_recording
+from servod.lab.recordings import load_recording, readers
 from tests.fuzz.recordings_bombs import csv_bomb, mat_bomb
 from tests.lab.recordings.mcap_file import write_mcap
 
@@ -71,7 +71,7 @@ WRITERS: dict[str, Callable[[Path, int], object]] = {
 def test_a_recording_at_the_limit_is_read_and_one_beyond_is_refused(
     suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bounds, "MOST_CELLS", 120)
+    monkeypatch.setattr(readers, "MOST_CELLS", 120)
     WRITERS[suffix](tmp_path / f"fits{suffix}", 120)
     WRITERS[suffix](tmp_path / f"large{suffix}", 126)
     assert len(load_recording(tmp_path / f"fits{suffix}")) == (20 if suffix == ".mcap" else 40)
@@ -82,7 +82,7 @@ def test_a_recording_at_the_limit_is_read_and_one_beyond_is_refused(
 @pytest.mark.parametrize("suffix", [".csv", ".csv.gz", ".mat", "-v7.mat"])
 def test_bytes_are_counted_as_well(suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     WRITERS[suffix](tmp_path / f"r{suffix}", 180)
-    monkeypatch.setattr(bounds, "MOST_BYTES", 100)
+    monkeypatch.setattr(readers, "MOST_BYTES", 100)
     if suffix == ".mat":  # of what is not packed, the file's own size is looked at
         monkeypatch.setattr("servod.lab.recordings.readers.MOST_BYTES", 100)
     with pytest.raises(BadInput, match=r"found \d+ bytes.*allowed: at most 100 bytes"):
@@ -97,7 +97,7 @@ def test_a_small_file_that_unpacks_to_gigabytes_is_refused_in_bounded_memory(
     assert (tmp_path / name).stat().st_size < 1024**2
     done = subprocess.run([sys.executable, "-c", CHILD, tmp_path / name], capture_output=True, text=True, check=True)
     grown_mib, said = done.stdout.split(" ", 1)
-    assert f"at most {bounds.MOST_CELLS} numbers" in said
+    assert f"at most {readers.MOST_CELLS} numbers" in said
     assert int(grown_mib) < 1536, done.stdout
 
 
@@ -115,7 +115,7 @@ def test_a_bomb_that_is_cut_short_lets_the_process_end(tmp_path: Path) -> None:
 def test_columns_that_are_not_used_count_for_nothing_but_are_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bounds, "MOST_CELLS", 3 * 60)
+    monkeypatch.setattr(readers, "MOST_CELLS", 3 * 60)
     lists = pa.array([[float(n) for n in range(100)]] * 60)
     pq.write_table(pa.table({**COLUMNS, "lists": lists, "more": COLUMNS["t_s"]}), tmp_path / "r.parquet")
     assert load_recording(tmp_path / "r.parquet").report == ("columns not used: lists, more",)

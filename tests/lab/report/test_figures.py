@@ -21,7 +21,7 @@ from servod.lab.report.figures.friction import dahl_curve, friction_map
 from servod.lab.report.figures.loop import bode, certificate_table, observations_table
 from servod.lab.report.figures.loop import measured_response as frequency_response
 from servod.lab.report.figures.motion import (
-    Motion,
+    PlottedMotion,
     before_after,
     disturbed_friction,
     errors,
@@ -45,11 +45,13 @@ from tests.lab.synthesize.designs import table1
 TABLE1 = load_gains(shipped("gains/table1_kz_kv_kx.yaml"))
 
 
-def motion(label: str, error_mrad: float, seconds: float = 3.0) -> Motion:
+def motion(label: str, error_mrad: float, seconds: float = 3.0) -> PlottedMotion:
     t = np.arange(round(1000 * seconds)) * 1e-3
     reference = 0.1 * np.sin(t)
     torque = 0.07 * np.sign(np.cos(t))
-    return Motion(label, t, reference, reference - 1e-3 * error_mrad * np.cos(40.0 * t), torque, 0.9 * torque, torque)
+    return PlottedMotion(
+        label, t, reference, reference - 1e-3 * error_mrad * np.cos(40.0 * t), torque, 0.9 * torque, torque
+    )
 
 
 MOTIONS = [motion("first", 20.0), motion("second", 0.5)]

@@ -7,7 +7,14 @@ import pytest
 from scipy.linalg import solve_discrete_lyapunov
 
 from servod.lab.report.figures.loop import bode, impulse_responses
-from servod.lab.report.responses import after, before, frequency_response, impulse_response, rigid, vertex_impulse
+from servod.lab.report.responses import (
+    before,
+    closed_loop_response,
+    frequency_response,
+    impulse_response,
+    rigid,
+    vertex_impulse,
+)
 from servod.lab.verify.closed_loop import spectral_radius
 from servod.lab.verify.proof import closed
 from tests.lab.synthesize.designs import table1_set
@@ -52,7 +59,7 @@ def test_without_friction_counting_every_loop_is_the_rigid_joint() -> None:
     ideal = np.abs(rigid(gains.design, f))
     law = gains.parameters
     for velocity in (0.001, 0.2):
-        for loop in (before(gains.design, velocity), after(gains.design, law, velocity, False)):  # type: ignore[arg-type]
+        for loop in (before(gains.design, velocity), closed_loop_response(gains.design, law, velocity, False)):  # type: ignore[arg-type]
             seen = np.abs(frequency_response(*loop, PERIOD_S, f))
             assert seen == pytest.approx(ideal, rel=0.3)
 

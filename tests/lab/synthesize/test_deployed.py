@@ -20,7 +20,7 @@ from servod.lab.synthesize.regions import pole_disc
 from servod.lab.verify.checks import speeds_of
 from servod.lab.verify.margins import Sweep
 from servod.lab.verify.proof import closed, region_margin
-from servod.lab.verify.sampled import Timing
+from servod.lab.verify.sampled import SampledTiming
 from servod.lab.verify.steady_friction import steady_friction
 from tests.lab.synthesize.designs import table1, table1_set
 
@@ -122,7 +122,7 @@ def test_feeding_the_last_commands_back_is_worth_disk_margin() -> None:
         for name, region in (("low", low), ("high", high))
     }
     without = law.model_copy(update={"regions": law.regions.model_copy(update=plain)})
-    timing = Timing(gains.design.period_s, gains.design.model.total_delay_s, gains.design.velocity_cutoff_hz)
+    timing = SampledTiming(gains.design.period_s, gains.design.model.total_delay_s, gains.design.velocity_cutoff_hz)
     margins = [
         Sweep(gains.law, p.pack(), steady_friction(table1()), timing, speeds_of(gains.design, 16)).disk_margin()[0]
         for p in (law, without)

@@ -12,19 +12,19 @@ from servod.formats.gains.parameters import LocalParameters
 from servod.kernels.laws import LAWS
 from servod.kernels.motions import paper
 from servod.lab.simulate.simulate import LoopSettings, simulate_closed_loop
-from servod.lab.synthesize.gain_set import Options, synthesize
+from servod.lab.synthesize.gain_set import DesignOptions, synthesize
 from servod.lab.synthesize.observer_width import GAINS, MARGIN, with_gains
 from servod.lab.verify.checks import speeds_of
 from servod.lab.verify.closed_loop import corners
 from servod.lab.verify.margins import NOMINAL, Sweep
-from servod.lab.verify.sampled import Timing
+from servod.lab.verify.sampled import SampledTiming
 from servod.lab.verify.steady_friction import steady_friction
 from tests.lab.synthesize.designs import table1
 
 
 @cache
 def without_observer() -> GainSet:
-    found = synthesize(table1(), options=Options(observer=False))
+    found = synthesize(table1(), options=DesignOptions(observer=False))
     assert isinstance(found, GainSet)
     return found
 
@@ -37,7 +37,7 @@ def law_of(gains: GainSet) -> LocalParameters:
 def sweep(law: LocalParameters) -> Sweep:
     design = without_observer().design
     assert design is not None
-    timing = Timing(design.period_s, design.model.total_delay_s, design.velocity_cutoff_hz)
+    timing = SampledTiming(design.period_s, design.model.total_delay_s, design.velocity_cutoff_hz)
     return Sweep(LAWS["local"], law.pack(), steady_friction(table1()), timing, speeds_of(design, 25))
 
 
@@ -77,6 +77,6 @@ def test_the_other_sign_is_unstable_and_the_sweep_of_the_certificate_says_so(gai
 
 
 def test_a_given_gain_is_taken_as_it_is() -> None:
-    given = synthesize(table1(), options=Options(observer=False, gain=0.02))
+    given = synthesize(table1(), options=DesignOptions(observer=False, gain=0.02))
     assert isinstance(given, GainSet)
     assert {s.gain for s in law_of(given).friction.sets} == {0.02}

@@ -10,7 +10,7 @@ from servod.cli.app import run
 from servod.lab.synthesize.deployed import Wishes, bare_proof, empty_design, programme
 from servod.lab.synthesize.gain_set import synthesize
 from servod.lab.synthesize.infeasible import Infeasible
-from servod.lab.verify.sampled import Timing
+from servod.lab.verify.sampled import SampledTiming
 from servod.lab.verify.vertices import fed_commands, known_commands
 from tests.lab.synthesize.designs import MODEL, table1
 
@@ -19,7 +19,7 @@ from tests.lab.synthesize.designs import MODEL, table1
     ("cycles", "fed", "known"), [(0.0, 1, 1), (1.0, 2, 2), (2.0, 3, 3), (5.0, 3, 5), (20.0, 3, 20)]
 )
 def test_every_command_on_its_way_is_a_state(cycles: float, fed: int, known: int) -> None:
-    timing = Timing(0.001, 0.001 * cycles, 300.0)
+    timing = SampledTiming(0.001, 0.001 * cycles, 300.0)
     assert (fed_commands(timing), known_commands(timing)) == (fed, known)
     late = table1().model_copy(update={"delay_s": 0.001 * cycles})
     design = empty_design(late, Wishes(), 300.0)

@@ -13,7 +13,7 @@ from servod.formats.gains.gain_set import GainSet, parse_gains
 from servod.formats.gains.parameters import LocalParameters
 from servod.lab.synthesize import infeasible
 from servod.lab.synthesize.deployed import Wishes
-from servod.lab.synthesize.gain_set import Options
+from servod.lab.synthesize.gain_set import DesignOptions
 from servod.lab.synthesize.infeasible import Infeasible
 from servod.lab.synthesize.lmi_reference import ReferenceWishes, programme, reference, solve
 from servod.lab.synthesize.reference import frame, reference_set
@@ -46,7 +46,7 @@ def test_the_set_says_its_mode_and_reads_back_equal(papers: GainSet) -> None:
 def test_every_vertex_is_stable_and_damped_as_asked(papers: GainSet, index: int) -> None:
     assert papers.design is not None
     proof = papers.design.reference[index]
-    made = frame(table1(), Wishes(), Options(), ReferenceWishes())
+    made = frame(table1(), Wishes(), DesignOptions(), ReferenceWishes())
     for vertex in vertices(
         proof.name,
         Polytope.stored(proof),
@@ -62,7 +62,7 @@ def test_every_vertex_is_stable_and_damped_as_asked(papers: GainSet, index: int)
 
 def test_the_h2_norm_by_integration_is_within_the_bound(papers: GainSet) -> None:
     """The impulse responses from w to (alpha x, beta u*) at every vertex hold no more than the bound's energy."""
-    made = frame(table1(), Wishes(), Options(), ReferenceWishes())
+    made = frame(table1(), Wishes(), DesignOptions(), ReferenceWishes())
     span = made.spans[1]
     answer = made.answer(span)
     assert answer.proof is not None and answer.norm is not None
@@ -82,12 +82,12 @@ def test_the_h2_norm_by_integration_is_within_the_bound(papers: GainSet) -> None
 
 
 def test_a_set_at_rest_is_infeasible_and_its_vertices_and_constraints_are_named() -> None:
-    found = reference_set(table1(), options=Options(leak_per_s=0.0))
+    found = reference_set(table1(), options=DesignOptions(leak_per_s=0.0))
     assert isinstance(found, Infeasible) and found.regions == ("low",)
     assert any(line.startswith("norm: low: a=0") for line in found.clashes)
     offered = {r.wish: r.enough for r in found.relaxations}
     leak = offered["leak of the friction state [1/s]"]
-    assert isinstance(reference_set(table1(), options=Options(leak_per_s=leak)), GainSet)
+    assert isinstance(reference_set(table1(), options=DesignOptions(leak_per_s=leak)), GainSet)
 
 
 def test_an_offered_decay_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -101,7 +101,7 @@ def test_an_offered_decay_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_l_that_helps_the_axis_is_refused_by_15_whose_integrator_lost_its_path() -> None:
-    found = reference_set(table1(), options=Options(gain=0.04))
+    found = reference_set(table1(), options=DesignOptions(gain=0.04))
     assert isinstance(found, Infeasible)
     assert all("positive feedback" in line for line in found.clashes)
     assert any(r.wish == "l" and r.enough == 0.0 for r in found.relaxations)
@@ -111,7 +111,7 @@ def test_l_that_helps_the_axis_is_refused_by_15_whose_integrator_lost_its_path()
 def test_both_forms_and_outputs_are_programmes_with_an_answer(output: ReferenceOutput) -> None:
     norms = {}
     for form in ReferenceForm:
-        made = frame(table1(), Wishes(), Options(), ReferenceWishes(form=form, output=output))
+        made = frame(table1(), Wishes(), DesignOptions(), ReferenceWishes(form=form, output=output))
         answer = made.answer(made.spans[1])
         assert answer.proof is not None and reference_margin(made.design, answer.proof) > 0.0
         norms[form] = answer.norm
@@ -120,7 +120,7 @@ def test_both_forms_and_outputs_are_programmes_with_an_answer(output: ReferenceO
 
 def test_the_literal_sum_never_costs_more_than_both_outputs() -> None:
     """|alpha x + beta u*| at their best phase is at most sqrt 2 of the pair."""
-    made = frame(table1(), Wishes(), Options(), ReferenceWishes())
+    made = frame(table1(), Wishes(), DesignOptions(), ReferenceWishes())
     span = made.spans[1]
     intervals = polytope(made.friction, made.law.friction, span, made.design.uncertainty)
     norms = [
@@ -131,7 +131,7 @@ def test_the_literal_sum_never_costs_more_than_both_outputs() -> None:
 
 
 def test_a_region_without_constraints_is_feasible() -> None:
-    made = frame(table1(), Wishes(), Options(), ReferenceWishes())
+    made = frame(table1(), Wishes(), DesignOptions(), ReferenceWishes())
     intervals = polytope(made.friction, made.law.friction, made.spans[1], made.design.uncertainty)
     assert solve(programme(made.friction, made.spans[1], intervals, made.asked), frozenset()) is not None
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from servod.common.yaml import validate
 from servod.formats.model.axis_model import AxisModel
-from servod.lab.tune.plan import TunePlan
+from servod.lab.tune.plan import TuningSettings
 
 
 def joint(size: float = 1.0, lean: float = 0.28) -> AxisModel:
@@ -31,6 +31,6 @@ def joint(size: float = 1.0, lean: float = 0.28) -> AxisModel:
     )
 
 
-def small(budget: int = 60, seed: int = 1, size: float = 1.0) -> TunePlan:
+def small(budget: int = 60, seed: int = 1, size: float = 1.0) -> TuningSettings:
     """A plan for tests: two plants, and few of them."""
-    return TunePlan(budget=budget, plants=2, seed=seed, torque_limit_nm=0.3 * size)
+    return TuningSettings(budget=budget, plants=2, seed=seed, torque_limit_nm=0.3 * size)

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from servod.lab.tune.laws import RIVALS, Axis, Range, symmetric
+from servod.lab.tune.laws import RIVALS, AxisFacts, Range, symmetric
 from servod.lab.tune.plan import Feedback
-from servod.lab.tune.tuning import Trial, least, with_noise
+from servod.lab.tune.tuning import TuningObjective, minimise, with_noise
 from servod.lab.verify.steady_friction import steady_friction
 from tests.lab.tune.axis import joint, small
 
@@ -53,7 +53,7 @@ def test_the_search_finds_the_bottom_within_its_budget() -> None:
         calls.append(shares)
         return valley(shares)
 
-    best = least(counted, [np.full(3, 0.5)], 150, 1)
+    best = minimise(counted, [np.full(3, 0.5)], 150, 1)
     assert len(calls) <= 150
     assert valley(best) < 1e-3
     assert all(np.all((shares >= 0.0) & (shares <= 1.0)) for shares in calls)
@@ -63,56 +63,56 @@ def test_the_search_keeps_to_its_bounds_and_repeats_itself() -> None:
     def downhill(shares: np.ndarray) -> float:
         return float(np.sum(shares))
 
-    first, again = (least(downhill, [np.full(2, 0.4)], 60, 3) for _ in range(2))
+    first, again = (minimise(downhill, [np.full(2, 0.4)], 60, 3) for _ in range(2))
     assert np.all(first <= 1e-6)
     assert np.array_equal(first, again)
 
 
 def test_the_search_is_never_worse_than_its_starts() -> None:
     starts = [np.array([0.9, 0.1, 0.9]), np.array([0.7, 0.49, 0.2])]
-    assert valley(least(valley, starts, 3, 1)) == pytest.approx(0.0, abs=1e-12)
+    assert valley(minimise(valley, starts, 3, 1)) == pytest.approx(0.0, abs=1e-12)
 
 
 @pytest.fixture(scope="module")
-def trial() -> Trial:
-    return Trial(Axis(joint(), small()))
+def trial() -> TuningObjective:
+    return TuningObjective(AxisFacts(joint(), small()))
 
 
-def test_the_plants_are_draws_of_the_model_and_the_last_is_later(trial: Trial) -> None:
+def test_the_plants_are_draws_of_the_model_and_the_last_is_later(trial: TuningObjective) -> None:
     assert len({plant.inertia for plant in trial.plants}) == 2
     assert all(abs(plant.inertia / 0.001 - 1.0) < 0.06 for plant in trial.plants)
     assert [plant.delay_s for plant in trial.plants] == pytest.approx([0.001, 0.0015], abs=20e-6)
-    other = Trial(Axis(joint(), small(seed=2)))
+    other = TuningObjective(AxisFacts(joint(), small(seed=2)))
     assert {p.inertia for p in other.plants}.isdisjoint({p.inertia for p in trial.plants})
 
 
-def test_the_papers_pd_is_the_measure_of_roughness(trial: Trial) -> None:
+def test_the_papers_pd_is_the_measure_of_roughness(trial: TuningObjective) -> None:
     assert trial.cost(trial.axis.paper_pd()).roughness == pytest.approx(1.0)
 
 
-def test_a_compensator_at_equal_feedback_costs_less_than_pd(trial: Trial) -> None:
+def test_a_compensator_at_equal_feedback_costs_less_than_pd(trial: TuningObjective) -> None:
     pd = trial.cost(trial.axis.paper_pd()).value
     for name in ("pd_dob", "pd_lugre", "local"):
         parameters = RIVALS[name].build(trial.axis, STARTS[name])
         assert trial.cost(parameters).value < 0.25 * pd
 
 
-def test_rough_torque_costs(trial: Trial) -> None:
+def test_rough_torque_costs(trial: TuningObjective) -> None:
     """The same set under half the limit: a tenth over the limit doubles the cost."""
     parameters = RIVALS["pd_dob"].build(trial.axis, STARTS["pd_dob"] | {"bandwidth": 300.0})
     free = trial.cost(parameters)
-    strict = Trial(replace(trial.axis, plan=replace(trial.axis.plan, roughness_limit=free.roughness / 1.1)))
+    strict = TuningObjective(replace(trial.axis, plan=replace(trial.axis.plan, roughness_limit=free.roughness / 1.1)))
     assert strict.cost(parameters).value == pytest.approx(2.0 * free.value)
 
 
-def test_a_set_that_shakes_the_joint_costs_more_than_none(trial: Trial) -> None:
+def test_a_set_that_shakes_the_joint_costs_more_than_none(trial: TuningObjective) -> None:
     wild = trial.cost(RIVALS["pd"].build(trial.axis, {"k_p": 1000.0, "k_d": 20.0}))
     assert wild.roughness > 20.0
     assert wild.value > trial.cost(trial.axis.paper_pd()).value
 
 
-def test_a_larger_axis_gets_larger_gains_and_the_same_cost(trial: Trial) -> None:
-    large = Trial(Axis(joint(100.0), small(size=100.0)))
+def test_a_larger_axis_gets_larger_gains_and_the_same_cost(trial: TuningObjective) -> None:
+    large = TuningObjective(AxisFacts(joint(100.0), small(size=100.0)))
     assert large.axis.paper_pd().position_gain_nm_per_rad == pytest.approx(250.0)
     for name in ("pd_dob", "local"):
         costs = [t.cost(RIVALS[name].build(t.axis, STARTS[name])).value for t in (trial, large)]
@@ -134,7 +134,7 @@ def test_noise_comes_from_the_identification_where_the_model_has_none() -> None:
 
 
 def test_every_rival_has_the_feedback_of_its_class() -> None:
-    axis = Axis(joint(), small())
+    axis = AxisFacts(joint(), small())
     for name, rival in RIVALS.items():
         assert set(rival.space(Feedback.FREE)) - set(rival.space(Feedback.EQUAL)) == {"k_p", "k_d"}
         parameters = rival.build(axis, STARTS[name]).model_dump()

@@ -12,7 +12,7 @@ from servod.lab.simulate.simulate import LoopSettings
 from servod.lab.tracking.metrics import curves_of, paper_rows, run, score
 from servod.lab.tune import Feedback, Tuned, rivals, tune
 from servod.lab.tune.laws import RIVALS
-from servod.lab.tune.rivals import before_it, needed
+from servod.lab.tune.rivals import needed, start_points
 from tests.lab.identify.joints import draw
 from tests.lab.tune.axis import joint, small
 
@@ -59,7 +59,7 @@ def test_who_is_started_from_is_tuned_too() -> None:
     fixed = RIVALS["pd_lugre"].forerunners
     found = needed(["pd", "pd_lugre"])
     assert {name for _, name in found} == {"pd", "pd_lugre", *fixed}
-    assert all(found.index(before) < found.index(key) for key in found for before in before_it(key))
+    assert all(found.index(before) < found.index(key) for key in found for before in start_points(key))
 
 
 def test_processes_change_nothing(field: dict[Feedback, dict[str, Tuned]]) -> None:

@@ -14,7 +14,7 @@ from servod.formats.model.keys import Harmonic
 from servod.kernels.physics.effects import dry_factor, ripple, thermal_factors
 from servod.kernels.physics.layout import PlantState
 from servod.lab.verify.checks import Subject
-from servod.lab.verify.closed_loop import Behind, Bristle, Deviation, Reach, corners, joint_point
+from servod.lab.verify.closed_loop import Behind, LinearBristle, LoopDeviation, Reach, corners, joint_point
 from servod.lab.verify.effect_checks import check_effects, covered, effects_of, level_of
 from servod.lab.verify.margins import Sweep, by_delay
 from servod.lab.verify.steady_friction import steady_friction
@@ -117,7 +117,7 @@ def test_physics_that_no_pole_has_in_it_is_named(effects: dict[str, object], nam
 def test_a_stiff_spring_is_a_rigid_joint_and_a_soft_one_is_judged_by_its_resonance() -> None:
     friction = steady_friction(table1())
     rigid, stiff = (
-        joint_point(friction, 0.1, Bristle.SLIDES, Deviation(behind=behind)).matrices()[0]
+        joint_point(friction, 0.1, LinearBristle.SLIDES, LoopDeviation(behind=behind)).matrices()[0]
         for behind in (None, Behind(0.0004, 1e7, 200.0, 0.0))
     )
     slow = np.sort(np.abs(np.linalg.eigvals(stiff)))[: len(rigid)]
@@ -136,7 +136,7 @@ def test_a_gap_is_judged_without_its_load_as_well() -> None:
 def test_joints_with_and_without_a_spring_are_judged_side_by_side() -> None:
     gains, friction = table1_set(), steady_friction(table1())
     assert gains.design is not None
-    cases = [Deviation(), Deviation(behind=Behind(0.0003, 1e6, 10.0, 0.0))]
+    cases = [LoopDeviation(), LoopDeviation(behind=Behind(0.0003, 1e6, 10.0, 0.0))]
     assert by_delay(cases) == [[0], [1]]
     sweep = Sweep(gains.law, gains.pack(), friction, Subject(gains, gains.design, 1, 1, 1).timing, [0.1])
     together = sweep.worst(cases).coupled_radius

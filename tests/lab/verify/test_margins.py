@@ -10,7 +10,7 @@ from servod.formats.gains.design import Uncertainty
 from servod.formats.model.axis_model import AxisModel
 from servod.formats.model.effects import ActuatorLag
 from servod.lab.verify.checks import CORNER_DISK, Subject, check_loop, observations
-from servod.lab.verify.closed_loop import Bristle, Deviation, corners, inner_points, joint_point, late_corners
+from servod.lab.verify.closed_loop import LinearBristle, LoopDeviation, corners, inner_points, joint_point, late_corners
 from servod.lab.verify.margins import NOMINAL, Sweep, sensitivity
 from servod.lab.verify.plants import drawn
 from servod.lab.verify.sampled import timing_of
@@ -42,9 +42,9 @@ def test_delay_in_place_of_a_lag_is_the_harder_of_both() -> None:
     """A joint with the lag as a fourth state has no smaller disk margin than with the delay, under the same law."""
     judged, tau = subject(), 0.0004
     sweep = judged.coarse
-    late = Deviation(delay_s=tau)
+    late = LoopDeviation(delay_s=tau)
     velocity, slopes = sweep.coupled[12]
-    a, b, _ = joint_point(sweep.friction, velocity, Bristle.SLIDES, Deviation()).matrices()
+    a, b, _ = joint_point(sweep.friction, velocity, LinearBristle.SLIDES, LoopDeviation()).matrices()
     held = np.zeros((5, 5))
     held[:3, :3], held[:3, 3], held[3, 3:] = a, b, (-1.0 / tau, 1.0 / tau)
     step = expm(held * judged.timing.period_s)

@@ -9,7 +9,7 @@ from servod.formats.gains.parameters import LocalParameters
 from servod.formats.model.effects import Cogging, Gravity, Spring
 from servod.formats.model.keys import Harmonic
 from servod.lab.verify.checks import Subject, check_loop
-from servod.lab.verify.closed_loop import Deviation
+from servod.lab.verify.closed_loop import LoopDeviation
 from servod.lab.verify.plants import drawn
 from servod.lab.verify.steady_friction import position_slopes
 from tests.lab.synthesize.designs import table1, table1_set
@@ -52,6 +52,6 @@ def test_a_slope_that_outweighs_the_feedback_is_unstable() -> None:
     judged, law = subject(), table1_set().parameters
     assert isinstance(law, LocalParameters)
     stiffness = law.input_scale_nm * min(law.regions.low.k_x_per_rad, law.regions.high.k_x_per_rad)
-    loose = [Deviation(position_slope=factor * stiffness) for factor in (-0.2, -20.0)]
+    loose = [LoopDeviation(position_slope=factor * stiffness) for factor in (-0.2, -20.0)]
     radii = [judged.coarse.worst([case]).radius for case in loose]
     assert radii[0] < 1.0 < radii[1]

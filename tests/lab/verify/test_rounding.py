@@ -10,7 +10,7 @@ from servod.formats.gains.parameters import LocalParameters
 from servod.formats.model.effects import Noise
 from servod.lab.synthesize.observer_width import with_observer
 from servod.lab.verify.checks import Subject
-from servod.lab.verify.closed_loop import Deviation
+from servod.lab.verify.closed_loop import LoopDeviation
 from servod.lab.verify.margins import NOMINAL, Sweep
 from servod.lab.verify.rounding import (
     LEAST_COUNTS,
@@ -32,7 +32,7 @@ def made() -> tuple[Sweep, Design, LocalParameters]:
 
 def test_a_joint_moves_with_its_rounding_and_more_where_it_is_less_damped() -> None:
     sweep, _, _ = made()
-    nominal, harder = swing_per_count(sweep, NOMINAL), swing_per_count(sweep, [Deviation(viscous=0.5, slope=1.5)])
+    nominal, harder = swing_per_count(sweep, NOMINAL), swing_per_count(sweep, [LoopDeviation(viscous=0.5, slope=1.5)])
     assert 1.0 < nominal < harder < 8.0
 
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from servod.lab.verify.sampled import Array, Timing, with_delay_and_filter
+from servod.lab.verify.sampled import Array, SampledTiming, with_delay_and_filter
 
 A = np.array([[0.0, 1.0, 0.0], [0.0, -60.0, -9.5e5], [0.0, 0.8, -300.0]])
 B, E = np.array([0.0, 1000.0, 0.0]), np.array([0.0, 1000.0, 0.0])
 FINE = 2000
 
 
-def fine(torques: Array, timing: Timing) -> tuple[Array, Array]:
+def fine(torques: Array, timing: SampledTiming) -> tuple[Array, Array]:
     """Positions and filtered velocities at the samples, by many small exact steps of the plant alone."""
     step = timing.period_s / FINE
     x, seen, filtered = np.zeros(3), 0.0, 0.0
@@ -34,7 +34,7 @@ def fine(torques: Array, timing: Timing) -> tuple[Array, Array]:
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.0004, 0.001, 0.0017, 0.002])
 def test_delay_and_filter_are_exact(delay_s: float) -> None:
-    timing = Timing(0.001, delay_s, 150.0)
+    timing = SampledTiming(0.001, delay_s, 150.0)
     a, b, _ = with_delay_and_filter(A, B, E, timing)
     torques = np.random.default_rng(1).normal(size=12)
     x = np.zeros(len(b))

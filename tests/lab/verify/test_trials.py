@@ -10,7 +10,7 @@ from servod.formats.model.axis_model import AxisModel, LocalFriction
 from servod.lab.simulate.noise import IDENTIFIED_HZ, noise_of
 from servod.lab.verify.plants import scaled
 from servod.lab.verify.steady_friction import steady_friction
-from servod.lab.verify.trials import LARGE_STEP_S, hold_ripple, quiet, run_trial, scale_of, trial_motion
+from servod.lab.verify.trials import LARGE_STEP_S, hold_ripple, quiet, run_sample, scale_of, trial_motion
 from tests.lab.synthesize.designs import table1, table1_set
 from tests.lab.synthesize.test_intervals import identified
 
@@ -76,9 +76,9 @@ def test_a_plant_that_gets_nowhere_fails_by_what_it_misses() -> None:
     gains = table1_set()
     assert gains.design is not None
     motion = trial_motion(gains.design.period_s, scale_of(gains.design))
-    assert run_trial(gains, gains.design, motion, 1, 0).stable
+    assert run_sample(gains, gains.design, motion, 1, 0).stable
     heavy = gains.design.model.model_copy(update={"torque_offset": -1.0})
-    lost = run_trial(gains, gains.design.model_copy(update={"model": heavy}), motion, 1, 0)
+    lost = run_sample(gains, gains.design.model_copy(update={"model": heavy}), motion, 1, 0)
     assert not lost.follows and not lost.arrives and not lost.stable
 
 

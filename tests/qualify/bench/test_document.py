@@ -7,12 +7,12 @@ import math
 
 import pytest
 
-from servod.qualify.bench import QUICK, THOROUGH, Plan, measure
+from servod.qualify.bench import QUICK, THOROUGH, BenchSettings, measure
 from servod.qualify.bench.plan import GOALS, figure, print_table
 
 pytestmark = pytest.mark.serial
 
-TINY = Plan(
+TINY = BenchSettings(
     wakeup_s=0.5, wakeup_rounds=1, ticks=50, wall_clock_s=0.5, memory_s=0.5, stepped_s=0.5, simulated_s=0.5, plants=1
 )
 

@@ -13,22 +13,33 @@ import yaml
 from servod.formats.model.axis_model import AxisModel, load_axis_model
 from servod.lab.recordings import Quantity, load_recording
 from servod.lab.simulate.replay import Drive, replay
-from servod.qualify.blind.case import SEEN, has_thermometer, make_case
-from servod.qualify.blind.conceal import CASES, HOLDOUT, SEALED, TRUTH, conceal, open_cases, read_truth, unlock
+from servod.qualify.blind.conceal import (
+    CASES,
+    HOLDOUT,
+    SEALED,
+    SEEN,
+    TRUTH,
+    conceal,
+    has_thermometer,
+    make_case,
+    open_cases,
+    read_truth,
+    unlock,
+)
 from servod.qualify.blind.concealed import NO_THERMOMETER, Concealed
 from servod.qualify.blind.hidden import HIDE, UNLISTED
-from servod.qualify.blind.plan import ALIKE, FAMILIES, HARDER, Cover, Plan, Settings, Sort, plans
+from servod.qualify.blind.plan import ALIKE, FAMILIES, HARDER, CaseSpec, Cover, Settings, Sort, plans
 
 
 def quiet(_done: int, _of: int) -> None:
     """No progress."""
 
 
-def planned(sort: Sort, effects: tuple[str, ...], **more: object) -> Plan:
+def planned(sort: Sort, effects: tuple[str, ...], **more: object) -> CaseSpec:
     """A plan of seed 7 that conceals `effects`."""
     base = next(p for p in plans(20, 7, Settings()) if p.sort is sort)
     fields = {"sort": sort, "effects": effects, "cover": Cover.NONE, "off": False, "other": False, "weight": False}
-    return Plan(**{**base.__dict__, **fields, **more})
+    return CaseSpec(**{**base.__dict__, **fields, **more})
 
 
 def test_every_name_comes_in_turn_and_every_kind_has_its_share() -> None:

@@ -15,8 +15,7 @@ import pytest
 
 from servod.common.errors import BadInput
 from servod.common.sources import DIAGNOSES, sha256_on_disk
-from servod.qualify.blind.case import make_case
-from servod.qualify.blind.conceal import CASES, SEALED, TRUTH, Trial, write_case, write_trial
+from servod.qualify.blind.conceal import CASES, SEALED, TRUTH, BlindTrial, make_case, write_case, write_trial
 from servod.qualify.blind.examine import ANSWERS, RUN, SAID, Examiner
 from servod.qualify.blind.plan import Settings, plans
 
@@ -67,7 +66,7 @@ def test_a_trial_does_not_go_on_with_other_sources(tmp_path: Path, run: dict[str
 def test_an_interrupt_ends_what_runs_and_keeps_nothing_half_done(tmp_path: Path, number: signal.Signals) -> None:
     case = make_case(plans(5, 1, Settings())[0], Settings())
     write_case(case, tmp_path / CASES / "c000", tmp_path / "held")
-    write_trial(tmp_path, Trial(1, 1, False, "0" * 64))
+    write_trial(tmp_path, BlindTrial(1, 1, False, "0" * 64))
     command = [sys.executable, "-m", "servod.cli", "prove", "--only", "diagnose", "--out", str(tmp_path)]
     trial = subprocess.Popen(command, stderr=subprocess.PIPE)
     said = tmp_path / ANSWERS / "c000" / SAID

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from servod.formats.model.axis_model import AxisModel
 from servod.lab.simulate.replay import Drive
 from servod.lab.simulate.replay import replay as replayed
-from servod.qualify.blind.axes import Axis, Kind, draw_axis
-from servod.qualify.blind.case import plain_model, true_model
+from servod.qualify.blind.axes import CaseAxis, CaseKind, draw_axis
+from servod.qualify.blind.conceal import plain_model, true_model
 from servod.qualify.blind.concealed import Draw
 from servod.qualify.blind.hidden import HIDE
 from servod.qualify.blind.physics import Physics
@@ -24,13 +24,13 @@ Array = NDArray[np.float64]
 SECONDS, HORIZON_S = 4.0, 0.25
 
 
-def light(seed: int, kind: Kind, weight: bool) -> Axis:
+def light(seed: int, kind: CaseKind, weight: bool) -> CaseAxis:
     """An axis whose bristle damps little, so that its stiffness and the Stribeck curve show in the motion."""
     axis = draw_axis(np.random.default_rng(seed), kind, weight)
     return replace(axis, physics=axis.physics._replace(sigma1=0.2 * axis.physics.sigma1))
 
 
-def driven(axis: Axis, physics: Physics) -> Drive:
+def driven(axis: CaseAxis, physics: Physics) -> Drive:
     """A recording without noise, with an encoder that shows every digit."""
     reference = axis.motions.multisine(np.random.default_rng(3), SECONDS)
     out, quiet = np.zeros((len(reference), 3)), np.zeros(len(reference))
@@ -38,8 +38,8 @@ def driven(axis: Axis, physics: Physics) -> Drive:
     return Drive(1e-3 * np.arange(len(out)), out[:, 0].copy(), out[:, 1].copy(), out[:, 2].copy())
 
 
-@pytest.mark.parametrize("kind", Kind)
-def test_a_plain_joint_is_the_simulators(kind: Kind) -> None:
+@pytest.mark.parametrize("kind", CaseKind)
+def test_a_plain_joint_is_the_simulators(kind: CaseKind) -> None:
     axis = draw_axis(np.random.default_rng(5), kind, weight=True)
     drive = driven(axis, axis.physics)
     error = replayed(AxisModel.model_validate(plain_model(axis.physics)), drive, HORIZON_S).rms
@@ -49,7 +49,7 @@ def test_a_plain_joint_is_the_simulators(kind: Kind) -> None:
 @pytest.mark.parametrize("name", sorted(HIDE))
 def test_a_concealed_effect_is_the_one_of_its_name(name: str) -> None:
     """The model file that says what is concealed foretells the recording; the believed one does not."""
-    axis = light(5, Kind.DIRECT_DRIVE, weight=False)
+    axis = light(5, CaseKind.DIRECT_DRIVE, weight=False)
     concealed = HIDE[name](Draw(axis, np.random.default_rng(8), 1.5, other=False))
     axis = axis.with_travel(concealed.travel)
     physics = axis.physics._replace(**{**concealed.changes, "push_start_s": 1.0, "push_end_s": 3.0})
@@ -65,7 +65,7 @@ def test_a_concealed_effect_is_the_one_of_its_name(name: str) -> None:
 
 
 def test_a_closed_loop_follows_its_reference() -> None:
-    axis = draw_axis(np.random.default_rng(1), Kind.HARMONIC_DRIVE, weight=False)
+    axis = draw_axis(np.random.default_rng(1), CaseKind.HARMONIC_DRIVE, weight=False)
     reference = axis.motions.slow_sine(np.random.default_rng(2), SECONDS)
     errors = []
     for ki in (0.0, axis.loop.ki):

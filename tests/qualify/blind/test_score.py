@@ -14,10 +14,20 @@ from typer.testing import CliRunner
 from servod.cli.app import app
 from servod.common.errors import BadInput
 from servod.qualify.blind import count, tables
-from servod.qualify.blind.conceal import CASES, FILE, SEALED, TRUTH, Trial, conceal, read_truth, unlock, write_trial
+from servod.qualify.blind.conceal import (
+    CASES,
+    FILE,
+    SEALED,
+    TRUTH,
+    BlindTrial,
+    conceal,
+    read_truth,
+    unlock,
+    write_trial,
+)
 from servod.qualify.blind.document import document, score, write
 from servod.qualify.blind.examine import ANSWERS, DIAGNOSIS, MODEL, RUN
-from servod.qualify.blind.plan import Cover, Plan, Settings, Sort, plans
+from servod.qualify.blind.plan import CaseSpec, Cover, Settings, Sort, plans
 from servod.qualify.blind.score import HeldOut, Scored, is_right, matches, parameters_of
 
 RAN = {"exit_code": 0, "wall_s": 10.0, "cpu_s": 15.0, "memory_mib": 300.0, "time_limit_s": 12.0, "sources": "ab" * 32}
@@ -38,9 +48,9 @@ def trial(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sealed trial of two cases: an offset, and nothing."""
     out = tmp_path_factory.mktemp("trial")
     base = plans(20, 7, Settings())[0].__dict__ | {"cover": Cover.NONE, "off": False, "other": False, "weight": False}
-    made = [Plan(**base | {"sort": Sort.SINGLE, "effects": ("torque_offset",)})]
-    made.append(Plan(**base | {"sort": Sort.NOTHING, "effects": ()}))
-    write_trial(out, Trial(2, 7, False, conceal(made, Settings(), out, quiet)))
+    made = [CaseSpec(**base | {"sort": Sort.SINGLE, "effects": ("torque_offset",)})]
+    made.append(CaseSpec(**base | {"sort": Sort.NOTHING, "effects": ()}))
+    write_trial(out, BlindTrial(2, 7, False, conceal(made, Settings(), out, quiet)))
     return out
 
 
@@ -60,7 +70,7 @@ def answered(trial: Path, tmp_path: Path, **answers: dict[str, Any]) -> Path:
 
 
 def scored(out: Path) -> dict[str, Any]:
-    trial = Trial(**json.loads((out / FILE).read_text()))
+    trial = BlindTrial(**json.loads((out / FILE).read_text()))
     return score(trial, out, quiet)
 
 
@@ -108,7 +118,7 @@ def test_windows_left_out_of_a_median_stand_beside_it(trial: Path) -> None:
     assert found["after_over_before"]["count"] == 2
     assert found["after_over_before"]["median"] == pytest.approx(0.125)
     assert found["after_over_before_all"]["median"] == pytest.approx(0.15)
-    shown = tables.markdown(document(Trial(3, 7, False), cases))
+    shown = tables.markdown(document(BlindTrial(3, 7, False), cases))
     assert "2 of 3 cases: believed model 3 times the true one's" in shown
     assert "all 3 cases with an effect" in shown
 
@@ -178,6 +188,6 @@ def test_phases_are_compared_around_the_circle_and_ratios_from_one() -> None:
 
 
 def test_a_document_of_no_answers_still_makes_tables(trial: Path) -> None:
-    found = document(Trial(0, 1, True, "0"), list[Scored]())
+    found = document(BlindTrial(0, 1, True, "0"), list[Scored]())
     assert "–" in tables.text(found)
     assert count.share(9, 10)["interval"] == [0.596, 0.982]

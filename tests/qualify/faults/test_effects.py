@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from servod.qualify.faults import run
-from servod.qualify.faults.actions import Action, action_of
+from servod.qualify.faults.actions import InjectionAction, action_of
 from servod.qualify.faults.run import Effects
 from servod.qualify.faults.scenario import Injection, Runs, Scenario
 from servod.qualify.faults.stepped import SteppedUnderTest
@@ -93,7 +93,7 @@ def test_each_effect_is_known_by_its_trace(
 
 def test_every_action_that_ships_has_a_trace_of_its_own() -> None:
     """No two kinds of action are counted by one mark, and no scenario injects what cannot be counted."""
-    owners: dict[object, type[Action]] = {}
+    owners: dict[object, type[InjectionAction]] = {}
     for name, shipped in shipped_scenarios().items():
         for injection in (*shipped.inject, *shipped.mend):
             action = action_of(Injection(do=injection.do), name, shipped.runs)

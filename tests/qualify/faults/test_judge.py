@@ -11,7 +11,7 @@ from servod.qualify.faults.judge import complaints, reaction
 from servod.qualify.faults.scenario import Scenario
 from servod.qualify.faults.under_test import Observation
 from servod.runtime.fieldbus.devices import DriveState
-from servod.runtime.loop.wiring.findings import Finding
+from servod.runtime.loop.wiring.findings import WiringOutcome
 
 MS = 1_000_000
 ON, OFF = DriveState.OPERATION_ENABLED, DriveState.SWITCH_ON_DISABLED
@@ -31,7 +31,7 @@ def seen(
     axis: str = "FAULT",
     refusal: str = "",
     lost: int = 0,
-    says: Finding | None = None,
+    says: WiringOutcome | None = None,
     errors: tuple[int, ...] = (),
 ) -> Observation:
     return Observation(samples, axis, frozenset({FaultCode.FEEDBACK_STALE}), refusal, lost, says, frozenset(errors))
@@ -64,8 +64,12 @@ def test_times_count_from_the_injection() -> None:
         ({"axis": ["FAULT"]}, seen(lost=1), "1 cycle records are missing"),
         ({"axis": ["FAULT"], "drive_shows": ["QUICK_STOP_ACTIVE"]}, seen(), "never showed QUICK_STOP_ACTIVE"),
         ({"axis": ["FAULT"], "drive_never": ["SWITCH_ON_DISABLED"]}, seen(), "showed SWITCH_ON_DISABLED"),
-        ({"axis": ["FAULT"], "says": "ONE_WAY"}, seen(says=Finding.ONE_WAY), ""),
-        ({"axis": ["FAULT"], "says": "ONE_WAY"}, seen(says=Finding.NO_MOTION), "says NO_MOTION, expected ONE_WAY"),
+        ({"axis": ["FAULT"], "says": "ONE_WAY"}, seen(says=WiringOutcome.ONE_WAY), ""),
+        (
+            {"axis": ["FAULT"], "says": "ONE_WAY"},
+            seen(says=WiringOutcome.NO_MOTION),
+            "says NO_MOTION, expected ONE_WAY",
+        ),
         ({"axis": ["FAULT"], "says": "ONE_WAY"}, seen(), "says nothing, expected ONE_WAY"),
         ({"axis": ["FAULT"], "drive_error": 0x2320}, seen(errors=(0x2320,)), ""),
         ({"axis": ["FAULT"], "drive_error": 0x2320}, seen(errors=(0x2310,)), "shown are 0x2310, expected 0x2320"),

@@ -6,9 +6,8 @@ from typing import Any
 import pytest
 
 from servod.common.errors import BadInput
-from servod.qualify.faults.document import document, summary
-from servod.qualify.faults.judge import Reaction, check_bounds, loss_of
-from servod.qualify.faults.run import Outcome
+from servod.qualify.faults.judge import ReactionTimes, check_bounds, loss_of
+from servod.qualify.faults.run import Outcome, document, summary
 from servod.qualify.faults.scenario import Loss, Scenario
 
 NONE, FEEDBACK, MASTER = Loss
@@ -98,7 +97,7 @@ def test_a_loss_without_its_bound_is_refused_unless_the_file_says_why() -> None:
 
 
 def outcome(name: str, gone_ms: float, exempt: str | None) -> Outcome:
-    times = Reaction(gone_ms, gone_ms)
+    times = ReactionTimes(gone_ms, gone_ms)
     return Outcome(
         name, "x", "x", "x", (), "", "FAULT", times, 0, exempt is None, (), MASTER, exempt, exempt is not None
     )

@@ -12,10 +12,9 @@ import pytest
 from servod.common.errors import AnswerIsNo
 from servod.formats.config import RecorderConfig
 from servod.formats.recording.record import FIELDS, RECORD
-from servod.qualify.faults.document import document
 from servod.qualify.faults.evidence import lost_records, wait_for_rows
-from servod.qualify.faults.judge import Reaction
-from servod.qualify.faults.run import Outcome
+from servod.qualify.faults.judge import ReactionTimes
+from servod.qualify.faults.run import Outcome, document
 from servod.qualify.faults.scenario import Loss
 from servod.runtime.daemon.recorder import Recorder
 
@@ -86,7 +85,7 @@ def outcome(lost: int | None) -> Outcome:
         detected=(),
         remedy="",
         axis="ENABLED",
-        reaction=Reaction(None, None),
+        reaction=ReactionTimes(None, None),
         lost_records=lost,
         recovered=True,
         complaints=(),

@@ -8,9 +8,9 @@ import pytest
 from servod.common.errors import BadInput
 from servod.drivers.virtual.bus_faults import BusFault, FaultKind
 from servod.drivers.virtual.client import VirtualBus
-from servod.qualify.faults.actions import Action, action_of
+from servod.qualify.faults.actions import InjectionAction, action_of
 from servod.qualify.faults.processes import ProcessAxis
-from servod.qualify.faults.scenario import Injection, Runs, Scenario, Start
+from servod.qualify.faults.scenario import Injection, Runs, Scenario, ScenarioStart
 
 NMT = {"nmt": {"who": "encoder", "command": "pre_operational"}}
 SCENARIO = {
@@ -23,7 +23,7 @@ SCENARIO = {
 }
 
 
-def action(do: dict[str, Any]) -> Action:
+def action(do: dict[str, Any]) -> InjectionAction:
     return action_of(Injection(do=do), "x", Runs.PROCESSES)
 
 
@@ -31,7 +31,7 @@ def action(do: dict[str, Any]) -> Action:
 def axis(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ProcessAxis]:
     scenario = Scenario.model_validate({**SCENARIO, "inject": [{"do": NMT}]})
     axis = ProcessAxis(scenario, tmp_path_factory.mktemp("axis"))
-    axis.start(Start.OFF)
+    axis.start(ScenarioStart.OFF)
     yield axis
     axis.close()
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from servod.lab.report.figures.motion import Motion
+from servod.lab.report.figures.motion import PlottedMotion
 from servod.lab.report.figures.sets import local_law
 from servod.lab.synthesize.local_sets import force_after
 from servod.lab.tracking.metrics import paper_rows
@@ -16,7 +16,7 @@ from servod.qualify.paper import table
 from servod.qualify.paper.claims import Claim, ordered
 from servod.qualify.paper.equations import compensator, equal_force_decay, exponent_of_18
 from servod.qualify.paper.joints import (
-    Joint,
+    PaperJoint,
     at_paper_feedback,
     consistent_g,
     printed_g,
@@ -77,7 +77,7 @@ def test_filtered_noise_has_the_asked_size_and_no_fast_part() -> None:
 
 def test_the_joints_friction_is_what_the_torque_overcomes() -> None:
     """Where the joint moves steadily, friction is that of Table I at its speed."""
-    plant = Joint.TABLE1.model()
+    plant = PaperJoint.TABLE1.model()
     run = simulate(plant, TABLE1, paper_rows(1e-3, 2.0))
     at = slice(800, 1200)
     speed = float(np.mean(run.true_velocity_rad_s[at]))
@@ -93,7 +93,7 @@ def test_noise_on_friction_is_in_the_friction_of_the_motion() -> None:
 
 def test_the_sweep_of_l_meets_the_run_without_it() -> None:
     sweep = sweep_of_l(with_l(TABLE1, "any", [0.3] * 9), 2.0, (0.01, 1.0))
-    assert sweep.without == pytest.approx(rms_mrad(Joint.TABLE1.model(), with_l(TABLE1, "none", [0.0] * 9), 2.0))
+    assert sweep.without == pytest.approx(rms_mrad(PaperJoint.TABLE1.model(), with_l(TABLE1, "none", [0.0] * 9), 2.0))
     assert sweep.rms_mrad["signs as printed"][1] > sweep.without
 
 
@@ -133,10 +133,10 @@ def test_the_table_puts_ours_beside_the_papers() -> None:
 
 def test_every_claim_and_every_rival_is_in_a_table() -> None:
     assert [row[3] for row in table.claims(document()).rows] == ["does not agree"] * 2
-    rival, deployed = table.tuned(document(), Joint.TABLE1).rows
+    rival, deployed = table.tuned(document(), PaperJoint.TABLE1).rows
     assert rival[:3] == ("pd", "equal", "2.5000")
     assert deployed == ("local, synthesized", table.UNLIMITED, "11.0000", "11.000", "1.1e+04")
-    first, *_ = table.steps(document(), Joint.TABLE1).rows
+    first, *_ = table.steps(document(), PaperJoint.TABLE1).rows
     assert first == ("PD", *("–",) * 6)
 
 
@@ -151,5 +151,5 @@ def test_an_error_around_zero_velocity_is_told_from_one_elsewhere() -> None:
     slow = speed < SLOW_RAD_S
     for wrong, agrees in ((slow, True), (~slow, False)):
         nothing = np.zeros_like(t)
-        motion = Motion("x", t, reference, reference - 1e-3 * wrong, nothing, nothing)
+        motion = PlottedMotion("x", t, reference, reference - 1e-3 * wrong, nothing, nothing)
         assert around_zero(motion).agrees is agrees

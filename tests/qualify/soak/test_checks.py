@@ -18,12 +18,12 @@ from servod.formats.config import load_config
 from servod.formats.gains.gain_set import load_gains
 from servod.formats.model.axis_model import load_axis_model
 from servod.kernels.laws import LAWS
-from servod.qualify.faults.judge import Reaction
+from servod.qualify.faults.judge import ReactionTimes
 from servod.qualify.soak.drive import SAMPLE_ROW, DriveCheck, check_reaction, reaction_in
 from servod.qualify.soak.kinds import KINDS, fault_bits
 from servod.qualify.soak.memory import Growth, Memory
 from servod.qualify.soak.rows import RowCheck, Rows, rows_of, run_lengths
-from servod.qualify.soak.starved import STARVED_CYCLE, STARVED_SUPERVISOR, Explained, Starved
+from servod.qualify.soak.starved import STARVED_CYCLE, STARVED_SUPERVISOR, ExcusedFaults, Starvation
 from servod.qualify.soak.syncs import SyncCheck, SyncListener
 from servod.qualify.soak.tally import FaultTally, Findings, Wrong
 from servod.runtime.fieldbus.devices import DriveState
@@ -177,8 +177,8 @@ def test_samples_that_nobody_read_are_found_once() -> None:
 def test_reaction_times_are_those_of_the_drive() -> None:
     on, off = DriveState.OPERATION_ENABLED, DriveState.SWITCH_ON_DISABLED
     samples = drive_samples([on, on, DriveState.QUICK_STOP_ACTIVE, off], [0.1, 0.1, 0.1, 0.0])
-    assert reaction_in(samples, PERIOD_NS) == Reaction(1.0, 2.0)
-    assert reaction_in(samples[:-1], PERIOD_NS) == Reaction(1.0, None)
+    assert reaction_in(samples, PERIOD_NS) == ReactionTimes(1.0, 2.0)
+    assert reaction_in(samples[:-1], PERIOD_NS) == ReactionTimes(1.0, None)
 
 
 @pytest.mark.parametrize(
@@ -202,7 +202,7 @@ def test_descriptors_that_are_not_closed_are_found() -> None:
 
 
 def test_a_fault_is_explained_in_its_time_and_no_longer() -> None:
-    explained = Explained(always=1)
+    explained = ExcusedFaults(always=1)
     explained.add(10, 2, 20)
     explained.add(15, 4)
     assert explained.at(np.array([9, 10, 20, 21])).tolist() == [1, 3, 7, 5]
@@ -213,7 +213,7 @@ def test_a_fault_is_explained_in_its_time_and_no_longer() -> None:
 
 def test_a_process_that_got_no_turn_was_starved() -> None:
     begun_ns, cpus = time.monotonic_ns(), os.sched_getaffinity(0)
-    starved, one = Starved(begun_ns), {min(cpus)}
+    starved, one = Starvation(begun_ns), {min(cpus)}
     busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(3)]
     try:
         for process in busy:
@@ -231,7 +231,7 @@ def test_short_waits_of_many_processes_starve_none(monkeypatch: pytest.MonkeyPat
     waited_ms = {1: 0, 2: 0, 3: 0}
     monkeypatch.setattr("servod.qualify.soak.starved.waited_ns", lambda pid: waited_ms[pid] * 1_000_000)
     monkeypatch.setattr("servod.qualify.soak.starved.stolen_ns", lambda: 0)
-    starved, watched = Starved(0), {1: STARVED_CYCLE, 2: STARVED_CYCLE, 3: STARVED_SUPERVISOR}
+    starved, watched = Starvation(0), {1: STARVED_CYCLE, 2: STARVED_CYCLE, 3: STARVED_SUPERVISOR}
     waited_ms.update({1: 20, 2: 20, 3: 20})
     assert starved.waited_ms(watched) == 60.0 and not starved.hungry(watched)
     starved.look(watched, 10)
@@ -243,8 +243,8 @@ def test_short_waits_of_many_processes_starve_none(monkeypatch: pytest.MonkeyPat
 
 def test_what_belongs_to_the_bound_is_told_with_it() -> None:
     kind, findings = next(k for k in KINDS if k.name == "encoder cut off"), Findings()
-    assert not check_reaction(kind, Reaction(109.0, 359.0), 0, FaultTally(), findings, 60.0)
-    assert check_reaction(kind, Reaction(115.0, 359.0), 0, FaultTally(), findings, 60.0, 10.0)
+    assert not check_reaction(kind, ReactionTimes(109.0, 359.0), 0, FaultTally(), findings, 60.0)
+    assert check_reaction(kind, ReactionTimes(115.0, 359.0), 0, FaultTally(), findings, 60.0, 10.0)
     assert not findings.counts
-    check_reaction(kind, Reaction(111.0, 359.0), 0, FaultTally(), findings, 60.0)
+    check_reaction(kind, ReactionTimes(111.0, 359.0), 0, FaultTally(), findings, 60.0)
     assert findings.told[0].text == "encoder cut off: command left after 111 ms, 110 ms allowed"

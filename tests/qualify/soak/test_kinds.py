@@ -10,7 +10,7 @@ import pytest
 
 from servod.qualify.faults.actions import action_of
 from servod.qualify.faults.scenario import Runs
-from servod.qualify.soak.kinds import KINDS, FaultKind
+from servod.qualify.soak.kinds import KINDS, InjectionKind
 
 
 class End(random.Random):
@@ -29,7 +29,7 @@ class End(random.Random):
 
 @pytest.mark.parametrize("end", [min, max])
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
-def test_both_ends_of_every_range_are_taken(kind: FaultKind, end: Callable[[Any, Any], Any]) -> None:
+def test_both_ends_of_every_range_are_taken(kind: InjectionKind, end: Callable[[Any, Any], Any]) -> None:
     action_of(kind.injection(End(end)), kind.name, Runs.STEPPED)
     if (repair := kind.repair()) is not None:
         action_of(repair, kind.name, Runs.STEPPED)

@@ -19,10 +19,10 @@ from servod.common.errors import Unreachable
 from servod.common.faults import FaultCode
 from servod.qualify.faults.scenario import Recovery
 from servod.qualify.soak.document import Course, added, document, verdict
-from servod.qualify.soak.kinds import KINDS, FaultKind
+from servod.qualify.soak.kinds import KINDS, InjectionKind
 from servod.qualify.soak.launch import DOCUMENT_NAME, Order, launch, run
 from servod.qualify.soak.memory import Memory
-from servod.qualify.soak.plan import Ending, Episode, Move, schedule
+from servod.qualify.soak.plan import Episode, Move, SoakEnding, schedule
 from servod.qualify.soak.stepped import GAIN_SETS, SteppedSoak
 from servod.qualify.soak.tally import Wrong
 from servod.runtime.loop.commands import ReferenceKind
@@ -36,9 +36,9 @@ def quiet(_line: str, _share: float) -> None:
     """Progress that nobody sees."""
 
 
-def befallen(fault: FaultKind) -> Episode:
+def befallen(fault: InjectionKind) -> Episode:
     """An episode in which `fault` comes."""
-    return Episode(1, None, _SINE, 0.25, fault, Ending.FINISH, 1)
+    return Episode(1, None, _SINE, 0.25, fault, SoakEnding.FINISH, 1)
 
 
 def children() -> set[int]:
@@ -105,7 +105,7 @@ def test_ctrl_c_leaves_a_report_of_what_was_done(axis: SteppedSoak, wrong: Count
     ],
 )
 def test_what_the_schedule_does_not_explain_is_found(
-    axis: SteppedSoak, wrong: Counter[Wrong], lie: FaultKind, finding: Wrong
+    axis: SteppedSoak, wrong: Counter[Wrong], lie: InjectionKind, finding: Wrong
 ) -> None:
     axis.episode(befallen(lie))
     assert finding in wrong
@@ -113,7 +113,7 @@ def test_what_the_schedule_does_not_explain_is_found(
 
 @pytest.mark.parametrize("kind", _RIDDEN, ids=lambda kind: kind.name)
 def test_what_is_ridden_through_counts_only_if_it_happened(
-    axis: SteppedSoak, wrong: Counter[Wrong], monkeypatch: pytest.MonkeyPatch, kind: FaultKind
+    axis: SteppedSoak, wrong: Counter[Wrong], monkeypatch: pytest.MonkeyPatch, kind: InjectionKind
 ) -> None:
     """By the bus itself: the same episode with nothing injected is found out."""
     before = replace(axis.tally.of(kind.name))

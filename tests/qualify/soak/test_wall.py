@@ -10,7 +10,7 @@ import pytest
 
 from servod.qualify.soak.kinds import KINDS
 from servod.qualify.soak.launch import DOCUMENT_NAME, run
-from servod.qualify.soak.plan import Ending, Episode, Move
+from servod.qualify.soak.plan import Episode, Move, SoakEnding
 from servod.qualify.soak.tally import Wrong
 from servod.qualify.soak.wall import WallSoak, of_the_wall
 from servod.runtime.loop.commands import ReferenceKind
@@ -24,7 +24,7 @@ def episodes() -> Iterator[Episode]:
     """One that is ridden through, one that stops the axis, one that ends the daemon."""
     move = Move(ReferenceKind.SINE, (0.1, 1.0, 0.6), 0.6)
     for number, name in enumerate(("torque frames lost", "safe torque off", "encoder reset"), start=1):
-        yield Episode(number, "demo_pd_dob" if number == 1 else None, move, 0.2, _KIND[name], Ending.FINISH, number)
+        yield Episode(number, "demo_pd_dob" if number == 1 else None, move, 0.2, _KIND[name], SoakEnding.FINISH, number)
 
 
 def test_every_row_of_the_recordings_has_its_sync_and_every_fault_is_seen(tmp_path: Path) -> None:

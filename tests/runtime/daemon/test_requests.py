@@ -13,10 +13,10 @@ from servod.common.errors import BadInput, Unreachable
 from servod.formats.protocol import Verb
 from servod.runtime.daemon.arguments import check_arguments
 from servod.runtime.daemon.connection import Reply
-from servod.runtime.daemon.flows import Flow, Flows, FutureWait, Orders, StateWait
+from servod.runtime.daemon.flows import Flow, Flows, FutureWait, OrderSender, StateWait
 from servod.runtime.daemon.gain_bank import GainBank
 from servod.runtime.daemon.recorder import Recorder
-from servod.runtime.daemon.trajectory import Table
+from servod.runtime.daemon.trajectory import MotionTable
 from servod.runtime.daemon.verbs import Verbs
 from servod.runtime.fieldbus.devices import DriveState
 from servod.runtime.loop.axis import AxisState
@@ -40,7 +40,7 @@ from servod.runtime.loop.handle import LoopHandle
 )
 def test_motions_become_the_loops_arguments(args: dict[str, Any], reference: list[float]) -> None:
     track = check_arguments(Verb.TRACK, args)
-    assert track.reference(track.table(Table())) == reference
+    assert track.reference(track.table(MotionTable())) == reference
 
 
 @pytest.mark.parametrize(
@@ -84,7 +84,7 @@ class _Answers:
 
 
 def test_flow_goes_on_when_its_order_comes_back() -> None:
-    orders, flows, answers = Orders(), Flows(), _Answers()
+    orders, flows, answers = OrderSender(), Flows(), _Answers()
 
     def flow() -> Flow:
         done = yield orders.expect(7, 0)
@@ -100,7 +100,7 @@ def test_flow_goes_on_when_its_order_comes_back() -> None:
 
 
 def test_refusal_and_silence_end_a_flow_with_the_reason() -> None:
-    orders, flows, answers = Orders(), Flows(), _Answers()
+    orders, flows, answers = OrderSender(), Flows(), _Answers()
 
     def flow(seq: int) -> Flow:
         yield orders.expect(seq, 0)
@@ -110,7 +110,7 @@ def test_refusal_and_silence_end_a_flow_with_the_reason() -> None:
     flows.start(flow(2), answers.reply())
     orders.see([record(1, command_seq=1, command_result=Refusal.NOT_ENABLED)], 1)
     flows.poll(1)
-    flows.poll(Orders.TIMEOUT_NS)
+    flows.poll(OrderSender.TIMEOUT_NS)
     messages = [a["error"]["message"] for a in answers.sent]
     assert ["not enabled" in messages[0], "did not answer" in messages[1]] == [True, True]
 

@@ -9,11 +9,11 @@ from daemon_rows import axis_config, record
 from servod.common.errors import BadInput, Unreachable
 from servod.formats.protocol import SampleKey, Verb
 from servod.runtime.daemon.arguments import check_arguments
-from servod.runtime.daemon.trajectory import Table, check_motion
+from servod.runtime.daemon.trajectory import MotionTable, check_motion
 
 
 def test_pieces_become_one_column_with_its_extent_and_steps() -> None:
-    table = Table()
+    table = MotionTable()
     table.add(SampleKey.POSITIONS, 0, [9.0])
     for start, piece in ((0, [0.0, 0.1]), (2, [0.4, 0.3])):
         table.add(SampleKey.POSITIONS, start, piece)
@@ -40,7 +40,7 @@ def test_pieces_become_one_column_with_its_extent_and_steps() -> None:
 )
 def test_motion_is_checked_with_figures_before_the_loop_is_asked(args: dict[str, Any], says: str) -> None:
     track = check_arguments(Verb.TRACK, args)
-    table = track.table(Table())
+    table = track.table(MotionTable())
     config = axis_config(Path("s"), Path("c"))
     limits = config.limits.model_copy(update={"speed_rad_s": 5.0})
     with pytest.raises(Unreachable) as caught:
@@ -71,7 +71,7 @@ def test_motion_is_checked_with_figures_before_the_loop_is_asked(args: dict[str,
 )
 def test_a_jump_beyond_the_following_error_is_bad_input(args: dict[str, Any], line: str) -> None:
     track = check_arguments(Verb.TRACK, args)
-    table = track.table(Table())
+    table = track.table(MotionTable())
     config = axis_config(Path("s"), Path("c"))
     limits = config.limits.model_copy(update={"speed_rad_s": 1e3, "following_error_rad": 0.205})
     now = record(reference_rad=0.5, position_rad=0.51)

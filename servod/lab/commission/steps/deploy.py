@@ -12,8 +12,8 @@ from servod.lab.commission.comparison import load_rows, save_rows
 from servod.lab.commission.state import AFTER_ROWS, BEFORE, BEFORE_ROWS, DEPLOYMENT, GAINS, MODEL, STORE, write_json
 from servod.lab.commission.state import read_walk_json as read_json
 from servod.lab.commission.walk import Walk
-from servod.lab.deploy.deployment import announced, deploy
-from servod.lab.deploy.outcome import Before, Deployment
+from servod.lab.deploy.deployment import deploy, motion_notice
+from servod.lab.deploy.outcome import Baseline, Deployment
 from servod.lab.identify.bounds import STIFF, feedback
 
 
@@ -41,7 +41,9 @@ class Deploy:
         gains = load_gains(walk.path(GAINS))
         if not walk.axis.virtual:
             name = walk.axis.config.name
-            walk.questions.agree(f"try the certified set {gains.name} on {name}: {announced(gains)}; is its way free?")
+            walk.questions.agree(
+                f"try the certified set {gains.name} on {name}: {motion_notice(gains)}; is its way free?"
+            )
         with (
             walk.axis.deployment(walk.path(STORE), gains, _present(walk)) as axis,
             walk.progress(self.title) as tell,
@@ -53,14 +55,14 @@ class Deploy:
         walk.say(f"deploy: {done.said}")
 
 
-def remember(walk: Walk, before: Before) -> None:
+def remember(walk: Walk, before: Baseline) -> None:
     """Put the run before the change on disk, with the hash of the set that it was made for."""
     walk.path(BEFORE).unlink(missing_ok=True)  # it is not of the rows that come
     save_rows(walk.path(BEFORE_ROWS), before.rows)
     write_json(walk.path(BEFORE), {"present": list(before.present), **walk.hashes(GAINS)})
 
 
-def remembered(walk: Walk) -> Before | None:
+def remembered(walk: Walk) -> Baseline | None:
     """The run before the change to this very set, where an earlier attempt at the step left one. Raises BadInput."""
     if not (walk.path(BEFORE).exists() and walk.path(BEFORE_ROWS).exists()):
         return None
@@ -68,7 +70,7 @@ def remembered(walk: Walk) -> Before | None:
     if found[GAINS] != walk.hashes(GAINS)[GAINS]:
         return None
     name, version = found["present"]
-    return Before((name, version), load_rows(walk.path(BEFORE_ROWS)))
+    return Baseline((name, version), load_rows(walk.path(BEFORE_ROWS)))
 
 
 def _keep(walk: Walk, done: Deployment) -> None:

@@ -11,7 +11,7 @@ from servod.formats.model.axis_model import load_axis_model
 from servod.lab.commission.comparison import DEPLOYED
 from servod.lab.commission.state import GAINS, MODEL, RIVALS, TUNING, write_json, write_text
 from servod.lab.commission.walk import Walk
-from servod.lab.tune.plan import BUDGET, ROUGHNESS_TOLERANCE, Feedback, Tuned, TunePlan
+from servod.lab.tune.plan import BUDGET, ROUGHNESS_TOLERANCE, Feedback, Tuned, TuningSettings
 from servod.lab.tune.rivals import rivals
 from servod.lab.tune.tuning import as_tuned
 
@@ -78,11 +78,11 @@ def rival_file(walk: Walk, feedback: Feedback, name: str) -> Path:
     return walk.path(RIVALS) / f"{name}_{feedback.value}.yaml"
 
 
-def _plan(walk: Walk) -> TunePlan:
+def _plan(walk: Walk) -> TuningSettings:
     """The deployed law's own loop: its encoder, cycle and velocity filter, and the axis's torque limit."""
     design = load_gains(walk.path(GAINS)).design
     assert design is not None  # a certified set has one
-    return TunePlan(
+    return TuningSettings(
         counts_per_turn=design.counts_per_turn,
         cutoff_hz=design.velocity_cutoff_hz,
         period_s=design.period_s,

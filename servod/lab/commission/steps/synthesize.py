@@ -15,7 +15,7 @@ from servod.formats.model.axis_model import AxisModel, load_axis_model
 from servod.lab.commission.state import DESIGN, INFEASIBLE, MODEL, RELAXED, write_json, write_text
 from servod.lab.commission.walk import Walk
 from servod.lab.synthesize.deployed import Wishes
-from servod.lab.synthesize.gain_set import Options, synthesize
+from servod.lab.synthesize.gain_set import DesignOptions, synthesize
 from servod.lab.synthesize.infeasible import Infeasible, Relaxation
 from servod.lab.synthesize.regions import uncertainty_of
 
@@ -59,7 +59,7 @@ class Synthesize:
     def _attempt(self, walk: Walk, model: AxisModel, wishes: Wishes) -> GainSet | Infeasible:
         with walk.progress(self.title) as tell:
             tell("both regions", 0.1)
-            options = Options(name=f"{walk.axis.config.name.lower()}_local", accuracy=walk.options.accuracy)
+            options = DesignOptions(name=f"{walk.axis.config.name.lower()}_local", accuracy=walk.options.accuracy)
             return synthesize(model, wishes, options, walk.path(MODEL))
 
 

@@ -15,7 +15,7 @@ from servod.lab.diagnose.data.trace import CheckedTrace
 from servod.lab.diagnose.settings import SETTINGS
 
 
-def one_way(traces: Sequence[CheckedTrace]) -> bool:
+def unidirectional(traces: Sequence[CheckedTrace]) -> bool:
     """Whether the axis hardly goes one of its two ways."""
     speed = np.concatenate([trace.velocity[trace.counts] for trace in traces])
     goes = SETTINGS.excitation.moving_speed * float(np.quantile(np.abs(speed), 0.98))
@@ -27,5 +27,5 @@ def creeps(traces: Sequence[CheckedTrace], inertia: float) -> bool:
     needed = np.abs(np.concatenate([inertia * trace.acceleration[trace.counts] for trace in traces]))
     needed = np.minimum(needed, np.quantile(needed, 1.0 - SETTINGS.excitation.otherwise))
     command = np.concatenate([trace.drive.torque[trace.counts] for trace in traces])
-    least = SETTINGS.excitation.least_inertial if one_way(traces) else SETTINGS.excitation.least_both_ways
+    least = SETTINGS.excitation.least_inertial if unidirectional(traces) else SETTINGS.excitation.least_both_ways
     return float(np.sqrt(np.mean(needed**2))) < least * float(np.sqrt(np.mean(command**2)))

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from importlib import import_module
 
-from servod.lab.diagnose.data.excitation import creeps, one_way
+from servod.lab.diagnose.data.excitation import creeps, unidirectional
 from servod.lab.diagnose.data.trace import CheckedTrace
 from servod.lab.diagnose.effects.effect import Effect
 
@@ -62,5 +62,5 @@ def names(which: Callable[[Effect], bool]) -> frozenset[str]:
 
 def unexcited_effects(traces: Sequence[CheckedTrace], inertia: float) -> frozenset[str]:
     """Effects that these recordings of an axis of this inertia cannot show."""
-    slow, straight = creeps(traces, inertia), one_way(traces)
+    slow, straight = creeps(traces, inertia), unidirectional(traces)
     return names(lambda found: (slow and found.swift) or (straight and found.directed))

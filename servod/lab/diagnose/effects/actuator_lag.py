@@ -10,13 +10,13 @@ from servod.formats.model.effects import ActuatorLag
 from servod.lab.diagnose.effects.effect import Effect, known_delay, simple
 from servod.lab.diagnose.effects.hypothesis import Term, Unknown
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 
 #: Time constants to start from, s.
 STARTS_S = (0.002, 0.006, 0.02)
 
 
-def terms(scene: Scene) -> list[Term]:
+def terms(scene: SearchContext) -> list[Term]:
     """A lag from some time constants, and a limited rate."""
     own = known_delay(scene.document)
     lags = [simple("actuator_lag", "lag", [Unknown("time_constant_s", "s", start, 1e-5, 0.5)]) for start in STARTS_S]

@@ -8,7 +8,7 @@ from servod.formats.model.friction import Asymmetry
 from servod.lab.diagnose.effects.effect import Effect, positive, share
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Teller, Term, Writer
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 
 
 def _write(document: Document, values: Sequence[float]) -> None:
@@ -44,7 +44,7 @@ def _teller(write: Writer) -> Teller:
     return tell
 
 
-def terms(_scene: Scene) -> list[Term]:
+def terms(_scene: SearchContext) -> list[Term]:
     """Dry friction by direction, and dry and viscous friction; each also with another level than the model's."""
     dry = share("dry", 0.0, -0.9, 0.9, 1.0)
     viscous = share("viscous", 0.0, -0.9, 0.9, 1.0)

@@ -6,7 +6,7 @@ from servod.formats.model.effects import Backlash
 from servod.lab.diagnose.effects.effect import Effect
 from servod.lab.diagnose.effects.hypothesis import Term
 from servod.lab.diagnose.effects.looks import Look, Split
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 from servod.lab.diagnose.effects.two_mass import two_mass_term
 
 #: Gaps to start from, as shares of the range, shares of the load, and resonances of the contact as multiples of the
@@ -14,7 +14,7 @@ from servod.lab.diagnose.effects.two_mass import two_mass_term
 GAPS, SHARES, RESONANCES = (0.0015, 0.005, 0.015), (0.35, 0.65), (4.0,)
 
 
-def terms(scene: Scene) -> list[Term]:
+def terms(scene: SearchContext) -> list[Term]:
     """Many starts: the cost has no slope towards a gap that is not there."""
     grid = [(gap, share, fast) for gap in GAPS for share in SHARES for fast in RESONANCES]
     return [

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.formats.model.effects import Cogging
-from servod.lab.diagnose.effects.effect import Effect, harmonic, sine_term, told_sines
+from servod.lab.diagnose.effects.effect import Effect, harmonic, report_sines, sine_term
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Term, Unknown
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 
 Array = NDArray[np.float64]
 
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 WHOLE_TURN, HIGHEST_ORDER, MOST_ORDERS, LEAST_ORDERS, LEAST_SHARE = 5.9, 128, 8, 3, 0.01
 
 
-def terms(scene: Scene) -> list[Term]:
+def terms(scene: SearchContext) -> list[Term]:
     """Sines whose period is searched, and with the second harmonic; whole orders of a turn where there are several."""
     peaks = scene.peaks(scene.carried(-np.ones_like(scene.position)), 3)
     most = 20.0 * max(scene.dry, 0.05 * scene.effort)
@@ -31,7 +31,7 @@ def terms(scene: Scene) -> list[Term]:
     return [*found, _comb(scene, orders, most)] if len(orders) >= LEAST_ORDERS else found
 
 
-def whole_orders(scene: Scene) -> list[int]:
+def whole_orders(scene: SearchContext) -> list[int]:
     """Orders of a motor's turn that the mismatch holds beside each other, strongest first: matching pursuit."""
     columns = scene.carried(-np.ones_like(scene.position))
     wanted = scene.mismatch[scene.thinned]
@@ -39,7 +39,8 @@ def whole_orders(scene: Scene) -> list[int]:
     found: list[int] = []
     for _ in range(MOST_ORDERS):
         best = max(
-            (n for n in range(1, HIGHEST_ORDER + 1) if n not in found), key=lambda n: taken(columns(float(n)), left)
+            (n for n in range(1, HIGHEST_ORDER + 1) if n not in found),
+            key=lambda n: explained_power(columns(float(n)), left),
         )
         design = np.column_stack([c for n in (*found, best) for c in columns(float(n))])
         after = wanted - design @ np.linalg.lstsq(design, wanted, rcond=None)[0]
@@ -50,12 +51,12 @@ def whole_orders(scene: Scene) -> list[int]:
     return found
 
 
-def taken(pair: tuple[Array, Array], wanted: Array) -> float:
+def explained_power(pair: tuple[Array, Array], wanted: Array) -> float:
     """Power of `wanted` that a sine and a cosine take, as if they were orthogonal."""
     return sum(float(wanted @ column) ** 2 / max(float(column @ column), 1e-30) for column in pair)
 
 
-def _comb(scene: Scene, orders: list[int], most: float) -> Term:
+def _comb(scene: SearchContext, orders: list[int], most: float) -> Term:
     """Sines of whole orders of a turn."""
     names = [f"{part}_of_{n}" for n in orders for part in ("sine", "cosine")]
     unknowns = tuple(Unknown(name, scene.force, 0.0, -most, most, scene.dry) for name in names)
@@ -69,7 +70,7 @@ def _comb(scene: Scene, orders: list[int], most: float) -> Term:
         rows.extend(harmonic(scene, n, amplitude, phase) for n, amplitude, phase in sines(values))
 
     def tell(_document: Document, values: Sequence[float]) -> list[Reported]:
-        return told_sines(scene, sines(values), scene.force)
+        return report_sines(scene, sines(values), scene.force)
 
     return Term("cogging", "orders of a turn", unknowns, write, tell)
 

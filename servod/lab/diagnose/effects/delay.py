@@ -9,13 +9,13 @@ from servod.lab.diagnose.effects.base import DELAY_S
 from servod.lab.diagnose.effects.effect import Effect, known_delay, simple
 from servod.lab.diagnose.effects.hypothesis import Document, Term, Unknown, get
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 
 #: Delays to start from, s.
 STARTS_S = (0.003, 0.008, 0.02)
 
 
-def terms(scene: Scene) -> list[Term]:
+def terms(scene: SearchContext) -> list[Term]:
     """Some starts: the cost has a valley for each wave of the excitation."""
     own = get(scene.document, "delay_s", 0.001)
     found = []

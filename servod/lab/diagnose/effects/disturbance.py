@@ -11,7 +11,7 @@ from servod.formats.model.effects import Disturbance
 from servod.lab.diagnose.effects.effect import Effect
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Term, Unknown
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 
 Array = NDArray[np.float64]
 
@@ -44,7 +44,7 @@ def windows(mismatch: Array, period_s: float) -> list[tuple[float, int, int]]:
     return found
 
 
-def terms(scene: Scene) -> list[Term]:
+def terms(scene: SearchContext) -> list[Term]:
     """The windows of single recordings in which a constant torque takes most, and windows common to all of them."""
     found = []
     traces = scene.predictor.traces
@@ -56,7 +56,7 @@ def terms(scene: Scene) -> list[Term]:
     return single + (_common(scene) if len(traces) > 1 else [])
 
 
-def _common(scene: Scene) -> list[Term]:
+def _common(scene: SearchContext) -> list[Term]:
     """Windows at the same time after the start of every recording."""
     traces, parts = scene.predictor.traces, scene.predictor.slices
     rows = min(part.stop - part.start for part in parts)
@@ -68,7 +68,7 @@ def _common(scene: Scene) -> list[Term]:
     return [_term(scene, t_s, (first, last), float(np.mean(mean[first:last])), shifts) for _, first, last in best]
 
 
-def _term(scene: Scene, t_s: Array, rows: tuple[int, int], torque: float, shifts: tuple[float, ...]) -> Term:
+def _term(scene: SearchContext, t_s: Array, rows: tuple[int, int], torque: float, shifts: tuple[float, ...]) -> Term:
     """A window from row to row of `t_s`, in recordings whose times stand `shifts` later; its shortest lies within."""
     most = 50.0 * max(scene.dry, 0.2 * scene.effort)
     length = max(float(t_s[rows[1]] - t_s[rows[0]]), SHORTEST_S)

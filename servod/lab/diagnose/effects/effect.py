@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from servod.formats.model.keys import Group
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Teller, Term, Unknown, Writer, get
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import Peak, Scene
+from servod.lab.diagnose.effects.scene import Peak, SearchContext
 
 #: By how much the model's own delay may be off beside a lag or a longer delay, s.
 OWN_DELAY_S = 0.0002
@@ -47,7 +47,7 @@ class Effect:
     shows: str
     confused: tuple[str, ...]
     experiment: str
-    terms: Callable[[Scene], list[Term]]
+    terms: Callable[[SearchContext], list[Term]]
     look: Look
     friction_keys: tuple[str, ...] = ()
     far: bool = False
@@ -71,7 +71,7 @@ def positive(key: str, unit: str, start: float, factor: float = 1000.0) -> Unkno
     return Unknown(key, unit, start, start / factor, start * factor)
 
 
-def told(unknowns: Sequence[Unknown]) -> Teller:
+def report_as_is(unknowns: Sequence[Unknown]) -> Teller:
     """A term whose unknowns are what is reported."""
     return lambda _document, values: [Reported(u.key, v, u.unit) for u, v in zip(unknowns, values, strict=True)]
 
@@ -90,7 +90,7 @@ def keys(group: str, names: Sequence[str], **fixed: float | str) -> Writer:
 def simple(effect: str, form: str, unknowns: Sequence[Unknown], **fixed: float | str) -> Term:
     """A term whose unknowns are keys of the effect's own group."""
     write = keys(effect, [u.key for u in unknowns], **fixed)
-    return Term(effect, form, tuple(unknowns), write, told(unknowns))
+    return Term(effect, form, tuple(unknowns), write, report_as_is(unknowns))
 
 
 def known_delay(document: Document) -> dict[str, tuple[float, float]]:
@@ -99,7 +99,7 @@ def known_delay(document: Document) -> dict[str, tuple[float, float]]:
     return {"delay_s": (max(own - OWN_DELAY_S, 0.0), own + OWN_DELAY_S)}
 
 
-def harmonic(scene: Scene, n: float, amplitude: float, phase: float) -> Document:
+def harmonic(scene: SearchContext, n: float, amplitude: float, phase: float) -> Document:
     """One sine over position as the axis model file has it."""
     if scene.linear:
         return {"amplitude": amplitude, "periods_per_metre": n / (2.0 * math.pi), "phase": phase}
@@ -107,7 +107,15 @@ def harmonic(scene: Scene, n: float, amplitude: float, phase: float) -> Document
 
 
 def sine_term(
-    effect: str, scene: Scene, peak: Peak, size: float, unit: str, *, most: float, multiples: int = 1, free: bool = True
+    effect: str,
+    scene: SearchContext,
+    peak: Peak,
+    size: float,
+    unit: str,
+    *,
+    most: float,
+    multiples: int = 1,
+    free: bool = True,
 ) -> Term:
     """A sum of sines over position: order n (unless not `free`) and a sine and cosine for each multiple of it.
 
@@ -137,12 +145,12 @@ def sine_term(
         rows.extend(harmonic(scene, n, a, phase) for n, a, phase in sines(values))
 
     def tell(_document: Document, values: Sequence[float]) -> list[Reported]:
-        return told_sines(scene, sines(values), unit)
+        return report_sines(scene, sines(values), unit)
 
     return Term(effect, f"{multiples} sines" if multiples > 1 else "sine", tuple(unknowns), write, tell)
 
 
-def told_sines(scene: Scene, sines: Sequence[tuple[float, float, float]], unit: str) -> list[Reported]:
+def report_sines(scene: SearchContext, sines: Sequence[tuple[float, float, float]], unit: str) -> list[Reported]:
     """What is reported of sines over position: periods, amplitude, phase of each."""
     found = []
     for row, (n, amplitude, phase) in enumerate(sines):

@@ -9,12 +9,12 @@ from servod.formats.model.effects import EncoderEccentricity
 from servod.lab.diagnose.effects.effect import Effect, sine_term
 from servod.lab.diagnose.effects.hypothesis import Term
 from servod.lab.diagnose.effects.looks import Look, Split
-from servod.lab.diagnose.effects.scene import Columns, Peak, Scene
+from servod.lab.diagnose.effects.scene import Columns, Peak, SearchContext
 
 Array = NDArray[np.float64]
 
 
-def _columns(scene: Scene) -> Columns:
+def _columns(scene: SearchContext) -> Columns:
     """What an error a*sin(n*x) of the encoder looks like: the torque that would make the joint move so."""
     rows = scene.thinned
     place, speed, growth = scene.lagged_position[rows], scene.velocity[rows], scene.acceleration[rows]
@@ -29,7 +29,7 @@ def _columns(scene: Scene) -> Columns:
     return columns
 
 
-def terms(scene: Scene) -> list[Term]:
+def terms(scene: SearchContext) -> list[Term]:
     """One and two periods in a turn, and a searched order."""
     effect, size = "encoder_eccentricity", 1e-3 * scene.reach
     most = 0.1 * scene.reach

@@ -9,7 +9,7 @@ from servod.formats.model.effects import Gravity
 from servod.lab.diagnose.effects.effect import Effect, share
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Term, get
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 
 
 def _add(document: Document, values: Sequence[float]) -> tuple[float, float]:
@@ -24,7 +24,7 @@ def _write(document: Document, values: Sequence[float]) -> None:
     document["gravity"] = {"amplitude": amplitude, "phase": phase}
 
 
-def terms(scene: Scene) -> list[Term]:
+def terms(scene: SearchContext) -> list[Term]:
     """A weight, beside the one that the model has; none on a linear axis, where it would be an offset."""
     if scene.linear:
         return []

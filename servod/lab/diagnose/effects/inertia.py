@@ -8,14 +8,14 @@ from servod.lab.diagnose.effects.base import RECALIBRATION, factor
 from servod.lab.diagnose.effects.effect import Effect
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Term, get
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 
 
 def _write(_document: Document, _values: Sequence[float]) -> None:
     """Nothing of its own: the term opens the bounds of the model's inertia."""
 
 
-def terms(scene: Scene) -> list[Term]:
+def terms(scene: SearchContext) -> list[Term]:
     """The model's inertia released."""
     unit = "kg" if scene.linear else "kg·m²"
 

@@ -6,7 +6,7 @@ from servod.formats.model.effects import JointElasticity
 from servod.lab.diagnose.effects.effect import Effect
 from servod.lab.diagnose.effects.hypothesis import Term
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 from servod.lab.diagnose.effects.two_mass import two_mass_term
 
 #: Resonances to start from, as multiples of the observer's bandwidth, and shares of the load.
@@ -17,7 +17,7 @@ RESONANCES, SHARES = (0.3, 0.7, 1.4, 2.8), (0.3, 0.65)
 BEND = 0.1
 
 
-def terms(scene: Scene) -> list[Term]:
+def terms(scene: SearchContext) -> list[Term]:
     """Many starts: the cost has a valley for each resonance that the excitation holds; and springs that stiffen."""
     grid = [(fast * scene.predictor.rate, share) for fast in RESONANCES for share in SHARES]
     straight = [two_mass_term("joint_elasticity", scene, share, rate) for rate, share in grid]

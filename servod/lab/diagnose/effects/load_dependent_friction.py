@@ -6,10 +6,10 @@ from servod.formats.model.friction import LoadDependentFriction
 from servod.lab.diagnose.effects.effect import Effect, share, simple
 from servod.lab.diagnose.effects.hypothesis import Term, get
 from servod.lab.diagnose.effects.looks import Look, Split
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 
 
-def terms(scene: Scene) -> list[Term]:
+def terms(scene: SearchContext) -> list[Term]:
     """By the applied torque; by gravity and spring where the model has them; by both."""
     command = share("per_command", 0.0, 0.0, 2.0, 0.1)
     load = share("per_load", 0.0, 0.0, 2.0, 0.1)

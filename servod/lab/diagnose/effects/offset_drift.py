@@ -11,7 +11,7 @@ from servod.formats.model.effects import OffsetDrift
 from servod.lab.diagnose.effects.effect import Effect
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Term, Unknown
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 
 Array = NDArray[np.float64]
 
@@ -23,26 +23,26 @@ SHORTEST_S = 4.0
 FIRST, LEAST, MOST = 0.4, 0.15, 1.5
 
 
-def terms(scene: Scene) -> list[Term]:
+def terms(scene: SearchContext) -> list[Term]:
     """A straight line over the time of each recording, and a drift that ends."""
     if scene.duration_s < SHORTEST_S:
         return []
     return [_straight(scene), _ending(scene)]
 
 
-def _since_start(scene: Scene) -> Array:
+def _since_start(scene: SearchContext) -> Array:
     """Time of each row since the first row of its recording, s."""
     parts = scene.predictor.slices
     return np.concatenate([scene.time_s[part] - scene.time_s[part.start] for part in parts])
 
 
-def _size(scene: Scene, shape: Array) -> float:
+def _size(scene: SearchContext, shape: Array) -> float:
     """What the mismatch has of a torque of this shape over time, beside a constant one."""
     found, _ = scene.fitted([shape, np.ones_like(shape)])
     return float(found[0])
 
 
-def _straight(scene: Scene) -> Term:
+def _straight(scene: SearchContext) -> Term:
     length = scene.duration_s
     change = _size(scene, _since_start(scene) / length)
     most = 20.0 * max(scene.dry, scene.effort)
@@ -57,7 +57,7 @@ def _straight(scene: Scene) -> Term:
     return Term("offset_drift", "straight", (unknown,), write, tell)
 
 
-def _ending(scene: Scene) -> Term:
+def _ending(scene: SearchContext) -> Term:
     length = scene.duration_s
     first = FIRST * length
     change = _size(scene, 1.0 - np.exp(-_since_start(scene) / first))

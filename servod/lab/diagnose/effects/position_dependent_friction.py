@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from servod.formats.model.friction import PositionDependentFriction
-from servod.lab.diagnose.effects.effect import Effect, harmonic, sine_term, told
+from servod.lab.diagnose.effects.effect import Effect, harmonic, report_as_is, sine_term
 from servod.lab.diagnose.effects.hypothesis import Document, Term, Unknown
 from servod.lab.diagnose.effects.looks import Look, Split
-from servod.lab.diagnose.effects.scene import Peak, Scene
+from servod.lab.diagnose.effects.scene import Peak, SearchContext
 
 #: Half waves along the way that make a profile.
 PROFILE = 4
@@ -21,7 +21,7 @@ def _write_bump(document: Document, values: Sequence[float]) -> None:
     group.setdefault("bumps", []).append({"factor": values[0], "position": values[1], "width": values[2]})
 
 
-def _bumps(scene: Scene) -> list[Term]:
+def _bumps(scene: SearchContext) -> list[Term]:
     """Tight spots where the mismatch opposed to the motion is strongest."""
     against = -scene.mismatch * np.sign(scene.velocity) / scene.dry
     rows = scene.predictor.counts & (np.abs(scene.velocity) > 0.02 * scene.speed)
@@ -40,11 +40,11 @@ def _bumps(scene: Scene) -> list[Term]:
             ),
             Unknown("width", scene.length, width * scene.reach, 0.01 * scene.reach, 0.5 * scene.reach),
         )
-        found.append(Term("position_dependent_friction", "tight spot", unknowns, _write_bump, told(unknowns)))
+        found.append(Term("position_dependent_friction", "tight spot", unknowns, _write_bump, report_as_is(unknowns)))
     return found
 
 
-def terms(scene: Scene) -> list[Term]:
+def terms(scene: SearchContext) -> list[Term]:
     """Sines over position whose period is searched, one of low order, a tight spot, and a profile of the whole way."""
     carrier = -scene.dry * np.tanh(scene.velocity / (0.02 * scene.speed))
     peaks = scene.peaks(scene.carried(carrier), 2)
@@ -53,7 +53,7 @@ def terms(scene: Scene) -> list[Term]:
     return found + _bumps(scene) + ([_profile(scene)] if scene.fine else [])
 
 
-def _profile(scene: Scene) -> Term:
+def _profile(scene: SearchContext) -> Term:
     """A smooth profile: half-range cosines from one end of the way to the other."""
     first, count = float(scene.position.min()), PROFILE
     unknowns = tuple(Unknown(f"wave_{k}", "1", 0.0, -0.9, 0.9, 0.3) for k in range(1, count + 1))
@@ -65,7 +65,7 @@ def _profile(scene: Scene) -> Term:
             phase = float(np.pi / 2.0 - np.remainder(n * first, 2.0 * np.pi))
             rows.append(harmonic(scene, n, amplitude, phase))
 
-    return Term("position_dependent_friction", "profile", unknowns, write, told(unknowns))
+    return Term("position_dependent_friction", "profile", unknowns, write, report_as_is(unknowns))
 
 
 EFFECT = Effect(

@@ -8,10 +8,10 @@ from servod.formats.model.effects import PositionDependentInertia
 from servod.lab.diagnose.effects.effect import Effect, sine_term
 from servod.lab.diagnose.effects.hypothesis import Term
 from servod.lab.diagnose.effects.looks import Look, Split
-from servod.lab.diagnose.effects.scene import Peak, Scene
+from servod.lab.diagnose.effects.scene import Peak, SearchContext
 
 
-def terms(scene: Scene) -> list[Term]:
+def terms(scene: SearchContext) -> list[Term]:
     """One and two periods in a turn (one in the range on a linear axis), and a searched order."""
     effect = "position_dependent_inertia"
     peaks = scene.peaks(scene.carried(-scene.inertia * scene.acceleration), 1)

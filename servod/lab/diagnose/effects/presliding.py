@@ -9,7 +9,7 @@ from servod.lab.diagnose.effects.base import BRISTLE_FACTOR, factor
 from servod.lab.diagnose.effects.effect import Effect, keys, positive, simple
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Teller, Term, Unknown, get
 from servod.lab.diagnose.effects.looks import Look, Split
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 
 #: Factors on the model's own stiffness and damping to start from, and by which they may be off.
 STARTS, MOST = ((0.25, 0.5), (4.0, 2.0), (1.0, 5.0), (1.0, 0.2)), 300.0
@@ -18,7 +18,7 @@ STARTS, MOST = ((0.25, 0.5), (4.0, 2.0), (1.0, 5.0), (1.0, 0.2)), 300.0
 WAYS = (1e-4, 1e-3, 1e-2)
 
 
-def _tell(scene: Scene) -> Teller:
+def _tell(scene: SearchContext) -> Teller:
     units = {"sigma0": f"{scene.force}/{scene.length}", "sigma1": f"{scene.force}·s/{scene.length}"}
 
     def tell(document: Document, values: Sequence[float]) -> list[Reported]:
@@ -28,7 +28,7 @@ def _tell(scene: Scene) -> Teller:
     return tell
 
 
-def terms(scene: Scene) -> list[Term]:
+def terms(scene: SearchContext) -> list[Term]:
     """The bristle of the model released, from where it stands, softer and stiffer; a new one; fading damping."""
     own, damping = get(scene.document, "friction.sigma0"), get(scene.document, "friction.sigma1")
     if own <= 0.0:
@@ -45,7 +45,7 @@ def terms(scene: Scene) -> list[Term]:
     return [*found, Term("presliding", "fading damping", (fading,), write, _tell(scene), opens)]
 
 
-def _new(scene: Scene, stiffness: float) -> Term:
+def _new(scene: SearchContext, stiffness: float) -> Term:
     """A bristle for a model without one."""
     unknowns = [
         positive("sigma0", f"{scene.force}/{scene.length}", stiffness),

@@ -49,7 +49,7 @@ class Peak:
 
 
 @dataclass(frozen=True)
-class Scene:
+class SearchContext:
     """The nominal document, the predictor with its traces, and the mismatch of the fit that stands now (N*m).
 
     `fine` asks for finer forms too, with more unknowns than a first look may spend.

@@ -8,10 +8,10 @@ from servod.formats.model.effects import Spring
 from servod.lab.diagnose.effects.effect import Effect, share
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Term
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 
 
-def terms(scene: Scene) -> list[Term]:
+def terms(scene: SearchContext) -> list[Term]:
     """A straight and a stiffening spring; the rest position enters as the torque at the middle of the range."""
     size = max(scene.dry, 0.05 * scene.effort)
     half = 0.5 * scene.reach

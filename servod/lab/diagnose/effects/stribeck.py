@@ -9,13 +9,13 @@ from servod.lab.diagnose.effects.base import STRIBECK_SHARE
 from servod.lab.diagnose.effects.effect import Effect
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Teller, Term, Unknown, get, put
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 
 #: Static friction to start from, as a multiple of Coulomb friction.
 START = 1.4
 
 
-def _tell(scene: Scene) -> Teller:
+def _tell(scene: SearchContext) -> Teller:
     def tell(document: Document, _values: Sequence[float]) -> list[Reported]:
         found = []
         for key, unit in (("static", scene.force), ("stribeck_velocity", f"{scene.length}/s"), ("exponent", "1")):
@@ -36,7 +36,7 @@ def _whole(document: Document, values: Sequence[float]) -> None:
     document["stribeck"] = {"static": static, "stribeck_velocity": values[1]}
 
 
-def terms(scene: Scene) -> list[Term]:
+def terms(scene: SearchContext) -> list[Term]:
     """The curve with the paper's exponent, from where it stands and from some velocities; one with a free exponent."""
     coulomb = get(scene.document, "friction.coulomb")
     if coulomb <= 0.0:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from servod.formats.model.friction import Thermal
-from servod.lab.diagnose.effects.effect import Effect, share, simple, told
+from servod.lab.diagnose.effects.effect import Effect, report_as_is, share, simple
 from servod.lab.diagnose.effects.hypothesis import Document, Term, Unknown
 from servod.lab.diagnose.effects.looks import Look, Split
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 
 
-def terms(scene: Scene) -> list[Term]:
+def terms(scene: SearchContext) -> list[Term]:
     """By the recorded temperature where there is one, linear and exponential; by time; by recording."""
     found = []
     if scene.warm:
@@ -46,7 +46,7 @@ def _between(drifts: list[Unknown], recordings: int) -> Term:
         drift.write(document, values[:2])
 
     unknowns = (*drifts, *levels)
-    return Term("thermal", "between recordings", unknowns, write, told(unknowns), each=each)
+    return Term("thermal", "between recordings", unknowns, write, report_as_is(unknowns), each=each)
 
 
 EFFECT = Effect(

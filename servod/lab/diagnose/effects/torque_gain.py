@@ -7,10 +7,10 @@ from servod.lab.diagnose.effects.base import RECALIBRATION
 from servod.lab.diagnose.effects.effect import Effect, positive, simple
 from servod.lab.diagnose.effects.hypothesis import Document, Term, get
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 
 
-def terms(scene: Scene) -> list[Term]:
+def terms(scene: SearchContext) -> list[Term]:
     """One factor, and one for each sign of the command."""
     factors = [positive("factor", "1", 1.0, 5.0), positive("negative_factor", "1", 1.0, 5.0)]
     return [simple("torque_gain", "one factor", factors[:1]), simple("torque_gain", "by sign", factors)]

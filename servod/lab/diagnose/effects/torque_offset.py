@@ -8,14 +8,14 @@ from servod.lab.diagnose.effects.base import OFFSET_SHARE
 from servod.lab.diagnose.effects.effect import Effect
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Term, get
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 
 
 def _write(_document: Document, _values: Sequence[float]) -> None:
     """Nothing of its own: the term opens the bounds of the model's offset."""
 
 
-def terms(scene: Scene) -> list[Term]:
+def terms(scene: SearchContext) -> list[Term]:
     """The model's offset released."""
     most = 20.0 * max(scene.dry, scene.effort)
 

@@ -6,13 +6,13 @@ from servod.formats.model.effects import TorqueRipple
 from servod.lab.diagnose.effects.effect import Effect, sine_term
 from servod.lab.diagnose.effects.hypothesis import Document, Term
 from servod.lab.diagnose.effects.looks import Look, Split
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 
 #: Torque ripple below this share of the command is what every motor has.
 LEAST_SHARE = 0.02
 
 
-def terms(scene: Scene) -> list[Term]:
+def terms(scene: SearchContext) -> list[Term]:
     """Sines whose period is searched, and with the second harmonic."""
     peaks = scene.peaks(scene.carried(scene.torque), 2)
     found = [sine_term("torque_ripple", scene, peak, 0.1, "1", most=0.45) for peak in peaks]

@@ -8,7 +8,7 @@ from servod.formats.model.effects import TorqueSaturation
 from servod.lab.diagnose.effects.effect import Effect, simple
 from servod.lab.diagnose.effects.hypothesis import Term, Unknown
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 
 #: Quantiles of the command at which a limit is looked for.
 QUANTILES = (0.9, 0.97, 0.995)
@@ -17,7 +17,7 @@ QUANTILES = (0.9, 0.97, 0.995)
 LOWEST = 0.6
 
 
-def terms(scene: Scene) -> list[Term]:
+def terms(scene: SearchContext) -> list[Term]:
     """A hard limit from some quantiles of the command, and a smooth one."""
     found = []
     most = float(np.max(np.abs(scene.torque)))

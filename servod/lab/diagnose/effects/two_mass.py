@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Term, Unknown, get
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 
 #: Shares of critical damping that the joint's spring, and the contact behind a gap, start with.
 DAMPING, CONTACT_DAMPING = 0.05, 0.4
@@ -16,7 +16,7 @@ GAP_NUDGE = 0.03
 
 
 def two_mass_term(
-    effect: str, scene: Scene, load: float, resonance: float, gap: float = 0.0, bend: float = 0.0
+    effect: str, scene: SearchContext, load: float, resonance: float, gap: float = 0.0, bend: float = 0.0
 ) -> Term:
     """A term with a share of the inertia behind a spring that resonates at `resonance` rad/s, and a gap if any.
 

@@ -6,13 +6,13 @@ from servod.formats.model.friction import ViscousNonlinear
 from servod.lab.diagnose.effects.effect import Effect, share, simple
 from servod.lab.diagnose.effects.hypothesis import Term, Unknown
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 
 #: Bound of the terms: so many times the model's own viscous torque, or dry friction, at high speed.
 MOST = 20.0
 
 
-def terms(scene: Scene) -> list[Term]:
+def terms(scene: SearchContext) -> list[Term]:
     """A quadratic, a cubic, both, and a power that thins out."""
     speed = scene.speed
     torque = max(scene.viscous * speed, scene.dry)

@@ -7,34 +7,157 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from servod.formats.model.axis_model import AxisModel
+from servod.lab.diagnose.data.trace import CheckedTrace
+from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.disturbance import EVERY, NAME
 from servod.lab.diagnose.effects.hypothesis import Document, Reported
+from servod.lab.diagnose.effects.looks import Look, Split
 from servod.lab.diagnose.judge.covariance import inside_region
-from servod.lab.diagnose.judge.curves import course, signature, spectrum
 from servod.lab.diagnose.judge.free_run import window_errors, windows
 from servod.lab.diagnose.judge.judgement import JudgedSelection
 from servod.lab.diagnose.judge.locate import bands, locate
 from servod.lab.diagnose.judge.verdict import alternatives, confidence
+from servod.lab.diagnose.predict.coordinates import coordinates
 from servod.lab.diagnose.predict.floor import trace_floor
+from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.result import (
     Evidence,
     FittedValue,
     Minor,
+    MinorReason,
     NamedEffect,
     Quality,
     RecordingErrors,
     SearchEffort,
+    Signature,
+    SignaturePart,
+    Spectrum,
     Windows,
 )
 from servod.lab.diagnose.select.fit import Fit
-from servod.lab.diagnose.select.merit import Merit
+from servod.lab.diagnose.select.levels import at_end_of_range, is_level_change, shorter_twin
+from servod.lab.diagnose.select.merit import Merit, large_enough
+from servod.lab.diagnose.select.refine import DRIFT, power_of_means
 from servod.lab.diagnose.select.selection import Fold
+from servod.lab.diagnose.select.selector import Selector
 from servod.lab.diagnose.settings import SETTINGS
+
+# Curves that the page of a diagnosis draws: signatures of terms, errors over time and over frequency.
+#
+# The last stage of the engine takes them from the judgement; what draws them computes nothing.
+
+
+_HALVES = {Split.DIRECTION: ("forward", "back"), Split.LOAD: ("command above zero", "command below zero")}
+
+
+def signature(judgement: JudgedSelection, place: int) -> Signature:
+    """What is left without the term at `place`, and what it makes of it, over its coordinate and over time."""
+    predictor, shown = judgement.predictor, effect(judgement.fit.hypothesis.terms[place].effect).look
+    without, left = judgement.validation.reduced[place].mismatch, judgement.fit.mismatch
+    term = without - left
+    known = coordinates(predictor)
+    unit, values = known.get(shown.coordinate, known["position"])
+    period = _period(judgement, place, values) if shown.periodic else None
+    if period is not None:
+        values = values % period
+    parts = tuple(
+        _part(name, values, without, term, rows & predictor.counts & np.isfinite(values))
+        for name, rows in _halves(predictor, shown).items()
+    )
+    index, first, rows = _stretch(predictor, term)
+    trace, begun = predictor.traces[index], predictor.slices[index].start + first
+    here, t_s = slice(begun, begun + rows), trace.drive.t_s[first : first + rows] - trace.shift_s
+    return Signature(
+        place + 1, shown.coordinate, unit, period, parts, trace.name, t_s, without[here], term[here], left[here]
+    )
+
+
+def _halves(predictor: Predictor, shown: Look) -> dict[str, NDArray[np.bool_]]:
+    """Rows that are drawn by themselves: all, or by the sign of velocity or command."""
+    if shown.split is Split.NONE:
+        return {"": np.ones(len(predictor.counts), dtype=bool)}
+    over = predictor.over("velocity" if shown.split is Split.DIRECTION else "torque")
+    first, second = _HALVES[shown.split]
+    return {first: over > 0.0, second: over < 0.0}
+
+
+def _part(name: str, values: Array, without: Array, term: Array, rows: NDArray[np.bool_]) -> SignaturePart:
+    """Means over bins with as many rows each."""
+    if int(rows.sum()) < 2 * SETTINGS.maps.least_in_bin:
+        return SignaturePart(name, *(np.zeros(0) for _ in range(4)))
+    edges = np.unique(np.quantile(values[rows], np.linspace(0.0, 1.0, SETTINGS.curves.signature_bins + 1)))
+    place = np.clip(np.searchsorted(edges, values[rows], side="right") - 1, 0, max(len(edges) - 2, 0))
+    count = np.bincount(place)
+    full = count >= min(SETTINGS.maps.least_in_bin, count.max())
+    middle, left, made = (
+        (np.bincount(place, part[rows]) / np.maximum(count, 1))[full] for part in (values, without, term)
+    )
+    square = (np.bincount(place, without[rows] ** 2) / np.maximum(count, 1))[full]
+    independent = np.maximum(count[full] / SETTINGS.curves.correlated_rows, 1.0)
+    return SignaturePart(name, middle, left, 2.0 * np.sqrt(np.maximum(square - left**2, 0.0) / independent), made)
+
+
+def _period(judgement: JudgedSelection, place: int, values: Array) -> float | None:
+    """The period of a periodic term where many of them lie in the range."""
+    fit = judgement.fit
+    reported = fit.hypothesis.terms[place].tell(
+        fit.hypothesis.written(fit.coordinates), fit.values[fit.hypothesis.share(place)]
+    )
+    found = {one.name: one.value for one in reported}
+    if "periods_per_turn" in found:
+        period = 2.0 * math.pi / found["periods_per_turn"]
+    elif "periods_per_metre" in found:
+        period = 1.0 / found["periods_per_metre"]
+    else:
+        return None
+    return period if float(np.ptp(values)) > SETTINGS.curves.fold_from * period else None
+
+
+def _stretch(predictor: Predictor, term: Array) -> tuple[int, int, int]:
+    """The stretch in which a term takes most: recording, first row in it, rows."""
+    best: tuple[float, int, int, int] = (-1.0, 0, 0, 1)
+    for index, (trace, part) in enumerate(zip(predictor.traces, predictor.slices, strict=True)):
+        rows = min(max(2, round(SETTINGS.curves.stretch_s / trace.period_s)), part.stop - part.start)
+        power = np.concatenate([[0.0], np.cumsum(term[part] ** 2)])
+        taken = power[rows:] - power[:-rows]
+        first = int(np.argmax(taken))
+        best = max(best, (float(taken[first]) / rows, index, first, rows))
+    return best[1:]
+
+
+def course(trace: CheckedTrace, *errors: Array) -> tuple[Array, ...]:
+    """Begins of short stretches of a recording, s, and the root mean square of each error in them."""
+    rows = max(1, round(SETTINGS.curves.course_s / trace.period_s))
+    count = len(trace.drive.t_s) // rows
+    t_s = trace.drive.t_s - trace.shift_s
+    means = ((error[: count * rows].reshape(count, rows) ** 2).mean(axis=1) for error in errors)
+    return (t_s[: count * rows : rows], *(np.sqrt(mean) for mean in means))
+
+
+def spectrum(predictor: Predictor, error: Array) -> Spectrum:
+    """Amplitude density over frequency, averaged over the recordings on common bands."""
+    from scipy.signal import welch
+
+    bands = SETTINGS.curves.bands
+    edges = np.geomspace(SETTINGS.curves.lowest_hz, SETTINGS.curves.highest_hz, bands + 1)
+    power, rows = np.zeros(bands), np.zeros(bands)
+    for trace, part in zip(predictor.traces, predictor.slices, strict=True):
+        length = min(len(error[part]), round(SETTINGS.curves.window_s / trace.period_s))
+        frequency, density = welch(error[part], 1.0 / trace.period_s, nperseg=length)
+        place = np.digitize(frequency, edges) - 1
+        inside = (place >= 0) & (place < bands)
+        power += np.bincount(place[inside], density[inside], bands)
+        rows += np.bincount(place[inside], minlength=bands)
+    full = rows > 0
+    middles = np.sqrt(edges[:-1] * edges[1:])[full]
+    return Spectrum(middles, np.sqrt(np.maximum(power[full] / rows[full], 1e-300)))
+
 
 Array = NDArray[np.float64]
 
@@ -232,3 +355,84 @@ def _recording(judgement: JudgedSelection, index: int) -> RecordingErrors:
 
 def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0
+
+
+# Which terms of the last fit are findings, and why the others are none: the levels of the outside contract once more.
+#
+# Stands between the judgement and the verdict. A term comes in by what it takes when it comes; beside those that come
+# later it may be worth less, or its numbers may be pushed to an end of their range. It stays in the model then, for the
+# others were fitted beside it, and is listed with its values as minor.
+#
+# The contract counts shares of the error on unseen rows. A drift of the constant torque is next to nothing in any row
+# and adds up in every simulation that runs freely: its share is that of the means over a second, where it shows.
+
+
+#: Numbers that say where or when a term acts, whatever its size.
+WHERE = frozenset(("shift", "torque_at_middle", "start_s", "position"))
+
+#: Sizes that are positive by themselves, so that only their interval tells them from nothing.
+POSITIVE = frozenset(("time_constant_s", "gap"))
+
+
+def name_findings(selector: Selector, judgement: JudgedSelection) -> JudgedSelection:
+    """The judgement with those named that are findings beside all others, and why the rest of the terms is none.
+
+    What each term is worth is said anew. Terms of one effect are one finding, if one of them is.
+    """
+    fit, selection = judgement.fit, judgement.selection
+    for place in judgement.named:
+        merit = selector.merit(selection, judgement.validation.reduced[place], fit)
+        selection = selection.with_merit(place, merit)
+    judgement = replace(judgement, selection=selection)
+    why = {place: _reason(judgement, place) for place in judgement.named}
+    names = {fit.hypothesis.terms[place].effect for place, reason in why.items() if reason is None}
+    named = tuple(place for place in judgement.named if fit.hypothesis.terms[place].effect in names)
+    kept = {place: reason for place, reason in why.items() if reason is not None and place not in named}
+    return replace(judgement, named=named, kept=kept | _under_level(judgement))
+
+
+def _under_level(judgement: JudgedSelection) -> dict[int, MinorReason]:
+    """Terms with numbers of their own that are under their level; what only opens the model's own is recalibrated."""
+    twin = shorter_twin(judgement.fit)
+    terms = enumerate(judgement.fit.hypothesis.terms)
+    return {
+        place: MinorReason.TWIN if term.effect == twin else MinorReason.LEVEL
+        for place, term in terms
+        if place not in judgement.named and term.unknowns
+    }
+
+
+def _reason(judgement: JudgedSelection, place: int) -> MinorReason | None:
+    """Why a term is no finding; None if it is one."""
+    fit = judgement.fit
+    merit = replace(judgement.selection.merits[place], share=_share(judgement, place))
+    if not large_enough(merit, is_level_change(fit.hypothesis.terms[place])):
+        return MinorReason.SMALL
+    if at_end_of_range(fit, place):
+        return MinorReason.AT_END
+    return None if differs_from_zero(fit, place, judgement.covariance) else MinorReason.UNSURE
+
+
+def _share(judgement: JudgedSelection, place: int) -> float:
+    """The share of the explainable error on unseen rows that a term takes, where it shows."""
+    rows = judgement.removed_share(place)
+    if judgement.fit.hypothesis.terms[place].effect != DRIFT[0]:
+        return rows
+    validation = judgement.validation
+    parts = (validation.without[place], validation.after, validation.before)
+    without, after, before = (power_of_means(judgement.predictor, held.mismatch) for held in parts)
+    return max(rows, (without - after) / max(before, 1e-30))
+
+
+def differs_from_zero(fit: Fit, place: int, covariance: Array) -> bool:
+    """Whether nothing at all lies outside the region of 95 % of what says how large a term is.
+
+    A term whose size has no zero, such as a stiffness or a limit, is told by what it takes alone.
+    """
+    unknowns, share = fit.hypothesis.unknowns, fit.hypothesis.share(place)
+    own = range(share.start, share.stop)
+    deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    if any(unknowns[i].key in POSITIVE and SETTINGS.intervals.z95 * deviations[i] >= 1.0 for i in own):
+        return False
+    sizes = [i for i in own if unknowns[i].size != 0.0 and unknowns[i].low <= 0.0 and unknowns[i].key not in WHERE]
+    return not sizes or not inside_region(fit.coordinates[sizes], covariance[np.ix_(sizes, sizes)])

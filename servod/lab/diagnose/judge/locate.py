@@ -14,16 +14,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 from servod.lab.diagnose.predict.coordinates import coordinates, units
 from servod.lab.diagnose.predict.predict import Predictor
-from servod.lab.diagnose.result import Map
+from servod.lab.diagnose.result import MismatchMap
 from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
 
 
-def maps(predictor: Predictor, mismatch: Array) -> list[Map]:
+def maps(predictor: Predictor, mismatch: Array) -> list[MismatchMap]:
     """Maps over all coordinates, the one that carries most first, and at the end what is everywhere alike."""
     memory = max(1, round(2.0 / (predictor.rate * predictor.traces[0].period_s)))
     bins = {"time": SETTINGS.maps.time_bins}
@@ -36,7 +36,7 @@ def maps(predictor: Predictor, mismatch: Array) -> list[Map]:
     return [*sorted(found, key=lambda m: -m.share), constant_part(predictor, mismatch, memory)]
 
 
-def constant_part(predictor: Predictor, mismatch: Array, memory: int) -> Map:
+def constant_part(predictor: Predictor, mismatch: Array, memory: int) -> MismatchMap:
     """The part of the mismatch that is the same in all rows, as a map of one bin."""
     from scipy.stats import f as fisher
 
@@ -50,17 +50,17 @@ def constant_part(predictor: Predictor, mismatch: Array, memory: int) -> Map:
 
 def _map(
     name: str, unit: str, edges: Array, mean: Array, error: Array, rows: NDArray[Any], share: float, chance: float
-) -> Map:
+) -> MismatchMap:
     """The map of those bins that hold rows enough."""
     full = rows >= SETTINGS.maps.least_in_bin
     middles = 0.5 * (edges[:-1] + edges[1:])
-    return Map(name, unit, middles[full], mean[full], error[full], len(rows), share, chance)
+    return MismatchMap(name, unit, middles[full], mean[full], error[full], len(rows), share, chance)
 
 
-def map_modulo_period(predictor: Predictor, mismatch: Array, memory: int) -> Map:
+def map_modulo_period(predictor: Predictor, mismatch: Array, memory: int) -> MismatchMap:
     """The map over the position modulo the period that takes most; its chance counts all periods that were tried."""
     axis = "linear" if predictor.linear else "rotary"
-    scene = Scene({"axis": axis}, predictor, mismatch)
+    scene = SearchContext({"axis": axis}, predictor, mismatch)
     best = scene.peaks(scene.carried(np.ones_like(scene.position)), 1)[0]
     period, unit = 2.0 * math.pi / best.n, units(predictor).length
     name = f"position modulo {period:.4g} {unit}"
@@ -76,7 +76,7 @@ def map_over(
     counts: NDArray[np.bool_],
     memory: int,
     bins: int,
-) -> Map:
+) -> MismatchMap:
     """Means of the mismatch over bins of `values` with as many rows each; `memory` rows count as one.
 
     Share and chance are of what differs between the bins; what is everywhere alike is no matter of a coordinate.

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from servod.lab.diagnose.effects import effect, effects
 from servod.lab.diagnose.effects.hypothesis import Term
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 from servod.lab.diagnose.predict.predict import in_parallel
 from servod.lab.diagnose.select.fit import Fit, Fitter
 from servod.lab.diagnose.settings import SETTINGS
@@ -46,11 +46,11 @@ class Candidate:
         return self.fit.coordinates[self.fit.hypothesis.share(self.place)]
 
 
-class Trials:
+class CandidateFits:
     """Fits candidates against one present fit: `short` works on shortened data, `whole` on everything."""
 
     def __init__(
-        self, whole: Fitter, short: Fitter, present: Fit, scene: Scene, nominal: bool, deadline: float
+        self, whole: Fitter, short: Fitter, present: Fit, scene: SearchContext, nominal: bool, deadline: float
     ) -> None:
         self.whole, self.short, self.present, self.scene, self.deadline = whole, short, present, scene, deadline
         self.tried = 0

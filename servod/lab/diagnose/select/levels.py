@@ -17,7 +17,7 @@ from servod.lab.diagnose.settings import SETTINGS
 NO_LEVEL = frozenset(("damping_velocity",))
 
 
-def on_bound(fit: Fit) -> bool:
+def level_at_bound(fit: Fit) -> bool:
     """Whether a parameter with a level stands on its bound: the data pull it further.
 
     The Stribeck velocity has none; it opens together with static friction.

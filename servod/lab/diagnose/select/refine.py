@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from servod.lab.diagnose.effects import effect, names
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.candidates import Candidate
 from servod.lab.diagnose.select.fit import Fit
@@ -44,7 +44,7 @@ PUT_BACK = (
 )
 
 
-def much_left(selector: Selector, selection: Selection) -> bool:
+def above_floor(selector: Selector, selection: Selection) -> bool:
     """Whether terms came in, and what they left is more than forms and noise make."""
     if not selection.terms:
         return False
@@ -129,8 +129,8 @@ def _fit_with(selector: Selector, selection: Selection, name: str, form: str) ->
     return selector.fit_on(selection, present, begun, lambda merit, _fit: _is_significant(selector, merit))
 
 
-def _scene(selector: Selector, present: Fit) -> Scene:
-    return Scene(selector.start.document, selector.predictor, present.mismatch)
+def _scene(selector: Selector, present: Fit) -> SearchContext:
+    return SearchContext(selector.start.document, selector.predictor, present.mismatch)
 
 
 def _left(selector: Selector, old: Fit, new: Fit) -> float:

@@ -18,10 +18,10 @@ from servod.formats.model.axis_model import AxisModel
 from servod.lab.diagnose.effects import effect, unexcited_effects
 from servod.lab.diagnose.effects.base import base_unknowns, document_of
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
-from servod.lab.diagnose.effects.scene import Scene
+from servod.lab.diagnose.effects.scene import SearchContext
 from servod.lab.diagnose.predict.floor import noise_floor, stretch_means
 from servod.lab.diagnose.predict.predict import Predictor, shorten
-from servod.lab.diagnose.select.candidates import Candidate, Trials
+from servod.lab.diagnose.select.candidates import Candidate, CandidateFits
 from servod.lab.diagnose.select.fit import Fit, Fitter, Weighing, long_run, scale_of
 from servod.lab.diagnose.select.levels import at_end_of_range, is_level_change
 from servod.lab.diagnose.select.merit import Merit, acting_torque, worth_naming
@@ -119,8 +119,8 @@ class Selector:
         whole = self.fitter(present.mismatch)
         quick = shorten(self.predictor, self.nominal, present.mismatch)
         short = Fitter(quick, Weighing(whole.weighing.scale, quick.counts.astype(np.float64)))
-        scene = Scene(self.start.document, self.predictor, present.mismatch, fine)
-        trials = Trials(whole, short, present, scene, not present.hypothesis.terms, self.deadline)
+        scene = SearchContext(self.start.document, self.predictor, present.mismatch, fine)
+        trials = CandidateFits(whole, short, present, scene, not present.hypothesis.terms, self.deadline)
         found = trials.run(skip=once_only(present.hypothesis) | skip | self.unexcited)
         self.tell(f"{trials.tried} starts tried; best: " + ", ".join(c.effect for c in found[:3]))
         return found, trials.tried

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
 from servod.lab.diagnose.select.candidates import Candidate
 from servod.lab.diagnose.select.fit import Fit
-from servod.lab.diagnose.select.levels import on_bound
+from servod.lab.diagnose.select.levels import level_at_bound
 from servod.lab.diagnose.select.selection import Selection, TermEntry
 from servod.lab.diagnose.select.selector import Selector
 from servod.lab.diagnose.settings import SETTINGS
@@ -39,7 +39,7 @@ def forward_selection(selector: Selector, selection: Selection) -> Selection:
 
 
 def _more_to_find(selector: Selector, selection: Selection) -> bool:
-    return not selector.nothing_left(selection) or on_bound(selection.fit)
+    return not selector.nothing_left(selection) or level_at_bound(selection.fit)
 
 
 def _add_best(selector: Selector, selection: Selection) -> Selection:

@@ -18,7 +18,7 @@ from servod.formats.gains.gain_set import pd_set
 from servod.lab.identify.bounds import Bounds
 from servod.lab.identify.shapes import samples
 from servod.lab.identify.store import motion_hash
-from servod.lab.identify.trace import Kind, Trace, trace_of
+from servod.lab.identify.trace import ExperimentKind, RecordedMotion, trace_of
 from servod.lab.recordings.recording import Rows, moving, rows_of
 
 Array = NDArray[np.float64]
@@ -34,7 +34,7 @@ SPEED_SPAN_S = 0.004
 class ExperimentEnded(AnswerIsNo):
     """The axis dropped out of an experiment; `trace` is what it recorded until then, None where there is nothing."""
 
-    def __init__(self, message: str, trace: Trace | None) -> None:
+    def __init__(self, message: str, trace: RecordedMotion | None) -> None:
         super().__init__(message)
         self.trace = trace
 
@@ -42,11 +42,11 @@ class ExperimentEnded(AnswerIsNo):
 class Keeper(Protocol):
     """Where recordings go, and where those of an interrupted walk come from (`store.Recordings`)."""
 
-    def recorded(self, kind: Kind, motion: str) -> Trace | None:
+    def recorded(self, kind: ExperimentKind, motion: str) -> RecordedMotion | None:
         """The earlier recording of this motion, if there is one."""
         ...
 
-    def keep(self, rows: Rows, trace: Trace, motion: str) -> Trace:
+    def keep(self, rows: Rows, trace: RecordedMotion, motion: str) -> RecordedMotion:
         """Keep a motion; returns its trace with the recording's hash."""
         ...
 
@@ -70,7 +70,7 @@ class Bench:
     position_rad: float = 0.0  # of the reference, relative to `start_rad`
     start_rad: float = 0.0  # where the axis stood when the walk began
     enabled: bool = True
-    traces: list[Trace] = field(default_factory=list)
+    traces: list[RecordedMotion] = field(default_factory=list)
     _gains: tuple[float, float] = (0.0, 0.0)
     _missed: _Move | None = None  # what has to be made up for before the first motion that is really run
 
@@ -90,7 +90,9 @@ class Bench:
         if self.enabled:
             change_feedback(self.axis, *self._gains)
 
-    def run(self, kind: Kind, positions: Array, torques: Array, window_rad: float, settings: dict[str, float]) -> Trace:
+    def run(
+        self, kind: ExperimentKind, positions: Array, torques: Array, window_rad: float, settings: dict[str, float]
+    ) -> RecordedMotion:
         """Run one motion, keep its recording, return its trace.
 
         Raises AnswerIsNo when the bounds forbid it, or when the joint moved faster than they allow.
@@ -126,13 +128,19 @@ class Bench:
             still = np.zeros(samples(duration_s, self.period_s))
             self._excite(still, still, self.bounds.window_rad)
 
-    def of(self, *kinds: Kind) -> list[Trace]:
+    def of(self, *kinds: ExperimentKind) -> list[RecordedMotion]:
         """Traces of these kinds so far."""
         return [trace for trace in self.traces if trace.kind in kinds]
 
     def _record(
-        self, kind: Kind, motion: str, positions: Array, torques: Array, window_rad: float, settings: dict[str, float]
-    ) -> Trace:
+        self,
+        kind: ExperimentKind,
+        motion: str,
+        positions: Array,
+        torques: Array,
+        window_rad: float,
+        settings: dict[str, float],
+    ) -> RecordedMotion:
         """Run the motion on the axis. Raises ExperimentEnded, with its trace, when the axis drops out."""
         self._wake()
         settings = {"resolution_rad": self.resolution_rad, **settings}
@@ -174,7 +182,7 @@ class Bench:
                 f"an experiment would go at {fastest:.3g} rad/s, {self.bounds.speed_rad_s:.3g} are allowed"
             )
 
-    def _check_speed(self, trace: Trace) -> None:
+    def _check_speed(self, trace: RecordedMotion) -> None:
         """What the joint did, not what was planned: nothing but friction holds it where no feedback acts."""
         seen = peak_speed(trace, SPEED_SPAN_S) - self.resolution_rad / SPEED_SPAN_S
         if seen > self.bounds.most_rad_s:
@@ -198,7 +206,7 @@ def change_feedback(axis: AxisClient, position_nm_per_rad: float, velocity_nms_p
     axis.activate(*axis.load(gains))
 
 
-def peak_speed(trace: Trace, span_s: float) -> float:
+def peak_speed(trace: RecordedMotion, span_s: float) -> float:
     """The highest mean speed over `span_s` in a recording, in rad/s; 0 for one that is shorter."""
     span = max(1, round(span_s / trace.period_s))
     ways = np.abs(trace.position_rad[span:] - trace.position_rad[:-span])

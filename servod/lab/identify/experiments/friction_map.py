@@ -16,10 +16,10 @@ import numpy as np
 from servod.lab.identify.experiments.common import Bench
 from servod.lab.identify.fits.break_away import BreakAwayFit
 from servod.lab.identify.shapes import sine
-from servod.lab.identify.trace import Kind, Trace
+from servod.lab.identify.trace import ExperimentKind, RecordedMotion
 
 
-class Sine(NamedTuple):
+class TestSine(NamedTuple):
     """One sine: peak velocity, amplitude, periods."""
 
     peak_rad_s: float
@@ -41,21 +41,23 @@ CROSSING_RAD_S, CROSSING_TURNS, CROSSING_SHARES, SLOW_CROSSING_RAD_S = 0.25, (9,
 FORWARD_SHARE, FORWARD_FROM = 0.8, 0.05
 
 
-def plan(bench: Bench, break_away_rad: float) -> list[Sine]:
+def plan(bench: Bench, break_away_rad: float) -> list[TestSine]:
     """The sines, slowest first, up to the allowed speed or what the travel permits; then the crossings."""
     travel = bench.bounds.travel_rad
     fastest = min(bench.bounds.speed_rad_s, 2.0 * np.pi * HIGHEST_HZ * travel)
     count = max(2, 1 + round(np.log(fastest / SLOWEST_RAD_S) / np.log(RATIO)))
     peaks = np.geomspace(SLOWEST_RAD_S, fastest, count)
-    sines = [Sine(float(p), float(min(p * LONGEST_PERIOD_S / (2.0 * np.pi), travel)), TURNS) for p in peaks]
+    sines = [TestSine(float(p), float(min(p * LONGEST_PERIOD_S / (2.0 * np.pi), travel)), TURNS) for p in peaks]
     peak = min(CROSSING_RAD_S, fastest)
     for share, turns in zip(CROSSING_SHARES, CROSSING_TURNS, strict=True):
         acceleration = share * SLOW_CROSSING_RAD_S**2 / break_away_rad
-        sines.append(Sine(peak, float(min(peak**2 / acceleration, travel)), turns))
+        sines.append(TestSine(peak, float(min(peak**2 / acceleration, travel)), turns))
     return sines
 
 
-def run(bench: Bench, gains: tuple[float, float], break_away: BreakAwayFit, break_away_rad: float) -> list[Trace]:
+def run(
+    bench: Bench, gains: tuple[float, float], break_away: BreakAwayFit, break_away_rad: float
+) -> list[RecordedMotion]:
     """All sines, each its own recording; `break_away_rad` is the bristles' way, break-away over stiffness."""
     traces = []
     for wanted in plan(bench, break_away_rad):
@@ -65,5 +67,5 @@ def run(bench: Bench, gains: tuple[float, float], break_away: BreakAwayFit, brea
         share = FORWARD_SHARE * np.clip(velocity / (FORWARD_FROM * wanted.peak_rad_s), -1.0, 1.0)
         forward = share * np.where(velocity > 0.0, break_away.positive.value, break_away.negative.value)
         settings = {"peak_rad_s": wanted.peak_rad_s, "kp": gains[0], "kd": gains[1]}
-        traces.append(bench.run(Kind.FRICTION_MAP, path, forward, bench.bounds.window_rad, settings))
+        traces.append(bench.run(ExperimentKind.FRICTION_MAP, path, forward, bench.bounds.window_rad, settings))
     return traces

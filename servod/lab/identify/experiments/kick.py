@@ -14,7 +14,7 @@ import numpy as np
 from servod.common.errors import AnswerIsNo
 from servod.lab.identify.experiments.common import SPEED_SPAN_S, Bench, peak_speed
 from servod.lab.identify.shapes import samples
-from servod.lab.identify.trace import Kind, Trace
+from servod.lab.identify.trace import ExperimentKind, RecordedMotion
 
 #: Torque against break-away.
 TORQUE_RATIO = 1.6
@@ -29,7 +29,7 @@ TRAVEL_SHARE = 0.25
 LEAD_S, COAST_S = 0.05, 0.35
 
 
-def run(bench: Bench, break_away_nm: tuple[float, float]) -> list[Trace]:
+def run(bench: Bench, break_away_nm: tuple[float, float]) -> list[RecordedMotion]:
     """Kicks of growing length there and back until both directions tell; `break_away_nm` positive, negative.
 
     Raises AnswerIsNo when they cannot: bounds, encoder or torque forbid it.
@@ -60,7 +60,7 @@ def _needed(bench: Bench) -> float:
     return max(SPEED_SHARE * bench.bounds.speed_rad_s, visible)
 
 
-def _longer(bench: Bench, kick: Trace, pulse: int, needed_rad_s: float) -> int:
+def _longer(bench: Bench, kick: RecordedMotion, pulse: int, needed_rad_s: float) -> int:
     """Periods of the next pulse: twice as many, as far as the speed allows it. Raises AnswerIsNo when none does."""
     # the shortest kicks do not fill the usual span
     reached, allowed = peak_speed(kick, 0.5 * SPEED_SPAN_S), bench.bounds.most_rad_s
@@ -80,7 +80,7 @@ def _longer(bench: Bench, kick: Trace, pulse: int, needed_rad_s: float) -> int:
     return min(2 * pulse, longest)
 
 
-def _kick(bench: Bench, torque_nm: float, pulse: int) -> Trace:
+def _kick(bench: Bench, torque_nm: float, pulse: int) -> RecordedMotion:
     """One kick of `pulse` periods in the direction of `torque_nm`, the break-away there, and the coast behind it."""
     bench.set_gains(0.0, 0.0)
     size = np.sign(torque_nm) * min(TORQUE_RATIO * abs(torque_nm), bench.bounds.torque_nm)
@@ -88,7 +88,7 @@ def _kick(bench: Bench, torque_nm: float, pulse: int) -> Trace:
     torque = np.zeros(lead + pulse + samples(COAST_S + pulse_s, bench.period_s))
     torque[lead : lead + pulse] = size
     window = min(TRAVEL_SHARE * bench.bounds.travel_rad, bench.bounds.window_rad)
-    return bench.run(Kind.KICK, np.zeros(len(torque)), torque, window, {"pulse_nm": size, "pulse_s": pulse_s})
+    return bench.run(ExperimentKind.KICK, np.zeros(len(torque)), torque, window, {"pulse_nm": size, "pulse_s": pulse_s})
 
 
 # Noise at rest: what encoder and torque reading show while nothing moves and no torque is asked for.
@@ -99,8 +99,8 @@ def _kick(bench: Bench, torque_nm: float, pulse: int) -> Trace:
 DURATION_S = 1.5
 
 
-def run_noise(bench: Bench) -> Trace:
+def run_noise(bench: Bench) -> RecordedMotion:
     """Record a rest under zero gains."""
     still = np.zeros(samples(DURATION_S, bench.period_s))
     bench.set_gains(0.0, 0.0)
-    return bench.run(Kind.NOISE, still, still, bench.bounds.window_rad, {})
+    return bench.run(ExperimentKind.NOISE, still, still, bench.bounds.window_rad, {})

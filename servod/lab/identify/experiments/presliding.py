@@ -13,7 +13,7 @@ import numpy as np
 
 from servod.lab.identify.experiments.common import Bench
 from servod.lab.identify.shapes import fade_in, multisine, samples, times
-from servod.lab.identify.trace import Kind, Trace
+from servod.lab.identify.trace import ExperimentKind, RecordedMotion
 
 FREQUENCY_HZ = 8.0
 FADE_IN_S = 0.25
@@ -27,7 +27,7 @@ ENOUGH_COUNTS = 6.0
 WINDOW_COUNTS, WINDOW_RAD = 12.0, 1e-3
 
 
-def burst(bench: Bench, break_away_nm: float, share: float) -> Trace:
+def burst(bench: Bench, break_away_nm: float, share: float) -> RecordedMotion:
     """One burst at the present position; `break_away_nm` of the weaker direction."""
     bench.set_gains(0.0, 0.0)
     duration_s = FADE_IN_S + CYCLES / FREQUENCY_HZ + TAIL_S
@@ -35,7 +35,7 @@ def burst(bench: Bench, break_away_nm: float, share: float) -> Trace:
     torque = share * break_away_nm * fade_in(t, FADE_IN_S) * np.sin(2.0 * np.pi * FREQUENCY_HZ * t)
     window = max(WINDOW_RAD, WINDOW_COUNTS * bench.resolution_rad)
     settings = {"frequency_hz": FREQUENCY_HZ, "from_s": FADE_IN_S, "cycles": CYCLES, "share": share}
-    return bench.run(Kind.PRESLIDING, np.zeros(len(t)), torque, window, settings)
+    return bench.run(ExperimentKind.PRESLIDING, np.zeros(len(t)), torque, window, settings)
 
 
 def share_for(bench: Bench, peak_to_peak_rad: float) -> float:
@@ -54,7 +54,7 @@ LOWEST_HZ, HIGHEST_HZ, LINES = 25.0, 230.0, 12
 BRISTLE_SHARE = 0.25
 
 
-def run(bench: Bench, break_away_nm: float) -> Trace:
+def run(bench: Bench, break_away_nm: float) -> RecordedMotion:
     """Record some periods at rest; `break_away_nm` of the weaker direction."""
     count = samples(PERIOD_S, bench.period_s)
     lines = np.unique(np.round(np.linspace(LOWEST_HZ * PERIOD_S, HIGHEST_HZ * PERIOD_S, LINES))).astype(np.int64)
@@ -67,4 +67,4 @@ def run(bench: Bench, break_away_nm: float) -> Trace:
     window = max(WINDOW_RAD, WINDOW_COUNTS * bench.resolution_rad)
     settings = {"count": float(count), "periods": float(PERIODS)}
     settings |= {f"line_{i}": float(line) for i, line in enumerate(lines)}
-    return bench.run(Kind.BRISTLE, np.zeros(len(torque)), torque, window, settings)
+    return bench.run(ExperimentKind.BRISTLE, np.zeros(len(torque)), torque, window, settings)

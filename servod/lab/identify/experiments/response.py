@@ -14,7 +14,7 @@ import numpy as np
 
 from servod.lab.identify.experiments.common import Bench
 from servod.lab.identify.shapes import multisine, samples, strokes
-from servod.lab.identify.trace import Kind, Trace
+from servod.lab.identify.trace import ExperimentKind, RecordedMotion
 
 STROKES = 12
 PERIOD_S = 1.0
@@ -48,7 +48,7 @@ def design(bench: Bench, inertia: float, speed_rad_s: float) -> Excitation:
     return Excitation(scale * wave, lines)
 
 
-def run(bench: Bench, inertia: float, gains: tuple[float, float]) -> Trace:
+def run(bench: Bench, inertia: float, gains: tuple[float, float]) -> RecordedMotion:
     """Strokes there and back with the multisine on each; `inertia` is the first idea of it."""
     steady_s = SETTLE_S + PERIOD_S
     stroke_s = steady_s + 0.64 * TURN_S
@@ -66,4 +66,4 @@ def run(bench: Bench, inertia: float, gains: tuple[float, float]) -> Trace:
     settings = {"first": float(starts[0] + settle), "stride": float(starts[1] - starts[0]), "count": float(count)}
     settings |= {"strokes": float(STROKES), "speed_rad_s": speed, "kp": gains[0], "kd": gains[1]}
     settings |= {f"line_{i}": float(line) for i, line in enumerate(excitation.lines)}
-    return bench.run(Kind.RESPONSE, path, torque, bench.bounds.window_rad, settings)
+    return bench.run(ExperimentKind.RESPONSE, path, torque, bench.bounds.window_rad, settings)

@@ -10,7 +10,7 @@ import numpy as np
 
 from servod.common.errors import AnswerIsNo
 from servod.lab.identify.estimate import Estimate, estimate
-from servod.lab.identify.trace import Trace
+from servod.lab.identify.trace import RecordedMotion
 
 #: The joint creeps up to half the window while the torque comes within a per cent of break-away, and begins to slide
 #: there; the command takes a cycle or two to act.
@@ -32,7 +32,7 @@ class BreakAwayFit(NamedTuple):
         return min(self.positive.value, self.negative.value)
 
 
-def torque_of(ramp: Trace) -> float:
+def torque_of(ramp: RecordedMotion) -> float:
     """Torque magnitude at the break-away of one ramp; NaN when the joint stayed."""
     away = np.abs(ramp.position_rad - ramp.position_rad[0]) > 0.5 * ramp.settings["window_rad"]
     if not away.any():
@@ -41,7 +41,7 @@ def torque_of(ramp: Trace) -> float:
     return abs(float(ramp.torque_nm[max(row, 0)]))
 
 
-def fit(ramps: Sequence[Trace]) -> BreakAwayFit:
+def fit(ramps: Sequence[RecordedMotion]) -> BreakAwayFit:
     """Mean and spread over the ramps of each direction. Raises AnswerIsNo when a direction has none."""
     return BreakAwayFit(*(_direction(ramps, sign) for sign in (1.0, -1.0)))
 
@@ -57,7 +57,7 @@ def widened(found: BreakAwayFit, half_nm: float) -> BreakAwayFit:
     )
 
 
-def _direction(ramps: Sequence[Trace], sign: float) -> Estimate:
+def _direction(ramps: Sequence[RecordedMotion], sign: float) -> Estimate:
     torques = np.array([torque_of(r) for r in ramps if r.settings["direction"] == sign])
     torques = torques[np.isfinite(torques)]
     if len(torques) == 0:

@@ -15,7 +15,7 @@ from scipy.linalg import solve_banded
 from scipy.optimize import least_squares
 
 from servod.lab.identify.estimate import Estimate, at_ends, estimate, jackknife, joined
-from servod.lab.identify.trace import Trace
+from servod.lab.identify.trace import RecordedMotion
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -39,7 +39,7 @@ class _Period(NamedTuple):
     torque: Complex
 
 
-def fit(trace: Trace, inertia: float, delay_s: float, viscous: float, stiffness: float) -> Estimate | None:
+def fit(trace: RecordedMotion, inertia: float, delay_s: float, viscous: float, stiffness: float) -> Estimate | None:
     """sigma1 in N*m*s/rad; None when the recording does not tell it (coarse encoder, too little motion).
 
     On a bent Dahl curve the bristle moves less than the joint, by the chord's stiffness over that at zero, `stiffness`.
@@ -72,7 +72,7 @@ def response(
     return total
 
 
-def _spectra(trace: Trace) -> tuple[Array, list[_Period]]:
+def _spectra(trace: RecordedMotion) -> tuple[Array, list[_Period]]:
     """Lines in Hz, and the spectra of all whole periods but the first."""
     s = trace.settings
     count = int(s["count"])

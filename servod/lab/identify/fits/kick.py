@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from servod.common.errors import AnswerIsNo
-from servod.lab.identify.trace import Trace, smooth
+from servod.lab.identify.trace import RecordedMotion, smooth
 
 WIDTH_S = 0.0025
 #: Delays that are tried, in periods.
@@ -26,7 +26,7 @@ class KickFit(NamedTuple):
     negative_nm: float
 
 
-def fit(kicks: Sequence[Trace]) -> KickFit:
+def fit(kicks: Sequence[RecordedMotion]) -> KickFit:
     """Regression torque = inertia*acceleration + friction(direction) over sliding rows, over all delays tried.
 
     Of `kicks`, which grew until they told, the last of each direction counts. Raises AnswerIsNo when inertia does not
@@ -39,7 +39,7 @@ def fit(kicks: Sequence[Trace]) -> KickFit:
     return best[1]
 
 
-def _with_delay(kicks: Sequence[Trace], delay_s: float) -> tuple[float, KickFit]:
+def _with_delay(kicks: Sequence[RecordedMotion], delay_s: float) -> tuple[float, KickFit]:
     design, torque = [], []
     for kick in kicks:
         s = smooth(kick.t_s, kick.torque_nm, kick.position_rad, delay_s, WIDTH_S)

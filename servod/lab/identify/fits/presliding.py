@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from servod.common.errors import AnswerIsNo
 from servod.lab.identify.estimate import Estimate, estimate, jackknife
 from servod.lab.identify.fits.break_away import BreakAwayFit
-from servod.lab.identify.trace import Trace
+from servod.lab.identify.trace import RecordedMotion
 
 Array = NDArray[np.float64]
 
@@ -72,7 +72,7 @@ def bend_factor(amplitude_nm: float, positive_nm: float, negative_nm: float) -> 
     return float(abs(np.mean(way * np.exp(-1j * phase))) / abs(np.mean(torque * np.exp(-1j * phase))))
 
 
-def fit(bursts: Sequence[Trace], break_away: BreakAwayFit) -> PreslidingFit:
+def fit(bursts: Sequence[RecordedMotion], break_away: BreakAwayFit) -> PreslidingFit:
     """c0 over all bursts that stayed below break-away.
 
     Raises AnswerIsNo when none did, or when the encoder shows too little of them.
@@ -121,7 +121,7 @@ def _sensitivity(amplitude: float, break_away: BreakAwayFit, bend: float) -> flo
     return abs(widened / bend - 1.0)
 
 
-def _steady(burst: Trace) -> NDArray[np.int64]:
+def _steady(burst: RecordedMotion) -> NDArray[np.int64]:
     """Indices of the whole cycles behind the fade-in; empty when the burst was cut short."""
     first = round(burst.settings["from_s"] / burst.period_s)
     whole = round(burst.settings["cycles"] / burst.settings["frequency_hz"] / burst.period_s)
@@ -129,7 +129,7 @@ def _steady(burst: Trace) -> NDArray[np.int64]:
     return np.arange(first, end, dtype=np.int64) if len(burst) >= end else np.arange(0, dtype=np.int64)
 
 
-def _response(burst: Trace) -> tuple[complex, complex]:
+def _response(burst: RecordedMotion) -> tuple[complex, complex]:
     """Fundamentals of torque and displacement, both turned so that the torque's is real."""
     rows, f, period = _steady(burst), burst.settings["frequency_hz"], burst.period_s
     torque = fundamental(burst.torque_nm[rows], f, period)
@@ -137,7 +137,7 @@ def _response(burst: Trace) -> tuple[complex, complex]:
     return complex(abs(torque)), fundamental(burst.position_rad[rows], f, period) * turn
 
 
-def _curve(bursts: Sequence[Trace]) -> tuple[Array, Array]:
+def _curve(bursts: Sequence[RecordedMotion]) -> tuple[Array, Array]:
     """One averaged cycle of displacement and torque over all bursts."""
     cycles = []
     for burst in bursts:

@@ -29,7 +29,7 @@ from servod.lab.identify.fits.strokes import (
     response_of,
     spectra,
 )
-from servod.lab.identify.trace import Trace
+from servod.lab.identify.trace import RecordedMotion
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -125,7 +125,7 @@ class _Found(NamedTuple):
     resonance: Resonance | None
 
 
-def fit(trace: Trace, inertia: float) -> ResponseFit:
+def fit(trace: RecordedMotion, inertia: float) -> ResponseFit:
     """Fit one multisine recording; `inertia` is the first idea of it. Raises AnswerIsNo without coherence."""
     frequency, strokes = spectra(trace)
     coherence = coherence_of(strokes)
@@ -269,7 +269,7 @@ def _delay(value_s: float, spread_s: float, freedom: int, note: str, lag: Estima
     return found if lag.value > 0.0 else replace(found, low=found.low - lag.high)
 
 
-def _torque_noise(lines: _Lines, strokes: Sequence[Stroke], trace: Trace, values: Array) -> Estimate:
+def _torque_noise(lines: _Lines, strokes: Sequence[Stroke], trace: RecordedMotion, values: Array) -> Estimate:
     """Torque disturbance below `NOISE_HZ`, from what the motion does beyond the torque; by the scatter of strokes.
 
     `lines` and `strokes` are all that were excited, coherent or not.

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.common.errors import AnswerIsNo
-from servod.lab.identify.trace import Trace
+from servod.lab.identify.trace import RecordedMotion
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -27,7 +27,7 @@ class Stroke(NamedTuple):
     excitation: Complex
 
 
-def spectra(trace: Trace) -> tuple[Array, list[Stroke]]:
+def spectra(trace: RecordedMotion) -> tuple[Array, list[Stroke]]:
     """Lines in Hz and the spectra of every whole stroke."""
     s = trace.settings
     count, first, stride = int(s["count"]), int(s["first"]), int(s["stride"])

@@ -11,7 +11,7 @@ from servod.common.errors import BadInput
 from servod.formats.model.axis_model import AxisModel
 from servod.formats.model.identified import IdentifiedMap
 from servod.lab.identify.fits.presliding import PreslidingFit
-from servod.lab.report.figure import Array, Axis, Colour, Curve, Figure, Panel, Scale, Style, array, curve
+from servod.lab.report.figure import Array, Colour, Curve, Figure, PlotAxis, PlotPanel, ScaleKind, Style, array, curve
 from servod.lab.verify.steady_friction import SteadyFriction, steady_friction
 
 _POINTS = 400
@@ -40,7 +40,7 @@ def dahl_curve(found: PreslidingFit, truth: AxisModel | None = None, name: str =
         f"The slope at zero is c0; the loop leans by a factor of {found.bend:.3f} where it comes near break-away, "
         "which Dahl's law takes off."
     )
-    panel = Panel(Axis("displacement in µrad"), Axis("torque in mN·m"), tuple(curves))
+    panel = PlotPanel(PlotAxis("displacement in µrad"), PlotAxis("torque in mN·m"), tuple(curves))
     return Figure(name, "Dahl curve: torque over presliding displacement", (panel,), caption=caption, row_height=1.5)
 
 
@@ -57,9 +57,14 @@ def friction_map(model: AxisModel, truth: AxisModel | None = None, name: str = "
         raise BadInput("model: identified", "nothing", "a model that servoctl identify wrote")
     found = model.identified.friction_map
     known = None if truth is None else steady_friction(truth)
-    signed = Panel(Axis("velocity in rad/s"), Axis("friction in mN·m"), _map_curves(found, known, False), "signed")
-    by_speed = Panel(
-        Axis("speed in rad/s", Scale.LOG), Axis("friction in mN·m"), _map_curves(found, known, True), "magnitude"
+    signed = PlotPanel(
+        PlotAxis("velocity in rad/s"), PlotAxis("friction in mN·m"), _map_curves(found, known, False), "signed"
+    )
+    by_speed = PlotPanel(
+        PlotAxis("speed in rad/s", ScaleKind.LOG),
+        PlotAxis("friction in mN·m"),
+        _map_curves(found, known, True),
+        "magnitude",
     )
     caption = "Bands are 95 % intervals; friction here is what the torque command must overcome, cogging taken off."
     return Figure(name, "Friction-velocity map", (signed, by_speed), 2, caption, 1.3)

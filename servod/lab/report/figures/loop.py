@@ -11,9 +11,28 @@ from servod.common.errors import BadInput
 from servod.formats.gains.design import Design, RegionProof
 from servod.formats.gains.gain_set import Certificate, GainSet
 from servod.lab.identify.fits.response import LEAST_COHERENCE, ResponseFit, falling_phase_rad
-from servod.lab.report.figure import Array, Axis, Colour, Curve, Figure, Panel, Scale, Style, Table, curve
+from servod.lab.report.figure import (
+    Array,
+    Colour,
+    Curve,
+    Figure,
+    PageTable,
+    PlotAxis,
+    PlotPanel,
+    ScaleKind,
+    Style,
+    curve,
+)
 from servod.lab.report.figures.sets import local_law
-from servod.lab.report.responses import Complex, Loop, after, before, frequency_response, rigid, vertex_impulse
+from servod.lab.report.responses import (
+    Complex,
+    Loop,
+    before,
+    closed_loop_response,
+    frequency_response,
+    rigid,
+    vertex_impulse,
+)
 
 #: Velocities of both halves of Fig. 4 [rad/s]: creeping (and at rest), and where trajectory (19) is fast.
 LOW_VELOCITIES, HIGH_VELOCITIES = (0.0, 0.001), (0.05, 0.2)
@@ -52,9 +71,9 @@ def bode(
         pairs = [curve_pair("rigid joint without friction", ideal, frequencies, Colour.ORANGE, Style.DOTTED)]
         for v, style in zip(velocities, (Style.LINE, Style.DASHED), strict=False):
             pairs.append(drawn("before", before(design, v), Colour.GREY, style))
-            pairs.append(drawn("after (9)", after(design, law, v, False), Colour.BLACK, style))
+            pairs.append(drawn("after (9)", closed_loop_response(design, law, v, False), Colour.BLACK, style))
             if law.disturbance_observer is not None:
-                observed = after(design, law, v, True)
+                observed = closed_loop_response(design, law, v, True)
                 pairs.append(drawn("after, with the output observer", observed, Colour.BLUE, style))
         columns.append(pairs)
     return _bode_figure(name, columns, (low, high))
@@ -64,14 +83,14 @@ def _bode_figure(
     name: str, columns: list[list[tuple[Curve, Curve]]], velocities: tuple[tuple[float, ...], ...]
 ) -> Figure:
     """Magnitudes above phases, a column for each range of velocities."""
-    x = Axis("frequency in Hz", Scale.LOG)
-    labels = (Axis("position/torque in rad/(N·m)", Scale.LOG), Axis("phase in degrees"))
+    x = PlotAxis("frequency in Hz", ScaleKind.LOG)
+    labels = (PlotAxis("position/torque in rad/(N·m)", ScaleKind.LOG), PlotAxis("phase in degrees"))
     titles = [
         f"{kind}: " + ", ".join(f"{v:g}" for v in speeds) + " rad/s (solid, dashed)"
         for kind, speeds in zip(("very low", "higher"), velocities, strict=True)
     ]
     panels = [
-        Panel(x, label, tuple(pair[part] for pair in pairs), title if part == 0 else "")
+        PlotPanel(x, label, tuple(pair[part] for pair in pairs), title if part == 0 else "")
         for part, label in enumerate(labels)
         for pairs, title in zip(columns, titles, strict=True)
     ]
@@ -113,9 +132,9 @@ def impulse_responses(gains: GainSet, name: str = "impulse_responses") -> Figure
         raise BadInput(f"gain set {gains.name}: design.regions", "none", "the proofs of both regions")
     columns = [_impulses(region, design.period_s) for region in design.regions]
     panels = [
-        Panel(
-            Axis("time in s"),
-            Axis(label),
+        PlotPanel(
+            PlotAxis("time in s"),
+            PlotAxis(label),
             tuple(curves[part] for curves in drawn),
             _region_title(region) if part == 0 else "",
         )
@@ -161,20 +180,20 @@ def _norms(region: RegionProof, period_s: float) -> str:
 # Stands on the gain set alone.
 
 
-def certificate_table(gains: GainSet) -> Table:
+def certificate_table(gains: GainSet) -> PageTable:
     """All checks in their order. Raises BadInput for a set without a certificate."""
     certificate = _certificate(gains)
     rows = [
         (c.name, f"{c.value:.4g}", f"{c.limit:.4g}", f"{c.margin:.3g}", _verdict(c.passed)) for c in certificate.checks
     ]
     verdict = "valid" if certificate.valid else "not valid"
-    return Table(f"Certificate: {verdict}", ("check", "figure", "limit", "margin", "verdict"), tuple(rows))
+    return PageTable(f"Certificate: {verdict}", ("check", "figure", "limit", "margin", "verdict"), tuple(rows))
 
 
-def observations_table(gains: GainSet) -> Table:
+def observations_table(gains: GainSet) -> PageTable:
     """What was observed beside the checks, told and not judged. Raises BadInput for a set without a certificate."""
     told = _certificate(gains).observations
-    return Table("Told, not judged", ("figure", "value"), tuple((k, f"{v:.4g}") for k, v in told.items()))
+    return PageTable("Told, not judged", ("figure", "value"), tuple((k, f"{v:.4g}") for k, v in told.items()))
 
 
 def _certificate(gains: GainSet) -> Certificate:
@@ -202,21 +221,21 @@ def measured_response(found: ResponseFit, name: str = "frequency_response") -> F
     fine = np.geomspace(found.frequency_hz[0], found.frequency_hz[-1], _RESPONSE_POINTS)
     gain, error, fitted = np.abs(found.response), _HALF * found.deviation, found.model(fine)
     phase, model_phase = np.degrees(found.phase_rad(found.response)), np.degrees(falling_phase_rad(fitted))
-    hz = Axis("frequency in Hz", Scale.LOG)
+    hz = PlotAxis("frequency in Hz", ScaleKind.LOG)
     panels = (
-        Panel(
+        PlotPanel(
             hz,
-            Axis("position/torque in rad/(N·m)", Scale.LOG),
+            PlotAxis("position/torque in rad/(N·m)", ScaleKind.LOG),
             _panel(found, gain, (gain * (1.0 - np.minimum(error, 0.99)), gain * (1.0 + error)), fine, np.abs(fitted)),
             "gain",
         ),
-        Panel(
+        PlotPanel(
             hz,
-            Axis("phase in degrees"),
+            PlotAxis("phase in degrees"),
             _panel(found, phase, (phase - np.degrees(error), phase + np.degrees(error)), fine, model_phase),
             "phase",
         ),
-        Panel(hz, Axis("coherence in %", span=(0.0, 105.0)), _coherence(found), "coherence"),
+        PlotPanel(hz, PlotAxis("coherence in %", span=(0.0, 105.0)), _coherence(found), "coherence"),
     )
     caption = (
         "Torque command to position while the joint slides; bars are 95 % intervals by the scatter of the strokes. "

@@ -10,9 +10,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from servod.lab.diagnose.result import Map, RecordingErrors, Spectrum, Units, Windows
+from servod.lab.diagnose.result import MismatchMap, RecordingErrors, Spectrum, Units, Windows
 from servod.lab.diagnose.settings import SETTINGS
-from servod.lab.report.figure import Axis, Colour, Curve, Figure, Panel, Scale, Style, curve
+from servod.lab.report.figure import Colour, Curve, Figure, PlotAxis, PlotPanel, ScaleKind, Style, curve
 
 #: Maps that are shown.
 SHOWN = 6
@@ -24,7 +24,7 @@ MOST_RECORDINGS = 6
 BAR, HALF_BAR = 0.62, 0.36
 
 
-def shares(maps: Sequence[Map]) -> dict[str, float]:
+def shares(maps: Sequence[MismatchMap]) -> dict[str, float]:
     """Share of the error by coordinate, largest first; both directions of a coordinate count as one."""
     found: dict[str, float] = {}
     for seen in maps:
@@ -34,7 +34,7 @@ def shares(maps: Sequence[Map]) -> dict[str, float]:
     return dict(sorted(found.items(), key=lambda item: -item[1]))
 
 
-def where(maps: Sequence[Map], units: Units) -> Figure:
+def where(maps: Sequence[MismatchMap], units: Units) -> Figure:
     """The first picture: the share of the error that each coordinate orders, and the map that orders most of it."""
     found = shares(maps)
     names = tuple(reversed(found))
@@ -42,7 +42,9 @@ def where(maps: Sequence[Map], units: Units) -> Figure:
         "share of the error", [100.0 * found[n] for n in names], np.arange(len(names)), Colour.BLUE, Style.BARS, BAR
     )
     most = 100.0 * max([*found.values(), 0.01])
-    left = Panel(Axis("share of the error in %", span=(0.0, min(100.0, 1.15 * most))), Axis("", names=names), (bars,))
+    left = PlotPanel(
+        PlotAxis("share of the error in %", span=(0.0, min(100.0, 1.15 * most))), PlotAxis("", names=names), (bars,)
+    )
     caption = (
         "Left: how much of the error becomes a plain curve when it is drawn over a coordinate, beyond what chance "
         "would make; the shares overlap, as velocity and direction do. Right: the error over the coordinate that "
@@ -51,22 +53,22 @@ def where(maps: Sequence[Map], units: Units) -> Figure:
     return Figure("where", "Where the model is off", (left, map_panel(maps[0], units)), 2, caption, 1.5)
 
 
-def map_panel(seen: Map, units: Units, after: Map | None = None) -> Panel:
+def map_panel(seen: MismatchMap, units: Units, after: MismatchMap | None = None) -> PlotPanel:
     """One map as a curve with its band; `after` in another colour beside it."""
     curves = [_mean(seen, "before", Colour.ORANGE)]
     if after is not None:
         curves.append(_mean(after, "after", Colour.BLUE))
     unit = "" if seen.unit == "1" or "modulo" in seen.coordinate else f" in {seen.unit}"
-    return Panel(Axis(f"{seen.coordinate}{unit}"), Axis(f"error in {units.force}"), tuple(curves))
+    return PlotPanel(PlotAxis(f"{seen.coordinate}{unit}"), PlotAxis(f"error in {units.force}"), tuple(curves))
 
 
-def _mean(seen: Map, label: str, colour: Colour) -> Curve:
+def _mean(seen: MismatchMap, label: str, colour: Colour) -> Curve:
     half = 2.0 * seen.error
     style = Style.POINTS if len(seen.at) < 4 else Style.LINE
     return curve(label, seen.at, seen.mean, colour, style, bounds=(seen.mean - half, seen.mean + half))
 
 
-def map_grid(before: Sequence[Map], after: Sequence[Map], units: Units) -> Figure:
+def map_grid(before: Sequence[MismatchMap], after: Sequence[MismatchMap], units: Units) -> Figure:
     """The maps that carry most, before and after on the same scale."""
     later = {seen.coordinate: seen for seen in after}
     chosen = [seen for seen in before if seen.coordinate in later and seen.bins > 1][:SHOWN]
@@ -86,7 +88,7 @@ def over_time(recordings: Sequence[RecordingErrors], units: Units) -> Figure:
             curve("before", one.t_s, one.before_curve, Colour.ORANGE),
             curve("after", one.t_s, one.after_curve, Colour.BLUE),
         )
-        panels.append(Panel(Axis("time in s"), Axis(f"error in {units.force}"), curves, one.name))
+        panels.append(PlotPanel(PlotAxis("time in s"), PlotAxis(f"error in {units.force}"), curves, one.name))
     caption = (
         f"Root mean square of the error in stretches of {SETTINGS.curves.course_s:g} s, by models fitted to the other "
         "recordings."
@@ -99,9 +101,9 @@ def spectrum(before: Spectrum, after: Spectrum, units: Units) -> Figure:
     """Power of the error over frequency, before and after."""
     shown = ((before, "before", Colour.ORANGE), (after, "after", Colour.BLUE))
     curves = [curve(label, error.frequency_hz, error.amplitude, colour) for error, label, colour in shown]
-    panel = Panel(
-        Axis("frequency in Hz", Scale.LOG),
-        Axis(f"error in {units.force}/√Hz", Scale.LOG),
+    panel = PlotPanel(
+        PlotAxis("frequency in Hz", ScaleKind.LOG),
+        PlotAxis(f"error in {units.force}/√Hz", ScaleKind.LOG),
         tuple(c for c in curves if c.x.size),
     )
     caption = "Amplitude of the error by frequency: a narrow peak is a resonance or a period, a broad rise is noise."
@@ -125,7 +127,9 @@ def window_course(windows: Sequence[Windows], left_out: str | None, units: Units
             curve("after", window.t_s, factor * window.after, Colour.BLUE, width=1.0),
         )
         title = f"{window.worst}, windows of {window.horizon_s:g} s"
-        panels.append(Panel(Axis("time in s"), Axis(f"position error in {prefix}{units.length}"), curves, title))
+        panels.append(
+            PlotPanel(PlotAxis("time in s"), PlotAxis(f"position error in {prefix}{units.length}"), curves, title)
+        )
     caption = (
         "Simulated minus recorded position; the simulation begins anew from the recording at every window. "
         f"{seen_by(left_out)}"
@@ -133,14 +137,14 @@ def window_course(windows: Sequence[Windows], left_out: str | None, units: Units
     return Figure("windows", "How far a simulation strays", tuple(panels), 1, caption, 0.8)
 
 
-def bars(panels: Sequence[Panel], left_out: str | None) -> Figure:
+def bars(panels: Sequence[PlotPanel], left_out: str | None) -> Figure:
     """Errors before and after, a panel for each kind of error."""
     rows = max(len(panel.y.names) for panel in panels)
     caption = f"Root mean square errors of each recording before and after. {seen_by(left_out)}"
     return Figure("held_out", "Errors before and after", tuple(panels), len(panels), caption, 0.45 + 0.13 * rows)
 
 
-def before_after(errors: Mapping[str, tuple[float, float]], unit: str, what: str, named: bool = True) -> Panel:
+def before_after(errors: Mapping[str, tuple[float, float]], unit: str, what: str, named: bool = True) -> PlotPanel:
     """Bars of an error before and after: name -> (before, after); a panel beside a `named` one needs no names."""
     names = tuple(reversed(list(errors)))
     places, (factor, prefix) = np.arange(len(names), dtype=float), _prefix(max(max(pair) for pair in errors.values()))
@@ -148,7 +152,9 @@ def before_after(errors: Mapping[str, tuple[float, float]], unit: str, what: str
         curve(label, [factor * errors[n][side] for n in names], places + shift, colour, Style.BARS, HALF_BAR)
         for side, label, shift, colour in ((0, "before", 0.19, Colour.ORANGE), (1, "after", -0.19, Colour.BLUE))
     )
-    return Panel(Axis(f"{what} in {prefix}{unit}"), Axis("", names=names if named else ("",) * len(names)), bars)
+    return PlotPanel(
+        PlotAxis(f"{what} in {prefix}{unit}"), PlotAxis("", names=names if named else ("",) * len(names)), bars
+    )
 
 
 def _prefix(largest: float) -> tuple[float, str]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from servod.lab.report.figure import COLOURS, Array, Axis, Colour, Curve, Figure, Panel, Style, array, curve
+from servod.lab.report.figure import COLOURS, Array, Colour, Curve, Figure, PlotAxis, PlotPanel, Style, array, curve
 from servod.lab.simulate.simulate import ClosedLoopRun
 
 MILLI = 1e3
@@ -20,7 +20,7 @@ SETTLE_S = 1.0
 
 
 @dataclass(frozen=True)
-class Motion:
+class PlottedMotion:
     """One motion, a value for each cycle. `friction_nm` is the law's compensation, `joint_friction_nm` the
     joint's own.
     """
@@ -42,10 +42,10 @@ class Motion:
         """RMS of the error from `after_s` on."""
         return float(np.sqrt(np.mean(self.error_mrad[self.time_s >= after_s] ** 2)))
 
-    def part(self, from_s: float, to_s: float) -> Motion:
+    def part(self, from_s: float, to_s: float) -> PlottedMotion:
         """The cycles between both times, time counted from the first of them."""
         here = (self.time_s >= from_s) & (self.time_s < to_s)
-        return Motion(
+        return PlottedMotion(
             self.label,
             self.time_s[here] - from_s,
             self.reference_rad[here],
@@ -56,28 +56,28 @@ class Motion:
         )
 
 
-def motion_of_rows(label: str, rows: NDArray[np.void]) -> Motion:
+def motion_of_rows(label: str, rows: NDArray[np.void]) -> PlottedMotion:
     """A motion from cycle records (dtype servod.lab.recordings.recording.ROW); positions are the encoder's."""
     time_s = (rows["time_ns"] - rows["time_ns"][0]) * 1e-9
     columns = ("reference_rad", "position_rad", "torque_nm", "torque_friction_nm")
-    return Motion(label, array(time_s), *(array(rows[c]) for c in columns))
+    return PlottedMotion(label, array(time_s), *(array(rows[c]) for c in columns))
 
 
-def motion_of_run(label: str, run: ClosedLoopRun, joint_friction_nm: Array | None = None) -> Motion:
+def motion_of_run(label: str, run: ClosedLoopRun, joint_friction_nm: Array | None = None) -> PlottedMotion:
     """A motion from the compiled simulator; positions are the true ones."""
-    return Motion(
+    return PlottedMotion(
         label, run.t_s, run.reference_rad, run.position_rad, run.torque_nm, run.friction_nm, joint_friction_nm
     )
 
 
-def tracking(motion: Motion, name: str = "tracking", title: str = "") -> Figure:
+def tracking(motion: PlottedMotion, name: str = "tracking", title: str = "") -> Figure:
     """Position, error and torque of one motion below each other (Fig. 15)."""
     title = title or f"Tracking under {motion.label}"
     return Figure(name, title, tuple(_column(motion)), row_height=0.85)
 
 
 def tracking_grid(
-    motions: Sequence[Motion], name: str = "tracking", title: str = "Tracking", same_error_scale: bool = True
+    motions: Sequence[PlottedMotion], name: str = "tracking", title: str = "Tracking", same_error_scale: bool = True
 ) -> Figure:
     """Position, error and torque of several motions, a column for each (Fig. 16, 17, 18).
 
@@ -90,8 +90,8 @@ def tracking_grid(
     return Figure(name, title, tuple(panels), len(motions), row_height=0.85)
 
 
-def _column(motion: Motion, error_span: tuple[float, float] | None = None) -> list[Panel]:
-    t = Axis("time in s")
+def _column(motion: PlottedMotion, error_span: tuple[float, float] | None = None) -> list[PlotPanel]:
+    t = PlotAxis("time in s")
     position = (
         curve("reference", motion.time_s, MILLI * motion.reference_rad, Colour.GREY, Style.DASHED),
         curve("position", motion.time_s, MILLI * motion.position_rad, Colour.BLUE),
@@ -103,14 +103,14 @@ def _column(motion: Motion, error_span: tuple[float, float] | None = None) -> li
             curve("of it friction compensation", motion.time_s, MILLI * motion.friction_nm, Colour.SKY, width=1.0)
         )
     return [
-        Panel(t, Axis("position in mrad"), position, motion.label),
-        Panel(t, Axis("error in mrad", span=error_span), error),
-        Panel(t, Axis("torque in mN·m"), tuple(torque)),
+        PlotPanel(t, PlotAxis("position in mrad"), position, motion.label),
+        PlotPanel(t, PlotAxis("error in mrad", span=error_span), error),
+        PlotPanel(t, PlotAxis("torque in mN·m"), tuple(torque)),
     ]
 
 
 def errors(
-    motions: Sequence[Motion], name: str = "errors", title: str = "Tracking errors", after_s: float = SETTLE_S
+    motions: Sequence[PlottedMotion], name: str = "errors", title: str = "Tracking errors", after_s: float = SETTLE_S
 ) -> Figure:
     """All errors in one panel, and below it those under a tenth of the worst on a scale of their own."""
     scores = {m.label: m.rms_mrad(after_s) for m in motions}
@@ -121,32 +121,41 @@ def errors(
     return Figure(name, title, tuple(panels), caption=caption)
 
 
-def _errors(motions: Sequence[Motion], scores: dict[str, float], colours: dict[str, Colour], after_s: float) -> Panel:
+def _errors(
+    motions: Sequence[PlottedMotion], scores: dict[str, float], colours: dict[str, Colour], after_s: float
+) -> PlotPanel:
     reach = 1.1 * max(float(np.abs(m.error_mrad[m.time_s >= after_s]).max()) for m in motions)
     curves = [curve(m.label, m.time_s, m.error_mrad, colours[m.label], width=1.0) for m in motions]
     title = "" if len(motions) == len(scores) else "those below a tenth of the worst"
-    return Panel(Axis("time in s"), Axis("error in mrad", span=(-reach, reach)), tuple(curves), title)
+    return PlotPanel(PlotAxis("time in s"), PlotAxis("error in mrad", span=(-reach, reach)), tuple(curves), title)
 
 
-def before_after(before: Motion, after: Motion, name: str = "before_after", title: str = "Before and after") -> Figure:
+def before_after(
+    before: PlottedMotion, after: PlottedMotion, name: str = "before_after", title: str = "Before and after"
+) -> Figure:
     """The same motion before and after a change: both errors, and both torques."""
-    t = Axis("time in s")
+    t = PlotAxis("time in s")
     shown = ((before, Colour.GREY), (after, Colour.BLUE))
     error = [curve(m.label, m.time_s, m.error_mrad, colour, width=1.1) for m, colour in shown]
     torque = [curve(m.label, m.time_s, MILLI * m.torque_nm, colour, width=1.1) for m, colour in shown]
     caption = f"RMS error {before.rms_mrad(0.0):.4g} mrad before, {after.rms_mrad(0.0):.4g} mrad after."
-    panels = (Panel(t, Axis("error in mrad"), tuple(error)), Panel(t, Axis("torque in mN·m"), tuple(torque)))
+    panels = (
+        PlotPanel(t, PlotAxis("error in mrad"), tuple(error)),
+        PlotPanel(t, PlotAxis("torque in mN·m"), tuple(torque)),
+    )
     return Figure(name, title, panels, caption=caption)
 
 
-def steps(motions: Sequence[Motion], name: str, title: str, settled_s: float = 0.15, shown_s: float = 0.6) -> Figure:
+def steps(
+    motions: Sequence[PlottedMotion], name: str, title: str, settled_s: float = 0.15, shown_s: float = 0.6
+) -> Figure:
     """Step responses over each other (Fig. 16, 17): position, the error near its end, torque, for `shown_s`.
 
     Motions begin with the step. The panel of the error shows what is left from `settled_s` on.
     """
     motions = [m.part(0.0, shown_s) for m in motions]
     colours = [COLOURS[i % len(COLOURS)] for i in range(len(motions))]
-    t = Axis("time in s")
+    t = PlotAxis("time in s")
     position = [curve(m.label, m.time_s, MILLI * m.position_rad, c) for m, c in zip(motions, colours, strict=True)]
     goal = curve("reference", motions[0].time_s, MILLI * motions[0].reference_rad, Colour.GREY, Style.DASHED)
     rest = [curve(m.label, m.time_s, m.error_mrad, c, width=1.1) for m, c in zip(motions, colours, strict=True)]
@@ -156,37 +165,37 @@ def steps(motions: Sequence[Motion], name: str, title: str, settled_s: float = 0
     left = [float(np.abs(m.error_mrad[m.time_s >= settled_s]).max(initial=0.0)) for m in motions]
     span = 1.1 * max(*left, 1e-3)
     panels = (
-        Panel(t, Axis("position in mrad"), (goal, *position)),
-        Panel(
+        PlotPanel(t, PlotAxis("position in mrad"), (goal, *position)),
+        PlotPanel(
             t,
-            Axis("error in mrad", span=(-span, span)),
+            PlotAxis("error in mrad", span=(-span, span)),
             tuple(rest),
             f"error, scale of what is left after {settled_s:g} s",
         ),
-        Panel(t, Axis("torque in mN·m"), tuple(torque)),
+        PlotPanel(t, PlotAxis("torque in mN·m"), tuple(torque)),
     )
     return Figure(name, title, panels, row_height=0.9)
 
 
-def position_and_friction(motions: Sequence[Motion], name: str, title: str) -> Figure:
+def position_and_friction(motions: Sequence[PlottedMotion], name: str, title: str) -> Figure:
     """Position (left), control signal and friction (right), a row for each motion (Fig. 9, 10)."""
     panels = [panel for motion in motions for panel in _position_and_friction(motion)]
     return Figure(name, title, tuple(panels), 2)
 
 
-def _position_and_friction(motion: Motion) -> tuple[Panel, Panel]:
-    t = Axis("time in s")
+def _position_and_friction(motion: PlottedMotion) -> tuple[PlotPanel, PlotPanel]:
+    t = PlotAxis("time in s")
     torque: list[Curve] = [curve("control signal", motion.time_s, MILLI * motion.torque_nm, Colour.BLACK, width=1.0)]
     if motion.joint_friction_nm is not None:
         friction = MILLI * motion.joint_friction_nm
         torque.append(curve("friction of the joint", motion.time_s, friction, Colour.ORANGE, Style.DASHED))
     position = _column(motion)[0]
-    return position, Panel(t, Axis("torque in mN·m"), tuple(torque))
+    return position, PlotPanel(t, PlotAxis("torque in mN·m"), tuple(torque))
 
 
-def disturbed_friction(nominal: Motion, disturbed: Motion, name: str = "disturbed_friction") -> Figure:
+def disturbed_friction(nominal: PlottedMotion, disturbed: PlottedMotion, name: str = "disturbed_friction") -> Figure:
     """Friction of the joint with and without the added disturbance (Fig. 11), and the errors of both (Fig. 12)."""
-    t = Axis("time in s")
+    t = PlotAxis("time in s")
     shown = ((disturbed, Colour.ORANGE, Style.LINE), (nominal, Colour.BLUE, Style.LINE))
     friction = [
         curve(m.label, m.time_s, MILLI * m.joint_friction_nm, colour, style, 1.0)
@@ -196,7 +205,7 @@ def disturbed_friction(nominal: Motion, disturbed: Motion, name: str = "disturbe
     error = [curve(m.label, m.time_s, m.error_mrad, colour, style, 1.0) for m, colour, style in shown]
     caption = f"RMS error {nominal.rms_mrad():.4g} mrad without, {disturbed.rms_mrad():.4g} mrad with the disturbance."
     panels = (
-        Panel(t, Axis("friction in mN·m"), tuple(friction), "friction of the joint"),
-        Panel(t, Axis("error in mrad"), tuple(error), "tracking error"),
+        PlotPanel(t, PlotAxis("friction in mN·m"), tuple(friction), "friction of the joint"),
+        PlotPanel(t, PlotAxis("error in mrad"), tuple(error), "tracking error"),
     )
     return Figure(name, "Friction tuned from its nominal level by filtered noise", panels, caption=caption)

@@ -12,7 +12,19 @@ from servod.formats.gains.gain_set import GainSet
 from servod.formats.gains.parameters import LocalParameters
 from servod.formats.model.axis_model import AxisModel
 from servod.kernels.laws.weights import Shape, blended, weights
-from servod.lab.report.figure import COLOURS, Array, Axis, Colour, Curve, Figure, Panel, Scale, Style, array, curve
+from servod.lab.report.figure import (
+    COLOURS,
+    Array,
+    Colour,
+    Curve,
+    Figure,
+    PlotAxis,
+    PlotPanel,
+    ScaleKind,
+    Style,
+    array,
+    curve,
+)
 from servod.lab.verify.steady_friction import SteadyFriction, steady_friction
 
 _POINTS = 1200
@@ -33,7 +45,9 @@ def weighting_functions(gains: GainSet, name: str = "weighting_functions") -> Fi
     nodes = [s.velocity_rad_s for s in law.friction.sets]
     near = sorted(abs(v) for v in nodes)[min(4, len(nodes) - 1)]
     panels = tuple(
-        Panel(Axis("velocity in rad/s", span=(-reach, reach)), Axis("weight μ_i"), _weights(law, reach), title)
+        PlotPanel(
+            PlotAxis("velocity in rad/s", span=(-reach, reach)), PlotAxis("weight μ_i"), _weights(law, reach), title
+        )
         for title, reach in (("whole range", 1.05 * max(map(abs, nodes))), ("around zero", 1.3 * near))
     )
     caption = f"{len(nodes)} local sets, shape {law.friction.weights.value}; at every velocity the weights sum to one."
@@ -89,10 +103,10 @@ def local_friction(gains: GainSet, model: AxisModel | None = None, name: str = "
         upper, lower = _direction(law, friction, nodes[sign * nodes > 0.0], sign, colour)
         force += upper
         deviation.append(lower)
-    x = Axis("speed in rad/s", Scale.LOG)
+    x = PlotAxis("speed in rad/s", ScaleKind.LOG)
     panels = (
-        Panel(x, Axis("friction in mN·m"), tuple(force), "steady friction, law and map"),
-        Panel(x, Axis("law minus map in %"), tuple(deviation), "difference"),
+        PlotPanel(x, PlotAxis("friction in mN·m"), tuple(force), "steady friction, law and map"),
+        PlotPanel(x, PlotAxis("law minus map in %"), tuple(deviation), "difference"),
     )
     caption = f"{len(nodes)} local sets, a_i by (7) in each direction; the law's own interpolation runs between them."
     return Figure(name, "Friction of the local sets", panels, 2, caption, 1.2)

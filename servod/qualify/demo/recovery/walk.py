@@ -17,25 +17,29 @@ import numpy as np
 
 from servod.client.axis import AxisClient, ReferenceMotion
 from servod.client.processes import socket_folder
-from servod.common.errors import AnswerIsNo
+from servod.common.errors import AnswerIsNo, BadInput
 from servod.common.files import write_bytes
 from servod.formats.gains.design import Uncertainty
 from servod.formats.gains.gain_set import GainSet
 from servod.formats.model.axis_model import AxisModel, axis_model_yaml, load_axis_model
 from servod.lab.commission.comparison import save_rows
 from servod.lab.deploy.deployment import deploy
-from servod.lab.deploy.judge import broken, skipped
+from servod.lab.deploy.judge import broken_promises, doubtful_timing
 from servod.lab.deploy.outcome import Deployment
+from servod.lab.diagnose.document import describe_certainty
 from servod.lab.diagnose.effects import names
 from servod.lab.diagnose.engine import diagnose
 from servod.lab.diagnose.result import Diagnosis, DiagnosisVerdict
 from servod.lab.recordings import load_recording
 from servod.lab.recordings.recording import Rows, moving, rows_of
-from servod.lab.report.diagnosis import MODEL, write_files
+from servod.lab.report.diagnosis import MODEL, DiagnosisReport, write_files
+from servod.lab.report.figure import Colour, Curve, Figure, PlotAxis, PlotPanel, curve
+from servod.lab.report.figures import mismatch
+from servod.lab.report.figures.signature import signature_figure
 from servod.lab.synthesize.deployed import Wishes
-from servod.lab.synthesize.gain_set import Options, synthesize
+from servod.lab.synthesize.gain_set import DesignOptions, synthesize
 from servod.lab.synthesize.infeasible import Infeasible
-from servod.lab.tracking.metrics import REST_S, Array, score
+from servod.lab.tracking.metrics import REST_S, SETTLE_S, Array, score
 from servod.lab.verify.certify import verify
 from servod.lab.verify.checks import LEAST_PLANTS
 from servod.lab.verify.vertices import least_widths
@@ -87,7 +91,7 @@ class Designed:
 
 
 @dataclass(frozen=True)
-class Recovery:
+class Retrofit:
     """What came of it; rows are the cycles on trajectory (19), figures RMS errors there in mrad."""
 
     effect: str
@@ -131,7 +135,7 @@ class Recovery:
         gains, came = self.first.gains, self.deployment.before
         if came is None or gains.design is None or gains.certificate is None or gains.certificate.promised is None:
             return []
-        return list(broken(came, gains.certificate.promised, 2.0 * math.pi / gains.design.counts_per_turn))
+        return list(broken_promises(came, gains.certificate.promised, 2.0 * math.pi / gains.design.counts_per_turn))
 
     @property
     def recovered_share(self) -> float:
@@ -166,7 +170,7 @@ def recover(
     tell: Tell,
     seed: int = 1,
     effort: Effort = Effort(),
-) -> Recovery:
+) -> Retrofit:
     """Run the whole story; files stay in `out`. Raises AnswerIsNo when a step's answer is no."""
     paper = ReferenceMotion.paper(effort.paper_s)
     tell("design for what is believed", 0.02)
@@ -188,7 +192,7 @@ def recover(
             done = _deployed(axis, second.gains, tell)
             tell("the axis under what was found", 0.95)
             after = moved(axis, paper)
-    return Recovery(effect, before, concealed, after, found, document, first, second, done)
+    return Retrofit(effect, before, concealed, after, found, document, first, second, done)
 
 
 def moved(axis: AxisClient, motion: ReferenceMotion) -> Rows:
@@ -201,7 +205,7 @@ def _deployed(axis: AxisClient, gains: GainSet, tell: Tell) -> Deployment:
     """Put the set on trial; again where it was turned down and the loop had skipped cycles, as deploy advises then."""
     for _ in range(_TRIALS):
         done = deploy(axis, gains, lambda what, share: tell(f"deploy: {what}", 0.85 + 0.08 * share))
-        if done.proven or done.rows_after is None or not skipped(done.rows_after):
+        if done.proven or done.rows_after is None or not doubtful_timing(done.rows_after):
             break
     return done
 
@@ -220,7 +224,7 @@ def designed(
     `same_filter` is a set whose velocity filter the axis has already. Raises AnswerIsNo.
     """
     cutoff = same_filter.design.velocity_cutoff_hz if same_filter and same_filter.design else None
-    options, said = Options(name=gains_file.stem, observer=False), ""
+    options, said = DesignOptions(name=gains_file.stem, observer=False), ""
     for scale in SCALES:
         wishes = Wishes(cutoff_hz=cutoff, uncertainty=_narrowed(model, scale))
         found = synthesize(model, wishes, options, model_file)
@@ -292,3 +296,135 @@ def motions(duration_s: float, period_s: float = 0.001) -> dict[str, Array]:
     smooth = np.hanning(width + 2)[1:-1]
     moves = np.convolve(np.pad(moves, width // 2, mode="edge"), smooth / smooth.sum(), mode="valid")
     return {"slow_sine": slow, "multisine": mixed, "moves": moves}
+
+
+# What a virtual axis can conceal: effects of a size that costs tracking, and the model that does not know them.
+#
+# Beside the data path. Sizes go with the joint's dry friction, so that any joint conceals something that counts.
+
+
+#: What stands under the effect's key in the axis model file, for a joint of some dry friction in N*m.
+CONCEALED: dict[str, Callable[[float], Any]] = {
+    "cogging": lambda dry: {"harmonics": [_sine(0.3 * dry, 22.0, 0.7), _sine(0.1 * dry, 44.0, 2.1)]},
+    "gravity": lambda dry: {"amplitude": 1.3 * dry, "phase": 0.3},
+    "asymmetry": lambda _dry: {"positive_dry": 1.3, "negative_dry": 0.7},
+    "spring": lambda dry: {"stiffness": 7.0 * dry, "rest": 0.1},
+    "torque_offset": lambda dry: 0.5 * dry,
+}
+
+#: What is concealed when nobody says what.
+DEFAULT = "gravity"
+
+#: Noise of the demo's joint, where the plant has none of its own.
+NOISE = {"torque_rms": 0.0003, "torque_bandwidth_hz": 200.0, "encoder_rms": 2.0e-6}
+
+
+def _sine(amplitude: float, periods_per_turn: float, phase: float) -> dict[str, float]:
+    return {"amplitude": amplitude, "periods_per_turn": periods_per_turn, "phase": phase}
+
+
+def believed_and_true(plant: AxisModel, effect: str) -> tuple[AxisModel, AxisModel]:
+    """The axis without and with the effect. An effect that `plant` has is taken out of what is believed.
+
+    Raises BadInput for an effect that a controller cannot be told of, and that the plant does not have.
+    """
+    document = plant.model_dump(mode="json", exclude_none=True, exclude_defaults=True)
+    document.setdefault("noise", NOISE)
+    if effect in document:
+        without = {key: value for key, value in document.items() if key != effect}
+        return AxisModel.model_validate(without), plant
+    if effect not in CONCEALED:
+        raise BadInput("--conceal", repr(effect), ", ".join(CONCEALED) + ", or an effect that --plant has")
+    dry = getattr(plant.friction, "coulomb", 0.0) or 0.05
+    return AxisModel.model_validate(document), AxisModel.model_validate(document | {effect: CONCEALED[effect](dry)})
+
+
+# The page of `servoctl demo --diagnose`: what was believed, what came, what was found, and what that gave back.
+#
+# The last step of `walk`; the diagnosis has its own page beside it.
+
+
+#: Runs as people read them, with their colours.
+RUNS = {
+    "before": ("as believed", Colour.BLACK),
+    "concealed": ("with the effect concealed", Colour.ORANGE),
+    "after": ("after diagnosis and new design", Colour.BLUE),
+}
+
+
+def write_recovery_page(found: Retrofit, out: Path) -> Path:
+    """Write `report.html` and pictures into `out`. Raises BadInput when that is not possible."""
+    report = DiagnosisReport(out, "servod demo: an axis that conceals something")
+    rms, page = found.rms_mrad, report.page
+    back = min(100.0 * found.recovered_share, 100.0)
+    page.lead(
+        f"{back:.0f} % of what the concealed effect cost is back: {rms['before']:.3f} mrad "
+        f"RMS on trajectory (19) as believed, {rms['concealed']:.3f} with it, {rms['after']:.3f} once it is known."
+    )
+    page.points(story(found))
+    report.figure(_errors(found))
+    _figures(report, found)
+    page.heading("What the diagnosis found in the axis's own recordings")
+    page.points([f["statement"] for f in found.document["findings"]])
+    page.points([line for f in found.document["findings"] for line in describe_certainty(f)])
+    evidence, units = found.diagnosis.evidence, found.diagnosis.units
+    if evidence is not None:
+        report.figure(mismatch.where(evidence.maps_before, units))
+        terms = [(one, named.effect) for named in evidence.findings for one in named.signatures]
+        for one, effect in sorted(terms, key=lambda term: term[0].number):
+            report.figure(signature_figure(one, effect, units))
+    page.sentence(f"All of it: {DIAGNOSIS}/report.html, {DIAGNOSIS}/diagnosis.json and {DIAGNOSIS}/model.yaml.")
+    return report.write()
+
+
+def story(found: Retrofit) -> list[str]:
+    """What happened, a sentence for each step."""
+    name = found.effect.replace("_", " ")
+    named = ", ".join(f["effect"].replace("_", " ") for f in found.document["findings"]) or "nothing by name"
+    stays = "was deployed" if found.deployment.proven else f"was rolled back ({'; '.join(found.deployment.reasons)})"
+    return [
+        f"A controller was designed and certified for what is believed of the axis, {within(found.first.scale)}.",
+        f"The axis has {name} that nobody told the controller of: {_kept(found)}.",
+        f"The axis's own recordings were diagnosed: {named}.",
+        f"A controller designed and certified for the extended model, {within(found.second.scale)}, {stays}.",
+    ]
+
+
+def _kept(found: Retrofit) -> str:
+    """Whether the axis did what the first certificate promised."""
+    if found.broken_promises:
+        return f"it tracks worse than the certificate promised ({'; '.join(found.broken_promises)})"
+    times = found.rms_mrad["concealed"] / found.rms_mrad["before"]
+    return (
+        "of the validation motion it does what the certificate promised all the same, and the error on trajectory (19) "
+        f"is {times:.2g} times as large"
+    )
+
+
+def _errors(found: Retrofit) -> Figure:
+    """The three errors on trajectory (19), over each other."""
+    runs = {"before": found.before, "concealed": found.concealed, "after": found.after}
+    curves: list[Curve] = []
+    for key in ("concealed", "before", "after"):
+        label, colour = RUNS[key]
+        late = time_s(runs[key]) >= SETTLE_S
+        curves.append(curve(label, time_s(runs[key])[late], error_mrad(runs[key])[late], colour, width=1.1))
+    panel = PlotPanel(PlotAxis("time in s"), PlotAxis("error in mrad"), tuple(curves))
+    caption = "Reference minus encoder position on trajectory (19), without its first second."
+    return Figure("recovery", "Tracking before, with and after", (panel,), 1, caption, 1.3)
+
+
+def _figures(report: DiagnosisReport, found: Retrofit) -> None:
+    """What certificates promised of the validation motion, and what came."""
+    first, done = found.first.promised_mrad, found.deployment.document()
+    after = done["after"] or {}
+    rows = [
+        (
+            key.removesuffix("_mrad"), f"{first.get(key, 0.0):.4g}", f"{value:.4g}",
+            f"{done['promised'][key]:.4g}", f"{after[key]:.4g}" if key in after else "none",
+        )
+        for key, value in done["before"].items()
+        if key in done["promised"] and isinstance(value, float)
+    ]  # fmt: skip
+    report.page.sentence("The validation motion, RMS error in mrad: what the certificates promised, and what came.")
+    report.page.table(("part", "promised at first", "came", "promised anew", "came then"), rows)

@@ -8,19 +8,18 @@ from __future__ import annotations
 
 from servod.common.errors import BadInput
 from servod.common.yaml import validate
-from servod.qualify.faults.actions.base import Action
+from servod.qualify.faults.actions.base import InjectionAction
 from servod.qualify.faults.actions.bus import BUS_ACTIONS
-from servod.qualify.faults.actions.gains import GAIN_FILE_ACTIONS
 from servod.qualify.faults.actions.guest import GUEST_ACTIONS
-from servod.qualify.faults.actions.machine import MACHINE_ACTIONS
+from servod.qualify.faults.actions.machine import GAIN_FILE_ACTIONS, MACHINE_ACTIONS
 from servod.qualify.faults.actions.nodes import NODE_ACTIONS
 from servod.qualify.faults.actions.processes import PROCESS_ACTIONS
 from servod.qualify.faults.scenario import Injection, Runs
 
-__all__ = ["ACTIONS", "Action", "action_of"]
+__all__ = ["ACTIONS", "InjectionAction", "action_of"]
 
 #: The one table of actions: name in the scenario's file -> model of its arguments.
-ACTIONS: dict[str, type[Action]] = {
+ACTIONS: dict[str, type[InjectionAction]] = {
     **BUS_ACTIONS,
     **NODE_ACTIONS,
     **MACHINE_ACTIONS,
@@ -30,7 +29,7 @@ ACTIONS: dict[str, type[Action]] = {
 }
 
 
-def action_of(injection: Injection, where: str, runs: Runs) -> Action:
+def action_of(injection: Injection, where: str, runs: Runs) -> InjectionAction:
     """The action that `injection` names, with its arguments checked; raises BadInput."""
     action = ACTIONS.get(injection.action)
     if action is None:

@@ -26,7 +26,7 @@ class Who(StrEnum):
 NODE_ID = {Who.AMPLIFIER: AMPLIFIER, Who.ENCODER: ENCODER}
 
 
-class Action(Strict):
+class InjectionAction(Strict):
     """One kind of injection; `runs` says which axes under test can show it, `traceless` what is told when it left no
     trace."""
 

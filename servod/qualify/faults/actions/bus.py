@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 from pydantic import Field
 
 from servod.drivers.virtual.bus_faults import ANY_ID, MYSELF, BusFault, FaultKind
-from servod.qualify.faults.actions.base import NODE_ID, Action, Who
+from servod.qualify.faults.actions.base import NODE_ID, InjectionAction, Who
 from servod.qualify.faults.scenario import Loss
 from servod.qualify.faults.under_test import AMPLIFIER, ENCODER
 from servod.runtime.fieldbus.cia import HEARTBEAT_BASE, RPDO_BASE, SYNC_ID, TPDO_BASE
@@ -74,7 +74,7 @@ _KIND = {
 }
 
 
-class BusAction(Action):
+class BusAction(InjectionAction):
     """An action that the hub carries out, and counts."""
 
     @abstractmethod
@@ -246,7 +246,7 @@ class SecondNode(BusAction):
         return BusFault(FaultKind.TWIN, participant=NODE_ID[self.who])
 
 
-BUS_ACTIONS: dict[str, type[Action]] = {
+BUS_ACTIONS: dict[str, type[InjectionAction]] = {
     "frames": Frames,
     "frames_pass": FramesPass,
     "silence": Silence,

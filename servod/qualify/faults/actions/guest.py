@@ -20,7 +20,7 @@ from servod.qualify.faults.scenario import Loss, Runs
 from servod.qualify.faults.wire import CanWire
 
 if TYPE_CHECKING:
-    from servod.qualify.faults.actions.base import Action
+    from servod.qualify.faults.actions.base import InjectionAction
     from servod.qualify.faults.processes import ProcessAxis
 
 #: Stands on the kernel's command line of the guest, and of no other machine.
@@ -151,7 +151,7 @@ class CanGen(GuestAction):
         return 1
 
 
-GUEST_ACTIONS: dict[str, type[Action]] = {
+GUEST_ACTIONS: dict[str, type[InjectionAction]] = {
     "interface": Interface,
     "set_clock": SetClock,
     "small_disk": SmallDisk,

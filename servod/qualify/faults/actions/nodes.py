@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, ClassVar
 from pydantic import Field, model_validator
 
 from servod.drivers.virtual.amplifier import AMPLIFIER_EDS
-from servod.drivers.virtual.dictionary import Dictionary, Entry
+from servod.drivers.virtual.dictionary import DeviceDictionary, Entry
 from servod.drivers.virtual.encoder import ENCODER_EDS
-from servod.qualify.faults.actions.base import NODE_ID, Action, Who
+from servod.qualify.faults.actions.base import NODE_ID, InjectionAction, Who
 from servod.qualify.faults.scenario import Loss
 from servod.runtime.fieldbus.cia import NMT_ID, NmtCommand
 
@@ -31,7 +31,7 @@ class NmtName(StrEnum):
     RESET_COMMUNICATION = "reset_communication"
 
 
-class FrameAction(Action):
+class FrameAction(InjectionAction):
     """An action that is one frame of a stranger."""
 
     traceless: ClassVar[str] = "nobody heard the frame"
@@ -76,7 +76,7 @@ _TAKES = {
 }
 
 
-class ObjectWrite(Action):
+class ObjectWrite(InjectionAction):
     """An object of a node changes: the vendor's objects 0x2000 put causes of faults into the virtual nodes."""
 
     traceless: ClassVar[str] = "the node did not take the value"
@@ -109,9 +109,9 @@ class ObjectWrite(Action):
 
 
 @cache
-def _objects(who: Who) -> Dictionary:
+def _objects(who: Who) -> DeviceDictionary:
     """The objects of one node as they are before anything is written; not for writing."""
-    return Dictionary(AMPLIFIER_EDS if who is Who.AMPLIFIER else ENCODER_EDS)
+    return DeviceDictionary(AMPLIFIER_EDS if who is Who.AMPLIFIER else ENCODER_EDS)
 
 
 def _entry(who: Who, index: int, subindex: int) -> Entry | None:
@@ -133,4 +133,8 @@ class ForeignFrame(FrameAction):
         return self.can_id, bytes.fromhex(self.data)
 
 
-NODE_ACTIONS: dict[str, type[Action]] = {"nmt": Nmt, "object_write": ObjectWrite, "foreign_frame": ForeignFrame}
+NODE_ACTIONS: dict[str, type[InjectionAction]] = {
+    "nmt": Nmt,
+    "object_write": ObjectWrite,
+    "foreign_frame": ForeignFrame,
+}

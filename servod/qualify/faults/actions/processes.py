@@ -18,7 +18,7 @@ from pydantic import Field
 
 from servod.client.processes import child, last_core, wait_until
 from servod.formats.protocol import Verb
-from servod.qualify.faults.actions.base import Action
+from servod.qualify.faults.actions.base import InjectionAction
 from servod.qualify.faults.machine import Process
 from servod.qualify.faults.processes import ProcessAxis
 from servod.qualify.faults.scenario import Loss, Runs
@@ -30,7 +30,7 @@ _KIB = 1024
 _CLIENT_S = 20.0
 
 
-class ProcessAction(Action):
+class ProcessAction(InjectionAction):
     """An action for which there must be processes."""
 
     runs: ClassVar[frozenset[Runs]] = frozenset({Runs.PROCESSES, Runs.GUEST})
@@ -221,7 +221,7 @@ def _moves(axis: ProcessAxis) -> bool:
         return bool(client.call(Verb.STATUS)["axis"]["motion_running"])
 
 
-PROCESS_ACTIONS: dict[str, type[Action]] = {
+PROCESS_ACTIONS: dict[str, type[InjectionAction]] = {
     "signal": Signal,
     "virtual_axis_back": VirtualAxisBack,
     "restart_daemon": RestartDaemon,

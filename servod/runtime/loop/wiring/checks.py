@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from servod.common.units import NS_PER_S, NS_PER_US, PER_MILLE, TWO_PI
 from servod.formats.config import AxisConfig
-from servod.runtime.loop.wiring.findings import Finding
+from servod.runtime.loop.wiring.findings import WiringOutcome
 
 #: Share of the torque and speed limits that the test uses, so that it never meets the limits' own reactions.
 SHARE = 0.9
@@ -46,16 +46,16 @@ MOST_ENERGY = 30.0
 FIRST_RATIO = 1.5
 
 
-class Verdict(NamedTuple):
+class CheckResult(NamedTuple):
     """A finding, what was found, and the range that would have been right."""
 
-    finding: Finding
+    finding: WiringOutcome
     found: float = math.nan
     lowest: float = math.nan
     highest: float = math.nan
 
 
-class ProofBounds(NamedTuple):
+class WiringTestBounds(NamedTuple):
     """What the test may do, and what the devices and the joint are said to be; SI units at the joint."""
 
     period_s: float
@@ -77,7 +77,7 @@ class ProofBounds(NamedTuple):
     friction_nm: float  # NaN where nobody says
 
 
-def proof_bounds(config: AxisConfig, amplifier_facts: Mapping[str, Any]) -> ProofBounds:
+def wiring_test_bounds(config: AxisConfig, amplifier_facts: Mapping[str, Any]) -> WiringTestBounds:
     """The bounds of one axis; `amplifier_facts` are those of its node plan (rated torque as the drive says)."""
     asked, limits = config.wiring_proof, config.limits
     amplifier, encoder = config.amplifier, config.encoder
@@ -88,7 +88,7 @@ def proof_bounds(config: AxisConfig, amplifier_facts: Mapping[str, Any]) -> Proo
     travel = max(asked.travel_rad or TRAVEL_RAD, TRAVEL_COUNTS * max(encoder_count, amplifier_count))
     travel = min(travel, most_travel / 3.0)
     lone_travel = max(LONE_TRAVELS * travel, LONE_SHARE * limits.encoder_mismatch_rad)
-    bounds = ProofBounds(
+    bounds = WiringTestBounds(
         period_s=config.cycle.period_us * NS_PER_US / NS_PER_S,
         most_nm=asked.torque_nm or SHARE * limits.torque_nm,
         first_nm=0.0,
@@ -110,7 +110,7 @@ def proof_bounds(config: AxisConfig, amplifier_facts: Mapping[str, Any]) -> Proo
     return _with_torques(bounds, asked.torque_nm is None)
 
 
-def _with_torques(bounds: ProofBounds, capped: bool) -> ProofBounds:
+def _with_torques(bounds: WiringTestBounds, capped: bool) -> WiringTestBounds:
     """First and most torque; `capped`: no more than what is expected of the joint needs, where that is known."""
     most_nm = min(bounds.most_nm, MOST_RATIO * friction_range(bounds)[1]) if capped else bounds.most_nm
     first_nm = FIRST_SHARE * most_nm
@@ -178,42 +178,42 @@ class TorqueLine:
         return (self._count * self._product - self._demand * self._actual) / spread if spread > 0.0 else math.nan
 
 
-def rated_torque(bounds: ProofBounds) -> Verdict | None:
+def rated_torque(bounds: WiringTestBounds) -> CheckResult | None:
     """Before any torque: limit and drive must be of one size, and the drive must be able to tell small torques."""
     ratio = bounds.limit_nm / (PER_MILLE * bounds.torque_count_nm)
     if math.isnan(ratio) or RATED_LOWEST <= ratio <= RATED_HIGHEST:
         return None
-    return Verdict(Finding.RATED_TORQUE, ratio, RATED_LOWEST, RATED_HIGHEST)
+    return CheckResult(WiringOutcome.RATED_TORQUE, ratio, RATED_LOWEST, RATED_HIGHEST)
 
 
-def signs(ways: tuple[float, float]) -> Verdict | None:
+def signs(ways: tuple[float, float]) -> CheckResult | None:
     """Both ways along the torque."""
     encoder, amplifier = ways
     if encoder < 0.0 and amplifier < 0.0:
-        return Verdict(Finding.TORQUE_POLARITY, -1.0, 1.0, 1.0)
+        return CheckResult(WiringOutcome.TORQUE_POLARITY, -1.0, 1.0, 1.0)
     if encoder < 0.0:
-        return Verdict(Finding.ENCODER_DIRECTION, -1.0, 1.0, 1.0)
-    return Verdict(Finding.AMPLIFIER_DIRECTION, -1.0, 1.0, 1.0) if amplifier < 0.0 else None
+        return CheckResult(WiringOutcome.ENCODER_DIRECTION, -1.0, 1.0, 1.0)
+    return CheckResult(WiringOutcome.AMPLIFIER_DIRECTION, -1.0, 1.0, 1.0) if amplifier < 0.0 else None
 
 
 def sensors(
-    whole: tuple[float, float], late: tuple[float, float], bounds: ProofBounds, noise_rad: float
-) -> Verdict | None:
+    whole: tuple[float, float], late: tuple[float, float], bounds: WiringTestBounds, noise_rad: float
+) -> CheckResult | None:
     """Stillness, signs and scale of both sensors. A wrong scale shows in the whole way and in its late part alike;
     slack only in the first, a spring that unwinds only in the second."""
     encoder, amplifier = abs(whole[0]), abs(whole[1])
     step_rad = max(bounds.encoder_count_rad, bounds.amplifier_count_rad)
     blur_rad = step_rad + noise_rad
     if encoder <= blur_rad < amplifier:
-        return Verdict(Finding.ENCODER_STILL, amplifier)
+        return CheckResult(WiringOutcome.ENCODER_STILL, amplifier)
     if amplifier <= blur_rad < encoder:
-        return Verdict(Finding.AMPLIFIER_STILL, encoder)
+        return CheckResult(WiringOutcome.AMPLIFIER_STILL, encoder)
     if verdict := signs(whole):
         return verdict
     allowed_rad = SCALE_COUNTS * step_rad + noise_rad
     longer = {_longer(ways, allowed_rad) for ways in (whole, late)}
     if longer in ({1}, {-1}):
-        return Verdict(Finding.POSITION_SCALE, amplifier / encoder, 1.0 / SCALE_RATIO, SCALE_RATIO)
+        return CheckResult(WiringOutcome.POSITION_SCALE, amplifier / encoder, 1.0 / SCALE_RATIO, SCALE_RATIO)
     return None
 
 
@@ -225,15 +225,15 @@ def _longer(ways: tuple[float, float], allowed_rad: float) -> int:
     return 1 if encoder > amplifier else -1
 
 
-def first_torque(push: Push, bounds: ProofBounds) -> Verdict | None:
+def first_torque(push: Push, bounds: WiringTestBounds) -> CheckResult | None:
     """A joint that moves under the very first torque, which was to move none: far more torque acts than was asked."""
     lowest_nm = FIRST_RATIO * bounds.first_nm
     if push.began_nm > lowest_nm or bounds.friction_nm <= 2.0 * lowest_nm:
         return None
-    return Verdict(Finding.TOO_EASY, push.began_nm, max(lowest_nm, friction_range(bounds)[0]))
+    return CheckResult(WiringOutcome.TOO_EASY, push.began_nm, max(lowest_nm, friction_range(bounds)[0]))
 
 
-def energy(push: Push, encoder_rad: float, bounds: ProofBounds) -> Verdict | None:
+def energy(push: Push, encoder_rad: float, bounds: WiringTestBounds) -> CheckResult | None:
     """Energy of the motion against the work that the torque can have done on the way, where the inertia is known."""
     passed_s = push.cut_s - push.began_s
     if math.isnan(bounds.inertia) or not passed_s > 0.0:
@@ -241,27 +241,31 @@ def energy(push: Push, encoder_rad: float, bounds: ProofBounds) -> Verdict | Non
     speed_rad_s = push.late_ways(encoder_rad, 0.0)[0] / passed_s
     work = push.cut_nm * abs(encoder_rad - push.encoder_rad)
     ratio = 0.5 * bounds.inertia * speed_rad_s * speed_rad_s / work if work > 0.0 else math.inf
-    return Verdict(Finding.TOO_FAST, ratio, 0.0, MOST_ENERGY) if ratio > MOST_ENERGY else None
+    return CheckResult(WiringOutcome.TOO_FAST, ratio, 0.0, MOST_ENERGY) if ratio > MOST_ENERGY else None
 
 
-def torque_at_rest(shown_nm: float, bounds: ProofBounds) -> Verdict | None:
+def torque_at_rest(shown_nm: float, bounds: WiringTestBounds) -> CheckResult | None:
     """0x6077 while none is demanded, on the mean: what the controller would go on from at its first cycle."""
     counts_nm = 0.0 if math.isnan(bounds.torque_count_nm) else ACTUAL_COUNTS * bounds.torque_count_nm
     allowed_nm = AT_REST_SHARE * bounds.limit_nm + counts_nm
-    return None if abs(shown_nm) <= allowed_nm else Verdict(Finding.TORQUE_AT_REST, shown_nm, -allowed_nm, allowed_nm)
+    return (
+        None
+        if abs(shown_nm) <= allowed_nm
+        else CheckResult(WiringOutcome.TORQUE_AT_REST, shown_nm, -allowed_nm, allowed_nm)
+    )
 
 
-def actual_torque(line: TorqueLine, bounds: ProofBounds) -> Verdict | None:
+def actual_torque(line: TorqueLine, bounds: WiringTestBounds) -> CheckResult | None:
     """0x6077 against the demand: sign and size."""
     slope = line.slope
     if line.most_nm < ACTUAL_COUNTS * bounds.torque_count_nm or math.isnan(slope):
         return None
     if ACTUAL_LOWEST <= slope <= ACTUAL_HIGHEST:
         return None
-    return Verdict(Finding.TORQUE_ACTUAL, slope, ACTUAL_LOWEST, ACTUAL_HIGHEST)
+    return CheckResult(WiringOutcome.TORQUE_ACTUAL, slope, ACTUAL_LOWEST, ACTUAL_HIGHEST)
 
 
-def friction_range(bounds: ProofBounds) -> tuple[float, float]:
+def friction_range(bounds: WiringTestBounds) -> tuple[float, float]:
     """Least and most friction, half of what lies between both break-aways, that fits what is known of the joint."""
     expected, limit_nm = bounds.friction_nm, bounds.limit_nm
     if math.isnan(expected):
@@ -269,13 +273,13 @@ def friction_range(bounds: ProofBounds) -> tuple[float, float]:
     return FRICTION_RATIO_LOW * expected, FRICTION_RATIO_HIGH * _expected_nm(bounds) + ALLOWED_SHARE * limit_nm
 
 
-def _expected_nm(bounds: ProofBounds) -> float:
+def _expected_nm(bounds: WiringTestBounds) -> float:
     """Torque of an expected break-away: friction, and what the ramp gets ahead while the inertia yields."""
     heavy_nm = 0.0 if math.isnan(bounds.inertia) else bounds.inertia * bounds.travel_rad * bounds.growth_per_s**2
     return bounds.friction_nm + heavy_nm
 
 
-def scale_factor(bounds: ProofBounds) -> float:
+def scale_factor(bounds: WiringTestBounds) -> float:
     """By how much the torque may be too strong or too weak and still pass; infinite where nothing bounds it."""
     lowest_nm, highest_nm = friction_range(bounds)
     if math.isnan(bounds.friction_nm):
@@ -287,12 +291,14 @@ def scale_factor(bounds: ProofBounds) -> float:
     return max(too_strong, too_weak)
 
 
-def friction(friction_nm: float, bounds: ProofBounds) -> Verdict | None:
+def friction(friction_nm: float, bounds: WiringTestBounds) -> CheckResult | None:
     """The size of the torque that moves the joint."""
     lowest_nm, highest_nm = friction_range(bounds)
     if friction_nm < lowest_nm:
-        return Verdict(Finding.TOO_EASY, friction_nm, lowest_nm, highest_nm)
-    return Verdict(Finding.TOO_HEAVY, friction_nm, lowest_nm, highest_nm) if friction_nm > highest_nm else None
+        return CheckResult(WiringOutcome.TOO_EASY, friction_nm, lowest_nm, highest_nm)
+    return (
+        CheckResult(WiringOutcome.TOO_HEAVY, friction_nm, lowest_nm, highest_nm) if friction_nm > highest_nm else None
+    )
 
 
 # How far the joint has moved over the last cycles: what tells motion, its direction and rest from single counts.
@@ -307,7 +313,7 @@ REST_CYCLES, SPEED_CYCLES = 20, 5
 _SLOWER = 0.9
 
 
-class Sway:
+class RestWindow:
     """The last REST_CYCLES positions with their times."""
 
     def __init__(self, position_rad: float, time_s: float) -> None:

@@ -11,7 +11,7 @@ from enum import IntEnum
 from typing import Any, NamedTuple
 
 
-class Finding(IntEnum):
+class WiringOutcome(IntEnum):
     """How a test ended: which check it failed, or that it passed them all. The number is what the loop reports."""
 
     PASSED = 0
@@ -36,7 +36,7 @@ class Finding(IntEnum):
     TORQUE_AT_REST = 19
 
 
-class Proof(NamedTuple):
+class WiringReport(NamedTuple):
     """One test as the loop reports it, in joint coordinates; NaN where nothing was measured."""
 
     finding: int  # servod.runtime.loop.wiring.findings.Finding
@@ -58,7 +58,7 @@ class Proof(NamedTuple):
     @property
     def passed(self) -> bool:
         """Polarity, scale and directions are proven."""
-        return self.finding == Finding.PASSED
+        return self.finding == WiringOutcome.PASSED
 
     @property
     def friction_nm(self) -> float:
@@ -78,7 +78,7 @@ class _Row(NamedTuple):
     remedy: str
 
 
-_F = Finding
+_F = WiringOutcome
 _SCALES = "encoder.counts_per_turn, amplifier.counts_per_turn and amplifier.gear_ratio against the data sheets"
 _RATED = (
     "compare 0x6076 with the data sheet, state amplifier.rated_torque_mnm, check amplifier.quirks and "
@@ -87,7 +87,7 @@ _RATED = (
 _KNOWN = "wiring_proof.friction_nm and wiring_proof.inertia (or the file that `model` names)"
 
 #: What each finding is called, and what to do. None of the sentences holds for a test that passed.
-FINDINGS: dict[Finding, _Row] = {
+FINDINGS: dict[WiringOutcome, _Row] = {
     _F.TORQUE_POLARITY: _Row(
         "positive torque moves the joint backwards by both sensors: wrong polarity of the torque",
         "turn round amplifier.torque_direction (or the drive's 0x607E)",
@@ -186,22 +186,23 @@ FINDINGS: dict[Finding, _Row] = {
 }
 
 
-def sentence(proof: Proof) -> str:
+def wiring_sentence(proof: WiringReport) -> str:
     """What a test found, in one line: what was measured, or which check failed, found, allowed and remedy."""
     if proof.passed:
         return f"wiring proven: {_measured(proof)}; {_scale(proof)}"
-    row = FINDINGS[Finding(int(proof.finding))]
+    outcome = WiringOutcome(int(proof.finding))
+    row = FINDINGS[outcome]
     text = row.text.format(found=proof.found, lowest=proof.lowest, highest=proof.highest, **_longer(proof.found))
-    return f"wiring not proven ({Finding(int(proof.finding)).name}): {text}; {row.remedy}. Measured: {_measured(proof)}"
+    return f"wiring not proven ({outcome.name}): {text}; {row.remedy}. Measured: {_measured(proof)}"
 
 
-def document(proof: Proof) -> dict[str, Any]:
+def wiring_document(proof: WiringReport) -> dict[str, Any]:
     """A test for JSON: its finding, the sentence, and every figure; None where nothing was measured."""
-    figures = {name: _finite(value) for name, value in zip(Proof._fields[1:], proof[1:], strict=True)}
+    figures = {name: _finite(value) for name, value in zip(WiringReport._fields[1:], proof[1:], strict=True)}
     return {
-        "finding": Finding(int(proof.finding)).name,
+        "finding": WiringOutcome(int(proof.finding)).name,
         "passed": proof.passed,
-        "text": sentence(proof),
+        "text": wiring_sentence(proof),
         "friction_nm": _finite(proof.friction_nm),
         "load_nm": _finite(proof.load_nm),
         **figures,
@@ -214,7 +215,7 @@ def _longer(ratio: float) -> dict[str, Any]:
     return {"longer": first, "shorter": second, "times": max(ratio, 1.0 / ratio) if ratio > 0.0 else math.inf}
 
 
-def _scale(proof: Proof) -> str:
+def _scale(proof: WiringReport) -> str:
     """How sharply a test that passed has proven the scale of the torque, and what would make it sharper."""
     known = math.isfinite(proof.scale_factor)
     only = "only " if known else ""
@@ -224,7 +225,7 @@ def _scale(proof: Proof) -> str:
     return f"the scale of the torque is proven {only}{how}: state {_KNOWN}"
 
 
-def _measured(proof: Proof) -> str:
+def _measured(proof: WiringReport) -> str:
     """The figures that there are."""
     parts = [
         ("moves at {:+.3g} N*m", proof.positive_nm),

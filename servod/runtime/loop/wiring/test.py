@@ -15,8 +15,16 @@ from enum import IntEnum
 
 from servod.runtime.fieldbus.devices import AmplifierFeedback, EncoderFeedback
 from servod.runtime.loop.wiring import checks as judge
-from servod.runtime.loop.wiring.checks import REST_CYCLES, SPEED_CYCLES, ProofBounds, Push, Sway, TorqueLine, Verdict
-from servod.runtime.loop.wiring.findings import Finding, Proof
+from servod.runtime.loop.wiring.checks import (
+    REST_CYCLES,
+    SPEED_CYCLES,
+    CheckResult,
+    Push,
+    RestWindow,
+    TorqueLine,
+    WiringTestBounds,
+)
+from servod.runtime.loop.wiring.findings import WiringOutcome, WiringReport
 
 #: The joint must stand within this time, before the first push and after each.
 _REST_S, _SETTLE_S = 0.5, 0.5
@@ -44,16 +52,16 @@ class _Stage(IntEnum):
     SETTLE = 2
 
 
-class WiringProof:
+class WiringTest:
     """The test of one axis; `step` once per cycle while it runs, `verdict` when it is over."""
 
-    def __init__(self, bounds: ProofBounds) -> None:
+    def __init__(self, bounds: WiringTestBounds) -> None:
         """Nothing is proven yet."""
         self._bounds = bounds
         self.proven = False
         self.running = False
-        self.verdict: Verdict | None = None
-        self._stages: dict[_Stage, Callable[[float], Verdict | None]] = {
+        self.verdict: CheckResult | None = None
+        self._stages: dict[_Stage, Callable[[float], CheckResult | None]] = {
             _Stage.REST: self._rest,
             _Stage.PUSH: self._ramp,
             _Stage.SETTLE: self._settle,
@@ -66,7 +74,7 @@ class WiringProof:
         self.running, self.verdict = True, None
         self._time_s = self._stage_s = self._hold_s = 0.0
         self._stage = _Stage.REST
-        self._sway = Sway(encoder_rad, 0.0)
+        self._sway = RestWindow(encoder_rad, 0.0)
         self._start_rad = self._encoder_rad = encoder_rad
         self._amplifier_rad = amplifier_rad
         self._noise_rad = self._travel_rad = self._fastest_rad_s = 0.0
@@ -90,7 +98,7 @@ class WiringProof:
         self._time_s += dt_s
         self._stage_s += dt_s
         if self._time_s > self._bounds.timeout_s:
-            return self._end(Verdict(Finding.TIMEOUT, self._time_s, 0.0, self._bounds.timeout_s))
+            return self._end(CheckResult(WiringOutcome.TIMEOUT, self._time_s, 0.0, self._bounds.timeout_s))
         if amplifier.age_cycles or encoder.age_cycles:
             return self._without_feedback(dt_s)
         self._stale_cycles = 0
@@ -100,12 +108,12 @@ class WiringProof:
 
     def interrupt(self) -> None:
         """Ended from outside, by a fault or a command; what was seen so far may still tell why."""
-        self._end(self._so_far() or Verdict(Finding.INTERRUPTED))
+        self._end(self._so_far() or CheckResult(WiringOutcome.INTERRUPTED))
 
-    def report(self) -> Proof:
+    def report(self) -> WiringReport:
         """The figures of the last test."""
-        verdict = self.verdict or Verdict(Finding.INTERRUPTED)
-        return Proof(
+        verdict = self.verdict or CheckResult(WiringOutcome.INTERRUPTED)
+        return WiringReport(
             *verdict,
             self._break_away_nm(1.0), self._break_away_nm(-1.0), self._ratio, self._line.slope, self._travel_rad,
             self._encoder_rad - self._start_rad, self._fastest_rad_s, self._noise_rad, self._time_s,
@@ -123,13 +131,13 @@ class WiringProof:
         elif not self._pushes:
             self._shown_nm += amplifier.torque_nm
 
-    def _breach(self) -> Verdict | None:
+    def _breach(self) -> CheckResult | None:
         """Further or faster than allowed; what was seen so far may say why."""
         bounds, verdict = self._bounds, None
         if self._travel_rad > bounds.most_travel_rad:
-            verdict = Verdict(Finding.TRAVEL, self._travel_rad, 0.0, bounds.most_travel_rad)
+            verdict = CheckResult(WiringOutcome.TRAVEL, self._travel_rad, 0.0, bounds.most_travel_rad)
         elif self._fastest_rad_s > bounds.most_rad_s + bounds.encoder_count_rad / (SPEED_CYCLES * bounds.period_s):
-            verdict = Verdict(Finding.SPEED, self._fastest_rad_s, 0.0, bounds.most_rad_s)
+            verdict = CheckResult(WiringOutcome.SPEED, self._fastest_rad_s, 0.0, bounds.most_rad_s)
         return verdict and (self._so_far() or verdict)
 
     def _without_feedback(self, dt_s: float) -> float:
@@ -153,9 +161,9 @@ class WiringProof:
     def _direction(self) -> float:
         return self._pushes[-1].sign if self._stage == _Stage.PUSH else -self._brake_direction
 
-    def _end(self, verdict: Verdict) -> float:
+    def _end(self, verdict: CheckResult) -> float:
         self.verdict, self.running = verdict, False
-        self.proven = verdict.finding == Finding.PASSED
+        self.proven = verdict.finding == WiringOutcome.PASSED
         self._torque_nm = self._wanted_nm = 0.0
         return 0.0
 
@@ -165,7 +173,7 @@ class WiringProof:
         self._quiet_cycles = 0
 
     # --- the stages ------------------------------------------------------------------------------------------------
-    def _rest(self, _dt_s: float) -> Verdict | None:
+    def _rest(self, _dt_s: float) -> CheckResult | None:
         """No torque yet: plausible sizes, and a joint that stands."""
         if verdict := judge.rated_torque(self._bounds):
             return verdict
@@ -182,16 +190,20 @@ class WiringProof:
         self._push(1.0 if self._encoder_rad <= self._bounds.middle_rad else -1.0)
         return None
 
-    def _moves_alone(self, allowed_rad: float) -> Verdict | None:
+    def _moves_alone(self, allowed_rad: float) -> CheckResult | None:
         moved_rad = self._encoder_rad - self._start_rad
-        return Verdict(Finding.NOT_AT_REST, moved_rad, 0.0, allowed_rad) if abs(moved_rad) > allowed_rad else None
+        return (
+            CheckResult(WiringOutcome.NOT_AT_REST, moved_rad, 0.0, allowed_rad)
+            if abs(moved_rad) > allowed_rad
+            else None
+        )
 
     def _push(self, sign: float) -> None:
         self._enter(_Stage.PUSH)
         self._torque_nm = self._bounds.first_nm
         self._pushes.append(Push(sign, self._sway.mean_rad(), self._amplifier_rad))
 
-    def _ramp(self, dt_s: float) -> Verdict | None:
+    def _ramp(self, dt_s: float) -> CheckResult | None:
         """More torque, until the joint has moved or the most was held for its time."""
         bounds, push = self._bounds, self._pushes[-1]
         encoder, amplifier = push.ways(self._encoder_rad, self._amplifier_rad)
@@ -218,7 +230,7 @@ class WiringProof:
     def _travel_needed(self) -> float:
         return max(self._bounds.travel_rad, _TRAVEL_NOISES * self._noise_rad)
 
-    def _cut(self, push: Push) -> Verdict | None:
+    def _cut(self, push: Push) -> CheckResult | None:
         """The joint has moved: end the torque, and judge at once what may not go on."""
         push.cut_nm, push.cut_s = self._torque_nm, self._time_s
         if not push.began:
@@ -233,7 +245,7 @@ class WiringProof:
         self._brake_first_nm = 2.0 * _BRAKE_SHARE * push.cut_nm
         return verdict
 
-    def _blocked(self) -> Verdict | None:
+    def _blocked(self) -> CheckResult | None:
         """No motion under the most torque; one direction alone may be a stop, so the other is tried first."""
         if len(self._pushes) == 1:
             self._enter(_Stage.SETTLE)
@@ -242,11 +254,11 @@ class WiringProof:
         if verdict := judge.actual_torque(self._line, bounds):
             return verdict
         if not first.moved:
-            return Verdict(Finding.NO_MOTION, bounds.most_nm)
+            return CheckResult(WiringOutcome.NO_MOTION, bounds.most_nm)
         at_least_nm = 0.5 * (first.began_nm + bounds.most_nm)  # friction: the other break-away lies beyond the most
-        return judge.friction(at_least_nm, bounds) or Verdict(Finding.ONE_WAY, bounds.most_nm)
+        return judge.friction(at_least_nm, bounds) or CheckResult(WiringOutcome.ONE_WAY, bounds.most_nm)
 
-    def _settle(self, dt_s: float) -> Verdict | None:
+    def _settle(self, dt_s: float) -> CheckResult | None:
         """Brake what moves, release what stands, and go on when it has stood for its time."""
         moves = self._moves()
         if moves and self._signs_known:
@@ -255,7 +267,7 @@ class WiringProof:
             self._torque_nm = 0.0
         stands, late = self._stands(), self._stage_s > _SETTLE_S
         if late and moves:
-            return Verdict(Finding.NOT_AT_REST, self._encoder_rad - self._start_rad)
+            return CheckResult(WiringOutcome.NOT_AT_REST, self._encoder_rad - self._start_rad)
         return self._go_on() if stands or late else None
 
     def _stands(self) -> bool:
@@ -273,7 +285,7 @@ class WiringProof:
             torque_nm = max(self._brake_first_nm, self._torque_nm * math.exp(dt_s / _BRAKE_GROWTH_S))
             self._torque_nm = min(self._bounds.most_nm, torque_nm)
 
-    def _go_on(self) -> Verdict | None:
+    def _go_on(self) -> CheckResult | None:
         """The next push, or the verdict over all of them."""
         last = self._pushes[-1]
         if self._repeat:
@@ -291,18 +303,18 @@ class WiringProof:
         return self._judge()
 
     # --- verdicts --------------------------------------------------------------------------------------------------
-    def _judge(self) -> Verdict:
+    def _judge(self) -> CheckResult:
         """Over both directions."""
         if not self._pushes[0].moved:
-            return Verdict(Finding.ONE_WAY, self._bounds.most_nm)
+            return CheckResult(WiringOutcome.ONE_WAY, self._bounds.most_nm)
         friction_nm = 0.5 * (self._break_away_nm(1.0) - self._break_away_nm(-1.0))
         return (
             judge.actual_torque(self._line, self._bounds)
             or judge.friction(friction_nm, self._bounds)
-            or Verdict(Finding.PASSED)
+            or CheckResult(WiringOutcome.PASSED)
         )
 
-    def _sensors(self) -> Verdict | None:
+    def _sensors(self) -> CheckResult | None:
         """Both sensors' ways of the present push."""
         push = self._pushes[-1]
         whole = push.ways(self._encoder_rad, self._amplifier_rad)
@@ -311,7 +323,7 @@ class WiringProof:
             self._ratio = whole[1] / whole[0]
         return judge.sensors(whole, late, self._bounds, _STILL_NOISES * self._noise_rad)
 
-    def _so_far(self) -> Verdict | None:
+    def _so_far(self) -> CheckResult | None:
         """What the sensors' ways of an unfinished push say, where there are any."""
         if self._stage != _Stage.PUSH:
             return None

@@ -8,8 +8,7 @@ import pytest
 from servod.common.errors import BadInput
 from servod.common.shipped import shipped
 from servod.formats.model.axis_model import load_axis_model
-from servod.qualify.demo.recovery.concealed import CONCEALED, believed_and_true
-from servod.qualify.demo.recovery.walk import motions
+from servod.qualify.demo.recovery.walk import CONCEALED, believed_and_true, motions
 
 TABLE1, DEMO = shipped("gains/axes/table1_joint.yaml"), shipped("gains/axes/demo_joint.yaml")
 

@@ -9,9 +9,7 @@ import pytest
 from servod.client.open import stepped_axis
 from servod.common.shipped import shipped
 from servod.formats.model.axis_model import load_axis_model
-from servod.qualify.demo.recovery.concealed import believed_and_true
-from servod.qualify.demo.recovery.page import write_recovery_page
-from servod.qualify.demo.recovery.walk import SCALES, Effort, recover
+from servod.qualify.demo.recovery.walk import SCALES, Effort, believed_and_true, recover, write_recovery_page
 
 EFFORT = Effort(paper_s=8.0, diagnosed_s=5.0, motion_s=6.0, plants=20)
 

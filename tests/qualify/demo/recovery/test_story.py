@@ -12,8 +12,7 @@ from servod.formats.gains.gain_set import Certificate, GainSet, Promise
 from servod.lab.deploy.outcome import Deployment, Ending
 from servod.lab.recordings.recording import ROW, Rows
 from servod.lab.verify.validation import Figures, Part
-from servod.qualify.demo.recovery.page import story
-from servod.qualify.demo.recovery.walk import Designed, Recovery
+from servod.qualify.demo.recovery.walk import Designed, Retrofit, story
 
 PROMISED = Promise.model_construct(slow_rad=1e-4, brisk_rad=1e-4, hold_rad=1e-4)
 
@@ -32,13 +31,13 @@ def designed(scale: float) -> Designed:
     return Designed(GainSet.model_construct(design=design, certificate=certificate), scale)
 
 
-def recovery(slow_rad: float) -> Recovery:
+def recovery(slow_rad: float) -> Retrofit:
     """A story whose first set left `slow_rad` on the slow sine of the validation motion."""
     before = Figures({Part.SLOW: (slow_rad,), Part.BRISK: (5e-5,), Part.HOLD: (5e-5,)})
     done = Deployment(Ending.KEPT, (), "second", 1, PROMISED, before, None, None, None)
     rows = (tracked(1e-5), tracked(2e-5), tracked(1e-5))
     nothing: Any = None  # no figure of the diagnosis is told here
-    return Recovery("gravity", *rows, nothing, {"findings": []}, designed(1.0), designed(0.25), done)
+    return Retrofit("gravity", *rows, nothing, {"findings": []}, designed(1.0), designed(0.25), done)
 
 
 @pytest.mark.parametrize(("slow_rad", "said"), [(5e-4, "worse than the certificate promised"), (5e-5, "all the same")])

@@ -18,7 +18,7 @@ from servod.common.clock import WallClock
 from servod.common.errors import Unreachable
 from servod.common.faults import FaultCode
 from servod.drivers.virtual.bus_faults import BusFault, FaultKind
-from servod.drivers.virtual.server import HubServer, Timing
+from servod.drivers.virtual.main import HubServer, Timing
 from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.drivers.virtual.world import World
 from servod.formats.config import AxisConfig

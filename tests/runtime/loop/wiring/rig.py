@@ -15,7 +15,7 @@ from servod.formats.model.axis_model import AxisModel
 from servod.kernels.laws import LAWS
 from servod.runtime.loop.axis import AxisState
 from servod.runtime.loop.commands import Op, Refusal
-from servod.runtime.loop.wiring.findings import Finding, Proof
+from servod.runtime.loop.wiring.findings import WiringOutcome, WiringReport
 
 
 def joint(**changes: Any) -> AxisModel:
@@ -37,13 +37,13 @@ class Outcome(NamedTuple):
     """How enabling ended, and what the joint really did meanwhile."""
 
     session: SteppedSession
-    proof: Proof
+    proof: WiringReport
     furthest_rad: float
     fastest_rad_s: float
 
     @property
-    def finding(self) -> Finding:
-        return Finding(self.proof.finding)
+    def finding(self) -> WiringOutcome:
+        return WiringOutcome(self.proof.finding)
 
     @property
     def enabled(self) -> bool:

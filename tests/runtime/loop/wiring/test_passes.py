@@ -14,7 +14,7 @@ from servod.formats.model.axis_model import AxisModel, axis_model_yaml, load_axi
 from servod.formats.wiring import warnings, with_expected
 from servod.runtime.loop.axis import AxisState
 from servod.runtime.loop.commands import Op, ReferenceKind, Refusal
-from servod.runtime.loop.wiring.findings import Finding, sentence
+from servod.runtime.loop.wiring.findings import WiringOutcome, wiring_sentence
 from tests.runtime.loop.wiring.rig import axis, enable, joint, proven
 
 SHIPPED = ("demo_joint", "table1_joint")
@@ -24,7 +24,7 @@ MOST_S, MOST_LEFT_RAD = 0.6, 5e-4
 @pytest.mark.parametrize("name", SHIPPED)
 def test_the_shipped_joints_are_proven_quickly_and_left_where_they_were(name):
     outcome = proven(load_axis_model(shipped(f"gains/axes/{name}.yaml")))
-    assert outcome.enabled, sentence(outcome.proof)
+    assert outcome.enabled, wiring_sentence(outcome.proof)
     assert outcome.proof.duration_s < MOST_S
     assert outcome.furthest_rad < 0.005
     assert abs(outcome.session.world.truth().position_rad) < MOST_LEFT_RAD
@@ -48,7 +48,7 @@ def test_the_shipped_joints_are_proven_quickly_and_left_where_they_were(name):
 )
 def test_slack_springs_and_other_laws_of_friction_are_no_wrong_wiring(changes):
     outcome = proven(joint(**changes))
-    assert outcome.enabled, sentence(outcome.proof)
+    assert outcome.enabled, wiring_sentence(outcome.proof)
 
 
 @st.composite
@@ -83,7 +83,7 @@ MANY = settings(max_examples=6, suppress_health_check=[HealthCheck.too_slow], de
 @given(plants(), st.integers(13, 20))
 def test_every_plausible_axis_is_enabled_within_the_bounds(plant, bits):
     outcome = proven(plant, encoder_counts_per_turn=2**bits)
-    assert outcome.enabled, sentence(outcome.proof)
+    assert outcome.enabled, wiring_sentence(outcome.proof)
     count_rad = 2.0 * math.pi / 2**bits
     assert outcome.furthest_rad < max(0.05, 100.0 * count_rad) + count_rad
     assert outcome.fastest_rad_s < 9.0
@@ -91,11 +91,11 @@ def test_every_plausible_axis_is_enabled_within_the_bounds(plant, bits):
 
 
 WRONG = [
-    ({}, {"polarity": 0x20}, {Finding.TORQUE_POLARITY}),
-    ({}, {"encoder_direction": -1}, {Finding.ENCODER_DIRECTION}),
-    ({"amplifier": {"position_direction": -1}}, {}, {Finding.AMPLIFIER_DIRECTION}),
-    ({}, {"gear_ratio": 10.0}, {Finding.POSITION_SCALE}),
-    ({"amplifier": {"counts_per_turn": 2**17}}, {}, {Finding.POSITION_SCALE}),
+    ({}, {"polarity": 0x20}, {WiringOutcome.TORQUE_POLARITY}),
+    ({}, {"encoder_direction": -1}, {WiringOutcome.ENCODER_DIRECTION}),
+    ({"amplifier": {"position_direction": -1}}, {}, {WiringOutcome.AMPLIFIER_DIRECTION}),
+    ({}, {"gear_ratio": 10.0}, {WiringOutcome.POSITION_SCALE}),
+    ({"amplifier": {"counts_per_turn": 2**17}}, {}, {WiringOutcome.POSITION_SCALE}),
 ]
 
 
@@ -104,7 +104,7 @@ WRONG = [
 def test_every_plausible_axis_that_is_wired_wrongly_is_refused_by_name(plant, bits, wrong):
     config, devices, findings = wrong
     outcome = proven(plant, config, encoder_counts_per_turn=2**bits, **devices)
-    assert outcome.finding in findings, sentence(outcome.proof)
+    assert outcome.finding in findings, wiring_sentence(outcome.proof)
     assert outcome.session.cycle.axis.state == AxisState.FAULT
     assert outcome.session.world.truth().torque_nm == 0.0
 
@@ -148,7 +148,7 @@ def test_nothing_else_moves_the_axis_meanwhile_and_disable_ends_the_test():
     session.send(Op.DISABLE)
     session.run(0.01)
     assert session.cycle.axis.state == AxisState.DISABLED
-    assert session.proof is not None and session.proof.finding == Finding.INTERRUPTED
+    assert session.proof is not None and session.proof.finding == WiringOutcome.INTERRUPTED
     assert session.world.truth().torque_nm == 0.0
     session.run(0.1)
     assert enable(session).enabled
