@@ -112,7 +112,7 @@ def _run(
             from servod.qualify.demo.runs import run_fast
 
             return run_fast(plant, seconds, rows, tell), []
-        from servod.qualify.demo.wall import run_wall
+        from servod.qualify.demo.wall_clock import run_wall
 
         return run_wall(plant, seconds, rows, recordings, tell)
 

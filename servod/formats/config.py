@@ -292,7 +292,8 @@ class LimitsConfig(Strict):
 
 
 class WiringProofConfig(Strict):
-    """The bounded test of polarity, scale and directions before the first torque (servod.runtime.loop.wiring.test)."""
+    """The bounded test of polarity, scale and directions before the first torque
+    (servod.runtime.loop.wiring.wiring_test)."""
 
     enabled: bool = Field(True, description="prove at the first enable after a start, and after what makes it doubtful")
     torque_nm: float | None = Field(

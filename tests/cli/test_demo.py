@@ -18,7 +18,7 @@ from servod.cli.demo import print_document
 from servod.common.faults import FAULTS, FaultCode
 from servod.common.shipped import shipped
 from servod.qualify.demo.entries import entries
-from servod.qualify.demo.wall import why
+from servod.qualify.demo.wall_clock import why
 
 #: Both lines of the paper's story: feedback alone sticks, a friction model removes most of the error.
 STUCK_MRAD, COMPENSATED_MRAD = 10.0, 2.0

@@ -80,6 +80,17 @@ def test_modules_say_where_they_stand() -> None:
     assert [place(f) for f in source.files("servod", "drivers") if not ast.get_docstring(source.tree(f))] == []
 
 
+def test_packages_list_files_that_are_there() -> None:
+    listed = [
+        (place(f), name)
+        for f in source.files("servod", "drivers")
+        if f.name == "__init__.py"
+        for name in re.findall(r"^(\w+\.py|\w+/)\s", ast.get_docstring(source.tree(f)) or "", re.MULTILINE)
+        if not (f.parent / name).exists()
+    ]
+    assert listed == []
+
+
 def test_public_functions_are_typed() -> None:
     """mypy proves the types; this proves that there are some to prove."""
     untyped = [place(f, n.lineno) for f in source.files("servod", "drivers") for n in functions(f) if n.returns is None]

@@ -1,11 +1,8 @@
 """Fair tuning of all laws: one optimiser, one budget, one set of plants, one limit on roughness, two classes.
 
 plan.py       class, budget and limits of a tuning, and its result
-laws.py       what is tuned of each law, and the axis it is for
-symmetric.py  the one friction curve that the LuGre observer can hold
-trial.py      what a gain set costs on the plants of a tuning
-search.py     the bounded optimiser
-tuning.py     one law in one class
+laws.py       what is tuned of each law, the axis it is for, and the one friction curve that LuGre's observer can hold
+tuning.py     one law in one class: what a set costs on the plants of a tuning, and the bounded optimiser
 rivals.py     all of them, over worker processes
 """
 

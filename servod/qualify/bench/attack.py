@@ -21,7 +21,7 @@ from servod.common.errors import AnswerIsNo
 from servod.drivers.virtual.drive_record import read_drive_record
 from servod.formats.recording.mcap_reader import read_recording
 from servod.qualify.bench.attackers import AT_WORK, AttackTally, failed
-from servod.qualify.bench.wall import resident_kib
+from servod.qualify.bench.wall_clock import resident_kib
 from servod.qualify.demo.axis import demo_config, plant_file
 from servod.runtime.fieldbus.devices import DriveState
 

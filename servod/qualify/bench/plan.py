@@ -16,7 +16,8 @@ from typing import Any, NamedTuple
 
 from servod.common.files import unwritable
 from servod.common.shipped import shipped
-from servod.qualify.bench import speed, tick, wakeup, wall
+from servod.qualify.bench import speed, tick, wakeup
+from servod.qualify.bench import wall_clock as wall
 
 # How long the laboratory takes: synthesis of both regions, a certificate, and a whole commissioning.
 #

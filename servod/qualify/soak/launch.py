@@ -23,7 +23,7 @@ from servod.qualify.soak.memory import Growth, Memory
 from servod.qualify.soak.plan import Episode, schedule
 from servod.qualify.soak.stepped import GAIN_SETS, SteppedSoak
 from servod.qualify.soak.tally import SoakedAxis, Wrong
-from servod.qualify.soak.wall import WallSoak, of_the_wall
+from servod.qualify.soak.wall_clock import WallSoak, of_the_wall
 
 # Runs a soak: episode after episode until the amount, the time or the person says enough; the state goes to disk.
 #

@@ -19,7 +19,7 @@ from servod.formats.recording.mcap_reader import read_recording
 from servod.formats.recording.mcap_writer import split_rows
 from servod.formats.recording.record import FIELDS
 from servod.lab.recordings.recording import ROW
-from servod.qualify.soak.starved import ExcusedFaults
+from servod.qualify.soak.starvation import ExcusedFaults
 from servod.qualify.soak.tally import Findings, Wrong
 from servod.runtime.daemon.recorder import Recorder
 from servod.runtime.fieldbus.devices import DriveState

@@ -29,7 +29,7 @@ class AxisState(IntEnum):
     RAMPING = 4  # torque going to zero
     QUICK_STOPPING = 5  # the drive stops the axis
     FAULT = 6
-    PROVING = 7  # before the first torque: the bounded test of the wiring (servod.runtime.loop.wiring.test)
+    PROVING = 7  # before the first torque: the bounded test of the wiring (servod.runtime.loop.wiring.wiring_test)
 
     @property
     def stopped(self) -> bool:

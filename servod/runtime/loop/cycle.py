@@ -28,7 +28,7 @@ from servod.runtime.loop.plan import LoopPlan
 from servod.runtime.loop.references import Reference
 from servod.runtime.loop.wiring.checks import wiring_test_bounds
 from servod.runtime.loop.wiring.findings import WiringReport
-from servod.runtime.loop.wiring.test import WiringTest
+from servod.runtime.loop.wiring.wiring_test import WiringTest
 
 _SUPERVISOR_LOST = FAULTS[FaultCode.SUPERVISOR_LOST].bit
 _NOT_PROVEN = FAULTS[FaultCode.WIRING_NOT_PROVEN].bit

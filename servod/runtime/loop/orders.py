@@ -11,7 +11,7 @@ from servod.runtime.loop.commands import Command, Op, Refusal
 from servod.runtime.loop.controller import Controller
 from servod.runtime.loop.limits import Limits
 from servod.runtime.loop.references import Reference, make_motion
-from servod.runtime.loop.wiring.test import WiringTest
+from servod.runtime.loop.wiring.wiring_test import WiringTest
 
 #: Faults that make what was proven doubtful: a sensor or a scale may not be what it was.
 _DOUBTFUL = sum(

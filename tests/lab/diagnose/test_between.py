@@ -9,7 +9,7 @@ from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.base import base_unknowns, document_of
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
-from servod.lab.diagnose.effects.scene import SearchContext
+from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.judge.covariance import common_factor, jackknife, model_error
 from servod.lab.diagnose.predict.innovation_kernel import mean_command
 from servod.lab.diagnose.predict.predict import Predictor

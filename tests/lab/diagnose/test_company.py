@@ -10,7 +10,7 @@ import pytest
 
 from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.effects import effect
-from servod.lab.diagnose.effects.scene import SearchContext
+from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.judge.verdict import confidence
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.candidates import Candidate

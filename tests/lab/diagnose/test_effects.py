@@ -20,7 +20,7 @@ from servod.lab.diagnose.effects.base import base_unknowns, document_of
 from servod.lab.diagnose.effects.effect import Effect, simple
 from servod.lab.diagnose.effects.hypothesis import Hypothesis, Unknown
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import SearchContext
+from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.explain import explain_effect, list_effects
 from servod.lab.diagnose.judge.covariance import common_factor
 from servod.lab.diagnose.judge.verdict import alternatives

@@ -12,7 +12,7 @@ from servod.formats.model.axis_model import AxisModel
 from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.hypothesis import Term
-from servod.lab.diagnose.effects.scene import SearchContext
+from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.judge.conclude import differs_from_zero, minor, name_findings
 from servod.lab.diagnose.judge.judgement import JudgedSelection, judge
 from servod.lab.diagnose.predict.predict import Predictor

@@ -11,7 +11,7 @@ import pytest
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.disturbance import EVERY
 from servod.lab.diagnose.effects.hypothesis import Term
-from servod.lab.diagnose.effects.scene import SearchContext
+from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.judge.free_run import free_run_gain, window_errors
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.cross_validation import RECORDING, STRETCH, make_folds, predict_held_out, single_events

@@ -13,7 +13,7 @@ from servod.lab.diagnose.data.trace import CheckedTrace
 from servod.lab.diagnose.effects import effect, names, unexcited_effects
 from servod.lab.diagnose.effects.base import document_of
 from servod.lab.diagnose.effects.cogging import whole_orders
-from servod.lab.diagnose.effects.scene import SearchContext
+from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.selector import Selector
 from servod.lab.recordings import load_recording

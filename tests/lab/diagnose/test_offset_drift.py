@@ -12,7 +12,7 @@ from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.document import diagnosis_document
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.base import document_of
-from servod.lab.diagnose.effects.scene import SearchContext
+from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.engine import diagnose
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.refine import add_drift

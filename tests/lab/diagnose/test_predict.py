@@ -13,7 +13,7 @@ from servod.formats.model.effects import Gravity
 from servod.kernels.laws import LAWS
 from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.effects import effect
-from servod.lab.diagnose.effects.scene import SearchContext
+from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.selection import Selection
 from servod.lab.diagnose.select.selector import Selector

@@ -14,7 +14,7 @@ from servod.lab.diagnose.effects.disturbance import SHORTEST_S, windows
 from servod.lab.diagnose.effects.disturbance import terms as windows_of
 from servod.lab.diagnose.effects.effect import sine_term
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
-from servod.lab.diagnose.effects.scene import Peak, SearchContext
+from servod.lab.diagnose.effects.search_context import Peak, SearchContext
 from servod.lab.diagnose.judge.verdict import Shares, alternatives, verdict
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.result import DiagnosisVerdict

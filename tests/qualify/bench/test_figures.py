@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 
 from servod.common.errors import BadInput
-from servod.qualify.bench import tick, wakeup, wall
+from servod.qualify.bench import tick, wakeup
+from servod.qualify.bench import wall_clock as wall
 from servod.qualify.bench.plan import GOALS, figure, print_table, write_json
 
 

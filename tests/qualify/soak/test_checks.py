@@ -23,7 +23,7 @@ from servod.qualify.soak.drive import SAMPLE_ROW, DriveCheck, check_reaction, re
 from servod.qualify.soak.kinds import KINDS, fault_bits
 from servod.qualify.soak.memory import Growth, Memory
 from servod.qualify.soak.rows import RowCheck, Rows, rows_of, run_lengths
-from servod.qualify.soak.starved import STARVED_CYCLE, STARVED_SUPERVISOR, ExcusedFaults, Starvation
+from servod.qualify.soak.starvation import STARVED_CYCLE, STARVED_SUPERVISOR, ExcusedFaults, Starvation
 from servod.qualify.soak.syncs import SyncCheck, SyncListener
 from servod.qualify.soak.tally import FaultTally, Findings, Wrong
 from servod.runtime.fieldbus.devices import DriveState
@@ -229,8 +229,8 @@ def test_a_process_that_got_no_turn_was_starved() -> None:
 
 def test_short_waits_of_many_processes_starve_none(monkeypatch: pytest.MonkeyPatch) -> None:
     waited_ms = {1: 0, 2: 0, 3: 0}
-    monkeypatch.setattr("servod.qualify.soak.starved.waited_ns", lambda pid: waited_ms[pid] * 1_000_000)
-    monkeypatch.setattr("servod.qualify.soak.starved.stolen_ns", lambda: 0)
+    monkeypatch.setattr("servod.qualify.soak.starvation.waited_ns", lambda pid: waited_ms[pid] * 1_000_000)
+    monkeypatch.setattr("servod.qualify.soak.starvation.stolen_ns", lambda: 0)
     starved, watched = Starvation(0), {1: STARVED_CYCLE, 2: STARVED_CYCLE, 3: STARVED_SUPERVISOR}
     waited_ms.update({1: 20, 2: 20, 3: 20})
     assert starved.waited_ms(watched) == 60.0 and not starved.hungry(watched)

@@ -9,7 +9,7 @@ import pytest
 from servod.formats.protocol import Verb
 from servod.qualify.faults.scenario import Recovery
 from servod.qualify.soak.tally import Findings, Tally, Wrong
-from servod.qualify.soak.wall import WallSoak
+from servod.qualify.soak.wall_clock import WallSoak
 
 
 class StoppedAxis:

@@ -12,7 +12,7 @@ from servod.qualify.soak.kinds import KINDS
 from servod.qualify.soak.launch import DOCUMENT_NAME, run
 from servod.qualify.soak.plan import Episode, Move, SoakEnding
 from servod.qualify.soak.tally import Wrong
-from servod.qualify.soak.wall import WallSoak, of_the_wall
+from servod.qualify.soak.wall_clock import WallSoak, of_the_wall
 from servod.runtime.loop.commands import ReferenceKind
 
 pytestmark = [pytest.mark.serial, pytest.mark.long]

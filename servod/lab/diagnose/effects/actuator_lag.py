@@ -10,7 +10,7 @@ from servod.formats.model.effects import ActuatorLag
 from servod.lab.diagnose.effects.effect import Effect, known_delay, simple
 from servod.lab.diagnose.effects.hypothesis import Term, Unknown
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import SearchContext
+from servod.lab.diagnose.effects.search_context import SearchContext
 
 #: Time constants to start from, s.
 STARTS_S = (0.002, 0.006, 0.02)

@@ -8,7 +8,7 @@ from servod.formats.model.friction import Asymmetry
 from servod.lab.diagnose.effects.effect import Effect, positive, share
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Teller, Term, Writer
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import SearchContext
+from servod.lab.diagnose.effects.search_context import SearchContext
 
 
 def _write(document: Document, values: Sequence[float]) -> None:

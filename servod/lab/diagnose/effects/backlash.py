@@ -6,7 +6,7 @@ from servod.formats.model.effects import Backlash
 from servod.lab.diagnose.effects.effect import Effect
 from servod.lab.diagnose.effects.hypothesis import Term
 from servod.lab.diagnose.effects.looks import Look, Split
-from servod.lab.diagnose.effects.scene import SearchContext
+from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.effects.two_mass import two_mass_term
 
 #: Gaps to start from, as shares of the range, shares of the load, and resonances of the contact as multiples of the

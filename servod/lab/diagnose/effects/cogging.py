@@ -12,7 +12,7 @@ from servod.formats.model.effects import Cogging
 from servod.lab.diagnose.effects.effect import Effect, harmonic, report_sines, sine_term
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Term, Unknown
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import SearchContext
+from servod.lab.diagnose.effects.search_context import SearchContext
 
 Array = NDArray[np.float64]
 

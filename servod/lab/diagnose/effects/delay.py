@@ -9,7 +9,7 @@ from servod.lab.diagnose.effects.base import DELAY_S
 from servod.lab.diagnose.effects.effect import Effect, known_delay, simple
 from servod.lab.diagnose.effects.hypothesis import Document, Term, Unknown, get
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import SearchContext
+from servod.lab.diagnose.effects.search_context import SearchContext
 
 #: Delays to start from, s.
 STARTS_S = (0.003, 0.008, 0.02)

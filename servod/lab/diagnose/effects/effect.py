@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from servod.formats.model.keys import Group
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Teller, Term, Unknown, Writer, get
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import Peak, SearchContext
+from servod.lab.diagnose.effects.search_context import Peak, SearchContext
 
 #: By how much the model's own delay may be off beside a lag or a longer delay, s.
 OWN_DELAY_S = 0.0002

@@ -9,7 +9,7 @@ from servod.formats.model.effects import EncoderEccentricity
 from servod.lab.diagnose.effects.effect import Effect, sine_term
 from servod.lab.diagnose.effects.hypothesis import Term
 from servod.lab.diagnose.effects.looks import Look, Split
-from servod.lab.diagnose.effects.scene import Columns, Peak, SearchContext
+from servod.lab.diagnose.effects.search_context import Columns, Peak, SearchContext
 
 Array = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from servod.formats.model.effects import Gravity
 from servod.lab.diagnose.effects.effect import Effect, share
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Term, get
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import SearchContext
+from servod.lab.diagnose.effects.search_context import SearchContext
 
 
 def _add(document: Document, values: Sequence[float]) -> tuple[float, float]:

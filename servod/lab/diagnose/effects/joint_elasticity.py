@@ -6,7 +6,7 @@ from servod.formats.model.effects import JointElasticity
 from servod.lab.diagnose.effects.effect import Effect
 from servod.lab.diagnose.effects.hypothesis import Term
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import SearchContext
+from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.effects.two_mass import two_mass_term
 
 #: Resonances to start from, as multiples of the observer's bandwidth, and shares of the load.

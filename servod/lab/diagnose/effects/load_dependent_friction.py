@@ -6,7 +6,7 @@ from servod.formats.model.friction import LoadDependentFriction
 from servod.lab.diagnose.effects.effect import Effect, share, simple
 from servod.lab.diagnose.effects.hypothesis import Term, get
 from servod.lab.diagnose.effects.looks import Look, Split
-from servod.lab.diagnose.effects.scene import SearchContext
+from servod.lab.diagnose.effects.search_context import SearchContext
 
 
 def terms(scene: SearchContext) -> list[Term]:

@@ -10,7 +10,7 @@ from servod.formats.model.friction import PositionDependentFriction
 from servod.lab.diagnose.effects.effect import Effect, harmonic, report_as_is, sine_term
 from servod.lab.diagnose.effects.hypothesis import Document, Term, Unknown
 from servod.lab.diagnose.effects.looks import Look, Split
-from servod.lab.diagnose.effects.scene import Peak, SearchContext
+from servod.lab.diagnose.effects.search_context import Peak, SearchContext
 
 #: Half waves along the way that make a profile.
 PROFILE = 4

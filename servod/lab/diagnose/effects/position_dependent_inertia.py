@@ -8,7 +8,7 @@ from servod.formats.model.effects import PositionDependentInertia
 from servod.lab.diagnose.effects.effect import Effect, sine_term
 from servod.lab.diagnose.effects.hypothesis import Term
 from servod.lab.diagnose.effects.looks import Look, Split
-from servod.lab.diagnose.effects.scene import Peak, SearchContext
+from servod.lab.diagnose.effects.search_context import Peak, SearchContext
 
 
 def terms(scene: SearchContext) -> list[Term]:

@@ -9,7 +9,7 @@ from servod.lab.diagnose.effects.base import BRISTLE_FACTOR, factor
 from servod.lab.diagnose.effects.effect import Effect, keys, positive, simple
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Teller, Term, Unknown, get
 from servod.lab.diagnose.effects.looks import Look, Split
-from servod.lab.diagnose.effects.scene import SearchContext
+from servod.lab.diagnose.effects.search_context import SearchContext
 
 #: Factors on the model's own stiffness and damping to start from, and by which they may be off.
 STARTS, MOST = ((0.25, 0.5), (4.0, 2.0), (1.0, 5.0), (1.0, 0.2)), 300.0

@@ -8,7 +8,7 @@ from servod.formats.model.effects import Spring
 from servod.lab.diagnose.effects.effect import Effect, share
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Term
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import SearchContext
+from servod.lab.diagnose.effects.search_context import SearchContext
 
 
 def terms(scene: SearchContext) -> list[Term]:

@@ -9,7 +9,7 @@ from servod.lab.diagnose.effects.base import STRIBECK_SHARE
 from servod.lab.diagnose.effects.effect import Effect
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Teller, Term, Unknown, get, put
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import SearchContext
+from servod.lab.diagnose.effects.search_context import SearchContext
 
 #: Static friction to start from, as a multiple of Coulomb friction.
 START = 1.4

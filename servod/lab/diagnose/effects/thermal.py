@@ -8,7 +8,7 @@ from servod.formats.model.friction import Thermal
 from servod.lab.diagnose.effects.effect import Effect, report_as_is, share, simple
 from servod.lab.diagnose.effects.hypothesis import Document, Term, Unknown
 from servod.lab.diagnose.effects.looks import Look, Split
-from servod.lab.diagnose.effects.scene import SearchContext
+from servod.lab.diagnose.effects.search_context import SearchContext
 
 
 def terms(scene: SearchContext) -> list[Term]:

@@ -7,7 +7,7 @@ from servod.lab.diagnose.effects.base import RECALIBRATION
 from servod.lab.diagnose.effects.effect import Effect, positive, simple
 from servod.lab.diagnose.effects.hypothesis import Document, Term, get
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import SearchContext
+from servod.lab.diagnose.effects.search_context import SearchContext
 
 
 def terms(scene: SearchContext) -> list[Term]:

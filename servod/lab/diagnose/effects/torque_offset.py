@@ -8,7 +8,7 @@ from servod.lab.diagnose.effects.base import OFFSET_SHARE
 from servod.lab.diagnose.effects.effect import Effect
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Term, get
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import SearchContext
+from servod.lab.diagnose.effects.search_context import SearchContext
 
 
 def _write(_document: Document, _values: Sequence[float]) -> None:

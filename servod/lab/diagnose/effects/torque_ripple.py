@@ -6,7 +6,7 @@ from servod.formats.model.effects import TorqueRipple
 from servod.lab.diagnose.effects.effect import Effect, sine_term
 from servod.lab.diagnose.effects.hypothesis import Document, Term
 from servod.lab.diagnose.effects.looks import Look, Split
-from servod.lab.diagnose.effects.scene import SearchContext
+from servod.lab.diagnose.effects.search_context import SearchContext
 
 #: Torque ripple below this share of the command is what every motor has.
 LEAST_SHARE = 0.02

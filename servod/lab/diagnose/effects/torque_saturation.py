@@ -8,7 +8,7 @@ from servod.formats.model.effects import TorqueSaturation
 from servod.lab.diagnose.effects.effect import Effect, simple
 from servod.lab.diagnose.effects.hypothesis import Term, Unknown
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import SearchContext
+from servod.lab.diagnose.effects.search_context import SearchContext
 
 #: Quantiles of the command at which a limit is looked for.
 QUANTILES = (0.9, 0.97, 0.995)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Term, Unknown, get
-from servod.lab.diagnose.effects.scene import SearchContext
+from servod.lab.diagnose.effects.search_context import SearchContext
 
 #: Shares of critical damping that the joint's spring, and the contact behind a gap, start with.
 DAMPING, CONTACT_DAMPING = 0.05, 0.4

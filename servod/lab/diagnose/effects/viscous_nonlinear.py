@@ -6,7 +6,7 @@ from servod.formats.model.friction import ViscousNonlinear
 from servod.lab.diagnose.effects.effect import Effect, share, simple
 from servod.lab.diagnose.effects.hypothesis import Term, Unknown
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.scene import SearchContext
+from servod.lab.diagnose.effects.search_context import SearchContext
 
 #: Bound of the terms: so many times the model's own viscous torque, or dry friction, at high speed.
 MOST = 20.0

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from servod.lab.diagnose.effects.scene import SearchContext
+from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.predict.coordinates import coordinates, units
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.result import MismatchMap

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from servod.lab.diagnose.effects import effect, effects
 from servod.lab.diagnose.effects.hypothesis import Term
-from servod.lab.diagnose.effects.scene import SearchContext
+from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.predict.predict import in_parallel
 from servod.lab.diagnose.select.fit import Fit, Fitter
 from servod.lab.diagnose.settings import SETTINGS

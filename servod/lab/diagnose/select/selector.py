@@ -18,7 +18,7 @@ from servod.formats.model.axis_model import AxisModel
 from servod.lab.diagnose.effects import effect, unexcited_effects
 from servod.lab.diagnose.effects.base import base_unknowns, document_of
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
-from servod.lab.diagnose.effects.scene import SearchContext
+from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.predict.floor import noise_floor, stretch_means
 from servod.lab.diagnose.predict.predict import Predictor, shorten
 from servod.lab.diagnose.select.candidates import Candidate, CandidateFits

@@ -2,9 +2,8 @@
 `servod.lab.report.figure.Figure`.
 
 friction.py   Dahl curve, friction-velocity map (Fig. 7, 8)
-response.py   frequency response of the sliding joint, with its coherence
 sets.py       weighting functions, friction of the local sets (Fig. 2)
-loop.py       frequency responses before and after compensation, impulse responses at every vertex (Fig. 4, 6)
-proof.py      the certificate as a table
+loop.py       frequency responses before and after compensation, impulse responses at every vertex (Fig. 4, 6);
+              response of the sliding joint, with its coherence; the certificate as a table
 motion.py     tracking, steps, friction under disturbance, before and after (Fig. 9 to 12, 15 to 18)
 """

@@ -1,6 +1,7 @@
 """What the bounded test of the wiring may do and what its answers must look like: bounds and checks, on plain floats.
 
-Below the test's state machine (servod.runtime.loop.wiring.test). Every check gives a verdict or None; none of them
+Below the test's state machine (servod.runtime.loop.wiring.wiring_test). Every check gives a verdict or None; none of
+them
 knows the cycle.
 """
 

@@ -1,6 +1,7 @@
 """What the bounded test before the first torque can find, and how each finding is told: one table, as for faults.
 
-Beside the data path. The loop runs the test (servod.runtime.loop.wiring.test) and hands over a row of numbers; log,
+Beside the data path. The loop runs the test (servod.runtime.loop.wiring.wiring_test) and hands over a row of numbers;
+log,
 status and command line make their sentences of it here.
 """
 

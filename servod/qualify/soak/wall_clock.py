@@ -30,7 +30,7 @@ from servod.qualify.soak.drive import DriveCheck, check_reaction, check_trace, r
 from servod.qualify.soak.kinds import ALWAYS, InjectionKind, fault_bits
 from servod.qualify.soak.plan import Episode, Move, SoakEnding, nothing_yet
 from servod.qualify.soak.rows import RecordedRows
-from servod.qualify.soak.starved import STARVED_CYCLE, STARVED_SUPERVISOR, ExcusedFaults, Starvation
+from servod.qualify.soak.starvation import STARVED_CYCLE, STARVED_SUPERVISOR, ExcusedFaults, Starvation
 from servod.qualify.soak.syncs import SyncThread
 from servod.qualify.soak.tally import Counts, Findings, Tally, Wrong
 from servod.qualify.soak.traces import LISTEN_S, BusListener, trace_of

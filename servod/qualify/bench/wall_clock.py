@@ -16,7 +16,7 @@ from servod.common.errors import AnswerIsNo
 from servod.formats.recording.mcap_reader import read_recording
 from servod.qualify.demo.axis import demo_config, gains_file, plant_file
 from servod.qualify.demo.runs import Run, cut_motion
-from servod.qualify.demo.wall import activate, motion_runs
+from servod.qualify.demo.wall_clock import activate, motion_runs
 
 _SAMPLE_S = 0.5
 #: Before this the history ring fills and the interpreter's arenas settle; growth counts from here on.
