@@ -1,6 +1,6 @@
 """Faults of the bus on demand: frames that vanish or come otherwise than sent, participants that fall silent or babble.
 
-The hub asks `frame_faults` for every frame while one is armed, `injection` does the rest. `BusFault` is the message by
+The hub asks for every frame while one is armed, the world does the rest. `BusFault` is the message by
 which a client of the socket asks for a fault: an error frame, which no CAN controller can send, with this in its data.
 """
 

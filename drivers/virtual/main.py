@@ -18,11 +18,11 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
+from servod.common.end_signals import on_end_signals
 from servod.common.errors import BadInput, ServodError, Unreachable
 from servod.common.files import reason
 from servod.common.shipped import shipped
 from servod.common.units import NS_PER_S
-from servod.common.workers import on_end_signals
 from servod.common.yaml import load_model, validate
 from servod.drivers.virtual.bus_faults import BusFault, FaultKind, kind_of
 from servod.drivers.virtual.client import STAMPED_FRAME

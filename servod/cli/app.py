@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import io
+import logging
 import os
 import sys
 from importlib import import_module
@@ -57,6 +58,7 @@ def _options(
 def main() -> None:
     """Entry point of `servoctl`: errors become one line on standard error and an exit code, never a traceback."""
     _stand_in_for_closed()
+    logging.getLogger("servod").addHandler(logging.NullHandler())  # the daemon's parts log; here they are only used
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal without the character still gets the rest

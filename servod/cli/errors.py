@@ -13,11 +13,8 @@ import re
 import shlex
 import shutil
 import sys
-from importlib import metadata
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote, urlsplit
-from urllib.request import url2pathname
 
 import typer
 
@@ -26,17 +23,15 @@ from servod.client.control import Refused
 from servod.common.errors import AnswerIsNo, BadInput, ServodError, Unreachable, one_line
 from servod.common.files import BadFile
 
-# How this servod came onto the machine, and by which command it gets the packages of an extra.
-#
-# Asked only when a package is missing: an advice that fits pip alone would put them elsewhere than where servoctl
-# looks.
-
-
+# How this servod came onto the machine, and by which command it gets the packages of an extra: an advice that fits pip
+# alone would put them elsewhere than where servoctl looks. What it asks is imported only when a package is missing.
 _DISTRIBUTION = "servod"
 
 
 def extra_of(package: str) -> str | None:
     """The extra that installs an import package, as servod's own metadata says; None when none does."""
+    from importlib import metadata
+
     name = re.escape(package.partition(".")[0])
     try:
         lines = metadata.requires(_DISTRIBUTION) or []
@@ -48,6 +43,8 @@ def extra_of(package: str) -> str | None:
 
 def how_to_get(extra: str) -> str:
     """The command that adds `extra` to this installation."""
+    from importlib import metadata
+
     try:
         origin = metadata.distribution(_DISTRIBUTION).read_text("direct_url.json")
     except metadata.PackageNotFoundError:
@@ -57,6 +54,9 @@ def how_to_get(extra: str) -> str:
 
 def command_for(extra: str, origin: dict[str, Any], prefix: Path) -> str:
     """The same for the environment at `prefix`; `origin` is direct_url.json (PEP 610), empty for a package index."""
+    from urllib.parse import unquote, urlsplit
+    from urllib.request import url2pathname
+
     if origin.get("dir_info", {}).get("editable"):
         return _in_checkout(extra, Path(url2pathname(unquote(urlsplit(origin["url"]).path))), prefix)
     wanted = f"'{_requirement(extra, origin)}'"

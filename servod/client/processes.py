@@ -21,9 +21,9 @@ from typing import NamedTuple
 import yaml
 
 from servod.client.control import ControlClient
+from servod.common.end_signals import END_SIGNALS
 from servod.common.errors import Unreachable
 from servod.common.portable import need_linux
-from servod.common.workers import END_SIGNALS
 from servod.formats.config import AxisConfig
 
 _PR_SET_PDEATHSIG, _PR_CAPBSET_DROP = 1, 24  # linux/prctl.h

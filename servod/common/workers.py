@@ -9,7 +9,6 @@ import contextlib
 import os
 import signal
 import sys
-import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -17,6 +16,7 @@ from functools import cache
 from multiprocessing import active_children, get_context, resource_tracker
 from multiprocessing.process import BaseProcess
 from multiprocessing.util import Finalize
+from pathlib import Path
 from typing import Any
 
 from servod.common.errors import Unreachable
@@ -24,8 +24,6 @@ from servod.common.portable import end_with_parent
 
 #: What Windows can wait for at once, less what the executor itself needs.
 _MOST_ON_WINDOWS = 61
-#: How long the account of semaphores may take to close [s].
-_TRACKER_S = 2.0
 
 
 @contextlib.contextmanager
@@ -63,22 +61,28 @@ def _tracker_goes_with_us() -> None:
     """Wait at our own end for the process in which multiprocessing keeps account of semaphores.
 
     Left alone it ends after us, and stays listed until whoever inherits it looks. Its end must come after that of all
-    semaphores (exit priority 0). Newer Pythons wait for it themselves.
+    semaphores (exit priority 0). Newer Pythons wait for it themselves, and Windows has none.
     """
-    if not hasattr(resource_tracker.ResourceTracker, "__del__"):
-        Finalize(None, _end_tracker, exitpriority=-1)
+    if sys.platform != "win32" and not hasattr(resource_tracker.ResourceTracker, "__del__"):
+        before = _children()
+        descriptor = resource_tracker.getfd()  # starts it, as the first semaphore would
+        started = _children() - before
+        if descriptor is not None and len(started) == 1:
+            Finalize(None, _end_tracker, (descriptor, *started), exitpriority=-1)
 
 
-def _end_tracker() -> None:
-    """Close the pipe on which the tracker lives, and reap it; whatever else we started has ended by then."""
-    descriptor = resource_tracker.getfd()
-    if descriptor is not None:
-        os.close(descriptor)
-    deadline = time.monotonic() + _TRACKER_S
-    with contextlib.suppress(ChildProcessError):  # none is left
-        while time.monotonic() < deadline:
-            if os.waitpid(-1, os.WNOHANG) == (0, 0):
-                time.sleep(0.005)
+def _children() -> set[int]:
+    """Process ids of our children (proc(5), task/children); empty where the system does not tell."""
+    with contextlib.suppress(OSError):
+        return set(map(int, Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()))
+    return set()
+
+
+def _end_tracker(descriptor: int, tracker: int) -> None:
+    """Close the pipe on which the tracker lives, and reap it."""
+    os.close(descriptor)
+    with contextlib.suppress(ChildProcessError):
+        os.waitpid(tracker, 0)
 
 
 def begin_worker(parent: int, begin: Callable[..., None] | None = None, given: tuple[Any, ...] = ()) -> None:
@@ -87,17 +91,3 @@ def begin_worker(parent: int, begin: Callable[..., None] | None = None, given: t
     end_with_parent(parent)
     if begin is not None:
         begin(*given)
-
-
-# The signals that ask a process of servod to end in order. Ground floor.
-
-
-#: What ends a process from outside: SIGTERM, and SIGHUP where a terminal sends one.
-END_SIGNALS = tuple(s for s in signal.Signals if s.name in ("SIGTERM", "SIGHUP"))
-
-
-def on_end_signals(act: Callable[[], None]) -> None:
-    """Let SIGTERM, SIGINT and SIGHUP (its terminal closes) call `act`; under nohup(1), SIGHUP stays ignored."""
-    for number in (*END_SIGNALS, signal.SIGINT):
-        if number.name != "SIGHUP" or signal.getsignal(number) != signal.SIG_IGN:
-            signal.signal(number, lambda *_: act())

@@ -23,7 +23,7 @@ from servod.runtime.daemon.recorder import Recorder
 from servod.runtime.loop.axis import AxisState
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "daemon"))
-from daemon_rows import record, row
+from tests.runtime.daemon.daemon_rows import record, row
 
 BLOCKED, LATE = FaultCode.FOLLOWING_ERROR, FaultCode.DEADLINE_LATE
 CLIPPED, LEFT = FaultCode.TORQUE_CLIPPED, FaultCode.DRIVE_LEFT_OPERATION

@@ -87,7 +87,7 @@ def test_what_nobody_foresaw_is_a_document_and_a_trace(
     def broken() -> None:
         raise ZeroDivisionError("by zero")
 
-    monkeypatch.setattr("servod.lab.diagnose.explain.listed", broken)
+    monkeypatch.setattr("servod.lab.diagnose.explain.list_effects", broken)
     with pytest.raises(ZeroDivisionError):
         run(["explain", "--json"])
     error = json.loads(capsys.readouterr().out)["error"]

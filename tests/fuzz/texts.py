@@ -236,7 +236,7 @@ def fault_scenarios(folder: Path) -> Target:
     """A file of scenarios of the fault campaign, with its variants."""
     from servod.qualify.faults.variants import load_scenarios, scenarios_in
 
-    shipped = ROOT / "servod" / "campaign" / "scenarios" / "bus"
+    shipped = ROOT / "servod" / "qualify" / "faults" / "scenarios" / "bus"
     assert scenarios_in(shipped)
     seeds = [file.read_bytes() for file in sorted(shipped.glob("*.yaml"))[:4]]
     return _yaml(folder / "scenario.yaml", load_scenarios, *seeds)

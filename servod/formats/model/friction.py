@@ -1,6 +1,6 @@
 """Groups of keys of the axis model file for what plain friction laws leave out, one for each effect.
 
-Beside `axis_effects`, which has the groups of everything that is no friction. Every group says its equation and source.
+Beside `effects`, which has the groups of everything that is no friction. Every group says its equation and source.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""Kernels of the effects beside plain friction; each equation stands in the docstring of its group in `axis_effects`.
+"""Kernels of the effects beside plain friction; each equation stands in the docstring of its group
+(servod.formats.model.effects).
 
 Called by `servod.kernels.physics.dynamics` in every inner step of a model that has such an effect. An absent effect
 costs one comparison. Plain functions on floats and numbers by name; the same source is compiled.

@@ -187,5 +187,5 @@ def check_reference(s: Subject) -> Iterator[CertificateCheck]:
             used = (own.k_z_per_rad, own.k_x_per_rad, own.k_v_s_per_rad)
             pairs = list(zip(used, gain_numbers(proof), strict=True))
             worst = float(np.max([abs(x - y) / max(abs(x), abs(y), 1e-12) for x, y in pairs]))
-            away = worst + sum(map(abs, own.pack_memory()))
+            away = worst + sum(map(abs, own.memory))
             yield at_most(f"gains of region {proof.name} against the proven ones", away, SAME)

@@ -13,9 +13,9 @@ from typing import NoReturn
 
 from servod import __version__
 from servod.common.clock import WallClock
+from servod.common.end_signals import on_end_signals
 from servod.common.errors import BadInput, ServodError
 from servod.common.faults import FaultCode
-from servod.common.workers import on_end_signals
 from servod.common.yaml import read_text
 from servod.formats.config import AxisConfig, load_config
 from servod.formats.gains.gain_set import load_gains, require_fit

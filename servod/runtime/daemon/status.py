@@ -153,7 +153,8 @@ class LeaseStatus(TypedDict):
 
 
 class WiringStatus(TypedDict):
-    """Tests of the wiring since the start; `last` is servod.runtime.loop.wiring.findings.document, None before the
+    """Tests of the wiring since the start; `last` is servod.runtime.loop.wiring.findings.wiring_document, None before
+    the
     first enable."""
 
     tests: int

@@ -72,11 +72,17 @@ class DriveState(IntEnum):
         return self in _COMMANDED
 
     @property
+    def off(self) -> bool:
+        """At rest without power: where a shutdown is to end, and stays."""
+        return self in _OFF
+
+    @property
     def unpowered(self) -> bool:
         """No torque can act. UNKNOWN is neither powered nor unpowered."""
         return not (self in _POWERED or self is DriveState.UNKNOWN)
 
 
+_OFF = (DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON, DriveState.FAULT)
 _COMMANDED = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
 _POWERED = (*_COMMANDED, DriveState.FAULT_REACTION_ACTIVE)
 

@@ -311,11 +311,7 @@ class Axis:
 
     def _quick_stop_is_over(self, amplifier: AmplifierFeedback) -> bool:
         """Over when the drive has switched itself off, or has had its time (it may hold in quick stop active)."""
-        off = amplifier.age_cycles == 0 and amplifier.state in (
-            DriveState.SWITCH_ON_DISABLED,
-            DriveState.READY_TO_SWITCH_ON,
-            DriveState.FAULT,
-        )
+        off = amplifier.age_cycles == 0 and amplifier.state.off
         return off or self._cycles_in_state > self._timeout_cycles
 
     def _torque_share(self) -> float:

@@ -16,7 +16,7 @@ from servod.common.faults import FAULTS, FaultCode
 from servod.common.units import NS_PER_S, NS_PER_US
 from servod.kernels.motions import Samples
 from servod.runtime.fieldbus.bus import Bus
-from servod.runtime.fieldbus.devices import AmplifierCommand, AmplifierFeedback, DriveState, EncoderFeedback, Goal, Mode
+from servod.runtime.fieldbus.devices import AmplifierCommand, AmplifierFeedback, EncoderFeedback, Goal, Mode
 from servod.runtime.fieldbus.registry import amplifier_of, encoder_of
 from servod.runtime.loop.axis import Axis, AxisOutput, AxisState
 from servod.runtime.loop.commands import Command
@@ -294,8 +294,7 @@ class Cycle:
             return
         self._resting += 1
         if amplifier.age_cycles == 0:  # a cycle without an answer says nothing, neither good nor bad
-            off = amplifier.state.unpowered and amplifier.state is not DriveState.SWITCHED_ON
-            self._goodbye = self._goodbye + 1 if off else 0
+            self._goodbye = self._goodbye + 1 if amplifier.state.off else 0
         self.seen_off = self._goodbye >= GOODBYE_CYCLES
         self.finished = self.seen_off or self._resting >= GOODBYE_TIMEOUT_CYCLES
 

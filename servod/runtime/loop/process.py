@@ -12,8 +12,8 @@ from collections.abc import Callable
 from typing import Protocol
 
 from servod.common.clock import Clock, WallClock
+from servod.common.end_signals import on_end_signals
 from servod.common.units import NS_PER_S
-from servod.common.workers import on_end_signals
 from servod.runtime.fieldbus.bus.open import open_bus
 from servod.runtime.loop.channel import Channel
 from servod.runtime.loop.cycle import Cycle

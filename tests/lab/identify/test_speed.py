@@ -13,7 +13,7 @@ from servod.lab.identify.experiments import kick
 from servod.lab.identify.experiments.common import SPEED_SPAN_S, Bench, enable_powerless, peak_speed
 from servod.lab.identify.fits import kick as kick_fit
 from servod.lab.identify.store import load
-from servod.lab.identify.trace import RecordedMotion
+from servod.lab.identify.trace import ExperimentKind, RecordedMotion
 from tests.lab.identify.conftest import Identification
 from tests.lab.identify.joints import Drawn, draw
 
@@ -82,14 +82,14 @@ def test_a_joint_that_is_faster_than_allowed_ends_the_walk(tmp_path):
     bench, truth = bench_of(draw(31, bits=20), tmp_path, 0.1)
     torque = np.where(np.arange(100) < 20, 0.1, 0.0)
     with pytest.raises(AnswerIsNo, match=r"went at .* rad/s in the experiment kick, 0.1 are allowed"):
-        bench.run(kick.Kind.KICK, np.zeros(100), torque, 0.1, {})
+        bench.run(ExperimentKind.KICK, np.zeros(100), torque, 0.1, {})
     assert truth.peak_rad_s > 0.1
 
 
 def test_a_path_that_is_faster_than_allowed_is_not_begun(tmp_path):
     bench, truth = bench_of(draw(31, bits=20), tmp_path, 0.1)
     with pytest.raises(AnswerIsNo, match="would go at"):
-        bench.run(kick.Kind.FRICTION_MAP, np.linspace(0.0, 0.02, 100), np.zeros(100), 0.1, {})
+        bench.run(ExperimentKind.FRICTION_MAP, np.linspace(0.0, 0.02, 100), np.zeros(100), 0.1, {})
     assert truth.peak_rad_s < 0.01
 
 

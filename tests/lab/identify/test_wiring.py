@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
@@ -90,7 +92,7 @@ def test_the_command_ends_with_one_line_and_exit_code_1(tmp_path, capsys):
     captured = capsys.readouterr()
     assert captured.err.count("\n") == 1
     assert "wrong polarity" in captured.err
-    assert captured.out == ""
+    assert json.loads(captured.out)["error"]["exit_code"] == 1
 
 
 def test_a_linear_axis_is_bad_input(tmp_path, capsys):

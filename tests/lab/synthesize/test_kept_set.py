@@ -100,5 +100,5 @@ def test_both_sets_track(origin: str) -> None:
     assert gains.design is not None
     motion = np.array([paper(k * 1e-3) for k in range(12_000)])
     settings = LoopSettings(velocity_cutoff_hz=gains.design.velocity_cutoff_hz)
-    run = simulate_closed_loop(table1(), gains.law.step, gains.pack(), motion, settings)
+    run = simulate_closed_loop(table1(), gains.law, gains.pack(), motion, settings)
     assert np.sqrt(np.mean(run.tracking_error_rad(1.0) ** 2)) < 9e-6

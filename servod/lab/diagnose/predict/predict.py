@@ -176,15 +176,21 @@ class Predictor:
         return np.where(self.counts, np.clip(clean, -limit, limit), 0.0)
 
     def _trace_mismatch(self, packed: PackedPlant, trace: CheckedTrace, seen: Observer) -> Array:
-        drive, observer = trace.drive, SETTINGS.observer
+        drive = trace.drive
         gap, first = packed.p.gap > 0.0, trace.first_row(packed.p.delay_s)
         axis = inputs(packed, PlantState(temperature_c=packed.p.start_c, first_s=trace.begun_s))
         states = np.array([self._start(packed, trace, int(row), first) for row in trace.starts])
         out = np.zeros(len(drive.t_s))
-        steps = seen.steps * observer.steps_in_gap if gap else seen.steps
+        steps = seen.steps * SETTINGS.observer.steps_in_gap if gap else seen.steps
         held = drive.t_s, drive.torque, first.command_before, drive.temperature_c, drive.position
-        share = observer.load_share_in_gap if gap else observer.load_share
-        gains = steps, seen.position_gain, seen.velocity_gain, share, observer.quiet_noises * trace.position_noise
+        share = SETTINGS.observer.load_share_in_gap if gap else SETTINGS.observer.load_share
+        gains = (
+            steps,
+            seen.position_gain,
+            seen.velocity_gain,
+            share,
+            SETTINGS.observer.quiet_noises * trace.position_noise,
+        )
         self._run(*axis, *held, *gains, trace.starts, states, out)
         return seen.to_torque * out
 
