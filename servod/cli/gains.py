@@ -87,7 +87,7 @@ def show(file: Annotated[Path, typer.Argument(help="Gain set, YAML.")], as_json:
     )
 
 
-@_app.command(help=example("Change to a stored gain set without a bump.", "servoctl gains activate my_axis"))
+@_app.command(help=example("Change to a stored gain set, bumpless.", "servoctl gains activate my_axis"))
 def activate(
     name: Annotated[str, typer.Argument(help="Name in the store.", autocompletion=stored_sets)],
     version: Annotated[int | None, typer.Option(min=1, help="Version; the newest unless given.")] = None,

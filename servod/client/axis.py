@@ -124,7 +124,7 @@ class AxisClient(Protocol):
         ...
 
     def activate(self, name: str, version: int) -> None:
-        """Change to a stored set on trial, without a bump: what is stored as active stays so."""
+        """Change to a stored set on trial, bumpless: what is stored as active stays so."""
         ...
 
     def keep(self, note: str, figures: dict[str, float]) -> None:

@@ -1,4 +1,4 @@
-"""Errors for people: the exceptions that end a command, and the one table of faults that log, CLI and README read.
+"""Errors for people: the exceptions that end a command, each with its exit code. The table of faults is `faults`.
 
 Stands on nothing. A *fault* is something that happens to a running axis and has a reaction; an *error* ends a command
 with one line on standard error and an exit code (0 done, 1 the answer is no, 2 bad input, 3 unreachable).

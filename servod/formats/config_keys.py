@@ -1,6 +1,6 @@
 """The keys of an axis configuration as a table: type, unit, default, range and meaning, from the file model itself.
 
-Beside servod.formats.config; `servoctl config keys`, the README and docs/reference print it.
+Beside servod.formats.config; `servoctl config keys` and docs/reference print it.
 """
 
 from __future__ import annotations

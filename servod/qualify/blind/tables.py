@@ -1,4 +1,4 @@
-"""The tables of a trial for terminal, README and page.
+"""The tables of a trial for terminal, manual and page.
 
 Made from the JSON document alone, so that a kept document gives the same tables.
 """

@@ -1,6 +1,6 @@
 """The paper's numbers beside ours, made from the JSON document of a run, so that anyone can print them again.
 
-Stands on plain values. The README quotes `numbers`; `QUANTITIES` is its first column, by which a test knows its form.
+Stands on plain values. The manual quotes `numbers`; `QUANTITIES` is its first column, by which a test knows its form.
 """
 
 from __future__ import annotations
@@ -139,6 +139,6 @@ def _verdict(claim: dict[str, Any]) -> str:
 
 
 def quotation(document: dict[str, Any]) -> str:
-    """What the README quotes: the numbers, and the rivals where they were tuned, as paper.md has them."""
+    """What the manual quotes: the numbers, and the rivals where they were tuned, as paper.md has them."""
     joints = [PaperJoint(name) for name in document["joints"] if document["joints"][name]["tuned"]]
     return "\n\n".join(each.markdown() for each in (numbers(document), *(tuned(document, joint) for joint in joints)))

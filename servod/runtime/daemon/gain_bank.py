@@ -95,7 +95,7 @@ class GainBank:
         return ""
 
     def activate(self, args: GainsActivateArgs, send: SendOrder, slow: Executor) -> Flow:
-        """Change the running controller to a stored set, without a bump."""
+        """Change the running controller to a stored set, bumpless."""
         stored: StoredSet = yield FutureWait(slow.submit(self._store.get, args.name, args.version))
         yield from self._deploy(stored, send)
         self._tried = stored if args.trial else None
