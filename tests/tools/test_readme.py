@@ -123,6 +123,7 @@ def test_the_here_document_of_the_first_steps_ends_where_its_word_stands() -> No
 def test_the_first_steps_work_as_they_stand(tmp_path: Path) -> None:
     """Every line between the marks, by a shell that ends at the first error; the commands are those of this Python."""
     (tmp_path / "gains").symlink_to(source.ROOT / "gains")
+    (tmp_path / ".venv").symlink_to(sys.prefix)
     environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
     shell = ["bash", "-e", "-c", "trap 'kill $(jobs -p) 2>/dev/null || true' EXIT\n" + first_steps()]
     begun = subprocess.Popen(

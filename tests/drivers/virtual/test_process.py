@@ -193,7 +193,7 @@ def test_a_record_for_which_there_is_no_room_is_refused_and_leaves_nothing(tmp_p
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
     try:
-        with pytest.raises(BadInput, match="File too large"):
+        with pytest.raises(BadInput, match="file too large"):
             DriveRecord(tmp_path / "ring")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
