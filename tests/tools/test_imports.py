@@ -57,3 +57,7 @@ def test_the_loop_loads_neither_canopen_nor_python_can() -> None:
 def test_the_command_line_starts_without_the_daemon_and_the_laboratory() -> None:
     heavy = ("servod.runtime.daemon", "servod.runtime.loop", "servod.runtime.fieldbus.master", "canopen", "mcap")
     assert not {name for name in loaded_with("servod.cli") if name.startswith(heavy)}
+
+
+def test_the_fault_campaign_runs_where_the_laboratory_is_not_installed() -> None:
+    assert {name.split(".")[0] for name in loaded_with("servod.qualify.faults.run")} & LAB == set()

@@ -10,12 +10,11 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from servod.client.processes import socket_folder
 from servod.common.errors import ServodError, Unreachable
 from servod.common.faults import FAULTS
-from servod.lab.report.page import Page
 from servod.qualify.faults.actions import InjectionAction, action_of
 from servod.qualify.faults.evidence import Watch
 from servod.qualify.faults.judge import ReactionTimes, complaints, loss_of, reaction
@@ -23,6 +22,9 @@ from servod.qualify.faults.processes import ProcessAxis
 from servod.qualify.faults.scenario import Injection, Loss, Recovery, Runs, Scenario
 from servod.qualify.faults.stepped import SteppedUnderTest
 from servod.qualify.faults.under_test import AxisUnderTest, Observation
+
+if TYPE_CHECKING:
+    from servod.lab.report.page import Page
 
 # Whether what a scenario injects really happened: a fault that hits nothing proves nothing.
 #
@@ -357,6 +359,8 @@ _TIMES = (
 
 def write_page(outcomes: Sequence[Outcome], planned: int, path: Path) -> None:
     """Write the page to `path`. Raises BadInput when that is not possible."""
+    from servod.lab.report.page import Page
+
     page = Page("servod: the fault campaign")
     first, *rest = summary(outcomes, planned)
     page.lead(first)
