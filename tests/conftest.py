@@ -6,7 +6,6 @@ import getpass
 import os
 import signal
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -44,7 +43,7 @@ os.environ["TMPDIR"] = tempfile.tempdir = temporary_folder()
 
 ROOT = Path(__file__).resolve().parent
 
-#: Files (or folders) whose tests start real processes on the wall clock; `./test` runs them alone, after all others.
+#: Files (or folders) whose tests run an axis on the wall clock; `./test` runs two at a time, after all others.
 SERIAL = (
     *("qualify/faults/test_control_attack.py", "qualify/faults/test_reactions.py"),
     *("runtime/daemon/test_daemon.py", "drivers/virtual/test_process.py"),
@@ -77,8 +76,16 @@ def pytest_report_header() -> str:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Let failures on the wall clock be held against the machine's load."""
+    """Let failures on the wall clock be held against the machine's load, and children hear signals as in a terminal.
+
+    What is ignored when the tests begin (SIGHUP under nohup(1), SIGINT in the background of a shell) every child would
+    inherit; a handler it does not. The controller of several workers leaves it to them: they shall outlive a terminal.
+    """
     config.pluginmanager.register(Judge(), "starved")
+    if hasattr(config, "workerinput") or not config.getoption("numprocesses", None):
+        for number in (signal.SIGHUP, signal.SIGINT):
+            if signal.getsignal(number) is signal.SIG_IGN:
+                signal.signal(number, lambda *_: None)
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -90,11 +97,3 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.serial)
         if any(relative.is_relative_to(entry) for entry in PROCESSES):
             item.add_marker(pytest.mark.processes)
-
-
-@pytest.fixture
-def hangup_ends() -> Iterator[None]:
-    """Children get SIGHUP as under a terminal: what is ignored, as by nohup(1), they would inherit; a handler not."""
-    before = signal.signal(signal.SIGHUP, lambda *_: None)
-    yield
-    signal.signal(signal.SIGHUP, before)

@@ -172,7 +172,6 @@ def test_the_demo_on_the_wall_clock(tmp_path: Path) -> None:
 
 
 @pytest.mark.serial
-@pytest.mark.usefixtures("hangup_ends")
 @pytest.mark.parametrize(
     ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 130), (signal.SIGHUP, 130), (signal.SIGKILL, -9)]
 )

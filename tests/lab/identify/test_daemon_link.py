@@ -66,7 +66,6 @@ def test_another_configuration_than_the_daemons_is_bad_input_by_its_key(tmp_path
             assert client.call("status")["controller"]["name"] == "demo_pd"
 
 
-@pytest.mark.usefixtures("hangup_ends")
 def test_whatever_ends_the_command_switches_the_axis_off_and_gives_the_gains_back(tmp_path):
     with running(tmp_path) as axis, ControlClient(axis.socket) as watcher:
         for number in (signal.SIGHUP, signal.SIGTERM):

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
+from servod.cli.app import run
 from servod.client.stepped import SteppedAxis
 from servod.client.virtual import virtual_session
 from servod.common.errors import AnswerIsNo
 from servod.common.yaml import parse_yaml, validate
-from servod.formats.model.axis_model import AxisModel, axis_model_yaml
+from servod.formats.model.axis_model import AxisModel, axis_model_yaml, load_axis_model
 from servod.lab.identify import store
 from servod.lab.identify.analysis import Analysis, analyse
 from servod.lab.identify.fits.cogging import GRAVITY
@@ -156,3 +159,15 @@ def test_a_repeat_on_a_worn_joint_says_how_much_friction_rose(fine):
     now = before.model_copy(update={"friction_map": found.model_copy(update={"torques": worn})})
     (told,) = changes(before, now)
     assert told.startswith("friction in positive direction rose by 15.0 % over the map")
+
+
+def test_recordings_become_a_model_and_a_document(fine: Identification, tmp_path, capsys):
+    out = tmp_path / "model.yaml"
+    command = ["identify", "--recordings", str(fine.recordings), "--out", str(out), "--json"]
+    assert run(command) == 0
+    found = json.loads(capsys.readouterr().out)
+    inertia = found["identified"]["inertia"]
+    assert inertia["low"] < inertia["value"] < inertia["high"]
+    assert load_axis_model(out).identified.values["inertia"].value == inertia["value"]
+    assert run([*command, "--before", str(out)]) == 0
+    assert json.loads(capsys.readouterr().out)["changes"] == []

@@ -20,6 +20,8 @@ from servod.common.errors import AnswerIsNo
 from servod.qualify.bench.attack import measure, text, told
 from servod.qualify.bench.attackers import SILENT
 
+pytestmark = pytest.mark.alone
+
 STOPS, ROUNDS = 3, 3
 
 
