@@ -12,10 +12,13 @@ import io
 import logging
 import os
 import sys
+from functools import cache
 from importlib import import_module
 from itertools import pairwise
+from typing import Any
 
 import typer
+from typer.main import get_command
 
 from servod import __version__
 from servod.cli.common import begin_command, drop_empty_folders
@@ -94,12 +97,18 @@ def _is_of_output(error: OSError) -> bool:
     return error.filename is None and error.errno in _NOBODY_TAKES
 
 
+@cache
+def command() -> Any:
+    """All verbs as one command of click; building it takes longer than most of them run."""
+    return get_command(app)
+
+
 def run(arguments: list[str]) -> int:
     """Run one command line and return its exit code."""
     begin_command()
     try:
         _refuse_empty(arguments)
-        code = app(args=arguments, prog_name="servoctl", standalone_mode=False)
+        code = command()(args=arguments, prog_name="servoctl", standalone_mode=False)
         if code == INTERRUPTED:  # typer turns Ctrl-C within a command into this
             raise KeyboardInterrupt
     except (Exception, KeyboardInterrupt) as error:

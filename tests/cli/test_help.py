@@ -10,9 +10,8 @@ from importlib.metadata import version
 from typing import Any
 
 import pytest
-from typer.main import get_command
 
-from servod.cli.app import app, run
+from servod.cli.app import command, run
 from servod.cli.groups import VERBS as VERBS_SHOWN
 
 
@@ -27,13 +26,13 @@ def commands(node: object, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ..
 
 def at(path: tuple[str, ...]) -> Any:
     """The command or group at a path."""
-    node: Any = get_command(app)
+    node: Any = command()
     for name in path:
         node = node.commands[name]
     return node
 
 
-COMMANDS = sorted(commands(get_command(app)))
+COMMANDS = sorted(commands(command()))
 VERBS = {"demo", "scan", "status", "enable", "disable", "stop", "track", "gains", "record", "replay", "bench", "config"}
 
 

@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.main import get_command
 
-from servod.cli.app import app, run
+from servod.cli.app import command, run
 from tests.cli.test_help import COMMANDS
 
 
 def options_of(path: tuple[str, ...]) -> set[str]:
-    node: Any = get_command(app)
+    node: Any = command()
     for name in path:
         node = node.commands[name]
     return {option for param in node.params for option in param.opts}
@@ -110,7 +109,7 @@ def test_an_answer_that_is_no_has_its_own_document_alone(
         verb.print_json({"valid": False})
         raise AnswerIsNo("not valid")
 
-    monkeypatch.setattr("servod.cli.app.app", lambda **_: answered())
+    monkeypatch.setattr("servod.cli.app.command", lambda: lambda **_: answered())
     assert run(["verify", "x", "--json"]) == 1
     shown = capsys.readouterr()
     assert json.loads(shown.out) == {"valid": False} and shown.err == "servoctl: not valid\n"
