@@ -55,17 +55,20 @@ def record(values: Any) -> Record:
     import numpy as np
 
     kind: object = type(values)
-    structure = _structure(kind)
+    structure, dtype = _structure(kind)
     names = structure(*(getattr(values, name) for name, *_ in structure._fields_))
-    return Record(names, np.frombuffer(names, dtype=np.dtype(structure)))
+    return Record(names, np.frombuffer(names, dtype=dtype))
 
 
 @cache
 def _structure(kind: object) -> Any:
-    """The C structure of a class of numbers."""
+    """The C structure of a class of numbers, and its one dtype: numba compares another that is equal at every call."""
+    import numpy as np
+
     types = {float: ctypes.c_double, int: ctypes.c_int64, bool: ctypes.c_bool}
     fields = [(name, types[hint]) for name, hint in get_type_hints(kind).items()]
-    return type("Fields", (ctypes.Structure,), {"_fields_": fields})
+    structure = type("Fields", (ctypes.Structure,), {"_fields_": fields})
+    return structure, np.dtype(structure)
 
 
 def entry(function: Kernel) -> Kernel:

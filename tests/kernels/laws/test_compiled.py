@@ -51,6 +51,11 @@ def test_a_record_is_one_memory_seen_from_both_sides() -> None:
     assert (memory["z_hat"][0], memory["d_hat"][0], names.asked, names.rest) == (0.25, 0.5, 0.125, 1.0)
 
 
+def test_records_of_a_kind_share_their_dtype() -> None:
+    """At every call numba compares the dtypes of records unless they are one object."""
+    assert record(LawState()).memory.dtype is record(LawState(z_hat=1.0)).memory.dtype
+
+
 def test_position_goes_flat_and_back() -> None:
     p = GAINS["local"]._replace(knows_position=True, position=PositionTorques(lead=0.001, waves=(0.1, 36.0, 0.2)))
     assert LAWS["local"].accepts(p.flat())
