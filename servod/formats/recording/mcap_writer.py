@@ -8,15 +8,34 @@ from __future__ import annotations
 
 import contextlib
 import json
+import struct
 import tempfile
 import time
+import zlib
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
+import zstandard
 from mcap.data_stream import RecordBuilder
-from mcap.records import ChunkIndex
-from mcap.writer import CompressionType, Writer
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
 
 from servod.formats.recording.record import CDR_HEADER, RECORD, ros2msg
 
@@ -35,32 +54,197 @@ def wall_offset_ns() -> int:
     return time.time_ns() - time.monotonic_ns()
 
 
-class _SpooledIndexes(list[ChunkIndex]):
-    """The writer's list of chunk indexes, kept in a nameless file beside the recording: in memory it would grow by
-    megabytes an hour."""
+_MAGIC = b"\x89MCAP0\r\n"
+#: Opcode, bytes that follow these two, channel, sequence, log time and publish time of a message; its data come next.
+_MESSAGE_HEAD = struct.Struct("<BQHIQQ")
+_HEAD_COUNTED = _MESSAGE_HEAD.size - 9
+_PIECE_BYTES = 64 * 1024
 
-    def __init__(self, folder: Path) -> None:
-        super().__init__()
-        self._spool = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - open as long as the recording is
-        self._builder = RecordBuilder()
 
-    def append(self, index: ChunkIndex) -> None:
-        index.write(self._builder)
-        self._spool.write(self._builder.end())
+def _packed(record: McapRecord) -> bytes:
+    builder = RecordBuilder()
+    record.write(builder)
+    return bytes(builder.end())
 
-    def __iter__(self) -> Iterator[Any]:
-        """One entry that writes them all; it has the one method that the MCAP writer calls."""
-        yield self
 
-    def write(self, builder: Any) -> None:
-        """Put the spooled indexes into the summary section."""
+class ChunkedWriter:
+    """MCAP in chunks packed with zstd and indexed, byte for byte what `mcap.writer.Writer` writes.
+
+    The library's writer keeps an object for every chunk until the end, which grows by megabytes an hour, and makes one
+    for every message. Here the chunk indexes go to `spool`, packed, and a message is a head and its data.
+    """
+
+    def __init__(self, stream: IO[bytes], spool: IO[bytes], chunk_bytes: int) -> None:
+        self._stream, self._spool, self._chunk_bytes = stream, spool, chunk_bytes
+        self._chunk = bytearray()  # the chunk in progress: schemas, channels, messages
+        self._entries: defaultdict[int, list[int]] = defaultdict(list)  # by channel: time, place, time, place ...
+        self._compress = zstandard.ZstdCompressor().compress
+        self._schemas: list[Schema] = []
+        self._channels: list[Channel] = []
+        self._attachments: list[AttachmentIndex] = []
+        self._metadata: list[MetadataIndex] = []
+        self._statistics = Statistics(
+            attachment_count=0,
+            channel_count=0,
+            channel_message_counts=defaultdict(int),
+            chunk_count=0,
+            message_count=0,
+            message_end_time=0,
+            message_start_time=0,
+            metadata_count=0,
+            schema_count=0,
+        )
+
+    def start(self, profile: str, library: str) -> None:
+        """Write the head of the file."""
+        self._stream.write(_MAGIC)
+        self._write(Header(profile=profile, library=library))
+
+    def add_schema(self, name: str, encoding: str, data: bytes) -> int:
+        """Number of a new schema; a channel names it."""
+        self._statistics.schema_count = number = len(self._schemas) + 1
+        self._schemas.append(Schema(id=number, name=name, encoding=encoding, data=data))
+        self._chunk += _packed(self._schemas[-1])
+        self._end_full_chunk()
+        return number
+
+    def add_channel(self, topic: str, encoding: str, schema: int) -> int:
+        """Number of a new channel; a message names it."""
+        self._statistics.channel_count = number = len(self._channels) + 1
+        self._channels.append(Channel(id=number, topic=topic, message_encoding=encoding, schema_id=schema, metadata={}))
+        self._chunk += _packed(self._channels[-1])
+        self._end_full_chunk()
+        return number
+
+    def add_messages(self, channel: int, messages: Iterable[tuple[int, bytes]]) -> int:
+        """Add time in ns and data of each message; returns how many there were."""
+        chunk, entries, limit, head = self._chunk, self._entries, self._chunk_bytes, _MESSAGE_HEAD.pack
+        opcode, count = int(Opcode.MESSAGE), 0
+        for time_ns, data in messages:
+            at = len(chunk)
+            chunk += head(opcode, _HEAD_COUNTED + len(data), channel, 0, time_ns, time_ns)
+            chunk += data
+            entries[channel].extend((time_ns, at))
+            count += 1
+            if len(chunk) > limit:
+                self._end_chunk()
+        return count
+
+    def add_attachment(self, time_ns: int, name: str, media_type: str, data: bytes) -> None:
+        """Add a file; what is in the chunk in progress comes after it."""
+        attachment = Attachment(create_time=time_ns, log_time=time_ns, name=name, media_type=media_type, data=data)
+        at, length = self._write(attachment)
+        index = AttachmentIndex(
+            offset=at,
+            length=length,
+            log_time=time_ns,
+            create_time=time_ns,
+            data_size=len(data),
+            name=name,
+            media_type=media_type,
+        )
+        self._attachments.append(index)
+        self._statistics.attachment_count += 1
+
+    def add_metadata(self, name: str, metadata: dict[str, str]) -> None:
+        """Add words with their meaning; what is in the chunk in progress comes after them."""
+        at, length = self._write(Metadata(name=name, metadata=metadata))
+        self._metadata.append(MetadataIndex(offset=at, length=length, name=name))
+        self._statistics.metadata_count += 1
+
+    def flush(self) -> None:
+        """End the chunk in progress, if there are messages in it, and hand everything to the kernel."""
+        self._end_chunk()
+        self._stream.flush()
+
+    def finish(self) -> None:
+        """Write what is left, the summary and the foot; the stream stays open."""
+        self._end_chunk()
+        self._write(DataEnd(data_section_crc=0))
+        start = self._stream.tell()
         self._spool.seek(0)
-        builder.write(self._spool.read())
+        groups: tuple[tuple[int, Iterable[bytes]], ...] = (
+            (Opcode.SCHEMA, map(_packed, self._schemas)),
+            (Opcode.CHANNEL, map(_packed, self._channels)),
+            (Opcode.STATISTICS, [_packed(self._statistics)]),
+            (Opcode.CHUNK_INDEX, iter(lambda: self._spool.read(_PIECE_BYTES), b"")),
+            (Opcode.ATTACHMENT_INDEX, map(_packed, self._attachments)),
+            (Opcode.METADATA_INDEX, map(_packed, self._metadata)),
+        )
+        offsets, crc, at = [], 0, start
+        for opcode, pieces in groups:
+            length, crc = self._put(pieces, crc)
+            offsets.append(SummaryOffset(group_opcode=opcode, group_start=at, group_length=length))
+            at += length
+        _, crc = self._put(map(_packed, offsets), crc)
+        foot = _packed(Footer(summary_start=start, summary_offset_start=at, summary_crc=0))
+        foot = foot[:-4]  # the checksum goes there: of the summary, and of the foot up to it
+        self._stream.write(foot + zlib.crc32(foot, crc).to_bytes(4, "little") + _MAGIC)
 
-    def close(self) -> None:
-        """Let go of the spool; it has no name, so nothing is left."""
-        with contextlib.suppress(OSError):  # a full disk may refuse its last bytes
-            self._spool.close()
+    def _write(self, record: McapRecord) -> tuple[int, int]:
+        """Where `record` stands in the file, and its length."""
+        at, data = self._stream.tell(), _packed(record)
+        self._stream.write(data)
+        return at, len(data)
+
+    def _put(self, pieces: Iterable[bytes], crc: int) -> tuple[int, int]:
+        """Write `pieces` of the summary; their length, and the checksum `crc` with them."""
+        length = 0
+        for piece in pieces:
+            self._stream.write(piece)
+            length, crc = length + len(piece), zlib.crc32(piece, crc)
+        return length, crc
+
+    def _end_full_chunk(self) -> None:
+        if len(self._chunk) > self._chunk_bytes:
+            self._end_chunk()
+
+    def _end_chunk(self) -> None:
+        """Write the chunk in progress and where its messages stand in it; without messages it stays in progress."""
+        if not self._entries:
+            return
+        first_ns = min(min(entries[::2]) for entries in self._entries.values())
+        last_ns = max(max(entries[::2]) for entries in self._entries.values())
+        chunk = Chunk(
+            compression="zstd",
+            data=self._compress(self._chunk),
+            message_end_time=last_ns,
+            message_start_time=first_ns,
+            uncompressed_crc=zlib.crc32(self._chunk),
+            uncompressed_size=len(self._chunk),
+        )
+        at, length = self._write(chunk)
+        end, places = at + length, {}
+        for channel, entries in self._entries.items():
+            size = 8 * len(entries)
+            index = struct.pack(f"<BQHI{len(entries)}Q", Opcode.MESSAGE_INDEX, 6 + size, channel, size, *entries)
+            self._stream.write(index)
+            places[channel] = end
+            end += len(index)
+        chunk_index = ChunkIndex(
+            chunk_length=length,
+            chunk_start_offset=at,
+            compression=chunk.compression,
+            compressed_size=len(chunk.data),
+            message_end_time=last_ns,
+            message_index_length=end - at - length,
+            message_index_offsets=places,
+            message_start_time=first_ns,
+            uncompressed_size=chunk.uncompressed_size,
+        )
+        self._spool.write(_packed(chunk_index))
+        self._count_chunk(first_ns, last_ns)
+        self._chunk.clear()
+        self._entries.clear()
+
+    def _count_chunk(self, first_ns: int, last_ns: int) -> None:
+        total = self._statistics
+        total.message_start_time = min(first_ns, total.message_start_time) if total.chunk_count else first_ns
+        total.message_end_time = max(last_ns, total.message_end_time)
+        total.chunk_count += 1
+        for channel, entries in self._entries.items():
+            total.channel_message_counts[channel] += len(entries) // 2
+            total.message_count += len(entries) // 2
 
 
 class McapFile:
@@ -70,7 +254,7 @@ class McapFile:
         """Create `path`; `offset_ns` turns record times into the log times of the file."""
         self.path, self.records = path, 0
         self._offset_ns = offset_ns
-        self._indexes = _SpooledIndexes(path.parent)
+        self._spool = tempfile.TemporaryFile(dir=path.parent)  # noqa: SIM115 - open as long as the recording is
         self._stream = path.open("xb")
         try:
             self._begin(attachments)
@@ -79,13 +263,12 @@ class McapFile:
             raise
 
     def _begin(self, attachments: Mapping[str, bytes]) -> None:
-        self._writer = Writer(self._stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
-        self._writer._Writer__chunk_indices = self._indexes
+        self._writer = ChunkedWriter(self._stream, self._spool, _CHUNK_BYTES)
         self._writer.start(profile="ros2", library="servod")
-        cycle_schema = self._writer.register_schema(CYCLE_SCHEMA, "ros2msg", ros2msg().encode())
-        event_schema = self._writer.register_schema("servod.Event", "jsonschema", json.dumps(_EVENT_SCHEMA).encode())
-        self._cycle = self._writer.register_channel(CYCLE_TOPIC, "cdr", cycle_schema)
-        self._event = self._writer.register_channel(EVENT_TOPIC, "json", event_schema)
+        cycle_schema = self._writer.add_schema(CYCLE_SCHEMA, "ros2msg", ros2msg().encode())
+        event_schema = self._writer.add_schema("servod.Event", "jsonschema", json.dumps(_EVENT_SCHEMA).encode())
+        self._cycle = self._writer.add_channel(CYCLE_TOPIC, "cdr", cycle_schema)
+        self._event = self._writer.add_channel(EVENT_TOPIC, "json", event_schema)
         self._writer.add_metadata("servod", {"wall_minus_monotonic_ns": str(self._offset_ns)})
         for name, data in attachments.items():
             self.attach(name, data)
@@ -93,21 +276,19 @@ class McapFile:
 
     def attach(self, name: str, data: bytes) -> None:
         """Add one file to the recording; a later one of the same name replaces it for readers."""
-        now_ns = time.time_ns()
-        self._writer.add_attachment(now_ns, now_ns, name, "application/yaml", data)
+        self._writer.add_attachment(time.time_ns(), name, "application/yaml", data)
 
     def write_rows(self, rows: Iterable[bytes]) -> None:
         """Add packed cycle records (RECORD.size bytes each)."""
-        add, channel, offset_ns = self._writer.add_message, self._cycle, self._offset_ns
-        for row in rows:
-            time_ns = int.from_bytes(row[:8], "little") + offset_ns
-            add(channel, time_ns, CDR_HEADER + row, time_ns)
-            self.records += 1
+        offset_ns = self._offset_ns
+        self.records += self._writer.add_messages(
+            self._cycle, ((int.from_bytes(row[:8], "little") + offset_ns, CDR_HEADER + row) for row in rows)
+        )
 
     def write_event(self, event: Mapping[str, Any]) -> None:
         """Add one event; it has at least time_ns (CLOCK_MONOTONIC), kind and text."""
         time_ns = int(event["time_ns"]) + self._offset_ns
-        self._writer.add_message(self._event, time_ns, json.dumps(event).encode(), time_ns)
+        self._writer.add_messages(self._event, [(time_ns, json.dumps(event).encode())])
 
     def sync(self) -> None:
         """Hand everything so far to the kernel: from here on kill -9 cannot take it away."""
@@ -121,7 +302,7 @@ class McapFile:
         """Write index and footer, and close."""
         self._writer.finish()
         self._stream.close()
-        self._indexes.close()
+        self._close_spool()
 
     def abandon(self) -> None:
         """Let go of a file that cannot be written any more; what is in it stays readable."""
@@ -129,7 +310,12 @@ class McapFile:
             self._stream.raw.close()
         with contextlib.suppress(OSError, ValueError):
             self._stream.close()
-        self._indexes.close()
+        self._close_spool()
+
+    def _close_spool(self) -> None:
+        """Let go of the spool; it has no name, so nothing is left."""
+        with contextlib.suppress(OSError):  # a full disk may refuse its last bytes
+            self._spool.close()
 
 
 def split_rows(data: bytes | bytearray | memoryview) -> Iterator[bytes]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
-from servod.kernels.laws import local, pd, pd_dob, pd_lugre, position
+from servod.kernels.laws import local, pd, pd_dob, pd_lugre, position, weights
 from servod.kernels.laws.state import LawState
 
 #: step(p, s, x_ref, v_ref, a_ref, x, v, u_applied, dt) -> (torque, feedback, friction, other), SI units; every law has
@@ -80,6 +80,31 @@ LAWS: dict[str, Law] = {
 }
 
 LAW_BY_NUMBER: dict[int, Law] = {int(law.number): law for law in LAWS.values()}
+
+#: Beside each class of named numbers one of the same names, with a slot for each.
+_SLOTTED: dict[type, type] = {
+    kind: type(kind.__name__, (), {"__slots__": kind._fields})
+    for kind in (
+        *(pd.PdGains, pd_dob.PdDobGains, pd_lugre.PdLugreGains),
+        *(local.LocalGains, weights.Sets, position.PositionTorques),
+    )
+}
+
+
+def in_slots(named: Any) -> Any:
+    """What `Law.named` gave with a slot for each name, as the loop holds it; anything else comes back as it is.
+
+    The interpreter reads a slot five times as fast as a NamedTuple's field, and a step reads up to sixty of them.
+    Compiled kernels take the NamedTuple.
+    """
+    kind = _SLOTTED.get(type(named))
+    if kind is None:
+        return named
+    slotted = kind()
+    for name, value in zip(named._fields, named, strict=True):
+        setattr(slotted, name, in_slots(value))
+    return slotted
+
 
 #: What each law is called where people read it.
 LABELS = {"pd": "PD", "pd_dob": "PD + DOB", "pd_lugre": "PD + LuGre", "local": "Local models"}

@@ -7,9 +7,9 @@ joint coordinates throughout; for a linear axis read N for N*m, m for rad, kg fo
 
 A record goes from kernel to kernel as one pointer, and an inner step takes what it took with flat arrays (41 ns plain,
 136 with every effect). A NamedTuple of 54 floats and 12 tables would go by value, and numba takes 8 to 14 us to accept
-one from Python, where an array takes 0.3; a bare record takes 13, one out of an array of one 0.7. Hence arrays of one
-where calls are short (`compiled.entry`). All kernels together compile within a tenth of the time of flat arrays; with
-such an entry around every one of them it was a quarter more.
+one from Python, where an array takes 0.1; a bare record takes 13, one out of an array of one 0.15. Hence one record of
+both, in an array of one, where calls are short (`PlantRecord`, `compiled.entry`). All kernels together compile within a
+tenth of the time of flat arrays; with such an entry around every one of them it was a quarter more.
 """
 
 from __future__ import annotations
@@ -129,3 +129,10 @@ class PlantState:
     first_s: float = 0.0  # time of the first step: drifts count from here, t_s of a recording may count from 1970
     friction: float = 0.0  # friction torque of the last step
     head: int = 0  # where the delay line is written next
+
+
+class PlantRecord(NamedTuple):
+    """Parameters and state as one record, which a kernel that is called from Python takes (`compiled.entry`)."""
+
+    p: PlantParameters
+    s: PlantState

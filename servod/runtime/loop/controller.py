@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from servod.kernels.laws import LAW_BY_NUMBER, LAWS, Law
+from servod.kernels.laws import LAW_BY_NUMBER, LAWS, Law, in_slots
 from servod.kernels.laws.state import LawState
 
 #: Time constant of the additive offset that makes a change of controller bumpless [s].
@@ -32,7 +32,7 @@ class Controller:
     def __init__(self, bumpless_time_s: float = BUMPLESS_TIME_S) -> None:
         self._bumpless_time_s = bumpless_time_s
         self._law = LAWS["pd"]
-        self._parameters = self._law.named((0.0,) * self._law.n_parameters)
+        self._parameters = in_slots(self._law.named((0.0,) * self._law.n_parameters))
         self._state = LawState()
         self._offset_nm = 0.0
         self._hand_over_nm: float | None = None
@@ -62,7 +62,7 @@ class Controller:
         law = LAW_BY_NUMBER.get(law_number)
         if law is None or not law.accepts(parameters):
             return False
-        named = law.named(tuple(float(value) for value in parameters))
+        named = in_slots(law.named(tuple(float(value) for value in parameters)))
         state = LawState(z_hat=self._carried_friction_state(law, named), asked=torque_now_nm)
         if law is self._law and math.isfinite(self._state.d_hat):
             state.d_hat = self._state.d_hat

@@ -12,6 +12,7 @@ from servod.kernels.laws.position import PositionTorques
 from servod.kernels.laws.state import STATES, LawState
 from servod.kernels.laws.weights import Shape
 from servod.kernels.physics.compiled import arrays, compiled, record
+from servod.kernels.physics.layout import PlantParameters, PlantRecord, PlantState
 from tests.kernels.laws.cases import GAINS, PARAMETERS, local_parameters
 
 CASES = {
@@ -49,6 +50,21 @@ def test_a_record_is_one_memory_seen_from_both_sides() -> None:
     names.d_hat = 0.5
     memory["asked"] = 0.125
     assert (memory["z_hat"][0], memory["d_hat"][0], names.asked, names.rest) == (0.25, 0.5, 0.125, 1.0)
+
+
+def test_parameters_and_state_of_a_plant_are_one_record() -> None:
+    """What numba takes for each array at a call is most of what a short call takes."""
+    names, memory = record(PlantRecord(PlantParameters(inertia=0.5, cogging_n=3), PlantState(velocity=0.25, head=7)))
+    assert (names.p.inertia, names.p.cogging_n, names.s.velocity, names.s.head) == (0.5, 3, 0.25, 7)
+    state = names.s
+    memory["s"]["bristle"] = 1e-4
+    state.friction = 0.125
+    assert (state.bristle, memory["s"]["friction"][0], memory.shape) == (1e-4, 0.125, (1,))
+
+
+def test_records_of_a_kind_share_their_dtype() -> None:
+    """At every call numba compares the dtypes of records unless they are one object."""
+    assert record(LawState()).memory.dtype is record(LawState(z_hat=1.0)).memory.dtype
 
 
 def test_position_goes_flat_and_back() -> None:

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import inspect
 import itertools
 import math
+from dataclasses import astuple, replace
+from typing import Any
 
 import pytest
 
-from servod.kernels.laws import LAWS, MAX_PARAMETERS, MAX_SETS, LawNumber, local
+from servod.kernels.laws import LAW_BY_NUMBER, LAWS, MAX_PARAMETERS, MAX_SETS, LawNumber, in_slots, local
+from servod.kernels.laws.position import PositionTorques
+from servod.kernels.laws.state import LawState
 from servod.runtime.loop.controller import BUMPLESS_TIME_S, Controller
-from tests.kernels.laws.cases import PARAMETERS, SIGMA0, local_gains, local_parameters
+from tests.kernels.laws.cases import GAINS, PARAMETERS, SIGMA0, local_gains, local_parameters
 
 DT = 0.001
 
@@ -124,3 +129,41 @@ def test_registry_numbers_are_stable_and_sizes_bounded() -> None:
     nodes = tuple(-1.0 + k / 32 for k in range(MAX_SETS))
     assert len(local_parameters(nodes)) <= MAX_PARAMETERS
     assert LAWS["local"].accepts(local_parameters(nodes))
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_the_loop_reads_every_parameter_from_a_slot(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[Any] = []
+
+    def step(p: Any, *rest: Any) -> tuple[float, float, float, float]:
+        seen.append(p)
+        return 0.0, 0.0, 0.0, 0.0
+
+    law = replace(LAWS[name], step=step)
+    monkeypatch.setitem(LAW_BY_NUMBER, int(law.number), law)
+    controller = Controller()
+    assert controller.activate(law.number, PARAMETERS[name], 0.0)
+    controller.step(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, DT)
+    pairs = [(seen[0], GAINS[name])]
+    if name == "local":
+        pairs += [(getattr(seen[0], field), getattr(GAINS[name], field)) for field in ("sets", "position")]
+    for slotted, named in pairs:
+        assert not hasattr(slotted, "__dict__")
+        assert all(inspect.ismemberdescriptor(getattr(type(slotted), field)) for field in named._fields)
+        plain = [field for field in named._fields if field not in ("sets", "position")]
+        assert [getattr(slotted, f) for f in plain] == [getattr(named, f) for f in plain]
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_slots_change_no_bit(name: str) -> None:
+    named = GAINS[name]
+    if name == "local":
+        known = PositionTorques(lead=0.001, spring=0.2, waves=(0.1, 36.0, 0.2))
+        named = named._replace(knows_position=True, position=known)
+    slotted, states = in_slots(named), (LawState(), LawState())
+    for k in range(500):
+        v = 0.7 * math.sin(0.03 * k) ** 3
+        arguments = (math.sin(0.01 * k), math.cos(0.01 * k), -v, math.sin(0.01 * k) - 1e-3 * v, v, states[0].asked, DT)
+        step = LAWS[name].step
+        assert step(slotted, states[0], *arguments) == step(named, states[1], *arguments)
+    assert astuple(states[0]) == astuple(states[1])

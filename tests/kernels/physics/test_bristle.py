@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from servod.kernels.physics.friction import bristle_step, coulomb_step, stribeck_curve
+from servod.kernels.physics.plant import INNER_STEP_S, delay_line
 from tests.kernels.physics.models import g, joint, plant, states
 
 
@@ -151,4 +152,4 @@ def test_delay_line_delays_by_any_time() -> None:
         axis = plant(joint(friction={"kind": "coulomb_viscous"}, delay_s=delay))
         axis.advance(0.01, 0.05)
         assert axis.velocity_rad_s == pytest.approx(0.01 / 0.001 * (0.05 - delay), rel=1e-9)
-        assert len(axis._line) == math.ceil(delay / 5e-5 + 1e-9) + 2
+        assert len(delay_line(delay, INNER_STEP_S)) == math.ceil(delay / 5e-5 + 1e-9) + 2

@@ -74,6 +74,19 @@ def test_compiled_is_pure_python(model: AxisModel) -> None:
         assert fast.motor_velocity_rad_s == pytest.approx(slow.motor_velocity_rad_s, rel=1e-7, abs=1e-10)
 
 
+@pytest.mark.parametrize("compile_kernel", [False, True])
+def test_a_delay_of_the_plants_own_stands_for_the_models(compile_kernel: bool) -> None:
+    whole, part, plain = (
+        Plant(joint(delay_s=model_s), 3, delay_s=own_s, compile_kernel=compile_kernel)
+        for model_s, own_s in ((0.003, 0.00112), (0.00112, None), (0.003, None))
+    )
+    for k in range(200):
+        for axis in (whole, part, plain):
+            axis.advance(0.1 * math.sin(0.05 * k), 1e-3)
+        assert whole.encoder_position_rad == part.encoder_position_rad == part.motor_position_rad
+    assert plain.encoder_position_rad != part.encoder_position_rad
+
+
 DRY = {"coulomb": 0.045, "viscous": 0.056}
 FRICTIONS: dict[str, dict[str, Any]] = {
     "lugre": LUGRE,

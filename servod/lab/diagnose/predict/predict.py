@@ -49,8 +49,8 @@ def without_lock(function: Kernel) -> Kernel:
 
     kernel = compiled(function)
 
-    def call(p: Any, tables: Any, s: Any, *rest: Any) -> None:
-        kernel(p[0], tables, s[0], *rest)
+    def call(axis: Any, tables: Any, *rest: Any) -> None:
+        kernel(axis[0].p, tables, axis[0].s, *rest)
 
     outer: Kernel = numba.njit(nogil=True)(call)
     return outer
