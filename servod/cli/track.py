@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, connect, example, report
-from servod.common.errors import AnswerIsNo
+from servod.common.errors import AnswerIsNo, BadInput
 
 if TYPE_CHECKING:
     from servod.client.control import ControlClient
@@ -62,6 +62,11 @@ def paper(
     as_json: JsonOption = False,
 ) -> None:
     """Track trajectory (19)."""
+    from servod.kernels.motions import PAPER_LONGEST_S
+
+    if duration > PAPER_LONGEST_S:
+        allowed = f"at most {PAPER_LONGEST_S:.6g} s, where the envelope of (19) ends"
+        raise BadInput("--duration", f"{duration:g} s", allowed)
     _track(socket, {"kind": "paper", "duration_s": duration}, duration, wait, as_json)
 
 

@@ -9,6 +9,7 @@ servod.runtime.daemon.control_server.
 
 from __future__ import annotations
 
+import math
 import socket
 import struct
 from collections.abc import Iterator, Sequence
@@ -119,7 +120,8 @@ class ControlClient:
         try:
             line = encode_line({"id": self._id, "verb": str(verb), "args": args})
         except ValueError:
-            raise BadInput(f"{verb}", "a number that is not finite", "finite numbers") from None
+            key, found = next(_not_finite(args), ("", "a number that is not finite"))
+            raise BadInput(f"{verb}{key}", found, "finite numbers") from None
         if len(line) > MAX_LINE_BYTES:
             raise BadInput(f"{verb}", f"{len(line)} bytes", f"at most {MAX_LINE_BYTES} bytes in a request")
         try:
@@ -145,6 +147,13 @@ class ControlClient:
             return decode_line(line)
         except ValueError as error:
             raise Unreachable(f"{self._path}: answers with something else than servod would ({error})") from None
+
+
+def _not_finite(args: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """Key and value of each argument that JSON has no number for."""
+    for key, value in args.items():
+        samples = value if isinstance(value, list | tuple) else [value]
+        yield from ((f": {key}", str(x)) for x in samples if isinstance(x, float) and not math.isfinite(x))
 
 
 def _why(error: OSError) -> str:
