@@ -27,6 +27,8 @@ _HELP = example(
     "servoctl faults --codes",
 )
 _FOLDER = Path("/var/lib/servod/recordings")
+#: The way on without a daemon.
+_OTHER_FOLDER = "another one: --config AXIS.yaml, or --recordings FOLDER"
 
 
 class _Asked(NamedTuple):
@@ -115,7 +117,8 @@ def _of_axis(asked: _Asked) -> dict[str, Any]:
         now = [fault["code"] for fault in ask(asked.socket, Verb.STATUS)["faults"]]
     except Unreachable as error:
         if not (asked.folder or _FOLDER).is_dir():
-            raise Unreachable(f"{error} And there is no folder of recordings, {asked.folder or _FOLDER}.") from None
+            nowhere = f"And there is no folder of recordings, {asked.folder or _FOLDER}"
+            raise Unreachable(f"{error} {nowhere}; {_OTHER_FOLDER}") from None
         return _of_folder(asked) | {"daemon": str(error)}
     rows: list[dict[str, Any]] = told["incidents"][::-1][: asked.most]
     folder = Path(told["directory"])
@@ -159,7 +162,7 @@ def _document(
 
 def _print(document: dict[str, Any]) -> None:
     if "daemon" in document:
-        print(f"{document['daemon']} From the fault files in {document['folder']}:")
+        print(f"{document['daemon']} From the fault files in {document['folder']} ({_OTHER_FOLDER}):")
     if document["now"]:
         print(f"latched now: {', '.join(document['now'])}")
     for row in document["incidents"]:

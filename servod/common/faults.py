@@ -134,7 +134,8 @@ FAULTS: dict[FaultCode, Fault] = dict(
             _C.ENCODER_ALARM,
             _R.DISABLE,
             "The encoder reports an alarm (CiA 406, 0x6503), or its alarm word comes no more.",
-            "Read 0x6503 with `servoctl status`; check supply and mounting of the encoder.",
+            "Check supply and mounting of the encoder; its EMCY is in the journal, and a daemon that starts while the "
+            "alarm stays names the alarm word (0x6503).",
         ),
         _row(
             _C.FEEDBACK_STALE,
@@ -243,7 +244,8 @@ FAULTS: dict[FaultCode, Fault] = dict(
         _row(
             _C.LOOP_LOST,
             _R.DISABLE,
-            "The loop process died; the drive stops by its own heartbeat consumer (0x1016).",
+            "The loop process died or hung; the supervisor switched the drive off. A drive that it does not reach "
+            "stops by its own heartbeat consumer (0x1016).",
             "See the journal and the pre-fault recording; restart the service.",
         ),
         _row(

@@ -166,6 +166,7 @@ def test_the_first_cause_is_the_strongest_of_its_cycle() -> None:
     ("words", "code", "line"),
     [
         (["--socket", "none"], 3, "there is no folder of recordings"),
+        (["--socket", "none"], 3, "another one: --config AXIS.yaml, or --recordings FOLDER"),
         (["--recordings", "none"], 2, "none: there is no such folder"),
         (["--codes", "--journal", "x"], 2, "--codes: found beside --journal"),
         (["--recordings", "a", "--journal", "x"], 2, "--journal: found beside --recordings"),
@@ -181,6 +182,15 @@ def test_nowhere_to_look_is_one_line(
     assert run(["faults", *words]) == code
     (shown,) = capsys.readouterr().err.splitlines()
     assert line in shown
+
+
+def test_where_no_daemon_answers_the_folder_that_is_read_is_named_and_how_to_name_another(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("servod.cli.faults._FOLDER", folder)
+    assert run(["faults", "--socket", str(folder / "none")]) == 0
+    first, *_ = capsys.readouterr().out.splitlines()
+    assert "no daemon answers" in first and f"fault files in {folder} (another one: --config AXIS.yaml" in first
 
 
 @pytest.mark.parametrize("name", ["soak", "paper"])
