@@ -137,7 +137,12 @@ def test_no_daemon_is_a_document(words: list[str], tmp_path: Path, capsys: pytes
 
 def test_no_such_verb_is_a_document(capsys: pytest.CaptureFixture[str]) -> None:
     assert told(["dance", "--json"], 2, capsys)["code"] == "usage"
-    assert told(["preset", "axis.yaml", "--json"], 2, capsys)["where"] == "--json"
+    assert told(["preset", "axis.yaml", "--json"], 2, capsys)["where"] == "--position-rad"
+
+
+def test_every_verb_has_json() -> None:
+    groups = {path[:-1] for path in COMMANDS}
+    assert set(COMMANDS) - set(WITH_JSON) <= groups
 
 
 def test_what_nobody_foresaw_is_a_document_and_a_trace(
