@@ -1,6 +1,6 @@
 """How a command ends that does not do what it was asked: one line on standard error, one document under `--json`.
 
-The document is `{"error": {"code": ..., "exit_code": ..., "message": ..., "where": ..., "found": ..., "allowed": ...}}`,
+The document is `{"error": {"code", "exit_code", "message", "where", "found", "allowed"}}`,
 the last three null where they are not known. A command whose answer is "no" and that has printed its own document
 already prints no second one.
 """
