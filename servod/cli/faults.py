@@ -136,11 +136,17 @@ def _told(row: dict[str, Any], rows: list[dict[str, Any]]) -> bool:
 
 
 def _read(folder: Path, axis: str | None, most: int, known: set[str]) -> tuple[list[dict[str, Any]], list[str]]:
-    """The newest incidents of the fault files, and which of these cannot be read and why."""
-    from servod.formats.recording.incidents import fault_files, newest, of_file
+    """The newest incidents of fault files and marks of runs, and which of these cannot be read and why."""
+    from servod.formats.recording.incidents import fault_files, marks, newest, of_file, of_mark
 
     found: list[Incident] = []
+    ends: list[Incident] = []
     unread: list[str] = []
+    for path in marks(folder, axis):
+        try:
+            ends += of_mark(path)
+        except BadInput as error:
+            unread.append(str(error))
     for path in fault_files(folder, axis):
         if len(found) >= most:
             break
@@ -150,7 +156,7 @@ def _read(folder: Path, axis: str | None, most: int, known: set[str]) -> tuple[l
             found += of_file(path)
         except BadInput as error:
             unread.append(str(error))
-    return [incident.document() for incident in newest(found, most)], unread
+    return [incident.document() for incident in newest([*found, *ends], most)], unread
 
 
 def _document(

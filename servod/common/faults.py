@@ -53,6 +53,7 @@ class FaultCode(IntEnum):
     SECOND_MASTER = 28
     WIRING_NOT_PROVEN = 29
     NODE_LEFT_OPERATIONAL = 30
+    DAEMON_LOST = 31
 
 
 #: Faults after which the nodes are not as they were configured: only a new bring-up may enable the axis again.
@@ -288,6 +289,13 @@ FAULTS: dict[FaultCode, Fault] = dict(
             "A node left the NMT state operational: somebody sent it an NMT command, or it did so by itself.",
             "Find who sends NMT commands (another master, a service tool), switch a stopped node off and on, then "
             "restart the daemon.",
+        ),
+        _row(
+            _C.DAEMON_LOST,
+            _R.NONE,
+            "servod ended without an orderly stop: it was killed, it crashed, or the machine lost its power. Loop and "
+            "drive stopped the axis by themselves.",
+            "See the journal of that time (`journalctl -u 'servod@*'`), and look at the axis before it is enabled.",
         ),
     ]
 )

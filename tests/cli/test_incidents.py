@@ -16,6 +16,7 @@ from servod.cli.app import run
 from servod.common.faults import FAULTS, FaultCode
 from servod.formats.config import RecorderConfig
 from servod.formats.recording.incidents import Incident, Seen
+from servod.formats.recording.run_mark import RunMark
 from servod.runtime.daemon.fault_watch import FaultWatch
 from servod.runtime.daemon.health import Health
 from servod.runtime.daemon.metrics import AxisMetrics
@@ -94,6 +95,22 @@ def test_a_file_that_cannot_be_read_hides_no_other(folder: Path, capsys: pytest.
     (folder / "joint-20260101-000000.mcap").write_bytes(b"a recording, no fault file")
     document = told(["--recordings", str(folder)], capsys)
     assert len(document["incidents"]) == 1 and str(broken) in document["not_read"][0]
+
+
+def test_a_run_without_an_orderly_end_is_among_what_happened(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As after kill -9: nobody ends the mark, and nobody holds it."""
+    for axis in ("joint", "other"):
+        with pytest.raises(ZeroDivisionError), RunMark(folder, axis):
+            raise ZeroDivisionError
+    (folder / "damaged.run.json").write_text("{")
+    document = told(["--recordings", str(folder)], capsys)
+    assert sorted((row["axis"], row["code"]) for row in document["incidents"]) == [
+        ("joint", "DAEMON_LOST"), ("joint", "FOLLOWING_ERROR"), ("other", "DAEMON_LOST"),
+    ]  # fmt: skip
+    assert "damaged.run.json" in document["not_read"][0]
+    assert run(["faults", "--recordings", str(folder)]) == 0
+    shown = capsys.readouterr().out
+    assert shown.count("servod ended without an orderly stop") == 2 and "[between 20" in shown
 
 
 def test_no_fault_is_an_answer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

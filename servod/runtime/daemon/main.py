@@ -20,6 +20,8 @@ from servod.common.yaml import read_text
 from servod.formats.config import AxisConfig, load_config
 from servod.formats.gains.gain_set import load_gains, require_fit
 from servod.formats.model.axis_model import load_axis_model
+from servod.formats.recording.incidents import of_abrupt_end
+from servod.formats.recording.run_mark import RunMark
 from servod.formats.wiring import warnings, with_expected
 from servod.runtime.daemon.gain_bank import GainBank
 from servod.runtime.daemon.lock import InstanceLock
@@ -68,6 +70,7 @@ def run(path: Path, on_ready: Callable[[Supervisor], None]) -> int:
     config = check(path)
     with ExitStack() as stack:
         stack.callback(InstanceLock(config).release)
+        mark = stack.enter_context(RunMark(config.recorder.directory, config.name))
         _leave_core_to_loop(config.cycle.cpu)
         sys.setswitchinterval(_SWITCH_S)
         bank = GainBank(config)
@@ -80,6 +83,8 @@ def run(path: Path, on_ready: Callable[[Supervisor], None]) -> int:
             log.info("%s", line)
         with ExitStack() as undo:
             supervisor = _supervise(config, Nodes(master, plans), bank, recorder, undo)
+            if mark.found is not None:
+                supervisor.tell_earlier(of_abrupt_end(mark.found, config.name))
             on_ready(supervisor)
             undo.pop_all()
         return supervisor.run()
