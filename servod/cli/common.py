@@ -206,6 +206,7 @@ def report(result: dict[str, Any], done: str, as_json: bool) -> None:
         print(done)
 
 
+# --- Progress --------------------------------------------------------------------------------------------------------
 # One progress bar over a whole command, on standard error, so that standard output stays what was asked for.
 
 

@@ -165,6 +165,7 @@ def print_document(rows: Sequence[DemoRow], document: dict[str, Any]) -> None:
     console.print(f"Report: {document['report']}", highlight=False, soft_wrap=True)
 
 
+# --- The story of a concealed effect ---------------------------------------------------------------------------------
 # `servoctl demo --diagnose`: the story of an effect that was concealed, from its cost to its cure, in one command.
 
 

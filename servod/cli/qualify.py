@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from servod.qualify.faults.run import Outcome
     from servod.qualify.faults.scenario import Scenario
 
+# --- The paper -------------------------------------------------------------------------------------------------------
 # `servoctl qualify paper`: the paper's figures and numbers from this software on the virtual axis, and what agrees.
 
 
@@ -81,6 +82,7 @@ def print_document(document: dict[str, Any], out: Path) -> None:
     print(f"Page: {out / 'paper.html'}; table and statements: {out / 'paper.md'}; pictures: {out / 'pictures'}")
 
 
+# --- The soak --------------------------------------------------------------------------------------------------------
 # `servoctl qualify soak`: hours of random moves and faults on the virtual axis, with every cycle accounted for.
 
 

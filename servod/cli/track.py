@@ -127,14 +127,14 @@ def _run(client: ControlClient, motion: dict[str, Any], tell: Tell) -> dict[str,
     with sigterm_as_interrupt():
         try:
             result = client.call("track", **motion)
-            _wait_for_end(client, tell)
+            _wait_until_over(client, tell)
         except KeyboardInterrupt:
             client.call("stop")
             raise
     return result
 
 
-def _wait_for_end(client: ControlClient, tell: Tell) -> None:
+def _wait_until_over(client: ControlClient, tell: Tell) -> None:
     """Poll until the motion is over."""
     started = time.monotonic()
     while True:

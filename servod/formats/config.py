@@ -15,9 +15,9 @@ from pydantic import Field, model_validator
 from servod.common.yaml import Strict
 from servod.formats.kinds import FileKind, load_kind
 
-# The part of the axis configuration that says what is on the wire: bus, cycle, heartbeats, amplifier and encoder.
-#
-# Every key states its meaning, unit, sense and what holds when it is left out: `servoctl config keys` prints them.
+# --- What is on the wire ---------------------------------------------------------------------------------------------
+# The part of the axis configuration that says what is on the wire: bus, cycle, heartbeats, amplifier and encoder. Every
+# key states its meaning, unit, sense and what holds when it is left out: `servoctl config keys` prints them.
 
 
 NodeId = Annotated[int, Field(ge=1, le=127, description="CANopen node id, 1 to 127")]

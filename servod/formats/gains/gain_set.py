@@ -27,9 +27,8 @@ from servod.formats.kinds import FileKind, require_kind
 from servod.formats.model.axis_model import load_axis_model
 from servod.kernels.laws import LAWS, Law
 
+# --- The verdict on a set --------------------------------------------------------------------------------------------
 # Whether a gain set counts as certified, and if not: which key says so, what stands there, and what helps.
-#
-# Beside servod.formats.gains.gain_set, which every refusal of a set comes from.
 
 
 class GainFault(NamedTuple):

@@ -270,10 +270,9 @@ def rotary(model: AxisModel, where: str) -> AxisModel:
     return model
 
 
-# Turns an axis model into the parameters of the physics kernels (`servod.kernels.physics.layout`).
-#
-# Stands between `servod.formats.model.axis_model` (what is in the file) and `servod.kernels.physics` (what is
-# computed); off the control path.
+# --- Parameters of the kernels ---------------------------------------------------------------------------------------
+# Turns an axis model into the parameters of the physics kernels (`servod.kernels.physics.layout`). Off the control
+# path.
 
 
 #: Friction torque below which the bristle equation divides by nothing sensible; far under any real joint's.

@@ -22,9 +22,9 @@ from servod.qualify.bench import wall_clock as wall
 if TYPE_CHECKING:
     from rich.console import Console
 
-# How long the laboratory takes: synthesis of both regions, a certificate, and a whole commissioning.
-#
-# Beside the figures of the loop; each on Table I's joint, the axis model that ships.
+# --- The laboratory --------------------------------------------------------------------------------------------------
+# How long the laboratory takes: synthesis of both regions, a certificate, and a whole commissioning. Each on Table I's
+# joint, the axis model that ships.
 
 
 PROCESSES = 2
@@ -128,6 +128,7 @@ def machine() -> dict[str, Any]:
     return {"cpu": model, "cores": cores, "kernel": platform.release(), "python": sys.version.split()[0]}
 
 
+# --- The table -------------------------------------------------------------------------------------------------------
 # The benchmark's figures as a table beside what they shall reach, and as a file.
 
 

@@ -126,9 +126,9 @@ class FaultWatch:
             self._file_due_ns = 0
 
 
-# Tells how each test of the wiring ended: a line in the journal, an event in the recording, a part of the status.
-#
-# Around the loop, beside the watch over faults, whose table has no room for what was measured.
+# --- The test of the wiring ------------------------------------------------------------------------------------------
+# Tells how each test of the wiring ended: a line in the journal, an event in the recording, a part of the status. The
+# table of faults has no room for what was measured.
 
 
 wiring_log = logging.getLogger("servod.wiring")

@@ -1,4 +1,9 @@
-"""The program `servod --config axis.yaml`: arguments, signals, exit codes. Started by systemd, or by hand to try it."""
+"""The program `servod --config axis.yaml`: from a configuration file to a supervised axis, and back again in reverse.
+
+Started by systemd, or by hand to try it; above the supervisor. The order is: read and check every file, take the locks,
+reach the bus, bring the nodes up, start the loop, open the sockets. What fails says so in one line, and nothing that
+was begun is left behind. Arguments, signals, exit codes and log lines stand here as well.
+"""
 
 from __future__ import annotations
 
@@ -35,12 +40,6 @@ from servod.runtime.fieldbus.master import Master
 from servod.runtime.fieldbus.master.planned import check_names, planned_bus_load
 from servod.runtime.loop.handle import LoopHandle
 from servod.runtime.loop.plan import LoopPlan
-
-# From a configuration file to a supervised axis, step by step, and back again in reverse whatever happens.
-#
-# Around the loop; runs once. The order is: read and check every file, take the locks, reach the bus, bring the nodes
-# up, start the loop, open the sockets. What fails says so in one line, and nothing that was begun is left behind.
-
 
 log = logging.getLogger("servod")
 
@@ -155,6 +154,7 @@ def _master_ids(config: AxisConfig) -> tuple[int, ...]:
     return tuple(base + node.node_id for node in (config.amplifier, config.encoder) for base in bases)
 
 
+# --- The journal -----------------------------------------------------------------------------------------------------
 # Log lines for the journal: to standard error, with systemd's level prefix where the journal reads it.
 
 
