@@ -22,7 +22,7 @@ from pydantic import Field
 
 from servod.common.errors import BadInput, ServodError
 from servod.common.files import open_file, reason, require_size, unreadable
-from servod.common.portable import flush_folder, lock_file
+from servod.common.portable import flush_folder, is_locked, lock_file
 from servod.common.yaml import Strict, validate
 
 log = logging.getLogger("servod")
@@ -156,7 +156,7 @@ def _read(path: Path, now_ns: int) -> _Told:
             mark = validate(json.loads(stream.read()), _Mark, str(path))
             if mark.running_since_ns is None:
                 return _Told(mark.abrupt_ends)
-            if _is_held(stream.fileno()):
+            if is_locked(stream.fileno()):
                 return _Told(mark.abrupt_ends, alive=True)
             seen_ns = max(mark.running_since_ns, os.fstat(stream.fileno()).st_mtime_ns)
     except OSError as error:
@@ -164,13 +164,3 @@ def _read(path: Path, now_ns: int) -> _Told:
     except ValueError as error:
         raise BadInput(str(path), f"no JSON document ({error})", _ALLOWED) from None
     return _Told(mark.abrupt_ends, AbruptEnd(seen_ns=seen_ns, found_ns=max(seen_ns, now_ns)))
-
-
-def _is_held(descriptor: int) -> bool:
-    """Whether a process has the file locked; asking takes the lock for a moment, of a file that nobody locks again."""
-    with open(descriptor, closefd=False, encoding="utf-8") as stream:
-        try:
-            lock_file(stream, wait=False)
-        except OSError:
-            return True
-    return False

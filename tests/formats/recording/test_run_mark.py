@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from servod.common.errors import BadInput, Unreachable
+from servod.common.portable import is_locked
 from servod.formats.recording import run_mark
 from servod.formats.recording.run_mark import MOST_ENDS, AbruptEnd, RunMark, abrupt_ends
 
@@ -127,6 +128,15 @@ def test_two_axes_of_one_name_do_not_tell_of_one_another(tmp_path: Path, caplog:
             assert second.found is None and "another servod holds it" in caplog.text
         assert json.loads(file_of(tmp_path).read_text())["running_since_ns"] is not None
     assert ends(tmp_path) == []
+
+
+def test_two_who_look_at_once_do_not_take_one_another_for_the_daemon(tmp_path: Path) -> None:
+    killed(tmp_path)
+    with file_of(tmp_path).open() as other:
+        assert not is_locked(other.fileno())  # it looks, and has not closed the file
+        assert len(ends(tmp_path)) == 1
+        with RunMark(tmp_path, "joint") as mark:
+            assert mark.found is not None
 
 
 def test_a_clock_that_was_set_back_gives_no_negative_time(tmp_path: Path) -> None:
