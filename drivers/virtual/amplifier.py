@@ -21,9 +21,9 @@ from servod.drivers.virtual.timeline import Timeline
 from servod.runtime.fieldbus.cia import Abort, Emcy, Obj402
 from servod.runtime.fieldbus.devices import DriveState, Mode
 
-# What makes the amplifier fault by itself, and whether the cause is gone: supply, STO, temperature, on demand.
-#
-# Beside the power machine. The objects 0x2000 are the vendor's: they put causes into the drive for trying.
+# --- Causes of faults ------------------------------------------------------------------------------------------------
+# What makes the amplifier fault by itself, and whether the cause is gone: supply, STO, temperature, on demand. The
+# objects 0x2000 are the vendor's: they put causes into the drive for trying.
 
 
 UNDER_VOLTAGE, OVER_VOLTAGE, SAFE_TORQUE_OFF, MOTOR_TEMPERATURE = 0x3220, 0x3210, 0x5441, 0x4310

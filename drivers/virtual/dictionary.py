@@ -248,9 +248,9 @@ def _variables(eds: Path) -> tuple[ODVariable, ...]:
     return tuple(variable for group in items for variable in group)
 
 
-# Store and restore of a node's parameters: 0x1010 and 0x1011 (CiA 301, 7.5.2.13 and 7.5.2.14).
-#
-# Beside the node's services. What is stored survives resets of the node, as long as its process lives.
+# --- Store and restore -----------------------------------------------------------------------------------------------
+# Store and restore of a node's parameters: 0x1010 and 0x1011 (CiA 301, 7.5.2.13 and 7.5.2.14). What is stored survives
+# resets of the node, as long as its process lives.
 
 
 SAVE, LOAD = 0x65766173, 0x64616F6C  # "save", "load"

@@ -18,9 +18,9 @@ from servod.drivers.virtual.port import ErrorState, Port
 from servod.drivers.virtual.timeline import NEVER, Timeline
 from servod.runtime.fieldbus.bus import CAN_EFF_FLAG, CAN_RTR_FLAG
 
-# Faults that hit single frames: what becomes of the next frames with an identifier.
-#
-# Asked by the hub for each frame that ends, while a fault is armed or a frame is held back.
+# --- Faults of single frames -----------------------------------------------------------------------------------------
+# Faults that hit single frames: what becomes of the next frames with an identifier. Asked by the hub for each frame
+# that ends, while a fault is armed or a frame is held back.
 
 
 _NS_PER_TENTH_MS = 100_000
@@ -133,10 +133,10 @@ def _flipped(data: bytes, bit: int) -> bytes:
     return number.to_bytes(len(data), "little")
 
 
-# How long a frame takes on the wire, and who wins arbitration (ISO 11898-1).
-#
-# Used by the hub. Lengths take the worst case of bit stuffing, from a table by data length, because counting the stuff
-# bits of every frame would cost more than everything else that the hub does; a bus that fits here fits in reality.
+# --- Frames on the wire ----------------------------------------------------------------------------------------------
+# How long a frame takes on the wire, and who wins arbitration (ISO 11898-1). Lengths take the worst case of bit
+# stuffing, from a table by data length, because counting the stuff bits of every frame would cost more than everything
+# else that the hub does; a bus that fits here fits in reality.
 
 
 #: Bits of a base-format data frame with n data bytes: 8n+47 (with interframe space) and the stuff bits of 34+8n bits.

@@ -37,10 +37,10 @@ from servod.formats.model.axis_model import AxisModel, load_rotary_model
 from servod.runtime.fieldbus.bus import CAN_ERR_BUSOFF, CAN_ERR_CRTL, CAN_ERR_FLAG, CAN_ERR_RESTARTED, CAN_FRAME, Bus
 from servod.runtime.fieldbus.bus.open import open_bus
 
-# The hub on a Unix socket: accepts clients, carries their frames, on the wall clock, in one thread.
-#
-# The other half of a 1 kHz loop in another process, so the way from a SYNC packet to the TPDO packets is short: one
-# select, one receive, the event loop of the world, one send for each receiver.
+# --- The hub on a socket ---------------------------------------------------------------------------------------------
+# The hub on a Unix socket: accepts clients, carries their frames, on the wall clock, in one thread. The other half of a
+# 1 kHz loop in another process, so the way from a SYNC packet to the TPDO packets is short: one select, one receive,
+# the event loop of the world, one send for each receiver.
 
 
 _CRTL_RX_OVERFLOW, _CRTL_TX_PASSIVE, _CRTL_ACTIVE = 0x01, 0x20, 0x40
@@ -222,9 +222,9 @@ def _served(path: Path) -> bool:
         return probe.connect_ex(str(path)) == 0
 
 
-# The same nodes on SocketCAN (vcan or a real interface): no hub, the kernel's bus carries the frames.
-#
-# Each node has its own raw socket, as two devices on one wire have their own controllers.
+# --- The nodes on SocketCAN ------------------------------------------------------------------------------------------
+# The same nodes on SocketCAN (vcan or a real interface): no hub, the kernel's bus carries the frames. Each node has its
+# own raw socket, as two devices on one wire have their own controllers.
 
 
 _LONGEST_WAIT_S = 0.1

@@ -18,10 +18,10 @@ from servod.drivers.virtual.timeline import Timeline
 from servod.runtime.fieldbus.cia import Obj402
 from servod.runtime.fieldbus.devices import Mode
 
-# The amplifier's own inner loops: velocity control, position control, set-point profile, braking.
-#
-# Used outside cyclic synchronous torque: in csv, csp and pp, and for every stop that the drive makes by itself. They
-# run on the drive's servo tick, in SI units of the joint.
+# --- The inner loops -------------------------------------------------------------------------------------------------
+# The amplifier's own inner loops: velocity control, position control, set-point profile, braking. Used outside cyclic
+# synchronous torque: in csv, csp and pp, and for every stop that the drive makes by itself. They run on the drive's
+# servo tick, in SI units of the joint.
 
 
 TICK_NS = 500_000
@@ -108,10 +108,10 @@ class Profile:
         return self.position_rad == self.target_rad or abs(self.target_rad - self.position_rad) < 1e-9
 
 
-# The amplifier's own torque limits, in the order of the standard, and its motor protection.
-#
-# Between the torque demand of any mode and the power stage. Everything in per mille of rated torque; torque and current
-# are taken as proportional, as in a synchronous motor below field weakening.
+# --- Torque limits and motor protection ------------------------------------------------------------------------------
+# The amplifier's own torque limits, in the order of the standard, and its motor protection. Between the torque demand
+# of any mode and the power stage. Everything in per mille of rated torque; torque and current are taken as
+# proportional, as in a synchronous motor below field weakening.
 
 
 RATED_PERMILLE = 1000

@@ -16,10 +16,10 @@ from servod.drivers.virtual.emergency import Emergency
 from servod.drivers.virtual.timeline import Timeline
 from servod.runtime.fieldbus.cia import PDO_NO_RTR, PDO_NOT_VALID, Abort, Emcy, Obj301
 
-# What may be written to PDO parameters and mappings, and when (CiA 301, 7.5.2.35 to 7.5.2.38).
-#
-# Hooks into the dictionary's entries 0x1400 to 0x1BFF. The order is forced: PDO not valid, sub 0 of the mapping to
-# zero, entries, sub 0, PDO valid; anything else is refused with the abort code that the standard or the field uses.
+# --- Rules of PDO parameters -----------------------------------------------------------------------------------------
+# What may be written to PDO parameters and mappings, and when (CiA 301, 7.5.2.35 to 7.5.2.38). Hooks into the
+# dictionary's entries 0x1400 to 0x1BFF. The order is forced: PDO not valid, sub 0 of the mapping to zero, entries, sub
+# 0, PDO valid; anything else is refused with the abort code that the standard or the field uses.
 
 
 _MAX_ENTRIES, _MAX_BITS = 8, 64
@@ -293,9 +293,9 @@ def _nothing() -> None:
     """A PDO that nobody watches changed."""
 
 
-# All PDOs of one node, and the order of things at SYNC.
-#
-# Used by the node for every SYNC and RPDO frame while it is operational.
+# --- The PDOs of a node ----------------------------------------------------------------------------------------------
+# All PDOs of one node, and the order of things at SYNC. Used by the node for every SYNC and RPDO frame while it is
+# operational.
 
 
 _PDOS = 4

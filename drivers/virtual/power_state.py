@@ -82,9 +82,8 @@ def decode_command(control_word: int) -> DriveCommand:
     return DriveCommand.ENABLE_OPERATION if control_word & 0x8 else DriveCommand.SWITCH_ON
 
 
+# --- The status word -------------------------------------------------------------------------------------------------
 # The status word 0x6041, put together from everything that it tells.
-#
-# Used by the amplifier at each refresh.
 
 
 _FOLLOWING_ERROR = 1 << 13
@@ -122,10 +121,9 @@ def status_word(
     return word
 
 
-# The acting half of the CiA 402 state machine: option codes, quick stop, fault reaction, fault reset by edge.
-#
-# Between the control word and the drive's torque production. It decides; the drive behind it brakes and cuts the
-# torque.
+# --- The state machine -----------------------------------------------------------------------------------------------
+# The acting half of the CiA 402 state machine: option codes, quick stop, fault reaction, fault reset by edge. Between
+# the control word and the drive's torque production. It decides; the drive behind it brakes and cuts the torque.
 
 
 _S = DriveState

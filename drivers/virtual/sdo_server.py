@@ -16,9 +16,9 @@ from servod.drivers.virtual.dictionary import DeviceDictionary, Failure, SdoRefu
 from servod.drivers.virtual.timeline import Timeline
 from servod.runtime.fieldbus.cia import Abort
 
-# SDO block transfers of a node, one object for each transfer under way (CiA 301, 7.2.4.3.9 to 7.2.4.3.15).
-#
-# Used by the SDO server, which hands every frame here while a block transfer runs. With CRC (CRC-16, x16+x12+x5+1).
+# --- Block transfers -------------------------------------------------------------------------------------------------
+# SDO block transfers of a node, one object for each transfer under way (CiA 301, 7.2.4.3.9 to 7.2.4.3.15). Used by the
+# SDO server, which hands every frame here while a block transfer runs. With CRC (CRC-16, x16+x12+x5+1).
 
 
 _SDO_BLOCK_HEAD = struct.Struct("<BHBI")

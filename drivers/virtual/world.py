@@ -25,10 +25,10 @@ from servod.formats.model.axis_model import AxisModel, rotary
 from servod.runtime.fieldbus.bus import BusCounters, Frame
 from servod.runtime.fieldbus.cia import SYNC_ID
 
+# --- Carrying out faults ---------------------------------------------------------------------------------------------
 # Carries out the faults that a client of the bus asks for: on frames, on participants, and by further participants.
-#
-# Beside the world: `inject` looks up what a kind of fault does; the hub then lets it happen to the frames. `happened`
-# says how often it did.
+# `inject` looks up what a kind of fault does; the hub then lets it happen to the frames. `happened` says how often it
+# did.
 
 
 _INJECTION_MS_NS, _US_NS = 1_000_000, 1_000

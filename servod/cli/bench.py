@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from servod.cli.common import JsonOption, example, need_folder, print_json
+from servod.cli.common import JsonOption, example, need_folder, print_json, table_console
 from servod.common.portable import need_linux
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def bench(
     if as_json:
         print_json(document)
     else:
-        print_table(document)
+        print_table(document, table_console())
 
 
 def _attack(console: Console, out: Path | None, as_json: bool) -> None:

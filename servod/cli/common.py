@@ -88,7 +88,8 @@ def begin_command() -> None:
 #: A stop is answered when the drive has stopped. One that takes longer [s] is a slow ramp, or a daemon that hangs.
 _LATE_S = 2.0
 _BESIDE_THE_AXIS = "a loop whose daemon hangs stops the axis by itself; IF IT MOVES ON, USE THE EMERGENCY STOP"
-_PIPE_COLUMNS = 200
+#: More than any line has; a table takes what it needs.
+_PIPE_COLUMNS = 10_000
 #: One entry for each document that this command printed.
 _printed: list[bool] = []
 #: Folders that this command made for its results, outermost first.
@@ -178,7 +179,7 @@ def need_file(option: str, file: Path) -> None:
 
 
 def table_console(markup: bool = True) -> Console:
-    """Where tables are printed: as wide as the terminal, and in a pipe so wide that no key and no figure is cut off."""
+    """Where tables are printed: as wide as the terminal, and in a pipe so wide that nothing is cut or broken off."""
     from rich.console import Console
 
     console = Console(markup=markup, highlight=markup)
@@ -205,6 +206,7 @@ def report(result: dict[str, Any], done: str, as_json: bool) -> None:
         print(done)
 
 
+# --- Progress --------------------------------------------------------------------------------------------------------
 # One progress bar over a whole command, on standard error, so that standard output stays what was asked for.
 
 

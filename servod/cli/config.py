@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import difflib
 import textwrap
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,6 +16,8 @@ if TYPE_CHECKING:
     from servod.formats.config_keys import ConfigKey
 
 _WIDTH = 118
+#: Names that are told where a key is misspelt.
+_MOST_NEAR = 2
 
 
 def keys(
@@ -41,10 +42,13 @@ def keys(
 
 def _known(key: str, names: list[str]) -> str:
     """What would have been a key, in a few words; a misspelt last part is looked for in every group."""
-    last = {name.rpartition(".")[2]: name for name in names}
-    near = difflib.get_close_matches(key, [*names, *last], n=1)
-    groups = ", ".join(dict.fromkeys(name.partition(".")[0] for name in names))
-    return f"{groups}, or a key below" + "".join(f" (did you mean {last.get(name, name)}?)" for name in near)
+    groups = list(dict.fromkeys(name.partition(".")[0] for name in names))
+    parts = {part: [part] for part in (*groups, *names)}
+    for name in names:
+        parts.setdefault(name.rpartition(".")[2], []).append(name)
+    near = [name for part in difflib.get_close_matches(key, parts, n=_MOST_NEAR) for name in parts[part]]
+    meant = f" (did you mean {' or '.join(dict.fromkeys(near))}?)" if near else ""
+    return f"{', '.join(groups)}, or a key below{meant}"
 
 
 def _print(rows: list[ConfigKey]) -> None:
@@ -107,24 +111,24 @@ _app.command(
 
 def _check(file: Path) -> dict[str, str]:
     from servod.common.yaml import parse_yaml, plain_name, read_text
+    from servod.formats.kinds import TELLING, FileKind, kind_of
 
     if file.suffix.lower() in (".eds", ".dcf"):
         return {"kind": "EDS", "note": _check_eds(file)}
     keys = parse_yaml(read_text(file), str(file))
     if not isinstance(keys, dict):
         raise BadInput(str(file), f"{plain_name(keys)} at the top", "a mapping of keys")
-    kind, checker = _recognise(file, keys)
-    return {"kind": kind, "note": checker(file)}
-
-
-def _recognise(file: Path, keys: dict[Any, Any]) -> tuple[str, Callable[[Path], str]]:
-    """The kind of a YAML file is the one whose tell-tale keys it has most of."""
-    hits = {kind: len(tell & set(keys)) for kind, (tell, _) in _KINDS.items()}
-    kind = max(hits, key=hits.__getitem__)
-    if hits[kind] == 0:
-        known = "; ".join(f"{name}: {', '.join(sorted(tell))}" for name, (tell, _) in _KINDS.items())
+    kind = kind_of(keys)
+    if kind is None:
+        known = "; ".join(f"{name}: {', '.join(sorted(telling))}" for name, telling in TELLING.items())
         raise BadInput(f"{file}: {', '.join(map(str, keys)) or '(top)'}", "keys of no known kind of file", known)
-    return kind, _KINDS[kind][1]
+    checks = {
+        FileKind.AXIS: _check_axis,
+        FileKind.GAINS: _check_gains,
+        FileKind.MODEL: _check_model,
+        FileKind.MAP: _check_map,
+    }
+    return {"kind": kind, "note": checks[kind](file)}
 
 
 def _check_axis(file: Path) -> str:
@@ -153,9 +157,11 @@ def _check_axis(file: Path) -> str:
 
 
 def _check_gains(file: Path) -> str:
-    from servod.formats.gains.gain_set import load_gains
+    """A set without a certificate is good, for a configuration may accept it; one that none may run is a mistake."""
+    from servod.formats.gains.gain_set import load_gains, require_certificate
 
     gains = load_gains(file)
+    require_certificate(gains, accept_uncertified=True, where=str(file))
     problem = gains.certificate_problem()
     return f"law {gains.law.name}, " + (f"not certified: {problem}" if problem else "certified")
 
@@ -180,15 +186,3 @@ def _check_eds(file: Path) -> str:
     dictionary = load_dictionary(file, node_id=1)
     mended = f"; mended: {'; '.join(dictionary.report)}" if dictionary.report else ""
     return f"{len(dictionary.objects)} objects{mended}"
-
-
-#: Kind of file -> keys that tell it, and what checks it.
-_KINDS: dict[str, tuple[set[str], Callable[[Path], str]]] = {
-    "axis configuration": (
-        {"bus", "cycle", "heartbeat", "amplifier", "encoder", "limits", "gains", "control", "recorder", "metrics"},
-        _check_axis,
-    ),
-    "gain set": ({"schema_version", "parameters", "provenance", "certificate", "description"}, _check_gains),
-    "axis model": ({"axis", "inertia", "friction", "delay_s", "gravity", "torque_offset"}, _check_model),
-    "column map": ({"columns"}, _check_map),
-}

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servod.cli.common import JsonOption, example, need_folder, one_thread, print_json, progress
+from servod.cli.common import JsonOption, example, need_folder, one_thread, print_json, progress, table_console
 from servod.cli.groups import effects
 from servod.common.errors import AnswerIsNo, BadInput
 from servod.common.portable import need_linux
@@ -141,7 +141,6 @@ def _progress(quiet: bool, seconds: float, rows: Sequence[DemoRow]) -> Iterator[
 
 def print_document(rows: Sequence[DemoRow], document: dict[str, Any]) -> None:
     """Print the demo's document as a table for people, with what each law had and what the system refused."""
-    from rich.console import Console
     from rich.table import Table
 
     table = Table(
@@ -151,7 +150,7 @@ def print_document(rows: Sequence[DemoRow], document: dict[str, Any]) -> None:
     for row in rows:
         score = scores[row.name]
         table.add_row(row.label, row.options, f"{score['rms_error_mrad']:.3f}", f"{score['max_error_mrad']:.3f}")
-    console = Console()
+    console = table_console()
     console.print(table)
     console.print(
         f"{document['cycles']} cycles of the four, {document['missed']} missed, {document['wall_s']:.1f} s.",
@@ -166,6 +165,7 @@ def print_document(rows: Sequence[DemoRow], document: dict[str, Any]) -> None:
     console.print(f"Report: {document['report']}", highlight=False, soft_wrap=True)
 
 
+# --- The story of a concealed effect ---------------------------------------------------------------------------------
 # `servoctl demo --diagnose`: the story of an effect that was concealed, from its cost to its cure, in one command.
 
 

@@ -1,8 +1,8 @@
 """How a command ends that does not do what it was asked: one line on standard error, one document under `--json`.
 
-The document is `{"error": {"code": ..., "exit_code": ..., "message": ..., "where": ..., "found": ..., "allowed": ...}}`
-with the last three where they are known. A command whose answer is "no" and that has printed its own document already
-prints no second one.
+The document is `{"error": {"code", "exit_code", "message", "where", "found", "allowed"}}`,
+the last three null where they are not known. A command whose answer is "no" and that has printed its own document
+already prints no second one.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import re
 import shlex
 import shutil
 import sys
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ import typer
 
 from servod.cli.common import json_is_printed, print_json
 from servod.client.control import Refused
-from servod.common.errors import AnswerIsNo, BadInput, ServodError, Unreachable, one_line
+from servod.common.errors import AnswerIsNo, BadInput, Details, ServodError, Unreachable, details, one_line
 from servod.common.files import BadFile
 
 # How this servod came onto the machine, and by which command it gets the packages of an extra: an advice that fits pip
@@ -145,7 +146,8 @@ def complain(error: BaseException, arguments: list[str]) -> int:
         code = "internal"
     message, exit_code = _message(error, code, arguments), _exit_code(error)
     if wants_json(arguments) and not json_is_printed():
-        print_json({"error": {"code": code, "exit_code": exit_code, "message": message, **_details(error)}})
+        known = _details(error, arguments)._asdict()
+        print_json({"error": {"code": code, "exit_code": exit_code, "message": message, **known}})
     if code == "internal":
         raise error
     say(message)
@@ -173,19 +175,46 @@ def _message(error: BaseException, code: str, arguments: list[str]) -> str:
         extra = extra_of(error.name or "?") or ""
         return f"`{command}` needs servod[{extra}] ({error.name} is missing); to get it: {how_to_get(extra)}"
     if isinstance(error, typer.TyperException):
-        return " ".join(f"{error.format_message()} Found: `{command}`; see --help.".split())
+        line = _usage_line(error, arguments)
+        return one_line(f"{line}{' See' if line.endswith('?') else '; see'} `{_asked_for(error)} --help`")
     return "interrupted" if code == "interrupted" else " ".join(str(error).split())
 
 
-def _details(error: BaseException) -> dict[str, str]:
+def _details(error: BaseException, arguments: list[str]) -> Details:
     """What is known of where it stands."""
-    if isinstance(error, BadInput):
-        known = {"where": error.where, "found": error.found, "allowed": error.allowed}
-    elif isinstance(error, typer.TyperException):
-        known = {"where": _option(error)}
-    else:
-        known = {}
-    return {key: one_line(value) for key, value in known.items() if value not in (None, "")}
+    return _usage_details(error, arguments) if isinstance(error, typer.TyperException) else details(error)
+
+
+def _usage_line(error: Any, arguments: list[str]) -> str:
+    """What is wrong with the command line, in the words of every other refusal where option and value are known."""
+    where, found, allowed = _usage_details(error, arguments)
+    if where is not None and allowed is not None:
+        return f"{where}: found {'nothing' if found is None else found}; allowed: {allowed}"
+    return str(error.format_message()).rstrip(". ")
+
+
+def _usage_details(error: Any, arguments: list[str]) -> Details:
+    """Option or argument, the value that was given for it, and what may stand there."""
+    param, where = getattr(error, "param", None), _option(error)
+    refused = re.sub(r"^Value error, ", "", str(getattr(error, "message", "") or "")).rstrip(". ")
+    if where is None or param is None or not refused:
+        return Details(where)
+    allowed = re.sub(r"^Input should be |^.* is not (?=one of )|, unable to parse .*$", "", refused)
+    return Details(where, _given(param.opts, arguments), allowed)
+
+
+def _given(options: list[str], arguments: list[str]) -> str | None:
+    """The value that stands behind an option on the command line."""
+    for word, behind in pairwise([*arguments, ""]):
+        name, equals, value = word.partition("=")
+        if name in options and name.startswith("-"):
+            return one_line(value if equals else behind)
+    return None
+
+
+def _asked_for(error: Any) -> str:
+    """The command whose help tells more: "servoctl track paper"."""
+    return str(getattr(getattr(error, "ctx", None), "command_path", None) or "servoctl")
 
 
 def _option(error: Any) -> str | None:

@@ -27,6 +27,8 @@ _HELP = example(
     "servoctl faults --codes",
 )
 _FOLDER = Path("/var/lib/servod/recordings")
+#: The way on without a daemon.
+_OTHER_FOLDER = "another one: --config AXIS.yaml, or --recordings FOLDER"
 
 
 class _Asked(NamedTuple):
@@ -115,7 +117,8 @@ def _of_axis(asked: _Asked) -> dict[str, Any]:
         now = [fault["code"] for fault in ask(asked.socket, Verb.STATUS)["faults"]]
     except Unreachable as error:
         if not (asked.folder or _FOLDER).is_dir():
-            raise Unreachable(f"{error} And there is no folder of recordings, {asked.folder or _FOLDER}.") from None
+            nowhere = f"And there is no folder of recordings, {asked.folder or _FOLDER}"
+            raise Unreachable(f"{error} {nowhere}; {_OTHER_FOLDER}") from None
         return _of_folder(asked) | {"daemon": str(error)}
     rows: list[dict[str, Any]] = told["incidents"][::-1][: asked.most]
     folder = Path(told["directory"])
@@ -133,11 +136,17 @@ def _told(row: dict[str, Any], rows: list[dict[str, Any]]) -> bool:
 
 
 def _read(folder: Path, axis: str | None, most: int, known: set[str]) -> tuple[list[dict[str, Any]], list[str]]:
-    """The newest incidents of the fault files, and which of these cannot be read and why."""
-    from servod.formats.recording.incidents import fault_files, newest, of_file
+    """The newest incidents of fault files and marks of runs, and which of these cannot be read and why."""
+    from servod.formats.recording.incidents import fault_files, marks, newest, of_file, of_mark
 
     found: list[Incident] = []
+    ends: list[Incident] = []
     unread: list[str] = []
+    for path in marks(folder, axis):
+        try:
+            ends += of_mark(path)
+        except BadInput as error:
+            unread.append(str(error))
     for path in fault_files(folder, axis):
         if len(found) >= most:
             break
@@ -147,7 +156,7 @@ def _read(folder: Path, axis: str | None, most: int, known: set[str]) -> tuple[l
             found += of_file(path)
         except BadInput as error:
             unread.append(str(error))
-    return [incident.document() for incident in newest(found, most)], unread
+    return [incident.document() for incident in newest([*found, *ends], most)], unread
 
 
 def _document(
@@ -159,7 +168,7 @@ def _document(
 
 def _print(document: dict[str, Any]) -> None:
     if "daemon" in document:
-        print(f"{document['daemon']} From the fault files in {document['folder']}:")
+        print(f"{document['daemon']} From the fault files in {document['folder']} ({_OTHER_FOLDER}):")
     if document["now"]:
         print(f"latched now: {', '.join(document['now'])}")
     for row in document["incidents"]:

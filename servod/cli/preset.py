@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from servod.cli.common import example
+from servod.cli.common import JsonOption, example, report
 from servod.common.portable import need_linux
 
 _HELP = example(
@@ -25,6 +25,7 @@ def register(app: typer.Typer) -> None:
 def preset(
     config: Annotated[Path, typer.Argument(help="Configuration of the axis.")],
     position_rad: Annotated[float, typer.Option(help="What the present position shall read, in rad.")],
+    as_json: JsonOption = False,
 ) -> None:
     """Set the encoder's zero."""
     need_linux("servoctl preset")
@@ -43,4 +44,6 @@ def preset(
             counts = master.preset_encoder(position_rad)
     finally:
         lock.release()
-    print(f"encoder node {axis.encoder.node_id} reads {position_rad:g} rad here (0x6003 = {counts})")
+    node_id = axis.encoder.node_id
+    done = f"encoder node {node_id} reads {position_rad:g} rad here (0x6003 = {counts})"
+    report({"node_id": node_id, "position_rad": position_rad, "counts": counts}, done, as_json)

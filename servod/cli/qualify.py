@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servod.cli.common import JsonOption, example, need_folder, one_thread, print_json
+from servod.cli.common import JsonOption, example, need_folder, one_thread, print_json, table_console
 from servod.cli.groups import scenario_groups
 from servod.common.errors import AnswerIsNo, BadInput
 from servod.common.portable import need_linux
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from servod.qualify.faults.run import Outcome
     from servod.qualify.faults.scenario import Scenario
 
+# --- The paper -------------------------------------------------------------------------------------------------------
 # `servoctl qualify paper`: the paper's figures and numbers from this software on the virtual axis, and what agrees.
 
 
@@ -81,6 +82,7 @@ def print_document(document: dict[str, Any], out: Path) -> None:
     print(f"Page: {out / 'paper.html'}; table and statements: {out / 'paper.md'}; pictures: {out / 'pictures'}")
 
 
+# --- The soak --------------------------------------------------------------------------------------------------------
 # `servoctl qualify soak`: hours of random moves and faults on the virtual axis, with every cycle accounted for.
 
 
@@ -149,12 +151,11 @@ def soak(
 
 
 def _print(found: dict[str, Any], out: Path) -> None:
-    from rich.console import Console
     from rich.table import Table
 
     from servod.qualify.soak.document import PAGE_NAME, count_rows, fault_rows, verdict
 
-    console = Console()
+    console = table_console()
     faults = Table("Fault", "Times", "In the log", "Ridden through", "Recovered", "Detected / ms", "Torque gone / ms")
     for name, injected, logged, ridden, recovered, _latched, _, detected, _, gone in fault_rows(found):
         faults.add_row(name, injected, logged, ridden, recovered, detected, gone)

@@ -208,17 +208,19 @@ def _values(document: dict[str, Any]) -> Table:
     return table
 
 
-def _timing(document: dict[str, Any]) -> Table:
+def _timing(document: dict[str, Any]) -> Group:
+    """The line above is none of the table's, which would break it to its own width."""
+    from rich.console import Group
     from rich.table import Table
 
     timing, loop = document["timing"], document["loop"]
     title = f"cycle {timing['cycle']}, {timing['missed']} missed; last {timing['window_s']:.0f} s in µs"
     style = "dim" if loop["stale"] else ""
-    table = Table("", "median", "p99", "max", title=_aged(title, loop), title_justify="left", box=None, style=style)
+    table = Table("", "median", "p99", "max", box=None, style=style)
     for key, label in (("lag", "wake-up"), ("tick", "work"), ("torque", "deadline to torque")):
         row = timing[key]
         table.add_row(label, *(f"{row[name]:.0f}" for name in ("p50_us", "p99_us", "max_us")), style=style)
-    return table
+    return Group(_aged(title, loop), table)
 
 
 def _grant_lines(document: dict[str, Any]) -> list[str]:

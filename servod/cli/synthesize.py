@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from servod.lab.synthesize.gain_set import DesignOptions
     from servod.lab.synthesize.infeasible import Infeasible
 
+# --- Options ---------------------------------------------------------------------------------------------------------
 # Options of `servoctl synthesize`: every one with its range and a line of help; a default of None is the mode's own.
-#
 # Imports typer alone, as all verbs do.
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, connect, example, report
-from servod.common.errors import AnswerIsNo
+from servod.common.errors import AnswerIsNo, BadInput
 
 if TYPE_CHECKING:
     from servod.client.control import ControlClient
@@ -62,6 +62,11 @@ def paper(
     as_json: JsonOption = False,
 ) -> None:
     """Track trajectory (19)."""
+    from servod.kernels.motions import PAPER_LONGEST_S
+
+    if duration > PAPER_LONGEST_S:
+        allowed = f"at most {PAPER_LONGEST_S:.6g} s, where the envelope of (19) ends"
+        raise BadInput("--duration", f"{duration:g} s", allowed)
     _track(socket, {"kind": "paper", "duration_s": duration}, duration, wait, as_json)
 
 
@@ -122,14 +127,14 @@ def _run(client: ControlClient, motion: dict[str, Any], tell: Tell) -> dict[str,
     with sigterm_as_interrupt():
         try:
             result = client.call("track", **motion)
-            _wait_for_end(client, tell)
+            _wait_until_over(client, tell)
         except KeyboardInterrupt:
             client.call("stop")
             raise
     return result
 
 
-def _wait_for_end(client: ControlClient, tell: Tell) -> None:
+def _wait_until_over(client: ControlClient, tell: Tell) -> None:
     """Poll until the motion is over."""
     started = time.monotonic()
     while True:

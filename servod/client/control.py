@@ -1,13 +1,15 @@
 """The control socket's protocol and its client: one JSON object per line over a Unix stream socket.
 
 Between command line and daemon. Request `{"id": 1, "verb": "status", "args": {}}`, answer `{"id": 1, "ok": true,
-"result": {...}}` or `{"id": 1, "ok": false, "error": {"exit_code": 3, "message": "one line"}}`. Requests are short, so
-that reading one never holds the daemon up: a long table of samples goes ahead of its motion in pieces. The server side
-is servod.runtime.daemon.control_server.
+"result": {...}}` or `{"id": 1, "ok": false, "error": {"exit_code": 3, "message": "one line", "where": null, "found":
+null, "allowed": null}}`, the last three as texts where bad input was found. Requests are short, so that reading one
+never holds the daemon up: a long table of samples goes ahead of its motion in pieces. The server side is
+servod.runtime.daemon.control_server.
 """
 
 from __future__ import annotations
 
+import math
 import socket
 import struct
 from collections.abc import Iterator, Sequence
@@ -15,7 +17,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from servod.common.errors import AnswerIsNo, BadInput, ServodError, Unreachable, one_line
+from servod.common.errors import AnswerIsNo, BadInput, Details, ServodError, Unreachable, one_line
 from servod.common.files import reason
 from servod.common.portable import need_linux
 from servod.formats.protocol import (
@@ -32,11 +34,13 @@ _TIMEVAL = struct.Struct("@ll")
 
 
 class RemoteBadInput(BadInput):
-    """Bad input that the daemon found; carries its line as it stands."""
+    """Bad input that the daemon found; carries its line as it stands, and its parts where the daemon tells them."""
 
-    def __init__(self, line: str) -> None:
+    def __init__(self, line: str, where: object = None, found: object = None, allowed: object = None) -> None:
         ServodError.__init__(self, line)
-        self.where, self.found, self.allowed = "daemon", line, ""
+        parts = (where, found, allowed)
+        told = all(isinstance(part, str) for part in parts)
+        self.where, self.found, self.allowed = map(str, parts if told else ("daemon", line, ""))
 
 
 class Refused(Unreachable):
@@ -116,7 +120,8 @@ class ControlClient:
         try:
             line = encode_line({"id": self._id, "verb": str(verb), "args": args})
         except ValueError:
-            raise BadInput(f"{verb}", "a number that is not finite", "finite numbers") from None
+            key, found = next(_not_finite(args), ("", "a number that is not finite"))
+            raise BadInput(f"{verb}{key}", found, "finite numbers") from None
         if len(line) > MAX_LINE_BYTES:
             raise BadInput(f"{verb}", f"{len(line)} bytes", f"at most {MAX_LINE_BYTES} bytes in a request")
         try:
@@ -144,6 +149,13 @@ class ControlClient:
             raise Unreachable(f"{self._path}: answers with something else than servod would ({error})") from None
 
 
+def _not_finite(args: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """Key and value of each argument that JSON has no number for."""
+    for key, value in args.items():
+        samples = value if isinstance(value, list | tuple) else [value]
+        yield from ((f": {key}", str(x)) for x in samples if isinstance(x, float) and not math.isfinite(x))
+
+
 def _why(error: OSError) -> str:
     """What a socket that nobody answers at means."""
     if isinstance(error, FileNotFoundError):
@@ -162,4 +174,7 @@ def _result(answer: dict[str, Any]) -> dict[str, Any]:
     kind = _ERRORS.get(code, Unreachable) if isinstance(code, int) else Unreachable
     if kind is Refused and answer.get("id") is None:  # of the connection: no request was refused
         kind = Unreachable
-    raise kind(one_line(error.get("message", "refused")))
+    line = one_line(error.get("message", "refused"))
+    if kind is RemoteBadInput:
+        raise RemoteBadInput(line, *(error.get(part) for part in Details._fields))
+    raise kind(line)

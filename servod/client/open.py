@@ -74,10 +74,10 @@ def daemon_axis(plant: AxisModel, gains: GainSet, folder: Path, _seed: int) -> I
         axis.disable()
 
 
+# --- The axis of a commissioning -------------------------------------------------------------------------------------
 # The axis of a commissioning: how its experiments, deployments and comparisons open it, and what tells it from others.
-#
-# The virtual axis is SYNC-stepped and gets the velocity filter that a set was designed for; the axis
-# under a daemon keeps what its configuration says.
+# The virtual axis is SYNC-stepped and gets the velocity filter that a set was designed for; the axis under a daemon
+# keeps what its configuration says.
 
 
 #: A step of the reference is as fast as the torque lets it be: so many times the speed of the experiments' limit.
@@ -140,7 +140,7 @@ class VirtualWalkAxis:
         """Joint, devices and configuration."""
         plant = hashlib.sha256(axis_model_yaml(self.joint).encode()).hexdigest()
         devices = self.settings.model_dump(mode="json") if self.settings else None
-        return {"plant": plant, "devices": devices} | configured(self.config)
+        return {"plant": plant, "devices": devices} | identifying_keys(self.config)
 
     @property
     def cutoff_hz(self) -> float | None:
@@ -161,9 +161,9 @@ class VirtualWalkAxis:
         """A new session with the filter of `gains`, and an empty store in `folder`."""
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-        yield axis_for_set(self.joint, folder, gains, present, self.seed, self.configured_for(gains), self.settings)
+        yield axis_for_set(self.joint, folder, gains, present, self.seed, self.with_filter_for(gains), self.settings)
 
-    def configured_for(self, gains: GainSet) -> AxisConfig:
+    def with_filter_for(self, gains: GainSet) -> AxisConfig:
         """The configuration with the velocity filter that the set was designed for."""
         return with_cutoff(self.config, gains.design.velocity_cutoff_hz) if gains.design else self.config
 
@@ -188,7 +188,7 @@ class DaemonWalkAxis:
     @property
     def identity(self) -> dict[str, Any]:
         """The configuration."""
-        return {"name": self.config.name} | configured(self.config)
+        return {"name": self.config.name} | identifying_keys(self.config)
 
     @property
     def cutoff_hz(self) -> float | None:
@@ -209,7 +209,7 @@ class DaemonWalkAxis:
             yield DaemonAxis(client)
 
 
-def configured(config: AxisConfig) -> dict[str, Any]:
+def identifying_keys(config: AxisConfig) -> dict[str, Any]:
     """What of a configuration makes another axis of it: cycle, devices and limits, without the velocity filter."""
     parts = config.model_dump(mode="json", include={"cycle", "amplifier", "encoder", "limits"})
     parts["encoder"].pop("velocity_cutoff_hz")

@@ -1,7 +1,7 @@
-"""The axis under a running daemon, over its socket: whatever ends a motion, the axis is stopped before all else.
+"""The axis under a running daemon: `DaemonAxis` over its control socket, and what that and other clients need for it.
 
-Above servod.client.control. An interrupt may cut a request in the middle, and with it the connection that the client
-commands on; the daemon takes a stop from anybody, so that it goes out on a connection of its own.
+Above servod.client.control: stopping, recording, and the configuration that the daemon runs with. The daemon's own
+limits, lease and heartbeats guard everything that is done.
 """
 
 from __future__ import annotations
@@ -20,6 +20,11 @@ from servod.formats.config import AxisConfig
 from servod.formats.gains.gain_set import GainSet
 from servod.formats.protocol import Verb
 from servod.formats.recording.mcap_reader import read_recording
+
+# --- Stopping and recording ------------------------------------------------------------------------------------------
+# Whatever ends a motion, the axis is stopped before all else. An interrupt may cut a request in the middle, and with it
+# the connection that the client commands on; the daemon takes a stop from anybody, so that it goes out on a connection
+# of its own.
 
 
 def quick_stop(client: ControlClient) -> None:
@@ -57,9 +62,9 @@ def recording(client: ControlClient) -> Iterator[Path]:
     client.call(Verb.RECORD_STOP)
 
 
-# The configuration that a running daemon has, for clients whose answer depends on its scales and limits.
-#
-# Beside servod.client.control. The daemon attaches its file to every recording; a recording of a moment tells it.
+# --- The daemon's configuration --------------------------------------------------------------------------------------
+# The configuration that a running daemon has, for clients whose answer depends on its scales and limits. The daemon
+# attaches its file to every recording; a recording of a moment tells it.
 
 
 #: What of a configuration decides how an axis measures and moves.
@@ -97,17 +102,15 @@ def _values(section: dict[str, Any], above: str = "") -> Iterator[tuple[str, Any
             yield f"{above}{key}", value
 
 
-# The axis under a running daemon: its verbs over the control socket, its recordings from disk.
-#
-# The daemon's own limits, lease and heartbeats guard everything that is done. The trial is its own as well: when this
-# client dies in the middle, the daemon goes back to the set of before by itself.
+# --- The axis --------------------------------------------------------------------------------------------------------
+# A trial is the daemon's as well: when this client dies in the middle, the daemon goes back to the set of before.
 
 
 _POLL_S = 0.05
 
 
 class DaemonAxis:
-    """servod.client.axis.AxisClient on the wall clock."""
+    """servod.client.axis.AxisClient on the wall clock: verbs over the control socket, recordings read from disk."""
 
     offset_ns: int | None = None
 

@@ -6,6 +6,8 @@ with one line on standard error and an exit code (0 done, 1 the answer is no, 2 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 #: Longest part of a message; what stood in a file may be of any length.
 _MOST_SHOWN = 600
 
@@ -33,6 +35,21 @@ class BadInput(ServodError):
     def __init__(self, where: str, found: object, allowed: str) -> None:
         self.where, self.found, self.allowed = where, found, allowed
         super().__init__(f"{one_line(where)}: found {one_line(found)}; allowed: {one_line(allowed)}")
+
+
+class Details(NamedTuple):
+    """Where an error stands, what was found there and what is allowed; None where that is not known."""
+
+    where: str | None = None
+    found: str | None = None
+    allowed: str | None = None
+
+
+def details(error: BaseException) -> Details:
+    """The parts of an error's line, each in one line of its own: what `--json` and the control socket tell of it."""
+    if not isinstance(error, BadInput):
+        return Details()
+    return Details(*(one_line(part) or None for part in (error.where, error.found, error.allowed)))
 
 
 def one_line(part: object) -> str:

@@ -53,6 +53,7 @@ class FaultCode(IntEnum):
     SECOND_MASTER = 28
     WIRING_NOT_PROVEN = 29
     NODE_LEFT_OPERATIONAL = 30
+    DAEMON_LOST = 31
 
 
 #: Faults after which the nodes are not as they were configured: only a new bring-up may enable the axis again.
@@ -134,7 +135,8 @@ FAULTS: dict[FaultCode, Fault] = dict(
             _C.ENCODER_ALARM,
             _R.DISABLE,
             "The encoder reports an alarm (CiA 406, 0x6503), or its alarm word comes no more.",
-            "Read 0x6503 with `servoctl status`; check supply and mounting of the encoder.",
+            "Check supply and mounting of the encoder; its EMCY is in the journal, and a daemon that starts while the "
+            "alarm stays names the alarm word (0x6503).",
         ),
         _row(
             _C.FEEDBACK_STALE,
@@ -243,7 +245,8 @@ FAULTS: dict[FaultCode, Fault] = dict(
         _row(
             _C.LOOP_LOST,
             _R.DISABLE,
-            "The loop process died; the drive stops by its own heartbeat consumer (0x1016).",
+            "The loop process died or hung; the supervisor switched the drive off. A drive that it does not reach "
+            "stops by its own heartbeat consumer (0x1016).",
             "See the journal and the pre-fault recording; restart the service.",
         ),
         _row(
@@ -286,6 +289,13 @@ FAULTS: dict[FaultCode, Fault] = dict(
             "A node left the NMT state operational: somebody sent it an NMT command, or it did so by itself.",
             "Find who sends NMT commands (another master, a service tool), switch a stopped node off and on, then "
             "restart the daemon.",
+        ),
+        _row(
+            _C.DAEMON_LOST,
+            _R.NONE,
+            "servod ended without an orderly stop: it was killed, it crashed, or the machine lost its power. Loop and "
+            "drive stopped the axis by themselves.",
+            "See the journal of that time (`journalctl -u 'servod@*'`), and look at the axis before it is enabled.",
         ),
     ]
 )

@@ -123,9 +123,8 @@ def open_file(path: str | Path) -> BinaryIO:
     raise OSError(errno.EINVAL, f"a {_KINDS.get(kind, 'special file')}, which might not end")
 
 
+# --- Writing ---------------------------------------------------------------------------------------------------------
 # Writes the files of a report: aside first, flushed, then renamed, so that an interrupted run leaves no half file.
-#
-# Under page and pictures.
 
 
 def write_bytes(path: Path, content: bytes) -> Path:

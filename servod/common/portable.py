@@ -62,6 +62,20 @@ def lock_again(descriptor: int) -> int:
     return descriptor
 
 
+def is_locked(descriptor: int) -> bool:
+    """Whether another holds the lock of this open file; two who ask at once do not take one another for it."""
+    try:
+        if sys.platform == "win32":
+            _lock(descriptor, wait=False)
+        else:
+            import fcntl
+
+            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    return False
+
+
 def _lock(descriptor: int, wait: bool) -> None:
     if sys.platform == "win32":
         import msvcrt

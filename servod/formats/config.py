@@ -12,11 +12,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from servod.common.yaml import Strict, load_model
+from servod.common.yaml import Strict
+from servod.formats.kinds import FileKind, load_kind
 
-# The part of the axis configuration that says what is on the wire: bus, cycle, heartbeats, amplifier and encoder.
-#
-# Every key states its meaning, unit, sense and what holds when it is left out: `servoctl config keys` prints them.
+# --- What is on the wire ---------------------------------------------------------------------------------------------
+# The part of the axis configuration that says what is on the wire: bus, cycle, heartbeats, amplifier and encoder. Every
+# key states its meaning, unit, sense and what holds when it is left out: `servoctl config keys` prints them.
 
 
 NodeId = Annotated[int, Field(ge=1, le=127, description="CANopen node id, 1 to 127")]
@@ -432,7 +433,7 @@ _PATHS: dict[str, tuple[str, ...]] = {
 
 def load_config(path: str | Path) -> AxisConfig:
     """Read and check an axis configuration; every relative path inside is relative to the file. Raises BadInput."""
-    config = load_model(path, AxisConfig)
+    config = load_kind(path, FileKind.AXIS, AxisConfig)
     base = Path(path).resolve().parent
     paths = _PATHS | ({"bus": ("channel",)} if config.bus.interface == "virtual" else {})
     changed: dict[str, Any] = {"model": _beside(base, config.model)}

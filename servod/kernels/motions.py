@@ -18,6 +18,8 @@ PAPER_DECAY_RAD_PER_S = 0.0033
 
 PAPER_OMEGA_RAD_PER_S = 0.2 * math.pi
 
+#: When the envelope A - B t of (19) has come to nothing, s.
+PAPER_LONGEST_S = PAPER_AMPLITUDE_RAD / PAPER_DECAY_RAD_PER_S
 
 Sample = tuple[float, float, float]
 

@@ -16,6 +16,7 @@ from servod.cli.app import run
 from servod.common.faults import FAULTS, FaultCode
 from servod.formats.config import RecorderConfig
 from servod.formats.recording.incidents import Incident, Seen
+from servod.formats.recording.run_mark import RunMark
 from servod.runtime.daemon.fault_watch import FaultWatch
 from servod.runtime.daemon.health import Health
 from servod.runtime.daemon.metrics import AxisMetrics
@@ -96,6 +97,22 @@ def test_a_file_that_cannot_be_read_hides_no_other(folder: Path, capsys: pytest.
     assert len(document["incidents"]) == 1 and str(broken) in document["not_read"][0]
 
 
+def test_a_run_without_an_orderly_end_is_among_what_happened(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As after kill -9: nobody ends the mark, and nobody holds it."""
+    for axis in ("joint", "other"):
+        with pytest.raises(ZeroDivisionError), RunMark(folder, axis):
+            raise ZeroDivisionError
+    (folder / "damaged.run.json").write_text("{")
+    document = told(["--recordings", str(folder)], capsys)
+    assert sorted((row["axis"], row["code"]) for row in document["incidents"]) == [
+        ("joint", "DAEMON_LOST"), ("joint", "FOLLOWING_ERROR"), ("other", "DAEMON_LOST"),
+    ]  # fmt: skip
+    assert "damaged.run.json" in document["not_read"][0]
+    assert run(["faults", "--recordings", str(folder)]) == 0
+    shown = capsys.readouterr().out
+    assert shown.count("servod ended without an orderly stop") == 2 and "[between 20" in shown
+
+
 def test_no_fault_is_an_answer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["faults", "--recordings", str(tmp_path)]) == 0
     assert capsys.readouterr().out == "no fault is on record\n"
@@ -166,6 +183,7 @@ def test_the_first_cause_is_the_strongest_of_its_cycle() -> None:
     ("words", "code", "line"),
     [
         (["--socket", "none"], 3, "there is no folder of recordings"),
+        (["--socket", "none"], 3, "another one: --config AXIS.yaml, or --recordings FOLDER"),
         (["--recordings", "none"], 2, "none: there is no such folder"),
         (["--codes", "--journal", "x"], 2, "--codes: found beside --journal"),
         (["--recordings", "a", "--journal", "x"], 2, "--journal: found beside --recordings"),
@@ -181,6 +199,15 @@ def test_nowhere_to_look_is_one_line(
     assert run(["faults", *words]) == code
     (shown,) = capsys.readouterr().err.splitlines()
     assert line in shown
+
+
+def test_where_no_daemon_answers_the_folder_that_is_read_is_named_and_how_to_name_another(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("servod.cli.faults._FOLDER", folder)
+    assert run(["faults", "--socket", str(folder / "none")]) == 0
+    first, *_ = capsys.readouterr().out.splitlines()
+    assert "no daemon answers" in first and f"fault files in {folder} (another one: --config AXIS.yaml" in first
 
 
 @pytest.mark.parametrize("name", ["soak", "paper"])

@@ -114,3 +114,13 @@ def test_who_stops_an_axis_is_told_when_the_answer_is_late(
         assert run(["stop", "--socket", str(path)]) == 3
     first, *_ = capsys.readouterr().err.splitlines()
     assert "stop: no answer yet" in first and "EMERGENCY STOP" in first
+
+
+def test_a_number_that_is_not_finite_is_told_with_its_key(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "axis.sock"
+    with socket.socket(socket.AF_UNIX) as daemon:
+        daemon.bind(str(path))
+        daemon.listen(1)
+        words = ["--amplitude", "0.1", "--frequency", "inf", "--duration", "1", "--no-wait", "--socket", str(path)]
+        assert run(["track", "sine", *words]) == 2
+    assert "track: frequency_hz: found inf; allowed: finite numbers" in capsys.readouterr().err

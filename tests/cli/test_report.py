@@ -95,7 +95,10 @@ def test_the_certified_set_is_the_last_row_and_says_what_it_stands(tmp_path: Pat
     assert last.margins is not None and all(row.margins is None for row in rows[:-1])
     runs = [cut_motion(row.name, recorded(0.001).tobytes()) for row in rows]
     write_demo_page(rows, runs, tmp_path / "report.html", Story("joint", True))
-    assert f"{last.label}: {last.margins}." in (tmp_path / "report.html").read_text()
+    text = (tmp_path / "report.html").read_text()
+    assert f"{last.label}: {last.margins}." in text
+    assert f"under {len(rows)} controllers" in text and "four" not in text.partition("<script")[0]
+    assert "PD, PD + DOB, PD + LuGre and Local models have the same PD feedback." in text
 
 
 def test_a_set_of_another_loop_is_refused_before_anything_runs(tmp_path: Path) -> None:

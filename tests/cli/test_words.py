@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from servod.cli import scan
 from servod.cli.app import run
+from servod.cli.common import table_console
+from servod.cli.status import screen
 from servod.cli.track import _where
+from tests.cli.test_status_screen import document
 
 
 def test_a_node_without_a_serial_number_has_a_dash(
@@ -39,6 +43,37 @@ def test_a_node_without_a_serial_number_has_a_dash(
 )
 def test_the_progress_of_a_motion_shows_no_old_error(motion: dict[str, Any], says: str) -> None:
     assert _where(motion) == says
+
+
+def test_no_line_of_a_screen_is_broken_in_a_pipe(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The title of the status and of its table, and the tables of demo and soak."""
+    from servod.cli.demo import print_document
+    from servod.cli.qualify import _print
+    from servod.qualify.demo.entries import DemoRow
+
+    monkeypatch.delenv("COLUMNS", raising=False)
+    status = document()
+    status["axis"]["reasons"] = [f"reason {k} that the drive is not ready" for k in range(20)]
+    table_console().print(screen(status))
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].endswith("reason 19 that the drive is not ready")
+    assert any(line.rstrip() == "cycle 12345, 3 missed; last 10 s in µs" for line in lines)
+
+    label = "a controller with a name " * 12
+    row = DemoRow(name="pd", label=label.strip(), options="x" * 200, gains=Path("pd.yaml"))
+    score = {"rms_error_mrad": 1.0, "max_error_mrad": 2.0}
+    rest = {"cycles": 1, "missed": 0, "wall_s": 1.0, "realtime_refused": [], "report": "r.html"}
+    print_document([row], {"controllers": {"pd": score}, **rest})
+    assert any(label.strip() in line and "x" * 200 in line for line in capsys.readouterr().out.splitlines())
+
+    long = "a fault with a name " * 15
+    monkeypatch.setattr("servod.qualify.soak.document.fault_rows", lambda _: [(long.strip(), *"123456789")])
+    monkeypatch.setattr("servod.qualify.soak.document.count_rows", lambda _: [("cycles", "1")])
+    monkeypatch.setattr("servod.qualify.soak.document.verdict", lambda _: "passed")
+    _print({"findings": []}, Path("out"))
+    assert any(long.strip() in line for line in capsys.readouterr().out.splitlines())
 
 
 def test_no_table_in_a_pipe_cuts_off_a_key(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

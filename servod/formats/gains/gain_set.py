@@ -23,12 +23,12 @@ from servod.common.yaml import Dumper, Strict, parse_yaml, read_text, validate
 from servod.formats.config import AxisConfig
 from servod.formats.gains.design import Design
 from servod.formats.gains.parameters import LocalSet, Parameters, PdParameters
+from servod.formats.kinds import FileKind, require_kind
 from servod.formats.model.axis_model import load_axis_model
 from servod.kernels.laws import LAWS, Law
 
+# --- The verdict on a set --------------------------------------------------------------------------------------------
 # Whether a gain set counts as certified, and if not: which key says so, what stands there, and what helps.
-#
-# Beside servod.formats.gains.gain_set, which every refusal of a set comes from.
 
 
 class GainFault(NamedTuple):
@@ -248,7 +248,9 @@ def _all_floats(value: Any) -> Any:
 
 def parse_gains(text: str, where: str) -> GainSet:
     """Check the YAML text of a gain set; `where` names it in errors. Raises BadInput (key, found, allowed)."""
-    return validate(parse_yaml(text, where), GainSet, where)
+    document = parse_yaml(text, where)
+    require_kind(document, FileKind.GAINS, where)
+    return validate(document, GainSet, where)
 
 
 def load_gains(path: str | Path) -> GainSet:

@@ -17,7 +17,8 @@ import yaml
 from pydantic import Field, model_validator
 
 from servod.common.errors import BadInput
-from servod.common.yaml import Dumper, Strict, load_model
+from servod.common.yaml import Dumper, Strict
+from servod.formats.kinds import FileKind, load_kind
 from servod.formats.model import effects as fx
 from servod.formats.model import friction as fr
 from servod.formats.model.identified import Identified
@@ -254,7 +255,7 @@ def wave_number(harmonic: Harmonic) -> float:
 
 def load_axis_model(path: str | Path) -> AxisModel:
     """Read and check an axis model file. Raises BadInput (file, key, found, allowed)."""
-    return load_model(path, AxisModel)
+    return load_kind(path, FileKind.MODEL, AxisModel)
 
 
 def load_rotary_model(path: str | Path) -> AxisModel:
@@ -269,10 +270,9 @@ def rotary(model: AxisModel, where: str) -> AxisModel:
     return model
 
 
-# Turns an axis model into the parameters of the physics kernels (`servod.kernels.physics.layout`).
-#
-# Stands between `servod.formats.model.axis_model` (what is in the file) and `servod.kernels.physics` (what is
-# computed); off the control path.
+# --- Parameters of the kernels ---------------------------------------------------------------------------------------
+# Turns an axis model into the parameters of the physics kernels (`servod.kernels.physics.layout`). Off the control
+# path.
 
 
 #: Friction torque below which the bristle equation divides by nothing sensible; far under any real joint's.

@@ -85,9 +85,8 @@ def export_parquet(recording: McapRecording, path: Path) -> int:
     return len(recording)
 
 
+# --- Tables of numbers -----------------------------------------------------------------------------------------------
 # Writes columns of numbers to CSV or Parquet, aside and then renamed, so that a reader never sees half a file.
-#
-# Behind replay, identification and diagnosis; the daemon's own recordings have `servod.formats.recording.export`.
 
 
 def write_table(path: Path, columns: Mapping[str, NDArray[np.float64]]) -> None:

@@ -1,4 +1,4 @@
-"""What befell an axis: faults that belong together, in the order of their times, from a fault file or from the journal.
+"""What befell an axis: faults that belong together, in the order of their times, from fault files or the journal.
 
 Behind the recorder. The daemon keeps its own incidents in the same form (servod.runtime.daemon.fault_watch); `servoctl
 faults` prints them. All times are of the clock on the wall, in ns since 1970.
@@ -7,6 +7,7 @@ faults` prints them. All times are of the clock on the wall, in ns since 1970.
 from __future__ import annotations
 
 import re
+import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -18,6 +19,7 @@ from servod.common.faults import FAULTS, FaultCode, Reaction, faults_in
 from servod.common.files import read_text
 from servod.common.units import NS_PER_S
 from servod.formats.recording.mcap_reader import McapRecording, read_recording
+from servod.formats.recording.run_mark import ENDING, AbruptEnd, abrupt_ends
 
 #: A fault that comes later than this after the one before it has a cause of its own.
 QUIET_NS = 10 * NS_PER_S
@@ -158,6 +160,22 @@ def _detail(event: dict[str, Any]) -> str:
 def _between(text: str, cause: str) -> str:
     match = re.match(r" \[(.*?)\] ", text.removeprefix(cause)) if text.startswith(cause) else None
     return match[1] if match else ""
+
+
+def of_abrupt_end(end: AbruptEnd, axis: str = "") -> Incident:
+    """The end of a run without an orderly stop, at the time when the daemon was last seen alive."""
+    between = f"between {moment(end.seen_ns)} and {moment(end.found_ns)}"
+    return Incident(axis, [Seen(end.seen_ns, FaultCode.DAEMON_LOST, between)])
+
+
+def of_mark(path: Path) -> list[Incident]:
+    """The ends without an orderly stop that the mark of an axis's runs tells. Raises BadInput."""
+    return [of_abrupt_end(end, path.name.removesuffix(ENDING)) for end in abrupt_ends(path, time.time_ns())]
+
+
+def marks(folder: Path, axis: str | None = None) -> list[Path]:
+    """The marks of runs in `folder`; that of one axis where its name is given."""
+    return sorted(path for path in folder.glob(f"*{ENDING}") if axis in (None, path.name.removesuffix(ENDING)))
 
 
 def of_journal(path: Path) -> list[Incident]:

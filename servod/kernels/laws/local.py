@@ -31,7 +31,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from servod.kernels.laws.observer import decayed, limited, observe, remember, winding_up
+from servod.kernels.laws.observers import decayed, limited, observe, remember, winding_up
 from servod.kernels.laws.position import PositionTorques, position_torque
 from servod.kernels.laws.state import LawState
 from servod.kernels.laws.weights import Sets, blended

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from servod.kernels.laws.observer import observe, remember
+from servod.kernels.laws.observers import observe, remember
 from servod.kernels.laws.state import LawState
 
 

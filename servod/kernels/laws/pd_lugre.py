@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from servod.kernels.laws.observer import decayed, limited, winding_up
+from servod.kernels.laws.observers import decayed, limited, winding_up
 from servod.kernels.laws.state import LawState
 
 

@@ -29,9 +29,8 @@ from servod.lab.recordings.recording import Rows, rows_of
 from servod.lab.tracking.metrics import Curves
 from servod.lab.tracking.stepped import measure
 
+# --- Jobs of a step --------------------------------------------------------------------------------------------------
 # Independent jobs of a step, side by side in worker processes, with progress by the jobs that are done.
-#
-# Under the steps that tune and measure.
 
 
 T = TypeVar("T")
@@ -51,9 +50,9 @@ def run_jobs(
     return results
 
 
-# Runs of deployments and comparisons on disk: recordings as MCAP, curves of the comparison as arrays.
-#
-# Under the steps; the report reads them back.
+# --- Runs on disk ----------------------------------------------------------------------------------------------------
+# Runs of deployments and comparisons on disk: recordings as MCAP, curves of the comparison as arrays. The report reads
+# them back.
 
 
 def save_rows(path: Path, rows: Rows) -> None:

@@ -272,9 +272,9 @@ def _rows(figures: dict[str, Any]) -> Iterator[tuple[str, ...]]:
             )
 
 
+# --- The document ----------------------------------------------------------------------------------------------------
 # The one document of a commissioning: what was identified, certified, deployed and measured, and how long it took.
-#
-# Above the steps' files; `servoctl commission --json` prints it.
+# `servoctl commission --json` prints it.
 
 
 def failure(walk: Walk, failed: StepFailed) -> dict[str, Any]:

@@ -22,9 +22,8 @@ from servod.common.portable import lock_file
 from servod.common.yaml import Strict, validate
 from servod.formats.gains.store import write_file
 
+# --- Files of a walk -------------------------------------------------------------------------------------------------
 # Names of the files in a walk's folder, and how plain values get into them.
-#
-# Under state and steps.
 
 
 RECORDINGS = "recordings"

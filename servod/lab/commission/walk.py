@@ -18,9 +18,9 @@ from servod.client.open import WalkAxis
 from servod.common.errors import AnswerIsNo, BadInput
 from servod.lab.commission.state import State, file_sha256, sole_walk
 
-# What a person must decide, and who answers when nobody is there.
-#
-# Beside the walk; a step asks before it does what cannot be undone or was not asked for.
+# --- Questions to a person -------------------------------------------------------------------------------------------
+# What a person must decide, and who answers when nobody is there. A step asks before it does what cannot be undone or
+# was not asked for.
 
 
 #: Puts a yes-or-no question to a person.

@@ -160,8 +160,7 @@ class _Trial:
         try:
             if change:
                 self._tell("change of the set", 0.48)
-                self._on_trial = True
-                self._axis.activate(*change)
+                self._activate(*change)
                 self._axis.wait(FADE_S)
             rows = self._move("under the new set", 0.52)
         except AnswerIsNo as error:
@@ -173,6 +172,16 @@ class _Trial:
         limited = limits_met(motions_in(rows)[0], motions_in(ran_before.rows)[0] if ran_before else None)
         reasons = [*limited, *rejections(before, after, self._promised, self._count_rad)]
         return rows, after, [*reasons, *(doubtful_timing(rows) if reasons else [])]
+
+    def _activate(self, name: str, version: int) -> None:
+        """From here on the set is on trial, also where an interrupt cuts the request; a refusal leaves nothing to give
+        up, which would only hide its reason."""
+        self._on_trial = True
+        try:
+            self._axis.activate(name, version)
+        except ServodError:
+            self._on_trial = False
+            raise
 
     def _end(self, before: Figures | None, after: Figures | None, reasons: list[str]) -> None:
         told = {"before": before, "after": after}

@@ -83,9 +83,8 @@ def _mrad(value_rad: float) -> str:
     return f"{1e3 * value_rad:.4g}"
 
 
+# --- The cycles of a trial -------------------------------------------------------------------------------------------
 # What the cycles of a trial say beside its figures: where motions ran, what was limited, what the loop skipped.
-#
-# Between an axis's rows and the verdict.
 
 
 #: A value that is limited in no more than this share of the sines' cycles says nothing against a set: one cycle in a

@@ -224,9 +224,8 @@ def describe_place(name: str, located: Mapping[str, Any]) -> str:
     return ", most of all ".join(said)
 
 
+# --- Sentences of the report -----------------------------------------------------------------------------------------
 # What the report says in plain sentences: the verdict, how sure, what remains, and what to record next.
-#
-# Stands on the document of a diagnosis alone.
 
 
 #: What to do about a refused recording, by a word of the reason.

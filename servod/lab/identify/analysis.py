@@ -20,10 +20,10 @@ from servod.lab.identify.fits import break_away, bristle, curve, friction_map, k
 from servod.lab.identify.fits.bristle import Bristle
 from servod.lab.identify.trace import ExperimentKind, RecordedMotion
 
-# Encoder and torque-reading noise from a recording at rest.
-#
-# A reading is rounded to counts. How much of its noise that hides or adds depends on where within a count the joint
-# stands, which nobody knows: the interval of the encoder's noise spans every place.
+# --- Noise at rest ---------------------------------------------------------------------------------------------------
+# Encoder and torque-reading noise from a recording at rest. A reading is rounded to counts. How much of its noise that
+# hides or adds depends on where within a count the joint stands, which nobody knows: the interval of the encoder's
+# noise spans every place.
 
 
 Array = NDArray[np.float64]

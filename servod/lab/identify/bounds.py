@@ -54,10 +54,9 @@ def bounds_from(
     return Bounds(half, centre, speed, most, SHARE * limits.torque_nm, SHARE * limits.following_error_rad)
 
 
-# PD feedback for the experiments, from what is known of the joint so far.
-#
-# Under the walk. The crossover is a share of what the loop's whole lag (delay, hold, velocity filter) allows, so that
-# the same rule holds for every size of axis.
+# --- Feedback for the experiments ------------------------------------------------------------------------------------
+# PD feedback for the experiments, from what is known of the joint so far. The crossover is a share of what the loop's
+# whole lag (delay, hold, velocity filter) allows, so that the same rule holds for every size of axis.
 
 
 #: Crossover times lag: careful while only the kicks are known, stiff once the delay is.

@@ -79,9 +79,9 @@ def sandwich(design: Array, residual: Array, weights: Array, clusters: NDArray[n
     return covariance
 
 
-# Ranges of searches: a number that stands at the end of its range was not found there, and says so.
-#
-# Under the fits that search; the linear ones have no ranges.
+# --- Ends of ranges --------------------------------------------------------------------------------------------------
+# Ranges of searches: a number that stands at the end of its range was not found there, and says so. Fits that are
+# linear have no ranges.
 
 
 #: The note of such a number.
@@ -90,7 +90,7 @@ AT_END = "at the end of its range"
 ON_BOUND = 1e-3
 
 
-def at_ends(values: Sequence[float], low: Sequence[float], high: Sequence[float]) -> tuple[str, ...]:
+def bound_notes(values: Sequence[float], low: Sequence[float], high: Sequence[float]) -> tuple[str, ...]:
     """A note for each of `values` that a search between `low` and `high` left at an end, empty for the others."""
     places = [(v - a) / (b - a) for v, a, b in zip(values, low, high, strict=True)]
     return tuple(AT_END if place < ON_BOUND or place > 1.0 - ON_BOUND else "" for place in places)

@@ -224,9 +224,9 @@ def _lean(analysis: Analysis) -> tuple[float, float]:
     return lean - half, lean + half
 
 
+# --- What has changed ------------------------------------------------------------------------------------------------
 # What has changed on an axis between two identifications: the repeat that a worn, cold or newly loaded joint asks for.
-#
-# Beside the result; reads only what stands in two axis model files.
+# Reads only what stands in two axis model files.
 
 
 #: A difference counts beyond this multiple of both half widths together: among some thirty numbers, one that lies just

@@ -73,9 +73,9 @@ def trace_of(kind: ExperimentKind, rows: Rows, settings: dict[str, float]) -> Re
     )
 
 
-# Recorded signals made ready for regressions: torque shifted by the delay, position smoothed and differentiated.
-#
-# Under the fits. Torque and position pass the same Gaussian kernel, so that a linear equation between them stays true.
+# --- Signals for regressions -----------------------------------------------------------------------------------------
+# Recorded signals made ready for regressions: torque shifted by the delay, position smoothed and differentiated. Torque
+# and position pass the same Gaussian kernel, so that a linear equation between them stays true.
 
 
 #: The kernel reaches this many standard deviations to each side.

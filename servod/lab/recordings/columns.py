@@ -14,7 +14,8 @@ from typing import Annotated
 from pydantic import BeforeValidator, Field
 
 from servod.common.errors import BadInput
-from servod.common.yaml import Strict, load_model
+from servod.common.yaml import Strict
+from servod.formats.kinds import FileKind, load_kind
 from servod.formats.model.axis_model import AxisKind
 
 
@@ -71,7 +72,7 @@ class ColumnMap(Strict):
 
 def load_column_map(path: Path) -> dict[str, ColumnSource]:
     """Canonical name -> source of the `--map` file at `path`. Raises BadInput."""
-    return load_model(path, ColumnMap).sources(str(path))
+    return load_kind(path, FileKind.MAP, ColumnMap).sources(str(path))
 
 
 def apply_map(

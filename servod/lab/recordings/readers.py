@@ -23,11 +23,10 @@ from numpy.typing import NDArray
 from servod.common.errors import BadInput
 from servod.common.files import open_file, require_size, unreadable
 
-# How much a recording may hold: one limit for every format, so that reading takes at most 3 GiB of memory.
-#
-# Beneath the readers, which count while they unpack: a few kilobytes can unpack to any amount. A number takes eight
-# bytes
-# in the reader's table, eight in the recording, and for a moment some more while its column is scaled and checked.
+# --- How much may be read --------------------------------------------------------------------------------------------
+# How much a recording may hold: one limit for every format, so that reading takes at most 3 GiB of memory. Beneath the
+# readers, which count while they unpack: a few kilobytes can unpack to any amount. A number takes eight bytes in the
+# reader's table, eight in the recording, and for a moment some more while its column is scaled and checked.
 
 
 #: Most numbers in the columns that are used: 20 million rows of three columns, five and a half hours at 1 kHz.
@@ -55,10 +54,10 @@ def require_bytes(path: Path, unpacked: int) -> None:
         raise BadInput(str(path), f"{unpacked} bytes or more unpacked", f"at most {MOST_BYTES} bytes: {_REMEDY}")
 
 
-# Reads the numeric vectors of a MAT file of version 5: MathWorks' "MAT-File Format", Level 5.
-#
-# Beside `readers`. scipy has a reader for all that MATLAB can store, but it is compiled without bounds: a file with a
-# bent length ends the process. This one reads arrays of numbers and structs of them, and checks every length.
+# --- MAT files -------------------------------------------------------------------------------------------------------
+# Reads the numeric vectors of a MAT file of version 5: MathWorks' "MAT-File Format", Level 5. scipy has a reader for
+# all that MATLAB can store, but it is compiled without bounds: a file with a bent length ends the process. This one
+# reads arrays of numbers and structs of them, and checks every length.
 
 
 _MAT_HEADER_BYTES = 128
@@ -218,9 +217,9 @@ def _text(data: memoryview) -> str:
     return bytes(data[:_LONGEST_NAME]).partition(b"\0")[0].decode("latin-1")
 
 
-# Reads CSV, plain or packed with gzip, into arrow columns; counts rows and bytes while they are unpacked.
-#
-# Beside `readers`. The text is never whole in memory: Arrow takes it block by block from a stream that counts.
+# --- CSV files -------------------------------------------------------------------------------------------------------
+# Reads CSV, plain or packed with gzip, into arrow columns; counts rows and bytes while they are unpacked. The text is
+# never whole in memory: Arrow takes it block by block from a stream that counts.
 
 
 #: Longest header line that is looked at to find names and separator.

@@ -202,6 +202,7 @@ def _check_time(path: Path, t_s: Array, report: list[str]) -> None:
         )
 
 
+# --- Cycle records as rows -------------------------------------------------------------------------------------------
 # Cycle records as rows of a numpy structured array: the same bytes as `servod.formats.recording.record.RECORD`.
 
 
@@ -211,8 +212,8 @@ Rows = NDArray[np.void]
 
 
 def rows_of(raw: bytes | bytearray) -> Rows:
-    """Packed cycle records as structured rows."""
-    return np.frombuffer(bytes(raw), dtype=ROW)
+    """Packed cycle records as structured rows, which look into `raw` and copy nothing."""
+    return np.frombuffer(raw, dtype=ROW)
 
 
 def moving(rows: Rows) -> Rows:

@@ -212,9 +212,9 @@ def _work(page: Page, document: Document) -> None:
     page.folded("Time by stage", spent)
 
 
-# Writes what a diagnosis leaves in its folder: diagnosis.json, model.yaml, report.html and the pictures.
-#
-# Behind `servoctl diagnose` and `servoctl demo --diagnose`; every file is written aside and renamed.
+# --- The folder of a diagnosis ---------------------------------------------------------------------------------------
+# Writes what a diagnosis leaves in its folder: diagnosis.json, model.yaml, report.html and the pictures. Every file is
+# written aside and renamed.
 
 
 #: Names of the files of the outside contract.

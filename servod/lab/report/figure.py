@@ -145,9 +145,8 @@ def array(values: ArrayLike) -> Array:
     return np.asarray(values, dtype=np.float64)
 
 
+# --- Time curves and histograms --------------------------------------------------------------------------------------
 # Time curves for the eye: long series thinned so that no peak is lost, and histograms of what a run measured.
-#
-# Behind everything; stands on numpy and plotly (the lab part).
 
 
 Series = NDArray[np.float64]

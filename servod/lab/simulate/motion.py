@@ -90,10 +90,10 @@ def _gain_table(span: int, order: int) -> tuple[float, tuple[float, ...]]:
     return gains[-1], tuple(gains[:-1])
 
 
-# How a recording starts: at rest or in motion, and under which command; judged from its first rows alone.
-#
-# Stands between the smoothed motion and replay. The first row is the poorest of all (nothing before it), and a free run
-# carries its error to the end; so what is known of rests counts more there than the slope of a few samples.
+# --- How a recording starts ------------------------------------------------------------------------------------------
+# How a recording starts: at rest or in motion, and under which command; judged from its first rows alone. The first row
+# is the poorest of all (nothing before it), and a free run carries its error to the end; so what is known of rests
+# counts more there than the slope of a few samples.
 
 
 #: An axis whose motion, extrapolated backward, began at most so long before the first row was just set off, s.

@@ -55,7 +55,7 @@ def acting(torque: Sequence[float], row: int, before: float) -> float:
     return before if row < 0 else torque[row]
 
 
-def piece_end(t: Any, row: int, delay_s: float, limit: float) -> float:
+def acts_until(t: Any, row: int, delay_s: float, limit: float) -> float:
     """When the command of `row` stops acting, at most `limit`."""
     if row + 1 >= len(t):
         return limit
@@ -96,7 +96,7 @@ def run(
         now = t[k]
         while now < t[k + 1]:
             row = switch_row(t, row, now, p.delay_s)
-            end = piece_end(t, row, p.delay_s, t[k + 1])
+            end = acts_until(t, row, p.delay_s, t[k + 1])
             steps = inner_steps(end - now, step_s)
             advance(
                 p, tables, s, line, acting(torque, row, before), 0.0, steps, (end - now) / steps, 0.0, temperature[k]
@@ -145,7 +145,7 @@ def follow(
         now = t[k]
         while now < t[k + 1]:
             row = switch_row(t, row, now, p.delay_s)
-            end = piece_end(t, row, p.delay_s, t[k + 1])
+            end = acts_until(t, row, p.delay_s, t[k + 1])
             s.torque = actuator(p, s.torque, acting(torque, row, before), end - now)
             now = end
         span = t[k + 1] - t[k]

@@ -23,10 +23,10 @@ from servod.kernels.physics.effects import encoder_position
 from servod.kernels.physics.layout import PlantParameters, PlantState, Tables
 from servod.kernels.physics.plant import INNER_STEP_S, delay_line, inputs
 
-# The closed loop as a kernel: axis, encoder, velocity filter, delay and any control law, sample by sample.
-#
-# Compiled by `servod.lab.simulate.simulate`, which puts the law in place of `control_law`. The velocity filter is that
-# of the encoder driver (difference over the measured time, exact first-order low-pass), so simulator and axis agree.
+# --- The closed loop -------------------------------------------------------------------------------------------------
+# The closed loop as a kernel: axis, encoder, velocity filter, delay and any control law, sample by sample. Compiled by
+# `servod.lab.simulate.simulate`, which puts the law in place of `control_law`. The velocity filter is that of the
+# encoder driver (difference over the measured time, exact first-order low-pass), so simulator and axis agree.
 
 
 #: A row of the kernel's output, in this order.

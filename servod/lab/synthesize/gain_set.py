@@ -52,10 +52,10 @@ from servod.lab.synthesize.observer_width import (
 from servod.lab.verify.rounding import hold_width, rest_width
 from servod.lab.verify.steady_friction import SteadyFriction, steady_friction
 
-# Where a synthesized set comes from: hashes of the model's file, of the recordings behind it, and of this tool.
-#
-# Beside the synthesis. The recordings' hashes stand in the model that an identification wrote; the tool's hash is over
-# the sources that compute, so that two versions of one number are told apart.
+# --- Where a set comes from ------------------------------------------------------------------------------------------
+# Where a synthesized set comes from: hashes of the model's file, of the recordings behind it, and of this tool. The
+# recordings' hashes stand in the model that an identification wrote; the tool's hash is over the sources that compute,
+# so that two versions of one number are told apart.
 
 
 def provenance(model: AxisModel, model_path: Path | None, note: str) -> Provenance:

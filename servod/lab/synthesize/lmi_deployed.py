@@ -291,10 +291,10 @@ def both(p: Programme, sliding: Solution, sticking: Solution) -> Solution:
     )
 
 
-# Joints that guide the feedback beside the vertices, and are no part of the proof: the bristle being turned over.
-#
-# Stands under the deployed mode. After a reversal a bristle is twice as stiff for milliseconds. The certificate judges
-# that at every speed; a feedback made for a steep fall of friction alone is too much for it there.
+# --- The bristle being turned over -----------------------------------------------------------------------------------
+# Joints that guide the feedback beside the vertices, and are no part of the proof: the bristle being turned over. After
+# a reversal a bristle is twice as stiff for milliseconds. The certificate judges that at every speed; a feedback made
+# for a steep fall of friction alone is too much for it there.
 
 
 #: (centre, radius) asked for: stable, no more, for it lasts for milliseconds.

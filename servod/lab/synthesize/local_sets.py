@@ -156,10 +156,10 @@ def largest_mismatch(law: LocalFrictionSets, time_s: float = FINITE_TIME_S) -> M
     return max(found, key=lambda pair: pair.share, default=None)
 
 
-# The law's feed-forward of what the axis model knows over position: gravity, cogging, spring, constant torque.
-#
-# Stands on the axis model; its result is the `position_feedforward` block of a gain set. Torques are divided by the
-# model's torque gain, as the steady friction is: what the law must ask for, not what the joint feels.
+# --- Feed-forward over position --------------------------------------------------------------------------------------
+# The law's feed-forward of what the axis model knows over position: gravity, cogging, spring, constant torque. Its
+# result is the `position_feedforward` block of a gain set. Torques are divided by the model's torque gain, as the
+# steady friction is: what the law must ask for, not what the joint feels.
 
 
 def position_feedforward(model: AxisModel, gain: float, period_s: float) -> PositionFeedforward | None:

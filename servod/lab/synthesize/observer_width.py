@@ -170,13 +170,13 @@ def low_bandwidths(design: Design, friction: SteadyFriction, law: LocalParameter
     return [low for low in wanted if low > WORTH * LOW_FACTORS[-1] * high]
 
 
-# The local compensating gains l_i of (9), designed: the largest that the sampled loop stands with a stated margin.
-#
-# Stands on the sweep that verification uses. l_i is integral action through the friction state, and the only one of a
-# law without output observer. Its sign makes z_hat push the way the feedback pushes; with the other one the loop is
-# unstable at every size (positive feedback around an integrator), so only l > 0 is looked for. How much a set may have
-# depends on its speed: creeping, where z_hat hardly leaks, 0.03 is the limit on the paper's joint, ten times that where
-# friction settles fast. One common gain would be that of the slowest set, and tracks a quarter worse.
+# --- Compensating gains ----------------------------------------------------------------------------------------------
+# The local compensating gains l_i of (9), designed: the largest that the sampled loop stands with a stated margin. l_i
+# is integral action through the friction state, and the only one of a law without output observer. Its sign makes z_hat
+# push the way the feedback pushes; with the other one the loop is unstable at every size (positive feedback around an
+# integrator), so only l > 0 is looked for. How much a set may have depends on its speed: creeping, where z_hat hardly
+# leaks, 0.03 is the limit on the paper's joint, ten times that where friction settles fast. One common gain would be
+# that of the slowest set, and tracks a quarter worse.
 
 
 #: Candidates [rad/s per unit of u* = u/K].
@@ -225,10 +225,10 @@ def designed(design: Design, friction: SteadyFriction, law: LocalParameters) -> 
     return with_gains(law, speeds, [0.0] * SPEEDS)
 
 
-# How fast the output observer may be in Omega_L while the reference moves, tried on simulated plants.
-#
-# Stands after the search for bandwidths that are stable. A fast observer tracks best, yet where friction turns over it
-# has taken the old direction for a disturbance, and may throw the joint forward: no pole shows that, a slow sine does.
+# --- The observer while the reference moves --------------------------------------------------------------------------
+# How fast the output observer may be in Omega_L while the reference moves, tried on simulated plants. A fast observer
+# tracks best, yet where friction turns over it has taken the old direction for a disturbance, and may throw the joint
+# forward: no pole shows that, a slow sine does.
 
 
 PLANTS, SEED = 20, 11  # of the trial; the certificate draws others, and many more
@@ -256,11 +256,10 @@ def follows(gains: GainSet) -> bool:
     return max(trial.error_share for trial in tried) < TRIED_SHARE * ERROR_SHARE
 
 
-# How much of feedback and observer is left of a joint at rest: as little as its loops at rest stand.
-#
-# Stands after the search for an observer. At rest a joint stands on its bristle, and what feedback adds is the
-# encoder's
-# noise: less of it keeps the joint where it is, yet where friction falls steeply with speed too little lets it hunt.
+# --- Feedback and observer at rest -----------------------------------------------------------------------------------
+# How much of feedback and observer is left of a joint at rest: as little as its loops at rest stand. At rest a joint
+# stands on its bristle, and what feedback adds is the encoder's noise: less of it keeps the joint where it is, yet
+# where friction falls steeply with speed too little lets it hunt.
 
 
 #: Best first: at 20 bit the first holds a joint within 5 urad, all of the feedback within 15 to 45.

@@ -35,11 +35,11 @@ def pole_disc(least_decay_per_s: float, least_damping: float, period_s: float) -
     return rho - low, low
 
 
-# Half widths of the design's intervals: those that an identification measured, stated defaults for the rest.
-#
-# Stands between the axis model file and the design. What was measured is taken as wide as it was measured, and never
-# narrower than a floor: an axis warms, and is not the same tomorrow. Torques are identified in units of the command, so
-# the torque gain is in every other number and has no interval of its own.
+# --- Half widths -----------------------------------------------------------------------------------------------------
+# Half widths of the design's intervals: those that an identification measured, stated defaults for the rest. What was
+# measured is taken as wide as it was measured, and never narrower than a floor: an axis warms, and is not the same
+# tomorrow. Torques are identified in units of the command, so the torque gain is in every other number and has no
+# interval of its own.
 
 
 #: The design's file takes no wider share. What was measured wider than this stays wider than the design, which then
@@ -57,9 +57,9 @@ def uncertainty_of(model: AxisModel) -> Uncertainty:
     return Uncertainty(torque_gain=0.0, **bounded)
 
 
-# Axes whose torque comes so late that nothing is designed for them: said at once, with what would help.
-#
-# Beside the LMIs of the deployed mode, which have a state for every command on its way.
+# --- Axes that are too late ------------------------------------------------------------------------------------------
+# Axes whose torque comes so late that nothing is designed for them: said at once, with what would help. The LMIs of the
+# deployed mode have a state for every command on its way.
 
 
 #: Cycles of delay up to which a design is tried. The law feeds the last three commands back; with four the paper's

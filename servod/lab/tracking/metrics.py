@@ -280,9 +280,9 @@ def swings(position_rad: Array, width_rad: float) -> int:
     return count
 
 
-# The motions under which gain sets are compared: trajectory (19), then two steps that are held for a long time.
-#
-# Stands on the loop's own reference functions, so that simulator and axis follow the same numbers.
+# --- The motions -----------------------------------------------------------------------------------------------------
+# The motions under which gain sets are compared: trajectory (19), then two steps that are held for a long time. They
+# are the loop's own reference functions, so that simulator and axis follow the same numbers.
 
 
 PAPER_S = 30.0
@@ -306,10 +306,9 @@ def step_rows(period_s: float, step_mrad: float, duration_s: float = HOLD_S) -> 
     return rows
 
 
-# Tracking on the compiled simulator: the same motions and rules as over the CAN loop, hundreds of times faster.
-#
-# Stands on `servod.lab.simulate.simulate`. What the simulator leaves out: the drive's steps of torque and its rate
-# limit.
+# --- On the compiled simulator ---------------------------------------------------------------------------------------
+# Tracking on the compiled simulator: the same motions and rules as over the CAN loop, hundreds of times faster. What
+# the simulator leaves out: the drive's steps of torque and its rate limit.
 
 
 def measure(

@@ -41,10 +41,10 @@ from servod.lab.synthesize.regions import OVERLAP_RAD_S
 from servod.lab.tune.plan import Feedback, TuningSettings
 from servod.lab.verify.steady_friction import SteadyFriction, steady_friction
 
-# One friction curve for both directions, fitted to the axis model's map: what the LuGre observer (18) can hold.
-#
-# Stands on the steady friction. The paper's observer has one set of parameters; that a real joint's directions differ
-# is its handicap by nature and not by tuning.
+# --- One friction curve ----------------------------------------------------------------------------------------------
+# One friction curve for both directions, fitted to the axis model's map: what the LuGre observer (18) can hold. The
+# paper's observer has one set of parameters; that a real joint's directions differ is its handicap by nature and not by
+# tuning.
 
 
 Array = NDArray[np.float64]

@@ -29,10 +29,10 @@ from servod.lab.tune.plan import Feedback, Tuned, TuningSettings
 from servod.lab.verify.plants import drawn
 from servod.lab.verify.trials import RIPPLE_LIMIT_RAD
 
-# What one gain set costs on the plants of a tuning: the same motion, plants, noise and rules for every law.
-#
-# Stands on the compiled simulator. Cost in mrad: the RMS error on (19), with the error of held steps beside it, times
-# what the set pays for rough torque, for restlessness and for plants that run away.
+# --- The cost of a set -----------------------------------------------------------------------------------------------
+# What one gain set costs on the plants of a tuning: the same motion, plants, noise and rules for every law. Cost in
+# mrad: the RMS error on (19), with the error of held steps beside it, times what the set pays for rough torque, for
+# restlessness and for plants that run away.
 
 
 #: Of (19): both reversals and both directions, sliding through the fall of the Stribeck curve.
@@ -178,8 +178,8 @@ def _beyond(share: float) -> float:
     return 1.0 + PENALTY * max(0.0, share - 1.0)
 
 
+# --- The optimiser ---------------------------------------------------------------------------------------------------
 # The bounded optimiser, the same for every law: even points over the whole range, then a simplex from the best.
-#
 # Derivative-free: costs of simulated plants with stiction and encoder steps have no useful slope. Sobol points look for
 # a better valley than that of the start, Nelder-Mead (with bounds, adaptive to the dimension) walks down in it. On
 # these costs that beat differential evolution by up to 40 % at equal budget, and two descents by 10 %. All numbers are

@@ -27,11 +27,11 @@ from servod.lab.verify.closed_loop import Behind, LoopDeviation, Reach, corners
 from servod.lab.verify.sampled import LONGEST_LAG
 from servod.lab.verify.steady_friction import SPRING_STRETCH_RAD, SteadyFriction, position_slopes, steady_friction
 
-# What effects of the axis model do to the values of the joint: how far each value goes over travel and temperature.
-#
-# Stands on axis model and steady friction, under the checks of effects. The loop check linearises a plain joint; an
-# effect that scales a value, or adds a slope, is in it as the ends of an interval. One function for each group, in the
-# table at the end; each gives bounds: amplitudes are summed as if they met in one place.
+# --- Effects on the values of the joint ------------------------------------------------------------------------------
+# What effects of the axis model do to the values of the joint: how far each value goes over travel and temperature. The
+# loop check linearises a plain joint; an effect that scales a value, or adds a slope, is in it as the ends of an
+# interval. One function for each group, in the table at the end; each gives bounds: amplitudes are summed as if they
+# met in one place.
 
 
 Ends = tuple[float, float]
@@ -280,10 +280,9 @@ def effects_of(model: AxisModel, level: ReachLevel) -> dict[str, EffectReach]:
     return found
 
 
-# What of an axis model no check of the sampled loop can carry.
-#
-# Stands on the axis model, under the checks of effects. Drawn plants are simulated with every effect, but poles and
-# margins are of a joint that is linearised: a certificate must not pass over the rest in silence.
+# --- What no check carries -------------------------------------------------------------------------------------------
+# What of an axis model no check of the sampled loop can carry. Drawn plants are simulated with every effect, but poles
+# and margins are of a joint that is linearised: a certificate must not pass over the rest in silence.
 
 
 #: Periods in which the torque must get from one end to the other: slower, its rate limit is a lag that grows.

@@ -23,9 +23,9 @@ from servod.lab.verify.sampled import Array
 from servod.lab.verify.steady_friction import SteadyFriction, steady_friction
 from servod.lab.verify.vertices import Span, ends
 
-# Vertices of the paper's polytope (15): what the reference mode solves over and its proof is evaluated on.
-#
-# Stands on the steady friction and the law's own local sets. Physically consistent with (12), states (z_hat, x, v):
+# --- Vertices of (15) ------------------------------------------------------------------------------------------------
+# Vertices of the paper's polytope (15): what the reference mode solves over and its proof is evaluated on. Physically
+# consistent with (12), states (z_hat, x, v):
 #
 #     A_i = [-a, 0, 1; 0, 0, 1; -dc/m, -kappa/m, -dd/m],  B_2i = [l, 0, K/m],  B_1 = [1, 0; 0, 0; 0, 1/m].
 #
@@ -162,9 +162,9 @@ def reference_gains(proof: ReferenceProof) -> RegionGains:
     return RegionGains(k_z_per_rad=k_z, k_x_per_rad=k_x, k_v_s_per_rad=k_v)
 
 
-# Checks of a set's proofs that hold for both modes: that every region has one, and the paper's own inequalities.
-#
-# Stands beside `checks`. What the reference mode proves says nothing of the sampled loop; the other checks judge that.
+# --- Checks of both modes --------------------------------------------------------------------------------------------
+# Checks of a set's proofs that hold for both modes: that every region has one, and the paper's own inequalities. What
+# the reference mode proves says nothing of the sampled loop; the other checks judge that.
 
 
 REGIONS = 2

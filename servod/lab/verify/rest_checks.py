@@ -104,7 +104,7 @@ def check_loads(s: Subject) -> Iterator[CertificateCheck]:
     gives, left = load / friction.stiffness, rest_width(s.design) + HOLD_LIMIT_RAD
     step, slow = load_step(s, load), slow_load(s, load)
     yield judged(s, still, "load step, greatest deviation [rad]", step, greatest, STEP_GIVES * gives + left)
-    yield judged(s, still, "load step, deviation at its end [rad]", step, at_end(s), left)
+    yield judged(s, still, "load step, deviation at its end [rad]", step, largest_in_last_second(s), left)
     yield judged(s, still, "slow load, greatest deviation [rad]", slow, greatest, SINE_GIVES * gives + left)
     yield judged(s, still, "blows at rest, deviation 1.5 s after [rad]", blows(s), after_blows(s), left)
 
@@ -177,7 +177,7 @@ def greatest(position_rad: Array) -> float:
     return float(np.abs(position_rad).max()) if np.isfinite(position_rad).all() else math.inf
 
 
-def at_end(s: Subject) -> Callable[[Array], float]:
+def largest_in_last_second(s: Subject) -> Callable[[Array], float]:
     """The largest deviation in the last second."""
     return lambda position_rad: greatest(position_rad[-round(1.0 / s.design.period_s) :])
 

@@ -75,10 +75,10 @@ def _l1_norms(sweep: Sweep, velocity: float, slopes: LawSlopes, cases: tuple[Loo
     return total
 
 
-# What may count as a joint at rest: the width that rounding and noise of the encoder make, and no more.
-#
-# Stands on a design alone. Synthesis takes the widths from here, and verification compares a set with them: within the
-# width most of the feedback is off, so a set that calls more of its travel rest is another law than the one judged.
+# --- The width of rest -----------------------------------------------------------------------------------------------
+# What may count as a joint at rest: the width that rounding and noise of the encoder make, and no more. Synthesis takes
+# the widths from here, and verification compares a set with them: within the width most of the feedback is off, so a
+# set that calls more of its travel rest is another law than the one judged.
 
 
 HOLD_COUNTS = 0.6  # hold width in encoder counts: what rounding hides, and no more, for the joint creeps as far

@@ -124,10 +124,9 @@ def _fitted(values: dict[str, IdentifiedValue], side: str) -> FittedCurve | None
     return FittedCurve(static - coulomb, speed, exponent, viscous)
 
 
-# How steeply torques over position rise and fall: cogging, gravity and springs act on the feedback as stiffness.
-#
-# Stands on the axis model, under the loop check. What is fed forward goes by the reference and closes no loop, so the
-# whole slope stays in the loop, fed forward or not.
+# --- Slopes over position --------------------------------------------------------------------------------------------
+# How steeply torques over position rise and fall: cogging, gravity and springs act on the feedback as stiffness. What
+# is fed forward goes by the reference and closes no loop, so the whole slope stays in the loop, fed forward or not.
 
 
 SPRING_STRETCH_RAD = 1.0  # at which a stiffening spring is judged

@@ -159,10 +159,9 @@ def motion_for(design: Design) -> ValidationMotion:
     )
 
 
-# What a certificate promises of the validation motion: the worst that drawn plants show, which a deployment measures.
-#
-# Stands on the compiled simulator and the validation motion, beside the checks: a promise is kept on the axis, not
-# here.
+# --- The promise -----------------------------------------------------------------------------------------------------
+# What a certificate promises of the validation motion: the worst that drawn plants show, which a deployment measures. A
+# promise is kept on the axis, not here.
 
 
 PLANTS = 24

@@ -157,11 +157,10 @@ def _to_feedback_first(size: int) -> Array:
     return change
 
 
+# --- Half widths -----------------------------------------------------------------------------------------------------
 # Half widths of what an identification measured, as shares of the values: what a design's intervals must hold.
-#
-# Stands on the identified values alone; synthesis widens them to its floors, verification compares them with the
-# design.
-# An interval need not be even: the wider side counts, as wide as it was measured.
+# Synthesis widens them to its floors, verification compares them with the design. An interval need not be even: the
+# wider side counts, as wide as it was measured.
 
 
 #: Names of identified values, by the key of Uncertainty that they bound; of several the widest counts.

@@ -150,11 +150,11 @@ def _again_and_again(path: str, attack: Attack, until_s: float, counts: memoryvi
 def _stay_idle(path: str, until_s: float, counts: memoryview) -> None:
     with contextlib.ExitStack() as stack:
         for _ in range(_IDLE_CONNECTIONS):
-            _join_in_the_end(stack.enter_context(_Connection(counts)), path, until_s)
+            _join_when_free(stack.enter_context(_Connection(counts)), path, until_s)
         time.sleep(max(0.0, until_s - time.monotonic()))
 
 
-def _join_in_the_end(connection: _Connection, path: str, until_s: float) -> None:
+def _join_when_free(connection: _Connection, path: str, until_s: float) -> None:
     """The others stand in the same queue, and it may be full."""
     while time.monotonic() < until_s:
         try:

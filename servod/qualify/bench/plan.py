@@ -12,16 +12,19 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from servod.common.files import unwritable
 from servod.common.shipped import shipped
 from servod.qualify.bench import speed, tick, wakeup
 from servod.qualify.bench import wall_clock as wall
 
-# How long the laboratory takes: synthesis of both regions, a certificate, and a whole commissioning.
-#
-# Beside the figures of the loop; each on Table I's joint, the axis model that ships.
+if TYPE_CHECKING:
+    from rich.console import Console
+
+# --- The laboratory --------------------------------------------------------------------------------------------------
+# How long the laboratory takes: synthesis of both regions, a certificate, and a whole commissioning. Each on Table I's
+# joint, the axis model that ships.
 
 
 PROCESSES = 2
@@ -125,6 +128,7 @@ def machine() -> dict[str, Any]:
     return {"cpu": model, "cores": cores, "kernel": platform.release(), "python": sys.version.split()[0]}
 
 
+# --- The table -------------------------------------------------------------------------------------------------------
 # The benchmark's figures as a table beside what they shall reach, and as a file.
 
 
@@ -204,17 +208,16 @@ def shown(document: dict[str, Any], goal: Target) -> str:
     return "not measured" if value is None else goal.text.format(value)
 
 
-def print_table(document: dict[str, Any]) -> None:
+def print_table(document: dict[str, Any], console: Console) -> None:
     """Print every figure beside its goal, and what it was measured on."""
-    from rich.console import Console
     from rich.table import Table
 
     machine = document["machine"]
-    title = f"{machine['cpu']}, {machine['cores']} cores, Linux {machine['kernel']}, Python {machine['python']}"
-    table = Table("Figure", "Measured", "Goal", "", title=title, title_justify="left")
+    measured_on = f"{machine['cpu']}, {machine['cores']} cores, Linux {machine['kernel']}, Python {machine['python']}"
+    table = Table("Figure", "Measured", "Goal", "")
     for goal in GOALS:
         table.add_row(goal.label, shown(document, goal), goal.goal, goal.verdict(document))
-    console = Console()
+    console.print(measured_on, highlight=False, markup=False)
     console.print(table)
     wall, memory = document["wall_clock"], document["memory"]
     console.print(

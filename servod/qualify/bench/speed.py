@@ -17,6 +17,7 @@ from servod.runtime.loop.commands import Op, ReferenceKind
 if TYPE_CHECKING:
     from servod.drivers.virtual.world import SteppedWorld
 
+# --- The axis of the benchmark ---------------------------------------------------------------------------------------
 # The stepped axis that the benchmark measures: the demo's joint under its local-model law.
 
 

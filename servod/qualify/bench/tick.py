@@ -20,9 +20,9 @@ from servod.runtime.fieldbus.bus import Bus, Frame
 from servod.runtime.loop.commands import Op, ReferenceKind
 from servod.runtime.loop.controller import Controller
 
+# --- Control laws ----------------------------------------------------------------------------------------------------
 # Times the control laws as the loop runs them: plain Python floats through `engine.Controller`, one call per cycle.
-#
-# Off the data path; `servoctl bench` prints the result. Nothing here asserts a time: machines differ.
+# `servoctl bench` prints the result. Nothing here asserts a time: machines differ.
 
 
 PERIOD_S = 0.001

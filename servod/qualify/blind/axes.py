@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 from servod.qualify.blind.physics import Physics
 from servod.qualify.blind.plant import PERIOD_S, Loop
 
-# What the axes of the trial do in front of the recorder: four references, rows of a millisecond.
-#
-# Stands beside the plant. The three recordings of a case have a reason each: the slow sine shows friction and
-# everything over position, the multisine inertia, delay and elasticity, the moves breakaway and rest; the fourth is
-# held out.
+# --- The motions -----------------------------------------------------------------------------------------------------
+# What the axes of the trial do in front of the recorder: four references, rows of a millisecond. The three recordings
+# of a case have a reason each: the slow sine shows friction and everything over position, the multisine inertia, delay
+# and elasticity, the moves breakaway and rest; the fourth is held out.
 
 
 Array = NDArray[np.float64]

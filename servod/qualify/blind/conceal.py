@@ -31,15 +31,14 @@ from servod.qualify.blind.physics import Physics
 from servod.qualify.blind.plan import CaseSpec, Cover, Settings, Sort
 from servod.qualify.blind.plant import Loop, rest, run
 
-# Makes one case: draws the axis and what it conceals, records it, and writes down the truth.
-#
-# Stands on plan, drawings and plant. An effect whose torque cannot be seen is drawn stronger, one that makes the loop
-# unstable weaker.
+# --- Making a case ---------------------------------------------------------------------------------------------------
+# Makes one case: draws the axis and what it conceals, records it, and writes down the truth. An effect whose torque
+# cannot be seen is drawn stronger, one that makes the loop unstable weaker.
 
 
-# What is true of a case, said in the words of an axis model file; and what its user believes.
-#
-# Stands between the plant's numbers and files. Knows the file format of the outside contract, no model code.
+# --- The truth of a case ---------------------------------------------------------------------------------------------
+# What is true of a case, said in the words of an axis model file; and what its user believes. Knows the file format of
+# the outside contract, no model code.
 
 
 def believed_model(physics: Physics, off: Sequence[float]) -> Document:
@@ -405,9 +404,9 @@ def read_truth(out: Path, digest: str) -> dict[str, Any]:
     return cases
 
 
-# What a trial is: its settings and the hash of its sealed truth, in one file of its folder.
-#
-# Under the three processes; each reads it, only the first writes it.
+# --- Settings and seal -----------------------------------------------------------------------------------------------
+# What a trial is: its settings and the hash of its sealed truth, in one file of its folder. Under the three processes;
+# each reads it, only the first writes it.
 
 
 FILE = "trial.json"

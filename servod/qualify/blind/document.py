@@ -33,9 +33,9 @@ from servod.qualify.blind.plan import Sort
 from servod.qualify.blind.score import Scored, score_case
 from servod.qualify.blind.tables import CONFIDENCE, EFFECTS
 
-# The pictures of a trial: who was taken for whom, and whether stated confidence is to be believed.
-#
-# Drawn from the JSON document, with plotly for the page and with matplotlib as PNG, both the same.
+# --- Pictures --------------------------------------------------------------------------------------------------------
+# The pictures of a trial: who was taken for whom, and whether stated confidence is to be believed. Drawn from the JSON
+# document, with plotly for the page and with matplotlib as PNG, both the same.
 
 
 Array = NDArray[np.float64]

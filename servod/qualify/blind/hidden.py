@@ -12,8 +12,8 @@ from collections.abc import Callable, Mapping
 from servod.qualify.blind import listed
 from servod.qualify.blind.concealed import NO_THERMOMETER, Concealed, Document, Draw
 
+# --- Between command and load ----------------------------------------------------------------------------------------
 # Draws what is concealed between command and load: the drive's faults, elasticity, inertia, and torques from outside.
-#
 
 
 def backlash(draw: Draw) -> Concealed:
@@ -126,9 +126,9 @@ def disturbance(draw: Draw) -> Concealed:
     return Concealed(changes, told, None if draw.other else {}, only=int(draw.one_of(0.0, 1.0, 2.0)))
 
 
-# Draws what is concealed over position: periodic torques, weights, springs, inertia, and an encoder off its axis.
-#
-# What repeats along the way repeats at least PERIODS times in the range.
+# --- Over position ---------------------------------------------------------------------------------------------------
+# Draws what is concealed over position: periodic torques, weights, springs, inertia, and an encoder off its axis. What
+# repeats along the way repeats at least PERIODS times in the range.
 
 
 #: Least periods in the range of whatever is periodic in position.
@@ -251,9 +251,9 @@ def _first(rows: list[Document]) -> dict[str, float]:
     return dict(rows[0])
 
 
-# Draws concealed friction: by direction, near rest, over speed, load and temperature.
-#
-# Sizes are shares of Coulomb friction.
+# --- Friction --------------------------------------------------------------------------------------------------------
+# Draws concealed friction: by direction, near rest, over speed, load and temperature. Sizes are shares of Coulomb
+# friction.
 
 
 def asymmetry(draw: Draw) -> Concealed:
@@ -330,8 +330,8 @@ def thermal(draw: Draw) -> Concealed:
     return Concealed(changes, found, {listed.THERMAL: {**found, "shape": shape}}, thermometer=True)
 
 
+# --- On nobody's list ------------------------------------------------------------------------------------------------
 # Draws physics that is on nobody's list: the right answer is that something unexplained is there, and where.
-#
 
 
 def cage_resonance(draw: Draw) -> Concealed:

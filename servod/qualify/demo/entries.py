@@ -18,9 +18,9 @@ from servod.formats.gains.parameters import LocalParameters, PdDobParameters, Pd
 from servod.kernels.laws import LABELS
 from servod.qualify.demo.axis import CERTIFIED, CERTIFIED_LABEL, CONTROLLERS, demo_config, gains_file
 
-# What the certificate of a gain set promises, in the units of a drive engineer: the margins that the demo shows.
-#
-# Beside the data path; reads the certificate that stands in the set, and computes no loop.
+# --- Margins ---------------------------------------------------------------------------------------------------------
+# What the certificate of a gain set promises, in the units of a drive engineer: the margins that the demo shows. Reads
+# the certificate that stands in the set, and computes no loop.
 
 
 #: Checks and observations of `servoctl verify` that are told, by their names in a certificate.

@@ -14,9 +14,11 @@ import numpy as np
 import plotly.graph_objects as go
 from plotly.colors import qualitative
 
+from servod.kernels.laws import LABELS
 from servod.lab.report.figure import histogram, time_curves
 from servod.lab.report.page import Page
 from servod.lab.tracking.metrics import SETTLE_S
+from servod.qualify.demo.axis import CONTROLLERS
 from servod.qualify.demo.entries import DemoRow
 from servod.qualify.demo.runs import Run
 
@@ -44,7 +46,7 @@ class Story(NamedTuple):
 
 def write_demo_page(rows: Sequence[DemoRow], runs: Sequence[Run], path: Path, story: Story) -> None:
     """Write the demo's report to `path`, one run for each row; raises BadInput when that is not possible."""
-    page = Page("servod demo: trajectory (19) under four controllers")
+    page = Page(f"servod demo: trajectory (19) under {len(rows)} controllers")
     labels = {row.name: row.label for row in rows}
     _say(page, labels, runs, story)
     _compare(page, rows, runs)
@@ -83,9 +85,11 @@ def _say(page: Page, labels: Labels, runs: Sequence[Run], story: Story) -> None:
 
 
 def _compare(page: Page, rows: Sequence[DemoRow], runs: Sequence[Run]) -> None:
+    alike = [LABELS[name] for name in CONTROLLERS]
     page.sentence(
-        "The four controllers have the same PD feedback. What else each law had stands in the table; what a single "
-        "option is worth shows when gain sets without it run beside them (servoctl demo --gains FILE)."
+        f"{', '.join(alike[:-1])} and {alike[-1]} have the same PD feedback. What else each law had "
+        "stands in the table; what a single option is worth shows when gain sets without it run beside them "
+        "(servoctl demo --gains FILE)."
     )
     cells = []
     for row, run in zip(rows, runs, strict=True):

@@ -85,10 +85,9 @@ def summary(runs: list[Run], wall_s: float) -> dict[str, Any]:
     }
 
 
-# The demo SYNC-stepped: the same runs in virtual time, two at once, as fast as they compute.
-#
-# Beside the data path. Each run is a session of its own (servod.client.stepped) in a worker process, from the same
-# start.
+# --- In virtual time -------------------------------------------------------------------------------------------------
+# The demo SYNC-stepped: the same runs in virtual time, two at once, as fast as they compute. Each run is a session of
+# its own (servod.client.stepped) in a worker process, from the same start.
 
 
 Progress = Callable[[str, float], None]

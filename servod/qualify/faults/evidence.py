@@ -127,10 +127,10 @@ def _fitted(held: Sequence[tuple[float, float]], center_rad: float, omega: float
     return (sx * cc - cx * sc) / determinant, (cx * ss - sx * sc) / determinant
 
 
-# How many cycle records a scenario cost: what is missing in the recordings that the daemon left.
-#
-# Behind the recorder of a daemon that always records. A recording that cannot be read at all is a complaint of its own
-# (BadInput), and so is none (AnswerIsNo): 0 records are lost only where there were records.
+# --- Lost records ----------------------------------------------------------------------------------------------------
+# How many cycle records a scenario cost: what is missing in the recordings that the daemon left. Behind the recorder of
+# a daemon that always records. A recording that cannot be read at all is a complaint of its own (BadInput), and so is
+# none (AnswerIsNo): 0 records are lost only where there were records.
 
 
 #: A row is in the file when its chunk is, after half a second; the rest is for a machine that others use too [s].

@@ -133,10 +133,9 @@ def _ms(time_ns: int | None, since_ns: int) -> float | None:
     return None if time_ns is None else (time_ns - since_ns) / _NS_PER_MS
 
 
-# What a scenario takes from the axis, by its actions and not by its own word, and whether it is bound as it must be.
-#
-# Between the actions and their readers: the check of a scenario's file, and the table of outcomes. A scenario to which
-# the bound does not apply says why (`exempt`), and is counted and shown.
+# --- What is lost ----------------------------------------------------------------------------------------------------
+# What a scenario takes from the axis, by its actions and not by its own word, and whether it is bound as it must be. A
+# scenario to which the bound does not apply says why (`exempt`), and is counted and shown.
 
 
 def loss_of(scenario: Scenario) -> Loss:

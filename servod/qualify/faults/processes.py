@@ -156,7 +156,7 @@ class ProcessAxis:
     def restart_daemon(self) -> None:
         """As the service manager does it: SIGTERM, wait, start."""
         self.signal([Process.DAEMON], signal.SIGTERM)
-        self._expect_end()
+        self._expect_exit()
         self._asked_to_end = False
         self.leave()
         self.machine.start_daemon()
@@ -172,7 +172,7 @@ class ProcessAxis:
     def observe(self) -> Observation:
         """What is seen now."""
         if self._asked_to_end:
-            self._expect_end()
+            self._expect_exit()
         samples = self.machine.drive_samples()
         axis, shown, overrun = self._shown(samples)
         told = {FaultCode[name] for name in _TOLD.findall(self.machine.daemon_log())}
@@ -236,7 +236,7 @@ class ProcessAxis:
             wait_for_rows(folder, due_ns)
         return lost_records(folder, self.config.cycle.period_us * NS_PER_US, due_ns)
 
-    def _expect_end(self) -> None:
+    def _expect_exit(self) -> None:
         """A daemon that was asked to end does so with 0."""
         try:
             code = self.machine.wait(Process.DAEMON, 10.0)

@@ -26,10 +26,10 @@ from servod.qualify.faults.under_test import AxisUnderTest, Observation
 if TYPE_CHECKING:
     from servod.lab.report.page import Page
 
-# Whether what a scenario injects really happened: a fault that hits nothing proves nothing.
-#
-# Part of the judge. Each action knows its trace: frames that the hub struck, a node that took a value, a process that
-# got its signal. Beside the injection on purpose: an injection that does nothing cannot say that it did.
+# --- What really happened --------------------------------------------------------------------------------------------
+# Whether what a scenario injects really happened: a fault that hits nothing proves nothing. Part of the judge. Each
+# action knows its trace: frames that the hub struck, a node that took a value, a process that got its signal. Beside
+# the injection on purpose: an injection that does nothing cannot say that it did.
 
 
 class Effects:
@@ -153,10 +153,9 @@ def _inject(axis: AxisUnderTest, scenario: Scenario, injections: Sequence[Inject
     return counted_ns
 
 
-# The whole campaign: scenarios one after the other, or several of those in virtual time at once.
-#
-# Above `run`; used by `servoctl qualify faults`. Whoever takes the outcomes may stop in between and keeps what came so
-# far.
+# --- The campaign ----------------------------------------------------------------------------------------------------
+# The whole campaign: scenarios one after the other, or several of those in virtual time at once. Whoever takes the
+# outcomes may stop in between and keeps what came so far.
 
 
 Scenarios = Mapping[str, Scenario]
@@ -180,17 +179,17 @@ def outcome_of(name: str, scenario: Scenario) -> Outcome:
     try:
         return run_scenario(name, scenario)
     except ServodError as error:
-        return _without_end(name, scenario, "not started", str(error))
+        return _unfinished(name, scenario, "not started", str(error))
     except Exception as error:  # a mistake of ours: the other scenarios and the report are not lost for it
         return _broken_off(name, scenario, error)
 
 
 def _broken_off(name: str, scenario: Scenario, error: BaseException) -> Outcome:
     why = " ".join(f"{type(error).__name__}: {error}".split())
-    return _without_end(name, scenario, "broken off", why)
+    return _unfinished(name, scenario, "broken off", why)
 
 
-def _without_end(name: str, scenario: Scenario, axis: str, why: str) -> Outcome:
+def _unfinished(name: str, scenario: Scenario, axis: str, why: str) -> Outcome:
     injected = ", ".join(i.action for i in scenario.inject)
     nothing = ReactionTimes(None, None)
     return Outcome(
@@ -226,9 +225,9 @@ def _at_once(scenarios: Scenarios, jobs: int) -> Iterator[Outcome]:
             yield done.result() if died is None else _broken_off(name, scenarios[name], died)
 
 
+# --- The document ----------------------------------------------------------------------------------------------------
 # What the campaign's outcomes say as one document: a row for each scenario, and the worst times of each kind of loss.
-#
-# Between `campaign` and its readers: terminal, JSON and page.
+# Terminal, JSON and page read it.
 
 
 HEADER = ("Scenario", "Passed", "Ends", "Loss", "Left / ms", "Gone / ms", "Lost", "Recovered", "Injected", "Detected")
@@ -344,9 +343,9 @@ def _plain(outcome: Outcome) -> dict[str, Any]:
     }
 
 
-# The page of `servoctl qualify faults`: what was injected, what the drive did, and what the user was told.
-#
-# Behind the campaign; needs the lab part. All text is escaped by the page.
+# --- The page --------------------------------------------------------------------------------------------------------
+# The page of `servoctl qualify faults`: what was injected, what the drive did, and what the user was told. Needs the
+# lab part. All text is escaped by the page.
 
 
 _TIMES = (

@@ -193,9 +193,8 @@ class Scenario(Strict):
         return self
 
 
+# --- Plant and configuration -----------------------------------------------------------------------------------------
 # Plant and configuration of a scenario: what its file states, laid over what ships.
-#
-# Used by every axis under test before it starts.
 
 
 Nested = dict[str, Any]

@@ -84,9 +84,8 @@ class _Filling:
         return self._row[key]
 
 
+# --- Files of scenarios ----------------------------------------------------------------------------------------------
 # Scenarios from their files, checked as a whole: those that ship, every YAML file under `scenarios/`, and others.
-#
-# Above the schema, for only actions, inputs and judge know what a scenario may ask of them.
 
 
 _FOLDER = Path(__file__).parent / "scenarios"

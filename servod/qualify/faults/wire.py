@@ -82,9 +82,9 @@ class CanWire:
         return open_bus(BusConfig(interface="socketcan", channel=self.interface), can_ids)
 
 
-# What somebody else on the bus does to an axis of processes: frames, a service tool's SDO, requests to the hub.
-#
-# Below `processes`. Each visit has a place of its own on the wire, and sees by itself what came of it.
+# --- Others on the bus -----------------------------------------------------------------------------------------------
+# What somebody else on the bus does to an axis of processes: frames, a service tool's SDO, requests to the hub. Each
+# visit has a place of its own on the wire, and sees by itself what came of it.
 
 
 #: A participant that leaves takes with it what still waits in its queue.

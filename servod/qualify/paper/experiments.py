@@ -145,10 +145,9 @@ def motion_of_curves(label: str, c: Curves) -> PlottedMotion:
     return PlottedMotion(label, c.time_s, c.reference_rad, c.position_rad, c.torque_nm, c.friction_nm)
 
 
+# --- The fair comparison ---------------------------------------------------------------------------------------------
 # Every law tuned by the same rules on the identified joint, then measured on the joint itself: the fair comparison.
-#
-# Jobs of the crew; stands on servod.lab.tune. Tuning sees the model and its intervals, scoring the plant, with other
-# seeds.
+# Tuning sees the model and its intervals, scoring the plant, with other seeds.
 
 
 #: What people read, by the rival's key in servod.lab.tune.laws.RIVALS.

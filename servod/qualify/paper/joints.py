@@ -60,9 +60,8 @@ def open_for_tracking(joint: PaperJoint, folder: Path, seed: int, cutoff_hz: flo
     return SteppedAxis(virtual_session(plant, folder, ENCODER_COUNTS, seed, config), folder)
 
 
+# --- Gain sets of the paper ------------------------------------------------------------------------------------------
 # Gain sets of the paper in every reading, and variants of them for the sweeps.
-#
-# Under the experiments; stands on the shipped sets and the local sets of synthesis.
 
 
 def shipped_set(name: str) -> GainSet:

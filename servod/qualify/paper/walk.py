@@ -27,10 +27,9 @@ from servod.qualify.paper.joints import PaperJoint, at_paper_feedback, printed_l
 from servod.qualify.paper.printed import FRICTION
 from servod.qualify.paper.results import Results, Row
 
-# Work on several processes: jobs with a weight each, progress by what is done, and a clean end at Ctrl-C.
-#
-# Under the walk; the processes are those of servod.common.workers. Jobs are plain functions on plain values; a worker
-# never leaves files that count.
+# --- Work on several processes ---------------------------------------------------------------------------------------
+# Work on several processes: jobs with a weight each, progress by what is done, and a clean end at Ctrl-C. The processes
+# are those of servod.common.workers. Jobs are plain functions on plain values; a worker never leaves files that count.
 
 
 P = ParamSpec("P")

@@ -144,6 +144,7 @@ def _finite(value: float) -> float | None:
     return round(value, 1) if math.isfinite(value) else None
 
 
+# --- The page --------------------------------------------------------------------------------------------------------
 # A soak as one HTML page and as a table for the terminal: what was counted, how faults were met, memory over time.
 
 

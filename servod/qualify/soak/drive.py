@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.drivers.virtual.drive_record import SAMPLE, DriveSample
+from servod.lab.recordings.recording import Rows
 from servod.qualify.faults.judge import NO_TORQUE_NM, ReactionTimes, reaction
 from servod.qualify.soak.kinds import InjectionKind
-from servod.qualify.soak.rows import Rows
 from servod.qualify.soak.tally import FaultTally, Findings, Wrong
 from servod.runtime.fieldbus.devices import DriveState
 
@@ -68,9 +68,9 @@ class DriveCheck:
             self._findings.add(wrong, int(samples["time_ns"][int(np.argmax(where))]), text, int(where.sum()))
 
 
-# Whether a fault was seen and the drive reacted in time, by its own record: out of the command, and without torque.
-#
-# Between rows, the drive's record and the findings; the bounds are those of the fault's kind.
+# --- The reaction ----------------------------------------------------------------------------------------------------
+# Whether a fault was seen and the drive reacted in time, by its own record: out of the command, and without torque. The
+# bounds are those of the fault's kind.
 
 
 def check_trace(kind: InjectionKind, happened: bool, injected_ns: int, findings: Findings) -> None:

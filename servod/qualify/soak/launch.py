@@ -25,9 +25,8 @@ from servod.qualify.soak.stepped import GAIN_SETS, SteppedSoak
 from servod.qualify.soak.tally import SoakedAxis, Wrong
 from servod.qualify.soak.wall_clock import WallSoak, of_the_wall
 
+# --- The run ---------------------------------------------------------------------------------------------------------
 # Runs a soak: episode after episode until the amount, the time or the person says enough; the state goes to disk.
-#
-# Above the axis (stepped or wall); called by `servoctl qualify soak`.
 
 
 #: Told one line on how it goes, and the share that is done.

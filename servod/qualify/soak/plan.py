@@ -133,6 +133,7 @@ _MOVES = {
 }
 
 
+# --- The axis --------------------------------------------------------------------------------------------------------
 # The axis that a soak begins with: what ships, with noise of its own.
 
 

@@ -18,14 +18,13 @@ from servod.formats.config import AxisConfig, RecorderConfig
 from servod.formats.recording.mcap_reader import read_recording
 from servod.formats.recording.mcap_writer import split_rows
 from servod.formats.recording.record import FIELDS
-from servod.lab.recordings.recording import ROW
+from servod.lab.recordings.recording import Rows, rows_of
 from servod.qualify.soak.starvation import ExcusedFaults
 from servod.qualify.soak.tally import Findings, Wrong
 from servod.runtime.daemon.recorder import Recorder
 from servod.runtime.fieldbus.devices import DriveState
 from servod.runtime.loop.axis import AxisState
 
-Rows = NDArray[np.void]
 Bits = int | NDArray[np.int64]
 
 #: The controller's own numbers, and those that stand for something in the world.
@@ -156,11 +155,6 @@ class RowCheck:
         self._findings.add(wrong, int(rows["time_ns"][at]), text, count)
 
 
-def rows_of(raw: bytes | bytearray) -> Rows:
-    """Packed cycle records as rows."""
-    return np.frombuffer(raw, dtype=ROW)
-
-
 def run_lengths(flags: NDArray[np.bool_], before: int) -> NDArray[np.int64]:
     """At each place, how many true flags in a row end there; `before` of them came earlier."""
     places = np.arange(1, len(flags) + 1)
@@ -168,10 +162,9 @@ def run_lengths(flags: NDArray[np.bool_], before: int) -> NDArray[np.int64]:
     return np.where(flags, places - last_false, 0)
 
 
-# The rows that a daemon recorded, file by file, held against the SYNC frames of the same time.
-#
-# Behind the recorder of a running daemon. A file that is complete is read, checked and removed, so that a soak of days
-# fits a disk.
+# --- Recorded files --------------------------------------------------------------------------------------------------
+# The rows that a daemon recorded, file by file, held against the SYNC frames of the same time. A file that is complete
+# is read, checked and removed, so that a soak of days fits a disk.
 
 
 #: The deadlines of a loop on the wall clock may seem so far off, by what a wake-up costs beyond its lag.
@@ -231,9 +224,9 @@ class RecordedRows:
         self.check.new_session()
 
 
-# Whether the recorder keeps every row: what it wrote is read back and held against what it was given, byte by byte.
-#
-# Behind the loop's rows; the same recorder as the daemon's.
+# --- What the recorder keeps -----------------------------------------------------------------------------------------
+# Whether the recorder keeps every row: what it wrote is read back and held against what it was given, byte by byte. The
+# same recorder as the daemon's.
 
 
 class RecordingCheck:

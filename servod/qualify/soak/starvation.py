@@ -19,9 +19,8 @@ from servod.common.faults import FaultCode
 from servod.common.units import NS_PER_S
 from servod.qualify.soak.kinds import fault_bits
 
+# --- Excuses ---------------------------------------------------------------------------------------------------------
 # Which faults may be seen when: what the schedule injected, and what a starved machine excuses, each for its time.
-#
-# Between the schedule and the rows, which are read back later than they were written.
 
 
 _OPEN_NS = 2**62

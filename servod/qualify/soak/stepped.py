@@ -19,6 +19,7 @@ from servod.common.units import NS_PER_S
 from servod.drivers.virtual.drive_record import DriveTail
 from servod.formats.gains.gain_set import load_gains
 from servod.kernels.laws import LAWS
+from servod.lab.recordings.recording import Rows, rows_of
 from servod.qualify.faults.actions import action_of
 from servod.qualify.faults.scenario import Injection, Recovery, Runs, ScenarioStart
 from servod.qualify.faults.stepped import RECORD_NAME, SteppedUnderTest
@@ -33,7 +34,7 @@ from servod.qualify.soak.drive import (
 )
 from servod.qualify.soak.kinds import ALWAYS, InjectionKind, fault_bits
 from servod.qualify.soak.plan import Episode, Move, SoakEnding, home, nothing_yet
-from servod.qualify.soak.rows import ANSWER_CYCLES, RecordingCheck, RowCheck, Rows, rows_of
+from servod.qualify.soak.rows import ANSWER_CYCLES, RecordingCheck, RowCheck
 from servod.qualify.soak.syncs import SyncCheck, SyncListener
 from servod.qualify.soak.tally import Counts, FaultTally, Findings, Tally, Wrong
 from servod.qualify.soak.traces import LISTEN_S, Listener, trace_of

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from servod.drivers.virtual.client import VirtualBus
 from servod.drivers.virtual.hub import Hub
 from servod.drivers.virtual.port import Port
-from servod.qualify.soak.rows import Rows
+from servod.lab.recordings.recording import Rows
 from servod.qualify.soak.tally import Findings, Wrong
 from servod.runtime.fieldbus.cia import SYNC_ID
 

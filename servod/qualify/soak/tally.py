@@ -103,6 +103,7 @@ class Tally:
         return self.faults.setdefault(kind, FaultTally())
 
 
+# --- Findings --------------------------------------------------------------------------------------------------------
 # What a soak may find wrong, and where it is kept: every kind counted, the first ones told in full.
 
 
@@ -161,6 +162,7 @@ class Findings:
             self.told.append(Anomaly(self.episode, time_s, wrong, text))
 
 
+# --- Counts ----------------------------------------------------------------------------------------------------------
 # What a soak counts on its axis, and what it asks of one, whatever the axis runs on.
 
 

@@ -10,8 +10,10 @@ from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
+from servod.common.errors import BadInput
 from servod.common.yaml import Strict, validate
 from servod.formats.protocol import PIECE_SAMPLES, SampleKey, Verb
+from servod.kernels.motions import PAPER_LONGEST_S
 from servod.runtime.daemon.trajectory import MotionTable
 from servod.runtime.loop.commands import ReferenceKind
 
@@ -104,7 +106,13 @@ class TrackArgs(Strict):
         return table
 
     def reference(self, table: MotionTable) -> list[float]:
-        """The arguments of Op.REFERENCE; the samples of `table` must stand in the trajectory area already."""
+        """The arguments of Op.REFERENCE; the samples of `table` must stand in the trajectory area already.
+
+        Raises BadInput for more of (19) than there is.
+        """
+        if self.kind is MotionKind.PAPER and (self.duration_s or 0.0) > PAPER_LONGEST_S:
+            allowed = f"at most {PAPER_LONGEST_S:.6g} s, where the envelope of (19) ends"
+            raise BadInput("track paper: duration_s", f"{self.duration_s:g} s", allowed)
         if not self.has_table:
             return [ReferenceKind[self.kind.name], *(float(getattr(self, key)) for key in _NEEDS[self.kind])]
         positions = table.positions

@@ -13,7 +13,7 @@ import socket
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from servod.common.errors import BadInput, ServodError, Unreachable
+from servod.common.errors import BadInput, ServodError, Unreachable, details
 from servod.common.units import NS_PER_S
 from servod.formats.protocol import MAX_LINE_BYTES, encode_line
 from servod.runtime.daemon.peer import Peer, peer_of
@@ -53,7 +53,8 @@ class Reply:
     def failed(self, error: Exception) -> None:
         """The request was refused; one line and the exit code for the command line."""
         known = error if isinstance(error, ServodError) else Unreachable(f"servod failed at this: {error!r}"[:300])
-        answer = {"exit_code": known.exit_code, "message": " ".join(str(known).split())}
+        message = " ".join(str(known).split())
+        answer = {"exit_code": known.exit_code, "message": message, **details(known)._asdict()}
         self._send({"id": self._number, "ok": False, "error": answer})
 
 

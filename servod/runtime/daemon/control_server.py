@@ -30,11 +30,11 @@ from servod.runtime.daemon.connection import Connection, Reply
 from servod.runtime.daemon.peer import Peer, group_id, may_command, peer_of
 from servod.runtime.daemon.status import LeaseStatus
 
-# Who may ask what: one client at a time commands, everyone in the group may look, and stop the axis.
-#
-# Below the control server. The first client that commands holds the lease until it disconnects. A stop needs no lease,
-# and wins over whoever holds it: that client may not enable the axis again until it connects anew. While a motion runs
-# whose client has left, others can only end it.
+# --- The right to command --------------------------------------------------------------------------------------------
+# Who may ask what: one client at a time commands, everyone in the group may look, and stop the axis. The first client
+# that commands holds the lease until it disconnects. A stop needs no lease, and wins over whoever holds it: that client
+# may not enable the axis again until it connects anew. While a motion runs whose client has left, others can only end
+# it.
 
 
 #: Anyone who may command may bring the axis to rest, whoever holds the lease.
@@ -100,11 +100,11 @@ class Lease:
             raise Unreachable(f"{started}; wait for its end, or stop, halt or disable the axis")
 
 
-# Who has a place at the control socket, and who gives way when all are taken.
-#
-# Below the control server. Whoever wants to stop the axis shall find a place, however many idle clients there are: no
-# process has more than its share, and of a full house leaves who is idle, else one of the most crowded process. The one
-# who commands stays; who commanded a moment ago, or stopped the axis, which takes no lease, leaves after all others.
+# --- Places ----------------------------------------------------------------------------------------------------------
+# Who has a place at the control socket, and who gives way when all are taken. Whoever wants to stop the axis shall find
+# a place, however many idle clients there are: no process has more than its share, and of a full house leaves who is
+# idle, else one of the most crowded process. The one who commands stays; who commanded a moment ago, or stopped the
+# axis, which takes no lease, leaves after all others.
 
 
 MAX_CLIENTS = 32

@@ -85,6 +85,13 @@ class FaultWatch:
         self._note(code, time.monotonic_ns(), detail)
         self.tell(FAULTS[code], detail)
 
+    def tell_earlier(self, incident: Incident) -> None:
+        """What befell the axis before this start, and was found at it."""
+        self._incidents.append(incident)
+        first = incident.first
+        self._metrics.count_fault(first.code)
+        self.tell(FAULTS[first.code], first.detail)
+
     def tell(self, fault: Fault, detail: str = "") -> None:
         """Log line and event of one fault, with the health of loop and bus beside it."""
         more = f" [{detail}]" if detail else ""
@@ -119,9 +126,9 @@ class FaultWatch:
             self._file_due_ns = 0
 
 
-# Tells how each test of the wiring ended: a line in the journal, an event in the recording, a part of the status.
-#
-# Around the loop, beside the watch over faults, whose table has no room for what was measured.
+# --- The test of the wiring ------------------------------------------------------------------------------------------
+# Tells how each test of the wiring ended: a line in the journal, an event in the recording, a part of the status. The
+# table of faults has no room for what was measured.
 
 
 wiring_log = logging.getLogger("servod.wiring")

@@ -1,4 +1,9 @@
-"""The program `servod --config axis.yaml`: arguments, signals, exit codes. Started by systemd, or by hand to try it."""
+"""The program `servod --config axis.yaml`: from a configuration file to a supervised axis, and back again in reverse.
+
+Started by systemd, or by hand to try it; above the supervisor. The order is: read and check every file, take the locks,
+reach the bus, bring the nodes up, start the loop, open the sockets. What fails says so in one line, and nothing that
+was begun is left behind. Arguments, signals, exit codes and log lines stand here as well.
+"""
 
 from __future__ import annotations
 
@@ -20,6 +25,8 @@ from servod.common.yaml import read_text
 from servod.formats.config import AxisConfig, load_config
 from servod.formats.gains.gain_set import load_gains, require_fit
 from servod.formats.model.axis_model import load_axis_model
+from servod.formats.recording.incidents import of_abrupt_end
+from servod.formats.recording.run_mark import RunMark
 from servod.formats.wiring import warnings, with_expected
 from servod.runtime.daemon.gain_bank import GainBank
 from servod.runtime.daemon.lock import InstanceLock
@@ -33,12 +40,6 @@ from servod.runtime.fieldbus.master import Master
 from servod.runtime.fieldbus.master.planned import check_names, planned_bus_load
 from servod.runtime.loop.handle import LoopHandle
 from servod.runtime.loop.plan import LoopPlan
-
-# From a configuration file to a supervised axis, step by step, and back again in reverse whatever happens.
-#
-# Around the loop; runs once. The order is: read and check every file, take the locks, reach the bus, bring the nodes
-# up, start the loop, open the sockets. What fails says so in one line, and nothing that was begun is left behind.
-
 
 log = logging.getLogger("servod")
 
@@ -68,6 +69,7 @@ def run(path: Path, on_ready: Callable[[Supervisor], None]) -> int:
     config = check(path)
     with ExitStack() as stack:
         stack.callback(InstanceLock(config).release)
+        mark = stack.enter_context(RunMark(config.recorder.directory, config.name))
         _leave_core_to_loop(config.cycle.cpu)
         sys.setswitchinterval(_SWITCH_S)
         bank = GainBank(config)
@@ -80,6 +82,8 @@ def run(path: Path, on_ready: Callable[[Supervisor], None]) -> int:
             log.info("%s", line)
         with ExitStack() as undo:
             supervisor = _supervise(config, Nodes(master, plans), bank, recorder, undo)
+            if mark.found is not None:
+                supervisor.tell_earlier(of_abrupt_end(mark.found, config.name))
             on_ready(supervisor)
             undo.pop_all()
         return supervisor.run()
@@ -150,6 +154,7 @@ def _master_ids(config: AxisConfig) -> tuple[int, ...]:
     return tuple(base + node.node_id for node in (config.amplifier, config.encoder) for base in bases)
 
 
+# --- The journal -----------------------------------------------------------------------------------------------------
 # Log lines for the journal: to standard error, with systemd's level prefix where the journal reads it.
 
 

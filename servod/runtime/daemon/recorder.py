@@ -25,9 +25,9 @@ from servod.formats.config import RecorderConfig
 from servod.formats.recording.mcap_writer import McapFile, split_rows, wall_offset_ns
 from servod.formats.recording.record import RECORD
 
-# Where recordings stand and how many of them: names, rotation, and how many fault files are kept.
-#
-# Below the recorder, in its writing thread, so that a slow disk holds up nobody.
+# --- Files and names -------------------------------------------------------------------------------------------------
+# Where recordings stand and how many of them: names, rotation, and how many fault files are kept. Below the recorder,
+# in its writing thread, so that a slow disk holds up nobody.
 
 
 MIB = 1024 * 1024
@@ -83,8 +83,8 @@ def _now() -> str:
     return datetime.now().astimezone().strftime(_STAMP)
 
 
+# --- The last seconds ------------------------------------------------------------------------------------------------
 # The last seconds of cycle records in a ring of fixed memory, so that a fault's recording starts before the fault.
-#
 # Filled by the supervisor, read when a fault file is written.
 
 

@@ -17,6 +17,7 @@ from servod.common.errors import Unreachable
 from servod.common.faults import FAULTS, FaultCode
 from servod.common.units import NS_PER_S
 from servod.formats.config import AxisConfig
+from servod.formats.recording.incidents import Incident
 from servod.formats.recording.record import RECORD, CycleRecord
 from servod.runtime.daemon.control_server import ControlServer
 from servod.runtime.daemon.fault_watch import FaultWatch, WiringTestWatch
@@ -81,6 +82,10 @@ class Supervisor:
         self._selector = selectors.DefaultSelector()
         self._server = ControlServer(config.control, self._selector, self._verbs)
         self._metrics_server = MetricsServer(config.metrics, self._metrics)
+
+    def tell_earlier(self, incident: Incident) -> None:
+        """What befell the axis before this start, and was found at it."""
+        self._faults.tell_earlier(incident)
 
     def request_stop(self) -> None:
         """Ask for an orderly end; for signal handlers."""

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from servod.kernels.motions import (
     PAPER_AMPLITUDE_RAD,
-    PAPER_DECAY_RAD_PER_S,
+    PAPER_LONGEST_S,
     PAPER_OMEGA_RAD_PER_S,
     Sample,
     Samples,
@@ -73,7 +73,7 @@ def _sine(rest: Sequence[float], _period_s: float, _trajectory: Samples) -> Moti
 
 def _paper(rest: Sequence[float], _period_s: float, _trajectory: Samples) -> Motion:
     (duration_s,) = rest
-    if not 0.0 < duration_s <= PAPER_AMPLITUDE_RAD / PAPER_DECAY_RAD_PER_S:
+    if not 0.0 < duration_s <= PAPER_LONGEST_S:
         raise ValueError("the envelope of (19) ends at 30.3 s")
     speed_rad_s = PAPER_AMPLITUDE_RAD * PAPER_OMEGA_RAD_PER_S
     return Motion(paper, duration_s, -PAPER_AMPLITUDE_RAD, PAPER_AMPLITUDE_RAD, speed_rad_s=speed_rad_s)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from servod.kernels.laws.observer import decayed, limited
+from servod.kernels.laws.observers import decayed, limited
 
 
 def fine_solution(z: float, decay: float, drive: float, dt: float) -> float:

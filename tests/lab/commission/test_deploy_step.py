@@ -126,7 +126,7 @@ class Lasting(VirtualWalkAxis):
         if store.active() is None:
             store.load(present.to_yaml(), present.name)
             store.activate(present.name)
-        yield Remembers(self.configured_for(gains), store, self.cut)
+        yield Remembers(self.with_filter_for(gains), store, self.cut)
 
 
 AXIS, CUT = Lasting(table1(), seed=1), Lasting(table1(), seed=1, cut=True)

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from servod.client.axis import LOOK_S, ReferenceMotion, Watch
+from servod.client.control import Refused
 from servod.client.stepped import SteppedAxis
 from servod.client.virtual import axis_for_set, with_cutoff
-from servod.common.errors import BadInput
+from servod.common.errors import AnswerIsNo, BadInput, ServodError
 from servod.common.faults import FAULTS, FaultCode
 from servod.formats.gains.gain_set import pd_set
 from servod.formats.gains.store import Action, GainStore
@@ -67,6 +68,26 @@ def test_a_set_for_another_joint_is_rolled_back(change: dict[str, float], tmp_pa
     entry = store.history()[-1]
     assert (entry.action, entry.name) == (Action.REJECT, certified().name)
     assert "promised" in entry.note
+
+
+@pytest.mark.parametrize("refusal", [AnswerIsNo("the store is full"), Refused("refused: a motion is running")])
+def test_a_set_that_is_not_activated_says_why(
+    refusal: ServodError, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing is on trial then; giving it up would only be refused, and hide the reason."""
+
+    def refused(*_: object) -> None:
+        raise refusal
+
+    axis = axis_of(table1(), tmp_path)
+    monkeypatch.setattr(axis, "activate", refused)
+    monkeypatch.setattr(axis, "give_up", lambda *_: pytest.fail("nothing is on trial"))
+    if isinstance(refusal, AnswerIsNo):
+        done = deploy(axis, certified(), quiet)
+        assert not done.proven and done.reasons == (str(refusal),)
+    else:
+        with pytest.raises(Refused, match="a motion is running"):
+            deploy(axis, certified(), quiet)
 
 
 def test_a_limit_that_is_met_rolls_back(tmp_path: Path) -> None:

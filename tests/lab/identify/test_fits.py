@@ -10,7 +10,7 @@ from servod.common.yaml import validate
 from servod.formats.model.axis_model import AxisModel
 from servod.kernels.physics.plant import Plant
 from servod.lab.identify import analysis
-from servod.lab.identify.estimate import AT_END, Estimate, at_ends, estimate, jackknife, sandwich
+from servod.lab.identify.estimate import AT_END, Estimate, bound_notes, estimate, jackknife, sandwich
 from servod.lab.identify.fits import bristle, cogging, curve, elastic, presliding, response
 from servod.lab.identify.fits.break_away import BreakAwayFit
 from servod.lab.identify.fits.bristle import Bristle, dry_columns, follow
@@ -273,7 +273,7 @@ def test_the_interval_of_the_encoder_noise_holds_it_beside_the_rounding(counts):
 
 
 def test_what_stands_at_the_end_of_its_range_says_so():
-    assert at_ends([0.0, 0.5, 1.0], [0.0] * 3, [1.0] * 3) == (AT_END, "", AT_END)
+    assert bound_notes([0.0, 0.5, 1.0], [0.0] * 3, [1.0] * 3) == (AT_END, "", AT_END)
     speed = np.geomspace(5e-3, 1.0, 25)
     flat = curve.fit(Side(speed, 0.05 + 0.05 * speed, np.full(25, 1e-4), 1e-9 * np.eye(25)))
     assert AT_END in flat.static.note and not flat.coulomb.note

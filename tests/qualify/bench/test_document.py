@@ -7,6 +7,7 @@ import math
 
 import pytest
 
+from servod.cli.common import table_console
 from servod.qualify.bench import QUICK, THOROUGH, BenchSettings, measure
 from servod.qualify.bench.plan import GOALS, figure, print_table
 
@@ -33,8 +34,8 @@ def test_the_document_has_every_key_and_a_finite_figure_for_each(
     figures = [figure(document, goal) for goal in GOALS]
     assert all(value is None or math.isfinite(value) for value in figures)
     assert document["memory"]["seconds"] == TINY.memory_s
-    monkeypatch.setenv("COLUMNS", "200")
-    print_table(document)
+    monkeypatch.delenv("COLUMNS", raising=False)
+    print_table(document, table_console())
     assert "not judged (measured 0.5 s)" in " ".join(capsys.readouterr().out.split())
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from servod.cli.common import table_console
 from servod.common.errors import BadInput
 from servod.qualify.bench import tick, wakeup
 from servod.qualify.bench import wall_clock as wall
@@ -83,8 +84,8 @@ def test_a_missing_cyclictest_is_told_in_the_table(
 ) -> None:
     missing = {"median_ratio": None, "p99_ratio": None, "rounds": [{}], "seconds": 3.0, "note": "apt install rt-tests"}
     assert figure(document(wakeup=missing), GOALS[0]) is None
-    monkeypatch.setenv("COLUMNS", "200")
-    print_table(document(wakeup=missing))
+    monkeypatch.delenv("COLUMNS", raising=False)
+    print_table(document(wakeup=missing), table_console())
     said = " ".join(capsys.readouterr().out.split())
     assert "apt install rt-tests" in said and "not measured" in said
 

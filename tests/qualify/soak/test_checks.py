@@ -18,11 +18,12 @@ from servod.formats.config import load_config
 from servod.formats.gains.gain_set import load_gains
 from servod.formats.model.axis_model import load_axis_model
 from servod.kernels.laws import LAWS
+from servod.lab.recordings.recording import Rows, rows_of
 from servod.qualify.faults.judge import ReactionTimes
 from servod.qualify.soak.drive import SAMPLE_ROW, DriveCheck, check_reaction, reaction_in
 from servod.qualify.soak.kinds import KINDS, fault_bits
 from servod.qualify.soak.memory import Growth, Memory
-from servod.qualify.soak.rows import RowCheck, Rows, rows_of, run_lengths
+from servod.qualify.soak.rows import RowCheck, run_lengths
 from servod.qualify.soak.starvation import STARVED_CYCLE, STARVED_SUPERVISOR, ExcusedFaults, Starvation
 from servod.qualify.soak.syncs import SyncCheck, SyncListener
 from servod.qualify.soak.tally import FaultTally, Findings, Wrong

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
@@ -175,19 +176,40 @@ def test_stopped_loop_ends_the_watchdog_food_and_then_the_daemon(tmp_path: Path)
     assert "LOOP_LOST" in {e.get("code") for e in recording.events}
 
 
+def _told_by(*words: str) -> dict[str, Any]:
+    command = [sys.executable, "-m", "servod.cli", "faults", *words, "--json"]
+    document: dict[str, Any] = json.loads(subprocess.run(command, check=True, capture_output=True).stdout)
+    return document
+
+
+def _told_by_files(folder: Path) -> list[dict[str, Any]]:
+    return _lost(_told_by("--recordings", str(folder / "recordings")))
+
+
+def _lost(document: dict[str, Any]) -> list[dict[str, Any]]:
+    return [row for row in document["incidents"] if row["code"] == "DAEMON_LOST"]
+
+
 def test_daemon_starts_again_after_kill_9(tmp_path: Path) -> None:
     with running(tmp_path) as axis:
         axis.daemon.kill()
         axis.daemon.wait()
         assert axis.socket.exists()
         time.sleep(1.0)
+        (gone,) = _told_by_files(tmp_path)
+        assert (gone["code"], gone["axis"]) == ("DAEMON_LOST", "tried")
         command = [sys.executable, "-m", "servod.runtime.daemon.main", "--config", str(tmp_path / "axis.yaml")]
         with subprocess.Popen(command, stderr=subprocess.PIPE) as second:
             try:
                 wait_for(lambda: answers(axis.socket) or second.poll() is not None, 60.0)
                 with ControlClient(axis.socket) as client:
                     assert client.call("status")["axis"]["state"] == "DISABLED"
+                    told, *_ = client.call("faults")["incidents"]  # a busy machine adds late cycles behind it
+                    assert (told["code"], told["time"]) == ("DAEMON_LOST", gone["time"])
+                shown = _lost(_told_by("--socket", str(axis.socket)))
+                assert [row["detail"] for row in shown] == [told["detail"]]  # by daemon and mark, and shown once
             finally:
                 second.send_signal(signal.SIGTERM)
             assert second.wait(10) == 0, second.stderr.read() if second.stderr else ""
         assert not axis.socket.exists()
+        assert [row["detail"] for row in _told_by_files(tmp_path)] == [told["detail"]]  # its own end was orderly

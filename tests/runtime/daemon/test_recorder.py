@@ -1,5 +1,6 @@
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -236,9 +237,9 @@ def test_clients_write_only_into_the_recordings_directory(tmp_path: Path, name: 
 
 def test_second_start_and_unwritable_directory_are_refused(tmp_path: Path) -> None:
     recorder = _recorder(tmp_path)
-    recorder.start().result(5)
-    with pytest.raises(Unreachable, match="already records"):
-        recorder.start().result(5)
+    path = recorder.start().result(5)
+    with pytest.raises(Unreachable, match=re.escape(f"already records to {path}; `servoctl record stop` ends it")):
+        recorder.start("other.mcap").result(5)
     recorder.close()
     (tmp_path / "file").write_text("")
     blocked = _recorder(tmp_path / "file" / "below")

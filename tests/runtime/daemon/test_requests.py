@@ -147,7 +147,9 @@ def test_full_disk_ends_the_request_only() -> None:
     flows.start(flow(), answers.reply())
     future.set_exception(OSError(28, "No space left on device", "active.json"))
     flows.poll(1)
-    assert answers.sent[0]["error"] == {"exit_code": 3, "message": "active.json: no space left on device"}
+    told = answers.sent[0]["error"]
+    assert (told["exit_code"], told["message"]) == (3, "active.json: no space left on device")
+    assert {told["where"], told["found"], told["allowed"]} == {None}
 
 
 def test_mistake_in_a_flow_ends_the_request_only() -> None:

@@ -1,5 +1,6 @@
 """Motions before the loop is asked: samples that come in pieces, and the check against the limits, with figures."""
 
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -8,8 +9,11 @@ from daemon_rows import axis_config, record
 
 from servod.common.errors import BadInput, Unreachable
 from servod.formats.protocol import SampleKey, Verb
-from servod.runtime.daemon.arguments import check_arguments
+from servod.kernels.motions import PAPER_LONGEST_S
+from servod.runtime.daemon.arguments import MotionKind, check_arguments
 from servod.runtime.daemon.trajectory import MotionTable, check_motion
+from servod.runtime.loop.commands import Refusal
+from servod.runtime.loop.references import make_motion
 
 
 def test_pieces_become_one_column_with_its_extent_and_steps() -> None:
@@ -35,7 +39,6 @@ def test_pieces_become_one_column_with_its_extent_and_steps() -> None:
         ({"kind": "sine", "amplitude_rad": 0.4, "frequency_hz": 2, "duration_s": 1}, "5.02655 rad/s"),
         ({"kind": "csv", "positions_rad": [0.0, 0.0051]}, "5.1 rad/s; limits.speed_rad_s allows 5"),
         ({"kind": "csv", "positions_rad": [0.0, -2.0]}, "-1.5 to 0.5 rad"),
-        ({"kind": "paper", "duration_s": 40}, "out of range"),
     ],
 )
 def test_motion_is_checked_with_figures_before_the_loop_is_asked(args: dict[str, Any], says: str) -> None:
@@ -48,6 +51,34 @@ def test_motion_is_checked_with_figures_before_the_loop_is_asked(args: dict[str,
             track.reference(table), table, config.model_copy(update={"limits": limits}), record(reference_rad=0.5)
         )
     assert says in str(caught.value)
+
+
+def test_more_of_the_papers_trajectory_than_there_is_is_bad_input() -> None:
+    track = check_arguments(Verb.TRACK, {"kind": "paper", "duration_s": 40})
+    with pytest.raises(BadInput) as caught:
+        track.reference(MotionTable())
+    assert (caught.value.where, caught.value.found) == ("track paper: duration_s", "40 s")
+    assert "at most 30.303 s" in caught.value.allowed
+
+
+EXTREMES = {
+    "amplitude_rad": (-1e4, -1e-300, 0.0, 1e4),
+    "frequency_hz": (1e-300, 500.0),
+    "duration_s": (1e-300, PAPER_LONGEST_S, 86_400.0),
+    "window_rad": (1e-300, 1e4),
+}
+
+
+@pytest.mark.parametrize("kind", [MotionKind.SINE, MotionKind.PAPER, MotionKind.STEP, MotionKind.EXCITE])
+def test_no_argument_that_is_allowed_is_refused_without_saying_which(kind: MotionKind) -> None:
+    """The loop's refusal of a bad argument names none; what it means is found before."""
+    table = {"positions_rad": [0.0, 0.0], "torques_nm": [0.0, 0.0]} if kind is MotionKind.EXCITE else {}
+    for values in itertools.product(*EXTREMES.values()):
+        if kind is MotionKind.PAPER and values[2] > PAPER_LONGEST_S:
+            continue
+        track = check_arguments(Verb.TRACK, {"kind": kind, **dict(zip(EXTREMES, values, strict=True)), **table})
+        motion = make_motion(track.reference(track.table(MotionTable())), 1e-3, [0.0, 0.0] * 2)
+        assert not isinstance(motion, Refusal), values
 
 
 @pytest.mark.parametrize(

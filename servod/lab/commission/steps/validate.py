@@ -26,9 +26,8 @@ from servod.lab.tracking.metrics import HOLD_S, PAPER_S, REST_S, STEPS_MRAD, Cur
 from servod.lab.tracking.stepped import curves_of
 from servod.lab.tune.plan import Feedback
 
+# --- Under a daemon --------------------------------------------------------------------------------------------------
 # The tracking comparison on an axis under a daemon: the deployed law alone, as far as the axis's limits allow.
-#
-# Beside the step that validates.
 
 
 def measure_on_daemon(

@@ -48,9 +48,9 @@ from servod.lab.diagnose.select.selection import Fold
 from servod.lab.diagnose.select.selector import Selector
 from servod.lab.diagnose.settings import SETTINGS
 
-# Curves that the page of a diagnosis draws: signatures of terms, errors over time and over frequency.
-#
-# The last stage of the engine takes them from the judgement; what draws them computes nothing.
+# --- Curves of the page ----------------------------------------------------------------------------------------------
+# Curves that the page of a diagnosis draws: signatures of terms, errors over time and over frequency. The last stage of
+# the engine takes them from the judgement; what draws them computes nothing.
 
 
 _HALVES = {Split.DIRECTION: ("forward", "back"), Split.LOAD: ("command above zero", "command below zero")}
@@ -357,11 +357,11 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0
 
 
-# Which terms of the last fit are findings, and why the others are none: the levels of the outside contract once more.
-#
-# Stands between the judgement and the verdict. A term comes in by what it takes when it comes; beside those that come
-# later it may be worth less, or its numbers may be pushed to an end of their range. It stays in the model then, for the
-# others were fitted beside it, and is listed with its values as minor.
+# --- Findings and minor terms ----------------------------------------------------------------------------------------
+# Which terms of the last fit are findings, and why the others are none: the levels of the outside contract once more. A
+# term comes in by what it takes when it comes; beside those that come later it may be worth less, or its numbers may be
+# pushed to an end of their range. It stays in the model then, for the others were fitted beside it, and is listed with
+# its values as minor.
 #
 # The contract counts shares of the error on unseen rows. A drift of the constant torque is next to nothing in any row
 # and adds up in every simulation that runs freely: its share is that of the means over a second, where it shows.

@@ -24,9 +24,9 @@ from servod.lab.diagnose.select.selection import CrossValidation, Selection
 from servod.lab.diagnose.select.selector import Selector
 from servod.lab.diagnose.settings import SETTINGS
 
-# What fits no known physics: kept as a table over the coordinate where it lives, without a name.
-#
-# Stands behind the selection: the table becomes `residual` in the axis model file.
+# --- What fits no known physics --------------------------------------------------------------------------------------
+# What fits no known physics: kept as a table over the coordinate where it lives, without a name. The table becomes
+# `residual` in the axis model file.
 
 
 def residual_table(predictor: Predictor, mismatch: Array) -> ResidualTable | None:

@@ -28,14 +28,13 @@ from servod.kernels.physics.effects import (
 )
 from servod.kernels.physics.friction import directed_curve
 from servod.kernels.physics.layout import PlantParameters, PlantState, Tables
-from servod.lab.simulate.open_loop import acting, begin, piece_end, switch_row
+from servod.lab.simulate.open_loop import acting, acts_until, begin, switch_row
 
-# One long step of the axis, second order in time: the physics of `servod.kernels.physics` at a recording's sample
-# time.
-#
-# Called by `innovation_kernel`. The simulator's step is first order and takes 50 us; here every effect is taken at
-# mid-step, so that a millisecond costs no half step of friction, and the bristle by the Pade form of its exponential,
-# which neither rings nor overshoots at any speed. The effects themselves are the simulator's own functions.
+# --- One step --------------------------------------------------------------------------------------------------------
+# One long step of the axis, second order in time: the physics of `servod.kernels.physics` at a recording's sample time.
+# The simulator's step is first order and takes 50 us; here every effect is taken at mid-step, so that a millisecond
+# costs no half step of friction, and the bristle by the Pade form of its exponential, which neither rings nor
+# overshoots at any speed. The effects themselves are the simulator's own functions.
 
 
 def step(
@@ -220,7 +219,7 @@ def innovate(
             loss, now = s.friction * s.velocity * whole, t[k + 1]
         while now < t[k + 1]:
             row = switch_row(t, row, now, p.delay_s)
-            end = piece_end(t, row, p.delay_s, t[k + 1])
+            end = acts_until(t, row, p.delay_s, t[k + 1])
             count = max(1, round(steps[k] * (end - now) / whole))
             command, h = acting(torque, row, before), (end - now) / count
             for _ in range(count):
@@ -240,7 +239,7 @@ def mean_command(
     begun, push = now, 0.0
     while now < end:
         row = switch_row(t, row, now, delay_s)
-        until = piece_end(t, row, delay_s, end)
+        until = acts_until(t, row, delay_s, end)
         push += acting(torque, row, before) * (until - now)
         now = until
     return row, push / (end - begun)

@@ -31,9 +31,9 @@ from servod.lab.simulate import open_loop
 from servod.lab.simulate.motion import FirstRow
 from servod.lab.simulate.replay import Drive
 
-# Runs simulations on both cores: kernels that let go of the interpreter's lock, and threads that call them.
-#
-# Stands between the predictor and the fit. Threads, not processes: recordings and Jacobians are large and shared.
+# --- Threads ---------------------------------------------------------------------------------------------------------
+# Runs simulations on both cores: kernels that let go of the interpreter's lock, and threads that call them. Threads,
+# not processes: recordings and Jacobians are large and shared.
 
 
 T = TypeVar("T")
@@ -207,9 +207,9 @@ class Predictor:
         return np.array([motion[0], motion[1], *hidden[0]])
 
 
-# A shorter set of data for first rounds: of every recording the stretch where most is left to explain.
-#
-# Stands between the predictor and the trials; what is tried on it and promises anything is fitted on everything after.
+# --- Shorter data ----------------------------------------------------------------------------------------------------
+# A shorter set of data for first rounds: of every recording the stretch where most is left to explain. What is tried on
+# it and promises anything is fitted on everything after.
 
 
 def shorten(predictor: Predictor, nominal: AxisModel, mismatch: Array) -> Predictor:

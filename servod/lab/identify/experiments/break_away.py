@@ -17,10 +17,10 @@ from servod.lab.identify.fits.break_away import torque_of
 from servod.lab.identify.shapes import growing, samples
 from servod.lab.identify.trace import ExperimentKind, RecordedMotion
 
-# What the first motion says of the wiring: sign and scale of torque and of both position sensors.
-#
-# Behind the first ramp, which moves the joint by about a milliradian under no feedback; nothing else runs before it.
-# What is wrong is told with the key to turn round, so that no position loop is ever closed over a wrong sign.
+# --- The wiring ------------------------------------------------------------------------------------------------------
+# What the first motion says of the wiring: sign and scale of torque and of both position sensors. Behind the first
+# ramp, which moves the joint by about a milliradian under no feedback; nothing else runs before it. What is wrong is
+# told with the key to turn round, so that no position loop is ever closed over a wrong sign.
 
 
 #: The two sensors' ways may differ by this factor (slack, elasticity) and by so many counts of the coarser one.

@@ -91,9 +91,9 @@ def _kick(bench: Bench, torque_nm: float, pulse: int) -> RecordedMotion:
     return bench.run(ExperimentKind.KICK, np.zeros(len(torque)), torque, window, {"pulse_nm": size, "pulse_s": pulse_s})
 
 
-# Noise at rest: what encoder and torque reading show while nothing moves and no torque is asked for.
-#
-# Reason: the noise floor bounds what all other experiments can see. Bounds: no torque, no motion.
+# --- Noise at rest ---------------------------------------------------------------------------------------------------
+# Noise at rest: what encoder and torque reading show while nothing moves and no torque is asked for. Reason: the noise
+# floor bounds what all other experiments can see. Bounds: no torque, no motion.
 
 
 DURATION_S = 1.5

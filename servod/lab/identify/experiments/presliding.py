@@ -43,10 +43,10 @@ def share_for(bench: Bench, peak_to_peak_rad: float) -> float:
     return SHARE if peak_to_peak_rad >= ENOUGH_COUNTS * bench.resolution_rad else COARSE_SHARE
 
 
-# Multisine below break-away, up to where the joint rings on its bristles: the bristles' damping.
-#
-# Reason: damping shows only near the resonance of inertia on bristles, beyond 100 Hz for a small joint. Amplitude: a
-# share of break-away that leaves room for the ringing. Bounds: a window, as for the presliding sine.
+# --- Multisine below break-away --------------------------------------------------------------------------------------
+# Multisine below break-away, up to where the joint rings on its bristles: the bristles' damping. Reason: damping shows
+# only near the resonance of inertia on bristles, beyond 100 Hz for a small joint. Amplitude: a share of break-away that
+# leaves room for the ringing. Bounds: a window, as for the presliding sine.
 
 
 PERIOD_S, PERIODS = 1.0, 8

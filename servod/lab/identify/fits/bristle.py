@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_banded
 from scipy.optimize import least_squares
 
-from servod.lab.identify.estimate import Estimate, at_ends, estimate, jackknife, joined
+from servod.lab.identify.estimate import Estimate, bound_notes, estimate, jackknife, joined
 from servod.lab.identify.trace import RecordedMotion
 
 Array = NDArray[np.float64]
@@ -97,7 +97,9 @@ def _solve(frequency: Array, periods: Sequence[_Period], inertia: float, delay_s
 def _note(x: Array) -> str:
     """What of the search stands at the end of its range."""
     names = ("the chord's stiffness", "the loop's loss", "the damping")
-    return joined(*(f"{name} {note}" for name, note in zip(names, at_ends(x.tolist(), *_RANGES), strict=True) if note))
+    return joined(
+        *(f"{name} {note}" for name, note in zip(names, bound_notes(x.tolist(), *_RANGES), strict=True) if note)
+    )
 
 
 def _searched(
@@ -116,11 +118,11 @@ def _searched(
     return least_squares(misfit, [1.0, 0.05, 0.5], bounds=_RANGES).x, first, float(critical)
 
 
-# Friction that follows its steady curve over a way: the LuGre bristle along a recorded motion, linear in the curve.
-#
-# Under the friction map. Of dz/dt = v - s0*|v|/g(v)*z follows, over the way s, d(s0*z)/ds = (sign(v)*g(v) - s0*z)/L
-# with L = g/s0: the bristle's force is the steady curve behind a first-order low-pass over way. Given L, which an
-# earlier fit knows well enough, it is linear in g (the paper's (1), (7) and (18)).
+# --- The bristle over its way ----------------------------------------------------------------------------------------
+# Friction that follows its steady curve over a way: the LuGre bristle along a recorded motion, linear in the curve. Of
+# dz/dt = v - s0*|v|/g(v)*z follows, over the way s, d(s0*z)/ds = (sign(v)*g(v) - s0*z)/L with L = g/s0: the bristle's
+# force is the steady curve behind a first-order low-pass over way. Given L, which an earlier fit knows well enough, it
+# is linear in g (the paper's (1), (7) and (18)).
 
 
 class Bristle(NamedTuple):

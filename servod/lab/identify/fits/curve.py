@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.optimize import least_squares
 
-from servod.lab.identify.estimate import LEVEL, Estimate, at_ends, estimate
+from servod.lab.identify.estimate import LEVEL, Estimate, bound_notes, estimate
 from servod.lab.identify.fits.friction_map import Side
 
 Array = NDArray[np.float64]
@@ -69,7 +69,7 @@ def fit(side: Side) -> CurveFit:
     unseen = np.diag((side.unseen / float(stats.norm.ppf(LEVEL))) ** 2)
     covariance = gain @ (side.covariance + unseen) @ gain.T
     return _named(
-        best.x, covariance, at_ends(best.x.tolist(), low.tolist(), high.tolist()), len(side.speed) - len(best.x)
+        best.x, covariance, bound_notes(best.x.tolist(), low.tolist(), high.tolist()), len(side.speed) - len(best.x)
     )
 
 

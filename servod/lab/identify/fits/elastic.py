@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.optimize import least_squares
 
-from servod.lab.identify.estimate import at_ends
+from servod.lab.identify.estimate import bound_notes
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -109,7 +109,7 @@ def solve_from(first: Elastic, frequency: Array, ratio: Complex, deviation: Arra
 
 def notes(joint: Elastic, inertia: float, highest_hz: float) -> Notes:
     """What stands at the end of the range that was searched from `inertia` and over lines up to `highest_hz`."""
-    return Notes(*at_ends(_values(joint).tolist(), *_ranges(math.log(inertia), highest_hz)))
+    return Notes(*bound_notes(_values(joint).tolist(), *_ranges(math.log(inertia), highest_hz)))
 
 
 def _from(frequency: Array, ratio: Complex, deviation: Array, period_s: float, x: Array) -> tuple[Elastic, float]:

@@ -20,9 +20,8 @@ from servod.lab.identify.fits import cogging
 from servod.lab.identify.fits.bristle import Bristle, dry_columns, follow
 from servod.lab.identify.trace import RecordedMotion, Smooth, smooth
 
+# --- Slow motions ----------------------------------------------------------------------------------------------------
 # Slow motions made ready for the friction map: smoothed, inertia taken off, cut into parts.
-#
-# Between the recordings and the friction map's regression.
 
 
 #: Smoothing of torque and motion: s at the finest, and so many counts' worth of time for a coarse encoder.

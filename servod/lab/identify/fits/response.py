@@ -17,7 +17,7 @@ from scipy import stats
 from scipy.optimize import least_squares
 
 from servod.common.errors import AnswerIsNo
-from servod.lab.identify.estimate import LEVEL, Estimate, at_ends, estimate, jackknife, joined
+from servod.lab.identify.estimate import LEVEL, Estimate, bound_notes, estimate, jackknife, joined
 from servod.lab.identify.fits import elastic
 from servod.lab.identify.fits.strokes import (
     Rigid,
@@ -247,7 +247,7 @@ def _ranges(start: Array) -> tuple[list[float], list[float]]:
 def _notes(values: Array, start: Array) -> tuple[str, ...]:
     """What of (inertia, viscous, delay, lag) stands at the end of its range."""
     inertia, viscous, delay_s, lag_s = values.tolist()
-    return at_ends([np.log(inertia), viscous / np.exp(start[0]), 1e3 * delay_s, 1e3 * lag_s], *_ranges(start))
+    return bound_notes([np.log(inertia), viscous / np.exp(start[0]), 1e3 * delay_s, 1e3 * lag_s], *_ranges(start))
 
 
 def _cost(lines: _Lines, ratio: Complex, values: Array) -> float:

@@ -83,9 +83,8 @@ def position_over_torque(frequency: Array, ratio: Complex, period_s: float) -> C
     return position
 
 
+# --- Response of a rigid joint ---------------------------------------------------------------------------------------
 # Sampled frequency response of a rigid joint behind command, hold, delay and first-order lag; exact, in closed form.
-#
-# Under the response fit.
 
 
 class Rigid(NamedTuple):

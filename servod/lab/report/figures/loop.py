@@ -175,9 +175,8 @@ def _norms(region: RegionProof, period_s: float) -> str:
     return f"Region {region.name}: norm of the worst response {largest:.3g}, proven bound {bound:.3g}."
 
 
+# --- The certificate as a table --------------------------------------------------------------------------------------
 # The certificate of a gain set as a table: every check with its figure, limit and margin.
-#
-# Stands on the gain set alone.
 
 
 def certificate_table(gains: GainSet) -> PageTable:
@@ -206,9 +205,8 @@ def _verdict(passed: bool) -> str:
     return "passed" if passed else "failed"
 
 
+# --- Frequency response ----------------------------------------------------------------------------------------------
 # Figure of an identification's frequency response: what the multisine showed, and the model that was put to it.
-#
-# Stands on the response fit alone.
 
 
 _RESPONSE_POINTS = 300

@@ -298,9 +298,9 @@ def motions(duration_s: float, period_s: float = 0.001) -> dict[str, Array]:
     return {"slow_sine": slow, "multisine": mixed, "moves": moves}
 
 
-# What a virtual axis can conceal: effects of a size that costs tracking, and the model that does not know them.
-#
-# Beside the data path. Sizes go with the joint's dry friction, so that any joint conceals something that counts.
+# --- What can be concealed -------------------------------------------------------------------------------------------
+# What a virtual axis can conceal: effects of a size that costs tracking, and the model that does not know them. Sizes
+# go with the joint's dry friction, so that any joint conceals something that counts.
 
 
 #: What stands under the effect's key in the axis model file, for a joint of some dry friction in N*m.
@@ -339,9 +339,9 @@ def believed_and_true(plant: AxisModel, effect: str) -> tuple[AxisModel, AxisMod
     return AxisModel.model_validate(document), AxisModel.model_validate(document | {effect: CONCEALED[effect](dry)})
 
 
-# The page of `servoctl demo --diagnose`: what was believed, what came, what was found, and what that gave back.
-#
-# The last step of `walk`; the diagnosis has its own page beside it.
+# --- The page --------------------------------------------------------------------------------------------------------
+# The page of `servoctl demo --diagnose`: what was believed, what came, what was found, and what that gave back. The
+# last step of `walk`; the diagnosis has its own page beside it.
 
 
 #: Runs as people read them, with their colours.

@@ -184,6 +184,7 @@ MACHINE_ACTIONS: dict[str, type[InjectionAction]] = {
 }
 
 
+# --- Gain-set files --------------------------------------------------------------------------------------------------
 # Actions on gain-set files: what befalls them between the moment they are stored and the moment they are to run.
 
 

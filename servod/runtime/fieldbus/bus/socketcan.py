@@ -31,9 +31,9 @@ from servod.runtime.fieldbus.bus import (
     Frame,
 )
 
-# What error frames mean for a connection: one table from the kernel's error classes to BusCounters.
-#
-# Used by every bus client that receives `struct can_frame` (SocketCAN and the virtual bus). Source: linux/can/error.h.
+# --- Error frames ----------------------------------------------------------------------------------------------------
+# What error frames mean for a connection: one table from the kernel's error classes to BusCounters. Used by every bus
+# client that receives `struct can_frame` (SocketCAN and the virtual bus). Source: linux/can/error.h.
 
 
 _CRTL_TX_OVERFLOW = 0x02

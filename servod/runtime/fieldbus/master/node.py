@@ -22,10 +22,10 @@ from servod.runtime.fieldbus.master.planned import Kind, load_setup
 from servod.runtime.fieldbus.master.sdo import NoAnswer, NodeSdo
 from servod.runtime.fieldbus.setup_tools import read_optional, write_checked
 
-# Writes PDO mappings by the sequence of CiA 301, reads everything back and compares. Off the control path.
-#
-# A wrong mapping is the worst kind of error: the drive accepts it and every value after it is plausible garbage. So the
-# lengths are checked against the EDS before, and the device's own answer against the plan after.
+# --- PDO mappings ----------------------------------------------------------------------------------------------------
+# Writes PDO mappings by the sequence of CiA 301, reads everything back and compares. A wrong mapping is the worst kind
+# of error: the drive accepts it and every value after it is plausible garbage. So the lengths are checked against the
+# EDS before, and the device's own answer against the plan after.
 
 
 _COB_ID, _TYPE, _INHIBIT, _EVENT_TIMER = 1, 2, 3, 5  # sub-indices of 1400/1800
@@ -158,11 +158,11 @@ def configure_pdos(sdo: SdoAccess, plan: NodePlan, dictionary: Dictionary) -> li
     return report
 
 
-# Writes the parameter values of a DCF to a node. Off the control path.
-#
-# A DCF is an EDS with ParameterValue keys: how somebody configured this device with the maker's tool. Only the device's
-# own parameters (0x2000 and up) are taken from it: communication objects are the bring-up's, which verifies them, and
-# what acts when it is written (control word, set-points, outputs, presets) is nobody's to write from a file.
+# --- DCF values ------------------------------------------------------------------------------------------------------
+# Writes the parameter values of a DCF to a node. A DCF is an EDS with ParameterValue keys: how somebody configured this
+# device with the maker's tool. Only the device's own parameters (0x2000 and up) are taken from it: communication
+# objects are the bring-up's, which verifies them, and what acts when it is written (control word, set-points, outputs,
+# presets) is nobody's to write from a file.
 
 
 _FIRST_DEVICE_OBJECT = 0x2000
@@ -199,7 +199,8 @@ def write_parameters(sdo: SdoAccess, dictionary: Dictionary) -> int:
     return written
 
 
-# The identity of a node (0x1018), checked before anything is written to it. Off the control path.
+# --- Identity --------------------------------------------------------------------------------------------------------
+# The identity of a node (0x1018), checked before anything is written to it.
 
 
 #: Sub-index of 0x1018 for each number that the configuration may state.

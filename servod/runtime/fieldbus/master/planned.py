@@ -17,11 +17,11 @@ from servod.runtime.fieldbus.cia import HEARTBEAT_BASE, SYNC_ID
 from servod.runtime.fieldbus.devices import Driver, NodePlan, PdoMap, Setup
 from servod.runtime.fieldbus.registry import driver_table, drivers_of, load_driver
 
-# The bus load of an axis, computed from the mapping that will be written, before anything is started.
-#
-# Worst case: every frame with the most stuff bits its length allows. The items are kept apart, so that a refusal can
-# say what uses the bus. Stands on servod.runtime.fieldbus.devices and servod.formats.config; the virtual bus models the
-# same bits by its own code.
+# --- Bus load --------------------------------------------------------------------------------------------------------
+# The bus load of an axis, computed from the mapping that will be written, before anything is started. Worst case: every
+# frame with the most stuff bits its length allows. The items are kept apart, so that a refusal can say what uses the
+# bus. Stands on servod.runtime.fieldbus.devices and servod.formats.config; the virtual bus models the same bits by its
+# own code.
 
 
 _LAST_SYNCHRONOUS_TYPE = 240  # CiA 301: 1 to 240 is every n-th SYNC, 0 acyclic synchronous

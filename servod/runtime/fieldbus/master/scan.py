@@ -19,10 +19,10 @@ from servod.runtime.fieldbus.master.network import BusNetwork
 from servod.runtime.fieldbus.master.node import NodeIdentity, read_identity
 from servod.runtime.fieldbus.master.sdo import NodeSdo
 
-# LSS master (CiA 305): finds nodes that have no node id yet, and leaves them as they are. Off the control path.
-#
-# Fast scan finds one unconfigured slave by its 128-bit identity, bit by bit: a slave answers when it agrees with all
-# bits so far, so silence is an answer too and its time-out is what the scan costs (about 60 silences for a node).
+# --- LSS -------------------------------------------------------------------------------------------------------------
+# LSS master (CiA 305): finds nodes that have no node id yet, and leaves them as they are. Fast scan finds one
+# unconfigured slave by its 128-bit identity, bit by bit: a slave answers when it agrees with all bits so far, so
+# silence is an answer too and its time-out is what the scan costs (about 60 silences for a node).
 
 
 class LssCommand(IntEnum):

@@ -302,9 +302,9 @@ def friction(friction_nm: float, bounds: WiringTestBounds) -> CheckResult | None
     )
 
 
-# How far the joint has moved over the last cycles: what tells motion, its direction and rest from single counts.
-#
-# Used by the test of the wiring in the loop; a fixed number of floats, nothing grows.
+# --- Motion over the last cycles -------------------------------------------------------------------------------------
+# How far the joint has moved over the last cycles: what tells motion, its direction and rest from single counts. Used
+# by the test of the wiring in the loop; a fixed number of floats, nothing grows.
 
 
 #: Cycles over which rest is judged, and over which speed and direction are.

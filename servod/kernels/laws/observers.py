@@ -1,6 +1,7 @@
-"""Disturbance observer: the torque that the model does not know, from the torque that really acted.
+"""The observers of the laws: the bristle that the friction laws follow, and the torque that no model knows.
 
-Stands under `pd_dob` and `local`. Because it works with the torque after limits it cannot wind up.
+Stands under `pd_dob`, `pd_lugre` and `local`. Plain floats, compiled by numba as they are. The friction state must not
+wind up where the limits cut the torque; the disturbance observer cannot, for it works with the torque that acted.
 """
 
 from __future__ import annotations
@@ -9,9 +10,8 @@ import math
 
 from servod.kernels.laws.state import LawState
 
-# Exact step of the friction state: what explicit Euler gets wrong at 1 ms, where the decay reaches 10 000 1/s.
-#
-# Stands under the friction laws. Plain floats, compiled as it is by numba.
+# --- Friction state -----------------------------------------------------------------------------------------------
+# Its step is exact: explicit Euler gets it wrong at 1 ms, where the decay reaches 10 000 1/s.
 
 
 SMALL_EXPONENT = 1e-9  # below it 1 - exp(-a*dt) equals a*dt to the last bit
@@ -27,6 +27,19 @@ def decayed(z: float, decay_per_s: float, drive_rad_s: float, dt: float) -> floa
         return z + drive_rad_s * dt
     gone = -math.expm1(-exponent)
     return z + (drive_rad_s / decay_per_s - z) * gone
+
+
+#: Less difference than this between asked and applied torque is rounding.
+LIMITED_NM = 1e-9
+
+
+def winding_up(s: LawState, push: float, u_applied: float) -> bool:
+    """Whether the limits cut the last torque (asked against applied) and `push` would ask for still more of it."""
+    cut = s.asked - u_applied
+    return (cut > LIMITED_NM and push > 0.0) or (cut < -LIMITED_NM and push < 0.0)
+
+
+# --- Disturbance observer -----------------------------------------------------------------------------------------
 
 
 def limited(value: float, bound: float) -> float:
@@ -66,17 +79,3 @@ def remember(s: LawState, v: float, modelled_nm: float, u_applied: float) -> Non
     s.last_velocity = v
     s.modelled = modelled_nm
     s.started = 1.0
-
-
-# Anti-windup of the friction state: no integral action into a limit that already holds.
-#
-# Stands under `pd_lugre` and `local`. The disturbance observer needs none, it works with the torque after limits.
-
-
-LIMITED_NM = 1e-9  # less difference than this between asked and applied is rounding
-
-
-def winding_up(s: LawState, push: float, u_applied: float) -> bool:
-    """Whether the limits cut the last torque (asked against applied) and `push` would ask for still more of it."""
-    cut = s.asked - u_applied
-    return (cut > LIMITED_NM and push > 0.0) or (cut < -LIMITED_NM and push < 0.0)
