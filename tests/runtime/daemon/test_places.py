@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import os
@@ -23,6 +24,7 @@ from servod.formats.protocol import Verb
 from servod.runtime.daemon.connection import Connection
 from servod.runtime.daemon.control_server import MAX_CLIENTS, MAX_CLIENTS_OF_A_PROCESS, Places
 from servod.runtime.daemon.peer import Peer
+from tests.on_event_loop import events_pass, on_event_loop
 
 
 @pytest.fixture
@@ -324,3 +326,67 @@ def test_who_is_hung_up_on_because_the_daemon_ends_is_told_so(served: Served) ->
         with pytest.raises(Unreachable, match="the loop was lost") as told:
             client.call(Verb.STATUS)
         assert not isinstance(told.value, Refused)
+
+
+class _Desk:
+    """What a connection belongs to: notes the lines, and answers none."""
+
+    def __init__(self) -> None:
+        self.lines: list[bytes] = []
+        self.dropped = 0
+
+    def dispatch(self, _client: Connection, line: bytes) -> None:
+        self.lines.append(line)
+
+    def drop(self, client: Connection) -> None:
+        self.dropped += 1
+        client.close()
+
+
+@pytest.fixture
+def wires() -> Iterator[tuple[socket.socket, socket.socket]]:
+    """A client's end and the server's."""
+    client, server = socket.socketpair()
+    server.setblocking(False)
+    with client, server:
+        yield client, server
+
+
+@on_event_loop
+async def test_client_is_asked_four_times_in_each_round(wires: tuple[socket.socket, socket.socket]) -> None:
+    (client, server), desk = wires, _Desk()
+    client.send(b"0\n")
+    connection = Connection(server, desk)
+    connection.begin()
+    assert desk.lines == [b"0"]  # what came with the connection is served before anybody else comes
+    for number in range(1, 6):
+        client.send(b"%d\n" % number)
+        await events_pass()
+    assert desk.lines == [b"0", b"1", b"2", b"3"]
+    connection.begin_round(1)
+    await events_pass()
+    assert desk.lines == [b"0", b"1", b"2", b"3", b"4", b"5"]
+
+
+@on_event_loop
+async def test_client_that_is_dropped_leaves_nothing_on_the_event_loop(
+    wires: tuple[socket.socket, socket.socket],
+) -> None:
+    """Before its task went its first step, while it waits for bytes, and while it waits for the next round."""
+    (_, server), desk, own = wires, _Desk(), asyncio.current_task()
+    connection = Connection(server, desk)
+    connection.begin()
+    connection.close()
+    await events_pass()
+    assert asyncio.all_tasks() == {own}
+    for sent in (b"", b"x\n" * 9):
+        client, server = socket.socketpair()
+        server.setblocking(False)
+        client.send(sent)
+        connection = Connection(server, desk)
+        connection.begin()
+        await events_pass()
+        client.close()
+        connection.begin_round(1)
+        await events_pass()
+        assert asyncio.all_tasks() == {own}
