@@ -30,8 +30,8 @@ from servod.runtime.daemon.arguments import (
     TrackArgs,
     check_arguments,
 )
-from servod.runtime.daemon.flows import OrderWait, finish
 from servod.runtime.daemon.gain_bank import GainBank
+from servod.runtime.daemon.requests import finish, taken
 from servod.runtime.daemon.trajectory import MotionTable
 from servod.runtime.fieldbus.master import BringUp, Master
 from servod.runtime.loop.axis import AxisState
@@ -225,7 +225,7 @@ class SteppedAxis:
     def run_active(self) -> None:
         """Give the loop the store's active set, as the one that it began with."""
         gains, parameters = self._bank.newest.gains, self._bank.newest.gains.pack()
-        self._send(Op.ACTIVATE, (0, gains.law.number, len(parameters), *parameters)).result()
+        finish(self._send(Op.ACTIVATE, (0, gains.law.number, len(parameters), *parameters)))
 
     def status(self) -> AxisReading:
         """As of the last cycle."""
@@ -314,12 +314,10 @@ class SteppedAxis:
             self.session.run(period_s)
             each_cycle(passed_s + count * period_s)
 
-    def _send(self, op: Op, arguments: Sequence[float]) -> OrderWait:
+    async def _send(self, op: Op, arguments: Sequence[float]) -> CycleRecord:
         """The bank's way to the loop, which has answered when this is back."""
         self.session.send(op, arguments)
-        answer = OrderWait(int(self.session.latest.command_seq), 0)
-        answer.record = self.session.latest
-        return answer
+        return taken(self.session.latest)
 
     def _require_enabled(self, raw: bytes = b"") -> None:
         state = self.session.cycle.axis.state

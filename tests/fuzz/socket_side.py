@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
-import selectors
 import socket
 import threading
 import time
@@ -28,6 +28,7 @@ from tests.axis_limits import LIMITS
 from tests.fuzz.shapes import JSON_TRICKS, request_lines
 from tests.fuzz.target import Target
 from tests.fuzz.texts import _GAINS
+from tests.on_event_loop import events_pass
 
 _REQUESTS: tuple[dict[str, Any], ...] = tuple(
     {"id": number, "verb": str(verb), "args": args}
@@ -54,8 +55,8 @@ _REQUESTS: tuple[dict[str, Any], ...] = tuple(
 )
 #: Rounds of the event loop that an answer may take; and those in which the server sees that a client has left.
 _ROUNDS, _ROUNDS_TO_LEAVE = 200, 6
-#: They take at least so long: each client has a share of every 20 ms, and what is beyond it waits.
-_SHARE_NS = 60_000_000
+#: They take at least so long: the recorder works in a thread of its own.
+_RECORDER_NS = 60_000_000
 
 
 class _Loop(LoopHandle):
@@ -86,20 +87,24 @@ class _Desk:
                 "recorder": {"directory": folder / "recordings"},
             }
         )
-        self.selector, self.loop = selectors.DefaultSelector(), _Loop()
+        self.loop = _Loop()
         recorder = Recorder(self.config.recorder, self.config.name, 1000)
         bank = GainBank(self.config)
         self.verbs = Verbs(self.config, self.loop, bank, recorder, dict, dict)
-        self.server = ControlServer(self.config.control, self.selector, self.verbs)
+        self.server = ControlServer(self.config.control, self.verbs)
+        self._events = asyncio.Runner()
+        self._events.get_loop().call_soon(self.server.begin)
 
     def rounds(self, until: Callable[[], bool]) -> None:
         """Rounds of the supervisor's event loop, until there is nothing more to wait for."""
+        self._events.run(self._rounds(until))
+
+    async def _rounds(self, until: Callable[[], bool]) -> None:
         begun_ns = time.monotonic_ns()
         for number in count():
-            if number >= _ROUNDS and time.monotonic_ns() - begun_ns > _SHARE_NS:
+            if number >= _ROUNDS and time.monotonic_ns() - begun_ns > _RECORDER_NS:
                 return
-            for key, events in self.selector.select(0.0):
-                key.data(events)
+            await events_pass()
             self.verbs.slow.submit(lambda: None).result()
             now_ns = time.monotonic_ns()
             self.verbs.tick([self.loop.latest], now_ns)

@@ -6,9 +6,9 @@ what it sends beyond that waits in the kernel, at its own expense.
 
 from __future__ import annotations
 
+import asyncio
 import re
 import select
-import selectors
 import socket
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -16,6 +16,7 @@ from typing import Any, Protocol
 from servod.common.errors import BadInput, ServodError, Unreachable, details
 from servod.common.units import NS_PER_S
 from servod.formats.protocol import MAX_LINE_BYTES, encode_line
+from servod.runtime.daemon.eager import begin
 from servod.runtime.daemon.peer import Peer, peer_of
 
 _READ_BYTES = 65_536
@@ -26,6 +27,7 @@ _UNREAD_BYTES = 64 * 1024
 _MAX_BACKLOG_BYTES = 4 * 1024 * 1024
 _MIN_WATCH_S, _MAX_WATCH_S = 0.02, 60.0
 _BLANK = re.compile(rb"\s*")
+_TOO_LONG = BadInput("request", "a longer line", f"at most {MAX_LINE_BYTES} bytes")
 
 
 class Reply:
@@ -73,24 +75,26 @@ class Owner(Protocol):
 class Connection:
     """One connection with its two buffers."""
 
-    def __init__(
-        self, connection: socket.socket, selector: selectors.BaseSelector, owner: Owner, now_ns: int = 0
-    ) -> None:
+    def __init__(self, connection: socket.socket, owner: Owner, now_ns: int = 0) -> None:
         """`connection` does not block; `now_ns` is when it came."""
         self.peer: Peer = peer_of(connection)
         self.active_ns = now_ns  # when it last asked something, or read what it watches
         self.commanded_ns: int | None = None  # when it last commanded, or stopped the axis
         self.under_way = 0  # requests without an answer yet
-        self._connection, self._selector, self._owner = connection, selector, owner
+        self._connection, self._owner, self._loop = connection, owner, asyncio.get_running_loop()
         self._incoming, self._outgoing = bytearray(), bytearray()
         self._searched = 0  # of the incoming bytes: no end of a line before here
         self._reads, self._lines, self._now_ns = _READS_IN_A_ROUND, _LINES_IN_A_ROUND, now_ns
-        self._events = 0
+        self._may_go_on = asyncio.Event()
         self._watch_period_ns, self._watch_next_ns = 0, 0
         self._watch_reply: Reply | None = None
         self._hung_up = select.poll()  # tells POLLHUP whatever it is asked for
         self._hung_up.register(connection, 0)
-        self._want()
+        self._serving: asyncio.Task[None] | None = None
+
+    def begin(self) -> None:
+        """Serve the client from now on; what it sent with its connection at once."""
+        self._serving = begin(self._serve())
 
     @property
     def held_bytes(self) -> int:
@@ -103,76 +107,57 @@ class Connection:
             self._owner.drop(self)
             return
         self._reads, self._lines, self._now_ns = _READS_IN_A_ROUND, _LINES_IN_A_ROUND, now_ns
-        self._serve()
+        self._may_go_on.set()
 
     def has_left(self) -> bool:
         """The other end is closed, both ways, whatever of what it sent is still to be read."""
         return bool(self._hung_up.poll(0))
 
-    def read(self) -> None:
-        """Take what came, and serve the lines in it."""
-        if not self._reads or not self._open:
-            return
+    async def _serve(self) -> None:
+        """Dispatch line after line until the client leaves; a line without end must not fill the memory."""
+        try:
+            while data := await self._receive():
+                self._incoming += data
+                while 0 <= (end := self._line_end()) <= MAX_LINE_BYTES:
+                    await self._share(lambda: self._lines)
+                    self._lines -= 1
+                    self.active_ns = self._now_ns
+                    self._owner.dispatch(self, self._cut(end))
+                if len(self._incoming) > MAX_LINE_BYTES:
+                    Reply(self.send, None).failed(_TOO_LONG)
+                    return
+        finally:
+            self._owner.drop(self)
+
+    async def _receive(self) -> bytes:
+        """What came; nothing when the client has gone."""
+        await self._share(lambda: min(self._reads, self._lines))
         self._reads -= 1
         try:
-            data = self._connection.recv(_READ_BYTES)
-        except BlockingIOError:
-            return
+            return await self._loop.sock_recv(self._connection, _READ_BYTES)
         except OSError:
-            data = b""
-        if not data:
-            self._owner.drop(self)
-            return
-        self._incoming += data
-        self._serve()
+            return b""
 
-    @property
-    def _open(self) -> bool:
-        return self._connection.fileno() >= 0
+    async def _share(self, left: Callable[[], int]) -> None:
+        """Wait until something is left of the client's share of the round, and there is room for its answers."""
+        while self._open and not (left() and len(self._outgoing) < _UNREAD_BYTES):
+            self._may_go_on.clear()
+            await self._may_go_on.wait()
 
-    def _on_events(self, events: int) -> None:
-        if events & selectors.EVENT_WRITE:
-            self._flush()
-        if events & selectors.EVENT_READ:
-            self.read()
-        self._want()
-
-    def _serve(self) -> None:
-        """Dispatch complete lines, as many as this round has left; a line without end must not fill the memory."""
-        while self._open and self._lines and len(self._outgoing) < _UNREAD_BYTES and (line := self._next_line()):
-            if len(line) > MAX_LINE_BYTES:
-                self._refuse_long_line()
-                return
-            self._lines -= 1
-            self.active_ns = self._now_ns
-            self._owner.dispatch(self, line)
-        if not self._has_line() and len(self._incoming) > MAX_LINE_BYTES:
-            self._refuse_long_line()
-        self._want()
-
-    def _has_line(self) -> bool:
-        """Whether a complete line waits; bytes that were searched once are not searched again."""
-        found = self._incoming.find(b"\n", self._searched) >= 0
-        self._searched = self._searched if found else len(self._incoming)
-        return found
-
-    def _next_line(self) -> bytes:
-        """Cut off the next line that is not blank; empty when there is none."""
+    def _line_end(self) -> int:
+        """Where the next line ends that is not blank, -1 when it is not complete; no byte is searched twice."""
         if blank := _BLANK.match(self._incoming):
             del self._incoming[: blank.end()]
             self._searched = max(0, self._searched - blank.end())
-        if not self._has_line():
-            return b""
         end = self._incoming.find(b"\n", self._searched)
+        self._searched = len(self._incoming) if end < 0 else end
+        return end
+
+    def _cut(self, end: int) -> bytes:
         line = bytes(self._incoming[:end])
         del self._incoming[: end + 1]
         self._searched = 0
         return line
-
-    def _refuse_long_line(self) -> None:
-        if self._open:
-            Reply(self.send, None).failed(BadInput("request", "a longer line", f"at most {MAX_LINE_BYTES} bytes"))
-        self._owner.drop(self)
 
     def send(self, message: dict[str, Any]) -> None:
         """Queue one line; raises ValueError, TypeError or RecursionError for what JSON cannot hold."""
@@ -183,30 +168,21 @@ class Connection:
 
     def _flush(self) -> None:
         try:
-            sent = self._connection.send(self._outgoing) if self._outgoing else 0
+            sent = self._connection.send(self._outgoing)
         except BlockingIOError:
             sent = 0
         except OSError:
-            self._outgoing.clear()  # the read side sees the end and drops the client
-            sent = 0
+            sent = len(self._outgoing)  # the read side sees the end and drops the client
         del self._outgoing[:sent]
-        self._want()
+        if self._outgoing:
+            self._loop.add_writer(self._connection, self._flush)
+        elif self._open:
+            self._loop.remove_writer(self._connection)
+        self._may_go_on.set()
 
-    def _want(self) -> None:
-        """Hear of bytes to read only while there is a share of the round left for them, and room for the answers."""
-        if not self._open:
-            return
-        hears = self._reads and self._lines and len(self._outgoing) < _UNREAD_BYTES
-        events = (selectors.EVENT_READ if hears else 0) | (selectors.EVENT_WRITE if self._outgoing else 0)
-        if events == self._events:
-            return
-        if not events:
-            self._selector.unregister(self._connection)
-        elif self._events:
-            self._selector.modify(self._connection, events, self._on_events)
-        else:
-            self._selector.register(self._connection, events, self._on_events)
-        self._events = events
+    @property
+    def _open(self) -> bool:
+        return self._connection.fileno() >= 0
 
     def start_watch(self, args: dict[str, Any], reply: Reply) -> None:
         """Send the status every args["period_s"] from now on."""
@@ -230,9 +206,11 @@ class Connection:
 
     def close(self) -> None:
         """Hang up."""
-        if self._events:
-            self._selector.unregister(self._connection)
-            self._events = 0
-        self._connection.close()
+        if self._open:
+            self._loop.remove_reader(self._connection)  # before its number is somebody else's
+            self._loop.remove_writer(self._connection)
+            self._connection.close()
+        if self._serving:
+            self._serving.cancel()
         self._incoming.clear()
         self._outgoing.clear()

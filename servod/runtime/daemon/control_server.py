@@ -1,6 +1,6 @@
 """Server side of the control socket: clients in, requests out, answers back, and never a moment of waiting.
 
-Runs inside the supervisor's event loop; sockets do not block. A client that is slow, broken or malicious loses its own
+Runs on the supervisor's event loop; sockets do not block. A client that is slow, broken or malicious loses its own
 connection and nothing else: lines, buffers, requests under way and the number of clients are bounded, in all and for
 each process, and so is what one round of the supervisor does for each client. Who may ask what:
 servod.runtime.daemon.control_server.
@@ -9,11 +9,11 @@ Protocol: servod.client.control.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import errno
 import logging
 import os
-import selectors
 import socket
 import stat
 from collections import Counter
@@ -158,7 +158,6 @@ _UNDER_WAY_OF_A_CLIENT, _UNDER_WAY = 8, 64
 _STOPS_BEYOND = 32
 #: What is answered at once and never under way.
 _AT_ONCE = frozenset({Verb.STATUS, Verb.TRAJECTORY})
-_ROUND_NS = 20_000_000
 _LONGEST_NUMBER = 64
 
 
@@ -185,26 +184,33 @@ class Handler(Protocol):
 class ControlServer:
     """The listening socket and its clients."""
 
-    def __init__(self, config: ControlConfig, selector: selectors.BaseSelector, handler: Handler) -> None:
-        """Bind and listen. Raises Unreachable when that is refused. The caller holds the instance lock."""
-        self._path, self._selector, self._handler = config.socket, selector, handler
+    def __init__(self, config: ControlConfig, handler: Handler, feed: Callable[[], None] = lambda: None) -> None:
+        """Bind and listen. Raises Unreachable when that is refused. The caller holds the instance lock.
+
+        `feed` is called for each request: many clients at once are no sign of a supervisor that hangs.
+        """
+        self._path, self._handler, self._feed = config.socket, handler, feed
         self._group = group_id(config.group)
         self._places = Places()
         self._lease = Lease(handler.motion_running)
-        self._under_way = self._accepted = 0
-        self._now_ns = self._next_round_ns = 0
-        self._listening = self._status_failed = False
+        self._under_way = self._now_ns = 0
+        self._status_failed = False
+        self._round = asyncio.Event()
         self._listener = _listen(config.socket, self._group)
-        self._listen(True)
+        self._welcoming: asyncio.Task[None] | None = None
+
+    def begin(self) -> None:
+        """Take clients from now on; call it on the event loop."""
+        self._welcoming = asyncio.get_running_loop().create_task(self._welcome())
 
     def tick(self, now_ns: int) -> None:
-        """A new round for every client, and what watchers are due; call it in every round of the event loop."""
+        """A new round for every client, and what watchers are due; call it every 20 ms."""
         self._now_ns = now_ns
-        if now_ns >= self._next_round_ns:
-            self._next_round_ns, self._accepted = now_ns + _ROUND_NS, 0
-            self._listen(True)
-            for client in list(self._places.clients):
-                client.begin_round(now_ns)
+        if self._welcoming and self._welcoming.done():
+            self._welcoming.result()  # a mistake of ours: without a door the axis is not to run on
+        self._round.set()
+        for client in list(self._places.clients):
+            client.begin_round(now_ns)
         self._tell_watchers(now_ns)
 
     def _tell_watchers(self, now_ns: int) -> None:
@@ -241,7 +247,9 @@ class ControlServer:
         for client in list(self._places.clients):
             Reply(client.send, None).failed(Unreachable(why))
             self.drop(client)
-        self._listen(False)
+        if self._welcoming:
+            self._welcoming.cancel()
+            self._welcoming.get_loop().remove_reader(self._listener)
         self._listener.close()
         self._path.unlink(missing_ok=True)
 
@@ -252,24 +260,16 @@ class ControlServer:
         if self._lease.left(client):
             self._handler.lease_ended()
 
-    def _listen(self, listening: bool) -> None:
-        """Hear of new clients, or let them queue."""
-        if listening and not self._listening:
-            self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
-        elif self._listening and not listening:
-            self._selector.unregister(self._listener)
-        self._listening = listening
-
-    def _accept(self, _events: int) -> None:
-        while self._accepted < _ACCEPT_IN_A_ROUND:
-            self._accepted += 1
-            try:
-                connection, _address = self._listener.accept()
-            except OSError:
-                return  # nobody waits, or descriptors ran out: nothing to hold against the axis
-            connection.setblocking(False)
-            self._admit(connection)
-        self._listen(False)
+    async def _welcome(self) -> None:
+        """Take those who queue, a few in each round."""
+        loop = asyncio.get_running_loop()
+        while True:
+            self._round.clear()
+            with contextlib.suppress(OSError):  # descriptors ran out: nothing to hold against the axis
+                for _ in range(_ACCEPT_IN_A_ROUND):
+                    connection, _address = await loop.sock_accept(self._listener)
+                    self._admit(connection)
+            await self._round.wait()
 
     def _admit(self, connection: socket.socket) -> None:
         """A place for a new client, or one line that says why not; what it sent with its connection is served now."""
@@ -285,12 +285,13 @@ class ControlServer:
                 Reply(lambda message: _send_once(connection, message), None).failed(error)
             connection.close()
             return
-        client = Connection(connection, self._selector, self, self._now_ns)
+        client = Connection(connection, self, self._now_ns)
         self._places.take(client)
-        client.read()
+        client.begin()
 
     def dispatch(self, client: Connection, line: bytes) -> None:
         """One request line: check it, check the right to ask it, and hand it on."""
+        self._feed()
         reply = Reply(client.send, None)
         try:
             message = decode_line(line)

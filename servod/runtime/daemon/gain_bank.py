@@ -7,7 +7,7 @@ becomes the store's active one only after the loop has taken it.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from concurrent.futures import Executor, Future
 from typing import Any
 
@@ -15,16 +15,17 @@ from servod.common.errors import AnswerIsNo, BadInput, ServodError
 from servod.formats.config import AxisConfig
 from servod.formats.gains.gain_set import GainSet, require_fit
 from servod.formats.gains.store import GainStore, StoredSet
+from servod.formats.recording.record import CycleRecord
 from servod.runtime.daemon.arguments import GainsActivateArgs, GainsLoadArgs, GainsVerdictArgs
-from servod.runtime.daemon.flows import Flow, FutureWait, Wait
+from servod.runtime.daemon.requests import work_of
 from servod.runtime.daemon.status import ControllerStatus
 from servod.runtime.loop.commands import Op
 
 log = logging.getLogger("servod.gains")
 
 _NO_TRIAL = "no gain set is on trial"
-#: Sends a command to the loop and gives what to wait for.
-SendOrder = Callable[[Op, Sequence[float]], Wait]
+#: Sends a command to the loop; awaited, gives the record that shows it done.
+SendOrder = Callable[[Op, Sequence[float]], Awaitable[CycleRecord]]
 #: Refuses a set that an axis may not run, by raising BadInput.
 Fits = Callable[[GainSet, AxisConfig], None]
 
@@ -69,16 +70,16 @@ class GainBank:
             "law": stored.gains.law.name if stored else "unknown",
         }
 
-    def load(self, args: GainsLoadArgs, slow: Executor) -> Flow:
+    async def load(self, args: GainsLoadArgs, slow: Executor) -> dict[str, Any]:
         """Check and store a set."""
-        stored = yield FutureWait(slow.submit(self._store.load, args.text, args.name))
+        stored = await work_of(slow.submit(self._store.load, args.text, args.name))
         return _row(stored)
 
-    def list(self, serial: int, slow: Executor) -> Flow:
+    async def list(self, serial: int, slow: Executor) -> dict[str, Any]:
         """All stored versions, and which one runs."""
         running = self._sets.get(serial)
         now = (running.name, running.version) if running else None
-        rows = yield FutureWait(slow.submit(self._rows, now))
+        rows = await work_of(slow.submit(self._rows, now))
         return {"gains": rows}
 
     def _rows(self, now: tuple[str, int] | None) -> Sequence[dict[str, Any]]:
@@ -94,33 +95,33 @@ class GainBank:
             return str(refusal)
         return ""
 
-    def activate(self, args: GainsActivateArgs, send: SendOrder, slow: Executor) -> Flow:
+    async def activate(self, args: GainsActivateArgs, send: SendOrder, slow: Executor) -> dict[str, Any]:
         """Change the running controller to a stored set, bumpless."""
-        stored: StoredSet = yield FutureWait(slow.submit(self._store.get, args.name, args.version))
-        yield from self._deploy(stored, send)
+        stored: StoredSet = await work_of(slow.submit(self._store.get, args.name, args.version))
+        await self._deploy(stored, send)
         self._tried = stored if args.trial else None
         if not args.trial:
-            yield from self._write(slow.submit(self._store.activate, stored.name, stored.version), stored, send, slow)
+            await self._write(slow.submit(self._store.activate, stored.name, stored.version), stored, send, slow)
         return _row(stored)
 
-    def keep(self, args: GainsVerdictArgs, send: SendOrder, slow: Executor) -> Flow:
+    async def keep(self, args: GainsVerdictArgs, send: SendOrder, slow: Executor) -> dict[str, Any]:
         """Make the set on trial the active one. Where the store cannot be written, the active one runs again."""
         tried, self._tried = self._tried, None  # from here on nobody else ends the trial
         if tried is None:
             raise AnswerIsNo(_NO_TRIAL)
         written = slow.submit(self._store.activate, tried.name, tried.version, args.note, args.figures)
-        yield from self._write(written, tried, send, slow)
+        await self._write(written, tried, send, slow)
         return _row(tried)
 
-    def rollback(self, args: GainsVerdictArgs, send: SendOrder, slow: Executor) -> Flow:
+    async def rollback(self, args: GainsVerdictArgs, send: SendOrder, slow: Executor) -> dict[str, Any]:
         """Go back to the set that was active before; from a trial, to the one that is."""
         if self._tried is None and args.trial:
             raise AnswerIsNo(_NO_TRIAL)
         if self._tried is not None:
-            return (yield from self._reject(self._tried, args, send, slow))
-        stored: StoredSet = yield FutureWait(slow.submit(self._store.previous))
-        yield from self._deploy(stored, send)
-        yield from self._write(slow.submit(self._store.rollback), stored, send, slow)
+            return await self._reject(self._tried, args, send, slow)
+        stored: StoredSet = await work_of(slow.submit(self._store.previous))
+        await self._deploy(stored, send)
+        await self._write(slow.submit(self._store.rollback), stored, send, slow)
         return _row(stored)
 
     def _active_or(self, initial: StoredSet) -> StoredSet:
@@ -140,42 +141,42 @@ class GainBank:
             return self._store.activate(initial.name, initial.version, f"in place of {last.name}: {error}")
         return active
 
-    def _reject(self, tried: StoredSet, args: GainsVerdictArgs, send: SendOrder, slow: Executor) -> Flow:
+    async def _reject(
+        self, tried: StoredSet, args: GainsVerdictArgs, send: SendOrder, slow: Executor
+    ) -> dict[str, Any]:
         """End a trial: the active set runs again."""
-        active = yield from self._back(send, slow)
-        yield FutureWait(slow.submit(self._store.reject, tried.name, tried.version, args.note, args.figures))
+        active = await self._back(send, slow)
+        await work_of(slow.submit(self._store.reject, tried.name, tried.version, args.note, args.figures))
         return active
 
-    def _write(self, written: Future[StoredSet], runs: StoredSet, send: SendOrder, slow: Executor) -> Flow:
+    async def _write(self, written: Future[StoredSet], runs: StoredSet, send: SendOrder, slow: Executor) -> None:
         """Wait until the store has the set that runs as its active one; when it cannot, the active one runs again.
 
         Should that fail too, the set that runs is on trial, so that whoever leaves or rolls back goes back.
         """
         try:
-            yield FutureWait(written)
+            await work_of(written)
         except (ServodError, OSError) as error:
             log.error("gain set %s version %d runs and cannot be stored as active: %s", runs.name, runs.version, error)
             self._tried = runs
-            yield from self._back(send, slow)
+            await self._back(send, slow)
             raise
-        return {}
 
-    def _back(self, send: SendOrder, slow: Executor) -> Flow:
+    async def _back(self, send: SendOrder, slow: Executor) -> dict[str, Any]:
         """The store's active set runs again, and none is on trial."""
-        active: StoredSet | None = yield FutureWait(slow.submit(self._store.active))
+        active: StoredSet | None = await work_of(slow.submit(self._store.active))
         assert active is not None  # the bank activated one when it began
-        yield from self._deploy(active, send)
+        await self._deploy(active, send)
         self._tried = None
         return _row(active)
 
-    def _deploy(self, stored: StoredSet, send: SendOrder) -> Flow:
+    async def _deploy(self, stored: StoredSet, send: SendOrder) -> None:
         """Send a set to the loop and wait until its records show that it runs."""
         self._fits(stored.gains, self._config)
         serial, parameters = self._last_serial + 1, stored.gains.pack()
-        yield send(Op.ACTIVATE, (serial, stored.gains.law.number, len(parameters), *parameters))
+        await send(Op.ACTIVATE, (serial, stored.gains.law.number, len(parameters), *parameters))
         self._last_serial, self._sets[serial] = serial, stored
         log.info("gain set %s version %d (%s) runs", stored.name, stored.version, stored.gains.law.name)
-        return {}
 
 
 def _row(stored: StoredSet) -> dict[str, Any]:

@@ -6,8 +6,8 @@ requests a step further; watchdog and status line to systemd, fed only while the
 
 from __future__ import annotations
 
+import asyncio
 import logging
-import selectors
 import time
 from concurrent.futures import Future
 from typing import Any
@@ -79,8 +79,7 @@ class Supervisor:
         self._faults = FaultWatch(recorder, self._health, self._metrics, config.name)
         self._proofs = WiringTestWatch(loop, recorder)
         self._verbs = Verbs(config, loop, bank, recorder, self._document, self._tell_faults)
-        self._selector = selectors.DefaultSelector()
-        self._server = ControlServer(config.control, self._selector, self._verbs)
+        self._server = ControlServer(config.control, self._verbs, loop.feed)
         self._metrics_server = MetricsServer(config.metrics, self._metrics)
 
     def tell_earlier(self, incident: Incident) -> None:
@@ -93,15 +92,17 @@ class Supervisor:
 
     def run(self) -> int:
         """Supervise until asked to stop (0) or until the loop is lost (3)."""
+        return asyncio.run(self._supervise())
+
+    async def _supervise(self) -> int:
+        self._server.begin()
         self._notifier.ready(f"{self._config.name}: the loop runs, the axis is disabled")
         try:
             while not self._stopping:
-                for key, events in self._selector.select(TICK_S):
-                    key.data(events)
-                    self._loop.feed()  # many clients at once are no sign of a supervisor that hangs
                 self._round(time.monotonic_ns())
                 if self._loop_is_lost():
                     return self._lose_loop()
+                await asyncio.sleep(TICK_S)
             return self._stop()
         finally:
             self._close()
@@ -218,7 +219,6 @@ class Supervisor:
         self._faults.finish()
         self._recorder.close()
         self._metrics_server.close()
-        self._selector.close()
 
     def _tell_faults(self) -> dict[str, Any]:
         """What befell the axis since the daemon started, and where the files of earlier times are."""

@@ -1,7 +1,7 @@
 """What each verb of the control socket does: arguments checked, commands sent to the loop, the answer awaited.
 
-Around the loop, between control server and loop handle. Nothing here blocks: what takes time is a flow, and disk or bus
-work runs in one slow thread.
+Around the loop, between control server and loop handle. Nothing here blocks: what takes time is awaited, and disk
+or bus work runs in one slow thread.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from servod.runtime.daemon.arguments import (
     check_arguments,
 )
 from servod.runtime.daemon.connection import Reply
-from servod.runtime.daemon.flows import Flow, Flows, FutureWait, OrderSender, OrderWait, StateWait
 from servod.runtime.daemon.gain_bank import GainBank
 from servod.runtime.daemon.recorder import Recorder
+from servod.runtime.daemon.requests import Request, Requests, SentOrder, Waits, work_of
 from servod.runtime.daemon.status import reason_texts
 from servod.runtime.daemon.trajectory import MotionTable, check_motion
 from servod.runtime.fieldbus.bus.open import open_bus
@@ -68,14 +68,14 @@ class Verbs:
         """`document` makes the status document, `faults` that of what befell the axis."""
         self._config, self._loop, self._bank, self._recorder = config, loop, bank, recorder
         self._document, self._faults = document, faults
-        self._orders, self._flows = OrderSender(), Flows()
-        self._last: tuple[Op, OrderWait] | None = None
+        self._waits, self._requests = Waits(), Requests()
+        self._last: tuple[Op, SentOrder] | None = None
         self._uploaded = MotionTable()
         self._reference_seq = 0  # the last motion's command
         self._leases_ended = 0
         self._enabling = 0  # requests to enable an axis that was off, without an answer yet
         self.slow = ThreadPoolExecutor(max_workers=1, thread_name_prefix="slow")
-        self._table: dict[Verb, Callable[[Any], Flow]] = {
+        self._table: dict[Verb, Callable[[Any], Request]] = {
             Verb.STATUS: self._status,
             Verb.ENABLE: self._enable,
             Verb.DISABLE: self._disable,
@@ -96,7 +96,7 @@ class Verbs:
 
     def handle(self, verb: Verb, args: dict[str, Any], reply: Reply) -> None:
         """Begin one request; raises BadInput on arguments that do not fit."""
-        self._flows.start(self._table[verb](check_arguments(verb, args)), reply)
+        self._requests.start(self._table[verb](check_arguments(verb, args)), reply)
 
     def status(self) -> dict[str, Any]:
         """The status document."""
@@ -114,63 +114,65 @@ class Verbs:
         self._leases_ended += 1
         if self._enabling:
             log.warning("the client that waited for the axis to be enabled left: disabled again")
-            self._flows.start(self._disable(NoArgs()), Reply(lambda _answer: None, None))
+            self._requests.start(self._disable(NoArgs()), Reply(lambda _answer: None, None))
         if self._bank.on_trial:
-            self._flows.start(self._gains_rollback(_LEFT), Reply(lambda _answer: None, None))
+            self._requests.start(self._gains_rollback(_LEFT), Reply(lambda _answer: None, None))
 
     def tick(self, records: list[CycleRecord], now_ns: int) -> None:
         """Go on with everything that waited for these records, or for time."""
-        self._orders.see(records, now_ns)
-        self._flows.poll(now_ns)
+        self._waits.see(records, now_ns)
 
     def close(self) -> None:
         """Give up what has not begun."""
         self.slow.shutdown(wait=False, cancel_futures=True)
 
-    # --- small tools of the flows --------------------------------------------------------------------------------
-    def _send(self, op: Op, arguments: Sequence[float] = ()) -> OrderWait:
+    # --- small tools of the verbs --------------------------------------------------------------------------------
+    def _send(self, op: Op, arguments: Sequence[float] = ()) -> SentOrder:
         seq = self._loop.send(op, arguments)
         self._recorder.add_event("command", op.name.lower(), arguments=list(arguments[:8]))
-        self._last = op, self._orders.expect(seq, time.monotonic_ns())
+        self._last = op, self._waits.order(seq, time.monotonic_ns())
         return self._last[1]
 
-    def _send_stop(self, op: Op) -> OrderWait:
+    def _send_stop(self, op: Op) -> SentOrder:
         """Of stops one after the other one is enough: nobody fills the queue so that another finds no room."""
         if self._last is not None:
             op_before, wait = self._last
-            if op is op_before and not wait.ready(time.monotonic_ns()):
+            if op is op_before and not wait.over(time.monotonic_ns()):
                 return wait
         return self._send(op)
 
-    def _latest(self) -> CycleRecord | None:
-        return self._loop.latest
+    async def _until(self, reached: Callable[[CycleRecord], bool], timeout_s: float) -> CycleRecord:
+        """Wait for a state of the axis; the newest record, also when time is up."""
+        deadline_ns = time.monotonic_ns() + int(timeout_s * NS_PER_S)
 
-    def _until(self, reached: Callable[[CycleRecord], bool], timeout_s: float) -> StateWait:
-        return StateWait(self._latest, reached, time.monotonic_ns() + int(timeout_s * NS_PER_S))
+        def ready(now_ns: int) -> bool:
+            record = self._loop.latest
+            return now_ns >= deadline_ns or (record is not None and reached(record))
+
+        await self._waits.until(ready)
+        return self._must_run()
 
     # --- the verbs -----------------------------------------------------------------------------------------------
-    def _status(self, _args: NoArgs) -> Flow:
-        yield from ()
+    async def _status(self, _args: NoArgs) -> dict[str, Any]:
         return self._document()
 
-    def _tell_faults(self, _args: NoArgs) -> Flow:
-        yield from ()
+    async def _tell_faults(self, _args: NoArgs) -> dict[str, Any]:
         return self._faults()
 
-    def _enable(self, args: EnableArgs) -> Flow:
+    async def _enable(self, args: EnableArgs) -> dict[str, Any]:
         record = self._loop.latest
         from_off = int(record is None or not AxisState(record.axis_state).under_way)
         self._enabling += from_off
         try:
-            return (yield from self._enable_and_wait(args))
+            return await self._enable_and_wait(args)
         finally:
             self._enabling -= from_off
 
-    def _enable_and_wait(self, args: EnableArgs) -> Flow:
+    async def _enable_and_wait(self, args: EnableArgs) -> dict[str, Any]:
         tests_before, _ = self._loop.proofs
-        yield self._send(Op.ENABLE, (float(args.reset_fault), float(args.prove)))
+        await self._send(Op.ENABLE, (float(args.reset_fault), float(args.prove)))
         timeout_s = self._config.amplifier.enable_timeout_s + self._config.wiring_proof.timeout_s + 1.0
-        record: CycleRecord = yield self._until(lambda r: not AxisState(r.axis_state).starting, timeout_s)
+        record = await self._until(lambda r: not AxisState(r.axis_state).starting, timeout_s)
         tests, proof = self._loop.proofs
         tested = proof if tests != tests_before else None
         if record.axis_state == AxisState.ENABLED:
@@ -180,33 +182,32 @@ class Verbs:
             raise AnswerIsNo(f"the axis is {state}, not enabled: {wiring_sentence(tested)}")
         raise Unreachable(f"the axis is {state}, not enabled: {_why_not_enabled(record)}")
 
-    def _disable(self, _args: NoArgs) -> Flow:
-        yield self._send_stop(Op.DISABLE)
-        return (yield from self._until_off(2.0 * self._config.limits.ramp_down_s))
+    async def _disable(self, _args: NoArgs) -> dict[str, Any]:
+        await self._send_stop(Op.DISABLE)
+        return await self._until_off(2.0 * self._config.limits.ramp_down_s)
 
-    def _stop(self, _args: NoArgs) -> Flow:
-        yield self._send_stop(Op.QUICK_STOP)
-        return (yield from self._until_off(self._config.amplifier.enable_timeout_s))
+    async def _stop(self, _args: NoArgs) -> dict[str, Any]:
+        await self._send_stop(Op.QUICK_STOP)
+        return await self._until_off(self._config.amplifier.enable_timeout_s)
 
-    def _until_off(self, usual_s: float) -> Flow:
+    async def _until_off(self, usual_s: float) -> dict[str, Any]:
         """Done only when the axis has stopped and the drive itself was seen without power."""
-        record: CycleRecord = yield self._until(_is_off, usual_s + _STOP_TIMEOUT_S)
+        record = await self._until(_is_off, usual_s + _STOP_TIMEOUT_S)
         if not _is_off(record):
             axis, drive = AxisState(record.axis_state).name, DriveState(record.drive_state).name
             heard = f"heard {record.amplifier_age} cycles ago" if record.amplifier_age else "heard now"
             raise Unreachable(f"not off: the axis is {axis}, the drive {drive} ({heard}): {_why(record)}")
         return _state(record)
 
-    def _halt(self, args: HaltArgs) -> Flow:
-        record = yield self._send(Op.HALT, (float(args.on),))
+    async def _halt(self, args: HaltArgs) -> dict[str, Any]:
+        record = await self._send(Op.HALT, (float(args.on),))
         return _state(record)
 
-    def _trajectory(self, args: TrajectoryArgs) -> Flow:
-        yield from ()
+    async def _trajectory(self, args: TrajectoryArgs) -> dict[str, Any]:
         self._uploaded.add(args.key, args.start, args.samples)
         return {"samples": args.start + len(args.samples)}
 
-    def _track(self, args: TrackArgs) -> Flow:
+    async def _track(self, args: TrackArgs) -> dict[str, Any]:
         table = args.table(self._uploaded)
         reference = args.reference(table)
         duration_s = self._duration_s(args, table)
@@ -219,7 +220,7 @@ class Verbs:
             self._loop.write_trajectory(table.area())
         wait = self._send(Op.REFERENCE, reference)
         self._reference_seq = wait.seq
-        record = yield wait
+        record = await wait
         return {**_state(record), "kind": args.kind, "duration_s": duration_s}
 
     def _must_run(self) -> CycleRecord:
@@ -241,49 +242,49 @@ class Verbs:
             return (len(table.positions.values) - 1) * self._config.cycle.period_us * 1e-6
         return args.duration_s or 0.0
 
-    def _gains_load(self, args: GainsLoadArgs) -> Flow:
-        return self._bank.load(args, self.slow)
+    async def _gains_load(self, args: GainsLoadArgs) -> dict[str, Any]:
+        return await self._bank.load(args, self.slow)
 
-    def _gains_list(self, _args: NoArgs) -> Flow:
+    async def _gains_list(self, _args: NoArgs) -> dict[str, Any]:
         record = self._loop.latest
-        return self._bank.list(record.controller if record else 0, self.slow)
+        return await self._bank.list(record.controller if record else 0, self.slow)
 
-    def _gains_activate(self, args: GainsActivateArgs) -> Flow:
+    async def _gains_activate(self, args: GainsActivateArgs) -> dict[str, Any]:
         """A trial whose client left before it began ends at once."""
         leases = self._leases_ended
-        result = yield from self._attach_gains(self._bank.activate(args, self._send, self.slow))
+        result = await self._attach_gains(self._bank.activate(args, self._send, self.slow))
         if args.trial and self._leases_ended != leases:
-            yield from self._gains_rollback(_LEFT)
+            await self._gains_rollback(_LEFT)
         return result
 
-    def _gains_keep(self, args: GainsVerdictArgs) -> Flow:
-        return self._attach_gains(self._bank.keep(args, self._send, self.slow))
+    async def _gains_keep(self, args: GainsVerdictArgs) -> dict[str, Any]:
+        return await self._attach_gains(self._bank.keep(args, self._send, self.slow))
 
-    def _gains_rollback(self, args: GainsVerdictArgs) -> Flow:
-        return self._attach_gains(self._bank.rollback(args, self._send, self.slow))
+    async def _gains_rollback(self, args: GainsVerdictArgs) -> dict[str, Any]:
+        return await self._attach_gains(self._bank.rollback(args, self._send, self.slow))
 
-    def _attach_gains(self, change: Flow) -> Flow:
+    async def _attach_gains(self, change: Request) -> dict[str, Any]:
         """After a change of the gain set, also one back when it failed, the recording gets the one that runs."""
         before = self._bank.newest
         try:
-            return (yield from change)
+            return await change
         finally:
             if self._bank.newest is not before:
                 self._recorder.set_attachment("gains.yaml", self._bank.newest.path.read_bytes())
 
-    def _record_start(self, args: RecordStartArgs) -> Flow:
-        path = yield FutureWait(self._recorder.start(args.path))
+    async def _record_start(self, args: RecordStartArgs) -> dict[str, Any]:
+        path = await work_of(self._recorder.start(args.path))
         return {"path": str(path)}
 
-    def _record_stop(self, _args: NoArgs) -> Flow:
-        state = yield FutureWait(self._recorder.stop())
+    async def _record_stop(self, _args: NoArgs) -> dict[str, Any]:
+        state = await work_of(self._recorder.stop())
         return dict(state)
 
-    def _scan(self, _args: NoArgs) -> Flow:
+    async def _scan(self, _args: NoArgs) -> dict[str, Any]:
         record = self._loop.latest
         if record is None or not AxisState(record.axis_state).stopped:
             raise Unreachable("refused: scanning needs the axis disabled; run `servoctl disable` first")
-        nodes = yield FutureWait(self.slow.submit(self._scan_bus))
+        nodes = await work_of(self.slow.submit(self._scan_bus))
         return {"nodes": nodes}
 
     def _scan_bus(self) -> list[dict[str, Any]]:

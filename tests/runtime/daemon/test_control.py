@@ -1,6 +1,5 @@
 import json
 import os
-import selectors
 import socket
 import stat
 import subprocess
@@ -45,17 +44,17 @@ def test_socket_is_for_owner_and_group_only_and_goes_away(served: Served) -> Non
     assert stat.S_IMODE(served.path.stat().st_mode) == 0o660
     served.server.close()
     assert not served.path.exists()
-    served.server = ControlServer(ControlConfig(socket=served.path), selectors.DefaultSelector(), served.handler)
+    served.server = ControlServer(ControlConfig(socket=served.path), served.handler)
 
 
 def test_stale_socket_is_replaced_and_other_files_are_not(tmp_path: Path) -> None:
     path = tmp_path / "axis.sock"
     with socket.socket(socket.AF_UNIX) as stale:
         stale.bind(str(path))
-    ControlServer(ControlConfig(socket=path), selectors.DefaultSelector(), Echo()).close()
+    ControlServer(ControlConfig(socket=path), Echo()).close()
     path.write_text("precious")
     with pytest.raises(Unreachable, match="cannot listen"):
-        ControlServer(ControlConfig(socket=path), selectors.DefaultSelector(), Echo())
+        ControlServer(ControlConfig(socket=path), Echo())
     assert path.read_text() == "precious"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -14,8 +15,8 @@ from servod.common.errors import AnswerIsNo
 from servod.common.shipped import shipped
 from servod.formats.config import load_config
 from servod.formats.gains.store import Action, GainStore
+from servod.formats.recording.record import CycleRecord
 from servod.runtime.daemon.arguments import GainsActivateArgs, GainsVerdictArgs
-from servod.runtime.daemon.flows import OrderWait, finish
 from servod.runtime.daemon.gain_bank import GainBank
 from servod.runtime.loop.commands import Op
 from tests.runtime.daemon.daemon_rows import record
@@ -29,12 +30,10 @@ class Loop:
     def __init__(self) -> None:
         self.serial = 0
 
-    def send(self, op: Op, arguments: Sequence[float]) -> OrderWait:
+    async def send(self, op: Op, arguments: Sequence[float]) -> CycleRecord:
         assert op is Op.ACTIVATE
         self.serial = int(arguments[0])
-        wait = OrderWait(self.serial, 0)
-        wait.record = record(1)
-        return wait
+        return record(1)
 
 
 class Bench:
@@ -58,13 +57,13 @@ class Bench:
         return stored.name
 
     def activate(self, trial: bool) -> dict[str, Any]:
-        return finish(self.bank.activate(GainsActivateArgs(name=TRIED, trial=trial), self.loop.send, self.slow))
+        return asyncio.run(self.bank.activate(GainsActivateArgs(name=TRIED, trial=trial), self.loop.send, self.slow))
 
     def keep(self) -> dict[str, Any]:
-        return finish(self.bank.keep(GainsVerdictArgs(), self.loop.send, self.slow))
+        return asyncio.run(self.bank.keep(GainsVerdictArgs(), self.loop.send, self.slow))
 
     def rollback(self, trial: bool) -> dict[str, Any]:
-        return finish(self.bank.rollback(GainsVerdictArgs(trial=trial), self.loop.send, self.slow))
+        return asyncio.run(self.bank.rollback(GainsVerdictArgs(trial=trial), self.loop.send, self.slow))
 
 
 @pytest.fixture
@@ -115,6 +114,6 @@ def test_the_list_says_what_this_axis_may_not_run(
     """The configuration may have changed since the set was stored."""
     gains = bench.config.gains.model_copy(update={"accept_uncertified": accepts})
     monkeypatch.setattr(bench.bank, "_config", bench.config.model_copy(update={"gains": gains}))
-    rows = finish(bench.bank.list(bench.loop.serial, bench.slow))["gains"]
+    rows = asyncio.run(bench.bank.list(bench.loop.serial, bench.slow))["gains"]
     assert sorted((row["name"], row["active"]) for row in rows) == sorted([(FIRST, True), (TRIED, False)])
     assert all(says in row["refused"] and bool(row["refused"]) != accepts for row in rows)

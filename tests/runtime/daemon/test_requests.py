@@ -1,5 +1,6 @@
-"""Requests: their arguments, flows, and what the verbs make of them."""
+"""Requests: their arguments, how they wait, and what the verbs make of them."""
 
+import asyncio
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
@@ -13,9 +14,9 @@ from servod.common.errors import BadInput, Unreachable
 from servod.formats.protocol import Verb
 from servod.runtime.daemon.arguments import check_arguments
 from servod.runtime.daemon.connection import Reply
-from servod.runtime.daemon.flows import Flow, Flows, FutureWait, OrderSender, StateWait
 from servod.runtime.daemon.gain_bank import GainBank
 from servod.runtime.daemon.recorder import Recorder
+from servod.runtime.daemon.requests import Requests, Waits, finish, work_of
 from servod.runtime.daemon.trajectory import MotionTable
 from servod.runtime.daemon.verbs import Verbs
 from servod.runtime.fieldbus.devices import DriveState
@@ -23,6 +24,7 @@ from servod.runtime.loop.axis import AxisState
 from servod.runtime.loop.channel import Channel
 from servod.runtime.loop.commands import Command, Op, ReferenceKind, Refusal
 from servod.runtime.loop.handle import LoopHandle
+from tests.on_event_loop import events_pass, on_event_loop
 
 
 # --- arguments --------------------------------------------------------------------------------------------------------
@@ -74,7 +76,7 @@ def test_bad_arguments_are_one_line(verb: Verb, args: dict[str, Any], says: str)
     assert len(str(caught.value)) < 400
 
 
-# --- flows ------------------------------------------------------------------------------------------------------------
+# --- requests ---------------------------------------------------------------------------------------------------------
 class _Answers:
     def __init__(self) -> None:
         self.sent: list[dict[str, Any]] = []
@@ -83,84 +85,132 @@ class _Answers:
         return Reply(self.sent.append, 1)
 
 
-def test_flow_goes_on_when_its_order_comes_back() -> None:
-    orders, flows, answers = OrderSender(), Flows(), _Answers()
+@on_event_loop
+async def test_request_goes_on_when_its_order_comes_back() -> None:
+    waits, requests, answers = Waits(), Requests(), _Answers()
 
-    def flow() -> Flow:
-        done = yield orders.expect(7, 0)
+    async def request() -> dict[str, Any]:
+        done = await waits.order(7, 0)
         return {"cycle": done.cycle}
 
-    flows.start(flow(), answers.reply())
-    orders.see([record(5, command_seq=6)], 1)
-    flows.poll(1)
+    requests.start(request(), answers.reply())
+    waits.see([record(5, command_seq=6)], 1)
+    await events_pass()
     assert answers.sent == []
-    orders.see([record(6, command_seq=7), record(7, command_seq=8)], 2)
-    flows.poll(2)
+    waits.see([record(6, command_seq=7), record(7, command_seq=8)], 2)
+    await events_pass()
     assert answers.sent == [{"id": 1, "ok": True, "result": {"cycle": 6}}]
 
 
-def test_refusal_and_silence_end_a_flow_with_the_reason() -> None:
-    orders, flows, answers = OrderSender(), Flows(), _Answers()
+@on_event_loop
+async def test_request_has_begun_before_anything_else_happens() -> None:
+    """A client that leaves in the same moment is seen to leave afterwards."""
+    waits, requests, begun = Waits(), Requests(), []
 
-    def flow(seq: int) -> Flow:
-        yield orders.expect(seq, 0)
+    async def request() -> dict[str, Any]:
+        begun.append(True)
+        await waits.order(1, 0)
         return {}
 
-    flows.start(flow(1), answers.reply())
-    flows.start(flow(2), answers.reply())
-    orders.see([record(1, command_seq=1, command_result=Refusal.NOT_ENABLED)], 1)
-    flows.poll(1)
-    flows.poll(OrderSender.TIMEOUT_NS)
+    requests.start(request(), _Answers().reply())
+    assert begun == [True]
+
+
+@on_event_loop
+async def test_refusal_and_silence_end_a_request_with_the_reason() -> None:
+    waits, requests, answers = Waits(), Requests(), _Answers()
+
+    async def request(seq: int) -> dict[str, Any]:
+        await waits.order(seq, 0)
+        return {}
+
+    requests.start(request(1), answers.reply())
+    requests.start(request(2), answers.reply())
+    waits.see([record(1, command_seq=1, command_result=Refusal.NOT_ENABLED)], 1)
+    await events_pass()
+    waits.see([], Waits.TIMEOUT_NS)
+    await events_pass()
     messages = [a["error"]["message"] for a in answers.sent]
     assert ["not enabled" in messages[0], "did not answer" in messages[1]] == [True, True]
 
 
-def test_flow_waits_for_threads_and_states_and_may_catch_errors() -> None:
-    flows, answers, future = Flows(), _Answers(), Future[int]()
+@on_event_loop
+async def test_request_waits_for_threads_and_states_and_may_catch_errors() -> None:
+    waits, requests, answers, future = Waits(), Requests(), _Answers(), Future[int]()
     now = record(axis_state=AxisState.ENABLING)
 
-    def flow() -> Flow:
+    async def request() -> dict[str, Any]:
         try:
-            yield FutureWait(future)
+            await work_of(future)
         except Unreachable:
-            seen = yield StateWait(lambda: now, lambda r: r.axis_state == AxisState.ENABLED, 100)
-        return {"state": seen.axis_state}
+            await waits.until(lambda now_ns: now_ns >= 100 or now.axis_state == AxisState.ENABLED)
+        return {"state": now.axis_state}
 
-    flows.start(flow(), answers.reply())
-    flows.poll(1)
+    requests.start(request(), answers.reply())
+    await events_pass()
     future.set_exception(Unreachable("no"))
-    flows.poll(2)
-    flows.poll(3)
+    await events_pass()
+    waits.see([], 3)
+    await events_pass()
     assert answers.sent == []
     now = record(axis_state=AxisState.ENABLED)
-    flows.poll(4)
+    waits.see([], 4)
+    await events_pass()
     assert answers.sent[0]["result"] == {"state": AxisState.ENABLED}
 
 
-def test_full_disk_ends_the_request_only() -> None:
-    flows, answers, future = Flows(), _Answers(), Future[int]()
+@on_event_loop
+async def test_full_disk_ends_the_request_only() -> None:
+    requests, answers, future = Requests(), _Answers(), Future[int]()
 
-    def flow() -> Flow:
-        yield FutureWait(future)
-        return {}
+    async def request() -> dict[str, Any]:
+        return {"found": await work_of(future)}
 
-    flows.start(flow(), answers.reply())
+    requests.start(request(), answers.reply())
     future.set_exception(OSError(28, "No space left on device", "active.json"))
-    flows.poll(1)
+    await events_pass()
     told = answers.sent[0]["error"]
     assert (told["exit_code"], told["message"]) == (3, "active.json: no space left on device")
     assert {told["where"], told["found"], told["allowed"]} == {None}
 
 
-def test_mistake_in_a_flow_ends_the_request_only() -> None:
-    flows, answers = Flows(), _Answers()
+@on_event_loop
+async def test_mistake_in_a_request_ends_that_request_only() -> None:
+    requests, answers = Requests(), _Answers()
 
-    def flow() -> Flow:
-        yield from ()
+    async def request() -> dict[str, Any]:
         raise KeyError("nobody foresaw this")
 
-    flows.start(flow(), answers.reply())
+    requests.start(request(), answers.reply())
     assert "nobody foresaw" in answers.sent[0]["error"]["message"]
+
+
+@on_event_loop
+async def test_request_that_is_cancelled_cleans_up_and_answers_nothing() -> None:
+    """At the daemon's end; its first step ran outside of its task."""
+    waits, requests, answers, cleaned = Waits(), Requests(), _Answers(), []
+
+    async def request() -> dict[str, Any]:
+        try:
+            await waits.order(1, 0)
+        finally:
+            cleaned.append(True)
+        return {}
+
+    requests.start(request(), answers.reply())
+    for task in asyncio.all_tasks() - {asyncio.current_task()}:
+        task.cancel()
+    await events_pass()
+    assert (cleaned, answers.sent) == ([True], [])
+
+
+def test_request_that_waits_cannot_be_finished_in_virtual_time() -> None:
+    async def request() -> dict[str, Any]:
+        await asyncio.sleep(0)
+        return {}
+
+    with pytest.raises(RuntimeError, match="waits for what does not come"):
+        finish(request())
 
 
 # --- verbs ------------------------------------------------------------------------------------------------------------
@@ -202,38 +252,42 @@ def verbs(tmp_path: Path) -> Iterator[tuple[Verbs, _Loop]]:
     verbs.close()
 
 
-def _csv(verbs: Verbs, positions: list[float], **more: Any) -> list[dict[str, Any]]:
+async def _csv(verbs: Verbs, positions: list[float], **more: Any) -> list[dict[str, Any]]:
     answers = _Answers()
     verbs.handle(Verb.TRACK, {"kind": "csv", "positions_rad": positions, **more}, answers.reply())
+    await events_pass()
     return answers.sent
 
 
-def test_trajectory_is_in_use_from_its_command_to_the_motions_end(verbs: tuple[Verbs, _Loop]) -> None:
+@on_event_loop
+async def test_trajectory_is_in_use_from_its_command_to_the_motions_end(verbs: tuple[Verbs, _Loop]) -> None:
     front, loop = verbs
-    assert _csv(front, [0.0, 0.1, 0.2]) == []
+    assert await _csv(front, [0.0, 0.1, 0.2]) == []
     first = loop.area
     for seen in ({}, {"command_seq": 1, "reference_active": 1}):
         loop.latest = record(2, axis_state=AxisState.ENABLED, **seen)
         assert front.motion_running()
-        (answer,) = _csv(front, [0.3, 0.3, 0.3])
+        (answer,) = await _csv(front, [0.3, 0.3, 0.3])
         assert "a motion is running" in answer["error"]["message"]
         assert (loop.area, loop.seq) == (first, 1)
     loop.latest = record(3, axis_state=AxisState.ENABLED, command_seq=1)
-    assert _csv(front, [0.3, 0.3, 0.3]) == []
+    assert await _csv(front, [0.3, 0.3, 0.3]) == []
     assert loop.area == [0.3, 0.3, 0.3]
 
 
-def test_check_alone_moves_nothing_and_tells_what_is_wrong(verbs: tuple[Verbs, _Loop]) -> None:
+@on_event_loop
+async def test_check_alone_moves_nothing_and_tells_what_is_wrong(verbs: tuple[Verbs, _Loop]) -> None:
     front, loop = verbs
     loop.latest = record(1, axis_state=AxisState.DISABLED)
-    (good,) = _csv(front, [0.0, 0.1], start_immediately=False)
+    (good,) = await _csv(front, [0.0, 0.1], start_immediately=False)
     assert good["result"]["duration_s"] == pytest.approx(0.001)
-    (bad,) = _csv(front, [0.0, 2.0], start_immediately=False)
+    (bad,) = await _csv(front, [0.0, 2.0], start_immediately=False)
     assert "position_max_rad" in bad["error"]["message"]
     assert (loop.area, loop.seq) == ([], 0)
 
 
-def test_samples_of_a_client_that_left_are_void(verbs: tuple[Verbs, _Loop]) -> None:
+@on_event_loop
+async def test_samples_of_a_client_that_left_are_void(verbs: tuple[Verbs, _Loop]) -> None:
     front, _ = verbs
     args = {"key": "positions_rad", "start": 0, "samples": [0.0, 0.1]}
     front.handle(Verb.TRAJECTORY, args, _Answers().reply())
@@ -245,7 +299,8 @@ def test_samples_of_a_client_that_left_are_void(verbs: tuple[Verbs, _Loop]) -> N
 
 @pytest.mark.parametrize("before", [AxisState.DISABLED, AxisState.ENABLED])
 @pytest.mark.parametrize("seen", [AxisState.ENABLING, AxisState.PROVING, AxisState.ENABLED])
-def test_axis_that_was_off_is_not_enabled_for_a_client_that_left(
+@on_event_loop
+async def test_axis_that_was_off_is_not_enabled_for_a_client_that_left(
     verbs: tuple[Verbs, _Loop], seen: AxisState, before: AxisState
 ) -> None:
     front, loop = verbs
@@ -254,6 +309,7 @@ def test_axis_that_was_off_is_not_enabled_for_a_client_that_left(
     loop.latest = record(2, axis_state=seen, command_seq=1)
     for _ in range(2):
         front.tick([loop.latest], time.monotonic_ns())
+        await events_pass()
     front.lease_ended()
     assert loop.sent == [Op.ENABLE, Op.DISABLE][: 1 if AxisState.ENABLED in (seen, before) else 2]
 
@@ -270,7 +326,8 @@ def test_axis_that_was_off_is_not_enabled_for_a_client_that_left(
         ),
     ],
 )
-def test_stop_that_stopped_nothing_is_no_success(
+@on_event_loop
+async def test_stop_that_stopped_nothing_is_no_success(
     verbs: tuple[Verbs, _Loop], verb: Verb, now: dict[str, int], says: str
 ) -> None:
     front, loop = verbs
@@ -278,14 +335,20 @@ def test_stop_that_stopped_nothing_is_no_success(
     front.handle(verb, {}, answers.reply())
     loop.latest = record(2, command_seq=1, **now)
     front.tick([loop.latest], time.monotonic_ns())
+    await events_pass()
     front.tick([], time.monotonic_ns())
+    await events_pass()
     assert answers.sent == []
     front.tick([], time.monotonic_ns() + 60_000_000_000)
+    await events_pass()
     assert answers.sent[0]["error"]["exit_code"] == 3
     assert says in answers.sent[0]["error"]["message"]
 
 
-def test_stops_one_after_the_other_are_one_command_until_the_loop_has_taken_it(verbs: tuple[Verbs, _Loop]) -> None:
+@on_event_loop
+async def test_stops_one_after_the_other_are_one_command_until_the_loop_has_taken_it(
+    verbs: tuple[Verbs, _Loop],
+) -> None:
     front, loop = verbs
     answers = _Answers()
     for _ in range(20):
@@ -297,7 +360,9 @@ def test_stops_one_after_the_other_are_one_command_until_the_loop_has_taken_it(v
     off = {"axis_state": AxisState.DISABLED, "drive_state": DriveState.SWITCH_ON_DISABLED}
     loop.latest = record(2, command_seq=3, **off)
     front.tick([record(1, command_seq=1), record(2, command_seq=2), loop.latest], time.monotonic_ns())
+    await events_pass()
     front.tick([], time.monotonic_ns())
+    await events_pass()
     assert [a["ok"] for a in answers.sent] == [True] * 22
     front.handle(Verb.STOP, {}, answers.reply())
     assert loop.seq == 4
