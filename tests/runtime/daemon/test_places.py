@@ -16,13 +16,14 @@ from pathlib import Path
 from typing import cast
 
 import pytest
-from served import Served, answer_of, raw
+from served import Echo, Served, answer_of, raw
 
 from servod.client.control import ControlClient, Refused
 from servod.common.errors import Unreachable
+from servod.formats.config import ControlConfig
 from servod.formats.protocol import Verb
 from servod.runtime.daemon.connection import Connection
-from servod.runtime.daemon.control_server import MAX_CLIENTS, MAX_CLIENTS_OF_A_PROCESS, Places
+from servod.runtime.daemon.control_server import MAX_CLIENTS, MAX_CLIENTS_OF_A_PROCESS, ControlServer, Places
 from servod.runtime.daemon.peer import Peer
 from tests.on_event_loop import events_pass, on_event_loop
 
@@ -390,3 +391,84 @@ async def test_client_that_is_dropped_leaves_nothing_on_the_event_loop(
         connection.begin_round(1)
         await events_pass()
         assert asyncio.all_tasks() == {own}
+
+
+@on_event_loop
+async def test_client_is_read_four_times_in_each_round(wires: tuple[socket.socket, socket.socket]) -> None:
+    """Single bytes, each of which would wake the daemon."""
+    (client, server), desk = wires, _Desk()
+    connection = Connection(server, desk)
+    connection.begin()
+    for _ in range(9):
+        client.send(b"x")
+        await events_pass()
+    assert connection.held_bytes == 4
+    connection.begin_round(1)
+    await events_pass()
+    assert connection.held_bytes == 9
+
+
+@on_event_loop
+async def test_client_is_asked_again_as_soon_as_it_has_read(wires: tuple[socket.socket, socket.socket]) -> None:
+    (client, server), desk = wires, _Desk()
+    connection = Connection(server, desk)
+    connection.send({"long": "x" * 1_000_000})
+    connection.begin()
+    client.send(b"1\n")
+    await events_pass()
+    assert desk.lines == [] and connection.held_bytes > 64 * 1024
+    client.setblocking(False)
+    while connection.held_bytes:
+        with contextlib.suppress(BlockingIOError):
+            client.recv(1 << 20)
+        await events_pass()
+    await events_pass()
+    assert desk.lines == [b"1"]
+
+
+@on_event_loop
+async def test_newcomer_with_the_number_of_a_socket_just_closed_is_heard(
+    wires: tuple[socket.socket, socket.socket],
+) -> None:
+    (_, server), desk, number = wires, _Desk(), wires[1].fileno()
+    before = Connection(server, desk)
+    before.begin()
+    await events_pass()
+    before.close()
+    ours, theirs = socket.socketpair()
+    assert ours.fileno() == number
+    ours.setblocking(False)
+    Connection(ours, desk).begin()
+    for _ in range(2):
+        await events_pass()
+    theirs.send(b"stop\n")
+    await events_pass()
+    assert desk.lines == [b"stop"]
+    theirs.close()
+
+
+@on_event_loop
+async def test_each_request_shows_the_loop_that_the_supervisor_lives(tmp_path: Path) -> None:
+    fed: list[bool] = []
+    server = ControlServer(ControlConfig(socket=tmp_path / "s"), Echo(), lambda: fed.append(True))
+    server.begin()
+    with socket.socket(socket.AF_UNIX) as client:
+        client.connect(str(tmp_path / "s"))
+        client.send(b'{"verb":"status"}\ngarbage\n')
+        await events_pass()
+    server.close()
+    assert fed == [True, True]
+
+
+@on_event_loop
+async def test_door_that_broke_ends_the_supervisor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An axis that nobody could stop any more is not to run on."""
+    monkeypatch.delattr(Places, "make_room")
+    server = ControlServer(ControlConfig(socket=tmp_path / "s"), Echo())
+    server.begin()
+    with socket.socket(socket.AF_UNIX) as client:
+        client.connect(str(tmp_path / "s"))
+        await events_pass()
+    with pytest.raises(AttributeError, match="make_room"):
+        server.tick(1)
+    server.close()
