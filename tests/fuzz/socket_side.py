@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 import socket
 import threading
 import time
@@ -73,6 +74,17 @@ class _Loop(LoopHandle):
         return int(self.latest.command_seq)
 
 
+class _Mistakes(logging.Handler):
+    """What went wrong in the coroutine of a client, which is logged and ends that client alone."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.ERROR)
+        self.found: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.found.append(f"{record.getMessage()}: {record.exc_info and record.exc_info[1]!r}")
+
+
 class _Desk:
     """Server, verbs, gain store and recorder as the supervisor has them, in one thread, driven by hand."""
 
@@ -94,6 +106,9 @@ class _Desk:
         self.server = ControlServer(self.config.control, self.verbs)
         self._events = asyncio.Runner()
         self._events.get_loop().call_soon(self.server.begin)
+
+        self.mistakes = _Mistakes()
+        logging.getLogger("servod.control").addHandler(self.mistakes)
 
     def rounds(self, until: Callable[[], bool]) -> None:
         """Rounds of the supervisor's event loop, until there is nothing more to wait for."""
@@ -122,6 +137,7 @@ def control_server(folder: Path) -> Target:
         for answer in answers:
             assert answer["ok"] or "servod failed" not in answer["error"]["message"], answer
             assert answer["ok"] or len(answer["error"]["message"]) < 1500, answer
+        assert not desk.mistakes.found, desk.mistakes.found
         good = _talk(desk, b'{"id": 7, "verb": "status", "args": {}}\n')
         assert {"id": 7, "ok": True, "result": {}} in good, good
         outside = [p.name for p in folder.iterdir() if p.name not in _OWN]

@@ -1,9 +1,10 @@
 """The mark of a run: tells, after a power cut or kill -9, that a daemon ended without an orderly stop, and when.
 
 Beside the recordings, one small file for each axis, `NAME.run.json`; the daemon writes it, `servoctl faults` reads it.
-It says "running" from the start to the orderly end. The daemon holds a lock on it, which ends with the process, and
-keeps its time of change new. A mark that says "running" and that nobody holds is of a daemon that is gone: alive at the
-mark's time of change, and dead when it was looked at. The next start keeps that as a pair of times, the last few.
+It says "running" from the start to the orderly end, and which file it is: a copy is of no run. The daemon holds a lock
+on it, which ends with the process, and keeps its time of change new. A mark that says "running" and that nobody
+holds is of a daemon that is gone: alive at the mark's time of change, and dead when it was looked at. The next start
+keeps that as a pair of times, the last few.
 """
 
 from __future__ import annotations
@@ -33,20 +34,23 @@ MOST_ENDS = 20
 #: Between two signs of life; so much earlier than its end a daemon may have been seen last.
 SIGN_S = 5.0
 _MOST_BYTES = 64 * 1024
+#: In the year 2262, the last time of many programs.
+_LATEST_NS = 2**63 - 1
 _ALLOWED = "the mark of a run, as servod writes it"
 
 
 class AbruptEnd(Strict):
     """A run that ended without an orderly stop: when it was last seen alive and when found ended, ns since 1970."""
 
-    seen_ns: int
-    found_ns: int
+    seen_ns: int = Field(ge=0, le=_LATEST_NS)
+    found_ns: int = Field(ge=0, le=_LATEST_NS)
 
 
 class _Mark(Strict):
     """The file."""
 
-    running_since_ns: int | None = None
+    running_since_ns: int | None = Field(None, ge=0, le=_LATEST_NS)
+    inode: int | None = None
     abrupt_ends: list[AbruptEnd] = Field(default_factory=list, max_length=MOST_ENDS)
 
 
@@ -109,7 +113,8 @@ class RunMark:
         stream = aside.open("w", encoding="utf-8")
         try:
             lock_file(stream, wait=False)
-            json.dump(mark.model_dump(mode="json"), stream)
+            inode = os.fstat(stream.fileno()).st_ino
+            json.dump(mark.model_copy(update={"inode": inode}).model_dump(mode="json"), stream)
             stream.flush()
             os.fsync(stream.fileno())
             aside.replace(self._path)
@@ -156,9 +161,14 @@ def _read(path: Path, now_ns: int) -> _Told:
             mark = validate(json.loads(stream.read()), _Mark, str(path))
             if mark.running_since_ns is None:
                 return _Told(mark.abrupt_ends)
+            state = os.fstat(stream.fileno())
             if is_locked(stream.fileno()):
                 return _Told(mark.abrupt_ends, alive=True)
-            seen_ns = max(mark.running_since_ns, os.fstat(stream.fileno()).st_mtime_ns)
+            if mark.inode not in (None, state.st_ino):
+                return _Told(mark.abrupt_ends)
+            if path.stat().st_ino != state.st_ino:  # its run ended meanwhile, and said so in the next file
+                return _read(path, now_ns)
+            seen_ns = max(mark.running_since_ns, state.st_mtime_ns)
     except OSError as error:
         raise unreadable(path, error) from None
     except ValueError as error:

@@ -7,6 +7,8 @@ what it sends beyond that waits in the kernel, at its own expense.
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import logging
 import re
 import select
 import socket
@@ -18,6 +20,8 @@ from servod.common.units import NS_PER_S
 from servod.formats.protocol import MAX_LINE_BYTES, encode_line
 from servod.runtime.daemon.eager import begin
 from servod.runtime.daemon.peer import Peer, peer_of
+
+log = logging.getLogger("servod.control")
 
 _READ_BYTES = 65_536
 #: Reads and lines of one client in one round of the supervisor.
@@ -67,6 +71,10 @@ class Owner(Protocol):
         """One request line came."""
         ...
 
+    def hear_out(self, client: Connection, lines: list[bytes]) -> None:
+        """The client has left; what it sent before and was not served yet."""
+        ...
+
     def drop(self, client: Connection) -> None:
         """The client has gone, or must go."""
         ...
@@ -104,6 +112,7 @@ class Connection:
     def begin_round(self, now_ns: int) -> None:
         """A new round: the client may be read again, and lines that waited are served; who has left is forgotten."""
         if self.has_left():
+            self._owner.hear_out(self, self._rest())
             self._owner.drop(self)
             return
         self._reads, self._lines, self._now_ns = _READS_IN_A_ROUND, _LINES_IN_A_ROUND, now_ns
@@ -112,6 +121,13 @@ class Connection:
     def has_left(self) -> bool:
         """The other end is closed, both ways, whatever of what it sent is still to be read."""
         return bool(self._hung_up.poll(0))
+
+    def _rest(self) -> list[bytes]:
+        """The whole lines that came and were not served."""
+        with contextlib.suppress(OSError):
+            for _ in range(_READS_IN_A_ROUND):
+                self._incoming += self._connection.recv(_READ_BYTES)
+        return bytes(self._incoming).split(b"\n")[:-1]
 
     async def _serve(self) -> None:
         """Dispatch line after line until the client leaves; a line without end must not fill the memory."""
@@ -126,6 +142,8 @@ class Connection:
                 if len(self._incoming) > MAX_LINE_BYTES:
                     Reply(self.send, None).failed(_TOO_LONG)
                     return
+        except Exception as error:  # what nobody foresaw ends this client, and nothing else
+            log.error("a client could not be served", exc_info=error)
         finally:
             self._owner.drop(self)
 

@@ -14,6 +14,7 @@ import contextlib
 import errno
 import logging
 import os
+import re
 import socket
 import stat
 from collections import Counter
@@ -25,7 +26,7 @@ from servod.common.errors import BadInput, ServodError, Unreachable
 from servod.common.files import reason
 from servod.common.units import NS_PER_S
 from servod.formats.config import ControlConfig
-from servod.formats.protocol import READING, Verb, decode_line, encode_line
+from servod.formats.protocol import MAX_LINE_BYTES, READING, Verb, decode_line, encode_line
 from servod.runtime.daemon.connection import Connection, Reply
 from servod.runtime.daemon.peer import Peer, group_id, may_command, peer_of
 from servod.runtime.daemon.status import LeaseStatus
@@ -159,6 +160,7 @@ _STOPS_BEYOND = 32
 #: What is answered at once and never under way.
 _AT_ONCE = frozenset({Verb.STATUS, Verb.TRAJECTORY})
 _LONGEST_NUMBER = 64
+_MAY_STOP = re.compile("|".join(STOPPING).encode())
 
 
 class Handler(Protocol):
@@ -264,11 +266,11 @@ class ControlServer:
         """Take those who queue, a few in each round."""
         loop = asyncio.get_running_loop()
         while True:
-            self._round.clear()
             with contextlib.suppress(OSError):  # descriptors ran out: nothing to hold against the axis
                 for _ in range(_ACCEPT_IN_A_ROUND):
                     connection, _address = await loop.sock_accept(self._listener)
                     self._admit(connection)
+            self._round.clear()
             await self._round.wait()
 
     def _admit(self, connection: socket.socket) -> None:
@@ -288,6 +290,15 @@ class ControlServer:
         client = Connection(connection, self, self._now_ns)
         self._places.take(client)
         client.begin()
+
+    def hear_out(self, client: Connection, lines: list[bytes]) -> None:
+        """Who asks for a stop and hangs up is heard all the same; nothing else that it asked is begun any more."""
+        for line in lines:
+            if len(line) <= MAX_LINE_BYTES and _MAY_STOP.search(line):
+                with contextlib.suppress(ServodError):
+                    if decode_line(line).get("verb") in STOPPING:
+                        self.dispatch(client, line)
+                        return
 
     def dispatch(self, client: Connection, line: bytes) -> None:
         """One request line: check it, check the right to ask it, and hand it on."""

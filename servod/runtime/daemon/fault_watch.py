@@ -88,9 +88,10 @@ class FaultWatch:
     def tell_earlier(self, incident: Incident) -> None:
         """What befell the axis before this start, and was found at it."""
         self._incidents.append(incident)
-        first = incident.first
-        self._metrics.count_fault(first.code)
-        self.tell(FAULTS[first.code], first.detail)
+        fault = FAULTS[incident.first.code]
+        self._metrics.count_fault(fault.code)
+        text = f"{fault.cause} [{incident.first.detail}] {fault.remedy}"
+        self._recorder.add_event("fault", text, code=fault.code.name, reaction=fault.reaction.name)
 
     def tell(self, fault: Fault, detail: str = "") -> None:
         """Log line and event of one fault, with the health of loop and bus beside it."""

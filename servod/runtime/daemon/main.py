@@ -70,6 +70,9 @@ def run(path: Path, on_ready: Callable[[Supervisor], None]) -> int:
     with ExitStack() as stack:
         stack.callback(InstanceLock(config).release)
         mark = stack.enter_context(RunMark(config.recorder.directory, config.name))
+        found = None if mark.found is None else of_abrupt_end(mark.found, config.name)
+        if found is not None:  # at once: a drive that is still booting may end this start
+            log.error("fault %s: %s", found.first.code.name, found.first.detail)
         _leave_core_to_loop(config.cycle.cpu)
         sys.setswitchinterval(_SWITCH_S)
         bank = GainBank(config)
@@ -82,8 +85,8 @@ def run(path: Path, on_ready: Callable[[Supervisor], None]) -> int:
             log.info("%s", line)
         with ExitStack() as undo:
             supervisor = _supervise(config, Nodes(master, plans), bank, recorder, undo)
-            if mark.found is not None:
-                supervisor.tell_earlier(of_abrupt_end(mark.found, config.name))
+            if found is not None:
+                supervisor.tell_earlier(found)
             on_ready(supervisor)
             undo.pop_all()
         return supervisor.run()

@@ -336,6 +336,8 @@ def _create(path: Path, attachments: dict[str, bytes], offset_ns: int) -> McapFi
 
 
 def _resolve(future: Future[T], job: Callable[[], T]) -> None:
+    if not future.set_running_or_notify_cancel():
+        return  # who asked has gone
     try:
         future.set_result(job())
     except ServodError as error:

@@ -77,6 +77,30 @@ def test_an_error_that_nobody_foresaw_is_no_orderly_end(tmp_path: Path) -> None:
     assert len(ends(tmp_path)) == 1
 
 
+def test_a_copy_of_a_mark_is_of_no_run(tmp_path: Path) -> None:
+    """Recordings that are copied from a running machine, or from a dead one, tell nothing that is not theirs."""
+    copy = tmp_path / "copy.run.json"
+    with RunMark(tmp_path, "joint"):
+        copy.write_bytes(file_of(tmp_path).read_bytes())
+        assert abrupt_ends(copy, time.time_ns()) == []
+    with pytest.raises(ZeroDivisionError), RunMark(tmp_path, "joint"):
+        raise ZeroDivisionError
+    copy.write_bytes(file_of(tmp_path).read_bytes())
+    assert (abrupt_ends(copy, time.time_ns()), len(ends(tmp_path))) == ([], 1)
+
+
+def test_an_orderly_end_while_one_looks_is_orderly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = RunMark(tmp_path, "joint").__enter__()
+
+    def ended_meanwhile(descriptor: int) -> bool:
+        monkeypatch.setattr(run_mark, "is_locked", is_locked)
+        run.__exit__(None, None, None)
+        return is_locked(descriptor)
+
+    monkeypatch.setattr(run_mark, "is_locked", ended_meanwhile)
+    assert ends(tmp_path) == []
+
+
 def test_old_ends_make_room(tmp_path: Path) -> None:
     for number in range(MOST_ENDS + 5):
         with pytest.raises(ZeroDivisionError), RunMark(tmp_path, "joint"):
@@ -112,7 +136,18 @@ def test_a_write_that_the_power_cuts_leaves_the_mark_of_before(
 
 
 @pytest.mark.parametrize(
-    "text", ["", "{", "[]", '{"abrupt_ends": 1}', '{"running_since_ns": "x"}', '{"more": 1}', "x" * 100_000]
+    "text",
+    [
+        "",
+        "{",
+        "[]",
+        '{"abrupt_ends": 1}',
+        '{"running_since_ns": "x"}',
+        '{"more": 1}',
+        '{"running_since_ns": 99999999999999999999999999}',
+        '{"abrupt_ends": [{"seen_ns": -9, "found_ns": 3}]}',
+        "x" * 100_000,
+    ],
 )
 def test_a_damaged_mark_is_bad_input_and_begun_anew(text: str, tmp_path: Path) -> None:
     file_of(tmp_path).write_text(text)

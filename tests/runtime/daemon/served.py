@@ -28,9 +28,11 @@ class Echo:
         self.answer: dict[str, Any] | None = None  # to what is not late
         self.moves = self.broken = self.patient = False
         self.ended_leases = 0
+        self.asked: list[Verb] = []
         self.pieces: list[tuple[str, int, list[float]]] = []
 
     def handle(self, verb: Verb, args: dict[str, Any], reply: Reply) -> None:
+        self.asked.append(verb)
         if verb in self.late_verbs:
             self.late.append(reply)
         elif self.answer is not None:

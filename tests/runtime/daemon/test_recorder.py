@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,7 @@ from servod.formats.config import RecorderConfig
 from servod.formats.recording.mcap_reader import read_recording
 from servod.formats.recording.mcap_writer import CYCLE_TOPIC, McapFile, split_rows
 from servod.formats.recording.record import CycleRecord
-from servod.runtime.daemon.recorder import HistoryRing, Recorder
+from servod.runtime.daemon.recorder import HistoryRing, Recorder, _resolve
 
 
 def _recorder(directory: Path, history_s: float = 1.0) -> Recorder:
@@ -256,3 +257,11 @@ def test_history_ring_keeps_the_newest_in_order() -> None:
     ring.add(rows(23, 4))
     assert list(split_rows(ring.snapshot())) == rows(10, 17)
     assert len(ring) == 10
+
+
+def test_who_gave_up_waiting_does_not_end_the_recorders_thread() -> None:
+    """The daemon's end cancels what requests still wait for."""
+    asked, done = Future[None](), list[None]()
+    asked.cancel()
+    _resolve(asked, lambda: done.append(None))
+    assert done == []
