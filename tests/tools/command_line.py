@@ -15,6 +15,8 @@ from servod.cli.groups import VERBS
 from servod.drivers.virtual import main as virtual_axis
 from servod.runtime.daemon import main as daemon
 
+#: What an option takes, in words; numbers have their range beside them.
+_VALUES = {"str": "text", "list[str]": "text", "list[Path]": "path", "int range": "int", "float range": "float"}
 _EXTRA = re.compile(r"^(.*?)(?:  \[(.*)\])?$", re.DOTALL)
 
 
@@ -61,16 +63,16 @@ def _row(param: Any, shown: str, text: str) -> Row:
     match = _EXTRA.match(text)
     meaning, extra = (match[1], match[2] or "") if match else (text, "")
     known = dict(part.partition(": ")[::2] for part in extra.split("; ") if part)
-    default = known.pop("default", "")
-    name, _, value = shown.partition(" <")
-    if param.param_type_name == "argument" or "HOURS" in name:
-        name, _, value = shown.partition(" ")
-    if "required" in known:
-        known.pop("required")
-        default = "required"
+    default = "required" if known.pop("required", None) is not None else known.pop("default", "")
     variable = known.pop("env var", "")
-    allowed = " or ".join([*(f"`{bound}`" for bound in known), *([f"the variable `{variable}`"] if variable else [])])
-    return Row(name, value.strip("<>").removesuffix(" range"), default, allowed, meaning)
+    name, _, value = shown.partition(" <")
+    value = value.removesuffix(">")
+    allowed = [f"`{bound}`" for bound in known] + ([f"the variable `{variable}`"] if variable else [])
+    if "|" in value:
+        value, allowed = "", [f"`{word}`" for word in value.split("|")]
+    if param.param_type_name == "argument":
+        value = ""
+    return Row(name, _VALUES.get(value, value), default, ", ".join(allowed), meaning)
 
 
 def _parsed(parser: argparse.ArgumentParser) -> list[Row]:
@@ -107,7 +109,7 @@ def _table(rows: list[Row]) -> str:
     shown = [
         [f"`{' '.join(filter(None, row[:2]))}`", code(row.default), row.allowed, prose(row.meaning)] for row in rows
     ]
-    return markdown(["", "Default", "Allowed", "Meaning"], shown)
+    return markdown(["Option or argument", "Default", "Allowed", "Meaning"], shown)
 
 
 def servoctl() -> str:

@@ -71,6 +71,8 @@ PAGES = {
     "gain_set": DOCS / "reference/gain-set.md",
     "record": DOCS / "reference/recording.md",
     "record_numbers": DOCS / "reference/recording.md",
+    "virtual_axis": DOCS / "reference/cli.md",
+    "columns": DOCS / "reference/recording.md",
     "protocol": DOCS / "reference/protocol.md",
     "json": DOCS / "reference/json.md",
 }
@@ -107,6 +109,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "gain_set": reference.gain_set,
     "record": reference.record,
     "record_numbers": reference.record_numbers,
+    "virtual_axis": reference.virtual_axis,
+    "columns": reference.columns,
     "protocol": reference.protocol,
     "json": reference.json_documents,
 }

@@ -10,10 +10,12 @@ import schema
 import yaml
 from tables import markdown, prose
 
+from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.formats.gains.gain_set import GainSet
 from servod.formats.model.axis_model import AxisModel
 from servod.formats.protocol import MAX_ANSWER_BYTES, MAX_LINE_BYTES, PIECE_SAMPLES, READING, Verb
 from servod.formats.recording.record import FIELDS
+from servod.lab.recordings.columns import REQUIRED, Quantity
 from servod.runtime.daemon.arguments import arguments_of
 from servod.runtime.daemon.control_server import MAX_CLIENTS, MAX_CLIENTS_OF_A_PROCESS, STOPPING
 from servod.runtime.fieldbus.devices import REASON_TEXT, DriveState, Goal
@@ -53,6 +55,21 @@ def gain_set() -> str:
     return schema.text(gain_set_groups(), units=True, top="The set")
 
 
+def virtual_axis() -> str:
+    """The keys of a settings file of the virtual axis."""
+    (found,) = schema.groups(VirtualAxisSettings)
+    return schema.table(found.keys, units=True)
+
+
+def columns() -> str:
+    """The columns that a recording of another machine may have."""
+    rows = [
+        [q.name.lower().replace("_", " "), *(f"`{name}`" for name in q.value), "yes" if q in REQUIRED else ""]
+        for q in Quantity
+    ]
+    return markdown(["Quantity", "Rotary axis", "Linear axis", "Needed"], rows)
+
+
 def record() -> str:
     """The fields of a cycle record."""
     rows = [[f"`{f.name}`", _TYPES[f.kind], f.unit, prose(f.text)] for f in FIELDS]
@@ -74,8 +91,8 @@ def record_numbers() -> str:
 
 def _right(verb: Verb) -> str:
     if verb in READING:
-        return "look"
-    return "stop: without the lease" if verb in STOPPING else "command: takes the lease"
+        return "Everybody may ask it."
+    return "Everybody may ask it, whoever commands." if verb in STOPPING else "Takes the lease."
 
 
 @cache
@@ -90,7 +107,7 @@ def protocol() -> str:
     parts = [markdown(["Bound", "Value"], _bounds())]
     for verb in Verb:
         told = documents()["protocol"][verb.value]
-        parts.append(f"## `{verb.value}`\n\n{told['does']} Right: {_right(verb)}. Answer: {told['answer']}.")
+        parts.append(f"## `{verb.value}`\n\n{told['does']} {_right(verb)}\n\nAnswer: {told['answer']}.")
         arguments = [group for group in schema.groups(arguments_of(verb)) if group.keys]
         parts += [schema.table(group.keys, units=True) for group in arguments]
         if told.get("arguments"):

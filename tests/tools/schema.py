@@ -11,6 +11,8 @@ from tables import code, markdown, prose
 
 from servod.cli.gains_view import unit_of
 
+#: Units that parameters of gain sets do not have.
+_UNITS = {"_hz": "Hz", "_us": "µs"}
 _TYPES = {"null": "none", "string": "text", "object": "mapping", "boolean": "true or false"}
 #: Where a key stands at the top of its file.
 TOP = ""
@@ -98,7 +100,7 @@ class _Walk:
             own = self._defined[definition].get("description", "").partition("\n\n")[0]
             meaning = self._elsewhere.get(definition) or meaning or ("" if len(kinds) > 1 else own)
             kind = "mapping" if definition in self._elsewhere else kind
-        return Key(name, kind, unit_of(name), "required" if required else _default(field), self._range(field), meaning)
+        return Key(name, kind, _unit(name), "required" if required else _default(field), self._range(field), meaning)
 
     def _type(self, field: dict[str, Any]) -> str:
         if name := _reference(field):
@@ -125,6 +127,10 @@ class _Walk:
         if isinstance(field.get("items"), dict):
             return ", ".join(filter(None, [_count(field), self._range(field["items"])]))
         return _bounds(field)
+
+
+def _unit(name: str) -> str:
+    return unit_of(name) or next((unit for end, unit in _UNITS.items() if name.endswith(end)), "")
 
 
 def _below(path: str, name: str) -> str:
