@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from tests import documents
 from tests.starved import Judge
 
 # As the commands do, and before numpy is imported: threads on small matrices cost a factor of ten on a shared machine.
@@ -44,6 +45,9 @@ def user() -> str:
 os.environ["TMPDIR"] = tempfile.tempdir = temporary_folder()
 
 ROOT = Path(__file__).resolve().parent
+
+#: Every JSON document that a test has printed is one that the reference describes.
+described = documents.described
 
 #: Files (or folders) whose tests run an axis on the wall clock; `./test` runs two at a time, after all others.
 SERIAL = (

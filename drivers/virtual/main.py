@@ -305,21 +305,22 @@ _OVERRIDES = "overrides the settings file"
 _SETTING_HELP = {"seed": f"begins the noise: the same number, the same noise; {_OVERRIDES}"}
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="servod-virtual-axis", description="A virtual servo axis.", epilog=_EXAMPLE)
-    bus = parser.add_mutually_exclusive_group(required=True)
+def parser() -> argparse.ArgumentParser:
+    """What `servod-virtual-axis` takes; the reference of the command line prints it too."""
+    found = argparse.ArgumentParser(prog="servod-virtual-axis", description="A virtual servo axis.", epilog=_EXAMPLE)
+    bus = found.add_mutually_exclusive_group(required=True)
     bus.add_argument("--socket", type=Path, metavar="PATH", help="serve a virtual CAN bus at this Unix socket")
     bus.add_argument("--can", metavar="INTERFACE", help="join a SocketCAN interface, e.g. vcan0")
-    parser.add_argument("--plant", type=Path, metavar="FILE", help="axis model of the joint (default: demo joint)")
-    parser.add_argument("--settings", type=Path, metavar="FILE", help="settings of the virtual axis (YAML)")
-    parser.add_argument("--record", type=Path, metavar="FILE", help="the drive's own record, survives any kill")
+    found.add_argument("--plant", type=Path, metavar="FILE", help="axis model of the joint (default: demo joint)")
+    found.add_argument("--settings", type=Path, metavar="FILE", help="settings of the virtual axis (YAML)")
+    found.add_argument("--record", type=Path, metavar="FILE", help="the drive's own record, survives any kill")
     timing = "frames come at once with the bus's time on them (stamped), or when they have really ended (paced)"
-    parser.add_argument("--timing", choices=[t.value for t in Timing], default=Timing.STAMPED.value, help=timing)
+    found.add_argument("--timing", choices=[t.value for t in Timing], default=Timing.STAMPED.value, help=timing)
     scheduler = "SCHED_FIFO priority, below the loop's; 0 leaves the scheduler alone (default: 40)"
-    parser.add_argument("--priority", type=int, choices=range(99), metavar="N", default=40, help=scheduler)
+    found.add_argument("--priority", type=int, choices=range(99), metavar="N", default=40, help=scheduler)
     for option, kind in _SETTING_OPTIONS.items():
-        parser.add_argument(f"--{option}", type=kind, metavar="N", help=_SETTING_HELP.get(option, _OVERRIDES))
-    return parser
+        found.add_argument(f"--{option}", type=kind, metavar="N", help=_SETTING_HELP.get(option, _OVERRIDES))
+    return found
 
 
 def _settings(arguments: argparse.Namespace) -> VirtualAxisSettings:
@@ -356,7 +357,7 @@ def _take_turns_first(priority: int) -> str:
 
 def main(argv: list[str] | None = None) -> int:
     """Run until told to stop; returns its exit code (servod.common.errors)."""
-    arguments = _parser().parse_args(argv)
+    arguments = parser().parse_args(argv)
     try:
         server = _server(arguments)
     except ServodError as error:

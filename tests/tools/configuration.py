@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import readme
+import tables
 
 from servod.formats.config_keys import config_keys
 
@@ -14,8 +15,8 @@ _HEADER = ["Key", "Type", "Unit", "Default", "Range", "Meaning"]
 
 def with_table(text: str) -> str:
     """The page's text with the table as the code has it now."""
-    rows = [[f"`{k.key}`", k.type, k.unit, readme.code(k.default), k.range, k.meaning] for k in config_keys()]
-    return readme.with_section(text, "config", readme.markdown(_HEADER, rows))
+    rows = [[f"`{k.key}`", k.type, k.unit, tables.code(k.default), k.range, k.meaning] for k in config_keys()]
+    return readme.with_section(text, "config", tables.markdown(_HEADER, rows))
 
 
 if __name__ == "__main__":

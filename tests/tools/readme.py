@@ -19,7 +19,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import command_line
+import reference
 import reliability
+from tables import markdown
 
 from servod.common.faults import FAULTS
 from servod.common.shipped import shipped
@@ -61,18 +64,23 @@ PAGES = {
     "demo": DOCS / "reference/measured.md",
     "paper": DOCS / "explanation/paper.md",
     "reliability": DOCS / "explanation/reliability.md",
+    "servoctl": DOCS / "reference/cli.md",
+    "servod": DOCS / "reference/cli.md",
+    "servod_virtual_axis": DOCS / "reference/cli.md",
+    "axis_model": DOCS / "reference/axis-model.md",
+    "gain_set": DOCS / "reference/gain-set.md",
+    "record": DOCS / "reference/recording.md",
+    "record_numbers": DOCS / "reference/recording.md",
+    "virtual_axis": DOCS / "reference/cli.md",
+    "columns": DOCS / "reference/recording.md",
+    "protocol": DOCS / "reference/protocol.md",
+    "json": DOCS / "reference/json.md",
 }
 
 
 def texts() -> list[Path]:
     """Everything that is written for people: the front door and every page of the manual."""
     return [*sorted(ROOT.glob("*.md")), *sorted(DOCS.rglob("*.md"))]
-
-
-def markdown(header: list[str], rows: list[list[str]]) -> str:
-    """A Markdown table."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
 
 
 def faults() -> str:
@@ -91,12 +99,21 @@ def quirks() -> str:
     return markdown(["`amplifier.quirks`", "Maker", "Deviation", "Source"], rows)
 
 
-def code(default: str) -> str:
-    """A default as it would stand in the file; not of a key that has none."""
-    return default if default == "required" else f"`{default}`"
-
-
-TABLES: dict[str, Callable[[], str]] = {"faults": faults, "quirks": quirks}
+TABLES: dict[str, Callable[[], str]] = {
+    "faults": faults,
+    "quirks": quirks,
+    "servoctl": command_line.servoctl,
+    "servod": command_line.servod,
+    "servod_virtual_axis": command_line.servod_virtual_axis,
+    "axis_model": reference.axis_model,
+    "gain_set": reference.gain_set,
+    "record": reference.record,
+    "record_numbers": reference.record_numbers,
+    "virtual_axis": reference.virtual_axis,
+    "columns": reference.columns,
+    "protocol": reference.protocol,
+    "json": reference.json_documents,
+}
 
 
 def written() -> dict[Path, str]:

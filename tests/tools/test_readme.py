@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 import re
-import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
-from subprocess import PIPE
 
+import blocks
 import pytest
 import readme
 import source
@@ -108,32 +103,14 @@ def test_the_two_commands_stand_in_it_and_run_on_their_own() -> None:
         assert (source.ROOT / name).stat().st_mode & 0o111
 
 
-def first_steps() -> str:
-    """The fenced block between the marks, to the letter: who copies these lines gets the same ones."""
-    (block,) = re.findall(r"^<!-- walk -->\n```sh\n(.*?)^```\n<!-- walk: end -->$", TEXT, re.DOTALL | re.MULTILINE)
-    return str(block)
-
-
 def test_the_here_document_of_the_first_steps_ends_where_its_word_stands() -> None:
-    (word,) = re.findall(r"<<(\w+)$", first_steps(), re.MULTILINE)
-    assert first_steps().splitlines().count(word) == 1
+    (word,) = re.findall(r"<<(\w+)$", blocks.first_steps(), re.MULTILINE)
+    assert blocks.first_steps().splitlines().count(word) == 1
 
 
 @pytest.mark.serial
 def test_the_first_steps_work_as_they_stand(tmp_path: Path) -> None:
     """Every line between the marks, by a shell that ends at the first error; the commands are those of this Python."""
-    (tmp_path / "gains").symlink_to(source.ROOT / "gains")
-    (tmp_path / ".venv").symlink_to(sys.prefix)
-    environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
-    shell = ["bash", "-e", "-c", "trap 'kill $(jobs -p) 2>/dev/null || true' EXIT\n" + first_steps()]
-    begun = subprocess.Popen(
-        shell, cwd=tmp_path, env=environment, stdout=PIPE, stderr=PIPE, text=True, start_new_session=True
-    )
-    try:
-        told, complained = begun.communicate(timeout=100)
-    finally:  # also what the shell started and a time-out leaves behind
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(begun.pid, signal.SIGKILL)
-    assert begun.returncode == 0, told + complained
+    told = blocks.run(blocks.first_steps(), tmp_path, 100.0)
     assert told.count("motion done") == 2
     assert "open-loop position error" in told

@@ -18,7 +18,11 @@ from packaging.requirements import Requirement
 
 #: Each lock and the extras of pyproject.toml in it.
 EXTRAS = {"deploy": (), "lab": ("lab",), "dev": ("lab", "dev"), "fuzz": ("lab", "dev", "fuzz")}
-LOCKS = (*EXTRAS, "build")
+#: Not on the way from one of these to the next.
+BESIDE = {"docs": ("docs",)}
+LOCKS = (*EXTRAS, *BESIDE, "build")
+#: Which can be installed upon another.
+UPON = (*itertools.pairwise(EXTRAS), ("build", "dev"), ("deploy", "docs"), ("docs", "dev"), ("build", "docs"))
 COMMANDS = ("demo", "test")
 
 
@@ -41,7 +45,8 @@ def wanted(name: str) -> list[Requirement]:
     if name == "build":
         return [Requirement(line) for line in (source.ROOT / "requirements/build.in").read_text().split()]
     project = tomllib.loads((source.ROOT / "pyproject.toml").read_text())["project"]
-    lines = [*project["dependencies"], *(line for e in EXTRAS[name] for line in project["optional-dependencies"][e])]
+    extras = (EXTRAS | BESIDE)[name]
+    lines = [*project["dependencies"], *(line for e in extras for line in project["optional-dependencies"][e])]
     return [Requirement(line) for line in lines]
 
 
@@ -61,15 +66,15 @@ def test_every_locked_file_has_its_hashes(name: str) -> None:
     assert [entry.split()[0] for entry in entries if "--hash=sha256:" not in entry] == []
 
 
-@pytest.mark.parametrize(("smaller", "larger"), [*itertools.pairwise(EXTRAS), ("build", "dev")])
+@pytest.mark.parametrize(("smaller", "larger"), UPON)
 def test_what_two_locks_share_has_one_version(smaller: str, larger: str) -> None:
     """One can be installed upon the other: ./demo, then ./test, then the fuzzing."""
     lesser, greater = versions(smaller), versions(larger)
     assert {p: v for p, v in lesser.items() if p in greater and greater[p] != v} == {}
-    assert smaller == "build" or lesser.keys() <= greater.keys()
+    assert smaller in ("build", "docs") or lesser.keys() <= greater.keys()
 
 
-@pytest.mark.parametrize("name", ["deploy", "lab", "dev", "build"])
+@pytest.mark.parametrize("name", ["deploy", "lab", "dev", "docs", "build"])
 def test_every_machine_gets_the_same_versions(name: str) -> None:
     every = {str(entry).partition(";")[0] for entry in locked(name)}
     for python, machine in itertools.product(("3.11", "3.12", "3.13", "3.14"), ("x86_64", "aarch64")):

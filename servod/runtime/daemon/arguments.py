@@ -31,7 +31,9 @@ class MotionKind(StrEnum):
 
 
 #: Samples that stand in the request itself; more come ahead, with the verb `trajectory`.
-_Samples = Annotated[list[float], Field(min_length=1, max_length=PIECE_SAMPLES)]
+_Samples = Annotated[
+    list[float], Field(min_length=1, max_length=PIECE_SAMPLES, description="one for each period of the loop")
+]
 
 _NEEDS: dict[MotionKind, tuple[str, ...]] = {
     MotionKind.SINE: ("amplitude_rad", "frequency_hz", "duration_s"),
@@ -49,21 +51,21 @@ class NoArgs(Strict):
 class EnableArgs(Strict):
     """`enable`; with `prove` the test of the wiring is repeated although it was passed."""
 
-    reset_fault: bool = False
-    prove: bool = False
+    reset_fault: bool = Field(False, description="reset latched faults and the drive's own first")
+    prove: bool = Field(False, description="test the wiring again")
 
 
 class HaltArgs(Strict):
     """`halt`: true holds the reference, false goes on."""
 
-    on: bool = True
+    on: bool = Field(True, description="hold, or go on")
 
 
 class TrajectoryArgs(Strict):
     """`trajectory`: a piece of the samples of the motion that comes next; `start` 0 begins the column anew."""
 
-    key: SampleKey
-    start: int = Field(ge=0)
+    key: SampleKey = Field(description="the argument of `track` that the samples are of")
+    start: int = Field(ge=0, description="number of the first sample; pieces follow one another without a gap")
     samples: _Samples
 
 
@@ -74,15 +76,17 @@ class TrackArgs(Strict):
     checked against the limits.
     """
 
-    kind: MotionKind
-    amplitude_rad: float | None = Field(None, ge=-1e4, le=1e4)
-    frequency_hz: float | None = Field(None, gt=0.0, le=500.0)
-    duration_s: _Duration | None = None
-    positions_rad: _Samples | None = None
-    torques_nm: _Samples | None = None
-    window_rad: float | None = Field(None, gt=0.0, le=1e4)
-    uploaded: bool = False
-    start_immediately: bool = True
+    kind: MotionKind = Field(description="which motion")
+    amplitude_rad: float | None = Field(None, ge=-1e4, le=1e4, description="of sine and step")
+    frequency_hz: float | None = Field(None, gt=0.0, le=500.0, description="of a sine")
+    duration_s: _Duration | None = Field(None, description="of sine, paper and step")
+    positions_rad: _Samples | None = Field(None, description="of csv and excite, relative to the first sample")
+    torques_nm: _Samples | None = Field(None, description="of excite: torque that is added to the controller's")
+    window_rad: float | None = Field(
+        None, gt=0.0, le=1e4, description="of excite: a change of the distance from the reference that ends it"
+    )
+    uploaded: bool = Field(False, description="the samples came ahead, with the verb `trajectory`")
+    start_immediately: bool = Field(True, description="false: only check the motion against the limits")
 
     @model_validator(mode="after")
     def _has_what_its_kind_needs(self) -> TrackArgs:
@@ -125,8 +129,8 @@ class TrackArgs(Strict):
 class GainsLoadArgs(Strict):
     """`gains_load`: the YAML text of a gain set; `name` says in errors which one."""
 
-    name: str = Field(min_length=1, max_length=200)
-    text: str
+    name: str = Field(min_length=1, max_length=200, description="what errors call it, e.g. the file's name")
+    text: str = Field(description="the gain set as YAML")
 
 
 class GainsActivateArgs(Strict):
@@ -136,9 +140,9 @@ class GainsActivateArgs(Strict):
     active before runs again.
     """
 
-    name: str = Field(min_length=1, max_length=200)
-    version: int | None = Field(None, ge=1)
-    trial: bool = False
+    name: str = Field(min_length=1, max_length=200, description="name in the store")
+    version: int | None = Field(None, ge=1, description="none: the newest")
+    trial: bool = Field(False, description="only until it is kept")
 
 
 class GainsVerdictArgs(Strict):
@@ -147,15 +151,15 @@ class GainsVerdictArgs(Strict):
     A `gains_rollback` with `trial` ends a trial and does nothing else.
     """
 
-    note: str = Field("", max_length=4000)
-    figures: dict[str, float] = Field(default_factory=dict, max_length=64)
-    trial: bool = False
+    note: str = Field("", max_length=4000, description="why")
+    figures: dict[str, float] = Field(default_factory=dict, max_length=64, description="what was measured, by name")
+    trial: bool = Field(False, description="of `gains_rollback`: end a trial and do nothing else")
 
 
 class RecordStartArgs(Strict):
     """`record_start`: a file in the recordings' directory, or a new name."""
 
-    path: str | None = Field(None, min_length=1, max_length=4096)
+    path: str | None = Field(None, min_length=1, max_length=4096, description="file name; none: a new one")
 
 
 _MODELS: dict[Verb, type[Strict]] = {
@@ -171,6 +175,11 @@ _MODELS: dict[Verb, type[Strict]] = {
 }
 
 
+def arguments_of(verb: Verb) -> type[Strict]:
+    """The model of a verb's arguments."""
+    return _MODELS.get(verb, NoArgs)
+
+
 def check_arguments(verb: Verb, args: dict[str, Any]) -> Any:
     """The verb's arguments as its model. Raises BadInput naming verb and key."""
-    return validate(args, _MODELS.get(verb, NoArgs), verb)
+    return validate(args, arguments_of(verb), verb)

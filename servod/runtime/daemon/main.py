@@ -213,17 +213,18 @@ class _Parser(argparse.ArgumentParser):
         raise BadInput("arguments", message, "see `servod --help`")
 
 
-def _parse(arguments: list[str] | None) -> argparse.Namespace:
-    parser = _Parser(
+def parser() -> argparse.ArgumentParser:
+    """What `servod` takes; the reference of the command line prints it too."""
+    found = _Parser(
         prog="servod",
         description="Runs one servo axis over CANopen: 1 kHz friction-compensating control, supervised and recorded.",
         epilog=_EXAMPLE,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="axis configuration (YAML)")
-    parser.add_argument("--check", action="store_true", help="check the configuration and end")
-    parser.add_argument("--version", action="version", version=f"servod {__version__}")
-    return parser.parse_args(arguments)
+    found.add_argument("--config", type=Path, required=True, metavar="FILE", help="axis configuration (YAML)")
+    found.add_argument("--check", action="store_true", help="check the configuration and end")
+    found.add_argument("--version", action="version", version=f"servod {__version__}", help="print the version")
+    return found
 
 
 def _end_start_on_signals() -> None:
@@ -243,7 +244,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the daemon; returns the exit code, with one line on standard error when it is not 0."""
     set_up_logging()
     try:
-        options = _parse(arguments)
+        options = parser().parse_args(arguments)
         if options.check:
             config = check(options.config)
             print(f"{options.config}: good; axis {config.name} on {config.bus.interface} {config.bus.channel}")
