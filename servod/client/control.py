@@ -8,6 +8,8 @@ is servod.runtime.daemon.control_server.
 
 from __future__ import annotations
 
+import base64
+import binascii
 import socket
 import struct
 from collections.abc import Iterator, Sequence
@@ -21,12 +23,14 @@ from servod.common.portable import need_linux
 from servod.formats.protocol import (
     MAX_ANSWER_BYTES,
     MAX_LINE_BYTES,
+    PIECE_CYCLES,
     PIECE_SAMPLES,
     SampleKey,
     Verb,
     decode_line,
     encode_line,
 )
+from servod.formats.recording.record import RECORD
 
 _TIMEVAL = struct.Struct("@ll")
 
@@ -142,6 +146,35 @@ class ControlClient:
             return decode_line(line)
         except ValueError as error:
             raise Unreachable(f"{self._path}: answers with something else than servod would ({error})") from None
+
+
+class CycleStream:
+    """The cycle records of a running axis as they come, from the daemon's memory: nothing is recorded for it.
+
+    The daemon holds the last seconds; `lost` counts those that a reader who came too late did not get.
+    """
+
+    def __init__(self, client: ControlClient) -> None:
+        """Begin behind the newest record. Raises as ControlClient.call."""
+        self._client = client
+        now = client.call(Verb.CYCLES)
+        self._last, self.count_rad, self.lost = int(now["last"]), float(now["count_rad"]), 0
+
+    def take(self) -> bytes:
+        """All records since the last time, packed, oldest first. Raises as ControlClient.call."""
+        taken = b""
+        while True:
+            answer = self._client.call(Verb.CYCLES, after=self._last)
+            try:
+                raw = base64.b64decode(answer["records"], validate=True)
+            except binascii.Error:
+                raise Unreachable(f"{self._client.path}: answers with something else than servod would") from None
+            count = len(raw) // RECORD.size
+            self.lost += int(answer["last"]) - self._last - count
+            self._last = int(answer["last"])
+            taken += raw
+            if count < PIECE_CYCLES:
+                return taken
 
 
 def _why(error: OSError) -> str:
