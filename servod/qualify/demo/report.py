@@ -14,9 +14,9 @@ import numpy as np
 import plotly.graph_objects as go
 from plotly.colors import qualitative
 
+from servod.kernels.scoring import SETTLE_S
 from servod.lab.report.figure import histogram, time_curves
 from servod.lab.report.page import Page
-from servod.lab.tracking.metrics import SETTLE_S
 from servod.qualify.demo.entries import DemoRow
 from servod.qualify.demo.runs import Run
 
