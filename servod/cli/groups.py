@@ -48,6 +48,7 @@ VERBS: dict[Panel, dict[str, str]] = {
         "commission": "All of these in one walk, with a report.",
     },
     Panel.ANALYSE: {
+        "plot": "Draw a recording: error, torque, states, faults.",
         "replay": "Simulate a model under a recorded torque.",
         "diagnose": "Find what physics a model leaves out.",
         "explain": "Explain an effect: equation, keys, units, ranges.",

@@ -136,4 +136,5 @@ def test_the_first_steps_work_as_they_stand(tmp_path: Path) -> None:
             os.killpg(begun.pid, signal.SIGKILL)
     assert begun.returncode == 0, told + complained
     assert told.count("motion done") == 2
+    assert "drawn: out/axis/first.html" in told
     assert "open-loop position error" in told
