@@ -155,10 +155,12 @@ class CycleStream:
     """
 
     def __init__(self, client: ControlClient) -> None:
-        """Begin behind the newest record. Raises as ControlClient.call."""
+        """Begin with the newest record, which is from before all that is asked for from now on. Raises as
+        ControlClient.call.
+        """
         self._client = client
         now = client.call(Verb.CYCLES)
-        self._last, self.count_rad, self.lost = int(now["last"]), float(now["count_rad"]), 0
+        self._last, self.count_rad, self.lost = max(int(now["last"]) - 1, 0), float(now["count_rad"]), 0
 
     def take(self) -> bytes:
         """All records since the last time, packed, oldest first. Raises as ControlClient.call."""

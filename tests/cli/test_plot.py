@@ -5,8 +5,6 @@ from __future__ import annotations
 import base64
 import json
 import re
-import shutil
-import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +15,7 @@ from servod.common.faults import FAULTS, FaultCode
 from servod.formats.recording.mcap_writer import McapFile
 from servod.formats.recording.record import FIELDS, RECORD, CycleRecord
 from servod.lab.report.figures.motion import RecordedRun, recorded_run
-from servod.lab.report.page_figure import _EVERY_ROW_JS, _at_most, every_row_script, plotly_figure
+from servod.lab.report.page_figure import _at_most, every_row_script, plotly_figure
 from servod.runtime.fieldbus.devices import DriveState
 from servod.runtime.loop.axis import AxisState
 
@@ -113,6 +111,26 @@ def test_what_cannot_be_drawn_is_one_line(
     assert says in line
 
 
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--no-wait", "--plot", "motion.png"], "what has not run cannot be drawn"),
+        (["--plot", "motion.pdf"], ".html (a page) or .png (a picture)"),
+        (["--plot", "/proc/nowhere/motion.png"], "/proc/nowhere"),
+        (["--duration", "601", "--plot", "motion.png"], "at most 600 s; a longer one is drawn from its recording"),
+    ],
+)
+def test_a_motion_that_could_not_be_drawn_does_not_begin(
+    words: list[str], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    motion = ["track", "sine", "--amplitude", "0.1", "--frequency", "1"]
+    motion += [] if "--duration" in words else ["--duration", "1"]
+    assert run([*motion, *words, "--socket", "/nowhere/axis.sock"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert says in line
+
+
 def test_states_jump_and_a_fault_of_one_cycle_is_seen() -> None:
     t = np.arange(10) * 1e-3
     faults = np.where(np.arange(10) == 4, FAULT, 0)
@@ -144,33 +162,3 @@ def test_a_curve_that_is_too_long_keeps_its_peaks() -> None:
     x, kept_y = _at_most(np.arange(100_000.0), y, 2000)
     assert len(x) <= 2001 and np.all(np.diff(x) > 0)
     assert kept_y.max() == 7.0 and x[np.argmax(kept_y)] == 54_321
-
-
-@pytest.mark.skipif(shutil.which("node") is None, reason="runs the page's own script: needs node")
-def test_from_afar_a_band_and_from_near_the_sine() -> None:
-    script = (
-        _EVERY_ROW_JS
-        + """
-    const x = Float64Array.from({ length: 60000 }, (_, k) => 1e-3 * k);
-    const y = Float32Array.from(x, (t) => Math.sin(40 * Math.PI * t));
-    y[31234] = 3.0;
-    y[100] = NaN;
-    const packed = Buffer.from(x.buffer).toString("base64");
-    console.log(JSON.stringify({
-      far: view(x, y, -Infinity, Infinity, 4000), near: view(x, y, 10.0, 10.1, 4000),
-      same: unpacked(packed, Float64Array)[59999],
-    }));
-    """
-    )
-    done = subprocess.run(["node", "-e", script], capture_output=True, text=True, check=True)
-    found = json.loads(done.stdout)
-    far_x, far_y = (np.array(v, dtype=float) for v in found["far"])
-    assert len(far_x) <= 4000 and np.all(np.diff(far_x) > 0)
-    assert np.nanmax(far_y) == 3.0
-    for second in range(60):
-        part = far_y[(far_x >= second) & (far_x < second + 1)]
-        assert np.nanmin(part) < -0.99 and np.nanmax(part) > 0.99
-    near_x, near_y = (np.array(v) for v in found["near"])
-    assert np.allclose(np.diff(near_x), 1e-3) and near_x[0] <= 10.0 and near_x[-1] >= 10.099
-    assert np.allclose(near_y, np.sin(40.0 * np.pi * near_x), atol=1e-6)
-    assert found["same"] == pytest.approx(59.999)

@@ -135,6 +135,6 @@ def test_the_first_steps_work_as_they_stand(tmp_path: Path) -> None:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(begun.pid, signal.SIGKILL)
     assert begun.returncode == 0, told + complained
-    assert told.count("motion done") == 2
+    assert told.count("motion done: RMS error ") == 2
     assert "drawn: out/axis/first.html" in told
     assert "open-loop position error" in told

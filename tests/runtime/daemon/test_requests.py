@@ -223,6 +223,7 @@ def test_cycles_go_out_in_pieces_and_what_left_the_memory_is_counted(tmp_path: P
     recorder.add_rows(rows(5))
     stream = CycleStream(cast(ControlClient, _Client()))
     assert stream.count_rad == pytest.approx(2.0 * math.pi / config.encoder.counts_per_turn)
+    assert stream.take() == row(4, position_rad=0.004)
     assert stream.take() == b""
     recorder.add_rows(rows(2 * PIECE_CYCLES, 5))
     assert stream.take() == b"".join(rows(2 * PIECE_CYCLES, 5))
