@@ -145,6 +145,7 @@ def test_states_jump_and_a_fault_of_one_cycle_is_seen() -> None:
     ]  # fmt: skip
     assert fault.x[0] == pytest.approx(4e-3) and fault.x[1] == pytest.approx(5e-3)
     assert figure.panels[-1].y.names == ("SPEED_LIMIT",)
+    assert {panel.x.span for panel in figure.panels} == {(0.0, float(t[-1]))}
 
 
 def test_every_curve_is_one_trace_in_the_same_order(recording: Path) -> None:

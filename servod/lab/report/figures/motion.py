@@ -256,7 +256,8 @@ def recorded_run(run: RecordedRun, name: str = "recording") -> Figure:
     rotary = "position_rad" in run.columns
     unit = "rad" if rotary else "m"
     position, reference = run.columns[f"position_{unit}"], run.columns.get(f"reference_{unit}")
-    t, x = PlotAxis("time in s"), run.time_s
+    x = run.time_s
+    t = PlotAxis("time in s", span=(float(x[0]), float(x[-1])))  # a short fault stands below its time
     curves = [] if reference is None else [curve("reference", x, reference, Colour.GREY, Style.DASHED)]
     panels = [PlotPanel(t, PlotAxis(f"position in {unit}"), (*curves, curve("position", x, position, Colour.BLUE)))]
     if reference is not None:
@@ -308,6 +309,7 @@ def _faults(run: RecordedRun, t: PlotAxis) -> list[PlotPanel]:
         x = np.column_stack([run.time_s[begins], until_s, until_s]).ravel()
         y = np.tile([float(place), float(place), np.nan], len(begins))
         curves.append(curve("fault", x, y, Colour.ORANGE, width=5.0, detail=code.name))
+        curves.append(curve("fault", x[::3], y[::3], Colour.ORANGE, Style.POINTS, detail=code.name))  # seen from afar
     names = tuple(code.name for code in codes)
     return [PlotPanel(t, PlotAxis("", span=(-0.5, len(names) - 0.5), names=names), tuple(curves), "faults present")]
 
