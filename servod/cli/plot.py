@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servod.cli.common import JsonOption, example, need_file, report
+from servod.cli.common import JsonOption, example, need_file, report, suggest
 from servod.common.errors import BadInput
 
 if TYPE_CHECKING:
@@ -70,6 +70,7 @@ def plot(
         "damage": damage,
         "files": [str(file) for file in files],
     }
+    suggest("replay", "--model", "MODEL", str(recording), why="what a model makes of the same torque")
     lines = [f"note: {damage}"] if damage else []
     report(result, "\n".join([*lines, *(f"drawn: {file}" for file in files)]), as_json)
 

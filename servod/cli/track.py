@@ -6,6 +6,7 @@ picture alone.
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, connect, example, report
+from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, connect, example, report, suggest
 from servod.common.errors import AnswerIsNo, BadInput
 
 if TYPE_CHECKING:
@@ -129,6 +130,7 @@ def _track(
     with connect(socket) as client:
         if not wait:
             result = client.call("track", **motion)
+            suggest("status", "--watch", why="Ctrl-C ends the watching, not the motion")
             report(result, "motion started", as_json)
             return
         watched = _Watched(client, draw is not None)
@@ -137,6 +139,7 @@ def _track(
     figures = watched.tally.figures()
     document = figures.document() | {"lost_cycles": watched.lost} if figures else None
     said = _in_words(document)
+    _suggest(document, plot)
     report(result | {"figures": document}, "\n".join(said), as_json)
     if draw is not None:
         draw(bytes(watched.kept), said)
@@ -193,6 +196,14 @@ class _Watched:
             active = bool(r.reference_active)
             cycle = MotionCycle(1e-9 * r.time_ns, active, r.reference_rad, r.position_rad, r.torque_nm, r.missed)
             self.tally.add(cycle)
+
+
+def _suggest(figures: dict[str, Any] | None, plot: Path | None) -> None:
+    """What the figures give reason for."""
+    if figures and figures["missed_cycles"]:
+        suggest("bench", why="how well this machine keeps time")
+    elif plot is None:
+        suggest(*sys.argv[1:], "--plot", "motion.html", why="the same motion in pictures")
 
 
 def _in_words(figures: dict[str, Any] | None) -> list[str]:
