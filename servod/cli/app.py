@@ -21,9 +21,9 @@ import typer
 from typer.main import get_command
 
 from servod import __version__
-from servod.cli.common import begin_command, drop_empty_folders
+from servod.cli.common import begin_command, drop_empty_folders, say_next
 from servod.cli.errors import INTERRUPTED, complain, say
-from servod.cli.groups import Grouped, modules
+from servod.cli.groups import NEXT, Grouped, modules
 from servod.common.errors import BadInput
 
 #: Windows says EINVAL of a pipe whose reader has gone.
@@ -117,7 +117,17 @@ def run(arguments: list[str]) -> int:
         return complain(error, arguments)
     finally:
         drop_empty_folders()
+    if not code:
+        _say_next(arguments)
     return code if isinstance(code, int) else 0
+
+
+def _say_next(arguments: list[str]) -> None:
+    """After a command that did its work: a help, a version and a document are no work to go on from."""
+    words = [text for text in arguments[:2] if not text.startswith("-")]
+    usual = NEXT.get(" ".join(words)) or NEXT.get(words[0] if words else "")
+    if usual and not {"-h", "--help", "--json"} & set(arguments):
+        say_next(usual)
 
 
 def _refuse_empty(arguments: list[str]) -> None:

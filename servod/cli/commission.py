@@ -21,6 +21,7 @@ from servod.cli.common import (
     one_thread,
     print_json,
     progress,
+    suggest,
     table_console,
 )
 from servod.cli.groups import walk_steps
@@ -70,6 +71,7 @@ def commission(
     one_thread()
     from servod.client.processes import sigterm_as_interrupt
     from servod.lab.commission.report import failure, result
+    from servod.lab.commission.state import GAINS
     from servod.lab.commission.steps import STEPS
     from servod.lab.commission.walk import Questions, StepFailed, Walk, WalkOptions, run
 
@@ -90,6 +92,8 @@ def commission(
         if as_json:
             print_json(failure(walk, failed))
         raise
+    if plant is not None:
+        suggest("gains", "show", str(out / GAINS), why="the virtual axis has ended")
     if as_json:
         print_json(document)
     else:

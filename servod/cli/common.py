@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shlex
 import sys
 import tempfile
 import threading
@@ -83,6 +84,21 @@ def json_is_printed() -> bool:
 def begin_command() -> None:
     """Forget what an earlier command of this process printed."""
     _printed.clear()
+    _suggested.clear()
+
+
+def suggest(*words: str, why: str = "") -> None:
+    """The words of `servoctl` that are sensible next, where that depends on what this command did.
+
+    Shown at its end on a terminal, in place of what servod.cli.groups.NEXT has for it.
+    """
+    _suggested[:] = [f"next: servoctl {shlex.join(words)}" + (f"   # {why}" if why else "")]
+
+
+def say_next(usual: str) -> None:
+    """The last line of a command on a terminal; a pipe, a document and a stage of another command get none."""
+    if sys.stdout.isatty() and not _printed and _HANDED_DOWN not in os.environ:
+        print(*(_suggested or [f"next: {usual}"]))
 
 
 #: A stop is answered when the drive has stopped. One that takes longer [s] is a slow ramp, or a daemon that hangs.
@@ -92,6 +108,8 @@ _BESIDE_THE_AXIS = "a loop whose daemon hangs stops the axis by itself; IF IT MO
 _PIPE_COLUMNS = 10_000
 #: One entry for each document that this command printed.
 _printed: list[bool] = []
+#: The line of `suggest`.
+_suggested: list[str] = []
 #: Folders that this command made for its results, outermost first.
 _made: list[Path] = []
 #: Descriptors of locked folders; they end with the command.

@@ -20,6 +20,7 @@ from servod.cli.common import (
     one_thread,
     print_json,
     progress,
+    suggest,
     table_console,
 )
 from servod.common.errors import AnswerIsNo, BadInput
@@ -74,6 +75,8 @@ def deploy(
         _print(done.document())
     if not done.proven:
         raise AnswerIsNo(done.said)
+    if plant is not None:
+        suggest("gains", "show", str(gains), why="the virtual axis has ended")
     if not as_json:
         print(done.said)
 

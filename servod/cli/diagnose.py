@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servod.cli.common import JsonOption, example, need_folder, one_thread, print_json
+from servod.cli.common import JsonOption, example, need_folder, one_thread, print_json, suggest
 from servod.common.errors import AnswerIsNo, BadInput
 
 if TYPE_CHECKING:
@@ -55,6 +55,8 @@ def diagnose(
         print_json(document)
     else:
         _print(found, document, out)
+    if found.evidence:
+        suggest("replay", "--model", str(out / "model.yaml"), str(recordings[0]), why="with the physics added")
     if document["verdict"] == "cannot_tell":
         raise AnswerIsNo(document["summary"])
 

@@ -48,6 +48,7 @@ VERBS: dict[Panel, dict[str, str]] = {
         "commission": "All of these in one walk, with a report.",
     },
     Panel.ANALYSE: {
+        "plot": "Draw a recording: error, torque, states, faults.",
         "replay": "Simulate a model under a recorded torque.",
         "diagnose": "Find what physics a model leaves out.",
         "explain": "Explain an effect: equation, keys, units, ranges.",
@@ -58,6 +59,48 @@ VERBS: dict[Panel, dict[str, str]] = {
         "prove": "Put the diagnosis to a blind trial.",
         "qualify": "Try servod itself: fault campaign, soak, paper.",
     },
+}
+
+_SMALL_SINE = "servoctl track sine --amplitude 0.02 --frequency 0.2 --duration 10"
+
+#: What comes next after each command, where the command itself does not know better (`servod.cli.common.suggest`).
+NEXT: dict[str, str] = {
+    "status": "servoctl enable   # tests the wiring, then holds the joint",
+    "enable": f"{_SMALL_SINE}   # says how well the joint follows",
+    "disable": "servoctl status",
+    "stop": "servoctl enable   # when it may move again",
+    "track sine": "servoctl disable",
+    "track paper": "servoctl disable",
+    "track step": "servoctl disable",
+    "track csv": "servoctl disable",
+    "record start": f"{_SMALL_SINE}",
+    "record stop": "servoctl plot FILE",
+    "record export": "servoctl plot FILE   # the recording in pictures",
+    "gains load": "servoctl gains list",
+    "gains list": "servoctl gains activate NAME",
+    "gains show": "servoctl gains load FILE --activate",
+    "gains activate": f"{_SMALL_SINE}   # `servoctl gains rollback` undoes the change",
+    "gains rollback": "servoctl gains list",
+    "faults": "servoctl enable --reset-fault   # when the cause is gone",
+    "config check": "servoctl scan   # which nodes are there",
+    "config keys": "servoctl config check FILE",
+    "scan": "servoctl config check FILE   # with the nodes that were found",
+    "preset": "servoctl enable",
+    "identify": "servoctl synthesize --model MODEL --out gains.yaml",
+    "synthesize": "servoctl verify GAINS",
+    "verify": "servoctl deploy GAINS",
+    "deploy": "servoctl track paper   # trajectory (19) under the new set",
+    "commission": "servoctl track paper   # trajectory (19) under the new set",
+    "plot": "servoctl replay --model MODEL REC   # what a model makes of the same torque",
+    "replay": "servoctl diagnose --model MODEL REC --out diagnosis   # what the model leaves out",
+    "diagnose": "servoctl synthesize --model MODEL --out gains.yaml   # from the model with the physics added",
+    "explain": "servoctl diagnose --model MODEL REC --out diagnosis",
+    "demo": "servoctl commission --plant PLANT --out commissioning   # the whole way to a certified set",
+    "bench": "servoctl config check FILE   # whether bus and period fit",
+    "prove": "servoctl diagnose --model MODEL REC --out diagnosis   # the same on recordings of yours",
+    "qualify faults": "servoctl qualify soak",
+    "qualify soak": "servoctl bench",
+    "qualify paper": "servoctl demo --fast",
 }
 
 #: Verbs that stand in the file of another one; every other verb has the file of its name.

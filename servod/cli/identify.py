@@ -20,6 +20,7 @@ from servod.cli.common import (
     need_folder,
     one_thread,
     print_json,
+    suggest,
     table_console,
 )
 from servod.common.errors import BadInput
@@ -87,6 +88,7 @@ def identify(
         analysis = job(_Walk(recordings_folder(out), travel, speed, seed, resume), tell)
     model = model_of(analysis)
     _write(out, axis_model_yaml(model))
+    suggest("synthesize", "--model", str(out), "--out", "gains.yaml", why="a gain set for this axis")
     found = document(analysis) | {"model": str(out)} | _changes(old, model)
     if as_json:
         print_json(found)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, connect, example, report
+from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, connect, example, report, suggest
 from servod.common.errors import AnswerIsNo, BadInput
 
 _app = typer.Typer(
@@ -42,6 +42,7 @@ def stop(socket: SocketOption = DEFAULT_SOCKET, as_json: JsonOption = False) -> 
         if not recorder["recording"]:
             raise AnswerIsNo(f"not recording. {recorder['failure']}")
         result = client.call("record_stop")
+    suggest("plot", result["path"], why="error, torque, states and faults in pictures")
     report(result, f"recorded {result['records']} cycles to {result['path']}", as_json)
 
 
@@ -66,4 +67,5 @@ def export(
     rows = writers[out.suffix](recording, out)
     cut = f"; {recording.damage}" if recording.damage else ""
     result = {"path": str(out), "rows": rows, "truncated": recording.truncated, "damage": recording.damage}
+    suggest("plot", str(file), why="the recording in pictures")
     report(result, f"wrote {out}: {rows} cycles of {file}{cut}", as_json)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servod.cli.common import DEFAULT_SOCKET, SocketOption, connect, example, print_json, table_console
+from servod.cli.common import DEFAULT_SOCKET, SocketOption, connect, example, print_json, suggest, table_console
 from servod.common.errors import one_line
 
 if TYPE_CHECKING:
@@ -54,7 +54,18 @@ def status(
     if as_json:
         print_json(document)
         return
+    _suggest(document["axis"])
     table_console().print(screen(document))
+
+
+def _suggest(axis: dict[str, Any]) -> None:
+    """By the state of the axis."""
+    if axis["state"] == "FAULT":
+        suggest("faults", why="the first cause, and what to do")
+    elif axis["motion_running"]:
+        suggest("status", "--watch")
+    elif axis["state"] == "ENABLED":
+        suggest("track", "sine", "--amplitude", "0.02", "--frequency", "0.2", "--duration", "10")
 
 
 def _print_lines(documents: Iterator[dict[str, Any]]) -> None:

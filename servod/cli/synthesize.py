@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servod.cli.common import JsonOption, example, need_file, one_thread, print_json
+from servod.cli.common import JsonOption, example, need_file, one_thread, print_json, suggest
 from servod.common.errors import AnswerIsNo, BadInput
 
 if TYPE_CHECKING:
@@ -203,6 +203,7 @@ def finish(result: GainSet | Infeasible, out: Path, cross_check: bool, as_json: 
 
         result = cross_checked(result)
     write_file(out, result.to_yaml())
+    suggest("verify", str(out), why="certifies it, or says why not")
     document = summary(result, out)
     if as_json:
         print_json(document)

@@ -1,7 +1,12 @@
-"""`servoctl track`: run a reference motion on the enabled axis and wait for its end; Ctrl-C or SIGTERM stops it."""
+"""`servoctl track`: run a reference motion on the enabled axis, wait for its end, and say how well it was followed.
+
+Ctrl-C or SIGTERM stops the axis. The figures are made of the daemon's cycle records as they come; numpy is wanted for a
+picture alone.
+"""
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -10,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, connect, example, report
+from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, connect, example, report, suggest
 from servod.common.errors import AnswerIsNo, BadInput
 
 if TYPE_CHECKING:
@@ -22,12 +27,21 @@ Tell = Callable[[float, dict[str, Any]], None]
 #: The longest period that a configuration may have (servod.formats.config.CycleConfig).
 LONGEST_PERIOD_US = 20_000
 _POLL_S = 0.1
+#: After its end the axis is watched for so long, until the reference has stood still for this time.
+_WATCH_S = 0.5
+#: Cycles of a longer motion would fill the memory; a recording holds them.
+_LONGEST_PLOT_S = 600.0
+#: Somebody may halt a motion for as long as he likes: what comes beyond this is not drawn.
+_MOST_KEPT_BYTES = 512 * 1024**2
 _app = typer.Typer(
     help=example("Run a reference motion from where the axis stands.", "servoctl track paper --duration 30"),
     rich_markup_mode=None,
 )
 _Wait = Annotated[
     bool, typer.Option("--wait/--no-wait", help="Wait for the end; Ctrl-C or SIGTERM then stops the axis.")
+]
+_Plot = Annotated[
+    Path | None, typer.Option("--plot", help="Draw the motion into this file: .html or .png (extra lab).")
 ]
 _Duration = Annotated[float, typer.Option(min=0.001, help="Duration in s.")]
 
@@ -43,12 +57,13 @@ def sine(
     frequency: Annotated[float, typer.Option(help="Frequency in Hz.")],
     duration: _Duration,
     wait: _Wait = True,
+    plot: _Plot = None,
     socket: SocketOption = DEFAULT_SOCKET,
     as_json: JsonOption = False,
 ) -> None:
     """Track a sine."""
     motion = {"kind": "sine", "amplitude_rad": amplitude, "frequency_hz": frequency, "duration_s": duration}
-    _track(socket, motion, duration, wait, as_json)
+    _track(socket, motion, duration, wait, plot, as_json)
 
 
 @_app.command(
@@ -58,6 +73,7 @@ def sine(
 def paper(
     duration: _Duration = 30.0,
     wait: _Wait = True,
+    plot: _Plot = None,
     socket: SocketOption = DEFAULT_SOCKET,
     as_json: JsonOption = False,
 ) -> None:
@@ -67,7 +83,7 @@ def paper(
     if duration > PAPER_LONGEST_S:
         allowed = f"at most {PAPER_LONGEST_S:.6g} s, where the envelope of (19) ends"
         raise BadInput("--duration", f"{duration:g} s", allowed)
-    _track(socket, {"kind": "paper", "duration_s": duration}, duration, wait, as_json)
+    _track(socket, {"kind": "paper", "duration_s": duration}, duration, wait, plot, as_json)
 
 
 @_app.command(help=example("A step of the reference.", "servoctl track step --amplitude 0.01 --duration 2"))
@@ -75,11 +91,12 @@ def step(
     amplitude: Annotated[float, typer.Option(help="Height in rad.")],
     duration: _Duration = 2.0,
     wait: _Wait = True,
+    plot: _Plot = None,
     socket: SocketOption = DEFAULT_SOCKET,
     as_json: JsonOption = False,
 ) -> None:
     """Track a step."""
-    _track(socket, {"kind": "step", "amplitude_rad": amplitude, "duration_s": duration}, duration, wait, as_json)
+    _track(socket, {"kind": "step", "amplitude_rad": amplitude, "duration_s": duration}, duration, wait, plot, as_json)
 
 
 @_app.command(
@@ -95,6 +112,7 @@ def csv(
         int | None, typer.Option(min=500, max=LONGEST_PERIOD_US, help="Period of the loop; the daemon knows it.")
     ] = None,
     wait: _Wait = True,
+    plot: _Plot = None,
     socket: SocketOption = DEFAULT_SOCKET,
     as_json: JsonOption = False,
 ) -> None:
@@ -107,44 +125,144 @@ def csv(
         period_us = int(ask(socket, "status")["timing"]["period_us"])
     positions = motion.on_grid(period_us * 1e-6)
     duration_s = len(positions) * period_us * 1e-6
-    _track(socket, {"kind": "csv", "positions_rad": positions}, duration_s, wait, as_json)
+    _track(socket, {"kind": "csv", "positions_rad": positions}, duration_s, wait, plot, as_json)
 
 
-def _track(socket: Path, motion: dict[str, Any], duration_s: float, wait: bool, as_json: bool) -> None:
+def _track(
+    socket: Path, motion: dict[str, Any], duration_s: float, wait: bool, plot: Path | None, as_json: bool
+) -> None:
+    draw = _drawing(plot, motion, duration_s, wait)
     with connect(socket) as client:
-        if wait:
-            with _progress(duration_s, as_json) as tell:
-                result = _run(client, motion, tell)
-        else:
+        if not wait:
             result = client.call("track", **motion)
-    report(result, "motion done" if wait else "motion started", as_json)
+            suggest("status", "--watch", why="Ctrl-C ends the watching, not the motion")
+            report(result, "motion started", as_json)
+            return
+        watched = _Watched(client, draw is not None)
+        with _progress(duration_s, as_json) as tell:
+            result = _run(client, motion, watched, tell)
+    figures = watched.tally.figures()
+    document = figures.document() | {"lost_cycles": watched.lost} if figures else None
+    said = _in_words(document)
+    _suggest(document, plot)
+    report(result | {"figures": document}, "\n".join(said), as_json)
+    if draw is not None:
+        draw(bytes(watched.kept), said)
+        if not as_json:
+            print(f"drawn: {plot}")
 
 
-def _run(client: ControlClient, motion: dict[str, Any], tell: Tell) -> dict[str, Any]:
+def _drawing(
+    plot: Path | None, motion: dict[str, Any], duration_s: float, wait: bool
+) -> Callable[[bytes, list[str]], None] | None:
+    """What draws packed cycle records, and what was said of them, into `plot`; what refuses it does so before the axis
+    moves.
+    """
+    if plot is None:
+        return None
+    if not wait:
+        raise BadInput("--plot", "--no-wait", "--wait: what has not run cannot be drawn")
+    if duration_s > _LONGEST_PLOT_S:
+        remedy = "a longer one is drawn from its recording (`servoctl record`, `servoctl plot`)"
+        raise BadInput("--plot", f"a motion of {duration_s:g} s", f"at most {_LONGEST_PLOT_S:g} s; {remedy}")
+    import servod.lab.report.figures.motion  # noqa: F401  # without the extra nothing shall move for a picture
+    from servod.cli.plot import check_drawing, draw_cycles
+
+    check_drawing("--plot", plot)
+    return lambda raw, said: draw_cycles(raw, f"servoctl track {motion['kind']}", plot, said)
+
+
+class _Watched:
+    """The cycles of a motion as they come: their figures, and with `keep` they themselves."""
+
+    def __init__(self, client: ControlClient, keep: bool) -> None:
+        from servod.client.control import CycleStream
+        from servod.kernels.scoring import MotionTally
+
+        self._stream: CycleStream = CycleStream(client)
+        self.tally: MotionTally = MotionTally(self._stream.count_rad)
+        self.kept = bytearray()
+        self._keep = keep
+
+    @property
+    def lost(self) -> int:
+        """Cycles that came too late to be seen."""
+        return self._stream.lost
+
+    def look(self) -> None:
+        """Take what has come."""
+        from servod.formats.recording.record import RECORD, CycleRecord
+        from servod.kernels.scoring import MotionCycle
+
+        raw = self._stream.take()
+        if self._keep and len(self.kept) < _MOST_KEPT_BYTES:
+            self.kept += raw
+        for r in map(CycleRecord._make, RECORD.iter_unpack(raw)):
+            active = bool(r.reference_active)
+            cycle = MotionCycle(1e-9 * r.time_ns, active, r.reference_rad, r.position_rad, r.torque_nm, r.missed)
+            self.tally.add(cycle)
+
+
+def _suggest(figures: dict[str, Any] | None, plot: Path | None) -> None:
+    """What the figures give reason for."""
+    if figures and figures["missed_cycles"]:
+        suggest("bench", why="how well this machine keeps time")
+    elif plot is None:
+        suggest(*sys.argv[1:], "--plot", "motion.html", why="the same motion in pictures")
+
+
+def _in_words(figures: dict[str, Any] | None) -> list[str]:
+    """What people read."""
+    if figures is None:
+        return ["motion done: too short for figures"]
+    begin = f" from {figures['judged_from_s']:g} s on" if figures["judged_from_s"] else ""
+    return [
+        f"motion done: RMS error {figures['rms_error_mrad']:.4g} mrad, peak error {figures['max_error_mrad']:.4g} mrad"
+        + begin,
+        _settled_in_words(figures),
+        f"peak torque {figures['peak_torque_nm']:.4g} N*m; {figures['missed_cycles']} of {figures['cycles']} cycles "
+        "missed" + (f"; {figures['lost_cycles']} cycles not seen" if figures["lost_cycles"] else ""),
+    ]
+
+
+def _settled_in_words(figures: dict[str, Any]) -> str:
+    from servod.kernels.scoring import BAND_COUNTS, BAND_SHARE
+
+    band = f"{figures['band_mrad']:.4g} mrad ({100 * BAND_SHARE:g} % of the travel, at least {BAND_COUNTS:g} counts)"
+    if figures["settling_s"] is None:
+        return f"not settled to {band} within the {figures['watched_s']:.2g} s after the reference had come to rest"
+    return f"settling time {figures['settling_s']:.3f} s after the reference had come to rest, to {band}"
+
+
+def _run(client: ControlClient, motion: dict[str, Any], watched: _Watched, tell: Tell) -> dict[str, Any]:
     """Start the motion and wait for its end; whatever interrupts it stops the axis before it ends the command."""
     from servod.client.processes import sigterm_as_interrupt
 
     with sigterm_as_interrupt():
         try:
             result = client.call("track", **motion)
-            _wait_until_over(client, tell)
+            _wait_for_end(client, watched, tell)
         except KeyboardInterrupt:
             client.call("stop")
             raise
     return result
 
 
-def _wait_until_over(client: ControlClient, tell: Tell) -> None:
-    """Poll until the motion is over."""
-    started = time.monotonic()
+def _wait_for_end(client: ControlClient, watched: _Watched, tell: Tell) -> None:
+    """Poll until the motion is over and what follows it was seen."""
+    started, ended = time.monotonic(), None
     while True:
         time.sleep(_POLL_S)
         status = client.call("status")
         if status["axis"]["state"] != "ENABLED":
             raise AnswerIsNo(f"the motion ended with the axis in {status['axis']['state']}: {_why(status)}")
-        if not status["axis"]["motion_running"]:
-            return
+        watched.look()
         tell(time.monotonic() - started, status["motion"])
+        if status["axis"]["motion_running"]:
+            continue
+        ended = ended or time.monotonic()
+        if watched.tally.at_rest_s >= _WATCH_S or time.monotonic() - ended > 2.0 * _WATCH_S:
+            return
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from servod.cli.common import JsonOption, example, one_thread, print_json
+from servod.cli.common import JsonOption, example, one_thread, print_json, suggest
 from servod.common.errors import AnswerIsNo
 
 if TYPE_CHECKING:
@@ -53,6 +53,7 @@ def verify(
     else:
         print_checks(result)
         print_hashes(hashes(checked))
+    suggest("deploy", str(gains), why="tries it on the axis, and goes back by itself when it is worse")
     if not result.valid:
         failed = [check.name for check in result.checks if not check.passed]
         raise AnswerIsNo(f"{gains}: not valid: {'; '.join(failed)}")

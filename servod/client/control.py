@@ -9,6 +9,8 @@ servod.runtime.daemon.control_server.
 
 from __future__ import annotations
 
+import base64
+import binascii
 import math
 import socket
 import struct
@@ -23,12 +25,14 @@ from servod.common.portable import need_linux
 from servod.formats.protocol import (
     MAX_ANSWER_BYTES,
     MAX_LINE_BYTES,
+    PIECE_CYCLES,
     PIECE_SAMPLES,
     SampleKey,
     Verb,
     decode_line,
     encode_line,
 )
+from servod.formats.recording.record import RECORD
 
 _TIMEVAL = struct.Struct("@ll")
 
@@ -154,6 +158,37 @@ def _not_finite(args: dict[str, Any]) -> Iterator[tuple[str, str]]:
     for key, value in args.items():
         samples = value if isinstance(value, list | tuple) else [value]
         yield from ((f": {key}", str(x)) for x in samples if isinstance(x, float) and not math.isfinite(x))
+
+
+class CycleStream:
+    """The cycle records of a running axis as they come, from the daemon's memory: nothing is recorded for it.
+
+    The daemon holds the last seconds; `lost` counts those that a reader who came too late did not get.
+    """
+
+    def __init__(self, client: ControlClient) -> None:
+        """Begin with the newest record, which is from before all that is asked for from now on. Raises as
+        ControlClient.call.
+        """
+        self._client = client
+        now = client.call(Verb.CYCLES)
+        self._last, self.count_rad, self.lost = max(int(now["last"]) - 1, 0), float(now["count_rad"]), 0
+
+    def take(self) -> bytes:
+        """All records since the last time, packed, oldest first. Raises as ControlClient.call."""
+        taken = b""
+        while True:
+            answer = self._client.call(Verb.CYCLES, after=self._last)
+            try:
+                raw = base64.b64decode(answer["records"], validate=True)
+            except binascii.Error:
+                raise Unreachable(f"{self._client.path}: answers with something else than servod would") from None
+            count = len(raw) // RECORD.size
+            self.lost += int(answer["last"]) - self._last - count
+            self._last = int(answer["last"])
+            taken += raw
+            if count < PIECE_CYCLES:
+                return taken
 
 
 def _why(error: OSError) -> str:

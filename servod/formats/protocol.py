@@ -20,6 +20,9 @@ MAX_ANSWER_BYTES = 4 * 1024 * 1024
 #: Samples in one request: as text, each takes at most 25 bytes.
 PIECE_SAMPLES = 2000
 
+#: Cycle records in one answer: as text, each takes 416 bytes.
+PIECE_CYCLES = 500
+
 
 class Verb(StrEnum):
     """What the daemon can be asked."""
@@ -41,10 +44,11 @@ class Verb(StrEnum):
     RECORD_STOP = "record_stop"
     SCAN = "scan"
     FAULTS = "faults"
+    CYCLES = "cycles"
 
 
 #: Verbs that only look; everything else needs the right to command.
-READING = frozenset({Verb.STATUS, Verb.WATCH, Verb.GAINS_LIST, Verb.FAULTS})
+READING = frozenset({Verb.STATUS, Verb.WATCH, Verb.GAINS_LIST, Verb.FAULTS, Verb.CYCLES})
 
 
 class SampleKey(StrEnum):

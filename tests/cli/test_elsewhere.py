@@ -64,6 +64,7 @@ ON_FILES = {
     "gains show": ["gains", "show", "gains.yaml", "--json"],
     "config check": ["config", "check", "gains.yaml", "model.yaml", "--json"],
     "fault codes": ["faults", "--codes", "--json"],
+    "plot": ["plot", "run.mcap", "--out", "OUT/run.png"],
     "export": ["record", "export", "run.mcap", "--out", "OUT/run.csv"],
 }
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import base64
 import itertools
 import json
 import os
 import pty
+import re
 import signal
 import subprocess
 import sys
@@ -13,11 +15,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from servod.cli.app import run
 from servod.client.control import ControlClient
 from servod.client.processes import child, running_axis, wait_until
+from servod.formats.recording.mcap_reader import read_recording
+from servod.lab.recordings.recording import moving, rows_of
+from servod.lab.tracking.metrics import score
 from servod.qualify.demo.axis import demo_config, gains_file, plant_file
 
 pytestmark = pytest.mark.serial
@@ -71,10 +77,44 @@ def servoctl(axis: Path, capsys: pytest.CaptureFixture[str]) -> Iterator[Servoct
 def test_enable_move_and_disable(servoctl: Servoctl) -> None:
     assert servoctl.state == "DISABLED"
     assert servoctl("enable").startswith("enabled\n")
-    assert servoctl("track", "sine", "--amplitude", "0.02", "--frequency", "2", "--duration", "0.5") == "motion done\n"
+    told = servoctl("track", "sine", "--amplitude", "0.02", "--frequency", "2", "--duration", "0.5").splitlines()
+    assert re.fullmatch(r"motion done: RMS error \S+ mrad, peak error \S+ mrad", told[0])
+    assert re.match(r"settling time \d\.\d{3} s after the reference had come to rest, to 0\.8 mrad \(2 % of", told[1])
+    assert re.fullmatch(r"peak torque \S+ N\*m; \d+ of (499|50[01]) cycles missed", told[2]) and len(told) == 3
     assert servoctl.state == "ENABLED"
     assert servoctl("disable") == "disabled\n"
     assert servoctl.state == "DISABLED"
+
+
+def test_the_figures_of_a_motion_are_those_of_its_recording(servoctl: Servoctl) -> None:
+    servoctl("enable")
+    path = servoctl.json("record", "start")["path"]
+    found = servoctl.json("track", "paper", "--duration", "3")["figures"]
+    servoctl("record", "stop")
+    rows = moving(rows_of(read_recording(path).rows))
+    error_mrad = 1e3 * (rows["reference_rad"] - rows["position_rad"])
+    expected = score(1e-9 * (rows["time_ns"] - rows["time_ns"][0]), error_mrad)
+    assert found["rms_error_mrad"] == pytest.approx(expected.rms_error_mrad, rel=1e-2)  # the last cycle is not moving
+    assert found["max_error_mrad"] == pytest.approx(expected.max_error_mrad, rel=1e-2)
+    assert found["peak_torque_nm"] == pytest.approx(float(np.abs(rows["torque_nm"]).max()), rel=1e-2)
+    assert found["missed_cycles"] == rows["missed"][-1] - rows["missed"][0]
+    assert (found["judged_from_s"], found["lost_cycles"]) == (1.0, 0)
+    assert found["watched_s"] >= 0.5
+
+
+def test_a_motion_is_drawn_with_its_every_cycle(servoctl: Servoctl, tmp_path: Path) -> None:
+    servoctl("enable")
+    page, words = tmp_path / "motion.html", ("--amplitude", "0.005", "--frequency", "20", "--duration", "0.5")
+    assert servoctl("track", "sine", *words, "--plot", str(page)).endswith(f"\ndrawn: {page}\n")
+    text = page.read_text()
+    assert "motion done: RMS error" in text and "state feedback" in text
+    kept = json.loads(re.findall(r"^const kept = (.*);$", text, re.MULTILINE)[0])
+    time_s = np.frombuffer(base64.b64decode(kept["times"][0]), "<f8")
+    reference = np.frombuffer(base64.b64decode(kept["curves"][0]["y"]), "<f4")
+    assert time_s[-1] > 0.9 and np.median(np.diff(time_s)) == pytest.approx(1e-3, rel=0.05)
+    assert np.ptp(reference) == pytest.approx(0.01, rel=2e-2)
+    turns = np.flatnonzero(np.diff(np.sign(np.diff(reference))) != 0)
+    assert len(turns) >= 19
 
 
 def test_stop_ends_a_motion_and_switches_off(servoctl: Servoctl) -> None:
@@ -98,7 +138,7 @@ def test_a_motion_from_a_spreadsheet_has_a_byte_order_mark(servoctl: Servoctl, t
     file = tmp_path / "motion.csv"
     file.write_text("t_s,reference_rad\n0,0\n0.25,0.01\n", encoding="utf-8-sig")
     servoctl("enable")
-    assert servoctl("track", "csv", str(file)) == "motion done\n"
+    assert servoctl("track", "csv", str(file)).startswith("motion done: ")
     assert servoctl.json("status")["timing"]["period_us"] == 1000
 
 

@@ -51,6 +51,7 @@ _REQUESTS: tuple[dict[str, Any], ...] = tuple(
             (Verb.GAINS_ROLLBACK, {"trial": True}),
             (Verb.RECORD_START, {"path": "run.mcap"}),
             (Verb.RECORD_STOP, {}),
+            (Verb.CYCLES, {"after": 0}),
         )
     )
 )

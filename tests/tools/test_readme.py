@@ -112,5 +112,6 @@ def test_the_here_document_of_the_first_steps_ends_where_its_word_stands() -> No
 def test_the_first_steps_work_as_they_stand(tmp_path: Path) -> None:
     """Every line between the marks, by a shell that ends at the first error; the commands are those of this Python."""
     told = blocks.run(blocks.first_steps(), tmp_path, 100.0)
-    assert told.count("motion done") == 2
+    assert told.count("motion done: RMS error ") == 2
+    assert "drawn: out/axis/first.html" in told
     assert "open-loop position error" in told

@@ -15,7 +15,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 CORE_IMPORTS = (
-    "servod.runtime.daemon.main servod.runtime.loop.process servod.drivers.cia402 servod.drivers.cia406 servod.cli"
+    "servod.runtime.daemon.main servod.runtime.loop.process servod.drivers.cia402 servod.drivers.cia406 servod.cli "
+    "servod.client.control servod.kernels.scoring"
 )
 LAB = "numpy scipy numba plotly matplotlib pyarrow cvxpy"
 WITHOUT_LAB = f"""
@@ -105,7 +106,12 @@ def test_the_core_works_without_the_laboratory(python: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    "command", ["demo --fast", "demo", "bench --quick", "replay --model axis.yaml run.csv"], ids=lambda c: c.split()[0]
+    "command",
+    [
+        *("demo --fast", "demo", "bench --quick", "replay --model axis.yaml run.csv", "plot run.csv"),
+        "track paper --plot motion.html",  # before anything moves
+    ],
+    ids=lambda c: c.split()[0],
 )
 def test_a_command_that_needs_the_laboratory_says_so_in_one_line(python: Path, tmp_path: Path, command: str) -> None:
     (tmp_path / "axis.yaml").write_text(

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -132,6 +132,75 @@ class Step(Protocol):
         ...
 
 
+# How long a walk still takes: what its steps usually take, corrected by what those took that have ended here.
+
+
+#: Seconds of a step on a virtual axis, roughly: the first guess, whose proportions alone are believed later.
+_USUAL_S = {
+    "identify": 40.0, "synthesize": 30.0, "verify": 30.0, "deploy": 10.0, "rivals": 90.0, "validate": 30.0,
+    "report": 10.0,
+}  # fmt: skip
+#: A step that nobody has timed.
+_UNKNOWN_S = 20.0
+#: A step's own share of progress is believed from here on.
+_TOLD_SHARE = 0.1
+
+
+@dataclass
+class Outlook:
+    """The seconds that are left, from the steps that ended and the share of the one that runs.
+
+    `earlier` are the seconds that steps took when they were done in this folder before, by name.
+    """
+
+    names: tuple[str, ...]
+    earlier: Mapping[str, float] = field(default_factory=dict)
+    now_s: Callable[[], float] = time.monotonic
+    _here: int = 0
+    _began_s: float = 0.0
+    _taken_s: float = 0.0
+    _usual_s: float = 0.0
+
+    def begin(self, name: str) -> str:
+        """A step begins; which one of how many it is, in words."""
+        self._here, self._began_s = self.names.index(name), self.now_s()
+        return f"step {self._here + 1} of {len(self.names)}"
+
+    def end(self) -> None:
+        """It was done; what it took corrects what is expected of the others."""
+        self._taken_s += self.now_s() - self._began_s
+        self._usual_s += self._usual(self._here)
+
+    def left_s(self, share: float = 0.0) -> float:
+        """Of this step, of which `share` is done, and of those behind it."""
+        pace = self._taken_s / self._usual_s if self._usual_s else 1.0
+        spent_s = self.now_s() - self._began_s
+        told = _TOLD_SHARE <= share <= 1.0
+        whole_s = spent_s / share if told else pace * self._usual(self._here)
+        behind_s = sum(self._usual(k) for k in range(self._here + 1, len(self.names)))
+        return max(whole_s - spent_s, 0.0) + pace * behind_s
+
+    def left(self, share: float = 0.0) -> str:
+        """The same in words: it is a guess."""
+        left_s = self.left_s(share)
+        return f"about {round(left_s / 60.0)} min left" if left_s >= 90.0 else f"about {max(left_s, 1.0):.0f} s left"
+
+    def _usual(self, step: int) -> float:
+        name = self.names[step]
+        return self.earlier.get(name, _USUAL_S.get(name, _UNKNOWN_S))
+
+
+def with_outlook(walk: Walk, outlook: Outlook, where: str) -> Walk:
+    """The walk as a step sees it whose progress says which step this is and how long the walk still takes."""
+
+    @contextmanager
+    def progress(title: str) -> Iterator[Tell]:
+        with walk.progress(title) as tell:
+            yield lambda what, share: tell(f"{what} ({where}, {outlook.left(share)})", share)
+
+    return replace(walk, progress=progress)
+
+
 class StepFailed(AnswerIsNo):
     """A step's answer was no; carries the step's name."""
 
@@ -151,17 +220,20 @@ def run(walk: Walk, steps: tuple[Step, ...]) -> State:
             raise BadInput("--again", name, ", ".join(names))
     with sole_walk(walk.folder):
         state = State(walk.folder, walk.axis.identity, [name for step in steps for name in step.outputs(walk)])
+        outlook = Outlook(tuple(names), state.seconds)
         for step in steps:
-            inputs = step.inputs(walk)
+            inputs, where = step.inputs(walk), outlook.begin(step.name)
             if step.name not in walk.options.again and state.done(step.name, inputs, step.outputs(walk)):
-                walk.say(f"{step.title}: done before")
+                walk.say(f"{where}: {step.title}: done before")
                 continue
             state.begin(step.name, step.outputs(walk))
+            walk.say(f"{where}: {step.title}, {outlook.left()}")
             started = time.monotonic()
             try:
-                step.run(walk)
+                step.run(with_outlook(walk, outlook, where))
             except AnswerIsNo as error:
                 raise StepFailed(step.name, str(error)) from error
             state.record(step.name, inputs, time.monotonic() - started, step.outputs(walk))
-            walk.say(f"{step.title}: {state.seconds[step.name]:.1f} s")
+            outlook.end()
+            walk.say(f"{where}: {step.title}: {state.seconds[step.name]:.1f} s")
     return state

@@ -16,7 +16,7 @@ from plotly.offline import get_plotlyjs
 from servod import __version__
 from servod.common.files import write_bytes
 from servod.lab.report.figure import Figure
-from servod.lab.report.page_figure import HEAD_PX, plotly_figure
+from servod.lab.report.page_figure import HEAD_PX, every_row_script, plotly_figure
 
 _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 70rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
@@ -65,14 +65,25 @@ class Page:
         body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
         self._parts.append(f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>")
 
-    def figure(self, figure: Figure | go.Figure) -> None:
-        """Add a figure, of this project or of plotly; the caption of the former stands below it."""
+    def figure(self, figure: Figure | go.Figure, every_row: bool = False) -> None:
+        """Add a figure, of this project or of plotly; the caption of the former stands below it.
+
+        With `every_row` the page holds a figure of this project as it is, and draws what is zoomed into from that.
+        """
         self._has_figure = True
         drawn = plotly_figure(figure) if isinstance(figure, Figure) else figure
+        if every_row:
+            drawn.update_xaxes(matches="x")
         top = HEAD_PX if isinstance(figure, Figure) else 75
         drawn.update_layout(template="plotly_white", margin={"l": 70, "r": 20, "t": top, "b": 50})
         self._parts.append(
-            plotly.io.to_html(drawn, full_html=False, include_plotlyjs=False, config={"displaylogo": False})
+            plotly.io.to_html(
+                drawn,
+                full_html=False,
+                include_plotlyjs=False,
+                config={"displaylogo": False},
+                post_script=every_row_script(figure) if every_row and isinstance(figure, Figure) else None,
+            )
         )
         if isinstance(figure, Figure) and figure.caption:
             self.sentence(figure.caption)

@@ -5,6 +5,9 @@ Between the description of a figure and the page; `pictures` draws the same with
 
 from __future__ import annotations
 
+import base64
+import json
+
 import numpy as np
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
@@ -38,6 +41,85 @@ def plotly_figure(figure: Figure) -> go.Figure:
     )
     drawn.update_layout(legend={"y": 1.0 - 38.0 / height})
     return drawn
+
+
+#: Rows that a page keeps of a curve: ten minutes at 1 kHz, four bytes each and eight for the time.
+_MOST_ROWS = 600_000
+#: What is in view is drawn whole up to so many rows of a curve; of more, lowest and highest of each bin.
+_IN_VIEW = 4000
+#: Runs on the page: whenever another part comes into view, each curve is drawn anew from all its rows. A bin gives its
+#: lowest and its highest row, as `thin` does, so that a fast sine is a band from afar and a sine from near.
+_EVERY_ROW_JS = """
+const unpacked = (text, kind) => new kind(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer);
+function place(x, t) {
+  let a = 0, b = x.length;
+  while (a < b) { const m = (a + b) >> 1; if (x[m] < t) a = m + 1; else b = m; }
+  return a;
+}
+function view(x, y, from, to, most) {
+  const a = Math.max(place(x, from) - 1, 0), b = Math.min(place(x, to) + 1, x.length);
+  if (b - a <= most) return [Array.from(x.subarray(a, b)), Array.from(y.subarray(a, b))];
+  const bins = most >> 1, xs = [], ys = [];
+  for (let k = 0; k < bins; k++) {
+    const p = a + Math.floor((k * (b - a)) / bins), q = a + Math.floor(((k + 1) * (b - a)) / bins);
+    let low = p, high = p;
+    for (let i = p + 1; i < q; i++) {
+      if (y[i] < y[low] || Number.isNaN(y[low])) low = i;
+      if (y[i] > y[high] || Number.isNaN(y[high])) high = i;
+    }
+    for (const i of low === high ? [low] : [Math.min(low, high), Math.max(low, high)]) { xs.push(x[i]); ys.push(y[i]); }
+  }
+  return [xs, ys];
+}
+"""
+_REDRAW_JS = """
+const plot = document.getElementById("{plot_id}");
+const times = kept.times.map((text) => unpacked(text, Float64Array));
+const curves = kept.curves.map((c) => [times[c.time], unpacked(c.y, Float32Array)]);
+plot.on("plotly_relayout", (change) => {
+  const moved = Object.keys(change).filter((key) => key.startsWith("xaxis"));
+  if (!moved.length) return;
+  const all = moved.some((key) => key.endsWith("autorange"));
+  const [from, to] = all ? [-Infinity, Infinity] : plot.layout.xaxis.range;
+  const drawn = curves.map(([x, y]) => view(x, y, from, to, kept.most));
+  Plotly.restyle(plot, { x: drawn.map((d) => d[0]), y: drawn.map((d) => d[1]) }, curves.map((_, i) => i));
+});
+"""
+
+
+def every_row_script(figure: Figure) -> str:
+    """Script for the page that draws what is zoomed into from all rows of the curves, not from those in the picture.
+
+    `figure` has lines without bounds alone, so that each curve is one trace.
+    """
+    times: dict[int, int] = {}
+    packed: list[str] = []
+    curves = []
+    for curve in (curve for panel in figure.panels for curve in panel.curves):
+        x, y = _at_most(curve.x, curve.y, _MOST_ROWS)
+        key = id(curve.x) if x is curve.x else id(curve)
+        if key not in times:
+            times[key] = len(packed)
+            packed.append(_packed(x, "<f8"))
+        curves.append({"time": times[key], "y": _packed(y, "<f4")})
+    kept = json.dumps({"times": packed, "curves": curves, "most": _IN_VIEW})
+    return f"{_EVERY_ROW_JS}const kept = {kept};\n{_REDRAW_JS}"
+
+
+def _packed(values: Array, kind: str) -> str:
+    return base64.b64encode(np.ascontiguousarray(values, dtype=kind).tobytes()).decode()
+
+
+def _at_most(x: Array, y: Array, most: int) -> tuple[Array, Array]:
+    """A curve that is longer than `most` as lowest and highest row of equal bins."""
+    if len(y) <= most:
+        return x, y
+    width = -(-len(y) // (most // 2))
+    whole = len(y) // width * width
+    begins = np.arange(0, whole, width)
+    bins = y[:whole].reshape(-1, width)
+    kept = np.unique(np.concatenate([begins + bins.argmin(axis=1), begins + bins.argmax(axis=1), [len(y) - 1]]))
+    return x[kept], y[kept]
 
 
 def _draw(drawn: go.Figure, panel: PlotPanel, row: int, column: int, named: set[str]) -> None:

@@ -20,17 +20,12 @@ from servod.common.errors import AnswerIsNo
 from servod.formats.gains.gain_set import GainSet
 from servod.formats.model.axis_model import AxisModel
 from servod.kernels.motions import paper
+from servod.kernels.scoring import SETTLE_S, settling_band
 from servod.lab.simulate.noise import noise_of, noise_series
 from servod.lab.simulate.simulate import ClosedLoopRun, LoopSettings, simulate_closed_loop
 
 Array = NDArray[np.float64]
 
-#: Trajectory (19) is scored without its first second, in which the axis starts to move.
-SETTLE_S = 1.0
-#: A step has settled when its error stays below this share of the step ...
-BAND_SHARE = 0.02
-#: ... or below this many encoder counts, where that is more: below it the encoder tells nothing.
-BAND_COUNTS = 3.0
 #: What is held is judged from here after the step on, whether or not it has settled.
 HOLD_FROM_S = 1.0
 #: The steady error is the mean of the last part of the hold.
@@ -203,7 +198,7 @@ def step_response(
     sigma_rad = reading_rms(count_rad, encoder_rms_rad or 0.0)
     moves = encoder_rms_rad is not None and scatter(held) > SCATTER * max(sigma_rad, LEAST_COUNT_RAD / ROUNDING)
     return StepResponse(
-        settling_s=settling(time_s, error, max(BAND_SHARE * abs(step_rad), BAND_COUNTS * count_rad)),
+        settling_s=settling(time_s, error, settling_band(step_rad, count_rad)),
         overshoot=max(0.0, float(beyond) / abs(step_rad)),
         steady_error_mrad=abs(float(np.mean(error[time_s >= time_s[-1] - STEADY_S]))) * 1e3,
         hold_mrad=1e3 * (swing_rad if true_swing_rad is None else true_swing_rad),

@@ -20,10 +20,11 @@ from servod.formats.gains.gain_set import GainSet, Provenance
 from servod.formats.gains.parameters import Parameters
 from servod.formats.model.axis_model import AxisModel
 from servod.kernels.laws import LAWS
+from servod.kernels.scoring import SETTLE_S
 from servod.lab.simulate.noise import noise_of, noise_series
 from servod.lab.simulate.simulate import simulate_closed_loop
 from servod.lab.synthesize.regions import uncertainty_of
-from servod.lab.tracking.metrics import SETTLE_S, STEPS_MRAD, Array, paper_rows
+from servod.lab.tracking.metrics import STEPS_MRAD, Array, paper_rows
 from servod.lab.tune.laws import PAPER_FEEDBACK, RIVALS, AxisFacts, Range, Rival
 from servod.lab.tune.plan import Feedback, Tuned, TuningSettings
 from servod.lab.verify.plants import drawn

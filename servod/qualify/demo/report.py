@@ -15,9 +15,9 @@ import plotly.graph_objects as go
 from plotly.colors import qualitative
 
 from servod.kernels.laws import LABELS
+from servod.kernels.scoring import SETTLE_S
 from servod.lab.report.figure import histogram, time_curves
 from servod.lab.report.page import Page
-from servod.lab.tracking.metrics import SETTLE_S
 from servod.qualify.demo.axis import CONTROLLERS
 from servod.qualify.demo.entries import DemoRow
 from servod.qualify.demo.runs import Run

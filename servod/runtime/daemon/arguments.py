@@ -162,6 +162,12 @@ class RecordStartArgs(Strict):
     path: str | None = Field(None, min_length=1, max_length=4096, description="file name; none: a new one")
 
 
+class CyclesArgs(Strict):
+    """`cycles`: the records after the one with this serial number; without it the number alone of the newest."""
+
+    after: int | None = Field(None, ge=0)
+
+
 _MODELS: dict[Verb, type[Strict]] = {
     Verb.ENABLE: EnableArgs,
     Verb.HALT: HaltArgs,
@@ -172,6 +178,7 @@ _MODELS: dict[Verb, type[Strict]] = {
     Verb.GAINS_KEEP: GainsVerdictArgs,
     Verb.GAINS_ROLLBACK: GainsVerdictArgs,
     Verb.RECORD_START: RecordStartArgs,
+    Verb.CYCLES: CyclesArgs,
 }
 
 

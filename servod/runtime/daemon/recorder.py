@@ -89,7 +89,10 @@ def _now() -> str:
 
 
 class HistoryRing:
-    """The newest `capacity` packed records; all memory is taken at the start and never grows."""
+    """The newest `capacity` packed records; all memory is taken at the start and never grows.
+
+    `added` counts all that ever came: it is the serial number of the newest.
+    """
 
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
@@ -98,6 +101,7 @@ class HistoryRing:
         )  # written, so that the pages are resident from now on
         self._next = 0
         self._count = 0
+        self.added = 0
 
     def __len__(self) -> int:
         return self._count
@@ -113,15 +117,33 @@ class HistoryRing:
             count += 1
             if at == capacity:
                 at = 0
+        self.added += count - self._count
         self._next, self._count = at, min(count, capacity)
 
-    def snapshot(self) -> bytes:
-        """A copy of all records, oldest first."""
-        size = RECORD.size
-        if self._count < self.capacity:
-            return bytes(self._data[: self._count * size])
-        cut = self._next * size
-        return bytes(self._data[cut:]) + bytes(self._data[:cut])
+    def newest(self, most: int) -> bytes:
+        """A copy of the newest records, at most so many, oldest first."""
+        return self._piece(self._count - min(most, self._count), self._count)
+
+    def after(self, serial: int, most: int) -> tuple[int, bytes]:
+        """The oldest records behind that with this serial number, at most so many, and the number of the last of them.
+
+        What has left the ring is left out: the caller sees it in the number.
+        """
+        oldest = self.added - self._count
+        first = min(max(serial, oldest), self.added)
+        last = min(first + most, self.added)
+        return last, self._piece(first - oldest, last - oldest)
+
+    def _piece(self, first: int, last: int) -> bytes:
+        """Records by their place in the ring, the oldest being 0."""
+        if first == last:
+            return b""
+        size, capacity = RECORD.size, self.capacity
+        begin = (self._next - self._count + first) % capacity
+        end = begin + last - first
+        if end <= capacity:
+            return bytes(self._data[begin * size : end * size])
+        return bytes(self._data[begin * size :]) + bytes(self._data[: (end - capacity) * size])
 
 
 T = TypeVar("T")
@@ -129,6 +151,8 @@ T = TypeVar("T")
 #: A file on disk is never older than this; kill -9 loses no more.
 SYNC_PERIOD_S = 0.5
 _QUEUE_BATCHES = 1024
+#: A client that reads along may be late by this, however short the history is that fault files get.
+_LOOK_BACK_S = 2.0
 _KEPT_EVENTS = 256
 
 
@@ -150,7 +174,8 @@ class Recorder:
 
     def __init__(self, config: RecorderConfig, axis_name: str, period_us: int) -> None:
         self._files, self._history_s = RecordingFiles(config, axis_name), config.history_s
-        self._history = HistoryRing(round(config.history_s * 1e6 / period_us))
+        self._history_cycles = round(config.history_s * 1e6 / period_us)
+        self._history = HistoryRing(max(self._history_cycles, round(_LOOK_BACK_S * 1e6 / period_us)))
         self._events: deque[dict[str, Any]] = deque(maxlen=_KEPT_EVENTS)
         self._attachments: dict[str, bytes] = {}
         self._attached: dict[str, bytes] = {}  # the same, in the writing thread
@@ -193,8 +218,21 @@ class Recorder:
 
     def write_fault_file(self, label: str) -> Future[Path]:
         """Write the history, and the events so far, to a file of their own named after `label`."""
-        rows, events, attachments = self._history.snapshot(), list(self._events), dict(self._attachments)
+        rows, events, attachments = (
+            self._history.newest(self._history_cycles),
+            list(self._events),
+            dict(self._attachments),
+        )
         return self._ask(lambda: self._write_history(label, rows, events, attachments))
+
+    @property
+    def newest_cycle(self) -> int:
+        """Serial number of the newest cycle record."""
+        return self._history.added
+
+    def cycles_after(self, serial: int, most: int) -> tuple[int, bytes]:
+        """Packed records from memory: HistoryRing.after."""
+        return self._history.after(serial, most)
 
     def take_failure(self) -> str:
         """Why recording failed since the last call; empty when it did not."""

@@ -6,7 +6,9 @@ or bus work runs in one slow thread.
 
 from __future__ import annotations
 
+import base64
 import logging
+import math
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -18,9 +20,10 @@ from servod.common.errors import AnswerIsNo, Unreachable
 from servod.common.faults import FAULTS, FaultCode, faults_in
 from servod.common.units import NS_PER_S
 from servod.formats.config import AxisConfig
-from servod.formats.protocol import Verb
+from servod.formats.protocol import PIECE_CYCLES, Verb
 from servod.formats.recording.record import CycleRecord
 from servod.runtime.daemon.arguments import (
+    CyclesArgs,
     EnableArgs,
     GainsActivateArgs,
     GainsLoadArgs,
@@ -92,6 +95,7 @@ class Verbs:
             Verb.RECORD_STOP: self._record_stop,
             Verb.SCAN: self._scan,
             Verb.FAULTS: self._tell_faults,
+            Verb.CYCLES: self._cycles,
         }
 
     def handle(self, verb: Verb, args: dict[str, Any], reply: Reply) -> None:
@@ -158,6 +162,14 @@ class Verbs:
 
     async def _tell_faults(self, _args: NoArgs) -> dict[str, Any]:
         return self._faults()
+
+    async def _cycles(self, args: CyclesArgs) -> dict[str, Any]:
+        """A piece of what the recorder holds in memory; as text of the packed records, which costs least."""
+        serial, raw = self._recorder.newest_cycle, b""
+        if args.after is not None:
+            serial, raw = self._recorder.cycles_after(args.after, PIECE_CYCLES)
+        count_rad = 2.0 * math.pi / self._config.encoder.counts_per_turn
+        return {"last": serial, "records": base64.b64encode(raw).decode(), "count_rad": count_rad}
 
     async def _enable(self, args: EnableArgs) -> dict[str, Any]:
         record = self._loop.latest

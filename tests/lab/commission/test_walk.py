@@ -14,6 +14,7 @@ from servod.client.open import VirtualWalkAxis
 from servod.common.errors import AnswerIsNo
 from servod.formats.gains.gain_set import load_gains
 from servod.formats.model.axis_model import axis_model_yaml
+from servod.lab.commission import walk
 from servod.lab.commission.comparison import load_curves, load_rows, save_curves
 from servod.lab.commission.report import failure, sections
 from servod.lab.commission.state import (
@@ -29,11 +30,12 @@ from servod.lab.commission.state import (
     write_text,
 )
 from servod.lab.commission.state import read_walk_json as read_json
+from servod.lab.commission.steps import STEPS as ALL_STEPS
 from servod.lab.commission.steps.deploy import Deploy
 from servod.lab.commission.steps.synthesize import Synthesize, agreed, relaxed, tell_clashes
 from servod.lab.commission.steps.validate import document as comparison
 from servod.lab.commission.steps.verify import Verify
-from servod.lab.commission.walk import Questions, Step, StepFailed, Tell, Walk, WalkOptions, run
+from servod.lab.commission.walk import Outlook, Questions, Step, StepFailed, Tell, Walk, WalkOptions, run
 from servod.lab.deploy.deployment import motion_notice
 from servod.lab.report.figure import Figure, PageTable
 from servod.lab.synthesize.deployed import Wishes
@@ -218,3 +220,44 @@ def test_a_law_that_stands_alone_says_no_roughness_limit() -> None:
 
 #: Sections that need no recordings of an identification.
 SHOWN = {"The law and its design", "The certificate", "Deployment", "Tracking"}
+
+
+def test_what_is_left_follows_the_pace_of_the_steps_that_ended() -> None:
+    now = [0.0]
+    outlook = Outlook(("identify", "deploy", "report"), {"deploy": 20.0}, lambda: now[0])
+    assert outlook.begin("identify") == "step 1 of 3"
+    assert outlook.left_s() == 70.0 and outlook.left() == "about 70 s left"
+    now[0] = 20.0
+    assert outlook.left_s(0.05) == 50.0  # too early to believe a share
+    assert outlook.left_s(0.25) == 90.0 and outlook.left(0.25) == "about 2 min left"
+    now[0] = 80.0
+    assert outlook.left_s(1.0) == 30.0
+    outlook.end()
+    assert outlook.begin("deploy") == "step 2 of 3"
+    assert outlook.left_s() == 60.0  # twice as slow as usual
+    now[0] = 500.0
+    assert outlook.left_s() == 20.0 and outlook.left_s(float("nan")) == 20.0
+
+
+def test_every_step_of_the_walk_has_a_usual_time() -> None:
+    assert set(walk._USUAL_S) == {step.name for step in ALL_STEPS}
+
+
+def test_the_progress_says_which_step_it_is_and_what_is_left(tmp_path: Path) -> None:
+    told: list[str] = []
+
+    @contextmanager
+    def progress(_title: str) -> Iterator[Tell]:
+        yield lambda what, _share: told.append(what)
+
+    @dataclass(frozen=True)
+    class Telling(Known):
+        def run(self, walk: Walk) -> None:
+            with walk.progress(self.title) as tell:
+                tell("moving", 0.0)
+            super().run(walk)
+
+    said: list[str] = []
+    run(replace(walk_in(tmp_path), progress=progress, say=said.append), (Telling(),))
+    assert told == ["moving (step 1 of 1, about 20 s left)"]
+    assert said[0] == "step 1 of 1: known, about 20 s left"

@@ -251,12 +251,38 @@ def test_second_start_and_unwritable_directory_are_refused(tmp_path: Path) -> No
 
 def test_history_ring_keeps_the_newest_in_order() -> None:
     ring = HistoryRing(10)
-    assert ring.snapshot() == b""
+    assert ring.newest(10) == b""
     ring.add(rows(4))
-    assert list(split_rows(ring.snapshot())) == rows(4)
+    assert list(split_rows(ring.newest(10))) == rows(4)
     ring.add(rows(23, 4))
-    assert list(split_rows(ring.snapshot())) == rows(10, 17)
+    assert list(split_rows(ring.newest(10))) == rows(10, 17)
     assert len(ring) == 10
+    assert list(split_rows(ring.newest(3))) == rows(3, 24)
+
+
+def test_history_ring_goes_on_behind_a_serial_number() -> None:
+    ring = HistoryRing(10)
+    assert ring.after(0, 5) == (0, b"")
+    ring.add(rows(7))
+    last, raw = ring.after(0, 5)
+    assert (last, list(split_rows(raw))) == (5, rows(5))
+    ring.add(rows(6, 7))
+    last, raw = ring.after(last, 100)
+    assert (last, list(split_rows(raw))) == (13, rows(8, 5))
+    assert ring.after(13, 5) == (13, b"")
+    ring.add(rows(20, 13))
+    assert ring.after(13, 4) == (27, b"".join(rows(4, 23)))  # 10 of those behind it had left the ring
+    assert ring.after(1000, 4) == (33, b"")
+
+
+def test_a_short_history_for_fault_files_leaves_room_to_read_along(tmp_path: Path) -> None:
+    recorder = _recorder(tmp_path, history_s=0.005)
+    recorder.add_rows(rows(1000))
+    assert recorder.newest_cycle == 1000
+    assert recorder.cycles_after(100, 3) == (103, b"".join(rows(3, 100)))
+    fault = read_recording(recorder.write_fault_file("x").result(5))
+    recorder.close()
+    assert [r.cycle for r in fault.records()] == [995, 996, 997, 998, 999]
 
 
 def test_who_gave_up_waiting_does_not_end_the_recorders_thread() -> None:

@@ -1,6 +1,8 @@
 """Requests: their arguments, how they wait, and what the verbs make of them."""
 
 import asyncio
+import json
+import math
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
@@ -8,10 +10,13 @@ from pathlib import Path
 from typing import Any, cast
 
 import pytest
-from daemon_rows import axis_config, record
+from daemon_rows import axis_config, record, row, rows
 
+from servod.client.control import ControlClient, CycleStream
 from servod.common.errors import BadInput, Unreachable
-from servod.formats.protocol import Verb
+from servod.formats.config import RecorderConfig
+from servod.formats.protocol import PIECE_CYCLES, Verb, encode_line
+from servod.formats.recording.record import CycleRecord
 from servod.runtime.daemon.arguments import check_arguments
 from servod.runtime.daemon.connection import Reply
 from servod.runtime.daemon.gain_bank import GainBank
@@ -66,6 +71,7 @@ def test_motions_become_the_loops_arguments(args: dict[str, Any], reference: lis
         (Verb.GAINS_LOAD, {"name": "x"}, "text"),
         (Verb.GAINS_ACTIVATE, {"name": ""}, "name"),
         (Verb.STATUS, {"x": 1}, "unknown key"),
+        (Verb.CYCLES, {"after": -1}, "after"),
     ],
 )
 def test_bad_arguments_are_one_line(verb: Verb, args: dict[str, Any], says: str) -> None:
@@ -249,6 +255,37 @@ def verbs(tmp_path: Path) -> Iterator[tuple[Verbs, _Loop]]:
     config = config.model_copy(update={"limits": config.limits.model_copy(update={"speed_rad_s": 1e3})})
     verbs = Verbs(config, cast(LoopHandle, loop), cast(GainBank, _Bank()), cast(Recorder, _Events()), dict, dict)
     yield verbs, loop
+    verbs.close()
+
+
+def test_cycles_go_out_in_pieces_and_what_left_the_memory_is_counted(tmp_path: Path) -> None:
+    config = axis_config(tmp_path / "s", tmp_path / "c")
+    recorder = Recorder(RecorderConfig(directory=tmp_path, history_s=0.0), "axis", 1000)
+    verbs = Verbs(config, cast(LoopHandle, _Loop()), cast(GainBank, _Bank()), recorder, dict, dict)
+
+    class _Client:
+        path = "axis.sock"
+
+        def call(self, verb: Verb, **args: Any) -> dict[str, Any]:
+            answers = _Answers()
+            verbs.handle(verb, args, answers.reply())
+            result: dict[str, Any] = json.loads(encode_line(answers.sent[0]))["result"]
+            return result
+
+    recorder.add_rows(rows(5))
+    stream = CycleStream(cast(ControlClient, _Client()))
+    assert stream.count_rad == pytest.approx(2.0 * math.pi / config.encoder.counts_per_turn)
+    assert stream.take() == row(4, position_rad=0.004)
+    assert stream.take() == b""
+    recorder.add_rows(rows(2 * PIECE_CYCLES, 5))
+    assert stream.take() == b"".join(rows(2 * PIECE_CYCLES, 5))
+    recorder.add_rows([row(2000, position_rad=math.nan)])
+    assert math.isnan(CycleRecord.unpack(stream.take()).position_rad)
+    assert stream.lost == 0
+    recorder.add_rows(rows(2300, 3000))
+    assert stream.take() == b"".join(rows(2000, 3300))  # two seconds are kept, however short the history
+    assert stream.lost == 300
+    recorder.close()
     verbs.close()
 
 

@@ -5,12 +5,13 @@ Stands on motions as arrays, cut from cycle records or from the compiled simulat
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from servod.common.faults import FaultCode
 from servod.lab.report.figure import COLOURS, Array, Colour, Curve, Figure, PlotAxis, PlotPanel, Style, array, curve
 from servod.lab.simulate.simulate import ClosedLoopRun
 
@@ -209,3 +210,115 @@ def disturbed_friction(nominal: PlottedMotion, disturbed: PlottedMotion, name: s
         PlotPanel(t, PlotAxis("error in mrad"), tuple(error), "tracking error"),
     )
     return Figure(name, "Friction tuned from its nominal level by filtered noise", panels, caption=caption)
+
+
+# A recording over time: what the loop wanted, what it got, what it commanded, and what axis and drive said of it.
+
+
+#: Places of a state panel: names of the states by their number in the record.
+StateNames = tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class RecordedRun:
+    """Columns of a recording that can be drawn, by their names in the cycle record (rad, N*m) or those of a linear axis
+    (m, N), and the time of each row in s.
+
+    `states` names what the columns of states hold: (column, title of its panel, names by number).
+    """
+
+    title: str
+    time_s: Array
+    columns: Mapping[str, NDArray[np.generic]]
+    states: tuple[tuple[str, str, StateNames], ...] = ()
+
+    def between(self, from_s: float | None, to_s: float | None) -> RecordedRun:
+        """The rows from `from_s` to before `to_s` (None: its begin, its end)."""
+        first = 0 if from_s is None else int(np.searchsorted(self.time_s, from_s))
+        last = len(self.time_s) if to_s is None else int(np.searchsorted(self.time_s, to_s))
+        columns = {name: values[first:last] for name, values in self.columns.items()}
+        return replace(self, time_s=self.time_s[first:last], columns=columns)
+
+
+#: Names in the record, and in the legend; each is drawn where the recording has it.
+_TORQUES = (
+    ("torque_nm", "commanded", Colour.BLACK),
+    ("torque_actual_nm", "measured by the drive", Colour.GREY),
+    ("torque_feedback_nm", "part: state feedback", Colour.BLUE),
+    ("torque_friction_nm", "part: friction compensation", Colour.ORANGE),
+    ("torque_other_nm", "part: observer, feed-forward, offset", Colour.GREEN),
+)
+_FORCES = (("force_n", "commanded", Colour.BLACK), ("force_actual_n", "measured by the drive", Colour.GREY))
+
+
+def recorded_run(run: RecordedRun, name: str = "recording") -> Figure:
+    """Reference and position, error, torque with its parts, states, and faults, one below the other."""
+    rotary = "position_rad" in run.columns
+    unit = "rad" if rotary else "m"
+    position, reference = run.columns[f"position_{unit}"], run.columns.get(f"reference_{unit}")
+    x = run.time_s
+    t = PlotAxis("time in s", span=(float(x[0]), float(x[-1])))  # a short fault stands below its time
+    curves = [] if reference is None else [curve("reference", x, reference, Colour.GREY, Style.DASHED)]
+    panels = [PlotPanel(t, PlotAxis(f"position in {unit}"), (*curves, curve("position", x, position, Colour.BLUE)))]
+    if reference is not None:
+        error = MILLI * (array(reference) - array(position))
+        panels.append(
+            PlotPanel(t, PlotAxis(f"error in m{unit}"), (curve("error", x, error, Colour.ORANGE, width=1.0),))
+        )
+    torques = tuple(
+        curve(label, x, run.columns[column], colour, width=1.0)
+        for column, label, colour in (_TORQUES if rotary else _FORCES)
+        if column in run.columns
+    )
+    panels.append(PlotPanel(t, PlotAxis("torque in N·m" if rotary else "force in N"), torques))
+    panels += [_states(run, t, *shown) for shown in run.states if shown[0] in run.columns]
+    faults = _faults(run, t)
+    return Figure(name, run.title, tuple(panels + faults), caption=_caption(run, bool(faults)), row_height=0.75)
+
+
+def _states(run: RecordedRun, t: PlotAxis, column: str, title: str, names: StateNames) -> PlotPanel:
+    """A line that jumps where the state changes."""
+    x, y = _stairs(run.time_s, array(run.columns[column]))
+    return PlotPanel(
+        t, PlotAxis("", span=(-0.5, len(names) - 0.5), names=names), (curve(title, x, y, Colour.PURPLE),), title
+    )
+
+
+def _stairs(x: Array, y: Array) -> tuple[Array, Array]:
+    """The corners of a series that holds its values: at each change the value of before, and the new one."""
+    at = np.flatnonzero(np.diff(y)) + 1
+    ends = np.array([0, len(y) - 1]) if len(y) else np.zeros(0, dtype=np.int64)
+    corners = np.sort(np.concatenate([ends, at, at]))
+    ys = y[corners]
+    second = np.append(corners[1:] == corners[:-1], False) if len(corners) else np.zeros(0, dtype=np.bool_)
+    ys[second & np.isin(corners, at)] = y[corners[second & np.isin(corners, at)] - 1]
+    return x[corners], ys
+
+
+def _faults(run: RecordedRun, t: PlotAxis) -> list[PlotPanel]:
+    """A bar over the time in which a fault was present, in a row for each; no panel where none was."""
+    bits = np.asarray(run.columns.get("faults", np.zeros(len(run.time_s))), dtype=np.int64)
+    codes = [code for code in FaultCode if np.any(bits & (1 << code))]
+    if not codes:
+        return []
+    curves = []
+    for place, code in enumerate(codes):
+        present = np.concatenate([[0], (bits >> code) & 1, [0]])
+        begins, ends = np.flatnonzero(np.diff(present) > 0), np.flatnonzero(np.diff(present) < 0) - 1
+        until_s = run.time_s[np.minimum(ends + 1, len(run.time_s) - 1)]
+        x = np.column_stack([run.time_s[begins], until_s, until_s]).ravel()
+        y = np.tile([float(place), float(place), np.nan], len(begins))
+        curves.append(curve("fault", x, y, Colour.ORANGE, width=5.0, detail=code.name))
+        curves.append(curve("fault", x[::3], y[::3], Colour.ORANGE, Style.POINTS, detail=code.name))  # seen from afar
+    names = tuple(code.name for code in codes)
+    return [PlotPanel(t, PlotAxis("", span=(-0.5, len(names) - 0.5), names=names), tuple(curves), "faults present")]
+
+
+def _caption(run: RecordedRun, faults: bool) -> str:
+    rows = len(run.time_s)
+    said = [f"{rows} cycles from {run.time_s[0]:.3f} to {run.time_s[-1]:.3f} s" if rows else "no cycles"]
+    if "missed" in run.columns and rows:
+        said.append(f"missed periods: {int(run.columns['missed'][-1]) - int(run.columns['missed'][0])}")
+    if "faults" in run.columns and not faults:
+        said.append("no fault present")
+    return ", ".join(said) + "."

@@ -22,6 +22,7 @@ from servod.common.files import write_bytes
 from servod.formats.gains.design import Uncertainty
 from servod.formats.gains.gain_set import GainSet
 from servod.formats.model.axis_model import AxisModel, axis_model_yaml, load_axis_model
+from servod.kernels.scoring import SETTLE_S
 from servod.lab.commission.comparison import save_rows
 from servod.lab.deploy.deployment import deploy
 from servod.lab.deploy.judge import broken_promises, doubtful_timing
@@ -39,7 +40,7 @@ from servod.lab.report.figures.signature import signature_figure
 from servod.lab.synthesize.deployed import Wishes
 from servod.lab.synthesize.gain_set import DesignOptions, synthesize
 from servod.lab.synthesize.infeasible import Infeasible
-from servod.lab.tracking.metrics import REST_S, SETTLE_S, Array, score
+from servod.lab.tracking.metrics import REST_S, Array, score
 from servod.lab.verify.certify import verify
 from servod.lab.verify.checks import LEAST_PLANTS
 from servod.lab.verify.vertices import least_widths
