@@ -165,7 +165,7 @@ class RecordStartArgs(Strict):
 class CyclesArgs(Strict):
     """`cycles`: the records after the one with this serial number; without it the number alone of the newest."""
 
-    after: int | None = Field(None, ge=0)
+    after: int | None = Field(None, ge=0, description="serial number of the last record that is known")
 
 
 _MODELS: dict[Verb, type[Strict]] = {
