@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 from servod.kernels.laws import LAW_BY_NUMBER, LAWS, Law, in_slots
 from servod.kernels.laws.state import LawState
 
-#: Time constant of the additive offset that makes a change of controller bumpless [s].
+#: Time constant of the offsets of torque and reference that make a change of controller bumpless [s].
 BUMPLESS_TIME_S = 0.1
-NEGLIGIBLE_OFFSET_NM = 1e-9
+NEGLIGIBLE_OFFSET_NM = NEGLIGIBLE_OFFSET_RAD = 1e-9
 
 
 class ControllerOutput(NamedTuple):
@@ -34,7 +34,7 @@ class Controller:
         self._law = LAWS["pd"]
         self._parameters = in_slots(self._law.named((0.0,) * self._law.n_parameters))
         self._state = LawState()
-        self._offset_nm = 0.0
+        self._offset_nm = self._offset_rad = 0.0
         self._hand_over_nm: float | None = None
 
     @property
@@ -55,7 +55,9 @@ class Controller:
     def activate(self, law_number: int, parameters: Sequence[float], torque_now_nm: float) -> bool:
         """Change law or gains between two cycles; the next output is `torque_now_nm`, the torque that acts now.
 
-        The difference to what the new law asks becomes an offset that decays with the bumpless time constant. A
+        The new law begins with the reference where the joint stands; this offset, and that of the torque to what the
+        law then asks, decay with the bumpless time constant. (An offset of torque alone would cancel the feedback of
+        one region of a scheduled law, and be left over, in the wrong direction, when the joint comes into the other.) A
         friction state is carried over as torque, a disturbance estimate only within the same law. Returns False, and
         changes nothing, for an unknown law or parameters of the wrong length.
         """
@@ -97,16 +99,26 @@ class Controller:
         `added_nm` is the torque of an excitation, which comes on top and counts as `other`.
         NaN in any measurement comes out as NaN: the limits decide what happens then, not the controller.
         """
+        self._take_over(x_ref - x, dt)
+        x_ref -= self._offset_rad
         torque, feedback, friction, other = self._law.step(
             self._parameters, self._state, x_ref, v_ref, a_ref, x, v, u_applied, dt
         )
         if self._hand_over_nm is not None:
             self._offset_nm = self._hand_over_nm - torque
             self._hand_over_nm = None
-        elif self._offset_nm != 0.0:
-            self._offset_nm *= math.exp(-dt / self._bumpless_time_s)
-            if abs(self._offset_nm) < NEGLIGIBLE_OFFSET_NM:
-                self._offset_nm = 0.0
         torque += self._offset_nm + added_nm
         self._state.asked = torque
         return ControllerOutput(torque, feedback, friction, other + self._offset_nm + added_nm)
+
+    def _take_over(self, error: float, dt: float) -> None:
+        """The offsets of this cycle: the whole error in the first one after a change, then ever less."""
+        if self._hand_over_nm is not None:
+            self._offset_rad = error if math.isfinite(error) else 0.0
+        elif self._offset_nm != 0.0 or self._offset_rad != 0.0:
+            left = math.exp(-dt / self._bumpless_time_s)
+            self._offset_nm, self._offset_rad = self._offset_nm * left, self._offset_rad * left
+            if abs(self._offset_nm) < NEGLIGIBLE_OFFSET_NM:
+                self._offset_nm = 0.0
+            if abs(self._offset_rad) < NEGLIGIBLE_OFFSET_RAD:
+                self._offset_rad = 0.0

@@ -10,6 +10,8 @@ from typing import Any
 
 import pytest
 
+from servod.common.shipped import shipped
+from servod.formats.gains.gain_set import load_gains
 from servod.kernels.laws import LAW_BY_NUMBER, LAWS, MAX_PARAMETERS, MAX_SETS, LawNumber, in_slots, local
 from servod.kernels.laws.position import PositionTorques
 from servod.kernels.laws.state import LawState
@@ -36,6 +38,23 @@ def test_change_is_bumpless(old: str, new: str) -> None:
     first = controller.step(0.03, 0.1, 0.0, 0.028, 0.09, torque, DT)
     assert first.u == pytest.approx(torque, abs=1e-9)
     assert first.u == pytest.approx(first.feedback + first.friction + first.other, abs=1e-12)
+
+
+@pytest.mark.parametrize("gains", ["demo_local_certified", "demo_local", "demo_local_stiff", "demo_pd_dob"])
+def test_a_change_under_a_following_error_goes_straight_to_what_the_new_law_asks(gains: str) -> None:
+    """A joint that sticks 25 mrad from its reference: never a torque below that of before, and no step on the way."""
+    controller, error = Controller(), 0.025
+    controller.activate(LawNumber.PD, (2.5, 0.12, 0.0), 0.0)
+    before = applied = 2.5 * error
+    new = load_gains(shipped(f"gains/{gains}.yaml"))
+    assert controller.activate(new.law.number, new.pack(), before)
+    asked = []
+    for _ in range(20):
+        applied = controller.step(error, 0.0, 0.0, 0.0, 0.0, applied, DT).u
+        asked.append(applied)
+    assert asked[0] == pytest.approx(before, abs=1e-9)
+    assert min(asked) >= before - 1e-3 and asked == sorted(asked)
+    assert max(b - a for a, b in itertools.pairwise(asked)) < 0.1
 
 
 def test_offset_decays_with_the_stated_time_constant() -> None:
@@ -96,10 +115,10 @@ def test_a_bumpless_offset_is_no_limit_to_the_anti_windup() -> None:
     controller = Controller()
     controller.activate(LawNumber.LOCAL, local_parameters(gain=0.04), -0.05)
     applied, states = -0.05, [0.0]
-    for _ in range(3):  # asked and applied agree all the time, so l goes on from the first step
+    for _ in range(4):  # asked and applied agree all the time, so l goes on as soon as there is an error
         applied = controller.step(1e-3, 0.0, 0.0, 0.0, 0.0, applied, DT).u
         states.append(controller.friction_state)
-    assert states == sorted(set(states))
+    assert states[1:] == sorted(set(states))  # the first step begins with the reference where the joint stands
 
 
 @pytest.mark.parametrize(
