@@ -1,4 +1,4 @@
-"""Health, faults, arguments, flows and locks: what the supervisor is made of."""
+"""Health, faults, arguments, requests and locks: what the supervisor is made of."""
 
 import logging
 import subprocess
