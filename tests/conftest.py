@@ -22,6 +22,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Tables and logs are compared as text: screen, colours and service manager of whoever runs the tests are no part of it.
 for name in ("COLUMNS", "LINES", "NO_COLOR", "FORCE_COLOR", "JOURNAL_STREAM", "NOTIFY_SOCKET", "WATCHDOG_USEC"):
     os.environ.pop(name, None)
+os.environ["TERM"] = "xterm"  # on a dumb one no bar is drawn
 
 #: The longest path of a socket, and what pytest, a test's name and the socket's own add to the temporary folder.
 SOCKET_PATH_BYTES = 107
