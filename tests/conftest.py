@@ -63,6 +63,9 @@ PROCESSES = (
     *("qualify/faults/test_processes.py", "qualify/soak/test_wall.py"),
 )
 
+#: Markers of few files; `-m` with one of them first loads no others.
+RARE = ("serial", "alone", "long")
+
 # A loaded machine is no finding; the examples are what counts.
 settings.register_profile("house", deadline=None)
 settings.load_profile("house")
@@ -95,12 +98,29 @@ def pytest_configure(config: pytest.Config) -> None:
                 signal.signal(number, lambda *_: None)
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Do not load a file that has none of the few tests asked for: that takes longer than some of the tests."""
+    wanted = config.getoption("markexpr").split(" ")[0]
+    if wanted in RARE and collection_path.suffix == ".py" and not marked(collection_path, wanted):
+        return True
+    return None
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the tests of SERIAL and PROCESSES, before the selection by marker."""
     for item in items:
         for mark in marks_of(item.path):
             item.add_marker(mark)
+        for name in RARE:
+            if item.get_closest_marker(name) and not marked(item.path, name):
+                raise pytest.UsageError(f"{item.path}: write mark.{name} into the file itself")
+
+
+@cache
+def marked(path: Path, name: str) -> bool:
+    """Whether a file has tests of this marker: by its own words or by the tables above."""
+    return f"mark.{name}" in path.read_text() or any(mark.name == name for mark in marks_of(path))
 
 
 @cache

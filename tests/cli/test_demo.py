@@ -161,7 +161,7 @@ def wait_until_it_moves(tmp_path: Path) -> None:
 
 @pytest.mark.serial
 def test_the_demo_on_the_wall_clock(tmp_path: Path) -> None:
-    demo = start(tmp_path, "--seconds", "4", "--json")
+    demo = start(tmp_path, "--seconds", "2.5", "--json")
     out, err = demo.communicate(timeout=100)
     assert (demo.returncode, err) == (0, "")
     check(json.loads(out), tmp_path / "out")

@@ -21,7 +21,8 @@ from servod.common.yaml import parse_yaml, validate
 from servod.formats.model.axis_model import AxisModel, axis_model_yaml, load_axis_model
 from servod.lab.identify import store
 from servod.lab.identify.analysis import Analysis, analyse
-from servod.lab.identify.experiments.common import enable_powerless
+from servod.lab.identify.bounds import bounds_from
+from servod.lab.identify.experiments.common import SPEED_SPAN_S, enable_powerless, peak_speed
 from servod.lab.identify.fits.cogging import GRAVITY
 from servod.lab.identify.result import changes, document, identified, model_of
 from servod.lab.identify.trace import ExperimentKind, trace_of
@@ -72,6 +73,11 @@ def test_the_frequency_response_is_in_the_document(found):
     turned = np.subtract(told["fitted_phase_deg"], told["phase_deg"])
     assert np.max(np.abs(off[upper])) < 0.04
     assert np.max(np.abs(turned[upper])) < 3.0
+
+
+def test_no_experiment_is_faster_than_planned(found):
+    allowed = bounds_from(found.axis.config.limits, 0.0, None, None)
+    assert max(peak_speed(trace, SPEED_SPAN_S) for trace in store.load(found.recordings)) <= allowed.speed_rad_s * 1.05
 
 
 def test_noise_at_rest(found):
