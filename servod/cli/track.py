@@ -15,7 +15,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servod.cli.common import DEFAULT_SOCKET, JsonOption, SocketOption, ask, connect, example, report, suggest
+from servod.cli.common import (
+    DEFAULT_SOCKET,
+    JsonOption,
+    SocketOption,
+    ask,
+    connect,
+    example,
+    print_json,
+    report,
+    suggest,
+)
 from servod.common.errors import AnswerIsNo, BadInput
 
 if TYPE_CHECKING:
@@ -33,6 +43,8 @@ _WATCH_S = 0.5
 _LONGEST_PLOT_S = 600.0
 #: Somebody may halt a motion for as long as he likes: what comes beyond this is not drawn.
 _MOST_KEPT_BYTES = 512 * 1024**2
+#: How the figures of a motion begin that ran to its end.
+_DONE = "motion done"
 _app = typer.Typer(
     help=example("Run a reference motion from where the axis stands.", "servoctl track paper --duration 30"),
     rich_markup_mode=None,
@@ -140,16 +152,29 @@ def _track(
             return
         watched = _Watched(client, draw is not None)
         with _progress(duration_s, as_json) as tell:
-            result = _run(client, motion, watched, tell)
-    figures = watched.tally.figures()
-    document = figures.document() | {"lost_cycles": watched.lost} if figures else None
-    said = _in_words(document)
-    _suggest(document, plot)
-    report(result | {"figures": document}, "\n".join(said), as_json)
+            try:
+                result = _run(client, motion, watched, tell)
+            except AnswerIsNo:
+                watched.look()
+                if not as_json:
+                    _show(watched, "motion broken off", draw, plot)
+                raise
+    if as_json:
+        print_json(result | {"figures": watched.document()})
+        if draw is not None:
+            draw(bytes(watched.kept), _in_words(watched.document(), _DONE))
+        return
+    _suggest(watched.document(), plot)
+    _show(watched, _DONE, draw, plot)
+
+
+def _show(watched: _Watched, begins: str, draw: Callable[[bytes, list[str]], None] | None, plot: Path | None) -> None:
+    """Figures and picture of what was seen."""
+    said = _in_words(watched.document(), begins)
+    print("\n".join(said))
     if draw is not None:
         draw(bytes(watched.kept), said)
-        if not as_json:
-            print(f"drawn: {plot}")
+        print(f"drawn: {plot}")
 
 
 def _drawing(
@@ -189,6 +214,11 @@ class _Watched:
         """Cycles that came too late to be seen."""
         return self._stream.lost
 
+    def document(self) -> dict[str, Any] | None:
+        """The figures as plain values; None where too little was seen."""
+        figures = self.tally.figures()
+        return figures.document() | {"lost_cycles": self.lost} if figures else None
+
     def look(self) -> None:
         """Take what has come."""
         from servod.formats.recording.record import RECORD, CycleRecord
@@ -211,15 +241,15 @@ def _suggest(figures: dict[str, Any] | None, plot: Path | None) -> None:
         suggest(*sys.argv[1:], "--plot", "motion.html", why="the same motion in pictures")
 
 
-def _in_words(figures: dict[str, Any] | None) -> list[str]:
+def _in_words(figures: dict[str, Any] | None, begins: str) -> list[str]:
     """What people read."""
     if figures is None:
-        return ["motion done: too short for figures"]
+        return [f"{begins}: too short for figures"]
     begin = f" from {figures['judged_from_s']:g} s on" if figures["judged_from_s"] else ""
     return [
-        f"motion done: RMS error {figures['rms_error_mrad']:.4g} mrad, peak error {figures['max_error_mrad']:.4g} mrad"
+        f"{begins}: RMS error {figures['rms_error_mrad']:.4g} mrad, peak error {figures['max_error_mrad']:.4g} mrad"
         + begin,
-        _settled_in_words(figures),
+        *([_settled_in_words(figures)] if begins == _DONE else []),
         f"peak torque {figures['peak_torque_nm']:.4g} N*m; {figures['missed_cycles']} of {figures['cycles']} cycles "
         "missed" + (f"; {figures['lost_cycles']} cycles not seen" if figures["lost_cycles"] else ""),
     ]

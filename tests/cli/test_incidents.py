@@ -61,6 +61,26 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
+def test_faults_of_one_stop_are_one_incident_however_far_apart(tmp_path: Path, capsys) -> None:
+    """A blocked joint first, and 12 s later, with nobody having enabled it, the drive gives up."""
+    recorder = Recorder(RecorderConfig(directory=tmp_path, history_s=30.0), "joint", 1000)
+    watch = FaultWatch(recorder, Health(1000, 0.4), AxisMetrics("joint", 0.4), "joint")
+    for cycle in range(0, 14_000, 10):
+        faults = word(BLOCKED) if cycle < 12_500 else word(BLOCKED, LEFT)
+        state = AxisState.ENABLED if cycle < 500 else AxisState.FAULT
+        values = {"faults": faults if cycle >= 500 else 0, "faults_latched": faults if cycle >= 500 else 0}
+        time_ns = (cycle + 1) * 1_000_000
+        recorder.add_rows([row(cycle, **values, axis_state=state, time_ns=time_ns)])
+        watch.see([record(cycle, **values, axis_state=state, time_ns=time_ns)], time_ns)
+        watch.tick(time_ns)
+    watch.tick(10**12)
+    recorder.close()
+    newest = max(tmp_path.glob("joint-fault-*.mcap"), key=lambda path: path.stat().st_size)
+    (incident,) = told([str(newest)], capsys)["incidents"]
+    assert incident["code"] == "FOLLOWING_ERROR"
+    assert {other["code"] for other in incident["faults"]} == {"FOLLOWING_ERROR", "DRIVE_LEFT_OPERATION"}
+
+
 def told(words: list[str], capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
     assert run(["faults", *words, "--json"]) == 0
     document: dict[str, Any] = json.loads(capsys.readouterr().out)

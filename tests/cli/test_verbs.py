@@ -11,6 +11,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -100,6 +101,22 @@ def test_the_figures_of_a_motion_are_those_of_its_recording(servoctl: Servoctl) 
     assert found["missed_cycles"] == rows["missed"][-1] - rows["missed"][0]
     assert (found["judged_from_s"], found["lost_cycles"]) == (1.0, 0)
     assert found["watched_s"] >= 0.5
+
+
+def test_a_motion_that_is_broken_off_says_how_it_was_until_then(
+    servoctl: Servoctl, axis: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    servoctl("enable")
+    stop = threading.Timer(1.5, lambda: ControlClient(axis).call("stop"))
+    stop.start()
+    words = ("sine", "--amplitude", "0.02", "--frequency", "1", "--duration", "30", "--socket", str(axis))
+    assert run(["track", *words]) == 1
+    stop.join()
+    captured = capsys.readouterr()
+    told = captured.out.splitlines()
+    assert re.match(r"motion broken off: RMS error \S+ mrad, peak error \S+ mrad", told[0]) and len(told) == 2
+    assert re.match(r"peak torque \S+ N\*m; \d+ of \d+ cycles missed", told[1])
+    assert captured.err.startswith("servoctl: the motion ended with the axis in ") and captured.err.count("\n") == 1
 
 
 def test_a_motion_is_drawn_with_its_every_cycle(servoctl: Servoctl, tmp_path: Path) -> None:

@@ -96,11 +96,11 @@ def moment(time_ns: int) -> str:
     return datetime.fromtimestamp(time_ns / NS_PER_S).astimezone().isoformat(" ", timespec="milliseconds")
 
 
-def grouped(seen: Iterable[Seen], axis: str = "") -> list[Incident]:
-    """Incidents of faults in the order of time."""
+def grouped(seen: Iterable[Seen], axis: str = "", one_stop: bool = False) -> list[Incident]:
+    """Incidents of faults in the order of time; with `one_stop` a single one, however long it took."""
     found: list[Incident] = []
     for one in sorted(seen, key=lambda s: s.time_ns):
-        if not found or not found[-1].goes_on(one.time_ns):
+        if not found or not (one_stop or found[-1].goes_on(one.time_ns)):
             found.append(Incident(axis))
         found[-1].add(one)
     return found
@@ -117,10 +117,10 @@ def of_file(path: Path) -> list[Incident]:
     """What a recording shows: of a fault file, the incident that it was written for. Raises BadInput."""
     recording = read_recording(path, {"faults", "faults_latched", "axis_state"})
     match = _FILE.fullmatch(path.name)
-    found = grouped(_appeared(recording), match["axis"] if match else "")
+    found = grouped(_appeared(recording), match["axis"] if match else "", one_stop=bool(match))
     for incident in found:
         incident.file = str(path)
-    return found[-1:] if match else found
+    return found
 
 
 def _appeared(recording: McapRecording) -> list[Seen]:
