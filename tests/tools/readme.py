@@ -22,6 +22,7 @@ from typing import Any
 import command_line
 import reference
 import reliability
+import safety_trace
 from tables import markdown
 
 from servod.common.faults import FAULTS
@@ -75,6 +76,8 @@ PAGES = {
     "columns": DOCS / "reference/recording.md",
     "protocol": DOCS / "reference/protocol.md",
     "json": DOCS / "reference/json.md",
+    "requirements": DOCS / "reference/safety-trace.md",
+    "supply": DOCS / "reference/safety-trace.md",
 }
 
 
@@ -113,6 +116,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "columns": reference.columns,
     "protocol": reference.protocol,
     "json": reference.json_documents,
+    "requirements": safety_trace.requirement_table,
+    "supply": safety_trace.supply_table,
 }
 
 

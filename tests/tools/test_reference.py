@@ -10,6 +10,7 @@ import command_line
 import pytest
 import readme
 import reference
+import safety_trace
 import schema
 
 from servod.cli.app import command
@@ -170,3 +171,11 @@ def test_a_key_that_the_reference_does_not_have_is_seen(command: str, document: 
 )
 def test_the_command_of_a_command_line(words: list[str], command: str) -> None:
     assert documents.command_of(words) == command
+
+
+def test_each_requirement_of_safety_is_shown_by_what_exists() -> None:
+    assert list(safety_trace.complaints()) == []
+    assert safety_trace.missing("scenario killed/nobody") and safety_trace.missing("cycle none")
+    assert safety_trace.missing("test tests/tools/test_reference.py::test_none") and safety_trace.missing(
+        "test x.py::y"
+    )
