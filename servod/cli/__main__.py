@@ -1,5 +1,5 @@
 """`python -m servod.cli` is `servoctl`."""
 
-from servod.cli.app import main
+from servod.cli import main
 
 main()

@@ -49,3 +49,20 @@ def test_a_closed_terminal_ends_a_command_unless_it_was_to_go_on(ignored: bool, 
     finally:
         signal.signal(signal.SIGHUP, before)
     assert (done.returncode, done.stdout) == (code, said)
+
+
+EARLY = """
+import sys
+class Interrupt:
+    def find_spec(self, name, *_):
+        if name == "typer":
+            raise KeyboardInterrupt
+sys.meta_path.insert(0, Interrupt())
+import servod.cli
+servod.cli.main()
+"""
+
+
+def test_ctrl_c_while_the_program_is_being_loaded_is_no_traceback() -> None:
+    done = subprocess.run([sys.executable, "-c", EARLY], capture_output=True, text=True, timeout=30)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
