@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 from servod.client.axis import LOOK_S, AxisDropped, AxisReading, ReferenceMotion, Watch
+from servod.common.clock import Clock
 from servod.common.errors import AnswerIsNo
 from servod.common.faults import fault_text
 from servod.common.units import NS_PER_S
@@ -23,6 +24,7 @@ from servod.formats.gains.gain_set import GainSet, pd_set
 from servod.formats.protocol import SampleKey, Verb
 from servod.formats.recording.record import RECORD, CycleRecord
 from servod.formats.wiring import with_expected
+from servod.kernels.motions import Samples
 from servod.runtime.daemon.arguments import (
     GainsActivateArgs,
     GainsLoadArgs,
@@ -55,23 +57,47 @@ _ENABLE_STEP_S = 0.02
 _POLL_NS = 20_000_000
 
 
-class _ListLink:
-    """The cycle's link without a second process: records are packed into one growing buffer."""
+class ListPort:
+    """The cycle's port without a second process: records are packed into one growing buffer."""
 
-    def __init__(self) -> None:
-        self.trajectory = array("d", bytes(8 * TRAJECTORY_SAMPLES))
-        self.commands: deque[Command] = deque()
-        self.raw = bytearray()
+    def __init__(self, clock: Clock) -> None:
+        """`clock` stamps the commands."""
+        self.trajectory: Samples = array("d", bytes(8 * TRAJECTORY_SAMPLES))
         self.proof: WiringReport | None = None
+        self._clock, self._rows = clock, bytearray()
+        self._commands: deque[Command] = deque()
+        self._seq = 0
+
+    @property
+    def rows(self) -> bytearray:
+        """All records since it was cleared, back to back (servod.formats.recording.record.RECORD)."""
+        return self._rows
 
     def write_record(self, values: Sequence[float]) -> None:
-        self.raw += RECORD.pack(*values)
+        """As LoopPort."""
+        self._rows += RECORD.pack(*values)
 
     def write_proof(self, proof: WiringReport) -> None:
+        """As LoopPort."""
         self.proof = proof
 
     def next_command(self) -> Command | None:
-        return self.commands.popleft() if self.commands else None
+        """As LoopPort."""
+        return self._commands.popleft() if self._commands else None
+
+    def supervisor_alive(self) -> bool:
+        """It is the caller."""
+        return True
+
+    def send(self, op: Op, arguments: Sequence[float]) -> None:
+        """Give the loop a command."""
+        self._seq += 1
+        self._commands.append(Command(self._seq, op, tuple(map(float, arguments)), self._clock.now_ns()))
+
+    def load_trajectory(self, samples: Sequence[float]) -> None:
+        """Fill the area that ReferenceKind.TABLE reads."""
+        assert isinstance(self.trajectory, array)
+        self.trajectory[: len(samples)] = array("d", samples)
 
 
 def _punctual() -> int:
@@ -85,40 +111,46 @@ class SteppedSession:
     `lateness_ns` says for each cycle how late the machine wakes the loop; whoever tries that puts a function there.
     """
 
-    def __init__(self, config: AxisConfig, world: SteppedWorld, law: int, parameters: Sequence[float]) -> None:
+    def __init__(
+        self,
+        config: AxisConfig,
+        world: SteppedWorld,
+        law: int,
+        parameters: Sequence[float],
+        port: ListPort | None = None,
+    ) -> None:
         """`law` and `parameters`: the first controller (a packed gain set)."""
         config = with_expected(config)
         self.config, self.world, self.clock = config, world, world.clock
         self.master = Master(config, world.connect(), world.clock, threaded=False)
         self.bring_up: BringUp = self.master.bring_up()
         plan = LoopPlan(config, self.bring_up.amplifier, self.bring_up.encoder, law, tuple(parameters))
-        self._link = _ListLink()
+        self.port = port or ListPort(world.clock)
         self.loop_bus = world.connect()
-        self.cycle = Cycle(plan, self.loop_bus, world.clock, self._link, lambda: True)
+        self.cycle = Cycle(plan, self.loop_bus, world.clock, self.port, self.port.supervisor_alive)
         self.lateness_ns: Callable[[], int] = _punctual
         self._deadline_ns = self.clock.now_ns() + self.cycle.period_ns
-        self._seq = 0
         self._cycles_until_poll = 0
         self._poll_cycles = max(1, _POLL_NS // self.cycle.period_ns)
 
     @property
     def raw(self) -> bytes:
         """All records since `clear`, back to back (servod.formats.recording.record.RECORD)."""
-        return bytes(self._link.raw)
+        return bytes(self.port.rows)
 
     @property
     def records(self) -> list[CycleRecord]:
         """All records since `clear`."""
-        return [CycleRecord._make(row) for row in RECORD.iter_unpack(self._link.raw)]
+        return [CycleRecord._make(row) for row in RECORD.iter_unpack(self.port.rows)]
 
     @property
     def latest(self) -> CycleRecord:
         """The last record."""
-        return CycleRecord.unpack(bytes(self._link.raw[-RECORD.size :]))
+        return CycleRecord.unpack(bytes(self.port.rows[-RECORD.size :]))
 
     def clear(self) -> None:
         """Forget the records so far."""
-        self._link.raw.clear()
+        self.port.rows.clear()
 
     def run(self, duration_s: float) -> None:
         """Advance virtual time, cycle by cycle."""
@@ -139,10 +171,13 @@ class SteppedSession:
 
     def send(self, op: Op, arguments: Sequence[float] = ()) -> Refusal:
         """Give the loop one command and run until it has answered."""
-        self._seq += 1
-        self._link.commands.append(Command(self._seq, op, tuple(map(float, arguments))))
+        result = self._give(op, arguments)
+        return Refusal(result if result >= 0 else self._give(Op.CONFIRM, (result,)))
+
+    def _give(self, op: Op, arguments: Sequence[float]) -> int:
+        self.port.send(op, arguments)
         self.run(2 * self.cycle.period_ns / NS_PER_S)
-        return Refusal(self.latest.command_result)
+        return self.latest.command_result
 
     def enable(self, reset_fault: bool = False) -> None:
         """Enable and wait for it; raises AnswerIsNo when the axis does not get there."""
@@ -169,11 +204,11 @@ class SteppedSession:
     @property
     def proof(self) -> WiringReport | None:
         """How the last test of the wiring ended; None before there was one."""
-        return self._link.proof
+        return self.port.proof
 
     def load_trajectory(self, positions_rad: Sequence[float]) -> None:
         """Fill the area that ReferenceKind.TABLE reads."""
-        self._link.trajectory[: len(positions_rad)] = array("d", positions_rad)
+        self.port.load_trajectory(positions_rad)
 
     def _must(self, refusal: Refusal) -> None:
         if refusal != Refusal.DONE:
@@ -187,8 +222,7 @@ class SteppedSession:
         self._cycles_until_poll = self._poll_cycles
         self.master.poll()
         for event in self.master.events():
-            self._seq += 1
-            self._link.commands.append(Command(self._seq, Op.NODE_EVENT, (float(event.fault),)))
+            self.port.send(Op.NODE_EVENT, (float(event.fault),))
 
 
 class SteppedAxis:

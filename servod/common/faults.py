@@ -54,6 +54,7 @@ class FaultCode(IntEnum):
     WIRING_NOT_PROVEN = 29
     NODE_LEFT_OPERATIONAL = 30
     DAEMON_LOST = 31
+    CHANNEL_CORRUPT = 32
 
 
 #: Faults after which the nodes are not as they were configured: only a new bring-up may enable the axis again.
@@ -296,6 +297,14 @@ FAULTS: dict[FaultCode, Fault] = dict(
             "servod ended without an orderly stop: it was killed, it crashed, or the machine lost its power. Loop and "
             "drive stopped the axis by themselves.",
             "See the journal of that time (`journalctl -u 'servod@*'`), and look at the axis before it is enabled.",
+        ),
+        _row(
+            _C.CHANNEL_CORRUPT,
+            _R.QUICK_STOP,
+            "A message between supervisor and loop came corrupt, out of order or too late: its number, checksum or age "
+            "is wrong. Nothing of it was used.",
+            "`servoctl enable --reset-fault`. If it comes again, test the machine's memory (EDAC counters, memtest86+) "
+            "and look for what starves the processes.",
         ),
     ]
 )

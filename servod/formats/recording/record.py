@@ -42,7 +42,12 @@ FIELDS: tuple[Field, ...] = (
     Field("encoder_age", "q", "cycles", "age of the encoder's feedback"),
     Field("controller", "q", "1", "serial number of the active gain set in this run"),
     Field("command_seq", "q", "1", "last command that was carried out"),
-    Field("command_result", "q", "code", "0 done, otherwise servod.runtime.loop.commands.Refusal"),
+    Field(
+        "command_result",
+        "q",
+        "code",
+        "0 done, below zero to be confirmed, otherwise servod.runtime.loop.commands.Refusal",
+    ),
     Field("reference_active", "q", "bool", "a reference motion is running"),
     Field("bus_queue_full", "q", "1", "frames that could not be queued"),
     Field("bus_error_frames", "q", "1", "error frames seen"),

@@ -33,9 +33,8 @@ async def work_of(future: Future[T]) -> T:
 
 def taken(record: CycleRecord) -> CycleRecord:
     """The record that answers a command; raises Unreachable with the loop's reason when it was refused."""
-    refusal = Refusal(record.command_result)
-    if refusal is not Refusal.DONE:
-        raise Unreachable(f"refused: {REFUSAL_TEXT[refusal]}")
+    if record.command_result > Refusal.DONE:
+        raise Unreachable(f"refused: {REFUSAL_TEXT[Refusal(record.command_result)]}")
     return record
 
 

@@ -134,11 +134,14 @@ class Supervisor:
         return records
 
     def _take_node_events(self) -> None:
-        """Node events become faults of the loop, which reacts in its next cycle."""
+        """Node events, and what came corrupt from the loop, become faults of the loop in its next cycle."""
         for event in self._nodes.events():
             log.error("%s (%s)", event.text, event.fault.name)
             self._recorder.add_event("node", event.text, node_id=event.node_id, fault=event.fault.name)
             self._relay.add(event.fault)
+        if self._loop.take_corrupt():
+            log.error("what the loop wrote into the shared memory came corrupt (%s)", FaultCode.CHANNEL_CORRUPT.name)
+            self._relay.add(FaultCode.CHANNEL_CORRUPT)
         self._relay.flush()
 
     def _switch_off_if_disobeyed(self, records: list[CycleRecord]) -> None:

@@ -182,7 +182,9 @@ class Verbs:
 
     async def _enable_and_wait(self, args: EnableArgs) -> dict[str, Any]:
         tests_before, _ = self._loop.proofs
-        await self._send(Op.ENABLE, (float(args.reset_fault), float(args.prove)))
+        asked = await self._send(Op.ENABLE, (float(args.reset_fault), float(args.prove)))
+        if asked.command_result < 0:
+            await self._send(Op.CONFIRM, (asked.command_result,))
         timeout_s = self._config.amplifier.enable_timeout_s + self._config.wiring_proof.timeout_s + 1.0
         record = await self._until(lambda r: not AxisState(r.axis_state).starting, timeout_s)
         tests, proof = self._loop.proofs

@@ -13,14 +13,19 @@ class Op(IntEnum):
     """What the loop can be told. Arguments in the comment."""
 
     NONE = 0
-    ENABLE = 1  # [reset_fault 0/1, prove 0/1]: with `prove` the test of the wiring is repeated
+    ENABLE = (
+        1  # [reset_fault 0/1, prove 0/1]: with `prove` the test of the wiring is repeated; an axis that is off asks
+    )
+    # for a CONFIRM
     DISABLE = 2  # [] ramp down, then disable
     QUICK_STOP = 3  # []
     HALT = 4  # [0/1] stop the reference and hold / go on
+    CONFIRM = 5  # [the result of the ENABLE before it]: a second message, so that no single one enables
     ACTIVATE = 6  # [serial, law, n_params, params...]: bumpless change of the controller
     REFERENCE = 7  # [ReferenceKind, arguments...]
     SHUTDOWN = 8  # [] ramp down, disable, end the loop
     NODE_EVENT = 9  # [fault code] something the supervisor saw (heartbeat lost, boot-up, EMCY): raise this fault
+    CORRUPT = 10  # [] nobody sends it: what the channel gives in place of a command that came bent or too late
 
 
 class ReferenceKind(IntEnum):
@@ -37,7 +42,7 @@ class ReferenceKind(IntEnum):
 
 
 class Refusal(IntEnum):
-    """Why a command was not carried out; 0 is done."""
+    """Why a command was not carried out; 0 is done. A result below zero is none of these: it confirms an ENABLE."""
 
     DONE = 0
     NOT_ENABLED = 1
@@ -50,6 +55,8 @@ class Refusal(IntEnum):
     TOO_FAST = 8
     PROVES_ONLY_FROM_OFF = 9
     JUMPS = 10
+    NOT_CONFIRMED = 11
+    CORRUPT = 12
 
 
 REFUSAL_TEXT: dict[Refusal, str] = {
@@ -63,12 +70,18 @@ REFUSAL_TEXT: dict[Refusal, str] = {
     Refusal.TOO_FAST: "the motion would be faster than limits.speed_rad_s",
     Refusal.PROVES_ONLY_FROM_OFF: "the wiring is proven on the way from off to on; run `servoctl disable` first",
     Refusal.JUMPS: "the reference would jump further from the joint than limits.following_error_rad",
+    Refusal.NOT_CONFIRMED: "another command came between the request to enable and its confirmation; try again",
+    Refusal.CORRUPT: "the command came to the loop corrupt or too late; see CHANNEL_CORRUPT in `servoctl faults`",
 }
 
 
 class Command(NamedTuple):
-    """One command; `seq` grows by one with each and comes back in the cycle record when it was carried out."""
+    """One command; `seq` grows by one with each and comes back in the cycle record when it was carried out.
+
+    `sent_ns` is on the clock of both sides.
+    """
 
     seq: int
     op: int
     arguments: tuple[float, ...]
+    sent_ns: int = 0

@@ -6,13 +6,12 @@ import contextlib
 import subprocess
 import sys
 import time
-from array import array
 from collections.abc import Sequence
 
 from servod.common.errors import BadInput, Unreachable
 from servod.formats.recording.record import CycleRecord
-from servod.runtime.loop.channel import MAX_ARGUMENTS, Channel
-from servod.runtime.loop.commands import Command, Op
+from servod.runtime.loop.channel import MAX_ARGUMENTS, TRAJECTORY_SAMPLES, Channel
+from servod.runtime.loop.commands import Op
 from servod.runtime.loop.plan import LoopPlan
 from servod.runtime.loop.realtime import Grant
 from servod.runtime.loop.wiring.findings import WiringReport
@@ -29,7 +28,6 @@ class LoopHandle:
         self.latest: CycleRecord | None = None
         self._channel = Channel()
         self._process: subprocess.Popen[str] | None = None
-        self._seq = 0
 
     def start(self) -> None:
         """Start the process and wait for its first cycle; raises Unreachable with its last words when it dies."""
@@ -84,16 +82,16 @@ class LoopHandle:
         """Queue a command and return its number; the record's `command_seq` shows when it was carried out."""
         if len(arguments) > MAX_ARGUMENTS:
             raise BadInput(f"command {op.name}", f"{len(arguments)} arguments", f"at most {MAX_ARGUMENTS}")
-        if not self._channel.send(Command(self._seq + 1, op, tuple(map(float, arguments)))):
+        number = self._channel.send(op, arguments)
+        if not number:
             raise Unreachable("the loop does not take commands: its queue is full")
-        self._seq += 1
-        return self._seq
+        return number
 
     def write_trajectory(self, positions_rad: Sequence[float]) -> None:
         """Fill the shared area that ReferenceKind.TABLE reads; only while no table motion runs."""
-        if len(positions_rad) > len(self._channel.trajectory):
-            raise BadInput("trajectory", f"{len(positions_rad)} samples", f"at most {len(self._channel.trajectory)}")
-        self._channel.trajectory[: len(positions_rad)] = array("d", positions_rad)
+        if len(positions_rad) > TRAJECTORY_SAMPLES:
+            raise BadInput("trajectory", f"{len(positions_rad)} samples", f"at most {TRAJECTORY_SAMPLES}")
+        self._channel.write_trajectory(positions_rad)
 
     def drain(self) -> list[bytes]:
         """All cycle records since the last call, raw (servod.formats.recording.record.RECORD)."""
@@ -101,6 +99,10 @@ class LoopHandle:
         if records:
             self.latest = CycleRecord.unpack(records[-1])
         return records
+
+    def take_corrupt(self) -> bool:
+        """Something that the loop wrote came bent since the last call."""
+        return self._channel.take_corrupt()
 
     def stop(self, timeout_s: float = 1.0) -> int:
         """Ask for a shutdown, wait, and kill what does not end; returns the exit code."""

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Sequence
+from zlib import crc32
 
 from servod.common.faults import FAULTS, FaultCode
+from servod.common.units import NS_PER_S
 from servod.kernels.motions import Samples
 from servod.runtime.loop.axis import Axis, AxisState
 from servod.runtime.loop.commands import Command, Op, Refusal
@@ -25,6 +28,8 @@ _DOUBTFUL = sum(
         FaultCode.WIRING_NOT_PROVEN,
     )
 )
+#: A request to enable is to be confirmed within this time.
+_CONFIRM_NS = NS_PER_S
 
 
 class Orders:
@@ -54,6 +59,8 @@ class Orders:
         self.controller_serial = controller_serial
         self.event_faults = 0
         self._position_rad = self._torque_nm = 0.0
+        self._request: Command | None = None  # an ENABLE that is to be confirmed
+        self._challenge = 0
         self._table: dict[int, Callable[[Sequence[float]], Refusal]] = {
             Op.ENABLE: self._enable,
             Op.DISABLE: self._disable,
@@ -63,13 +70,33 @@ class Orders:
             Op.REFERENCE: self._start_motion,
             Op.SHUTDOWN: self._end,
             Op.NODE_EVENT: self._raise_event,
+            Op.CORRUPT: self._corrupt,
         }
 
-    def carry_out(self, command: Command, position_rad: float, torque_nm: float) -> Refusal:
-        """Carry out one command, with joint and torque as they are now; the answer goes into the cycle record."""
+    def carry_out(self, command: Command, position_rad: float, torque_nm: float) -> int:
+        """Carry out one command, with joint and torque as they are now; the answer goes into the cycle record.
+
+        A Refusal, or below zero what an ENABLE is to be confirmed with, by the very next command.
+        """
         self._position_rad, self._torque_nm = position_rad, torque_nm
+        request, self._request = self._request, None
+        if command.op == Op.ENABLE and self._axis.state.stopped:
+            self._request = command
+            said_and_seen = struct.pack("<qqdd", command.seq, command.sent_ns, position_rad, torque_nm)
+            self._challenge = -1 - crc32(said_and_seen)
+            return self._challenge
+        if command.op == Op.CONFIRM:
+            return self._confirm(request, command)
         order = self._table.get(command.op)
         return Refusal.BAD_ARGUMENT if order is None else order(command.arguments)
+
+    def _confirm(self, request: Command | None, command: Command) -> Refusal:
+        """The second of the two messages that it takes to enable; it repeats what the loop answered to the first."""
+        if request is None or command.arguments != (float(self._challenge),):
+            return Refusal.NOT_CONFIRMED
+        if command.sent_ns - request.sent_ns > _CONFIRM_NS:
+            return Refusal.NOT_CONFIRMED
+        return self._enable(request.arguments)
 
     def _enable(self, arguments: Sequence[float]) -> Refusal:
         if not self._limits.position_min_rad <= self._position_rad <= self._limits.position_max_rad:
@@ -132,3 +159,7 @@ class Orders:
         self.event_faults |= bit
         self._axis.note(bit)
         return Refusal.DONE
+
+    def _corrupt(self, _arguments: Sequence[float]) -> Refusal:
+        self._raise_event((FaultCode.CHANNEL_CORRUPT,))
+        return Refusal.CORRUPT

@@ -90,7 +90,7 @@ def _table(rest: Sequence[float], period_s: float, trajectory: Samples) -> Motio
     samples, lowest_rad, highest_rad = int(rest[0]), rest[1], rest[2]
     if not 2 <= samples <= len(trajectory):
         raise ValueError("between 2 samples and the size of the trajectory area")
-    first_rad = trajectory[0]
+    first_rad = _first_of(trajectory)
     path = table(trajectory, samples, period_s)
     return Motion(path, (samples - 1) * period_s, lowest_rad - first_rad, highest_rad - first_rad)
 
@@ -100,8 +100,15 @@ def _excite(rest: Sequence[float], period_s: float, trajectory: Samples) -> Moti
     if not 2 <= samples <= len(trajectory) // 2 or window_rad <= 0.0:
         raise ValueError("between 2 samples and half the trajectory area; a positive window")
     torque = torque_table(trajectory, samples, samples, period_s)
-    path, first_rad, duration_s = table(trajectory, samples, period_s), trajectory[0], (samples - 1) * period_s
+    first_rad, duration_s = _first_of(trajectory), (samples - 1) * period_s
+    path = table(trajectory, samples, period_s)
     return Motion(path, duration_s, lowest_rad - first_rad, highest_rad - first_rad, torque, window_rad)
+
+
+def _first_of(trajectory: Samples) -> float:
+    if not math.isfinite(trajectory[0]):  # what a bent table begins with
+        raise ValueError("samples are finite")
+    return trajectory[0]
 
 
 _BUILDERS: dict[int, Callable[[Sequence[float], float, Samples], Motion]] = {
