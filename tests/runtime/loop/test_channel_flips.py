@@ -1,7 +1,7 @@
 """Every bit of the shared memory bent once: disabled, enabled at rest and moving, with and without a command under way.
 
 One process holds master, loop and virtual axis with a real channel between them, brings the axis to where it shall be,
-and forks for each flip: all begin in the same state, and what they do is compared, row by row, with a twin without a flip.
+and forks for each flip: all begin in the same state, and what they do is compared, row by row, with a twin without one.
 A flip is either without any effect, or the fault CHANNEL_CORRUPT and no torque from that row on. In memory that nobody
 reads the same bit of many bytes is bent at once.
 """
