@@ -85,6 +85,7 @@ def record_numbers() -> str:
     }
     rows = [[f"`{field}`", str(int(member)), f"`{member.name}`"] for field, kind in kinds.items() for member in kind]
     rows += [["`reasons`", str(int(bit)), f"`{bit.name}`: {text}"] for bit, text in REASON_TEXT.items()]
+    rows += [["`command_result`", "below 0", "the request to enable is to be confirmed with this number"]]
     rows += [["`command_result`", str(int(r)), f"`{r.name}`: {REFUSAL_TEXT.get(r, 'done')}"] for r in Refusal]
     return markdown(["Field", "Number", "Meaning"], rows)
 

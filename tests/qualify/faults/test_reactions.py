@@ -136,3 +136,37 @@ def test_a_node_that_babbles_with_low_priority_does_not_hold_the_loop():
         axis.run(0.001)
     assert axis.cycle.axis.state == AxisState.ENABLED
     assert isinstance(intruder.receive(0.0), Frame)
+
+
+@pytest.mark.parametrize(
+    ("between", "wrong", "wait_s", "refusal"),
+    [
+        ([], 0.0, 0.0, Refusal.DONE),
+        ([], 1.0, 0.0, Refusal.NOT_CONFIRMED),
+        ([], 0.0, 1.1, Refusal.NOT_CONFIRMED),
+        ([(Op.HALT, (0.0,))], 0.0, 0.0, Refusal.NOT_CONFIRMED),
+        ([(Op.DISABLE, ())], 0.0, 0.0, Refusal.NOT_CONFIRMED),
+        ([(Op.CONFIRM, (-1.0,))], 0.0, 0.0, Refusal.NOT_CONFIRMED),
+    ],
+)
+def test_enabling_takes_a_request_and_its_confirmation_as_the_very_next_command(between, wrong, wait_s, refusal):
+    axis = session()
+    axis.port.send(Op.ENABLE, (0.0, 0.0))
+    axis.run(0.01)
+    asked_for = axis.latest.command_result
+    assert asked_for < 0
+    assert axis.cycle.axis.state == AxisState.DISABLED
+    for op, arguments in between:
+        axis.port.send(op, arguments)
+    axis.run(wait_s)
+    axis.port.send(Op.CONFIRM, (asked_for + wrong,))
+    axis.run(0.01)
+    assert axis.latest.command_result == refusal
+    axis.run(2.0)
+    assert axis.cycle.axis.state == (AxisState.ENABLED if refusal == Refusal.DONE else AxisState.DISABLED)
+    axis.send(Op.DISABLE)
+    axis.run(1.0)
+    axis.port.send(Op.CONFIRM, (asked_for,))  # nor does the old one a second time
+    axis.run(0.5)
+    assert axis.latest.command_result == Refusal.NOT_CONFIRMED
+    assert axis.cycle.axis.state == AxisState.DISABLED

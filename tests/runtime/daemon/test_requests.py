@@ -227,12 +227,14 @@ class _Loop:
 
     def __init__(self) -> None:
         self.sent: list[Op] = []
+        self.arguments: Sequence[float] = ()
         self.latest = record(1, axis_state=AxisState.ENABLED)
         self.seq = 0
         self.area: list[float] = []
 
-    def send(self, op: Op, _arguments: Sequence[float] = ()) -> int:
+    def send(self, op: Op, arguments: Sequence[float] = ()) -> int:
         self.sent.append(op)
+        self.arguments = arguments
         self.seq += 1
         return self.seq
 
@@ -349,6 +351,23 @@ async def test_axis_that_was_off_is_not_enabled_for_a_client_that_left(
         await events_pass()
     front.lease_ended()
     assert loop.sent == [Op.ENABLE, Op.DISABLE][: 1 if AxisState.ENABLED in (seen, before) else 2]
+
+
+@on_event_loop
+async def test_enabling_is_confirmed_with_what_the_loop_answered(verbs: tuple[Verbs, _Loop]) -> None:
+    front, loop = verbs
+    answers = _Answers()
+    loop.latest = record(1, axis_state=AxisState.DISABLED)
+    front.handle(Verb.ENABLE, {}, answers.reply())
+    loop.latest = record(2, axis_state=AxisState.DISABLED, command_seq=1, command_result=-77)
+    front.tick([loop.latest], time.monotonic_ns())
+    await events_pass()
+    assert (loop.sent, loop.arguments) == ([Op.ENABLE, Op.CONFIRM], (-77,))
+    loop.latest = record(3, axis_state=AxisState.ENABLED, command_seq=2)
+    for _ in range(2):
+        front.tick([loop.latest], time.monotonic_ns())
+        await events_pass()
+    assert answers.sent[0]["result"]["state"] == "ENABLED"
 
 
 @pytest.mark.parametrize("verb", [Verb.STOP, Verb.DISABLE])
