@@ -7,6 +7,7 @@ fast demo, by benchmarks, by tests, and wherever a virtual axis is run as fast a
 from __future__ import annotations
 
 import contextlib
+import os
 from array import array
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -17,7 +18,7 @@ from typing import TYPE_CHECKING, ParamSpec, TypeVar
 from servod.client.axis import LOOK_S, AxisDropped, AxisReading, ReferenceMotion, Watch
 from servod.common.clock import Clock
 from servod.common.errors import AnswerIsNo
-from servod.common.faults import fault_text
+from servod.common.faults import FaultCode, fault_text
 from servod.common.units import NS_PER_S
 from servod.formats.config import AxisConfig
 from servod.formats.gains.gain_set import GainSet, pd_set
@@ -37,10 +38,11 @@ from servod.runtime.daemon.requests import finish, taken
 from servod.runtime.daemon.trajectory import MotionTable
 from servod.runtime.fieldbus.master import BringUp, Master
 from servod.runtime.loop.axis import AxisState
-from servod.runtime.loop.channel import TRAJECTORY_SAMPLES
+from servod.runtime.loop.channel import TRAJECTORY_SAMPLES, Channel
 from servod.runtime.loop.commands import REFUSAL_TEXT, Command, Op, Refusal
 from servod.runtime.loop.cycle import Cycle
 from servod.runtime.loop.plan import LoopPlan
+from servod.runtime.loop.process import supervisor_watch
 from servod.runtime.loop.wiring.findings import WiringReport, wiring_sentence
 
 if TYPE_CHECKING:
@@ -98,6 +100,59 @@ class ListPort:
         """Fill the area that ReferenceKind.TABLE reads."""
         assert isinstance(self.trajectory, array)
         self.trajectory[: len(samples)] = array("d", samples)
+
+    def look(self) -> None:
+        """The supervisor's round."""
+
+
+class ChannelPort(ListPort):
+    """The shared memory of the daemon between cycle and session, both sides in one process, and the supervisor's part."""
+
+    def __init__(self, clock: Clock) -> None:
+        super().__init__(clock)
+        self.supervisor = Channel(clock=clock)
+        self.supervisor.beat()
+        self.loop = Channel(os.dup(self.supervisor.fd), clock)
+        self.trajectory = self.loop.trajectory
+        self._alive = supervisor_watch(self.loop, clock)
+
+    @property
+    def rows(self) -> bytearray:
+        """All records since it was cleared, as they came."""
+        for row in self.supervisor.drain():
+            self._rows += row
+        return self._rows
+
+    def write_record(self, values: Sequence[float]) -> None:
+        """As LoopPort."""
+        self.loop.write_record(values)
+
+    def write_proof(self, proof: WiringReport) -> None:
+        """As LoopPort."""
+        self.loop.write_proof(proof)
+
+    def next_command(self) -> Command | None:
+        """As LoopPort."""
+        return self.loop.next_command()
+
+    def supervisor_alive(self) -> bool:
+        """As the loop process sees it."""
+        return self._alive()
+
+    def send(self, op: Op, arguments: Sequence[float]) -> None:
+        """Queue a command."""
+        self.supervisor.send(op, tuple(map(float, arguments)))
+
+    def load_trajectory(self, samples: Sequence[float]) -> None:
+        """Fill the area that ReferenceKind.TABLE reads."""
+        self.supervisor.write_trajectory(samples)
+
+    def look(self) -> None:
+        """Beat, read what came, and tell the loop of what came bent."""
+        self.supervisor.beat()
+        _, self.proof = len(self.rows), self.supervisor.proofs()[1]
+        if self.supervisor.take_corrupt():
+            self.send(Op.NODE_EVENT, (FaultCode.CHANNEL_CORRUPT,))
 
 
 def _punctual() -> int:
@@ -220,6 +275,7 @@ class SteppedSession:
         if self._cycles_until_poll > 0:
             return
         self._cycles_until_poll = self._poll_cycles
+        self.port.look()
         self.master.poll()
         for event in self.master.events():
             self.port.send(Op.NODE_EVENT, (float(event.fault),))

@@ -9,7 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from servod.client.stepped import SteppedSession
+from servod.client.stepped import ListPort, SteppedSession
 from servod.formats.gains.gain_set import GainSet, load_gains
 from servod.qualify.demo.axis import demo_config, gains_file, plant_file
 from servod.runtime.loop.commands import Op, ReferenceKind
@@ -27,7 +27,7 @@ def local_gains() -> GainSet:
 
 
 @contextmanager
-def stepped_session(wrap: type | None = None) -> Iterator[SteppedSession]:
+def stepped_session(wrap: type | None = None, port: type[ListPort] = ListPort) -> Iterator[SteppedSession]:
     """An enabled session; `wrap` may stand between it and the world, to look at its frames."""
     from servod.drivers.virtual.world import SteppedWorld, VirtualAxisSettings
     from servod.formats.model.axis_model import load_axis_model
@@ -36,7 +36,8 @@ def stepped_session(wrap: type | None = None) -> Iterator[SteppedSession]:
     world: SteppedWorld = SteppedWorld(VirtualAxisSettings(), load_axis_model(plant_file(None)))
     with TemporaryDirectory(prefix="servod-bench-") as folder:
         config = demo_config(Path(folder), Path(folder))
-        session = SteppedSession(config, world if wrap is None else wrap(world), gains.law.number, gains.pack())
+        wrapped = world if wrap is None else wrap(world)
+        session = SteppedSession(config, wrapped, gains.law.number, gains.pack(), port(world.clock))
         session.enable()
         yield session
 

@@ -2,9 +2,9 @@
 
 Neither side believes what it reads. Messages are numbered without a gap, and each stands in the slot of its number
 behind a ticket: one aligned word of number and CRC-32 over number, length and data. The writer fills the slot and
-stores the ticket last; the reader knows by itself which number comes next, copies the slot, and checks the copy. No word says
-how much there is to read, so none can make old messages new ones. What is bent, repeated, out of order or (of commands
-that give motion) too old is FaultCode.CHANNEL_CORRUPT, and nothing of it is used. Nobody ever waits for the other.
+stores the ticket last; the reader knows by itself which number comes next, copies the slot, and checks the copy. No
+word says how much there is to read, so none can make old messages new ones. What is bent, repeated, out of order or (of
+commands that give motion) too old is FaultCode.CHANNEL_CORRUPT, and nothing of it is used. Nobody waits for the other.
 
 Memory order: CPython has no barriers, and on ARM the ticket may be seen before its data. The CRC then does not fit, and
 the reader looks again in its next round, which is far longer than a store is on its way: what stays so is bent.

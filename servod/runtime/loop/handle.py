@@ -17,6 +17,7 @@ from servod.runtime.loop.realtime import Grant
 from servod.runtime.loop.wiring.findings import WiringReport
 
 START_TIMEOUT_S = 10.0
+_ASK_AGAIN_S = 0.5
 
 
 class LoopHandle:
@@ -107,11 +108,13 @@ class LoopHandle:
     def stop(self, timeout_s: float = 1.0) -> int:
         """Ask for a shutdown, wait, and kill what does not end; returns the exit code."""
         assert self._process is not None
-        if self.alive():
-            with contextlib.suppress(Unreachable):  # a loop that takes no commands is killed below
-                self.send(Op.SHUTDOWN)
-        deadline = time.monotonic() + timeout_s
-        while self.alive() and time.monotonic() < deadline:
+        ask_again = time.monotonic()
+        deadline = ask_again + timeout_s
+        while self.alive() and time.monotonic() <= deadline:
+            if time.monotonic() >= ask_again:  # one may come corrupt
+                ask_again += _ASK_AGAIN_S
+                with contextlib.suppress(Unreachable):  # a loop that takes no commands is killed below
+                    self.send(Op.SHUTDOWN)
             self.feed()
             time.sleep(0.005)
         self._process.kill()
