@@ -106,7 +106,7 @@ class ListPort:
 
 
 class ChannelPort(ListPort):
-    """The shared memory of the daemon between cycle and session, both sides in one process, and the supervisor's part."""
+    """The daemon's shared memory between cycle and session, both sides in one process, and the supervisor's part."""
 
     def __init__(self, clock: Clock) -> None:
         super().__init__(clock)
