@@ -26,8 +26,8 @@ from pathlib import Path
 from pydantic import Field
 
 from servod.common.errors import BadInput
-from servod.common.files import unwritable
-from servod.common.portable import flush_folder, lock_file
+from servod.common.files import make_folder, unwritable, write_atomically
+from servod.common.portable import lock_file
 from servod.common.yaml import Strict, load_model, read_text
 from servod.formats.gains.gain_set import NAME_PATTERN, GainSet, parse_gains, require_certificate
 
@@ -82,30 +82,6 @@ class _Active(Strict):
     previous: list[SetReference]
 
 
-def write_atomically(path: Path, text: str) -> None:
-    """Replace `path` by `text`: write aside, flush to disk, rename. After a kill there is the old file or the new."""
-    aside = path.with_name(f"{path.name}.{os.getpid()}.tmp")
-    try:
-        with aside.open("w", encoding="utf-8", newline="\n") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        aside.replace(path)
-    except OSError:
-        with contextlib.suppress(OSError):  # half a file fills the very disk that took no more
-            aside.unlink(missing_ok=True)
-        raise
-    flush_folder(path.parent)
-
-
-def write_file(path: Path, text: str) -> None:
-    """`write_atomically` for files that a user named. Raises BadInput."""
-    try:
-        write_atomically(path, text)
-    except OSError as error:
-        raise unwritable(path, error) from None
-
-
 class GainStore:
     """A directory of gain sets. Raises BadInput when the directory cannot be used or a set is unknown or bad."""
 
@@ -115,7 +91,7 @@ class GainStore:
         self._history_file = directory / "history.jsonl"
         self._parsed: dict[Path, tuple[tuple[int, ...], StoredSet]] = {}
         try:
-            self._sets.mkdir(parents=True, exist_ok=True)
+            make_folder(self._sets)
             with self._locked():
                 self._sweep()
         except OSError as error:
@@ -152,8 +128,7 @@ class GainStore:
                 return self.get(gains.name, newest)
             version = newest + 1
             path = self._path(gains.name, version)
-            path.parent.mkdir(exist_ok=True)
-            flush_folder(self._sets)
+            make_folder(path.parent)
             write_atomically(path, text)
             stored = self.get(gains.name, version)
             self._log(Action.LOAD, stored)

@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from servod.common.errors import BadInput
-from servod.formats.gains.store import Action, GainStore, write_atomically
+from servod.common.files import write_atomically
+from servod.formats.gains.store import Action, GainStore
 from tests.formats.gains import good
 
 STIFFER = good.PD.replace("2.5", "3.5")
