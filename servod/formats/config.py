@@ -336,6 +336,12 @@ class GainsConfig(Strict):
 
     directory: Path = Field(Path("/var/lib/servod/gains"), description="where versions and the active set are kept")
     initial: Path = Field(description="gain set of the first start; later the one that was activated last counts")
+    max_versions: int = Field(
+        100,
+        ge=1,
+        le=100_000,
+        description="of each set the oldest beyond this are removed, but the active and those before",
+    )
     accept_uncertified: bool = Field(
         False, description="run gain sets that carry no certificate; one that says no, or is broken, never runs"
     )

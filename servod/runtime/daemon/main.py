@@ -123,7 +123,7 @@ def _leave_core_to_loop(cpu: int | None) -> None:
 def _recorder(config: AxisConfig, path: Path, bank: GainBank) -> Recorder:
     recorder = Recorder(config.recorder, config.name, config.cycle.period_us)
     recorder.set_attachment("config.yaml", read_text(path).encode())
-    recorder.set_attachment("gains.yaml", bank.newest.path.read_bytes())
+    recorder.set_attachment("gains.yaml", bank.newest.text.encode())
     if config.model is not None:
         recorder.set_attachment("model.yaml", read_text(config.model).encode())
     if config.recorder.always:

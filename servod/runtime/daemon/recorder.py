@@ -367,7 +367,7 @@ class Recorder:
         self._lost = self._given - self._records
 
     def _make_room(self) -> None:
-        self._files.make_room(self._file and self._file.path)
+        self._files.make_room(None if self._file is None else self._file.path)
 
     def _write_rows(self, rows: Sequence[bytes]) -> None:
         if self._file is not None:
