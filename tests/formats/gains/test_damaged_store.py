@@ -60,6 +60,7 @@ def _stored_files(folder: Path) -> Iterator[Path]:
     yield from sorted((folder / "sets").rglob("*.yaml"))
 
 
+LONG = [pytest.mark.long, pytest.mark.timeout(900)]
 CERTIFIED = good.certified(parse_gains(good.PD.replace("bench_pd", "certified"), "x")).to_yaml()
 
 
@@ -68,8 +69,8 @@ CERTIFIED = good.certified(parse_gains(good.PD.replace("bench_pd", "certified"),
     [
         pytest.param(60, good.PD, id="a set that came without a seal"),
         pytest.param(60, CERTIFIED, id="a certified set"),
-        pytest.param(2500, good.PD, id="long, without a seal", marks=pytest.mark.long),
-        pytest.param(2500, CERTIFIED, id="long, certified", marks=pytest.mark.long),
+        pytest.param(2500, good.PD, id="long, without a seal", marks=LONG),
+        pytest.param(2500, CERTIFIED, id="long, certified", marks=LONG),
     ],
 )
 def test_no_damage_runs_other_numbers_or_ends_a_start(
