@@ -246,9 +246,10 @@ def _grant_lines(document: dict[str, Any]) -> list[str]:
 
 
 def _recording(recorder: dict[str, Any]) -> str:
+    removed = f"; {recorder['removed']} old files removed" if recorder["removed"] else ""
     if recorder["failure"]:
-        return f"failed: {recorder['failure']}"
-    return f"{recorder['path']} ({recorder['records']} cycles)" if recorder["recording"] else "off"
+        return f"failed: {recorder['failure']}{removed}"
+    return (f"{recorder['path']} ({recorder['records']} cycles)" if recorder["recording"] else "off") + removed
 
 
 def _number(value: float | None, scale: float, unit: str) -> str:

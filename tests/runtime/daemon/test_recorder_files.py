@@ -6,6 +6,8 @@ import os
 import random
 import resource
 import shutil
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,8 +16,11 @@ from typing import Any
 
 import pytest
 from daemon_rows import row, rows
+from running import CONFIG
 
+from servod.client.processes import child, wait_until
 from servod.common.errors import Unreachable
+from servod.common.shipped import shipped
 from servod.formats.config import RecorderConfig
 from servod.formats.recording.mcap_reader import read_recording
 from servod.runtime.daemon.recorder import MIB, Recorder
@@ -155,3 +160,22 @@ def test_recordings_that_are_too_old_go_at_the_start(tmp_path: Path) -> None:
     _until(lambda: recorder.state()["removed"] == 1)
     recorder.close()
     assert [path.exists() for path in (old, new, named, fault)] == [False, True, True, True]
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize(("kib", "line"), [(64, "shared memory for the loop cannot be made"), (0, "gain store")])
+def test_a_daemon_that_may_write_no_large_files_ends_with_one_line(tmp_path: Path, kib: int, line: str) -> None:
+    config, bus = tmp_path / "axis.yaml", tmp_path / "bus"
+    config.write_text(CONFIG.format(folder=tmp_path, gains=shipped("gains/demo_pd.yaml"), travel_rad=0.6))
+    with child("servod.drivers.virtual.main", ["--socket", str(bus)], tmp_path / "axis.log") as axis:
+        wait_until(bus.exists, axis, tmp_path / "axis.log", 30.0)
+        with _files_of_at_most(1024 * kib):
+            ended = subprocess.run(
+                [sys.executable, "-m", "servod.runtime.daemon.main", "--config", str(config)],
+                capture_output=True,
+                text=True,
+                timeout=60,
+            )
+    assert "Traceback" not in ended.stderr and ended.returncode in (2, 3)
+    last = ended.stderr.splitlines()[-1]
+    assert last.startswith("servod: ") and line in last and "file too large" in last.lower()
