@@ -148,23 +148,26 @@ def test_recordings_are_readable_up_to_the_last_second_and_saved_fault_files_who
     with disk.watch():
         recorder = Recorder(RecorderConfig(directory=disk.root / "recordings", history_s=0.3), "axis", 1000)
         recorder.set_attachment("config.yaml", b"name: a\n")
-        recorder.start("run.mcap").result(5)
+        recorder.start("run.mcap").result(60)
         end = time.monotonic() + 2.6
         while time.monotonic() < end:
             recorder.add_rows([row(given + n, position_rad=drawn.random()) for n in range(20)])
             given += 20
             disk.mark(("given", time.monotonic(), given))
+            disk.mark(("told", "", recorder.state()["records"]))
             time.sleep(0.02)
             if given == 1000:
                 recorder.add_event("fault", "FOLLOWING_ERROR", code="FOLLOWING_ERROR")
-                fault = recorder.write_fault_file("FOLLOWING_ERROR").result(5)
+                fault = recorder.write_fault_file("FOLLOWING_ERROR").result(60)
                 disk.mark(("saved", str(fault.relative_to(disk.root)), 0))
-        recorder.stop().result(5)
+        recorder.stop().result(60)
         disk.mark(("stopped", "", given))
         recorder.close()
 
     def check(root: Path, cut: Cut) -> None:
-        must = max((m[2] for m in cut.marks if m[0] == "given" and m[1] < cut.time_s - 1.0), default=0)
+        rounds = [mark for mark in cut.marks if mark[0] == "given"][:-50]  # a second, on a busy machine more
+        must = max((m[2] for m in rounds if m[1] < cut.time_s - 1.0), default=0)
+        must = max([must, *(mark[2] for mark in cut.marks if mark[0] == "told")])
         stopped = any(mark[0] == "stopped" for mark in cut.marks)
         path = root / "recordings" / "run.mcap"
         try:
