@@ -24,10 +24,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from servod.common.files import write_atomically
 from servod.common.yaml import validate
 from servod.formats.config import EncoderConfig
 from servod.formats.gains.gain_set import GainSet, load_gains
-from servod.formats.gains.store import write_atomically
 from servod.formats.model.axis_model import AxisModel, LugreFriction, load_axis_model
 
 GAINS = Path(__file__).resolve().parent.parent / "gains"

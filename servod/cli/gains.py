@@ -49,9 +49,10 @@ def load(
     load_gains(file)  # refuse here, where the file's name is known
     with connect(socket) as client:
         result = client.call("gains_load", name=str(file), text=read_text(file))
+        sealed = "; it came without a seal, the store's copy has one" if result["sealed"] else ""
         if activate:
-            result = client.call("gains_activate", name=result["name"], version=result["version"])
-    report(result, f"{'activated' if activate else 'loaded'} {_title(result)}", as_json)
+            result |= client.call("gains_activate", name=result["name"], version=result["version"])
+    report(result, f"{'activated' if activate else 'loaded'} {_title(result)}{sealed}", as_json)
     warn([result])
 
 

@@ -24,7 +24,7 @@ from servod.cli.common import (
     table_console,
 )
 from servod.common.errors import BadInput
-from servod.common.files import unwritable
+from servod.common.files import write_file
 
 if TYPE_CHECKING:
     from servod.client.axis import AxisClient
@@ -87,7 +87,7 @@ def identify(
     with _progress(quiet=as_json) as tell:
         analysis = job(_Walk(recordings_folder(out), travel, speed, seed, resume), tell)
     model = model_of(analysis)
-    _write(out, axis_model_yaml(model))
+    write_file(out, axis_model_yaml(model))
     suggest("synthesize", "--model", str(out), "--out", "gains.yaml", why="a gain set for this axis")
     found = document(analysis) | {"model": str(out)} | _changes(old, model)
     if as_json:
@@ -184,16 +184,6 @@ def _changes(old: AxisModel | None, new: AxisModel) -> dict[str, Any]:
     if old is None or old.identified is None or new.identified is None:
         return {}
     return {"changes": changes(old.identified, new.identified)}
-
-
-def _write(path: Path, text: str) -> None:
-    """Aside first, so that nobody reads half a model. Raises BadInput."""
-    aside = path.with_name(path.name + ".part")
-    try:
-        aside.write_text(text, encoding="utf-8")
-        aside.replace(path)
-    except OSError as error:
-        raise unwritable(path, error) from None
 
 
 @contextmanager

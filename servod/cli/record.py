@@ -43,7 +43,8 @@ def stop(socket: SocketOption = DEFAULT_SOCKET, as_json: JsonOption = False) -> 
             raise AnswerIsNo(f"not recording. {recorder['failure']}")
         result = client.call("record_stop")
     suggest("plot", result["path"], why="error, torque, states and faults in pictures")
-    report(result, f"recorded {result['records']} cycles to {result['path']}", as_json)
+    lost = f"; {result['dropped']} more are in no file, the disk did not keep up" if result["dropped"] else ""
+    report(result, f"recorded {result['records']} cycles to {result['path']}{lost}", as_json)
 
 
 @_app.command(

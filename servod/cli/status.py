@@ -129,6 +129,7 @@ def screen(document: dict[str, Any]) -> Group:
     return Group(
         _headline(document),
         *_fault_lines(document),
+        *_note_lines(document),
         *_wiring_lines(document),
         _values(document),
         _timing(document),
@@ -174,6 +175,11 @@ def _fault_lines(document: dict[str, Any]) -> list[str]:
         f"[red]{'now' if f['present'] else 'was'}[/red] {f['code']} ({f['reaction']}): {f['cause']} {f['remedy']}"
         for f in document["faults"]
     ]
+
+
+def _note_lines(document: dict[str, Any]) -> list[str]:
+    note = document["controller"]["note"]
+    return [f"[yellow]gain set[/yellow] {note}"] if note else []
 
 
 def _wiring_lines(document: dict[str, Any]) -> list[str]:
@@ -240,9 +246,10 @@ def _grant_lines(document: dict[str, Any]) -> list[str]:
 
 
 def _recording(recorder: dict[str, Any]) -> str:
+    removed = f"; {recorder['removed']} old files removed" if recorder["removed"] else ""
     if recorder["failure"]:
-        return f"failed: {recorder['failure']}"
-    return f"{recorder['path']} ({recorder['records']} cycles)" if recorder["recording"] else "off"
+        return f"failed: {recorder['failure']}{removed}"
+    return (f"{recorder['path']} ({recorder['records']} cycles)" if recorder["recording"] else "off") + removed
 
 
 def _number(value: float | None, scale: float, unit: str) -> str:

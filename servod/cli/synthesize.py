@@ -192,7 +192,7 @@ def options_of(
 
 def finish(result: GainSet | Infeasible, out: Path, cross_check: bool, as_json: bool) -> None:
     """Write and print the set, or say why there is none. Raises AnswerIsNo."""
-    from servod.formats.gains.store import write_file
+    from servod.common.files import write_file
     from servod.lab.synthesize.infeasible import Infeasible
 
     if isinstance(result, Infeasible):

@@ -40,8 +40,8 @@ def verify(
 ) -> None:
     """Verify GAINS; exit code 1 when the set is not valid."""
     one_thread()
+    from servod.common.files import write_file
     from servod.formats.gains.gain_set import load_gains
-    from servod.formats.gains.store import write_file
     from servod.lab.verify.certify import verify
 
     checked = load_gains(gains)

@@ -1,18 +1,22 @@
-"""Reads files that people name: whole, of bounded size, and never a pipe or a device that might not end.
+"""Reads files that people name: whole, of bounded size, no pipe or device that might not end; writes them for good.
 
-Ground floor, stands on errors alone; every text that servod reads comes through here.
+Ground floor, stands on errors and systems alone; every text that servod reads, and every file that must outlive a power
+cut, comes through here.
 """
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import os
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from servod.common.errors import BadInput, ServodError, one_line
+from servod.common.portable import flush_folder
 
 #: Largest file that is read as a whole.
 MOST_BYTES = 64 * 1024 * 1024
@@ -124,19 +128,57 @@ def open_file(path: str | Path) -> BinaryIO:
 
 
 # --- Writing ---------------------------------------------------------------------------------------------------------
-# Writes the files of a report: aside first, flushed, then renamed, so that an interrupted run leaves no half file.
+# Every file that must outlive a power cut: written aside, flushed to the disk, renamed, and the name flushed as well.
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[BinaryIO]:
+    """A stream whose content takes the place of `path` at the end of the block, whole or not at all. Raises OSError.
+
+    After a kill or a power cut at any moment there is the old file or the new one; after the block, the new one.
+    """
+    aside = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+    try:
+        with aside.open("wb") as stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+        aside.replace(path)
+    except BaseException:
+        with contextlib.suppress(OSError):  # half a file fills the very disk that took no more
+            aside.unlink(missing_ok=True)
+        raise
+    flush_folder(path.parent)
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Replace `path` by `text`, whole or not at all; its folder is there. Raises OSError."""
+    with replacing(path) as stream:
+        stream.write(text.encode())
 
 
 def write_bytes(path: Path, content: bytes) -> Path:
     """Replace `path` by `content`, make its folder where it is missing, and return `path`. Raises BadInput."""
-    aside = path.with_name(path.name + ".part")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with aside.open("wb") as stream:
+        make_folder(path.parent)
+        with replacing(path) as stream:
             stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
-        aside.replace(path)
     except OSError as error:
         raise unwritable(path, error) from None
     return path
+
+
+def write_file(path: Path, text: str) -> None:
+    """Replace a file that a user named; its folder must be there. Raises BadInput."""
+    try:
+        write_atomically(path, text)
+    except OSError as error:
+        raise unwritable(path, error) from None
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder and those above it, for good: a power cut takes one that is not, with all in it. Raises OSError."""
+    missing = [one for one in (folder, *folder.parents) if not one.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    for made in reversed(missing):
+        flush_folder(made.parent)

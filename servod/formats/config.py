@@ -336,6 +336,12 @@ class GainsConfig(Strict):
 
     directory: Path = Field(Path("/var/lib/servod/gains"), description="where versions and the active set are kept")
     initial: Path = Field(description="gain set of the first start; later the one that was activated last counts")
+    max_versions: int = Field(
+        100,
+        ge=1,
+        le=100_000,
+        description="of each set the oldest beyond this are removed, but the active and those before",
+    )
     accept_uncertified: bool = Field(
         False, description="run gain sets that carry no certificate; one that says no, or is broken, never runs"
     )
@@ -358,6 +364,16 @@ class RecorderConfig(Strict):
     always: bool = Field(False, description="record from the daemon's start to its stop")
     max_file_mib: int = Field(1024, ge=1, le=1_048_576, description="a recording that is larger goes on in a new file")
     max_fault_files: int = Field(50, ge=1, le=100_000, description="the oldest fault files beyond this are removed")
+    max_total_mib: int = Field(
+        20_480,
+        ge=4,
+        le=1_000_000_000,
+        description="most of recordings and fault files together; the oldest recordings make room, no fault file does. "
+        "Recordings with a name of your own are neither counted nor removed",
+    )
+    max_age_days: float | None = Field(
+        None, ge=0.01, le=36_500.0, description="recordings not touched for so long are removed; left out: none is"
+    )
 
 
 class MetricsConfig(Strict):

@@ -21,6 +21,7 @@ _UNITS = {
     "_us": "µs",
     "_ms": "ms",
     "_hz": "Hz",
+    "_days": "d",
     "_s": "s",
     "_cycles": "cycles",
     "_counts": "counts",

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from servod.common.errors import BadInput
-from servod.formats.gains.store import write_file
+from servod.common.files import write_file
 from servod.formats.recording.export import export_csv, export_parquet, write_table
 from servod.formats.recording.mcap_reader import read_recording
 from tests.fuzz.recordings import recorded

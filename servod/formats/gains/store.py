@@ -2,13 +2,17 @@
 
 Beside the data path; the supervisor owns it, `servoctl gains` reaches it through the supervisor.
 
-    DIRECTORY/sets/NAME/0001.yaml   text of version 1, never changed after it was written
-    DIRECTORY/active.json           the active version and those before it, replaced as a whole
+    DIRECTORY/sets/NAME/0001.yaml   text of version 1 with a seal, never changed after it was written
+    DIRECTORY/active.json           the active version and those before it with their hash, replaced as a whole
+    DIRECTORY/active.copy.json      the same once more, written after it, for the case that it is damaged
     DIRECTORY/history.jsonl         one line for each load, activation, rollback and rejected trial, for people
     DIRECTORY/lock                  held while something changes
 
 Every file is written aside, flushed to the disk and renamed, so that a kill at any moment leaves the old state or the
 new one. `active.json` alone decides; the history line comes after it and may be the one thing that a kill loses.
+
+What is read is what was written, or it is refused: hashes show every change by accident, as of a bit on the disk. They
+are no signature: who means to can compute them anew.
 """
 
 from __future__ import annotations
@@ -16,6 +20,7 @@ from __future__ import annotations
 import contextlib
 import datetime
 import hashlib
+import logging
 import os
 import re
 from collections.abc import Iterator
@@ -26,14 +31,18 @@ from pathlib import Path
 from pydantic import Field
 
 from servod.common.errors import BadInput
-from servod.common.files import unwritable
-from servod.common.portable import flush_folder, lock_file
-from servod.common.yaml import Strict, load_model, read_text
-from servod.formats.gains.gain_set import NAME_PATTERN, GainSet, parse_gains, require_certificate
+from servod.common.files import make_folder, read_text, reason, unreadable, unwritable, write_atomically
+from servod.common.portable import lock_file
+from servod.common.yaml import Strict, load_model
+from servod.formats.gains.gain_set import NAME_PATTERN, GainSet, Sha256, parse_gains, require_certificate
 
 _VERSION_FILE = re.compile(r"^([0-9]{4,})\.yaml$")
 _NAME = re.compile(NAME_PATTERN)
 MAX_ROLLBACKS = 100
+#: Lines of the history that are kept at the least; a store that has twice as many when it is opened forgets the oldest.
+_KEPT_LINES = 5000
+
+log = logging.getLogger("servod.gains")
 
 
 class Action(StrEnum):
@@ -47,13 +56,14 @@ class Action(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class StoredSet:
-    """One version of one gain set in the store; `sha256` is of the file's text in UTF-8."""
+    """One version of one gain set in the store; `sha256` is of the file's `text` in UTF-8."""
 
     name: str
     version: int
     sha256: str
     path: Path
     gains: GainSet
+    text: str
 
 
 class SetReference(Strict):
@@ -76,46 +86,45 @@ class HistoryEntry(Strict):
 
 
 class _Active(Strict):
-    """Content of active.json; `previous` has the last one at its end."""
+    """Content of active.json; `previous` has the last one at its end. The hash is of the rest; earlier versions wrote
+    none."""
 
     current: SetReference
     previous: list[SetReference]
+    sha256: Sha256 | None = None
+
+    def content_sha256(self) -> str:
+        """Hash of all but itself."""
+        return hashlib.sha256(self.model_dump_json(exclude={"sha256"}).encode()).hexdigest()
 
 
-def write_atomically(path: Path, text: str) -> None:
-    """Replace `path` by `text`: write aside, flush to disk, rename. After a kill there is the old file or the new."""
-    aside = path.with_name(f"{path.name}.{os.getpid()}.tmp")
-    try:
-        with aside.open("w", encoding="utf-8", newline="\n") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        aside.replace(path)
-    except OSError:
-        with contextlib.suppress(OSError):  # half a file fills the very disk that took no more
-            aside.unlink(missing_ok=True)
-        raise
-    flush_folder(path.parent)
-
-
-def write_file(path: Path, text: str) -> None:
-    """`write_atomically` for files that a user named. Raises BadInput."""
-    try:
-        write_atomically(path, text)
-    except OSError as error:
-        raise unwritable(path, error) from None
+def sealed_text(text: str, gains: GainSet) -> str:
+    """The text of a set with its seal: as it is where it has one, else with one at its end, comments and all."""
+    if gains.seal is not None:
+        return text
+    sealed = gains.sealed()
+    found = f"{text.rstrip()}\nseal: {sealed.seal}\n"
+    with contextlib.suppress(BadInput):  # a document in braces, or with an end of its own
+        if parse_gains(found, gains.name) == sealed:
+            return found
+    return sealed.to_yaml()
 
 
 class GainStore:
-    """A directory of gain sets. Raises BadInput when the directory cannot be used or a set is unknown or bad."""
+    """A directory of gain sets. Raises BadInput when the directory cannot be used or a set is unknown or bad.
 
-    def __init__(self, directory: Path) -> None:
-        self.directory = directory
+    Of each name the newest `max_versions` are kept, and those that are active or that a rollback leads to. `damage` is
+    what was wrong with the active set's file when it was last read: empty, or a sentence.
+    """
+
+    def __init__(self, directory: Path, max_versions: int = 100) -> None:
+        self.directory, self.damage, self._max_versions = directory, "", max_versions
         self._sets, self._active_file = directory / "sets", directory / "active.json"
+        self._active_copy = directory / "active.copy.json"
         self._history_file = directory / "history.jsonl"
         self._parsed: dict[Path, tuple[tuple[int, ...], StoredSet]] = {}
         try:
-            self._sets.mkdir(parents=True, exist_ok=True)
+            make_folder(self._sets)
             with self._locked():
                 self._sweep()
         except OSError as error:
@@ -129,35 +138,54 @@ class GainStore:
             yield
 
     def _sweep(self) -> None:
-        """Remove what a kill left half-written, and end a history line that it cut."""
+        """Remove what a kill left half-written, end a history line that it cut, mend what says which set is active."""
         for leftover in self.directory.rglob("*.tmp"):
             leftover.unlink()
         if self._history_file.exists() and not self._history_file.read_bytes().endswith(b"\n"):
             with self._history_file.open("ab") as file:
                 file.write(b"\n")
+        with contextlib.suppress(BadInput, OSError):  # nothing to mend it with, or a disk that takes nothing: later
+            lines = self._history_lines()
+            if len(lines) > 2 * _KEPT_LINES:
+                write_atomically(self._history_file, "\n".join(lines[-_KEPT_LINES:]) + "\n")
+            state = self._active()
+            if state is not None and not (self._active_copy.exists() and state.sha256 and not self.damage):
+                self._write_active(state)
 
     def load(self, text: str, where: str, name: str | None = None) -> StoredSet:
         """Check a gain set and store it as the next version of its name; the newest text again gets none.
 
-        One whose certificate or seal does not belong to its numbers is not stored: it could never be activated. `name`,
-        when given, must be the name in the file: one set is never known by two names. `where` is for errors.
+        One whose certificate or seal does not belong to its numbers is not stored: it could never be activated. One
+        without a seal, of an earlier version or by hand, gets it here. `name`, when given, must be the name in the
+        file: one set is never known by two names. `where` is for errors.
         """
         gains = parse_gains(text, where)
         if name is not None and name != gains.name:
             raise BadInput(f"{where}: name", gains.name, f"{name}, the name it shall be loaded as")
         require_certificate(gains, accept_uncertified=True, where=where)
+        text = sealed_text(text, gains)
         with self._locked():
             newest = max(self._versions(gains.name), default=0)
-            if newest and self._path(gains.name, newest).read_text(encoding="utf-8") == text:
+            if newest and _holds(self._path(gains.name, newest), text):
                 return self.get(gains.name, newest)
             version = newest + 1
             path = self._path(gains.name, version)
-            path.parent.mkdir(exist_ok=True)
-            flush_folder(self._sets)
+            make_folder(path.parent)
             write_atomically(path, text)
             stored = self.get(gains.name, version)
             self._log(Action.LOAD, stored)
+            self._drop_old(gains.name)
             return stored
+
+    def _drop_old(self, name: str) -> None:
+        """Remove the oldest versions beyond the cap; without knowing what is active, none."""
+        with contextlib.suppress(BadInput, OSError):
+            state = self._active()
+            used = {(one.name, one.version) for one in (*state.previous, state.current)} if state else set()
+            for version in self._versions(name)[: -self._max_versions]:
+                if (name, version) not in used:
+                    self._path(name, version).unlink()
+                    log.info("gain set %s version %d removed: the oldest beyond gains.max_versions", name, version)
 
     def load_file(self, path: str | Path) -> StoredSet:
         """Store the gain-set file at `path`; see `load`."""
@@ -177,9 +205,12 @@ class GainStore:
         return self._read(name, chosen)
 
     def _read(self, name: str, version: int) -> StoredSet:
-        """One version; a file is parsed anew only when it was touched since, so that lists are cheap."""
+        """One version, as it was stored; parsed anew only when its file was touched since, so that lists are cheap."""
         path = self._path(name, version)
-        status = path.stat()
+        try:
+            status = path.stat()
+        except OSError as error:
+            raise unreadable(path, error) from None
         touched = (status.st_ino, status.st_mtime_ns, status.st_ctime_ns, status.st_size)
         before, stored = self._parsed.get(path, (None, None))
         if stored is None or before != touched:
@@ -187,17 +218,37 @@ class GainStore:
             gains = parse_gains(text, str(path))
             if gains.name != name:
                 raise BadInput(f"{path}: name", gains.name, f"{name}, under which it was stored; load the set anew")
-            stored = StoredSet(name, version, hashlib.sha256(text.encode()).hexdigest(), path, gains)
+            stored = StoredSet(name, version, hashlib.sha256(text.encode()).hexdigest(), path, gains, text)
+            self._require_as_stored(stored)
             self._parsed[path] = touched, stored
         return stored
+
+    def _require_as_stored(self, found: StoredSet) -> None:
+        """Refuse numbers that are not those which were stored. Raises BadInput.
+
+        The seal tells. Earlier versions stored some sets without one: of these the hash in the history does.
+        """
+        if found.gains.seal is not None:
+            if not found.gains.seal_broken:
+                return
+            problem = "numbers that were changed after the set was sealed"
+        else:
+            if any((one.action, one.sha256) == (Action.LOAD, found.sha256) for one in self.history()):
+                return
+            problem = "no seal, and no hash of it in the history: it is not what was stored"
+        raise BadInput(f"{found.path}: seal", problem, "the file as it was stored; `servoctl gains load` the set anew")
 
     def names(self) -> list[str]:
         """Names of all stored sets, in order."""
         return sorted(entry.name for entry in self._sets.iterdir() if self._versions(entry.name))
 
-    def stored(self) -> list[StoredSet]:
+    def versions(self) -> list[tuple[str, int]]:
         """Every version of every set, by name and version."""
-        return [self.get(name, version) for name in self.names() for version in self._versions(name)]
+        return [(name, version) for name in self.names() for version in self._versions(name)]
+
+    def stored(self) -> list[StoredSet]:
+        """All of them, each as it was stored. Raises BadInput at the first that is not."""
+        return [self.get(name, version) for name, version in self.versions()]
 
     def active(self) -> StoredSet | None:
         """The active set; None before the first activation."""
@@ -215,7 +266,11 @@ class GainStore:
         """Make a stored set the active one; the present one becomes what `rollback` returns to."""
         with self._locked():
             stored = self.get(name, version)
-            state = self._active()
+            try:
+                state = self._active()
+            except BadInput as error:  # the set is named, so there is no need to know the one before
+                log.error("%s; the activations before this one are forgotten", error)
+                state = None
             new = SetReference(name=stored.name, version=stored.version)
             if state is None:
                 self._write_active(_Active(current=new, previous=[]))
@@ -250,13 +305,17 @@ class GainStore:
 
     def history(self) -> list[HistoryEntry]:
         """What happened, oldest first; a line that a kill cut short is left out."""
-        if not self._history_file.exists():
-            return []
         entries = []
-        for line in self._history_file.read_text(encoding="utf-8").splitlines():
+        for line in self._history_lines():
             with contextlib.suppress(ValueError):
                 entries.append(HistoryEntry.model_validate_json(line))
         return entries
+
+    def _history_lines(self) -> list[str]:
+        try:
+            return self._history_file.read_text(encoding="utf-8", errors="replace").splitlines()
+        except OSError:
+            return []
 
     def _versions(self, name: str) -> list[int]:
         folder = self._sets / name
@@ -268,10 +327,26 @@ class GainStore:
         return self._sets / name / f"{version:04d}.yaml"
 
     def _active(self) -> _Active | None:
-        return load_model(self._active_file, _Active) if self._active_file.exists() else None
+        """What active.json says, or its copy where it is damaged or gone. Raises BadInput when neither can be read."""
+        files = [file for file in (self._active_file, self._active_copy) if file.exists()]
+        if not files:
+            return None
+        try:
+            if files[0] == self._active_copy:
+                raise BadInput(str(self._active_file), "no file, although it has a copy", "the file as servod wrote it")
+            return _read_active(self._active_file)
+        except BadInput as error:
+            if self._active_copy not in files:
+                raise
+            state = _read_active(self._active_copy)
+            self.damage = f"{error}; {self._active_copy.name} was taken in its place"
+            log.error("%s", self.damage)
+            return state
 
     def _write_active(self, state: _Active) -> None:
-        write_atomically(self._active_file, state.model_dump_json(indent=1) + "\n")
+        text = state.model_copy(update={"sha256": state.content_sha256()}).model_dump_json(indent=1) + "\n"
+        write_atomically(self._active_file, text)
+        write_atomically(self._active_copy, text)
 
     def _log(self, action: Action, stored: StoredSet, note: str = "", figures: dict[str, float] | None = None) -> None:
         entry = HistoryEntry(
@@ -283,7 +358,25 @@ class GainStore:
             note=note,
             figures=figures or {},
         )
-        with self._history_file.open("a", encoding="utf-8") as file:
-            file.write(entry.model_dump_json() + "\n")
-            file.flush()
-            os.fsync(file.fileno())
+        try:
+            with self._history_file.open("a", encoding="utf-8") as file:
+                file.write(entry.model_dump_json() + "\n")
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:  # what the line tells of is done and stands: a full disk shall not call it undone
+            log.warning("%s: without a line on %s %s (%s)", self._history_file, action, stored.name, reason(error))
+
+
+def _holds(path: Path, text: str) -> bool:
+    """Whether a file has just this text."""
+    try:
+        return path.read_bytes() == text.encode()
+    except OSError:
+        return False
+
+
+def _read_active(path: Path) -> _Active:
+    state = load_model(path, _Active)
+    if state.sha256 not in (None, state.content_sha256()):
+        raise BadInput(f"{path}: sha256", "a hash of other content", "the file as servod wrote it")
+    return state

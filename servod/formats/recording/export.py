@@ -6,9 +6,8 @@ carry their units. Files are written aside, synced and renamed.
 
 from __future__ import annotations
 
-import contextlib
 import csv
-import os
+import io
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TextIO
@@ -16,7 +15,7 @@ from typing import Any, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from servod.common.files import unwritable
+from servod.common.files import replacing, unwritable
 from servod.formats.recording.mcap_reader import McapRecording
 
 _NS_PER_S = 1e9
@@ -24,23 +23,14 @@ _NS_PER_S = 1e9
 
 def export_csv(recording: McapRecording, path: Path) -> int:
     """Write `recording` to `path` as CSV; returns the number of rows. Raises BadInput when that cannot be written."""
-    aside = path.with_name(path.name + ".part")
     try:
-        with aside.open("w", newline="", encoding="utf-8") as stream:
-            _write_csv(recording, stream)
-            stream.flush()
-            os.fsync(stream.fileno())
-        aside.replace(path)
+        with replacing(path) as stream:
+            text = io.TextIOWrapper(stream, encoding="utf-8", newline="")
+            _write_csv(recording, text)
+            text.detach()  # flushes; the stream below is not ours to close
     except OSError as error:
-        _remove(aside)
         raise unwritable(path, error) from None
     return len(recording)
-
-
-def _remove(aside: Path) -> None:
-    """Take away what could not be written whole: on a full disk it is what fills it."""
-    with contextlib.suppress(OSError):
-        aside.unlink(missing_ok=True)
 
 
 def _write_csv(recording: McapRecording, stream: TextIO) -> None:
@@ -75,12 +65,10 @@ def export_parquet(recording: McapRecording, path: Path) -> int:
     for name, kind, unit in zip(recording.names, recording.kinds, recording.units, strict=True):
         fields.append(pa.field(name, types[kind], metadata={"unit": unit}))
         columns.append(pa.array(recording.column(name), types[kind]))
-    aside = path.with_name(path.name + ".part")
     try:
-        pq.write_table(pa.table(columns, schema=pa.schema(fields)), aside)
-        aside.replace(path)
+        with replacing(path) as stream:
+            pq.write_table(pa.table(columns, schema=pa.schema(fields)), stream)
     except OSError as error:
-        _remove(aside)
         raise unwritable(path, error) from None
     return len(recording)
 
@@ -99,18 +87,12 @@ def write_table(path: Path, columns: Mapping[str, NDArray[np.float64]]) -> None:
     import pyarrow.parquet as pq
 
     table = pa.table({name: np.ascontiguousarray(values) for name, values in columns.items()})
-    aside = path.with_name(path.name + ".part")
     try:
-        with aside.open("wb") as stream:
+        with replacing(path) as stream:
             if path.suffix == ".parquet":
                 pq.write_table(table, stream)
             else:
                 stream.write((",".join(columns) + "\n").encode())
                 pc.write_csv(table, stream, pc.WriteOptions(include_header=False))
-            stream.flush()
-            os.fsync(stream.fileno())
-        aside.replace(path)
     except OSError as error:
-        with contextlib.suppress(OSError):  # half a file fills the very disk that took no more
-            aside.unlink(missing_ok=True)
         raise unwritable(path, error) from None

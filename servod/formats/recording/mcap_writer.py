@@ -1,13 +1,15 @@
 """One recording file: MCAP with the cycle records as CDR messages, events as JSON, and attachments.
 
-Below the recorder, in its writing thread. The file survives kill -9: `sync` ends the chunk in progress and hands it to
-the kernel, so that only what came since the last `sync` can be lost. Specification: https://mcap.dev/spec.
+Below the recorder, in its writing thread. The file survives kill -9 and a power cut: `sync` ends the chunk in progress
+and has it on the disk, so that only what came since the last `sync` can be lost. Specification: https://mcap.dev/spec.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
+import os
 import struct
 import tempfile
 import time
@@ -37,6 +39,7 @@ from mcap.records import (
     SummaryOffset,
 )
 
+from servod.common.portable import flush_folder
 from servod.formats.recording.record import CDR_HEADER, RECORD, ros2msg
 
 CYCLE_TOPIC, EVENT_TOPIC = "/servod/cycle", "/servod/events"
@@ -83,6 +86,9 @@ class ChunkedWriter:
         self._channels: list[Channel] = []
         self._attachments: list[AttachmentIndex] = []
         self._metadata: list[MetadataIndex] = []
+        #: Where chunks end, since the last flush and the one before, and how many messages of each channel are in the
+        #: file up to there.
+        self.chunk_ends: list[tuple[int, dict[int, int]]] = []
         self._statistics = Statistics(
             attachment_count=0,
             channel_count=0,
@@ -156,6 +162,7 @@ class ChunkedWriter:
         """End the chunk in progress, if there are messages in it, and hand everything to the kernel."""
         self._end_chunk()
         self._stream.flush()
+        del self.chunk_ends[:-1]
 
     def finish(self) -> None:
         """Write what is left, the summary and the foot; the stream stays open."""
@@ -184,6 +191,8 @@ class ChunkedWriter:
     def _write(self, record: McapRecord) -> tuple[int, int]:
         """Where `record` stands in the file, and its length."""
         at, data = self._stream.tell(), _packed(record)
+        if isinstance(record, Chunk):  # noted first: a disk that is full in the middle of it tells by the file's size
+            self.chunk_ends.append((at + len(data), self._messages_by_channel()))
         self._stream.write(data)
         return at, len(data)
 
@@ -237,6 +246,13 @@ class ChunkedWriter:
         self._chunk.clear()
         self._entries.clear()
 
+    def _messages_by_channel(self) -> dict[int, int]:
+        """Messages so far, those of the chunk in progress among them."""
+        counts = dict(self._statistics.channel_message_counts)
+        for channel, entries in self._entries.items():
+            counts[channel] = counts.get(channel, 0) + len(entries) // 2
+        return counts
+
     def _count_chunk(self, first_ns: int, last_ns: int) -> None:
         total = self._statistics
         total.message_start_time = min(first_ns, total.message_start_time) if total.chunk_count else first_ns
@@ -258,6 +274,7 @@ class McapFile:
         self._stream = path.open("xb")
         try:
             self._begin(attachments)
+            flush_folder(path.parent)
         except BaseException:
             self.abandon()
             raise
@@ -291,26 +308,46 @@ class McapFile:
         self._writer.add_messages(self._event, [(time_ns, json.dumps(event).encode())])
 
     def sync(self) -> None:
-        """Hand everything so far to the kernel: from here on kill -9 cannot take it away."""
+        """Have everything so far on the disk: from here on neither kill -9 nor a power cut can take it away.
+
+        Raises FileNotFoundError when the file was deleted or moved: nobody would find what is written to it.
+        """
         self._writer.flush()
+        os.fsync(self._stream.fileno())
+        if not self._is_there():
+            raise FileNotFoundError(errno.ENOENT, "the file was deleted or moved while it was recorded", str(self.path))
+
+    def _is_there(self) -> bool:
+        """The file that is written is the one that its path names."""
+        try:
+            return os.path.samestat(self.path.stat(), os.fstat(self._stream.fileno()))
+        except FileNotFoundError:
+            return False
 
     def size_bytes(self) -> int:
         """Bytes written so far."""
         return self._stream.tell()
 
     def close(self) -> None:
-        """Write index and footer, and close."""
+        """Write index and footer, have it all on the disk, and close."""
         self._writer.finish()
+        self.sync()
         self._stream.close()
         self._close_spool()
 
-    def abandon(self) -> None:
-        """Let go of a file that cannot be written any more; what is in it stays readable."""
+    def abandon(self) -> int:
+        """Let go of a file that cannot be written any more; returns how many cycles can be read from its path."""
+        held = 0
+        with contextlib.suppress(OSError, ValueError):  # ValueError: it was closed already
+            size = os.fstat(self._stream.fileno()).st_size
+            ends = [counts for end, counts in self._writer.chunk_ends if end <= size and self._is_there()]
+            held = ends[-1].get(self._cycle, 0) if ends else 0
         with contextlib.suppress(OSError):
             self._stream.raw.close()
         with contextlib.suppress(OSError, ValueError):
             self._stream.close()
         self._close_spool()
+        return held
 
     def _close_spool(self) -> None:
         """Let go of the spool; it has no name, so nothing is left."""

@@ -22,7 +22,7 @@ from typing import IO, NamedTuple, Self
 from pydantic import Field
 
 from servod.common.errors import BadInput, ServodError
-from servod.common.files import open_file, reason, require_size, unreadable
+from servod.common.files import make_folder, open_file, reason, require_size, unreadable
 from servod.common.portable import flush_folder, is_locked, lock_file
 from servod.common.yaml import Strict, validate
 
@@ -71,7 +71,7 @@ class RunMark:
     def __enter__(self) -> Self:
         now_ns = time.time_ns()
         try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(self._path.parent)
             if self._take_over(now_ns):
                 self._held = self._write(_Mark(running_since_ns=now_ns, abrupt_ends=self._ends))
                 self._signs.start()

@@ -17,7 +17,8 @@ import numpy as np
 
 from servod.client.open import VirtualWalkAxis
 from servod.common.errors import AnswerIsNo, BadInput
-from servod.common.files import unreadable, unwritable
+from servod.common.files import make_folder, replacing, unreadable, unwritable
+from servod.common.portable import flush_folder
 from servod.common.workers import worker_pool
 from servod.formats.gains.gain_set import load_gains
 from servod.formats.recording.mcap_reader import read_recording
@@ -59,12 +60,13 @@ def save_rows(path: Path, rows: Rows) -> None:
     """Cycle records as a recording, in place of an earlier one. Raises BadInput."""
     aside = path.with_name(path.name + ".part")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         aside.unlink(missing_ok=True)
         file = McapFile(aside, {}, 0)
         file.write_rows(split_rows(rows.tobytes()))
         file.close()
         aside.replace(path)
+        flush_folder(path.parent)
     except OSError as error:
         raise unwritable(path, error) from None
 
@@ -81,12 +83,10 @@ def save_curves(path: Path, curves: dict[str, Curves]) -> None:
         for motion, run in curves.items()
         for f in fields(run)
     }
-    aside = path.with_name(path.name + ".part")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with aside.open("wb") as stream:
+        make_folder(path.parent)
+        with replacing(path) as stream:
             np.savez_compressed(stream, **arrays)
-        aside.replace(path)
     except OSError as error:
         raise unwritable(path, error) from None
 

@@ -17,10 +17,9 @@ from pydantic import Field
 
 from servod.common import files
 from servod.common.errors import BadInput, Unreachable
-from servod.common.files import read_json, unwritable
+from servod.common.files import read_json, write_bytes, write_file
 from servod.common.portable import lock_file
 from servod.common.yaml import Strict, validate
-from servod.formats.gains.store import write_file
 
 # --- Files of a walk -------------------------------------------------------------------------------------------------
 # Names of the files in a walk's folder, and how plain values get into them.
@@ -42,11 +41,7 @@ EARLIER = "earlier"
 
 def write_text(path: Path, text: str) -> None:
     """Replace a file as a whole. Raises BadInput."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise unwritable(path, error) from None
-    write_file(path, text)
+    write_bytes(path, text.encode())
 
 
 def write_json(path: Path, document: Any) -> None:

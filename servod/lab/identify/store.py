@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from servod.common.errors import BadInput
-from servod.common.files import read_json, unreadable, unwritable
+from servod.common.files import make_folder, read_json, unreadable, unwritable, write_atomically
 from servod.common.yaml import Strict, validate
 from servod.formats.recording.mcap_reader import read_recording
 from servod.formats.recording.mcap_writer import McapFile, split_rows, wall_offset_ns
@@ -113,9 +113,7 @@ class Recordings:
 
     def _write_list(self) -> None:
         written = _List(conditions=self.conditions, start_rad=self.start_rad, experiments=self._done)
-        aside = self.folder / (LIST + ".part")
-        aside.write_text(written.model_dump_json(indent=1) + "\n", encoding="utf-8")
-        aside.replace(self.folder / LIST)
+        write_atomically(self.folder / LIST, written.model_dump_json(indent=1) + "\n")
 
     def _take_up(self) -> None:
         """Find the earlier recordings, if they were made under these conditions."""
@@ -127,7 +125,7 @@ class Recordings:
 
     def _make_folder(self) -> None:
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
+            make_folder(self.folder)
         except OSError as error:
             raise _unwritable(self.folder, error) from None
 

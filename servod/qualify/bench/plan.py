@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import platform
 import subprocess
 import sys
@@ -14,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from servod.common.files import unwritable
+from servod.common.files import write_file
 from servod.common.shipped import shipped
 from servod.qualify.bench import speed, tick, wakeup
 from servod.qualify.bench import wall_clock as wall
@@ -228,13 +227,5 @@ def print_table(document: dict[str, Any], console: Console) -> None:
 
 
 def write_json(document: dict[str, Any], path: Path) -> None:
-    """Write the document aside and rename it to `path`. Raises BadInput when that is not possible."""
-    aside = path.with_name(path.name + ".part")
-    try:
-        with aside.open("w", encoding="utf-8") as stream:
-            json.dump(document, stream, indent=2)
-            stream.flush()
-            os.fsync(stream.fileno())
-        aside.replace(path)
-    except OSError as error:
-        raise unwritable(path, error) from None
+    """Replace `path` by the document. Raises BadInput when that is not possible."""
+    write_file(path, json.dumps(document, indent=2))

@@ -6,18 +6,20 @@ becomes the store's active one only after the loop has taken it.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Awaitable, Callable, Sequence
 from concurrent.futures import Executor, Future
 from typing import Any
 
-from servod.common.errors import AnswerIsNo, BadInput, ServodError
+from servod.common.errors import AnswerIsNo, BadInput, ServodError, Unreachable
+from servod.common.files import unwritable
 from servod.formats.config import AxisConfig
 from servod.formats.gains.gain_set import GainSet, require_fit
 from servod.formats.gains.store import GainStore, StoredSet
 from servod.formats.recording.record import CycleRecord
 from servod.runtime.daemon.arguments import GainsActivateArgs, GainsLoadArgs, GainsVerdictArgs
-from servod.runtime.daemon.requests import work_of
+from servod.runtime.daemon.requests import NoAnswer, work_of
 from servod.runtime.daemon.status import ControllerStatus
 from servod.runtime.loop.commands import Op
 
@@ -37,18 +39,23 @@ class GainBank:
         """Open the store and choose the first set: the one active last, or gains.initial. Raises BadInput.
 
         A set that this axis may not run any more, whatever the reason, gives way to gains.initial: the configuration
-        or the version of servod may have changed since it was activated, and the axis shall start all the same.
+        or the version of servod may have changed since it was activated, or its file on the disk, and the axis shall
+        start all the same. `note` says so, until somebody activates a set.
         """
-        self._config, self._fits = config, fits
-        self._store = GainStore(config.gains.directory)
-        initial = self._store.load_file(config.gains.initial)
-        active = self._active_or(initial)
+        self._config, self._fits, self._note = config, fits, ""
+        self._store = GainStore(config.gains.directory, config.gains.max_versions)
+        try:
+            initial = self._store.load_file(config.gains.initial)
+            active = self._active_or(initial)
+        except OSError as error:
+            raise unwritable(f"gain store {config.gains.directory}", error) from None
         fits(active.gains, config)
         log.info("gain set %s version %d (%s)", active.name, active.version, active.gains.law.name)
         if warning := active.gains.certificate_warning():
             log.warning("gain set %s version %d: %s", active.name, active.version, warning)
         self._sets = {0: active}
-        self._last_serial = 0
+        self._last_serial = self._running = 0
+        self._kept = active  # what the store has as the active set, as far as it could be written
         self._tried: StoredSet | None = None
 
     @property
@@ -58,8 +65,8 @@ class GainBank:
 
     @property
     def newest(self) -> StoredSet:
-        """The set that was sent to the loop last; before that the one it starts with, as serial 0."""
-        return self._sets[self._last_serial]
+        """The set that the loop took last; before that the one it starts with, as serial 0."""
+        return self._sets[self._running]
 
     def describe(self, serial: int) -> ControllerStatus:
         """The part of the status document."""
@@ -68,12 +75,13 @@ class GainBank:
             "serial": serial,
             "name": stored.name if stored else "unknown",
             "law": stored.gains.law.name if stored else "unknown",
+            "note": self._note,
         }
 
     async def load(self, args: GainsLoadArgs, slow: Executor) -> dict[str, Any]:
         """Check and store a set."""
-        stored = await work_of(slow.submit(self._store.load, args.text, args.name))
-        return _row(stored)
+        stored: StoredSet = await work_of(slow.submit(self._store.load, args.text, args.name))
+        return {**_row(stored), "sealed": stored.text != args.text}
 
     async def list(self, serial: int, slow: Executor) -> dict[str, Any]:
         """All stored versions, and which one runs."""
@@ -84,16 +92,18 @@ class GainBank:
 
     def _rows(self, now: tuple[str, int] | None) -> Sequence[dict[str, Any]]:
         """All stored versions: which one runs, and why the axis may not run one (`refused`, else empty)."""
-        return [
-            {**_row(s), "active": (s.name, s.version) == now, "refused": self._refusal(s)} for s in self._store.stored()
-        ]
+        return [{**self._row_of(*one), "active": one == now} for one in self._store.versions()]
 
-    def _refusal(self, stored: StoredSet) -> str:
+    def _row_of(self, name: str, version: int) -> dict[str, Any]:
+        """One version, also one whose file is damaged."""
+        row = {"name": name, "version": version, "law": "unknown", "certified": False, "sha256": "", "warning": ""}
         try:
+            stored = self._store.get(name, version)
+            row = _row(stored)
             require_fit(stored.gains, self._config)
         except BadInput as refusal:
-            return str(refusal)
-        return ""
+            return {**row, "refused": str(refusal)}
+        return {**row, "refused": ""}
 
     async def activate(self, args: GainsActivateArgs, send: SendOrder, slow: Executor) -> dict[str, Any]:
         """Change the running controller to a stored set, bumpless."""
@@ -119,26 +129,34 @@ class GainBank:
             raise AnswerIsNo(_NO_TRIAL)
         if self._tried is not None:
             return await self._reject(self._tried, args, send, slow)
-        stored: StoredSet = await work_of(slow.submit(self._store.previous))
+        stored = await work_of(slow.submit(self._store.previous))
         await self._deploy(stored, send)
         await self._write(slow.submit(self._store.rollback), stored, send, slow)
         return _row(stored)
 
     def _active_or(self, initial: StoredSet) -> StoredSet:
         """The stored active set where the axis may run it; else `initial`, which is active from then on."""
-        last = self._store.active_reference()
-        if last is None:
-            return self._store.activate(initial.name, initial.version)
+        wanted, remedy = (
+            "the set that was active",
+            "`servoctl gains list` and `servoctl gains activate` the one that is meant",
+        )
         try:
+            last = self._store.active_reference()
+            if last is None:
+                return self._store.activate(initial.name, initial.version)
+            wanted = f"{last.name} version {last.version}"
+            remedy = (
+                f"Set back what was changed and `servoctl gains activate {last.name}`, or make a set anew: "
+                "`servoctl synthesize`, `verify`, `deploy`"
+            )
             active = self._store.get(last.name, last.version)
             self._fits(active.gains, self._config)
         except BadInput as error:
-            log.warning(
-                "%s; %s version %d (gains.initial) runs in place of %s version %d. Set back what was changed and "
-                "`servoctl gains activate %s`, or make a set anew: `servoctl synthesize`, `verify`, `deploy`",
-                *(error, initial.name, initial.version, last.name, last.version, last.name),
-            )
-            return self._store.activate(initial.name, initial.version, f"in place of {last.name}: {error}")
+            place = f"{initial.name} version {initial.version} (gains.initial) runs in place of {wanted}"
+            self._note = f"{error}; {place}"
+            log.warning("%s. %s", self._note, remedy)
+            return self._store.activate(initial.name, initial.version, f"in place of {wanted}: {error}")
+        self._note = self._store.damage
         return active
 
     async def _reject(
@@ -161,22 +179,48 @@ class GainBank:
             self._tried = runs
             await self._back(send, slow)
             raise
+        self._kept, self._note = runs, ""
 
     async def _back(self, send: SendOrder, slow: Executor) -> dict[str, Any]:
-        """The store's active set runs again, and none is on trial."""
-        active: StoredSet | None = await work_of(slow.submit(self._store.active))
-        assert active is not None  # the bank activated one when it began
+        """The active set runs again, and none is on trial: the one in memory, whatever became of the store."""
+        active = self._kept
         await self._deploy(active, send)
         self._tried = None
+        last = await work_of(slow.submit(self._stored_as_active))
+        if last != (active.name, active.version):  # a write that failed half-way, or a file that was damaged since
+            await work_of(slow.submit(self._store.activate, active.name, active.version, "runs again"))
         return _row(active)
 
+    def _stored_as_active(self) -> tuple[str, int] | None:
+        with contextlib.suppress(BadInput):
+            if last := self._store.active_reference():
+                return last.name, last.version
+        return None
+
     async def _deploy(self, stored: StoredSet, send: SendOrder) -> None:
-        """Send a set to the loop and wait until its records show that it runs."""
+        """Send a set to the loop and wait until its records show that it runs.
+
+        A loop that does not answer may take it yet: then the set that runs now is sent behind it, so that what was
+        refused does not run in the end.
+        """
         self._fits(stored.gains, self._config)
-        serial, parameters = self._last_serial + 1, stored.gains.pack()
-        await send(Op.ACTIVATE, (serial, stored.gains.law.number, len(parameters), *parameters))
-        self._last_serial, self._sets[serial] = serial, stored
+        before = self.newest
+        try:
+            await self._send(stored, send)
+        except NoAnswer:
+            log.error("the loop did not answer; gain set %s version %d is sent again", before.name, before.version)
+            with contextlib.suppress(Unreachable):  # it takes both, in this order, or none
+                await self._send(before, send)
+            self._running = self._last_serial
+            raise
         log.info("gain set %s version %d (%s) runs", stored.name, stored.version, stored.gains.law.name)
+
+    async def _send(self, stored: StoredSet, send: SendOrder) -> None:
+        self._last_serial = serial = self._last_serial + 1
+        self._sets[serial] = stored  # known before it runs: the answer may be missed
+        parameters = stored.gains.pack()
+        await send(Op.ACTIVATE, (serial, stored.gains.law.number, len(parameters), *parameters))
+        self._running = serial
 
 
 def _row(stored: StoredSet) -> dict[str, Any]:

@@ -19,8 +19,9 @@ from typing import NoReturn
 from servod import __version__
 from servod.common.clock import WallClock
 from servod.common.end_signals import on_end_signals
-from servod.common.errors import BadInput, ServodError
+from servod.common.errors import BadInput, ServodError, Unreachable
 from servod.common.faults import FaultCode
+from servod.common.files import reason
 from servod.common.yaml import read_text
 from servod.formats.config import AxisConfig, load_config
 from servod.formats.gains.gain_set import load_gains, require_fit
@@ -99,7 +100,11 @@ def _supervise(config: AxisConfig, nodes: Nodes, bank: GainBank, recorder: Recor
     expected = with_expected(config)
     for line in warnings(expected):
         log.warning("%s", line)
-    loop = LoopHandle(LoopPlan(expected, plans.amplifier, plans.encoder, int(gains.law.number), gains.pack()))
+    plan = LoopPlan(expected, plans.amplifier, plans.encoder, int(gains.law.number), gains.pack())
+    try:
+        loop = LoopHandle(plan)
+    except OSError as error:  # a limit on the size of files holds for shared memory, too
+        raise Unreachable(f"shared memory for the loop cannot be made ({reason(error)}); see `ulimit -a`") from None
     undo.callback(_give_back, nodes, loop)
     _start_loop(loop)
     return Supervisor(config, nodes, loop, bank, recorder, Notifier())
@@ -123,7 +128,7 @@ def _leave_core_to_loop(cpu: int | None) -> None:
 def _recorder(config: AxisConfig, path: Path, bank: GainBank) -> Recorder:
     recorder = Recorder(config.recorder, config.name, config.cycle.period_us)
     recorder.set_attachment("config.yaml", read_text(path).encode())
-    recorder.set_attachment("gains.yaml", bank.newest.path.read_bytes())
+    recorder.set_attachment("gains.yaml", bank.newest.text.encode())
     if config.model is not None:
         recorder.set_attachment("model.yaml", read_text(config.model).encode())
     if config.recorder.always:

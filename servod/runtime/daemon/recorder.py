@@ -8,6 +8,9 @@ dropped, counted and reported as RECORDER_FAILED.
 from __future__ import annotations
 
 import contextlib
+import logging
+import math
+import os
 import queue
 import re
 import threading
@@ -20,17 +23,22 @@ from pathlib import Path
 from typing import Any, TypedDict, TypeVar
 
 from servod.common.errors import BadInput, ServodError, Unreachable
-from servod.common.files import reason
+from servod.common.files import make_folder, reason
 from servod.formats.config import RecorderConfig
 from servod.formats.recording.mcap_writer import McapFile, split_rows, wall_offset_ns
 from servod.formats.recording.record import RECORD
 
+log = logging.getLogger("servod.recorder")
+
 # --- Files and names -------------------------------------------------------------------------------------------------
-# Where recordings stand and how many of them: names, rotation, and how many fault files are kept. Below the recorder,
-# in its writing thread, so that a slow disk holds up nobody.
+# Where recordings stand and how many of them: names, rotation, what is removed and when. Below the recorder, in its
+# writing thread, so that a slow disk holds up nobody.
 
 
 MIB = 1024 * 1024
+_DAY_S = 86400.0
+#: A recording goes on in a new file at this share of all, so that the oldest can go while the newest is written.
+_PART_SHARE = 4
 #: Names are shown in logs, on terminals and on pages: nothing in them may act there, or look like an option.
 _FILE_NAME = re.compile(r"\w[\w .,+()-]{0,200}\.mcap")
 _STAMP = "%Y%m%d-%H%M%S"
@@ -41,9 +49,13 @@ class RecordingFiles:
 
     def __init__(self, config: RecorderConfig, axis_name: str) -> None:
         self._directory, self._axis_name = config.directory, axis_name
-        self._max_fault_files = config.max_fault_files
-        self._fault_name = re.compile(rf"{re.escape(axis_name)}-fault-\d{{8}}-\d{{6}}-\w+(-\d+)?\.mcap")
-        self.max_bytes = config.max_file_mib * MIB
+        self._max_fault_files, self._max_age_days = config.max_fault_files, config.max_age_days
+        axis = re.escape(axis_name)
+        self._fault_name = re.compile(rf"{axis}-fault-\d{{8}}-\d{{6}}-\w+(-\d+)?\.mcap")
+        self._own_name = re.compile(rf"{axis}-\d{{8}}-\d{{6}}(-\d+)?\.mcap")
+        self._max_total_bytes = config.max_total_mib * MIB
+        self.max_bytes = min(config.max_file_mib * MIB, self._max_total_bytes // _PART_SHARE)
+        self.total_bytes = self.removed = 0
 
     def recording(self, name: str | None) -> Path:
         """A path in the directory, and nowhere else: clients must not write where they please. Raises BadInput."""
@@ -55,27 +67,59 @@ class RecordingFiles:
             raise BadInput("record_start: path", repr(name), f"{allowed} {self._directory}")
         return path
 
-    def next_part(self, first: Path) -> Path:
-        """Where a recording goes on that began in `first` and is full: the same name with a number."""
-        return self._unused(first.stem)
+    def next_part(self, first: Path, number: int) -> Path:
+        """Where a recording goes on that began in `first`: the same name with this number, or the next that is free.
+
+        Never with a smaller one that has become free: the parts stay in their order.
+        """
+        return self._unused(first.stem, number)
 
     def fault(self, label: str) -> Path:
         """A new path for the seconds before a fault."""
         return self._unused(f"{self._axis_name}-fault-{_now()}-{label}")
 
-    def drop_old_fault_files(self) -> None:
-        """Remove the oldest fault files beyond recorder.max_fault_files; whoever wants one for good copies it."""
-        found = [path for path in self._directory.glob("*.mcap") if self._fault_name.fullmatch(path.name)]
-        found.sort(key=lambda path: path.stat().st_mtime_ns)
-        for path in found[: -self._max_fault_files]:
-            with contextlib.suppress(OSError):
-                path.unlink()
+    def make_room(self, writing: Path | None = None) -> None:
+        """Remove the oldest of what is beyond recorder.max_fault_files, max_age_days and max_total_mib.
 
-    def _unused(self, stem: str) -> Path:
-        path, number = self._directory / f"{stem}.mcap", 1
-        while path.exists():
+        Only files that servod named itself: whoever wants one for good copies it. `writing` stays, and has room to
+        become a full part; so do the newest fault files, however old they are.
+        """
+        faults, others = self._found(self._fault_name), self._found(self._own_name)
+        part = others.pop(writing, None) if writing else None
+        for path in list(faults)[: -self._max_fault_files]:
+            self._remove(path, "recorder.max_fault_files")
+            del faults[path]
+        oldest_s = time.time() - (self._max_age_days or 0.0) * _DAY_S
+        left = sum(state.st_size for state in (*faults.values(), *others.values()))
+        most = self._max_total_bytes - (self.max_bytes if part else 0)
+        for path, state in others.items():
+            too_old = self._max_age_days is not None and state.st_mtime < oldest_s
+            if too_old or left > most:
+                self._remove(path, "recorder.max_age_days" if too_old else "recorder.max_total_mib")
+                left -= state.st_size
+        self.total_bytes = left + (part.st_size if part else 0)
+
+    def _found(self, name: re.Pattern[str]) -> dict[Path, os.stat_result]:
+        """The files of such a name, the oldest first."""
+        found = {}
+        for path in self._directory.glob("*.mcap"):
+            with contextlib.suppress(OSError):  # somebody removed it meanwhile
+                if name.fullmatch(path.name):
+                    found[path] = path.stat()
+        return dict(sorted(found.items(), key=lambda entry: entry[1].st_mtime_ns))
+
+    def _remove(self, path: Path, key: str) -> None:
+        try:
+            path.unlink()
+        except OSError as error:
+            log.warning("%s: cannot be removed (%s)", path, reason(error))
+        else:
+            self.removed += 1
+            log.info("%s removed: it was the oldest beyond %s", path, key)
+
+    def _unused(self, stem: str, number: int = 1) -> Path:
+        while (path := self._directory / (f"{stem}-{number}.mcap" if number > 1 else f"{stem}.mcap")).exists():
             number += 1
-            path = self._directory / f"{stem}-{number}.mcap"
         return path
 
 
@@ -148,8 +192,9 @@ class HistoryRing:
 
 T = TypeVar("T")
 
-#: A file on disk is never older than this; kill -9 loses no more.
+#: A file on disk is never older than this and what the disk takes to sync: kill -9 and power cuts lose no more.
 SYNC_PERIOD_S = 0.5
+_ROOM_PERIOD_S = 60.0
 _QUEUE_BATCHES = 1024
 #: A client that reads along may be late by this, however short the history is that fault files get.
 _LOOK_BACK_S = 2.0
@@ -158,7 +203,8 @@ _KEPT_EVENTS = 256
 
 class RecorderState(TypedDict):
     """What is being recorded: the file written now, and how much in all its parts; `failure` is empty while all is
-    well."""
+    well, `dropped` goes on counting after one. Of the folder: bytes of what servod named itself, how many it removed.
+    """
 
     recording: bool
     path: str
@@ -167,6 +213,8 @@ class RecorderState(TypedDict):
     dropped: int
     history_s: float
     failure: str
+    total_bytes: int
+    removed: int
 
 
 class Recorder:
@@ -181,9 +229,12 @@ class Recorder:
         self._attached: dict[str, bytes] = {}  # the same, in the writing thread
         self._offset_ns = wall_offset_ns()
         self._file: McapFile | None = None
-        self._first_part, self._full_records, self._full_bytes = Path(), 0, 0
-        self._path, self._records, self._bytes, self._dropped = "", 0, 0, 0
+        self._first_part, self._parts, self._full_records, self._full_bytes = Path(), 1, 0, 0
+        self._path, self._records, self._bytes = "", 0, 0
+        #: Cycles for which the queue had no room; those that the writing thread was given, and those that no file took.
+        self._dropped, self._given, self._lost = 0, 0, 0
         self._failure, self._new_failure = "", ""
+        self._broken = False  # a recording failed, and nobody has asked for its end or another yet
         self._jobs: queue.Queue[Callable[[], None] | None] = queue.Queue(_QUEUE_BATCHES)
         self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
         self._thread.start()
@@ -192,7 +243,11 @@ class Recorder:
     def add_rows(self, rows: Sequence[bytes]) -> None:
         """Take packed cycle records, oldest first: into the history, and into the file when one is open."""
         self._history.add(rows)
-        if rows and self._file is not None and not self._put(lambda: self._write_rows(rows)):
+        if not rows or (self._file is None and not self._broken):
+            return
+        if self._broken:
+            self._dropped += len(rows)
+        elif not self._put(lambda: self._write_rows(rows)):
             self._dropped += len(rows)
             self._fail("the disk does not keep up; cycles were dropped")
 
@@ -246,9 +301,11 @@ class Recorder:
             "path": self._path,
             "records": self._records,
             "bytes": self._bytes,
-            "dropped": self._dropped,
+            "dropped": self._dropped + self._lost,
             "history_s": self._history_s,
             "failure": self._failure,
+            "total_bytes": self._files.total_bytes,
+            "removed": self._files.removed,
         }
 
     def close(self, timeout_s: float = 2.0) -> None:
@@ -277,8 +334,11 @@ class Recorder:
 
     # --- writing thread ------------------------------------------------------------------------------------------
     def _work(self) -> None:
-        synced = time.monotonic()
+        synced, room = time.monotonic(), -math.inf
         while True:
+            if time.monotonic() - room >= _ROOM_PERIOD_S:
+                self._guard(self._make_room)
+                room = time.monotonic()
             try:
                 job = self._jobs.get(timeout=SYNC_PERIOD_S)
             except queue.Empty:
@@ -298,12 +358,23 @@ class Recorder:
         except (OSError, ValueError) as error:
             self._fail(f"{self._path}: {getattr(error, 'strerror', None) or error}")
             if self._file is not None:
-                self._file.abandon()
-                self._file = None
+                self._give_up(self._file)
+
+    def _give_up(self, file: McapFile) -> None:
+        """End a recording whose file takes no more: count what is in it, and what is not."""
+        self._broken, self._file = True, None
+        self._records = self._full_records + file.abandon()
+        self._lost = self._given - self._records
+
+    def _make_room(self) -> None:
+        self._files.make_room(None if self._file is None else self._file.path)
 
     def _write_rows(self, rows: Sequence[bytes]) -> None:
         if self._file is not None:
+            self._given += len(rows)
             self._file.write_rows(rows)
+        elif self._broken:
+            self._lost += len(rows)
 
     def _write_event(self, event: dict[str, Any]) -> None:
         if self._file is not None:
@@ -323,11 +394,18 @@ class Recorder:
                 self._go_on_in_a_new_file(self._file)
 
     def _go_on_in_a_new_file(self, full: McapFile) -> None:
-        path = self._files.next_part(self._first_part)
         full.close()
         self._full_records, self._full_bytes = self._records, self._full_bytes + full.path.stat().st_size
-        self._file = McapFile(path, self._attached, self._offset_ns)
+        self._parts += 1
+        path = self._files.next_part(self._first_part, self._parts)
+        try:
+            make_folder(path.parent)
+            self._file = McapFile(path, self._attached, self._offset_ns)
+        except OSError:  # what is full is whole: it is only that the recording does not go on
+            self._broken, self._file = True, None
+            raise
         self._path = str(path)
+        self._make_room()
 
     def _finish(self) -> None:
         if self._file is not None:
@@ -338,14 +416,23 @@ class Recorder:
         if self._file is not None:
             raise Unreachable(f"recorder: already records to {self._path}; `servoctl record stop` ends it")
         self._file = _create(path, attachments, self._offset_ns)
-        self._first_part, self._full_records, self._full_bytes = path, 0, 0
-        self._path, self._records, self._bytes, self._dropped, self._failure = str(path), 0, 0, 0, ""
+        self._first_part, self._parts, self._full_records, self._full_bytes = path, 1, 0, 0
+        self._path, self._records, self._bytes, self._failure = str(path), 0, 0, ""
+        self._dropped, self._given, self._lost, self._broken = 0, 0, 0, False
+        self._make_room()
         return path
 
     def _stop(self) -> RecorderState:
-        if self._file is not None:
+        if self._broken:
+            self._broken = False
+            raise Unreachable(f"recorder: the recording had failed: {self._failure}")
+        try:
             self._sync()
             self._finish()
+        except OSError:
+            if self._file is not None:
+                self._give_up(self._file)  # before the answer goes out: who asked may look at the state at once
+            raise
         return self.state()
 
     def _write_history(
@@ -361,13 +448,13 @@ class Recorder:
         except OSError as error:
             file.abandon()
             raise Unreachable(f"{path}: cannot be written ({reason(error)})") from None
-        self._files.drop_old_fault_files()
+        self._make_room()
         return path
 
 
 def _create(path: Path, attachments: dict[str, bytes], offset_ns: int) -> McapFile:
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         return McapFile(path, attachments, offset_ns)
     except OSError as error:
         raise Unreachable(f"{path}: cannot be written ({reason(error)})") from None
@@ -381,7 +468,8 @@ def _resolve(future: Future[T], job: Callable[[], T]) -> None:
     except ServodError as error:
         future.set_exception(error)
     except (OSError, ValueError) as error:
-        future.set_exception(Unreachable(f"recorder: {error}"))
+        told = f"{error.filename or 'disk'}: {reason(error)}" if isinstance(error, OSError) else str(error)
+        future.set_exception(Unreachable(f"recorder: {told}"))
         raise
 
 

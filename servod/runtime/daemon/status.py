@@ -102,11 +102,12 @@ class TimingStatus(TypedDict):
 
 
 class ControllerStatus(TypedDict):
-    """The active gain set."""
+    """The active gain set; `note` says why it is not the one that was active last, empty where it is."""
 
     serial: int
     name: str
     law: str
+    note: str
 
 
 class BusStatus(TypedDict):

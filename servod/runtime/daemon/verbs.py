@@ -284,7 +284,7 @@ class Verbs:
             return await change
         finally:
             if self._bank.newest is not before:
-                self._recorder.set_attachment("gains.yaml", self._bank.newest.path.read_bytes())
+                self._recorder.set_attachment("gains.yaml", self._bank.newest.text.encode())
 
     async def _record_start(self, args: RecordStartArgs) -> dict[str, Any]:
         path = await work_of(self._recorder.start(args.path))

@@ -84,3 +84,8 @@ def certified(gains: GainSet, valid: bool = True) -> GainSet:
     )
     parts = {"certificate": certificate, "design": gains.design or DESIGN}
     return parse_gains(gains.model_copy(update=parts).sealed().to_yaml(), "certified.yaml")
+
+
+def certified_text() -> str:
+    """The text of a certified PD set."""
+    return certified(parse_gains(PD, "good.yaml")).to_yaml()

@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from servod.common.errors import BadInput
-from servod.formats.gains.store import Action, GainStore, write_atomically
+from servod.common.files import write_atomically
+from servod.formats.gains.store import Action, GainStore
 from tests.formats.gains import good
 
 STIFFER = good.PD.replace("2.5", "3.5")
@@ -25,7 +26,8 @@ def store(tmp_path: Path) -> GainStore:
 
 def test_versions_grow_and_the_same_text_again_gets_none(store: GainStore) -> None:
     assert [store.load(text, "x").version for text in (good.PD, good.PD, STIFFER, STIFFER, good.PD)] == [1, 1, 2, 2, 3]
-    assert store.get("bench_pd", 1).path.read_text(encoding="utf-8") == good.PD
+    first = store.get("bench_pd", 1)
+    assert first.path.read_text(encoding="utf-8") == first.text == f"{good.PD}seal: {first.gains.seal}\n"
     assert store.get("bench_pd").version == 3
     assert [(s.name, s.version) for s in store.stored()] == [("bench_pd", v) for v in (1, 2, 3)]
 

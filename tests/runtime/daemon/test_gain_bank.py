@@ -11,13 +11,14 @@ from typing import Any
 
 import pytest
 
-from servod.common.errors import AnswerIsNo
+from servod.common.errors import AnswerIsNo, BadInput, Unreachable
 from servod.common.shipped import shipped
 from servod.formats.config import load_config
 from servod.formats.gains.store import Action, GainStore
 from servod.formats.recording.record import CycleRecord
 from servod.runtime.daemon.arguments import GainsActivateArgs, GainsVerdictArgs
 from servod.runtime.daemon.gain_bank import GainBank
+from servod.runtime.daemon.requests import NoAnswer
 from servod.runtime.loop.commands import Op
 from tests.runtime.daemon.daemon_rows import record
 
@@ -98,6 +99,63 @@ def test_a_set_that_cannot_be_stored_as_active_does_not_run_on(bench: Bench) -> 
     with pytest.raises(OSError, match=r"active\.json"):
         bench.rollback(trial=False)
     assert (bench.runs, bench.active) == (TRIED, TRIED)
+
+
+def test_a_history_that_takes_no_line_refuses_nothing(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+    """The activation is done by then: to call it refused left the refused set running, and active."""
+    history = bench.store.directory / "history.jsonl"
+    history.unlink()
+    history.mkdir()
+    bench.activate(trial=False)
+    assert (bench.runs, bench.active) == (TRIED, TRIED)
+    assert "without a line on activate" in caplog.text
+
+
+def test_a_file_that_goes_while_its_set_is_on_trial_is_not_needed_for_the_way_back(bench: Bench) -> None:
+    bench.activate(trial=True)
+    for file in ("active.json", "active.copy.json"):
+        (bench.store.directory / file).write_bytes(bytes(40))
+    (bench.store.directory / "sets" / FIRST / "0001.yaml").write_bytes(b"")
+    with pytest.raises(BadInput, match=r"0001\.yaml"):  # it cannot be stored as active again; it runs all the same
+        bench.rollback(trial=True)
+    assert (bench.runs, bench.bank.on_trial) == (FIRST, False)
+
+
+class SlowLoop(Loop):
+    """Answers nothing while it hangs, and takes what was sent in order when it goes on."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.hangs, self.waiting = True, list[int]()
+
+    async def send(self, op: Op, arguments: Sequence[float]) -> CycleRecord:
+        if not self.hangs:
+            return await super().send(op, arguments)
+        self.waiting.append(int(arguments[0]))
+        raise NoAnswer("the loop did not answer in time")
+
+    def go_on(self) -> None:
+        self.hangs = False
+        self.serial = self.waiting[-1]
+
+
+def test_what_a_loop_takes_after_all_is_not_the_refused_set(bench: Bench) -> None:
+    bench.loop = loop = SlowLoop()
+    with pytest.raises(Unreachable, match="did not answer in time"):
+        bench.activate(trial=False)
+    loop.go_on()
+    assert (bench.runs, bench.active, bench.bank.newest.name) == (FIRST, FIRST, FIRST)
+    bench.activate(trial=False)
+    assert (bench.runs, bench.active, bench.bank.newest.name) == (TRIED, TRIED, TRIED)
+
+
+def test_a_damaged_version_does_not_hide_the_others(bench: Bench) -> None:
+    (bench.store.directory / "sets" / TRIED / "0001.yaml").write_bytes(b"parameters: {")
+    rows = asyncio.run(bench.bank.list(bench.loop.serial, bench.slow))["gains"]
+    assert [(row["name"], row["law"], bool(row["refused"])) for row in rows] == [
+        (FIRST, "pd", False),
+        (TRIED, "unknown", True),
+    ]
 
 
 def test_a_trial_is_given_up(bench: Bench) -> None:

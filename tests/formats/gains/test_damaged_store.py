@@ -1,0 +1,215 @@
+"""Damaged files of the gain store: no set runs with other numbers than were stored, and every start begins."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import random
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from servod.common.errors import BadInput
+from servod.common.files import write_atomically
+from servod.common.shipped import shipped
+from servod.formats.config import AxisConfig, load_config
+from servod.formats.gains.gain_set import parse_gains
+from servod.formats.gains.store import Action, GainStore, sealed_text
+from servod.runtime.daemon.gain_bank import GainBank
+from tests.formats.gains import good
+
+STIFFER = good.PD.replace("2.5", "3.5")
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> AxisConfig:
+    """The shipped virtual axis with a store of its own, at work for a while; the last set of each kind is active."""
+    config = load_config(shipped("gains/config/virtual.yaml"))
+    gains = config.gains.model_copy(update={"directory": tmp_path / "gains", "accept_uncertified": True})
+    return config.model_copy(update={"gains": gains})
+
+
+def _used(config: AxisConfig, active: str) -> GainBank:
+    bank = GainBank(config)
+    store = GainStore(config.gains.directory)
+    for text in (good.PD, STIFFER, good.LUGRE, good.certified(parse_gains(good.LOCAL, "x")).to_yaml(), active):
+        stored = store.load(text, "x")
+        store.activate(stored.name, stored.version)
+    bank = GainBank(config)
+    assert bank.newest == store.active() and bank.describe(0)["note"] == ""
+    return bank
+
+
+def _damaged(content: bytes, drawn: random.Random) -> bytes:
+    """One bit flipped, the end cut off, or a stretch of zeros, as disks do it."""
+    at = drawn.randrange(len(content))
+    match drawn.randrange(5):
+        case 0:
+            return content[:at]
+        case 1:
+            end = min(len(content), at + drawn.choice((1, 16, 512)))
+            return content[:at] + bytes(end - at) + content[end:]
+        case _:
+            return content[:at] + bytes([content[at] ^ 1 << drawn.randrange(8)]) + content[at + 1 :]
+
+
+def _stored_files(folder: Path) -> Iterator[Path]:
+    yield from sorted(folder.glob("active*.json"))
+    yield from sorted((folder / "sets").rglob("*.yaml"))
+
+
+LONG = [pytest.mark.long, pytest.mark.timeout(900)]
+CERTIFIED = good.certified(parse_gains(good.PD.replace("bench_pd", "certified"), "x")).to_yaml()
+
+
+@pytest.mark.parametrize(
+    ("rounds", "active"),
+    [
+        pytest.param(60, good.PD, id="a set that came without a seal"),
+        pytest.param(60, CERTIFIED, id="a certified set"),
+        pytest.param(2500, good.PD, id="long, without a seal", marks=LONG),
+        pytest.param(2500, CERTIFIED, id="long, certified", marks=LONG),
+    ],
+)
+def test_no_damage_runs_other_numbers_or_ends_a_start(
+    rounds: int, active: str, config: AxisConfig, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Two thirds of the damage is to what decides: the active set's file, and the one that names it."""
+    caplog.set_level(logging.CRITICAL, "servod")
+    folder, drawn = config.gains.directory, random.Random(rounds)
+    before = _used(config, active).newest
+    packed = {(one.name, one.version): one.gains.pack() for one in GainStore(folder).stored()}
+    initial = parse_gains(config.gains.initial.read_text(), "x")
+    whole = folder.with_name("whole")
+    shutil.copytree(folder, whole)
+    told = 0
+    for _ in range(rounds):
+        files = list(_stored_files(folder))
+        path = drawn.choice([before.path, folder / "active.json"]) if drawn.random() < 2 / 3 else drawn.choice(files)
+        content = path.read_bytes()
+        path.write_bytes(_damaged(content, drawn))
+        bank = GainBank(config)
+        runs, note = bank.newest, bank.describe(0)["note"]
+        if (runs.name, runs.version) == (before.name, before.version):
+            assert runs.gains.pack() == before.gains.pack()
+        else:
+            assert note and runs.gains.pack() == initial.pack()
+            told += 1
+        for name, version in GainStore(folder).versions():  # whatever else is readable has its numbers, too
+            if (name, version) in packed:
+                try:
+                    assert GainStore(folder).get(name, version).gains.pack() == packed[name, version]
+                except BadInput:
+                    continue
+        shutil.rmtree(folder)
+        shutil.copytree(whole, folder)
+    assert told > rounds / 5
+
+
+@pytest.mark.parametrize("step", [7, pytest.param(1, marks=pytest.mark.long)])  # 7: each bit of a byte in turn
+def test_every_single_bit_of_a_set_that_came_without_a_seal(step: int, config: AxisConfig) -> None:
+    """36 of 1,276 such flips ran in silence once, a velocity gain of 8.12 in place of 0.12 among them."""
+    store = GainStore(config.gains.directory)
+    stored = store.load(good.PD, "x")
+    content, refused = stored.path.read_bytes(), 0
+    for bit in range(0, 8 * len(content), step):
+        bent = bytearray(content)
+        bent[bit // 8] ^= 1 << bit % 8
+        stored.path.write_bytes(bent)
+        try:
+            assert store.get("bench_pd").gains == stored.gains
+        except BadInput as error:
+            assert str(stored.path) in str(error)
+            refused += 1
+    assert refused > 0.9 * 8 * len(content) / step  # the rest are blanks, quotes and comments
+
+
+def test_a_damaged_active_file_gives_way_to_its_copy_aloud(
+    config: AxisConfig, caplog: pytest.LogCaptureFixture
+) -> None:
+    before = _used(config, good.PD).newest
+    file = config.gains.directory / "active.json"
+    for content in (b"", bytes(40), b'{"current": 1}', file.read_bytes().replace(b'"bench_pd"', b'"bench_pe"', 1)):
+        file.write_bytes(content)
+        bank = GainBank(config)
+        assert bank.newest == before
+        assert "active.json" in bank.describe(0)["note"] and "was taken in its place" in caplog.text
+        assert GainBank(config).describe(0)["note"] == ""  # mended
+    file.unlink()
+    assert "no file, although it has a copy" in GainBank(config).describe(0)["note"]
+
+
+def test_without_either_the_initial_set_runs_and_says_what_to_do(
+    config: AxisConfig, caplog: pytest.LogCaptureFixture
+) -> None:
+    _used(config, good.PD)
+    for name in ("active.json", "active.copy.json"):
+        (config.gains.directory / name).write_bytes(b"{")
+    bank = GainBank(config)
+    assert bank.newest.gains.name == parse_gains(config.gains.initial.read_text(), "x").name
+    assert "(gains.initial) runs in place of the set that was active" in bank.describe(0)["note"]
+    assert "`servoctl gains activate` the one that is meant" in caplog.text
+    assert GainBank(config).describe(0)["note"] == ""  # it is the active one from then on
+
+
+def test_a_store_of_an_earlier_version_goes_on(config: AxisConfig) -> None:
+    """It had sets without a seal, of which the history has the hash, and an active.json without one."""
+    _used(config, good.PD)
+    folder = config.gains.directory
+    stored = GainStore(folder).get("bench_pd")
+    write_atomically(stored.path, good.PD)
+    history = (folder / "history.jsonl").read_text()
+    old = GainStore(folder)
+    with pytest.raises(BadInput, match="no seal, and no hash of it in the history"):
+        old.get("bench_pd")
+    write_atomically(
+        folder / "history.jsonl", history.replace(stored.sha256, hashlib.sha256(good.PD.encode()).hexdigest())
+    )
+    (folder / "active.copy.json").unlink()
+    state = (folder / "active.json").read_text()
+    write_atomically(
+        folder / "active.json",
+        "\n".join(line for line in state.splitlines() if "sha256" not in line).replace("],", "]"),
+    )
+    bank = GainBank(config)
+    assert (bank.newest.name, bank.newest.version, bank.newest.gains.seal) == ("bench_pd", stored.version, None)
+    assert bank.describe(0)["note"] == "" and "sha256" in (folder / "active.json").read_text()
+    stored.path.write_text(good.PD.replace("2.5", "2.6"))
+    assert "runs in place of bench_pd" in GainBank(config).describe(0)["note"]
+    again = GainStore(folder).load(good.PD, "x")  # the explicit way: it is stored once more, with a seal
+    assert again.version == stored.version + 1 and not again.gains.seal_broken and again.gains.seal
+
+
+@pytest.mark.parametrize("text", [good.PD, "---\n" + good.PD + "...\n", good.PD + "\n# the end", good.LUGRE])
+def test_a_seal_comes_to_any_text_and_changes_no_number(text: str) -> None:
+    gains = parse_gains(text, "x")
+    sealed = sealed_text(text, gains)
+    assert parse_gains(sealed, "x") == gains.sealed()
+    assert sealed_text(sealed, gains.sealed()) == sealed
+    in_braces = '{"schema_version": 1, "name": "a", "parameters": ' + gains.parameters.model_dump_json()
+    in_braces += ', "provenance": {"author": "A", "date": "2026-11-20"}}'
+    braced = parse_gains(in_braces, "x")
+    assert parse_gains(sealed_text(in_braces, braced), "x") == braced.sealed()
+
+
+def test_the_oldest_versions_go_but_no_active_one_nor_those_before(tmp_path: Path) -> None:
+    store = GainStore(tmp_path, max_versions=3)
+    for n in range(8):
+        stored = store.load(good.PD.replace("2.5", f"2.{n}"), "x")
+        if n in (1, 2):
+            store.activate(stored.name, stored.version)
+    assert [version for _, version in store.versions()] == [2, 3, 6, 7, 8]
+    assert store.rollback().version == 2
+
+
+def test_a_long_history_forgets_its_oldest_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("servod.formats.gains.store._KEPT_LINES", 10)
+    store = GainStore(tmp_path)
+    store.load(good.PD, "x")
+    for _ in range(30):
+        store.activate("bench_pd")
+    again = GainStore(tmp_path)
+    assert [entry.action for entry in again.history()] == [Action.ACTIVATE] * 10
+    assert again.get("bench_pd") == store.get("bench_pd")
