@@ -6,7 +6,7 @@ drawing itself is the laboratory's.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -61,7 +61,7 @@ def plot(
         known = f"{whole.time_s[0]:g} to {whole.time_s[-1]:g} s" if len(whole.time_s) else "a recording with cycles"
         raise BadInput(f"{recording}: time", f"no two rows from {from_s} to {to_s} s", known)
     for file in files:
-        draw(run, file, happened)
+        draw(run, file, happened, made_from={"recording": recording})
     result = {
         "recording": str(recording),
         "rows": len(run.time_s),
@@ -82,12 +82,19 @@ def check_drawing(option: str, file: Path) -> None:
     need_file(option, file)
 
 
-def draw(run: RecordedRun, file: Path, happened: Sequence[tuple[str, str, str]] = (), said: Sequence[str] = ()) -> None:
+def draw(
+    run: RecordedRun,
+    file: Path,
+    happened: Sequence[tuple[str, str, str]] = (),
+    said: Sequence[str] = (),
+    made_from: Mapping[str, Path] | None = None,
+) -> None:
     """Write `run` as a page or as a picture. Raises BadInput.
 
-    The page has the sentences of `said` too, and `happened` as rows of time, kind and text.
+    The page begins with the first sentence of `said`, or without one with the figures of the run, and has `happened` as
+    rows of time, kind and text.
     """
-    from servod.lab.report.figures.motion import recorded_run
+    from servod.lab.report.figures.motion import describe_run, recorded_run
 
     figure = recorded_run(run, file.stem)
     if file.suffix == PICTURE:
@@ -95,16 +102,17 @@ def draw(run: RecordedRun, file: Path, happened: Sequence[tuple[str, str, str]] 
 
         write_pictures(figure, file.parent, ("png",))
         return
-    from servod.lab.report.page import Page
+    from servod.lab.report.figure import PageTable
+    from servod.lab.report.page import Origin, Page, Verdict
 
-    page = Page(run.title)
-    if said:
-        page.points(said)
+    first, *more = said or [describe_run(run)]
+    page = Page(run.title, Verdict(first), Origin(made_from or {}))
+    page.points(more)
     page.sentence("Drag over a part of a panel to see it closer, double-click to see all; all panels move together.")
-    page.figure(figure, every_row=True)
+    page.figure(figure)
     if happened:
         page.heading("What happened")
-        page.table(("t / s", "", ""), happened)
+        page.table(PageTable("Events", ("time / s", "kind", "what"), tuple(happened)))
     page.write(file)
 
 

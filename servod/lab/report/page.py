@@ -1,42 +1,73 @@
-"""Builds one self-contained HTML page: sentences, tables and plotly figures, with the plotting code inside the file.
+"""Builds one self-contained HTML page: the verdict, by what and from what it was made, then sentences, tables, figures.
 
-Behind everything; called by verbs that report. Needs plotly (the lab part).
+Behind everything; called by verbs that report. Style and script are page.css and page.js, and stand in the file: it
+opens without a network. Needs the lab part.
 """
 
 from __future__ import annotations
 
+import datetime
+import hashlib
 import html
-from collections.abc import Sequence
+import json
+import platform
+import re
+import shutil
+import subprocess
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
-import plotly.graph_objects as go
-import plotly.io
-from plotly.offline import get_plotlyjs
+import numpy as np
 
-from servod import __version__
+import servod
 from servod.common.files import write_bytes
-from servod.lab.report.figure import Figure
-from servod.lab.report.page_figure import HEAD_PX, every_row_script, plotly_figure
+from servod.formats.config import AmplifierConfig, AxisConfig, EncoderConfig
+from servod.lab.report.figure import Figure, PageTable
+from servod.lab.report.page_figure import PageData, figure_html
 
-_STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 70rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
-h1 { font-size: 1.6rem; } h2 { font-size: 1.2rem; margin-top: 2.5rem; }
-table { border-collapse: collapse; } th, td { padding: .3rem .9rem; text-align: right; border-bottom: 1px solid #ddd; }
-th:first-child, td:first-child { text-align: left; } table { margin: 1rem 0; }
-.lead { font-size: 1.25rem; font-weight: 600; border-left: 4px solid #0072b2;
-  padding-left: .8rem; }
-details { margin: .8rem 0; } summary { cursor: pointer; color: #0072b2; } details p { margin: .4rem 1.2rem; }
-footer { margin-top: 3rem; color: #777; font-size: .85rem; }
-"""
+_HERE = Path(__file__).parent
+#: What is aligned as a number.
+_NUMBER = re.compile(r"[-+−–<≤≥]? ?\d|[-–]$")
+_TEXT = ' class="text"'
+#: Digits of a hash that are shown; all of them stand under the pointer.
+_SHORT = 12
+
+
+class Verdict(NamedTuple):
+    """The answer in one sentence, with the figures that decide; `passed` is None where nothing was judged."""
+
+    text: str
+    passed: bool | None = None
+
+    def html(self) -> str:
+        """The first paragraph of the page."""
+        kind = {True: "passed", False: "failed", None: "told"}[self.passed]
+        word = {True: "Passed: ", False: "Refused: ", None: ""}[self.passed]
+        return f'<p id="verdict" class="{kind}">{html.escape(word + self.text)}</p>'
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What a report was made from: files by what they are, and the axis whose drives it is about.
+
+    Files are hashed when the page is made; one that is not there (any more) is left out. `hashes` are of what is no
+    file, as the gain set within a daemon.
+    """
+
+    files: Mapping[str, Path | Sequence[Path]] = field(default_factory=dict)
+    axis: AxisConfig | None = None
+    hashes: Mapping[str, str] = field(default_factory=dict)
 
 
 class Page:
-    """A page in the making; parts appear in the order in which they were added."""
+    """A page in the making; parts appear in the order in which they were added, verdict and signature before them."""
 
-    def __init__(self, title: str) -> None:
-        self._title = title
-        self._parts = [f"<h1>{html.escape(title)}</h1>"]
-        self._has_figure = False
+    def __init__(self, title: str, verdict: Verdict, origin: Origin | None = None) -> None:
+        self._title, self._verdict, self._origin = title, verdict, origin or Origin()
+        self._parts: list[str] = []
+        self._figures: list[Figure] = []
 
     def heading(self, text: str) -> None:
         """Begin a section."""
@@ -46,57 +77,165 @@ class Page:
         """Add a paragraph of plain text."""
         self._parts.append(f"<p>{html.escape(text)}</p>")
 
-    def lead(self, text: str) -> None:
-        """Add a paragraph that stands out: the answer in one sentence."""
-        self._parts.append(f'<p class="lead">{html.escape(text)}</p>')
-
     def points(self, lines: Sequence[str]) -> None:
         """Add a list of plain sentences."""
-        self._parts.append("<ul>" + "".join(f"<li>{html.escape(line)}</li>" for line in lines) + "</ul>")
+        if lines:
+            self._parts.append("<ul>" + "".join(f"<li>{html.escape(line)}</li>" for line in lines) + "</ul>")
 
     def folded(self, title: str, lines: Sequence[str]) -> None:
         """Add paragraphs that are shown when their title is clicked: mathematics, and what few readers need."""
         inner = "".join(f"<p>{html.escape(line)}</p>" for line in lines)
         self._parts.append(f"<details><summary>{html.escape(title)}</summary>{inner}</details>")
 
-    def table(self, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-        """Add a table; cells are plain text."""
-        head = "".join(f"<th>{html.escape(cell)}</th>" for cell in header)
-        body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-        self._parts.append(f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>")
+    def table(self, table: PageTable, folded: bool = False) -> None:
+        """Add a table; a `folded` one is shown when its title is clicked. Without rows nothing is added."""
+        if table.rows:
+            shown = table_html(table, caption=not folded)
+            title = html.escape(table.title)
+            self._parts.append(f"<details><summary>{title}</summary>{shown}</details>" if folded else shown)
 
-    def figure(self, figure: Figure | go.Figure, every_row: bool = False) -> None:
-        """Add a figure, of this project or of plotly; the caption of the former stands below it.
+    def html_part(self, text: str) -> None:
+        """Add HTML as it is."""
+        self._parts.append(text)
 
-        With `every_row` the page holds a figure of this project as it is, and draws what is zoomed into from that.
-        """
-        self._has_figure = True
-        drawn = plotly_figure(figure) if isinstance(figure, Figure) else figure
-        if every_row:
-            drawn.update_xaxes(matches="x")
-        top = HEAD_PX if isinstance(figure, Figure) else 75
-        drawn.update_layout(template="plotly_white", margin={"l": 70, "r": 20, "t": top, "b": 50})
-        self._parts.append(
-            plotly.io.to_html(
-                drawn,
-                full_html=False,
-                include_plotlyjs=False,
-                config={"displaylogo": False},
-                post_script=every_row_script(figure) if every_row and isinstance(figure, Figure) else None,
-            )
-        )
-        if isinstance(figure, Figure) and figure.caption:
-            self.sentence(figure.caption)
+    def figure(self, figure: Figure) -> None:
+        """Add a figure with its caption; every row of its curves is kept in the page. Names are unique in a page."""
+        self._figures.append(figure)
+        self._parts.append(figure_html(figure))
 
     def html(self) -> str:
-        """The whole page; plotly's own code stands in it once, so that it opens without a network."""
-        script = f"<script>{get_plotlyjs()}</script>" if self._has_figure else ""
+        """The whole page."""
+        title, style = html.escape(self._title), (_HERE / "page.css").read_text()
         return (
-            f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{html.escape(self._title)}</title>'
-            f"<style>{_STYLE}</style>{script}</head>\n<body>\n" + "\n".join(self._parts) + "\n"
-            f"<footer>servod {__version__}</footer>\n</body></html>\n"
+            f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
+            '<meta name="viewport" content="width=device-width, initial-scale=1">'
+            f"<style>{style}{_running_head(self._title)}</style></head>\n<body>\n"
+            f'<header><h1 id="title">{title}</h1>{self._verdict.html()}{signature(self._origin)}</header>\n<main>\n'
+            + "\n".join(self._parts)
+            + f"\n</main>\n<footer>servod {servod.__version__}</footer>\n{self._drawing()}</body></html>\n"
+        )
+
+    def _drawing(self) -> str:
+        """Rows and script, where the page has figures."""
+        if not self._figures:
+            return ""
+        rows = json.dumps(PageData(self._figures).document(), allow_nan=False).replace("<", "\\u003c")
+        return (
+            "<noscript><p>The pictures of this page are drawn by its script, which is switched off here.</p></noscript>"
+            f'<script type="application/json" id="page-data">{rows}</script>'
+            f"<script>{(_HERE / 'page.js').read_text()}</script>\n"
         )
 
     def write(self, path: Path) -> None:
         """Write the page aside and rename it to `path`. Raises BadInput when that is not possible."""
         write_bytes(path, self.html().encode())
+
+
+def table_html(table: PageTable, caption: bool = True, shades: Sequence[Sequence[int]] | None = None) -> str:
+    """A table that scrolls in a box of its own where it is wider than the page; a row that failed says so.
+
+    `shades` colours its cells, first column left out, from 0 (not at all) to 3.
+    """
+    text = [any(cell and not _NUMBER.match(cell) for cell in column) for column in zip(*table.rows, strict=True)]
+    lines = []
+    for index, (first, *rest) in enumerate(table.rows):
+        looks = [_TEXT if words else "" for words in text[1:]]
+        if shades:
+            looks = [f' class="share{shade}"' if shade else "" for shade in shades[index]]
+        cells = "".join(f"<td{look}>{html.escape(cell)}</td>" for look, cell in zip(looks, rest, strict=True))
+        failed = ' class="failed"' if "failed" in rest else ""
+        lines.append(f'<tr{failed}><th scope="row">{html.escape(first)}</th>{cells}</tr>')
+    head = "".join(
+        f'<th scope="col"{_TEXT if words else ""}>{html.escape(cell)}</th>'
+        for cell, words in zip(table.header, text, strict=True)
+    )
+    title, kind = html.escape(table.title or table.header[0]), ' class="cells"' if shades else ""
+    above = f"<caption>{html.escape(table.title)}</caption>" if caption and table.title else ""
+    return (
+        f'<div class="scroll" role="region" tabindex="0" aria-label="Table: {title}"><table{kind}>{above}'
+        f"<thead><tr>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table></div>"
+    )
+
+
+def _running_head(title: str) -> str:
+    """Title and page number on every sheet of paper."""
+    text = "".join(c for c in title if c.isprintable() and c not in '"\\<')
+    look = "font: 8pt system-ui, sans-serif; color: #444;"
+    return (
+        f'@page {{ @top-left {{ content: "{text}"; {look} }} '
+        f'@bottom-right {{ content: counter(page) " of " counter(pages); {look} }} }}'
+    )
+
+
+# --- The signature ---------------------------------------------------------------------------------------------------
+# Who made a page, when, on what and from what: what one wants to know before one signs it.
+
+
+def signature(origin: Origin) -> str:
+    """The block below the verdict."""
+    now = datetime.datetime.now().astimezone()
+    utc = now.astimezone(datetime.UTC)
+    local = now.strftime("%Y-%m-%d %H:%M:%S %z")
+    rows = [
+        ("date", html.escape(f"{utc:%Y-%m-%d %H:%M:%S} UTC (here {local[:-2]}:{local[-2:]})")),
+        ("host", html.escape(f"{platform.node()}, {platform.machine()}")),
+        ("servod", html.escape(f"{servod.__version__}{_commit()}")),
+        ("Python", html.escape(f"{platform.python_version()}, numpy {np.__version__}")),
+        ("kernel", html.escape(f"{platform.system()} {platform.release()}")),
+        *(("drive", html.escape(line)) for line in drives(origin.axis)),
+        *(("file", line) for line in _files(origin)),
+        *((html.escape(what), _hash(value)) for what, value in origin.hashes.items()),
+    ]
+    inner = "".join(f"<dt>{name}</dt><dd>{value}</dd>" for name, value in rows)
+    return f'<section id="signature" aria-label="Signature"><dl>{inner}</dl></section>'
+
+
+def drives(axis: AxisConfig | None) -> list[str]:
+    """The nodes of an axis with the identity (0x1018) that each was checked for at the start."""
+    return [] if axis is None else [_drive("amplifier", axis.amplifier), _drive("encoder", axis.encoder)]
+
+
+def _drive(role: str, node: AmplifierConfig | EncoderConfig) -> str:
+    numbers = {
+        name: f"0x{value:x}" if name != "serial" else str(value)
+        for name, value in node.identity.model_dump().items()
+        if value is not None
+    }
+    known = ", ".join(f"{name.replace('_id', '').replace('_code', '')} {value}" for name, value in numbers.items())
+    return f"{role}, node {node.node_id}, driver {node.driver}: {known or 'identity not stated in the configuration'}"
+
+
+def _files(origin: Origin) -> list[str]:
+    """Each file with its hash; of a list one line with the hash over all of them."""
+    lines = []
+    for what, given in origin.files.items():
+        files = [file for file in ([given] if isinstance(given, Path) else given) if file.is_file()]
+        if not files:
+            continue
+        hashes = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
+        if len(files) == 1:
+            lines.append(f"{html.escape(f'{what}: {files[0].name}')} {_hash(hashes[0])}")
+            continue
+        each = "".join(f"<div>{html.escape(f.name)} {_hash(h)}</div>" for f, h in zip(files, hashes, strict=True))
+        whole = hashlib.sha256("".join(hashes).encode()).hexdigest()
+        lines.append(
+            f"{html.escape(what)}: <details><summary>{len(files)} files {_hash(whole)}</summary>{each}</details>"
+        )
+    return lines
+
+
+def _hash(sha256: str) -> str:
+    return f'<code class="hash" title="SHA-256 {sha256}">{sha256[:_SHORT]}</code>'
+
+
+def _commit() -> str:
+    """The commit of a checkout, with a mark where files differ from it; nothing for an installed package."""
+    tree, git = Path(servod.__file__).parents[1], shutil.which("git")
+    if git is None or not (tree / ".git").exists():
+        return ""
+    asked = [git, "-C", str(tree), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
+    try:
+        found = subprocess.run(asked, capture_output=True, text=True, timeout=5.0, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return f", git {found.stdout.strip()}" if found.returncode == 0 and found.stdout.strip() else ""

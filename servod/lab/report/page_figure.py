@@ -1,116 +1,95 @@
-"""Draws a figure with plotly, for the page.
+"""A figure as a page holds it: the HTML around its panels, and every row of its curves for page.js to draw.
 
-Between the description of a figure and the page; `pictures` draws the same with matplotlib.
+Between the description of a figure and the page; `pictures` draws the same with matplotlib. Rows are kept as they are,
+each series once however many curves show it, up to MOST_BYTES for the whole page; what is longer keeps lowest and
+highest row of equal bins.
 """
 
 from __future__ import annotations
 
 import base64
-import json
+import html
+import zlib
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
-import plotly.graph_objects as go
-from plotly.subplots import make_subplots
 
-from servod.lab.report.figure import Array, Curve, Figure, PlotAxis, PlotPanel, ScaleKind, Style, thin
+from servod.lab.report.figure import Array, Curve, Figure, PlotAxis, PlotPanel, ScaleKind, Style
 
-_DASHES = {Style.LINE: "solid", Style.DASHED: "dash", Style.DOTTED: "dot", Style.POINTS: "solid"}
-_ROW_PX, _GAP_PX = 270, 85
-#: Room above the panels for title and legend.
-HEAD_PX = 110
-_FOOT_PX = 50
-
-
-def plotly_figure(figure: Figure) -> go.Figure:
-    """The figure as plotly draws it: panels in a grid, one legend above all of them."""
-    height = HEAD_PX + _FOOT_PX + round(_ROW_PX * figure.row_height) * figure.rows + _GAP_PX * (figure.rows - 1)
-    drawn = make_subplots(
-        rows=figure.rows,
-        cols=figure.columns,
-        subplot_titles=[panel.title for panel in figure.panels],
-        vertical_spacing=_GAP_PX / (height - HEAD_PX - _FOOT_PX) if figure.rows > 1 else 0.0,
-        horizontal_spacing=0.22 / figure.columns,
-    )
-    named: set[str] = set()
-    for index, panel in enumerate(figure.panels):
-        _draw(drawn, panel, 1 + index // figure.columns, 1 + index % figure.columns, named)
-    drawn.update_layout(
-        title={"text": figure.title, "y": 1.0, "yref": "container", "yanchor": "top", "pad": {"t": 12}},
-        height=height,
-        legend={"orientation": "h", "x": 0.0, "y": 1.0, "yref": "container", "yanchor": "top", "xanchor": "left"},
-    )
-    drawn.update_layout(legend={"y": 1.0 - 38.0 / height})
-    return drawn
+#: Rows that a page keeps of a curve: ten minutes at 1 kHz. And of all its curves, four bytes each before deflating.
+MOST_ROWS, MOST_BYTES = 600_000, 24_000_000
+#: Of a series that is thinned to fit into MOST_BYTES at least so many rows stay.
+_LEAST_ROWS = 4000
+#: Times that differ from an even grid by less than this share of a step are that grid.
+_EVEN = 1e-3
+_TOOLS = (
+    *(("in", "+", "Zoom in"), ("out", "−", "Zoom out"), ("left", "←", "Earlier"), ("right", "→", "Later")),
+    ("all", "all", "Show all"),
+)
+_DASHES = {Style.DASHED: "7 4", Style.DOTTED: "2 3"}
 
 
-#: Rows that a page keeps of a curve: ten minutes at 1 kHz, four bytes each and eight for the time.
-_MOST_ROWS = 600_000
-#: What is in view is drawn whole up to so many rows of a curve; of more, lowest and highest of each bin.
-_IN_VIEW = 4000
-#: Runs on the page: whenever another part comes into view, each curve is drawn anew from all its rows. A bin gives its
-#: lowest and its highest row, as `thin` does, so that a fast sine is a band from afar and a sine from near.
-_EVERY_ROW_JS = """
-const unpacked = (text, kind) => new kind(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer);
-function place(x, t) {
-  let a = 0, b = x.length;
-  while (a < b) { const m = (a + b) >> 1; if (x[m] < t) a = m + 1; else b = m; }
-  return a;
-}
-function view(x, y, from, to, most) {
-  const a = Math.max(place(x, from) - 1, 0), b = Math.min(place(x, to) + 1, x.length);
-  if (b - a <= most) return [Array.from(x.subarray(a, b)), Array.from(y.subarray(a, b))];
-  const bins = most >> 1, xs = [], ys = [];
-  for (let k = 0; k < bins; k++) {
-    const p = a + Math.floor((k * (b - a)) / bins), q = a + Math.floor(((k + 1) * (b - a)) / bins);
-    let low = p, high = p;
-    for (let i = p + 1; i < q; i++) {
-      if (y[i] < y[low] || Number.isNaN(y[low])) low = i;
-      if (y[i] > y[high] || Number.isNaN(y[high])) high = i;
-    }
-    for (const i of low === high ? [low] : [Math.min(low, high), Math.max(low, high)]) { xs.push(x[i]); ys.push(y[i]); }
-  }
-  return [xs, ys];
-}
-"""
-_REDRAW_JS = """
-const plot = document.getElementById("{plot_id}");
-const times = kept.times.map((text) => unpacked(text, Float64Array));
-const curves = kept.curves.map((c) => [times[c.time], unpacked(c.y, Float32Array)]);
-plot.on("plotly_relayout", (change) => {
-  const moved = Object.keys(change).filter((key) => key.startsWith("xaxis"));
-  if (!moved.length) return;
-  const all = moved.some((key) => key.endsWith("autorange"));
-  const [from, to] = all ? [-Infinity, Infinity] : plot.layout.xaxis.range;
-  const drawn = curves.map(([x, y]) => view(x, y, from, to, kept.most));
-  Plotly.restyle(plot, { x: drawn.map((d) => d[0]), y: drawn.map((d) => d[1]) }, curves.map((_, i) => i));
-});
-"""
+class PageData:
+    """What page.js draws from: series of numbers, and figures that name them by their place."""
+
+    def __init__(self, figures: Sequence[Figure]) -> None:
+        self._arrays: list[dict[str, Any]] = []
+        self._places: dict[bytes, int] = {}
+        lengths = {id(c.y): len(c.y) for f in figures for p in f.panels for c in p.curves}
+        self.most_rows = _most_rows(list(lengths.values()))
+        self._figures = [self._figure(figure) for figure in figures]
+
+    def document(self) -> dict[str, Any]:
+        """Plain values for the page."""
+        return {"arrays": self._arrays, "figures": self._figures}
+
+    def _figure(self, figure: Figure) -> dict[str, Any]:
+        panels = [
+            {
+                "title": p.title,
+                "x": _scale(p.x),
+                "y": _scale(p.y),
+                "curves": [self._curve(c, p) for c in p.curves],
+            }
+            for p in figure.panels
+        ]
+        return {"name": figure.name, "columns": figure.columns, "row_height": figure.row_height, "panels": panels}
+
+    def _curve(self, curve: Curve, panel: PlotPanel) -> dict[str, Any]:
+        held = {"label": curve.label, "detail": curve.detail, "colour": curve.colour.name.lower()}
+        held |= {"style": curve.style.value, "width": curve.width}  # type: ignore[dict-item]
+        x, y = at_most(curve.x, curve.y, self.most_rows)
+        places: dict[str, Any] = {"x": self._series(x, precise=True), "y": self._series(y)}
+        if curve.bounds is not None:
+            places |= {"low": self._series(curve.bounds[0]), "high": self._series(curve.bounds[1])}
+        return held | places
+
+    def _series(self, values: Array, precise: bool = False) -> int:
+        packed = packed_series(values, precise)
+        key = repr(sorted(packed.items())).encode()
+        if key not in self._places:
+            self._places[key] = len(self._arrays)
+            self._arrays.append(packed)
+        return self._places[key]
 
 
-def every_row_script(figure: Figure) -> str:
-    """Script for the page that draws what is zoomed into from all rows of the curves, not from those in the picture.
+def packed_series(values: Array, precise: bool = False) -> dict[str, Any]:
+    """A series as the page keeps it: an even grid by its numbers, others as bytes by their place in a float, deflated.
 
-    `figure` has lines without bounds alone, so that each curve is one trace.
+    `precise` keeps eight bytes of each value, where four would make steps of a long time.
     """
-    times: dict[int, int] = {}
-    packed: list[str] = []
-    curves = []
-    for curve in (curve for panel in figure.panels for curve in panel.curves):
-        x, y = _at_most(curve.x, curve.y, _MOST_ROWS)
-        key = id(curve.x) if x is curve.x else id(curve)
-        if key not in times:
-            times[key] = len(packed)
-            packed.append(_packed(x, "<f8"))
-        curves.append({"time": times[key], "y": _packed(y, "<f4")})
-    kept = json.dumps({"times": packed, "curves": curves, "most": _IN_VIEW})
-    return f"{_EVERY_ROW_JS}const kept = {kept};\n{_REDRAW_JS}"
+    if precise and len(values) > 1:
+        step = (values[-1] - values[0]) / (len(values) - 1)
+        even = values[0] + step * np.arange(len(values))
+        if step > 0.0 and float(np.abs(values - even).max()) < _EVEN * step:
+            return {"n": len(values), "from": float(values[0]), "step": float(step)}
+    kind, size = ("f8", 8) if precise else ("f4", 4)
+    raw = np.ascontiguousarray(values, dtype=f"<{kind}").view(np.uint8).reshape(-1, size)
+    return {"kind": kind, "z": base64.b64encode(zlib.compress(raw.T.tobytes(), 6)).decode()}
 
 
-def _packed(values: Array, kind: str) -> str:
-    return base64.b64encode(np.ascontiguousarray(values, dtype=kind).tobytes()).decode()
-
-
-def _at_most(x: Array, y: Array, most: int) -> tuple[Array, Array]:
+def at_most(x: Array, y: Array, most: int) -> tuple[Array, Array]:
     """A curve that is longer than `most` as lowest and highest row of equal bins."""
     if len(y) <= most:
         return x, y
@@ -122,74 +101,75 @@ def _at_most(x: Array, y: Array, most: int) -> tuple[Array, Array]:
     return x[kept], y[kept]
 
 
-def _draw(drawn: go.Figure, panel: PlotPanel, row: int, column: int, named: set[str]) -> None:
-    for curve in panel.curves:
-        if curve.bounds is not None and curve.style is not Style.POINTS:
-            drawn.add_trace(_band(curve, *curve.bounds), row=row, col=column)
-        trace = _bars if curve.style is Style.BARS else _trace
-        drawn.add_trace(trace(curve, bool(curve.label) and curve.label not in named), row=row, col=column)
-        named.add(curve.label)
-    drawn.update_xaxes(**_axis(panel.x), row=row, col=column)
-    drawn.update_yaxes(**_axis(panel.y), row=row, col=column)
+def _most_rows(lengths: list[int]) -> int:
+    """The longest that a curve may be so that all of them together keep MOST_BYTES."""
+    most = MOST_ROWS
+    while most > _LEAST_ROWS and sum(4 * min(length, most) for length in lengths) > MOST_BYTES:
+        most = max(most * 4 // 5, _LEAST_ROWS)
+    return most
 
 
-def _axis(axis: PlotAxis) -> dict[str, object]:
-    settings: dict[str, object] = {"title": {"text": axis.label, "standoff": 6}, "type": axis.scale.value}
-    if axis.scale is ScaleKind.LOG:
-        settings |= {"exponentformat": "power", "dtick": 1}
-    if axis.names:
-        settings |= {"tickvals": list(range(len(axis.names))), "ticktext": list(axis.names), "automargin": True}
+def _scale(axis: PlotAxis) -> dict[str, Any]:
+    scale: dict[str, Any] = {"label": axis.label, "log": axis.scale is ScaleKind.LOG}
     if axis.span is not None:
-        settings["range"] = [float(np.log10(v)) if axis.scale is ScaleKind.LOG else v for v in axis.span]
-    return settings
+        scale["span"] = [float(end) for end in axis.span]
+    if axis.names:
+        scale["names"] = list(axis.names)
+    return scale
 
 
-def _trace(curve: Curve, first: bool) -> go.Scatter:
-    """One curve, thinned for the eye; points are drawn as they are, with their intervals as bars."""
-    points = curve.style is Style.POINTS
-    x, y = (curve.x, curve.y) if points else thin(curve.x, curve.y)
-    bars = None
-    if points and curve.bounds is not None:
-        low, high = curve.bounds
-        bars = {"type": "data", "symmetric": False, "array": high - curve.y, "arrayminus": curve.y - low}
-    return go.Scatter(
-        x=x.astype(np.float32),
-        y=y.astype(np.float32),
-        name=curve.label or curve.detail,
-        legendgroup=curve.label,
-        showlegend=first,
-        mode="markers" if points else "lines",
-        line={"color": curve.colour.value, "width": curve.width, "dash": _DASHES[curve.style]},
-        marker={"color": curve.colour.value, "size": 6},
-        error_y=bars,
-        hovertext=curve.detail or None,
+def figure_html(figure: Figure) -> str:
+    """The figure without its curves: title, legend, tools, a place for each panel, caption."""
+    name = html.escape(figure.name)
+    panels = "".join(_panel_html(panel, k) for k, panel in enumerate(figure.panels))
+    tools = "".join(
+        f'<button type="button" data-act="{act}" aria-label="{says}">{sign}</button>' for act, sign, says in _TOOLS
+    )
+    caption = f"<figcaption>{html.escape(figure.caption)}</figcaption>" if figure.caption else ""
+    return (
+        f'<figure id="figure-{name}" data-figure="{name}" aria-label="{html.escape(figure.title)}">'
+        f'<p class="figure-title">{html.escape(figure.title)}</p>'
+        f'<div class="controls"><div class="legend">{_legend(figure)}</div><div class="tools">{tools}</div></div>'
+        f'<div class="panels">{panels}</div>{caption}</figure>'
     )
 
 
-def _bars(curve: Curve, first: bool) -> go.Bar:
-    """Lying bars."""
-    return go.Bar(
-        x=curve.x.astype(np.float32),
-        y=curve.y.astype(np.float32),
-        orientation="h",
-        width=curve.width,
-        name=curve.label or curve.detail,
-        legendgroup=curve.label,
-        showlegend=first,
-        marker={"color": curve.colour.value},
+def _legend(figure: Figure) -> str:
+    """A button for each label; one alone needs no legend."""
+    first: dict[str, Curve] = {}
+    for shown in (c for panel in figure.panels for c in panel.curves if c.label):
+        first.setdefault(shown.label, shown)
+    if len(first) < 2:
+        return ""
+    return "".join(
+        f'<button type="button" aria-pressed="true">{_sample(curve)}{html.escape(label)}</button>'
+        for label, curve in first.items()
     )
 
 
-def _band(curve: Curve, low: Array, high: Array) -> go.Scatter:
-    """The area between both bounds, in a pale shade of the curve."""
-    red, green, blue = (int(curve.colour.value[i : i + 2], 16) for i in (1, 3, 5))
-    return go.Scatter(
-        x=np.concatenate([curve.x, curve.x[::-1]]),
-        y=np.concatenate([high, low[::-1]]),
-        fill="toself",
-        fillcolor=f"rgba({red},{green},{blue},0.18)",
-        line={"width": 0},
-        hoverinfo="skip",
-        legendgroup=curve.label,
-        showlegend=False,
+def _sample(curve: Curve) -> str:
+    """How a curve looks, in small."""
+    colour = f"var(--{curve.colour.name.lower()})"
+    if curve.style is Style.POINTS:
+        mark = f'<circle cx="11" cy="6" r="3.5" fill="{colour}"/>'
+    elif curve.style is Style.BARS:
+        mark = f'<rect width="22" height="9" y="1.5" fill="{colour}"/>'
+    else:
+        dash = f' stroke-dasharray="{_DASHES[curve.style]}"' if curve.style in _DASHES else ""
+        mark = f'<path d="M0 6H22" stroke="{colour}" stroke-width="2.5"{dash}/>'
+    return f'<svg width="22" height="12" aria-hidden="true">{mark}</svg>'
+
+
+def _panel_html(panel: PlotPanel, number: int) -> str:
+    title = f"<b>{html.escape(panel.title)}</b>" if panel.title else ""
+    drawn = ", ".join(dict.fromkeys(c.label for c in panel.curves if c.label)) or "curves"
+    over = " over ".join(filter(None, (panel.y.label or "states", panel.x.label)))
+    says = html.escape(f"{panel.title + ': ' if panel.title else ''}{over}: {drawn}")
+    return (
+        f'<div class="panel" data-panel="{number}" role="group" tabindex="0" aria-label="{says}. '
+        'Plus and minus zoom, arrows move, 0 shows all.">'
+        f'<p class="panel-head">{title}{html.escape(panel.y.label)}<span class="y-factor"></span></p>'
+        f'<svg role="img" aria-label="{says}"></svg>'
+        f'<p class="panel-foot">{html.escape(panel.x.label)}<span class="x-factor"></span></p>'
+        '<div class="readout" hidden></div></div>'
     )
