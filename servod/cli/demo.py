@@ -146,12 +146,12 @@ def print_document(rows: Sequence[DemoRow], document: dict[str, Any]) -> None:
     from servod.qualify.demo.report import demo_verdict
 
     table = Table(
-        "Controller", "Options", "RMS / mrad", "Largest / mrad", title="Error on trajectory (19), first second left out"
+        "Controller", "RMS / mrad", "Largest / mrad", "Options", title="Error on trajectory (19), first second left out"
     )
     scores = document["controllers"] | document.get("others", {})
     for row in rows:
         score = scores[row.name]
-        table.add_row(row.label, row.options, f"{score['rms_error_mrad']:.3f}", f"{score['max_error_mrad']:.3f}")
+        table.add_row(row.label, f"{score['rms_error_mrad']:.3f}", f"{score['max_error_mrad']:.3f}", row.options)
     console = table_console()
     console.print(demo_verdict({row.label: scores[row.name]["rms_error_mrad"] for row in rows}), highlight=False)
     console.print(table)

@@ -96,7 +96,8 @@ def draw(
     """
     from servod.lab.report.figures.motion import describe_run, recorded_run
 
-    figure = recorded_run(run, file.stem)
+    first, *more = said or [describe_run(run)]
+    figure = replace(recorded_run(run, file.stem), caption=f"{first.removesuffix('.')}.")
     if file.suffix == PICTURE:
         from servod.lab.report.pictures import write_pictures
 
@@ -105,7 +106,6 @@ def draw(
     from servod.lab.report.figure import PageTable
     from servod.lab.report.page import Origin, Page, Verdict
 
-    first, *more = said or [describe_run(run)]
     page = Page(run.title, Verdict(first), Origin(made_from or {}))
     page.points(more)
     page.sentence("Drag over a part of a panel to see it closer, double-click to see all; all panels move together.")

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from servod.cli.app import run
+from servod.cli.plot import draw_cycles
 from servod.common.faults import FAULTS, FaultCode
 from servod.formats.recording.mcap_writer import McapFile
 from servod.formats.recording.record import FIELDS, RECORD, CycleRecord
@@ -84,6 +85,20 @@ def test_a_page_and_a_picture(
     t, reference = kept(page)[0]
     assert np.allclose(t, 1e-3 * np.arange(CYCLES))
     assert np.allclose(reference, 0.1 * np.sin(40.0 * np.pi * t), atol=1e-7)
+
+
+def test_caption_and_verdict_tell_the_same_figures(recording: Path, tmp_path: Path) -> None:
+    """Of a recording those of its rows; of a motion those of its tally, in both places."""
+    page = tmp_path / "run.html"
+    assert run(["plot", str(recording), "--out", str(page)]) == 0
+    for expected in (
+        r"20000 cycles .*; RMS error .* largest .*; SPEED_LIMIT at 19\.000 s\.",
+        r"motion done: RMS 1 mrad\.",
+    ):
+        text = page.read_text()
+        (verdict,), (caption,) = re.findall(r'id="verdict".*?>(.*?)</p>', text), re.findall(r"<figcaption>(.*?)<", text)
+        assert re.fullmatch(expected, caption) and verdict.removesuffix(".") == caption.removesuffix(".")
+        draw_cycles(cycle(0) + cycle(1), "servoctl track sine", page, ["motion done: RMS 1 mrad"])
 
 
 def test_a_part_is_drawn_with_every_row(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

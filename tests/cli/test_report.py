@@ -72,6 +72,18 @@ def test_summary_has_its_keys_and_counts_skipped_periods() -> None:
     assert (document["missed"], document["cycles"]) == (28, 4 * 3007)
 
 
+def test_captions_have_the_figures_of_the_document(tmp_path: Path) -> None:
+    rows, raw = entries(), [recorded(0.001 * (i + 1)).tobytes() for i in range(len(CONTROLLERS))]
+    runs = [cut_motion(c, r) for c, r in zip(CONTROLLERS, raw, strict=True)]
+    write_demo_page(rows, runs, tmp_path / "report.html", Story("joint", True))
+    text = (tmp_path / "report.html").read_text()
+    known = {f"{s['rms_error_mrad']:.3f}" for s in summary(runs, 1.0)["controllers"].values()}
+    captions = re.findall(r"<figcaption>(.*?)</figcaption>", text)
+    told = re.findall(r"([\d.]+) mrad", " ".join(captions))
+    assert captions and set(told) == known
+    assert set(re.findall(r"([\d.]+) mrad", re.findall(r'id="verdict".*?</p>', text)[0])) <= known
+
+
 def test_further_runs_stand_apart_from_the_four_controllers() -> None:
     raw = recorded(0.001).tobytes()
     document = summary([cut_motion(c, raw) for c in (*CONTROLLERS, "demo_local_plain")], 1.5)
@@ -145,7 +157,7 @@ def test_the_page_is_whole_and_needs_no_network(tmp_path: Path, stepped: bool) -
     page = tmp_path / "deep" / "report.html"
     write_demo_page(entries(), runs, page, Story("a <joint>", stepped))
     text = page.read_text()
-    assert "PD tracked best, with 1.000 mrad RMS: 4 times less than Local models, 4.000 mrad" in text
+    assert "PD leaves 1.000 mrad RMS of tracking error on a joint that sticks, and no other controller less." in text
     assert "a &lt;joint&gt;" in text
     assert text.count("<figure ") == 1 + len(runs) + (0 if stepped else 2)
     body = re.sub(r"<script>.*?</script>", "", text.replace("\n", " "), count=1)

@@ -5,7 +5,7 @@
 // Text is HTML or SVG text of 12 px that no scaling touches; colours are variables of page.css.
 "use strict";
 
-const MOST_IN_VIEW = 4000, PRINT_PX = 690, LEAST_COLUMN_PX = 210, ROW_PX = 230, HOVERED = 6;
+const MOST_IN_VIEW = 4000, PRINT_PX = 690, LEAST_COLUMN_PX = 210, ROW_PX = 230, PRINT_ROW_PX = 165, HOVERED = 6;
 
 // --- Rows ---
 
@@ -160,7 +160,7 @@ class Panel {
   draw(width, left) {
     const hidden = this.figure.hidden, narrow = width < 420 && this.y.names;
     const shown = this.curves.map((curve, k) => ({ curve, ...this.drawn(k) })).filter((s) => !hidden.has(s.curve.label));
-    const height = Math.round(ROW_PX * this.figure.rowHeight), [a, b] = this.range(), [low, high] = this.yRange(shown);
+    const height = Math.round((Figure.printing ? PRINT_ROW_PX : ROW_PX) * this.figure.rowHeight), [a, b] = this.range(), [low, high] = this.yRange(shown);
     const box = { left, right: width - 12, top: 6, bottom: height - 22 };
     this.box = box;
     this.toX = (v) => box.left + (((this.x.log ? log10(v) : v) - a) / (b - a)) * (box.right - box.left);

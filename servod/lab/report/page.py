@@ -31,6 +31,8 @@ _HERE = Path(__file__).parent
 #: What is aligned as a number.
 _NUMBER = re.compile(r"[-+−–<≤≥]? ?\d|[-–]$")
 _TEXT = ' class="text"'
+#: Letters from which a cell is not squeezed to a word a line; rows up to which a table is not parted on paper.
+_LONG, _SHORT_TABLE = 30, 15
 #: Digits of a hash that are shown; all of them stand under the pointer.
 _SHORT = 12
 
@@ -67,10 +69,12 @@ class Page:
     def __init__(self, title: str, verdict: Verdict, origin: Origin | None = None) -> None:
         self._title, self._verdict, self._origin = title, verdict, origin or Origin()
         self._parts: list[str] = []
+        self._heading = ""
         self._figures: list[Figure] = []
 
     def heading(self, text: str) -> None:
         """Begin a section."""
+        self._heading = text
         self._parts.append(f"<h2>{html.escape(text)}</h2>")
 
     def sentence(self, text: str) -> None:
@@ -90,7 +94,7 @@ class Page:
     def table(self, table: PageTable, folded: bool = False) -> None:
         """Add a table; a `folded` one is shown when its title is clicked. Without rows nothing is added."""
         if table.rows:
-            shown = table_html(table, caption=not folded)
+            shown = table_html(table, caption=not folded and table.title != self._heading)
             title = html.escape(table.title)
             self._parts.append(f"<details><summary>{title}</summary>{shown}</details>" if folded else shown)
 
@@ -136,10 +140,10 @@ def table_html(table: PageTable, caption: bool = True, shades: Sequence[Sequence
 
     `shades` colours its cells, first column left out, from 0 (not at all) to 3.
     """
-    text = [any(cell and not _NUMBER.match(cell) for cell in column) for column in zip(*table.rows, strict=True)]
+    text = [_is_text([cell for cell in column if cell]) for column in zip(*table.rows, strict=True)]
     lines = []
     for index, (first, *rest) in enumerate(table.rows):
-        looks = [_TEXT if words else "" for words in text[1:]]
+        looks = [_look(words, cell) for words, cell in zip(text[1:], rest, strict=True)]
         if shades:
             looks = [f' class="share{shade}"' if shade else "" for shade in shades[index]]
         cells = "".join(f"<td{look}>{html.escape(cell)}</td>" for look, cell in zip(looks, rest, strict=True))
@@ -150,11 +154,22 @@ def table_html(table: PageTable, caption: bool = True, shades: Sequence[Sequence
         for cell, words in zip(table.header, text, strict=True)
     )
     title, kind = html.escape(table.title or table.header[0]), ' class="cells"' if shades else ""
+    short = " short" if len(table.rows) <= _SHORT_TABLE else ""
     above = f"<caption>{html.escape(table.title)}</caption>" if caption and table.title else ""
     return (
-        f'<div class="scroll" role="region" tabindex="0" aria-label="Table: {title}"><table{kind}>{above}'
+        f'<div class="scroll{short}" role="region" tabindex="0" aria-label="Table: {title}"><table{kind}>{above}'
         f"<thead><tr>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table></div>"
     )
+
+
+def _look(words: bool, cell: str) -> str:
+    """The class of a cell."""
+    return ' class="text long"' if words and len(cell) > _LONG else _TEXT if words else ""
+
+
+def _is_text(cells: Sequence[str]) -> bool:
+    """Whether a column is aligned as text: most of its cells are no numbers."""
+    return sum(_NUMBER.match(cell) is None for cell in cells) > len(cells) / 2
 
 
 def _running_head(title: str) -> str:

@@ -23,6 +23,8 @@ MOST_ROWS, MOST_BYTES = 600_000, 24_000_000
 _LEAST_ROWS = 4000
 #: Times that differ from an even grid by less than this share of a step are that grid.
 _EVEN = 1e-3
+#: Rows of panels up to which a figure stands whole on a sheet of paper.
+_SHORT_ROWS = 3.0
 _TOOLS = (
     *(("in", "+", "Zoom in"), ("out", "−", "Zoom out"), ("left", "←", "Earlier"), ("right", "→", "Later")),
     ("all", "all", "Show all"),
@@ -125,9 +127,10 @@ def figure_html(figure: Figure) -> str:
     tools = "".join(
         f'<button type="button" data-act="{act}" aria-label="{says}">{sign}</button>' for act, sign, says in _TOOLS
     )
+    short = ' class="short"' if figure.rows * figure.row_height <= _SHORT_ROWS else ""
     caption = f"<figcaption>{html.escape(figure.caption)}</figcaption>" if figure.caption else ""
     return (
-        f'<figure id="figure-{name}" data-figure="{name}" aria-label="{html.escape(figure.title)}">'
+        f'<figure id="figure-{name}"{short} data-figure="{name}" aria-label="{html.escape(figure.title)}">'
         f'<p class="figure-title">{html.escape(figure.title)}</p>'
         f'<div class="controls"><div class="legend">{_legend(figure)}</div><div class="tools">{tools}</div></div>'
         f'<div class="panels">{panels}</div>{caption}</figure>'

@@ -181,7 +181,7 @@ class Sweep:
             for key, value in classical_margins(1.0 / response - 1.0, np.angle(FINE_CIRCLE)).items():
                 found[key].append(value)
         worst = {key: (max if key == PEAK else min)(values, default=np.inf) for key, values in found.items()}
-        return {key: value for key, value in worst.items() if np.isfinite(value)}
+        return {key: float(value) for key, value in worst.items() if np.isfinite(value)}
 
     def judge(self, cases: Sequence[LoopDeviation]) -> Judgement:
         """Poles and disk margin of `cases` at once, for a search: what `worst` and `disk_margin` say."""
@@ -247,23 +247,24 @@ def disk_margins(response: NDArray[np.complex128]) -> Array:
 
 
 class MarginWords(NamedTuple):
-    """How a margin reads."""
+    """How a margin reads; `usual` is what textbooks ask of a loop (Astrom, Murray: Feedback Systems, ch. 10)."""
 
     name: str
     unit: str
     meaning: str
+    usual: str
 
 
 UP, DOWN, PHASE, DELAY = "gain margin up [dB]", "gain margin down [dB]", "phase margin [deg]", "delay margin [cycles]"
 PEAK = "peak sensitivity Ms"
 #: Margins by their keys in the observations of a certificate.
 MARGINS = {
-    UP: MarginWords("gain margin, up", "dB", "so much more gain from command to torque the loop still stands"),
-    DOWN: MarginWords("gain margin, down", "dB", "so much less gain it still stands, where friction destabilises"),
-    PHASE: MarginWords("phase margin", "°", "so much more phase lag, or less, where the gain is one"),
-    DELAY: MarginWords("delay margin", "cycles", "so much more delay from command to torque"),
-    PEAK: MarginWords("peak sensitivity Ms", "", "largest |S|; 1/Ms is the least distance of the Nyquist curve to -1"),
-}  # fmt: skip
+    UP: MarginWords("gain margin upward", "dB", "so much more gain from command to torque it still stands", "6"),
+    DOWN: MarginWords("gain margin downward", "dB", "so much less gain, where friction destabilises the joint", "6"),
+    PHASE: MarginWords("phase margin", "°", "so much more phase lag, or less, where the gain is one", "30 to 60"),
+    DELAY: MarginWords("delay margin", "cycles", "so much more delay from command to torque", "1"),
+    PEAK: MarginWords("peak sensitivity Ms", "", "largest |S|; 1/Ms is the least distance of L to -1", "at most 2"),
+}
 #: Frequencies in rad a sample, closely enough that a crossing between two is a straight line.
 FINE_CIRCLE = np.exp(1j * np.geomspace(1e-4, np.pi, 4000))
 
@@ -281,8 +282,9 @@ def classical_margins(loop: NDArray[np.complex128], angle: Array) -> dict[str, f
     turned = _crossings(np.sin(phase))
     negative = np.cos(_between(phase, turned)) < 0.0
     gains = list(20.0 / np.log(10.0) * _between(size, turned)[negative])
-    if loop[-1].real < 0.0:  # at half the sample rate L is real
-        gains.append(20.0 * float(np.log10(abs(loop[-1]))))
+    level = abs(size[1] - size[0]) < 0.1 * np.log(angle[1] / angle[0])  # no integrator
+    ends = [loop[0]] * bool(level and loop[0].real < 0.0) + [loop[-1]] * bool(loop[-1].real < 0.0)
+    gains += [20.0 * float(np.log10(abs(end))) for end in ends]  # at rest and at half the sample rate L is real
     wrapped = np.abs((lag + np.pi) % (2.0 * np.pi) - np.pi)
     return {
         UP: min((-g for g in gains if g < 0.0), default=np.inf),

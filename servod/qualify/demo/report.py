@@ -77,16 +77,16 @@ def write_demo_page(rows: Sequence[DemoRow], runs: Sequence[Run], path: Path, st
 
 
 def demo_verdict(scores: Mapping[str, float]) -> str:
-    """What a newcomer wants to know: how much of the error that friction makes is gone, and under which controller.
+    """What a newcomer wants to know: the error that friction makes of a plain loop, and what is left of it.
 
-    `scores` are RMS errors in mrad by what people read.
+    `scores` are RMS errors in mrad by what people read, that of the plain loop first.
     """
-    best, worst = min(scores, key=scores.__getitem__), max(scores, key=scores.__getitem__)
-    times = scores[worst] / max(scores[best], 1e-12)
-    return (
-        f"{best} tracked best, with {scores[best]:.3f} mrad RMS: {times:.0f} times less than {worst}, "
-        f"{scores[worst]:.3f} mrad, on the same joint that sticks."
-    )
+    plain, best = next(iter(scores)), min(scores, key=scores.__getitem__)
+    left = f"{plain} leaves {scores[plain]:.3f} mrad RMS of tracking error on a joint that sticks"
+    if best == plain:
+        return f"{left}, and no other controller less."
+    times = scores[plain] / max(scores[best], 1e-12)
+    return f"{left}; the least is {scores[best]:.3f} mrad ({best}), {times:.3g} times less."
 
 
 def _say(page: Page, runs: Sequence[Run], story: Story) -> None:

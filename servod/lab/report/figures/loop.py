@@ -194,8 +194,8 @@ def certificate_tables(gains: GainSet) -> Iterator[PageTable]:
     Raises BadInput for a set without a certificate.
     """
     certificate = _certificate(gains)
-    margins = tuple((name, f"{value:.4g}", unit, what) for name, value, unit, what in margin_rows(certificate))
-    yield PageTable("Margins of the loop, least over all speeds", ("margin", "value", "unit", "what it is"), margins)
+    header = ("margin", "value", "unit", "textbooks ask for", "what it is")
+    yield PageTable("Margins of the loop, the least over all speeds", header, tuple(margin_rows(certificate)))
     checks = sorted(certificate.checks, key=lambda check: (check.passed, -limit_used(check)))
     first = sum(not check.passed for check in checks) + _TIGHTEST
     verdict = "valid" if certificate.valid else "not valid"
@@ -210,16 +210,19 @@ _HEADER = ("check", "figure", "limit", "limit used", "verdict")
 
 
 def _check_row(check: CertificateCheck) -> tuple[str, ...]:
-    used = f"{100.0 * limit_used(check):.0f} %" if check.limit else ""
+    used = f"{100.0 * limit_used(check):.0f} %" if limit_used(check) else "met exactly" if check.limit else "none"
     return check.name, f"{check.value:.4g}", f"{check.limit:.4g}", used, _verdict(check.passed)
 
 
 def limit_used(check: CertificateCheck) -> float:
-    """How much of its limit a check has used: 1 at the limit, 0 far from it; what allows nothing and has it is 0.
+    """How much of its limit a check has used: 1 at the limit, 0 far from it.
 
-    Of a pole its distance from the unit circle counts, which is what its decay goes by.
+    What keeps its limit exactly, as a count does, has no margin to lose and is 0. Of a pole its distance from the unit
+    circle counts, which is what its decay goes by.
     """
     value, limit = check.value, check.limit
+    if check.passed and abs(value - limit) <= 1e-6 * abs(limit):
+        return 0.0
     if check.name.startswith("largest pole"):
         value, limit = 1.0 - limit, max(1.0 - value, 1e-12)
     elif limit - value != check.margin:  # a figure that must not be below its limit
@@ -233,10 +236,12 @@ def observations_table(gains: GainSet) -> PageTable:
     return PageTable("Told, not judged", ("figure", "value"), tuple((k, f"{v:.4g}") for k, v in told.items()))
 
 
-def margin_rows(certificate: Certificate) -> list[tuple[str, float, str, str]]:
-    """(name, value, unit, meaning) of each margin that a certificate states; none in one of an earlier version."""
+def margin_rows(certificate: Certificate) -> Iterator[tuple[str, ...]]:
+    """One row for each margin that a certificate states; none of one of an earlier version."""
     told = certificate.observations
-    return [(words.name, told[key], words.unit, words.meaning) for key, words in MARGINS.items() if key in told]
+    for key, words in MARGINS.items():
+        if key in told:
+            yield words.name, f"{told[key]:.3g}", words.unit, words.usual, words.meaning
 
 
 def _certificate(gains: GainSet) -> Certificate:
