@@ -88,11 +88,12 @@ def draw(
     happened: Sequence[tuple[str, str, str]] = (),
     said: Sequence[str] = (),
     made_from: Mapping[str, Path] | None = None,
+    nodes: Sequence[Mapping[str, Any]] = (),
 ) -> None:
     """Write `run` as a page or as a picture. Raises BadInput.
 
     The page begins with the first sentence of `said`, or without one with the figures of the run, and has `happened` as
-    rows of time, kind and text.
+    rows of time, kind and text. `nodes` are those of the daemon's status.
     """
     from servod.lab.report.figures.motion import describe_run, recorded_run
 
@@ -106,7 +107,7 @@ def draw(
     from servod.lab.report.figure import PageTable
     from servod.lab.report.page import Origin, Page, Verdict
 
-    page = Page(run.title, Verdict(first), Origin(made_from or {}))
+    page = Page(run.title, Verdict(first), Origin(made_from or {}, nodes=nodes))
     page.points(more)
     page.sentence("Drag over a part of a panel to see it closer, double-click to see all; all panels move together.")
     page.figure(figure)
@@ -116,14 +117,16 @@ def draw(
     page.write(file)
 
 
-def draw_cycles(raw: bytes, title: str, file: Path, said: Sequence[str]) -> None:
-    """Draw packed cycle records, under what was said of them."""
+def draw_cycles(
+    raw: bytes, title: str, file: Path, said: Sequence[str], nodes: Sequence[Mapping[str, Any]] = ()
+) -> None:
+    """Draw packed cycle records, under what was said of them; `nodes` are those of the daemon's status."""
     from servod.formats.recording.mcap_reader import McapRecording
     from servod.formats.recording.record import FIELDS
 
     kinds = "".join(field.kind for field in FIELDS)
     names, units = tuple(field.name for field in FIELDS), tuple(field.unit for field in FIELDS)
-    draw(_of_cycles(McapRecording(names, kinds, units, bytearray(raw)), title), file, said=said)
+    draw(_of_cycles(McapRecording(names, kinds, units, bytearray(raw)), title), file, said=said, nodes=nodes)
 
 
 def _load(path: Path, map_file: Path | None) -> tuple[RecordedRun, list[tuple[str, str, str]], str]:

@@ -108,7 +108,8 @@ def _origin(walk: Walk) -> Origin:
     files |= {"certificate": walk.path(CERTIFICATE), "deployment": walk.path(DEPLOYMENT)}
     files |= {"tracking": walk.path(TRACKING)}
     recorded = [*walk.path(RECORDINGS).glob("*"), *walk.path(RUNS).glob("*.mcap")]
-    return Origin(files | {"recordings": sorted(recorded)}, walk.axis.config)
+    facts = {"axis": "virtual: a simulated joint, no hardware moved"} if walk.axis.virtual else {}
+    return Origin(files | {"recordings": sorted(recorded)}, walk.axis.config, walk.axis.nodes(), facts)
 
 
 def _summary(page: Page, walk: Walk) -> None:

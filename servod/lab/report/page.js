@@ -293,7 +293,7 @@ class Panel {
     box.style.left = px > (this.box.left + this.box.right) / 2 ? `${this.box.left + 4}px` : `${Math.min(px + 12, this.box.right - 140)}px`;
   }
 }
-Panel.made = 0;
+Panel.made = 0; // for ids
 
 // Panels whose scale over x is the same: they are zoomed together, in whatever figures they stand.
 class Group {
@@ -349,7 +349,7 @@ class Figure {
 }
 
 async function begin() {
-  const data = JSON.parse(document.getElementById("page-data").textContent);
+  const data = JSON.parse(document.getElementById("page-data")?.textContent ?? '{"arrays": [], "figures": []}');
   const arrays = await Promise.all(data.arrays.map(loaded)), groups = new Map(), figures = {};
   for (const spec of data.figures) {
     const figure = new Figure(spec, arrays, document.getElementById(`figure-${spec.name}`));
@@ -362,7 +362,14 @@ async function begin() {
     }
   }
   const draw = () => Object.values(figures).forEach((figure) => figure.draw());
-  const print = (now) => { if (Figure.printing !== now) { Figure.printing = now; draw(); } };
+  const folded = () => document.querySelectorAll("details:not([open])");
+  const print = (now) => {
+    if (Figure.printing === now) return;
+    Figure.printing = now;
+    if (now) folded().forEach((part) => { part.open = true; part.dataset.folded = ""; });
+    else document.querySelectorAll("[data-folded]").forEach((part) => { part.open = false; delete part.dataset.folded; });
+    draw();
+  };
   draw();
   let width = window.innerWidth;
   window.addEventListener("resize", () => { if (!Figure.printing && window.innerWidth !== width) { width = window.innerWidth; draw(); } });
@@ -373,5 +380,6 @@ async function begin() {
   document.documentElement.dataset.ready = "1";
 }
 
+Figure.printing = false;
 if (typeof document === "undefined") module.exports = { loaded, view, ticks, extent };
 else window.servodReady = begin();

@@ -17,13 +17,13 @@ import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 import servod
 from servod.common.files import write_bytes
-from servod.formats.config import AmplifierConfig, AxisConfig, EncoderConfig
+from servod.formats.config import AxisConfig
 from servod.lab.report.figure import Figure, PageTable
 from servod.lab.report.page_figure import PageData, figure_html
 
@@ -54,13 +54,15 @@ class Verdict(NamedTuple):
 class Origin:
     """What a report was made from: files by what they are, and the axis whose drives it is about.
 
-    Files are hashed when the page is made; one that is not there (any more) is left out. `hashes` are of what is no
-    file, as the gain set within a daemon.
+    Files are hashed when the page is made; one that is not there (any more) is left out. `nodes` are those of the
+    daemon's status, with the identity that each told; without them the configuration's counts. `facts` are further
+    lines by their names.
     """
 
     files: Mapping[str, Path | Sequence[Path]] = field(default_factory=dict)
     axis: AxisConfig | None = None
-    hashes: Mapping[str, str] = field(default_factory=dict)
+    nodes: Sequence[Mapping[str, Any]] = ()
+    facts: Mapping[str, str] = field(default_factory=dict)
 
 
 class Page:
@@ -120,14 +122,15 @@ class Page:
         )
 
     def _drawing(self) -> str:
-        """Rows and script, where the page has figures."""
+        """The script, which unfolds what is printed, and the rows that it draws."""
+        script = f"<script>{(_HERE / 'page.js').read_text()}</script>\n"
         if not self._figures:
-            return ""
+            return script
         rows = json.dumps(PageData(self._figures).document(), allow_nan=False).replace("<", "\\u003c")
         return (
             "<noscript><p>The pictures of this page are drawn by its script, which is switched off here.</p></noscript>"
             f'<script type="application/json" id="page-data">{rows}</script>'
-            f"<script>{(_HERE / 'page.js').read_text()}</script>\n"
+            f"{script}"
         )
 
     def write(self, path: Path) -> None:
@@ -197,27 +200,31 @@ def signature(origin: Origin) -> str:
         ("servod", html.escape(f"{servod.__version__}{_commit()}")),
         ("Python", html.escape(f"{platform.python_version()}, numpy {np.__version__}")),
         ("kernel", html.escape(f"{platform.system()} {platform.release()}")),
-        *(("drive", html.escape(line)) for line in drives(origin.axis)),
+        *((html.escape(name), html.escape(fact)) for name, fact in origin.facts.items()),
+        *(("drive", html.escape(line)) for line in drives(origin)),
         *(("file", line) for line in _files(origin)),
-        *((html.escape(what), _hash(value)) for what, value in origin.hashes.items()),
     ]
     inner = "".join(f"<dt>{name}</dt><dd>{value}</dd>" for name, value in rows)
     return f'<section id="signature" aria-label="Signature"><dl>{inner}</dl></section>'
 
 
-def drives(axis: AxisConfig | None) -> list[str]:
-    """The nodes of an axis with the identity (0x1018) that each was checked for at the start."""
-    return [] if axis is None else [_drive("amplifier", axis.amplifier), _drive("encoder", axis.encoder)]
+def drives(origin: Origin) -> list[str]:
+    """Each node with its identity (0x1018): as it told it, or as the configuration has it checked at the start."""
+    nodes, axis = origin.nodes, origin.axis
+    if not nodes and axis is not None:
+        pairs = (("amplifier", axis.amplifier), ("encoder", axis.encoder))
+        nodes = [{"role": role, **node.model_dump(include={"node_id", "driver", "identity"})} for role, node in pairs]
+    return [_drive(node) for node in nodes]
 
 
-def _drive(role: str, node: AmplifierConfig | EncoderConfig) -> str:
-    numbers = {
-        name: f"0x{value:x}" if name != "serial" else str(value)
-        for name, value in node.identity.model_dump().items()
-        if value is not None
-    }
-    known = ", ".join(f"{name.replace('_id', '').replace('_code', '')} {value}" for name, value in numbers.items())
-    return f"{role}, node {node.node_id}, driver {node.driver}: {known or 'identity not stated in the configuration'}"
+def _drive(node: Mapping[str, Any]) -> str:
+    told = {name: value for name, value in (node.get("identity") or {}).items() if value is not None}
+    shown = (
+        f"{name.replace('_id', '').replace('_code', '')} {value if name == 'serial' else hex(value)}"
+        for name, value in told.items()
+    )
+    known = ", ".join(shown) or "identity not stated"
+    return f"{node['role']}, node {node['node_id']}, driver {node['driver']}: {known}"
 
 
 def _files(origin: Origin) -> list[str]:

@@ -18,7 +18,7 @@ from servod.formats.config import AmplifierConfig, Identity
 from servod.formats.gains.gain_set import CertificateCheck, GainSet, load_gains
 from servod.lab.report.figure import Colour, Figure, PageTable, PlotAxis, PlotPanel, curve
 from servod.lab.report.figures.loop import PASSED, certificate_tables, limit_used, observations_table
-from servod.lab.report.page import Origin, Page, Verdict
+from servod.lab.report.page import Origin, Page, Verdict, drives
 from servod.lab.verify.margins import DELAY, PHASE
 
 
@@ -57,14 +57,16 @@ def test_a_page_begins_with_verdict_and_signature(tmp_path: Path) -> None:
         update={"amplifier": AmplifierConfig(identity=Identity(vendor_id=0xFB, product_code=0x6400, serial=4711))}
     )
     gone = tmp_path / "gone.yaml"
-    origin = Origin({"model": files[0], "recordings": files[1:], "map": gone}, axis, {"gains": "ab" * 32})
+    origin = Origin({"model": files[0], "recordings": files[1:], "map": gone}, axis, facts={"axis": "virtual"})
     text = a_page(origin).html()
     assert text.index("<h1") < text.index('id="verdict"') < text.index('id="signature"') < text.index("<main>")
     assert '<p id="verdict" class="passed">Passed: 3 of 3 hold</p>' in text
     for file in files:
         assert f"SHA-256 {hashlib.sha256(file.read_bytes()).hexdigest()}" in text
     assert "vendor 0xfb, product 0x6400, serial 4711" in text and "identity not stated" in text
-    assert "2 files" in text and "gone.yaml" not in text and f"SHA-256 {'ab' * 32}" in text
+    assert "2 files" in text and "gone.yaml" not in text and "<dt>axis</dt><dd>virtual</dd>" in text
+    told = {"role": "encoder", "node_id": 2, "driver": "cia406", "identity": {"vendor_id": 0x2E4, "serial": None}}
+    assert drives(Origin(axis=axis, nodes=[told])) == ["encoder, node 2, driver cia406: vendor 0x2e4"]
     signed = re.search(r'<section id="signature".*?</section>', text)
     assert signed
     for part in (r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d UTC \(here .*[+-]\d\d:\d\d\)", servod.__version__, "numpy", "Linux"):
