@@ -240,9 +240,8 @@ def _files(origin: Origin) -> list[str]:
             continue
         each = "".join(f"<div>{html.escape(f.name)} {_hash(h)}</div>" for f, h in zip(files, hashes, strict=True))
         whole = hashlib.sha256("".join(hashes).encode()).hexdigest()
-        lines.append(
-            f"{html.escape(what)}: <details><summary>{len(files)} files {_hash(whole)}</summary>{each}</details>"
-        )
+        title = f"{html.escape(what)}: {len(files)} files {_hash(whole)}"
+        lines.append(f"<details><summary>{title}</summary>{each}</details>")
     return lines
 
 

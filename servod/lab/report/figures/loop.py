@@ -210,7 +210,9 @@ _HEADER = ("check", "figure", "limit", "limit used", "verdict")
 
 
 def _check_row(check: CertificateCheck) -> tuple[str, ...]:
-    used = f"{100.0 * limit_used(check):.0f} %" if limit_used(check) else "met exactly" if check.limit else "none"
+    used = f"{100.0 * limit_used(check):.0f} %"
+    if _exact(check):
+        used = "met exactly"
     return check.name, f"{check.value:.4g}", f"{check.limit:.4g}", used, _verdict(check.passed)
 
 
@@ -221,9 +223,9 @@ def limit_used(check: CertificateCheck) -> float:
     circle counts, which is what its decay goes by.
     """
     value, limit = check.value, check.limit
-    if check.passed and abs(value - limit) <= 1e-6 * abs(limit):
+    if _exact(check):
         return 0.0
-    if check.name.startswith("largest pole"):
+    if "pole" in check.name:
         value, limit = 1.0 - limit, max(1.0 - value, 1e-12)
     elif limit - value != check.margin:  # a figure that must not be below its limit
         value, limit = limit, value
@@ -234,6 +236,10 @@ def observations_table(gains: GainSet) -> PageTable:
     """What was observed beside the checks, told and not judged. Raises BadInput for a set without a certificate."""
     told = {k: v for k, v in _certificate(gains).observations.items() if k not in MARGINS}
     return PageTable("Told, not judged", ("figure", "value"), tuple((k, f"{v:.4g}") for k, v in told.items()))
+
+
+def _exact(check: CertificateCheck) -> bool:
+    return check.passed and abs(check.value - check.limit) <= 1e-6 * abs(check.limit)
 
 
 def margin_rows(certificate: Certificate) -> Iterator[tuple[str, ...]]:
