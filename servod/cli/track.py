@@ -181,9 +181,7 @@ def _show(watched: _Watched, begins: str, draw: _Draw | None, plot: Path | None)
         print(f"drawn: {plot}")
 
 
-def _drawing(
-    plot: Path | None, motion: dict[str, Any], duration_s: float, wait: bool
-) -> _Draw | None:
+def _drawing(plot: Path | None, motion: dict[str, Any], duration_s: float, wait: bool) -> _Draw | None:
     """What draws packed cycle records, and what was said of them, into `plot`; what refuses it does so before the axis
     moves.
     """

@@ -19,7 +19,7 @@ from servod.formats.recording.mcap_writer import McapFile
 from servod.formats.recording.record import FIELDS, RECORD, CycleRecord
 from servod.lab.report.figure import Figure, PlotAxis, PlotPanel, curve
 from servod.lab.report.figures.motion import RecordedRun, recorded_run
-from servod.lab.report.page_figure import MOST_BYTES, PageData, at_most
+from servod.lab.report.page import MOST_BYTES, PageData, at_most
 from servod.runtime.fieldbus.devices import DriveState
 from servod.runtime.loop.axis import AxisState
 

@@ -1,6 +1,6 @@
 """What a figure shows, apart from how it is drawn: curves in panels, with units on every axis.
 
-Behind everything. Functions of `figures` make a `Figure` from results; `page_figure` with page.js draws it on a page
+Behind everything. Functions of `figures` make a `Figure` from results; `page` with page.js draws it on a page
 and `pictures` with matplotlib, so that both show the same. Colours are Okabe's and Ito's, which colour-blind readers
 tell apart, and line styles differ as well, so that a figure survives black and white.
 """

@@ -1,6 +1,6 @@
 // Draws the figures of a report as SVG at the size they are seen in, zooms them together, and prints them whole.
 //
-// The page holds every row (see page_figure.py); what is in view is drawn from those: all rows where they are few, else
+// The page holds every row (see page.py); what is in view is drawn from those: all rows where they are few, else
 // the lowest and the highest of each bin, so that a fast sine is a band from afar and a sine from near.
 // Text is HTML or SVG text of 12 px that no scaling touches; colours are variables of page.css.
 "use strict";

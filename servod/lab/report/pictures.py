@@ -1,6 +1,6 @@
 """Draws a figure with matplotlib and writes it as PNG and SVG, for documents and print.
 
-Between the description of a figure and files; `page_figure` with page.js draws the same on a page. The same
+Between the description of a figure and files; `page` with page.js draws the same on a page. The same
 figure gives the same bytes: no dates, no random ids.
 """
 

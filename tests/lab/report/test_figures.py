@@ -37,8 +37,7 @@ from servod.lab.report.figures.sets import (
     weight_table,
     weighting_functions,
 )
-from servod.lab.report.page import Page, Verdict
-from servod.lab.report.page_figure import PageData, figure_html
+from servod.lab.report.page import Page, PageData, Verdict, figure_html
 from servod.lab.report.pictures import write_pictures
 from tests.lab.synthesize.designs import table1
 

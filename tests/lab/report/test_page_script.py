@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from servod.lab.report.page_figure import packed_series
+from servod.lab.report.page import packed_series
 
 SCRIPT = Path("servod/lab/report/page.js").resolve()
 
