@@ -296,10 +296,12 @@ class Node:
             raise Unreachable(self._why_silent(str(error))) from None
         check_identity(self.node_id, found, self.section.identity, PROFILE[self._kind])
         self.identity = found
+        numbers = {"product": found.product_code, "revision": found.revision}
+        words = (f"{name} {'absent' if value is None else f'0x{value:X}'}" for name, value in numbers.items())
+        serial = "absent" if found.serial is None else found.serial
         return [
-            f"node {self.node_id}: profile {found.profile}, vendor {_hex(found.vendor_id)}, "
-            f"product {_hex(found.product_code)}, revision {_hex(found.revision)}, "
-            f"serial {'absent' if found.serial is None else found.serial}"
+            f"node {self.node_id}: profile {found.profile}, vendor 0x{found.vendor_id:08X}, {', '.join(words)}, "
+            f"serial {serial}"
         ]
 
     def _ask_for_a_twin(self) -> None:
