@@ -81,7 +81,7 @@ def demo(
     runs, refused = _run(fast, model, seconds, rows, recordings, quiet=as_json)
     elapsed_s = time.monotonic() - started
     report = out / "report.html"
-    write_demo_page(rows, runs, report, Story(model.name, fast, refused))
+    write_demo_page(rows, runs, report, Story(model.name, fast, refused, model))
     document = summary(runs, elapsed_s) | {
         "mode": "stepped" if fast else "wall",
         "realtime_refused": refused,
@@ -143,14 +143,17 @@ def print_document(rows: Sequence[DemoRow], document: dict[str, Any]) -> None:
     """Print the demo's document as a table for people, with what each law had and what the system refused."""
     from rich.table import Table
 
+    from servod.qualify.demo.report import demo_verdict
+
     table = Table(
-        "Controller", "Options", "RMS / mrad", "Largest / mrad", title="Error on trajectory (19), first second left out"
+        "Controller", "RMS / mrad", "Largest / mrad", "Options", title="Error on trajectory (19), first second left out"
     )
     scores = document["controllers"] | document.get("others", {})
     for row in rows:
         score = scores[row.name]
-        table.add_row(row.label, row.options, f"{score['rms_error_mrad']:.3f}", f"{score['max_error_mrad']:.3f}")
+        table.add_row(row.label, f"{score['rms_error_mrad']:.3f}", f"{score['max_error_mrad']:.3f}", row.options)
     console = table_console()
+    console.print(demo_verdict({row.label: scores[row.name]["rms_error_mrad"] for row in rows}), highlight=False)
     console.print(table)
     console.print(
         f"{document['cycles']} cycles of the four, {document['missed']} missed, {document['wall_s']:.1f} s.",
@@ -169,17 +172,13 @@ def print_document(rows: Sequence[DemoRow], document: dict[str, Any]) -> None:
 # `servoctl demo --diagnose`: the story of an effect that was concealed, from its cost to its cure, in one command.
 
 
-#: Share of the cost that must come back.
-LEAST_RECOVERED = 0.8
-
-
 def demo_diagnose(plant: Path, effect: str, fast: bool, out: Path, as_json: bool) -> None:
     """Run the story on `plant` and print it. Raises AnswerIsNo when less than LEAST_RECOVERED comes back."""
     one_thread()
     from servod.client.open import daemon_axis, stepped_axis
     from servod.client.processes import sigterm_as_interrupt
     from servod.formats.model.axis_model import load_rotary_model
-    from servod.qualify.demo.recovery.walk import believed_and_true, recover, write_recovery_page
+    from servod.qualify.demo.recovery.walk import LEAST_RECOVERED, believed_and_true, recover, write_recovery_page
 
     believed, true = believed_and_true(load_rotary_model(plant), effect)
     need_folder("--out", out)

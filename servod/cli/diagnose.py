@@ -44,13 +44,15 @@ def diagnose(
     from servod.formats.model.axis_model import load_axis_model
     from servod.lab.diagnose.engine import diagnose as run
     from servod.lab.report.diagnosis import write_files
+    from servod.lab.report.page import Origin
 
     axis = load_axis_model(model)
     _need_own_folder(out, model)
     recorded = [one.between(from_s, to_s) for one in _load(recordings, map_file, axis, model)]
     need_folder("--out", out)
     found = run(axis, recorded, time_limit, _quiet if as_json else _progress)
-    document = write_files(out, found, model.name)
+    origin = Origin({"model": model, "recordings": recordings, "map": [map_file] if map_file else []})
+    document = write_files(out, found, model.name, origin)
     if as_json:
         print_json(document)
     else:

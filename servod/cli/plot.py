@@ -6,7 +6,7 @@ drawing itself is the laboratory's.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -61,7 +61,7 @@ def plot(
         known = f"{whole.time_s[0]:g} to {whole.time_s[-1]:g} s" if len(whole.time_s) else "a recording with cycles"
         raise BadInput(f"{recording}: time", f"no two rows from {from_s} to {to_s} s", known)
     for file in files:
-        draw(run, file, happened)
+        draw(run, file, happened, made_from={"recording": recording})
     result = {
         "recording": str(recording),
         "rows": len(run.time_s),
@@ -82,40 +82,51 @@ def check_drawing(option: str, file: Path) -> None:
     need_file(option, file)
 
 
-def draw(run: RecordedRun, file: Path, happened: Sequence[tuple[str, str, str]] = (), said: Sequence[str] = ()) -> None:
+def draw(
+    run: RecordedRun,
+    file: Path,
+    happened: Sequence[tuple[str, str, str]] = (),
+    said: Sequence[str] = (),
+    made_from: Mapping[str, Path] | None = None,
+    nodes: Sequence[Mapping[str, Any]] = (),
+) -> None:
     """Write `run` as a page or as a picture. Raises BadInput.
 
-    The page has the sentences of `said` too, and `happened` as rows of time, kind and text.
+    The page begins with the first sentence of `said`, or without one with the figures of the run, and has `happened` as
+    rows of time, kind and text. `nodes` are those of the daemon's status.
     """
-    from servod.lab.report.figures.motion import recorded_run
+    from servod.lab.report.figures.motion import describe_run, recorded_run
 
-    figure = recorded_run(run, file.stem)
+    first, *more = said or [describe_run(run)]
+    figure = replace(recorded_run(run, file.stem), caption=f"{first.removesuffix('.')}.")
     if file.suffix == PICTURE:
         from servod.lab.report.pictures import write_pictures
 
         write_pictures(figure, file.parent, ("png",))
         return
-    from servod.lab.report.page import Page
+    from servod.lab.report.figure import PageTable
+    from servod.lab.report.page import Origin, Page, Verdict
 
-    page = Page(run.title)
-    if said:
-        page.points(said)
+    page = Page(run.title, Verdict(first), Origin(made_from or {}, nodes=nodes))
+    page.points(more)
     page.sentence("Drag over a part of a panel to see it closer, double-click to see all; all panels move together.")
-    page.figure(figure, every_row=True)
+    page.figure(figure)
     if happened:
         page.heading("What happened")
-        page.table(("t / s", "", ""), happened)
+        page.table(PageTable("Events", ("time / s", "kind", "what"), tuple(happened)))
     page.write(file)
 
 
-def draw_cycles(raw: bytes, title: str, file: Path, said: Sequence[str]) -> None:
-    """Draw packed cycle records, under what was said of them."""
+def draw_cycles(
+    raw: bytes, title: str, file: Path, said: Sequence[str], nodes: Sequence[Mapping[str, Any]] = ()
+) -> None:
+    """Draw packed cycle records, under what was said of them; `nodes` are those of the daemon's status."""
     from servod.formats.recording.mcap_reader import McapRecording
     from servod.formats.recording.record import FIELDS
 
     kinds = "".join(field.kind for field in FIELDS)
     names, units = tuple(field.name for field in FIELDS), tuple(field.unit for field in FIELDS)
-    draw(_of_cycles(McapRecording(names, kinds, units, bytearray(raw)), title), file, said=said)
+    draw(_of_cycles(McapRecording(names, kinds, units, bytearray(raw)), title), file, said=said, nodes=nodes)
 
 
 def _load(path: Path, map_file: Path | None) -> tuple[RecordedRun, list[tuple[str, str, str]], str]:

@@ -162,24 +162,26 @@ def _track(
     if as_json:
         print_json(result | {"figures": watched.document()})
         if draw is not None:
-            draw(bytes(watched.kept), _in_words(watched.document(), _DONE))
+            draw(bytes(watched.kept), _in_words(watched.document(), _DONE), watched.nodes)
         return
     _suggest(watched.document(), plot)
     _show(watched, _DONE, draw, plot)
 
 
-def _show(watched: _Watched, begins: str, draw: Callable[[bytes, list[str]], None] | None, plot: Path | None) -> None:
+#: Draws packed cycle records under what was said of them, with the nodes that moved.
+_Draw = Callable[[bytes, list[str], list[dict[str, Any]]], None]
+
+
+def _show(watched: _Watched, begins: str, draw: _Draw | None, plot: Path | None) -> None:
     """Figures and picture of what was seen."""
     said = _in_words(watched.document(), begins)
     print("\n".join(said))
     if draw is not None:
-        draw(bytes(watched.kept), said)
+        draw(bytes(watched.kept), said, watched.nodes)
         print(f"drawn: {plot}")
 
 
-def _drawing(
-    plot: Path | None, motion: dict[str, Any], duration_s: float, wait: bool
-) -> Callable[[bytes, list[str]], None] | None:
+def _drawing(plot: Path | None, motion: dict[str, Any], duration_s: float, wait: bool) -> _Draw | None:
     """What draws packed cycle records, and what was said of them, into `plot`; what refuses it does so before the axis
     moves.
     """
@@ -194,7 +196,7 @@ def _drawing(
     from servod.cli.plot import check_drawing, draw_cycles
 
     check_drawing("--plot", plot)
-    return lambda raw, said: draw_cycles(raw, f"servoctl track {motion['kind']}", plot, said)
+    return lambda raw, said, nodes: draw_cycles(raw, f"servoctl track {motion['kind']}", plot, said, nodes)
 
 
 class _Watched:
@@ -207,6 +209,7 @@ class _Watched:
         self._stream: CycleStream = CycleStream(client)
         self.tally: MotionTally = MotionTally(self._stream.count_rad)
         self.kept = bytearray()
+        self.nodes: list[dict[str, Any]] = client.call("status")["nodes"] if keep else []
         self._keep = keep
 
     @property

@@ -93,9 +93,18 @@ def print_hashes(found: dict[str, str | list[str] | None]) -> None:
 
 
 def print_checks(result: Verification) -> None:
-    """Print every check with its figure, limit and margin, and what was observed."""
-    for check in result.checks:
+    """Print the margins of the loop, every check with its figure, limit and margin, and what was observed.
+
+    Checks that failed come first.
+    """
+    from servod.lab.verify.margins import MARGINS, describe_margins
+
+    if margins := describe_margins(result.observations):
+        print(f"{margins} (each least over all speeds, at the drive's torque command)")
+    for check in sorted(result.checks, key=lambda check: check.passed):
         mark = "pass" if check.passed else "FAIL"
         print(f"{mark}  {check.name}: {check.value:.6g} (limit {check.limit:.6g}, margin {check.margin:.3g})")
     for name, value in result.observations.items():
+        if name in MARGINS:
+            continue
         print(f"told  {name}: {value:.6g}")

@@ -28,10 +28,12 @@ from servod.client.virtual import (
     virtual_session,
     with_cutoff,
 )
+from servod.common.errors import Unreachable
 from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.formats.config import AxisConfig
 from servod.formats.gains.gain_set import GainSet
 from servod.formats.model.axis_model import AxisModel, axis_model_yaml
+from servod.formats.protocol import Verb
 
 #: After an axis was enabled, until what is held has come to rest.
 _SETTLE_S = 1.0
@@ -97,6 +99,10 @@ class WalkAxis(Protocol):
         """What tells this axis from another one, in plain values."""
         ...
 
+    def nodes(self) -> list[dict[str, Any]]:
+        """Its nodes, as the daemon's status tells of them; none where no daemon is reached."""
+        ...
+
     @property
     def cutoff_hz(self) -> float | None:
         """The velocity filter that a design must take; None where it may choose."""
@@ -141,6 +147,10 @@ class VirtualWalkAxis:
         plant = hashlib.sha256(axis_model_yaml(self.joint).encode()).hexdigest()
         devices = self.settings.model_dump(mode="json") if self.settings else None
         return {"plant": plant, "devices": devices} | identifying_keys(self.config)
+
+    def nodes(self) -> list[dict[str, Any]]:
+        """None: its devices are those of the configuration."""
+        return []
 
     @property
     def cutoff_hz(self) -> float | None:
@@ -189,6 +199,15 @@ class DaemonWalkAxis:
     def identity(self) -> dict[str, Any]:
         """The configuration."""
         return {"name": self.config.name} | identifying_keys(self.config)
+
+    def nodes(self) -> list[dict[str, Any]]:
+        """As the daemon tells of them; none when it has ended, for a page can be made without it."""
+        try:
+            with ControlClient(self.socket) as client:
+                found: list[dict[str, Any]] = client.call(Verb.STATUS)["nodes"]
+        except Unreachable:
+            return []
+        return found
 
     @property
     def cutoff_hz(self) -> float | None:

@@ -5,17 +5,21 @@ from __future__ import annotations
 import base64
 import json
 import re
+import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from servod.cli.app import run
+from servod.cli.plot import draw_cycles
 from servod.common.faults import FAULTS, FaultCode
 from servod.formats.recording.mcap_writer import McapFile
 from servod.formats.recording.record import FIELDS, RECORD, CycleRecord
+from servod.lab.report.figure import Figure, PlotAxis, PlotPanel, curve
 from servod.lab.report.figures.motion import RecordedRun, recorded_run
-from servod.lab.report.page_figure import _at_most, every_row_script, plotly_figure
+from servod.lab.report.page import MOST_BYTES, PageData, at_most
 from servod.runtime.fieldbus.devices import DriveState
 from servod.runtime.loop.axis import AxisState
 
@@ -51,11 +55,20 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def kept(page: str) -> list[tuple[np.ndarray, np.ndarray]]:
     """Time and value of every curve, as the page keeps them."""
-    found = re.search(r"^const kept = (\{.*\});$", page, re.MULTILINE)
+    found = re.search(r'id="page-data">(.*?)</script>', page)
     assert found
     document = json.loads(found[1])
-    times = [np.frombuffer(base64.b64decode(text), "<f8") for text in document["times"]]
-    return [(times[c["time"]], np.frombuffer(base64.b64decode(c["y"]), "<f4")) for c in document["curves"]]
+    curves = [curve for figure in document["figures"] for panel in figure["panels"] for curve in panel["curves"]]
+    return [(unpacked(document["arrays"][c["x"]]), unpacked(document["arrays"][c["y"]])) for c in curves]
+
+
+def unpacked(array: dict[str, Any]) -> np.ndarray:
+    """Rows from their packed form: an even grid by its numbers, or bytes by their place."""
+    if "z" not in array:
+        return array["from"] + array["step"] * np.arange(array["n"])
+    size = int(array["kind"][1])
+    raw = np.frombuffer(zlib.decompress(base64.b64decode(array["z"])), np.uint8).reshape(size, -1)
+    return np.ascontiguousarray(raw.T).view(f"<{array['kind']}").ravel()
 
 
 def test_a_page_and_a_picture(
@@ -72,6 +85,20 @@ def test_a_page_and_a_picture(
     t, reference = kept(page)[0]
     assert np.allclose(t, 1e-3 * np.arange(CYCLES))
     assert np.allclose(reference, 0.1 * np.sin(40.0 * np.pi * t), atol=1e-7)
+
+
+def test_caption_and_verdict_tell_the_same_figures(recording: Path, tmp_path: Path) -> None:
+    """Of a recording those of its rows; of a motion those of its tally, in both places."""
+    page = tmp_path / "run.html"
+    assert run(["plot", str(recording), "--out", str(page)]) == 0
+    for expected in (
+        r"20000 cycles .*; RMS error .* largest .*; SPEED_LIMIT at 19\.000 s\.",
+        r"motion done: RMS 1 mrad\.",
+    ):
+        text = page.read_text()
+        (verdict,), (caption,) = re.findall(r'id="verdict".*?>(.*?)</p>', text), re.findall(r"<figcaption>(.*?)<", text)
+        assert re.fullmatch(expected, caption) and verdict.removesuffix(".") == caption.removesuffix(".")
+        draw_cycles(cycle(0) + cycle(1), "servoctl track sine", page, ["motion done: RMS 1 mrad"])
 
 
 def test_a_part_is_drawn_with_every_row(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -148,18 +175,26 @@ def test_states_jump_and_a_fault_of_one_cycle_is_seen() -> None:
     assert {panel.x.span for panel in figure.panels} == {(0.0, float(t[-1]))}
 
 
-def test_every_curve_is_one_trace_in_the_same_order(recording: Path) -> None:
+def test_a_series_that_many_curves_show_is_kept_once() -> None:
     t = np.arange(3000) * 1e-3
-    figure = recorded_run(RecordedRun("run", t, {"position_rad": t, "reference_rad": 2 * t, "torque_nm": 3 * t}))
-    drawn, curves = plotly_figure(figure), kept(every_row_script(figure))
-    assert len(drawn.data) == len(curves)
-    for trace, (_, y) in zip(drawn.data, curves, strict=True):
-        assert trace.y[-1] == pytest.approx(float(y[-1]))
+    figure = recorded_run(RecordedRun("run", t, {"position_rad": t, "reference_rad": 2 * t, "torque_nm": 2 * t}))
+    document = PageData([figure, figure]).document()
+    assert len(document["arrays"]) == len({json.dumps(a) for a in document["arrays"]}) < len(figure.panels) * 2 + 1
+
+
+def test_rows_of_a_page_have_a_bound() -> None:
+    """Twenty curves of ten minutes at 1 kHz are thinned alike until they fit."""
+    noise = np.random.default_rng(1).normal(size=600_000)
+    curves = tuple(curve("", np.arange(600_000.0), noise + k) for k in range(20))
+    figure = Figure("long", "long", (PlotPanel(PlotAxis("time in s"), PlotAxis("y"), curves),))
+    data = PageData([figure])
+    held = sum(len(unpacked(a)) * 4 for a in data.document()["arrays"] if a.get("kind") == "f4")
+    assert held <= MOST_BYTES and 4000 < data.most_rows < 600_000
 
 
 def test_a_curve_that_is_too_long_keeps_its_peaks() -> None:
     y = np.sin(np.arange(100_000) * 0.4)
     y[54_321] = 7.0
-    x, kept_y = _at_most(np.arange(100_000.0), y, 2000)
+    x, kept_y = at_most(np.arange(100_000.0), y, 2000)
     assert len(x) <= 2001 and np.all(np.diff(x) > 0)
     assert kept_y.max() == 7.0 and x[np.argmax(kept_y)] == 54_321

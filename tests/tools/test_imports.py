@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import source
 
-LAB = {"numpy", "scipy", "numba", "llvmlite", "plotly", "matplotlib", "pyarrow", "cvxpy", "clarabel", "scs", "pandas"}
+LAB = {"numpy", "scipy", "numba", "llvmlite", "matplotlib", "pyarrow", "cvxpy", "clarabel", "scs", "pandas"}
 CORE = [
     "servod.runtime.daemon.main",
     "servod.runtime.loop.process",

@@ -18,7 +18,7 @@ CORE_IMPORTS = (
     "servod.runtime.daemon.main servod.runtime.loop.process servod.drivers.cia402 servod.drivers.cia406 servod.cli "
     "servod.client.control servod.kernels.scoring"
 )
-LAB = "numpy scipy numba plotly matplotlib pyarrow cvxpy"
+LAB = "numpy scipy numba matplotlib pyarrow cvxpy"
 WITHOUT_LAB = f"""
 import importlib, sys
 for name in {LAB.split()}:

@@ -5,7 +5,8 @@ Stands on the figures of servod.lab.report; called by the last step.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 from servod.client.open import VirtualWalkAxis
@@ -27,6 +28,7 @@ from servod.lab.commission.state import (
     RELAXED,
     REPORT,
     RESULT,
+    RUNS,
     TRACKING,
     TUNING,
     State,
@@ -38,10 +40,12 @@ from servod.lab.identify import store
 from servod.lab.identify.analysis import analyse
 from servod.lab.report.figure import Figure, PageTable
 from servod.lab.report.figures import friction, loop, motion, sets
+from servod.lab.report.figures.loop import PASSED
 from servod.lab.report.figures.motion import PlottedMotion
-from servod.lab.report.page import Page
+from servod.lab.report.page import Origin, Page, Verdict
 from servod.lab.report.pictures import write_pictures
 from servod.lab.tracking.metrics import STEPS_MRAD, Curves, curve_key
+from servod.lab.verify.margins import describe_margins
 
 Part = Figure | PageTable | str
 #: Laws as people read them.
@@ -55,7 +59,7 @@ CLASSES = {
 
 def write_report(walk: Walk, tell: Tell) -> None:
     """Write report.html, and every figure as PNG and SVG. Raises BadInput."""
-    page = Page(f"Commissioning of {walk.axis.config.name}")
+    page = Page(f"Commissioning of {walk.axis.config.name}", Verdict(verdict(walk), True), _origin(walk))
     _summary(page, walk)
     gains, model = load_gains(walk.path(GAINS)), load_axis_model(walk.path(MODEL))
     shown = sections(walk, gains, model)
@@ -82,11 +86,30 @@ def _add(page: Page, walk: Walk, part: Part) -> None:
     if isinstance(part, str):
         page.sentence(part)
     elif isinstance(part, PageTable):
-        page.sentence(part.title)
-        page.table(part.header, part.rows)
+        page.table(part, folded=part.title.startswith(PASSED))
     else:
         page.figure(part)
         write_pictures(part, walk.path(PICTURES))
+
+
+def verdict(walk: Walk) -> str:
+    """What decided, in one sentence: the page is written only of an axis that kept what was promised."""
+    deployment, certificate = read_json(walk.path(DEPLOYMENT)), read_json(walk.path(CERTIFICATE))
+    came, promised = deployment["after"]["slow_mrad"], deployment["promised"]["slow_mrad"]
+    loop_stands = describe_margins(certificate["observations"])
+    return (
+        f"the deployed gain set keeps its promise with {came:.4g} of {promised:.4g} mrad RMS on the slow sine; all "
+        f"{len(certificate['checks'])} checks of its certificate hold{f'; {loop_stands}' if loop_stands else ''}."
+    )
+
+
+def _origin(walk: Walk) -> Origin:
+    files: dict[str, Path | Sequence[Path]] = {"model": walk.path(MODEL), "gains": walk.path(GAINS)}
+    files |= {"certificate": walk.path(CERTIFICATE), "deployment": walk.path(DEPLOYMENT)}
+    files |= {"tracking": walk.path(TRACKING)}
+    recorded = [*walk.path(RECORDINGS).glob("*"), *walk.path(RUNS).glob("*.mcap")]
+    facts = {"axis": "virtual: a simulated joint, no hardware moved"} if walk.axis.virtual else {}
+    return Origin(files | {"recordings": sorted(recorded)}, walk.axis.config, walk.axis.nodes(), facts)
 
 
 def _summary(page: Page, walk: Walk) -> None:
@@ -101,7 +124,7 @@ def _summary(page: Page, walk: Walk) -> None:
         page.sentence(f"The design was agreed to be relaxed: {relaxed['wish']} {relaxed['enough']:.3g}.")
     was = f"went from {deployment['before']['slow_mrad']:.4g} to" if deployment["before"] else "was"
     page.sentence(
-        f"On the validation motion the error {was} {deployment['after']['slow_mrad']:.4g} mrad RMS; "
+        f"On the slow sine of the validation motion the error {was} {deployment['after']['slow_mrad']:.4g} mrad RMS; "
         f"{deployment['promised']['slow_mrad']:.4g} mrad was promised."
     )
     if "local" in tracking:
@@ -135,7 +158,7 @@ def _design(gains: GainSet, model: AxisModel) -> Iterator[Part]:
 
 
 def _certificate(gains: GainSet) -> Iterator[Part]:
-    yield loop.certificate_table(gains)
+    yield from loop.certificate_tables(gains)
     yield loop.observations_table(gains)
 
 
@@ -149,7 +172,15 @@ def _deployment(walk: Walk) -> Iterator[Part]:
         return
     files = {"before": BEFORE_ROWS, "after": AFTER_ROWS}
     before, after = (motion.motion_of_rows(label, load_rows(walk.path(name))) for label, name in files.items())
-    yield motion.before_after(before, after, title="The validation motion before and after")
+    caption = f"Its parts as the table has them: {_parts('before', found)} {_parts('after', found)}"
+    title = "The validation motion before and after"
+    yield motion.before_after(before, after, title=title, caption=caption)
+
+
+def _parts(run: str, found: dict[str, Any]) -> str:
+    """The figures of one run of the validation motion."""
+    parts = (f"{name.removesuffix('_mrad')} {found[run][name]:.4g} mrad" for name in found["promised"])
+    return f"{run} {', '.join(parts)}."
 
 
 def _tracking(walk: Walk) -> Iterator[Part]:
@@ -163,7 +194,7 @@ def _tracking(walk: Walk) -> Iterator[Part]:
         yield from _tuned(feedback, title, read_json(walk.path(TUNING)).get(feedback, {}))
         keys = {law: law if law == DEPLOYED else f"{feedback}_{law}" for law in figures if "failed" not in figures[law]}
         runs = {law: load_curves(run_files(walk, key)[1]) for law, key in keys.items()}
-        yield from _figures(name, title, runs)
+        yield from _figures(name, title, runs, figures)
     yield from (f"Not measured: {line}" for line in found.get("not_measured", []))
 
 
@@ -218,10 +249,11 @@ def _label(law: str, found: dict[str, Any]) -> str:
     return ", ".join(filter(None, (NAMES[law], _against_limit(found))))
 
 
-def _figures(name: str, title: str, runs: dict[str, dict[str, Curves]]) -> Iterator[Figure]:
+def _figures(name: str, title: str, runs: dict[str, dict[str, Curves]], figures: dict[str, Any]) -> Iterator[Figure]:
     motions = [_motion(law, curves["paper"]) for law, curves in runs.items()]
     yield motion.tracking_grid(motions, f"tracking_{name}", f"{title}: trajectory (19)", same_error_scale=False)
-    yield motion.errors(motions, f"errors_{name}", f"{title}: errors on trajectory (19)")
+    scores = {NAMES[law]: figures[law]["rms_error_mrad"] for law in runs}
+    yield motion.errors(motions, f"errors_{name}", f"{title}: errors on trajectory (19)", scores=scores)
     for step in STEPS_MRAD:
         key = curve_key(step)
         stepped = [_motion(law, curves[key]) for law, curves in runs.items() if key in curves]

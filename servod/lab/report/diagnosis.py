@@ -22,11 +22,11 @@ from servod.lab.diagnose.document import (
     verdict_sentence,
 )
 from servod.lab.diagnose.explain import explain_effect
-from servod.lab.diagnose.result import Diagnosis, Evidence, Units
-from servod.lab.report.figure import Figure
+from servod.lab.diagnose.result import Diagnosis, DiagnosisVerdict, Evidence, Units
+from servod.lab.report.figure import Figure, PageTable
 from servod.lab.report.figures import mismatch as figures
 from servod.lab.report.figures.signature import signature_figure, table_figure
-from servod.lab.report.page import Page
+from servod.lab.report.page import Origin, Page, Verdict
 from servod.lab.report.pictures import write_pictures
 
 Document = dict[str, Any]
@@ -38,8 +38,8 @@ PAGE, PICTURES = "report.html", "pictures"
 class DiagnosisReport:
     """The page in the making; every figure is written as PNG too."""
 
-    def __init__(self, folder: Path, title: str) -> None:
-        self.page, self._pictures = Page(title), folder / PICTURES
+    def __init__(self, folder: Path, title: str, verdict: Verdict, origin: Origin | None = None) -> None:
+        self.page, self._pictures = Page(title, verdict, origin), folder / PICTURES
         self._path = folder / PAGE
 
     def figure(self, shown: Figure) -> None:
@@ -53,9 +53,16 @@ class DiagnosisReport:
         return self._path
 
 
-def write_report(folder: Path, diagnosis: Diagnosis, document: Document, title: str = "the model") -> Path:
+#: Whether a verdict says that the model may stay as it is; what cannot be told is neither.
+_PASSED = {DiagnosisVerdict.ADEQUATE: True, DiagnosisVerdict.CANNOT_TELL: False}
+
+
+def write_report(
+    folder: Path, diagnosis: Diagnosis, document: Document, title: str = "the model", origin: Origin | None = None
+) -> Path:
     """Write `report.html` and `pictures/*.png` into `folder`; `document` is that of the diagnosis."""
-    report = DiagnosisReport(folder, f"Diagnosis: what {title} leaves out")
+    verdict = Verdict(verdict_sentence(document), _PASSED.get(diagnosis.verdict))
+    report = DiagnosisReport(folder, f"Diagnosis: what {title} leaves out", verdict, origin)
     _answer(report.page, document)
     if diagnosis.evidence is not None:
         _where(report, diagnosis.evidence, diagnosis.units)
@@ -69,8 +76,7 @@ def write_report(folder: Path, diagnosis: Diagnosis, document: Document, title: 
 
 
 def _answer(page: Page, document: Document) -> None:
-    """Verdict, what was left out, how sure: everything that fits into a few sentences."""
-    page.lead(verdict_sentence(document))
+    """What was left out, how sure: everything that fits into a few sentences."""
     page.points([f["statement"] for f in document["findings"]])
     page.points([line for f in document["findings"] for line in describe_certainty(f)])
 
@@ -113,7 +119,7 @@ def _parameters(page: Page, parameters: Document) -> None:
         (name, f"{v['value']:.5g}", f"{v['interval'][0]:.4g} to {v['interval'][1]:.4g}", v["unit"])
         for name, v in parameters.items()
     ]
-    page.table(("parameter", "value", "95 % interval", "unit"), rows)
+    page.table(PageTable("Parameters", ("parameter", "value", "95 % interval", "unit"), tuple(rows)))
 
 
 def _recalibrated(page: Page, document: Document) -> None:
@@ -124,7 +130,8 @@ def _recalibrated(page: Page, document: Document) -> None:
             (name, f"{v['from']:.5g}", f"{v['to']:.5g}", f"{v['interval'][0]:.4g} to {v['interval'][1]:.4g}", v["unit"])
             for name, v in document["recalibrated"].items()
         ]
-        page.table(("parameter", "model", "fitted", "95 % interval", "unit"), rows)
+        header = ("parameter", "model", "fitted", "95 % interval", "unit")
+        page.table(PageTable("Recalibrated", header, tuple(rows)))
     if document["minor"]:
         small = "; ".join(_small(name, size) for name, size in document["minor"].items())
         page.sentence(f"Seen, but no finding: {small}. Every real axis has some.")
@@ -157,7 +164,7 @@ def _fit(report: DiagnosisReport, evidence: Evidence, document: Document, units:
         for horizon, w in fit["windows"].items()
     ]
     header = ("simulated freely for", "model as it came", "recalibrated only", "with what was found", "unit")
-    report.page.table(header, rows)
+    report.page.table(PageTable("Position errors", header, tuple(rows)))
     torque = {r["name"]: (r["mismatch_before"], r["mismatch_after"]) for r in document["recordings"] if r["taken"]}
     panels = [figures.before_after(torque, units.force, "torque error")]
     for horizon, window in fit["windows"].items():
@@ -197,7 +204,7 @@ def _recordings(page: Page, document: Document) -> None:
     ]  # fmt: skip
     if rows:
         header = ("recording", "length / s", "rate / Hz", "rows compared", f"encoder noise / {length}")
-        page.table((*header, f"noise floor / {force}"), rows)
+        page.table(PageTable("What was compared", (*header, f"noise floor / {force}"), tuple(rows)))
     repaired = [f"{r['name']}: {note}." for r in document["recordings"] if r["taken"] for note in r["notes"]]
     refused = [f"{r['name']} was not used: {r['reason']}." for r in document["recordings"] if not r["taken"]]
     page.points([*refused, *repaired] or ["Nothing had to be repaired or refused."])
@@ -221,15 +228,18 @@ def _work(page: Page, document: Document) -> None:
 DOCUMENT, MODEL = "diagnosis.json", "model.yaml"
 
 
-def write_files(folder: Path, diagnosis: Diagnosis, title: str) -> dict[str, Any]:
-    """Write all files into `folder` and return the document. Without an answer there is no model. Raises BadInput."""
+def write_files(folder: Path, diagnosis: Diagnosis, title: str, origin: Origin | None = None) -> dict[str, Any]:
+    """Write all files into `folder` and return the document. Without an answer there is no model. Raises BadInput.
+
+    `origin` is what the page states as its sources.
+    """
     begun = monotonic()
     document = diagnosis_document(diagnosis)
     if diagnosis.evidence is None:
         (folder / MODEL).unlink(missing_ok=True)
     else:
         write_bytes(folder / MODEL, axis_model_yaml(diagnosis.evidence.model).encode())
-    write_report(folder, diagnosis, document, title)
+    write_report(folder, diagnosis, document, title, origin)
     document["seconds"]["report"] = round(monotonic() - begun, 2)
     write_bytes(folder / DOCUMENT, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
     return document

@@ -1,19 +1,17 @@
 """What a figure shows, apart from how it is drawn: curves in panels, with units on every axis.
 
-Behind everything. Functions of `figures` make a `Figure` from results; `page_figure` draws it with plotly and
-`pictures` with matplotlib, so that both show the same. Colours are Okabe's and Ito's, which colour-blind readers tell
-apart, and line styles differ as well, so that a figure survives black and white.
+Behind everything. Functions of `figures` make a `Figure` from results; `page` with page.js draws it on a page
+and `pictures` with matplotlib, so that both show the same. Colours are Okabe's and Ito's, which colour-blind readers
+tell apart, and line styles differ as well, so that a figure survives black and white.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 from itertools import pairwise
 
 import numpy as np
-import plotly.graph_objects as go
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
@@ -47,7 +45,7 @@ class Style(Enum):
 
 
 class ScaleKind(Enum):
-    """Scale of an axis; the values are what both plotting libraries call it."""
+    """Scale of an axis; the values are what matplotlib calls it."""
 
     LINEAR = "linear"
     LOG = "log"
@@ -145,16 +143,14 @@ def array(values: ArrayLike) -> Array:
     return np.asarray(values, dtype=np.float64)
 
 
-# --- Time curves and histograms --------------------------------------------------------------------------------------
-# Time curves for the eye: long series thinned so that no peak is lost, and histograms of what a run measured.
+# --- Long series -----------------------------------------------------------------------------------------------------
+# Thinned for the pictures so that no peak is lost.
 
 
 Series = NDArray[np.float64]
 
 #: Lowest and highest for each of 900 columns, about a pixel each; more points than this cannot be seen.
 _POINTS = 1800
-#: Above the curves: beside them, its width would depend on the names in it.
-_LEGEND = {"orientation": "h", "x": 0.0, "xanchor": "left", "y": 1.0, "yanchor": "bottom"}
 
 
 def thin(time_s: Series, values: Series, points: int = _POINTS) -> tuple[Series, Series]:
@@ -171,32 +167,3 @@ def thin(time_s: Series, values: Series, points: int = _POINTS) -> tuple[Series,
 def _extremes(values: Series, first: int, last: int) -> list[int]:
     part = values[first:last]
     return [first + int(part.argmin()), first + int(part.argmax())]
-
-
-def time_curves(time_s: Series, curves: Mapping[str, Series], title: str, unit: str) -> go.Figure:
-    """Several series over the same time axis; `unit` labels the vertical one.
-
-    Drawn as SVG: browsers allow a page only a few WebGL contexts and blank the rest, some have none. The margins stay
-    as they are whatever the labels, so that equal times stand below each other in all figures.
-    """
-    figure = go.Figure()
-    for name, values in curves.items():
-        x, y = thin(time_s, np.asarray(values, dtype=np.float64))
-        figure.add_scatter(x=x.astype(np.float32), y=y.astype(np.float32), name=name, mode="lines", line={"width": 1.2})
-    figure.update_layout(title=title, height=400, hovermode="x unified", showlegend=True, legend=_LEGEND)
-    span_s = [float(time_s[0]), float(time_s[-1])] if len(time_s) else None
-    figure.update_xaxes(title="time in s", range=span_s, automargin=False)
-    figure.update_yaxes(title=unit, automargin=False)
-    return figure
-
-
-def histogram(samples: Mapping[str, Series], title: str, unit: str, bins: int = 120) -> go.Figure:
-    """Distributions side by side, up to the 99.9th percentile; counts on a logarithmic axis, so that rare ones show."""
-    figure = go.Figure()
-    top = max(float(np.percentile(values, 99.9)) for values in samples.values())
-    edges = np.linspace(0.0, max(top, 1.0), bins + 1)
-    for name, values in samples.items():
-        counts, _ = np.histogram(values, edges)
-        figure.add_scatter(x=edges[:-1], y=counts, name=name, mode="lines", line={"shape": "hv"})
-    figure.update_layout(title=title, xaxis_title=unit, yaxis_title="cycles", yaxis_type="log", height=340)
-    return figure

@@ -1,7 +1,7 @@
 """Draws a figure with matplotlib and writes it as PNG and SVG, for documents and print.
 
-Between the description of a figure and files; `page_figure` draws the same with plotly. The same figure gives the same
-bytes: no dates, no random ids.
+Between the description of a figure and files; `page` with page.js draws the same on a page. The same
+figure gives the same bytes: no dates, no random ids.
 """
 
 from __future__ import annotations

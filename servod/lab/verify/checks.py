@@ -270,6 +270,7 @@ def observations(s: Subject) -> dict[str, float]:
     delays = {f"largest pole, {name} of delay": s.dense.worst(NOMINAL, s.cycles(n)).radius for name, n in told.items()}
     longest = largest_tolerated(lambda d: sweep.stable(LoopDeviation(), d), 0.0, EXTRA_DELAY_CYCLES * period)
     return {
+        **sweep.classical_margins(),
         **delays,
         "largest error on the sine over the plants [share]": max(trial.error_share for trial in s.trials),
         "largest rest of the large step over the plants [share]": max(trial.unsettled_share for trial in s.trials),

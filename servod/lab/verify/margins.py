@@ -5,10 +5,10 @@ Stands on `closed_loop`. A sweep linearises the law once per velocity and judges
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -172,6 +172,17 @@ class Sweep:
                     least, where = margin, velocity
         return least, where
 
+    def classical_margins(self) -> dict[str, float]:
+        """MARGINS of the joint as modelled by their keys, each the least (peak sensitivity: the largest) over all
+        velocities; one that no frequency bounds is left out."""
+        found: dict[str, list[float]] = {key: [] for key in MARGINS}
+        for _, _, (closed, column, row) in self.systems(NOMINAL, transient=False):
+            response = sensitivity(closed, column, row, on_circle=FINE_CIRCLE)[0]
+            for key, value in classical_margins(1.0 / response - 1.0, np.angle(FINE_CIRCLE)).items():
+                found[key].append(value)
+        worst = {key: (max if key == PEAK else min)(values, default=np.inf) for key, values in found.items()}
+        return {key: float(value) for key, value in worst.items() if np.isfinite(value)}
+
     def judge(self, cases: Sequence[LoopDeviation]) -> Judgement:
         """Poles and disk margin of `cases` at once, for a search: what `worst` and `disk_margin` say."""
         found, hardest = Judgement(self.own_radius, 0.0, np.inf, 0.0, []), set()
@@ -202,18 +213,24 @@ def by_delay(cases: Sequence[LoopDeviation]) -> list[list[int]]:
     return [[i for i, kind in enumerate(kinds) if kind == one] for one in dict.fromkeys(kinds)]
 
 
-def sensitivity(closed: Array, column: Array, row: Array, poles: NDArray[Any] | None = None) -> NDArray[np.complex128]:
-    """S of each closed loop at the drive over FREQUENCIES up to half the sample rate, from its `poles` if known.
+def sensitivity(
+    closed: Array,
+    column: Array,
+    row: Array,
+    poles: NDArray[Any] | None = None,
+    on_circle: NDArray[np.complex128] = ON_CIRCLE,
+) -> NDArray[np.complex128]:
+    """S of each closed loop at the drive over `on_circle` up to half the sample rate, from its `poles` if known.
 
     S(z) = det(z - A_open)/det(z - A_closed): the zeros of S are the poles of the open loop.
     """
     known = np.linalg.eigvals(closed) if poles is None else poles
     zeros = np.linalg.eigvals(closed - column[:, :, None] * row)
-    above = np.ones((len(closed), FREQUENCIES), dtype=np.complex128)
+    above = np.ones((len(closed), len(on_circle)), dtype=np.complex128)
     below = np.ones_like(above)
     for zero, pole in zip(zeros.T, known.T, strict=True):  # one root of all loops at a time: no array in all three
-        above *= ON_CIRCLE - zero[:, None]
-        below *= ON_CIRCLE - pole[:, None]
+        above *= on_circle - zero[:, None]
+        below *= on_circle - pole[:, None]
     response: NDArray[np.complex128] = above / below
     return response
 
@@ -222,6 +239,83 @@ def disk_margins(response: NDArray[np.complex128]) -> Array:
     """Symmetric disk margin 1/max|S - 1/2| of each response of S."""
     margins: Array = 1.0 / np.abs(response - 0.5).max(axis=1)
     return margins
+
+
+# --- Classical margins -----------------------------------------------------------------------------------------------
+# What control engineers read first: gain, phase, delay and Ms, one at a time, from the frequency response of the loop
+# that is opened at the drive's torque command.
+
+
+class MarginWords(NamedTuple):
+    """How a margin reads; `usual` is what textbooks ask of a loop (Astrom, Murray: Feedback Systems, ch. 10)."""
+
+    name: str
+    unit: str
+    meaning: str
+    usual: str
+
+
+UP, DOWN, PHASE, DELAY = "gain margin up [dB]", "gain margin down [dB]", "phase margin [deg]", "delay margin [cycles]"
+PEAK = "peak sensitivity Ms"
+#: Margins by their keys in the observations of a certificate.
+MARGINS = {
+    UP: MarginWords("gain margin upward", "dB", "so much more gain from command to torque it still stands", "6"),
+    DOWN: MarginWords("gain margin downward", "dB", "so much less gain, where friction destabilises the joint", "6"),
+    PHASE: MarginWords("phase margin", "°", "so much more phase lag, or less, where the gain is one", "30 to 60"),
+    DELAY: MarginWords("delay margin", "cycles", "so much more delay from command to torque", "1"),
+    PEAK: MarginWords("peak sensitivity Ms", "", "largest |S|; 1/Ms is the least distance of L to -1", "at most 2"),
+}
+#: Frequencies in rad a sample, closely enough that a crossing between two is a straight line.
+FINE_CIRCLE = np.exp(1j * np.geomspace(1e-4, np.pi, 4000))
+
+
+def classical_margins(loop: NDArray[np.complex128], angle: Array) -> dict[str, float]:
+    """MARGINS of one stable closed loop from L, sampled at `angle` [rad a sample], up to half the sample rate.
+
+    L is that of 1 + L = 0: gain margins where the phase is -180 degrees, the others where |L| = 1;
+    Ms = max |1/(1 + L)|. Between two frequencies log |L| and phase are straight lines. A delay margin counts the phase
+    down to -180 degrees from above, whatever lies between. inf: no such crossing.
+    """
+    size, phase = np.log(np.abs(loop)), np.unwrap(np.angle(loop))
+    crossed = _crossings(size)
+    lag, omega = _between(phase, crossed) + np.pi, _between(angle, crossed)
+    turned = _crossings(np.sin(phase))
+    negative = np.cos(_between(phase, turned)) < 0.0
+    gains = list(20.0 / np.log(10.0) * _between(size, turned)[negative])
+    level = abs(size[1] - size[0]) < 0.1 * np.log(angle[1] / angle[0])  # no integrator
+    ends = [loop[0]] * bool(level and loop[0].real < 0.0) + [loop[-1]] * bool(loop[-1].real < 0.0)
+    gains += [20.0 * float(np.log10(abs(end))) for end in ends]  # at rest and at half the sample rate L is real
+    wrapped = np.abs((lag + np.pi) % (2.0 * np.pi) - np.pi)
+    return {
+        UP: min((-g for g in gains if g < 0.0), default=np.inf),
+        DOWN: min((g for g in gains if g > 0.0), default=np.inf),
+        PHASE: float(np.degrees(wrapped.min(initial=np.inf))),
+        DELAY: float(((lag % (2.0 * np.pi)) / omega).min(initial=np.inf)),
+        PEAK: float((1.0 / np.abs(1.0 + loop)).max()),
+    }
+
+
+def _crossings(values: Array) -> Array:
+    """(place, share of the step behind it) of every change of sign."""
+    at = np.flatnonzero(np.signbit(values[:-1]) != np.signbit(values[1:]))
+    return np.array([at, values[at] / (values[at] - values[at + 1])])
+
+
+def _between(values: Array, crossed: Array) -> Array:
+    """`values` at crossings, on a straight line."""
+    at = crossed[0].astype(np.intp)
+    found: Array = values[at] + crossed[1] * (values[at + 1] - values[at])
+    return found
+
+
+def describe_margins(observations: Mapping[str, float]) -> str:
+    """The margins of a certificate in one clause; empty where it states none."""
+    told = [
+        f"{words.name} {observations[key]:.3g} {words.unit}".rstrip()
+        for key, words in MARGINS.items()
+        if key in observations
+    ]
+    return ", ".join(told).replace(" °", "°")
 
 
 def largest_tolerated(stable: Callable[[float], bool], start: float, end: float) -> float:

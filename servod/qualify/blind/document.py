@@ -15,16 +15,14 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-import plotly.graph_objects as go
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure as Canvas
 from numpy.typing import NDArray
 
 from servod.common.errors import BadInput
 from servod.common.files import write_bytes
-from servod.lab.report.figure import Colour, Figure, PlotAxis, PlotPanel, Style, curve
-from servod.lab.report.page import Page
-from servod.lab.report.page_figure import plotly_figure
+from servod.lab.report.figure import Colour, Figure, PageTable, PlotAxis, PlotPanel, Style, curve
+from servod.lab.report.page import Page, Verdict, table_html
 from servod.lab.report.pictures import write_pictures
 from servod.qualify.blind import count, tables
 from servod.qualify.blind.conceal import SEALED, TRUTH, BlindTrial, read_truth
@@ -35,7 +33,7 @@ from servod.qualify.blind.tables import CONFIDENCE, EFFECTS
 
 # --- Pictures --------------------------------------------------------------------------------------------------------
 # The pictures of a trial: who was taken for whom, and whether stated confidence is to be believed. Drawn from the JSON
-# document, with plotly for the page and with matplotlib as PNG, both the same.
+# document, for the page and with matplotlib as PNG, both the same.
 
 
 Array = NDArray[np.float64]
@@ -58,16 +56,14 @@ class Matrix:
         """Counts over the sum of their row."""
         return np.asarray(self.counts / np.maximum(self.counts.sum(axis=1, keepdims=True), 1.0))
 
-    def plotly(self) -> go.Figure:
-        """For the page."""
+    def add_to(self, page: Page) -> None:
+        """Into the page: a table of counts, its cells coloured by their share of the row."""
         written = [[f"{n:.0f}" if n else "" for n in row] for row in self.counts]
-        place: Any = {"z": self.shares, "x": self.columns, "y": self.rows, "text": written}
-        cells = go.Heatmap(**place, texttemplate="%{text}", colorscale="Blues", zmin=0, zmax=1, showscale=False)
-        drawn = go.Figure(cells)
-        drawn.update_layout(title=self.title, height=230 + 24 * len(self.rows))
-        drawn.update_yaxes(autorange="reversed", title="concealed", automargin=True)
-        drawn.update_xaxes(title="answer", tickangle=-60, automargin=True)
-        return drawn
+        rows = tuple((name, *cells) for name, cells in zip(self.rows, written, strict=True))
+        shades = [[math.ceil(3.0 * share) for share in row] for row in self.shares]
+        table = PageTable(self.title, ("concealed \\ answer", *self.columns), rows)
+        page.html_part(table_html(table, shades=shades))
+        page.sentence(self.caption)
 
     def write(self, folder: Path) -> None:
         """As PNG, for documents. Raises BadInput."""
@@ -97,14 +93,9 @@ class Drawn:
     figure: Figure
     beside: str
 
-    @property
-    def caption(self) -> str:
-        """What is seen."""
-        return self.figure.caption
-
-    def plotly(self) -> go.Figure:
-        """For the page."""
-        return plotly_figure(self.figure)
+    def add_to(self, page: Page) -> None:
+        """Into the page."""
+        page.figure(self.figure)
 
     def write(self, folder: Path) -> None:
         """As PNG, for documents. Raises BadInput."""
@@ -229,15 +220,14 @@ def write(found: dict[str, Any], out: Path) -> None:
     for picture in drawn:
         picture.write(out / PICTURES)
     write_bytes(out / "prove.md", tables.markdown(found).encode())
-    page = Page("A blind trial of the diagnosis")
+    page = Page("A blind trial of the diagnosis", Verdict(tables.verdict(found)))
     for sentence in tables.sentences(found):
         page.sentence(sentence)
     for table in tables.all_tables(found):
         page.heading(table.title)
-        page.table(table.header, table.rows)
+        page.table(table)
         for picture in drawn:
             if picture.beside == table.title:
-                page.figure(picture.plotly())
-                page.sentence(picture.caption)
+                picture.add_to(page)
     page.write(out / "prove.html")
     write_bytes(out / "prove.json", (json.dumps(found, indent=1, allow_nan=False) + "\n").encode())

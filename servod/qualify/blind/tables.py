@@ -54,6 +54,12 @@ def sentences(found: Mapping[str, Any]) -> Iterator[str]:
         yield f"False alarm: {', '.join(named)} in {case}, where nothing is hidden."
 
 
+def verdict(found: Mapping[str, Any]) -> str:
+    """How many answers are right, and how many false alarms there were."""
+    right = sum(bool(case["right"]) for case in found["results"])
+    return f"{right} of {found['cases']} answers are right; {len(found['false_alarms'])} false alarms."
+
+
 def results(found: Mapping[str, Any]) -> PageTable:
     """What a trial is judged by, with the goals."""
     goals = HARDER_GOALS if found["harder"] else GOALS
@@ -70,7 +76,7 @@ def results(found: Mapping[str, Any]) -> PageTable:
     for key, text in _SPENT.items():
         spread = found["times"][key]
         rows.append((f"{text}: median, max", f"{number(spread['median'])}, {number(spread['max'])}", "", ""))
-    return PageTable(RESULT, ("", "found", "of", "goal"), tuple(rows))
+    return PageTable(RESULT, ("what", "found", "of", "goal"), tuple(rows))
 
 
 def _held_out(spreads: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
@@ -125,18 +131,18 @@ def hidden(found: Mapping[str, Any]) -> PageTable:
     rows: list[tuple[str, ...]] = []
     for key, text in (("by_cover", "cover"), ("by_form", "form"), ("by_joint", "joint")):
         rows += [_counted(f"{text}: {name}", counted, None)[:3] for name, counted in found[key].items()]
-    return PageTable(HIDDEN, ("", "right", "of"), tuple(rows))
+    return PageTable(HIDDEN, ("what hid it", "right", "of"), tuple(rows))
 
 
 def every_case(found: Mapping[str, Any]) -> PageTable:
     """One row a case."""
     rows = []
-    for case in found["results"]:
+    for case in sorted(found["results"], key=lambda case: bool(case["right"])):  # the wrong ones first
         named = ", ".join(f"{name} ({sure:.2f})" for name, sure in case["named"].items())
         concealed = ", ".join(case["concealed"]) or "nothing"
         more = ", ".join(filter(None, (case["joint"], case["cover"], "other form" if case["other_form"] else "")))
         rows.append((case["case"], concealed, more, case["verdict"], named, "right" if case["right"] else "wrong"))
-    return PageTable(CASES, ("case", "concealed", "axis", "verdict", "named", ""), tuple(rows))
+    return PageTable(CASES, ("case", "concealed", "axis", "verdict", "named", "answer"), tuple(rows))
 
 
 def markdown(found: Mapping[str, Any]) -> str:

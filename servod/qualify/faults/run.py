@@ -358,21 +358,29 @@ _TIMES = (
 
 def write_page(outcomes: Sequence[Outcome], planned: int, path: Path) -> None:
     """Write the page to `path`. Raises BadInput when that is not possible."""
-    from servod.lab.report.page import Page
+    from servod.lab.report.figure import PageTable
+    from servod.lab.report.page import Page, Verdict
 
-    page = Page("servod: the fault campaign")
     first, *rest = summary(outcomes, planned)
-    page.lead(first)
+    passed = all(outcome.passed for outcome in outcomes) and len(outcomes) == planned
+    page = Page("servod: the fault campaign", Verdict(first, passed))
     page.points(rest)
     page.sentence(_TIMES)
     _failures(page, outcomes)
     by_group = sorted(outcomes, key=lambda outcome: (outcome.group, outcome.name))
     for group, members in groupby(by_group, key=lambda outcome: outcome.group):
-        rows = list(members)
-        page.heading(f"{group.capitalize()}: {len(rows)} scenarios")
-        page.table(HEADER, [cells(outcome) for outcome in rows])
+        rows = sorted(members, key=_worst_first)
+        title = f"{group.capitalize()}: {len(rows)} scenarios"
+        page.heading(title)
+        failed = not all(outcome.passed for outcome in rows)
+        page.table(PageTable(title, HEADER, tuple(map(cells, rows))), folded=not failed)
         page.folded("What each is, and what the user was told", [_told(outcome) for outcome in rows])
     page.write(path)
+
+
+def _worst_first(outcome: Outcome) -> tuple[bool, float]:
+    """Failed before passed, then by how long the torque stayed."""
+    return outcome.passed, -(outcome.reaction.gone_ms or 0.0)
 
 
 def _failures(page: Page, outcomes: Sequence[Outcome]) -> None:

@@ -16,7 +16,7 @@ from servod import __version__
 from servod.common.files import write_bytes
 from servod.formats.gains.parameters import LocalParameters
 from servod.lab.report.figure import PageTable
-from servod.lab.report.page import Page
+from servod.lab.report.page import Page, Verdict
 from servod.qualify.paper import beyond, friction, loops, motions, table
 from servod.qualify.paper.claims import Claim, Shown
 from servod.qualify.paper.experiments import Found, Measured
@@ -106,13 +106,21 @@ def markdown(found: dict[str, Any]) -> str:
     return "\n\n".join(parts) + "\n"
 
 
+def verdict(found: dict[str, Any]) -> Verdict:
+    """How many of the paper's statements hold here."""
+    said = [claim["agrees"] for f in found["figures"] for claim in f["claims"]]
+    said += [statement["agrees"] for statement in found["statements"]]
+    joints = ", ".join(PaperJoint(name).label for name in found["joints"])
+    return Verdict(f"{sum(said)} of {len(said)} statements of the paper hold here, on {joints}; seed {found['seed']}.")
+
+
 def write(folder: Path, figures: Sequence[Shown], found: dict[str, Any]) -> None:
     """Page, Markdown and JSON into `folder`. Raises BadInput when it cannot be written."""
-    page = Page(_TITLE)
+    page = Page(_TITLE, verdict(found))
     page.sentence(_NOTE)
     for each in tables(found):
         page.heading(each.title)
-        page.table(each.header, each.rows)
+        page.table(each)
     for s in figures:
         page.heading(f"Fig. {s.number}" if s.number[0].isdigit() else s.number)
         for claim in s.claims:

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from servod.lab.report.figure import COLOURS, Curve, Figure, PlotAxis, PlotPanel, Style
-from servod.lab.report.page import Page
+from servod.lab.report.figure import COLOURS, Curve, Figure, PageTable, PlotAxis, PlotPanel, Style
+from servod.lab.report.page import Page, Verdict
 from servod.qualify.soak.memory import LIMIT_KB_PER_H, LONG_S, Growth, Memory
 from servod.qualify.soak.tally import COUNTED, SoakedAxis, median_ms
 
@@ -223,21 +223,18 @@ def fault_rows(found: dict[str, Any]) -> list[tuple[str, ...]]:
 
 def write_page(found: dict[str, Any], folder: Path) -> Path:
     """Write the page into `folder`; raises BadInput when that is not possible."""
-    page = Page("servod: soak")
-    page.lead(verdict(found))
+    page = Page("servod: soak", Verdict(verdict(found), not found["wrong"] and not found["unproven"]))
     page.sentence(
         f"Mode {found['mode']}, seed {', '.join(map(str, found['seeds']))}. Every cycle's record, every SYNC and every "
         "sample of the drive's own record was checked."
     )
-    page.table(("counted", ""), count_rows(found))
+    page.table(PageTable("Counted", ("counted", "figure"), tuple(count_rows(found))))
     if found["findings"]:
         page.heading("What was wrong")
-        page.table(
-            ("episode", "axis time s", "what", ""),
-            [(str(f["episode"]), _seconds(f["time_s"]), f["wrong"], f["text"]) for f in found["findings"]],
-        )
+        wrong = [(str(f["episode"]), _seconds(f["time_s"]), f["wrong"], f["text"]) for f in found["findings"]]
+        page.table(PageTable("Findings", ("episode", "axis time / s", "kind", "what"), tuple(wrong)))
     page.heading("Faults and reactions")
-    page.table(_FAULT_HEADER, fault_rows(found))
+    page.table(PageTable("By kind of fault", _FAULT_HEADER, tuple(fault_rows(found))))
     reactions = _reactions(found)
     if reactions.panels:
         page.figure(reactions)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 from servod.common.errors import ServodError, Unreachable
 from servod.common.faults import FaultCode
-from servod.runtime.daemon.status import Age, NodeStatus
+from servod.runtime.daemon.status import Age, IdentityStatus, NodeStatus
 from servod.runtime.fieldbus.cia import CW_DISABLE_VOLTAGE, NmtCommand, NmtState, Obj402
 from servod.runtime.fieldbus.master import BringUp, Master
 from servod.runtime.fieldbus.master.monitor import NodeEvent
@@ -60,10 +60,22 @@ class Nodes:
                 "role": role,
                 "driver": plan.driver,
                 "state": self._state(plan.node_id),
+                "identity": self._identity(plan.node_id),
                 **self._age(plan.node_id),
             }
             for role, plan in (("amplifier", self.plans.amplifier), ("encoder", self.plans.encoder))
         ]
+
+    def _identity(self, node_id: int) -> IdentityStatus | None:
+        found = self._master.identity(node_id)
+        if found is None:
+            return None
+        return {
+            "vendor_id": found.vendor_id,
+            "product_code": found.product_code,
+            "revision": found.revision,
+            "serial": found.serial,
+        }
 
     def _age(self, node_id: int) -> Age:
         age_s = self._master.heartbeat_age_s(node_id)

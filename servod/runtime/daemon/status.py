@@ -123,6 +123,15 @@ class BusStatus(TypedDict):
     ignored_frames: int
 
 
+class IdentityStatus(TypedDict):
+    """What a node said of itself at the start (0x1018); None what it does not have."""
+
+    vendor_id: int
+    product_code: int | None
+    revision: int | None
+    serial: int | None
+
+
 class NodeStatus(Age):
     """One node and the state that its last heartbeat told; the age is that heartbeat's."""
 
@@ -130,6 +139,7 @@ class NodeStatus(Age):
     role: str
     driver: str
     state: str
+    identity: IdentityStatus | None
 
 
 class GrantStatus(TypedDict):

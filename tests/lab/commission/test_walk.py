@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -16,7 +17,7 @@ from servod.formats.gains.gain_set import load_gains
 from servod.formats.model.axis_model import axis_model_yaml
 from servod.lab.commission import walk
 from servod.lab.commission.comparison import load_curves, load_rows, save_curves
-from servod.lab.commission.report import failure, sections
+from servod.lab.commission.report import failure, sections, verdict
 from servod.lab.commission.state import (
     DEPLOYMENT,
     GAINS,
@@ -187,6 +188,12 @@ def test_curves_come_back_from_disk_and_stand_on_the_page(folder: Path) -> None:
     assert set(made) == SHOWN
     figures = {part.name for parts in made.values() for part in parts if isinstance(part, Figure)}
     assert {"bode", "impulse_responses", "weighting_functions", "before_after", "step_100_free_feedback"} <= figures
+    captions = [p.caption for title in ("Deployment", "Tracking") for p in made[title] if isinstance(p, Figure)]
+    known = {f"{v:.4g}" for name in (DEPLOYMENT, TRACKING) for v in leaves(read_json(folder / name))}
+    told = [
+        n for text in [*captions, verdict(walk)] for n in re.findall(r"([\d.]+(?:e-\d+)?)(?: of [\d.]+)? mrad", text)
+    ]
+    assert len(told) > 6 and set(told) <= known
     (reached,) = (p for p in made["Tracking"] if isinstance(p, PageTable) and "tuning reached" in p.title)
     over = "Deployed, over the limit (x2)"
     assert [(row[0], *row[3:]) for row in reached.rows] == [("Local models", "4.20", "5"), (over, "10.00", "5")]
@@ -195,6 +202,15 @@ def test_curves_come_back_from_disk_and_stand_on_the_page(folder: Path) -> None:
     (said,) = (p for p in made["Tracking"] if isinstance(p, str))
     assert "10 times the roughness of the paper's PD, over the limit (x2)" in said
     assert any(isinstance(part, PageTable) and "Certificate" in part.title for part in made["The certificate"])
+
+
+def leaves(document: Any) -> Iterator[float]:
+    """Every number of a JSON document."""
+    if isinstance(document, dict | list):
+        for part in document.values() if isinstance(document, dict) else document:
+            yield from leaves(part)
+    elif isinstance(document, float | int):
+        yield float(document)
 
 
 def judged(ratio: float) -> dict[str, Any]:

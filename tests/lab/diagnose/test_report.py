@@ -98,7 +98,7 @@ def test_page_stands_alone(written: tuple[Path, dict[str, Any]]) -> None:
     body = page.split("<body>")[1]
     assert not re.search(r'<(script|link|img)[^>]+(src|href)="?http', page)
     order = (
-        'class="lead"',
+        'id="verdict"',
         "Where the model is off",
         "Finding 1: spring",
         "95 % interval",

@@ -18,7 +18,7 @@ from servod.lab.identify.fits.presliding import PreslidingFit
 from servod.lab.identify.fits.response import ResponseFit
 from servod.lab.report.figure import Figure, Style
 from servod.lab.report.figures.friction import dahl_curve, friction_map
-from servod.lab.report.figures.loop import bode, certificate_table, observations_table
+from servod.lab.report.figures.loop import bode, certificate_tables, observations_table
 from servod.lab.report.figures.loop import measured_response as frequency_response
 from servod.lab.report.figures.motion import (
     PlottedMotion,
@@ -37,8 +37,7 @@ from servod.lab.report.figures.sets import (
     weight_table,
     weighting_functions,
 )
-from servod.lab.report.page import Page
-from servod.lab.report.page_figure import plotly_figure
+from servod.lab.report.page import Page, PageData, Verdict, figure_html
 from servod.lab.report.pictures import write_pictures
 from tests.lab.synthesize.designs import table1
 
@@ -100,16 +99,16 @@ def figures() -> list[Figure]:
 
 
 @pytest.mark.parametrize("figure", figures(), ids=lambda f: f.name)
-def test_both_renderers_show_every_curve_under_axes_with_units(figure: Figure) -> None:
-    """In the page there is a trace for each curve; every axis names its unit, or is a weight."""
-    drawn = plotly_figure(figure)
-    names = {trace.name for trace in drawn.data}
-    for panel in figure.panels:
-        assert all((c.label or c.detail) in names for c in panel.curves)
+def test_the_page_has_every_curve_under_axes_with_units(figure: Figure) -> None:
+    """Each curve stands in the page with its rows; every axis names its unit, or is a weight; labels stand once."""
+    document, text = PageData([figure]).document(), figure_html(figure)
+    for panel, held in zip(figure.panels, document["figures"][0]["panels"], strict=True):
+        assert [c.label for c in panel.curves] == [c["label"] for c in held["curves"]]
         for axis in (panel.x, panel.y):
             assert re.search(r" in \S+", axis.label) or "weight" in axis.label
-    shown = [trace.name for trace in drawn.data if trace.showlegend]
-    assert len(shown) == len(set(shown))
+    labels = re.findall(r'aria-pressed="true"><svg.*?</svg>(.*?)</button>', text)
+    assert len(labels) == len(set(labels))
+    assert text.count('class="panel"') == len(figure.panels) and figure.title in text
 
 
 def test_pictures_are_the_same_bytes_every_time(tmp_path: Path) -> None:
@@ -127,11 +126,11 @@ def test_a_folder_that_cannot_be_written_is_bad_input(tmp_path: Path) -> None:
 
 
 def test_the_page_needs_no_network_and_holds_figure_and_caption(tmp_path: Path) -> None:
-    page = Page("title")
+    page = Page("title", Verdict("it went well", True))
     page.figure(before_after(*MOTIONS))
     page.write(tmp_path / "page.html")
     text = (tmp_path / "page.html").read_text()
-    assert "RMS error" in text and "Plotly.newPlot" in text
+    assert "RMS error" in text and "page-data" in text and "Passed: it went well" in text
     assert not re.findall(r"<(?:script|link|img)[^>]+(?:src|href)=.https?:", text)
 
 
@@ -210,6 +209,6 @@ def test_other_laws_and_bare_sets_are_refused() -> None:
         weighting_functions(load_gains(shipped("gains/paper_pd.yaml")))
     with pytest.raises(BadInput, match="design"):
         bode(TABLE1)
-    for table in (certificate_table, observations_table):
+    for table in (lambda gains: list(certificate_tables(gains)), observations_table):
         with pytest.raises(BadInput, match="certificate"):
             table(TABLE1)

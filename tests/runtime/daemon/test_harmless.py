@@ -7,7 +7,6 @@ import logging
 from pathlib import Path
 from typing import Any
 
-import plotly.graph_objects as go
 import pytest
 from rich.console import Console
 
@@ -15,7 +14,8 @@ from servod.cli.scan import _cells
 from servod.cli.status import _plain
 from servod.common.errors import BadInput
 from servod.formats.config import RecorderConfig
-from servod.lab.report.page import Page
+from servod.lab.report.figure import Figure, PageTable, PlotAxis, PlotPanel, curve
+from servod.lab.report.page import Page, Verdict
 from servod.runtime.daemon.main import harmless, print_error, set_up_logging
 from servod.runtime.daemon.recorder import RecordingFiles
 
@@ -91,21 +91,20 @@ def test_screens_show_names_and_do_not_obey_them() -> None:
 
 
 def test_pages_show_markup_as_text() -> None:
-    page = Page(HOSTILE)
+    page = Page(HOSTILE, Verdict(HOSTILE))
     page.heading(HOSTILE)
     page.sentence(HOSTILE)
-    page.lead(HOSTILE)
     page.points([HOSTILE])
     page.folded(HOSTILE, [HOSTILE])
-    page.table([HOSTILE], [[HOSTILE]])
+    page.table(PageTable(f"{HOSTILE}.", (HOSTILE,), ((HOSTILE,),)))
     text = page.html()
-    assert text.count("&lt;script&gt;alert(1)") == 10
+    assert text.count("&lt;script&gt;alert(1)") == 12
     assert "<script>alert" not in text and "<img" not in text
 
 
 def test_figures_on_a_page_do_not_end_their_script() -> None:
-    page = Page("a page")
-
-    page.figure(go.Figure(go.Scatter(x=[0, 1], y=[0, 1], name=HOSTILE)).update_layout(title=HOSTILE))
+    page, axis = Page("a page", Verdict("drawn")), PlotAxis(HOSTILE, names=(HOSTILE,))
+    shown = tuple(curve(label, [0, 1], [0, 1], detail=HOSTILE) for label in (HOSTILE, "b"))
+    page.figure(Figure("hostile", HOSTILE, (PlotPanel(axis, axis, shown, HOSTILE),), caption=HOSTILE))
     drawn = page.html().split("</head>")[1]
     assert "<script>alert" not in drawn and "<img" not in drawn

@@ -212,7 +212,7 @@ def test_shipped_configurations_are_good(name: str) -> None:
 
 
 def test_daemon_imports_nothing_of_the_laboratory() -> None:
-    heavy = "('numpy', 'scipy', 'numba', 'matplotlib', 'plotly', 'pyarrow', 'cvxpy')"
+    heavy = "('numpy', 'scipy', 'numba', 'matplotlib', 'pyarrow', 'cvxpy')"
     code = f"import sys, servod.runtime.daemon.main; sys.exit(str([m for m in {heavy} if m in sys.modules] or ''))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stderr.strip() == ""

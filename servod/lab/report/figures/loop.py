@@ -5,11 +5,13 @@ Stands on the stored design of a gain set and the linearised loop of verificatio
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from servod.common.errors import BadInput
 from servod.formats.gains.design import Design, RegionProof
-from servod.formats.gains.gain_set import Certificate, GainSet
+from servod.formats.gains.gain_set import Certificate, CertificateCheck, GainSet
 from servod.lab.identify.fits.response import LEAST_COHERENCE, ResponseFit, falling_phase_rad
 from servod.lab.report.figure import (
     Array,
@@ -33,6 +35,7 @@ from servod.lab.report.responses import (
     rigid,
     vertex_impulse,
 )
+from servod.lab.verify.margins import MARGINS
 
 #: Velocities of both halves of Fig. 4 [rad/s]: creeping (and at rest), and where trajectory (19) is fast.
 LOW_VELOCITIES, HIGH_VELOCITIES = (0.0, 0.001), (0.05, 0.2)
@@ -179,20 +182,72 @@ def _norms(region: RegionProof, period_s: float) -> str:
 # The certificate of a gain set as a table: every check with its figure, limit and margin.
 
 
-def certificate_table(gains: GainSet) -> PageTable:
-    """All checks in their order. Raises BadInput for a set without a certificate."""
+#: Titles of tables that a page folds begin so.
+PASSED = "Passed"
+#: So many passed checks stand open: those that have used most of their limit.
+_TIGHTEST = 5
+
+
+def certificate_tables(gains: GainSet) -> Iterator[PageTable]:
+    """Margins in a drive engineer's units; checks that failed, then the tightest; the others, to be folded.
+
+    Raises BadInput for a set without a certificate.
+    """
     certificate = _certificate(gains)
-    rows = [
-        (c.name, f"{c.value:.4g}", f"{c.limit:.4g}", f"{c.margin:.3g}", _verdict(c.passed)) for c in certificate.checks
-    ]
+    header = ("margin", "value", "unit", "textbooks ask for", "what it is")
+    yield PageTable("Margins of the loop, the least over all speeds", header, tuple(margin_rows(certificate)))
+    checks = sorted(certificate.checks, key=lambda check: (check.passed, -limit_used(check)))
+    first = sum(not check.passed for check in checks) + _TIGHTEST
     verdict = "valid" if certificate.valid else "not valid"
-    return PageTable(f"Certificate: {verdict}", ("check", "figure", "limit", "margin", "verdict"), tuple(rows))
+    title = f"Certificate: {verdict}. Of {len(checks)} checks the failed, then the {_TIGHTEST} nearest to their limit"
+    yield PageTable(title, _HEADER, tuple(map(_check_row, checks[:first])))
+    yield PageTable(
+        f"{PASSED}: the other {len(checks[first:])} checks", _HEADER, tuple(map(_check_row, checks[first:]))
+    )
+
+
+_HEADER = ("check", "figure", "limit", "limit used", "verdict")
+
+
+def _check_row(check: CertificateCheck) -> tuple[str, ...]:
+    used = f"{100.0 * limit_used(check):.0f} %"
+    if _exact(check):
+        used = "met exactly"
+    return check.name, f"{check.value:.4g}", f"{check.limit:.4g}", used, _verdict(check.passed)
+
+
+def limit_used(check: CertificateCheck) -> float:
+    """How much of its limit a check has used: 1 at the limit, 0 far from it.
+
+    What keeps its limit exactly, as a count does, has no margin to lose and is 0. Of a pole its distance from the unit
+    circle counts, which is what its decay goes by.
+    """
+    value, limit = check.value, check.limit
+    if _exact(check):
+        return 0.0
+    if "pole" in check.name:
+        value, limit = 1.0 - limit, max(1.0 - value, 1e-12)
+    elif limit - value != check.margin:  # a figure that must not be below its limit
+        value, limit = limit, value
+    return value / limit if limit > 0.0 else float(not check.passed)
 
 
 def observations_table(gains: GainSet) -> PageTable:
     """What was observed beside the checks, told and not judged. Raises BadInput for a set without a certificate."""
-    told = _certificate(gains).observations
+    told = {k: v for k, v in _certificate(gains).observations.items() if k not in MARGINS}
     return PageTable("Told, not judged", ("figure", "value"), tuple((k, f"{v:.4g}") for k, v in told.items()))
+
+
+def _exact(check: CertificateCheck) -> bool:
+    return check.passed and abs(check.value - check.limit) <= 1e-6 * abs(check.limit)
+
+
+def margin_rows(certificate: Certificate) -> Iterator[tuple[str, ...]]:
+    """One row for each margin that a certificate states; none of one of an earlier version."""
+    told = certificate.observations
+    for key, words in MARGINS.items():
+        if key in told:
+            yield words.name, f"{told[key]:.3g}", words.unit, words.usual, words.meaning
 
 
 def _certificate(gains: GainSet) -> Certificate:

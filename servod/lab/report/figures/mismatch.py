@@ -46,8 +46,8 @@ def where(maps: Sequence[MismatchMap], units: Units) -> Figure:
         PlotAxis("share of the error in %", span=(0.0, min(100.0, 1.15 * most))), PlotAxis("", names=names), (bars,)
     )
     caption = (
-        "Left: how much of the error becomes a plain curve when it is drawn over a coordinate, beyond what chance "
-        "would make; the shares overlap, as velocity and direction do. Right: the error over the coordinate that "
+        "First: how much of the error becomes a plain curve when it is drawn over a coordinate, beyond what chance "
+        "would make; the shares overlap, as velocity and direction do. Second: the error over the coordinate that "
         "orders most of it, with twice its standard error."
     )
     return Figure("where", "Where the model is off", (left, map_panel(maps[0], units)), 2, caption, 1.5)

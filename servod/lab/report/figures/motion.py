@@ -111,10 +111,17 @@ def _column(motion: PlottedMotion, error_span: tuple[float, float] | None = None
 
 
 def errors(
-    motions: Sequence[PlottedMotion], name: str = "errors", title: str = "Tracking errors", after_s: float = SETTLE_S
+    motions: Sequence[PlottedMotion],
+    name: str = "errors",
+    title: str = "Tracking errors",
+    after_s: float = SETTLE_S,
+    scores: Mapping[str, float] | None = None,
 ) -> Figure:
-    """All errors in one panel, and below it those under a tenth of the worst on a scale of their own."""
-    scores = {m.label: m.rms_mrad(after_s) for m in motions}
+    """All errors in one panel, and below it those under a tenth of the worst on a scale of their own.
+
+    `scores` are the RMS errors in mrad that a report has of these motions already; the caption shows the same.
+    """
+    scores = dict(scores or {m.label: m.rms_mrad(after_s) for m in motions})
     colours = {m.label: COLOURS[i % len(COLOURS)] for i, m in enumerate(motions)}
     fine = [m for m in motions if scores[m.label] < 0.1 * max(scores.values())]
     panels = [_errors(shown, scores, colours, after_s) for shown in (motions, fine) if shown]
@@ -132,14 +139,21 @@ def _errors(
 
 
 def before_after(
-    before: PlottedMotion, after: PlottedMotion, name: str = "before_after", title: str = "Before and after"
+    before: PlottedMotion,
+    after: PlottedMotion,
+    name: str = "before_after",
+    title: str = "Before and after",
+    caption: str = "",
 ) -> Figure:
-    """The same motion before and after a change: both errors, and both torques."""
+    """The same motion before and after a change: both errors, and both torques.
+
+    The caption has the RMS errors of the whole motion, unless a report judges it by other figures and says so.
+    """
     t = PlotAxis("time in s")
     shown = ((before, Colour.GREY), (after, Colour.BLUE))
     error = [curve(m.label, m.time_s, m.error_mrad, colour, width=1.1) for m, colour in shown]
     torque = [curve(m.label, m.time_s, MILLI * m.torque_nm, colour, width=1.1) for m, colour in shown]
-    caption = f"RMS error {before.rms_mrad(0.0):.4g} mrad before, {after.rms_mrad(0.0):.4g} mrad after."
+    caption = caption or f"RMS error {before.rms_mrad(0.0):.4g} mrad before, {after.rms_mrad(0.0):.4g} mrad after."
     panels = (
         PlotPanel(t, PlotAxis("error in mrad"), tuple(error)),
         PlotPanel(t, PlotAxis("torque in mN·m"), tuple(torque)),
@@ -273,7 +287,7 @@ def recorded_run(run: RecordedRun, name: str = "recording") -> Figure:
     panels.append(PlotPanel(t, PlotAxis("torque in N·m" if rotary else "force in N"), torques))
     panels += [_states(run, t, *shown) for shown in run.states if shown[0] in run.columns]
     faults = _faults(run, t)
-    return Figure(name, run.title, tuple(panels + faults), caption=_caption(run, bool(faults)), row_height=0.75)
+    return Figure(name, run.title, tuple(panels + faults), caption=describe_run(run), row_height=0.75)
 
 
 def _states(run: RecordedRun, t: PlotAxis, column: str, title: str, names: StateNames) -> PlotPanel:
@@ -314,11 +328,19 @@ def _faults(run: RecordedRun, t: PlotAxis) -> list[PlotPanel]:
     return [PlotPanel(t, PlotAxis("", span=(-0.5, len(names) - 0.5), names=names), tuple(curves), "faults present")]
 
 
-def _caption(run: RecordedRun, faults: bool) -> str:
-    rows = len(run.time_s)
-    said = [f"{rows} cycles from {run.time_s[0]:.3f} to {run.time_s[-1]:.3f} s" if rows else "no cycles"]
-    if "missed" in run.columns and rows:
+def describe_run(run: RecordedRun) -> str:
+    """How it went in one sentence: length, error, missed periods, faults with the time at which each came."""
+    rows, unit = len(run.time_s), "rad" if "position_rad" in run.columns else "m"
+    if not rows:
+        return "No cycles."
+    said = [f"{rows} cycles from {run.time_s[0]:.3f} to {run.time_s[-1]:.3f} s"]
+    if f"reference_{unit}" in run.columns:
+        error = MILLI * (array(run.columns[f"reference_{unit}"]) - array(run.columns[f"position_{unit}"]))
+        said.append(f"RMS error {np.sqrt(np.mean(error**2)):.4g} m{unit}, largest {np.abs(error).max():.4g} m{unit}")
+    if "missed" in run.columns:
         said.append(f"missed periods: {int(run.columns['missed'][-1]) - int(run.columns['missed'][0])}")
-    if "faults" in run.columns and not faults:
-        said.append("no fault present")
-    return ", ".join(said) + "."
+    if "faults" in run.columns:
+        bits = np.asarray(run.columns["faults"], dtype=np.int64)
+        at = {code.name: run.time_s[np.argmax((bits >> code) & 1)] for code in FaultCode if np.any(bits & (1 << code))}
+        said.append(", ".join(f"{name} at {t:.3f} s" for name, t in at.items()) or "no fault present")
+    return "; ".join(said) + "."

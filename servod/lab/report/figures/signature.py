@@ -19,7 +19,7 @@ def signature_figure(found: Signature, effect: str, units: Units) -> Figure:
     panels = (_over_coordinate(found, units), _over_time(found, units))
     caption = (
         "Points: the error of the model without this effect, with twice its standard error. Line: what the fitted "
-        "effect makes of it. Right: the stretch of time in which the effect acts most."
+        "effect makes of it. Second panel: the stretch of time in which the effect acts most."
     )
     return Figure(f"finding_{effect}_{found.number}", f"The signature of {effect}", panels, 2, caption, 1.35)
 

@@ -34,9 +34,10 @@ from servod.lab.diagnose.result import Diagnosis, DiagnosisVerdict
 from servod.lab.recordings import load_recording
 from servod.lab.recordings.recording import Rows, moving, rows_of
 from servod.lab.report.diagnosis import MODEL, DiagnosisReport, write_files
-from servod.lab.report.figure import Colour, Curve, Figure, PlotAxis, PlotPanel, curve
+from servod.lab.report.figure import Colour, Curve, Figure, PageTable, PlotAxis, PlotPanel, curve
 from servod.lab.report.figures import mismatch
 from servod.lab.report.figures.signature import signature_figure
+from servod.lab.report.page import Origin, Verdict
 from servod.lab.synthesize.deployed import Wishes
 from servod.lab.synthesize.gain_set import DesignOptions, synthesize
 from servod.lab.synthesize.infeasible import Infeasible
@@ -345,6 +346,9 @@ def believed_and_true(plant: AxisModel, effect: str) -> tuple[AxisModel, AxisMod
 # last step of `walk`; the diagnosis has its own page beside it.
 
 
+#: Share of the cost that must come back.
+LEAST_RECOVERED = 0.8
+
 #: Runs as people read them, with their colours.
 RUNS = {
     "before": ("as believed", Colour.BLACK),
@@ -355,13 +359,19 @@ RUNS = {
 
 def write_recovery_page(found: Retrofit, out: Path) -> Path:
     """Write `report.html` and pictures into `out`. Raises BadInput when that is not possible."""
-    report = DiagnosisReport(out, "servod demo: an axis that conceals something")
-    rms, page = found.rms_mrad, report.page
-    back = min(100.0 * found.recovered_share, 100.0)
-    page.lead(
+    rms, back = found.rms_mrad, min(100.0 * found.recovered_share, 100.0)
+    verdict = Verdict(
         f"{back:.0f} % of what the concealed effect cost is back: {rms['before']:.3f} mrad "
-        f"RMS on trajectory (19) as believed, {rms['concealed']:.3f} with it, {rms['after']:.3f} once it is known."
+        f"RMS on trajectory (19) as believed, {rms['concealed']:.3f} with it, {rms['after']:.3f} once it is known.",
+        found.recovered_share >= LEAST_RECOVERED,
     )
+    files = {"believed model": out / "believed.yaml", "extended model": out / "extended.yaml"}
+    files |= {"gains before": out / "gains_before.yaml", "gains after": out / "gains_after.yaml"}
+    recorded = {"recordings": sorted((out / "recordings").glob("*.mcap"))}
+    report = DiagnosisReport(
+        out, "servod demo: an axis that conceals something", verdict, Origin({**files, **recorded})
+    )
+    page = report.page
     page.points(story(found))
     report.figure(_errors(found))
     _figures(report, found)
@@ -427,5 +437,6 @@ def _figures(report: DiagnosisReport, found: Retrofit) -> None:
         for key, value in done["before"].items()
         if key in done["promised"] and isinstance(value, float)
     ]  # fmt: skip
-    report.page.sentence("The validation motion, RMS error in mrad: what the certificates promised, and what came.")
-    report.page.table(("part", "promised at first", "came", "promised anew", "came then"), rows)
+    title = "The validation motion, RMS error in mrad: what the certificates promised, and what came"
+    header = ("part", "promised at first", "came", "promised again", "came then")
+    report.page.table(PageTable(title, header, tuple(rows)))

@@ -18,7 +18,7 @@ from servod.runtime.fieldbus.cia import NmtCommand
 from servod.runtime.fieldbus.devices import NodePlan, PresetSetup, SdoAccess
 from servod.runtime.fieldbus.master.monitor import NodeEvent
 from servod.runtime.fieldbus.master.network import BusNetwork
-from servod.runtime.fieldbus.master.node import Node, send_nmt
+from servod.runtime.fieldbus.master.node import Node, NodeIdentity, send_nmt
 from servod.runtime.fieldbus.master.planned import checked_load
 
 
@@ -116,6 +116,10 @@ class Master:
             while node.watch.events:
                 found.append(node.watch.events.popleft())
         return sorted(found, key=lambda event: event.time_ns)
+
+    def identity(self, node_id: int) -> NodeIdentity | None:
+        """What a node said of itself (0x1018) when it was brought up; None before."""
+        return self._nodes[node_id].identity
 
     def sdo(self, node_id: int) -> SdoAccess:
         """SDO access to one of the two nodes."""

@@ -281,6 +281,7 @@ class Node:
         self.dictionary = dictionary_for(self.section.driver, self.section.eds, self.node_id)
         self.sdo = NodeSdo(network, self.node_id, self.dictionary.objects)
         self.watch = NodeWatch(network, self.node_id, _EMCY_FAULT[kind], config.heartbeat.node_timeout_ms)
+        self.identity: NodeIdentity | None = None
 
     def report_dictionary(self) -> list[str]:
         """What was mended in the EDS."""
@@ -294,9 +295,13 @@ class Node:
         except NoAnswer as error:
             raise Unreachable(self._why_silent(str(error))) from None
         check_identity(self.node_id, found, self.section.identity, PROFILE[self._kind])
+        self.identity = found
+        numbers = {"product": found.product_code, "revision": found.revision}
+        words = (f"{name} {'absent' if value is None else f'0x{value:X}'}" for name, value in numbers.items())
+        serial = "absent" if found.serial is None else found.serial
         return [
-            f"node {self.node_id}: profile {found.profile}, vendor 0x{found.vendor_id:08X}, "
-            f"product 0x{found.product_code:X}, revision 0x{found.revision:X}, serial {found.serial}"
+            f"node {self.node_id}: profile {found.profile}, vendor 0x{found.vendor_id:08X}, {', '.join(words)}, "
+            f"serial {serial}"
         ]
 
     def _ask_for_a_twin(self) -> None:
