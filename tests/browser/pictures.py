@@ -36,7 +36,8 @@ _DESK_PX, _PHONE_PX, _HIGH_PX, _GAP_PX = 980, 390, 1040, 24
 _COLUMNS, _COLOURS = 100, 64
 _MARGIN_COLOUR = "#c8ccd2"
 _TERMINAL = """<!doctype html><meta charset="utf-8"><style>body {{ margin: 0; background: #14171b; }}
-pre {{ display: inline-block; margin: 0; padding: 14px 18px; background: #14171b; color: #e6e9ec;
+pre {{ display: inline-block; width: 100ch; white-space: pre-wrap; word-break: break-all;
+margin: 0; padding: 14px 18px; background: #14171b; color: #e6e9ec;
 font: 14px/1.165 "DejaVu Sans Mono", monospace; }}</style><pre><b>$ {command}</b>
 {code}</pre>"""
 #: What is typed in each picture of a terminal; the folder has the checkout's gains beside it.
@@ -125,7 +126,7 @@ def report_picture(browser: Browser, file: Path) -> Image.Image:
 
 
 def terminal_picture(browser: Browser, html: str) -> Image.Image:
-    """A terminal as wide as its lines."""
+    """A terminal of its columns, which breaks longer lines as one does."""
     with _page(browser, 1600, "dark") as page:
         page.set_content(html)
         return Image.open(io.BytesIO(page.locator("pre").screenshot()))
