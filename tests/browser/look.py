@@ -227,10 +227,10 @@ def _paper(page: Page, look: Look, out: Path) -> Look:
     seen = page.evaluate(_MEASURE)
     for part in seen["figures"]:
         held = part["inside"] in ("avoid", "avoid-page")
-        low = part["height"] < PAPER["height"] / 2
+        low = part["kind"] == "figure" and part["height"] < PAPER["height"] / 2
         if not held and (part["kind"] in ("row", "panel") or low):
             look.found.append(f"paper may cut it: {part['kind']} {part['where']}")
-        if (held or part["kind"] in ("row", "panel")) and part["height"] > PAPER["height"]:
+        if part["kind"] in ("row", "panel") and part["height"] > PAPER["height"]:
             look.found.append(f"higher than paper: {part['kind']} {part['where']}, {part['height']:.0f} px")
     look.found = list(dict.fromkeys(look.found))
     page.pdf(path=out / f"{look.page.replace('/', '_')}.pdf", format="A4", print_background=True)
@@ -272,7 +272,7 @@ _BAD = (
         "dark scheme, light page",
         "error: not caught",
         "asks https:",
-        "paper may cut it: table",
+        "paper may cut it: row",
         "only in a caption: 0.126",
     ),
 )
