@@ -16,6 +16,9 @@ import source
 INDEX = readme.DOCS / "index.md"
 #: Links of a text, with what follows the path; not those within code.
 LINK = re.compile(r"\]\((?!mailto:)([^)\s]+)\)")
+PICTURE = re.compile(r"!\[([^\]]*)\]\(([^)\s]+\.png)\)")
+#: Octets of a picture, and of all.
+MOST_BYTES, MOST_OF_ALL = 150_000, 1_500_000
 CODE = re.compile(r"^```.*?^```$|`[^`\n]*`", re.DOTALL | re.MULTILINE)
 TOCTREE = re.compile(r"^```\{toctree\}\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 
@@ -59,6 +62,18 @@ def test_every_link_leads_to_a_heading() -> None:
             if "://" not in link and anchor and anchor not in anchors(target.read_text()):
                 wrong.append(f"{page.relative_to(source.ROOT)}: {link}")
     assert wrong == []
+
+
+def test_every_picture_is_small_and_shown_with_words_for_those_who_do_not_see_it() -> None:
+    shown = {}
+    for page in readme.texts():
+        for words, path in PICTURE.findall(page.read_text()):
+            shown[(page.parent / path).resolve()] = words
+            assert len(words) > 15, f"{page.relative_to(source.ROOT)}: {path} says {words!r}"
+    sizes = {file.resolve(): file.stat().st_size for file in (readme.DOCS / "pictures").iterdir()}
+    assert sizes.keys() == shown.keys()
+    assert [file.name for file, size in sizes.items() if size > MOST_BYTES] == []
+    assert sum(sizes.values()) <= MOST_OF_ALL
 
 
 def test_every_address_of_the_network_is_written_as_one() -> None:

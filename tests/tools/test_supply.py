@@ -19,10 +19,11 @@ from packaging.requirements import Requirement
 #: Each lock and the extras of pyproject.toml in it.
 EXTRAS = {"deploy": (), "lab": ("lab",), "dev": ("lab", "dev"), "fuzz": ("lab", "dev", "fuzz")}
 #: Not on the way from one of these to the next.
-BESIDE = {"docs": ("docs",)}
+BESIDE = {"docs": ("docs",), "browser": ("lab", "browser")}
 LOCKS = (*EXTRAS, *BESIDE, "build")
 #: Which can be installed upon another.
 UPON = (*itertools.pairwise(EXTRAS), ("build", "dev"), ("deploy", "docs"), ("docs", "dev"), ("build", "docs"))
+UPON += (("lab", "browser"), ("browser", "dev"), ("build", "browser"))
 COMMANDS = ("demo", "test")
 
 
@@ -71,10 +72,10 @@ def test_what_two_locks_share_has_one_version(smaller: str, larger: str) -> None
     """One can be installed upon the other: ./demo, then ./test, then the fuzzing."""
     lesser, greater = versions(smaller), versions(larger)
     assert {p: v for p, v in lesser.items() if p in greater and greater[p] != v} == {}
-    assert smaller in ("build", "docs") or lesser.keys() <= greater.keys()
+    assert smaller in ("build", *BESIDE) or lesser.keys() <= greater.keys()
 
 
-@pytest.mark.parametrize("name", ["deploy", "lab", "dev", "docs", "build"])
+@pytest.mark.parametrize("name", ["deploy", "lab", "dev", *BESIDE, "build"])
 def test_every_machine_gets_the_same_versions(name: str) -> None:
     every = {str(entry).partition(";")[0] for entry in locked(name)}
     for python, machine in itertools.product(("3.11", "3.12", "3.13", "3.14"), ("x86_64", "aarch64")):

@@ -1,0 +1,1 @@
+"""Every report of servoctl, looked at in a real browser: `scripts/browser`."""
