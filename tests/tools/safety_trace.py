@@ -40,11 +40,17 @@ def requirements() -> list[Requirement]:
     return [Requirement(**one) for one in yaml.safe_load((ROOT / "tests/tools/safety_trace.yaml").read_text())]
 
 
+@cache
+def _scenarios() -> dict[str, object]:
+    return dict(shipped_scenarios())
+
+
+@cache
 def scenarios_of(evidence: str) -> list[str]:
     """The scenarios that an entry `scenario NAME` or `scenario GROUP/*` names."""
     name = evidence.removeprefix("scenario ")
     group = name.removesuffix("*")
-    return [s for s in shipped_scenarios() if s == name or (group != name and s.startswith(group))]
+    return [s for s in _scenarios() if s == name or (group != name and s.startswith(group))]
 
 
 def missing(evidence: str) -> bool:
@@ -61,7 +67,7 @@ def missing(evidence: str) -> bool:
 def unused_scenarios() -> list[str]:
     """Scenarios of the campaign that no requirement names."""
     used = {s for one in requirements() for evidence in one.shown_by for s in scenarios_of(evidence)}
-    return sorted(set(shipped_scenarios()) - used)
+    return sorted(set(_scenarios()) - used)
 
 
 def requirement_table() -> str:
