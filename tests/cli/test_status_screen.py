@@ -51,7 +51,7 @@ def document() -> dict[str, Any]:
                 "remedy": FAULT.remedy,
             }
         ],
-        "controller": {"serial": 1, "name": "trial", "law": "pd"},
+        "controller": {"serial": 1, "name": "trial", "law": "pd", "note": ""},
         "timing": {"window_s": 10.0, "cycle": 12345, "missed": 3, "lag": lag, "tick": lag, "torque": lag},
         "bus": {
             "interface": "socketcan",
@@ -129,6 +129,12 @@ def test_a_node_that_is_silent_is_grey_and_says_since_when() -> None:
     status = document()
     status["nodes"][0] |= {"state": "silent (was OPERATIONAL)"} | STALE
     assert "silent (was OPERATIONAL), stale 3.2 s" in shown(status)
+
+
+def test_a_set_that_is_not_the_one_active_last_says_why() -> None:
+    status = document()
+    status["controller"]["note"] = "active.json is damaged, its copy was taken"
+    assert "gain set active.json is damaged, its copy was taken" in shown(status)
 
 
 def test_a_watched_status_grows_old_while_the_daemon_is_silent() -> None:

@@ -41,7 +41,7 @@ def _position(client: ControlClient) -> float:
 def test_status_after_start_is_disabled_and_healthy(client: ControlClient) -> None:
     status = client.call("status")
     assert (status["axis"]["state"], status["drive"]["state"]) == ("DISABLED", "SWITCH_ON_DISABLED")
-    assert status["controller"] == {"serial": 0, "name": "demo_pd", "law": "pd"}
+    assert status["controller"] == {"serial": 0, "name": "demo_pd", "law": "pd", "note": ""}
     assert 0.3 < status["bus"]["load"] < 0.5
     wait_for(lambda: {n["state"] for n in client.call("status")["nodes"]} == {"OPERATIONAL"})
     assert {g["name"] for g in status["grants"]} >= {"memory_lock", "sched_fifo", "cpu_affinity"}
