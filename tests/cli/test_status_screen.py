@@ -66,7 +66,7 @@ def document() -> dict[str, Any]:
             {"name": "memory_lock", "granted": True, "reason": ""},
             {"name": "sched_fifo", "granted": False, "reason": "priority 80: Operation not permitted"},
         ],
-        "recorder": {"recording": False, "path": "", "records": 0, "failure": ""},
+        "recorder": {"recording": False, "path": "", "records": 0, "failure": "", "removed": 0},
     }
 
 
