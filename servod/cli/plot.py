@@ -113,7 +113,7 @@ def draw(
     page.figure(figure)
     if happened:
         page.heading("What happened")
-        page.table(PageTable("Events", ("time / s", "kind", "what"), tuple(happened)))
+        page.table(PageTable("Events, as the supervisor saw them", ("told at / s", "kind", "what"), tuple(happened)))
     page.write(file)
 
 
