@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints, is_typeddict
 
 import command_line
@@ -121,7 +122,9 @@ def test_every_verb_with_json_says_what_it_prints() -> None:
 
 def fields(kind: Any) -> Iterator[documents.Place]:
     """The places of all values of a typed document."""
-    for name, inner in get_type_hints(kind).items():
+    for name, hint in get_type_hints(kind).items():
+        parts = get_args(hint) if isinstance(hint, UnionType) else ()  # a document, or None
+        inner = next(filter(is_typeddict, parts), hint)
         if is_typeddict(inner):
             yield from ((name, *place) for place in fields(inner))
         elif get_origin(inner) is list and is_typeddict(get_args(inner)[0]):

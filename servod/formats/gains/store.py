@@ -117,7 +117,8 @@ class GainStore:
     what was wrong with the active set's file when it was last read: empty, or a sentence.
     """
 
-    def __init__(self, directory: Path, max_versions: int = 100) -> None:
+    def __init__(self, directory: Path, max_versions: int = 100, mends: bool = True) -> None:
+        """With `mends` False, what says which set is active stays as it is until `mend`."""
         self.directory, self.damage, self._max_versions = directory, "", max_versions
         self._sets, self._active_file = directory / "sets", directory / "active.json"
         self._active_copy = directory / "active.copy.json"
@@ -127,6 +128,8 @@ class GainStore:
             make_folder(self._sets)
             with self._locked():
                 self._sweep()
+            if mends:
+                self.mend()
         except OSError as error:
             raise unwritable(f"gain store {directory}", error) from None
 
@@ -138,16 +141,20 @@ class GainStore:
             yield
 
     def _sweep(self) -> None:
-        """Remove what a kill left half-written, end a history line that it cut, mend what says which set is active."""
+        """Remove what a kill left half-written, end a history line that it cut."""
         for leftover in self.directory.rglob("*.tmp"):
             leftover.unlink()
         if self._history_file.exists() and not self._history_file.read_bytes().endswith(b"\n"):
             with self._history_file.open("ab") as file:
                 file.write(b"\n")
-        with contextlib.suppress(BadInput, OSError):  # nothing to mend it with, or a disk that takes nothing: later
+        with contextlib.suppress(OSError):  # a disk that takes nothing: later
             lines = self._history_lines()
             if len(lines) > 2 * _KEPT_LINES:
                 write_atomically(self._history_file, "\n".join(lines[-_KEPT_LINES:]) + "\n")
+
+    def mend(self) -> None:
+        """Write what says which set is active anew where it is damaged, has no copy, or is of an earlier version."""
+        with self._locked(), contextlib.suppress(BadInput, OSError):  # nothing to mend it with, or a full disk: later
             state = self._active()
             if state is not None and not (self._active_copy.exists() and state.sha256 and not self.damage):
                 self._write_active(state)

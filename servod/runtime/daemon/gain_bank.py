@@ -35,15 +35,17 @@ Fits = Callable[[GainSet, AxisConfig], None]
 class GainBank:
     """The sets that ran since the daemon's start, by serial number."""
 
-    def __init__(self, config: AxisConfig, fits: Fits = require_fit) -> None:
+    def __init__(self, config: AxisConfig, fits: Fits = require_fit, begins: bool = True) -> None:
         """Open the store and choose the first set: the one active last, or gains.initial. Raises BadInput.
 
         A set that this axis may not run any more, whatever the reason, gives way to gains.initial: the configuration
         or the version of servod may have changed since it was activated, or its file on the disk, and the axis shall
-        start all the same. `note` says so, until somebody activates a set.
+        start all the same. `note` says so, until somebody activates a set. Unless it `begins`, the store's active set
+        stays as it is until `begin`.
         """
         self._config, self._fits, self._note = config, fits, ""
-        self._store = GainStore(config.gains.directory, config.gains.max_versions)
+        self._why_first: str | None = None  # the first set is not the store's active one yet
+        self._store = GainStore(config.gains.directory, config.gains.max_versions, mends=begins)
         try:
             initial = self._store.load_file(config.gains.initial)
             active = self._active_or(initial)
@@ -57,6 +59,17 @@ class GainBank:
         self._last_serial = self._running = 0
         self._kept = active  # what the store has as the active set, as far as it could be written
         self._tried: StoredSet | None = None
+        if begins:
+            self.begin()
+
+    def begin(self) -> None:
+        """Make the first set the store's active one: the axis runs with it. Raises BadInput."""
+        try:
+            self._store.mend()
+            if self._why_first is not None:
+                self._store.activate(self._kept.name, self._kept.version, self._why_first)
+        except OSError as error:
+            raise unwritable(f"gain store {self._config.gains.directory}", error) from None
 
     @property
     def on_trial(self) -> bool:
@@ -135,7 +148,7 @@ class GainBank:
         return _row(stored)
 
     def _active_or(self, initial: StoredSet) -> StoredSet:
-        """The stored active set where the axis may run it; else `initial`, which is active from then on."""
+        """The stored active set where the axis may run it; else `initial`, which is active from `begin` on."""
         wanted, remedy = (
             "the set that was active",
             "`servoctl gains list` and `servoctl gains activate` the one that is meant",
@@ -143,7 +156,8 @@ class GainBank:
         try:
             last = self._store.active_reference()
             if last is None:
-                return self._store.activate(initial.name, initial.version)
+                self._why_first = ""
+                return initial
             wanted = f"{last.name} version {last.version}"
             remedy = (
                 f"Set back what was changed and `servoctl gains activate {last.name}`, or make a set anew: "
@@ -155,7 +169,8 @@ class GainBank:
             place = f"{initial.name} version {initial.version} (gains.initial) runs in place of {wanted}"
             self._note = f"{error}; {place}"
             log.warning("%s. %s", self._note, remedy)
-            return self._store.activate(initial.name, initial.version, f"in place of {wanted}: {error}")
+            self._why_first = f"in place of {wanted}: {error}"
+            return initial
         self._note = self._store.damage
         return active
 

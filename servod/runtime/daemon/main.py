@@ -76,7 +76,7 @@ def run(path: Path, on_ready: Callable[[Supervisor], None]) -> int:
             log.error("fault %s: %s", found.first.code.name, found.first.detail)
         _leave_core_to_loop(config.cycle.cpu)
         sys.setswitchinterval(_SWITCH_S)
-        bank = GainBank(config)
+        bank = GainBank(config, begins=False)
         recorder = _recorder(config, path, bank)
         stack.callback(recorder.close)
         master = Master(config, open_bus(config.bus, _master_ids(config)), WallClock(), threaded=False)
@@ -88,6 +88,7 @@ def run(path: Path, on_ready: Callable[[Supervisor], None]) -> int:
             supervisor = _supervise(config, Nodes(master, plans), bank, recorder, undo)
             if found is not None:
                 supervisor.tell_earlier(found)
+            bank.begin()  # a start that failed leaves the active set as it was
             on_ready(supervisor)
             undo.pop_all()
         return supervisor.run()

@@ -154,6 +154,22 @@ def test_without_either_the_initial_set_runs_and_says_what_to_do(
     assert GainBank(config).describe(0)["note"] == ""  # it is the active one from then on
 
 
+def test_a_start_that_fails_leaves_the_active_set_as_it_was(config: AxisConfig) -> None:
+    """Nothing but `begin` says which set is active, be the present one unfit or its copy gone."""
+    stored = _used(config, good.PD).newest
+    stored.path.write_text(good.PD.replace("2.5", "2.6"))
+    (config.gains.directory / "active.copy.json").unlink()
+
+    def kept() -> dict[str, bytes]:
+        return {file.name: file.read_bytes() for file in config.gains.directory.glob("*.json*")}
+
+    before = kept()
+    bank = GainBank(config, begins=False)
+    assert "runs in place of bench_pd" in bank.describe(0)["note"] and kept() == before
+    bank.begin()
+    assert GainStore(config.gains.directory).active() == bank.newest
+
+
 def test_a_store_of_an_earlier_version_goes_on(config: AxisConfig) -> None:
     """It had sets without a seal, of which the history has the hash, and an active.json without one."""
     _used(config, good.PD)
