@@ -110,6 +110,10 @@ def sealed_text(text: str, gains: GainSet) -> str:
     return sealed.to_yaml()
 
 
+#: A file that was changed is refused by `gains load`, too.
+_INSTEAD = "`servoctl gains activate` another version, or make the set anew (`servoctl synthesize`, then `verify`)"
+
+
 class GainStore:
     """A directory of gain sets. Raises BadInput when the directory cannot be used or a set is unknown or bad.
 
@@ -224,7 +228,7 @@ class GainStore:
             text = read_text(path)
             gains = parse_gains(text, str(path))
             if gains.name != name:
-                raise BadInput(f"{path}: name", gains.name, f"{name}, under which it was stored; load the set anew")
+                raise BadInput(f"{path}: name", gains.name, f"{name}, under which it was stored; {_INSTEAD}")
             stored = StoredSet(name, version, hashlib.sha256(text.encode()).hexdigest(), path, gains, text)
             self._require_as_stored(stored)
             self._parsed[path] = touched, stored
@@ -243,7 +247,7 @@ class GainStore:
             if any((one.action, one.sha256) == (Action.LOAD, found.sha256) for one in self.history()):
                 return
             problem = "no seal, and no hash of it in the history: it is not what was stored"
-        raise BadInput(f"{found.path}: seal", problem, "the file as it was stored; `servoctl gains load` the set anew")
+        raise BadInput(f"{found.path}: seal", problem, f"the file as it was stored; {_INSTEAD}")
 
     def names(self) -> list[str]:
         """Names of all stored sets, in order."""

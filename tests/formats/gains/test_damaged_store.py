@@ -166,6 +166,7 @@ def test_a_start_that_fails_leaves_the_active_set_as_it_was(config: AxisConfig) 
     before = kept()
     bank = GainBank(config, begins=False)
     assert "runs in place of bench_pd" in bank.describe(0)["note"] and kept() == before
+    assert "gains load" not in bank.describe(0)["note"], "it would refuse this file, too"
     bank.begin()
     assert GainStore(config.gains.directory).active() == bank.newest
 
