@@ -89,6 +89,7 @@ def draw(
     said: Sequence[str] = (),
     made_from: Mapping[str, Path] | None = None,
     nodes: Sequence[Mapping[str, Any]] = (),
+    facts: Mapping[str, str] | None = None,
 ) -> None:
     """Write `run` as a page or as a picture. Raises BadInput.
 
@@ -107,7 +108,7 @@ def draw(
     from servod.lab.report.figure import PageTable
     from servod.lab.report.page import Origin, Page, Verdict
 
-    page = Page(run.title, Verdict(first), Origin(made_from or {}, nodes=nodes))
+    page = Page(run.title, Verdict(first), Origin(made_from or {}, nodes=nodes, facts=facts or {}))
     page.points(more)
     page.sentence("Drag over a part of a panel to see it closer, double-click to see all; all panels move together.")
     page.figure(figure)
@@ -118,15 +119,22 @@ def draw(
 
 
 def draw_cycles(
-    raw: bytes, title: str, file: Path, said: Sequence[str], nodes: Sequence[Mapping[str, Any]] = ()
+    raw: bytes,
+    title: str,
+    file: Path,
+    said: Sequence[str],
+    nodes: Sequence[Mapping[str, Any]] = (),
+    facts: Mapping[str, str] | None = None,
 ) -> None:
-    """Draw packed cycle records, under what was said of them; `nodes` are those of the daemon's status."""
+    """Draw packed cycle records, under what was said of them; `nodes` and `facts` are those of the page's origin."""
     from servod.formats.recording.mcap_reader import McapRecording
     from servod.formats.recording.record import FIELDS
 
     kinds = "".join(field.kind for field in FIELDS)
     names, units = tuple(field.name for field in FIELDS), tuple(field.unit for field in FIELDS)
-    draw(_of_cycles(McapRecording(names, kinds, units, bytearray(raw)), title), file, said=said, nodes=nodes)
+    draw(
+        _of_cycles(McapRecording(names, kinds, units, bytearray(raw)), title), file, said=said, nodes=nodes, facts=facts
+    )
 
 
 def _load(path: Path, map_file: Path | None) -> tuple[RecordedRun, list[tuple[str, str, str]], str]:

@@ -162,14 +162,14 @@ def _track(
     if as_json:
         print_json(result | {"figures": watched.document()})
         if draw is not None:
-            draw(bytes(watched.kept), _in_words(watched.document(), _DONE), watched.nodes)
+            draw(bytes(watched.kept), _in_words(watched.document(), _DONE), watched.nodes, watched.facts)
         return
     _suggest(watched.document(), plot)
     _show(watched, _DONE, draw, plot)
 
 
-#: Draws packed cycle records under what was said of them, with the nodes that moved.
-_Draw = Callable[[bytes, list[str], list[dict[str, Any]]], None]
+#: Draws packed cycle records under what was said of them, with the nodes that moved and further facts.
+_Draw = Callable[[bytes, list[str], list[dict[str, Any]], dict[str, str]], None]
 
 
 def _show(watched: _Watched, begins: str, draw: _Draw | None, plot: Path | None) -> None:
@@ -177,7 +177,7 @@ def _show(watched: _Watched, begins: str, draw: _Draw | None, plot: Path | None)
     said = _in_words(watched.document(), begins)
     print("\n".join(said))
     if draw is not None:
-        draw(bytes(watched.kept), said, watched.nodes)
+        draw(bytes(watched.kept), said, watched.nodes, watched.facts)
         print(f"drawn: {plot}")
 
 
@@ -196,7 +196,8 @@ def _drawing(plot: Path | None, motion: dict[str, Any], duration_s: float, wait:
     from servod.cli.plot import check_drawing, draw_cycles
 
     check_drawing("--plot", plot)
-    return lambda raw, said, nodes: draw_cycles(raw, f"servoctl track {motion['kind']}", plot, said, nodes)
+    title = f"servoctl track {motion['kind']}"
+    return lambda raw, said, nodes, facts: draw_cycles(raw, title, plot, said, nodes, facts)
 
 
 class _Watched:
@@ -210,6 +211,7 @@ class _Watched:
         self.tally: MotionTally = MotionTally(self._stream.count_rad)
         self.kept = bytearray()
         self.nodes: list[dict[str, Any]] = client.call("status")["nodes"] if keep else []
+        self.facts: dict[str, str] = _gain_set(client) if keep else {}
         self._keep = keep
 
     @property
@@ -234,6 +236,12 @@ class _Watched:
             active = bool(r.reference_active)
             cycle = MotionCycle(1e-9 * r.time_ns, active, r.reference_rad, r.position_rad, r.torque_nm, r.missed)
             self.tally.add(cycle)
+
+
+def _gain_set(client: ControlClient) -> dict[str, str]:
+    """The set that runs, as a fact of a page."""
+    row = next((row for row in client.call("gains_list")["gains"] if row["active"]), None)
+    return {"gain set": f"{row['name']} version {row['version']}, sha256 {row['sha256']}"} if row else {}
 
 
 def _suggest(figures: dict[str, Any] | None, plot: Path | None) -> None:
@@ -326,4 +334,6 @@ def _where(motion: dict[str, Any]) -> str:
 
 
 def _why(status: dict[str, Any]) -> str:
-    return " ".join(f"{f['code']}: {f['cause']}" for f in status["faults"]) or "it was stopped or disabled"
+    """The faults that end a motion; an old warning does not."""
+    ends = [f for f in status["faults"] if f["reaction"] not in ("NONE", "CLIP")]
+    return " ".join(f"{f['code']}: {f['cause']}" for f in ends) or "it was stopped or disabled"

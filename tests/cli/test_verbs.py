@@ -125,6 +125,8 @@ def test_a_motion_is_drawn_with_its_every_cycle(servoctl: Servoctl, tmp_path: Pa
     assert servoctl("track", "sine", *words, "--plot", str(page)).endswith(f"\ndrawn: {page}\n")
     text = page.read_text()
     assert "motion done: RMS error" in text and "state feedback" in text
+    (row,) = (one for one in servoctl.json("gains", "list")["gains"] if one["active"])
+    assert f"{row['name']} version {row['version']}, sha256 {row['sha256']}" in text
     kept = json.loads(re.findall(r"^const kept = (.*);$", text, re.MULTILINE)[0])
     time_s = np.frombuffer(base64.b64decode(kept["times"][0]), "<f8")
     reference = np.frombuffer(base64.b64decode(kept["curves"][0]["y"]), "<f4")

@@ -12,7 +12,7 @@ from servod.cli import scan
 from servod.cli.app import run
 from servod.cli.common import table_console
 from servod.cli.status import screen
-from servod.cli.track import _where
+from servod.cli.track import _where, _why
 from tests.cli.test_status_screen import document
 
 
@@ -82,3 +82,10 @@ def test_no_table_in_a_pipe_cuts_off_a_key(monkeypatch: pytest.MonkeyPatch, caps
     text = capsys.readouterr().out
     assert "…" not in text
     assert "limits.torque_rate_nm_per_s" in text and "limits.position_min_rad" in text
+
+
+def test_only_a_fault_that_stops_is_why_a_motion_ended() -> None:
+    warning = {"code": "DEADLINE_LATE", "reaction": "NONE", "cause": "Cycles started late."}
+    fault = {"code": "DRIVE_RESET", "reaction": "DISABLE", "cause": "A node was reset."}
+    assert _why({"faults": [warning]}) == "it was stopped or disabled"
+    assert _why({"faults": [warning, fault]}) == "DRIVE_RESET: A node was reset."
