@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import itertools
 import json
 import os
@@ -26,6 +25,7 @@ from servod.formats.recording.mcap_reader import read_recording
 from servod.lab.recordings.recording import moving, rows_of
 from servod.lab.tracking.metrics import score
 from servod.qualify.demo.axis import demo_config, gains_file, plant_file
+from tests.cli.test_plot import kept
 
 pytestmark = pytest.mark.serial
 
@@ -127,9 +127,7 @@ def test_a_motion_is_drawn_with_its_every_cycle(servoctl: Servoctl, tmp_path: Pa
     assert "motion done: RMS error" in text and "state feedback" in text
     (row,) = (one for one in servoctl.json("gains", "list")["gains"] if one["active"])
     assert f"{row['name']} version {row['version']}, sha256 {row['sha256']}" in text
-    kept = json.loads(re.findall(r"^const kept = (.*);$", text, re.MULTILINE)[0])
-    time_s = np.frombuffer(base64.b64decode(kept["times"][0]), "<f8")
-    reference = np.frombuffer(base64.b64decode(kept["curves"][0]["y"]), "<f4")
+    time_s, reference = kept(text)[0]
     assert time_s[-1] > 0.9 and np.median(np.diff(time_s)) == pytest.approx(1e-3, rel=0.05)
     assert np.ptp(reference) == pytest.approx(0.01, rel=2e-2)
     turns = np.flatnonzero(np.diff(np.sign(np.diff(reference))) != 0)
