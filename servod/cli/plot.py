@@ -31,7 +31,7 @@ PAGE, PICTURE = ".html", ".png"
 #: Columns of the daemon's recordings that are drawn.
 _DRAWN = frozenset({
     "position_rad", "reference_rad", "torque_nm", "torque_actual_nm", "torque_feedback_nm", "torque_friction_nm",
-    "torque_other_nm", "axis_state", "drive_state", "faults", "missed",
+    "torque_other_nm", "axis_state", "drive_state", "controller", "faults", "missed",
 })  # fmt: skip
 #: Events that the page lists.
 _MOST_EVENTS = 500

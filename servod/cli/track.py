@@ -256,7 +256,7 @@ def _in_words(figures: dict[str, Any] | None, begins: str) -> list[str]:
     """What people read."""
     if figures is None:
         return [f"{begins}: too short for figures"]
-    begin = f" from {figures['judged_from_s']:g} s on" if figures["judged_from_s"] else ""
+    begin = f" from {figures['judged_from_s']:g} s of the motion on" if figures["judged_from_s"] else ""
     return [
         f"{begins}: RMS error {figures['rms_error_mrad']:.4g} mrad, peak error {figures['max_error_mrad']:.4g} mrad"
         + begin,

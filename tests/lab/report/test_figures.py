@@ -22,7 +22,9 @@ from servod.lab.report.figures.loop import bode, certificate_tables, observation
 from servod.lab.report.figures.loop import measured_response as frequency_response
 from servod.lab.report.figures.motion import (
     PlottedMotion,
+    RecordedRun,
     before_after,
+    describe_run,
     disturbed_friction,
     errors,
     position_and_friction,
@@ -212,3 +214,18 @@ def test_other_laws_and_bare_sets_are_refused() -> None:
     for table in (lambda gains: list(certificate_tables(gains)), observations_table):
         with pytest.raises(BadInput, match="certificate"):
             table(TABLE1)
+
+
+def test_a_recording_is_judged_where_the_axis_was_enabled_and_for_each_gain_set() -> None:
+    """Disabled for two rows, then two under gain set 1 that are 1 mrad off and two under gain set 2 that are 3 mrad off."""
+    state = np.array([0, 0, 2, 2, 2, 2])
+    columns = {
+        "position_rad": np.array([5.0, 5.0, 0.001, 0.001, 0.003, 0.003]),
+        "reference_rad": np.zeros(6),
+        "axis_state": state,
+        "controller": np.array([1, 1, 1, 1, 2, 2]),
+    }
+    told = describe_run(RecordedRun("run", np.arange(6.0), columns))
+    assert "RMS error 1 mrad, largest 1 mrad under gain set 1 of this run" in told
+    assert "RMS error 3 mrad, largest 3 mrad under gain set 2 of this run" in told
+    assert "never enabled" in describe_run(RecordedRun("run", np.arange(6.0), columns | {"axis_state": 0 * state}))

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from servod.common.faults import FaultCode
 from servod.lab.report.figure import COLOURS, Array, Colour, Curve, Figure, PlotAxis, PlotPanel, Style, array, curve
 from servod.lab.simulate.simulate import ClosedLoopRun
+from servod.runtime.loop.axis import AxisState
 
 MILLI = 1e3
 #: Trajectory (19) is scored without its first second.
@@ -336,11 +337,29 @@ def describe_run(run: RecordedRun) -> str:
     said = [f"{rows} cycles from {run.time_s[0]:.3f} to {run.time_s[-1]:.3f} s"]
     if f"reference_{unit}" in run.columns:
         error = MILLI * (array(run.columns[f"reference_{unit}"]) - array(run.columns[f"position_{unit}"]))
-        said.append(f"RMS error {np.sqrt(np.mean(error**2)):.4g} m{unit}, largest {np.abs(error).max():.4g} m{unit}")
+        said += _following_errors(run, error, unit)
     if "missed" in run.columns:
         said.append(f"missed periods: {int(run.columns['missed'][-1]) - int(run.columns['missed'][0])}")
     if "faults" in run.columns:
         bits = np.asarray(run.columns["faults"], dtype=np.int64)
         at = {code.name: run.time_s[np.argmax((bits >> code) & 1)] for code in FaultCode if np.any(bits & (1 << code))}
-        said.append(", ".join(f"{name} at {t:.3f} s" for name, t in at.items()) or "no fault present")
+        first = sorted(at.items(), key=lambda item: item[1])
+        said.append(", ".join(f"{name} first at {t:.3f} s" for name, t in first) or "no fault present")
     return "; ".join(said) + "."
+
+
+def _following_errors(run: RecordedRun, error: Array, unit: str) -> list[str]:
+    """Following error while the axis was enabled, for each gain set that ran then; of another recording, of all."""
+    rows = np.ones(len(error), dtype=bool)
+    if "axis_state" in run.columns:
+        rows = np.asarray(run.columns["axis_state"]) == AxisState.ENABLED
+        if not rows.any():
+            return ["never enabled"]
+    serials = np.asarray(run.columns.get("controller", np.zeros(len(error))))
+    told = []
+    for serial in dict.fromkeys(serials[rows]):
+        of_set = error[rows & (serials == serial)]
+        name = f" under gain set {int(serial)} of this run" if len(set(serials[rows])) > 1 else ""
+        rms, largest = np.sqrt(np.mean(of_set**2)), np.abs(of_set).max()
+        told.append(f"RMS error {rms:.4g} m{unit}, largest {largest:.4g} m{unit}{name}")
+    return told
