@@ -217,7 +217,7 @@ def test_other_laws_and_bare_sets_are_refused() -> None:
 
 
 def test_a_recording_is_judged_where_the_axis_was_enabled_and_for_each_gain_set() -> None:
-    """Disabled for two rows, then two under gain set 1 that are 1 mrad off and two under gain set 2 that are 3 mrad off."""
+    """Disabled for two rows, then two 1 mrad off under gain set 1, and two 3 mrad off under gain set 2."""
     state = np.array([0, 0, 2, 2, 2, 2])
     columns = {
         "position_rad": np.array([5.0, 5.0, 0.001, 0.001, 0.003, 0.003]),
