@@ -42,7 +42,7 @@ def refused(folder, plant, config, settings) -> str:
         ("amplifier", {"torque_direction": -1}, "amplifier.torque_direction"),
         ("encoder", {"direction": -1}, "encoder.direction"),
         ("amplifier", {"position_direction": -1}, "amplifier.position_direction"),
-        ("amplifier", {"counts_per_turn": 2**17}, "8 times as far"),
+        ("amplifier", {"counts_per_turn": 2**17}, "the amplifier's sensor moved 8"),
         ("amplifier", {"gear_ratio": 2.0}, "encoder's sensor moved 2 times as far as the amplifier's"),
         ("amplifier", {"gear_ratio": 0.5}, "amplifier's sensor moved 2 times as far as the encoder's"),
         ("amplifier", {"counts_per_turn": 2**26}, "64 times as far"),

@@ -225,7 +225,10 @@ def test_a_recording_is_judged_where_the_axis_was_enabled_and_for_each_gain_set(
         "axis_state": state,
         "controller": np.array([1, 1, 1, 1, 2, 2]),
     }
-    told = describe_run(RecordedRun("run", np.arange(6.0), columns))
+    states = (("axis_state", "axis", ("DISABLED", "ENABLING", "ENABLED")),)
+    told = describe_run(RecordedRun("run", np.arange(6.0), columns, states=states))
     assert "RMS error 1 mrad, largest 1 mrad under gain set 1 of this run" in told
     assert "RMS error 3 mrad, largest 3 mrad under gain set 2 of this run" in told
-    assert "never enabled" in describe_run(RecordedRun("run", np.arange(6.0), columns | {"axis_state": 0 * state}))
+    assert "never enabled" in describe_run(
+        RecordedRun("run", np.arange(6.0), columns | {"axis_state": 0 * state}, states=states)
+    )

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from servod.common.faults import FaultCode
 from servod.lab.report.figure import COLOURS, Array, Colour, Curve, Figure, PlotAxis, PlotPanel, Style, array, curve
 from servod.lab.simulate.simulate import ClosedLoopRun
-from servod.runtime.loop.axis import AxisState
 
 MILLI = 1e3
 #: Trajectory (19) is scored without its first second.
@@ -351,8 +350,9 @@ def describe_run(run: RecordedRun) -> str:
 def _following_errors(run: RecordedRun, error: Array, unit: str) -> list[str]:
     """Following error while the axis was enabled, for each gain set that ran then; of another recording, of all."""
     rows = np.ones(len(error), dtype=bool)
-    if "axis_state" in run.columns:
-        rows = np.asarray(run.columns["axis_state"]) == AxisState.ENABLED
+    enabled = next((names.index("ENABLED") for column, _, names in run.states if column == "axis_state"), None)
+    if enabled is not None:
+        rows = np.asarray(run.columns["axis_state"]) == enabled
         if not rows.any():
             return ["never enabled"]
     serials = np.asarray(run.columns.get("controller", np.zeros(len(error))))
