@@ -173,7 +173,8 @@ def _look(words: bool, cell: str) -> str:
 
 def _is_text(cells: Sequence[str]) -> bool:
     """Whether a column is aligned as text: most of its cells are no numbers."""
-    return sum(_NUMBER.match(cell) is None for cell in cells) > len(cells) / 2
+    told = [cell for cell in cells if cell not in ("", "-", "–")]
+    return sum(_NUMBER.match(cell) is None for cell in told) > len(told) / 2
 
 
 def _running_head(title: str) -> str:

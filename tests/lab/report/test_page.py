@@ -18,7 +18,7 @@ from servod.formats.config import AmplifierConfig, Identity
 from servod.formats.gains.gain_set import CertificateCheck, GainSet, load_gains
 from servod.lab.report.figure import Colour, Figure, PageTable, PlotAxis, PlotPanel, curve
 from servod.lab.report.figures.loop import PASSED, certificate_tables, limit_used, observations_table
-from servod.lab.report.page import Origin, Page, Verdict, drives
+from servod.lab.report.page import Origin, Page, Verdict, _is_text, drives
 from servod.lab.verify.margins import DELAY, PHASE
 
 
@@ -153,3 +153,8 @@ def test_a_limit_is_used_up_from_either_side() -> None:
     assert limit_used(check("largest pole, corners", 0.99, 0.999)) == pytest.approx(0.1)
     assert limit_used(check("plants that fail", 1.0, 0.0)) == 1.0
     assert limit_used(check("plants that fail", 0.0, 0.0)) == 0.0
+
+
+def test_a_column_of_words_is_one_though_most_of_its_cells_are_empty() -> None:
+    """Else its words stay on one line, and push the table off the paper."""
+    assert _is_text(["-", "-", "-", "DRIVE_FAULT, COMMANDS_LOST"]) and not _is_text(["-", "-", "3.5"])
