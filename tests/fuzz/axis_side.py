@@ -86,10 +86,10 @@ def _play(world: SteppedWorld, data: bytes, ids: tuple[int, ...]) -> None:
     _listen(bus, clock, 3.0)  # beyond the stall time of any transfer
     for node in world.devices.nodes:
         assert -1e3 < world.truth().torque_nm < 1e3
-        if node.node_id > 127:
-            continue
         bus.send(NMT_ID, bytes((NmtCommand.RESET_COMMUNICATION, 0)))
         _listen(bus, clock, 0.1)
+        if node.node_id > 127:  # LSS may have taken its id away, from this reset on
+            continue
         bus.send(SDO_REQUEST_BASE + node.node_id, _SDO[0])
         answers = [f for f in _listen(bus, clock, 0.1) if f[0] == SDO_ANSWER_BASE + node.node_id]
         assert len(answers) == 1, f"node {node.node_id} answers no SDO any more"
