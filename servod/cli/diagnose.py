@@ -22,19 +22,31 @@ if TYPE_CHECKING:
 EXAMPLE = "servoctl diagnose --model model.yaml run1.csv.gz run2.csv.gz --out diagnosis"
 
 
+#: Share of a recording's rows that may stand in another: at rest two may begin alike.
+SAME_ROWS = 0.1
+
+
 def register(app: typer.Typer) -> None:
     """Add the verb to `app`."""
     app.command(name="diagnose", help=example("Find what physics a model leaves out.", EXAMPLE))(diagnose)
 
 
 def diagnose(
-    recordings: Annotated[list[Path], typer.Argument(metavar="REC...", help="CSV, CSV.gz, Parquet, MAT v5 or MCAP.")],
+    recordings: Annotated[
+        list[Path], typer.Argument(metavar="REC...", help="CSV, text, Parquet, MAT v5, npy, JSON or MCAP.")
+    ],
     model: Annotated[Path, typer.Option(help="Axis model (YAML) that the recordings are compared with.")],
     out: Annotated[Path, typer.Option(help="Folder for diagnosis.json, model.yaml and report.html.")],
-    map_file: Annotated[Path | None, typer.Option("--map", help="Renames and scales foreign columns (YAML).")] = None,
+    map_file: Annotated[
+        Path | None, typer.Option("--map", help="Names and units of foreign columns: YAML, or a shipped map.")
+    ] = None,
     from_s: Annotated[float | None, typer.Option(help="First time of the RECs to use, s.")] = None,
     to_s: Annotated[float | None, typer.Option(help="Time of the RECs to stop before, s.")] = None,
     time_limit: Annotated[float, typer.Option(help="Seconds after which the search ends with what it has.")] = 120.0,
+    hold_out: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="REC", help="A recording that judges the answer and is in no fit; repeat."),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Compare RECs with MODEL, name what is missing, write the extended model. Exit code 1: these data cannot tell."""
@@ -43,15 +55,20 @@ def diagnose(
     one_thread()
     from servod.formats.model.axis_model import load_axis_model
     from servod.lab.diagnose.engine import diagnose as run
+    from servod.lab.recordings import find_map
     from servod.lab.report.diagnosis import write_files
     from servod.lab.report.page import Origin
 
+    map_file = find_map(map_file) if map_file else None
     axis = load_axis_model(model)
     _need_own_folder(out, model)
     recorded = [one.between(from_s, to_s) for one in _load(recordings, map_file, axis, model)]
+    unseen = _load(hold_out or [], map_file, axis, model)
+    _need_unseen(unseen, recorded)
     need_folder("--out", out)
-    found = run(axis, recorded, time_limit, _quiet if as_json else _progress)
-    origin = Origin({"model": model, "recordings": recordings, "map": [map_file] if map_file else []})
+    found = run(axis, recorded, time_limit, _quiet if as_json else _progress, unseen)
+    sources: dict[str, Path | list[Path]] = {"model": model, "recordings": recordings, "held out": hold_out or []}
+    origin = Origin({**sources, "map": [map_file] if map_file else []})
     document = write_files(out, found, model.name, origin)
     if as_json:
         print_json(document)
@@ -87,6 +104,20 @@ def _load(paths: list[Path], map_file: Path | None, axis: AxisModel, model: Path
     return recorded
 
 
+def _need_unseen(unseen: list[Recording], seen: list[Recording]) -> None:
+    """See that no recording that is held out has rows of one that is fitted. Raises BadInput."""
+    for one in unseen:
+        own = _rows(one)
+        for other in seen:
+            if len(own & _rows(other)) > SAME_ROWS * len(own):
+                raise BadInput(f"--hold-out {one.path}", f"rows of {other.path}", "a recording that no fit sees")
+
+
+def _rows(recording: Recording) -> set[tuple[float, float]]:
+    """Its rows as pairs of time and position."""
+    return set(zip(recording.t_s.tolist(), recording.position.tolist(), strict=True))
+
+
 def _quiet(_line: str) -> None:
     """No progress beside a JSON document."""
 
@@ -108,7 +139,14 @@ def _print(found: Diagnosis, document: dict[str, Any], out: Path) -> None:
             print(f"    {name} = {value['value']:.5g} {value['unit']}  [{low:.5g}, {high:.5g}]")
         for other in finding["alternatives"]:
             print(f"    not told apart from {other['effect']}: {other['experiment']}")
+    for name, value in document.get("drive", {}).items():
+        low, high = value["interval"]
+        print(f"drive: {name} = {value['value']:.5g} {value['unit']}  [{low:.5g}, {high:.5g}]")
     for name, change in document["recalibrated"].items():
         print(f"recalibrated: {name} {change['from']:.5g} -> {change['to']:.5g} {change['unit']}")
+    for name, windows in document.get("held_out", {}).items():
+        for horizon, w in windows.items():
+            told = f"{w['before']:.3g} -> {w['after']:.3g} {w['unit']} (coasting {w['coasting']:.3g})"
+            print(f"held out: {name}: windows of {horizon} s: {told}")
     model = f", {out / 'model.yaml'}" if found.evidence else ""
     print(f"written: {out / 'diagnosis.json'}{model}, {out / 'report.html'}")

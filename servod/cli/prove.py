@@ -6,6 +6,7 @@ folders, the third opens the seal.
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import signal
 import sys
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from servod.cli.common import JsonOption, example, need_folder, one_thread, run_stage
+from servod.cli.groups import engines
 from servod.common.errors import BadInput
 from servod.common.files import BadFile
 
@@ -28,6 +30,7 @@ _HELP = example(
     "interrupted trial goes on where it was. Exit code 0: it was scored.",
     "servoctl prove --cases 24 --seed 7 --out out/prove",
     "servoctl prove --cases 120 --seed 8 --harder --out out/harder",
+    "servoctl prove --cases 60 --null 60 --seed 9 --engine mujoco --out out/mujoco",
 )
 
 
@@ -47,11 +50,17 @@ def register(app: typer.Typer) -> None:
 
 def prove(
     out: Annotated[Path, typer.Option(help="Folder of the trial: cases, sealed truth, answers, report.")],
-    cases: Annotated[int, typer.Option(min=1, max=10_000, help="How many cases.")] = 120,
+    cases: Annotated[
+        int | None, typer.Option(min=0, max=10_000, help="How many mixed cases; 120, or none beside --null alone.")
+    ] = None,
+    null: Annotated[int, typer.Option(min=0, max=10_000, help="So many more that conceal nothing.")] = 0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the trial; the same draws the same cases.")] = 1,
     harder: Annotated[
         bool, typer.Option("--harder", help="1 % of other effects, four times the noise, other forms in the plant.")
     ] = False,
+    engine: Annotated[
+        str, typer.Option(help="Who moves the axes: own, or mujoco (servod[sim]).", autocompletion=engines)
+    ] = "own",
     jobs: Annotated[int, typer.Option(min=1, max=64, help="Diagnoses at a time.")] = 2,
     time_limit: Annotated[float, typer.Option(min=1.0, max=1e5, help="Of each diagnosis, s.")] = 120.0,
     only: Annotated[
@@ -61,17 +70,30 @@ def prove(
 ) -> None:
     """Run the trial in OUT."""
     one_thread()
+    if only not in (Stage.DIAGNOSE, Stage.SCORE):
+        _need_own_folder(out)
     need_folder("--out", out, alone=True)
+    trial = _trial(cases, null, seed, harder, engine)
     match only:
         case None:
-            drawn = [f"--cases={cases}", f"--seed={seed}", *(["--harder"] if harder else [])]
+            drawn = [f"--cases={trial.cases}", f"--null={null}", f"--seed={seed}", f"--engine={engine}"]
+            drawn += ["--harder"] if harder else []
             _in_processes(out, drawn, [f"--jobs={jobs}", f"--time-limit={time_limit}"], as_json)
         case Stage.CONCEAL | Stage.CASES:
-            _conceal(out, cases, seed, harder, sealed=only is Stage.CONCEAL)
+            _conceal(out, trial, sealed=only is Stage.CONCEAL)
         case Stage.DIAGNOSE:
             _diagnose(out, jobs, time_limit)
         case Stage.SCORE:
             _score(out, as_json)
+
+
+def _need_own_folder(out: Path) -> None:
+    """See that nothing of other origin lies in `out`: a trial seals and overwrites what is there. Raises BadInput."""
+    from servod.qualify.blind.conceal import foreign_in
+
+    if foreign := foreign_in(out):
+        listed = ", ".join(foreign[:3]) + (f" and {len(foreign) - 3} more" if len(foreign) > 3 else "")
+        raise BadInput(f"--out {out}", listed, "an empty folder, or one of an earlier `servoctl prove`")
 
 
 def _in_processes(out: Path, drawn: list[str], diagnosed: list[str], as_json: bool) -> None:
@@ -88,29 +110,43 @@ def _in_processes(out: Path, drawn: list[str], diagnosed: list[str], as_json: bo
             raise typer.Exit(code)
 
 
-def _conceal(out: Path, cases: int, seed: int, harder: bool, sealed: bool) -> None:
+def _trial(cases: int | None, null: int, seed: int, harder: bool, engine: str) -> BlindTrial:
+    """What was asked for. Raises BadInput where it is nothing, or the engine is not there."""
+    from servod.qualify.blind.conceal import BlindTrial
+    from servod.qualify.blind.plan import Engine
+
+    if engine not in set(Engine):
+        raise BadInput("--engine", repr(engine), ", ".join(Engine))
+    if engine == Engine.MUJOCO and importlib.util.find_spec("mujoco") is None:
+        raise BadInput("--engine", "no MuJoCo is installed", "own, or pip install 'servod[sim]'")
+    mixed = (0 if null else 120) if cases is None else cases
+    if mixed + null == 0:
+        raise BadInput("--cases", "0", "1 case or more, here or as --null")
+    return BlindTrial(mixed, seed, harder, null, Engine(engine))
+
+
+def _conceal(out: Path, trial: BlindTrial, sealed: bool) -> None:
     from dataclasses import replace
 
     from servod.cli.common import progress
-    from servod.qualify.blind.conceal import FILE, BlindTrial, conceal, open_cases, read_trial, write_trial
-    from servod.qualify.blind.plan import HARDER, Settings, plans
+    from servod.qualify.blind.conceal import FILE, conceal, open_cases, read_trial, write_trial
+    from servod.qualify.blind.plan import plans, settings_of
 
-    trial, there = BlindTrial(cases, seed, harder), read_trial(out)
+    there = read_trial(out)
     if there is not None and not there.same(trial):
-        found = f"{there.cases} cases of seed {there.seed}" + (", harder" if there.harder else "")
-        raise BadInput(str(out / FILE), found, "the same trial, or another folder")
-    settings = HARDER if harder else Settings()
+        raise BadInput(str(out / FILE), str(there), "the same trial, or another folder")
+    settings = settings_of(trial.harder, trial.engine)
     if there is None:
         with progress("conceal", quiet=False) as tell:
             make = conceal if sealed else open_cases
-            digest = make(
-                plans(cases, seed, settings), settings, out, lambda n, of: tell(f"concealed {n} of {of}", n / of)
-            )
+            drawn = plans(trial.cases, trial.seed, settings, trial.null)
+            digest = make(drawn, settings, out, lambda n, of: tell(f"concealed {n} of {of}", n / of))
         if digest is None:
             return
         there = replace(trial, sha256=digest)
         write_trial(out, there)
-    print(f"sealed: SHA-256 {there.sha256} of the truth of {cases} cases", file=sys.stderr, flush=True)
+    told = f"the truth of {trial.cases + trial.null} cases"
+    print(f"sealed: SHA-256 {there.sha256} of {told}", file=sys.stderr, flush=True)
 
 
 def _diagnose(out: Path, jobs: int, time_limit: float) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servod.cli.common import JsonOption, example, print_json
+from servod.cli.common import JsonOption, example, keep_inputs, print_json
 from servod.cli.groups import horizons, starts
 from servod.common.errors import BadInput
 from servod.common.files import BadFile
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from servod.formats.model.axis_model import AxisModel
     from servod.lab.recordings import Recording
     from servod.lab.simulate.motion import Start
-    from servod.lab.simulate.replay import Replay
+    from servod.lab.simulate.replay import Drive, Replay
 
 EXAMPLE = "servoctl replay --model model.yaml run.csv.gz --horizon 0.25 --out sim.csv"
 
@@ -30,12 +30,14 @@ def register(app: typer.Typer) -> None:
 
 
 def replay(
-    recording: Annotated[Path, typer.Argument(metavar="REC", help="CSV, CSV.gz, Parquet, MAT v5 or MCAP.")],
+    recording: Annotated[Path, typer.Argument(metavar="REC", help="CSV, text, Parquet, MAT v5, npy, JSON or MCAP.")],
     model: Annotated[Path, typer.Option(help="Axis model (YAML).")],
     horizon: Annotated[
         str, typer.Option(help="Restart from the recording every so many seconds, or `full`.", autocompletion=horizons)
     ] = "full",
-    map_file: Annotated[Path | None, typer.Option("--map", help="Renames and scales foreign columns (YAML).")] = None,
+    map_file: Annotated[
+        Path | None, typer.Option("--map", help="Names and units of foreign columns: YAML, or a shipped map.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Write t_s, position and velocity here (.csv or .parquet).")] = None,
     start: Annotated[
         str,
@@ -48,22 +50,29 @@ def replay(
     to_s: Annotated[float | None, typer.Option(help="Time of REC to stop before, s.")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Simulate MODEL under the torque of REC and report the open-loop position error."""
+    """Simulate MODEL under the torque of REC and report the position error.
+
+    Where REC has no torque the drive of MODEL makes it; a servo's loop is closed over the simulated position.
+    """
     horizon_s = parse_horizon(horizon)
     check_out(out)
+    if out is not None:
+        keep_inputs(out, recording, model, map_file)
     first = parse_start(start)
     from servod.formats.model.axis_model import load_axis_model
     from servod.lab.recordings import load_recording
     from servod.lab.simulate.replay import replay as simulate
+    from servod.lab.simulate.replay import switched_on
 
     axis = load_axis_model(model)
     recorded = load_recording(recording, map_file).between(from_s, to_s)
     if recorded.axis is not axis.axis:
         raise BadInput(f"{model}: axis", axis.axis.value, f"{recorded.axis.value}, as the columns of {recording} say")
-    result = simulate(axis, recorded.drive, horizon_s, start=first)
+    drive = switched_on(axis, recorded.driven_by(axis))
+    result = simulate(axis, drive, horizon_s, start=first)
     if out is not None:
         write_simulation(out, recorded, result)
-    document = summary(recorded, axis, result, horizon_s)
+    document = summary(recorded, axis, result, horizon_s, drive)
     if as_json:
         print_json(document)
     else:
@@ -118,7 +127,9 @@ def write_simulation(out: Path, recorded: Recording, result: Replay) -> None:
     )
 
 
-def summary(recorded: Recording, axis: AxisModel, result: Replay, horizon_s: float | None) -> dict[str, Any]:
+def summary(
+    recorded: Recording, axis: AxisModel, result: Replay, horizon_s: float | None, drive: Drive
+) -> dict[str, Any]:
     """The command's JSON document: the error over rows whose position was measured, and what it was measured on."""
     unit = "m" if axis.axis.value == "linear" else "rad"
     measured = result.over(recorded.measured)
@@ -131,9 +142,36 @@ def summary(recorded: Recording, axis: AxisModel, result: Replay, horizon_s: flo
         "unit": unit,
         f"rms_error_{unit}": measured.rms,
         f"max_error_{unit}": measured.max,
+        f"mean_error_{unit}": measured.mean,
         "start": "rest" if result.at_rest else "recorded",
-        "report": [*recorded.report, *gap_report(recorded, horizon_s)],
+        "report": [
+            *recorded.report,
+            *horizon_report(recorded, horizon_s),
+            *gap_report(recorded, horizon_s),
+            *drive_report(axis, drive),
+        ],
     }
+
+
+def drive_report(axis: AxisModel, drive: Drive) -> list[str]:
+    """What was made of the command where it is no torque, in sentences."""
+    if axis.drive is None or drive.told is None:
+        return []
+    told = f"torque: by the model's drive ({axis.drive.kind.value})"
+    if axis.drive.kind.feeds_back:
+        told += ", its loop closed over the simulated motion"
+    off = ~drive.told.on
+    if not off.any():
+        return [told]
+    return [told, f"drive: off in {100.0 * float(off.mean()):.0f} % of the rows, from {drive.t_s[off.argmax()]:.4g} s"]
+
+
+def horizon_report(recorded: Recording, horizon_s: float | None) -> list[str]:
+    """A horizon that no restart comes from, in a sentence."""
+    length_s = float(recorded.t_s[-1] - recorded.t_s[0])
+    if horizon_s is None or horizon_s <= length_s:
+        return []
+    return [f"--horizon: {horizon_s:g} s is longer than the {length_s:.4g} s of the recording; no restart"]
 
 
 def gap_report(recorded: Recording, horizon_s: float | None) -> list[str]:

@@ -14,7 +14,7 @@ from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.drivers.virtual.world import SteppedWorld
 from servod.formats.config import AxisConfig
 from servod.runtime.fieldbus.bus import CAN_EFF_FLAG, CAN_RTR_FLAG
-from servod.runtime.fieldbus.cia import EMCY_BASE, HEARTBEAT_BASE, LSS_FROM_SLAVE_ID, SDO_ANSWER_BASE
+from servod.runtime.fieldbus.cia import EMCY_BASE, HEARTBEAT_BASE, LSS_FROM_SLAVE_ID, SDO_ANSWER_BASE, SDO_REQUEST_BASE
 from servod.runtime.fieldbus.devices import AmplifierCommand, Goal, SdoAccess
 from servod.runtime.fieldbus.master import Master
 from servod.runtime.fieldbus.master.eds import dictionary_for
@@ -127,21 +127,23 @@ def _use(sdo: SdoAccess) -> None:
 
 
 def monitor(folder: Path) -> Target:
-    """Heartbeats and EMCY of a node."""
+    """Heartbeats, EMCY and SDO of a node."""
 
     def run(data: bytes) -> None:
         clock = ScriptClock()
         network = BusNetwork(ScriptBus(clock, iter(())), clock, threaded=False)
-        watch = NodeWatch(network, 1, FaultCode.DRIVE_FAULT, 150)
+        watch = NodeWatch(network, 1, FaultCode.DRIVE_FAULT, 50, 150)
         watch.watch(True)
-        for can_id, payload in frames(data, (HEARTBEAT_BASE + 1, EMCY_BASE + 1)):
+        for can_id, payload in frames(
+            data, (HEARTBEAT_BASE + 1, EMCY_BASE + 1, SDO_REQUEST_BASE + 1, SDO_ANSWER_BASE + 1)
+        ):
             network.notify(can_id, bytearray(payload), clock.time_ns)
             clock.time_ns += 10_000_000 * len(payload)
             watch.check()
         assert all(event.text.isprintable() for event in watch.events)
 
     seed = bytes((0, 1, 5, 1, 8)) + bytes.fromhex("3081010000000000") + bytes((0, 1, 0))
-    return Target(run, (seed,), frame_lists((0, 1), (b"\x05", b"\x00", b"\x7f")))
+    return Target(run, (seed,), frame_lists((0, 1, 2, 3), (b"\x05", b"\x00", b"\x7f")))
 
 
 def drivers(folder: Path) -> Target:

@@ -25,7 +25,10 @@ READERS: dict[str, tuple[Callable[[Path], object], str]] = {
     "EDS": (lambda path: load_dictionary(path, 1), ".eds"),
     "motion": (read_motion, ".csv"),
     "daemon's recording": (read_recording, ".mcap"),
-    **{f"recording {suffix}": (load_recording, suffix) for suffix in (".csv", ".csv.gz", ".parquet", ".mat", ".mcap")},
+    **{
+        f"recording {suffix}": (load_recording, suffix)
+        for suffix in (".csv", ".csv.gz", ".txt", ".parquet", ".mat", ".npy", ".npz", ".json", ".jsonl", ".mcap")
+    },
 }
 
 

@@ -21,6 +21,7 @@ from servod.common.yaml import Dumper, Strict
 from servod.formats.kinds import FileKind, load_kind
 from servod.formats.model import effects as fx
 from servod.formats.model import friction as fr
+from servod.formats.model.drive import DriveLaw
 from servod.formats.model.identified import Identified
 from servod.formats.model.keys import Group, Harmonic, Harmonics
 from servod.kernels.physics.layout import PackedPlant, PlantParameters
@@ -108,6 +109,7 @@ class AxisModel(Strict):
     inertia: Positive = Field(description="all that moves: kg*m^2, kg when linear")
     delay_s: float = Field(0.001, ge=0.0, le=0.25, description="command to torque")
     friction: Friction
+    drive: DriveLaw | None = None
     gravity: fx.Gravity | None = None
     torque_offset: float = Field(0.0, description="N*m beside the command, with the command's sign")
     asymmetry: fr.Asymmetry | None = None

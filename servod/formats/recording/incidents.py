@@ -24,7 +24,7 @@ from servod.formats.recording.run_mark import ENDING, AbruptEnd, abrupt_ends
 #: A fault that comes later than this after the one before it has a cause of its own.
 QUIET_NS = 10 * NS_PER_S
 _MOST_FAULTS = 100
-_ENABLING = 1  # servod.runtime.loop.axis.AxisState, which stands above
+_ENABLING = 1  # servod.runtime.loop.axis_state.AxisState, which stands above
 _FILE = re.compile(r"(?P<axis>.+)-fault-(?P<stamp>\d{8}-\d{6})-\w+?(-\d+)?\.mcap")
 _LINE = re.compile(r"\bfault (?P<code>[A-Z_]+) \((?P<reaction>[A-Z_]+)\): (?P<text>.*)")
 #: How journalctl (short-iso, short-iso-precise) and the daemon itself write when a line came.

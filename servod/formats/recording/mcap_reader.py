@@ -7,11 +7,13 @@ everything before it and says `truncated`.
 from __future__ import annotations
 
 import array
+import hashlib
 import json
 import os
 import re
 import struct
 import zlib
+from collections import Counter
 from collections.abc import Container, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,8 +21,9 @@ from typing import Any, BinaryIO, cast
 
 import zstandard
 from mcap.exceptions import InvalidMagic, McapError
-from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Message, Metadata, Schema
-from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Message, Metadata, Schema, Statistics
+from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk, get_chunk_data_stream
 
 from servod.common.errors import BadInput
 from servod.common.files import open_file, unreadable
@@ -37,6 +40,10 @@ _RECORD_LIMIT_BYTES = 64 * 1024 * 1024
 _UNPACKED_LIMIT_BYTES = 4 * 1024**3
 #: Most that is kept beside the cycles: attachments, events, and what the file says of its own form.
 _BESIDE_LIMIT_BYTES = 32 * 1024 * 1024
+_HASHED_BYTES = 1024 * 1024
+#: Opcode, length, channel, sequence, log time and publish time of a message, before its data; what the length counts
+#: begins behind it.
+_MESSAGE_HEAD, _COUNTED_FROM = struct.Struct("<BQHIQQ"), 9
 _REMEDY = "record in parts: a smaller recorder.max_file_mib"
 _BROKEN = (
     *(McapError, CRCValidationError, struct.error, zlib.error, zstandard.ZstdError, ValueError, EOFError, KeyError),
@@ -51,21 +58,29 @@ class McapRecording:
     `kinds` has one letter per name, "d" (float64) or "q" (int64), little endian; `truncated` tells that the file
     ends without its footer, as after kill -9, or is damaged; `damage` says then where, and what could be read.
     `left_out` are the names in the file that were not wanted; `wall_offset_ns` turns its times into the time of day.
+    Of attachments of one name the last counts; `attached` has all of them, in their order.
+    `sha256` is of the very bytes that were read, to the end that the file had when it was opened.
     """
 
     names: tuple[str, ...] = ()
     kinds: str = ""
     units: tuple[str, ...] = ()
     rows: bytearray = field(default_factory=bytearray)
-    attachments: dict[str, bytes] = field(default_factory=dict)
+    attached: list[tuple[str, bytes]] = field(default_factory=list)
     events: list[dict[str, Any]] = field(default_factory=list)
     truncated: bool = True
     damage: str = ""
     left_out: tuple[str, ...] = ()
     wall_offset_ns: int = 0
+    sha256: str = ""
 
     def __len__(self) -> int:
         return len(self.rows) // self.row_bytes if self.names else 0
+
+    @property
+    def attachments(self) -> dict[str, bytes]:
+        """Files in the recording by their names."""
+        return dict(self.attached)
 
     @property
     def row_bytes(self) -> int:
@@ -103,11 +118,9 @@ def read_recording(
     try:
         with open_file(path) as stream:
             bounded = _Bounded(stream)
-            reader = StreamReader(
-                cast(Any, bounded), validate_crcs=True, emit_chunks=True, record_size_limit=_RECORD_LIMIT_BYTES
-            )
-            _read_stream(reader, taker)
-            _tell_damage(recording, stream.tell(), bounded.size)
+            _read_stream(_reader(bounded), taker)
+            _tell_damage(recording, taker.promised, bounded)
+            recording.sha256 = bounded.sha256()
     except InvalidMagic:
         raise BadInput(str(path), "a file that is not MCAP", "a recording of servod (.mcap)") from None
     except OSError as error:
@@ -120,23 +133,88 @@ def read_recording(
     return recording
 
 
+def recorded_at_ns(path: str | Path) -> int | None:
+    """The time of day of the first cycle of the recording at `path`, ns since 1970 in UTC; reads no further.
+
+    None where the file does not tell: it is none of servod's, it is broken, or its axis was in virtual time.
+    """
+    found = McapRecording()
+    taker = _Taker(path, found, (), None)
+    try:
+        with open_file(path) as stream:
+            for record in _unpacked(_reader(_Bounded(stream)), path):
+                taker.take(record)
+                if found.rows and (found.names[0], found.kinds[0]) == (TIME, "q"):
+                    return found.column(TIME)[0] + found.wall_offset_ns if found.wall_offset_ns else None
+    except (*_BROKEN, OSError, BadInput):
+        pass
+    return None
+
+
+def foreign_messages(path: str | Path, schema: str) -> Iterator[tuple[Schema, Channel, Message]]:
+    """The messages of this schema in an MCAP file of other makers, in their order, with what tells how to decode them.
+
+    Ends where the file breaks off. Raises BadInput when it is no MCAP file, or unpacks to over 4 GiB.
+    """
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, Channel] = {}
+    beside_bytes = 0
+    try:
+        with open_file(path) as stream:
+            for record in _unpacked(_reader(_Bounded(stream)), path):
+                if isinstance(record, Schema | Channel):
+                    beside_bytes += len(record.data) if isinstance(record, Schema) else len(record.topic)
+                    if beside_bytes > _BESIDE_LIMIT_BYTES:
+                        raise BadInput(str(path), f"over {beside_bytes} bytes of schemas", "a recording")
+                if isinstance(record, Schema) and record.name == schema:
+                    schemas[record.id] = record
+                elif isinstance(record, Channel) and record.schema_id in schemas:
+                    channels[record.id] = record
+                elif isinstance(record, Message) and record.channel_id in channels:
+                    channel = channels[record.channel_id]
+                    yield schemas[channel.schema_id], channel, record
+    except InvalidMagic:
+        raise BadInput(str(path), "a file that is not MCAP", "a recording (.mcap)") from None
+    except OSError as error:
+        raise unreadable(path, error) from None
+    except _BROKEN:
+        return
+
+
+def _reader(bounded: _Bounded) -> StreamReader:
+    return StreamReader(cast(Any, bounded), validate_crcs=True, emit_chunks=True, record_size_limit=_RECORD_LIMIT_BYTES)
+
+
 class _Bounded:
-    """A file that is never asked for more than it has: Python makes room for all that is asked for."""
+    """A file that is never asked for more than it had when it was opened: Python makes room for all that is asked for.
+
+    Hashes what is read.
+    """
 
     def __init__(self, stream: BinaryIO) -> None:
-        self.size = os.fstat(stream.fileno()).st_size
-        self._stream = stream
+        self.size, self.at = os.fstat(stream.fileno()).st_size, 0
+        self._stream, self._hash = stream, hashlib.sha256()
 
     def read(self, count: int) -> bytes:
         """At most `count` bytes."""
-        return self._stream.read(min(count, self.size))
+        data = self._stream.read(min(count, self.size - self.at))
+        self.at += len(data)
+        self._hash.update(data)
+        return data
+
+    def sha256(self) -> str:
+        """Of the whole file: what nobody has read yet is read for it."""
+        while self.read(_HASHED_BYTES):
+            pass
+        return self._hash.hexdigest()
 
 
-def _tell_damage(recording: McapRecording, read_bytes: int, all_bytes: int) -> None:
-    """Say where a file that has no end breaks off."""
+def _tell_damage(recording: McapRecording, promised: int | None, bounded: _Bounded) -> None:
+    """Say where a file that has no end breaks off, and what one has lost whose index promises more cycles."""
     if recording.truncated:
-        what = "cut off" if read_bytes >= all_bytes else "damaged"
-        readable = f"{len(recording)} cycles could be read, from the first {read_bytes} of {all_bytes} bytes"
+        what = "cut off" if bounded.at >= bounded.size and promised is None else "damaged"
+        cycles = f"{len(recording)} cycles" if promised is None else f"{len(recording)} of {promised} cycles"
+        readable = f"{cycles} could be read, from the first {bounded.at} of {bounded.size} bytes"
         recording.damage = f"the file is {what}: {readable}"
 
 
@@ -173,7 +251,21 @@ def _unpacked(reader: StreamReader, path: str | Path) -> Iterator[McapRecord]:
         if left_bytes < 0:
             found = f"more than {_UNPACKED_LIMIT_BYTES} bytes unpacked"
             raise BadInput(str(path), found, f"at most that much at once; {_REMEDY}")
-        yield from breakup_chunk(record, validate_crc=True)
+        yield from _records_of(record)
+
+
+def _records_of(chunk: Chunk) -> list[McapRecord]:
+    """What is in a chunk as `breakup_chunk` gives it, in a third of its time where that is messages alone."""
+    stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+    data, at, found = stream.read(size), 0, list[McapRecord]()
+    while at + _MESSAGE_HEAD.size <= size:
+        opcode, length, channel, sequence, logged_ns, published_ns = _MESSAGE_HEAD.unpack_from(data, at)
+        end = at + _COUNTED_FROM + length
+        if opcode != Opcode.MESSAGE or end < at + _MESSAGE_HEAD.size or end > size:
+            break
+        found.append(Message(channel, logged_ns, data[at + _MESSAGE_HEAD.size : end], published_ns, sequence))
+        at = end
+    return found if at == size else breakup_chunk(chunk, validate_crc=True)
 
 
 def _claimed_bytes(chunk: Chunk) -> int:
@@ -195,13 +287,19 @@ class _Taker:
         self._topics: dict[int, str] = {}
         self._row = struct.Struct("")  # splits a row of the file into the cells that are kept
         self._beside_bytes = 0
+        self._taken: Counter[int] = Counter()  # messages by channel
+        #: How many cycles the index of the file has, where that are not those that were read.
+        self.promised: int | None = None
 
     def take(self, record: McapRecord) -> None:
         """Keep of a record what belongs into the recording. Raises BadInput when that becomes too much."""
         if isinstance(record, Message):
+            self._taken[record.channel_id] += 1
             self._take_message(record)
+        elif isinstance(record, Statistics):
+            self._compare(record)
         elif isinstance(record, Footer):
-            self.recording.truncated = False
+            self.recording.truncated = self.promised is not None
         elif isinstance(record, Schema):
             self._count_beside(len(record.data))
             self._schemas[record.id] = record
@@ -216,7 +314,14 @@ class _Taker:
                 self.recording.wall_offset_ns = int(offset) if _WHOLE.fullmatch(offset) else 0
         elif isinstance(record, Attachment):
             self._count_beside(len(record.data))
-            self.recording.attachments[record.name] = record.data
+            self.recording.attached.append((record.name, record.data))
+
+    def _compare(self, index: Statistics) -> None:
+        """A record whose kind was bent is passed over in silence: the index knows how many there were."""
+        counted = {k: n for k, n in index.channel_message_counts.items() if n}
+        if counted != self._taken or index.attachment_count != len(self.recording.attached):
+            cycles = next((k for k, topic in self._topics.items() if topic == CYCLE_TOPIC), 0)
+            self.promised = counted.get(cycles, len(self.recording))
 
     def _take_channel(self, channel: Channel) -> None:
         if channel.topic != CYCLE_TOPIC or self.recording.names:

@@ -71,7 +71,7 @@ def _packed(record: McapRecord) -> bytes:
 
 
 class ChunkedWriter:
-    """MCAP in chunks packed with zstd and indexed, byte for byte what `mcap.writer.Writer` writes.
+    """MCAP in chunks packed with zstd and indexed, byte for byte what `mcap.writer.Writer` writes with all checksums.
 
     The library's writer keeps an object for every chunk until the end, which grows by megabytes an hour, and makes one
     for every message. Here the chunk indexes go to `spool`, packed, and a message is a head and its data.
@@ -79,6 +79,7 @@ class ChunkedWriter:
 
     def __init__(self, stream: IO[bytes], spool: IO[bytes], chunk_bytes: int) -> None:
         self._stream, self._spool, self._chunk_bytes = stream, spool, chunk_bytes
+        self._data_crc = 0  # of all that was written so far: without it a bent opcode hides a whole chunk
         self._chunk = bytearray()  # the chunk in progress: schemas, channels, messages
         self._entries: defaultdict[int, list[int]] = defaultdict(list)  # by channel: time, place, time, place ...
         self._compress = zstandard.ZstdCompressor().compress
@@ -103,7 +104,7 @@ class ChunkedWriter:
 
     def start(self, profile: str, library: str) -> None:
         """Write the head of the file."""
-        self._stream.write(_MAGIC)
+        self._emit(_MAGIC)
         self._write(Header(profile=profile, library=library))
 
     def add_schema(self, name: str, encoding: str, data: bytes) -> int:
@@ -167,7 +168,7 @@ class ChunkedWriter:
     def finish(self) -> None:
         """Write what is left, the summary and the foot; the stream stays open."""
         self._end_chunk()
-        self._write(DataEnd(data_section_crc=0))
+        self._write(DataEnd(data_section_crc=self._data_crc))
         start = self._stream.tell()
         self._spool.seek(0)
         groups: tuple[tuple[int, Iterable[bytes]], ...] = (
@@ -193,8 +194,13 @@ class ChunkedWriter:
         at, data = self._stream.tell(), _packed(record)
         if isinstance(record, Chunk):  # noted first: a disk that is full in the middle of it tells by the file's size
             self.chunk_ends.append((at + len(data), self._messages_by_channel()))
-        self._stream.write(data)
+        self._emit(data)
         return at, len(data)
+
+    def _emit(self, data: bytes) -> None:
+        """Write a part of the data section."""
+        self._data_crc = zlib.crc32(data, self._data_crc)
+        self._stream.write(data)
 
     def _put(self, pieces: Iterable[bytes], crc: int) -> tuple[int, int]:
         """Write `pieces` of the summary; their length, and the checksum `crc` with them."""
@@ -227,7 +233,7 @@ class ChunkedWriter:
         for channel, entries in self._entries.items():
             size = 8 * len(entries)
             index = struct.pack(f"<BQHI{len(entries)}Q", Opcode.MESSAGE_INDEX, 6 + size, channel, size, *entries)
-            self._stream.write(index)
+            self._emit(index)
             places[channel] = end
             end += len(index)
         chunk_index = ChunkIndex(

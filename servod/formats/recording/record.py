@@ -28,7 +28,7 @@ FIELDS: tuple[Field, ...] = (
     Field("lag_ns", "q", "ns", "wake-up after the deadline"),
     Field("tick_ns", "q", "ns", "work of the previous cycle without waiting"),
     Field("torque_sent_ns", "q", "ns", "deadline to torque frame of the previous cycle"),
-    Field("axis_state", "q", "enum", "servod.runtime.loop.axis.AxisState"),
+    Field("axis_state", "q", "enum", "servod.runtime.loop.axis_state.AxisState"),
     Field("drive_state", "q", "enum", "servod.runtime.fieldbus.devices.DriveState"),
     Field("status_word", "q", "bits", "0x6041"),
     Field("mode", "q", "enum", "0x6061"),

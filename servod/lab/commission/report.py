@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from servod.client.open import VirtualWalkAxis
-from servod.formats.gains.gain_set import GainSet, load_gains
+from servod.formats.gains.gain_set import CertificateCheck, GainSet, load_gains
 from servod.formats.model.axis_model import AxisModel, load_axis_model
 from servod.kernels.laws import LABELS
 from servod.lab.commission.comparison import DEPLOYED, load_curves, load_rows, run_files
@@ -19,12 +20,14 @@ from servod.lab.commission.state import (
     BEFORE_ROWS,
     CERTIFICATE,
     DEPLOYMENT,
+    DESIGN,
     GAINS,
     IDENTIFIED,
     INFEASIBLE,
     MODEL,
     PICTURES,
     RECORDINGS,
+    REFUSED,
     RELAXED,
     REPORT,
     RESULT,
@@ -71,6 +74,77 @@ def write_report(walk: Walk, tell: Tell) -> None:
     page.write(walk.path(REPORT))
 
 
+def write_refusal(walk: Walk, failed: StepFailed) -> Path | None:
+    """Write refused.html of a walk that a step ended with a no: which one and why, what its checks found, and what the
+    steps before had made. None where nothing of it is on disk yet. Raises BadInput.
+    """
+    parts = dict(_refused(walk, failed.step))
+    if not parts:
+        return None
+    upto = next((k for k, (step, _, _) in enumerate(_MADE) if step == failed.step), len(_MADE))
+    made = {what: walk.path(name) for _, what, name in _MADE[: upto + 1]}
+    origin = Origin(made, walk.axis.config, walk.axis.nodes(), _facts(walk) | {"step": failed.step})
+    page = Page(
+        f"Commissioning of {walk.axis.config.name}", Verdict(str(failed).removesuffix(".") + ".", False), origin
+    )
+    page.sentence("Nothing of this runs on the axis: what ran before the commissioning still does.")
+    for title, shown in parts.items():
+        page.heading(title)
+        for part in shown:
+            if isinstance(part, Figure):
+                page.figure(part)
+            else:
+                _add(page, walk, part)
+    page.write(walk.path(REFUSED))
+    return walk.path(REFUSED)
+
+
+#: What a page of a refused walk is made from: the step that leaves it, what it is, and its file.
+_MADE = (
+    ("identify", "model", MODEL),
+    ("synthesize", "design", DESIGN),
+    ("verify", "verdict of the checks", CERTIFICATE),
+    ("deploy", "deployment", DEPLOYMENT),
+)
+
+
+def _refused(walk: Walk, step: str) -> Iterator[tuple[str, Iterator[Part]]]:
+    """The parts of such a page, what was refused first; files of later steps are of an earlier walk."""
+    if step == "deploy" and walk.path(DEPLOYMENT).exists():
+        yield "Deployment", _trial(walk)
+    if step == "verify" and walk.path(CERTIFICATE).exists():
+        yield "What the checks found", loop.judged_tables(SimpleNamespace(**_judged(walk)))
+    if step == "synthesize" and walk.path(INFEASIBLE).exists():
+        yield "What clashes", iter(read_json(walk.path(INFEASIBLE))["clashes"])
+    if step != "identify" and walk.path(IDENTIFIED).exists():
+        model = load_axis_model(walk.path(MODEL))
+        yield "The axis as identified", _identified(walk, model)
+        if step != "synthesize" and walk.path(DESIGN).exists():
+            yield "The law and its design", _design(load_gains(walk.path(DESIGN)), model)
+
+
+def _judged(walk: Walk) -> dict[str, Any]:
+    """The document of the checks with its checks as such."""
+    found: dict[str, Any] = read_json(walk.path(CERTIFICATE))
+    return found | {"checks": [CertificateCheck.model_validate(check) for check in found["checks"]]}
+
+
+def _trial(walk: Walk) -> Iterator[Part]:
+    """What a deployment that did not prove itself measured."""
+    found = read_json(walk.path(DEPLOYMENT))
+    columns = [run for run in ("before", "after", "promised") if found.get(run)]
+    names = list(dict.fromkeys(name for run in columns for name in found[run]))
+    rows = [
+        (name.removesuffix("_mrad"), *(f"{found[run][name]:.4g}" if name in found[run] else "-" for run in columns))
+        for name in names
+    ]
+    yield PageTable("Validation motion, mrad", ("figure", *columns), tuple(rows))
+
+
+def _facts(walk: Walk) -> dict[str, str]:
+    return {"axis": "virtual: a simulated joint, no hardware moved"} if walk.axis.virtual else {}
+
+
 def sections(walk: Walk, gains: GainSet, model: AxisModel) -> dict[str, Callable[[], Iterator[Part]]]:
     """What makes the parts of each section, by its title, in the order of the page."""
     return {
@@ -108,8 +182,7 @@ def _origin(walk: Walk) -> Origin:
     files |= {"certificate": walk.path(CERTIFICATE), "deployment": walk.path(DEPLOYMENT)}
     files |= {"tracking": walk.path(TRACKING)}
     recorded = [*walk.path(RECORDINGS).glob("*"), *walk.path(RUNS).glob("*.mcap")]
-    facts = {"axis": "virtual: a simulated joint, no hardware moved"} if walk.axis.virtual else {}
-    return Origin(files | {"recordings": sorted(recorded)}, walk.axis.config, walk.axis.nodes(), facts)
+    return Origin(files | {"recordings": sorted(recorded)}, walk.axis.config, walk.axis.nodes(), _facts(walk))
 
 
 def _summary(page: Page, walk: Walk) -> None:
@@ -164,9 +237,7 @@ def _certificate(gains: GainSet) -> Iterator[Part]:
 
 def _deployment(walk: Walk) -> Iterator[Part]:
     found = read_json(walk.path(DEPLOYMENT))
-    columns = [run for run in ("before", "after", "promised") if found[run]]
-    rows = [(name.removesuffix("_mrad"), *(f"{found[run][name]:.4g}" for run in columns)) for name in found["promised"]]
-    yield PageTable("Validation motion, mrad", ("figure", *columns), tuple(rows))
+    yield from _trial(walk)
     if not found["before"]:
         yield "The set was active already, and nothing was measured before it: its promise alone judged it."
         return
@@ -288,7 +359,7 @@ def _rows(figures: dict[str, Any]) -> Iterator[tuple[str, ...]]:
             yield (_label(law, f), f["failed"], *[""] * (len(_HEADER) - 2))
             continue
         torque = (f"{1e3 * f['roughness_nm']:.3g}", f"{f['roughness_ratio']:.3g}" if "roughness_ratio" in f else "")
-        head = (_label(law, f), f"{f['rms_error_mrad']:.4f}", f"{f['max_error_mrad']:.3f}", *torque)
+        head = (_label(law, f), f"{f['rms_error_mrad']:.4g}", f"{f['max_error_mrad']:.4g}", *torque)
         if not f["steps"]:
             yield (*head, *[""] * 5)
         for size, s in f["steps"].items():
@@ -328,6 +399,7 @@ def failure(walk: Walk, failed: StepFailed) -> dict[str, Any]:
 
 def result(walk: Walk, state: State) -> dict[str, Any]:
     """Put the document together from the files of a walk that is complete, and keep it in the folder."""
+    walk.path(REFUSED).unlink(missing_ok=True)  # of an earlier attempt
     gains = load_gains(walk.path(GAINS))
     assert gains.design is not None  # a certified set has one
     document = {

@@ -33,7 +33,7 @@ STORE, DEPLOYMENT = "store", "deployment.json"
 BEFORE, BEFORE_ROWS, AFTER_ROWS = "runs/before.json", "runs/deploy_before.mcap", "runs/deploy_after.mcap"
 RIVALS, TUNING = "rivals", "tuning.json"
 TRACKING, RUNS = "tracking.json", "runs"
-REPORT, PICTURES = "report.html", "pictures"
+REPORT, REFUSED, PICTURES = "report.html", "refused.html", "pictures"
 RESULT = "commission.json"
 #: What steps had left that are done anew.
 EARLIER = "earlier"

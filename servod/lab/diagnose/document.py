@@ -15,9 +15,11 @@ from servod.lab.diagnose.result import (
     Evidence,
     FittedValue,
     FreeRun,
+    HeldOutRecording,
     Minor,
     MismatchMap,
     NamedEffect,
+    PartialAnswer,
     Quality,
     RecordingErrors,
 )
@@ -31,17 +33,23 @@ def diagnosis_document(diagnosis: Diagnosis) -> Document:
     found: Document = {"verdict": diagnosis.verdict.value, "summary": summary(diagnosis)}
     found["findings"] = [_finding(one, diagnosis.units.force) for one in evidence.findings] if evidence else []
     found["recalibrated"] = _recalibrated(evidence.recalibrated) if evidence else {}
+    if evidence is not None and evidence.drive:
+        found["drive"] = _parameters(evidence.drive)
     found["minor"] = {name: _minor(one) for name, one in evidence.minor.items()} if evidence else {}
     found["fit"] = _fit(diagnosis, evidence) if evidence else {}
     if evidence is not None and evidence.residual is not None:
         left = evidence.residual
         table = {"grid": left.grid.tolist(), "torque": left.torque.tolist()}
         found["unexplained"] = {"coordinate": left.coordinate, "share": left.share, **table}
+    if evidence is not None and evidence.partial is not None:
+        found["partial"] = _partial(evidence.partial)
     if evidence is not None:
         found["located"] = [_map(one) for one in evidence.maps_before]
         found["remaining"] = [_map(one) for one in evidence.maps_after]
     found["recordings"] = [_recording(one) for one in evidence.recordings] if evidence else []
     found["recordings"] += [{"name": r.name, "taken": False, "reason": r.reason} for r in diagnosis.refused]
+    if diagnosis.held_out:
+        found["held_out"] = {one.name: _held_out(one, diagnosis.units.length) for one in diagnosis.held_out}
     found["units"] = {"position": diagnosis.units.length, "torque": diagnosis.units.force}
     found["seconds"] = {stage: round(value, 2) for stage, value in diagnosis.seconds.items()}
     return found
@@ -86,8 +94,17 @@ def _found(diagnosis: Diagnosis, evidence: Evidence) -> str:
         return _too_little(diagnosis, evidence)
     if diagnosis.verdict is DiagnosisVerdict.UNEXPLAINED:
         where = evidence.maps_before[0].coordinate
-        return f"Something is left that no known physics explains; it shows most over {where}."
+        return f"Something is left that no known physics explains; it shows most over {where}.{_part(evidence)}"
     return "The model is adequate: nothing worth naming is left beyond the noise."
+
+
+def _part(evidence: Evidence) -> str:
+    """What known physics explains of it, as a sentence behind another; empty where it explains little."""
+    part = evidence.partial
+    if part is None:
+        return ""
+    names = " and ".join(f"{one.effect.replace('_', ' ')} ({100.0 * one.share:.0f} %)" for one in part.effects)
+    return f" Part of it goes with {names}; the rest shows most over {part.rest} and has no name."
 
 
 def _too_little(diagnosis: Diagnosis, evidence: Evidence) -> str:
@@ -120,6 +137,14 @@ def _finding(found: NamedEffect, force: str) -> Document:
         "experiment": what.experiment,
         "held_out": {"before": found.without, "after": found.after, "unit": force},
     }
+
+
+def _partial(found: PartialAnswer) -> Document:
+    effects = [
+        {"effect": one.effect, "share": round(one.share, 4), "parameters": _parameters(one.parameters)}
+        for one in found.effects
+    ]
+    return {"effects": effects, "share": round(found.share, 4), "rest": found.rest}
 
 
 def _parameters(found: Mapping[str, FittedValue]) -> Document:
@@ -163,6 +188,13 @@ def _windows(quality: Quality, unit: str) -> Document:
         each = {name: _free_run(errors) for name, errors in window.recordings.items()}
         found[f"{window.horizon_s:g}"] = {"unit": unit, **_free_run(window.errors), "recordings": each}
     return found
+
+
+def _held_out(found: HeldOutRecording, unit: str) -> Document:
+    return {
+        f"{w.horizon_s:g}": {"unit": unit, "before": w.before, "after": w.after, "coasting": w.coasting}
+        for w in found.windows
+    }
 
 
 def _free_run(errors: FreeRun) -> Document:
@@ -252,7 +284,7 @@ MATHEMATICS = (
     "model. It stays when the gain is significant against correlated noise with a correction for the number of things "
     "tried (Bayesian information criterion), and when it is large enough to be worth naming.",
     "Proof. Each recording in turn is left out, the rest is fitted again, and the one left out is predicted; a quarter "
-    "of every recording where there is only one, or where recordings differ in a number of their own. Intervals "
+    "of it where there is only one. Intervals "
     "count correlated rows as fewer (sums over blocks of a quarter of a second: Carlstein, Annals of Statistics 14, "
     "1986).",
 )
@@ -275,11 +307,35 @@ def describe_certainty(finding: Document) -> list[str]:
     return lines
 
 
+#: An error of less than so many times the noise floor is noise.
+_NOISE = 1.1
+
+
+def describe_fit(document: Document) -> str:
+    """What the fit changed on rows that it has not seen. A change within the noise is called no gain."""
+    fit, held = document["fit"], document["fit"]["held_out"]
+    before, after, floor, unit = held["before"], held["after"], fit["noise_floor"], fit["unit"]
+    begins = f"On rows that the fit has not seen ({held['left_out']} was left out) the torque error"
+    noise = f"the noise floor is {floor:.3g} {unit}"
+    if before < _NOISE * floor:
+        return (
+            f"{begins} is {before:.3g} {unit} without and {after:.3g} {unit} with the fit; {noise}. Both are within "
+            "the noise: the difference says nothing."
+        )
+    if after >= before:
+        return f"{begins} did not become less: {before:.3g} before, {after:.3g} {unit} after; {noise}."
+    return (
+        f"{begins} went from {before:.3g} to {after:.3g} {unit}; {noise}. "
+        f"{100.0 * fit['explainable_removed']:.0f} % of what could be explained is gone"
+        + (", and what is left is within the noise." if after < _NOISE * floor else ".")
+    )
+
+
 def describe_rest(document: Document) -> str:
     """What is left, and where it lives."""
     fit, left = document["fit"], [m for m in document["remaining"] if m["chance"] < 1e-3 and m["share"] > 0.01]
     times = fit["held_out"]["after"] / max(fit["noise_floor"], 1e-30)
-    if not left or times < 1.1:
+    if not left or times < _NOISE:
         return "What is left is noise: no coordinate orders it any more."
     most = left[0]
     return (

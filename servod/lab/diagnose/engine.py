@@ -12,14 +12,24 @@ from time import monotonic
 
 from servod.formats.model.axis_model import AxisModel
 from servod.lab.diagnose.data.intake import load_traces
-from servod.lab.diagnose.judge.conclude import conclude, extended_model, free_windows, name_findings
+from servod.lab.diagnose.judge.conclude import (
+    conclude,
+    extended_model,
+    free_windows,
+    name_findings,
+    reject_terms,
+)
+from servod.lab.diagnose.judge.hold_out import judge_held_out
 from servod.lab.diagnose.judge.judgement import JudgedSelection, judge, predicts_nothing, without_names
+from servod.lab.diagnose.judge.partial import model_without_names, partial_answer
 from servod.lab.diagnose.judge.verdict import below_noise, verdict
 from servod.lab.diagnose.predict.coordinates import units
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.result import Diagnosis, DiagnosisVerdict
 from servod.lab.diagnose.select.cross_validation import cross_validate
+from servod.lab.diagnose.select.drive import complete_drive
 from servod.lab.diagnose.select.refine import above_floor, add_drift, add_group, restore_nominal
+from servod.lab.diagnose.select.selection import Selection
 from servod.lab.diagnose.select.selector import Selector
 from servod.lab.diagnose.select.stepwise import forward_selection, swap_terms
 from servod.lab.diagnose.settings import SETTINGS
@@ -29,43 +39,67 @@ Tell = Callable[[str], None]
 
 
 def diagnose(
-    model: AxisModel, recordings: Sequence[Recording], time_limit_s: float = 120.0, tell: Tell | None = None
+    model: AxisModel,
+    recordings: Sequence[Recording],
+    time_limit_s: float = 120.0,
+    tell: Tell | None = None,
+    held_out: Sequence[Recording] = (),
 ) -> Diagnosis:
     """What `model` leaves out of the axis that the recordings are of.
 
     The search for terms ends after three quarters of `time_limit_s` with what it has; `tell` is called with a line of
     progress now and then. Recordings that cannot tell are refused with a reason each, and without any other there is no
-    evidence. Computed on up to two cores.
+    evidence. `held_out` are judged by what was found, and by nothing before. Computed on up to two cores.
 
         found = diagnose(load_axis_model(path), [load_recording(run) for run in runs])
         for effect in found.evidence.findings if found.evidence else (): print(effect.effect, effect.parameters)
     """
     tell = tell or (lambda _line: None)
     begun = monotonic()
+    completed = complete_drive(model, recordings)
+    model = completed.model
     traces, refused = load_traces(recordings, model)
     seconds = {"intake": monotonic() - begun}
     if not traces:
         return Diagnosis(units(model), tuple(refused), DiagnosisVerdict.CANNOT_TELL, None, seconds | {"windows": 0.0})
     tell(f"{len(traces)} recordings taken in")
-    selector = Selector(Predictor(traces, model), model, begun + SETTINGS.forward.search_share * time_limit_s, tell)
-    selection = swap_terms(selector, forward_selection(selector, selector.fit_base()))
-    if above_floor(selector, selection):
-        selection = add_drift(selector, add_group(selector, selection))
+    deadline = begun + SETTINGS.forward.search_share * time_limit_s
+    selector = Selector(Predictor(traces, model), model, deadline, tell, completed.unknown)
+    selection = _selected(selector, selector.fit_base())
     seconds["search"] = monotonic() - begun - seconds["intake"]
-    selection = cross_validate(selector, restore_nominal(selector, selection))
-    judgement = name_findings(selector, judge(selector, selection))
+    judgement = _judged(selector, selection)
+    while (rest := reject_terms(selector, judgement)) is not None:
+        judgement = _judged(selector, _selected(selector, rest))
     final, judgement = _verdict(judgement)
     seconds["proof"] = monotonic() - begun - seconds["intake"] - seconds["search"]
-    extended = extended_model(judgement, model)
-    free = free_windows(judgement, model, extended)
+    if final is DiagnosisVerdict.UNEXPLAINED:
+        (extended, free), part = model_without_names(judgement, model), partial_answer(judgement)
+    else:
+        extended, free, part = extended_model(judgement, model), free_windows(judgement, model), None
+    judged = judge_held_out(model, extended, held_out)
     seconds["windows"] = monotonic() - begun - sum(seconds.values())
-    return Diagnosis(units(model), tuple(refused), final, conclude(judgement, extended, free), seconds)
+    return Diagnosis(units(model), tuple(refused), final, conclude(judgement, extended, free, part), seconds, judged)
+
+
+def _selected(selector: Selector, selection: Selection) -> Selection:
+    """The selection with all terms that are worth it, but those of effects that were rejected."""
+    selection = swap_terms(selector, forward_selection(selector, selection))
+    if above_floor(selector, selection):
+        selection = add_drift(selector, add_group(selector, selection))
+    return selection
+
+
+def _judged(selector: Selector, selection: Selection) -> JudgedSelection:
+    """The selection cross-validated and judged, and which of its terms are findings."""
+    selection = cross_validate(selector, restore_nominal(selector, selection))
+    return name_findings(selector, judge(selector, selection))
 
 
 def _verdict(judgement: JudgedSelection) -> tuple[DiagnosisVerdict, JudgedSelection]:
     """The verdict, and the judgement without names where none may stand."""
     predictor, selection = judgement.predictor, judgement.selection
-    found = verdict(judgement.named, judgement.errors, predictor.dry)
+    driven = any(trace.drive.told is not None for trace in predictor.traces)
+    found = verdict(judgement.named, judgement.errors, predictor.dry, driven=driven)
     if found is DiagnosisVerdict.MISSING_PHYSICS and predicts_nothing(judgement):
         found = DiagnosisVerdict.UNEXPLAINED
     if found is DiagnosisVerdict.UNEXPLAINED:

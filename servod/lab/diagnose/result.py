@@ -168,6 +168,27 @@ class Minor:
 
 
 @dataclass(frozen=True)
+class PartialEffect:
+    """An effect that removes `share` of the explainable error on unseen rows, beside something that has no name."""
+
+    effect: str
+    share: float
+    parameters: Mapping[str, FittedValue]
+
+
+@dataclass(frozen=True)
+class PartialAnswer:
+    """What known physics explains of a mismatch that it does not explain: no finding, for what is left may change it.
+
+    `share` is what all of it removes together, `rest` the coordinate over which what is left shows most.
+    """
+
+    effects: tuple[PartialEffect, ...]
+    share: float
+    rest: str
+
+
+@dataclass(frozen=True)
 class FreeRun:
     """Position errors of windows simulated freely: by the model as it came, recalibrated, and with the physics added.
 
@@ -255,12 +276,16 @@ class SearchEffort:
 class Evidence:
     """Everything behind a verdict on recordings that can tell.
 
-    `model` is the axis model with the physics added. `maps_before` and `bands` (of frequency) show the mismatch of the
-    recalibrated model, `maps_after` what is left. `encoder_noise` is what the encoder alone makes of torque in a row.
+    `model` is the axis model with the physics added; where nothing has a name, whichever predicts unseen rows best.
+    `drive` is what was unknown of the drive. `maps_before` and `bands` (of frequency) show the mismatch of the
+    recalibrated model, `maps_after` what is left.
+    `partial` is what known physics explains of something that has no name. `encoder_noise` is what the encoder alone
+    makes of torque in a row.
     """
 
     findings: tuple[NamedEffect, ...]
     recalibrated: Mapping[str, FittedValue]
+    drive: Mapping[str, FittedValue]
     minor: Mapping[str, Minor]
     residual: ResidualTable | None
     model: AxisModel
@@ -272,11 +297,25 @@ class Evidence:
     search: SearchEffort
     encoder_noise: float
     dry_friction: float
+    partial: PartialAnswer | None = None
 
-    @property
-    def left_out(self) -> str | None:
-        """What was left out of the fits in turn; None where what has no name was fitted to everything."""
-        return self.quality.left_out if self.residual is None else None
+
+@dataclass(frozen=True)
+class HeldOutWindow:
+    """RMS position errors of windows of one length: by the model as it came, by the extended one, and by coasting."""
+
+    horizon_s: float
+    before: float
+    after: float
+    coasting: float
+
+
+@dataclass(frozen=True)
+class HeldOutRecording:
+    """A recording that nothing was fitted to."""
+
+    name: str
+    windows: tuple[HeldOutWindow, ...]
 
 
 @dataclass(frozen=True)
@@ -288,3 +327,4 @@ class Diagnosis:
     verdict: DiagnosisVerdict
     evidence: Evidence | None
     seconds: Mapping[str, float]
+    held_out: tuple[HeldOutRecording, ...] = ()

@@ -29,12 +29,18 @@ class IntakeSettings:
     #: Noise that the slowest observer makes of the encoder's, as a share of dry friction, from which nothing can be
     #: said.
     most_noise: float = 0.5
+    #: Time around the instant at which a drive goes off or on that does not count, s.
+    around_off_s: float = 0.1
+    #: Steps of the thermometer that a temperature must change by: its last digit flickers between two or three.
+    least_steps_warm: float = 3.0
     #: This share of the command's spread counts for dry friction where it is more.
     noise_of_command: float = 0.3
     #: Share of rows at the end of the command's range from which a recording is refused as saturated.
     saturated: float = 0.4
     #: The same share from which it is noted.
     noted_saturated: float = 0.02
+    #: Share of rows as one of their neighbours from which a command is of steps, and at no limit.
+    held: float = 0.9
     #: A row that leaves its neighbours by so many noises and comes back is a glitch,
     glitch_noises: float = 30.0
     #: if it is as many usual steps as well: a fast motion is none.
@@ -81,6 +87,10 @@ class ObserverSettings:
     fastest: float = 200.0
     #: The bandwidth's share of the sampling rate, at most.
     share_of_sampling: float = 0.1
+    #: The same up to `slow_sampling`: where rows are rare, a slower observer shows less than its noise is worth.
+    most_of_sampling: float = 0.33
+    #: Bandwidth up to which that share may go, rad/s.
+    slow_sampling: float = 50.0
     #: The same where the axis creeps: a slower observer carries a model along that sticks and slips.
     share_creeping: float = 0.35
     #: Share of dry friction that encoder noise may make of the mismatch; sets the bandwidth.
@@ -99,8 +109,8 @@ class ObserverSettings:
     load_share_in_gap: float = 1.0
     #: Innovations below this many noises of the encoder carry the model's friction nowhere.
     quiet_noises: float = 5.0
-    #: Time constants of the observer that pass before a row behind a start counts.
-    settling: float = 30.0
+    #: Time constants of the observer that pass before a row behind a start counts: what is left of it is 1e-5 then.
+    settling: float = 15.0
     #: Mismatches beyond this many dry frictions say no more: a model that has run away counts as that bad.
     worst: float = 1e6
     #: Share of each recording that first rounds run on: the stretch where most is left shows most of any effect.
@@ -123,6 +133,8 @@ class FloorSettings:
     score: float = -0.674
     #: By how much slow torque noise may exceed the white part of the mismatch, in power.
     slow_over_white: float = 6.0
+    #: Share of an error that the floor, known no better than this, leaves to be explained at least.
+    told: float = 0.02
 
 
 @dataclass(frozen=True)
@@ -279,6 +291,10 @@ class DriftSettings:
     least_taken: float = 0.15
     #: What it must gain beyond the Bayesian information criterion, in units of noise; one thing is tried, not hundreds.
     least_gain: float = 20.0
+    #: The same where it takes a good part of the means' power, which noise does not,
+    least_gain_of_most: float = 10.0
+    #: namely this share.
+    most_taken: float = 0.4
 
 
 @dataclass(frozen=True)
@@ -308,6 +324,8 @@ class ValidationSettings:
     #: Free windows of unseen rows must come out by this factor better with the names than without. A few terms with
     #: dynamics of their own can follow nearly any mismatch one sample ahead, and predict nothing.
     most_free_run_error: float = 0.7
+    #: The same where the model's drive makes the torque: a servo's loop pulls a simulated run back by itself.
+    most_free_run_error_by_drive: float = 0.85
     #: That is not asked where the mismatch is within so many times the noise floor anyway.
     fitted_floors: float = 2.0
 
@@ -386,8 +404,12 @@ class VerdictSettings:
     least_explained: float = 0.85
     #: The same where what is left is worth a name itself.
     least_beside_much: float = 0.925
+    #: The same where no torque was recorded and the model's drive makes it: its inner loop has parts of its own.
+    least_by_drive: float = 0.5
     #: What is left is worth a name itself from this share of dry friction on.
     much_torque: float = 0.05
+    #: Share of the explainable error on unseen rows from which a name that may not stand is told as part of the answer.
+    least_partial: float = 0.5
     #: What is left above the noise floor counts as unexplained from this share of dry friction,
     left_torque: float = 0.02
     #: if it is also this share of what could be explained.

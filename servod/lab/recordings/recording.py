@@ -5,19 +5,35 @@ Stands between the readers and everything that works on recordings: replay, iden
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from servod.common.errors import BadInput
-from servod.formats.model.axis_model import AxisKind
+from servod.formats.model.axis_model import AxisKind, AxisModel
+from servod.formats.model.drive import DriveKind, DriveLaw
 from servod.formats.recording.record import FIELDS
-from servod.lab.recordings.columns import ALL_NAMES, REQUIRED, Quantity, apply_map, axis_of, load_column_map
-from servod.lab.recordings.readers import numbers, read_columns
+from servod.lab.recordings.columns import (
+    COMMANDS,
+    REQUIRED,
+    ColumnSource,
+    Element,
+    Quantity,
+    apply_map,
+    axis_of,
+    load_column_map,
+    wanted_names,
+)
+from servod.lab.recordings.numbers import element, numbers
+from servod.lab.recordings.readers import read_columns
+from servod.lab.recordings.wraps import beside, doubtful_unit, find_wrap, unwrapped
 from servod.lab.simulate.replay import Drive
+from servod.lab.simulate.servo import ToldRows
 
 Array = NDArray[np.float64]
 
@@ -32,6 +48,14 @@ LARGEST = 1e30
 
 #: Time between rows, s, beyond which the column is surely in another unit.
 SHORTEST_STEP_S, LONGEST_STEP_S = 1e-6, 20.0
+
+#: What a drive of each kind is told.
+_TOLD = {
+    DriveKind.POSITION_SERVO: Quantity.REFERENCE,
+    DriveKind.VELOCITY: Quantity.SPEED_REFERENCE,
+    DriveKind.VOLTAGE: Quantity.VOLTAGE,
+    DriveKind.CURRENT: Quantity.CURRENT,
+}
 
 #: Steps that differ from the median by more than this share make a recording uneven.
 UNEVEN_SHARE = 0.1
@@ -61,7 +85,12 @@ class Recording:
 
     @property
     def torque(self) -> Array:
-        """Commanded torque (force), held over each sample."""
+        """Commanded torque (force), held over each sample. Raises BadInput where the recording has none."""
+        if Quantity.TORQUE not in self.columns:
+            name = Quantity.TORQUE.column(self.axis)
+            there = ", ".join(quantity.column(self.axis) for quantity in COMMANDS if quantity in self.columns)
+            allowed = f"{name}; a --map file makes it of a current, a voltage or a duty, a drive: in the model of any"
+            raise BadInput(f"{self.path}: column {name}", f"none (there is {there})", allowed)
         return self.columns[Quantity.TORQUE]
 
     @property
@@ -92,39 +121,140 @@ class Recording:
     @cached_property
     def drive(self) -> Drive:
         """What a replay needs of the recording."""
-        warm = self.get(Quantity.TEMPERATURE)
-        temperature = np.full(len(self), np.nan) if warm is None else _filled(self.t_s, warm)
-        return Drive(self.t_s, self.torque, self.position, temperature)
+        return Drive(self.t_s, self.torque, self.position, self._row(Quantity.TEMPERATURE))
+
+    def driven_by(self, model: AxisModel) -> Drive:
+        """What a replay of `model` needs: what its drive was told where the model has one, else as `drive`.
+
+        The torque is not made of it yet (`servod.lab.simulate.replay.driven`).
+        Raises BadInput where the recording lacks what that drive is told, or its gain is known to neither.
+        """
+        if model.drive is None:
+            return self.drive
+        if model.drive.factor is None:
+            allowed = "N*m of a full duty, a V or an A: give it, or k_t; diagnose fits it"
+            raise BadInput("model: drive.torque_per_command", "none", allowed)
+        temperature, command = self._row(Quantity.TEMPERATURE), self._told(model.drive)
+        told = ToldRows(command, self._row(Quantity.GAIN), self._row(Quantity.SUPPLY), self._on(model.drive, command))
+        if model.drive.kind.feeds_back and model.drive.kp is None and not np.isfinite(told.gain).all():
+            raise BadInput(f"{self.path}: column kp", "none", "kp, or drive.kp in the model: the gain of its servo")
+        if model.drive.by_supply and model.drive.supply_v is None and not np.isfinite(told.supply_v).all():
+            raise BadInput(f"{self.path}: column supply_v", "none", "supply_v, or drive.supply_v in the model")
+        return Drive(self.t_s, np.zeros(len(self)), self.position, temperature, told)
+
+    def _row(self, quantity: Quantity) -> Array:
+        """An optional column with its holes filled; NaN where there is none."""
+        values = self.get(quantity)
+        return np.full(len(self), np.nan) if values is None else _filled(self.t_s, values)
+
+    def _on(self, law: DriveLaw, command: Array) -> NDArray[np.bool_]:
+        """Rows in which the drive is on: by `enabled`, or by the duty that a servo reports beside its goal."""
+        enabled, duty = self.get(Quantity.ENABLED), self.get(Quantity.DUTY)
+        if enabled is not None:
+            kept = _held(enabled) if np.isfinite(enabled).any() else np.ones(len(self))
+            return kept > 0.5
+        if duty is None or law.kind is not DriveKind.POSITION_SERVO:
+            return np.ones(len(self), dtype=bool)
+        return on_by_duty(duty, command - self.position)
+
+    def _told(self, law: DriveLaw) -> Array:
+        """The column that a drive of this law is told, holes held. Raises BadInput where the recording has none."""
+        wanted = _TOLD[law.kind]
+        values = self.get(wanted)
+        if values is None and law.kind is DriveKind.VOLTAGE and (duty := self.get(Quantity.DUTY)) is not None:
+            supply = self._row(Quantity.SUPPLY)
+            known = np.where(np.isfinite(supply), supply, np.nan if law.supply_v is None else law.supply_v)
+            values = duty * known
+        if values is None or not np.isfinite(values).any():
+            name, there = wanted.column(self.axis), ", ".join(q.column(self.axis) for q in self.columns)
+            allowed = f"{name}, as drive.kind {law.kind.value} of the model is told"
+            raise BadInput(f"{self.path}: column {name}", f"none (there is {there})", allowed)
+        return _held(values)
+
+
+#: Where a drive reports no duty at all, it is off if its error elsewhere makes such a duty: a dead band is smaller.
+OFF_ASKED = 0.2
+
+
+def on_by_duty(duty: Array, error: Array) -> NDArray[np.bool_]:
+    """Rows in which a servo is on, by the duty that it reports and its error.
+
+    It is off for as long as the duty is exactly nothing, where the error comes to what elsewhere makes OFF_ASKED of a
+    full duty: a servo at its goal, and one within its dead band, make none either, and are on.
+    """
+    on = np.ones(len(duty), dtype=bool)
+    made = np.isfinite(duty) & (duty != 0.0) & (np.abs(duty) < 0.99 * np.nanmax(np.abs(duty), initial=0.0))
+    if not made.any():
+        return on
+    asked = np.abs(error) * float(np.median(np.abs(duty[made]) / np.maximum(np.abs(error[made]), 1e-12)))
+    edges = np.flatnonzero(np.diff((duty == 0.0).astype(np.int8), prepend=0, append=0))
+    for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        on[first:end] = float(np.max(asked[first:end])) < OFF_ASKED
+    return on
+
+
+def _held(values: Array) -> Array:
+    """A column with its holes filled by the value before, and those ahead of the first by that."""
+    holes = ~np.isfinite(values)
+    kept = np.maximum.accumulate(np.where(holes, -1, np.arange(len(values))))
+    return np.asarray(values[np.where(kept < 0, int(np.argmin(holes)), kept)])
 
 
 def load_recording(path: str | Path, map_path: str | Path | None = None) -> Recording:
-    """Read, name, check and repair the recording at `path`; `map_path` is a `--map` file.
+    """Read, name, check and repair the recording at `path`; `map_path` is a `--map` file, or the name of a shipped one.
 
+    A recording without a torque is read as well where it has a goal position, a voltage, a duty or a current.
     Raises BadInput naming file and column.
     """
     path = Path(path)
     sources = load_column_map(Path(map_path)) if map_path is not None else {}
-    foreign, report = read_columns(path, {*ALL_NAMES, *(source.source for source in sources.values())})
-    chosen, unused = apply_map(foreign, sources, str(path))
+    foreign, report = read_columns(path, wanted_names(sources.values()))
+    chosen, places, unused = apply_map(foreign, sources, str(path))
     axis = axis_of(chosen, foreign, str(path))
-    columns = {}
+    columns: dict[Quantity, Array] = {}
     for quantity in Quantity:
-        source = chosen.get(quantity.column(axis))
+        source = chosen.get(name := quantity.column(axis))
         if source is not None:
-            values = numbers(foreign[source.source], path, source.source)
-            with np.errstate(over="ignore", invalid="ignore"):
-                scaled = source.scale * values + source.offset
-                scaled[~(np.abs(scaled) < LARGEST)] = np.nan
-            columns[quantity] = scaled
+            columns[quantity] = _scaled(_column(foreign, places.get(name), source, path), name, source)
     foreign.clear()  # a large file's columns would stand in memory twice
+    for quantity, values in columns.items():
+        if not values.ndim and quantity is not Quantity.TIME:
+            columns[quantity] = np.full(columns[Quantity.TIME].size, float(values))
     if unused:
         report.append(f"columns not used: {', '.join(unused)}")
     return _checked(path, axis, columns, report)
 
 
+def _column(foreign: dict[str, Any], place: Element | None, source: ColumnSource, path: Path) -> Array:
+    """The numbers of one source, one for each row; without dimensions where one number holds for all."""
+    if place is None:
+        behind = re.search(rf"{re.escape(source.from_name or '')}([-+]?\d+(?:\.\d+)?)", path.name)
+        if behind is None:
+            raise BadInput(f"{path}: file's name", "no number", f"a number behind {source.from_name!r}, as mapped")
+        return np.array(float(behind[1]))
+    column = foreign[place.name]
+    if place.at is not None:
+        column = element(column, place.at, place.row, path, place.name)
+    values = numbers(column, path, place.name)
+    if values.ndim > 1:
+        rows, count = values.shape
+        found, allowed = f"a matrix of {rows} rows and {count} columns", f"from: {place.name}[:,0] to [:,{count - 1}]"
+        raise BadInput(f"{path}: column {place.name}", found, allowed)
+    return values
+
+
+def _scaled(values: Array, name: str, source: ColumnSource) -> Array:
+    """In the canonical unit; what no measurement can be is missing."""
+    scale, offset = source.line(name)
+    with np.errstate(over="ignore", invalid="ignore"):
+        scaled = np.asarray(scale * values + offset)
+        scaled[~(np.abs(scaled) < LARGEST)] = np.nan
+    return scaled
+
+
 def _checked(path: Path, axis: AxisKind, columns: dict[Quantity, Array], report: list[str]) -> Recording:
     """Equal lengths, enough rows, time forward; holes filled and reported."""
-    rows = len(columns[Quantity.TIME])
+    rows = columns[Quantity.TIME].size
     if rows < LEAST_ROWS:
         raise BadInput(f"{path}: column t_s", f"{rows} rows", f"at least {LEAST_ROWS}")
     for quantity, values in columns.items():
@@ -132,27 +262,42 @@ def _checked(path: Path, axis: AxisKind, columns: dict[Quantity, Array], report:
         if len(values) != rows:
             raise BadInput(f"{path}: column {name}", f"{len(values)} rows", f"{rows} rows, as t_s has")
         missing = np.count_nonzero(~np.isfinite(values))
-        if quantity in REQUIRED and missing > MOST_MISSING * rows:
+        if quantity in (*REQUIRED, Quantity.TORQUE) and missing > MOST_MISSING * rows:
             raise BadInput(
                 f"{path}: column {name}", f"{missing} of {rows} cells without a number", "at most half missing"
             )
     measured = np.isfinite(columns[Quantity.POSITION])
     _fill_holes(columns, axis, report)
-    _check_time(path, columns[Quantity.TIME], report)
+    _check_time(path, columns, report)
+    _unwrap(columns, axis, report)
     return Recording(path, axis, columns, measured, tuple(report))
+
+
+def _unwrap(columns: dict[Quantity, Array], axis: AxisKind, report: list[str]) -> None:
+    """Join a position that wraps, with its reference, and ask where it looks like another unit."""
+    position = columns[Quantity.POSITION]
+    size, name = find_wrap(position), Quantity.POSITION.column(axis)
+    if (doubt := doubtful_unit(position, size, axis is AxisKind.ROTARY)) is not None:
+        report.append(f"{name}: {doubt}")
+    if size is None:
+        return
+    joined = unwrapped(position, size)
+    jumps = int(np.count_nonzero(np.abs(np.diff(position)) > 0.5 * size))
+    columns[Quantity.POSITION] = joined
+    if (reference := columns.get(Quantity.REFERENCE)) is not None:
+        columns[Quantity.REFERENCE] = beside(reference, position, joined, size)
+    report.append(f"{name}: {jumps} jumps of {size:.6g}, joined: the position wraps there")
 
 
 def _fill_holes(columns: dict[Quantity, Array], axis: AxisKind, report: list[str]) -> None:
     """Fill missing cells of the required columns: time and position linearly, torque by its last value."""
-    for quantity in REQUIRED:
-        values = columns[quantity]
-        holes = ~np.isfinite(values)
-        if not holes.any():
+    for quantity in (Quantity.TIME, Quantity.TORQUE, Quantity.POSITION):
+        values = columns.get(quantity)
+        if values is None or not (holes := ~np.isfinite(values)).any():
             continue
         row = np.arange(len(values), dtype=np.float64)
         if quantity is Quantity.TORQUE:
-            kept = np.maximum.accumulate(np.where(holes, -1, np.arange(len(values))))
-            columns[quantity] = values[np.where(kept < 0, int(np.argmin(holes)), kept)]
+            columns[quantity] = _held(values)
         else:
             along = row if quantity is Quantity.TIME else columns[Quantity.TIME]
             columns[quantity] = np.interp(along, along[~holes], values[~holes])
@@ -167,8 +312,36 @@ def _filled(t_s: Array, values: Array) -> Array:
     return np.interp(t_s, t_s[known], values[known]) if known.any() else values
 
 
-def _check_time(path: Path, t_s: Array, report: list[str]) -> None:
+#: No gap is told to be of more samples than this.
+_MOST_MISSING = 1e9
+
+
+def missing_samples(t_s: Array, cycle: Array | None = None) -> NDArray[np.int64]:
+    """How many samples are missing before each row but the first, shape (n - 1,).
+
+    By the numbers of the cycles where they count rows: a stamp says when its cycle began, and one that began late
+    leaves a gap in time behind which nothing is missing. Else by the stamps, of which one that is late makes the next
+    step as much shorter.
+    """
+    if len(t_s) < 2:
+        return np.zeros(0, dtype=np.int64)
+    if cycle is not None:
+        counted = np.diff(cycle)
+        if np.all(counted >= 1.0) and np.median(counted) == 1.0:
+            return counted.astype(np.int64) - 1
+    with np.errstate(over="ignore", invalid="ignore"):  # stamps of a bent file may be any number
+        steps = np.diff(t_s)
+        period = float(np.median(steps))
+        if not period > 0.0:
+            return np.zeros(len(steps), dtype=np.int64)
+        late = np.append(np.maximum(period - steps[1:], 0.0), 0.0)
+        missing = np.nan_to_num(np.round((steps - late) / period) - 1.0, nan=0.0)
+        return np.where(steps > 1.5 * period, np.clip(missing, 0.0, _MOST_MISSING), 0.0).astype(np.int64)
+
+
+def _check_time(path: Path, columns: dict[Quantity, Array], report: list[str]) -> None:
     """Time must not run backwards; doubled stamps, uneven steps and gaps are reported."""
+    t_s = columns[Quantity.TIME]
     steps = np.diff(t_s)
     back = np.flatnonzero(steps < 0.0)
     if len(back):
@@ -186,13 +359,12 @@ def _check_time(path: Path, t_s: Array, report: list[str]) -> None:
     if doubled:
         report.append(f"t_s: {doubled} time stamps twice; such rows get the same simulated value")
     uneven = np.abs(steps - period) > UNEVEN_SHARE * period
-    gaps = steps > 1.5 * period
-    if gaps.any():
-        lost = int(np.sum(np.round(steps[gaps] / period) - 1.0))
-        worst = int(np.argmax(steps))
+    missing = missing_samples(t_s, columns.get(Quantity.CYCLE))
+    if missing.any():
+        worst = int(np.argmax(np.where(missing > 0, steps, 0.0)))
         report.append(
-            f"t_s: {int(gaps.sum())} gaps, about {lost} samples missing, the longest {steps[worst]:.4g} s at "
-            f"{t_s[worst]:.6g} s; simulated on the recorded stamps"
+            f"t_s: {np.count_nonzero(missing)} gaps, about {missing.sum()} samples missing, the longest "
+            f"{steps[worst]:.4g} s at {t_s[worst]:.6g} s; simulated on the recorded stamps"
         )
     if uneven.mean() > 0.01:
         share = 100.0 * float(uneven.mean())

@@ -16,6 +16,7 @@ from servod.lab.diagnose.document import (
     MATHEMATICS,
     REMEDIES,
     describe_certainty,
+    describe_fit,
     describe_rest,
     diagnosis_document,
     next_experiments,
@@ -108,6 +109,13 @@ def _what(report: DiagnosisReport, evidence: Evidence, document: Document, units
             "The mathematics of this finding",
             [f"Equation: {known['equation']}.", f"Source: {known['source']}.", "Keys in the axis model file:", *keys],
         )
+    for part in document.get("partial", {"effects": []})["effects"]:
+        report.page.heading(f"Part of the answer: {part['effect'].replace('_', ' ')}")
+        report.page.sentence(
+            f"It takes {100.0 * part['share']:.0f} % of the explainable mismatch on rows that the fit has not seen; "
+            "what is left beside it has no name, and may change it."
+        )
+        _parameters(report.page, part["parameters"])
     if evidence.residual is not None:
         report.page.heading("What is left has no name")
         report.figure(table_figure(evidence.residual, units))
@@ -149,11 +157,7 @@ def _small(name: str, size: Document) -> str:
 def _fit(report: DiagnosisReport, evidence: Evidence, document: Document, units: Units) -> None:
     fit, held = document["fit"], document["fit"]["held_out"]
     report.page.heading("The fit before and after")
-    report.page.sentence(
-        f"On rows that the fit has not seen ({held['left_out']} was left out) the torque error went from "
-        f"{held['before']:.3g} to {held['after']:.3g} {fit['unit']}; the noise floor is {fit['noise_floor']:.3g} "
-        f"{fit['unit']}. {100.0 * fit['explainable_removed']:.0f} % of what could be explained is gone."
-    )
+    report.page.sentence(describe_fit(document))
     if held["not_judged_s"]:
         report.page.sentence(
             f"Errors leave out {held['not_judged_s']:.2g} s in and behind an external torque that came once: nothing "
@@ -165,13 +169,26 @@ def _fit(report: DiagnosisReport, evidence: Evidence, document: Document, units:
     ]
     header = ("simulated freely for", "model as it came", "recalibrated only", "with what was found", "unit")
     report.page.table(PageTable("Position errors", header, tuple(rows)))
+    _held_out(report.page, document)
     torque = {r["name"]: (r["mismatch_before"], r["mismatch_after"]) for r in document["recordings"] if r["taken"]}
     panels = [figures.before_after(torque, units.force, "torque error")]
     for horizon, window in fit["windows"].items():
         errors = {name: (w["before"], w["after"]) for name, w in window["recordings"].items()}
         panels.append(figures.before_after(errors, units.length, f"position after {horizon} s", named=False))
-    report.figure(figures.bars(panels, evidence.left_out))
+    report.figure(figures.bars(panels, evidence.quality.left_out))
     report.figure(figures.over_time(evidence.recordings, units))
+
+
+def _held_out(page: Page, document: Document) -> None:
+    """Recordings that no fit has seen."""
+    rows = [
+        (name, f"{horizon} s", f"{w['before']:.4g}", f"{w['after']:.4g}", f"{w['coasting']:.4g}", w["unit"])
+        for name, windows in document.get("held_out", {}).items()
+        for horizon, w in windows.items()
+    ]
+    if rows:
+        header = ("held out", "simulated freely for", "model as it came", "model.yaml", "going on at its speed", "unit")
+        page.table(PageTable("Recordings that no fit has seen", header, tuple(rows)))
 
 
 def _remains(report: DiagnosisReport, evidence: Evidence, document: Document, units: Units) -> None:
@@ -180,7 +197,7 @@ def _remains(report: DiagnosisReport, evidence: Evidence, document: Document, un
     report.figure(figures.map_grid(evidence.maps_before, evidence.maps_after, units))
     report.figure(figures.spectrum(evidence.quality.spectrum_before, evidence.quality.spectrum_after, units))
     if evidence.quality.windows:
-        report.figure(figures.window_course(evidence.quality.windows, evidence.left_out, units))
+        report.figure(figures.window_course(evidence.quality.windows, evidence.quality.left_out, units))
 
 
 def _experiments(page: Page, document: Document) -> None:

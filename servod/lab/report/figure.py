@@ -7,12 +7,13 @@ tell apart, and line styles differ as well, so that a figure survives black and 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import Enum
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from servod.common.errors import visible
 
 Array = NDArray[np.float64]
 
@@ -51,8 +52,18 @@ class ScaleKind(Enum):
     LOG = "log"
 
 
+class Worded:
+    """What is drawn with words that may come from a file's name: none of them acts on what stands beside it."""
+
+    def __post_init__(self) -> None:
+        for key in (field.name for field in fields(self) if field.name != "name"):  # type: ignore[arg-type]
+            words = getattr(self, key)
+            if isinstance(words, str):
+                object.__setattr__(self, key, visible(words))
+
+
 @dataclass(frozen=True)
-class Curve:
+class Curve(Worded):
     """One curve. Curves with the same `label` share one entry of the legend, without a label they have none; `detail`
     tells curves apart under the mouse.
 
@@ -71,7 +82,7 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class PlotAxis:
+class PlotAxis(Worded):
     """One axis: its label with the unit, its scale, and its range where the data should not choose it.
 
     `names` stand at 0, 1, 2, ... in place of numbers.
@@ -84,7 +95,7 @@ class PlotAxis:
 
 
 @dataclass(frozen=True)
-class PlotPanel:
+class PlotPanel(Worded):
     """One pair of axes with its curves."""
 
     x: PlotAxis
@@ -94,7 +105,7 @@ class PlotPanel:
 
 
 @dataclass(frozen=True)
-class Figure:
+class Figure(Worded):
     """Panels, row by row in `columns` columns. `name` is the stem of its picture files; `caption` says what is seen."""
 
     name: str
@@ -153,17 +164,28 @@ Series = NDArray[np.float64]
 _POINTS = 1800
 
 
-def thin(time_s: Series, values: Series, points: int = _POINTS) -> tuple[Series, Series]:
-    """At most about `points` samples of a series: lowest and highest of each bin, in their order in time."""
-    bins = points // 2
-    if len(values) <= points:
-        return time_s, values
-    edges = np.linspace(0, len(values), bins + 1).astype(int)
-    pairs = [_extremes(values, a, b) for a, b in pairwise(edges)]
-    index = np.unique(np.concatenate(pairs))
-    return time_s[index], values[index]
+def thin(x: Series, values: Series, points: int = _POINTS) -> tuple[Series, Series]:
+    """At most about `points` samples of a series, in their order: those of `extremes`."""
+    index = extremes(values, points)
+    return x[index], values[index]
 
 
-def _extremes(values: Series, first: int, last: int) -> list[int]:
-    part = values[first:last]
-    return [first + int(part.argmin()), first + int(part.argmax())]
+def extremes(values: Series, most: int) -> NDArray[np.intp]:
+    """Places of at most `most` values that look like all of them: the first and the last, and of equal bins the lowest,
+    the highest, and one that is no number where there is one, so that a gap stays a gap.
+    """
+    rows = np.arange(len(values))
+    if len(values) <= most:
+        return rows
+    no_number = bool(np.isnan(values).any())
+    width = -(-len(values) // max((most - 2) // (3 if no_number else 2), 1))
+    table = np.pad(values, (0, -len(values) % width), constant_values=np.nan).reshape(-1, width)
+    holes, begins = np.isnan(table), rows[::width]
+    kept = [
+        begins + np.where(holes, np.inf, table).argmin(axis=1),
+        begins + np.where(holes, -np.inf, table).argmax(axis=1),
+    ]
+    if no_number:
+        first = begins + holes.argmax(axis=1)
+        kept.append(first[holes.any(axis=1) & (first < len(values))])
+    return np.unique(np.concatenate([*kept, rows[[0, -1]]]))

@@ -6,6 +6,9 @@
 "use strict";
 
 const MOST_IN_VIEW = 4000, PRINT_PX = 690, LEAST_COLUMN_PX = 210, ROW_PX = 230, PRINT_ROW_PX = 165, HOVERED = 6;
+const LEAST_LEFT_PX = 50, RIGHT_PX = 12, GAP_PX = 6;
+const BESIDE_PX = 28, NAME_PX = 17; // above and below a panel; what a name of its scale needs
+const TICK_FONT = "12px system-ui, sans-serif"; // that of .panel text in page.css
 
 // --- Rows ---
 
@@ -34,20 +37,25 @@ function place(x, at) {
   return a;
 }
 
-// The rows between `from` and `to` with a neighbour on each side; more than `most` as extremes of equal bins.
+// The rows between `from` and `to` with a neighbour on each side; of more than `most` the first, the last, and of equal
+// bins the lowest, the highest, and one that is no number.
 function view(x, y, from, to, most) {
   const a = Math.max(place(x, from) - 1, 0), b = Math.min(place(x, to) + 1, x.length);
   if (b - a <= most) return [Array.from(x.subarray(a, b)), Array.from(y.subarray(a, b))];
-  const bins = most >> 1, xs = [], ys = [];
+  const bins = Math.floor((most - 2) / 3), xs = [x[a]], ys = [y[a]];
   for (let k = 0; k < bins; k++) {
     const p = a + Math.floor((k * (b - a)) / bins), q = a + Math.floor(((k + 1) * (b - a)) / bins);
-    let low = p, high = p;
-    for (let i = p + 1; i < q; i++) {
-      if (y[i] < y[low] || Number.isNaN(y[low])) low = i;
-      if (y[i] > y[high] || Number.isNaN(y[high])) high = i;
+    let low = -1, high = -1, hole = -1;
+    for (let i = p; i < q; i++) {
+      if (Number.isNaN(y[i])) { hole = i; continue; }
+      if (low < 0 || y[i] < y[low]) low = i;
+      if (high < 0 || y[i] > y[high]) high = i;
     }
-    for (const i of low === high ? [low] : [Math.min(low, high), Math.max(low, high)]) { xs.push(x[i]); ys.push(y[i]); }
+    const kept = new Set([low, high, hole].filter((i) => i > a && i < b - 1).sort((i, j) => i - j));
+    for (const i of kept) { xs.push(x[i]); ys.push(y[i]); }
   }
+  xs.push(x[b - 1]);
+  ys.push(y[b - 1]);
   return [xs, ys];
 }
 
@@ -58,7 +66,7 @@ const raised = (n) => String(n).replace(/[-\d]/g, (c) => (c === "-" ? "⁻" : "�
 
 function extent(lists) {
   let low = Infinity, high = -Infinity;
-  for (const list of lists) for (const v of list) { if (v < low) low = v; if (v > high) high = v; }
+  for (const list of lists) for (const v of list) if (Number.isFinite(v)) { if (v < low) low = v; if (v > high) high = v; }
   if (low > high) return [0, 1];
   return low === high ? [low - (Math.abs(low) || 1) * 0.5, high + (Math.abs(high) || 1) * 0.5] : [low, high];
 }
@@ -92,6 +100,24 @@ function ticks(scale, from, to, most) {
   const decimals = Math.min(12, Math.max(0, -Math.floor(Math.log10(step / unit) + 1e-9)));
   const words = (v) => (v / unit).toFixed(decimals).replace(/^-(0(\.0+)?)$/, "$1").replace("-", "−");
   return { at, words, factor: power ? ` ×10${raised(power)}` : "" };
+}
+
+// How wide the words of a tick are, in px: measured as they are drawn; without a page by the widest digit of any font.
+const wide = (() => {
+  const pen = typeof document === "undefined" ? null : document.createElement("canvas").getContext("2d");
+  if (pen) pen.font = TICK_FONT;
+  return (words) => (pen ? pen.measureText(words).width : 7.7 * words.length);
+})();
+
+const widest = (tick) => Math.max(0, ...tick.at.map((v) => wide(tick.words(v))));
+const leftRoom = (tick) => Math.max(LEAST_LEFT_PX, Math.ceil(GAP_PX + widest(tick)) + 2);
+
+// The ticks of a scale that lies, as many as stand beside one another.
+function apart(scale, from, to, room) {
+  for (let most = room / 75; ; most *= 0.7) {
+    const found = ticks(scale, from, to, most);
+    if (most < 1 || found.at.length < 3 || found.at.length * (widest(found) + 8) <= room) return found;
+  }
 }
 
 // --- Panels ---
@@ -151,21 +177,26 @@ class Panel {
     return [a - more, b + more];
   }
 
-  // Room that the names of a scale take on the left of a panel; in a narrow one they stand inside.
-  leftOf(width) {
-    const letters = this.y.names && width >= 420 ? Math.max(...this.y.names.map((name) => name.length)) : 0;
-    return Math.max(50, Math.min(0.4 * width, 14 + 7.4 * letters));
+  // What is drawn at this width, and the room that the words of its scale take on the left; names that would take too
+  // much of a panel stand inside.
+  lay(width) {
+    const hidden = this.figure.hidden;
+    const shown = this.curves.map((curve, k) => ({ curve, ...this.drawn(k) })).filter((s) => !hidden.has(s.curve.label));
+    const named = BESIDE_PX + NAME_PX * (this.y.names?.length ?? 0), [low, high] = this.yRange(shown);
+    const height = Math.max(named, Math.round((Figure.printing ? PRINT_ROW_PX : ROW_PX) * this.figure.rowHeight));
+    const ty = ticks(this.y, low, high, (height - BESIDE_PX) / 38), left = leftRoom(ty);
+    const narrow = this.y.names !== undefined && (width < 420 || left > 0.4 * width);
+    this.plan = { shown, height, low, high, ty, narrow };
+    return narrow ? LEAST_LEFT_PX : left;
   }
 
   draw(width, left) {
-    const hidden = this.figure.hidden, narrow = width < 420 && this.y.names;
-    const shown = this.curves.map((curve, k) => ({ curve, ...this.drawn(k) })).filter((s) => !hidden.has(s.curve.label));
-    const height = Math.round((Figure.printing ? PRINT_ROW_PX : ROW_PX) * this.figure.rowHeight), [a, b] = this.range(), [low, high] = this.yRange(shown);
-    const box = { left, right: width - 12, top: 6, bottom: height - 22 };
+    const { shown, height, low, high, ty, narrow } = this.plan, [a, b] = this.range();
+    const box = { left, right: width - RIGHT_PX, top: 6, bottom: height - BESIDE_PX + 6 };
     this.box = box;
     this.toX = (v) => box.left + (((this.x.log ? log10(v) : v) - a) / (b - a)) * (box.right - box.left);
     this.toY = (v) => box.bottom - (((this.y.log ? log10(v) : v) - low) / (high - low)) * (box.bottom - box.top);
-    const tx = ticks(this.x, a, b, (box.right - box.left) / 75), ty = ticks(this.y, low, high, (box.bottom - box.top) / 38);
+    const tx = apart(this.x, a, b, box.right - box.left);
     this.factors(tx.factor, ty.factor);
     this.svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
     this.svg.setAttribute("width", width);
@@ -184,13 +215,14 @@ class Panel {
   grid(tx, ty, narrow) {
     const { left, right, top, bottom } = this.box, at = (v, log) => (log ? 10 ** v : v), parts = [];
     for (const v of tx.at) {
-      const x = this.toX(at(v, this.x.log)).toFixed(1), end = x > right - 16 ? "end" : x < left + 8 ? "start" : "middle";
-      parts.push(`<path class="grid" d="M${x} ${top}V${bottom}"/><text x="${x}" y="${bottom + 15}" text-anchor="${end}">${escaped(tx.words(v))}</text>`);
+      const x = this.toX(at(v, this.x.log)).toFixed(1), words = tx.words(v), half = wide(words) / 2 + 1;
+      const middle = Math.max(half, Math.min(x, right + RIGHT_PX - half)).toFixed(1);
+      parts.push(`<path class="grid" d="M${x} ${top}V${bottom}"/><text x="${middle}" y="${bottom + 15}" text-anchor="middle">${escaped(words)}</text>`);
     }
     for (const v of ty.at) {
       const y = this.toY(at(v, this.y.log)).toFixed(1);
       parts.push(`<path class="grid" d="M${left} ${y}H${right}"/>`);
-      if (!narrow) parts.push(`<text x="${left - 6}" y="${+y + 4}" text-anchor="end">${escaped(ty.words(v))}</text>`);
+      if (!narrow) parts.push(`<text x="${left - GAP_PX}" y="${+y + 4}" text-anchor="end">${escaped(ty.words(v))}</text>`);
     }
     parts.push(`<path class="frame" d="M${left} ${top}V${bottom}H${right}"/>`);
     return parts.join("");
@@ -285,7 +317,7 @@ class Panel {
     for (const curve of this.curves) {
       if (!curve.sorted || curve.style === "bars" || this.figure.hidden.has(curve.label) || !curve.x.length) continue;
       const k = Math.min(place(curve.x, at), curve.x.length - 1);
-      const value = this.y.names ? this.y.names[Math.round(curve.y[k])] ?? "" : String(+curve.y[k].toPrecision(5));
+      const value = this.y.names ? this.y.names[Math.round(curve.y[k])] ?? "" : String(+curve.y[k].toPrecision(7));
       lines.push(`${curve.detail || curve.label || this.y.label}: ${value}`);
     }
     box.hidden = !lines.length;
@@ -343,8 +375,9 @@ class Figure {
     const each = Math.floor((width - gap * (columns - 1)) / columns), rows = Math.ceil(this.panels.length / this.columns);
     this.panels.forEach((panel, k) => {
       panel.element.style.order = columns === 1 ? (k % this.columns) * rows + Math.floor(k / this.columns) : k;
-      panel.draw(each, columns === 1 ? Math.max(...this.panels.map((p) => p.leftOf(each))) : panel.leftOf(each));
     });
+    const lefts = this.panels.map((panel) => panel.lay(each)), widest = Math.max(...lefts);
+    this.panels.forEach((panel, k) => panel.draw(each, columns === 1 ? widest : lefts[k]));
   }
 }
 
@@ -381,5 +414,5 @@ async function begin() {
 }
 
 Figure.printing = false;
-if (typeof document === "undefined") module.exports = { loaded, view, ticks, extent };
+if (typeof document === "undefined") module.exports = { loaded, view, ticks, extent, leftRoom, apart, wide };
 else window.servodReady = begin();

@@ -15,6 +15,7 @@ import platform
 import re
 import shutil
 import subprocess
+import time
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -24,9 +25,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import servod
+from servod.common.errors import visible
 from servod.common.files import write_bytes
+from servod.common.units import NS_PER_S
 from servod.formats.config import AxisConfig
-from servod.lab.report.figure import Array, Curve, Figure, PageTable, PlotAxis, PlotPanel, ScaleKind, Style
+from servod.formats.recording.mcap_reader import recorded_at_ns
+from servod.lab.report.figure import Array, Curve, Figure, PageTable, PlotAxis, PlotPanel, ScaleKind, Style, extremes
 
 _HERE = Path(__file__).parent
 #: What is aligned as a number.
@@ -34,8 +38,13 @@ _NUMBER = re.compile(r"[-+−–<≤≥]? ?\d|[-–]$")
 _TEXT = ' class="text"'
 #: Letters from which a cell is not squeezed to a word a line; rows up to which a table is not parted on paper.
 _LONG, _SHORT_TABLE = 30, 15
-#: Digits of a hash that are shown; all of them stand under the pointer.
-_SHORT = 12
+#: What an origin calls the recordings that its page is about.
+_RECORDINGS = ("recording", "recordings")
+
+
+def _text(words: str) -> str:
+    """Words as HTML, whatever they hold."""
+    return html.escape(visible(words))
 
 
 class Verdict(NamedTuple):
@@ -48,22 +57,36 @@ class Verdict(NamedTuple):
         """The first paragraph of the page."""
         kind = {True: "passed", False: "failed", None: "told"}[self.passed]
         word = {True: "Passed: ", False: "Refused: ", None: ""}[self.passed]
-        return f'<p id="verdict" class="{kind}">{html.escape(word + self.text)}</p>'
+        return f'<p id="verdict" class="{kind}">{_text(word + self.text)}</p>'
 
 
 @dataclass(frozen=True)
 class Origin:
     """What a report was made from: files by what they are, and the axis whose drives it is about.
 
-    Files are hashed when the page is made; one that is not there (any more) is left out. `nodes` are those of the
-    daemon's status, with the identity that each told; without them the configuration's counts. `facts` are further
-    lines by their names.
+    Files are hashed when this is made, right after they were read, unless their reader has told their `sha256`; one
+    that is not there is left out. `nodes` are those of the daemon's status, with the identity that each told; without
+    them the configuration's counts. `facts` are further lines by their names. Files that it calls "recording" or
+    "recordings" tell themselves when that was; `recorded_ns` does so for cycles that stand in no file (time of day of
+    the first, ns since 1970).
     """
 
     files: Mapping[str, Path | Sequence[Path]] = field(default_factory=dict)
     axis: AxisConfig | None = None
     nodes: Sequence[Mapping[str, Any]] = ()
     facts: Mapping[str, str] = field(default_factory=dict)
+    recorded_ns: int | None = None
+    sha256: Mapping[Path, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        files = {file for name in self.files for file in self.given(name)} - set(self.sha256)
+        now = {file: hashlib.sha256(file.read_bytes()).hexdigest() for file in files if file.is_file()}
+        object.__setattr__(self, "sha256", {**now, **self.sha256})
+
+    def given(self, name: str) -> list[Path]:
+        """The files of a name, as a list."""
+        found = self.files.get(name, ())
+        return [found] if isinstance(found, Path) else list(found)
 
 
 class Page:
@@ -78,27 +101,27 @@ class Page:
     def heading(self, text: str) -> None:
         """Begin a section."""
         self._heading = text
-        self._parts.append(f"<h2>{html.escape(text)}</h2>")
+        self._parts.append(f"<h2>{_text(text)}</h2>")
 
     def sentence(self, text: str) -> None:
         """Add a paragraph of plain text."""
-        self._parts.append(f"<p>{html.escape(text)}</p>")
+        self._parts.append(f"<p>{_text(text)}</p>")
 
     def points(self, lines: Sequence[str]) -> None:
         """Add a list of plain sentences."""
         if lines:
-            self._parts.append("<ul>" + "".join(f"<li>{html.escape(line)}</li>" for line in lines) + "</ul>")
+            self._parts.append("<ul>" + "".join(f"<li>{_text(line)}</li>" for line in lines) + "</ul>")
 
     def folded(self, title: str, lines: Sequence[str]) -> None:
         """Add paragraphs that are shown when their title is clicked: mathematics, and what few readers need."""
-        inner = "".join(f"<p>{html.escape(line)}</p>" for line in lines)
-        self._parts.append(f"<details><summary>{html.escape(title)}</summary>{inner}</details>")
+        inner = "".join(f"<p>{_text(line)}</p>" for line in lines)
+        self._parts.append(f"<details><summary>{_text(title)}</summary>{inner}</details>")
 
     def table(self, table: PageTable, folded: bool = False) -> None:
         """Add a table; a `folded` one is shown when its title is clicked. Without rows nothing is added."""
         if table.rows:
             shown = table_html(table, caption=not folded and table.title != self._heading)
-            title = html.escape(table.title)
+            title = _text(table.title)
             self._parts.append(f"<details><summary>{title}</summary>{shown}</details>" if folded else shown)
 
     def html_part(self, text: str) -> None:
@@ -112,7 +135,7 @@ class Page:
 
     def html(self) -> str:
         """The whole page."""
-        title, style = html.escape(self._title), (_HERE / "page.css").read_text()
+        title, style = _text(self._title), (_HERE / "page.css").read_text()
         return (
             f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
             '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -150,16 +173,16 @@ def table_html(table: PageTable, caption: bool = True, shades: Sequence[Sequence
         looks = [_look(words, cell) for words, cell in zip(text[1:], rest, strict=True)]
         if shades:
             looks = [f' class="share{shade}"' if shade else "" for shade in shades[index]]
-        cells = "".join(f"<td{look}>{html.escape(cell)}</td>" for look, cell in zip(looks, rest, strict=True))
+        cells = "".join(f"<td{look}>{_text(cell)}</td>" for look, cell in zip(looks, rest, strict=True))
         failed = ' class="failed"' if "failed" in rest else ""
-        lines.append(f'<tr{failed}><th scope="row">{html.escape(first)}</th>{cells}</tr>')
+        lines.append(f'<tr{failed}><th scope="row">{_text(first)}</th>{cells}</tr>')
     head = "".join(
-        f'<th scope="col"{_TEXT if words else ""}>{html.escape(cell)}</th>'
+        f'<th scope="col"{_TEXT if words else ""}>{_text(cell)}</th>'
         for cell, words in zip(table.header, text, strict=True)
     )
-    title, kind = html.escape(table.title or table.header[0]), ' class="cells"' if shades else ""
+    title, kind = _text(table.title or table.header[0]), ' class="cells"' if shades else ""
     short = " short" if len(table.rows) <= _SHORT_TABLE else ""
-    above = f"<caption>{html.escape(table.title)}</caption>" if caption and table.title else ""
+    above = f"<caption>{_text(table.title)}</caption>" if caption and table.title else ""
     return (
         f'<div class="scroll{short}" role="region" tabindex="0" aria-label="Table: {title}"><table{kind}>{above}'
         f"<thead><tr>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table></div>"
@@ -193,21 +216,38 @@ def _running_head(title: str) -> str:
 
 def signature(origin: Origin) -> str:
     """The block below the verdict."""
-    now = datetime.datetime.now().astimezone()
-    utc = now.astimezone(datetime.UTC)
-    local = now.strftime("%Y-%m-%d %H:%M:%S %z")
     rows = [
-        ("date", html.escape(f"{utc:%Y-%m-%d %H:%M:%S} UTC (here {local[:-2]}:{local[-2:]})")),
-        ("host", html.escape(f"{platform.node()}, {platform.machine()}")),
-        ("servod", html.escape(f"{servod.__version__}{_commit()}")),
-        ("Python", html.escape(f"{platform.python_version()}, numpy {np.__version__}")),
-        ("kernel", html.escape(f"{platform.system()} {platform.release()}")),
-        *((html.escape(name), html.escape(fact)) for name, fact in origin.facts.items()),
-        *(("drive", html.escape(line)) for line in drives(origin)),
+        ("drawn", _text(_time_of_day(time.time_ns()))),
+        *(("recorded", _text(line)) for line in _recorded(origin)),
+        ("host", _text(f"{platform.node()}, {platform.machine()}")),
+        ("servod", _text(f"{servod.__version__}{_commit()}")),
+        ("Python", _text(f"{platform.python_version()}, numpy {np.__version__}")),
+        ("kernel", _text(f"{platform.system()} {platform.release()}")),
+        *((_text(name), _text(fact)) for name, fact in origin.facts.items()),
+        *(("drive", _text(line)) for line in drives(origin)),
         *(("file", line) for line in _files(origin)),
     ]
     inner = "".join(f"<dt>{name}</dt><dd>{value}</dd>" for name, value in rows)
     return f'<section id="signature" aria-label="Signature"><dl>{inner}</dl></section>'
+
+
+def _time_of_day(time_ns: int) -> str:
+    """A time in UTC, and as the clock on this machine's wall shows it."""
+    utc = datetime.datetime.fromtimestamp(time_ns // NS_PER_S, datetime.UTC)
+    local = utc.astimezone().strftime("%Y-%m-%d %H:%M:%S %z")
+    return f"{utc:%Y-%m-%d %H:%M:%S} UTC (here {local[:-2]}:{local[-2:]})"
+
+
+def _recorded(origin: Origin) -> list[str]:
+    """When the recordings that the page is about began, first and last; a page without recordings has no such line."""
+    if origin.recorded_ns is not None:
+        return [_time_of_day(origin.recorded_ns)]
+    files = [file for name in _RECORDINGS for file in origin.given(name) if file.is_file()]
+    told = sorted(at for file in files if (at := recorded_at_ns(file)) is not None)
+    if not told:
+        return ["not told: no time of day stands in the files"] if files else []
+    first, last = _time_of_day(told[0]), _time_of_day(told[-1])
+    return [first if len(files) == 1 else f"{first} to {last}, {len(told)} of {len(files)} files tell it"]
 
 
 def drives(origin: Origin) -> list[str]:
@@ -232,23 +272,24 @@ def _drive(node: Mapping[str, Any]) -> str:
 def _files(origin: Origin) -> list[str]:
     """Each file with its hash; of a list one line with the hash over all of them."""
     lines = []
-    for what, given in origin.files.items():
-        files = [file for file in ([given] if isinstance(given, Path) else given) if file.is_file()]
+    for what in origin.files:
+        files = [file for file in origin.given(what) if file in origin.sha256]
         if not files:
             continue
-        hashes = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
+        hashes = [origin.sha256[file] for file in files]
         if len(files) == 1:
-            lines.append(f"{html.escape(f'{what}: {files[0].name}')} {_hash(hashes[0])}")
+            lines.append(f"<bdi>{_text(f'{what}: {files[0].name}')}</bdi> {_hash(hashes[0])}")
             continue
-        each = "".join(f"<div>{html.escape(f.name)} {_hash(h)}</div>" for f, h in zip(files, hashes, strict=True))
+        named = zip(files, hashes, strict=True)
+        each = "".join(f"<div><bdi>{_text(file.name)}</bdi> {_hash(one)}</div>" for file, one in named)
         whole = hashlib.sha256("".join(hashes).encode()).hexdigest()
-        title = f"{html.escape(what)}: {len(files)} files {_hash(whole)}"
+        title = f"{_text(what)}: {len(files)} files {_hash(whole)}"
         lines.append(f"<details><summary>{title}</summary>{each}</details>")
     return lines
 
 
 def _hash(sha256: str) -> str:
-    return f'<code class="hash" title="SHA-256 {sha256}">{sha256[:_SHORT]}</code>'
+    return f'<code class="hash" dir="ltr" title="SHA-256">{sha256}</code>'
 
 
 def _commit() -> str:
@@ -275,6 +316,8 @@ MOST_ROWS, MOST_BYTES = 600_000, 24_000_000
 _LEAST_ROWS = 4000
 #: Times that differ from an even grid by less than this share of a step are that grid.
 _EVEN = 1e-3
+#: Share of its usual step that a value may lose when it is kept in four bytes.
+_LOST = 1e-2
 #: Rows of panels up to which a figure stands whole on a sheet of paper.
 _SHORT_ROWS = 3.0
 _TOOLS = (
@@ -290,8 +333,8 @@ class PageData:
     def __init__(self, figures: Sequence[Figure]) -> None:
         self._arrays: list[dict[str, Any]] = []
         self._places: dict[bytes, int] = {}
-        lengths = {id(c.y): len(c.y) for f in figures for p in f.panels for c in p.curves}
-        self.most_rows = _most_rows(list(lengths.values()))
+        shown = [y for f in figures for p in f.panels for c in p.curves for y in (c.y, *(c.bounds or ()))]
+        self.most_rows = _most_rows([(len(y), _bytes_each(y)) for y in {id(y): y for y in shown}.values()])
         self._figures = [self._figure(figure) for figure in figures]
 
     def document(self) -> dict[str, Any]:
@@ -308,15 +351,20 @@ class PageData:
             }
             for p in figure.panels
         ]
-        return {"name": figure.name, "columns": figure.columns, "row_height": figure.row_height, "panels": panels}
+        return {
+            "name": visible(figure.name),
+            "columns": figure.columns,
+            "row_height": figure.row_height,
+            "panels": panels,
+        }
 
     def _curve(self, curve: Curve, panel: PlotPanel) -> dict[str, Any]:
         held = {"label": curve.label, "detail": curve.detail, "colour": curve.colour.name.lower()}
         held |= {"style": curve.style.value, "width": curve.width}  # type: ignore[dict-item]
-        x, y = at_most(curve.x, curve.y, self.most_rows)
-        places: dict[str, Any] = {"x": self._series(x, precise=True), "y": self._series(y)}
+        kept = extremes(curve.y, self.most_rows)
+        places: dict[str, Any] = {"x": self._series(curve.x[kept], precise=True), "y": self._series(curve.y[kept])}
         if curve.bounds is not None:
-            places |= {"low": self._series(curve.bounds[0]), "high": self._series(curve.bounds[1])}
+            places |= {key: self._series(y[kept]) for key, y in zip(("low", "high"), curve.bounds, strict=True)}
         return held | places
 
     def _series(self, values: Array, precise: bool = False) -> int:
@@ -331,34 +379,31 @@ class PageData:
 def packed_series(values: Array, precise: bool = False) -> dict[str, Any]:
     """A series as the page keeps it: an even grid by its numbers, others as bytes by their place in a float, deflated.
 
-    `precise` keeps eight bytes of each value, where four would make steps of a long time.
+    Eight bytes of each value where four would make steps of what is smooth; `precise`: of all but an even grid.
     """
     if precise and len(values) > 1:
         step = (values[-1] - values[0]) / (len(values) - 1)
         even = values[0] + step * np.arange(len(values))
         if step > 0.0 and float(np.abs(values - even).max()) < _EVEN * step:
             return {"n": len(values), "from": float(values[0]), "step": float(step)}
-    kind, size = ("f8", 8) if precise else ("f4", 4)
-    raw = np.ascontiguousarray(values, dtype=f"<{kind}").view(np.uint8).reshape(-1, size)
-    return {"kind": kind, "z": base64.b64encode(zlib.compress(raw.T.tobytes(), 6)).decode()}
+    size = 8 if precise else _bytes_each(values)
+    raw = np.ascontiguousarray(values, dtype=f"<f{size}").view(np.uint8).reshape(-1, size)
+    return {"kind": f"f{size}", "z": base64.b64encode(zlib.compress(raw.T.tobytes(), 6)).decode()}
 
 
-def at_most(x: Array, y: Array, most: int) -> tuple[Array, Array]:
-    """A curve that is longer than `most` as lowest and highest row of equal bins."""
-    if len(y) <= most:
-        return x, y
-    width = -(-len(y) // (most // 2))
-    whole = len(y) // width * width
-    begins = np.arange(0, whole, width)
-    bins = y[:whole].reshape(-1, width)
-    kept = np.unique(np.concatenate([begins + bins.argmin(axis=1), begins + bins.argmax(axis=1), [len(y) - 1]]))
-    return x[kept], y[kept]
+def _bytes_each(values: Array) -> int:
+    """Four where that loses little of the usual step from row to row: far from zero it would lose the step itself."""
+    known = values[np.isfinite(values)]
+    steps = np.abs(np.diff(known))
+    with np.errstate(over="ignore"):
+        lost = np.abs(known - known.astype(np.float32))
+    return 4 if not steps.any() or lost.max() <= _LOST * np.median(steps[steps > 0.0]) else 8
 
 
-def _most_rows(lengths: list[int]) -> int:
-    """The longest that a curve may be so that all of them together keep MOST_BYTES."""
+def _most_rows(sizes: list[tuple[int, int]]) -> int:
+    """The longest that a curve may be so that all of them, by length and bytes of each value, keep MOST_BYTES."""
     most = MOST_ROWS
-    while most > _LEAST_ROWS and sum(4 * min(length, most) for length in lengths) > MOST_BYTES:
+    while most > _LEAST_ROWS and sum(size * min(length, most) for length, size in sizes) > MOST_BYTES:
         most = max(most * 4 // 5, _LEAST_ROWS)
     return most
 
@@ -368,22 +413,22 @@ def _scale(axis: PlotAxis) -> dict[str, Any]:
     if axis.span is not None:
         scale["span"] = [float(end) for end in axis.span]
     if axis.names:
-        scale["names"] = list(axis.names)
+        scale["names"] = [visible(name) for name in axis.names]
     return scale
 
 
 def figure_html(figure: Figure) -> str:
     """The figure without its curves: title, legend, tools, a place for each panel, caption."""
-    name = html.escape(figure.name)
+    name = _text(figure.name)
     panels = "".join(_panel_html(panel, k) for k, panel in enumerate(figure.panels))
     tools = "".join(
         f'<button type="button" data-act="{act}" aria-label="{says}">{sign}</button>' for act, sign, says in _TOOLS
     )
     short = ' class="short"' if figure.rows * figure.row_height <= _SHORT_ROWS else ""
-    caption = f"<figcaption>{html.escape(figure.caption)}</figcaption>" if figure.caption else ""
+    caption = f"<figcaption>{_text(figure.caption)}</figcaption>" if figure.caption else ""
     return (
-        f'<figure id="figure-{name}"{short} data-figure="{name}" aria-label="{html.escape(figure.title)}">'
-        f'<p class="figure-title">{html.escape(figure.title)}</p>'
+        f'<figure id="figure-{name}"{short} data-figure="{name}" aria-label="{_text(figure.title)}">'
+        f'<p class="figure-title">{_text(figure.title)}</p>'
         f'<div class="controls"><div class="legend">{_legend(figure)}</div><div class="tools">{tools}</div></div>'
         f'<div class="panels">{panels}</div>{caption}</figure>'
     )
@@ -397,7 +442,7 @@ def _legend(figure: Figure) -> str:
     if len(first) < 2:
         return ""
     return "".join(
-        f'<button type="button" aria-pressed="true">{_sample(curve)}{html.escape(label)}</button>'
+        f'<button type="button" aria-pressed="true">{_sample(curve)}{_text(label)}</button>'
         for label, curve in first.items()
     )
 
@@ -416,15 +461,15 @@ def _sample(curve: Curve) -> str:
 
 
 def _panel_html(panel: PlotPanel, number: int) -> str:
-    title = f"<b>{html.escape(panel.title)}</b>" if panel.title else ""
+    title = f"<b>{_text(panel.title)}</b>" if panel.title else ""
     drawn = ", ".join(dict.fromkeys(c.label for c in panel.curves if c.label)) or "curves"
     over = " over ".join(filter(None, (panel.y.label or "states", panel.x.label)))
-    says = html.escape(f"{panel.title + ': ' if panel.title else ''}{over}: {drawn}")
+    says = _text(f"{panel.title + ': ' if panel.title else ''}{over}: {drawn}")
     return (
         f'<div class="panel" data-panel="{number}" role="group" tabindex="0" aria-label="{says}. '
         'Plus and minus zoom, arrows move, 0 shows all.">'
-        f'<p class="panel-head">{title}{html.escape(panel.y.label)}<span class="y-factor"></span></p>'
+        f'<p class="panel-head">{title}{_text(panel.y.label)}<span class="y-factor"></span></p>'
         f'<svg role="img" aria-label="{says}"></svg>'
-        f'<p class="panel-foot">{html.escape(panel.x.label)}<span class="x-factor"></span></p>'
+        f'<p class="panel-foot">{_text(panel.x.label)}<span class="x-factor"></span></p>'
         '<div class="readout" hidden></div></div>'
     )

@@ -62,8 +62,8 @@ class Verification:
         )
 
     def certified(self, gains: GainSet) -> GainSet:
-        """`gains` with the certificate, valid or not, sealed; a seal that was broken stays so."""
-        judged = gains.model_copy(update={"certificate": self.certificate(gains)})
+        """`gains` with the certificate, valid or not, sealed and unsigned; a seal that was broken stays so."""
+        judged = gains.model_copy(update={"certificate": self.certificate(gains), "signature": None})
         return judged if gains.seal_broken else judged.sealed()
 
 

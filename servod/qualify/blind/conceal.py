@@ -10,6 +10,7 @@ import gzip
 import hashlib
 import io
 import json
+import re
 import secrets
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -23,12 +24,12 @@ from numpy.typing import NDArray
 from servod import __version__
 from servod.common.errors import BadInput
 from servod.common.files import read_json, write_bytes
-from servod.qualify.blind import listed
+from servod.qualify.blind import engine, listed
 from servod.qualify.blind.axes import CaseAxis, draw_axis
 from servod.qualify.blind.concealed import NO_THERMOMETER, Concealed, Document, Draw
 from servod.qualify.blind.hidden import HIDE, UNLISTED
 from servod.qualify.blind.physics import Physics
-from servod.qualify.blind.plan import CaseSpec, Cover, Settings, Sort
+from servod.qualify.blind.plan import CaseSpec, Cover, Engine, Settings, Sort
 from servod.qualify.blind.plant import Loop, rest, run
 
 # --- Making a case ---------------------------------------------------------------------------------------------------
@@ -115,11 +116,12 @@ class Case:
 
 @dataclass(frozen=True)
 class CaseRecorder:
-    """How an axis is recorded: the controller, the torque noise in N*m, and whether its temperature is."""
+    """How an axis is recorded: the controller, the torque noise in N*m, whether its temperature is, by which engine."""
 
     loop: Loop
     noise: float
     thermometer: bool
+    engine: Engine = Engine.OWN
 
 
 def make_case(plan: CaseSpec, settings: Settings) -> Case:
@@ -139,7 +141,9 @@ def make_case(plan: CaseSpec, settings: Settings) -> Case:
     physics = _all_changes(axis.physics, hidden)
     plant = _cluttered(physics, axis, rng, plan.effects) if settings.clutter else physics
     noisy = max(settings.noise, BELOW_NOISE if plan.cover is Cover.NOISE else 1.0)
-    recorder = CaseRecorder(loop, TORQUE_NOISE * noisy * axis.physics.coulomb, has_thermometer(hidden, plan.seed))
+    recorder = CaseRecorder(
+        loop, TORQUE_NOISE * noisy * axis.physics.coulomb, has_thermometer(hidden, plan.seed), settings.engine
+    )
     believed = _believed(axis.physics, hidden)
     if plan.cover is Cover.ABSORBED:
         believed = _absorbing(believed, axis, physics, rng)
@@ -218,6 +222,7 @@ def record(
     wanted: Sequence[Array],
 ) -> dict[str, dict[str, Array]]:
     """Three recordings and the one held out of the motions `wanted`; the joint cools a little between them."""
+    follow = engine.run if recorder.engine is Engine.MUJOCO else run
     warm, found = 25.0, {}
     for index, (name, reference) in enumerate(zip(NAMES, wanted, strict=True)):
         here = plant
@@ -226,7 +231,7 @@ def record(
         start = rest(25.0 if any(c.cold for c in hidden) else warm, float(rng.uniform(0.0, 50.0)))
         out = np.zeros((len(reference), 3))
         jitter = ENCODER_NOISE * rng.normal(size=len(reference))
-        run(here, recorder.loop, start, reference, recorder.noise * rng.normal(size=len(reference)), jitter, out)
+        follow(here, recorder.loop, start, reference, recorder.noise * rng.normal(size=len(reference)), jitter, out)
         warm = 25.0 + 0.8 * (float(out[-1, 2]) - 25.0)
         found[name] = _columns(reference, out, rng, recorder.thermometer)
     return found
@@ -308,7 +313,7 @@ def _truth(
         "cover": plan.cover.value,
         "forms": plan.other,
         "off": plan.off,
-        "settings": asdict(settings),
+        "settings": asdict(settings) | {"engine": settings.engine.value},
         "strength": [round(size, 4) for size in seen],
         "coulomb": axis.physics.coulomb,
         "parameters": {
@@ -411,21 +416,40 @@ def read_truth(out: Path, digest: str) -> dict[str, Any]:
 
 FILE = "trial.json"
 _ALLOWED = "what `servoctl prove` wrote"
+#: Folders of cases that lie open, or of a trial that was interrupted before its file was written.
+_CASE = re.compile(r"c\d{3,5}").fullmatch
 
 
 @dataclass(frozen=True)
 class BlindTrial:
-    """The cases of a trial: how many, by which seed, whether the harder ones; and the hash of the sealed truth."""
+    """The cases of a trial and the hash of the sealed truth.
+
+    `cases` are mixed, `null` more conceal nothing; by which seed, whether the harder ones, moved by which engine.
+    """
 
     cases: int
     seed: int
     harder: bool
+    null: int = 0
+    engine: Engine = Engine.OWN
     sha256: str = ""
     version: str = __version__
 
     def same(self, other: BlindTrial) -> bool:
         """Whether both draw the same cases."""
-        return (self.cases, self.seed, self.harder) == (other.cases, other.seed, other.harder)
+        return replace(self, sha256="", version="") == replace(other, sha256="", version="")
+
+    def __str__(self) -> str:
+        null = f" and {self.null} that conceal nothing" if self.null else ""
+        by = "" if self.engine == Engine.OWN else f", moved by {self.engine}"
+        return f"{self.cases} cases of seed {self.seed}{null}" + (", harder" if self.harder else "") + by
+
+
+def foreign_in(out: Path) -> list[str]:
+    """Names in a folder that no trial put there; none where a trial's file says that the folder is one's."""
+    if not out.is_dir() or (out / FILE).exists():
+        return []
+    return sorted(path.name for path in out.iterdir() if path.name not in (CASES, SEALED) and not _CASE(path.name))
 
 
 def write_trial(out: Path, trial: BlindTrial) -> None:

@@ -167,6 +167,8 @@ def document(trial: BlindTrial, cases: list[Scored]) -> dict[str, Any]:
         "sources": next((case.run["sources"] for case in cases if case.run), None),
         "cases": trial.cases,
         "seed": trial.seed,
+        "null": trial.null,
+        "engine": trial.engine,
         "harder": trial.harder,
         "sha256": trial.sha256,
         "table": count.shares(cases, lambda case: case.sort.value),

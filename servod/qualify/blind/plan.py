@@ -5,15 +5,16 @@ Stands above the drawings and below the cases.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from itertools import cycle, islice
+from itertools import chain, cycle, islice
 
 import numpy as np
 
 from servod.qualify.blind import listed
 from servod.qualify.blind.axes import CaseKind
+from servod.qualify.blind.engine import CONCEALS
 from servod.qualify.blind.hidden import HIDE, UNLISTED
 
 
@@ -79,16 +80,34 @@ ALIKE = (
 )
 
 
+class Engine(StrEnum):
+    """Who moves the axes of a trial."""
+
+    OWN = "own"  # the trial's plant
+    MUJOCO = "mujoco"
+
+
 @dataclass(frozen=True)
 class Settings:
-    """How hard a trial is: share of cases whose plant has other forms, 1 % of other effects, factor on the noise."""
+    """How hard a trial is: share of cases whose plant has other forms, 1 % of other effects, factor on the noise.
+
+    `engine` moves the axes, and conceals what it has means for.
+    """
 
     other_forms: float = 0.25
     clutter: bool = False
     noise: float = 1.0
+    engine: Engine = Engine.OWN
 
 
 HARDER = Settings(other_forms=1.0, clutter=True, noise=4.0)
+
+
+def settings_of(harder: bool, engine: Engine) -> Settings:
+    """The settings of a trial. MuJoCo knows no other forms than its own; the harder trial has four times the noise."""
+    if engine is Engine.MUJOCO:
+        return Settings(other_forms=0.0, noise=HARDER.noise if harder else 1.0, engine=engine)
+    return HARDER if harder else Settings()
 
 
 @dataclass(frozen=True)
@@ -105,12 +124,13 @@ class CaseSpec:
     seed: int
 
 
-def plans(cases: int, seed: int, settings: Settings) -> list[CaseSpec]:
-    """The cases of a trial, in an order that tells nothing."""
+def plans(cases: int, seed: int, settings: Settings, null: int = 0) -> list[CaseSpec]:
+    """The cases of a trial and `null` more that conceal nothing, in an order that tells nothing."""
     rng = np.random.default_rng(seed)
     covers = islice(cycle(COVERS), int(rng.integers(len(COVERS))), None)
     made = []
-    for number, (sort, effects) in enumerate(contents(cases, rng)):
+    nothing: Iterator[tuple[Sort, tuple[str, ...]]] = ((Sort.NOTHING, ()) for _ in range(null))
+    for number, (sort, effects) in enumerate(chain(contents(cases, rng, settings.engine), nothing)):
         other = sort in {Sort.SINGLE, Sort.PAIR} and bool(rng.uniform() < settings.other_forms)
         kind, weight = list(CaseKind)[int(rng.integers(3))], bool(rng.uniform() < 0.3)
         cover = suited(next(covers), sort, effects)
@@ -118,18 +138,21 @@ def plans(cases: int, seed: int, settings: Settings) -> list[CaseSpec]:
     return [made[i] for i in rng.permutation(len(made))]
 
 
-def contents(cases: int, rng: np.random.Generator) -> Iterator[tuple[Sort, tuple[str, ...]]]:
-    """Kind and effects of every case; names come in turn, so that none is missed."""
-    counts = {sort: round(share * cases) for sort, share in MIX.items()}
+def contents(
+    cases: int, rng: np.random.Generator, engine: Engine = Engine.OWN
+) -> Iterator[tuple[Sort, tuple[str, ...]]]:
+    """Kind and effects of every case; names come in turn, so that none is missed. MuJoCo knows no unlisted physics."""
+    names, own = (CONCEALS, False) if engine is Engine.MUJOCO else (tuple(HIDE), True)
+    counts = {sort: round(share * cases) for sort, share in MIX.items() if own or sort is not Sort.UNKNOWN}
     counts[Sort.SINGLE] += cases - sum(counts.values())
-    singles, unlisted = _in_turn(list(HIDE), rng), _in_turn(list(UNLISTED), rng)
+    singles, unlisted = _in_turn(names, rng), _in_turn(list(UNLISTED), rng)
     for _ in range(counts[Sort.SINGLE]):
         yield Sort.SINGLE, (next(singles),)
     for _ in range(counts[Sort.PAIR]):
-        yield Sort.PAIR, pair(rng)
+        yield Sort.PAIR, pair(rng, names)
     for _ in range(counts[Sort.NOTHING]):
         yield Sort.NOTHING, ()
-    for _ in range(counts[Sort.UNKNOWN]):
+    for _ in range(counts.get(Sort.UNKNOWN, 0)):
         yield Sort.UNKNOWN, (next(unlisted),)
 
 
@@ -138,12 +161,12 @@ def _in_turn(names: Sequence[str], rng: np.random.Generator) -> Iterator[str]:
         yield from (names[i] for i in rng.permutation(len(names)))
 
 
-def pair(rng: np.random.Generator) -> tuple[str, str]:
-    """Two effects that good data can tell apart."""
+def pair(rng: np.random.Generator, names: Container[str]) -> tuple[str, str]:
+    """Two effects among `names` that good data can tell apart."""
     while True:
         first, second = rng.choice(len(FAMILIES), 2, replace=False)
         one, other = (str(rng.choice(FAMILIES[i])) for i in (first, second))
-        if {one, other} not in ALIKE:
+        if {one, other} not in ALIKE and one in names and other in names:
             return one, other
 
 

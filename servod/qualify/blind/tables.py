@@ -41,10 +41,14 @@ def all_tables(found: Mapping[str, Any]) -> list[PageTable]:
 
 def sentences(found: Mapping[str, Any]) -> Iterator[str]:
     """What was done, in sentences."""
-    harder = ", with 1 % of other effects, four times the noise and other forms in the plant" if found["harder"] else ""
+    own = found["engine"] == "own"
+    more = "1 % of other effects, four times the noise and other forms in the plant" if own else "four times the noise"
+    harder = f", with {more}" if found["harder"] else ""
+    null = f" and {found['null']} that conceal nothing" if found["null"] else ""
+    plant = "an independent plant" if own else "an independent plant and moved by MuJoCo"
     diagnosed = f"servod {found['version']}" + (f", sources {found['sources'][:12]}," if found["sources"] else "")
     yield (
-        f"{found['cases']} cases of seed {found['seed']}{harder}: axes drawn by an independent plant, recorded in a "
+        f"{found['cases']} cases of seed {found['seed']}{null}{harder}: axes drawn by {plant}, recorded in a "
         f"closed loop, diagnosed by {diagnosed} from their folders alone. SHA-256 of the truth, told "
         f"before: {found['sha256']}."
     )
@@ -57,7 +61,7 @@ def sentences(found: Mapping[str, Any]) -> Iterator[str]:
 def verdict(found: Mapping[str, Any]) -> str:
     """How many answers are right, and how many false alarms there were."""
     right = sum(bool(case["right"]) for case in found["results"])
-    return f"{right} of {found['cases']} answers are right; {len(found['false_alarms'])} false alarms."
+    return f"{right} of {len(found['results'])} answers are right; {len(found['false_alarms'])} false alarms."
 
 
 def results(found: Mapping[str, Any]) -> PageTable:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import html
+import json
 import re
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -17,8 +20,9 @@ from servod.formats.gains.gain_set import load_gains
 from servod.formats.model.axis_model import axis_model_yaml
 from servod.lab.commission import walk
 from servod.lab.commission.comparison import load_curves, load_rows, save_curves
-from servod.lab.commission.report import failure, sections, verdict
+from servod.lab.commission.report import failure, sections, verdict, write_refusal
 from servod.lab.commission.state import (
+    CERTIFICATE,
     DEPLOYMENT,
     GAINS,
     MODEL,
@@ -157,6 +161,26 @@ def test_a_step_that_says_no_is_named_in_the_document(folder: Path) -> None:
     document = failure(walk_in(folder), StepFailed("deploy", "rolled back"))
     assert document["failed"] == {"step": "deploy", "message": "rolled back"}
     assert document["deployment"] == read_json(folder / DEPLOYMENT)
+
+
+def test_a_walk_without_a_valid_set_has_a_page_that_says_why(folder: Path, tmp_path: Path) -> None:
+    """Its verdict is the refusal, its first table the checks that failed; files of later steps are not of this walk."""
+    shutil.copytree(folder, tmp_path / "walk")
+    here = walk_in(tmp_path / "walk")
+    found = read_json(here.path(CERTIFICATE))
+    found["valid"] = found["checks"][3]["passed"] = False
+    here.path(CERTIFICATE).write_text(json.dumps(found))
+    for step, parts in (("deploy", "Deployment"), ("verify", "What the checks found")):
+        page = write_refusal(here, StepFailed(step, f"{step}: not valid: {found['checks'][3]['name']}"))
+        assert page == here.path("refused.html")
+        text = page.read_text()
+        told = f"Refused: {step}: not valid: {found['checks'][3]['name']}."
+        assert f'<p id="verdict" class="failed">{html.escape(told)}</p>' in text
+        assert re.findall("<h2>(.*?)</h2>", text)[0].startswith(parts)
+        failed = re.search('<tr class="failed"><th scope="row">(.*?)</th>', text)
+        assert (failed and failed[1]) == (html.escape(found["checks"][3]["name"]) if step == "verify" else None)
+    assert "Deployment" not in text and "deployment: " not in text
+    assert write_refusal(walk_in(tmp_path / "empty"), StepFailed("identify", "the axis does not move")) is None
 
 
 def test_clashing_vertices_are_told_and_stand_in_the_document(tmp_path: Path) -> None:

@@ -22,12 +22,19 @@ from servod.lab.deploy.outcome import Baseline, Ending
 from servod.lab.recordings.recording import ROW, Rows
 from servod.lab.verify.plants import scaled
 from servod.lab.verify.validation import motion_for
-from servod.runtime.loop.axis import AxisState
+from servod.runtime.loop.axis_state import AxisState
 from servod.runtime.loop.commands import Op
-from tests.lab.deploy.sets import certified
+from tests.lab.deploy.sets import certified_in_short as certified
+from tests.lab.deploy.sets import shorten_validation
 from tests.lab.synthesize.designs import table1
 
 PD = pd_set("present", 2.5, 0.12)
+
+
+@pytest.fixture(autouse=True)
+def in_short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every trial of this file; the motion in its full length is that of tests/lab/commission."""
+    shorten_validation(monkeypatch)
 
 
 def axis_of(plant: AxisModel, folder: Path) -> SteppedAxis:

@@ -21,9 +21,7 @@ from servod.lab.deploy.deployment import deploy
 from servod.lab.deploy.judge import motions_in
 from servod.lab.deploy.outcome import Deployment
 from servod.lab.recordings.recording import Rows
-from servod.lab.verify import validation
-from servod.lab.verify.validation import promise
-from tests.lab.deploy.sets import certified
+from tests.lab.deploy.sets import certified_in_short, shorten_validation
 from tests.lab.synthesize.designs import table1
 from tests.runtime.daemon.running import at_rest, running, wait_for
 
@@ -50,14 +48,9 @@ BUSY_SHARE, CHANCES = 0.003, 3
 
 @pytest.fixture
 def gains(monkeypatch: pytest.MonkeyPatch) -> GainSet:
-    """A certified set whose validation motion, and the promise for it, take half of the usual time."""
-    monkeypatch.setattr(validation, "SLOW_HZ", 2.0)
-    monkeypatch.setattr(validation, "BRISK_PERIODS", 8)
-    found = certified()
-    assert found.design is not None and found.certificate is not None
-    promised = promise(found, found.design, 1)
-    certificate = found.certificate.model_copy(update={"promised": promised})
-    return found.model_copy(update={"certificate": certificate}).sealed()
+    """A certified set whose validation motion takes half of the usual time."""
+    shorten_validation(monkeypatch)
+    return certified_in_short()
 
 
 def skipped_share(rows: Rows) -> float:

@@ -19,6 +19,7 @@ from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.result import MinorReason
 from servod.lab.diagnose.select.cross_validation import cross_validate
 from servod.lab.diagnose.select.fit import Fit
+from servod.lab.diagnose.select.levels import at_end_of_range
 from servod.lab.diagnose.select.merit import Merit, large_enough
 from servod.lab.diagnose.select.selection import Selection, TermEntry
 from servod.lab.diagnose.select.selector import Selector
@@ -36,8 +37,8 @@ def selecting(hidden: AxisModel) -> Selector:
 
 @pytest.fixture(scope="module")
 def selector() -> Selector:
-    """An axis with a weight."""
-    return selecting(believed(gravity={"amplitude": 0.1, "phase": 0.5}))
+    """An axis with a weight, and with a hundredth of its dry friction growing with the square of the speed."""
+    return selecting(believed(gravity={"amplitude": 0.1, "phase": 0.5}, viscous_nonlinear={"quadratic": 3e-4}))
 
 
 def form(selector: Selector, name: str) -> Term:
@@ -55,7 +56,7 @@ def sorted_with(selector: Selector, *terms: Term) -> JudgedSelection:
         fit = selector.settle(hypothesis, hypothesis.beside(fit.coordinates), fit.mismatch)
     error = selector.error(selector.predictor.mismatch(believed()))
     merits, entries = (UNKNOWN,) * len(terms), (TermEntry(0.1, ()),) * len(terms)
-    selection = Selection(base, fit, error, 0.0, merits, entries, {"gravity": UNKNOWN}, 1)
+    selection = Selection(base, fit, error, 0.0, merits, entries, {"gravity": UNKNOWN}, tried=1)
     return name_findings(selector, judge(selector, cross_validate(selector, selection)))
 
 
@@ -74,11 +75,22 @@ def test_what_is_small_or_under_its_level_stays_in_the_model_and_is_told(selecto
 
 def test_what_ends_at_the_end_of_a_range_is_no_finding(selector: Selector) -> None:
     sine, cosine = form(selector, "gravity").unknowns
-    narrow = replace(form(selector, "gravity"), unknowns=(replace(sine, low=-0.03, high=0.03), cosine))
+    narrow = replace(form(selector, "gravity"), unknowns=(replace(sine, low=-0.08, high=0.08), cosine))
     judgement = sorted_with(selector, narrow)
     assert judgement.named == ()
     assert judgement.kept == {0: MinorReason.AT_END}
     assert minor(judgement)["gravity"].why is MinorReason.AT_END
+
+
+def test_a_spring_may_rest_beyond_what_is_searched(selector: Selector) -> None:
+    """It is a constant force and a slope then, and no other effect's shape."""
+    mismatch = selector.predictor.mismatch(believed())
+    scene = SearchContext(selector.start.document, selector.predictor, mismatch)
+    stiffening = next(term for term in effect("spring").terms(scene) if term.form == "stiffening")
+    hypothesis = selector.start.with_term(stiffening)
+    at, share = hypothesis.start.copy(), hypothesis.share(0)
+    at[share] = (0.2, hypothesis.bounds[0][share][1], 0.0)
+    assert not at_end_of_range(Fit(hypothesis, at, np.zeros(0), 0.0, np.zeros((0, 0)), True))
 
 
 @pytest.mark.parametrize(("deviation", "told"), [(0.4, True), (0.6, False)])

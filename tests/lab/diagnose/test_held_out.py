@@ -14,7 +14,7 @@ from servod.lab.diagnose.effects.hypothesis import Term
 from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.judge.free_run import free_run_gain, window_errors
 from servod.lab.diagnose.predict.predict import Predictor
-from servod.lab.diagnose.select.cross_validation import RECORDING, STRETCH, make_folds, predict_held_out, single_events
+from servod.lab.diagnose.select.cross_validation import RECORDING, make_folds, predict_held_out, single_events
 from servod.lab.diagnose.select.fit import Fit, Fitter, Weighing
 from servod.lab.diagnose.select.selection import Fold
 from servod.lab.diagnose.settings import SETTINGS
@@ -25,8 +25,8 @@ from tests.lab.diagnose.test_between import colder
 
 @pytest.fixture(scope="module")
 def levels() -> tuple[Predictor, Fit]:
-    """Two recordings, the second with 1.3 times the friction, and a fit with a level of friction of its own for it."""
-    predictor, fit = colder(1.0, 1.3)
+    """Three recordings, the last with 1.3 times the friction of the first, and a fit in which it grows with them."""
+    predictor, fit = colder(1.3)
     return predictor, with_jacobian(predictor, fit)
 
 
@@ -60,15 +60,15 @@ def pushes(predictor: Predictor) -> list[Term]:
 
 
 def test_a_level_is_not_that_of_the_rows_that_it_is_judged_by(levels: tuple[Predictor, Fit]) -> None:
-    """Wherever it stood before: a recording left out as a whole would keep the level that was fitted to it."""
+    """Wherever it stood before: the levels of a recording left out are those that the others predict."""
     predictor, fit = levels
     elsewhere = fit.coordinates.copy()
     elsewhere[fit.hypothesis.share(0)] += [0.0, 0.0, 0.1, 0.1]
-    mismatch = predictor.mismatch(*fit.hypothesis.models(elsewhere, 2))
+    mismatch = predictor.mismatch(*fit.hypothesis.models(elsewhere, 3))
     moved = with_jacobian(predictor, replace(fit, coordinates=elsewhere, mismatch=mismatch))
     shared = make_folds(predictor, fit)
     near, far = (predict_held_out(predictor, one, shared) for one in (fit, moved))
-    assert shared.left_out == STRETCH
+    assert shared.left_out == RECORDING
     assert float(np.sqrt(np.mean(mismatch[predictor.counts] ** 2))) > 3.0 * near.rms
     assert far.rms == pytest.approx(near.rms, rel=0.15)
     for one, other in zip(near.coordinates, far.coordinates, strict=True):
@@ -80,25 +80,23 @@ def test_every_row_is_left_out_single_events(levels: tuple[Predictor, Fit]) -> N
     for shared in (make_folds(predictor, fit), make_folds(predictor, bare(fit))):
         assert np.all(np.sum(shared.parts, axis=0) == 1)
     assert shared.left_out == RECORDING
-    assert len(shared.parts) == 2
+    assert len(shared.parts) == 3
 
 
 def test_models_of_a_fold_have_the_levels_of_their_recordings(levels: tuple[Predictor, Fit]) -> None:
     predictor, fit = levels
     held = predict_held_out(predictor, fit, make_folds(predictor, fit))
     for fold in held.folds:
-        ratio = fold.of(1).friction.viscous / fold.of(0).friction.viscous
+        ratio = fold.of(2).friction.viscous / fold.of(0).friction.viscous
         assert ratio == pytest.approx(1.3, rel=0.03)
 
 
 def test_windows_are_judged_by_the_model_that_has_not_seen_them(levels: tuple[Predictor, Fit]) -> None:
     predictor, fit = levels
-    light, heavy = (believed(inertia=0.02 * factor) for factor in (0.9, 1.2))
-    folds = [
-        Fold(rows, (model,)) for rows, model in zip(make_folds(predictor, bare(fit)).parts, (light, heavy), strict=True)
-    ]
+    models = [believed(inertia=0.02 * factor) for factor in (0.9, 1.2, 1.1)]
+    folds = [Fold(rows, (model,)) for rows, model in zip(make_folds(predictor, bare(fit)).parts, models, strict=True)]
     window = window_errors(predictor, believed(), folds, folds)[0]
-    for part, trace, model in zip(predictor.slices, predictor.traces, (light, heavy), strict=True):
+    for part, trace, model in zip(predictor.slices, predictor.traces, models, strict=True):
         drive = replace(trace.drive, t_s=trace.drive.t_s - trace.shift_s)
         for error, judge in ((window.recalibrated, model), (window.nominal, believed())):
             assert np.allclose(error[part], replay(judge, drive, window.horizon_s).error, atol=1e-12)
@@ -139,7 +137,8 @@ def test_an_event_in_one_recording_is_not_judged(levels: tuple[Predictor, Fit]) 
 
 def test_an_event_of_every_recording_is_predicted_by_the_others(levels: tuple[Predictor, Fit]) -> None:
     """A torque that is not there goes by the first recording, which is exactly the model's."""
-    predictor, fit = levels
+    three, fit = levels
+    predictor = Predictor(three.traces[:2], believed(), three.rate)
     event = with_term(predictor, fit, next(term for term in pushes(predictor) if term.form == EVERY))
     shared = make_folds(predictor, event)
     held = predict_held_out(predictor, event, shared)

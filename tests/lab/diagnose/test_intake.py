@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.engine import diagnose
 from servod.lab.diagnose.judge.verdict import below_noise
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.result import DiagnosisVerdict
-from servod.lab.recordings import Recording
+from servod.lab.recordings import Quantity, Recording
 from tests.lab.diagnose.axes import believed, record, recording
+
+Array = NDArray[np.float64]
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +35,24 @@ def test_good_recording_is_taken(made: Recording) -> None:
     traces, refused = load_traces([made], believed())
     assert refused == []
     assert traces[0].notes == ()
+
+
+@pytest.mark.parametrize(
+    ("shown_c", "changes"),
+    [
+        (lambda share: np.round(29.0 + 1.4 * np.sin(9.0 * share)), False),  # 28, 29 and 30: the last digit flickers
+        (lambda share: np.full_like(share, 29.0), False),
+        (lambda share: np.round(29.0 + 6.0 * share), True),
+        (lambda share: np.round(29.0 + 1.2 * share, 2), True),
+    ],
+)
+def test_a_thermometer_must_show_more_than_its_last_digit(
+    made: Recording, shown_c: Callable[[Array], Array], changes: bool
+) -> None:
+    share = np.linspace(0.0, 1.0, len(made))
+    warm = replace(made, columns={**made.columns, Quantity.TEMPERATURE: shown_c(share)})
+    (trace,), _ = load_traces([warm], believed())
+    assert trace.has_temperature is changes
 
 
 def test_too_short(made: Recording) -> None:
@@ -140,3 +164,14 @@ def test_noise_that_hides_what_is_left_is_no_finding_of_physics(made: Recording)
     assert not below_noise(DiagnosisVerdict.MISSING_PHYSICS, predictor.encoder_noise, predictor.dry)
     quiet = Predictor(load_traces([made], model)[0], model)
     assert not below_noise(DiagnosisVerdict.UNEXPLAINED, quiet.encoder_noise, quiet.dry)
+
+
+def test_steps_and_square_waves_are_at_no_limit() -> None:
+    from servod.lab.diagnose.data.intake import _at_limit
+
+    t_s = np.arange(4000) * 1e-3
+    assert _at_limit(np.sign(np.sin(9.0 * t_s) + 1e-9)) == 0.0
+    assert _at_limit(np.where(np.sin(9.0 * t_s) > 0.2, 1.0, 0.25)) == 0.0
+    noise = 0.05 * np.random.default_rng(1).normal(size=len(t_s))
+    assert _at_limit(np.clip(2.0 * np.sin(9.0 * t_s) + noise, -1.0, 1.0)) > 0.4
+    assert _at_limit(np.clip(9.0 * np.sin(9.0 * t_s), -1.0, 1.0)) > 0.4

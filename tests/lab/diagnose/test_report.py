@@ -13,7 +13,7 @@ import pytest
 from servod.cli.app import run
 from servod.formats.model.axis_model import AxisKind, axis_model_yaml, load_axis_model
 from servod.lab.diagnose.data.intake import load_traces
-from servod.lab.diagnose.document import describe_place
+from servod.lab.diagnose.document import describe_fit, describe_place
 from servod.lab.diagnose.effects import effects
 from servod.lab.diagnose.engine import diagnose
 from servod.lab.diagnose.judge.locate import maps
@@ -176,3 +176,19 @@ def test_maps_tell_a_curve_from_a_constant() -> None:
     ordered = maps(predictor, noise + curve)
     assert ordered[0].coordinate == "position"
     assert ordered[0].share > 0.7
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "says", "not_said"),
+    [
+        (0.0105, 0.0100, "Both are within the noise: the difference says nothing.", "gone"),
+        (0.0200, 0.0210, "did not become less: 0.02 before, 0.021 N·m after", "gone"),
+        (0.0500, 0.0102, "96 % of what could be explained is gone, and what is left is within the noise.", "nothing"),
+        (0.0500, 0.0300, "went from 0.05 to 0.03 N·m; the noise floor is 0.01 N·m. 96 % of what", "within"),
+    ],
+)
+def test_a_change_within_the_noise_is_no_gain(before: float, after: float, says: str, not_said: str) -> None:
+    held = {"before": before, "after": after, "left_out": "a.csv"}
+    fit = {"unit": "N·m", "held_out": held, "noise_floor": 0.01, "explainable_removed": 0.96}
+    said = describe_fit({"fit": fit})
+    assert says in said and not_said not in said

@@ -15,7 +15,7 @@ from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.formats.model.axis_model import AxisKind, axis_model_yaml
 from servod.formats.model.effects import TorqueGain
 from servod.lab.identify.walk import identify
-from servod.runtime.loop.axis import AxisState
+from servod.runtime.loop.axis_state import AxisState
 from tests.lab.identify.joints import draw
 
 JOINT = draw(4).model

@@ -9,12 +9,16 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
 from scipy.io import savemat
 
 from servod.common.errors import BadInput
 from servod.formats.model.axis_model import AxisKind
 from servod.formats.recording.record import FIELDS, CycleRecord
 from servod.lab.recordings import Quantity, load_recording
+from servod.lab.recordings.readers import widened
+from servod.lab.recordings.recording import missing_samples
 
 T = np.arange(50) * 1e-3
 U = 0.1 * np.sin(T)
@@ -93,6 +97,24 @@ def test_gaps_jitter_and_doubled_stamps_are_reported(tmp_path: Path) -> None:
     assert "uneven" in load_recording(written(tmp_path, uneven)).report[-1]
 
 
+@given(
+    dropped=st.sets(st.integers(1, 58)),
+    late=st.lists(st.floats(0.0, 0.9), min_size=60, max_size=60),
+    numbered=st.booleans(),
+)
+def test_samples_are_missing_where_cycles_are(dropped: set[int], late: list[float], numbered: bool) -> None:
+    """By numbers however late each cycle was; by stamps where one of them was late, with its neighbours in time."""
+    kept = np.array([k for k in range(60) if k not in dropped])
+    assume(np.median(np.diff(kept)) == 1.0)
+    if numbered:
+        found = missing_samples(1e-3 * (kept + np.array(late)[kept]), kept.astype(float))
+        assert np.array_equal(found, np.diff(kept) - 1)
+    else:
+        stamps = kept.astype(float)
+        stamps[len(stamps) // 2] += late[0]
+        assert missing_samples(1e-3 * stamps).sum() == len(dropped)
+
+
 MISTAKES = {
     "no time": (rows("time,torque_nm,position_rad"), ["t_s", "time"]),
     "no torque": (rows("t_s,torque,position_rad"), ["torque_nm", "--map"]),
@@ -152,3 +174,18 @@ def test_a_stretch_of_time_is_cut_out_and_told(tmp_path: Path) -> None:
     assert recording.between(None, None) is recording
     with pytest.raises(BadInput, match=r"r\.csv: column t_s: found 0 rows from 1000"):
         recording.between(1000.0, None)
+
+
+def test_numbers_of_four_bytes_are_the_decimals_that_were_written(tmp_path: Path) -> None:
+    """No staircase in time and position: steps stay even, also a quarter of an hour from the begin."""
+    t_s = np.round(900.0 + 1e-3 * np.arange(5000), 3)
+    position = np.round(3.0 + 1e-5 * np.arange(5000), 5)
+    assert np.diff(t_s.astype(np.float32).astype(np.float64)).std() > 1e-6
+    for values in (t_s, position, np.array([0.0, -0.1, np.nan, np.inf, 1e-30])):
+        assert np.array_equal(widened(values.astype(np.float32)), values, equal_nan=True)
+    table = {"t_s": t_s.astype(np.float32), "torque_nm": position, "position_rad": position.astype(np.float32)}
+    pq.write_table(pa.table(table), tmp_path / "a.parquet")
+    recording = load_recording(tmp_path / "a.parquet")
+    assert np.array_equal(recording.t_s, t_s) and np.array_equal(recording.position, position)
+    drawn = np.random.default_rng(1).integers(0, 2**32, 100_000, dtype=np.uint32).view(np.float32)
+    assert np.array_equal(widened(drawn).astype(np.float32), drawn, equal_nan=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 from html.parser import HTMLParser
 from itertools import pairwise
@@ -16,6 +17,8 @@ from servod.client.virtual import virtual_config
 from servod.common.shipped import shipped
 from servod.formats.config import AmplifierConfig, Identity
 from servod.formats.gains.gain_set import CertificateCheck, GainSet, load_gains
+from servod.formats.recording.mcap_writer import McapFile
+from servod.formats.recording.record import FIELDS, RECORD, CycleRecord
 from servod.lab.report.figure import Colour, Figure, PageTable, PlotAxis, PlotPanel, curve
 from servod.lab.report.figures.loop import PASSED, certificate_tables, limit_used, observations_table
 from servod.lab.report.page import Origin, Page, Verdict, _is_text, drives
@@ -62,15 +65,63 @@ def test_a_page_begins_with_verdict_and_signature(tmp_path: Path) -> None:
     assert text.index("<h1") < text.index('id="verdict"') < text.index('id="signature"') < text.index("<main>")
     assert '<p id="verdict" class="passed">Passed: 3 of 3 hold</p>' in text
     for file in files:
-        assert f"SHA-256 {hashlib.sha256(file.read_bytes()).hexdigest()}" in text
+        assert f">{hashlib.sha256(file.read_bytes()).hexdigest()}</code>" in text
     assert "vendor 0xfb, product 0x6400, serial 4711" in text and "identity not stated" in text
     assert "2 files" in text and "gone.yaml" not in text and "<dt>axis</dt><dd>virtual</dd>" in text
     told = {"role": "encoder", "node_id": 2, "driver": "cia406", "identity": {"vendor_id": 0x2E4, "serial": None}}
     assert drives(Origin(axis=axis, nodes=[told])) == ["encoder, node 2, driver cia406: vendor 0x2e4"]
     signed = re.search(r'<section id="signature".*?</section>', text)
     assert signed
-    for part in (r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d UTC \(here .*[+-]\d\d:\d\d\)", servod.__version__, "numpy", "Linux"):
+    stamp = r"<dt>drawn</dt><dd>\d{4}-\d\d-\d\d \d\d:\d\d:\d\d UTC \(here .*[+-]\d\d:\d\d\)"
+    for part in (stamp, servod.__version__, "numpy", "Linux"):
         assert re.search(part, signed[0])
+
+
+def test_no_name_acts_on_what_stands_beside_it(tmp_path: Path) -> None:
+    """A name that turns the writing direction would turn the hash behind it; one in Latin-1 is no text at all."""
+    bent = tmp_path / "run\u202e\u2067cam.gnp"
+    latin = tmp_path / os.fsdecode(b"caf\xe9.mcap")
+    for file in (bent, latin):
+        file.write_bytes(b"x")
+    page = Page(latin.name, Verdict(bent.name), Origin({"recordings": [bent, latin], "model": bent}))
+    panel = PlotPanel(PlotAxis("t"), PlotAxis(bent.name), (curve(bent.name, [0.0, 1.0], [0.0, 1.0]),), latin.name)
+    page.figure(Figure(latin.stem, bent.name, (panel,)))
+    page.table(PageTable(bent.name, (bent.name, latin.name), ((bent.name, latin.name),)))
+    page.write(tmp_path / "page.html")
+    text = (tmp_path / "page.html").read_text()
+    assert not set("\u202e\u2067") & set(text) and "run\\u202e\\u2067cam.gnp" in text and "caf\\udce9" in text
+    assert '"name": "caf\\\\udce9"' in text and 'id="figure-caf\\udce9"' in text  # page.js finds it
+    assert all(f"<bdi>{name}" in text for name in ("model: run", "caf", "run")) and text.count('dir="ltr"') == 4
+
+
+def recorded(text: str) -> list[str]:
+    """What a page tells of when it was recorded."""
+    return re.findall(r"<dt>recorded</dt><dd>(.*?)</dd>", text)
+
+
+def test_a_page_tells_when_its_recordings_were_made(tmp_path: Path) -> None:
+    """By the time of day of the first cycle. Virtual time, CSV and broken files tell none."""
+    files = []
+    zero = CycleRecord._make(0 if f.kind == "q" else 0.0 for f in FIELDS)
+    for name, offset_s in (("b", 1_700_000_060), ("a", 1_700_000_000), ("virtual", 0)):
+        files.append(tmp_path / f"{name}.mcap")
+        file = McapFile(files[-1], {}, offset_s * 10**9)
+        file.write_rows([RECORD.pack(*zero._replace(time_ns=at)) for at in (7 * 10**9, 9 * 10**9)])
+        file.close()
+    for name, rows in (("broken.mcap", files[0].read_bytes()[:60]), ("other.csv", b"t_s,torque_nm,position_rad\n")):
+        files.append(tmp_path / name)
+        files[-1].write_bytes(rows)
+    (one,) = recorded(a_page(Origin({"recording": files[0]})).html())
+    assert re.fullmatch(r"2023-11-14 22:14:27 UTC \(here .*\)", one)
+    (several,) = recorded(a_page(Origin({"recordings": files})).html())
+    assert re.fullmatch(r"2023-11-14 22:13:27 .* to 2023-11-14 22:14:27 .*, 2 of 5 files tell it", several)
+    for silent in files[2:]:
+        assert recorded(a_page(Origin({"recording": silent})).html()) == [
+            "not told: no time of day stands in the files"
+        ]
+    assert recorded(a_page(Origin({"model": files[0]})).html()) == []
+    (live,) = recorded(a_page(Origin(recorded_ns=1_700_000_000 * 10**9)).html())
+    assert live.startswith("2023-11-14 22:13:20 UTC")
 
 
 @pytest.mark.parametrize(("passed", "kind", "word"), [(False, "failed", "Refused: "), (None, "told", "")])

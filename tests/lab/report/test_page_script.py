@@ -17,7 +17,7 @@ SCRIPT = Path("servod/lab/report/page.js").resolve()
 
 def node(script: str) -> Any:
     """What `script` prints as JSON, with the names of page.js at hand."""
-    names = "const { loaded, view, ticks, extent } = require(" + json.dumps(str(SCRIPT)) + ");\n"
+    names = "const { loaded, view, ticks, extent, leftRoom, apart, wide } = require(" + json.dumps(str(SCRIPT)) + ");\n"
     done = subprocess.run(["node", "-"], input=names + script, capture_output=True, text=True, check=True)
     return json.loads(done.stdout)
 
@@ -39,6 +39,15 @@ def test_rows_arrive_as_they_were_packed() -> None:
     assert np.array_equal(np.array(found[2], dtype=np.float32), y.astype(np.float32), equal_nan=True)
 
 
+def test_what_is_smooth_far_from_zero_has_no_steps() -> None:
+    """A joint that creeps by a microradian a row, a thousand radians from its zero: four bytes hold every 60th row."""
+    position = 1e3 + 1e-6 * np.arange(5000) ** 1.01
+    found = node(
+        f"loaded({json.dumps(packed_series(position))}).then((rows) => console.log(JSON.stringify(Array.from(rows))));"
+    )
+    assert np.array_equal(found, position)
+
+
 def test_from_afar_a_band_and_from_near_the_sine() -> None:
     """A sine of 20 Hz at 1 kHz over a minute: no triangles, and no peak lost."""
     found = node("""
@@ -46,11 +55,12 @@ def test_from_afar_a_band_and_from_near_the_sine() -> None:
     const y = Float32Array.from(x, (t) => Math.sin(40 * Math.PI * t));
     y[31234] = 3.0;
     y[100] = NaN;
+    y[59999] = -2.0;
     console.log(JSON.stringify({ far: view(x, y, -Infinity, Infinity, 4000), near: view(x, y, 10.0, 10.2, 4000) }));
     """)
     far_x, far_y = (np.array(v, dtype=float) for v in found["far"])
     assert len(far_x) <= 4000 and np.all(np.diff(far_x) > 0)
-    assert np.nanmax(far_y) == 3.0
+    assert np.nanmax(far_y) == 3.0 and np.isnan(far_y).any() and (far_x[0], far_y[-1]) == (0.0, -2.0)
     for second in range(60):
         part = far_y[(far_x >= second) & (far_x < second + 1)]
         assert np.nanmin(part) < -0.99 and np.nanmax(part) > 0.99
@@ -78,3 +88,25 @@ def test_ticks_are_round_numbers_with_as_few_digits_as_tell_them_apart(
         "console.log(JSON.stringify([t.at.map((v) => t.words(v)), t.factor]));"
     )
     assert found == [words, factor]
+
+
+def test_what_is_infinite_has_no_part_in_a_scale() -> None:
+    """One such sample would leave a picture empty."""
+    found = node("console.log(JSON.stringify(extent([[1, 2, Infinity], [NaN, -3, -Infinity]])));")
+    assert found == [-3, 2]
+
+
+@pytest.mark.parametrize("ends", [(-1.2e-3, 0.2e-3), (-2e4, -1.9999e4), (-1e-4, 1e-4), (0.0, 1.0)])
+def test_words_of_ticks_have_the_room_that_they_take(ends: tuple[float, float]) -> None:
+    """The minus sign among them; and those of a scale that lies do not stand upon one another."""
+    low, high = ends
+    found = node(f"""
+    const y = ticks({{}}, {low}, {high}, 6), x = apart({{}}, {low}, {high}, 250);
+    const words = (t) => t.at.map((v) => wide(t.words(v)));
+    console.log(JSON.stringify([leftRoom(y), words(y), words(x), x.at]));
+    """)
+    left, upright, lying, places = found
+    assert left >= max(50, max(upright) + 6)
+    assert len(places) >= 2
+    between = (places[1] - places[0]) / (high - low) * 250
+    assert len(places) < 3 or between >= max(lying)

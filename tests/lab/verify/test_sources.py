@@ -13,7 +13,10 @@ from servod.common.sources import DIAGNOSES, SYNTHESIZES, VERIFIES, sources
 
 PACKAGE = Path(servod.__file__).parent
 #: Reading and writing of files, names and numbers of commands, processes: no figure depends on them.
-NEUTRAL = ("common/", "formats/config.py", "formats/kinds.py", "formats/protocol.py", "formats/wiring.py")
+NEUTRAL = (
+    *("common/", "formats/config", "formats/gains/signature.py", "formats/kinds.py", "formats/protocol.py"),
+    "formats/wiring.py",
+)
 
 
 def without_influence(path: str) -> bool:

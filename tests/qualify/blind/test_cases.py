@@ -27,8 +27,20 @@ from servod.qualify.blind.conceal import (
     unlock,
 )
 from servod.qualify.blind.concealed import NO_THERMOMETER, Concealed
+from servod.qualify.blind.engine import CONCEALS
 from servod.qualify.blind.hidden import HIDE, UNLISTED
-from servod.qualify.blind.plan import ALIKE, FAMILIES, HARDER, CaseSpec, Cover, Settings, Sort, plans
+from servod.qualify.blind.plan import (
+    ALIKE,
+    FAMILIES,
+    HARDER,
+    CaseSpec,
+    Cover,
+    Engine,
+    Settings,
+    Sort,
+    plans,
+    settings_of,
+)
 
 
 def quiet(_done: int, _of: int) -> None:
@@ -51,6 +63,29 @@ def test_every_name_comes_in_turn_and_every_kind_has_its_share() -> None:
     assert {plan.effects[0] for plan in made if plan.sort is Sort.UNKNOWN} == set(UNLISTED)
     assert {plan.cover for plan in made} == set(Cover)
     assert plans(120, 4, Settings()) == made != plans(120, 5, Settings())
+
+
+def test_cases_that_conceal_nothing_come_on_top() -> None:
+    made = plans(20, 4, Settings(), null=30)
+    assert len(made) == 50 and sum(plan.sort is Sort.NOTHING for plan in made) == 34
+    assert [plan.sort for plan in plans(0, 4, Settings(), null=3)] == [Sort.NOTHING] * 3
+
+
+def test_another_engine_conceals_what_it_has_means_for() -> None:
+    made = plans(60, 4, settings_of(False, Engine.MUJOCO))
+    counts = Counter(plan.sort for plan in made)
+    assert counts == {Sort.SINGLE: 37, Sort.PAIR: 12, Sort.NOTHING: 11}
+    assert {effect for plan in made for effect in plan.effects} == set(CONCEALS)
+    assert not any(plan.other for plan in made)
+
+
+def test_another_engine_records_the_same_axis() -> None:
+    plan = planned(Sort.SINGLE, ("cogging",))
+    own, other = (make_case(plan, Settings(engine=engine)) for engine in Engine)
+    assert own.truth["params"] == other.truth["params"] and own.model == other.model
+    for name, columns in own.recordings.items():
+        torque = other.recordings[name]["torque_nm"]
+        assert 0.0 < np.std(torque - columns["torque_nm"]) < 0.1 * np.std(torque)
 
 
 def test_pairs_are_of_effects_that_data_can_tell_apart() -> None:

@@ -66,7 +66,7 @@ def test_a_trial_does_not_go_on_with_other_sources(tmp_path: Path, run: dict[str
 def test_an_interrupt_ends_what_runs_and_keeps_nothing_half_done(tmp_path: Path, number: signal.Signals) -> None:
     case = make_case(plans(5, 1, Settings())[0], Settings())
     write_case(case, tmp_path / CASES / "c000", tmp_path / "held")
-    write_trial(tmp_path, BlindTrial(1, 1, False, "0" * 64))
+    write_trial(tmp_path, BlindTrial(1, 1, False, sha256="0" * 64))
     command = [sys.executable, "-m", "servod.cli", "prove", "--only", "diagnose", "--out", str(tmp_path)]
     trial = subprocess.Popen(command, stderr=subprocess.PIPE)
     said = tmp_path / ANSWERS / "c000" / SAID

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,8 @@ from servod.lab.simulate.replay import replay as replayed
 from servod.qualify.blind.axes import CaseAxis, CaseKind, draw_axis
 from servod.qualify.blind.conceal import plain_model, true_model
 from servod.qualify.blind.concealed import Draw
+from servod.qualify.blind.engine import CONCEALS, description
+from servod.qualify.blind.engine import run as moved_by_mujoco
 from servod.qualify.blind.hidden import HIDE
 from servod.qualify.blind.physics import Physics
 from servod.qualify.blind.plant import rest, run
@@ -62,6 +65,40 @@ def test_a_concealed_effect_is_the_one_of_its_name(name: str) -> None:
     believed = plain_model(axis.physics._replace(**concealed.believed))
     before, after = (replayed(AxisModel.model_validate(m), drive, HORIZON_S).rms for m in (believed, true))
     assert after < 0.2 * before
+
+
+#: A contact that bounces is another motion in each engine.
+SMOOTH = sorted(set(CONCEALS) - {"backlash"})
+
+
+@pytest.mark.parametrize("name", SMOOTH)
+def test_an_effect_is_the_same_physics_in_another_engine(name: str) -> None:
+    """Both plants conceal it: the command that is asked for is the same, and not the one without the effect."""
+    axis = draw_axis(np.random.default_rng(5), CaseKind.HARMONIC_DRIVE, weight=name != "gravity")
+    concealed = HIDE[name](Draw(axis, np.random.default_rng(8), 1.5, other=False))
+    axis = axis.with_travel(concealed.travel)
+    plain = axis.physics._replace(**concealed.believed)
+    physics = axis.physics._replace(**{**concealed.changes, "push_start_s": 1.0, "push_end_s": 3.0})
+    reference = axis.motions.multisine(np.random.default_rng(3), SECONDS)
+    quiet = np.zeros(len(reference))
+    found = []
+    for follow, p in ((run, physics), (moved_by_mujoco, physics), (run, plain)):
+        out = np.zeros((len(reference), 3))
+        follow(p, axis.loop._replace(ki=0.0, counts=2.0**40), rest(), reference, quiet, quiet, out)
+        found.append(out[:, 0])
+    own, others, without = found
+    # 50 us at most between two integrators
+    assert np.std(others - own) < 0.05 * axis.physics.coulomb + 0.05 * np.std(without - own)
+    if name not in {"stribeck", "torque_offset"}:  # these are as small as that on this axis
+        assert np.std(without - own) > 4.0 * np.std(others - own)
+
+
+def test_backlash_in_another_engine_has_its_gap() -> None:
+    axis = draw_axis(np.random.default_rng(5), CaseKind.HARMONIC_DRIVE, weight=False)
+    concealed = HIDE["backlash"](Draw(axis, np.random.default_rng(8), 1.5, other=False))
+    described = description(axis.physics._replace(**concealed.changes))
+    low, high = map(float, re.search(r'range="(\S+) (\S+)"', described).groups())  # type: ignore[union-attr]
+    assert high - low == pytest.approx(concealed.parameters["gap"])
 
 
 def test_a_closed_loop_follows_its_reference() -> None:

@@ -50,7 +50,7 @@ def trial(tmp_path_factory: pytest.TempPathFactory) -> Path:
     base = plans(20, 7, Settings())[0].__dict__ | {"cover": Cover.NONE, "off": False, "other": False, "weight": False}
     made = [CaseSpec(**base | {"sort": Sort.SINGLE, "effects": ("torque_offset",)})]
     made.append(CaseSpec(**base | {"sort": Sort.NOTHING, "effects": ()}))
-    write_trial(out, BlindTrial(2, 7, False, conceal(made, Settings(), out, quiet)))
+    write_trial(out, BlindTrial(2, 7, False, sha256=conceal(made, Settings(), out, quiet)))
     return out
 
 
@@ -188,6 +188,6 @@ def test_phases_are_compared_around_the_circle_and_ratios_from_one() -> None:
 
 
 def test_a_document_of_no_answers_still_makes_tables(trial: Path) -> None:
-    found = document(BlindTrial(0, 1, True, "0"), list[Scored]())
+    found = document(BlindTrial(0, 1, True, sha256="0"), list[Scored]())
     assert "–" in tables.text(found)
     assert count.share(9, 10)["interval"] == [0.596, 0.982]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from servod.lab.diagnose.result import RefusedRecording
 from servod.lab.diagnose.settings import SETTINGS
 from servod.lab.recordings import Quantity, Recording
 from servod.lab.simulate.motion import noise_rms
-from servod.lab.simulate.replay import Drive
+from servod.lab.simulate.replay import Drive, driven, switched_on
 
 Array = NDArray[np.float64]
 
@@ -35,7 +35,7 @@ def load_traces(recordings: Sequence[Recording], model: AxisModel) -> tuple[list
         name = recording.path.name
         if any(other.path.name == name for other in recordings[:index]):
             name = f"{recording.path.parent.name}/{name}"
-        trace = make_trace(recording, name, index * SETTINGS.intake.apart_s)
+        trace = make_trace(recording, name, index * SETTINGS.intake.apart_s, model)
         reason = refusal_reason(trace, model)
         if reason is None:
             traces.append(trace)
@@ -44,24 +44,37 @@ def load_traces(recordings: Sequence[Recording], model: AxisModel) -> tuple[list
     return traces, refused
 
 
-def make_trace(recording: Recording, name: str, shift_s: float) -> CheckedTrace:
-    """The recording with glitches repaired, on a time of its own."""
+def make_trace(recording: Recording, name: str, shift_s: float, model: AxisModel) -> CheckedTrace:
+    """The recording with glitches repaired, on a time of its own; its command goes through the drive of the model."""
     notes = [_shorten_note(note) for note in recording.report]
-    drive = recording.drive
+    drive = recording.driven_by(model)
     counts = recording.measured.copy()
     position = _unwrap(drive.position, notes)
-    position, torque = (
-        _remove_glitches(values, what, counts, notes)
-        for values, what in ((position, "position"), (drive.torque, "command"))
-    )
+    position = _remove_glitches(position, "position", counts, notes)
+    if drive.told is None:
+        torque, told = _remove_glitches(drive.torque, "command", counts, notes), None
+    else:
+        drive = driven(model, switched_on(model, replace(drive, position=position)))[1]
+        torque, told = drive.torque, drive.told
+        _leave_out_off(told.on if told else counts, drive.t_s, counts, notes)
     _note_saturation(torque, notes)
     t_s = drive.t_s - drive.t_s[0] + shift_s
     warm = recording.get(Quantity.TEMPERATURE)
     has_temperature = (
         warm is not None and bool(np.isfinite(drive.temperature_c).all()) and _temperature_changes(drive.temperature_c)
     )
-    moved = Drive(t_s, torque, position, drive.temperature_c)
+    moved = Drive(t_s, torque, position, drive.temperature_c, told)
     return CheckedTrace(name, moved, counts, tuple(notes), has_temperature, shift_s - float(drive.t_s[0]), shift_s)
+
+
+def _leave_out_off(on: Rows, t_s: Array, counts: Rows, notes: list[str]) -> None:
+    """Rows in which the drive is off do not count, nor those around the instant at which it goes off or on."""
+    if on.all():
+        return
+    notes.append(f"drive: off in {100.0 * float(np.mean(~on)):.0f} % of the rows, from {t_s[np.argmin(on)]:.3g} s on")
+    counts &= on
+    for row in np.flatnonzero(np.diff(on.astype(np.int8))):
+        counts &= np.abs(t_s - t_s[row]) > SETTINGS.intake.around_off_s
 
 
 def _shorten_note(note: str) -> str:
@@ -75,8 +88,17 @@ def _shorten_note(note: str) -> str:
 
 
 def _temperature_changes(temperature_c: Array) -> bool:
-    """Whether the temperature changes by more than its noise."""
-    return float(np.ptp(temperature_c)) > 10.0 * noise_rms(temperature_c) or float(np.ptp(temperature_c)) > 1.0
+    """Whether the temperature changes by more than its noise, and by more than the thermometer's last digit flickers.
+
+    One that counts whole degrees and shows two or three of them says nothing of when the joint was warmer: what goes
+    with the motion's phase would be taken for warmth.
+    """
+    steps = np.abs(np.diff(temperature_c))
+    steps = steps[steps > 0.0]
+    range_c = float(np.ptp(temperature_c))
+    if not len(steps) or range_c < SETTINGS.intake.least_steps_warm * float(steps.min()) * (1.0 - 1e-6):
+        return False
+    return range_c > 10.0 * noise_rms(temperature_c) or range_c > 1.0
 
 
 def _unwrap(position: Array, notes: list[str]) -> Array:
@@ -118,9 +140,21 @@ def find_glitches(values: Array) -> Rows:
 
 
 def _at_limit(torque: Array) -> float:
-    """Share of rows in which the command stands at the very end of its range."""
+    """Share of rows in which the command is cut off at the very end of its range.
+
+    Steps and square waves stand there too and are not cut off: their command goes there from a level at which it was
+    held, or from the other end, and leaves to one.
+    """
     most = float(np.max(np.abs(torque)))
-    return float(np.mean(np.abs(torque) >= most * (1.0 - 1e-9))) if most > 0.0 else 0.0
+    if most <= 0.0:
+        return 0.0
+    at = np.abs(torque) >= most * (1.0 - 1e-9)
+    same = np.concatenate([[False], np.diff(torque) == 0.0, [False]])
+    held = same[:-1] | same[1:]  # as the row before, or as the one behind
+    edges = np.flatnonzero(np.diff(at.astype(np.int8)))
+    outside = np.where(at[edges], edges + 1, edges)
+    steps = bool(held.mean() > SETTINGS.intake.held) and (not len(edges) or bool(held[outside].mean() > 0.9))
+    return 0.0 if steps else float(np.mean(at))
 
 
 def _note_saturation(torque: Array, notes: list[str]) -> None:
@@ -131,15 +165,11 @@ def _note_saturation(torque: Array, notes: list[str]) -> None:
 
 def refusal_reason(trace: CheckedTrace, model: AxisModel) -> str | None:
     """Why this recording cannot tell anything about this model; None when it can."""
-    return (
-        _too_coarse(trace)
-        or _too_short(trace)
-        or _never_changes(trace)
-        or wrong_sign_or_unit(trace, model)
-        or _too_noisy(trace, model)
-        or _too_still(trace)
-        or _saturated(trace)
-    )
+    recorded = _too_coarse(trace) or _too_short(trace) or _never_changes(trace)
+    moved = _too_noisy(trace, model) or _too_still(trace)
+    if trace.drive.told is not None:  # the torque is the model's own, limit and unit included
+        return recorded or moved
+    return recorded or wrong_sign_or_unit(trace, model) or moved or _saturated(trace)
 
 
 def _too_coarse(trace: CheckedTrace) -> str | None:

@@ -17,7 +17,12 @@ STARTS_S = (0.002, 0.006, 0.02)
 
 
 def terms(scene: SearchContext) -> list[Term]:
-    """A lag from some time constants, and a limited rate."""
+    """A lag from some time constants, and a limited rate; none where a servo's own loop makes the torque.
+
+    There the motor's time constant is a millisecond or two, and what comes late is the goal: a delay.
+    """
+    if scene.servo:
+        return []
     own = known_delay(scene.document)
     lags = [simple("actuator_lag", "lag", [Unknown("time_constant_s", "s", start, 1e-5, 0.5)]) for start in STARTS_S]
     step = np.abs(np.diff(scene.torque)) / max(trace.period_s for trace in scene.predictor.traces)

@@ -27,6 +27,9 @@ STRIBECK_SHARE, OFFSET_SHARE, BRISTLE_FACTOR, DELAY_S = 0.25, 0.03, 2.0, 0.002
 #: The Stribeck velocity is known poorly and shows little; a wide bound keeps it from being a finding.
 STRIBECK_VELOCITY_FACTOR = 1.5
 
+#: By which factor an unknown of the drive may be off what simulated runs say of it, and how well these know it.
+DRIVE_FACTOR, DRIVE_KNOWN = 1.25, 0.04
+
 #: Parameters that the outside contract gives a level, which is their bound until a term opens it.
 LEVELS = frozenset(
     ("friction.static", "friction.stribeck_velocity", "friction.sigma0", "friction.sigma1", "torque_offset", "inertia")
@@ -59,14 +62,23 @@ def known(key: str, unit: str, value: float, off: float = RECALIBRATION, spread:
     return Unknown(key, unit, value, value / (1.0 + off), value * (1.0 + off), spread=spread)
 
 
-def base_unknowns(model: AxisModel) -> tuple[Unknown, ...]:
-    """The unknowns of the model's own parameters."""
+def base_unknowns(model: AxisModel, unknown: frozenset[str] = frozenset()) -> tuple[Unknown, ...]:
+    """The unknowns of the model's own parameters; those keys that are `unknown` start at their values and are free."""
     document = document_of(model)
     axis = "m" if model.axis.value == "linear" else "rad"
     force = "N" if axis == "m" else "N·m"
     inertia = known("inertia", "kg" if axis == "m" else "kg·m²", model.inertia)
     own = (*_friction(document, axis, force), *_gravity(document, force), *_command(model, force))
-    return (inertia, *own, *_drift(document, force))
+    return (inertia, *own, *_drift(document, force), *_drive(document, force, unknown))
+
+
+def _drive(document: Document, force: str, unknown: frozenset[str]) -> list[Unknown]:
+    """What is unknown of the drive: free, with no belief beforehand."""
+    units = {"drive.torque_per_command": force, "drive.kp": "1/rad"}
+    return [
+        known(key, units[key], get(document, key), DRIVE_FACTOR - 1.0, DRIVE_KNOWN)
+        for key in sorted(unknown & units.keys())
+    ]
 
 
 def _friction(document: Document, axis: str, force: str) -> list[Unknown]:

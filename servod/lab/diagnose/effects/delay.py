@@ -12,7 +12,7 @@ from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.search_context import SearchContext
 
 #: Delays to start from, s.
-STARTS_S = (0.003, 0.008, 0.02)
+STARTS_S = (0.003, 0.008, 0.02, 0.045)
 
 
 def terms(scene: SearchContext) -> list[Term]:

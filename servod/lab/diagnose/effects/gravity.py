@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import numpy as np
+
 from servod.formats.model.effects import Gravity
 from servod.lab.diagnose.effects.effect import Effect, share
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Term, get
@@ -30,13 +32,25 @@ def terms(scene: SearchContext) -> list[Term]:
         return []
     most = 50.0 * max(scene.dry, scene.effort)
     size = max(scene.dry, 0.1 * scene.effort)
-    unknowns = (share("sine", 0.0, -most, most, size), share("cosine", 0.0, -most, most, size))
+    starts = [(0.0, 0.0), _regressed(scene, most)]
 
     def tell(document: Document, _values: Sequence[float]) -> list[Reported]:
         units = {"amplitude": scene.force, "phase": "rad"}
         return [Reported(key, get(document, f"gravity.{key}"), unit) for key, unit in units.items()]
 
-    return [Term("gravity", "weight", unknowns, _write, tell)]
+    found = []
+    for sine, cosine in starts:
+        unknowns = (share("sine", sine, -most, most, size), share("cosine", cosine, -most, most, size))
+        found.append(Term("gravity", "weight", unknowns, _write, tell))
+    return found
+
+
+def _regressed(scene: SearchContext, most: float) -> tuple[float, float]:
+    """Sine and cosine of the weight from one regression beside the motion: a weight of many frictions is far away."""
+    v = scene.velocity
+    motion = [scene.acceleration, v, np.tanh(v / (0.02 * scene.speed)), np.ones_like(v)]
+    (sine, cosine, *_), _ = scene.fitted([np.sin(scene.position), np.cos(scene.position), *motion])
+    return float(np.clip(-sine, -most, most)), float(np.clip(-cosine, -most, most))
 
 
 EFFECT = Effect(

@@ -2,22 +2,38 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from servod.formats.model.friction import LoadDependentFriction
 from servod.lab.diagnose.effects.effect import Effect, share, simple
 from servod.lab.diagnose.effects.hypothesis import Term, get
 from servod.lab.diagnose.effects.looks import Look, Split
 from servod.lab.diagnose.effects.search_context import SearchContext
 
+#: Gears that lose more of the torque than this would hold themselves whatever drives them.
+MOST_PER_COMMAND = 0.8
+
+#: By which factor Coulomb friction may be another beside friction of the load.
+LEVEL = 10.0
+
 
 def terms(scene: SearchContext) -> list[Term]:
-    """By the applied torque; by gravity and spring where the model has them; by both."""
-    command = share("per_command", 0.0, 0.0, 2.0, 0.1)
+    """By the applied torque; by gravity and spring where the axis has them; by both; beside Coulomb's of another size.
+
+    Friction under a load is partly load's and partly the model's own: who measured it once took both for one.
+    """
+    command = share("per_command", 0.0, 0.0, MOST_PER_COMMAND, 0.1)
     load = share("per_load", 0.0, 0.0, 2.0, 0.1)
-    found = [simple("load_dependent_friction", "applied torque", [command])]
-    if get(scene.document, "gravity.amplitude") > 0.0 or "spring" in scene.document:
-        found.append(simple("load_dependent_friction", "load torque", [load]))
-        found.append(simple("load_dependent_friction", "both", [command, load]))
-    return found
+    forms = {"applied torque": [command]}
+    if any(get(known, "gravity.amplitude") > 0.0 or "spring" in known for known in (scene.document, scene.present)):
+        forms |= {"load torque": [load], "both": [command, load]}
+    found = [simple("load_dependent_friction", form, unknowns) for form, unknowns in forms.items()]
+    own = get(scene.document, "friction.coulomb")
+    if own <= 0.0 or get(scene.document, "friction.static") > 0.0:
+        return found
+    opens = {"friction.coulomb": (own / LEVEL, own * LEVEL)}
+    another = [replace(term, form=f"{term.form}, another level", opens=opens) for term in found[:2]]
+    return found + another
 
 
 EFFECT = Effect(

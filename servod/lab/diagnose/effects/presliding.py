@@ -29,8 +29,13 @@ def _tell(scene: SearchContext) -> Teller:
 
 
 def terms(scene: SearchContext) -> list[Term]:
-    """The bristle of the model released, from where it stands, softer and stiffer; a new one; fading damping."""
+    """The bristle of the model released, from where it stands, softer and stiffer; a new one; fading damping.
+
+    No new one where a servo's loop makes the torque: so soft a bristle is what its delay leaves.
+    """
     own, damping = get(scene.document, "friction.sigma0"), get(scene.document, "friction.sigma1")
+    if own <= 0.0 and scene.servo:
+        return []
     if own <= 0.0:
         return [_new(scene, scene.dry / (way * scene.reach)) for way in WAYS]
     opens = {"friction.sigma0": (own / MOST, own * MOST)}

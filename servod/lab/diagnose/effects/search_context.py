@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -52,18 +52,26 @@ class Peak:
 class SearchContext:
     """The nominal document, the predictor with its traces, and the mismatch of the fit that stands now (N*m).
 
-    `fine` asks for finer forms too, with more unknowns than a first look may spend.
+    `fine` asks for finer forms too, with more unknowns than a first look may spend; `present` is the document of that
+    fit, for what acts on something that the nominal model does not have.
     """
 
     document: Document
     predictor: Predictor
     mismatch: Array
     fine: bool = False
+    present: Document = field(default_factory=dict)
 
     @property
     def linear(self) -> bool:
         """Whether the axis moves in metres."""
         return self.document.get("axis") == "linear"
+
+    @property
+    def servo(self) -> bool:
+        """Whether the torque is what a servo makes of its goal, by the drive of the model."""
+        told = any(trace.drive.told is not None for trace in self.predictor.traces)
+        return told and self.document["drive"]["kind"] in {"position_servo", "velocity"}
 
     @property
     def force(self) -> str:

@@ -4,15 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from servod.formats.model.friction import Thermal
 from servod.lab.diagnose.effects.effect import Effect, report_as_is, share, simple
 from servod.lab.diagnose.effects.hypothesis import Document, Term, Unknown
 from servod.lab.diagnose.effects.looks import Look, Split
 from servod.lab.diagnose.effects.search_context import SearchContext
 
+#: Recordings from which on their order says that it was time that passed.
+LEAST_IN_ORDER = 3
+
+#: Share of the way to the last level that a recording leaves to those behind it: what warms up does so ever slower.
+STILL_TO_GO = 0.7
+
 
 def terms(scene: SearchContext) -> list[Term]:
-    """By the recorded temperature where there is one, linear and exponential; by time; by recording."""
+    """By the recorded temperature where there is one, linear and exponential; by time; by the recordings' order."""
     found = []
     if scene.warm:
         rates = [share(key, 0.0, -0.5, 0.5, 0.05, "1/°C") for key in ("dry_per_c", "viscous_per_c")]
@@ -22,23 +30,32 @@ def terms(scene: SearchContext) -> list[Term]:
     drifts = [
         share(key, 0.0, -3.0 / length, 3.0 / length, 0.3 / length, "1/s") for key in ("dry_per_s", "viscous_per_s")
     ]
-    count = len(scene.predictor.traces)
-    between = [_between(drifts, count)] if count > 1 else []
+    between = [_between(drifts, len(scene.predictor.traces))] if _order_may_tell(scene) else []
     return [*found, simple("thermal", "drift", drifts), *between]
 
 
+def _order_may_tell(scene: SearchContext) -> bool:
+    """Whether recordings may differ by their place in time: there are enough of them, and no thermometer says more.
+
+    Two recordings stand in an order whatever differs between them.
+    """
+    measured = all(bool(np.isfinite(trace.drive.temperature_c).all()) for trace in scene.predictor.traces)
+    return len(scene.predictor.traces) >= LEAST_IN_ORDER and not measured
+
+
 def _between(drifts: list[Unknown], recordings: int) -> Term:
-    """A drift, and another level of friction in each recording than in the first: a colder lubricant."""
-    names = [f"{kind}_recording_{n}" for n in range(2, recordings + 1) for kind in ("dry", "viscous")]
-    levels = [share(name, 0.0, -0.8, 4.0, 1.0) for name in names]
+    """A drift, and a level of friction that goes on from recording to recording in their order, ever slower.
+
+    Two numbers however many recordings there are: any two recordings predict the level of another.
+    """
+    levels = [share(name, 0.0, -0.8, 4.0, 1.0) for name in ("dry_at_last", "viscous_at_last")]
 
     def each(document: Document, values: Sequence[float], recording: int) -> None:
-        if recording == 0:
-            return
-        dry, viscous = values[2 * recording : 2 * recording + 2]
+        dry, viscous = values[2:]
+        reached = (1.0 - STILL_TO_GO**recording) / (1.0 - STILL_TO_GO ** (recordings - 1))
         for key, more in (("coulomb", dry), ("static", dry), ("viscous", viscous)):
             if key in document["friction"]:
-                document["friction"][key] *= 1.0 + more
+                document["friction"][key] *= 1.0 + more * reached
 
     drift = simple("thermal", "drift", drifts)
 

@@ -18,8 +18,10 @@ LOWEST = 0.6
 
 
 def terms(scene: SearchContext) -> list[Term]:
-    """A hard limit from some quantiles of the command, and a smooth one."""
-    found = []
+    """A hard limit from some quantiles of the command, and a smooth one; none beside a servo's own, its full duty."""
+    found: list[Term] = []
+    if scene.servo:
+        return found
     most = float(np.max(np.abs(scene.torque)))
     least = max(float(np.quantile(np.abs(scene.torque), LOWEST)), 0.01 * most)
     for quantile in QUANTILES:

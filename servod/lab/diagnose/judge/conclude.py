@@ -18,9 +18,9 @@ from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.disturbance import EVERY, NAME
 from servod.lab.diagnose.effects.hypothesis import Document, Reported
 from servod.lab.diagnose.effects.looks import Look, Split
-from servod.lab.diagnose.judge.covariance import inside_region
+from servod.lab.diagnose.judge.covariance import bounded_error, inside_region
 from servod.lab.diagnose.judge.free_run import window_errors, windows
-from servod.lab.diagnose.judge.judgement import JudgedSelection
+from servod.lab.diagnose.judge.judgement import JudgedSelection, write_table
 from servod.lab.diagnose.judge.locate import bands, locate
 from servod.lab.diagnose.judge.verdict import alternatives, confidence
 from servod.lab.diagnose.predict.coordinates import coordinates
@@ -32,6 +32,7 @@ from servod.lab.diagnose.result import (
     Minor,
     MinorReason,
     NamedEffect,
+    PartialAnswer,
     Quality,
     RecordingErrors,
     SearchEffort,
@@ -40,11 +41,11 @@ from servod.lab.diagnose.result import (
     Spectrum,
     Windows,
 )
-from servod.lab.diagnose.select.fit import Fit
+from servod.lab.diagnose.select.fit import Fit, on_bound
 from servod.lab.diagnose.select.levels import at_end_of_range, is_level_change, shorter_twin
 from servod.lab.diagnose.select.merit import Merit, large_enough
 from servod.lab.diagnose.select.refine import DRIFT, power_of_means
-from servod.lab.diagnose.select.selection import Fold
+from servod.lab.diagnose.select.selection import Selection
 from servod.lab.diagnose.select.selector import Selector
 from servod.lab.diagnose.settings import SETTINGS
 
@@ -161,13 +162,19 @@ def spectrum(predictor: Predictor, error: Array) -> Spectrum:
 
 Array = NDArray[np.float64]
 
+#: Keys of the drive begin so.
+DRIVE = "drive."
 
-def conclude(judgement: JudgedSelection, model: AxisModel, free: tuple[Windows, ...]) -> Evidence:
+
+def conclude(
+    judgement: JudgedSelection, model: AxisModel, free: tuple[Windows, ...], partial: PartialAnswer | None = None
+) -> Evidence:
     """The plain result; `model` is that of `extended_model` and `free` the errors of `free_windows`."""
     predictor, selection = judgement.predictor, judgement.selection
     return Evidence(
         findings=findings(judgement),
         recalibrated=recalibrated(judgement),
+        drive=fitted_drive(judgement),
         minor=minor(judgement),
         residual=judgement.residual,
         model=model,
@@ -179,6 +186,7 @@ def conclude(judgement: JudgedSelection, model: AxisModel, free: tuple[Windows, 
         search=SearchEffort(predictor.rate, selection.tried, selection.cut),
         encoder_noise=predictor.encoder_noise,
         dry_friction=predictor.dry,
+        partial=partial,
     )
 
 
@@ -229,12 +237,14 @@ def _deviations(judgement: JudgedSelection, place: int, values: Sequence[Reporte
     """Standard deviations of reported values, by their derivatives."""
     fit = judgement.fit
     slopes = np.zeros((len(values), len(fit.coordinates)))
-    for index in range(len(fit.coordinates)):
+    inward = np.where(fit.coordinates + 1e-5 <= fit.hypothesis.bounds[1], 1e-5, -1e-5)
+    for index, nudge in enumerate(inward):
         nudged = fit.coordinates.copy()
-        nudged[index] += 1e-5
+        nudged[index] += nudge
         there = _reported(fit, place, nudged)
-        slopes[:, index] = [(b.value - a.value) / 1e-5 for a, b in zip(values, there, strict=True)]
-    variances = np.einsum("ij,jk,ik->i", slopes, judgement.covariance, slopes)
+        slopes[:, index] = [(b.value - a.value) / nudge for a, b in zip(values, there, strict=True)]
+    covariance = judgement.covariance + bounded_error(fit)
+    variances = np.einsum("ij,jk,ik->i", slopes, covariance, slopes)
     return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
 
 
@@ -243,6 +253,9 @@ def minor(judgement: JudgedSelection) -> dict[str, Minor]:
     terms, merits = judgement.fit.hypothesis.terms, judgement.selection.merits
     named = {terms[place].effect for place in judgement.named}
     seen = {name: _minor(merit) for name, merit in judgement.selection.minor.items() if name not in named}
+    for name, (merit, why) in judgement.selection.rejected.items():
+        if name not in named:
+            seen[name] = replace(_minor(merit), why=why)
     for name in dict.fromkeys(terms[place].effect for place in judgement.kept):
         those = [place for place in judgement.kept if terms[place].effect == name]
         largest = _minor(max((merits[place] for place in those), key=lambda merit: merit.torque))
@@ -255,18 +268,36 @@ def _minor(merit: Merit) -> Minor:
 
 
 def recalibrated(judgement: JudgedSelection) -> dict[str, FittedValue]:
-    """Parameters of the model itself that were off, with their 95 % intervals. Those of a finding are not here."""
+    """Parameters of the model itself that were off, with their 95 % intervals.
+
+    Those of a finding are not here, nor one that stands on its bound: what the data say of it nobody has asked them.
+    """
     fit = judgement.fit
     opened = {key for place in judgement.named for key in fit.hypothesis.terms[place].opens}
+    bounded = on_bound(fit)
     found = {}
     for index, (unknown, nominal) in enumerate(zip(fit.hypothesis.unknowns, fit.hypothesis.base, strict=False)):
         value = fit.values[index]
         half = SETTINGS.intervals.z95 * math.sqrt(max(float(judgement.covariance[index, index]), 0.0))
         size = unknown.size if unknown.size else abs(value)
-        if unknown.key in opened or abs(value - nominal.start) <= max(SETTINGS.intervals.least_change, half) * size:
+        if unknown.key in opened or bounded[index] or unknown.key.startswith(DRIVE):
+            continue
+        if abs(value - nominal.start) <= max(SETTINGS.intervals.least_change, half) * size:
             continue
         half *= size
         found[unknown.key] = FittedValue(value, unknown.unit, value - half, value + half, nominal.start)
+    return found
+
+
+def fitted_drive(judgement: JudgedSelection) -> dict[str, FittedValue]:
+    """What was unknown of the drive, with its 95 % intervals."""
+    fit, found = judgement.fit, {}
+    for index, unknown in enumerate(fit.hypothesis.base):
+        if unknown.key.startswith(DRIVE):
+            value = fit.values[index]
+            spread = SETTINGS.intervals.z95 * math.sqrt(max(float(judgement.covariance[index, index]), 0.0))
+            ends = value * math.exp(-spread), value * math.exp(spread)
+            found[unknown.key.removeprefix(DRIVE)] = FittedValue(value, unknown.unit, *ends)
     return found
 
 
@@ -284,10 +315,8 @@ def extended_model(judgement: JudgedSelection, nominal: AxisModel) -> AxisModel:
             start, length, torque = values[fit.hypothesis.share(place)]
             rows = document.setdefault(NAME, {}).setdefault("windows", [])
             rows.append({"start_s": start, "end_s": start + length, "torque": torque})
-    left = judgement.residual
-    if left is not None:
-        table = {"grid": left.grid.tolist(), "torque": left.torque.tolist()}
-        document.setdefault("residual", {})[left.coordinate] = table
+    if judgement.residual is not None:
+        write_table(document, judgement.residual)
     if nominal.noise is not None:
         document["noise"] = nominal.noise.model_dump(mode="json", exclude_none=True)
     return AxisModel.model_validate(document)
@@ -303,17 +332,16 @@ def _model_coordinates(judgement: JudgedSelection) -> Array:
     fit = judgement.fit
     if fit.hypothesis.terms or judgement.residual is not None:
         return fit.coordinates
-    changed = recalibrated(judgement)
-    moved = [unknown.key in changed for unknown in fit.hypothesis.base]
+    changed = [*recalibrated(judgement), *(f"{DRIVE}{key}" for key in fitted_drive(judgement))]
+    pairs = zip(fit.hypothesis.base, on_bound(fit), strict=False)
+    moved = [unknown.key in changed or bounded for unknown, bounded in pairs]
     back = np.where(moved, 0.0, fit.coordinates - fit.hypothesis.start)
     return fit.coordinates - back if inside_region(back, judgement.covariance) else fit.coordinates
 
 
-def free_windows(judgement: JudgedSelection, nominal: AxisModel, model: AxisModel) -> tuple[Windows, ...]:
-    """Errors of free windows. What has no name is a table over everything, so that its rows have been seen."""
-    predictor, after = judgement.predictor, judgement.validation.after.folds
-    if judgement.residual is not None:
-        after = (Fold(np.ones(len(predictor.counts), dtype=bool), (model,)),)
+def free_windows(judgement: JudgedSelection, nominal: AxisModel) -> tuple[Windows, ...]:
+    """Errors of free windows, by models that were fitted without the rows; what has no name is a table in them."""
+    predictor, after = judgement.predictor, judgement.tables or judgement.validation.after.folds
     errors = window_errors(predictor, nominal, judgement.validation.before.folds, after)
     return windows(errors, predictor, judgement.validation.folds.judged)
 
@@ -359,9 +387,10 @@ def _rms(values: Array) -> float:
 
 # --- Findings and minor terms ----------------------------------------------------------------------------------------
 # Which terms of the last fit are findings, and why the others are none: the levels of the outside contract once more. A
-# term comes in by what it takes when it comes; beside those that come later it may be worth less, or its numbers may be
-# pushed to an end of their range. It stays in the model then, for the others were fitted beside it, and is listed with
-# its values as minor.
+# term comes in by what it takes when it comes; beside those that come later it may be worth less. It stays in the model
+# then, for the others were fitted beside it, and is listed with its values as minor. One whose numbers are pushed to an
+# end of their range is somebody else's shape: it goes, and what it took counts as left. So does one that is not told
+# from none, unless rows that no fit has seen are predicted worse without it.
 #
 # The contract counts shares of the error on unseen rows. A drift of the constant torque is next to nothing in any row
 # and adds up in every simulation that runs freely: its share is that of the means over a second, where it shows.
@@ -389,6 +418,27 @@ def name_findings(selector: Selector, judgement: JudgedSelection) -> JudgedSelec
     named = tuple(place for place in judgement.named if fit.hypothesis.terms[place].effect in names)
     kept = {place: reason for place, reason in why.items() if reason is not None and place not in named}
     return replace(judgement, named=named, kept=kept | _under_level(judgement))
+
+
+def reject_terms(selector: Selector, judgement: JudgedSelection) -> Selection | None:
+    """The selection without the terms that were rejected, and those that follow from them; None where none was.
+
+    A value at the end of its range has not been measured, and what such a term takes is not explained by it.
+    """
+    rejected = sorted(place for place, why in judgement.kept.items() if _goes(judgement, place, why))
+    selection = judgement.selection
+    terms = selection.fit.hypothesis.terms
+    why = {terms[place].effect: (selection.merits[place], judgement.kept[place]) for place in rejected}
+    for place in reversed(rejected):
+        selection = selection.without_term(place, selector.settle_without(selection.fit, place))
+    return replace(selection, rejected={**selection.rejected, **why}) if rejected else None
+
+
+def _goes(judgement: JudgedSelection, place: int, why: MinorReason) -> bool:
+    """Whether a term goes for a reason: one that is only not told from none stays where unseen rows need it."""
+    if why is MinorReason.UNSURE:
+        return judgement.removed_share(place) < SETTINGS.worth.share
+    return why is MinorReason.AT_END
 
 
 def _under_level(judgement: JudgedSelection) -> dict[int, MinorReason]:

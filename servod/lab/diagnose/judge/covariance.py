@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.base import TORQUES
-from servod.lab.diagnose.select.fit import Fit, Weighing, covariance
+from servod.lab.diagnose.select.fit import Fit, Weighing, covariance, on_bound
 from servod.lab.diagnose.select.selection import HeldOutErrors
 from servod.lab.diagnose.settings import SETTINGS
 
@@ -24,6 +24,12 @@ BRISTLE = ("friction.sigma0", "friction.sigma1")
 def total_covariance(fit: Fit, weighing: Weighing, period_s: float, held: HeldOutErrors) -> Array:
     """Covariance of the coordinates of `fit`; `held` has the fits without each recording."""
     return covariance(fit, weighing, period_s) + jackknife(fit, held) + model_error(fit) + common_factor(fit)
+
+
+def bounded_error(fit: Fit) -> Array:
+    """Of a coordinate on its bound nothing is known but its range: half of that is one standard deviation."""
+    low, high = fit.hypothesis.bounds
+    return np.diag(np.where(on_bound(fit), 0.5 * (high - low), 0.0) ** 2)
 
 
 def jackknife(fit: Fit, held: HeldOutErrors) -> Array:

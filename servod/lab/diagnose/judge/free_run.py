@@ -105,4 +105,4 @@ def _drive(trace: CheckedTrace, model: AxisModel) -> Drive:
     if model.disturbance is not None and model.disturbance.windows:
         return trace.drive
     drive = trace.drive
-    return Drive(drive.t_s - trace.shift_s, drive.torque, drive.position, drive.temperature_c)
+    return Drive(drive.t_s - trace.shift_s, drive.torque, drive.position, drive.temperature_c, drive.told)

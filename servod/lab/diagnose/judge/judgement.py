@@ -12,17 +12,24 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from servod.formats.model.axis_model import AxisModel
+from servod.lab.diagnose.effects.base import document_of
+from servod.lab.diagnose.effects.hypothesis import Document
 from servod.lab.diagnose.judge.covariance import total_covariance
 from servod.lab.diagnose.judge.free_run import free_run_gain
 from servod.lab.diagnose.judge.locate import maps
 from servod.lab.diagnose.judge.verdict import Shares, shares
+from servod.lab.diagnose.predict.floor import above_noise
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.result import MinorReason, MismatchMap, ResidualTable
 from servod.lab.diagnose.select.cross_validation import make_folds, predict_held_out, single_events
 from servod.lab.diagnose.select.fit import Fit, Weighing
-from servod.lab.diagnose.select.selection import CrossValidation, Selection
+from servod.lab.diagnose.select.selection import CrossValidation, Fold, Folds, HeldOutErrors, Selection
 from servod.lab.diagnose.select.selector import Selector
 from servod.lab.diagnose.settings import SETTINGS
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.bool_]
 
 # --- What fits no known physics --------------------------------------------------------------------------------------
 # What fits no known physics: kept as a table over the coordinate where it lives, without a name. The table becomes
@@ -31,20 +38,27 @@ from servod.lab.diagnose.settings import SETTINGS
 
 def residual_table(predictor: Predictor, mismatch: Array) -> ResidualTable | None:
     """The table that predicts most of the mismatch of unseen stretches; None where none predicts enough."""
-    late = 2.0 * SETTINGS.observer.poles_damping / predictor.rate
-    velocity = predictor.over("velocity")
-    places = {
-        "position": predictor.over("position") - late * velocity,
-        "velocity": velocity - late * predictor.over("acceleration"),
-    }
-    found = [_table(name, values, predictor, mismatch) for name, values in places.items()]
+    found = [_table(name, values, predictor, mismatch) for name, values in _places(predictor).items()]
     best = max(found, key=lambda table: table.share)
     return best if best.share >= SETTINGS.maps.table_least_share else None
 
 
-def _table(name: str, values: Array, predictor: Predictor, mismatch: Array) -> ResidualTable:
-    """Least squares of a piecewise linear function, and its share on every second stretch from the others."""
-    rows = np.flatnonzero(predictor.counts)
+def _places(predictor: Predictor) -> dict[str, Array]:
+    """Coordinates of tables, as late as the observer shows a torque there."""
+    late = 2.0 * SETTINGS.observer.poles_damping / predictor.rate
+    velocity = predictor.over("velocity")
+    return {
+        "position": predictor.over("position") - late * velocity,
+        "velocity": velocity - late * predictor.over("acceleration"),
+    }
+
+
+def _table(name: str, values: Array, predictor: Predictor, mismatch: Array, seen: Rows | None = None) -> ResidualTable:
+    """Least squares of a piecewise linear function, and its share on every second stretch from the others.
+
+    Of the rows that are `seen`; of all that count where nobody says.
+    """
+    rows = np.flatnonzero(predictor.counts if seen is None else predictor.counts & seen)
     grid = np.unique(np.quantile(values[rows], np.linspace(0.002, 0.998, SETTINGS.maps.table_points)))
     design = hats(values[rows], grid)
     stretch = (rows // max(1, round(1.0 / predictor.traces[0].period_s))) % 2 == 0
@@ -61,6 +75,24 @@ def _ridge(design: Array, wanted: Array) -> Array:
     return np.asarray(np.linalg.solve(normal + 1e-6 * np.trace(normal) * np.eye(len(normal)), design.T @ wanted))
 
 
+def write_table(document: Document, table: ResidualTable) -> None:
+    """Add the table to a model's document."""
+    rows = {"grid": table.grid.tolist(), "torque": table.torque.tolist()}
+    document.setdefault("residual", {})[table.coordinate] = rows
+
+
+def _with_tables(predictor: Predictor, folds: Folds, held: HeldOutErrors, coordinate: str) -> tuple[Fold, ...]:
+    """The models of every fold with a table over `coordinate` that has not seen the fold's rows either."""
+    found = []
+    for out, fold in zip(folds.parts, held.folds, strict=True):
+        table = _table(coordinate, _places(predictor)[coordinate], predictor, predictor.mismatch(*fold.models), ~out)
+        documents = [document_of(model) for model in fold.models]
+        for document in documents:
+            write_table(document, table)
+        found.append(Fold(out, tuple(AxisModel.model_validate(document) for document in documents)))
+    return tuple(found)
+
+
 def hats(values: Array, grid: Array) -> Array:
     """Piecewise linear basis on `grid`, zero outside."""
     place = np.clip(np.searchsorted(grid, values, side="right") - 1, 0, len(grid) - 2)
@@ -73,9 +105,6 @@ def hats(values: Array, grid: Array) -> Array:
     return design
 
 
-Array = NDArray[np.float64]
-
-
 @dataclass(frozen=True)
 class JudgedSelection:
     """Everything that was judged of a selection, on recordings that can tell.
@@ -83,7 +112,8 @@ class JudgedSelection:
     `named` are places of terms in the fit; `errors` are those of the fits to everything, by which names are judged,
     `unseen` those on rows that the fits have not seen. `removed_by_known` is the share of the explainable error that
     known physics removes there, also where its names may not stand. `kept` says of terms in the fit why they are no
-    findings.
+    findings. Where no name may stand, `tables` are the models of every fold with a table of what is left, and `partial`
+    is the judgement whose names are a part of the answer.
     """
 
     predictor: Predictor
@@ -98,6 +128,8 @@ class JudgedSelection:
     maps_before: list[MismatchMap]
     maps_after: list[MismatchMap]
     kept: Mapping[int, MinorReason] = field(default_factory=dict)
+    tables: tuple[Fold, ...] = ()
+    partial: JudgedSelection | None = None
 
     @property
     def fit(self) -> Fit:
@@ -108,7 +140,7 @@ class JudgedSelection:
         """The share of the explainable error on unseen rows that a named term removes."""
         unseen = self.unseen
         without = float(np.mean(self.validation.without[place].mismatch[self.predictor.counts] ** 2))
-        return max(without - unseen.after**2, 0.0) / max(unseen.before**2 - unseen.floor**2, 1e-30)
+        return max(without - unseen.after**2, 0.0) / above_noise(unseen.before**2, unseen.floor**2)
 
 
 def judge(selector: Selector, selection: Selection) -> JudgedSelection:
@@ -146,7 +178,9 @@ def predicts_nothing(judgement: JudgedSelection) -> bool:
     if within_noise or set(judgement.named) <= set(single_events(judgement.fit.hypothesis)):
         return False
     gain = free_run_gain(judgement.predictor, validation.before, validation.after, validation.folds.judged)
-    return gain > SETTINGS.validation.most_free_run_error
+    driven = any(trace.drive.told is not None for trace in judgement.predictor.traces)
+    most = SETTINGS.validation.most_free_run_error_by_drive if driven else SETTINGS.validation.most_free_run_error
+    return gain > most
 
 
 def without_names(judgement: JudgedSelection) -> JudgedSelection:
@@ -158,8 +192,11 @@ def without_names(judgement: JudgedSelection) -> JudgedSelection:
     before = predict_held_out(predictor, base, folds)
     errors, unseen = (shares((rows, rows), predictor.counts, floor) for rows in (base.mismatch, before.mismatch))
     validation = CrossValidation((), {}, folds, before, before, {})
+    tables = _with_tables(predictor, folds, before, left.coordinate) if left is not None else ()
+    partial = judgement if judgement.named and not predicts_nothing(judgement) else None
     bare = replace(judgement.selection, fit=base, merits=(), entries=(), validation=validation)
     return replace(
         judgement, selection=bare, validation=validation, named=(), kept={}, errors=errors, unseen=unseen,
         covariance=judgement.covariance[:size, :size], residual=left, maps_after=judgement.maps_before,
+        tables=tables, partial=partial,
     )  # fmt: skip

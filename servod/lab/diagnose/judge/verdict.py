@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.lab.diagnose.effects import effect
+from servod.lab.diagnose.predict.floor import above_noise
 from servod.lab.diagnose.result import DiagnosisVerdict
 from servod.lab.diagnose.select.candidates import Candidate
 from servod.lab.diagnose.select.selection import Selection
@@ -39,17 +40,21 @@ class Shares:
 def shares(mismatch: tuple[Array, Array], counts: NDArray[np.bool_], floor: float) -> Shares:
     """Errors of two mismatches, before and after, over the rows that count; `floor` is a mean square."""
     before, after = (float(np.mean(rows[counts] ** 2)) for rows in mismatch)
-    removed = (before - after) / max(before - floor, 1e-30)
+    removed = (before - after) / above_noise(before, floor)
     return Shares(math.sqrt(before), math.sqrt(after), math.sqrt(floor), min(max(removed, 0.0), 1.0))
 
 
-def verdict(named: Sequence[int], errors: Shares, dry: float) -> DiagnosisVerdict:
-    """The verdict on what was named (places of terms) and what is left."""
+def verdict(named: Sequence[int], errors: Shares, dry: float, *, driven: bool = False) -> DiagnosisVerdict:
+    """The verdict on what was named (places of terms) and what is left.
+
+    Where the torque is `driven` (by the drive of the model, not recorded) what is left is the drive's as well.
+    """
     left = errors.left / dry
     much = left > SETTINGS.verdict.left_torque and 1.0 - errors.removed > SETTINGS.verdict.left_share
     least = (
         SETTINGS.verdict.least_beside_much if left > SETTINGS.verdict.much_torque else SETTINGS.verdict.least_explained
     )
+    least = SETTINGS.verdict.least_by_drive if driven else least
     if much and (not named or errors.removed < least):
         return DiagnosisVerdict.UNEXPLAINED
     return DiagnosisVerdict.MISSING_PHYSICS if named else DiagnosisVerdict.ADEQUATE

@@ -24,6 +24,11 @@ def noise_floor(predictor: Predictor, mismatch: Array) -> float:
     return float(np.mean(parts))
 
 
+def above_noise(error: float, floor: float) -> float:
+    """What of a mean square lies above the floor; the least that a floor, itself an estimate, can tell from none."""
+    return max(error - floor, SETTINGS.floor.told * error, 1e-30)
+
+
 def trace_floor(predictor: Predictor, index: int, mismatch: Array) -> float:
     """Mean square of the noise in one recording's mismatch."""
     part, trace = predictor.slices[index], predictor.traces[index]

@@ -3,6 +3,12 @@
 Stands between traces and everything that judges models. The model runs on the recorded command and is pulled to the
 encoder by an observer of fixed gains (`innovation_kernel`); the pull, expressed as torque, is the mismatch seen through
 a low-pass of the observer's bandwidth. Where a model is right it is noise.
+
+The torque is that of the command which would close the gap: the pull times the model's own mass, over what the model
+makes of a command. With one mass for all models a trial model k times heavier would shrink every torque that it leaves
+out by k, and mass, gain, saturation and friction of the command would explain anything (the least squares of motion on
+command in place of that of command on motion, which feedback makes biased: Ljung, System Identification, 1999, 13.4).
+A lighter or stronger model is told with the nominal mass: its own would make the encoder's noise small instead.
 """
 
 from __future__ import annotations
@@ -13,15 +19,15 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from servod.common.portable import usable_cores
 from servod.formats.model.axis_model import AxisKind, AxisModel
-from servod.kernels.physics.compiled import Kernel, available, compiled
-from servod.kernels.physics.layout import PackedPlant, PlantState
+from servod.kernels.physics.compiled import Kernel, available, entry_without_lock
+from servod.kernels.physics.layout import PackedPlant, PlantParameters, PlantState
 from servod.kernels.physics.plant import inputs
 from servod.lab.diagnose.data.excitation import creeps
 from servod.lab.diagnose.data.trace import CheckedTrace, dry_friction
@@ -29,7 +35,7 @@ from servod.lab.diagnose.predict.innovation_kernel import innovate
 from servod.lab.diagnose.settings import SETTINGS
 from servod.lab.simulate import open_loop
 from servod.lab.simulate.motion import FirstRow
-from servod.lab.simulate.replay import Drive
+from servod.lab.simulate.replay import Drive, driven
 
 # --- Threads ---------------------------------------------------------------------------------------------------------
 # Runs simulations on both cores: kernels that let go of the interpreter's lock, and threads that call them. Threads,
@@ -43,17 +49,7 @@ R = TypeVar("R")
 @cache
 def without_lock(function: Kernel) -> Kernel:
     """`function` compiled, and called without the interpreter's lock; in pure Python where there is no compiler."""
-    if not available():
-        return function
-    import numba
-
-    kernel = compiled(function)
-
-    def call(axis: Any, tables: Any, *rest: Any) -> None:
-        kernel(axis[0].p, tables, axis[0].s, *rest)
-
-    outer: Kernel = numba.njit(nogil=True)(call)
-    return outer
+    return entry_without_lock(function) if available() else function
 
 
 @cache
@@ -81,7 +77,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Observer:
-    """Fixed gains for a trace: one row each; `to_torque` turns an innovation into torque."""
+    """Fixed gains for a trace: one row each; `to_torque` turns an innovation into torque of the nominal mass."""
 
     bandwidth: float
     position_gain: Array
@@ -101,7 +97,8 @@ def bandwidth(inertia: float, dry: float, traces: Sequence[CheckedTrace]) -> flo
     )
     allowed *= math.sqrt(1.0 / math.sqrt(allowed * period))  # a slow observer averages over more rows
     share = SETTINGS.observer.share_creeping if creeps(traces, inertia) else SETTINGS.observer.share_of_sampling
-    return min(max(allowed, SETTINGS.observer.slowest), SETTINGS.observer.fastest, share / period)
+    rare = min(SETTINGS.observer.most_of_sampling / period, SETTINGS.observer.slow_sampling)
+    return min(max(allowed, SETTINGS.observer.slowest), SETTINGS.observer.fastest, max(share / period, rare))
 
 
 def observer(trace: CheckedTrace, inertia: float, rate: float) -> Observer:
@@ -123,11 +120,12 @@ def _steps(trace: CheckedTrace, step: Array) -> NDArray[np.int64]:
 
 
 class Predictor:
-    """Mismatch of any model with fixed recordings; the scale of torque is that of the nominal model."""
+    """Mismatch of any model with fixed recordings, as the command that would close the gap."""
 
     def __init__(self, traces: Sequence[CheckedTrace], nominal: AxisModel, rate: float | None = None) -> None:
         self.traces = tuple(traces)
         self.dry = dry_friction(nominal)
+        self.inertia = nominal.inertia
         self.linear = nominal.axis is AxisKind.LINEAR
         self.rate = bandwidth(nominal.inertia, self.dry, traces) if rate is None else rate
         self.observers = tuple(observer(trace, nominal.inertia, self.rate) for trace in self.traces)
@@ -164,22 +162,20 @@ class Predictor:
 
         One model for all traces, or one for each.
         """
-        packed = [model.pack() for model in models]
-        each = packed if len(packed) > 1 else packed * len(self.traces)
+        each = models if len(models) > 1 else models * len(self.traces)
         self.evaluations += 1
         parts = [
-            self._trace_mismatch(packed, trace, seen)
-            for packed, trace, seen in zip(each, self.traces, self.observers, strict=True)
+            self._trace_mismatch(*driven(model, trace.drive), trace, seen)
+            for model, trace, seen in zip(each, self.traces, self.observers, strict=True)
         ]
         limit = SETTINGS.observer.worst * self.dry
         clean = np.nan_to_num(np.concatenate(parts), nan=limit, posinf=limit, neginf=-limit)
         return np.where(self.counts, np.clip(clean, -limit, limit), 0.0)
 
-    def _trace_mismatch(self, packed: PackedPlant, trace: CheckedTrace, seen: Observer) -> Array:
-        drive = trace.drive
+    def _trace_mismatch(self, packed: PackedPlant, drive: Drive, trace: CheckedTrace, seen: Observer) -> Array:
         gap, first = packed.p.gap > 0.0, trace.first_row(packed.p.delay_s)
         axis = inputs(packed, PlantState(temperature_c=packed.p.start_c, first_s=trace.begun_s))
-        states = np.array([self._start(packed, trace, int(row), first) for row in trace.starts])
+        states = np.array([self._start(packed, drive, int(row), first) for row in trace.starts])
         out = np.zeros(len(drive.t_s))
         steps = seen.steps * SETTINGS.observer.steps_in_gap if gap else seen.steps
         held = drive.t_s, drive.torque, first.command_before, drive.temperature_c, drive.position
@@ -192,11 +188,12 @@ class Predictor:
             SETTINGS.observer.quiet_noises * trace.position_noise,
         )
         self._run(*axis, *held, *gains, trace.starts, states, out)
-        return seen.to_torque * out
+        heavier = max((packed.p.inertia + packed.p.load_inertia) / self.inertia, 1.0)
+        weaker = min(torque_per_command(packed.p, trace), 1.0)
+        return seen.to_torque * (heavier / weaker) * out
 
-    def _start(self, packed: PackedPlant, trace: CheckedTrace, row: int, known: FirstRow) -> Array:
+    def _start(self, packed: PackedPlant, drive: Drive, row: int, known: FirstRow) -> Array:
         """Position, velocity and hidden states in balance with the recorded motion of one row."""
-        drive = trace.drive
         motion = known.motion if row == 0 else tuple(drive.motion[row, :3])
         before = known.command_before if row == 0 else float(drive.torque[row - 1])
         hidden = np.zeros((1, 4))
@@ -205,6 +202,26 @@ class Predictor:
         moved = np.array([motion])
         self._follow(*axis, drive.t_s[one], moved, drive.torque[one], before, drive.temperature_c[one], hidden, 1e-3)
         return np.array([motion[0], motion[1], *hidden[0]])
+
+
+#: The least that a model may make of a command, as a share of it: one that makes nothing would be off by anything.
+LEAST_TORQUE = 0.02
+
+
+def torque_per_command(p: PlantParameters, trace: CheckedTrace) -> float:
+    """What a model makes of the recorded command, by least squares: its gain, limit and friction of the command."""
+    if not p.complex and p.friction_per_command == 0.0:
+        return 1.0
+    command = trace.drive.torque
+    made = command
+    if p.complex:
+        made = np.where(command >= 0.0, p.gain_positive, p.gain_negative) * command
+        if p.limit_positive > 0.0:
+            limit = np.where(made >= 0.0, p.limit_positive, p.limit_negative)
+            made = limit * np.tanh(made / limit) if p.limit_soft else np.clip(made, -limit, limit)
+    made = made - p.friction_per_command * np.abs(made) * np.sign(trace.velocity)
+    power = float(command @ command)
+    return max(float(made @ command) / power, LEAST_TORQUE) if power > 0.0 else 1.0
 
 
 # --- Shorter data ----------------------------------------------------------------------------------------------------
@@ -228,5 +245,6 @@ def _cut(trace: CheckedTrace, mismatch: Array, settling_s: float) -> CheckedTrac
     first = int(np.argmax(power[rows:] - power[: len(power) - rows]))
     part = slice(first, first + rows)
     drive = trace.drive
-    short = Drive(drive.t_s[part], drive.torque[part], drive.position[part], drive.temperature_c[part])
+    told = drive.told.part(part) if drive.told else None
+    short = Drive(drive.t_s[part], drive.torque[part], drive.position[part], drive.temperature_c[part], told)
     return replace(trace, drive=short, counts=trace.counts[part])

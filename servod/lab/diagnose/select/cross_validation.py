@@ -1,8 +1,7 @@
 """Cross-validation: some rows are left out in turn, the rest is fitted again, and the rows left out are predicted.
 
-The last stage of the selection. What is left out is a recording; a stretch of every recording instead where there is
-only one, or where recordings have levels of their own, which no other recording predicts. Nothing predicts an event in
-one recording either: its rows are not judged.
+The last stage of the selection. What is left out is a recording; a stretch of it instead where there is only one.
+Nothing predicts an event in one recording: its rows are not judged.
 """
 
 from __future__ import annotations
@@ -66,8 +65,7 @@ def _worst(selection: Selection, validation: CrossValidation) -> int | None:
 
 def make_folds(predictor: Predictor, fit: Fit) -> Folds:
     """How the rows are shared out so that nothing of `fit` is judged by rows that it was fitted to."""
-    own_levels = any(term.each is not None for term in fit.hypothesis.terms)
-    whole = len(predictor.slices) > 1 and not own_levels
+    whole = len(predictor.slices) > 1
     parts = [_edges(part, 1 if whole else SETTINGS.validation.stretches) for part in predictor.slices]
     groups = [[part[0]] for part in parts] if whole else [list(group) for group in zip(*parts, strict=True)]
     judged = predictor.counts & ~_events(predictor, fit)

@@ -207,6 +207,12 @@ def _bounded_step(normal: Array, slope: Array, damping: float, fit: Fit) -> Arra
     return change
 
 
+def on_bound(fit: Fit) -> NDArray[np.bool_]:
+    """Coordinates that lie on a bound: the data pull them further, or they do not matter."""
+    low, high = fit.hypothesis.bounds
+    return np.asarray(np.minimum(fit.coordinates - low, high - fit.coordinates) < SETTINGS.worth.on_bound)
+
+
 def scale_of(mismatch: Array, counts: NDArray[np.bool_], floor: float) -> float:
     """Robust standard deviation of the mismatch, at least `floor` and a share of its root mean square."""
     spread = float(np.median(np.abs(mismatch[counts]))) / 0.6745

@@ -35,11 +35,12 @@ def is_level_change(term: Term) -> bool:
 
 
 #: Numbers that may lie at an end of their range: where they do not matter, or are known beforehand to a narrow one.
-#: A bristle's damping is one of them, the model's own as well as that of a bristle that the model does not have.
+#: A bristle's damping is one of them, the model's own as well as that of a bristle that the model does not have; where
+#: a spring rests is another: far beyond the travel it pulls with a constant force and a slope.
 MAY_END = frozenset(
     (
         *("damping", "cubic", "exponent", "delay_s", "sigma1", "friction.sigma1"),
-        *("friction.stribeck_velocity", "damping_velocity"),
+        *("friction.stribeck_velocity", "damping_velocity", "shift"),
     )
 )
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from servod.lab.diagnose.effects import effect, names
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
 from servod.lab.diagnose.effects.search_context import SearchContext
+from servod.lab.diagnose.predict.floor import above_noise
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.candidates import Candidate
 from servod.lab.diagnose.select.fit import Fit
@@ -49,7 +50,7 @@ def above_floor(selector: Selector, selection: Selection) -> bool:
     if not selection.terms:
         return False
     left = selector.error(selection.fit.mismatch) - selection.floor
-    explainable = max(selection.base_error - selection.floor, 1e-30)
+    explainable = above_noise(selection.base_error, selection.floor)
     torque = math.sqrt(max(left, 0.0))
     return left > SETTINGS.group.left_share * explainable and torque > SETTINGS.group.much_left * selector.predictor.dry
 
@@ -63,7 +64,8 @@ def add_group(selector: Selector, selection: Selection) -> Selection:
     while longer.terms < SETTINGS.group.most_terms and monotonic() < selector.deadline:
         if selector.nothing_left(longer):
             break
-        candidates, tried = selector.candidates(longer.fit, True, names(lambda what: what.soaks_up))
+        skip = names(lambda what: what.soaks_up) | frozenset(longer.rejected)
+        candidates, tried = selector.candidates(longer.fit, True, skip)
         before = longer.terms
         longer = add_first(selector, replace(longer, tried=longer.tried + tried), candidates)
         if longer.terms == before:
@@ -103,20 +105,23 @@ def add_drift(selector: Selector, selection: Selection) -> Selection:
     """
     present = selection.fit
     there = {term.effect for term in present.hypothesis.terms}
-    if there & {DRIFT[0], DRIFT_RIVAL[0]} or not effect(DRIFT[0]).terms(_scene(selector, present)):
+    out = there | set(selection.rejected)
+    if out & {DRIFT[0], DRIFT_RIVAL[0]} or not effect(DRIFT[0]).terms(_scene(selector, present)):
         return selection
     drift, merit = _fit_with(selector, selection, *DRIFT)
     left = _left(selector, present, drift)
-    if left > 1.0 - SETTINGS.drift.least_taken or not _is_significant(selector, merit) or not is_sound(merit, drift):
+    taken = left <= 1.0 - SETTINGS.drift.least_taken and _is_significant(selector, merit, 1.0 - left)
+    if not taken or not is_sound(merit, drift):
         return selection
     other, _ = _fit_with(selector, selection, *DRIFT_RIVAL)
     rival = Candidate(DRIFT_RIVAL[0], other, _left(selector, present, other))
     return selection.with_term(drift, merit, TermEntry(left, (rival,)))
 
 
-def _is_significant(selector: Selector, merit: Merit) -> bool:
-    """Whether a term of one number is significant."""
-    return merit.gain >= SETTINGS.drift.least_gain + math.log(float(selector.rows.sum()))
+def _is_significant(selector: Selector, merit: Merit, taken: float = 0.0) -> bool:
+    """Whether a term of one number is significant that takes a share of the means' power."""
+    least = SETTINGS.drift.least_gain_of_most if taken >= SETTINGS.drift.most_taken else SETTINGS.drift.least_gain
+    return merit.gain >= least + math.log(float(selector.rows.sum()))
 
 
 def _fit_with(selector: Selector, selection: Selection, name: str, form: str) -> tuple[Fit, Merit]:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.formats.model.axis_model import AxisModel
+from servod.lab.diagnose.result import MinorReason
 from servod.lab.diagnose.select.candidates import Candidate
 from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.select.merit import Merit
@@ -82,8 +83,8 @@ class Selection:
     """What is selected so far: the fit with all terms, the fit of the base alone, and for each term how it came in.
 
     `floor` is the noise floor as a mean square, `base_error` that of the base's mismatch; `minor` are effects that are
-    significant and not worth a name. `tried` counts starts of effects; `cut`: time ended the search while something was
-    left.
+    significant and not worth a name, `rejected` those that came in and had to go again, and why. `tried` counts starts
+    of effects; `cut`: time ended the search while something was left.
     """
 
     base: Fit
@@ -93,6 +94,7 @@ class Selection:
     merits: tuple[Merit, ...] = ()
     entries: tuple[TermEntry, ...] = ()
     minor: Mapping[str, Merit] = field(default_factory=dict)
+    rejected: Mapping[str, tuple[Merit, MinorReason]] = field(default_factory=dict)
     tried: int = 0
     cut: bool = False
     validation: CrossValidation | None = None

@@ -19,7 +19,7 @@ from servod.lab.diagnose.effects import effect, unexcited_effects
 from servod.lab.diagnose.effects.base import base_unknowns, document_of
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
 from servod.lab.diagnose.effects.search_context import SearchContext
-from servod.lab.diagnose.predict.floor import noise_floor, stretch_means
+from servod.lab.diagnose.predict.floor import above_noise, noise_floor, stretch_means
 from servod.lab.diagnose.predict.predict import Predictor, shorten
 from servod.lab.diagnose.select.candidates import Candidate, CandidateFits
 from servod.lab.diagnose.select.fit import Fit, Fitter, Weighing, long_run, scale_of
@@ -31,17 +31,30 @@ from servod.lab.diagnose.settings import SETTINGS
 Array = NDArray[np.float64]
 Tell = Callable[[str], None]
 
+#: What every geared servo has, first of all.
+SERVO = ("delay", "load_dependent_friction")
+
 #: Whether a new term deserves to come in, by what it is worth and the fit with it.
 Deserves = Callable[[Merit, Fit], bool]
 
 
 class Selector:
-    """Fits and measures on fixed recordings; `deadline` is the monotonic time at which the search for terms ends."""
+    """Fits and measures on fixed recordings; `deadline` is the monotonic time at which the search for terms ends.
 
-    def __init__(self, predictor: Predictor, nominal: AxisModel, deadline: float, tell: Tell) -> None:
+    Keys in `unknown` are of the drive: their values in `nominal` are starts, and they are free.
+    """
+
+    def __init__(
+        self,
+        predictor: Predictor,
+        nominal: AxisModel,
+        deadline: float,
+        tell: Tell,
+        unknown: frozenset[str] = frozenset(),
+    ) -> None:
         self.predictor, self.deadline, self.tell = predictor, deadline, tell
         self.nominal = nominal
-        self.start = Hypothesis(document_of(nominal), base_unknowns(nominal))
+        self.start = Hypothesis(document_of(nominal), base_unknowns(nominal, unknown))
         self.unexcited = unexcited_effects(predictor.traces, nominal.inertia)
         self.rows = predictor.counts.astype(np.float64)
 
@@ -119,9 +132,12 @@ class Selector:
         whole = self.fitter(present.mismatch)
         quick = shorten(self.predictor, self.nominal, present.mismatch)
         short = Fitter(quick, Weighing(whole.weighing.scale, quick.counts.astype(np.float64)))
-        scene = SearchContext(self.start.document, self.predictor, present.mismatch, fine)
+        fitted = present.hypothesis.written(present.coordinates)
+        scene = SearchContext(self.start.document, self.predictor, present.mismatch, fine, fitted)
         trials = CandidateFits(whole, short, present, scene, not present.hypothesis.terms, self.deadline)
         found = trials.run(skip=once_only(present.hypothesis) | skip | self.unexcited)
+        if scene.servo:  # what every geared servo has comes first: others swallow it, and their own parts after it
+            found.sort(key=lambda candidate: SERVO.index(candidate.effect) if candidate.effect in SERVO else len(SERVO))
         self.tell(f"{trials.tried} starts tried; best: " + ", ".join(c.effect for c in found[:3]))
         return found, trials.tried
 
@@ -140,7 +156,7 @@ class Selector:
 
     def merit(self, selection: Selection, without: Fit, with_term: Fit) -> Merit:
         """What the step from one fit to the other is worth, by floor and base of the selection."""
-        explainable = max(selection.base_error - selection.floor, 1e-30)
+        explainable = above_noise(selection.base_error, selection.floor)
         saved = self.error(without.mismatch) - self.error(with_term.mismatch)
         torque = self._acting(without.mismatch, with_term.mismatch)
         fitter = self.fitter(with_term.mismatch)
@@ -148,7 +164,7 @@ class Selector:
         gain = 2.0 * (cost - with_term.cost) / self._correlation(with_term.mismatch, fitter.weighing.scale)
         blow = SETTINGS.worth.blow * float(np.median(np.abs(with_term.mismatch[self.predictor.counts]))) / 0.6745
         was, now = (self.error(np.clip(fit.mismatch, -blow, blow)) for fit in (without, with_term))
-        of_left = (was - now) / max(was - selection.floor, 1e-30)
+        of_left = (was - now) / above_noise(was, selection.floor)
         return Merit(saved / explainable, of_left, torque, gain, self._own_torque(without, with_term))
 
     def _acting(self, one: Array, other: Array) -> float:

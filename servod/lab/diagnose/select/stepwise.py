@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
 from servod.lab.diagnose.select.candidates import Candidate
 from servod.lab.diagnose.select.fit import Fit
-from servod.lab.diagnose.select.levels import level_at_bound
+from servod.lab.diagnose.select.levels import at_end_of_range, level_at_bound
 from servod.lab.diagnose.select.selection import Selection, TermEntry
 from servod.lab.diagnose.select.selector import Selector
 from servod.lab.diagnose.settings import SETTINGS
@@ -45,14 +45,19 @@ def _more_to_find(selector: Selector, selection: Selection) -> bool:
 def _add_best(selector: Selector, selection: Selection) -> Selection:
     """Try all effects beside the present fit and take the best if it deserves it.
 
-    A fit behind a gap may improve by being fitted again: what a term is worth counts from there.
+    A fit behind a gap may improve by being fitted again: what a term is worth counts from there. One that has run to
+    the end of its range is none, and sets no bar for the others.
     """
     present = selection.fit
-    candidates, tried = selector.candidates(present)
+    candidates, tried = selector.candidates(present, skip=frozenset(selection.rejected))
     selection = replace(selection, tried=selection.tried + tried)
     deserves = partial(selector.deserves, selection)
+    best = math.inf
     for candidate in candidates:
-        if candidate.left > candidates[0].left + SETTINGS.forward.close * (1.0 - candidates[0].left):
+        if at_end_of_range(candidate.fit, candidate.place):
+            continue
+        best = min(best, candidate.left)
+        if candidate.left > best + SETTINGS.forward.close * (1.0 - best):
             break
         begun = selector.settle_candidate(candidate, present.mismatch)
         fit, merit = selector.fit_on(selection, present, begun, deserves)
@@ -64,7 +69,7 @@ def _add_best(selector: Selector, selection: Selection) -> Selection:
         if selector.may_enter(selection, merit, fit):
             others = tuple(c for c in candidates if c.effect != candidate.effect)
             return selection.with_term(fit, merit, TermEntry(candidate.left, others))
-        if selector.significant(selection, merit, fit):
+        if selector.significant(selection, merit, fit) and not at_end_of_range(fit):
             first = selection.minor.get(candidate.effect, merit)
             selection = replace(selection, minor={**selection.minor, candidate.effect: first})
     return selection
@@ -123,7 +128,8 @@ def _swap(selector: Selector, selection: Selection, index: int, rival: Candidate
 
 def _rivals(selection: Selection, index: int) -> tuple[Candidate, ...]:
     """Rivals of a term that stood close when it came in and are not in by now."""
-    entry, there = selection.entries[index], {term.effect for term in selection.fit.hypothesis.terms}
+    entry = selection.entries[index]
+    there = {term.effect for term in selection.fit.hypothesis.terms} | set(selection.rejected)
     most = SETTINGS.swap.within * entry.left
     close = tuple(c for c in entry.rivals if c.left <= most and c.effect not in there)
     return close[: SETTINGS.swap.most_tried]

@@ -6,6 +6,7 @@ Stands on the stored design of a gain set and the linearised loop of verificatio
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Protocol
 
 import numpy as np
 
@@ -182,6 +183,25 @@ def _norms(region: RegionProof, period_s: float) -> str:
 # The certificate of a gain set as a table: every check with its figure, limit and margin.
 
 
+class Judged(Protocol):
+    """A verdict with its figures: a certificate, or what the checks said of a set that got none."""
+
+    @property
+    def valid(self) -> bool:
+        """Whether all checks passed."""
+        ...
+
+    @property
+    def checks(self) -> list[CertificateCheck]:
+        """Each with figure and limit."""
+        ...
+
+    @property
+    def observations(self) -> dict[str, float]:
+        """Told, not judged."""
+        ...
+
+
 #: Titles of tables that a page folds begin so.
 PASSED = "Passed"
 #: So many passed checks stand open: those that have used most of their limit.
@@ -193,7 +213,11 @@ def certificate_tables(gains: GainSet) -> Iterator[PageTable]:
 
     Raises BadInput for a set without a certificate.
     """
-    certificate = _certificate(gains)
+    return judged_tables(_certificate(gains))
+
+
+def judged_tables(certificate: Judged) -> Iterator[PageTable]:
+    """The same of any verdict on a set, also where no certificate was issued."""
     header = ("margin", "value", "unit", "textbooks ask for", "what it is")
     yield PageTable("Margins of the loop, the least over all speeds", header, tuple(margin_rows(certificate)))
     checks = sorted(certificate.checks, key=lambda check: (check.passed, -limit_used(check)))
@@ -242,7 +266,7 @@ def _exact(check: CertificateCheck) -> bool:
     return check.passed and abs(check.value - check.limit) <= 1e-6 * abs(check.limit)
 
 
-def margin_rows(certificate: Certificate) -> Iterator[tuple[str, ...]]:
+def margin_rows(certificate: Judged) -> Iterator[tuple[str, ...]]:
     """One row for each margin that a certificate states; none of one of an earlier version."""
     told = certificate.observations
     for key, words in MARGINS.items():

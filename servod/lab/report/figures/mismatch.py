@@ -110,14 +110,12 @@ def spectrum(before: Spectrum, after: Spectrum, units: Units) -> Figure:
     return Figure("spectrum", "The error over frequency", (panel,), 1, caption)
 
 
-def seen_by(left_out: str | None) -> str:
-    """By what rows were judged; None: by a table that was fitted to them, since what is left has no name."""
-    if left_out is None:
-        return "What has no name is a table that has seen these rows."
+def seen_by(left_out: str) -> str:
+    """By what rows were judged."""
     return f"Each row is judged by a model that was fitted without it: {left_out} was left out."
 
 
-def window_course(windows: Sequence[Windows], left_out: str | None, units: Units) -> Figure:
+def window_course(windows: Sequence[Windows], left_out: str, units: Units) -> Figure:
     """Error of windows that are simulated freely, over time, in the recording where it was largest."""
     panels = []
     for window in windows:
@@ -137,7 +135,7 @@ def window_course(windows: Sequence[Windows], left_out: str | None, units: Units
     return Figure("windows", "How far a simulation strays", tuple(panels), 1, caption, 0.8)
 
 
-def bars(panels: Sequence[PlotPanel], left_out: str | None) -> Figure:
+def bars(panels: Sequence[PlotPanel], left_out: str) -> Figure:
     """Errors before and after, a panel for each kind of error."""
     rows = max(len(panel.y.names) for panel in panels)
     caption = f"Root mean square errors of each recording before and after. {seen_by(left_out)}"

@@ -6,12 +6,13 @@ Stands on motions as arrays, cut from cycle records or from the compiled simulat
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from servod.common.faults import FaultCode
+from servod.lab.recordings.recording import LARGEST, missing_samples
 from servod.lab.report.figure import COLOURS, Array, Colour, Curve, Figure, PlotAxis, PlotPanel, Style, array, curve
 from servod.lab.simulate.simulate import ClosedLoopRun
 
@@ -41,7 +42,13 @@ class PlottedMotion:
 
     def rms_mrad(self, after_s: float = SETTLE_S) -> float:
         """RMS of the error from `after_s` on."""
-        return float(np.sqrt(np.mean(self.error_mrad[self.time_s >= after_s] ** 2)))
+        error = self.error_mrad[self.time_s >= after_s]
+        return float(np.sqrt(np.mean(error[np.isfinite(error)] ** 2)))
+
+    def most_mrad(self, after_s: float) -> float:
+        """Largest error from `after_s` on; 0 where there is none."""
+        error = np.abs(self.error_mrad[self.time_s >= after_s])
+        return float(error[np.isfinite(error)].max(initial=0.0))
 
     def part(self, from_s: float, to_s: float) -> PlottedMotion:
         """The cycles between both times, time counted from the first of them."""
@@ -84,7 +91,7 @@ def tracking_grid(
 
     `same_error_scale` draws all errors on one scale, so that they can be compared by eye.
     """
-    top = 1.05 * max(float(np.abs(m.error_mrad[m.time_s >= SETTLE_S]).max()) for m in motions)
+    top = 1.05 * max(m.most_mrad(SETTLE_S) for m in motions)
     span = (-top, top) if same_error_scale else None
     columns = [_column(motion, span) for motion in motions]
     panels = [column[row] for row in range(3) for column in columns]
@@ -132,7 +139,7 @@ def errors(
 def _errors(
     motions: Sequence[PlottedMotion], scores: dict[str, float], colours: dict[str, Colour], after_s: float
 ) -> PlotPanel:
-    reach = 1.1 * max(float(np.abs(m.error_mrad[m.time_s >= after_s]).max()) for m in motions)
+    reach = 1.1 * max(m.most_mrad(after_s) for m in motions)
     curves = [curve(m.label, m.time_s, m.error_mrad, colours[m.label], width=1.0) for m in motions]
     title = "" if len(motions) == len(scores) else "those below a tenth of the worst"
     return PlotPanel(PlotAxis("time in s"), PlotAxis("error in mrad", span=(-reach, reach)), tuple(curves), title)
@@ -177,8 +184,7 @@ def steps(
     torque = [
         curve(m.label, m.time_s, MILLI * m.torque_nm, c, width=1.0) for m, c in zip(motions, colours, strict=True)
     ]
-    left = [float(np.abs(m.error_mrad[m.time_s >= settled_s]).max(initial=0.0)) for m in motions]
-    span = 1.1 * max(*left, 1e-3)
+    span = 1.1 * max(*(m.most_mrad(settled_s) for m in motions), 1e-3)
     panels = (
         PlotPanel(t, PlotAxis("position in mrad"), (goal, *position)),
         PlotPanel(
@@ -238,13 +244,16 @@ class RecordedRun:
     """Columns of a recording that can be drawn, by their names in the cycle record (rad, N*m) or those of a linear axis
     (m, N), and the time of each row in s.
 
-    `states` names what the columns of states hold: (column, title of its panel, names by number).
+    `states` names what the columns of states hold: (column, title of its panel, names by number). `sets` names the gain
+    sets of the column `controller`, and `damage` says what is missing of the file.
     """
 
     title: str
     time_s: Array
     columns: Mapping[str, NDArray[np.generic]]
     states: tuple[tuple[str, str, StateNames], ...] = ()
+    sets: Mapping[int, str] = field(default_factory=dict)
+    damage: str = ""
 
     def between(self, from_s: float | None, to_s: float | None) -> RecordedRun:
         """The rows from `from_s` to before `to_s` (None: its begin, its end)."""
@@ -287,14 +296,17 @@ def recorded_run(run: RecordedRun, name: str = "recording") -> Figure:
     panels.append(PlotPanel(t, PlotAxis("torque in N·m" if rotary else "force in N"), torques))
     panels += [_states(run, t, *shown) for shown in run.states if shown[0] in run.columns]
     faults = _faults(run, t)
-    return Figure(name, run.title, tuple(panels + faults), caption=describe_run(run), row_height=0.75)
+    title = f"{run.title} (incomplete)" if run.damage else run.title
+    return Figure(name, title, tuple(panels + faults), caption=describe_run(run), row_height=0.75)
 
 
 def _states(run: RecordedRun, t: PlotAxis, column: str, title: str, names: StateNames) -> PlotPanel:
-    """A line that jumps where the state changes."""
-    x, y = _stairs(run.time_s, array(run.columns[column]))
+    """A line that jumps where the state changes; the states that occur have a place each, in the order of the enum."""
+    occur, places = np.unique(array(run.columns[column]), return_inverse=True)
+    shown = tuple(names[int(k)] if 0 <= k < len(names) else f"{k:g}" for k in occur)
+    x, y = _stairs(run.time_s, places.astype(np.float64))
     return PlotPanel(
-        t, PlotAxis("", span=(-0.5, len(names) - 0.5), names=names), (curve(title, x, y, Colour.PURPLE),), title
+        t, PlotAxis("", span=(-0.5, len(shown) - 0.5), names=shown), (curve(title, x, y, Colour.PURPLE),), title
     )
 
 
@@ -329,22 +341,33 @@ def _faults(run: RecordedRun, t: PlotAxis) -> list[PlotPanel]:
 
 
 def describe_run(run: RecordedRun) -> str:
-    """How it went in one sentence: length, error, missed periods, faults with the time at which each came."""
+    """How it went in one sentence: what the file lost, length, error, missing samples, faults with their times."""
     rows, unit = len(run.time_s), "rad" if "position_rad" in run.columns else "m"
+    said = [f"Incomplete: {run.damage}"] if run.damage else []
     if not rows:
-        return "No cycles."
-    said = [f"{rows} cycles from {run.time_s[0]:.3f} to {run.time_s[-1]:.3f} s"]
+        return "; ".join([*said, "no cycles" if said else "No cycles"]) + "."
+    said.append(f"{rows} cycles from {run.time_s[0]:.3f} to {run.time_s[-1]:.3f} s")
     if f"reference_{unit}" in run.columns:
         error = MILLI * (array(run.columns[f"reference_{unit}"]) - array(run.columns[f"position_{unit}"]))
         said += _following_errors(run, error, unit)
-    if "missed" in run.columns:
-        said.append(f"missed periods: {int(run.columns['missed'][-1]) - int(run.columns['missed'][0])}")
+    said.append(_missing(run))
     if "faults" in run.columns:
         bits = np.asarray(run.columns["faults"], dtype=np.int64)
         at = {code.name: run.time_s[np.argmax((bits >> code) & 1)] for code in FaultCode if np.any(bits & (1 << code))}
         first = sorted(at.items(), key=lambda item: item[1])
-        said.append(", ".join(f"{name} first at {t:.3f} s" for name, t in first) or "no fault present")
+        said.append(", ".join(f"{name} first at t = {t:.3f} s" for name, t in first) or "no fault present")
     return "; ".join(said) + "."
+
+
+def _missing(run: RecordedRun) -> str:
+    """Samples that are missing, and what is known of why: the loop skipped their periods, or they were not recorded."""
+    cycle = run.columns.get("cycle")
+    missing = int(missing_samples(run.time_s, None if cycle is None else array(cycle)).sum())
+    said = f"missing samples: {missing}"
+    if "missed" not in run.columns:
+        return said
+    skipped = int(run.columns["missed"][-1]) - int(run.columns["missed"][0])
+    return said if skipped == missing else f"{said}, periods that the loop skipped: {skipped}"
 
 
 def _following_errors(run: RecordedRun, error: Array, unit: str) -> list[str]:
@@ -360,6 +383,18 @@ def _following_errors(run: RecordedRun, error: Array, unit: str) -> list[str]:
     for serial in dict.fromkeys(serials[rows]):
         of_set = error[rows & (serials == serial)]
         name = f" under gain set {int(serial)} of this run" if len(set(serials[rows])) > 1 else ""
-        rms, largest = np.sqrt(np.mean(of_set**2)), np.abs(of_set).max()
-        told.append(f"RMS error {rms:.4g} m{unit}, largest {largest:.4g} m{unit}{name}")
+        if name and serial in run.sets:
+            name += f" ({run.sets[serial]})"
+        told.append(_judged(of_set, unit) + name)
     return told
+
+
+def _judged(error: Array, unit: str) -> str:
+    """RMS and largest of the errors that are numbers, and how many are none, or none that was measured."""
+    known = error[np.abs(error) < LARGEST]
+    without = len(error) - len(known)
+    if not len(known):
+        return f"no error can be told, {without} cycles have none"
+    rms, largest = np.sqrt(np.mean(known**2)), np.abs(known).max()
+    told = f"RMS error {rms:.4g} m{unit}, largest {largest:.4g} m{unit}"
+    return f"{told} ({without} of {len(error)} cycles, which have no error, left out)" if without else told

@@ -1,0 +1,258 @@
+"""What a drive makes of its command: torque for each recorded row, and the axis with its servo's loop closed.
+
+Stands beside `replay`, for recordings without a torque. Two views of one law (`servod.formats.model.drive`): over the
+recorded motion (`drive_torque`), where the recorded goal and position give the torque that acted, and on the simulated
+motion (`run_closed`), where the servo acts on what the model does.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servod.formats.model.drive import DriveKind, DriveLaw
+from servod.kernels.physics.dynamics import advance
+from servod.kernels.physics.effects import encoder_position
+from servod.kernels.physics.layout import PlantParameters, PlantState, Tables
+from servod.lab.simulate.open_loop import acting, acts_until, begin, inner_steps, switch_row
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.bool_]
+
+#: A servo's own loop runs at about a kilohertz: its duty is held for so long, s.
+LOOP_PERIOD_S = 1e-3
+
+
+@dataclass(frozen=True)
+class ToldRows:
+    """What a recording says of its drive, a value for each row: the command that it was told, in the unit of its kind
+    (rad, rad/s, V or A; m when linear), its gain `kp` and its supply in V (NaN where not recorded), and whether it is
+    on: one that is off makes no torque."""
+
+    command: Array
+    gain: Array
+    supply_v: Array
+    on: NDArray[np.bool_]
+
+    def part(self, rows: slice) -> ToldRows:
+        """The same over some rows."""
+        return ToldRows(self.command[rows], self.gain[rows], self.supply_v[rows], self.on[rows])
+
+
+def torque_per_unit(law: DriveLaw, told: ToldRows) -> Array:
+    """Torque of a duty, volt or ampere of one in each row, N*m. Raises ValueError where the law does not say."""
+    factor = law.factor
+    if factor is None:
+        raise ValueError("a drive whose torque_per_command is unknown")
+    if not law.by_supply:
+        return np.full(len(told.command), factor)
+    known = law.supply_v if law.supply_v is not None else math.nan
+    return factor * np.where(np.isfinite(told.supply_v), told.supply_v, known)
+
+
+def loop_gain(law: DriveLaw, told: ToldRows) -> Array:
+    """Duty per rad of error in each row (duty*s/rad with kind velocity)."""
+    own = np.full(len(told.command), law.kp) if law.kp is not None else told.gain
+    return law.gain_scale * own
+
+
+def arriving(law: DriveLaw, t_s: Array, command: Array) -> Array:
+    """The command as the drive follows it: no faster than `goal_rate`."""
+    if law.goal_rate is None:
+        return command
+    followed = command.copy()
+    for row in range(1, len(command)):
+        reach = law.goal_rate * (t_s[row] - t_s[row - 1])
+        followed[row] = min(max(command[row], followed[row - 1] - reach), followed[row - 1] + reach)
+    return followed
+
+
+def mean_arriving(t_s: Array, command: Array, delay_s: float) -> Array:
+    """Mean over each row's step of a command that is held over its sample and arrives `delay_s` late.
+
+    Before the first row its command is taken to have stood; the mean is smooth in the delay.
+    """
+    ends = np.append(t_s, t_s[-1] + (t_s[-1] - t_s[-2]))
+    area = np.concatenate([[0.0], np.cumsum(command * np.diff(ends))])
+    late = ends - delay_s
+    reached = np.where(late < t_s[0], command[0] * (late - t_s[0]), np.interp(late, ends, area))
+    span = np.diff(ends)
+    return np.asarray(np.where(span > 0.0, np.diff(reached) / np.maximum(span, 1e-12), command))
+
+
+def drive_torque(law: DriveLaw, told: ToldRows, t_s: Array, position: Array, delay_s: float) -> Array:
+    """Torque that acted over each row's step, N*m: the law on the recorded command and the recorded motion.
+
+    `delay_s` is on the command's way alone: what the servo feeds back is its own measurement.
+    """
+    came = mean_arriving(t_s, arriving(law, t_s, told.command), delay_s)
+    if law.kind.feeds_back:
+        came = _duty(law, told, t_s, position, came)
+    most = law.most
+    made = torque_per_unit(law, told) * (came if most is None else np.clip(came, -most, most))
+    return np.where(told.on, made, 0.0)
+
+
+def _duty(law: DriveLaw, told: ToldRows, t_s: Array, position: Array, goal: Array) -> Array:
+    """The duty that the loop asks for, before its limit."""
+    step, error, speed = _errors(law, t_s, position, goal)
+    duty = loop_gain(law, told) * error
+    if law.kd > 0.0:
+        duty = duty - law.gain_scale * law.kd * speed
+    return duty + _integral(law, step, error) if law.ki > 0.0 else duty
+
+
+def _errors(law: DriveLaw, t_s: Array, position: Array, goal: Array) -> tuple[Array, Array, Array]:
+    """Length of each row's step, and error behind the dead band and speed, both as means over it."""
+    step = np.diff(t_s, append=t_s[-1] + (t_s[-1] - t_s[-2]))
+    behind = np.append(position[1:], 2.0 * position[-1] - position[-2])
+    speed = (behind - position) / np.maximum(step, 1e-9)
+    error = goal - (0.5 * (position + behind) if law.kind is DriveKind.POSITION_SERVO else speed)
+    return step, np.where(np.abs(error) <= law.dead_band, 0.0, error), speed
+
+
+def recorded_totals(law: DriveLaw, told: ToldRows, t_s: Array, position: Array, delay_s: float) -> Array:
+    """The integral part in each row as the recorded motion makes it; nothing where the law has none."""
+    if law.ki == 0.0:
+        return np.zeros(len(t_s))
+    came = mean_arriving(t_s, arriving(law, t_s, told.command), delay_s)
+    step, error, _ = _errors(law, t_s, position, came)
+    return _integral(law, step, error)
+
+
+def _integral(law: DriveLaw, step: Array, error: Array) -> Array:
+    """The integral part in each row, from none at the first, within the limit (no wind-up)."""
+    most = law.most or math.inf
+    found, total = np.zeros(len(error)), 0.0
+    for row in range(len(error)):
+        found[row] = total
+        total = min(max(total + law.gain_scale * law.ki * error[row] * step[row], -most), most)
+    return found
+
+
+# --- A drive that is off ---------------------------------------------------------------------------------------------
+# Recordings of a drop, or of a servo whose protection has tripped, ask for a goal that nothing follows any more.
+
+
+#: A drive is off where, for so long, s, it would push with this share of the most that it can ...
+OFF_LEAST_S, OFF_PUSHES = 0.3, 0.9
+
+#: ... and what the motion needs is at most this share of it: a drive that is stalled holds what it pushes against.
+OFF_NEEDS = 0.2
+
+
+def find_on(torque: Array, most: Array, needed: tuple[Array, Array], t_s: Array) -> Rows:
+    """Rows in which a drive is on, by what the motion needed.
+
+    `torque` is what the drive makes when it is on, `most` the largest that it can; `needed` the torque of the model's
+    motion without dry friction: all of it, and what is left without viscous friction and back-EMF. Full torque that
+    nothing stands against tells that the drive is off; it is for as long before and after as it saves
+    squares to leave out its torque.
+    """
+    on = np.ones(len(torque), dtype=bool)
+    whole, bare = needed
+    pushed = (np.abs(torque) >= OFF_PUSHES * most) & (np.abs(whole) <= OFF_NEEDS * np.abs(torque))
+    saved = (whole - torque) ** 2 - np.minimum(whole**2, bare**2)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], pushed.astype(np.int8), [0]])))
+    for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        if t_s[end - 1] - t_s[first] >= OFF_LEAST_S:
+            on[first - _longest(saved[:first][::-1]) : end + _longest(saved[end:])] = False
+    return on
+
+
+def _longest(saved: Array) -> int:
+    """How many rows to take for the greatest sum; none where every sum is a loss."""
+    total = np.cumsum(saved)
+    return int(np.argmax(total)) + 1 if len(total) and float(np.max(total)) > 0.0 else 0
+
+
+# --- The loop closed -------------------------------------------------------------------------------------------------
+# The servo acts on the simulated position: what a replay and free windows of such a recording are.
+
+
+class ServoNumbers(NamedTuple):
+    """The law as the kernel takes it; gain and torque per duty come row by row."""
+
+    on_speed: bool
+    ki: float
+    kd: float
+    dead_band: float
+    limit: float
+
+
+def servo_numbers(law: DriveLaw) -> ServoNumbers:
+    """The numbers of a law that feeds back."""
+    most = law.most if law.most is not None else math.inf
+    kd, ki = law.gain_scale * law.kd, law.gain_scale * law.ki
+    return ServoNumbers(law.kind is DriveKind.VELOCITY, ki, kd, law.dead_band, most)
+
+
+def servo_duty(
+    n: ServoNumbers, gain: float, goal: float, position: float, velocity: float, total: float, h: float
+) -> tuple[float, float]:
+    """Duty behind the limit, and the integral part after `h` seconds."""
+    error = goal - (velocity if n.on_speed else position)
+    if abs(error) <= n.dead_band:
+        error = 0.0
+    duty = gain * error - n.kd * velocity + total
+    total = min(max(total + n.ki * error * h, -n.limit), n.limit)
+    return min(max(duty, -n.limit), n.limit), total
+
+
+def run_closed(
+    p: PlantParameters,
+    tables: Tables,
+    s: PlantState,
+    line: Any,
+    off: PlantParameters,
+    n: ServoNumbers,
+    t: Any,
+    goal: Any,
+    delay_s: float,
+    gain: Any,
+    factor: Any,
+    on: Any,
+    temperature: Any,
+    starts: Any,
+    start_states: Any,
+    totals: Any,
+    out: Any,
+    step_s: float,
+) -> None:
+    """`open_loop.run` with the servo's loop closed over the simulated motion.
+
+    `goal` of a row arrives `delay_s` late, `gain` and `factor` (N*m at full duty) hold from their rows on, `totals` are
+    the integral parts at the rows in `starts`. Where the drive is not `on` the axis is `off`: no torque, no back-EMF.
+    `out` gets encoder position, velocity, load position, and torque.
+    """
+    window, row, total = 0, -1, 0.0
+    for k in range(len(t)):
+        s.time_s = t[k]
+        if window < len(starts) and starts[window] == k:
+            begin(s, start_states[window])
+            total = totals[window]
+            window += 1
+        out[k, 0], out[k, 1] = encoder_position(p, tables, s.position), s.velocity
+        out[k, 2], out[k, 3] = s.load_position, s.torque
+        if k + 1 == len(t):
+            break
+        now = t[k]
+        while now < t[k + 1]:
+            row = switch_row(t, row, now, delay_s)
+            end = acts_until(t, row, delay_s, t[k + 1])
+            pieces = inner_steps(end - now, LOOP_PERIOD_S)
+            h = (end - now) / pieces
+            steps = inner_steps(h, step_s)
+            for _ in range(pieces):
+                shown = encoder_position(p, tables, s.position)
+                duty, total = servo_duty(n, gain[k], acting(goal, row, goal[0]), shown, s.velocity, total, h)
+                if on[k]:
+                    advance(p, tables, s, line, factor[k] * duty, 0.0, steps, h / steps, 0.0, temperature[k])
+                else:
+                    total = 0.0
+                    advance(off, tables, s, line, 0.0, 0.0, steps, h / steps, 0.0, temperature[k])
+            now = end

@@ -1,0 +1,84 @@
+"""Diagnosis of recordings that have a goal and a position only: what makes torque of them is fitted and told."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from servod.common.errors import BadInput
+from servod.formats.model.axis_model import AxisModel
+from servod.lab.diagnose.document import diagnosis_document
+from servod.lab.diagnose.engine import diagnose
+from servod.lab.diagnose.result import Diagnosis
+from servod.lab.recordings import Recording
+from tests.lab.simulate.servo_axis import ServoAxis, goal_of
+from tests.lab.simulate.test_servo import PERIOD_S, model_of, recorded, write
+
+TRUTH = ServoAxis(gain=6.0, full=3.0, delay_s=0.03, coulomb=0.06, gravity=0.8)
+
+
+def recordings(axis: ServoAxis, tmp_path: Path) -> list[Recording]:
+    """Three motions."""
+    found = []
+    for kind in range(3):
+        (tmp_path / str(kind)).mkdir()
+        found.append(recorded(axis, tmp_path / str(kind), kind))
+    return found
+
+
+def document_of(axis: ServoAxis, runs: Sequence[Recording], **drive: Any) -> tuple[Diagnosis, dict[str, Any]]:
+    """The diagnosis of a model of that truth without its delay, and with keys of its drive changed."""
+    found = diagnose(model_of(axis, delay_s=0.0, **drive), runs, 60.0)
+    return found, diagnosis_document(found)
+
+
+def test_delay_and_torque_of_a_servo_are_found_from_goals_and_positions(tmp_path: Path) -> None:
+    found, document = document_of(TRUTH, recordings(TRUTH, tmp_path), torque_per_command=None)
+    (finding,) = document["findings"]
+    assert finding["effect"] == "delay"
+    low, high = finding["parameters"]["additional_s"]["interval"]
+    assert low < TRUTH.delay_s < high and high - low < 0.01
+    torque = document["drive"]["torque_per_command"]
+    assert torque["interval"][0] < TRUTH.full < torque["interval"][1]
+    assert found.evidence is not None
+    window = document["fit"]["windows"]["1"]
+    assert window["after"] < 0.3 * window["before"]
+    drive = found.evidence.model.drive
+    assert drive is not None and drive.torque_per_command == pytest.approx(torque["value"])
+
+
+def test_an_unknown_gain_of_a_servo_is_told_with_its_interval(tmp_path: Path) -> None:
+    _, document = document_of(TRUTH, recordings(TRUTH, tmp_path), kp=None)
+    low, high = document["drive"]["kp"]["interval"]
+    assert low < TRUTH.gain < high < 1.3 * low
+
+
+def test_nothing_is_named_of_a_drive_that_is_known(tmp_path: Path) -> None:
+    found = diagnose(model_of(TRUTH), recordings(TRUTH, tmp_path), 60.0)
+    assert found.evidence is not None
+    assert not found.evidence.findings and not found.evidence.drive
+
+
+def test_of_gain_and_torque_one_must_be_known(tmp_path: Path) -> None:
+    model = model_of(TRUTH, kp=None, torque_per_command=None)
+    with pytest.raises(BadInput, match="only their product"):
+        diagnose(model, recordings(TRUTH, tmp_path), 10.0)
+
+
+def test_rows_in_which_the_drive_is_off_do_not_count(tmp_path: Path) -> None:
+    t_s = np.arange(600) * PERIOD_S
+    axis = ServoAxis(off_from_s=4.0)
+    goal = goal_of(t_s, 0)
+    enabled = (t_s < 4.0).astype(float)
+    run = write(
+        tmp_path / "off.csv", t_s=t_s, reference_rad=goal, position_rad=axis.run(goal, PERIOD_S), enabled=enabled
+    )
+    model: AxisModel = model_of(axis)
+    found = diagnosis_document(diagnose(model, [run], 30.0))
+    (told,) = found["recordings"]
+    assert any(note.startswith("drive: off in 33 %") for note in told["notes"])
+    assert not found["findings"]
