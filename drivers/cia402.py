@@ -19,6 +19,7 @@ from servod.runtime.fieldbus.cia import (
     CW_ENABLE_OPERATION,
     CW_FAULT_RESET,
     CW_HALT,
+    CW_QUICK_STOP,
     EMCY_BASE,
     SW_REMOTE,
     SW_VOLTAGE_ENABLED,
@@ -30,6 +31,7 @@ from servod.runtime.fieldbus.devices import (
     NEVER_CYCLES,
     AmplifierCommand,
     AmplifierFeedback,
+    DriveInput,
     Driver,
     DriveState,
     Goal,
@@ -47,12 +49,17 @@ _FORMATS: dict[int, str] = {
     Obj402.TORQUE_ACTUAL: "h",
     Obj402.MODE_DISPLAY: "b",
     Obj402.ERROR_CODE: "H",
+    Obj402.DIGITAL_INPUTS: "I",
+    Obj402.DIGITAL_OUTPUTS: "I",
     Obj402.TARGET_TORQUE: "h",
     Obj402.TARGET_POSITION: "i",
     Obj402.TARGET_VELOCITY: "i",
 }
 _EMCY = struct.Struct("<HB5s")
 _MODE_NOT_KNOWN = -1
+#: A brake by output is open in no other state, and for no other goal.
+_TORQUE_STATES = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
+_TORQUE_GOALS = (Goal.ENABLED, Goal.QUICK_STOP)
 
 
 class Cia402Amplifier:
@@ -63,6 +70,7 @@ class Cia402Amplifier:
         self._wanted_mode = Mode(int(facts["mode"]))
         self._acting_modes = (int(self._wanted_mode), _MODE_NOT_KNOWN)  # in another mode the target means another thing
         self._target = TARGETS[self._wanted_mode](facts)
+        self._input_rows = [tuple(row) for row in facts.get("inputs", ())]
         self._bind_pdos(plan)
         self._control_words = control_words(int(facts["quick_stop_option"]))
         self._reached = reached_states(int(facts["quick_stop_option"]))
@@ -83,6 +91,9 @@ class Cia402Amplifier:
         self._unwrapped_counts: int | None = None
         self._torque_per_mille = 0
         self._error_code = 0
+        self._sto_error = int(facts.get("sto_error", 0))
+        self._inputs = 0  # bits of DriveInput that are active
+        self._inputs_age_cycles = 0  # since all of them were last said to be
         self._commands_missed = False
         self._feedback: AmplifierFeedback | None = None
         self._goal = Goal.OFF
@@ -103,11 +114,14 @@ class Cia402Amplifier:
         self._torque_slot = slot(feedback, Obj402.TORQUE_ACTUAL)
         self._command_id, self._command_codec = command.cob_id, codec(command, _FORMATS, plan.driver)
         self._word_first = slot(command, Obj402.CONTROL_WORD) == 0
+        brake = plan.facts.get("brake")
+        self._brake: tuple[int, int] | None = None if brake is None else (brake[0], brake[1])
         self._slow_id, self._slow_codec = -1, struct.Struct("<bH")
-        self._mode_slot, self._error_slot = 0, 1
+        self._mode_slot, self._error_slot, self._inputs_slot = 0, 1, -1
         if slow is not None:
             self._slow_id, self._slow_codec = slow.cob_id, codec(slow, _FORMATS, plan.driver)
             self._mode_slot, self._error_slot = slot(slow, Obj402.MODE_DISPLAY), slot(slow, Obj402.ERROR_CODE)
+            self._inputs_slot = slot(slow, Obj402.DIGITAL_INPUTS) if self._input_rows else -1
         self._slow_limit_cycles = lost_after_cycles(slow, float(plan.facts["period_s"]))
         self._emcy_id = EMCY_BASE + plan.node_id
         slow_ids = () if slow is None else (self._slow_id,)
@@ -128,13 +142,26 @@ class Cia402Amplifier:
             else:
                 values = self._slow_codec.unpack_from(data)
                 self._mode, self._error_code = values[self._mode_slot], values[self._error_slot]
-                self._slow_age_cycles = 0
+                self._slow_age_cycles, self._feedback = 0, None
+                if self._inputs_slot >= 0:
+                    word = values[self._inputs_slot]
+                    self._take_inputs(sum(flag for flag, mask, active in self._input_rows if word & mask == active))
         elif can_id == self._emcy_id:
             if len(data) < _EMCY.size:
                 self.ignored_frames += 1
             else:
                 self._take_emergency(_EMCY.unpack_from(data)[0])
         return False
+
+    def _take_inputs(self, active: int) -> None:
+        """An active input stays so until the drive has had several event timers to say it again: whoever sends the
+        PDO in the drive's name, with the input released, hides no emergency stop."""
+        if active & self._inputs == self._inputs:
+            self._inputs, self._inputs_age_cycles = active, 0
+        elif self._inputs_age_cycles > (self._slow_limit_cycles or 0):
+            self._inputs = active
+        else:
+            self._inputs |= active
 
     def _take_emergency(self, code: int) -> None:
         """The drive tells of the deadline of its RPDO once, and takes that back when commands come again."""
@@ -160,7 +187,9 @@ class Cia402Amplifier:
     def read(self) -> AmplifierFeedback:
         """The feedback of this cycle; the same value until a new frame comes or `write` closes the cycle."""
         if self._feedback is None:
-            reasons = self._reasons() | (Reason.COMMANDS_MISSED if self._commands_missed else 0)
+            reasons = int(self._reasons())  # plain: what is asked of it in every cycle costs a microsecond else
+            if self._commands_missed:
+                reasons |= int(Reason.COMMANDS_MISSED)
             self._feedback = AmplifierFeedback(
                 self._time_ns,
                 self._age_cycles,
@@ -172,11 +201,19 @@ class Cia402Amplifier:
                 self._error_code,
                 reasons == 0,
                 reasons,
+                self._active_inputs(),
             )
         return self._feedback
 
     def _slow_lost(self) -> bool:
         return self._slow_limit_cycles is not None and self._slow_age_cycles > self._slow_limit_cycles
+
+    def _active_inputs(self) -> int:
+        """Inputs that are not heard any more are taken for active: a stop that cannot be seen is one."""
+        active = sum(flag for flag, _, _ in self._input_rows) if self._slow_lost() else self._inputs
+        in_fault = self._state in (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE)
+        told = self._sto_error and in_fault and self._error_code == self._sto_error
+        return active | DriveInput.STO_TOLD if told else active
 
     def _shown_mode(self) -> int:
         """The mode last shown; one that is not shown any more is a wrong one while the drive acts on targets.
@@ -232,10 +269,12 @@ class Cia402Amplifier:
             target = self._idle_target(state == DriveState.QUICK_STOP_ACTIVE and word == CW_ENABLE_OPERATION)
         if command.halt and word & CW_ENABLE_OPERATION == CW_ENABLE_OPERATION:
             word |= CW_HALT
+        opens = command.release_brake and goal in _TORQUE_GOALS and state in _TORQUE_STATES and word & CW_QUICK_STOP
         word |= self._reset_bit(command.reset_fault, state)
         self._close_cycle(goal, command.halt, word)
         values = (word, target) if self._word_first else (target, word)
-        return self._command_id, self._command_codec.pack(*values)
+        outputs = () if self._brake is None else (self._brake[1 if opens else 0],)  # mapped last
+        return self._command_id, self._command_codec.pack(*values, *outputs)
 
     def _idle_target(self, holding: bool) -> int:
         return self._target.idle(self._position_counts, self._torque_per_mille, holding)
@@ -262,6 +301,7 @@ class Cia402Amplifier:
         self._goal, self._halt, self._control_word = goal, halt, word
         self._age_cycles += 1
         self._slow_age_cycles += 1
+        self._inputs_age_cycles += 1
         self._feedback = None
 
 

@@ -16,7 +16,7 @@ from servod.runtime.fieldbus.cia import (
     CW_QUICK_STOP,
     CW_SHUTDOWN,
     CW_SWITCH_ON,
-    STATUS_WORD_TABLE,
+    decode_status_word,
 )
 from servod.runtime.fieldbus.devices import DriveState, Goal
 
@@ -76,14 +76,6 @@ _AT_OFF = frozenset({_S.NOT_READY_TO_SWITCH_ON, _S.SWITCH_ON_DISABLED, _S.FAULT}
 def quick_stop_stays(quick_stop_option: int) -> bool:
     """Whether the drive stays in quick stop active (0x605A is 5 to 8) and may go back by transition 16."""
     return quick_stop_option >= 5
-
-
-def decode_status_word(status_word: int) -> DriveState:
-    """State of a status word by the table of CiA 402; a word that matches no row is UNKNOWN, never a guess."""
-    for mask, value, state in STATUS_WORD_TABLE:
-        if status_word & mask == value:
-            return state
-    return DriveState.UNKNOWN
 
 
 #: The same, indexed by the low seven bits of the status word (the table's masks use no others).

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from servod.common.errors import BadInput, Unreachable
-from servod.common.units import rad_per_count
+from servod.common.units import rad_per_count, wrapped_difference
 from servod.runtime.fieldbus.cia import TPDO_BASE, Obj406
 from servod.runtime.fieldbus.devices import NodePlan, PdoEntry, PdoMap, SdoAccess
 from servod.runtime.fieldbus.setup_tools import read_optional, write_checked
@@ -91,6 +91,14 @@ class EncoderSetup:
             node = self._encoder.node_id
             raise Unreachable(f"encoder node {node}: measuring range 0x6002 = {measuring_range} is less than one turn")
         return measuring_range
+
+    def position_rad(self, sdo: SdoAccess) -> float:
+        """Where the joint stands, as the cycle face decodes it: the turn nearest to zero."""
+        encoder, span = self._encoder, self._measuring_range(sdo)
+        counts_per_rad = encoder.direction / rad_per_count(encoder.counts_per_turn)
+        zero = round(encoder.zero_offset_rad * counts_per_rad)
+        counts = zero + wrapped_difference(sdo.read(Obj406.POSITION), zero % span, span)
+        return counts / counts_per_rad - encoder.zero_offset_rad
 
     def preset(self, sdo: SdoAccess, position_rad: float) -> int:
         """Make the joint's present position read `position_rad` (0x6003); the device refuses it in motion.

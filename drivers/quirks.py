@@ -21,6 +21,14 @@ class Presence(IntEnum):
     REQUIRED = 2  # the drive does not work in the cyclic modes without it: its absence ends the bring-up
 
 
+class CommandDeadline(IntEnum):
+    """What a drive does when its command frames stay away for longer than 0x1400:5; CiA 301 asks for the EMCY alone."""
+
+    STOPS = 1  # as for a lost heartbeat (0x6007), and somebody has shown it: counts as a guard
+    TELLS = 2  # EMCY 0x8250 and no more, which is all that CiA 301 asks for: only the loop can act on it
+    MISSING = 3  # has no such sub-index, or ignores it
+
+
 @dataclass(frozen=True, slots=True)
 class Deviation:
     """One documented difference: what it is, the manual or thread that says so, and how servod meets it."""
@@ -42,6 +50,15 @@ class Precondition:
 
 
 @dataclass(frozen=True, slots=True)
+class Shown:
+    """A vendor object by which a drive shows something of itself: it does where this reads `value`."""
+
+    index: int
+    subindex: int
+    value: int
+
+
+@dataclass(frozen=True, slots=True)
 class Quirks:
     """One row: how to treat a maker's drives where they differ. The defaults are the standard."""
 
@@ -49,6 +66,9 @@ class Quirks:
     rated_torque_unit_nm: float = 1e-3  # one count of 0x6076
     interpolation_period: Presence = Presence.OPTIONAL  # 0x60C2
     interpolation_exponents: tuple[int, ...] = (-3, -4, -5, -6)  # values of 0x60C2:2 that the drive takes
+    deceleration: bool = False  # 0x6085 is in the user units of 0x6064 per s^2; else the engineer sets the ramp
+    command_deadline: CommandDeadline = CommandDeadline.TELLS
+    deadline_stops: Shown | None = None  # not all drives of the row stop at it: only one that shows this is believed
     max_pdo_entries: int = 8
     pdo_pairs: int = 4  # RPDOs and TPDOs to look for; all that are not planned are set not valid
     reset_communication_at_start: bool = False
@@ -181,8 +201,46 @@ _TECHNOSOFT = Quirks(
     ),
 )
 
+_CANOPENNODE = Quirks(
+    maker="CANopenNode (drives built on this stack)",
+    deviations=(
+        Deviation(
+            "the deadline 0x1400:5 of a synchronous RPDO is looked at when SYNC comes: it tells of lost commands, and "
+            "never of a master that died, which ends both",
+            "CANopenNode 9b8beed, 301/CO_PDO.c, CO_RPDO_process",
+            "as of every drive of which nobody has shown more: the heartbeat guards",
+        ),
+        Deviation(
+            "NMT start is not obeyed while its heartbeat consumer still misses a master that died",
+            "CANopenNode 9b8beed, 301/CO_NMT_Heartbeat.c, CO_NMT_process",
+            "the bring-up lets every drive forget the old watch first",
+        ),
+    ),
+)
+
+_VIRTUAL = Quirks(
+    maker="servod's virtual drive",
+    deceleration=True,
+    command_deadline=CommandDeadline.STOPS,
+    deadline_stops=Shown(0x2007, 0, 1),
+    deviations=(
+        Deviation(
+            "stops by 0x6007 at the deadline of its commands (0x1400:5), and does not only tell of it, if 0x2007 is 1",
+            "drivers/virtual/amplifier.py, commands_overdue",
+            "command_deadline: the deadline guards, the heartbeat behind it; deadline_stops: 0x2007 is read",
+        ),
+        Deviation(
+            "its ramps 0x6084 and 0x6085 are in the unit of 0x6064 per s^2",
+            "drivers/virtual/motion.py",
+            "deceleration: the ramp that a stop is reckoned with is written and read back",
+        ),
+    ),
+)
+
 QUIRKS: dict[str, Quirks] = {
-    "none": Quirks(maker="CiA 402"),
+    "none": Quirks(maker="CiA 402", deceleration=True),
+    "virtual": _VIRTUAL,
+    "canopennode": _CANOPENNODE,
     "epos4": _MAXON,
     "elmo": _ELMO,
     "copley": _COPLEY,

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from servod.drivers.virtual.dictionary import DeviceDictionary, SdoRefusal
 from servod.drivers.virtual.drive_record import DriveRecord
-from servod.drivers.virtual.joint import Joint
+from servod.drivers.virtual.joint import Joint, JointBrake
 from servod.drivers.virtual.motion import TorqueStage
 from servod.drivers.virtual.motor_sensor import MotorSensor
 from servod.drivers.virtual.node import Send, VirtualNode
@@ -27,6 +27,7 @@ from servod.runtime.fieldbus.devices import DriveState, Mode
 
 
 UNDER_VOLTAGE, OVER_VOLTAGE, SAFE_TORQUE_OFF, MOTOR_TEMPERATURE = 0x3220, 0x3210, 0x5441, 0x4310
+_STO_CLOSED = 1 << 17
 _LOWEST_MV, _HIGHEST_MV = 18_000, 60_000
 _MOTOR_LIMIT_C = 120.0
 #: Error classes (high nibble of the code) after which the power stage cannot brake any more.
@@ -36,7 +37,7 @@ _UNUSABLE = (0x2, 0x3, 0x5)
 class DriveFaults:
     """Reads the causes; `0x2000` sub 1 error code, 2 safe torque off, 3 supply in mV, 4 local control, 5 the state
     (servod.runtime.fieldbus.devices.DriveState) in which control words do nothing, 6 the transition that control
-    words do not cause."""
+    words do not cause, 7 what the contacts at the digital inputs give, 24 V is 1, 8 a brake that does not open."""
 
     def __init__(self, dictionary: DeviceDictionary) -> None:
         self._injected = dictionary.entry(0x2000, 1)
@@ -45,6 +46,8 @@ class DriveFaults:
         self._local = dictionary.entry(0x2000, 4)
         self._stuck = dictionary.entry(0x2000, 5)
         self._refused = dictionary.entry(0x2000, 6)
+        self._contacts = dictionary.entry(0x2000, 7)
+        self._brake_stuck = dictionary.entry(0x2000, 8)
 
     @property
     def supplied(self) -> bool:
@@ -55,6 +58,15 @@ class DriveFaults:
     def inhibited(self) -> bool:
         """True while safe torque off is active."""
         return bool(self._safe_torque_off.value)
+
+    def brake_stuck(self) -> bool:
+        """True while the brake does not open."""
+        return bool(self._brake_stuck.value)
+
+    @property
+    def inputs(self) -> int:
+        """0x60FD: the contacts; bit 17 shows besides that the STO circuit is closed."""
+        return self._contacts.value & ~(_STO_CLOSED if self.inhibited else 0)
 
     @property
     def local(self) -> bool:
@@ -111,13 +123,16 @@ class AmplifierNode(VirtualNode):
         self, settings: VirtualAxisSettings, joint: Joint, timeline: Timeline, send: Send, record: DriveRecord | None
     ) -> None:
         super().__init__(AMPLIFIER_EDS, settings.amplifier_node_id, settings.amplifier_serial, timeline, send)
+        self.dictionary.remove(settings.missing_objects + (["1400:5"] if settings.command_deadline == "none" else []))
         self.settings, self.joint, self._record = settings, joint, record
         entry = self.dictionary.entry
         self._apply_settings()
         self.sensor = MotorSensor(self.dictionary, joint, settings.amplifier_counts_per_turn, settings.gear_ratio)
         self.machine = PowerMachine(self)
-        self.motion = TorqueStage(self.dictionary, joint, self.sensor, timeline, self.machine.stopped)
+        self.motion = TorqueStage(self.dictionary, joint, self.sensor, timeline, self._at_rest)
         self.faults = DriveFaults(self.dictionary)
+        self.holding = JointBrake(settings, joint, timeline, self.faults.brake_stuck)
+        self._outputs, self._outputs_mask = entry(Obj402.DIGITAL_OUTPUTS, 1), entry(Obj402.DIGITAL_OUTPUTS, 2)
         self._error = 0
         self._too_far_since_ns: int | None = None
         self._control, self._mode_wanted = entry(Obj402.CONTROL_WORD), entry(Obj402.MODE)
@@ -126,6 +141,7 @@ class AmplifierNode(VirtualNode):
         self._counts, self._velocity, self._sensor_velocity = entry(0x6063), entry(0x606C), entry(0x6069)
         self._current, self._position_demand, self._following = entry(0x6078), entry(0x6062), entry(0x60F4)
         self._velocity_demand, self._internal_demand, self._effort = entry(0x606B), entry(0x60FC), entry(0x60FA)
+        self._digital_inputs = entry(Obj402.DIGITAL_INPUTS)
         self._events = (self._status, self._error_code, self._mode_shown)
         self._announced = (0, 0, 0)
         self._mode_timer = timeline.timer(self._mode_taken)
@@ -157,17 +173,19 @@ class AmplifierNode(VirtualNode):
     def energise(self, time_ns: int) -> None:
         """Follow the targets."""
         self.dictionary.write_lock = True
+        self.holding.torque(True, time_ns)
         self.motion.energise(time_ns)
 
     def cut(self, time_ns: int) -> None:
         """No torque."""
         self.dictionary.write_lock = False
+        self.holding.torque(False, time_ns)
         self.motion.cut(time_ns)
 
     def fault_cleared(self, time_ns: int) -> None:
         """The fault was acknowledged: error code and EMCY go."""
         code, self._error = self._error, 0
-        if code != Emcy.HEARTBEAT_LOST:
+        if code not in (Emcy.HEARTBEAT_LOST, Emcy.RPDO_TIME_OUT):  # these go when the master is heard again
             self.emergency.clear(code, time_ns)
 
     # --- Node ------------------------------------------------------------------------------------------------------
@@ -180,12 +198,14 @@ class AmplifierNode(VirtualNode):
         self._mode_timer.cancel()
         self.motion.set_mode(Mode.NONE, time_ns)
         self.machine.start(time_ns)
+        self.holding.output(self._outputs.value, self._outputs_mask.value, time_ns)
         self._mode_taken(time_ns)
         self._watch.arm(time_ns + _WATCH_NS)
         self._write_record(time_ns)
 
     def commanded(self, time_ns: int) -> None:
         """New control word or targets: judge the word with everything of its PDO in place."""
+        self.holding.output(self._outputs.value, self._outputs_mask.value, time_ns)
         if self._mode_wanted.value != self.motion.mode and not self._mode_timer.armed:
             self._mode_timer.arm(time_ns + MODE_CHANGE_NS)
         if not self.faults.local:
@@ -195,13 +215,19 @@ class AmplifierNode(VirtualNode):
             self.motion.targets(time_ns)
         self._write_record(time_ns)
 
-    def connection_lost(self, time_ns: int) -> None:
+    def commands_overdue(self, time_ns: int) -> None:
+        """As for a lost heartbeat: 0x6007, then 0x1029. A drive without power has nothing to react with."""
+        if self.settings.command_deadline == "stops" and self._switched_on:
+            self.connection_lost(time_ns, Emcy.RPDO_TIME_OUT)
+            self._error_behaviour(time_ns)
+
+    def connection_lost(self, time_ns: int, code: int = Emcy.HEARTBEAT_LOST) -> None:
         """Abort connection option code 0x6007."""
         option = self.dictionary.value(Obj402.ABORT_CONNECTION)
-        if self.machine.state is not DriveState.SWITCHED_ON and self.machine.state not in ENERGISED:
+        if not self._switched_on:
             return
         if option == _ABORT_FAULT:
-            self._fault(Emcy.HEARTBEAT_LOST, time_ns)
+            self._fault(code, time_ns)
         elif option == _ABORT_DISABLE:
             self.machine.command(DriveCommand.DISABLE_VOLTAGE, time_ns)
         elif option == _ABORT_QUICK_STOP:
@@ -222,9 +248,18 @@ class AmplifierNode(VirtualNode):
         if motion.mode is not Mode.CYCLIC_SYNC_TORQUE:
             self._refresh_demands(user_per_rad, position)
             self._watch_following_error(time_ns)
+        self._digital_inputs.value = self.faults.inputs
         self._status.value = self._status_word()
 
     # --- inside ----------------------------------------------------------------------------------------------------
+
+    def _at_rest(self, time_ns: int) -> None:
+        """A stop came to rest: the brake that the drive sequences closes before the torque goes."""
+        self.holding.close_then(self.machine.stopped, time_ns)
+
+    @property
+    def _switched_on(self) -> bool:
+        return self.machine.state is DriveState.SWITCHED_ON or self.machine.state in ENERGISED
 
     def _refresh_demands(self, user_per_rad: float, position: int) -> None:
         """Position and velocity demands, which cyclic torque does not have."""
@@ -261,8 +296,7 @@ class AmplifierNode(VirtualNode):
     def _supervise(self, time_ns: int) -> None:
         """Look for causes of faults."""
         state = self.machine.state
-        switched_on = state is DriveState.SWITCHED_ON or state in ENERGISED
-        code = self.faults.cause(self.joint.plant.temperature_c, switched_on)
+        code = self.faults.cause(self.joint.plant.temperature_c, self._switched_on)
         if code:
             self._fault(code, time_ns)
         elif state is DriveState.READY_TO_SWITCH_ON and not self.has_power():
@@ -308,6 +342,7 @@ class AmplifierNode(VirtualNode):
         set_default(Obj402.ENCODER_RESOLUTION, 1, s.amplifier_counts_per_turn)
         set_default(Obj402.FEED, 1, s.amplifier_counts_per_turn)
         set_default(Obj402.POLARITY, 0, s.polarity)
+        set_default(0x2007, 0, int(s.command_deadline == "stops"))
         for obj in (Obj402.MAX_TORQUE, Obj402.MAX_CURRENT, Obj402.POSITIVE_TORQUE_LIMIT, Obj402.NEGATIVE_TORQUE_LIMIT):
             set_default(obj, 0, s.max_torque_permille)
 
@@ -326,6 +361,8 @@ class AmplifierNode(VirtualNode):
             entry(index).read = now
         for index in (0x6040, 0x6060, 0x6071, 0x607A, 0x60B0, 0x60B1, 0x60B2, 0x60FF):
             entry(index).written = lambda value: self.commanded(self.timeline.now_ns)
+        for subindex in (1, 2):
+            entry(Obj402.DIGITAL_OUTPUTS, subindex).written = lambda value: self.commanded(self.timeline.now_ns)
         for index, subindex in ((0x6076, 0), (0x607E, 0), *((i, s) for i in (0x608F, 0x6091, 0x6092) for s in (1, 2))):
             entry(index, subindex).written = lambda value: self._scale()
         for subindex in (1, 2, 3):

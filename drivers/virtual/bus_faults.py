@@ -14,6 +14,8 @@ from typing import NamedTuple
 _MESSAGE = struct.Struct("<BBHI")
 #: `can_id` of a fault that hits every frame.
 ANY_ID = 0xFFFF
+#: Where the subindex stands in the `amount` of a WRITE.
+SUBINDEX_SHIFT = 24
 #: `participant` that means the client which sends the request.
 MYSELF = 0
 
@@ -38,6 +40,7 @@ class FaultKind(IntEnum):
     BABBLE = 14  # somebody sends `can_id` for `amount` ms, `detail` frames each ms (0: as many as the bus takes)
     TWIN = 15  # a second node with the participant's id is switched on
     CLEAR = 16  # no frame is hit any more
+    WRITE = 18  # the node's object `can_id` gets what `amount` says, past the bus: subindex in its first octet, value
     HAPPENED = 17  # no fault, a question: how often the kind `amount` took effect so far; the answer has it as `amount`
 
 
@@ -73,6 +76,11 @@ class BusFault(NamedTuple):
     def concerns(self) -> tuple[FaultKind, int]:
         """What its effect is counted by: the kind, and the identifier or the participant that it hits."""
         return self.kind, self.can_id if self.kind in _BY_IDENTIFIER else self.participant
+
+    @classmethod
+    def write(cls, node_id: int, index: int, subindex: int, value: int) -> BusFault:
+        """An object of a node changes, as its maker's tool would change it over a plug of its own."""
+        return cls(FaultKind.WRITE, index, subindex << SUBINDEX_SHIFT | value, node_id)
 
     def encode(self) -> bytes:
         """Eight bytes for an error frame."""

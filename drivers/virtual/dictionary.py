@@ -143,6 +143,7 @@ class DeviceDictionary:
     def __init__(self, eds: Path) -> None:
         self._entries = {(e.index, e.subindex): e for e in map(Entry, _variables(eds))}
         self._indices = {index for index, _ in self._entries}
+        self._missing: set[tuple[int, int]] = set()
         self.write_lock = False
         self.injected_abort = 0
         self.faulty = FaultyObject(self._entries)
@@ -156,6 +157,14 @@ class DeviceDictionary:
         if found is None:
             raise SdoRefusal(Abort.NO_SUCH_SUBINDEX if index in self._indices else Abort.NO_SUCH_OBJECT)
         return found
+
+    def remove(self, names: list[str]) -> None:
+        """Let clients find no such object ("6007") or sub-index ("1400:5"); inside, its default goes on to hold."""
+        for name in names:
+            index, _, subindex = name.partition(":")
+            self._missing |= {
+                key for key in self._entries if key[0] == int(index, 16) and subindex in ("", f"{key[1]:X}")
+            }
 
     def has(self, index: int, subindex: int = 0) -> bool:
         """True when the entry exists."""
@@ -222,6 +231,9 @@ class DeviceDictionary:
 
     def _strike(self, index: int, subindex: int) -> None:
         """Answer this access with the injected abort code, once; the faulty object's at every access."""
+        if (index, subindex) in self._missing:
+            whole = all((i, s) in self._missing for i, s in self._entries if i == index)
+            raise SdoRefusal(Abort.NO_SUCH_OBJECT if whole else Abort.NO_SUCH_SUBINDEX)
         self.faulty.refuse(index, subindex)
         if self.injected_abort and index != _ABORT_INJECTION:
             code, self.injected_abort = self.injected_abort, 0

@@ -17,7 +17,7 @@ from servod.drivers.virtual.joint import Joint
 from servod.drivers.virtual.node import Send, VirtualNode
 from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.drivers.virtual.timeline import Timeline
-from servod.runtime.fieldbus.cia import Abort, Obj406
+from servod.runtime.fieldbus.cia import Abort, Emcy, Obj406
 
 ENCODER_EDS = Path(str(files("servod.drivers") / "eds" / "encoder.eds"))
 _CODE_SEQUENCE, _SCALING = 0x1, 0x4
@@ -65,7 +65,7 @@ class EncoderNode(VirtualNode):
     def commanded(self, time_ns: int) -> None:
         """An encoder has no RPDO: nothing to judge."""
 
-    def connection_lost(self, time_ns: int) -> None:
+    def connection_lost(self, time_ns: int, code: int = Emcy.HEARTBEAT_LOST) -> None:
         """An encoder moves nothing: it goes on measuring."""
 
     def refresh(self, time_ns: int) -> None:

@@ -164,6 +164,12 @@ def arbitration_key(can_id: int) -> int:
     return (can_id & 0x7FF) << 21 | remote << 19
 
 
+def _arbitrated(port: Port) -> int:
+    return arbitration_key(port.queue[0][0])
+
+
+#: Looked up once: what an enumeration's member costs is paid with every frame.
+_BUS_OFF, _CORRUPT = ErrorState.BUS_OFF, FaultKind.CORRUPT
 #: What a destroyed frame adds to the transmitter's and the receivers' error counters.
 TRANSMIT_ERROR_STEP, RECEIVE_ERROR_STEP = 8, 1
 
@@ -204,15 +210,18 @@ class Hub:
 
     def submit(self, port: Port, can_id: int, data: bytes, time_ns: int) -> bool:
         """Queue a frame of `port`; False when its queue is full or it is bus-off. A silenced port loses it unseen."""
-        if port.state is ErrorState.BUS_OFF or len(port.queue) >= port.depth:
+        queue = port.queue
+        if port.state is _BUS_OFF or len(queue) >= port.depth:
             port.dropped += 1
             return False
         if time_ns < port.silent_until_ns:
             port.silenced += 1
             return True
-        ready_ns = max(time_ns + port.delay_ns, port.stuck_until_ns)
-        port.held += ready_ns > time_ns
-        port.queue.append((can_id, data, ready_ns))
+        ready_ns = time_ns + port.delay_ns
+        ready_ns = max(ready_ns, port.stuck_until_ns)
+        if ready_ns > time_ns:
+            port.held += 1
+        queue.append((can_id, data, ready_ns))
         self._waiting += 1
         return True
 
@@ -246,20 +255,21 @@ class Hub:
 
     def _start(self, limit_ns: int) -> bool:
         """Arbitrate at the next moment at which the bus is free and somebody waits."""
-        start_ns = self._next_start_ns()
-        if start_ns > limit_ns:
-            return False
-        winner, best = None, NEVER
+        winner, start_ns, several = None, NEVER, False
         for port in self._ports:
             queue = port.queue
-            if queue and queue[0][2] <= start_ns:
-                key = arbitration_key(queue[0][0])
-                if key < best:
-                    winner, best = port, key
-        if winner is None:
+            if queue:
+                several = winner is not None
+                winner = port
+                start_ns = min(start_ns, queue[0][2])
+        start_ns = max(start_ns, self._end_ns)
+        if winner is None or start_ns > limit_ns:
             return False
+        if several:
+            winner = min([p for p in self._ports if p.queue and p.queue[0][2] <= start_ns], key=_arbitrated)
         self._sender, self._frame = winner, winner.queue[0]
-        duration_ns = frame_bits(self._frame[0], len(self._frame[1])) * self._bit_ns
+        can_id, data, _ = self._frame
+        duration_ns = (STANDARD_BITS[len(data)] if can_id <= 0x7FF else frame_bits(can_id, len(data))) * self._bit_ns
         self.busy_ns += duration_ns
         self._end_ns = start_ns + duration_ns
         return True
@@ -271,7 +281,7 @@ class Hub:
         self._sender = None
         armed = self.faults.armed
         strike = self.faults.strike(can_id) if armed else UNHURT
-        if strike.kind is FaultKind.CORRUPT:
+        if armed and strike.kind is _CORRUPT:
             self._destroyed(sender, end_ns)
             return
         sender.queue.popleft()
@@ -288,7 +298,7 @@ class Hub:
 
     def _deliver(self, sender: Port, can_id: int, data: bytes, end_ns: int) -> None:
         for port in self._ports:
-            if port is sender or port.state is ErrorState.BUS_OFF:
+            if port is sender or port.state is _BUS_OFF:
                 continue
             if port.silent_until_ns <= end_ns:
                 port.receive(can_id, data, end_ns)

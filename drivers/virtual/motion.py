@@ -26,32 +26,30 @@ from servod.runtime.fieldbus.devices import Mode
 
 TICK_NS = 500_000
 TICK_S = TICK_NS / NS_PER_S
-_VELOCITY_BANDWIDTH = TWO_PI * 30.0  # 1/s
-_INTEGRAL_RATE = 40.0  # 1/s
+_VELOCITY_BANDWIDTH = TWO_PI * 60.0  # 1/s
+_INTEGRAL_RATE = 100.0  # 1/s
 _POSITION_GAIN = 20.0  # 1/s
-#: At rest is slower than this [rad/s] for so many ticks.
-_REST_RAD_S, _REST_TICKS = 0.02, 4
-#: A stop that is not at rest after its ramp and this time [s] counts as done: the load drives the axis.
-_STOP_GRACE_S = 0.1
 
 
 class VelocityLoop:
     """PI control of the velocity; tuned from the inertia that the drive was commissioned with."""
 
     def __init__(self, inertia: float) -> None:
-        self._gain = inertia * _VELOCITY_BANDWIDTH
+        self._inertia, self._gain = inertia, inertia * _VELOCITY_BANDWIDTH
         self._integral_nm = 0.0
 
     def reset(self, torque_nm: float) -> None:
         """Take over at the torque now produced."""
         self._integral_nm = torque_nm
 
-    def torque_nm(self, wanted_rad_s: float, actual_rad_s: float, limit_nm: float) -> float:
-        """One tick; the integral part stays within `limit_nm`."""
+    def torque_nm(self, wanted_rad_s: float, actual_rad_s: float, limit_nm: float, wanted_rad_s2: float = 0.0) -> float:
+        """One tick; the integral part stays within `limit_nm`, and still where the torque is at its limit already."""
         error = wanted_rad_s - actual_rad_s
-        integral = self._integral_nm + self._gain * _INTEGRAL_RATE * error * TICK_S
-        self._integral_nm = min(max(integral, -limit_nm), limit_nm)
-        return self._integral_nm + self._gain * error
+        straight_nm = self._gain * error + self._inertia * wanted_rad_s2
+        if abs(straight_nm + self._integral_nm) < limit_nm or error * self._integral_nm < 0.0:
+            integral = self._integral_nm + self._gain * _INTEGRAL_RATE * error * TICK_S
+            self._integral_nm = min(max(integral, -limit_nm), limit_nm)
+        return self._integral_nm + straight_nm
 
     def brake_nm(self, actual_rad_s: float) -> float:
         """Torque of short-circuited windings: against the velocity, nothing stored."""
@@ -64,25 +62,31 @@ def position_to_velocity(error_rad: float) -> float:
 
 
 class Brake:
-    """A stop under way: its velocity ramp, and when it is done."""
+    """A stop under way: its velocity ramp, and when it is done.
 
-    def __init__(self, ramp: Ramp, velocity_rad_s: float, deceleration_rad_s2: float, resolution_rad_s: float) -> None:
+    At rest is no faster than `rest_rad_s` for `rest_s`, once the ramp has ended (0x606F, 0x6070): a load that the
+    torque cannot stop is braked on.
+    """
+
+    def __init__(
+        self, ramp: Ramp, velocity_rad_s: float, deceleration_rad_s2: float, rest_rad_s: float, rest_s: float
+    ) -> None:
         self.ramp = ramp
         self._wanted = velocity_rad_s if ramp in (Ramp.SLOW_DOWN, Ramp.QUICK_STOP) else 0.0
         self._step = deceleration_rad_s2 * TICK_S
-        self._rest_rad_s = max(_REST_RAD_S, resolution_rad_s)
+        self._rest_rad_s, self._rest_ticks = rest_rad_s, max(1, round(rest_s / TICK_S))
         self._quiet = 0
-        self._left_s = abs(velocity_rad_s) / deceleration_rad_s2 + _STOP_GRACE_S
+        self.wanted_rad_s2 = 0.0
         self.done = False
 
     def wanted_rad_s(self, actual_rad_s: float) -> float:
-        """Advance one tick: the velocity to follow. Sets `done` when the axis is at rest or the time is up."""
+        """Advance one tick: the velocity to follow, its change in `wanted_rad_s2`. Sets `done` when the axis rests."""
         wanted = self._wanted
         self._wanted = math.copysign(max(abs(wanted) - self._step, 0.0), wanted)
-        self._left_s -= TICK_S
-        slow = self._wanted == 0.0 and abs(actual_rad_s) < self._rest_rad_s
+        self.wanted_rad_s2 = (self._wanted - wanted) / TICK_S
+        slow = self._wanted == 0.0 and abs(actual_rad_s) <= self._rest_rad_s
         self._quiet = self._quiet + 1 if slow else 0
-        self.done = self.done or self._quiet >= _REST_TICKS or self._left_s <= 0.0
+        self.done = self.done or self._quiet >= self._rest_ticks
         return self._wanted
 
 
@@ -138,12 +142,19 @@ class TorqueLimits:
         """True while the motor protection holds the torque at its rated value (warning, status word bit 7)."""
         return self._folded_back
 
-    def clamp(self, demand: float, motor_speed_rpm: float, stopping: bool) -> int:
-        """The torque produced: 0x6072, then 0x60E0/0x60E1 (not in a quick stop), 0x6073, thermal, speed guard."""
+    def clamp(self, demand: float, motor_speed_rpm: float, stopping: bool, outward: float = 0.0) -> int:
+        """The torque produced: 0x6072, then 0x60E0/0x60E1 and 0x607D (not in a quick stop), 0x6073, thermal, speed.
+
+        `outward`: the sense of torque that drives further beyond a position limit, 0 within.
+        """
         high = low = self._max_torque.value
         if not stopping:
             high = min(high, self._positive.value)
             low = min(low, self._negative.value)
+            if outward > 0.0:
+                high = 0
+            elif outward < 0.0:
+                low = 0
         current = RATED_PERMILLE if self._folded_back else self._max_current.value
         high, low = min(high, current), min(low, current)
         speed = self._max_speed.value
@@ -170,7 +181,7 @@ class TorqueLimits:
 _POLARITY_TORQUE = 0x20
 _HALT, _NEW_SET_POINT, _RELATIVE = 0x100, 0x10, 0x40
 _DECELERATION = {Ramp.SLOW_DOWN: 0x6084, Ramp.QUICK_STOP: 0x6085}
-_MNM_PER_NM = 1000.0
+_MNM_PER_NM, _MS_PER_S = 1000.0, 1000.0
 CYCLIC = (Mode.CYCLIC_SYNC_TORQUE, Mode.CYCLIC_SYNC_VELOCITY, Mode.CYCLIC_SYNC_POSITION)
 
 
@@ -193,6 +204,7 @@ class TorqueStage:
         self._target_torque, self._torque_offset = entry(Obj402.TARGET_TORQUE), entry(Obj402.TORQUE_OFFSET)
         self._target_position, self._target_velocity = entry(Obj402.TARGET_POSITION), entry(Obj402.TARGET_VELOCITY)
         self._position_offset, self._velocity_offset = entry(0x60B0), entry(0x60B1)
+        self._ends = entry(Obj402.POSITION_LIMITS, 1), entry(Obj402.POSITION_LIMITS, 2)
         self.mode = Mode.NONE
         self.following = False  # the target values count
         self.halted = False
@@ -297,9 +309,12 @@ class TorqueStage:
         """Start the stop; with the current limit, the ramp is as steep as the torque allows."""
         velocity = self._sensor.velocity_rad_s
         deceleration = self._dictionary.value(_DECELERATION.get(ramp, 0x6085)) / abs(self._sensor.user_per_rad)
+        value = self._dictionary.value
         resolution = 2.0 / (self._sensor.counts_per_rad * TICK_S)
-        self._brake = Brake(ramp, velocity, deceleration, resolution)
-        self._loop.reset(self._joint.torque_nm)
+        rest_rad_s = max(value(Obj402.VELOCITY_THRESHOLD) / abs(self._sensor.user_per_rad), resolution)
+        rest_s = value(Obj402.VELOCITY_THRESHOLD_TIME) / _MS_PER_S
+        self._brake = Brake(ramp, velocity, deceleration, rest_rad_s, rest_s)
+        self._loop.reset(0.0)  # what the joint was driven with is no part of a stop
         self._tick.arm(time_ns + TICK_NS)
 
     def _ticked(self, time_ns: int) -> None:
@@ -321,7 +336,7 @@ class TorqueStage:
         if brake.ramp is Ramp.VOLTAGE_LIMIT:
             torque = self._loop.brake_nm(actual)
         else:
-            torque = self._loop.torque_nm(wanted, actual, limit_nm)
+            torque = self._loop.torque_nm(wanted, actual, limit_nm, brake.wanted_rad_s2)
         self._produce(torque / self.nm_per_permille, time_ns)
         if brake.done and not was_done and not self.following:
             self._stopped(time_ns)
@@ -346,10 +361,17 @@ class TorqueStage:
             return position_to_velocity(self._profile.position_rad - position) + self._profile.velocity_rad_s
         return 0.0
 
+    def _outward(self) -> float:
+        """Which torque leads further beyond 0x607D."""
+        per_count = self._sensor.user_per_count
+        position, (lowest, highest) = self._sensor.counts * per_count, self._ends
+        beyond = (position > highest.value) - (position < lowest.value)
+        return beyond * per_count * self.nm_per_permille
+
     def _produce(self, demand: float, time_ns: int) -> None:
         """The last step of every mode: limits, then the power stage."""
         self.limits.warm(self.produced, (time_ns - self._produced_ns) / 1e9 if self._produced_ns else 0.0)
         self._produced_ns = time_ns
         self.demand = demand
-        self.produced = self.limits.clamp(demand, self._sensor.speed_rpm, not self.following)
+        self.produced = self.limits.clamp(demand, self._sensor.speed_rpm, not self.following, self._outward())
         self._joint.command(self.produced * self.nm_per_permille, time_ns)

@@ -11,9 +11,8 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-from servod.drivers.virtual.dictionary import DeviceDictionary, Storage
-from servod.drivers.virtual.emergency import Emergency
-from servod.drivers.virtual.heartbeat import HeartbeatConsumer, HeartbeatProducer
+from servod.drivers.virtual.dictionary import DeviceDictionary, SdoRefusal, Storage
+from servod.drivers.virtual.error_control import Emergency, HeartbeatConsumer, HeartbeatProducer
 from servod.drivers.virtual.lss import LssSlave
 from servod.drivers.virtual.pdo import PdoEngine
 from servod.drivers.virtual.port import ErrorState
@@ -27,6 +26,7 @@ from servod.runtime.fieldbus.cia import (
     NMT_ID,
     SDO_ANSWER_BASE,
     SDO_REQUEST_BASE,
+    Abort,
     Emcy,
     NmtCommand,
     NmtState,
@@ -80,8 +80,11 @@ class VirtualNode(ABC):
         """The device starts anew (power on, NMT reset node); its objects have their defaults."""
 
     @abstractmethod
-    def connection_lost(self, time_ns: int) -> None:
-        """The master is silent, the bus is off, or NMT left operational."""
+    def connection_lost(self, time_ns: int, code: int = Emcy.HEARTBEAT_LOST) -> None:
+        """The master is silent, its commands are overdue, the bus is off, or NMT left operational; `code` says what."""
+
+    def commands_overdue(self, time_ns: int) -> None:  # noqa: B027
+        """CiA 301 asks for the EMCY alone; a device that does more fills this in."""
 
     # --- life --------------------------------------------------------------------------------------------------
 
@@ -249,6 +252,7 @@ class VirtualNode(ABC):
         """Let written communication objects act."""
         self.pdo.on_change = self._route
         entry = self.dictionary.entry
+        entry(Obj301.SYNC_OVERFLOW).check = _counts_or_not
         entry(Obj301.HEARTBEAT_PRODUCER).written = lambda value: self.producer.restart(self.timeline.now_ns)
         entry(Obj301.SYNC_COB_ID).written = lambda value: self._route()
         for index in range(1, self.dictionary.value(Obj301.HEARTBEAT_CONSUMER) + 1):
@@ -257,3 +261,9 @@ class VirtualNode(ABC):
     def _watch_heartbeats(self) -> None:
         self.consumer.configure()
         self._route()
+
+
+def _counts_or_not(value: int) -> None:
+    """0x1019: no counter, or one that runs to 2..240 (CiA 301)."""
+    if value == 1:
+        raise SdoRefusal(Abort.VALUE_RANGE)

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from servod.drivers.virtual.dictionary import DeviceDictionary, Entry, SdoRefusal
-from servod.drivers.virtual.emergency import Emergency
+from servod.drivers.virtual.error_control import Emergency
 from servod.drivers.virtual.timeline import Timeline
 from servod.runtime.fieldbus.cia import PDO_NO_RTR, PDO_NOT_VALID, Abort, Emcy, Obj301
 
@@ -113,6 +113,9 @@ class Application(Protocol):
     def commanded(self, time_ns: int) -> None:
         """An RPDO was applied as a whole; judge it."""
 
+    def commands_overdue(self, time_ns: int) -> None:
+        """The deadline of an RPDO passed (0x1400:5); the EMCY is out."""
+
 
 class Pdo:
     """What both directions share: parameters and the packing of the mapping, rebuilt after each change."""
@@ -146,12 +149,25 @@ class Pdo:
 class Rpdo(Pdo):
     """One PDO that the node receives."""
 
-    def __init__(self, number: int, dictionary: DeviceDictionary, emergency: Emergency, timeline: Timeline) -> None:
+    def __init__(
+        self,
+        number: int,
+        dictionary: DeviceDictionary,
+        emergency: Emergency,
+        timeline: Timeline,
+        overdue: Callable[[int], None],
+    ) -> None:
         super().__init__(dictionary, 0x1400 + number, 0x1600 + number)
-        self._emergency = emergency
+        self._emergency, self._overdue = emergency, overdue
         self._deadline = timeline.timer(self._missed)
         self._waiting: tuple[int, ...] | None = None
         self._wrong_length = False
+
+    def configure(self) -> None:
+        """As the dictionary says; supervision ends at once where the deadline is taken away."""
+        super().configure()
+        if not self.event_ms or not self.valid:
+            self._deadline.cancel()
 
     def stop(self) -> None:
         """Leave operational: forget what waits, stop supervision."""
@@ -193,8 +209,9 @@ class Rpdo(Pdo):
         return True
 
     def _missed(self, time_ns: int) -> None:
-        """The deadline passed: told, and nothing more, as some drives do (Novanta Summit, error 0x8250)."""
+        """The deadline passed: told, then the device reacts."""
         self._emergency.set(Emcy.RPDO_TIME_OUT, time_ns, self.cob_id.to_bytes(2, "little"))
+        self._overdue(time_ns)
 
 
 class Tpdo(Pdo):
@@ -315,7 +332,7 @@ class PdoEngine:
         self._application, self._emergency = application, emergency
         self._overflow = dictionary.entry(Obj301.SYNC_OVERFLOW)
         receive = [n for n in range(_PDOS) if dictionary.has(Obj301.RPDO_PARAMETER + n, 1)]
-        self.rpdos = [Rpdo(n, dictionary, emergency, timeline) for n in receive]
+        self.rpdos = [Rpdo(n, dictionary, emergency, timeline, application.commands_overdue) for n in receive]
         self.tpdos = [Tpdo(n, dictionary, timeline, send) for n in range(_PDOS)]
         self._now_ns = 0
         self.active = False

@@ -5,7 +5,7 @@ Read by the virtual world from its command line or a YAML file; the master never
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
@@ -30,8 +30,22 @@ class VirtualAxisSettings(Strict):
     encoder_measuring_range_counts: int = Field(2**31, ge=4, le=2**32 - 1, description="0x6002; any number")
     encoder_direction: Literal[1, -1] = Field(1, description="-1: mounted the other way round")
     encoder_noise_counts: float = Field(0.0, ge=0.0, le=1e6, description="standard deviation of a reading")
+    brake: Literal["none", "output", "drive"] = Field(
+        "none", description="holding brake on the joint: by bit 16 of 0x60FE:1, or sequenced by the drive itself"
+    )
+    brake_nm: float = Field(1.0, ge=0.0, le=1e6, description="what the closed brake holds")
+    brake_release_s: float = Field(0.05, ge=0.0, le=5.0, description="from the release until it is open")
+    brake_engage_s: float = Field(0.05, ge=0.0, le=5.0, description="from the command until it is closed")
     start_position_rad: float = Field(0.0, description="of the joint at power-on")
     cycle_period_s: float = Field(0.001, ge=1e-5, le=0.1, description="part of the model's delay that SYNC costs")
+    command_deadline: Literal["stops", "tells", "none"] = Field(
+        "stops",
+        description="0x1400:5: the drive stops by 0x6007 and 0x1029, sends EMCY 0x8250 alone, or has none",
+    )
+    missing_objects: list[Annotated[str, Field(pattern=r"^[0-9A-F]{4}(:[0-9A-F]{1,2})?$")]] = Field(
+        [],
+        description="objects, or sub-indices, that the amplifier does not have, in hexadecimal: 6007, 1400:5",
+    )
     bit_rate: Literal[10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000] = Field(
         1_000_000, description="bit/s of the modelled bus"
     )

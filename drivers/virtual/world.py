@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 
 from servod.common.units import NS_PER_S
 from servod.drivers.virtual.amplifier import AmplifierNode
-from servod.drivers.virtual.bus_faults import FRAME_KINDS, MYSELF, BusFault, FaultKind
+from servod.drivers.virtual.bus_faults import FRAME_KINDS, MYSELF, SUBINDEX_SHIFT, BusFault, FaultKind
 from servod.drivers.virtual.drive_record import DriveRecord
 from servod.drivers.virtual.encoder import EncoderNode
 from servod.drivers.virtual.hub import Hub
@@ -44,9 +44,13 @@ class Participants(Protocol):
     timeline: Timeline
     babbled: Counter[int]  # frames of each identifier that babblers have sent
     twins: list[tuple[int, Port]]  # second nodes with a number that is taken
+    written: int  # objects that were changed past the bus
 
     def switch_on_twin(self, node_id: int, time_ns: int) -> None:
         """Switch on a second node with this number."""
+
+    def write(self, node_id: int, index: int, subindex: int, value: int) -> bool:
+        """Change an object of a node past the bus."""
 
     def port_of(self, participant: int) -> Port | None:
         """The connection of a node, None when it is not there."""
@@ -62,6 +66,9 @@ def inject(world: Participants, fault: BusFault, client: Port, time_ns: int) -> 
         _Babbler(world, fault, time_ns)
     elif fault.kind is FaultKind.TWIN:
         world.switch_on_twin(fault.participant, time_ns)
+    elif fault.kind is FaultKind.WRITE:
+        subindex, value = divmod(fault.amount, 1 << SUBINDEX_SHIFT)
+        world.write(fault.participant, fault.can_id, subindex, value)
     elif fault.kind in _ON_PORT:
         port = _port(world, fault, client)
         if port is not None:
@@ -78,6 +85,8 @@ def happened(world: Participants, fault: BusFault, client: Port) -> int:
         return world.hub.faults.cleared
     if fault.kind is FaultKind.BABBLE:
         return world.babbled[fault.can_id]
+    if fault.kind is FaultKind.WRITE:
+        return world.written
     if fault.kind is FaultKind.TWIN:
         return sum(port.sent for node_id, port in world.twins if node_id == fault.participant)
     port = _port(world, fault, client) if fault.kind in _LEFT_ON_PORT else None
@@ -181,7 +190,7 @@ class Devices:
         self, settings: VirtualAxisSettings, model: AxisModel, timeline: Timeline, record: DriveRecord | None = None
     ) -> None:
         self.settings, self.timeline = settings, timeline
-        self.joint = Joint(rotary(model, "plant"), settings.seed, settings.cycle_period_s)
+        self.joint = Joint(rotary(model, "plant"), settings.seed, settings.cycle_period_s, settings.brake_nm)
         if settings.start_position_rad:
             self.joint.plant.place(settings.start_position_rad)
         self._record = record
@@ -203,14 +212,17 @@ class Devices:
 
 class World:
     """Hub and devices; nothing happens unless `advance` is called. `babbled` counts the frames of babblers that the bus
-    carried, by identifier; `twins` are the second nodes that were switched on, by node id."""
+    carried, by identifier; `twins` are the second nodes that were switched on, by node id; `written` counts objects
+    that were changed past the bus."""
 
     def __init__(self, settings: VirtualAxisSettings, model: AxisModel, record: DriveRecord | None = None) -> None:
         self.settings, self._model = settings, model
         self.timeline = Timeline()
         self.hub = Hub(self.timeline, settings.bit_rate)
+        self._next_timer_ns, self._step_bus = self.timeline.next_ns, self.hub.step  # looked up once: for every event
         self.babbled: Counter[int] = Counter()
         self.twins: list[tuple[int, Port]] = []
+        self.written = 0
         self.devices = Devices(settings, model, self.timeline, record)
         self._node_ports = {name: self._node_port(name) for name in ("amplifier", "encoder")}
         sends = [self.sender(port) for port in self._node_ports.values()]
@@ -230,8 +242,8 @@ class World:
 
     def advance_once(self, now_ns: int, bus_ns: int) -> bool:
         """The next single event; False when none is due."""
-        timer_ns = self.timeline.next_ns()
-        if self.hub.step(timer_ns if timer_ns <= now_ns else bus_ns):
+        timer_ns = self._next_timer_ns()
+        if self._step_bus(timer_ns if timer_ns <= now_ns else bus_ns):
             return True
         if timer_ns <= now_ns:
             self.timeline.fire_next()
@@ -263,6 +275,21 @@ class World:
                 twin.power_on(time_ns)
             else:
                 self.hub.detach(port)
+
+    def write(self, node_id: int, index: int, subindex: int, value: int) -> bool:
+        """Change an object of a node past the bus, straight in its dictionary; True when it keeps the value."""
+        took = False
+        for node in self.devices.nodes:
+            if node.node_id != node_id or not node.dictionary.has(index, subindex):
+                continue
+            entry = node.dictionary.entry(index, subindex)
+            if entry.writable:
+                entry.value = value
+                if entry.written is not None:
+                    entry.written(value)
+                took = entry.value == value
+        self.written += took
+        return took
 
     def port_of(self, node_id: int) -> Port | None:
         """The CAN controller of a node."""

@@ -70,7 +70,7 @@ def commission(
     """Walk from identification to validation in OUT; exit code 1 when a step's answer is no."""
     one_thread()
     from servod.client.processes import sigterm_as_interrupt
-    from servod.lab.commission.report import failure, result
+    from servod.lab.commission.report import failure, result, write_refusal
     from servod.lab.commission.state import GAINS
     from servod.lab.commission.steps import STEPS
     from servod.lab.commission.walk import Questions, StepFailed, Walk, WalkOptions, run
@@ -89,6 +89,9 @@ def commission(
         with sigterm_as_interrupt():
             document = result(walk, run(walk, STEPS))
     except StepFailed as failed:
+        page = write_refusal(walk, failed)
+        if page is not None and not as_json:
+            print(f"report: {page}", file=sys.stderr)
         if as_json:
             print_json(failure(walk, failed))
         raise

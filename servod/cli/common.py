@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servod.common.errors import Unreachable
+from servod.common.errors import BadInput, Unreachable
 from servod.common.files import BadFile, reason
 from servod.common.portable import lock_again, lock_folder
 
@@ -116,6 +116,13 @@ _made: list[Path] = []
 _locks: list[int] = []
 #: The environment variable that tells a stage of a command which descriptors these are.
 _HANDED_DOWN = "SERVOCTL_LOCKED_FOLDERS"
+
+
+def keep_inputs(out: Path, *inputs: Path | None) -> None:
+    """Raise BadInput where writing `out` would replace a file that is read."""
+    for given in inputs:
+        if given is not None and out.exists() and given.exists() and out.samefile(given):
+            raise BadInput(f"--out {out}", "a file that is read", "another file: nothing is overwritten by itself")
 
 
 def need_folder(option: str, folder: Path, alone: bool = False) -> None:

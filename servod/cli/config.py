@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import textwrap
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -13,6 +13,7 @@ from servod.cli.common import JsonOption, example, print_json
 from servod.common.errors import BadInput
 
 if TYPE_CHECKING:
+    from servod.formats.config import AxisConfig
     from servod.formats.config_keys import ConfigKey
 
 _WIDTH = 118
@@ -81,7 +82,7 @@ def register(app: typer.Typer) -> None:
     short_help="Check files, each recognised by its content.",
     help=example(
         "Check axis configurations, gain sets, axis models, column maps and EDS files, each recognised by its content, "
-        "with everything that they name.",
+        "with everything that they name. Values that weaken a guard, or lie beyond model and drive, are warned of.",
         "servoctl config check /etc/servod/axis.yaml gains.yaml model.yaml drive.eds",
     ),
 )
@@ -89,13 +90,15 @@ def check(
     files: Annotated[list[Path], typer.Argument(help="Files to check.", metavar="FILE...")],
     as_json: JsonOption = False,
 ) -> None:
-    """Check files; the first mistake ends the command with exit code 2."""
+    """Check files; the first mistake ends the command with exit code 2, a warning does not."""
     found = [{"file": str(file), **_check(file)} for file in files]
     if as_json:
         print_json({"files": found})
         return
     for row in found:
-        print(f"{row['file']}: {row['kind']}, no mistakes" + (f"; {row['note']}" if row["note"] else ""))
+        note = str(row["note"]).replace("; stopping:", "\n  stopping:")
+        print(f"{row['file']}: {row['kind']}, no mistakes" + (f"; {note}" if note else ""))
+        print(*(f"  warning: {line}\n" for line in row["warnings"]), sep="", end="")
 
 
 _app.command(
@@ -109,12 +112,12 @@ _app.command(
 )(keys)
 
 
-def _check(file: Path) -> dict[str, str]:
+def _check(file: Path) -> dict[str, Any]:
     from servod.common.yaml import parse_yaml, plain_name, read_text
     from servod.formats.kinds import TELLING, FileKind, kind_of
 
     if file.suffix.lower() in (".eds", ".dcf"):
-        return {"kind": "EDS", "note": _check_eds(file)}
+        return {"kind": "EDS", "note": _check_eds(file), "warnings": []}
     keys = parse_yaml(read_text(file), str(file))
     if not isinstance(keys, dict):
         raise BadInput(str(file), f"{plain_name(keys)} at the top", "a mapping of keys")
@@ -122,27 +125,41 @@ def _check(file: Path) -> dict[str, str]:
     if kind is None:
         known = "; ".join(f"{name}: {', '.join(sorted(telling))}" for name, telling in TELLING.items())
         raise BadInput(f"{file}: {', '.join(map(str, keys)) or '(top)'}", "keys of no known kind of file", known)
+    if kind is FileKind.AXIS:
+        return _check_axis(file)
     checks = {
-        FileKind.AXIS: _check_axis,
         FileKind.GAINS: _check_gains,
         FileKind.MODEL: _check_model,
         FileKind.MAP: _check_map,
     }
-    return {"kind": kind, "note": checks[kind](file)}
+    return {"kind": kind, "note": checks[kind](file), "warnings": []}
 
 
-def _check_axis(file: Path) -> str:
-    """The configuration and everything that it names: drivers, quirks, EDS, gain set, model."""
+def _warnings(file: Path) -> list[str]:
+    """What in a configuration without mistakes guards less than it seems."""
+    from servod.formats.config import load_config
+    from servod.formats.config_guards import weakened
+    from servod.formats.model.axis_model import load_axis_model
+    from servod.formats.wiring import with_expected
+
+    config = with_expected(load_config(file))
+    return weakened(config, load_axis_model(config.model) if config.model else None)
+
+
+def _check_axis(file: Path) -> dict[str, Any]:
+    """The configuration and everything that it names: drivers, quirks, EDS, gain set, model; and how it stops."""
     from servod.drivers.quirks import load_quirks
     from servod.formats.config import load_config
     from servod.formats.gains.gain_set import load_gains, require_fit
-    from servod.formats.wiring import with_expected
-    from servod.runtime.fieldbus.master.planned import check_names, planned_bus_load
+    from servod.formats.kinds import FileKind
+    from servod.formats.stopping import UNKNOWN
+    from servod.formats.wiring import brake_notes, with_expected
+    from servod.runtime.fieldbus.master.planned import check_names, narrowed_by_stop, planned_bus_load
 
     config = load_config(file)
     notes = check_names(config, str(file))
     try:
-        load_quirks(config.amplifier.quirks)
+        load_quirks(config.quirks)
     except BadInput as error:
         raise BadInput(f"{file}: {error.where}", error.found, error.allowed) from None
     for eds in (config.amplifier.eds, config.encoder.eds):
@@ -150,10 +167,32 @@ def _check_axis(file: Path) -> str:
             _check_eds(Path(eds))
     require_fit(load_gains(config.gains.initial), config, str(config.gains.initial))
     with_expected(config)
+    notes += [*_open_wires(config), *brake_notes(config)]
     load = planned_bus_load(config, str(file))
     where = f"{config.bus.interface} {config.bus.channel}"
+    try:
+        _, stopping = narrowed_by_stop(config)
+    except BadInput as error:
+        raise BadInput(f"{file}: {error.where}", error.found, error.allowed) from None
+    notes += [UNKNOWN] if stopping is None else stopping.lines()
     notes.insert(0, f"axis {config.name} on {where}, bus load {100.0 * load.share:.1f} % at {load.bit_rate} bit/s")
-    return "; ".join(notes)
+    return {
+        "kind": FileKind.AXIS,
+        "note": "; ".join(notes),
+        "stopping": None if stopping is None else stopping.document(),
+        "warnings": _warnings(file),
+    }
+
+
+def _open_wires(config: AxisConfig) -> list[str]:
+    """Inputs of which a broken wire is not seen."""
+    inputs = config.amplifier.inputs
+    rows = (("estop", inputs.estop_bit, inputs.estop_active), ("sto", inputs.sto_bit, inputs.sto_active))
+    return [
+        f"amplifier.inputs.{name}_active is high: a broken wire is not seen, the input then never stops the axis"
+        for name, bit, level in rows
+        if bit is not None and level == "high"
+    ]
 
 
 def _check_gains(file: Path) -> str:

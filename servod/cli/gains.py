@@ -83,6 +83,7 @@ def show(file: Annotated[Path, typer.Argument(help="Gain set, YAML.")], as_json:
     print(*gains_view.headline(gains), sep="\n")
     print(f"verdict: {gains_view.verdict(gains)}")
     print(f"seal: {seal.problem if seal else fits}")
+    print(f"signature: {f'by {gains.signature.signer}, not checked here' if gains.signature else 'none'}")
     _print_tables(
         gains_view.parameter_table(gains), *gains_view.list_tables(gains), gains_view.certificate_table(gains)
     )

@@ -41,6 +41,7 @@ VERBS: dict[Panel, dict[str, str]] = {
         "config": "Check configurations, gain sets, models and EDS files.",
         "scan": "List the nodes on the bus.",
         "preset": "Set the joint's zero in the encoder.",
+        "guard-test": "Prove that the drive stops without its master.",
         "identify": "Identify the axis: inertia, friction, delay, noise.",
         "synthesize": "Compute a gain set for an axis model.",
         "verify": "Certify a gain set, or say why not.",
@@ -52,6 +53,7 @@ VERBS: dict[Panel, dict[str, str]] = {
         "replay": "Simulate a model under a recorded torque.",
         "diagnose": "Find what physics a model leaves out.",
         "explain": "Explain an effect: equation, keys, units, ranges.",
+        "export": "Write an axis model for another simulator.",
     },
     Panel.QUALIFY: {
         "demo": "Track a motion on the virtual axis under four laws.",
@@ -68,6 +70,7 @@ NEXT: dict[str, str] = {
     "status": "servoctl enable   # tests the wiring, then holds the joint",
     "enable": f"{_SMALL_SINE}   # says how well the joint follows",
     "disable": "servoctl status",
+    "guard-test": "servoctl enable   # once the daemon runs again",
     "stop": "servoctl status   # what state the axis is in; `servoctl enable` when it may move again",
     "track sine": "servoctl disable",
     "track paper": "servoctl disable",
@@ -95,6 +98,7 @@ NEXT: dict[str, str] = {
     "replay": "servoctl diagnose --model MODEL REC --out diagnosis   # what the model leaves out",
     "diagnose": "servoctl synthesize --model MODEL --out gains.yaml   # from the model with the physics added",
     "explain": "servoctl diagnose --model MODEL REC --out diagnosis",
+    "export": "servoctl explain EFFECT   # what the format leaves out, in equations",
     "demo": "servoctl commission --plant PLANT --out commissioning   # the whole way to a certified set",
     "bench": "servoctl config check FILE   # whether bus and period fit",
     "prove": "servoctl diagnose --model MODEL REC --out diagnosis   # the same on recordings of yours",
@@ -109,7 +113,7 @@ _BESIDE = {"disable": "enable", "stop": "enable"}
 
 def modules() -> list[str]:
     """The files of the verbs, in the order of the screen; each has a `register(app)`."""
-    return list(dict.fromkeys(_BESIDE.get(name, name) for lines in VERBS.values() for name in lines))
+    return list(dict.fromkeys(_BESIDE.get(name, name).replace("-", "_") for lines in VERBS.values() for name in lines))
 
 
 class Grouped(TyperGroup):
@@ -189,6 +193,16 @@ def walk_steps(incomplete: str) -> list[str]:
 def horizons(incomplete: str) -> list[str]:
     """A whole run, or the window that is usual."""
     return [text for text in ("full", "0.25", "1") if text.startswith(incomplete)]
+
+
+def export_formats(incomplete: str = "") -> list[str]:
+    """The languages that an axis model is exported to."""
+    return [text for text in ("mujoco", "urdf", "json") if text.startswith(incomplete)]
+
+
+def engines(incomplete: str) -> list[str]:
+    """Who may move the axes of a blind trial."""
+    return [text for text in ("own", "mujoco") if text.startswith(incomplete)]
 
 
 def starts(incomplete: str) -> list[str]:

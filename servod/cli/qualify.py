@@ -180,6 +180,7 @@ _HELP = example(
     "servoctl qualify faults",
     "servoctl qualify faults --stepped --group encoder --out out/faults",
     "servoctl qualify faults --only 'torque_frames*' --json",
+    "servoctl qualify faults --stepped --random 200 --seed 1",
     "servoctl qualify faults --scenario my_fault.yaml",
 )
 
@@ -219,13 +220,23 @@ def faults(
         list[Path] | None, typer.Option(help="Run the scenarios of this file instead; may be given again.")
     ] = None,
     stepped: Annotated[bool, typer.Option("--stepped", help="Leave out the scenarios on the wall clock.")] = False,
+    random: Annotated[
+        int | None,
+        typer.Option(min=1, max=100_000, help="Draw so many instead: one thing fails at peak torque or top speed."),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Of --random; the same gives the same.")] = 1,
     jobs: Annotated[int, typer.Option(min=1, max=256, help="Scenarios in virtual time that run at once.")] = 1,
     out: Annotated[Path | None, typer.Option(help="Folder for the page and the document of the outcomes.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Run the campaign."""
     need_linux("servoctl qualify faults")
-    chosen = _chosen(scenario, only, group, stepped)
+    if random is None:
+        chosen = _chosen(scenario, only, group, stepped)
+    else:
+        from servod.qualify.faults.chance import drawn
+
+        chosen = {name: s for name, s in drawn(random, seed).items() if fnmatchcase(name, only or "*")}
     if out is not None:
         need_folder("--out", out, alone=True)
     found: list[Outcome] = []

@@ -12,7 +12,7 @@ from servod.common.errors import BadInput, Unreachable, one_line
 from servod.common.portable import need_linux
 
 if TYPE_CHECKING:
-    from servod.formats.config import BusConfig
+    from servod.formats.config_wire import BusConfig
 
 _HELP = example(
     "List the nodes on the bus with identity, NMT state and LSS. Without --channel the daemon is asked; with it the "
@@ -61,7 +61,7 @@ def _through_daemon(socket: Any) -> list[dict[str, Any]]:
 def _on_bus(interface: str, channel: str, bit_rate: int, socket: Any) -> list[dict[str, Any]]:
     need_linux("servoctl scan")
     from servod.common.yaml import validate
-    from servod.formats.config import BusConfig
+    from servod.formats.config_wire import BusConfig
     from servod.runtime.daemon.lock import BusLock
 
     config = validate({"interface": interface, "channel": channel, "bit_rate": bit_rate}, BusConfig, "servoctl scan")

@@ -131,6 +131,8 @@ def screen(document: dict[str, Any]) -> Group:
         *_fault_lines(document),
         *_note_lines(document),
         *_wiring_lines(document),
+        *_stopping_lines(document),
+        *_guard_lines(document),
         _values(document),
         _timing(document),
         *_grant_lines(document),
@@ -178,8 +180,9 @@ def _fault_lines(document: dict[str, Any]) -> list[str]:
 
 
 def _note_lines(document: dict[str, Any]) -> list[str]:
-    note = document["controller"]["note"]
-    return [f"[yellow]gain set[/yellow] {note}"] if note else []
+    note, abandoned = document["controller"]["note"], document["motion"].get("abandoned", "")
+    lines = [f"[yellow]gain set[/yellow] {note}"] if note else []
+    return [*lines, *([f"[yellow]halted[/yellow] {abandoned}"] if abandoned else [])]
 
 
 def _wiring_lines(document: dict[str, Any]) -> list[str]:
@@ -187,6 +190,26 @@ def _wiring_lines(document: dict[str, Any]) -> list[str]:
     if last is None:
         return []
     return [last["text"] if last["passed"] else f"[red]{last['text']}[/red]"]
+
+
+def _stopping_lines(document: dict[str, Any]) -> list[str]:
+    """The stop that is stated, and what was narrowed for it."""
+    stop = document["stopping"]
+    if stop is None:
+        return ["[yellow]stopping[/yellow] not reckoned: nothing tells of the joint (see `servoctl config check`)"]
+    coasts = "does not rest" if stop["coasts_rad"] is None else f"coasts {stop['coasts_rad']:.3g} rad at most"
+    line = (
+        f"stops within {1e3 * stop['time_s']:.0f} ms, {stop['speed_rad_s']:.3g} rad/s and {stop['travel_rad']:.3g} rad "
+        f"after a loss of the master; without the drive it {coasts}"
+    )
+    return ["; ".join([line, *(f"[yellow]narrowed[/yellow] {text}" for text in stop["narrowed"])])]
+
+
+def _guard_lines(document: dict[str, Any]) -> list[str]:
+    guards = document["guards"]
+    proof = guards["proof"]
+    lines = ["[red]unguarded[/red] the drive does not stop by itself when servod is dead"] * guards["unguarded"]
+    return lines + [f"[yellow]guards[/yellow] {proof['text']}"] * (proof["asked_for"] and not proof["holds"])
 
 
 def _values(document: dict[str, Any]) -> Table:
@@ -219,10 +242,19 @@ def _values(document: dict[str, Any]) -> Table:
     table.add_row("bus", f"{bus['interface']} {bus['channel']}", "load", load)
     queue_full, error_frames = (_aged(str(bus[key]), loop) for key in ("queue_full", "error_frames"))
     table.add_row("queue full", queue_full, "error frames", error_frames)
+    if inputs := document["inputs"]:
+        words = (_input(row["name"], row["active"]) for row in inputs)
+        table.add_row("inputs", _aged(", ".join(words), loop))
+    if (brake := document["brake"])["by"] != "none":
+        table.add_row("brake", _aged(f"{brake['state']}, by {brake['by']}", loop))
     for node in document["nodes"]:
         state = node["state"] if node["stale"] else f"{node['state']}, {_heard(node)}"
         table.add_row(f"node {node['node_id']}", node["role"], node["driver"], _aged(state, node))
     return table
+
+
+def _input(name: str, active: bool) -> str:
+    return f"[red]{name} ACTIVE[/red]" if active else f"{name} clear"
 
 
 def _timing(document: dict[str, Any]) -> Group:

@@ -6,10 +6,11 @@ picture alone.
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -26,7 +27,8 @@ from servod.cli.common import (
     report,
     suggest,
 )
-from servod.common.errors import AnswerIsNo, BadInput
+from servod.common.errors import AnswerIsNo, BadInput, ServodError
+from servod.formats.recording.record import RECORD, CycleRecord
 
 if TYPE_CHECKING:
     from servod.client.control import ControlClient
@@ -34,7 +36,7 @@ if TYPE_CHECKING:
 #: Told how far a motion is: seconds since its start, and the status document's motion.
 Tell = Callable[[float, dict[str, Any]], None]
 
-#: The longest period that a configuration may have (servod.formats.config.CycleConfig).
+#: The longest period that a configuration may have (servod.formats.config_wire.CycleConfig).
 LONGEST_PERIOD_US = 20_000
 _POLL_S = 0.1
 #: After its end the axis is watched for so long, until the reference has stood still for this time.
@@ -45,12 +47,19 @@ _LONGEST_PLOT_S = 600.0
 _MOST_KEPT_BYTES = 512 * 1024**2
 #: How the figures of a motion begin that ran to its end.
 _DONE = "motion done"
+#: And of one that did not.
+_BROKEN_OFF = "motion broken off"
 _app = typer.Typer(
     help=example("Run a reference motion from where the axis stands.", "servoctl track paper --duration 30"),
     rich_markup_mode=None,
 )
 _Wait = Annotated[
-    bool, typer.Option("--wait/--no-wait", help="Wait for the end; Ctrl-C or SIGTERM then stops the axis.")
+    bool,
+    typer.Option(
+        "--wait/--no-wait",
+        help="Wait for the end: Ctrl-C or SIGTERM stops the axis; a command that dies or hangs halts it within 0.5 s. "
+        "With --no-wait the motion goes on by itself.",
+    ),
 ]
 _Plot = Annotated[
     Path | None, typer.Option("--plot", help="Draw the motion into this file: .html or .png (extra lab).")
@@ -143,10 +152,12 @@ def csv(
 def _track(
     socket: Path, motion: dict[str, Any], duration_s: float, wait: bool, plot: Path | None, as_json: bool
 ) -> None:
+    from servod.client.control import Refused
+
     draw = _drawing(plot, motion, duration_s, wait)
     with connect(socket) as client:
         if not wait:
-            result = client.call("track", **motion)
+            result = client.call("track", renew_s=None, **motion)
             suggest("status", "--watch", why="Ctrl-C ends the watching, not the motion")
             report(result, "motion started", as_json)
             return
@@ -154,31 +165,33 @@ def _track(
         with _progress(duration_s, as_json) as tell:
             try:
                 result = _run(client, motion, watched, tell)
-            except AnswerIsNo:
-                watched.look()
-                if not as_json:
-                    _show(watched, "motion broken off", draw, plot)
+            except (ServodError, KeyboardInterrupt) as error:
+                with suppress(ServodError):
+                    watched.look()
+                moved = not isinstance(error, Refused | BadInput)  # these come before the first cycle of it
+                if moved and (watched.document() or isinstance(error, AnswerIsNo)):
+                    why = "stopped by Ctrl-C or SIGTERM" if isinstance(error, KeyboardInterrupt) else str(error)
+                    _show(watched, _BROKEN_OFF, draw, plot, as_json, f" ({why.rstrip('.')})")
                 raise
     if as_json:
         print_json(result | {"figures": watched.document()})
-        if draw is not None:
-            draw(bytes(watched.kept), _in_words(watched.document(), _DONE), watched.nodes, watched.facts)
-        return
-    _suggest(watched.document(), plot)
-    _show(watched, _DONE, draw, plot)
+    else:
+        _suggest(watched.document(), plot)
+    _show(watched, _DONE, draw, plot, as_json)
 
 
 #: Draws packed cycle records under what was said of them, with the nodes that moved and further facts.
 _Draw = Callable[[bytes, list[str], list[dict[str, Any]], dict[str, str]], None]
 
 
-def _show(watched: _Watched, begins: str, draw: _Draw | None, plot: Path | None) -> None:
-    """Figures and picture of what was seen."""
+def _show(watched: _Watched, begins: str, draw: _Draw | None, plot: Path | None, quiet: bool, why: str = "") -> None:
+    """Figures and picture of what was seen; the picture says `why` it ended, which the terminal is told as an error."""
     said = _in_words(watched.document(), begins)
-    print("\n".join(said))
-    if draw is not None:
-        draw(bytes(watched.kept), said, watched.nodes, watched.facts)
-        print(f"drawn: {plot}")
+    drawn = draw is not None and len(watched.kept) > RECORD.size
+    if draw is not None and drawn:
+        draw(bytes(watched.kept), [said[0].replace(begins, begins + why, 1), *said[1:]], watched.nodes, watched.facts)
+    if not quiet:
+        print("\n".join([*said, *([f"drawn: {plot}"] if drawn else [])]))
 
 
 def _drawing(plot: Path | None, motion: dict[str, Any], duration_s: float, wait: bool) -> _Draw | None:
@@ -212,7 +225,7 @@ class _Watched:
         self.kept = bytearray()
         self.nodes: list[dict[str, Any]] = client.call("status")["nodes"] if keep else []
         self.facts: dict[str, str] = _gain_set(client) if keep else {}
-        self._keep = keep
+        self._keep, self._unknown = keep, 0
 
     @property
     def lost(self) -> int:
@@ -222,11 +235,10 @@ class _Watched:
     def document(self) -> dict[str, Any] | None:
         """The figures as plain values; None where too little was seen."""
         figures = self.tally.figures()
-        return figures.document() | {"lost_cycles": self.lost} if figures else None
+        return figures.document() | {"lost_cycles": self.lost, "unknown_cycles": self._unknown} if figures else None
 
     def look(self) -> None:
         """Take what has come."""
-        from servod.formats.recording.record import RECORD, CycleRecord
         from servod.kernels.scoring import MotionCycle
 
         raw = self._stream.take()
@@ -236,6 +248,7 @@ class _Watched:
             active = bool(r.reference_active)
             cycle = MotionCycle(1e-9 * r.time_ns, active, r.reference_rad, r.position_rad, r.torque_nm, r.missed)
             self.tally.add(cycle)
+            self._unknown += active and not math.isfinite(r.reference_rad - r.position_rad)
 
 
 def _gain_set(client: ControlClient) -> dict[str, str]:
@@ -256,12 +269,14 @@ def _in_words(figures: dict[str, Any] | None, begins: str) -> list[str]:
     """What people read."""
     if figures is None:
         return [f"{begins}: too short for figures"]
+    periods = figures["cycles"] + figures["missed_cycles"] + figures["lost_cycles"]
     begin = f" from {figures['judged_from_s']:g} s of the motion on" if figures["judged_from_s"] else ""
     return [
         f"{begins}: RMS error {figures['rms_error_mrad']:.4g} mrad, peak error {figures['max_error_mrad']:.4g} mrad"
-        + begin,
+        + begin
+        + (f"; {figures['unknown_cycles']} cycles, which have no error, left out" if figures["unknown_cycles"] else ""),
         *([_settled_in_words(figures)] if begins == _DONE else []),
-        f"peak torque {figures['peak_torque_nm']:.4g} N*m; {figures['missed_cycles']} of {figures['cycles']} cycles "
+        f"peak torque {figures['peak_torque_nm']:.4g} N*m; {figures['missed_cycles']} of {periods} cycles "
         "missed" + (f"; {figures['lost_cycles']} cycles not seen" if figures["lost_cycles"] else ""),
     ]
 
@@ -297,6 +312,8 @@ def _wait_for_end(client: ControlClient, watched: _Watched, tell: Tell) -> None:
         status = client.call("status")
         if status["axis"]["state"] != "ENABLED":
             raise AnswerIsNo(f"the motion ended with the axis in {status['axis']['state']}: {_why(status)}")
+        if abandoned := status["motion"]["abandoned"]:
+            raise AnswerIsNo(abandoned)
         watched.look()
         tell(time.monotonic() - started, status["motion"])
         if status["axis"]["motion_running"]:
@@ -336,4 +353,6 @@ def _where(motion: dict[str, Any]) -> str:
 def _why(status: dict[str, Any]) -> str:
     """The faults that end a motion; an old warning does not."""
     ends = [f for f in status["faults"] if f["reaction"] not in ("NONE", "CLIP")]
-    return " ".join(f"{f['code']}: {f['cause']}" for f in ends) or "it was stopped or disabled"
+    stopper = status["lease"]["stopped_by"]
+    stopped = f"process {stopper} stopped it" if stopper else "it was stopped or disabled"
+    return " ".join(f"{f['code']}: {f['cause']}" for f in ends) or stopped

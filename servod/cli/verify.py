@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from servod.cli.common import JsonOption, example, one_thread, print_json, suggest
-from servod.common.errors import AnswerIsNo
+from servod.common.errors import AnswerIsNo, BadInput
 
 if TYPE_CHECKING:
     from servod.formats.gains.gain_set import GainSet
@@ -36,27 +36,47 @@ def verify(
             help="Write the certificate, valid or not, into the file; a valid one is not revoked for want of plants."
         ),
     ] = True,
+    sign: Annotated[
+        Path | None,
+        typer.Option(help="Sign a set that is valid with this private Ed25519 key, OpenSSH or PEM (extra sign)."),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Verify GAINS; exit code 1 when the set is not valid."""
     one_thread()
     from servod.common.files import write_file
+    from servod.formats.gains import signature
     from servod.formats.gains.gain_set import load_gains
     from servod.lab.verify.certify import verify
 
     checked = load_gains(gains)
+    if sign is not None and not write:
+        raise BadInput("--sign", "--no-write", "--write: a signature stands in the file")
+    key = signature.load_private_key(str(sign), _passphrase) if sign else None
     result = verify(checked, plants, seed, processes, str(gains))
+    signer = None
     if write and may_be_written(checked, result):
-        write_file(gains, result.certified(checked).to_yaml())
+        judged = result.certified(checked)
+        if key is not None and judged.certificate_problem() is None:
+            judged = judged.model_copy(update={"signature": signature.sign(judged.content_sha256(), key)})
+            signer = judged.signature and judged.signature.signer
+        write_file(gains, judged.to_yaml())
     if as_json:
-        print_json(result.document() | {"hashes": hashes(checked)})
+        print_json(result.document() | {"hashes": hashes(checked), "signed_by": signer})
     else:
         print_checks(result)
         print_hashes(hashes(checked))
+        if signer:
+            print(f"signed by {signer}")
     suggest("deploy", str(gains), why="tries it on the axis, and goes back by itself when it is worse")
     if not result.valid:
         failed = [check.name for check in result.checks if not check.passed]
         raise AnswerIsNo(f"{gains}: not valid: {'; '.join(failed)}")
+
+
+def _passphrase() -> str | None:
+    """Of the site's key, from the person at the terminal."""
+    return str(typer.prompt("passphrase", hide_input=True, err=True)) if sys.stdin.isatty() else None
 
 
 def may_be_written(gains: GainSet, result: Verification) -> bool:

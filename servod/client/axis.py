@@ -67,7 +67,7 @@ class ReferenceMotion:
 
 
 class AxisReading(NamedTuple):
-    """The axis now; `state` is the name of its servod.runtime.loop.axis.AxisState."""
+    """The axis now; `state` is the name of its servod.runtime.loop.axis_state.AxisState."""
 
     state: str
     moves: bool

@@ -34,10 +34,12 @@ from servod.runtime.daemon.arguments import (
     check_arguments,
 )
 from servod.runtime.daemon.gain_bank import GainBank
+from servod.runtime.daemon.nodes import Nodes
 from servod.runtime.daemon.requests import finish, taken
 from servod.runtime.daemon.trajectory import MotionTable
-from servod.runtime.fieldbus.master import BringUp, Master
-from servod.runtime.loop.axis import AxisState
+from servod.runtime.fieldbus.master import BringUp, Master, master_ids
+from servod.runtime.fieldbus.master.planned import narrowed_by_stop, stopping_as_found
+from servod.runtime.loop.axis_state import AxisState
 from servod.runtime.loop.channel import TRAJECTORY_SAMPLES, Channel
 from servod.runtime.loop.commands import REFUSAL_TEXT, Command, Op, Refusal
 from servod.runtime.loop.cycle import Cycle
@@ -66,6 +68,7 @@ class ListPort:
         """`clock` stamps the commands."""
         self.trajectory: Samples = array("d", bytes(8 * TRAJECTORY_SAMPLES))
         self.proof: WiringReport | None = None
+        self.orphaned = False
         self._clock, self._rows = clock, bytearray()
         self._commands: deque[Command] = deque()
         self._seq = 0
@@ -88,8 +91,8 @@ class ListPort:
         return self._commands.popleft() if self._commands else None
 
     def supervisor_alive(self) -> bool:
-        """It is the caller."""
-        return True
+        """It is the caller, until it dies."""
+        return not self.orphaned
 
     def send(self, op: Op, arguments: Sequence[float]) -> None:
         """Give the loop a command."""
@@ -137,7 +140,7 @@ class ChannelPort(ListPort):
 
     def supervisor_alive(self) -> bool:
         """As the loop process sees it."""
-        return self._alive()
+        return not self.orphaned and self._alive()
 
     def send(self, op: Op, arguments: Sequence[float]) -> None:
         """Queue a command."""
@@ -175,17 +178,21 @@ class SteppedSession:
         port: ListPort | None = None,
     ) -> None:
         """`law` and `parameters`: the first controller (a packed gain set)."""
-        config = with_expected(config)
-        self.config, self.world, self.clock = config, world, world.clock
-        self.master = Master(config, world.connect(), world.clock, threaded=False)
+        config, self.world, self.clock = with_expected(config), world, world.clock
+        narrowed, _ = narrowed_by_stop(config)
+        self.master = Master(narrowed, world.connect(master_ids(config)), world.clock, threaded=False)
         self.bring_up: BringUp = self.master.bring_up()
-        plan = LoopPlan(config, self.bring_up.amplifier, self.bring_up.encoder, law, tuple(parameters))
+        config, self.stopping = stopping_as_found(config, self.bring_up.amplifier)
+        self.config = config
+        stop = None if self.stopping is None else self.stopping.facts
+        plan = LoopPlan(config, self.bring_up.amplifier, self.bring_up.encoder, law, tuple(parameters), stop=stop)
         self.port = port or ListPort(world.clock)
         self.loop_bus = world.connect()
         self.cycle = Cycle(plan, self.loop_bus, world.clock, self.port, self.port.supervisor_alive)
         self.lateness_ns: Callable[[], int] = _punctual
         self._deadline_ns = self.clock.now_ns() + self.cycle.period_ns
         self._cycles_until_poll = 0
+        self.loop_dead, self._unheard_polls = False, 0
         self._poll_cycles = max(1, _POLL_NS // self.cycle.period_ns)
 
     @property
@@ -214,9 +221,18 @@ class SteppedSession:
             self._step()
             self._look_after_nodes()
 
+    def die(self, loop: bool, supervisor: bool) -> None:
+        """What `kill -9` does: a dead loop takes part in nothing any more, a dead supervisor leaves the loop alone."""
+        self.loop_dead |= loop
+        self.port.orphaned |= supervisor
+
     def _step(self) -> None:
         """One cycle, as servod.runtime.loop.process.run paces it: periods that a late wake-up missed are skipped."""
         cycle, period_ns = self.cycle, self.cycle.period_ns
+        if self.loop_dead or (self.port.orphaned and cycle.finished):
+            self.clock.sleep_until(self._deadline_ns)
+            self._deadline_ns += period_ns
+            return
         late_ns = self.lateness_ns()
         self.clock.sleep_until(self._deadline_ns + late_ns)
         skipped = late_ns // period_ns
@@ -237,10 +253,11 @@ class SteppedSession:
     def enable(self, reset_fault: bool = False) -> None:
         """Enable and wait for it; raises AnswerIsNo when the axis does not get there."""
         self._must(self.send(Op.ENABLE, [reset_fault]))
-        timeout_s = self.config.amplifier.enable_timeout_s + self.config.wiring_proof.timeout_s
+        amplifier = self.config.amplifier
+        timeout_s = amplifier.enable_timeout_s + amplifier.brake.release_s + self.config.wiring_proof.timeout_s
         for _ in range(round(timeout_s / _ENABLE_STEP_S)):
             self.run(_ENABLE_STEP_S)
-            if not self.cycle.axis.state.starting:
+            if not self.cycle.axis.state.arriving:
                 break
         if self.cycle.axis.state != AxisState.ENABLED:
             raise AnswerIsNo(f"the axis is {self.cycle.axis.state.name}, not enabled. {self.why}")
@@ -275,10 +292,32 @@ class SteppedSession:
         if self._cycles_until_poll > 0:
             return
         self._cycles_until_poll = self._poll_cycles
+        if self.port.orphaned:
+            return
+        if self.loop_dead:
+            self._end_without_loop()
+            return
         self.port.look()
         self.master.poll()
         for event in self.master.events():
             self.port.send(Op.NODE_EVENT, (float(event.fault),))
+        self._unheard_polls += self.cycle.axis.unheard
+        if self._unheard_polls == 2:  # NMT stop comes from the loop, which makes the drive answer SDO some cycles later
+            self._stop_unheard()
+
+    def _stop_unheard(self) -> None:
+        """What the daemon does beside its rounds for a drive that stays powered. The loop, which has withdrawn, is not
+        late for it: its next cycle comes when this is done."""
+        Nodes(self.master, self.bring_up).stop_axis()
+        behind_ns = max(0, self.clock.now_ns() - self._deadline_ns)
+        periods = -(-behind_ns // self.cycle.period_ns)
+        self._deadline_ns += periods * self.cycle.period_ns
+        self.cycle.stand_still(periods)
+
+    def _end_without_loop(self) -> None:
+        """What the daemon does when it sees its loop dead, before it ends."""
+        self.port.orphaned = True
+        Nodes(self.master, self.bring_up).stop_axis()
 
 
 class SteppedAxis:
@@ -417,7 +456,7 @@ class SteppedAxis:
     def _off(self, op: Op) -> None:
         with contextlib.suppress(AnswerIsNo):
             self.session.send(op)
-            self.session.run(self.config.limits.ramp_down_s + 0.1)
+            self.session.run(self.config.limits.ramp_down_s + self.config.amplifier.brake.engage_s + 0.1)
 
 
 class _InPlace(Executor):

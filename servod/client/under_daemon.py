@@ -18,7 +18,7 @@ from servod.common.errors import AnswerIsNo, BadInput, ServodError, Unreachable
 from servod.common.yaml import parse_yaml, validate
 from servod.formats.config import AxisConfig
 from servod.formats.gains.gain_set import GainSet
-from servod.formats.protocol import Verb
+from servod.formats.protocol import TOOL_RENEW_S, Verb
 from servod.formats.recording.mcap_reader import read_recording
 
 # --- Stopping and recording ------------------------------------------------------------------------------------------
@@ -118,7 +118,7 @@ class DaemonAxis:
         """`config` must be the file that the daemon was started with; without one its own is asked for when it is
         wanted. Raises BadInput, naming the first other key.
         """
-        self._client, self._config = client, config
+        self._client, self._config, self._abandoned = client, config, ""
         if config is not None:
             require_daemon_config(client, config)
 
@@ -173,9 +173,13 @@ class DaemonAxis:
         self._client.call(Verb.GAINS_ROLLBACK, note=note, figures=figures, trial=True)
 
     def begin(self, motion: ReferenceMotion) -> None:
-        """Start a motion. What the daemon refuses because the axis has dropped out is the axis's answer."""
+        """Start a motion and let it run, whatever becomes of this client."""
+        self._start(motion, None)
+
+    def _start(self, motion: ReferenceMotion, renew_s: float | None) -> None:
+        """What the daemon refuses because the axis has dropped out is the axis's answer."""
         try:
-            self._client.call(Verb.TRACK, **motion.arguments)
+            self._client.call(Verb.TRACK, renew_s=renew_s, **motion.arguments)
         except Refused:
             self._moves()
             raise
@@ -188,10 +192,12 @@ class DaemonAxis:
         started, dropped = time.monotonic(), None
         with recording(self._client) as path:
             try:
-                self.begin(motion)
+                self._start(motion, TOOL_RENEW_S)
                 while self._moves_on():
                     if watch:
                         watch(time.monotonic() - started)
+                if self._abandoned:
+                    raise AxisDropped("ENABLED", self._abandoned)
             except AxisDropped as error:
                 dropped = error
         raw = bytes(read_recording(path).rows)
@@ -216,4 +222,5 @@ class DaemonAxis:
         if status["axis"]["state"] != "ENABLED":
             why = "; ".join(f"{f['code']}: {f['cause']} {f['remedy']}" for f in status["faults"])
             raise AxisDropped(status["axis"]["state"], why)
+        self._abandoned = str(status["motion"]["abandoned"])
         return bool(status["axis"]["motion_running"])

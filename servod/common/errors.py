@@ -57,7 +57,13 @@ def one_line(part: object) -> str:
     text = " ".join(str(part).split())
     if len(text) > _MOST_SHOWN:
         text = f"{text[: _MOST_SHOWN - 80]} ... {text[-70:]}"
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    return visible(text)
+
+
+def visible(text: str) -> str:
+    """`text` with a sign for every character but the end of a line that has none: what acts on a terminal, turns the
+    direction of what stands beside it, or comes from a file name that is no UTF-8."""
+    return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
 
 
 class Unreachable(ServodError):

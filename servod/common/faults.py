@@ -55,6 +55,13 @@ class FaultCode(IntEnum):
     NODE_LEFT_OPERATIONAL = 30
     DAEMON_LOST = 31
     CHANNEL_CORRUPT = 32
+    FOREIGN_SDO = 33
+    FOREIGN_FEEDBACK = 34
+    GUARD_CHANGED = 35
+    TORQUE_IMPLAUSIBLE = 36
+    DUPLICATE_NODE = 37
+    ESTOP_ACTIVE = 38
+    STO_ACTIVE = 39
 
 
 #: Faults after which the nodes are not as they were configured: only a new bring-up may enable the axis again.
@@ -67,6 +74,9 @@ NEEDS_RESTART = frozenset(
         FaultCode.DRIVE_STAYS_POWERED,
         FaultCode.COMMANDS_LOST,
         FaultCode.NODE_LEFT_OPERATIONAL,
+        FaultCode.FOREIGN_SDO,
+        FaultCode.DUPLICATE_NODE,
+        FaultCode.GUARD_CHANGED,
     }
 )
 
@@ -123,7 +133,8 @@ FAULTS: dict[FaultCode, Fault] = dict(
         _row(
             _C.FOLLOWING_ERROR,
             _R.RAMP_DOWN,
-            "Position and reference differ by more than limits.following_error_rad.",
+            "Position and reference differ by more than limits.following_error_rad. (A joint that moves is stopped by "
+            "the drive's quick stop.)",
             "Check for a blocked joint, a wrong polarity or too fast a reference; widen the window only after that.",
         ),
         _row(
@@ -174,7 +185,7 @@ FAULTS: dict[FaultCode, Fault] = dict(
             _C.DRIVE_RESET,
             _R.DISABLE,
             "A node sent its boot-up message while it should have been operational: it was reset.",
-            "Check the supply of the node; restart the daemon, which configures the node anew.",
+            "Check the supply of the node. The service configures it anew by itself; restart a daemon without --wait.",
         ),
         _row(
             _C.DRIVE_LEFT_OPERATION,
@@ -214,15 +225,17 @@ FAULTS: dict[FaultCode, Fault] = dict(
         ),
         _row(
             _C.NODE_HEARTBEAT_LOST,
-            _R.DISABLE,
+            _R.QUICK_STOP,
             "A node's heartbeat did not arrive within its time.",
-            "Check the node's supply and the bus wiring, then restart the daemon, which configures the node anew.",
+            "Check the node's supply and the bus wiring. The service begins anew by itself once the node answers; "
+            "restart a daemon without --wait.",
         ),
         _row(
             _C.BUS_OFF,
-            _R.DISABLE,
+            _R.QUICK_STOP,
             "The CAN controller is bus-off: too many transmit errors.",
-            "Check bit rate, termination (60 ohm across the lines) and wiring; restart the daemon after mending.",
+            "Check bit rate, termination (60 ohm across the lines) and wiring. The service begins anew by itself once "
+            "the nodes answer; restart a daemon without --wait.",
         ),
         _row(
             _C.BUS_QUEUE_FULL,
@@ -232,9 +245,10 @@ FAULTS: dict[FaultCode, Fault] = dict(
         ),
         _row(
             _C.BUS_DOWN,
-            _R.DISABLE,
+            _R.QUICK_STOP,
             "The CAN interface is down or the bus connection was closed.",
-            "Bring the interface up (`ip link set can0 up`), then restart the daemon.",
+            "Bring the interface up (`ip link set can0 up`). The service begins anew by itself once the nodes answer; "
+            "restart a daemon without --wait.",
         ),
         _row(
             _C.SUPERVISOR_LOST,
@@ -246,8 +260,8 @@ FAULTS: dict[FaultCode, Fault] = dict(
         _row(
             _C.LOOP_LOST,
             _R.DISABLE,
-            "The loop process died or hung; the supervisor switched the drive off. A drive that it does not reach "
-            "stops by its own heartbeat consumer (0x1016).",
+            "The loop process died or hung; the supervisor switched the drive off, braked to rest. "
+            "A drive that it does not reach stops by its own heartbeat consumer (0x1016).",
             "See the journal and the pre-fault recording; restart the service.",
         ),
         _row(
@@ -266,16 +280,17 @@ FAULTS: dict[FaultCode, Fault] = dict(
         _row(
             _C.COMMANDS_LOST,
             _R.DISABLE,
-            "The powered drive misses the command frames (RPDO1; EMCY 0x8250), or takes none from the bus any more "
-            "(status word bit 9); it was stopped by NMT.",
+            "The powered drive misses the command frames (RPDO1; EMCY 0x8250), takes none from the bus any more "
+            "(status word bit 9) or does not follow them (bit 12); it was stopped by NMT.",
             "Check wiring and plugs, and whether somebody else commands the drive; then restart the daemon.",
         ),
         _row(
             _C.SECOND_MASTER,
             _R.QUICK_STOP,
-            "Somebody else sends frames that only this master may send: SYNC, the command or the master's heartbeat.",
-            "Find the other master on the bus: a second daemon, another controller, or a node that produces SYNC "
-            "(0x1005 bit 30).",
+            "Somebody else sends frames that only this master may send: SYNC, NMT, TIME, LSS, a command (RPDO) or the "
+            "master's heartbeat.",
+            "Find the other master on the bus: a second daemon, another controller, a service tool, or a node that "
+            "produces SYNC (0x1005 bit 30).",
         ),
         _row(
             _C.WIRING_NOT_PROVEN,
@@ -305,6 +320,61 @@ FAULTS: dict[FaultCode, Fault] = dict(
             "is wrong. Nothing of it was used.",
             "`servoctl enable --reset-fault`. If it comes again, test the machine's memory (EDAC counters, memtest86+) "
             "and look for what starves the processes.",
+        ),
+        _row(
+            _C.FOREIGN_SDO,
+            _R.QUICK_STOP,
+            "Somebody else speaks SDO with a node of the axis: a request that this master did not send, or an answer "
+            "that it did not ask for. Limits and guards of the node may be changed.",
+            "The journal has the frame and its object. Take the service tool or the other master off the bus, then "
+            "restart the daemon, which configures the node anew.",
+        ),
+        _row(
+            _C.FOREIGN_FEEDBACK,
+            _R.QUICK_STOP,
+            "A node's synchronous feedback (TPDO) came that no SYNC asked for, or a TPDO that is switched off: "
+            "somebody else sends it, or SYNC reaches the nodes twice.",
+            "Find who else sends the node's frames, or the gateway that repeats SYNC; then `servoctl enable "
+            "--reset-fault`.",
+        ),
+        _row(
+            _C.GUARD_CHANGED,
+            _R.QUICK_STOP,
+            "A guard in the drive does not read as servod wrote it: a limit, its way to stop, its reaction to a dead "
+            "master. The journal names the object.",
+            "Find who writes to the drive (a service tool, another master), then restart the daemon, which writes the "
+            "guards again.",
+        ),
+        _row(
+            _C.TORQUE_IMPLAUSIBLE,
+            _R.QUICK_STOP,
+            "The torque that the drive says it gives (0x6077) is far from the torque that it was told, by more than "
+            "limits.torque_mismatch_nm.",
+            "Look for a drive in current limit, a wrong motor or lost phase, a wrong 0x6077; then `servoctl enable "
+            "--reset-fault`.",
+        ),
+        _row(
+            _C.DUPLICATE_NODE,
+            _R.QUICK_STOP,
+            "Two senders use one node id: heartbeats come between those of the node, or an EMCY takes back an error "
+            "that was never heard of, because somebody else sent it or because the bus lost the error's own frame.",
+            "Give each node its own id (`servoctl scan` shows who is there), find who sends in its name, or mend the "
+            "bus where it was disturbed; then restart the daemon.",
+        ),
+        _row(
+            _C.ESTOP_ACTIVE,
+            _R.QUICK_STOP,
+            "The emergency stop is active (amplifier.inputs.estop_bit), its wire is broken, or the drive's inputs "
+            "(0x60FD) are not heard any more.",
+            "Make the machine safe and release the emergency stop, then `servoctl enable --reset-fault`. Releasing it "
+            "enables nothing.",
+        ),
+        _row(
+            _C.STO_ACTIVE,
+            _R.DISABLE,
+            "Safe torque off is active (amplifier.inputs.sto_bit or sto_error): the drive has no torque, so the joint "
+            "coasts.",
+            "Find who opened the STO circuit and why, close it, then `servoctl enable --reset-fault`.",
         ),
     ]
 )

@@ -20,7 +20,8 @@ VERIFIES = (
 SYNTHESIZES = ("lab/synthesize/*.py", *VERIFIES)
 #: What a diagnosis comes from, intake and simulator included.
 DIAGNOSES = (
-    *("lab/diagnose/**/*.py", "lab/recordings/*.py", "lab/simulate/*.py", "formats/recording/record.py"),
+    *("lab/diagnose/**/*.py", "lab/recordings/**/*.py", "lab/simulate/*.py", "formats/recording/record.py"),
+    "formats/recording/mcap_*.py",
     *("kernels/**/*.py", "formats/model/*.py"),
 )
 

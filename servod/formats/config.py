@@ -2,221 +2,35 @@
 
 Every key has its unit in its name, its range and its meaning here; an unknown key is an error (servod.common.yaml). The
 daemon, the command line and the virtual axis read the same file, the virtual axis only for node ids and bus. What is on
-the wire stands in servod.formats.config; `servoctl config keys` prints every key.
+the wire stands in servod.formats.config_wire; `servoctl config keys` prints every key.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 from pydantic import Field, model_validator
 
 from servod.common.yaml import Strict
+from servod.formats.config_wire import (
+    AmplifierConfig,
+    BrakeConfig,
+    BusConfig,
+    CycleConfig,
+    EncoderConfig,
+    HeartbeatConfig,
+    Identity,
+    InputsConfig,
+    NodeId,
+)
+from servod.formats.gains.signature import is_key
 from servod.formats.kinds import FileKind, load_kind
-
-# --- What is on the wire ---------------------------------------------------------------------------------------------
-# The part of the axis configuration that says what is on the wire: bus, cycle, heartbeats, amplifier and encoder. Every
-# key states its meaning, unit, sense and what holds when it is left out: `servoctl config keys` prints them.
-
-
-NodeId = Annotated[int, Field(ge=1, le=127, description="CANopen node id, 1 to 127")]
-
-
-class BusConfig(Strict):
-    """How to reach the bus. `virtual`: channel is the hub's Unix socket; `socketcan`: an interface name; any other
-    name goes to python-can with `options`."""
-
-    interface: str = Field(
-        "virtual", min_length=1, description="socketcan, virtual, or a name that python-can knows, e.g. pcan, kvaser"
-    )
-    channel: str = Field(
-        "/run/servod/vbus0",
-        min_length=1,
-        description="socketcan: the network interface, e.g. can0; virtual: the hub's Unix socket; else python-can's",
-    )
-    bit_rate: Literal[10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000] = Field(
-        1_000_000,
-        description="what the bus load is reckoned with, and what python-can sets; a socketcan interface is set by the "
-        "system (ip link, systemd-networkd), so state the same here",
-    )
-    max_load: float = Field(
-        0.7,
-        ge=0.01,
-        le=0.95,
-        description="share of the bit rate that the cyclic frames may use; with more the daemon does not start",
-    )
-    options: dict[str, Any] = Field(
-        default_factory=dict, description="further arguments of python-can's Bus(); unused with socketcan and virtual"
-    )
-
-
-class CycleConfig(Strict):
-    """The 1 kHz cycle and what it asks of the operating system."""
-
-    period_us: int = Field(
-        1000,
-        ge=500,
-        le=20_000,
-        description="time from SYNC to SYNC; written to the drive (0x60C2), and what a certified gain set is bound to",
-    )
-    feedback_timeout_us: int = Field(
-        600,
-        ge=50,
-        le=19_000,
-        description="longest wait for both nodes' positions after SYNC, less than period_us; what has not come by then "
-        "is stale in this cycle",
-    )
-    cpu: int | None = Field(
-        None, ge=0, le=1023, description="core to pin the loop to, counted from 0; left out: the system chooses"
-    )
-    priority: int = Field(
-        80, ge=0, le=98, description="SCHED_FIFO priority of the loop; 0 leaves the default scheduler"
-    )
-
-    @model_validator(mode="after")
-    def _timeout_fits(self) -> CycleConfig:
-        if self.feedback_timeout_us >= self.period_us:
-            raise ValueError("cycle.feedback_timeout_us less than cycle.period_us")
-        return self
-
-
-class HeartbeatConfig(Strict):
-    """Heartbeats both ways (CiA 301: 0x1016, 0x1017)."""
-
-    master_node_id: NodeId = Field(
-        126, description="node id under which servod sends its own heartbeat; of no device on the bus"
-    )
-    master_period_ms: int = Field(
-        50, ge=10, le=1000, description="servod's heartbeat; the loop itself sends it, so it ends with the loop"
-    )
-    drive_timeout_ms: int = Field(
-        150,
-        ge=20,
-        le=5000,
-        description="without servod's heartbeat for this time the drive stops by itself (0x1016), the last line of "
-        "defence; also the deadline of the torque commands; at least twice master_period_ms",
-    )
-    node_period_ms: int = Field(50, ge=10, le=1000, description="heartbeat of drive and encoder, written to 0x1017")
-    node_timeout_ms: int = Field(
-        150,
-        ge=20,
-        le=5000,
-        description="a node whose heartbeat stays away for longer is lost: disabled (NODE_HEARTBEAT_LOST); at "
-        "least twice node_period_ms",
-    )
-
-    @model_validator(mode="after")
-    def _timeouts_exceed_periods(self) -> HeartbeatConfig:
-        if self.drive_timeout_ms < 2 * self.master_period_ms:
-            raise ValueError("heartbeat.drive_timeout_ms at least twice master_period_ms")
-        if self.node_timeout_ms < 2 * self.node_period_ms:
-            raise ValueError("heartbeat.node_timeout_ms at least twice node_period_ms")
-        return self
-
-
-class Identity(Strict):
-    """Identity object 0x1018; every number that is given is checked before anything else is written."""
-
-    vendor_id: int | None = Field(
-        None,
-        ge=0,
-        le=0xFFFFFFFF,
-        description="0x1018:1, the maker's number; another one ends the start-up; left out: any will do",
-    )
-    product_code: int | None = Field(
-        None, ge=0, le=0xFFFFFFFF, description="0x1018:2; another one ends the start-up; left out: any will do"
-    )
-    revision: int | None = Field(
-        None, ge=0, le=0xFFFFFFFF, description="0x1018:3; another one ends the start-up; left out: any will do"
-    )
-    serial: int | None = Field(
-        None,
-        ge=0,
-        le=0xFFFFFFFF,
-        description="0x1018:4, one single device; another one ends the start-up; left out: any will do",
-    )
-
-
-class AmplifierConfig(Strict):
-    """The servo amplifier. Positions of 0x6064 are counts of the motor encoder; the joint turns 1/gear_ratio of it."""
-
-    driver: str = Field("cia402", min_length=1, description="device driver by name; cia402 is the profile's")
-    node_id: NodeId = Field(1, description="CANopen node id of the drive")
-    eds: str | None = Field(None, description="EDS or DCF file; left out: the driver's generic dictionary")
-    identity: Identity = Identity()
-    quirks: str = Field("none", description="row of the quirks table, e.g. epos4, elmo, copley, nanotec, technosoft")
-    counts_per_turn: int = Field(
-        1_048_576,
-        ge=4,
-        le=2**32 - 1,
-        description="counts of 0x6064 in one turn of the motor shaft, before the gear: lines times four, or 2^bits",
-    )
-    gear_ratio: float = Field(
-        1.0,
-        ge=1e-6,
-        le=1e6,
-        description="turns of the motor for one turn of the joint: 100 for a 100:1 reducer, 1 for a direct drive; "
-        "joint angle = motor angle / gear_ratio, joint torque = motor torque * gear_ratio, without losses",
-    )
-    position_direction: Literal[1, -1] = Field(
-        1, description="-1 where 0x6064 falls while the joint's encoder, with encoder.direction, rises"
-    )
-    torque_direction: Literal[1, -1] = Field(
-        1, description="-1 where a positive 0x6071 turns the joint so that its position falls; on top of 0x607E"
-    )
-    rated_torque_mnm: int | None = Field(
-        None,
-        ge=1,
-        description="rated torque of the motor, before the gear, as 0x6076 must read; left out: what it reads counts",
-    )
-    quick_stop_option: Literal[0, 1, 2, 3, 4, 5, 6, 7, 8] = Field(
-        2,
-        description="0x605A, how the drive stops: 0 torque off, 1 its slow-down ramp, 2 its quick-stop ramp, 3 current "
-        "limit, 4 voltage limit, each then off; 5 to 8 the same as 1 to 4, then holding with torque",
-    )
-    heartbeat_reaction: Literal[1, 2, 3] = Field(
-        3, description="0x6007, when servod's heartbeat stays away: 1 fault, 2 disable voltage, 3 quick stop"
-    )
-    enable_timeout_s: float = Field(
-        2.0,
-        ge=1e-3,
-        le=60.0,
-        description="longest time to power up, beyond: ENABLE_TIMEOUT; and longest wait for the drive's own quick stop",
-    )
-
-
-class EncoderConfig(Strict):
-    """The joint's encoder and how its velocity is made."""
-
-    driver: str = Field("cia406", min_length=1, description="device driver by name; cia406 is the profile's")
-    node_id: NodeId = Field(2, description="CANopen node id of the encoder")
-    eds: str | None = Field(None, description="EDS or DCF file; left out: the driver's generic dictionary")
-    identity: Identity = Identity()
-    counts_per_turn: int = Field(
-        1_048_576,
-        ge=4,
-        le=2**32 - 1,
-        description="counts in one turn of the joint; 0x6001, or 0x6501 without scaling, must read the same",
-    )
-    measuring_range_counts: int | None = Field(
-        None, ge=4, le=2**32, description="where the counter wraps, as 0x6002 must read; left out: what it reads counts"
-    )
-    direction: Literal[1, -1] = Field(1, description="-1 where the counter falls while the joint turns as positive")
-    zero_offset_rad: float = Field(
-        0.0, ge=-1e6, le=1e6, description="what the encoder reads, with direction, where the joint is to be at 0 rad"
-    )
-    velocity_cutoff_hz: float = Field(
-        120.0,
-        ge=0.1,
-        le=2000.0,
-        description="first-order low-pass of the velocity; a certified gain set is bound to its own",
-    )
-
 
 __all__ = [
     "AmplifierConfig",
     "AxisConfig",
+    "BrakeConfig",
     "BusConfig",
     "ControlConfig",
     "CycleConfig",
@@ -224,10 +38,12 @@ __all__ = [
     "GainsConfig",
     "HeartbeatConfig",
     "Identity",
+    "InputsConfig",
     "LimitsConfig",
     "MetricsConfig",
     "NodeId",
     "RecorderConfig",
+    "StoppingConfig",
     "WiringProofConfig",
     "load_config",
 ]
@@ -236,6 +52,8 @@ __all__ = [
 _PROOF_SHARE = 0.9
 #: What it needs besides a ramp each way: at rest, holding, coming to rest [s].
 _PROOF_RESTS_S = 0.1
+#: The deadline of the commands is in whole ms, and one frame that is late by a few is no dead master.
+_LEAST_DEADLINE_MS = 5
 
 
 class LimitsConfig(Strict):
@@ -268,6 +86,13 @@ class LimitsConfig(Strict):
         le=1e6,
         description="most distance that drive's and encoder's position of the joint may drift apart since the enable; "
         "beyond: disabled (ENCODER_IMPLAUSIBLE)",
+    )
+    torque_mismatch_nm: float | None = Field(
+        None,
+        ge=1e-6,
+        le=1e5,
+        description="most distance of the torque that the drive says it gives (0x6077) and what it was told; beyond "
+        "for 50 cycles: quick stop (TORQUE_IMPLAUSIBLE); left out: a quarter of torque_nm",
     )
     stale_cycles: int = Field(
         5, ge=1, le=1000, description="cycles in a row without fresh feedback; as many: quick stop (FEEDBACK_STALE)"
@@ -331,6 +156,52 @@ class WiringProofConfig(Strict):
         return self
 
 
+class StoppingConfig(Strict):
+    """The worst joint that a stop is reckoned with (servod.formats.stopping); left out: what `model` says, or else the
+    design of the first gain set, or else wiring_proof.inertia with half of its friction_nm and no load."""
+
+    least_inertia: float | None = Field(
+        None, ge=1e-12, le=1e6, description="of all that moves, without load; none: 0.9 of the model's"
+    )
+    most_inertia: float | None = Field(
+        None, ge=1e-12, le=1e6, description="with the greatest load; none: 1.1 of the model's"
+    )
+    least_friction_nm: float | None = Field(
+        None, ge=0.0, le=1e5, description="dry friction that is always there, warm and run in; none: half the model's"
+    )
+    least_viscous: float | None = Field(
+        None, ge=0.0, le=1e5, description="viscous friction that is always there; none: half the model's"
+    )
+    load_min_nm: float | None = Field(
+        None,
+        ge=-1e5,
+        le=0.0,
+        description="load on the joint the negative way, e.g. a weight; none: the model's gravity",
+    )
+    load_max_nm: float | None = Field(
+        None, ge=0.0, le=1e5, description="load on the joint the positive way; none: the model's gravity"
+    )
+    deceleration_rad_s2: float | None = Field(
+        None,
+        ge=1e-3,
+        le=1e7,
+        description="ramp of the drive's quick stop at the joint, written to 0x6085 (option 1: 0x6084) unless it is "
+        "steeper there; none: 0.8 of what limits.torque_nm can do with the most inertia and load",
+    )
+    drive_lag_s: float = Field(
+        0.006, ge=0.0, le=1.0, description="the drive's own velocity control follows its ramp so much later"
+    )
+    within_s: float | None = Field(
+        None,
+        ge=0.005,
+        le=60.0,
+        description="torque is gone so long after a loss of the master, braking included; where a brake or 0x605A from "
+        "5 on holds the joint on purpose, it is at rest by then, and the torque gone later (status: stopping.held_s); "
+        "limits.speed_rad_s is narrowed until it is; none: 0.06 s, or 0.3 s where the drive reacts to its commands "
+        "later than 0.03 s",
+    )
+
+
 class GainsConfig(Strict):
     """Where gain sets are kept and which one is active at start."""
 
@@ -344,6 +215,12 @@ class GainsConfig(Strict):
     )
     accept_uncertified: bool = Field(
         False, description="run gain sets that carry no certificate; one that says no, or is broken, never runs"
+    )
+    signers: list[str] = Field(
+        default_factory=list,
+        max_length=100,
+        description="run only sets that one of these public Ed25519 keys has signed (`servoctl verify --sign`): each a "
+        "line of OpenSSH, or a file of such lines or PEM (extra `sign`); none: hashes alone, against accidents",
     )
 
 
@@ -401,11 +278,12 @@ class AxisConfig(Strict):
     encoder: EncoderConfig = EncoderConfig()
     limits: LimitsConfig
     wiring_proof: WiringProofConfig = WiringProofConfig()
+    stopping: StoppingConfig = StoppingConfig()
     gains: GainsConfig
     model: Path | None = Field(
         None,
-        description="axis model: friction and inertia that the test of the wiring expects, the delay that a gain set "
-        "must be designed for, attached to every recording; left out: none of these",
+        description="axis model: what the test of the wiring expects and what a stop is reckoned with, the delay that "
+        "a gain set must be designed for, attached to every recording; left out: none of these",
     )
     control: ControlConfig = ControlConfig()
     recorder: RecorderConfig = RecorderConfig()
@@ -417,6 +295,26 @@ class AxisConfig(Strict):
         if len(set(ids)) != len(ids):
             raise ValueError("different ids for heartbeat.master_node_id, amplifier.node_id and encoder.node_id")
         return self
+
+    @model_validator(mode="after")
+    def _deadline_fits_cycle(self) -> AxisConfig:
+        if 0 < 1000 * (self.heartbeat.command_deadline_ms or 0) < 2 * self.cycle.period_us:
+            raise ValueError("heartbeat.command_deadline_ms 0, or at least twice cycle.period_us")
+        return self
+
+    @property
+    def quirks(self) -> str:
+        """Row of the quirks table (drivers/quirks.py)."""
+        return self.amplifier.quirks or ("virtual" if self.bus.interface == "virtual" else "none")
+
+    @property
+    def command_deadline_ms(self) -> int:
+        """Deadline of the command frames in the drive (0x1400:5), in ms; 0: none is wanted."""
+        if self.heartbeat.command_deadline_ms is not None:
+            return self.heartbeat.command_deadline_ms
+        # The loop itself stops the axis when it was late for so long: the drive need not wait any longer for it.
+        budget_ms = max(-(-self.limits.late_cycles * self.cycle.period_us // 1000), _LEAST_DEADLINE_MS)
+        return min(max(budget_ms, 2 * -(-self.cycle.period_us // 1000)), self.heartbeat.drive_timeout_ms)
 
     @model_validator(mode="after")
     def _proof_fits_limits(self) -> AxisConfig:
@@ -456,6 +354,8 @@ def load_config(path: str | Path) -> AxisConfig:
     for name, keys in paths.items():
         section = getattr(config, name)
         changed[name] = section.model_copy(update={key: _beside(base, getattr(section, key)) for key in keys})
+    signers = [one if is_key(one) else str(base / one) for one in config.gains.signers]
+    changed["gains"] = changed["gains"].model_copy(update={"signers": signers})
     return config.model_copy(update=changed)
 
 

@@ -13,6 +13,7 @@ from servod.formats.config import AxisConfig
 #: Unit by the end of a key's name, the longest ends first.
 _UNITS = {
     "_nm_per_s": "N·m/s",
+    "_rad_s2": "rad/s²",
     "_rad_s": "rad/s",
     "_mnm": "mN·m",
     "_rad": "rad",
@@ -33,6 +34,9 @@ _NAMED = {
     "amplifier.counts_per_turn": "counts per motor turn",
     "amplifier.gear_ratio": "motor turns per joint turn",
     "encoder.counts_per_turn": "counts per joint turn",
+    "stopping.least_inertia": "kg·m²",
+    "stopping.least_viscous": "N·m·s/rad",
+    "stopping.most_inertia": "kg·m²",
     "wiring_proof.inertia": "kg·m²",
 }
 _TYPES = {"null": "none", "string": "text", "object": "mapping", "number": "number", "integer": "integer"}

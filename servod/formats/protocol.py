@@ -24,6 +24,12 @@ PIECE_SAMPLES = 2000
 PIECE_CYCLES = 500
 
 
+#: A motion halts when the client that started it has asked nothing for so long, unless that says otherwise [s].
+RENEW_S = 0.5
+#: The same for tools that measure and compute beside the motion [s].
+TOOL_RENEW_S = 1.0
+
+
 class Verb(StrEnum):
     """What the daemon can be asked."""
 

@@ -5,9 +5,16 @@ Beside the data path; the loop gets numbers and reads no file.
 
 from __future__ import annotations
 
+import math
+
 from servod.common.errors import BadInput
 from servod.formats.config import AxisConfig
 from servod.formats.model.axis_model import AxisKind, AxisModel, load_axis_model
+
+#: Places within the position limits at which a load is looked at.
+_PLACES = 200
+#: 0x605A from here on: the drive holds after the stop.
+_HOLDS = 5
 
 
 def with_expected(config: AxisConfig) -> AxisConfig:
@@ -58,3 +65,47 @@ def break_away_nm(model: AxisModel) -> float:
         return max(abs(torque) for torque in friction.torques)
     static = None if friction.kind == "coulomb_viscous" else friction.static
     return friction.coulomb if static is None else static
+
+
+def load_nm(model: AxisModel, config: AxisConfig) -> float:
+    """The largest torque that gravity and torque_offset of the model put on the joint within the position limits."""
+    low, high = config.limits.position_min_rad, config.limits.position_max_rad
+    amplitude, phase = (model.gravity.amplitude, model.gravity.phase) if model.gravity else (0.0, 0.0)
+    places = (low + (high - low) * k / _PLACES for k in range(_PLACES + 1))
+    return max(abs(amplitude * math.sin(place + phase) + model.torque_offset) for place in places)
+
+
+def brake_notes(config: AxisConfig) -> list[str]:
+    """What may fall on this axis, when, and how far, with the load of the model and no friction to hold it."""
+    brake, option = config.amplifier.brake, config.amplifier.quick_stop_option
+    model = None if config.model is None else load_axis_model(config.model)
+    load = 0.0 if model is None or model.axis is not AxisKind.ROTARY else load_nm(model, config)
+    if brake.by == "none":
+        if model is None or load <= break_away_nm(model):
+            return []
+        return [f"a load of {load:.3g} N*m is more than friction holds: it falls when switched off, without a brake"]
+    fall = "how far a load falls meanwhile cannot be said without `model`"
+    if model is not None:
+        fall_rad = 0.5 * load / model.inertia * brake.engage_s**2
+        fall = f"a load of {load:.3g} N*m falls up to {fall_rad:.3g} rad meanwhile"
+    notes = [
+        f"when the drive faults, STO opens or the bus is lost the torque goes at once, and the brake closes after "
+        f"{brake.engage_s:g} s (amplifier.brake.engage_s): {fall}"
+    ]
+    if brake.by == "output":
+        dies = "holds the load, the brake open" if option >= _HOLDS else "lets go, the brake open: the load falls"
+        notes.append(
+            f"when this computer dies nobody closes a brake by output: the drive stops by itself and {dies} "
+            f"(amplifier.quick_stop_option {option})"
+        )
+        if option < _HOLDS:
+            notes.append(
+                f"at a stop amplifier.quick_stop_option {option} lets go when the joint has come to rest, before the "
+                f"brake is closed: {fall}; 5 to 8 hold until it is"
+            )
+    elif option in (0, *range(_HOLDS, 9)):
+        notes.append(
+            f"amplifier.quick_stop_option {option}: the drive closes its brake after a stop when it switches off by "
+            "itself, with 1 to 4"
+        )
+    return notes

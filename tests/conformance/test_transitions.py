@@ -9,10 +9,15 @@ from servod.drivers.cia402_state import (
     STATE_OF_STATUS,
     TRANSITIONS,
     control_words,
-    decode_status_word,
     reached_states,
 )
-from servod.runtime.fieldbus.cia import CW_FAULT_RESET, CW_QUICK_STOP, CW_SHUTDOWN, STATUS_WORD_TABLE
+from servod.runtime.fieldbus.cia import (
+    CW_FAULT_RESET,
+    CW_QUICK_STOP,
+    CW_SHUTDOWN,
+    STATUS_WORD_TABLE,
+    decode_status_word,
+)
 from servod.runtime.fieldbus.devices import DriveState, Goal
 
 S = DriveState

@@ -16,6 +16,7 @@ from servod.runtime.fieldbus.devices import (
     HANDSHAKE_SYNCS,
     NEVER_CYCLES,
     AmplifierCommand,
+    DriveInput,
     DriveState,
     Goal,
     Mode,
@@ -141,7 +142,7 @@ def test_goal_that_is_reached_in_a_wrong_mode_says_so(mode: int) -> None:
 
 # --- feedback ---------------------------------------------------------------------------------------------------------
 def test_before_the_first_frame_nothing_is_claimed() -> None:
-    nothing = (0, NEVER_CYCLES, S.UNKNOWN, 0, -1, 0.0, 0.0, 0, False, Reason.NO_FEEDBACK)
+    nothing = (0, NEVER_CYCLES, S.UNKNOWN, 0, -1, 0.0, 0.0, 0, False, Reason.NO_FEEDBACK, 0)
     assert tuple(bench().driver.read()) == nothing
 
 
@@ -237,3 +238,72 @@ def test_every_reason_in_every_state_after_the_handshake(option: int, state: Dri
     else:
         expected = beside.get(state, Reason.NONE) | mode or Reason.HANDSHAKE
     assert waited(axis, state, goal) == expected
+
+
+@pytest.mark.parametrize(
+    ("word", "levels", "active"),
+    [
+        (0x30000, ("low", "low"), DriveInput(0)),
+        (0x20000, ("low", "low"), DriveInput.ESTOP),
+        (0x10000, ("low", "low"), DriveInput.STO),
+        (0x0FFFF, ("low", "low"), DriveInput.ESTOP | DriveInput.STO),
+        (0x30000, ("high", "low"), DriveInput.ESTOP),
+        (0x20000, ("high", "high"), DriveInput.STO),
+        (0xFFFCFFFF, ("high", "high"), DriveInput(0)),
+    ],
+)
+def test_inputs_are_active_by_their_level(word: int, levels: tuple[str, str], active: DriveInput) -> None:
+    inputs = {"estop_bit": 16, "estop_active": levels[0], "sto_bit": 17, "sto_active": levels[1]}
+    axis = bench(inputs=inputs)
+    axis.say(S.SWITCH_ON_DISABLED)
+    assert axis.driver.read().inputs == 0, "not heard yet, and not missing yet"
+    say_inputs(axis, word)
+    assert axis.driver.read().inputs == active
+
+
+def say_inputs(axis: AmplifierBench, word: int, error_code: int = 0) -> None:
+    values = {Obj402.MODE_DISPLAY: Mode.CYCLIC_SYNC_TORQUE, Obj402.ERROR_CODE: error_code}
+    data = encode(axis.slow_pdo, values | {Obj402.DIGITAL_INPUTS: word})
+    axis.driver.on_frame(axis.slow_pdo.cob_id, data, axis.time_ns)
+
+
+@pytest.mark.parametrize("level", ["low", "high"])
+def test_inputs_that_are_not_heard_any_more_are_active(level: str) -> None:
+    axis = bench(inputs={"estop_bit": 3, "estop_active": level})
+    say_inputs(axis, 8 if level == "low" else 0)
+    seen = []
+    for _ in range(45):
+        axis.cycle(S.OPERATION_ENABLED, Goal.ENABLED)
+        axis.say(S.OPERATION_ENABLED)
+        seen.append(axis.driver.read().inputs)
+    assert seen == 40 * [0] + 5 * [DriveInput.ESTOP], "three event timers of 10 ms and ten cycles"
+    say_inputs(axis, 8 if level == "low" else 0)
+    assert axis.driver.read().inputs == 0
+
+
+def test_active_input_is_not_hidden_by_who_says_that_it_is_released() -> None:
+    axis = bench(inputs={"estop_bit": 3, "estop_active": "high"})
+    seen = set()
+    for number in range(200):
+        axis.cycle(S.OPERATION_ENABLED, Goal.ENABLED)
+        if number % 10 == 0:
+            say_inputs(axis, 8)  # the drive, by its event timer
+        say_inputs(axis, 0)  # somebody else, behind it and in each cycle
+        seen.add(axis.driver.read().inputs)
+    assert seen == {DriveInput.ESTOP}
+    for _ in range(45):
+        axis.cycle(S.OPERATION_ENABLED, Goal.ENABLED)
+        say_inputs(axis, 0)
+    assert axis.driver.read().inputs == 0, "released, and nobody says otherwise"
+
+
+def test_sto_is_told_by_the_drives_error_code_while_it_is_in_fault() -> None:
+    axis = bench(inputs={"sto_error": 0x5441})
+    told = []
+    for state in (S.SWITCHED_ON, S.FAULT, S.FAULT_REACTION_ACTIVE, S.READY_TO_SWITCH_ON):
+        axis.say(state)
+        axis.say_emcy(0x4310 if state is S.SWITCHED_ON else 0x5441)
+        told.append(axis.driver.read().inputs)
+    axis.say(S.FAULT)
+    axis.say_emcy(0x4310)
+    assert [*told, axis.driver.read().inputs] == [0, DriveInput.STO_TOLD, DriveInput.STO_TOLD, 0, 0]

@@ -13,14 +13,22 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "conformance"))
 from drivers_under_test import axis_config
 
 from servod.common.errors import BadInput, Unreachable
+from servod.drivers.cia402 import Cia402Amplifier
 from servod.drivers.cia402_setup import SUPPORTED_MODE_BIT, AmplifierSetup, amplifier_pdos, interpolation_period
 from servod.drivers.quirks import QUIRKS, Presence, load_quirks
 from servod.runtime.fieldbus.cia import Abort, Obj402
-from servod.runtime.fieldbus.devices import DriveState, Mode, NodePlan, SdoAbort
+from servod.runtime.fieldbus.devices import AmplifierCommand, DriveState, Goal, Mode, NodePlan, SdoAbort
 
 STATUS, MODES, RATED = (Obj402.STATUS_WORD, 0), (Obj402.SUPPORTED_MODES, 0), (Obj402.RATED_TORQUE, 0)
 QUICK_STOP, ABORT, MODE = (Obj402.QUICK_STOP_OPTION, 0), (Obj402.ABORT_CONNECTION, 0), (Obj402.MODE, 0)
 PERIOD, EXPONENT = (Obj402.INTERPOLATION_PERIOD, 1), (Obj402.INTERPOLATION_PERIOD, 2)
+FAULT_REACTION = (Obj402.FAULT_REACTION_OPTION, 0)
+#: The limits of a drive that nobody has set: as wide as the objects are.
+LIMITS_BEFORE = {(index, 0): 0x7FFF for index in (0x6072, 0x60E0, 0x60E1, 0x6066)}
+LIMITS_BEFORE |= {(index, 0): 0xFFFFFFFF for index in (0x6065, 0x607F, 0x6080)} | {
+    (0x607D, 1): -(2**31),
+    (0x607D, 2): 2**31 - 1,
+}
 CST = 1 << 9
 
 
@@ -29,7 +37,9 @@ class Dictionary(dict[tuple[int, int], int]):
 
     def __init__(self) -> None:
         super().__init__({STATUS: 0x0240, MODES: CST, RATED: 2000, QUICK_STOP: 2, ABORT: 0, MODE: 0})
-        self.update({PERIOD: 0, EXPONENT: 0})
+        self.update({PERIOD: 0, EXPONENT: 0, FAULT_REACTION: 1, (0x1001, 0): 0, (0x1029, 1): 1, (0x6064, 0): 0})
+        self[0x2007, 0] = 1  # by which the drive of the shipped row shows that it stops at its deadline
+        self.update(LIMITS_BEFORE)
         self.written: list[tuple[int, int]] = []
 
     def read(self, index: int, subindex: int = 0) -> int:
@@ -52,7 +62,7 @@ def configured(device: Dictionary, mode: Mode = Mode.CYCLIC_SYNC_TORQUE, **ampli
 def test_everything_that_is_wanted_is_written_and_told() -> None:
     device = Dictionary()
     plan = configured(device, quick_stop_option=6, heartbeat_reaction=3)
-    assert (device[QUICK_STOP], device[ABORT], device[MODE]) == (6, 3, 10)
+    assert (device[QUICK_STOP], device[ABORT], device[MODE]) == (6, 1, 10)  # it would hold for ever by 3
     assert device[PERIOD] * 10.0 ** device[EXPONENT] == pytest.approx(1e-3)
     assert device.written[-1] == MODE, "last, before the node becomes operational"
     assert (plan.facts["rated_torque_nm"], plan.facts["polarity"], plan.facts["notes"]) == (2.0, 0, [])
@@ -119,7 +129,10 @@ def test_facts_before_the_drive_is_asked_are_in_si_units() -> None:
     assert (facts["period_s"], facts["rated_torque_nm"]) == (pytest.approx(1e-3), pytest.approx(2.0))
 
 
-@pytest.mark.parametrize(("missing", "note"), [(QUICK_STOP, "0x605A"), (ABORT, "0x6007"), (PERIOD, "0x60C2")])
+@pytest.mark.parametrize(
+    ("missing", "note"),
+    [(ABORT, "0x6007"), (PERIOD, "0x60C2"), ((0x6080, 0), "0x6080:0"), ((0x2007, 0), "0x2007 does not show")],
+)
 def test_what_a_drive_does_not_have_is_told(missing: tuple[int, int], note: str) -> None:
     device = Dictionary()
     del device[missing]
@@ -182,6 +195,9 @@ def test_pdos_are_the_documented_ones() -> None:
         [(0x6041, 16), (0x6064, 32), (0x6077, 16)],
         [(0x6061, 8), (0x603F, 16)],
     ]
+    slow = amplifier_pdos(5, Mode.CYCLIC_SYNC_TORQUE, 150, with_inputs=True)[2]
+    assert [(entry.index, entry.bits) for entry in slow.entries] == [(0x6061, 8), (0x603F, 16), (0x60FD, 32)]
+    assert slow.event_timer_ms == 10, "a drive need not send it when an input changes"
 
 
 @pytest.mark.parametrize(("entries", "fits"), [(3, True), (2, False)])
@@ -194,3 +210,32 @@ def test_drive_that_maps_too_few_objects_is_refused(entries: int, fits: bool, mo
     else:
         with pytest.raises(BadInput, match="maps 3 objects in one PDO"):
             setup.plan()
+
+
+OUTPUTS, MASK = (0x60FE, 1), (0x60FE, 2)
+
+
+@pytest.mark.parametrize(("engages", "closed"), [("low", 0), ("high", 1 << 5)])
+def test_the_brake_is_closed_before_its_output_is_taken(engages: str, closed: int) -> None:
+    device = Dictionary()
+    device.update({OUTPUTS: 0b100100, MASK: 0b1000})
+    plan = configured(device, brake={"by": "output", "output_bit": 5, "output_engages": engages})
+    assert (device[OUTPUTS], device[MASK]) == (0b100 | closed, 0b101000), "the other outputs stay as they are"
+    places = [device.written.index(place) for place in (OUTPUTS, MASK)]
+    assert places == sorted(places)
+    command = next(pdo for pdo in plan.pdos if pdo.receive)
+    assert [entry.word for entry in command.entries] == [0x60400010, 0x60710010, 0x60FE0120]
+    driver = Cia402Amplifier(plan)
+    sent = {driver.write(AmplifierCommand(goal, 0.0))[1][-4:] for goal in Goal}
+    assert sent == {(0b100 | closed).to_bytes(4, "little")}, "each cycle, too"
+    assert plan.facts["brake"] == (0b100 | closed, 0b100 | closed ^ 1 << 5)
+
+
+def test_a_drive_without_outputs_cannot_have_the_brake() -> None:
+    with pytest.raises(Unreachable, match=r"0x60FE is missing, needed for amplifier\.brake"):
+        configured(Dictionary(), brake={"by": "output", "output_bit": 5})
+    device = Dictionary()
+    device[OUTPUTS] = 0b100100  # a drive without the mask, which is optional
+    assert configured(device, brake={"by": "output", "output_bit": 5}).facts["brake"] == (0b100, 0b100100)
+    assert device[OUTPUTS] == 0b100
+    assert all(len(pdo.entries) == 2 for pdo in configured(Dictionary(), brake={"by": "drive"}).pdos if pdo.receive)

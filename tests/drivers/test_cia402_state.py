@@ -13,10 +13,10 @@ from servod.drivers.cia402_state import (
     STATE_OF_STATUS,
     TRANSITIONS,
     control_words,
-    decode_status_word,
     quick_stop_stays,
     reached_states,
 )
+from servod.runtime.fieldbus.cia import decode_status_word
 from servod.runtime.fieldbus.devices import DriveState, Goal
 
 S = DriveState

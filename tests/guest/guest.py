@@ -9,15 +9,19 @@ fresh with each run through a shared folder. One slow CPU: behaviour is tested t
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
+import random
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
+import time
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +29,11 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 CACHE = Path(os.environ.get("SERVOD_GUEST_CACHE", Path.home() / ".cache" / "servod-guest"))
 PACKAGES = "systemd,systemd-sysv,dbus,python3,iproute2,kmod,procps,can-utils"
 GUEST_PYTHON = "3.11"  # Debian bookworm's
-BOOT_TIMEOUT_S = 420
+BOOT_TIMEOUT_S = 800
+#: Other people's CANopen devices, for the step `foreign`; without their sources the guest goes without them.
+THIRD_PARTY = REPOSITORY.parent / "shared" / "third_party"
+#: In which the work of tests/guest/inside/power.py has come round.
+CUT_WITHIN_S = 12.0
 
 #: Runs at the end of the boot; the shared folder's path on the host stands on the kernel's command line.
 _TESTS_UNIT = """\
@@ -95,6 +103,10 @@ def _share(folder: Path) -> None:
     for name in ("systemd", "gains", "tests/conformance"):
         shutil.copytree(REPOSITORY / name, folder / name)
     shutil.copytree(Path(__file__).with_name("inside"), folder / "inside")
+    if THIRD_PARTY.is_dir():
+        build = "from tests.foreign.canopennode import *; build(Path(sys.argv[1]), '-static')"
+        command = [sys.executable, "-c", f"import sys; {build}", str(folder / "canopennode")]
+        subprocess.run(command, check=True, cwd=REPOSITORY)
 
 
 def run(steps: Sequence[str] = ()) -> list[dict[str, Any]]:
@@ -114,6 +126,51 @@ def run(steps: Sequence[str] = ()) -> list[dict[str, Any]]:
         return [json.loads(line) for line in results.read_text().splitlines()]
 
 
+def cut(count: int, rng: random.Random) -> list[dict[str, Any]]:
+    """Cut the machine's power `count` times, each at a random moment of its work; what each next start found."""
+    disk = image()
+    with tempfile.TemporaryDirectory(prefix="servod-guest-") as name:
+        folder = Path(name)
+        _share(folder)
+        told = folder / "told.jsonl"
+        for begun in range(count):
+            (folder / "steps").write_text("powered" if begun else "install powered")
+            with _booted(disk, folder) as guest:
+                deadline = time.monotonic() + BOOT_TIMEOUT_S
+                while not told.exists() or told.read_text().count('"boot"') <= begun:
+                    if guest.poll() is not None or time.monotonic() > deadline:
+                        raise RuntimeError(f"start {begun}: {(folder / 'results.jsonl').read_text()}")
+                    time.sleep(0.05)
+                time.sleep(rng.uniform(0.0, CUT_WITHIN_S))
+        (folder / "last").touch()
+        (folder / "steps").write_text("powered")
+        _boot(disk, folder)
+        results = [json.loads(line) for line in (folder / "results.jsonl").read_text().splitlines()]
+        if "cuts" not in results[-1]:
+            raise RuntimeError(results[-1]["error"])
+        return list(results[-1]["cuts"])[1:]
+
+
+@contextlib.contextmanager
+def _booted(disk: Path, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """A guest that is killed, all of it at once, at the end of the block: what its kernel had not written is lost."""
+    with (folder / "console").open("wb") as console:
+        guest = subprocess.Popen(
+            _command(disk, folder),
+            stdin=subprocess.DEVNULL,
+            stdout=console,
+            stderr=subprocess.STDOUT,
+            env=_environment(),
+            start_new_session=True,
+        )
+        try:
+            yield guest
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(guest.pid, signal.SIGKILL)
+            guest.wait()
+
+
 def _shim() -> Path:
     """The library that whole_xstate.c explains."""
     path = CACHE / "whole_xstate.so"
@@ -122,22 +179,33 @@ def _shim() -> Path:
     return path
 
 
-def _boot(disk: Path, folder: Path) -> str:
-    """Run the guest to its end on one pinned CPU; returns what its console said."""
-    command = [
+def _command(disk: Path, folder: Path) -> list[str]:
+    """One pinned CPU; the disk's changes beside it, in the folder of this run."""
+    return [
         *("taskset", "-c", str(min(os.sched_getaffinity(0))), "linux.uml", "mem=768M"),
         *(f"ubd0={folder / 'root.cow'},{disk}", "root=/dev/ubda", "rootfstype=ext4", "rw", "init=/sbin/init"),
         *("con=null", "con0=fd:0,fd:1", "quiet", f"servod.share={folder}"),
     ]
-    done = subprocess.run(
-        command,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        timeout=BOOT_TIMEOUT_S,
-        env={**os.environ, "LD_PRELOAD": str(_shim())},
-    )
-    return done.stdout.decode(errors="replace")
+
+
+def _environment() -> dict[str, str]:
+    return {**os.environ, "LD_PRELOAD": str(_shim())}
+
+
+def _boot(disk: Path, folder: Path) -> str:
+    """Run the guest to its end; returns what its console said. Raises RuntimeError with what it did when it hangs."""
+    with _booted(disk, folder) as guest:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            guest.wait(BOOT_TIMEOUT_S)
+        hangs = guest.poll() is None
+    console = (folder / "console").read_text(errors="replace")
+    if hangs:
+        results = folder / "results.jsonl"
+        done = [json.loads(line)["step"] for line in results.read_text().splitlines()] if results.exists() else []
+        raise RuntimeError(
+            f"not done after {BOOT_TIMEOUT_S} s, behind {done}; its console ended with:\n{console[-2000:]}"
+        )
+    return console
 
 
 if __name__ == "__main__":

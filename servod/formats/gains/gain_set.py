@@ -23,6 +23,7 @@ from servod.common.yaml import Dumper, Strict, parse_yaml, read_text, validate
 from servod.formats.config import AxisConfig
 from servod.formats.gains.design import Design
 from servod.formats.gains.parameters import LocalSet, Parameters, PdParameters
+from servod.formats.gains.signature import GainSignature, require_signature
 from servod.formats.kinds import FileKind, require_kind
 from servod.formats.model.axis_model import load_axis_model
 from servod.kernels.laws import LAWS, Law
@@ -181,6 +182,7 @@ class GainSet(Strict):
     design: Design | None = Field(None, description="what the set was designed for, with its proofs")
     certificate: Certificate | None = None
     seal: Sha256 | None = Field(None, description="hash of all the rest, written by the tool that wrote the set")
+    signature: GainSignature | None = Field(None, description="of the site, over all the rest but the seal")
 
     @property
     def law(self) -> Law:
@@ -200,8 +202,8 @@ class GainSet(Strict):
         return _digest(self.parameters.model_dump(mode="json", exclude_none=True))
 
     def content_sha256(self) -> str:
-        """Hash of the whole set but its seal, in the same canonical form."""
-        return _digest(self.model_dump(mode="json", exclude={"seal"}, exclude_none=True))
+        """Hash of the whole set but its seal and signature, in the same canonical form."""
+        return _digest(self.model_dump(mode="json", exclude={"seal", "signature"}, exclude_none=True))
 
     def sealed(self) -> GainSet:
         """The same set with a seal that fits: every later change of a number shows."""
@@ -279,10 +281,17 @@ def require_fit(gains: GainSet, config: AxisConfig, where: str | None = None) ->
     """Refuse a set that this axis may not run: no certificate that counts, or one for another cycle or velocity filter.
 
     Raises BadInput; `where` is the file, when there is one. The configuration may accept sets without a certificate,
-    but not one of another loop.
+    but not one of another loop, nor one without the signature that it asks for.
     """
     require_certificate(gains, config.gains.accept_uncertified, where)
+    require_signed(gains, config, where)
     require_same_loop(gains, config, where)
+
+
+def require_signed(gains: GainSet, config: AxisConfig, where: str | None = None) -> None:
+    """Refuse a set that no signer of the configuration has signed, where it names any. Raises BadInput."""
+    content = gains.content_sha256() if config.gains.signers else ""
+    require_signature(content, gains.signature, config.gains.signers, where or f"gain set {gains.name}")
 
 
 def require_same_loop(gains: GainSet, config: AxisConfig, where: str | None = None) -> None:

@@ -19,6 +19,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple, get_type_hints
 
+from servod.common.files import write_atomically
+
 Kernel = Callable[..., Any]
 
 
@@ -88,6 +90,11 @@ def entry(function: Kernel) -> Kernel:
     return compiled(entered, kernel=function)
 
 
+def entry_without_lock(function: Kernel) -> Kernel:
+    """`entry`, and the interpreter's lock is let go while the kernel runs: for threads."""
+    return _compiled(entered, (("kernel", function),), without_lock=True)
+
+
 def kernel(p: Any, tables: Any, s: Any, *rest: Any) -> None:
     """Nothing; `entry` puts the kernel that shall run in this function's place."""
 
@@ -119,7 +126,7 @@ def bound(function: Kernel, **swap: Kernel) -> Kernel:
 
 
 @cache
-def _compiled(function: Kernel, swap: tuple[tuple[str, Kernel], ...]) -> Kernel:
+def _compiled(function: Kernel, swap: tuple[tuple[str, Kernel], ...], without_lock: bool = False) -> Kernel:
     import numba
     from numba.core import config as numba_config
 
@@ -127,12 +134,13 @@ def _compiled(function: Kernel, swap: tuple[tuple[str, Kernel], ...]) -> Kernel:
     njit: Any = numba.njit  # its stubs do not know _nrt
 
     called = {name: compiled(callee) for name, callee in {**_callees(function), **dict(swap)}.items()}
-    copy = bound(function, **called)
+    copy, own = bound(function, **called), _cache_folder(function, swap, without_lock)
+    copy.__code__ = copy.__code__.replace(co_filename=str(_source_in(own, Path(inspect.getfile(function)))))
     folder = config.CACHE_DIR
-    config.CACHE_DIR = str(_cache_folder(function, swap))
+    config.CACHE_DIR = str(own)
     try:
         # no kernel makes an array, so none needs numba's counting of references: it took two thirds of the time
-        kernel: Kernel = njit(cache=True, error_model="numpy", _nrt=False)(copy)
+        kernel: Kernel = njit(cache=True, error_model="numpy", _nrt=False, nogil=without_lock)(copy)
     finally:
         config.CACHE_DIR = folder
     return kernel
@@ -156,8 +164,8 @@ def _sources(function: Kernel) -> set[Path]:
     return files
 
 
-def _cache_folder(function: Kernel, swap: tuple[tuple[str, Kernel], ...]) -> Path:
-    digest = hashlib.sha256()
+def _cache_folder(function: Kernel, swap: tuple[tuple[str, Kernel], ...], without_lock: bool) -> Path:
+    digest = hashlib.sha256(b"without lock" if without_lock else b"")
     files = set(_sources(function))
     for name, callee in swap:
         files |= _sources(callee)
@@ -166,6 +174,19 @@ def _cache_folder(function: Kernel, swap: tuple[tuple[str, Kernel], ...]) -> Pat
     for path in sorted({*files, layout, Path(__file__)}):
         digest.update(path.read_bytes())
     return _user_cache() / f"{function.__name__}-{digest.hexdigest()[:16]}"
+
+
+def _source_in(folder: Path, source: Path) -> Path:
+    """A copy of the file beside its machine code, which numba finds again by this path: so every installation of the
+    same source finds it. Where nothing can be written, the file itself."""
+    copy = folder / source.name
+    try:
+        if not copy.exists():
+            folder.mkdir(parents=True, exist_ok=True)
+            write_atomically(copy, source.read_text())
+    except OSError:
+        return source
+    return copy
 
 
 def _user_cache() -> Path:

@@ -111,7 +111,7 @@ def _watch(client: ControlClient, duration_s: float) -> _Span:
 
 def _move(client: ControlClient) -> None:
     client.call("enable", reset_fault=True)
-    client.call("track", kind="sine", amplitude_rad=0.05, frequency_hz=1.0, duration_s=600.0)
+    client.call("track", kind="sine", amplitude_rad=0.05, frequency_hz=1.0, duration_s=600.0, renew_s=None)
 
 
 def _stop(client: ControlClient, record: Path) -> float:

@@ -80,9 +80,9 @@ class _Stopwatch:
         self.clock: Clock = world.clock
         self.spent_ns = 0
 
-    def connect(self) -> _TimedBus:
+    def connect(self, can_ids: tuple[int, ...] | None = None) -> _TimedBus:
         """A connection whose time counts."""
-        return _TimedBus(self._world.connect(), self)
+        return _TimedBus(self._world.connect(can_ids), self)
 
 
 class _TimedBus:

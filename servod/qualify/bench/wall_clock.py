@@ -32,7 +32,7 @@ def measure(wall_clock_s: float, memory_s: float) -> tuple[dict[str, Any], dict[
         with running_axis(demo_config(folder, folder / "recordings"), plant_file(None), folder) as (client, daemon_pid):
             activate(client, gains_file("local"))
             client.call("enable")
-            client.call("track", kind="sine", amplitude_rad=0.05, frequency_hz=0.5, duration_s=3600.0)
+            client.call("track", kind="sine", amplitude_rad=0.05, frequency_hz=0.5, duration_s=3600.0, renew_s=None)
             run = _record(client, wall_clock_s)
             memory = _watch_memory(client, _processes(daemon_pid), memory_s)
             client.call("disable")

@@ -15,6 +15,7 @@ from servod.client.control import ControlClient
 from servod.client.processes import running_axis, sigterm_as_interrupt, socket_folder
 from servod.common.errors import AnswerIsNo
 from servod.common.faults import FaultCode
+from servod.formats.protocol import TOOL_RENEW_S
 from servod.formats.recording.mcap_reader import read_recording
 from servod.qualify.demo.axis import demo_config
 from servod.qualify.demo.entries import DemoRow
@@ -59,7 +60,7 @@ def _run(client: ControlClient, row: DemoRow, duration_s: float, recordings: Pat
     (recordings / f"{row.name}.mcap").unlink(missing_ok=True)
     path = client.call("record_start", path=f"{row.name}.mcap")["path"]
     started = time.monotonic()
-    client.call("track", kind="paper", duration_s=duration_s)
+    client.call("track", kind="paper", duration_s=duration_s, renew_s=TOOL_RENEW_S)
     while _moves(client):
         progress(row.name, min(1.0, (time.monotonic() - started) / duration_s))
     progress(row.name, 1.0)
@@ -80,7 +81,7 @@ def _go_home(client: ControlClient, home_rad: float) -> None:
         return
     steps = round(_HOME_S * 1000)
     positions = [0.5 * way_rad * (1.0 - math.cos(math.pi * k / steps)) for k in range(steps + 1)]
-    client.call("track", kind="csv", positions_rad=positions)
+    client.call("track", kind="csv", positions_rad=positions, renew_s=TOOL_RENEW_S)
     while _moves(client):
         pass
 
@@ -119,4 +120,6 @@ def motion_runs(client: ControlClient) -> bool:
     status: dict[str, Any] = client.call("status")
     if status["axis"]["state"] != "ENABLED":
         raise AnswerIsNo(f"the axis went to {status['axis']['state']} while it was to move. {why(status['faults'])}")
+    if abandoned := status["motion"]["abandoned"]:
+        raise AnswerIsNo(abandoned)
     return bool(status["axis"]["motion_running"])

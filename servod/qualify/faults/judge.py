@@ -9,13 +9,12 @@ from servod.drivers.virtual.drive_record import DriveSample
 from servod.qualify.faults.actions import action_of
 from servod.qualify.faults.evidence import Watch, motion_complaints, record_complaints
 from servod.qualify.faults.scenario import FEEDBACK_LOSS_MS, MASTER_LOSS_MS, Expectation, Loss, Scenario
+from servod.qualify.faults.stops import NO_TORQUE_NM, stop_complaints, stop_of
 from servod.qualify.faults.under_test import Observation
 from servod.runtime.fieldbus.devices import DriveState
-from servod.runtime.loop.axis import AxisState
+from servod.runtime.loop.axis_state import AxisState
 from servod.runtime.loop.wiring.findings import WiringOutcome
 
-#: The drive counts its torque in per mille of the rated torque: less than one count is none.
-NO_TORQUE_NM = 1e-9
 _NS_PER_MS = 1e6
 
 
@@ -37,9 +36,8 @@ def reaction(samples: list[DriveSample], injected_ns: int) -> ReactionTimes:
     if not after:
         return ReactionTimes(None, None)
     left = next((s.time_ns for s in after if s.state is not DriveState.OPERATION_ENABLED), None)
-    last = max((number for number, s in enumerate(after) if not abs(s.torque_nm) <= NO_TORQUE_NM), default=-1)
-    gone = after[last + 1].time_ns if last + 1 < len(after) else None
-    return ReactionTimes(_ms(left, injected_ns), _ms(gone, injected_ns))
+    stop = stop_of(samples, injected_ns)
+    return ReactionTimes(_ms(left, injected_ns), None if stop is None else stop.gone_ms)
 
 
 def complaints(scenario: Scenario, seen: Observation, times: ReactionTimes, watch: Watch) -> list[str]:
@@ -51,7 +49,9 @@ def complaints(scenario: Scenario, seen: Observation, times: ReactionTimes, watc
         *_complaints(scenario.expect, seen, times),
         *_on_the_way(scenario.expect, states),
         _limited(scenario.expect.most_nm, after),
+        _sunk(scenario.expect.sinks_rad, seen.samples, watch),
         *motion_complaints(scenario, seen.samples, watch),
+        *stop_complaints(scenario, loss_of(scenario), seen.samples, watch.injected_ns, seen.stated),
     ]
     return [text for text in found if text]
 
@@ -61,6 +61,7 @@ def _complaints(expected: Expectation, seen: Observation, times: ReactionTimes) 
     return [
         "" if seen.axis in expected.axis else f"the axis ended {seen.axis}, expected {' or '.join(expected.axis)}",
         _named(set(expected.faults), names),
+        *(f"{name} is shown as well" for name in expected.never_told if name in names),
         _in_time("the drive left the controller's command", times.left_ms, expected.reaction_ms),
         _in_time("the torque was gone", times.gone_ms, expected.torque_gone_ms),
         _refused(expected.refused, seen.refusal),
@@ -86,6 +87,15 @@ def _limited(most_nm: float | None, after: list[DriveSample]) -> str:
     return (
         f"the joint felt {felt_nm:.3f} N*m, expected {most_nm:g}" if most_nm is not None and felt_nm > most_nm else ""
     )
+
+
+def _sunk(sinks_rad: float | None, samples: list[DriveSample], watch: Watch) -> str:
+    """How far a load fell until the brake held it, by the drive's record of the true joint."""
+    before = [sample.position_rad for sample in samples if sample.time_ns <= watch.injected_ns]
+    if sinks_rad is None or not before:
+        return ""
+    sunk_rad = max(abs(s.position_rad - before[-1]) for s in samples if s.time_ns >= watch.injected_ns)
+    return "" if sunk_rad <= sinks_rad else f"the joint went {sunk_rad:.4f} rad away, expected {sinks_rad:g}"
 
 
 def _named(expected: set[str], names: set[str]) -> str:

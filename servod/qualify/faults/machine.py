@@ -37,8 +37,9 @@ class Process(StrEnum):
 class Machine:
     """The processes in `folder` (plant.yaml, settings.yaml and axis.yaml stand there), and the ways to look at them."""
 
-    def __init__(self, folder: Path, wire: Wire) -> None:
-        self.folder, self.wire = folder, wire
+    def __init__(self, folder: Path, wire: Wire, waits: bool = False) -> None:
+        """With `waits` the daemon waits for bus and nodes, and begins anew after their loss."""
+        self.folder, self.wire, self._waits = folder, wire, waits
         self.config = folder / "axis.yaml"
         self.socket = folder / "axis.sock"
         self.virtual_axis: Popen[bytes] | None = None
@@ -72,7 +73,7 @@ class Machine:
 
     def daemon_process(self, log: Path) -> Popen[bytes]:
         """One more daemon of this axis; whoever starts it waits for it."""
-        arguments = ["--config", str(self.config)]
+        arguments = ["--config", str(self.config), *(["--wait"] if self._waits else [])]
         return self._stack.enter_context(child("servod.runtime.daemon.main", arguments, log, dropped=_PASS_BY_MODES))
 
     def keep(self, process: contextlib.AbstractContextManager[Popen[bytes]]) -> Popen[bytes]:

@@ -30,6 +30,7 @@ from servod.drivers.virtual.drive_record import DriveSample
 from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.formats.model.axis_model import axis_model_yaml
 from servod.formats.protocol import Verb
+from servod.formats.stopping import StoppingStatus
 from servod.qualify.faults.evidence import lost_records, wait_for_rows
 from servod.qualify.faults.machine import Machine, Process
 from servod.qualify.faults.scenario import (
@@ -38,14 +39,15 @@ from servod.qualify.faults.scenario import (
     Scenario,
     ScenarioStart,
     config_of,
+    known_joint,
     merged,
     plant_of,
     shipped_config,
 )
 from servod.qualify.faults.under_test import MOTION, Observation
-from servod.qualify.faults.wire import HubWire, Wire, at_the_hub, download, send_heard
+from servod.qualify.faults.wire import HubWire, Wire, at_the_hub, send_heard
 from servod.runtime.fieldbus.devices import DriveState
-from servod.runtime.loop.axis import AxisState
+from servod.runtime.loop.axis_state import AxisState
 
 #: The joint moves when its torque is so large [N*m]: enough to lose.
 _MOVING_NM, _START_S = 0.01, 20.0
@@ -68,9 +70,10 @@ class ProcessAxis:
         self, scenario: Scenario, folder: Path, machine: Machine | None = None, over: Nested | None = None
     ) -> None:
         """Raises BadInput for a scenario's keys."""
-        self.folder, self.machine = folder, machine or Machine(folder, HubWire(folder))
+        self.folder, self.machine = folder, machine or Machine(folder, HubWire(folder), scenario.waits)
         self.wire = self.machine.wire
-        self.config = config_of(scenario, merged(_base(folder, self.wire), over or {}))
+        config = config_of(scenario, merged(_base(folder, self.wire), over or {}))
+        self.config = known_joint(scenario, config, folder)
         settings = validate(scenario.settings, VirtualAxisSettings, f"{scenario.title}: settings")
         (folder / "settings.yaml").write_text(yaml.safe_dump(settings.model_dump(mode="json")))
         (folder / "plant.yaml").write_text(axis_model_yaml(plant_of(scenario)))
@@ -81,6 +84,7 @@ class ProcessAxis:
         self._hit_ns: int | None = None
         self._asked_to_end = self._off = self._up = False
         self.refusal = ""
+        self._stated: StoppingStatus | None = None
         self.stopped_client: Popen[bytes] | None = None
 
     def now_ns(self) -> int:
@@ -102,6 +106,7 @@ class ProcessAxis:
             self._wait_until(self._moves, "the axis does not move")
             time.sleep(_SHOWN_PERIODS / self._motion.frequency_hz)
         self._wait_until(self._recorded, "the recorder writes nothing")
+        self._stated = self.client.call(Verb.STATUS)["stopping"]
 
     def run(self, duration_s: float) -> None:
         """Let time pass; an axis that is off is brought up first, and a refusal is kept."""
@@ -118,6 +123,7 @@ class ProcessAxis:
         """Ask the hub, as somebody else than the loop. Raises BadInput for what only the loop itself could ask for."""
         with at_the_hub(self.wire, fault) as foreign:
             foreign.inject(fault)
+            foreign.happened(fault)  # answered behind it: who leaves at once takes what still waits with him
 
     def fault_effect(self, fault: BusFault) -> int:
         """Ask the hub, as somebody else than the loop."""
@@ -133,8 +139,12 @@ class ProcessAxis:
         return self.effects[can_id, data]
 
     def sdo_write(self, node_id: int, index: int, subindex: int, value: int) -> bool:
-        """As a service tool on the same bus; True when the node confirms it."""
-        return download(self.wire, node_id, index, subindex, value)
+        """Ask the hub, which is in one process with the nodes; on the bus it would be a foreign SDO."""
+        fault = BusFault.write(node_id, index, subindex, value)
+        with at_the_hub(self.wire, fault) as foreign:
+            before = foreign.happened(fault)
+            foreign.inject(fault)
+            return foreign.happened(fault) > before
 
     def call(self, verb: Verb, **args: Any) -> dict[str, Any]:
         """Ask the daemon for anything; a refusal is kept, and gives nothing."""
@@ -177,7 +187,7 @@ class ProcessAxis:
         axis, shown, overrun = self._shown(samples)
         told = {FaultCode[name] for name in _TOLD.findall(self.machine.daemon_log())}
         lost = self._lost_records() + overrun if self._up and self.config.recorder.always else None
-        return Observation(samples, axis, frozenset(shown | told), self.refusal, lost)
+        return Observation(samples, axis, frozenset(shown | told), self.refusal, lost, stated=self._stated)
 
     def recover(self, recovery: Recovery) -> bool:
         """Do what a person would do, and hold for a tenth of a second."""

@@ -15,12 +15,14 @@ from typing import TYPE_CHECKING, Any
 from servod.client.processes import socket_folder
 from servod.common.errors import ServodError, Unreachable
 from servod.common.faults import FAULTS
+from servod.formats.stopping import StoppingStatus
 from servod.qualify.faults.actions import InjectionAction, action_of
 from servod.qualify.faults.evidence import Watch
 from servod.qualify.faults.judge import ReactionTimes, complaints, loss_of, reaction
 from servod.qualify.faults.processes import ProcessAxis
 from servod.qualify.faults.scenario import Injection, Loss, Recovery, Runs, Scenario
 from servod.qualify.faults.stepped import SteppedUnderTest
+from servod.qualify.faults.stops import StopSeen, stop_of, stopped_by
 from servod.qualify.faults.under_test import AxisUnderTest, Observation
 
 if TYPE_CHECKING:
@@ -74,6 +76,8 @@ class Outcome:
     loss: Loss
     exempt: str | None = None
     by_repair: bool = False  # nothing but a repair was to bring it back
+    stop: StopSeen | None = None  # of an axis that was stopped
+    stated: StoppingStatus | None = None  # time_s, speed_rad_s, travel_rad and more, as servod has them
 
     @property
     def passed(self) -> bool:
@@ -107,12 +111,19 @@ def run_scenario(
         recovered = scenario.recover is not Recovery.REPAIR and _recover(axis, scenario)
     if not recovered and scenario.recover is not Recovery.REPAIR:
         found.append(f"the axis was not enabled again by {scenario.recover}")
-    return _outcome(name, scenario, seen, times, recovered, found)
+    return _outcome(name, scenario, seen, injected_ns, times, recovered, found)
 
 
 def _outcome(
-    name: str, scenario: Scenario, seen: Observation, times: ReactionTimes, recovered: bool, found: list[str]
+    name: str,
+    scenario: Scenario,
+    seen: Observation,
+    injected_ns: int,
+    times: ReactionTimes,
+    recovered: bool,
+    found: list[str],
 ) -> Outcome:
+    stop = stop_of(seen.samples, injected_ns) if stopped_by(scenario) else None
     codes = sorted(seen.latched)
     return Outcome(
         name,
@@ -129,6 +140,8 @@ def _outcome(
         loss_of(scenario),
         scenario.expect.exempt,
         scenario.recover is Recovery.REPAIR,
+        stop,
+        seen.stated,
     )
 
 
@@ -336,6 +349,9 @@ def _plain(outcome: Outcome) -> dict[str, Any]:
         "axis": outcome.axis,
         "left_ms": outcome.reaction.left_ms,
         "gone_ms": outcome.reaction.gone_ms,
+        "fastest_rad_s": None if outcome.stop is None else outcome.stop.fastest_rad_s,
+        "travel_rad": None if outcome.stop is None else outcome.stop.to_rest_rad,
+        "stated": outcome.stated,
         "lost_records": outcome.lost_records,
         "recovered": outcome.recovered,
         "passed": outcome.passed,

@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 from enum import StrEnum
 from functools import cache
+from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field, model_validator
@@ -18,9 +19,10 @@ from servod.common.shipped import shipped
 from servod.common.yaml import Strict, validate
 from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.formats.config import AxisConfig, load_config
-from servod.formats.model.axis_model import AxisModel, load_axis_model
+from servod.formats.model.axis_model import AxisModel, axis_model_yaml, load_axis_model
+from servod.formats.stopping import joint_of
 from servod.runtime.fieldbus.devices import DriveState
-from servod.runtime.loop.axis import AxisState
+from servod.runtime.loop.axis_state import AxisState
 from servod.runtime.loop.wiring.findings import WiringOutcome
 
 #: After a loss of the master the torque must be gone within this time [ms].
@@ -121,12 +123,19 @@ class Expectation(Strict):
     """What must happen. Times count from the timed or first injection, on the drive's side, in bus time."""
 
     exempt: str | None = Field(None, min_length=20, description="why the bound of a loss does not hold here, in words")
+    coasts: str | None = Field(
+        None, min_length=20, description="why no ramp of the drive brings the joint to rest here, in words"
+    )
+    unstated: str | None = Field(
+        None, min_length=20, description="why servod's statement of a stop is not about this one, in words"
+    )
     axis: list[AxisWord] = Field(
-        min_length=1, description="names of servod.runtime.loop.axis.AxisState; one of them at the end"
+        min_length=1, description="names of servod.runtime.loop.axis_state.AxisState; one of them at the end"
     )
     faults: list[FaultWord] = Field(
         [], description="names of servod.common.faults.FaultCode; one of them at least is latched"
     )
+    never_told: list[FaultWord] = Field([], description="names of servod.common.faults.FaultCode, none is latched")
     reaction_ms: float | None = Field(None, gt=0.0, description="the drive has left the controller's command by then")
     torque_gone_ms: float | None = Field(None, gt=0.0, description="the joint feels no torque from then on")
     refused: str | None = Field(None, description="words of the message with which the bring-up or command is refused")
@@ -137,6 +146,9 @@ class Expectation(Strict):
     drive_error: int | None = Field(None, gt=0, le=0xFFFF, description="the error code that the user is shown")
     strays_rad: float = Field(0.03, gt=0.0, description="an axis that stays enabled: distance from its motion")
     fastest_rad_s: float = Field(2.0, gt=0.0, description="an axis that stays enabled: speed of the joint")
+    sinks_rad: float | None = Field(
+        None, gt=0.0, description="an axis that starts at rest: the joint stays this near to where it was"
+    )
     most_nm: float | None = Field(None, gt=0.0, description="the joint feels no more torque than this")
     drive_shows: list[DriveWord] = Field(
         [], description="names of servod.runtime.fieldbus.devices.DriveState, all seen after the injection"
@@ -165,6 +177,7 @@ class Scenario(Strict):
     group: str = Field(min_length=1, description="heading in the table: bus, drive, encoder, process, ...")
     runs: Runs = Runs.STEPPED
     start: ScenarioStart = ScenarioStart.MOVING
+    waits: bool = Field(False, description="the daemon runs as the unit runs it, with --wait; the guest's always does")
     settings: dict[str, Any] = Field({}, description="of the virtual axis, over its defaults")
     config: dict[str, Any] = Field(
         {},
@@ -185,6 +198,12 @@ class Scenario(Strict):
         return self
 
     @model_validator(mode="after")
+    def _sinks_from_rest(self) -> Scenario:
+        if self.expect.sinks_rad is not None and self.start is not ScenarioStart.ENABLED:
+            raise ValueError("expect.sinks_rad is for start: enabled")
+        return self
+
+    @model_validator(mode="after")
     def _runs_can_show_it(self) -> Scenario:
         if self.runs is not Runs.STEPPED and (
             self.start is ScenarioStart.PROVING or self.expect.drive_error is not None
@@ -202,6 +221,8 @@ Nested = dict[str, Any]
 
 #: The wiring was proven at an enable long ago; a scenario that is about the proof asks for it.
 PROVEN_BEFORE = {"wiring_proof": {"enabled": False}}
+#: In virtual time nobody is late: the drive is held to the deadline of a real one, not to that of a shared processor.
+PUNCTUAL = {"heartbeat": {"command_deadline_ms": 20}}
 
 
 def shipped_config() -> Nested:
@@ -238,9 +259,36 @@ def _demo_joint() -> Nested:
     return load_axis_model(shipped("gains/axes/demo_joint.yaml")).model_dump(mode="json", exclude_none=True)
 
 
+def demo_effects() -> list[str]:
+    """Names of the groups that the demo joint has: a plant sets them null to have none of them."""
+    model = validate(_demo_joint(), AxisModel, "demo joint")
+    return [name for name, _ in model.groups()]
+
+
 def config_of(scenario: Scenario, base: Nested) -> AxisConfig:
     """The axis: the scenario's keys over `base`. Raises BadInput."""
     return validate(merged(base, scenario.config), AxisConfig, f"{scenario.title}: config")
+
+
+def known_joint(scenario: Scenario, config: AxisConfig, folder: Path) -> AxisConfig:
+    """`config` with the section stopping as an engineer states it who has identified the scenario's joint, so that
+    every stop is held against a statement; one that it has stays. `folder` takes the model. Raises BadInput."""
+    if config.stopping.least_inertia is not None:
+        return config
+    path = folder / "joint.yaml"
+    path.write_text(axis_model_yaml(plant_of(scenario)))
+    joint = joint_of(config.model_copy(update={"model": path}))
+    if joint is None:
+        return config
+    told = {
+        "least_inertia": joint.least_inertia,
+        "most_inertia": joint.most_inertia,
+        "least_friction_nm": joint.friction_nm,
+        "least_viscous": joint.viscous,
+        "load_min_nm": joint.load_min_nm,
+        "load_max_nm": joint.load_max_nm,
+    }
+    return config.model_copy(update={"stopping": config.stopping.model_copy(update=told)})
 
 
 def merged(base: Nested, over: Nested) -> Nested:

@@ -18,19 +18,22 @@ from servod.formats.config import AxisConfig
 from servod.formats.gains.gain_set import load_gains
 from servod.qualify.faults.scenario import (
     PROVEN_BEFORE,
+    PUNCTUAL,
     Nested,
     Recovery,
     Runs,
     Scenario,
     ScenarioStart,
     config_of,
+    known_joint,
     merged,
     plant_of,
     shipped_config,
 )
 from servod.qualify.faults.under_test import MOTION, Observation
 from servod.runtime.fieldbus.cia import NMT_ID
-from servod.runtime.loop.axis import AxisState
+from servod.runtime.fieldbus.devices import DriveState
+from servod.runtime.loop.axis_state import AxisState
 from servod.runtime.loop.commands import REFUSAL_TEXT, Op, Refusal
 from servod.runtime.loop.wiring.findings import WiringOutcome
 
@@ -56,7 +59,8 @@ class SteppedUnderTest:
         settings = validate(scenario.settings, VirtualAxisSettings, f"{where}: settings")
         record = DriveRecord(self._record_path, _samples(scenario))
         self.world = SteppedWorld(settings, plant_of(scenario), record)
-        self._config = config_of(scenario, merged(shipped_config(), PROVEN_BEFORE))
+        config = config_of(scenario, merged(merged(shipped_config(), PROVEN_BEFORE), PUNCTUAL))
+        self._config = known_joint(scenario, config, folder)
         self._foreign = self.world.connect(())
         self._axis: SteppedAxis | None = None
         self._refusal = ""
@@ -128,12 +132,7 @@ class SteppedUnderTest:
 
     def sdo_write(self, node_id: int, index: int, subindex: int, value: int) -> bool:
         """Write past the bus, straight into the node's dictionary."""
-        (node,) = (n for n in self.world.devices.nodes if n.node_id == node_id)
-        entry = node.dictionary.entry(index, subindex)
-        entry.value = value
-        if entry.written is not None:
-            entry.written(value)
-        return entry.value == value
+        return self.world.write(node_id, index, subindex, value)
 
     def command(self, op: Op, arguments: Sequence[float] = ()) -> bool:
         """Give the loop a command; False when it was refused, which is kept."""
@@ -148,11 +147,16 @@ class SteppedUnderTest:
         if self._axis is None:
             return Observation(samples, AxisState.DISABLED.name, frozenset(), self._refusal)
         axis, records = self.session.cycle.axis, self.session.records
+        state = axis.state
+        if self.session.loop_dead:  # nobody is left to say it: the drive does
+            state = AxisState.ENABLED if samples[-1].state is DriveState.OPERATION_ENABLED else AxisState.DISABLED
         latched = frozenset(fault.code for fault in faults_in(axis.latched))
         proof = self.session.proof
         says = None if proof is None else WiringOutcome(int(proof.finding))
         errors = frozenset(record.drive_error for record in records) - {0}
-        return Observation(samples, axis.state.name, latched, self._refusal, says=says, drive_errors=errors)
+        stopping = self.session.stopping
+        stated = None if stopping is None else stopping.document()
+        return Observation(samples, state.name, latched, self._refusal, None, says, errors, stated)
 
     def recover(self, recovery: Recovery) -> bool:
         """Do what a person would do, and hold for a tenth of a second."""

@@ -11,6 +11,7 @@ from servod.client.axis import AxisClient, ReferenceMotion
 from servod.common.faults import FaultCode
 from servod.drivers.virtual.bus_faults import BusFault
 from servod.drivers.virtual.drive_record import DriveSample
+from servod.formats.stopping import StoppingStatus
 from servod.qualify.faults.scenario import Recovery, Runs, ScenarioStart
 from servod.runtime.loop.wiring.findings import WiringOutcome
 
@@ -45,7 +46,8 @@ class Observation:
     `samples`: the drive's own record; `axis`: name of the axis state; `latched`: the faults that the user is shown;
     `refusal`: message with which bring-up or command was refused, "" when none was; `lost_records`: cycles without a
     record, None where no recorder runs (in virtual time the rows do not leave the process); `says`: how the last proof
-    of the wiring ended, None where none was told; `drive_errors`: the drive's error codes in the cycle records.
+    of the wiring ended, None where none was told; `drive_errors`: the drive's error codes in the cycle records;
+    `stated`: the stop that servod stated (`stopping` of the status), None where it stated none.
     """
 
     samples: list[DriveSample]
@@ -55,6 +57,7 @@ class Observation:
     lost_records: int | None = None
     says: WiringOutcome | None = None
     drive_errors: frozenset[int] = frozenset()
+    stated: StoppingStatus | None = None
 
 
 class AxisUnderTest(Protocol):
@@ -92,7 +95,7 @@ class AxisUnderTest(Protocol):
         """How often such a frame of a foreign participant was heard so far."""
 
     def sdo_write(self, node_id: int, index: int, subindex: int, value: int) -> bool:
-        """Write an object of a node, as the vendor's service tool would; True when the node has taken it."""
+        """Write an object of a node past the bus, by a plug of its own; True when the node has taken it."""
 
     def observe(self) -> Observation:
         """What is seen now."""

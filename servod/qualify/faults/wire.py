@@ -6,23 +6,17 @@ Below `processes`. Says how each side is told of the wire, and gives a foreign p
 from __future__ import annotations
 
 import contextlib
-import struct
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Protocol
 
 from servod.common.errors import BadInput
-from servod.drivers.virtual.amplifier import AMPLIFIER_EDS
 from servod.drivers.virtual.bus_faults import FRAME_KINDS, MYSELF, BusFault, FaultKind
 from servod.drivers.virtual.client import VirtualBus
-from servod.drivers.virtual.dictionary import DeviceDictionary
-from servod.drivers.virtual.encoder import ENCODER_EDS
-from servod.formats.config import BusConfig
-from servod.qualify.faults.under_test import AMPLIFIER
+from servod.formats.config_wire import BusConfig
 from servod.runtime.fieldbus.bus import Bus
 from servod.runtime.fieldbus.bus.open import open_bus
-from servod.runtime.fieldbus.cia import SDO_ANSWER_BASE, SDO_REQUEST_BASE
 
 #: An identifier that nobody sends.
 NOTHING = (0x7FF,)
@@ -83,17 +77,14 @@ class CanWire:
 
 
 # --- Others on the bus -----------------------------------------------------------------------------------------------
-# What somebody else on the bus does to an axis of processes: frames, a service tool's SDO, requests to the hub. Each
-# visit has a place of its own on the wire, and sees by itself what came of it.
+# What somebody else on the bus does to an axis of processes: frames, requests to the hub. Each visit has a place of its
+# own on the wire, and sees by itself what came of it.
 
 
 #: A participant that leaves takes with it what still waits in its queue.
 _SENT_S = 0.01
-_DOWNLOAD = struct.Struct("<BHB4s")
-#: The node's answer to a download, and how long it may take [s] (CiA 301, 7.2.4.3.4).
-_CONFIRMED, _ANSWER_S = 0x60, 0.2
 #: Faults that concern no participant.
-_OF_NOBODY = FRAME_KINDS | {FaultKind.BABBLE, FaultKind.CLEAR}
+_OF_NOBODY = FRAME_KINDS | {FaultKind.BABBLE, FaultKind.CLEAR, FaultKind.WRITE}
 
 
 def send_heard(wire: Wire, can_id: int, data: bytes) -> int:
@@ -105,23 +96,6 @@ def send_heard(wire: Wire, can_id: int, data: bytes) -> int:
         while (heard := ear.receive()) is not None:
             times += (heard.can_id, heard.data) == (can_id, data)
         return times
-
-
-def download(wire: Wire, node_id: int, index: int, subindex: int, value: int) -> bool:
-    """One expedited SDO download; True when the node confirms it. Raises Unreachable."""
-    entry = DeviceDictionary(AMPLIFIER_EDS if node_id == AMPLIFIER else ENCODER_EDS).entry(index, subindex)
-    entry.value = value
-    data = entry.encode()
-    head = 0x23 | (4 - len(data)) << 2  # expedited, with its length (CiA 301, 7.2.4.3.3)
-    request = _DOWNLOAD.pack(head, index, subindex, data)
-    with contextlib.closing(wire.foreign((SDO_ANSWER_BASE + node_id,))) as tool:
-        tool.send(SDO_REQUEST_BASE + node_id, request)
-        deadline = time.monotonic() + _ANSWER_S
-        while time.monotonic() < deadline:
-            answer = tool.receive(_ANSWER_S)
-            if answer is not None and answer.data[1:4] == request[1:4]:
-                return answer.data[0] == _CONFIRMED
-    return False
 
 
 @contextlib.contextmanager

@@ -23,7 +23,6 @@ from servod.qualify.soak.memory import LIMIT_KB_PER_H, LONG_S, Growth, Memory
 from servod.qualify.soak.tally import COUNTED, SoakedAxis, median_ms
 
 _CURVE_POINTS = 200
-_NS_PER_H = 3.6e12
 #: Exit codes with which `servoctl qualify soak` says what it found; None: still running.
 _SAID = (0, 1, None)
 _ADDED = (
@@ -54,7 +53,7 @@ def document(axis: SoakedAxis, memories: Mapping[str, Memory], wall_s: float, co
         "interrupted": course is Course.INTERRUPTED,
         "wall_s": round(wall_s, 1),
         "cpu_s": round(time.process_time(), 1),
-        "axis_hours": counts.cycles * counts.period_ns / _NS_PER_H,
+        "axis_hours": counts.axis_s / 3600.0,
         **{name: value for name, value in counts._asdict().items() if name != "period_ns"},
         "episodes": tally.episodes,
         "restarts": tally.restarts,
@@ -81,7 +80,7 @@ def _unproven(memories: Mapping[str, Memory], course: Course) -> list[str]:
     reasons = [] if course is Course.COMPLETE else [str(course)]
     for name, memory in memories.items():
         if memory.watched_s >= LONG_S and memory.slope().growth is Growth.TOO_SHORT:
-            reasons.append(f"memory of {name} cannot be told after {memory.watched_s / 3600.0:.1f} h")
+            reasons.append(f"memory of {name} cannot be told after {memory.watched_s / 3600.0:.1f} h of axis time")
     return reasons
 
 
@@ -267,7 +266,7 @@ def _memory(found: dict[str, Any]) -> Figure:
     for colour, memory in zip(COLOURS, found["memory"], strict=False):
         samples = np.array(memory["curve"], dtype=float).reshape(-1, 3)
         curves.append(Curve(memory["process"], samples[:, 0] / 60.0, samples[:, 1] / 1024.0, colour))
-    panel = PlotPanel(PlotAxis("wall clock / min"), PlotAxis("resident / MB"), tuple(curves))
+    panel = PlotPanel(PlotAxis("axis time / min"), PlotAxis("resident / MB"), tuple(curves))
     return Figure("memory", "Resident size", (panel,), caption="Sampled from /proc while the soak ran.")
 
 

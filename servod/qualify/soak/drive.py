@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from servod.drivers.virtual.drive_record import SAMPLE, DriveSample
 from servod.lab.recordings.recording import Rows
-from servod.qualify.faults.judge import NO_TORQUE_NM, ReactionTimes, reaction
+from servod.qualify.faults.judge import ReactionTimes, reaction
+from servod.qualify.faults.stops import NO_TORQUE_NM
 from servod.qualify.soak.kinds import InjectionKind
 from servod.qualify.soak.tally import FaultTally, Findings, Wrong
 from servod.runtime.fieldbus.devices import DriveState

@@ -22,6 +22,7 @@ _MOTION = frozenset({_F.FOLLOWING_ERROR, _F.SPEED_LIMIT, _F.ENCODER_IMPLAUSIBLE}
 _NODE_GONE = _MOTION | {
     *(_F.FEEDBACK_STALE, _F.NODE_HEARTBEAT_LOST, _F.DRIVE_FAULT, _F.DRIVE_LEFT_OPERATION, _F.DRIVE_STAYS_POWERED),
     *(_F.DRIVE_RESET, _F.DRIVE_MODE_WRONG, _F.ENCODER_ALARM, _F.COMMANDS_LOST, _F.NODE_LEFT_OPERATIONAL),
+    _F.SECOND_MASTER,
 }
 
 
@@ -109,11 +110,6 @@ def _write(who: str, index: int, subindex: int, value: Any) -> Action:
     return {"object_write": {"who": who, "index": index, "subindex": subindex, "value": value}}
 
 
-def _warned(warnings: int) -> str:
-    """The download by which a service tool puts warnings into the encoder, as the bytes of its frame."""
-    return f"2B002002{warnings:02X}000000"
-
-
 def _silence(who: str | OneOf, low_ms: int, high_ms: int) -> Action:
     return {"silence": {"who": who, "for_ms": Between(low_ms, high_ms)}}
 
@@ -152,6 +148,17 @@ def _encoder(name: str, do: Action, undo: Action | None = None) -> InjectionKind
     return _node(name, do, undo, left_ms=FEEDBACK_LOSS_MS)
 
 
+def _commanded(kind: InjectionKind) -> InjectionKind:
+    """A node whose NMT state somebody else changed: his command is seen before the node is missed."""
+    return replace(kind, expects=kind.expects | {_F.SECOND_MASTER})
+
+
+def _commands(name: str, do: Action) -> InjectionKind:
+    """No command reaches the drive for longer than it waits for one."""
+    expects = frozenset({_F.COMMANDS_LOST, _F.DRIVE_FAULT, _F.DRIVE_LEFT_OPERATION})
+    return replace(_node(name, do), expects=expects, deaf_cycles=60)
+
+
 def _resettable(
     name: str, do: Action, expects: set[FaultCode], undo: Action | None = None, latched_ms: float = FEEDBACK_LOSS_MS
 ) -> InjectionKind:
@@ -179,6 +186,8 @@ def _drive(name: str, subindex: int, value: Any, normal: int) -> InjectionKind:
 _CYCLIC = OneOf(("torque", "drive_feedback", "encoder_feedback"))
 #: An error code of each class of CiA 301 that a drive has for itself.
 _DRIVE_ERRORS = (0x2310, 0x3210, 0x4310, 0x5441, 0x6320, 0x7300, 0x8611, 0xFF01)
+#: A download of a warning into the encoder, as the bytes of its frame.
+_WARNING = "2B00200201000000"
 _NAN_GAINS: Action = {"gains": {"law": "pd", "parameters": ["nan", "nan", 0.0]}}
 _GOOD_GAINS: Action = {"gains": {"law": "pd", "parameters": [2.5, 0.12, 0.0]}}
 
@@ -186,7 +195,7 @@ KINDS: tuple[InjectionKind, ...] = (
     # Ridden through.
     InjectionKind("drive feedback lost, a few", _frames("drive_feedback", "drop", 1, 15)),
     InjectionKind("encoder feedback lost, a few", _frames("encoder_feedback", "drop", 1, 15)),
-    InjectionKind("torque frames lost", _frames("torque", "drop", 1, 50)),
+    InjectionKind("torque frames lost, a few", _frames("torque", "drop", 1, 15)),
     InjectionKind("torque frames late", _frames("torque", "late", 1, 10, 20)),
     InjectionKind("drive feedback late", _frames("drive_feedback", "late", 1, 5, 12)),
     InjectionKind("encoder feedback late", _frames("encoder_feedback", "late", 1, 5, 12)),
@@ -194,26 +203,28 @@ KINDS: tuple[InjectionKind, ...] = (
     InjectionKind("cyclic frames reordered", _frames(_CYCLIC, "reorder", 1, 50)),
     InjectionKind("drive feedback cut short", _frames("drive_feedback", "shorten", 1, 15, Between(1, 7))),
     InjectionKind("encoder feedback cut short", _frames("encoder_feedback", "shorten", 1, 15, Between(1, 3))),
-    InjectionKind("node away for a moment", _silence(OneOf(("encoder", "amplifier")), 5, 12)),
+    # A drive that is away may miss a heartbeat of the master, which it rides through or not (below).
+    InjectionKind("encoder away for a moment", _silence("encoder", 5, 12)),
     InjectionKind(
-        "a stranger talks", {"babble": {"can_id": OneOf((0x100, 0x183, 0x7FF)), "for_ms": 250, "each_ms": 2}}
+        "a stranger talks", {"babble": {"can_id": OneOf((0x184, 0x183, 0x7FF)), "for_ms": 250, "each_ms": 2}}
     ),
     InjectionKind("SYNC lost, a few", _frames("sync", "drop", 1, 10), takes_syncs=True),
     InjectionKind("frames destroyed", _frames("any", "destroy", 1, 5)),
     InjectionKind("torque frame destroyed", _frames("torque", "destroy", 1, 5)),
-    InjectionKind("master's heartbeat lost", _frames("master_heartbeat", "drop", 1, 1)),
-    InjectionKind(
-        "encoder warning", {"foreign_frame": {"can_id": 0x602, "data": OneOf(tuple(map(_warned, range(1, 5))))}}
-    ),
     # Stopped, and enabled again after a reset.
     # Feedback is missed after 20 cycles in virtual time, and after 50 on the wall clock.
-    _resettable("drive feedback lost, many", _frames("drive_feedback", "drop", 55, 60), {_F.FEEDBACK_STALE}),
+    replace(  # a drive that cannot be seen to stop is told by NMT, which its PDOs do not survive
+        _resettable("drive feedback lost, many", _frames("drive_feedback", "drop", 55, 60), {_F.FEEDBACK_STALE}),
+        undo={"frames_pass": {}},
+        explains=_NODE_GONE,
+        recovery=Recovery.RESTART,
+    ),
     _resettable("encoder feedback lost, many", _frames("encoder_feedback", "drop", 55, 200), {_F.FEEDBACK_STALE}),
     replace(
-        _resettable("torque frames cut short", _frames("torque", "shorten", 1, 50, Between(1, 3)), {_F.DRIVE_FAULT}),
+        _resettable("torque frames cut short", _frames("torque", "shorten", 1, 5, Between(1, 3)), {_F.DRIVE_FAULT}),
         latched_ms=70.0,  # told by EMCY, and the monitor of the nodes looks every 20 ms
         left_ms=70.0,
-        deaf_cycles=50,
+        deaf_cycles=50,  # the drive still stops by its ramp
     ),
     _resettable(
         "position bit of the encoder wrong",
@@ -244,16 +255,25 @@ KINDS: tuple[InjectionKind, ...] = (
         latched_ms=400.0,
     ),
     # The nodes must be configured anew.
+    replace(
+        _encoder("a service tool writes", {"foreign_frame": {"can_id": 0x602, "data": _WARNING}}),
+        expects=frozenset({_F.FOREIGN_SDO}),
+    ),
+    # The drive hears no command within its deadline, not even the one that stops it: it is stopped by NMT.
+    _commands("torque frames lost, many", _frames("torque", "drop", 40, 60)),
+    _commands("torque frames cut short, many", _frames("torque", "shorten", 40, 60, Between(1, 3))),
+    # One that is lost may be ridden through or not: the drive waits for two periods, and the next comes as they end.
+    _node("master's heartbeat lost", _frames("master_heartbeat", "drop", 4, 8)),
     _encoder("encoder cut off", _silence("encoder", 40, 600)),
     _node("drive cut off", _silence("amplifier", 40, 600)),
     _node("loop cut off", _silence("loop", 200, 600), takes_syncs=True),
-    _encoder("encoder reset", _nmt("encoder", "reset_node", "reset_communication")),
-    _node("drive reset", _nmt("amplifier", "reset_node", "reset_communication")),
-    _encoder("encoder pre-operational", _nmt("encoder", "pre_operational")),
-    _node("drive pre-operational", _nmt("amplifier", "pre_operational")),
+    _commanded(_encoder("encoder reset", _nmt("encoder", "reset_node", "reset_communication"))),
+    _commanded(_node("drive reset", _nmt("amplifier", "reset_node", "reset_communication"))),
+    _commanded(_encoder("encoder pre-operational", _nmt("encoder", "pre_operational"))),
+    _commanded(_node("drive pre-operational", _nmt("amplifier", "pre_operational"))),
     # A stopped node answers no SDO, so that nobody can ask who it is: a person sends this, or takes its supply away.
-    _encoder("encoder stopped", _nmt("encoder", "stop"), _nmt("encoder", "pre_operational")),
-    _node("drive stopped", _nmt("amplifier", "stop"), _nmt("amplifier", "pre_operational")),
+    _commanded(_encoder("encoder stopped", _nmt("encoder", "stop"), _nmt("encoder", "pre_operational"))),
+    _commanded(_node("drive stopped", _nmt("amplifier", "stop"), _nmt("amplifier", "pre_operational"))),
     _encoder("encoder bus-off", {"bus_off": {"who": "encoder"}}),
     _node("drive bus-off", {"bus_off": {"who": "amplifier"}}),
     _node("loop's interface down", {"interface_down": {"for_ms": Between(1, 500)}}, takes_syncs=True),

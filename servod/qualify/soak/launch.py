@@ -33,6 +33,8 @@ from servod.qualify.soak.wall_clock import WallSoak, of_the_wall
 Tell = Callable[[str, float], None]
 DOCUMENT_NAME = "soak.json"
 _SAVE_S = 10.0
+#: Between two looks at memory [s of axis time]; a look hands back what is not used, which takes a tenth of a second.
+_LOOK_S = 30.0
 
 
 @dataclass
@@ -49,13 +51,17 @@ class SoakWatch:
         """Time since the beginning."""
         return time.monotonic() - self.began_s
 
-    def look(self, processes: dict[str, int]) -> None:
-        """Sample the memory of `processes`; one that was started anew is another one, and the longest lived is kept."""
+    def look(self, processes: dict[str, int], axis_s: float) -> None:
+        """Sample the memory of `processes` at `axis_s`, the time that the axis has run: what grows grows with cycles,
+        moves and faults, and stepped time runs faster than the wall's.
+
+        One that was started anew is another one, and the longest lived is kept.
+        """
         for name, pid in processes.items():
             memory = self.memories.get(name)
             if memory is None or memory.pid != pid:
-                memory = self.memories[name] = Memory(pid)
-            memory.sample()
+                memory = self.memories[name] = Memory(pid, _LOOK_S)
+            memory.sample(axis_s)
             if name not in self.longest or memory.watched_s >= self.longest[name].watched_s:
                 self.longest[name] = memory
 
@@ -94,10 +100,10 @@ def _go_through(
     axis: SoakedAxis, episodes: Iterable[Episode], cycles: int, watch: SoakWatch, folder: Path, tell: Tell
 ) -> None:
     next_save_s = 0.0
-    watch.look(axis.processes())
+    watch.look(axis.processes(), axis.counts.axis_s)
     for episode in episodes:
         axis.episode(episode)
-        watch.look(axis.processes())
+        watch.look(axis.processes(), axis.counts.axis_s)
         done, elapsed_s = axis.counts.cycles, watch.elapsed_s
         tell(_line(axis, elapsed_s), max(done / cycles, elapsed_s / watch.limit_s))
         if elapsed_s > next_save_s:
@@ -109,7 +115,7 @@ def _go_through(
 
 def _line(axis: SoakedAxis, elapsed_s: float) -> str:
     counts, faults = axis.counts, axis.tally.faults.values()
-    speed = counts.cycles * counts.period_ns / 1e9 / max(elapsed_s, 1e-9)
+    speed = counts.axis_s / max(elapsed_s, 1e-9)
     wrong = sum(axis.findings.counts.values())
     return f"{counts.cycles / 1e6:.2f} M cycles, {speed:.1f}x, {sum(f.injected for f in faults)} faults, {wrong} wrong"
 
@@ -118,7 +124,7 @@ def _judge_memory(axis: SoakedAxis, watch: SoakWatch) -> None:
     for name, memory in watch.longest.items():
         slope = memory.slope()
         if slope.growth is Growth.GROWS:
-            axis.findings.add(Wrong.MEMORY, None, f"{name}: {slope.kb_per_h:.0f} kB/h")
+            axis.findings.add(Wrong.MEMORY, None, f"{name}: {slope.kb_per_h:.0f} kB in an hour of axis time")
         if memory.descriptors_grow():
             axis.findings.add(Wrong.DESCRIPTORS, None, name)
 

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-#: More growth than this is a leak: a month of it would still fit a small machine.
+#: More growth than this is a leak: a month of it would still fit a small machine. Hours are those of the axis.
 LIMIT_KB_PER_H = 1024.0
 #: What the allocator may take and give back without it meaning anything [kB].
 _SLACK_KB = 2048.0
@@ -29,8 +29,8 @@ _BLOCKS = 12
 _T95 = 2.228
 #: Before so long [s] caches and buffers still fill, and growth is none.
 SETTLED_S = 1800.0
-#: A process that was watched for so long [s] must be told. An hour cannot: resident size breathes by single arenas of
-#: Python's allocator, of 1 MiB each, which makes its interval +-1.5 MB/h.
+#: A process that was watched for so long [s of axis time] must be told. One hour cannot: resident size breathes by
+#: single arenas of Python's allocator, of 1 MiB each, which makes its interval +-1.5 MB/h.
 LONG_S = 4 * 3600.0
 _PAGE_KB = os.sysconf("SC_PAGE_SIZE") / 1024.0
 
@@ -63,7 +63,7 @@ class Memory:
         self._count, self._next_s = 0, -math.inf
 
     def sample(self, now_s: float | None = None) -> None:
-        """Look, when it is time."""
+        """Look, when it is time by the wall's clock, or by the one that `now_s` is of."""
         now_s = time.monotonic() if now_s is None else now_s
         if now_s < self._next_s:
             return

@@ -23,7 +23,7 @@ from servod.qualify.soak.starvation import ExcusedFaults
 from servod.qualify.soak.tally import Findings, Wrong
 from servod.runtime.daemon.recorder import Recorder
 from servod.runtime.fieldbus.devices import DriveState
-from servod.runtime.loop.axis import AxisState
+from servod.runtime.loop.axis_state import AxisState
 
 Bits = int | NDArray[np.int64]
 

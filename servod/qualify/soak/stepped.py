@@ -38,7 +38,7 @@ from servod.qualify.soak.rows import ANSWER_CYCLES, RecordingCheck, RowCheck
 from servod.qualify.soak.syncs import SyncCheck, SyncListener
 from servod.qualify.soak.tally import Counts, FaultTally, Findings, Tally, Wrong
 from servod.qualify.soak.traces import LISTEN_S, Listener, trace_of
-from servod.runtime.loop.axis import AxisState
+from servod.runtime.loop.axis_state import AxisState
 from servod.runtime.loop.commands import REFUSAL_TEXT, Op, Refusal
 
 #: Gain sets that the schedule changes between; every restart begins with the first.

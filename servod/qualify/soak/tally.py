@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from servod.common.units import NS_PER_S
 from servod.qualify.soak.plan import Episode
 
 _BINS_MS = 1000
@@ -183,6 +184,11 @@ class Counts(NamedTuple):
     drive_samples: int
     recordings: int
     rows_read_back: int
+
+    @property
+    def axis_s(self) -> float:
+        """The time that the axis has run."""
+        return self.cycles * self.period_ns / NS_PER_S
 
 
 class SoakedAxis(Protocol):

@@ -21,8 +21,7 @@ from servod.drivers.virtual.port import Port
 from servod.qualify.faults.actions import InjectionAction
 from servod.qualify.faults.actions.base import Who
 from servod.qualify.faults.actions.bus import CAN_ID, Babble, FrameFault, FrameName, Frames, Silence
-from servod.qualify.faults.actions.nodes import ForeignFrame
-from servod.runtime.fieldbus.cia import SDO_ANSWER_BASE, SDO_REQUEST_BASE, SYNC_ID
+from servod.runtime.fieldbus.cia import SYNC_ID
 
 #: So long before the injection one listens: the rarest frame that is hit, a heartbeat, comes every 50 ms [s].
 LISTEN_S = 0.06
@@ -41,11 +40,10 @@ class Sign(StrEnum):
 
 
 class BusSign(NamedTuple):
-    """A sign, and the frames that bear it; `begins`: how the data of the frame begins that is to be heard."""
+    """A sign, and the frames that bear it."""
 
     sign: Sign
     can_id: int
-    begins: bytes = b""
 
 
 class Heard(NamedTuple):
@@ -64,8 +62,6 @@ _SIGNS = {
     FrameFault.SHORTEN: Sign.SHORT,
 }
 _ANSWERS = {Who.AMPLIFIER: FrameName.DRIVE_FEEDBACK, Who.ENCODER: FrameName.ENCODER_FEEDBACK}
-#: A download that was carried out is confirmed with this and the object (CiA 301, 7.2.4.3.4).
-_CONFIRMED = b"\x60"
 
 
 def trace_of(action: InjectionAction) -> BusSign | None:
@@ -79,9 +75,6 @@ def trace_of(action: InjectionAction) -> BusSign | None:
             return BusSign(Sign.GAP, CAN_ID[_ANSWERS[who]]) if who in _ANSWERS else None
         case Babble(can_id=can_id):
             return BusSign(Sign.HEARD, can_id)
-        case ForeignFrame(can_id=can_id, data=data) if can_id > SDO_REQUEST_BASE:
-            answer = can_id - SDO_REQUEST_BASE + SDO_ANSWER_BASE
-            return BusSign(Sign.HEARD, answer, _CONFIRMED + bytes.fromhex(data)[1:4])
     return None
 
 
@@ -91,7 +84,7 @@ def shows(trace: BusSign, heard: Sequence[Heard], destroyed: int) -> bool:
         return destroyed > 0
     frames = [frame.data for frame in heard if frame.can_id == trace.can_id]
     if trace.sign is Sign.HEARD:
-        return any(data.startswith(trace.begins) for data in frames)
+        return bool(frames)
     if trace.sign is Sign.SHORT:
         return len({len(data) for data in frames}) > 1
     distances = _distances(heard, trace.can_id)

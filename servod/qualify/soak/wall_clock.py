@@ -34,7 +34,7 @@ from servod.qualify.soak.starvation import STARVED_CYCLE, STARVED_SUPERVISOR, Ex
 from servod.qualify.soak.syncs import SyncThread
 from servod.qualify.soak.tally import Counts, Findings, Tally, Wrong
 from servod.qualify.soak.traces import LISTEN_S, BusListener, trace_of
-from servod.runtime.loop.axis import AxisState
+from servod.runtime.loop.axis_state import AxisState
 from servod.runtime.loop.commands import ReferenceKind
 
 #: Actions that happen within the loop's process.
@@ -158,7 +158,7 @@ class WallSoak:
     def _move(self, move: Move) -> bool:
         self.tally.moves[move.kind.name] += 1
         arguments = _track(move)
-        return arguments is not None and self._ask(Verb.TRACK, **arguments)
+        return arguments is not None and self._ask(Verb.TRACK, renew_s=None, **arguments)
 
     def _end(self, episode: Episode) -> None:
         self.tally.endings[episode.ending.name] += 1

@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from servod.common.errors import BadInput
 from servod.common.yaml import Strict, validate
-from servod.formats.protocol import PIECE_SAMPLES, SampleKey, Verb
+from servod.formats.protocol import PIECE_SAMPLES, RENEW_S, SampleKey, Verb
 from servod.kernels.motions import PAPER_LONGEST_S
 from servod.runtime.daemon.trajectory import MotionTable
 from servod.runtime.loop.commands import ReferenceKind
@@ -87,6 +87,12 @@ class TrackArgs(Strict):
     )
     uploaded: bool = Field(False, description="the samples came ahead, with the verb `trajectory`")
     start_immediately: bool = Field(True, description="false: only check the motion against the limits")
+    renew_s: float | None = Field(
+        RENEW_S,
+        ge=0.1,
+        le=60.0,
+        description="the motion halts when this client has asked nothing for so long, or has left; none: it goes on",
+    )
 
     @model_validator(mode="after")
     def _has_what_its_kind_needs(self) -> TrackArgs:

@@ -30,6 +30,8 @@ _READS_IN_A_ROUND = _LINES_IN_A_ROUND = 4
 _UNREAD_BYTES = 64 * 1024
 _MAX_BACKLOG_BYTES = 4 * 1024 * 1024
 _MIN_WATCH_S, _MAX_WATCH_S = 0.02, 60.0
+#: A round of the supervisor that takes longer was held up.
+_LONGEST_ROUND_NS = NS_PER_S // 20
 _BLANK = re.compile(rb"\s*")
 _TOO_LONG = BadInput("request", "a longer line", f"at most {MAX_LINE_BYTES} bytes")
 
@@ -88,6 +90,7 @@ class Connection:
         self.peer: Peer = peer_of(connection)
         self.active_ns = now_ns  # when it last asked something, or read what it watches
         self.commanded_ns: int | None = None  # when it last commanded, or stopped the axis
+        self.unheard_ns = 0  # for how long it has asked nothing, without what held it or the supervisor up
         self.under_way = 0  # requests without an answer yet
         self._connection, self._owner, self._loop = connection, owner, asyncio.get_running_loop()
         self._incoming, self._outgoing = bytearray(), bytearray()
@@ -115,6 +118,7 @@ class Connection:
             self._owner.hear_out(self, self._rest())
             self._owner.drop(self)
             return
+        self.unheard_ns = 0 if self.under_way else self.unheard_ns + min(now_ns - self._now_ns, _LONGEST_ROUND_NS)
         self._reads, self._lines, self._now_ns = _READS_IN_A_ROUND, _LINES_IN_A_ROUND, now_ns
         self._may_go_on.set()
 
@@ -137,7 +141,7 @@ class Connection:
                 while 0 <= (end := self._line_end()) <= MAX_LINE_BYTES:
                     await self._share(lambda: self._lines)
                     self._lines -= 1
-                    self.active_ns = self._now_ns
+                    self.active_ns, self.unheard_ns = self._now_ns, 0
                     self._owner.dispatch(self, self._cut(end))
                 if len(self._incoming) > MAX_LINE_BYTES:
                     Reply(self.send, None).failed(_TOO_LONG)

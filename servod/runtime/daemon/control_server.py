@@ -55,9 +55,13 @@ class Lease:
         self._stopped_by: Peer | None = None  # who stopped the holder's axis
 
     def status(self) -> LeaseStatus:
-        """Who commands; pid 0 when nobody does."""
-        peer = self.holder.peer if self.holder else None
-        return {"pid": peer.pid if peer else 0, "uid": peer.uid if peer else 0}
+        """Who commands, and who stopped him; pid 0 when nobody does."""
+        peer, stopper = self.holder.peer if self.holder else None, self._stopped_by
+        return {
+            "pid": peer.pid if peer else 0,
+            "uid": peer.uid if peer else 0,
+            "stopped_by": stopper.pid if stopper else 0,
+        }
 
     def take(self, client: Connection, verb: Verb) -> None:
         """Check the right of `client` to ask for `verb`, and give it the lease where the verb needs it.
@@ -78,6 +82,20 @@ class Lease:
         self.holder = client
         if verb is Verb.TRACK:
             self._mover = client
+
+    def lets_go(self, limit_ns: int) -> str:
+        """Why nobody holds the motion any more that its client is to renew each `limit_ns`; empty while it does.
+
+        An open connection says nothing: a process that the client forked, or one that hangs, keeps it open.
+        """
+        if self._mover is None:
+            return ""
+        pid = self._mover.peer.pid
+        if self._mover is not self.holder:
+            return f"process {pid}, which started it, has left"
+        if self._mover.unheard_ns > limit_ns:
+            return f"process {pid}, which started it, has asked nothing for {limit_ns / NS_PER_S:g} s"
+        return ""
 
     def left(self, client: Connection) -> bool:
         """A client has gone; whether it held the lease."""
@@ -182,6 +200,15 @@ class Handler(Protocol):
         """The commanding client has gone: what it began and did not finish is void."""
         ...
 
+    @property
+    def renew_ns(self) -> int | None:
+        """How long the motion that runs goes on without a word of its client; None: for good, or there is none."""
+        ...
+
+    def abandon_motion(self, why: str) -> None:
+        """Bring the reference to rest, and end the motion there."""
+        ...
+
 
 class ControlServer:
     """The listening socket and its clients."""
@@ -199,6 +226,7 @@ class ControlServer:
         self._status_failed = False
         self._round = asyncio.Event()
         self._listener = _listen(config.socket, self._group)
+        self._place, self._look_ns, self._closed_told = _place_of(config.socket), 0, False
         self._welcoming: asyncio.Task[None] | None = None
 
     def begin(self) -> None:
@@ -211,9 +239,41 @@ class ControlServer:
         if self._welcoming and self._welcoming.done():
             self._welcoming.result()  # a mistake of ours: without a door the axis is not to run on
         self._round.set()
+        self._keep_door(now_ns)
         for client in list(self._places.clients):
             client.begin_round(now_ns)
+        if (limit_ns := self._handler.renew_ns) is not None and (why := self._lease.lets_go(limit_ns)):
+            self._handler.abandon_motion(why)
         self._tell_watchers(now_ns)
+
+    def _keep_door(self, now_ns: int) -> None:
+        """A socket file that somebody removed is made again: who is connected stays, and newcomers must find it."""
+        if now_ns < self._look_ns or self._welcoming is None:
+            return
+        self._look_ns = now_ns + NS_PER_S
+        if _place_of(self._path) == self._place:
+            return
+        try:
+            listener = _listen(self._path, self._group)
+        except Unreachable as error:
+            if not self._closed_told:
+                log.error("the control socket is gone, and newcomers cannot stop the axis: %s", error)
+            self._closed_told = True
+            return
+        log.warning("%s was gone and is made again", self._path)
+        self._shut(taking_queue=True)
+        self._listener, self._place, self._closed_told = listener, _place_of(self._path), False
+        self.begin()
+
+    def _shut(self, taking_queue: bool = False) -> None:
+        """Take no more clients at the present listener, but for those who queue there, if they are wanted."""
+        if self._welcoming:
+            self._welcoming.cancel()
+            self._welcoming.get_loop().remove_reader(self._listener)
+        self._welcoming = None
+        if taking_queue:
+            self._take_queued(_BACKLOG + 1)
+        self._listener.close()
 
     def _tell_watchers(self, now_ns: int) -> None:
         due = [c for c in self._places.clients if c.watch_due(now_ns)]
@@ -249,10 +309,7 @@ class ControlServer:
         for client in list(self._places.clients):
             Reply(client.send, None).failed(Unreachable(why))
             self.drop(client)
-        if self._welcoming:
-            self._welcoming.cancel()
-            self._welcoming.get_loop().remove_reader(self._listener)
-        self._listener.close()
+        self._shut()
         self._path.unlink(missing_ok=True)
 
     def drop(self, client: Connection) -> None:
@@ -263,15 +320,33 @@ class ControlServer:
             self._handler.lease_ended()
 
     async def _welcome(self) -> None:
-        """Take those who queue, a few in each round."""
-        loop = asyncio.get_running_loop()
+        """Take those who queue, a few in each round.
+
+        Waits for somebody to queue and takes him at once: `sock_accept`, cancelled, may have taken one and lose him.
+        """
+        loop, listener, places = asyncio.get_running_loop(), self._listener, _ACCEPT_IN_A_ROUND
         while True:
-            with contextlib.suppress(OSError):  # descriptors ran out: nothing to hold against the axis
-                for _ in range(_ACCEPT_IN_A_ROUND):
-                    connection, _address = await loop.sock_accept(self._listener)
-                    self._admit(connection)
-            self._round.clear()
-            await self._round.wait()
+            somebody = asyncio.Event()
+            loop.add_reader(listener, somebody.set)
+            await somebody.wait()
+            loop.remove_reader(listener)
+            taken = self._take_queued(places)
+            places -= taken
+            if not taken:
+                self._round.clear()
+                await self._round.wait()
+                places = _ACCEPT_IN_A_ROUND
+
+    def _take_queued(self, most: int) -> int:
+        """How many of those who queue found their way in."""
+        for taken in range(most):
+            try:
+                connection, _address = self._listener.accept()
+            except OSError:  # nobody any more; or descriptors ran out: nothing to hold against the axis
+                return taken
+            connection.setblocking(False)
+            self._admit(connection)
+        return most
 
     def _admit(self, connection: socket.socket) -> None:
         """A place for a new client, or one line that says why not; what it sent with its connection is served now."""
@@ -366,6 +441,15 @@ def _request(message: dict[str, Any]) -> tuple[Verb, dict[str, Any]]:
         return Verb(str(name)), args
     except ValueError:
         raise BadInput("request: verb", repr(name)[:80], ", ".join(Verb)) from None
+
+
+def _place_of(path: Path) -> tuple[int, int] | None:
+    """What tells a file from another one of its name; None when there is none to be seen."""
+    try:
+        state = path.stat()
+    except OSError:
+        return None
+    return state.st_dev, state.st_ino
 
 
 def _listen(path: Path, group: int | None) -> socket.socket:

@@ -21,7 +21,7 @@ from servod.runtime.daemon.health import Health
 from servod.runtime.daemon.metrics import AxisMetrics
 from servod.runtime.daemon.recorder import Recorder
 from servod.runtime.daemon.status import WiringStatus
-from servod.runtime.loop.axis import AxisState
+from servod.runtime.loop.axis_state import AxisState
 from servod.runtime.loop.handle import LoopHandle
 from servod.runtime.loop.wiring.findings import WiringOutcome, wiring_document, wiring_sentence
 
@@ -29,20 +29,34 @@ log = logging.getLogger("servod.faults")
 
 #: The fault file is written this long after the fault, so that it shows the reaction too.
 _AFTER_FAULT_NS = NS_PER_S // 2
-#: What is kept of the past in memory; fault files reach farther back.
+#: What is kept of the past in memory.
 _MOST_INCIDENTS = 50
 _LEVEL = {Reaction.NONE: logging.WARNING, Reaction.CLIP: logging.WARNING}
+
+
+def memory_of_incidents() -> deque[Incident]:
+    """Of one daemon; fault files reach farther back."""
+    return deque(maxlen=_MOST_INCIDENTS)
 
 
 class FaultWatch:
     """Edge detector over the records' fault words."""
 
-    def __init__(self, recorder: Recorder, health: Health, metrics: AxisMetrics, axis: str = "") -> None:
+    def __init__(
+        self,
+        recorder: Recorder,
+        health: Health,
+        metrics: AxisMetrics,
+        axis: str = "",
+        incidents: deque[Incident] | None = None,
+        known: int = 0,
+    ) -> None:
+        """`incidents` is the daemon's memory, where it is older than this watch; the faults `known` were told."""
         self._recorder, self._health, self._metrics, self._axis = recorder, health, metrics, axis
-        self._incidents: deque[Incident] = deque(maxlen=_MOST_INCIDENTS)
+        self._incidents = memory_of_incidents() if incidents is None else incidents
         self._begins = True
         self._offset_ns = wall_offset_ns()
-        self._known = 0
+        self._known = known
         self._state = int(AxisState.DISABLED)
         self._file_due_ns, self._file_label = 0, ""
         self._files: list[tuple[Future[Path], Incident | None]] = []

@@ -15,7 +15,7 @@ from typing import Any
 from servod.common.errors import AnswerIsNo, BadInput, ServodError, Unreachable
 from servod.common.files import unwritable
 from servod.formats.config import AxisConfig
-from servod.formats.gains.gain_set import GainSet, require_fit
+from servod.formats.gains.gain_set import GainSet, parse_gains, require_fit, require_signed
 from servod.formats.gains.store import GainStore, StoredSet
 from servod.formats.recording.record import CycleRecord
 from servod.runtime.daemon.arguments import GainsActivateArgs, GainsLoadArgs, GainsVerdictArgs
@@ -92,9 +92,14 @@ class GainBank:
         }
 
     async def load(self, args: GainsLoadArgs, slow: Executor) -> dict[str, Any]:
-        """Check and store a set."""
-        stored: StoredSet = await work_of(slow.submit(self._store.load, args.text, args.name))
+        """Check and store a set; where the configuration names signers, only one that they have signed."""
+        stored: StoredSet = await work_of(slow.submit(self._load, args))
         return {**_row(stored), "sealed": stored.text != args.text}
+
+    def _load(self, args: GainsLoadArgs) -> StoredSet:
+        if self._config.gains.signers:
+            require_signed(parse_gains(args.text, args.name), self._config, args.name)
+        return self._store.load(args.text, args.name)
 
     async def list(self, serial: int, slow: Executor) -> dict[str, Any]:
         """All stored versions, and which one runs."""

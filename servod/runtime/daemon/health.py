@@ -18,6 +18,8 @@ WINDOW_S = 10.0
 _HUNG_NS, _HUNG_PERIODS = NS_PER_S, 50
 #: After a pause of its own of this length, the watcher knows nothing of the loop and begins anew.
 _OWN_PAUSE_NS = NS_PER_S // 5
+#: A round of the watcher that took longer says no more of the loop than this; so long a machine may stall besides.
+_ROUND_NS, _STALL_NS = NS_PER_S // 25, NS_PER_S // 10
 
 
 class _Ring:
@@ -73,6 +75,37 @@ class Pulse:
     def stopped(self) -> bool:
         """The loop hangs."""
         return self._silent_ns > self._limit_ns
+
+
+class StandingLoop:
+    """Whether the drive is to be stopped past a loop that stands still, long before that counts as hung.
+
+    A machine may stall for some ten milliseconds, so silence alone is no reason before the drive must have stopped by
+    itself. A drive that tells that it misses the loop does, and a load that its brake does not hold yet falls.
+    """
+
+    def __init__(self, reaction_s: float) -> None:
+        """`reaction_s`: the drive has reacted to a dead master by then, as is stated."""
+        self._limit_ns = round(reaction_s * NS_PER_S) + _STALL_NS
+        self._silent_ns = 0
+        self._looked_ns: int | None = None
+        self._told = self._done = False
+
+    def look(self, wrote: bool, drive_told: bool, now_ns: int) -> bool:
+        """Once per round: whether records came since the last look, and whether the drive told that it misses the loop.
+
+        True once for each standstill: now.
+        """
+        pause_ns = 0 if self._looked_ns is None else min(now_ns - self._looked_ns, _ROUND_NS)
+        self._looked_ns = now_ns
+        if wrote:
+            self._silent_ns, self._told, self._done = 0, False, False
+            return False
+        self._silent_ns += pause_ns
+        self._told = self._told or drive_told
+        due = not self._done and (self._told or self._silent_ns > self._limit_ns)
+        self._done = self._done or due
+        return due
 
 
 class Health:

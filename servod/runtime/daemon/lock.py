@@ -1,31 +1,46 @@
-"""One daemon per control socket and per bus: locks that die with their process.
+"""One daemon per control socket and per bus: locked files that give their locks back with their process.
 
-Taken by the supervisor before it touches either, and by whoever else wants the bus for itself. Each lock is a
-listening socket in the abstract name space: it lives exactly as long as the process, leaves no file behind, is seen in
-the network name space that CAN interfaces live in as well, and tells by SO_PEERCRED who holds it.
+Taken by the supervisor before it touches either, and by whoever else wants the bus for itself. The lock of a control
+socket or of a virtual bus lies beside its socket, that of every other bus in the runtime folder, with the network name
+space in its name that the interface lives in: one place for each interface, whoever starts a daemon. Owner and group
+alone may open such a file, so that nobody else on the machine keeps a daemon from its start; names that anybody may
+bind, as the abstract ones of sockets, would let them.
 """
 
 from __future__ import annotations
 
-import hashlib
-import socket
+import contextlib
+import fcntl
+import os
+import pwd
+from pathlib import Path
 from types import TracebackType
 from typing import Self
+from urllib.parse import quote
 
 from servod.common.errors import Unreachable
+from servod.common.files import reason
 from servod.formats.config import AxisConfig, BusConfig
-from servod.runtime.daemon.peer import peer_of
+
+#: Of the service (RuntimeDirectory=). Two places would let two daemons on one bus.
+RUNTIME_FOLDER = Path("/run/servod")
+_OPEN = os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+_RIGHTS = 0o660
+_PID_BYTES = 20
 
 
 class _Lock:
-    """Locks of one process; `release`, the end of a `with` block or of the process gives them back."""
+    """Locks of one process; `release`, the end of a `with` block or of the process gives them back.
 
-    def __init__(self, *names: str) -> None:
-        """Raises Unreachable, naming the process that holds it, when one of them is taken."""
-        self._sockets: list[socket.socket] = []
+    The files stay: whoever takes one away lets two think that they own what it stands for, until `keep` is called.
+    """
+
+    def __init__(self, *wanted: tuple[str, Path]) -> None:
+        """What is owned, and its file. Raises Unreachable, with who stands in the way, when one cannot be had."""
+        self._files: dict[tuple[str, Path], int] = {}
         try:
-            for name in names:
-                self._take(name)
+            for what, path in wanted:
+                self._files[what, path] = _taken(what, path)
         except Unreachable:
             self.release()
             raise
@@ -36,47 +51,110 @@ class _Lock:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         self.release()
 
-    def _take(self, what: str) -> None:
-        address = "\0servod-" + hashlib.sha256(what.encode()).hexdigest()[:32]
-        lock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
-        try:
-            lock.bind(address)
-            lock.listen(1)
-        except OSError:
-            lock.close()
-            raise Unreachable(f"{what}: another servod (process {_holder(address)}) owns it") from None
-        self._sockets.append(lock)
+    def keep(self) -> None:
+        """Make the files again that somebody removed, before another takes them. Raises Unreachable: one has."""
+        for (what, path), file in self._files.items():
+            if not _is_at(path, file):
+                self._files[what, path] = _taken(what, path)
+                os.close(file)
 
     def release(self) -> None:
         """Give the locks back."""
-        for lock in self._sockets:
-            lock.close()
-        self._sockets.clear()
+        while self._files:
+            os.close(self._files.popitem()[1])
 
 
 class InstanceLock(_Lock):
     """What a daemon owns: its control socket and its bus."""
 
     def __init__(self, config: AxisConfig) -> None:
-        super().__init__(f"control socket {config.control.socket.resolve()}", _bus_name(config.bus))
+        socket = config.control.socket.resolve()
+        super().__init__((f"control socket {socket}", _beside(socket)), _of_bus(config.bus))
 
 
 class BusLock(_Lock):
     """The bus alone, for a program that uses it for a moment."""
 
     def __init__(self, bus: BusConfig) -> None:
-        super().__init__(_bus_name(bus))
+        super().__init__(_of_bus(bus))
 
 
-def _bus_name(bus: BusConfig) -> str:
-    return f"bus {bus.interface} {bus.channel}"
+def _taken(what: str, path: Path) -> int:
+    """The file, locked for this process. Raises Unreachable."""
+    try:
+        file = _open(path)
+    except OSError as error:
+        owner = f", which belongs to user {_owner(path)}" if os.path.lexists(path) else ""
+        raise Unreachable(f"{what}: its lock {path}{owner}, cannot be opened ({reason(error)})") from None
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        holder = os.pread(file, _PID_BYTES, 0).decode(errors="replace").strip() or "unknown"
+        os.close(file)
+        raise Unreachable(f"{what}: another servod (process {holder}) owns it") from None
+    with contextlib.suppress(OSError):  # a full disk: it is ours all the same, only nobody can tell whose
+        os.pwrite(file, f"{os.getpid()}\n".ljust(_PID_BYTES).encode(), 0)
+    return file
 
 
-def _holder(address: str) -> str:
-    """Process id of the one that listens at `address`."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK) as probe:
-        try:
-            probe.connect(address)
-            return str(peer_of(probe).pid)
-        except OSError:
-            return "unknown"
+def _is_at(path: Path, file: int) -> bool:
+    try:
+        return os.path.samestat(path.stat(), os.fstat(file))
+    except OSError:
+        return False
+
+
+def _of_bus(bus: BusConfig) -> tuple[str, Path]:
+    what = f"bus {bus.interface} {bus.channel}"
+    if bus.interface == "virtual":
+        return what, _beside(Path(bus.channel).resolve())
+    space = Path("/proc/self/ns/net").stat().st_ino
+    name = f"bus-{bus.interface}-{quote(bus.channel, safe='')}-{space}.lock"
+    return what, _runtime_folder(what, name, bus.interface == "socketcan") / name
+
+
+def _beside(socket: Path) -> Path:
+    return socket.with_name(f"{socket.name}.lock")
+
+
+def _runtime_folder(what: str, name: str, shared: bool) -> Path:
+    """Where the lock `name` is, or may be made by this user. Raises Unreachable when there is no such folder.
+
+    An interface of the kernel is `shared` by all users of the machine, and so is the one place of its lock. An adapter
+    is its user's alone.
+    """
+    own = os.environ.get("XDG_RUNTIME_DIR", "")
+    if os.access(RUNTIME_FOLDER, os.W_OK | os.X_OK) or os.path.lexists(RUNTIME_FOLDER / name):
+        return RUNTIME_FOLDER
+    if own.startswith("/") and not shared:
+        return Path(own)
+    if os.geteuid() == 0:
+        return RUNTIME_FOLDER
+    raise Unreachable(
+        f"{what}: no lock for it, for nothing may be written in {RUNTIME_FOLDER}; run as the user servod, or where "
+        f'the service is not installed: sudo install -d -o "$USER" {RUNTIME_FOLDER}'
+    )
+
+
+def _open(path: Path) -> int:
+    """The file, made when it is missing: for the folder's owner when root makes it, who is not to lock him out."""
+    try:
+        return os.open(path, _OPEN)
+    except FileNotFoundError:
+        pass
+    if not path.parent.is_dir():
+        path.parent.mkdir(parents=True)
+    file = os.open(path, _OPEN | os.O_CREAT, _RIGHTS)
+    os.fchmod(file, _RIGHTS)  # whatever the umask left of them
+    if os.geteuid() == 0:
+        folder = path.parent.stat()
+        os.fchown(file, folder.st_uid, folder.st_gid)
+    return file
+
+
+def _owner(path: Path) -> str:
+    number = path.lstat().st_uid
+    try:
+        return pwd.getpwuid(number).pw_name
+    except KeyError:
+        return str(number)

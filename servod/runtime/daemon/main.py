@@ -11,6 +11,7 @@ import argparse
 import logging
 import os
 import sys
+import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -20,25 +21,28 @@ from servod import __version__
 from servod.common.clock import WallClock
 from servod.common.end_signals import on_end_signals
 from servod.common.errors import BadInput, ServodError, Unreachable
-from servod.common.faults import FaultCode
+from servod.common.faults import FaultCode, fault_text
 from servod.common.files import reason
 from servod.common.yaml import read_text
 from servod.formats.config import AxisConfig, load_config
+from servod.formats.config_guards import weakened
 from servod.formats.gains.gain_set import load_gains, require_fit
 from servod.formats.model.axis_model import load_axis_model
 from servod.formats.recording.incidents import of_abrupt_end
 from servod.formats.recording.run_mark import RunMark
-from servod.formats.wiring import warnings, with_expected
+from servod.formats.stopping import UNKNOWN, Stopping
+from servod.formats.wiring import with_expected
+from servod.runtime.daemon.fault_watch import memory_of_incidents
 from servod.runtime.daemon.gain_bank import GainBank
 from servod.runtime.daemon.lock import InstanceLock
 from servod.runtime.daemon.nodes import Nodes
 from servod.runtime.daemon.notify import Notifier
 from servod.runtime.daemon.recorder import Recorder
-from servod.runtime.daemon.supervisor import Supervisor
+from servod.runtime.daemon.supervisor import Context, Supervisor
+from servod.runtime.daemon.waiting import SHOWN_S, BringUpFailure, shown_s_after, wait_for_nodes
 from servod.runtime.fieldbus.bus.open import open_bus
-from servod.runtime.fieldbus.cia import EMCY_BASE, HEARTBEAT_BASE, SDO_ANSWER_BASE
-from servod.runtime.fieldbus.master import Master
-from servod.runtime.fieldbus.master.planned import check_names, planned_bus_load
+from servod.runtime.fieldbus.master import BringUp, Master, master_ids
+from servod.runtime.fieldbus.master.planned import check_names, narrowed_by_stop, planned_bus_load, stopping_as_found
 from servod.runtime.loop.handle import LoopHandle
 from servod.runtime.loop.plan import LoopPlan
 
@@ -59,56 +63,133 @@ def check(path: Path) -> AxisConfig:
     if config.model is not None:
         load_axis_model(config.model)
     planned_bus_load(config, str(path))
+    narrowed_by_stop(config)
     return config
 
 
-def run(path: Path, on_ready: Callable[[Supervisor], None]) -> int:
+def run(path: Path, on_ready: Callable[[Supervisor], None], waits: bool = False) -> int:
     """Run the axis that `path` configures until it ends; returns the exit code.
 
-    Raises ServodError when it cannot begin. `on_ready` is told the supervisor before it begins, for signals.
+    Raises ServodError when it cannot begin. `on_ready` is told the supervisor before it begins, for signals. With
+    `waits` it waits for bus and nodes at the start, and begins anew when they were lost and are back.
     """
     config = check(path)
+    incidents, notifier = memory_of_incidents(), Notifier()
     with ExitStack() as stack:
-        stack.callback(InstanceLock(config).release)
+        lock = stack.enter_context(InstanceLock(config))
         mark = stack.enter_context(RunMark(config.recorder.directory, config.name))
         found = None if mark.found is None else of_abrupt_end(mark.found, config.name)
         if found is not None:  # at once: a drive that is still booting may end this start
             log.error("fault %s: %s", found.first.code.name, found.first.detail)
         _leave_core_to_loop(config.cycle.cpu)
         sys.setswitchinterval(_SWITCH_S)
-        bank = GainBank(config, begins=False)
-        recorder = _recorder(config, path, bank)
-        stack.callback(recorder.close)
-        master = Master(config, open_bus(config.bus, _master_ids(config)), WallClock(), threaded=False)
-        stack.callback(master.close)
-        plans = master.bring_up()
-        for line in plans.report:
-            log.info("%s", line)
-        with ExitStack() as undo:
-            supervisor = _supervise(config, Nodes(master, plans), bank, recorder, undo)
-            if found is not None:
-                supervisor.tell_earlier(found)
-            bank.begin()  # a start that failed leaves the active set as it was
-            on_ready(supervisor)
-            undo.pop_all()
-        return supervisor.run()
+        return _run_on(config, path, Context(lock, notifier, incidents, SHOWN_S if waits else None, found), on_ready)
 
 
-def _supervise(config: AxisConfig, nodes: Nodes, bank: GainBank, recorder: Recorder, undo: ExitStack) -> Supervisor:
+def _run_on(config: AxisConfig, path: Path, context: Context, on_ready: Callable[[Supervisor], None]) -> int:
+    """The axis, and for a daemon that waits again and again; the exit code.
+
+    What fails while nodes that answer are brought up is waited for as well: a drive may be heard before it can be set
+    up, and a start that ends uses up one of the few that the service manager allows.
+    """
+    failure: BringUpFailure | None = None
+    while True:
+        if context.shown_s is not None:
+            wait_for_nodes(config, context.notifier, context.incidents, failure)
+        began, bank = time.monotonic(), GainBank(config, begins=False)
+        with ExitStack() as held:
+            try:
+                master, plans = _bring_up(config, held)
+            except ServodError as error:
+                if context.shown_s is None or isinstance(error, BadInput):
+                    raise
+                failure = BringUpFailure.after(error, failure)
+                continue
+            failure = None
+            supervisor = _begin(config, path, Nodes(master, plans), bank, context, held, on_ready)
+            code = supervisor.run()
+        if code is not None or context.shown_s is None:
+            return code or 0
+        _end_start_on_signals()
+        if supervisor.stopping:
+            return 0
+        shown_s = shown_s_after(context.shown_s, time.monotonic() - began)
+        context = context._replace(shown_s=shown_s, found=None, carried=supervisor.carried)
+
+
+def _bring_up(config: AxisConfig, held: ExitStack) -> tuple[Master, BringUp]:
+    """Both nodes, operational; `held` leaves the bus. Raises ServodError."""
+    narrowed, _ = narrowed_by_stop(config)
+    master = Master(narrowed, open_bus(config.bus, master_ids(config)), WallClock(), threaded=False)
+    held.callback(master.close)
+    plans = master.bring_up()
+    for line in plans.report:
+        log.info("%s", line)
+    return master, plans
+
+
+def _begin(
+    config: AxisConfig,
+    path: Path,
+    nodes: Nodes,
+    bank: GainBank,
+    context: Context,
+    held: ExitStack,
+    on_ready: Callable[[Supervisor], None],
+) -> Supervisor:
+    """Recorder, loop and supervisor of nodes that are operational; `held` closes what they stand on. `config` is as it
+    is written; what follows has its limits as they can be kept."""
+    recorder = _recorder(config, path, bank)
+    held.callback(recorder.close)
+    try:
+        config, stopping = stopping_as_found(config, nodes.plans.amplifier)
+    except ServodError:
+        nodes.stand_down()
+        raise
+    if context.carried:
+        log.warning("still latched from before, until `servoctl enable --reset-fault`: %s", fault_text(context.carried))
+    for line in [UNKNOWN] if stopping is None else stopping.lines():
+        log.warning("%s", line)
+    with ExitStack() as undo:
+        supervisor = _supervise(config, stopping, nodes, bank, recorder, context, undo)
+        bank.begin()  # a start that failed leaves the active set as it was
+        on_ready(supervisor)
+        undo.pop_all()
+    return supervisor
+
+
+def _supervise(
+    config: AxisConfig,
+    stopping: Stopping | None,
+    nodes: Nodes,
+    bank: GainBank,
+    recorder: Recorder,
+    context: Context,
+    undo: ExitStack,
+) -> Supervisor:
     """Loop and supervisor on nodes that are operational; `undo` is what to do when that fails half-way."""
     gains = bank.newest.gains
     plans = nodes.plans
     expected = with_expected(config)
-    for line in warnings(expected):
+    for line in weakened(expected, load_axis_model(config.model) if config.model else None):
         log.warning("%s", line)
-    plan = LoopPlan(expected, plans.amplifier, plans.encoder, int(gains.law.number), gains.pack())
+    stop = None if stopping is None else stopping.facts
+    plan = LoopPlan(
+        expected,
+        plans.amplifier,
+        plans.encoder,
+        int(gains.law.number),
+        gains.pack(),
+        stop=stop,
+        carried=context.carried,
+    )
     try:
         loop = LoopHandle(plan)
     except OSError as error:  # a limit on the size of files holds for shared memory, too
         raise Unreachable(f"shared memory for the loop cannot be made ({reason(error)}); see `ulimit -a`") from None
     undo.callback(_give_back, nodes, loop)
     _start_loop(loop)
-    return Supervisor(config, nodes, loop, bank, recorder, Notifier())
+    return Supervisor(config, stopping, nodes, loop, bank, recorder, context)
 
 
 def _give_back(nodes: Nodes, loop: LoopHandle) -> None:
@@ -157,12 +238,6 @@ def _start_loop(loop: LoopHandle) -> None:
         )
 
 
-def _master_ids(config: AxisConfig) -> tuple[int, ...]:
-    """What the master listens to; the cyclic frames are the loop's, and the kernel keeps them away where it can."""
-    bases = (EMCY_BASE, SDO_ANSWER_BASE, HEARTBEAT_BASE)
-    return tuple(base + node.node_id for node in (config.amplifier, config.encoder) for base in bases)
-
-
 # --- The journal -----------------------------------------------------------------------------------------------------
 # Log lines for the journal: to standard error, with systemd's level prefix where the journal reads it.
 
@@ -206,6 +281,7 @@ def set_up_logging() -> None:
 _EXAMPLE = """\
 example:
   servod --config /etc/servod/config/can0.yaml          run the axis until SIGTERM
+  servod --config /etc/servod/config/can0.yaml --wait   the same as a service: wait for late nodes, begin anew
   servod --config /etc/servod/config/can0.yaml --check  only check the configuration and the files it names
 
 exit codes: 0 done, 2 bad usage or input, 3 bus, device or loop cannot be reached or was lost
@@ -228,6 +304,11 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     found.add_argument("--config", type=Path, required=True, metavar="FILE", help="axis configuration (YAML)")
+    found.add_argument(
+        "--wait",
+        action="store_true",
+        help="wait for bus and nodes that are late, and begin anew, disabled, when they were lost and are back",
+    )
     found.add_argument("--check", action="store_true", help="check the configuration and end")
     found.add_argument("--version", action="version", version=f"servod {__version__}", help="print the version")
     return found
@@ -256,7 +337,7 @@ def main(arguments: list[str] | None = None) -> int:
             print(f"{options.config}: good; axis {config.name} on {config.bus.interface} {config.bus.channel}")
             return 0
         _end_start_on_signals()
-        return run(options.config, _stop_on_signals)
+        return run(options.config, _stop_on_signals, options.wait)
     except ServodError as error:
         print_error(str(error))
         return error.exit_code

@@ -21,7 +21,7 @@ from servod.common.files import reason
 from servod.formats.config import MetricsConfig
 from servod.formats.recording.record import CycleRecord
 from servod.runtime.fieldbus.devices import DriveState
-from servod.runtime.loop.axis import AxisState
+from servod.runtime.loop.axis_state import AxisState
 
 #: Upper bounds of the histograms' buckets, in ns: from a good wake-up to several lost periods.
 _BOUNDS_NS = tuple(n * 1000 for n in (10, 20, 50, 75, 100, 150, 200, 300, 500, 750, 1000, 2000, 5000, 20_000))

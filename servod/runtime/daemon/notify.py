@@ -40,6 +40,10 @@ class Notifier:
         """One line for `systemctl status`."""
         self._send(f"STATUS={_one_line(status)}")
 
+    def waiting(self, status: str, timeout_s: float) -> None:
+        """The daemon waits for what is not its own; it says so again within `timeout_s`, before or after `ready`."""
+        self._send(f"STATUS={_one_line(status)}\nEXTEND_TIMEOUT_USEC={int(timeout_s * 1e6)}\nWATCHDOG=1")
+
     def stopping(self, timeout_s: float) -> None:
         """The daemon begins to stop, and needs at most `timeout_s` for it, whatever TimeoutStopSec says."""
         self._send(f"STOPPING=1\nEXTEND_TIMEOUT_USEC={int(timeout_s * 1e6)}")

@@ -373,6 +373,8 @@ class Recorder:
         if self._file is not None:
             self._given += len(rows)
             self._file.write_rows(rows)
+            if self._file.size_bytes() >= self._files.max_bytes:  # however much comes between two syncs
+                self._sync()
         elif self._broken:
             self._lost += len(rows)
 

@@ -9,13 +9,15 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple, TypedDict
 
-from servod.common.faults import Fault, faults_in
+from servod.common.faults import FAULTS, Fault, FaultCode, faults_in
 from servod.common.units import NS_PER_S
-from servod.formats.config import AxisConfig, BusConfig
+from servod.formats.config import AxisConfig, BrakeConfig, BusConfig, InputsConfig
 from servod.formats.recording.record import CycleRecord
+from servod.formats.stopping import StoppingStatus
+from servod.runtime.daemon.guard_test import ProofStatus
 from servod.runtime.daemon.recorder import RecorderState
 from servod.runtime.fieldbus.devices import NEVER_CYCLES, REASON_TEXT, DriveState, Goal, Reason
-from servod.runtime.loop.axis import AxisState
+from servod.runtime.loop.axis_state import AxisState
 
 #: A loop that writes its record in every cycle, read every 20 ms, is stale after this time.
 _RECORD_STALE_S = 0.2
@@ -49,11 +51,26 @@ class DriveStatus(Age):
     encoder_age_cycles: int
 
 
+class InputStatus(TypedDict):
+    """One input of the drive that the axis acts on; `active`: it stops the axis, or is not heard any more."""
+
+    name: str
+    active: bool
+
+
+class BrakeStatus(TypedDict):
+    """The holding brake: who sequences it (none, drive, output), and what it is told or expected to do."""
+
+    by: str
+    state: str
+
+
 class MotionStatus(Age):
     """Positions in rad, velocity in rad/s, torques in N*m, all at the joint; None is not finite (JSON has no NaN).
 
     The age is that of the encoder's feedback: position, velocity, following error. The drive's own position and torque
     (`motor_position_rad`, `torque_actual_nm`) are as old as the drive's status, everything else as the loop's.
+    `abandoned` says why the last motion ended before its time, when its client let go of it; empty otherwise.
     """
 
     reference_rad: float | None
@@ -68,6 +85,7 @@ class MotionStatus(Age):
     torque_other_nm: float | None
     friction_state_rad: float | None
     disturbance_nm: float | None
+    abandoned: str
 
 
 class FaultStatus(TypedDict):
@@ -142,6 +160,19 @@ class NodeStatus(Age):
     identity: IdentityStatus | None
 
 
+class GuardStatus(TypedDict):
+    """How the drive guards itself: how soon it stops without a master, how often its guards are read again, and their
+    proof (servod.runtime.daemon.guard_test.ProofStatus)."""
+
+    unguarded: bool
+    reaction_ms: int
+    command_deadline_ms: int
+    heartbeat_timeout_ms: int
+    most_torque_nm: float | None
+    watched: int
+    proof: ProofStatus
+
+
 class GrantStatus(TypedDict):
     """One thing asked of the operating system for real time, and whether it was given."""
 
@@ -157,10 +188,11 @@ class LoopStatus(Age):
 
 
 class LeaseStatus(TypedDict):
-    """The client that commands; pid 0 when none does."""
+    """The client that commands, pid 0 when none does; and the process that stopped its axis, 0 when none did."""
 
     pid: int
     uid: int
+    stopped_by: int
 
 
 class WiringStatus(TypedDict):
@@ -173,37 +205,50 @@ class WiringStatus(TypedDict):
 
 
 class Status(TypedDict):
-    """The whole document."""
+    """The whole document; `stopping` is servod.formats.stopping.Stopping's, None where nothing tells of the joint."""
 
     name: str
     version: str
     uptime_s: float
     axis: AxisStatus
     drive: DriveStatus
+    inputs: list[InputStatus]
+    brake: BrakeStatus
     motion: MotionStatus
     faults: list[FaultStatus]
     wiring: WiringStatus
+    stopping: StoppingStatus | None
     controller: ControllerStatus
     loop: LoopStatus
     timing: TimingStatus
     bus: BusStatus
     nodes: list[NodeStatus]
+    guards: GuardStatus
     grants: list[GrantStatus]
     recorder: RecorderState
     lease: LeaseStatus
 
 
-_PROVING = "wiring is being proven"
+_BRAKE = dict.fromkeys(AxisState, "closed") | {
+    AxisState.PROVING: "open",
+    AxisState.RELEASING: "opening",
+    AxisState.ENABLED: "open",
+    AxisState.BRAKING: "open",
+    AxisState.ENGAGING: "closing",
+    AxisState.QUICK_STOPPING: "closing at rest",
+}
+#: The drive has its power; the axis is not there yet.
+_BEFORE = {AxisState.PROVING: "wiring is being proven", AxisState.RELEASING: "the brake opens"}
 
 
 def axis_status(record: CycleRecord) -> AxisStatus:
     """State, goal and reasons of one cycle."""
-    proving = record.axis_state == AxisState.PROVING  # the drive has its power; the axis is not there yet
+    before = [text for state, text in _BEFORE.items() if state == record.axis_state]
     return {
         "state": AxisState(record.axis_state).name,
         "goal": Goal(record.goal).name,
-        "goal_reached": bool(record.goal_reached) and not proving,
-        "reasons": [_PROVING] * proving + reason_texts(record.reasons),
+        "goal_reached": bool(record.goal_reached) and not before,
+        "reasons": before + reason_texts(record.reasons),
         "motion_running": bool(record.reference_active),
     }
 
@@ -254,7 +299,21 @@ def drive_status(record: CycleRecord, fresh: Freshness) -> DriveStatus:
     }
 
 
-def motion_status(record: CycleRecord, fresh: Freshness) -> MotionStatus:
+def inputs_status(inputs: InputsConfig, record: CycleRecord) -> list[InputStatus]:
+    """The configured inputs, as the loop judged them in this cycle."""
+    rows = (
+        ("estop", inputs.estop_bit is not None, FaultCode.ESTOP_ACTIVE),
+        ("sto", inputs.tells_sto, FaultCode.STO_ACTIVE),
+    )
+    return [{"name": n, "active": bool(record.faults & FAULTS[code].bit)} for n, there, code in rows if there]
+
+
+def brake_status(brake: BrakeConfig, record: CycleRecord) -> BrakeStatus:
+    """By the state of the axis, for a brake has no sensor."""
+    return {"by": brake.by, "state": "none" if brake.by == "none" else _BRAKE[AxisState(record.axis_state)]}
+
+
+def motion_status(record: CycleRecord, fresh: Freshness, abandoned: str = "") -> MotionStatus:
     """Reference, feedback and the parts of the torque."""
     return {
         **fresh.feedback(record.encoder_age),
@@ -270,6 +329,7 @@ def motion_status(record: CycleRecord, fresh: Freshness) -> MotionStatus:
         "torque_other_nm": _finite(record.torque_other_nm),
         "friction_state_rad": _finite(record.friction_state),
         "disturbance_nm": _finite(record.disturbance_nm),
+        "abandoned": abandoned,
     }
 
 

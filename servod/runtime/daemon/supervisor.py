@@ -9,8 +9,9 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
+from collections import deque
 from concurrent.futures import Future
-from typing import Any
+from typing import Any, NamedTuple
 
 from servod import __version__
 from servod.common.errors import Unreachable
@@ -19,10 +20,12 @@ from servod.common.units import NS_PER_S
 from servod.formats.config import AxisConfig
 from servod.formats.recording.incidents import Incident
 from servod.formats.recording.record import RECORD, CycleRecord
+from servod.formats.stopping import Stopping
 from servod.runtime.daemon.control_server import ControlServer
 from servod.runtime.daemon.fault_watch import FaultWatch, WiringTestWatch
 from servod.runtime.daemon.gain_bank import GainBank
-from servod.runtime.daemon.health import Health, Pulse
+from servod.runtime.daemon.health import Health, Pulse, StandingLoop
+from servod.runtime.daemon.lock import InstanceLock
 from servod.runtime.daemon.metrics import AxisMetrics, MetricsServer
 from servod.runtime.daemon.nodes import FaultRelay, Nodes
 from servod.runtime.daemon.notify import Notifier
@@ -31,13 +34,19 @@ from servod.runtime.daemon.status import (
     Freshness,
     Status,
     axis_status,
+    brake_status,
     bus_status,
     drive_status,
     fault_status,
+    inputs_status,
     motion_status,
 )
 from servod.runtime.daemon.verbs import Verbs
-from servod.runtime.loop.axis import AxisState
+from servod.runtime.daemon.waiting import Comeback, carried_by
+from servod.runtime.fieldbus.devices import DriveState
+from servod.runtime.fieldbus.master.planned import reaction_s
+from servod.runtime.fieldbus.master.sdo import SDO_TIMEOUT_S
+from servod.runtime.loop.axis_state import AxisState
 from servod.runtime.loop.cycle import GOODBYE_TIMEOUT_CYCLES
 from servod.runtime.loop.handle import LoopHandle
 
@@ -46,9 +55,29 @@ log = logging.getLogger("servod")
 TICK_S = 0.02
 #: For an orderly end, on top of what loop and drive may take.
 _STOP_MARGIN_S = 2.0
+#: Quick stop, brake, voltage off and brake again, none of them answered.
+_SILENT_S = 4 * SDO_TIMEOUT_S
+#: For a loop whose connection may be dead to see the drive off once more, before the axis begins anew.
+_LEAVE_S = 0.5
 _STATUS_NS = NS_PER_S
 _TEXTFILE_NS = 5 * NS_PER_S
 _STAYS_POWERED = FAULTS[FaultCode.DRIVE_STAYS_POWERED].bit
+
+
+class Context(NamedTuple):
+    """What outlives the supervisor, in a daemon whose axis begins anew.
+
+    `incidents` is what befell the axis; with `shown_s`, one that lost bus or nodes begins anew once they are back and
+    its fault was shown for so long. `found` befell it before this start, and was found at it; the faults `carried`,
+    as bits, are latched from before.
+    """
+
+    lock: InstanceLock
+    notifier: Notifier
+    incidents: deque[Incident]
+    shown_s: float | None = None
+    found: Incident | None = None
+    carried: int = 0
 
 
 class Supervisor:
@@ -57,44 +86,57 @@ class Supervisor:
     def __init__(
         self,
         config: AxisConfig,
+        stopping: Stopping | None,
         nodes: Nodes,
         loop: LoopHandle,
         bank: GainBank,
         recorder: Recorder,
-        notifier: Notifier,
+        context: Context,
     ) -> None:
         """The nodes are up and the loop runs. Raises Unreachable or BadInput when a socket cannot be opened."""
-        self._config, self._nodes, self._loop = config, nodes, loop
-        self._bank, self._recorder, self._notifier = bank, recorder, notifier
+        self._config, self._stated_stop, self._nodes, self._loop = config, stopping, nodes, loop
+        self._bank, self._recorder, self._notifier = bank, recorder, context.notifier
         self._started = time.monotonic()
-        self._stopping = self._textfile_failed = False
+        self._stopping = self._textfile_failed = self._lock_lost = False
+        self._lock = context.lock
         self._told_off = False
         self._why_ends = "servod was asked to end"
         self._relay = FaultRelay(loop.send)
         self._fed_cycle = -1
         self._next_feed_ns = self._next_status_ns = self._next_textfile_ns = 0
         self._pulse = Pulse(config.cycle.period_us)
+        self._standing = StandingLoop(reaction_s(config, nodes.plans.amplifier))
+        self._drive_told = False  # in this round, that it misses the loop
         self._health = Health(config.cycle.period_us, nodes.plans.bus_load)
         self._metrics = AxisMetrics(config.name, nodes.plans.bus_load)
-        self._faults = FaultWatch(recorder, self._health, self._metrics, config.name)
+        self.carried = 0  # faults that stay latched when the axis begins anew
+        self._faults = FaultWatch(
+            recorder, self._health, self._metrics, config.name, context.incidents, context.carried
+        )
+        if context.found is not None:
+            self._faults.tell_earlier(context.found)
         self._proofs = WiringTestWatch(loop, recorder)
-        self._verbs = Verbs(config, loop, bank, recorder, self._document, self._tell_faults)
+        self._verbs = Verbs(config, loop, bank, recorder, self._document, self._tell_faults, nodes.of_ours, nodes.proof)
+        self._comeback = (
+            Comeback(config, self._verbs.slow, nodes.of_ours, context.shown_s) if context.shown_s is not None else None
+        )
         self._server = ControlServer(config.control, self._verbs, loop.feed)
         self._metrics_server = MetricsServer(config.metrics, self._metrics)
-
-    def tell_earlier(self, incident: Incident) -> None:
-        """What befell the axis before this start, and was found at it."""
-        self._faults.tell_earlier(incident)
 
     def request_stop(self) -> None:
         """Ask for an orderly end; for signal handlers."""
         self._stopping = True
 
-    def run(self) -> int:
-        """Supervise until asked to stop (0) or until the loop is lost (3)."""
+    @property
+    def stopping(self) -> bool:
+        """An orderly end was asked for."""
+        return self._stopping
+
+    def run(self) -> int | None:
+        """Supervise until asked to stop (0), until the loop is lost (3), or until the axis shall begin anew (None)."""
         return asyncio.run(self._supervise())
 
-    async def _supervise(self) -> int:
+    async def _supervise(self) -> int | None:
         self._server.begin()
         self._notifier.ready(f"{self._config.name}: the loop runs, the axis is disabled")
         try:
@@ -102,6 +144,9 @@ class Supervisor:
                 self._round(time.monotonic_ns())
                 if self._loop_is_lost():
                     return self._lose_loop()
+                if self._comeback and self._comeback.see(self._loop.latest, time.monotonic_ns()):
+                    self._leave_for_new()
+                    return None
                 await asyncio.sleep(TICK_S)
             return self._stop()
         finally:
@@ -113,6 +158,7 @@ class Supervisor:
         records = self._take_records(now_ns)
         self._pulse.look(bool(records), now_ns)
         self._take_node_events()
+        self._stop_past_standing_loop(bool(records), now_ns)
         self._switch_off_if_disobeyed(records)
         self._verbs.tick(records, now_ns)
         self._faults.tick(now_ns)
@@ -135,23 +181,40 @@ class Supervisor:
 
     def _take_node_events(self) -> None:
         """Node events, and what came corrupt from the loop, become faults of the loop in its next cycle."""
-        for event in self._nodes.events():
-            log.error("%s (%s)", event.text, event.fault.name)
-            self._recorder.add_event("node", event.text, node_id=event.node_id, fault=event.fault.name)
-            self._relay.add(event.fault)
+        self._note_node_events()
         if self._loop.take_corrupt():
             log.error("what the loop wrote into the shared memory came corrupt (%s)", FaultCode.CHANNEL_CORRUPT.name)
             self._relay.add(FaultCode.CHANNEL_CORRUPT)
         self._relay.flush()
 
+    def _note_node_events(self) -> None:
+        for event in self._nodes.events():
+            log.error("%s (%s)", event.text, event.fault.name)
+            self._recorder.add_event("node", event.text, node_id=event.node_id, fault=event.fault.name)
+            self._relay.add(event.fault)
+            self._drive_told = self._drive_told or self._nodes.told_to_miss_us(event)
+
+    def _stop_past_standing_loop(self, wrote: bool, now_ns: int) -> None:
+        """The drive stops by itself or holds its last torque, and the brake is open: at once, beside the rounds. A loop
+        that wakes is told; one that does not is lost (`_loop_is_lost`)."""
+        told, self._drive_told = self._drive_told, False
+        latest = self._loop.latest
+        if not self._standing.look(wrote, told, now_ns) or latest is None:
+            return
+        if AxisState(latest.axis_state).stopped and not DriveState(latest.drive_state).commanded:
+            return
+        log.error("the loop stands still%s: stopping the drive by SDO", " and the drive misses it" if told else "")
+        self._relay.add(FaultCode.LOOP_LOST)
+        asyncio.get_running_loop().run_in_executor(None, self._nodes.stop_past_loop)
+
     def _switch_off_if_disobeyed(self, records: list[CycleRecord]) -> None:
-        """The loop's goal OFF did not reach the drive: by SDO and NMT, once. A drive that answers neither holds this
-        up for longer than the loop waits for us; it then ends, which is all that is left to do."""
+        """The loop's goal did not reach the drive: by SDO and NMT, once. Beside the rounds: the way to rest and the
+        brake take longer than the loop and the watchdog wait for those."""
         if self._told_off or not any(record.faults & _STAYS_POWERED for record in records):
             return
         self._told_off = True
         log.error("the drive stays powered: switching it off by SDO and NMT pre-operational")
-        self._nodes.switch_off()
+        asyncio.get_running_loop().run_in_executor(None, self._nodes.stop_axis)
 
     def _tell_manager(self, now_ns: int) -> None:
         """Feed the watchdog only when the loop has gone on since the last time."""
@@ -162,7 +225,17 @@ class Supervisor:
             self._notifier.alive()
         if now_ns >= self._next_status_ns and latest:
             self._next_status_ns = now_ns + _STATUS_NS
+            self._keep_lock()
             self._notifier.status(f"{AxisState(latest.axis_state).name}; {self._health.line()}")
+
+    def _keep_lock(self) -> None:
+        """What a second daemon would take is ours all the time; one that has it already is told of, once."""
+        try:
+            self._lock.keep()
+        except Unreachable as error:
+            if not self._lock_lost:
+                log.error("a lock was removed, and is not ours any more: %s", error)
+            self._lock_lost = True
 
     def _write_textfile(self, now_ns: int) -> None:
         if self._config.metrics.textfile is not None and now_ns >= self._next_textfile_ns:
@@ -183,10 +256,12 @@ class Supervisor:
         return not self._loop.alive() or self._pulse.stopped
 
     def _lose_loop(self) -> int:
-        """The loop died or hangs: the drive off before anything else, then tell, then end for systemd to restart."""
+        """The loop died or hangs: the drive brakes before anything else, and is off at rest; then tell, then end for
+        systemd to restart. Voltage off at once would let the joint coast."""
         hung = self._loop.alive()
-        self._nodes.switch_off()
-        exit_code = self._loop.stop(0.0)
+        self._tell_stopping()  # before anything that a silent drive may hold up
+        exit_code = self._loop.stop(0.0)  # one that hangs may wake and command again
+        self._nodes.stop_axis()
         self._take_records(time.monotonic_ns())
         words = " / ".join(self._loop.last_words().strip().splitlines()[-3:])
         detail = "it hung" if hung else f"exit code {exit_code}"
@@ -201,19 +276,41 @@ class Supervisor:
         timeout_s = self._stop_timeout_s()
         self._notifier.stopping(timeout_s + _STOP_MARGIN_S)
         exit_code = self._loop.stop(timeout_s)
+        if exit_code != 0:
+            self._tell_stopping()
+            self._nodes.stop_axis()
         self._take_records(time.monotonic_ns())
         if exit_code != 0:
-            self._nodes.switch_off()
             log.error("the loop did not see the drive off (exit code %d); 0x1016 is left as it is", exit_code)
             return Unreachable.exit_code
         self._nodes.stand_down()
         log.info("stopped; the axis is disabled")
         return 0
 
+    def _tell_stopping(self) -> None:
+        """To systemd: how long braking by SDO may take, and time-outs of a drive that does not answer."""
+        amplifier = self._config.amplifier
+        self._notifier.stopping(amplifier.enable_timeout_s + amplifier.brake.engage_s + _STOP_MARGIN_S + _SILENT_S)
+
+    def _leave_for_new(self) -> None:
+        """Bus and nodes are back, the drive shows no power. The loop ends, in order where its own connection lives."""
+        self._why_ends = "servod begins anew, for bus and nodes are back; connect again"
+        log.warning("bus and nodes are back: bringing the axis up anew, disabled")
+        self._recorder.add_event("node", "bus and nodes are back: the axis begins anew, disabled")
+        exit_code = self._loop.stop(_LEAVE_S)
+        self._take_records(time.monotonic_ns())
+        self._note_node_events()
+        latched = self._loop.latest.faults_latched if self._loop.latest else 0
+        before = self._comeback.before if self._comeback else 0
+        self.carried = carried_by(latched | self._relay.waiting, before)
+        if exit_code == 0:
+            self._nodes.stand_down()
+
     def _stop_timeout_s(self) -> float:
         """Braking and ramping, or the drive's quick stop, and then the wait for a drive that shall show it is off."""
         goodbye_s = GOODBYE_TIMEOUT_CYCLES * self._config.cycle.period_us * 1e-6
-        motion_s = 2.0 * self._config.limits.ramp_down_s + self._config.amplifier.enable_timeout_s
+        amplifier = self._config.amplifier
+        motion_s = 2.0 * self._config.limits.ramp_down_s + amplifier.enable_timeout_s + amplifier.brake.engage_s
         return motion_s + goodbye_s + _STOP_MARGIN_S
 
     def _close(self) -> None:
@@ -240,14 +337,18 @@ class Supervisor:
             "uptime_s": time.monotonic() - self._started,
             "axis": axis_status(latest),
             "drive": drive_status(latest, fresh),
-            "motion": motion_status(latest, fresh),
+            "inputs": inputs_status(self._config.amplifier.inputs, latest),
+            "brake": brake_status(self._config.amplifier.brake, latest),
+            "motion": motion_status(latest, fresh, self._verbs.abandoned),
             "faults": fault_status(latest),
             "wiring": self._proofs.status(),
+            "stopping": None if self._stated_stop is None else self._stated_stop.document(),
             "controller": self._bank.describe(latest.controller),
             "loop": {"pid": self._loop.pid, **fresh.record()},
             "timing": self._health.timing(self._loop.lost),
             "bus": bus_status(self._config.bus, self._nodes.plans.bus_load, latest),
             "nodes": self._nodes.status(),
+            "guards": self._nodes.guards(),
             "grants": [{"name": g.name, "granted": g.granted, "reason": g.reason} for g in self._loop.grants],
             "recorder": self._recorder.state(),
             "lease": self._server.lease(),

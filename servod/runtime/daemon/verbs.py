@@ -7,6 +7,7 @@ or bus work runs in one slow thread.
 from __future__ import annotations
 
 import base64
+import contextlib
 import logging
 import math
 import time
@@ -37,14 +38,16 @@ from servod.runtime.daemon.arguments import (
 )
 from servod.runtime.daemon.connection import Reply
 from servod.runtime.daemon.gain_bank import GainBank
+from servod.runtime.daemon.guard_test import ProofStatus, require_proof
 from servod.runtime.daemon.recorder import Recorder
 from servod.runtime.daemon.requests import Request, Requests, SentOrder, Waits, work_of
 from servod.runtime.daemon.status import reason_texts
 from servod.runtime.daemon.trajectory import MotionTable, check_motion
+from servod.runtime.fieldbus.bus import Bus
 from servod.runtime.fieldbus.bus.open import open_bus
 from servod.runtime.fieldbus.devices import DriveState
 from servod.runtime.fieldbus.master.scan import scan
-from servod.runtime.loop.axis import AxisState
+from servod.runtime.loop.axis_state import AxisState
 from servod.runtime.loop.commands import REFUSAL_TEXT, Op, Refusal
 from servod.runtime.loop.handle import LoopHandle
 from servod.runtime.loop.wiring.findings import wiring_document, wiring_sentence
@@ -67,14 +70,19 @@ class Verbs:
         recorder: Recorder,
         document: Callable[[], dict[str, Any]],
         faults: Callable[[], dict[str, Any]],
+        of_ours: Callable[[Bus], Bus],
+        proof: Callable[[], ProofStatus],
     ) -> None:
-        """`document` makes the status document, `faults` that of what befell the axis."""
+        """`document` makes the status document, `faults` that of what befell the axis, `proof` that of the drive's
+        guards; `of_ours` makes a connection to the bus known as one of the daemon's."""
         self._config, self._loop, self._bank, self._recorder = config, loop, bank, recorder
-        self._document, self._faults = document, faults
+        self._document, self._faults, self._of_ours, self._proof = document, faults, of_ours, proof
         self._waits, self._requests = Waits(), Requests()
         self._last: tuple[Op, SentOrder] | None = None
         self._uploaded = MotionTable()
         self._reference_seq = 0  # the last motion's command
+        self._renew_ns: int | None = None  # of that motion
+        self.abandoned = ""  # why that motion ended before its time, when its client let go of it
         self._leases_ended = 0
         self._enabling = 0  # requests to enable an axis that was off, without an answer yet
         self.slow = ThreadPoolExecutor(max_workers=1, thread_name_prefix="slow")
@@ -110,6 +118,19 @@ class Verbs:
         """A motion runs, or its command is on the way; until then the trajectory area must not change."""
         record = self._loop.latest
         return record is not None and (record.command_seq < self._reference_seq or bool(record.reference_active))
+
+    @property
+    def renew_ns(self) -> int | None:
+        """How long the motion that runs goes on without a word of its client; None: for good, or there is none."""
+        return self._renew_ns if not self.abandoned and self.motion_running() else None
+
+    def abandon_motion(self, why: str) -> None:
+        """Bring the reference to rest, and end the motion there; the axis stays enabled and holds."""
+        with contextlib.suppress(Unreachable):  # a queue that is full now is not so in the next round
+            self._send(Op.HALT, (1.0, 1.0))
+            self.abandoned = f"the motion was halted: {why}"
+            log.warning("%s", self.abandoned)
+            self._recorder.add_event("motion", self.abandoned)
 
     def lease_ended(self) -> None:
         """Samples that the client sent ahead are void, a gain set that it tried is not kept, nor is an axis enabled
@@ -172,6 +193,7 @@ class Verbs:
         return {"last": serial, "records": base64.b64encode(raw).decode(), "count_rad": count_rad}
 
     async def _enable(self, args: EnableArgs) -> dict[str, Any]:
+        require_proof(self._proof())
         record = self._loop.latest
         from_off = int(record is None or not AxisState(record.axis_state).under_way)
         self._enabling += from_off
@@ -185,8 +207,10 @@ class Verbs:
         asked = await self._send(Op.ENABLE, (float(args.reset_fault), float(args.prove)))
         if asked.command_result < 0:
             await self._send(Op.CONFIRM, (asked.command_result,))
-        timeout_s = self._config.amplifier.enable_timeout_s + self._config.wiring_proof.timeout_s + 1.0
-        record = await self._until(lambda r: not AxisState(r.axis_state).starting, timeout_s)
+        amplifier = self._config.amplifier
+        times_s = amplifier.enable_timeout_s, amplifier.brake.release_s, self._config.wiring_proof.timeout_s
+        timeout_s = sum(times_s) + 1.0
+        record = await self._until(lambda r: not AxisState(r.axis_state).arriving, timeout_s)
         tests, proof = self._loop.proofs
         tested = proof if tests != tests_before else None
         if record.axis_state == AxisState.ENABLED:
@@ -198,11 +222,11 @@ class Verbs:
 
     async def _disable(self, _args: NoArgs) -> dict[str, Any]:
         await self._send_stop(Op.DISABLE)
-        return await self._until_off(2.0 * self._config.limits.ramp_down_s)
+        return await self._until_off(2.0 * self._config.limits.ramp_down_s + self._config.amplifier.brake.engage_s)
 
     async def _stop(self, _args: NoArgs) -> dict[str, Any]:
         await self._send_stop(Op.QUICK_STOP)
-        return await self._until_off(self._config.amplifier.enable_timeout_s)
+        return await self._until_off(self._config.amplifier.enable_timeout_s + self._config.amplifier.brake.engage_s)
 
     async def _until_off(self, usual_s: float) -> dict[str, Any]:
         """Done only when the axis has stopped and the drive itself was seen without power."""
@@ -233,7 +257,8 @@ class Verbs:
         if args.has_table:
             self._loop.write_trajectory(table.area())
         wait = self._send(Op.REFERENCE, reference)
-        self._reference_seq = wait.seq
+        self._reference_seq, self.abandoned = wait.seq, ""
+        self._renew_ns = None if args.renew_s is None else round(args.renew_s * NS_PER_S)
         record = await wait
         return {**_state(record), "kind": args.kind, "duration_s": duration_s}
 
@@ -303,7 +328,7 @@ class Verbs:
 
     def _scan_bus(self) -> list[dict[str, Any]]:
         """In the slow thread, on a connection of its own, which `scan` closes; no LSS beside a running loop."""
-        return [asdict(node) for node in scan(open_bus(self._config.bus), WallClock(), lss=False)]
+        return [asdict(node) for node in scan(self._of_ours(open_bus(self._config.bus)), WallClock(), lss=False)]
 
 
 def _state(record: CycleRecord) -> dict[str, Any]:

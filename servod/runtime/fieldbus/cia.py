@@ -134,6 +134,8 @@ class Obj402(IntEnum):
     FOLLOWING_WINDOW = 0x6065
     FOLLOWING_TIME_OUT = 0x6066
     VELOCITY_ACTUAL = 0x606C
+    VELOCITY_THRESHOLD = 0x606F
+    VELOCITY_THRESHOLD_TIME = 0x6070
     TARGET_TORQUE = 0x6071
     MAX_TORQUE = 0x6072
     MAX_CURRENT = 0x6073
@@ -144,19 +146,24 @@ class Obj402(IntEnum):
     CURRENT_ACTUAL = 0x6078
     DC_LINK_VOLTAGE = 0x6079
     TARGET_POSITION = 0x607A
+    POSITION_LIMITS = 0x607D
     POLARITY = 0x607E
+    MAX_PROFILE_VELOCITY = 0x607F
     MAX_MOTOR_SPEED = 0x6080
+    PROFILE_DECELERATION = 0x6084
     QUICK_STOP_DECELERATION = 0x6085
     TORQUE_SLOPE = 0x6087
     ENCODER_RESOLUTION = 0x608F
     GEAR_RATIO = 0x6091
     FEED = 0x6092
+    VELOCITY_UNIT = 0x60A9
     TORQUE_OFFSET = 0x60B2
     INTERPOLATION_PERIOD = 0x60C2
     POSITIVE_TORQUE_LIMIT = 0x60E0
     NEGATIVE_TORQUE_LIMIT = 0x60E1
     FOLLOWING_ERROR_ACTUAL = 0x60F4
     DIGITAL_INPUTS = 0x60FD
+    DIGITAL_OUTPUTS = 0x60FE
     TARGET_VELOCITY = 0x60FF
     SUPPORTED_MODES = 0x6502
 
@@ -195,7 +202,7 @@ ACTING_OBJECTS = frozenset(
         0x60B1,  # velocity offset
         0x60B8,  # touch probe function
         0x60C1,  # interpolation data record
-        0x60FE,  # digital outputs, the brake among them
+        Obj402.DIGITAL_OUTPUTS,  # the brake among them
         Obj406.PRESET,
         0x6010,  # preset values of an encoder with several channels
     }
@@ -222,6 +229,15 @@ STATUS_WORD_TABLE: tuple[tuple[int, int, DriveState], ...] = (
     (0x4F, 0x0F, DriveState.FAULT_REACTION_ACTIVE),
     (0x4F, 0x08, DriveState.FAULT),
 )
+
+
+def decode_status_word(status_word: int) -> DriveState:
+    """State of a status word by the table of CiA 402; a word that matches no row is UNKNOWN, never a guess."""
+    for mask, value, state in STATUS_WORD_TABLE:
+        if status_word & mask == value:
+            return state
+    return DriveState.UNKNOWN
+
 
 SW_VOLTAGE_ENABLED = 1 << 4
 SW_QUICK_STOP = 1 << 5  # active low

@@ -12,7 +12,8 @@ Amplifier
  2. `write` is asked every cycle and always gives exactly one frame that fits the mapping. Torque is encoded only when
     the present state is OPERATION_ENABLED and the goal is ENABLED; in every other case the frame carries zero torque.
     One exception: going back from quick stop (transition 16) the drive holds the load, so the frame then carries the
-    torque now produced.
+    torque now produced. A brake by output is released only on request, and only in OPERATION_ENABLED or
+    QUICK_STOP_ACTIVE.
  3. The control word is planned from the present state and the goal alone. A transient state may never be seen.
     After a state change was asked for, the driver waits HANDSHAKE_SYNCS cycles before it judges.
  4. A fault is reset only by an explicit `reset_fault` request: one rising edge for each request.
@@ -25,7 +26,7 @@ Encoder
     one it is at least NEVER_CYCLES.
 Both
  9. What comes by event timer (mode, alarms) has an age too: away for three event timers it is no longer taken for true.
-    An amplifier that is enabled then shows Mode.NONE, an encoder shows ALARMS_STALE.
+    An amplifier that is enabled then shows Mode.NONE, its configured inputs are active, an encoder shows ALARMS_STALE.
 """
 
 from __future__ import annotations
@@ -143,6 +144,14 @@ REASON_TEXT: dict[Reason, str] = {
 }
 
 
+class DriveInput(IntFlag):
+    """What the drive's inputs say that stops the axis (amplifier.inputs)."""
+
+    ESTOP = 1
+    STO = 2  # the circuit is open now
+    STO_TOLD = 4  # the drive is in fault, and its error code says that STO was it
+
+
 class AmplifierFeedback(NamedTuple):
     """What the amplifier said last, in SI units of the joint."""
 
@@ -156,6 +165,7 @@ class AmplifierFeedback(NamedTuple):
     error_code: int  # 0x603F or EMCY, the last that was heard; 0 when none
     goal_reached: bool
     reasons: int  # bits of Reason
+    inputs: int = 0  # bits of DriveInput that are active; all that are configured when they are not heard any more
 
 
 class EncoderFeedback(NamedTuple):
@@ -175,6 +185,7 @@ class AmplifierCommand(NamedTuple):
     torque_nm: float
     halt: bool = False
     reset_fault: bool = False
+    release_brake: bool = False  # only of a brake by output; acts while the drive gives torque
     setpoint: float = 0.0  # joint position_rad (csp, pp) or velocity_rad_s (csv); not used in cst
 
 
@@ -300,8 +311,25 @@ class Setup(Protocol):
 
 
 @runtime_checkable
+class GuardedSetup(Setup, Protocol):
+    """Set-up face of a drive that keeps limits by itself."""
+
+    def guard_positions(self, sdo: SdoAccess, plan: NodePlan, joint_rad: float) -> list[str]:
+        """Write its position limits, with the joint at `joint_rad` now; into the plan's facts. Notes."""
+        ...
+
+    def put_back(self, sdo: SdoAccess, plan: NodePlan) -> None:
+        """Its limits as they were before `configure`; only while it has no torque."""
+        ...
+
+
+@runtime_checkable
 class PresetSetup(Setup, Protocol):
     """Set-up face of a position sensor whose zero can be set in the device."""
+
+    def position_rad(self, sdo: SdoAccess) -> float:
+        """Where the joint stands."""
+        ...
 
     def preset(self, sdo: SdoAccess, position_rad: float) -> int:
         """Make the present position of the joint read `position_rad`; the counts that were written.

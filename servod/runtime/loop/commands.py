@@ -19,7 +19,7 @@ class Op(IntEnum):
     # for a CONFIRM
     DISABLE = 2  # [] ramp down, then disable
     QUICK_STOP = 3  # []
-    HALT = 4  # [0/1] stop the reference and hold / go on
+    HALT = 4  # [0/1, 0/1] stop the reference and hold / go on; with the second, the motion ends there
     CONFIRM = 5  # [the result of the ENABLE before it]: a second message, so that no single one enables
     ACTIVATE = 6  # [serial, law, n_params, params...]: bumpless change of the controller
     REFERENCE = 7  # [ReferenceKind, arguments...]
@@ -57,6 +57,8 @@ class Refusal(IntEnum):
     JUMPS = 10
     NOT_CONFIRMED = 11
     CORRUPT = 12
+    ESTOP_ACTIVE = 13
+    STO_ACTIVE = 14
 
 
 REFUSAL_TEXT: dict[Refusal, str] = {
@@ -65,12 +67,15 @@ REFUSAL_TEXT: dict[Refusal, str] = {
     Refusal.MOTION_RUNNING: "a motion is running; `servoctl stop` ends it",
     Refusal.BAD_ARGUMENT: "an argument is not a finite number or out of range",
     Refusal.OUT_OF_RANGE: "the motion would leave limits.position_min_rad to position_max_rad",
-    Refusal.NEEDS_RESTART: "a node or the bus was lost; the nodes must be configured anew: restart the daemon",
+    Refusal.NEEDS_RESTART: "a node or the bus was lost; the nodes must be configured anew: the service does so by "
+    "itself once they answer; else restart the daemon",
     Refusal.OUTSIDE_LIMITS: "the joint is outside limits.position_min_rad to position_max_rad; move it back by hand",
     Refusal.TOO_FAST: "the motion would be faster than limits.speed_rad_s",
     Refusal.PROVES_ONLY_FROM_OFF: "the wiring is proven on the way from off to on; run `servoctl disable` first",
     Refusal.JUMPS: "the reference would jump further from the joint than limits.following_error_rad",
     Refusal.NOT_CONFIRMED: "another command came between the request to enable and its confirmation; try again",
+    Refusal.ESTOP_ACTIVE: "the emergency stop is active, or its input (0x60FD) is not heard; release it first",
+    Refusal.STO_ACTIVE: "the STO circuit is open, or its input (0x60FD) is not heard; close it first",
     Refusal.CORRUPT: "the command came to the loop corrupt or too late; see CHANNEL_CORRUPT in `servoctl faults`",
 }
 

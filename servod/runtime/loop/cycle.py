@@ -18,7 +18,9 @@ from servod.kernels.motions import Samples
 from servod.runtime.fieldbus.bus import Bus
 from servod.runtime.fieldbus.devices import AmplifierCommand, AmplifierFeedback, EncoderFeedback, Goal, Mode
 from servod.runtime.fieldbus.registry import amplifier_of, encoder_of
-from servod.runtime.loop.axis import Axis, AxisOutput, AxisState
+from servod.runtime.loop.axis import Axis, AxisOutput
+from servod.runtime.loop.axis_state import AxisState
+from servod.runtime.loop.brake import BrakeTimes, rest_rad
 from servod.runtime.loop.commands import Command
 from servod.runtime.loop.controller import Controller
 from servod.runtime.loop.exchange import Exchange
@@ -35,6 +37,7 @@ _NOT_PROVEN = FAULTS[FaultCode.WIRING_NOT_PROVEN].bit
 #: At a shutdown the drive must be seen without power for so many cycles, and has so many to get there.
 GOODBYE_CYCLES = 20
 GOODBYE_TIMEOUT_CYCLES = 1000
+_STAYS = 4  # 0x605A: the options beyond hold in quick stop active
 #: How long a drive stays in NMT stopped before it is asked to be pre-operational.
 _STOPPED_CYCLES = 5
 
@@ -90,9 +93,14 @@ class Cycle:
         self.exchange = Exchange(bus, clock, self.amplifier, self.encoder, plan)
         self.axis = Axis(
             self._period_s, config.limits.ramp_down_s, config.amplifier.enable_timeout_s, Mode.CYCLIC_SYNC_TORQUE,
-            config.wiring_proof.timeout_s,
+            config.wiring_proof.timeout_s, config.amplifier.inputs.tells_sto,
+            BrakeTimes.of(config.amplifier), config.limits.stale_cycles,
+            rest_rad(config.amplifier) if config.amplifier.quick_stop_option > _STAYS else None,
         )  # fmt: skip
-        self.limits = Limits(config.limits)
+        self.axis.carry(plan.carried)
+        self.limits = Limits(config.limits, plan.stop)
+        self._limit_nm = self.limits.torque_nm
+        self._drive_limit_nm = float(plan.amplifier.facts.get("most_torque_nm", self._limit_nm))
         bounds = wiring_test_bounds(config, plan.amplifier.facts)
         self.proof, self._proof_travel_rad = WiringTest(bounds), bounds.most_travel_rad
         self.controller = Controller()
@@ -105,6 +113,7 @@ class Cycle:
         self.shutting_down = self.finished = self.seen_off = False
         self.torque_nm = self.encoder_position_rad = 0.0
         self._ramp_from_nm = 0.0
+        self._opening = False  # before the test of the wiring the brake opens
         self._heartbeat_every = max(
             _STOPPED_CYCLES + 1, config.heartbeat.master_period_ms * 1000 // config.cycle.period_us
         )
@@ -112,6 +121,11 @@ class Cycle:
         self._last_sync_ns = self.exchange.sync_ns - self.period_ns
         self._command_seq = self._command_result = 0
         self._tick_ns = self._torque_sent_ns = self._goodbye = self._resting = self._withdrawn = 0
+
+    def stand_still(self, periods: int) -> None:
+        """So many periods went by without a cycle, in virtual time, and nobody was late."""
+        self._number += periods
+        self._missed += periods
 
     def step(self, deadline_ns: int, woke_ns: int, skipped: int) -> None:
         """One cycle; `skipped` periods were missed before it."""
@@ -124,8 +138,10 @@ class Cycle:
         amplifier, encoder = self.amplifier.read(), self.encoder.read()
         dt_s = self._interval_s(sync_ns)
         self.encoder_position_rad = encoder.position_rad
+        self.limits.look(amplifier, encoder, dt_s)
         faults = self._faults(amplifier, encoder, skipped)
-        output = self.axis.step(amplifier, encoder.age_cycles == 0, faults, self.reference.at_rest)
+        moving = self.limits.moving(encoder)
+        output = self.axis.step(amplifier, encoder.age_cycles == 0, faults, self.reference.at_rest, moving)
         torque = self._torque(output, amplifier, encoder, dt_s)
         sent_nm = self._send(torque.limited, output)
         self._torque_sent_ns = self.clock.now_ns() - deadline_ns
@@ -152,7 +168,9 @@ class Cycle:
         if self.axis.state.powered:
             followed = self.reference.position_rad if self.axis.state.following else None
             faults |= self.limits.motion_faults(amplifier, encoder, followed)
-        if self.proof.running:
+            if followed is not None:
+                faults |= self.limits.torque_faults(amplifier)
+        if self.proof.running or self._opening:
             faults |= self.limits.proving_faults(encoder, self._proof_travel_rad)
         if not self._supervisor_alive():
             faults |= _SUPERVISOR_LOST
@@ -166,6 +184,7 @@ class Cycle:
         if self.axis.state == AxisState.PROVING:
             return self._prove(amplifier, encoder, dt_s)
         if not output.controlled:
+            self._opening = False
             self._rest(encoder)
             return _NO_TORQUE
         if output.just_enabled:
@@ -194,7 +213,15 @@ class Cycle:
     def _prove(self, amplifier: AmplifierFeedback, encoder: EncoderFeedback, dt_s: float) -> _Torque:
         """In place of the controller, before the first torque: the bounded test of the wiring."""
         proof = self.proof
+        if not self.axis.brake_open:  # what moves a joint without torque meanwhile, ends it (proving_faults)
+            if not self._opening:
+                self.limits.arm(amplifier, encoder)
+            self._opening = True
+            self._rest(encoder)
+            return _NO_TORQUE
+        self._opening = False
         if not proof.running and proof.verdict is None:
+            self.limits.torque_nm = self._limit_nm  # the drive's own limit rests on a scale that is not proven yet
             self.limits.arm(amplifier, encoder)
             self.limits.release()  # what 0x6077 shows is not proven yet
             self.reference.hold(encoder.position_rad)
@@ -217,6 +244,7 @@ class Cycle:
 
     def _seed(self, amplifier: AmplifierFeedback, encoder: EncoderFeedback) -> None:
         """First controlled cycle: stay where the joint is, go on from the torque that is produced now."""
+        self.limits.torque_nm = self._drive_limit_nm  # more would be clipped there, unseen by the law
         self.limits.arm(amplifier, encoder)
         self.torque_nm = self._ramp_from_nm = amplifier.torque_nm
         self.reference.hold(encoder.position_rad)
@@ -238,7 +266,7 @@ class Cycle:
         """
         goal = self.axis.goal
         torque_nm = wanted_nm if goal == Goal.ENABLED else 0.0
-        command = AmplifierCommand(goal, torque_nm, False, output.reset_fault)
+        command = AmplifierCommand(goal, torque_nm, False, output.reset_fault, self.axis.release_brake)
         self.exchange.send(*self.amplifier.write(command))
         if self.axis.unheard:
             self._withdraw()
@@ -248,9 +276,9 @@ class Cycle:
         return torque_nm
 
     def _withdraw(self) -> None:
-        """The control word does not stop the drive: NMT shall, whose identifier is another, and so shall its own
-        consumer (0x1016), which misses our heartbeat from now on. NMT stop is what 0x6007 reacts to (CiA 402-2); in
-        pre-operational, a few cycles later, the drive answers SDO again.
+        """The control word does not stop the drive: NMT shall, whose identifier is another and which needs no SYNC, and
+        so shall its own consumer (0x1016), which misses our heartbeat from now on. NMT stop is what 0x6007 reacts to
+        (CiA 402-2); in pre-operational, a few cycles later, the drive answers SDO again.
         """
         if self._withdrawn == 0:
             self.exchange.stop_drive()
@@ -300,4 +328,4 @@ class Cycle:
 
     def let_go(self) -> None:
         """Last frame of a loop that ends in an error: voltage off, without waiting for an answer."""
-        self.exchange.send(*self.amplifier.write(AmplifierCommand(Goal.OFF, 0.0)))
+        self.exchange.send_last(*self.amplifier.write(AmplifierCommand(Goal.OFF, 0.0)))

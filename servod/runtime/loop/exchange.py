@@ -5,32 +5,61 @@ from __future__ import annotations
 from servod.common.clock import Clock
 from servod.common.faults import FAULTS, FaultCode
 from servod.common.units import NS_PER_S
-from servod.runtime.fieldbus.bus import Bus
-from servod.runtime.fieldbus.cia import HEARTBEAT_BASE, NMT_ID, SYNC_ID, NmtCommand, NmtState
+from servod.runtime.fieldbus.bus import Bus, Frame
+from servod.runtime.fieldbus.cia import (
+    HEARTBEAT_BASE,
+    LSS_FROM_SLAVE_ID,
+    LSS_TO_SLAVE_ID,
+    NMT_ID,
+    RPDO_BASE,
+    SYNC_ID,
+    TIME_ID,
+    TPDO_BASE,
+    NmtCommand,
+    NmtState,
+)
 from servod.runtime.fieldbus.devices import Amplifier, Encoder, NodePlan
 from servod.runtime.loop.plan import LoopPlan
 
-_BUS_OFF, _BUS_DOWN, _QUEUE_FULL, _SECOND_MASTER = (
-    FAULTS[c].bit for c in (FaultCode.BUS_OFF, FaultCode.BUS_DOWN, FaultCode.BUS_QUEUE_FULL, FaultCode.SECOND_MASTER)
+_BUS_OFF, _BUS_DOWN, _QUEUE_FULL = (
+    FAULTS[c].bit for c in (FaultCode.BUS_OFF, FaultCode.BUS_DOWN, FaultCode.BUS_QUEUE_FULL)
 )
+_SECOND_MASTER, _FOREIGN_FEEDBACK = (FAULTS[c].bit for c in (FaultCode.SECOND_MASTER, FaultCode.FOREIGN_FEEDBACK))
 _OPERATIONAL = bytes([NmtState.OPERATIONAL])
 #: A cycle takes at most this many frames from the socket, so that a babbling node cannot hold the loop.
 MAX_FRAMES = 64
+#: Feedback that is missing stays owed, since a bus that stalls delivers it later. What is still owed after so many
+#: cycles in a row with all feedback in time is lost. Silence forgives nothing: what was held up may come after it.
+#: One frame stays owed: a node that answers by a clock of its own may be a cycle behind all the while, which looks the
+#: same, and sends two in one cycle when it catches up.
+_PUNCTUAL_CYCLES = 100
+#: A controller that did not see its frame acknowledged by all sends it once more, at once, and who had taken it has it
+#: twice (ISO 11898-1: the last bit of end of frame). The same data within some three frames is that, and not foreign.
+_REPEATED_BITS = 500
 
 
 class Exchange:
-    """The loop's own connection to the bus, and which frame belongs to which device."""
+    """The loop's own connection to the bus: which frame belongs to which device, and which to nobody here.
+
+    A connection never hears its own frames. So what has the identifier of a master comes from another one, from
+    whatever machine. Of each synchronous frame of the nodes one is owed for each SYNC; one more is foreign. So is a
+    PDO of theirs that was switched off.
+    """
 
     def __init__(self, bus: Bus, clock: Clock, amplifier: Amplifier, encoder: Encoder, plan: LoopPlan) -> None:
         """Frames of other nodes are read and dropped."""
         self._bus, self._clock = bus, clock
         self._receivers = {i: device for device in (amplifier, encoder) for i in device.receive_ids}
         self._sync_frames = amplifier.sync_frames + encoder.sync_frames
-        self._sync_ids = _synchronous_ids(plan.amplifier) | _synchronous_ids(plan.encoder)
         self._amplifier_id = plan.amplifier.node_id
         self._heartbeat_id = HEARTBEAT_BASE + plan.config.heartbeat.master_node_id
-        self._ours = frozenset({SYNC_ID, self._heartbeat_id, *(p.cob_id for p in plan.amplifier.pdos if p.receive)})
-        self._others_frames = 0  # with identifiers that are ours, since the last look
+        self._strangers = dict.fromkeys(_master_ids(plan) | {self._heartbeat_id}, _SECOND_MASTER)
+        self._strangers |= dict.fromkeys(_unplanned_ids(plan), _FOREIGN_FEEDBACK)
+        self._owed = dict.fromkeys(_synchronous_ids(plan.amplifier) | _synchronous_ids(plan.encoder), 0)
+        self._newest: dict[int, Frame] = {}
+        self._repeated_ns = _REPEATED_BITS * NS_PER_S // plan.config.bus.bit_rate
+        self._punctual = 0  # cycles in a row with all feedback in time and none late
+        self._foreign = 0  # fault bits of what others sent, since the last look
         self.late_frames = 0
         self._queue_full = self._bus_off_events = self._down_events = 0
         self.sync_ns = clock.now_ns()
@@ -38,8 +67,15 @@ class Exchange:
     def sync(self) -> int:
         """Take what came since the last cycle, send SYNC, and return the moment of it: all feedback is sampled then."""
         self._drain()
+        owed = self._owed
+        if self._punctual >= _PUNCTUAL_CYCLES:
+            self._punctual = 0
+            for can_id in owed:
+                owed[can_id] = min(owed[can_id], 1)
         self.sync_ns = self._clock.now_ns()
-        self._bus.send(SYNC_ID, b"")
+        if self._bus.send(SYNC_ID, b""):
+            for can_id in owed:
+                owed[can_id] += 1
         return self.sync_ns
 
     def collect(self, until_ns: int) -> None:
@@ -47,30 +83,39 @@ class Exchange:
 
         On a machine that is slow for a moment the time may be over while the answer is already there.
         """
-        missing, clock, bus, sync_ns = self._sync_frames, self._clock, self._bus, self.sync_ns
+        missing, clock, bus, sync_ns, owed = self._sync_frames, self._clock, self._bus, self.sync_ns, self._owed
         for _ in range(MAX_FRAMES):
             remaining_ns = until_ns - clock.now_ns()
             frame = bus.receive(max(remaining_ns, 0) / NS_PER_S)
             if frame is None:
                 return
+            if frame.can_id in owed:
+                self._count_off(frame)
             receiver = self._receivers.get(frame.can_id)
             if receiver is not None and receiver.on_frame(frame.can_id, frame.data, sync_ns):
                 missing -= 1
                 if missing == 0:
+                    self._punctual += 1
                     return
-            elif receiver is None and frame.can_id in self._ours:
-                self._others_frames += 1
+            elif receiver is None and frame.can_id in self._strangers:
+                self._foreign |= self._strangers[frame.can_id]
 
     def send(self, can_id: int, data: bytes) -> None:
         """Queue the torque frame; a full queue is counted and seen in `faults`."""
         self._bus.send(can_id, data)
+
+    def send_last(self, can_id: int, data: bytes) -> None:
+        """A last command with the SYNC behind it that it acts at: nobody sends another."""
+        self._bus.send(can_id, data)
+        self._bus.send(SYNC_ID, b"")
 
     def heartbeat(self) -> None:
         """The master's heartbeat: when this process dies, the drive notices."""
         self._bus.send(self._heartbeat_id, _OPERATIONAL)
 
     def stop_drive(self) -> None:
-        """NMT stop to the amplifier."""
+        """NMT stop to the amplifier. From now on the supervisor stops it by NMT, too, and is no other master."""
+        self._strangers.pop(NMT_ID, None)
         self._bus.send(NMT_ID, bytes((NmtCommand.STOP, self._amplifier_id)))
 
     def make_drive_answer(self) -> None:
@@ -89,9 +134,8 @@ class Exchange:
         if counters.queue_full != self._queue_full:
             self._queue_full = counters.queue_full
             faults |= _QUEUE_FULL
-        if self._others_frames:
-            self._others_frames = 0
-            faults |= _SECOND_MASTER
+        faults |= self._foreign
+        self._foreign = 0
         return faults
 
     def counts(self) -> tuple[int, int]:
@@ -107,12 +151,40 @@ class Exchange:
             if frame is None:
                 return
             receiver = self._receivers.get(frame.can_id)
-            if frame.can_id in self._sync_ids:
+            if frame.can_id in self._owed:
+                self._count_off(frame)
                 self.late_frames += 1
+                self._punctual = 0
             elif receiver is not None:
                 receiver.on_frame(frame.can_id, frame.data, self.sync_ns)
-            elif frame.can_id in self._ours:
-                self._others_frames += 1
+            elif frame.can_id in self._strangers:
+                self._foreign |= self._strangers[frame.can_id]
+
+    def _count_off(self, frame: Frame) -> None:
+        """A synchronous frame of a node against those that SYNC asked for."""
+        can_id, before = frame.can_id, self._newest.get(frame.can_id)
+        if self._owed[can_id] > 0:
+            self._owed[can_id] -= 1
+            self._newest[can_id] = frame
+        elif before is None or frame.data != before.data or frame.time_ns - before.time_ns > self._repeated_ns:
+            self._foreign |= _FOREIGN_FEEDBACK
+
+
+def _master_ids(plan: LoopPlan) -> set[int]:
+    """Identifiers of what only a master sends, and all command PDOs of the axis's nodes. SDO is the supervisor's.
+
+    An LSS answer, too: no slave sends one that no master asked for (CiA 305), and beside a running loop we ask none.
+    """
+    nodes = (plan.amplifier, plan.encoder)
+    commands = {base + node.node_id for base in RPDO_BASE for node in nodes}
+    planned = {pdo.cob_id for node in nodes for pdo in node.pdos if pdo.receive}
+    return commands | planned | {NMT_ID, SYNC_ID, TIME_ID, LSS_TO_SLAVE_ID, LSS_FROM_SLAVE_ID}
+
+
+def _unplanned_ids(plan: LoopPlan) -> set[int]:
+    """Identifiers of the nodes' other TPDOs, in CiA 301's predefined set: the bring-up has switched these off."""
+    nodes = (plan.amplifier, plan.encoder)
+    return {base + node.node_id for base in TPDO_BASE for node in nodes} - {p.cob_id for n in nodes for p in n.pdos}
 
 
 def _synchronous_ids(plan: NodePlan) -> frozenset[int]:

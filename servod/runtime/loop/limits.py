@@ -11,7 +11,10 @@ import math
 
 from servod.common.faults import FAULTS, FaultCode
 from servod.formats.config import LimitsConfig
-from servod.runtime.fieldbus.devices import AmplifierFeedback, EncoderFeedback
+from servod.kernels.holding import Holding, Proof
+from servod.kernels.stopping import StopFacts, Way, both_ways
+from servod.runtime.fieldbus.cia import SW_INTERNAL_LIMIT
+from servod.runtime.fieldbus.devices import NEVER_CYCLES, AmplifierFeedback, EncoderFeedback
 
 _BIT = {code: fault.bit for code, fault in FAULTS.items()}
 _NOT_FINITE = _BIT[FaultCode.NOT_FINITE]
@@ -26,21 +29,38 @@ _BUDGET = _BIT[FaultCode.DEADLINE_BUDGET]
 _CLIPPED = _BIT[FaultCode.TORQUE_CLIPPED]
 _RATE = _BIT[FaultCode.TORQUE_RATE_CLIPPED]
 _NOT_PROVEN = _BIT[FaultCode.WIRING_NOT_PROVEN]
+_BENT_TORQUE = _BIT[FaultCode.TORQUE_IMPLAUSIBLE]
 
 
 #: The test of the wiring ends itself beyond its travel; where it does not, the limits do beyond this multiple of it.
 PROVING_TRAVELS = 2.0
 #: Skipped periods that one punctual cycle makes up for: a single good cycle does not forgive a starving machine.
 _FORGIVEN_PER_CYCLE = 0.05
+#: The speed that the drive's own sensor shows is low-passed with this time constant, as the encoder's is.
+_MOTOR_SPEED_S = 2e-3
+#: The drive's torque is held against the commands of so many cycles, which is what its current loop and the wire take.
+_MEMORY_CYCLES = 20
+#: A torque that is bent in so many cycles in a row is no disturbance.
+_MOST_BENT_CYCLES = 50
+#: Of limits.torque_nm, where limits.torque_mismatch_nm is left out.
+_MISMATCH_SHARE = 0.25
 #: Above this share of the speed limit a joint counts as moving.
 _MOVING_SHARE = 0.01
+#: Above this one it is not let go after a stop under control.
+_LET_GO_SHARE = 0.03
+#: From this share of the speed limit on a joint moves towards an end, and its load may slow it down.
+_MOVES_SHARE = 0.1
 
 
 class Limits:
     """Limits of one axis; holds the last torque, the encoder offset at enable and how late the loop has been."""
 
-    def __init__(self, config: LimitsConfig) -> None:
-        """Copies the numbers out of `config`, so that the cycle touches plain floats only."""
+    def __init__(self, config: LimitsConfig, stop: StopFacts | None = None) -> None:
+        """Copies the numbers out of `config`, so that the cycle touches plain floats only.
+
+        With `stop` torque and position are limited so that the joint rests inside its range, and no faster than its
+        speed limit allows, should nobody command it from now on (`look`).
+        """
         self.torque_nm = config.torque_nm
         self.torque_rate_nm_per_s = config.torque_rate_nm_per_s
         self.speed_rad_s = config.speed_rad_s
@@ -48,15 +68,78 @@ class Limits:
         self.following_error_rad = config.following_error_rad
         self.encoder_mismatch_rad = config.encoder_mismatch_rad
         self.stale_cycles, self.late_cycles = config.stale_cycles, config.late_cycles
+        mismatch_nm = config.torque_mismatch_nm
+        self.torque_mismatch_nm = _MISMATCH_SHARE * config.torque_nm if mismatch_nm is None else mismatch_nm
+        self._forgets_nm = config.torque_nm / _MEMORY_CYCLES  # in each cycle
+        self._most_told_nm = self._least_told_nm = 0.0
+        self._bent_cycles = 0
         self._last_torque_nm = 0.0
         self._encoder_offset_rad = self._armed_at_rad = 0.0
         self._late_level = 0.0
+        self._ways = None if stop is None else both_ways(stop)
+        self._holding = None if stop is None else Holding(stop)
+        self._motor_rad, self._motor_rad_s, self._motor_s = math.nan, 0.0, 0.0
+        self._least_nm, self._most_nm, self._near_end = -math.inf, math.inf, False
+
+    def look(self, amplifier: AmplifierFeedback, encoder: EncoderFeedback, dt_s: float) -> None:
+        """Where the joint stands in this cycle and how fast it is: what torque it may have, and whether it must stop.
+
+        The faster of both sensors counts, each way: one of them may stand still. What was not heard is reckoned with
+        the last torque, the load and the least inertia.
+        """
+        if self._ways is None or self._holding is None:
+            return
+        up, down = self._ways
+        self._motor_s += dt_s  # since the drive was heard last: its way is that of all cycles that were lost
+        if amplifier.age_cycles == 0:
+            change_rad, over_s = amplifier.position_rad - self._motor_rad, self._motor_s
+            self._motor_rad, self._motor_s = amplifier.position_rad, 0.0
+            if math.isfinite(change_rad):
+                self._motor_rad_s += (change_rad / over_s - self._motor_rad_s) * over_s / (over_s + _MOTOR_SPEED_S)
+        unheard_s = max(amplifier.age_cycles, encoder.age_cycles) * dt_s if amplifier.age_cycles < NEVER_CYCLES else 0.0
+        gained_rad_s = (abs(self._last_torque_nm) + up.facts.load_nm) / up.facts.least_inertia * unheard_s
+        fast_rad_s = max(encoder.velocity_rad_s, self._motor_rad_s) + gained_rad_s
+        slow_rad_s = min(encoder.velocity_rad_s, self._motor_rad_s) - gained_rad_s
+        ahead_rad = self.position_max_rad - encoder.position_rad - max(fast_rad_s, 0.0) * unheard_s
+        behind_rad = encoder.position_rad - self.position_min_rad - max(-slow_rad_s, 0.0) * unheard_s
+        self._most_nm = up.most_torque_nm(fast_rad_s, ahead_rad)
+        self._least_nm = -down.most_torque_nm(-slow_rad_s, behind_rad)
+        heard = encoder.age_cycles == 0
+        proof = self._holding.look(encoder.position_rad, self._last_torque_nm, dt_s, heard)
+        self._leave_what_holds((fast_rad_s, -slow_rad_s), (ahead_rad, behind_rad), proof, self._ways)
+        self._near_end = up.too_near(fast_rad_s, ahead_rad) or down.too_near(-slow_rad_s, behind_rad)
+
+    def _leave_what_holds(
+        self, speeds_rad_s: tuple[float, float], rooms_rad: tuple[float, float], proof: Proof, ways: tuple[Way, Way]
+    ) -> None:
+        """The end of the range takes no torque away that a load is proven to take: that would let it fall.
+
+        What may hang on the joint need not: without proof the joint could leave its range by the torque for it.
+        """
+        up, down = ways
+        rests_up = self._rests(max(speeds_rad_s[0], proof.speed_rad_s))
+        rests_down = self._rests(max(speeds_rad_s[1], -proof.speed_rad_s))
+        held_up_nm, held_down_nm = rests_up * proof.up_nm, rests_down * proof.down_nm
+        if held_up_nm:
+            self._most_nm = max(self._most_nm, up.most_held_nm(held_up_nm, speeds_rad_s[0], rooms_rad[0]))
+        if held_down_nm:
+            self._least_nm = min(self._least_nm, -down.most_held_nm(held_down_nm, speeds_rad_s[1], rooms_rad[1]))
+
+    def _rests(self, speed_rad_s: float) -> float:
+        """1 for a joint that does not move this way, 0 for one that does, which its load may slow down."""
+        left = (_MOVES_SHARE - speed_rad_s / self.speed_rad_s) / (_MOVES_SHARE - _MOVING_SHARE)
+        return min(1.0, max(0.0, left))
 
     def arm(self, amplifier: AmplifierFeedback, encoder: EncoderFeedback) -> None:
         """At enable: both position sensors agree by definition now; torque starts from what is produced now."""
         self._encoder_offset_rad = amplifier.position_rad - encoder.position_rad
         self._armed_at_rad = encoder.position_rad
         self._last_torque_nm = amplifier.torque_nm if math.isfinite(amplifier.torque_nm) else 0.0
+        self._most_told_nm = self._least_told_nm = self._last_torque_nm
+        self._bent_cycles = 0
+        if self._holding is not None:
+            still = abs(encoder.velocity_rad_s) <= _MOVING_SHARE * self.speed_rad_s
+            self._holding.begin(encoder.position_rad, self._last_torque_nm if still else 0.0)
 
     def feedback_faults(self, amplifier: AmplifierFeedback, encoder: EncoderFeedback, skipped: int) -> int:
         """Faults of feedback and deadline, which count whether or not the axis is enabled; as fault bits."""
@@ -80,7 +163,7 @@ class Limits:
         position = encoder.position_rad
         if not abs(encoder.velocity_rad_s) <= self.speed_rad_s:
             faults |= _SPEED
-        if not self.position_min_rad <= position <= self.position_max_rad:
+        if self._near_end or not self.position_min_rad <= position <= self.position_max_rad:
             faults |= _POSITION
         if reference_rad is not None and not abs(reference_rad - position) <= self.following_error_rad:
             faults |= _FOLLOWING
@@ -96,6 +179,16 @@ class Limits:
         near = abs(encoder.position_rad - self._armed_at_rad) <= PROVING_TRAVELS * most_travel_rad
         return 0 if near else _NOT_PROVEN
 
+    def torque_faults(self, amplifier: AmplifierFeedback) -> int:
+        """A drive that says it gives another torque than it was told in the last cycles; one that says that it limits
+        the torque may."""
+        if amplifier.age_cycles or amplifier.status_word & SW_INTERNAL_LIMIT:
+            return 0
+        above_nm, below_nm = amplifier.torque_nm - self._most_told_nm, self._least_told_nm - amplifier.torque_nm
+        bent = above_nm > self.torque_mismatch_nm or below_nm > self.torque_mismatch_nm
+        self._bent_cycles = self._bent_cycles + 1 if bent else 0
+        return _BENT_TORQUE if self._bent_cycles >= _MOST_BENT_CYCLES else 0
+
     def limit_torque(self, wanted_nm: float, dt_s: float) -> tuple[float, int]:
         """The torque that may go out, and fault bits of what was limited. Not finite gives zero."""
         if not (math.isfinite(wanted_nm) and math.isfinite(dt_s)):
@@ -108,7 +201,11 @@ class Limits:
             torque_nm, faults = self._last_torque_nm + math.copysign(step_nm, change_nm), _RATE
         if abs(torque_nm) > self.torque_nm:  # the torque itself has the last word, wherever the ramp began
             torque_nm, faults = math.copysign(self.torque_nm, torque_nm), faults | _CLIPPED
+        if not self._least_nm <= torque_nm <= self._most_nm:
+            torque_nm, faults = min(max(torque_nm, self._least_nm), self._most_nm), faults | _CLIPPED
         self._last_torque_nm = torque_nm
+        self._most_told_nm = max(torque_nm, self._most_told_nm - self._forgets_nm)
+        self._least_told_nm = min(torque_nm, self._least_told_nm + self._forgets_nm)
         return torque_nm, faults
 
     def ramp(self, from_nm: float, share: float, velocity_rad_s: float) -> float:
@@ -119,6 +216,10 @@ class Limits:
         """
         drives = from_nm * velocity_rad_s > 0.0 and abs(velocity_rad_s) > _MOVING_SHARE * self.speed_rad_s
         return 0.0 if drives else from_nm * share
+
+    def moving(self, encoder: EncoderFeedback) -> bool:
+        """The joint is too fast to be let go: it would coast on."""
+        return abs(encoder.velocity_rad_s) > _LET_GO_SHARE * self.speed_rad_s
 
     def release(self) -> None:
         """The axis produces no torque: the next ramp starts from zero."""

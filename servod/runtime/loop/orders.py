@@ -9,7 +9,8 @@ from zlib import crc32
 from servod.common.faults import FAULTS, FaultCode
 from servod.common.units import NS_PER_S
 from servod.kernels.motions import Samples
-from servod.runtime.loop.axis import Axis, AxisState
+from servod.runtime.loop.axis import Axis
+from servod.runtime.loop.axis_state import AxisState
 from servod.runtime.loop.commands import Command, Op, Refusal
 from servod.runtime.loop.controller import Controller
 from servod.runtime.loop.limits import Limits
@@ -120,7 +121,8 @@ class Orders:
         return Refusal.DONE
 
     def _halt(self, arguments: Sequence[float]) -> Refusal:
-        self._reference.halt(bool(arguments and arguments[0]))
+        on, leave = ([bool(value) for value in arguments] + [False, False])[:2]
+        self._reference.halt(on, leave)
         return Refusal.DONE
 
     def _activate(self, arguments: Sequence[float]) -> Refusal:

@@ -8,13 +8,15 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from servod.formats.config import AxisConfig
+from servod.kernels.stopping import StopFacts
 from servod.runtime.fieldbus.devices import NodePlan, PdoEntry, PdoMap
 
 
 @dataclass(frozen=True)
 class LoopPlan:
     """Everything the loop needs; `law` and `parameters` are a packed gain set (servod.formats.gains.gain_set),
-    `serial` its number."""
+    `serial` its number; `stop` what the limits reckon a stop with, None where nothing is known of the joint; `carried`
+    the faults of a loop before, which nobody has acknowledged."""
 
     config: AxisConfig
     amplifier: NodePlan
@@ -22,6 +24,8 @@ class LoopPlan:
     law: int
     parameters: tuple[float, ...]
     serial: int = 0
+    stop: StopFacts | None = None
+    carried: int = 0
 
     def to_json(self) -> str:
         """The plan as text for the loop process."""
@@ -33,6 +37,8 @@ class LoopPlan:
                 "law": self.law,
                 "parameters": list(self.parameters),
                 "serial": self.serial,
+                "stop": self.stop,
+                "carried": self.carried,
             }
         )
 
@@ -47,6 +53,8 @@ class LoopPlan:
             data["law"],
             tuple(data["parameters"]),
             data["serial"],
+            None if data["stop"] is None else StopFacts(*data["stop"]),
+            data["carried"],
         )
 
 

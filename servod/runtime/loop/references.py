@@ -153,8 +153,9 @@ class Reference:
         self.active, self._scale, self._wanted_scale = motion.duration_s > 0.0, 1.0, 1.0
         self._leaving, self._first_distance_rad = False, math.nan
 
-    def halt(self, on: bool) -> None:
-        """Let time slow down to a stand (`on`) or run again."""
+    def halt(self, on: bool, leave: bool = False) -> None:
+        """Let time slow down to a stand (`on`) or run again; with `leave` the motion ends there."""
+        self._leaving = self._leaving or (leave and self.active)
         self._wanted_scale = 0.0 if on or self._leaving else 1.0
 
     def watch(self, position_rad: float) -> None:

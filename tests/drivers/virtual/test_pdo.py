@@ -161,3 +161,9 @@ def test_sync_counter_and_start_value(bench: Bench) -> None:
     bench.bus.send(0x80, b"")
     bench.pass_time(0.001)
     assert bench.frames(0x082)[0][:2] == b"\x40\x82"
+
+
+@pytest.mark.parametrize(("value", "code"), [(1, 0x06090030), (241, 0x06090031)])
+def test_a_sync_counter_that_cannot_be_is_refused(bench: Bench, value: int, code: int) -> None:
+    assert abort_code(lambda: bench.write(AMPLIFIER, 0x1019, 0, value, 1)) == code
+    assert bench.read(AMPLIFIER, 0x1019) == 0

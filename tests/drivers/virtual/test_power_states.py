@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
@@ -165,6 +166,45 @@ def test_quick_stop_brakes_along_its_ramp(bench: Bench) -> None:
     start = bench.world.truth().velocity_rad_s
     bench.cycle(0x02, cycles=1 + round(start / 30 / 2 * 1000))
     assert bench.world.truth().velocity_rad_s == pytest.approx(start / 2, rel=0.25)
+
+
+def braked(joint: dict[str, Any], speed_rad_s: float, load_nm: float = 0.0) -> tuple[float, float]:
+    """(ms until the drive has switched off, rad) of a quick stop with 200 rad/s^2 while it gives all it has."""
+    bench = Bench(joint)
+    bench.enabled()
+    bench.cycle(0x0F, 3000, cycles=2)
+    bench.world.devices.joint.plant.place(0.0, speed_rad_s)
+    bench.world.devices.joint.load_nm = load_nm
+    bench.cycle(0x02, 3000)
+    start_ns, start_rad = bench.world.clock.now_ns(), bench.world.truth().position_rad
+    while bench.state is not S.SWITCH_ON_DISABLED and bench.world.clock.now_ns() - start_ns < 1e9:
+        bench.cycle(0x02, 3000)
+    return (bench.world.clock.now_ns() - start_ns) / 1e6, bench.world.truth().position_rad - start_rad
+
+
+LIGHT = {"inertia": 0.001, "friction": {"kind": "coulomb_viscous", "coulomb": 0.005, "viscous": 0.0}}
+
+
+def test_a_quick_stop_ends_with_its_ramp() -> None:
+    """2.3 rad/s at 200 rad/s^2 take 11.5 ms; the torque that drove the joint has no part in it."""
+    time_ms, way_rad = braked(LIGHT, 2.3)
+    assert time_ms <= 20.0
+    assert way_rad <= 2.3 * 2.3 / 400.0 + 2.3 * 0.006
+
+
+def test_a_quick_stop_goes_on_until_the_joint_rests() -> None:
+    """30 rad/s^2 is all that 0.3 N*m do to a heavy joint: its 0.1 s are not cut short. A load is let go at rest."""
+    time_ms, way_rad = braked(LIGHT | {"inertia": 0.01}, 3.0)
+    assert 95.0 <= time_ms <= 125.0
+    assert way_rad == pytest.approx(3.0 * 3.0 / 60.0, rel=0.15)
+    time_ms, way_rad = braked(LIGHT, 2.3, load_nm=0.1)
+    assert time_ms <= 40.0
+    assert way_rad <= 0.05
+
+
+def test_a_load_that_the_torque_cannot_stop_is_braked_on() -> None:
+    time_ms, _ = braked(LIGHT | {"inertia": 0.01}, 1.0, load_nm=0.32)
+    assert time_ms >= 1000.0
 
 
 @pytest.mark.parametrize(("word", "target"), [(0x07, S.SWITCHED_ON), (0x06, S.READY_TO_SWITCH_ON)])

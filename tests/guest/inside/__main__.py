@@ -32,15 +32,19 @@ STEPS = (
     ("faults", "campaign"),
     ("service", "bad_configuration"),
     ("service", "stop"),
+    ("foreign", "foreign"),  # on a bus of its own
+    ("bus", "own_bus"),  # takes the interface away from all others
 )
+#: Only where it is named.
+ON_REQUEST = (("power", "powered"),)
 
 
 def main() -> None:
     """Step after step into SHARE/results.jsonl; with names behind SHARE only these."""
     share, *chosen = sys.argv[1:]
     with (Path(share) / "results.jsonl").open("w") as results:
-        for module, step in STEPS:
-            if chosen and step not in chosen:
+        for module, step in (*STEPS, *ON_REQUEST):
+            if step not in chosen and (chosen or (module, step) in ON_REQUEST):
                 continue
             result: dict[str, Any] = {"step": step}
             started = time.monotonic()

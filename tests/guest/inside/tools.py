@@ -80,6 +80,21 @@ def status() -> dict[str, Any]:
         return dict(connection.call("status"))
 
 
+def at_rest() -> bool:
+    """Whether the daemon runs, disabled and without a fault."""
+    if prop("ActiveState") != "active":
+        return False
+    now = status()
+    return now["axis"]["state"] == "DISABLED" and not now["faults"]
+
+
+def begun_anew() -> None:
+    """A daemon without a fault and with the axis disabled; one that is so already is left."""
+    wait_for(lambda: prop("ActiveState") not in ("activating", "deactivating"), what="a settled service")
+    if not at_rest():
+        shell("systemctl", "restart", UNIT)
+
+
 def drop_in(unit: str, text: str) -> None:
     """Add to a unit."""
     folder = Path(f"/etc/systemd/system/{unit}.d")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import runpy
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +16,7 @@ from scipy.integrate import solve_ivp
 from servod.formats.model.axis_model import AxisModel
 from servod.kernels.laws import LAWS
 from servod.kernels.laws.state import LawState
-from servod.kernels.physics.compiled import bound
+from servod.kernels.physics.compiled import bound, compiled
 from servod.kernels.physics.layout import PlantState
 from servod.kernels.physics.plant import Plant
 from servod.lab.simulate.simulate import LoopSettings, run, simulate_closed_loop
@@ -236,3 +238,16 @@ def test_closed_loop_tracks_limits_and_counts() -> None:
     assert np.allclose(counts, np.round(counts), atol=1e-6)
     free = simulate_closed_loop(joint(delay_s=0.001), LAWS["pd"], (2.5, 0.12, 0.0), rows)
     assert 0.005 < np.sqrt(np.mean(free.tracking_error_rad(1.0) ** 2)) < 0.04
+
+
+def test_another_installation_of_the_same_source_is_not_compiled_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    for place, hits in (("here", 0), ("there", 1)):
+        file = tmp_path / place / "doubling.py"
+        file.parent.mkdir()
+        file.write_text("def doubled(x):\n    return 2.0 * x\n")
+        kernel = compiled(runpy.run_path(str(file))["doubled"])
+        assert kernel(2.0) == 4.0
+        assert sum(kernel.stats.cache_hits.values()) == hits

@@ -152,7 +152,7 @@ class Bus:
 def test_the_stopwatch_adds_up_the_time_in_the_bus_and_passes_everything_on(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tick.time, "perf_counter_ns", Clock())
     bus = Bus()
-    stopwatch = tick._Stopwatch(SimpleNamespace(clock=None, connect=lambda: bus))
+    stopwatch = tick._Stopwatch(SimpleNamespace(clock=None, connect=lambda _can_ids: bus))
     timed = stopwatch.connect()
     assert timed.send(0x201, b"x") is False
     assert timed.receive(0.5) == "frame"

@@ -19,7 +19,7 @@ from servod.formats.model.axis_model import AxisModel, load_axis_model
 from servod.kernels.laws import LAWS
 from servod.runtime.fieldbus.bus import Frame
 from servod.runtime.fieldbus.cia import NmtCommand
-from servod.runtime.loop.axis import AxisState
+from servod.runtime.loop.axis_state import AxisState
 from servod.runtime.loop.commands import Op, ReferenceKind, Refusal
 
 AMPLIFIER, ENCODER = 1, 2
@@ -68,6 +68,14 @@ def test_a_node_that_was_reset_needs_a_new_bring_up(node_id):
     assert FaultCode.DRIVE_RESET in latched(axis)
     assert axis.send(Op.ENABLE, [1]) == Refusal.NEEDS_RESTART
     assert axis.cycle.axis.state != AxisState.ENABLED
+
+
+def test_last_frame_of_a_loop_that_breaks_acts_at_once():
+    """It is synchronous: without a SYNC behind it the drive would keep the torque until its own guards act."""
+    axis = moving(session())
+    axis.cycle.let_go()
+    axis.world.clock.sleep_until(axis.world.clock.now_ns() + 2_000_000)
+    assert axis.world.truth().torque_nm == 0.0
 
 
 def test_limits_hold_while_the_torque_ramps_down():

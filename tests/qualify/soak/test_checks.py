@@ -28,7 +28,7 @@ from servod.qualify.soak.starvation import STARVED_CYCLE, STARVED_SUPERVISOR, Ex
 from servod.qualify.soak.syncs import SyncCheck, SyncListener
 from servod.qualify.soak.tally import FaultTally, Findings, Wrong
 from servod.runtime.fieldbus.devices import DriveState
-from servod.runtime.loop.axis import AxisState
+from servod.runtime.loop.axis_state import AxisState
 
 PERIOD_NS = 1_000_000
 LIMIT_NM = 0.3

@@ -23,7 +23,7 @@ _KIND = {kind.name: kind for kind in KINDS if of_the_wall(kind)}
 def episodes() -> Iterator[Episode]:
     """One that is ridden through, one that stops the axis, one that ends the daemon."""
     move = Move(ReferenceKind.SINE, (0.1, 1.0, 0.6), 0.6)
-    for number, name in enumerate(("torque frames lost", "safe torque off", "encoder reset"), start=1):
+    for number, name in enumerate(("torque frames lost, a few", "safe torque off", "encoder reset"), start=1):
         yield Episode(number, "demo_pd_dob" if number == 1 else None, move, 0.2, _KIND[name], SoakEnding.FINISH, number)
 
 

@@ -86,7 +86,7 @@ def running(folder: Path, plant: Path | None = None, more: str = "", travel_rad:
         ) as axis:
             wait_until((folder / "bus").exists, axis, folder / "axis.log", 30.0)
             with (
-                _told_to(folder / "notify"),
+                told_to(folder / "notify"),
                 child("servod.runtime.daemon.main", ["--config", str(config)], log) as daemon,
             ):
                 wait_until(lambda: answers(folder / "axis.sock"), daemon, log, 30.0)
@@ -104,7 +104,7 @@ def answers(path: Path) -> bool:
 
 
 @contextlib.contextmanager
-def _told_to(notify: Path) -> Iterator[None]:
+def told_to(notify: Path) -> Iterator[None]:
     """Children started in this block take `notify` for the service manager, with a watchdog of 0.4 s."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("NOTIFY_SOCKET", str(notify))

@@ -28,6 +28,9 @@ class Echo:
         self.answer: dict[str, Any] | None = None  # to what is not late
         self.moves = self.broken = self.patient = False
         self.ended_leases = 0
+        self.renew_ns: int | None = None
+        self.abandoned: list[str] = []
+        self.held_up_s = 0.0
         self.asked: list[Verb] = []
         self.pieces: list[tuple[str, int, list[float]]] = []
 
@@ -58,6 +61,9 @@ class Echo:
     def lease_ended(self) -> None:
         self.ended_leases += 1
 
+    def abandon_motion(self, why: str) -> None:
+        self.abandoned.append(why)
+
 
 class Served:
     """A control server in a thread of its own."""
@@ -78,6 +84,8 @@ class Served:
             began = time.monotonic()
             self.server.tick(time.monotonic_ns())
             self._answer_late()
+            time.sleep(self.handler.held_up_s)  # on the event loop: as a supervisor that gets no processor
+            self.handler.held_up_s = 0.0
             await asyncio.sleep(_ROUND_S)
             self.longest_round_s = max(self.longest_round_s, time.monotonic() - began - _ROUND_S)
         self.server.close(self._why)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import fcntl
 import socket
 from collections.abc import Iterator
 from pathlib import Path
@@ -123,6 +124,15 @@ async def test_client_is_asked_again_as_soon_as_it_has_read(wires: tuple[socket.
     assert desk.lines == [b"1"]
 
 
+def _pair_with(number: int) -> tuple[socket.socket, socket.socket]:
+    """Two connected sockets, the first with this number, which is free; lower ones may be, too."""
+    ours, theirs = sorted(socket.socketpair(), key=lambda end: end.fileno() != number)
+    if ours.fileno() != number:
+        with ours:
+            ours = socket.socket(fileno=fcntl.fcntl(ours, fcntl.F_DUPFD_CLOEXEC, number))
+    return ours, theirs
+
+
 @on_event_loop
 async def test_newcomer_with_the_number_of_a_socket_just_closed_is_heard(
     wires: tuple[socket.socket, socket.socket],
@@ -132,7 +142,7 @@ async def test_newcomer_with_the_number_of_a_socket_just_closed_is_heard(
     before.begin()
     await events_pass()
     before.close()
-    ours, theirs = socket.socketpair()
+    ours, theirs = _pair_with(number)
     assert ours.fileno() == number
     ours.setblocking(False)
     Connection(ours, desk).begin()

@@ -1,3 +1,5 @@
+import asyncio
+import contextlib
 import json
 import os
 import socket
@@ -9,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from running import wait_for
 from served import Echo, Served, answer_of, raw
 
 from servod.client.control import ControlClient
@@ -42,9 +45,49 @@ def test_errors_keep_their_kind_and_are_one_line(served: Served, code: int, kind
 
 def test_socket_is_for_owner_and_group_only_and_goes_away(served: Served) -> None:
     assert stat.S_IMODE(served.path.stat().st_mode) == 0o660
-    served.server.close()
+    served.close()  # in its own thread, whose next round would make a socket that is gone again
     assert not served.path.exists()
-    served.server = ControlServer(ControlConfig(socket=served.path), served.handler)
+
+
+def test_socket_that_somebody_removed_is_made_again(served: Served) -> None:
+    with ControlClient(served.path) as before:
+        before.call(Verb.STATUS)  # it has its place
+        served.path.unlink()
+        with pytest.raises(Unreachable):
+            ControlClient(served.path)
+        wait_for(served.path.exists)
+        with ControlClient(served.path) as newcomer:
+            assert newcomer.call(Verb.GAINS_KEEP)["verb"] == "gains_keep"
+        assert before.call(Verb.STATUS)["verb"] == "status"
+        assert stat.S_IMODE(served.path.stat().st_mode) == 0o660
+    served.close()
+    assert not served.path.exists()
+
+
+def test_who_queued_when_the_socket_was_made_again_is_served(tmp_path: Path) -> None:
+    path, handler = tmp_path / "axis.sock", Echo()
+
+    async def told() -> bytes:
+        server = ControlServer(ControlConfig(socket=path), handler)
+        server.begin()
+        with socket.socket(socket.AF_UNIX) as client:
+            client.connect(str(path))  # nobody has taken it yet
+            client.sendall(b'{"id": 1, "verb": "status"}\n')
+            path.unlink()
+            server.tick(time.monotonic_ns())
+            assert path.exists()
+            client.setblocking(False)
+            try:
+                async with asyncio.timeout(5.0):
+                    while True:
+                        server.tick(time.monotonic_ns())
+                        await asyncio.sleep(0.01)
+                        with contextlib.suppress(BlockingIOError):
+                            return client.recv(4096)
+            finally:
+                server.close()
+
+    assert json.loads(asyncio.run(told()))["ok"] is True
 
 
 def test_stale_socket_is_replaced_and_other_files_are_not(tmp_path: Path) -> None:

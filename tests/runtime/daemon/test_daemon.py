@@ -86,7 +86,7 @@ def test_motions_are_refused_with_the_reason(client: ControlClient) -> None:
 
 def test_halt_holds_and_goes_on(client: ControlClient) -> None:
     client.call("enable")
-    client.call("track", kind="sine", amplitude_rad=0.02, frequency_hz=1, duration_s=30)
+    client.call("track", kind="sine", amplitude_rad=0.02, frequency_hz=1, duration_s=30, renew_s=None)
     client.call("halt", on=True)
     time.sleep(0.5)
     held = [client.call("status")["motion"]["reference_rad"] for _ in range(3)]
@@ -111,9 +111,12 @@ def test_gain_sets_change_while_the_axis_runs_and_roll_back(client: ControlClien
         client.call("gains_load", name="try", text="law: [")
 
 
-def test_scan_finds_both_nodes(client: ControlClient) -> None:
+def test_scan_finds_both_nodes_and_is_nobody_else(client: ControlClient, axis: Running) -> None:
     nodes = client.call("scan")["nodes"]
     assert [(n["node_id"], n["identity"]["device_type"] & 0xFFFF) for n in nodes] == [(1, 402), (2, 406)]
+    assert "FOREIGN_SDO" not in axis.log
+    client.call("enable")
+    client.call("disable")
 
 
 def test_scan_of_a_bus_that_a_daemon_owns_goes_through_the_daemon(axis: Running) -> None:

@@ -10,7 +10,7 @@ from servod.common.errors import BadInput
 from servod.common.faults import FaultCode
 from servod.formats.config import MetricsConfig
 from servod.runtime.daemon.metrics import AxisMetrics, MetricsServer
-from servod.runtime.loop.axis import AxisState
+from servod.runtime.loop.axis_state import AxisState
 
 CLIP = 1 << FaultCode.TORQUE_CLIPPED
 

@@ -142,6 +142,21 @@ def test_the_oldest_recordings_make_room_and_no_fault_file_does(tmp_path: Path) 
     assert cycles == list(range(cycles[0], given)) and cycles[0] > 0
 
 
+def test_no_part_grows_beyond_its_share_however_fast_the_rows_come(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Far more between two syncs than a part has room for; a chunk in progress comes on top."""
+    monkeypatch.setattr("servod.runtime.daemon.recorder.SYNC_PERIOD_S", 60.0)
+    recorder, drawn = _recorder(tmp_path, max_total_mib=8), random.Random(2)
+    recorder.start().result(5)
+    for first in range(0, 60_000, 500):
+        recorder.add_rows(_noise(first, 500, drawn))
+    assert recorder.stop().result(30)["records"] == 60_000
+    recorder.close()
+    sizes = [path.stat().st_size for path in tmp_path.glob("axis-*.mcap")]
+    assert len(sizes) > 1 and max(sizes) <= 2.1 * MIB
+
+
 def test_recordings_that_are_too_old_go_at_the_start(tmp_path: Path) -> None:
     old, new, named, fault = (
         tmp_path / name

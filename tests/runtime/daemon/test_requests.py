@@ -20,12 +20,14 @@ from servod.formats.recording.record import CycleRecord
 from servod.runtime.daemon.arguments import check_arguments
 from servod.runtime.daemon.connection import Reply
 from servod.runtime.daemon.gain_bank import GainBank
+from servod.runtime.daemon.guard_test import ProofStatus
 from servod.runtime.daemon.recorder import Recorder
 from servod.runtime.daemon.requests import Requests, Waits, finish, work_of
 from servod.runtime.daemon.trajectory import MotionTable
 from servod.runtime.daemon.verbs import Verbs
+from servod.runtime.fieldbus.bus import Bus
 from servod.runtime.fieldbus.devices import DriveState
-from servod.runtime.loop.axis import AxisState
+from servod.runtime.loop.axis_state import AxisState
 from servod.runtime.loop.channel import Channel
 from servod.runtime.loop.commands import Op, ReferenceKind, Refusal
 from servod.runtime.loop.handle import LoopHandle
@@ -251,11 +253,21 @@ class _Bank:
     on_trial = False
 
 
+def _same(bus: Bus) -> Bus:
+    return bus
+
+
+def _proven() -> ProofStatus:
+    return ProofStatus(asked_for=False, holds=True, time=None, text="")
+
+
 @pytest.fixture
 def verbs(tmp_path: Path) -> Iterator[tuple[Verbs, _Loop]]:
     loop, config = _Loop(), axis_config(tmp_path / "s", tmp_path / "c")
     config = config.model_copy(update={"limits": config.limits.model_copy(update={"speed_rad_s": 1e3})})
-    verbs = Verbs(config, cast(LoopHandle, loop), cast(GainBank, _Bank()), cast(Recorder, _Events()), dict, dict)
+    verbs = Verbs(
+        config, cast(LoopHandle, loop), cast(GainBank, _Bank()), cast(Recorder, _Events()), dict, dict, _same, _proven
+    )
     yield verbs, loop
     verbs.close()
 
@@ -263,7 +275,7 @@ def verbs(tmp_path: Path) -> Iterator[tuple[Verbs, _Loop]]:
 def test_cycles_go_out_in_pieces_and_what_left_the_memory_is_counted(tmp_path: Path) -> None:
     config = axis_config(tmp_path / "s", tmp_path / "c")
     recorder = Recorder(RecorderConfig(directory=tmp_path, history_s=0.0), "axis", 1000)
-    verbs = Verbs(config, cast(LoopHandle, _Loop()), cast(GainBank, _Bank()), recorder, dict, dict)
+    verbs = Verbs(config, cast(LoopHandle, _Loop()), cast(GainBank, _Bank()), recorder, dict, dict, _same, _proven)
 
     class _Client:
         path = "axis.sock"

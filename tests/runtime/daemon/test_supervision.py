@@ -5,24 +5,34 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
-from daemon_rows import axis_config, record, rows
+from daemon_rows import record, rows
 
 from servod.common.errors import Unreachable
-from servod.common.faults import FaultCode
-from servod.formats.config import BusConfig, RecorderConfig
+from servod.common.faults import FAULTS, FaultCode
+from servod.common.shipped import shipped
+from servod.formats.config import BrakeConfig, BusConfig, InputsConfig, RecorderConfig, load_config
 from servod.formats.recording.mcap_reader import read_recording
 from servod.runtime.daemon.fault_watch import FaultWatch
-from servod.runtime.daemon.health import Health, Pulse
-from servod.runtime.daemon.lock import BusLock, InstanceLock
+from servod.runtime.daemon.health import Health, Pulse, StandingLoop
 from servod.runtime.daemon.metrics import AxisMetrics
 from servod.runtime.daemon.nodes import FaultRelay, nmt_name
 from servod.runtime.daemon.recorder import Recorder
-from servod.runtime.daemon.status import Freshness, axis_status, bus_status, fault_status, motion_status
+from servod.runtime.daemon.status import (
+    Freshness,
+    axis_status,
+    brake_status,
+    bus_status,
+    fault_status,
+    inputs_status,
+    motion_status,
+)
+from servod.runtime.daemon.supervisor import Supervisor
 from servod.runtime.daemon.verbs import _why_not_enabled
 from servod.runtime.fieldbus.devices import Reason
-from servod.runtime.loop.axis import AxisState
+from servod.runtime.loop.axis_state import AxisState
 from servod.runtime.loop.commands import Op
 
 FOLLOWING = 1 << FaultCode.FOLLOWING_ERROR
@@ -62,6 +72,27 @@ def test_slow_loop_has_many_periods_and_a_stalled_watcher_blames_nobody() -> Non
     assert _look(stalled, [*range(60_900, 61_100, 20)])
 
 
+def _due(standing: StandingLoop, rounds: Sequence[tuple[int, bool, bool]]) -> list[int]:
+    """The moments at which the drive is to be stopped; `rounds`: time in ms, whether the loop wrote, the drive told."""
+    return [at for at, wrote, told in rounds if standing.look(wrote, told, at * 1_000_000)]
+
+
+def test_a_standing_loop_whose_drive_misses_it_is_passed_at_once_and_once() -> None:
+    standing = StandingLoop(0.02)
+    assert _due(standing, [(0, True, False), (20, True, True), (40, False, False), (60, False, True)]) == [60]
+    assert _due(standing, [(80, False, True), (2000, False, False)]) == [], "once for each standstill"
+    assert _due(standing, [(2020, True, False), (2040, False, True)]) == [2040]
+
+
+def test_a_silent_loop_is_passed_when_its_drive_must_have_reacted_and_not_for_a_stall() -> None:
+    silent = [(at, at == 0, False) for at in range(0, 400, 20)]
+    assert _due(StandingLoop(0.02), silent) == [140], "0.12 s passed, whatever the drive tells"
+    assert _due(StandingLoop(0.1), silent) == [220]
+    stalls = [(0, True, False), (50, False, False), (100, False, False), (120, True, False)]
+    assert _due(StandingLoop(0.02), stalls) == []
+    assert _due(StandingLoop(0.02), [(0, True, False), (5000, False, False)]) == [], "the watcher itself stood still"
+
+
 def test_health_without_cycles() -> None:
     assert Health(1000, 0.5).line() == "no cycle yet"
     assert Health(1000, 0.5).timing(0)["lag"]["max_us"] == 0.0
@@ -77,6 +108,23 @@ def test_status_says_why_the_goal_is_not_reached() -> None:
 def test_an_axis_whose_wiring_is_being_proven_has_not_reached_its_goal() -> None:
     status = axis_status(record(axis_state=AxisState.PROVING, goal=2, goal_reached=1))
     assert (status["goal_reached"], status["reasons"]) == (False, ["wiring is being proven"])
+
+
+def test_an_axis_whose_brake_opens_has_not_reached_its_goal() -> None:
+    status = axis_status(record(axis_state=AxisState.RELEASING, goal=2, goal_reached=1))
+    assert (status["goal_reached"], status["reasons"]) == (False, ["the brake opens"])
+
+
+def test_inputs_and_brake_are_shown_where_there_are_any() -> None:
+    at_rest, stopped = record(axis_state=AxisState.ENABLED), record(faults=FAULTS[FaultCode.ESTOP_ACTIVE].bit)
+    inputs = InputsConfig(estop_bit=16, sto_error=0x5441)
+    assert [row["active"] for row in inputs_status(inputs, at_rest)] == [False, False]
+    assert [row for row in inputs_status(inputs, stopped) if row["active"]] == [{"name": "estop", "active": True}]
+    assert inputs_status(InputsConfig(), stopped) == []
+    assert brake_status(BrakeConfig(), at_rest) == {"by": "none", "state": "none"}
+    shown = [brake_status(BrakeConfig(by="drive"), record(axis_state=state))["state"] for state in AxisState]
+    assert shown.count("open") == 3, "proving, enabled, braking"
+    assert {"closed", "opening", "closing", "closing at rest"} < set(shown)
 
 
 def test_an_axis_that_somebody_stopped_is_told_so_and_a_fault_goes_first() -> None:
@@ -171,20 +219,6 @@ def test_clipping_writes_no_file(recorder: Recorder, tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-# --- instance lock ----------------------------------------------------------------------------------------------------
-def test_second_daemon_on_socket_or_bus_is_refused(tmp_path: Path) -> None:
-    first = InstanceLock(axis_config(tmp_path / "a.sock", tmp_path / "bus1"))
-    for socket, channel in (("a.sock", "bus2"), ("b.sock", "bus1")):
-        with pytest.raises(Unreachable, match=r"another servod \(process [0-9]+\)"):
-            InstanceLock(axis_config(tmp_path / socket, tmp_path / channel))
-    InstanceLock(axis_config(tmp_path / "b.sock", tmp_path / "bus2")).release()
-    first.release()
-    with BusLock(BusConfig(channel=str(tmp_path / "bus1"))), pytest.raises(Unreachable, match="another servod"):
-        InstanceLock(axis_config(tmp_path / "a.sock", tmp_path / "bus1"))
-    InstanceLock(axis_config(tmp_path / "a.sock", tmp_path / "bus1")).release()
-    assert not list(tmp_path.iterdir())
-
-
 # --- the program ------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     ("arguments", "says"),
@@ -216,3 +250,35 @@ def test_daemon_imports_nothing_of_the_laboratory() -> None:
     code = f"import sys, servod.runtime.daemon.main; sys.exit(str([m for m in {heavy} if m in sys.modules] or ''))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stderr.strip() == ""
+
+
+# --- the end ----------------------------------------------------------------------------------------------------------
+def _ending(exit_code: int) -> tuple[Supervisor, Mock]:
+    """A supervisor made of mocks, whose loop ends with that code."""
+    supervisor, told = Supervisor.__new__(Supervisor), Mock()
+    supervisor.__dict__.update(
+        {f"_{name}": getattr(told, name) for name in ("nodes", "loop", "notifier", "faults", "take_records")}
+    )
+    supervisor._config = load_config(shipped("gains/config/virtual.yaml"))
+    told.loop.stop.return_value, told.loop.last_words.return_value = exit_code, ""
+    return supervisor, told
+
+
+def _order(told: Mock) -> list[str]:
+    names = (name for name, _, _ in told.mock_calls)
+    return [name for name in names if name in ("notifier.stopping", "loop.stop") or name.startswith("nodes.")]
+
+
+def test_systemd_is_told_and_a_hung_loop_killed_before_a_silent_drive_holds_up_anything() -> None:
+    supervisor, told = _ending(-9)
+    assert supervisor._lose_loop() == Unreachable.exit_code
+    assert _order(told) == ["notifier.stopping", "loop.stop", "nodes.stop_axis"]
+
+
+@pytest.mark.parametrize(
+    ("exit_code", "last"), [(1, ["notifier.stopping", "nodes.stop_axis"]), (0, ["nodes.stand_down"])]
+)
+def test_a_loop_that_dies_in_an_orderly_stop_leaves_the_drive_to_brake(exit_code: int, last: list[str]) -> None:
+    supervisor, told = _ending(exit_code)
+    supervisor._stop()
+    assert _order(told) == ["notifier.stopping", "loop.stop", *last]

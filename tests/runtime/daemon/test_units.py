@@ -1,5 +1,6 @@
 import os
 import re
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -9,7 +10,8 @@ from servod.formats.config import LimitsConfig, load_config
 from servod.runtime.loop.cycle import GOODBYE_TIMEOUT_CYCLES
 
 SYSTEMD = Path(__file__).parents[3] / "systemd"
-UNITS = sorted(SYSTEMD.glob("*.service"))
+#: Without that which is no program of servod's, but ip(8) once at the start, as root in the machine's own name spaces.
+UNITS = sorted(set(SYSTEMD.glob("*.service")) - {SYSTEMD / "servod-bus@.service"})
 
 
 def test_verify_prints_nothing() -> None:
@@ -38,6 +40,23 @@ def test_no_signal_kills_the_loop_before_it_has_stopped_the_axis() -> None:
     (longest,) = [m.le for m in LimitsConfig.model_fields["ramp_down_s"].metadata if hasattr(m, "le")]
     goodbye_s = GOODBYE_TIMEOUT_CYCLES * 0.02
     assert float(_key(unit, "TimeoutStopSec")) > 2.0 * longest + goodbye_s
+
+
+def test_the_service_waits_for_late_nodes_and_fills_no_journal() -> None:
+    unit = (SYSTEMD / "servod@.service").read_text()
+    assert "servod --wait " in _key(unit, "ExecStart")
+    assert int(_key(unit, "LogRateLimitBurst")) / int(_key(unit, "LogRateLimitIntervalSec").removesuffix("s")) <= 20
+
+
+def test_drop_in_binds_the_service_to_its_interface(tmp_path: Path) -> None:
+    shutil.copytree(SYSTEMD / "servod@can0.service.d", tmp_path / "servod@can0.service.d")
+    (tmp_path / "servod@can0.service").write_text((SYSTEMD / "servod@.service").read_text())
+    done = subprocess.run(
+        ["systemd-analyze", "verify", str(tmp_path / "servod@can0.service")], capture_output=True, text=True
+    )
+    assert (done.stdout + done.stderr, done.returncode) == ("", 0)
+    text = (tmp_path / "servod@can0.service.d/device.conf").read_text()
+    assert {_key(text, "BindsTo"), _key(text, "WantedBy")} == {"sys-subsystem-net-devices-can0.device"}
 
 
 def _key(unit: str, name: str) -> str:

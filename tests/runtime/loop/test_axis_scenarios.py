@@ -9,8 +9,9 @@ import pytest
 
 from servod.common.faults import FAULTS, FaultCode
 from servod.common.yaml import parse_yaml
-from servod.runtime.fieldbus.devices import AmplifierFeedback, DriveState, Mode, Reason
-from servod.runtime.loop.axis import Axis, AxisState
+from servod.runtime.fieldbus.devices import AmplifierFeedback, DriveInput, DriveState, Mode, Reason
+from servod.runtime.loop.axis import Axis
+from servod.runtime.loop.axis_state import AxisState
 from servod.runtime.loop.commands import Refusal
 
 SCENARIOS = sorted((Path(__file__).parents[2] / "cycles").glob("*.yaml"))
@@ -18,8 +19,8 @@ PERIOD_S = 1e-3
 
 
 def feedback(text: str) -> AmplifierFeedback:
-    """`text`: a drive state, optionally followed by words: stale, warning, limit, remote, mode=N, "misses
-    commands"."""
+    """`text`: a drive state, optionally followed by words: stale, warning, limit, remote, mode=N, "misses commands",
+    estop, sto (the inputs), sto_told (by the drive's error code)."""
     name, *words = text.split()
     state = DriveState[name]
     mode = next((int(w[5:]) for w in words if w.startswith("mode=")), 10)
@@ -28,7 +29,8 @@ def feedback(text: str) -> AmplifierFeedback:
     reached = state == DriveState.OPERATION_ENABLED
     reasons = Reason.IN_FAULT if state == DriveState.FAULT else Reason.NONE
     reasons |= Reason.COMMANDS_MISSED if "misses" in words else Reason.NONE
-    return AmplifierFeedback(0, int("stale" in words), state, status, mode, 0.0, 0.0, 0, reached, reasons)
+    inputs = sum(flag for flag in DriveInput if flag.name.lower() in words)
+    return AmplifierFeedback(0, int("stale" in words), state, status, mode, 0.0, 0.0, 0, reached, reasons, inputs)
 
 
 def ask(axis: Axis, request: str) -> Refusal | None:
@@ -52,7 +54,8 @@ def names(word: int) -> list[str]:
 @pytest.mark.parametrize("path", SCENARIOS, ids=lambda p: p.stem)
 def test_scenario(path):
     document = parse_yaml(path.read_text(), path.name)
-    axis = Axis(PERIOD_S, document.get("ramp_s", 0.003), document.get("enable_timeout_s", 0.01), Mode(10), 5.0)
+    times = (document.get("ramp_s", 0.003), document.get("enable_timeout_s", 0.01))
+    axis = Axis(PERIOD_S, *times, Mode(10), 5.0, document.get("sto_known", False))
     drive = "SWITCH_ON_DISABLED"
     for number, entry in enumerate(document["cycles"], 1):
         drive = entry.get("drive", drive)
@@ -61,9 +64,8 @@ def test_scenario(path):
             assert (refusal or Refusal.DONE).name == entry.get("answer", "DONE"), f"{path.name}, entry {number}"
         bits = sum(FAULTS[FaultCode[name]].bit for name in entry.get("faults", []))
         for _ in range(entry.get("repeat", 1)):
-            output = axis.step(
-                feedback(drive), "encoder stale" not in entry, bits, entry.get("reference at rest", False)
-            )
+            at_rest, moves = entry.get("reference at rest", False), entry.get("joint moves", False)
+            output = axis.step(feedback(drive), "encoder stale" not in entry, bits, at_rest, moves)
         shown = {
             "axis": axis.state.name,
             "goal": axis.goal.name,
@@ -87,3 +89,17 @@ def _same(got: dict, expected: dict) -> bool:
 def test_there_are_scenarios():
     assert len(SCENARIOS) >= 8
     assert {s.name for s in AxisState} >= {"ENABLED", "FAULT"}
+
+
+def test_carried_fault_asks_for_a_reset_by_hand_and_for_a_restart_when_it_comes_again():
+    bit = FAULTS[FaultCode.FOREIGN_SDO].bit
+    for again in (False, True):
+        axis = Axis(PERIOD_S, 0.003, 0.01, Mode(10), 5.0)
+        axis.carry(bit)
+        assert axis.state is AxisState.FAULT and axis.latched == bit
+        assert axis.enable(False) == Refusal.FAULT_PRESENT
+        if again:
+            axis.note(bit)
+        axis.step(feedback("SWITCH_ON_DISABLED"), True, 0, True)
+        assert axis.latched == bit
+        assert axis.enable(True) == (Refusal.NEEDS_RESTART if again else Refusal.DONE)

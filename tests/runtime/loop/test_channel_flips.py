@@ -26,11 +26,12 @@ from servod.formats.gains.gain_set import load_gains
 from servod.formats.model.axis_model import load_axis_model
 from servod.formats.recording.record import FIELDS, RECORD, CycleRecord
 from servod.runtime.loop import channel as module
-from servod.runtime.loop.axis import AxisState
+from servod.runtime.loop.axis_state import AxisState
 from servod.runtime.loop.channel import COMMAND_SLOTS
 from servod.runtime.loop.commands import Op, ReferenceKind, Refusal
 from servod.runtime.loop.realtime import Grant
 from servod.runtime.loop.wiring.findings import WiringReport
+from tests.forked import forked
 
 CORRUPT = FAULTS[FaultCode.CHANNEL_CORRUPT].bit
 #: What a flip may take until it is seen, two rounds of the supervisor; and until a stop is over.
@@ -107,11 +108,16 @@ UNDER_WAY: dict[Op, tuple[float, ...]] = {
 }
 
 
-@pytest.fixture(params=STATES)
-def axis(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Axis]:
-    one = _OneMemory()
-    monkeypatch.setattr(module, "mmap", one)
-    monkeypatch.setattr(os, "getppid", lambda: 1)  # which a fork changes, and the death of the supervisor
+@pytest.fixture(params=STATES, scope="module")
+def axis(request: pytest.FixtureRequest) -> Iterator[Axis]:
+    """One for all tests, which do everything in forks."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "mmap", _OneMemory())
+        patch.setattr(os, "getppid", lambda: 1)  # which a fork changes, and the death of the supervisor
+        yield from _brought_to(STATES[request.param])
+
+
+def _brought_to(state: Callable[[SteppedSession], None]) -> Iterator[Axis]:
     gains = load_gains(shipped("gains/demo_pd.yaml"))
     world = SteppedWorld(VirtualAxisSettings(), load_axis_model(shipped("gains/axes/demo_joint.yaml")))
     config = load_config(shipped("gains/config/virtual.yaml"))
@@ -121,7 +127,7 @@ def axis(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Ite
         session.enable()
         session.send(Op.DISABLE)
         session.run(config.limits.ramp_down_s + 0.3)
-    STATES[request.param](session)
+    state(session)
     gc.collect()
     gc.freeze()
     yield Axis(session, port)
@@ -181,25 +187,6 @@ def _judge(story: Story, whole: Story, twin: Story) -> str:
 _STANDING = (AxisState.DISABLED, AxisState.FAULT, AxisState.QUICK_STOPPING)
 
 
-def _forked(work: Callable[[], bytes]) -> bytes:
-    """What `work` gives in a copy of this process."""
-    reading, writing = os.pipe()
-    pid = os.fork()
-    if pid == 0:
-        try:
-            answer = work()
-        except BaseException as error:
-            answer = repr(error).encode()
-        with os.fdopen(writing, "wb") as pipe:
-            pipe.write(answer)
-        os._exit(0)
-    os.close(writing)
-    with os.fdopen(reading, "rb") as pipe:
-        answer = pipe.read()
-    os.waitpid(pid, 0)
-    return answer
-
-
 class Flips:
     """Flips from one state of an axis, each judged against the twin."""
 
@@ -236,7 +223,7 @@ class Flips:
         def told() -> Story:
             return _tell(self._axis, flip, under_way, under_way)
 
-        verdict = _forked(lambda: _judge(told(), self._whole, self._twin).encode()).decode()
+        verdict = forked(lambda: _judge(told(), self._whole, self._twin).encode()).decode()
         assert verdict in ("same", "fault"), f"{name}: {verdict}"
         self.seen[verdict] = self.seen.get(verdict, 0) + 1
 
@@ -245,7 +232,7 @@ class Flips:
             story = _tell(self._axis, lambda: None, self._under_way, under_way)
             return b"".join(story.written + story.came)
 
-        rows = [row for (row,) in struct.iter_unpack(f"{RECORD.size}s", _forked(packed))]
+        rows = [row for (row,) in struct.iter_unpack(f"{RECORD.size}s", forked(packed))]
         return Story(rows[: len(rows) // 2], rows[len(rows) // 2 :])  # all that was written came
 
 

@@ -33,6 +33,7 @@ class FrameName(StrEnum):
     SYNC = "sync"
     TORQUE = "torque"  # RPDO1 of the amplifier: control word and torque
     DRIVE_FEEDBACK = "drive_feedback"  # TPDO1 of the amplifier
+    DRIVE_INPUTS = "drive_inputs"  # TPDO2 of the amplifier: mode, error code, digital inputs
     ENCODER_FEEDBACK = "encoder_feedback"  # TPDO2 of the encoder
     MASTER_HEARTBEAT = "master_heartbeat"
     AMPLIFIER_HEARTBEAT = "amplifier_heartbeat"
@@ -44,6 +45,7 @@ CAN_ID = {
     FrameName.SYNC: SYNC_ID,
     FrameName.TORQUE: RPDO_BASE[0] + AMPLIFIER,
     FrameName.DRIVE_FEEDBACK: TPDO_BASE[0] + AMPLIFIER,
+    FrameName.DRIVE_INPUTS: TPDO_BASE[1] + AMPLIFIER,
     FrameName.ENCODER_FEEDBACK: TPDO_BASE[1] + ENCODER,
     FrameName.MASTER_HEARTBEAT: HEARTBEAT_BASE + 126,
     FrameName.AMPLIFIER_HEARTBEAT: HEARTBEAT_BASE + AMPLIFIER,

@@ -78,6 +78,38 @@ class Sine(SteppedAction):
         return axis.command(Op.REFERENCE, [ReferenceKind.SINE, self.amplitude_rad, self.frequency_hz, 600.0])
 
 
+class Step(SteppedAction):
+    """A person lets the reference jump: all the torque that there is."""
+
+    amplitude_rad: float
+
+    def act(self, axis: SteppedUnderTest) -> int:
+        """Start it, for as long as the scenario lasts."""
+        return axis.command(Op.REFERENCE, [ReferenceKind.STEP, self.amplitude_rad, 600.0])
+
+
+class Mortal(StrEnum):
+    """A process that can die."""
+
+    LOOP = "loop"
+    SUPERVISOR = "supervisor"
+
+
+class Dies(SteppedAction):
+    """`kill -9` of loop, supervisor, or both at once, in virtual time."""
+
+    who: list[Mortal] = Field(min_length=1)
+
+    def loss(self) -> Loss:
+        """The drive loses its master, or will."""
+        return Loss.MASTER
+
+    def act(self, axis: SteppedUnderTest) -> int:
+        """Kill them."""
+        axis.session.die(Mortal.LOOP in self.who, Mortal.SUPERVISOR in self.who)
+        return 1
+
+
 class WakesLate(SteppedAction):
     """The operating system wakes the loop late, up to `most_us`, in one cycle of `one_in`; SYNC comes as late."""
 
@@ -177,6 +209,8 @@ MACHINE_ACTIONS: dict[str, type[InjectionAction]] = {
     "gains": Gains,
     "tell": Tell,
     "sine": Sine,
+    "dies": Dies,
+    "step": Step,
     "wakes_late": WakesLate,
     "configure": Configure,
     "counter_wraps": CounterWraps,

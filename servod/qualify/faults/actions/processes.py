@@ -5,6 +5,7 @@ Only axes that are processes can show them.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import resource
 import signal
@@ -17,17 +18,22 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from pydantic import Field
 
 from servod.client.processes import child, last_core, wait_until
-from servod.formats.protocol import Verb
+from servod.common.errors import ServodError
+from servod.formats.protocol import RENEW_S, Verb
 from servod.qualify.faults.actions.base import InjectionAction
 from servod.qualify.faults.machine import Process
 from servod.qualify.faults.processes import ProcessAxis
 from servod.qualify.faults.scenario import Loss, Runs
+from servod.runtime.loop.axis_state import AxisState
 
 if TYPE_CHECKING:
     from servod.qualify.faults.under_test import AxisUnderTest
 
 _KIB = 1024
 _CLIENT_S = 20.0
+#: From the loss to the new bring-up, on the slowest machine (the guest); how often one looks meanwhile.
+_ANEW_S, _LOOK_S = 90.0, 0.1
+_HELD_UP_S = 0.5
 
 
 class ProcessAction(InjectionAction):
@@ -93,6 +99,28 @@ class VirtualAxisBack(ProcessAction):
         return 1
 
 
+class BeginsAnew(ProcessAction):
+    """Bus and nodes are back: the daemon brings the axis up anew by itself, DISABLED, and was in FAULT until then."""
+
+    traceless: ClassVar[str] = "the axis did not go from FAULT to DISABLED by itself, or was enabled"
+
+    def act(self, axis: ProcessAxis) -> int:
+        """Watch it until its fault is gone, without a command."""
+        axis.leave()
+        states: list[str] = []
+        deadline = time.monotonic() + _ANEW_S
+        while time.monotonic() < deadline:
+            with contextlib.suppress(ServodError), axis.machine.client() as client:
+                status = client.call(Verb.STATUS)
+                states.append(status["axis"]["state"])
+                if states[-1] != AxisState.FAULT.name and not status["faults"]:
+                    break
+            time.sleep(_LOOK_S)
+        while states and states[0] == AxisState.QUICK_STOPPING.name:  # a drive that is not heard is told for a while
+            states.pop(0)
+        return list(dict.fromkeys(states)) == [AxisState.FAULT.name, AxisState.DISABLED.name]
+
+
 class RestartDaemon(ProcessAction):
     """Somebody restarts the service."""
 
@@ -146,6 +174,22 @@ class ClientStopped(ProcessAction):
         client.send_signal(signal.SIGSTOP)
         changed = os.waitid(os.P_PID, client.pid, os.WSTOPPED | os.WEXITED | os.WNOWAIT)
         return changed is not None and changed.si_code == os.CLD_STOPPED
+
+
+class MotionHalts(ProcessAction):
+    """The motion that nobody renews comes to rest by itself, and the axis holds."""
+
+    traceless: ClassVar[str] = "the motion of a client that is gone went on"
+
+    def act(self, axis: ProcessAxis) -> int:
+        """Look on until it has; half a second, braking, and what a machine that others use takes."""
+        deadline = time.monotonic() + RENEW_S + axis.config.limits.ramp_down_s + _HELD_UP_S
+        while _moves(axis) and time.monotonic() < deadline:
+            time.sleep(_LOOK_S)
+        with axis.machine.client() as client:
+            status = client.call(Verb.STATUS)
+        halted = bool(status["motion"]["abandoned"]) and not status["axis"]["motion_running"]
+        return halted and status["axis"]["state"] == AxisState.ENABLED.name
 
 
 class StoppedClientEnds(ProcessAction):
@@ -224,11 +268,13 @@ def _moves(axis: ProcessAxis) -> bool:
 PROCESS_ACTIONS: dict[str, type[InjectionAction]] = {
     "signal": Signal,
     "virtual_axis_back": VirtualAxisBack,
+    "begins_anew": BeginsAnew,
     "restart_daemon": RestartDaemon,
     "second_daemon": SecondDaemon,
     "ask": Ask,
     "client_killed": ClientKilled,
     "client_stopped": ClientStopped,
+    "motion_halts": MotionHalts,
     "stopped_client_ends": StoppedClientEnds,
     "cpu_load": CpuLoad,
     "disk_full": DiskFull,

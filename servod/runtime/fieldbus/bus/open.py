@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from importlib import import_module
 
-from servod.formats.config import BusConfig
+from servod.formats.config_wire import BusConfig
 from servod.runtime.fieldbus.bus import Bus
 
 #: interface -> (module, class with `configured(BusConfig, can_ids)`).

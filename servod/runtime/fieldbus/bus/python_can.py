@@ -16,7 +16,7 @@ from typing import Any
 import can
 
 from servod.common.errors import Unreachable
-from servod.formats.config import BusConfig
+from servod.formats.config_wire import BusConfig
 from servod.runtime.fieldbus.bus import BusCounters, Frame
 from servod.runtime.fieldbus.bus.socketcan import count_error_frame
 

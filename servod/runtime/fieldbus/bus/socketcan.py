@@ -18,7 +18,7 @@ import time
 from servod.common.errors import Unreachable
 from servod.common.files import reason
 from servod.common.units import NS_PER_S
-from servod.formats.config import BusConfig
+from servod.formats.config_wire import BusConfig
 from servod.runtime.fieldbus.bus import (
     CAN_EFF_FLAG,
     CAN_ERR_BUSOFF,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from servod.runtime.fieldbus.master.master import BringUp, Master
+from servod.runtime.fieldbus.master.master import BringUp, Master, master_ids
 from servod.runtime.fieldbus.master.monitor import NodeEvent
 
-__all__ = ["BringUp", "Master", "NodeEvent"]
+__all__ = ["BringUp", "Master", "NodeEvent", "master_ids"]

@@ -14,10 +14,10 @@ from servod.common.clock import Clock
 from servod.common.errors import BadInput, Unreachable
 from servod.formats.config import AxisConfig
 from servod.runtime.fieldbus.bus import Bus
-from servod.runtime.fieldbus.cia import NmtCommand
-from servod.runtime.fieldbus.devices import NodePlan, PresetSetup, SdoAccess
-from servod.runtime.fieldbus.master.monitor import NodeEvent
-from servod.runtime.fieldbus.master.network import BusNetwork
+from servod.runtime.fieldbus.cia import EMCY_BASE, HEARTBEAT_BASE, SDO_ANSWER_BASE, SDO_REQUEST_BASE, NmtCommand
+from servod.runtime.fieldbus.devices import GuardedSetup, NodePlan, PresetSetup, SdoAccess
+from servod.runtime.fieldbus.master.monitor import GuardWatch, NodeEvent
+from servod.runtime.fieldbus.master.network import AnnouncedBus, BusNetwork
 from servod.runtime.fieldbus.master.node import Node, NodeIdentity, send_nmt
 from servod.runtime.fieldbus.master.planned import checked_load
 
@@ -32,6 +32,12 @@ class BringUp:
     report: list[str] = field(default_factory=list)
 
 
+def master_ids(config: AxisConfig) -> tuple[int, ...]:
+    """What the master listens to; the cyclic frames are the loop's, and the bus keeps them away where it can."""
+    bases = (EMCY_BASE, SDO_ANSWER_BASE, SDO_REQUEST_BASE, HEARTBEAT_BASE)
+    return tuple(base + node.node_id for node in (config.amplifier, config.encoder) for base in bases)
+
+
 class Master:
     """Master of one axis on its own bus connection, which it owns from now on.
 
@@ -40,7 +46,7 @@ class Master:
     """
 
     def __init__(self, config: AxisConfig, bus: Bus, clock: Clock, threaded: bool) -> None:
-        self._config = config
+        self.config = self._config = config
         self._network = BusNetwork(bus, clock, threaded)
         try:
             self._amplifier = Node(self._network, config, "amplifier")
@@ -48,6 +54,8 @@ class Master:
         except BaseException:
             self._network.disconnect()
             raise
+        self._guarded: NodePlan | None = None  # the amplifier's, once it is up
+        self._guards: GuardWatch | None = None
         self._nodes = {node.node_id: node for node in (self._amplifier, self._encoder)}
 
     def bring_up(self) -> BringUp:
@@ -57,24 +65,45 @@ class Master:
         wanted = [node.setup.plan() for node in nodes]
         load = checked_load(self._config, wanted)
         report.append(f"bus load {load.describe()}")
-        for node in nodes:
-            node.watch.watch(False)
-            report += node.identify()
-        for node in nodes:
-            node.inspect()
+        report += self.look()
         for node in nodes:
             node.stop_operation()
+            node.stop_watching_master()  # whose error, of a master that died, keeps some drives from operational
         plans = []
         for node, plan in zip(nodes, wanted, strict=True):
             report += node.reset_as_quirks_ask(plan)
             configured, lines = node.configure()
             plans.append(configured)
             report += lines
-        for node in nodes:
-            node.start_heartbeats()
+        report += self._guard_positions(plans[0])
+        for node, plan in zip(nodes, plans, strict=True):
+            node.start_heartbeats(plan)
         for node in nodes:
             node.start()
+        self._guarded = plans[0]
+        self._guards = self._amplifier.guard_watch(plans[0])
         return BringUp(plans[0], plans[1], load.share, report)
+
+    def look(self) -> list[str]:
+        """By reads alone: both nodes are there, are the configured ones, and may be set up; who they are.
+
+        Raises Unreachable with the first thing that is in the way.
+        """
+        nodes, report = (self._amplifier, self._encoder), []
+        for node in nodes:
+            node.watch.watch(False)
+            report += node.identify()
+        for node in nodes:
+            node.inspect()
+        return report
+
+    def _guard_positions(self, plan: NodePlan) -> list[str]:
+        """The drive's own position limits, where it has them and the encoder can be asked where the joint stands."""
+        drive, encoder = self._amplifier.setup, self._encoder.setup
+        if not isinstance(drive, GuardedSetup) or not isinstance(encoder, PresetSetup):
+            return []
+        notes = drive.guard_positions(self._amplifier.sdo, plan, encoder.position_rad(self._encoder.sdo))
+        return [f"node {plan.node_id}: {note}" for note in notes]
 
     def preset_encoder(self, position_rad: float) -> int:
         """Make the joint's present position read `position_rad` in the encoder; the counts that it holds then.
@@ -82,13 +111,10 @@ class Master:
         Instead of a bring-up, while no loop runs. Raises Unreachable where a node is not the configured one, the
         amplifier is powered or the joint moves, BadInput when the encoder's driver knows no preset.
         """
-        nodes, setup = (self._amplifier, self._encoder), self._encoder.setup
+        setup = self._encoder.setup
         if not isinstance(setup, PresetSetup):
             raise BadInput("encoder.driver", self._config.encoder.driver, "a driver with preset")
-        for node in nodes:
-            node.identify()
-        for node in nodes:
-            node.inspect()
+        self.look()
         return setup.preset(self._encoder.sdo, position_rad)
 
     def stand_down(self) -> None:
@@ -97,6 +123,9 @@ class Master:
             node.watch.watch(False)
             send_nmt(self._network, NmtCommand.PRE_OPERATIONAL, node.node_id)
             node.stop_watching_master()
+        drive = self._amplifier.setup
+        if self._guarded and isinstance(drive, GuardedSetup):
+            drive.put_back(self._amplifier.sdo, self._guarded)
 
     def poll(self) -> None:
         """Take waiting frames and check the heartbeats; call at least every 20 ms.
@@ -108,6 +137,8 @@ class Master:
         self._network.drain()
         for node in self._nodes.values():
             node.watch.check()
+        if self._guards is not None:
+            self._guards.check()
 
     def events(self) -> list[NodeEvent]:
         """What the nodes did since the last call, oldest first."""
@@ -149,6 +180,19 @@ class Master:
             if node_id in (0, node.node_id):
                 node.watch.watch(command == NmtCommand.START)
         send_nmt(self._network, command, node_id)
+
+    @property
+    def clock(self) -> Clock:
+        """What the waits here go by."""
+        return self._network.clock
+
+    def pause(self, duration_s: float) -> None:
+        """Wait, and take frames meanwhile."""
+        self._network.wait(lambda: False, duration_s)
+
+    def of_ours(self, bus: Bus) -> Bus:
+        """`bus`, a further connection of this process, so that the watch knows its frames from those of others."""
+        return AnnouncedBus(bus, self._network)
 
     def close(self) -> None:
         """Leave the bus; nothing is sent."""

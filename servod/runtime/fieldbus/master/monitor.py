@@ -1,4 +1,5 @@
-"""Watches the nodes of an axis: heartbeats that stop, boot-up where there should be none, EMCY. Off the control path.
+"""Watches the nodes of an axis: heartbeats that stop, boot-up where there should be none, EMCY; and who else speaks
+with them or for them. Off the control path.
 
 Everything seen becomes a NodeEvent that names a row of the fault table; the supervisor hands it to the loop.
 """
@@ -7,21 +8,44 @@ from __future__ import annotations
 
 import struct
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from canopen.emcy import EmcyError
 
+from servod.common.clock import Clock
 from servod.common.faults import FaultCode
 from servod.common.units import NS_PER_S
-from servod.runtime.fieldbus.cia import EMCY_BASE, HEARTBEAT_BASE, NmtState
+from servod.runtime.fieldbus.cia import EMCY_BASE, HEARTBEAT_BASE, SDO_ANSWER_BASE, SDO_REQUEST_BASE, Emcy, NmtState
 from servod.runtime.fieldbus.master.network import BusNetwork
+from servod.runtime.fieldbus.master.sdo import NodeSdo, SdoAnswer
 
 _EMCY = struct.Struct("<HB5s")
 _TOGGLE_MASK = 0x7F
 #: States after operational that a node only reaches by NMT; a number that is none is shown, and is no state.
 _LEFT = (NmtState.STOPPED, NmtState.PRE_OPERATIONAL)
+#: EMCY of a node that misses its master; what comes before the supervision begins is of the master before us.
+MASTER_MISSED = (Emcy.HEARTBEAT_LOST, Emcy.RPDO_TIME_OUT)
+#: The guards are read one after the other, so far apart: a few in each second.
+_GUARD_NS = 250_000_000
+#: A question without an answer is asked again after this time; so many in a row say that it cannot be read.
+_UNANSWERED_NS, _MOST_UNANSWERED = 500_000_000, 5
 #: More waiting events than this means that nobody reads them; the oldest are dropped then.
 _MAX_EVENTS = 1000
+#: Who floods the bus with foreign frames is told of once in this time; the fault is latched all the same.
+_TOLD_NS = NS_PER_S
+#: Some nodes take several errors back one by one although the first of these frames says that none is left.
+_TAKEN_BACK_NS = NS_PER_S
+#: A beat is foreign when it is early beside each of so many before it, and never with fewer than `_LEAST` to judge by.
+#: A bus that stalls delivers late, never early: beside the last beat that was in time nothing is early but a stranger.
+_BEATS, _LEAST = 16, 4
+#: So many beats in a row with the distance of a rhythm make one.
+_RHYTHM = 8
+#: Early is more than this share of the period. A stranger in the first part of a period shows at once, one in the rest
+#: by the node's own next beat, which comes right behind. What a clock is slow in `_BEATS` periods adds to the time.
+_EARLY = 0.4
+#: After a silence of so many periods, and at the begin, what was due may come in a burst, until the rhythm stands.
+_SILENCE = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,10 +59,46 @@ class NodeEvent:
     code: int
 
 
-class NodeWatch:
-    """Heartbeat consumer and EMCY consumer for one node."""
+class Rhythm:
+    """The beats of one sender, each `period_ns` after the one before.
 
-    def __init__(self, network: BusNetwork, node_id: int, emcy_fault: FaultCode, timeout_ms: int) -> None:
+    Tells a second sender of a periodic frame from one sender whose frames come late and then in time again.
+    """
+
+    def __init__(self, period_ns: int) -> None:
+        self._period_ns = period_ns
+        self._beats: deque[int] = deque(maxlen=_BEATS)
+        self._owed, self._calm = _RHYTHM, 0  # beats that a silence owes; beats in a row with the distance of a rhythm
+
+    def restart(self, time_ns: int) -> None:
+        """The sender begins anew at `time_ns`."""
+        self._beats.clear()
+        self._beats.append(time_ns)
+        self._owed, self._calm = _RHYTHM, 0
+
+    def foreign(self, time_ns: int) -> bool:
+        """Take a beat; True when it cannot be the one sender's."""
+        beats, period_ns = self._beats, self._period_ns
+        silent = (time_ns - beats[-1]) // period_ns if beats else 0
+        by_ns = [period_ns * back - (time_ns - beat) for back, beat in enumerate(reversed(beats), start=1)]
+        beats.append(time_ns)
+        if silent >= _SILENCE:
+            self._owed, self._calm = max(self._owed, silent), 0
+        least_ns = _EARLY * period_ns
+        if len(by_ns) < _LEAST or min(by_ns) <= least_ns:
+            self._calm += bool(by_ns) and by_ns[0] <= least_ns  # one of a burst says nothing of the rhythm
+            self._owed = 0 if self._calm >= _RHYTHM else self._owed
+            return False
+        self._owed, self._calm = self._owed - 1, 0
+        return self._owed < 0
+
+
+class NodeWatch:
+    """Heartbeat consumer and EMCY consumer for one node, and its witness against strangers."""
+
+    def __init__(
+        self, network: BusNetwork, node_id: int, emcy_fault: FaultCode, period_ms: int, timeout_ms: int
+    ) -> None:
         self.node_id = node_id
         self.nmt_state: int | None = None  # not heard yet
         self.boot_ups = 0
@@ -50,12 +110,34 @@ class NodeWatch:
         self._heartbeat_ns: int | None = None
         self.lost = False  # its heartbeat is missing now
         self._watching = False
+        self._rhythm = Rhythm(period_ms * 1_000_000)
+        self._errors = 0  # that the node told of, or had at the bring-up, and may take back
+        self._none_left_ns = 0  # since when it says that it has none, 0 while it does not
+        self._answers = network.answers
+        self._told_ns: dict[FaultCode, int] = {}
         network.subscribe(HEARTBEAT_BASE + node_id, self._on_heartbeat)
         network.subscribe(EMCY_BASE + node_id, self._on_emcy)
+        network.subscribe(SDO_REQUEST_BASE + node_id, self._on_request)
+        network.subscribe(SDO_ANSWER_BASE + node_id, self._on_answer)
+
+    @property
+    def watching(self) -> bool:
+        """Whether the supervision is on."""
+        return self._watching
 
     def watch(self, on: bool) -> None:
-        """Start or end the supervision: only then a boot-up, a stop of heartbeats or another state is an event."""
+        """Start or end the supervision: only then a boot-up, a stop of heartbeats or another state is an event.
+
+        What the drive told meanwhile of a master that died before is no event of ours.
+        """
+        for event in [event for event in self.events if event.code in MASTER_MISSED]:
+            self.events.remove(event)
         self._heard_ns, self.lost, self._watching = self._clock.now_ns(), False, on
+
+    @property
+    def at_work(self) -> bool:
+        """Supervised, heard and operational: one that was reset has lost its settings too, which is no fault more."""
+        return self._watching and not self.lost and self.nmt_state == NmtState.OPERATIONAL
 
     @property
     def limit_s(self) -> float:
@@ -74,9 +156,13 @@ class NodeWatch:
         if silent_ns > self._timeout_ns:
             self.lost = True
             text = f"node {self.node_id}: no heartbeat for {silent_ns / 1e6:.0f} ms"
-            self._add(FaultCode.NODE_HEARTBEAT_LOST, text, 0)
+            self.add(FaultCode.NODE_HEARTBEAT_LOST, text, 0)
 
-    def _on_heartbeat(self, _can_id: int, data: bytearray, _time_ns: float) -> None:
+    def has_errors(self) -> None:
+        """The error register (0x1001) shows errors that the node told of before anybody listened."""
+        self._errors, self._none_left_ns = max(self._errors, 1), 0
+
+    def _on_heartbeat(self, _can_id: int, data: bytearray, time_ns: float) -> None:
         if not data:
             return
         state = data[0] & _TOGGLE_MASK
@@ -85,23 +171,109 @@ class NodeWatch:
         self.lost = False
         if state == NmtState.BOOT_UP:
             self.boot_ups += 1
+        foreign = False
+        if state != previous:  # told at once, and the rhythm may begin anew with it
+            self._rhythm.restart(int(time_ns))
+        else:
+            foreign = self._rhythm.foreign(int(time_ns))
         if not self._watching:
             return
+        if foreign:
+            self._blame(FaultCode.DUPLICATE_NODE, f"node {self.node_id}: heartbeats of two senders", state)
         if state == NmtState.BOOT_UP:
-            self._add(FaultCode.DRIVE_RESET, f"node {self.node_id}: boot-up while it should be operational", state)
+            self.add(FaultCode.DRIVE_RESET, f"node {self.node_id}: boot-up while it should be operational", state)
         elif state in _LEFT and previous == NmtState.OPERATIONAL:
             text = f"node {self.node_id}: left NMT operational (state {state})"
-            self._add(FaultCode.NODE_LEFT_OPERATIONAL, text, state)
+            self.add(FaultCode.NODE_LEFT_OPERATIONAL, text, state)
 
     def _on_emcy(self, _can_id: int, data: bytearray, time_ns: float) -> None:
         if len(data) < _EMCY.size:
             return
         code, register, maker = _EMCY.unpack_from(data)
-        if code & 0xFF00 == 0:  # error reset, or no error any more
+        if code & 0xFF00 == 0:
+            self._take_back(register)
             return
+        self._errors, self._none_left_ns = self._errors + 1, 0
         meaning = EmcyError(code, register, maker, time_ns).get_desc()
         text = f"node {self.node_id}: EMCY 0x{code:04X} {meaning}, register 0x{register:02X}, {maker.hex(' ')}"
-        self._add(self._emcy_fault, text, code)
+        self.add(self._emcy_fault, text, code)
 
-    def _add(self, fault: FaultCode, text: str, code: int) -> None:
+    def _take_back(self, register: int) -> None:
+        """EMCY without a code: an error is gone, or all that were; who had none has nothing to take back."""
+        now_ns = self._clock.now_ns()
+        if self._none_left_ns and now_ns - self._none_left_ns > _TAKEN_BACK_NS:
+            self._errors = 0
+        if self._errors == 0:
+            text = f"node {self.node_id}: EMCY takes back an error that was never heard (register 0x{register:02X}): "
+            text += "somebody else sent it, or the error was lost on the bus"
+            self._blame(FaultCode.DUPLICATE_NODE, text, 0)
+            return
+        self._errors = max(self._errors - 1, 1 if register else 0)
+        self._none_left_ns = 0 if register else self._none_left_ns or now_ns
+
+    def _on_request(self, can_id: int, data: bytearray, _time_ns: float) -> None:
+        if not self._answers.own(can_id, bytes(data)):
+            self._blame(FaultCode.FOREIGN_SDO, f"node {self.node_id}: SDO request of somebody else, {data.hex(' ')}", 0)
+
+    def _on_answer(self, can_id: int, data: bytearray, _time_ns: float) -> None:
+        if not self._answers.answered(can_id):
+            text = f"node {self.node_id}: SDO answer that this master did not ask for, {data.hex(' ')}"
+            self._blame(FaultCode.FOREIGN_SDO, text, 0)
+
+    def _blame(self, fault: FaultCode, text: str, code: int) -> None:
+        """Somebody else was heard."""
+        now_ns = self._clock.now_ns()
+        if self._watching and now_ns - self._told_ns.get(fault, -_TOLD_NS) >= _TOLD_NS:
+            self._told_ns[fault] = now_ns
+            self.add(fault, text, code)
+
+    def add(self, fault: FaultCode, text: str, code: int) -> None:
+        """An event of this node."""
         self.events.append(NodeEvent(self._clock.now_ns(), self.node_id, fault, text, code))
+
+
+class GuardWatch:
+    """Reads the guards of a drive again in turn while it runs: anybody on the bus may write them by SDO.
+
+    Never waits: a question goes out in one look, its answer is taken in another.
+    """
+
+    def __init__(self, sdo: NodeSdo, watch: NodeWatch, guards: Sequence[tuple[int, int, int]], clock: Clock) -> None:
+        self._sdo, self._watch, self._clock = sdo, watch, clock
+        self._guards = [(index, subindex, value) for index, subindex, value in guards]
+        self._next = self._unanswered = 0
+        self._asked: tuple[int, int, int] | None = None
+        self._asked_ns = 0
+        self._told: set[tuple[int, int]] = set()
+
+    def check(self) -> None:
+        """One look; call as often as the node's watch is checked."""
+        now_ns = self._clock.now_ns()
+        if not self._watch.at_work or not self._guards:
+            self._asked = None
+        elif self._asked is not None and (answer := self._sdo.answer()) is not None:
+            self._judge(self._asked, answer)
+            self._asked, self._unanswered = None, 0
+        elif self._asked is not None and now_ns - self._asked_ns > _UNANSWERED_NS:
+            self._asked, self._unanswered = None, self._unanswered + 1
+            if self._unanswered == _MOST_UNANSWERED:
+                self._tell((0, 0), "the guards of the drive cannot be read any more")
+        elif self._asked is None and now_ns - self._asked_ns >= _GUARD_NS:
+            guard = self._guards[self._next]
+            if self._sdo.ask(guard[0], guard[1]):
+                self._asked, self._asked_ns = guard, now_ns
+                self._next = (self._next + 1) % len(self._guards)
+
+    def _judge(self, guard: tuple[int, int, int], answer: SdoAnswer) -> None:
+        index, subindex, value = guard
+        if answer.value == value:
+            self._told.discard((index, subindex))
+            return
+        found = f"aborts with 0x{answer.abort:08X}" if answer.value is None else f"reads {answer.value}"
+        self._tell((index, subindex), f"0x{index:04X}:{subindex} was {value}, now {found}")
+
+    def _tell(self, guard: tuple[int, int], text: str) -> None:
+        """Once, until it is right again."""
+        if guard not in self._told:
+            self._told.add(guard)
+            self._watch.add(FaultCode.GUARD_CHANGED, f"node {self._watch.node_id}: {text}", 0)

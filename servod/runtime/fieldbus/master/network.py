@@ -7,6 +7,7 @@ clock nobody else runs, so every wait pumps the bus itself, and time advances by
 from __future__ import annotations
 
 import threading
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable
 
 import canopen
@@ -15,9 +16,75 @@ from servod.common.clock import Clock
 from servod.common.errors import Unreachable
 from servod.common.units import NS_PER_S
 from servod.runtime.fieldbus.bus import CAN_EFF_FLAG, CAN_RTR_FLAG, Bus
-from servod.runtime.fieldbus.cia import LSS_FROM_SLAVE_ID
+from servod.runtime.fieldbus.cia import LSS_FROM_SLAVE_ID, SDO_ANSWER_BASE, SDO_REQUEST_BASE
 
 _READER_WAIT_S = 0.05  # how long the reader thread stays in one receive: bounds the time that closing takes
+
+#: No more answers than this are waited for, and none for longer: it was lost, or its node is not there.
+_MOST_OWED, _OWED_NS = 64, 5 * NS_PER_S
+_SDO_ABORT = 4  # command specifier, the upper three bits of the first byte: nobody answers it (CiA 301, 7.2.4.3.17)
+
+
+class SdoAnswers:
+    """The answers that the nodes owe for our requests, each at most one; and the requests of our other connections."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._asked_ns: defaultdict[int, deque[int]] = defaultdict(lambda: deque(maxlen=_MOST_OWED))
+        self._announced: Counter[tuple[int, bytes]] = Counter()
+        self._lock = threading.Lock()
+
+    def asked(self, can_id: int, data: bytes) -> None:
+        """A frame of ours goes out on some connection; a request of SDO is owed an answer from now on."""
+        node_id = can_id - SDO_REQUEST_BASE
+        if 0 < node_id < 0x80 and data and data[0] >> 5 != _SDO_ABORT:
+            self._asked_ns[node_id].append(self._clock.now_ns())
+
+    def answered(self, can_id: int) -> bool:
+        """An answer came; False when none was owed."""
+        asked_ns = self._asked_ns[can_id - SDO_ANSWER_BASE]
+        while asked_ns and asked_ns[0] < self._clock.now_ns() - _OWED_NS:
+            asked_ns.popleft()
+        if not asked_ns:
+            return False
+        asked_ns.pop()  # the newest: one that was lost grows old, whatever is asked after it
+        return True
+
+    def announce(self, can_id: int, data: bytes) -> None:
+        """Another connection of ours is about to send this, which will be heard here."""
+        with self._lock:
+            self._announced[can_id, data] += 1
+
+    def own(self, can_id: int, data: bytes) -> bool:
+        """A request was heard; whether it is one of ours, which is owed its answer then."""
+        with self._lock:
+            if self._announced[can_id, data] <= 0:
+                del self._announced[can_id, data]
+                return False
+            self._announced[can_id, data] -= 1
+        self.asked(can_id, data)
+        return True
+
+
+class AnnouncedBus:
+    """A further connection of this process, whose frames its master shall not take for somebody else's."""
+
+    def __init__(self, bus: Bus, network: BusNetwork) -> None:
+        self._bus, self._network = bus, network
+        self.counters = bus.counters
+        self.receive, self.fileno = bus.receive, bus.fileno
+        network.shared.add(self)
+
+    def close(self) -> None:
+        """Leave the bus; the master has it for itself again."""
+        self._network.shared.discard(self)
+        self._bus.close()
+
+    def send(self, can_id: int, data: bytes) -> bool:
+        """As the bus does, announced where the master listens to it."""
+        if can_id in self._network.subscribers:
+            self._network.answers.announce(can_id, data)
+        return self._bus.send(can_id, data)
 
 
 class BusNetwork(canopen.Network):
@@ -28,6 +95,8 @@ class BusNetwork(canopen.Network):
         self.unsubscribe(LSS_FROM_SLAVE_ID)  # canopen's own LSS master, which nobody asks, would keep every answer
         self._servod_bus = bus
         self.clock = clock
+        self.answers = SdoAnswers(clock)
+        self.shared: set[AnnouncedBus] = set()  # further connections of this process that are open
         self._arrived = threading.Condition()
         self._closing = False
         self.broken: Exception | None = None  # what ended the reader thread, if anything did
@@ -38,6 +107,7 @@ class BusNetwork(canopen.Network):
     def send_message(self, can_id: int, data: bytes | Iterable[int], remote: bool = False) -> None:
         """Queue one frame; raises Unreachable when the bus does not take it."""
         with self.send_lock:
+            self.answers.asked(can_id, bytes(data))
             sent = self._servod_bus.send(can_id | (CAN_RTR_FLAG if remote else 0), bytes(data))
         if not sent:
             counters = self._servod_bus.counters

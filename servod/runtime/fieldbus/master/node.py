@@ -16,7 +16,7 @@ from servod.formats.config import AmplifierConfig, AxisConfig, EncoderConfig, Id
 from servod.runtime.fieldbus.cia import PDO_NO_RTR, PDO_NOT_VALID, NmtCommand, NmtState, Obj301, acts_when_written
 from servod.runtime.fieldbus.devices import NodePlan, PdoMap, SdoAbort, SdoAccess, Setup
 from servod.runtime.fieldbus.master.eds import Dictionary, dictionary_for
-from servod.runtime.fieldbus.master.monitor import NodeWatch
+from servod.runtime.fieldbus.master.monitor import GuardWatch, NodeWatch
 from servod.runtime.fieldbus.master.network import BusNetwork
 from servod.runtime.fieldbus.master.planned import Kind, load_setup
 from servod.runtime.fieldbus.master.sdo import NoAnswer, NodeSdo
@@ -149,10 +149,12 @@ def configure_pdos(sdo: SdoAccess, plan: NodePlan, dictionary: Dictionary) -> li
     check_lengths(plan, dictionary)
     switched_off = disable_other_pdos(sdo, plan)
     unguarded = [pdo for pdo in plan.pdos if not write_pdo(sdo, pdo) and pdo.event_timer_ms]
+    deadlines = [pdo.event_timer_ms for pdo in plan.pdos if pdo.receive and pdo not in unguarded]
+    plan.facts["deadline_told_ms"] = told_ms = min(deadlines, default=0)
+    plan.facts["command_deadline_ms"] = told_ms if plan.facts.get("deadline_stops") else 0
     for pdo in plan.pdos:
         verify_pdo(sdo, plan.node_id, pdo)
     report = [f"node {plan.node_id}: {len(plan.pdos)} PDOs written and read back"]
-    report += [f"node {plan.node_id} RPDO{pdo.number}: no deadline, the heartbeat guards alone" for pdo in unguarded]
     if switched_off:
         report.append(f"node {plan.node_id}: switched off {', '.join(f'0x{i:04X}' for i in switched_off)}")
     return report
@@ -261,6 +263,7 @@ _EMCY_FAULT = {"amplifier": FaultCode.DRIVE_FAULT, "encoder": FaultCode.ENCODER_
 _BOOT_UP_S = 2.0
 _OPERATIONAL_S = 1.0
 _MAX_CONSUMERS = 16
+_MOST_ERRORS = 8  # of the history, for the log
 #: A second node with the same id answers the same request within this time.
 _TWIN_S = 0.005
 
@@ -280,8 +283,12 @@ class Node:
         self.setup: Setup = load_setup(config, kind)
         self.dictionary = dictionary_for(self.section.driver, self.section.eds, self.node_id)
         self.sdo = NodeSdo(network, self.node_id, self.dictionary.objects)
-        self.watch = NodeWatch(network, self.node_id, _EMCY_FAULT[kind], config.heartbeat.node_timeout_ms)
+        heartbeat = config.heartbeat
+        self.watch = NodeWatch(
+            network, self.node_id, _EMCY_FAULT[kind], heartbeat.node_period_ms, heartbeat.node_timeout_ms
+        )
         self.identity: NodeIdentity | None = None
+        self.error_register = 0  # as read last (0x1001)
 
     def report_dictionary(self) -> list[str]:
         """What was mended in the EDS."""
@@ -301,8 +308,19 @@ class Node:
         serial = "absent" if found.serial is None else found.serial
         return [
             f"node {self.node_id}: profile {found.profile}, vendor 0x{found.vendor_id:08X}, {', '.join(words)}, "
-            f"serial {serial}"
+            f"serial {serial}",
+            *self._errors(),
         ]
+
+    def _errors(self) -> list[str]:
+        """What stands in its error register and history (0x1001, 0x1003), newest first, for the log."""
+        self.error_register = read_optional(self.sdo, Obj301.ERROR_REGISTER) or 0
+        count = min(read_optional(self.sdo, Obj301.ERROR_HISTORY) or 0, _MOST_ERRORS)
+        history = [read_optional(self.sdo, Obj301.ERROR_HISTORY, number) or 0 for number in range(1, count + 1)]
+        told = ", ".join(f"0x{error & 0xFFFF:04X}" for error in history) or "none"
+        if not self.error_register and not history:
+            return []
+        return [f"node {self.node_id}: error register 0x{self.error_register:02X}, errors so far, newest first: {told}"]
 
     def _ask_for_a_twin(self) -> None:
         """One read that tells two nodes from one; raises Unreachable when both answer."""
@@ -358,8 +376,33 @@ class Node:
             plan = self.setup.configure(self.sdo)
             report.append(f"node {self.node_id}: {written} parameters written from {self.dictionary.source}")
         report += configure_pdos(self.sdo, plan, self.dictionary)
+        if self._kind == "amplifier":
+            report.append(f"node {self.node_id}: {self._guard_against_silence(plan)}")
         report += [f"node {self.node_id}: {note}" for note in plan.facts.pop("notes", [])]
         return plan, report + self._report_left_out()
+
+    def _guard_against_silence(self, plan: NodePlan) -> str:
+        """Facts of how soon the drive stops when the master is dead: by the command deadline, else by the heartbeat.
+
+        Two periods of the heartbeat must do, which may guard alone: SYNC lost, or a deadline that only tells. Raises
+        Unreachable where neither guards, unless the configuration takes that on itself.
+        """
+        facts, heartbeat, deadline_ms = plan.facts, self._config.heartbeat, plan.facts["command_deadline_ms"]
+        for pdo in plan.pdos:
+            if pdo.receive and facts["deadline_told_ms"]:
+                facts["guards"].append((parameter_index(pdo), _EVENT_TIMER, facts["deadline_told_ms"]))
+        facts["unguarded"] = not (deadline_ms or facts.get("heartbeat_reaction", True))
+        if facts["unguarded"] and not self._config.amplifier.unguarded:
+            raise Unreachable(
+                f"amplifier node {self.node_id} does not stop by itself when servod is dead: it has neither 0x6007 nor "
+                "a deadline of its commands (0x1400:5) that stops it; use another drive, or, where nobody can be hurt, "
+                "amplifier.unguarded: true"
+            )
+        facts["heartbeat_timeout_ms"] = min(heartbeat.drive_timeout_ms, 2 * heartbeat.master_period_ms)
+        facts["reaction_ms"] = deadline_ms or facts["heartbeat_timeout_ms"]
+        if deadline_ms:
+            return f"stops {deadline_ms} ms after the last command (0x1400:5)"
+        return f"no command deadline counts, the heartbeat guards alone: {facts['reaction_ms']} ms (0x1016)"
 
     def _report_left_out(self) -> list[str]:
         if not (indices := left_out(self.dictionary)):
@@ -367,12 +410,18 @@ class Node:
         names = ", ".join(f"0x{index:04X}" for index in indices)
         return [f"node {self.node_id}: not written from {self.dictionary.source}, they are commands: {names}"]
 
-    def start_heartbeats(self) -> None:
+    def start_heartbeats(self, plan: NodePlan) -> None:
         """0x1017 in the node, and for the amplifier 0x1016: it must stop by itself when we die."""
         heartbeat = self._config.heartbeat
         write_checked(self.sdo, Obj301.HEARTBEAT_PRODUCER, 0, heartbeat.node_period_ms)
         if self._kind == "amplifier":
-            self._watch_master(heartbeat.master_node_id << 16 | heartbeat.drive_timeout_ms)
+            entry = heartbeat.master_node_id << 16 | int(plan.facts["heartbeat_timeout_ms"])
+            self._watch_master(entry)
+            plan.facts["guards"].append((int(Obj301.HEARTBEAT_CONSUMER), 1, entry))
+
+    def guard_watch(self, plan: NodePlan) -> GuardWatch:
+        """What reads the drive's guards again in turn."""
+        return GuardWatch(self.sdo, self.watch, plan.facts.get("guards", ()), self._network.clock)
 
     def stop_watching_master(self) -> None:
         """Let the node forget the master's heartbeat, for an orderly end; only while it has no torque."""
@@ -390,6 +439,8 @@ class Node:
 
     def start(self) -> None:
         """NMT start, seen in the node's own heartbeat. Raises Unreachable when it stays elsewhere."""
+        if read_optional(self.sdo, Obj301.ERROR_REGISTER):
+            self.watch.has_errors()
         self.watch.nmt_state = None
         send_nmt(self._network, NmtCommand.START, self.node_id)
         if not self._network.wait(lambda: self.watch.nmt_state == NmtState.OPERATIONAL, _OPERATIONAL_S):

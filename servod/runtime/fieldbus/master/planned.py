@@ -5,6 +5,7 @@ Off the control path. `servod --check` and `servoctl config check` refuse by it 
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -13,9 +14,10 @@ from typing import Literal
 from servod.common.errors import BadInput
 from servod.common.portable import has_group
 from servod.formats.config import AxisConfig
+from servod.formats.stopping import Stopping, with_stopping
 from servod.runtime.fieldbus.cia import HEARTBEAT_BASE, SYNC_ID
-from servod.runtime.fieldbus.devices import Driver, NodePlan, PdoMap, Setup
-from servod.runtime.fieldbus.registry import driver_table, drivers_of, load_driver
+from servod.runtime.fieldbus.devices import HANDSHAKE_SYNCS, Driver, NodePlan, PdoMap, Setup
+from servod.runtime.fieldbus.registry import DRIVERS, driver_table, drivers_of, load_driver
 
 # --- Bus load --------------------------------------------------------------------------------------------------------
 # The bus load of an axis, computed from the mapping that will be written, before anything is started. Worst case: every
@@ -119,7 +121,7 @@ Kind = Literal["amplifier", "encoder"]
 def load_setup(config: AxisConfig, kind: Kind) -> Setup:
     """The set-up face of the configured amplifier or encoder; raises BadInput unless it is a driver of that kind."""
     name = (config.amplifier if kind == "amplifier" else config.encoder).driver
-    driver: Driver | None = load_driver(name) if name in driver_table() else None
+    driver: Driver | None = load_driver(name) if name in DRIVERS or name in driver_table() else None
     if driver is None or driver.kind != kind:
         found = f"{name} ({driver.kind})" if driver else name
         raise BadInput(f"{kind}.driver", found, ", ".join(drivers_of(kind)))
@@ -130,10 +132,17 @@ def load_setup(config: AxisConfig, kind: Kind) -> Setup:
 def check_names(config: AxisConfig, source: str) -> list[str]:
     """Check what the configuration in the file `source` calls by name and no file stands for; gives notes for people.
 
-    Raises BadInput for a bus interface that nobody knows and for a socket whose path the kernel does not take. A
-    control group that is missing is a note: the machine that checks need not be the one that runs.
+    Raises BadInput for a bus interface that nobody knows, for a socket whose path the kernel does not take, and where a
+    file stands in place of a folder. A control group that is missing is a note: the machine that checks need not be the
+    one that runs.
     """
     _check_interface(config.bus.interface, source)
+    for key, folder in {"gains": config.gains.directory, "recorder": config.recorder.directory}.items():
+        file = next((path for path in (folder, *folder.parents) if path.exists()), folder)
+        if file.exists() and not file.is_dir():
+            raise BadInput(
+                f"{source}: {key}.directory", f"{file}, which is a file", "a folder; one that is missing is made"
+            )
     paths = {"control.socket": str(config.control.socket)}
     if config.bus.interface == "virtual":
         paths["bus.channel"] = config.bus.channel
@@ -156,6 +165,39 @@ def _check_interface(interface: str, source: str) -> None:
     if interface not in VALID_INTERFACES:
         names = ", ".join(sorted({*_OWN_INTERFACES, *VALID_INTERFACES}))
         raise BadInput(f"{source}: bus.interface", interface, names)
+
+
+def reaction_s(config: AxisConfig, plan: NodePlan | None = None) -> float:
+    """How long the drive goes on with its last command, in s: when the master is dead, until the deadline of its
+    commands where it stops by that, else until its heartbeat consumer reacts; and when SYNC alone is lost, which none
+    of both sees, until the loop has had no answer for long enough (servod.runtime.loop.axis). As planned, or as `plan`
+    came up.
+    """
+    facts, heartbeat = (plan or load_setup(config, "amplifier").plan()).facts, config.heartbeat
+    dead_ms = facts.get("reaction_ms")
+    if dead_ms is None:
+        by_deadline = facts.get("deadline_stops") and config.command_deadline_ms
+        dead_ms = by_deadline or min(heartbeat.drive_timeout_ms, 2 * heartbeat.master_period_ms)
+    unanswered_cycles = config.limits.stale_cycles + HANDSHAKE_SYNCS + 1
+    return max(float(dead_ms) * 1e-3, unanswered_cycles * config.cycle.period_us * 1e-6)
+
+
+def narrowed_by_stop(config: AxisConfig, plan: NodePlan | None = None) -> tuple[AxisConfig, Stopping | None]:
+    """`config` with its limits narrowed by what the drive does by itself, and the statement (servod.formats.stopping);
+    as planned, or as `plan` came up. Raises BadInput."""
+    facts = (plan or load_setup(config, "amplifier").plan()).facts
+    return with_stopping(config, reaction_s(config, plan), bool(facts.get("writes_ramp", True)))
+
+
+def stopping_as_found(config: AxisConfig, plan: NodePlan) -> tuple[AxisConfig, Stopping | None]:
+    """The limits and the stop of `config` (servod.formats.stopping) with the torque that the drive really leaves and
+    the guards that it really has. Raises BadInput."""
+    torque_nm = min(plan.facts.get("most_torque_nm", math.inf), config.limits.torque_nm)
+    limits = config.limits.model_copy(update={"torque_nm": torque_nm})
+    narrowed, stopping = narrowed_by_stop(config.model_copy(update={"limits": limits}), plan)
+    # What is configured stays as it is: the test of the wiring compares it with the drive's rated torque.
+    told = narrowed.limits.model_copy(update={"torque_nm": config.limits.torque_nm})
+    return narrowed.model_copy(update={"limits": told}), stopping
 
 
 def checked_load(config: AxisConfig, plans: list[NodePlan]) -> BusLoad:

@@ -1,6 +1,7 @@
 """SDO access to one node: confirmed reads and writes by the node's own dictionary. Off the control path.
 
-One lock per node, so that two threads never mix answers. A time-out is told to the node by an abort frame, otherwise
+One lock per node, so that two threads never mix answers; an answer that names another object than was asked for is
+somebody else's, or came too late, and counts for nothing. A time-out is told to the node by an abort frame, otherwise
 its server stays busy. Lengths come from the EDS; an object that the EDS does not have is as absent as the device says.
 """
 
@@ -10,7 +11,7 @@ import queue
 import struct
 import threading
 from collections import deque
-from typing import Any
+from typing import Any, NamedTuple
 
 from canopen.objectdictionary import ODVariable, datatypes
 from canopen.sdo.client import SdoClient
@@ -31,6 +32,14 @@ _MOST_WAITING, _MOST_ANSWERS = 64, 40_000
 _MOST_NUMBER_BYTES = 8
 _ABORT_REQUEST = struct.Struct("<BHBL")
 _ABORT_COMMAND = 0x80
+#: An upload's request, and the answer that carries the number and its size (CiA 301, 7.2.4.3.6).
+_ASK = struct.Struct("<BHB4x")
+_UPLOAD, _EXPEDITED, _EXPEDITED_MASK = 0x40, 0x43, 0xE3
+#: Answers that name their object: to the begin of an upload and of a download (7.2.4.3.3 and 7.2.4.3.6), by the three
+#: highest bits. An abort names it too, but devices are known that fill in zeros.
+_NAMING, _SPECIFIER_MASK = (0x40, 0x60), 0xE0
+#: A question that nobody waits for is answered within this time, or lost.
+_ASKED_S = 0.05
 
 #: CiA 301 abort codes for people; the rest is said by the enum's name.
 ABORT_TEXT: dict[int, str] = {
@@ -57,6 +66,13 @@ def abort_text(code: int) -> str:
         return Abort(code).name.lower().replace("_", " ")
     except ValueError:
         return "unknown abort code"
+
+
+class SdoAnswer(NamedTuple):
+    """The number that a node gave, or None and the abort code."""
+
+    value: int | None
+    abort: int
 
 
 class NoAnswer(Unreachable):
@@ -108,8 +124,11 @@ class _Client(SdoClient):
         self.current, self._answered = (index, subindex), 0
 
     def on_response(self, can_id: int, data: bytearray, timestamp: float) -> None:
-        """An answer of the server; what is too short or long for one is none."""
-        if len(data) == _FRAME_BYTES:
+        """An answer of the server to this transfer; what is too short or long for one is none."""
+        if len(data) != _FRAME_BYTES:
+            return
+        command, *named = _ASK.unpack(data)
+        if command & _SPECIFIER_MASK not in _NAMING or tuple(named) == self.current:
             self._answers.put(bytes(data))
 
     def read_response(self) -> bytes:
@@ -145,6 +164,9 @@ class NodeSdo:
         self._network = network
         self._client = _Client(node_id, dictionary, network)
         network.subscribe(SDO_ANSWER_BASE + node_id, self._client.on_response)
+        network.subscribe(SDO_ANSWER_BASE + node_id, self._on_answer)
+        self._question: tuple[int, int] | None = None
+        self._answer: SdoAnswer | None = None
 
     def variable(self, index: int, subindex: int) -> ODVariable | None:
         """The dictionary's entry, None when the EDS has none."""
@@ -177,6 +199,39 @@ class NodeSdo:
         """Upload raw data."""
         return bytes(self._transfer(index, subindex, "read", lambda: self._client.upload(index, subindex)))
 
+    def ask(self, index: int, subindex: int) -> bool:
+        """Ask for a number without waiting for it; `answer` gives what came.
+
+        False while a transfer is under way, here or on a further connection of this process: a server has one.
+        """
+        if self._network.shared or not self._lock.acquire(blocking=False):
+            return False
+        try:
+            self._question, self._answer = (index, subindex), None
+            self._network.send_message(SDO_REQUEST_BASE + self.node_id, _ASK.pack(_UPLOAD, index, subindex))
+        except Unreachable:  # the bus is down, which others tell
+            self._question = None
+        finally:
+            self._lock.release()
+        return self._question is not None
+
+    def answer(self) -> SdoAnswer | None:
+        """What the node said to `ask`; None before it does."""
+        return self._answer
+
+    def _on_answer(self, _can_id: int, data: bytearray, _time_ns: float) -> None:
+        question = self._question
+        if question is None or len(data) != _FRAME_BYTES or _ASK.unpack_from(data)[1:] != question:
+            return
+        command, self._question = data[0], None
+        if command == _ABORT_COMMAND:
+            self._answer = SdoAnswer(None, int.from_bytes(data[4:8], "little"))
+        elif command & _EXPEDITED_MASK == _EXPEDITED:
+            variable = self.variable(*question)
+            signed = variable is not None and variable.data_type in datatypes.SIGNED_TYPES
+            size = _FRAME_BYTES - 4 - (command >> 2 & 3)
+            self._answer = SdoAnswer(int.from_bytes(data[4 : 4 + size], "little", signed=signed), 0)
+
     def write(self, index: int, subindex: int, value: int) -> None:
         """Download an integer with the length that the EDS gives.
 
@@ -194,6 +249,9 @@ class NodeSdo:
 
     def _transfer(self, index: int, subindex: int, verb: str, transfer: Any) -> Any:
         with self._lock:
+            if self._question is not None:  # its answer would be taken for ours
+                self._network.wait(lambda: self._question is None, _ASKED_S)
+                self._question = None
             self._network.drain()  # an answer that came too late must not be taken for the next one
             self._client.begin(index, subindex)
             try:

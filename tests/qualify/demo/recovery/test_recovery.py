@@ -11,7 +11,7 @@ from servod.common.shipped import shipped
 from servod.formats.model.axis_model import load_axis_model
 from servod.qualify.demo.recovery.walk import SCALES, Effort, believed_and_true, recover, write_recovery_page
 
-EFFORT = Effort(paper_s=8.0, diagnosed_s=5.0, motion_s=6.0, plants=20)
+EFFORT = Effort(paper_s=8.0, diagnosed_s=8.0, motion_s=6.0, plants=20)
 
 
 @pytest.mark.long

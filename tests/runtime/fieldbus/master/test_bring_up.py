@@ -46,7 +46,7 @@ def test_both_nodes_become_operational_and_watch_each_other(world: Witness, thre
     with master(world, axis_config(), threaded) as instance:
         up = instance.bring_up()
     assert world.amplifier.nmt.state == world.encoder.nmt.state == "OPERATIONAL"
-    assert world.amplifier.sdo[0x1016][1].raw == 126 << 16 | 150
+    assert world.amplifier.sdo[0x1016][1].raw == 126 << 16 | 100
     assert world.amplifier.sdo[0x1017].raw == world.encoder.sdo[0x1017].raw == 50
     assert up.amplifier.facts["rated_torque_nm"] == world.amplifier.sdo[0x6076].raw * 1e-3
     assert up.encoder.facts["measuring_range_counts"] == world.encoder.sdo[0x6002].raw
@@ -81,7 +81,9 @@ def test_the_mapping_is_written_by_the_sequence_of_cia_301(world: Witness) -> No
     assert steps[0][2] >> 31 == 1
     assert steps[1][2] == 0
     assert steps[-1][2] & ~0x40000000 == 0x201
-    assert writes.first(Obj402.MODE) < writes.first(0x1400, 1) < writes.first(Obj301.HEARTBEAT_CONSUMER, 1)
+    forgets, watches = (at for at, entry in enumerate(writes.seen) if entry[:2] == (Obj301.HEARTBEAT_CONSUMER, 1))
+    assert [writes.seen[at][2] for at in (forgets, watches)] == [0, 126 << 16 | 100]
+    assert forgets < writes.first(Obj402.MODE) < writes.first(0x1400, 1) < watches
 
 
 def test_pdos_that_are_not_planned_are_switched_off(world: Witness) -> None:
@@ -123,12 +125,12 @@ def test_too_much_bus_load_is_refused_before_anything_is_written(world: Witness)
         (0x1801, 5, 10, r"TPDO2, object 0x1801:5: wrote 0x00000064, device reads 0x0000000A"),
         (0x1801, 3, 300, r"TPDO2, object 0x1801:3: wrote 0x00000000, device reads 0x0000012C"),
         (0x1800, 5, 20, r"TPDO1, object 0x1800:5: wrote 0x00000000, device reads 0x00000014"),
-        (0x1400, 5, 0, r"object 0x1400:5: wrote 150, device reads 0"),
+        (0x1400, 5, 0, r"object 0x1400:5: wrote 20, device reads 0"),
         (0x1400, 1, 0x80000201, r"RPDO1, object 0x1400:1: wrote 0x00000201, device reads 0x80000201"),
         (0x605A, 0, 0, r"0x605A:0: wrote 2, device reads 0"),
         (0x6060, 0, 8, r"0x6060:0: wrote 10, device reads 8"),
         (0x1017, 0, 7, r"0x1017:0: wrote 50, device reads 7"),
-        (0x1016, 1, 0, r"0x1016:1: wrote 8257686, device reads 0"),
+        (0x1016, 1, 0, r"0x1016:1: wrote 8257636, device reads 0"),
     ],
 )
 def test_a_device_that_keeps_something_else_is_found(
@@ -146,7 +148,7 @@ def test_a_drive_without_a_deadline_is_reported(world: Witness) -> None:
     del world.amplifier.object_dictionary[0x1400].subindices[5]
     with master(world, axis_config()) as instance:
         report = instance.bring_up().report
-    assert "node 1 RPDO1: no deadline, the heartbeat guards alone" in report
+    assert "node 1: no command deadline counts, the heartbeat guards alone: 100 ms (0x1016)" in report
 
 
 @pytest.mark.parametrize("status_word", [0x0237, 0x0217, 0x021F])

@@ -11,8 +11,7 @@ from rig import Rig
 from witness import EDS, Witness, axis_config, master, witness
 
 from servod.common.errors import Unreachable
-from servod.drivers.cia402_state import decode_status_word
-from servod.runtime.fieldbus.cia import Obj402, acts_when_written
+from servod.runtime.fieldbus.cia import Obj402, acts_when_written, decode_status_word
 from servod.runtime.fieldbus.devices import DriveState
 from servod.runtime.fieldbus.master.eds import load_dictionary
 from servod.runtime.fieldbus.master.node import parameters

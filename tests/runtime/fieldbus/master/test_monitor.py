@@ -77,8 +77,12 @@ def test_emcy_names_its_code_and_meaning(axis: tuple[Witness, Master], node: int
 
 
 def test_an_error_that_is_cleared_is_no_event(axis: tuple[Witness, Master]) -> None:
+    axis[0].amplifier.emcy.send(0x8130, 0x11)
+    assert [event.fault for event in events_until(axis[1], bool)] == [FaultCode.DRIVE_FAULT]
     axis[0].amplifier.emcy.reset()
     assert events_until(axis[1], bool, 0.2) == []
+    axis[0].amplifier.emcy.reset()
+    assert [event.fault for event in events_until(axis[1], bool)] == [FaultCode.DUPLICATE_NODE]
 
 
 def test_short_heartbeat_and_emcy_frames_are_ignored(axis: tuple[Witness, Master]) -> None:

@@ -53,3 +53,18 @@ def test_config_check_shows_the_load_and_refuses_too_slow_a_bus(
     assert "bus load 38.6 % at 1000000 bit/s" in capsys.readouterr().out
     assert run(["config", "check", str(configured(tmp_path, 500_000))]) == 2
     assert "% of 500000 bit/s" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("below", ["", "deeper/still"])
+@pytest.mark.parametrize("section", ["gains", "recorder"])
+def test_a_file_in_place_of_a_folder_is_refused_before_the_axis_begins(
+    tmp_path: Path, section: str, below: str
+) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    sections = load_config(CONFIG).model_dump(mode="json")
+    sections[section]["directory"] = str(file / below)
+    configuration = tmp_path / "axis.yaml"
+    configuration.write_text(json.dumps(sections))
+    with pytest.raises(BadInput, match=rf"axis.yaml: {section}.directory: found {file}, which is a file"):
+        check(configuration)

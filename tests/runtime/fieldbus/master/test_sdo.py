@@ -16,7 +16,7 @@ from servod.common.clock import WallClock
 from servod.common.errors import BadInput, Unreachable
 from servod.runtime.fieldbus.devices import SdoAbort
 from servod.runtime.fieldbus.master.eds import load_dictionary
-from servod.runtime.fieldbus.master.network import BusNetwork
+from servod.runtime.fieldbus.master.network import AnnouncedBus, BusNetwork
 from servod.runtime.fieldbus.master.sdo import SDO_TIMEOUT_S, NodeSdo, abort_text
 
 
@@ -89,6 +89,37 @@ def test_an_answer_that_came_too_late_is_not_taken_for_the_next(network: BusNetw
         stop.set()
         slow.join()
         bus.shutdown()
+
+
+@pytest.mark.parametrize("stale", [b"\x4b\x41\x60\x00\x50\x02\0\0", b"\x60\x85\x60\x00\0\0\0\0"])
+def test_an_answer_that_names_another_object_is_not_taken_for_this_one(
+    stale: bytes, network: BusNetwork, world: Witness
+) -> None:
+    """The question was another client's, or one of ours that nobody waits for any more."""
+    bus, answers = world.raw(), [stale, struct.pack("<BHBL", 0x43, 0x6076, 0, 222)]
+
+    def answer() -> None:
+        while (message := bus.recv(1.0)) is not None and message.arbitration_id != 0x605:
+            continue
+        for data in answers:
+            bus.send(can.Message(arbitration_id=0x585, data=data, is_extended_id=False))
+
+    node = threading.Thread(target=answer)
+    node.start()
+    try:
+        assert access(network, 5).read(0x6076) == 222
+    finally:
+        node.join()
+        bus.shutdown()
+
+
+def test_nothing_is_asked_beside_a_further_connection_of_this_process(network: BusNetwork, world: Witness) -> None:
+    """A server knows one transfer: a question would break a string that the other connection reads in segments."""
+    sdo, beside = access(network), AnnouncedBus(world.bus(), network)
+    assert not sdo.ask(0x6041, 0)
+    beside.close()
+    assert sdo.ask(0x6041, 0)
+    assert network.wait(lambda: sdo.answer() is not None, SDO_TIMEOUT_S)
 
 
 def test_a_value_that_does_not_fit_never_goes_out(network: BusNetwork) -> None:

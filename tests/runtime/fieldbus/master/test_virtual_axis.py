@@ -14,9 +14,10 @@ from servod.common.faults import FaultCode
 from servod.common.units import NS_PER_S
 from servod.drivers.virtual.bus_faults import BusFault, FaultKind
 from servod.drivers.virtual.world import SteppedBus
-from servod.runtime.fieldbus.cia import Emcy, NmtCommand, Obj301, Obj402, Obj406
+from servod.runtime.fieldbus.cia import NmtCommand, Obj301, Obj402, Obj406
 from servod.runtime.fieldbus.devices import DriveState, Goal, Reason, SdoAbort
 from servod.runtime.fieldbus.master.sdo import SDO_TIMEOUT_S
+from tests.axis_limits import LIMITS
 
 S = DriveState
 
@@ -88,7 +89,7 @@ def test_torque_and_both_positions_agree_through_a_gear() -> None:
 @pytest.mark.parametrize("start_rad", [-0.5, 0.0, 3.0])
 def test_encoder_wraps_at_a_range_that_is_no_power_of_two(start_rad: float) -> None:
     world = stepped_world(encoder_measuring_range_counts=1_200_000, start_position_rad=start_rad)
-    rig = Rig(world)
+    rig = Rig(world, limits=LIMITS | {"position_max_rad": 30.0})  # the drive itself stops at its own (0x607D)
     rig.start()
     rig.until(Goal.ENABLED)
     first = rig.run(1, Goal.ENABLED, 0.1)[1].position_rad
@@ -158,17 +159,6 @@ def test_the_drive_stops_by_itself_when_the_masters_heartbeat_ends(enabled: Rig)
     assert truth.torque_nm == 0.0
     emcy = [event.code for event in enabled.events if event.node_id == 1]
     assert 0x8130 in emcy
-
-
-def test_commands_alone_that_do_not_arrive_are_seen_by_the_drive(enabled: Rig) -> None:
-    """The heartbeat goes on, so only the deadline of the RPDO (0x1400:5) can tell."""
-    enabled.bus.inject(BusFault(FaultKind.DROP, can_id=0x201, amount=400))
-    enabled.run(140, Goal.ENABLED, 0.03)
-    assert enabled.events == []
-    enabled.run(30, Goal.ENABLED, 0.03)
-    assert [(event.node_id, event.fault, event.code) for event in enabled.events] == [
-        (1, FaultCode.DRIVE_FAULT, Emcy.RPDO_TIME_OUT)
-    ]
 
 
 def test_a_reset_of_the_drive_while_operational_is_seen(enabled: Rig) -> None:
@@ -277,7 +267,7 @@ def test_a_drive_that_somebody_runs_is_asked_and_left_alone(
     enabled.deadline_ns = enabled.clock.now_ns()
     assert enabled.run(200, Goal.ENABLED, 0.03)[0].state is S.OPERATION_ENABLED
     assert enabled.world.truth().torque_nm == pytest.approx(0.03, abs=2e-4)
-    assert enabled.master.sdo(1).read(Obj301.HEARTBEAT_CONSUMER, 1) == 126 << 16 | 150
+    assert enabled.master.sdo(1).read(Obj301.HEARTBEAT_CONSUMER, 1) == 126 << 16 | 100
 
 
 def test_a_drive_whose_master_died_is_taken_over_when_it_has_stopped_itself(enabled: Rig) -> None:

@@ -6,15 +6,19 @@ from typing import Any
 
 from servod.common.faults import FAULTS, FaultCode
 from servod.runtime.fieldbus.devices import DriveState, Mode
-from servod.runtime.loop.axis import Axis, AxisState
+from servod.runtime.loop.axis import Axis
+from servod.runtime.loop.axis_state import AxisState
 from servod.runtime.loop.commands import Refusal
 from tests.runtime.loop.boundary.feedback import amplifier
 
 S, D, F = AxisState, DriveState, FaultCode
 PERIOD_S = 2.0**-10
-RAMP, TIMEOUT, OBEY, PROOF = 8, 16, 102, 64  # cycles; 0.1 s are 102.4
+RAMP, TIMEOUT, OBEY, PROOF = 8, 16, 31, 64  # cycles; 0.03 s are 30.7
 PROOF_MARGIN = 256  # cycles
+STALE = 5  # cycles
 BIT = {code: fault.bit for code, fault in FAULTS.items()}
+#: Those of an axis without a brake; with one: tests/runtime/loop/test_brake.py.
+STATES = [state for state in S if state not in (S.RELEASING, S.ENGAGING)]
 CONTROLLED = (S.ENABLED, S.BRAKING, S.RAMPING)
 BEFORE_CONTROL = (S.ENABLING, S.PROVING)
 OFF = {"state": D.SWITCH_ON_DISABLED, "status_word": 0x0240, "goal_reached": False}
@@ -39,7 +43,9 @@ def step(axis: Axis, faults: int = 0, fresh: bool = True, at_rest: bool = False,
 
 
 def new() -> Axis:
-    return Axis(PERIOD_S, RAMP * PERIOD_S, TIMEOUT * PERIOD_S, Mode.CYCLIC_SYNC_TORQUE, PROOF * PERIOD_S)
+    return Axis(
+        PERIOD_S, RAMP * PERIOD_S, TIMEOUT * PERIOD_S, Mode.CYCLIC_SYNC_TORQUE, PROOF * PERIOD_S, stale_cycles=STALE
+    )
 
 
 def axis_in(state: AxisState) -> Axis:

@@ -9,7 +9,8 @@ import pytest
 
 from servod.common.faults import FAULTS, NEEDS_RESTART, FaultCode, Reaction
 from servod.runtime.fieldbus.devices import DriveState, Goal, Mode, Reason
-from servod.runtime.loop.axis import Axis, AxisState
+from servod.runtime.loop.axis import Axis
+from servod.runtime.loop.axis_state import AxisState
 from servod.runtime.loop.commands import Refusal
 from tests.runtime.loop.boundary.axis_rig import (
     BEFORE_CONTROL,
@@ -18,6 +19,7 @@ from tests.runtime.loop.boundary.axis_rig import (
     PERIOD_S,
     RAMP,
     READY,
+    STATES,
     TIMEOUT,
     D,
     F,
@@ -28,7 +30,7 @@ from tests.runtime.loop.boundary.axis_rig import (
 )
 
 
-@pytest.mark.parametrize("state", list(S))
+@pytest.mark.parametrize("state", STATES)
 def test_each_state_stays_and_asks_for_what_belongs_to_it(state: AxisState) -> None:
     axis = axis_in(state)
     output = step(axis)
@@ -49,6 +51,7 @@ def test_new_axis_is_disabled_without_faults() -> None:
 
 def test_recorded_numbers_of_the_states_stay() -> None:
     names = ["DISABLED", "ENABLING", "ENABLED", "BRAKING", "RAMPING", "QUICK_STOPPING", "FAULT", "PROVING"]
+    names += ["RELEASING", "ENGAGING"]
     assert [(state.name, int(state)) for state in S] == [(name, number) for number, name in enumerate(names)]
 
 
@@ -69,7 +72,7 @@ def expected(state: AxisState, code: FaultCode) -> AxisState:
     return state
 
 
-@pytest.mark.parametrize("state", list(S))
+@pytest.mark.parametrize("state", STATES)
 @pytest.mark.parametrize("code", list(F))
 def test_every_fault_in_every_state_has_its_reaction(code: FaultCode, state: AxisState) -> None:
     axis = axis_in(state)
@@ -77,12 +80,12 @@ def test_every_fault_in_every_state_has_its_reaction(code: FaultCode, state: Axi
     step(axis, BIT[code])
     assert axis.state == expected(state, code)
     assert axis.faults == BIT[code]
-    kept = state not in (S.DISABLED, S.FAULT) or code in NEEDS_RESTART
+    kept = state not in (S.DISABLED, S.FAULT) or code in NEEDS_RESTART | {F.SECOND_MASTER, F.FOREIGN_FEEDBACK}
     assert axis.latched == before | (BIT[code] if kept else 0)
     assert axis.unheard is (code in (F.DRIVE_STAYS_POWERED, F.COMMANDS_LOST) and bool(axis.latched & BIT[code]))
 
 
-@pytest.mark.parametrize("state", list(S))
+@pytest.mark.parametrize("state", STATES)
 @pytest.mark.parametrize("code", [F.TORQUE_CLIPPED, F.FOLLOWING_ERROR, F.SPEED_LIMIT, F.NOT_FINITE])
 def test_fault_after_the_step_reacts_in_the_same_cycle(code: FaultCode, state: AxisState) -> None:
     axis = axis_in(state)
@@ -201,7 +204,7 @@ def test_enable_with_a_latched_fault(code: FaultCode, reset: bool) -> None:
         assert step(axis).reset_fault is False, "one edge"
 
 
-@pytest.mark.parametrize("state", list(S))
+@pytest.mark.parametrize("state", STATES)
 def test_reset_in_every_state(state: AxisState) -> None:
     axis = axis_in(state)
     axis.note(BIT[F.DRIVE_RESET] | BIT[F.SPEED_LIMIT])
@@ -216,7 +219,7 @@ def test_reset_in_every_state(state: AxisState) -> None:
     assert [step(axis).reset_fault, step(axis).reset_fault] == [True, False]
 
 
-@pytest.mark.parametrize("state", list(S))
+@pytest.mark.parametrize("state", STATES)
 def test_disable_and_quick_stop_in_every_state(state: AxisState) -> None:
     disabled, stopped = axis_in(state), axis_in(state)
     disabled.disable()

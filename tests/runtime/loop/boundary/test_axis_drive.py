@@ -7,11 +7,14 @@ from typing import Any
 import pytest
 
 from servod.common.faults import FaultCode
-from servod.runtime.fieldbus.devices import DriveState, Mode, Reason
-from servod.runtime.loop.axis import Axis, AxisState
+from servod.runtime.fieldbus.devices import HANDSHAKE_SYNCS, DriveState, Mode, Reason
+from servod.runtime.loop.axis import Axis
+from servod.runtime.loop.axis_state import AxisState
+from servod.runtime.loop.brake import BrakeTimes
 from tests.runtime.loop.boundary.axis_rig import (
     BIT,
     CONTROLLED,
+    DRIVE,
     OBEY,
     OFF,
     PERIOD_S,
@@ -19,6 +22,8 @@ from tests.runtime.loop.boundary.axis_rig import (
     PROOF_MARGIN,
     RAMP,
     READY,
+    STALE,
+    STATES,
     TIMEOUT,
     D,
     F,
@@ -27,6 +32,7 @@ from tests.runtime.loop.boundary.axis_rig import (
     new,
     step,
 )
+from tests.runtime.loop.boundary.feedback import amplifier
 
 
 # --- from the drive's word to the first torque ------------------------------------------------------------------------
@@ -76,7 +82,7 @@ def test_proof_of_the_last_time_does_not_count() -> None:
 
 
 # --- what the drive says ----------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("state", list(S))
+@pytest.mark.parametrize("state", STATES)
 def test_drive_in_fault_is_one_but_while_it_is_being_reset(state: AxisState) -> None:
     for drive in (D.FAULT, D.FAULT_REACTION_ACTIVE):
         axis = axis_in(state)
@@ -88,7 +94,7 @@ def test_drive_in_fault_is_one_but_while_it_is_being_reset(state: AxisState) -> 
 
 
 @pytest.mark.parametrize(("bit", "code"), [(7, F.DRIVE_WARNING), (11, F.DRIVE_LIMITS_TORQUE)])
-@pytest.mark.parametrize("state", list(S))
+@pytest.mark.parametrize("state", STATES)
 def test_bits_of_the_status_word(state: AxisState, bit: int, code: FaultCode) -> None:
     axis = axis_in(state)
     step(axis, status_word=0x0237 | 1 << bit)
@@ -155,6 +161,23 @@ def test_commands_that_do_not_arrive_matter_to_a_powered_drive(drive: DriveState
     assert not axis.faults & BIT[F.COMMANDS_LOST], "no other reason says so"
 
 
+FOLLOWS, LIMITED = 0x1237, 0x0A37
+
+
+def test_a_drive_that_follows_its_command_no_more_does_not_get_it() -> None:
+    """Status word bit 12; one that never shows it, or limits its torque, is believed."""
+    axis = axis_in(S.ENABLED)
+    for word in [0x0237] * 40 + [FOLLOWS] + [0x0237] * 10 + [FOLLOWS] + [0x0237] * 10 + [LIMITED] * 40:
+        step(axis, status_word=word)
+        assert not axis.faults & BIT[F.COMMANDS_LOST]
+    for _ in range(10):
+        step(axis, status_word=0x0237)
+        assert not axis.faults & BIT[F.COMMANDS_LOST]
+    step(axis, status_word=0x0237)
+    assert axis.faults & BIT[F.COMMANDS_LOST]
+    assert axis.unheard
+
+
 # --- a drive that does not obey ---------------------------------------------------------------------------------------
 STAYS = BIT[F.DRIVE_STAYS_POWERED]
 
@@ -182,9 +205,60 @@ def test_drive_that_was_not_heard_since_it_was_told_off() -> None:
     assert cycles_until_disobedience(axis, state=D.SWITCH_ON_DISABLED, age_cycles=1) == OBEY + 1
     axis = axis_in(S.ENABLED)
     step(axis, BIT[F.NOT_FINITE])
+    assert cycles_until_disobedience(axis, age_cycles=STALE - 1) == OBEY + 1
+    axis = axis_in(S.ENABLED)
+    step(axis, BIT[F.NOT_FINITE])
     step(axis, state=D.SWITCH_ON_DISABLED)
     assert cycles_until_disobedience(axis, state=D.SWITCH_ON_DISABLED, age_cycles=1) == 0, "it was seen off"
     assert cycles_until_disobedience(new(), age_cycles=1) == 0, "and so is a drive before its first enable"
+
+
+@pytest.mark.parametrize("age_cycles", [STALE, STALE + 1, 1000])
+def test_a_drive_that_does_not_answer_has_the_handshake_alone(age_cycles: int) -> None:
+    """Without SYNC it takes no command, and the deadline of its commands sees them come all the same."""
+    axis = axis_in(S.ENABLED)
+    step(axis, BIT[F.FEEDBACK_STALE], age_cycles=age_cycles)
+    assert axis.state == S.QUICK_STOPPING
+    assert cycles_until_disobedience(axis, age_cycles=age_cycles) == HANDSHAKE_SYNCS + 1
+
+
+@pytest.mark.parametrize("clocked", [True, False])
+def test_a_brake_by_output_closes_before_nmt_ends_its_frames_where_sync_lives(clocked: bool) -> None:
+    """The encoder tells: it is not heard either when SYNC is lost, and then the drive takes no command."""
+    engage = 100
+    brake = BrakeTimes(True, PERIOD_S, engage * PERIOD_S)
+    axis = Axis(PERIOD_S, 0.01, 10.0, Mode.CYCLIC_SYNC_TORQUE, 1.0, brake=brake, stale_cycles=STALE)
+    axis.enable(False)
+    for _ in range(10):
+        axis.step(amplifier(**READY), True, 0, False)
+    assert axis.state == S.ENABLED
+    seen = []
+    for age_cycles in range(1, STALE + engage + 10):
+        fault = BIT[F.FEEDBACK_STALE] if age_cycles >= STALE else 0
+        step(axis, fault, age_cycles=age_cycles, fresh=clocked)
+        seen.append(axis.unheard)
+    first = seen.index(True) + 1 - STALE
+    assert first == (engage + HANDSHAKE_SYNCS + 1 if clocked else HANDSHAKE_SYNCS + 1)
+
+
+@pytest.mark.parametrize("by_drive", [True, False])
+def test_a_coarse_sensor_of_a_drive_that_holds_rests_within_its_counts(by_drive: bool) -> None:
+    brake = BrakeTimes(False, 0.01, 0.01) if by_drive else None
+    axis = Axis(PERIOD_S, 0.01, 2.0, Mode.CYCLIC_SYNC_TORQUE, 1.0, brake=brake, stays_rad=2e-3)
+    axis.enable(False)
+    for _ in range(30):
+        axis.step(amplifier(**READY), True, 0, False)
+    axis.quick_stop()
+    for number in range(30):
+        step(axis, state=D.QUICK_STOP_ACTIVE, position_rad=1e-3 * (number % 2))
+    assert axis.state == S.DISABLED
+
+
+def test_a_drive_with_a_brake_of_its_own_may_hold_until_that_is_closed() -> None:
+    for by_output, cycles in ((False, 133), (True, OBEY)):  # 0.03 and 0.1 s are 133.1
+        brake = BrakeTimes(by_output, 0.1, 0.1)
+        axis = Axis(PERIOD_S, 0.01, 10.0, Mode.CYCLIC_SYNC_TORQUE, 1.0, brake=brake)
+        assert cycles_until_disobedience(axis, state=D.OPERATION_ENABLED) == cycles + 1
 
 
 def test_one_obedient_cycle_begins_the_count_anew() -> None:
@@ -212,6 +286,31 @@ def test_quick_stop_may_hold_for_as_long_as_it_takes() -> None:
     axis.quick_stop()
     assert cycles_until_disobedience(axis, state=D.QUICK_STOP_ACTIVE) == 0
     assert axis.state == S.QUICK_STOPPING
+
+
+def test_a_drive_that_would_hold_in_quick_stop_active_is_switched_off_at_rest() -> None:
+    """0x605A from 5 on: at rest for 20 ms, and no torque is left that nobody asked for; a ramp is waited for."""
+    axis = Axis(PERIOD_S, RAMP * PERIOD_S, 1000 * PERIOD_S, Mode.CYCLIC_SYNC_TORQUE, 1.0, stays_rad=2e-4)
+    axis.enable(False)
+    step(axis, **READY)
+    axis.quick_stop()
+    for number in range(40):
+        step(axis, state=D.QUICK_STOP_ACTIVE, position_rad=0.001 * number)
+        assert axis.state == S.QUICK_STOPPING
+    for _ in range(20):
+        step(axis, state=D.QUICK_STOP_ACTIVE, position_rad=0.039)
+    assert axis.state == S.DISABLED
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_a_joint_that_the_controller_did_not_bring_to_rest_is_the_drives_to_stop(moving: bool) -> None:
+    """A law that runs away does not follow its reference to rest: letting go then would lose the ramp."""
+    axis = axis_in(S.ENABLED)
+    axis.step(amplifier(**DRIVE[S.ENABLED]), True, BIT[F.SUPERVISOR_LOST], False, moving)
+    assert axis.state == S.BRAKING
+    for _ in range(RAMP + 1 if moving else 1):  # it has its time for that
+        axis.step(amplifier(**DRIVE[S.ENABLED]), True, BIT[F.SUPERVISOR_LOST], True, moving)
+    assert axis.state == (S.QUICK_STOPPING if moving else S.RAMPING)
 
 
 def test_slow_loop_gives_a_drive_four_cycles() -> None:

@@ -261,3 +261,43 @@ def test_ramp_takes_its_share(share: float, torque: float) -> None:
 def test_positions_are_compared_when_they_are_of_one_moment(amp_age: int, enc_age: int, compared: int) -> None:
     amp, enc = amplifier(position_rad=1.0, age_cycles=amp_age), encoder(age_cycles=enc_age)
     assert armed().motion_faults(amp, enc, 0.0) == compared * BIT[FaultCode.ENCODER_IMPLAUSIBLE]
+
+
+# --- the torque that the drive says it gives --------------------------------------------------------------------------
+BENT = BIT[FaultCode.TORQUE_IMPLAUSIBLE]
+MISMATCH = 0.25 * CONFIG.torque_nm
+
+
+def said(limits: Limits, torque_nm: float, cycles: int, **changes: object) -> list[int]:
+    return [limits.torque_faults(amplifier(torque_nm=torque_nm, **changes)) for _ in range(cycles)]
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_bent_torque_is_a_fault_after_so_many_cycles_in_a_row(sign: float) -> None:
+    assert set(said(armed(), sign * MISMATCH, 200)) == {0}, "as far as is allowed"
+    limits = armed()
+    assert said(limits, sign * above(MISMATCH), 49) == [0] * 49
+    assert said(limits, 0.0, 1) == [0]
+    assert said(limits, sign * above(MISMATCH), 50) == [0] * 49 + [BENT]
+
+
+@pytest.mark.parametrize("changes", [{"age_cycles": 1}, {"status_word": 0x0A37}])
+def test_an_old_torque_and_one_that_the_drive_says_it_limits_are_not_judged(changes: dict[str, int]) -> None:
+    assert set(said(armed(), 0.5, 200, **changes)) == {0}
+
+
+def test_the_torque_is_held_against_the_commands_of_the_last_cycles() -> None:
+    """A command of full torque is forgotten in twenty cycles, so that what the drive still gives of it is no lie."""
+    limits = armed(CONFIG.torque_nm)
+    for _ in range(9):
+        limits.limit_torque(0.0, 1.0)
+    assert set(said(limits, 0.75 * CONFIG.torque_nm, 100)) == {0}
+    for _ in range(10):
+        limits.limit_torque(0.0, 1.0)
+    assert said(limits, 0.75 * CONFIG.torque_nm, 50)[-1] == BENT
+
+
+def test_the_allowed_distance_can_be_stated() -> None:
+    limits = Limits(CONFIG.model_copy(update={"torque_mismatch_nm": 0.0625}))
+    limits.arm(amplifier(), encoder())
+    assert said(limits, above(0.0625), 50)[-1] == BENT

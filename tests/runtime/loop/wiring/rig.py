@@ -13,7 +13,7 @@ from servod.drivers.virtual.world import SteppedWorld, VirtualAxisSettings
 from servod.formats.config import AxisConfig
 from servod.formats.model.axis_model import AxisModel
 from servod.kernels.laws import LAWS
-from servod.runtime.loop.axis import AxisState
+from servod.runtime.loop.axis_state import AxisState
 from servod.runtime.loop.commands import Op, Refusal
 from servod.runtime.loop.wiring.findings import WiringOutcome, WiringReport
 

@@ -12,7 +12,7 @@ from servod.common.faults import FAULTS, FaultCode
 from servod.common.shipped import shipped
 from servod.formats.model.axis_model import AxisModel, axis_model_yaml, load_axis_model
 from servod.formats.wiring import warnings, with_expected
-from servod.runtime.loop.axis import AxisState
+from servod.runtime.loop.axis_state import AxisState
 from servod.runtime.loop.commands import Op, ReferenceKind, Refusal
 from servod.runtime.loop.wiring.findings import WiringOutcome, wiring_sentence
 from tests.runtime.loop.wiring.rig import axis, enable, joint, proven

@@ -1,0 +1,134 @@
+"""What in an axis configuration weakens a guard, or lies beyond what model and drive can do, for people.
+
+Beside the data path: said by `servoctl config check` and in the daemon's log. Every value here is allowed, and some
+axis may need it; whoever set it shall know what it takes away.
+"""
+
+from __future__ import annotations
+
+import math
+
+from servod.formats.config import AxisConfig
+from servod.formats.model.axis_model import AxisKind, AxisModel
+from servod.formats.wiring import warnings
+
+#: No joint of a machine that people stand beside turns faster (9549 turns a minute).
+_MOST_SPEED_RAD_S = 1000.0
+#: Servo motors stand three times their rated torque for a moment, few four times.
+_MOST_OF_RATED = 4.0
+#: Without feedback the torque of before goes on for this time at most before it is noticed.
+_MOST_BLIND_S = 0.05
+_MOST_LATE_S, _MOST_RAMP_S = 0.25, 0.5
+#: A drive whose master has died holds its torque for so long (servod's own time-out is 150 ms).
+_MOST_DEAD_MS = 500
+#: Drive and encoder that drift apart by so much are not on one joint; a slip of an eighth of a turn is long seen.
+_MOST_MISMATCH_RAD = math.pi / 4.0
+
+
+def weakened(config: AxisConfig, model: AxisModel | None = None) -> list[str]:
+    """One line for each value of `config` (after `with_expected`) that guards less than it seems, key first."""
+    lines = [*_limits(config), *_times(config), *_beyond_drive(config), *warnings(config)]
+    if model is not None and model.axis is AxisKind.ROTARY:
+        lines += _beyond_model(config, model)
+    if config.gains.accept_uncertified:
+        lines.append("gains.accept_uncertified is true: a gain set that nobody verified may run")
+    if config.recorder.history_s == 0.0:
+        lines.append("recorder.history_s is 0: nothing of the seconds before a fault is kept")
+    if "interface" not in config.bus.model_fields_set:
+        lines.append(f"bus.interface is not stated: a virtual axis at {config.bus.channel}, no drive on a real bus")
+    return lines
+
+
+def _limits(config: AxisConfig) -> list[str]:
+    limits, period_s = config.limits, config.cycle.period_us * 1e-6
+    travel_rad = limits.position_max_rad - limits.position_min_rad
+    counts = config.encoder.measuring_range_counts or 2**32
+    range_rad = 2.0 * math.pi * counts / config.encoder.counts_per_turn
+    lines = []
+    if limits.speed_rad_s > _MOST_SPEED_RAD_S:
+        lines.append(f"limits.speed_rad_s {limits.speed_rad_s:g}: no joint turns so fast; nothing limits the speed")
+    elif limits.speed_rad_s * period_s > 0.5 * range_rad:
+        lines.append(
+            f"limits.speed_rad_s {limits.speed_rad_s:g}: half the encoder's range of {range_rad:.3g} rad and more "
+            "in one period, so that the speed cannot be told"
+        )
+    if travel_rad >= range_rad:
+        lines.append(
+            f"limits.position_min_rad and position_max_rad: the encoder's range of {range_rad:.3g} rad ends before them"
+        )
+    if limits.following_error_rad >= travel_rad:
+        lines.append(f"limits.following_error_rad {limits.following_error_rad:g}: the position limits come before it")
+    if limits.encoder_mismatch_rad > min(_MOST_MISMATCH_RAD, travel_rad):
+        lines.append(
+            f"limits.encoder_mismatch_rad {limits.encoder_mismatch_rad:g}: a coupling that slips by an eighth of a "
+            "turn is not noticed"
+        )
+    if limits.torque_rate_nm_per_s * period_s >= 2.0 * limits.torque_nm:
+        lines.append(
+            f"limits.torque_rate_nm_per_s {limits.torque_rate_nm_per_s:g}: from one torque limit to the other in a "
+            "period, so that it limits nothing"
+        )
+    return lines
+
+
+def _times(config: AxisConfig) -> list[str]:
+    limits, period_s = config.limits, config.cycle.period_us * 1e-6
+    found = (
+        ("limits.stale_cycles", limits.stale_cycles, limits.stale_cycles * period_s, _MOST_BLIND_S, "without feedback"),
+        (
+            "limits.late_cycles",
+            limits.late_cycles,
+            limits.late_cycles * period_s,
+            _MOST_LATE_S,
+            "of a loop that stands",
+        ),
+        ("limits.ramp_down_s", limits.ramp_down_s, limits.ramp_down_s, _MOST_RAMP_S, "of torque after a fault"),
+    )
+    lines = [
+        f"{key} {value:g}: up to {time_s:.3g} s {what} before the axis is off; up to {most_s:g} s is usual"
+        for key, value, time_s, most_s, what in found
+        if time_s > most_s
+    ]
+    if config.heartbeat.command_deadline_ms == 0:
+        lines.append(
+            "heartbeat.command_deadline_ms 0: when the commands alone are lost the drive holds its torque until the "
+            "joint shows it; when this computer dies, until the heartbeat is missed"
+        )
+    dead_ms = config.heartbeat.drive_timeout_ms
+    if dead_ms > _MOST_DEAD_MS:
+        lines.append(
+            f"heartbeat.drive_timeout_ms {dead_ms}: when this computer dies the drive holds its torque for "
+            f"{dead_ms / 1e3:g} s"
+        )
+    return lines
+
+
+def _beyond_drive(config: AxisConfig) -> list[str]:
+    rated_mnm = config.amplifier.rated_torque_mnm
+    if rated_mnm is None:
+        return []
+    share = config.limits.torque_nm / (rated_mnm * 1e-3 * config.amplifier.gear_ratio)
+    if share <= _MOST_OF_RATED:
+        return []
+    return [
+        f"limits.torque_nm {config.limits.torque_nm:g}: {share:.3g} times what the motor is rated for, after the gear"
+    ]
+
+
+def _beyond_model(config: AxisConfig, model: AxisModel) -> list[str]:
+    limits, lines = config.limits, []
+    saturation = model.torque_saturation
+    if saturation is not None:
+        most_nm = max(saturation.limit, saturation.negative_limit or 0.0)
+        if limits.torque_nm > most_nm:
+            lines.append(
+                f"limits.torque_nm {limits.torque_nm:g}: the joint of {config.model} gives {most_nm:g} at most"
+            )
+    if model.friction.kind == "local":
+        known_rad_s = max(abs(velocity) for velocity in model.friction.velocities)
+        if limits.speed_rad_s > known_rad_s:
+            lines.append(
+                f"limits.speed_rad_s {limits.speed_rad_s:g}: the friction of {config.model} was measured up to "
+                f"{known_rad_s:.3g} rad/s"
+            )
+    return lines

@@ -1,0 +1,329 @@
+"""The guards of the drive proven, not believed: the master falls silent on purpose and looks that the drive stops.
+
+Instead of a daemon. The joint is at rest with the drive enabled at zero torque, because a drive without power has
+nothing to show. What was proven, of which drive with which guards, and when, stands in a file beside the gain sets;
+`enable` asks for a newer one where `amplifier.guard_test_days` says so.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, TypedDict
+
+from servod.common.clock import Clock
+from servod.common.errors import AnswerIsNo, BadInput, Unreachable
+from servod.common.files import read_json, write_atomically
+from servod.formats.config import AxisConfig
+from servod.formats.stopping import CYCLES_BEHIND
+from servod.runtime.fieldbus.bus import Bus
+from servod.runtime.fieldbus.cia import (
+    CW_DISABLE_VOLTAGE,
+    CW_FAULT_RESET,
+    HEARTBEAT_BASE,
+    SYNC_ID,
+    Emcy,
+    NmtState,
+    Obj301,
+    Obj402,
+    decode_status_word,
+)
+from servod.runtime.fieldbus.devices import (
+    AmplifierCommand,
+    AmplifierFeedback,
+    DriveInput,
+    DriveState,
+    Goal,
+    NodePlan,
+    SdoAccess,
+)
+from servod.runtime.fieldbus.master import BringUp, Master
+from servod.runtime.fieldbus.master.planned import narrowed_by_stop
+from servod.runtime.fieldbus.registry import amplifier_of
+
+PROOF_NAME = "guard-proof.json"
+_S_PER_DAY = 86_400.0
+_MS = 1_000_000
+#: At rest under no torque for so many cycles before the silence, and no further than this from where it was [rad].
+_REST_CYCLES, _REST_RAD = 50, 0.02
+#: With inputs to be read: they come by an event timer, and those that do not come count as active after 40 ms.
+_INPUTS_S = 0.06
+#: A machine that stands still lets the other guard act, or does not see when the drive stopped: tried anew, so often.
+_TRIES = 3
+#: The drive is looked at once in a cycle; a look that is later by more is a machine that stood still.
+_LOOK_CYCLES = 3
+#: What the drive tells when each guard acts.
+_TOLD = {"commands": Emcy.RPDO_TIME_OUT, "heartbeat": Emcy.HEARTBEAT_LOST}
+_STAYS = 5  # 0x605A from here on
+_EXPECTED = (Emcy.HEARTBEAT_LOST, Emcy.RPDO_TIME_OUT)
+
+
+@dataclass(frozen=True)
+class GuardResult:
+    """One guard: the silence that it watches for, the time that it has, when the drive had left the command, and when
+    it was without power; in ms since the last frame. None: not within its time."""
+
+    guard: str
+    limit_ms: float
+    left_ms: float | None
+    off_ms: float | None
+
+    @property
+    def passed(self) -> bool:
+        """The drive stopped by itself, in time."""
+        return self.left_ms is not None and self.left_ms <= self.limit_ms and self.off_ms is not None
+
+
+class _Seen(NamedTuple):
+    """A result; `unsure`: in time or too late, by when the drive was looked at; `stalled`: since that was late."""
+
+    result: GuardResult
+    unsure: bool
+    stalled: bool
+
+
+class ProofStatus(TypedDict):
+    """The proof of the guards as the status tells it; `text` says why it does not hold, empty where it does."""
+
+    asked_for: bool
+    holds: bool
+    time: float | None
+    text: str
+
+
+def terms(amplifier: NodePlan, identity: Any) -> dict[str, Any]:
+    """What a proof holds for: this drive, with these ways and times to stop."""
+    ways = {Obj402.QUICK_STOP_OPTION, Obj402.FAULT_REACTION_OPTION, Obj402.ABORT_CONNECTION, Obj301.ERROR_BEHAVIOUR,
+            Obj301.HEARTBEAT_CONSUMER, Obj301.RPDO_PARAMETER}  # fmt: skip
+    guards = [list(guard) for guard in amplifier.facts.get("guards", ()) if guard[0] in ways]
+    return {"drive": asdict(identity), "guards": guards}
+
+
+class GuardTest:
+    """The test of one axis: `connect` gives a new connection to its bus."""
+
+    def __init__(self, config: AxisConfig, connect: Callable[[], Bus], clock: Clock) -> None:
+        # As the daemon runs it: with the limits and the ramp that the stop is reckoned with.
+        self._config, self._connect, self.clock = narrowed_by_stop(config)[0], connect, clock
+        # A drive that holds for a brake that servod closes stays in quick stop active, and has stopped there.
+        self._holds = config.amplifier.brake.by == "output" and config.amplifier.quick_stop_option >= _STAYS
+        self.period_ns = config.cycle.period_us * 1000
+        self.beat_ns = config.heartbeat.master_period_ms * _MS
+        self.beat_id = HEARTBEAT_BASE + config.heartbeat.master_node_id
+
+    def run(self) -> tuple[list[GuardResult], dict[str, Any]]:
+        """Each guard that is counted on, and the terms that the result holds for.
+
+        Raises Unreachable where the drive cannot be enabled, AnswerIsNo where the joint does not stay at rest.
+        """
+        master = Master(self._config, self._connect(), self.clock, threaded=False)
+        try:
+            return self._run(master)
+        finally:
+            master.close()
+
+    def _run(self, master: Master) -> tuple[list[GuardResult], dict[str, Any]]:
+        results: list[GuardResult] = []
+        up = master.bring_up()
+        facts = up.amplifier.facts
+        found = terms(up.amplifier, master.identity(up.amplifier.node_id))
+        silences = [("commands", facts["command_deadline_ms"]), ("heartbeat", facts["heartbeat_timeout_ms"])]
+        counted = [(guard, limit_ms) for guard, limit_ms in silences if limit_ms and self._counts(guard, facts)]
+        if not counted:
+            raise AnswerIsNo("no guard of this drive is counted on (amplifier.unguarded): there is nothing to test")
+        for number, (guard, limit_ms) in enumerate(counted):
+            up = up if number == 0 else master.bring_up()
+            results.append(self._tried(master, up, guard, float(limit_ms)))
+        self._reset_expected(master, up.amplifier.node_id)
+        master.stand_down()
+        return results, found
+
+    def _tried(self, master: Master, up: BringUp, guard: str, limit_ms: float) -> GuardResult:
+        """One guard, again where this machine was in the way. Raises Unreachable where it always was."""
+        late: GuardResult | None = None
+        for _ in range(_TRIES):
+            seen = self._try(master, up, guard, limit_ms)
+            if seen is not None and not seen.unsure:
+                return seen.result
+            late = late or (seen.result if seen is not None and not seen.stalled else None)
+            up = master.bring_up()
+        if late is not None:
+            return late
+        raise Unreachable(
+            f"{guard}: each time the drive told that another of its guards acted first, or was looked at too late, "
+            "since this machine stood still meanwhile: end what else runs here, then test again"
+        )
+
+    @staticmethod
+    def _counts(guard: str, facts: dict[str, Any]) -> bool:
+        return guard == "commands" or bool(facts.get("heartbeat_reaction"))
+
+    def _try(self, master: Master, up: BringUp, guard: str, limit_ms: float) -> _Seen | None:
+        """Bring the drive to zero torque at rest, fall silent, and look until it is without power. However that ends,
+        the drive is switched off. None where another guard acted."""
+        bus, sdo = self._connect(), master.sdo(up.amplifier.node_id)
+        drive = _Cycles(self, bus, up)
+        with ExitStack() as end:  # whatever fails of these, the others are done
+            end.callback(bus.close)
+            end.callback(sdo.write, Obj402.CONTROL_WORD, 0, CW_DISABLE_VOLTAGE)  # its PDOs may have ended
+            end.callback(drive.run, Goal.OFF, 20)
+            end.callback(setattr, drive, "silent", "")
+            self._come_to_rest(drive, sdo)
+            drive.silent = guard
+            left_ms, off_ms, told, before_ms = self._look(sdo, drive, limit_ms)
+        # The first that it tells is the one that acted: others may follow while its ramp lasts.
+        if next((code for code in told if code in _TOLD.values()), _TOLD[guard]) != _TOLD[guard]:
+            return None
+        # What the stop is reckoned with, and no more (servod.formats.stopping).
+        most_ms = limit_ms + CYCLES_BEHIND * self.period_ns / _MS
+        unsure = left_ms is not None and before_ms <= most_ms < left_ms
+        stalled = left_ms is not None and left_ms - before_ms > _LOOK_CYCLES * self.period_ns / _MS
+        return _Seen(GuardResult(guard, most_ms, left_ms, off_ms), unsure, stalled)
+
+    def _come_to_rest(self, drive: _Cycles, sdo: SdoAccess) -> None:
+        reads_inputs = self._config.amplifier.inputs.estop_bit is not None or self._config.amplifier.inputs.tells_sto
+        off = drive.run(Goal.OFF, round(_INPUTS_S * 1e9 / self.period_ns) if reads_inputs else 10)
+        _refuse_stopped(off)
+        fault = off.state is DriveState.FAULT
+        if fault and (error := sdo.read(Obj402.ERROR_CODE)) not in _EXPECTED:
+            raise Unreachable(
+                f"the drive is in a fault of its own (error 0x{error:04X}), which this test does not reset: remove its "
+                "cause, then `servoctl enable --reset-fault`"
+            )
+        drive.run(Goal.OFF, 1, reset=fault)
+        for _ in range(round(self._config.amplifier.enable_timeout_s * 1e9 / self.period_ns)):
+            feedback = drive.run(Goal.ENABLED, 1)
+            _refuse_stopped(feedback)
+            if feedback.state is DriveState.OPERATION_ENABLED and feedback.goal_reached:
+                break
+        else:
+            raise Unreachable(f"the drive is {feedback.state.name}, not enabled, so its guards cannot be tried")
+        start_rad = feedback.position_rad
+        for _ in range(_REST_CYCLES):
+            feedback = drive.run(Goal.ENABLED, 1)
+            _refuse_stopped(feedback)
+            if abs(feedback.position_rad - start_rad) > _REST_RAD:
+                raise AnswerIsNo("the joint moves without torque: hold its load (brake, support), then test again")
+
+    def _look(
+        self, sdo: SdoAccess, drive: _Cycles, limit_ms: float
+    ) -> tuple[float | None, float | None, list[int], float]:
+        """When the drive had left the command at the latest, when it was without power, the codes that it told, and
+        until when at least it had not left. Its status word is asked for by SDO in each cycle: PDOs may end with the
+        reaction."""
+        last_ns, told = drive.last_ns[drive.silent], list[int]()
+        before_ms = 0.0
+        left_ms: float | None = None
+        most_ms = 2.0 * limit_ms + 1e3 * self._config.amplifier.enable_timeout_s
+        while (since_ms := (self.clock.now_ns() - last_ns) / _MS) < most_ms:
+            feedback = drive.run(Goal.ENABLED, 1)
+            if feedback.inputs and left_ms is None and not feedback.age_cycles:
+                _refuse_stopped(feedback)
+            told.append(feedback.error_code)
+            asked_ms = (self.clock.now_ns() - last_ns) / _MS
+            state = decode_status_word(sdo.read(Obj402.STATUS_WORD))
+            answered_ms = (self.clock.now_ns() - last_ns) / _MS
+            if state is DriveState.OPERATION_ENABLED:
+                before_ms = asked_ms
+            elif left_ms is None:
+                left_ms = answered_ms
+            if state.unpowered or (self._holds and state is DriveState.QUICK_STOP_ACTIVE):
+                return left_ms, answered_ms, told, before_ms
+            if left_ms is None and since_ms > 2.0 * limit_ms + 100.0:
+                break
+        return left_ms, None, told, before_ms
+
+    def _reset_expected(self, master: Master, node_id: int) -> None:
+        """The fault that the test itself has caused goes; any other stays as it is."""
+        sdo = master.sdo(node_id)
+        fault = decode_status_word(sdo.read(Obj402.STATUS_WORD)) is DriveState.FAULT
+        if fault and sdo.read(Obj402.ERROR_CODE) in _EXPECTED:
+            sdo.write(Obj402.CONTROL_WORD, 0, CW_FAULT_RESET)
+            sdo.write(Obj402.CONTROL_WORD, 0, CW_DISABLE_VOLTAGE)
+
+
+def _refuse_stopped(feedback: AmplifierFeedback) -> None:
+    """Raise AnswerIsNo while somebody holds the axis stopped."""
+    if feedback.inputs & (DriveInput.ESTOP | DriveInput.STO):
+        raise AnswerIsNo("the emergency stop or STO is active, or not heard of: release it, then test again")
+
+
+class _Cycles:
+    """SYNC, command and heartbeat of a loop in its plainest form, any of which may fall `silent`."""
+
+    def __init__(self, test: GuardTest, bus: Bus, up: BringUp) -> None:
+        self._test, self._bus, self._clock = test, bus, test.clock
+        self._amplifier = amplifier_of(up.amplifier)
+        self.silent = ""
+        self._next_ns = self._beat_ns = self._clock.now_ns()
+        self.last_ns = {"commands": self._next_ns, "heartbeat": self._next_ns}  # when each went out last
+
+    def run(self, goal: Goal, cycles: int, reset: bool = False) -> AmplifierFeedback:
+        """So many cycles; the newest feedback."""
+        for _ in range(cycles):
+            self._next_ns = max(self._next_ns + self._test.period_ns, self._clock.now_ns())
+            self._clock.sleep_until(self._next_ns)
+            while (frame := self._bus.receive(0.0)) is not None:
+                if frame.can_id in self._amplifier.receive_ids:
+                    self._amplifier.on_frame(*frame)
+            if self._clock.now_ns() >= self._beat_ns:
+                self._beat_ns = self._clock.now_ns() + self._test.beat_ns
+                self._send("heartbeat", self._test.beat_id, bytes((NmtState.OPERATIONAL,)))
+            self._bus.send(SYNC_ID, b"")
+            feedback = self._amplifier.read()
+            self._send("commands", *self._amplifier.write(AmplifierCommand(goal, 0.0, False, reset)))
+        return feedback
+
+    def _send(self, what: str, can_id: int, data: bytes) -> None:
+        if what != self.silent:
+            self._bus.send(can_id, data)
+            self.last_ns[what] = self._clock.now_ns()
+
+
+# --- The proof ---
+
+
+def keep_proof(config: AxisConfig, results: list[GuardResult], found: dict[str, Any]) -> Path:
+    """Write the proof of a test that passed; where it is."""
+    path = config.gains.directory / PROOF_NAME
+    document = {"time": time.time(), "terms": found, "results": [asdict(result) for result in results]}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, json.dumps(document, indent=1) + "\n")
+    return path
+
+
+def proof_status(config: AxisConfig, found: dict[str, Any], now_s: float) -> ProofStatus:
+    """Whether the guards of the drive that was brought up with the terms `found` are proven, as of `now_s` (Unix)."""
+    days = config.amplifier.guard_test_days
+    tested_s, text = _judge(config, found, now_s)
+    return {"asked_for": days is not None, "holds": not text, "time": tested_s, "text": text}
+
+
+def _judge(config: AxisConfig, found: dict[str, Any], now_s: float) -> tuple[float | None, str]:
+    path = config.gains.directory / PROOF_NAME
+    try:
+        proof = read_json(path, "a proof by `servoctl guard-test`")
+        tested_s, held = float(proof["time"]), proof["terms"]
+    except (BadInput, KeyError, TypeError, ValueError):
+        return None, f"the drive's guards were never tested ({path} is missing or broken)"
+    if held != found:
+        return tested_s, "the drive, its guards or their times are others than those that were tested"
+    days = config.amplifier.guard_test_days
+    if tested_s > now_s:
+        return tested_s, "the test of the drive's guards is dated in the future: set the clock"
+    if days is not None and now_s - tested_s > days * _S_PER_DAY:
+        return tested_s, f"the test of the drive's guards is older than amplifier.guard_test_days ({days:g})"
+    return tested_s, ""
+
+
+def require_proof(proof: ProofStatus) -> None:
+    """Raise Unreachable where the configuration asks for a proof that does not hold."""
+    if proof["asked_for"] and not proof["holds"]:
+        raise Unreachable(
+            f"refused: {proof['text']}; stop the daemon, run `servoctl guard-test CONFIG` with nobody in reach, start "
+            "it again"
+        )

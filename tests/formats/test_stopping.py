@@ -1,0 +1,165 @@
+"""What a configuration says of its stop: where the joint is from, what is narrowed, and by how much."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from servod.common.errors import BadInput
+from servod.common.shipped import shipped
+from servod.common.yaml import validate
+from servod.formats.config import AxisConfig
+from servod.formats.stopping import Stopping, joint_of, with_stopping
+from servod.qualify.faults.scenario import merged, shipped_config
+
+SOON_S, HEARTBEAT_S = 0.02, 0.15
+LIGHT = {"least_inertia": 0.001, "least_friction_nm": 0.005}
+
+
+def axis(stopping: dict[str, Any] | None = None, **over: Any) -> AxisConfig:
+    limits = {"torque_nm": 0.3, "speed_rad_s": 3.0, "position_min_rad": -0.6, "position_max_rad": 0.6}
+    own = {"limits": {**limits, "stale_cycles": 5}, "stopping": stopping or {}}
+    return validate(merged(merged(shipped_config(), own), over), AxisConfig, "axis")
+
+
+def stated(config: AxisConfig, reaction_s: float = SOON_S) -> Stopping:
+    found = with_stopping(config, reaction_s)[1]
+    assert found is not None
+    return found
+
+
+def test_nothing_is_stated_of_a_joint_that_nobody_knows() -> None:
+    config = axis()
+    assert with_stopping(config, SOON_S) == (config, None)
+
+
+def test_speed_torque_and_ramp_are_narrowed_and_it_is_said_by_how_much() -> None:
+    narrow, stopping = with_stopping(axis(LIGHT), HEARTBEAT_S)
+    assert stopping is not None
+    assert narrow.limits.speed_rad_s == stopping.facts.speed_rad_s == 3.0
+    assert narrow.stopping.deceleration_rad_s2 == pytest.approx(0.8 * 0.305 / 0.001)
+    assert stopping.torque_at_rest_nm == pytest.approx(0.005 + 0.001 * 3.45 / stopping.facts.hold_s)
+    assert stopping.torque_at_rest_nm < 0.03
+    assert stopping.time_s <= 0.3
+    assert stopping.speed_rad_s == pytest.approx(3.6)
+    (torque,) = stopping.narrowed
+    assert torque.startswith("limits.torque_nm 0.3 towards the motion is narrowed to 0.0274 N*m at rest")
+    assert any(torque in line for line in stopping.lines())
+
+
+def test_a_heavy_joint_gets_the_speed_that_it_brakes_from_in_time() -> None:
+    heavy = {"least_inertia": 0.02, "least_friction_nm": 0.01}
+    narrow, stopping = with_stopping(axis(heavy), SOON_S)
+    assert stopping is not None
+    assert narrow.limits.speed_rad_s < 0.4
+    assert stopping.time_s == pytest.approx(0.06, rel=1e-3)
+    assert "limits.speed_rad_s 3 is narrowed to" in stopping.narrowed[0]
+    assert with_stopping(axis({**heavy, "within_s": 1.0}), SOON_S)[0].limits.speed_rad_s == 3.0
+
+
+def test_a_range_that_is_too_small_for_the_speed_narrows_it() -> None:
+    stopping = stated(axis({**LIGHT, "within_s": 1.0, "deceleration_rad_s2": 5.0}))
+    assert stopping.travel_rad == pytest.approx(1.2, rel=1e-3)
+    assert stopping.facts.speed_rad_s == pytest.approx(stopping.speed_rad_s / 1.2) != 3.0
+
+
+def test_a_load_that_friction_does_not_hold_is_said_plainly() -> None:
+    stopping = stated(axis({**LIGHT, "least_inertia": 0.01, "within_s": 1.0, "load_min_nm": -0.05}))
+    assert stopping.document()["coasts_rad"] is None
+    assert "does not rest by itself: a load of 0.05 N*m is not held by 0.005 N*m of friction" in stopping.lines()[1]
+    assert stopping.facts.speed_rad_s == pytest.approx(3.0)
+    held = stated(axis({**LIGHT, "load_min_nm": -0.004}))
+    assert held.document()["coasts_rad"] > held.travel_rad
+
+
+def test_a_drive_that_switches_off_lets_the_joint_coast_and_that_counts() -> None:
+    off = {"amplifier": {"heartbeat_reaction": 2}}
+    stopping = stated(axis({**LIGHT, "within_s": 1.0}, **off))
+    assert stopping.facts.deceleration_rad_s2 == 0.0
+    assert stopping.time_s == pytest.approx(0.103)  # the ramp-down of a loop that lost its supervisor takes longer
+    assert stopping.travel_rad == pytest.approx(1.2, rel=1e-3)
+    assert stopping.facts.speed_rad_s < 3.0
+    with pytest.raises(BadInput, match="with a drive that does not brake"):
+        with_stopping(axis({"least_inertia": 0.001}, **off), SOON_S)
+
+
+@pytest.mark.parametrize(
+    ("amplifier", "more_s"),
+    [
+        ({"brake": {"by": "drive", "engage_s": 0.1}}, 0.1),
+        ({"brake": {"by": "output", "output_bit": 16, "engage_s": 0.1}}, 0.12),
+        ({"quick_stop_option": 6}, 0.02),
+    ],
+)
+def test_the_torque_that_holds_until_the_brake_is_closed_is_stated(amplifier: dict[str, Any], more_s: float) -> None:
+    """What brings the joint to rest is as before; at rest it is held for so much longer."""
+    plain, held = stated(axis(LIGHT)), stated(axis(LIGHT, amplifier=amplifier))
+    assert held.time_s == pytest.approx(plain.time_s + more_s)
+    assert held.facts == plain.facts
+    assert (plain.held_s, held.held_s) == (0.0, pytest.approx(more_s))
+    assert "after a loss of the master torque is gone within 57 ms" in plain.statement()[0]
+    both = "the joint is at rest within 57 ms and torque, which holds it on purpose until then, is gone within"
+    assert f"{both} {57 + 1e3 * more_s:.0f} ms" in held.statement()[0]
+    by_output_and_stays = axis(LIGHT, amplifier={"brake": {"by": "output", "output_bit": 16}, "quick_stop_option": 6})
+    assert any("until it is switched off" in line for line in stated(by_output_and_stays).statement())
+    assert not any("until it is switched off" in line for line in held.statement())
+
+
+@pytest.mark.parametrize("amplifier", [{"quick_stop_option": 6}, {"brake": {"by": "drive", "engage_s": 0.2}}])
+def test_the_joint_rests_within_the_stated_time_and_the_torque_that_holds_it_is_gone_later(
+    amplifier: dict[str, Any],
+) -> None:
+    heavy = {"least_inertia": 0.02, "least_friction_nm": 0.01, "within_s": 0.12}
+    stopping = stated(axis(heavy, amplifier=amplifier))
+    assert stopping.time_s - stopping.held_s == pytest.approx(0.12, rel=1e-3)
+    assert "the joint is at rest within 120 ms (stopping.within_s)" in stopping.narrowed[0]
+    assert "torque is gone within 120 ms (stopping.within_s)" in stated(axis(heavy)).narrowed[0]
+
+
+def test_lost_commands_without_a_deadline_are_said_to_be_in_no_figure() -> None:
+    unguarded = axis(LIGHT, heartbeat={"command_deadline_ms": 0})
+    (note,) = set(stated(unguarded, HEARTBEAT_S).statement()) - set(stated(axis(LIGHT), HEARTBEAT_S).statement())
+    assert note.startswith("stopping: commands alone lost, the master alive: not in these figures")
+
+
+def test_a_ramp_that_nobody_writes_is_none_unless_it_is_stated() -> None:
+    assert with_stopping(axis(LIGHT), SOON_S, writes_ramp=False)[1].facts.deceleration_rad_s2 == 0.0
+    told = axis({**LIGHT, "deceleration_rad_s2": 100.0})
+    assert with_stopping(told, SOON_S, writes_ramp=False)[1].facts.deceleration_rad_s2 == 100.0
+    falls = {"load_min_nm": -0.05, **LIGHT}
+    with pytest.raises(BadInput, match=r"stopping\.deceleration_rad_s2"):
+        with_stopping(axis(falls), SOON_S, writes_ramp=False)
+
+
+def test_the_joint_is_the_model_s_unless_it_is_stated(tmp_path: Path) -> None:
+    model = tmp_path / "model.yaml"
+    model.write_text(
+        "inertia: 0.002\nfriction: {kind: coulomb_viscous, coulomb: 0.04, viscous: 0.02}\n"
+        "asymmetry: {negative_dry: 0.5}\ngravity: {amplitude: 0.1}\n"
+        "cogging: {harmonics: [{amplitude: 0.01, periods_per_turn: 22}]}\n"
+    )
+    joint = joint_of(axis(model=str(model)))
+    assert joint is not None
+    assert (joint.least_inertia, joint.most_inertia) == pytest.approx((0.0018, 0.0022))
+    assert (joint.friction_nm, joint.viscous) == pytest.approx((0.01, 0.01))
+    assert joint.load_max_nm == pytest.approx(0.1 * 0.564642 + 0.01, rel=1e-4)  # sin(0.6)
+    assert joint.load_min_nm == pytest.approx(-joint.load_max_nm)
+    told = joint_of(axis({"least_inertia": 0.001, "load_min_nm": 0.0, "least_friction_nm": 0.0}, model=str(model)))
+    assert told is not None
+    assert (told.least_inertia, told.most_inertia, told.load_min_nm, told.friction_nm) == (0.001, 0.0022, 0.0, 0.0)
+
+
+def test_the_design_of_the_first_gain_set_knows_the_joint_too() -> None:
+    joint = joint_of(axis(gains={"initial": str(shipped("gains/demo_local_certified.yaml"))}))
+    assert joint is not None
+    assert "design of the first gain set" in joint.source
+    assert 0.0008 < joint.least_inertia < joint.most_inertia < 0.0013
+
+
+def test_what_the_test_of_the_wiring_expects_is_better_than_nothing() -> None:
+    joint = joint_of(axis(wiring_proof={"inertia": 0.001, "friction_nm": 0.07}))
+    assert joint is not None
+    assert (joint.least_inertia, joint.friction_nm) == pytest.approx((0.0009, 0.035))
+    assert joint.assumed == ("assumed: no load (stopping.load_min_nm, load_max_nm)",)

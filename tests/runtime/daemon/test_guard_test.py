@@ -1,0 +1,239 @@
+"""The guards of the drive tried on the stepped virtual axis: what stops in time, what does not, and the proof of it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from servod.common.errors import AnswerIsNo, Unreachable
+from servod.drivers.virtual.settings import VirtualAxisSettings
+from servod.drivers.virtual.world import SteppedWorld
+from servod.formats.config import AxisConfig
+from servod.formats.model.axis_model import AxisModel
+from servod.runtime.daemon.guard_test import (
+    PROOF_NAME,
+    GuardResult,
+    GuardTest,
+    _Cycles,
+    keep_proof,
+    proof_status,
+    require_proof,
+)
+from servod.runtime.fieldbus.devices import AmplifierFeedback, DriveState, Goal
+from tests.axis_limits import LIMITS
+
+JOINT = {"inertia": 0.001, "friction": {"kind": "coulomb_viscous", "coulomb": 0.01, "viscous": 0.05}}
+DAY_S = 86_400.0
+
+
+def world_of(plant: dict[str, Any] | None = None, **settings: Any) -> SteppedWorld:
+    return SteppedWorld(VirtualAxisSettings(**settings), AxisModel.model_validate(JOINT | (plant or {})))
+
+
+def axis(tmp_path: Path, days: float | None = 30.0, **sections: Any) -> AxisConfig:
+    amplifier = {"guard_test_days": days} | sections.pop("amplifier", {})
+    gains = {"initial": "gains.yaml", "directory": str(tmp_path / "gains")}
+    return AxisConfig.model_validate({"limits": LIMITS, "gains": gains, "amplifier": amplifier} | sections)
+
+
+def tried(world: SteppedWorld, config: AxisConfig) -> tuple[list[GuardResult], dict[str, Any]]:
+    return GuardTest(config, world.connect, world.clock).run()
+
+
+@pytest.mark.parametrize("reaction", [1, 2, 3])
+def test_each_guard_stops_the_drive_in_its_time(tmp_path: Path, reaction: int) -> None:
+    world = world_of()
+    results, _ = tried(world, axis(tmp_path, amplifier={"heartbeat_reaction": reaction}))
+    assert [(result.guard, result.passed) for result in results] == [("commands", True), ("heartbeat", True)]
+    commands, heartbeat = results
+    assert 19.0 <= (commands.left_ms or 0) <= 25.0
+    assert 50.0 <= (heartbeat.left_ms or 0) <= 103.0
+    assert (commands.limit_ms, heartbeat.limit_ms) == (23.0, 103.0)  # what the stop is reckoned with, and no more
+    assert world.amplifier.machine.state is DriveState.SWITCH_ON_DISABLED  # the fault that the test caused is gone
+    assert world.truth().torque_nm == 0.0
+
+
+class Stalls(SteppedWorld):
+    """The machine stands still for 30 ms in the silence of the heartbeat, `left` times."""
+
+    left = 1
+
+    def stall(self, test: GuardTest) -> None:
+        run = _Cycles.run
+
+        def late(drive: _Cycles, goal: Goal, cycles: int, reset: bool = False) -> AmplifierFeedback:
+            if drive.silent == "heartbeat" and self.left:
+                self.left -= 1
+                self.clock.sleep_until(self.clock.now_ns() + 30_000_000)
+            return run(drive, goal, cycles, reset)
+
+        _Cycles.run = late  # type: ignore[method-assign]
+        try:
+            self.results = test.run()[0]
+        finally:
+            _Cycles.run = run  # type: ignore[method-assign]
+
+
+def test_a_heartbeat_that_the_command_deadline_covers_is_tried_anew(tmp_path: Path) -> None:
+    world = Stalls(VirtualAxisSettings(), AxisModel.model_validate(JOINT))
+    world.stall(GuardTest(axis(tmp_path), world.connect, world.clock))
+    assert [(result.guard, result.passed) for result in world.results] == [("commands", True), ("heartbeat", True)]
+    assert (world.results[1].left_ms or 0) > 50.0
+    world.left = 1000
+    with pytest.raises(Unreachable, match="heartbeat: each time the drive told that another of its guards"):
+        world.stall(GuardTest(axis(tmp_path), world.connect, world.clock))
+    assert world.amplifier.machine.state.unpowered
+
+
+class LooksLate(SteppedWorld):
+    """The machine stands still before an answer of the drive is looked at, from 19 to 35 ms after the last command."""
+
+    left, late_ms = 1, 16
+
+    def late(self, test: GuardTest) -> list[GuardResult]:
+        run = _Cycles.run
+
+        def stands(drive: _Cycles, goal: Goal, cycles: int, reset: bool = False) -> AmplifierFeedback:
+            feedback = run(drive, goal, cycles, reset)
+            since_ns = self.clock.now_ns() - drive.last_ns["commands"]
+            if drive.silent == "commands" and self.left and since_ns > 18_000_000:
+                self.left -= 1
+                self.clock.sleep_until(self.clock.now_ns() + self.late_ms * 1_000_000)
+            return feedback
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(_Cycles, "run", stands)
+            return test.run()[0]
+
+
+def test_a_stop_that_is_looked_at_too_late_is_tried_anew(tmp_path: Path) -> None:
+    world = LooksLate(VirtualAxisSettings(), AxisModel.model_validate(JOINT))
+    results = world.late(GuardTest(axis(tmp_path), world.connect, world.clock))
+    assert [(result.guard, result.passed) for result in results] == [("commands", True), ("heartbeat", True)]
+    assert results[0].left_ms is not None and results[0].left_ms <= 23.0, "no bound is another one"
+    world.left = 1000
+    with pytest.raises(Unreachable, match=r"commands: .* was looked at too late, since this machine stood still"):
+        world.late(GuardTest(axis(tmp_path), world.connect, world.clock))
+    assert world.amplifier.machine.state.unpowered
+
+
+@pytest.mark.parametrize("how", [KeyboardInterrupt, SystemExit, RuntimeError])
+@pytest.mark.parametrize("silent", ["", "commands", "heartbeat"])
+@pytest.mark.parametrize("cycles_fail", [False, True])
+def test_a_test_that_is_broken_off_leaves_the_drive_off(
+    tmp_path: Path, how: type[BaseException], silent: str, cycles_fail: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world, run, hit = world_of(), _Cycles.run, False
+
+    def broken_off(drive: _Cycles, goal: Goal, cycles: int, reset: bool = False) -> AmplifierFeedback:
+        nonlocal hit
+        enabled = world.amplifier.machine.state is DriveState.OPERATION_ENABLED
+        if drive.silent == silent and enabled and not hit:
+            hit = True
+            raise how
+        if hit and cycles_fail:
+            raise how
+        return run(drive, goal, cycles, reset)
+
+    monkeypatch.setattr(_Cycles, "run", broken_off)
+    with pytest.raises(how):
+        tried(world, axis(tmp_path))
+    assert hit
+    assert world.amplifier.machine.state.unpowered
+
+
+def test_nothing_is_enabled_while_the_emergency_stop_is_active(tmp_path: Path) -> None:
+    world = world_of()
+    world.amplifier.dictionary.entry(0x2000, 7).value = 0
+    with pytest.raises(AnswerIsNo, match="emergency stop or STO is active"):
+        tried(world, axis(tmp_path, amplifier={"inputs": {"estop_bit": 16}}))
+    assert world.amplifier.machine.last_transition != 4
+    world.amplifier.dictionary.entry(0x2000, 7).value = 0x30000
+    assert all(result.passed for result in tried(world, axis(tmp_path, amplifier={"inputs": {"estop_bit": 16}}))[0])
+
+
+def test_the_drive_is_tried_as_the_daemon_runs_it(tmp_path: Path) -> None:
+    """With the ramp that the stop is reckoned with; the raw configuration leaves what stood in the drive."""
+    world, written = world_of(), []
+    ramp = world.amplifier.dictionary.entry(0x6085)
+    hook = ramp.written
+    ramp.written = lambda value: (written.append(value), hook(value) if hook else None)
+    assert all(result.passed for result in tried(world, axis(tmp_path, stopping={"least_inertia": 0.001}))[0])
+    assert written[0] > 33_000_000  # 0.8 of 1 N*m on 0.001 kg*m^2; it stands at 200 rad/s^2 before
+
+
+@pytest.mark.parametrize("option", [5, 6, 7, 8])
+def test_a_drive_that_stays_in_quick_stop_active_passes_and_is_left_off(tmp_path: Path, option: int) -> None:
+    world = world_of()
+    results, _ = tried(world, axis(tmp_path, amplifier={"quick_stop_option": option, "heartbeat_reaction": 3}))
+    assert all(result.passed for result in results)
+    assert world.amplifier.machine.state.unpowered
+
+
+def test_a_drive_that_holds_for_a_brake_by_output_passes_and_is_left_off(tmp_path: Path) -> None:
+    """By 0x6007 = 3 it holds in quick stop active, so that a supervisor which outlives its loop can close the brake."""
+    world = world_of(brake="output")
+    brake = {"by": "output", "output_bit": 16}
+    results, _ = tried(world, axis(tmp_path, amplifier={"quick_stop_option": 6, "brake": brake}))
+    assert all(result.passed for result in results)
+    assert world.amplifier.machine.state.unpowered
+
+
+def test_a_drive_that_only_tells_is_found(tmp_path: Path) -> None:
+    """Its EMCY comes in time, and its torque stays: a real stop is asked for, whatever the drive says of itself."""
+    world = world_of(command_deadline="tells")
+    world.amplifier.dictionary.set_default(0x2007, 0, 1)
+    results, _ = tried(world, axis(tmp_path))
+    assert [(result.guard, result.passed) for result in results] == [("commands", False), ("heartbeat", True)]
+    assert world.amplifier.machine.state.unpowered
+
+
+def test_where_only_the_heartbeat_counts_only_it_is_tried(tmp_path: Path) -> None:
+    results, _ = tried(world_of(command_deadline="none"), axis(tmp_path))
+    assert [(result.guard, result.passed) for result in results] == [("heartbeat", True)]
+    with pytest.raises(AnswerIsNo, match="nothing to test"):
+        tried(world_of(missing_objects=["1400:5", "6007"]), axis(tmp_path, amplifier={"unguarded": True}))
+
+
+def test_a_fault_of_the_drives_own_is_not_reset(tmp_path: Path) -> None:
+    world = world_of()
+    world.amplifier.dictionary.entry(0x2000, 1).value = 0x7305
+    world.clock.sleep_until(world.clock.now_ns() + 10_000_000)
+    world.amplifier.dictionary.entry(0x2000, 1).value = 0
+    with pytest.raises(Unreachable, match=r"a fault of its own \(error 0x7305\)"):
+        tried(world, axis(tmp_path))
+    assert world.amplifier.machine.state is DriveState.FAULT
+
+
+def test_a_joint_that_moves_without_torque_ends_the_test(tmp_path: Path) -> None:
+    world = world_of({"gravity": {"amplitude": 0.1, "phase": 1.57}})
+    with pytest.raises(AnswerIsNo, match="moves without torque"):
+        tried(world, axis(tmp_path))
+    assert world.amplifier.machine.state.unpowered
+
+
+def test_a_proof_holds_for_its_drive_its_guards_and_its_time(tmp_path: Path) -> None:
+    config, world = axis(tmp_path), world_of()
+    with pytest.raises(Unreachable, match="never tested"):
+        require_proof(proof_status(config, {}, 0.0))
+    results, found = tried(world, config)
+    path = keep_proof(config, results, found)
+    assert path.name == PROOF_NAME
+    now_s = json.loads(path.read_text())["time"]
+    found = json.loads(json.dumps(found))
+    require_proof(proof_status(config, found, now_s + 29 * DAY_S))
+    with pytest.raises(Unreachable, match=r"older than amplifier.guard_test_days \(30\)"):
+        require_proof(proof_status(config, found, now_s + 31 * DAY_S))
+    with pytest.raises(Unreachable, match="dated in the future"):
+        require_proof(proof_status(config, found, now_s - DAY_S))
+    for other in (world_of(amplifier_serial=7), world):
+        changed = axis(tmp_path, amplifier={"heartbeat_reaction": 2} if other is world else {})
+        with pytest.raises(Unreachable, match="are others than those that were tested"):
+            require_proof(proof_status(config, json.loads(json.dumps(tried(other, changed)[1])), now_s))
+    path.write_text("{")
+    with pytest.raises(Unreachable, match="missing or broken"):
+        require_proof(proof_status(config, found, now_s))
+    require_proof(proof_status(axis(tmp_path, days=None), found, now_s))
