@@ -37,7 +37,7 @@ MADE_CERTIFIED = "# Made by scripts/make_gain_sets.py --certified.\n"
 #: The set that is certified, the model that it is of, and the plant that this was identified on.
 CERTIFIED = GAINS / "demo_local_certified.yaml"
 IDENTIFIED, PLANT = AXES / "demo_joint_identified.yaml", AXES / "demo_joint.yaml"
-DATE = datetime.date(2026, 11, 21).isoformat()
+DATE = datetime.date(2026, 11, 23).isoformat()
 MAP_ERROR, MAP_SEED = 0.03, 3
 
 #: c0_hat as a share of sigma0: up to 0.8 is stable with one to three cycles of delay, 1.0 is marginal.

@@ -3,8 +3,8 @@
     servoctl record export out/axis/recordings/first.mcap --out out/axis/first.csv
     python scripts/tutorial_picture.py out/axis/first.csv --out out/axis/first.png
 
-Each motion of the recording is one curve over the time since it began: the error above, torque and its friction part
-below. It prints the RMS error of each, without the first second. Needs the lab part.
+Each motion of the recording is one curve over the time since it began: the errors above, each scale in a panel of its
+own, torque and its friction part below. It prints the RMS error of each, without the first second. Needs the lab part.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 SETTLED_S = 1.0
-SIZE_INCHES, DOTS_PER_INCH = (8.0, 5.6), 80
+WIDTH_INCHES, PANEL_INCHES, DOTS_PER_INCH = 8.0, 1.9, 80
+#: An error below this share of the largest of a panel would be a flat line there.
+LEAST_SHARE = 0.1
 COLUMNS = ("t_s", "reference_active", "reference_rad", "position_rad", "torque_nm", "torque_friction_nm")
 
 Samples = NDArray[np.float64]
@@ -77,27 +79,42 @@ def read_motions(path: Path) -> list[Motion]:
     ]
 
 
+def by_scale(motions: Sequence[Motion]) -> list[list[int]]:
+    """Places of motions whose errors are seen on one scale: each at least a tenth of the largest of them, RMS."""
+    groups: list[list[int]] = []
+    for place in sorted(range(len(motions)), key=lambda k: -motions[k].rms_mrad):
+        if groups and motions[place].rms_mrad >= LEAST_SHARE * motions[groups[-1][0]].rms_mrad:
+            groups[-1].append(place)
+        else:
+            groups.append([place])
+    return groups
+
+
 def draw(motions: Sequence[Motion], labels: Sequence[str], out: Path) -> None:
-    """Reference, error of each motion, and the torque of the last with its friction part."""
-    figure = Figure(figsize=SIZE_INCHES, dpi=DOTS_PER_INCH, layout="constrained")
+    """Reference, errors in a panel for each scale, and the torque of the last motion with its friction part."""
+    groups = by_scale(motions)
+    count = len(groups) + 2
+    figure = Figure((WIDTH_INCHES, PANEL_INCHES * count), dpi=DOTS_PER_INCH, layout="constrained")
     FigureCanvasAgg(figure)
-    upper, middle, lower = figure.subplots(3, 1, sharex=True)
+    upper, *middle, lower = figure.subplots(count, 1, sharex=True)
     last = motions[-1]
     upper.plot(last.time_s, last.reference_mrad, color="k", linewidth=0.8)
     upper.set_ylabel("reference / mrad")
-    for index, (motion, label) in enumerate(zip(motions, labels, strict=False)):
-        shown = f"{label}: {motion.rms_mrad:.3f} mrad RMS"
-        middle.plot(motion.time_s, motion.error_mrad, label=shown, color=f"C{index}", linewidth=0.8)
-    middle.set_ylabel("error / mrad")
+    for panel, group in zip(middle, groups, strict=True):
+        for place in group:
+            motion, shown = motions[place], f"{labels[place]}: {motions[place].rms_mrad:.3f} mrad RMS"
+            panel.plot(motion.time_s, motion.error_mrad, label=shown, color=f"C{place}", linewidth=0.8)
+        panel.set_ylabel("error / mrad")
     lower.plot(last.time_s, last.torque_mnm, label=f"torque, {labels[-1]}", color="C7", linewidth=0.6)
     lower.plot(last.time_s, last.friction_mnm, label="of it the model's friction", color="C3", linewidth=0.8)
     lower.set_ylabel("torque / mN·m")
-    lower.set_ylim(-120.0, 170.0)  # the first cycles, in which the reference's velocity jumps, go beyond
     lower.set_xlabel("time since the motion began / s")
-    for panel in (upper, middle, lower):
+    for panel in (upper, *middle, lower):
         panel.grid(alpha=0.3)
-    for panel in (middle, lower):
-        panel.legend(loc="upper right", fontsize=8)
+        panel.margins(y=0.06)  # of all rows, the jumps of the first cycles too
+    for panel in (*middle, lower):  # above the panel, where there is no curve
+        panel.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2, ncols=3, fontsize=8, frameon=False)
+    figure.align_ylabels()
     out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(out, metadata={"Software": None})
 

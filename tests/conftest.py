@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from tests import documents
-from tests.starved import Judge
+from tests import documents, starved
+from tests.foreign import LEFT_OUT
 
 # As the commands do, and before numpy is imported: threads on small matrices cost a factor of ten on a shared machine.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -44,6 +44,7 @@ def user() -> str:
 
 
 os.environ["TMPDIR"] = tempfile.tempdir = temporary_folder()
+os.environ.setdefault("XDG_RUNTIME_DIR", os.environ["TMPDIR"])  # where no login made one; root's would be /run/servod
 
 ROOT = Path(__file__).resolve().parent
 
@@ -53,14 +54,29 @@ described = documents.described
 #: Files (or folders) whose tests run an axis on the wall clock; `./test` runs two at a time, after all others.
 SERIAL = (
     *("qualify/faults/test_control_attack.py", "qualify/faults/test_reactions.py"),
-    *("runtime/daemon/test_daemon.py", "drivers/virtual/test_process.py"),
+    *("runtime/daemon/test_daemon.py", "drivers/virtual/test_process.py", "foreign/test_devices.py"),
+    "foreign/test_intruders.py",
 )
 
 #: More whose tests start real processes, beside others.
 PROCESSES = (
-    *("runtime/daemon", "cli", "conformance", "lab/commission/test_daemon_tracking.py"),
+    *("runtime/daemon", "cli", "conformance", "foreign", "lab/commission/test_daemon_tracking.py"),
     *("lab/identify/test_daemon_link.py", "lab/deploy/test_on_daemon.py", "lab/deploy/test_daemon_link.py"),
     *("qualify/faults/test_processes.py", "qualify/soak/test_wall.py"),
+)
+
+#: Files that take longest, the longest first: `./test` begins with them, so that no worker ends with one alone.
+DEAREST = (
+    *("lab/identify/test_walk.py", "qualify/faults/test_scenarios.py", "runtime/daemon/test_waiting.py"),
+    *("cli/test_elsewhere.py", "qualify/paper/test_cli.py"),
+    *("runtime/loop/test_channel_flips.py", "runtime/daemon/test_defence.py", "runtime/loop/test_foreign.py"),
+    *("lab/deploy/test_deployment.py", "cli/test_synthesize.py", "lab/commission/test_walk.py", "cli/test_demo.py"),
+    *("lab/verify/test_cli.py", "lab/synthesize/test_reference.py", "qualify/blind/test_cases.py"),
+    *("runtime/daemon/test_daemon.py", "qualify/faults/test_processes.py", "cli/test_verbs.py", "tools/test_blocks.py"),
+    *("drivers/virtual/test_process.py", "qualify/faults/test_reactions.py", "lab/identify/test_daemon_link.py"),
+    *("lab/diagnose", "lab/identify", "lab/verify", "lab/synthesize", "qualify/faults", "qualify/soak"),
+    *("cli/test_plot.py", "qualify/blind", "lab/tune", "lab/commission", "cli/test_commission.py", "foreign"),
+    *("runtime/loop/test_channel.py", "runtime/daemon", "formats/gains", "drivers", "cli", "tools"),
 )
 
 #: Markers of few files; `-m` with one of them first loads no others.
@@ -71,18 +87,24 @@ settings.register_profile("house", deadline=None)
 settings.load_profile("house")
 
 
-#: Recordings of other people beside the project, each with the tests that want it.
-NAMES = ("recordings/emps", "recordings/bam_xl330", "recordings/odrive_cogging", "practice")
+#: Recordings and programs of other people beside the project, which some tests want.
+NAMES = ("recordings/emps", "recordings/bam_xl330", "recordings/odrive_cogging", "practice", "third_party")
 SHARED = {name: ROOT.parents[1] / "shared" / name for name in NAMES}
 
 
 def pytest_report_header() -> str:
-    """Say which recordings of other people are there: without them tests/lab/simulate/test_shared_data.py has fewer
+    """Say what of other people is there: without it tests/lab/simulate/test_shared_data.py and tests/foreign have fewer
     tests."""
     there = (
         f"{name} {'present' if folder.is_dir() else 'ABSENT, its tests do not run'}" for name, folder in SHARED.items()
     )
     return "shared data: " + "; ".join(there)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Say at the end which tests with other people's programs are left out, and why."""
+    for pattern, reason in LEFT_OUT.items():
+        terminalreporter.write_line(f"tests/foreign/{pattern} left out: {reason}")
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -91,7 +113,9 @@ def pytest_configure(config: pytest.Config) -> None:
     What is ignored when the tests begin (SIGHUP under nohup(1), SIGINT in the background of a shell) every child would
     inherit; a handler it does not. The controller of several workers leaves it to them: they shall outlive a terminal.
     """
-    config.pluginmanager.register(Judge(), "starved")
+    judge = starved.Judge()
+    config.pluginmanager.register(judge, "starved")
+    config.pluginmanager.register(starved.OnceMore(judge), "once_more")
     if hasattr(config, "workerinput") or not config.getoption("numprocesses", None):
         for number in (signal.SIGHUP, signal.SIGINT):
             if signal.getsignal(number) is signal.SIG_IGN:
@@ -108,7 +132,8 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests of SERIAL and PROCESSES, before the selection by marker."""
+    """Mark the tests of SERIAL and PROCESSES, before the selection by marker; the dearest files come first."""
+    items.sort(key=lambda item: place_of(item.path))
     for item in items:
         for mark in marks_of(item.path):
             item.add_marker(mark)
@@ -121,6 +146,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def marked(path: Path, name: str) -> bool:
     """Whether a file has tests of this marker: by its own words or by the tables above."""
     return f"mark.{name}" in path.read_text() or any(mark.name == name for mark in marks_of(path))
+
+
+@cache
+def place_of(path: Path) -> int:
+    """Where in DEAREST a file stands, itself or its folder; all others behind."""
+    return next((i for i, name in enumerate(DEAREST) if path.is_relative_to(ROOT / name)), len(DEAREST))
 
 
 @cache

@@ -126,4 +126,4 @@ def described() -> Iterator[None]:
         patch.setattr(app, "command", noted)
         patch.setattr("servod.cli.common.json", SimpleNamespace(dumps=dumps, loads=json.loads))
         yield
-    assert missing == [], "docs/reference/json.md does not say what these are (tests/tools/documents.yaml)"
+    assert missing == [], f"docs/reference/json.md does not say what these are (tests/tools/documents.yaml): {missing}"

@@ -22,5 +22,5 @@ def on_event_loop(test: Callable[P, Coroutine[Any, Any, None]]) -> Callable[P, N
 
 async def events_pass() -> None:
     """Let everything on the event loop go on that waits for nothing more."""
-    for _ in range(3):  # the selector tells, the task goes on, what it began goes on
+    for _ in range(5):  # the door's task begins to wait, the selector tells, it goes on, what it began goes on
         await asyncio.sleep(0)

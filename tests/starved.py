@@ -3,24 +3,30 @@
 A failure of a test of real processes (mark `serial` or `processes`) becomes a skip with figures when both hold:
 
 - While it ran, or while a fixture of it was made, programs that the tests did not start took the processors, and the
-  kernel counted that programs waited for them. What the tests and their children use themselves never counts, so code
-  that burns time excuses nothing.
+  kernel counted that programs waited for them; or a whole processor stood still, as those of virtual machines do: a
+  program that goes before all others there did not run either. What the tests and their children use themselves never
+  counts, so code that burns time excuses nothing.
 - Time is what failed: a time-out, a fault of lateness and none beside it in the message or in the daemon's log, or a
   comparison in a test that compares times alone (mark `wall_clock`). What a drive did, a torque, a limit or another
   fault fails on any machine.
+
+A test that failed on a starved machine is run once more before it is judged.
 """
 
 from __future__ import annotations
 
 import os
 import re
+import select
 import subprocess
+import sys
 import time
 from collections.abc import Collection, Generator, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+from _pytest.runner import runtestprotocol  # as pytest-rerunfailures has it: there is no public one
 
 from servod.common.errors import ServodError
 from servod.common.faults import FaultCode
@@ -28,15 +34,33 @@ from servod.common.faults import FaultCode
 #: Share of all processors that others took, and of the time in which somebody waited; and the first where no kernel
 #: counts the second (Linux without PSI).
 OTHERS_SHARE, WAITED_SHARE, OTHERS_ALONE_SHARE = 0.25, 0.1, 0.5
+#: The shortest stand-still of a processor that makes feedback stale: the default of limits.stale_cycles.
+STALL_S = 0.005
 #: What a loop, a drive or a supervisor that does not get its turn comes to, by itself. A following error is not among
 #: them: an axis that runs away has it too.
 LATENESS = {
     *(FaultCode.DEADLINE_LATE, FaultCode.DEADLINE_BUDGET, FaultCode.FEEDBACK_STALE, FaultCode.SUPERVISOR_LOST),
     *(FaultCode.NODE_HEARTBEAT_LOST, FaultCode.COMMANDS_LOST, FaultCode.BUS_QUEUE_FULL),
+    # A drive that is not heard to stop is told by NMT, and must be configured anew.
+    *(FaultCode.DRIVE_STAYS_POWERED, FaultCode.NODE_LEFT_OPERATIONAL),
 }
 #: Logs of the daemons that the tests of this file started.
 LOGS: list[Path] = []
-_LOGGED, _FOLLOWS = re.compile(r"fault (\w+) \("), re.compile(r"a fault is latched|'FAULT'")
+_LOGGED = re.compile(r"fault (\w+) \(")
+_FOLLOWS = re.compile(r"a fault is latched|'FAULT'|is FAULT|the axis is not enabled|must be configured anew")
+#: Sleeps on one processor before all that servod starts there, and tells when it slept too long, and how much [s].
+_WITNESS = """
+import os, sys, time
+os.sched_setaffinity(0, {int(sys.argv[1])})
+os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(98))
+last = time.monotonic()
+while True:
+    time.sleep(0.002)
+    now = time.monotonic()
+    if now - last > 0.002 + float(sys.argv[2]):
+        print(now, now - last - 0.002, flush=True)
+    last = now
+"""
 _OURS = "SERVOD_TEST_RUN"
 _TICKS = os.sysconf("SC_CLK_TCK")
 _WAITED = re.compile(r"some .*total=(\d+)")
@@ -58,11 +82,14 @@ class Span(NamedTuple):
     cores: int
     others_s: float
     waited_s: float | None
+    stall_s: float = 0.0
 
     @property
     def starved(self) -> str:
         """The evidence in a few words; empty when there is none."""
         others = self.others_s / (self.seconds * self.cores) if self.seconds > 0.0 else 0.0
+        if self.stall_s >= STALL_S:
+            return f"a processor stood still for {1e3 * self.stall_s:.0f} ms"
         said = f"other programs had {others:.0%} of {self.cores} processors for {self.seconds:.1f} s"
         if self.waited_s is None:
             return said if others > OTHERS_ALONE_SHARE else ""
@@ -112,10 +139,43 @@ def logged(logs: Iterable[Path]) -> set[str]:
     return {name for log in logs if log.exists() for name in _LOGGED.findall(log.read_text(errors="replace"))}
 
 
+class Stalls:
+    """When processors stood still. Without rights to go before other programs (SCHED_FIFO) it saw nothing."""
+
+    def __init__(self) -> None:
+        self._witnesses: list[subprocess.Popen[bytes]] = []
+        self._seen: list[tuple[float, float]] = []
+
+    def watch(self) -> None:
+        """Begin, if it has not; a witness ends with the pipe that nobody reads any more."""
+        for core in () if self._witnesses else sorted(os.sched_getaffinity(0)):
+            command = [sys.executable, "-I", "-S", "-c", _WITNESS, str(core), str(STALL_S)]
+            self._witnesses.append(subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL))
+
+    def longest_s(self, first_s: float, last_s: float) -> float:
+        """The longest between two times."""
+        pipes = [witness.stdout for witness in self._witnesses]
+        while ready := select.select(pipes, [], [], 0)[0]:
+            lines = b"".join(os.read(pipe.fileno(), 1 << 16) for pipe in ready).splitlines()  # each written whole
+            self._seen += [(float(end), float(length)) for end, length in map(bytes.split, lines)]
+            if not lines:  # they could not begin
+                break
+        return max((length for end, length in self._seen if first_s <= end <= last_s), default=0.0)
+
+    def end(self) -> None:
+        """Leave no process behind."""
+        for witness in self._witnesses:
+            witness.kill()
+            witness.wait()
+        self._witnesses.clear()
+
+
 def by_lateness(error: BaseException, times_alone: bool, faults: Collection[str] = ()) -> bool:
     """Whether time is what failed; `times_alone`: the test compares nothing but times, `faults`: those of its axis."""
-    if faults and {FaultCode[name] for name in faults} <= LATENESS and _FOLLOWS.search(str(error)):
-        return isinstance(error, ServodError | AssertionError)
+    if faults and {FaultCode[name] for name in faults} <= LATENESS:
+        follows = _FOLLOWS.search(str(error)) or any(name in str(error) for name in faults)
+        if follows and isinstance(error, ServodError | AssertionError):
+            return True
     if isinstance(error, TimeoutError | subprocess.TimeoutExpired):
         return True
     if isinstance(error, AssertionError):
@@ -132,13 +192,21 @@ class Judge:
         self._began: Reading | None = None
         self._file: Path | None = None
         self._fixtures: dict[str, Span] = {}
+        self._stalls = Stalls()
+
+    def pytest_unconfigure(self) -> None:
+        """The last hook."""
+        self._stalls.end()
 
     @pytest.hookimpl(wrapper=True, tryfirst=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Generator[None, Any, Any]:
         """Read before its fixtures are made."""
         if item.path != self._file:
             LOGS.clear()
-        self._file, self._began = item.path, read() if _judged(item) else None
+        self._file, self._began = item.path, None
+        if _judged(item):
+            self._stalls.watch()
+            self._began = read()
         return (yield)
 
     @pytest.hookimpl(wrapper=True)
@@ -150,7 +218,7 @@ class Judge:
         try:
             return (yield)
         finally:
-            self._fixtures[f"{fixturedef.baseid}::{fixturedef.argname}"] = between(first, read())
+            self._fixtures[f"{fixturedef.baseid}::{fixturedef.argname}"] = self._since(first)
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_makereport(
@@ -159,7 +227,7 @@ class Judge:
         """Make of a failure a skip that says why, if that is what it is."""
         report = yield
         if report.failed and call.excinfo is not None and self._began is not None:
-            spans = [between(self._began, read()), *self._of_fixtures(item)]
+            spans = [self._since(self._began), *self._of_fixtures(item)]
             evidence = next((span.starved for span in spans if span.starved), "")
             times_alone = item.get_closest_marker("wall_clock") is not None
             if evidence and by_lateness(call.excinfo.value, times_alone, logged(LOGS)):
@@ -168,9 +236,43 @@ class Judge:
                 report.longrepr = (str(item.path), (item.location[1] or 0) + 1, said)
         return report
 
+    def evidence(self) -> str:
+        """What says that the machine was starved since the present test began; empty where nothing does."""
+        return "" if self._began is None else self._since(self._began).starved
+
+    def _since(self, first: Reading) -> Span:
+        last = read()
+        return between(first, last)._replace(stall_s=self._stalls.longest_s(first.now_s, last.now_s))
+
     def _of_fixtures(self, item: pytest.Item) -> Iterable[Span]:
         names: list[str] = getattr(item, "fixturenames", [])
         return (span for key, span in self._fixtures.items() for name in names if _belongs(item, key, name))
+
+
+class OnceMore:
+    """Runs a test of the wall clock that failed on a starved machine once more; the second run counts.
+
+    An axis that stood still for longer than a motion allows can have any fault, so none is excused: a second run that
+    passes shows that it was the machine. On an idle machine nothing is run twice.
+    """
+
+    def __init__(self, judge: Judge) -> None:
+        self._judge = judge
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_runtest_protocol(self, item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
+        """All of a test's reports, told when they are the last."""
+        if not _judged(item):
+            return None
+        item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
+        reports = runtestprotocol(item, nextitem=nextitem, log=False)
+        if any(report.failed for report in reports) and (evidence := self._judge.evidence()):
+            item.warn(pytest.PytestWarning(f"ran once more, the machine was starved: {evidence}"))
+            reports = runtestprotocol(item, nextitem=nextitem, log=False)
+        for report in reports:
+            item.ihook.pytest_runtest_logreport(report=report)
+        item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
+        return True
 
 
 def _judged(item: pytest.Item) -> bool:

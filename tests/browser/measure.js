@@ -71,7 +71,6 @@
   return {
     texts, broken, strokes, figures, wide: wide.slice(0, 5).map(where), scroll: sheet.scrollWidth - sheet.clientWidth, phone,
     width: sheet.clientWidth, scrolled: sheet.scrollWidth,
-    captions: [...document.querySelectorAll("figcaption")].map((e) => e.innerText),
-    words: document.body.innerText, outside: bare.textContent,
+    captions: [...document.querySelectorAll("figcaption")].map((e) => e.innerText), outside: bare.textContent,
   };
 }

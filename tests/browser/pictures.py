@@ -4,7 +4,8 @@
     scripts/browser --pictures --keep demo       those of one report, as it was made before
 
 A report is shown as on a desk in light and, beside it, as on a phone in dark. A terminal is what a command printed on
-one of 100 columns. Each picture has a palette and is held to a size. What scripts/*_picture.py draw is not of these.
+one of 100 columns, in a folder of its own that is nobody's home: no picture shows where the checkout lies. Each picture
+has a palette and is held to a size. What scripts/*_picture.py draw is not of these.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,6 +26,7 @@ from pathlib import Path
 from PIL import Image
 from playwright.sync_api import Browser, sync_playwright
 from rich.console import Console
+from rich.terminal_theme import MONOKAI
 from rich.text import Text
 
 from tests.browser import reports
@@ -33,10 +36,10 @@ FOLDER = reports.ROOT / "docs/pictures"
 #: No picture has more octets, nor have all of the folder.
 MOST_BYTES, MOST_OF_ALL = 150_000, 1_500_000
 _DESK_PX, _PHONE_PX, _HIGH_PX, _GAP_PX = 980, 390, 1040, 24
-_COLUMNS, _COLOURS = 100, 64
+_COLUMNS, _COLOURS = 100, 128
 _MARGIN_COLOUR = "#c8ccd2"
 _TERMINAL = """<!doctype html><meta charset="utf-8"><style>body {{ margin: 0; background: #14171b; }}
-pre {{ display: inline-block; width: 100ch; white-space: pre-wrap; word-break: break-all;
+pre {{ display: inline-block; width: 100.5ch; white-space: pre-wrap; word-break: break-all;
 margin: 0; padding: 14px 18px; background: #14171b; color: #e6e9ec;
 font: 14px/1.165 "DejaVu Sans Mono", monospace; }}</style><pre><b>$ {command}</b>
 {code}</pre>"""
@@ -66,7 +69,7 @@ ON_AXIS: dict[str, tuple[str, ...]] = {
 def typed(words: tuple[str, ...], folder: Path, socket: Path | None = None) -> str:
     """What a command prints on a terminal, with its colours; bars, which go to standard error, are left out."""
     mine, its = pty.openpty()
-    environment = os.environ | {"COLUMNS": str(_COLUMNS), "TERM": "xterm-256color"}
+    environment = os.environ | {"COLUMNS": str(_COLUMNS), "TERM": "xterm-256color", "HOME": str(folder)}
     environment |= {"SERVOD_SOCKET": str(socket)} if socket else {}
     command = [sys.executable, "-m", "servod.cli", *words]
     with subprocess.Popen(command, cwd=folder, env=environment, stdout=its, stderr=subprocess.DEVNULL) as process:
@@ -86,13 +89,16 @@ def typed(words: tuple[str, ...], folder: Path, socket: Path | None = None) -> s
     return printed.decode().replace("\r\n", "\n")
 
 
-def terminals(out: Path, names: set[str]) -> Iterator[tuple[str, str]]:
-    """Name and HTML of each terminal."""
-    folder = out / "terminal"
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
+def terminals(pages: Path, names: set[str], folder: Path) -> Iterator[tuple[str, str]]:
+    """Name and HTML of each terminal. Raises Failed where one shows the checkout."""
+    for name, words, printed in _printed(pages, names, folder):
+        if str(reports.ROOT) in printed:
+            raise reports.Failed(f"servoctl {shlex.join(words)} shows {reports.ROOT}")
+        yield name, _html(words, printed)
+
+
+def _printed(pages: Path, names: set[str], folder: Path) -> Iterator[tuple[str, tuple[str, ...], str]]:
     (folder / "gains").symlink_to(reports.ROOT / "gains")
-    pages = out / "pages"
     if "commission" in names:
         shutil.copytree(pages / "commission", folder / "commissioning")
     if "diagnose" in names:
@@ -101,18 +107,20 @@ def terminals(out: Path, names: set[str]) -> Iterator[tuple[str, str]]:
             shutil.copy(file, folder / (f"run{n}.csv.gz" if n else "model.yaml"))
     for name, words in TERMINALS.items():
         if name in names:
-            yield name, _html(words, typed(words, folder))
+            yield name, words, typed(words, folder)
     if "track" in names:
         with reports.axis(folder / "axis") as socket:
             for name, words in ON_AXIS.items():
-                yield name, _html(words, typed(words, folder, socket))
+                yield name, words, typed(words, folder, socket)
 
 
 def _html(words: tuple[str, ...], printed: str) -> str:
     console = Console(record=True, width=_COLUMNS, file=io.StringIO(), force_terminal=True, color_system="truecolor")
     console.print(Text.from_ansi(printed.rstrip("\n")), soft_wrap=True)
     command = shlex.join(("servoctl", *words)).replace("&", "&amp;").replace("<", "&lt;")
-    return _TERMINAL.format(command=command, code=console.export_html(inline_styles=True, code_format="{code}"))
+    return _TERMINAL.format(
+        command=command, code=console.export_html(theme=MONOKAI, inline_styles=True, code_format="{code}")
+    )
 
 
 def report_picture(browser: Browser, file: Path) -> Image.Image:
@@ -169,8 +177,9 @@ def main() -> int:
                 raise reports.Failed(error)
             name = file.relative_to(out / "pages").parts[0] if file.stem == "report" else file.stem
             save(report_picture(browser, file), f"report-{name}")
-        for name, html in terminals(out, names):
-            save(terminal_picture(browser, html), f"terminal-{name}")
+        with tempfile.TemporaryDirectory(prefix="servod-") as folder:
+            for name, html in terminals(out / "pages", names, Path(folder)):
+                save(terminal_picture(browser, html), f"terminal-{name}")
         browser.close()
     total = sum(file.stat().st_size for file in FOLDER.glob("*.png"))
     print(f"{FOLDER}: {total / 1e6:.2f} MB in all")

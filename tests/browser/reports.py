@@ -42,11 +42,14 @@ class Failed(Exception):
 
 @dataclass(frozen=True)
 class Report:
-    """One page: where it lies below the folder of all reports, who writes it, and what makes it."""
+    """One page: where it lies below the folder of all reports, who writes it, what makes it, and with which further
+    words it does so where only the look of the page counts, not its figures.
+    """
 
     page: str
     module: str
-    make: Callable[[Path], None]
+    make: Callable[..., None]
+    quick: tuple[object, ...] = ()
 
     @property
     def name(self) -> str:
@@ -109,11 +112,11 @@ def _running(module: str, *words: object, until: Path) -> Iterator[None]:
 # --- What makes each page ---------------------------------------------------------------------------------------------
 
 
-def _by(*words: object, codes: tuple[int, ...] = (0,)) -> Callable[[Path], None]:
+def _by(*words: object, codes: tuple[int, ...] = (0,)) -> Callable[..., None]:
     """One command that takes the folder with --out."""
 
-    def make(folder: Path) -> None:
-        servoctl(*words, "--out", folder, codes=codes)
+    def make(folder: Path, *quick: object) -> None:
+        servoctl(*words, *quick, "--out", folder, codes=codes)
 
     return make
 
@@ -160,6 +163,7 @@ REPORTS = (
         "commission/report.html",
         "servod.lab.commission.report",
         _by("commission", "--yes", "--plant", DEMO_JOINT),
+        ("--budget", 60),  # plants for each rival's tuning; fewer than 1000 plants of --plants certify nothing
     ),
     Report(
         "retrofit/report.html",
@@ -183,7 +187,7 @@ REPORTS = (
 BESIDE = ("track/run.html",)
 
 
-def make(out: Path, names: set[str], keep: bool, jobs: int) -> Iterator[tuple[Path, str]]:
+def make(out: Path, names: set[str], keep: bool, jobs: int, quick: bool = False) -> Iterator[tuple[Path, str]]:
     """Make the pages of these reports (all where there is no name): each file, and why it is not there."""
     chosen = [report for report in REPORTS if not names or report.name in names]
 
@@ -194,7 +198,7 @@ def make(out: Path, names: set[str], keep: bool, jobs: int) -> Iterator[tuple[Pa
             folder.mkdir(parents=True)
             begun_s = time.monotonic()
             try:
-                report.make(folder)
+                report.make(folder, *(report.quick if quick else ()))
             except (Failed, subprocess.TimeoutExpired) as error:
                 return report, str(error)
             print(f"{report.name:<12} made in {time.monotonic() - begun_s:.0f} s", flush=True)

@@ -15,6 +15,7 @@ import yaml
 
 from servod.cli.app import run
 from servod.cli.demo import print_document
+from servod.common.errors import ServodError
 from servod.common.faults import FAULTS, FaultCode
 from servod.common.shipped import shipped
 from servod.qualify.demo.entries import entries
@@ -40,7 +41,7 @@ def check(document: dict, out: Path) -> None:
 
 
 def test_the_fast_demo_prints_one_document(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["demo", "--fast", "--seconds", "5", "--json", "--out", str(tmp_path)]) == 0
+    assert run(["demo", "--fast", "--seconds", "3", "--json", "--out", str(tmp_path)]) == 0
     captured = capsys.readouterr()
     document = json.loads(captured.out)
     check(document, tmp_path)
@@ -50,7 +51,7 @@ def test_the_fast_demo_prints_one_document(tmp_path: Path, capsys: pytest.Captur
     assert list(document["certified"]) == ["local_certified"]
     assert document["certified"]["local_certified"]["plants"] >= 1000
     assert document["missed"] == 0
-    assert document["cycles"] == pytest.approx(4 * 5000, abs=8)
+    assert document["cycles"] == pytest.approx(4 * 3000, abs=8)
 
 
 def test_further_gain_sets_run_beside_the_four(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -152,18 +153,23 @@ def started_by(tmp_path: Path) -> list[str]:
     return found
 
 
-def wait_until_it_moves(tmp_path: Path) -> None:
-    deadline = time.monotonic() + 30.0
+def wait_until_it_moves(demo: subprocess.Popen[str], tmp_path: Path) -> None:
+    deadline = time.monotonic() + 90.0
     while not list(tmp_path.glob("out/recordings/pd.mcap")):
-        assert time.monotonic() < deadline
+        if demo.poll() is not None:
+            raise ServodError(f"the demo ended with {demo.returncode} before it moved: {demo.communicate()}")
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"no motion after 90 s; {started_by(tmp_path)}")
         time.sleep(0.1)
 
 
 @pytest.mark.serial
 def test_the_demo_on_the_wall_clock(tmp_path: Path) -> None:
     demo = start(tmp_path, "--seconds", "2.5", "--json")
-    out, err = demo.communicate(timeout=100)
-    assert (demo.returncode, err) == (0, "")
+    out, err = demo.communicate(timeout=60)
+    if demo.returncode:
+        raise ServodError(f"the demo ended with {demo.returncode}: {err}")
+    assert err == ""
     check(json.loads(out), tmp_path / "out")
     assert sorted(f.stem for f in (tmp_path / "out/recordings").glob("*.mcap")) == [
         *("local", "local_certified", "pd", "pd_dob", "pd_lugre")
@@ -177,7 +183,7 @@ def test_the_demo_on_the_wall_clock(tmp_path: Path) -> None:
 )
 def test_nothing_is_left_running(tmp_path: Path, number: signal.Signals, code: int) -> None:
     demo = start(tmp_path)
-    wait_until_it_moves(tmp_path)
+    wait_until_it_moves(demo, tmp_path)
     assert len(started_by(tmp_path)) >= 2
     demo.send_signal(number)
     _, err = demo.communicate(timeout=30)

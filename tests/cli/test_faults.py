@@ -57,7 +57,7 @@ def test_one_that_does_not_pass_is_exit_code_1_and_says_why(mine: Path, capsys: 
     ("words", "told"),
     [
         (["--only", "no such"], "--only"),
-        (["--group", "weather"], "--group: found weather; allowed: bus"),
+        (["--group", "weather"], "--group: found weather; allowed: brake, bus"),
         (["--scenario", "/nowhere.yaml"], "/nowhere.yaml"),
     ],
 )

@@ -21,7 +21,7 @@ from servod.runtime.daemon.fault_watch import FaultWatch
 from servod.runtime.daemon.health import Health
 from servod.runtime.daemon.metrics import AxisMetrics
 from servod.runtime.daemon.recorder import Recorder
-from servod.runtime.loop.axis import AxisState
+from servod.runtime.loop.axis_state import AxisState
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "daemon"))
 from tests.runtime.daemon.daemon_rows import record, row

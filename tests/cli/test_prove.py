@@ -7,7 +7,9 @@ import os
 import subprocess
 from pathlib import Path
 
-from servod.qualify.blind.conceal import BlindTrial, write_trial
+import pytest
+
+from servod.qualify.blind.conceal import BlindTrial, foreign_in, write_trial
 from tests.cli.test_output import servoctl
 
 _OPTIONS = ("--cases", "1", "--seed", "1")
@@ -42,3 +44,26 @@ def test_another_command_in_the_folder_keeps_this_one_out(tmp_path: Path) -> Non
     for refused in (done, claimed):
         assert (refused.returncode, refused.stderr.count(b"another command is at work there")) == (3, 1)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("stage", ["conceal", "cases"])
+def test_a_folder_of_other_origin_is_left_alone(tmp_path: Path, stage: str) -> None:
+    for name in ("a.txt", "b.txt", "c.txt", "d.txt"):
+        (tmp_path / name).write_text("mine")
+    done = servoctl("prove", *_OPTIONS, "--only", stage, "--out", str(tmp_path), stdout=subprocess.PIPE)
+    assert done.stderr.decode() == (
+        f"servoctl: --out {tmp_path}: found a.txt, b.txt, c.txt and 1 more; "
+        "allowed: an empty folder, or one of an earlier `servoctl prove`\n"
+    )
+    assert done.returncode == 2
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.txt", "b.txt", "c.txt", "d.txt"]
+
+
+def test_an_own_folder_is_known_by_its_trial_or_by_what_an_interrupted_one_left(tmp_path: Path) -> None:
+    (tmp_path / "cases").mkdir()
+    (tmp_path / "c007").mkdir()
+    assert foreign_in(tmp_path) == [] == foreign_in(tmp_path / "none")
+    (tmp_path / "notes.txt").touch()
+    assert foreign_in(tmp_path) == ["notes.txt"]
+    write_trial(tmp_path, BlindTrial(3, 9, harder=True))
+    assert foreign_in(tmp_path) == []

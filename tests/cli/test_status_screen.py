@@ -18,6 +18,9 @@ NEVER = {"age_s": None, "stale": True}
 GREY = "\x1b[2m"
 
 
+STOPS = {"time_s": 0.058, "speed_rad_s": 3.6, "travel_rad": 0.14, "coasts_rad": None, "narrowed": ["speed [limits]"]}
+
+
 def document() -> dict[str, Any]:
     """A status document of an axis that did not get where it should."""
     lag = {"p50_us": 20.0, "p99_us": 60.0, "max_us": 900.0}
@@ -31,6 +34,8 @@ def document() -> dict[str, Any]:
             "motion_running": False,
         },
         "drive": {"state": "SWITCH_ON_DISABLED", "status_word": "0x0240", "error_code": "0x0000", "mode": 10} | FRESH,
+        "brake": {"by": "output", "state": "opening"},
+        "inputs": [{"name": "estop", "active": True}, {"name": "sto", "active": False}],
         "motion": {
             "position_rad": 0.25,
             "reference_rad": 0.2,
@@ -41,6 +46,11 @@ def document() -> dict[str, Any]:
         }
         | FRESH,
         "loop": {"pid": 17} | FRESH,
+        "stopping": STOPS,
+        "guards": {
+            "unguarded": True,
+            "proof": {"asked_for": True, "holds": False, "time": None, "text": "the guards were never tested"},
+        },
         "wiring": {"tests": 1, "last": {"passed": False, "text": "wiring not proven (TORQUE_POLARITY): turn it"}},
         "faults": [
             {
@@ -94,6 +104,13 @@ def shown(view: Any, styles: bool = False) -> str:
 )
 def test_the_screen_shows(text: str) -> None:
     assert text in shown(document())
+
+
+def test_the_stop_that_is_stated_and_what_was_narrowed_are_shown() -> None:
+    text = shown(document())
+    assert "stops within 58 ms, 3.6 rad/s and 0.14 rad after a loss of the master; without the drive it does" in text
+    assert "narrowed speed [limits]" in text
+    assert "stopping not reckoned" in shown({**document(), "stopping": None})
 
 
 def test_it_is_one_screen() -> None:

@@ -87,5 +87,6 @@ def test_no_table_in_a_pipe_cuts_off_a_key(monkeypatch: pytest.MonkeyPatch, caps
 def test_only_a_fault_that_stops_is_why_a_motion_ended() -> None:
     warning = {"code": "DEADLINE_LATE", "reaction": "NONE", "cause": "Cycles started late."}
     fault = {"code": "DRIVE_RESET", "reaction": "DISABLE", "cause": "A node was reset."}
-    assert _why({"faults": [warning]}) == "it was stopped or disabled"
-    assert _why({"faults": [warning, fault]}) == "DRIVE_RESET: A node was reset."
+    nobody = {"lease": {"stopped_by": None}}
+    assert _why({"faults": [warning], **nobody}) == "it was stopped or disabled"
+    assert _why({"faults": [warning, fault], **nobody}) == "DRIVE_RESET: A node was reset."

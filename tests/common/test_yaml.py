@@ -1,7 +1,16 @@
 """YAML 1.2 as every file is read: numbers are numbers, words are words, and what is neither is one line."""
 
-import pytest
+import string
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
+import pytest
+import yaml
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from servod.common import yaml as ours
 from servod.common.errors import BadInput
 from servod.common.yaml import parse_yaml, validate
 from servod.formats.config import AxisConfig
@@ -50,3 +59,34 @@ def test_only_finite_numbers_are_numbers(value):
 def test_a_good_file_is_taken_with_whole_numbers_for_reals():
     config = validate(parse_yaml(LIMITS, "f.yaml"), AxisConfig, "f.yaml")
     assert (config.limits.speed_rad_s, config.limits.encoder_mismatch_rad) == (20.0, 0.05)
+
+
+SHIPPED = Path(__file__).parents[2] / "gains"
+WORDS = st.sampled_from(
+    [*string.printable, "\ufeff", "\u2028", "é", ": ", "- ", "\n  ", "|\n  ", "&a ", "*a", "1e3", "'#"]
+)
+
+
+def outcome(load: Callable[[str], Any], text: str) -> str:
+    try:
+        return repr(load(text))
+    except (yaml.YAMLError, ValueError) as error:
+        return str(error)
+
+
+@given(st.lists(WORDS, max_size=12).map("".join))
+@example("a\t")
+@example("|#")
+@example("{a: b? c}")
+@example("a: !")
+@example("a\n\ufeff")
+def test_the_swift_parser_changes_neither_value_nor_message(text: str) -> None:
+    assert outcome(ours._load, text) == outcome(lambda t: yaml.load(t, Loader=ours._Loader), text)
+
+
+@pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.yaml")), ids=lambda path: path.stem)
+def test_the_swift_parser_reads_what_ships(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = path.read_text()
+    slow = yaml.load(text, Loader=ours._Loader)
+    monkeypatch.setattr(ours, "_Loader", None)
+    assert repr(ours._load(text)) == repr(slow)

@@ -3,7 +3,8 @@
 Each stands between two marks in one page of `docs`. `--measure` first runs `servoctl bench`, `servoctl qualify paper`
 and `servoctl demo --fast` with the manual's gain sets (twenty minutes on an idle machine) and writes what they print;
 `--bench FILE`, `--paper FILE` and `--demo FILE` take documents that were kept (--json). `--soak FILE` (again for more),
-`--faults FILE` and `--fuzz FILE`, given together, write the table of reliability from the documents of
+`--faults FILE` and `--fuzz FILE`, given together, write the table of reliability (`--faults` also the times of the
+failure modes in docs/safety.md) from the documents of
 `servoctl qualify soak`, `servoctl qualify faults` and `python -m tests.fuzz.run`.
 """
 
@@ -23,6 +24,7 @@ import command_line
 import reference
 import reliability
 import safety_trace
+import stops
 from tables import markdown
 
 from servod.common.faults import FAULTS
@@ -74,10 +76,12 @@ PAGES = {
     "record_numbers": DOCS / "reference/recording.md",
     "virtual_axis": DOCS / "reference/cli.md",
     "columns": DOCS / "reference/recording.md",
+    "spellings": DOCS / "reference/recording.md",
     "protocol": DOCS / "reference/protocol.md",
     "json": DOCS / "reference/json.md",
     "requirements": DOCS / "reference/safety-trace.md",
     "supply": DOCS / "reference/safety-trace.md",
+    "stops": DOCS / "safety.md",
 }
 
 
@@ -114,10 +118,12 @@ TABLES: dict[str, Callable[[], str]] = {
     "record_numbers": reference.record_numbers,
     "virtual_axis": reference.virtual_axis,
     "columns": reference.columns,
+    "spellings": reference.unit_spellings,
     "protocol": reference.protocol,
     "json": reference.json_documents,
     "requirements": safety_trace.requirement_table,
     "supply": safety_trace.supply_table,
+    "stops": stops.stops_table,
 }
 
 
@@ -201,6 +207,9 @@ def main() -> None:
     tried = reliability_rows(options.soak, options.faults, options.fuzz)
     if tried:
         write("reliability", markdown(reliability.HEADER, tried))
+    if options.faults:
+        page = DOCS / "safety.md"
+        page.write_text(reliability.with_times(page.read_text(), json.loads(options.faults.read_text())))
 
 
 def write(name: str, content: str) -> None:

@@ -15,11 +15,12 @@ from servod.formats.gains.gain_set import GainSet
 from servod.formats.model.axis_model import AxisModel
 from servod.formats.protocol import MAX_ANSWER_BYTES, MAX_LINE_BYTES, PIECE_SAMPLES, READING, Verb
 from servod.formats.recording.record import FIELDS
-from servod.lab.recordings.columns import REQUIRED, Quantity
+from servod.lab.recordings.columns import COMMANDS, REQUIRED, Quantity
+from servod.lab.recordings.units import dimension_of, spellings, units_of
 from servod.runtime.daemon.arguments import arguments_of
 from servod.runtime.daemon.control_server import MAX_CLIENTS, MAX_CLIENTS_OF_A_PROCESS, STOPPING
 from servod.runtime.fieldbus.devices import REASON_TEXT, DriveState, Goal
-from servod.runtime.loop.axis import AxisState
+from servod.runtime.loop.axis_state import AxisState
 from servod.runtime.loop.commands import REFUSAL_TEXT, Refusal
 
 _HERE = Path(__file__).parent
@@ -64,10 +65,27 @@ def virtual_axis() -> str:
 def columns() -> str:
     """The columns that a recording of another machine may have."""
     rows = [
-        [q.name.lower().replace("_", " "), *(f"`{name}`" for name in q.value), "yes" if q in REQUIRED else ""]
+        [
+            q.name.lower().replace("_", " "),
+            *(f"`{name}`" for name in q.value),
+            "yes" if q in REQUIRED else "one of these" if q in COMMANDS else "",
+            _units(q),
+        ]
         for q in Quantity
     ]
-    return markdown(["Quantity", "Rotary axis", "Linear axis", "Needed"], rows)
+    return markdown(["Quantity", "Rotary axis", "Linear axis", "Needed", "Units that a map may name"], rows)
+
+
+def unit_spellings() -> str:
+    """Other ways to write a unit in a map."""
+    rows = [[f"`{unit}`", ", ".join(f"`{name}`" for name in names)] for unit, names in spellings().items()]
+    return markdown(["Unit", "May also be written"], rows)
+
+
+def _units(quantity: Quantity) -> str:
+    """Units of the rotary column, and those of the linear one where they differ."""
+    told = dict.fromkeys(", ".join(f"`{unit}`" for unit in units_of(dimension_of(name))) for name in quantity.value)
+    return "; ".join(told)
 
 
 def record() -> str:

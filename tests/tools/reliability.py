@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
+#: A row of the failure modes whose last cell begins with scenarios of one time; those of processes are `killed/both`.
+_FAILURE = re.compile(r"^(?P<row>\| .* \|) (?P<times>[^|]*) \| `(?P<name>[\w/ .-]+)`(?P<more>[^|]*) \|$", re.MULTILINE)
+#: A row of the short table above it: left and gone in a cell each.
+_DEATH = re.compile(
+    r"^(?P<row>\| .* \|) (?P<left>\d+) \| (?P<gone>\d+) \| (?P<last>`[\w ]*--only '?(?P<name>[\w/ .-]+)'?`) \|$",
+    re.MULTILINE,
+)
 HEADER = ["Put through", "How much", "Came out", "Command"]
 Row = list[str]
 
@@ -98,3 +106,29 @@ def _fuzz(fuzz: list[dict[str, Any]]) -> Row:
     crashes = {(row["target"], crash["key"]) for row in fuzz for crash in row["crashes"]}
     much = f"{inputs:,} inputs to {len(targets)} ways in, {hours:.2f} h"
     return ["fuzzing", much, f"{len(crashes):,} crashes", "`python -m tests.fuzz.run`"]
+
+
+def with_times(text: str, faults: dict[str, Any]) -> str:
+    """Both tables of the safety page with the times of a campaign: the drive left the command / the torque was gone.
+
+    A row keeps its cell where its scenario did not run or has no such times. Raises ValueError where an axis rode
+    through that the table lets stop, or the other way round.
+    """
+    ran = {scenario["name"]: scenario for scenario in faults["scenarios"]}
+
+    def timed(row: re.Match[str]) -> str:
+        if (scenario := ran.get(row["name"])) is None:
+            return row[0]
+        if (scenario["axis"] == "ENABLED") != (row["times"] == "rides"):
+            raise ValueError(f"{row['name']}: {scenario['axis']}, in the table {row['times']}")
+        left, gone = scenario["left_ms"], scenario["gone_ms"]
+        if left is None or gone is None or row["times"] in ("rides", "no torque"):
+            return row[0]
+        times = f"{left:.0f}" if f"{left:.0f}" == f"{gone:.0f}" else f"{left:.0f} / {gone:.0f}"
+        return f"{row['row']} {times} | `{row['name']}`{row['more']} |"
+
+    def died(row: re.Match[str]) -> str:
+        left, gone = (ran.get(row["name"], {}).get(key) for key in ("left_ms", "gone_ms"))
+        return row[0] if left is None or gone is None else f"{row['row']} {left:.0f} | {gone:.0f} | {row['last']} |"
+
+    return _DEATH.sub(died, _FAILURE.sub(timed, text))

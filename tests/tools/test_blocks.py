@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import blocks
@@ -78,3 +79,13 @@ def test_a_command_that_fails_ends_the_page(tmp_path: Path) -> None:
 )
 def test_the_commands_of_a_page_work_as_they_stand(page: Path, tmp_path: Path) -> None:
     blocks.run(blocks.script(page), tmp_path, 1100.0 if long(page) else 100.0)
+
+
+def test_the_check_of_the_first_configuration_prints_what_the_page_shows(tmp_path: Path) -> None:
+    """To the letter, but for `…`: lines that are left out there are questions of whoever meets them."""
+    page = readme.DOCS / "tutorials/first-axis.md"
+    first = blocks.blocks(page)[0].text
+    assert first.endswith("servoctl config check out/axis/axis.yaml\n")
+    shown = page.read_text().partition(f"{first}```\n\n```\n")[2].partition("\n```")[0]
+    pattern = ".*".join(re.escape(part) for part in shown.split("…"))
+    assert "not reckoned" in shown and re.fullmatch(f"{pattern}\n", blocks.run(first, tmp_path, 60.0))

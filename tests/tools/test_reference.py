@@ -68,7 +68,7 @@ def options(found: Any, words: str) -> Iterator[tuple[str, str]]:
 
 
 def test_every_verb_and_option_stands_in_the_command_line() -> None:
-    sections = dict(re.findall(r"^### (servoctl [\w ]+)\n(.*?)(?=^##)", page("cli"), re.DOTALL | re.MULTILINE))
+    sections = dict(re.findall(r"^### (servoctl [\w -]+)\n(.*?)(?=^##)", page("cli"), re.DOTALL | re.MULTILINE))
     typed = [(words, name) for words, name in options(command(), "servoctl") if words != "servoctl"]
     assert {words for words, _ in typed} <= set(sections)
     wrong = [(words, name) for words, name in typed if name.startswith("-") and not _has(sections[words], name)]

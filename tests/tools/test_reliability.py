@@ -62,3 +62,25 @@ def test_the_campaign_and_fuzzing_are_told_with_what_failed() -> None:
     assert campaign[1:3] == ["48 of 50 scenarios", "47 passed; 2 cycle records lost"]
     assert feedback[2] == "the drive had left the command after 21 ms at the latest"
     assert fuzzing[1:3] == ["1,000 inputs to 1 ways in, 1.00 h", "1 crashes"]
+
+
+_FAILURES = """| Part | Failure | ms | Behind the row |
+| cable | the drive | 19 | 31 | `servoctl qualify faults --only 'cut_off/amplifier'` |
+| Bus | cut | 127 / 149 | `cut_off/amplifier` |
+| Joint | overload | rides | `overload_clips` |
+| Kernel | gone | the same | `vcan_interface_gone`, by `scripts/guest` |
+"""
+
+
+def test_failure_modes_have_the_times_of_the_campaign() -> None:
+    cut = {"name": "cut_off/amplifier", "axis": "FAULT", "left_ms": 20.4, "gone_ms": 43.3}
+    clips = {"name": "overload_clips", "axis": "ENABLED", "left_ms": None, "gone_ms": None}
+    faults = {"scenarios": [cut, clips]}
+    assert reliability.with_times(_FAILURES, faults) == _FAILURES.replace("127 / 149", "20 / 43").replace(
+        "19 | 31", "20 | 43"
+    )
+    faults["scenarios"][0] = {**cut, "gone_ms": 20.1}
+    assert "| cut | 20 |" in reliability.with_times(_FAILURES, faults)
+    clips["axis"] = "FAULT"
+    with pytest.raises(ValueError, match="overload_clips: FAULT, in the table rides"):
+        reliability.with_times(_FAILURES, faults)

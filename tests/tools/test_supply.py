@@ -17,13 +17,13 @@ import source
 from packaging.requirements import Requirement
 
 #: Each lock and the extras of pyproject.toml in it.
-EXTRAS = {"deploy": (), "lab": ("lab",), "dev": ("lab", "dev"), "fuzz": ("lab", "dev", "fuzz")}
+EXTRAS = {"deploy": (), "lab": ("lab",), "dev": ("lab", "dev", "sign"), "fuzz": ("lab", "dev", "sign", "fuzz")}
 #: Not on the way from one of these to the next.
-BESIDE = {"docs": ("docs",), "browser": ("lab", "browser")}
+BESIDE = {"docs": ("docs",), "browser": ("lab", "browser"), "sign": ("sign",)}
 LOCKS = (*EXTRAS, *BESIDE, "build")
 #: Which can be installed upon another.
 UPON = (*itertools.pairwise(EXTRAS), ("build", "dev"), ("deploy", "docs"), ("docs", "dev"), ("build", "docs"))
-UPON += (("lab", "browser"), ("browser", "dev"), ("build", "browser"))
+UPON += (("lab", "browser"), ("browser", "dev"), ("build", "browser"), ("deploy", "sign"), ("sign", "dev"))
 COMMANDS = ("demo", "test")
 
 
