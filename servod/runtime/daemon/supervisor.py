@@ -42,7 +42,7 @@ from servod.runtime.daemon.status import (
     motion_status,
 )
 from servod.runtime.daemon.verbs import Verbs
-from servod.runtime.daemon.waiting import Comeback, carried_by
+from servod.runtime.daemon.waiting import BEGINS_ANEW, Comeback, carried_by
 from servod.runtime.fieldbus.devices import DriveState
 from servod.runtime.fieldbus.master.planned import reaction_s
 from servod.runtime.fieldbus.master.sdo import SDO_TIMEOUT_S
@@ -295,7 +295,7 @@ class Supervisor:
     def _leave_for_new(self) -> None:
         """Bus and nodes are back, the drive shows no power. The loop ends, in order where its own connection lives."""
         self._why_ends = "servod begins anew, for bus and nodes are back; connect again"
-        log.warning("bus and nodes are back: bringing the axis up anew, disabled")
+        log.warning(BEGINS_ANEW)
         self._recorder.add_event("node", "bus and nodes are back: the axis begins anew, disabled")
         exit_code = self._loop.stop(_LEAVE_S)
         self._take_records(time.monotonic_ns())

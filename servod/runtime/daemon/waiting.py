@@ -40,6 +40,8 @@ _LOOK_EVERY_S, _TELL_EVERY_S = 1.0, 1.0
 _LONGEST_PAUSE_S = 30.0
 #: A fault is shown for so long before the axis begins anew; one that comes back at once for twice as long each time.
 SHOWN_S, _LONGEST_SHOWN_S = 2.0, 60.0
+#: What the log says when an axis begins anew.
+BEGINS_ANEW = "bus and nodes are back: bringing the axis up anew, disabled"
 #: An axis that ran for so long did begin; what takes it away then is another matter.
 _RAN_S = 60.0
 #: What takes bus or nodes away, by whatever is plugged, supplied or configured outside of servod.
