@@ -1,15 +1,17 @@
 """The page of a commissioning and its pictures: from the folder's files alone, so that it can be made anew at any time.
 
-Stands on the figures of servod.lab.report; called by the last step.
+Stands on the figures of servod.lab.report. The last step of the walk makes it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+from servod import __version__
 from servod.client.open import VirtualWalkAxis
 from servod.formats.gains.gain_set import CertificateCheck, GainSet, load_gains
 from servod.formats.model.axis_model import AxisModel, load_axis_model
@@ -421,3 +423,28 @@ def result(walk: Walk, state: State) -> dict[str, Any]:
     }
     write_json(walk.path(RESULT), document)
     return document
+
+
+# --- Step 7 ----------------------------------------------------------------------------------------------------------
+# The last step of the walk: one page that shows all of it, and its pictures.
+
+
+@dataclass(frozen=True)
+class Report:
+    """Leaves report.html and the pictures."""
+
+    name: str = "report"
+    title: str = "report"
+
+    def outputs(self, _walk: Walk) -> tuple[str, ...]:
+        """Files in the walk's folder."""
+        return (REPORT, PICTURES)
+
+    def inputs(self, walk: Walk) -> dict[str, Any]:
+        """Everything that is shown."""
+        return {**walk.hashes(IDENTIFIED, MODEL, GAINS, DEPLOYMENT, TRACKING, TUNING), "version": __version__}
+
+    def run(self, walk: Walk) -> None:
+        """From the folder's files alone."""
+        with walk.progress(self.title) as tell:
+            write_report(walk, tell)

@@ -37,9 +37,8 @@ from servod.lab.commission.state import (
 from servod.lab.commission.state import read_walk_json as read_json
 from servod.lab.commission.steps import STEPS as ALL_STEPS
 from servod.lab.commission.steps.deploy import Deploy
-from servod.lab.commission.steps.synthesize import Synthesize, agreed, relaxed, tell_clashes
+from servod.lab.commission.steps.synthesize import Synthesize, Verify, agreed, relaxed, tell_clashes
 from servod.lab.commission.steps.validate import document as comparison
-from servod.lab.commission.steps.verify import Verify
 from servod.lab.commission.walk import Outlook, Questions, Step, StepFailed, Tell, Walk, WalkOptions, run
 from servod.lab.deploy.deployment import motion_notice
 from servod.lab.report.figure import Figure, PageTable

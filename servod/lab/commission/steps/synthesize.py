@@ -1,4 +1,6 @@
-"""Step 2: the model becomes a gain set with its proofs, or the walk says what would have to be relaxed."""
+"""Steps 2 and 3: the model becomes a gain set with its proofs, or the walk says what would have to be relaxed; then the
+set is judged from itself alone, and gets its certificate.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +10,17 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from servod.common.errors import AnswerIsNo
-from servod.common.sources import SYNTHESIZES, source_sha256
+from servod.common.sources import SYNTHESIZES, VERIFIES, source_sha256
 from servod.common.units import NS_PER_S, NS_PER_US
-from servod.formats.gains.gain_set import GainSet
+from servod.formats.gains.gain_set import GainSet, load_gains
 from servod.formats.model.axis_model import AxisModel, load_axis_model
-from servod.lab.commission.state import DESIGN, INFEASIBLE, MODEL, RELAXED, write_json, write_text
+from servod.lab.commission.state import CERTIFICATE, DESIGN, GAINS, INFEASIBLE, MODEL, RELAXED, write_json, write_text
 from servod.lab.commission.walk import Walk
 from servod.lab.synthesize.deployed import Wishes
 from servod.lab.synthesize.gain_set import DesignOptions, synthesize
 from servod.lab.synthesize.infeasible import Infeasible, Relaxation
 from servod.lab.synthesize.regions import uncertainty_of
+from servod.lab.verify.certify import SEED, verify
 
 #: The regions' overlap ends at this share of the speed at most.
 OVERLAP_SHARE = 0.5
@@ -113,3 +116,36 @@ def agreed(walk: Walk, found: Infeasible) -> Relaxation:
     told = [*remedies, *(f"{relaxation} would do by itself (--yes takes the first)" for relaxation in offers)]
     where = " and ".join(found.regions) or "both regions together"
     raise AnswerIsNo(f"synthesize: no feedback for {where}; {'; '.join(told) or 'no single relaxation helps'}")
+
+
+# --- Step 3 ----------------------------------------------------------------------------------------------------------
+# The set is judged from itself alone, and gets its certificate.
+
+
+@dataclass(frozen=True)
+class Verify:
+    """Leaves the certified gain set, and the document of `servoctl verify --json`."""
+
+    name: str = "verify"
+    title: str = "verify"
+
+    def outputs(self, _walk: Walk) -> tuple[str, ...]:
+        """Files in the walk's folder."""
+        return (GAINS, CERTIFICATE)
+
+    def inputs(self, walk: Walk) -> dict[str, Any]:
+        """The set, how thoroughly it is judged, and by which sources."""
+        return {**walk.hashes(DESIGN), "plants": walk.options.plants, "seed": SEED, "tool": source_sha256(VERIFIES)}
+
+    def run(self, walk: Walk) -> None:
+        """Raises AnswerIsNo when the set is not valid; then the document stands alone, without a set to deploy."""
+        gains = load_gains(walk.path(DESIGN))
+        with walk.progress(self.title) as tell:
+            tell(f"{walk.options.plants} plants", 0.1)
+            options, where = walk.options, str(walk.path(DESIGN))
+            result = verify(gains, options.plants, SEED, options.processes, where, least_plants=options.least_plants)
+        write_json(walk.path(CERTIFICATE), result.document())
+        if not result.valid:
+            failed = [check.name for check in result.checks if not check.passed]
+            raise AnswerIsNo(f"verify: not valid: {'; '.join(failed)}")
+        write_text(walk.path(GAINS), result.certified(gains).to_yaml())
