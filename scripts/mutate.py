@@ -93,7 +93,9 @@ TARGETS = {
         ),
     ),
     "cia402_setup": Target(
-        "drivers/cia402_setup.py", "servod.drivers.cia402_setup", ("tests/drivers/test_cia402_setup.py",)
+        "drivers/cia402_setup.py",
+        "servod.drivers.cia402_setup",
+        ("tests/drivers/test_cia402_setup.py", "tests/drivers/test_cia402_guards.py"),
     ),
 }
 

@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 
 from servod.common.errors import Unreachable
-from servod.drivers.cia402_guards import Guards, put_back, write_position_limits
-from servod.drivers.cia402_setup import AmplifierSetup
+from servod.drivers.cia402_setup import AmplifierSetup, Guards, put_back, write_position_limits
 from servod.runtime.fieldbus.cia import Abort
 from servod.runtime.fieldbus.devices import SdoAbort
 from tests.drivers.test_cia402_setup import ABORT, FAULT_REACTION, QUICK_STOP, Dictionary, axis_config, configured

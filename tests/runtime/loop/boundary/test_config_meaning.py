@@ -10,8 +10,7 @@ import pytest
 
 from servod.drivers.cia402 import Cia402Amplifier
 from servod.drivers.cia402_setup import AmplifierSetup
-from servod.drivers.cia406 import Cia406Encoder
-from servod.drivers.cia406_setup import EncoderSetup
+from servod.drivers.cia406 import Cia406Encoder, EncoderSetup
 from servod.formats.config import AxisConfig
 from servod.formats.config_keys import config_keys
 from servod.runtime.fieldbus.devices import AmplifierCommand, Goal
