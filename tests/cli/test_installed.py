@@ -8,9 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from servod.cli import errors
-from servod.cli.app import run
-from servod.cli.errors import command_for, extra_of
+from servod.cli.app import command_for, extra_of, run
 
 EDITABLE = {"dir_info": {"editable": True}}
 
@@ -69,10 +67,9 @@ def test_which_extra_has_a_package() -> None:
 
 
 def test_the_line_and_the_document(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(errors, "how_to_get", lambda extra: f"get {extra}")
-    monkeypatch.setattr("servod.cli.errors.how_to_get", lambda extra: f"get {extra}")
+    monkeypatch.setattr("servod.cli.app.how_to_get", lambda extra: f"get {extra}")
     monkeypatch.setitem(sys.modules, "servod.lab.diagnose.effects", None)
-    monkeypatch.setattr("servod.cli.errors.extra_of", lambda name: "lab")
+    monkeypatch.setattr("servod.cli.app.extra_of", lambda name: "lab")
     assert run(["explain", "--json"]) == 2
     shown = capsys.readouterr()
     error = json.loads(shown.out)["error"]

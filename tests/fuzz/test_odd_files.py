@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from servod.cli.motion_file import read_motion
+from servod.cli.track import read_motion
 from servod.common.errors import BadInput
 from servod.formats.config import load_config
 from servod.formats.gains.gain_set import load_gains

@@ -225,7 +225,7 @@ def config_check(folder: Path) -> Target:
 
 def motion(folder: Path) -> Target:
     """A reference motion, put on the loop's grid."""
-    from servod.cli.motion_file import COLUMNS, read_motion
+    from servod.cli.track import COLUMNS, read_motion
 
     seed = b"t_s,reference_rad\n0,0\n0.5,0.1\n1.0,0.2\n"
     read = _file(folder / "motion.csv", lambda path: read_motion(path).on_grid(1e-3))

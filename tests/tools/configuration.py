@@ -7,7 +7,7 @@ from pathlib import Path
 import readme
 import tables
 
-from servod.formats.config_keys import config_keys
+from servod.cli.config import config_keys
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "configuration.md"
 _HEADER = ["Key", "Type", "Unit", "Default", "Range", "Meaning"]

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from pydantic import BaseModel
 from tables import code, markdown, prose
 
-from servod.cli.gains_view import unit_of
+from servod.cli.gains import unit_of
 
 #: Units that parameters of gain sets do not have.
 _UNITS = {"_hz": "Hz", "_us": "µs"}

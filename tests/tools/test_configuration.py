@@ -8,7 +8,7 @@ import configuration
 import pytest
 
 from servod.cli.app import run
-from servod.formats.config_keys import ConfigKey, config_keys
+from servod.cli.config import ConfigKey, config_keys
 
 KEYS = config_keys()
 

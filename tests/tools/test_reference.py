@@ -14,13 +14,12 @@ import reference
 import safety_trace
 import schema
 
-from servod.cli.app import command
-from servod.cli.errors import _CODES, INTERRUPTED
+from servod.cli.app import _CODES, INTERRUPTED, command
+from servod.cli.config import config_keys
 from servod.common.errors import AnswerIsNo, BadInput, ServodError, Unreachable
 from servod.common.faults import FaultCode
 from servod.drivers.quirks import QUIRKS
 from servod.drivers.virtual.settings import VirtualAxisSettings
-from servod.formats.config_keys import config_keys
 from servod.formats.protocol import Verb
 from servod.formats.recording.record import FIELDS
 from servod.runtime.daemon.status import Status

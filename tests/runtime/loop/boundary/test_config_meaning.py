@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
+from servod.cli.config import config_keys
 from servod.drivers.cia402 import Cia402Amplifier
 from servod.drivers.cia402_setup import AmplifierSetup
 from servod.drivers.cia406 import Cia406Encoder, EncoderSetup
 from servod.formats.config import AxisConfig
-from servod.formats.config_keys import config_keys
 from servod.runtime.fieldbus.devices import AmplifierCommand, Goal
 
 MEANING = {key.key: key.meaning for key in config_keys()}
