@@ -15,8 +15,7 @@ from servod.formats.gains.gain_set import GainSet
 from servod.formats.model.axis_model import AxisModel
 from servod.formats.protocol import MAX_ANSWER_BYTES, MAX_LINE_BYTES, PIECE_SAMPLES, READING, Verb
 from servod.formats.recording.record import FIELDS
-from servod.lab.recordings.columns import COMMANDS, REQUIRED, Quantity
-from servod.lab.recordings.units import dimension_of, spellings, units_of
+from servod.lab.recordings.columns import COMMANDS, REQUIRED, Quantity, dimension_of, spellings, units_of
 from servod.runtime.daemon.arguments import arguments_of
 from servod.runtime.daemon.control_server import MAX_CLIENTS, MAX_CLIENTS_OF_A_PROCESS, STOPPING
 from servod.runtime.fieldbus.devices import REASON_TEXT, DriveState, Goal

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from servod.lab.recordings import Quantity, Recording, load_recording
-from servod.lab.recordings.wraps import find_wrap
+from servod.lab.recordings.recording import find_wrap
 
 T = np.arange(2000) * 1e-3
 NOISE = np.random.default_rng(1).normal(size=len(T))
