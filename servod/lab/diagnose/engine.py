@@ -19,7 +19,7 @@ from servod.lab.diagnose.judge.conclude import (
     name_findings,
     reject_terms,
 )
-from servod.lab.diagnose.judge.hold_out import judge_held_out
+from servod.lab.diagnose.judge.free_run import judge_held_out
 from servod.lab.diagnose.judge.judgement import JudgedSelection, judge, predicts_nothing, without_names
 from servod.lab.diagnose.judge.partial import model_without_names, partial_answer
 from servod.lab.diagnose.judge.verdict import below_noise, verdict

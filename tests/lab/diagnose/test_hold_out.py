@@ -10,7 +10,7 @@ import pytest
 
 from servod.cli.diagnose import _need_unseen
 from servod.common.errors import BadInput
-from servod.lab.diagnose.judge.hold_out import coasting, judge_held_out
+from servod.lab.diagnose.judge.free_run import coasting, judge_held_out
 from servod.lab.simulate.replay import window_starts
 from tests.lab.diagnose.axes import believed, record
 
