@@ -17,7 +17,7 @@ from servod.lab.identify.fits.bristle import Bristle, dry_columns, follow
 from servod.lab.identify.fits.elastic import Elastic
 from servod.lab.identify.fits.friction_map import Side
 from servod.lab.identify.fits.presliding import bend_factor, fundamental
-from servod.lab.identify.fits.strokes import Rigid, response_of
+from servod.lab.identify.fits.response import Rigid, response_of
 from servod.lab.identify.shapes import multisine
 from servod.lab.identify.trace import ExperimentKind, RecordedMotion, acting_torque, smooth
 
