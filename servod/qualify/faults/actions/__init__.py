@@ -1,7 +1,8 @@
 """What an injection can do to an axis under test: one class for each action, in one table.
 
 An action is the model of its own arguments (checked when the scenario is read) with `apply`. The files of this folder
-group them: `bus` (frames and wires), `nodes` (NMT, SDO, EMCY, heartbeat), `machine` (commands, gains, configuration).
+group them: `bus` (frames, wires, NMT, objects of the nodes), `machine` (commands, gains, configuration), `processes`
+and `guest`.
 """
 
 from __future__ import annotations
@@ -9,10 +10,9 @@ from __future__ import annotations
 from servod.common.errors import BadInput
 from servod.common.yaml import validate
 from servod.qualify.faults.actions.base import InjectionAction
-from servod.qualify.faults.actions.bus import BUS_ACTIONS
+from servod.qualify.faults.actions.bus import BUS_ACTIONS, NODE_ACTIONS
 from servod.qualify.faults.actions.guest import GUEST_ACTIONS
 from servod.qualify.faults.actions.machine import GAIN_FILE_ACTIONS, MACHINE_ACTIONS
-from servod.qualify.faults.actions.nodes import NODE_ACTIONS
 from servod.qualify.faults.actions.processes import PROCESS_ACTIONS
 from servod.qualify.faults.scenario import Injection, Runs
 
