@@ -2,6 +2,5 @@
 
 reduce.py       what a format leaves out of a model, one step for each effect
 mjcf.py, urdf.py  the reduced model as MJCF (MuJoCo) and as URDF
-judge.py        what is lost costs so much; what was written moves in MuJoCo as ours does here
-export.py       the room's entry
+export.py       the room's entry: writes a file, says what that loses and costs, and runs it in MuJoCo beside ours
 """

@@ -13,8 +13,8 @@ import pytest
 
 from servod.cli.app import run
 from servod.formats.model.axis_model import AxisModel, axis_model_yaml
-from servod.lab.export import judge, mjcf, urdf
-from servod.lab.export.export import export
+from servod.lab.export import mjcf, urdf
+from servod.lab.export.export import AGREES, costs, export, own_motion, round_trip
 from servod.lab.export.reduce import folded, losses
 from servod.lab.simulate.replay import replay
 
@@ -52,8 +52,8 @@ SAID_BY_MJCF = {
 def test_mjcf_moves_as_the_model_and_leaves_nothing_out(name: str) -> None:
     model = SAID_BY_MJCF[name]
     assert not list(losses(model, mjcf.LOSSES))
-    found = judge.round_trip(mjcf.says(model), mjcf.write(mjcf.says(model), "axis"), "axis", [judge.own_motion(model)])
-    assert found.engine.startswith("MuJoCo") and found.agrees and found.apart < judge.AGREES
+    found = round_trip(mjcf.says(model), mjcf.write(mjcf.says(model), "axis"), "axis", [own_motion(model)])
+    assert found.engine.startswith("MuJoCo") and found.agrees and found.apart < AGREES
 
 
 LEFT_OUT = {
@@ -73,9 +73,9 @@ LEFT_OUT = {
 @pytest.mark.parametrize("name", LEFT_OUT)
 def test_what_mjcf_leaves_out_is_named_and_costs_what_the_file_is_off(name: str) -> None:
     model, said = LEFT_OUT[name], mjcf.says(LEFT_OUT[name])
-    drives = [judge.own_motion(model)]
-    lost = judge.costs(model, mjcf.LOSSES, drives)
-    found = judge.round_trip(said, mjcf.write(said, "axis"), "axis", drives)
+    drives = [own_motion(model)]
+    lost = costs(model, mjcf.LOSSES, drives)
+    found = round_trip(said, mjcf.write(said, "axis"), "axis", drives)
     assert list(lost) == [name] and lost[name] > 1e-3
     assert found.agrees and found.theirs == pytest.approx(lost[name], rel=0.1)
 
@@ -85,19 +85,19 @@ def test_urdf_keeps_inertia_weight_friction_and_limit_alone() -> None:
         friction=LUGRE, gravity={"amplitude": 2.0}, torque_saturation={"limit": 2.5}, cogging={"harmonics": WAVES}
     )
     said = urdf.says(model)
-    drives = [judge.own_motion(model)]
-    lost = set(judge.costs(model, urdf.LOSSES, drives))
+    drives = [own_motion(model)]
+    lost = set(costs(model, urdf.LOSSES, drives))
     assert lost == {"cogging", "friction.stribeck", "friction.bristle", "delay_s"}
     root = ET.fromstring(urdf.write(said, "elbow"))
     dynamics = root.find("joint[@name='elbow']/dynamics")
     assert dynamics is not None and dynamics.attrib == {"damping": "0.3", "friction": "0.8"}
-    assert judge.round_trip(said, urdf.write(said, "elbow"), "elbow", drives).agrees
+    assert round_trip(said, urdf.write(said, "elbow"), "elbow", drives).agrees
 
 
 def test_a_file_that_says_something_else_does_not_agree() -> None:
     model = joint()
     wrong = mjcf.write(joint(inertia=0.055), "axis")
-    assert not judge.round_trip(mjcf.says(model), wrong, "axis", [judge.own_motion(model)]).agrees
+    assert not round_trip(mjcf.says(model), wrong, "axis", [own_motion(model)]).agrees
 
 
 @pytest.mark.parametrize(
@@ -110,7 +110,7 @@ def test_a_file_that_says_something_else_does_not_agree() -> None:
     ],
 )
 def test_groups_of_friction_folded_into_the_law_are_the_same_physics(model: AxisModel) -> None:
-    drive = judge.own_motion(model)
+    drive = own_motion(model)
     plain = folded(model)
     assert plain.stribeck is None and plain.presliding is None
     np.testing.assert_array_equal(replay(plain, drive, 0.25).position, replay(model, drive, 0.25).position)
