@@ -28,10 +28,16 @@ from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.result import Diagnosis, DiagnosisVerdict
 from servod.lab.diagnose.select.cross_validation import cross_validate
 from servod.lab.diagnose.select.drive import complete_drive
-from servod.lab.diagnose.select.refine import above_floor, add_drift, add_group, restore_nominal
 from servod.lab.diagnose.select.selection import Selection
 from servod.lab.diagnose.select.selector import Selector
-from servod.lab.diagnose.select.stepwise import forward_selection, swap_terms
+from servod.lab.diagnose.select.stepwise import (
+    above_floor,
+    add_drift,
+    add_group,
+    forward_selection,
+    restore_nominal,
+    swap_terms,
+)
 from servod.lab.diagnose.settings import SETTINGS
 from servod.lab.recordings import Recording
 

@@ -16,10 +16,9 @@ from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.candidates import Candidate
 from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.select.merit import Merit
-from servod.lab.diagnose.select.refine import add_first
 from servod.lab.diagnose.select.selection import Selection, TermEntry
 from servod.lab.diagnose.select.selector import Selector
-from servod.lab.diagnose.select.stepwise import swap_terms
+from servod.lab.diagnose.select.stepwise import add_first, swap_terms
 from tests.lab.diagnose.axes import believed, record
 
 #: What a term is said to be worth before anybody has looked.

@@ -15,9 +15,9 @@ from servod.lab.diagnose.effects.base import document_of
 from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.engine import diagnose
 from servod.lab.diagnose.predict.predict import Predictor
-from servod.lab.diagnose.select.refine import add_drift
 from servod.lab.diagnose.select.selection import Selection
 from servod.lab.diagnose.select.selector import Selector
+from servod.lab.diagnose.select.stepwise import add_drift
 from servod.lab.diagnose.settings import SETTINGS
 from tests.lab.diagnose.axes import believed, record
 

@@ -14,9 +14,8 @@ from servod.lab.diagnose.judge.partial import best_model, model_without_names, p
 from servod.lab.diagnose.result import FreeRun, Windows
 from servod.lab.diagnose.select.candidates import Candidate
 from servod.lab.diagnose.select.merit import Merit
-from servod.lab.diagnose.select.refine import _is_significant
 from servod.lab.diagnose.select.selector import Selector
-from servod.lab.diagnose.select.stepwise import forward_selection
+from servod.lab.diagnose.select.stepwise import _is_significant, forward_selection
 from servod.lab.diagnose.settings import SETTINGS
 from tests.lab.diagnose.axes import believed
 from tests.lab.diagnose.test_findings import form, selecting, sorted_with

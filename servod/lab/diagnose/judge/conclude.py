@@ -44,9 +44,9 @@ from servod.lab.diagnose.result import (
 from servod.lab.diagnose.select.fit import Fit, on_bound
 from servod.lab.diagnose.select.levels import at_end_of_range, is_level_change, shorter_twin
 from servod.lab.diagnose.select.merit import Merit, large_enough
-from servod.lab.diagnose.select.refine import DRIFT, power_of_means
 from servod.lab.diagnose.select.selection import Selection
 from servod.lab.diagnose.select.selector import Selector
+from servod.lab.diagnose.select.stepwise import DRIFT, power_of_means
 from servod.lab.diagnose.settings import SETTINGS
 
 # --- Curves of the page ----------------------------------------------------------------------------------------------

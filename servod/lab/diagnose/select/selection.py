@@ -1,6 +1,6 @@
 """The state of a selection, which each stage takes and returns: fits, and for each term its worth and how it came in.
 
-Stands below the stages (`stepwise`, `refine`, `cross_validation`) and above the fit; plain values, nothing decided.
+Stands below the stages (`stepwise`, `cross_validation`) and above the fit; plain values, nothing decided.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Stepwise selection: terms come in one at a time, the best first, go when others do their work, and change places.
 
-The first stages of the selection, each from one `Selection` to the next: `forward_selection` with
-`backward_elimination` behind each term (Efroymson, Multiple regression analysis, 1960), then `swap_terms`.
+The stages of the selection, each from one `Selection` to the next: `forward_selection` with `backward_elimination`
+behind each term (Efroymson, Multiple regression analysis, 1960), then `swap_terms`; and what real machines need beyond.
 """
 
 from __future__ import annotations
@@ -14,12 +14,17 @@ from time import monotonic
 import numpy as np
 from numpy.typing import NDArray
 
+from servod.lab.diagnose.effects import effect, names
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
+from servod.lab.diagnose.effects.search_context import SearchContext
+from servod.lab.diagnose.predict.floor import above_noise
+from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.candidates import Candidate
 from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.select.levels import at_end_of_range, level_at_bound
+from servod.lab.diagnose.select.merit import Merit
 from servod.lab.diagnose.select.selection import Selection, TermEntry
-from servod.lab.diagnose.select.selector import Selector
+from servod.lab.diagnose.select.selector import Selector, is_sound
 from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
@@ -168,3 +173,175 @@ def _better(selector: Selector, old: Fit, new: Fit) -> bool:
 
 def _size(fit: Fit) -> int:
     return sum(term.numbers for term in fit.hypothesis.terms)
+
+
+# --- Beyond stepwise selection ---------------------------------------------------------------------------------------
+# What real machines need beyond stepwise selection: several terms at once, a slow drift, values put back.
+#
+# The later stages of the selection. Real machines have several effects none of which takes much of what is left, and
+# all together do; and a constant torque that changes slowly, which is next to nothing in any row.
+
+
+#: The effect and form of a slow change, and what it must be told from: friction that drifts, which turns with the
+#: direction.
+DRIFT, DRIFT_RIVAL = ("offset_drift", "straight"), ("thermal", "drift")
+
+#: Parameters that are put back where the data do not mind: bristle, Stribeck curve, offset and delay show little in
+#: most recordings, and a value that noise or the sample time has moved is no recalibration.
+PUT_BACK = (
+    "friction.sigma0",
+    "friction.sigma1",
+    "friction.static",
+    "friction.stribeck_velocity",
+    "torque_offset",
+    "delay_s",
+)
+
+
+def above_floor(selector: Selector, selection: Selection) -> bool:
+    """Whether terms came in, and what they left is more than forms and noise make."""
+    if not selection.terms:
+        return False
+    left = selector.error(selection.fit.mismatch) - selection.floor
+    explainable = above_noise(selection.base_error, selection.floor)
+    torque = math.sqrt(max(left, 0.0))
+    return left > SETTINGS.group.left_share * explainable and torque > SETTINGS.group.much_left * selector.predictor.dry
+
+
+def add_group(selector: Selector, selection: Selection) -> Selection:
+    """Add the best terms one after the other, finer forms among them; all of them stay, or none.
+
+    Forward selection adds a term only when it takes a good share of what is left. Here all together must.
+    """
+    longer = selection
+    while longer.terms < SETTINGS.group.most_terms and monotonic() < selector.deadline:
+        if selector.nothing_left(longer):
+            break
+        skip = names(lambda what: what.soaks_up) | frozenset(longer.rejected)
+        candidates, tried = selector.candidates(longer.fit, True, skip)
+        before = longer.terms
+        longer = add_first(selector, replace(longer, tried=longer.tried + tried), candidates)
+        if longer.terms == before:
+            break
+    if longer.fit is not selection.fit:
+        together = selector.merit(longer, selection.fit, longer.fit)
+        if together.of_left >= SETTINGS.group.least_together:
+            return longer
+    return replace(selection, floor=longer.floor)
+
+
+def add_first(selector: Selector, selection: Selection, candidates: list[Candidate]) -> Selection:
+    """Add the first of the best candidates that deserves it and whose fit is sound, if one does."""
+    present = selection.fit
+    deserves = partial(_deserves, selector, selection)
+    for candidate in candidates[: SETTINGS.group.tried]:
+        begun = selector.settle(candidate.fit.hypothesis, candidate.fit.coordinates, present.mismatch)
+        fit, merit = selector.fit_on(selection, present, begun, deserves)
+        selection = selector.lower_floor(selection, fit.mismatch)
+        if deserves(merit, fit) and is_sound(merit, fit):
+            others = tuple(c for c in candidates if c.effect != candidate.effect)
+            return selection.with_term(fit, merit, TermEntry(candidate.left, others))
+    return selection
+
+
+def _deserves(selector: Selector, selection: Selection, merit: Merit, fit: Fit) -> bool:
+    """Whether a term is significant and of some size."""
+    of_size = merit.of_left >= SETTINGS.group.least_each and merit.torque >= SETTINGS.group.least_torque
+    return of_size and selector.significant(selection, merit, fit)
+
+
+def add_drift(selector: Selector, selection: Selection) -> Selection:
+    """Add a drift of the offset where it takes a good share of what is left over a second.
+
+    A slow change of the constant torque is next to nothing in any row, and most of what carries a simulation away: what
+    is left is judged by its means over a second, as a simulation that runs freely for a second adds it up.
+    """
+    present = selection.fit
+    there = {term.effect for term in present.hypothesis.terms}
+    out = there | set(selection.rejected)
+    if out & {DRIFT[0], DRIFT_RIVAL[0]} or not effect(DRIFT[0]).terms(_scene(selector, present)):
+        return selection
+    drift, merit = _fit_with(selector, selection, *DRIFT)
+    left = _left(selector, present, drift)
+    taken = left <= 1.0 - SETTINGS.drift.least_taken and _is_significant(selector, merit, 1.0 - left)
+    if not taken or not is_sound(merit, drift):
+        return selection
+    other, _ = _fit_with(selector, selection, *DRIFT_RIVAL)
+    rival = Candidate(DRIFT_RIVAL[0], other, _left(selector, present, other))
+    return selection.with_term(drift, merit, TermEntry(left, (rival,)))
+
+
+def _is_significant(selector: Selector, merit: Merit, taken: float = 0.0) -> bool:
+    """Whether a term of one number is significant that takes a share of the means' power."""
+    least = SETTINGS.drift.least_gain_of_most if taken >= SETTINGS.drift.most_taken else SETTINGS.drift.least_gain
+    return merit.gain >= least + math.log(float(selector.rows.sum()))
+
+
+def _fit_with(selector: Selector, selection: Selection, name: str, form: str) -> tuple[Fit, Merit]:
+    """The fit with a form of an effect beside all that is in, fitted to its end, and what the effect is worth."""
+    present = selection.fit
+    term = next(term for term in effect(name).terms(_scene(selector, present)) if term.form == form)
+    hypothesis = present.hypothesis.with_term(term)
+    at = hypothesis.beside(present.coordinates)
+    begun = selector.settle(hypothesis, at, present.mismatch, present.jacobian)
+    return selector.fit_on(selection, present, begun, lambda merit, _fit: _is_significant(selector, merit))
+
+
+def _scene(selector: Selector, present: Fit) -> SearchContext:
+    return SearchContext(selector.start.document, selector.predictor, present.mismatch)
+
+
+def _left(selector: Selector, old: Fit, new: Fit) -> float:
+    """The share of the means' power that `new` leaves of what `old` left."""
+    was, now = (power_of_means(selector.predictor, fit.mismatch) for fit in (old, new))
+    return now / max(was, 1e-30)
+
+
+def power_of_means(predictor: Predictor, mismatch: Array) -> float:
+    """Power of the mismatch's means over a second, as a sum over all spans of all recordings, N^2*m^2."""
+    found = []
+    for part, trace in zip(predictor.slices, predictor.traces, strict=True):
+        rows = max(8, round(SETTINGS.drift.span_s / trace.period_s))
+        count = (part.stop - part.start) // rows
+        found.append(mismatch[part][: count * rows].reshape(count, rows).mean(axis=1))
+    return float(np.sum(np.concatenate(found) ** 2))
+
+
+def restore_nominal(selector: Selector, selection: Selection) -> Selection:
+    """Put as many of PUT_BACK at their nominal values as the data do not mind; those that a term opens stay.
+
+    They are held for the fit alone: what is known of them, and so every interval, stays as it was.
+    """
+    fit = selection.fit
+    opened = {key for term in fit.hypothesis.terms for key in term.opens}
+    candidates = [key for key in PUT_BACK if key not in opened and any(u.key == key for u in fit.hypothesis.base)]
+    restored = fit
+    for keys in [candidates, *[[key] for key in candidates]]:
+        held = _held(selector, restored, keys)
+        if held is not None:
+            restored = held
+            if keys is candidates:
+                break
+    if restored is not fit:
+        fit = selector.refresh(replace(restored, hypothesis=fit.hypothesis))
+    return selector.lower_floor(replace(selection, fit=fit), fit.mismatch)
+
+
+def _held(selector: Selector, fit: Fit, keys: list[str]) -> Fit | None:
+    """The fit with `keys` at their nominal values, None where the data mind."""
+    base = tuple(replace(u, spread=SETTINGS.reset.firm) if u.key in keys else u for u in fit.hypothesis.base)
+    hypothesis = Hypothesis(fit.hypothesis.document, base, fit.hypothesis.terms)
+    at = fit.coordinates.copy()
+    for index, unknown in enumerate(base):
+        if unknown.key in keys:
+            at[index] = unknown.coordinate(unknown.start)
+    fitter = selector.fitter(fit.mismatch)
+    begun = fitter.begin(hypothesis, at, fit.jacobian)
+    if begun is None:
+        return None
+    held = fitter.refine(begun, 3, len(at))
+    changed = np.abs(held.mismatch - fit.mismatch)[selector.predictor.counts]
+    if float(np.quantile(changed, 0.99)) > SETTINGS.reset.torque * selector.predictor.dry:
+        return None
+    grown = selector.error(held.mismatch) > (1.0 + SETTINGS.reset.error) * selector.error(fit.mismatch)
+    return None if grown else held
