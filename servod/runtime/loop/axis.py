@@ -102,7 +102,7 @@ class Axis:
         self._prove = self._proven = False
         self._sto = StoNaming(period_s, sto_known)
         self._inputs = 0  # of this cycle
-        self._brake = HoldingBrake(brake, period_s) if brake else None
+        self._brake = HoldingBrake(brake, period_s, stale_cycles) if brake else None
         self._rest = RestWatch(period_s, stays_rad) if stays_rad is not None and not self._sequenced else None
         self._torque_on = False  # the drive gives torque, by command
         if self._brake:
@@ -134,7 +134,7 @@ class Axis:
     @property
     def unheard(self) -> bool:
         """The drive does not follow the control word, or does not get it: other ways must stop it."""
-        return bool(self.latched & _UNHEARD_MASK)
+        return bool(self.latched & ~self._carried & _UNHEARD_MASK)
 
     def enable(self, reset_fault: bool, prove: bool = False) -> Refusal:
         """Explicit request to enable; with `reset_fault` latched faults and the drive's fault are reset first.
@@ -145,6 +145,8 @@ class Axis:
             return Refusal.DONE if self.state.under_way else Refusal.MOTION_RUNNING
         if self.latched & _OFF_MASK & ~self._carried:
             return Refusal.NEEDS_RESTART
+        if self._stops_on:  # the drive is on its ramp, which anything else would end
+            return Refusal.MOTION_RUNNING
         if self._inputs & (DriveInput.ESTOP | DriveInput.STO):
             return Refusal.ESTOP_ACTIVE if self._inputs & DriveInput.ESTOP else Refusal.STO_ACTIVE
         if self._sto.pending:
@@ -165,7 +167,7 @@ class Axis:
 
     def reset_fault(self) -> Refusal:
         """Forget latched faults, but for those that need a restart, and ask the drive once to reset its own."""
-        if self.state.powered:
+        if self.state.powered or self._stops_on:
             return Refusal.MOTION_RUNNING
         self.latched, self._reset_wanted = self.latched & _OFF_MASK & ~self._carried, True
         self._carried = 0
@@ -415,9 +417,12 @@ class Axis:
 
     def _after_braking(self) -> AxisState:
         """The torque goes, or stays until the brake is closed: the controller's, or the drive's own that closes it. A
-        joint that the controller did not bring to rest with its reference is the drive's to stop."""
+        joint that the controller did not bring to rest with its reference is the drive's to stop: a brake that holds
+        is no brake that stops."""
+        if self._moving:
+            return AxisState.QUICK_STOPPING
         if self._brake is None:
-            return AxisState.QUICK_STOPPING if self._moving else AxisState.RAMPING
+            return AxisState.RAMPING
         return AxisState.ENGAGING if self._brake.by_output else AxisState.QUICK_STOPPING
 
     def _finish_enabling(self, amplifier: AmplifierFeedback, encoder_fresh: bool) -> bool:

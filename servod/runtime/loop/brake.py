@@ -63,10 +63,11 @@ class RestWatch:
 
 
 class HoldingBrake:
-    """Counts the brake's times in cycles; `open_from` is asked with the cycles since the axis began to hold."""
+    """Counts the brake's times in cycles, and sees in a quick stop when it must close."""
 
-    def __init__(self, times: BrakeTimes, period_s: float) -> None:
-        self.by_output = times.by_output
+    def __init__(self, times: BrakeTimes, period_s: float, stale_cycles: int) -> None:
+        """A drive that is not heard for `stale_cycles` gives no torque that one may wait with."""
+        self.by_output, self._stale_cycles = times.by_output, stale_cycles
         #: Torque first: the drive has answered that it holds before the brake opens.
         self.torque_first_cycles = HANDSHAKE_SYNCS
         self.open_cycles = HANDSHAKE_SYNCS + math.ceil(times.release_s / period_s - 1e-9)
@@ -89,7 +90,7 @@ class HoldingBrake:
 
     def watch_stop(self, amplifier: AmplifierFeedback, torque_on: bool, overdue: bool) -> bool:
         """One cycle of a quick stop; True when the brake has closed, or there is no torque left to wait with."""
-        rests, unheard = self._rest.rests(amplifier), amplifier.age_cycles >= HANDSHAKE_SYNCS
+        rests, unheard = self._rest.rests(amplifier), amplifier.age_cycles >= self._stale_cycles
         if rests or unheard or overdue or not torque_on:
             self.close()
         if self.closing_cycles is None:

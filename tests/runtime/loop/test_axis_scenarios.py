@@ -91,6 +91,16 @@ def test_there_are_scenarios():
     assert {s.name for s in AxisState} >= {"ENABLED", "FAULT"}
 
 
+@pytest.mark.parametrize("code", [FaultCode.COMMANDS_LOST, FaultCode.DRIVE_STAYS_POWERED])
+def test_a_drive_that_was_not_heard_before_it_was_brought_up_anew_is_heard_now(code):
+    axis = Axis(PERIOD_S, 0.003, 0.01, Mode(10), 5.0)
+    axis.carry(FAULTS[code].bit)
+    axis.step(feedback("SWITCH_ON_DISABLED"), True, 0, True)
+    assert not axis.unheard, "it would be stopped by NMT again, for ever"
+    axis.note(FAULTS[code].bit)
+    assert axis.unheard
+
+
 def test_carried_fault_asks_for_a_reset_by_hand_and_for_a_restart_when_it_comes_again():
     bit = FAULTS[FaultCode.FOREIGN_SDO].bit
     for again in (False, True):

@@ -150,6 +150,30 @@ def test_disable_holds_until_the_brake_is_closed() -> None:
     ]
 
 
+def test_a_joint_that_moves_on_is_stopped_by_the_drive_before_the_brake_closes() -> None:
+    """A brake that holds is no brake that stops: the law did not bring the joint to rest in its time."""
+    axis = powered(make_axis())
+    axis.disable()
+    for _ in range(5):
+        axis.step(feedback(DriveState.OPERATION_ENABLED), True, 0, False, moving=True)
+    assert axis.state is AxisState.QUICK_STOPPING
+    for number in range(40):
+        axis.step(feedback(DriveState.QUICK_STOP_ACTIVE, position_rad=0.01 * number), True, 0, False, moving=True)
+        assert axis.release_brake
+    cycles = path(axis, 60)
+    assert [open_ for _, open_, _ in cycles] == [True, False, False] and cycles[-1][0] == "DISABLED"
+
+
+@pytest.mark.parametrize(("unheard", "stays_open"), [(4, True), (5, False)])
+def test_frames_lost_in_a_stop_close_the_brake_when_the_drive_counts_as_lost(unheard: int, stays_open: bool) -> None:
+    axis = powered(make_axis())
+    axis.quick_stop()
+    for number in range(30):
+        age = max(0, min(number - 9, unheard)) if number < 10 + unheard else 0
+        axis.step(feedback(DriveState.QUICK_STOP_ACTIVE, age, position_rad=0.01 * number), True, 0, False, moving=True)
+    assert axis.release_brake is stays_open
+
+
 @pytest.mark.parametrize("code", [FaultCode.FOLLOWING_ERROR, FaultCode.SPEED_LIMIT, FaultCode.ESTOP_ACTIVE])
 def test_stops_by_the_drive_hold_until_the_brake_is_closed(code: FaultCode) -> None:
     axis = powered(make_axis())

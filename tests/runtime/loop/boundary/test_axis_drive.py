@@ -7,10 +7,11 @@ from typing import Any
 import pytest
 
 from servod.common.faults import FaultCode
-from servod.runtime.fieldbus.devices import HANDSHAKE_SYNCS, DriveState, Mode, Reason
+from servod.runtime.fieldbus.devices import HANDSHAKE_SYNCS, DriveState, Goal, Mode, Reason
 from servod.runtime.loop.axis import Axis
 from servod.runtime.loop.axis_state import AxisState
 from servod.runtime.loop.brake import BrakeTimes
+from servod.runtime.loop.commands import Refusal
 from tests.runtime.loop.boundary.axis_rig import (
     BIT,
     CONTROLLED,
@@ -311,6 +312,16 @@ def test_a_joint_that_the_controller_did_not_bring_to_rest_is_the_drives_to_stop
     for _ in range(RAMP + 1 if moving else 1):  # it has its time for that
         axis.step(amplifier(**DRIVE[S.ENABLED]), True, BIT[F.SUPERVISOR_LOST], True, moving)
     assert axis.state == (S.QUICK_STOPPING if moving else S.RAMPING)
+
+
+def test_a_drive_on_its_ramp_after_a_fault_is_left_to_it() -> None:
+    axis = axis_in(S.ENABLED)
+    step(axis, state=D.QUICK_STOP_ACTIVE, goal_reached=False)
+    assert (axis.state, axis.goal) == (S.FAULT, Goal.QUICK_STOP)
+    assert (axis.enable(True), axis.reset_fault()) == (Refusal.MOTION_RUNNING, Refusal.MOTION_RUNNING)
+    step(axis, state=D.SWITCH_ON_DISABLED, goal_reached=False)
+    assert (axis.state, axis.goal) == (S.FAULT, Goal.OFF)
+    assert axis.enable(True) == Refusal.DONE
 
 
 def test_slow_loop_gives_a_drive_four_cycles() -> None:
