@@ -142,8 +142,17 @@ class SocketCanBus:
             if frame is not None:
                 return frame
             remaining = deadline - time.monotonic()
-            if remaining <= 0.0 or not self._poll.poll(1000.0 * remaining):
+            if remaining <= 0.0 or not self._readable(1000.0 * remaining):
                 return None
+
+    def _readable(self, timeout_ms: float) -> bool:
+        """Wait for a frame. The supervisor's threads share the bus, and an object of poll serves one of them."""
+        try:
+            return bool(self._poll.poll(timeout_ms))
+        except RuntimeError:
+            poll = select.poll()
+            poll.register(self._socket, select.POLLIN)
+            return bool(poll.poll(timeout_ms))
 
     def _read_one(self) -> Frame | None:
         while True:

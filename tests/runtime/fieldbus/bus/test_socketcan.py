@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import socket
 import struct
+import threading
 import time
 
 import pytest
 
-from servod.runtime.fieldbus.bus.socketcan import _SO_TIMESTAMPNS, _monotonic_ns, pack_filters
+from servod.runtime.fieldbus.bus.socketcan import _SO_TIMESTAMPNS, SocketCanBus, _monotonic_ns, pack_filters
 
 
 def accepted(filters: bytes, can_id: int) -> bool:
@@ -45,3 +46,24 @@ def test_a_stamp_from_before_the_clock_was_set_is_replaced(age_ns: int) -> None:
 def test_without_a_stamp_the_local_time_counts() -> None:
     before_ns = time.monotonic_ns()
     assert before_ns <= _monotonic_ns([]) <= time.monotonic_ns()
+
+
+def test_two_threads_may_wait_for_frames() -> None:
+    """The supervisor stops the drive in a thread beside its rounds, and both wait for answers."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    bus, errors = SocketCanBus(ours), list[BaseException]()
+
+    def wait() -> None:
+        try:
+            assert bus.receive(0.3) is None
+        except BaseException as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=wait) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert errors == []
+    bus.close()
+    theirs.close()
