@@ -55,6 +55,11 @@ class SdoAnswers:
         with self._lock:
             self._announced[can_id, data] += 1
 
+    def withdraw(self, can_id: int, data: bytes) -> None:
+        """The bus did not take what was announced."""
+        with self._lock:
+            self._announced[can_id, data] -= 1
+
     def own(self, can_id: int, data: bytes) -> bool:
         """A request was heard; whether it is one of ours, which is owed its answer then."""
         with self._lock:
@@ -82,9 +87,13 @@ class AnnouncedBus:
 
     def send(self, can_id: int, data: bytes) -> bool:
         """As the bus does, announced where the master listens to it."""
-        if can_id in self._network.subscribers:
+        listens = can_id in self._network.subscribers
+        if listens:
             self._network.answers.announce(can_id, data)
-        return self._bus.send(can_id, data)
+        sent = self._bus.send(can_id, data)
+        if listens and not sent:
+            self._network.answers.withdraw(can_id, data)
+        return sent
 
 
 class BusNetwork(canopen.Network):

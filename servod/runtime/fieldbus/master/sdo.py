@@ -34,7 +34,7 @@ _ABORT_REQUEST = struct.Struct("<BHBL")
 _ABORT_COMMAND = 0x80
 #: An upload's request, and the answer that carries the number and its size (CiA 301, 7.2.4.3.6).
 _ASK = struct.Struct("<BHB4x")
-_UPLOAD, _EXPEDITED, _EXPEDITED_MASK = 0x40, 0x43, 0xE3
+_UPLOAD, _EXPEDITED, _EXPEDITED_MASK, _SIZED = 0x40, 0x42, 0xE2, 0x01
 #: Answers that name their object: to the begin of an upload and of a download (7.2.4.3.3 and 7.2.4.3.6), by the three
 #: highest bits. An abort names it too, but devices are known that fill in zeros.
 _NAMING, _SPECIFIER_MASK = (0x40, 0x60), 0xE0
@@ -229,7 +229,9 @@ class NodeSdo:
         elif command & _EXPEDITED_MASK == _EXPEDITED:
             variable = self.variable(*question)
             signed = variable is not None and variable.data_type in datatypes.SIGNED_TYPES
-            size = _FRAME_BYTES - 4 - (command >> 2 & 3)
+            size = _FRAME_BYTES - 4 - (command >> 2 & 3 if command & _SIZED else 0)
+            if variable is not None and variable.fixed_size:  # as an upload does: devices are known that fill up
+                size = min(size, len(variable) // 8)
             self._answer = SdoAnswer(int.from_bytes(data[4 : 4 + size], "little", signed=signed), 0)
 
     def write(self, index: int, subindex: int, value: int) -> None:

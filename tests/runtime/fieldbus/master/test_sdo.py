@@ -113,6 +113,43 @@ def test_an_answer_that_names_another_object_is_not_taken_for_this_one(
         bus.shutdown()
 
 
+@pytest.mark.parametrize(
+    "command",
+    [0x4B, 0x42, 0x43],
+    ids=["two bytes", "no size told", "filled up to four"],
+)
+def test_a_question_is_answered_by_what_a_read_takes(command: int, network: BusNetwork, world: Witness) -> None:
+    """0x6072 has two bytes. CiA 301 allows an answer without its size, and drives are known that send four."""
+    bus, sdo = world.raw(), access(network, 5)
+
+    def answer() -> None:
+        while (message := bus.recv(1.0)) is not None and message.arbitration_id != 0x605:
+            continue
+        data = struct.pack("<BHBHH", command, 0x6072, 0, 1000, 0x7777)
+        bus.send(can.Message(arbitration_id=0x585, data=data, is_extended_id=False))
+
+    node = threading.Thread(target=answer)
+    node.start()
+    try:
+        assert sdo.ask(0x6072, 0)
+        assert network.wait(lambda: sdo.answer() is not None, SDO_TIMEOUT_S)
+        assert sdo.answer() == (1000, 0)
+    finally:
+        node.join()
+        bus.shutdown()
+
+
+def test_a_request_that_the_bus_did_not_take_is_not_owed_to_a_stranger(world: Witness) -> None:
+    network = BusNetwork(world.bus(), WallClock(), False)
+    access(network)
+    network.subscribe(0x601, lambda *_: None)
+    bus = world.bus()
+    bus.send = lambda can_id, data: False  # type: ignore[method-assign]
+    assert not AnnouncedBus(bus, network).send(0x601, b"\x40\x41\x60\0\0\0\0\0")
+    assert not network.answers.own(0x601, b"\x40\x41\x60\0\0\0\0\0")
+    network.disconnect()
+
+
 def test_nothing_is_asked_beside_a_further_connection_of_this_process(network: BusNetwork, world: Witness) -> None:
     """A server knows one transfer: a question would break a string that the other connection reads in segments."""
     sdo, beside = access(network), AnnouncedBus(world.bus(), network)
