@@ -59,6 +59,9 @@ _STOP_MARGIN_S = 2.0
 _SILENT_S = 4 * SDO_TIMEOUT_S
 #: For a loop whose connection may be dead to see the drive off once more, before the axis begins anew.
 _LEAVE_S = 0.5
+#: The longest that the manager's watchdog waits from there to the first round of the next supervisor: both nodes are
+#: reset and brought up by some two hundred SDO transfers.
+_ANEW_S = 60.0
 _STATUS_NS = NS_PER_S
 _TEXTFILE_NS = 5 * NS_PER_S
 _STAYS_POWERED = FAULTS[FaultCode.DRIVE_STAYS_POWERED].bit
@@ -118,7 +121,9 @@ class Supervisor:
         self._proofs = WiringTestWatch(loop, recorder)
         self._verbs = Verbs(config, loop, bank, recorder, self._document, self._tell_faults, nodes.of_ours, nodes.proof)
         self._comeback = (
-            Comeback(config, self._verbs.slow, nodes.of_ours, context.shown_s) if context.shown_s is not None else None
+            Comeback(config, self._verbs.slow, nodes.of_ours, context.shown_s, context.carried)
+            if context.shown_s is not None
+            else None
         )
         self._server = ControlServer(config.control, self._verbs, loop.feed)
         self._metrics_server = MetricsServer(config.metrics, self._metrics)
@@ -296,6 +301,7 @@ class Supervisor:
         """Bus and nodes are back, the drive shows no power. The loop ends, in order where its own connection lives."""
         self._why_ends = "servod begins anew, for bus and nodes are back; connect again"
         log.warning(BEGINS_ANEW)
+        self._notifier.begins_anew(BEGINS_ANEW, _ANEW_S)
         self._recorder.add_event("node", "bus and nodes are back: the axis begins anew, disabled")
         exit_code = self._loop.stop(_LEAVE_S)
         self._take_records(time.monotonic_ns())

@@ -194,15 +194,21 @@ class Comeback:
     """Whether an axis that lost bus or nodes may begin anew: it stands, its fault was shown, and both are back."""
 
     def __init__(
-        self, config: AxisConfig, worker: Executor, of_ours: Callable[[Bus], Bus], shown_s: float = SHOWN_S
+        self,
+        config: AxisConfig,
+        worker: Executor,
+        of_ours: Callable[[Bus], Bus],
+        shown_s: float = SHOWN_S,
+        carried: int = 0,
     ) -> None:
-        """`worker` looks, so that the supervisor waits for nobody; `of_ours`: as `look` has it."""
+        """`worker` looks, so that the supervisor waits for nobody; `of_ours`: as `look` has it. The faults `carried`
+        were latched before this axis began, and are not of its next loss."""
         self._config, self._worker, self._shown_ns = config, worker, round(shown_s * NS_PER_S)
         self._of_ours = of_ours
         self._lost_ns: int | None = None
         self._look_ns = 0
         #: Faults that were latched a second and more before the loss, and those of the last look at the second's end.
-        self.before, self._newer, self._second_ns = 0, 0, 0
+        self.before, self._newer, self._second_ns = carried, carried, 0
         self._attempt: Future[None] | None = None
 
     def see(self, record: CycleRecord | None, now_ns: int) -> bool:

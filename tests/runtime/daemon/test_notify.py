@@ -31,6 +31,16 @@ def test_messages_are_what_systemd_reads(manager: socket.socket) -> None:
     manager.close()
 
 
+def test_who_begins_anew_has_the_watchdogs_patience_until_it_is_ready_again(manager: socket.socket) -> None:
+    notifier = Notifier({"NOTIFY_SOCKET": manager.getsockname(), "WATCHDOG_USEC": "2000000"})
+    notifier.begins_anew("bus and nodes are back", 60.0)
+    notifier.ready("the axis is disabled")
+    assert [manager.recv(200) for _ in range(2)] == [
+        b"STATUS=bus and nodes are back\nWATCHDOG_USEC=60000000\nWATCHDOG=1",
+        b"READY=1\nSTATUS=the axis is disabled\nWATCHDOG_USEC=2000000\nWATCHDOG=1",
+    ]
+
+
 def test_abstract_address() -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.settimeout(2)

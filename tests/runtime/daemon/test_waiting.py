@@ -190,6 +190,14 @@ def test_an_alarm_of_long_before_the_loss_stays_and_one_that_the_loss_brings_goe
     assert bool(carried_by(alarm | loss, comeback.before) & alarm) is stays
 
 
+def test_an_alarm_that_nobody_acknowledged_outlives_a_loss_right_after_the_new_beginning() -> None:
+    alarm, loss = (FAULTS[code].bit for code in (FaultCode.ENCODER_ALARM, FaultCode.NODE_HEARTBEAT_LOST))
+    comeback = Comeback(cast(AxisConfig, None), cast(Executor, None), lambda bus: bus, carried=alarm)
+    _seen(comeback, alarm, 10.0)
+    _seen(comeback, alarm | loss, 10.8)
+    assert carried_by(alarm | loss, comeback.before) == alarm
+
+
 def test_loss_of_a_node_acknowledges_no_sign_of_a_stranger(service: Service) -> None:
     service.axis()
     service.comes_to("DISABLED")
