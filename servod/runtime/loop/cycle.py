@@ -327,5 +327,8 @@ class Cycle:
         self.finished = self.seen_off or self._resting >= GOODBYE_TIMEOUT_CYCLES
 
     def let_go(self) -> None:
-        """Last frame of a loop that ends in an error: voltage off, without waiting for an answer."""
-        self.exchange.send_last(*self.amplifier.write(AmplifierCommand(Goal.OFF, 0.0)))
+        """Last frame of a loop that ends in an error: the drive's quick stop, without waiting for an answer.
+
+        Voltage off would let the joint coast; the supervisor switches off when it rests, or the drive's guards act.
+        """
+        self.exchange.send_last(*self.amplifier.write(AmplifierCommand(Goal.QUICK_STOP, 0.0)))

@@ -19,6 +19,7 @@ from servod.formats.model.axis_model import AxisModel, load_axis_model
 from servod.kernels.laws import LAWS
 from servod.runtime.fieldbus.bus import Frame
 from servod.runtime.fieldbus.cia import NmtCommand
+from servod.runtime.fieldbus.devices import DriveState
 from servod.runtime.loop.axis_state import AxisState
 from servod.runtime.loop.commands import Op, ReferenceKind, Refusal
 
@@ -71,11 +72,15 @@ def test_a_node_that_was_reset_needs_a_new_bring_up(node_id):
 
 
 def test_last_frame_of_a_loop_that_breaks_acts_at_once():
-    """It is synchronous: without a SYNC behind it the drive would keep the torque until its own guards act."""
+    """It is synchronous: without a SYNC behind it the drive would keep the torque until its own guards act. It asks for
+    the drive's own ramp: without torque the joint would coast."""
     axis = moving(session())
     axis.cycle.let_go()
     axis.world.clock.sleep_until(axis.world.clock.now_ns() + 2_000_000)
-    assert axis.world.truth().torque_nm == 0.0
+    assert axis.world.amplifier.machine.state is DriveState.QUICK_STOP_ACTIVE
+    speed = axis.world.truth().velocity_rad_s
+    axis.world.clock.sleep_until(axis.world.clock.now_ns() + 18_000_000)
+    assert abs(axis.world.truth().velocity_rad_s) < 0.05 * abs(speed)
 
 
 def test_limits_hold_while_the_torque_ramps_down():
