@@ -99,7 +99,8 @@ class StandingLoop:
         pause_ns = 0 if self._looked_ns is None else min(now_ns - self._looked_ns, _ROUND_NS)
         self._looked_ns = now_ns
         if wrote:
-            self._silent_ns, self._told, self._done = 0, False, False
+            # What the drive tells in the round of the last records, the next round without one acts on.
+            self._silent_ns, self._told, self._done = 0, drive_told, False
             return False
         self._silent_ns += pause_ns
         self._told = self._told or drive_told

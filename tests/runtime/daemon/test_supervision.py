@@ -79,9 +79,10 @@ def _due(standing: StandingLoop, rounds: Sequence[tuple[int, bool, bool]]) -> li
 
 def test_a_standing_loop_whose_drive_misses_it_is_passed_at_once_and_once() -> None:
     standing = StandingLoop(0.02)
-    assert _due(standing, [(0, True, False), (20, True, True), (40, False, False), (60, False, True)]) == [60]
+    assert _due(standing, [(0, True, True), (20, True, False), (40, False, False), (60, False, True)]) == [60]
     assert _due(standing, [(80, False, True), (2000, False, False)]) == [], "once for each standstill"
     assert _due(standing, [(2020, True, False), (2040, False, True)]) == [2040]
+    assert _due(standing, [(2060, True, True), (2080, False, False)]) == [2080], "told in the round of the last record"
 
 
 def test_a_silent_loop_is_passed_when_its_drive_must_have_reacted_and_not_for_a_stall() -> None:
