@@ -296,21 +296,30 @@ def keep_proof(config: AxisConfig, results: list[GuardResult], found: dict[str, 
     return path
 
 
-def proof_status(config: AxisConfig, found: dict[str, Any], now_s: float) -> ProofStatus:
-    """Whether the guards of the drive that was brought up with the terms `found` are proven, as of `now_s` (Unix)."""
+def read_proof(config: AxisConfig) -> dict[str, Any] | None:
+    """What the last test that passed has left; None without one that can be read."""
+    try:
+        proof = read_json(config.gains.directory / PROOF_NAME, "a proof by `servoctl guard-test`")
+        return {"time": float(proof["time"]), "terms": proof["terms"]}
+    except (BadInput, KeyError, TypeError, ValueError):
+        return None
+
+
+def proof_status(config: AxisConfig, proof: dict[str, Any] | None, found: dict[str, Any], now_s: float) -> ProofStatus:
+    """Whether `proof` holds for the drive that was brought up with the terms `found`, as of `now_s` (Unix)."""
     days = config.amplifier.guard_test_days
-    tested_s, text = _judge(config, found, now_s)
+    tested_s, text = _judge(config, proof, found, now_s)
     return {"asked_for": days is not None, "holds": not text, "time": tested_s, "text": text}
 
 
-def _judge(config: AxisConfig, found: dict[str, Any], now_s: float) -> tuple[float | None, str]:
-    path = config.gains.directory / PROOF_NAME
-    try:
-        proof = read_json(path, "a proof by `servoctl guard-test`")
-        tested_s, held = float(proof["time"]), proof["terms"]
-    except (BadInput, KeyError, TypeError, ValueError):
+def _judge(
+    config: AxisConfig, proof: dict[str, Any] | None, found: dict[str, Any], now_s: float
+) -> tuple[float | None, str]:
+    if proof is None:
+        path = config.gains.directory / PROOF_NAME
         return None, f"the drive's guards were never tested ({path} is missing or broken)"
-    if held != found:
+    tested_s = proof["time"]
+    if proof["terms"] != found:
         return tested_s, "the drive, its guards or their times are others than those that were tested"
     days = config.amplifier.guard_test_days
     if tested_s > now_s:

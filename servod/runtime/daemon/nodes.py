@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from servod.common.errors import ServodError, Unreachable
 from servod.common.faults import FAULTS, FaultCode
 from servod.common.units import NS_PER_S, TWO_PI
-from servod.runtime.daemon.guard_test import ProofStatus, proof_status, terms
+from servod.runtime.daemon.guard_test import ProofStatus, proof_status, read_proof, terms
 from servod.runtime.daemon.status import Age, GuardStatus, IdentityStatus, NodeStatus
 from servod.runtime.fieldbus.bus import Bus
 from servod.runtime.fieldbus.cia import (
@@ -42,6 +42,8 @@ class Nodes:
 
     def __init__(self, master: Master, plans: BringUp) -> None:
         self._master, self.plans = master, plans
+        # Once, before the rounds begin, which wait for no disk: the test runs while no daemon does.
+        self._proof = read_proof(master.config)
 
     def events(self) -> list[NodeEvent]:
         """Listen, and give what the nodes did since the last call."""
@@ -140,7 +142,7 @@ class Nodes:
         """Whether the guards of this drive are proven."""
         amplifier = self.plans.amplifier
         found = terms(amplifier, self._master.identity(amplifier.node_id))
-        return proof_status(self._master.config, found, time.time())
+        return proof_status(self._master.config, self._proof, found, time.time())
 
     def guards(self) -> GuardStatus:
         """How the drive guards itself, for the status document."""

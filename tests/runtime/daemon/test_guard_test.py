@@ -17,9 +17,11 @@ from servod.runtime.daemon.guard_test import (
     PROOF_NAME,
     GuardResult,
     GuardTest,
+    ProofStatus,
     _Cycles,
     keep_proof,
     proof_status,
+    read_proof,
     require_proof,
 )
 from servod.runtime.fieldbus.devices import AmplifierFeedback, DriveState, Goal
@@ -37,6 +39,10 @@ def axis(tmp_path: Path, days: float | None = 30.0, **sections: Any) -> AxisConf
     amplifier = {"guard_test_days": days} | sections.pop("amplifier", {})
     gains = {"initial": "gains.yaml", "directory": str(tmp_path / "gains")}
     return AxisConfig.model_validate({"limits": LIMITS, "gains": gains, "amplifier": amplifier} | sections)
+
+
+def _status(config: AxisConfig, found: dict[str, Any], now_s: float) -> ProofStatus:
+    return proof_status(config, read_proof(config), found, now_s)
 
 
 def tried(world: SteppedWorld, config: AxisConfig) -> tuple[list[GuardResult], dict[str, Any]]:
@@ -218,22 +224,22 @@ def test_a_joint_that_moves_without_torque_ends_the_test(tmp_path: Path) -> None
 def test_a_proof_holds_for_its_drive_its_guards_and_its_time(tmp_path: Path) -> None:
     config, world = axis(tmp_path), world_of()
     with pytest.raises(Unreachable, match="never tested"):
-        require_proof(proof_status(config, {}, 0.0))
+        require_proof(_status(config, {}, 0.0))
     results, found = tried(world, config)
     path = keep_proof(config, results, found)
     assert path.name == PROOF_NAME
     now_s = json.loads(path.read_text())["time"]
     found = json.loads(json.dumps(found))
-    require_proof(proof_status(config, found, now_s + 29 * DAY_S))
+    require_proof(_status(config, found, now_s + 29 * DAY_S))
     with pytest.raises(Unreachable, match=r"older than amplifier.guard_test_days \(30\)"):
-        require_proof(proof_status(config, found, now_s + 31 * DAY_S))
+        require_proof(_status(config, found, now_s + 31 * DAY_S))
     with pytest.raises(Unreachable, match="dated in the future"):
-        require_proof(proof_status(config, found, now_s - DAY_S))
+        require_proof(_status(config, found, now_s - DAY_S))
     for other in (world_of(amplifier_serial=7), world):
         changed = axis(tmp_path, amplifier={"heartbeat_reaction": 2} if other is world else {})
         with pytest.raises(Unreachable, match="are others than those that were tested"):
-            require_proof(proof_status(config, json.loads(json.dumps(tried(other, changed)[1])), now_s))
+            require_proof(_status(config, json.loads(json.dumps(tried(other, changed)[1])), now_s))
     path.write_text("{")
     with pytest.raises(Unreachable, match="missing or broken"):
-        require_proof(proof_status(config, found, now_s))
-    require_proof(proof_status(axis(tmp_path, days=None), found, now_s))
+        require_proof(_status(config, found, now_s))
+    require_proof(_status(axis(tmp_path, days=None), found, now_s))
