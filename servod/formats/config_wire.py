@@ -93,7 +93,8 @@ class HeartbeatConfig(Strict):
         None,
         ge=0,
         le=5000,
-        description="without command frames for this time the drive stops by itself (0x1400:5), at least two cycles; "
+        description="without command frames for this time a drive that has 0x1400:5 stops by itself, or only tells: "
+        "its quirks say which; at least two cycles; "
         "left out: as many cycles as limits.late_cycles, 5 ms at least, drive_timeout_ms at most; 0: not used, only "
         "the heartbeat guards",
     )
@@ -102,7 +103,7 @@ class HeartbeatConfig(Strict):
         150,
         ge=20,
         le=5000,
-        description="a node whose heartbeat stays away for longer is lost: disabled (NODE_HEARTBEAT_LOST); at "
+        description="a node whose heartbeat stays away for longer is lost: quick stop (NODE_HEARTBEAT_LOST); at "
         "least twice node_period_ms",
     )
 
