@@ -14,6 +14,7 @@ from servod.common.errors import BadInput, Unreachable
 from servod.common.units import PER_MILLE, rad_per_count
 from servod.drivers.cia402_target import target_type
 from servod.drivers.quirks import CommandDeadline, Presence, Quirks, load_quirks
+from servod.formats.config_wire import quick_stop_stays
 from servod.runtime.fieldbus.cia import RPDO_BASE, TPDO_BASE, Obj301, Obj402, decode_status_word
 from servod.runtime.fieldbus.devices import (
     DriveInput,
@@ -145,7 +146,7 @@ class AmplifierSetup:
     def inspect(self, sdo: SdoAccess) -> None:
         """Refuse a powered drive: it may be another axis's, or this one's whose heartbeat time-out still runs."""
         state = decode_status_word(sdo.read(Obj402.STATUS_WORD))
-        if state is DriveState.QUICK_STOP_ACTIVE and self._amplifier.quick_stop_option > 4:
+        if state is DriveState.QUICK_STOP_ACTIVE and quick_stop_stays(self._amplifier.quick_stop_option):
             raise Unreachable(
                 f"amplifier node {self._amplifier.node_id} holds the joint in quick stop active (0x605A), and no "
                 "time-out ends that: support the load, then switch the drive's power off and on, and start again"
@@ -304,7 +305,6 @@ _RAMPS: dict[int, int] = {
     5: Obj402.PROFILE_DECELERATION,
     6: Obj402.QUICK_STOP_DECELERATION,
 }
-_STAY = 5  # 0x605A from here on holds after the ramp of 4 less
 _ABORT_FAULT, _ABORT_QUICK_STOP = 1, 3  # of 0x6007
 #: 0x1029:1: a drive that lost its master leaves operational, so that a master that comes back commands nothing.
 _LEAVE_OPERATIONAL = 0
@@ -370,7 +370,7 @@ def write_stops(guards: Guards, config: AxisConfig) -> bool:
     """
     amplifier = config.amplifier
     option = amplifier.quick_stop_option
-    rows = ((Obj402.QUICK_STOP_OPTION, option), (Obj402.FAULT_REACTION_OPTION, option - 4 * (option >= _STAY)))
+    rows = ((Obj402.QUICK_STOP_OPTION, option), (Obj402.FAULT_REACTION_OPTION, option - 4 * quick_stop_stays(option)))
     for index, value in rows:
         if not _takes(guards, index, value):
             if not amplifier.unguarded:
@@ -384,7 +384,7 @@ def write_stops(guards: Guards, config: AxisConfig) -> bool:
         guards.notes.append("no 0x1029:1: what the node does after a communication error is its maker's choice")
     # With an option that stays in quick stop active, a quick stop that nobody ends would hold with torque for ever.
     # With a brake by output that is wanted: while the drive holds, the supervisor that survived its loop closes it.
-    stays = option >= _STAY and amplifier.brake.by != "output"
+    stays = quick_stop_stays(option) and amplifier.brake.by != "output"
     holds = stays and amplifier.heartbeat_reaction == _ABORT_QUICK_STOP
     if guards.exact(Obj402.ABORT_CONNECTION, 0, _ABORT_FAULT if holds else amplifier.heartbeat_reaction):
         return True

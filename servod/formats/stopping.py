@@ -12,6 +12,7 @@ from typing import TypedDict
 
 from servod.common.errors import BadInput
 from servod.formats.config import AxisConfig
+from servod.formats.config_wire import quick_stop_stays
 from servod.formats.gains.gain_set import load_gains
 from servod.formats.model.axis_model import AxisKind, AxisModel, load_axis_model
 from servod.kernels.stopping import OVERSPEED, RECKONED_OVERSPEED, REST_S, StopFacts, both_ways
@@ -34,7 +35,7 @@ _BISECTIONS = 60
 #: A load that falls may take the rest of the speed that is stated.
 _LEAST_SHARE = 0.2
 #: 0x605A, 0x6007: without torque, with the ramps, and with windings shorted.
-_OFF, _RAMPS, _CURRENT_LIMIT, _STAY, _REACTS_OFF, _HOLDS = 0, (1, 2), 3, 4, 2, 3
+_OFF, _RAMPS, _CURRENT_LIMIT, _REACTS_OFF, _HOLDS = 0, (1, 2), 3, 2, 3
 
 
 @dataclass(frozen=True)
@@ -253,7 +254,7 @@ def _ramp(config: AxisConfig, most_rad_s2: float, writes_ramp: bool) -> float:
     option, told = config.amplifier.quick_stop_option, config.stopping.deceleration_rad_s2
     if config.amplifier.heartbeat_reaction == _REACTS_OFF or option == _OFF:
         return 0.0
-    kind = option - _STAY if option > _STAY else option
+    kind = option - 4 if quick_stop_stays(option) else option
     if told is not None:
         return min(told, most_rad_s2)
     if kind in _RAMPS and not writes_ramp:
@@ -269,7 +270,7 @@ def _holds(config: AxisConfig) -> list[str]:
             "commands alone lost, the master alive: not in these figures, the drive has no deadline for them "
             "(heartbeat.command_deadline_ms 0)"
         )
-    stays = amplifier.quick_stop_option > _STAY and amplifier.heartbeat_reaction == _HOLDS
+    stays = quick_stop_stays(amplifier.quick_stop_option) and amplifier.heartbeat_reaction == _HOLDS
     if amplifier.brake.by == "output" and stays:
         notes.append(
             "loop and supervisor dead: at rest the drive holds the joint with torque until it is switched off, since "
@@ -281,7 +282,7 @@ def _holds(config: AxisConfig) -> list[str]:
 def _held_s(config: AxisConfig) -> float:
     """How long the torque holds the joint that has come to rest: until its brake is closed, or servod has seen the rest
     of a drive that stays in quick stop active (0x605A from 5 on)."""
-    brake, stays = config.amplifier.brake, config.amplifier.quick_stop_option > _STAY
+    brake, stays = config.amplifier.brake, quick_stop_stays(config.amplifier.quick_stop_option)
     seen_s = REST_S if stays or brake.by == "output" else 0.0
     return seen_s + (brake.engage_s if brake.by != "none" else 0.0)
 

@@ -9,12 +9,11 @@ import math
 
 from servod.common.errors import BadInput
 from servod.formats.config import AxisConfig
+from servod.formats.config_wire import QUICK_STOP_STAYS, quick_stop_stays
 from servod.formats.model.axis_model import AxisKind, AxisModel, load_axis_model
 
 #: Places within the position limits at which a load is looked at.
 _PLACES = 200
-#: 0x605A from here on: the drive holds after the stop.
-_HOLDS = 5
 
 
 def with_expected(config: AxisConfig) -> AxisConfig:
@@ -93,17 +92,19 @@ def brake_notes(config: AxisConfig) -> list[str]:
         f"{brake.engage_s:g} s (amplifier.brake.engage_s): {fall}"
     ]
     if brake.by == "output":
-        dies = "holds the load, the brake open" if option >= _HOLDS else "lets go, the brake open: the load falls"
+        dies = (
+            "holds the load, the brake open" if quick_stop_stays(option) else "lets go, the brake open: the load falls"
+        )
         notes.append(
             f"when this computer dies nobody closes a brake by output: the drive stops by itself and {dies} "
             f"(amplifier.quick_stop_option {option})"
         )
-        if option < _HOLDS:
+        if not quick_stop_stays(option):
             notes.append(
                 f"at a stop amplifier.quick_stop_option {option} lets go when the joint has come to rest, before the "
                 f"brake is closed: {fall}; 5 to 8 hold until it is"
             )
-    elif option in (0, *range(_HOLDS, 9)):
+    elif option in (0, *range(QUICK_STOP_STAYS, 9)):
         notes.append(
             f"amplifier.quick_stop_option {option}: the drive closes its brake after a stop when it switches off by "
             "itself, with 1 to 4"

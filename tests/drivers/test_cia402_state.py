@@ -13,9 +13,9 @@ from servod.drivers.cia402_state import (
     STATE_OF_STATUS,
     TRANSITIONS,
     control_words,
-    quick_stop_stays,
     reached_states,
 )
+from servod.formats.config_wire import quick_stop_stays
 from servod.runtime.fieldbus.cia import decode_status_word
 from servod.runtime.fieldbus.devices import DriveState, Goal
 

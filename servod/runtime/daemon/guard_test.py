@@ -19,6 +19,7 @@ from servod.common.clock import Clock
 from servod.common.errors import AnswerIsNo, BadInput, Unreachable
 from servod.common.files import read_json, write_atomically
 from servod.formats.config import AxisConfig
+from servod.formats.config_wire import quick_stop_stays
 from servod.formats.stopping import CYCLES_BEHIND
 from servod.runtime.fieldbus.bus import Bus
 from servod.runtime.fieldbus.cia import (
@@ -58,7 +59,6 @@ _TRIES = 3
 _LOOK_CYCLES = 3
 #: What the drive tells when each guard acts.
 _TOLD = {"commands": Emcy.RPDO_TIME_OUT, "heartbeat": Emcy.HEARTBEAT_LOST}
-_STAYS = 5  # 0x605A from here on
 _EXPECTED = (Emcy.HEARTBEAT_LOST, Emcy.RPDO_TIME_OUT)
 
 
@@ -110,7 +110,7 @@ class GuardTest:
         # As the daemon runs it: with the limits and the ramp that the stop is reckoned with.
         self._config, self._connect, self.clock = narrowed_by_stop(config)[0], connect, clock
         # A drive that holds for a brake that servod closes stays in quick stop active, and has stopped there.
-        self._holds = config.amplifier.brake.by == "output" and config.amplifier.quick_stop_option >= _STAYS
+        self._holds = config.amplifier.brake.by == "output" and quick_stop_stays(config.amplifier.quick_stop_option)
         self.period_ns = config.cycle.period_us * 1000
         self.beat_ns = config.heartbeat.master_period_ms * _MS
         self.beat_id = HEARTBEAT_BASE + config.heartbeat.master_node_id

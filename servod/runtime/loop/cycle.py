@@ -14,6 +14,7 @@ from typing import NamedTuple, Protocol
 from servod.common.clock import Clock
 from servod.common.faults import FAULTS, FaultCode
 from servod.common.units import NS_PER_S, NS_PER_US
+from servod.formats.config_wire import quick_stop_stays
 from servod.kernels.motions import Samples
 from servod.runtime.fieldbus.bus import Bus
 from servod.runtime.fieldbus.devices import AmplifierCommand, AmplifierFeedback, EncoderFeedback, Goal, Mode
@@ -37,7 +38,6 @@ _NOT_PROVEN = FAULTS[FaultCode.WIRING_NOT_PROVEN].bit
 #: At a shutdown the drive must be seen without power for so many cycles, and has so many to get there.
 GOODBYE_CYCLES = 20
 GOODBYE_TIMEOUT_CYCLES = 1000
-_STAYS = 4  # 0x605A: the options beyond hold in quick stop active
 #: How long a drive stays in NMT stopped before it is asked to be pre-operational.
 _STOPPED_CYCLES = 5
 
@@ -95,7 +95,7 @@ class Cycle:
             self._period_s, config.limits.ramp_down_s, config.amplifier.enable_timeout_s, Mode.CYCLIC_SYNC_TORQUE,
             config.wiring_proof.timeout_s, config.amplifier.inputs.tells_sto,
             BrakeTimes.of(config.amplifier), config.limits.stale_cycles,
-            rest_rad(config.amplifier) if config.amplifier.quick_stop_option > _STAYS else None,
+            rest_rad(config.amplifier) if quick_stop_stays(config.amplifier.quick_stop_option) else None,
         )  # fmt: skip
         self.axis.carry(plan.carried)
         self.limits = Limits(config.limits, plan.stop)
