@@ -10,6 +10,7 @@ import math
 
 from servod.formats.config import AxisConfig
 from servod.formats.model.axis_model import AxisKind, AxisModel
+from servod.formats.stopping import contradictions
 from servod.formats.wiring import warnings
 
 #: No joint of a machine that people stand beside turns faster (9549 turns a minute).
@@ -29,7 +30,7 @@ def weakened(config: AxisConfig, model: AxisModel | None = None) -> list[str]:
     """One line for each value of `config` (after `with_expected`) that guards less than it seems, key first."""
     lines = [*_limits(config), *_times(config), *_beyond_drive(config), *warnings(config)]
     if model is not None and model.axis is AxisKind.ROTARY:
-        lines += _beyond_model(config, model)
+        lines += [*_beyond_model(config, model), *contradictions(config, model)]
     if config.gains.accept_uncertified:
         lines.append("gains.accept_uncertified is true: a gain set that nobody verified may run")
     if config.recorder.history_s == 0.0:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TypedDict
+from typing import NamedTuple, TypedDict
 
 from servod.common.errors import BadInput
 from servod.formats.config import AxisConfig
@@ -29,6 +29,11 @@ CYCLES_BEHIND = 3
 #: Torque is gone, or only holds a joint at rest, within these times [s]: where the drive misses its commands sooner
 #: than the third, and else.
 _WITHIN_S, _WITHIN_BY_HEARTBEAT_S, _SOON_S = 0.06, 0.3, 0.03
+#: Of a model these change what a stop takes, and no figure here knows them.
+_NOT_RECKONED = (
+    *("position_dependent_friction", "load_dependent_friction", "viscous_nonlinear", "thermal", "disturbance"),
+    *("offset_drift", "residual", "backlash", "joint_elasticity"),
+)
 #: Loads over position are looked at in so many places of the range.
 _PLACES = 256
 _BISECTIONS = 60
@@ -40,7 +45,12 @@ _OFF, _RAMPS, _CURRENT_LIMIT, _REACTS_OFF, _HOLDS = 0, (1, 2), 3, 2, 3
 
 @dataclass(frozen=True)
 class JointBounds:
-    """What is known of the joint's worst, and from where; `assumed` is what nobody states."""
+    """What is known of the joint's worst, and from where; `assumed` is what nobody states.
+
+    Inertias, friction and loads are those of a joint that takes the command as its torque: where one of the drive gives
+    `torque_factor` of it, they are so much smaller. `brake_nm` is the most command that acts, `late_s` how long torque
+    goes on after its command.
+    """
 
     least_inertia: float
     most_inertia: float
@@ -50,6 +60,9 @@ class JointBounds:
     load_max_nm: float
     source: str
     assumed: tuple[str, ...]
+    torque_factor: float = 1.0
+    brake_nm: float = math.inf
+    late_s: float = 0.0
 
 
 class StoppingStatus(TypedDict):
@@ -176,7 +189,7 @@ def stated(config: AxisConfig, joint: JointBounds, reaction_s: float, writes_ram
     """The statement for a joint. Raises BadInput for limits that cannot be kept."""
     within_s = config.stopping.within_s or (_WITHIN_S if reaction_s <= _SOON_S else _WITHIN_BY_HEARTBEAT_S)
     widest = _facts(config, joint, reaction_s, writes_ramp)
-    _check_load(widest)
+    _check_load(widest, min(config.limits.torque_nm, joint.brake_nm))
     facts = _largest(widest, within_s)
     _check_kept(facts)
     ways, speed_rad_s, end_rad_s = both_ways(facts), facts.speed_rad_s, _end_rad_s(facts)
@@ -203,6 +216,11 @@ def stated(config: AxisConfig, joint: JointBounds, reaction_s: float, writes_ram
             f"limits.ramp_down_s {config.limits.ramp_down_s:g} is narrowed to {ramp_down_s:.3g} s: braking and ramp of "
             "a loop that lost its supervisor take twice as long"
         )
+    # A law that runs away does not brake: a loop that lost its supervisor lets it for that long, within the limits and
+    # the range, and then the drive stops it.
+    alone_rad = speed_rad_s * (ramp_down_s + CYCLES_BEHIND * config.cycle.period_us * 1e-6) + max(
+        end_rad_s * (facts.lag_s + 0.5 * end_rad_s / way.deceleration_rad_s2) for way in ways
+    )
     unbraked_rad = max(way.behind * speed_rad_s + way.ahead * end_rad_s for way in ways)
     coasts_rad = max(way.coasting_rad(end_rad_s) for way in ways)
     return Stopping(
@@ -211,10 +229,13 @@ def stated(config: AxisConfig, joint: JointBounds, reaction_s: float, writes_ram
         max(_time_s(facts), 2.0 * ramp_down_s + CYCLES_BEHIND * config.cycle.period_us * 1e-6) + held_s,
         held_s,
         end_rad_s,
-        max(way.travel_rad(speed_rad_s, end_rad_s) for way in ways),
+        max(
+            min(alone_rad, facts.position_max_rad - facts.position_min_rad),
+            *(way.travel_rad(speed_rad_s, end_rad_s) for way in ways),
+        ),
         unbraked_rad,
         unbraked_rad + coasts_rad,
-        0.5 * facts.most_inertia * end_rad_s * end_rad_s,
+        0.5 * joint.torque_factor * facts.most_inertia * end_rad_s * end_rad_s,
         min(at_rest_nm, facts.torque_nm),
         min(at_speed_nm, facts.torque_nm),
         ramp_down_s,
@@ -226,9 +247,10 @@ def stated(config: AxisConfig, joint: JointBounds, reaction_s: float, writes_ram
 def _facts(config: AxisConfig, joint: JointBounds, reaction_s: float, writes_ramp: bool) -> StopFacts:
     limits, period_s = config.limits, config.cycle.period_us * 1e-6
     filter_s = 1.0 / (2.0 * math.pi * config.encoder.velocity_cutoff_hz)
-    hold_s = reaction_s + CYCLES_BEHIND * period_s + filter_s  # what is not heard meanwhile, the limits reckon with
+    # What is not heard meanwhile, the limits reckon with.
+    hold_s = reaction_s + CYCLES_BEHIND * period_s + filter_s + joint.late_s
     load_nm = max(-joint.load_min_nm, joint.load_max_nm)
-    most_rad_s2 = (limits.torque_nm + joint.friction_nm - load_nm) / joint.most_inertia
+    most_rad_s2 = (min(limits.torque_nm, joint.brake_nm) + joint.friction_nm - load_nm) / joint.most_inertia
     ramp_rad_s2 = _ramp(config, most_rad_s2, writes_ramp)
     return StopFacts(
         joint.least_inertia,
@@ -243,7 +265,7 @@ def _facts(config: AxisConfig, joint: JointBounds, reaction_s: float, writes_ram
         limits.position_min_rad,
         limits.position_max_rad,
         hold_s,
-        config.stopping.drive_lag_s,
+        max(config.stopping.drive_lag_s, joint.late_s),
         ramp_rad_s2,
     )
 
@@ -336,12 +358,12 @@ def _largest(facts: StopFacts, within_s: float) -> StopFacts:
     return _at(facts, low)
 
 
-def _check_load(facts: StopFacts) -> None:
-    """The drive must be able to brake against the load."""
-    lacks_nm = facts.load_nm - facts.friction_nm - facts.torque_nm
+def _check_load(facts: StopFacts, brake_nm: float) -> None:
+    """The drive must be able to brake against the load, with `brake_nm` at most."""
+    lacks_nm = facts.load_nm - facts.friction_nm - brake_nm
     if lacks_nm >= 0.0:
-        allowed = f"more than {lacks_nm + facts.torque_nm:.3g} N*m, with which a load of {facts.load_nm:.3g} N*m stops"
-        raise BadInput("limits.torque_nm", f"{facts.torque_nm:g} N*m", allowed)
+        allowed = f"more than {lacks_nm + brake_nm:.3g} N*m, with which a load of {facts.load_nm:.3g} N*m stops"
+        raise BadInput("limits.torque_nm", f"{brake_nm:g} N*m", allowed)
 
 
 def _check_kept(facts: StopFacts) -> None:
@@ -400,16 +422,79 @@ def joint_of(config: AxisConfig) -> JointBounds | None:
         assumed.append("assumed: no load (stopping.load_min_nm, load_max_nm)")
     if nominal is None or None not in (told.least_inertia, told.most_inertia):
         source = "the section stopping states it"
-    return JointBounds(
-        least,
-        most,
-        friction_nm if told.least_friction_nm is None else told.least_friction_nm,
+    elif told.model_fields_set & _OF_THE_JOINT:
+        source += ", but for what the section stopping states"
+    path = _TorquePath.of(model, config)
+    inertias_nm = (least, most, friction_nm if told.least_friction_nm is None else told.least_friction_nm)
+    loads_nm = (
         viscous if told.least_viscous is None else told.least_viscous,
         low_nm if told.load_min_nm is None else told.load_min_nm,
         high_nm if told.load_max_nm is None else told.load_max_nm,
-        source,
-        tuple(assumed),
     )
+    least, most, friction_nm, viscous, low_nm, high_nm = (x / path.factor for x in (*inertias_nm, *loads_nm))
+    return JointBounds(
+        least, most, friction_nm, viscous, low_nm, high_nm, source, (*assumed, *path.notes),
+        path.factor, path.brake_nm, path.late_s,
+    )  # fmt: skip
+
+
+#: What the section `stopping` says of the joint, and no other key of it.
+_OF_THE_JOINT = {"least_inertia", "most_inertia", "least_friction_nm", "least_viscous", "load_min_nm", "load_max_nm"}
+
+
+class _TorquePath(NamedTuple):
+    """From the command to the joint's torque, at its worst: the most that a command of 1 gives, the most command that
+    still acts, and how much later than its command torque ends."""
+
+    factor: float = 1.0
+    brake_nm: float = math.inf
+    late_s: float = 0.0
+    notes: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, model: AxisModel | None, config: AxisConfig) -> _TorquePath:
+        """By the model; without one torque is the command."""
+        if model is None:
+            return cls()
+        gain, limit, lag = model.torque_gain, model.torque_saturation, model.actuator_lag
+        factors = (1.0,) if gain is None else (gain.factor, gain.negative_factor or gain.factor)
+        ripple = sum(abs(wave.amplitude) for wave in model.torque_ripple.harmonics) if model.torque_ripple else 0.0
+        factor = max(factors) * (1.0 + ripple)
+        brake_nm = config.limits.torque_nm * min(factors) * max(0.0, 1.0 - ripple)
+        if limit is not None:
+            brake_nm = min(brake_nm, limit.limit, limit.negative_limit or limit.limit)
+        late_s = max(0.0, model.total_delay_s - config.cycle.period_us * 1e-6)
+        if lag is not None:
+            late_s += lag.time_constant_s
+            late_s += 2.0 * min(brake_nm, config.limits.torque_nm * factor) / lag.slew_per_s if lag.slew_per_s else 0.0
+        notes = []
+        if late_s > config.stopping.drive_lag_s:
+            notes.append(
+                f"torque is {1e3 * late_s:.3g} ms late by the model (delay, actuator_lag): these figures reckon with "
+                "that, but not whether the drive's own ramp comes to rest with it; try it with the drive"
+            )
+        if left := [name for name in _NOT_RECKONED if getattr(model, name) is not None]:
+            notes.append(f"not in these figures, though the model has it: {', '.join(left)}")
+        return cls(factor, brake_nm / factor, late_s, tuple(notes))
+
+
+def contradictions(config: AxisConfig, model: AxisModel) -> list[str]:
+    """What the section `stopping` says of a better joint than the model, in sentences."""
+    told, (low_nm, high_nm) = config.stopping, _loads(model, config)
+    dry_nm, viscous = (value / _FRICTION_SHARE for value in _least_friction(model))
+    rows = (
+        ("least_inertia", told.least_inertia, model.inertia, 1.0),
+        ("most_inertia", told.most_inertia, model.inertia, -1.0),
+        ("least_friction_nm", told.least_friction_nm, dry_nm, 1.0),
+        ("least_viscous", told.least_viscous, viscous, 1.0),
+        ("load_min_nm", told.load_min_nm, low_nm, 1.0),
+        ("load_max_nm", told.load_max_nm, high_nm, -1.0),
+    )
+    return [
+        f"stopping.{key} {value:g}: the model has {of_model:.3g}; the stopping distance is that of a better joint"
+        for key, value, of_model, better in rows
+        if value is not None and better * (value - of_model) > 1e-9 + 1e-6 * abs(of_model)
+    ]
 
 
 def _model(config: AxisConfig) -> tuple[AxisModel | None, str]:

@@ -6,11 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from servod.common.errors import BadInput
 from servod.common.shipped import shipped
 from servod.common.yaml import validate
 from servod.formats.config import AxisConfig
+from servod.formats.config_guards import weakened
+from servod.formats.model.axis_model import load_axis_model
 from servod.formats.stopping import Stopping, joint_of, with_stopping
 from servod.qualify.faults.scenario import merged, shipped_config
 
@@ -163,3 +166,88 @@ def test_what_the_test_of_the_wiring_expects_is_better_than_nothing() -> None:
     assert joint is not None
     assert (joint.least_inertia, joint.friction_nm) == pytest.approx((0.0009, 0.035))
     assert joint.assumed == ("assumed: no load (stopping.load_min_nm, load_max_nm)",)
+
+
+DRY = {"kind": "coulomb_viscous", "coulomb": 0.01, "viscous": 0.002}
+
+
+def modelled(folder: Path, stopping: dict[str, Any] | None = None, **effects: Any) -> AxisConfig:
+    path = folder / "model.yaml"
+    path.write_text(yaml.safe_dump({"inertia": 0.001, "delay_s": 0.001, "friction": DRY, **effects}))
+    return axis(stopping, model=str(path))
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0, 4.0])
+def test_a_drive_that_gives_more_than_it_is_told_is_a_lighter_joint(factor: float, tmp_path: Path) -> None:
+    """Torque = factor*command: the same motion as of a joint with a part of everything, told in torques of commands."""
+    gained = stated(modelled(tmp_path, torque_gain={"factor": factor}))
+    lighter = {"kind": "coulomb_viscous", "coulomb": 0.01 / factor, "viscous": 0.002 / factor}
+    plain = stated(modelled(tmp_path, inertia=0.001 / factor, friction=lighter))
+    assert gained.facts == pytest.approx(plain.facts)
+    assert (gained.travel_rad, gained.time_s) == pytest.approx((plain.travel_rad, plain.time_s))
+    assert gained.energy_j == pytest.approx(factor * plain.energy_j)
+
+
+def test_what_the_drive_cannot_brake_with_it_does_not_brake_with(tmp_path: Path) -> None:
+    stopping = stated(modelled(tmp_path, torque_saturation={"limit": 0.03}))
+    assert stopping.facts.deceleration_rad_s2 == pytest.approx(0.8 * (0.03 + 0.005) / 0.0011)
+    assert stopping.facts.speed_rad_s < 3.0, "narrowed until it rests in 60 ms"
+    falls = {"gravity": {"amplitude": 0.06, "phase": 1.57}}
+    with pytest.raises(BadInput, match=r"a load of 0\.06 N"):
+        stated(modelled(tmp_path, torque_saturation={"limit": 0.03}, **falls))
+
+
+@pytest.mark.parametrize(
+    ("effect", "late_s"),
+    [
+        ({"delay": {"additional_s": 0.01}}, 0.01),
+        ({"delay_s": 0.005}, 0.004),
+        ({"actuator_lag": {"time_constant_s": 0.015}}, 0.015),
+        ({"actuator_lag": {"slew_per_s": 40.0}}, 0.015),
+    ],
+)
+def test_torque_that_comes_late_goes_late(effect: dict[str, Any], late_s: float, tmp_path: Path) -> None:
+    plain, late = stated(modelled(tmp_path)), stated(modelled(tmp_path, {"within_s": 0.2}, **effect))
+    assert late.facts.hold_s - plain.facts.hold_s == pytest.approx(late_s)
+    assert late.facts.lag_s == pytest.approx(max(0.006, late_s))
+    assert any("ms late by the model" in note for note in late.notes) is (late_s > 0.006)
+
+
+def test_what_no_figure_knows_of_a_model_is_said(tmp_path: Path) -> None:
+    quadratic = {"viscous_nonlinear": {"quadratic": 0.001}}
+    assert any(
+        note.endswith("the model has it: viscous_nonlinear") for note in stated(modelled(tmp_path, **quadratic)).notes
+    )
+    assert len(stated(modelled(tmp_path)).notes) == 1
+
+
+@pytest.mark.parametrize(
+    ("key", "better", "worse"),
+    [
+        ("least_inertia", 0.002, 0.0005),
+        ("most_inertia", 0.00095, 0.003),
+        ("least_friction_nm", 0.2, 0.001),
+        ("load_max_nm", 0.01, 0.08),
+    ],
+)
+def test_a_joint_that_is_stated_better_than_its_model_is_told_of(
+    key: str, better: float, worse: float, tmp_path: Path
+) -> None:
+    for value, told in ((better, True), (worse, False)):
+        config = modelled(tmp_path, {key: value}, gravity={"amplitude": 0.06, "phase": 0.0})
+        assert config.model is not None
+        lines = weakened(config, load_axis_model(config.model))
+        assert any(line.startswith(f"stopping.{key}") for line in lines) is told
+        joint = joint_of(config)
+        assert joint is not None and joint.source.endswith("but for what the section stopping states")
+
+
+def test_a_loop_without_its_supervisor_lets_a_law_run_away_until_its_ramp_is_over(tmp_path: Path) -> None:
+    """The drive's own reaction does not come into it: the way is that of the loop, and of the ramp behind it."""
+    config = modelled(tmp_path, {"within_s": 0.2})
+    long, short = (
+        stated(config.model_copy(update={"limits": config.limits.model_copy(update={"ramp_down_s": ramp_s})}))
+        for ramp_s in (0.09, 0.01)
+    )
+    assert long.travel_rad == pytest.approx(3.0 * 0.093 + 3.6 * (0.006 + 0.5 * 3.6 / long.facts.deceleration_rad_s2))
+    assert short.travel_rad < long.travel_rad

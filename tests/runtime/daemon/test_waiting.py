@@ -208,7 +208,10 @@ def test_loss_of_a_node_acknowledges_no_sign_of_a_stranger(service: Service) -> 
         service.comes_to("DISABLED", "FOREIGN_SDO", "SECOND_MASTER", "DRIVE_RESET")
     service.wait_until(lambda s: s["axis"]["state"] == "FAULT" and s["uptime_s"] < SHOWN_S)
     latched = {fault["code"] for fault in service.ask("status")["faults"]}
-    assert latched - {"GUARD_CHANGED", "DEADLINE_LATE"} == {"FOREIGN_SDO", "SECOND_MASTER"}  # what it wrote may be a guard
+    assert latched - {"GUARD_CHANGED", "DEADLINE_LATE"} == {
+        "FOREIGN_SDO",
+        "SECOND_MASTER",
+    }  # what it wrote may be a guard
     assert "still latched from before" in service.log
     with pytest.raises(Refused, match="a fault is latched"):
         service.ask("enable")
