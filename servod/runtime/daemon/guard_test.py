@@ -7,7 +7,9 @@ nothing to show. What was proven, of which drive with which guards, and when, st
 
 from __future__ import annotations
 
+import hashlib
 import json
+import math
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -292,16 +294,23 @@ def keep_proof(config: AxisConfig, results: list[GuardResult], found: dict[str, 
     path = config.gains.directory / PROOF_NAME
     document = {"time": time.time(), "terms": found, "results": [asdict(result) for result in results]}
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, json.dumps(document, indent=1) + "\n")
+    write_atomically(path, json.dumps({**document, "sha256": _sha256(document)}, indent=1) + "\n")
     return path
+
+
+def _sha256(document: dict[str, Any]) -> str:
+    """Over what the proof says; it protects from accident, as that of a gain set does."""
+    return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
 
 
 def read_proof(config: AxisConfig) -> dict[str, Any] | None:
     """What the last test that passed has left; None without one that can be read."""
     try:
         proof = read_json(config.gains.directory / PROOF_NAME, "a proof by `servoctl guard-test`")
-        return {"time": float(proof["time"]), "terms": proof["terms"]}
-    except (BadInput, KeyError, TypeError, ValueError):
+        told = proof.pop("sha256")
+        sound = told == _sha256(proof) and math.isfinite(proof["time"])
+        return {"time": float(proof["time"]), "terms": proof["terms"]} if sound else None
+    except (BadInput, AttributeError, KeyError, TypeError, ValueError):
         return None
 
 

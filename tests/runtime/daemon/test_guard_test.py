@@ -239,7 +239,15 @@ def test_a_proof_holds_for_its_drive_its_guards_and_its_time(tmp_path: Path) -> 
         changed = axis(tmp_path, amplifier={"heartbeat_reaction": 2} if other is world else {})
         with pytest.raises(Unreachable, match="are others than those that were tested"):
             require_proof(_status(config, json.loads(json.dumps(tried(other, changed)[1])), now_s))
-    path.write_text("{")
-    with pytest.raises(Unreachable, match="missing or broken"):
-        require_proof(_status(config, found, now_s))
+    whole = path.read_text()
+    for broken in (
+        "{",
+        "[]",
+        whole.replace(str(now_s), "NaN"),
+        whole.replace(str(now_s), str(now_s + DAY_S)),
+        whole.replace('"guard": "commands"', '"guard": "commanded"'),
+    ):
+        path.write_text(broken)
+        with pytest.raises(Unreachable, match="missing or broken"):
+            require_proof(_status(config, found, now_s))
     require_proof(_status(axis(tmp_path, days=None), found, now_s))
