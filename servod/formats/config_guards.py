@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 
 from servod.formats.config import AxisConfig
+from servod.formats.joint_bounds import contradictions
 from servod.formats.model.axis_model import AxisKind, AxisModel
-from servod.formats.stopping import contradictions
 from servod.formats.wiring import warnings
 
 #: No joint of a machine that people stand beside turns faster (9549 turns a minute).

@@ -13,8 +13,9 @@ from servod.common.shipped import shipped
 from servod.common.yaml import validate
 from servod.formats.config import AxisConfig
 from servod.formats.config_guards import weakened
+from servod.formats.joint_bounds import joint_of
 from servod.formats.model.axis_model import load_axis_model
-from servod.formats.stopping import Stopping, joint_of, with_stopping
+from servod.formats.stopping import Stopping, with_stopping
 from servod.qualify.faults.scenario import merged, shipped_config
 
 SOON_S, HEARTBEAT_S = 0.02, 0.15

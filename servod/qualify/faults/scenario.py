@@ -19,8 +19,8 @@ from servod.common.shipped import shipped
 from servod.common.yaml import Strict, validate
 from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.formats.config import AxisConfig, load_config
+from servod.formats.joint_bounds import joint_of
 from servod.formats.model.axis_model import AxisModel, axis_model_yaml, load_axis_model
-from servod.formats.stopping import joint_of
 from servod.runtime.fieldbus.devices import DriveState
 from servod.runtime.loop.axis_state import AxisState
 from servod.runtime.loop.wiring.findings import WiringOutcome

@@ -165,9 +165,7 @@ class GainsVerdictArgs(Strict):
 class RecordStartArgs(Strict):
     """`record_start`: a file in the recordings' directory, or a new name."""
 
-    path: str | None = Field(
-        None, min_length=1, max_length=4096, pattern=r"^[^\x00]+$", description="file name; none: a new one"
-    )
+    path: str | None = Field(None, min_length=1, max_length=4096, description="file name; none: a new one")
 
 
 class CyclesArgs(Strict):

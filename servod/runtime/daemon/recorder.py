@@ -61,7 +61,7 @@ class RecordingFiles:
         """A path in the directory, and nowhere else: clients must not write where they please. Raises BadInput."""
         if name is None:
             return self._unused(f"{self._axis_name}-{_now()}")
-        path = (self._directory / name).resolve()
+        path = (self._directory / name.replace("\0", "/")).resolve()  # a zero byte is in no name of a file
         if path.parent != self._directory.resolve() or not _FILE_NAME.fullmatch(path.name):
             allowed = "a file name of letters, digits, spaces and any of . , + ( ) - that ends in .mcap, in"
             raise BadInput("record_start: path", repr(name), f"{allowed} {self._directory}")

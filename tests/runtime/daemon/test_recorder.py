@@ -228,7 +228,7 @@ def _wait_for(get: Callable[[], str]) -> str:
     raise AssertionError("nothing came")
 
 
-@pytest.mark.parametrize("name", ["../out.mcap", "/etc/x.mcap", "sub/x.mcap", "x.csv"])
+@pytest.mark.parametrize("name", ["../out.mcap", "/etc/x.mcap", "sub/x.mcap", "x.csv", "a\0b.mcap"])
 def test_clients_write_only_into_the_recordings_directory(tmp_path: Path, name: str) -> None:
     recorder = _recorder(tmp_path)
     with pytest.raises(BadInput, match="allowed: a file name"):
