@@ -152,7 +152,7 @@ def _check_axis(file: Path) -> dict[str, Any]:
     from servod.formats.kinds import FileKind
     from servod.formats.stopping import UNKNOWN
     from servod.formats.wiring import brake_notes, with_expected
-    from servod.runtime.fieldbus.master.planned import check_names, narrowed_by_stop, planned_bus_load
+    from servod.runtime.fieldbus.master.planned import check_names, narrowed_by_stop, planned_bus_load, reaction_s
 
     config = load_config(file)
     notes = check_names(config, str(file))
@@ -172,7 +172,9 @@ def _check_axis(file: Path) -> dict[str, Any]:
         _, stopping = narrowed_by_stop(config)
     except BadInput as error:
         raise BadInput(f"{file}: {error.where}", error.found, error.allowed) from None
-    notes += [UNKNOWN] if stopping is None else stopping.lines()
+    dead_ms = 1e3 * reaction_s(config)
+    dead = f"stopping: when this computer dies, the drive goes on with its last command for {dead_ms:.0f} ms"
+    notes += [UNKNOWN, dead] if stopping is None else stopping.lines()
     notes.insert(0, f"axis {config.name} on {where}, bus load {100.0 * load.share:.1f} % at {load.bit_rate} bit/s")
     return {
         "kind": FileKind.AXIS,

@@ -76,7 +76,9 @@ def demo(
     model, rows = plant_file(plant), entries(further, certified=plant is None)
     load_rotary_model(model)
     recordings = out / "recordings"
-    need_folder("--out", out if fast else recordings, alone=True)
+    need_folder("--out", out, alone=True)
+    if not fast:
+        need_folder("--out", recordings)
     started = time.monotonic()
     runs, refused = _run(fast, model, seconds, rows, recordings, quiet=as_json)
     elapsed_s = time.monotonic() - started

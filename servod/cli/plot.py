@@ -74,7 +74,10 @@ def plot(
     run = whole.between(from_s, to_s)
     if len(run.time_s) < 2:
         known = f"{whole.time_s[0]:g} to {whole.time_s[-1]:g} s" if len(whole.time_s) else "a recording with cycles"
-        raise BadInput(f"{recording}: time", f"no two rows from {from_s} to {to_s} s", known)
+        asked_for = (
+            f"{'the begin' if from_s is None else f'{from_s:g} s'} to {'the end' if to_s is None else f'{to_s:g} s'}"
+        )
+        raise BadInput(f"{recording}: time", f"no two rows from {asked_for}", known)
     asked = from_s is not None or to_s is not None
     ends = (run.time_s[0], run.time_s[-1]) if asked else (-math.inf, math.inf)
     seen = [event for event in drawn.events if ends[0] <= event[0] <= ends[1]]

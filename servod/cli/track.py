@@ -52,6 +52,7 @@ _MOST_KEPT_BYTES = 512 * 1024**2
 _DONE = "motion done"
 #: And of one that did not.
 _BROKEN_OFF = "motion broken off"
+_INTERRUPTED = "stopped by Ctrl-C or SIGTERM: the axis is brought to rest and disabled"
 _app = typer.Typer(
     help=example("Run a reference motion from where the axis stands.", "servoctl track paper --duration 30"),
     rich_markup_mode=None,
@@ -171,7 +172,7 @@ def _track(
                     watched.look()
                 moved = not isinstance(error, Refused | BadInput)  # these come before the first cycle of it
                 if moved and (watched.document() or isinstance(error, AnswerIsNo)):
-                    why = "stopped by Ctrl-C or SIGTERM" if isinstance(error, KeyboardInterrupt) else str(error)
+                    why = _INTERRUPTED if isinstance(error, KeyboardInterrupt) else str(error)
                     _show(watched, _BROKEN_OFF, draw, plot, as_json, f" ({why.rstrip('.')})")
                 raise
     if as_json:

@@ -145,7 +145,10 @@ def test_an_interrupted_motion_is_drawn_with_the_reason(servoctl: Servoctl, axis
         time.sleep(1.5)
         track.send_signal(signal.SIGINT)
         assert track.wait(60) == 130
-    assert "motion broken off (stopped by Ctrl-C or SIGTERM): RMS error" in page.read_text()
+    assert (
+        "motion broken off (stopped by Ctrl-C or SIGTERM: the axis is brought to rest and disabled): RMS error"
+        in page.read_text()
+    )
 
 
 def test_a_motion_is_drawn_with_its_every_cycle(servoctl: Servoctl, tmp_path: Path) -> None:

@@ -86,7 +86,7 @@ def demo_verdict(scores: Mapping[str, float]) -> str:
     if best == plain:
         return f"{left}, and no other controller less."
     times = scores[plain] / max(scores[best], 1e-12)
-    return f"{left}; the least is {scores[best]:.3f} mrad ({best}), {times:.3g} times less."
+    return f"{left}; the least is {scores[best]:.3f} mrad ({best}), {times:.0f} times less."
 
 
 def _say(page: Page, runs: Sequence[Run], story: Story) -> None:

@@ -272,7 +272,8 @@ def config_of(scenario: Scenario, base: Nested) -> AxisConfig:
 
 def known_joint(scenario: Scenario, config: AxisConfig, folder: Path) -> AxisConfig:
     """`config` with the section stopping as an engineer states it who has identified the scenario's joint, so that
-    every stop is held against a statement; one that it has stays. `folder` takes the model. Raises BadInput."""
+    every stop is held against a statement; one that it has stays. What is wrong with the drive's torque he does not
+    know. `folder` takes the model. Raises BadInput."""
     if config.stopping.least_inertia is not None:
         return config
     path = folder / "joint.yaml"
@@ -288,6 +289,7 @@ def known_joint(scenario: Scenario, config: AxisConfig, folder: Path) -> AxisCon
         "load_min_nm": joint.load_min_nm,
         "load_max_nm": joint.load_max_nm,
     }
+    told = {key: joint.torque_factor * value for key, value in told.items()}
     return config.model_copy(update={"stopping": config.stopping.model_copy(update=told)})
 
 
