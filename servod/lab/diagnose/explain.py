@@ -12,6 +12,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from servod.formats.model.axis_model import AxisModel, LugreFriction
+from servod.formats.model.drive import DriveLaw
 from servod.lab.diagnose.effects import effect, effects
 from servod.lab.diagnose.effects.effect import Effect
 
@@ -35,14 +36,18 @@ def explain_effect(name: str) -> dict[str, Any]:
         "shows": found.shows,
         "confused_with": list(found.confused),
         "experiment": found.experiment,
-        "keys": [*_keys(found), *(_friction_key(key) for key in found.friction_keys)],
+        "keys": [
+            *_keys(found),
+            *(_friction_key(key) for key in found.friction_keys),
+            *(_key(f"drive.{key}", DriveLaw.model_fields[key]) for key in found.drive_keys),
+        ],
     }
 
 
 def _keys(found: Effect) -> list[dict[str, str]]:
     """Keys of the effect's group of the axis model, or the plain key itself."""
     if found.group is None:
-        return [_key(found.name, AxisModel.model_fields[found.name])]
+        return [] if found.drive_keys else [_key(found.name, AxisModel.model_fields[found.name])]
     return _fields(found.name, found.group)
 
 

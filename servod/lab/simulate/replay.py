@@ -26,6 +26,7 @@ from servod.lab.simulate import open_loop, servo
 from servod.lab.simulate.motion import FirstRow, Start, first_row, smoothed_motion
 from servod.lab.simulate.servo import (
     ToldRows,
+    against_emf,
     drive_torque,
     find_on,
     loop_gain,
@@ -140,14 +141,19 @@ def hidden_motion(packed: PackedPlant, drive: Drive, first: FirstRow, starts: ND
 def driven(model: AxisModel, drive: Drive) -> tuple[PackedPlant, Drive]:
     """The model packed and the rows with the torque that its drive makes of what the drive was told.
 
-    The delay is in that torque then, for it is on the command's way and not on that of the motion fed back; the
-    back-EMF is viscous friction. Rows of a torque, and a model without a drive, come back as they are.
+    The delay is in that torque then, for it is on the command's way and not on that of the motion fed back. So is the
+    back-EMF of a servo, by the recorded motion; that of a drive told a voltage is viscous friction. Rows of a torque,
+    and a model without a drive, come back as they are.
     """
     packed, law = model.pack(), model.drive
     if law is None or drive.told is None:
         return packed, drive
     torque = drive_torque(law, drive.told, drive.t_s, drive.position, model.total_delay_s + law.delay_s)
-    p = packed.p._replace(delay_s=0.0, viscous=packed.p.viscous + law.back_emf)
+    p = packed.p._replace(delay_s=0.0)
+    if law.kind.feeds_back:
+        torque = against_emf(law, drive.told, torque, drive.motion[:, 1]) if law.back_emf > 0.0 else torque
+    else:
+        p = p._replace(viscous=p.viscous + law.back_emf)
     return packed._replace(p=p), _with(drive, torque, drive.told)
 
 
@@ -223,17 +229,11 @@ def _run_closed(
     law, told = model.drive, drive.told
     if law is None or told is None:
         raise ValueError("a servo and what it was told")
-    goal = servo.arriving(law, drive.t_s, told.command)
-    delay_s = model.total_delay_s + law.delay_s
-    totals = servo.recorded_totals(law, told, drive.t_s, drive.position, delay_s)[starts]
+    t_s, delay_s = drive.t_s, model.total_delay_s + law.delay_s
+    totals = servo.recorded_totals(law, told, t_s, drive.position, delay_s)[starts]
+    goals = servo.followed_at(law, t_s, told.command, delay_s, starts)
     rows = loop_gain(law, told), torque_per_unit(law, told), told.on, drive.temperature_c
-    numbers, off = servo_numbers(law), inputs(_switched_off(model), PlantState(), bare=True)[0]
     _kernel(servo.run_closed)(
-        *begun, line, off, numbers, drive.t_s, goal, delay_s, *rows, starts, states, totals, out, inner_step_s
-    )
-
-
-def _switched_off(model: AxisModel) -> PackedPlant:
-    """The axis without its drive: packed as it stands, for the back-EMF is the drive's."""
-    packed = model.pack()
-    return packed._replace(p=packed.p._replace(delay_s=0.0))
+        *begun, line, servo_numbers(law, model.inertia), t_s, told.command, delay_s, *rows, starts, states, totals,
+        goals, out, inner_step_s,
+    )  # fmt: skip

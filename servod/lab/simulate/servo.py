@@ -26,6 +26,9 @@ Rows = NDArray[np.bool_]
 #: A servo's own loop runs at about a kilohertz: its duty is held for so long, s.
 LOOP_PERIOD_S = 1e-3
 
+#: Back-EMF acts at once; its torque is held for at most this share of the time in which it would stop the motor.
+EMF_STEP = 0.1
+
 
 @dataclass(frozen=True)
 class ToldRows:
@@ -60,15 +63,34 @@ def loop_gain(law: DriveLaw, told: ToldRows) -> Array:
     return law.gain_scale * own
 
 
-def arriving(law: DriveLaw, t_s: Array, command: Array) -> Array:
-    """The command as the drive follows it: no faster than `goal_rate`."""
+class FollowedGoal(NamedTuple):
+    """What a drive makes of its goal before it acts: where it stands at each row, and its mean over each row's step."""
+
+    at_row: Array
+    mean: Array
+
+
+def followed(law: DriveLaw, t_s: Array, command: Array) -> FollowedGoal:
+    """The command as the drive follows it, from the first row's on: no faster than `goal_rate`."""
     if law.goal_rate is None:
-        return command
-    followed = command.copy()
-    for row in range(1, len(command)):
-        reach = law.goal_rate * (t_s[row] - t_s[row - 1])
-        followed[row] = min(max(command[row], followed[row - 1] - reach), followed[row - 1] + reach)
-    return followed
+        return FollowedGoal(command, command)
+    step = np.diff(t_s, append=t_s[-1] + (t_s[-1] - t_s[-2]))
+    at_row, mean = command.copy(), command.copy()
+    goal = float(command[0])
+    for row, (wanted, most) in enumerate(zip(command.tolist(), (law.goal_rate * step).tolist(), strict=True)):
+        at_row[row], way = goal, wanted - goal
+        if abs(way) <= most:  # there before the next row: what is missing on the way is half a triangle
+            mean[row] = wanted - 0.5 * way * (abs(way) / most if most > 0.0 else 0.0)
+            goal = wanted
+        else:
+            mean[row] = goal + math.copysign(0.5 * most, way)
+            goal += math.copysign(most, way)
+    return FollowedGoal(at_row, mean)
+
+
+def followed_at(law: DriveLaw, t_s: Array, command: Array, delay_s: float, rows: NDArray[np.int64]) -> Array:
+    """Where a goal that comes `delay_s` late stands at some rows: the start of windows."""
+    return np.interp(t_s[rows] - delay_s, t_s, followed(law, t_s, command).at_row)
 
 
 def mean_arriving(t_s: Array, command: Array, delay_s: float) -> Array:
@@ -89,12 +111,21 @@ def drive_torque(law: DriveLaw, told: ToldRows, t_s: Array, position: Array, del
 
     `delay_s` is on the command's way alone: what the servo feeds back is its own measurement.
     """
-    came = mean_arriving(t_s, arriving(law, t_s, told.command), delay_s)
+    came = mean_arriving(t_s, followed(law, t_s, told.command).mean, delay_s)
     if law.kind.feeds_back:
         came = _duty(law, told, t_s, position, came)
     most = law.most
     made = torque_per_unit(law, told) * (came if most is None else np.clip(came, -most, most))
     return np.where(told.on, made, 0.0)
+
+
+def against_emf(law: DriveLaw, told: ToldRows, torque: Array, velocity: Array) -> Array:
+    """What is left of the drive's torque over each row's step behind the back-EMF of the recorded motion, N*m.
+
+    The current makes the torque that the gears carry, and it is what the back-EMF leaves of the voltage.
+    """
+    mean = 0.5 * (velocity + np.append(velocity[1:], velocity[-1]))
+    return np.where(told.on, torque - law.back_emf * mean, 0.0)
 
 
 def _duty(law: DriveLaw, told: ToldRows, t_s: Array, position: Array, goal: Array) -> Array:
@@ -119,7 +150,7 @@ def recorded_totals(law: DriveLaw, told: ToldRows, t_s: Array, position: Array, 
     """The integral part in each row as the recorded motion makes it; nothing where the law has none."""
     if law.ki == 0.0:
         return np.zeros(len(t_s))
-    came = mean_arriving(t_s, arriving(law, t_s, told.command), delay_s)
+    came = mean_arriving(t_s, followed(law, t_s, told.command).mean, delay_s)
     step, error, _ = _errors(law, t_s, position, came)
     return _integral(law, step, error)
 
@@ -175,20 +206,26 @@ def _longest(saved: Array) -> int:
 
 
 class ServoNumbers(NamedTuple):
-    """The law as the kernel takes it; gain and torque per duty come row by row."""
+    """The law as the kernel takes it, its torque held for `loop_s`; gain and torque per duty come row by row."""
 
     on_speed: bool
     ki: float
     kd: float
     dead_band: float
     limit: float
+    goal_rate: float
+    emf: float
+    loop_s: float
 
 
-def servo_numbers(law: DriveLaw) -> ServoNumbers:
-    """The numbers of a law that feeds back."""
+def servo_numbers(law: DriveLaw, inertia: float) -> ServoNumbers:
+    """The numbers of a law that feeds back, on a motor of this inertia."""
     most = law.most if law.most is not None else math.inf
     kd, ki = law.gain_scale * law.kd, law.gain_scale * law.ki
-    return ServoNumbers(law.kind is DriveKind.VELOCITY, ki, kd, law.dead_band, most)
+    rate = law.goal_rate if law.goal_rate is not None else math.inf
+    emf = law.back_emf
+    loop_s = min(LOOP_PERIOD_S, EMF_STEP * inertia / emf) if emf > 0.0 else LOOP_PERIOD_S
+    return ServoNumbers(law.kind is DriveKind.VELOCITY, ki, kd, law.dead_band, most, rate, emf, loop_s)
 
 
 def servo_duty(
@@ -208,7 +245,6 @@ def run_closed(
     tables: Tables,
     s: PlantState,
     line: Any,
-    off: PlantParameters,
     n: ServoNumbers,
     t: Any,
     goal: Any,
@@ -220,21 +256,23 @@ def run_closed(
     starts: Any,
     start_states: Any,
     totals: Any,
+    goals: Any,
     out: Any,
     step_s: float,
 ) -> None:
     """`open_loop.run` with the servo's loop closed over the simulated motion.
 
     `goal` of a row arrives `delay_s` late, `gain` and `factor` (N*m at full duty) hold from their rows on, `totals` are
-    the integral parts at the rows in `starts`. Where the drive is not `on` the axis is `off`: no torque, no back-EMF.
+    the integral parts and `goals` the goals as followed at the rows in `starts`. Where the drive is not `on` there is
+    no torque and no back-EMF.
     `out` gets encoder position, velocity, load position, and torque.
     """
-    window, row, total = 0, -1, 0.0
+    window, row, total, aim = 0, -1, 0.0, goal[0]
     for k in range(len(t)):
         s.time_s = t[k]
         if window < len(starts) and starts[window] == k:
             begin(s, start_states[window])
-            total = totals[window]
+            total, aim = totals[window], goals[window]
             window += 1
         out[k, 0], out[k, 1] = encoder_position(p, tables, s.position), s.velocity
         out[k, 2], out[k, 3] = s.load_position, s.torque
@@ -244,15 +282,16 @@ def run_closed(
         while now < t[k + 1]:
             row = switch_row(t, row, now, delay_s)
             end = acts_until(t, row, delay_s, t[k + 1])
-            pieces = inner_steps(end - now, LOOP_PERIOD_S)
+            pieces = inner_steps(end - now, n.loop_s)
             h = (end - now) / pieces
             steps = inner_steps(h, step_s)
+            wanted = acting(goal, row, goal[0])
             for _ in range(pieces):
+                aim = min(max(wanted, aim - n.goal_rate * h), aim + n.goal_rate * h)
                 shown = encoder_position(p, tables, s.position)
-                duty, total = servo_duty(n, gain[k], acting(goal, row, goal[0]), shown, s.velocity, total, h)
-                if on[k]:
-                    advance(p, tables, s, line, factor[k] * duty, 0.0, steps, h / steps, 0.0, temperature[k])
-                else:
-                    total = 0.0
-                    advance(off, tables, s, line, 0.0, 0.0, steps, h / steps, 0.0, temperature[k])
+                duty, total = servo_duty(n, gain[k], aim, shown, s.velocity, total, h)
+                torque = factor[k] * duty - n.emf * s.velocity
+                if not on[k]:
+                    torque = total = 0.0
+                advance(p, tables, s, line, torque, 0.0, steps, h / steps, 0.0, temperature[k])
             now = end

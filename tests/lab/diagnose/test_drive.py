@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,50 @@ def test_delay_and_torque_of_a_servo_are_found_from_goals_and_positions(tmp_path
     assert window["after"] < 0.3 * window["before"]
     drive = found.evidence.model.drive
     assert drive is not None and drive.torque_per_command == pytest.approx(torque["value"])
+
+
+@pytest.mark.parametrize(
+    ("hidden", "believed", "effect", "key", "value"),
+    [
+        ({"goal_rate": 2.6}, {}, "goal_rate", "goal_rate", 2.6),
+        ({"dead_band": 0.06}, {}, "drive_dead_band", "dead_band", 0.06),
+        ({"ki": 5.0}, {}, "drive_integral", "ki", 5.0),
+        ({}, {"gain_scale": 0.5}, "drive_gain", "gain_scale", 1.0),
+    ],
+)
+def test_what_a_servo_does_beside_its_gain_is_named(
+    hidden: dict[str, float], believed: dict[str, float], effect: str, key: str, value: float, tmp_path: Path
+) -> None:
+    axis = replace(TRUTH, **hidden)
+    found = diagnosis_document(diagnose(model_of(axis, **believed), moved(axis, tmp_path), 120.0))
+    names = [finding["effect"] for finding in found["findings"]]
+    assert names == [effect]
+    assert found["findings"][0]["parameters"][key]["value"] == pytest.approx(value, rel=0.15)
+
+
+def moved(axis: ServoAxis, tmp_path: Path) -> list[Recording]:
+    """Steps with rests, whose goal jumps, and two sines."""
+    t_s = np.arange(600) * PERIOD_S
+    jumps = np.array([0.0, 0.9, -0.5, 0.3, -0.9, 1.2, 0.0])[np.minimum(t_s / 0.9, 6.0).astype(int)]
+    found = []
+    for name, goal in (("jumps", jumps), ("sines", goal_of(t_s, 0))):
+        path = tmp_path / f"{name}.csv"
+        found.append(write(path, t_s=t_s, reference_rad=goal, position_rad=axis.run(goal, PERIOD_S)))
+    return found
+
+
+def test_back_emf_is_told_from_friction_where_the_drive_goes_off(tmp_path: Path) -> None:
+    axis = replace(TRUTH, viscous=0.1, emf=0.5, off_from_s=3.5)
+    t_s = np.arange(600) * PERIOD_S
+    runs = []
+    for kind, goal in enumerate((np.interp(t_s, [0.0, 3.0], [0.0, 2.4]), goal_of(t_s, 0))):
+        columns = {"t_s": t_s, "reference_rad": goal, "position_rad": axis.run(goal, PERIOD_S)}
+        runs.append(write(tmp_path / f"{kind}.csv", **columns, enabled=(t_s < 3.5).astype(float)))
+    model = model_of(replace(axis, viscous=0.6))  # what one measures who does not know of it
+    found = diagnosis_document(diagnose(model, runs, 120.0))
+    low, high = found["drive"]["emf_viscous"]["interval"]
+    assert low < 0.5 < high and high - low < 0.3
+    assert not found["findings"]
 
 
 def test_an_unknown_gain_of_a_servo_is_told_with_its_interval(tmp_path: Path) -> None:

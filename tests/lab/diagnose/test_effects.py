@@ -6,6 +6,7 @@ import functools
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from types import ModuleType
 
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 
 from servod.common.yaml import parse_yaml, validate
 from servod.formats.model.axis_model import AxisModel, axis_model_yaml
+from servod.formats.model.drive import DriveLaw
 from servod.lab.diagnose import effects as package
 from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.effects import NAMES, effect, effects, names, unexcited_effects
@@ -30,6 +32,8 @@ from servod.lab.diagnose.select.levels import named_terms
 from servod.lab.diagnose.select.selection import Selection, TermEntry
 from servod.lab.diagnose.select.selector import once_only
 from tests.lab.diagnose.axes import believed, record
+from tests.lab.simulate.servo_axis import ServoAxis
+from tests.lab.simulate.test_servo import model_of, recorded
 
 
 @functools.cache
@@ -40,11 +44,24 @@ def scene() -> SearchContext:
     return SearchContext(document_of(model), predictor, predictor.mismatch(believed()))
 
 
+@functools.cache
+def servo_scene(folder: Path) -> SearchContext:
+    """Of recordings with a goal in place of a torque."""
+    axis = ServoAxis(coulomb=0.06)
+    model = model_of(axis)
+    traces, _ = load_traces([recorded(axis, folder, kind=2)], model)
+    predictor = Predictor(traces, model)
+    return SearchContext(document_of(model), predictor, predictor.mismatch(model))
+
+
 @pytest.mark.parametrize("name", NAMES)
-def test_starts_are_models(name: str) -> None:
-    model = believed(gravity={"amplitude": 0.1, "phase": 0.2})
+def test_starts_are_models(name: str, tmp_path_factory: pytest.TempPathFactory) -> None:
+    on_drive = bool(effect(name).drive_keys)
+    seen = servo_scene(tmp_path_factory.getbasetemp()) if on_drive else scene()
+    model = AxisModel.model_validate(seen.document)
     base = Hypothesis(document_of(model), base_unknowns(model))
-    terms = effect(name).terms(scene())
+    terms = effect(name).terms(seen)
+    assert not on_drive or not effect(name).terms(scene())  # a recorded torque is behind the drive
     assert terms
     for term in terms:
         hypothesis = base.with_term(term)
@@ -79,6 +96,9 @@ def test_a_record_has_the_name_of_its_file_and_the_group_of_its_key(name: str) -
     found = effect(name)
     assert found.name == name
     assert found.twin in {"", *NAMES} and bool(found.twin) == bool(found.lateness)
+    if found.drive_keys:
+        assert found.group is None and set(found.drive_keys) <= set(DriveLaw.model_fields)
+        return
     annotation = AxisModel.model_fields[name].annotation
     assert annotation is float if found.group is None else annotation == found.group | None
 

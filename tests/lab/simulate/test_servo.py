@@ -10,6 +10,7 @@ import pytest
 
 from servod.common.errors import BadInput
 from servod.formats.model.axis_model import AxisModel, axis_model_yaml, load_axis_model
+from servod.formats.model.friction import LoadDependentFriction
 from servod.lab.recordings import Recording, load_recording
 from servod.lab.simulate.replay import driven, replay, switched_on
 from tests.lab.simulate.servo_axis import ServoAxis, goal_of
@@ -76,6 +77,33 @@ def test_a_drive_that_goes_off_is_seen_and_obeyed(tmp_path: Path) -> None:
     assert abs(T[np.argmin(seen.told.on)] - 3.0) < 0.1 and not seen.told.on[320:].any()
     told = write(tmp_path / "told.csv", **columns, enabled=(T < 3.0).astype(float))
     assert replay(model, told.driven_by(model), None).rms < 0.01
+
+
+@pytest.mark.parametrize(
+    ("hidden", "drive"),
+    [
+        ({"goal_rate": 2.0}, {"goal_rate": 2.0}),
+        ({"dead_band": 0.05}, {"dead_band": 0.05}),
+        ({"ki": 4.0}, {"ki": 4.0}),
+        ({"emf": 0.6, "per_torque": 0.2}, {"emf_viscous": 0.6}),
+    ],
+)
+def test_what_a_drive_does_beside_its_gain_is_replayed(
+    hidden: dict[str, float], drive: dict[str, float], tmp_path: Path
+) -> None:
+    axis = ServoAxis(**hidden)
+    goal = 0.9 * np.sign(np.sin(2.0 * T)) * np.minimum(T, 1.0)
+    rows = write(tmp_path / "run.csv", t_s=T, reference_rad=goal, position_rad=axis.run(goal, PERIOD_S))
+    plain, model = model_of(axis), model_of(axis, **drive)
+    if axis.per_torque:
+        model = model.model_copy(update={"load_dependent_friction": LoadDependentFriction(per_command=axis.per_torque)})
+    right, wrong = (replay(one, rows.driven_by(one), None).rms for one in (model, plain))
+    assert right < 0.01 and wrong > 3.0 * right
+    for horizon_s in (0.25, 1.0):  # windows begin with the goal on its way, and the integral as it stands
+        assert replay(model, rows.driven_by(model), horizon_s).rms < 0.01
+    packed, moved = driven(model, rows.driven_by(model))
+    least = 0.04 if axis.dead_band else 0.012  # a row that crosses the edge of a band is known by its mean alone
+    assert replay(packed, moved, 0.25).rms < least
 
 
 def test_a_drive_is_off_where_it_reports_no_duty_far_from_its_goal(tmp_path: Path) -> None:

@@ -54,9 +54,10 @@ def make_trace(recording: Recording, name: str, shift_s: float, model: AxisModel
     if drive.told is None:
         torque, told = _remove_glitches(drive.torque, "command", counts, notes), None
     else:
+        guessed = bool(drive.told.on.all())
         drive = driven(model, switched_on(model, replace(drive, position=position)))[1]
         torque, told = drive.torque, drive.told
-        _leave_out_off(told.on if told else counts, drive.t_s, counts, notes)
+        _leave_out_off(told.on if told else counts, drive.t_s, counts, notes, guessed=guessed)
     _note_saturation(torque, notes)
     t_s = drive.t_s - drive.t_s[0] + shift_s
     warm = recording.get(Quantity.TEMPERATURE)
@@ -67,12 +68,17 @@ def make_trace(recording: Recording, name: str, shift_s: float, model: AxisModel
     return CheckedTrace(name, moved, counts, tuple(notes), has_temperature, shift_s - float(drive.t_s[0]), shift_s)
 
 
-def _leave_out_off(on: Rows, t_s: Array, counts: Rows, notes: list[str]) -> None:
-    """Rows in which the drive is off do not count, nor those around the instant at which it goes off or on."""
+def _leave_out_off(on: Rows, t_s: Array, counts: Rows, notes: list[str], *, guessed: bool) -> None:
+    """Rows around the instant at which the drive goes off or on do not count.
+
+    Nor do those in which it is off where that is `guessed` from the motion: where the recording says it, they show the
+    axis alone.
+    """
     if on.all():
         return
     notes.append(f"drive: off in {100.0 * float(np.mean(~on)):.0f} % of the rows, from {t_s[np.argmin(on)]:.3g} s on")
-    counts &= on
+    if guessed:
+        counts &= on
     for row in np.flatnonzero(np.diff(on.astype(np.int8))):
         counts &= np.abs(t_s - t_s[row]) > SETTINGS.intake.around_off_s
 

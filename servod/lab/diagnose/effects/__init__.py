@@ -15,7 +15,8 @@ from servod.lab.diagnose.data.excitation import creeps, unidirectional
 from servod.lab.diagnose.data.trace import CheckedTrace
 from servod.lab.diagnose.effects.effect import Effect
 
-#: Names of the outside contract and our own (offset_drift), in the order in which they are tried and explained.
+#: Names of the outside contract and our own (offset_drift, and those of a servo's drive), in the order in which they
+#: are tried and explained.
 NAMES: tuple[str, ...] = (
     "asymmetry",
     "stribeck",
@@ -40,6 +41,10 @@ NAMES: tuple[str, ...] = (
     "torque_offset",
     "disturbance",
     "offset_drift",
+    "goal_rate",
+    "drive_gain",
+    "drive_dead_band",
+    "drive_integral",
 )
 
 

@@ -30,6 +30,9 @@ STRIBECK_VELOCITY_FACTOR = 1.5
 #: By which factor an unknown of the drive may be off what simulated runs say of it, and how well these know it.
 DRIVE_FACTOR, DRIVE_KNOWN = 1.25, 0.04
 
+#: The drive's back-EMF; by which factor friction may be another beside an unknown drive, and how well it is known.
+BACK_EMF, FRICTION_FACTOR, FRICTION_KNOWN = "drive.emf_viscous", 10.0, math.log(2.0)
+
 #: Parameters that the outside contract gives a level, which is their bound until a term opens it.
 LEVELS = frozenset(
     ("friction.static", "friction.stribeck_velocity", "friction.sigma0", "friction.sigma1", "torque_offset", "inertia")
@@ -68,17 +71,42 @@ def base_unknowns(model: AxisModel, unknown: frozenset[str] = frozenset()) -> tu
     axis = "m" if model.axis.value == "linear" else "rad"
     force = "N" if axis == "m" else "N·m"
     inertia = known("inertia", "kg" if axis == "m" else "kg·m²", model.inertia)
-    own = (*_friction(document, axis, force), *_gravity(document, force), *_command(model, force))
+    own = [*_friction(document, axis, force), *_gravity(document, force), *_command(model, force)]
+    own = [_beside_drive(one, document, unknown) for one in own]
     return (inertia, *own, *_drift(document, force), *_drive(document, force, unknown))
 
 
 def _drive(document: Document, force: str, unknown: frozenset[str]) -> list[Unknown]:
     """What is unknown of the drive: free, with no belief beforehand."""
     units = {"drive.torque_per_command": force, "drive.kp": "1/rad"}
-    return [
+    found = [
         known(key, units[key], get(document, key), DRIVE_FACTOR - 1.0, DRIVE_KNOWN)
         for key in sorted(unknown & units.keys())
     ]
+    if BACK_EMF in unknown:
+        size = _viscous_size(document)
+        found.append(Unknown(BACK_EMF, f"{force}·s/rad", 0.0, 0.0, FRICTION_FACTOR * size, size))
+    return found
+
+
+def _viscous_size(document: Document) -> float:
+    """What back-EMF and viscous friction are told in: the model's own, or its dry friction at a radian a second."""
+    return max(get(document, "friction.viscous"), 1e-3 * get(document, "friction.coulomb"), 1e-12)
+
+
+def _beside_drive(own: Unknown, document: Document, unknown: frozenset[str]) -> Unknown:
+    """A number of the model's own friction beside an unknown drive.
+
+    Friction in N*m came with a torque of the drive that somebody assumed; and what was taken for viscous friction may
+    be back-EMF, all of it.
+    """
+    if own.key == "friction.viscous" and BACK_EMF in unknown:
+        size = _viscous_size(document)
+        return Unknown(own.key, own.unit, own.start, 0.0, FRICTION_FACTOR * size, size)
+    if unknown and own.key in {"friction.viscous", "friction.coulomb"}:
+        low, high = own.start / FRICTION_FACTOR, own.start * FRICTION_FACTOR
+        return Unknown(own.key, own.unit, own.start, low, high, spread=FRICTION_KNOWN)
+    return own
 
 
 def _friction(document: Document, axis: str, force: str) -> list[Unknown]:

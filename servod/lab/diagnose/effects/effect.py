@@ -23,7 +23,8 @@ class Effect:
     """One effect by its name in the outside contract.
 
     `group` is its group of keys in the axis model file, under its name; None where the name is a plain key of every
-    model. `friction_keys` are keys of the model's own friction that it works on beside. `statement` says in one
+    model, or the effect is one of the drive: then `drive_keys` are the keys of that. `friction_keys` are keys of the
+    model's own friction that it works on beside. `statement` says in one
     sentence what was left out; `shows` where its signature is and `look` how that is drawn; `confused` what it is
     mistaken for and `experiment` what tells them apart. `terms` gives its forms with start values for a scene, none
     where it cannot act.
@@ -50,6 +51,7 @@ class Effect:
     terms: Callable[[SearchContext], list[Term]]
     look: Look
     friction_keys: tuple[str, ...] = ()
+    drive_keys: tuple[str, ...] = ()
     far: bool = False
     swift: bool = False
     directed: bool = False
@@ -91,6 +93,11 @@ def simple(effect: str, form: str, unknowns: Sequence[Unknown], **fixed: float |
     """A term whose unknowns are keys of the effect's own group."""
     write = keys(effect, [u.key for u in unknowns], **fixed)
     return Term(effect, form, tuple(unknowns), write, report_as_is(unknowns))
+
+
+def of_drive(effect: str, form: str, unknowns: Sequence[Unknown]) -> Term:
+    """A term whose unknowns are keys of the model's drive, which acts where a recording has no torque."""
+    return Term(effect, form, tuple(unknowns), keys("drive", [u.key for u in unknowns]), report_as_is(unknowns))
 
 
 def known_delay(document: Document) -> dict[str, tuple[float, float]]:

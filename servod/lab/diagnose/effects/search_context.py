@@ -73,6 +73,12 @@ class SearchContext:
         told = any(trace.drive.told is not None for trace in self.predictor.traces)
         return told and self.document["drive"]["kind"] in {"position_servo", "velocity"}
 
+    @cached_property
+    def servo_gain(self) -> float:
+        """What the servo's loop makes of an error by the model or the recording, before `gain_scale`, 1/rad."""
+        told = [trace.drive.told.gain for trace in self.predictor.traces if trace.drive.told is not None]
+        return get(self.document, "drive.kp", float(np.median(np.concatenate(told))))
+
     @property
     def force(self) -> str:
         """Unit of torque."""

@@ -296,7 +296,8 @@ def fitted_drive(judgement: JudgedSelection) -> dict[str, FittedValue]:
         if unknown.key.startswith(DRIVE):
             value = fit.values[index]
             spread = SETTINGS.intervals.z95 * math.sqrt(max(float(judgement.covariance[index, index]), 0.0))
-            ends = value * math.exp(-spread), value * math.exp(spread)
+            scale = unknown.size * spread
+            ends = (value - scale, value + scale) if scale else (value * math.exp(-spread), value * math.exp(spread))
             found[unknown.key.removeprefix(DRIVE)] = FittedValue(value, unknown.unit, *ends)
     return found
 

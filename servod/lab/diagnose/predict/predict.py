@@ -8,7 +8,8 @@ The torque is that of the command which would close the gap: the pull times the 
 makes of a command. With one mass for all models a trial model k times heavier would shrink every torque that it leaves
 out by k, and mass, gain, saturation and friction of the command would explain anything (the least squares of motion on
 command in place of that of command on motion, which feedback makes biased: Ljung, System Identification, 1999, 13.4).
-A lighter or stronger model is told with the nominal mass: its own would make the encoder's noise small instead.
+A lighter or stronger model is told with the nominal mass: its own would make the encoder's noise small instead. The
+same holds of a drive whose torque is fitted: half the torque of a duty would halve all that a model leaves out.
 """
 
 from __future__ import annotations
@@ -126,6 +127,7 @@ class Predictor:
         self.traces = tuple(traces)
         self.dry = dry_friction(nominal)
         self.inertia = nominal.inertia
+        self.drive_torque = drive_factor(nominal)
         self.linear = nominal.axis is AxisKind.LINEAR
         self.rate = bandwidth(nominal.inertia, self.dry, traces) if rate is None else rate
         self.observers = tuple(observer(trace, nominal.inertia, self.rate) for trace in self.traces)
@@ -165,14 +167,17 @@ class Predictor:
         each = models if len(models) > 1 else models * len(self.traces)
         self.evaluations += 1
         parts = [
-            self._trace_mismatch(*driven(model, trace.drive), trace, seen)
+            self._trace_mismatch(*driven(model, trace.drive), trace, seen, drive_factor(model) / self.drive_torque)
             for model, trace, seen in zip(each, self.traces, self.observers, strict=True)
         ]
         limit = SETTINGS.observer.worst * self.dry
         clean = np.nan_to_num(np.concatenate(parts), nan=limit, posinf=limit, neginf=-limit)
         return np.where(self.counts, np.clip(clean, -limit, limit), 0.0)
 
-    def _trace_mismatch(self, packed: PackedPlant, drive: Drive, trace: CheckedTrace, seen: Observer) -> Array:
+    def _trace_mismatch(
+        self, packed: PackedPlant, drive: Drive, trace: CheckedTrace, seen: Observer, stronger: float
+    ) -> Array:
+        """Of one trace; `stronger`: torque of a duty, volt or ampere over that of the nominal drive."""
         gap, first = packed.p.gap > 0.0, trace.first_row(packed.p.delay_s)
         axis = inputs(packed, PlantState(temperature_c=packed.p.start_c, first_s=trace.begun_s))
         states = np.array([self._start(packed, drive, int(row), first) for row in trace.starts])
@@ -189,7 +194,7 @@ class Predictor:
         )
         self._run(*axis, *held, *gains, trace.starts, states, out)
         heavier = max((packed.p.inertia + packed.p.load_inertia) / self.inertia, 1.0)
-        weaker = min(torque_per_command(packed.p, trace), 1.0)
+        weaker = min(torque_per_command(packed.p, trace) * stronger, 1.0)
         return seen.to_torque * (heavier / weaker) * out
 
     def _start(self, packed: PackedPlant, drive: Drive, row: int, known: FirstRow) -> Array:
@@ -202,6 +207,12 @@ class Predictor:
         moved = np.array([motion])
         self._follow(*axis, drive.t_s[one], moved, drive.torque[one], before, drive.temperature_c[one], hidden, 1e-3)
         return np.array([motion[0], motion[1], *hidden[0]])
+
+
+def drive_factor(model: AxisModel) -> float:
+    """Torque that the drive of a model makes of a command of one; 1 where the command is a torque."""
+    factor = model.drive.factor if model.drive is not None else None
+    return factor if factor is not None else 1.0
 
 
 #: The least that a model may make of a command, as a share of it: one that makes nothing would be off by anything.

@@ -2,8 +2,10 @@
 
 Stands between the model as it came and intake. Torque for one unit of the command, or the servo's gain: first by least
 squares of the torque that the model's motion needs, at the delay that makes the most of it; then by the error of
-simulated runs, a servo's loop closed, beside mass, friction, friction of the load, weight and delay. Closed loops
-leave no choice between a strong drive on a stiff axis and a weak one on an easy axis, which needed torques do.
+simulated runs, a servo's loop closed, beside what may stand in the way: mass, friction, friction of the load, weight,
+delay, the rate of the goal, back-EMF. Closed loops leave no choice between a strong drive on a stiff axis and a weak
+one on an easy axis, which needed torques do. Back-EMF is told from viscous friction where the drive goes off: it is
+fitted where a recording says so and the model says nothing of it.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ from numpy.typing import NDArray
 
 from servod.common.errors import BadInput
 from servod.formats.model.axis_model import AxisModel
+from servod.formats.model.drive import DriveLaw
 from servod.lab.diagnose.data.trace import dry_friction
 from servod.lab.diagnose.effects.base import document_of
 from servod.lab.diagnose.effects.hypothesis import get, put
@@ -24,6 +27,7 @@ from servod.lab.simulate.replay import Drive, replay, switched_on
 from servod.lab.simulate.servo import drive_torque
 
 Array = NDArray[np.float64]
+Rows = NDArray[np.bool_]
 
 #: Delays tried, s.
 DELAYS_S = tuple(0.005 * step for step in range(17))
@@ -41,17 +45,44 @@ class CompletedDrive:
     error: float = 0.0
 
 
-#: Recordings used, at most; steps of the fit; a run of a drive without a loop of its own is so long, s.
-MOST_RECORDINGS, STEPS, HORIZON_S = 6, 12, 0.5
+#: Recordings used, at most; steps of the fit; runs are so long, s: a drive without a loop of its own runs away.
+MOST_RECORDINGS, STEPS, SERVO_HORIZON_S, HORIZON_S = 6, 12, 1.0, 0.5
 
-#: What is known beforehand, as logarithms: of mass and weight, and of friction, in which a back-EMF may be or not.
-MASS_KNOWN, WEIGHT_KNOWN, FRICTION_KNOWN = 0.3, 0.04, 2.0
-
-#: What a delay and a friction of the load may be, and at which they start.
-DELAY_START_S, DELAY_SIZE_S, LOAD_START, LOAD_SIZE = 0.015, 0.02, 0.1, 0.2
+#: Rows so long, s, in which a drive is off and the axis moves show what is friction without back-EMF.
+LEAST_OFF_S = 0.2
 
 #: Rows whose errors count as one, s: errors of simulated runs are slow.
 CORRELATED_S = 0.25
+
+
+@dataclass(frozen=True)
+class _Number:
+    """A number of the fit: start, bounds, and precision of what is known beforehand (1/spread)."""
+
+    start: float
+    low: float
+    high: float
+    known: float
+
+
+#: The value that is unknown and what may stand in its way. Logarithms of factors: of the value, mass, viscous and dry
+#: friction (in which a back-EMF may be or not), weight, goal's rate; a delay and friction of load and torque in SIZES;
+#: the share of back-EMF in what is viscous.
+_NUMBERS = {
+    "value": _Number(0.0, -2.3, 2.3, 0.0),
+    "mass": _Number(0.0, -2.3, 2.3, 1.0 / 0.3),
+    "viscous": _Number(0.0, -2.3, 2.3, 0.5),
+    "dry": _Number(0.0, -2.3, 2.3, 0.5),
+    "weight": _Number(0.0, -2.3, 2.3, 25.0),
+    "late": _Number(0.75, 0.0, 5.0, 0.5),
+    "load": _Number(0.5, 0.0, 4.0, 0.5),
+    "torque": _Number(0.5, 0.0, 3.0, 0.5),
+    "rate": _Number(0.0, -1.0, 3.0, 0.1),
+    "emf": _Number(0.5, 0.0, 1.0, 0.1),
+}
+
+#: A delay in s, friction of the load and of the torque as shares.
+SIZES = {"late": 0.02, "load": 0.2, "torque": 0.2}
 
 
 def complete_drive(model: AxisModel, recordings: Sequence[Recording]) -> CompletedDrive:
@@ -61,69 +92,116 @@ def complete_drive(model: AxisModel, recordings: Sequence[Recording]) -> Complet
         return CompletedDrive(model, frozenset())
     gain_known = not law.kind.feeds_back or law.kp is not None or _recorded_gain(recordings)
     if gain_known and law.factor is not None:
-        return CompletedDrive(model, frozenset())
+        drives = [recording.driven_by(model) for recording in recordings]
+        return CompletedDrive(model, _emf_keys(law, drives))
     if not gain_known and law.factor is None:
         raise BadInput("model: drive", "neither kp nor torque_per_command", "one of them: only their product shows")
     key = "torque_per_command" if gain_known else "kp"
     trial = law.model_copy(update={key: 1.0 if gain_known else SMALL})
     changed = model.model_copy(update={"drive": trial})
-    value = _slope(changed, [recording.driven_by(changed) for recording in recordings])
+    drives = [recording.driven_by(changed) for recording in recordings]
+    value, emf = _slope(changed, drives), _emf_keys(law, drives)
     if value <= 0.0:
         raise BadInput(
             "recordings: goal and motion", "a torque against the goal", "the goal and the position in one sign"
         )
     value = value if gain_known else value * SMALL
     whole = model.model_copy(update={"drive": law.model_copy(update={key: value})})
-    factor, error = _refined(whole, key, [recording.driven_by(whole) for recording in recordings[:MOST_RECORDINGS]])
+    factor, error = _refined(whole, key, drives[:MOST_RECORDINGS], bool(emf))
     whole = whole.model_copy(update={"drive": law.model_copy(update={key: value * factor})})
-    return CompletedDrive(whole, frozenset((f"drive.{key}",)), error)
+    return CompletedDrive(whole, emf | {f"drive.{key}"}, error)
 
 
-def _refined(model: AxisModel, key: str, drives: Sequence[Drive]) -> tuple[float, float]:
+def _emf_keys(law: DriveLaw, drives: Sequence[Drive]) -> frozenset[str]:
+    """The key of the back-EMF where that is unknown, and a drive is off, as recorded, while the axis moves."""
+    known = not law.kind.feeds_back or law.k_t is not None or "emf_viscous" in law.model_fields_set
+    shown = not known and any(_off_in_motion(drive) >= LEAST_OFF_S for drive in drives)
+    return frozenset(("drive.emf_viscous",)) if shown else frozenset()
+
+
+def _off_in_motion(drive: Drive) -> float:
+    """For how long the drive is off, as recorded, while the axis moves, s."""
+    if drive.told is None or drive.told.on.all():
+        return 0.0
+    moves = np.abs(drive.motion[:, 1]) > 0.1 * float(np.quantile(np.abs(drive.motion[:, 1]), 0.95))
+    return drive.period_s * float(np.count_nonzero(~drive.told.on & moves))
+
+
+def _refined(model: AxisModel, key: str, drives: Sequence[Drive], emf: bool) -> tuple[float, float]:
     """By which factor the value that is unknown is another, by the error of simulated runs; and its relative error."""
     from scipy.optimize import least_squares
 
+    feeds_back = model.drive is not None and model.drive.kind.feeds_back
+    recorded = [drive.told is None or not drive.told.on.all() for drive in drives]
     drives = [switched_on(model, drive) for drive in drives]
-    horizon_s = None if model.drive is not None and model.drive.kind.feeds_back else HORIZON_S
-    counted = [drive.told.on if drive.told is not None else np.ones(len(drive.t_s), dtype=bool) for drive in drives]
-    priors = np.array([0.0, 1.0 / MASS_KNOWN, 1.0 / FRICTION_KNOWN, 1.0 / FRICTION_KNOWN, 1.0 / WEIGHT_KNOWN, 0.5, 0.5])
-    begun = np.array([0.0, 0.0, 0.0, 0.0, 0.0, DELAY_START_S / DELAY_SIZE_S, LOAD_START / LOAD_SIZE])
+    horizon_s = SERVO_HORIZON_S if feeds_back else HORIZON_S
+    rows = [_counted(drive, known) for drive, known in zip(drives, recorded, strict=True)]
+    rate = _fast_goal(drives) if feeds_back else None
+    absent = {name for name, there in (("rate", rate is not None), ("emf", emf)) if not there}
+    names = [name for name in _NUMBERS if name not in absent]
+    start, low, high, known = (np.array([getattr(_NUMBERS[name], what) for name in names]) for what in _PARTS)
 
     def errors(numbers: Array) -> Array:
-        trial = _plain(model, key, numbers)
-        runs = (replay(trial, drive, horizon_s).error[on] for drive, on in zip(drives, counted, strict=True))
+        trial = _plain(model, key, dict(zip(names, numbers.tolist(), strict=True)), rate)
+        runs = (replay(trial, drive, horizon_s).error[on] for drive, on in zip(drives, rows, strict=True))
         return np.concatenate(list(runs))
 
-    first = errors(begun)
-    scale = max(float(np.median(np.abs(first))), 1e-9)
+    at, scale = start, max(float(np.median(np.abs(errors(start)))), 1e-9)
     for _ in range(2):
 
         def residuals(numbers: Array, scale: float = scale) -> Array:
-            return np.concatenate([errors(numbers) / scale, priors * numbers])
+            return np.concatenate([errors(numbers) / scale, known * (numbers - start)])
 
-        low, high = np.full(7, -np.log(10.0)), np.full(7, np.log(10.0))
-        low[5:], high[5:] = 0.0, (5.0, 4.0)
-        found = least_squares(residuals, begun, bounds=(low, high), loss="soft_l1", diff_step=1e-3, max_nfev=STEPS)
-        begun = np.clip(found.x, low + 1e-6, high - 1e-6)
-        scale = max(float(np.sqrt(np.mean(errors(begun) ** 2))), 1e-9)
+        found = least_squares(residuals, at, bounds=(low, high), loss="soft_l1", diff_step=1e-3, max_nfev=STEPS)
+        at = np.clip(found.x, low + 1e-6, high - 1e-6)
+        scale = max(float(np.sqrt(np.mean(errors(at) ** 2))), 1e-9)
     alike = max(1.0, CORRELATED_S / drives[0].period_s)
-    size = float(np.sqrt(np.mean(found.fun[: -len(priors)] ** 2)))
+    size = float(np.sqrt(np.mean(found.fun[: -len(names)] ** 2)))
     covariance = np.linalg.pinv(found.jac.T @ found.jac) * alike * size**2
-    return float(np.exp(begun[0])), float(np.sqrt(max(covariance[0, 0], 0.0)))
+    return float(np.exp(at[0])), float(np.sqrt(max(covariance[0, 0], 0.0)))
 
 
-def _plain(model: AxisModel, key: str, numbers: Array) -> AxisModel:
-    """The model with its own numbers by these factors (logarithms), a delay and friction of the load beside."""
-    value, mass, viscous, dry, weight = (float(np.exp(number)) for number in numbers[:5])
-    document = document_of(model)
-    put(document, f"drive.{key}", get(document, f"drive.{key}") * value)
-    for name, factor in (("viscous", viscous), ("coulomb", dry), ("static", dry)):
+#: What a number is made of, in the order in which the fit takes it.
+_PARTS = ("start", "low", "high", "known")
+
+
+def _counted(drive: Drive, known: bool) -> Rows:
+    """Rows whose error counts: all, but those in which the drive is off by the motion alone."""
+    return np.ones(len(drive.t_s), dtype=bool) if known or drive.told is None else drive.told.on
+
+
+def _fast_goal(drives: Sequence[Drive]) -> float | None:
+    """A high speed of the motion where the goal is much faster: it may be followed at a limited rate."""
+    speed = float(np.quantile(np.abs(np.concatenate([drive.motion[:, 1] for drive in drives])), 0.98))
+    fastest = max(
+        float(np.max(np.abs(np.diff(drive.told.command)) / np.maximum(np.diff(drive.t_s), 1e-9)))
+        for drive in drives
+        if drive.told is not None
+    )
+    return 1.2 * speed if fastest > 3.0 * speed else None
+
+
+def _plain(model: AxisModel, key: str, numbers: dict[str, float], rate: float | None) -> AxisModel:
+    """The model with its own values by these numbers, and what may stand in the way beside."""
+    document, law = document_of(model), model.drive
+    put(document, f"drive.{key}", get(document, f"drive.{key}") * np.exp(numbers["value"]))
+    for name, by in (("viscous", "viscous"), ("coulomb", "dry"), ("static", "dry")):
         if get(document, f"friction.{name}") > 0.0:
-            put(document, f"friction.{name}", get(document, f"friction.{name}") * factor)
+            put(document, f"friction.{name}", get(document, f"friction.{name}") * np.exp(numbers[by]))
+    if "emf" in numbers:
+        whole = get(document, "friction.viscous")
+        put(document, "friction.viscous", (1.0 - numbers["emf"]) * whole)
+        put(document, "drive.emf_viscous", numbers["emf"] * whole)
     if model.gravity is not None:
-        put(document, "gravity.amplitude", get(document, "gravity.amplitude") * weight)
-    delay_s, per_load = min(model.delay_s + DELAY_SIZE_S * float(numbers[5]), 0.25), LOAD_SIZE * float(numbers[6])
-    rest = {"inertia": model.inertia * mass, "delay_s": delay_s, "load_dependent_friction.per_load": per_load}
+        put(document, "gravity.amplitude", get(document, "gravity.amplitude") * np.exp(numbers["weight"]))
+    if rate is not None and law is not None and law.goal_rate is None:
+        put(document, "drive.goal_rate", rate * np.exp(numbers["rate"]))
+    rest = {
+        "inertia": model.inertia * np.exp(numbers["mass"]),
+        "delay_s": min(model.delay_s + SIZES["late"] * numbers["late"], 0.25),
+        "load_dependent_friction.per_load": SIZES["load"] * numbers["load"],
+        "load_dependent_friction.per_command": SIZES["torque"] * numbers["torque"],
+    }
     for name, number in rest.items():
         put(document, name, number)
     return AxisModel.model_validate(document)

@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 Tell = Callable[[str], None]
 
 #: What every geared servo has, first of all.
-SERVO = ("delay", "load_dependent_friction")
+SERVO = ("delay", "goal_rate", "load_dependent_friction")
 
 #: Whether a new term deserves to come in, by what it is worth and the fit with it.
 Deserves = Callable[[Merit, Fit], bool]
