@@ -45,7 +45,9 @@ class Drive:
     """What a replay needs of a recording: rows of time, torque command, position, temperature (NaN = not recorded).
 
     SI units of the axis (rad or m). Time must not run backwards; torque and position must be finite. Where a drive was
-    `told` something else than a torque, `torque` is what the model at hand makes of that (`driven`).
+    `told` something else than a torque, `torque` is what the model at hand makes of that (`driven`). Rows cut out of a
+    recording know the `whole` of it and the row there with which they begin: a drive follows its goal and integrates
+    its error from the recording's first row on.
     """
 
     t_s: Array
@@ -53,6 +55,15 @@ class Drive:
     position: Array
     temperature_c: Array
     told: ToldRows | None = None
+    whole: Drive | None = None
+    begun: int = 0
+
+    def part(self, rows: slice) -> Drive:
+        """Some rows, which know those before them where the drive was told something else than a torque."""
+        own = self.t_s[rows], self.torque[rows], self.position[rows], self.temperature_c[rows]
+        if self.told is None:
+            return Drive(*own)
+        return Drive(*own, self.told.part(rows), self.whole or self, self.begun + rows.indices(len(self.t_s))[0])
 
     @cached_property
     def motion(self) -> Array:
@@ -148,7 +159,9 @@ def driven(model: AxisModel, drive: Drive) -> tuple[PackedPlant, Drive]:
     packed, law = model.pack(), model.drive
     if law is None or drive.told is None:
         return packed, drive
-    torque = drive_torque(law, drive.told, drive.t_s, drive.position, model.total_delay_s + law.delay_s)
+    rows = drive.whole or drive
+    torque = drive_torque(law, rows.told or drive.told, rows.t_s, rows.position, model.total_delay_s + law.delay_s)
+    torque = torque[drive.begun : drive.begun + len(drive.t_s)]
     p = packed.p._replace(delay_s=0.0)
     if law.kind.feeds_back:
         torque = against_emf(law, drive.told, torque, drive.motion[:, 1]) if law.back_emf > 0.0 else torque
@@ -179,7 +192,7 @@ def switched_on(model: AxisModel, drive: Drive) -> Drive:
         moved = moved + model.spring.stiffness * (position - model.spring.rest)
     slid = moved + (model.friction.viscous + law.back_emf) * velocity
     most = (law.most or math.inf) * torque_per_unit(law, told)
-    on = find_on(torque, most, (slid, moved), drive.t_s)
+    on = find_on(torque, most, (slid, moved), velocity, drive.t_s)
     return _with(drive, drive.torque, replace(told, on=on))
 
 

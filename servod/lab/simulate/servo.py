@@ -175,22 +175,29 @@ OFF_LEAST_S, OFF_PUSHES = 0.3, 0.9
 #: ... and what the motion needs is at most this share of it: a drive that is stalled holds what it pushes against.
 OFF_NEEDS = 0.2
 
+#: What goes to its goal in this share of the rows is driven, at a limited rate: an axis that is off falls or rests.
+DRIVEN = 0.8
 
-def find_on(torque: Array, most: Array, needed: tuple[Array, Array], t_s: Array) -> Rows:
+#: Slower than this share of a high speed of the recording is at rest.
+SLOW = 0.05
+
+
+def find_on(torque: Array, most: Array, needed: tuple[Array, Array], velocity: Array, t_s: Array) -> Rows:
     """Rows in which a drive is on, by what the motion needed.
 
     `torque` is what the drive makes when it is on, `most` the largest that it can; `needed` the torque of the model's
     motion without dry friction: all of it, and what is left without viscous friction and back-EMF. Full torque that
-    nothing stands against tells that the drive is off; it is for as long before and after as it saves
-    squares to leave out its torque.
+    nothing stands against tells that the drive is off, unless the axis goes on to its goal all the while (`velocity`);
+    it is for as long before and after as it saves squares to leave out its torque.
     """
     on = np.ones(len(torque), dtype=bool)
     whole, bare = needed
     pushed = (np.abs(torque) >= OFF_PUSHES * most) & (np.abs(whole) <= OFF_NEEDS * np.abs(torque))
     saved = (whole - torque) ** 2 - np.minimum(whole**2, bare**2)
+    follows = velocity * np.sign(torque) > SLOW * float(np.quantile(np.abs(velocity), 0.98))
     edges = np.flatnonzero(np.diff(np.concatenate([[0], pushed.astype(np.int8), [0]])))
     for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-        if t_s[end - 1] - t_s[first] >= OFF_LEAST_S:
+        if t_s[end - 1] - t_s[first] >= OFF_LEAST_S and float(np.mean(follows[first:end])) < DRIVEN:
             on[first - _longest(saved[:first][::-1]) : end + _longest(saved[end:])] = False
     return on
 

@@ -56,8 +56,10 @@ def test_delay_and_torque_of_a_servo_are_found_from_goals_and_positions(tmp_path
     ("hidden", "believed", "effect", "key", "value"),
     [
         ({"goal_rate": 2.6}, {}, "goal_rate", "goal_rate", 2.6),
+        ({"goal_rate": 0.8}, {}, "goal_rate", "goal_rate", 0.8),
         ({"dead_band": 0.06}, {}, "drive_dead_band", "dead_band", 0.06),
         ({"ki": 5.0}, {}, "drive_integral", "ki", 5.0),
+        ({"ki": 2.0}, {}, "drive_integral", "ki", 2.0),
         ({}, {"gain_scale": 0.5}, "drive_gain", "gain_scale", 1.0),
     ],
 )
@@ -69,6 +71,25 @@ def test_what_a_servo_does_beside_its_gain_is_named(
     names = [finding["effect"] for finding in found["findings"]]
     assert names == [effect]
     assert found["findings"][0]["parameters"][key]["value"] == pytest.approx(value, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("hidden", "effects"),
+    [
+        ({}, []),
+        ({"goal_rate": 2.6}, ["goal_rate"]),
+        ({"per_torque": 0.3}, ["load_dependent_friction"]),
+        ({"goal_rate": 3.0, "per_torque": 0.3}, ["goal_rate", "load_dependent_friction"]),
+    ],
+)
+def test_the_torque_of_a_servo_is_found_where_its_goal_jumps(
+    hidden: dict[str, float], effects: list[str], tmp_path: Path
+) -> None:
+    """A limited rate and friction of the load look like a weak drive; both stand in the fit of the torque."""
+    axis = replace(TRUTH, **hidden)
+    found = diagnosis_document(diagnose(model_of(axis, torque_per_command=None), moved(axis, tmp_path), 120.0))
+    assert found["drive"]["torque_per_command"]["value"] == pytest.approx(TRUTH.full, rel=0.03)
+    assert [finding["effect"] for finding in found["findings"]] == effects
 
 
 def moved(axis: ServoAxis, tmp_path: Path) -> list[Recording]:

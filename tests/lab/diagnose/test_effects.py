@@ -17,7 +17,7 @@ from servod.formats.model.axis_model import AxisModel, axis_model_yaml
 from servod.formats.model.drive import DriveLaw
 from servod.lab.diagnose import effects as package
 from servod.lab.diagnose.data.intake import load_traces
-from servod.lab.diagnose.effects import NAMES, effect, effects, names, unexcited_effects
+from servod.lab.diagnose.effects import NAMES, effect, effects, fitted_elsewhere, names, unexcited_effects
 from servod.lab.diagnose.effects.base import base_unknowns, document_of
 from servod.lab.diagnose.effects.effect import Effect, simple
 from servod.lab.diagnose.effects.hypothesis import Hypothesis, Unknown
@@ -89,6 +89,12 @@ def test_every_number_of_a_spring_has_its_own_unit() -> None:
         assert told["stiffness"] == "N·m/rad"
         assert told["rest"] == "rad"
         assert told.get("cubic", "N·m/rad·1/rad²") == "N·m/rad·1/rad²"
+
+
+def test_a_gain_is_not_tried_beside_a_number_of_the_drive_that_is_one_with_it() -> None:
+    assert fitted_elsewhere(frozenset(("drive.torque_per_command",))) == {"torque_gain"}
+    assert fitted_elsewhere(frozenset(("drive.kp", "drive.emf_viscous"))) == {"torque_gain", "drive_gain"}
+    assert not fitted_elsewhere(frozenset())
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -104,6 +105,26 @@ def test_what_a_drive_does_beside_its_gain_is_replayed(
     packed, moved = driven(model, rows.driven_by(model))
     least = 0.04 if axis.dead_band else 0.012  # a row that crosses the edge of a band is known by its mean alone
     assert replay(packed, moved, 0.25).rms < least
+
+
+def test_some_rows_of_a_recording_know_where_goal_and_integral_stand(tmp_path: Path) -> None:
+    axis = ServoAxis(goal_rate=0.8, ki=4.0)
+    rows, model = recorded(axis, tmp_path), model_of(axis, goal_rate=0.8, ki=4.0)
+    drive = rows.driven_by(model)
+    part = drive.part(slice(150, 400)).part(slice(50, None))
+    made, whole = driven(model, part)[1].torque, driven(model, drive)[1].torque[200:400]
+    assert np.array_equal(made, whole)
+    alone = replace(part, whole=None, begun=0)
+    assert np.max(np.abs(driven(model, alone)[1].torque - whole)) > 0.2
+
+
+def test_a_drive_that_follows_its_goal_slowly_is_on(tmp_path: Path) -> None:
+    axis = ServoAxis(goal_rate=1.0)
+    goal = np.array([0.0, 1.2, -1.2, 1.2])[np.minimum(T / 1.5, 3.0).astype(int)]
+    model = model_of(axis)
+    rows = write(tmp_path / "run.csv", t_s=T, reference_rad=goal, position_rad=axis.run(goal, PERIOD_S))
+    seen = switched_on(model, rows.driven_by(model)).told
+    assert seen is not None and seen.on.all()
 
 
 def test_a_drive_is_off_where_it_reports_no_duty_far_from_its_goal(tmp_path: Path) -> None:

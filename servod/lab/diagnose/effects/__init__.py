@@ -65,6 +65,11 @@ def names(which: Callable[[Effect], bool]) -> frozenset[str]:
     return frozenset(found.name for found in effects() if which(found))
 
 
+def fitted_elsewhere(unknown: frozenset[str]) -> frozenset[str]:
+    """Effects that cannot be told from a number of the drive that is fitted (`unknown`)."""
+    return names(lambda found: not unknown.isdisjoint(found.one_with))
+
+
 def unexcited_effects(traces: Sequence[CheckedTrace], inertia: float) -> frozenset[str]:
     """Effects that these recordings of an axis of this inertia cannot show."""
     slow, straight = creeps(traces, inertia), unidirectional(traces)

@@ -30,6 +30,9 @@ STRIBECK_VELOCITY_FACTOR = 1.5
 #: By which factor an unknown of the drive may be off what simulated runs say of it, and how well these know it.
 DRIVE_FACTOR, DRIVE_KNOWN = 1.25, 0.04
 
+#: Numbers of a drive, of which one may be unknown: what makes a torque of a command, and what makes that of an error.
+DRIVE_SCALES = ("drive.torque_per_command", "drive.kp")
+
 #: The drive's back-EMF; by which factor friction may be another beside an unknown drive, and how well it is known.
 BACK_EMF, FRICTION_FACTOR, FRICTION_KNOWN = "drive.emf_viscous", 10.0, math.log(2.0)
 

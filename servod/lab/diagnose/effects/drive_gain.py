@@ -40,5 +40,6 @@ EFFECT = Effect(
     look=Look("load"),
     drive_keys=("gain_scale",),
     far=True,
+    one_with=("drive.kp",),
     at_level=_at_level,
 )

@@ -31,7 +31,8 @@ class Effect:
 
     For the search: `far` effects are also started from the nominal model, whose refit they distort; `swift` ones show
     against the inertia alone, not on an axis that creeps; `directed` ones tell one direction from the other;
-    `repeatable` ones may come in again with another period or place (a second harmonic is no second effect); those
+    `repeatable` ones may come in again with another period or place (a second harmonic is no second effect); where a
+    number of the drive that is `one_with` theirs is fitted, they are not tried; those
     that `soaks_up` take what others leave, and are too plain to be a detail where they are real.
 
     For the verdict: `at_level` says of the nominal and the fitted model whether the effect is more than recalibration;
@@ -56,6 +57,7 @@ class Effect:
     swift: bool = False
     directed: bool = False
     repeatable: bool = False
+    one_with: tuple[str, ...] = ()
     soaks_up: bool = False
     at_level: Callable[[Document, Document], bool] = lambda _nominal, _fitted: True
     scales_torques: bool = False

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from servod.formats.model.effects import TorqueGain
-from servod.lab.diagnose.effects.base import RECALIBRATION
+from servod.lab.diagnose.effects.base import DRIVE_SCALES, RECALIBRATION
 from servod.lab.diagnose.effects.effect import Effect, positive, simple
 from servod.lab.diagnose.effects.hypothesis import Document, Term, get
 from servod.lab.diagnose.effects.looks import Look
@@ -33,6 +33,7 @@ EFFECT = Effect(
     terms=terms,
     look=Look("load"),
     far=True,
+    one_with=DRIVE_SCALES,
     swift=True,
     scales_torques=True,
     at_level=_at_level,

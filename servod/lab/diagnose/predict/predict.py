@@ -255,7 +255,4 @@ def _cut(trace: CheckedTrace, mismatch: Array, settling_s: float) -> CheckedTrac
     power = np.concatenate([[0.0], np.cumsum(mismatch**2)])
     first = int(np.argmax(power[rows:] - power[: len(power) - rows]))
     part = slice(first, first + rows)
-    drive = trace.drive
-    told = drive.told.part(part) if drive.told else None
-    short = Drive(drive.t_s[part], drive.torque[part], drive.position[part], drive.temperature_c[part], told)
-    return replace(trace, drive=short, counts=trace.counts[part])
+    return replace(trace, drive=trace.drive.part(part), counts=trace.counts[part])

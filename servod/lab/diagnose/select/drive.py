@@ -45,8 +45,14 @@ class CompletedDrive:
     error: float = 0.0
 
 
-#: Recordings used, at most; steps of the fit; runs are so long, s: a drive without a loop of its own runs away.
-MOST_RECORDINGS, STEPS, SERVO_HORIZON_S, HORIZON_S = 6, 12, 1.0, 0.5
+#: Recordings used, at most; runs are so long, s: a drive without a loop of its own runs away.
+MOST_RECORDINGS, SERVO_HORIZON_S, HORIZON_S = 6, 1.0, 0.5
+
+#: Steps of the fit, at most, and the relative gain of a step that ends it: jumps of the goal bend its valley.
+STEPS, ENOUGH = 40, 1e-4
+
+#: Rates of the goal tried, as shares of a high speed of the motion.
+RATES = (0.6, 0.7, 0.8, 0.9, 1.0, 1.15, 1.4)
 
 #: Rows so long, s, in which a drive is off and the axis moves show what is friction without back-EMF.
 LEAST_OFF_S = 0.2
@@ -100,14 +106,14 @@ def complete_drive(model: AxisModel, recordings: Sequence[Recording]) -> Complet
     trial = law.model_copy(update={key: 1.0 if gain_known else SMALL})
     changed = model.model_copy(update={"drive": trial})
     drives = [recording.driven_by(changed) for recording in recordings]
-    value, emf = _slope(changed, drives), _emf_keys(law, drives)
-    if value <= 0.0:
+    begun, emf = _begin(changed, drives), _emf_keys(law, drives)
+    if begun.slope <= 0.0:
         raise BadInput(
             "recordings: goal and motion", "a torque against the goal", "the goal and the position in one sign"
         )
-    value = value if gain_known else value * SMALL
+    value = begun.slope if gain_known else begun.slope * SMALL
     whole = model.model_copy(update={"drive": law.model_copy(update={key: value})})
-    factor, error = _refined(whole, key, drives[:MOST_RECORDINGS], bool(emf))
+    factor, error = _refined(whole, key, drives[:MOST_RECORDINGS], begun, bool(emf))
     whole = whole.model_copy(update={"drive": law.model_copy(update={key: value * factor})})
     return CompletedDrive(whole, emf | {f"drive.{key}"}, error)
 
@@ -127,7 +133,7 @@ def _off_in_motion(drive: Drive) -> float:
     return drive.period_s * float(np.count_nonzero(~drive.told.on & moves))
 
 
-def _refined(model: AxisModel, key: str, drives: Sequence[Drive], emf: bool) -> tuple[float, float]:
+def _refined(model: AxisModel, key: str, drives: Sequence[Drive], begun: _Begun, emf: bool) -> tuple[float, float]:
     """By which factor the value that is unknown is another, by the error of simulated runs; and its relative error."""
     from scipy.optimize import least_squares
 
@@ -136,23 +142,29 @@ def _refined(model: AxisModel, key: str, drives: Sequence[Drive], emf: bool) -> 
     drives = [switched_on(model, drive) for drive in drives]
     horizon_s = SERVO_HORIZON_S if feeds_back else HORIZON_S
     rows = [_counted(drive, known) for drive, known in zip(drives, recorded, strict=True)]
-    rate = _fast_goal(drives) if feeds_back else None
-    absent = {name for name, there in (("rate", rate is not None), ("emf", emf)) if not there}
+    absent = {name for name, there in (("rate", begun.rate is not None), ("emf", emf)) if not there}
     names = [name for name in _NUMBERS if name not in absent]
     start, low, high, known = (np.array([getattr(_NUMBERS[name], what) for name in names]) for what in _PARTS)
+    at = start.copy()
+    at[names.index("late")] = begun.late_s / SIZES["late"]
+    if begun.rate is not None and not begun.limited:
+        at[names.index("rate")] = _NUMBERS["rate"].high
+    at = np.clip(at, low + 1e-6, high - 1e-6)
 
     def errors(numbers: Array) -> Array:
-        trial = _plain(model, key, dict(zip(names, numbers.tolist(), strict=True)), rate)
+        trial = _plain(model, key, dict(zip(names, numbers.tolist(), strict=True)), begun.rate)
         runs = (replay(trial, drive, horizon_s).error[on] for drive, on in zip(drives, rows, strict=True))
         return np.concatenate(list(runs))
 
-    at, scale = start, max(float(np.median(np.abs(errors(start)))), 1e-9)
+    scale = max(float(np.median(np.abs(errors(at)))), 1e-9)
     for _ in range(2):
 
         def residuals(numbers: Array, scale: float = scale) -> Array:
             return np.concatenate([errors(numbers) / scale, known * (numbers - start)])
 
-        found = least_squares(residuals, at, bounds=(low, high), loss="soft_l1", diff_step=1e-3, max_nfev=STEPS)
+        found = least_squares(
+            residuals, at, bounds=(low, high), loss="soft_l1", diff_step=1e-3, ftol=ENOUGH, xtol=ENOUGH, max_nfev=STEPS
+        )
         at = np.clip(found.x, low + 1e-6, high - 1e-6)
         scale = max(float(np.sqrt(np.mean(errors(at) ** 2))), 1e-9)
     alike = max(1.0, CORRELATED_S / drives[0].period_s)
@@ -178,7 +190,7 @@ def _fast_goal(drives: Sequence[Drive]) -> float | None:
         for drive in drives
         if drive.told is not None
     )
-    return 1.2 * speed if fastest > 3.0 * speed else None
+    return speed if fastest > 3.0 * speed else None
 
 
 def _plain(model: AxisModel, key: str, numbers: dict[str, float], rate: float | None) -> AxisModel:
@@ -214,21 +226,38 @@ def _recorded_gain(recordings: Sequence[Recording]) -> bool:
     return all(gain is not None and bool(np.isfinite(gain).all()) for gain in gains)
 
 
-def _slope(model: AxisModel, drives: Sequence[Drive]) -> float:
-    """Needed torque over the torque that the trial drive makes, at the delay at which the two go together best."""
-    law = model.drive
-    if law is None:
-        return 0.0
-    found = []
+@dataclass(frozen=True)
+class _Begun:
+    """Where the fit of simulated runs begins: needed torque over that of the trial drive, delay, and rate of the goal.
+
+    `rate` is None where the goal is never much faster than the axis; `limited` says whether it fits better than none.
+    """
+
+    slope: float
+    late_s: float
+    rate: float | None
+    limited: bool
+
+
+def _begin(model: AxisModel, drives: Sequence[Drive]) -> _Begun:
+    """The delay and the rate of the goal at which needed torque and that of the trial drive go together best."""
+    if (law := model.drive) is None:
+        return _Begun(0.0, 0.0, None, limited=False)
+    speed = _fast_goal(drives) if law.kind.feeds_back and law.goal_rate is None else None
+    rates = [None] if speed is None else [None, *(share * speed for share in RATES)]
     needed = np.concatenate([_needed(model, drive) for drive in drives])
-    for delay_s in DELAYS_S:
-        made = np.concatenate(
-            [drive_torque(law, d.told, d.t_s, d.position, delay_s) for d in drives if d.told is not None]
-        )
-        power = float(made @ made)
-        slope = float(made @ needed) / power if power > 0.0 else 0.0
-        found.append((float(np.sum((needed - slope * made) ** 2)), slope))
-    return min(found)[1]
+    found = []
+    for rate in rates:
+        trial = law if rate is None else law.model_copy(update={"goal_rate": rate})
+        for late_s in DELAYS_S:
+            made = np.concatenate(
+                [drive_torque(trial, d.told, d.t_s, d.position, late_s) for d in drives if d.told is not None]
+            )
+            power = float(made @ made)
+            slope = float(made @ needed) / power if power > 0.0 else 0.0
+            found.append((float(np.sum((needed - slope * made) ** 2)), slope, late_s, rate))
+    _, slope, late_s, rate = min(found, key=lambda one: one[0])
+    return _Begun(slope, late_s, rate if rate is not None else speed, limited=rate is not None)
 
 
 def _needed(model: AxisModel, drive: Drive) -> Array:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.formats.model.axis_model import AxisModel
-from servod.lab.diagnose.effects import effect, unexcited_effects
+from servod.lab.diagnose.effects import effect, fitted_elsewhere, unexcited_effects
 from servod.lab.diagnose.effects.base import base_unknowns, document_of
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
 from servod.lab.diagnose.effects.search_context import SearchContext
@@ -55,7 +55,7 @@ class Selector:
         self.predictor, self.deadline, self.tell = predictor, deadline, tell
         self.nominal = nominal
         self.start = Hypothesis(document_of(nominal), base_unknowns(nominal, unknown))
-        self.unexcited = unexcited_effects(predictor.traces, nominal.inertia)
+        self.untried = unexcited_effects(predictor.traces, nominal.inertia) | fitted_elsewhere(unknown)
         self.rows = predictor.counts.astype(np.float64)
 
     def fitter(self, mismatch: Array) -> Fitter:
@@ -135,7 +135,7 @@ class Selector:
         fitted = present.hypothesis.written(present.coordinates)
         scene = SearchContext(self.start.document, self.predictor, present.mismatch, fine, fitted)
         trials = CandidateFits(whole, short, present, scene, not present.hypothesis.terms, self.deadline)
-        found = trials.run(skip=once_only(present.hypothesis) | skip | self.unexcited)
+        found = trials.run(skip=once_only(present.hypothesis) | skip | self.untried)
         if scene.servo:  # what every geared servo has comes first: others swallow it, and their own parts after it
             found.sort(key=lambda candidate: SERVO.index(candidate.effect) if candidate.effect in SERVO else len(SERVO))
         self.tell(f"{trials.tried} starts tried; best: " + ", ".join(c.effect for c in found[:3]))
