@@ -93,6 +93,8 @@ class ObserverSettings:
     slow_sampling: float = 50.0
     #: The same where the axis creeps: a slower observer carries a model along that sticks and slips.
     share_creeping: float = 0.35
+    #: Share of the command that encoder noise may make where most of the command's power is beyond that bandwidth.
+    swift_noise: float = 0.02
     #: Share of dry friction that encoder noise may make of the mismatch; sets the bandwidth.
     wanted_noise: float = 0.006
     #: Damping of the observer's poles.
@@ -111,6 +113,10 @@ class ObserverSettings:
     quiet_noises: float = 5.0
     #: Time constants of the observer that pass before a row behind a start counts: what is left of it is 1e-5 then.
     settling: float = 15.0
+    #: A gap in time of so many time constants of the observer begins anew behind it,
+    gap_constants: float = 2.0
+    #: if it is of so many rows as well: an uneven sampling is none.
+    gap_rows: float = 5.0
     #: Mismatches beyond this many dry frictions say no more: a model that has run away counts as that bad.
     worst: float = 1e6
     #: Share of each recording that first rounds run on: the stretch where most is left shows most of any effect.
@@ -277,6 +283,12 @@ class SwapSettings:
     most_tried: int = 2
     #: They left at most so many times what the term left.
     within: float = 2.5
+    #: A rival that leaves at most so many times what the term leaves takes its place by what it predicts,
+    near: float = 1.2
+    #: when free windows of unseen rows, short and long ones, are off by this share at most of what they were.
+    predicts: float = 0.6
+    #: One that costs less must not make them worse than this.
+    no_worse: float = 1.05
     #: A rival takes the place when the cost falls by more than this share of it, or with fewer unknowns rises by less.
     better: float = 0.01
 
@@ -414,6 +426,14 @@ class VerdictSettings:
     left_torque: float = 0.02
     #: if it is also this share of what could be explained.
     left_share: float = 0.05
+    #: Length of a stretch that may be an event of its own, s,
+    event_s: float = 0.1
+    #: the share of all stretches that such events are at most,
+    event_share: float = 0.02
+    #: out of at least so many stretches,
+    event_of: int = 50
+    #: and the share of the power of what is left that they carry at least.
+    event_power: float = 0.5
     #: Share of dry friction from which the encoder's noise in the mismatch hides what is left.
     hides_rest: float = 0.15
     #: The same from which it hides everything.

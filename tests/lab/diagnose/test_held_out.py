@@ -12,10 +12,11 @@ from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.disturbance import EVERY
 from servod.lab.diagnose.effects.hypothesis import Term
 from servod.lab.diagnose.effects.search_context import SearchContext
-from servod.lab.diagnose.judge.free_run import free_run_gain, window_errors
+from servod.lab.diagnose.judge.free_run import window_errors
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.cross_validation import RECORDING, make_folds, predict_held_out, single_events
 from servod.lab.diagnose.select.fit import Fit, Fitter, Weighing
+from servod.lab.diagnose.select.free_windows import free_run_gain
 from servod.lab.diagnose.select.selection import Fold
 from servod.lab.diagnose.settings import SETTINGS
 from servod.lab.simulate.replay import replay

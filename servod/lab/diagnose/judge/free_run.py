@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.formats.model.axis_model import AxisModel
-from servod.lab.diagnose.data.trace import CheckedTrace
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.result import FreeRun, HeldOutRecording, HeldOutWindow, Windows
-from servod.lab.diagnose.select.selection import Fold, HeldOutErrors
+from servod.lab.diagnose.select.free_windows import fold_errors
+from servod.lab.diagnose.select.selection import Fold
 from servod.lab.diagnose.settings import SETTINGS
 from servod.lab.recordings import Recording
 from servod.lab.simulate.replay import Drive, replay, switched_on
@@ -44,19 +44,9 @@ def window_errors(
     """Errors for every horizon; each fold's model judges the rows that it has not seen."""
     whole = [Fold(np.ones(len(predictor.counts), dtype=bool), (nominal,))]
     return [
-        WindowErrors(horizon, *(_errors(predictor, folds, horizon) for folds in (whole, base, after)))
+        WindowErrors(horizon, *(fold_errors(predictor, folds, horizon) for folds in (whole, base, after)))
         for horizon in SETTINGS.validation.horizons_s
     ]
-
-
-def free_run_gain(
-    predictor: Predictor, before: HeldOutErrors, after: HeldOutErrors, judged: NDArray[np.bool_]
-) -> float:
-    """RMS of the shortest windows by fits with the physics added, as a multiple of that by fits without it."""
-    with_it, without = (
-        _errors(predictor, held.folds, SETTINGS.validation.horizons_s[0])[judged] for held in (after, before)
-    )
-    return float(np.sqrt(np.mean(with_it**2) / max(float(np.mean(without**2)), 1e-30)))
 
 
 def windows(errors: Sequence[WindowErrors], predictor: Predictor, judged: NDArray[np.bool_]) -> tuple[Windows, ...]:
@@ -89,24 +79,6 @@ def _free_run(window: WindowErrors, judged: NDArray[np.bool_]) -> FreeRun:
     """Root mean squares over the rows that are judged."""
     errors = (window.nominal, window.recalibrated, window.after)
     return FreeRun(*(float(np.sqrt(np.mean(error[judged] ** 2))) for error in errors))
-
-
-def _errors(predictor: Predictor, folds: Sequence[Fold], horizon_s: float) -> Array:
-    error = np.zeros(len(predictor.counts))
-    for fold in folds:
-        for index, (trace, part) in enumerate(zip(predictor.traces, predictor.slices, strict=True)):
-            rows, model = fold.rows[part], fold.of(index)
-            if rows.any():
-                error[part][rows] = replay(model, _drive(trace, model), horizon_s).error[rows]
-    return error
-
-
-def _drive(trace: CheckedTrace, model: AxisModel) -> Drive:
-    """The recording on the time that the model's windows of disturbance are in: shifted, where one was fitted."""
-    if model.disturbance is not None and model.disturbance.windows:
-        return trace.drive
-    drive = trace.drive
-    return Drive(drive.t_s - trace.shift_s, drive.torque, drive.position, drive.temperature_c, drive.told)
 
 
 # --- Held-out recordings ---------------------------------------------------------------------------------------------

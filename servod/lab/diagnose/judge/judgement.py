@@ -16,14 +16,14 @@ from servod.formats.model.axis_model import AxisModel
 from servod.lab.diagnose.effects.base import document_of
 from servod.lab.diagnose.effects.hypothesis import Document
 from servod.lab.diagnose.judge.covariance import total_covariance
-from servod.lab.diagnose.judge.free_run import free_run_gain
 from servod.lab.diagnose.judge.locate import maps
-from servod.lab.diagnose.judge.verdict import Shares, shares
+from servod.lab.diagnose.judge.verdict import Shares, shares, without_event
 from servod.lab.diagnose.predict.floor import above_noise
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.result import MinorReason, MismatchMap, ResidualTable
 from servod.lab.diagnose.select.cross_validation import make_folds, predict_held_out, single_events
 from servod.lab.diagnose.select.fit import Fit, Weighing
+from servod.lab.diagnose.select.free_windows import free_run_gain
 from servod.lab.diagnose.select.selection import CrossValidation, Fold, Folds, HeldOutErrors, Selection
 from servod.lab.diagnose.select.selector import Selector
 from servod.lab.diagnose.settings import SETTINGS
@@ -109,11 +109,11 @@ def hats(values: Array, grid: Array) -> Array:
 class JudgedSelection:
     """Everything that was judged of a selection, on recordings that can tell.
 
-    `named` are places of terms in the fit; `errors` are those of the fits to everything, by which names are judged,
-    `unseen` those on rows that the fits have not seen. `removed_by_known` is the share of the explainable error that
-    known physics removes there, also where its names may not stand. `kept` says of terms in the fit why they are no
-    findings. Where no name may stand, `tables` are the models of every fold with a table of what is left, and `partial`
-    is the judgement whose names are a part of the answer.
+    `named` are places of terms in the fit; `errors` are those of the fits to everything, by which names are judged
+    (less what happened once), `unseen` those on rows that the fits have not seen. `removed_by_known` is the share of
+    the explainable error that known physics removes there, also where its names may not stand. `kept` says of terms in
+    the fit why they are no findings. Where no name may stand, `tables` are the models of every fold with a table of
+    what is left, and `partial` is the judgement whose names are a part of the answer.
     """
 
     predictor: Predictor
@@ -149,10 +149,9 @@ def judge(selector: Selector, selection: Selection) -> JudgedSelection:
     if validation is None:
         raise ValueError("a selection is judged when it was cross-validated")
     weighing = Weighing(selector.fitter(fit.mismatch).weighing.scale, selector.rows)
-    seen, unseen = (
-        shares(pair, predictor.counts, selection.floor)
-        for pair in ((base.mismatch, fit.mismatch), (validation.before.mismatch, validation.after.mismatch))
-    )
+    held = validation.before.mismatch, validation.after.mismatch
+    seen = shares((base.mismatch, fit.mismatch), without_event(predictor, fit.mismatch), selection.floor)
+    unseen = shares(held, predictor.counts, selection.floor)
     return JudgedSelection(
         predictor=predictor,
         selection=selection,

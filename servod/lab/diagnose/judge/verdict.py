@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.predict.floor import above_noise
+from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.result import DiagnosisVerdict
 from servod.lab.diagnose.select.candidates import Candidate
 from servod.lab.diagnose.select.selection import Selection
@@ -42,6 +43,26 @@ def shares(mismatch: tuple[Array, Array], counts: NDArray[np.bool_], floor: floa
     before, after = (float(np.mean(rows[counts] ** 2)) for rows in mismatch)
     removed = (before - after) / above_noise(before, floor)
     return Shares(math.sqrt(before), math.sqrt(after), math.sqrt(floor), min(max(removed, 0.0), 1.0))
+
+
+def without_event(predictor: Predictor, mismatch: Array) -> NDArray[np.bool_]:
+    """The rows that count less those few stretches in which most of what is left stands: something happened there once.
+
+    A verdict is about the axis. A push at the start or a broken stretch carries most of a mean square whatever the
+    model; where they are not so few, or carry less than most of it, all rows are judged.
+    """
+    rows = max(1, round(SETTINGS.verdict.event_s / predictor.traces[0].period_s))
+    kept, parts = predictor.counts.copy(), []
+    for part in predictor.slices:
+        parts += [slice(a, min(a + rows, part.stop)) for a in range(part.start, part.stop, rows)]
+    power = np.array([float(np.sum(mismatch[part][predictor.counts[part]] ** 2)) for part in parts])
+    few = max(1, math.ceil(SETTINGS.verdict.event_share * len(parts)))
+    worst = np.argsort(-power)[:few]
+    if len(parts) < SETTINGS.verdict.event_of or float(power[worst].sum()) < SETTINGS.verdict.event_power * power.sum():
+        return kept
+    for place in worst:
+        kept[parts[place]] = False
+    return kept if kept.any() else predictor.counts
 
 
 def verdict(named: Sequence[int], errors: Shares, dry: float, *, driven: bool = False) -> DiagnosisVerdict:

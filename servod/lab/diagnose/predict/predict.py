@@ -99,7 +99,37 @@ def bandwidth(inertia: float, dry: float, traces: Sequence[CheckedTrace]) -> flo
     allowed *= math.sqrt(1.0 / math.sqrt(allowed * period))  # a slow observer averages over more rows
     share = SETTINGS.observer.share_creeping if creeps(traces, inertia) else SETTINGS.observer.share_of_sampling
     rare = min(SETTINGS.observer.most_of_sampling / period, SETTINGS.observer.slow_sampling)
-    return min(max(allowed, SETTINGS.observer.slowest), SETTINGS.observer.fastest, max(share / period, rare))
+    usual = min(max(allowed, SETTINGS.observer.slowest), SETTINGS.observer.fastest, max(share / period, rare))
+    return max(usual, _swift_bandwidth(inertia, usual, traces))
+
+
+def _swift_bandwidth(inertia: float, usual: float, traces: Sequence[CheckedTrace]) -> float:
+    """Bandwidth that a command asks for most of whose power lies beyond the usual one, rad/s; 0 where none does.
+
+    What drives such an axis (cogging of a motor with many poles that turns) is hidden by a slower observer's low-pass,
+    and what is left is taken for a bent friction curve. Encoder noise may make a share of that command then.
+    """
+    asked, size = (min(of(trace.drive) for trace in traces) for of in (middle_frequency, command_rms))
+    noise = inertia * max(trace.position_noise for trace in traces)
+    if asked <= usual or noise <= 0.0:
+        return 0.0
+    allowed = math.sqrt(SETTINGS.observer.swift_noise * size / noise)
+    return min(asked, allowed, SETTINGS.observer.share_creeping / max(trace.period_s for trace in traces))
+
+
+def middle_frequency(drive: Drive) -> float:
+    """The frequency that half of the power of the command's changes lies below, rad/s."""
+    power = np.abs(np.fft.rfft(drive.torque - float(np.mean(drive.torque)))) ** 2
+    total = np.cumsum(power)
+    if total[-1] <= 0.0:
+        return 0.0
+    place = int(np.searchsorted(total, 0.5 * total[-1]))
+    return 2.0 * math.pi * place / (len(drive.torque) * drive.period_s)
+
+
+def command_rms(drive: Drive) -> float:
+    """Root mean square of the command's changes, N*m or N."""
+    return float(np.std(drive.torque))
 
 
 def observer(trace: CheckedTrace, inertia: float, rate: float) -> Observer:
@@ -111,6 +141,17 @@ def observer(trace: CheckedTrace, inertia: float, rate: float) -> Observer:
     turn = np.cos(rate * step * math.sqrt(1.0 - SETTINGS.observer.poles_damping**2))
     velocity_gain = (1.0 - 2.0 * decay * turn + decay**2) / step
     return Observer(rate, 1.0 - decay**2, velocity_gain, inertia * velocity_gain / step, _steps(trace, step))
+
+
+def starts_behind_gaps(trace: CheckedTrace, rate: float) -> NDArray[np.int64]:
+    """Rows where the observer begins anew: the trace's own starts, and rows behind gaps too long for the observer.
+
+    Nobody knows the command in a gap. What it did there shows as torque that the axis lacks for as long as the observer
+    remembers; so a gap of some of its time constants hides what a longer one would.
+    """
+    step = np.diff(trace.drive.t_s)
+    lost = max(SETTINGS.observer.gap_constants / rate, SETTINGS.observer.gap_rows * trace.period_s)
+    return np.unique(np.concatenate([trace.starts, np.flatnonzero(step > lost) + 1])).astype(np.int64)
 
 
 def _steps(trace: CheckedTrace, step: Array) -> NDArray[np.int64]:
@@ -133,14 +174,16 @@ class Predictor:
         self.observers = tuple(observer(trace, nominal.inertia, self.rate) for trace in self.traces)
         ends = np.cumsum([len(trace.drive.t_s) for trace in self.traces])
         self.slices = tuple(slice(int(a), int(b)) for a, b in zip([0, *ends[:-1]], ends, strict=True))
-        self.counts = np.concatenate([self._rows_that_count(trace) for trace in self.traces])
+        self.starts = tuple(starts_behind_gaps(trace, self.rate) for trace in self.traces)
+        self.counts = np.concatenate([self._rows_that_count(i) for i in range(len(self.traces))])
         self.evaluations = 0
         self._run, self._follow = without_lock(innovate), without_lock(open_loop.follow)
 
-    def _rows_that_count(self, trace: CheckedTrace) -> NDArray[np.bool_]:
+    def _rows_that_count(self, index: int) -> NDArray[np.bool_]:
         """Rows that count: those of the trace, once the observer has settled behind each start."""
+        trace = self.traces[index]
         counts = trace.counts.copy()
-        for row in trace.starts:
+        for row in self.starts[index]:
             begun = trace.drive.t_s[row]
             counts &= ~((trace.drive.t_s >= begun) & (trace.drive.t_s < begun + SETTINGS.observer.settling / self.rate))
         return counts
@@ -167,20 +210,19 @@ class Predictor:
         each = models if len(models) > 1 else models * len(self.traces)
         self.evaluations += 1
         parts = [
-            self._trace_mismatch(*driven(model, trace.drive), trace, seen, drive_factor(model) / self.drive_torque)
-            for model, trace, seen in zip(each, self.traces, self.observers, strict=True)
+            self._trace_mismatch(*driven(model, trace.drive), index, drive_factor(model) / self.drive_torque)
+            for index, (model, trace) in enumerate(zip(each, self.traces, strict=True))
         ]
         limit = SETTINGS.observer.worst * self.dry
         clean = np.nan_to_num(np.concatenate(parts), nan=limit, posinf=limit, neginf=-limit)
         return np.where(self.counts, np.clip(clean, -limit, limit), 0.0)
 
-    def _trace_mismatch(
-        self, packed: PackedPlant, drive: Drive, trace: CheckedTrace, seen: Observer, stronger: float
-    ) -> Array:
+    def _trace_mismatch(self, packed: PackedPlant, drive: Drive, index: int, stronger: float) -> Array:
         """Of one trace; `stronger`: torque of a duty, volt or ampere over that of the nominal drive."""
+        trace, seen, starts = self.traces[index], self.observers[index], self.starts[index]
         gap, first = packed.p.gap > 0.0, trace.first_row(packed.p.delay_s)
         axis = inputs(packed, PlantState(temperature_c=packed.p.start_c, first_s=trace.begun_s))
-        states = np.array([self._start(packed, drive, int(row), first) for row in trace.starts])
+        states = np.array([self._start(packed, drive, int(row), first) for row in starts])
         out = np.zeros(len(drive.t_s))
         steps = seen.steps * SETTINGS.observer.steps_in_gap if gap else seen.steps
         held = drive.t_s, drive.torque, first.command_before, drive.temperature_c, drive.position
@@ -192,7 +234,7 @@ class Predictor:
             share,
             SETTINGS.observer.quiet_noises * trace.position_noise,
         )
-        self._run(*axis, *held, *gains, trace.starts, states, out)
+        self._run(*axis, *held, *gains, starts, states, out)
         heavier = max((packed.p.inertia + packed.p.load_inertia) / self.inertia, 1.0)
         weaker = min(torque_per_command(packed.p, trace) * stronger, 1.0)
         return seen.to_torque * (heavier / weaker) * out

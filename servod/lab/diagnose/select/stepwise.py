@@ -20,7 +20,9 @@ from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.predict.floor import above_noise
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.candidates import Candidate
+from servod.lab.diagnose.select.cross_validation import make_folds, predict_held_out
 from servod.lab.diagnose.select.fit import Fit
+from servod.lab.diagnose.select.free_windows import free_run_errors
 from servod.lab.diagnose.select.levels import at_end_of_range, level_at_bound
 from servod.lab.diagnose.select.merit import Merit
 from servod.lab.diagnose.select.selection import Selection, TermEntry
@@ -95,12 +97,13 @@ def backward_elimination(selector: Selector, selection: Selection) -> Selection:
 
 
 def swap_terms(selector: Selector, selection: Selection) -> Selection:
-    """Try rivals in the place of every term but the last, which had them all beside it.
+    """Try rivals in the place of every term; the last had them all beside it, and only one that predicts takes it.
 
-    What was best alone need not be best in company.
+    What was best alone need not be best in company, and what is best one sample ahead need not predict. A swap that
+    makes windows of unseen rows, simulated freely, worse is none.
     """
     before = selection.fit
-    for index in range(selection.terms - 1):
+    for index in range(selection.terms):
         for rival in _rivals(selection, index):
             if monotonic() > selector.deadline:
                 break
@@ -118,11 +121,18 @@ def swap_terms(selector: Selector, selection: Selection) -> Selection:
 
 def _swap(selector: Selector, selection: Selection, index: int, rival: Candidate) -> Selection | None:
     """The selection with a rival in the place of a term, if it does better there and deserves to come in."""
+    last, near = index == selection.terms - 1, rival.left <= SETTINGS.swap.near * selection.entries[index].left
+    if last and not near:
+        return None
     fit = _instead(selector, selection.fit, index, rival)
-    if fit is None or not _better(selector, selection.fit, fit):
+    if fit is None:
+        return None
+    better = not last and _better(selector, selection.fit, fit)
+    if not better and not (near and _cost_ratio(selector, selection.fit, fit) <= SETTINGS.swap.near):
         return None
     merit = selector.merit(selection, selector.settle_without(fit, index), fit)
-    if not selector.may_enter(selection, merit, fit, index):
+    most = SETTINGS.swap.no_worse if better else SETTINGS.swap.predicts
+    if not selector.may_enter(selection, merit, fit, index) or not _predicts(selector, selection.fit, fit, most):
         return None
     entry = selection.entries[index]
     old = Candidate(selection.fit.hypothesis.terms[index].effect, selection.fit, entry.left, index)
@@ -163,12 +173,24 @@ def _coordinates(fit: Fit, hypothesis: Hypothesis, index: int, rival: Candidate)
     return np.asarray(at)
 
 
+def _predicts(selector: Selector, old: Fit, new: Fit, most: float) -> bool:
+    """Whether free windows of every length are off by no more than `most` times what the old fit's are, unseen."""
+    predictor, folds = selector.predictor, make_folds(selector.predictor, old)
+    was, now = (free_run_errors(predictor, predict_held_out(predictor, fit, folds), folds.judged) for fit in (old, new))
+    return bool(np.all(now <= most * was))
+
+
 def _better(selector: Selector, old: Fit, new: Fit) -> bool:
     """Whether the new fit costs less, in the scale of the old one."""
+    better = SETTINGS.swap.better if _size(new) < _size(old) else -SETTINGS.swap.better
+    return math.log(max(_cost_ratio(selector, old, new), 1e-30)) < better
+
+
+def _cost_ratio(selector: Selector, old: Fit, new: Fit) -> float:
+    """Cost of the new fit over that of the old one, in the old one's scale."""
     fitter = selector.fitter(old.mismatch)
     was, now = (fitter.cost(fit.hypothesis, fit.coordinates, fit.mismatch) for fit in (old, new))
-    better = SETTINGS.swap.better if _size(new) < _size(old) else -SETTINGS.swap.better
-    return math.log(max(now, 1e-30) / max(was, 1e-30)) < better
+    return now / max(was, 1e-30)
 
 
 def _size(fit: Fit) -> int:
