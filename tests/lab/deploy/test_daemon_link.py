@@ -48,7 +48,8 @@ def test_a_trial_is_run_kept_and_undone(tmp_path: Path) -> None:
             link.enable()
             link.activate(*link.load(local))
             parts = motions_in(run_validation(link, motion, 0.1))
-            assert [round(len(part), -2) for part in parts] == [500, 1000, 1000]
+            spans_s = [1e-9 * float(part["time_ns"][-1] - part["time_ns"][0]) for part in parts]  # rows may be skipped
+            assert spans_s == pytest.approx([0.5, 1.0, 1.0], abs=0.05)
             assert link.active == ("demo_local", 1)
             link.keep("good", {"after_slow_mrad": 0.1})
             link.activate(*link.load(load_gains(shipped("gains/demo_pd_dob.yaml"))))
