@@ -173,7 +173,7 @@ def _check_axis(file: Path) -> dict[str, Any]:
     except BadInput as error:
         raise BadInput(f"{file}: {error.where}", error.found, error.allowed) from None
     dead_ms = 1e3 * reaction_s(config)
-    dead = f"stopping: when this computer dies, the drive goes on with its last command for {dead_ms:.0f} ms"
+    dead = f"stopping: when this computer dies, the drive goes on with its last command for up to {dead_ms:.0f} ms"
     notes += [UNKNOWN, dead] if stopping is None else stopping.lines()
     notes.insert(0, f"axis {config.name} on {where}, bus load {100.0 * load.share:.1f} % at {load.bit_rate} bit/s")
     return {
