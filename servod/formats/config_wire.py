@@ -87,7 +87,7 @@ class HeartbeatConfig(Strict):
         ge=20,
         le=5000,
         description="without servod's heartbeat for this time the drive stops by itself (0x1016), the last line of "
-        "defence; at least twice master_period_ms, and never written as more than twice",
+        "defence; at least twice master_period_ms, and never written as more than twice: 100 ms with both left out",
     )
     command_deadline_ms: int | None = Field(
         None,
