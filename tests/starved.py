@@ -5,7 +5,8 @@ A failure of a test of real processes (mark `serial` or `processes`) becomes a s
 - While it ran, or while a fixture of it was made, programs that the tests did not start took the processors, and the
   kernel counted that programs waited for them; or a whole processor stood still, as those of virtual machines do: a
   program that goes before all others there did not run either. What the tests and their children use themselves never
-  counts, so code that burns time excuses nothing.
+  counts, so code that burns time excuses nothing. Or the loop may not go before others (SCHED_FIFO is refused to this
+  user): then whatever runs anywhere, the tests' own attackers too, takes its turn.
 - Time is what failed: a time-out, a fault of lateness and none beside it in the message or in the daemon's log, or a
   comparison in a test that compares times alone (mark `wall_clock`). What a drive did, a torque, a limit or another
   fault fails on any machine.
@@ -134,6 +135,17 @@ def _waited_s() -> float | None:
     return int(found[1]) / 1e6 if found else None
 
 
+def refused() -> str:
+    """What keeps a loop of this user from going before other programs; empty where nothing does."""
+    policy, param = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+    except PermissionError:
+        return "this user may not use SCHED_FIFO, so any program goes before the loop"
+    os.sched_setscheduler(0, policy, param)
+    return ""
+
+
 def logged(logs: Iterable[Path]) -> set[str]:
     """The faults that daemons wrote down."""
     return {name for log in logs if log.exists() for name in _LOGGED.findall(log.read_text(errors="replace"))}
@@ -192,7 +204,7 @@ class Judge:
         self._began: Reading | None = None
         self._file: Path | None = None
         self._fixtures: dict[str, Span] = {}
-        self._stalls = Stalls()
+        self._stalls, self._refused = Stalls(), refused()
 
     def pytest_unconfigure(self) -> None:
         """The last hook."""
@@ -228,7 +240,7 @@ class Judge:
         report = yield
         if report.failed and call.excinfo is not None and self._began is not None:
             spans = [self._since(self._began), *self._of_fixtures(item)]
-            evidence = next((span.starved for span in spans if span.starved), "")
+            evidence = next((span.starved for span in spans if span.starved), self._refused)
             times_alone = item.get_closest_marker("wall_clock") is not None
             if evidence and by_lateness(call.excinfo.value, times_alone, logged(LOGS)):
                 report.outcome = "skipped"
@@ -238,7 +250,7 @@ class Judge:
 
     def evidence(self) -> str:
         """What says that the machine was starved since the present test began; empty where nothing does."""
-        return "" if self._began is None else self._since(self._began).starved
+        return "" if self._began is None else self._since(self._began).starved or self._refused
 
     def _since(self, first: Reading) -> Span:
         last = read()

@@ -121,7 +121,7 @@ def test_loop_outlives_its_supervisor_and_brakes_to_rest(results: Results) -> No
     killed = _of(results, "supervisor_killed")
     assert killed["torque_before_nm"] > 0.05
     assert killed["speed_at_end_rad_s"] < 0.05
-    assert killed["torque_at_end_nm"] < 0.05, "less than it sticks with; a whole ramp is one cycle of 20 ms here"
+    assert killed["torque_at_end_nm"] < 0.05, "less than it sticks with: the ramp is over"
     assert killed["drive_states"][0] == "OPERATION_ENABLED"
     assert not {"FAULT", "FAULT_REACTION_ACTIVE", "QUICK_STOP_ACTIVE"} & set(killed["drive_states"])
 

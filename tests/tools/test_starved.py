@@ -14,6 +14,7 @@ import source
 
 from servod.client.control import Refused
 from servod.common.errors import BadInput, Unreachable
+from tests import starved
 from tests.starved import Reading, Span, Stalls, between, by_lateness, logged, read
 
 TESTS = """
@@ -52,16 +53,20 @@ from tests import starved
 def pytest_configure(config):
     count = itertools.count()
     starved.read = lambda: starved.Reading(n := next(count), n * {busy}, 0.0, n * {waited})
+    starved.refused = lambda: {refused!r}
     judge = starved.Judge()
     config.pluginmanager.register(judge, "starved")
     config.pluginmanager.register(starved.OnceMore(judge), "once_more")
 """
 
 
-def outcomes(folder: Path, busy: float, waited: float, text: str = TESTS) -> tuple[dict[str, str], str]:
+def outcomes(
+    folder: Path, busy: float, waited: float, text: str = TESTS, refused: str = ""
+) -> tuple[dict[str, str], str]:
     """Outcome of every test in a run of its own, on a machine with these counts in each second; and what was said."""
     (folder / "test_axis.py").write_text(text)
-    (folder / "conftest.py").write_text(CONFTEST.format(busy=busy * (os.cpu_count() or 1), waited=waited))
+    made = CONFTEST.format(busy=busy * (os.cpu_count() or 1), waited=waited, refused=refused)
+    (folder / "conftest.py").write_text(made)
     (folder / "pytest.ini").write_text("[pytest]\nmarkers =\n  serial\n  wall_clock\n")
     command = [sys.executable, "-m", "pytest", "-v", "-rs", "-p", "no:cacheprovider", "-p", "no:xdist", str(folder)]
     environment = os.environ | {"PYTHONPATH": str(source.ROOT), "COLUMNS": "300"}
@@ -77,6 +82,20 @@ def test_on_a_starved_machine_lateness_is_told_and_all_else_fails(tmp_path: Path
     found, said = outcomes(tmp_path, busy=0.9, waited=0.8)
     assert found == FAILED_ALWAYS | dict.fromkeys(OF_TIME, "SKIPPED") | {"test_it_passes": "PASSED"}, said
     assert "the machine was starved: other programs had 90% of" in said
+
+
+def test_where_the_loop_may_not_go_before_others_lateness_is_told_and_all_else_fails(tmp_path: Path) -> None:
+    found, said = outcomes(tmp_path, busy=0.0, waited=0.0, refused="no SCHED_FIFO")
+    assert found == FAILED_ALWAYS | dict.fromkeys(OF_TIME, "SKIPPED") | {"test_it_passes": "PASSED"}, said
+    assert "the machine was starved: no SCHED_FIFO" in said
+
+
+def test_a_refused_policy_is_told_and_a_granted_one_is_given_back() -> None:
+    """As root without limits, and as nobody."""
+    before = os.sched_getscheduler(0)
+    may = subprocess.run([sys.executable, "-c", HOLD], stderr=subprocess.DEVNULL).returncode == 0
+    assert bool(starved.refused()) != may
+    assert os.sched_getscheduler(0) == before
 
 
 ONCE_MORE = """

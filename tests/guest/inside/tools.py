@@ -15,7 +15,8 @@ DRIVE_RECORD = "/run/servod/drive.bin"
 CONFIG_FILE, GAINS_FILE = Path("/etc/servod/config/guest.yaml"), Path("/etc/servod/guest_pd.yaml")
 
 #: Slow on purpose: the guest's one CPU is many times slower than any machine that servod is for. One period is twenty
-#: of those that servod is made for, and the heartbeats go with it. A joint that was let go of may turn far.
+#: of those that servod is made for, and heartbeats and ramp go with it: braking within one cycle, a joint is let go of
+#: at whatever speed that cycle left it. A joint that was let go of may turn far.
 CONFIG = """
 name: guest
 bus: {interface: socketcan, channel: vcan0}
@@ -24,7 +25,7 @@ heartbeat: {master_period_ms: 200, drive_timeout_ms: 2000, node_period_ms: 200, 
 amplifier: {enable_timeout_s: 20}
 wiring_proof: {enabled: false}  # at 50 Hz the joint is far away before its first answer comes
 limits: {torque_nm: 0.9, torque_rate_nm_per_s: 400.0, speed_rad_s: 20.0, position_min_rad: -999, position_max_rad: 999,
-  following_error_rad: 3.0, encoder_mismatch_rad: 0.5, stale_cycles: 100, late_cycles: 5000}
+  following_error_rad: 3.0, encoder_mismatch_rad: 0.5, stale_cycles: 100, late_cycles: 5000, ramp_down_s: 0.4}
 gains: {directory: /var/lib/servod/guest/gains, initial: /etc/servod/guest_pd.yaml, accept_uncertified: true}
 control: {socket: /run/servod/guest.sock, group: servod}
 recorder: {directory: /var/lib/servod/guest/recordings, history_s: 5}
