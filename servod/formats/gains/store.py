@@ -135,7 +135,7 @@ class GainStore:
             if mends:
                 self.mend()
         except OSError as error:
-            raise unwritable(f"gain store {directory}", error) from None
+            raise unwritable(f"gain store {error.filename or directory}", error) from None
 
     @contextlib.contextmanager
     def _locked(self) -> Iterator[None]:
@@ -147,11 +147,12 @@ class GainStore:
     def _sweep(self) -> None:
         """Remove what a kill left half-written, end a history line that it cut."""
         for leftover in self.directory.rglob("*.tmp"):
-            leftover.unlink()
-        if self._history_file.exists() and not self._history_file.read_bytes().endswith(b"\n"):
-            with self._history_file.open("ab") as file:
-                file.write(b"\n")
-        with contextlib.suppress(OSError):  # a disk that takes nothing: later
+            if leftover.is_file():
+                leftover.unlink()
+        with contextlib.suppress(OSError):  # a disk that takes nothing: later; no line of it is needed to run
+            if self._history_file.exists() and not self._history_file.read_bytes().endswith(b"\n"):
+                with self._history_file.open("ab") as file:
+                    file.write(b"\n")
             lines = self._history_lines()
             if len(lines) > 2 * _KEPT_LINES:
                 write_atomically(self._history_file, "\n".join(lines[-_KEPT_LINES:]) + "\n")
@@ -357,7 +358,10 @@ class GainStore:
     def _write_active(self, state: _Active) -> None:
         text = state.model_copy(update={"sha256": state.content_sha256()}).model_dump_json(indent=1) + "\n"
         write_atomically(self._active_file, text)
-        write_atomically(self._active_copy, text)
+        try:
+            write_atomically(self._active_copy, text)
+        except OSError as error:  # what is active is written and stands
+            log.warning("%s: without a copy (%s)", self._active_copy, reason(error))
 
     def _log(self, action: Action, stored: StoredSet, note: str = "", figures: dict[str, float] | None = None) -> None:
         entry = HistoryEntry(

@@ -230,3 +230,23 @@ def test_a_long_history_forgets_its_oldest_lines(tmp_path: Path, monkeypatch: py
     again = GainStore(tmp_path)
     assert [entry.action for entry in again.history()] == [Action.ACTIVATE] * 10
     assert again.get("bench_pd") == store.get("bench_pd")
+
+
+@pytest.mark.parametrize("name", ["history.jsonl", "active.copy.json", "x.1.tmp", "lock"])
+def test_a_folder_where_a_file_should_be_ends_no_start_but_for_the_lock_which_it_names(
+    tmp_path: Path, name: str
+) -> None:
+    store = GainStore(tmp_path)
+    store.load(good.PD, "x")
+    store.activate("bench_pd")
+    (tmp_path / name).unlink(missing_ok=True)
+    (tmp_path / name / "below").mkdir(parents=True)
+    if name == "lock":
+        with pytest.raises(BadInput, match=f"^gain store {tmp_path}/lock: is a folder, a file is needed$"):
+            GainStore(tmp_path)
+        return
+    again = GainStore(tmp_path)
+    again.load(good.LUGRE, "x")
+    again.activate("bench_lugre")
+    active = GainStore(tmp_path).active()
+    assert active is not None and active.name == "bench_lugre"
