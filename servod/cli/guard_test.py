@@ -15,8 +15,8 @@ from servod.common.portable import need_linux
 _ENDS = (signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM))
 _HELP = example(
     "Prove that the drive stops by itself when servod is dead. It is enabled at zero torque with the joint at rest, "
-    "then the commands stay away, then the heartbeat; each time the drive must stop within its time. Only while no "
-    "daemon runs the axis, with a hanging load held and nobody in reach.",
+    "then the commands stay away, then the heartbeat, then everything and SYNC too; each time the drive must stop "
+    "within its time. Only while no daemon runs the axis, with a hanging load held and nobody in reach.",
     "servoctl guard-test /etc/servod/axis.yaml",
 )
 

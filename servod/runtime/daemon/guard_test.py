@@ -61,13 +61,16 @@ _TRIES = 3
 _LOOK_CYCLES = 3
 #: What the drive tells when each guard acts.
 _TOLD = {"commands": Emcy.RPDO_TIME_OUT, "heartbeat": Emcy.HEARTBEAT_LOST}
+_EVERYTHING = "everything"
+#: A proof of fewer is none.
+_SILENCES = [*_TOLD, _EVERYTHING]
 _EXPECTED = (Emcy.HEARTBEAT_LOST, Emcy.RPDO_TIME_OUT)
 
 
 @dataclass(frozen=True)
 class GuardResult:
-    """One guard: the silence that it watches for, the time that it has, when the drive had left the command, and when
-    it was without power; in ms since the last frame. None: not within its time."""
+    """One silence: what stays away, the time that the guard against it has, when the drive had left the command, and
+    when it was without power; in ms since the last frame. None: not within its time."""
 
     guard: str
     limit_ms: float
@@ -78,6 +81,14 @@ class GuardResult:
     def passed(self) -> bool:
         """The drive stopped by itself, in time."""
         return self.left_ms is not None and self.left_ms <= self.limit_ms and self.off_ms is not None
+
+
+class _Silence(NamedTuple):
+    """What stays away, the guard that is counted on against it, and its time."""
+
+    name: str
+    guard: str
+    limit_ms: float
 
 
 class _Seen(NamedTuple):
@@ -102,7 +113,7 @@ def terms(amplifier: NodePlan, identity: Any) -> dict[str, Any]:
     ways = {Obj402.QUICK_STOP_OPTION, Obj402.FAULT_REACTION_OPTION, Obj402.ABORT_CONNECTION, Obj301.ERROR_BEHAVIOUR,
             Obj301.HEARTBEAT_CONSUMER, Obj301.RPDO_PARAMETER}  # fmt: skip
     guards = [list(guard) for guard in amplifier.facts.get("guards", ()) if guard[0] in ways]
-    return {"drive": asdict(identity), "guards": guards}
+    return {"drive": asdict(identity), "guards": guards, "silences": _SILENCES}
 
 
 class GuardTest:
@@ -133,22 +144,28 @@ class GuardTest:
         up = master.bring_up()
         facts = up.amplifier.facts
         found = terms(up.amplifier, master.identity(up.amplifier.node_id))
-        silences = [("commands", facts["command_deadline_ms"]), ("heartbeat", facts["heartbeat_timeout_ms"])]
-        counted = [(guard, limit_ms) for guard, limit_ms in silences if limit_ms and self._counts(guard, facts)]
+        guards = [("commands", facts["command_deadline_ms"]), ("heartbeat", facts["heartbeat_timeout_ms"])]
+        counted = [
+            _Silence(guard, guard, float(limit_ms))
+            for guard, limit_ms in guards
+            if limit_ms and self._counts(guard, facts)
+        ]
         if not counted:
             raise AnswerIsNo("no guard of this drive is counted on (amplifier.unguarded): there is nothing to test")
-        for number, (guard, limit_ms) in enumerate(counted):
+        # As when this computer dies: without SYNC, too, at which alone some drives look at what else is overdue.
+        dead = min(counted, key=lambda silence: silence.limit_ms)._replace(name=_EVERYTHING)
+        for number, silence in enumerate([*counted, dead]):
             up = up if number == 0 else master.bring_up()
-            results.append(self._tried(master, up, guard, float(limit_ms)))
+            results.append(self._tried(master, up, silence))
         self._reset_expected(master, up.amplifier.node_id)
         master.stand_down()
         return results, found
 
-    def _tried(self, master: Master, up: BringUp, guard: str, limit_ms: float) -> GuardResult:
-        """One guard, again where this machine was in the way. Raises Unreachable where it always was."""
+    def _tried(self, master: Master, up: BringUp, silence: _Silence) -> GuardResult:
+        """One silence, again where this machine was in the way. Raises Unreachable where it always was."""
         late: GuardResult | None = None
         for _ in range(_TRIES):
-            seen = self._try(master, up, guard, limit_ms)
+            seen = self._try(master, up, silence)
             if seen is not None and not seen.unsure:
                 return seen.result
             late = late or (seen.result if seen is not None and not seen.stalled else None)
@@ -156,15 +173,15 @@ class GuardTest:
         if late is not None:
             return late
         raise Unreachable(
-            f"{guard}: each time the drive told that another of its guards acted first, or was looked at too late, "
-            "since this machine stood still meanwhile: end what else runs here, then test again"
+            f"{silence.name}: each time the drive told that another of its guards acted first, or was looked at too "
+            "late, since this machine stood still meanwhile: end what else runs here, then test again"
         )
 
     @staticmethod
     def _counts(guard: str, facts: dict[str, Any]) -> bool:
         return guard == "commands" or bool(facts.get("heartbeat_reaction"))
 
-    def _try(self, master: Master, up: BringUp, guard: str, limit_ms: float) -> _Seen | None:
+    def _try(self, master: Master, up: BringUp, silence: _Silence) -> _Seen | None:
         """Bring the drive to zero torque at rest, fall silent, and look until it is without power. However that ends,
         the drive is switched off. None where another guard acted."""
         bus, sdo = self._connect(), master.sdo(up.amplifier.node_id)
@@ -175,16 +192,17 @@ class GuardTest:
             end.callback(drive.run, Goal.OFF, 20)
             end.callback(setattr, drive, "silent", "")
             self._come_to_rest(drive, sdo)
-            drive.silent = guard
-            left_ms, off_ms, told, before_ms = self._look(sdo, drive, limit_ms)
+            drive.silent = silence.name
+            left_ms, off_ms, told, before_ms = self._look(sdo, drive, silence)
         # The first that it tells is the one that acted: others may follow while its ramp lasts.
-        if next((code for code in told if code in _TOLD.values()), _TOLD[guard]) != _TOLD[guard]:
+        acted = next((code for code in told if code in _TOLD.values()), None)
+        if silence.name != _EVERYTHING and acted not in (None, _TOLD[silence.guard]):
             return None
         # What the stop is reckoned with, and no more (servod.formats.stopping).
-        most_ms = limit_ms + CYCLES_BEHIND * self.period_ns / _MS
+        most_ms = silence.limit_ms + CYCLES_BEHIND * self.period_ns / _MS
         unsure = left_ms is not None and before_ms <= most_ms < left_ms
         stalled = left_ms is not None and left_ms - before_ms > _LOOK_CYCLES * self.period_ns / _MS
-        return _Seen(GuardResult(guard, most_ms, left_ms, off_ms), unsure, stalled)
+        return _Seen(GuardResult(silence.name, most_ms, left_ms, off_ms), unsure, stalled)
 
     def _come_to_rest(self, drive: _Cycles, sdo: SdoAccess) -> None:
         reads_inputs = self._config.amplifier.inputs.estop_bit is not None or self._config.amplifier.inputs.tells_sto
@@ -212,12 +230,12 @@ class GuardTest:
                 raise AnswerIsNo("the joint moves without torque: hold its load (brake, support), then test again")
 
     def _look(
-        self, sdo: SdoAccess, drive: _Cycles, limit_ms: float
+        self, sdo: SdoAccess, drive: _Cycles, silence: _Silence
     ) -> tuple[float | None, float | None, list[int], float]:
         """When the drive had left the command at the latest, when it was without power, the codes that it told, and
         until when at least it had not left. Its status word is asked for by SDO in each cycle: PDOs may end with the
         reaction."""
-        last_ns, told = drive.last_ns[drive.silent], list[int]()
+        last_ns, limit_ms, told = drive.last_ns[silence.guard], silence.limit_ms, list[int]()
         before_ms = 0.0
         left_ms: float | None = None
         most_ms = 2.0 * limit_ms + 1e3 * self._config.amplifier.enable_timeout_s
@@ -275,13 +293,14 @@ class _Cycles:
             if self._clock.now_ns() >= self._beat_ns:
                 self._beat_ns = self._clock.now_ns() + self._test.beat_ns
                 self._send("heartbeat", self._test.beat_id, bytes((NmtState.OPERATIONAL,)))
-            self._bus.send(SYNC_ID, b"")
+            if self.silent != _EVERYTHING:
+                self._bus.send(SYNC_ID, b"")
             feedback = self._amplifier.read()
             self._send("commands", *self._amplifier.write(AmplifierCommand(goal, 0.0, False, reset)))
         return feedback
 
     def _send(self, what: str, can_id: int, data: bytes) -> None:
-        if what != self.silent:
+        if self.silent not in (what, _EVERYTHING):
             self._bus.send(can_id, data)
             self.last_ns[what] = self._clock.now_ns()
 

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from servod.common.errors import AnswerIsNo, Unreachable
+from servod.drivers.virtual.pdo import Rpdo
 from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.drivers.virtual.world import SteppedWorld
 from servod.formats.config import AxisConfig
@@ -29,6 +30,7 @@ from tests.axis_limits import LIMITS
 
 JOINT = {"inertia": 0.001, "friction": {"kind": "coulomb_viscous", "coulomb": 0.01, "viscous": 0.05}}
 DAY_S = 86_400.0
+SILENCES = ("commands", "heartbeat", "everything")
 
 
 def world_of(plant: dict[str, Any] | None = None, **settings: Any) -> SteppedWorld:
@@ -53,11 +55,13 @@ def tried(world: SteppedWorld, config: AxisConfig) -> tuple[list[GuardResult], d
 def test_each_guard_stops_the_drive_in_its_time(tmp_path: Path, reaction: int) -> None:
     world = world_of()
     results, _ = tried(world, axis(tmp_path, amplifier={"heartbeat_reaction": reaction}))
-    assert [(result.guard, result.passed) for result in results] == [("commands", True), ("heartbeat", True)]
-    commands, heartbeat = results
+    assert {result.guard: result.passed for result in results} == dict.fromkeys(SILENCES, True)
+    commands, heartbeat, everything = results
     assert 19.0 <= (commands.left_ms or 0) <= 25.0
     assert 50.0 <= (heartbeat.left_ms or 0) <= 103.0
-    assert (commands.limit_ms, heartbeat.limit_ms) == (23.0, 103.0)  # what the stop is reckoned with, and no more
+    assert 19.0 <= (everything.left_ms or 0) <= 25.0
+    limits_ms = [result.limit_ms for result in results]
+    assert limits_ms == [23.0, 103.0, 23.0]  # what the stop is reckoned with, and no more
     assert world.amplifier.machine.state is DriveState.SWITCH_ON_DISABLED  # the fault that the test caused is gone
     assert world.truth().torque_nm == 0.0
 
@@ -193,13 +197,35 @@ def test_a_drive_that_only_tells_is_found(tmp_path: Path) -> None:
     world = world_of(command_deadline="tells")
     world.amplifier.dictionary.set_default(0x2007, 0, 1)
     results, _ = tried(world, axis(tmp_path))
-    assert [(result.guard, result.passed) for result in results] == [("commands", False), ("heartbeat", True)]
+    assert [result.passed for result in results] == [False, True, False]
     assert world.amplifier.machine.state.unpowered
+
+
+def test_a_drive_that_looks_at_its_deadline_at_sync_alone_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the commands alone away it stops in time; when this computer dies there is no SYNC either."""
+    missed, applied = Rpdo._missed, Rpdo.apply
+    late: dict[Rpdo, int] = {}
+
+    def apply(rpdo: Rpdo) -> bool:
+        if rpdo in late:
+            late.pop(rpdo)
+            missed(rpdo, world.clock.now_ns())
+        return applied(rpdo)
+
+    monkeypatch.setattr(Rpdo, "_missed", lambda rpdo, time_ns: late.update({rpdo: time_ns}))
+    monkeypatch.setattr(Rpdo, "apply", apply)
+    world = world_of()
+    results, _ = tried(world, axis(tmp_path))
+    assert {result.guard: result.passed for result in results} == dict(zip(SILENCES, (True, True, False), strict=True))
+    assert 50.0 <= (results[2].left_ms or 0) <= 103.0  # by the heartbeat
 
 
 def test_where_only_the_heartbeat_counts_only_it_is_tried(tmp_path: Path) -> None:
     results, _ = tried(world_of(command_deadline="none"), axis(tmp_path))
-    assert [(result.guard, result.passed) for result in results] == [("heartbeat", True)]
+    assert [(result.guard, result.passed) for result in results] == [("heartbeat", True), ("everything", True)]
+    assert results[1].limit_ms == 103.0
     with pytest.raises(AnswerIsNo, match="nothing to test"):
         tried(world_of(missing_objects=["1400:5", "6007"]), axis(tmp_path, amplifier={"unguarded": True}))
 
