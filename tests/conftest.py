@@ -67,8 +67,8 @@ PROCESSES = (
 
 #: Files that take longest, the longest first: `./test` begins with them, so that no worker ends with one alone.
 DEAREST = (
-    *("lab/identify/test_walk.py", "qualify/faults/test_scenarios.py", "runtime/daemon/test_waiting.py"),
-    *("cli/test_elsewhere.py", "qualify/paper/test_cli.py"),
+    *("lab/identify/test_walk.py", "lab/diagnose/test_drive.py", "qualify/faults/test_scenarios.py"),
+    *("runtime/daemon/test_waiting.py", "cli/test_elsewhere.py", "qualify/paper/test_cli.py"),
     *("runtime/loop/test_channel_flips.py", "runtime/daemon/test_defence.py", "runtime/loop/test_foreign.py"),
     *("lab/deploy/test_deployment.py", "cli/test_synthesize.py", "lab/commission/test_walk.py", "cli/test_demo.py"),
     *("lab/verify/test_cli.py", "lab/synthesize/test_reference.py", "qualify/blind/test_cases.py"),
