@@ -356,8 +356,9 @@ FAULTS: dict[FaultCode, Fault] = dict(
         _row(
             _C.DUPLICATE_NODE,
             _R.QUICK_STOP,
-            "Two senders use one node id: heartbeats come between those of the node, or an EMCY takes back an error "
-            "that was never heard of, because somebody else sent it or because the bus lost the error's own frame.",
+            "Two senders use one node id: heartbeats come between those of the node, heartbeat or EMCY have another "
+            "length than CiA 301 gives them, or an EMCY takes back an error that was never heard of, because somebody "
+            "else sent it or because the bus lost the error's own frame.",
             "Give each node its own id (`servoctl scan` shows who is there), find who sends in its name, or mend the "
             "bus where it was disturbed; then restart the daemon.",
         ),

@@ -163,7 +163,8 @@ class NodeWatch:
         self._errors, self._none_left_ns = max(self._errors, 1), 0
 
     def _on_heartbeat(self, _can_id: int, data: bytearray, time_ns: float) -> None:
-        if not data:
+        if len(data) != 1:
+            self._misshapen("heartbeat", data, 1)
             return
         state = data[0] & _TOGGLE_MASK
         previous, self.nmt_state = self.nmt_state, state
@@ -187,7 +188,8 @@ class NodeWatch:
             self.add(FaultCode.NODE_LEFT_OPERATIONAL, text, state)
 
     def _on_emcy(self, _can_id: int, data: bytearray, time_ns: float) -> None:
-        if len(data) < _EMCY.size:
+        if len(data) != _EMCY.size:
+            self._misshapen("EMCY", data, _EMCY.size)
             return
         code, register, maker = _EMCY.unpack_from(data)
         if code & 0xFF00 == 0:
@@ -219,6 +221,11 @@ class NodeWatch:
         if not self._answers.answered(can_id):
             text = f"node {self.node_id}: SDO answer that this master did not ask for, {data.hex(' ')}"
             self._blame(FaultCode.FOREIGN_SDO, text, 0)
+
+    def _misshapen(self, what: str, data: bytearray, size: int) -> None:
+        """CiA 301 gives the frame one length; it says nothing that could be believed, and no node sends it."""
+        text = f"node {self.node_id}: {what} of {len(data)} bytes instead of {size} ({data.hex(' ')})"
+        self._blame(FaultCode.DUPLICATE_NODE, text, 0)
 
     def _blame(self, fault: FaultCode, text: str, code: int) -> None:
         """Somebody else was heard."""

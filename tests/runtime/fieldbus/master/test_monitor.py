@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Iterator
 
@@ -85,11 +86,22 @@ def test_an_error_that_is_cleared_is_no_event(axis: tuple[Witness, Master]) -> N
     assert [event.fault for event in events_until(axis[1], bool)] == [FaultCode.DUPLICATE_NODE]
 
 
-def test_short_heartbeat_and_emcy_frames_are_ignored(axis: tuple[Witness, Master]) -> None:
+@pytest.mark.parametrize(
+    ("can_id", "data", "said"),
+    [
+        (0x701, b"", "heartbeat of 0 bytes instead of 1"),
+        (0x701, b"\x05\x05", "heartbeat of 2 bytes instead of 1"),
+        (0x081, b"\x30\x81", r"EMCY of 2 bytes instead of 8 \(30 81\)"),
+        (0x082, b"\x00\x10\x01\x00\x00\x00\x00", "node 2: EMCY of 7 bytes instead of 8"),
+    ],
+)
+def test_frames_of_another_length_than_cia_301_gives_them_are_somebody_elses(
+    axis: tuple[Witness, Master], can_id: int, data: bytes, said: str
+) -> None:
     world, instance = axis
-    world.network.send_message(0x701, b"")
-    world.network.send_message(0x081, b"\x30\x81")
-    assert events_until(instance, bool, 0.1) == []
+    world.network.send_message(can_id, data)
+    (event,) = events_until(instance, bool)
+    assert event.fault is FaultCode.DUPLICATE_NODE and re.search(said, event.text)
 
 
 def test_a_reset_that_we_ask_for_is_no_event(axis: tuple[Witness, Master]) -> None:
