@@ -84,6 +84,7 @@ class Verbs:
         self._renew_ns: int | None = None  # of that motion
         self.abandoned = ""  # why that motion ended before its time, when its client let go of it
         self._leases_ended = 0
+        self._stopping = 0  # requests to stop without an answer yet
         self._enabling = 0  # requests to enable an axis that was off, without an answer yet
         self.slow = ThreadPoolExecutor(max_workers=1, thread_name_prefix="slow")
         self._table: dict[Verb, Callable[[Any], Request]] = {
@@ -194,6 +195,8 @@ class Verbs:
 
     async def _enable(self, args: EnableArgs) -> dict[str, Any]:
         require_proof(self._proof())
+        if self._stopping:  # whichever came first: two connections are not always read in the order that they wrote
+            raise Unreachable("refused: somebody stops the axis at this moment; enable it once that is over")
         record = self._loop.latest
         from_off = int(record is None or not AxisState(record.axis_state).under_way)
         self._enabling += from_off
@@ -221,16 +224,20 @@ class Verbs:
         raise Unreachable(f"the axis is {state}, not enabled: {_why_not_enabled(record)}")
 
     async def _disable(self, _args: NoArgs) -> dict[str, Any]:
-        await self._send_stop(Op.DISABLE)
-        return await self._until_off(2.0 * self._config.limits.ramp_down_s + self._config.amplifier.brake.engage_s)
+        return await self._until_off(Op.DISABLE, 2.0 * self._config.limits.ramp_down_s)
 
     async def _stop(self, _args: NoArgs) -> dict[str, Any]:
-        await self._send_stop(Op.QUICK_STOP)
-        return await self._until_off(self._config.amplifier.enable_timeout_s + self._config.amplifier.brake.engage_s)
+        return await self._until_off(Op.QUICK_STOP, self._config.amplifier.enable_timeout_s)
 
-    async def _until_off(self, usual_s: float) -> dict[str, Any]:
-        """Done only when the axis has stopped and the drive itself was seen without power."""
-        record = await self._until(_is_off, usual_s + _STOP_TIMEOUT_S)
+    async def _until_off(self, op: Op, usual_s: float) -> dict[str, Any]:
+        """Done only when the axis has stopped and the drive itself was seen without power; nobody enables it before."""
+        self._stopping += 1
+        try:
+            await self._send_stop(op)
+            timeout_s = usual_s + self._config.amplifier.brake.engage_s + _STOP_TIMEOUT_S
+            record = await self._until(_is_off, timeout_s)
+        finally:
+            self._stopping -= 1
         if not _is_off(record):
             axis, drive = AxisState(record.axis_state).name, DriveState(record.drive_state).name
             heard = f"heard {record.amplifier_age} cycles ago" if record.amplifier_age else "heard now"

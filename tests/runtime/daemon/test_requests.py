@@ -413,6 +413,28 @@ async def test_stop_that_stopped_nothing_is_no_success(
     assert says in answers.sent[0]["error"]["message"]
 
 
+@pytest.mark.parametrize("verb", [Verb.STOP, Verb.DISABLE])
+@on_event_loop
+async def test_an_enable_that_is_read_behind_a_stop_that_has_no_answer_yet_is_void(
+    verbs: tuple[Verbs, _Loop], verb: Verb
+) -> None:
+    """Two connections are not always read in the order that they wrote: the stop may have come after it."""
+    front, loop = verbs
+    off = {"axis_state": AxisState.DISABLED, "drive_state": DriveState.SWITCH_ON_DISABLED}
+    loop.latest = record(1, **off)
+    stopped, enabled = _Answers(), _Answers()
+    front.handle(verb, {}, stopped.reply())
+    front.handle(Verb.ENABLE, {}, enabled.reply())
+    assert "somebody stops the axis" in enabled.sent[0]["error"]["message"]
+    for _ in range(2):
+        loop.latest = record(2, command_seq=1, **off)
+        front.tick([loop.latest], time.monotonic_ns())
+        await events_pass()
+    assert stopped.sent[0]["ok"] and Op.ENABLE not in loop.sent
+    front.handle(Verb.ENABLE, {}, _Answers().reply())
+    assert loop.sent[-1] is Op.ENABLE
+
+
 @on_event_loop
 async def test_stops_one_after_the_other_are_one_command_until_the_loop_has_taken_it(
     verbs: tuple[Verbs, _Loop],
