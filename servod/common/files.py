@@ -118,13 +118,28 @@ def require_size(path: str | Path, stream: BinaryIO, most_bytes: int) -> None:
 def open_file(path: str | Path) -> BinaryIO:
     """A file to read from, which is no pipe and no device. Raises OSError."""
     descriptor = os.open(path, _READING)
-    kind = stat.S_IFMT(os.fstat(descriptor).st_mode)
-    if kind == stat.S_IFREG:
-        return os.fdopen(descriptor, "rb")
-    os.close(descriptor)
+    try:
+        _require_file(path, os.fstat(descriptor))
+    except OSError:
+        os.close(descriptor)
+        raise
+    return os.fdopen(descriptor, "rb")
+
+
+def open_to_append(path: Path) -> BinaryIO:
+    """A file to write to at its end, made where there is none; no pipe and no device. Raises OSError."""
+    with contextlib.suppress(FileNotFoundError):
+        _require_file(path, path.stat())
+    return path.open("ab")
+
+
+def _require_file(path: str | Path, found: os.stat_result) -> None:
+    """Raise OSError for a folder, and for what might not end."""
+    kind = stat.S_IFMT(found.st_mode)
     if kind == stat.S_IFDIR:
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-    raise OSError(errno.EINVAL, f"a {_KINDS.get(kind, 'special file')}, which might not end")
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if kind != stat.S_IFREG:
+        raise OSError(errno.EINVAL, f"a {_KINDS.get(kind, 'special file')}, which might not end", str(path))
 
 
 # --- Writing ---------------------------------------------------------------------------------------------------------

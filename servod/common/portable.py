@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from servod.common.errors import Unreachable
 
@@ -32,7 +32,7 @@ def usable_cores() -> int:
     return os.cpu_count() or 1
 
 
-def lock_file(file: IO[str], wait: bool) -> None:
+def lock_file(file: IO[Any], wait: bool) -> None:
     """Lock an open file until it is closed or the process ends. Raises OSError when another has it, unless `wait`."""
     _lock(file.fileno(), wait)
 

@@ -252,3 +252,19 @@ def test_a_loop_without_its_supervisor_lets_a_law_run_away_until_its_ramp_is_ove
     )
     assert long.travel_rad == pytest.approx(3.0 * 0.093 + 3.6 * (0.006 + 0.5 * 3.6 / long.facts.deceleration_rad_s2))
     assert short.travel_rad < long.travel_rad
+    drive_s = short.time_s - short.facts.hold_s  # the drive's part, where its own reaction is the longest of all
+    assert long.time_s == pytest.approx(max(2.0 * long.ramp_down_s, long.ramp_down_s + drive_s) + 0.003)
+
+
+def test_the_ramp_of_a_loop_alone_leaves_the_drive_its_time() -> None:
+    """Both within the time that is asked for: braking by the loop, then the stop of the drive."""
+    heavy = stated(axis({"least_inertia": 0.02, "least_friction_nm": 0.01}))
+    drive_s = heavy.facts.speed_rad_s * 1.2 / heavy.facts.deceleration_rad_s2 + 2.0 * heavy.facts.lag_s
+    assert heavy.ramp_down_s + 0.003 + drive_s <= 0.06 + 1e-6
+    assert heavy.time_s == pytest.approx(0.06, rel=1e-3)
+
+
+@pytest.mark.parametrize(("gear_ratio", "told"), [(1.0, False), (10.0, True), (100.0, True)])
+def test_rest_that_is_seen_late_behind_a_gear_is_told(gear_ratio: float, told: bool) -> None:
+    lines = stated(axis(LIGHT, amplifier={"gear_ratio": gear_ratio})).lines()
+    assert any("the drive may see the rest later" in line for line in lines) is told

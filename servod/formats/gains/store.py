@@ -31,7 +31,16 @@ from pathlib import Path
 from pydantic import Field
 
 from servod.common.errors import BadInput
-from servod.common.files import make_folder, read_text, reason, unreadable, unwritable, write_atomically
+from servod.common.files import (
+    make_folder,
+    open_to_append,
+    read_bytes,
+    read_text,
+    reason,
+    unreadable,
+    unwritable,
+    write_atomically,
+)
 from servod.common.portable import lock_file
 from servod.common.yaml import Strict, load_model
 from servod.formats.gains.gain_set import NAME_PATTERN, GainSet, Sha256, parse_gains, require_certificate
@@ -140,7 +149,7 @@ class GainStore:
     @contextlib.contextmanager
     def _locked(self) -> Iterator[None]:
         """One writer at a time, also across processes; the lock ends with the process, however it ends."""
-        with (self.directory / "lock").open("w") as file:
+        with open_to_append(self.directory / "lock") as file:
             lock_file(file, wait=True)
             yield
 
@@ -150,8 +159,8 @@ class GainStore:
             if leftover.is_file():
                 leftover.unlink()
         with contextlib.suppress(OSError):  # a disk that takes nothing: later; no line of it is needed to run
-            if self._history_file.exists() and not self._history_file.read_bytes().endswith(b"\n"):
-                with self._history_file.open("ab") as file:
+            if self._history_file.exists() and not self._history_bytes().endswith(b"\n"):
+                with open_to_append(self._history_file) as file:
                     file.write(b"\n")
             lines = self._history_lines()
             if len(lines) > 2 * _KEPT_LINES:
@@ -324,10 +333,14 @@ class GainStore:
         return entries
 
     def _history_lines(self) -> list[str]:
+        return self._history_bytes().decode("utf-8", errors="replace").splitlines()
+
+    def _history_bytes(self) -> bytes:
+        """Nothing where it cannot be read, or is no file."""
         try:
-            return self._history_file.read_text(encoding="utf-8", errors="replace").splitlines()
-        except OSError:
-            return []
+            return read_bytes(self._history_file)
+        except BadInput:
+            return b""
 
     def _versions(self, name: str) -> list[int]:
         folder = self._sets / name
@@ -374,8 +387,8 @@ class GainStore:
             figures=figures or {},
         )
         try:
-            with self._history_file.open("a", encoding="utf-8") as file:
-                file.write(entry.model_dump_json() + "\n")
+            with open_to_append(self._history_file) as file:
+                file.write(entry.model_dump_json().encode() + b"\n")
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:  # what the line tells of is done and stands: a full disk shall not call it undone
@@ -385,8 +398,8 @@ class GainStore:
 def _holds(path: Path, text: str) -> bool:
     """Whether a file has just this text."""
     try:
-        return path.read_bytes() == text.encode()
-    except OSError:
+        return read_bytes(path) == text.encode()
+    except BadInput:
         return False
 
 

@@ -51,8 +51,13 @@ from servod.runtime.fieldbus.registry import amplifier_of
 PROOF_NAME = "guard-proof.json"
 _S_PER_DAY = 86_400.0
 _MS = 1_000_000
-#: At rest under no torque for so many cycles before the silence, and no further than this from where it was [rad].
-_REST_CYCLES, _REST_RAD = 50, 0.02
+#: Before each silence the drive stays enabled at rest with everything there, for so many times the longest guard's time
+#: and cycles more, and no further than this from where it was [rad]: what ends by itself is no reaction to silence.
+_REST_TIMES, _REST_CYCLES, _REST_RAD = 2.0, 50, 0.02
+#: A guard acts not before this share of its time, however coarse its timer: what does is another reason to stop.
+_EARLIEST_SHARE = 0.4
+#: A drive that has stopped stays so in the silence that goes on, for its guard's time once more and at least this [ms].
+_STAYS_OFF_MS = 50.0
 #: With inputs to be read: they come by an event timer, and those that do not come count as active after 40 ms.
 _INPUTS_S = 0.06
 #: A machine that stands still lets the other guard act, or does not see when the drive stopped: tried anew, so often.
@@ -124,6 +129,7 @@ class GuardTest:
         self._config, self._connect, self.clock = narrowed_by_stop(config)[0], connect, clock
         # A drive that holds for a brake that servod closes stays in quick stop active, and has stopped there.
         self._holds = config.amplifier.brake.by == "output" and quick_stop_stays(config.amplifier.quick_stop_option)
+        self._longest_ms = 0.0
         self.period_ns = config.cycle.period_us * 1000
         self.beat_ns = config.heartbeat.master_period_ms * _MS
         self.beat_id = HEARTBEAT_BASE + config.heartbeat.master_node_id
@@ -152,6 +158,7 @@ class GuardTest:
         ]
         if not counted:
             raise AnswerIsNo("no guard of this drive is counted on (amplifier.unguarded): there is nothing to test")
+        self._longest_ms = max(silence.limit_ms for silence in counted)
         # As when this computer dies: without SYNC, too, at which alone some drives look at what else is overdue.
         dead = min(counted, key=lambda silence: silence.limit_ms)._replace(name=_EVERYTHING)
         for number, silence in enumerate([*counted, dead]):
@@ -191,9 +198,16 @@ class GuardTest:
             end.callback(sdo.write, Obj402.CONTROL_WORD, 0, CW_DISABLE_VOLTAGE)  # its PDOs may have ended
             end.callback(drive.run, Goal.OFF, 20)
             end.callback(setattr, drive, "silent", "")
-            self._come_to_rest(drive, sdo)
+            self._enable(drive, sdo)
+            if not self._rests(drive, sdo):
+                return None
             drive.silent = silence.name
             left_ms, off_ms, told, before_ms = self._look(sdo, drive, silence)
+        if left_ms is not None and left_ms < _EARLIEST_SHARE * silence.limit_ms:
+            raise AnswerIsNo(
+                f"{silence.name}: the drive left the command {left_ms:.1f} ms into the silence, and its guard acts "
+                f"after {silence.limit_ms:g} ms: it stops for another reason, which says nothing of its guard"
+            )
         # The first that it tells is the one that acted: others may follow while its ramp lasts.
         acted = next((code for code in told if code in _TOLD.values()), None)
         if silence.name != _EVERYTHING and acted not in (None, _TOLD[silence.guard]):
@@ -204,7 +218,7 @@ class GuardTest:
         stalled = left_ms is not None and left_ms - before_ms > _LOOK_CYCLES * self.period_ns / _MS
         return _Seen(GuardResult(silence.name, most_ms, left_ms, off_ms), unsure, stalled)
 
-    def _come_to_rest(self, drive: _Cycles, sdo: SdoAccess) -> None:
+    def _enable(self, drive: _Cycles, sdo: SdoAccess) -> None:
         reads_inputs = self._config.amplifier.inputs.estop_bit is not None or self._config.amplifier.inputs.tells_sto
         off = drive.run(Goal.OFF, round(_INPUTS_S * 1e9 / self.period_ns) if reads_inputs else 10)
         _refuse_stopped(off)
@@ -222,12 +236,25 @@ class GuardTest:
                 break
         else:
             raise Unreachable(f"the drive is {feedback.state.name}, not enabled, so its guards cannot be tried")
-        start_rad = feedback.position_rad
-        for _ in range(_REST_CYCLES):
+
+    def _rests(self, drive: _Cycles, sdo: SdoAccess) -> bool:
+        """Whether the drive stays enabled, at rest, with nothing silent; False where a guard acted since this machine
+        stood still. Raises AnswerIsNo where it leaves operation for another reason, or the joint moves."""
+        start_rad = drive.run(Goal.ENABLED, 1).position_rad
+        for _ in range(_REST_CYCLES + round(_REST_TIMES * self._longest_ms * _MS / self.period_ns)):
             feedback = drive.run(Goal.ENABLED, 1)
             _refuse_stopped(feedback)
             if abs(feedback.position_rad - start_rad) > _REST_RAD:
                 raise AnswerIsNo("the joint moves without torque: hold its load (brake, support), then test again")
+            if feedback.age_cycles == 0 and feedback.state is not DriveState.OPERATION_ENABLED:
+                codes = {feedback.error_code, sdo.read(Obj402.ERROR_CODE)}
+                if codes & set(_EXPECTED):
+                    return False
+                raise AnswerIsNo(
+                    f"the drive leaves operation by itself ({feedback.state.name}, error 0x{max(codes):04X}) while "
+                    "nothing is silent: remove the cause, then test again"
+                )
+        return True
 
     def _look(
         self, sdo: SdoAccess, drive: _Cycles, silence: _Silence
@@ -251,11 +278,24 @@ class GuardTest:
                 before_ms = asked_ms
             elif left_ms is None:
                 left_ms = answered_ms
-            if state.unpowered or (self._holds and state is DriveState.QUICK_STOP_ACTIVE):
-                return left_ms, answered_ms, told, before_ms
+            if self._stopped(state):
+                off_ms = answered_ms if self._stays_off(sdo, drive, limit_ms) else None
+                return left_ms, off_ms, told, before_ms
             if left_ms is None and since_ms > 2.0 * limit_ms + 100.0:
                 break
         return left_ms, None, told, before_ms
+
+    def _stopped(self, state: DriveState) -> bool:
+        return state.unpowered or (self._holds and state is DriveState.QUICK_STOP_ACTIVE)
+
+    def _stays_off(self, sdo: SdoAccess, drive: _Cycles, limit_ms: float) -> bool:
+        """Whether a drive that has stopped stays so while the silence goes on; where commands go out, they say off."""
+        end_ns = self.clock.now_ns() + round(max(limit_ms, _STAYS_OFF_MS) * _MS)
+        while self.clock.now_ns() < end_ns:
+            drive.run(Goal.QUICK_STOP if self._holds else Goal.OFF, 1)
+            if not self._stopped(decode_status_word(sdo.read(Obj402.STATUS_WORD))):
+                return False
+        return True
 
     def _reset_expected(self, master: Master, node_id: int) -> None:
         """The fault that the test itself has caused goes; any other stays as it is."""
@@ -329,7 +369,7 @@ def read_proof(config: AxisConfig) -> dict[str, Any] | None:
         told = proof.pop("sha256")
         sound = told == _sha256(proof) and math.isfinite(proof["time"])
         return {"time": float(proof["time"]), "terms": proof["terms"]} if sound else None
-    except (BadInput, AttributeError, KeyError, TypeError, ValueError):
+    except (BadInput, AttributeError, KeyError, TypeError, ValueError, OverflowError):  # a time of 400 digits
         return None
 
 

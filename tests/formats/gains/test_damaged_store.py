@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import os
 import random
 import shutil
 from collections.abc import Iterator
@@ -232,20 +233,25 @@ def test_a_long_history_forgets_its_oldest_lines(tmp_path: Path, monkeypatch: py
     assert again.get("bench_pd") == store.get("bench_pd")
 
 
-@pytest.mark.parametrize("name", ["history.jsonl", "active.copy.json", "x.1.tmp", "lock"])
-def test_a_folder_where_a_file_should_be_ends_no_start_but_for_the_lock_which_it_names(
-    tmp_path: Path, name: str
+@pytest.mark.parametrize("kind", ["folder", "pipe"])
+@pytest.mark.parametrize("name", ["history.jsonl", "active.copy.json", "x.1.tmp", "lock", "sets/bench_pd/0001.yaml"])
+def test_no_file_where_one_should_be_ends_no_start_but_for_the_lock_which_it_names(
+    tmp_path: Path, name: str, kind: str
 ) -> None:
     store = GainStore(tmp_path)
     store.load(good.PD, "x")
     store.activate("bench_pd")
     (tmp_path / name).unlink(missing_ok=True)
-    (tmp_path / name / "below").mkdir(parents=True)
+    if kind == "folder":
+        (tmp_path / name / "below").mkdir(parents=True)
+    else:
+        os.mkfifo(tmp_path / name)
     if name == "lock":
-        with pytest.raises(BadInput, match=f"^gain store {tmp_path}/lock: is a folder, a file is needed$"):
+        with pytest.raises(BadInput, match=f"^gain store {tmp_path}/lock: .*(a folder|a pipe)"):
             GainStore(tmp_path)
         return
     again = GainStore(tmp_path)
+    assert again.load(good.PD, "x").version == (2 if "sets" in name else 1)
     again.load(good.LUGRE, "x")
     again.activate("bench_lugre")
     active = GainStore(tmp_path).active()

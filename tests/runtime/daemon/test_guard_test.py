@@ -14,18 +14,22 @@ from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.drivers.virtual.world import SteppedWorld
 from servod.formats.config import AxisConfig
 from servod.formats.model.axis_model import AxisModel
+from servod.runtime.daemon import guard_test
 from servod.runtime.daemon.guard_test import (
     PROOF_NAME,
     GuardResult,
     GuardTest,
     ProofStatus,
     _Cycles,
+    _Silence,
     keep_proof,
     proof_status,
     read_proof,
     require_proof,
 )
+from servod.runtime.fieldbus.cia import decode_status_word
 from servod.runtime.fieldbus.devices import AmplifierFeedback, DriveState, Goal
+from servod.runtime.fieldbus.master import Master
 from tests.axis_limits import LIMITS
 
 JOINT = {"inertia": 0.001, "friction": {"kind": "coulomb_viscous", "coulomb": 0.01, "viscous": 0.05}}
@@ -201,6 +205,53 @@ def test_a_drive_that_only_tells_is_found(tmp_path: Path) -> None:
     assert world.amplifier.machine.state.unpowered
 
 
+@pytest.mark.parametrize(
+    ("after_ms", "says"),
+    [
+        (20, r"leaves operation by itself \(FAULT_REACTION_ACTIVE, error 0x7305\) while nothing is silent"),
+        (220, r"leaves operation by itself"),  # twice the heartbeat's time is not over yet
+        (255, r"commands: the drive left the command \d\.\d ms into the silence, and its guard acts after 20 ms"),
+    ],
+)
+def test_a_drive_that_stops_for_another_reason_proves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, after_ms: int, says: str
+) -> None:
+    """It trips so long after each enabling, whether anything is silent or not."""
+    world, run = world_of(), _Cycles.run
+    enabled_ns = 0
+
+    def tripping(drive: _Cycles, goal: Goal, cycles: int, reset: bool = False) -> AmplifierFeedback:
+        nonlocal enabled_ns
+        on = world.amplifier.machine.state is DriveState.OPERATION_ENABLED
+        enabled_ns = (enabled_ns or world.clock.now_ns()) if on else 0
+        tripped = enabled_ns and world.clock.now_ns() - enabled_ns > after_ms * 1_000_000
+        world.amplifier.dictionary.entry(0x2000, 1).value = 0x7305 if tripped else 0
+        return run(drive, goal, cycles, reset)
+
+    monkeypatch.setattr(_Cycles, "run", tripping)
+    with pytest.raises(AnswerIsNo, match=says):
+        tried(world, axis(tmp_path))
+    assert world.amplifier.machine.state.unpowered
+
+
+def test_a_drive_that_comes_back_in_the_silence_does_not_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    world, first_ns = world_of(), list[int]()
+
+    def told(word: int) -> DriveState:
+        state = decode_status_word(word)
+        if state.unpowered and not first_ns:
+            first_ns.append(world.clock.now_ns())
+        return DriveState.OPERATION_ENABLED if first_ns and world.clock.now_ns() > first_ns[0] + 20_000_000 else state
+
+    monkeypatch.setattr(guard_test, "decode_status_word", told)
+    silence = _Silence("commands", "commands", 20.0)
+    test = GuardTest(axis(tmp_path), world.connect, world.clock)
+    master = Master(test._config, world.connect(), world.clock, threaded=False)
+    seen = test._try(master, master.bring_up(), silence)
+    master.close()
+    assert seen is not None and seen.result.left_ms is not None and not seen.result.passed
+
+
 def test_a_drive_that_looks_at_its_deadline_at_sync_alone_is_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -266,7 +317,10 @@ def test_a_proof_holds_for_its_drive_its_guards_and_its_time(tmp_path: Path) -> 
         with pytest.raises(Unreachable, match="are others than those that were tested"):
             require_proof(_status(config, json.loads(json.dumps(tried(other, changed)[1])), now_s))
     whole = path.read_text()
+    endless = {**json.loads(whole), "time": 10**400}
+    del endless["sha256"]
     for broken in (
+        json.dumps({**endless, "sha256": guard_test._sha256(endless)}),
         "{",
         "[]",
         whole.replace(str(now_s), "NaN"),
