@@ -88,7 +88,7 @@ def describe_changes(changes: Mapping[str, FittedValue]) -> str:
 def _found(diagnosis: Diagnosis, evidence: Evidence) -> str:
     """What was found, when there was time for it."""
     if evidence.findings:
-        sentences = " ".join(f"{effect(one.effect).statement}." for one in evidence.findings)
+        sentences = " ".join(f"{_statement(one)}." for one in evidence.findings)
         return f"{sentences} {100.0 * evidence.quality.removed:.0f} % of the explainable mismatch is gone."
     if diagnosis.verdict is DiagnosisVerdict.CANNOT_TELL:
         return _too_little(diagnosis, evidence)
@@ -96,6 +96,12 @@ def _found(diagnosis: Diagnosis, evidence: Evidence) -> str:
         where = evidence.maps_before[0].coordinate
         return f"Something is left that no known physics explains; it shows most over {where}.{_part(evidence)}"
     return "The model is adequate: nothing worth naming is left beyond the noise."
+
+
+def _statement(found: NamedEffect) -> str:
+    """What was left out; of a number of the model's own, by how much it is off."""
+    said, over = effect(found.effect).statement, found.parameters.get("over_model")
+    return said if over is None else f"{said}, {over.value:.3g} times what the model says"
 
 
 def _part(evidence: Evidence) -> str:
@@ -121,7 +127,7 @@ def _too_little(diagnosis: Diagnosis, evidence: Evidence) -> str:
 def _finding(found: NamedEffect, force: str) -> Document:
     what = effect(found.effect)
     statement = (
-        f"{what.statement}. It carries {100.0 * found.removed_share:.0f} % of the explainable mismatch and "
+        f"{_statement(found)}. It carries {100.0 * found.removed_share:.0f} % of the explainable mismatch and "
         f"{100.0 * found.torque:.1f} % of dry friction where it acts. It shows as {what.shows}; it is strongest "
         f"{describe_place(found.effect, found.located)}."
     )

@@ -47,7 +47,7 @@ def explain_effect(name: str) -> dict[str, Any]:
 def _keys(found: Effect) -> list[dict[str, str]]:
     """Keys of the effect's group of the axis model, or the plain key itself."""
     if found.group is None:
-        return [] if found.drive_keys else [_key(found.name, AxisModel.model_fields[found.name])]
+        return [_key(found.name, AxisModel.model_fields[found.name])] if found.name in AxisModel.model_fields else []
     return _fields(found.name, found.group)
 
 

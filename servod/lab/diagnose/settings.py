@@ -256,6 +256,16 @@ class ForwardSettings:
 
 
 @dataclass(frozen=True)
+class JointSettings:
+    """Levels of the model's own friction, released together."""
+
+    #: They come before an effect that needs as many numbers and leaves no less than this share of what they leave,
+    as_good: float = 1.05
+    #: or as good as nothing, as they do: a share of what was there.
+    nothing: float = 0.002
+
+
+@dataclass(frozen=True)
 class GroupSettings:
     """Several effects at once, none of which takes much of what is left."""
 
@@ -460,6 +470,7 @@ class DiagnosisSettings:
     trials: TrialSettings = TrialSettings()
     worth: WorthSettings = WorthSettings()
     forward: ForwardSettings = ForwardSettings()
+    joint: JointSettings = JointSettings()
     group: GroupSettings = GroupSettings()
     swap: SwapSettings = SwapSettings()
     drift: DriftSettings = DriftSettings()

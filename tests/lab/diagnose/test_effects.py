@@ -92,8 +92,9 @@ def test_every_number_of_a_spring_has_its_own_unit() -> None:
 
 
 def test_a_gain_is_not_tried_beside_a_number_of_the_drive_that_is_one_with_it() -> None:
-    assert fitted_elsewhere(frozenset(("drive.torque_per_command",))) == {"torque_gain"}
-    assert fitted_elsewhere(frozenset(("drive.kp", "drive.emf_viscous"))) == {"torque_gain", "drive_gain"}
+    levels = {"dry_friction", "viscous_friction"}  # friction is free beside such a number
+    assert fitted_elsewhere(frozenset(("drive.torque_per_command",))) == {"torque_gain", *levels}
+    assert fitted_elsewhere(frozenset(("drive.kp", "drive.emf_viscous"))) == {"torque_gain", "drive_gain", *levels}
     assert not fitted_elsewhere(frozenset())
 
 
@@ -104,6 +105,9 @@ def test_a_record_has_the_name_of_its_file_and_the_group_of_its_key(name: str) -
     assert found.twin in {"", *NAMES} and bool(found.twin) == bool(found.lateness)
     if found.drive_keys:
         assert found.group is None and set(found.drive_keys) <= set(DriveLaw.model_fields)
+        return
+    if found.group is None and found.friction_keys:  # a level of the model's own friction
+        assert name not in AxisModel.model_fields
         return
     annotation = AxisModel.model_fields[name].annotation
     assert annotation is float if found.group is None else annotation == found.group | None

@@ -40,6 +40,8 @@ NAMES: tuple[str, ...] = (
     "encoder_eccentricity",
     "torque_offset",
     "disturbance",
+    "dry_friction",
+    "viscous_friction",
     "offset_drift",
     "goal_rate",
     "drive_gain",

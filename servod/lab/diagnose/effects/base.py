@@ -24,6 +24,9 @@ PHASE_OFF, PHASE_KNOWN = 0.03, 0.008
 #: Levels of the contract: static - coulomb and offset as shares of Coulomb friction, bristle as a factor, delay in s.
 STRIBECK_SHARE, OFFSET_SHARE, BRISTLE_FACTOR, DELAY_S = 0.25, 0.03, 2.0, 0.002
 
+#: From which share of its own level on dry or viscous friction is a finding.
+LEVEL_SHARE = 0.25
+
 #: The Stribeck velocity is known poorly and shows little; a wide bound keeps it from being a finding.
 STRIBECK_VELOCITY_FACTOR = 1.5
 
@@ -160,6 +163,14 @@ def _drift(document: Document, force: str) -> list[Unknown]:
     if per_s == 0.0:
         return []
     return [Unknown("offset_drift.per_s", f"{force}/s", per_s, min(per_s, 0.0), max(per_s, 0.0), abs(per_s), 1.0)]
+
+
+def off_by_share(nominal: Document, fitted: Document, key: str) -> float:
+    """By which share of what the model says a parameter is off; inf where the model says nothing of it and one is."""
+    was, now = get(nominal, key), get(fitted, key)
+    if was <= 0.0:
+        return math.inf if now > 0.0 else 0.0
+    return abs(now - was) / was
 
 
 def factor(nominal: Document, fitted: Document, key: str) -> float:

@@ -10,12 +10,20 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from servod.formats.model.keys import Group
-from servod.lab.diagnose.effects.hypothesis import Document, Reported, Teller, Term, Unknown, Writer, get
+from servod.lab.diagnose.effects.base import BACK_EMF, DRIVE_SCALES
+from servod.lab.diagnose.effects.hypothesis import LEVEL, Document, Reported, Teller, Term, Unknown, Writer, get, put
 from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.search_context import Peak, SearchContext
 
 #: By how much the model's own delay may be off beside a lag or a longer delay, s.
 OWN_DELAY_S = 0.0002
+
+
+#: Numbers of a drive beside which the model's friction is in a torque that somebody assumed, and is free anyway.
+ANOTHER_DRIVE = (*DRIVE_SCALES, BACK_EMF)
+
+#: How well a level of the model's own friction is known beforehand, as a factor, and by which it is off at most.
+LEVEL_KNOWN, LEVEL_MOST = 3.0, 30.0
 
 
 @dataclass(frozen=True)
@@ -33,7 +41,9 @@ class Effect:
     against the inertia alone, not on an axis that creeps; `directed` ones tell one direction from the other;
     `repeatable` ones may come in again with another period or place (a second harmonic is no second effect); where a
     number of the drive that is `one_with` theirs is fitted, they are not tried; those
-    that `soaks_up` take what others leave, and are too plain to be a detail where they are real.
+    that `soaks_up` take what others leave, and are too plain to be a detail where they are real; numbers of the model's
+    own that may all be off at once are tried `jointly` too. An effect is a special
+    case of those it is `within`, which leave as little with more numbers and are no rivals.
 
     For the verdict: `at_level` says of the nominal and the fitted model whether the effect is more than recalibration;
     with one that `scales_torques`, no recording tells the common factor on all torques of the axis. An effect and its
@@ -59,6 +69,8 @@ class Effect:
     repeatable: bool = False
     one_with: tuple[str, ...] = ()
     soaks_up: bool = False
+    jointly: bool = False
+    within: tuple[str, ...] = ()
     at_level: Callable[[Document, Document], bool] = lambda _nominal, _fitted: True
     scales_torques: bool = False
     twin: str = ""
@@ -95,6 +107,20 @@ def simple(effect: str, form: str, unknowns: Sequence[Unknown], **fixed: float |
     """A term whose unknowns are keys of the effect's own group."""
     write = keys(effect, [u.key for u in unknowns], **fixed)
     return Term(effect, form, tuple(unknowns), write, report_as_is(unknowns))
+
+
+def level(effect: str, nominal: Document, scales: tuple[str, ...], tell: Teller) -> Term:
+    """A term that is one factor on numbers of the model's own, which start at what they are in `nominal` beside it."""
+
+    def write(document: Document, values: Sequence[float]) -> None:
+        for key in scales:
+            if get(document, key) > 0.0:
+                put(document, key, values[0] * get(document, key))
+
+    known = math.log(LEVEL_KNOWN)
+    own = Unknown(LEVEL, "1", 1.0, 1.0 / LEVEL_MOST, LEVEL_MOST, spread=known)
+    begins = {key: get(nominal, key) for key in scales if get(nominal, key) > 0.0}
+    return Term(effect, "level", (own,), write, tell, begins=begins, scales=scales)
 
 
 def of_drive(effect: str, form: str, unknowns: Sequence[Unknown]) -> Term:

@@ -19,6 +19,9 @@ from numpy.typing import NDArray
 from servod.formats.model.axis_model import AxisModel
 
 Array = NDArray[np.float64]
+
+#: The key of an unknown that is a factor on the model's own: 1 is no effect.
+LEVEL = "level_factor"
 Document = dict[str, Any]
 
 
@@ -74,7 +77,8 @@ class Term:
     """One effect in one form: its unknowns, how they are written, and bounds of the model's own that it opens.
 
     `opens` maps keys of the base to new (low, high) and `begins` to start values. Terms without unknowns open only.
-    `each` writes what differs from recording to recording.
+    `each` writes what differs from recording to recording. Its first unknown is a factor on those keys of the model's
+    own that it `scales`.
     """
 
     effect: str
@@ -85,6 +89,7 @@ class Term:
     opens: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     begins: Mapping[str, float] = field(default_factory=dict)
     each: EachWriter | None = None
+    scales: tuple[str, ...] = ()
 
     @property
     def numbers(self) -> int:

@@ -41,6 +41,7 @@ EFFECT = Effect(
     terms=terms,
     look=Look("acceleration"),
     far=True,
+    jointly=True,
     swift=True,
     at_level=_at_level,
 )

@@ -59,11 +59,15 @@ def terms(scene: SearchContext) -> list[Term]:
 
 
 def _at_level(nominal: Document, fitted: Document) -> bool:
-    """The model's own curve must rise by a share of Coulomb friction; another curve has no level."""
+    """The model's own curve must rise by a share of Coulomb friction; another curve has no level.
+
+    What a factor on all dry friction makes of its rise is that of `dry_friction`.
+    """
     if "stribeck" in fitted:
         return True
-    was, now = (get(d, "friction.static") - get(d, "friction.coulomb") for d in (nominal, fitted))
-    return abs(now - was) >= STRIBECK_SHARE * get(nominal, "friction.coulomb")
+    was, now = ((get(d, "friction.static"), get(d, "friction.coulomb")) for d in (nominal, fitted))
+    level = now[1] / was[1]
+    return abs(now[0] - now[1] - level * (was[0] - was[1])) >= STRIBECK_SHARE * level * was[1]
 
 
 EFFECT = Effect(

@@ -13,19 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.formats.model.axis_model import AxisModel
-from servod.lab.diagnose.data.trace import CheckedTrace
-from servod.lab.diagnose.effects import effect
+from servod.lab.diagnose.effects import effects
 from servod.lab.diagnose.effects.disturbance import EVERY, NAME
-from servod.lab.diagnose.effects.hypothesis import Document, Reported
-from servod.lab.diagnose.effects.looks import Look, Split
+from servod.lab.diagnose.effects.hypothesis import LEVEL, Document, Reported, Unknown, get
 from servod.lab.diagnose.judge.covariance import bounded_error, inside_region
+from servod.lab.diagnose.judge.curves import course, signature, spectrum
 from servod.lab.diagnose.judge.free_run import window_errors, windows
 from servod.lab.diagnose.judge.judgement import JudgedSelection, write_table
 from servod.lab.diagnose.judge.locate import bands, locate
 from servod.lab.diagnose.judge.verdict import alternatives, confidence
-from servod.lab.diagnose.predict.coordinates import coordinates
 from servod.lab.diagnose.predict.floor import trace_floor
-from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.result import (
     Evidence,
     FittedValue,
@@ -36,9 +33,6 @@ from servod.lab.diagnose.result import (
     Quality,
     RecordingErrors,
     SearchEffort,
-    Signature,
-    SignaturePart,
-    Spectrum,
     Windows,
 )
 from servod.lab.diagnose.select.fit import Fit, on_bound
@@ -48,117 +42,6 @@ from servod.lab.diagnose.select.selection import Selection
 from servod.lab.diagnose.select.selector import Selector
 from servod.lab.diagnose.select.stepwise import DRIFT, power_of_means
 from servod.lab.diagnose.settings import SETTINGS
-
-# --- Curves of the page ----------------------------------------------------------------------------------------------
-# Curves that the page of a diagnosis draws: signatures of terms, errors over time and over frequency. The last stage of
-# the engine takes them from the judgement; what draws them computes nothing.
-
-
-_HALVES = {Split.DIRECTION: ("forward", "back"), Split.LOAD: ("command above zero", "command below zero")}
-
-
-def signature(judgement: JudgedSelection, place: int) -> Signature:
-    """What is left without the term at `place`, and what it makes of it, over its coordinate and over time."""
-    predictor, shown = judgement.predictor, effect(judgement.fit.hypothesis.terms[place].effect).look
-    without, left = judgement.validation.reduced[place].mismatch, judgement.fit.mismatch
-    term = without - left
-    known = coordinates(predictor)
-    unit, values = known.get(shown.coordinate, known["position"])
-    period = _period(judgement, place, values) if shown.periodic else None
-    if period is not None:
-        values = values % period
-    parts = tuple(
-        _part(name, values, without, term, rows & predictor.counts & np.isfinite(values))
-        for name, rows in _halves(predictor, shown).items()
-    )
-    index, first, rows = _stretch(predictor, term)
-    trace, begun = predictor.traces[index], predictor.slices[index].start + first
-    here, t_s = slice(begun, begun + rows), trace.drive.t_s[first : first + rows] - trace.shift_s
-    return Signature(
-        place + 1, shown.coordinate, unit, period, parts, trace.name, t_s, without[here], term[here], left[here]
-    )
-
-
-def _halves(predictor: Predictor, shown: Look) -> dict[str, NDArray[np.bool_]]:
-    """Rows that are drawn by themselves: all, or by the sign of velocity or command."""
-    if shown.split is Split.NONE:
-        return {"": np.ones(len(predictor.counts), dtype=bool)}
-    over = predictor.over("velocity" if shown.split is Split.DIRECTION else "torque")
-    first, second = _HALVES[shown.split]
-    return {first: over > 0.0, second: over < 0.0}
-
-
-def _part(name: str, values: Array, without: Array, term: Array, rows: NDArray[np.bool_]) -> SignaturePart:
-    """Means over bins with as many rows each."""
-    if int(rows.sum()) < 2 * SETTINGS.maps.least_in_bin:
-        return SignaturePart(name, *(np.zeros(0) for _ in range(4)))
-    edges = np.unique(np.quantile(values[rows], np.linspace(0.0, 1.0, SETTINGS.curves.signature_bins + 1)))
-    place = np.clip(np.searchsorted(edges, values[rows], side="right") - 1, 0, max(len(edges) - 2, 0))
-    count = np.bincount(place)
-    full = count >= min(SETTINGS.maps.least_in_bin, count.max())
-    middle, left, made = (
-        (np.bincount(place, part[rows]) / np.maximum(count, 1))[full] for part in (values, without, term)
-    )
-    square = (np.bincount(place, without[rows] ** 2) / np.maximum(count, 1))[full]
-    independent = np.maximum(count[full] / SETTINGS.curves.correlated_rows, 1.0)
-    return SignaturePart(name, middle, left, 2.0 * np.sqrt(np.maximum(square - left**2, 0.0) / independent), made)
-
-
-def _period(judgement: JudgedSelection, place: int, values: Array) -> float | None:
-    """The period of a periodic term where many of them lie in the range."""
-    fit = judgement.fit
-    reported = fit.hypothesis.terms[place].tell(
-        fit.hypothesis.written(fit.coordinates), fit.values[fit.hypothesis.share(place)]
-    )
-    found = {one.name: one.value for one in reported}
-    if "periods_per_turn" in found:
-        period = 2.0 * math.pi / found["periods_per_turn"]
-    elif "periods_per_metre" in found:
-        period = 1.0 / found["periods_per_metre"]
-    else:
-        return None
-    return period if float(np.ptp(values)) > SETTINGS.curves.fold_from * period else None
-
-
-def _stretch(predictor: Predictor, term: Array) -> tuple[int, int, int]:
-    """The stretch in which a term takes most: recording, first row in it, rows."""
-    best: tuple[float, int, int, int] = (-1.0, 0, 0, 1)
-    for index, (trace, part) in enumerate(zip(predictor.traces, predictor.slices, strict=True)):
-        rows = min(max(2, round(SETTINGS.curves.stretch_s / trace.period_s)), part.stop - part.start)
-        power = np.concatenate([[0.0], np.cumsum(term[part] ** 2)])
-        taken = power[rows:] - power[:-rows]
-        first = int(np.argmax(taken))
-        best = max(best, (float(taken[first]) / rows, index, first, rows))
-    return best[1:]
-
-
-def course(trace: CheckedTrace, *errors: Array) -> tuple[Array, ...]:
-    """Begins of short stretches of a recording, s, and the root mean square of each error in them."""
-    rows = max(1, round(SETTINGS.curves.course_s / trace.period_s))
-    count = len(trace.drive.t_s) // rows
-    t_s = trace.drive.t_s - trace.shift_s
-    means = ((error[: count * rows].reshape(count, rows) ** 2).mean(axis=1) for error in errors)
-    return (t_s[: count * rows : rows], *(np.sqrt(mean) for mean in means))
-
-
-def spectrum(predictor: Predictor, error: Array) -> Spectrum:
-    """Amplitude density over frequency, averaged over the recordings on common bands."""
-    from scipy.signal import welch
-
-    bands = SETTINGS.curves.bands
-    edges = np.geomspace(SETTINGS.curves.lowest_hz, SETTINGS.curves.highest_hz, bands + 1)
-    power, rows = np.zeros(bands), np.zeros(bands)
-    for trace, part in zip(predictor.traces, predictor.slices, strict=True):
-        length = min(len(error[part]), round(SETTINGS.curves.window_s / trace.period_s))
-        frequency, density = welch(error[part], 1.0 / trace.period_s, nperseg=length)
-        place = np.digitize(frequency, edges) - 1
-        inside = (place >= 0) & (place < bands)
-        power += np.bincount(place[inside], density[inside], bands)
-        rows += np.bincount(place[inside], minlength=bands)
-    full = rows > 0
-    middles = np.sqrt(edges[:-1] * edges[1:])[full]
-    return Spectrum(middles, np.sqrt(np.maximum(power[full] / rows[full], 1e-300)))
-
 
 Array = NDArray[np.float64]
 
@@ -271,22 +154,35 @@ def recalibrated(judgement: JudgedSelection) -> dict[str, FittedValue]:
     """Parameters of the model itself that were off, with their 95 % intervals.
 
     Those of a finding are not here, nor one that stands on its bound: what the data say of it nobody has asked them.
+    A factor on the model's own that is under its level is in the value.
     """
     fit = judgement.fit
-    opened = {key for place in judgement.named for key in fit.hypothesis.terms[place].opens}
-    bounded = on_bound(fit)
+    told = {*judgement.named, *(place for place in judgement.kept if fit.hypothesis.terms[place].scales)}
+    elsewhere = {key for place in told for term in [fit.hypothesis.terms[place]] for key in (*term.opens, *term.scales)}
+    bounded, written = on_bound(fit), fit.hypothesis.written(fit.coordinates)
     found = {}
     for index, (unknown, nominal) in enumerate(zip(fit.hypothesis.unknowns, fit.hypothesis.base, strict=False)):
-        value = fit.values[index]
-        half = SETTINGS.intervals.z95 * math.sqrt(max(float(judgement.covariance[index, index]), 0.0))
+        along = _along(fit, index, unknown.key)
+        value = get(written, unknown.key) if along.sum() > 1.0 else fit.values[index]
+        half = SETTINGS.intervals.z95 * math.sqrt(max(float(along @ judgement.covariance @ along), 0.0))
         size = unknown.size if unknown.size else abs(value)
-        if unknown.key in opened or bounded[index] or unknown.key.startswith(DRIVE):
+        if unknown.key in elsewhere or bounded[index] or unknown.key.startswith(DRIVE):
             continue
         if abs(value - nominal.start) <= max(SETTINGS.intervals.least_change, half) * size:
             continue
         half *= size
         found[unknown.key] = FittedValue(value, unknown.unit, value - half, value + half, nominal.start)
     return found
+
+
+def _along(fit: Fit, index: int, key: str) -> Array:
+    """The coordinates whose sum is the logarithm of a number of the model's own: its own, and factors on it."""
+    along = np.zeros(len(fit.coordinates))
+    along[index] = 1.0
+    for place, term in enumerate(fit.hypothesis.terms):
+        if key in term.scales:
+            along[fit.hypothesis.share(place).start] = 1.0
+    return along
 
 
 def fitted_drive(judgement: JudgedSelection) -> dict[str, FittedValue]:
@@ -436,20 +332,24 @@ def reject_terms(selector: Selector, judgement: JudgedSelection) -> Selection | 
 
 
 def _goes(judgement: JudgedSelection, place: int, why: MinorReason) -> bool:
-    """Whether a term goes for a reason: one that is only not told from none stays where unseen rows need it."""
+    """Whether a term goes for a reason: one that is only not told from none stays where unseen rows need it.
+
+    Not where a plainer effect is within it: what it took there is that one's.
+    """
     if why is MinorReason.UNSURE:
-        return judgement.removed_share(place) < SETTINGS.worth.share
+        plainer = any(judgement.fit.hypothesis.terms[place].effect in one.within for one in effects())
+        return plainer or judgement.removed_share(place) < SETTINGS.worth.share
     return why is MinorReason.AT_END
 
 
 def _under_level(judgement: JudgedSelection) -> dict[int, MinorReason]:
-    """Terms with numbers of their own that are under their level; what only opens the model's own is recalibrated."""
+    """Terms with numbers of their own that are under their level; what only changes the model's own is recalibrated."""
     twin = shorter_twin(judgement.fit)
     terms = enumerate(judgement.fit.hypothesis.terms)
     return {
         place: MinorReason.TWIN if term.effect == twin else MinorReason.LEVEL
         for place, term in terms
-        if place not in judgement.named and term.unknowns
+        if place not in judgement.named and term.unknowns and not term.scales
     }
 
 
@@ -478,12 +378,22 @@ def _share(judgement: JudgedSelection, place: int) -> float:
 def differs_from_zero(fit: Fit, place: int, covariance: Array) -> bool:
     """Whether nothing at all lies outside the region of 95 % of what says how large a term is.
 
-    A term whose size has no zero, such as a stiffness or a limit, is told by what it takes alone.
+    Numbers that are only sure together are not: one of them must lie outside its own interval around nothing too, lest
+    a report show an effect none of whose numbers is told from none. A term whose size has no zero, such as a stiffness
+    or a limit, is told by what it takes alone.
     """
     unknowns, share = fit.hypothesis.unknowns, fit.hypothesis.share(place)
     own = range(share.start, share.stop)
     deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     if any(unknowns[i].key in POSITIVE and SETTINGS.intervals.z95 * deviations[i] >= 1.0 for i in own):
         return False
-    sizes = [i for i in own if unknowns[i].size != 0.0 and unknowns[i].low <= 0.0 and unknowns[i].key not in WHERE]
-    return not sizes or not inside_region(fit.coordinates[sizes], covariance[np.ix_(sizes, sizes)])
+    sizes = [i for i in own if _has_none(unknowns[i])]
+    if not sizes:
+        return True
+    alone = np.abs(fit.coordinates[sizes]) > SETTINGS.intervals.z95 * deviations[sizes]
+    return bool(alone.any()) and not inside_region(fit.coordinates[sizes], covariance[np.ix_(sizes, sizes)])
+
+
+def _has_none(unknown: Unknown) -> bool:
+    """Whether a coordinate of 0 says that a term is not there: a size of nothing, or a factor of one."""
+    return unknown.key == LEVEL or (unknown.size != 0.0 and unknown.low <= 0.0 and unknown.key not in WHERE)

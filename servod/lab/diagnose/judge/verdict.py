@@ -122,6 +122,9 @@ def alternatives(selection: Selection, index: int) -> list[str]:
 
 
 def _rivals(selection: Selection, index: int) -> list[tuple[Candidate, float]]:
-    """Rivals of a term and what each left of the cost over what the term left, when the term came in."""
-    entry = selection.entries[index]
-    return [(rival, rival.left / max(entry.left, 1e-12)) for rival in entry.rivals]
+    """Rivals of a term and what each left of the cost over what the term left, when the term came in.
+
+    One that has the term within it leaves as little, and says nothing against it.
+    """
+    entry, within = selection.entries[index], effect(selection.fit.hypothesis.terms[index].effect).within
+    return [(rival, rival.left / max(entry.left, 1e-12)) for rival in entry.rivals if rival.effect not in within]

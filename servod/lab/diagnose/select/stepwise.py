@@ -23,6 +23,7 @@ from servod.lab.diagnose.select.candidates import Candidate
 from servod.lab.diagnose.select.cross_validation import make_folds, predict_held_out
 from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.select.free_windows import free_run_errors
+from servod.lab.diagnose.select.joint import add_levels
 from servod.lab.diagnose.select.levels import at_end_of_range, level_at_bound
 from servod.lab.diagnose.select.merit import Merit
 from servod.lab.diagnose.select.selection import Selection, TermEntry
@@ -58,6 +59,8 @@ def _add_best(selector: Selector, selection: Selection) -> Selection:
     present = selection.fit
     candidates, tried = selector.candidates(present, skip=frozenset(selection.rejected))
     selection = replace(selection, tried=selection.tried + tried)
+    if (longer := add_levels(selector, selection, candidates)) is not None:
+        return longer
     deserves = partial(selector.deserves, selection)
     best = math.inf
     for candidate in candidates:
