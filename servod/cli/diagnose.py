@@ -22,10 +22,6 @@ if TYPE_CHECKING:
 EXAMPLE = "servoctl diagnose --model model.yaml run1.csv.gz run2.csv.gz --out diagnosis"
 
 
-#: Share of a recording's rows that may stand in another: at rest two may begin alike.
-SAME_ROWS = 0.1
-
-
 def register(app: typer.Typer) -> None:
     """Add the verb to `app`."""
     app.command(name="diagnose", help=example("Find what physics a model leaves out.", EXAMPLE))(diagnose)
@@ -56,6 +52,7 @@ def diagnose(
     from servod.formats.model.axis_model import load_axis_model
     from servod.lab.diagnose.engine import diagnose as run
     from servod.lab.recordings import find_map
+    from servod.lab.recordings.same import need_distinct
     from servod.lab.report.diagnosis import write_files
     from servod.lab.report.page import Origin
 
@@ -64,7 +61,7 @@ def diagnose(
     _need_own_folder(out, model)
     recorded = [one.between(from_s, to_s) for one in _load(recordings, map_file, axis, model)]
     unseen = _load(hold_out or [], map_file, axis, model)
-    _need_unseen(unseen, recorded)
+    need_distinct(recorded, unseen)
     need_folder("--out", out)
     found = run(axis, recorded, time_limit, _quiet if as_json else _progress, unseen)
     sources: dict[str, Path | list[Path]] = {"model": model, "recordings": recordings, "held out": hold_out or []}
@@ -102,20 +99,6 @@ def _load(paths: list[Path], map_file: Path | None, axis: AxisModel, model: Path
             wanted = f"{recording.axis.value}, as the columns of {recording.path} say"
             raise BadInput(f"{model}: axis", axis.axis.value, wanted)
     return recorded
-
-
-def _need_unseen(unseen: list[Recording], seen: list[Recording]) -> None:
-    """See that no recording that is held out has rows of one that is fitted. Raises BadInput."""
-    for one in unseen:
-        own = _rows(one)
-        for other in seen:
-            if len(own & _rows(other)) > SAME_ROWS * len(own):
-                raise BadInput(f"--hold-out {one.path}", f"rows of {other.path}", "a recording that no fit sees")
-
-
-def _rows(recording: Recording) -> set[tuple[float, float]]:
-    """Its rows as pairs of time and position."""
-    return set(zip(recording.t_s.tolist(), recording.position.tolist(), strict=True))
 
 
 def _quiet(_line: str) -> None:
