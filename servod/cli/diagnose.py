@@ -114,6 +114,9 @@ def _print(found: Diagnosis, document: dict[str, Any], out: Path) -> None:
     """The answer for people: verdict, findings with their parameters, what was recalibrated."""
     for refused in found.refused:
         print(f"not used: {refused.name}: {refused.reason}")
+    for recording in document["recordings"]:
+        for question in (note for note in recording["notes"] if "?" in note):
+            print(f"note: {recording['name']}: {question}")
     print(f"{document['verdict']}: {document['summary']}")
     for finding in document["findings"]:
         print(f"- {finding['effect']} (confidence {finding['confidence']:.2f}): {finding['statement']}")

@@ -17,11 +17,13 @@ from servod.lab.diagnose.result import (
     FreeRun,
     HeldOutRecording,
     Minor,
+    MinorReason,
     MismatchMap,
     NamedEffect,
     PartialAnswer,
     Quality,
     RecordingErrors,
+    RefusedRecording,
 )
 
 Document = dict[str, Any]
@@ -47,7 +49,7 @@ def diagnosis_document(diagnosis: Diagnosis) -> Document:
         found["located"] = [_map(one) for one in evidence.maps_before]
         found["remaining"] = [_map(one) for one in evidence.maps_after]
     found["recordings"] = [_recording(one) for one in evidence.recordings] if evidence else []
-    found["recordings"] += [{"name": r.name, "taken": False, "reason": r.reason} for r in diagnosis.refused]
+    found["recordings"] += [_refused(one) for one in diagnosis.refused]
     if diagnosis.held_out:
         found["held_out"] = {one.name: _held_out(one, diagnosis.units.length) for one in diagnosis.held_out}
     found["units"] = {"position": diagnosis.units.length, "torque": diagnosis.units.force}
@@ -62,8 +64,18 @@ def summary(diagnosis: Diagnosis) -> str:
         reasons = "; ".join(f"{r.name}: {r.reason}" for r in diagnosis.refused)
         return f"These data cannot tell: {reasons}."
     cut = describe_cut(evidence.search.starts_tried) if evidence.search.cut_by_time else ""
-    return " ".join(
-        part for part in (_found(diagnosis, evidence), cut, describe_changes(evidence.recalibrated)) if part
+    said = _found(diagnosis, evidence), describe_beyond(evidence), cut, describe_changes(evidence.recalibrated)
+    return " ".join(part for part in said if part)
+
+
+def describe_beyond(evidence: Evidence) -> str:
+    """Effects that got no name since they would need torques beyond the recordings', as a sentence; empty for none."""
+    beyond = [name.replace("_", " ") for name, one in evidence.minor.items() if one.why is MinorReason.BEYOND]
+    if not beyond:
+        return ""
+    return (
+        f"No name is given to {' and '.join(beyond)}: it would take many times the largest torque of these recordings. "
+        "Look at the units of command and position (unit: in a --map file), and at the drive's factor."
     )
 
 
@@ -217,6 +229,10 @@ def _map(found: MismatchMap) -> Document:
         "mean": found.mean.tolist(),
         "error": found.error.tolist(),
     }
+
+
+def _refused(found: RefusedRecording) -> Document:
+    return {"name": found.name, "taken": False, "reason": found.reason, "notes": list(found.notes)}
 
 
 def _recording(found: RecordingErrors) -> Document:

@@ -37,6 +37,7 @@ class MinorReason(StrEnum):
     SMALL = "below the smallest size worth a name"
     UNSURE = "not told from none"
     AT_END = "a number of it lies at the end of its range"
+    BEYOND = "more torque than the recordings hold"
 
 
 @dataclass(frozen=True)
@@ -49,10 +50,11 @@ class Units:
 
 @dataclass(frozen=True)
 class RefusedRecording:
-    """A recording that cannot tell, and why."""
+    """A recording that cannot tell, and why; `notes` as of one that can."""
 
     name: str
     reason: str
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

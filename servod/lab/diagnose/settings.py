@@ -51,6 +51,8 @@ class IntakeSettings:
     names_listed: int = 6
     #: A factor by which a unit is off at least: no model of the right axis is so wrong.
     wrong_unit: float = 5.0
+    #: A factor on what moves by which no model is off, whatever else it leaves out: no mass is looked for so far away.
+    no_model: float = 100.0
     #: By how much the factors of inertia and of friction may differ and be one unit.
     same_unit: float = 3.0
     #: Standard errors from which a factor in the command is certain; a refusal must not be a matter of chance.
@@ -225,6 +227,8 @@ class WorthSettings:
     sure_share: float = 0.3
     #: A coordinate so near to its bound, or to the end of its range, lies on it.
     on_bound: float = 1e-6
+    #: A torque where it acts of so many times the largest command is none: what is fed and what moves are in two units.
+    most_of_command: float = 5.0
     #: Robust deviations beyond which a mismatch is a blow, and counts no more for what is left.
     blow: float = 8.0
     #: Blocks whose sums are taken to be independent when a gain is judged, s. Shorter than those of the intervals: what

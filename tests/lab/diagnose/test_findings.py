@@ -13,7 +13,7 @@ from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.hypothesis import Term
 from servod.lab.diagnose.effects.search_context import SearchContext
-from servod.lab.diagnose.judge.conclude import differs_from_zero, minor, name_findings
+from servod.lab.diagnose.judge.conclude import beyond_command, differs_from_zero, minor, name_findings
 from servod.lab.diagnose.judge.judgement import JudgedSelection, judge
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.result import MinorReason
@@ -80,6 +80,17 @@ def test_what_ends_at_the_end_of_a_range_is_no_finding(selector: Selector) -> No
     assert judgement.named == ()
     assert judgement.kept == {0: MinorReason.AT_END}
     assert minor(judgement)["gravity"].why is MinorReason.AT_END
+
+
+@pytest.mark.parametrize(("times", "beyond"), [(3.0, False), (30.0, True)])
+def test_no_effect_takes_many_times_the_largest_command(selector: Selector, times: float, beyond: bool) -> None:
+    """Nothing in the recordings holds against it: the command is in another unit than the motion."""
+    judgement = sorted_with(selector, form(selector, "gravity"))
+    predictor = judgement.predictor
+    own = times * float(np.max(np.abs(predictor.over("torque")))) / predictor.dry
+    merit = replace(judgement.selection.merits[0], own=own)
+    judgement = replace(judgement, selection=judgement.selection.with_merit(0, merit))
+    assert beyond_command(judgement, 0) is beyond
 
 
 def test_a_spring_may_rest_beyond_what_is_searched(selector: Selector) -> None:

@@ -40,7 +40,7 @@ def load_traces(recordings: Sequence[Recording], model: AxisModel) -> tuple[list
         if reason is None:
             traces.append(trace)
         else:
-            refused.append(RefusedRecording(name, reason))
+            refused.append(RefusedRecording(name, reason, trace.notes))
     return traces, refused
 
 
@@ -173,9 +173,11 @@ def refusal_reason(trace: CheckedTrace, model: AxisModel) -> str | None:
     """Why this recording cannot tell anything about this model; None when it can."""
     recorded = _too_coarse(trace) or _too_short(trace) or _never_changes(trace)
     moved = _too_noisy(trace, model) or _too_still(trace)
-    if trace.drive.told is not None:  # the torque is the model's own, limit and unit included
+    if trace.drive.told is None:
+        return recorded or wrong_sign_or_unit(trace, model) or moved or _saturated(trace)
+    if model.drive is not None and model.drive.kind.feeds_back:  # a goal has the unit of the position
         return recorded or moved
-    return recorded or wrong_sign_or_unit(trace, model) or moved or _saturated(trace)
+    return recorded or wrong_sign_or_unit(trace, model) or moved  # what is at the drive's limit is the model's own
 
 
 def _too_coarse(trace: CheckedTrace) -> str | None:
@@ -261,15 +263,27 @@ def wrong_sign_or_unit(trace: CheckedTrace, model: AxisModel) -> str | None:
         return None
     if dry.sure and dry.value < 0.0 and (moved.value < 0.0 or not moved.sure):
         return f"command and motion have opposite signs (friction stands in the command times {dry.value:.3g})"
-    if not (moved.sure and dry.sure):
-        return None
-    apart = max(moved.value / dry.value, dry.value / moved.value) if moved.value * dry.value > 0.0 else math.inf
-    scale = math.sqrt(abs(moved.value * dry.value))
+    both = _unit_by_both(moved.value, dry.value, model) if moved.sure and dry.sure else None
+    return both or _unit_by_motion(moved)
+
+
+def _unit_by_both(moved: float, dry: float, model: AxisModel) -> str | None:
+    """What speaks against the recording where the factors of motion and of dry friction are both certain."""
+    apart = max(moved / dry, dry / moved) if moved * dry > 0.0 else math.inf
+    scale = math.sqrt(abs(moved * dry))
     if apart < SETTINGS.intake.same_unit and not 1.0 / SETTINGS.intake.wrong_unit < scale < SETTINGS.intake.wrong_unit:
         return f"the command is {scale:.3g} times what the model needs: another unit, or another axis"
-    if moved.value > 0.0 and 1.0 / SETTINGS.intake.same_unit < dry.value < SETTINGS.intake.same_unit:
-        return _position_unit(moved.value, model)
+    if moved > 0.0 and 1.0 / SETTINGS.intake.same_unit < dry < SETTINGS.intake.same_unit:
+        return _position_unit(moved, model)
     return None
+
+
+def _unit_by_motion(moved: Factor) -> str | None:
+    """What speaks against it where friction says nothing, beside a weight of many frictions: a factor beyond reason."""
+    most = SETTINGS.intake.no_model
+    if not moved.sure or 1.0 / most < abs(moved.value) < most:
+        return None
+    return f"the command is {moved.value:.3g} times what the model's motion needs: another unit, or another axis"
 
 
 def _position_unit(moved: float, model: AxisModel) -> str | None:
@@ -286,7 +300,8 @@ def factors(trace: CheckedTrace, model: AxisModel) -> tuple[Factor, Factor, floa
     x, v = trace.drive.position, trace.velocity
     rows = trace.counts & np.isfinite(v)
     slow = max(0.05 * float(np.std(v[rows])), 1e-12)
-    motion = model.inertia * trace.acceleration + model.friction.viscous * v
+    emf = model.drive.back_emf if model.drive is not None and trace.drive.told is not None else 0.0
+    motion = model.inertia * trace.acceleration + (model.friction.viscous + emf) * v
     place = (x - float(np.mean(x[rows]))) / max(float(np.std(x[rows])), 1e-12)
     parts = [motion, dry_friction(model) * np.tanh(v / slow), np.ones_like(x), place, place**2, place**3]
     if model.gravity is not None:

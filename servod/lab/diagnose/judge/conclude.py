@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.formats.model.axis_model import AxisModel
-from servod.lab.diagnose.effects import effects
+from servod.lab.diagnose.effects import effect, effects
 from servod.lab.diagnose.effects.disturbance import EVERY, NAME
 from servod.lab.diagnose.effects.hypothesis import LEVEL, Document, Reported, Unknown, get
 from servod.lab.diagnose.judge.covariance import bounded_error, inside_region
@@ -339,7 +339,7 @@ def _goes(judgement: JudgedSelection, place: int, why: MinorReason) -> bool:
     if why is MinorReason.UNSURE:
         plainer = any(judgement.fit.hypothesis.terms[place].effect in one.within for one in effects())
         return plainer or judgement.removed_share(place) < SETTINGS.worth.share
-    return why is MinorReason.AT_END
+    return why in {MinorReason.AT_END, MinorReason.BEYOND}
 
 
 def _under_level(judgement: JudgedSelection) -> dict[int, MinorReason]:
@@ -361,7 +361,21 @@ def _reason(judgement: JudgedSelection, place: int) -> MinorReason | None:
         return MinorReason.SMALL
     if at_end_of_range(fit, place):
         return MinorReason.AT_END
+    if beyond_command(judgement, place):
+        return MinorReason.BEYOND
     return None if differs_from_zero(fit, place, judgement.covariance) else MinorReason.UNSURE
+
+
+def beyond_command(judgement: JudgedSelection, place: int) -> bool:
+    """Whether a term makes torques that nothing in the recordings holds against: units are mixed up then.
+
+    Factors on the model's own, or on the command, are judged by their ranges.
+    """
+    term, predictor = judgement.fit.hypothesis.terms[place], judgement.predictor
+    if term.scales or effect(term.effect).scales_torques or effect(term.effect).drive_keys:
+        return False
+    largest = float(np.max(np.abs(predictor.over("torque"))))
+    return judgement.selection.merits[place].own * predictor.dry > SETTINGS.worth.most_of_command * largest
 
 
 def _share(judgement: JudgedSelection, place: int) -> float:
