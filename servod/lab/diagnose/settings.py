@@ -263,7 +263,9 @@ class ForwardSettings:
 class JointSettings:
     """Levels of the model's own friction, released together."""
 
-    #: They come before an effect that needs as many numbers and leaves no less than this share of what they leave,
+    #: Where they leave less than this share of what was there,
+    nearly_all: float = 0.05
+    #: they come before an effect that needs as many numbers and leaves no less than this share of what they leave,
     as_good: float = 1.05
     #: or as good as nothing, as they do: a share of what was there.
     nothing: float = 0.002

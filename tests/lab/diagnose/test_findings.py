@@ -13,7 +13,7 @@ from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.hypothesis import Term
 from servod.lab.diagnose.effects.search_context import SearchContext
-from servod.lab.diagnose.judge.conclude import beyond_command, differs_from_zero, minor, name_findings
+from servod.lab.diagnose.judge.conclude import beyond_command, differs_from_zero, minor, name_findings, plainer_form
 from servod.lab.diagnose.judge.judgement import JudgedSelection, judge
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.result import MinorReason
@@ -91,6 +91,21 @@ def test_no_effect_takes_many_times_the_largest_command(selector: Selector, time
     merit = replace(judgement.selection.merits[0], own=own)
     judgement = replace(judgement, selection=judgement.selection.with_merit(0, merit))
     assert beyond_command(judgement, 0) is beyond
+
+
+def test_numbers_that_are_sure_together_alone_give_way_to_a_plainer_form(selector: Selector) -> None:
+    """Two curves at once, where one of them is there."""
+    scene = SearchContext(selector.start.document, selector.predictor, selector.predictor.mismatch(believed()))
+    both = next(term for term in effect("viscous_nonlinear").terms(scene) if term.form == "quadratic and cubic")
+    fit = base = selector.settle(selector.start, None, selector.predictor.mismatch(believed()))
+    for term in (form(selector, "gravity"), both):
+        hypothesis = fit.hypothesis.with_term(term)
+        fit = selector.settle(hypothesis, hypothesis.beside(fit.coordinates), fit.mismatch)
+    plainer = plainer_form(selector, Selection(base, fit, 1.0, 0.0), 1)
+    assert plainer is not None
+    kept, given = plainer.fit.hypothesis.terms
+    assert kept.effect == "gravity" and given.effect == both.effect and given.numbers < both.numbers
+    assert plainer_form(selector, plainer, 1) is None
 
 
 def test_a_spring_may_rest_beyond_what_is_searched(selector: Selector) -> None:

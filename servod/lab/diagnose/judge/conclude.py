@@ -16,6 +16,7 @@ from servod.formats.model.axis_model import AxisModel
 from servod.lab.diagnose.effects import effect, effects
 from servod.lab.diagnose.effects.disturbance import EVERY, NAME
 from servod.lab.diagnose.effects.hypothesis import LEVEL, Document, Reported, Unknown, get
+from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.judge.covariance import bounded_error, inside_region
 from servod.lab.diagnose.judge.curves import course, signature, spectrum
 from servod.lab.diagnose.judge.free_run import window_errors, windows
@@ -320,8 +321,14 @@ def name_findings(selector: Selector, judgement: JudgedSelection) -> JudgedSelec
 def reject_terms(selector: Selector, judgement: JudgedSelection) -> Selection | None:
     """The selection without the terms that were rejected, and those that follow from them; None where none was.
 
-    A value at the end of its range has not been measured, and what such a term takes is not explained by it.
+    A value at the end of its range has not been measured, and what such a term takes is not explained by it. One whose
+    numbers are only told from none together gives way to a plainer form of its effect first, where there is one.
     """
+    unsure = [place for place, why in judgement.kept.items() if why is MinorReason.UNSURE]
+    for place in unsure:
+        plainer = plainer_form(selector, judgement.selection, place)
+        if plainer is not None and differ_together(judgement.fit, place, judgement.covariance):
+            return plainer
     rejected = sorted(place for place, why in judgement.kept.items() if _goes(judgement, place, why))
     selection = judgement.selection
     terms = selection.fit.hypothesis.terms
@@ -329,6 +336,26 @@ def reject_terms(selector: Selector, judgement: JudgedSelection) -> Selection | 
     for place in reversed(rejected):
         selection = selection.without_term(place, selector.settle_without(selection.fit, place))
     return replace(selection, rejected={**selection.rejected, **why}) if rejected else None
+
+
+def plainer_form(selector: Selector, selection: Selection, place: int) -> Selection | None:
+    """The selection with the best form of a term's effect that needs fewer numbers; None where there is none.
+
+    Friction by the applied torque and by the load, both at once, is sure together and neither alone.
+    """
+    fit = selection.fit
+    own, share = fit.hypothesis.terms[place], fit.hypothesis.share(place)
+    scene = SearchContext(selector.start.document, selector.predictor, selection.base.mismatch)
+    fits = []
+    for term in effect(own.effect).terms(scene):
+        if term.unknowns and term.numbers < own.numbers:
+            terms = (*fit.hypothesis.terms[:place], term, *fit.hypothesis.terms[place + 1 :])
+            start = [unknown.coordinate(unknown.start) for unknown in term.unknowns]
+            at = np.concatenate([fit.coordinates[: share.start], start, fit.coordinates[share.stop :]])
+            fits.append(selector.settle(replace(fit.hypothesis, terms=terms), at, fit.mismatch))
+    if not fits:
+        return None
+    return replace(selection, fit=min(fits, key=lambda one: selector.error(one.mismatch)))
 
 
 def _goes(judgement: JudgedSelection, place: int, why: MinorReason) -> bool:
@@ -396,16 +423,27 @@ def differs_from_zero(fit: Fit, place: int, covariance: Array) -> bool:
     a report show an effect none of whose numbers is told from none. A term whose size has no zero, such as a stiffness
     or a limit, is told by what it takes alone.
     """
+    sizes = _sizes(fit, place)
+    half = SETTINGS.intervals.z95 * np.sqrt(np.maximum(np.diag(covariance)[sizes], 0.0))
+    alone = not sizes or bool(np.any(np.abs(fit.coordinates[sizes]) > half))
+    return alone and differ_together(fit, place, covariance)
+
+
+def differ_together(fit: Fit, place: int, covariance: Array) -> bool:
+    """Whether nothing at all lies outside the region of 95 % of all sizes of a term."""
     unknowns, share = fit.hypothesis.unknowns, fit.hypothesis.share(place)
     own = range(share.start, share.stop)
     deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     if any(unknowns[i].key in POSITIVE and SETTINGS.intervals.z95 * deviations[i] >= 1.0 for i in own):
         return False
-    sizes = [i for i in own if _has_none(unknowns[i])]
-    if not sizes:
-        return True
-    alone = np.abs(fit.coordinates[sizes]) > SETTINGS.intervals.z95 * deviations[sizes]
-    return bool(alone.any()) and not inside_region(fit.coordinates[sizes], covariance[np.ix_(sizes, sizes)])
+    sizes = _sizes(fit, place)
+    return not sizes or not inside_region(fit.coordinates[sizes], covariance[np.ix_(sizes, sizes)])
+
+
+def _sizes(fit: Fit, place: int) -> list[int]:
+    """Places of the coordinates of a term that say how large it is."""
+    share = fit.hypothesis.share(place)
+    return [index for index in range(share.start, share.stop) if _has_none(fit.hypothesis.unknowns[index])]
 
 
 def _has_none(unknown: Unknown) -> bool:

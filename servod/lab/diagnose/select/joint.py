@@ -93,10 +93,10 @@ def _left(selector: Selector, old: Fit, new: Fit) -> float:
 def _better(rival: Candidate, left: float, numbers: int) -> bool:
     """Whether a candidate explains better than levels that leave so much with so many numbers.
 
-    One with as many numbers must leave clearly less: the plain cause comes first.
+    Where levels leave next to nothing one with as many numbers must leave clearly less: the plain cause comes first.
     """
     if at_end_of_range(rival.fit, rival.place):
         return False
-    if rival.term.numbers >= numbers and left <= SETTINGS.joint.as_good * rival.left + SETTINGS.joint.nothing:
-        return False
+    if left <= SETTINGS.joint.nearly_all and rival.term.numbers >= numbers:
+        return left > SETTINGS.joint.as_good * rival.left + SETTINGS.joint.nothing
     return penalised_left(rival) <= left * (1.0 + SETTINGS.trials.per_number * numbers)
