@@ -113,6 +113,9 @@ def _found(diagnosis: Diagnosis, evidence: Evidence) -> str:
 def _statement(found: NamedEffect) -> str:
     """What was left out; of a number of the model's own, by how much it is off."""
     said, over = effect(found.effect).statement, found.parameters.get("over_model")
+    if found.product_with:
+        product = f"{found.effect.replace('_', ' ')} and {found.product_with.replace('_', ' ')}"
+        return f"{said}; only the product of {product} shows, since the servo is hardly ever at its limit"
     return said if over is None else f"{said}, {over.value:.3g} times what the model says"
 
 

@@ -140,7 +140,8 @@ class NamedEffect:
 
     `removed_share` is the part of the explainable error that it removes on unseen rows, `torque` its size as a share of
     dry friction where it acts. `without` and `after` are the errors on unseen rows without and with it. `alternatives`
-    are effects that these data cannot tell it from; `located` says where it acts, by recording, time and coordinate.
+    are effects that these data cannot tell it from; `located` says where it acts, by recording, time and coordinate. Of
+    it and `product_with` only the product shows, where that is an effect.
     """
 
     effect: str
@@ -154,6 +155,7 @@ class NamedEffect:
     without: float
     after: float
     signatures: tuple[Signature, ...]
+    product_with: str = ""
 
 
 @dataclass(frozen=True)

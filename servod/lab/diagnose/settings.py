@@ -459,6 +459,10 @@ class VerdictSettings:
     #: Confidence 0.5 + 0.49*(1 - exp(-gap/gap_scale)); gap: logarithm of what the best rival leaves over what the
     #: finding leaves.
     gap_scale: float = 0.15
+    #: Share of the rows at a servo's limit from which its gain is told from its torque; below, only the product shows,
+    at_limit: float = 0.02
+    #: and either name is as likely as the other.
+    either: float = 0.5
     #: From this share of the explainable error removed on, what is left says nothing against the names.
     fully: float = 0.95
 

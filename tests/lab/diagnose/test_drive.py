@@ -12,8 +12,11 @@ import pytest
 
 from servod.common.errors import BadInput
 from servod.formats.model.axis_model import AxisModel
+from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.document import diagnosis_document
 from servod.lab.diagnose.engine import diagnose
+from servod.lab.diagnose.judge.verdict import product_with
+from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.result import Diagnosis
 from servod.lab.recordings import Recording
 from tests.lab.simulate.servo_axis import ServoAxis, goal_of
@@ -92,12 +95,31 @@ def test_the_torque_of_a_servo_is_found_where_its_goal_jumps(
     assert [finding["effect"] for finding in found["findings"]] == effects
 
 
-def moved(axis: ServoAxis, tmp_path: Path) -> list[Recording]:
+def test_of_gain_and_torque_only_the_product_shows_below_the_limit(tmp_path: Path) -> None:
+    """A name for either would be as right as one for the other."""
+    model = model_of(TRUTH)
+    predictor = Predictor(load_traces(moved(TRUTH, tmp_path), model)[0], model)
+    assert product_with(predictor, model, "drive_gain") == product_with(predictor, model, "delay") == ""
+    free = model_of(TRUTH, limit=50.0)
+    assert product_with(predictor, free, "drive_gain") == "torque_gain"
+    assert product_with(predictor, free, "torque_gain") == "drive_gain"
+
+
+def test_a_gain_that_is_not_told_from_the_torque_is_no_certain_name(tmp_path: Path) -> None:
+    runs = moved(TRUTH, tmp_path, 0.12)
+    document = diagnosis_document(diagnose(model_of(TRUTH, gain_scale=0.5), runs, 60.0))
+    (finding,) = (one for one in document["findings"] if one["effect"] in {"drive_gain", "torque_gain"})
+    assert finding["confidence"] <= 0.5
+    assert "only the product of" in finding["statement"]
+    assert {finding["effect"], finding["alternatives"][0]["effect"]} == {"drive_gain", "torque_gain"}
+
+
+def moved(axis: ServoAxis, tmp_path: Path, size: float = 1.0) -> list[Recording]:
     """Steps with rests, whose goal jumps, and two sines."""
     t_s = np.arange(600) * PERIOD_S
     jumps = np.array([0.0, 0.9, -0.5, 0.3, -0.9, 1.2, 0.0])[np.minimum(t_s / 0.9, 6.0).astype(int)]
     found = []
-    for name, goal in (("jumps", jumps), ("sines", goal_of(t_s, 0))):
+    for name, goal in (("jumps", size * jumps), ("sines", size * goal_of(t_s, 0))):
         path = tmp_path / f"{name}.csv"
         found.append(write(path, t_s=t_s, reference_rad=goal, position_rad=axis.run(goal, PERIOD_S)))
     return found

@@ -41,5 +41,6 @@ EFFECT = Effect(
     drive_keys=("gain_scale",),
     far=True,
     one_with=("drive.kp",),
+    product_with="torque_gain",
     at_level=_at_level,
 )

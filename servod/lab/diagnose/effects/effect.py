@@ -46,7 +46,8 @@ class Effect:
     case of those it is `within`, which leave as little with more numbers and are no rivals.
 
     For the verdict: `at_level` says of the nominal and the fitted model whether the effect is more than recalibration;
-    with one that `scales_torques`, no recording tells the common factor on all torques of the axis. An effect and its
+    with one that `scales_torques`, no recording tells the common factor on all torques of the axis. Of an effect and
+    what it makes a `product_with` a servo shows that alone while its duty is below the limit. An effect and its
     `twin` that are in together are one finding, by the name of the one that makes the torque later: `lateness` is the
     key that says by how much.
     """
@@ -73,6 +74,7 @@ class Effect:
     within: tuple[str, ...] = ()
     at_level: Callable[[Document, Document], bool] = lambda _nominal, _fitted: True
     scales_torques: bool = False
+    product_with: str = ""
     twin: str = ""
     lateness: str = ""
 

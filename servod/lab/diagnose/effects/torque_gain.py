@@ -36,5 +36,6 @@ EFFECT = Effect(
     one_with=DRIVE_SCALES,
     swift=True,
     scales_torques=True,
+    product_with="drive_gain",
     at_level=_at_level,
 )

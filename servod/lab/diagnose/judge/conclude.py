@@ -22,7 +22,7 @@ from servod.lab.diagnose.judge.curves import course, signature, spectrum
 from servod.lab.diagnose.judge.free_run import window_errors, windows
 from servod.lab.diagnose.judge.judgement import JudgedSelection, write_table
 from servod.lab.diagnose.judge.locate import bands, locate
-from servod.lab.diagnose.judge.verdict import alternatives, confidence
+from servod.lab.diagnose.judge.verdict import alternatives, confidence, product_with
 from servod.lab.diagnose.predict.floor import trace_floor
 from servod.lab.diagnose.result import (
     Evidence,
@@ -84,18 +84,22 @@ def findings(judgement: JudgedSelection) -> tuple[NamedEffect, ...]:
 def _finding(judgement: JudgedSelection, name: str, named: Sequence[int]) -> NamedEffect:
     fit, first, selection = judgement.fit, named[0], judgement.selection
     contribution = judgement.validation.reduced[first].mismatch - fit.mismatch
+    product = product_with(judgement.predictor, fit.model, name)
+    sure = min(confidence(selection, place, judgement.errors.removed) for place in named)
+    others = alternatives(selection, first)
     return NamedEffect(
         effect=name,
         forms=tuple(fit.hypothesis.terms[place].form for place in named),
         parameters=parameters(judgement, named),
-        confidence=min(confidence(selection, place, judgement.errors.removed) for place in named),
-        alternatives=tuple(alternatives(selection, first)),
+        confidence=min(sure, SETTINGS.verdict.either) if product else sure,
+        alternatives=tuple(dict.fromkeys([product, *others] if product else others)),
         located=locate(judgement.predictor, contribution, judgement.predictor.dry),
         removed_share=judgement.removed_share(first),
         torque=selection.merits[first].torque,
         without=judgement.validation.without[first].rms,
         after=judgement.validation.after.rms,
         signatures=tuple(signature(judgement, place) for place in named),
+        product_with=product,
     )
 
 

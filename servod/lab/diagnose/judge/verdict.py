@@ -12,6 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from servod.formats.model.axis_model import AxisModel
+from servod.formats.model.drive import DriveLaw
+from servod.lab.diagnose.data.trace import CheckedTrace
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.predict.floor import above_noise
 from servod.lab.diagnose.predict.predict import Predictor
@@ -19,6 +22,7 @@ from servod.lab.diagnose.result import DiagnosisVerdict
 from servod.lab.diagnose.select.candidates import Candidate
 from servod.lab.diagnose.select.selection import Selection
 from servod.lab.diagnose.settings import SETTINGS
+from servod.lab.simulate.servo import drive_torque, torque_per_unit
 
 Array = NDArray[np.float64]
 
@@ -88,6 +92,24 @@ def below_noise(found: DiagnosisVerdict, encoder_noise: float, dry: float) -> bo
         DiagnosisVerdict.ADEQUATE: SETTINGS.verdict.hides_all,
     }
     return found in hides and encoder_noise > hides[found] * dry
+
+
+def product_with(predictor: Predictor, model: AxisModel, name: str) -> str:
+    """The effect of which and this one only the product shows, since a servo is hardly ever at its limit; else none."""
+    law, other = model.drive, effect(name).product_with
+    if law is None or not law.kind.feeds_back or not other:
+        return ""
+    rows = [_at_limit(model, law, trace) for trace in predictor.traces if trace.drive.told is not None]
+    return other if rows and float(np.mean(np.concatenate(rows))) < SETTINGS.verdict.at_limit else ""
+
+
+def _at_limit(model: AxisModel, law: DriveLaw, trace: CheckedTrace) -> NDArray[np.bool_]:
+    """Rows in which the duty that a servo asks for is at its limit."""
+    drive = trace.drive
+    if drive.told is None or law.most is None:
+        return np.zeros(len(drive.t_s), dtype=bool)
+    made = drive_torque(law, drive.told, drive.t_s, drive.position, model.total_delay_s + law.delay_s)
+    return np.asarray(np.abs(made) >= (1.0 - 1e-9) * law.most * torque_per_unit(law, drive.told))
 
 
 def confidence(selection: Selection, index: int, removed: float) -> float:
