@@ -6,7 +6,7 @@ A failure of a test of real processes (mark `serial` or `processes`) becomes a s
   kernel counted that programs waited for them; or a whole processor stood still, as those of virtual machines do: a
   program that goes before all others there did not run either. What the tests and their children use themselves never
   counts, so code that burns time excuses nothing. Or the loop may not go before others (SCHED_FIFO is refused to this
-  user): then whatever runs anywhere, the tests' own attackers too, takes its turn.
+  user): then whatever runs anywhere, the tests' own attackers too, takes its turn. That excuses no time-out.
 - Time is what failed: a time-out, a fault of lateness and none beside it in the message or in the daemon's log, or a
   comparison in a test that compares times alone (mark `wall_clock`). What a drive did, a torque, a limit or another
   fault fails on any machine.
@@ -31,6 +31,7 @@ from _pytest.runner import runtestprotocol  # as pytest-rerunfailures has it: th
 
 from servod.common.errors import ServodError
 from servod.common.faults import FaultCode
+from servod.formats.config import CycleConfig
 
 #: Share of all processors that others took, and of the time in which somebody waited; and the first where no kernel
 #: counts the second (Linux without PSI).
@@ -135,13 +136,13 @@ def _waited_s() -> float | None:
     return int(found[1]) / 1e6 if found else None
 
 
-def refused() -> str:
+def refused(priority: int = CycleConfig().priority) -> str:
     """What keeps a loop of this user from going before other programs; empty where nothing does."""
     policy, param = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except PermissionError:
-        return "this user may not use SCHED_FIFO, so any program goes before the loop"
+        return f"this user may not use SCHED_FIFO {priority}, so any program goes before the loop"
     os.sched_setscheduler(0, policy, param)
     return ""
 
@@ -240,9 +241,11 @@ class Judge:
         report = yield
         if report.failed and call.excinfo is not None and self._began is not None:
             spans = [self._since(self._began), *self._of_fixtures(item)]
-            evidence = next((span.starved for span in spans if span.starved), self._refused)
+            starved, error = next((span.starved for span in spans if span.starved), ""), call.excinfo.value
+            never_came = isinstance(error, TimeoutError | subprocess.TimeoutExpired)
+            evidence = starved if never_came else starved or self._refused
             times_alone = item.get_closest_marker("wall_clock") is not None
-            if evidence and by_lateness(call.excinfo.value, times_alone, logged(LOGS)):
+            if evidence and by_lateness(error, times_alone, logged(LOGS)):
                 report.outcome = "skipped"
                 said = f"Skipped: the machine was starved: {evidence} ({call.excinfo.exconly()[:200]})"
                 report.longrepr = (str(item.path), (item.location[1] or 0) + 1, said)

@@ -59,6 +59,8 @@ def guard_test(
         f"(limit {result.limit_ms:.1f} ms)"
         if result.left_ms is not None and result.off_ms is not None
         else f"{result.guard}: the drive went on"
+        if result.left_ms is None
+        else f"{result.guard}: the drive left the command after {result.left_ms:.1f} ms and did not stay without power"
         for result in results
     ]
     if not all(result.passed for result in results):

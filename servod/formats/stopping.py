@@ -124,9 +124,10 @@ class Stopping:
         }
 
 
-#: From this gear ratio on the drive's own sight of rest, which is at the motor, takes some milliseconds longer: 8, 23,
-#: 32, 40 and 48 ms at 10, 30, 100, 300 and 1000 on the virtual axis.
-_FINE_GEAR = 10.0
+#: The drive's threshold of rest (0x606F) counts at the motor, so behind a gear it is so many times finer at the joint,
+#: and what is left of the speed decays with the drive's lag: 8, 23, 32, 40 and 48 ms more at 10, 30, 100, 300 and 1000
+#: on the virtual axis (lag 6 ms).
+_DECAYS_LAGS = 1.2
 
 #: What is said where nothing is known of the joint.
 UNKNOWN = (
@@ -184,8 +185,8 @@ def stated(config: AxisConfig, joint: JointBounds, reaction_s: float, writes_ram
     ramp_down_s = min(config.limits.ramp_down_s, max(most_ramp_s, 1e-3))
     if ramp_down_s < config.limits.ramp_down_s:
         narrowed.append(
-            f"limits.ramp_down_s {config.limits.ramp_down_s:g} is narrowed to {ramp_down_s:.3g} s: braking and ramp of "
-            "a loop that lost its supervisor take twice as long"
+            f"limits.ramp_down_s {config.limits.ramp_down_s:g} is narrowed to {ramp_down_s:.3g} s: a loop that lost "
+            f"its supervisor brakes for so long, then comes its ramp, or the drive's ({1e3 * by_drive_s:.0f} ms)"
         )
     # A law that runs away does not brake: a loop that lost its supervisor lets it for that long, within the limits and
     # the range, and then the drive stops it.
@@ -264,11 +265,6 @@ def _holds(config: AxisConfig) -> list[str]:
             "(heartbeat.command_deadline_ms 0)"
         )
     stays = quick_stop_stays(amplifier.quick_stop_option) and amplifier.heartbeat_reaction == _HOLDS
-    if amplifier.gear_ratio >= _FINE_GEAR:
-        notes.append(
-            f"behind a gear of {amplifier.gear_ratio:g} the drive may see the rest later, and keep its torque for "
-            "longer than the stated time: its threshold (0x606F) counts at the motor"
-        )
     if amplifier.brake.by == "output" and stays:
         notes.append(
             "loop and supervisor dead: at rest the drive holds the joint with torque until it is switched off, since "
@@ -278,11 +274,12 @@ def _holds(config: AxisConfig) -> list[str]:
 
 
 def _held_s(config: AxisConfig) -> float:
-    """How long the torque holds the joint that has come to rest: until its brake is closed, or servod has seen the rest
-    of a drive that stays in quick stop active (0x605A from 5 on)."""
+    """How long the torque holds the joint that has come to rest: until the drive has seen it, behind a gear; until its
+    brake is closed, or servod has seen the rest of a drive that stays in quick stop active (0x605A from 5 on)."""
     brake, stays = config.amplifier.brake, quick_stop_stays(config.amplifier.quick_stop_option)
     seen_s = REST_S if stays or brake.by == "output" else 0.0
-    return seen_s + (brake.engage_s if brake.by != "none" else 0.0)
+    finer = math.log(max(config.amplifier.gear_ratio, 1.0))
+    return seen_s + (brake.engage_s if brake.by != "none" else 0.0) + _DECAYS_LAGS * config.stopping.drive_lag_s * finer
 
 
 def _time_s(facts: StopFacts) -> float:

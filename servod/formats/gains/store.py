@@ -167,11 +167,19 @@ class GainStore:
                 write_atomically(self._history_file, "\n".join(lines[-_KEPT_LINES:]) + "\n")
 
     def mend(self) -> None:
-        """Write what says which set is active anew where it is damaged, has no copy, or is of an earlier version."""
+        """Write what says which set is active anew where it is damaged, has no copy or an old one, or is of an earlier
+        version."""
         with self._locked(), contextlib.suppress(BadInput, OSError):  # nothing to mend it with, or a full disk: later
             state = self._active()
-            if state is not None and not (self._active_copy.exists() and state.sha256 and not self.damage):
+            if state is not None and not (state.sha256 and not self.damage and self._copy_is_the_same()):
                 self._write_active(state)
+
+    def _copy_is_the_same(self) -> bool:
+        """A power cut between the two files, or a disk that took only one, leaves a copy that names an older set."""
+        try:
+            return read_bytes(self._active_copy) == read_bytes(self._active_file)
+        except BadInput:
+            return False
 
     def load(self, text: str, where: str, name: str | None = None) -> StoredSet:
         """Check a gain set and store it as the next version of its name; the newest text again gets none.
@@ -373,8 +381,10 @@ class GainStore:
         write_atomically(self._active_file, text)
         try:
             write_atomically(self._active_copy, text)
-        except OSError as error:  # what is active is written and stands
+        except OSError as error:  # what is active is written and stands; no copy is better than an older one
             log.warning("%s: without a copy (%s)", self._active_copy, reason(error))
+            with contextlib.suppress(OSError):
+                self._active_copy.unlink(missing_ok=True)
 
     def _log(self, action: Action, stored: StoredSet, note: str = "", figures: dict[str, float] | None = None) -> None:
         entry = HistoryEntry(

@@ -11,7 +11,7 @@ import hashlib
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -47,6 +47,7 @@ from servod.runtime.fieldbus.devices import (
 from servod.runtime.fieldbus.master import BringUp, Master
 from servod.runtime.fieldbus.master.planned import narrowed_by_stop
 from servod.runtime.fieldbus.registry import amplifier_of
+from servod.runtime.fieldbus.setup_tools import read_optional
 
 PROOF_NAME = "guard-proof.json"
 _S_PER_DAY = 86_400.0
@@ -67,8 +68,6 @@ _LOOK_CYCLES = 3
 #: What the drive tells when each guard acts.
 _TOLD = {"commands": Emcy.RPDO_TIME_OUT, "heartbeat": Emcy.HEARTBEAT_LOST}
 _EVERYTHING = "everything"
-#: A proof of fewer is none.
-_SILENCES = [*_TOLD, _EVERYTHING]
 _EXPECTED = (Emcy.HEARTBEAT_LOST, Emcy.RPDO_TIME_OUT)
 
 
@@ -118,7 +117,21 @@ def terms(amplifier: NodePlan, identity: Any) -> dict[str, Any]:
     ways = {Obj402.QUICK_STOP_OPTION, Obj402.FAULT_REACTION_OPTION, Obj402.ABORT_CONNECTION, Obj301.ERROR_BEHAVIOUR,
             Obj301.HEARTBEAT_CONSUMER, Obj301.RPDO_PARAMETER}  # fmt: skip
     guards = [list(guard) for guard in amplifier.facts.get("guards", ()) if guard[0] in ways]
-    return {"drive": asdict(identity), "guards": guards, "silences": _SILENCES}
+    return {"drive": asdict(identity), "guards": guards, "silences": [s.name for s in silences_of(amplifier.facts)]}
+
+
+def silences_of(facts: dict[str, Any]) -> list[_Silence]:
+    """What a drive with these guards is tried with; nothing where none of them is counted on."""
+    times = {"commands": facts.get("command_deadline_ms"), "heartbeat": facts.get("heartbeat_timeout_ms")}
+    counted = [
+        _Silence(guard, guard, float(limit_ms))
+        for guard, limit_ms in times.items()
+        if limit_ms and (guard == "commands" or facts.get("heartbeat_reaction"))
+    ]
+    if not counted:
+        return []
+    # As when this computer dies: without SYNC, too, at which alone some drives look at what else is overdue.
+    return [*counted, min(counted, key=lambda silence: silence.limit_ms)._replace(name=_EVERYTHING)]
 
 
 class GuardTest:
@@ -129,7 +142,7 @@ class GuardTest:
         self._config, self._connect, self.clock = narrowed_by_stop(config)[0], connect, clock
         # A drive that holds for a brake that servod closes stays in quick stop active, and has stopped there.
         self._holds = config.amplifier.brake.by == "output" and quick_stop_stays(config.amplifier.quick_stop_option)
-        self._longest_ms = 0.0
+        self._longest_ms, self._caused = 0.0, False
         self.period_ns = config.cycle.period_us * 1000
         self.beat_ns = config.heartbeat.master_period_ms * _MS
         self.beat_id = HEARTBEAT_BASE + config.heartbeat.master_node_id
@@ -137,7 +150,8 @@ class GuardTest:
     def run(self) -> tuple[list[GuardResult], dict[str, Any]]:
         """Each guard that is counted on, and the terms that the result holds for.
 
-        Raises Unreachable where the drive cannot be enabled, AnswerIsNo where the joint does not stay at rest.
+        Raises Unreachable where the drive cannot be enabled, AnswerIsNo where the joint does not stay at rest, or the
+        drive stops for another reason than the silence.
         """
         master = Master(self._config, self._connect(), self.clock, threaded=False)
         try:
@@ -150,18 +164,11 @@ class GuardTest:
         up = master.bring_up()
         facts = up.amplifier.facts
         found = terms(up.amplifier, master.identity(up.amplifier.node_id))
-        guards = [("commands", facts["command_deadline_ms"]), ("heartbeat", facts["heartbeat_timeout_ms"])]
-        counted = [
-            _Silence(guard, guard, float(limit_ms))
-            for guard, limit_ms in guards
-            if limit_ms and self._counts(guard, facts)
-        ]
-        if not counted:
+        silences = silences_of(facts)
+        if not silences:
             raise AnswerIsNo("no guard of this drive is counted on (amplifier.unguarded): there is nothing to test")
-        self._longest_ms = max(silence.limit_ms for silence in counted)
-        # As when this computer dies: without SYNC, too, at which alone some drives look at what else is overdue.
-        dead = min(counted, key=lambda silence: silence.limit_ms)._replace(name=_EVERYTHING)
-        for number, silence in enumerate([*counted, dead]):
+        self._longest_ms = max(silence.limit_ms for silence in silences)
+        for number, silence in enumerate(silences):
             up = up if number == 0 else master.bring_up()
             results.append(self._tried(master, up, silence))
         self._reset_expected(master, up.amplifier.node_id)
@@ -184,10 +191,6 @@ class GuardTest:
             "late, since this machine stood still meanwhile: end what else runs here, then test again"
         )
 
-    @staticmethod
-    def _counts(guard: str, facts: dict[str, Any]) -> bool:
-        return guard == "commands" or bool(facts.get("heartbeat_reaction"))
-
     def _try(self, master: Master, up: BringUp, silence: _Silence) -> _Seen | None:
         """Bring the drive to zero torque at rest, fall silent, and look until it is without power. However that ends,
         the drive is switched off. None where another guard acted."""
@@ -201,8 +204,9 @@ class GuardTest:
             self._enable(drive, sdo)
             if not self._rests(drive, sdo):
                 return None
-            drive.silent = silence.name
+            drive.silent, self._caused = silence.name, True
             left_ms, off_ms, told, before_ms = self._look(sdo, drive, silence)
+            _refuse_other_reason(silence, told, sdo)
         if left_ms is not None and left_ms < _EARLIEST_SHARE * silence.limit_ms:
             raise AnswerIsNo(
                 f"{silence.name}: the drive left the command {left_ms:.1f} ms into the silence, and its guard acts "
@@ -223,7 +227,9 @@ class GuardTest:
         off = drive.run(Goal.OFF, round(_INPUTS_S * 1e9 / self.period_ns) if reads_inputs else 10)
         _refuse_stopped(off)
         fault = off.state is DriveState.FAULT
-        if fault and (error := sdo.read(Obj402.ERROR_CODE)) not in _EXPECTED:
+        error = _error_code(sdo, off.error_code) if fault else 0
+        unknown = error == 0 and self._caused  # no 0x603F: the fault that the silence before has caused
+        if fault and error not in _EXPECTED and not unknown:
             raise Unreachable(
                 f"the drive is in a fault of its own (error 0x{error:04X}), which this test does not reset: remove its "
                 "cause, then `servoctl enable --reset-fault`"
@@ -243,17 +249,19 @@ class GuardTest:
         start_rad = drive.run(Goal.ENABLED, 1).position_rad
         for _ in range(_REST_CYCLES + round(_REST_TIMES * self._longest_ms * _MS / self.period_ns)):
             feedback = drive.run(Goal.ENABLED, 1)
+            state = decode_status_word(sdo.read(Obj402.STATUS_WORD))  # its PDOs may have ended
+            if state is not DriveState.OPERATION_ENABLED:
+                code = feedback.error_code or _error_code(sdo, 0)
+                if code in _EXPECTED:
+                    return False
+                _refuse_stopped(feedback)
+                raise AnswerIsNo(
+                    f"the drive leaves operation by itself ({state.name}, error 0x{code:04X}) while nothing is silent: "
+                    "remove the cause, then test again"
+                )
             _refuse_stopped(feedback)
             if abs(feedback.position_rad - start_rad) > _REST_RAD:
                 raise AnswerIsNo("the joint moves without torque: hold its load (brake, support), then test again")
-            if feedback.age_cycles == 0 and feedback.state is not DriveState.OPERATION_ENABLED:
-                codes = {feedback.error_code, sdo.read(Obj402.ERROR_CODE)}
-                if codes & set(_EXPECTED):
-                    return False
-                raise AnswerIsNo(
-                    f"the drive leaves operation by itself ({feedback.state.name}, error 0x{max(codes):04X}) while "
-                    "nothing is silent: remove the cause, then test again"
-                )
         return True
 
     def _look(
@@ -268,7 +276,8 @@ class GuardTest:
         most_ms = 2.0 * limit_ms + 1e3 * self._config.amplifier.enable_timeout_s
         while (since_ms := (self.clock.now_ns() - last_ns) / _MS) < most_ms:
             feedback = drive.run(Goal.ENABLED, 1)
-            if feedback.inputs and left_ms is None and not feedback.age_cycles:
+            # Without SYNC the feedback grows old, and inputs come by an event timer all the same.
+            if left_ms is None and (feedback.age_cycles == 0 or silence.name == _EVERYTHING):
                 _refuse_stopped(feedback)
             told.append(feedback.error_code)
             asked_ms = (self.clock.now_ns() - last_ns) / _MS
@@ -301,9 +310,26 @@ class GuardTest:
         """The fault that the test itself has caused goes; any other stays as it is."""
         sdo = master.sdo(node_id)
         fault = decode_status_word(sdo.read(Obj402.STATUS_WORD)) is DriveState.FAULT
-        if fault and sdo.read(Obj402.ERROR_CODE) in _EXPECTED:
+        if fault and _error_code(sdo, 0) in (0, *_EXPECTED):
             sdo.write(Obj402.CONTROL_WORD, 0, CW_FAULT_RESET)
             sdo.write(Obj402.CONTROL_WORD, 0, CW_DISABLE_VOLTAGE)
+
+
+def _error_code(sdo: SdoAccess, told: int) -> int:
+    """What 0x603F says; what an EMCY has `told` where the drive does not have it."""
+    code = read_optional(sdo, Obj402.ERROR_CODE)
+    return told if code is None else code
+
+
+def _refuse_other_reason(silence: _Silence, told: Sequence[int], sdo: SdoAccess) -> None:
+    """Raise AnswerIsNo where the drive says that it stopped for something else than the silence."""
+    faulty = decode_status_word(sdo.read(Obj402.STATUS_WORD)) is DriveState.FAULT
+    codes = [*told, _error_code(sdo, 0) if faulty else 0]
+    if other := next((code for code in codes if code and code not in _EXPECTED), None):
+        raise AnswerIsNo(
+            f"{silence.name}: the drive says that it stopped for another reason (error 0x{other:04X}), which says "
+            "nothing of its guard: remove the cause, then test again"
+        )
 
 
 def _refuse_stopped(feedback: AmplifierFeedback) -> None:
@@ -387,6 +413,8 @@ def _judge(
         path = config.gains.directory / PROOF_NAME
         return None, f"the drive's guards were never tested ({path} is missing or broken)"
     tested_s = proof["time"]
+    if {**proof["terms"], "silences": None} == {**found, "silences": None} != found != proof["terms"]:
+        return tested_s, "the drive's guards were tested with other silences, by an earlier version of servod"
     if proof["terms"] != found:
         return tested_s, "the drive, its guards or their times are others than those that were tested"
     days = config.amplifier.guard_test_days

@@ -256,3 +256,30 @@ def test_no_file_where_one_should_be_ends_no_start_but_for_the_lock_which_it_nam
     again.activate("bench_lugre")
     active = GainStore(tmp_path).active()
     assert active is not None and active.name == "bench_lugre"
+
+
+def test_a_copy_that_a_full_disk_left_behind_never_brings_an_older_set_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither one that could not be written, nor one that a power cut left as it was."""
+    store = GainStore(tmp_path)
+    for text in (good.PD, good.LUGRE):
+        store.load(text, "x")
+    store.activate("bench_pd")
+    copy = tmp_path / "active.copy.json"
+    older = copy.read_text()
+
+    def full(path: Path, text: str) -> None:
+        if path == copy:
+            raise OSError(28, "No space left on device")
+        write_atomically(path, text)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("servod.formats.gains.store.write_atomically", full)
+        store.activate("bench_lugre")
+    assert not copy.exists()
+    copy.write_text(older)
+    GainStore(tmp_path)
+    (tmp_path / "active.json").write_text("{")
+    active = GainStore(tmp_path).active()
+    assert active is not None and active.name == "bench_lugre"

@@ -435,6 +435,33 @@ async def test_an_enable_that_is_read_behind_a_stop_that_has_no_answer_yet_is_vo
     assert loop.sent[-1] is Op.ENABLE
 
 
+@pytest.mark.parametrize("how", ["the queue is full", "no answer", "not off"])
+@on_event_loop
+async def test_a_stop_that_failed_keeps_nobody_from_enabling(
+    verbs: tuple[Verbs, _Loop], monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    front, loop = verbs
+    loop.latest = record(1, axis_state=AxisState.ENABLED)
+    answers = _Answers()
+
+    def full(_op: Op, _arguments: Sequence[float] = ()) -> int:
+        raise Unreachable("the command queue is full")
+
+    with monkeypatch.context() as patch:
+        if how == "the queue is full":
+            patch.setattr(loop, "send", full)
+        front.handle(Verb.STOP, {}, answers.reply())
+        await events_pass()
+    if how == "not off":
+        front.tick([record(2, command_seq=1, axis_state=AxisState.ENABLED)], time.monotonic_ns())
+        await events_pass()
+    front.tick([], time.monotonic_ns() + 60_000_000_000)
+    await events_pass()
+    assert not answers.sent[0]["ok"]
+    front.handle(Verb.ENABLE, {}, _Answers().reply())
+    assert loop.sent[-1] is Op.ENABLE
+
+
 @on_event_loop
 async def test_stops_one_after_the_other_are_one_command_until_the_loop_has_taken_it(
     verbs: tuple[Verbs, _Loop],
