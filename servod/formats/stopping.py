@@ -124,6 +124,8 @@ class Stopping:
         }
 
 
+#: What a drive takes for rest, rad/s: the joint coasts on from there by its friction when the torque goes.
+_CREEPS_RAD_S = 0.012
 #: The drive's threshold of rest (0x606F) counts at the motor, so behind a gear it is so many times finer at the joint,
 #: and what is left of the speed decays with the drive's lag: 8, 23, 32, 40 and 48 ms more at 10, 30, 100, 300 and 1000
 #: on the virtual axis (lag 6 ms).
@@ -195,6 +197,7 @@ def stated(config: AxisConfig, joint: JointBounds, reaction_s: float, writes_ram
     )
     unbraked_rad = max(way.behind * speed_rad_s + way.ahead * end_rad_s for way in ways)
     coasts_rad = max(way.coasting_rad(end_rad_s) for way in ways)
+    creeps_rad = max(way.coasting_rad(_CREEPS_RAD_S) for way in ways) if facts.deceleration_rad_s2 else 0.0
     return Stopping(
         facts,
         reaction_s,
@@ -204,7 +207,8 @@ def stated(config: AxisConfig, joint: JointBounds, reaction_s: float, writes_ram
         max(
             min(alone_rad, facts.position_max_rad - facts.position_min_rad),
             *(way.travel_rad(speed_rad_s, end_rad_s) for way in ways),
-        ),
+        )
+        + (creeps_rad if math.isfinite(creeps_rad) else 0.0),  # what no friction holds is told apart
         unbraked_rad,
         unbraked_rad + coasts_rad,
         0.5 * joint.torque_factor * facts.most_inertia * end_rad_s * end_rad_s,

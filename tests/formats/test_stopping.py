@@ -16,6 +16,7 @@ from servod.formats.config_guards import weakened
 from servod.formats.joint_bounds import joint_of
 from servod.formats.model.axis_model import load_axis_model
 from servod.formats.stopping import Stopping, with_stopping
+from servod.kernels.stopping import both_ways
 from servod.qualify.faults.scenario import merged, shipped_config
 
 SOON_S, HEARTBEAT_S = 0.02, 0.15
@@ -250,7 +251,8 @@ def test_a_loop_without_its_supervisor_lets_a_law_run_away_until_its_ramp_is_ove
         stated(config.model_copy(update={"limits": config.limits.model_copy(update={"ramp_down_s": ramp_s})}))
         for ramp_s in (0.09, 0.01)
     )
-    assert long.travel_rad == pytest.approx(3.0 * 0.093 + 3.6 * (0.006 + 0.5 * 3.6 / long.facts.deceleration_rad_s2))
+    way_rad = 3.0 * 0.093 + 3.6 * (0.006 + 0.5 * 3.6 / long.facts.deceleration_rad_s2)
+    assert long.travel_rad == pytest.approx(way_rad, abs=1e-4)
     assert short.travel_rad < long.travel_rad
     drive_s = short.time_s - short.facts.hold_s  # the drive's part, where its own reaction is the longest of all
     assert long.time_s == pytest.approx(max(2.0 * long.ramp_down_s, long.ramp_down_s + drive_s) + 0.003)
@@ -271,3 +273,17 @@ def test_rest_that_the_drive_sees_late_behind_a_gear_is_in_the_time(gear_ratio: 
     assert geared.time_s - plain.time_s == pytest.approx(later_s, abs=1e-4)
     assert geared.held_s == pytest.approx(later_s, abs=1e-4)
     assert geared.facts.speed_rad_s == plain.facts.speed_rad_s
+
+
+def test_a_joint_with_next_to_no_friction_creeps_on_behind_the_ramp() -> None:
+    """From what the drive takes for rest; with more friction next to nothing."""
+    own = {"least_inertia": 0.006, "most_inertia": 0.006}
+    for friction_nm, creeps_rad in ((3e-5, 0.0144), (0.01, 4.3e-5)):
+        found = stated(axis({**own, "least_friction_nm": friction_nm}))
+        facts = found.facts
+        powered_rad = max(way.travel_rad(facts.speed_rad_s, found.speed_rad_s) for way in both_ways(facts))
+        alone_rad = facts.speed_rad_s * (found.ramp_down_s + 0.003) + max(
+            found.speed_rad_s * (facts.lag_s + 0.5 * found.speed_rad_s / way.deceleration_rad_s2)
+            for way in both_ways(facts)
+        )
+        assert found.travel_rad - max(powered_rad, alone_rad) == pytest.approx(creeps_rad, rel=0.02)
