@@ -29,7 +29,7 @@ _OPERATIONAL = bytes([NmtState.OPERATIONAL])
 #: A cycle takes at most this many frames from the socket, so that a babbling node cannot hold the loop.
 MAX_FRAMES = 64
 #: Feedback that is missing stays owed, since a bus that stalls delivers it later. What is still owed after so many
-#: cycles in a row with all feedback in time is lost. Silence forgives nothing: what was held up may come after it.
+#: cycles in a row with all feedback in time is lost. A cycle without begins the row anew: what it held up is to come.
 #: One frame stays owed: a node that answers by a clock of its own may be a cycle behind all the while, which looks the
 #: same, and sends two in one cycle when it catches up.
 _PUNCTUAL_CYCLES = 100
@@ -84,6 +84,7 @@ class Exchange:
         On a machine that is slow for a moment the time may be over while the answer is already there.
         """
         missing, clock, bus, sync_ns, owed = self._sync_frames, self._clock, self._bus, self.sync_ns, self._owed
+        punctual, self._punctual = self._punctual, 0
         for _ in range(MAX_FRAMES):
             remaining_ns = until_ns - clock.now_ns()
             frame = bus.receive(max(remaining_ns, 0) / NS_PER_S)
@@ -95,7 +96,7 @@ class Exchange:
             if receiver is not None and receiver.on_frame(frame.can_id, frame.data, sync_ns):
                 missing -= 1
                 if missing == 0:
-                    self._punctual += 1
+                    self._punctual = punctual + 1
                     return
             elif receiver is None and frame.can_id in self._strangers:
                 self._foreign |= self._strangers[frame.can_id]

@@ -184,6 +184,25 @@ def test_node_a_cycle_behind_that_catches_up_is_nobody_else() -> None:
     assert F.FOREIGN_FEEDBACK not in latched(axis)
 
 
+def test_what_a_stall_held_up_is_not_given_up_at_the_first_answer_behind_it() -> None:
+    """A node that stood still answers in time again before what it owes is through, at whatever cycle it was."""
+    axis = ready("rests")
+
+    def blamed(phase_ms: int) -> bytes:
+        axis.run(phase_ms * 1e-3)
+        for can_id in (0x181, 0x282):
+            axis.loop_bus.inject(BusFault(FaultKind.DROP, can_id, 3))
+        axis.run(5e-3)  # three without an answer, two with
+        held_up = axis.world.connect(())
+        axis.clock.sleep_until(axis.clock.now_ns() + 420_000)
+        for counts in range(3):
+            held_up.send(0x282, counts.to_bytes(4, "little"))
+        axis.run(0.02)
+        return b"%d" % (F.FOREIGN_FEEDBACK in latched(axis))
+
+    assert {ms: forked(lambda ms=ms: blamed(ms)) for ms in range(100)} == dict.fromkeys(range(100), b"0")
+
+
 def test_feedback_that_a_controller_repeats_is_not_foreign() -> None:
     """The transmitter did not see its frame acknowledged by all: CAN gives it again, at once, with the same data."""
     axis = axis_that("moves")
