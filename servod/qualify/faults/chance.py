@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from servod.common.yaml import validate
 from servod.formats.config import AxisConfig
-from servod.kernels.stopping import StopFacts, both_ways
+from servod.kernels.stopping import StopFacts, Way, both_ways
 from servod.qualify.faults.judge import check_bounds, loss_of
 from servod.qualify.faults.scenario import (
     FEEDBACK_LOSS_MS,
@@ -112,6 +112,10 @@ _UNWATCHED = {
     "exempt": "commands alone lost by a drive without a deadline: a bent torque, a speed or a position shows it",
     "torque_gone_ms": 1000.0,
 }
+#: Of the time in which an axis that runs away is stopped by its own limits, the part in which something may fail.
+_OF_THE_WAY = 0.8
+#: Of the reckoning of that time.
+_STEP_S = 0.0005
 #: Of the sine that brings the axis to its top speed.
 _AMPLITUDE_RAD = 0.12
 _AT_PEAK, _AT_TOP, _RUNS_AWAY = "at peak torque", "at top speed", "running away"
@@ -137,8 +141,7 @@ def _scenario(chance: random.Random, joint: str, what: str, how: str, deadline: 
     config = _config(kind, deadline)
     gone_ms = DEADLINE_GONE_MS if deadline == _STOPS and kind.within_s is None else HEARTBEAT_GONE_MS
     facts = _facts(config)
-    inject = _brought_there(chance, kind, sign, how, facts)
-    longest_ms = _SHARES[how] * 1000.0 * facts.hold_s  # beyond, its own limits stop the axis
+    inject, longest_ms = _brought_there(chance, kind, sign, how, facts)
     title = f"{what}, {how}, {joint} joint, {'forward' if sign > 0 else 'backward'}, {_DEADLINES[deadline]}"
     data = {
         "title": title[:100],
@@ -196,8 +199,14 @@ def _config(kind: _JointKind, deadline: str) -> Nested:
     }
 
 
-def _brought_there(chance: random.Random, kind: _JointKind, sign: float, how: str, facts: StopFacts) -> list[Nested]:
-    """Injections that bring the axis to its worst: stiff gains, the load, and a motion or a law that runs away."""
+def _brought_there(
+    chance: random.Random, kind: _JointKind, sign: float, how: str, facts: StopFacts
+) -> tuple[list[Nested], float]:
+    """Injections that bring the axis to its worst: stiff gains, the load, and a motion or a law that runs away.
+
+    With the time after the last of them beyond which its own limits stop the axis, in ms.
+    """
+    longest_ms = _SHARES[how] * 1000.0 * facts.hold_s
     damping = 150.0 * kind.inertia
     gains = [chance.uniform(4.0, 8.0) * damping, damping, kind.inertia]
     found: list[Nested] = [{"do": {"gains": {"law": "pd", "parameters": gains}}}]
@@ -205,16 +214,36 @@ def _brought_there(chance: random.Random, kind: _JointKind, sign: float, how: st
         found.append({"at_ms": 5.0, "do": {"load": {"torque_nm": kind.load_nm}}})
     begin_ms = 300.0
     if how == _AT_PEAK:
-        return [*found, {"at_ms": begin_ms, "do": {"step": {"amplitude_rad": sign * 0.45}}}]
+        return [*found, {"at_ms": begin_ms, "do": {"step": {"amplitude_rad": sign * 0.45}}}], longest_ms
     frequency_hz = chance.uniform(0.75, 0.9) * _top_rad_s(facts) / (2.0 * math.pi * _AMPLITUDE_RAD)
     found.append(
         {"at_ms": begin_ms, "do": {"sine": {"amplitude_rad": sign * _AMPLITUDE_RAD, "frequency_hz": frequency_hz}}}
     )
-    fastest_ms = begin_ms + 1000.0 * chance.choice((0.5, 1.0, 1.5)) / frequency_hz
+    halves = chance.choice((1, 2, 3))
+    fastest_ms = begin_ms + 500.0 * halves / frequency_hz
     if how == _AT_TOP:
-        return [*found, {"at_ms": fastest_ms - 30.0, "do": {"gains": {"law": "pd", "parameters": gains}}}]
+        return [*found, {"at_ms": fastest_ms - 30.0, "do": {"gains": {"law": "pd", "parameters": gains}}}], longest_ms
     away = {"law": "pd", "parameters": [0.0, -chance.choice((0.5, 5.0, 50.0)) * gains[1], 0.0]}
-    return [*found, {"at_ms": fastest_ms - 20.0, "do": {"gains": away}}]
+    found.append({"at_ms": fastest_ms - 20.0, "do": {"gains": away}})
+    forward = (sign > 0.0) == (halves % 2 == 0)
+    speed_rad_s = 2.0 * math.pi * frequency_hz * _AMPLITUDE_RAD
+    room_rad = facts.position_max_rad - facts.load_nm / gains[0]  # which the load has taken already
+    away_s = _run_away_s(both_ways(facts)[0 if forward else 1], speed_rad_s, room_rad)
+    return found, min(longest_ms, 1000.0 * _OF_THE_WAY * away_s)
+
+
+def _run_away_s(way: Way, speed_rad_s: float, room_rad: float) -> float:
+    """How long a law that asks for all torque that the limits leave it takes to where they stop the joint, in s.
+
+    The load goes on to push a joint that they allow no torque any more: it is there soon, and without one never.
+    """
+    facts, steps = way.facts, 0
+    while not way.too_near(speed_rad_s, room_rad) and steps * _STEP_S < facts.hold_s:
+        torque_nm = min(facts.torque_nm, way.most_torque_nm(speed_rad_s, room_rad))
+        speed_rad_s += _STEP_S * (torque_nm + way.push_nm) / facts.least_inertia
+        room_rad -= _STEP_S * speed_rad_s
+        steps += 1
+    return steps * _STEP_S
 
 
 def _facts(over: Nested) -> StopFacts:

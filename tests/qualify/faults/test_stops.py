@@ -146,6 +146,13 @@ def test_random_stops_keep_what_was_stated(number: int) -> None:
     assert outcome.passed, outcome.complaints
 
 
+def test_an_axis_that_its_load_drives_away_meets_its_failure_before_its_limits() -> None:
+    """A hanging joint that runs away downwards is stopped by its position limit within some 35 ms."""
+    name = "random/155"
+    outcome = outcome_of(name, drawn(155, 94)[name])
+    assert outcome.passed, outcome.complaints
+
+
 @pytest.mark.parametrize("number", [35, 90, 114])
 def test_a_dead_loop_has_no_leave_to_coast(number: int) -> None:
     """The supervisor has the drive brake, and so it is held against what was stated of that."""
