@@ -410,6 +410,9 @@ class Axis:
             self._stop(self._after_braking(), self._end_state)
         if state == AxisState.ENGAGING and self._brake and self._cycles_in_state > self._brake.engage_cycles:
             self._enter(AxisState.RAMPING)
+        if state == AxisState.RAMPING and self._moving:  # a load, or its own way on: without torque it would go on
+            self._stop(AxisState.QUICK_STOPPING, self._end_state)
+            return False
         ramped = state == AxisState.RAMPING and self._cycles_in_state >= self._ramp_cycles
         if ramped or (state == AxisState.QUICK_STOPPING and self._quick_stop_is_over(amplifier)):
             self._enter(self._end_state)

@@ -314,6 +314,15 @@ def test_a_joint_that_the_controller_did_not_bring_to_rest_is_the_drives_to_stop
     assert axis.state == (S.QUICK_STOPPING if moving else S.RAMPING)
 
 
+def test_a_joint_that_begins_to_move_while_its_torque_goes_is_the_drives_to_stop() -> None:
+    """Braking may end where a joint turns back: its load drove it to 0.7 rad/s until the ramp had switched it off."""
+    axis = axis_in(S.RAMPING)
+    axis.step(amplifier(**DRIVE[S.RAMPING]), True, 0, True, False)
+    assert axis.state == S.RAMPING
+    axis.step(amplifier(**DRIVE[S.RAMPING]), True, 0, True, True)
+    assert (axis.state, axis.goal) == (S.QUICK_STOPPING, Goal.QUICK_STOP)
+
+
 def test_a_drive_on_its_ramp_after_a_fault_is_left_to_it() -> None:
     axis = axis_in(S.ENABLED)
     step(axis, state=D.QUICK_STOP_ACTIVE, goal_reached=False)
