@@ -27,13 +27,6 @@ STUCK_MRAD, COMPENSATED_MRAD = 10.0, 2.0
 
 def check(document: dict, out: Path) -> None:
     """The documented keys, errors in the right order, and a report."""
-    rms = checked_but_for_the_order(document, out)
-    assert max(rms["pd_dob"], rms["pd_lugre"], rms["local"]) < COMPENSATED_MRAD
-    assert rms["local"] == min(rms.values())
-
-
-def checked_but_for_the_order(document: dict, out: Path) -> dict[str, float]:
-    """Errors in mrad of a demo whose missed cycles may cost any compensator a millirad or two."""
     scores = document["controllers"]
     assert list(scores) == ["pd", "pd_dob", "pd_lugre", "local"]
     for score in scores.values():
@@ -41,10 +34,11 @@ def checked_but_for_the_order(document: dict, out: Path) -> dict[str, float]:
         assert 0.0 < score["rms_error_mrad"] <= score["max_error_mrad"]
     rms = {name: score["rms_error_mrad"] for name, score in scores.items()}
     assert rms["pd"] > STUCK_MRAD
-    assert max(rms["pd_dob"], rms["pd_lugre"], rms["local"]) < STUCK_MRAD
+    missed = document["missed"] > 0  # each may cost any of them a millirad or two
+    assert max(rms["pd_dob"], rms["pd_lugre"], rms["local"]) < (STUCK_MRAD if missed else COMPENSATED_MRAD)
+    assert missed or rms["local"] == min(rms.values())
     assert document["wall_s"] > 0.0
     assert (out / "report.html").stat().st_size > 300_000
-    return rms
 
 
 def test_the_fast_demo_prints_one_document(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -177,7 +171,7 @@ def test_the_demo_on_the_wall_clock(tmp_path: Path) -> None:
     if demo.returncode:
         raise ServodError(f"the demo ended with {demo.returncode}: {err}")
     assert err == ""
-    checked_but_for_the_order(json.loads(out), tmp_path / "out")
+    check(json.loads(out), tmp_path / "out")
     assert sorted(f.stem for f in (tmp_path / "out/recordings").glob("*.mcap")) == [
         *("local", "local_certified", "pd", "pd_dob", "pd_lugre")
     ]
