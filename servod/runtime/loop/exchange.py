@@ -5,7 +5,7 @@ from __future__ import annotations
 from servod.common.clock import Clock
 from servod.common.faults import FAULTS, FaultCode
 from servod.common.units import NS_PER_S
-from servod.runtime.fieldbus.bus import Bus, Frame
+from servod.runtime.fieldbus.bus import Bus
 from servod.runtime.fieldbus.cia import (
     HEARTBEAT_BASE,
     LSS_FROM_SLAVE_ID,
@@ -19,6 +19,7 @@ from servod.runtime.fieldbus.cia import (
     NmtState,
 )
 from servod.runtime.fieldbus.devices import Amplifier, Encoder, NodePlan
+from servod.runtime.loop.answers import Answers
 from servod.runtime.loop.plan import LoopPlan
 
 _BUS_OFF, _BUS_DOWN, _QUEUE_FULL = (
@@ -28,13 +29,7 @@ _SECOND_MASTER, _FOREIGN_FEEDBACK = (FAULTS[c].bit for c in (FaultCode.SECOND_MA
 _OPERATIONAL = bytes([NmtState.OPERATIONAL])
 #: A cycle takes at most this many frames from the socket, so that a babbling node cannot hold the loop.
 MAX_FRAMES = 64
-#: Feedback that is missing stays owed, since a bus that stalls delivers it later. What is still owed after so many
-#: cycles in a row with all feedback in time is lost. A cycle without begins the row anew: what it held up is to come.
-#: One frame stays owed: a node that answers by a clock of its own may be a cycle behind all the while, which looks the
-#: same, and sends two in one cycle when it catches up.
-_PUNCTUAL_CYCLES = 100
-#: A controller that did not see its frame acknowledged by all sends it once more, at once, and who had taken it has it
-#: twice (ISO 11898-1: the last bit of end of frame). The same data within some three frames is that, and not foreign.
+#: A frame that a controller gives once more, because it did not see it acknowledged, comes within some three frames.
 _REPEATED_BITS = 500
 
 
@@ -55,10 +50,8 @@ class Exchange:
         self._heartbeat_id = HEARTBEAT_BASE + plan.config.heartbeat.master_node_id
         self._strangers = dict.fromkeys(_master_ids(plan) | {self._heartbeat_id}, _SECOND_MASTER)
         self._strangers |= dict.fromkeys(_unplanned_ids(plan), _FOREIGN_FEEDBACK)
-        self._owed = dict.fromkeys(_synchronous_ids(plan.amplifier) | _synchronous_ids(plan.encoder), 0)
-        self._newest: dict[int, Frame] = {}
-        self._repeated_ns = _REPEATED_BITS * NS_PER_S // plan.config.bus.bit_rate
-        self._punctual = 0  # cycles in a row with all feedback in time and none late
+        synchronous = _synchronous_ids(plan.amplifier) | _synchronous_ids(plan.encoder)
+        self._answers = Answers(synchronous, _REPEATED_BITS * NS_PER_S // plan.config.bus.bit_rate)
         self._foreign = 0  # fault bits of what others sent, since the last look
         self.late_frames = 0
         self._queue_full = self._bus_off_events = self._down_events = 0
@@ -67,15 +60,9 @@ class Exchange:
     def sync(self) -> int:
         """Take what came since the last cycle, send SYNC, and return the moment of it: all feedback is sampled then."""
         self._drain()
-        owed = self._owed
-        if self._punctual >= _PUNCTUAL_CYCLES:
-            self._punctual = 0
-            for can_id in owed:
-                owed[can_id] = min(owed[can_id], 1)
         self.sync_ns = self._clock.now_ns()
         if self._bus.send(SYNC_ID, b""):
-            for can_id in owed:
-                owed[can_id] += 1
+            self._answers.ask(self.sync_ns)
         return self.sync_ns
 
     def collect(self, until_ns: int) -> None:
@@ -83,20 +70,20 @@ class Exchange:
 
         On a machine that is slow for a moment the time may be over while the answer is already there.
         """
-        missing, clock, bus, sync_ns, owed = self._sync_frames, self._clock, self._bus, self.sync_ns, self._owed
-        punctual, self._punctual = self._punctual, 0
+        clock, bus, sync_ns, answers = self._clock, self._bus, self.sync_ns, self._answers
+        answered: set[int] = set()  # two of one kind, a late one or a repeated one, are no answer of the other node
         for _ in range(MAX_FRAMES):
             remaining_ns = until_ns - clock.now_ns()
             frame = bus.receive(max(remaining_ns, 0) / NS_PER_S)
             if frame is None:
                 return
-            if frame.can_id in owed:
-                self._count_off(frame)
+            if frame.can_id in answers and not answers.take(frame):
+                self._foreign |= _FOREIGN_FEEDBACK
             receiver = self._receivers.get(frame.can_id)
             if receiver is not None and receiver.on_frame(frame.can_id, frame.data, sync_ns):
-                missing -= 1
-                if missing == 0:
-                    self._punctual = punctual + 1
+                answered.add(frame.can_id)
+                if len(answered) == self._sync_frames:
+                    answers.complete()
                     return
             elif receiver is None and frame.can_id in self._strangers:
                 self._foreign |= self._strangers[frame.can_id]
@@ -152,23 +139,14 @@ class Exchange:
             if frame is None:
                 return
             receiver = self._receivers.get(frame.can_id)
-            if frame.can_id in self._owed:
-                self._count_off(frame)
+            if frame.can_id in self._answers:
+                if not self._answers.take(frame):
+                    self._foreign |= _FOREIGN_FEEDBACK
                 self.late_frames += 1
-                self._punctual = 0
             elif receiver is not None:
                 receiver.on_frame(frame.can_id, frame.data, self.sync_ns)
             elif frame.can_id in self._strangers:
                 self._foreign |= self._strangers[frame.can_id]
-
-    def _count_off(self, frame: Frame) -> None:
-        """A synchronous frame of a node against those that SYNC asked for."""
-        can_id, before = frame.can_id, self._newest.get(frame.can_id)
-        if self._owed[can_id] > 0:
-            self._owed[can_id] -= 1
-            self._newest[can_id] = frame
-        elif before is None or frame.data != before.data or frame.time_ns - before.time_ns > self._repeated_ns:
-            self._foreign |= _FOREIGN_FEEDBACK
 
 
 def _master_ids(plan: LoopPlan) -> set[int]:

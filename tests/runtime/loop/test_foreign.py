@@ -212,6 +212,59 @@ def test_feedback_that_a_controller_repeats_is_not_foreign() -> None:
     assert latched(axis) == set()
 
 
+@pytest.mark.parametrize("every_ms", [20, 50, 99, 150])
+def test_a_bus_that_loses_frames_all_the_while_does_not_let_foreign_ones_pass(every_ms: int) -> None:
+    """What is lost is given up again and again, and not only behind a long row without a loss."""
+    axis = ready("holds")
+
+    def passed() -> bytes:
+        for _ in range(3000 // every_ms):
+            axis.loop_bus.inject(BusFault(FaultKind.DROP, 0x282, 1))
+            axis.run(every_ms * 1e-3)
+        return b"%d" % next(n for n in range(200) if hear_a_stranger_at_once(axis, n))
+
+    assert int(forked(passed)) <= 1 + 100 // every_ms
+
+
+def hear_a_stranger_at_once(axis: SteppedSession, count: int) -> bool:
+    stranger = axis.world.connect(())
+    axis.clock.sleep_until(axis.clock.now_ns() + 420_000)
+    stranger.send(0x282, (1000 + count).to_bytes(4, "little"))
+    axis.run(1e-3)
+    return F.FOREIGN_FEEDBACK in latched(axis)
+
+
+@pytest.mark.parametrize(("node", "can_id"), [(1, 0x181), (2, 0x282)])
+@pytest.mark.parametrize("does", ["rests", "holds", "moves"])
+def test_one_foreign_frame_in_a_stall_is_told_behind_it(does: str, node: int, can_id: int) -> None:
+    """At rest, too, where the node's own frame that is then one too many looks like the one before it."""
+    axis = ready(does)
+
+    def heard() -> bytes:
+        axis.loop_bus.inject(BusFault(FaultKind.STUCK, amount=10, participant=node))
+        axis.run(1e-3)
+        foreign = {0x181: "3706000000000000", 0x282: "00100000"}[can_id]
+        stranger = axis.world.connect(())
+        axis.clock.sleep_until(axis.clock.now_ns() + 420_000)
+        stranger.send(can_id, bytes.fromhex(foreign))
+        axis.run(0.01 + LONGEST_S)
+        return b"%d" % (F.FOREIGN_FEEDBACK in latched(axis))
+
+    assert forked(heard) == b"1"
+
+
+def test_a_frame_that_comes_twice_does_not_stand_for_the_other_nodes() -> None:
+    """The cycle waits for one frame of each node, and not for as many frames as there are nodes."""
+    axis = axis_that("moves")
+    axis.loop_bus.inject(BusFault(FaultKind.DELAY, amount=200, participant=2))  # the copy comes before its frame
+    axis.run(0.01)
+    axis.clear()
+    axis.loop_bus.inject(BusFault(FaultKind.DUPLICATE, 0x181, 40))
+    axis.run(0.1)
+    assert {record.encoder_age for record in axis.records} == {0}
+    assert latched(axis) == set()
+
+
 @pytest.mark.parametrize("ours", [True, False])
 def test_a_scan_of_this_daemon_is_told_from_that_of_somebody_else(ours: bool) -> None:
     axis = axis_that("rests")
