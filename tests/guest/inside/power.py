@@ -133,8 +133,10 @@ def _is_closed(row: dict[str, Any]) -> bool:
 
 
 def _store(config: AxisConfig, said: list[dict[str, Any]]) -> dict[str, Any]:
-    """The active set, and which it may be: the last that was told to be active, or one that was begun after it."""
+    """The active set, and which it may be: the last that was told to be active, the first start's where none was, or
+    one that was begun after it."""
     done = max((at for at, row in enumerate(said) if "active" in row), default=-1)
-    may = [row["begun"] for row in said[done + 1 :] if "begun" in row] + [said[done]["active"]] * (done >= 0)
+    before = said[done]["active"] if done >= 0 else said[0]["running"][0]
+    may = [before, *(row["begun"] for row in said[done + 1 :] if "begun" in row)]
     active = GainStore(config.gains.directory, mends=False).active()
     return {"active": [active.name, active.version] if active else None, "may": may}
