@@ -56,6 +56,7 @@ KINDS = {
     "SDO answer": (0x581, "4300100092010200", F.FOREIGN_SDO),
     "EMCY": (0x081, "1023810000000000", F.DRIVE_FAULT),
     "EMCY of the encoder": (0x082, "1023810000000000", F.ENCODER_ALARM),
+    "boot-up of DS-301 V3": (0x081, "", F.DRIVE_RESET),
     "EMCY takes back": (0x081, "0000000000000000", F.DUPLICATE_NODE),
     "heartbeat of the drive": (0x701, "05", F.DUPLICATE_NODE),
     "heartbeat of the encoder": (0x702, "05", F.DUPLICATE_NODE),

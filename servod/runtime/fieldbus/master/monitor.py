@@ -188,6 +188,9 @@ class NodeWatch:
             self.add(FaultCode.NODE_LEFT_OPERATIONAL, text, state)
 
     def _on_emcy(self, _can_id: int, data: bytearray, time_ns: float) -> None:
+        if not data:
+            self._boots_as_of_old()
+            return
         if len(data) != _EMCY.size:
             self._misshapen("EMCY", data, _EMCY.size)
             return
@@ -199,6 +202,13 @@ class NodeWatch:
         meaning = EmcyError(code, register, maker, time_ns).get_desc()
         text = f"node {self.node_id}: EMCY 0x{code:04X} {meaning}, register 0x{register:02X}, {maker.hex(' ')}"
         self.add(self._emcy_fault, text, code)
+
+    def _boots_as_of_old(self) -> None:
+        """The boot-up of devices by DS-301 before its version 4: the identifier of an EMCY without data."""
+        self.boot_ups += 1
+        if self._watching:
+            text = f"node {self.node_id}: boot-up as by DS-301 V3 (EMCY without data) while it should be operational"
+            self.add(FaultCode.DRIVE_RESET, text, int(NmtState.BOOT_UP))
 
     def _take_back(self, register: int) -> None:
         """EMCY without a code: an error is gone, or all that were; who had none has nothing to take back."""
