@@ -32,9 +32,12 @@ from pydantic import Field
 
 from servod.common.errors import BadInput
 from servod.common.files import (
+    MOST_BYTES,
     make_folder,
+    open_file,
     open_to_append,
     read_bytes,
+    read_json,
     read_text,
     reason,
     unreadable,
@@ -42,7 +45,7 @@ from servod.common.files import (
     write_atomically,
 )
 from servod.common.portable import lock_file
-from servod.common.yaml import Strict, load_model
+from servod.common.yaml import Strict, validate
 from servod.formats.gains.gain_set import NAME_PATTERN, GainSet, Sha256, parse_gains, require_certificate
 
 _VERSION_FILE = re.compile(r"^([0-9]{4,})\.yaml$")
@@ -154,16 +157,19 @@ class GainStore:
             yield
 
     def _sweep(self) -> None:
-        """Remove what a kill left half-written, end a history line that it cut."""
+        """Remove what a kill left half-written, end a history line that it cut; tell of a history that is no file."""
         for leftover in self.directory.rglob("*.tmp"):
             if leftover.is_file():
                 leftover.unlink()
         with contextlib.suppress(OSError):  # a disk that takes nothing: later; no line of it is needed to run
+            if self._history_file.exists() and not self._history_file.is_file():
+                log.warning("%s: is no file; move it away: until then what happens leaves no line", self._history_file)
+                return
             if self._history_file.exists() and not self._history_bytes().endswith(b"\n"):
                 with open_to_append(self._history_file) as file:
                     file.write(b"\n")
             lines = self._history_lines()
-            if len(lines) > 2 * _KEPT_LINES:
+            if len(lines) > 2 * _KEPT_LINES or self._history_file.stat().st_size > MOST_BYTES:
                 write_atomically(self._history_file, "\n".join(lines[-_KEPT_LINES:]) + "\n")
 
     def mend(self) -> None:
@@ -171,8 +177,11 @@ class GainStore:
         version."""
         with self._locked(), contextlib.suppress(BadInput, OSError):  # nothing to mend it with, or a full disk: later
             state = self._active()
-            if state is not None and not (state.sha256 and not self.damage and self._copy_is_the_same()):
-                self._write_active(state)
+            if state is None or (state.sha256 and not self.damage and self._copy_is_the_same()):
+                return
+            if not self.damage and self._active_copy.exists():
+                log.warning("%s: is not what %s says; written anew from it", self._active_copy, self._active_file.name)
+            self._write_active(state)
 
     def _copy_is_the_same(self) -> bool:
         """A power cut between the two files, or a disk that took only one, leaves a copy that names an older set."""
@@ -344,10 +353,13 @@ class GainStore:
         return self._history_bytes().decode("utf-8", errors="replace").splitlines()
 
     def _history_bytes(self) -> bytes:
-        """Nothing where it cannot be read, or is no file."""
+        """The end of it where it has grown beyond what is read; nothing where it cannot be read, or is no file."""
         try:
-            return read_bytes(self._history_file)
-        except BadInput:
+            with open_file(self._history_file) as stream:
+                size = stream.seek(0, os.SEEK_END)
+                stream.seek(max(size - MOST_BYTES, 0))
+                return stream.read(MOST_BYTES)
+        except OSError:
             return b""
 
     def _versions(self, name: str) -> list[int]:
@@ -371,7 +383,11 @@ class GainStore:
         except BadInput as error:
             if self._active_copy not in files:
                 raise
-            state = _read_active(self._active_copy)
+            try:
+                state = _read_active(self._active_copy)
+            except BadInput as second:
+                found = f"{error.found}; in its copy {self._active_copy.name} {second.found}"
+                raise BadInput(error.where, found, "the file as servod wrote it, or its copy") from None
             self.damage = f"{error}; {self._active_copy.name} was taken in its place"
             log.error("%s", self.damage)
             return state
@@ -414,7 +430,8 @@ def _holds(path: Path, text: str) -> bool:
 
 
 def _read_active(path: Path) -> _Active:
-    state = load_model(path, _Active)
+    written = "the file as servod wrote it"
+    state = validate(read_json(path, written), _Active, str(path))
     if state.sha256 not in (None, state.content_sha256()):
-        raise BadInput(f"{path}: sha256", "a hash of other content", "the file as servod wrote it")
+        raise BadInput(f"{path}: sha256", "a hash of other content", written)
     return state

@@ -172,8 +172,8 @@ class GainBank:
             self._fits(active.gains, self._config)
         except BadInput as error:
             place = f"{initial.name} version {initial.version} (gains.initial) runs in place of {wanted}"
-            self._note = f"{error}; {place}"
-            log.warning("%s. %s", self._note, remedy)
+            self._note = f"{error}; {place}. {remedy}"
+            log.warning("%s", self._note)
             self._why_first = f"in place of {wanted}: {error}"
             return initial
         self._note = self._store.damage

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from servod.common.errors import BadInput
-from servod.common.files import write_atomically
+from servod.common.files import MOST_BYTES, write_atomically
 from servod.common.shipped import shipped
 from servod.formats.config import AxisConfig, load_config
 from servod.formats.gains.gain_set import parse_gains
@@ -283,3 +283,41 @@ def test_a_copy_that_a_full_disk_left_behind_never_brings_an_older_set_back(
     (tmp_path / "active.json").write_text("{")
     active = GainStore(tmp_path).active()
     assert active is not None and active.name == "bench_lugre"
+
+
+def test_a_damaged_copy_is_mended_and_the_log_says_so(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    store = GainStore(tmp_path)
+    store.load(good.PD, "x")
+    store.activate("bench_pd")
+    copy = tmp_path / "active.copy.json"
+    whole = copy.read_text()
+    GainStore(tmp_path)
+    assert caplog.text == ""
+    copy.write_text(whole.replace("bench", "trench"))
+    GainStore(tmp_path)
+    assert copy.read_text() == whole
+    assert "active.copy.json: is not what active.json says; written anew from it" in caplog.text
+
+
+def test_with_both_files_damaged_the_refusal_names_both(tmp_path: Path) -> None:
+    for name in ("active.json", "active.copy.json"):
+        (tmp_path / name).write_text("{")
+    with pytest.raises(BadInput, match=r"active.json: found no JSON document .* in its copy active.copy.json no JSON"):
+        GainStore(tmp_path).active()
+
+
+def test_a_history_that_is_a_folder_is_told_of_at_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (tmp_path / "history.jsonl").mkdir()
+    GainStore(tmp_path)
+    assert "history.jsonl: is no file; move it away" in caplog.text
+
+
+def test_of_a_history_beyond_what_is_read_the_newest_stays(tmp_path: Path) -> None:
+    store = GainStore(tmp_path)
+    store.load(good.PD, "x")
+    path = tmp_path / "history.jsonl"
+    line = path.read_bytes()
+    path.write_bytes(b"\n" * MOST_BYTES + line)
+    again = GainStore(tmp_path)
+    assert [entry.name for entry in again.history()] == ["bench_pd"]
+    assert path.stat().st_size < MOST_BYTES
