@@ -53,7 +53,8 @@ def guard_test(
     for number in _ENDS:  # as Ctrl-C: the drive is switched off before this ends
         signal.signal(number, _end)
     with InstanceLock(axis):
-        results, found = GuardTest(axis, lambda: open_bus(axis.bus), WallClock()).run()
+        test = GuardTest(axis, lambda: open_bus(axis.bus), WallClock(), lambda text: typer.echo(text, err=True))
+        results, found = test.run()
     words = [
         f"{result.guard}: stopped within {result.left_ms:.1f} ms of the last frame, off after {result.off_ms:.0f} ms "
         f"(limit {result.limit_ms:.1f} ms)"
@@ -70,4 +71,4 @@ def guard_test(
         )
     path = keep_proof(axis, results, found)
     document = {"results": [asdict(result) for result in results], "proof": str(path)}
-    report(document, "; ".join(words) + f"; proof in {path}", as_json)
+    report(document, "\n".join([*words, f"proof in {path}"]), as_json)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -48,6 +49,8 @@ from servod.runtime.fieldbus.master import BringUp, Master
 from servod.runtime.fieldbus.master.planned import narrowed_by_stop
 from servod.runtime.fieldbus.registry import amplifier_of
 from servod.runtime.fieldbus.setup_tools import read_optional
+
+log = logging.getLogger("servod.guards")
 
 PROOF_NAME = "guard-proof.json"
 _S_PER_DAY = 86_400.0
@@ -112,6 +115,13 @@ class ProofStatus(TypedDict):
     text: str
 
 
+class Proof(TypedDict):
+    """When the guards were tried (Unix time), and what that holds for."""
+
+    time: float
+    terms: dict[str, Any]
+
+
 def terms(amplifier: NodePlan, identity: Any) -> dict[str, Any]:
     """What a proof holds for: this drive, with these ways and times to stop."""
     ways = {Obj402.QUICK_STOP_OPTION, Obj402.FAULT_REACTION_OPTION, Obj402.ABORT_CONNECTION, Obj301.ERROR_BEHAVIOUR,
@@ -135,11 +145,13 @@ def silences_of(facts: dict[str, Any]) -> list[_Silence]:
 
 
 class GuardTest:
-    """The test of one axis: `connect` gives a new connection to its bus."""
+    """The test of one axis: `connect` gives a new connection to its bus, `tell` hears what comes next."""
 
-    def __init__(self, config: AxisConfig, connect: Callable[[], Bus], clock: Clock) -> None:
+    def __init__(
+        self, config: AxisConfig, connect: Callable[[], Bus], clock: Clock, tell: Callable[[str], None] = log.info
+    ) -> None:
         # As the daemon runs it: with the limits and the ramp that the stop is reckoned with.
-        self._config, self._connect, self.clock = narrowed_by_stop(config)[0], connect, clock
+        self._config, self._connect, self.clock, self._tell = narrowed_by_stop(config)[0], connect, clock, tell
         # A drive that holds for a brake that servod closes stays in quick stop active, and has stopped there.
         self._holds = config.amplifier.brake.by == "output" and quick_stop_stays(config.amplifier.quick_stop_option)
         self._longest_ms, self._caused = 0.0, False
@@ -169,6 +181,10 @@ class GuardTest:
             raise AnswerIsNo("no guard of this drive is counted on (amplifier.unguarded): there is nothing to test")
         self._longest_ms = max(silence.limit_ms for silence in silences)
         for number, silence in enumerate(silences):
+            self._tell(
+                f"{number + 1} of {len(silences)}: {silence.name} will stay away; the drive has to stop within "
+                f"{silence.limit_ms:g} ms by its guard of the {silence.guard}"
+            )
             up = up if number == 0 else master.bring_up()
             results.append(self._tried(master, up, silence))
         self._reset_expected(master, up.amplifier.node_id)
@@ -178,7 +194,9 @@ class GuardTest:
     def _tried(self, master: Master, up: BringUp, silence: _Silence) -> GuardResult:
         """One silence, again where this machine was in the way. Raises Unreachable where it always was."""
         late: GuardResult | None = None
-        for _ in range(_TRIES):
+        for number in range(_TRIES):
+            if number:
+                self._tell(f"again, {number + 1} of {_TRIES}: this machine stood still, or another guard acted first")
             seen = self._try(master, up, silence)
             if seen is not None and not seen.unsure:
                 return seen.result
@@ -334,8 +352,14 @@ def _refuse_other_reason(silence: _Silence, told: Sequence[int], sdo: SdoAccess)
 
 def _refuse_stopped(feedback: AmplifierFeedback) -> None:
     """Raise AnswerIsNo while somebody holds the axis stopped."""
-    if feedback.inputs & (DriveInput.ESTOP | DriveInput.STO):
-        raise AnswerIsNo("the emergency stop or STO is active, or not heard of: release it, then test again")
+    for told, name, key in (
+        (DriveInput.ESTOP, "the emergency stop", "amplifier.inputs.estop_bit"),
+        (DriveInput.STO, "STO", "amplifier.inputs.sto_bit or sto_error"),
+    ):
+        if feedback.inputs & told:
+            raise AnswerIsNo(
+                f"{name} is active, or its input is not heard of (0x60FD, {key}): release it, then test again"
+            )
 
 
 class _Cycles:
@@ -388,30 +412,33 @@ def _sha256(document: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
 
 
-def read_proof(config: AxisConfig) -> dict[str, Any] | None:
-    """What the last test that passed has left; None without one that can be read."""
+def read_proof(config: AxisConfig) -> Proof | str:
+    """What the last test that passed has left, or why there is nothing that counts, in a sentence."""
+    path = config.gains.directory / PROOF_NAME
+    if not path.exists():
+        return f"the drive's guards were never tested (there is no {path})"
     try:
-        proof = read_json(config.gains.directory / PROOF_NAME, "a proof by `servoctl guard-test`")
+        proof = read_json(path, "a proof by `servoctl guard-test`")
         told = proof.pop("sha256")
-        sound = told == _sha256(proof) and math.isfinite(proof["time"])
-        return {"time": float(proof["time"]), "terms": proof["terms"]} if sound else None
-    except (BadInput, AttributeError, KeyError, TypeError, ValueError, OverflowError):  # a time of 400 digits
-        return None
+        if told == _sha256(proof) and math.isfinite(proof["time"]):
+            return {"time": float(proof["time"]), "terms": proof["terms"]}
+    except BadInput as error:
+        return f"the proof of the drive's guards cannot be read ({error})"
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError):  # a time of 400 digits
+        pass
+    return f"the proof of the drive's guards was changed since `servoctl guard-test` wrote it ({path})"
 
 
-def proof_status(config: AxisConfig, proof: dict[str, Any] | None, found: dict[str, Any], now_s: float) -> ProofStatus:
+def proof_status(config: AxisConfig, proof: Proof | str, found: dict[str, Any], now_s: float) -> ProofStatus:
     """Whether `proof` holds for the drive that was brought up with the terms `found`, as of `now_s` (Unix)."""
     days = config.amplifier.guard_test_days
     tested_s, text = _judge(config, proof, found, now_s)
     return {"asked_for": days is not None, "holds": not text, "time": tested_s, "text": text}
 
 
-def _judge(
-    config: AxisConfig, proof: dict[str, Any] | None, found: dict[str, Any], now_s: float
-) -> tuple[float | None, str]:
-    if proof is None:
-        path = config.gains.directory / PROOF_NAME
-        return None, f"the drive's guards were never tested ({path} is missing or broken)"
+def _judge(config: AxisConfig, proof: Proof | str, found: dict[str, Any], now_s: float) -> tuple[float | None, str]:
+    if isinstance(proof, str):
+        return None, proof
     tested_s = proof["time"]
     if {**proof["terms"], "silences": None} == {**found, "silences": None} != found != proof["terms"]:
         return tested_s, "the drive's guards were tested with other silences, by an earlier version of servod"

@@ -44,6 +44,9 @@ class Nodes:
         self._master, self.plans = master, plans
         # Once, before the rounds begin, which wait for no disk: the test runs while no daemon does.
         self._proof = read_proof(master.config)
+        proof = self.proof()
+        if proof["asked_for"] and not proof["holds"]:
+            log.warning("%s: run `servoctl guard-test` while no daemon runs; until then no enabling", proof["text"])
 
     def events(self) -> list[NodeEvent]:
         """Listen, and give what the nodes did since the last call."""

@@ -74,8 +74,10 @@ REFUSAL_TEXT: dict[Refusal, str] = {
     Refusal.PROVES_ONLY_FROM_OFF: "the wiring is proven on the way from off to on; run `servoctl disable` first",
     Refusal.JUMPS: "the reference would jump further from the joint than limits.following_error_rad",
     Refusal.NOT_CONFIRMED: "another command came between the request to enable and its confirmation; try again",
-    Refusal.ESTOP_ACTIVE: "the emergency stop is active, or its input (0x60FD) is not heard; release it first",
-    Refusal.STO_ACTIVE: "the STO circuit is open, or its input (0x60FD) is not heard; close it first",
+    Refusal.ESTOP_ACTIVE: "the emergency stop is active, or its input is not heard (bit amplifier.inputs.estop_bit of "
+    "0x60FD); release it first",
+    Refusal.STO_ACTIVE: "the STO circuit is open, or its input is not heard (bit amplifier.inputs.sto_bit of 0x60FD, "
+    "or the error amplifier.inputs.sto_error); close it first",
     Refusal.CORRUPT: "the command came to the loop corrupt or too late; see CHANNEL_CORRUPT in `servoctl faults`",
 }
 
