@@ -11,6 +11,10 @@ import readme
 
 PAGES = blocks.pages()
 RUN = [page for page in PAGES if blocks.runs(page)]
+#: Run with another page behind them, in the same shell: not alone as well.
+BEFORE = {
+    page.parent / word.removeprefix("after ") for page in RUN for word in blocks.options(page) if "after " in word
+}
 
 
 def name(page: Path) -> str:
@@ -31,10 +35,7 @@ def test_every_block_says_whether_it_is_run() -> None:
 def test_every_option_of_a_mark_is_known() -> None:
     words = {word for page in PAGES for word in blocks.options(page)}
     assert words - {"long", "on an axis"} == {word for word in words if word.startswith("after ")}
-    behind = [
-        page.parent / word.removeprefix("after ") for page in RUN for word in blocks.options(page) if "aft" in word
-    ]
-    assert [str(page) for page in behind if page not in RUN] == []
+    assert [str(page) for page in BEFORE if page not in RUN] == []
 
 
 def test_commands_stand_in_fences_and_not_in_indented_lines() -> None:
@@ -75,6 +76,7 @@ def test_a_command_that_fails_ends_the_page(tmp_path: Path) -> None:
     [
         pytest.param(page, id=name(page), marks=[pytest.mark.long, pytest.mark.timeout(1200)] if long(page) else [])
         for page in RUN
+        if page not in BEFORE
     ],
 )
 def test_the_commands_of_a_page_work_as_they_stand(page: Path, tmp_path: Path) -> None:
