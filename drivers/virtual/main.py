@@ -1,6 +1,7 @@
 """`servod-virtual-axis`: the virtual axis as its own process, on the virtual bus or on SocketCAN.
 
 Where the real machine would be. Prints one line, `ready ...`, when it serves, and ends cleanly on SIGTERM and SIGINT.
+SIGUSR1 presses its emergency stop and releases it again, SIGUSR2 opens and closes its STO circuit.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import contextlib
 import gc
 import os
 import select
+import signal
 import socket
 import struct
 import sys
@@ -141,6 +143,7 @@ class HubServer:
 
     def __init__(self, world: World, path: Path, timing: Timing) -> None:
         self._world, self._path = world, path
+        self.devices = world.devices
         self._look_ahead_ns = LOOK_AHEAD_NS if timing is Timing.STAMPED else 0
         self._listener = _listen(path)
         self._clients: list[Client] = []
@@ -230,6 +233,9 @@ def _served(path: Path) -> bool:
 _LONGEST_WAIT_S = 0.1
 _BURST = 64
 
+#: Bit of 0x60FD at which the virtual machine's emergency stop gives 24 V while it is released.
+ESTOP_CONTACT = 1 << 16
+
 
 class CanServer:
     """The devices on `buses`, the amplifier's and the encoder's connection, until `stop`."""
@@ -239,8 +245,8 @@ class CanServer:
     ) -> None:
         self._timeline = Timeline()
         self._buses = buses
-        self._devices = Devices(settings, model, self._timeline, record)
-        self._devices.build(*(_sender(bus) for bus in self._buses))
+        self.devices = Devices(settings, model, self._timeline, record)
+        self.devices.build(*(_sender(bus) for bus in self._buses))
         self._bus_off = [False, False]
         self._stopping = False
 
@@ -250,12 +256,12 @@ class CanServer:
 
     def run(self) -> None:
         """The loop: wait for frames or the next deadline, serve both."""
-        self._devices.power_on(time.monotonic_ns())
+        self.devices.power_on(time.monotonic_ns())
         timeline = self._timeline
         while not self._stopping:
             wait_s = (timeline.next_ns() - time.monotonic_ns()) / NS_PER_S
             select.select(self._buses, (), (), min(max(wait_s, 0.0), _LONGEST_WAIT_S))
-            for number, (bus, node) in enumerate(zip(self._buses, self._devices.nodes, strict=True)):
+            for number, (bus, node) in enumerate(zip(self._buses, self.devices.nodes, strict=True)):
                 self._serve(number, bus, node)
             now_ns = time.monotonic_ns()
             while timeline.next_ns() <= now_ns:
@@ -288,7 +294,10 @@ def _sender(bus: Bus) -> Send:
     return lambda can_id, data, time_ns: bus.send(can_id, data)
 
 
-_EXAMPLE = "example: servod-virtual-axis --socket /tmp/vbus0 --plant joint.yaml --record drive.bin --seed 7"
+_EXAMPLE = (
+    "SIGUSR1 presses the emergency stop (bit 16 of 0x60FD) and releases it, SIGUSR2 opens and closes the STO circuit "
+    "(bit 17). example: servod-virtual-axis --socket /tmp/vbus0 --plant joint.yaml --record drive.bin --seed 7"
+)
 #: Options that override a key of the settings, with their types.
 _SETTING_OPTIONS: dict[str, type] = {
     "seed": int,
@@ -344,6 +353,20 @@ def _server(arguments: argparse.Namespace) -> HubServer | CanServer:
     return server
 
 
+def _on_circuit_signals(devices: Devices) -> None:
+    """Let SIGUSR1 and SIGUSR2 turn what a person at the machine would: its emergency stop and its STO circuit."""
+    contacts, safe_torque_off = (devices.nodes[0].dictionary.entry(0x2000, sub) for sub in (7, 2))
+
+    def press(*_: object) -> None:
+        contacts.value ^= ESTOP_CONTACT
+
+    def open_circuit(*_: object) -> None:
+        safe_torque_off.value ^= 1
+
+    signal.signal(signal.SIGUSR1, press)
+    signal.signal(signal.SIGUSR2, open_circuit)
+
+
 def _take_turns_first(priority: int) -> str:
     """Ask for real-time scheduling: an axis that queues behind ordinary processes answers late; a note if refused."""
     if priority == 0:
@@ -364,6 +387,7 @@ def main(argv: list[str] | None = None) -> int:
         print(f"servod-virtual-axis: {error}", file=sys.stderr)
         return error.exit_code
     on_end_signals(server.stop)
+    _on_circuit_signals(server.devices)
     gc.freeze()  # what stands now stays; collections in the loop then have little to look at
     print(f"ready {arguments.can or arguments.socket}{_take_turns_first(arguments.priority)}", flush=True)
     try:

@@ -163,6 +163,23 @@ def test_it_ends_cleanly(axis: Axis, number: int) -> None:
     assert not axis.bus.exists()
 
 
+def test_its_emergency_stop_and_its_sto_circuit_are_turned_by_signals(axis: Axis, network: canopen.Network) -> None:
+    amplifier = network.add_node(1, str(EDS / "amplifier.eds"))
+
+    def wait_for(circuits: int) -> None:
+        deadline = time.monotonic() + 5.0
+        while amplifier.sdo[0x60FD].raw & 0x30000 != circuits:
+            assert time.monotonic() < deadline
+            time.sleep(0.005)
+
+    wait_for(0x30000)
+    for number, turned in ((signal.SIGUSR1, 0x20000), (signal.SIGUSR2, 0x10000)):
+        axis.process.send_signal(number)
+        wait_for(turned)
+        axis.process.send_signal(number)
+        wait_for(0x30000)
+
+
 def test_the_drive_record_survives_a_kill(axis: Axis) -> None:
     bus = VirtualBus(str(axis.bus))
     bus.send(0x601, bytes.fromhex("2b40600006000000"))
