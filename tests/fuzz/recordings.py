@@ -160,8 +160,8 @@ def _records(draw: st.DrawFn, seed: bytes) -> bytes:
         length = int.from_bytes(seed[at + 1 : at + 9], "little")
         records.append((seed[at], seed[at + 9 : at + 9 + length]))
         at += 9 + length
-    for _ in range(draw(st.integers(1, 4))):
-        where = draw(st.integers(0, len(records) - 1))
+    places = st.integers(0, len(records) - 1)
+    for where in draw(st.lists(places, min_size=1, max_size=4, unique=True)):  # a chunk that is bent unpacks no more
         opcode, content = records[where]
         if opcode == 6 and draw(st.booleans()):
             content = _bent_chunk(draw, content)
