@@ -112,6 +112,9 @@ _UNWATCHED = {
     "exempt": "commands alone lost by a drive without a deadline: a bent torque, a speed or a position shows it",
     "torque_gone_ms": 1000.0,
 }
+#: Of the sine's amplitude: where nothing watches the commands, a joint that comes to rest under the torque that its
+#: drive holds is seen by its reference alone, and only beyond the following-error window (docs/safety.md).
+_WINDOW_SHARE = 0.9
 #: Of the time in which an axis that runs away is stopped by its own limits, the part in which something may fail.
 _OF_THE_WAY = 0.8
 #: Of the reckoning of that time.
@@ -139,6 +142,9 @@ def drawn(count: int, seed: int) -> dict[str, Scenario]:
 def _scenario(chance: random.Random, joint: str, what: str, how: str, deadline: str) -> Scenario:
     kind, sign = _JOINTS[joint], chance.choice((1.0, -1.0))
     config = _config(kind, deadline)
+    unwatched = what == _UNHEARD and deadline == _NONE
+    if unwatched and how == _AT_TOP and kind.within_s is None:  # a joint that is given time follows less closely
+        config["limits"]["following_error_rad"] = _WINDOW_SHARE * _AMPLITUDE_RAD
     gone_ms = DEADLINE_GONE_MS if deadline == _STOPS and kind.within_s is None else HEARTBEAT_GONE_MS
     facts = _facts(config)
     inject, longest_ms = _brought_there(chance, kind, sign, how, facts)
@@ -173,7 +179,7 @@ def _scenario(chance: random.Random, joint: str, what: str, how: str, deadline: 
     }
     scenario = validate(data, Scenario, title)
     more: dict[str, Any] = {"coasts": _COASTS.get(what)}
-    if what == _UNHEARD and deadline == _NONE:
+    if unwatched:
         more |= _UNWATCHED
     if what == _FROZEN:
         more["exempt"] = "a frozen encoder shows when the joint has gone on by the mismatch"
