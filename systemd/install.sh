@@ -21,3 +21,4 @@ if [ -z "$root" ]; then
     systemctl daemon-reload
     if command -v udevadm >/dev/null; then udevadm control --reload && udevadm trigger --sysname-match=cpu_dma_latency; fi
 fi
+sync # an empty file that a power cut leaves would be kept by the next run
