@@ -128,7 +128,20 @@ class Push:
         self.encoder_rad, self.amplifier_rad = encoder_rad, amplifier_rad  # where it started
         self.began_nm = self.began_s = math.nan  # torque, magnitude, and time at the first sign of a motion
         self.began_encoder_rad = self.began_amplifier_rad = 0.0
+        self.furthest_encoder_rad, self.furthest_amplifier_rad = encoder_rad, amplifier_rad
         self.cut_nm = self.cut_s = math.nan
+
+    def see(self, encoder_rad: float, amplifier_rad: float) -> None:
+        """One cycle, until the joint stands again: where each sensor was furthest along the torque."""
+        self.furthest_encoder_rad = self.sign * max(self.sign * self.furthest_encoder_rad, self.sign * encoder_rad)
+        self.furthest_amplifier_rad = self.sign * max(
+            self.sign * self.furthest_amplifier_rad, self.sign * amplifier_rad
+        )
+
+    def begin_way(self, encoder_rad: float, amplifier_rad: float) -> None:
+        """The way counts from here."""
+        self.encoder_rad = self.furthest_encoder_rad = encoder_rad
+        self.amplifier_rad = self.furthest_amplifier_rad = amplifier_rad
 
     def begin_motion(self, torque_nm: float, time_s: float, encoder_rad: float, amplifier_rad: float) -> None:
         """The joint has begun to move."""
@@ -198,10 +211,11 @@ def signs(ways: tuple[float, float]) -> CheckResult | None:
 
 
 def sensors(
-    whole: tuple[float, float], late: tuple[float, float], bounds: WiringTestBounds, noise_rad: float
+    whole: tuple[float, float], late: tuple[float, float], bounds: WiringTestBounds, noise_rad: float, skew_rad: float
 ) -> CheckResult | None:
     """Stillness, signs and scale of both sensors. A wrong scale shows in the whole way and in its late part alike;
-    slack only in the first, a spring that unwinds only in the second."""
+    slack only in the first, a spring that unwinds only in the second. `skew_rad`: what two sensors that are right may
+    differ by while the joint moves, for neither shows the very moment."""
     encoder, amplifier = abs(whole[0]), abs(whole[1])
     step_rad = max(bounds.encoder_count_rad, bounds.amplifier_count_rad)
     blur_rad = step_rad + noise_rad
@@ -211,7 +225,7 @@ def sensors(
         return CheckResult(WiringOutcome.AMPLIFIER_STILL, encoder)
     if verdict := signs(whole):
         return verdict
-    allowed_rad = SCALE_COUNTS * step_rad + noise_rad
+    allowed_rad = SCALE_COUNTS * step_rad + noise_rad + skew_rad
     longer = {_longer(ways, allowed_rad) for ways in (whole, late)}
     if longer in ({1}, {-1}):
         return CheckResult(WiringOutcome.POSITION_SCALE, amplifier / encoder, 1.0 / SCALE_RATIO, SCALE_RATIO)

@@ -126,10 +126,12 @@ class WiringTest:
         self._sway.add(encoder.position_rad, self._time_s)
         self._travel_rad = max(self._travel_rad, abs(encoder.position_rad - self._start_rad))
         self._fastest_rad_s = max(self._fastest_rad_s, abs(self._sway.speed_rad_s()))
+        if self._pushes:
+            self._pushes[-1].see(encoder.position_rad, amplifier.position_rad)
+        else:
+            self._shown_nm += amplifier.torque_nm
         if self._stage == _Stage.PUSH:
             self._line.add(demand_nm, amplifier.torque_nm)
-        elif not self._pushes:
-            self._shown_nm += amplifier.torque_nm
 
     def _breach(self) -> CheckResult | None:
         """Further or faster than allowed; what was seen so far may say why."""
@@ -208,7 +210,7 @@ class WiringTest:
         bounds, push = self._bounds, self._pushes[-1]
         encoder, amplifier = push.ways(self._encoder_rad, self._amplifier_rad)
         if self._signs_known and encoder < 0.0:  # still drifting back: the way counts from where it turns
-            push.encoder_rad, push.amplifier_rad = self._encoder_rad, self._amplifier_rad
+            push.begin_way(self._encoder_rad, self._amplifier_rad)
         if not push.began and abs(encoder) > self._began_rad():
             push.begin_motion(self._torque_nm, self._time_s, self._encoder_rad, self._amplifier_rad)
         if self._moved(abs(encoder), abs(amplifier)):
@@ -236,7 +238,7 @@ class WiringTest:
         if not push.began:
             push.begin_motion(self._torque_nm, self._time_s, push.encoder_rad, push.amplifier_rad)
         verdict = (
-            self._sensors()
+            self._sensors(self._encoder_rad, self._amplifier_rad)
             or judge.first_torque(push, self._bounds)
             or judge.energy(push, self._encoder_rad, self._bounds)
         )
@@ -293,10 +295,9 @@ class WiringTest:
             self._pushes.pop()
             self._push(last.sign)
             return None
-        if last.ways(self._encoder_rad, self._amplifier_rad)[0] > self._travel_needed() and (
-            verdict := self._sensors()
-        ):
-            return verdict  # over the whole way, which is longer than that up to the end of the torque
+        # Where each sensor turned: further than up to the end of the torque, and no matter how late either shows it.
+        if last.moved and (verdict := self._sensors(last.furthest_encoder_rad, last.furthest_amplifier_rad)):
+            return verdict
         if len(self._pushes) == 1:
             self._push(-last.sign)
             return None
@@ -314,21 +315,22 @@ class WiringTest:
             or CheckResult(WiringOutcome.PASSED)
         )
 
-    def _sensors(self) -> CheckResult | None:
-        """Both sensors' ways of the present push."""
+    def _sensors(self, encoder_rad: float, amplifier_rad: float) -> CheckResult | None:
+        """Both sensors' ways of the present push, up to these positions."""
         push = self._pushes[-1]
-        whole = push.ways(self._encoder_rad, self._amplifier_rad)
-        late = push.late_ways(self._encoder_rad, self._amplifier_rad)
+        whole, late = push.ways(encoder_rad, amplifier_rad), push.late_ways(encoder_rad, amplifier_rad)
         if whole[0] != 0.0:
             self._ratio = whole[1] / whole[0]
-        return judge.sensors(whole, late, self._bounds, _STILL_NOISES * self._noise_rad)
+        skew_rad = abs(self._sway.way_rad(SPEED_CYCLES))
+        return judge.sensors(whole, late, self._bounds, _STILL_NOISES * self._noise_rad, skew_rad)
 
     def _so_far(self) -> CheckResult | None:
         """What the sensors' ways of an unfinished push say, where there are any."""
         if self._stage != _Stage.PUSH:
             return None
-        ways = self._pushes[-1].ways(self._encoder_rad, self._amplifier_rad)
-        return self._sensors() if max(abs(ways[0]), abs(ways[1])) > 0.5 * self._bounds.travel_rad else None
+        now = (self._encoder_rad, self._amplifier_rad)
+        ways = self._pushes[-1].ways(*now)
+        return self._sensors(*now) if max(abs(ways[0]), abs(ways[1])) > 0.5 * self._bounds.travel_rad else None
 
     def _moves(self) -> bool:
         return abs(self._sway.way_rad(SPEED_CYCLES)) > self._still_rad()
