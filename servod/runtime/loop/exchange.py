@@ -5,8 +5,9 @@ from __future__ import annotations
 from servod.common.clock import Clock
 from servod.common.faults import FAULTS, FaultCode
 from servod.common.units import NS_PER_S
-from servod.runtime.fieldbus.bus import Bus
+from servod.runtime.fieldbus.bus import Bus, Frame
 from servod.runtime.fieldbus.cia import (
+    EMCY_BASE,
     HEARTBEAT_BASE,
     LSS_FROM_SLAVE_ID,
     LSS_TO_SLAVE_ID,
@@ -52,6 +53,7 @@ class Exchange:
         self._strangers |= dict.fromkeys(_unplanned_ids(plan), _FOREIGN_FEEDBACK)
         synchronous = _synchronous_ids(plan.amplifier) | _synchronous_ids(plan.encoder)
         self._answers = Answers(synchronous, _REPEATED_BITS * NS_PER_S // plan.config.bus.bit_rate)
+        self._event_bytes = _event_bytes(plan.amplifier) | _event_bytes(plan.encoder)
         self._foreign = 0  # fault bits of what others sent, since the last look
         self.late_frames = 0
         self._queue_full = self._bus_off_events = self._down_events = 0
@@ -85,8 +87,8 @@ class Exchange:
                 if len(answered) == self._sync_frames:
                     answers.complete()
                     return
-            elif receiver is None and frame.can_id in self._strangers:
-                self._foreign |= self._strangers[frame.can_id]
+            else:
+                self._look_at(frame)
 
     def send(self, can_id: int, data: bytes) -> None:
         """Queue the torque frame; a full queue is counted and seen in `faults`."""
@@ -143,27 +145,41 @@ class Exchange:
                 if not self._answers.take(frame):
                     self._foreign |= _FOREIGN_FEEDBACK
                 self.late_frames += 1
-            elif receiver is not None:
+                continue
+            if receiver is not None:
                 receiver.on_frame(frame.can_id, frame.data, self.sync_ns)
-            elif frame.can_id in self._strangers:
-                self._foreign |= self._strangers[frame.can_id]
+            self._look_at(frame)
+
+    def _look_at(self, frame: Frame) -> None:
+        """What answers no SYNC: of a master, switched off, or shorter than the PDO that the node was told to send."""
+        self._foreign |= self._strangers.get(frame.can_id, 0)
+        if len(frame.data) < self._event_bytes.get(frame.can_id, 0):
+            self._foreign |= _FOREIGN_FEEDBACK
 
 
 def _master_ids(plan: LoopPlan) -> set[int]:
     """Identifiers of what only a master sends, and all command PDOs of the axis's nodes. SDO is the supervisor's.
 
-    An LSS answer, too: no slave sends one that no master asked for (CiA 305), and beside a running loop we ask none.
+    An EMCY of the master's node, too, and an LSS answer: no slave sends one that no master asked for (CiA 305), and
+    beside a running loop we ask none.
     """
     nodes = (plan.amplifier, plan.encoder)
     commands = {base + node.node_id for base in RPDO_BASE for node in nodes}
     planned = {pdo.cob_id for node in nodes for pdo in node.pdos if pdo.receive}
-    return commands | planned | {NMT_ID, SYNC_ID, TIME_ID, LSS_TO_SLAVE_ID, LSS_FROM_SLAVE_ID}
+    emergency = {EMCY_BASE + plan.config.heartbeat.master_node_id}
+    return commands | planned | emergency | {NMT_ID, SYNC_ID, TIME_ID, LSS_TO_SLAVE_ID, LSS_FROM_SLAVE_ID}
 
 
 def _unplanned_ids(plan: LoopPlan) -> set[int]:
     """Identifiers of the nodes' other TPDOs, in CiA 301's predefined set: the bring-up has switched these off."""
     nodes = (plan.amplifier, plan.encoder)
     return {base + node.node_id for base in TPDO_BASE for node in nodes} - {p.cob_id for n in nodes for p in n.pdos}
+
+
+def _event_bytes(plan: NodePlan) -> dict[int, int]:
+    """Length of the node's TPDOs that follow events, by COB-ID."""
+    answers = _synchronous_ids(plan)
+    return {p.cob_id: p.data_bytes for p in plan.pdos if not p.receive and p.cob_id not in answers}
 
 
 def _synchronous_ids(plan: NodePlan) -> frozenset[int]:

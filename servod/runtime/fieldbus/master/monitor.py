@@ -22,7 +22,8 @@ from servod.runtime.fieldbus.master.sdo import NodeSdo, SdoAnswer
 
 _EMCY = struct.Struct("<HB5s")
 _TOGGLE_MASK = 0x7F
-#: States after operational that a node only reaches by NMT; a number that is none is shown, and is no state.
+_STATES = frozenset(NmtState)
+#: States after operational that a node only reaches by NMT.
 _LEFT = (NmtState.STOPPED, NmtState.PRE_OPERATIONAL)
 #: EMCY of a node that misses its master; what comes before the supervision begins is of the master before us.
 MASTER_MISSED = (Emcy.HEARTBEAT_LOST, Emcy.RPDO_TIME_OUT)
@@ -167,6 +168,10 @@ class NodeWatch:
             self._misshapen("heartbeat", data, 1)
             return
         state = data[0] & _TOGGLE_MASK
+        if state not in _STATES:  # no sign of life either
+            text = f"node {self.node_id}: heartbeat with NMT state {state}, which CiA 301 does not know"
+            self._blame(FaultCode.DUPLICATE_NODE, text, state)
+            return
         previous, self.nmt_state = self.nmt_state, state
         self._heard_ns = self._heartbeat_ns = self._clock.now_ns()
         self.lost = False
