@@ -71,17 +71,23 @@ def _tell(**facts: Any) -> None:
 def _record(connection: ControlClient) -> None:
     """A motion into a recording that is told, with the last cycle that there has been, until it ends."""
     path = connection.call("record_start")["path"]
+    told = {"recording": path, "begun_ns": _now_ns(connection)}
     connection.call("enable")
     connection.call("track", kind="sine", amplitude_rad=0.3, frequency_hz=0.5, duration_s=4.0)
     for _ in range(8):
-        serial = connection.call("cycles")["last"]
-        raw = base64.b64decode(connection.call("cycles", after=serial - 1)["records"])
-        cycle = CycleRecord(*RECORD.unpack(raw[-RECORD.size :]))
-        _tell(recording=path, cycle=cycle.cycle, time_ns=cycle.time_ns)
+        now_ns = _now_ns(connection)
+        _tell(**told, time_ns=now_ns)
         time.sleep(0.3)
     connection.call("record_stop")
-    _tell(recording=path, cycle=cycle.cycle, time_ns=cycle.time_ns, closed=True)
+    _tell(**told, time_ns=now_ns, closed=True)
     connection.call("disable")
+
+
+def _now_ns(connection: ControlClient) -> int:
+    """Of the last cycle that there has been."""
+    serial = connection.call("cycles")["last"]
+    raw = base64.b64decode(connection.call("cycles", after=serial - 1)["records"])
+    return CycleRecord(*RECORD.unpack(raw[-RECORD.size :])).time_ns
 
 
 def _change_gains(connection: ControlClient) -> None:
@@ -117,15 +123,15 @@ def _files(told: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
     """Recordings and fault files that were told since the last start: rows that are missing, and damage."""
     last = {row[kind]: row for row in told for kind in ("recording", "fault_file") if kind in row}
     for path, row in last.items():
+        kept_ns, found = row.get("begun_ns", 0), {"path": path, "whole": False, "closed": _is_closed(row)}
         try:
             recording = read_recording(path)
-        except BadInput as error:
-            yield {"path": path, "unreadable": str(error)}
-            continue
-        times = recording.column("time_ns")
-        lost_s = max(0.0, (row["time_ns"] - times[-1]) / 1e9) if "time_ns" in row else 0.0
-        whole = not recording.truncated
-        yield {"path": path, "rows": len(recording), "lost_s": lost_s, "whole": whole, "closed": _is_closed(row)}
+        except BadInput as error:  # as it should be, where the cut came within its first second
+            found |= {"unreadable": str(error)}
+        else:
+            kept_ns = recording.column("time_ns")[-1]
+            found |= {"rows": len(recording), "whole": not recording.truncated}
+        yield found | {"lost_s": max(0.0, (row["time_ns"] - kept_ns) / 1e9) if "time_ns" in row else 0.0}
 
 
 def _is_closed(row: dict[str, Any]) -> bool:
