@@ -12,6 +12,7 @@ from servod.formats.config import AxisConfig
 from servod.formats.joint_bounds import contradictions
 from servod.formats.model.axis_model import AxisKind, AxisModel
 from servod.formats.wiring import warnings
+from servod.kernels.filters import low_pass_share
 
 #: No joint of a machine that people stand beside turns faster (9549 turns a minute).
 _MOST_SPEED_RAD_S = 1000.0
@@ -22,6 +23,8 @@ _MOST_BLIND_S = 0.05
 _MOST_LATE_S, _MOST_RAMP_S = 0.25, 0.5
 #: A drive whose master has died holds its torque for so long (servod's own time-out is 150 ms).
 _MOST_DEAD_MS = 500
+#: One count that looks like more than this share of the speed limit makes a joint trip far below it.
+_MOST_COUNT_SPEED = 0.2
 #: Drive and encoder that drift apart by so much are not on one joint; a slip of an eighth of a turn is long seen.
 _MOST_MISMATCH_RAD = math.pi / 4.0
 
@@ -53,6 +56,13 @@ def _limits(config: AxisConfig) -> list[str]:
             f"limits.speed_rad_s {limits.speed_rad_s:g}: half the encoder's range of {range_rad:.3g} rad and more "
             "in one period, so that the speed cannot be told"
         )
+    count_rad_s = _one_count_rad_s(config)
+    if count_rad_s > _MOST_COUNT_SPEED * limits.speed_rad_s:
+        lines.append(
+            f"limits.speed_rad_s {limits.speed_rad_s:g}: one count of the encoder (encoder.counts_per_turn "
+            f"{config.encoder.counts_per_turn}) looks like {count_rad_s:.3g} rad/s, and so much below the limit the "
+            "joint may trip; lower encoder.velocity_cutoff_hz"
+        )
     if travel_rad >= range_rad:
         lines.append(
             f"limits.position_min_rad and position_max_rad: the encoder's range of {range_rad:.3g} rad ends before them"
@@ -70,6 +80,12 @@ def _limits(config: AxisConfig) -> list[str]:
             "period, so that it limits nothing"
         )
     return lines
+
+
+def _one_count_rad_s(config: AxisConfig) -> float:
+    """What the low-passed speed shows after a step of one count in one period, rad/s."""
+    count_rad, period_s = 2.0 * math.pi / config.encoder.counts_per_turn, config.cycle.period_us * 1e-6
+    return low_pass_share(config.encoder.velocity_cutoff_hz, period_s) * count_rad / period_s
 
 
 def _times(config: AxisConfig) -> list[str]:

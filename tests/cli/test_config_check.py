@@ -108,6 +108,7 @@ def test_a_set_without_a_certificate_is_allowed_and_noted(tmp_path: Path, capsys
 #: Each changes one value of the can0.yaml that ships, and the key that the warning begins with.
 WEAK: list[tuple[dict[str, Any], str]] = [
     ({"limits": {"speed_rad_s": 1e5}}, "limits.speed_rad_s 100000: no joint"),
+    ({"limits": {"speed_rad_s": 1.0}, "encoder": {"counts_per_turn": 4096}}, "limits.speed_rad_s 1: one count"),
     ({"limits": {"position_min_rad": -1e5, "position_max_rad": 1e5}}, "limits.position_min_rad and position_max_rad"),
     ({"limits": {"following_error_rad": 1e5}}, "limits.following_error_rad 100000"),
     ({"limits": {"encoder_mismatch_rad": 1e5}}, "limits.encoder_mismatch_rad 100000"),
