@@ -129,9 +129,11 @@ def test_a_fault_in_virtual_time_is_named_with_its_remedy(
 )
 def test_faults_of_lateness_name_the_busy_machine(fault: FaultCode, starved: bool) -> None:
     row = FAULTS[fault]
-    said = why([{"code": fault.name, "cause": row.cause, "remedy": row.remedy}])
+    rows = [{"code": fault.name, "cause": row.cause, "remedy": row.remedy}]
+    said = why(rows, 0.001)
     assert said.startswith(f"{fault.name}: {row.cause} {row.remedy}")
     assert ("wants the machine for itself" in said) == starved
+    assert "(12% of the cycles were missed): the demo on the wall clock wants the machine for itself" in why(rows, 0.12)
 
 
 def start(tmp_path: Path, *arguments: str) -> subprocess.Popen[str]:
