@@ -287,8 +287,8 @@ FAULTS: dict[FaultCode, Fault] = dict(
         _row(
             _C.SECOND_MASTER,
             _R.QUICK_STOP,
-            "Somebody else sends frames that only this master may send: SYNC, NMT, TIME, LSS, a command (RPDO) or the "
-            "master's heartbeat.",
+            "Somebody else sends frames that only this master may send: SYNC, NMT, TIME, LSS, a command (RPDO), the "
+            "master's heartbeat or its EMCY.",
             "Find the other master on the bus: a second daemon, another controller, a service tool, or a node that "
             "produces SYNC (0x1005 bit 30).",
         ),
@@ -332,8 +332,8 @@ FAULTS: dict[FaultCode, Fault] = dict(
         _row(
             _C.FOREIGN_FEEDBACK,
             _R.QUICK_STOP,
-            "A node's synchronous feedback (TPDO) came that no SYNC asked for, or a TPDO that is switched off: "
-            "somebody else sends it, or SYNC reaches the nodes twice.",
+            "A node's synchronous feedback (TPDO) came that no SYNC asked for, or a TPDO that is switched off or "
+            "shorter than its mapping: somebody else sends it, or SYNC reaches the nodes twice.",
             "Find who else sends the node's frames, or the gateway that repeats SYNC; then `servoctl enable "
             "--reset-fault`.",
         ),
@@ -357,8 +357,8 @@ FAULTS: dict[FaultCode, Fault] = dict(
             _C.DUPLICATE_NODE,
             _R.QUICK_STOP,
             "Two senders use one node id: heartbeats come between those of the node, heartbeat or EMCY have another "
-            "length than CiA 301 gives them, or an EMCY takes back an error that was never heard of, because somebody "
-            "else sent it or because the bus lost the error's own frame.",
+            "length or NMT state than CiA 301 gives them, or an EMCY takes back an error that was never heard of, "
+            "because somebody else sent it or because the bus lost the error's own frame.",
             "Give each node its own id (`servoctl scan` shows who is there), find who sends in its name, or mend the "
             "bus where it was disturbed; then restart the daemon.",
         ),
