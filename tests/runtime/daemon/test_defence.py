@@ -64,19 +64,21 @@ def test_stopped_supervisor_does_not_blame_the_loop(tmp_path: Path) -> None:
         assert "it hung" not in axis.log
 
 
-def test_heartbeat_of_no_known_state_is_shown_and_kills_nobody(axis: Running, client: ControlClient) -> None:
-    bus = VirtualBus(str(axis.folder / "bus"))
+def test_heartbeat_of_no_known_state_is_shown_and_a_fault_and_kills_nobody(tmp_path: Path) -> None:
+    with running(tmp_path) as axis, ControlClient(axis.socket) as client, ControlClient(axis.socket) as watcher:
+        client.call("enable")
+        bus = VirtualBus(str(axis.folder / "bus"))
 
-    def shown() -> bool:
-        bus.send(0x700 + ENCODER, b"\x02")
-        return "unknown state 2" in {node["state"] for node in _state(client)["nodes"]}
+        def shown() -> bool:
+            bus.send(0x700 + ENCODER, b"\x02")
+            return "unknown state 2" in {node["state"] for node in _state(client)["nodes"]}
 
-    with ControlClient(axis.socket) as watcher:
         watch = watcher.watch(0.02)
         wait_for(shown)
         assert next(watch)
-    bus.close()
-    assert axis.daemon.poll() is None
+        wait_for(lambda: {fault["code"] for fault in _state(client)["faults"]} == {"DUPLICATE_NODE"})
+        bus.close()
+        assert axis.daemon.poll() is None
 
 
 def test_long_motion_comes_in_pieces_and_leaves_the_loop_alone(client: ControlClient) -> None:

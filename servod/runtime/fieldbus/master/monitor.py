@@ -168,10 +168,6 @@ class NodeWatch:
             self._misshapen("heartbeat", data, 1)
             return
         state = data[0] & _TOGGLE_MASK
-        if state not in _STATES:  # no sign of life either
-            text = f"node {self.node_id}: heartbeat with NMT state {state}, which CiA 301 does not know"
-            self._blame(FaultCode.DUPLICATE_NODE, text, state)
-            return
         previous, self.nmt_state = self.nmt_state, state
         self._heard_ns = self._heartbeat_ns = self._clock.now_ns()
         self.lost = False
@@ -184,7 +180,10 @@ class NodeWatch:
             foreign = self._rhythm.foreign(int(time_ns))
         if not self._watching:
             return
-        if foreign:
+        if state not in _STATES:
+            text = f"node {self.node_id}: heartbeat with NMT state {state}, which CiA 301 does not know"
+            self._blame(FaultCode.DUPLICATE_NODE, text, state)
+        elif foreign:
             self._blame(FaultCode.DUPLICATE_NODE, f"node {self.node_id}: heartbeats of two senders", state)
         if state == NmtState.BOOT_UP:
             self.add(FaultCode.DRIVE_RESET, f"node {self.node_id}: boot-up while it should be operational", state)
