@@ -116,7 +116,7 @@ def pytest_configure(config: pytest.Config) -> None:
     """
     judge = starved.Judge()
     config.pluginmanager.register(judge, "starved")
-    config.pluginmanager.register(starved.OnceMore(judge), "once_more")
+    config.pluginmanager.register(starved.Again(judge), "again")
     if hasattr(config, "workerinput") or not config.getoption("numprocesses", None):
         for number in (signal.SIGHUP, signal.SIGINT):
             if signal.getsignal(number) is signal.SIG_IGN:
