@@ -165,6 +165,7 @@ class Design(_Numbers):
     counts_per_turn: Annotated[float, Field(ge=0.0)]
     speed_max_rad_s: Positive
     torque_limit_nm: Positive | None = Field(None, description="of the axis; without: what its friction asks for")
+    torque_rate_nm_per_s: Positive | None = Field(None, description="of the axis; without: not compared")
     accuracy: Share = Field(0.0, description="force tolerance between local sets, as a share")
     model: AxisModel = Field(strict=False)
     uncertainty: Uncertainty

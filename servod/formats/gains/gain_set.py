@@ -152,6 +152,9 @@ class Promise(Strict):
 class Certificate(Strict):
     """Statement that the gains were verified; bound to these very numbers by their hash."""
 
+    proven: Literal["frozen"] | None = Field(
+        None, description="frozen: stable at each constant speed; that it is from speed to speed simulations alone say"
+    )
     valid: bool = Field(strict=True)
     parameters_sha256: Sha256
     model_sha256: Sha256 | None = None
@@ -163,6 +166,7 @@ class Certificate(Strict):
     observations: dict[str, float] = Field(default_factory=dict, description="figures that are told, not judged")
     promised: Promise | None = Field(None, description="what a deployment measures again on the axis")
     torque_nm: float | None = Field(None, gt=0.0, description="the drive's torque that the trials took for granted")
+    torque_rate_nm_per_s: float | None = Field(None, gt=0.0, description="slowest limit of the rate that they stood")
 
     @model_validator(mode="after")
     def _valid_means_checked(self) -> Certificate:
@@ -295,10 +299,11 @@ def require_signed(gains: GainSet, config: AxisConfig, where: str | None = None)
 
 
 def require_same_loop(gains: GainSet, config: AxisConfig, where: str | None = None) -> None:
-    """Refuse a set whose design is for another cycle, filter, encoder, torque or delay than the axis has.
+    """Refuse a set whose design is for another cycle, filter, encoder, torque, rate or delay than the axis has.
 
     What was certified is the sampled loop with its delay and its filter; with others the proof says nothing. A finer
-    encoder, more torque and less delay are no worse. What a set or a configuration does not state is not compared.
+    encoder, more torque, a faster change of it and less delay are no worse. What a set or a configuration does not
+    state is not compared.
     Raises BadInput; `where` is the file, when there is one.
     """
     if gains.design is None:
@@ -318,8 +323,11 @@ def require_same_loop(gains: GainSet, config: AxisConfig, where: str | None = No
 def _no_more(gains: GainSet, design: Design, config: AxisConfig) -> Iterator[tuple[str, float, float]]:
     """Key, what the set takes for granted, and what the axis has of it; an encoder without counts has no steps."""
     yield "design.counts_per_turn", design.counts_per_turn, config.encoder.counts_per_turn
-    if gains.certificate is not None and gains.certificate.torque_nm is not None:
-        yield "certificate.torque_nm", gains.certificate.torque_nm, config.limits.torque_nm
+    certificate, limits = gains.certificate, config.limits
+    if certificate is not None and certificate.torque_nm is not None:
+        yield "certificate.torque_nm", certificate.torque_nm, limits.torque_nm
+    if certificate is not None and certificate.torque_rate_nm_per_s is not None:
+        yield "certificate.torque_rate_nm_per_s", certificate.torque_rate_nm_per_s, limits.torque_rate_nm_per_s
 
 
 def _require_delay(where: str, design: Design, config: AxisConfig) -> None:

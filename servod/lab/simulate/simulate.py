@@ -74,15 +74,16 @@ def run(
     resolution_rad: float,
     cutoff_hz: float,
     limit_nm: float,
+    rate_nm_per_s: float,
 ) -> None:
     """Run the loop over the rows of `reference` (position, velocity, acceleration); fills the rows of `out`.
 
     The command of sample k acts from t_k + delay_s. `resolution_rad` 0 means an encoder without steps; `external` is
     a torque for each sample beside the command, `reading` an error of each encoder reading in rad. The law sees the
-    torque that was applied after `limit_nm`.
+    torque that was applied after `rate_nm_per_s` and `limit_nm`, which come in the order of the axis's own limits.
     """
     kept = math.exp(-2.0 * math.pi * cutoff_hz * dt)
-    applied, filtered = 0.0, s.velocity
+    applied, filtered, change_nm = 0.0, s.velocity, rate_nm_per_s * dt
     seen = quantised(encoder_position(p, tables, s.position) + reading[0], resolution_rad)
     for k in range(len(reference)):
         last, seen = seen, quantised(encoder_position(p, tables, s.position) + reading[k], resolution_rad)
@@ -90,7 +91,8 @@ def run(
             filtered = kept * filtered + (1.0 - kept) * (seen - last) / dt
         x_ref, v_ref, a_ref = reference[k][0], reference[k][1], reference[k][2]
         asked = control_law(gains, law_state, x_ref, v_ref, a_ref, seen, filtered, applied, dt)
-        applied = min(max(asked[0], -limit_nm), limit_nm)
+        slewed = min(max(asked[0], applied - change_nm), applied + change_nm)
+        applied = min(max(slewed, -limit_nm), limit_nm)
         row = out[k]
         row[0], row[1], row[2], row[3] = s.load_position, seen, filtered, s.velocity
         row[4], row[5], row[6], row[7] = applied, asked[1], asked[2], asked[3]
@@ -109,7 +111,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class LoopSettings:
-    """What stands around the law: sample time, encoder, velocity filter and the last limit."""
+    """What stands around the law: sample time, encoder, velocity filter and the last limits."""
 
     period_s: float = 0.001
     counts_per_turn: float = 2.0**20  # 0 = no steps
@@ -117,6 +119,7 @@ class LoopSettings:
     torque_limit_nm: float = math.inf
     delay_s: float | None = None  # None = the model's
     inner_step_s: float = INNER_STEP_S
+    torque_rate_nm_per_s: float = math.inf
 
     @property
     def resolution_rad(self) -> float:
@@ -178,7 +181,8 @@ def simulate_closed_loop(
         kernel, loop = compiled(run, control_law=law.step), (arrays(named), record(law_state).memory[0])
     else:
         kernel, loop = bound(run, control_law=law.step), (named, law_state)
-    around = settings.resolution_rad, settings.velocity_cutoff_hz, settings.torque_limit_nm
+    limits = settings.torque_limit_nm, settings.torque_rate_nm_per_s
+    around = settings.resolution_rad, settings.velocity_cutoff_hz, *limits
     kernel(*axis, line, *loop, reference, *disturbed, out, settings.period_s, steps, delay_s, *around)
     columns = {name: out[:, i] for i, name in enumerate(OUTPUTS)}
     t_s: Array = np.arange(len(reference), dtype=np.float64) * settings.period_s

@@ -45,6 +45,7 @@ class Wishes:
     cutoff_hz: float | None = None  # of the velocity filter; None = the lowest that is feasible
     counts_per_turn: float = 2.0**20
     torque_limit_nm: float | None = None  # of the axis
+    torque_rate_nm_per_s: float | None = None  # of the axis
     speed_max: float = 0.5
     overlap: tuple[float, float] = OVERLAP_RAD_S
     position_weight: float = 1.0
@@ -88,6 +89,7 @@ def empty_design(model: AxisModel, wishes: Wishes, cutoff_hz: float) -> Design:
         counts_per_turn=wishes.counts_per_turn,
         speed_max_rad_s=wishes.speed_max,
         torque_limit_nm=wishes.torque_limit_nm,
+        torque_rate_nm_per_s=wishes.torque_rate_nm_per_s,
         model=model,
         uncertainty=wishes.uncertainty,
     )

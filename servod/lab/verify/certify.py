@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import datetime
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from servod import __version__
 from servod.common.errors import BadInput
@@ -15,12 +15,15 @@ from servod.common.sources import VERIFIES, source_sha256
 from servod.formats.gains.gain_set import Certificate, CertificateCheck, GainSet, Promise
 from servod.lab.verify.checks import LEAST_PLANTS, SIMULATED, STATIC, Subject, at_most, observations
 from servod.lab.verify.effect_checks import check_effects
+from servod.lab.verify.feedforward import check_feedforward
 from servod.lab.verify.reference_proof import check_reference
 from servod.lab.verify.rest_checks import check_loads, check_rest
 from servod.lab.verify.trials import scale_of
 from servod.lab.verify.validation import promise
 
 SEED, PROCESSES = 1, 2
+#: No Lyapunov function over all speeds stands behind the poles and margins: each is of one constant speed.
+PROVEN: Literal["frozen"] = "frozen"
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +33,7 @@ class Verification:
     checks: list[CertificateCheck]
     observations: dict[str, float]
     promised: Promise | None = None
+    least_rate_nm_per_s: float | None = None
 
     @property
     def valid(self) -> bool:
@@ -39,6 +43,7 @@ class Verification:
     def document(self) -> dict[str, Any]:
         """Plain values, as `servoctl verify --json` prints them."""
         return {
+            "proven": PROVEN,
             "valid": self.valid,
             "checks": [check.model_dump() for check in self.checks],
             "observations": self.observations,
@@ -48,6 +53,7 @@ class Verification:
     def certificate(self, gains: GainSet) -> Certificate:
         """The certificate for these very gains."""
         return Certificate(
+            proven=PROVEN,
             valid=self.valid,
             parameters_sha256=gains.parameters_sha256(),
             model_sha256=gains.provenance.model_sha256,
@@ -59,6 +65,7 @@ class Verification:
             observations=self.observations,
             promised=self.promised,
             torque_nm=scale_of(gains.design).torque_nm if gains.design else None,
+            torque_rate_nm_per_s=self.least_rate_nm_per_s if self.valid else None,
         )
 
     def certified(self, gains: GainSet) -> GainSet:
@@ -88,7 +95,8 @@ def verify(
     if gains.design is None:
         raise BadInput(f"{where}: design", "nothing", "a design, as `servoctl synthesize` writes it")
     subject = Subject(gains, gains.design, plants, seed, processes, least_plants)
-    checks = [check for judge in (*STATIC, check_rest, check_effects, check_reference) for check in judge(subject)]
+    cheap = (*STATIC, check_feedforward, check_rest, check_effects, check_reference)
+    checks = [check for judge in cheap for check in judge(subject)]
     if not all(check.passed for check in checks):
         return Verification(checks, {})
     checks += [check for judge in (*SIMULATED, check_loads) for check in judge(subject)]
@@ -96,4 +104,4 @@ def verify(
     checks.append(
         at_most("validation motion that a plant does not get through (0 no, 1 yes)", float(not promised), 0.0)
     )
-    return Verification(checks, observations(subject), promised)
+    return Verification(checks, observations(subject), promised, subject.least_rate_nm_per_s)

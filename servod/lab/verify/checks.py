@@ -5,9 +5,10 @@ Stands on proof, margins and trials. A check is added to the table at the end an
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -29,7 +30,9 @@ from servod.lab.verify.trials import (
     RIPPLE_LIMIT_RAD,
     SETTLED_SHARE,
     Sample,
+    fastest_rate,
     hold_ripple,
+    least_rate,
     monte_carlo,
     quiet,
     ramp_ripples,
@@ -85,17 +88,34 @@ class Subject:
         """The same loop with a delay of `count` cycles."""
         return replace(self.timing, delay_s=count * self.timing.period_s)
 
-    def sweep(self, speeds: int) -> Sweep:
-        """The linearised law at `speeds` speeds per direction."""
+    def sweep(self, count: int, also: Iterable[float] = ()) -> Sweep:
+        """The linearised law at `count` speeds per direction, and at others."""
+        speeds = {*speeds_of(self.design, count), *also}
         friction, local = steady_friction(self.design.model), self.gains.parameters
         arrival = arrival_of(local) if isinstance(local, LocalParameters) else None
-        return Sweep(self.gains.law, self.gains.pack(), friction, self.timing, speeds_of(self.design, speeds), arrival)
+        return Sweep(self.gains.law, self.gains.pack(), friction, self.timing, sorted(speeds), arrival)
+
+    @property
+    def own_speeds(self) -> list[float]:
+        """Where the law's schedules bend, and half-way between: a set is narrow enough to lie between any others."""
+        local, low = self.gains.parameters, SLOWEST * self.design.speed_max_rad_s
+        if not isinstance(local, LocalParameters):
+            return []
+        bends = {abs(own.velocity_rad_s) for own in local.friction.sets}
+        bends |= {local.regions.overlap_from_rad_s, local.regions.overlap_to_rad_s}
+        known = sorted({low} | {v for v in bends if low <= v <= TOP * self.design.speed_max_rad_s})
+        return sorted({*known, *(0.5 * (a + b) for a, b in pairwise(known))})
 
     @cached_property
     def trials(self) -> list[Sample]:
         """The Monte-Carlo's plants, simulated."""
         shaken_rad = self.rounding_rad + self.gives_way_rad
         return monte_carlo(self.gains, self.plants, self.seed, self.processes, shaken_rad)
+
+    @cached_property
+    def least_rate_nm_per_s(self) -> float:
+        """The slowest change of the torque, of RATES, with which all of LIMIT_CYCLE_PLANTS stand the trial motion."""
+        return least_rate(self.gains, LIMIT_CYCLE_PLANTS, self.seed, self.rounding_rad + self.gives_way_rad)
 
     @cached_property
     def rounding_rad(self) -> float:
@@ -116,8 +136,8 @@ class Subject:
 
     @cached_property
     def dense(self) -> Sweep:
-        """The sweep for inner points, dense enough to lie between nodes and between the regions."""
-        return self.sweep(DENSE_SPEEDS)
+        """The sweep for inner points: dense, and at every bend of the law's schedules."""
+        return self.sweep(DENSE_SPEEDS, self.own_speeds)
 
 
 def speeds_of(design: Design, count: int) -> list[float]:
@@ -232,6 +252,12 @@ def check_monte_carlo(s: Subject) -> Iterator[CertificateCheck]:
         yield at_most(f"plants of {len(s.trials)} that {what}", float(failed), 0.0)
 
 
+def check_rate(s: Subject) -> Iterator[CertificateCheck]:
+    """The law gets along with how fast the axis lets its torque change; what it needs is bound by the certificate."""
+    own = s.design.torque_rate_nm_per_s or fastest_rate(s.design)
+    yield at_most("torque rate that the trial motion needs [N*m/s]", s.least_rate_nm_per_s, own)
+
+
 def check_limit_cycles(s: Subject) -> Iterator[CertificateCheck]:
     """20 s hold and slow ramps on the model and on drawn plants: first without torque noise, then with it.
 
@@ -295,4 +321,4 @@ STATIC: tuple[Callable[[Subject], Iterator[CertificateCheck]], ...] = (
     check_intervals,
     check_loop,
 )
-SIMULATED = (check_monte_carlo, check_limit_cycles)
+SIMULATED = (check_monte_carlo, check_rate, check_limit_cycles)

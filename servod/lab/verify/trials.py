@@ -42,6 +42,8 @@ TORQUE_FACTOR = 3.0  # of the largest friction: the drive of the trials has no m
 RAMP_SHARES = (0.001, 0.004, 0.02)  # of the top speed
 RAMP_S = 4.0
 LONG_HOLD_S = 20.0
+#: Changes of the torque in one cycle that are tried, as shares of the drive's torque in the trials.
+RATES = (2.0, 1.0, 0.5, 0.2, 0.1, 0.05)
 GRID = 60  # speeds per direction at which the fall is looked for
 
 
@@ -136,10 +138,16 @@ def quiet(plant: AxisModel, resolution_rad: float) -> AxisModel:
     return plant.model_copy(update={"noise": noise.model_copy(update={"torque_rms": 0.0})})
 
 
-def simulated(gains: GainSet, design: Design, plant: AxisModel, motion: Array, seed: int) -> tuple[Array, Array]:
-    """(tracking error, position) of one plant along `motion`, with noise, encoder steps and a drive's torque limit."""
+def simulated(
+    gains: GainSet, design: Design, plant: AxisModel, motion: Array, seed: int, rate_nm_per_s: float = math.inf
+) -> tuple[Array, Array]:
+    """(tracking error, position) of one plant along `motion`, with noise, encoder steps and a drive's torque limits."""
     settings = LoopSettings(
-        design.period_s, design.counts_per_turn, design.velocity_cutoff_hz, scale_of(design).torque_nm
+        design.period_s,
+        design.counts_per_turn,
+        design.velocity_cutoff_hz,
+        scale_of(design).torque_nm,
+        torque_rate_nm_per_s=rate_nm_per_s,
     )
     noise = noise_of(plant, settings.resolution_rad)
     torque, reading = noise_series(noise, len(motion), design.period_s, seed)
@@ -155,12 +163,21 @@ def simulated(gains: GainSet, design: Design, plant: AxisModel, motion: Array, s
     return run.tracking_error_rad(), run.position_rad
 
 
-def run_sample(gains: GainSet, design: Design, motion: Array, seed: int, index: int, shaken_rad: float = 0.0) -> Sample:
+def run_sample(
+    gains: GainSet,
+    design: Design,
+    motion: Array,
+    seed: int,
+    index: int,
+    shaken_rad: float = 0.0,
+    rate_nm_per_s: float = math.inf,
+) -> Sample:
     """One plant of the Monte-Carlo; a plant that runs away counts with infinite figures.
 
     `shaken_rad`: how far counts and noise alone may move a joint, peak to peak; no part of the ripple.
     """
-    error, position = simulated(gains, design, drawn(design.model, design.uncertainty, seed, index), motion, index)
+    plant = drawn(design.model, design.uncertainty, seed, index)
+    error, position = simulated(gains, design, plant, motion, index, rate_nm_per_s)
     if not np.isfinite(position).all():
         return Sample(index, math.inf, math.inf, math.inf)
     scale, ends, last = scale_of(design), np.cumsum(counts(design.period_s)), round(RIPPLE_S / design.period_s)
@@ -194,6 +211,28 @@ def monte_carlo(gains: GainSet, plants: int, seed: int, processes: int, shaken_r
     with worker_pool(processes) as pool:
         parts = [pool.submit(_worker, text, seed, shaken_rad, *ends) for ends in pairwise(cuts)]
         return [trial for part in parts for trial in part.result()]
+
+
+def fastest_rate(design: Design) -> float:
+    """A change of the torque from one limit to the other in one cycle [N*m/s]: as if there were no bound."""
+    return RATES[0] * scale_of(design).torque_nm / design.period_s
+
+
+def least_rate(gains: GainSet, plants: int, seed: int, shaken_rad: float) -> float:
+    """The slowest change of the torque [N*m/s], of RATES, at which and above which `plants` plants stand the motion.
+
+    inf where they do not even with the fastest.
+    """
+    assert gains.design is not None
+    design, scale, least = gains.design, scale_of(gains.design), math.inf
+    motion = trial_motion(design.period_s, scale)
+    for share in RATES:
+        rate = share * scale.torque_nm / design.period_s
+        samples = (run_sample(gains, design, motion, seed, i, shaken_rad, rate) for i in range(plants))
+        if not all(sample.stable for sample in samples):
+            break
+        least = rate
+    return least
 
 
 def hold_ripple(gains: GainSet, design: Design, plant: AxisModel) -> float:

@@ -87,6 +87,7 @@ def _loop(walk: Walk) -> dict[str, Any]:
         "cutoff_hz": walk.axis.cutoff_hz,
         "counts_per_turn": float(config.encoder.counts_per_turn),
         "torque_limit_nm": config.limits.torque_nm,
+        "torque_rate_nm_per_s": config.limits.torque_rate_nm_per_s,
     }
 
 
