@@ -200,7 +200,7 @@ def reference(duration_s: float) -> np.ndarray:
 def test_closed_loop_is_the_same_loop_in_pure_python() -> None:
     """The compiled simulator is the source around the law that the control loop runs."""
     law, gains, rows = LAWS["pd"], (2.5, 0.12, 0.0), reference(0.3)
-    fast = simulate_closed_loop(joint(delay_s=0.001), law, gains, rows)
+    fast = simulate_closed_loop(joint(delay_s=0.001), law, gains, rows, LoopSettings(torque_rate_nm_per_s=2.0))
     from servod.kernels.physics.plant import INNER_STEP_S, delay_line
 
     out = np.zeros((len(rows), 8))
@@ -223,6 +223,7 @@ def test_closed_loop_is_the_same_loop_in_pure_python() -> None:
         step,
         120.0,
         math.inf,
+        2.0,
     )
     assert np.allclose(fast.position_rad, out[:, 0], rtol=1e-6, atol=1e-9)
     assert np.allclose(fast.torque_nm, out[:, 4], rtol=1e-5, atol=1e-7)
@@ -234,6 +235,10 @@ def test_closed_loop_tracks_limits_and_counts() -> None:
         joint(delay_s=0.001), LAWS["pd"], (2.5, 0.12, 0.0), rows, LoopSettings(torque_limit_nm=0.05)
     )
     assert np.max(np.abs(run_.torque_nm)) <= 0.05
+    slow = LoopSettings(torque_limit_nm=0.05, torque_rate_nm_per_s=1.0)
+    slowed = simulate_closed_loop(joint(delay_s=0.001), LAWS["pd"], (2.5, 0.12, 0.0), rows, slow)
+    assert np.max(np.abs(np.diff(slowed.torque_nm, prepend=0.0))) == pytest.approx(1e-3)
+    assert np.max(np.abs(np.diff(run_.torque_nm, prepend=0.0))) > 2e-3
     counts = run_.encoder_rad / (2.0 * math.pi / 2.0**20)
     assert np.allclose(counts, np.round(counts), atol=1e-6)
     free = simulate_closed_loop(joint(delay_s=0.001), LAWS["pd"], (2.5, 0.12, 0.0), rows)
