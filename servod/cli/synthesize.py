@@ -64,7 +64,9 @@ Decay = Annotated[float | None, typer.Option(min=0.1, max=500.0, help="Least dec
 ZetaMin = Annotated[
     float | None, typer.Option("--zeta-min", "--damping", min=0.001, max=0.85, help="Least damping ratio.")
 ]
-Uncertainty = Annotated[float, typer.Option(min=0.0, max=10.0, help="Scale of all intervals.")]
+Uncertainty = Annotated[
+    float, typer.Option(min=0.0, max=10.0, help="Scale of all intervals; none gets narrower than may be certified.")
+]
 Delay = Annotated[float | None, typer.Option(min=0.0, max=0.02, help="Command to torque, s, instead of the model's.")]
 Period = Annotated[int, typer.Option(min=250, max=10_000, help="Cycle, microseconds.")]
 Cutoff = Annotated[float | None, typer.Option(min=10.0, max=2000.0, help="Velocity filter, Hz, instead of the best.")]
@@ -150,10 +152,11 @@ def wishes_of(
 ) -> Wishes:
     """What is asked of the loop, with the intervals that were identified."""
     from servod.lab.synthesize.deployed import Wishes
-    from servod.lab.synthesize.regions import uncertainty_of
+    from servod.lab.synthesize.regions import narrowed, uncertainty_of
 
+    known = uncertainty_of(axis)
     return Wishes(
-        uncertainty=uncertainty_of(axis).scaled(uncertainty),
+        uncertainty=narrowed(known, uncertainty, axis) if uncertainty < 1.0 else known.scaled(uncertainty),
         period_s=1e-6 * period_us,
         cutoff_hz=cutoff_hz,
         counts_per_turn=float(counts),

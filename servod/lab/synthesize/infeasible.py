@@ -23,7 +23,7 @@ from servod.lab.synthesize.deployed import (
     regions,
 )
 from servod.lab.synthesize.lmi_deployed import first_feedback
-from servod.lab.synthesize.regions import delay_refusal
+from servod.lab.synthesize.regions import delay_refusal, narrowed
 from servod.lab.verify.proof import scaled_vertices
 from servod.lab.verify.vertices import Span
 
@@ -82,7 +82,7 @@ def relaxations(model: AxisModel, wishes: Wishes) -> Iterator[Relaxation]:
     fixed = replace(wishes, cutoff_hz=wishes.cutoff_hz or CUTOFFS_HZ[-1], slow_disc=slow)
 
     def shrunk(factor: float) -> Wishes:
-        return replace(fixed, uncertainty=wishes.uncertainty.scaled(factor))
+        return replace(fixed, uncertainty=narrowed(wishes.uncertainty, factor, model))
 
     def slower(factor: float) -> Wishes:
         return replace(fixed, least_decay_per_s=factor * wishes.least_decay_per_s)

@@ -18,6 +18,7 @@ from servod.lab.synthesize.deployed import Wishes, empty_design
 from servod.lab.synthesize.gain_set import DesignOptions, gain_set, parameters
 from servod.lab.synthesize.infeasible import Infeasible, Relaxation, largest_factor
 from servod.lab.synthesize.lmi_reference import PARTS, ReferenceAnswer, ReferenceWishes, programme, reference, solve
+from servod.lab.synthesize.regions import narrowed
 from servod.lab.verify.reference_proof import gain_numbers, polytope, reference_gains, reference_margin
 from servod.lab.verify.steady_friction import SteadyFriction, steady_friction
 from servod.lab.verify.vertices import Span
@@ -113,7 +114,7 @@ def relaxations(
         return all(made.feasible(span) for span in made.spans)
 
     def narrower(factor: float) -> bool:
-        return feasible(replace(wishes, uncertainty=wishes.uncertainty.scaled(factor)), options, asked)
+        return feasible(replace(wishes, uncertainty=narrowed(wishes.uncertainty, factor, model)), options, asked)
 
     shrunk = largest_factor(narrower)
     if shrunk is not None:

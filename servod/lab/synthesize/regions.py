@@ -14,7 +14,7 @@ from servod.formats.gains.design import Uncertainty
 from servod.formats.model.axis_model import AxisModel
 from servod.kernels.laws.local import COMMANDS
 from servod.lab.verify.sampled import WHOLE
-from servod.lab.verify.vertices import FLOORS, measured_widths
+from servod.lab.verify.vertices import FLOORS, least_widths, measured_widths
 
 STEPS = 40
 #: Speeds between which the regions' gains blend [rad/s]: below the fall of the Stribeck curve of the paper's joint.
@@ -55,6 +55,14 @@ def uncertainty_of(model: AxisModel) -> Uncertainty:
     if "delay_s" in bounded:
         bounded["delay_s"] = min(bounded["delay_s"], model.total_delay_s, 0.01)
     return Uncertainty(torque_gain=0.0, **bounded)
+
+
+def narrowed(uncertainty: Uncertainty, factor: float, model: AxisModel) -> Uncertainty:
+    """`uncertainty` times a factor below one, but nowhere narrower than a certificate of `model` allows."""
+    allowed = {key: max(measured_widths(model).get(key, 0.0), least) for key, least in least_widths(model).items()}
+    scaled = uncertainty.scaled(factor)
+    kept = {key: min(getattr(uncertainty, key), max(getattr(scaled, key), least)) for key, least in allowed.items()}
+    return scaled.model_copy(update=kept)
 
 
 # --- Axes that are too late ------------------------------------------------------------------------------------------

@@ -197,7 +197,8 @@ def measured_widths(model: AxisModel) -> dict[str, float]:
     if "sigma1" in known.not_identifiable:
         found["damping"] = ASSUMED_DAMPING
     if "delay_s" in known.values:
-        found["delay_s"] = _half_width(known.values["delay_s"])
+        delay = known.values["delay_s"]
+        found["delay_s"] = max(delay.high - delay.value, delay.value - max(delay.low, 0.0))  # no torque comes before
     return found | _of_map(known)
 
 

@@ -44,6 +44,7 @@ from servod.lab.deploy.deployment import motion_notice
 from servod.lab.report.figure import Figure, PageTable
 from servod.lab.synthesize.deployed import Wishes
 from servod.lab.synthesize.infeasible import Infeasible, Relaxation
+from servod.lab.synthesize.regions import narrowed
 from servod.lab.tracking import metrics
 from tests.lab.synthesize.designs import table1
 
@@ -116,9 +117,9 @@ def test_made_again_every_file_is_the_same_byte_for_byte(folder: Path) -> None:
 
 def test_a_relaxation_changes_its_own_wish_alone() -> None:
     wishes = Wishes()
-    smaller = relaxed(wishes, Relaxation("scale of the uncertainty", 1.0, 0.5))
-    assert smaller.uncertainty == wishes.uncertainty.scaled(0.49)
-    slower = relaxed(wishes, Relaxation("least decay [1/s]", wishes.least_decay_per_s, 2.0))
+    smaller = relaxed(table1(), wishes, Relaxation("scale of the uncertainty", 1.0, 0.5))
+    assert smaller.uncertainty == narrowed(wishes.uncertainty, 0.49, table1()) != wishes.uncertainty
+    slower = relaxed(table1(), wishes, Relaxation("least decay [1/s]", wishes.least_decay_per_s, 2.0))
     assert slower.least_decay_per_s == pytest.approx(1.96) and slower.uncertainty == wishes.uncertainty
 
 

@@ -8,7 +8,7 @@ from servod.common.yaml import validate
 from servod.formats.gains.design import Uncertainty
 from servod.formats.model.axis_model import AxisModel
 from servod.formats.model.identified import IdentifiedValue
-from servod.lab.synthesize.regions import uncertainty_of
+from servod.lab.synthesize.regions import narrowed, uncertainty_of
 from servod.lab.verify.checks import Subject, check_intervals
 from servod.lab.verify.steady_friction import steady_friction
 from servod.lab.verify.vertices import ASSUMED_DAMPING, FLOORS
@@ -98,6 +98,29 @@ def test_intervals_below_the_floors_are_not_certified_whether_measured_or_not(me
         check = list(check_intervals(Subject(gains, design, 1, 1, 1)))[1]
         assert check.passed == passed and ("inertia" in check.name) == (not passed)
         assert ("intervals not measured" in check.name) == (not measured)
+
+
+@pytest.mark.parametrize("model", [table1(), identified(0.3, 0.004), identified(0.001, 1e-5)])
+@pytest.mark.parametrize("factor", [0.02, 0.5, 0.9])
+def test_what_is_narrowed_may_still_be_certified(model: AxisModel, factor: float) -> None:
+    """An offer that is taken is not refused by the next step."""
+    gains, asked = table1_set(), uncertainty_of(model).scaled(1.5)
+    assert gains.design is not None
+    found = narrowed(asked, factor, model)
+    assert found != asked and all(getattr(found, key) <= getattr(asked, key) for key in FLOORS)
+    design = gains.design.model_copy(update={"model": model, "uncertainty": found})
+    assert [check.name for check in check_intervals(Subject(gains, design, 1, 1, 1)) if not check.passed] == []
+
+
+def test_a_delay_that_may_be_none_at_all_is_not_below_it() -> None:
+    """On a spring the interval of the delay reaches below zero; no torque comes before its command."""
+    gains, model = table1_set(), identified(0.01, 1e-4)
+    assert gains.design is not None and model.identified is not None
+    delay = IdentifiedValue(value=0.001, low=-0.00005, high=0.0015, unit="s")
+    known = model.identified.model_copy(update={"values": model.identified.values | {"delay_s": delay}})
+    model = model.model_copy(update={"identified": known, "delay_s": 0.001})
+    design = gains.design.model_copy(update={"model": model, "uncertainty": uncertainty_of(model)})
+    assert [check.name for check in check_intervals(Subject(gains, design, 1, 1, 1)) if not check.passed] == []
 
 
 def test_an_assumed_damping_has_the_interval_of_an_assumption() -> None:

@@ -19,7 +19,7 @@ from servod.lab.commission.walk import Walk
 from servod.lab.synthesize.deployed import Wishes
 from servod.lab.synthesize.gain_set import DesignOptions, synthesize
 from servod.lab.synthesize.infeasible import Infeasible, Relaxation
-from servod.lab.synthesize.regions import uncertainty_of
+from servod.lab.synthesize.regions import narrowed, uncertainty_of
 from servod.lab.verify.certify import SEED, verify
 
 #: The regions' overlap ends at this share of the speed at most.
@@ -52,7 +52,7 @@ class Synthesize:
         if isinstance(found, Infeasible):
             tell_clashes(walk, found)
             taken = agreed(walk, found)
-            found = self._attempt(walk, model, relaxed(wishes, taken))
+            found = self._attempt(walk, model, relaxed(model, wishes, taken))
         if isinstance(found, Infeasible):
             tell_clashes(walk, found)
             raise AnswerIsNo(f"synthesize: no design even with {taken}")
@@ -92,17 +92,17 @@ def _loop(walk: Walk) -> dict[str, Any]:
 
 
 #: Wishes that a relaxation may change, by how the synthesis names them.
-_CHANGES: dict[str, Callable[[Wishes, Relaxation], Wishes]] = {
-    "scale of the uncertainty": lambda w, r: replace(w, uncertainty=w.uncertainty.scaled(r.enough / r.asked)),
-    "least decay [1/s]": lambda w, r: replace(w, least_decay_per_s=r.enough),
-    "least damping ratio": lambda w, r: replace(w, least_damping=r.enough),
+_CHANGES: dict[str, Callable[[AxisModel, Wishes, Relaxation], Wishes]] = {
+    "scale of the uncertainty": lambda m, w, r: replace(w, uncertainty=narrowed(w.uncertainty, r.enough / r.asked, m)),
+    "least decay [1/s]": lambda _, w, r: replace(w, least_decay_per_s=r.enough),
+    "least damping ratio": lambda _, w, r: replace(w, least_damping=r.enough),
 }
 
 
-def relaxed(wishes: Wishes, relaxation: Relaxation) -> Wishes:
+def relaxed(model: AxisModel, wishes: Wishes, relaxation: Relaxation) -> Wishes:
     """The wishes with one of them lowered, a little further than what was found to be just enough."""
     further = replace(relaxation, enough=0.98 * relaxation.enough)
-    return _CHANGES[relaxation.wish](wishes, further)
+    return _CHANGES[relaxation.wish](model, wishes, further)
 
 
 def agreed(walk: Walk, found: Infeasible) -> Relaxation:
