@@ -154,6 +154,7 @@ _UNITS = {
     "_nm_per_rad3": "N·m/rad³",
     "_nms_per_rad": "N·m·s/rad",
     "_nm_per_rad": "N·m/rad",
+    "_nm_per_s": "N·m/s",
     "_s_per_rad": "s/rad",
     "_per_turn": "per turn",
     "_kg_m2": "kg·m²",

@@ -117,12 +117,10 @@ def print_checks(result: Verification) -> None:
 
     Checks that failed come first.
     """
-    from servod.lab.verify.certify import PROVEN
+    from servod.lab.verify.certify import STABILITY
     from servod.lab.verify.margins import MARGINS, describe_margins
 
-    print(
-        f"{PROVEN}: poles and margins are of constant speeds; what happens from one to another simulations alone show"
-    )
+    print(f"{STABILITY}: poles and margins are of constant speeds; from one to another simulations alone show it")
     if margins := describe_margins(result.observations):
         print(f"{margins} (each least over all speeds, at the drive's torque command)")
     for check in sorted(result.checks, key=lambda check: check.passed):

@@ -152,8 +152,8 @@ class Promise(Strict):
 class Certificate(Strict):
     """Statement that the gains were verified; bound to these very numbers by their hash."""
 
-    proven: Literal["frozen"] | None = Field(
-        None, description="frozen: stable at each constant speed; that it is from speed to speed simulations alone say"
+    stability: Literal["frozen"] | None = Field(
+        None, description="frozen: judged at constant speeds; what happens from one to another simulations alone show"
     )
     valid: bool = Field(strict=True)
     parameters_sha256: Sha256

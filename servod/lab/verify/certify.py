@@ -23,7 +23,7 @@ from servod.lab.verify.validation import promise
 
 SEED, PROCESSES = 1, 2
 #: No Lyapunov function over all speeds stands behind the poles and margins: each is of one constant speed.
-PROVEN: Literal["frozen"] = "frozen"
+STABILITY: Literal["frozen"] = "frozen"
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class Verification:
     def document(self) -> dict[str, Any]:
         """Plain values, as `servoctl verify --json` prints them."""
         return {
-            "proven": PROVEN,
+            "stability": STABILITY,
             "valid": self.valid,
             "checks": [check.model_dump() for check in self.checks],
             "observations": self.observations,
@@ -53,7 +53,7 @@ class Verification:
     def certificate(self, gains: GainSet) -> Certificate:
         """The certificate for these very gains."""
         return Certificate(
-            proven=PROVEN,
+            stability=STABILITY,
             valid=self.valid,
             parameters_sha256=gains.parameters_sha256(),
             model_sha256=gains.provenance.model_sha256,

@@ -76,7 +76,7 @@ def compensated(s: Subject, local: LocalParameters, side: float) -> Iterator[tup
 def unknown_nm(known: PositionFeedforward, model: AxisModel) -> float:
     """Bound of the torque by which `known` differs from the same terms of the model, per unit of its torque gain."""
     gain = steady_friction(model).gain
-    waves = dict(_waves(model, gain))
+    waves = _waves(model, gain)
     used: dict[float, complex] = {}
     for wave in known.waves:
         used[wave.waves_per_turn] = used.get(wave.waves_per_turn, 0.0) + _phasor(wave.amplitude_nm, wave.phase_rad)
@@ -90,14 +90,14 @@ def _phasor(amplitude: float, phase_rad: float) -> complex:
     return amplitude * complex(math.cos(phase_rad), math.sin(phase_rad))
 
 
-def _waves(model: AxisModel, gain: float) -> Iterator[tuple[float, complex]]:
-    """(waves a turn, phasor) of gravity and cogging together."""
+def _waves(model: AxisModel, gain: float) -> dict[float, complex]:
+    """Phasors of gravity and cogging together, by their waves a turn."""
     found: dict[float, complex] = {}
     terms = [(1.0, model.gravity.amplitude, model.gravity.phase)] if model.gravity else []
     terms += [(wave_number(h), h.amplitude, h.phase) for h in (model.cogging.harmonics if model.cogging else ())]
     for number, amplitude, phase in terms:
         found[number] = found.get(number, 0.0) + _phasor(amplitude / gain, phase)
-    yield from found.items()
+    return found
 
 
 def _spring_differs(known: PositionFeedforward, model: AxisModel, gain: float) -> float:

@@ -41,10 +41,10 @@ from servod.lab.report.page import Origin, Verdict
 from servod.lab.synthesize.deployed import Wishes
 from servod.lab.synthesize.gain_set import DesignOptions, synthesize
 from servod.lab.synthesize.infeasible import Infeasible
+from servod.lab.synthesize.regions import narrowed
 from servod.lab.tracking.metrics import REST_S, Array, score
 from servod.lab.verify.certify import verify
 from servod.lab.verify.checks import LEAST_PLANTS
-from servod.lab.verify.vertices import least_widths
 
 #: Told what is done, and the share of the whole that is.
 Tell = Callable[[str, float], None]
@@ -228,7 +228,7 @@ def designed(
     cutoff = same_filter.design.velocity_cutoff_hz if same_filter and same_filter.design else None
     options, said = DesignOptions(name=gains_file.stem, observer=False), ""
     for scale in SCALES:
-        wishes = Wishes(cutoff_hz=cutoff, uncertainty=_narrowed(model, scale))
+        wishes = Wishes(cutoff_hz=cutoff, uncertainty=narrowed(Uncertainty(), scale, model))
         found = synthesize(model, wishes, options, model_file)
         if isinstance(found, Infeasible):
             said = f"no feedback for {model_file.name}: {'; '.join(found.clashes)}"
@@ -240,13 +240,6 @@ def designed(
             return Designed(certified, scale)
         said = f"{gains_file}: not valid: {'; '.join(c.name for c in checked.checks if not c.passed)}"
     raise AnswerIsNo(said)
-
-
-def _narrowed(model: AxisModel, scale: float) -> Uncertainty:
-    """The usual uncertainty times `scale`, but nowhere narrower than a certificate allows."""
-    scaled = Uncertainty().scaled(scale)
-    least = {key: max(width, getattr(scaled, key)) for key, width in least_widths(model).items()}
-    return scaled.model_copy(update=least)
 
 
 def _recorded(axis: AxisClient, tracked: Rows, out: Path, tell: Tell, effort: Effort) -> list[Path]:
