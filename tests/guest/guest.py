@@ -1,6 +1,6 @@
 """A whole Linux in one process (user-mode-linux): real SocketCAN and real systemd where the host has neither.
 
-    python tests/guest/guest.py [STEP ...]      build the image if need be, run inside, print the results as JSON lines
+    python -m tests.guest.guest [STEP ...]      build the image if need be, run inside, print the results as JSON lines
 
 Needs: apt-get install user-mode-linux mmdebstrap e2fsprogs gcc; root, and the network once.
 The image (Debian with systemd, and what servod needs of PyPI) is kept in ~/.cache/servod-guest; servod itself comes
@@ -24,6 +24,8 @@ import tomllib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
+
+from tests.guest.host import told
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 CACHE = Path(os.environ.get("SERVOD_GUEST_CACHE", Path.home() / ".cache" / "servod-guest"))
@@ -195,7 +197,7 @@ def _environment() -> dict[str, str]:
 def _boot(disk: Path, folder: Path) -> str:
     """Run the guest to its end; returns what its console said. Raises RuntimeError with what it did when it hangs."""
     with _booted(disk, folder) as guest:
-        with contextlib.suppress(subprocess.TimeoutExpired):
+        with told(guest.pid, folder / "starved"), contextlib.suppress(subprocess.TimeoutExpired):
             guest.wait(BOOT_TIMEOUT_S)
         hangs = guest.poll() is None
     console = (folder / "console").read_text(errors="replace")
