@@ -15,8 +15,9 @@ from pathlib import Path
 from tests.starved import Stalls
 
 #: Looks this often; a look is told when the guest waited for a larger share of it, or stood still for longer: one of
-#: its cycles. Alone on a processor its processes wait for one another for some 3 % of the time.
-_LOOK_S, _WAITED_SHARE, _STOOD_S = 0.5, 0.1, 0.02
+#: its cycles. Alone on a processor its processes wait for one another for some 3 % of the time,
+#: for 20 % where many start.
+_LOOK_S, _WAITED_SHARE, _STOOD_S = 1.0, 0.3, 0.02
 
 
 @contextmanager
