@@ -14,6 +14,7 @@ from servod.common.errors import BadInput, Unreachable
 from servod.common.units import PER_MILLE, rad_per_count
 from servod.drivers.cia402_state import quick_stop_stays
 from servod.drivers.cia402_target import target_type
+from servod.drivers.pdo_codec import slow_syncs
 from servod.drivers.quirks import CommandDeadline, Presence, Quirks, load_quirks
 from servod.runtime.fieldbus.cia import RPDO_BASE, TPDO_BASE, Obj301, Obj402, decode_status_word
 from servod.runtime.fieldbus.devices import (
@@ -38,17 +39,22 @@ SUPPORTED_MODE_BIT = {
     Mode.CYCLIC_SYNC_VELOCITY: 8,
     Mode.CYCLIC_SYNC_TORQUE: 9,
 }
-_SLOW_TIMER_MS = 100
-#: Drives need not send the PDO when an input changes: so often they send it anyway, if somebody acts on its inputs.
-_INPUTS_TIMER_MS = 10
+#: By events alone where a drive knows no transmission type but 1 and 255. Drives need not send the PDO when an input
+#: changes: so often they send it anyway, if somebody acts on its inputs.
+_SLOW_TIMER_MS, _INPUTS_TIMER_MS = 100, 10
 #: Bits of 0x1001: current, voltage, temperature (CiA 301).
 _POWER_ERRORS = 0x0E
 
 
 def amplifier_pdos(
-    node_id: int, mode: Mode, command_deadline_ms: int, with_inputs: bool = False, with_outputs: bool = False
+    node_id: int,
+    mode: Mode,
+    command_deadline_ms: int,
+    slow_syncs: int,
+    with_inputs: bool = False,
+    with_outputs: bool = False,
 ) -> tuple[PdoMap, ...]:
-    """The three PDOs of the amplifier: command, synchronous feedback, and the slow rest by its event timer.
+    """The three PDOs of the amplifier: command, synchronous feedback, and the rest with every `slow_syncs`-th SYNC.
 
     The command's deadline guards against a dead loop and against commands alone that do not arrive, where the drive
     stops at it (drivers/quirks.py); the heartbeat guards in any case. The EMCY is a fault of the axis in any case.
@@ -67,7 +73,7 @@ def amplifier_pdos(
     return (
         PdoMap(True, 1, RPDO_BASE[0] + node_id, 1, command, event_timer_ms=command_deadline_ms),
         PdoMap(False, 1, TPDO_BASE[0] + node_id, 1, feedback),
-        PdoMap(False, 2, TPDO_BASE[1] + node_id, 255, slow, event_timer_ms=slow_ms),
+        PdoMap(False, 2, TPDO_BASE[1] + node_id, slow_syncs, slow, event_timer_ms=slow_ms),
     )
 
 
@@ -117,7 +123,8 @@ class AmplifierSetup:
         amplifier = self._amplifier
         inputs = input_rows(amplifier.inputs)
         brake = brake_outputs(amplifier.brake)
-        pdos = amplifier_pdos(amplifier.node_id, self._mode, self._command_deadline_ms, bool(inputs), brake is not None)
+        syncs, deadline_ms = slow_syncs(self._period_us), self._command_deadline_ms
+        pdos = amplifier_pdos(amplifier.node_id, self._mode, deadline_ms, syncs, bool(inputs), brake is not None)
         longest = max(len(pdo.entries) for pdo in pdos)
         if longest > self._quirks.max_pdo_entries:
             raise BadInput("amplifier.quirks", self._config.quirks, f"a drive that maps {longest} objects in one PDO")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from servod.common.errors import BadInput, Unreachable
 from servod.common.units import NS_PER_S, rad_per_count, wrapped_difference
-from servod.drivers.pdo_codec import codec, find, lost_after_cycles, slot
+from servod.drivers.pdo_codec import codec, find, lost_after_cycles, slot, slow_syncs
 from servod.kernels.filters import low_pass_share, velocity_delay_s
 from servod.runtime.fieldbus.cia import TPDO_BASE, Obj406
 from servod.runtime.fieldbus.devices import (
@@ -41,10 +41,11 @@ _SLOW_TIMER_MS = 100
 _OPERATING_SCALING = 1 << 2  # 0x6000 bit 2: scaling function on
 
 
-def encoder_pdos(node_id: int) -> tuple[PdoMap, ...]:
-    """The two PDOs of the encoder: alarms by event timer, position at each SYNC."""
+def encoder_pdos(node_id: int, slow_syncs: int) -> tuple[PdoMap, ...]:
+    """The two PDOs of the encoder: alarms with every `slow_syncs`-th SYNC, position with each."""
+    alarms = (PdoEntry(Obj406.ALARMS, 0, 16),)
     return (
-        PdoMap(False, 1, TPDO_BASE[0] + node_id, 255, (PdoEntry(Obj406.ALARMS, 0, 16),), event_timer_ms=_SLOW_TIMER_MS),
+        PdoMap(False, 1, TPDO_BASE[0] + node_id, slow_syncs, alarms, event_timer_ms=_SLOW_TIMER_MS),
         PdoMap(False, 2, TPDO_BASE[1] + node_id, 1, (PdoEntry(Obj406.POSITION, 0, 32),)),
     )
 
@@ -69,7 +70,8 @@ class EncoderSetup:
         }
         if encoder.measuring_range_counts is not None:
             facts["measuring_range_counts"] = encoder.measuring_range_counts
-        return NodePlan(encoder.driver, encoder.node_id, encoder_pdos(encoder.node_id), facts)
+        pdos = encoder_pdos(encoder.node_id, slow_syncs(self._period_us))
+        return NodePlan(encoder.driver, encoder.node_id, pdos, facts)
 
     def inspect(self, sdo: SdoAccess) -> None:
         """Refuse an encoder that shows alarms: its position may be wrong (CiA 406, 0x6503)."""

@@ -11,14 +11,27 @@ import struct
 from collections.abc import Iterable, Mapping
 
 from servod.common.errors import BadInput
-from servod.runtime.fieldbus.devices import NodePlan, PdoMap
+from servod.runtime.fieldbus.devices import LAST_SYNCHRONOUS_TYPE, NodePlan, PdoMap
 
 #: How many event timers a PDO may stay away, and the cycles on top for the jitter of bus and loop.
 _EVENT_TIMERS, _MARGIN_CYCLES = 3, 10
+_SLOW_US = 10_000
+
+
+def slow_syncs(period_us: int) -> int:
+    """With every how many-th SYNC comes what need not come with each: some 10 ms.
+
+    At least four: a node that answers a cycle late must not look like two (servod.runtime.loop.answers).
+    """
+    return min(max(_SLOW_US // period_us, 4), LAST_SYNCHRONOUS_TYPE)
 
 
 def lost_after_cycles(pdo: PdoMap | None, period_s: float) -> int | None:
-    """Cycles without this PDO after which what it said is not known any more; None when it has no event timer."""
+    """Cycles without this PDO after which what it said is not known any more; None when it has no event timer.
+
+    Its event timer counts for one that comes with SYNC, too, which is sooner: what a stall holds up must not disable a
+    joint that the loop still brakes.
+    """
     if pdo is None or not pdo.event_timer_ms:
         return None
     return math.ceil(_EVENT_TIMERS * pdo.event_timer_ms * 1e-3 / period_s) + _MARGIN_CYCLES

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from servod.formats.config import AxisConfig
@@ -71,6 +72,11 @@ def plan_of(kind: str, name: str, **options: Any) -> NodePlan:
 def find_pdo(plan: NodePlan, index: int) -> PdoMap:
     """The planned PDO that maps an object."""
     return next(pdo for pdo in plan.pdos if index in {entry.index for entry in pdo.entries})
+
+
+def by_events_alone(pdo: PdoMap) -> PdoMap:
+    """The same PDO without a time after which it must come again; one that comes with each SYNC as it is."""
+    return pdo if pdo.receive or pdo.syncs == 1 else replace(pdo, transmission_type=255, event_timer_ms=0)
 
 
 def encode(pdo: PdoMap, values: dict[int, int]) -> bytes:

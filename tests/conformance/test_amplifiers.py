@@ -8,7 +8,15 @@ import itertools
 import math
 
 import pytest
-from drivers_under_test import RATED_TORQUE_MNM, STATUS_WORD, AmplifierBench, find_pdo, names_of, plan_of
+from drivers_under_test import (
+    RATED_TORQUE_MNM,
+    STATUS_WORD,
+    AmplifierBench,
+    by_events_alone,
+    find_pdo,
+    names_of,
+    plan_of,
+)
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -204,9 +212,9 @@ def test_a_mode_that_is_not_shown_any_more_is_not_known(bench: AmplifierBench, s
     assert bench.driver.read().mode == mode
 
 
-def test_a_mode_without_event_timer_has_no_age(name: str) -> None:
+def test_a_mode_that_follows_events_alone_has_no_age(name: str) -> None:
     plan = plan_of("amplifier", name)
-    pdos = tuple(dataclasses.replace(pdo, event_timer_ms=0) for pdo in plan.pdos)
+    pdos = tuple(by_events_alone(pdo) for pdo in plan.pdos)
     bench = AmplifierBench(name)
     bench.driver = load_driver(name).cyclic(dataclasses.replace(plan, pdos=pdos))
     bench.say_mode(plan.facts["mode"])

@@ -6,7 +6,15 @@ import dataclasses
 import math
 
 import pytest
-from drivers_under_test import COUNTS_PER_TURN, MEASURING_RANGE, PERIOD_NS, EncoderBench, names_of, plan_of
+from drivers_under_test import (
+    COUNTS_PER_TURN,
+    MEASURING_RANGE,
+    PERIOD_NS,
+    EncoderBench,
+    by_events_alone,
+    names_of,
+    plan_of,
+)
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -164,8 +172,8 @@ def test_an_alarm_word_that_stays_away_is_an_alarm_itself(bench: EncoderBench) -
     assert bench.driver.read().alarms == 2
 
 
-def test_an_alarm_word_without_event_timer_has_no_age(name: str) -> None:
+def test_an_alarm_word_that_follows_events_alone_has_no_age(name: str) -> None:
     plan = plan_of("encoder", name)
-    pdos = tuple(dataclasses.replace(pdo, event_timer_ms=0) for pdo in plan.pdos)
+    pdos = tuple(by_events_alone(pdo) for pdo in plan.pdos)
     driver = load_driver(name).cyclic(dataclasses.replace(plan, pdos=pdos))
     assert {driver.read().alarms for _ in range(2000)} == {0}

@@ -183,19 +183,19 @@ def test_interpolation_period_that_does_not_fit_is_refused(period_us: int) -> No
 
 
 def test_pdos_are_the_documented_ones() -> None:
-    command, feedback, slow = amplifier_pdos(5, Mode.CYCLIC_SYNC_TORQUE, 150)
+    command, feedback, slow = amplifier_pdos(5, Mode.CYCLIC_SYNC_TORQUE, 150, 10)
     assert (command.cob_id, command.event_timer_ms, feedback.cob_id, slow.cob_id) == (0x205, 150, 0x185, 0x285)
-    assert [pdo.transmission_type for pdo in (command, feedback, slow)] == [1, 1, 255]
+    assert [pdo.transmission_type for pdo in (command, feedback, slow)] == [1, 1, 10]
     assert [(pdo.receive, pdo.number) for pdo in (command, feedback, slow)] == [(True, 1), (False, 1), (False, 2)]
     assert {entry.subindex for pdo in (command, feedback, slow) for entry in pdo.entries} == {0}
-    assert slow.event_timer_ms == 100
+    assert (slow.event_timer_ms, slow.timer_ms) == (100, 0), "for a drive that knows no tenth SYNC"
     mapped = [[(entry.index, entry.bits) for entry in pdo.entries] for pdo in (command, feedback, slow)]
     assert mapped == [
         [(0x6040, 16), (0x6071, 16)],
         [(0x6041, 16), (0x6064, 32), (0x6077, 16)],
         [(0x6061, 8), (0x603F, 16)],
     ]
-    slow = amplifier_pdos(5, Mode.CYCLIC_SYNC_TORQUE, 150, with_inputs=True)[2]
+    slow = amplifier_pdos(5, Mode.CYCLIC_SYNC_TORQUE, 150, 10, with_inputs=True)[2]
     assert [(entry.index, entry.bits) for entry in slow.entries] == [(0x6061, 8), (0x603F, 16), (0x60FD, 32)]
     assert slow.event_timer_ms == 10, "a drive need not send it when an input changes"
 

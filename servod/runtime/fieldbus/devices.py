@@ -226,6 +226,10 @@ class Encoder(Protocol):
         ...
 
 
+#: Transmission types up to this one go by SYNC (CiA 301, 0x1800:2).
+LAST_SYNCHRONOUS_TYPE = 240
+
+
 @dataclass(frozen=True)
 class PdoEntry:
     """One mapped object of a PDO (CiA 301): index, subindex, length in bits."""
@@ -245,6 +249,7 @@ class PdoMap:
     """One PDO as it shall stand in the device; `number` counts from 1, `receive` is seen from the device (RPDO).
 
     The event timer of an RPDO is its deadline: the device raises EMCY 8250 when the next one does not come in time.
+    That of a TPDO that comes with every n-th SYNC is for a device that knows no such type: there it follows events.
     """
 
     receive: bool
@@ -259,6 +264,17 @@ class PdoMap:
     def data_bytes(self) -> int:
         """Length of the frame's data."""
         return sum(e.bits for e in self.entries) // 8
+
+    @property
+    def syncs(self) -> int:
+        """A TPDO comes with every SYNC (1), with every n-th, or follows events (0)."""
+        synchronous = not self.receive and self.transmission_type <= LAST_SYNCHRONOUS_TYPE
+        return max(1, self.transmission_type) if synchronous else 0
+
+    @property
+    def timer_ms(self) -> int:
+        """What its event timer shall be: 0 with SYNC, where some devices would send by it as well."""
+        return 0 if self.syncs else self.event_timer_ms
 
 
 @dataclass(frozen=True)

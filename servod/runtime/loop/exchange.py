@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from servod.common.clock import Clock
 from servod.common.faults import FAULTS, FaultCode
 from servod.common.units import NS_PER_S
@@ -19,8 +21,8 @@ from servod.runtime.fieldbus.cia import (
     NmtCommand,
     NmtState,
 )
-from servod.runtime.fieldbus.devices import Amplifier, Encoder, NodePlan
-from servod.runtime.loop.answers import Answers
+from servod.runtime.fieldbus.devices import Amplifier, Encoder, PdoMap
+from servod.runtime.loop.answers import Answers, Rare
 from servod.runtime.loop.plan import LoopPlan
 
 _BUS_OFF, _BUS_DOWN, _QUEUE_FULL = (
@@ -38,8 +40,8 @@ class Exchange:
     """The loop's own connection to the bus: which frame belongs to which device, and which to nobody here.
 
     A connection never hears its own frames. So what has the identifier of a master comes from another one, from
-    whatever machine. Of each synchronous frame of the nodes one is owed for each SYNC; one more is foreign. So is a
-    PDO of theirs that was switched off.
+    whatever machine. Of each synchronous frame of the nodes one is owed for each SYNC, or for each n-th; one more is
+    foreign. So is a PDO of theirs that was switched off.
     """
 
     def __init__(self, bus: Bus, clock: Clock, amplifier: Amplifier, encoder: Encoder, plan: LoopPlan) -> None:
@@ -51,9 +53,11 @@ class Exchange:
         self._heartbeat_id = HEARTBEAT_BASE + plan.config.heartbeat.master_node_id
         self._strangers = dict.fromkeys(_master_ids(plan) | {self._heartbeat_id}, _SECOND_MASTER)
         self._strangers |= dict.fromkeys(_unplanned_ids(plan), _FOREIGN_FEEDBACK)
-        synchronous = _synchronous_ids(plan.amplifier) | _synchronous_ids(plan.encoder)
-        self._answers = Answers(synchronous, _REPEATED_BITS * NS_PER_S // plan.config.bus.bit_rate)
-        self._event_bytes = _event_bytes(plan.amplifier) | _event_bytes(plan.encoder)
+        repeated_ns = _REPEATED_BITS * NS_PER_S // plan.config.bus.bit_rate
+        nodes = [[pdo for pdo in node.pdos if not pdo.receive] for node in (plan.amplifier, plan.encoder)]
+        self._answers = Answers((pdo.cob_id for sent in nodes for pdo in sent if pdo.syncs == 1), repeated_ns)
+        self._rare = Rare({i: row for sent in nodes for i, row in _rare(sent).items()}, repeated_ns)
+        self._rare_bytes = {pdo.cob_id: pdo.data_bytes for sent in nodes for pdo in sent if pdo.syncs != 1}
         self._foreign = 0  # fault bits of what others sent, since the last look
         self.late_frames = 0
         self._queue_full = self._bus_off_events = self._down_events = 0
@@ -65,6 +69,7 @@ class Exchange:
         self.sync_ns = self._clock.now_ns()
         if self._bus.send(SYNC_ID, b""):
             self._answers.ask(self.sync_ns)
+            self._rare.ask()
         return self.sync_ns
 
     def collect(self, until_ns: int) -> None:
@@ -79,8 +84,8 @@ class Exchange:
             frame = bus.receive(max(remaining_ns, 0) / NS_PER_S)
             if frame is None:
                 return
-            if frame.can_id in answers and not answers.take(frame):
-                self._foreign |= _FOREIGN_FEEDBACK
+            if frame.can_id in answers:
+                self._answer(frame)
             receiver = self._receivers.get(frame.can_id)
             if receiver is not None and receiver.on_frame(frame.can_id, frame.data, sync_ns):
                 answered.add(frame.can_id)
@@ -142,18 +147,24 @@ class Exchange:
                 return
             receiver = self._receivers.get(frame.can_id)
             if frame.can_id in self._answers:
-                if not self._answers.take(frame):
-                    self._foreign |= _FOREIGN_FEEDBACK
+                self._answer(frame)
                 self.late_frames += 1
                 continue
             if receiver is not None:
                 receiver.on_frame(frame.can_id, frame.data, self.sync_ns)
             self._look_at(frame)
 
+    def _answer(self, frame: Frame) -> None:
+        """What comes with each SYNC, or looks like it."""
+        self._rare.hear(frame.can_id)
+        if not self._answers.take(frame):
+            self._foreign |= _FOREIGN_FEEDBACK
+
     def _look_at(self, frame: Frame) -> None:
-        """What answers no SYNC: of a master, switched off, or shorter than the PDO that the node was told to send."""
+        """What does not come with each SYNC: of a master, switched off, too soon, or shorter than the node's own."""
         self._foreign |= self._strangers.get(frame.can_id, 0)
-        if len(frame.data) < self._event_bytes.get(frame.can_id, 0):
+        short = len(frame.data) < self._rare_bytes.get(frame.can_id, 0)
+        if short or (frame.can_id in self._rare and not self._rare.take(frame)):
             self._foreign |= _FOREIGN_FEEDBACK
 
 
@@ -176,12 +187,7 @@ def _unplanned_ids(plan: LoopPlan) -> set[int]:
     return {base + node.node_id for base in TPDO_BASE for node in nodes} - {p.cob_id for n in nodes for p in n.pdos}
 
 
-def _event_bytes(plan: NodePlan) -> dict[int, int]:
-    """Length of the node's TPDOs that follow events, by COB-ID."""
-    answers = _synchronous_ids(plan)
-    return {p.cob_id: p.data_bytes for p in plan.pdos if not p.receive and p.cob_id not in answers}
-
-
-def _synchronous_ids(plan: NodePlan) -> frozenset[int]:
-    """COB-IDs of the TPDOs that answer a SYNC (transmission types 0 to 240)."""
-    return frozenset(p.cob_id for p in plan.pdos if not p.receive and p.transmission_type <= 240)
+def _rare(sent: Sequence[PdoMap]) -> dict[int, tuple[int, int]]:
+    """Of one node's TPDOs those that come with every n-th SYNC: n, and the identifier of one that comes with each."""
+    each = [pdo.cob_id for pdo in sent if pdo.syncs == 1]
+    return {pdo.cob_id: (pdo.syncs, each[0]) for pdo in sent if pdo.syncs > 1 and each}

@@ -49,8 +49,10 @@ KINDS = {
     "feedback of the drive": (0x181, "3706000000000000", F.FOREIGN_FEEDBACK),
     "short feedback of the drive": (0x181, "37", F.FOREIGN_FEEDBACK),
     "position": (0x282, "10000000", F.FOREIGN_FEEDBACK),
-    "short event PDO of the drive": (0x281, "0A00", F.FOREIGN_FEEDBACK),
-    "event PDO of the encoder without data": (0x182, "", F.FOREIGN_FEEDBACK),
+    "mode and error of the drive, too short": (0x281, "0A00", F.FOREIGN_FEEDBACK),
+    "another mode of the drive": (0x281, "010000", F.FOREIGN_FEEDBACK),
+    "alarms of the encoder without data": (0x182, "", F.FOREIGN_FEEDBACK),
+    "an alarm of the encoder": (0x182, "0100", F.FOREIGN_FEEDBACK),
     "third PDO of the drive": (0x381, "0000", F.FOREIGN_FEEDBACK),
     "fourth PDO of the encoder": (0x482, "", F.FOREIGN_FEEDBACK),
     "SDO read": (0x601, "4000100000000000", F.FOREIGN_SDO),
@@ -127,6 +129,26 @@ def test_a_second_heartbeat_is_a_fault_wherever_it_comes_between_two(kind: str) 
         return b"%d" % hear_a_stranger(axis, kind, 100)
 
     assert {ms: forked(lambda ms=ms: heard(ms)) for ms in range(0, 50, 5)} == dict.fromkeys(range(0, 50, 5), b"1")
+
+
+@pytest.mark.parametrize(("can_id", "data"), [(0x281, "0A0000"), (0x182, "0000")])
+@pytest.mark.parametrize("does", ["rests", "moves"])
+def test_a_second_frame_of_every_tenth_sync_is_a_fault_wherever_it_comes(does: str, can_id: int, data: str) -> None:
+    """Mode and error of the drive, alarms of the encoder, as they are: behind the node's own one copy may be CAN's."""
+    axis = ready(does)
+
+    def heard(phase_ms: int, copies: int) -> bytes:
+        axis.run(phase_ms * 1e-3)
+        stranger = axis.world.connect(())
+        axis.clock.sleep_until(axis.clock.now_ns() + 100_000)
+        for _ in range(copies):
+            stranger.send(can_id, bytes.fromhex(data))
+        axis.run(0.02)
+        return b"%d" % (F.FOREIGN_FEEDBACK in latched(axis))
+
+    alone, twice = ([forked(lambda ms=ms, n=n: heard(ms, n)) for ms in range(10)] for n in (1, 2))
+    assert alone.count(b"1") >= 9
+    assert twice == [b"1"] * 10
 
 
 STALLS = st.lists(
@@ -214,6 +236,8 @@ def test_feedback_that_a_controller_repeats_is_not_foreign() -> None:
     axis = axis_that("moves")
     axis.loop_bus.inject(BusFault(FaultKind.DUPLICATE, 0x181, 1))
     axis.loop_bus.inject(BusFault(FaultKind.DUPLICATE, 0x282, 1))
+    axis.loop_bus.inject(BusFault(FaultKind.DUPLICATE, 0x281, 1))
+    axis.loop_bus.inject(BusFault(FaultKind.DUPLICATE, 0x182, 1))
     axis.run(0.1)
     assert latched(axis) == set()
 
@@ -243,20 +267,24 @@ def hear_a_stranger_at_once(axis: SteppedSession, count: int) -> bool:
 @pytest.mark.parametrize(("node", "can_id"), [(1, 0x181), (2, 0x282)])
 @pytest.mark.parametrize("does", ["rests", "holds", "moves"])
 def test_one_foreign_frame_in_a_stall_is_told_behind_it(does: str, node: int, can_id: int) -> None:
-    """At rest, too, where the node's own frame that is then one too many looks like the one before it."""
+    """At rest, too, where the node's own frame that is then one too many looks like the one before it.
+
+    However long it is: at some lengths the last frames of the stall and the first behind it come close together.
+    """
     axis = ready(does)
 
-    def heard() -> bytes:
-        axis.loop_bus.inject(BusFault(FaultKind.STUCK, amount=10, participant=node))
+    def heard(length_ms: int) -> bytes:
+        axis.loop_bus.inject(BusFault(FaultKind.STUCK, amount=length_ms, participant=node))
         axis.run(1e-3)
         foreign = {0x181: "3706000000000000", 0x282: "00100000"}[can_id]
         stranger = axis.world.connect(())
         axis.clock.sleep_until(axis.clock.now_ns() + 420_000)
         stranger.send(can_id, bytes.fromhex(foreign))
-        axis.run(0.01 + LONGEST_S)
+        axis.run(length_ms * 1e-3 + LONGEST_S)
         return b"%d" % (F.FOREIGN_FEEDBACK in latched(axis))
 
-    assert forked(heard) == b"1"
+    lengths_ms = range(2, 26)  # behind a longer one the feedback is stale, which is a fault already
+    assert {ms: forked(lambda ms=ms: heard(ms)) for ms in lengths_ms} == dict.fromkeys(lengths_ms, b"1")
 
 
 def test_a_frame_that_comes_twice_does_not_stand_for_the_other_nodes() -> None:

@@ -6,7 +6,7 @@ The steps are kept apart, because their order is the safety of the bring-up: see
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from canopen.objectdictionary import ODVariable, datatypes
 
@@ -30,6 +30,7 @@ from servod.runtime.fieldbus.setup_tools import read_optional, write_checked
 
 _COB_ID, _TYPE, _INHIBIT, _EVENT_TIMER = 1, 2, 3, 5  # sub-indices of 1400/1800
 _COMPARED_COB_BITS = ~PDO_NO_RTR & 0xFFFFFFFF  # bit 30 is the device's own business
+_EVENT_DRIVEN = 255  # by the device's profile (CiA 301, 0x1800:2)
 _FIRST_DATA_OBJECT = 0x20  # indices below are the dummy types that fill gaps
 
 
@@ -57,8 +58,11 @@ def check_lengths(plan: NodePlan, dictionary: Dictionary) -> None:
                 raise BadInput(dictionary.source, f"object {name} with {len(variable)} bits", f"{entry.bits} bits")
 
 
-def write_pdo(sdo: SdoAccess, pdo: PdoMap) -> bool:
-    """Write one PDO: not valid, mapping off, entries, mapping on, parameters, valid; False when it has no deadline."""
+def write_pdo(sdo: SdoAccess, pdo: PdoMap) -> tuple[PdoMap, bool]:
+    """Write one PDO: not valid, mapping off, entries, mapping on, parameters, valid.
+
+    The PDO as the device has it now, and whether it has a deadline where it wants one.
+    """
     parameter, mapping = parameter_index(pdo), mapping_index(pdo)
     present = sdo.read(parameter, _COB_ID)
     sdo.write(parameter, _COB_ID, present | PDO_NOT_VALID)
@@ -66,13 +70,31 @@ def write_pdo(sdo: SdoAccess, pdo: PdoMap) -> bool:
     for place, entry in enumerate(pdo.entries, start=1):
         sdo.write(mapping, place, entry.word)
     sdo.write(mapping, 0, len(pdo.entries))
-    sdo.write(parameter, _TYPE, pdo.transmission_type)
+    pdo = with_type(sdo, pdo)
     for subindex, wanted, found in timers(sdo, pdo):
         if found != wanted:
             sdo.write(parameter, subindex, wanted)
     guarded = not pdo.receive or write_deadline(sdo, pdo)
     sdo.write(parameter, _COB_ID, pdo.cob_id | present & PDO_NO_RTR)
-    return guarded
+    return pdo, guarded
+
+
+def with_type(sdo: SdoAccess, pdo: PdoMap) -> PdoMap:
+    """Write the transmission type; a device without that every n-th SYNC follows events instead, by its event timer.
+
+    CiA 301 lets a device refuse types that it does not have; every drive has 1 and 254 or 255.
+    """
+    try:
+        sdo.write(parameter_index(pdo), _TYPE, pdo.transmission_type)
+        kept = sdo.read(parameter_index(pdo), _TYPE) if pdo.syncs > 1 else pdo.transmission_type
+    except SdoAbort:
+        if pdo.syncs <= 1:
+            raise
+        kept = _EVENT_DRIVEN
+    if kept != pdo.transmission_type:
+        pdo = replace(pdo, transmission_type=_EVENT_DRIVEN)
+        sdo.write(parameter_index(pdo), _TYPE, pdo.transmission_type)
+    return pdo
 
 
 def timers(sdo: SdoAccess, pdo: PdoMap) -> list[tuple[int, int, int]]:
@@ -82,7 +104,7 @@ def timers(sdo: SdoAccess, pdo: PdoMap) -> list[tuple[int, int, int]]:
     a timer is wanted and missing.
     """
     rows = []
-    for subindex, wanted in () if pdo.receive else ((_INHIBIT, pdo.inhibit_100us), (_EVENT_TIMER, pdo.event_timer_ms)):
+    for subindex, wanted in () if pdo.receive else ((_INHIBIT, pdo.inhibit_100us), (_EVENT_TIMER, pdo.timer_ms)):
         present = read_optional(sdo, parameter_index(pdo), subindex)
         if present is not None:
             rows.append((subindex, wanted, present))
@@ -144,12 +166,14 @@ def disable_other_pdos(sdo: SdoAccess, plan: NodePlan) -> list[int]:
     return switched_off
 
 
-def configure_pdos(sdo: SdoAccess, plan: NodePlan, dictionary: Dictionary) -> list[str]:
-    """Check, write and verify all PDOs of a plan; lines for the report."""
+def configure_pdos(sdo: SdoAccess, plan: NodePlan, dictionary: Dictionary) -> tuple[NodePlan, list[str]]:
+    """Check, write and verify all PDOs of a plan; the plan as the device has it, and lines for the report."""
     check_lengths(plan, dictionary)
     switched_off = disable_other_pdos(sdo, plan)
-    unguarded = [pdo for pdo in plan.pdos if not write_pdo(sdo, pdo) and pdo.event_timer_ms]
-    deadlines = [pdo.event_timer_ms for pdo in plan.pdos if pdo.receive and pdo not in unguarded]
+    written = [write_pdo(sdo, pdo) for pdo in plan.pdos]
+    deadlines = [pdo.event_timer_ms for pdo, guarded in written if pdo.receive and guarded]
+    events = [f"TPDO{pdo.number}" for (pdo, _), wanted in zip(written, plan.pdos, strict=True) if pdo != wanted]
+    plan = replace(plan, pdos=tuple(pdo for pdo, _ in written))
     plan.facts["deadline_told_ms"] = told_ms = min(deadlines, default=0)
     plan.facts["command_deadline_ms"] = told_ms if plan.facts.get("deadline_stops") else 0
     for pdo in plan.pdos:
@@ -157,7 +181,9 @@ def configure_pdos(sdo: SdoAccess, plan: NodePlan, dictionary: Dictionary) -> li
     report = [f"node {plan.node_id}: {len(plan.pdos)} PDOs written and read back"]
     if switched_off:
         report.append(f"node {plan.node_id}: switched off {', '.join(f'0x{i:04X}' for i in switched_off)}")
-    return report
+    if events:
+        report.append(f"node {plan.node_id}: {', '.join(events)} by events: it sends none with every n-th SYNC")
+    return plan, report
 
 
 # --- DCF values ------------------------------------------------------------------------------------------------------
@@ -375,7 +401,8 @@ class Node:
         if written := write_parameters(self.sdo, self.dictionary):
             plan = self.setup.configure(self.sdo)
             report.append(f"node {self.node_id}: {written} parameters written from {self.dictionary.source}")
-        report += configure_pdos(self.sdo, plan, self.dictionary)
+        plan, told = configure_pdos(self.sdo, plan, self.dictionary)
+        report += told
         if self._kind == "amplifier":
             report.append(f"node {self.node_id}: {self._guard_against_silence(plan)}")
         report += [f"node {self.node_id}: {note}" for note in plan.facts.pop("notes", [])]

@@ -26,7 +26,6 @@ from servod.runtime.fieldbus.registry import DRIVERS, driver_table, drivers_of, 
 # own code.
 
 
-_LAST_SYNCHRONOUS_TYPE = 240  # CiA 301: 1 to 240 is every n-th SYNC, 0 acyclic synchronous
 _INHIBIT_S = 100e-6
 
 
@@ -80,8 +79,8 @@ def pdo_rate_per_s(pdo: PdoMap, period_s: float) -> float:
     """Frames per second of a PDO: by SYNC, by its event timer, or, with neither, as its inhibit time allows."""
     if pdo.receive:
         return 1.0 / period_s  # the loop sends it every cycle, whatever its type
-    if pdo.transmission_type <= _LAST_SYNCHRONOUS_TYPE:
-        return 1.0 / (period_s * max(1, pdo.transmission_type))
+    if pdo.syncs:
+        return 1.0 / (period_s * pdo.syncs)
     if pdo.event_timer_ms:
         return 1000.0 / pdo.event_timer_ms
     return 1.0 / max(period_s, pdo.inhibit_100us * _INHIBIT_S)

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from canopen import SdoAbortedError
 from rig import Rig
 from witness import Witness, axis_config, master, witness
 
@@ -86,6 +87,32 @@ def test_the_mapping_is_written_by_the_sequence_of_cia_301(world: Witness) -> No
     assert forgets < writes.first(Obj402.MODE) < writes.first(0x1400, 1) < watches
 
 
+@pytest.mark.parametrize("refuses", [True, False])
+def test_a_drive_without_every_nth_sync_sends_by_events(world: Witness, refuses: bool) -> None:
+    """Some know types 1 and 255 alone: they say so, or keep the one they had."""
+    kept = [255]
+
+    def write(*, index: int, subindex: int, od: Any, data: bytes) -> None:
+        if (index, subindex) == (0x1801, 2):
+            if data[0] in (1, 255):
+                kept[0] = data[0]
+            elif refuses:
+                raise SdoAbortedError(0x06090030)
+
+    def read(*, index: int, subindex: int, od: Any) -> int | None:
+        return kept[0] if (index, subindex) == (0x1801, 2) else None
+
+    world.amplifier.add_write_callback(write)
+    world.amplifier.add_read_callback(read)
+    with master(world, axis_config()) as instance:
+        up = instance.bring_up()
+    _, feedback, slow = up.amplifier.pdos
+    assert (feedback.transmission_type, slow.transmission_type, slow.timer_ms) == (1, 255, 100)
+    assert world.amplifier.sdo[0x1801][5].raw == 100
+    assert "node 1: TPDO2 by events: it sends none with every n-th SYNC" in up.report
+    assert up.encoder.pdos[0].transmission_type == world.encoder.sdo[0x1800][2].raw == 10
+
+
 def test_pdos_that_are_not_planned_are_switched_off(world: Witness) -> None:
     world.amplifier.sdo[0x1402][1].raw = 0x401
     with master(world, axis_config()) as instance:
@@ -122,7 +149,7 @@ def test_too_much_bus_load_is_refused_before_anything_is_written(world: Witness)
         (0x1600, 2, 0x60710020, r"RPDO1, object 0x1600:2: wrote 0x60710010, device reads 0x60710020"),
         (0x1A00, 0, 2, r"TPDO1, object 0x1A00:0: wrote 0x00000003, device reads 0x00000002"),
         (0x1800, 2, 255, r"TPDO1, object 0x1800:2: wrote 0x00000001, device reads 0x000000FF"),
-        (0x1801, 5, 10, r"TPDO2, object 0x1801:5: wrote 0x00000064, device reads 0x0000000A"),
+        (0x1801, 5, 10, r"TPDO2, object 0x1801:5: wrote 0x00000000, device reads 0x0000000A"),
         (0x1801, 3, 300, r"TPDO2, object 0x1801:3: wrote 0x00000000, device reads 0x0000012C"),
         (0x1800, 5, 20, r"TPDO1, object 0x1800:5: wrote 0x00000000, device reads 0x00000014"),
         (0x1400, 5, 0, r"object 0x1400:5: wrote 20, device reads 0"),

@@ -42,7 +42,7 @@ def test_a_driver_of_the_other_kind_is_refused() -> None:
 
 def test_the_daemons_check_refuses_too_slow_a_bus(tmp_path: Path) -> None:
     check(configured(tmp_path, 1_000_000))
-    with pytest.raises(BadInput, match=r"axis.yaml: bus load: .*77\.\d % of 500000 bit/s.*at most bus.max_load = 70 %"):
+    with pytest.raises(BadInput, match=r"axis.yaml: bus load: .*80\.\d % of 500000 bit/s.*at most bus.max_load = 70 %"):
         check(configured(tmp_path, 500_000))
 
 
@@ -50,7 +50,7 @@ def test_config_check_shows_the_load_and_refuses_too_slow_a_bus(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(["config", "check", str(configured(tmp_path, 1_000_000))]) == 0
-    assert "bus load 38.6 % at 1000000 bit/s" in capsys.readouterr().out
+    assert "bus load 40.0 % at 1000000 bit/s" in capsys.readouterr().out
     assert run(["config", "check", str(configured(tmp_path, 500_000))]) == 2
     assert "% of 500000 bit/s" in capsys.readouterr().err
 
