@@ -18,6 +18,7 @@ from servod.drivers.pdo_codec import slow_syncs
 from servod.drivers.quirks import CommandDeadline, Presence, Quirks, load_quirks
 from servod.runtime.fieldbus.cia import RPDO_BASE, TPDO_BASE, Obj301, Obj402, decode_status_word
 from servod.runtime.fieldbus.devices import (
+    EVENT_DRIVEN,
     DriveInput,
     DriveState,
     Mode,
@@ -39,8 +40,8 @@ SUPPORTED_MODE_BIT = {
     Mode.CYCLIC_SYNC_VELOCITY: 8,
     Mode.CYCLIC_SYNC_TORQUE: 9,
 }
-#: By events alone where a drive knows no transmission type but 1 and 255. Drives need not send the PDO when an input
-#: changes: so often they send it anyway, if somebody acts on its inputs.
+#: By events where a drive knows no transmission type but 1 and 255, and with inputs: an emergency stop comes at once,
+#: without SYNC too. Drives need not send the PDO when an input changes: so often they send it anyway.
 _SLOW_TIMER_MS, _INPUTS_TIMER_MS = 100, 10
 #: Bits of 0x1001: current, voltage, temperature (CiA 301).
 _POWER_ERRORS = 0x0E
@@ -54,7 +55,8 @@ def amplifier_pdos(
     with_inputs: bool = False,
     with_outputs: bool = False,
 ) -> tuple[PdoMap, ...]:
-    """The three PDOs of the amplifier: command, synchronous feedback, and the rest with every `slow_syncs`-th SYNC.
+    """The three PDOs of the amplifier: command, synchronous feedback, and the rest with every `slow_syncs`-th SYNC
+    or, with inputs, by events.
 
     The command's deadline guards against a dead loop and against commands alone that do not arrive, where the drive
     stops at it (drivers/quirks.py); the heartbeat guards in any case. The EMCY is a fault of the axis in any case.
@@ -69,11 +71,11 @@ def amplifier_pdos(
     )
     inputs = (PdoEntry(Obj402.DIGITAL_INPUTS, 0, 32),) if with_inputs else ()
     slow = (PdoEntry(Obj402.MODE_DISPLAY, 0, 8), PdoEntry(Obj402.ERROR_CODE, 0, 16), *inputs)
-    slow_ms = _INPUTS_TIMER_MS if with_inputs else _SLOW_TIMER_MS
+    slow_type, slow_ms = (EVENT_DRIVEN, _INPUTS_TIMER_MS) if with_inputs else (slow_syncs, _SLOW_TIMER_MS)
     return (
         PdoMap(True, 1, RPDO_BASE[0] + node_id, 1, command, event_timer_ms=command_deadline_ms),
         PdoMap(False, 1, TPDO_BASE[0] + node_id, 1, feedback),
-        PdoMap(False, 2, TPDO_BASE[1] + node_id, slow_syncs, slow, event_timer_ms=slow_ms),
+        PdoMap(False, 2, TPDO_BASE[1] + node_id, slow_type, slow, event_timer_ms=slow_ms),
     )
 
 

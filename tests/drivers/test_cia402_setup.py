@@ -197,7 +197,7 @@ def test_pdos_are_the_documented_ones() -> None:
     ]
     slow = amplifier_pdos(5, Mode.CYCLIC_SYNC_TORQUE, 150, 10, with_inputs=True)[2]
     assert [(entry.index, entry.bits) for entry in slow.entries] == [(0x6061, 8), (0x603F, 16), (0x60FD, 32)]
-    assert slow.event_timer_ms == 10, "a drive need not send it when an input changes"
+    assert (slow.transmission_type, slow.timer_ms) == (255, 10), "a drive need not send it when an input changes"
 
 
 @pytest.mark.parametrize(("entries", "fits"), [(3, True), (2, False)])

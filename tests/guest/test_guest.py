@@ -143,9 +143,7 @@ def test_the_fault_campaign_passes_on_vcan(results: Results) -> None:
     assert len(scenarios) >= 10
     failed = {name: row for name, row in scenarios.items() if row["complaints"]}
     said = "\n".join(f"{name}: {key}: {value}" for name, row in failed.items() for key, value in row.items())
-    assert all(row.get("starved") for row in failed.values()), said
-    if failed:
-        pytest.skip(f"three times each while the host kept the processor from the guest:\n{said}")
+    assert not failed, said
 
 
 def test_bad_configuration_fails_once_with_its_line(results: Results) -> None:

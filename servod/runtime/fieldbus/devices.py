@@ -228,6 +228,8 @@ class Encoder(Protocol):
 
 #: Transmission types up to this one go by SYNC (CiA 301, 0x1800:2).
 LAST_SYNCHRONOUS_TYPE = 240
+#: By events, as the device's profile says.
+EVENT_DRIVEN = 255
 
 
 @dataclass(frozen=True)

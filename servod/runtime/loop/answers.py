@@ -30,7 +30,7 @@ class Answers:
         self._owed = dict.fromkeys(can_ids, 0)
         self._least = dict(self._owed)  # of what was owed at each SYNC, since the count of complete cycles began
         self._complete = 0
-        self._in_time = dict(self._owed)  # SYNCs in a row at which no earlier frame was owed
+        self._in_time = dict.fromkeys(self._owed, _IN_TIME)  # SYNCs in a row at which no earlier frame was owed
         self._newest: dict[int, tuple[Frame, int, bool]] = {}  # with its SYNC, and whether a copy of it may pass
         self._repeated_ns, self._sync_ns = repeated_ns, 0
 

@@ -14,7 +14,7 @@ from servod.common.errors import BadInput, Unreachable
 from servod.common.faults import FaultCode
 from servod.formats.config import AmplifierConfig, AxisConfig, EncoderConfig, Identity
 from servod.runtime.fieldbus.cia import PDO_NO_RTR, PDO_NOT_VALID, NmtCommand, NmtState, Obj301, acts_when_written
-from servod.runtime.fieldbus.devices import NodePlan, PdoMap, SdoAbort, SdoAccess, Setup
+from servod.runtime.fieldbus.devices import EVENT_DRIVEN, NodePlan, PdoMap, SdoAbort, SdoAccess, Setup
 from servod.runtime.fieldbus.master.eds import Dictionary, dictionary_for
 from servod.runtime.fieldbus.master.monitor import GuardWatch, NodeWatch
 from servod.runtime.fieldbus.master.network import BusNetwork
@@ -30,7 +30,6 @@ from servod.runtime.fieldbus.setup_tools import read_optional, write_checked
 
 _COB_ID, _TYPE, _INHIBIT, _EVENT_TIMER = 1, 2, 3, 5  # sub-indices of 1400/1800
 _COMPARED_COB_BITS = ~PDO_NO_RTR & 0xFFFFFFFF  # bit 30 is the device's own business
-_EVENT_DRIVEN = 255  # by the device's profile (CiA 301, 0x1800:2)
 _FIRST_DATA_OBJECT = 0x20  # indices below are the dummy types that fill gaps
 
 
@@ -90,9 +89,9 @@ def with_type(sdo: SdoAccess, pdo: PdoMap) -> PdoMap:
     except SdoAbort:
         if pdo.syncs <= 1:
             raise
-        kept = _EVENT_DRIVEN
+        kept = EVENT_DRIVEN
     if kept != pdo.transmission_type:
-        pdo = replace(pdo, transmission_type=_EVENT_DRIVEN)
+        pdo = replace(pdo, transmission_type=EVENT_DRIVEN)
         sdo.write(parameter_index(pdo), _TYPE, pdo.transmission_type)
     return pdo
 

@@ -139,7 +139,7 @@ def test_a_device_of_another_profile_is_refused(world: Witness) -> None:
 
 def test_too_much_bus_load_is_refused_before_anything_is_written(world: Witness) -> None:
     writes = Writes(world.amplifier, world.encoder)
-    refuse(world, BadInput, r"154.2 % of 250000 bit/s", bus={"bit_rate": 250_000})
+    refuse(world, BadInput, r"160.0 % of 250000 bit/s", bus={"bit_rate": 250_000})
     assert writes.seen == []
 
 
