@@ -28,6 +28,8 @@ from servod.runtime.fieldbus.bus.open import open_bus
 from servod.runtime.fieldbus.bus.socketcan import SocketCanBus
 
 WAIT_S = 0.5
+#: NMT, SYNC, SDO requests to nodes 1 and 2, LSS: the nodes of a virtual axis that is on the bus too answer these.
+ANSWERED = {0x000, 0x080, 0x601, 0x602, 0x7E5}
 
 
 @pytest.fixture(params=list(BUSES))
@@ -50,7 +52,7 @@ def test_a_frame_reaches_the_other_and_not_its_sender(wire: Wire) -> None:
 
 
 @settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(can_id=st.integers(0, 0x7FF), data=st.binary(max_size=8))
+@given(can_id=st.sampled_from([i for i in range(0x800) if i not in ANSWERED]), data=st.binary(max_size=8))
 def test_every_identifier_and_length_comes_back_as_it_was(wire: Wire, can_id: int, data: bytes) -> None:
     assert wire.other.send(can_id, data)
     (frame,) = take(wire.one, 1)
