@@ -198,7 +198,9 @@ class Limits:
         step_nm = self.torque_rate_nm_per_s * dt_s
         change_nm = wanted_nm - self._last_torque_nm
         if abs(change_nm) > step_nm:
-            torque_nm, faults = self._last_torque_nm + math.copysign(step_nm, change_nm), _RATE
+            torque_nm = self._last_torque_nm + math.copysign(step_nm, change_nm)
+            # A step that is longer by a rounding alone gets there all the same.
+            faults = _RATE if torque_nm != wanted_nm else 0
         if abs(torque_nm) > self.torque_nm:  # the torque itself has the last word, wherever the ramp began
             torque_nm, faults = math.copysign(self.torque_nm, torque_nm), faults | _CLIPPED
         if not self._least_nm <= torque_nm <= self._most_nm:
