@@ -8,10 +8,11 @@ import json
 import sys
 import time
 import traceback
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from inside.tools import shell
+from inside.tools import shell, unless_starved
 
 #: Module and step; a module is imported when its first step comes, since only the first one can do without servod.
 STEPS = (
@@ -35,6 +36,8 @@ STEPS = (
     ("foreign", "foreign"),  # on a bus of its own
     ("bus", "own_bus"),  # takes the interface away from all others
 )
+#: Steps that leave nothing behind, so that they can be run again where the host kept the processor from them.
+ON_THEIR_OWN = ("foreign",)
 #: Only where it is named.
 ON_REQUEST = (("power", "powered"),)
 
@@ -46,17 +49,22 @@ def main() -> None:
         for module, step in (*STEPS, *ON_REQUEST):
             if step not in chosen and (chosen or (module, step) in ON_REQUEST):
                 continue
-            result: dict[str, Any] = {"step": step}
-            started = time.monotonic()
-            try:
-                result |= getattr(importlib.import_module(f"inside.{module}"), step)()
-            except Exception:
-                result["error"] = traceback.format_exc()[-3000:]
-                with contextlib.suppress(Exception):
-                    result["journal_tail"] = shell("journalctl", "--no-pager", "-n", "40", "-o", "cat")[-4000:]
-            result["seconds"] = round(time.monotonic() - started, 1)
+            once = partial(_run, module, step)
+            result = unless_starved(once, "error") if step in ON_THEIR_OWN else once()
             results.write(json.dumps(result) + "\n")
             results.flush()
+
+
+def _run(module: str, step: str) -> dict[str, Any]:
+    result: dict[str, Any] = {"step": step}
+    started = time.monotonic()
+    try:
+        result |= getattr(importlib.import_module(f"inside.{module}"), step)()
+    except Exception:
+        result["error"] = traceback.format_exc()[-3000:]
+        with contextlib.suppress(Exception):
+            result["journal_tail"] = shell("journalctl", "--no-pager", "-n", "40", "-o", "cat")[-4000:]
+    return result | {"seconds": round(time.monotonic() - started, 1)}
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ import signal
 import sys
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from inside.tools import (
     prop,
     shell,
     status,
+    unless_starved,
     wait_for,
 )
 from servod.common.errors import ServodError
@@ -40,8 +42,6 @@ from servod.qualify.faults.wire import CanWire
 
 #: The longest that a daemon may take to come back by itself or by hand.
 _BACK_S = 60.0
-#: A scenario that failed while the host kept the processor from the guest is run again, so often at most.
-_AGAIN = 2
 
 
 class UnitMachine(Machine):
@@ -133,28 +133,9 @@ def campaign() -> dict[str, Any]:
         outcomes = {}
         for name, scenario in shipped_scenarios().items():
             if scenario.runs is Runs.GUEST:
-                outcomes[name] = _judged(name, scenario)
+                outcomes[name] = unless_starved(partial(_outcome, name, scenario), "complaints")
                 print(json.dumps({name: outcomes[name]}), file=rows, flush=True)
     return {"scenarios": outcomes}
-
-
-def _judged(name: str, scenario: Scenario) -> dict[str, Any]:
-    """The last of its runs, with what the host says of it; each run that failed wants a saying of its own."""
-    for left in reversed(range(_AGAIN + 1)):
-        before = _starved()
-        row = _outcome(name, scenario)
-        if not row["complaints"]:
-            break
-        row["starved"] = sorted(_starved() - before)
-        if not left or not row["starved"]:
-            break
-        print(json.dumps({name: row}), flush=True)
-    return row
-
-
-def _starved() -> set[str]:
-    """What tests/guest/host.py wrote down so far."""
-    return {file.name for file in (Path(sys.argv[1]) / "starved").glob("*")}
 
 
 def _outcome(name: str, scenario: Scenario) -> dict[str, Any]:

@@ -40,7 +40,7 @@ def foreign() -> dict[str, Any]:
         program = shutil.copy(Path(sys.argv[1]) / "canopennode" / name, f"/usr/local/bin/foreign-{name}")
         started = ["--setenv", f"JOINT={JOINT}", str(program), INTERFACE, "-i", str(node_id)]
         # Before whatever starts beside it on the one CPU, as the virtual axis: five cycles without an answer are stale.
-        shell("systemd-run", "--nice=-10", "--unit", f"foreign-{name}", *started)
+        shell("systemd-run", "--collect", "--nice=-10", "--unit", f"foreign-{name}", *started)
     Path("/etc/servod/config/foreign.yaml").write_text(yaml.safe_dump(_scaled()))
     shell("systemctl", "start", UNIT)
     try:
@@ -48,6 +48,7 @@ def foreign() -> dict[str, Any]:
     finally:
         for unit in (UNIT, *(f"foreign-{name}" for name in NODES)):
             shell("systemctl", "stop", unit, check=False)
+        shell("ip", "link", "delete", INTERFACE)
 
 
 def _scaled() -> dict[str, Any]:
