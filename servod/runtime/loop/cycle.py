@@ -215,15 +215,14 @@ class Cycle:
         proof = self.proof
         if not self.axis.brake_open:  # what moves a joint without torque meanwhile, ends it (proving_faults)
             if not self._opening:
-                self.limits.arm(amplifier, encoder)
+                self.limits.arm(amplifier, encoder, 0.0)
             self._opening = True
             self._rest(encoder)
             return _NO_TORQUE
         self._opening = False
         if not proof.running and proof.verdict is None:
             self.limits.torque_nm = self._limit_nm  # the drive's own limit rests on a scale that is not proven yet
-            self.limits.arm(amplifier, encoder)
-            self.limits.release()  # what 0x6077 shows is not proven yet
+            self.limits.arm(amplifier, encoder, 0.0)
             self.reference.hold(encoder.position_rad)
             proof.begin(encoder.position_rad, amplifier.position_rad)
         wanted_nm = proof.step(amplifier, encoder, self.torque_nm, dt_s)
@@ -243,12 +242,12 @@ class Cycle:
             self.axis.raise_fault(_NOT_PROVEN)
 
     def _seed(self, amplifier: AmplifierFeedback, encoder: EncoderFeedback) -> None:
-        """First controlled cycle: stay where the joint is, go on from the torque that is produced now."""
+        """First controlled cycle: stay where the joint is, go on from the torque that the drive was told last."""
         self.limits.torque_nm = self._drive_limit_nm  # more would be clipped there, unseen by the law
-        self.limits.arm(amplifier, encoder)
-        self.torque_nm = self._ramp_from_nm = amplifier.torque_nm
+        self.limits.arm(amplifier, encoder, self.torque_nm)
+        self._ramp_from_nm = self.torque_nm
         self.reference.hold(encoder.position_rad)
-        self.controller.reset(amplifier.torque_nm)
+        self.controller.reset(self.torque_nm)
 
     def _rest(self, encoder: EncoderFeedback) -> None:
         """Not controlled: the reference follows the joint, torque and ramps start from zero next time."""

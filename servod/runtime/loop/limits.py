@@ -72,8 +72,8 @@ class Limits:
         self.torque_mismatch_nm = _MISMATCH_SHARE * config.torque_nm if mismatch_nm is None else mismatch_nm
         self._forgets_nm = config.torque_nm / _MEMORY_CYCLES  # in each cycle
         self._most_told_nm = self._least_told_nm = 0.0
-        self._bent_cycles = 0
-        self._last_torque_nm = 0.0
+        self._bent_cycles = self._apart_cycles = 0
+        self._last_torque_nm = self._dt_s = 0.0
         self._encoder_offset_rad = self._armed_at_rad = 0.0
         self._late_level = 0.0
         self._ways = None if stop is None else both_ways(stop)
@@ -87,6 +87,7 @@ class Limits:
         The faster of both sensors counts, each way: one of them may stand still. What was not heard is reckoned with
         the last torque, the load and the least inertia.
         """
+        self._dt_s = dt_s
         if self._ways is None or self._holding is None:
             return
         up, down = self._ways
@@ -130,13 +131,16 @@ class Limits:
         left = (_MOVES_SHARE - speed_rad_s / self.speed_rad_s) / (_MOVES_SHARE - _MOVING_SHARE)
         return min(1.0, max(0.0, left))
 
-    def arm(self, amplifier: AmplifierFeedback, encoder: EncoderFeedback) -> None:
-        """At enable: both position sensors agree by definition now; torque starts from what is produced now."""
+    def arm(self, amplifier: AmplifierFeedback, encoder: EncoderFeedback, told_nm: float) -> None:
+        """At enable: both position sensors agree by definition now; torque starts from what the drive was told last.
+
+        What it shows (0x6077) may be wrong, and must not become torque: `torque_faults` judges it.
+        """
         self._encoder_offset_rad = amplifier.position_rad - encoder.position_rad
         self._armed_at_rad = encoder.position_rad
-        self._last_torque_nm = amplifier.torque_nm if math.isfinite(amplifier.torque_nm) else 0.0
+        self._last_torque_nm = told_nm
         self._most_told_nm = self._least_told_nm = self._last_torque_nm
-        self._bent_cycles = 0
+        self._bent_cycles = self._apart_cycles = 0
         if self._holding is not None:
             still = abs(encoder.velocity_rad_s) <= _MOVING_SHARE * self.speed_rad_s
             self._holding.begin(encoder.position_rad, self._last_torque_nm if still else 0.0)
@@ -167,12 +171,22 @@ class Limits:
             faults |= _POSITION
         if reference_rad is not None and not abs(reference_rad - position) <= self.following_error_rad:
             faults |= _FOLLOWING
-        # Positions of two moments differ in motion: a lost frame is for the staleness to judge.
-        same_moment = amplifier.age_cycles == encoder.age_cycles
-        difference_rad = abs(amplifier.position_rad - position - self._encoder_offset_rad)
-        if same_moment and not difference_rad <= self.encoder_mismatch_rad:
+        if not self._sensors_agree(amplifier, encoder):
             faults |= _MISMATCH
         return faults
+
+    def _sensors_agree(self, amplifier: AmplifierFeedback, encoder: EncoderFeedback) -> bool:
+        """Whether both position sensors do, as far as one can tell.
+
+        Positions of two moments differ in motion: that waits for frames of one moment, but no longer than feedback may
+        be away; then what the joint can have moved between them is allowed.
+        """
+        apart_cycles = abs(amplifier.age_cycles - encoder.age_cycles)
+        self._apart_cycles = self._apart_cycles + 1 if apart_cycles else 0
+        if 0 < self._apart_cycles <= self.stale_cycles:
+            return True
+        difference_rad = abs(amplifier.position_rad - encoder.position_rad - self._encoder_offset_rad)
+        return difference_rad <= self.encoder_mismatch_rad + apart_cycles * self._dt_s * self.speed_rad_s
 
     def proving_faults(self, encoder: EncoderFeedback, most_travel_rad: float) -> int:
         """While the wiring is proven: the joint stays near where the test began, whatever the test thinks of it."""
@@ -181,10 +195,13 @@ class Limits:
 
     def torque_faults(self, amplifier: AmplifierFeedback) -> int:
         """A drive that says it gives another torque than it was told in the last cycles; one that says that it limits
-        the torque may."""
-        if amplifier.age_cycles or amplifier.status_word & SW_INTERNAL_LIMIT:
+        the torque may give less, down to none."""
+        if amplifier.age_cycles:
             return 0
-        above_nm, below_nm = amplifier.torque_nm - self._most_told_nm, self._least_told_nm - amplifier.torque_nm
+        most_nm, least_nm = self._most_told_nm, self._least_told_nm
+        if amplifier.status_word & SW_INTERNAL_LIMIT:
+            most_nm, least_nm = max(most_nm, 0.0), min(least_nm, 0.0)
+        above_nm, below_nm = amplifier.torque_nm - most_nm, least_nm - amplifier.torque_nm
         bent = above_nm > self.torque_mismatch_nm or below_nm > self.torque_mismatch_nm
         self._bent_cycles = self._bent_cycles + 1 if bent else 0
         return _BENT_TORQUE if self._bent_cycles >= _MOST_BENT_CYCLES else 0

@@ -25,6 +25,7 @@ _DOUBTFUL = sum(
         FaultCode.FOLLOWING_ERROR,
         FaultCode.ENCODER_IMPLAUSIBLE,
         FaultCode.ENCODER_ALARM,
+        FaultCode.TORQUE_IMPLAUSIBLE,
         FaultCode.NOT_FINITE,
         FaultCode.WIRING_NOT_PROVEN,
     )

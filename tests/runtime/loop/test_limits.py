@@ -21,7 +21,7 @@ PERIOD_S = 1e-3
 
 def armed() -> Limits:
     limits = Limits(CONFIG)
-    limits.arm(amplifier(), encoder())
+    limits.arm(amplifier(), encoder(), 0.0)
     return limits
 
 
@@ -119,14 +119,14 @@ def test_mutation_of_the_limits_in_cycles(name, bit):
 
 def test_offset_between_the_sensors_at_enable_is_not_a_mismatch():
     limits = Limits(CONFIG)
-    limits.arm(amplifier(position_rad=7.0), encoder(position_rad=0.5))
+    limits.arm(amplifier(position_rad=7.0), encoder(position_rad=0.5), 0.0)
     assert limits.motion_faults(amplifier(position_rad=7.0), encoder(position_rad=0.5), 0.5) == 0
     assert limits.motion_faults(amplifier(position_rad=7.2), encoder(position_rad=0.5), 0.5) != 0
 
 
 def test_rate_limit_starts_from_the_torque_at_enable():
     limits = Limits(CONFIG)
-    limits.arm(amplifier(torque_nm=0.2), encoder())
+    limits.arm(amplifier(), encoder(), 0.2)
     assert limits.limit_torque(0.2, PERIOD_S) == (0.2, 0)
     torque, faults = limits.limit_torque(-0.2, PERIOD_S)
     assert torque == pytest.approx(0.1)
@@ -136,7 +136,7 @@ def test_rate_limit_starts_from_the_torque_at_enable():
 @pytest.mark.parametrize("name", ["position_min_rad", "position_max_rad", "torque_rate_nm_per_s"])
 def test_mutation_of_range_and_rate(name):
     wide = Limits(CONFIG.model_copy(update={name: getattr(CONFIG, name) * 1000}))
-    wide.arm(amplifier(), encoder())
+    wide.arm(amplifier(), encoder(), 0.0)
 
     def seen(limits: Limits) -> set[FaultCode]:
         low, high = encoder(position_rad=-1.5), encoder(position_rad=2.5)
@@ -152,7 +152,7 @@ def test_mutation_of_range_and_rate(name):
 @given(st.floats(-10, 10), st.lists(st.floats(allow_nan=True, allow_infinity=True), max_size=60))
 def test_no_sequence_of_wishes_gets_more_torque_or_rate_than_allowed(start, wishes):
     limits, last = Limits(CONFIG), start
-    limits.arm(amplifier(torque_nm=start), encoder())
+    limits.arm(amplifier(), encoder(), start)
     for wish in wishes:
         torque, faults = limits.limit_torque(wish, PERIOD_S)
         assert math.isfinite(torque)
@@ -186,7 +186,7 @@ def test_mutation_each_limit_is_in_use(name):
         return limits.motion_faults(amplifier(position_rad=0.2), enc, 0.4) | limits.limit_torque(0.35, 1.0)[1]
 
     wide = Limits(CONFIG.model_copy(update={name: getattr(CONFIG, name) * 1000}))
-    wide.arm(amplifier(), encoder())
+    wide.arm(amplifier(), encoder(), 0.0)
     assert everything(wide).bit_count() == everything(armed()).bit_count() - 1
 
 
@@ -195,7 +195,7 @@ STOP = StopFacts(1e-3, 1e-3, 0.01, 0.0, -0.02, 0.02, 0.3, 5.0, 5.75, -1.0, 2.0, 
 
 def looked(amp: AmplifierFeedback, enc: EncoderFeedback) -> Limits:
     limits = Limits(CONFIG, STOP)
-    limits.arm(amp, enc)
+    limits.arm(amp, enc, 0.0)
     limits.look(amp, enc, PERIOD_S)
     return limits
 
@@ -224,7 +224,7 @@ def test_the_position_limit_acts_where_the_joint_can_still_stop():
 
 def test_an_encoder_that_stands_still_does_not_hide_the_speed():
     limits = Limits(CONFIG, STOP)
-    limits.arm(amplifier(), encoder())
+    limits.arm(amplifier(), encoder(), 0.0)
     for number in range(30):
         limits.look(amplifier(position_rad=0.004 * number), encoder(), PERIOD_S)
     limits._last_torque_nm = 0.3
@@ -238,11 +238,28 @@ def test_a_joint_faster_than_three_hundredths_of_its_speed_limit_is_not_let_go()
         assert limits.moving(encoder(velocity_rad_s=speed)) is moving
 
 
+@pytest.mark.parametrize(
+    ("apart_rad", "speed_rad_s", "told"), [(0.3, 0.0, True), (0.0, 4.0, False), (0.0, -4.0, False)]
+)
+def test_frames_that_are_never_of_one_moment_hide_no_mismatch(apart_rad: float, speed_rad_s: float, told: bool) -> None:
+    """Each node loses every other frame. What a joint moves between two moments is none."""
+    limits, seen = Limits(CONFIG), []
+    limits.arm(amplifier(), encoder(), 0.0)
+    for number in range(100):
+        of_drive, of_encoder = (number - number % 2, number - (number + 1) % 2)  # the cycle that each is of
+        way_rad = speed_rad_s * PERIOD_S
+        amp = amplifier(position_rad=apart_rad + way_rad * of_drive, age_cycles=number - of_drive)
+        enc = encoder(position_rad=way_rad * of_encoder, age_cycles=number - of_encoder, velocity_rad_s=speed_rad_s)
+        limits.look(amp, enc, PERIOD_S)
+        seen.append(FaultCode.ENCODER_IMPLAUSIBLE in codes(limits.motion_faults(amp, enc, None)))
+    assert seen == [told and number >= CONFIG.stale_cycles for number in range(100)]
+
+
 @pytest.mark.parametrize("lost", [1, 4, 15])
 def test_frames_that_were_lost_make_the_joint_no_faster(lost: int) -> None:
     """The way since the drive was heard last is that of all cycles meanwhile, not of one."""
     limits = Limits(CONFIG, STOP)
-    limits.arm(amplifier(), encoder())
+    limits.arm(amplifier(), encoder(), 0.0)
     for number in range(60):
         heard = number % (lost + 1) == 0
         limits.look(amplifier(position_rad=0.002 * number, age_cycles=0 if heard else 1), encoder(), PERIOD_S)
@@ -285,7 +302,7 @@ def moved(load_nm, from_rad, to_rad, enabled_at_nm=0.0, gain=8.0, damping=0.16, 
     master may die: the joint rests inside its range."""
     config = CONFIG.model_copy(update={"torque_nm": 0.8, "position_max_rad": 1.0, "torque_rate_nm_per_s": 400.0})
     limits, position, speed, seen = Limits(config, facts), from_rad, 0.0, []
-    limits.arm(amplifier(position_rad=position, torque_nm=enabled_at_nm), encoder(position_rad=position))
+    limits.arm(amplifier(position_rad=position), encoder(position_rad=position), enabled_at_nm)
     commands = deque([enabled_at_nm] * (late + 1), maxlen=late + 1)
     for _ in range(cycles):
         amp, enc = amplifier(position_rad=position), encoder(position_rad=position, velocity_rad_s=speed)

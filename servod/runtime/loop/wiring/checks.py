@@ -260,7 +260,7 @@ def energy(push: Push, encoder_rad: float, bounds: WiringTestBounds) -> CheckRes
 
 
 def torque_at_rest(shown_nm: float, bounds: WiringTestBounds) -> CheckResult | None:
-    """0x6077 while none is demanded, on the mean: what the controller would go on from at its first cycle."""
+    """0x6077 while none is demanded, on the mean: a torque of the drive's own, or a sensor that is off."""
     counts_nm = 0.0 if math.isnan(bounds.torque_count_nm) else ACTUAL_COUNTS * bounds.torque_count_nm
     allowed_nm = AT_REST_SHARE * bounds.limit_nm + counts_nm
     return (

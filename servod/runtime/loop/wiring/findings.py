@@ -127,7 +127,7 @@ FINDINGS: dict[WiringOutcome, _Row] = {
     ),
     _F.TORQUE_AT_REST: _Row(
         "the drive shows {found:.3g} N*m (0x6077) while none is demanded, {lowest:.3g} to {highest:.3g} are allowed: "
-        "the controller goes on from what it shows",
+        "it gives a torque of its own, or shows a wrong one",
         "check the drive's torque offset (0x60B2), the zero of its current sensors, and the mapping of 0x6077",
     ),
     _F.RATED_TORQUE: _Row(

@@ -22,7 +22,7 @@ BIT = {code: fault.bit for code, fault in FAULTS.items()}
 
 def armed(torque_nm: float = 0.0) -> Limits:
     limits = Limits(CONFIG)
-    limits.arm(amplifier(torque_nm=torque_nm), encoder())
+    limits.arm(amplifier(), encoder(), torque_nm)
     return limits
 
 
@@ -76,7 +76,7 @@ def test_reference_that_is_followed_no_more_is_not_compared() -> None:
 def test_what_the_sensors_differ_by_at_enable_belongs_to_them() -> None:
     limits = Limits(CONFIG)
     assert limits.motion_faults(amplifier(position_rad=0.125), encoder(), 0.0) == 0, "zero before the first enable"
-    limits.arm(amplifier(position_rad=5.0), encoder(position_rad=1.0))
+    limits.arm(amplifier(position_rad=5.0), encoder(position_rad=1.0), 0.0)
     for motor, fault in ((5.125, 0), (4.875, 0), (5.25, 1), (4.75, 1), (1.0, 1)):
         found = limits.motion_faults(amplifier(position_rad=motor), encoder(position_rad=1.0), 1.0)
         assert found == fault * BIT[FaultCode.ENCODER_IMPLAUSIBLE]
@@ -87,11 +87,11 @@ def test_joint_that_is_proven_stays_within_twice_the_travel_of_where_it_began(si
     limits = Limits(CONFIG)
     assert limits.proving_faults(encoder(position_rad=sign * 0.5), 0.25) == 0, "zero before the first enable"
     for began in (0.0, 8.0, -8.0):  # whole eighths, so that differences are exact
-        limits.arm(amplifier(), encoder(position_rad=began))
+        limits.arm(amplifier(), encoder(position_rad=began), 0.0)
         for travel, fault in ((0.0, 0), (0.375, 0), (0.5, 0), (0.625, 1), (2.0, 1), (9.0, 1), (INF, 1), (NAN, 1)):
             found = limits.proving_faults(encoder(position_rad=began + sign * travel), 0.25)
             assert found == fault * BIT[FaultCode.WIRING_NOT_PROVEN]
-    limits.arm(amplifier(), encoder())
+    limits.arm(amplifier(), encoder(), 0.0)
     assert limits.proving_faults(encoder(position_rad=sign * above(0.5)), 0.25), "to the last bit"
     assert not limits.proving_faults(encoder(position_rad=sign * 2.0), 1.0), "the travel is the test's own"
 
@@ -215,11 +215,6 @@ def test_no_number_gives_no_torque_and_the_next_ramp_starts_there(bad: float) ->
         assert limits.limit_torque(0.25, DT_S) == (STEP_NM, RATE)
 
 
-@pytest.mark.parametrize("bad", NOT_FINITE)
-def test_torque_at_enable_that_is_no_number_counts_as_none(bad: float) -> None:
-    assert limited(0.25, last=bad) == (STEP_NM, RATE)
-
-
 def test_before_the_first_enable_the_ramp_starts_from_zero() -> None:
     assert Limits(CONFIG).limit_torque(0.25, DT_S) == (STEP_NM, RATE)
 
@@ -282,9 +277,22 @@ def test_a_bent_torque_is_a_fault_after_so_many_cycles_in_a_row(sign: float) -> 
     assert said(limits, sign * above(MISMATCH), 50) == [0] * 49 + [BENT]
 
 
-@pytest.mark.parametrize("changes", [{"age_cycles": 1}, {"status_word": 0x0A37}])
-def test_an_old_torque_and_one_that_the_drive_says_it_limits_are_not_judged(changes: dict[str, int]) -> None:
-    assert set(said(armed(), 0.5, 200, **changes)) == {0}
+def test_an_old_torque_is_not_judged() -> None:
+    assert set(said(armed(), 0.5, 200, age_cycles=1)) == {0}
+
+
+@pytest.mark.parametrize("told_nm", [0.5, -0.5])
+def test_a_drive_that_says_it_limits_the_torque_may_give_less_and_never_more(told_nm: float) -> None:
+    def shown(torque_nm: float) -> set[int]:
+        limits, seen = armed(told_nm), set()
+        for _ in range(200):
+            limits.limit_torque(told_nm, DT_S)
+            seen |= set(said(limits, torque_nm, 1, status_word=0x0A37))
+        return seen
+
+    assert shown(0.0) == shown(0.5 * told_nm) == shown(told_nm) == {0}
+    beyond = math.copysign(1.01 * MISMATCH, told_nm)
+    assert shown(told_nm + beyond) == shown(-beyond) == {0, BENT}
 
 
 def test_the_torque_is_held_against_the_commands_of_the_last_cycles() -> None:
@@ -300,5 +308,5 @@ def test_the_torque_is_held_against_the_commands_of_the_last_cycles() -> None:
 
 def test_the_allowed_distance_can_be_stated() -> None:
     limits = Limits(CONFIG.model_copy(update={"torque_mismatch_nm": 0.0625}))
-    limits.arm(amplifier(), encoder())
+    limits.arm(amplifier(), encoder(), 0.0)
     assert said(limits, above(0.0625), 50)[-1] == BENT
