@@ -317,7 +317,7 @@ class Axis:
             self._stop(AxisState.QUICK_STOPPING, AxisState.FAULT)
         elif self.state == AxisState.RELEASING:
             self._stop(self._after_braking(), AxisState.FAULT)
-        elif self.state == AxisState.ENABLED:
+        elif self.state == AxisState.ENABLED or (self.state == AxisState.BRAKING and not sound):
             self._stop(AxisState.BRAKING if sound else AxisState.RAMPING, AxisState.FAULT)
 
     def _drive_faults(self, amplifier: AmplifierFeedback) -> int:

@@ -55,8 +55,10 @@ class RestWatch:
         self._quiet = 0
 
     def rests(self, amplifier: AmplifierFeedback) -> bool:
-        """One cycle; what is not heard does not move."""
-        if not amplifier.age_cycles and not abs(amplifier.position_rad - self._anchor_rad) <= self._rest_rad:
+        """One cycle; one in which the drive is not heard says nothing of rest."""
+        if amplifier.age_cycles:
+            return False
+        if not abs(amplifier.position_rad - self._anchor_rad) <= self._rest_rad:
             self._anchor_rad, self._quiet = amplifier.position_rad, 0
         self._quiet += 1
         return self._quiet > self._rest_cycles

@@ -20,7 +20,7 @@ class StoNaming:
         self._window_cycles = max(1, round(_STO_TOLD_S / period_s)) if known else 0
         self._left = self._window_cycles
         self._held = 0  # faults that wait for their name
-        self._owns = False  # the drive's fault is STO's, until it is left
+        self._owns = False  # the drive's fault is STO's, until it is left, or stays when STO is over
 
     @property
     def pending(self) -> bool:
@@ -38,9 +38,12 @@ class StoNaming:
             return faults, 0
         late = _STO if self._held and faults & _STO else 0
         if faults & _STO:
-            self._owns, self._held = True, 0
+            self._owns, self._held, self._left = True, 0, self._window_cycles
         elif self._owns:
-            self._owns = in_fault
+            self._left -= 1
+            self._owns = in_fault and self._left > 0
+            if in_fault and not self._owns:  # STO is over and the fault is not: it may be the drive's own
+                return faults, late | faults & _BY_STO
         if self._owns:
             return faults & ~_BY_STO, late
         if not (self._held or faults & _BY_STO):

@@ -69,6 +69,8 @@ def expected(state: AxisState, code: FaultCode) -> AxisState:
         return S.QUICK_STOPPING
     if state == S.ENABLED:
         return S.BRAKING if code == F.SUPERVISOR_LOST else S.RAMPING
+    if state == S.BRAKING:  # its law is not sound any more
+        return S.BRAKING if code == F.SUPERVISOR_LOST else S.RAMPING
     return state
 
 

@@ -303,6 +303,19 @@ def test_a_drive_that_would_hold_in_quick_stop_active_is_switched_off_at_rest() 
     assert axis.state == S.DISABLED
 
 
+@pytest.mark.parametrize("period_s", [1e-3, 5e-3, 1e-2])
+def test_a_drive_that_is_not_heard_on_its_ramp_is_not_at_rest(period_s: float) -> None:
+    """Voltage off would end the ramp, and the joint coast."""
+    axis = Axis(period_s, 0.01, 1.0, Mode.CYCLIC_SYNC_TORQUE, 1.0, stale_cycles=50, stays_rad=2e-4)
+    axis.enable(False)
+    step(axis, **READY)
+    axis.quick_stop()
+    step(axis, state=D.QUICK_STOP_ACTIVE, position_rad=0.001)
+    for age in range(1, 49):
+        step(axis, state=D.QUICK_STOP_ACTIVE, position_rad=0.001, age_cycles=age)
+        assert axis.goal == Goal.QUICK_STOP
+
+
 @pytest.mark.parametrize("moving", [False, True])
 def test_a_joint_that_the_controller_did_not_bring_to_rest_is_the_drives_to_stop(moving: bool) -> None:
     """A law that runs away does not follow its reference to rest: letting go then would lose the ramp."""
