@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, ParamSpec, TypeVar
 from servod.client.axis import LOOK_S, AxisDropped, AxisReading, ReferenceMotion, Watch
 from servod.common.clock import Clock
 from servod.common.errors import AnswerIsNo
-from servod.common.faults import FaultCode, fault_text
+from servod.common.faults import FAULTS, FaultCode, fault_text
 from servod.common.units import NS_PER_S
 from servod.formats.config import AxisConfig
 from servod.formats.gains.gain_set import GainSet, pd_set
@@ -42,7 +42,7 @@ from servod.runtime.fieldbus.master.planned import narrowed_by_stop, stopping_as
 from servod.runtime.loop.axis_state import AxisState
 from servod.runtime.loop.channel import TRAJECTORY_SAMPLES, Channel
 from servod.runtime.loop.commands import REFUSAL_TEXT, Command, Op, Refusal
-from servod.runtime.loop.cycle import Cycle
+from servod.runtime.loop.cycle import ANSWERS_AGAIN_CYCLES, Cycle
 from servod.runtime.loop.plan import LoopPlan
 from servod.runtime.loop.process import supervisor_watch
 from servod.runtime.loop.wiring.findings import WiringReport, wiring_sentence
@@ -55,6 +55,7 @@ T = TypeVar("T")
 
 #: Virtual time between two looks at an axis that is being enabled.
 _ENABLE_STEP_S = 0.02
+_STAYS_POWERED = FAULTS[FaultCode.DRIVE_STAYS_POWERED].bit
 
 
 #: The daemon's supervisor looks at the nodes so often (servod.runtime.daemon.supervisor.TICK_S).
@@ -192,7 +193,8 @@ class SteppedSession:
         self.lateness_ns: Callable[[], int] = _punctual
         self._deadline_ns = self.clock.now_ns() + self.cycle.period_ns
         self._cycles_until_poll = 0
-        self.loop_dead, self._unheard_polls = False, 0
+        self.loop_dead = self._stays_powered = self._told_off = False
+        self._stops_in = 0
         self._poll_cycles = max(1, _POLL_NS // self.cycle.period_ns)
 
     @property
@@ -288,6 +290,10 @@ class SteppedSession:
 
     def _look_after_nodes(self) -> None:
         """The supervisor's part, as often as the daemon's: each event becomes a fault in the loop."""
+        self._stays_powered |= bool(self.cycle.axis.faults & _STAYS_POWERED)
+        self._stops_in -= 1
+        if self._stops_in == 0 and not (self.port.orphaned or self.loop_dead):
+            self._stop_withdrawn()
         self._cycles_until_poll -= 1
         if self._cycles_until_poll > 0:
             return
@@ -301,13 +307,12 @@ class SteppedSession:
         self.master.poll()
         for event in self.master.events():
             self.port.send(Op.NODE_EVENT, (float(event.fault),))
-        self._unheard_polls += self.cycle.axis.unheard
-        if self._unheard_polls == 2:  # NMT stop comes from the loop, which makes the drive answer SDO some cycles later
-            self._stop_unheard()
+        if self._stays_powered and not self._told_off:
+            self._told_off, self._stops_in = True, ANSWERS_AGAIN_CYCLES
 
-    def _stop_unheard(self) -> None:
-        """What the daemon does beside its rounds for a drive that stays powered. The loop, which has withdrawn, is not
-        late for it: its next cycle comes when this is done."""
+    def _stop_withdrawn(self) -> None:
+        """What the daemon does beside its rounds for a drive that stays powered, once that may answer SDO again. The
+        loop, which has withdrawn, is not late for it: its next cycle comes when this is done."""
         Nodes(self.master, self.bring_up).stop_axis()
         behind_ns = max(0, self.clock.now_ns() - self._deadline_ns)
         periods = -(-behind_ns // self.cycle.period_ns)

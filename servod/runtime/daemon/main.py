@@ -187,6 +187,7 @@ def _supervise(
         loop = LoopHandle(plan)
     except OSError as error:  # a limit on the size of files holds for shared memory, too
         raise Unreachable(f"shared memory for the loop cannot be made ({reason(error)}); see `ulimit -a`") from None
+    undo.callback(loop.close)
     undo.callback(_give_back, nodes, loop)
     _start_loop(loop)
     return Supervisor(config, stopping, nodes, loop, bank, recorder, context)

@@ -29,6 +29,7 @@ from servod.runtime.fieldbus.master import BringUp, Master
 from servod.runtime.fieldbus.master.monitor import MASTER_MISSED, NodeEvent
 from servod.runtime.loop.brake import rest_rad
 from servod.runtime.loop.commands import Op
+from servod.runtime.loop.cycle import ANSWERS_AGAIN_CYCLES
 
 log = logging.getLogger("servod")
 
@@ -103,6 +104,13 @@ class Nodes:
         would let the joint coast, and a load fall."""
         self.brake_to_rest(self._master.config.amplifier.enable_timeout_s)
         self.switch_off()
+
+    def stop_withdrawn(self) -> None:
+        """`stop_axis` for a drive that the loop withdraws from: NMT stopped answers no SDO, and the loop ends it some
+        cycles later. Asked twice, for the drive may take a while for that."""
+        self._master.pause(ANSWERS_AGAIN_CYCLES * self._master.config.cycle.period_us * 1e-6)
+        self.quick_stop()
+        self.stop_axis()
 
     def switch_off(self) -> None:
         """Voltage off by SDO, brake closed, then NMT pre-operational; each is tried whatever became of the others."""

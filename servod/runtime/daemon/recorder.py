@@ -255,12 +255,14 @@ class Recorder:
         """Note something that happened (fault, command, node event); kept for fault files too."""
         event = {"time_ns": time.monotonic_ns(), "kind": kind, "text": text, **details}
         self._events.append(event)
-        self._put(lambda: self._write_event(event))
+        if not self._put(lambda: self._write_event(event)):
+            self._fail("the disk does not keep up; an event was dropped")
 
     def set_attachment(self, name: str, data: bytes) -> None:
         """Attach a file (config.yaml, gains.yaml, model.yaml) to every recording, the running one included."""
         self._attachments[name] = data
-        self._put(lambda: self._attach(name, data))
+        if not self._put(lambda: self._attach(name, data)):
+            self._fail(f"the disk does not keep up; {name} was dropped")
 
     def start(self, name: str | None = None) -> Future[Path]:
         """Begin a recording in the configured directory; the future gives its path, or BadInput or Unreachable."""
@@ -352,11 +354,13 @@ class Recorder:
         self._guard(self._finish)
 
     def _guard(self, job: Callable[[], None]) -> None:
-        """Run one job; a disk that fails ends the recording, never the thread."""
+        """Run one job; whatever fails ends the recording, never the thread."""
         try:
             job()
-        except (OSError, ValueError) as error:
-            self._fail(f"{self._path}: {getattr(error, 'strerror', None) or error}")
+        except Exception as error:
+            if not isinstance(error, OSError | ValueError):
+                log.exception("the recorder failed in a way that nobody expected")
+            self._fail(f"{self._path or 'recorder'}: {getattr(error, 'strerror', None) or str(error) or repr(error)}")
             if self._file is not None:
                 self._give_up(self._file)
 
@@ -450,6 +454,9 @@ class Recorder:
         except OSError as error:
             file.abandon()
             raise Unreachable(f"{path}: cannot be written ({reason(error)})") from None
+        except Exception:
+            file.abandon()
+            raise
         self._make_room()
         return path
 
@@ -469,9 +476,11 @@ def _resolve(future: Future[T], job: Callable[[], T]) -> None:
         future.set_result(job())
     except ServodError as error:
         future.set_exception(error)
-    except (OSError, ValueError) as error:
-        told = f"{error.filename or 'disk'}: {reason(error)}" if isinstance(error, OSError) else str(error)
-        future.set_exception(Unreachable(f"recorder: {told}"))
+    except OSError as error:
+        future.set_exception(Unreachable(f"recorder: {error.filename or 'disk'}: {reason(error)}"))
+        raise
+    except Exception as error:
+        future.set_exception(Unreachable(f"recorder: {str(error) or repr(error)}"))
         raise
 
 

@@ -10,6 +10,7 @@ import asyncio
 import logging
 import time
 from collections import deque
+from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any, NamedTuple
 
@@ -210,7 +211,7 @@ class Supervisor:
             return
         log.error("the loop stands still%s: stopping the drive by SDO", " and the drive misses it" if told else "")
         self._relay.add(FaultCode.LOOP_LOST)
-        asyncio.get_running_loop().run_in_executor(None, self._nodes.stop_past_loop)
+        self._beside(self._nodes.stop_past_loop)
 
     def _switch_off_if_disobeyed(self, records: list[CycleRecord]) -> None:
         """The loop's goal did not reach the drive: by SDO and NMT, once. Beside the rounds: the way to rest and the
@@ -219,7 +220,18 @@ class Supervisor:
             return
         self._told_off = True
         log.error("the drive stays powered: switching it off by SDO and NMT pre-operational")
-        asyncio.get_running_loop().run_in_executor(None, self._nodes.stop_axis)
+        self._beside(self._nodes.stop_withdrawn)
+
+    def _beside(self, job: Callable[[], None]) -> None:
+        """Run `job` beside the rounds; what it did not expect itself is told, for nobody waits for it."""
+
+        def told() -> None:
+            try:
+                job()
+            except Exception:
+                log.exception("stopping the drive by SDO failed in a way that nobody expected")
+
+        asyncio.get_running_loop().run_in_executor(None, told)
 
     def _tell_manager(self, now_ns: int) -> None:
         """Feed the watchdog only when the loop has gone on since the last time."""
@@ -325,6 +337,7 @@ class Supervisor:
         self._faults.finish()
         self._recorder.close()
         self._metrics_server.close()
+        self._loop.close()
 
     def _tell_faults(self) -> dict[str, Any]:
         """What befell the axis since the daemon started, and where the files of earlier times are."""

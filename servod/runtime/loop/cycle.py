@@ -38,8 +38,10 @@ _NOT_PROVEN = FAULTS[FaultCode.WIRING_NOT_PROVEN].bit
 #: At a shutdown the drive must be seen without power for so many cycles, and has so many to get there.
 GOODBYE_CYCLES = 20
 GOODBYE_TIMEOUT_CYCLES = 1000
-#: How long a drive stays in NMT stopped before it is asked to be pre-operational.
+#: How long a drive that is withdrawn from stays in NMT stopped before it is asked to be pre-operational, and after how
+#: long it answers SDO again.
 _STOPPED_CYCLES = 5
+ANSWERS_AGAIN_CYCLES = _STOPPED_CYCLES + 2
 
 
 class LoopPort(Protocol):

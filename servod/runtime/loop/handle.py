@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import signal
 import subprocess
 import sys
 import time
@@ -18,6 +19,8 @@ from servod.runtime.loop.wiring.findings import WiringReport
 
 START_TIMEOUT_S = 10.0
 _ASK_AGAIN_S = 0.5
+#: A process that was killed is gone in this time, unless the kernel holds it: the axis is not to wait for that.
+_KILLED_S = 0.2
 
 
 class LoopHandle:
@@ -118,7 +121,16 @@ class LoopHandle:
             self.feed()
             time.sleep(0.005)
         self._process.kill()
-        return self._process.wait()
+        try:
+            return self._process.wait(_KILLED_S)
+        except subprocess.TimeoutExpired:  # the kernel holds it; it commands nothing any more
+            return -signal.SIGKILL
+
+    def close(self) -> None:
+        """Give the memory back; nothing else may be called from then on."""
+        if self._process and self._process.stderr:
+            self._process.stderr.close()
+        self._channel.close()
 
     def last_words(self) -> str:
         """What the process wrote on standard error; call after it ended."""

@@ -4,6 +4,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -283,6 +284,37 @@ def test_a_short_history_for_fault_files_leaves_room_to_read_along(tmp_path: Pat
     fault = read_recording(recorder.write_fault_file("x").result(5))
     recorder.close()
     assert [r.cycle for r in fault.records()] == [995, 996, 997, 998, 999]
+
+
+def test_what_nobody_expected_of_a_file_is_told_and_ends_neither_the_thread_nor_later_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder = _recorder(tmp_path)
+    recorder.add_rows(rows(100, 0))
+    with monkeypatch.context() as patched:
+        patched.setattr(McapFile, "write_rows", _no_memory)
+        with pytest.raises(Unreachable, match="no memory"):
+            recorder.write_fault_file("FIRST").result(5)
+    assert read_recording(recorder.write_fault_file("SECOND").result(5)).column("position_rad")[99] == 0.099
+    assert "no memory" in recorder.take_failure()
+    recorder.close()
+
+
+def _no_memory(_file: McapFile, _rows: object) -> None:
+    raise MemoryError("no memory")
+
+
+def test_an_event_and_a_file_that_the_queue_does_not_take_are_told(tmp_path: Path) -> None:
+    recorder, disk = _recorder(tmp_path), threading.Event()
+    recorder._put(lambda: print(disk.wait()))
+    while recorder._put(lambda: None):
+        pass
+    recorder.add_event("fault", "it happened")
+    assert "an event was dropped" in recorder.take_failure()
+    recorder.set_attachment("gains.yaml", b"law: pd\n")
+    assert "gains.yaml was dropped" in recorder.take_failure()
+    disk.set()
+    recorder.close()
 
 
 def test_who_gave_up_waiting_does_not_end_the_recorders_thread() -> None:

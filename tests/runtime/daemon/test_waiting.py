@@ -136,16 +136,27 @@ def _began_anew(service: Service) -> list[str]:
 def test_supply_that_comes_back_brings_the_axis_back_disabled(service: Service) -> None:
     axis = service.axis()
     _moving(service)
+    at_first = _shared_memories(service)
     axis.kill()
     service.comes_to("FAULT", "BUS_DOWN")
     time.sleep(SHOWN_S + 1.0)
     service.comes_to("FAULT", "BUS_DOWN")  # nothing is back: the fault goes on to be shown
     service.axis()
     assert "BUS_DOWN" in _began_anew(service)
+    assert _shared_memories(service) == at_first, "one that began anew a thousand times would have no descriptor left"
     assert service.ask("enable", reset_fault=False)["state"] == "ENABLED"
     service.ask("disable")
     service.daemon.send_signal(signal.SIGTERM)
     assert service.daemon.wait(10.0) == 0
+
+
+def _shared_memories(service: Service) -> int:
+    """Those that the daemon has open."""
+    names = []
+    for file in Path(f"/proc/{service.daemon.pid}/fd").iterdir():
+        with contextlib.suppress(FileNotFoundError):
+            names.append(str(file.readlink()))
+    return sum("servod-channel" in name for name in names)
 
 
 def test_supply_that_goes_and_comes_while_the_axis_is_off_is_no_matter_for_a_person(service: Service) -> None:

@@ -129,10 +129,11 @@ class NodeWatch:
     def watch(self, on: bool) -> None:
         """Start or end the supervision: only then a boot-up, a stop of heartbeats or another state is an event.
 
-        What the drive told meanwhile of a master that died before is no event of ours.
+        What the drive told before the begin, of a master that died, is no event of ours.
         """
-        for event in [event for event in self.events if event.code in MASTER_MISSED]:
-            self.events.remove(event)
+        if on:  # the end may come in another thread than the events
+            for event in [event for event in self.events if event.code in MASTER_MISSED]:
+                self.events.remove(event)
         self._heard_ns, self.lost, self._watching = self._clock.now_ns(), False, on
 
     @property
