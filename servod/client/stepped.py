@@ -37,7 +37,7 @@ from servod.runtime.daemon.gain_bank import GainBank
 from servod.runtime.daemon.nodes import Nodes
 from servod.runtime.daemon.requests import finish, taken
 from servod.runtime.daemon.trajectory import MotionTable
-from servod.runtime.fieldbus.master import BringUp, Master, master_ids
+from servod.runtime.fieldbus.master import BringUp, Master, master_ids, start_ids
 from servod.runtime.fieldbus.master.planned import narrowed_by_stop, stopping_as_found
 from servod.runtime.loop.axis_state import AxisState
 from servod.runtime.loop.channel import TRAJECTORY_SAMPLES, Channel
@@ -181,7 +181,8 @@ class SteppedSession:
         """`law` and `parameters`: the first controller (a packed gain set)."""
         config, self.world, self.clock = with_expected(config), world, world.clock
         narrowed, _ = narrowed_by_stop(config)
-        self.master = Master(narrowed, world.connect(master_ids(config)), world.clock, threaded=False)
+        buses = [world.connect(ids(config)) for ids in (master_ids, start_ids)]
+        self.master = Master(narrowed, buses[0], world.clock, threaded=False, start_bus=buses[1])
         self.bring_up: BringUp = self.master.bring_up()
         config, self.stopping = stopping_as_found(config, self.bring_up.amplifier)
         self.config = config
@@ -190,6 +191,7 @@ class SteppedSession:
         self.port = port or ListPort(world.clock)
         self.loop_bus = world.connect()
         self.cycle = Cycle(plan, self.loop_bus, world.clock, self.port, self.port.supervisor_alive)
+        self.master.hand_over()
         self.lateness_ns: Callable[[], int] = _punctual
         self._deadline_ns = self.clock.now_ns() + self.cycle.period_ns
         self._cycles_until_poll = 0

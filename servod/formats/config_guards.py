@@ -23,6 +23,8 @@ _MOST_BLIND_S = 0.05
 _MOST_LATE_S, _MOST_RAMP_S = 0.25, 0.5
 #: A drive whose master has died holds its torque for so long (servod's own time-out is 150 ms).
 _MOST_DEAD_MS = 500
+#: A forged heartbeat shows when the node's own comes, this share of the period later.
+_TOLD_SHARE, _MOST_TOLD_MS = 0.4, 50.0
 #: One count that looks like more than this share of the speed limit makes a joint trip far below it.
 _MOST_COUNT_SPEED = 0.2
 #: Drive and encoder that drift apart by so much are not on one joint; a slip of an eighth of a turn is long seen.
@@ -110,6 +112,12 @@ def _times(config: AxisConfig) -> list[str]:
         lines.append(
             "heartbeat.command_deadline_ms 0: when the commands alone are lost the drive holds its torque until the "
             "joint shows it; when this computer dies, until the heartbeat is missed"
+        )
+    told_ms = _TOLD_SHARE * config.heartbeat.node_period_ms
+    if told_ms > _MOST_TOLD_MS:
+        lines.append(
+            f"heartbeat.node_period_ms {config.heartbeat.node_period_ms}: a heartbeat that somebody else sends for a "
+            f"node is told up to {told_ms / 1e3:g} s later"
         )
     dead_ms = config.heartbeat.drive_timeout_ms
     if dead_ms > _MOST_DEAD_MS:

@@ -41,7 +41,7 @@ from servod.runtime.daemon.recorder import Recorder
 from servod.runtime.daemon.supervisor import Context, Supervisor
 from servod.runtime.daemon.waiting import SHOWN_S, BringUpFailure, shown_s_after, wait_for_nodes
 from servod.runtime.fieldbus.bus.open import open_bus
-from servod.runtime.fieldbus.master import BringUp, Master, master_ids
+from servod.runtime.fieldbus.master import BringUp, Master, master_ids, start_ids
 from servod.runtime.fieldbus.master.planned import check_names, narrowed_by_stop, planned_bus_load, stopping_as_found
 from servod.runtime.loop.handle import LoopHandle
 from servod.runtime.loop.plan import LoopPlan
@@ -120,7 +120,13 @@ def _run_on(config: AxisConfig, path: Path, context: Context, on_ready: Callable
 def _bring_up(config: AxisConfig, held: ExitStack) -> tuple[Master, BringUp]:
     """Both nodes, operational; `held` leaves the bus. Raises ServodError."""
     narrowed, _ = narrowed_by_stop(config)
-    master = Master(narrowed, open_bus(config.bus, master_ids(config)), WallClock(), threaded=False)
+    start_bus = open_bus(config.bus, start_ids(config))
+    try:
+        bus = open_bus(config.bus, master_ids(config))
+    except BaseException:
+        start_bus.close()
+        raise
+    master = Master(narrowed, bus, WallClock(), threaded=False, start_bus=start_bus)
     held.callback(master.close)
     plans = master.bring_up()
     for line in plans.report:
@@ -189,7 +195,7 @@ def _supervise(
         raise Unreachable(f"shared memory for the loop cannot be made ({reason(error)}); see `ulimit -a`") from None
     undo.callback(loop.close)
     undo.callback(_give_back, nodes, loop)
-    _start_loop(loop)
+    _start_loop(loop, nodes)
     return Supervisor(config, stopping, nodes, loop, bank, recorder, context)
 
 
@@ -227,8 +233,9 @@ def _record_from_the_start(recorder: Recorder) -> None:
         log.error("fault %s: %s", FaultCode.RECORDER_FAILED.name, error or "the disk does not answer")
 
 
-def _start_loop(loop: LoopHandle) -> None:
-    loop.start()
+def _start_loop(loop: LoopHandle, nodes: Nodes) -> None:
+    loop.start(nodes.look_for_strangers)
+    nodes.hand_over()
     for grant in loop.grants:
         log.log(
             logging.INFO if grant.granted else logging.WARNING,

@@ -49,6 +49,14 @@ class Nodes:
         if proof["asked_for"] and not proof["holds"]:
             log.warning("%s: run `servoctl guard-test` while no daemon runs; until then no enabling", proof["text"])
 
+    def look_for_strangers(self) -> None:
+        """Until the loop listens: raises Unreachable where somebody else commands or asks the nodes."""
+        self._master.look_for_strangers()
+
+    def hand_over(self) -> None:
+        """The loop listens from now on."""
+        self._master.hand_over()
+
     def events(self) -> list[NodeEvent]:
         """Listen, and give what the nodes did since the last call."""
         self._master.poll()

@@ -6,6 +6,7 @@ vendors' manuals.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from enum import IntEnum
 
 from servod.runtime.fieldbus.devices import DriveState
@@ -16,6 +17,18 @@ TPDO_BASE = (0x180, 0x280, 0x380, 0x480)
 RPDO_BASE = (0x200, 0x300, 0x400, 0x500)
 SDO_ANSWER_BASE, SDO_REQUEST_BASE, HEARTBEAT_BASE = 0x580, 0x600, 0x700
 LSS_TO_SLAVE_ID, LSS_FROM_SLAVE_ID = 0x7E5, 0x7E4
+
+
+def ids_of_masters(node_ids: Iterable[int], master_node_id: int) -> set[int]:
+    """Identifiers of what only a master sends: its own, NMT, SYNC, TIME, LSS, and command PDOs to these nodes.
+
+    An LSS answer, too: no slave sends one that no master asked for (CiA 305), and we ask none.
+    """
+    commands = {base + node_id for base in RPDO_BASE for node_id in node_ids}
+    own = {EMCY_BASE + master_node_id, HEARTBEAT_BASE + master_node_id}
+    return commands | own | {NMT_ID, SYNC_ID, TIME_ID, LSS_TO_SLAVE_ID, LSS_FROM_SLAVE_ID}
+
+
 PDO_NOT_VALID = 0x80000000
 PDO_NO_RTR = 0x40000000
 

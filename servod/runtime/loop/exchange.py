@@ -9,17 +9,13 @@ from servod.common.faults import FAULTS, FaultCode
 from servod.common.units import NS_PER_S
 from servod.runtime.fieldbus.bus import Bus, Frame
 from servod.runtime.fieldbus.cia import (
-    EMCY_BASE,
     HEARTBEAT_BASE,
-    LSS_FROM_SLAVE_ID,
-    LSS_TO_SLAVE_ID,
     NMT_ID,
-    RPDO_BASE,
     SYNC_ID,
-    TIME_ID,
     TPDO_BASE,
     NmtCommand,
     NmtState,
+    ids_of_masters,
 )
 from servod.runtime.fieldbus.devices import Amplifier, Encoder, PdoMap
 from servod.runtime.loop.answers import Answers, Rare
@@ -51,7 +47,7 @@ class Exchange:
         self._sync_frames = amplifier.sync_frames + encoder.sync_frames
         self._amplifier_id = plan.amplifier.node_id
         self._heartbeat_id = HEARTBEAT_BASE + plan.config.heartbeat.master_node_id
-        self._strangers = dict.fromkeys(_master_ids(plan) | {self._heartbeat_id}, _SECOND_MASTER)
+        self._strangers = dict.fromkeys(_master_ids(plan), _SECOND_MASTER)
         self._strangers |= dict.fromkeys(_unplanned_ids(plan), _FOREIGN_FEEDBACK)
         repeated_ns = _REPEATED_BITS * NS_PER_S // plan.config.bus.bit_rate
         nodes = [[pdo for pdo in node.pdos if not pdo.receive] for node in (plan.amplifier, plan.encoder)]
@@ -169,16 +165,10 @@ class Exchange:
 
 
 def _master_ids(plan: LoopPlan) -> set[int]:
-    """Identifiers of what only a master sends, and all command PDOs of the axis's nodes. SDO is the supervisor's.
-
-    An EMCY of the master's node, too, and an LSS answer: no slave sends one that no master asked for (CiA 305), and
-    beside a running loop we ask none.
-    """
+    """What only masters send, and the planned command PDOs. SDO is the supervisor's."""
     nodes = (plan.amplifier, plan.encoder)
-    commands = {base + node.node_id for base in RPDO_BASE for node in nodes}
     planned = {pdo.cob_id for node in nodes for pdo in node.pdos if pdo.receive}
-    emergency = {EMCY_BASE + plan.config.heartbeat.master_node_id}
-    return commands | planned | emergency | {NMT_ID, SYNC_ID, TIME_ID, LSS_TO_SLAVE_ID, LSS_FROM_SLAVE_ID}
+    return planned | ids_of_masters([node.node_id for node in nodes], plan.config.heartbeat.master_node_id)
 
 
 def _unplanned_ids(plan: LoopPlan) -> set[int]:

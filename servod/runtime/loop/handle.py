@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from servod.common.errors import BadInput, Unreachable
 from servod.formats.recording.record import CycleRecord
@@ -33,8 +33,11 @@ class LoopHandle:
         self._channel = Channel()
         self._process: subprocess.Popen[str] | None = None
 
-    def start(self) -> None:
-        """Start the process and wait for its first cycle; raises Unreachable with its last words when it dies."""
+    def start(self, meanwhile: Callable[[], None] = lambda: None) -> None:
+        """Start the process and wait for its first cycle; raises Unreachable with its last words when it dies.
+
+        `meanwhile` is done again and again until then; what it raises ends the start.
+        """
         fd = self._channel.fd
         self._channel.beat()
         self._process = subprocess.Popen(
@@ -47,7 +50,7 @@ class LoopHandle:
         assert self._process.stdin is not None
         self._process.stdin.write(self.plan.to_json())
         self._process.stdin.close()
-        self._wait_until_ready()
+        self._wait_until_ready(meanwhile)
 
     @property
     def pid(self) -> int:
@@ -137,7 +140,7 @@ class LoopHandle:
         stream = self._process.stderr if self._process else None
         return stream.read() if stream and not stream.closed else ""
 
-    def _wait_until_ready(self) -> None:
+    def _wait_until_ready(self, meanwhile: Callable[[], None]) -> None:
         deadline = time.monotonic() + START_TIMEOUT_S
         while not self._channel.ready:
             if not self.alive():
@@ -146,5 +149,6 @@ class LoopHandle:
             if time.monotonic() > deadline:
                 late = f"the loop process did not begin within {START_TIMEOUT_S:.0f} s"
                 raise Unreachable(f"{late}: is the machine busy with other work?")
+            meanwhile()
             self.feed()
             time.sleep(0.01)

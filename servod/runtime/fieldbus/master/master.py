@@ -20,6 +20,7 @@ from servod.runtime.fieldbus.master.monitor import GuardWatch, NodeEvent
 from servod.runtime.fieldbus.master.network import AnnouncedBus, BusNetwork
 from servod.runtime.fieldbus.master.node import Node, NodeIdentity, send_nmt
 from servod.runtime.fieldbus.master.planned import checked_load
+from servod.runtime.fieldbus.master.start_watch import StartWatch, foreign
 
 
 @dataclass(frozen=True)
@@ -45,14 +46,18 @@ class Master:
     and on the stepped world that is what lets time advance.
     """
 
-    def __init__(self, config: AxisConfig, bus: Bus, clock: Clock, threaded: bool) -> None:
+    def __init__(
+        self, config: AxisConfig, bus: Bus, clock: Clock, threaded: bool, start_bus: Bus | None = None
+    ) -> None:
+        """`start_bus`: another connection, opened with `start_ids`, that tells of other masters until `hand_over`."""
         self.config = self._config = config
         self._network = BusNetwork(bus, clock, threaded)
+        self._start_watch = None if start_bus is None else StartWatch(start_bus, self._network, config)
         try:
             self._amplifier = Node(self._network, config, "amplifier")
             self._encoder = Node(self._network, config, "encoder")
         except BaseException:
-            self._network.disconnect()
+            self.close()
             raise
         self._guarded: NodePlan | None = None  # the amplifier's, once it is up
         self._guards: GuardWatch | None = None
@@ -61,12 +66,15 @@ class Master:
     def bring_up(self) -> BringUp:
         """Bring both nodes to operational; raises BadInput, Unreachable or SdoAbort with one line that says where."""
         nodes = (self._amplifier, self._encoder)
+        for node in nodes:
+            node.watch.foreign, node.watch.sets_up = "", False
         report = [line for node in nodes for line in node.report_dictionary()]
         wanted = [node.setup.plan() for node in nodes]
         load = checked_load(self._config, wanted)
         report.append(f"bus load {load.describe()}")
         report += self.look()
         for node in nodes:
+            node.watch.sets_up = True
             node.stop_operation()
             node.stop_watching_master()  # whose error, of a master that died, keeps some drives from operational
         plans = []
@@ -82,7 +90,28 @@ class Master:
             node.start()
         self._guarded = plans[0]
         self._guards = self._amplifier.guard_watch(plans[0])
+        try:
+            self.look_for_strangers()
+        except Unreachable:
+            self.stand_down()
+            raise
         return BringUp(plans[0], plans[1], load.share, report)
+
+    def look_for_strangers(self) -> None:
+        """From the bring-up until `hand_over`: raises Unreachable where somebody else spoke with the nodes."""
+        self._network.drain()
+        for node in self._nodes.values():
+            if node.watch.foreign:
+                raise foreign(node.watch.foreign)
+        if self._start_watch is not None:
+            self._start_watch.look()
+
+    def hand_over(self) -> None:
+        """The loop listens, and speaks, from now on."""
+        if self._start_watch is not None:
+            self._start_watch.close()
+            self._start_watch = None
+            self._network.announces.clear()
 
     def look(self) -> list[str]:
         """By reads alone: both nodes are there, are the configured ones, and may be set up; who they are.
@@ -196,4 +225,5 @@ class Master:
 
     def close(self) -> None:
         """Leave the bus; nothing is sent."""
+        self.hand_over()
         self._network.disconnect()

@@ -37,11 +37,11 @@ _MAX_EVENTS = 1000
 _TOLD_NS = NS_PER_S
 #: Some nodes take several errors back one by one although the first of these frames says that none is left.
 _TAKEN_BACK_NS = NS_PER_S
-#: A beat is foreign when it is early beside each of so many before it, and never with fewer than `_LEAST` to judge by.
+#: A beat is foreign when it is early beside each of so many before it, and never with less than `_LEAST_NS` to go by.
 #: A bus that stalls delivers late, never early: beside the last beat that was in time nothing is early but a stranger.
-_BEATS, _LEAST = 16, 4
-#: So many beats in a row with the distance of a rhythm make one.
-_RHYTHM = 8
+_BEATS, _LEAST_NS = 16, 200_000_000
+#: Beats in a row with the distance of a rhythm make one after this time, which is a stall of the bus that ends.
+_RHYTHM_NS = 400_000_000
 #: Early is more than this share of the period. A stranger in the first part of a period shows at once, one in the rest
 #: by the node's own next beat, which comes right behind. What a clock is slow in `_BEATS` periods adds to the time.
 _EARLY = 0.4
@@ -69,13 +69,17 @@ class Rhythm:
     def __init__(self, period_ns: int) -> None:
         self._period_ns = period_ns
         self._beats: deque[int] = deque(maxlen=_BEATS)
-        self._owed, self._calm = _RHYTHM, 0  # beats that a silence owes; beats in a row with the distance of a rhythm
+        self._least, self._rhythm = (max(1, -(-span // period_ns)) for span in (_LEAST_NS, _RHYTHM_NS))
+        self._owed, self._calm = (
+            self._rhythm,
+            0,
+        )  # beats that a silence owes; beats in a row with the distance of a rhythm
 
     def restart(self, time_ns: int) -> None:
         """The sender begins anew at `time_ns`."""
         self._beats.clear()
         self._beats.append(time_ns)
-        self._owed, self._calm = _RHYTHM, 0
+        self._owed, self._calm = self._rhythm, 0
 
     def foreign(self, time_ns: int) -> bool:
         """Take a beat; True when it cannot be the one sender's."""
@@ -86,9 +90,9 @@ class Rhythm:
         if silent >= _SILENCE:
             self._owed, self._calm = max(self._owed, silent), 0
         least_ns = _EARLY * period_ns
-        if len(by_ns) < _LEAST or min(by_ns) <= least_ns:
+        if len(by_ns) < self._least or min(by_ns) <= least_ns:
             self._calm += bool(by_ns) and by_ns[0] <= least_ns  # one of a burst says nothing of the rhythm
-            self._owed = 0 if self._calm >= _RHYTHM else self._owed
+            self._owed = 0 if self._calm >= self._rhythm else self._owed
             return False
         self._owed, self._calm = self._owed - 1, 0
         return self._owed < 0
@@ -116,6 +120,8 @@ class NodeWatch:
         self._none_left_ns = 0  # since when it says that it has none, 0 while it does not
         self._answers = network.answers
         self._told_ns: dict[FaultCode, int] = {}
+        #: Who else spoke with the node while it was set up, the first of them; `sets_up`: our own transfers write.
+        self.foreign, self.sets_up = "", False
         network.subscribe(HEARTBEAT_BASE + node_id, self._on_heartbeat)
         network.subscribe(EMCY_BASE + node_id, self._on_emcy)
         network.subscribe(SDO_REQUEST_BASE + node_id, self._on_request)
@@ -230,11 +236,15 @@ class NodeWatch:
 
     def _on_request(self, can_id: int, data: bytearray, _time_ns: float) -> None:
         if not self._answers.own(can_id, bytes(data)):
-            self._blame(FaultCode.FOREIGN_SDO, f"node {self.node_id}: SDO request of somebody else, {data.hex(' ')}", 0)
+            text = f"node {self.node_id}: SDO request of somebody else, {data.hex(' ')}"
+            self.foreign = self.foreign or text
+            self._blame(FaultCode.FOREIGN_SDO, text, 0)
 
     def _on_answer(self, can_id: int, data: bytearray, _time_ns: float) -> None:
         if not self._answers.answered(can_id):
             text = f"node {self.node_id}: SDO answer that this master did not ask for, {data.hex(' ')}"
+            if self.sets_up:  # before, it may be for a master that has just ended
+                self.foreign = self.foreign or text
             self._blame(FaultCode.FOREIGN_SDO, text, 0)
 
     def _misshapen(self, what: str, data: bytearray, size: int) -> None:

@@ -106,6 +106,7 @@ class BusNetwork(canopen.Network):
         self.clock = clock
         self.answers = SdoAnswers(clock)
         self.shared: set[AnnouncedBus] = set()  # further connections of this process that are open
+        self.announces: set[int] = set()  # what another connection of this process listens to, and we may send
         self._arrived = threading.Condition()
         self._closing = False
         self.broken: Exception | None = None  # what ended the reader thread, if anything did
@@ -117,8 +118,12 @@ class BusNetwork(canopen.Network):
         """Queue one frame; raises Unreachable when the bus does not take it."""
         with self.send_lock:
             self.answers.asked(can_id, bytes(data))
+            if can_id in self.announces:
+                self.answers.announce(can_id, bytes(data))
             sent = self._servod_bus.send(can_id | (CAN_RTR_FLAG if remote else 0), bytes(data))
         if not sent:
+            if can_id in self.announces:
+                self.answers.withdraw(can_id, bytes(data))
             counters = self._servod_bus.counters
             state = "bus-off" if counters.bus_off else "down" if counters.down else "full queue"
             raise Unreachable(f"bus: frame 0x{can_id:03X} could not be sent ({state})")

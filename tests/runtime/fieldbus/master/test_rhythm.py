@@ -42,6 +42,17 @@ def test_a_stranger_is_told_within_half_a_period_or_little_more(phase: float, pe
     assert 0 <= first - stranger_ns <= 0.6 * PERIOD_NS
 
 
+@given(st.floats(0.0, 0.999), st.sampled_from([60, 100, 200, 500, 1000]), st.floats(0.99, 1.01))
+def test_a_slow_beat_is_known_as_soon_as_a_fast_one(phase: float, period_ms: int, clock: float) -> None:
+    """A second or two periods after the begin somebody else is told, by the next beat of the node at the latest."""
+    period_ns = period_ms * 1_000_000
+    rhythm, after = Rhythm(period_ns), max(2, 800 // period_ms)
+    stranger_ns = round((after + phase) * clock * period_ns)
+    times_ns = sorted([*(round(beat * clock * period_ns) for beat in range(40)), stranger_ns])
+    told_ns = [time_ns for time_ns in times_ns if rhythm.foreign(time_ns)]
+    assert 0 <= told_ns[0] - stranger_ns <= 0.6 * period_ns
+
+
 def test_a_sender_that_begins_anew_is_not_judged_by_what_was() -> None:
     rhythm = Rhythm(PERIOD_NS)
     assert not any(rhythm.foreign(beat * PERIOD_NS) for beat in range(10))

@@ -1,0 +1,42 @@
+"""Hears other masters while the nodes are set up, until the loop hears them itself. Off the control path.
+
+What others write meanwhile may stay: it comes behind our own reading back, and no object is read again at once.
+"""
+
+from __future__ import annotations
+
+from servod.common.errors import Unreachable
+from servod.formats.config import AxisConfig
+from servod.runtime.fieldbus.bus import Bus
+from servod.runtime.fieldbus.cia import ids_of_masters
+from servod.runtime.fieldbus.master.network import BusNetwork
+
+
+def start_ids(config: AxisConfig) -> tuple[int, ...]:
+    """What a StartWatch listens to."""
+    nodes = (config.amplifier.node_id, config.encoder.node_id)
+    return tuple(sorted(ids_of_masters(nodes, config.heartbeat.master_node_id)))
+
+
+class StartWatch:
+    """A connection of its own for what only a master sends; the NMT commands of `network` are ours."""
+
+    def __init__(self, bus: Bus, network: BusNetwork, config: AxisConfig) -> None:
+        """`bus` is opened with `start_ids`; it is closed with `close`."""
+        self._bus, self._answers, self._ids = bus, network.answers, frozenset(start_ids(config))
+        network.announces.update(self._ids)
+
+    def look(self) -> None:
+        """Take what came; raises Unreachable for what this master did not send."""
+        while (frame := self._bus.receive(0.0)) is not None:
+            if frame.can_id in self._ids and not self._answers.own(frame.can_id, frame.data):
+                raise foreign(f"frame 0x{frame.can_id:03X} {frame.data.hex(' ')}".rstrip())
+
+    def close(self) -> None:
+        """The loop hears others from now on."""
+        self._bus.close()
+
+
+def foreign(what: str) -> Unreachable:
+    """The start ends: nobody knows what the nodes are set to."""
+    return Unreachable(f"somebody else spoke on the bus while the nodes were set up: {what}; see who it is, then start")
