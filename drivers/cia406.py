@@ -129,7 +129,12 @@ class EncoderSetup:
         """
         encoder = self._encoder
         counts_per_rad = encoder.direction / rad_per_count(encoder.counts_per_turn)
-        counts = round((position_rad + encoder.zero_offset_rad) * counts_per_rad) % self._measuring_range(sdo)
+        span = self._measuring_range(sdo)
+        most_rad = 0.5 * span * rad_per_count(encoder.counts_per_turn)
+        if not abs(position_rad) < most_rad:  # NaN, too
+            allowed = f"nearer to zero than {most_rad:.6g} rad, half of what the encoder measures (0x6002)"
+            raise BadInput("position", f"{position_rad:g} rad", allowed)
+        counts = round((position_rad + encoder.zero_offset_rad) * counts_per_rad) % span
         write_checked(sdo, Obj406.PRESET, 0, counts)
         return counts
 

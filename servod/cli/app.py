@@ -245,6 +245,8 @@ def _quoted(path: Path) -> str:
     return f"'{text}'" if " " in text else text
 
 
+#: What typer says of a file before we could.
+_NOT_READABLE = re.compile(r"path '(.*)' is not readable", re.IGNORECASE)
 #: As shells count SIGINT.
 INTERRUPTED = 130
 #: The `code` of each kind of error, the narrowest first.
@@ -269,6 +271,8 @@ def wants_json(arguments: list[str]) -> bool:
 
 def complain(error: BaseException, arguments: list[str]) -> int:
     """Tell the user, and return the exit code; an error that is none of the user's is raised again, with its trace."""
+    if isinstance(error, typer.BadParameter) and (unread := _NOT_READABLE.search(error.message)):
+        error = BadFile(unread[1], "may not be read (permission denied)", "a file or folder that may be read")
     code = next((code for kind, code in _CODES if isinstance(error, kind)), "internal")
     if isinstance(error, ImportError) and extra_of(error.name or "?") is None:
         code = "internal"

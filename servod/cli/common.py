@@ -9,6 +9,7 @@ import contextlib
 import json
 import os
 import shlex
+import stat
 import sys
 import tempfile
 import threading
@@ -20,7 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from servod.common.errors import BadInput, Unreachable
-from servod.common.files import BadFile, reason
+from servod.common.files import BadFile, reason, unwritable
 from servod.common.portable import lock_again, lock_folder
 
 if TYPE_CHECKING:
@@ -121,8 +122,16 @@ _HANDED_DOWN = "SERVOCTL_LOCKED_FOLDERS"
 def keep_inputs(out: Path, *inputs: Path | None) -> None:
     """Raise BadInput where writing `out` would replace a file that is read."""
     for given in inputs:
-        if given is not None and out.exists() and given.exists() and out.samefile(given):
+        if given is not None and same_file(out, given):
             raise BadInput(f"--out {out}", "a file that is read", "another file: nothing is overwritten by itself")
+
+
+def same_file(one: Path, other: Path) -> bool:
+    """Whether both are there, and one file."""
+    try:
+        return one.samefile(other)
+    except OSError:
+        return False
 
 
 def need_folder(option: str, folder: Path, alone: bool = False) -> None:
@@ -130,8 +139,8 @@ def need_folder(option: str, folder: Path, alone: bool = False) -> None:
 
     `alone`: no other command that wants it alone works there as long as this process lives. Raises Unreachable.
     """
-    _made.extend(reversed([path for path in (folder, *folder.parents) if not path.exists()]))
     try:
+        _made.extend(reversed([path for path in (folder, *folder.parents) if not path.exists()]))
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
@@ -198,9 +207,14 @@ def drop_empty_folders() -> None:
 
 def need_file(option: str, file: Path) -> None:
     """See that `file` can be written before any work is done for it. Raises BadInput."""
-    if file.is_dir():
-        raise BadFile(f"{option} {file}", "is a folder, a file is needed", "a file that can be written")
-    need_folder(option, file.resolve().parent)
+    try:
+        if stat.S_ISDIR(file.stat().st_mode):
+            raise BadFile(f"{option} {file}", "is a folder, a file is needed", "a file that can be written")
+    except FileNotFoundError:
+        pass
+    except OSError as error:
+        raise unwritable(f"{option} {file}", error) from None
+    need_folder(option, file.absolute().parent)
 
 
 def table_console(markup: bool = True) -> Console:

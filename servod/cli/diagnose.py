@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servod.cli.common import JsonOption, example, need_folder, one_thread, print_json, suggest
+from servod.cli.common import JsonOption, example, need_folder, one_thread, print_json, same_file, suggest
 from servod.common.errors import AnswerIsNo, BadInput
+from servod.common.files import is_there
 
 if TYPE_CHECKING:
     from servod.formats.model.axis_model import AxisModel
@@ -81,10 +82,10 @@ def _need_own_folder(out: Path, model: Path) -> None:
     """See that nothing of other origin in `out` would be overwritten. Raises BadInput."""
     from servod.lab.report.diagnosis import DOCUMENT, MODEL, PAGE
 
-    if model.resolve() == (out / MODEL).resolve():
+    if model.absolute() == (out / MODEL).absolute() or same_file(model, out / MODEL):
         raise BadInput("--model", str(model), "a file that the diagnosis in --out does not replace")
-    there = [name for name in (MODEL, PAGE) if (out / name).exists()]
-    if there and not (out / DOCUMENT).exists():
+    there = [name for name in (MODEL, PAGE) if is_there(out / name)]
+    if there and not is_there(out / DOCUMENT):
         raise BadInput(
             f"--out {out}", f"{', '.join(there)} without {DOCUMENT}", "an empty folder, or an earlier diagnosis"
         )

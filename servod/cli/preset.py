@@ -41,9 +41,12 @@ def preset(
     lock = InstanceLock(axis)
     try:
         with closing(Master(axis, open_bus(axis.bus), WallClock(), threaded=False)) as master:
-            counts = master.preset_encoder(position_rad)
+            counts, reads_rad = master.preset_encoder(position_rad)
     finally:
         lock.release()
     node_id = axis.encoder.node_id
-    done = f"encoder node {node_id} reads {position_rad:g} rad here (0x6003 = {counts})"
-    report({"node_id": node_id, "position_rad": position_rad, "counts": counts}, done, as_json)
+    done = f"encoder node {node_id} reads {reads_rad:g} rad here (0x6003 = {counts})"
+    low_rad, high_rad = axis.limits.position_min_rad, axis.limits.position_max_rad
+    if not low_rad <= reads_rad <= high_rad:
+        done += f"; that is outside the limits ({low_rad:g} to {high_rad:g} rad), where the axis is not enabled"
+    report({"node_id": node_id, "position_rad": reads_rad, "counts": counts}, done, as_json)

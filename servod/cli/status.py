@@ -48,7 +48,7 @@ def status(
     with connect(socket) as client:
         if watch:
             with suppress(KeyboardInterrupt):
-                (_print_lines if as_json else _watch)(client.watch())
+                (_print_lines if as_json else follow)(client.watch())
             return
         document = client.call("status")
     if as_json:
@@ -74,10 +74,16 @@ def _print_lines(documents: Iterator[dict[str, Any]]) -> None:
         print(json.dumps(document, allow_nan=False), flush=True)
 
 
-def _watch(documents: Iterator[dict[str, Any]]) -> None:
+def follow(documents: Iterator[dict[str, Any]]) -> None:
+    """Show each status as it comes: on a terminal in the place of the one before."""
     from rich.live import Live
 
-    view = WatchView()
+    view, console = WatchView(), table_console()
+    if not console.is_terminal:  # into a pipe or a file nothing is drawn again: each status as it comes
+        for document in documents:
+            console.print(screen(document))
+            console.file.flush()
+        return
     with Live(view, refresh_per_second=5):
         for document in documents:
             view.see(document)

@@ -60,6 +60,11 @@ def unwritable(where: str | Path, error: Exception) -> BadFile:
     return BadFile(str(where), _sentence(where, error, writing=True), "a file that can be written")
 
 
+def is_there(path: Path) -> bool:
+    """Whether something is there, as far as one may look; never raises."""
+    return os.path.exists(path)  # noqa: PTH110  (Path.exists raises where a folder may not be searched)
+
+
 def reason(error: OSError) -> str:
     """What the system says, to stand in a sentence: "no such device", "permission denied"."""
     text = error.strerror or str(error)
@@ -159,9 +164,11 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
             stream.flush()
             os.fsync(stream.fileno())
         aside.replace(path)
-    except BaseException:
+    except BaseException as error:
         with contextlib.suppress(OSError):  # half a file fills the very disk that took no more
             aside.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename is None:  # a full disk names no file by itself
+            error.filename = str(path)
         raise
     flush_folder(path.parent)
 

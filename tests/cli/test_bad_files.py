@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 from pathlib import Path
 
@@ -32,6 +33,15 @@ COMMANDS = {
         ["diagnose", "--model", "model.yaml", "run.csv", "--out", "model.yaml"],
         "--out model.yaml: a file stands where a folder is needed",
     ),
+    "name that is too long": (["plot", "run.csv", "--out", f"{'a' * 300}.html"], "the name is too long"),
+    "links in a circle": (
+        ["identify", "--plant", "model.yaml", "--out", "circle/model.yaml"],
+        "--out circle/model.yaml: its links go round in a circle",
+    ),
+    "trial at links in a circle": (
+        ["prove", "--out", "circle"],
+        "--out circle: a file stands where a folder is needed",
+    ),
     "no daemon": (["status", "--socket", "none"], "no daemon answers (there is no such socket); is servod running?"),
     "no trial": (["prove", "--only", "score", "--out", "trial"], "there is no such file; needed: a folder in which"),
 }
@@ -46,7 +56,17 @@ def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     Path("run.csv").write_text("\n".join(["t_s,torque_nm,position_rad", *rows]))
     Path("folder").mkdir()
     os.mkfifo("pipe")
+    Path("circle").symlink_to("circle")
     return tmp_path
+
+
+@pytest.mark.parametrize("words", [["config", "check", "model.yaml"], ["faults", "--recordings", "folder"]])
+def test_what_may_not_be_read_is_told_so(words, files, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(os, "access", lambda *_args, **_options: False)  # as for everybody but root
+    assert run([*words, "--json"]) == 2
+    told = capsys.readouterr()
+    assert told.err == f"servoctl: {words[-1]}: may not be read (permission denied)\n"
+    assert json.loads(told.out)["error"]["code"] == "bad_file"
 
 
 @pytest.mark.parametrize(("words", "told"), COMMANDS.values(), ids=list(COMMANDS))

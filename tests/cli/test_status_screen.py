@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
 from rich.console import Console
 
-from servod.cli.status import WatchView, screen
+from servod.cli.status import WatchView, follow, screen
 from servod.common.faults import FAULTS, FaultCode
 
 FAULT = FAULTS[FaultCode.FOLLOWING_ERROR]
@@ -152,6 +153,18 @@ def test_a_set_that_is_not_the_one_active_last_says_why() -> None:
     status = document()
     status["controller"]["note"] = "active.json is damaged, its copy was taken"
     assert "gain set active.json is damaged, its copy was taken" in shown(status)
+
+
+def test_into_a_pipe_each_status_goes_out_as_it_comes(capsys: pytest.CaptureFixture[str]) -> None:
+    said = []
+
+    def coming() -> Iterator[dict[str, Any]]:
+        for _ in range(2):
+            yield document()
+            said.append(capsys.readouterr().out)
+
+    follow(coming())
+    assert ["+0.2500 rad" in text for text in said] == [True, True]
 
 
 def test_a_watched_status_grows_old_while_the_daemon_is_silent() -> None:

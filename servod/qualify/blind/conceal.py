@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from servod import __version__
 from servod.common.errors import BadInput
-from servod.common.files import read_json, write_bytes
+from servod.common.files import is_there, read_json, write_bytes
 from servod.qualify.blind import engine, listed
 from servod.qualify.blind.axes import CaseAxis, draw_axis
 from servod.qualify.blind.concealed import NO_THERMOMETER, Concealed, Document, Draw
@@ -447,7 +447,7 @@ class BlindTrial:
 
 def foreign_in(out: Path) -> list[str]:
     """Names in a folder that no trial put there; none where a trial's file says that the folder is one's."""
-    if not out.is_dir() or (out / FILE).exists():
+    if not is_there(out) or is_there(out / FILE) or not out.is_dir():
         return []
     return sorted(path.name for path in out.iterdir() if path.name not in (CASES, SEALED) and not _CASE(path.name))
 

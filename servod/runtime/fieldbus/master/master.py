@@ -134,8 +134,8 @@ class Master:
         notes = drive.guard_positions(self._amplifier.sdo, plan, encoder.position_rad(self._encoder.sdo))
         return [f"node {plan.node_id}: {note}" for note in notes]
 
-    def preset_encoder(self, position_rad: float) -> int:
-        """Make the joint's present position read `position_rad` in the encoder; the counts that it holds then.
+    def preset_encoder(self, position_rad: float) -> tuple[int, float]:
+        """Make the joint's present position read `position_rad` in the encoder; what was written, and what it reads.
 
         Instead of a bring-up, while no loop runs. Raises Unreachable where a node is not the configured one, the
         amplifier is powered or the joint moves, BadInput when the encoder's driver knows no preset.
@@ -144,7 +144,8 @@ class Master:
         if not isinstance(setup, PresetSetup):
             raise BadInput("encoder.driver", self._config.encoder.driver, "a driver with preset")
         self.look()
-        return setup.preset(self._encoder.sdo, position_rad)
+        counts = setup.preset(self._encoder.sdo, position_rad)
+        return counts, setup.position_rad(self._encoder.sdo)
 
     def stand_down(self) -> None:
         """Orderly end: nodes pre-operational and the drive no longer watching us. Only when the drive has no torque."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from servod.common.errors import BadInput
+from servod.common.files import is_there
 from servod.common.portable import has_group
 from servod.formats.config import AxisConfig
 from servod.formats.stopping import Stopping, with_stopping
@@ -137,8 +138,8 @@ def check_names(config: AxisConfig, source: str) -> list[str]:
     """
     _check_interface(config.bus.interface, source)
     for key, folder in {"gains": config.gains.directory, "recorder": config.recorder.directory}.items():
-        file = next((path for path in (folder, *folder.parents) if path.exists()), folder)
-        if file.exists() and not file.is_dir():
+        file = next((path for path in (folder, *folder.parents) if is_there(path)), folder)
+        if is_there(file) and not file.is_dir():
             raise BadInput(
                 f"{source}: {key}.directory", f"{file}, which is a file", "a folder; one that is missing is made"
             )

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from rig import Rig, stepped_world
 
-from servod.common.errors import Unreachable
+from servod.common.errors import BadInput, Unreachable
 from servod.common.faults import FaultCode
 from servod.common.units import NS_PER_S
 from servod.drivers.virtual.bus_faults import BusFault, FaultKind
@@ -325,6 +325,14 @@ def test_a_preset_sets_what_the_joint_reads(encoder: dict[str, Any]) -> None:
     rig.start()
     _, feedback = rig.run(2, Goal.OFF)
     assert feedback.position_rad == pytest.approx(-0.25, abs=1e-5)
+
+
+@pytest.mark.parametrize("position_rad", [math.nan, math.inf, -1e300, 1e5])
+def test_a_preset_that_the_encoder_cannot_read_is_refused_and_nothing_is_written(position_rad: float) -> None:
+    rig = Rig(stepped_world(start_position_rad=0.3))
+    with pytest.raises(BadInput, match="half of what the encoder measures"):
+        rig.master.preset_encoder(position_rad)
+    assert rig.master.preset_encoder(0.25)[1] == pytest.approx(0.25, abs=1e-5)
 
 
 def test_no_preset_while_the_drive_has_power(enabled: Rig) -> None:
