@@ -153,7 +153,9 @@ class Supervisor:
                 if self._comeback and self._comeback.see(self._loop.latest, time.monotonic_ns()):
                     self._leave_for_new()
                     return None
-                await asyncio.sleep(TICK_S)
+                await asyncio.sleep(0.5 * TICK_S)
+                self._take_node_events()  # twice a round: what others send shall be a fault within 50 ms
+                await asyncio.sleep(0.5 * TICK_S)
             return self._stop()
         finally:
             self._close()
@@ -281,7 +283,8 @@ class Supervisor:
         self._nodes.stop_axis()
         self._take_records(time.monotonic_ns())
         words = " / ".join(self._loop.last_words().strip().splitlines()[-3:])
-        detail = "it hung" if hung else f"exit code {exit_code}"
+        in_order = "it ended in order by itself, told by a signal or since this process stood still"
+        detail = "it hung" if hung else f"exit code {exit_code}" if exit_code else in_order
         self._why_ends = f"servod ends, since the loop was lost: {detail}"
         self._faults.raise_own(FaultCode.LOOP_LOST, f"{detail}{': ' + words if words else ''}")
         self._faults.write_file(FaultCode.LOOP_LOST.name)
