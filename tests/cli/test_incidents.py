@@ -15,7 +15,7 @@ import pytest
 from servod.cli.app import run
 from servod.common.faults import FAULTS, FaultCode
 from servod.formats.config import RecorderConfig
-from servod.formats.recording.incidents import Incident, Seen
+from servod.formats.recording.incidents import Incident, Seen, newest
 from servod.formats.recording.run_mark import RunMark
 from servod.runtime.daemon.fault_watch import FaultWatch
 from servod.runtime.daemon.health import Health
@@ -191,6 +191,13 @@ def test_the_daemon_remembers_incidents_and_their_files(tmp_path: Path) -> None:
     watch.raise_own(FaultCode.RECORDER_FAILED, "no space")
     assert watch.incidents()[-1]["faults"][-1]["detail"] == "no space"
     recorder.close()
+
+
+def test_an_incident_that_stands_in_two_files_is_told_once_with_all_that_followed() -> None:
+    lost, followed = Seen(10**18, FaultCode.SUPERVISOR_LOST), Seen(10**18 + 10**9, FaultCode.LOOP_LOST)
+    rows = [Incident("a", [lost], "1.mcap"), Incident("a", [lost, followed], "2.mcap"), Incident("b", [lost])]
+    assert [(row.axis, row.file) for row in newest(rows, 9)] == [("a", "2.mcap"), ("b", "")]
+    assert newest(rows, 1)[0].faults
 
 
 def test_the_first_cause_is_the_strongest_of_its_cycle() -> None:

@@ -202,5 +202,9 @@ def _time_ns(stamp: re.Match[str]) -> int:
 
 
 def newest(incidents: Sequence[Incident], most: int) -> list[Incident]:
-    """At most so many, newest first."""
-    return sorted(incidents, key=lambda incident: incident.first.time_ns, reverse=True)[:most]
+    """At most so many, newest first; of one that several files show, as each later one has it in its history, the
+    fullest."""
+    fullest: dict[tuple[str, str, FaultCode], Incident] = {}
+    for incident in sorted(incidents, key=lambda incident: len(incident.faults)):
+        fullest[incident.axis, moment(incident.first.time_ns), incident.first.code] = incident
+    return sorted(fullest.values(), key=lambda incident: incident.first.time_ns, reverse=True)[:most]
