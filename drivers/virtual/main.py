@@ -20,6 +20,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
+from servod.common.arguments import ArgumentParser
 from servod.common.end_signals import on_end_signals
 from servod.common.errors import BadInput, ServodError, Unreachable
 from servod.common.files import reason
@@ -316,7 +317,7 @@ _SETTING_HELP = {"seed": f"begins the noise: the same number, the same noise; {_
 
 def parser() -> argparse.ArgumentParser:
     """What `servod-virtual-axis` takes; the reference of the command line prints it too."""
-    found = argparse.ArgumentParser(prog="servod-virtual-axis", description="A virtual servo axis.", epilog=_EXAMPLE)
+    found = ArgumentParser(prog="servod-virtual-axis", description="A virtual servo axis.", epilog=_EXAMPLE)
     bus = found.add_mutually_exclusive_group(required=True)
     bus.add_argument("--socket", type=Path, metavar="PATH", help="serve a virtual CAN bus at this Unix socket")
     bus.add_argument("--can", metavar="INTERFACE", help="join a SocketCAN interface, e.g. vcan0")
@@ -380,8 +381,8 @@ def _take_turns_first(priority: int) -> str:
 
 def main(argv: list[str] | None = None) -> int:
     """Run until told to stop; returns its exit code (servod.common.errors)."""
-    arguments = parser().parse_args(argv)
     try:
+        arguments = parser().parse_args(argv)
         server = _server(arguments)
     except ServodError as error:
         print(f"servod-virtual-axis: {error}", file=sys.stderr)

@@ -15,9 +15,9 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import NoReturn
 
 from servod import __version__
+from servod.common.arguments import ArgumentParser
 from servod.common.clock import WallClock
 from servod.common.end_signals import on_end_signals
 from servod.common.errors import BadInput, ServodError, Unreachable
@@ -296,16 +296,9 @@ exit codes: 0 done, 2 bad usage or input, 3 bus, device or loop cannot be reache
 """
 
 
-class _Parser(argparse.ArgumentParser):
-    """Says what is wrong with the arguments in one line."""
-
-    def error(self, message: str) -> NoReturn:
-        raise BadInput("arguments", message, "see `servod --help`")
-
-
 def parser() -> argparse.ArgumentParser:
     """What `servod` takes; the reference of the command line prints it too."""
-    found = _Parser(
+    found = ArgumentParser(
         prog="servod",
         description="Runs one servo axis over CANopen: 1 kHz friction-compensating control, supervised and recorded.",
         epilog=_EXAMPLE,

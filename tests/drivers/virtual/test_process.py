@@ -304,6 +304,8 @@ def test_it_asks_for_real_time_by_itself(axis: Axis, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "code", "named"),
     [
+        ([], 2, "one of the arguments --socket --can is required"),
+        (["--socket", "{folder}/bus", "--seed", "x"], 2, "--seed: invalid int value"),
         (["--can", "nosuchcan0"], 3, "nosuchcan0"),
         (["--socket", "{folder}/no/such/folder/bus"], 2, "found no folder "),
         (["--socket", "{folder}/bus", "--plant", "{folder}/missing.yaml"], 2, "missing.yaml"),
