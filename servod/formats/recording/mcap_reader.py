@@ -1,7 +1,7 @@
 """Reads a recording back, whole or cut off by a crash, without numpy.
 
 Behind the recorder; export, replay and the physics side start here. A file that ends in the middle of a record gives
-everything before it and says `truncated`.
+everything before it and says `truncated`; one with a damaged chunk, some half a second of cycles, gives all others.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import re
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Container, Iterator
+from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, cast
@@ -119,7 +119,7 @@ def read_recording(
         with open_file(path) as stream:
             bounded = _Bounded(stream)
             _read_stream(_reader(bounded), taker)
-            _tell_damage(recording, taker.promised, bounded)
+            _tell_damage(recording, taker, bounded)
             recording.sha256 = bounded.sha256()
     except InvalidMagic:
         raise BadInput(str(path), "a file that is not MCAP", "a recording of servod (.mcap)") from None
@@ -209,20 +209,22 @@ class _Bounded:
         return self._hash.hexdigest()
 
 
-def _tell_damage(recording: McapRecording, promised: int | None, bounded: _Bounded) -> None:
+def _tell_damage(recording: McapRecording, taker: _Taker, bounded: _Bounded) -> None:
     """Say where a file that has no end breaks off, and what one has lost whose index promises more cycles."""
     if recording.truncated:
-        what = "cut off" if bounded.at >= bounded.size and promised is None else "damaged"
+        promised, left_out = taker.promised, taker.chunks_left_out
+        what = "cut off" if bounded.at >= bounded.size and promised is None and not left_out else "damaged"
         cycles = f"{len(recording)} cycles" if promised is None else f"{len(recording)} of {promised} cycles"
         readable = f"{cycles} could be read, from the first {bounded.at} of {bounded.size} bytes"
-        recording.damage = f"the file is {what}: {readable}"
+        without = f"; damaged within, and left out: {left_out} of its pieces of some half a second" if left_out else ""
+        recording.damage = f"the file is {what}: {readable}{without}"
 
 
 def _read_stream(reader: StreamReader, taker: _Taker) -> None:
     """Read until the footer, or until the file breaks off."""
     started = False
     try:
-        for record in _unpacked(reader, taker.path):
+        for record in _unpacked(reader, taker.path, taker.leave_out):
             started = True
             taker.take(record)
     except InvalidMagic:
@@ -234,10 +236,13 @@ def _read_stream(reader: StreamReader, taker: _Taker) -> None:
             raise InvalidMagic((0,) * 8) from None
 
 
-def _unpacked(reader: StreamReader, path: str | Path) -> Iterator[McapRecord]:
+def _unpacked(
+    reader: StreamReader, path: str | Path, damaged: Callable[[], None] | None = None
+) -> Iterator[McapRecord]:
     """All records, those in chunks too. Raises ValueError on a chunk that claims more than any of servod's has.
 
-    Raises BadInput when all together are too many to be read at once.
+    A chunk that is damaged is left out where `damaged` wants to be told of it. Raises BadInput when all together are
+    too many to be read at once.
     """
     left_bytes = _UNPACKED_LIMIT_BYTES
     for record in reader.records:
@@ -251,7 +256,14 @@ def _unpacked(reader: StreamReader, path: str | Path) -> Iterator[McapRecord]:
         if left_bytes < 0:
             found = f"more than {_UNPACKED_LIMIT_BYTES} bytes unpacked"
             raise BadInput(str(path), found, f"at most that much at once; {_REMEDY}")
-        yield from _records_of(record)
+        try:
+            inside = _records_of(record)
+        except _BROKEN:
+            if damaged is None:
+                raise
+            damaged()
+        else:
+            yield from inside
 
 
 def _records_of(chunk: Chunk) -> list[McapRecord]:
@@ -290,6 +302,7 @@ class _Taker:
         self._taken: Counter[int] = Counter()  # messages by channel
         #: How many cycles the index of the file has, where that are not those that were read.
         self.promised: int | None = None
+        self.chunks_left_out = 0
 
     def take(self, record: McapRecord) -> None:
         """Keep of a record what belongs into the recording. Raises BadInput when that becomes too much."""
@@ -299,7 +312,7 @@ class _Taker:
         elif isinstance(record, Statistics):
             self._compare(record)
         elif isinstance(record, Footer):
-            self.recording.truncated = self.promised is not None
+            self.recording.truncated = self.promised is not None or self.chunks_left_out > 0
         elif isinstance(record, Schema):
             self._count_beside(len(record.data))
             self._schemas[record.id] = record
@@ -315,6 +328,10 @@ class _Taker:
         elif isinstance(record, Attachment):
             self._count_beside(len(record.data))
             self.recording.attached.append((record.name, record.data))
+
+    def leave_out(self) -> None:
+        """A chunk is damaged; what stands behind it is read all the same."""
+        self.chunks_left_out += 1
 
     def _compare(self, index: Statistics) -> None:
         """A record whose kind was bent is passed over in silence: the index knows how many there were."""

@@ -137,6 +137,27 @@ def test_all_that_was_synced_is_in_the_file_while_it_is_written(tmp_path: Path) 
     assert file.records == 2000
 
 
+def test_a_damaged_piece_costs_itself_alone(tmp_path: Path) -> None:
+    path, bent = tmp_path / "a.mcap", tmp_path / "bent.mcap"
+    file = McapFile(path, {}, 1)
+    for part in range(4):
+        file.write_rows([(part * 50 + k).to_bytes(8, "little") + bytes(RECORD.size - 8) for k in range(50)])
+        file.sync()
+    file.close()
+    raw, at, seen = path.read_bytes(), len(MAGIC), []
+    while raw[at] != Opcode.DATA_END:
+        length = int.from_bytes(raw[at + 1 : at + 9], "little")
+        if raw[at] == Opcode.CHUNK and at > 2000:  # behind the first, which says what a cycle has
+            data = bytearray(raw)
+            data[at + length // 2] ^= 0x10
+            bent.write_bytes(data)
+            found = read_recording(bent)
+            seen.append(sorted(set(range(200)) - set(found.column("time_ns"))))
+            assert "150 cycles" in found.damage and "left out: 1 of its pieces" in found.damage and found.truncated
+        at += 9 + length
+    assert seen == [list(range(50 * part, 50 * part + 50)) for part in range(1, 4)]
+
+
 def test_no_record_is_lost_in_silence(tmp_path: Path) -> None:
     """A bent kind makes a reader pass a record over, a chunk of cycles too: checksum and index both tell of it.
 
