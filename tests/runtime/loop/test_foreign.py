@@ -151,6 +151,19 @@ def test_a_second_frame_of_every_tenth_sync_is_a_fault_wherever_it_comes(does: s
     assert twice == [b"1"] * 10
 
 
+@pytest.mark.parametrize("node_id", [1, 2])
+def test_an_error_that_somebody_else_told_of_leaves_nothing_to_take_back(node_id: int) -> None:
+    """Its error register, which is asked meanwhile, knows of none."""
+    axis = axis_that("rests")
+    stranger = axis.world.connect(())
+    stranger.send(0x080 + node_id, bytes.fromhex("1023810000000000"))
+    axis.run(2.0)
+    axis.enable(reset_fault=True)
+    stranger.send(0x080 + node_id, bytes(8))
+    axis.run(LONGEST_S)
+    assert F.DUPLICATE_NODE in latched(axis)
+
+
 STALLS = st.lists(
     st.tuples(st.integers(0, 60), st.integers(1, 100), st.sets(st.sampled_from(PARTICIPANTS), min_size=1)), max_size=12
 )

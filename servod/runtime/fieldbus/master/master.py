@@ -60,7 +60,7 @@ class Master:
             self.close()
             raise
         self._guarded: NodePlan | None = None  # the amplifier's, once it is up
-        self._guards: GuardWatch | None = None
+        self._guards: list[GuardWatch] = []
         self._nodes = {node.node_id: node for node in (self._amplifier, self._encoder)}
 
     def bring_up(self) -> BringUp:
@@ -89,7 +89,7 @@ class Master:
         for node in nodes:
             node.start()
         self._guarded = plans[0]
-        self._guards = self._amplifier.guard_watch(plans[0])
+        self._guards = [node.guard_watch(plan) for node, plan in zip(nodes, plans, strict=True)]
         try:
             self.look_for_strangers()
         except Unreachable:
@@ -167,8 +167,8 @@ class Master:
         self._network.drain()
         for node in self._nodes.values():
             node.watch.check()
-        if self._guards is not None:
-            self._guards.check()
+        for guards in self._guards:
+            guards.check()
 
     def events(self) -> list[NodeEvent]:
         """What the nodes did since the last call, oldest first."""

@@ -16,7 +16,15 @@ from canopen.emcy import EmcyError
 from servod.common.clock import Clock
 from servod.common.faults import FaultCode
 from servod.common.units import NS_PER_S
-from servod.runtime.fieldbus.cia import EMCY_BASE, HEARTBEAT_BASE, SDO_ANSWER_BASE, SDO_REQUEST_BASE, Emcy, NmtState
+from servod.runtime.fieldbus.cia import (
+    EMCY_BASE,
+    HEARTBEAT_BASE,
+    SDO_ANSWER_BASE,
+    SDO_REQUEST_BASE,
+    Emcy,
+    NmtState,
+    Obj301,
+)
 from servod.runtime.fieldbus.master.network import BusNetwork
 from servod.runtime.fieldbus.master.sdo import NodeSdo, SdoAnswer
 
@@ -117,6 +125,7 @@ class NodeWatch:
         self._watching = False
         self._rhythm = Rhythm(period_ms * 1_000_000)
         self._errors = 0  # that the node told of, or had at the bring-up, and may take back
+        self._in_register = True  # the last that it told of
         self._none_left_ns = 0  # since when it says that it has none, 0 while it does not
         self._answers = network.answers
         self._told_ns: dict[FaultCode, int] = {}
@@ -166,9 +175,22 @@ class NodeWatch:
             text = f"node {self.node_id}: no heartbeat for {silent_ns / 1e6:.0f} ms"
             self.add(FaultCode.NODE_HEARTBEAT_LOST, text, 0)
 
+    @property
+    def tells_errors(self) -> bool:
+        """By what was heard it has errors that it has not taken back, and they show in its error register."""
+        return self._errors > 0 and self._in_register
+
+    def register(self, value: int) -> None:
+        """Its error register (0x1001), as it answers now: who has no errors has none to take back either, but for the
+        EMCY that may still be on its way."""
+        now_ns = self._clock.now_ns()
+        self._none_left_ns = 0 if value else self._none_left_ns or now_ns
+        if not value and now_ns - self._none_left_ns > _TAKEN_BACK_NS:
+            self._errors = 0
+
     def has_errors(self) -> None:
         """The error register (0x1001) shows errors that the node told of before anybody listened."""
-        self._errors, self._none_left_ns = max(self._errors, 1), 0
+        self._errors, self._none_left_ns, self._in_register = max(self._errors, 1), 0, True
 
     def _on_heartbeat(self, _can_id: int, data: bytearray, time_ns: float) -> None:
         if len(data) != 1:
@@ -209,7 +231,7 @@ class NodeWatch:
         if code & 0xFF00 == 0:
             self._take_back(register)
             return
-        self._errors, self._none_left_ns = self._errors + 1, 0
+        self._errors, self._none_left_ns, self._in_register = self._errors + 1, 0, register != 0
         meaning = EmcyError(code, register, maker, time_ns).get_desc()
         text = f"node {self.node_id}: EMCY 0x{code:04X} {meaning}, register 0x{register:02X}, {maker.hex(' ')}"
         self.add(self._emcy_fault, text, code)
@@ -264,10 +286,15 @@ class NodeWatch:
         self.events.append(NodeEvent(self._clock.now_ns(), self.node_id, fault, text, code))
 
 
+#: Whether the node has an error: nothing is expected of it.
+_REGISTER = (int(Obj301.ERROR_REGISTER), 0, 0)
+
+
 class GuardWatch:
     """Reads the guards of a drive again in turn while it runs: anybody on the bus may write them by SDO.
 
-    Never waits: a question goes out in one look, its answer is taken in another.
+    And whether a node that told of errors still has any: somebody else may have told. Never waits: a question goes out
+    in one look, its answer is taken in another.
     """
 
     def __init__(self, sdo: NodeSdo, watch: NodeWatch, guards: Sequence[tuple[int, int, int]], clock: Clock) -> None:
@@ -275,28 +302,34 @@ class GuardWatch:
         self._guards = [(index, subindex, value) for index, subindex, value in guards]
         self._next = self._unanswered = 0
         self._asked: tuple[int, int, int] | None = None
-        self._asked_ns = 0
+        self._asked_ns, self._register_next = 0, True
         self._told: set[tuple[int, int]] = set()
 
     def check(self) -> None:
         """One look; call as often as the node's watch is checked."""
         now_ns = self._clock.now_ns()
-        if not self._watch.at_work or not self._guards:
+        if not self._watch.at_work or not (self._guards or self._watch.tells_errors):
             self._asked = None
         elif self._asked is not None and (answer := self._sdo.answer()) is not None:
             self._judge(self._asked, answer)
             self._asked, self._unanswered = None, 0
         elif self._asked is not None and now_ns - self._asked_ns > _UNANSWERED_NS:
-            self._asked, self._unanswered = None, self._unanswered + 1
+            self._unanswered += self._asked is not _REGISTER
+            self._asked = None
             if self._unanswered == _MOST_UNANSWERED:
                 self._tell((0, 0), "the guards of the drive cannot be read any more")
         elif self._asked is None and now_ns - self._asked_ns >= _GUARD_NS:
-            guard = self._guards[self._next]
-            if self._sdo.ask(guard[0], guard[1]):
-                self._asked, self._asked_ns = guard, now_ns
-                self._next = (self._next + 1) % len(self._guards)
+            register = self._watch.tells_errors and (self._register_next or not self._guards)
+            question = _REGISTER if register else self._guards[self._next]
+            if self._sdo.ask(question[0], question[1]):
+                self._asked, self._asked_ns, self._register_next = question, now_ns, not register
+                self._next = self._next if register else (self._next + 1) % len(self._guards)
 
     def _judge(self, guard: tuple[int, int, int], answer: SdoAnswer) -> None:
+        if guard is _REGISTER:
+            if answer.value is not None:
+                self._watch.register(answer.value)
+            return
         index, subindex, value = guard
         if answer.value == value:
             self._told.discard((index, subindex))
