@@ -32,8 +32,8 @@ def captured(bus: Path, file: Path) -> Iterator[None]:
         output.write(_HEADER)
 
         def write() -> None:
-            while not over.is_set():
-                if (frame := witness.receive(0.05)) is not None:
+            while (frame := witness.receive(0.05)) is not None or not over.is_set():  # what waits at the end is taken
+                if frame is not None:
                     output.write(packet(frame))
 
         thread = threading.Thread(target=write)

@@ -110,7 +110,11 @@ def test_servoctl_preset_sets_the_zero_where_no_daemon_runs(
     counts = round(0.5 / (2 * math.pi) * 2**20)
     assert capsys.readouterr().out == f"encoder node 2 reads 0.5 rad here (0x6003 = {counts})\n"
     assert run(["preset", str(file), "--position-rad", "0.5", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {"node_id": 2, "position_rad": 0.5, "counts": counts}
+    assert json.loads(capsys.readouterr().out) == {
+        "node_id": 2,
+        "position_rad": pytest.approx(0.5, abs=2 * math.pi / 2**20),
+        "counts": counts,
+    }
     master = Master(config, open_bus(config.bus), WallClock(), threaded=False)
     assert master.sdo(2).read(Obj406.POSITION) == pytest.approx(counts, abs=20)
     master.close()
