@@ -93,7 +93,8 @@ class Master:
         try:
             self.look_for_strangers()
         except Unreachable:
-            self.stand_down()
+            for node in nodes:  # the guards stay: nobody knows what the other one has done
+                self.nmt(NmtCommand.PRE_OPERATIONAL, node.node_id)
             raise
         return BringUp(plans[0], plans[1], load.share, report)
 

@@ -12,6 +12,7 @@ from servod.formats.config import AxisConfig, load_config
 from servod.formats.gains.gain_set import load_gains
 from servod.formats.model.axis_model import load_axis_model
 from servod.runtime.fieldbus.bus import Bus
+from servod.runtime.fieldbus.cia import NmtState
 from servod.runtime.fieldbus.master.network import BusNetwork
 
 FRAMES = {
@@ -74,3 +75,5 @@ def test_the_start_ends_whenever_it_comes(kind: str, share: float, transfers: in
     attack.bus = there.connect()
     with pytest.raises(Unreachable, match="somebody else spoke on the bus while the nodes were set up"):
         start(there)
+    there.clock.sleep_until(there.clock.now_ns() + 5_000_000)
+    assert {node.state for node in (there.amplifier, there.encoder)} == {NmtState.PRE_OPERATIONAL}
