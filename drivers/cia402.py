@@ -11,10 +11,9 @@ import struct
 
 from servod.common.units import PER_MILLE, rad_per_count
 from servod.drivers.cia402_setup import AmplifierSetup
-from servod.drivers.cia402_state import STATE_OF_STATUS, control_words, reached_states
+from servod.drivers.cia402_state import STATE_OF_STATUS, control_words, quick_stop_stays, reached_states
 from servod.drivers.cia402_target import TARGETS
 from servod.drivers.pdo_codec import codec, find, lost_after_cycles, slot
-from servod.kernels.stopping import quick_stop_stays
 from servod.runtime.fieldbus.cia import (
     CW_DISABLE_VOLTAGE,
     CW_ENABLE_OPERATION,

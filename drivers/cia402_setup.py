@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 from servod.common.errors import BadInput, Unreachable
 from servod.common.units import PER_MILLE, rad_per_count
+from servod.drivers.cia402_state import quick_stop_stays
 from servod.drivers.cia402_target import target_type
 from servod.drivers.pdo_codec import slow_syncs
 from servod.drivers.quirks import CommandDeadline, Presence, Quirks, load_quirks
-from servod.kernels.stopping import quick_stop_stays
 from servod.runtime.fieldbus.cia import RPDO_BASE, TPDO_BASE, Obj301, Obj402, decode_status_word
 from servod.runtime.fieldbus.devices import (
     EVENT_DRIVEN,

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from servod.kernels.stopping import quick_stop_stays
 from servod.runtime.fieldbus.cia import (
     CW_DISABLE_VOLTAGE,
     CW_ENABLE_OPERATION,
@@ -72,6 +71,11 @@ _HOLD: dict[Goal, tuple[DriveState, int, int]] = {
 
 #: There a goal of OFF or QUICK_STOP has nothing left to do; from the other states without power OFF goes on to these.
 _AT_OFF = frozenset({_S.NOT_READY_TO_SWITCH_ON, _S.SWITCH_ON_DISABLED, _S.FAULT})
+
+
+def quick_stop_stays(quick_stop_option: int) -> bool:
+    """As that of servod.formats.config_wire, which loads more than the cycle has use for."""
+    return quick_stop_option >= 5
 
 
 #: The same, indexed by the low seven bits of the status word (the table's masks use no others).

@@ -208,6 +208,15 @@ class BrakeConfig(Strict):
         return self
 
 
+#: 0x605A from here on: the ramp of 4 less, and then quick stop active is kept, with torque.
+QUICK_STOP_STAYS = 5
+
+
+def quick_stop_stays(quick_stop_option: int) -> bool:
+    """Whether the drive stays in quick stop active (0x605A is 5 to 8) and may go back by transition 16."""
+    return quick_stop_option >= QUICK_STOP_STAYS
+
+
 class AmplifierConfig(Strict):
     """The servo amplifier. Positions of 0x6064 are counts of the motor encoder; the joint turns 1/gear_ratio of it."""
 

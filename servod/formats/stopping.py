@@ -12,8 +12,9 @@ from typing import TypedDict
 
 from servod.common.errors import BadInput
 from servod.formats.config import AxisConfig
+from servod.formats.config_wire import quick_stop_stays
 from servod.formats.joint_bounds import JointBounds, joint_of
-from servod.kernels.stopping import OVERSPEED, RECKONED_OVERSPEED, REST_S, StopFacts, both_ways, quick_stop_stays
+from servod.kernels.stopping import OVERSPEED, RECKONED_OVERSPEED, REST_S, StopFacts, both_ways
 
 #: A ramp that nobody states takes so much of the torque that the heaviest joint leaves for it.
 _RAMP_SHARE = 0.8

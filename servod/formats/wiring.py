@@ -9,8 +9,8 @@ import math
 
 from servod.common.errors import BadInput
 from servod.formats.config import AxisConfig
+from servod.formats.config_wire import QUICK_STOP_STAYS, quick_stop_stays
 from servod.formats.model.axis_model import AxisKind, AxisModel, load_axis_model
-from servod.kernels.stopping import QUICK_STOP_STAYS, quick_stop_stays
 
 #: Places within the position limits at which a load is looked at.
 _PLACES = 200

@@ -18,13 +18,6 @@ OVERSPEED, RECKONED_OVERSPEED = 1.2, 1.15
 REST_S = 0.02
 #: A viscous friction whose time constant is longer than so many times `hold_s` makes no difference, and divides badly.
 _SLOW = 1e4
-#: 0x605A from here on: the ramp of 4 less, and then quick stop active is kept, with torque.
-QUICK_STOP_STAYS = 5
-
-
-def quick_stop_stays(quick_stop_option: int) -> bool:
-    """Whether the drive stays in quick stop active (0x605A is 5 to 8) and may go back by transition 16."""
-    return quick_stop_option >= QUICK_STOP_STAYS
 
 
 class StopFacts(NamedTuple):

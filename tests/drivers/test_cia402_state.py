@@ -13,9 +13,10 @@ from servod.drivers.cia402_state import (
     STATE_OF_STATUS,
     TRANSITIONS,
     control_words,
+    quick_stop_stays,
     reached_states,
 )
-from servod.kernels.stopping import quick_stop_stays
+from servod.formats import config_wire
 from servod.runtime.fieldbus.cia import decode_status_word
 from servod.runtime.fieldbus.devices import DriveState, Goal
 
@@ -95,7 +96,7 @@ def test_every_goal_is_reached_where_documented(option: int) -> None:
     stopped = still | {S.QUICK_STOP_ACTIVE} if option >= 5 else still
     where = {Goal.OFF: still, Goal.READY: {S.READY_TO_SWITCH_ON}, Goal.ENABLED: {S.OPERATION_ENABLED}}
     where[Goal.QUICK_STOP] = stopped
-    assert quick_stop_stays(option) is (option in (5, 6, 7, 8))
+    assert quick_stop_stays(option) is config_wire.quick_stop_stays(option) is (option in (5, 6, 7, 8))
     for goal in Goal:
         assert {state for state in DriveState if reached_states(option)[goal][state]} == where[goal]
 

@@ -22,8 +22,8 @@ from servod.common.clock import Clock
 from servod.common.errors import AnswerIsNo, BadInput, Unreachable
 from servod.common.files import read_json, write_atomically
 from servod.formats.config import AxisConfig
+from servod.formats.config_wire import quick_stop_stays
 from servod.formats.stopping import CYCLES_BEHIND
-from servod.kernels.stopping import quick_stop_stays
 from servod.runtime.fieldbus.bus import Bus
 from servod.runtime.fieldbus.cia import (
     CW_DISABLE_VOLTAGE,

@@ -14,8 +14,8 @@ from typing import NamedTuple, Protocol
 from servod.common.clock import Clock
 from servod.common.faults import FAULTS, FaultCode
 from servod.common.units import NS_PER_S, NS_PER_US
+from servod.formats.config_wire import quick_stop_stays
 from servod.kernels.motions import Samples
-from servod.kernels.stopping import quick_stop_stays
 from servod.runtime.fieldbus.bus import Bus
 from servod.runtime.fieldbus.devices import AmplifierCommand, AmplifierFeedback, EncoderFeedback, Goal, Mode
 from servod.runtime.fieldbus.registry import amplifier_of, encoder_of
