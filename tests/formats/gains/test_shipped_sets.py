@@ -53,6 +53,11 @@ def test_the_demos_daemon_takes_the_certified_set_by_its_certificate(tmp_path: P
     assert GainBank(strict.model_copy(update={"gains": started})).newest.gains.certificate_problem() is None
 
 
+def test_the_certified_set_is_certified_by_the_checks_that_ship_with_it() -> None:
+    """Else the first line of the demo warns of it: `servoctl verify gains/demo_local_certified.yaml` issues it anew."""
+    assert load_gains(gains_file(CERTIFIED)).certificate_warning() is None
+
+
 def test_the_margins_that_the_demo_tells_are_those_of_the_certificate() -> None:
     gains = load_gains(gains_file(CERTIFIED))
     certificate = gains.certificate
