@@ -78,10 +78,8 @@ class Rhythm:
         self._period_ns = period_ns
         self._beats: deque[int] = deque(maxlen=_BEATS)
         self._least, self._rhythm = (max(1, -(-span // period_ns)) for span in (_LEAST_NS, _RHYTHM_NS))
-        self._owed, self._calm = (
-            self._rhythm,
-            0,
-        )  # beats that a silence owes; beats in a row with the distance of a rhythm
+        # Beats that a silence owes; beats in a row with the distance of a rhythm.
+        self._owed, self._calm = self._rhythm, 0
 
     def restart(self, time_ns: int) -> None:
         """The sender begins anew at `time_ns`."""
