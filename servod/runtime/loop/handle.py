@@ -24,7 +24,7 @@ _KILLED_S = 0.2
 
 
 class LoopHandle:
-    """One loop process. Not thread-safe; `feed` must be called at least ten times a second while it runs."""
+    """One loop process. Not thread-safe; once `feed` was called, it must be at least ten times a second."""
 
     def __init__(self, plan: LoopPlan) -> None:
         """Nothing is started yet."""
@@ -39,7 +39,6 @@ class LoopHandle:
         `meanwhile` is done again and again until then; what it raises ends the start.
         """
         fd = self._channel.fd
-        self._channel.beat()
         self._process = subprocess.Popen(
             [sys.executable, "-m", "servod.runtime.loop.process", str(fd)],
             stdin=subprocess.PIPE,
@@ -150,5 +149,4 @@ class LoopHandle:
                 late = f"the loop process did not begin within {START_TIMEOUT_S:.0f} s"
                 raise Unreachable(f"{late}: is the machine busy with other work?")
             meanwhile()
-            self.feed()
             time.sleep(0.01)

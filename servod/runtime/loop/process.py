@@ -23,25 +23,28 @@ from servod.runtime.loop.realtime import apply_realtime
 #: A supervisor whose beat stands still for this long counts as lost. Its death is seen within one cycle; this is for
 #: one that hangs, which is not urgent: the loop has everything that it needs to control the axis.
 SUPERVISOR_TIMEOUT_S = 1.0
+#: Until its first beat it is on its way from the loop's start to its rounds, with sockets and files to open. Nobody can
+#: command the axis before.
+FIRST_BEAT_S = 10.0
 #: Exit code of a loop that ended in order but did not see the drive switch off.
 NOT_SEEN_OFF = 4
 
 
 def supervisor_watch(channel: Channel, clock: Clock) -> Callable[[], bool]:
-    """A check, cheap enough for every cycle: is the parent the same, and does its beat go on?"""
+    """A check, cheap enough for every cycle: is the parent the same, and does its beat begin and go on?"""
     parent = os.getppid()
-    timeout_ns = int(SUPERVISOR_TIMEOUT_S * NS_PER_S)
+    patience_ns = int(FIRST_BEAT_S * NS_PER_S)
     last_beats, since_ns = channel.supervisor_beats(), clock.now_ns()
 
     def alive() -> bool:
-        nonlocal last_beats, since_ns
+        nonlocal last_beats, since_ns, patience_ns
         if os.getppid() != parent:
             return False
         beats = channel.supervisor_beats()
         if beats != last_beats:
-            last_beats, since_ns = beats, clock.now_ns()
+            last_beats, since_ns, patience_ns = beats, clock.now_ns(), int(SUPERVISOR_TIMEOUT_S * NS_PER_S)
             return True
-        return clock.now_ns() - since_ns < timeout_ns
+        return clock.now_ns() - since_ns < patience_ns
 
     return alive
 

@@ -13,7 +13,9 @@ from servod.runtime.loop.realtime import Grant
 from servod.runtime.loop.wiring.findings import WiringReport
 
 
-class _Clock:
+class Hand:
+    """A clock that stands until somebody moves it."""
+
     ns = 0
 
     def now_ns(self) -> int:
@@ -28,7 +30,7 @@ def record(number: int) -> tuple[float, ...]:
 
 
 def both_sides() -> tuple[Channel, Channel]:
-    clock = _Clock()
+    clock = Hand()
     supervisor = Channel(clock=clock)
     return supervisor, Channel(os.dup(supervisor.fd), clock)
 
@@ -109,9 +111,9 @@ def test_table_is_read_as_it_was_written_and_the_next_one_instead_of_it():
 @pytest.mark.parametrize("age_ns", [NS_PER_S, NS_PER_S + 1, -1])
 def test_what_gives_motion_is_refused_when_it_comes_too_late_and_a_stop_never_is(op, age_ns):
     supervisor, loop = both_sides()
-    _Clock.ns = 10 * NS_PER_S
+    Hand.ns = 10 * NS_PER_S
     number = supervisor.send(op, (1.0,))
-    _Clock.ns += age_ns
+    Hand.ns += age_ns
     command = loop.next_command()
     assert command is not None
     assert command.seq == number

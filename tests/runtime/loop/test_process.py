@@ -1,0 +1,34 @@
+"""When the loop process takes its supervisor for lost: beats that stand still, and those that never began."""
+
+import os
+
+from servod.common.units import NS_PER_S
+from servod.runtime.loop.channel import Channel
+from servod.runtime.loop.process import FIRST_BEAT_S, SUPERVISOR_TIMEOUT_S, supervisor_watch
+from tests.runtime.loop.test_channel import Hand
+
+
+def test_a_supervisor_that_opens_its_sockets_is_waited_for_and_one_that_hangs_later_is_not():
+    clock = Hand()
+    supervisor = Channel(clock=clock)
+    loop = Channel(os.dup(supervisor.fd), clock)
+    alive = supervisor_watch(loop, clock)
+
+    def alive_after(quiet_s: float) -> bool:
+        clock.ns += round(quiet_s * NS_PER_S)
+        return alive()
+
+    assert alive_after(FIRST_BEAT_S - 0.01)
+    supervisor.beat()
+    assert alive_after(0.0)
+    assert alive_after(SUPERVISOR_TIMEOUT_S - 0.01)
+    assert not alive_after(0.02)
+    supervisor.beat()
+    assert alive_after(0.0)
+
+
+def test_a_supervisor_that_never_begins_is_lost():
+    clock = Hand()
+    alive = supervisor_watch(Channel(clock=clock), clock)
+    clock.ns += round((FIRST_BEAT_S + 0.01) * NS_PER_S)
+    assert not alive()
