@@ -17,6 +17,20 @@ _STAY_OWED: Final = 1
 _IN_TIME: Final = 5
 
 
+class _Kind:
+    """What is known of the frames of one identifier."""
+
+    __slots__ = ("alone", "heard", "in_time", "least", "newest", "newest_sync_ns", "owed")
+
+    def __init__(self) -> None:
+        self.owed = self.least = 0  # the least of what was owed at each SYNC since the count of complete cycles began
+        self.in_time = _IN_TIME  # SYNCs in a row at which no earlier frame was owed
+        self.heard = 0
+        self.newest: Frame | None = None
+        self.newest_sync_ns = 0
+        self.alone = False  # a copy of the newest may pass
+
+
 class Answers:
     """Tells a frame that a node owed from one that nobody asked for.
 
@@ -27,48 +41,47 @@ class Answers:
 
     def __init__(self, can_ids: Iterable[int], repeated_ns: int) -> None:
         """Identifiers of the frames that answer a SYNC; a copy that comes within `repeated_ns` is CAN's own."""
-        self._owed = dict.fromkeys(can_ids, 0)
-        self._least = dict(self._owed)  # of what was owed at each SYNC, since the count of complete cycles began
+        self.kinds = {can_id: _Kind() for can_id in can_ids}
+        self.asked = 0  # SYNCs
+        self._each = tuple(self.kinds.values())
         self._complete = 0
-        self._in_time = dict.fromkeys(self._owed, _IN_TIME)  # SYNCs in a row at which no earlier frame was owed
-        self._newest: dict[int, tuple[Frame, int, bool]] = {}  # with its SYNC, and whether a copy of it may pass
         self._repeated_ns, self._sync_ns = repeated_ns, 0
-
-    def __contains__(self, can_id: int) -> bool:
-        return can_id in self._owed
 
     def ask(self, sync_ns: int) -> None:
         """A SYNC went out: each node owes one frame more."""
-        owed, least = self._owed, self._least
         self._sync_ns = sync_ns
-        for can_id, count in owed.items():
-            least[can_id] = min(least[can_id], count)
-        if self._complete >= _COMPLETE_CYCLES:
+        self.asked += 1
+        forgets = self._complete >= _COMPLETE_CYCLES
+        if forgets:
             self._complete = 0
-            for can_id in owed:
-                owed[can_id] -= max(least[can_id] - _STAY_OWED, 0)
-                least[can_id] = owed[can_id]
-        for can_id in owed:
-            self._in_time[can_id] = 0 if owed[can_id] > _STAY_OWED else self._in_time[can_id] + 1
-            owed[can_id] += 1
+        for kind in self._each:
+            owed = kind.owed
+            kind.least = min(kind.least, owed)
+            if forgets:
+                owed -= max(kind.least - _STAY_OWED, 0)
+                kind.least = owed
+            kind.in_time = 0 if owed > _STAY_OWED else kind.in_time + 1
+            kind.owed = owed + 1
 
     def complete(self) -> None:
         """The cycle had all its feedback in time."""
         self._complete += 1
 
     def take(self, frame: Frame) -> bool:
-        """Whether a node may have sent this frame, which is counted off then."""
-        can_id, newest = frame.can_id, self._newest.get(frame.can_id)
-        if self._owed[can_id] > 0:
-            self._owed[can_id] -= 1
-            alone = newest is None or newest[1] != self._sync_ns
-            self._newest[can_id] = frame, self._sync_ns, alone and self._in_time[can_id] >= _IN_TIME
+        """Whether a node may have sent this frame, which is counted off then. KeyError for one of no kind here."""
+        kind = self.kinds[frame.can_id]
+        kind.heard += 1
+        if kind.owed > 0:
+            kind.owed -= 1
+            alone = kind.newest_sync_ns != self._sync_ns or kind.newest is None
+            kind.alone = alone and kind.in_time >= _IN_TIME
+            kind.newest, kind.newest_sync_ns = frame, self._sync_ns
             return True
-        if newest is None:
+        alone, kind.alone = kind.alone, False
+        if kind.newest is None:
             return False
-        before, sync_ns, alone = newest
-        self._newest[can_id] = before, sync_ns, False
-        return alone and frame.data == before.data and frame.time_ns - before.time_ns <= self._repeated_ns
+        near = frame.time_ns - kind.newest.time_ns <= self._repeated_ns
+        return alone and near and frame.data == kind.newest.data
 
 
 class Rare:
@@ -79,29 +92,19 @@ class Rare:
     counted in the node's frames of each SYNC as well; where those are lost, SYNC counts.
     """
 
-    def __init__(self, syncs: Mapping[int, tuple[int, int]], repeated_ns: int) -> None:
-        """Of each identifier its n and that of the same node's frame of each SYNC; within `repeated_ns` CAN copies."""
-        self._syncs, self._repeated_ns = dict(syncs), repeated_ns
-        self._asked = 0
-        self._heard = {beside: 0 for _, beside in syncs.values()}
+    def __init__(self, syncs: Mapping[int, tuple[int, int]], answers: Answers, repeated_ns: int) -> None:
+        """Of each identifier its n and that of the same node's frame of each SYNC, which `answers` counts; within
+        `repeated_ns` CAN copies."""
+        self._syncs, self._answers, self._repeated_ns = dict(syncs), answers, repeated_ns
         self._newest: dict[int, tuple[Frame, int, int, bool]] = {}  # with both counts; whether a copy may pass
 
     def __contains__(self, can_id: int) -> bool:
         return can_id in self._syncs
 
-    def ask(self) -> None:
-        """A SYNC went out."""
-        self._asked += 1
-
-    def hear(self, can_id: int) -> None:
-        """A frame of each SYNC came."""
-        if can_id in self._heard:
-            self._heard[can_id] += 1
-
     def take(self, frame: Frame) -> bool:
         """Whether the node may have sent this frame."""
         count, beside = self._syncs[frame.can_id]
-        asked, heard = self._asked, self._heard[beside]
+        asked, heard = self._answers.asked, self._answers.kinds[beside].heard
         if (before := self._newest.get(frame.can_id)) is not None:
             newest, asked_then, heard_then, alone = before
             if 2 * max(asked - asked_then, heard - heard_then) <= count:

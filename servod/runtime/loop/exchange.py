@@ -52,7 +52,8 @@ class Exchange:
         repeated_ns = _REPEATED_BITS * NS_PER_S // plan.config.bus.bit_rate
         nodes = [[pdo for pdo in node.pdos if not pdo.receive] for node in (plan.amplifier, plan.encoder)]
         self._answers = Answers((pdo.cob_id for sent in nodes for pdo in sent if pdo.syncs == 1), repeated_ns)
-        self._rare = Rare({i: row for sent in nodes for i, row in _rare(sent).items()}, repeated_ns)
+        rare = {i: row for sent in nodes for i, row in _rare(sent).items()}
+        self._rare = Rare(rare, self._answers, repeated_ns)
         self._rare_bytes = {pdo.cob_id: pdo.data_bytes for sent in nodes for pdo in sent if pdo.syncs != 1}
         self._foreign = 0  # fault bits of what others sent, since the last look
         self.late_frames = 0
@@ -65,7 +66,6 @@ class Exchange:
         self.sync_ns = self._clock.now_ns()
         if self._bus.send(SYNC_ID, b""):
             self._answers.ask(self.sync_ns)
-            self._rare.ask()
         return self.sync_ns
 
     def collect(self, until_ns: int) -> None:
@@ -80,8 +80,8 @@ class Exchange:
             frame = bus.receive(max(remaining_ns, 0) / NS_PER_S)
             if frame is None:
                 return
-            if frame.can_id in answers:
-                self._answer(frame)
+            if frame.can_id in answers.kinds and not answers.take(frame):
+                self._foreign |= _FOREIGN_FEEDBACK
             receiver = self._receivers.get(frame.can_id)
             if receiver is not None and receiver.on_frame(frame.can_id, frame.data, sync_ns):
                 answered.add(frame.can_id)
@@ -142,19 +142,13 @@ class Exchange:
             if frame is None:
                 return
             receiver = self._receivers.get(frame.can_id)
-            if frame.can_id in self._answers:
-                self._answer(frame)
+            if frame.can_id in self._answers.kinds:
+                self._foreign |= 0 if self._answers.take(frame) else _FOREIGN_FEEDBACK
                 self.late_frames += 1
                 continue
             if receiver is not None:
                 receiver.on_frame(frame.can_id, frame.data, self.sync_ns)
             self._look_at(frame)
-
-    def _answer(self, frame: Frame) -> None:
-        """What comes with each SYNC, or looks like it."""
-        self._rare.hear(frame.can_id)
-        if not self._answers.take(frame):
-            self._foreign |= _FOREIGN_FEEDBACK
 
     def _look_at(self, frame: Frame) -> None:
         """What does not come with each SYNC: of a master, switched off, too soon, or shorter than the node's own."""
