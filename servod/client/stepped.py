@@ -115,10 +115,9 @@ class ChannelPort(ListPort):
     def __init__(self, clock: Clock) -> None:
         super().__init__(clock)
         self.supervisor = Channel(clock=clock)
-        self.supervisor.beat()
         self.loop = Channel(os.dup(self.supervisor.fd), clock)
         self.trajectory = self.loop.trajectory
-        self._alive = supervisor_watch(self.loop, clock)
+        self._alive = supervisor_watch(self.loop, clock, os.getppid())
 
     @property
     def rows(self) -> bytearray:

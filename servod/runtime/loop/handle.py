@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import subprocess
 import sys
@@ -40,7 +41,7 @@ class LoopHandle:
         """
         fd = self._channel.fd
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "servod.runtime.loop.process", str(fd)],
+            [sys.executable, "-m", "servod.runtime.loop.process", str(fd), str(os.getpid())],
             stdin=subprocess.PIPE,
             stderr=subprocess.PIPE,
             pass_fds=(fd,),

@@ -1,4 +1,4 @@
-"""The loop process: `python -m servod.runtime.loop.process FD`, with the plan on standard input.
+"""The loop process: `python -m servod.runtime.loop.process FD PARENT`, with the plan on standard input.
 
 One thread. Absolute deadlines; a missed period is skipped and counted, never made up for. Its death stops the master's
 heartbeat, which the drive watches (0x1016); the death of its parent makes it brake, ramp down and switch off.
@@ -25,14 +25,13 @@ from servod.runtime.loop.realtime import apply_realtime
 SUPERVISOR_TIMEOUT_S = 1.0
 #: Until its first beat it is on its way from the loop's start to its rounds, with sockets and files to open. Nobody can
 #: command the axis before.
-FIRST_BEAT_S = 10.0
+FIRST_BEAT_S = 5.0
 #: Exit code of a loop that ended in order but did not see the drive switch off.
 NOT_SEEN_OFF = 4
 
 
-def supervisor_watch(channel: Channel, clock: Clock) -> Callable[[], bool]:
-    """A check, cheap enough for every cycle: is the parent the same, and does its beat begin and go on?"""
-    parent = os.getppid()
+def supervisor_watch(channel: Channel, clock: Clock, parent: int) -> Callable[[], bool]:
+    """A check, cheap enough for every cycle: is this process `parent`'s still, and does its beat begin and go on?"""
     patience_ns = int(FIRST_BEAT_S * NS_PER_S)
     last_beats, since_ns = channel.supervisor_beats(), clock.now_ns()
 
@@ -85,7 +84,7 @@ def main() -> int:
     plan = LoopPlan.from_json(sys.stdin.read())
     channel, clock = Channel(int(sys.argv[1])), WallClock()
     bus = open_bus(plan.config.bus)
-    cycle = Cycle(plan, bus, clock, channel, supervisor_watch(channel, clock))
+    cycle = Cycle(plan, bus, clock, channel, supervisor_watch(channel, clock, int(sys.argv[2])))
     on_end_signals(cycle.shut_down)
     grants = apply_realtime(plan.config.cycle.cpu, plan.config.cycle.priority)
     channel.publish_ready(grants)

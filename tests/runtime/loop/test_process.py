@@ -12,7 +12,7 @@ def test_a_supervisor_that_opens_its_sockets_is_waited_for_and_one_that_hangs_la
     clock = Hand()
     supervisor = Channel(clock=clock)
     loop = Channel(os.dup(supervisor.fd), clock)
-    alive = supervisor_watch(loop, clock)
+    alive = supervisor_watch(loop, clock, os.getppid())
 
     def alive_after(quiet_s: float) -> bool:
         clock.ns += round(quiet_s * NS_PER_S)
@@ -29,6 +29,11 @@ def test_a_supervisor_that_opens_its_sockets_is_waited_for_and_one_that_hangs_la
 
 def test_a_supervisor_that_never_begins_is_lost():
     clock = Hand()
-    alive = supervisor_watch(Channel(clock=clock), clock)
+    alive = supervisor_watch(Channel(clock=clock), clock, os.getppid())
     clock.ns += round((FIRST_BEAT_S + 0.01) * NS_PER_S)
     assert not alive()
+
+
+def test_a_supervisor_that_died_while_this_process_began_is_lost_at_once():
+    clock = Hand()
+    assert not supervisor_watch(Channel(clock=clock), clock, os.getppid() + 1)()
