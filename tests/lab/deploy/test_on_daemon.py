@@ -38,7 +38,7 @@ from servod.formats.gains.gain_set import load_gains
 axis = DaemonAxis(ControlClient(sys.argv[1]))
 axis.enable()
 axis.activate(*axis.load(load_gains(sys.argv[2])))
-axis.run(ReferenceMotion.sine(0.05, 0.5, 4.0))
+axis.run(ReferenceMotion.sine(0.05, 0.5, 8.0))
 """
 
 
