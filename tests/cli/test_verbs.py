@@ -13,7 +13,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,80 +23,37 @@ import pytest
 from servod.cli.app import run
 from servod.client.control import ControlClient
 from servod.client.processes import child, running_axis, wait_until
-from servod.common.errors import ServodError
-from servod.common.faults import NEEDS_RESTART
-from servod.drivers.virtual.client import VirtualBus
+from servod.formats.config import ControlConfig
 from servod.formats.recording.mcap_reader import read_recording
 from servod.lab.recordings.recording import moving, rows_of
 from servod.lab.tracking.metrics import score
 from servod.qualify.demo.axis import demo_config, gains_file, plant_file
-from servod.runtime.fieldbus.cia import NmtCommand
 from tests.cli.test_plot import kept
-from tests.runtime.daemon.running import wait_for
+from tests.runtime.daemon.running import SharedAxis
 from tests.starved import LOGS
 
 pytestmark = pytest.mark.serial
 
 
-class SharedAxis:
-    """A daemon on a virtual axis, for one test after the other.
-
-    A machine that stands still for a tenth of a second leaves a drive that only a new start brings up; the test that it
-    hit says so, and the next one begins on a new axis.
-    """
-
-    def __init__(self, make_folder: Callable[[], Path]) -> None:
-        """Started by the first `stands`."""
-        self._make_folder = make_folder
-        self._held = contextlib.ExitStack()
-        self._socket: Path | None = None
-
-    def close(self) -> None:
-        """End the daemon."""
-        self._held.close()
-
-    def stands(self) -> Path:
-        """The control socket of an axis that can be enabled; recordings lie in `recordings` beside it."""
-        if self._socket is None or self._needs_restart(self._socket):
-            self.close()
-            folder = self._make_folder()
-            config = demo_config(folder, folder / "recordings")
-            LOGS.append(folder / "servod.log")
-            self._held.enter_context(running_axis(config, plant_file(None), folder))
-            self._socket = config.control.socket
-        return self._socket
-
-    def _needs_restart(self, socket: Path) -> bool:
-        try:
-            with ControlClient(socket) as client:
-                told = {fault["code"] for fault in client.call("status")["faults"]}
-        except ServodError:
-            return True
-        return not told.isdisjoint(code.name for code in NEEDS_RESTART)
+@contextlib.contextmanager
+def begun(folder: Path) -> Iterator[ControlConfig]:
+    """A daemon on a virtual axis; recordings lie in `recordings` beside its socket."""
+    config = demo_config(folder, folder / "recordings")
+    LOGS.append(folder / "servod.log")
+    with running_axis(config, plant_file(None), folder):
+        yield config.control
 
 
 @pytest.fixture(scope="module")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SharedAxis]:
-    """The axis of this file's tests."""
-    with contextlib.closing(SharedAxis(lambda: tmp_path_factory.mktemp("axis"))) as found:
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SharedAxis[ControlConfig]]:
+    with contextlib.closing(SharedAxis(lambda: begun(tmp_path_factory.mktemp("axis")))) as found:
         yield found
 
 
 @pytest.fixture
-def axis(shared: SharedAxis) -> Path:
-    """The control socket of a daemon on a virtual axis; recordings lie in `recordings` beside it."""
-    return shared.stands()
-
-
-def test_an_axis_that_needs_a_new_start_is_replaced(shared: SharedAxis) -> None:
-    first = shared.stands()
-    assert shared.stands() == first
-    bus = VirtualBus(str(first.parent / "bus"))
-    bus.send(0, bytes((NmtCommand.STOP, 0)))
-    bus.close()
-    with ControlClient(first) as client:
-        wait_for(lambda: "NODE_LEFT_OPERATIONAL" in {row["code"] for row in client.call("status")["faults"]})
-    assert shared.stands() != first
+def axis(shared: SharedAxis[ControlConfig]) -> Path:
+    """The control socket of a daemon on a virtual axis."""
+    return shared.stands().socket
 
 
 class Servoctl:

@@ -9,12 +9,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from subprocess import Popen
+from typing import Generic, Protocol, TypeVar
 
 import pytest
 
 from servod.client.control import ControlClient, Refused
 from servod.client.processes import child, wait_until
-from servod.common.errors import Unreachable
+from servod.common.errors import ServodError, Unreachable
+from servod.common.faults import NEEDS_RESTART
 from servod.common.shipped import shipped
 from tests.starved import LOGS
 
@@ -131,3 +133,48 @@ def at_rest(client: ControlClient) -> Callable[[], bool]:
         return not status["axis"]["motion_running"]
 
     return rests
+
+
+class HasSocket(Protocol):
+    """What runs, as far as a shared axis asks."""
+
+    @property
+    def socket(self) -> Path:
+        """Its control socket."""
+        ...
+
+
+_T = TypeVar("_T", bound=HasSocket)
+
+
+class SharedAxis(Generic[_T]):
+    """A daemon on a virtual axis, for one test after the other.
+
+    A machine that stands still for a tenth of a second leaves a drive that only a new start brings up; the test that it
+    hit says so, and the next one, or its second try, begins on a new axis.
+    """
+
+    def __init__(self, begin: Callable[[], contextlib.AbstractContextManager[_T]]) -> None:
+        """`begin` starts one; the first `stands` calls it."""
+        self._begin, self._held = begin, contextlib.ExitStack()
+        self._runs: _T | None = None
+
+    def close(self) -> None:
+        """End the daemon."""
+        self._held.close()
+
+    def stands(self) -> _T:
+        """What runs, on an axis that can be enabled."""
+        if self._runs is None or _needs_restart(self._runs.socket):
+            self.close()
+            self._runs = self._held.enter_context(self._begin())
+        return self._runs
+
+
+def _needs_restart(control: Path) -> bool:
+    try:
+        with ControlClient(control) as client:
+            told = {fault["code"] for fault in client.call("status")["faults"]}
+    except ServodError:
+        return True
+    return not told.isdisjoint(code.name for code in NEEDS_RESTART)

@@ -9,11 +9,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
-from running import CONFIG, Running, running, wait_for
+from running import CONFIG, Running, SharedAxis, running, wait_for
 
 from servod.client.control import ControlClient, Refused
 from servod.client.processes import child, wait_until
@@ -27,9 +28,14 @@ AMPLIFIER, ENCODER = 1, 2
 
 
 @pytest.fixture(scope="module")
-def axis(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
-    with running(tmp_path_factory.mktemp("axis")) as axis:
-        yield axis
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SharedAxis[Running]]:
+    with closing(SharedAxis(lambda: running(tmp_path_factory.mktemp("axis")))) as found:
+        yield found
+
+
+@pytest.fixture
+def axis(shared: SharedAxis[Running]) -> Running:
+    return shared.stands()
 
 
 @pytest.fixture
@@ -127,6 +133,18 @@ def test_node_that_was_reset_needs_a_new_start(tmp_path: Path) -> None:
         axis.daemon.send_signal(signal.SIGTERM)
         assert axis.daemon.wait(20) == 3
         assert "0x1016 is left as it is" in axis.log
+
+
+def test_a_shared_axis_that_needs_a_new_start_is_replaced(tmp_path_factory: pytest.TempPathFactory) -> None:
+    with closing(SharedAxis(lambda: running(tmp_path_factory.mktemp("axis")))) as shared:
+        first = shared.stands()
+        assert shared.stands() is first
+        bus = VirtualBus(str(first.folder / "bus"))
+        bus.send(0, bytes([129, AMPLIFIER]))
+        bus.close()
+        with ControlClient(first.socket) as client:
+            wait_for(lambda: "DRIVE_RESET" in {fault["code"] for fault in _state(client)["faults"]})
+        assert shared.stands() is not first
 
 
 def test_drive_that_does_not_hear_is_switched_off_by_sdo(tmp_path: Path) -> None:

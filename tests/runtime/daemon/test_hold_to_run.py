@@ -8,11 +8,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
-from running import Running, running, wait_for
+from running import Running, SharedAxis, running, wait_for
 from served import Served
 
 from servod.client.control import ControlClient
@@ -39,9 +40,14 @@ os._exit(0)
 
 
 @pytest.fixture(scope="module")
-def axis(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
-    with running(tmp_path_factory.mktemp("held")) as axis:
-        yield axis
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SharedAxis[Running]]:
+    with closing(SharedAxis(lambda: running(tmp_path_factory.mktemp("axis")))) as found:
+        yield found
+
+
+@pytest.fixture
+def axis(shared: SharedAxis[Running]) -> Running:
+    return shared.stands()
 
 
 def _status(axis: Running) -> dict[str, Any]:
