@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import socket
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,7 @@ import pytest
 
 from servod.client.control import ControlClient, Refused
 from servod.client.processes import child, wait_until
-from servod.common.errors import ServodError, Unreachable
+from servod.common.errors import Unreachable
 from servod.common.faults import NEEDS_RESTART
 from servod.common.shipped import shipped
 from tests.starved import LOGS
@@ -164,17 +165,18 @@ class SharedAxis(Generic[_T]):
         self._held.close()
 
     def stands(self) -> _T:
-        """What runs, on an axis that can be enabled."""
-        if self._runs is None or _needs_restart(self._runs.socket):
+        """What runs, on an axis that can be enabled. A new one is told of; a daemon that is gone is not replaced."""
+        if self._runs is not None and (lost := _needs_restart(self._runs.socket)):
+            warnings.warn(pytest.PytestWarning(f"a new axis, the last one needs a new start: {lost}"), stacklevel=2)
             self.close()
+            self._runs = None
+        if self._runs is None:
             self._runs = self._held.enter_context(self._begin())
         return self._runs
 
 
-def _needs_restart(control: Path) -> bool:
-    try:
-        with ControlClient(control) as client:
-            told = {fault["code"] for fault in client.call("status")["faults"]}
-    except ServodError:
-        return True
-    return not told.isdisjoint(code.name for code in NEEDS_RESTART)
+def _needs_restart(control: Path) -> str:
+    """The faults that do, or nothing."""
+    with ControlClient(control) as client:
+        told = {fault["code"] for fault in client.call("status")["faults"]}
+    return ", ".join(code.name for code in NEEDS_RESTART if code.name in told)

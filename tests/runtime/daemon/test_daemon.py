@@ -8,29 +8,17 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
-from running import Running, SharedAxis, answers, at_rest, running, wait_for
+from running import Running, answers, at_rest, running, wait_for
 
 from servod.client.control import ControlClient
 from servod.common.errors import BadInput, Unreachable
 from servod.common.shipped import shipped
 from servod.formats.recording.mcap_reader import read_recording
-
-
-@pytest.fixture(scope="module")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SharedAxis[Running]]:
-    with closing(SharedAxis(lambda: running(tmp_path_factory.mktemp("axis")))) as found:
-        yield found
-
-
-@pytest.fixture
-def axis(shared: SharedAxis[Running]) -> Running:
-    return shared.stands()
 
 
 @pytest.fixture

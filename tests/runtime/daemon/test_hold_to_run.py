@@ -7,13 +7,11 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
-from running import Running, SharedAxis, running, wait_for
+from running import Running, wait_for
 from served import Served
 
 from servod.client.control import ControlClient
@@ -37,17 +35,6 @@ if sys.argv[2] == "hangs":
     time.sleep(30)
 os._exit(0)
 """
-
-
-@pytest.fixture(scope="module")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SharedAxis[Running]]:
-    with closing(SharedAxis(lambda: running(tmp_path_factory.mktemp("axis")))) as found:
-        yield found
-
-
-@pytest.fixture
-def axis(shared: SharedAxis[Running]) -> Running:
-    return shared.stands()
 
 
 def _status(axis: Running) -> dict[str, Any]:

@@ -1,9 +1,16 @@
 """When the loop process takes its supervisor for lost: beats that stand still, and those that never began."""
 
 import os
+import subprocess
+import sys
+from typing import Any, cast
+
+import pytest
 
 from servod.common.units import NS_PER_S
 from servod.runtime.loop.channel import Channel
+from servod.runtime.loop.handle import LoopHandle
+from servod.runtime.loop.plan import LoopPlan
 from servod.runtime.loop.process import FIRST_BEAT_S, SUPERVISOR_TIMEOUT_S, supervisor_watch
 from tests.runtime.loop.test_channel import Hand
 
@@ -37,3 +44,37 @@ def test_a_supervisor_that_never_begins_is_lost():
 def test_a_supervisor_that_died_while_this_process_began_is_lost_at_once():
     clock = Hand()
     assert not supervisor_watch(Channel(clock=clock), clock, os.getppid() + 1)()
+
+
+#: In place of the loop: ready half a second after its start.
+CHILD = """
+import sys, time
+from servod.runtime.loop.channel import Channel
+sys.stdin.read()
+channel = Channel(int(sys.argv[1]))
+time.sleep(0.5)
+channel.publish_ready([])
+"""
+
+
+class _Plan:
+    def to_json(self) -> str:
+        return "{}"
+
+
+def test_the_start_of_the_loop_is_no_beat_yet(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else the shorter patience would begin before the supervisor's rounds do."""
+    popen = subprocess.Popen
+
+    def child(command: list[str], **options: Any) -> subprocess.Popen[str]:
+        return popen([sys.executable, "-c", CHILD, command[-2]], **options)
+
+    monkeypatch.setattr(subprocess, "Popen", child)
+    loop, looks = LoopHandle(cast(LoopPlan, _Plan())), []
+    before = loop._channel.supervisor_beats()
+    loop.start(lambda: looks.append(loop._channel.supervisor_beats()))
+    assert len(looks) > 2
+    assert {*looks, loop._channel.supervisor_beats()} == {before}
+    loop.feed()
+    assert loop._channel.supervisor_beats() != before
+    loop.close()
