@@ -14,3 +14,10 @@ def on_end_signals(act: Callable[[], None]) -> None:
     for number in (*END_SIGNALS, signal.SIGINT):
         if number.name != "SIGHUP" or signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, lambda *_: act())
+
+
+def as_born_alone() -> None:
+    """Take back what the parent left of its own: children whose end nobody would hear of (SIGCHLD ignored: every one
+    then seems to have ended well), and end signals that are blocked."""
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, (*END_SIGNALS, signal.SIGINT, signal.SIGALRM))

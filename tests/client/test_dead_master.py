@@ -83,6 +83,24 @@ def test_torque_is_gone_in_time_when_sync_is_lost_at_peak_torque(
     assert session.cycle.axis.latched & FAULTS[FaultCode.DRIVE_STAYS_POWERED].bit
 
 
+@pytest.mark.parametrize("period_us", [1000, 4000, 20_000])
+def test_an_orphaned_loop_that_cannot_hear_the_drive_ends_in_a_second(period_us: int) -> None:
+    config = AxisConfig.model_validate({
+        "limits": LIMITS, "gains": {"initial": "gains.yaml"}, "cycle": {"period_us": period_us}, "heartbeat": {},
+    })  # fmt: skip
+    settings = VirtualAxisSettings(cycle_period_s=1e-6 * period_us)
+    gains = pd_set("pd", 2.5, 0.12)
+    world = SteppedWorld(settings, AxisModel.model_validate(LIGHT))
+    session = SteppedSession(config, world, gains.law.number, gains.pack())
+    session.run(0.2)
+    session.loop_bus.inject(BusFault(FaultKind.SILENT, amount=60_000, participant=1))
+    session.die(loop=False, supervisor=True)
+    session.run(0.9)
+    assert not session.cycle.finished
+    session.run(0.2)
+    assert session.cycle.finished and not session.cycle.seen_off
+
+
 def reach_peak(session: SteppedSession) -> None:
     """Run until the torque rises no more: what the limits leave a joint that nobody may command from now on."""
     before_nm = 0.0

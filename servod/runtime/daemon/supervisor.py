@@ -48,7 +48,7 @@ from servod.runtime.fieldbus.devices import DriveState
 from servod.runtime.fieldbus.master.planned import reaction_s
 from servod.runtime.fieldbus.master.sdo import SDO_TIMEOUT_S
 from servod.runtime.loop.axis_state import AxisState
-from servod.runtime.loop.cycle import GOODBYE_TIMEOUT_CYCLES
+from servod.runtime.loop.cycle import GOODBYE_TIMEOUT_S
 from servod.runtime.loop.handle import LoopHandle
 
 log = logging.getLogger("servod")
@@ -329,10 +329,9 @@ class Supervisor:
 
     def _stop_timeout_s(self) -> float:
         """Braking and ramping, or the drive's quick stop, and then the wait for a drive that shall show it is off."""
-        goodbye_s = GOODBYE_TIMEOUT_CYCLES * self._config.cycle.period_us * 1e-6
         amplifier = self._config.amplifier
         motion_s = 2.0 * self._config.limits.ramp_down_s + amplifier.enable_timeout_s + amplifier.brake.engage_s
-        return motion_s + goodbye_s + _STOP_MARGIN_S
+        return motion_s + GOODBYE_TIMEOUT_S + _STOP_MARGIN_S
 
     def _close(self) -> None:
         self._server.close(self._why_ends)

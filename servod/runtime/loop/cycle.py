@@ -37,7 +37,7 @@ _SUPERVISOR_LOST = FAULTS[FaultCode.SUPERVISOR_LOST].bit
 _NOT_PROVEN = FAULTS[FaultCode.WIRING_NOT_PROVEN].bit
 #: At a shutdown the drive must be seen without power for so many cycles, and has so many to get there.
 GOODBYE_CYCLES = 20
-GOODBYE_TIMEOUT_CYCLES = 1000
+GOODBYE_TIMEOUT_S = 1.0
 #: How long a drive that is withdrawn from stays in NMT stopped before it is asked to be pre-operational, and after how
 #: long it answers SDO again.
 _STOPPED_CYCLES = 5
@@ -121,6 +121,7 @@ class Cycle:
         )
         self._number = self._missed = self._heartbeat_due = 0
         self._last_sync_ns = self.exchange.sync_ns - self.period_ns
+        self._goodbye_cycles = max(2 * GOODBYE_CYCLES, round(GOODBYE_TIMEOUT_S / self._period_s))
         self._command_seq = self._command_result = 0
         self._tick_ns = self._torque_sent_ns = self._goodbye = self._resting = self._withdrawn = 0
 
@@ -325,7 +326,7 @@ class Cycle:
         if amplifier.age_cycles == 0:  # a cycle without an answer says nothing, neither good nor bad
             self._goodbye = self._goodbye + 1 if amplifier.state.off else 0
         self.seen_off = self._goodbye >= GOODBYE_CYCLES
-        self.finished = self.seen_off or self._resting >= GOODBYE_TIMEOUT_CYCLES
+        self.finished = self.seen_off or self._resting >= self._goodbye_cycles
 
     def let_go(self) -> None:
         """Last frame of a loop that ends in an error: the drive's quick stop, without waiting for an answer.

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from servod.formats.config import LimitsConfig, load_config
-from servod.runtime.loop.cycle import GOODBYE_TIMEOUT_CYCLES
+from servod.runtime.loop.cycle import GOODBYE_TIMEOUT_S
 
 SYSTEMD = Path(__file__).parents[3] / "systemd"
 #: Without that which is no program of servod's, but ip(8) once at the start, as root in the machine's own name spaces.
@@ -38,8 +38,7 @@ def test_no_signal_kills_the_loop_before_it_has_stopped_the_axis() -> None:
     assert _key(unit, "KillMode") == "control-group"  # SIGTERM to the loop also when the supervisor is gone
     assert _key(unit, "WatchdogSignal") == "SIGTERM"  # it too goes to the whole group
     (longest,) = [m.le for m in LimitsConfig.model_fields["ramp_down_s"].metadata if hasattr(m, "le")]
-    goodbye_s = GOODBYE_TIMEOUT_CYCLES * 0.02
-    assert float(_key(unit, "TimeoutStopSec")) > 2.0 * longest + goodbye_s
+    assert float(_key(unit, "TimeoutStopSec")) > 2.0 * longest + GOODBYE_TIMEOUT_S
 
 
 def test_the_service_waits_for_late_nodes_and_fills_no_journal() -> None:

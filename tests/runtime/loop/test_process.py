@@ -1,6 +1,7 @@
 """When the loop process takes its supervisor for lost: beats that stand still, and those that never began."""
 
 import os
+import signal
 import subprocess
 import sys
 from typing import Any, cast
@@ -78,3 +79,9 @@ def test_the_start_of_the_loop_is_no_beat_yet(monkeypatch: pytest.MonkeyPatch) -
     loop.feed()
     assert loop._channel.supervisor_beats() != before
     loop.close()
+
+
+def test_a_supervisor_that_stands_still_before_it_wrote_the_plan_is_not_waited_for_without_end() -> None:
+    code = "from servod.runtime.loop import process; process.FIRST_BEAT_S = 0.2; process.main()"
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE) as loop:
+        assert loop.wait(30.0) == -signal.SIGALRM
