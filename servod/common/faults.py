@@ -62,6 +62,7 @@ class FaultCode(IntEnum):
     DUPLICATE_NODE = 37
     ESTOP_ACTIVE = 38
     STO_ACTIVE = 39
+    OSCILLATES = 40
 
 
 #: Faults after which the nodes are not as they were configured: only a new bring-up may enable the axis again.
@@ -376,6 +377,15 @@ FAULTS: dict[FaultCode, Fault] = dict(
             "Safe torque off is active (amplifier.inputs.sto_bit or sto_error): the drive has no torque, so the joint "
             "coasts.",
             "Find who opened the STO circuit and why, close it, then `servoctl enable --reset-fault`.",
+        ),
+        _row(
+            _C.OSCILLATES,
+            _R.QUICK_STOP,
+            "The torque swings to and fro by more than limits.oscillation_nm, again and again, and the reference does "
+            "not ask for it: the feedback loop is unstable, or something shakes the joint.",
+            "Go back to gains that were quiet (`servoctl gains rollback`); look for a loose coupling, a lower torque "
+            "rate, a longer delay or another inertia than the gains were designed for; then `servoctl enable "
+            "--reset-fault`.",
         ),
     ]
 )

@@ -94,6 +94,13 @@ class LimitsConfig(Strict):
         description="most distance of the torque that the drive says it gives (0x6077) and what it was told; beyond "
         "for 50 cycles: quick stop (TORQUE_IMPLAUSIBLE); left out: a quarter of torque_nm",
     )
+    oscillation_nm: float | None = Field(
+        None,
+        ge=1e-6,
+        le=1e6,
+        description="peak-to-peak torque that counts as a swing; 6 that the reference does not ask for, of which one "
+        "in two seconds is forgotten: quick stop (OSCILLATES); left out: half of torque_nm; twice torque_nm: never",
+    )
     stale_cycles: int = Field(
         5, ge=1, le=1000, description="cycles in a row without fresh feedback; as many: quick stop (FEEDBACK_STALE)"
     )

@@ -27,6 +27,7 @@ from servod.runtime.loop.controller import Controller
 from servod.runtime.loop.exchange import Exchange
 from servod.runtime.loop.limits import Limits
 from servod.runtime.loop.orders import Orders
+from servod.runtime.loop.oscillation import Oscillation, least_swing_nm
 from servod.runtime.loop.plan import LoopPlan
 from servod.runtime.loop.references import Reference
 from servod.runtime.loop.wiring.checks import wiring_test_bounds
@@ -35,6 +36,7 @@ from servod.runtime.loop.wiring.wiring_test import WiringTest
 
 _SUPERVISOR_LOST = FAULTS[FaultCode.SUPERVISOR_LOST].bit
 _NOT_PROVEN = FAULTS[FaultCode.WIRING_NOT_PROVEN].bit
+_OSCILLATES = FAULTS[FaultCode.OSCILLATES].bit
 #: At a shutdown the drive must be seen without power for so many cycles, and has so many to get there.
 GOODBYE_CYCLES = 20
 GOODBYE_TIMEOUT_S = 1.0
@@ -102,6 +104,7 @@ class Cycle:
         self.axis.carry(plan.carried)
         self.limits = Limits(config.limits, plan.stop)
         self._limit_nm = self.limits.torque_nm
+        self.oscillation = Oscillation(least_swing_nm(config.limits))
         self._drive_limit_nm = float(plan.amplifier.facts.get("most_torque_nm", self._limit_nm))
         bounds = wiring_test_bounds(config, plan.amplifier.facts)
         self.proof, self._proof_travel_rad = WiringTest(bounds), bounds.most_travel_rad
@@ -206,10 +209,15 @@ class Cycle:
         if ramping:
             wanted_nm = self.limits.ramp(self._ramp_from_nm, output.torque_share, encoder.velocity_rad_s)
         sent_nm, faults = self.limits.limit_torque(wanted_nm, dt_s)
-        if faults:
-            self.axis.raise_fault(faults)
         if not ramping:
             self._ramp_from_nm = sent_nm
+            if self.oscillation.look(
+                sent_nm - reference.torque_nm, reference.position_rad, reference.velocity_rad_s,
+                reference.acceleration_rad_s2, dt_s,
+            ):  # fmt: skip
+                faults |= _OSCILLATES
+        if faults:
+            self.axis.raise_fault(faults)
         self.torque_nm = sent_nm
         return _Torque(sent_nm, law.u, law.feedback, law.friction, law.other)
 
@@ -248,6 +256,7 @@ class Cycle:
         """First controlled cycle: stay where the joint is, go on from the torque that the drive was told last."""
         self.limits.torque_nm = self._drive_limit_nm  # more would be clipped there, unseen by the law
         self.limits.arm(amplifier, encoder, self.torque_nm)
+        self.oscillation.begin(encoder.position_rad)
         self._ramp_from_nm = self.torque_nm
         self.reference.hold(encoder.position_rad)
         self.controller.reset(self.torque_nm)

@@ -1,0 +1,184 @@
+"""A loop that swings by itself is told from one whose reference swings, by drawn motions and on the virtual axis."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from servod.client.stepped import SteppedSession
+from servod.client.virtual import virtual_config, virtual_session
+from servod.common.faults import FAULTS, FaultCode
+from servod.formats.gains.gain_set import load_gains
+from servod.formats.model.axis_model import AxisModel, load_axis_model
+from servod.formats.model.effects import JointElasticity
+from servod.kernels.laws import LAWS
+from servod.runtime.loop.axis_state import AxisState
+from servod.runtime.loop.commands import Op, ReferenceKind
+from servod.runtime.loop.oscillation import Oscillation, Turns, least_swing_nm
+from tests.runtime.loop.boundary.feedback import CONFIG
+
+DT_S = 1e-3
+OSCILLATES = FAULTS[FaultCode.OSCILLATES].bit
+SHIPPED = Path(__file__).parents[3] / "gains"
+JOINT = load_axis_model(SHIPPED / "axes/table1_joint.yaml")
+CERTIFIED = load_gains(SHIPPED / "demo_local_certified.yaml")
+STIFF, STIFFER = (LAWS["pd"].number, 3, 20.0, 0.2, 0.0), (LAWS["pd"].number, 3, 40.0, 0.3, 0.0)
+DESIGNED = (CERTIFIED.law.number, len(CERTIFIED.pack()), *CERTIFIED.pack())
+
+
+def turning_points(values: list[int], least: int) -> int:
+    """By the definition: the longest sequence of values that falls and rises in turn, each time by more than that."""
+    falls, rises = [0] * len(values), [0] * len(values)  # the longest that ends here, its last step down or up
+    for n, value in enumerate(values):
+        for m in range(n):
+            if values[m] - value > least:
+                falls[n] = max(falls[n], rises[m] + 1)
+            if value - values[m] > least and falls[m]:
+                rises[n] = max(rises[n], falls[m] + 1)
+    return max(falls + rises)
+
+
+@given(st.lists(st.integers(-20, 20), min_size=1, max_size=60), st.integers(0, 10))
+def test_turning_points_alternate_and_are_far_enough_apart(values: list[int], least: int) -> None:
+    turns = Turns()
+    at = [n for n, value in enumerate(values) if turns.step(value, least)]
+    assert len(at) == turning_points(values, least)
+    for n, (before, after) in enumerate(itertools.pairwise(at)):
+        falls = n % 2 == 0  # the first turn ends a rise
+        between = values[before : after + 1]
+        assert (values[after] - min(between) if falls else max(between) - values[after]) > least
+
+
+def told(torque: list[float], positions: list[float], swing_nm: float = 0.1) -> float:
+    """When the loop was said to swing by itself, s; infinite: never. Velocities are differences of the positions."""
+    look, last_rad, last_rad_s = Oscillation(swing_nm), positions[0], 0.0
+    look.begin(last_rad)
+    for n, (u, x) in enumerate(zip(torque, positions, strict=True)):
+        v = (x - last_rad) / DT_S
+        if look.look(u, x, v, (v - last_rad_s) / DT_S, DT_S):
+            return n * DT_S
+        last_rad, last_rad_s = x, v
+    return math.inf
+
+
+TONES = st.lists(st.tuples(st.floats(0.05, 30.0), st.floats(0.1, 2.0), st.floats(0.0, 6.0)), min_size=1, max_size=3)
+
+
+@settings(max_examples=40)
+@given(TONES, st.floats(1e-4, 0.1), st.floats(0.01, 0.5), st.floats(0.0, 0.5))
+def test_what_the_reference_asks_for_is_no_oscillation(
+    tones: list[tuple[float, float, float]], inertia: float, dry: float, viscous: float
+) -> None:
+    """Ten seconds of tones (Hz, rad/s, phase), and the torque that inertia and friction need for them, all of it."""
+
+    def at(order: int, t: float) -> float:
+        return sum(
+            v * (2.0 * math.pi * f) ** (order - 1) * math.sin(2.0 * math.pi * f * t + p + order * math.pi / 2.0)
+            for f, v, p in tones
+        )
+
+    times = [n * DT_S for n in range(10_000)]
+    speeds = [at(1, t) for t in times]
+    torque = [inertia * at(2, t) + math.copysign(dry, v) + viscous * v for t, v in zip(times, speeds, strict=True)]
+    assert told(torque, [at(0, t) for t in times], 0.5 * max(map(abs, torque))) == math.inf
+
+
+@given(st.floats(4.0, 400.0), st.floats(0.0, 6.0), st.floats(0.0, 1.0))
+def test_a_swing_beside_a_reference_at_rest_or_in_slow_motion_is_told(hz: float, phase: float, speed: float) -> None:
+    times = [n * DT_S for n in range(3000)]
+    own = [0.08 * math.sin(2.0 * math.pi * hz * t + phase) for t in times]
+    half_s = max(0.05, 0.5 / hz)
+    assert told(own, [0.2] * len(times)) <= 9.0 * half_s
+    assert told(own, [0.2 + speed * t for t in times]) <= 12.0 * half_s  # which begins with a jump of the speed
+
+
+@given(st.floats(0.5, 400.0), st.floats(0.0, 6.0))
+def test_a_swing_that_is_too_small_is_none(hz: float, phase: float) -> None:
+    times = [n * DT_S for n in range(3000)]
+    assert told([0.049 * math.sin(2.0 * math.pi * hz * t + phase) for t in times], [0.0] * len(times)) == math.inf
+
+
+@pytest.mark.parametrize(("hz", "zeta"), [(20.0, 0.06), (250.0, 0.01)])
+def test_what_rings_down_after_each_step_is_none(hz: float, zeta: float) -> None:
+    """A step of the reference each second, and a torque that answers it with its limit and rings down."""
+    torque, positions = [], []
+    for n in range(10_000):
+        t = n * DT_S % 1.0
+        torque.append(0.1 * math.exp(-2.0 * math.pi * hz * zeta * t) * math.cos(2.0 * math.pi * hz * t))
+        positions.append(0.1 * (n // 1000))
+    assert told(torque, positions) == math.inf
+
+
+def test_half_the_torque_limit_counts_unless_stated() -> None:
+    assert least_swing_nm(CONFIG) == 0.5 * CONFIG.torque_nm
+    assert least_swing_nm(CONFIG.model_copy(update={"oscillation_nm": 0.3})) == 0.3
+
+
+# --- on the virtual axis ----------------------------------------------------------------------------------------------
+
+
+def axis(
+    folder: Path, joint: AxisModel = JOINT, law: tuple[float, ...] = STIFF, limits: dict[str, float] | None = None
+) -> SteppedSession:
+    """Enabled; both laws suit the joint of Table I."""
+    config = virtual_config(folder, 100, 2**20)
+    config = config.model_copy(update={"limits": config.limits.model_copy(update=limits or {})})
+    session = virtual_session(joint, folder, 2**20, 1, config)
+    session.send(Op.ACTIVATE, (1, *law))
+    session.enable()
+    session.run(0.1)
+    session.clear()
+    return session
+
+
+STEP, PAPER = (ReferenceKind.STEP, 0.01, 4.0), (ReferenceKind.PAPER, 3.0)
+SINES = [(ReferenceKind.SINE, 0.1, 2.0, 4.0), (ReferenceKind.SINE, 0.005, 12.0, 4.0)]
+
+
+@pytest.mark.parametrize("law", [STIFF, DESIGNED], ids=["PD", "designed"])
+@pytest.mark.parametrize("motion", [STEP, PAPER, *SINES])
+def test_a_sound_axis_is_let_alone(tmp_path: Path, motion: tuple[float, ...], law: tuple[float, ...]) -> None:
+    session = axis(tmp_path, law=law)
+    session.send(Op.REFERENCE, motion)
+    session.run(3.0)
+    assert session.cycle.axis.state is AxisState.ENABLED
+    assert not session.cycle.axis.latched & OSCILLATES
+
+
+def loose_coupling(hz: float) -> AxisModel:
+    """Half of the inertia behind a spring that resonates there."""
+    half = JOINT.inertia / 2.0
+    stiffness = (2.0 * math.pi * hz) ** 2 * half / 2.0
+    spring = JointElasticity(stiffness=stiffness, load_inertia=half, damping=0.01 * math.sqrt(stiffness * half))
+    return JOINT.model_copy(update={"joint_elasticity": spring})
+
+
+@pytest.mark.parametrize(
+    ("joint", "law", "limits", "within_s"),
+    [
+        pytest.param(JOINT, STIFF, {"torque_rate_nm_per_s": 1.5}, 2.0, id="torque rate"),
+        pytest.param(JOINT.model_copy(update={"delay_s": 0.004}), STIFFER, {}, 1.0, id="delay"),
+        pytest.param(loose_coupling(250.0), DESIGNED, {}, 1.0, id="coupling"),
+    ],
+)
+def test_an_unstable_loop_is_stopped_by_the_drive(
+    tmp_path: Path, joint: AxisModel, law: tuple[float, ...], limits: dict[str, float], within_s: float
+) -> None:
+    session = axis(tmp_path, joint, law, limits)
+    session.send(Op.REFERENCE, STEP)
+    session.run(within_s)
+    assert session.cycle.axis.latched & OSCILLATES
+    session.run(1.0)
+    assert session.cycle.axis.state is AxisState.FAULT
+    assert abs(session.world.truth().velocity_rad_s) < 1e-2
+    first = next(n for n, row in enumerate(session.records) if row.faults & OSCILLATES)
+    assert all(row.torque_nm == 0.0 for row in session.records[first:])
+    held = axis(tmp_path, joint, law, limits | {"oscillation_nm": 0.6})  # twice the torque limit: never
+    held.send(Op.REFERENCE, STEP)
+    held.run(within_s)
+    assert held.cycle.axis.state is AxisState.ENABLED
