@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import cvxpy as cp
 import numpy as np
@@ -77,25 +76,57 @@ class Solved:
 def solve(region: Region, parts: frozenset[str], strict: float = STRICT) -> Solved | None:
     """The programme over all vertices with the named constraints; None when it is infeasible.
 
-    Every inequality holds by `strict`, in scaled units.
+    Every inequality holds by `strict`, in scaled units. Each is handed over as one affine map of all unknowns: built
+    of cvxpy's own blocks, reading them took it forty times as long as solving.
     """
-    p, y = cp.Variable((3, 3), symmetric=True), cp.Variable((1, 3))
-    outputs = _outputs(region, p, y) / region.wishes.torque_weight
-    rows = outputs.shape[0]
-    q = cp.Variable((rows, rows), symmetric=True)
-    constraints = [cp.bmat([[q, outputs], [outputs.T, p]]) >> strict * np.eye(3 + rows), p >> strict * np.eye(3)]
+    rows = _output_rows(region)
     size = disturbance_size(region)
-    for vertex in region.found:
-        constraints += [
-            block >> strict * np.eye(block.shape[0]) for block in _blocks(vertex, region, size, parts, p, y)
-        ]
-    problem = cp.Problem(cp.Minimize(cp.trace(q)), constraints)
-    if not solved(problem, region.wishes.solver) or p.value is None:
+    count_p, count_q = _entries(3), _entries(rows)
+
+    def unknowns(x: Array) -> tuple[Array, Array, Array]:
+        return _symmetric(x[:count_p], 3), x[count_p:-count_q][None], _symmetric(x[-count_q:], rows)
+
+    def matrices(x: Array) -> list[Array]:
+        p, y, q = unknowns(x)
+        outputs = _outputs(region, p, y) / region.wishes.torque_weight
+        found = [np.block([[q, outputs], [outputs.T, p]]), p]
+        return found + [block for vertex in region.found for block in _blocks(vertex, region, size, parts, p, y)]
+
+    count = count_p + 3 + count_q
+    x, none = cp.Variable(count), matrices(np.zeros(count))
+    slopes = zip(*(matrices(unit) for unit in np.eye(count)), strict=True)
+    constraints = []
+    for offset, parts_of in zip(none, slopes, strict=True):
+        n = len(offset)
+        slope = np.stack([(part - offset).ravel() for part in parts_of], axis=1)
+        constraints.append(cp.reshape(slope @ x + offset.ravel(), (n, n), order="C") >> strict * np.eye(n))
+    weights = np.concatenate([np.zeros(count_p + 3), _traced(rows)])
+    problem = cp.Problem(cp.Minimize(weights @ x), constraints)
+    if not solved(problem, region.wishes.solver) or x.value is None:
         return None
     unit = size * region.wishes.torque_weight
-    values = [np.asarray(value, dtype=np.float64) for value in (p.value, y.value[0], q.value)]
+    p, y, q = unknowns(np.asarray(x.value, dtype=np.float64))
     norm = unit * math.sqrt(max(float(problem.value), 0.0))
-    return Solved(size**2 * values[0], size**2 * values[1], unit**2 * values[2], norm)
+    return Solved(size**2 * p, size**2 * y[0], unit**2 * q, norm)
+
+
+def _entries(size: int) -> int:
+    return size * (size + 1) // 2
+
+
+def _symmetric(entries: Array, size: int) -> Array:
+    """The symmetric matrix of its upper triangle, row by row."""
+    upper = np.zeros((size, size))
+    upper[np.triu_indices(size)] = entries
+    found: Array = upper + np.triu(upper, 1).T
+    return found
+
+
+def _traced(size: int) -> Array:
+    """Which of the entries stand on the diagonal."""
+    rows, columns = np.triu_indices(size)
+    found: Array = (rows == columns).astype(np.float64)
+    return found
 
 
 def disturbance_size(region: Region) -> float:
@@ -104,15 +135,21 @@ def disturbance_size(region: Region) -> float:
     return largest / math.sqrt(RATE_PER_S)
 
 
-def _outputs(region: Region, p: Any, y: Any) -> Any:
+def _output_rows(region: Region) -> int:
+    return 1 if region.wishes.output is ReferenceOutput.SCALAR else 2
+
+
+def _outputs(region: Region, p: Array, y: Array) -> Array:
     """(C' + D' K_u*) P, as in servod.lab.verify.reference_proof.output_rows."""
     w = region.wishes
     position = np.array([[0.0, w.position_weight * region.scale[1], 0.0]]) @ p
     torque = w.torque_weight * y
-    return position + torque if w.output is ReferenceOutput.SCALAR else cp.vstack([position, torque])
+    return position + torque if w.output is ReferenceOutput.SCALAR else np.vstack([position, torque])
 
 
-def _blocks(vertex: ContinuousVertex, region: Region, size: float, parts: frozenset[str], p: Any, y: Any) -> list[Any]:
+def _blocks(
+    vertex: ContinuousVertex, region: Region, size: float, parts: frozenset[str], p: Array, y: Array
+) -> list[Array]:
     """The matrices of one vertex that must be positive, by constraint: see servod.lab.verify.reference_proof."""
     w, scale = region.wishes, region.scale
     flow = (vertex.a * (scale / scale[:, None]) @ p + vertex.b2 / scale[:, None] @ y) / RATE_PER_S
@@ -120,9 +157,9 @@ def _blocks(vertex: ContinuousVertex, region: Region, size: float, parts: frozen
     theta = float(np.arccos(w.least_damping))
     wide, skew = np.sin(theta) * both, np.cos(theta) * (flow - flow.T)
     known = {
-        "norm": -cp.bmat([[both, b1], [b1.T, -np.eye(b1.shape[1])]]),
+        "norm": -np.block([[both, b1], [b1.T, -np.eye(b1.shape[1])]]),
         "decay": -both - 2.0 * w.least_decay_per_s / RATE_PER_S * p,
-        "damping": -cp.bmat([[wide, skew], [-skew, wide]]),
+        "damping": -np.block([[wide, skew], [-skew, wide]]),
     }
     return [known[part] for part in PARTS if part in parts]
 
@@ -142,13 +179,14 @@ def reference(
     intervals: Polytope,
     wishes: ReferenceWishes | None = None,
     strict: float = STRICT,
+    why: bool = True,
 ) -> ReferenceAnswer:
-    """The reference design of one region: the proof with its gains, or the clash."""
+    """The reference design of one region: the proof with its gains, or the clash, where `why` asks for it."""
     region = programme(friction, span, intervals, wishes or ReferenceWishes())
     solved = solve(region, frozenset(PARTS), strict)
     if solved is not None:
         return ReferenceAnswer(_proof(span, intervals, region, solved), solved.norm, ())
-    return ReferenceAnswer(None, None, tuple(_clashes(span, region)))
+    return ReferenceAnswer(None, None, tuple(_clashes(span, region)) if why else ())
 
 
 def _proof(span: Span, intervals: Polytope, region: Region, solved: Solved) -> ReferenceProof:

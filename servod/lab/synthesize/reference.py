@@ -17,7 +17,7 @@ from servod.formats.model.axis_model import AxisModel
 from servod.lab.synthesize.deployed import Wishes, empty_design
 from servod.lab.synthesize.gain_set import DesignOptions, gain_set, parameters
 from servod.lab.synthesize.infeasible import Infeasible, Relaxation, largest_factor
-from servod.lab.synthesize.lmi_reference import PARTS, ReferenceAnswer, ReferenceWishes, programme, reference, solve
+from servod.lab.synthesize.lmi_reference import ReferenceAnswer, ReferenceWishes, reference
 from servod.lab.synthesize.regions import narrowed
 from servod.lab.verify.reference_proof import gain_numbers, polytope, reference_gains, reference_margin
 from servod.lab.verify.steady_friction import SteadyFriction, steady_friction
@@ -38,12 +38,15 @@ class ReferenceFrame:
     spans: tuple[Span, Span]
     asked: ReferenceWishes
 
-    def answer(self, span: Span) -> ReferenceAnswer:
-        """The proof of one region, held by eigenvalues and with a feedback that the law may have; or the clash."""
+    def answer(self, span: Span, why: bool = True) -> ReferenceAnswer:
+        """The proof of one region, held by eigenvalues and with a feedback that the law may have; or the clash.
+
+        Without `why` no clash is searched for.
+        """
         intervals = polytope(self.friction, self.law.friction, span, self.design.uncertainty)
         problems: list[str] = []
         for strict in STRICTNESS:
-            found = reference(self.friction, span, intervals, self.asked, strict)
+            found = reference(self.friction, span, intervals, self.asked, strict, why and not problems)
             if found.proof is None:
                 return ReferenceAnswer(None, None, tuple(problems) or found.clashes)
             problems = usable(self.design, found.proof)
@@ -53,10 +56,7 @@ class ReferenceFrame:
 
     def feasible(self, span: Span) -> bool:
         """Whether the region has a usable solution; no search for what clashes."""
-        intervals = polytope(self.friction, self.law.friction, span, self.design.uncertainty)
-        if solve(programme(self.friction, span, intervals, self.asked), frozenset(PARTS)) is None:
-            return False
-        return self.answer(span).proof is not None
+        return self.answer(span, why=False).proof is not None
 
 
 def usable(design: Design, proof: ReferenceProof) -> list[str]:
