@@ -6,7 +6,7 @@ with one line on standard error and an exit code (0 done, 1 the answer is no, 2 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 #: Longest part of a message; what stood in a file may be of any length.
 _MOST_SHOWN = 600
@@ -16,6 +16,17 @@ class ServodError(Exception):
     """Base of all errors that a command reports in one line; `exit_code` is what the process returns."""
 
     exit_code = 1
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """As it is, whatever its parts were: an error that cannot be read on its way from a worker process to its
+        parent looks as if the worker had died."""
+        return _as_it_was, (type(self), self.args, self.__dict__)
+
+
+def _as_it_was(kind: type[ServodError], args: tuple[Any, ...], parts: dict[str, Any]) -> ServodError:
+    error = kind.__new__(kind, *args)
+    error.__dict__.update(parts)
+    return error
 
 
 class AnswerIsNo(ServodError):
