@@ -16,8 +16,12 @@ def on_end_signals(act: Callable[[], None]) -> None:
             signal.signal(number, lambda *_: act())
 
 
-def as_born_alone() -> None:
-    """Take back what the parent left of its own: children whose end nobody would hear of (SIGCHLD ignored: every one
-    then seems to have ended well), and end signals that are blocked."""
-    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, (*END_SIGNALS, signal.SIGINT, signal.SIGALRM))
+def restore_inherited_signals() -> None:
+    """Take back what the parent left of its own, first of all in a process that has children or deadlines.
+
+    Where SIGCHLD is ignored nobody hears how a child ended, and each seems to have ended well; signals that are blocked
+    end nothing. SIGALRM is the loop's own deadline. Nothing to do on Windows.
+    """
+    if hasattr(signal, "pthread_sigmask"):
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, (*END_SIGNALS, signal.SIGINT, signal.SIGALRM))

@@ -15,7 +15,7 @@ from servod.runtime.daemon.main import main
 main(["--config", "missing.yaml", "--check"])
 child = subprocess.Popen([sys.executable, "-c", "import os, signal; os.kill(os.getpid(), signal.SIGKILL)"])
 blocked = signal.pthread_sigmask(signal.SIG_BLOCK, ())
-print(child.wait(), sorted({signal.SIGTERM, signal.SIGINT, signal.SIGHUP} & blocked))
+print(child.wait(), sorted({signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGALRM} & blocked))
 """
 
 

@@ -77,7 +77,7 @@ def solve(region: Region, parts: frozenset[str], strict: float = STRICT) -> Solv
     """The programme over all vertices with the named constraints; None when it is infeasible.
 
     Every inequality holds by `strict`, in scaled units. Each is handed over as one affine map of all unknowns: built
-    of cvxpy's own blocks, reading them took it forty times as long as solving.
+    of cvxpy's own blocks, reading them took it ten times as long as solving.
     """
     rows = _output_rows(region)
     size = disturbance_size(region)
@@ -93,14 +93,14 @@ def solve(region: Region, parts: frozenset[str], strict: float = STRICT) -> Solv
         return found + [block for vertex in region.found for block in _blocks(vertex, region, size, parts, p, y)]
 
     count = count_p + 3 + count_q
-    x, none = cp.Variable(count), matrices(np.zeros(count))
+    x, at_zero = cp.Variable(count), matrices(np.zeros(count))
     slopes = zip(*(matrices(unit) for unit in np.eye(count)), strict=True)
     constraints = []
-    for offset, parts_of in zip(none, slopes, strict=True):
+    for offset, columns in zip(at_zero, slopes, strict=True):
         n = len(offset)
-        slope = np.stack([(part - offset).ravel() for part in parts_of], axis=1)
+        slope = np.stack([(column - offset).ravel() for column in columns], axis=1)
         constraints.append(cp.reshape(slope @ x + offset.ravel(), (n, n), order="C") >> strict * np.eye(n))
-    weights = np.concatenate([np.zeros(count_p + 3), _traced(rows)])
+    weights = np.concatenate([np.zeros(count_p + 3), _diagonal_weights(rows)])
     problem = cp.Problem(cp.Minimize(weights @ x), constraints)
     if not solved(problem, region.wishes.solver) or x.value is None:
         return None
@@ -122,7 +122,7 @@ def _symmetric(entries: Array, size: int) -> Array:
     return found
 
 
-def _traced(size: int) -> Array:
+def _diagonal_weights(size: int) -> Array:
     """Which of the entries stand on the diagonal."""
     rows, columns = np.triu_indices(size)
     found: Array = (rows == columns).astype(np.float64)

@@ -19,7 +19,7 @@ from pathlib import Path
 from servod import __version__
 from servod.common.arguments import ArgumentParser
 from servod.common.clock import WallClock
-from servod.common.end_signals import as_born_alone, on_end_signals
+from servod.common.end_signals import on_end_signals, restore_inherited_signals
 from servod.common.errors import BadInput, ServodError, Unreachable
 from servod.common.faults import FaultCode, fault_text
 from servod.common.files import reason
@@ -234,10 +234,7 @@ def _record_from_the_start(recorder: Recorder) -> None:
 
 
 def _start_loop(loop: LoopHandle, nodes: Nodes) -> None:
-    try:
-        loop.start(nodes.look_for_strangers)
-    except OSError as error:  # a limit on open files or processes
-        raise Unreachable(f"the loop process cannot be started ({reason(error)}); see `ulimit -a`") from None
+    loop.start(nodes.look_for_strangers)
     nodes.hand_over()
     for grant in loop.grants:
         log.log(
@@ -334,7 +331,7 @@ def _stop_on_signals(supervisor: Supervisor) -> None:
 def main(arguments: list[str] | None = None) -> int:
     """Run the daemon; returns the exit code, with one line on standard error when it is not 0."""
     set_up_logging()
-    as_born_alone()
+    restore_inherited_signals()
     try:
         options = parser().parse_args(arguments)
         if options.check:

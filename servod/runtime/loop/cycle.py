@@ -27,7 +27,7 @@ from servod.runtime.loop.controller import Controller
 from servod.runtime.loop.exchange import Exchange
 from servod.runtime.loop.limits import Limits
 from servod.runtime.loop.orders import Orders
-from servod.runtime.loop.oscillation import Oscillation, least_swing_nm
+from servod.runtime.loop.oscillation import Oscillation
 from servod.runtime.loop.plan import LoopPlan
 from servod.runtime.loop.references import Reference
 from servod.runtime.loop.wiring.checks import wiring_test_bounds
@@ -104,7 +104,7 @@ class Cycle:
         self.axis.carry(plan.carried)
         self.limits = Limits(config.limits, plan.stop)
         self._limit_nm = self.limits.torque_nm
-        self.oscillation = Oscillation(least_swing_nm(config.limits))
+        self.oscillation = Oscillation(config.limits.oscillation_nm)
         self._drive_limit_nm = float(plan.amplifier.facts.get("most_torque_nm", self._limit_nm))
         bounds = wiring_test_bounds(config, plan.amplifier.facts)
         self.proof, self._proof_travel_rad = WiringTest(bounds), bounds.most_travel_rad
@@ -115,6 +115,7 @@ class Cycle:
             self.axis, self.reference, self.controller, self.limits, self.proof, config.wiring_proof.enabled,
             link.trajectory, self._period_s, plan.serial, self.shut_down,
         )  # fmt: skip
+        self._judged_serial = plan.serial
         self.shutting_down = self.finished = self.seen_off = False
         self.torque_nm = self.encoder_position_rad = 0.0
         self._ramp_from_nm = 0.0
@@ -211,10 +212,10 @@ class Cycle:
         sent_nm, faults = self.limits.limit_torque(wanted_nm, dt_s)
         if not ramping:
             self._ramp_from_nm = sent_nm
-            if self.oscillation.look(
-                sent_nm - reference.torque_nm, reference.position_rad, reference.velocity_rad_s,
-                reference.acceleration_rad_s2, dt_s,
-            ):  # fmt: skip
+            if reference.injects or self.orders.controller_serial != self._judged_serial:
+                self._judged_serial = self.orders.controller_serial
+                self.oscillation.begin(reference.position_rad, self.limits.torque_nm)
+            if self.oscillation.look(sent_nm, reference.position_rad, reference.velocity_rad_s, dt_s):
                 faults |= _OSCILLATES
         if faults:
             self.axis.raise_fault(faults)
@@ -256,7 +257,7 @@ class Cycle:
         """First controlled cycle: stay where the joint is, go on from the torque that the drive was told last."""
         self.limits.torque_nm = self._drive_limit_nm  # more would be clipped there, unseen by the law
         self.limits.arm(amplifier, encoder, self.torque_nm)
-        self.oscillation.begin(encoder.position_rad)
+        self.oscillation.begin(encoder.position_rad, self.limits.torque_nm)
         self._ramp_from_nm = self.torque_nm
         self.reference.hold(encoder.position_rad)
         self.controller.reset(self.torque_nm)

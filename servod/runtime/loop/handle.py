@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 
 from servod.common.errors import BadInput, Unreachable
+from servod.common.files import reason
 from servod.formats.recording.record import CycleRecord
 from servod.runtime.loop.channel import MAX_ARGUMENTS, TRAJECTORY_SAMPLES, Channel
 from servod.runtime.loop.commands import Op
@@ -40,16 +41,20 @@ class LoopHandle:
         `meanwhile` is done again and again until then; what it raises ends the start.
         """
         fd = self._channel.fd
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "servod.runtime.loop.process", str(fd), str(os.getpid())],
-            stdin=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            pass_fds=(fd,),
-            text=True,
-        )
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "servod.runtime.loop.process", str(fd), str(os.getpid())],
+                stdin=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                pass_fds=(fd,),
+                text=True,
+            )
+        except OSError as error:  # a limit on open files or processes
+            raise Unreachable(f"the loop process cannot be started ({reason(error)}); see `ulimit -a`") from None
         assert self._process.stdin is not None
-        self._process.stdin.write(self.plan.to_json())
-        self._process.stdin.close()
+        with contextlib.suppress(BrokenPipeError):  # what it died of is told below
+            self._process.stdin.write(self.plan.to_json())
+            self._process.stdin.close()
         self._wait_until_ready(meanwhile)
 
     @property
@@ -145,6 +150,8 @@ class LoopHandle:
         while not self._channel.ready:
             if not self.alive():
                 words = self.last_words().strip().splitlines()
+                if self.exit_code == -signal.SIGALRM:
+                    words = ["it was not told its plan in time: is the machine busy with other work?"]
                 raise Unreachable(f"the loop process ended at its start: {words[-1] if words else 'no message'}")
             if time.monotonic() > deadline:
                 late = f"the loop process did not begin within {START_TIMEOUT_S:.0f} s"

@@ -26,6 +26,7 @@ _DOUBTFUL = sum(
         FaultCode.ENCODER_IMPLAUSIBLE,
         FaultCode.ENCODER_ALARM,
         FaultCode.TORQUE_IMPLAUSIBLE,
+        FaultCode.OSCILLATES,
         FaultCode.NOT_FINITE,
         FaultCode.WIRING_NOT_PROVEN,
     )

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from servod.common.clock import Clock, WallClock
-from servod.common.end_signals import on_end_signals
+from servod.common.end_signals import on_end_signals, restore_inherited_signals
 from servod.common.units import NS_PER_S
 from servod.runtime.fieldbus.bus.open import open_bus
 from servod.runtime.loop.channel import Channel
@@ -92,6 +92,7 @@ def _plan_in_time() -> str:
 
 def main() -> int:
     """Entry point of the loop process; 0 when the drive was seen switched off at the end, else NOT_SEEN_OFF."""
+    restore_inherited_signals()
     plan = LoopPlan.from_json(_plan_in_time())
     channel, clock = Channel(int(sys.argv[1])), WallClock()
     bus = open_bus(plan.config.bus)

@@ -140,6 +140,11 @@ class Reference:
         """No motion, or its time stands still."""
         return not self.active or self._scale == 0.0
 
+    @property
+    def injects(self) -> bool:
+        """The motion adds torque of its own."""
+        return self._motion is not None and self._motion.torque_nm is not None
+
     def hold(self, position_rad: float) -> None:
         """End any motion; stay at `position_rad`."""
         self.active, self._motion, self._base_rad = False, None, position_rad

@@ -69,7 +69,7 @@ class UnitMachine(Machine):
         begun_anew()
 
     def stop_daemon(self) -> None:
-        """At once: an orderly end waits 1000 cycles, 20 s here, for a drive that is not heard any more."""
+        """At once: an orderly end waits for a drive that is not heard any more."""
         shell("systemctl", "kill", "--signal=KILL", UNIT)
         shell("systemctl", "stop", UNIT)
 

@@ -19,10 +19,10 @@ from servod.formats.model.effects import JointElasticity
 from servod.kernels.laws import LAWS
 from servod.runtime.loop.axis_state import AxisState
 from servod.runtime.loop.commands import Op, ReferenceKind
-from servod.runtime.loop.oscillation import Oscillation, Turns, least_swing_nm
-from tests.runtime.loop.boundary.feedback import CONFIG
+from servod.runtime.loop.oscillation import Oscillation, Turns
 
 DT_S = 1e-3
+FASTEST = 20.0
 OSCILLATES = FAULTS[FaultCode.OSCILLATES].bit
 SHIPPED = Path(__file__).parents[3] / "gains"
 JOINT = load_axis_model(SHIPPED / "axes/table1_joint.yaml")
@@ -54,15 +54,15 @@ def test_turning_points_alternate_and_are_far_enough_apart(values: list[int], le
         assert (values[after] - min(between) if falls else max(between) - values[after]) > least
 
 
-def told(torque: list[float], positions: list[float], swing_nm: float = 0.1) -> float:
-    """When the loop was said to swing by itself, s; infinite: never. Velocities are differences of the positions."""
-    look, last_rad, last_rad_s = Oscillation(swing_nm), positions[0], 0.0
-    look.begin(last_rad)
-    for n, (u, x) in enumerate(zip(torque, positions, strict=True)):
-        v = (x - last_rad) / DT_S
-        if look.look(u, x, v, (v - last_rad_s) / DT_S, DT_S):
+def first_alarm_s(torque: list[float], positions: list[float], swing_nm: float = 0.1) -> float:
+    """When the loop was said to swing by itself, infinite: never. The reference as a table gives it: lines between its
+    positions; where it jumps, as a step does, with no velocity."""
+    found = Oscillation(swing_nm)
+    found.begin(positions[0], math.inf)
+    for n, (u, x, following) in enumerate(zip(torque, positions, [*positions[1:], positions[-1]], strict=True)):
+        velocity = (following - x) / DT_S
+        if found.look(u, x, velocity if abs(velocity) < FASTEST else 0.0, DT_S):
             return n * DT_S
-        last_rad, last_rad_s = x, v
     return math.inf
 
 
@@ -85,38 +85,58 @@ def test_what_the_reference_asks_for_is_no_oscillation(
     times = [n * DT_S for n in range(10_000)]
     speeds = [at(1, t) for t in times]
     torque = [inertia * at(2, t) + math.copysign(dry, v) + viscous * v for t, v in zip(times, speeds, strict=True)]
-    assert told(torque, [at(0, t) for t in times], 0.5 * max(map(abs, torque))) == math.inf
+    assert first_alarm_s(torque, [at(0, t) for t in times], max(map(abs, torque))) == math.inf
 
 
 @given(st.floats(4.0, 400.0), st.floats(0.0, 6.0), st.floats(0.0, 1.0))
-def test_a_swing_beside_a_reference_at_rest_or_in_slow_motion_is_told(hz: float, phase: float, speed: float) -> None:
+def test_a_swing_beside_a_reference_at_rest_or_in_slow_motion_is_first_alarm_s(
+    hz: float, phase: float, speed: float
+) -> None:
     times = [n * DT_S for n in range(3000)]
     own = [0.08 * math.sin(2.0 * math.pi * hz * t + phase) for t in times]
     half_s = max(0.05, 0.5 / hz)
-    assert told(own, [0.2] * len(times)) <= 9.0 * half_s
-    assert told(own, [0.2 + speed * t for t in times]) <= 12.0 * half_s  # which begins with a jump of the speed
+    assert first_alarm_s(own, [0.2] * len(times)) <= 9.0 * half_s
+    assert (
+        first_alarm_s(own, [0.2 + speed * t for t in times]) <= 12.0 * half_s
+    )  # which begins with a jump of the speed
 
 
 @given(st.floats(0.5, 400.0), st.floats(0.0, 6.0))
 def test_a_swing_that_is_too_small_is_none(hz: float, phase: float) -> None:
     times = [n * DT_S for n in range(3000)]
-    assert told([0.049 * math.sin(2.0 * math.pi * hz * t + phase) for t in times], [0.0] * len(times)) == math.inf
+    assert (
+        first_alarm_s([0.049 * math.sin(2.0 * math.pi * hz * t + phase) for t in times], [0.0] * len(times)) == math.inf
+    )
 
 
-@pytest.mark.parametrize(("hz", "zeta"), [(20.0, 0.06), (250.0, 0.01)])
+@pytest.mark.parametrize(("hz", "zeta"), [(20.0, 0.06), (5.0, 0.06), (250.0, 0.01)])
 def test_what_rings_down_after_each_step_is_none(hz: float, zeta: float) -> None:
-    """A step of the reference each second, and a torque that answers it with its limit and rings down."""
+    """A step of the reference each two seconds, and a torque that answers it with its limit and rings down; each swing
+    of half the limit counts."""
     torque, positions = [], []
-    for n in range(10_000):
-        t = n * DT_S % 1.0
+    for n in range(20_000):
+        t = n * DT_S % 2.0
         torque.append(0.1 * math.exp(-2.0 * math.pi * hz * zeta * t) * math.cos(2.0 * math.pi * hz * t))
-        positions.append(0.1 * (n // 1000))
-    assert told(torque, positions) == math.inf
+        positions.append(0.1 * ((n + 1999) // 2000))
+    assert first_alarm_s(torque, positions, 0.05) == math.inf
 
 
-def test_half_the_torque_limit_counts_unless_stated() -> None:
-    assert least_swing_nm(CONFIG) == 0.5 * CONFIG.torque_nm
-    assert least_swing_nm(CONFIG.model_copy(update={"oscillation_nm": 0.3})) == 0.3
+@given(st.floats(0.1, 4.0), st.floats(25.0, 200.0), st.floats(0.0, 6.0))
+def test_a_swing_beside_a_reference_that_swings_slowly_is_told(slow_hz: float, hz: float, phase: float) -> None:
+    times = [n * DT_S for n in range(3000)]
+    own = [0.12 * math.sin(2.0 * math.pi * hz * t + phase) for t in times]
+    assert first_alarm_s(own, [0.1 * math.sin(2.0 * math.pi * slow_hz * t) for t in times]) <= 1.0
+
+
+def test_an_enable_begins_anew_with_the_limit_that_is_in_force() -> None:
+    found = Oscillation(None)
+    found.begin(0.0, 0.2)
+    own = [0.09 * math.sin(2.0 * math.pi * 20.0 * n * DT_S) for n in range(1000)]
+    assert not any(found.look(u, 0.0, 0.0, DT_S) for u in own)
+    found.begin(0.0, 0.1)
+    assert any(found.look(u, 0.0, 0.0, DT_S) for u in own)
+    found.begin(0.0, 0.1)
+    assert not found.look(own[-1], 0.0, 0.0, DT_S)
 
 
 # --- on the virtual axis ----------------------------------------------------------------------------------------------
@@ -150,6 +170,30 @@ def test_a_sound_axis_is_let_alone(tmp_path: Path, motion: tuple[float, ...], la
     assert not session.cycle.axis.latched & OSCILLATES
 
 
+def test_a_table_that_waves_without_a_stop_is_let_alone(tmp_path: Path) -> None:
+    """A cam: torque for inertia and viscous friction ten times a second, and the reference never reverses."""
+    session = axis(tmp_path, limits={"oscillation_nm": 0.1, "position_max_rad": 10.0})
+    times = [n * DT_S for n in range(3000)]
+    positions = [1.3 * t + 1.2 / (10.0 * math.pi) * (1.0 - math.cos(10.0 * math.pi * t)) for t in times]
+    session.load_trajectory(positions)
+    session.send(Op.REFERENCE, (ReferenceKind.TABLE, len(positions), 0.0, 5.0))
+    session.run(2.9)
+    torque = [row.torque_nm for row in session.records[-1000:]]
+    assert max(torque) - min(torque) > 0.1
+    assert session.cycle.axis.state is AxisState.ENABLED
+
+
+@pytest.mark.parametrize("added_nm", [0.0, 0.2])
+def test_torque_that_an_experiment_injects_is_no_oscillation(tmp_path: Path, added_nm: float) -> None:
+    session = axis(tmp_path, limits={"oscillation_nm": 0.1})
+    added = [added_nm * math.sin(10.0 * math.pi * n * DT_S) for n in range(3000)]
+    session.load_trajectory([0.0] * 3000 + added)
+    session.send(Op.REFERENCE, (ReferenceKind.EXCITE, 3000, 0.0, 0.0, 0.5))
+    session.run(2.5)
+    assert session.cycle.reference.active
+    assert session.cycle.axis.state is AxisState.ENABLED
+
+
 def loose_coupling(hz: float) -> AxisModel:
     """Half of the inertia behind a spring that resonates there."""
     half = JOINT.inertia / 2.0
@@ -161,7 +205,7 @@ def loose_coupling(hz: float) -> AxisModel:
 @pytest.mark.parametrize(
     ("joint", "law", "limits", "within_s"),
     [
-        pytest.param(JOINT, STIFF, {"torque_rate_nm_per_s": 1.5}, 2.0, id="torque rate"),
+        pytest.param(JOINT, STIFF, {"torque_rate_nm_per_s": 1.5, "oscillation_nm": 0.15}, 2.0, id="torque rate"),
         pytest.param(JOINT.model_copy(update={"delay_s": 0.004}), STIFFER, {}, 1.0, id="delay"),
         pytest.param(loose_coupling(250.0), DESIGNED, {}, 1.0, id="coupling"),
     ],
@@ -178,6 +222,9 @@ def test_an_unstable_loop_is_stopped_by_the_drive(
     assert abs(session.world.truth().velocity_rad_s) < 1e-2
     first = next(n for n, row in enumerate(session.records) if row.faults & OSCILLATES)
     assert all(row.torque_nm == 0.0 for row in session.records[first:])
+    session.enable(reset_fault=True)
+    session.run(0.2)
+    assert session.cycle.axis.state is AxisState.ENABLED
     held = axis(tmp_path, joint, law, limits | {"oscillation_nm": 0.6})  # twice the torque limit: never
     held.send(Op.REFERENCE, STEP)
     held.run(within_s)
