@@ -68,7 +68,8 @@ class Oscillation:
         level = self._level
         forgotten = _FORGOTTEN_PER_S * dt_s
         level = max(0.0, level - forgotten) if level > 0.0 else min(0.0, level + forgotten)
-        if velocity == 0.0 and abs(position - self._position) > _LEAST_JUMP:  # a step: all begins anew
+        jumps = velocity == self._velocity == 0.0 and abs(position - self._position) > _LEAST_JUMP
+        if jumps:  # a step: all begins anew
             level = min(level, 0.0) - _ASKED_TURNS
         elif self._asked(velocity, dt_s):
             level -= _ASKED_TURNS
