@@ -60,7 +60,7 @@ class Oscillation:
         self._swing_nm = limit_nm if self._configured_nm is None else self._configured_nm
         self._torque, self._acceleration, self._level = Turns(), Turns(), 0.0
         self._since_turn_s = _APART_S
-        self._greatest = self._velocity = self._last_way = 0.0
+        self._greatest = self._last_size = self._velocity = self._last_way = 0.0
         self._position, self._reversed = position, False
 
     def look(self, torque_nm: float, position: float, velocity: float, dt_s: float) -> bool:
@@ -84,7 +84,8 @@ class Oscillation:
     def _asked(self, velocity: float, dt_s: float) -> bool:
         """A turn of the reference: it reverses, or its acceleration turns; of one turn both count once."""
         acceleration = (velocity - self._velocity) / dt_s
-        size = abs(acceleration)
+        # A jump of the velocity, as at the start of a table, is one cycle's and no scale for what follows.
+        size, self._last_size = min(abs(acceleration), self._last_size), abs(acceleration)
         self._greatest = size if size > self._greatest else self._greatest * (1.0 - min(dt_s / _OF_LATE_S, 1.0))
         turned = self._acceleration.step(acceleration, max(_TURN_SHARE * self._greatest, _LEAST_ACCELERATION))
         if abs(velocity) > _LEAST_SPEED:
