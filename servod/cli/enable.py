@@ -40,22 +40,27 @@ def enable(
     as_json: JsonOption = False,
 ) -> None:
     """Enable the axis."""
-    result = _enable_or_leave_off(socket, reset_fault=reset_fault, prove=prove)
+    from servod.formats.stopping import UNKNOWN
+
+    result, joint_known = _enable_or_leave_off(socket, reset_fault=reset_fault, prove=prove)
     wiring = result.get("wiring")
-    report(result, f"enabled\n{wiring['text']}" if wiring else "enabled", as_json)
+    lines = ["enabled", *([wiring["text"]] if wiring else []), *([] if joint_known else [f"warning: {UNKNOWN}"])]
+    report(result, "\n".join(lines), as_json)
 
 
-def _enable_or_leave_off(socket: Path, **arguments: bool) -> dict[str, Any]:
-    """Enable and wait; whatever interrupts it has the axis off before it ends the command."""
+def _enable_or_leave_off(socket: Path, **arguments: bool) -> tuple[dict[str, Any], bool]:
+    """Enable and wait; whatever interrupts it has the axis off before it ends the command. Also whether anything tells
+    of the joint, so that its stop is reckoned."""
     from servod.client.processes import sigterm_as_interrupt
 
     with connect(socket) as client, sigterm_as_interrupt():
         try:
             result: dict[str, Any] = client.call("enable", **arguments)
+            known = client.call("status")["stopping"] is not None
         except KeyboardInterrupt:
             client.call("disable")
             raise
-    return result
+    return result, known
 
 
 def disable(socket: SocketOption = DEFAULT_SOCKET, as_json: JsonOption = False) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 from servod.formats.config import AxisConfig
-from servod.formats.joint_bounds import contradictions
+from servod.formats.joint_bounds import contradictions, joint_of
 from servod.formats.model.axis_model import AxisKind, AxisModel
 from servod.formats.wiring import warnings
 from servod.kernels.filters import low_pass_share
@@ -25,15 +25,24 @@ _MOST_LATE_S, _MOST_RAMP_S = 0.25, 0.5
 _MOST_DEAD_MS = 500
 #: A forged heartbeat shows when the node's own comes, this share of the period later.
 _TOLD_SHARE, _MOST_TOLD_MS = 0.4, 50.0
+#: 0x6007: the voltage is disabled.
+_COASTS = 2
 #: One count that looks like more than this share of the speed limit makes a joint trip far below it.
 _MOST_COUNT_SPEED = 0.2
+#: No servo motor, alone and at its peak torque, accelerates faster; those of the highest dynamics reach a third of it.
+_MOST_ACCELERATION_RAD_S2 = 1e6
+#: Torque after a loss of the master, where the drive knows no deadline of its commands.
+_MOST_WITHIN_S = 0.3
+#: A drive that reacts at all to its deadline need not wait longer than for a dead master's heartbeat.
+_MOST_DEADLINE_MS = 150
 #: Drive and encoder that drift apart by so much are not on one joint; a slip of an eighth of a turn is long seen.
 _MOST_MISMATCH_RAD = math.pi / 4.0
 
 
 def weakened(config: AxisConfig, model: AxisModel | None = None) -> list[str]:
     """One line for each value of `config` (after `with_expected`) that guards less than it seems, key first."""
-    lines = [*_limits(config), *_times(config), *_beyond_drive(config), *warnings(config)]
+    lines = [*_limits(config), *_watches(config), *_times(config), *_reactions(config), *_beyond_drive(config)]
+    lines += warnings(config)
     if model is not None and model.axis is AxisKind.ROTARY:
         lines += [*_beyond_model(config, model), *contradictions(config, model)]
     if config.gains.accept_uncertified:
@@ -84,6 +93,49 @@ def _limits(config: AxisConfig) -> list[str]:
     return lines
 
 
+def _watches(config: AxisConfig) -> list[str]:
+    """What is told from the torque, and never comes where its limit is beyond all torque."""
+    limits, joint = config.limits, joint_of(config)
+    both_nm = 2.0 * limits.torque_nm
+    lines = []
+    if limits.torque_mismatch_nm is not None and limits.torque_mismatch_nm >= both_nm:
+        lines.append(
+            f"limits.torque_mismatch_nm {limits.torque_mismatch_nm:g}: torque that the drive does not give, or gives "
+            "the wrong way, is not noticed; left out it is a quarter of limits.torque_nm"
+        )
+    if limits.oscillation_nm is not None and limits.oscillation_nm >= both_nm:
+        lines.append(
+            f"limits.oscillation_nm {limits.oscillation_nm:g}: a feedback loop that swings by itself is not noticed; "
+            "left out it is limits.torque_nm"
+        )
+    if joint is not None and limits.torque_nm > _MOST_ACCELERATION_RAD_S2 * joint.most_inertia:
+        lines.append(
+            f"limits.torque_nm {limits.torque_nm:g}: {limits.torque_nm / joint.most_inertia:.3g} rad/s^2 of this "
+            "joint, which no motor gives; every stop is reckoned with that torque"
+        )
+    return lines
+
+
+def _reactions(config: AxisConfig) -> list[str]:
+    """What the drive shall do by itself."""
+    amplifier, lines = config.amplifier, []
+    if amplifier.unguarded:
+        lines.append("amplifier.unguarded is true: a drive that does not stop by itself when servod dies may run")
+    if amplifier.quick_stop_option == 0:
+        lines.append("amplifier.quick_stop_option 0: at a quick stop the drive lets the joint coast")
+    if amplifier.heartbeat_reaction == _COASTS:
+        lines.append(
+            f"amplifier.heartbeat_reaction {_COASTS}: when servod dies the drive lets the joint coast instead of "
+            "braking it"
+        )
+    if amplifier.guard_test_days is None and config.bus.interface != "virtual":
+        lines.append(
+            "amplifier.guard_test_days is not stated: nothing asks for a new proof (`servoctl guard-test`) that the "
+            "drive stops by itself when servod is dead"
+        )
+    return lines
+
+
 def _one_count_rad_s(config: AxisConfig) -> float:
     """What the low-passed speed shows after a step of one count in one period, rad/s."""
     count_rad, period_s = 2.0 * math.pi / config.encoder.counts_per_turn, config.cycle.period_us * 1e-6
@@ -112,6 +164,16 @@ def _times(config: AxisConfig) -> list[str]:
         lines.append(
             "heartbeat.command_deadline_ms 0: when the commands alone are lost the drive holds its torque until the "
             "joint shows it; when this computer dies, until the heartbeat is missed"
+        )
+    if (config.heartbeat.command_deadline_ms or 0) > _MOST_DEADLINE_MS:
+        lines.append(
+            f"heartbeat.command_deadline_ms {config.heartbeat.command_deadline_ms}: so long the drive goes on with "
+            "its last torque when its commands are lost"
+        )
+    if (config.stopping.within_s or 0.0) > _MOST_WITHIN_S:
+        lines.append(
+            f"stopping.within_s {config.stopping.within_s:g}: torque may act for so long after a loss of the master; "
+            f"up to {_MOST_WITHIN_S:g} s is usual"
         )
     told_ms = _TOLD_SHARE * config.heartbeat.node_period_ms
     if told_ms > _MOST_TOLD_MS:

@@ -114,8 +114,20 @@ WEAK: list[tuple[dict[str, Any], str]] = [
     ({"limits": {"encoder_mismatch_rad": 1e5}}, "limits.encoder_mismatch_rad 100000"),
     ({"limits": {"torque_rate_nm_per_s": 1e5}}, "limits.torque_rate_nm_per_s 100000"),
     (
-        {"limits": {"stale_cycles": 1000}, "stopping": {"within_s": 2.0}},
-        "limits.stale_cycles 1000: up to 1 s without feedback",
+        {"limits": {"stale_cycles": 200}, "stopping": {"within_s": 0.3}},
+        "limits.stale_cycles 200: up to 0.2 s without feedback",
+    ),
+    ({"limits": {"torque_mismatch_nm": 0.6}}, "limits.torque_mismatch_nm 0.6: torque that the drive does not give"),
+    ({"limits": {"oscillation_nm": 1e5}}, "limits.oscillation_nm 100000: a feedback loop that swings"),
+    ({"wiring_proof": {"inertia": 1e-7}}, "limits.torque_nm 0.3: 2.73e+06 rad/s^2 of this joint"),
+    ({"amplifier": {"unguarded": True}}, "amplifier.unguarded is true"),
+    ({"amplifier": {"quick_stop_option": 0}}, "amplifier.quick_stop_option 0: at a quick stop"),
+    ({"amplifier": {"heartbeat_reaction": 2}}, "amplifier.heartbeat_reaction 2: when servod dies"),
+    ({"amplifier": {"guard_test_days": None}}, "amplifier.guard_test_days is not stated"),
+    ({"stopping": {"within_s": 5.0}}, "stopping.within_s 5: torque may act for so long"),
+    (
+        {"heartbeat": {"command_deadline_ms": 2000, "drive_timeout_ms": 500}},
+        "heartbeat.command_deadline_ms 2000: so long the drive goes on",
     ),
     ({"limits": {"late_cycles": 10_000}}, "limits.late_cycles 10000"),
     ({"limits": {"ramp_down_s": 1.0}}, "limits.ramp_down_s 1"),
@@ -143,6 +155,7 @@ def _sound(tmp_path: Path, over: dict[str, Any], model: dict[str, Any] | None = 
     axis = parse_yaml((GAINS / "config" / "can0.yaml").read_text(), "can0")
     axis["gains"] |= {"initial": str(GAINS / "demo_pd.yaml"), "accept_uncertified": True}
     axis["wiring_proof"] = {"friction_nm": 0.05, "inertia": 0.001}
+    axis["amplifier"]["guard_test_days"] = 180
     sound = {"torque_nm": 0.3, "torque_rate_nm_per_s": 100.0, "speed_rad_s": 5.0, "following_error_rad": 0.2}
     axis["limits"] |= {**sound, "position_min_rad": -1.0, "position_max_rad": 1.0, "encoder_mismatch_rad": 0.05}
     for name, section in over.items():
