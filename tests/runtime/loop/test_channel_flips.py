@@ -6,10 +6,10 @@ A flip is either without any effect, or the fault CHANNEL_CORRUPT and no torque 
 reads the same bit of many bytes is bent at once.
 """
 
+import datetime
 import gc
 import mmap
 import os
-import random
 import struct
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
@@ -187,13 +187,17 @@ def _judge(story: Story, whole: Story, twin: Story) -> str:
 _STANDING = (AxisState.DISABLED, AxisState.FAULT, AxisState.QUICK_STOPPING)
 
 
+#: Which flips are the sample's; a failure names its bit, so that it can be had again on any other day.
+DAY = datetime.date.today().toordinal()
+
+
 class Flips:
     """Flips from one state of an axis, each judged against the twin."""
 
     def __init__(self, axis: Axis, under_way: Op | None = None, share: int = 1) -> None:
-        """One of `share` flips is made, always the same ones."""
+        """One of `share` flips is made; which one, the day says."""
         self._axis, self._under_way = axis, under_way
-        self._draw, self._share = random.Random(1), share
+        self._ahead, self._share = DAY % share, share
         self.seen: dict[str, int] = {}
         self._twin = self._without_flip(None)
         self._whole = self._without_flip(under_way)
@@ -201,17 +205,21 @@ class Flips:
     def bits(self, bits: Iterable[int]) -> None:
         """One by one."""
         for bit in bits:
-            if self._draw.randrange(self._share) == 0:
+            if self._due():
                 self._look(f"bit {bit % 64} of word {bit // 64}", bit // 8, bytes((1 << bit % 8,)))
 
     def group(self, at: int, size: int, bit: int) -> None:
         """The same bit of many bytes."""
-        if self._draw.randrange(self._share) == 0:
+        if self._due():
             self._look(f"bits {bit} of bytes {at} to {at + size}", at, bytes((1 << bit,)) * size)
 
     def words(self, first: int, count: int) -> None:
         """All bits of some words."""
         self.bits(range(64 * first, 64 * (first + count)))
+
+    def _due(self) -> bool:
+        self._ahead = (self._ahead + 1) % self._share
+        return self._ahead == 0
 
     def _look(self, name: str, at: int, mask: bytes) -> None:
         memory, under_way = self._axis.port.loop._view, self._under_way
@@ -236,7 +244,7 @@ class Flips:
         return Story(rows[: len(rows) // 2], rows[len(rows) // 2 :])  # all that was written came
 
 
-#: Of how many flips one is made: a sample each time, all of them in the long run.
+#: Of how many flips one is made: the sample is another one each day, until all were made.
 SHARES = [pytest.param(61, id="sample"), pytest.param(1, id="all", marks=[pytest.mark.long, pytest.mark.timeout(3600)])]
 ROW_WORDS, BLOCK_WORDS = len(FIELDS) + 2, module._BLOCK_SAMPLES + 2
 
@@ -249,7 +257,7 @@ def test_bits_in_front_of_the_rings_and_of_waiting_slots(axis: Axis, share: int)
     flips.words(loop._proofs.index(1), len(WiringReport._fields) + 2)
     for ahead in range(COMMAND_SLOTS):
         flips.words(loop._commands.index(loop._next_command + ahead), 7 if ahead < 2 else 1)
-    assert flips.seen.keys() == {"same", "fault"}
+    assert flips.seen.keys() == {"same", "fault"} or (share > 1 and flips.seen)
 
 
 @pytest.mark.parametrize("share", SHARES)
@@ -258,7 +266,7 @@ def test_bits_of_records(axis: Axis, share: int) -> None:
     newest = loop._row + BEFORE
     for number in (newest, newest + 1):
         flips.words(loop._records.index(number), ROW_WORDS)
-    assert flips.seen.keys() == {"same", "fault"}
+    assert flips.seen.keys() == {"same", "fault"} or (share > 1 and flips.seen)
 
 
 @pytest.mark.parametrize("axis", ["moving"], indirect=True)
@@ -270,7 +278,7 @@ def test_bits_of_a_table(axis: Axis, share: int) -> None:
     for block in range(read, read + 4):
         words = BLOCK_WORDS if block == read + 2 else 2  # which is checked next
         flips.words(loop._blocks.index(loop.trajectory._table * module._BLOCKS + block), words)
-    assert flips.seen.keys() == {"same", "fault"}
+    assert flips.seen.keys() == {"same", "fault"} or (share > 1 and flips.seen)
 
 
 @pytest.mark.parametrize("under_way", UNDER_WAY)
@@ -279,7 +287,7 @@ def test_bits_of_a_command_under_way(axis: Axis, under_way: Op, share: int) -> N
     flips = Flips(axis, under_way, share)
     number = axis.port.supervisor._sent + (2 if under_way is Op.CONFIRM else 1)
     flips.words(axis.port.loop._commands.index(number), 6 + max(1, len(UNDER_WAY[under_way])))
-    assert flips.seen["fault"] >= 6
+    assert flips.seen["fault"] >= (6 if share == 1 else 1)
 
 
 @pytest.mark.parametrize("share", SHARES)
