@@ -12,7 +12,7 @@ from servod.qualify.faults.variants import shipped_scenarios
 SCENARIOS = {name: s for name, s in shipped_scenarios().items() if s.runs is Runs.PROCESSES}
 
 #: Scenarios without which no change may come in.
-DEATHS = ("killed/", "asked_to_end/", "two_daemons")
+DEATHS = ("killed/", "killed_at_peak_torque/", "asked_to_end/", "two_daemons")
 
 
 def named(name: str) -> object:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import random
 from abc import abstractmethod
@@ -13,6 +14,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import yaml
 from pydantic import Field
 
+from servod.client.axis import ReferenceMotion
+from servod.common.errors import ServodError
 from servod.common.shipped import shipped
 from servod.drivers.virtual.port import Port
 from servod.formats.protocol import Verb
@@ -24,10 +27,13 @@ from servod.qualify.faults.scenario import Loss, Runs
 from servod.runtime.loop.commands import Op, ReferenceKind
 
 if TYPE_CHECKING:
-    from servod.qualify.faults.actions.base import InjectionAction
     from servod.qualify.faults.processes import ProcessAxis
     from servod.qualify.faults.stepped import SteppedUnderTest
     from servod.qualify.faults.under_test import AxisUnderTest
+
+
+#: A motion that outlasts its scenario.
+_LONG_S = 600.0
 
 
 class OpName(StrEnum):
@@ -75,17 +81,21 @@ class Sine(SteppedAction):
 
     def act(self, axis: SteppedUnderTest) -> int:
         """Start it, for as long as the scenario lasts."""
-        return axis.command(Op.REFERENCE, [ReferenceKind.SINE, self.amplitude_rad, self.frequency_hz, 600.0])
+        return axis.command(Op.REFERENCE, [ReferenceKind.SINE, self.amplitude_rad, self.frequency_hz, _LONG_S])
 
 
-class Step(SteppedAction):
+class Step(InjectionAction):
     """A person lets the reference jump: all the torque that there is."""
+
+    runs: ClassVar[frozenset[Runs]] = frozenset({Runs.STEPPED, Runs.PROCESSES, Runs.GUEST})
 
     amplitude_rad: float
 
-    def act(self, axis: SteppedUnderTest) -> int:
-        """Start it, for as long as the scenario lasts."""
-        return axis.command(Op.REFERENCE, [ReferenceKind.STEP, self.amplitude_rad, 600.0])
+    def apply(self, axis: AxisUnderTest) -> None:
+        """Start it, for as long as the scenario lasts; one that is refused takes no effect."""
+        with contextlib.suppress(ServodError):
+            axis.axis.begin(ReferenceMotion.step(self.amplitude_rad, _LONG_S))
+            self.took(axis, 1)
 
 
 class Mortal(StrEnum):
