@@ -1,7 +1,7 @@
 """What shows each requirement of safety, and the software of others that servod is made with: two tables of the manual.
 
-`safety_trace.yaml` names scenarios of the fault campaign, files of tests/cycles and tests; what is not there is an
-error, and a scenario that shows nothing is one as well.
+`safety_trace.yaml` names hazards of docs/safety.md, scenarios of the fault campaign, files of tests/cycles and tests;
+what is not there is an error, and so is a hazard without a requirement, or a scenario that shows nothing.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ _PINNED = re.compile(r"^([A-Za-z0-9._-]+)==([^ ;\\]+)", re.MULTILINE)
 
 
 class Requirement(NamedTuple):
-    """One requirement, the hazard that it answers, and what shows that it is met."""
+    """One requirement, the hazards that it answers, and what shows that it is met."""
 
     id: str
     requirement: str
-    hazard: str
+    hazards: list[str]
     shown_by: list[str]
 
 
@@ -38,6 +38,13 @@ class Requirement(NamedTuple):
 def requirements() -> list[Requirement]:
     """Those of safety_trace.yaml."""
     return [Requirement(**one) for one in yaml.safe_load((ROOT / "tests/tools/safety_trace.yaml").read_text())]
+
+
+@cache
+def hazards() -> dict[str, str]:
+    """Number and name of each row of the hazard table of docs/safety.md."""
+    part = (ROOT / "docs/safety.md").read_text().split("\n## Hazards\n")[1].split("\n## ")[0]
+    return dict(re.findall(r"^\| (H\d+) \| ([^|]+) \|", part, re.MULTILINE))
 
 
 @cache
@@ -72,8 +79,11 @@ def unused_scenarios() -> list[str]:
 
 def requirement_table() -> str:
     """Each requirement with what shows it."""
-    rows = [[r.id, r.requirement, r.hazard, ", ".join(map(_shown, r.shown_by))] for r in requirements()]
-    return markdown(["", "Requirement", "Hazard", "Shown by"], rows)
+    rows = [
+        [r.id, r.requirement, ", ".join(f"{h} {hazards()[h]}" for h in r.hazards), ", ".join(map(_shown, r.shown_by))]
+        for r in requirements()
+    ]
+    return markdown(["", "Requirement", "Hazards", "Shown by"], rows)
 
 
 def supply_table() -> str:
@@ -112,6 +122,9 @@ def _licence(name: str) -> str:
 
 def complaints() -> Iterator[str]:
     """Everything that is wrong with safety_trace.yaml."""
+    answered = {hazard for one in requirements() for hazard in one.hazards}
     for one in requirements():
         yield from (f"{one.id}: there is no {evidence}" for evidence in one.shown_by if missing(evidence))
+        yield from (f"{one.id}: docs/safety.md has no hazard {h}" for h in one.hazards if h not in hazards())
+    yield from (f"no requirement answers the hazard {h}" for h in hazards() if h not in answered)
     yield from (f"no requirement names the scenario {name}" for name in unused_scenarios())

@@ -181,3 +181,20 @@ def test_each_requirement_of_safety_is_shown_by_what_exists() -> None:
     assert safety_trace.missing("test tests/tools/test_reference.py::test_none") and safety_trace.missing(
         "test x.py::y"
     )
+
+
+def test_each_hazard_of_the_trace_is_one_of_the_safety_page_and_has_a_requirement(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    known = safety_trace.hazards()
+    assert list(known) == [f"H{n}" for n in range(1, len(known) + 1)] and len(known) >= 10
+    one, *others = every = safety_trace.requirements()
+
+    def told(changed: list[safety_trace.Requirement]) -> list[str]:
+        monkeypatch.setattr(safety_trace, "requirements", lambda: changed)
+        return [line for line in safety_trace.complaints() if "hazard" in line]
+
+    assert f"{one.id}: docs/safety.md has no hazard H99" in told([one._replace(hazards=["H99"]), *others])
+    for hazard in known:
+        left = [other for other in every if hazard not in other.hazards]
+        assert f"no requirement answers the hazard {hazard}" in told(left)
