@@ -20,8 +20,8 @@ from tables import markdown
 from servod.qualify.faults.variants import shipped_scenarios
 
 ROOT = Path(__file__).resolve().parents[2]
-#: Where each lock is installed.
-LOCKS = {"deploy": "beside the axis", "lab": "at the desk"}
+#: Where each lock is installed; what is in several counts where it comes first.
+LOCKS = {"deploy": "beside the axis", "sign": "beside the axis, with the extra `sign`", "lab": "at the desk"}
 _PINNED = re.compile(r"^([A-Za-z0-9._-]+)==([^ ;\\]+)", re.MULTILINE)
 
 
