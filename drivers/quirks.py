@@ -39,6 +39,14 @@ class Deviation:
 
 
 @dataclass(frozen=True, slots=True)
+class DeadlineSource:
+    """What is known of a maker's deadline of the commands (0x1400:5): one sentence, and who says so."""
+
+    text: str = "the manual is not known to say"
+    source: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class Precondition:
     """A vendor object that must read `value` under `mask`, else the drive ignores us; read, never written."""
 
@@ -68,6 +76,7 @@ class Quirks:
     interpolation_exponents: tuple[int, ...] = (-3, -4, -5, -6)  # values of 0x60C2:2 that the drive takes
     deceleration: bool = False  # 0x6085 is in the user units of 0x6064 per s^2; else the engineer sets the ramp
     command_deadline: CommandDeadline = CommandDeadline.TELLS
+    deadline_source: DeadlineSource = DeadlineSource()  # for people: why `command_deadline` is what it is
     deadline_stops: Shown | None = None  # not all drives of the row stop at it: only one that shows this is believed
     max_pdo_entries: int = 8
     pdo_pairs: int = 4  # RPDOs and TPDOs to look for; all that are not planned are set not valid
@@ -79,6 +88,11 @@ class Quirks:
 
 _MAXON = Quirks(
     maker="maxon EPOS4",
+    deadline_source=DeadlineSource(
+        "0x1400 has a COB-ID and a transmission type alone, so that firmware has no deadline; of later ones it is not "
+        "known",
+        "EDS of the EPOS4 Module 50/8, software version 0x0110 (in GitHub's lfelipem/maxon_epos4_ros1)",
+    ),
     rated_torque_unit_nm=1e-6,
     interpolation_period=Presence.REQUIRED,
     reset_communication_after=frozenset({Emcy.HEARTBEAT_LOST, Emcy.ERROR_PASSIVE}),
@@ -103,6 +117,11 @@ _MAXON = Quirks(
 
 _ELMO = Quirks(
     maker="Elmo",
+    deadline_source=DeadlineSource(
+        "0x1400 to 0x1403 of SimplIQ have two entries, COB-ID and transmission type, so there is no deadline; of other "
+        "families it is not known",
+        "Elmo CANopen DS 301 Implementation Guide MAN-CAN301IG 2.1, chapter 12, objects 0x1400 - 0x1403",
+    ),
     reset_communication_at_start=True,
     deviations=(
         Deviation(
@@ -203,6 +222,11 @@ _TECHNOSOFT = Quirks(
 
 _CANOPENNODE = Quirks(
     maker="CANopenNode (drives built on this stack)",
+    deadline_source=DeadlineSource(
+        "watched, for a synchronous RPDO when SYNC comes, and told as an error; whether the node then leaves "
+        "operational is up to who built it, and the power stage is not the stack's",
+        "CANopenNode 9b8beed, 301/CO_PDO.c, CO_RPDO_process; CANopenNode issues 612 and 618",
+    ),
     deviations=(
         Deviation(
             "the deadline 0x1400:5 of a synchronous RPDO is looked at when SYNC comes: it tells of lost commands, and "
@@ -220,6 +244,10 @@ _CANOPENNODE = Quirks(
 
 _VIRTUAL = Quirks(
     maker="servod's virtual drive",
+    deadline_source=DeadlineSource(
+        "watched; stops by 0x6007 where 0x2007 is 1, else tells of it by the EMCY 0x8250",
+        "drivers/virtual/amplifier.py, commands_overdue",
+    ),
     deceleration=True,
     command_deadline=CommandDeadline.STOPS,
     deadline_stops=Shown(0x2007, 0, 1),
@@ -238,7 +266,14 @@ _VIRTUAL = Quirks(
 )
 
 QUIRKS: dict[str, Quirks] = {
-    "none": Quirks(maker="CiA 402", deceleration=True),
+    "none": Quirks(
+        maker="CiA 402",
+        deceleration=True,
+        deadline_source=DeadlineSource(
+            "told to the device's application; there is an EMCY code for it (0x8250), and no word of what a drive does",
+            "CiA 301, object 0x1400, as rtlabs-com/c-open pull request 63 reads it",
+        ),
+    ),
     "virtual": _VIRTUAL,
     "canopennode": _CANOPENNODE,
     "epos4": _MAXON,

@@ -29,7 +29,7 @@ from tables import markdown
 
 from servod.common.faults import FAULTS
 from servod.common.shipped import shipped
-from servod.drivers.quirks import QUIRKS
+from servod.drivers.quirks import QUIRKS, CommandDeadline
 from servod.qualify.bench.plan import GOALS
 from servod.qualify.bench.plan import shown as shown_figure
 from servod.qualify.demo.axis import CERTIFIED
@@ -62,6 +62,7 @@ DOCS = ROOT / "docs"
 PAGES = {
     "faults": DOCS / "reference/faults.md",
     "quirks": DOCS / "reference/drives.md",
+    "deadlines": DOCS / "reference/drives.md",
     "config": DOCS / "reference/configuration.md",
     "bench": DOCS / "reference/measured.md",
     "demo": DOCS / "reference/measured.md",
@@ -106,9 +107,24 @@ def quirks() -> str:
     return markdown(["`amplifier.quirks`", "Maker", "Deviation", "Source"], rows)
 
 
+def deadlines() -> str:
+    """What is known of each maker's deadline of the commands, and what servod makes of it."""
+    counts = {
+        CommandDeadline.STOPS: "the deadline, where the drive shows that it stops by it",
+        CommandDeadline.TELLS: "the heartbeat",
+        CommandDeadline.MISSING: "the heartbeat",
+    }
+    rows = [
+        [f"`{name}`", row.maker, row.deadline_source.text, row.deadline_source.source, counts[row.command_deadline]]
+        for name, row in QUIRKS.items()
+    ]
+    return markdown(["`amplifier.quirks`", "Maker", "What is known of 0x1400:5", "Source", "Counts as the guard"], rows)
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "faults": faults,
     "quirks": quirks,
+    "deadlines": deadlines,
     "servoctl": command_line.servoctl,
     "servod": command_line.servod,
     "servod_virtual_axis": command_line.servod_virtual_axis,

@@ -12,7 +12,7 @@ from witness import EDS, Witness, axis_config, master, witness
 
 from servod.common.errors import BadInput, Unreachable
 from servod.drivers.cia402_setup import interpolation_period
-from servod.drivers.quirks import QUIRKS, load_quirks
+from servod.drivers.quirks import QUIRKS, CommandDeadline, load_quirks
 
 MAKERS = [name for name in QUIRKS if name != "none"]
 
@@ -32,6 +32,14 @@ def test_every_deviation_names_its_source_and_our_answer(name: str) -> None:
     row = load_quirks(name)
     assert len(row.deviations) >= 2
     assert all(deviation.text and deviation.source and deviation.answer for deviation in row.deviations)
+
+
+@pytest.mark.parametrize("name", list(QUIRKS))
+def test_what_is_known_of_the_deadline_has_a_source_or_is_said_to_be_unknown(name: str) -> None:
+    row = load_quirks(name)
+    told = row.deadline_source
+    assert bool(told.source) is (told.text != "the manual is not known to say")
+    assert told.source or row.command_deadline is CommandDeadline.TELLS, "what nobody says is not acted on"
 
 
 def test_an_unknown_row_says_the_known_ones() -> None:
