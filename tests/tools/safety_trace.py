@@ -106,7 +106,8 @@ def _shown(evidence: str) -> str:
 
 @cache
 def _tests_of(file: Path) -> set[str]:
-    return {node.name for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, ast.FunctionDef)}
+    functions = ast.FunctionDef | ast.AsyncFunctionDef
+    return {node.name for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, functions)}
 
 
 def _licence(name: str) -> str:

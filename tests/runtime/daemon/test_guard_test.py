@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -16,7 +17,9 @@ from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.drivers.virtual.world import SteppedWorld
 from servod.formats.config import AxisConfig
 from servod.formats.model.axis_model import AxisModel
+from servod.formats.protocol import Verb
 from servod.runtime.daemon import guard_test
+from servod.runtime.daemon.connection import Reply
 from servod.runtime.daemon.guard_test import (
     PROOF_NAME,
     GuardResult,
@@ -29,10 +32,12 @@ from servod.runtime.daemon.guard_test import (
     read_proof,
     require_proof,
 )
+from servod.runtime.daemon.verbs import Verbs
 from servod.runtime.fieldbus.cia import decode_status_word
 from servod.runtime.fieldbus.devices import AmplifierFeedback, DriveState, Goal
 from servod.runtime.fieldbus.master import Master
 from tests.axis_limits import LIMITS
+from tests.on_event_loop import events_pass, on_event_loop
 
 JOINT = {"inertia": 0.001, "friction": {"kind": "coulomb_viscous", "coulomb": 0.01, "viscous": 0.05}}
 DAY_S = 86_400.0
@@ -408,3 +413,17 @@ def test_a_proof_holds_for_its_drive_its_guards_and_its_time(tmp_path: Path) -> 
         with pytest.raises(Unreachable, match=said):
             require_proof(_status(config, found, now_s))
     require_proof(_status(axis(tmp_path, days=None), found, now_s))
+
+
+@pytest.mark.parametrize("days", [30.0, None])
+@on_event_loop
+async def test_the_daemon_enables_nothing_while_a_proof_is_asked_for(tmp_path: Path, days: float | None) -> None:
+    config, loop = axis(tmp_path, days), MagicMock(latest=None, proofs=(0, None))
+    told = list[dict[str, Any]]()
+    proof = _status(config, {}, 0.0)
+    front = Verbs(config, loop, MagicMock(), MagicMock(), dict, dict, lambda bus: bus, lambda: proof)
+    front.handle(Verb.ENABLE, {}, Reply(told.append, 1))
+    await events_pass()
+    front.close()
+    assert loop.send.called is (days is None)
+    assert ["never tested" in answer["error"]["message"] for answer in told] == [True] * (days is not None)
