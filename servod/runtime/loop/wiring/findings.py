@@ -138,13 +138,14 @@ FINDINGS: dict[WiringOutcome, _Row] = {
     _F.NO_MOTION: _Row(
         "the joint did not move under {found:.3g} N*m in either direction: it is blocked or braked, or the scale of "
         "the torque is wrong",
-        f"free the joint; {_RATED}; raise wiring_proof.torque_nm or limits.torque_nm if its friction is that large",
+        f"free the joint; {_RATED}; raise wiring_proof.torque_nm or limits.torque_nm if its friction is that large; "
+        "where the way to rest narrows the torque (`servoctl status`), see heartbeat.command_deadline_ms",
     ),
     _F.ONE_WAY: _Row(
         "the joint moved in one direction, and not under {found:.3g} N*m in the other: it stands at a stop, or a "
         "constant load is larger than that torque",
         "move it away from the stop by hand with the drive disabled; raise wiring_proof.torque_nm if the load is that "
-        "large",
+        "large; where the way to rest narrows the torque (`servoctl status`), see heartbeat.command_deadline_ms",
     ),
     _F.TOO_EASY: _Row(
         "the joint moves at {found:.3g} N*m already, at least {lowest:.3g} N*m were expected: the scale of the torque "

@@ -132,6 +132,8 @@ class WiringTest:
             self._shown_nm += amplifier.torque_nm
         if self._stage == _Stage.PUSH:
             self._line.add(demand_nm, amplifier.torque_nm)
+            push = self._pushes[-1]
+            push.told_nm = max(push.told_nm, push.sign * demand_nm)
 
     def _breach(self) -> CheckResult | None:
         """Further or faster than allowed; what was seen so far may say why."""
@@ -252,13 +254,13 @@ class WiringTest:
         if len(self._pushes) == 1:
             self._enter(_Stage.SETTLE)
             return None
-        first, bounds = self._pushes[0], self._bounds
+        first, bounds, told_nm = self._pushes[0], self._bounds, self._pushes[-1].told_nm
         if verdict := judge.actual_torque(self._line, bounds):
             return verdict
         if not first.moved:
-            return CheckResult(WiringOutcome.NO_MOTION, bounds.most_nm)
-        at_least_nm = 0.5 * (first.began_nm + bounds.most_nm)  # friction: the other break-away lies beyond the most
-        return judge.friction(at_least_nm, bounds) or CheckResult(WiringOutcome.ONE_WAY, bounds.most_nm)
+            return CheckResult(WiringOutcome.NO_MOTION, min(first.told_nm, told_nm))
+        at_least_nm = 0.5 * (first.began_nm + told_nm)  # friction: the other break-away lies beyond the most
+        return judge.friction(at_least_nm, bounds) or CheckResult(WiringOutcome.ONE_WAY, told_nm)
 
     def _settle(self, dt_s: float) -> CheckResult | None:
         """Brake what moves, release what stands, and go on when it has stood for its time."""
@@ -307,7 +309,7 @@ class WiringTest:
     def _judge(self) -> CheckResult:
         """Over both directions."""
         if not self._pushes[0].moved:
-            return CheckResult(WiringOutcome.ONE_WAY, self._bounds.most_nm)
+            return CheckResult(WiringOutcome.ONE_WAY, self._pushes[0].told_nm)
         friction_nm = 0.5 * (self._break_away_nm(1.0) - self._break_away_nm(-1.0))
         return (
             judge.actual_torque(self._line, self._bounds)
