@@ -65,6 +65,9 @@ class RecordingFiles:
         if path.parent != self._directory.resolve() or not _FILE_NAME.fullmatch(path.name):
             allowed = "a file name of letters, digits, spaces and any of . , + ( ) - that ends in .mcap, in"
             raise BadInput("record_start: path", repr(name), f"{allowed} {self._directory}")
+        if self._fault_name.fullmatch(path.name) or self._own_name.fullmatch(path.name):
+            # It would count as one of those that make room, and push the seconds before a real fault out.
+            raise BadInput("record_start: path", repr(name), "a name that servod does not give its own files")
         return path
 
     def next_part(self, first: Path, number: int) -> Path:

@@ -19,7 +19,7 @@ from daemon_rows import row, rows
 from running import CONFIG
 
 from servod.client.processes import child, wait_until
-from servod.common.errors import Unreachable
+from servod.common.errors import BadInput, Unreachable
 from servod.common.shipped import shipped
 from servod.formats.config import RecorderConfig
 from servod.formats.recording.mcap_reader import read_recording
@@ -194,3 +194,14 @@ def test_a_daemon_that_may_write_no_large_files_ends_with_one_line(tmp_path: Pat
     assert "Traceback" not in ended.stderr and ended.returncode in (2, 3)
     last = ended.stderr.splitlines()[-1]
     assert last.startswith("servod: ") and line in last and "file too large" in last.lower()
+
+
+@pytest.mark.parametrize("name", ["axis-fault-20990101-000000-OSCILLATES.mcap", "axis-20990101-000000.mcap"])
+def test_no_client_gives_a_recording_the_name_of_one_that_makes_room(tmp_path: Path, name: str) -> None:
+    """Enough of them would push the seconds before a real fault out."""
+    recorder = _recorder(tmp_path)
+    with pytest.raises(BadInput, match="a name that servod does not give its own files"):
+        recorder.start(name).result(5)
+    recorder.start("other-" + name).result(5)
+    recorder.close()
+    assert [path.name for path in tmp_path.iterdir()] == ["other-" + name]
