@@ -212,11 +212,13 @@ class Cycle:
         sent_nm, faults = self.limits.limit_torque(wanted_nm, dt_s)
         if not ramping:
             self._ramp_from_nm = sent_nm
-            if reference.injects or self.orders.controller_serial != self._judged_serial:
+            if self.orders.controller_serial != self._judged_serial:
                 self._judged_serial = self.orders.controller_serial
-                self.oscillation.begin(reference.position_rad, self.limits.torque_nm)
-            if self.oscillation.look(sent_nm, reference.position_rad, reference.velocity_rad_s, dt_s):
-                faults |= _OSCILLATES
+                self.oscillation.begin(reference.position_rad, self.limits.at_rest_nm)
+            swings = self.oscillation.look(
+                sent_nm, reference.position_rad, reference.velocity_rad_s, dt_s, reference.torque_nm
+            )
+            faults |= _OSCILLATES if swings else 0
         if faults:
             self.axis.raise_fault(faults)
         self.torque_nm = sent_nm
@@ -257,7 +259,7 @@ class Cycle:
         """First controlled cycle: stay where the joint is, go on from the torque that the drive was told last."""
         self.limits.torque_nm = self._drive_limit_nm  # more would be clipped there, unseen by the law
         self.limits.arm(amplifier, encoder, self.torque_nm)
-        self.oscillation.begin(encoder.position_rad, self.limits.torque_nm)
+        self.oscillation.begin(encoder.position_rad, self.limits.at_rest_nm)
         self._ramp_from_nm = self.torque_nm
         self.reference.hold(encoder.position_rad)
         self.controller.reset(self.torque_nm)

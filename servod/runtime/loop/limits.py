@@ -81,6 +81,12 @@ class Limits:
         self._motor_rad, self._motor_rad_s, self._motor_s = math.nan, 0.0, 0.0
         self._least_nm, self._most_nm, self._near_end = -math.inf, math.inf, False
 
+    @property
+    def at_rest_nm(self) -> float:
+        """The torque that a joint at rest in the middle of its range may have, both ways [N*m]."""
+        narrowed = () if self._ways is None else (way.most_torque_nm(0.0, math.inf) for way in self._ways)
+        return min(self.torque_nm, *narrowed) if self._ways else self.torque_nm
+
     def look(self, amplifier: AmplifierFeedback, encoder: EncoderFeedback, dt_s: float) -> None:
         """Where the joint stands in this cycle and how fast it is: what torque it may have, and whether it must stop.
 

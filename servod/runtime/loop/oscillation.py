@@ -22,6 +22,13 @@ _ASKED_TURNS, _MOST_CREDIT = 2.0, 3.0
 #: Turns of the reference are those of its acceleration by this share of the greatest one of late.
 _TURN_SHARE = 0.25
 _OF_LATE_S = 0.2
+#: A step begins all anew, but not one that comes sooner after another: from then on each is a turn of the reference.
+_ANEW_S = 1.0
+#: Torque that is injected on purpose makes the law swing too: from this share of the least range on, and this long.
+_INJECTED_SHARE, _INJECTED_S = 0.1, 0.2
+#: Turns between which the reference has gone on so far [rad, m] are those of a load over the position: a weight that
+#: turns, a slope. So slow a swing at speed shows in the following error.
+_LOAD_WAY = 1.0
 #: Less than that is rounding: acceleration, speed and jump of a reference, in rad or m and s.
 _LEAST_ACCELERATION, _LEAST_SPEED, _LEAST_JUMP = 1e-3, 1e-6, 1e-9
 
@@ -50,34 +57,47 @@ class Oscillation:
     """Counts the turns of the torque against those of the reference, cycle by cycle."""
 
     def __init__(self, swing_nm: float | None) -> None:
-        """`swing_nm`: the least peak-to-peak torque that counts; None: the torque limit that is in force."""
+        """`swing_nm`: the least peak-to-peak torque that counts; None: the torque that a joint at rest may have."""
         self._configured_nm = swing_nm
         self.begin(0.0, math.inf)
 
     def begin(self, position: float, limit_nm: float) -> None:
-        """Nothing was counted: at an enable, a change of the law, and while torque is injected on purpose; the
-        reference is at `position`, the torque limit `limit_nm` in force."""
+        """Nothing was counted: at an enable and a change of the law; the reference is at `position`, and the torque
+        limit at rest is `limit_nm`, as the way to rest may have narrowed it."""
         self._swing_nm = limit_nm if self._configured_nm is None else self._configured_nm
+        self._since_step_s, self._injected = math.inf, 0.0
+        self._forget(position)
+
+    def _forget(self, position: float) -> None:
         self._torque, self._acceleration, self._level = Turns(), Turns(), 0.0
         self._since_turn_s = _APART_S
         self._greatest = self._last_size = self._velocity = self._last_way = 0.0
         self._position, self._reversed = position, False
+        self._turned_at = position
 
-    def look(self, torque_nm: float, position: float, velocity: float, dt_s: float) -> bool:
-        """One cycle: the torque that went out, and the reference, rad and rad/s. True while it swings by itself."""
+    def look(self, torque_nm: float, position: float, velocity: float, dt_s: float, injected_nm: float = 0.0) -> bool:
+        """One cycle: the torque that went out, the reference, rad and rad/s, and what of the torque somebody injects.
+        True while it swings by itself."""
+        if injected_nm or self._injected:
+            self._injected = max(abs(injected_nm), self._injected * (1.0 - min(dt_s / _INJECTED_S, 1.0)))
+            if self._injected > _INJECTED_SHARE * self._swing_nm:
+                self._forget(position)
+        self._since_step_s += dt_s
         level = self._level
         forgotten = _FORGOTTEN_PER_S * dt_s
         level = max(0.0, level - forgotten) if level > 0.0 else min(0.0, level + forgotten)
         jumps = velocity == self._velocity == 0.0 and abs(position - self._position) > _LEAST_JUMP
-        if jumps:  # a step: all begins anew
-            level = min(level, 0.0) - _ASKED_TURNS
+        if jumps:
+            level = (min(level, 0.0) if self._since_step_s >= _ANEW_S else level) - _ASKED_TURNS
+            self._since_step_s = 0.0
         elif self._asked(velocity, dt_s):
             level -= _ASKED_TURNS
         self._position, self._velocity = position, velocity
         level = max(level, -_MOST_CREDIT)
         self._since_turn_s += dt_s
         if self._torque.step(torque_nm, self._swing_nm) and self._since_turn_s >= _APART_S:
-            level, self._since_turn_s = level + 1.0, 0.0
+            level += 1.0 if abs(position - self._turned_at) < _LOAD_WAY else 0.0
+            self._since_turn_s, self._turned_at = 0.0, position
         self._level = level
         return level >= MOST_TURNS
 

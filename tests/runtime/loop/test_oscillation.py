@@ -136,6 +136,38 @@ def test_an_enable_begins_anew_with_the_limit_that_is_in_force() -> None:
     assert not found.look(own[-1], 0.0, 0.0, DT_S)
 
 
+def swings(hz: float, n: int) -> float:
+    return 0.1 * math.sin(2.0 * math.pi * hz * n * DT_S)
+
+
+def test_steps_that_come_again_and_again_hide_no_swing() -> None:
+    """Each far below a count of any encoder: a client that wants to hide something, or a table of rounded numbers."""
+    found, position = Oscillation(0.1), 0.0
+    found.begin(0.0, 0.1)
+    alarms = []
+    for n in range(2000):
+        position += 2e-9 * (n % 90 == 0)
+        alarms.append(found.look(swings(100.0, n), position, 0.0, DT_S))
+    assert any(alarms[:1000])
+
+
+@pytest.mark.parametrize(("injected_nm", "alarm"), [(0.0, True), (0.005, True), (0.05, False)])
+def test_only_torque_that_is_worth_it_excuses_a_swing(injected_nm: float, alarm: bool) -> None:
+    found = Oscillation(0.1)
+    found.begin(0.0, 0.1)
+    torques = [injected_nm * math.sin(2.0 * math.pi * 7.0 * n * DT_S) for n in range(2000)]
+    assert any(found.look(swings(100.0, n), 0.0, 0.0, DT_S, own) for n, own in enumerate(torques)) is alarm
+
+
+@pytest.mark.parametrize(("rad_s", "alarm"), [(0.0, True), (1.0, True), (12.0, False)])
+def test_a_load_that_turns_with_the_joint_is_no_swing(rad_s: float, alarm: bool) -> None:
+    """Torque for a weight goes to and fro twice a turn; as fast a swing of a joint that hardly moves is one."""
+    found = Oscillation(0.1)
+    found.begin(0.0, 0.1)
+    hz = 12.0 / (2.0 * math.pi)
+    assert any(found.look(swings(hz, n), rad_s * n * DT_S, rad_s, DT_S) for n in range(8000)) is alarm
+
+
 # --- on the virtual axis ----------------------------------------------------------------------------------------------
 
 
@@ -235,4 +267,26 @@ def test_the_law_that_the_loop_began_with_is_judged_too(tmp_path: Path) -> None:
     session.enable()
     session.send(Op.REFERENCE, STEP)
     session.run(1.0)
+    assert session.cycle.axis.latched & OSCILLATES
+
+
+def test_a_swing_of_a_torque_that_the_way_to_rest_narrows_is_told(tmp_path: Path) -> None:
+    """The drive goes on for 100 ms by itself, so the joint may have less than half of limits.torque_nm."""
+    config = virtual_config(tmp_path, 100, 2**20)
+    limits = {"torque_nm": 0.3, "speed_rad_s": 3.0, "position_min_rad": -0.6, "position_max_rad": 0.6}
+    config = config.model_copy(
+        update={
+            "limits": config.limits.model_copy(update=limits),
+            "heartbeat": config.heartbeat.model_copy(update={"command_deadline_ms": 0, "drive_timeout_ms": 100}),
+            "model": SHIPPED / "axes/demo_joint.yaml",
+        }
+    )
+    session = virtual_session(load_axis_model(SHIPPED / "axes/demo_joint.yaml"), tmp_path, 2**20, 1, config)
+    session.send(Op.ACTIVATE, (1, LAWS["pd"].number, 3, 2.5, 0.12, 0.0))
+    session.enable()
+    session.run(0.2)
+    assert session.cycle.limits.at_rest_nm < 0.5 * session.cycle.limits.torque_nm
+    session.send(Op.ACTIVATE, (2, LAWS["pd"].number, 3, 2.5, 2.5, 0.0))
+    session.send(Op.REFERENCE, (ReferenceKind.STEP, 0.02, 4.0))
+    session.run(2.0)
     assert session.cycle.axis.latched & OSCILLATES
