@@ -139,6 +139,7 @@ def screen(document: dict[str, Any]) -> Group:
         *_wiring_lines(document),
         *_stopping_lines(document),
         *_guard_lines(document),
+        *_promise_lines(document),
         _values(document),
         _timing(document),
         *_grant_lines(document),
@@ -209,6 +210,22 @@ def _stopping_lines(document: dict[str, Any]) -> list[str]:
         f"after a loss of the master; without the drive it {coasts}"
     )
     return ["; ".join([line, *(f"[yellow]narrowed[/yellow] {text}" for text in stop["narrowed"])])]
+
+
+def _promise_lines(document: dict[str, Any]) -> list[str]:
+    """What of the joint is not as the running set's certificate has it; nothing where all is."""
+    told = [
+        f"{row['name']} {row['share']:.2f} times the model's, certified from {row['certified'][0]:.2f} to "
+        f"{row['certified'][1]:.2f}"
+        for row in document["promise"]["joint"]
+        if row["told"]
+    ]
+    told += [
+        f"RMS error {1e3 * row['rms_rad']:.3g} mrad in {row['kind']} motion, promised {1e3 * row['promised_rad']:.3g}"
+        for row in document["promise"]["errors"]
+        if row["told"]
+    ]
+    return [f"[yellow]not as certified[/yellow] {'; '.join(told)}"] if told else []
 
 
 def _guard_lines(document: dict[str, Any]) -> list[str]:

@@ -63,6 +63,7 @@ class FaultCode(IntEnum):
     ESTOP_ACTIVE = 38
     STO_ACTIVE = 39
     OSCILLATES = 40
+    PROMISE_BROKEN = 41
 
 
 #: Faults after which the nodes are not as they were configured: only a new bring-up may enable the axis again.
@@ -328,7 +329,8 @@ FAULTS: dict[FaultCode, Fault] = dict(
             "Somebody else speaks SDO with a node of the axis: a request that this master did not send, or an answer "
             "that it did not ask for. Limits and guards of the node may be changed.",
             "The journal has the frame and its object. Take the service tool or the other master off the bus, then "
-            "restart the daemon, which configures the node anew.",
+            "restart the daemon, which configures the node anew. What servod leaves as it finds it (the drive's own "
+            "torque limit 0x6072, its gains) somebody must set back, or a power cycle does.",
         ),
         _row(
             _C.FOREIGN_FEEDBACK,
@@ -386,6 +388,15 @@ FAULTS: dict[FaultCode, Fault] = dict(
             "Go back to gains that were quiet (`servoctl gains rollback`); look for a loose coupling, a lower torque "
             "rate, a longer delay or another inertia than the gains were designed for; then `servoctl enable "
             "--reset-fault`.",
+        ),
+        _row(
+            _C.PROMISE_BROKEN,
+            _R.NONE,
+            "The joint is not the one any more that the running gain set is certified for, or it tracks worse than the "
+            "certificate promises.",
+            "See what changed (`servoctl status`): lubrication, temperature, load, a tool, a bearing. Let `servoctl "
+            "diagnose` look at a recording; if it stays, identify the axis again and make a new set (`servoctl "
+            "commission`), or go back to gains that ask for less (`servoctl gains rollback`).",
         ),
     ]
 )

@@ -81,6 +81,11 @@ class GainBank:
         """The set that the loop took last; before that the one it starts with, as serial 0."""
         return self._sets[self._running]
 
+    def gains_of(self, serial: int) -> GainSet | None:
+        """The set behind a serial number of the cycle record."""
+        stored = self._sets.get(serial)
+        return stored.gains if stored else None
+
     def describe(self, serial: int) -> ControllerStatus:
         """The part of the status document."""
         stored = self._sets.get(serial)

@@ -7,7 +7,7 @@ labels are made only when somebody collects. Served over a local HTTP port, writ
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 from prometheus_client import CollectorRegistry, start_http_server, write_to_textfile
@@ -20,6 +20,7 @@ from servod.common.faults import FAULTS, FaultCode
 from servod.common.files import reason
 from servod.formats.config import MetricsConfig
 from servod.formats.recording.record import CycleRecord
+from servod.runtime.daemon.promise import QuantityStatus
 from servod.runtime.fieldbus.devices import DriveState
 from servod.runtime.loop.axis_state import AxisState
 
@@ -60,6 +61,7 @@ class AxisMetrics(Collector):
         self._faults = dict.fromkeys(FaultCode, 0)
         self._before = 0
         self.records_lost = 0
+        self.joint: Callable[[], Sequence[QuantityStatus]] = tuple
         self.registry = CollectorRegistry()
         self.registry.register(self)
 
@@ -96,6 +98,12 @@ class AxisMetrics(Collector):
         yield faults
         yield GaugeMetricFamily("servod_bus_load_ratio", "Cyclic share of the bit rate, computed", self._bus_load)
         yield CounterMetricFamily("servod_records_lost", "Cycle records overwritten before read", self.records_lost)
+        shares = GaugeMetricFamily(
+            "servod_joint_share", "Value of the joint over that of the certified model", labels=["of"]
+        )
+        for row in self.joint():
+            shares.add_metric([row["name"].replace(" ", "_")], row["share"])
+        yield shares
         if self._latest is not None:
             yield from self._of_latest(self._latest)
 

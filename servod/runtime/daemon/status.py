@@ -15,6 +15,7 @@ from servod.formats.config import AxisConfig, BrakeConfig, BusConfig, InputsConf
 from servod.formats.recording.record import CycleRecord
 from servod.formats.stopping import StoppingStatus
 from servod.runtime.daemon.guard_test import ProofStatus
+from servod.runtime.daemon.promise import PromiseStatus
 from servod.runtime.daemon.recorder import RecorderState
 from servod.runtime.fieldbus.devices import NEVER_CYCLES, REASON_TEXT, DriveState, Goal, Reason
 from servod.runtime.loop.axis_state import AxisState
@@ -219,6 +220,7 @@ class Status(TypedDict):
     wiring: WiringStatus
     stopping: StoppingStatus | None
     controller: ControllerStatus
+    promise: PromiseStatus
     loop: LoopStatus
     timing: TimingStatus
     bus: BusStatus

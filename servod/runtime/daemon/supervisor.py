@@ -30,6 +30,7 @@ from servod.runtime.daemon.lock import InstanceLock
 from servod.runtime.daemon.metrics import AxisMetrics, MetricsServer
 from servod.runtime.daemon.nodes import FaultRelay, Nodes
 from servod.runtime.daemon.notify import Notifier
+from servod.runtime.daemon.promise import Expected, PromiseWatch
 from servod.runtime.daemon.recorder import Recorder
 from servod.runtime.daemon.status import (
     Freshness,
@@ -120,6 +121,8 @@ class Supervisor:
         if context.found is not None:
             self._faults.tell_earlier(context.found)
         self._proofs = WiringTestWatch(loop, recorder)
+        self._promise = PromiseWatch()
+        self._metrics.joint = lambda: self._promise.status()["joint"]
         self._verbs = Verbs(config, loop, bank, recorder, self._document, self._tell_faults, nodes.of_ours, nodes.proof)
         self._comeback = (
             Comeback(config, self._verbs.slow, nodes.of_ours, context.shown_s, context.carried)
@@ -183,9 +186,18 @@ class Supervisor:
         self._metrics.count(records)
         self._metrics.records_lost = self._loop.lost
         self._faults.see(records, now_ns)
+        self._hold_to_promise(records)
         if failure := self._recorder.take_failure():
             self._faults.raise_own(FaultCode.RECORDER_FAILED, failure)
         return records
+
+    def _hold_to_promise(self, records: list[CycleRecord]) -> None:
+        """Tell of a joint that the running set is not certified for any more; its limits and faults are the loop's."""
+        if records and records[-1].controller != self._promise.serial:
+            gains = self._bank.gains_of(records[-1].controller)
+            self._promise.begin(records[-1].controller, None if gains is None else Expected.of(gains))
+        for told in self._promise.see(records):
+            self._faults.raise_own(FaultCode.PROMISE_BROKEN, told)
 
     def _take_node_events(self) -> None:
         """Node events, and what came corrupt from the loop, become faults of the loop in its next cycle."""
@@ -365,6 +377,7 @@ class Supervisor:
             "wiring": self._proofs.status(),
             "stopping": None if self._stated_stop is None else self._stated_stop.document(),
             "controller": self._bank.describe(latest.controller),
+            "promise": self._promise.status(),
             "loop": {"pid": self._loop.pid, **fresh.record()},
             "timing": self._health.timing(self._loop.lost),
             "bus": bus_status(self._config.bus, self._nodes.plans.bus_load, latest),
