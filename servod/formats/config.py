@@ -99,8 +99,8 @@ class LimitsConfig(Strict):
         ge=1e-6,
         le=1e6,
         description="peak-to-peak torque that counts as a swing; 6 that the reference does not ask for, of which one "
-        "in two seconds is forgotten: quick stop (OSCILLATES); left out: torque_nm, or what the way to rest leaves a joint "
-        "at rest of it; twice torque_nm: never",
+        "in two seconds is forgotten: quick stop (OSCILLATES); left out: torque_nm, or what the way to rest leaves a "
+        "joint at rest of it; twice torque_nm: never",
     )
     stale_cycles: int = Field(
         5, ge=1, le=1000, description="cycles in a row without fresh feedback; as many: quick stop (FEEDBACK_STALE)"
