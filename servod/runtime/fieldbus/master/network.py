@@ -7,7 +7,7 @@ clock nobody else runs, so every wait pumps the bus itself, and time advances by
 from __future__ import annotations
 
 import threading
-from collections import Counter, defaultdict, deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterable
 
 import canopen
@@ -31,7 +31,7 @@ class SdoAnswers:
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self._asked_ns: defaultdict[int, deque[int]] = defaultdict(lambda: deque(maxlen=_MOST_OWED))
-        self._announced: Counter[tuple[int, bytes]] = Counter()
+        self._announced_ns: defaultdict[tuple[int, bytes], deque[int]] = defaultdict(lambda: deque(maxlen=_MOST_OWED))
         self._lock = threading.Lock()
 
     def asked(self, can_id: int, data: bytes) -> None:
@@ -53,20 +53,28 @@ class SdoAnswers:
     def announce(self, can_id: int, data: bytes) -> None:
         """Another connection of ours is about to send this, which will be heard here."""
         with self._lock:
-            self._announced[can_id, data] += 1
+            self._announced_ns[can_id, data].append(self._clock.now_ns())
 
     def withdraw(self, can_id: int, data: bytes) -> None:
         """The bus did not take what was announced."""
         with self._lock:
-            self._announced[can_id, data] -= 1
+            if announced_ns := self._announced_ns[can_id, data]:
+                announced_ns.pop()
 
-    def own(self, can_id: int, data: bytes) -> bool:
-        """A request was heard; whether it is one of ours, which is owed its answer then."""
+    def own(self, can_id: int, data: bytes, heard_late: bool = False) -> bool:
+        """A request was heard; whether it is one of ours, which is owed its answer then.
+
+        What was announced long ago never reached the bus, and shall not excuse somebody else's; unless frames wait for
+        whoever hears them, as at the start (`heard_late`).
+        """
         with self._lock:
-            if self._announced[can_id, data] <= 0:
-                del self._announced[can_id, data]
+            announced_ns = self._announced_ns[can_id, data]
+            while announced_ns and not heard_late and announced_ns[0] < self._clock.now_ns() - _OWED_NS:
+                announced_ns.popleft()
+            if not announced_ns:
+                del self._announced_ns[can_id, data]
                 return False
-            self._announced[can_id, data] -= 1
+            announced_ns.popleft()
         self.asked(can_id, data)
         return True
 

@@ -29,7 +29,7 @@ class StartWatch:
     def look(self) -> None:
         """Take what came; raises Unreachable for what this master did not send."""
         while (frame := self._bus.receive(0.0)) is not None:
-            if frame.can_id in self._ids and not self._answers.own(frame.can_id, frame.data):
+            if frame.can_id in self._ids and not self._answers.own(frame.can_id, frame.data, heard_late=True):
                 raise foreign(f"frame 0x{frame.can_id:03X} {frame.data.hex(' ')}".rstrip())
 
     def close(self) -> None:

@@ -14,9 +14,10 @@ from witness import EDS, Witness, witness
 
 from servod.common.clock import WallClock
 from servod.common.errors import BadInput, Unreachable
+from servod.common.units import NS_PER_S
 from servod.runtime.fieldbus.devices import SdoAbort
 from servod.runtime.fieldbus.master.eds import load_dictionary
-from servod.runtime.fieldbus.master.network import AnnouncedBus, BusNetwork
+from servod.runtime.fieldbus.master.network import AnnouncedBus, BusNetwork, SdoAnswers
 from servod.runtime.fieldbus.master.sdo import SDO_TIMEOUT_S, NodeSdo, abort_text
 
 
@@ -204,3 +205,27 @@ def test_a_bus_that_takes_no_frame_is_unreachable(network: BusNetwork, monkeypat
     monkeypatch.setattr(network._servod_bus._bus, "send", refuse)  # type: ignore[attr-defined]
     with pytest.raises(Unreachable, match=r"frame 0x601 could not be sent \(full queue\)"):
         access(network).read(0x1000)
+
+
+class HandClock(WallClock):
+    """Moved on by hand."""
+
+    ns = 0
+
+    def now_ns(self) -> int:
+        return self.ns
+
+
+def test_a_frame_that_was_announced_and_never_came_excuses_no_other_for_long() -> None:
+    clock = HandClock()
+    answers, request = SdoAnswers(clock), (0x601, bytes(8))
+    answers.announce(*request)
+    clock.ns += 4 * NS_PER_S
+    assert answers.own(*request) and not answers.own(*request)
+    for heard_late in (False, True):
+        answers.announce(*request)
+        clock.ns += 6 * NS_PER_S
+        assert answers.own(*request, heard_late=heard_late) is heard_late
+    answers.announce(*request)
+    answers.withdraw(*request)
+    assert not answers.own(*request)
