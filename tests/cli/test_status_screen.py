@@ -52,7 +52,7 @@ def document() -> dict[str, Any]:
             "unguarded": True,
             "proof": {"asked_for": True, "holds": False, "time": None, "text": "the guards were never tested"},
         },
-        "promise": {"judged": True, "motion_s": 5.0, "joint": [], "errors": []},
+        "promise": {"judged": True, "note": "", "motion_s": 5.0, "joint": [], "errors": []},
         "wiring": {"tests": 1, "last": {"passed": False, "text": "wiring not proven (TORQUE_POLARITY): turn it"}},
         "faults": [
             {
@@ -118,7 +118,13 @@ def test_the_stop_that_is_stated_and_what_was_narrowed_are_shown() -> None:
 def test_what_is_not_as_certified_is_shown() -> None:
     row = {"name": "inertia", "share": 2.0, "standard_error": 0.02, "certified": [0.95, 1.05]}
     error = {"kind": "slow", "rms_rad": 5e-5, "promised_rad": 1e-5}
-    promise = {"judged": True, "motion_s": 9.0, "joint": [row | {"told": True}], "errors": [error | {"told": True}]}
+    promise = {
+        "judged": True,
+        "note": "",
+        "motion_s": 9.0,
+        "joint": [row | {"told": True}],
+        "errors": [error | {"told": True}],
+    }
     text = shown({**document(), "promise": promise})
     assert "not as certified inertia 2.00 times the model's, certified from 0.95 to 1.05; RMS error 0.05 mrad" in text
     promise |= {"joint": [row | {"told": False}], "errors": [error | {"told": False}]}

@@ -2,14 +2,17 @@
 
 Beside the loop, which it never touches: a joint that changed is told, with what changed and by how much. Two looks:
 
-- Balance of momentum over short windows of motion one way, delay taken out:
-      int(u - T(x)) dt = m*dv + int F(v) dt,     F(v) = c0*v/a(v) + d0*v as in (9), (16)
-  gives m and the level of F in either direction as shares of the model's, by least squares that forgets. Nothing is
-  differentiated twice, so coarse encoders do; a window that reverses holds the bristle's way, and is left out.
-- Error of the reference in half a second against what the certificate promises of its validation motion, where the
-  reference asks for no more speed and acceleration than that motion.
+- Balance of momentum over short windows of motion one way, delay and filter taken out:
+      int(u - T(x)) dt = m*dv + int F(v) dt,     F(v) = g(v) + d(v)*v as in (7), (18)
+  gives m and the level of F in either direction as shares of the model's, by least squares that forgets. Reversals, in
+  which the bristle turns over, lie between the windows; one whose dv may be the encoder's noise tells nothing of m.
+- Error in each second against what the certificate promises of its validation motion, where the reference asks for no
+  more speed and acceleration than that motion does.
 
-Source: (9), (16) of the paper; forgetting least squares with a prior that stays, Ljung, System Identification, ch. 11.
+Not seen: delay, a coupling, the torque's rate (limits and OSCILLATES). A load that the law does not know looks like
+more friction one way and less the other, and is told as that or a load.
+
+Source: (7), (18) of the paper; forgetting least squares with a prior that stays, Ljung, System Identification, ch. 11.
 """
 
 from __future__ import annotations
@@ -25,7 +28,10 @@ from servod.formats.gains.gain_set import GainSet, Promise
 from servod.formats.gains.parameters import LocalParameters
 from servod.formats.recording.record import CycleRecord
 from servod.kernels.laws.local import LocalGains
-from servod.kernels.laws.weights import blended
+from servod.kernels.laws.position import position_torque
+from servod.kernels.physics.effects import nonlinear_viscous
+from servod.kernels.physics.friction import directed_curve
+from servod.kernels.physics.layout import PackedPlant
 from servod.runtime.loop.axis_state import AxisState
 
 WINDOW_S = 0.02
@@ -39,6 +45,10 @@ _ALIKE = 3.0
 _LEAST_SCATTER = 0.02
 #: Slower than this share of the design's top speed a joint may stick.
 _SLIDES_SHARE = 0.04
+#: A window tells of the inertia where its change of speed is so many times its noise.
+_ABOVE_NOISE = 6.0
+#: After a reversal the bristle has turned over when the joint has gone so many of its greatest deflections.
+_TURNED_OVER = 3.0
 #: Beyond the certified interval: what friction does over a day's temperature; and so many standard errors.
 _BEYOND, _SIGMAS = 0.15, 4.0
 #: So many windows in a row must say so.
@@ -55,7 +65,7 @@ INERTIA, FORWARD, BACKWARD = "inertia", "friction forward", "friction backward"
 
 class QuantityStatus(TypedDict):
     """A value of the joint as a share of the model's, with what it may be off by (one standard error) and the interval
-    that is certified; `told` once it was beyond it."""
+    that is certified; `told` while it is beyond that by so much that it was told."""
 
     name: str
     share: float
@@ -75,24 +85,36 @@ class ErrorStatus(TypedDict):
 
 
 class PromiseStatus(TypedDict):
-    """`judged`: the running set says what joint it is for; `motion_s` is how much motion the shares stand on."""
+    """`judged`: the running set says what joint it is for; `note`: why nothing is said of the joint itself; `motion_s`
+    is how much motion the shares stand on."""
 
     judged: bool
+    note: str
     motion_s: float
     joint: list[QuantityStatus]
     errors: list[ErrorStatus]
 
 
+#: Effects of a model in which the balance still holds: those of friction at a velocity, of time, and over position.
+_BALANCED = {"asymmetry", "stribeck", "viscous_nonlinear", "thermal", "delay", "actuator_lag", "noise", "cogging"}
+_BALANCED |= {"torque_gain", "torque_saturation"}
+#: Those over position of which a mean is left: the law has to know them.
+_KNOWN_OVER_POSITION = {"gravity", "spring"}
+
+
 @dataclass(frozen=True)
 class Expected:
-    """What a gain set says of the joint that it is certified for."""
+    """What a gain set says of the joint that it is certified for; `left_out` says why the balance is not judged."""
 
     law: LocalGains
-    inertia: float
+    packed: PackedPlant
+    gain: float
     period_s: float
     late_cycles: int
     slides_rad_s: float
+    speed_noise_rad_s: float
     width: dict[str, float]
+    left_out: str
     promised: Promise | None
     speed_max_rad_s: float
 
@@ -102,29 +124,54 @@ class Expected:
         law, design, certificate = gains.parameters, gains.design, gains.certificate
         if not isinstance(law, LocalParameters) or design is None or certificate is None or not certificate.valid:
             return None
-        return cls._of(law, design, certificate.promised)
+        return cls._of(law.named(), design, certificate.promised)
 
     @classmethod
-    def _of(cls, law: LocalParameters, design: Design, promised: Promise | None) -> Expected:
-        model, u = design.model, design.uncertainty
+    def _of(cls, law: LocalGains, design: Design, promised: Promise | None) -> Expected:
+        model, u, period_s = design.model, design.uncertainty, design.period_s
         lag_s = model.actuator_lag.time_constant_s if model.actuator_lag else 0.0
-        friction = u.dry + u.viscous
+        filter_s = 1.0 / (2.0 * math.pi * design.velocity_cutoff_hz)
+        friction = u.dry + u.viscous + u.torque_gain
+        allowed = _BALANCED | (_KNOWN_OVER_POSITION if law.knows_position else set())
+        others = sorted({name for name, _ in model.groups()} - allowed - {"identified"})
+        if model.torque_offset and not law.knows_position:
+            others.append("torque_offset")
+        gain = model.torque_gain
         return cls(
-            law.named(),
-            model.inertia,
-            design.period_s,
-            round((model.total_delay_s + lag_s) / design.period_s),
+            law,
+            model.pack(),
+            1.0 if gain is None else math.sqrt(gain.factor * (gain.negative_factor or gain.factor)),
+            period_s,
+            # What the command of a cycle does is in the next cycle's velocity, half a cycle late by the difference.
+            round((model.total_delay_s + lag_s + filter_s) / period_s + 1.5),
             _SLIDES_SHARE * design.speed_max_rad_s,
+            _speed_noise_rad_s(design),
             {INERTIA: u.inertia + u.torque_gain, FORWARD: friction, BACKWARD: friction},
+            f"the model has {', '.join(others)}" if others else "",
             promised,
             design.speed_max_rad_s,
         )
 
+    @property
+    def inertia(self) -> float:
+        """All that moves, per unit of torque gain [kg*m^2]."""
+        return (self.packed.p.inertia + self.packed.p.load_inertia) / self.gain
+
     def friction_nm(self, velocity_rad_s: float) -> float:
-        """The friction that the law takes for the joint's when it slides."""
-        law = self.law
-        decay = max(blended(law.sets, law.shape, velocity_rad_s)[0], law.leak)
-        return law.stiffness * velocity_rad_s / decay + law.viscous * velocity_rad_s
+        """The model's friction of a joint that slides, per unit of torque gain."""
+        p, v = self.packed.p, velocity_rad_s
+        side = p.positive_viscous if v >= 0.0 else p.negative_viscous
+        viscous = max(p.viscous * side + nonlinear_viscous(p, v), 0.0)
+        return (math.copysign(directed_curve(*self.packed, v), v) + viscous * v) / self.gain
+
+
+def _speed_noise_rad_s(design: Design) -> float:
+    """RMS of the filtered velocity by rounding and noise of the encoder: a difference, and a first-order low-pass."""
+    count_rad = 2.0 * math.pi / design.counts_per_turn if design.counts_per_turn else 0.0
+    noise = design.model.noise
+    read_rad = math.hypot(count_rad / math.sqrt(12.0), noise.encoder_rms if noise else 0.0)
+    kept = math.exp(-2.0 * math.pi * design.velocity_cutoff_hz * design.period_s)
+    return read_rad / design.period_s * (1.0 - kept) * math.sqrt(2.0 / (1.0 + kept))
 
 
 class Shares:
@@ -183,7 +230,12 @@ class _Errors:
     squares: float = 0.0
     speed_rad_s: float = 0.0
     acceleration_rad_s2: float = 0.0
-    last_rad_s: float | None = None
+    last_rad_s: float = 0.0
+
+
+def _finite(record: CycleRecord) -> bool:
+    values = record.torque_nm, record.velocity_rad_s, record.position_rad, record.reference_rad
+    return all(map(math.isfinite, values))
 
 
 @dataclass
@@ -201,22 +253,23 @@ class PromiseWatch:
     def begin(self, serial: int, expected: Expected | None) -> None:
         """Another gain set runs: nothing was seen of its joint yet."""
         self.serial, self.expected, self.shares, self.motion_s = serial, expected, Shares(), 0.0
-        self._window, self._errors, self._reference_rad_s, self._cycle = _Window(), _Errors(), 0.0, -1
         self._torques: deque[float] = deque(maxlen=1 + (expected.late_cycles if expected else 0))
+        self._cycle = -1
         self._beyond = dict.fromkeys((INERTIA, FORWARD, BACKWARD), 0)
         self._told: set[str] = set()
         self._worse: dict[str, deque[bool]] = {}
         self._rms_rad: dict[str, float] = {}
+        self._interrupt()
 
     def see(self, records: Sequence[CycleRecord]) -> list[str]:
-        """One sentence for each thing that is not as certified, the first time; for an enabled axis."""
+        """One sentence for each thing that is not as certified, when it begins; for an enabled axis."""
         if self.expected is None:
             return []
         found = []
         for record in records:
             follows, self._cycle = record.cycle == self._cycle + 1, record.cycle
             controlled = record.axis_state == AxisState.ENABLED and record.controller == self.serial
-            if not (controlled and follows and record.encoder_age == 0):
+            if not (controlled and follows and record.encoder_age == 0 and _finite(record)):
                 self._interrupt()
                 continue
             if told := self._balance(record, self.expected):
@@ -228,46 +281,60 @@ class PromiseWatch:
     def _interrupt(self) -> None:
         self._torques.clear()
         self._window, self._errors = _Window(), _Errors()
+        self._way = self._turned_at_rad = 0.0
 
     def _balance(self, record: CycleRecord, e: Expected) -> str:
         """The momentum of the window that ends with this cycle."""
+        if e.left_out:
+            return ""
         v, w, torques = record.velocity_rad_s, self._window, self._torques
-        torques.append(record.torque_nm - self._known_over_position(record, e))
-        way = math.copysign(1.0, v) if abs(v) > e.slides_rad_s else 0.0
+        known_nm = position_torque(e.law.position, record.position_rad, 0.0) if e.law.knows_position else 0.0
+        torques.append(record.torque_nm)
+        way = self._slides(record, e)
         if way == 0.0 or way != w.way or len(torques) <= e.late_cycles:
             self._window = _Window(0, way, v, v)
             return self._close(w, e) if w.cycles * e.period_s >= 0.5 * WINDOW_S else ""
         w.cycles, w.last_rad_s = w.cycles + 1, v
-        w.torque += torques[0] * e.period_s
+        w.torque += (torques[0] - known_nm) * e.period_s
         w.friction += e.friction_nm(v) * e.period_s
         if w.cycles * e.period_s < WINDOW_S:
             return ""
         self._window = _Window(0, way, v, v)
         return self._close(w, e)
 
+    def _slides(self, record: CycleRecord, e: Expected) -> float:
+        """The way that the joint slides, 0.0 where it may stick or its bristle is still being turned over."""
+        v = record.velocity_rad_s
+        if v * self._way <= 0.0:
+            self._way, self._turned_at_rad = math.copysign(1.0, v) if v else 0.0, record.position_rad
+        turned_over = abs(record.position_rad - self._turned_at_rad) > _TURNED_OVER * e.law.state_limit
+        return self._way if turned_over and abs(v) > e.slides_rad_s else 0.0
+
     def _close(self, w: _Window, e: Expected) -> str:
         """A whole window, or what the joint left of it when it came to rest."""
-        row = [e.inertia * (w.last_rad_s - w.began_rad_s), max(w.friction, 0.0), min(w.friction, 0.0)]
-        self.shares.add(row, w.torque, _LEAST_SCATTER * abs(w.friction))
+        change = w.last_rad_s - w.began_rad_s
+        told, noise = math.sqrt(2.0) * e.speed_noise_rad_s, e.inertia * math.sqrt(2.0) * e.speed_noise_rad_s
+        # Noise in what is regressed on would draw the inertia to nothing: such a change is taken as the model has it.
+        tells = abs(change) > _ABOVE_NOISE * told
+        row = [e.inertia * change if tells else 0.0, max(w.friction, 0.0), min(w.friction, 0.0)]
+        found = w.torque if tells else w.torque - e.inertia * change
+        self.shares.add(row, found, math.hypot(_LEAST_SCATTER * w.friction, noise) or 1.0)
         self.motion_s += w.cycles * e.period_s
         return self._drifted(e)
-
-    def _known_over_position(self, record: CycleRecord, e: Expected) -> float:
-        """T(x) of (16), from what the law fed forward: all other torque but the observer's and the inertia's."""
-        last, self._reference_rad_s = self._reference_rad_s, record.reference_velocity_rad_s
-        if not e.law.knows_position:
-            return 0.0
-        inertia_nm = e.law.feedforward_inertia * (record.reference_velocity_rad_s - last) / e.period_s
-        return record.torque_other_nm - record.disturbance_nm - inertia_nm
 
     def _drifted(self, e: Expected) -> str:
         texts = []
         for name, share, error in zip(self._beyond, self.shares.values, self.shares.errors, strict=True):
             beyond = abs(share - 1.0) > e.width[name] + _BEYOND + _SIGMAS * error
             self._beyond[name] = self._beyond[name] + 1 if beyond else 0
-            if self._beyond[name] >= _STAYS and name not in self._told:
+            if not beyond:
+                self._told.discard(name)
+            elif self._beyond[name] >= _STAYS and name not in self._told:
                 self._told.add(name)
                 texts.append(f"{name} is {share:.2f} times the model's (give or take {2.0 * error:.2f})")
+        _, forward, backward = self.shares.values
+        if texts and (forward - 1.0) * (backward - 1.0) < 0.0:
+            texts.append("a load that the law does not know would look like this")
         return "; ".join(texts)
 
     def _error(self, record: CycleRecord, e: Expected) -> str:
@@ -276,14 +343,13 @@ class PromiseWatch:
         if e.promised is None or not record.reference_active:
             self._errors = _Errors()
             return ""
-        if own.last_rad_s is not None:
-            own.acceleration_rad_s2 = max(own.acceleration_rad_s2, abs(v - own.last_rad_s) / e.period_s)
+        own.acceleration_rad_s2 = max(own.acceleration_rad_s2, abs(v - own.last_rad_s) / e.period_s)
         own.last_rad_s, own.cycles = v, own.cycles + 1
         own.speed_rad_s = max(own.speed_rad_s, abs(v))
         own.squares += (record.reference_rad - record.position_rad) ** 2
         if own.cycles * e.period_s < ERROR_S:
             return ""
-        self._errors = _Errors()
+        self._errors = _Errors(last_rad_s=v)
         kind, promised_rad = self._kind(own, e, e.promised)
         if not kind:
             return ""
@@ -291,7 +357,10 @@ class PromiseWatch:
         self._rms_rad[kind] = rms_rad
         worse = self._worse.setdefault(kind, deque(maxlen=_LAST_WINDOWS))
         worse.append(rms_rad > _WORSE * promised_rad)
-        if sum(worse) < _OF_WINDOWS or kind in self._told:
+        if sum(worse) < _OF_WINDOWS:
+            self._told.discard(kind)
+            return ""
+        if kind in self._told:
             return ""
         self._told.add(kind)
         return f"RMS error {1e3 * rms_rad:.3g} mrad in {kind} motion, promised {1e3 * promised_rad:.3g} mrad"
@@ -312,7 +381,7 @@ class PromiseWatch:
         """What was seen so far."""
         e = self.expected
         if e is None:
-            return {"judged": False, "motion_s": 0.0, "joint": [], "errors": []}
+            return {"judged": False, "note": "", "motion_s": 0.0, "joint": [], "errors": []}
         joint: list[QuantityStatus] = [
             {
                 "name": name,
@@ -322,10 +391,11 @@ class PromiseWatch:
                 "told": name in self._told,
             }
             for name, share, error in zip(self._beyond, self.shares.values, self.shares.errors, strict=True)
+            if not e.left_out
         ]
         promised = {} if e.promised is None else {"slow": e.promised.slow_rad, "brisk": e.promised.brisk_rad}
         errors: list[ErrorStatus] = [
             {"kind": kind, "rms_rad": self._rms_rad.get(kind), "promised_rad": rad, "told": kind in self._told}
             for kind, rad in promised.items()
         ]
-        return {"judged": True, "motion_s": self.motion_s, "joint": joint, "errors": errors}
+        return {"judged": True, "note": e.left_out, "motion_s": self.motion_s, "joint": joint, "errors": errors}

@@ -192,7 +192,17 @@ class Supervisor:
         return records
 
     def _hold_to_promise(self, records: list[CycleRecord]) -> None:
-        """Tell of a joint that the running set is not certified for any more; its limits and faults are the loop's."""
+        """Tell of a joint that the running set is not certified for any more; its limits and faults are the loop's.
+
+        What stops nothing shall end nothing either: should it fail, it is told once, and off until another set runs.
+        """
+        try:
+            self._look_at_promise(records)
+        except Exception:
+            log.exception("the look whether the joint is as certified failed in a way that nobody expected")
+            self._promise.begin(self._promise.serial, None)
+
+    def _look_at_promise(self, records: list[CycleRecord]) -> None:
         if records and records[-1].controller != self._promise.serial:
             gains = self._bank.gains_of(records[-1].controller)
             self._promise.begin(records[-1].controller, None if gains is None else Expected.of(gains))
