@@ -83,9 +83,11 @@ class Limits:
 
     @property
     def at_rest_nm(self) -> float:
-        """The torque that a joint at rest in the middle of its range may have, both ways [N*m]."""
-        narrowed = () if self._ways is None else (way.most_torque_nm(0.0, math.inf) for way in self._ways)
-        return min(self.torque_nm, *narrowed) if self._ways else self.torque_nm
+        """Half of the range of torque that a joint at rest in the middle of its travel may have [N*m]."""
+        if self._ways is None:
+            return self.torque_nm
+        up, down = (min(self.torque_nm, way.most_torque_nm(0.0, math.inf)) for way in self._ways)
+        return 0.5 * (up + down)
 
     def look(self, amplifier: AmplifierFeedback, encoder: EncoderFeedback, dt_s: float) -> None:
         """Where the joint stands in this cycle and how fast it is: what torque it may have, and whether it must stop.

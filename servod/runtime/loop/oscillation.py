@@ -22,7 +22,7 @@ _ASKED_TURNS, _MOST_CREDIT = 2.0, 3.0
 #: Turns of the reference are those of its acceleration by this share of the greatest one of late.
 _TURN_SHARE = 0.25
 _OF_LATE_S = 0.2
-#: A step begins all anew, but not one that comes sooner after another: from then on each is a turn of the reference.
+#: A step begins all anew, but no sooner than this after the last time that one did; else it is a turn of the reference.
 _ANEW_S = 1.0
 #: Torque that is injected on purpose makes the law swing too: from this share of the least range on, and this long.
 _INJECTED_SHARE, _INJECTED_S = 0.1, 0.2
@@ -65,13 +65,13 @@ class Oscillation:
         """Nothing was counted: at an enable and a change of the law; the reference is at `position`, and the torque
         limit at rest is `limit_nm`, as the way to rest may have narrowed it."""
         self._swing_nm = limit_nm if self._configured_nm is None else self._configured_nm
-        self._since_step_s, self._injected = math.inf, 0.0
+        self._since_anew_s, self._injected, self._velocity = math.inf, 0.0, 0.0
         self._forget(position)
 
     def _forget(self, position: float) -> None:
         self._torque, self._acceleration, self._level = Turns(), Turns(), 0.0
         self._since_turn_s = _APART_S
-        self._greatest = self._last_size = self._velocity = self._last_way = 0.0
+        self._greatest = self._last_size = self._last_way = 0.0
         self._position, self._reversed = position, False
         self._turned_at = position
 
@@ -82,14 +82,18 @@ class Oscillation:
             self._injected = max(abs(injected_nm), self._injected * (1.0 - min(dt_s / _INJECTED_S, 1.0)))
             if self._injected > _INJECTED_SHARE * self._swing_nm:
                 self._forget(position)
-        self._since_step_s += dt_s
+                self._velocity = velocity
+            elif injected_nm == 0.0:
+                self._injected = 0.0
+        self._since_anew_s += dt_s
         level = self._level
         forgotten = _FORGOTTEN_PER_S * dt_s
         level = max(0.0, level - forgotten) if level > 0.0 else min(0.0, level + forgotten)
         jumps = velocity == self._velocity == 0.0 and abs(position - self._position) > _LEAST_JUMP
         if jumps:
-            level = (min(level, 0.0) if self._since_step_s >= _ANEW_S else level) - _ASKED_TURNS
-            self._since_step_s = 0.0
+            anew = self._since_anew_s >= _ANEW_S
+            level = (min(level, 0.0) if anew else level) - _ASKED_TURNS
+            self._since_anew_s = 0.0 if anew else self._since_anew_s
         elif self._asked(velocity, dt_s):
             level -= _ASKED_TURNS
         self._position, self._velocity = position, velocity

@@ -151,6 +151,17 @@ def test_steps_that_come_again_and_again_hide_no_swing() -> None:
     assert any(alarms[:1000])
 
 
+@pytest.mark.parametrize("every_s", [0.4, 0.8, 0.95, 1.5])
+def test_what_rings_down_after_each_of_many_steps_is_none(every_s: float) -> None:
+    """10 Hz with a damping ratio of 0.1, the first swing by the limit."""
+    torque, positions = [], []
+    for n in range(20_000):
+        t = n * DT_S % every_s
+        torque.append(0.1 * math.exp(-2.0 * math.pi * t) * math.cos(20.0 * math.pi * t))
+        positions.append(0.1 * math.ceil(n * DT_S / every_s))
+    assert first_alarm_s(torque, positions) == math.inf
+
+
 @pytest.mark.parametrize(("injected_nm", "alarm"), [(0.0, True), (0.005, True), (0.05, False)])
 def test_only_torque_that_is_worth_it_excuses_a_swing(injected_nm: float, alarm: bool) -> None:
     found = Oscillation(0.1)
