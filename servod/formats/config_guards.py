@@ -96,17 +96,16 @@ def _limits(config: AxisConfig) -> list[str]:
 def _watches(config: AxisConfig) -> list[str]:
     """What is told from the torque, and never comes where its limit is beyond all torque."""
     limits, joint = config.limits, joint_of(config)
-    both_nm = 2.0 * limits.torque_nm
     lines = []
-    if limits.torque_mismatch_nm is not None and limits.torque_mismatch_nm >= both_nm:
+    if limits.torque_mismatch_nm is not None and limits.torque_mismatch_nm >= limits.torque_nm:
         lines.append(
-            f"limits.torque_mismatch_nm {limits.torque_mismatch_nm:g}: torque that the drive does not give, or gives "
-            "the wrong way, is not noticed; left out it is a quarter of limits.torque_nm"
+            f"limits.torque_mismatch_nm {limits.torque_mismatch_nm:g}: torque that the drive does not give is not "
+            "noticed; left out it is a quarter of limits.torque_nm"
         )
-    if limits.oscillation_nm is not None and limits.oscillation_nm >= both_nm:
+    if limits.oscillation_nm is not None and limits.oscillation_nm > limits.torque_nm:
         lines.append(
-            f"limits.oscillation_nm {limits.oscillation_nm:g}: a feedback loop that swings by itself is not noticed; "
-            "left out it is limits.torque_nm"
+            f"limits.oscillation_nm {limits.oscillation_nm:g}: a feedback loop that swings by itself is not noticed "
+            "before it does so by more than limits.torque_nm, and never from twice that on"
         )
     if joint is not None and limits.torque_nm > _MOST_ACCELERATION_RAD_S2 * joint.most_inertia:
         lines.append(

@@ -117,7 +117,7 @@ WEAK: list[tuple[dict[str, Any], str]] = [
         {"limits": {"stale_cycles": 200}, "stopping": {"within_s": 0.3}},
         "limits.stale_cycles 200: up to 0.2 s without feedback",
     ),
-    ({"limits": {"torque_mismatch_nm": 0.6}}, "limits.torque_mismatch_nm 0.6: torque that the drive does not give"),
+    ({"limits": {"torque_mismatch_nm": 0.3}}, "limits.torque_mismatch_nm 0.3: torque that the drive does not give"),
     ({"limits": {"oscillation_nm": 1e5}}, "limits.oscillation_nm 100000: a feedback loop that swings"),
     ({"wiring_proof": {"inertia": 1e-7}}, "limits.torque_nm 0.3: 2.73e+06 rad/s^2 of this joint"),
     ({"amplifier": {"unguarded": True}}, "amplifier.unguarded is true"),

@@ -52,6 +52,7 @@ class RecordingFiles:
         self._max_fault_files, self._max_age_days = config.max_fault_files, config.max_age_days
         axis = re.escape(axis_name)
         self._fault_name = re.compile(rf"{axis}-fault-\d{{8}}-\d{{6}}-\w+(-\d+)?\.mcap")
+        self._like_own = re.compile(rf"{axis}-(fault-)?\d{{8}}-\d{{6}}")
         self._own_name = re.compile(rf"{axis}-\d{{8}}-\d{{6}}(-\d+)?\.mcap")
         self._max_total_bytes = config.max_total_mib * MIB
         self.max_bytes = min(config.max_file_mib * MIB, self._max_total_bytes // _PART_SHARE)
@@ -65,7 +66,7 @@ class RecordingFiles:
         if path.parent != self._directory.resolve() or not _FILE_NAME.fullmatch(path.name):
             allowed = "a file name of letters, digits, spaces and any of . , + ( ) - that ends in .mcap, in"
             raise BadInput("record_start: path", repr(name), f"{allowed} {self._directory}")
-        if self._fault_name.fullmatch(path.name) or self._own_name.fullmatch(path.name):
+        if self._like_own.match(path.name):
             # It would count as one of those that make room, and push the seconds before a real fault out.
             raise BadInput("record_start: path", repr(name), "a name that servod does not give its own files")
         return path

@@ -15,7 +15,7 @@ import yaml
 from pydantic import Field
 
 from servod.client.axis import ReferenceMotion
-from servod.common.errors import ServodError
+from servod.common.errors import AnswerIsNo
 from servod.common.shipped import shipped
 from servod.drivers.virtual.port import Port
 from servod.formats.protocol import Verb
@@ -93,7 +93,7 @@ class Step(InjectionAction):
 
     def apply(self, axis: AxisUnderTest) -> None:
         """Start it, for as long as the scenario lasts; one that is refused takes no effect."""
-        with contextlib.suppress(ServodError):
+        with contextlib.suppress(AnswerIsNo):
             axis.axis.begin(ReferenceMotion.step(self.amplitude_rad, _LONG_S))
             self.took(axis, 1)
 

@@ -240,6 +240,20 @@ def test_no_more_torque_is_used_than_the_joint_can_need():
     assert max(abs(row.torque_nm) for row in stated.records) == pytest.approx(most_nm, rel=0.01)
 
 
+@pytest.mark.parametrize(
+    "plant", [BLOCKED, joint(gravity={"amplitude": 0.05, "phase": 1.57})], ids=["blocked", "one way"]
+)
+def test_the_torque_that_is_named_is_the_one_that_went_out(plant):
+    """The way to rest of a light joint narrows it, when the drive goes on by itself for 100 ms."""
+    light = {"least_inertia": 1e-3, "most_inertia": 1e-3, "least_friction_nm": 0.04}
+    narrow = {"limits": {"torque_nm": 0.3, "speed_rad_s": 3.0}, "heartbeat": {"command_deadline_ms": 0}}
+    session = axis(plant, narrow | {"stopping": light}, bought_for=JOINT)
+    assert enable(session).finding in (WiringOutcome.NO_MOTION, WiringOutcome.ONE_WAY)
+    most_nm = max(abs(row.torque_nm) for row in session.records)
+    assert most_nm < 0.5 * 0.3
+    assert session.proof.found == pytest.approx(most_nm, rel=0.02)
+
+
 def test_every_finding_has_a_sentence_and_a_remedy_and_a_document_without_nan():
     proof = proven(JOINT).proof
     for finding in WiringOutcome:
