@@ -20,6 +20,7 @@ class Cogging(Harmonics):
     Source: reluctance of slots against magnets; Hanselman, Brushless Permanent Magnet Motor Design, 2003.
     """
 
+    balanced = True
     plain = True
 
 
@@ -35,6 +36,7 @@ class TorqueRipple(Harmonics):
 class Gravity(Group):
     """Resisting torque amplitude*sin(x + phase): a pendulum. amplitude = m*g*l."""
 
+    balanced = held = True
     plain = True
 
     amplitude: float = Field(0.0, description="N*m")
@@ -43,6 +45,8 @@ class Gravity(Group):
 
 class Spring(Group):
     """Resisting torque stiffness*(x - rest) + cubic*(x - rest)^3: cable, hose, counterbalance, flexure."""
+
+    balanced = held = True
 
     stiffness: NonNegative = Field(0.0, description="N*m/rad")
     rest: float = Field(0.0, description="position without torque, rad")
@@ -85,6 +89,8 @@ class Backlash(Group):
 class TorqueGain(Group):
     """Torque = factor*command (k_t, gear or amplifier scale is not what the command assumes)."""
 
+    balanced = True
+
     factor: Factor = 1.0
     negative_factor: Factor | None = Field(None, description="factor of negative commands, when different")
 
@@ -99,6 +105,8 @@ class LimitShape(StrEnum):
 class TorqueSaturation(Group):
     """Torque = clip(torque, -negative_limit, limit), or limit*tanh(torque/limit): current limit, iron saturation."""
 
+    balanced = True
+
     limit: Positive = Field(description="N*m")
     negative_limit: Positive | None = Field(None, description="N*m (a positive number); None = limit")
     shape: LimitShape = LimitShape.HARD
@@ -107,6 +115,7 @@ class TorqueSaturation(Group):
 class Delay(Group):
     """Command to torque takes delay_s + additional_s: bus cycles, filters, drive scheduling."""
 
+    balanced = True
     plain = True
 
     additional_s: float = Field(ge=-0.001, le=0.25)
@@ -114,6 +123,8 @@ class Delay(Group):
 
 class ActuatorLag(Group):
     """Torque follows the delayed command by dT/dt = (command - T)/time_constant_s, at most slew_per_s."""
+
+    balanced = True
 
     time_constant_s: NonNegative = Field(0.0, le=1.0)
     slew_per_s: Positive | None = Field(None, description="N*m/s")

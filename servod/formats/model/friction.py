@@ -20,6 +20,7 @@ class Asymmetry(Group):
     Armstrong-Helouvry, Dupont, Canudas de Wit, Automatica 30(7), 1994.
     """
 
+    balanced = True
     plain = True
 
     positive_dry: Factor = Field(1.0, description="factor of Coulomb and static friction for v > 0")
@@ -35,6 +36,7 @@ class Stribeck(Group):
     Source: the paper's (18) with the exponent's sign mended; exponent by Bo and Pavelescu, Wear 82, 1982.
     """
 
+    balanced = True
     plain = True
 
     static: NonNegative | None = Field(None, description="F_S, N*m")
@@ -61,6 +63,8 @@ class ViscousNonlinear(Group):
 
     Source: Kruif, Gautier and others fit drives with |v|^n; churning losses are quadratic, greases thin (n < 1).
     """
+
+    balanced = True
 
     quadratic: float = Field(0.0, description="N*m*s^2/rad^2")
     cubic: float = Field(0.0, description="N*m*s^3/rad^3")
@@ -119,6 +123,7 @@ class Thermal(Group):
     Source: Bittencourt and Gunnarsson, ASME JDSMC 134(5), 2012; Simoni et al., IROS 2015.
     """
 
+    balanced = True
     plain = True
 
     dry_per_c: float = Field(0.0, ge=-1.0, le=1.0, description="1/degC")

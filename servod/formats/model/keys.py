@@ -37,10 +37,13 @@ class Group(Strict):
 
     `plain`: the kernels' plain loop obeys the group, or it is not in the dynamics at all; beside any other the full
     loop runs. `under_one`: the power of n with which |amplitude|*n^power of its waves must sum to less than 1 (0:
-    shares, 1: slopes), if any.
+    shares, 1: slopes), if any. `balanced`: of a joint that slides one way the command still is what inertia, friction
+    over velocity and torque over position ask for; `held`: such a torque has a mean, so that a law must know it.
     """
 
     plain: ClassVar[bool] = False
+    balanced: ClassVar[bool] = False
+    held: ClassVar[bool] = False
     under_one: ClassVar[int | None] = None
 
     @property

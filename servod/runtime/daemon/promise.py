@@ -95,13 +95,6 @@ class PromiseStatus(TypedDict):
     errors: list[ErrorStatus]
 
 
-#: Effects of a model in which the balance still holds: those of friction at a velocity, of time, and over position.
-_BALANCED = {"asymmetry", "stribeck", "viscous_nonlinear", "thermal", "delay", "actuator_lag", "noise", "cogging"}
-_BALANCED |= {"torque_gain", "torque_saturation"}
-#: Those over position of which a mean is left: the law has to know them.
-_KNOWN_OVER_POSITION = {"gravity", "spring"}
-
-
 @dataclass(frozen=True)
 class Expected:
     """What a gain set says of the joint that it is certified for; `left_out` says why the balance is not judged."""
@@ -132,15 +125,14 @@ class Expected:
         lag_s = model.actuator_lag.time_constant_s if model.actuator_lag else 0.0
         filter_s = 1.0 / (2.0 * math.pi * design.velocity_cutoff_hz)
         friction = u.dry + u.viscous + u.torque_gain
-        allowed = _BALANCED | (_KNOWN_OVER_POSITION if law.knows_position else set())
-        others = sorted({name for name, _ in model.groups()} - allowed - {"identified"})
-        if model.torque_offset and not law.knows_position:
-            others.append("torque_offset")
-        gain = model.torque_gain
+        packed, known = model.pack(), law.knows_position
+        others = [name for name, group in model.groups() if not group.balanced or (group.held and not known)]
+        if packed.p.offset and not known:
+            others.append("an offset of the torque")
         return cls(
             law,
-            model.pack(),
-            1.0 if gain is None else math.sqrt(gain.factor * (gain.negative_factor or gain.factor)),
+            packed,
+            math.sqrt(packed.p.gain_positive * packed.p.gain_negative) or 1.0,  # none where the model states none
             period_s,
             # What the command of a cycle does is in the next cycle's velocity, half a cycle late by the difference.
             round((model.total_delay_s + lag_s + filter_s) / period_s + 1.5),

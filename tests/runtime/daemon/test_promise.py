@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from servod.cli.app import run
@@ -232,15 +232,15 @@ def test_cycle_and_filter_are_reckoned_with(certified: GainSet, cutoff_hz: float
         assert watch.shares.values == pytest.approx([1.0, 1.0, 1.0], abs=0.12)
 
 
-@given(st.floats(0.5, 2.5), st.floats(0.4, 2.0))
-@settings(max_examples=10)
+@pytest.mark.parametrize("inertia", [0.5, 1.0, 2.5])
+@pytest.mark.parametrize("friction", [0.4, 1.0, 2.0])
 def test_shares_are_those_of_the_joint(certified: GainSet, inertia: float, friction: float) -> None:
     motion = Motion(0.02, 3.0, inertia=inertia, friction=friction)
-    watch, told = watched(certified, motion.records(certified, 4.0))
+    watch, told = watched(certified, motion.records(certified))
     assert watch.shares.values == pytest.approx([inertia, friction, friction], abs=0.1)
     for name, share in ((INERTIA, inertia), (FORWARD, friction), (BACKWARD, friction)):
-        if abs(share - 1.0) > 0.6:
-            assert any(name in text for _, text in told)
+        if share == 1.0 or abs(share - 1.0) > 0.55:
+            assert any(name in text for _, text in told) is (share != 1.0)
 
 
 def test_a_load_that_the_law_does_not_know_may_be_the_reason(certified: GainSet) -> None:
