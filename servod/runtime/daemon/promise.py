@@ -6,8 +6,8 @@ Beside the loop, which it never touches: a joint that changed is told, with what
       int(u - T(x)) dt = m*dv + int F(v) dt,     F(v) = g(v) + d(v)*v as in (7), (18)
   gives m and the level of F in either direction as shares of the model's, by least squares that forgets. Reversals, in
   which the bristle turns over, lie between the windows; one whose dv may be the encoder's noise tells nothing of m.
-- Error in each second against what the certificate promises of its validation motion, where the reference asks for no
-  more speed and acceleration than that motion does.
+- Error in each second against what the certificate promises of its validation motion, where the reference is as fast
+  as one of its sines, and asks for no more acceleration.
 
 Not seen: delay, a coupling, the torque's rate (limits and OSCILLATES). A load that the law does not know looks like
 more friction one way and less the other, and is told as that or a load.
@@ -59,6 +59,8 @@ _WORSE, _OF_WINDOWS, _LAST_WINDOWS = 2.0, 3, 4
 #: The validation motion's slow sine (servod.lab.verify.validation): peak speed as a share of the design's, and Hz.
 _SLOW_SHARE, _SLOW_HZ, _BRISK_SHARE, _BRISK_HZ, _BRISK_CYCLES = 0.126, 0.5, 0.5, 12.5, 60
 _ROOM = 1.05
+#: A sine of less speed at the same acceleration reverses more often on its bristle, of which nothing is promised.
+_AS_FAST = 0.5
 
 INERTIA, FORWARD, BACKWARD = "inertia", "friction forward", "friction backward"
 
@@ -360,12 +362,10 @@ class PromiseWatch:
     def _kind(self, own: _Errors, e: Expected, promised: Promise) -> tuple[str, float]:
         """Which sine of the validation motion asks for as much, and what is promised of it."""
         slow = _ROOM * _SLOW_SHARE * e.speed_max_rad_s
-        if own.speed_rad_s == 0.0:
-            return "", 0.0
-        if own.speed_rad_s <= slow and own.acceleration_rad_s2 <= slow * 2.0 * math.pi * _SLOW_HZ:
+        if _AS_FAST * slow <= own.speed_rad_s <= slow and own.acceleration_rad_s2 <= slow * 2.0 * math.pi * _SLOW_HZ:
             return "slow", promised.slow_rad
         brisk, hz = _ROOM * _BRISK_SHARE * e.speed_max_rad_s, min(_BRISK_HZ, 1.0 / (_BRISK_CYCLES * e.period_s))
-        if own.speed_rad_s <= brisk and own.acceleration_rad_s2 <= brisk * 2.0 * math.pi * hz:
+        if _AS_FAST * brisk <= own.speed_rad_s <= brisk and own.acceleration_rad_s2 <= brisk * 2.0 * math.pi * hz:
             return "brisk", max(promised.brisk_rad, promised.slow_rad)
         return "", 0.0
 

@@ -41,7 +41,9 @@ PAPER = ReferenceMotion({"kind": "paper", "duration_s": 10.0})
 #: A table's acceleration is not fed forward.
 TABLE = ReferenceMotion.table([0.01 * (1.0 - math.cos(12.0 * math.pi * k * 1e-3)) for k in range(8000)])
 STEP = ReferenceMotion.step(0.01, 4.0)
-MOTIONS = {"slow": SLOW, "middle": MIDDLE, "brisk": BRISK, "paper": PAPER, "table": TABLE, "step": STEP}
+#: It reverses on its bristle eleven times a second, and is tracked worse than the validation motion.
+SMALL = ReferenceMotion.sine(0.001, 5.5, 6.0)
+MOTIONS = {"slow": SLOW, "middle": MIDDLE, "brisk": BRISK, "paper": PAPER, "table": TABLE, "step": STEP, "small": SMALL}
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +80,7 @@ def test_a_sound_joint_is_let_alone(certified: GainSet, tmp_path: Path, motion: 
     assert inertia["share"] == pytest.approx(1.0, abs=max(0.12, inertia["standard_error"]))
     for row in friction:
         assert row["share"] == pytest.approx(1.0, abs=max(0.03, row["standard_error"]))
-    assert watch.motion_s > 5.0 or motion == "step"
+    assert watch.motion_s > 5.0 or motion in ("step", "small")
 
 
 @pytest.mark.parametrize("share", [0.6, 1.5])
