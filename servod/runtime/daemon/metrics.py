@@ -101,9 +101,13 @@ class AxisMetrics(Collector):
         shares = GaugeMetricFamily(
             "servod_joint_share", "Value of the joint over that of the certified model", labels=["of"]
         )
+        errors = GaugeMetricFamily(
+            "servod_joint_share_standard_error", "What servod_joint_share may be off by", labels=["of"]
+        )
         for row in self.joint():
-            shares.add_metric([row["name"].replace(" ", "_")], row["share"])
-        yield shares
+            for family, value in ((shares, row["share"]), (errors, row["standard_error"])):
+                family.add_metric([row["name"].replace(" ", "_")], value)
+        yield from (shares, errors)
         if self._latest is not None:
             yield from self._of_latest(self._latest)
 

@@ -224,7 +224,7 @@ class _Errors:
     squares: float = 0.0
     speed_rad_s: float = 0.0
     acceleration_rad_s2: float = 0.0
-    last_rad_s: float = 0.0
+    last_rad_s: float | None = None  # none after a gap: what the reference did in it is not known
 
 
 def _finite(record: CycleRecord) -> bool:
@@ -335,9 +335,10 @@ class PromiseWatch:
         """RMS error of a window of motion, where the promise speaks of such motion."""
         own, v = self._errors, record.reference_velocity_rad_s
         if e.promised is None or not record.reference_active:
-            self._errors = _Errors()
+            self._errors = _Errors(last_rad_s=0.0)  # a motion that begins at speed is a jump
             return ""
-        own.acceleration_rad_s2 = max(own.acceleration_rad_s2, abs(v - own.last_rad_s) / e.period_s)
+        if own.last_rad_s is not None:
+            own.acceleration_rad_s2 = max(own.acceleration_rad_s2, abs(v - own.last_rad_s) / e.period_s)
         own.last_rad_s, own.cycles = v, own.cycles + 1
         own.speed_rad_s = max(own.speed_rad_s, abs(v))
         own.squares += (record.reference_rad - record.position_rad) ** 2
@@ -351,8 +352,9 @@ class PromiseWatch:
         self._rms_rad[kind] = rms_rad
         worse = self._worse.setdefault(kind, deque(maxlen=_LAST_WINDOWS))
         worse.append(rms_rad > _WORSE * promised_rad)
-        if sum(worse) < _OF_WINDOWS:
+        if not any(worse):
             self._told.discard(kind)
+        if sum(worse) < _OF_WINDOWS:
             return ""
         if kind in self._told:
             return ""

@@ -122,6 +122,13 @@ def test_an_error_beyond_the_promise_is_told_once(certified: GainSet, tmp_path: 
     assert text.startswith("RMS error ") and "mrad in brisk motion, promised 0.197 mrad" in text
 
 
+def test_cycles_that_are_missed_do_not_silence_the_error(certified: GainSet, tmp_path: Path) -> None:
+    records = [r._replace(position_rad=r.position_rad + 1e-3) for r in moved(JOINT, certified, tmp_path, SLOW)]
+    some = [r for n, r in enumerate(records) if n % 1500 != 700]
+    told = watched(certified, some)[1]
+    assert len(told) == 1 and told[0][0] < 9.0
+
+
 def test_a_set_without_a_certificate_promises_nothing(certified: GainSet, tmp_path: Path) -> None:
     bare = certified.model_copy(update={"certificate": None})
     assert Expected.of(bare) is None

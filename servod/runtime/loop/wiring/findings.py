@@ -143,7 +143,7 @@ FINDINGS: dict[WiringOutcome, _Row] = {
     ),
     _F.ONE_WAY: _Row(
         "the joint moved in one direction, and not under {found:.3g} N*m in the other: it stands at a stop, or a "
-        "constant load is larger than that torque",
+        "constant load, or its friction that way, is larger than that torque",
         "move it away from the stop by hand with the drive disabled; raise wiring_proof.torque_nm if the load is that "
         "large; where the way to rest narrows the torque (`servoctl status`), see heartbeat.command_deadline_ms",
     ),
