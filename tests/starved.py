@@ -38,6 +38,8 @@ from servod.formats.config import CycleConfig
 OTHERS_SHARE, WAITED_SHARE, OTHERS_ALONE_SHARE = 0.25, 0.1, 0.5
 #: The shortest stand-still of a processor that makes feedback stale: the default of limits.stale_cycles.
 STALL_S = 0.005
+#: An axis that one test leaves to the next shows this long afterwards what a stand-still did to it.
+SHOWS_AFTER_S = 1.0
 #: What a loop, a drive or a supervisor that does not get its turn comes to, by itself. A following error is not among
 #: them: an axis that runs away has it too.
 LATENESS = {
@@ -49,6 +51,8 @@ LATENESS = {
 #: Logs of the daemons that the tests of this file started.
 LOGS: list[Path] = []
 _LOGGED = re.compile(r"fault (\w+) \(")
+#: A drive that missed its master says so by EMCY 0x8130 (CiA 301, life guard or heartbeat error).
+_EMCY, _MISSED_ITS_MASTER = re.compile(r"EMCY 0x([0-9A-F]{4})"), {"8130"}
 _FOLLOWS = re.compile(r"a fault is latched|'FAULT'|is FAULT|the axis is not enabled|must be configured anew")
 #: Sleeps on one processor before all that servod starts there, and tells when it slept too long, and how much [s].
 _WITNESS = """
@@ -150,8 +154,14 @@ def refused(priority: int = CycleConfig().priority) -> str:
 
 
 def logged(logs: Iterable[Path]) -> set[str]:
-    """The faults that daemons wrote down."""
-    return {name for log in logs if log.exists() for name in _LOGGED.findall(log.read_text(errors="replace"))}
+    """The faults that daemons wrote down; a drive's own that it had for want of heartbeats is one of heartbeats."""
+    found = set()
+    for text in (log.read_text(errors="replace") for log in logs if log.exists()):
+        named = set(_LOGGED.findall(text))
+        if "DRIVE_FAULT" in named and set(_EMCY.findall(text)) == _MISSED_ITS_MASTER:
+            named = named - {"DRIVE_FAULT"} | {"NODE_HEARTBEAT_LOST"}
+        found |= named
+    return found
 
 
 class Stalls:
@@ -168,14 +178,14 @@ class Stalls:
             self._witnesses.append(subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL))
 
     def longest_s(self, first_s: float, last_s: float) -> float:
-        """The longest between two times."""
+        """The longest that ended between two times, or shortly before."""
         pipes = [witness.stdout for witness in self._witnesses]
         while ready := select.select(pipes, [], [], 0)[0]:
             lines = b"".join(os.read(pipe.fileno(), 1 << 16) for pipe in ready).splitlines()  # each written whole
             self._seen += [(float(end), float(length)) for end, length in map(bytes.split, lines)]
             if not lines:  # they could not begin
                 break
-        return max((length for end, length in self._seen if first_s <= end <= last_s), default=0.0)
+        return max((length for end, length in self._seen if first_s - SHOWS_AFTER_S <= end <= last_s), default=0.0)
 
     def end(self) -> None:
         """Leave no process behind."""

@@ -173,6 +173,19 @@ def test_what_follows_from_a_latched_fault_has_the_excuse_of_that_fault(
     assert not by_lateness(KeyError("'FAULT'"), times_alone=False, faults=found)
 
 
+LEFT = "ERROR fault NODE_LEFT_OPERATIONAL"
+
+
+@pytest.mark.parametrize(("emcy", "excused"), [(["8130"], True), (["8130", "2310"], False), ([], False)])
+def test_a_drive_that_missed_its_master_missed_it_in_time(tmp_path: Path, emcy: list[str], excused: bool) -> None:
+    said = "".join(f"ERROR node 1: EMCY 0x{code} Monitoring, register 0x11 (DRIVE_FAULT)\n" for code in emcy)
+    (tmp_path / "log").write_text(
+        f"{said}ERROR fault DRIVE_FAULT (DISABLE): why | timing\n{LEFT} (QUICK_STOP): why | timing\n"
+    )
+    error = AssertionError("not off: the axis is DISABLED: DRIVE_FAULT: why. NODE_LEFT_OPERATIONAL: why\nassert 3 == 0")
+    assert by_lateness(error, times_alone=False, faults=logged([tmp_path / "log"])) == excused
+
+
 def test_comparisons_of_times_are_excused_where_the_test_says_that_it_makes_no_others() -> None:
     assert by_lateness(AssertionError("12 ms < 10 ms"), times_alone=True)
     assert not by_lateness(ZeroDivisionError(), times_alone=True)
@@ -219,6 +232,8 @@ def test_a_processor_that_stands_still_is_seen() -> None:
     found = stalls.longest_s(held_s, time.monotonic())
     stalls.end()
     assert found >= 0.025 if may else found == before == 0.0
+    began_after = stalls.longest_s(time.monotonic(), time.monotonic() + 1.0)
+    assert began_after == found  # it hit an axis that the next test finds
     assert stalls.longest_s(held_s + 60.0, held_s + 61.0) == 0.0
 
 
