@@ -45,6 +45,7 @@ class Weights(StrEnum):
 class Velocity(StrEnum):
     """Whose velocity drives the friction state."""
 
+    CORRECTED_REFERENCE = "corrected_reference"
     REFERENCE = "reference"
     MEASURED = "measured"
 
@@ -118,7 +119,7 @@ def synthesize(
     accuracy: Accuracy = 0.02,
     paper_nodes: PaperNodes = False,
     weights: WeightsOption = Weights.LINEAR,
-    velocity: VelocityOption = Velocity.REFERENCE,
+    velocity: VelocityOption = Velocity.CORRECTED_REFERENCE,
     observer: Observer = True,
     position_torque: PositionTorque = True,
     leak: Leak = 2.0,

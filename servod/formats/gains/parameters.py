@@ -6,6 +6,7 @@ Beside the data path: read once, packed into plain floats, then never touched ag
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 from enum import StrEnum
 from typing import Annotated, Literal
 
@@ -43,6 +44,15 @@ class VelocitySource(StrEnum):
 
     MEASURED = "measured"
     REFERENCE = "reference"
+    CORRECTED_REFERENCE = "corrected_reference"
+
+
+#: What the kernel calls them.
+_SOURCES: Mapping[VelocitySource, float] = {
+    VelocitySource.MEASURED: local.MEASURED,
+    VelocitySource.REFERENCE: local.REFERENCE,
+    VelocitySource.CORRECTED_REFERENCE: local.CORRECTED,
+}
 
 
 class PdParameters(Strict):
@@ -211,7 +221,7 @@ class LocalFrictionSets(Strict):
         if not (nodes[0] < 0.0 < nodes[-1] and 0.0 in nodes):
             raise ValueError("sets on both sides of velocity_rad_s 0 and one at 0")
         if self.lead_s and self.velocity is VelocitySource.MEASURED:
-            raise ValueError("lead_s only with velocity: reference")
+            raise ValueError("lead_s only with velocity: reference or corrected_reference")
         return self
 
     def named(self) -> Sets:
@@ -299,7 +309,7 @@ class LocalParameters(Strict):
             viscous=f.viscous_nms_per_rad,
             leak=f.leak_per_s,
             state_limit=f.friction_limit_nm / f.stiffness_nm_per_rad,
-            source=local.REFERENCE if f.velocity is VelocitySource.REFERENCE else local.MEASURED,
+            source=_SOURCES[f.velocity],
             lead=f.lead_s,
             shape=float(Shape[f.weights.name]),
             hold_within=self.hold_within_rad,

@@ -10,9 +10,13 @@ through, which is the predictor that the delay asks for (0: none). T is what is 
 (servod.kernels.laws.position). All three gains are negative feedback. l > 0 makes z_hat push the way the feedback
 pushes (integral action through the friction state); the other sign is harmful. Every direction has its own nodes, so
 asymmetry needs nothing special.
-Options: the velocity of z_hat, of d0 and of the sets is the measured one or the reference's, led by a stated time;
-an output disturbance observer around the whole (bandwidth 0: none). The regions go by the faster of both velocities:
+Options: the velocity w of z_hat, of d0 and of the sets is the measured one or the reference's, led by a stated time,
+as it is or corrected by the error; an output disturbance observer around the whole (bandwidth 0: none). The regions go by the faster of both velocities:
 a step has no reference velocity, yet the gains of Omega_L on a joint that turns fast make a limit cycle.
+Driven by the reference alone, the friction that is compensated has the reference's phase whatever the joint does: once
+pushed, a joint may swing against it for ever, on ten times its error. The corrected reference goes the way back as
+soon as the error is more than a bristle stretches, when the joint cannot but slide otherwise than the reference:
+w = v_ref + (k_x/k_v)|L * (e beyond F_max/c0), the reference velocity of Slotine and Li with a dead zone.
 Far from its goal, as in a step, the joint is approached with a bounded speed: the feedback sees a limited error.
 The observer has bandwidths of its own in Omega_L: one for coming to rest, under a reference that rests, and one under
 a reference that moves. There a fast one may take friction that turns over for a disturbance, and throw the joint
@@ -53,7 +57,7 @@ class LocalGains(NamedTuple):
     viscous: float  # d0_hat [N*m*s/rad]
     leak: float  # least decay of z_hat [1/s]
     state_limit: float  # bound of |z_hat| [rad], F_max/c0 as below (8)
-    source: float  # MEASURED or REFERENCE: whose velocity drives z_hat, d0 and the sets
+    source: float  # MEASURED, REFERENCE or CORRECTED: whose velocity drives z_hat, d0 and the sets
     lead: float  # time by which the reference velocity is led [s]
     shape: float  # servod.kernels.laws.weights.Shape
     hold_within: float  # hold width [rad]
@@ -101,6 +105,7 @@ FIRST_NODE = 33  # ... and the first of them
 
 MEASURED = 0.0
 REFERENCE = 1.0
+CORRECTED = 2.0
 REST_TO_S, REST_FROM_S = 0.02, 0.004  # time constants with which a joint comes to count as at rest, and ceases to
 COMMANDS = 3  # past commands that may be fed back: those of two cycles of delay, and one that the velocity lags behind
 
@@ -114,6 +119,17 @@ def awake(p: LocalGains, s: LawState, stands: bool, error: float, dt: float) -> 
     else:
         s.rest *= math.exp(-dt / REST_FROM_S)
     return 1.0 - s.rest * (1.0 - p.rest_share)
+
+
+def way_back(p: LocalGains, error: float) -> float:
+    """Velocity that corrects the reference's [rad/s]: 0 up to the stretch of a bristle, then towards the reference.
+
+    As fast as the feedback of Omega_L would bring the joint back, and no faster than the outermost set knows.
+    """
+    beyond = abs(error) - p.state_limit
+    if beyond <= 0.0 or p.low_k_v <= 0.0:
+        return 0.0
+    return math.copysign(min(p.low_k_x / p.low_k_v * beyond, p.sets.nodes[-1]), error)
 
 
 def high_share(p: LocalGains, speed: float) -> float:
@@ -149,12 +165,14 @@ def step(
     dt: float,
 ) -> tuple[float, float, float, float]:
     """One cycle: (torque, of it feedback K*u*, friction compensation, other) in N*m."""
-    w = v_ref + p.lead * a_ref if p.source == REFERENCE else v
+    w = v if p.source == MEASURED else v_ref + p.lead * a_ref
     error = x_ref - x
+    stands = v_ref == 0.0 and a_ref == 0.0
+    if p.source == CORRECTED and not stands:
+        w += way_back(p, error)
     s.command_1 -= (s.asked - u_applied) / p.input_scale  # what the limits cut never acts
     share = high_share(p, max(abs(w), abs(v)))
     seen = limited(error, p.error_limit) if p.error_limit > 0.0 else error
-    stands = v_ref == 0.0 and a_ref == 0.0
     acts = awake(p, s, stands, error, dt)
     u_star = acts * scheduled(p, s, share, seen, v_ref - v)
     s.command_3, s.command_2, s.command_1 = s.command_2, s.command_1, u_star
@@ -163,7 +181,7 @@ def step(
     drive = w
     if moves and gain != 0.0 and not winding_up(s, u_star, u_applied):
         drive += gain * u_star
-    if moves or p.source != REFERENCE:
+    if moves or p.source == MEASURED:
         s.z_hat = limited(decayed(s.z_hat, max(decay, p.leak), drive, dt), p.state_limit)
     friction = p.stiffness * s.z_hat + p.viscous * w
     known = position_torque(p.position, x_ref, v_ref) if p.knows_position else 0.0

@@ -82,7 +82,7 @@ class DesignOptions:
     name: str = "synthesized"
     accuracy: float = ACCURACY
     paper_nodes: bool = False
-    velocity: VelocitySource = VelocitySource.REFERENCE
+    velocity: VelocitySource = VelocitySource.CORRECTED_REFERENCE
     observer: bool = True
     gain: float | None = None  # l_i; None = 0 where the observer is the integral action, else designed
     leak_per_s: float = 2.0

@@ -16,6 +16,7 @@ from servod.formats.gains.gain_set import Certificate, CertificateCheck, GainSet
 from servod.lab.verify.checks import LEAST_PLANTS, SIMULATED, STATIC, Subject, at_most, observations
 from servod.lab.verify.effect_checks import check_effects
 from servod.lab.verify.feedforward import check_feedforward
+from servod.lab.verify.pushes import check_pushes
 from servod.lab.verify.reference_proof import check_reference
 from servod.lab.verify.rest_checks import check_loads, check_rest
 from servod.lab.verify.trials import scale_of
@@ -99,7 +100,7 @@ def verify(
     checks = [check for judge in cheap for check in judge(subject)]
     if not all(check.passed for check in checks):
         return Verification(checks, {})
-    checks += [check for judge in (*SIMULATED, check_loads) for check in judge(subject)]
+    checks += [check for judge in (*SIMULATED, check_loads, check_pushes) for check in judge(subject)]
     promised = promise(gains, gains.design, seed)
     checks.append(
         at_most("validation motion that a plant does not get through (0 no, 1 yes)", float(not promised), 0.0)
