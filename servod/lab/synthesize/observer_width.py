@@ -235,6 +235,8 @@ def designed(design: Design, friction: SteadyFriction, law: LocalParameters) -> 
 PLANTS, SEED = 20, 11  # of the trial; the certificate draws others, and many more
 #: Largest figure of these plants as a share of what the certificate allows: it meets worse ones.
 TRIED_SHARE = 0.5
+#: Bandwidths that are tried, best first, as shares of the way from the one of coming to rest to that of Omega_H.
+MOVING_SHARES = (0.0, 0.25, 0.5)
 
 
 def with_moving_observer(gains: GainSet, friction: SteadyFriction) -> GainSet:
@@ -243,7 +245,7 @@ def with_moving_observer(gains: GainSet, friction: SteadyFriction) -> GainSet:
     assert isinstance(law, LocalParameters) and law.disturbance_observer is not None and design is not None
     high, rest = law.disturbance_observer.bandwidth_rad_s, law.disturbance_observer.low_bandwidth_rad_s
     search = Search(design, friction)
-    for moving in [rest, math.sqrt(rest * high)] if rest else []:
+    for moving in [rest * (high / rest) ** share for share in MOVING_SHARES] if rest else []:
         faster = with_observer(law, high, rest, moving)
         found = gains.model_copy(update={"parameters": faster}).sealed()
         stands = search.stands(faster, DISK_LIMIT, law.regions.overlap_to_rad_s)

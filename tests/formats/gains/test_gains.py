@@ -249,6 +249,15 @@ def test_a_set_that_an_earlier_version_sealed_is_what_it_was() -> None:
     require_fit(gains, load_config(shipped("gains/config/virtual.yaml")))
 
 
+@pytest.mark.parametrize(
+    ("velocity", "source"),
+    [("measured", local.MEASURED), ("reference", local.REFERENCE), ("corrected_reference", local.CORRECTED)],
+)
+def test_every_velocity_source_has_its_own_number(velocity: str, source: float) -> None:
+    text = good.LOCAL.replace("    sets:", f"    velocity: {velocity}\n    sets:")
+    assert local.LocalGains.from_flat(parse_gains(text, "good.yaml").pack()).source == source
+
+
 @pytest.mark.parametrize(("low", "moving", "packed"), [(None, None, 50.0), (300.0, None, 300.0), (300.0, 120.0, 120.0)])
 def test_an_observer_of_an_earlier_version_keeps_its_bandwidth_in_slow_motion(
     low: float | None, moving: float | None, packed: float

@@ -109,6 +109,30 @@ def test_reference_velocity_is_led() -> None:
     assert s.z_hat == pytest.approx(0.001 * DT, rel=0.02)
 
 
+def driven(p: local.LocalGains, error: float, v_ref: float) -> float:
+    """Velocity that drove z_hat in one step from rest [rad/s]; the decay of so short a step is negligible."""
+    s = LawState()
+    LAWS["local"].step(p._replace(sets=p.sets._replace(decays=(0.0,) * len(p.sets.nodes))), s, error, v_ref, *REST)
+    return s.z_hat / DT
+
+
+REST = (0.0, 0.0, 0.0, 0.0, DT)  # reference acceleration, position, velocity, torque, period
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(("beyond_rad", "more"), [(-1e-6, 0.0), (0.0, 0.0), (1e-3, 25.0 / 1.2 * 1e-3), (0.1, 0.5)])
+def test_the_corrected_reference_goes_the_way_back_beyond_a_bristles_stretch(
+    sign: float, beyond_rad: float, more: float
+) -> None:
+    p = local_gains(source=local.CORRECTED)
+    p = p._replace(leak=0.0, state_limit=1e-3)
+    error = sign * (p.state_limit + beyond_rad)
+    assert driven(p, error, 0.01) == pytest.approx(0.01 + sign * more)
+    assert driven(p._replace(source=local.REFERENCE), error, 0.01) == pytest.approx(0.01)
+    assert driven(p, error, 0.0) == 0.0  # a reference that rests is followed as ever
+    assert driven(p._replace(low_k_v=0.0), error, 0.01) == pytest.approx(0.01)
+
+
 @pytest.mark.parametrize(("speed", "share"), [(0.0, 0.0), (0.005, 0.0), (0.0125, 0.5), (0.02, 1.0), (0.3, 1.0)])
 @pytest.mark.parametrize("moves", ["joint", "reference"])
 def test_region_gains_blend_over_the_overlap(speed: float, share: float, moves: str) -> None:

@@ -1,0 +1,91 @@
+"""A joint that was thrown off its motion comes back under a certified set, and a set that keeps it is refused."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from servod.client.axis import ReferenceMotion
+from servod.client.open import stepped_axis
+from servod.common.shipped import shipped
+from servod.formats.gains.gain_set import GainSet, load_gains
+from servod.formats.gains.parameters import LocalParameters, VelocitySource
+from servod.formats.model.axis_model import load_axis_model
+from servod.formats.recording.record import RECORD, CycleRecord
+from servod.lab.synthesize.observer_width import with_observer
+from servod.lab.verify.checks import Subject
+from servod.lab.verify.pushes import Thrown, check_pushes, swing_limit_rad
+from servod.lab.verify.trials import scale_of
+
+
+def certified() -> GainSet:
+    return load_gains(shipped("gains/demo_local_certified.yaml"))
+
+
+def with_reference_alone(gains: GainSet) -> GainSet:
+    """Friction in the phase of the reference whatever the joint does, and an observer that gathers fast."""
+    law = gains.parameters
+    assert isinstance(law, LocalParameters) and law.disturbance_observer is not None
+    observer = law.disturbance_observer
+    moving = with_observer(law, observer.bandwidth_rad_s, observer.low_bandwidth_rad_s, observer.low_bandwidth_rad_s)
+    friction = law.friction.model_copy(update={"velocity": VelocitySource.REFERENCE})
+    changed = {"name": "kept", "parameters": moving.model_copy(update={"friction": friction}), "certificate": None}
+    return gains.model_copy(update=changed).sealed()
+
+
+def thrown(gains: GainSet) -> Thrown:
+    assert gains.design is not None
+    return Thrown(gains, gains.design.model, gains.design, scale_of(gains.design))
+
+
+def test_the_set_that_ships_has_no_second_steady_motion() -> None:
+    good = certified()
+    assert good.design is not None
+    (check,) = check_pushes(Subject(good, good.design, 1, 1, 1))
+    assert check.passed, check
+
+
+def test_a_second_steady_motion_is_refused() -> None:
+    """With the model alone; drawn plants only make it worse."""
+    kept = with_reference_alone(certified())
+    assert kept.design is not None
+    assert max(thrown(kept).excesses_rad()) > 20.0 * swing_limit_rad(kept.design)
+
+
+@pytest.mark.parametrize(("frequency_hz", "speed_rad_s"), [(0.5, 0.1), (3.0, 0.02), (20.0, 0.1)])
+def test_what_comes_back_differs_by_less_than_a_count(frequency_hz: float, speed_rad_s: float) -> None:
+    found = thrown(certified())
+    assert abs(found.excess_rad(frequency_hz, speed_rad_s)) < 2.0 * math.pi / 2**20
+
+
+def test_a_law_that_runs_away_is_no_small_figure() -> None:
+    gains = certified()
+    law = gains.parameters
+    assert isinstance(law, LocalParameters)
+    high = law.regions.high.model_copy(update={"k_v_s_per_rad": 0.0, "k_x_per_rad": 1e7})
+    low = law.regions.low.model_copy(update={"k_v_s_per_rad": 0.0, "k_x_per_rad": 1e7})
+    wild = law.model_copy(update={"regions": law.regions.model_copy(update={"low": low, "high": high})})
+    worst = max(thrown(gains.model_copy(update={"parameters": wild})).excesses_rad())
+    assert worst > swing_limit_rad(gains.design) or math.isnan(worst)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("amplitude_rad", "frequency_hz"), [(3.5e-4, 5.477), (7.3e-5, 15.38)])
+def test_the_axis_that_the_loop_runs_comes_back_too(amplitude_rad: float, frequency_hz: float, tmp_path: Path) -> None:
+    """The loop's own motions, one behind the other, and the joint that the shipped set was identified on."""
+    joint = load_axis_model(shipped("gains/axes/demo_joint.yaml"))
+
+    def rms_rad(gains: GainSet, before: bool) -> float:
+        folder = tmp_path / f"{gains.name}{before}"
+        folder.mkdir()
+        with stepped_axis(joint, gains, folder, 3) as axis:
+            if before:
+                axis.run(ReferenceMotion.sine(0.02, 5.0, 2.0))
+            raw = axis.run(ReferenceMotion.sine(amplitude_rad, frequency_hz, 2.0))
+        rows = [row for row in map(CycleRecord._make, RECORD.iter_unpack(raw)) if row.reference_active]
+        return float(np.sqrt(np.mean([(row.reference_rad - row.position_rad) ** 2 for row in rows[-1000:]])))
+
+    assert rms_rad(certified(), True) < 1.2 * rms_rad(certified(), False)
+    assert rms_rad(with_reference_alone(certified()), True) > 1e-3
