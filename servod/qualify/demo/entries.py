@@ -131,7 +131,7 @@ def _local_options(parameters: LocalParameters) -> str:
     return ", ".join(
         [
             f"friction map of {len(friction.sets)} velocities",
-            f"{friction.velocity.value} velocity",
+            f"{friction.velocity.value.replace('_', ' ')} velocity",
             f"observer {observer.bandwidth_rad_s:g} rad/s" if observer else "no observer",
             f"{regions} feedback",
             *(["inertia fed forward"] if parameters.feedforward_inertia_kg_m2 else []),
