@@ -79,7 +79,9 @@ OverlapTo = Annotated[float, typer.Option(min=1e-5, max=10.0, help="Omega_L ends
 Accuracy = Annotated[float, typer.Option(min=0.001, max=0.5, help="Force tolerance between local sets, a share.")]
 PaperNodes = Annotated[bool, typer.Option("--paper-nodes", help="The paper's nine local sets.")]
 WeightsOption = Annotated[Weights, typer.Option(help="Shape of the weighting functions.")]
-VelocityOption = Annotated[Velocity, typer.Option(help="Whose velocity drives the friction state.")]
+VelocityOption = Annotated[
+    Velocity, typer.Option(help="Whose velocity drives the friction state; corrected falls back where it swings.")
+]
 Observer = Annotated[bool, typer.Option(help="Output disturbance observer.")]
 PositionTorque = Annotated[bool, typer.Option(help="Feed known torques over position forward.")]
 Leak = Annotated[float, typer.Option(min=0.0, max=100.0, help="Least decay of the friction state, 1/s.")]

@@ -11,8 +11,9 @@ through, which is the predictor that the delay asks for (0: none). T is what is 
 pushes (integral action through the friction state); the other sign is harmful. Every direction has its own nodes, so
 asymmetry needs nothing special.
 Options: the velocity w of z_hat, of d0 and of the sets is the measured one or the reference's, led by a stated time,
-as it is or corrected by the error; an output disturbance observer around the whole (bandwidth 0: none). The regions go by the faster of both velocities:
-a step has no reference velocity, yet the gains of Omega_L on a joint that turns fast make a limit cycle.
+as it is or corrected by the error; an output disturbance observer around the whole (bandwidth 0: none).
+The regions go by the faster of both velocities: a step has no reference velocity, yet the gains of Omega_L on a joint
+that turns fast make a limit cycle.
 Driven by the reference alone, the friction that is compensated has the reference's phase whatever the joint does: once
 pushed, a joint may swing against it for ever, on ten times its error. The corrected reference goes the way back as
 soon as the error is more than a bristle stretches, when the joint cannot but slide otherwise than the reference:

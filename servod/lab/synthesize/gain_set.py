@@ -46,6 +46,7 @@ from servod.lab.synthesize.observer_width import (
     designed,
     with_moving_observer,
     with_observer,
+    with_returning_velocity,
     with_share_at_rest,
     with_widest_observer,
 )
@@ -178,7 +179,9 @@ def synthesize(
     if law.disturbance_observer is None and options.gain is None:
         law = designed(design, friction, law)
     found = with_share_at_rest(gain_set(design, law, options, model_path))
-    return found if law.disturbance_observer is None else with_moving_observer(found, friction)
+    return with_returning_velocity(
+        found if law.disturbance_observer is None else with_moving_observer(found, friction), design
+    )
 
 
 def gain_set(design: Design, law: LocalParameters, options: DesignOptions, model_path: Path | None) -> GainSet:

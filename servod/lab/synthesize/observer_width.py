@@ -15,7 +15,7 @@ import numpy as np
 
 from servod.formats.gains.design import Design
 from servod.formats.gains.gain_set import GainSet
-from servod.formats.gains.parameters import LocalParameters
+from servod.formats.gains.parameters import LocalParameters, VelocitySource
 from servod.kernels.laws import LAWS
 from servod.lab.verify.checks import CORNER_DISK, CORNER_SPEEDS, DISK_LIMIT, Subject, speeds_of
 from servod.lab.verify.closed_loop import LoopDeviation, corners, late_corners
@@ -264,6 +264,20 @@ def returns(gains: GainSet, design: Design) -> bool:
     """Whether the joint as modelled comes back to every sine that it was pushed off, with something to spare."""
     thrown = Thrown(gains, design.model, design, scale_of(design))
     return all(excess < TRIED_SHARE * swing_limit_rad(design) for excess in thrown.excesses_rad())
+
+
+def with_returning_velocity(gains: GainSet, design: Design) -> GainSet:
+    """`gains`, or the same with the reference's velocity as it is where that alone comes back from pushes; sealed.
+
+    Without an output observer, weak feedback and friction that falls much leave the correction a swing of its own.
+    """
+    law = gains.parameters
+    assert isinstance(law, LocalParameters)
+    if law.friction.velocity is not VelocitySource.CORRECTED_REFERENCE or returns(gains, design):
+        return gains
+    friction = law.friction.model_copy(update={"velocity": VelocitySource.REFERENCE})
+    plain = gains.model_copy(update={"parameters": law.model_copy(update={"friction": friction})}).sealed()
+    return plain if returns(plain, design) else gains
 
 
 # --- Feedback and observer at rest -----------------------------------------------------------------------------------

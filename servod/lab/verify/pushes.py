@@ -30,11 +30,11 @@ FREQUENCIES = 8
 LEAST_SPEED, MOST_SPEED, SPEEDS = 0.006, 0.2, 6
 REST_S, PUSH_AT_S, PUSH_S, BACK_S = 0.1, 0.3, 0.1, 1.0
 WATCHED_S = 0.5  # at least, and whole periods
-#: What throws it otherwise: a sine at top speed that ends in mid-swing, in so many s at so much of the highest frequency.
+#: What throws it otherwise: a sine at top speed that ends in mid-swing, at so much of the highest frequency.
 BEFORE_S, BEFORE_SHARE = 1.0, 0.25
 PLANTS = 3  # drawn ones, beside the model
-#: Of the stretch of a bristle at full friction, F_max/c0: a motion that differs by more is one in which the joint slides
-#: other ways than the reference.
+#: Of the stretch of a bristle at full friction, F_max/c0: in a motion that differs by more the joint slides other ways
+#: than the reference.
 STRETCH_SHARE = 0.5
 
 
@@ -102,7 +102,7 @@ def swing_limit_rad(design: Design) -> float:
 
 
 def check_pushes(s: Subject) -> Iterator[CertificateCheck]:
-    """Sines from inside Omega_L to far outside, on the model and drawn plants: each pushed, or after a faster motion."""
+    """Sines from inside Omega_L to far outside, on model and drawn plants: each pushed, or after a faster motion."""
     scale = scale_of(s.design)
     plants = [s.design.model, *(drawn(s.design.model, s.design.uncertainty, s.seed, i) for i in range(PLANTS))]
     worst = max(excess for plant in plants for excess in Thrown(s.gains, plant, s.design, scale).excesses_rad())

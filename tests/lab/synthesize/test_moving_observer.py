@@ -5,8 +5,14 @@ from __future__ import annotations
 import pytest
 
 from servod.formats.gains.gain_set import GainSet
-from servod.formats.gains.parameters import LocalParameters
-from servod.lab.synthesize.observer_width import follows, with_moving_observer, with_observer
+from servod.formats.gains.parameters import LocalParameters, VelocitySource
+from servod.lab.synthesize import observer_width
+from servod.lab.synthesize.observer_width import (
+    follows,
+    with_moving_observer,
+    with_observer,
+    with_returning_velocity,
+)
 from servod.lab.verify.steady_friction import steady_friction
 from tests.lab.synthesize.designs import table1_set
 
@@ -42,3 +48,22 @@ def test_with_a_coarse_encoder_one_that_throws_the_joint_is_not_taken() -> None:
 
 def test_without_a_bandwidth_for_rest_there_is_nothing_to_choose() -> None:
     assert moving_bandwidth(with_bandwidths(30.0, None)) is None
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_the_velocity_that_comes_back_is_taken(first: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whichever the simulated pushes tell; neither leaves the one that was wished."""
+    gains = table1_set()
+    law, design = gains.parameters, gains.design
+    assert isinstance(law, LocalParameters) and design is not None
+
+    def source(found: GainSet) -> VelocitySource:
+        assert isinstance(found.parameters, LocalParameters) and not found.seal_broken
+        return found.parameters.friction.velocity
+
+    back = {VelocitySource.CORRECTED_REFERENCE: first, VelocitySource.REFERENCE: not first}
+    monkeypatch.setattr(observer_width, "returns", lambda found, _: back[source(found)])
+    wished = VelocitySource.CORRECTED_REFERENCE
+    assert source(with_returning_velocity(gains, design)) is (wished if first else VelocitySource.REFERENCE)
+    monkeypatch.setattr(observer_width, "returns", lambda *_: False)
+    assert source(with_returning_velocity(gains, design)) is wished
