@@ -179,9 +179,7 @@ def synthesize(
     if law.disturbance_observer is None and options.gain is None:
         law = designed(design, friction, law)
     found = with_share_at_rest(gain_set(design, law, options, model_path))
-    return with_returning_velocity(
-        found if law.disturbance_observer is None else with_moving_observer(found, friction), design
-    )
+    return with_moving_observer(found, friction) if law.disturbance_observer else with_returning_velocity(found)
 
 
 def gain_set(design: Design, law: LocalParameters, options: DesignOptions, model_path: Path | None) -> GainSet:

@@ -240,7 +240,10 @@ MOVING_SHARES = (0.0, 0.25, 0.5)
 
 
 def with_moving_observer(gains: GainSet, friction: SteadyFriction) -> GainSet:
-    """`gains` with the bandwidth of coming to rest also in motion where that stands and follows; sealed."""
+    """`gains` with a bandwidth of its own in motion, the fastest that stands, follows and returns; sealed.
+
+    Where none does it has the one of Omega_H, and the velocity that returns with that.
+    """
     law, design = gains.parameters, gains.design
     assert isinstance(law, LocalParameters) and law.disturbance_observer is not None and design is not None
     high, rest = law.disturbance_observer.bandwidth_rad_s, law.disturbance_observer.low_bandwidth_rad_s
@@ -251,7 +254,7 @@ def with_moving_observer(gains: GainSet, friction: SteadyFriction) -> GainSet:
         stands = search.stands(faster, DISK_LIMIT, law.regions.overlap_to_rad_s)
         if stands and follows(found) and returns(found, design):
             return found
-    return gains
+    return with_returning_velocity(gains)
 
 
 def follows(gains: GainSet) -> bool:
@@ -266,13 +269,13 @@ def returns(gains: GainSet, design: Design) -> bool:
     return all(excess < TRIED_SHARE * swing_limit_rad(design) for excess in thrown.excesses_rad())
 
 
-def with_returning_velocity(gains: GainSet, design: Design) -> GainSet:
+def with_returning_velocity(gains: GainSet) -> GainSet:
     """`gains`, or the same with the reference's velocity as it is where that alone comes back from pushes; sealed.
 
     Without an output observer, weak feedback and friction that falls much leave the correction a swing of its own.
     """
-    law = gains.parameters
-    assert isinstance(law, LocalParameters)
+    law, design = gains.parameters, gains.design
+    assert isinstance(law, LocalParameters) and design is not None
     if law.friction.velocity is not VelocitySource.CORRECTED_REFERENCE or returns(gains, design):
         return gains
     friction = law.friction.model_copy(update={"velocity": VelocitySource.REFERENCE})

@@ -54,8 +54,6 @@ def test_without_a_bandwidth_for_rest_there_is_nothing_to_choose() -> None:
 def test_the_velocity_that_comes_back_is_taken(first: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whichever the simulated pushes tell; neither leaves the one that was wished."""
     gains = table1_set()
-    law, design = gains.parameters, gains.design
-    assert isinstance(law, LocalParameters) and design is not None
 
     def source(found: GainSet) -> VelocitySource:
         assert isinstance(found.parameters, LocalParameters) and not found.seal_broken
@@ -64,6 +62,6 @@ def test_the_velocity_that_comes_back_is_taken(first: bool, monkeypatch: pytest.
     back = {VelocitySource.CORRECTED_REFERENCE: first, VelocitySource.REFERENCE: not first}
     monkeypatch.setattr(observer_width, "returns", lambda found, _: back[source(found)])
     wished = VelocitySource.CORRECTED_REFERENCE
-    assert source(with_returning_velocity(gains, design)) is (wished if first else VelocitySource.REFERENCE)
+    assert source(with_returning_velocity(gains)) is (wished if first else VelocitySource.REFERENCE)
     monkeypatch.setattr(observer_width, "returns", lambda *_: False)
-    assert source(with_returning_velocity(gains, design)) is wished
+    assert source(with_returning_velocity(gains)) is wished
