@@ -356,6 +356,9 @@ class ValidationSettings:
     most_free_run_error_by_drive: float = 0.85
     #: That is not asked where the mismatch is within so many times the noise floor anyway.
     fitted_floors: float = 2.0
+    #: Nor where rows that no fit has seen have a mismatch of no more than this share of what they had: that predicts.
+    #: Where friction falls with speed a simulated run leaves the recorded one however good the model is.
+    predicted_share: float = 0.02
 
 
 @dataclass(frozen=True)

@@ -173,6 +173,16 @@ def off_by_share(nominal: Document, fitted: Document, key: str) -> float:
     return abs(now - was) / was
 
 
+def dry_nm(document: Document) -> float:
+    """The level of the model's dry friction, N*m: Coulomb friction, or the mean over a map's nodes."""
+    law = document["friction"]
+    if law["kind"] != "local":
+        return get(document, "friction.coulomb")
+    viscous = law.get("viscous", 0.0)
+    parts = [abs(t - viscous * v) for v, t in zip(law["velocities"], law["torques"], strict=True)]
+    return math.fsum(parts) / len(parts)
+
+
 def factor(nominal: Document, fitted: Document, key: str) -> float:
     """By which factor, never below 1, a parameter is off; 1 where one of the two has none."""
     was, now = get(nominal, key), get(fitted, key)

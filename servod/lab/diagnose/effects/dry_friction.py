@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from servod.lab.diagnose.effects.base import LEVEL_SHARE, off_by_share
-from servod.lab.diagnose.effects.effect import ANOTHER_DRIVE, Effect, level
+from servod.lab.diagnose.effects.base import LEVEL_SHARE, dry_nm
+from servod.lab.diagnose.effects.effect import ANOTHER_DRIVE, Effect, level, map_level
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Term, get
 from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.search_context import SearchContext
@@ -15,7 +15,9 @@ SCALES = ("friction.coulomb", "friction.static")
 
 
 def terms(scene: SearchContext) -> list[Term]:
-    """One factor on all dry friction; none where a map has its own curve."""
+    """One factor on all dry friction, or on the dry part of a map."""
+    if scene.document["friction"]["kind"] == "local":
+        return [map_level("dry_friction", dry=True)]
     nominal = get(scene.document, "friction.coulomb")
     if nominal <= 0.0:
         return []
@@ -28,7 +30,8 @@ def terms(scene: SearchContext) -> list[Term]:
 
 
 def _at_level(nominal: Document, fitted: Document) -> bool:
-    return off_by_share(nominal, fitted, "friction.coulomb") >= LEVEL_SHARE
+    was = dry_nm(nominal)
+    return was > 0.0 and abs(dry_nm(fitted) - was) >= LEVEL_SHARE * was
 
 
 EFFECT = Effect(

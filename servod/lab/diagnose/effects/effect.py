@@ -119,10 +119,34 @@ def level(effect: str, nominal: Document, scales: tuple[str, ...], tell: Teller)
             if get(document, key) > 0.0:
                 put(document, key, values[0] * get(document, key))
 
-    known = math.log(LEVEL_KNOWN)
-    own = Unknown(LEVEL, "1", 1.0, 1.0 / LEVEL_MOST, LEVEL_MOST, spread=known)
+    own = level_factor()
     begins = {key: get(nominal, key) for key in scales if get(nominal, key) > 0.0}
     return Term(effect, "level", (own,), write, tell, begins=begins, scales=scales)
+
+
+def level_factor() -> Unknown:
+    """A factor on what the model says: 1 is no effect, and a few times more or less no surprise."""
+    return Unknown(LEVEL, "1", 1.0, 1.0 / LEVEL_MOST, LEVEL_MOST, spread=math.log(LEVEL_KNOWN))
+
+
+def map_level(effect: str, dry: bool) -> Term:
+    """A factor on the dry or on the viscous part of a friction map, whose torques have both in them."""
+
+    def write(document: Document, values: Sequence[float]) -> None:
+        law = document["friction"]
+        viscous, change = law.get("viscous", 0.0), values[0] - 1.0
+        parts = [viscous * v for v in law["velocities"]]
+        if dry:
+            law["torques"] = [t + change * (t - part) for t, part in zip(law["torques"], parts, strict=True)]
+        else:
+            law["torques"] = [t + change * part for t, part in zip(law["torques"], parts, strict=True)]
+            law["viscous"] = values[0] * viscous
+
+    def tell(_document: Document, values: Sequence[float]) -> list[Reported]:
+        return [Reported("over_model", values[0], "1")]
+
+    scales = ("friction.torques",) if dry else ("friction.torques", "friction.viscous")
+    return Term(effect, "level", (level_factor(),), write, tell, scales=scales)
 
 
 def of_drive(effect: str, form: str, unknowns: Sequence[Unknown]) -> Term:

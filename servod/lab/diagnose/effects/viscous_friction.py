@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from servod.lab.diagnose.effects.base import LEVEL_SHARE, off_by_share
-from servod.lab.diagnose.effects.effect import ANOTHER_DRIVE, Effect, level
+from servod.lab.diagnose.effects.effect import ANOTHER_DRIVE, Effect, level, map_level
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Term, Unknown, get, put
 from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.search_context import SearchContext
@@ -20,7 +20,7 @@ def terms(scene: SearchContext) -> list[Term]:
     """One factor on the model's own; where that has none, the coefficient itself."""
     nominal, unit = get(scene.document, KEY), f"{scene.force}·s/{scene.length}"
     if scene.document["friction"]["kind"] == "local":
-        return []
+        return [map_level("viscous_friction", dry=False)] if nominal > 0.0 else []
 
     def tell(document: Document, _values: Sequence[float]) -> list[Reported]:
         found = get(document, KEY)

@@ -174,7 +174,8 @@ def predicts_nothing(judgement: JudgedSelection) -> bool:
     """
     validation, unseen = judgement.validation, judgement.unseen
     within_noise = unseen.after < SETTINGS.validation.fitted_floors * unseen.floor
-    if within_noise or set(judgement.named) <= set(single_events(judgement.fit.hypothesis)):
+    predicted = unseen.after < SETTINGS.validation.predicted_share * unseen.before
+    if within_noise or predicted or set(judgement.named) <= set(single_events(judgement.fit.hypothesis)):
         return False
     gain = free_run_gain(judgement.predictor, validation.before, validation.after, validation.folds.judged)
     driven = any(trace.drive.told is not None for trace in judgement.predictor.traces)
