@@ -52,7 +52,7 @@ LATENESS = {
 LOGS: list[Path] = []
 _LOGGED = re.compile(r"fault (\w+) \(")
 #: A drive that missed its master says so by EMCY 0x8130 (CiA 301, life guard or heartbeat error).
-_EMCY, _MISSED_ITS_MASTER = re.compile(r"EMCY 0x([0-9A-F]{4})"), {"8130"}
+_EMCY, _MISSED_ITS_MASTER = re.compile(r"EMCY 0x([0-9A-F]{4}) .*\(DRIVE_FAULT\)"), {"8130"}
 _FOLLOWS = re.compile(r"a fault is latched|'FAULT'|is FAULT|the axis is not enabled|must be configured anew")
 #: Sleeps on one processor before all that servod starts there, and tells when it slept too long, and how much [s].
 _WITNESS = """
@@ -157,8 +157,9 @@ def logged(logs: Iterable[Path]) -> set[str]:
     """The faults that daemons wrote down; a drive's own that it had for want of heartbeats is one of heartbeats."""
     found = set()
     for text in (log.read_text(errors="replace") for log in logs if log.exists()):
-        named = set(_LOGGED.findall(text))
-        if "DRIVE_FAULT" in named and set(_EMCY.findall(text)) == _MISSED_ITS_MASTER:
+        faults, told = _LOGGED.findall(text), _EMCY.findall(text)
+        named = set(faults)
+        if 0 < faults.count("DRIVE_FAULT") <= len(told) and set(told) == _MISSED_ITS_MASTER:
             named = named - {"DRIVE_FAULT"} | {"NODE_HEARTBEAT_LOST"}
         found |= named
     return found

@@ -17,7 +17,8 @@ that turns fast make a limit cycle.
 Driven by the reference alone, the friction that is compensated has the reference's phase whatever the joint does: once
 pushed, a joint may swing against it for ever, on ten times its error. The corrected reference goes the way back as
 soon as the error is more than a bristle stretches, when the joint cannot but slide otherwise than the reference:
-w = v_ref + (k_x/k_v)|L * (e beyond F_max/c0), the reference velocity of Slotine and Li with a dead zone.
+w = v_ref + (k_x/k_v)|L * (e beyond F_max/c0 and the hold width), the reference velocity of Slotine and Li with a dead
+zone. The regions, which go by the faster of w and v, follow: a joint that is far off is fed back as one that slides.
 Far from its goal, as in a step, the joint is approached with a bounded speed: the feedback sees a limited error.
 The observer has bandwidths of its own in Omega_L: one for coming to rest, under a reference that rests, and one under
 a reference that moves. There a fast one may take friction that turns over for a disturbance, and throw the joint
@@ -125,12 +126,14 @@ def awake(p: LocalGains, s: LawState, stands: bool, error: float, dt: float) -> 
 def way_back(p: LocalGains, error: float) -> float:
     """Velocity that corrects the reference's [rad/s]: 0 up to the stretch of a bristle, then towards the reference.
 
-    As fast as the feedback of Omega_L would bring the joint back, and no faster than the outermost set knows.
+    As fast as the feedback of Omega_L would bring the joint back, and no faster than the outermost set of that side.
+    The hold width comes on top: so much of an error the encoder's steps alone may show.
     """
-    beyond = abs(error) - p.state_limit
+    beyond = abs(error) - p.state_limit - p.hold_within
     if beyond <= 0.0 or p.low_k_v <= 0.0:
         return 0.0
-    return math.copysign(min(p.low_k_x / p.low_k_v * beyond, p.sets.nodes[-1]), error)
+    speed = p.low_k_x / p.low_k_v * beyond
+    return min(speed, p.sets.nodes[-1]) if error > 0.0 else max(-speed, p.sets.nodes[0])
 
 
 def high_share(p: LocalGains, speed: float) -> float:

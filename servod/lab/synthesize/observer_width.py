@@ -21,7 +21,7 @@ from servod.lab.verify.checks import CORNER_DISK, CORNER_SPEEDS, DISK_LIMIT, Sub
 from servod.lab.verify.closed_loop import LoopDeviation, corners, late_corners
 from servod.lab.verify.effect_checks import late_effects
 from servod.lab.verify.margins import Judgement, Sweep, arrival_of
-from servod.lab.verify.pushes import Thrown, swing_limit_rad
+from servod.lab.verify.pushes import PushedOff, swing_limit_rad
 from servod.lab.verify.rest_checks import RESTING_POLE, resting_radius, resting_speed
 from servod.lab.verify.sampled import timing_of
 from servod.lab.verify.steady_friction import SteadyFriction
@@ -265,8 +265,8 @@ def follows(gains: GainSet) -> bool:
 
 def returns(gains: GainSet, design: Design) -> bool:
     """Whether the joint as modelled comes back to every sine that it was pushed off, with something to spare."""
-    thrown = Thrown(gains, design.model, design, scale_of(design))
-    return all(excess < TRIED_SHARE * swing_limit_rad(design) for excess in thrown.excesses_rad())
+    pushed = PushedOff(gains, design.model, design, scale_of(design))
+    return all(excess < TRIED_SHARE * swing_limit_rad(design) for excess in pushed.excesses_rad())
 
 
 def with_returning_velocity(gains: GainSet) -> GainSet:
@@ -279,7 +279,10 @@ def with_returning_velocity(gains: GainSet) -> GainSet:
     if law.friction.velocity is not VelocitySource.CORRECTED_REFERENCE or returns(gains, design):
         return gains
     friction = law.friction.model_copy(update={"velocity": VelocitySource.REFERENCE})
-    plain = gains.model_copy(update={"parameters": law.model_copy(update={"friction": friction})}).sealed()
+    note = f"{gains.provenance.note} Friction follows the plain reference: corrected it swings by itself."
+    origin = gains.provenance.model_copy(update={"note": note})
+    changed = {"parameters": law.model_copy(update={"friction": friction}), "provenance": origin}
+    plain = gains.model_copy(update=changed).sealed()
     return plain if returns(plain, design) else gains
 
 

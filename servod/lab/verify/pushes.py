@@ -19,6 +19,7 @@ from servod.formats.model.axis_model import AxisModel
 from servod.lab.simulate.simulate import LoopSettings, simulate_closed_loop
 from servod.lab.verify.checks import Subject, at_most
 from servod.lab.verify.plants import drawn
+from servod.lab.verify.rounding import LEAST_COUNTS, count_rad
 from servod.lab.verify.sampled import Array
 from servod.lab.verify.steady_friction import steady_friction
 from servod.lab.verify.trials import Scale, scale_of
@@ -28,14 +29,18 @@ CYCLES, HIGHEST_HZ, SLOWEST_SHARE = 50, 20.0, 1.0 / 40.0
 FREQUENCIES = 8
 #: Peak speeds as shares of the top speed: from inside Omega_L to far outside.
 LEAST_SPEED, MOST_SPEED, SPEEDS = 0.006, 0.2, 6
+#: Lengths at a cycle of 1 ms and less; at a slower one, whose law is slower alike, they have as many cycles.
 REST_S, PUSH_AT_S, PUSH_S, BACK_S = 0.1, 0.3, 0.1, 1.0
+SHORT_CYCLE_S = 0.001
 WATCHED_S = 0.5  # at least, and whole periods
-#: What throws it otherwise: a sine at top speed that ends in mid-swing, at so much of the highest frequency.
-BEFORE_S, BEFORE_SHARE = 1.0, 0.25
+#: What throws it otherwise: so many periods of a sine at top speed, which end at full speed.
+BEFORE_PERIODS, BEFORE_SHARE = 5, 0.25
 PLANTS = 3  # drawn ones, beside the model
-#: Of the stretch of a bristle at full friction, F_max/c0: in a motion that differs by more the joint slides other ways
+#: Of the stretch of a bristle at static friction, F_S/c0: in a motion that differs by more the joint slides other ways
 #: than the reference.
 STRETCH_SHARE = 0.5
+#: Of a sine's amplitude: an error that swings by more from rest on is no tracking that a push could be compared with.
+OWN_SHARE = 0.5
 
 
 def frequencies_hz(period_s: float) -> list[float]:
@@ -57,7 +62,7 @@ def sine(amplitude_rad: float, frequency_hz: float, duration_s: float, period_s:
 
 
 @dataclass(frozen=True)
-class Thrown:
+class PushedOff:
     """One plant under a set, on sines, quiet: the noise of sensor and torque would blur what is compared."""
 
     gains: GainSet
@@ -66,44 +71,62 @@ class Thrown:
     scale: Scale
 
     def excesses_rad(self) -> Iterator[float]:
-        """Of all sines: how much larger the error swings BACK_S after a push than without one, RMS [rad]."""
+        """Of all sines that the drive has the torque for: how much larger the error swings BACK_S after a push, RMS."""
+        friction = steady_friction(self.plant)
+        spare_nm = self.scale.torque_nm / friction.gain - friction.largest(self.design.speed_max_rad_s)
         for frequency in frequencies_hz(self.design.period_s):
-            yield from (self.excess_rad(frequency, speed) for speed in speeds_rad_s(self.design))
+            for speed in speeds_rad_s(self.design):
+                if 2.0 * math.pi * frequency * speed * friction.inertia <= spare_nm:
+                    yield self.excess_rad(frequency, speed)
 
     def excess_rad(self, frequency_hz: float, speed_rad_s: float) -> float:
-        """Of one sine with this peak speed; inf where the joint runs away."""
+        """Of one sine with this peak speed; inf where the joint runs away.
+
+        Where the error swings by more than OWN_SHARE of the sine without any push, that swing itself.
+        """
         period, amplitude = self.design.period_s, speed_rad_s / (2.0 * math.pi * frequency_hz)
-        watched_s = math.ceil(WATCHED_S * frequency_hz) / frequency_hz
-        motion = sine(amplitude, frequency_hz, PUSH_AT_S + PUSH_S + BACK_S + watched_s, period)
-        push = np.zeros(len(motion))
-        push[round(PUSH_AT_S / period) : round((PUSH_AT_S + PUSH_S) / period)] = self.scale.torque_nm
-        before_hz = BEFORE_SHARE * frequencies_hz(period)[-1]
-        before = sine(self.scale.top_rad_s / (2.0 * math.pi * before_hz), before_hz, BEFORE_S, period)
-        moved = np.concatenate([before, motion + np.array([before[-1, 0], 0.0, 0.0])])
+        watched_s = math.ceil(self._s(WATCHED_S) * frequency_hz) / frequency_hz
+        pushed_s = self._s(PUSH_AT_S), self._s(PUSH_AT_S + PUSH_S)
+        motion = sine(amplitude, frequency_hz, pushed_s[1] + self._s(BACK_S) + watched_s, period)
         last = round(watched_s / period)
-        thrown = max(self._swing_rad(motion, last, push), self._swing_rad(moved, last))
-        return thrown - self._swing_rad(motion, last)
+        own = self._swing_rad(motion, last)
+        if own > max(swing_limit_rad(self.design), OWN_SHARE * amplitude):
+            return own
+        push = np.zeros(len(motion))
+        push[round(pushed_s[0] / period) : round(pushed_s[1] / period)] = self.scale.torque_nm
+        before_hz = BEFORE_SHARE * frequencies_hz(period)[-1]
+        before = sine(self.scale.top_rad_s / (2.0 * math.pi * before_hz), before_hz, BEFORE_PERIODS / before_hz, period)
+        moved = np.concatenate([before, motion + np.array([before[-1, 0], 0.0, 0.0])])
+        return max(self._swing_rad(motion, last, push), self._swing_rad(moved, last)) - own
+
+    def _s(self, length_s: float) -> float:
+        """A length at this cycle."""
+        return length_s * max(1.0, self.design.period_s / SHORT_CYCLE_S)
 
     def _swing_rad(self, motion: Array, last: int, push_nm: Array | None = None) -> float:
-        """Standard deviation of the error: without its mean, for what creeps back is no second motion."""
-        d, rest = self.design, np.zeros(round(REST_S / self.design.period_s))
+        """RMS of the error, less its mean and slope, for what creeps back is no second motion; inf if it runs away."""
+        d, rest = self.design, np.zeros(round(self._s(REST_S) / self.design.period_s))
         settings = LoopSettings(d.period_s, d.counts_per_turn, d.velocity_cutoff_hz, self.scale.torque_nm)
         rows = np.concatenate([np.zeros((len(rest), 3)), motion])
         external = None if push_nm is None else np.concatenate([rest, push_nm])
         run = simulate_closed_loop(self.plant, self.gains.law, self.gains.pack(), rows, settings, external_nm=external)
         error = run.tracking_error_rad()[-last:]
-        return float(np.std(error)) if np.isfinite(error).all() else math.inf
+        if not np.isfinite(error).all():
+            return math.inf
+        steps = np.arange(last, dtype=np.float64)
+        return float(np.std(error - np.polyval(np.polyfit(steps, error, 1), steps)))
 
 
 def swing_limit_rad(design: Design) -> float:
-    """What may be left of a push: STRETCH_SHARE of F_max/c0 [rad]."""
+    """What may be left of a push [rad]: STRETCH_SHARE of F_S/c0, and LEAST_COUNTS, which no law tells from motion."""
     friction = steady_friction(design.model)
-    return STRETCH_SHARE * friction.largest(design.speed_max_rad_s) / friction.stiffness
+    stretch = friction.largest(LEAST_SPEED * design.speed_max_rad_s) / friction.stiffness
+    return STRETCH_SHARE * stretch + LEAST_COUNTS * count_rad(design)
 
 
 def check_pushes(s: Subject) -> Iterator[CertificateCheck]:
     """Sines from inside Omega_L to far outside, on model and drawn plants: each pushed, or after a faster motion."""
     scale = scale_of(s.design)
     plants = [s.design.model, *(drawn(s.design.model, s.design.uncertainty, s.seed, i) for i in range(PLANTS))]
-    worst = max(excess for plant in plants for excess in Thrown(s.gains, plant, s.design, scale).excesses_rad())
+    worst = max(excess for plant in plants for excess in PushedOff(s.gains, plant, s.design, scale).excesses_rad())
     yield at_most("pushed off a sine, error that swings on [rad RMS]", worst, swing_limit_rad(s.design))

@@ -29,7 +29,7 @@ class Row(Enum):
     TABLE1_OTHER = "Table I as (K_x, K_v, K_z)", RMS_MRAD["local"]
     TABLE1_PRINTED_L = "Table I, l_i as printed", RMS_MRAD["local"]
     LOCAL_PLAIN = "local at the paper's PD gains, no observer, measured velocity", RMS_MRAD["local"]
-    LOCAL_EQUAL = "local at the paper's PD gains, observer, reference velocity", RMS_MRAD["local"]
+    LOCAL_EQUAL = "local at the paper's PD gains, observer, corrected reference velocity", RMS_MRAD["local"]
     DEPLOYED = "local, synthesized", RMS_MRAD["local"]
 
     def __init__(self, label: str, paper_mrad: float | None) -> None:

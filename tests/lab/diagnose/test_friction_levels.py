@@ -94,3 +94,32 @@ def test_a_level_whose_interval_holds_the_models_own_is_no_finding(deviation: fl
             covariance[one, other] = covariance[other, one] = -0.99 * deviation**2
         assert differs_from_zero(fit, 0, covariance) is told
     assert hypothesis.unknowns[-1].key != LEVEL
+
+
+def as_map() -> AxisModel:
+    """The believed axis with its friction as an identification writes it: steady torques at speeds of both signs."""
+    own = BELIEVED["friction"]
+    speeds = np.geomspace(0.003, 4.0, 30)
+    fall = np.exp(-((speeds / own["stribeck_velocity"]) ** 2))
+    torques = own["coulomb"] + (own["static"] - own["coulomb"]) * fall + own["viscous"] * speeds
+    friction = {
+        "kind": "local",
+        "velocities": [*(-speeds[::-1]), *speeds],
+        "torques": [*(-torques[::-1]), *torques],
+        **{key: own[key] for key in ("sigma0", "sigma1", "viscous")},
+    }
+    return AxisModel.model_validate(BELIEVED | {"friction": friction})
+
+
+@pytest.mark.parametrize(
+    ("factors", "levels"),
+    [
+        ({"coulomb": 0.6, "static": 0.6}, {"dry_friction": 0.6}),
+        ({}, {}),
+    ],
+)
+def test_a_friction_map_has_levels_as_a_law_has(factors: dict[str, float], levels: dict[str, float]) -> None:
+    found = diagnosis_document(diagnose(as_map(), record(axis(**factors), seconds=4.0)))
+    assert found["verdict"] == ("missing_physics" if levels else "adequate")
+    assert over_model(found) == pytest.approx(levels, rel=0.04)
+    assert {one["effect"] for one in found["findings"]} == set(levels)

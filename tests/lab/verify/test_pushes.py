@@ -17,7 +17,16 @@ from servod.formats.model.axis_model import load_axis_model
 from servod.formats.recording.record import RECORD, CycleRecord
 from servod.lab.synthesize.observer_width import with_observer
 from servod.lab.verify.checks import Subject
-from servod.lab.verify.pushes import Thrown, check_pushes, swing_limit_rad
+from servod.lab.verify.pushes import (
+    BEFORE_PERIODS,
+    BEFORE_SHARE,
+    CYCLES,
+    PushedOff,
+    check_pushes,
+    frequencies_hz,
+    sine,
+    swing_limit_rad,
+)
 from servod.lab.verify.trials import scale_of
 
 
@@ -36,9 +45,9 @@ def with_reference_alone(gains: GainSet) -> GainSet:
     return gains.model_copy(update=changed).sealed()
 
 
-def thrown(gains: GainSet) -> Thrown:
+def thrown(gains: GainSet) -> PushedOff:
     assert gains.design is not None
-    return Thrown(gains, gains.design.model, gains.design, scale_of(gains.design))
+    return PushedOff(gains, gains.design.model, gains.design, scale_of(gains.design))
 
 
 def test_the_set_that_ships_has_no_second_steady_motion() -> None:
@@ -61,15 +70,36 @@ def test_what_comes_back_differs_by_less_than_a_count(frequency_hz: float, speed
     assert abs(found.excess_rad(frequency_hz, speed_rad_s)) < 2.0 * math.pi / 2**20
 
 
-def test_a_law_that_runs_away_is_no_small_figure() -> None:
+def test_a_law_that_swings_by_itself_is_no_small_figure() -> None:
+    """From rest on, so that there is no motion without a swing to compare with."""
     gains = certified()
-    law = gains.parameters
-    assert isinstance(law, LocalParameters)
-    high = law.regions.high.model_copy(update={"k_v_s_per_rad": 0.0, "k_x_per_rad": 1e7})
-    low = law.regions.low.model_copy(update={"k_v_s_per_rad": 0.0, "k_x_per_rad": 1e7})
-    wild = law.model_copy(update={"regions": law.regions.model_copy(update={"low": low, "high": high})})
-    worst = max(thrown(gains.model_copy(update={"parameters": wild})).excesses_rad())
-    assert worst > swing_limit_rad(gains.design) or math.isnan(worst)  # type: ignore[arg-type]
+    law, design = gains.parameters, gains.design
+    assert isinstance(law, LocalParameters) and design is not None
+    feedback = {"k_x_per_rad": 2e4, "k_u": None}
+    regions = {name: getattr(law.regions, name).model_copy(update=feedback) for name in ("low", "high")}
+    wild = law.model_copy(update={"regions": law.regions.model_copy(update=regions)})
+    found = thrown(gains.model_copy(update={"parameters": wild}))
+    assert found.excess_rad(3.0, 0.02) > 10.0 * swing_limit_rad(design)
+
+
+@pytest.mark.parametrize("period_s", [0.0005, 0.001, 0.002, 0.003, 0.004, 0.007, 0.02])
+def test_what_went_before_ends_at_full_speed_and_all_sines_fit_the_cycle(period_s: float) -> None:
+    highest = frequencies_hz(period_s)[-1]
+    before_hz = BEFORE_SHARE * highest
+    before = sine(0.5 / (2.0 * math.pi * before_hz), before_hz, BEFORE_PERIODS / before_hz, period_s)
+    assert before[-1, 1] == pytest.approx(0.5, rel=0.01)
+    assert highest * CYCLES * period_s <= 1.0 + 1e-9
+
+
+def test_a_drive_that_cannot_is_not_asked() -> None:
+    """A heavy joint at 20 Hz wants more torque than there is: what is judged is the law, not the drive's limit."""
+    gains = certified()
+    assert gains.design is not None
+    model = gains.design.model.model_copy(update={"inertia": 0.05})
+    heavy = PushedOff(gains, model, gains.design, scale_of(gains.design))
+    judged: list[tuple[float, float]] = []
+    object.__setattr__(heavy, "excess_rad", lambda f, v: judged.append((f, v)) or 0.0)
+    assert list(heavy.excesses_rad()) and max(2.0 * math.pi * f * v * 0.05 for f, v in judged) < heavy.scale.torque_nm
 
 
 @pytest.mark.parametrize(("amplitude_rad", "frequency_hz"), [(3.5e-4, 5.477), (7.3e-5, 15.38)])

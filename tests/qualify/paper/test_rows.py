@@ -52,7 +52,7 @@ def test_the_label_says_the_law_and_its_options(row: Row) -> None:
         assert "no options" not in label or not options_of(SETS[row])
         assert "all options" not in label or options_of(SETS[row]) == OPTIONS
         if "velocity" in label:
-            assert f"{law.friction.velocity.value} velocity" in label
+            assert f", {law.friction.velocity.value.replace('_', ' ')} velocity" in label
             assert ("no observer" in label) == (law.disturbance_observer is None)
             assert "observer" in label
 
