@@ -172,7 +172,7 @@ def step(
     w = v if p.source == MEASURED else v_ref + p.lead * a_ref
     error = x_ref - x
     stands = v_ref == 0.0 and a_ref == 0.0
-    if p.source == CORRECTED and not stands:
+    if p.source == CORRECTED:  # under a reference that rests too: between two moves the joint has not changed
         w += way_back(p, error)
     s.command_1 -= (s.asked - u_applied) / p.input_scale  # what the limits cut never acts
     share = high_share(p, max(abs(w), abs(v)))

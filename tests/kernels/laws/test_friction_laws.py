@@ -129,7 +129,7 @@ def test_the_corrected_reference_goes_the_way_back_beyond_a_bristles_stretch(
     error = sign * (p.state_limit + beyond_rad)
     assert driven(p, error, 0.01) == pytest.approx(0.01 + sign * more)
     assert driven(p._replace(source=local.REFERENCE), error, 0.01) == pytest.approx(0.01)
-    assert driven(p, error, 0.0) == 0.0  # a reference that rests is followed as ever
+    assert driven(p, error, 0.0) == pytest.approx(sign * more)  # also back to a reference that rests
     assert driven(p._replace(low_k_v=0.0), error, 0.01) == pytest.approx(0.01)
 
 

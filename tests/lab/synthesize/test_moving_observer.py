@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from servod.formats.gains.gain_set import GainSet
@@ -32,11 +34,12 @@ def moving_bandwidth(gains: GainSet) -> float | None:
     return found.parameters.disturbance_observer.low_moving_bandwidth_rad_s
 
 
-def test_the_papers_joint_moves_with_the_observer_that_brings_it_to_rest() -> None:
+def test_the_papers_joint_moves_with_an_observer_between_those_of_both_regions() -> None:
     observer = table1_set().parameters.disturbance_observer  # type: ignore[union-attr]
     assert observer is not None and observer.low_bandwidth_rad_s is not None
     bare = with_bandwidths(observer.bandwidth_rad_s, observer.low_bandwidth_rad_s)
-    assert moving_bandwidth(bare) == pytest.approx(observer.low_bandwidth_rad_s)
+    half_way = math.sqrt(observer.low_bandwidth_rad_s * observer.bandwidth_rad_s)
+    assert moving_bandwidth(bare) == pytest.approx(half_way)
 
 
 def test_with_a_coarse_encoder_one_that_throws_the_joint_is_not_taken() -> None:
