@@ -85,8 +85,9 @@ def _memory(memory: dict[str, Any]) -> str:
 def _faults(faults: dict[str, Any]) -> Iterator[Row]:
     """The campaign as a whole, and the worst times of each kind of loss by the drive's own record."""
     much, passed = f"{faults['run']:,} of {faults['planned']:,} scenarios", f"{faults['passed']:,} passed"
-    if faults.get("recorded"):
-        lost = f"{faults['lost_records']:,} cycle records lost in {faults['recorded']:,} with a recorder"
+    if faults.get("recorded", 1):  # documents of before there was the key were of processes
+        lost = f"{faults['lost_records']:,} cycle records lost"
+        lost += f" in {faults['recorded']:,} with a recorder" if "recorded" in faults else ""
         yield ["fault campaign", much, f"{passed}; {lost}", "`servoctl qualify faults`"]
     else:  # nothing records where time is stepped
         yield ["fault campaign, in virtual time", much, passed, "`servoctl qualify faults --stepped`"]

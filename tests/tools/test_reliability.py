@@ -60,6 +60,10 @@ def test_what_was_ridden_through_is_told_apart_from_what_the_log_says(
 def test_the_campaign_and_fuzzing_are_told_with_what_failed() -> None:
     campaign, feedback, fuzzing = reliability.rows([], _FAULTS, _FUZZ)
     assert campaign[1:3] == ["48 of 50 scenarios", "47 passed; 2 cycle records lost"]
+    (stepped, *_) = reliability.rows([], {**_FAULTS, "recorded": 0}, None)
+    assert (stepped[2], stepped[3]) == ("47 passed", "`servoctl qualify faults --stepped`")
+    (recorded, *_) = reliability.rows([], {**_FAULTS, "recorded": 9}, None)
+    assert recorded[2:] == ["47 passed; 2 cycle records lost in 9 with a recorder", "`servoctl qualify faults`"]
     assert feedback[2] == "the drive had left the command after 21 ms at the latest"
     assert fuzzing[1:3] == ["1,000 inputs to 1 ways in, 1.00 h", "1 crashes"]
 
