@@ -128,5 +128,6 @@ def check_pushes(s: Subject) -> Iterator[CertificateCheck]:
     """Sines from inside Omega_L to far outside, on model and drawn plants: each pushed, or after a faster motion."""
     scale = scale_of(s.design)
     plants = [s.design.model, *(drawn(s.design.model, s.design.uncertainty, s.seed, i) for i in range(PLANTS))]
-    worst = max(excess for plant in plants for excess in PushedOff(s.gains, plant, s.design, scale).excesses_rad())
+    found = (excess for plant in plants for excess in PushedOff(s.gains, plant, s.design, scale).excesses_rad())
+    worst = max(found, default=math.inf)  # a drive that has the torque for no sine proves nothing
     yield at_most("pushed off a sine, error that swings on [rad RMS]", worst, swing_limit_rad(s.design))

@@ -102,6 +102,14 @@ def test_a_drive_that_cannot_is_not_asked() -> None:
     assert list(heavy.excesses_rad()) and max(2.0 * math.pi * f * v * 0.05 for f, v in judged) < heavy.scale.torque_nm
 
 
+def test_a_drive_that_has_the_torque_for_no_sine_proves_nothing() -> None:
+    gains = certified()
+    assert gains.design is not None
+    weak = gains.design.model_copy(update={"torque_limit_nm": 0.01})
+    (check,) = check_pushes(Subject(gains, weak, 1, 1, 1))
+    assert not check.passed and check.value > 1e6 * check.limit
+
+
 @pytest.mark.parametrize(("amplitude_rad", "frequency_hz"), [(3.5e-4, 5.477), (7.3e-5, 15.38)])
 def test_the_axis_that_the_loop_runs_comes_back_too(amplitude_rad: float, frequency_hz: float, tmp_path: Path) -> None:
     """The loop's own motions, one behind the other, and the joint that the shipped set was identified on."""
