@@ -16,6 +16,7 @@ A test that failed on a starved machine is run again, up to twice, before it is 
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import select
@@ -301,6 +302,9 @@ class Again:
             if not failed or not (evidence := self._judge.evidence(first)):
                 break
             item.warn(pytest.PytestWarning(f"ran again, the machine was starved: {evidence}"))
+            with contextlib.suppress(Exception):  # of an axis that the next run starts anew
+                # A fixture of the file is kept with what it raised or measured on the starved machine.
+                item.session._setupstate.teardown_exact(None)
         for report in reports:
             item.ihook.pytest_runtest_logreport(report=report)
         item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)

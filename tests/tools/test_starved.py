@@ -124,6 +124,34 @@ def test_a_motion_is_run_again_on_a_starved_machine_alone_and_must_pass_then(
     assert outcome == {"test_a_motion": found}, said
 
 
+ANEW = """
+import pytest
+
+made = []
+
+@pytest.fixture(scope="module")
+def axis():
+    made.append(None)
+    if len(made) < 3:
+        raise RuntimeError("a fault")
+    return len(made)
+
+@pytest.mark.serial
+def test_it_moves(axis):
+    assert axis == 3
+
+@pytest.mark.serial
+def test_it_stands(axis):
+    assert axis == 3
+"""
+
+
+@pytest.mark.parametrize(("busy", "found"), [(0.9, "PASSED"), (0.0, "ERROR")])
+def test_a_run_again_makes_the_axis_of_its_file_anew(tmp_path: Path, busy: float, found: str) -> None:
+    outcome, said = outcomes(tmp_path, busy, 0.8, ANEW)
+    assert outcome == {"test_it_moves": found, "test_it_stands": found}, said
+
+
 @pytest.mark.parametrize(("busy", "waited"), [(0.0, 0.0), (0.2, 0.9), (0.9, 0.05)])
 def test_on_an_idle_machine_every_failure_stays_one(tmp_path: Path, busy: float, waited: float) -> None:
     found, said = outcomes(tmp_path, busy, waited)
