@@ -101,6 +101,8 @@ class ObserverSettings:
     wanted_noise: float = 0.006
     #: Damping of the observer's poles.
     poles_damping: float = 0.8
+    #: The observer's damping over the rate with which falling friction makes the model's errors grow.
+    over_growth: float = 1.2
     #: Longest step of the model, s.
     longest_step_s: float = 0.0013
     #: Steps of a row around reversals, where friction turns over within a sample or two.
@@ -177,6 +179,10 @@ class FitSettings:
     least_damping: float = 1e-8
     #: Longest step of one coordinate at once.
     longest_step: float = 1.5
+    #: A fresh Jacobian that promises this share of the cost, along which no step helps, was of a rough mismatch:
+    promised: float = 0.01
+    #: its nudges are made so many times as wide.
+    wide: float = 10.0
     #: Length of the blocks whose sums are taken to be independent, s: rows within one may be correlated as they like.
     memory_s: float = 0.25
     #: Steps of a fit, in each of two scales.
@@ -358,7 +364,7 @@ class ValidationSettings:
     fitted_floors: float = 2.0
     #: Nor where rows that no fit has seen have a mismatch of no more than this share of what they had: that predicts.
     #: Where friction falls with speed a simulated run leaves the recorded one however good the model is.
-    predicted_share: float = 0.02
+    predicted_share: float = 0.05
 
 
 @dataclass(frozen=True)

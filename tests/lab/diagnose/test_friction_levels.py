@@ -19,6 +19,7 @@ from servod.lab.diagnose.engine import diagnose
 from servod.lab.diagnose.judge.conclude import differs_from_zero
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.fit import Fit
+from servod.lab.diagnose.select.levels import is_another
 from tests.lab.diagnose.axes import BELIEVED, believed, record
 
 Document = dict[str, Any]
@@ -115,6 +116,7 @@ def as_map() -> AxisModel:
     ("factors", "levels"),
     [
         ({"coulomb": 0.6, "static": 0.6}, {"dry_friction": 0.6}),
+        ({"coulomb": 1.6, "static": 1.6, "viscous": 1.6}, {"dry_friction": 1.6, "viscous_friction": 1.6}),
         ({}, {}),
     ],
 )
@@ -123,3 +125,15 @@ def test_a_friction_map_has_levels_as_a_law_has(factors: dict[str, float], level
     assert found["verdict"] == ("missing_physics" if levels else "adequate")
     assert over_model(found) == pytest.approx(levels, rel=0.04)
     assert {one["effect"] for one in found["findings"]} == set(levels)
+
+
+@pytest.mark.parametrize(("dry", "viscous", "another"), [(0.01, 0.02, True), (0.1, 0.0, False), (0.0, -0.1, False)])
+def test_one_factor_on_both_directions_is_no_asymmetry(dry: float, viscous: float, another: bool) -> None:
+    model = believed()
+    predictor = Predictor(load_traces(record(model, seconds=2.0)[:1], model)[0], model)
+    scene = SearchContext(document_of(model), predictor, np.zeros(len(predictor.counts)))
+    forms = {term.form: term for term in effect("asymmetry").terms(scene)}
+    hypothesis = Hypothesis(scene.document, base_unknowns(model)).with_term(forms["both, another level"])
+    at = hypothesis.start.copy()
+    at[hypothesis.share(0)] = (dry, viscous, np.log(1.6))
+    assert is_another(Fit(hypothesis, at, np.zeros(0), 0.0, np.zeros((0, 0)), True)) is another

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from servod.formats.model.friction import Asymmetry
 from servod.lab.diagnose.effects.effect import Effect, positive, share
-from servod.lab.diagnose.effects.hypothesis import Document, Reported, Teller, Term, Writer
+from servod.lab.diagnose.effects.hypothesis import Document, Reported, Teller, Term, Writer, get
 from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.search_context import SearchContext
+
+#: The least by which the ratio of one direction's friction to the other's is off the model's, as a logarithm.
+LEAST_DIFFERENCE = 0.08
 
 
 def _write(document: Document, values: Sequence[float]) -> None:
@@ -58,6 +62,18 @@ def terms(_scene: SearchContext) -> list[Term]:
     return [Term("asymmetry", form, unknowns, write, _teller(write)) for form, (write, unknowns) in forms.items()]
 
 
+def _at_level(nominal: Document, fitted: Document) -> bool:
+    """Whether the directions differ otherwise than the model's do: one factor on both is a level."""
+    for part in ("dry", "viscous"):
+        was, now = (
+            get(document, f"asymmetry.positive_{part}", 1.0) / get(document, f"asymmetry.negative_{part}", 1.0)
+            for document in (nominal, fitted)
+        )
+        if abs(math.log(now / was)) >= LEAST_DIFFERENCE:
+            return True
+    return False
+
+
 EFFECT = Effect(
     name="asymmetry",
     group=Asymmetry,
@@ -70,4 +86,5 @@ EFFECT = Effect(
     terms=terms,
     look=Look("velocity"),
     directed=True,
+    at_level=_at_level,
 )

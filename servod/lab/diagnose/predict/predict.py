@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from servod.common.portable import usable_cores
 from servod.formats.model.axis_model import AxisKind, AxisModel
 from servod.kernels.physics.compiled import Kernel, available, entry_without_lock
+from servod.kernels.physics.friction import directed_curve
 from servod.kernels.physics.layout import PackedPlant, PlantParameters, PlantState
 from servod.kernels.physics.plant import inputs
 from servod.lab.diagnose.data.excitation import creeps
@@ -87,8 +88,16 @@ class Observer:
     steps: NDArray[np.int64]
 
 
-def bandwidth(inertia: float, dry: float, traces: Sequence[CheckedTrace]) -> float:
-    """Observer bandwidth in rad/s for an axis of this inertia and dry friction: as fast as the encoder noise allows."""
+#: Ratio of the two speeds of a chord.
+CHORD = 1.5
+
+
+def bandwidth(inertia: float, dry: float, traces: Sequence[CheckedTrace], growth: float = 0.0) -> float:
+    """Observer bandwidth in rad/s for an axis of this inertia and dry friction: as fast as the encoder noise allows.
+
+    Where sampling and noise let it, fast enough for a model whose errors of velocity grow with `growth` rad/s: its
+    damping 2*zeta*rate must be more than that, else what is left is chance.
+    """
     noise = max(trace.position_noise for trace in traces)
     period = max(trace.period_s for trace in traces)
     allowed = (
@@ -100,7 +109,25 @@ def bandwidth(inertia: float, dry: float, traces: Sequence[CheckedTrace]) -> flo
     share = SETTINGS.observer.share_creeping if creeps(traces, inertia) else SETTINGS.observer.share_of_sampling
     rare = min(SETTINGS.observer.most_of_sampling / period, SETTINGS.observer.slow_sampling)
     usual = min(max(allowed, SETTINGS.observer.slowest), SETTINGS.observer.fastest, max(share / period, rare))
-    return max(usual, _swift_bandwidth(inertia, usual, traces))
+    holds = SETTINGS.observer.over_growth * growth / (2.0 * SETTINGS.observer.poles_damping)
+    held = min(holds, max(allowed, SETTINGS.observer.slowest), SETTINGS.observer.share_creeping / period)
+    return max(usual, held, _swift_bandwidth(inertia, usual, traces))
+
+
+def growth_rate(model: AxisModel, traces: Sequence[CheckedTrace]) -> float:
+    """Rate in rad/s with which an error of velocity grows where the model's steady friction falls; 0 where it does not.
+
+    The steepest chord over speeds that the recordings go through: noise of a measured map makes any slope between two
+    nodes.
+    """
+    packed = model.pack()
+    top = max(float(np.max(np.abs(trace.velocity[trace.counts]))) for trace in traces)
+    steepest = 0.0
+    for speed in top * np.geomspace(1e-3, 1.0 / CHORD, 60):
+        for side in (-1.0, 1.0):
+            slow, fast = (directed_curve(*packed, side * v) for v in (speed, CHORD * speed))
+            steepest = max(steepest, (slow - fast) / ((CHORD - 1.0) * float(speed)) - packed.p.viscous)
+    return steepest / model.inertia
 
 
 def _swift_bandwidth(inertia: float, usual: float, traces: Sequence[CheckedTrace]) -> float:
@@ -170,7 +197,7 @@ class Predictor:
         self.inertia = nominal.inertia
         self.drive_torque = drive_factor(nominal)
         self.linear = nominal.axis is AxisKind.LINEAR
-        self.rate = bandwidth(nominal.inertia, self.dry, traces) if rate is None else rate
+        self.rate = bandwidth(nominal.inertia, self.dry, traces, growth_rate(nominal, traces)) if rate is None else rate
         self.observers = tuple(observer(trace, nominal.inertia, self.rate) for trace in self.traces)
         ends = np.cumsum([len(trace.drive.t_s) for trace in self.traces])
         self.slices = tuple(slice(int(a), int(b)) for a, b in zip([0, *ends[:-1]], ends, strict=True))

@@ -32,7 +32,10 @@ class Weighing(NamedTuple):
 
 @dataclass(frozen=True)
 class Fit:
-    """A fitted hypothesis: coordinates, mismatch of all rows, cost, and the Jacobian where it was last computed."""
+    """A fitted hypothesis: coordinates, mismatch of all rows, cost, and the Jacobian where it was last computed.
+
+    `span` is the factor on the nudges of its derivatives: more than 1 where fine ones led nowhere.
+    """
 
     hypothesis: Hypothesis
     coordinates: Array
@@ -40,6 +43,7 @@ class Fit:
     cost: float
     jacobian: Array
     converged: bool
+    span: float = 1.0
 
     @property
     def model(self) -> AxisModel:
@@ -93,7 +97,9 @@ class Fitter:
         if mismatch is None:
             return None
         known = np.zeros((len(mismatch), 0)) if jacobian is None else jacobian
-        return Fit(hypothesis, at, mismatch, self.cost(hypothesis, at, mismatch), known, False)
+        # A map follows falling friction where a curve is smooth: along it the mismatch is rough as a rule.
+        span = SETTINGS.fit.wide if hypothesis.document["friction"]["kind"] == "local" else 1.0
+        return Fit(hypothesis, at, mismatch, self.cost(hypothesis, at, mismatch), known, False, span)
 
     def predicted_cost(self, fit: Fit) -> float:
         """The cost after one step along the columns of the Jacobian that are known, by the Jacobian alone."""
@@ -105,7 +111,9 @@ class Fitter:
         """Go on fitting for some steps; the first `keep_columns` columns of the Jacobian are taken as they are.
 
         The first `known` are taken as they are to begin with. The Jacobian follows the steps by secants (Broyden, Math.
-        Comp. 19, 1965) and is taken anew when they stop to help; a fit ends only on a fresh one.
+        Comp. 19, 1965) and is taken anew when they stop to help; a fit ends only on a fresh one. Where that promises
+        much and no step along it helps, the mismatch is rough: a model that sticks and slips along falling friction
+        does so elsewhere after the least change. Then the derivatives are taken over a wider span.
         """
         damping, fresh = SETTINGS.fit.least_damping, known <= keep_columns
         jacobian = self.derivatives(fit, max(keep_columns, known))
@@ -117,8 +125,9 @@ class Fitter:
                 fit = replace(stepped, jacobian=jacobian)
                 continue
             fit = stepped
-            if fresh:
+            if fresh and (fit.span > 1.0 or self._promise(fit, jacobian) < SETTINGS.fit.promised):
                 return replace(fit, converged=True)
+            fit = replace(fit, span=SETTINGS.fit.wide) if fresh else fit
             jacobian, fresh, damping = self.derivatives(fit, keep_columns), True, SETTINGS.fit.least_damping
         return fit
 
@@ -140,7 +149,7 @@ class Fitter:
 
     def _column(self, fit: Fit, index: int) -> Array:
         nudged = fit.coordinates.copy()
-        nudge = fit.hypothesis.unknowns[index].nudge
+        nudge = fit.span * fit.hypothesis.unknowns[index].nudge
         nudge = nudge if nudged[index] + nudge <= fit.hypothesis.bounds[1][index] else -nudge
         nudged[index] += nudge
         there = self.mismatch(fit.hypothesis, nudged)
@@ -156,11 +165,16 @@ class Fitter:
             if mismatch is not None:
                 cost = self.cost(fit.hypothesis, at, mismatch)
                 if cost < fit.cost:
-                    return Fit(fit.hypothesis, at, mismatch, cost, jacobian, False), max(
-                        0.2 * damping, SETTINGS.fit.least_damping
-                    )
+                    better = replace(fit, coordinates=at, mismatch=mismatch, cost=cost, jacobian=jacobian)
+                    return replace(better, converged=False), max(0.2 * damping, SETTINGS.fit.least_damping)
             damping = max(8.0 * damping, 1e-2)
-        return Fit(fit.hypothesis, fit.coordinates, fit.mismatch, fit.cost, jacobian, False), damping
+        return replace(fit, jacobian=jacobian, converged=False), damping
+
+    def _promise(self, fit: Fit, jacobian: Array) -> float:
+        """The share of the cost that one step would take if the mismatch were straight along the Jacobian."""
+        normal, slope = self._normal(fit, jacobian)
+        change = _bounded_step(normal, slope, SETTINGS.fit.least_damping, fit)
+        return -float(slope @ change + 0.5 * change @ normal @ change) / max(fit.cost, 1.0)
 
     def _normal(self, fit: Fit, jacobian: Array) -> tuple[Array, Array]:
         """Normal matrix and slope of the cost, prior included."""

@@ -14,7 +14,7 @@ from servod.lab.diagnose.effects.hypothesis import Term
 from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.select.candidates import Candidate, penalised_left
 from servod.lab.diagnose.select.fit import Fit, on_bound
-from servod.lab.diagnose.select.levels import at_end_of_range
+from servod.lab.diagnose.select.levels import is_another
 from servod.lab.diagnose.select.merit import Merit, large_enough, worth_naming
 from servod.lab.diagnose.select.selection import Selection, TermEntry
 from servod.lab.diagnose.select.selector import Selector, is_sound
@@ -57,7 +57,7 @@ def _released(selector: Selector, selection: Selection) -> Fit:
     for term in sorted((term for first in terms for term in first), key=lambda term: bool(term.opens)):
         bounded = {unknown.key for unknown, on in zip(fit.hypothesis.base, on_bound(fit), strict=False) if on}
         fit = fit if term.opens and bounded.isdisjoint(term.opens) else _with(selector, fit, term)
-    return fit
+    return selector.fit_to_end(fit)
 
 
 def _with(selector: Selector, fit: Fit, term: Term) -> Fit:
@@ -95,7 +95,7 @@ def _better(rival: Candidate, left: float, numbers: int) -> bool:
 
     Where levels leave next to nothing one with as many numbers must leave clearly less: the plain cause comes first.
     """
-    if at_end_of_range(rival.fit, rival.place):
+    if is_another(rival.fit, rival.place):
         return False
     if left <= SETTINGS.joint.nearly_all and rival.term.numbers >= numbers:
         return left > SETTINGS.joint.as_good * rival.left + SETTINGS.joint.nothing

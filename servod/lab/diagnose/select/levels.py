@@ -65,6 +65,17 @@ def at_end_of_range(fit: Fit, place: int = -1) -> bool:
     return False
 
 
+def is_another(fit: Fit, place: int = -1) -> bool:
+    """Whether a term says itself that it is something else.
+
+    It lies at an end of its range, or is short of its own level where a plainer effect within it would do.
+    """
+    terms = fit.hypothesis.terms
+    plainer = any(terms[place].effect in one.within for one in effects())
+    short = plainer and range(len(terms))[place] not in named_terms(fit, fit.hypothesis.document)
+    return short or at_end_of_range(fit, place)
+
+
 def named_terms(fit: Fit, nominal: Document) -> tuple[int, ...]:
     """Places of the terms whose effect is at least at its level."""
     fitted = fit.hypothesis.written(fit.coordinates)

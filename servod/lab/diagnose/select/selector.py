@@ -23,7 +23,7 @@ from servod.lab.diagnose.predict.floor import above_noise, noise_floor, stretch_
 from servod.lab.diagnose.predict.predict import Predictor, shorten
 from servod.lab.diagnose.select.candidates import Candidate, CandidateFits
 from servod.lab.diagnose.select.fit import Fit, Fitter, Weighing, long_run, scale_of
-from servod.lab.diagnose.select.levels import at_end_of_range, is_level_change
+from servod.lab.diagnose.select.levels import is_another, is_level_change
 from servod.lab.diagnose.select.merit import Merit, acting_torque, worth_naming
 from servod.lab.diagnose.select.selection import Selection
 from servod.lab.diagnose.settings import SETTINGS
@@ -109,6 +109,14 @@ class Selector:
         fitter = self.fitter(mismatch)
         cost = fitter.cost(fit.hypothesis, fit.coordinates, fit.mismatch)
         return fitter.refine(replace(fit, cost=cost, converged=False), SETTINGS.fit.steps, known=known)
+
+    def fit_to_end(self, fit: Fit) -> Fit:
+        """A fit fitted on until it is at its end, or has had its turns."""
+        for _ in range(SETTINGS.forward.refits):
+            if fit.converged:
+                break
+            fit = self._refined(fit, fit.mismatch, len(fit.coordinates))
+        return fit
 
     def fit_on(self, selection: Selection, present: Fit, fit: Fit, deserves: Deserves) -> tuple[Fit, Merit]:
         """A fit that deserves to come in, fitted on until it is at its end or nearly; and what it is worth."""
@@ -207,8 +215,8 @@ class Selector:
 
 
 def is_sound(merit: Merit, fit: Fit, place: int = -1) -> bool:
-    """Whether the fit of a term has come to an end, and not to one of a range."""
-    return (fit.converged or merit.share >= SETTINGS.worth.sure_share) and not at_end_of_range(fit, place)
+    """Whether the fit of a term has come to an end, and says that the term is what it is called."""
+    return (fit.converged or merit.share >= SETTINGS.worth.sure_share) and not is_another(fit, place)
 
 
 def once_only(hypothesis: Hypothesis) -> set[str]:

@@ -24,7 +24,7 @@ from servod.lab.diagnose.select.cross_validation import make_folds, predict_held
 from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.select.free_windows import free_run_errors
 from servod.lab.diagnose.select.joint import add_levels
-from servod.lab.diagnose.select.levels import at_end_of_range, level_at_bound
+from servod.lab.diagnose.select.levels import is_another, level_at_bound
 from servod.lab.diagnose.select.merit import Merit
 from servod.lab.diagnose.select.selection import Selection, TermEntry
 from servod.lab.diagnose.select.selector import Selector, is_sound
@@ -64,7 +64,7 @@ def _add_best(selector: Selector, selection: Selection) -> Selection:
     deserves = partial(selector.deserves, selection)
     best = math.inf
     for candidate in candidates:
-        if at_end_of_range(candidate.fit, candidate.place):
+        if is_another(candidate.fit, candidate.place):
             continue
         best = min(best, candidate.left)
         if candidate.left > best + SETTINGS.forward.close * (1.0 - best):
@@ -79,7 +79,7 @@ def _add_best(selector: Selector, selection: Selection) -> Selection:
         if selector.may_enter(selection, merit, fit):
             others = tuple(c for c in candidates if c.effect != candidate.effect)
             return selection.with_term(fit, merit, TermEntry(candidate.left, others))
-        if selector.significant(selection, merit, fit) and not at_end_of_range(fit):
+        if selector.significant(selection, merit, fit) and not is_another(fit):
             first = selection.minor.get(candidate.effect, merit)
             selection = replace(selection, minor={**selection.minor, candidate.effect: first})
     return selection
@@ -145,9 +145,12 @@ def _swap(selector: Selector, selection: Selection, index: int, rival: Candidate
 
 
 def _rivals(selection: Selection, index: int) -> tuple[Candidate, ...]:
-    """Rivals of a term that stood close when it came in and are not in by now."""
-    entry = selection.entries[index]
-    there = {term.effect for term in selection.fit.hypothesis.terms} | set(selection.rejected)
+    """Rivals of a term that stood close when it came in and are not in by now.
+
+    What the term is a special case of is none: it leaves as little with more numbers, whatever the truth.
+    """
+    entry, terms = selection.entries[index], selection.fit.hypothesis.terms
+    there = {term.effect for term in terms} | set(selection.rejected) | set(effect(terms[index].effect).within)
     most = SETTINGS.swap.within * entry.left
     close = tuple(c for c in entry.rivals if c.left <= most and c.effect not in there)
     return close[: SETTINGS.swap.most_tried]
