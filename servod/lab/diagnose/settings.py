@@ -26,8 +26,7 @@ class IntakeSettings:
     least_moving: float = 0.03
     #: Longest time between rows, s: friction and inertia of a servo axis act within milliseconds.
     coarsest_s: float = 0.1
-    #: Noise that the slowest observer makes of the encoder's, as a share of dry friction, from which nothing can be
-    #: said.
+    #: Noise that the slowest observer makes of the encoder's, as a share of dry friction, that hides everything.
     most_noise: float = 0.5
     #: Time around the instant at which a drive goes off or on that does not count, s.
     around_off_s: float = 0.1
@@ -167,21 +166,18 @@ class FitSettings:
 
     #: Scales beyond which a row's mismatch counts by its distance only.
     huber: float = 4.0
-    #: The scale of a mismatch is at least this share of its root mean square: rare blows must not count by distance
-    #: alone.
+    #: The scale of a mismatch is at least this share of its RMS: rare blows must not count by distance alone.
     least_of_rms: float = 0.3
     #: Nor is it smaller than this share of dry friction.
     least_scale: float = 0.002
     #: A fit has converged when a step improves the cost by less than this share.
     converged: float = 1e-3
-    #: Damping that steps begin with, as a share of the normal matrix's diagonal: so little that where the data say
-    #: nothing, what was known beforehand decides.
+    #: Damping that steps begin with, of the normal matrix's diagonal: so little that beliefs decide where data do not.
     least_damping: float = 1e-8
     #: Longest step of one coordinate at once.
     longest_step: float = 1.5
-    #: A fresh Jacobian that promises this share of the cost, along which no step helps, was of a rough mismatch:
+    #: A fresh Jacobian that promises this share of the cost, along which no step helps, is taken over a wider span.
     promised: float = 0.01
-    #: its nudges are made so many times as wide.
     wide: float = 10.0
     #: Length of the blocks whose sums are taken to be independent, s: rows within one may be correlated as they like.
     memory_s: float = 0.25
@@ -260,8 +256,7 @@ class ForwardSettings:
     close: float = 0.3
     #: Times that a fit goes on where a term deserves it.
     refits: int = 2
-    #: The share of what a term takes that is as good as nothing: blows behind a gap come a sample earlier or later, and
-    #: no step ends exactly.
+    #: The share of what a term takes that is as good as nothing: blows behind a gap come a sample earlier or later.
     near: float = 0.05
 
 
@@ -377,8 +372,7 @@ class IntervalSettings:
     region: float = 0.95
     #: Error of any estimate that steps of a sample and forms that are not quite the axis's make, as a share of it.
     model_error: float = 0.006
-    #: By how much worse steps of a sample make the bristle's stiffness and damping, which act for some samples at
-    #: a time.
+    #: By how much worse steps of a sample make the bristle's numbers, which act for some samples at a time.
     bristle_error: float = 2.0
     #: A change of a parameter below this share is none.
     least_change: float = 0.002
