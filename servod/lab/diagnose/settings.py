@@ -176,8 +176,9 @@ class FitSettings:
     least_damping: float = 1e-8
     #: Longest step of one coordinate at once.
     longest_step: float = 1.5
-    #: A fresh Jacobian that promises this share of the cost, along which no step helps, is taken over a wider span.
+    #: A fresh Jacobian that promises this share of the cost, along which no step helps, is taken over a wider span,
     promised: float = 0.01
+    #: so many times as wide.
     wide: float = 10.0
     #: Length of the blocks whose sums are taken to be independent, s: rows within one may be correlated as they like.
     memory_s: float = 0.25
