@@ -125,10 +125,10 @@ class _Walk(NamedTuple):
 def _from_recordings(folder: Path) -> Job:
     """Reads at once, so that a mistake is told before anything begins."""
     from servod.lab.identify.analysis import analyse
-    from servod.lab.identify.store import load
+    from servod.lab.identify.store import load, load_devices
 
-    traces = load(folder)
-    return lambda _walk, _tell: analyse(traces)
+    traces, devices = load(folder), load_devices(folder)
+    return lambda _walk, _tell: analyse(traces, devices)
 
 
 def _virtual(plant: Path, config: Path | None, settings: Path | None, encoder_counts: int | None, seed: int) -> Job:

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Protocol
 from servod.common.errors import AnswerIsNo
 from servod.formats.config import AxisConfig
 from servod.formats.gains.gain_set import GainSet
+from servod.formats.model.identified import Devices
 
 #: Told at every look at a motion that runs: how many seconds of it have passed.
 Watch = Callable[[float], None]
@@ -91,6 +92,11 @@ class AxisClient(Protocol):
     @property
     def config(self) -> AxisConfig:
         """Limits, period, filter and encoder of the axis."""
+        ...
+
+    @property
+    def devices(self) -> Devices:
+        """Drive and encoder, as far as they say who they are."""
         ...
 
     @property

@@ -18,6 +18,7 @@ from servod.common.errors import AnswerIsNo, BadInput, ServodError, Unreachable
 from servod.common.yaml import parse_yaml, validate
 from servod.formats.config import AxisConfig
 from servod.formats.gains.gain_set import GainSet
+from servod.formats.model.identified import DeviceIdentity, Devices
 from servod.formats.protocol import TOOL_RENEW_S, Verb
 from servod.formats.recording.mcap_reader import read_recording
 
@@ -127,6 +128,15 @@ class DaemonAxis:
         """The file's, or what the daemon attaches to its recordings."""
         self._config = self._config or daemon_config(self._client)
         return self._config
+
+    @property
+    def devices(self) -> Devices:
+        """As they told the daemon at its start."""
+        found = {node["role"]: node["identity"] or {} for node in self._client.call(Verb.STATUS)["nodes"]}
+        keys = DeviceIdentity.model_fields
+        return Devices.model_validate(
+            {role: {key: identity.get(key) for key in keys} for role, identity in found.items()}
+        )
 
     @property
     def active(self) -> tuple[str, int]:

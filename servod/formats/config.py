@@ -222,7 +222,9 @@ class GainsConfig(Strict):
         description="of each set the oldest beyond this are removed, but the active and those before",
     )
     accept_uncertified: bool = Field(
-        False, description="run gain sets that carry no certificate; one that says no, or is broken, never runs"
+        False,
+        description="run gain sets that carry no certificate, and those of another drive or encoder; one whose "
+        "certificate says no, or is broken, never runs",
     )
     signers: list[str] = Field(
         default_factory=list,

@@ -36,12 +36,40 @@ class IdentifiedMap(Strict):
         return self
 
 
+class DeviceIdentity(Strict):
+    """What a node says of itself in 0x1018 (CiA 301); None: it does not say, or nobody asked."""
+
+    vendor_id: int | None = Field(None, ge=0, le=0xFFFFFFFF, description="0x1018:1")
+    product_code: int | None = Field(None, ge=0, le=0xFFFFFFFF, description="0x1018:2")
+    serial: int | None = Field(None, ge=0, le=0xFFFFFFFF, description="0x1018:4")
+
+
+class Devices(Strict):
+    """Drive and encoder that something was measured with."""
+
+    amplifier: DeviceIdentity = DeviceIdentity()
+    encoder: DeviceIdentity = DeviceIdentity()
+
+    def differing(self, others: Devices) -> tuple[str, int, int] | None:
+        """Key, own and other number of the first that both say and that differ; None where nothing differs."""
+        for role in Devices.model_fields:
+            mine, its = getattr(self, role), getattr(others, role)
+            for key in DeviceIdentity.model_fields:
+                own, other = getattr(mine, key), getattr(its, key)
+                if own is not None and other is not None and own != other:
+                    return f"{role}.{key}", own, other
+        return None
+
+
 class Identified(Strict):
     """Everything that was measured, by name, and what the experiments could not tell."""
 
     values: dict[str, IdentifiedValue]
     friction_map: IdentifiedMap
     not_identifiable: dict[str, str] = Field(default_factory=dict, description="what, and what would tell it")
+    devices: Devices | None = Field(
+        None, description="drive and encoder that it was measured with; a set made of it runs with these alone"
+    )
     data_sha256: list[Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]] = Field(
         default_factory=list, description="hashes of the recordings' files that it was fitted on, in their order"
     )

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from servod.common.errors import AnswerIsNo
+from servod.formats.model.identified import Devices
 from servod.lab.identify.estimate import LEVEL, Estimate
 from servod.lab.identify.fits import break_away, bristle, curve, friction_map, kick, presliding, response
 from servod.lab.identify.fits.bristle import Bristle
@@ -137,6 +138,7 @@ class Analysis:
     negative: curve.CurveFit
     damping: Estimate | None
     data_sha256: tuple[str, ...]  # of the recordings' files
+    devices: Devices | None
 
     @property
     def break_away_rad(self) -> float:
@@ -157,8 +159,11 @@ def of_kind(traces: Sequence[RecordedMotion], kind: ExperimentKind) -> list[Reco
     return found
 
 
-def analyse(traces: Sequence[RecordedMotion]) -> Analysis:
-    """Fit everything. Raises AnswerIsNo where an experiment is missing or tells nothing."""
+def analyse(traces: Sequence[RecordedMotion], devices: Devices | None = None) -> Analysis:
+    """Fit everything that was recorded, with these devices.
+
+    Raises AnswerIsNo where an experiment is missing or tells nothing.
+    """
     ramps = of_kind(traces, ExperimentKind.BREAK_AWAY)
     slides = break_away.fit([ramp for ramp in ramps if not ramp.settings["search"]] or ramps)
     rocked = presliding.fit(of_kind(traces, ExperimentKind.PRESLIDING), slides)
@@ -181,6 +186,7 @@ def analyse(traces: Sequence[RecordedMotion]) -> Analysis:
         negative,
         damping,
         tuple(trace.sha256 for trace in traces if trace.sha256),
+        devices,
     )
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from servod.formats.model.axis_model import AxisModel, LocalFriction
 from servod.formats.model.effects import ActuatorLag, Cogging, Gravity, JointElasticity
-from servod.formats.model.identified import Identified, IdentifiedMap, IdentifiedValue
+from servod.formats.model.identified import Devices, Identified, IdentifiedMap, IdentifiedValue
 from servod.formats.model.keys import Harmonic as ModelHarmonic
 from servod.lab.identify.analysis import Analysis, assumed_damping
 from servod.lab.identify.estimate import Estimate
@@ -75,6 +75,7 @@ def identified(analysis: Analysis) -> Identified:
             half_widths=list(_rounded(_both(analysis.map.negative.half_width, analysis.map.positive.half_width))),
         ),
         not_identifiable=_not_identifiable(analysis),
+        devices=None if analysis.devices == Devices() else analysis.devices,
         data_sha256=list(analysis.data_sha256),
     )
 

@@ -20,6 +20,7 @@ from pydantic import Field
 from servod.common.errors import BadInput
 from servod.common.files import make_folder, read_json, unreadable, unwritable, write_atomically
 from servod.common.yaml import Strict, validate
+from servod.formats.model.identified import Devices
 from servod.formats.recording.mcap_reader import read_recording
 from servod.formats.recording.mcap_writer import McapFile, split_rows, wall_offset_ns
 from servod.lab.identify.trace import ExperimentKind, RecordedMotion
@@ -47,6 +48,7 @@ class _List(Strict):
 
     conditions: str
     start_rad: float | None
+    devices: Devices | None = None
     experiments: list[_Entry]
 
 
@@ -66,6 +68,7 @@ class Recordings:
         self.folder, self.conditions = folder, conditions
         self._offset_ns = wall_offset_ns() if offset_ns is None else offset_ns
         self.start_rad: float | None = None
+        self.devices: Devices | None = None
         self._done: list[_Entry] = []
         self._earlier: list[_Entry] = []
         if resume:
@@ -77,9 +80,9 @@ class Recordings:
         """Earlier recordings that the walk has not asked for yet."""
         return len(self._earlier)
 
-    def begin(self, start_rad: float) -> None:
-        """The walk begins with the axis at `start_rad`."""
-        self.start_rad = start_rad
+    def begin(self, start_rad: float, devices: Devices | None = None) -> None:
+        """The walk begins with the axis at `start_rad`, on these devices."""
+        self.start_rad, self.devices = start_rad, devices
 
     def recorded(self, kind: ExperimentKind, motion: str) -> RecordedMotion | None:
         """The earlier recording of the next motion; None when there is none, and then no later one is given either.
@@ -112,7 +115,9 @@ class Recordings:
         return replace(trace, sha256=sha256)
 
     def _write_list(self) -> None:
-        written = _List(conditions=self.conditions, start_rad=self.start_rad, experiments=self._done)
+        written = _List(
+            conditions=self.conditions, start_rad=self.start_rad, devices=self.devices, experiments=self._done
+        )
         write_atomically(self.folder / LIST, written.model_dump_json(indent=1) + "\n")
 
     def _take_up(self) -> None:
@@ -156,6 +161,11 @@ def motion_hash(positions: NDArray[np.float64], torques: NDArray[np.float64], wi
 def load(folder: Path) -> list[RecordedMotion]:
     """All traces that `Recordings` wrote to `folder`. Raises BadInput."""
     return [_trace(folder, entry) for entry in _read_list(folder).experiments]
+
+
+def load_devices(folder: Path) -> Devices | None:
+    """The devices that they were recorded with; None where nobody asked. Raises BadInput."""
+    return _read_list(folder).devices
 
 
 def _read_list(folder: Path) -> _List:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from servod.client.axis import AxisClient
 from servod.common.errors import ServodError
 from servod.formats.config import AxisConfig
+from servod.formats.model.identified import Devices
 from servod.lab.identify import store
 from servod.lab.identify.analysis import Analysis, analyse, break_away_rad, of_kind
 from servod.lab.identify.bounds import CAREFUL, STIFF, bounds_from, feedback
@@ -56,12 +57,12 @@ def identify(
     is identified, too; what is not taken up again the first new recording sets aside within `out`. Raises AnswerIsNo
     when the axis refuses, faults, is wired wrongly, or tells nothing.
     """
-    conditions = _conditions(axis.config, travel_rad, speed_rad_s, seed, subject)
+    conditions = _conditions(axis.config, axis.devices, travel_rad, speed_rad_s, seed, subject)
     recordings = store.Recordings(out, conditions, resume, axis.offset_ns)
     taken_up = recordings.start_rad is not None
     try:
         start_rad = enable_powerless(axis) if recordings.start_rad is None else recordings.start_rad
-        recordings.begin(start_rad)
+        recordings.begin(start_rad, axis.devices)
         bounds = bounds_from(axis.config.limits, start_rad, travel_rad, speed_rad_s)
         rng = np.random.default_rng(seed)
         bench = Bench(axis, bounds, recordings, rng, start_rad=start_rad, enabled=not taken_up)
@@ -71,15 +72,15 @@ def identify(
         with contextlib.suppress(ServodError):  # a daemon that is gone, or no experiment was run
             axis.give_up("the feedback of experiments, which are over", {})
     tell("fits", 0.97)
-    return analyse(bench.traces)
+    return analyse(bench.traces, recordings.devices)
 
 
 def _conditions(
-    config: AxisConfig, travel_rad: float | None, speed_rad_s: float | None, seed: int, subject: str
+    config: AxisConfig, devices: Devices, travel_rad: float | None, speed_rad_s: float | None, seed: int, subject: str
 ) -> str:
     """Hash of all that recordings of one walk must share; paths and services of the configuration do not count."""
     parts = config.model_dump(mode="json", include={"cycle", "amplifier", "encoder", "limits"})
-    asked = json.dumps([parts, travel_rad, speed_rad_s, seed, subject], sort_keys=True)
+    asked = json.dumps([parts, devices.model_dump(), travel_rad, speed_rad_s, seed, subject], sort_keys=True)
     return hashlib.sha256(asked.encode()).hexdigest()
 
 

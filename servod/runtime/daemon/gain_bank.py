@@ -15,8 +15,9 @@ from typing import Any
 from servod.common.errors import AnswerIsNo, BadInput, ServodError, Unreachable
 from servod.common.files import unwritable
 from servod.formats.config import AxisConfig
-from servod.formats.gains.gain_set import GainSet, parse_gains, require_fit, require_signed
+from servod.formats.gains.gain_set import GainSet, parse_gains, require_devices, require_fit, require_signed
 from servod.formats.gains.store import GainStore, StoredSet
+from servod.formats.model.identified import Devices
 from servod.formats.recording.record import CycleRecord
 from servod.runtime.daemon.arguments import GainsActivateArgs, GainsLoadArgs, GainsVerdictArgs
 from servod.runtime.daemon.requests import NoAnswer, work_of
@@ -44,6 +45,7 @@ class GainBank:
         stays as it is until `begin`.
         """
         self._config, self._fits, self._note = config, fits, ""
+        self._devices: Devices | None = None
         self._why_first: str | None = None  # the first set is not the store's active one yet
         self._store = GainStore(config.gains.directory, config.gains.max_versions, mends=begins)
         try:
@@ -70,6 +72,23 @@ class GainBank:
                 self._store.activate(self._kept.name, self._kept.version, self._why_first)
         except OSError as error:
             raise unwritable(f"gain store {self._config.gains.directory}", error) from None
+
+    def know(self, devices: Devices) -> None:
+        """Drive and encoder of the axis, once they were asked: no set of others runs from here on."""
+        self._devices = devices
+        try:
+            self.require_own_devices()
+        except BadInput as error:
+            self._note = f"the axis is not enabled: {error}"
+            log.warning("%s", self._note)
+
+    def require_own_devices(self) -> None:
+        """Refuse the set that runs where it was made for another drive or encoder. Raises BadInput."""
+        self._require_devices(self.newest.gains)
+
+    def _require_devices(self, gains: GainSet) -> None:
+        if self._devices is not None:
+            require_devices(gains, self._devices, self._config)
 
     @property
     def on_trial(self) -> bool:
@@ -124,6 +143,7 @@ class GainBank:
             stored = self._store.get(name, version)
             row = _row(stored)
             require_fit(stored.gains, self._config)
+            self._require_devices(stored.gains)
         except BadInput as refusal:
             return {**row, "refused": str(refusal)}
         return {**row, "refused": ""}
@@ -229,6 +249,7 @@ class GainBank:
         refused does not run in the end.
         """
         self._fits(stored.gains, self._config)
+        self._require_devices(stored.gains)
         before = self.newest
         try:
             await self._send(stored, send)

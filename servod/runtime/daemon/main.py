@@ -106,7 +106,9 @@ def _run_on(config: AxisConfig, path: Path, context: Context, on_ready: Callable
                 failure = BringUpFailure.after(error, failure)
                 continue
             failure = None
-            supervisor = _begin(config, path, Nodes(master, plans), bank, context, held, on_ready)
+            nodes = Nodes(master, plans)
+            bank.know(nodes.devices())
+            supervisor = _begin(config, path, nodes, bank, context, held, on_ready)
             code = supervisor.run()
         if code is not None or context.shown_s is None:
             return code or 0

@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from servod.common.errors import ServodError, Unreachable
 from servod.common.faults import FAULTS, FaultCode
 from servod.common.units import NS_PER_S, TWO_PI
+from servod.formats.model.identified import DeviceIdentity, Devices
 from servod.runtime.daemon.guard_test import ProofStatus, proof_status, read_proof, terms
 from servod.runtime.daemon.status import Age, GuardStatus, IdentityStatus, NodeStatus
 from servod.runtime.fieldbus.bus import Bus
@@ -24,7 +25,7 @@ from servod.runtime.fieldbus.cia import (
     Obj402,
     decode_status_word,
 )
-from servod.runtime.fieldbus.devices import DriveState
+from servod.runtime.fieldbus.devices import DriveState, NodePlan
 from servod.runtime.fieldbus.master import BringUp, Master
 from servod.runtime.fieldbus.master.monitor import MASTER_MISSED, NodeEvent
 from servod.runtime.loop.brake import rest_rad
@@ -187,8 +188,19 @@ class Nodes:
                 "identity": self._identity(plan.node_id),
                 **self._age(plan.node_id),
             }
-            for role, plan in (("amplifier", self.plans.amplifier), ("encoder", self.plans.encoder))
+            for role, plan in self._roles()
         ]
+
+    def devices(self) -> Devices:
+        """What drive and encoder said of themselves at the start."""
+        keys = DeviceIdentity.model_fields
+        found = ((role, self._master.identity(plan.node_id)) for role, plan in self._roles())
+        return Devices.model_validate(
+            {role: {key: getattr(one, key) for key in keys} for role, one in found if one is not None}
+        )
+
+    def _roles(self) -> tuple[tuple[str, NodePlan], ...]:
+        return ("amplifier", self.plans.amplifier), ("encoder", self.plans.encoder)
 
     def _identity(self, node_id: int) -> IdentityStatus | None:
         found = self._master.identity(node_id)

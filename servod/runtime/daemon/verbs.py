@@ -195,6 +195,7 @@ class Verbs:
 
     async def _enable(self, args: EnableArgs) -> dict[str, Any]:
         require_proof(self._proof())
+        self._bank.require_own_devices()
         if self._stopping:  # whichever came first: two connections are not always read in the order that they wrote
             raise Unreachable("refused: somebody stops the axis at this moment; enable it once that is over")
         record = self._loop.latest

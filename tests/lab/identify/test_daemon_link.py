@@ -36,6 +36,8 @@ def test_break_away_is_measured_through_the_daemon(tmp_path):
         assert torque_of(ramp) == pytest.approx(0.0805, rel=0.1)  # the demo joint, forwards
         assert ramp.excitation_nm == pytest.approx(ramp.torque_nm, abs=1e-9)
         assert [len(trace) for trace in load(tmp_path / "recordings")] == [len(ramp)]
+        assert (link.devices.amplifier.serial, link.devices.encoder.serial) == (1, 2)
+        assert link.devices.amplifier.vendor_id is not None
         assert client.call("status")["controller"]["name"] == "identify_pd"
         link.disable()
         assert client.call("status")["axis"]["state"] == "DISABLED"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from servod.client.virtual import virtual_session
 from servod.common.errors import AnswerIsNo, BadInput
 from servod.common.yaml import parse_yaml, validate
 from servod.formats.model.axis_model import AxisModel, axis_model_yaml, load_axis_model
+from servod.formats.model.identified import Devices
 from servod.lab.identify import store
 from servod.lab.identify.analysis import Analysis
 from servod.lab.identify.bounds import bounds_from
@@ -301,6 +303,22 @@ def test_a_walk_that_leaves_the_recorded_one_halfway_sets_all_of_it_aside(tmp_pa
     new = again.keep(rows, trace_of(ExperimentKind.NOISE, rows, {}), "another motion")
     assert [trace.sha256 for trace in store.load(tmp_path)] == [first.sha256, new.sha256]
     assert [trace.sha256 for trace in store.load(tmp_path / "before_01")] == before
+
+
+def test_an_identification_knows_its_devices(fine: Identification, tmp_path):
+    """Those of a virtual axis are anybody's; what an axis says of its own goes into the list and the model."""
+    assert store.load_devices(fine.recordings) == fine.analysis.devices == Devices()
+    assert identified(fine.analysis).devices is None
+    own = Devices.model_validate({"amplifier": {"serial": 4711}})
+    axis = SteppedAxis(virtual_session(draw(3).model, tmp_path, 2**20, 1), tmp_path)
+    enable_powerless(axis)
+    rows = rested(axis, 50)
+    made = store.Recordings(tmp_path / "made", "this axis")
+    made.begin(0.0, own)
+    made.keep(rows, trace_of(ExperimentKind.NOISE, rows, {}), "a motion")
+    assert store.load_devices(tmp_path / "made") == own
+    model = model_of(replace(fine.analysis, devices=own))
+    assert model.identified is not None and model.identified.devices == own
 
 
 def test_an_identification_knows_its_recordings(fine: Identification):
