@@ -121,7 +121,7 @@ def growth_rate(model: AxisModel, traces: Sequence[CheckedTrace]) -> float:
     nodes.
     """
     packed = model.pack()
-    top = max(float(np.max(np.abs(trace.velocity[trace.counts]))) for trace in traces)
+    top = max(float(np.max(np.abs(trace.velocity[trace.counts]), initial=1e-9)) for trace in traces)
     steepest = 0.0
     for speed in top * np.geomspace(1e-3, 1.0 / CHORD, 60):
         for side in (-1.0, 1.0):
