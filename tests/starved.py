@@ -16,7 +16,6 @@ A test that failed on a starved machine is run again, up to twice, before it is 
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 import select
@@ -28,6 +27,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+from _pytest.outcomes import OutcomeException
 from _pytest.runner import runtestprotocol  # as pytest-rerunfailures has it: there is no public one
 
 from servod.common.errors import ServodError
@@ -289,6 +289,15 @@ class Again:
     def __init__(self, judge: Judge) -> None:
         self._judge = judge
 
+    @staticmethod
+    def _end_fixtures_of_file(item: pytest.Item) -> None:
+        """So that they are made anew: pytest keeps what one raised, or measured on the starved machine."""
+        file = item.getparent(pytest.Module)
+        try:
+            item.session._setupstate.teardown_exact(file.parent if file is not None else None)  # type: ignore[arg-type]
+        except (Exception, OutcomeException) as error:
+            item.warn(pytest.PytestWarning(f"a fixture did not end: {error}"))
+
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtest_protocol(self, item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
         """All of a test's reports, told when they are the last."""
@@ -302,9 +311,7 @@ class Again:
             if not failed or not (evidence := self._judge.evidence(first)):
                 break
             item.warn(pytest.PytestWarning(f"ran again, the machine was starved: {evidence}"))
-            with contextlib.suppress(Exception):  # of an axis that the next run starts anew
-                # A fixture of the file is kept with what it raised or measured on the starved machine.
-                item.session._setupstate.teardown_exact(None)
+            self._end_fixtures_of_file(item)
         for report in reports:
             item.ihook.pytest_runtest_logreport(report=report)
         item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)

@@ -21,7 +21,7 @@ from servod.common.errors import AnswerIsNo
 from servod.common.faults import FAULTS, FaultCode, fault_text
 from servod.common.units import NS_PER_S
 from servod.formats.config import AxisConfig
-from servod.formats.gains.gain_set import GainSet, devices_of, pd_set
+from servod.formats.gains.gain_set import GainSet, pd_set
 from servod.formats.model.identified import Devices
 from servod.formats.protocol import SampleKey, Verb
 from servod.formats.recording.record import RECORD, CycleRecord
@@ -355,8 +355,8 @@ class SteppedAxis:
 
     @property
     def devices(self) -> Devices:
-        """As configured: any virtual device will do."""
-        return devices_of(self.config)
+        """None: whatever the configuration states, nobody touched it."""
+        return Devices()
 
     @property
     def active(self) -> tuple[str, int]:

@@ -18,7 +18,7 @@ from servod.common.errors import AnswerIsNo, BadInput, ServodError, Unreachable
 from servod.common.yaml import parse_yaml, validate
 from servod.formats.config import AxisConfig
 from servod.formats.gains.gain_set import GainSet
-from servod.formats.model.identified import DeviceIdentity, Devices
+from servod.formats.model.identified import Devices
 from servod.formats.protocol import TOOL_RENEW_S, Verb
 from servod.formats.recording.mcap_reader import read_recording
 
@@ -132,11 +132,7 @@ class DaemonAxis:
     @property
     def devices(self) -> Devices:
         """As they told the daemon at its start."""
-        found = {node["role"]: node["identity"] or {} for node in self._client.call(Verb.STATUS)["nodes"]}
-        keys = DeviceIdentity.model_fields
-        return Devices.model_validate(
-            {role: {key: identity.get(key) for key in keys} for role, identity in found.items()}
-        )
+        return Devices.of({node["role"]: node["identity"] for node in self._client.call(Verb.STATUS)["nodes"]})
 
     @property
     def active(self) -> tuple[str, int]:

@@ -46,7 +46,7 @@ def weakened(config: AxisConfig, model: AxisModel | None = None) -> list[str]:
     if model is not None and model.axis is AxisKind.ROTARY:
         lines += [*_beyond_model(config, model), *contradictions(config, model)]
     if config.gains.accept_uncertified:
-        lines.append("gains.accept_uncertified is true: a gain set that nobody verified may run")
+        lines.append("gains.accept_uncertified is true: a gain set that nobody verified, or of another drive, may run")
     if config.recorder.history_s == 0.0:
         lines.append("recorder.history_s is 0: nothing of the seconds before a fault is kept")
     if "interface" not in config.bus.model_fields_set:

@@ -26,7 +26,7 @@ from servod.formats.gains.parameters import LocalSet, Parameters, PdParameters
 from servod.formats.gains.signature import GainSignature, require_signature
 from servod.formats.kinds import FileKind, require_kind
 from servod.formats.model.axis_model import load_axis_model
-from servod.formats.model.identified import DeviceIdentity, Devices
+from servod.formats.model.identified import Devices
 from servod.kernels.laws import LAWS, Law
 
 # --- The verdict on a set --------------------------------------------------------------------------------------------
@@ -324,30 +324,32 @@ def require_same_loop(gains: GainSet, config: AxisConfig, where: str | None = No
 
 def devices_of(config: AxisConfig) -> Devices:
     """Drive and encoder as far as the configuration states them; the daemon starts with no others."""
-    stated = {
-        role: section.identity.model_dump(include=set(DeviceIdentity.model_fields))
-        for role, section in (("amplifier", config.amplifier), ("encoder", config.encoder))
-    }
-    return Devices.model_validate(stated)
+    amplifier, encoder = config.amplifier.identity.model_dump(), config.encoder.identity.model_dump()
+    return Devices.of({"amplifier": amplifier, "encoder": encoder})
 
 
 def require_devices(gains: GainSet, devices: Devices, config: AxisConfig, where: str | None = None) -> None:
     """Refuse a set whose model was identified with another drive or encoder than these.
 
     Another of the same type has other friction behind it, another torque constant and another zero. What one of both
-    does not say is not compared. Not where the configuration accepts sets without a certificate: one of other devices
-    is none. Raises BadInput; `where` is the file, when there is one.
+    does not say is not compared. A configuration that accepts sets without a certificate accepts these, at its owner's
+    word. Raises BadInput; `where` is the file, when there is one.
     """
+    if not config.gains.accept_uncertified and (error := of_others(gains, devices, where)):
+        raise error
+
+
+def of_others(gains: GainSet, devices: Devices, where: str | None = None) -> BadInput | None:
+    """What says that a set's model was identified with another drive or encoder; None where nothing does."""
     known = gains.design.model.identified if gains.design is not None else None
-    if known is None or known.devices is None or config.gains.accept_uncertified:
-        return
-    if found := known.devices.differing(devices):
-        key, own, other = found
-        raise BadInput(
-            f"{where or f'gain set {gains.name}'}: design.model.identified.devices.{key}",
-            own,
-            f"{other}, as the axis has it; identify this axis and make a set of that, or set gains.accept_uncertified",
-        )
+    if known is None or known.devices is None or not (found := known.devices.differing(devices)):
+        return None
+    key, own, other = found
+    return BadInput(
+        f"{where or f'gain set {gains.name}'}: design.model.identified.devices.{key}",
+        own,
+        f"{other}, as the axis has it; identify this axis and make a set of that, or set gains.accept_uncertified",
+    )
 
 
 def _no_more(gains: GainSet, design: Design, config: AxisConfig) -> Iterator[tuple[str, float, float]]:

@@ -5,7 +5,8 @@ Physics does not read it; synthesis takes its vertices from here, reports print 
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
@@ -49,6 +50,16 @@ class Devices(Strict):
 
     amplifier: DeviceIdentity = DeviceIdentity()
     encoder: DeviceIdentity = DeviceIdentity()
+
+    @classmethod
+    def of(cls, identities: Mapping[str, Mapping[str, Any] | None]) -> Devices:
+        """Of what each role's node says; what it says besides is left out."""
+        kept = {
+            role: {key: found.get(key) for key in DeviceIdentity.model_fields}
+            for role, found in identities.items()
+            if found is not None
+        }
+        return cls.model_validate(kept)
 
     def differing(self, others: Devices) -> tuple[str, int, int] | None:
         """Key, own and other number of the first that both say and that differ; None where nothing differs."""

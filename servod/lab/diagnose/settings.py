@@ -176,10 +176,10 @@ class FitSettings:
     least_damping: float = 1e-8
     #: Longest step of one coordinate at once.
     longest_step: float = 1.5
-    #: A fresh Jacobian that promises this share of the cost, along which no step helps, is taken over a wider span,
-    promised: float = 0.01
-    #: so many times as wide.
-    wide: float = 10.0
+    #: A fresh Jacobian that predicts to gain this share of the cost, and no step helps, is taken over a wider span,
+    predicted: float = 0.01
+    #: of so much of each coordinate, at least.
+    wide: float = 0.01
     #: Length of the blocks whose sums are taken to be independent, s: rows within one may be correlated as they like.
     memory_s: float = 0.25
     #: Steps of a fit, in each of two scales.

@@ -57,12 +57,13 @@ def identify(
     is identified, too; what is not taken up again the first new recording sets aside within `out`. Raises AnswerIsNo
     when the axis refuses, faults, is wired wrongly, or tells nothing.
     """
-    conditions = _conditions(axis.config, axis.devices, travel_rad, speed_rad_s, seed, subject)
+    devices = axis.devices
+    conditions = _conditions(axis.config, devices, travel_rad, speed_rad_s, seed, subject)
     recordings = store.Recordings(out, conditions, resume, axis.offset_ns)
     taken_up = recordings.start_rad is not None
     try:
         start_rad = enable_powerless(axis) if recordings.start_rad is None else recordings.start_rad
-        recordings.begin(start_rad, axis.devices)
+        recordings.begin(start_rad, devices)
         bounds = bounds_from(axis.config.limits, start_rad, travel_rad, speed_rad_s)
         rng = np.random.default_rng(seed)
         bench = Bench(axis, bounds, recordings, rng, start_rad=start_rad, enabled=not taken_up)
@@ -80,7 +81,8 @@ def _conditions(
 ) -> str:
     """Hash of all that recordings of one walk must share; paths and services of the configuration do not count."""
     parts = config.model_dump(mode="json", include={"cycle", "amplifier", "encoder", "limits"})
-    asked = json.dumps([parts, devices.model_dump(), travel_rad, speed_rad_s, seed, subject], sort_keys=True)
+    known = [devices.model_dump()] if devices != Devices() else []
+    asked = json.dumps([parts, *known, travel_rad, speed_rad_s, seed, subject], sort_keys=True)
     return hashlib.sha256(asked.encode()).hexdigest()
 
 

@@ -15,7 +15,7 @@ from typing import Any
 from servod.common.errors import AnswerIsNo, BadInput, ServodError, Unreachable
 from servod.common.files import unwritable
 from servod.formats.config import AxisConfig
-from servod.formats.gains.gain_set import GainSet, parse_gains, require_devices, require_fit, require_signed
+from servod.formats.gains.gain_set import GainSet, of_others, parse_gains, require_devices, require_fit, require_signed
 from servod.formats.gains.store import GainStore, StoredSet
 from servod.formats.model.identified import Devices
 from servod.formats.recording.record import CycleRecord
@@ -74,13 +74,25 @@ class GainBank:
             raise unwritable(f"gain store {self._config.gains.directory}", error) from None
 
     def know(self, devices: Devices) -> None:
-        """Drive and encoder of the axis, once they were asked: no set of others runs from here on."""
+        """Drive and encoder of the axis, before its loop starts: a first set of others gives way to gains.initial.
+
+        Where that is of others too, the axis is not enabled under it; where any set is accepted, it runs. Raises
+        BadInput.
+        """
         self._devices = devices
-        try:
-            self.require_own_devices()
-        except BadInput as error:
-            self._note = f"the axis is not enabled: {error}"
-            log.warning("%s", self._note)
+        if (error := of_others(self.newest.gains, devices)) is None:
+            return
+        accepted, initial = self._config.gains.accept_uncertified, self._store.load_file(self._config.gains.initial)
+        if accepted:
+            said = f"gains.accept_uncertified lets a set of other devices run: {error}"
+        elif of_others(initial.gains, devices) is not None:
+            said = f"the axis is not enabled: {error}"
+        else:
+            self._sets, self._kept = {0: initial}, initial
+            self._why_first = f"in place of {error}"
+            said = f"{error}; {initial.name} version {initial.version} (gains.initial) runs in its place"
+        self._note = "; ".join(filter(None, (self._note, said)))
+        log.warning("%s", said)
 
     def require_own_devices(self) -> None:
         """Refuse the set that runs where it was made for another drive or encoder. Raises BadInput."""
@@ -151,6 +163,7 @@ class GainBank:
     async def activate(self, args: GainsActivateArgs, send: SendOrder, slow: Executor) -> dict[str, Any]:
         """Change the running controller to a stored set, bumpless."""
         stored: StoredSet = await work_of(slow.submit(self._store.get, args.name, args.version))
+        self._require_devices(stored.gains)
         await self._deploy(stored, send)
         self._tried = stored if args.trial else None
         if not args.trial:
@@ -173,6 +186,7 @@ class GainBank:
         if self._tried is not None:
             return await self._reject(self._tried, args, send, slow)
         stored = await work_of(slow.submit(self._store.previous))
+        self._require_devices(stored.gains)
         await self._deploy(stored, send)
         await self._write(slow.submit(self._store.rollback), stored, send, slow)
         return _row(stored)
@@ -229,6 +243,10 @@ class GainBank:
     async def _back(self, send: SendOrder, slow: Executor) -> dict[str, Any]:
         """The active set runs again, and none is on trial: the one in memory, whatever became of the store."""
         active = self._kept
+        try:
+            self._require_devices(active.gains)
+        except BadInput:
+            await send(Op.QUICK_STOP, ())  # an axis that is off may have it, and no other
         await self._deploy(active, send)
         self._tried = None
         last = await work_of(slow.submit(self._stored_as_active))
@@ -249,7 +267,6 @@ class GainBank:
         refused does not run in the end.
         """
         self._fits(stored.gains, self._config)
-        self._require_devices(stored.gains)
         before = self.newest
         try:
             await self._send(stored, send)

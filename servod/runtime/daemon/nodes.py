@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from servod.common.errors import ServodError, Unreachable
 from servod.common.faults import FAULTS, FaultCode
 from servod.common.units import NS_PER_S, TWO_PI
-from servod.formats.model.identified import DeviceIdentity, Devices
+from servod.formats.model.identified import Devices
 from servod.runtime.daemon.guard_test import ProofStatus, proof_status, read_proof, terms
 from servod.runtime.daemon.status import Age, GuardStatus, IdentityStatus, NodeStatus
 from servod.runtime.fieldbus.bus import Bus
@@ -193,11 +193,7 @@ class Nodes:
 
     def devices(self) -> Devices:
         """What drive and encoder said of themselves at the start."""
-        keys = DeviceIdentity.model_fields
-        found = ((role, self._master.identity(plan.node_id)) for role, plan in self._roles())
-        return Devices.model_validate(
-            {role: {key: getattr(one, key) for key in keys} for role, one in found if one is not None}
-        )
+        return Devices.of({role: self._identity(plan.node_id) for role, plan in self._roles()})
 
     def _roles(self) -> tuple[tuple[str, NodePlan], ...]:
         return ("amplifier", self.plans.amplifier), ("encoder", self.plans.encoder)

@@ -15,8 +15,9 @@ from servod.common.shipped import shipped
 from servod.common.yaml import parse_yaml
 from servod.formats.config import AxisConfig, load_config
 from servod.formats.gains.gain_set import GainSet, devices_of, load_gains, require_devices, require_same_loop
+from servod.formats.gains.store import GainStore
 from servod.formats.model.identified import Devices
-from servod.runtime.daemon.arguments import GainsActivateArgs
+from servod.runtime.daemon.arguments import GainsActivateArgs, GainsVerdictArgs
 from servod.runtime.daemon.gain_bank import GainBank
 from servod.runtime.loop.commands import Op
 
@@ -80,24 +81,77 @@ def test_a_set_keeps_its_devices_through_its_file(tmp_path: Path) -> None:
     assert loaded.model.identified.devices == Devices.model_validate(OWN)
 
 
-async def _no_loop(_op: Op, _arguments: Sequence[float]) -> Any:
-    pytest.fail("the set went to the loop")
+class _Loop:
+    """Takes every order, and keeps them."""
+
+    def __init__(self) -> None:
+        self.sent: list[Op] = []
+
+    async def send(self, op: Op, _arguments: Sequence[float]) -> Any:
+        self.sent.append(op)
+
+
+def _bank(folder: Path, initial: GainSet, *, accept: bool = False) -> GainBank:
+    """A bank that minds nothing but devices."""
+    file = folder / "initial.yaml"
+    file.write_text(initial.to_yaml())
+    config = configured(accept)
+    gains = config.gains.model_copy(update={"directory": folder / "store", "initial": file})
+    return GainBank(config.model_copy(update={"gains": gains}), lambda _gains, _config: None)
+
+
+def _of_own() -> GainSet:
+    return identified_with(OWN).model_copy(update={"certificate": None}).sealed()
+
+
+OTHERS = Devices.model_validate(OWN | {"amplifier": {"serial": 1}})
+SAID = r"amplifier\.serial: found 4711; allowed: 1"
 
 
 def test_an_axis_that_found_other_devices_runs_no_set_of_these(tmp_path: Path) -> None:
-    """Neither the one it starts with nor one that is activated, whatever else fits."""
-    initial = tmp_path / "initial.yaml"
-    initial.write_text(identified_with(OWN).model_copy(update={"certificate": None}).sealed().to_yaml())
-    config = configured()
-    gains = config.gains.model_copy(update={"directory": tmp_path / "store", "initial": initial})
-    bank = GainBank(config.model_copy(update={"gains": gains}), lambda _gains, _config: None)
+    """Neither the one it starts with nor one that is activated or gone back to, whatever else fits."""
+    bank, loop = _bank(tmp_path, _of_own()), _Loop()
     bank.require_own_devices()  # nobody has asked the nodes yet
     bank.know(Devices.model_validate(OWN))
     bank.require_own_devices()
-    name = bank.newest.name
-    bank.know(Devices.model_validate(OWN | {"amplifier": {"serial": 1}}))
-    assert f"{KEY}.amplifier.serial" in bank.describe(0)["note"]
-    with pytest.raises(BadInput, match=r"amplifier\.serial: found 4711; allowed: 1"):
+    assert bank.describe(0)["note"] == ""
+    bank.know(OTHERS)
+    assert "the axis is not enabled: " in bank.describe(0)["note"]
+    with pytest.raises(BadInput, match=SAID):
         bank.require_own_devices()
-    with ThreadPoolExecutor(1) as slow, pytest.raises(BadInput, match=r"amplifier\.serial"):
-        asyncio.run(bank.activate(GainsActivateArgs(name=name), _no_loop, slow))
+    with ThreadPoolExecutor(1) as slow, pytest.raises(BadInput, match=SAID):
+        asyncio.run(bank.activate(GainsActivateArgs(name=bank.newest.name), loop.send, slow))
+    assert loop.sent == []
+
+
+def test_a_set_on_trial_that_ends_before_one_of_other_devices_ends_on_an_axis_that_is_off(tmp_path: Path) -> None:
+    bank, loop = _bank(tmp_path, _of_own()), _Loop()
+    GainStore(tmp_path / "store").load_file(shipped("gains/demo_pd.yaml"))
+    bank.know(OTHERS)
+    with ThreadPoolExecutor(1) as slow:
+        asyncio.run(bank.activate(GainsActivateArgs(name="demo_pd", trial=True), loop.send, slow))
+        bank.require_own_devices()
+        asyncio.run(bank.rollback(GainsVerdictArgs(trial=True), loop.send, slow))
+    assert loop.sent == [Op.ACTIVATE, Op.QUICK_STOP, Op.ACTIVATE] and not bank.on_trial
+    with pytest.raises(BadInput, match=SAID):
+        bank.require_own_devices()
+
+
+def test_a_set_of_other_devices_that_was_active_gives_way_to_the_initial_one(tmp_path: Path) -> None:
+    pd = load_gains(shipped("gains/demo_pd.yaml"))
+    store = GainStore(tmp_path / "store")
+    stored = store.load(_of_own().to_yaml(), "own")
+    store.activate(stored.name, stored.version, "")
+    bank = _bank(tmp_path, pd)
+    assert bank.newest.name == stored.name
+    bank.know(OTHERS)
+    assert bank.newest.name == pd.name
+    assert f"{pd.name} version 1 (gains.initial) runs in its place" in bank.describe(0)["note"]
+    bank.require_own_devices()
+
+
+def test_where_any_set_is_accepted_one_of_other_devices_runs_and_is_told_of(tmp_path: Path) -> None:
+    bank = _bank(tmp_path, _of_own(), accept=True)
+    bank.know(OTHERS)
+    bank.require_own_devices()
+    assert "gains.accept_uncertified lets a set of other devices run" in bank.describe(0)["note"]

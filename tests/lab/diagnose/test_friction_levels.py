@@ -127,13 +127,21 @@ def test_a_friction_map_has_levels_as_a_law_has(factors: dict[str, float], level
     assert {one["effect"] for one in found["findings"]} == set(levels)
 
 
-@pytest.mark.parametrize(("dry", "viscous", "another"), [(0.01, 0.02, True), (0.1, 0.0, False), (0.0, -0.1, False)])
-def test_one_factor_on_both_directions_is_no_asymmetry(dry: float, viscous: float, another: bool) -> None:
+@pytest.mark.parametrize(
+    ("form", "numbers", "another"),
+    [
+        ("both, another level", (0.01, 0.02, np.log(1.6)), True),
+        ("both, another level", (0.1, 0.0, np.log(1.6)), False),
+        ("both, another level", (0.0, -0.1, np.log(1.6)), False),
+        ("both", (0.02, 0.02), False),
+    ],
+)
+def test_one_factor_on_both_directions_is_no_asymmetry(form: str, numbers: tuple[float, ...], another: bool) -> None:
     model = believed()
     predictor = Predictor(load_traces(record(model, seconds=2.0)[:1], model)[0], model)
     scene = SearchContext(document_of(model), predictor, np.zeros(len(predictor.counts)))
     forms = {term.form: term for term in effect("asymmetry").terms(scene)}
-    hypothesis = Hypothesis(scene.document, base_unknowns(model)).with_term(forms["both, another level"])
+    hypothesis = Hypothesis(scene.document, base_unknowns(model)).with_term(forms[form])
     at = hypothesis.start.copy()
-    at[hypothesis.share(0)] = (dry, viscous, np.log(1.6))
+    at[hypothesis.share(0)] = numbers
     assert is_another(Fit(hypothesis, at, np.zeros(0), 0.0, np.zeros((0, 0)), True)) is another

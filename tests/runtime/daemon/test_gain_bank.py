@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -15,12 +16,17 @@ from servod.common.errors import AnswerIsNo, BadInput, Unreachable
 from servod.common.shipped import shipped
 from servod.formats.config import load_config
 from servod.formats.gains.store import Action, GainStore
+from servod.formats.protocol import Verb
 from servod.formats.recording.record import CycleRecord
 from servod.runtime.daemon.arguments import GainsActivateArgs, GainsVerdictArgs
+from servod.runtime.daemon.connection import Reply
 from servod.runtime.daemon.gain_bank import GainBank
+from servod.runtime.daemon.guard_test import ProofStatus
 from servod.runtime.daemon.requests import NoAnswer
+from servod.runtime.daemon.verbs import Verbs
 from servod.runtime.loop.commands import Op
-from tests.runtime.daemon.daemon_rows import record
+from tests.on_event_loop import events_pass, on_event_loop
+from tests.runtime.daemon.daemon_rows import axis_config, record
 
 FIRST, TRIED = "demo_pd", "demo_pd_dob"
 
@@ -175,3 +181,21 @@ def test_the_list_says_what_this_axis_may_not_run(
     rows = asyncio.run(bench.bank.list(bench.loop.serial, bench.slow))["gains"]
     assert sorted((row["name"], row["active"]) for row in rows) == sorted([(FIRST, True), (TRIED, False)])
     assert all(says in row["refused"] and bool(row["refused"]) != accepts for row in rows)
+
+
+@on_event_loop
+async def test_a_set_of_other_devices_enables_nothing(tmp_path: Path) -> None:
+    config, loop, bank = (
+        axis_config(tmp_path / "s", tmp_path / "c"),
+        MagicMock(latest=None, proofs=(0, None)),
+        MagicMock(),
+    )
+    bank.require_own_devices.side_effect = BadInput("gain set x: devices.amplifier.serial", 4711, "1")
+    told, proof = list[dict[str, Any]](), ProofStatus(asked_for=False, holds=True, time=None, text="")
+    front = Verbs(config, loop, bank, MagicMock(), dict, dict, lambda bus: bus, lambda: proof)
+    front.handle(Verb.ENABLE, {}, Reply(told.append, 1))
+    await events_pass()
+    front.close()
+    assert not loop.send.called
+    (answer,) = told
+    assert answer["error"]["exit_code"] == 2 and "amplifier.serial: found 4711" in answer["error"]["message"]

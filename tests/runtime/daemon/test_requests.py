@@ -251,12 +251,9 @@ class _Events:
 
 class _Bank:
     on_trial = False
-    others = False
 
     def require_own_devices(self) -> None:
-        """Of GainBank."""
-        if self.others:
-            raise BadInput("gain set x: design.model.identified.devices.amplifier.serial", 4711, "1")
+        """They are."""
 
 
 def _same(bus: Bus) -> Bus:
@@ -276,20 +273,6 @@ def verbs(tmp_path: Path) -> Iterator[tuple[Verbs, _Loop]]:
     )
     yield verbs, loop
     verbs.close()
-
-
-@on_event_loop
-async def test_a_set_of_other_devices_enables_nothing(
-    verbs: tuple[Verbs, _Loop], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    answers, (front, loop) = _Answers(), verbs
-    loop.latest = record(1, axis_state=AxisState.DISABLED)
-    monkeypatch.setattr(_Bank, "others", True)
-    front.handle(Verb.ENABLE, {}, answers.reply())
-    await events_pass()
-    assert loop.sent == []
-    (answer,) = answers.sent
-    assert "amplifier.serial: found 4711; allowed: 1" in answer["error"]["message"]
 
 
 def test_cycles_go_out_in_pieces_and_what_left_the_memory_is_counted(tmp_path: Path) -> None:

@@ -7,12 +7,13 @@ from collections.abc import Sequence
 
 from servod.formats.model.friction import Asymmetry
 from servod.lab.diagnose.effects.effect import Effect, positive, share
-from servod.lab.diagnose.effects.hypothesis import Document, Reported, Teller, Term, Writer, get
+from servod.lab.diagnose.effects.hypothesis import PLAINER_FACTOR, Document, Reported, Teller, Term, Writer, get
 from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.search_context import SearchContext
 
-#: The least by which the ratio of one direction's friction to the other's is off the model's, as a logarithm.
-LEAST_DIFFERENCE = 0.08
+#: The least by which the ratio of one direction's friction to the other's is off the model's (its logarithm): half of
+#: it is the least share of dry friction that is worth a name.
+LEAST_LOG_RATIO = 0.06
 
 
 def _write(document: Document, values: Sequence[float]) -> None:
@@ -52,7 +53,7 @@ def terms(_scene: SearchContext) -> list[Term]:
     """Dry friction by direction, and dry and viscous friction; each also with another level than the model's."""
     dry = share("dry", 0.0, -0.9, 0.9, 1.0)
     viscous = share("viscous", 0.0, -0.9, 0.9, 1.0)
-    level = positive("level", "1", 1.0, 3.0)
+    level = positive(PLAINER_FACTOR, "1", 1.0, 3.0)
     forms = {
         "both": (_write, (dry, viscous)),
         "dry": (_write_dry, (dry,)),
@@ -69,7 +70,7 @@ def _at_level(nominal: Document, fitted: Document) -> bool:
             get(document, f"asymmetry.positive_{part}", 1.0) / get(document, f"asymmetry.negative_{part}", 1.0)
             for document in (nominal, fitted)
         )
-        if abs(math.log(now / was)) >= LEAST_DIFFERENCE:
+        if abs(math.log(now / was)) >= LEAST_LOG_RATIO:
             return True
     return False
 

@@ -22,6 +22,9 @@ Array = NDArray[np.float64]
 
 #: The key of an unknown that is a factor on the model's own: 1 is no effect.
 LEVEL = "level_factor"
+
+#: A factor among the numbers of an effect that a plainer effect within it is alone.
+PLAINER_FACTOR = "level"
 Document = dict[str, Any]
 
 

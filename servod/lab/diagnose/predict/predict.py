@@ -126,7 +126,8 @@ def growth_rate(model: AxisModel, traces: Sequence[CheckedTrace]) -> float:
     for speed in top * np.geomspace(1e-3, 1.0 / CHORD, 60):
         for side in (-1.0, 1.0):
             slow, fast = (directed_curve(*packed, side * v) for v in (speed, CHORD * speed))
-            steepest = max(steepest, (slow - fast) / ((CHORD - 1.0) * float(speed)) - packed.p.viscous)
+            viscous = packed.p.viscous * (packed.p.positive_viscous if side > 0.0 else packed.p.negative_viscous)
+            steepest = max(steepest, (slow - fast) / ((CHORD - 1.0) * float(speed)) - viscous)
     return steepest / model.inertia
 
 

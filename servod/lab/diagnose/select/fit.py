@@ -34,7 +34,7 @@ class Weighing(NamedTuple):
 class Fit:
     """A fitted hypothesis: coordinates, mismatch of all rows, cost, and the Jacobian where it was last computed.
 
-    `span` is the factor on the nudges of its derivatives: more than 1 where fine ones led nowhere.
+    `span` is the least that its derivatives are taken over: more than 0 where fine ones led nowhere.
     """
 
     hypothesis: Hypothesis
@@ -43,7 +43,7 @@ class Fit:
     cost: float
     jacobian: Array
     converged: bool
-    span: float = 1.0
+    span: float = 0.0
 
     @property
     def model(self) -> AxisModel:
@@ -98,7 +98,7 @@ class Fitter:
             return None
         known = np.zeros((len(mismatch), 0)) if jacobian is None else jacobian
         # A map follows falling friction where a curve is smooth: along it the mismatch is rough as a rule.
-        span = SETTINGS.fit.wide if hypothesis.document["friction"]["kind"] == "local" else 1.0
+        span = SETTINGS.fit.wide if hypothesis.document["friction"]["kind"] == "local" else 0.0
         return Fit(hypothesis, at, mismatch, self.cost(hypothesis, at, mismatch), known, False, span)
 
     def predicted_cost(self, fit: Fit) -> float:
@@ -125,7 +125,7 @@ class Fitter:
                 fit = replace(stepped, jacobian=jacobian)
                 continue
             fit = stepped
-            if fresh and (fit.span > 1.0 or self._promise(fit, jacobian) < SETTINGS.fit.promised):
+            if fresh and (fit.span > 0.0 or self._predicted_gain(fit, jacobian) < SETTINGS.fit.predicted):
                 return replace(fit, converged=True)
             fit = replace(fit, span=SETTINGS.fit.wide) if fresh else fit
             jacobian, fresh, damping = self.derivatives(fit, keep_columns), True, SETTINGS.fit.least_damping
@@ -149,7 +149,7 @@ class Fitter:
 
     def _column(self, fit: Fit, index: int) -> Array:
         nudged = fit.coordinates.copy()
-        nudge = fit.span * fit.hypothesis.unknowns[index].nudge
+        nudge = max(fit.hypothesis.unknowns[index].nudge, fit.span)
         nudge = nudge if nudged[index] + nudge <= fit.hypothesis.bounds[1][index] else -nudge
         nudged[index] += nudge
         there = self.mismatch(fit.hypothesis, nudged)
@@ -170,7 +170,7 @@ class Fitter:
             damping = max(8.0 * damping, 1e-2)
         return replace(fit, jacobian=jacobian, converged=False), damping
 
-    def _promise(self, fit: Fit, jacobian: Array) -> float:
+    def _predicted_gain(self, fit: Fit, jacobian: Array) -> float:
         """The share of the cost that one step would take if the mismatch were straight along the Jacobian."""
         normal, slope = self._normal(fit, jacobian)
         change = _bounded_step(normal, slope, SETTINGS.fit.least_damping, fit)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from servod.lab.diagnose.effects import effect, effects
 from servod.lab.diagnose.effects.base import LEVELS
-from servod.lab.diagnose.effects.hypothesis import Document, Term, get
+from servod.lab.diagnose.effects.hypothesis import PLAINER_FACTOR, Document, Term, get
 from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.settings import SETTINGS
 
@@ -68,11 +68,12 @@ def at_end_of_range(fit: Fit, place: int = -1) -> bool:
 def is_another(fit: Fit, place: int = -1) -> bool:
     """Whether a term says itself that it is something else.
 
-    It lies at an end of its range, or is short of its own level where a plainer effect within it would do.
+    It lies at an end of its range, or is short of its own level and has a factor that a plainer effect is alone.
     """
-    terms = fit.hypothesis.terms
+    terms, place = fit.hypothesis.terms, place % len(fit.hypothesis.terms)
     plainer = any(terms[place].effect in one.within for one in effects())
-    short = plainer and range(len(terms))[place] not in named_terms(fit, fit.hypothesis.document)
+    levelled = any(unknown.key == PLAINER_FACTOR for unknown in terms[place].unknowns)
+    short = plainer and levelled and place not in named_terms(fit, fit.hypothesis.document)
     return short or at_end_of_range(fit, place)
 
 
