@@ -54,6 +54,8 @@ LOGS: list[Path] = []
 _LOGGED = re.compile(r"fault (\w+) \(")
 #: A drive that missed its master says so by EMCY 0x8130 (CiA 301, life guard or heartbeat error).
 _EMCY, _MISSED_ITS_MASTER = re.compile(r"EMCY 0x([0-9A-F]{4}) .*\(DRIVE_FAULT\)"), {"8130"}
+#: From where a daemon is ended to where the next begins.
+_ENDED = re.compile(r" INFO stopping: .*?(?= INFO gain set |\Z)", re.DOTALL)
 _FOLLOWS = re.compile(r"a fault is latched|'FAULT'|is FAULT|the axis is not enabled|must be configured anew")
 #: Sleeps on one processor before all that servod starts there, and tells when it slept too long, and how much [s].
 _WITNESS = """
@@ -155,15 +157,21 @@ def refused(priority: int = CycleConfig().priority) -> str:
 
 
 def logged(logs: Iterable[Path]) -> set[str]:
-    """The faults that daemons wrote down; a drive's own that it had for want of heartbeats is one of heartbeats."""
-    found = set()
-    for text in (log.read_text(errors="replace") for log in logs if log.exists()):
-        faults, told = _LOGGED.findall(text), _EMCY.findall(text)
-        named = set(faults)
-        if 0 < faults.count("DRIVE_FAULT") <= len(told) and set(told) == _MISSED_ITS_MASTER:
-            named = named - {"DRIVE_FAULT"} | {"NODE_HEARTBEAT_LOST"}
-        found |= named
-    return found
+    """The faults that daemons wrote down."""
+    return {name for log in logs if log.exists() for name in written(log.read_text(errors="replace"))}
+
+
+def written(text: str) -> set[str]:
+    """The faults in the log of daemons, or in what a test says of it, each until it was ended.
+
+    A drive's own that it had for want of heartbeats is one of heartbeats. What comes when a test that failed ends its
+    processes, bus and encoder first, is no cause of it.
+    """
+    text = _ENDED.sub("", text)
+    faults, told = _LOGGED.findall(text), _EMCY.findall(text)
+    if 0 < faults.count("DRIVE_FAULT") <= len(told) and set(told) == _MISSED_ITS_MASTER:
+        return set(faults) - {"DRIVE_FAULT"} | {"NODE_HEARTBEAT_LOST"}
+    return set(faults)
 
 
 class Stalls:
@@ -259,7 +267,7 @@ class Judge:
             never_came = isinstance(error, TimeoutError | subprocess.TimeoutExpired)
             evidence = starved if never_came else starved or self._refused
             times_alone = item.get_closest_marker("wall_clock") is not None
-            if evidence and by_lateness(error, times_alone, logged(LOGS)):
+            if evidence and by_lateness(error, times_alone, logged(LOGS) | written(str(error))):
                 report.outcome = "skipped"
                 said = f"Skipped: the machine was starved: {evidence} ({call.excinfo.exconly()[:200]})"
                 report.longrepr = (str(item.path), (item.location[1] or 0) + 1, said)

@@ -16,7 +16,7 @@ from servod.client.control import Refused
 from servod.common.errors import BadInput, Unreachable
 from servod.formats.config import CycleConfig
 from tests import starved
-from tests.starved import Reading, Span, Stalls, between, by_lateness, logged, read
+from tests.starved import Reading, Span, Stalls, between, by_lateness, logged, read, written
 
 TESTS = """
 import pytest
@@ -212,6 +212,26 @@ def test_a_drive_that_missed_its_master_missed_it_in_time(tmp_path: Path, emcy: 
     )
     error = AssertionError("not off: the axis is DISABLED: DRIVE_FAULT: why. NODE_LEFT_OPERATIONAL: why\nassert 3 == 0")
     assert by_lateness(error, times_alone=False, faults=logged([tmp_path / "log"])) == excused
+
+
+STALE = "00:01 ERROR fault FEEDBACK_STALE (QUICK_STOP): why | timing\n"
+DOWN = "00:02 ERROR fault BUS_DOWN (QUICK_STOP): why | timing\n"
+BEGUN, ENDED = "00:00 INFO gain set demo_pd version 1 (pd)\n", "00:01 INFO stopping: braking\n"
+
+
+@pytest.mark.parametrize(
+    ("log", "found"),
+    [
+        (BEGUN + STALE + ENDED + DOWN, {"FEEDBACK_STALE"}),
+        (BEGUN + STALE + DOWN + ENDED, {"FEEDBACK_STALE", "BUS_DOWN"}),
+        (BEGUN + ENDED + DOWN + BEGUN + STALE, {"FEEDBACK_STALE"}),
+        (BEGUN + ENDED + BEGUN + DOWN, {"BUS_DOWN"}),
+    ],
+)
+def test_what_befalls_a_daemon_that_was_ended_is_no_cause(log: str, found: set[str]) -> None:
+    assert written(log) == found
+    error = AssertionError(f"{log}servoctl: refused: must be configured anew\nassert 3 == 0")
+    assert by_lateness(error, times_alone=False, faults=written(str(error))) == ("BUS_DOWN" not in found)
 
 
 def test_comparisons_of_times_are_excused_where_the_test_says_that_it_makes_no_others() -> None:
