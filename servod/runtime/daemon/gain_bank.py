@@ -76,8 +76,8 @@ class GainBank:
     def know(self, devices: Devices) -> None:
         """Drive and encoder of the axis, before its loop starts: a first set of others gives way to gains.initial.
 
-        Where that is of others too, the axis is not enabled under it; where any set is accepted, it runs. Raises
-        BadInput.
+        Where that is of others too, or may not run for another reason, the axis is not enabled; where any set is
+        accepted, it runs. Raises BadInput.
         """
         self._devices = devices
         if (error := of_others(self.newest.gains, devices)) is None:
@@ -85,7 +85,7 @@ class GainBank:
         accepted, initial = self._config.gains.accept_uncertified, self._store.load_file(self._config.gains.initial)
         if accepted:
             said = f"gains.accept_uncertified lets a set of other devices run: {error}"
-        elif of_others(initial.gains, devices) is not None:
+        elif not self._may_run(initial):
             said = f"the axis is not enabled: {error}"
         else:
             self._sets, self._kept = {0: initial}, initial
@@ -93,6 +93,14 @@ class GainBank:
             said = f"{error}; {initial.name} version {initial.version} (gains.initial) runs in its place"
         self._note = "; ".join(filter(None, (self._note, said)))
         log.warning("%s", said)
+
+    def _may_run(self, stored: StoredSet) -> bool:
+        try:
+            self._fits(stored.gains, self._config)
+            self._require_devices(stored.gains)
+        except BadInput:
+            return False
+        return True
 
     def require_own_devices(self) -> None:
         """Refuse the set that runs where it was made for another drive or encoder. Raises BadInput."""

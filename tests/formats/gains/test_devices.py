@@ -18,7 +18,7 @@ from servod.formats.gains.gain_set import GainSet, devices_of, load_gains, requi
 from servod.formats.gains.store import GainStore
 from servod.formats.model.identified import Devices
 from servod.runtime.daemon.arguments import GainsActivateArgs, GainsVerdictArgs
-from servod.runtime.daemon.gain_bank import GainBank
+from servod.runtime.daemon.gain_bank import Fits, GainBank
 from servod.runtime.loop.commands import Op
 
 OWN = {"amplifier": {"vendor_id": 0x2E8, "serial": 4711}, "encoder": {"product_code": 7, "serial": 4712}}
@@ -91,13 +91,15 @@ class _Loop:
         self.sent.append(op)
 
 
-def _bank(folder: Path, initial: GainSet, *, accept: bool = False) -> GainBank:
+def _bank(
+    folder: Path, initial: GainSet, *, accept: bool = False, fits: Fits = lambda _gains, _config: None
+) -> GainBank:
     """A bank that minds nothing but devices."""
     file = folder / "initial.yaml"
     file.write_text(initial.to_yaml())
     config = configured(accept)
     gains = config.gains.model_copy(update={"directory": folder / "store", "initial": file})
-    return GainBank(config.model_copy(update={"gains": gains}), lambda _gains, _config: None)
+    return GainBank(config.model_copy(update={"gains": gains}), fits)
 
 
 def _of_own() -> GainSet:
@@ -155,3 +157,19 @@ def test_where_any_set_is_accepted_one_of_other_devices_runs_and_is_told_of(tmp_
     bank.know(OTHERS)
     bank.require_own_devices()
     assert "gains.accept_uncertified lets a set of other devices run" in bank.describe(0)["note"]
+
+
+def test_an_initial_set_that_may_not_run_does_not_run_in_place_of_one_of_other_devices(tmp_path: Path) -> None:
+    store = GainStore(tmp_path / "store")
+    stored = store.load(_of_own().to_yaml(), "own")
+    store.activate(stored.name, stored.version, "")
+
+    def fits(gains: GainSet, _config: AxisConfig) -> None:
+        if gains.name != stored.name:
+            raise BadInput("initial.yaml", "no certificate", "one")
+
+    bank = _bank(tmp_path, load_gains(shipped("gains/demo_pd.yaml")), fits=fits)
+    bank.know(OTHERS)
+    assert bank.newest.name == stored.name and "the axis is not enabled" in bank.describe(0)["note"]
+    with pytest.raises(BadInput, match=SAID):
+        bank.require_own_devices()
