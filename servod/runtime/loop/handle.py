@@ -35,10 +35,11 @@ class LoopHandle:
         self._channel = Channel()
         self._process: subprocess.Popen[str] | None = None
 
-    def start(self, meanwhile: Callable[[], None] = lambda: None) -> None:
+    def start(self, meanwhile: Callable[[Callable[[], bool]], None] = lambda _: None) -> None:
         """Start the process and wait for its first cycle; raises Unreachable with its last words when it dies.
 
-        `meanwhile` is done again and again until then; what it raises ends the start.
+        `meanwhile` is done again and again until then; what it raises ends the start. It is given what tells whether
+        the loop has begun since.
         """
         fd = self._channel.fd
         try:
@@ -145,7 +146,7 @@ class LoopHandle:
         stream = self._process.stderr if self._process else None
         return stream.read() if stream and not stream.closed else ""
 
-    def _wait_until_ready(self, meanwhile: Callable[[], None]) -> None:
+    def _wait_until_ready(self, meanwhile: Callable[[Callable[[], bool]], None]) -> None:
         deadline = time.monotonic() + START_TIMEOUT_S
         while not self._channel.ready:
             if not self.alive():
@@ -156,5 +157,5 @@ class LoopHandle:
             if time.monotonic() > deadline:
                 late = f"the loop process did not begin within {START_TIMEOUT_S:.0f} s"
                 raise Unreachable(f"{late}: is the machine busy with other work?")
-            meanwhile()
+            meanwhile(lambda: self._channel.ready)
             time.sleep(0.01)

@@ -4,6 +4,8 @@ import os
 import signal
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from typing import Any, cast
 
 import pytest
@@ -63,17 +65,39 @@ class _Plan:
         return "{}"
 
 
-def test_the_start_of_the_loop_is_no_beat_yet(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Else the shorter patience would begin before the supervisor's rounds do."""
+@pytest.fixture
+def late_child(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loop's process is one that is ready after half a second, and does no more."""
     popen = subprocess.Popen
 
     def child(command: list[str], **options: Any) -> subprocess.Popen[str]:
         return popen([sys.executable, "-c", CHILD, command[-2]], **options)
 
     monkeypatch.setattr(subprocess, "Popen", child)
+
+
+@pytest.mark.usefixtures("late_child")
+def test_a_look_that_took_long_is_told_that_the_loop_began() -> None:
+    """What it hears then may be the loop's own."""
+    loop, told = LoopHandle(cast(LoopPlan, _Plan())), []
+
+    def look(began: Callable[[], bool]) -> None:
+        told.append(began())
+        time.sleep(2.0)
+        told.append(began())
+
+    loop.start(look)
+    loop.close()
+    assert told[0] is False
+    assert told[-1] is True
+
+
+@pytest.mark.usefixtures("late_child")
+def test_the_start_of_the_loop_is_no_beat_yet() -> None:
+    """Else the shorter patience would begin before the supervisor's rounds do."""
     loop, looks = LoopHandle(cast(LoopPlan, _Plan())), []
     before = loop._channel.supervisor_beats()
-    loop.start(lambda: looks.append(loop._channel.supervisor_beats()))
+    loop.start(lambda _: looks.append(loop._channel.supervisor_beats()))
     assert len(looks) > 2
     assert {*looks, loop._channel.supervisor_beats()} == {before}
     loop.feed()

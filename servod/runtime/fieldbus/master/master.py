@@ -8,6 +8,7 @@ only then NMT start. SYNC, PDOs and the master's heartbeat are the loop's, not o
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from servod.common.clock import Clock
@@ -98,14 +99,17 @@ class Master:
             raise
         return BringUp(plans[0], plans[1], load.share, report)
 
-    def look_for_strangers(self) -> None:
-        """From the bring-up until `hand_over`: raises Unreachable where somebody else spoke with the nodes."""
+    def look_for_strangers(self, loop_began: Callable[[], bool] = lambda: False) -> None:
+        """From the bring-up until `hand_over`: raises Unreachable where somebody else spoke with the nodes.
+
+        `loop_began`: whether the loop speaks by now; see StartWatch.look.
+        """
         self._network.drain()
         for node in self._nodes.values():
             if node.watch.foreign:
                 raise foreign(node.watch.foreign)
         if self._start_watch is not None:
-            self._start_watch.look()
+            self._start_watch.look(loop_began)
 
     def hand_over(self) -> None:
         """The loop listens, and speaks, from now on."""

@@ -5,10 +5,12 @@ What others write meanwhile may stay: it comes behind our own reading back, and 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from servod.common.errors import Unreachable
 from servod.formats.config import AxisConfig
 from servod.runtime.fieldbus.bus import Bus
-from servod.runtime.fieldbus.cia import ids_of_masters
+from servod.runtime.fieldbus.cia import HEARTBEAT_BASE, RPDO_BASE, SYNC_ID, ids_of_masters
 from servod.runtime.fieldbus.master.network import BusNetwork
 
 
@@ -24,12 +26,22 @@ class StartWatch:
     def __init__(self, bus: Bus, network: BusNetwork, config: AxisConfig) -> None:
         """`bus` is opened with `start_ids`; it is closed with `close`."""
         self._bus, self._answers, self._ids = bus, network.answers, frozenset(start_ids(config))
+        commands = {base + config.amplifier.node_id for base in RPDO_BASE}
+        self._of_loop = commands | {SYNC_ID, HEARTBEAT_BASE + config.heartbeat.master_node_id}
         network.announces.update(self._ids)
 
-    def look(self) -> None:
-        """Take what came; raises Unreachable for what this master did not send."""
+    def look(self, loop_began: Callable[[], bool] = lambda: False) -> None:
+        """Take what came; raises Unreachable for what this master did not send.
+
+        `loop_began` is asked behind the last frame: what came until then is nobody's of ours while it says no. Once it
+        has begun, its cyclic frames are among them, and it hears those of others itself.
+        """
+        frames = []
         while (frame := self._bus.receive(0.0)) is not None:
-            if frame.can_id in self._ids and not self._answers.own(frame.can_id, frame.data, heard_late=True):
+            frames.append(frame)
+        ids = self._ids - self._of_loop if frames and loop_began() else self._ids
+        for frame in frames:
+            if frame.can_id in ids and not self._answers.own(frame.can_id, frame.data, heard_late=True):
                 raise foreign(f"frame 0x{frame.can_id:03X} {frame.data.hex(' ')}".rstrip())
 
     def close(self) -> None:

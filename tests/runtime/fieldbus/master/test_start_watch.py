@@ -13,6 +13,7 @@ from servod.formats.gains.gain_set import load_gains
 from servod.formats.model.axis_model import load_axis_model
 from servod.runtime.fieldbus.bus import Bus
 from servod.runtime.fieldbus.cia import NmtState
+from servod.runtime.fieldbus.master import Master, master_ids, start_ids
 from servod.runtime.fieldbus.master.network import BusNetwork
 
 FRAMES = {
@@ -77,3 +78,19 @@ def test_the_start_ends_whenever_it_comes(kind: str, share: float, transfers: in
         start(there)
     there.clock.sleep_until(there.clock.now_ns() + 5_000_000)
     assert {node.state for node in (there.amplifier, there.encoder)} == {NmtState.PRE_OPERATIONAL}
+
+
+@pytest.mark.parametrize("kind", FRAMES)
+@pytest.mark.parametrize("began", [False, True])
+def test_the_loops_own_first_frames_are_no_stranger(kind: str, began: bool) -> None:
+    """A machine that stood still looks when the loop has begun since: what the loop sends is no stranger's."""
+    there, axis = world(), config()
+    master_bus, start_bus, loop = there.connect(master_ids(axis)), there.connect(start_ids(axis)), there.connect()
+    master = Master(axis, master_bus, there.clock, threaded=False, start_bus=start_bus)
+    loop.send(FRAMES[kind][0], bytes.fromhex(FRAMES[kind][1]))
+    there.clock.sleep_until(there.clock.now_ns() + 1_000_000)
+    if began and kind in ("SYNC", "command", "heartbeat of the master"):
+        master.look_for_strangers(lambda: began)
+    else:
+        with pytest.raises(Unreachable, match="somebody else spoke"):
+            master.look_for_strangers(lambda: began)
