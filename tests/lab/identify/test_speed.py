@@ -8,6 +8,9 @@ import pytest
 from servod.client.stepped import SteppedAxis
 from servod.client.virtual import virtual_session
 from servod.common.errors import AnswerIsNo
+from servod.common.shipped import shipped
+from servod.formats.config import load_config
+from servod.formats.model.axis_model import AxisModel, load_axis_model
 from servod.lab.identify.bounds import bounds_from
 from servod.lab.identify.experiments import kick
 from servod.lab.identify.experiments.common import Bench, enable_powerless
@@ -58,6 +61,23 @@ def test_kicks_keep_to_the_speed_and_tell_inertia(bits, speed_rad_s, tmp_path):
     kicks = kick.run(bench, break_away(joint))
     assert truth.peak_rad_s <= speed_rad_s
     assert kick_fit.fit(kicks).inertia == pytest.approx(joint.model.inertia, rel=0.4)
+
+
+@pytest.mark.parametrize("held_by", ["viscous friction", "cogging"])
+def test_a_joint_that_a_longer_kick_makes_no_faster_is_kicked_harder(held_by, tmp_path):
+    """Limits of the shipped configuration, whose speed the first torque never comes near; or a joint in a valley."""
+    valley = {"harmonics": [{"amplitude": 0.02, "periods_per_turn": 22, "phase": 0.0}]}
+    joint = load_axis_model(shipped("gains/axes/table1_joint.yaml"))
+    if held_by == "cogging":
+        joint = AxisModel.model_validate(joint.model_dump(exclude_unset=True) | {"cogging": valley})
+    config = load_config(shipped("gains/config/virtual.yaml")) if held_by == "viscous friction" else None
+    session = virtual_session(joint, tmp_path, None, 1, config)
+    axis = SteppedAxis(session, tmp_path)
+    bounds = bounds_from(axis.config.limits, enable_powerless(axis), None, None)
+    bench, truth = Bench(axis, bounds, Unkept(), np.random.default_rng(1)), Truth(session)
+    kicks = kick.run(bench, (0.071, 0.071))
+    assert truth.peak_rad_s <= bounds.most_rad_s
+    assert kick_fit.fit(kicks).inertia == pytest.approx(joint.inertia, rel=0.5)
 
 
 @pytest.mark.parametrize(

@@ -1,13 +1,16 @@
 """Kicks: a short torque pulse in each direction, for a first idea of inertia.
 
-Reason: the feedback of all later experiments is set from it. Amplitude: a fixed multiple of break-away; its duration is
-doubled from one period until the joint reaches a useful speed, and never so far that the next kick would pass the
-allowed one, which is known from the kick before. Bounds: speed and a window; friction alone stops the joint.
+Reason: the feedback of all later experiments is set from it. Amplitude: a multiple of break-away; the pulse's duration
+is doubled from one period until the joint reaches a useful speed, and its torque grows where a longer pulse makes the
+joint no faster: viscous friction carries it, or a hill of cogging holds it. Never so far that the next kick would pass
+the allowed speed, which is known from the kick before. Bounds: speed, torque and a window; friction alone stops the
+joint.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,8 +19,10 @@ from servod.lab.identify.experiments.common import SPEED_SPAN_S, Bench, peak_spe
 from servod.lab.identify.shapes import samples
 from servod.lab.identify.trace import ExperimentKind, RecordedMotion
 
-#: Torque against break-away.
-TORQUE_RATIO = 1.6
+#: Torque against break-away: of the first kick, and the factor by which it grows.
+TORQUE_RATIO, TORQUE_STEP = 1.6, 1.25
+#: A pulse twice as long that makes the joint no faster than by this factor is long enough.
+LEVELS_OFF = 1.3
 #: Shorter pulses are over before the fit can tell inertia from bristles; longer ones are no kicks.
 LEAST_S, LONGEST_S = 0.004, 1.0
 #: Fast enough: this share of the allowed speed, and so many counts per period.
@@ -29,21 +34,30 @@ TRAVEL_SHARE = 0.25
 LEAD_S, COAST_S = 0.05, 0.35
 
 
+@dataclass(frozen=True)
+class _Pulse:
+    """Torque against break-away, duration in periods, and the speed that the pulse before it reached."""
+
+    ratio: float = TORQUE_RATIO
+    periods: int = 1
+    before_rad_s: float = 0.0
+
+
 def run(bench: Bench, break_away_nm: tuple[float, float]) -> list[RecordedMotion]:
     """Kicks of growing length there and back until both directions tell; `break_away_nm` positive, negative.
 
     Raises AnswerIsNo when they cannot: bounds, encoder or torque forbid it.
     """
     needed_rad_s, kicks = _needed(bench), []
-    pulses = {sign * size: 1 for sign, size in zip((1.0, -1.0), break_away_nm, strict=True)}
+    pulses = {sign * size: _Pulse() for sign, size in zip((1.0, -1.0), break_away_nm, strict=True)}
     while pulses:
         for torque_nm, pulse in list(pulses.items()):
             kick = _kick(bench, torque_nm, pulse)
             kicks.append(kick)
-            if pulse * bench.period_s >= LEAST_S and peak_speed(kick, SPEED_SPAN_S) >= needed_rad_s:
+            if pulse.periods * bench.period_s >= LEAST_S and peak_speed(kick, SPEED_SPAN_S) >= needed_rad_s:
                 del pulses[torque_nm]
             else:
-                pulses[torque_nm] = _longer(bench, kick, pulse, needed_rad_s)
+                pulses[torque_nm] = _next(bench, kick, pulse, abs(torque_nm), needed_rad_s)
     return kicks
 
 
@@ -60,33 +74,45 @@ def _needed(bench: Bench) -> float:
     return max(SPEED_SHARE * bench.bounds.speed_rad_s, visible)
 
 
-def _longer(bench: Bench, kick: RecordedMotion, pulse: int, needed_rad_s: float) -> int:
-    """Periods of the next pulse: twice as many, as far as the speed allows it. Raises AnswerIsNo when none does."""
+def _next(bench: Bench, kick: RecordedMotion, pulse: _Pulse, break_away_nm: float, needed_rad_s: float) -> _Pulse:
+    """The next pulse: twice as long, or stronger where length does not help, as far as speed and torque allow it.
+
+    Raises AnswerIsNo when none is allowed.
+    """
     # the shortest kicks do not fill the usual span
     reached, allowed = peak_speed(kick, 0.5 * SPEED_SPAN_S), bench.bounds.most_rad_s
-    longest = math.floor(pulse * allowed / (GROWTH * reached)) if reached > 0.0 else 2 * pulse
-    if longest <= pulse:
+    factor = allowed / (GROWTH * reached) if reached > 0.0 else math.inf
+    long = 2 * pulse.periods * bench.period_s > LONGEST_S
+    if long or 0.0 < reached < LEVELS_OFF * pulse.before_rad_s:
+        ratio = TORQUE_STEP * pulse.ratio
+        # friction keeps at most the break-away of both: what is left grows by more than the torque
+        faster = (ratio - 1.0) / (pulse.ratio - 1.0)
+        if faster <= factor and ratio * break_away_nm <= bench.bounds.torque_nm:
+            return _Pulse(ratio, pulse.periods, reached)
+    longest = math.floor(pulse.periods * min(factor, 2.0))
+    if longest <= pulse.periods:
         raise AnswerIsNo(
             f"inertia is not identifiable at this speed: a kick of {1e3 * kick.settings['pulse_s']:.2g} ms takes the "
             f"joint to {reached:.2g} rad/s, {allowed:.2g} are allowed, and it must last {1e3 * LEAST_S:g} ms and "
             f"reach {needed_rad_s:.2g} rad/s to tell; allow more (--speed, limits.speed_rad_s)"
         )
-    if 2 * pulse * bench.period_s > LONGEST_S:
+    if long:
         raise AnswerIsNo(
             f"the joint does not pick up speed when kicked: {reached:.2g} rad/s, and {needed_rad_s:.2g} are needed to "
-            "tell; its inertia is too large for the allowed torque (limits.torque_nm), its travel is too short "
-            "(--travel, limits.position_min_rad and position_max_rad), or its encoder is too coarse"
+            "tell; its inertia or friction is too large for the allowed torque (limits.torque_nm) or the experiments "
+            "are to be too fast (--speed), its travel is too short (--travel, limits.position_min_rad and "
+            "position_max_rad), or its encoder is too coarse"
         )
-    return min(2 * pulse, longest)
+    return _Pulse(pulse.ratio, longest, reached)
 
 
-def _kick(bench: Bench, torque_nm: float, pulse: int) -> RecordedMotion:
-    """One kick of `pulse` periods in the direction of `torque_nm`, the break-away there, and the coast behind it."""
+def _kick(bench: Bench, torque_nm: float, pulse: _Pulse) -> RecordedMotion:
+    """One kick in the direction of `torque_nm`, the break-away there, and the coast behind it."""
     bench.set_gains(0.0, 0.0)
-    size = np.sign(torque_nm) * min(TORQUE_RATIO * abs(torque_nm), bench.bounds.torque_nm)
-    pulse_s, lead = pulse * bench.period_s, samples(LEAD_S, bench.period_s)
-    torque = np.zeros(lead + pulse + samples(COAST_S + pulse_s, bench.period_s))
-    torque[lead : lead + pulse] = size
+    size = np.sign(torque_nm) * min(pulse.ratio * abs(torque_nm), bench.bounds.torque_nm)
+    pulse_s, lead = pulse.periods * bench.period_s, samples(LEAD_S, bench.period_s)
+    torque = np.zeros(lead + pulse.periods + samples(COAST_S + pulse_s, bench.period_s))
+    torque[lead : lead + pulse.periods] = size
     window = min(TRAVEL_SHARE * bench.bounds.travel_rad, bench.bounds.window_rad)
     return bench.run(ExperimentKind.KICK, np.zeros(len(torque)), torque, window, {"pulse_nm": size, "pulse_s": pulse_s})
 
