@@ -63,19 +63,24 @@ def test_kicks_keep_to_the_speed_and_tell_inertia(bits, speed_rad_s, tmp_path):
     assert kick_fit.fit(kicks).inertia == pytest.approx(joint.model.inertia, rel=0.4)
 
 
-@pytest.mark.parametrize("held_by", ["viscous friction", "cogging"])
-def test_a_joint_that_a_longer_kick_makes_no_faster_is_kicked_harder(held_by, tmp_path):
-    """Limits of the shipped configuration, whose speed the first torque never comes near; or a joint in a valley."""
-    valley = {"harmonics": [{"amplitude": 0.02, "periods_per_turn": 22, "phase": 0.0}]}
-    joint = load_axis_model(shipped("gains/axes/table1_joint.yaml"))
-    if held_by == "cogging":
-        joint = AxisModel.model_validate(joint.model_dump(exclude_unset=True) | {"cogging": valley})
-    config = load_config(shipped("gains/config/virtual.yaml")) if held_by == "viscous friction" else None
-    session = virtual_session(joint, tmp_path, None, 1, config)
+UNEVEN = {"positive_dry": 1.1, "negative_dry": 0.9}
+#: The joint stands on a slope: that way it breaks away at little, and a hill of three times as much is before it.
+SLOPE = {"harmonics": [{"amplitude": 0.02, "periods_per_turn": 22, "phase": 1.4}]}
+
+
+@pytest.mark.parametrize(
+    ("config", "parts", "break_away_nm"),
+    [("gains/config/virtual.yaml", {}, (0.077, 0.063)), (None, {"cogging": SLOPE}, (0.097, 0.043))],
+    ids=["viscous friction and a high limit of speed", "cogging"],
+)
+def test_a_joint_that_a_longer_kick_makes_no_faster_is_kicked_harder(config, parts, break_away_nm, tmp_path):
+    plain = load_axis_model(shipped("gains/axes/table1_joint.yaml")).model_dump(exclude_unset=True)
+    joint = AxisModel.model_validate(plain | {"asymmetry": UNEVEN} | parts)
+    session = virtual_session(joint, tmp_path, None, 1, load_config(shipped(config)) if config else None)
     axis = SteppedAxis(session, tmp_path)
     bounds = bounds_from(axis.config.limits, enable_powerless(axis), None, None)
     bench, truth = Bench(axis, bounds, Unkept(), np.random.default_rng(1)), Truth(session)
-    kicks = kick.run(bench, (0.071, 0.071))
+    kicks = kick.run(bench, break_away_nm)
     assert truth.peak_rad_s <= bounds.most_rad_s
     assert kick_fit.fit(kicks).inertia == pytest.approx(joint.inertia, rel=0.5)
 
