@@ -133,6 +133,7 @@ class Analysis:
     presliding: presliding.PreslidingFit
     kick: kick.KickFit
     response: response.ResponseFit
+    torque_noise: Estimate
     map: friction_map.MapFit
     positive: curve.CurveFit
     negative: curve.CurveFit
@@ -168,19 +169,22 @@ def analyse(traces: Sequence[RecordedMotion], devices: Devices | None = None) ->
     slides = break_away.fit([ramp for ramp in ramps if not ramp.settings["search"]] or ramps)
     rocked = presliding.fit(of_kind(traces, ExperimentKind.PRESLIDING), slides)
     kicked = kick.fit(of_kind(traces, ExperimentKind.KICK))
-    answer = response.fit(of_kind(traces, ExperimentKind.RESPONSE)[-1], kicked.inertia)
+    slid = of_kind(traces, ExperimentKind.RESPONSE)[-1]
+    answer = response.fit(slid, kicked.inertia)
     delay_s = answer.delay_s.value + answer.lag_s.value
     damping = _damping(traces, answer, rocked)
     bristles = _bristle(slides, rocked, damping, answer.inertia.value)
     mapped = friction_map.fit(of_kind(traces, ExperimentKind.FRICTION_MAP), answer.inertia.value, delay_s, bristles)
     positive, negative = curve.fit(mapped.positive), curve.fit(mapped.negative)
+    shaken = response.torque_noise(slid, answer, mapped.cogging)
     cogs = sum(wave.amplitude.value for wave in mapped.cogging)
     return Analysis(
         fit(of_kind(traces, ExperimentKind.NOISE)[-1]),
-        break_away.widened(slides, math.hypot(cogs, EARLY_BY * answer.torque_noise_rms.value)),
+        break_away.widened(slides, math.hypot(cogs, EARLY_BY * shaken.value)),
         rocked,
         kicked,
         answer,
+        shaken,
         mapped,
         positive,
         negative,

@@ -95,7 +95,7 @@ def estimates(analysis: Analysis) -> dict[str, Estimate]:
         **_of_curve(analysis.negative, "negative"),
         "encoder_noise_rms": analysis.noise.encoder_rms,
         "torque_reading_noise_rms": analysis.noise.torque_reading_rms,
-        "torque_noise_rms": answer.torque_noise_rms,
+        "torque_noise_rms": analysis.torque_noise,
     }
     numbers |= {
         "gravity" if wave.order == GRAVITY else f"cogging_{wave.order}": wave.amplitude for wave in analysis.map.cogging

@@ -23,7 +23,8 @@ def noise_of(model: AxisModel, resolution_rad: float = 0.0) -> Noise | None:
     """The model's own noise, or what its identification measured; None where nobody says anything of it.
 
     What was measured at rest has the rounding to encoder counts in it: a simulation that rounds to `resolution_rad`
-    by itself gets the rest. The torque noise was measured while sliding with the cogging in it, and is an upper bound.
+    by itself gets the rest. The torque noise was measured while sliding, beside the cogging that was found: an upper
+    bound.
     """
     if model.noise is not None or model.identified is None:
         return model.noise

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -15,7 +17,7 @@ from servod.lab.identify.fits import bristle, cogging, curve, elastic, preslidin
 from servod.lab.identify.fits.break_away import BreakAwayFit
 from servod.lab.identify.fits.bristle import Bristle, dry_columns, follow
 from servod.lab.identify.fits.elastic import Elastic
-from servod.lab.identify.fits.friction_map import Side
+from servod.lab.identify.fits.friction_map import FittedHarmonic, Side
 from servod.lab.identify.fits.presliding import bend_factor, fundamental
 from servod.lab.identify.fits.response import Rigid, response_of
 from servod.lab.identify.shapes import multisine
@@ -194,12 +196,40 @@ def excited(disturbance_nm: list[float]) -> RecordedMotion:
     return RecordedMotion(ExperimentKind.RESPONSE, t, torque, position, position, torque, torque, position, settings)
 
 
+def noise_of(trace: RecordedMotion) -> Estimate:
+    """Torque noise of a joint without cogging."""
+    return response.torque_noise(trace, response.fit(trace, 1e-3), ())
+
+
 def test_the_interval_of_the_torque_noise_is_the_scatter_of_the_strokes():
-    steady = response.fit(excited([4e-4] * 12), 1e-3).torque_noise_rms
+    steady = noise_of(excited([4e-4] * 12))
     assert steady.holds(4e-4)
     assert 0.03 < steady.half_width / steady.value < 0.15
-    once = response.fit(excited([1e-5] * 11 + [1.4e-3]), 1e-3).torque_noise_rms
+    once = noise_of(excited([1e-5] * 11 + [1.4e-3]))
     assert once.half_width > 0.5 * once.value
+
+
+def test_cogging_that_is_known_is_no_torque_noise():
+    """The plant's own simulation under the same multisine; the joint slides over 26 teeth of 20 mN*m."""
+    joint = AxisModel.model_validate(
+        {
+            "inertia": 1e-3,
+            "delay_s": 1e-3,
+            "friction": {"kind": "coulomb_viscous", "viscous": 0.06},
+            "cogging": {"harmonics": [{"amplitude": 0.02, "periods_per_turn": 22, "phase": 0.7}]},
+        }
+    )
+    slid = excited([0.0] * 8)
+    plant, pushed, position = Plant(joint), slid.torque_nm + 0.06, []
+    for torque in pushed:
+        position.append(plant.position_rad)
+        plant.advance(float(torque), PERIOD_S)
+    slid.settings["first"], slid.settings["strokes"] = slid.settings["count"], 7.0
+    slid = replace(slid, torque_nm=pushed, position_rad=np.array(position))
+    wave = FittedHarmonic(22, Estimate(0.02, 0.02, 0.02, "N*m"), 0.7)
+    answer = response.fit(slid, 1e-3)
+    assert response.torque_noise(slid, answer, ()).value > 0.005
+    assert response.torque_noise(slid, answer, (wave,)).value < 0.001
 
 
 def test_the_intervals_of_the_curve_are_the_scatter_of_its_nodes():

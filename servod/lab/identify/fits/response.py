@@ -1,4 +1,4 @@
-"""Frequency response of the sliding joint: inertia, viscous slope, delay, lag, first resonance, torque noise.
+"""Frequency response of the sliding joint: inertia, viscous slope, delay, lag, first resonance; and the torque noise.
 
 The multisine is the instrument: position and torque are both correlated with it, stroke by stroke, so that feedback,
 quantisation and friction's own torque do not bias the response (joint input-output method; Pintelon and Schoukens,
@@ -20,6 +20,7 @@ from scipy.optimize import least_squares
 from servod.common.errors import AnswerIsNo
 from servod.lab.identify.estimate import LEVEL, Estimate, bound_notes, estimate, jackknife, joined
 from servod.lab.identify.fits import elastic
+from servod.lab.identify.fits.friction_map import FittedHarmonic
 from servod.lab.identify.trace import RecordedMotion
 
 Array = NDArray[np.float64]
@@ -38,6 +39,8 @@ UNEXPLAINED, SPRUNG_COST = 1.5, 0.2
 INERTIA_ALLOWANCE, DELAY_ALLOWANCE_S = 0.01, 5e-5
 #: Torque noise is told up to here: above, the encoder's own shows more.
 NOISE_HZ = 40.0
+#: Variance of the second difference of independent values of variance one: 1 + 4 + 1.
+SECOND_DIFFERENCE = 6.0
 
 
 class Resonance(NamedTuple):
@@ -60,7 +63,6 @@ class ResponseFit(NamedTuple):
     delay_s: Estimate
     lag_s: Estimate
     resonance: Resonance | None
-    torque_noise_rms: Estimate
     frequency_hz: Array
     response: Complex
     deviation: Array
@@ -137,7 +139,6 @@ def fit(trace: RecordedMotion, inertia: float) -> ResponseFit:
         _delay(values[2], spread[2], freedom, notes[2], found.lag),
         found.lag,
         found.resonance,
-        _torque_noise(_Lines(frequency, deviation, period), strokes, trace, values),
         frequency,
         position_over_torque(frequency, ratio_of(strokes), period),
         deviation,
@@ -260,22 +261,36 @@ def _delay(value_s: float, spread_s: float, freedom: int, note: str, lag: Estima
     return found if lag.value > 0.0 else replace(found, low=found.low - lag.high)
 
 
-def _torque_noise(lines: _Lines, strokes: Sequence[Stroke], trace: RecordedMotion, values: Array) -> Estimate:
-    """Torque disturbance below `NOISE_HZ`, from what the motion does beyond the torque; by the scatter of strokes.
+def torque_noise(trace: RecordedMotion, answer: ResponseFit, cogging: Sequence[FittedHarmonic]) -> Estimate:
+    """Torque disturbance below `NOISE_HZ` beside `cogging`: what the motion does beyond the torque.
 
-    `lines` and `strokes` are all that were excited, coherent or not.
+    Its interval is the scatter of the strokes; all lines count. Differences of neighbours keep out that a stroke does
+    not end as it began, which adds the same to all lines (Pintelon and Schoukens, 2012, 2.2.3).
     """
-    ratio = _model(lines.frequency, values, lines.period_s)
-    low = lines.frequency < NOISE_HZ
-    bandwidth_lines = NOISE_HZ * trace.settings["count"] * lines.period_s
+    known = replace(trace, torque_nm=trace.torque_nm - _in_commands(cogging, trace, answer))
+    count, period_s = int(trace.settings["count"]), answer.period_s
+    lines = np.arange(max(1, int(trace.settings["line_0"]) - 1), math.ceil(NOISE_HZ * count * period_s) + 1)
+    frequency = lines / (count * period_s)
+    ratio = answer.model(frequency) * (np.exp(2j * np.pi * frequency * period_s) - 1.0)
+    strokes = strokes_of(known, lines)
 
     def rms(parts: Sequence[Stroke]) -> Array:
-        errors = np.array([np.abs((s.velocity - ratio * s.torque) / ratio)[low] for s in parts])
-        return np.sqrt(np.atleast_1d(np.mean(2.0 * errors**2) * bandwidth_lines))
+        errors = np.abs(np.diff([s.velocity / ratio - s.torque for s in parts], 2))
+        return np.sqrt(np.atleast_1d(np.mean(2.0 * errors**2) / SECOND_DIFFERENCE * NOISE_HZ * count * period_s))
 
     found, spread = jackknife(rms, strokes)
-    note = f"below {NOISE_HZ:g} Hz while sliding, cogging included"
+    note = f"below {NOISE_HZ:g} Hz while sliding, beside the cogging that is known"
     return estimate(found[0], spread[0], len(strokes) - 1, "N*m", share=INERTIA_ALLOWANCE, note=note)
+
+
+def _in_commands(cogging: Sequence[FittedHarmonic], trace: RecordedMotion, answer: ResponseFit) -> Array:
+    """Resisting torque of `cogging` as commands: each acts on a joint that is by delay and half a hold further."""
+    late_s = answer.delay_s.value + answer.lag_s.value + 0.5 * answer.period_s
+    position = np.interp(trace.t_s + late_s, trace.t_s, trace.position_rad)
+    torque: Array = np.zeros(len(position))
+    for wave in cogging:
+        torque += wave.amplitude.value * np.sin(wave.order * position + wave.phase)
+    return torque
 
 
 # --- Strokes ---------------------------------------------------------------------------------------------------------
@@ -291,10 +306,22 @@ class Stroke(NamedTuple):
 
 
 def spectra(trace: RecordedMotion) -> tuple[Array, list[Stroke]]:
-    """Lines in Hz and the spectra of every whole stroke."""
+    """Excited lines in Hz and the spectra of every whole stroke there. Raises AnswerIsNo with too few strokes."""
+    s = trace.settings
+    lines = np.array([int(s[f"line_{i}"]) for i in range(sum(key.startswith("line_") for key in s))])
+    strokes = strokes_of(trace, lines)
+    if len(strokes) < 4:
+        raise AnswerIsNo(
+            f"the multisine recording has {len(strokes)} whole strokes, and four are needed: see that nothing stops "
+            "the axis on its way, or give it more --travel"
+        )
+    return lines / (s["count"] * trace.period_s), strokes
+
+
+def strokes_of(trace: RecordedMotion, lines: NDArray[np.int_]) -> list[Stroke]:
+    """Spectra of every whole stroke at these lines."""
     s = trace.settings
     count, first, stride = int(s["count"]), int(s["first"]), int(s["stride"])
-    lines = np.array([int(s[f"line_{i}"]) for i in range(sum(key.startswith("line_") for key in s))])
     strokes = []
     for i in range(int(s["strokes"])):
         start = first + i * stride
@@ -303,12 +330,7 @@ def spectra(trace: RecordedMotion) -> tuple[Array, list[Stroke]]:
         way = np.diff(trace.position_rad[start : start + count + 1])
         parts = (way - way.mean(), trace.torque_nm[start : start + count], trace.excitation_nm[start : start + count])
         strokes.append(Stroke(*(np.fft.rfft(part)[lines] / count for part in parts)))
-    if len(strokes) < 4:
-        raise AnswerIsNo(
-            f"the multisine recording has {len(strokes)} whole strokes, and four are needed: see that nothing stops "
-            "the axis on its way, or give it more --travel"
-        )
-    return lines / (count * trace.period_s), strokes
+    return strokes
 
 
 def ratio_of(strokes: Sequence[Stroke]) -> Complex:
