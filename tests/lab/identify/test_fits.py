@@ -142,6 +142,18 @@ def test_the_resonance_of_two_masses_is_found(joint):
     assert found.delay_s == pytest.approx(joint.delay_s, abs=1e-4)
 
 
+@pytest.mark.parametrize("lag_s", [0.0, 3e-4])
+def test_a_lag_beside_a_resonance_is_bounded_by_what_the_response_shows(lag_s):
+    """The interval of the delay reaches down by that: of no lag by a third of a cycle at most, of a lag to below it."""
+    frequency = np.unique(np.round(np.geomspace(3.0, 160.0, 26)))
+    rng, joint = np.random.default_rng(9), Elastic(1e-3, 0.06, 1e-3, 90.0, 0.5, 0.03)
+    exact = elastic.response_of(joint, frequency, PERIOD_S) / (1.0 + 2j * np.pi * frequency * lag_s)
+    noisy = exact * (1.0 + 0.005 * (rng.normal(size=len(exact)) + 1j * rng.normal(size=len(exact))))
+    seen = frequency, noisy, np.full(len(frequency), 0.005), PERIOD_S
+    longest = elastic.longest_lag_s(elastic.solve(*seen, 6e-4), *seen, 1e-3, 1.1)
+    assert lag_s <= longest < lag_s + 3.3e-4
+
+
 def test_bristle_force_along_a_recorded_motion_is_that_of_the_plant():
     friction = {"kind": "lugre", "sigma0": 950.0, "sigma1": 1.0, "coulomb": 0.045, "static": 0.07}
     model = validate({"inertia": 1e-3, "delay_s": 0.0, "friction": friction}, AxisModel, "joint")

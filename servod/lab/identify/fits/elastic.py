@@ -24,6 +24,8 @@ LOWEST_HZ = 12.0
 _STARTS, _LOADS = (0.3, 0.5, 0.65, 0.8, 0.9, 1.0), (0.25, 0.6)
 #: Ranges: share of the inertia behind the spring, damping ratio of the resonance.
 _LOAD, _DAMPING = (0.02, 0.95), (1e-3, 0.7)
+#: Halvings of the interval in which the longest lag lies.
+LAG_STEPS = 5
 #: Longest delay that is looked for, s.
 LONGEST_DELAY_S = 0.05
 
@@ -105,6 +107,30 @@ def solve(frequency: Array, ratio: Complex, deviation: Array, period_s: float, i
 def solve_from(first: Elastic, frequency: Array, ratio: Complex, deviation: Array, period_s: float) -> Elastic:
     """The same, beginning at a solution that is nearly right."""
     return _from(frequency, ratio, deviation, period_s, _values(first))[0]
+
+
+def longest_lag_s(
+    first: Elastic, frequency: Array, ratio: Complex, deviation: Array, period_s: float, longest_s: float, worse: float
+) -> float:
+    """Longest lag [s], up to `longest_s`, with which two masses fit no worse than by the factor `worse`; 0.0 if none.
+
+    All numbers are fitted anew behind each lag (profile likelihood); by bisection, since longer ones fit worse.
+    """
+
+    def cost(lag_s: float) -> float:
+        behind = ratio * (1.0 + 2j * np.pi * frequency * lag_s)
+        values = _values(first)
+        values[2] = max(values[2] - 1e3 * lag_s, 0.0)
+        return _from(frequency, behind, deviation, period_s, values)[1]
+
+    most = worse * cost(0.0)
+    if cost(longest_s) <= most:
+        return longest_s
+    good, bad = 0.0, longest_s
+    for _ in range(LAG_STEPS):
+        middle = 0.5 * (good + bad)
+        good, bad = (middle, bad) if cost(middle) <= most else (good, middle)
+    return bad
 
 
 def notes(joint: Elastic, inertia: float, highest_hz: float) -> Notes:

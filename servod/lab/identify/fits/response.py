@@ -200,8 +200,12 @@ def _sprung(lines: _Lines, strokes: Sequence[Stroke], inertia: float, rigid: Seq
         ),
         elastic.Elastic(*values),
     )
-    unseen = min(lines.period_s, float(values[2]))
-    lag = Estimate(0.0, 0.0, unseen, "s", "not told beside a resonance; what there is, is part of the delay")
+    worse = 1.0 + float(stats.f.ppf(2.0 * LEVEL - 1.0, 1, 2 * len(lines.frequency) - 6)) / (
+        2 * len(lines.frequency) - 6
+    )
+    longest = min(lines.period_s, float(values[2]))
+    unseen = elastic.longest_lag_s(joint, lines.frequency, ratio, lines.deviation, lines.period_s, longest, worse)
+    lag = Estimate(0.0, 0.0, unseen, "s", "none that could be told from the delay; what there is, is part of the delay")
     return _Found(np.array([*values[:3], 0.0]), np.array([*spread[:3], 0.0]), notes[:3], lag, resonance)
 
 
