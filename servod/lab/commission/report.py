@@ -197,6 +197,11 @@ def _summary(page: Page, walk: Walk) -> None:
     )
     if relaxed:
         page.sentence(f"The design was agreed to be relaxed: {relaxed['wish']} {relaxed['enough']:.3g}.")
+    for refused in certificate.get("refused", ()):  # a folder of an earlier version has none
+        page.sentence(
+            f"A design in which position errors count with {refused['position_weight']:g} of their weight was refused: "
+            f"{'; '.join(refused['failed'])}."
+        )
     was = f"went from {deployment['before']['slow_mrad']:.4g} to" if deployment["before"] else "was"
     page.sentence(
         f"On the slow sine of the validation motion the error {was} {deployment['after']['slow_mrad']:.4g} mrad RMS; "

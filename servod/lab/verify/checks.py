@@ -61,6 +61,8 @@ LIMIT_CYCLE_PLANTS = 4
 LEAST_PLANTS = 1000
 #: The check that there were so many: the only one that says nothing against a set.
 PLANTS_CHECK = "plants of the Monte-Carlo"
+#: The check that the design is for the identified axis: no gain mends it.
+INTERVALS_CHECK = "identified interval over the design's, the widest"
 
 
 @dataclass(frozen=True)
@@ -193,7 +195,7 @@ def check_intervals(s: Subject) -> Iterator[CertificateCheck]:
     design = s.design.uncertainty.model_dump()
     beyond = {key: width / max(design[key], SAME) for key, width in measured_widths(s.design.model).items()}
     wide = [key for key, ratio in beyond.items() if not ratio <= 1.0 + SAME]
-    name = f"identified interval over the design's, the widest{': ' if wide else ''}{', '.join(wide)}"
+    name = f"{INTERVALS_CHECK}{': ' if wide else ''}{', '.join(wide)}"
     yield at_most(name, float(np.max([0.0, *beyond.values()])), 1.0 + SAME)
     share = {key: design[key] / least if least else 1.0 for key, least in least_widths(s.design.model).items()}
     narrow = [key for key, ratio in share.items() if not ratio >= 1.0 - SAME]

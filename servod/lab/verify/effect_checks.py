@@ -305,6 +305,8 @@ def unknown_physics(model: AxisModel, period_s: float, level: ReachLevel) -> Ite
 
 #: Shares of the contact's stiffness that a gap is judged with; without any, the motor is alone.
 GAP_SHARES = (0.03, 0.1, 0.3, 1.0)
+#: The check that there is none; no gain mends it.
+PHYSICS_CHECK = "physics that the loop check does not know"
 _WORDS = {"inertia": "inertia", "torque_gain": "gain", "dry": "dry friction", "viscous": "viscous friction"}
 
 
@@ -313,7 +315,7 @@ def check_effects(s: Subject) -> Iterator[CertificateCheck]:
     model, friction = s.design.model, s.coarse.friction
     level = level_of(model, friction, s.design.speed_max_rad_s)
     problems = list(unknown_physics(model, s.design.period_s, level))
-    name = f"physics that the loop check does not know{': ' if problems else ''}{', '.join(problems)}"
+    name = f"{PHYSICS_CHECK}{': ' if problems else ''}{', '.join(problems)}"
     yield at_most(name[:MOST_NAME], float(len(problems)), 0.0)
     effects = effects_of(model, level)
     if effects:

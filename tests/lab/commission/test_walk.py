@@ -16,7 +16,7 @@ import pytest
 
 from servod.client.open import VirtualWalkAxis
 from servod.common.errors import AnswerIsNo
-from servod.formats.gains.gain_set import load_gains
+from servod.formats.gains.gain_set import GainSet, load_gains
 from servod.formats.model.axis_model import axis_model_yaml
 from servod.lab.commission import walk
 from servod.lab.commission.comparison import load_curves, load_rows, save_curves
@@ -46,6 +46,9 @@ from servod.lab.synthesize.deployed import Wishes
 from servod.lab.synthesize.infeasible import Infeasible, Relaxation
 from servod.lab.synthesize.regions import narrowed
 from servod.lab.tracking import metrics
+from servod.lab.verify.certify import Verification
+from servod.lab.verify.checks import at_most
+from servod.lab.verify.effect_checks import PHYSICS_CHECK
 from tests.lab.synthesize.designs import table1
 
 pytestmark = pytest.mark.timeout(400)  # some 16 s on a quiet core; a busy machine is no finding
@@ -181,6 +184,37 @@ def test_a_walk_without_a_valid_set_has_a_page_that_says_why(folder: Path, tmp_p
         assert (failed and failed[1]) == (html.escape(found["checks"][3]["name"]) if step == "verify" else None)
     assert "Deployment" not in text and "deployment: " not in text
     assert write_refusal(walk_in(tmp_path / "empty"), StepFailed("identify", "the axis does not move")) is None
+
+
+def test_a_set_that_the_checks_refuse_gives_way_to_one_of_less_gain(folder: Path, tmp_path: Path, monkeypatch) -> None:
+    """The next of the ladder is designed for the same model; what was refused before, and why, is kept."""
+    shutil.copytree(folder, tmp_path / "walk")
+    told: list[str] = []
+    here = replace(walk_in(tmp_path / "walk"), say=told.append)
+    gains_before = load_gains(here.path(GAINS))
+
+    def refuse(name: str, below: float) -> None:
+        def judge(gains: GainSet, *_how: object, **_options: object) -> Verification:
+            weight = gains.design.regions[0].position_weight
+            return Verification([at_most(name if weight >= below else "all else", weight, below)], {})
+
+        monkeypatch.setattr("servod.lab.commission.steps.synthesize.verify", judge)
+
+    refuse("pushed off a sine", 0.5)
+    Verify().run(here)
+    found, gains = read_json(here.path(CERTIFICATE)), load_gains(here.path(GAINS))
+    assert found["valid"] and found["position_weight"] == 0.3
+    assert found["refused"] == [{"position_weight": 1.0, "failed": ["pushed off a sine"]}]
+    high, high_before = gains.parameters.regions.high, gains_before.parameters.regions.high
+    assert high.k_x_per_rad < 0.6 * high_before.k_x_per_rad
+    assert gains.design.model == gains_before.design.model
+    assert told[0] == "verify: not valid: pushed off a sine"
+
+    refuse(PHYSICS_CHECK, 0.01)
+    told.clear()
+    with pytest.raises(AnswerIsNo, match=f"^verify: not valid: {PHYSICS_CHECK}$"):
+        Verify().run(here)
+    assert len(told) == 1  # less gain does not mend that, and nothing more is designed
 
 
 def test_clashing_vertices_are_told_and_stand_in_the_document(tmp_path: Path) -> None:

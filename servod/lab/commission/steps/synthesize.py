@@ -1,11 +1,11 @@
 """Steps 2 and 3: the model becomes a gain set with its proofs, or the walk says what would have to be relaxed; then the
-set is judged from itself alone, and gets its certificate.
+set is judged from itself alone, and gets its certificate, or gives way to one of less position gain.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -14,16 +14,33 @@ from servod.common.sources import SYNTHESIZES, VERIFIES, source_sha256
 from servod.common.units import NS_PER_S, NS_PER_US
 from servod.formats.gains.gain_set import GainSet, load_gains
 from servod.formats.model.axis_model import AxisModel, load_axis_model
-from servod.lab.commission.state import CERTIFICATE, DESIGN, GAINS, INFEASIBLE, MODEL, RELAXED, write_json, write_text
+from servod.lab.commission.state import (
+    CERTIFICATE,
+    DESIGN,
+    GAINS,
+    INFEASIBLE,
+    MODEL,
+    RELAXED,
+    read_walk_json,
+    write_json,
+    write_text,
+)
 from servod.lab.commission.walk import Walk
 from servod.lab.synthesize.deployed import Wishes
 from servod.lab.synthesize.gain_set import DesignOptions, synthesize
 from servod.lab.synthesize.infeasible import Infeasible, Relaxation
 from servod.lab.synthesize.regions import narrowed, uncertainty_of
-from servod.lab.verify.certify import SEED, verify
+from servod.lab.verify.certify import SEED, Verification, verify
+from servod.lab.verify.checks import INTERVALS_CHECK, PLANTS_CHECK
+from servod.lab.verify.effect_checks import PHYSICS_CHECK
 
 #: The regions' overlap ends at this share of the speed at most.
 OVERLAP_SHARE = 0.5
+#: Position errors count with these shares of their weight, each where the checks refuse the set before: what follows
+#: the reference less closely leaves more margin, and comes back where the other swings on.
+LADDER = (1.0, 0.3, 0.1)
+#: Checks that find something else than too much gain.
+NOT_OF_GAIN = (PLANTS_CHECK, PHYSICS_CHECK, INTERVALS_CHECK)
 
 
 @dataclass(frozen=True)
@@ -46,24 +63,24 @@ class Synthesize:
         """Raises AnswerIsNo when the demands cannot be met and no relaxation was agreed to."""
         walk.path(INFEASIBLE).unlink(missing_ok=True)
         model = load_axis_model(walk.path(MODEL))
-        wishes = Wishes(uncertainty=uncertainty_of(model), **_loop(walk))
-        taken: Relaxation | None = None
-        found = self._attempt(walk, model, wishes)
+        wishes, taken = _wishes(walk, model), None
+        found = _attempt(walk, self.title, model, wishes)
         if isinstance(found, Infeasible):
             tell_clashes(walk, found)
             taken = agreed(walk, found)
-            found = self._attempt(walk, model, relaxed(model, wishes, taken))
+            found = _attempt(walk, self.title, model, relaxed(model, wishes, taken))
         if isinstance(found, Infeasible):
             tell_clashes(walk, found)
             raise AnswerIsNo(f"synthesize: no design even with {taken}")
         write_json(walk.path(RELAXED), asdict(taken) if taken else None)
         write_text(walk.path(DESIGN), found.to_yaml())
 
-    def _attempt(self, walk: Walk, model: AxisModel, wishes: Wishes) -> GainSet | Infeasible:
-        with walk.progress(self.title) as tell:
-            tell("both regions", 0.1)
-            options = DesignOptions(name=f"{walk.axis.config.name.lower()}_local", accuracy=walk.options.accuracy)
-            return synthesize(model, wishes, options, walk.path(MODEL))
+
+def _attempt(walk: Walk, title: str, model: AxisModel, wishes: Wishes) -> GainSet | Infeasible:
+    with walk.progress(title) as tell:
+        tell("both regions", 0.1)
+        options = DesignOptions(name=f"{walk.axis.config.name.lower()}_local", accuracy=walk.options.accuracy)
+        return synthesize(model, wishes, options, walk.path(MODEL))
 
 
 def tell_clashes(walk: Walk, found: Infeasible) -> None:
@@ -71,6 +88,11 @@ def tell_clashes(walk: Walk, found: Infeasible) -> None:
     write_json(walk.path(INFEASIBLE), asdict(found))
     for line in found.clashes:
         walk.say(f"clash: {line}")
+
+
+def _wishes(walk: Walk, model: AxisModel) -> Wishes:
+    """What is asked of the design before anything is relaxed."""
+    return Wishes(uncertainty=uncertainty_of(model), **_loop(walk))
 
 
 def _loop(walk: Walk) -> dict[str, Any]:
@@ -120,12 +142,12 @@ def agreed(walk: Walk, found: Infeasible) -> Relaxation:
 
 
 # --- Step 3 ----------------------------------------------------------------------------------------------------------
-# The set is judged from itself alone, and gets its certificate.
+# The set is judged from itself alone, and gets its certificate; where it is refused, one of less gain is judged.
 
 
 @dataclass(frozen=True)
 class Verify:
-    """Leaves the certified gain set, and the document of `servoctl verify --json`."""
+    """Leaves the certified gain set, and the document of `servoctl verify --json` with what was refused before it."""
 
     name: str = "verify"
     title: str = "verify"
@@ -139,14 +161,45 @@ class Verify:
         return {**walk.hashes(DESIGN), "plants": walk.options.plants, "seed": SEED, "tool": source_sha256(VERIFIES)}
 
     def run(self, walk: Walk) -> None:
-        """Raises AnswerIsNo when the set is not valid; then the document stands alone, without a set to deploy."""
-        gains = load_gains(walk.path(DESIGN))
+        """Raises AnswerIsNo when no set is valid; then the first one's document stands alone, with no set to deploy."""
+        refused: list[dict[str, Any]] = []
+        first: dict[str, Any] = {}
+        for weight, gains in self._ladder(walk):
+            result = self._judged(walk, gains)
+            if result.valid:
+                write_json(walk.path(CERTIFICATE), result.document() | rung(weight, refused))
+                write_text(walk.path(GAINS), result.certified(gains).to_yaml())
+                return
+            failed = [check.name for check in result.checks if not check.passed]
+            refused.append({"position_weight": weight, "failed": failed})
+            first = first or result.document()
+            write_json(walk.path(CERTIFICATE), first | rung(LADDER[0], refused))
+            walk.say(f"verify: not valid: {'; '.join(failed)}")
+            if any(name.startswith(NOT_OF_GAIN) for name in failed):
+                break
+        neither = ", nor is one with less position gain" if len(refused) > 1 else ""
+        raise AnswerIsNo(f"verify: not valid: {'; '.join(refused[0]['failed'])}{neither}")
+
+    def _ladder(self, walk: Walk) -> Iterator[tuple[float, GainSet]]:
+        """(share of the position error's weight, set): the step before left the first."""
+        yield LADDER[0], load_gains(walk.path(DESIGN))
+        model, taken = load_axis_model(walk.path(MODEL)), read_walk_json(walk.path(RELAXED))
+        wishes = _wishes(walk, model)
+        if taken:
+            wishes = relaxed(model, wishes, Relaxation(**taken))
+        for weight in LADDER[1:]:
+            walk.say(f"verify: a design in which position errors count with {weight:g} of their weight")
+            found = _attempt(walk, self.title, model, replace(wishes, position_weight=weight * wishes.position_weight))
+            if isinstance(found, GainSet):
+                yield weight, found
+
+    def _judged(self, walk: Walk, gains: GainSet) -> Verification:
         with walk.progress(self.title) as tell:
             tell(f"{walk.options.plants} plants", 0.1)
             options, where = walk.options, str(walk.path(DESIGN))
-            result = verify(gains, options.plants, SEED, options.processes, where, least_plants=options.least_plants)
-        write_json(walk.path(CERTIFICATE), result.document())
-        if not result.valid:
-            failed = [check.name for check in result.checks if not check.passed]
-            raise AnswerIsNo(f"verify: not valid: {'; '.join(failed)}")
-        write_text(walk.path(GAINS), result.certified(gains).to_yaml())
+            return verify(gains, options.plants, SEED, options.processes, where, least_plants=options.least_plants)
+
+
+def rung(weight: float, refused: list[dict[str, Any]]) -> dict[str, Any]:
+    """Which set of the ladder a document is of, and what the checks found in those that they refused."""
+    return {"position_weight": weight, "refused": refused}
