@@ -100,7 +100,7 @@ def scales(friction: SteadyFriction, design: Design) -> tuple[list[float], float
     torque = friction.largest(design.speed_max_rad_s)
     position = torque / (friction.inertia * POSITION_BANDWIDTH_RAD_S**2)
     speed = position * POSITION_BANDWIDTH_RAD_S
-    commands = known_commands(timing_of(design))
+    commands = known_commands(timing_of(design).as_delay)
     return [position, speed, *[torque] * commands, speed, torque / friction.stiffness], torque
 
 
@@ -127,7 +127,7 @@ def programme(design: Design, proof: RegionProof, wishes: Wishes) -> Programme:
         proof.torque_weight,
         [discs.get(j.mode, disc if j.performs else falling) for j in found],
         wishes.solver,
-        2 + fed_commands(timing_of(design)),
+        2 + fed_commands(timing_of(design).as_delay),
     )
 
 

@@ -77,11 +77,12 @@ LONGEST_CYCLES = 5.0
 
 def delay_refusal(model: AxisModel, period_s: float) -> str | None:
     """Why no design is tried for the delay of `model` at this cycle; None where it is short enough."""
-    cycles = model.total_delay_s / period_s
+    late_s = model.total_delay_s + (model.actuator_lag.time_constant_s if model.actuator_lag else 0.0)
+    cycles = late_s / period_s
     if cycles <= LONGEST_CYCLES + WHOLE:
         return None
-    remedy = f"a cycle of {1e3 * model.total_delay_s / LONGEST_CYCLES:.3g} ms and more has it within that"
+    remedy = f"a cycle of {1e3 * late_s / LONGEST_CYCLES:.3g} ms and more has it within that"
     return (
-        f"too much delay: {1e3 * model.total_delay_s:.3g} ms are {cycles:.3g} cycles, and the law, which feeds "
+        f"too much delay: {1e3 * late_s:.3g} ms are {cycles:.3g} cycles, and the law, which feeds "
         f"{COMMANDS} commands back, is designed for up to {LONGEST_CYCLES:g}; {remedy}"
     )

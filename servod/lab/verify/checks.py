@@ -78,13 +78,13 @@ class Subject:
 
     @property
     def timing(self) -> SampledTiming:
-        """Period, delay and filter that the design states."""
+        """Period, delay, filter and lag that the design states."""
         return timing_of(self.design)
 
     @property
     def own_cycles(self) -> float:
-        """The axis's own delay in cycles."""
-        return self.timing.delay_s / self.timing.period_s
+        """The axis's own delay in cycles, with its lag."""
+        return self.timing.as_delay.delay_s / self.timing.period_s
 
     def cycles(self, count: float) -> SampledTiming:
         """The same loop with a delay of `count` cycles."""
@@ -303,7 +303,7 @@ def observations(s: Subject) -> dict[str, float]:
         "largest error on the sine over the plants [share]": max(trial.error_share for trial in s.trials),
         "largest rest of the large step over the plants [share]": max(trial.unsettled_share for trial in s.trials),
         "largest swing at rest over the plants [share of the step]": max(trial.ripple_share for trial in s.trials),
-        "largest tolerated delay [s]": s.timing.delay_s + longest,
+        "largest tolerated delay [s]": s.timing.as_delay.delay_s + longest,
         "largest tolerated friction scale": largest_tolerated(
             lambda f: sweep.stable(LoopDeviation(dry=f, viscous=f)), 1.0, FACTOR_LIMIT
         ),

@@ -19,7 +19,7 @@ import numpy as np
 from servod.formats.gains.design import SHARES, Uncertainty
 from servod.kernels.laws.state import N_STATES
 from servod.lab.verify.law_slopes import LawSlopes
-from servod.lab.verify.sampled import Array, SampledTiming, with_delay_and_filter
+from servod.lab.verify.sampled import Array, SampledTiming, with_delay_and_filter, with_lag
 from servod.lab.verify.steady_friction import SteadyFriction
 
 STUCK_DECAY_PER_S = 1000.0  # of the bristle state where the stiffness acts on the position and the state does nothing
@@ -213,6 +213,7 @@ def sampled_points(points: Sequence[JointPoint], timing: SampledTiming) -> tuple
     """
     parts = [point.matrices() for point in points]
     a, b, e = (np.array(part) for part in zip(*parts, strict=True))
+    a, b, e = with_lag(a, b, e, timing.lag_s)
     plant_a, plant_b, _ = with_delay_and_filter(a, b, e, timing)
     return plant_a, plant_b, a.shape[-1]
 

@@ -90,7 +90,7 @@ def scaled_vertices(design: Design, region: RegionProof) -> tuple[list[VertexJoi
 
 def scaled(found: list[VertexJoint], design: Design, region: RegionProof) -> tuple[Array, Array, Array]:
     """(A, B, E) of joints in the region's scaled states."""
-    a, b, e = sampled_vertices(found, timing_of(design))
+    a, b, e = sampled_vertices(found, timing_of(design).as_delay)
     scale = np.array(region.scale)
     torque = region.torque_scale_nm
     return a * (scale / scale[:, None]), b * torque / scale, e * torque / scale

@@ -8,7 +8,7 @@ first-order low-pass). Everything is exact: matrix exponentials, no rounding of 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,18 +18,25 @@ from servod.formats.gains.design import Design
 Array = NDArray[np.float64]
 PADE, PADE_NORM = 8, 1.0
 WHOLE = 1e-6  # a delay nearer than this to whole periods is whole
-#: Lag in periods that counts as delay: a loop that crosses at a third of 1/period loses 5 % of its gain to it, half of
-#: what the disk margin keeps. A longer one is physics that the loop check does not know.
-LONGEST_LAG = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class SampledTiming:
-    """Sample period, command-to-torque delay and the cut-off of the velocity filter."""
+    """Sample period, command-to-torque delay, cut-off of the velocity filter, and the torque's lag behind the delay."""
 
     period_s: float
     delay_s: float
     cutoff_hz: float
+    lag_s: float = 0.0
+
+    @property
+    def as_delay(self) -> SampledTiming:
+        """The same with the lag as delay, for who has no state for it.
+
+        A lag tau turns the phase by atan(w*tau), a delay of tau by w*tau, which is more at every frequency: a loop that
+        is designed so is designed for later torque than it has. Left out is the gain that the lag takes.
+        """
+        return replace(self, delay_s=self.delay_s + self.lag_s, lag_s=0.0)
 
     @property
     def kept(self) -> float:
@@ -54,14 +61,10 @@ class SampledTiming:
 
 
 def timing_of(design: Design) -> SampledTiming:
-    """Period, delay and filter that the design states, with the actuator's lag as delay.
-
-    A lag tau turns the phase by atan(w*tau), a delay of tau by w*tau, which is more at every frequency, so the loop is
-    judged later than it is. What this leaves out is the gain that the lag takes: up to LONGEST_LAG it is small.
-    """
+    """Period, delay, filter and lag that the design states."""
     model = design.model
     lag_s = model.actuator_lag.time_constant_s if model.actuator_lag else 0.0
-    return SampledTiming(design.period_s, model.total_delay_s + lag_s, design.velocity_cutoff_hz)
+    return SampledTiming(design.period_s, model.total_delay_s, design.velocity_cutoff_hz, lag_s)
 
 
 def exponential(stack: Array) -> Array:
@@ -87,6 +90,18 @@ def exponential(stack: Array) -> Array:
     for _ in range(squarings):
         result = np.matmul(result, result)
     return np.asarray(result, dtype=np.float64)
+
+
+def with_lag(a: Array, b: Array, e: Array, lag_s: float) -> tuple[Array, Array, Array]:
+    """(A, B, E) of stacks of joints whose torque follows the command by dT/dt = (u - T)/lag: one state more."""
+    if lag_s <= 0.0:
+        return a, b, e
+    n = a.shape[-1]
+    full = np.zeros((*a.shape[:-2], n + 1, n + 1))
+    full[..., :n, :n], full[..., :n, n], full[..., n, n] = a, b, -1.0 / lag_s
+    drive = np.zeros((*b.shape[:-1], n + 1))
+    drive[..., n] = 1.0 / lag_s
+    return full, drive, np.concatenate([e, np.zeros((*e.shape[:-1], 1))], axis=-1)
 
 
 def sample_joint(a: Array, b: Array, e: Array, timing: SampledTiming) -> tuple[Array, Array, Array, Array]:

@@ -98,7 +98,7 @@ def test_effects_that_the_loop_has_anyway_add_no_check() -> None:
     ("effects", "named"),
     [
         ({"actuator_lag": {"time_constant_s": 0.0005}}, None),
-        ({"actuator_lag": {"time_constant_s": 0.003}}, "actuator_lag.time_constant_s is longer than a cycle"),
+        ({"actuator_lag": {"time_constant_s": 0.003}}, None),
         ({"actuator_lag": {"slew_per_s": 5.0}}, "actuator_lag.slew_per_s turns the torque around in more than 5"),
         ({"torque_saturation": {"limit": 0.1}, "offset_drift": {"per_s": -1.0, "time_s": 0.02}}, None),
         (

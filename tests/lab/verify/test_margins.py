@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -13,7 +15,7 @@ from servod.lab.verify.checks import CORNER_DISK, Subject, check_loop, observati
 from servod.lab.verify.closed_loop import LinearBristle, LoopDeviation, corners, inner_points, joint_point, late_corners
 from servod.lab.verify.margins import NOMINAL, Sweep, sensitivity
 from servod.lab.verify.plants import drawn
-from servod.lab.verify.sampled import timing_of
+from servod.lab.verify.sampled import SampledTiming
 from tests.lab.synthesize.designs import table1, table1_set
 
 CORNER = "symmetric disk margin, worst corner of the intervals"
@@ -31,15 +33,15 @@ def lagging(time_constant_s: float) -> AxisModel:
     return table1().model_copy(update={"actuator_lag": ActuatorLag(time_constant_s=time_constant_s)})
 
 
-def test_a_lag_is_in_the_loop_as_delay() -> None:
+def test_a_lag_is_in_the_loop() -> None:
     rigid, slow = subject(), subject(lagging(0.0005))
-    assert timing_of(slow.design).delay_s == pytest.approx(rigid.timing.delay_s + 0.0005)
+    assert slow.timing.as_delay.delay_s == pytest.approx(rigid.timing.delay_s + 0.0005)
     assert slow.coarse.disk_margin()[0] < 0.5 * rigid.coarse.disk_margin()[0]
     assert slow.coarse.worst(NOMINAL).coupled_radius > rigid.coarse.worst(NOMINAL).coupled_radius
 
 
-def test_delay_in_place_of_a_lag_is_the_harder_of_both() -> None:
-    """A joint with the lag as a fourth state has no smaller disk margin than with the delay, under the same law."""
+def test_a_lag_is_a_state_of_the_joint_and_a_delay_in_its_place_is_the_harder_of_both() -> None:
+    """The margin is that of a joint put together here with the lag as a fourth state, under the same law."""
     judged, tau = subject(), 0.0004
     sweep = judged.coarse
     late = LoopDeviation(delay_s=tau)
@@ -66,9 +68,13 @@ def test_delay_in_place_of_a_lag_is_the_harder_of_both() -> None:
         closed[6 + j, columns] = slopes.matrix[1 + i, seen]
     lag = 1.0 / np.abs(sensitivity(closed[None], column[None], row) - 0.5).max()
     one = Sweep(sweep.law, sweep.gains, sweep.friction, sweep.timing, (abs(velocity),))
-    systems = [x for v, _, x in one.systems((late,), transient=False) if v == velocity]
-    delay = min(1.0 / np.abs(sensitivity(*system) - 0.5).max() for system in systems)
-    assert 0.0 < delay < lag
+
+    def margin(case: LoopDeviation, timing: SampledTiming) -> float:
+        systems = [x for v, _, x in one.systems((case,), timing, transient=False) if v == velocity]
+        return min(1.0 / float(np.abs(sensitivity(*system) - 0.5).max()) for system in systems)
+
+    assert margin(LoopDeviation(), replace(judged.timing, lag_s=tau)) == pytest.approx(lag, rel=1e-6)
+    assert 0.0 < margin(late, judged.timing) < lag
 
 
 def test_the_response_from_poles_is_that_of_the_states() -> None:
