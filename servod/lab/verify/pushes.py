@@ -41,6 +41,9 @@ PLANTS = 3  # drawn ones, beside the model
 STRETCH_SHARE = 0.5
 #: Of a sine's amplitude: an error that swings by more from rest on is no tracking that a push could be compared with.
 OWN_SHARE = 0.5
+#: And by more than so many times what may be left of a push: a sine of a few counts or less than the bristle's stretch
+#: cannot be followed. A joint that merely stands under it has an error of the sine itself.
+OWN_LIMITS = 2.0
 
 
 def frequencies_hz(period_s: float) -> list[float]:
@@ -90,7 +93,7 @@ class PushedOff:
         motion = sine(amplitude, frequency_hz, pushed_s[1] + self._s(BACK_S) + watched_s, period)
         last = round(watched_s / period)
         own = self._swing_rad(motion, last)
-        if own > max(swing_limit_rad(self.design), OWN_SHARE * amplitude):
+        if own > max(OWN_LIMITS * swing_limit_rad(self.design), OWN_SHARE * amplitude):
             return own
         push = np.zeros(len(motion))
         push[round(pushed_s[0] / period) : round(pushed_s[1] / period)] = self.scale.torque_nm

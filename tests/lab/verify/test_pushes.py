@@ -11,7 +11,7 @@ import pytest
 from servod.client.axis import ReferenceMotion
 from servod.client.open import stepped_axis
 from servod.common.shipped import shipped
-from servod.formats.gains.gain_set import GainSet, load_gains
+from servod.formats.gains.gain_set import GainSet, load_gains, pd_set
 from servod.formats.gains.parameters import LocalParameters, VelocitySource
 from servod.formats.model.axis_model import load_axis_model
 from servod.formats.recording.record import RECORD, CycleRecord
@@ -80,6 +80,17 @@ def test_a_law_that_swings_by_itself_is_no_small_figure() -> None:
     wild = law.model_copy(update={"regions": law.regions.model_copy(update=regions)})
     found = thrown(gains.model_copy(update={"parameters": wild}))
     assert found.excess_rad(3.0, 0.02) > 10.0 * swing_limit_rad(design)
+
+
+def test_a_joint_that_stands_under_a_sine_of_a_few_counts_does_not_swing() -> None:
+    """No law can follow what its encoder hardly shows; without feedback the error is the sine itself, pushed or not."""
+    design = certified().design
+    assert design is not None
+    coarse = design.model_copy(update={"counts_per_turn": 2.0**17})
+    standing = PushedOff(pd_set("none", 0.0, 0.0), coarse.model, coarse, scale_of(coarse))
+    amplitude_rad = 1.9 * swing_limit_rad(coarse)
+    assert amplitude_rad / math.sqrt(2.0) > swing_limit_rad(coarse)
+    assert standing.excess_rad(2.5, 2.0 * math.pi * 2.5 * amplitude_rad) < 0.1 * swing_limit_rad(coarse)
 
 
 @pytest.mark.parametrize("period_s", [0.0005, 0.001, 0.002, 0.003, 0.004, 0.007, 0.02])
