@@ -207,7 +207,8 @@ def _damping(
     if not ringing or answer.lag_s.value > 0.0:
         return None
     viscous = max(0.0, answer.viscous_slope.value)
-    return bristle.fit(ringing[-1], answer.inertia.value, answer.delay_s.value, viscous, rocked.stiffness.value)
+    moved = bristle.Moved(answer.inertia.value, answer.resonance.joint if answer.resonance else None)
+    return bristle.fit(ringing[-1], moved, answer.delay_s.value, viscous, rocked.stiffness.value)
 
 
 def _bristle(

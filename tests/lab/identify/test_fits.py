@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from servod.common.errors import AnswerIsNo
 from servod.common.yaml import validate
@@ -15,7 +16,7 @@ from servod.lab.identify import analysis
 from servod.lab.identify.estimate import AT_END, Estimate, bound_notes, estimate, jackknife, sandwich
 from servod.lab.identify.fits import bristle, cogging, curve, elastic, presliding, response
 from servod.lab.identify.fits.break_away import BreakAwayFit
-from servod.lab.identify.fits.bristle import Bristle, dry_columns, follow
+from servod.lab.identify.fits.bristle import Bristle, Moved, dry_columns, follow
 from servod.lab.identify.fits.elastic import Elastic
 from servod.lab.identify.fits.friction_map import FittedHarmonic, Side
 from servod.lab.identify.fits.presliding import bend_factor, fundamental
@@ -325,6 +326,36 @@ def test_what_stands_at_the_end_of_its_range_says_so():
     assert elastic.notes(joint, 1e-3, 160.0) == ("", "", "", "", "", AT_END)
 
 
+def rung(lines, torque, way) -> RecordedMotion:
+    """Five periods of a second each, on the bristles."""
+    settings = {"count": len(torque) / 5.0, "periods": 5.0}
+    settings |= {f"line_{i}": float(line) for i, line in enumerate(lines)}
+    t = np.arange(len(torque)) * PERIOD_S
+    return RecordedMotion(ExperimentKind.BRISTLE, t, torque, way, way, torque, torque, way, settings)
+
+
+def test_bristle_damping_is_told_from_the_spring_that_a_part_of_the_inertia_is_behind():
+    """Two masses on a bristle, stepped exactly; taken for one rigid mass its damping comes out elsewhere."""
+    spring = Elastic(1e-3, 0.06, 0.0, 150.0, 0.5, 0.02)
+    motor, load, k, d = 5e-4, spring.load_inertia, spring.stiffness, spring.damping
+    a, stiffness, damping = np.zeros((5, 5)), 950.0, 1.0
+    a[0, 1] = a[2, 3] = 1.0
+    a[1] = np.array([-k - stiffness, -d - damping, k, d, 1.0]) / motor
+    a[3] = np.array([k, d, -k, -d, 0.0]) / load
+    step, lines, rng = expm(a * PERIOD_S), np.arange(25, 230, 17), np.random.default_rng(4)
+    torque, state, way = np.tile(0.01 * multisine(lines, np.ones(len(lines)), 1000, rng), 5), np.zeros(5), []
+    for u in torque:
+        way.append(state[0])
+        state[4] = u
+        state = step @ state
+    ringing = rung(lines, torque, np.array(way) + 1e-9 * rng.normal(size=len(way)))
+    told = bristle.fit(ringing, Moved(1e-3, spring), 0.0, 0.0, stiffness)
+    rigid = bristle.fit(ringing, Moved(1e-3), 0.0, 0.0, stiffness)
+    assert told is not None
+    assert told.value == pytest.approx(damping, rel=0.05)
+    assert rigid is None or abs(rigid.value - damping) > 0.3
+
+
 @pytest.mark.parametrize(("damping", "noted"), [(0.6, False), (20.0, True)])
 def test_bristle_damping_beyond_its_range_says_so(damping, noted):
     inertia, stiffness, count = 1e-3, 950.0, 1000
@@ -332,18 +363,10 @@ def test_bristle_damping_beyond_its_range_says_so(damping, noted):
     critical = 2.0 * np.sqrt(stiffness * inertia)
     wave = 0.01 * multisine(lines, np.ones(len(lines)), count, rng)
     ratio = np.zeros(count // 2 + 1, dtype=complex)
-    ratio[lines] = bristle.response(lines / 1.0, inertia, stiffness, 0.1, damping * critical, 1e-3, PERIOD_S)
+    moved = Moved(inertia)
+    ratio[lines] = bristle.response(lines / 1.0, moved, stiffness, 0.1, damping * critical, 1e-3, PERIOD_S)
     way = np.tile(np.fft.irfft(ratio * np.fft.rfft(wave), count), 5) + 1e-9 * rng.normal(size=5 * count)
-    torque, settings = np.tile(wave, 5), {"count": float(count), "periods": 5.0}
-    settings |= {f"line_{i}": float(line) for i, line in enumerate(lines)}
-    t = np.arange(5 * count) * PERIOD_S
-    found = bristle.fit(
-        RecordedMotion(ExperimentKind.BRISTLE, t, torque, way, way, torque, torque, way, settings),
-        inertia,
-        1e-3,
-        0.0,
-        950.0,
-    )
+    found = bristle.fit(rung(lines, np.tile(wave, 5), way), moved, 1e-3, 0.0, 950.0)
     assert found is not None
     assert (AT_END in found.note) == noted
 

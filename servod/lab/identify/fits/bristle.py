@@ -1,7 +1,8 @@
 """Bristle damping sigma1 from the joint's ringing on its bristles below break-away.
 
 X/U = 1/(k*(1 + j*eta) + j*w*d - m*w^2): eta is the loss of the Dahl loop, the same at every frequency; d grows with it
-and is sigma1 plus viscous friction. Inertia and delay are known from the sliding joint.
+and is sigma1 plus viscous friction. Inertia, a spring behind which a part of it is, and delay are known from the
+sliding joint.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from scipy.linalg import solve_banded
 from scipy.optimize import least_squares
 
 from servod.lab.identify.estimate import Estimate, bound_notes, estimate, jackknife, joined
+from servod.lab.identify.fits.elastic import Elastic
 from servod.lab.identify.trace import RecordedMotion
 
 Array = NDArray[np.float64]
@@ -32,6 +34,20 @@ ALLOWANCE = 0.2
 _RANGES = ([0.2, 0.0, 0.0], [5.0, 0.8, 5.0])
 
 
+class Moved(NamedTuple):
+    """What is moved, kg*m^2, and the joint with the spring that a part of it is behind; None where all is rigid."""
+
+    inertia: float
+    spring: Elastic | None = None
+
+    def inertia_at(self, w: Array) -> Array | Complex | float:
+        """Inertia that the motor's side feels at these angular frequencies; complex where the spring damps."""
+        if self.spring is None:
+            return self.inertia
+        load, force = self.spring.load_inertia, self.spring.stiffness + 1j * w * self.spring.damping
+        return self.inertia - load + load * force / (force - load * w * w)
+
+
 class _Period(NamedTuple):
     """Spectra of one period at the excited lines."""
 
@@ -39,7 +55,7 @@ class _Period(NamedTuple):
     torque: Complex
 
 
-def fit(trace: RecordedMotion, inertia: float, delay_s: float, viscous: float, stiffness: float) -> Estimate | None:
+def fit(trace: RecordedMotion, moved: Moved, delay_s: float, viscous: float, stiffness: float) -> Estimate | None:
     """sigma1 in N*m*s/rad; None when the recording does not tell it (coarse encoder, too little motion).
 
     On a bent Dahl curve the bristle moves less than the joint, by the chord's stiffness over that at zero, `stiffness`.
@@ -49,25 +65,25 @@ def fit(trace: RecordedMotion, inertia: float, delay_s: float, viscous: float, s
         return None
 
     def damping(parts: Sequence[_Period]) -> Array:
-        chord, _, slope = _solve(frequency, parts, inertia, delay_s, trace.period_s)
+        chord, _, slope = _solve(frequency, parts, moved, delay_s, trace.period_s)
         return np.array([(slope - viscous) * stiffness / chord])
 
     values, spread = jackknife(damping, periods)
-    note = _note(_searched(frequency, periods, inertia, delay_s, trace.period_s)[0])
+    note = _note(_searched(frequency, periods, moved, delay_s, trace.period_s)[0])
     found = estimate(float(values[0]), float(spread[0]), len(periods) - 1, "N*m*s/rad", share=ALLOWANCE, note=note)
     told = found.value > 0.0 and found.half_width < WIDEST_SHARE * found.value
     return found if told else None
 
 
 def response(
-    frequency: Array, inertia: float, stiffness: float, loss: float, damping: float, delay_s: float, period_s: float
+    frequency: Array, moved: Moved, stiffness: float, loss: float, damping: float, delay_s: float, period_s: float
 ) -> Complex:
     """Sampled position over the held command, images of the spectrum included."""
     total = np.zeros(len(frequency), dtype=np.complex128)
     for image in range(-IMAGES, IMAGES + 1):
         w = 2.0 * np.pi * (frequency + image / period_s)
         spring = stiffness * (1.0 + 1j * loss * np.sign(w))
-        joint = 1.0 / (spring + 1j * w * damping - inertia * w * w)
+        joint = 1.0 / (spring + 1j * w * damping - moved.inertia_at(w) * w * w)
         total += joint * (1.0 - np.exp(-1j * w * period_s)) / (1j * w) / period_s * np.exp(-1j * w * delay_s)
     return total
 
@@ -88,9 +104,9 @@ def _spectra(trace: RecordedMotion) -> tuple[Array, list[_Period]]:
     return lines / (count * trace.period_s), periods
 
 
-def _solve(frequency: Array, periods: Sequence[_Period], inertia: float, delay_s: float, period_s: float) -> Array:
+def _solve(frequency: Array, periods: Sequence[_Period], moved: Moved, delay_s: float, period_s: float) -> Array:
     """(stiffness, loss, damping) that fit the periods' mean response."""
-    (chord, loss, damping), first, critical = _searched(frequency, periods, inertia, delay_s, period_s)
+    (chord, loss, damping), first, critical = _searched(frequency, periods, moved, delay_s, period_s)
     return np.array([first * chord, loss, critical * damping])
 
 
@@ -103,15 +119,15 @@ def _note(x: Array) -> str:
 
 
 def _searched(
-    frequency: Array, periods: Sequence[_Period], inertia: float, delay_s: float, period_s: float
+    frequency: Array, periods: Sequence[_Period], moved: Moved, delay_s: float, period_s: float
 ) -> tuple[Array, float, float]:
     """(stiffness, loss, damping) as the search has them, and the units of stiffness and damping."""
     measured = np.asarray(sum(p.way for p in periods) / sum(p.torque for p in periods))
     first = float(1.0 / np.abs(measured[0]))
-    critical = 2.0 * np.sqrt(first * inertia)
+    critical = 2.0 * np.sqrt(first * moved.inertia)
 
     def misfit(x: Array) -> Array:
-        model = response(frequency, inertia, first * x[0], x[1], critical * x[2], delay_s, period_s)
+        model = response(frequency, moved, first * x[0], x[1], critical * x[2], delay_s, period_s)
         error = (model - measured) * first
         return np.concatenate([error.real, error.imag])
 
