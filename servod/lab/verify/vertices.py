@@ -197,8 +197,12 @@ def measured_widths(model: AxisModel) -> dict[str, float]:
     if "sigma1" in known.not_identifiable:
         found["damping"] = ASSUMED_DAMPING
     if "delay_s" in known.values:
-        delay = known.values["delay_s"]
-        found["delay_s"] = max(delay.high - delay.value, delay.value - max(delay.low, 0.0))  # no torque comes before
+        delay, lag = known.values["delay_s"], known.values.get("lag_s")
+        # where no lag was told, the delay reaches down by the longest that may be a part of it; and as a part of it, a
+        # lag turns the phase no further than the delay that it is taken for
+        hidden = lag.high if lag is not None and lag.value == 0.0 else 0.0
+        early = delay.value - max(delay.low, 0.0) - hidden  # no torque comes before it is asked for
+        found["delay_s"] = max(delay.high - delay.value, early)
     return found | _of_map(known)
 
 

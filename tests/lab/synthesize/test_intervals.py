@@ -78,6 +78,22 @@ def test_the_wider_side_counts_and_nothing_is_cut_at_half() -> None:
     assert found.damping == pytest.approx(0.7) and found.delay_s == pytest.approx(7e-5)
 
 
+def test_a_lag_that_may_hide_in_the_delay_does_not_widen_it() -> None:
+    """As a part of the delay it turns the phase no further; where a lag was told, the delay stands for itself."""
+    model = identified(0.001, 1e-5)
+    assert model.identified is not None
+    delay = IdentifiedValue(value=0.001, low=0.0008, high=0.00105, unit="s")
+
+    def width(lag: IdentifiedValue) -> float:
+        values = model.identified.values | {"delay_s": delay, "lag_s": lag}
+        known = model.identified.model_copy(update={"values": values})
+        return uncertainty_of(model.model_copy(update={"identified": known})).delay_s
+
+    assert width(IdentifiedValue(value=0.0, low=0.0, high=0.00016, unit="s")) == pytest.approx(5e-5)
+    assert width(IdentifiedValue(value=0.0, low=0.0, high=0.00010, unit="s")) == pytest.approx(1e-4)
+    assert width(IdentifiedValue(value=0.001, low=0.0009, high=0.0011, unit="s")) == pytest.approx(2e-4)
+
+
 def test_a_design_narrower_than_what_was_measured_is_not_certified() -> None:
     gains, model = table1_set(), identified(0.3, 0.004)
     assert gains.design is not None
