@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+
 import numpy as np
 import pytest
 
@@ -61,6 +63,23 @@ def test_kicks_keep_to_the_speed_and_tell_inertia(bits, speed_rad_s, tmp_path):
     kicks = kick.run(bench, break_away(joint))
     assert truth.peak_rad_s <= speed_rad_s
     assert kick_fit.fit(kicks).inertia == pytest.approx(joint.model.inertia, rel=0.4)
+
+
+@pytest.mark.parametrize(
+    ("amplitude", "waves", "phase", "speed_rad_s"), [(0.05, 40, 0.5, 0.4), (0.06, 30, 1.4, 0.45), (0.05, 30, 0.0, 0.25)]
+)
+def test_a_joint_that_leaves_a_hill_is_no_faster_than_allowed(amplitude, waves, phase, speed_rad_s, tmp_path):
+    """What held it in its valley, as much as its friction, does not hold it beyond."""
+    hill = {"harmonics": [{"amplitude": amplitude, "periods_per_turn": waves, "phase": phase}]}
+    plain = load_axis_model(shipped("gains/axes/table1_joint.yaml"))
+    joint = AxisModel.model_validate(plain.model_dump(exclude_unset=True) | {"cogging": hill})
+    session = virtual_session(joint, tmp_path, 2**17, 1)
+    axis = SteppedAxis(session, tmp_path)
+    bounds = bounds_from(axis.config.limits, enable_powerless(axis), None, speed_rad_s)
+    bench, truth = Bench(axis, bounds, Unkept(), np.random.default_rng(1)), Truth(session)
+    with contextlib.suppress(AnswerIsNo):  # that it cannot be told at this speed is an answer
+        kick.run(bench, (0.071, 0.071))
+    assert 0.0 < truth.peak_rad_s <= speed_rad_s
 
 
 UNEVEN = {"positive_dry": 1.1, "negative_dry": 0.9}

@@ -2,9 +2,9 @@
 
 Reason: the feedback of all later experiments is set from it. Amplitude: a multiple of break-away; the pulse's duration
 is doubled from one period until the joint reaches a useful speed, and its torque grows where a longer pulse makes the
-joint no faster: viscous friction carries it, or a hill of cogging holds it. Never so far that the next kick would pass
-the allowed speed, which is known from the kick before. Bounds: speed, torque and a window; friction alone stops the
-joint.
+joint no faster: viscous friction carries it, or a hill of cogging holds it. It is doubled never so far that the next
+kick would pass the allowed speed, as the kick before tells; a stronger one begins again with a quarter of the length,
+for what held the joint may not hold it then. Bounds: speed, torque and a window; friction alone stops the joint.
 """
 
 from __future__ import annotations
@@ -19,10 +19,13 @@ from servod.lab.identify.experiments.common import SPEED_SPAN_S, Bench, peak_spe
 from servod.lab.identify.shapes import samples
 from servod.lab.identify.trace import ExperimentKind, RecordedMotion
 
-#: Torque against break-away: of the first kick, and the factor by which it grows.
-TORQUE_RATIO, TORQUE_STEP = 1.6, 1.25
-#: A pulse twice as long that makes the joint no faster than by this factor is long enough.
-LEVELS_OFF = 1.3
+#: Torque against break-away: of the first kick, the step by which it grows, the least step near the bound.
+TORQUE_RATIO, TORQUE_STEP, LEAST_STEP = 1.6, 1.25, 1.05
+#: A pulse twice as long that makes the joint no faster than by this factor is long enough, where the encoder shows the
+#: slower of both by so many counts.
+LEVELS_OFF, LEAST_COUNTS = 1.3, 4.0
+#: A stronger pulse is at first this many times shorter.
+SHORTER = 4
 #: Shorter pulses are over before the fit can tell inertia from bristles; longer ones are no kicks.
 LEAST_S, LONGEST_S = 0.004, 1.0
 #: Fast enough: this share of the allowed speed, and so many counts per period.
@@ -82,13 +85,12 @@ def _next(bench: Bench, kick: RecordedMotion, pulse: _Pulse, break_away_nm: floa
     # the shortest kicks do not fill the usual span
     reached, allowed = peak_speed(kick, 0.5 * SPEED_SPAN_S), bench.bounds.most_rad_s
     factor = allowed / (GROWTH * reached) if reached > 0.0 else math.inf
-    long = 2 * pulse.periods * bench.period_s > LONGEST_S
-    if long or 0.0 < reached < LEVELS_OFF * pulse.before_rad_s:
-        ratio = TORQUE_STEP * pulse.ratio
-        # friction keeps at most the break-away of both: what is left grows by more than the torque
-        faster = (ratio - 1.0) / (pulse.ratio - 1.0)
-        if faster <= factor and ratio * break_away_nm <= bench.bounds.torque_nm:
-            return _Pulse(ratio, pulse.periods, reached)
+    at_longest = 2 * pulse.periods * bench.period_s > LONGEST_S
+    shown_rad_s = LEAST_COUNTS * bench.resolution_rad / (0.5 * SPEED_SPAN_S)
+    if at_longest or (shown_rad_s < pulse.before_rad_s and reached < LEVELS_OFF * pulse.before_rad_s):
+        ratio = min(TORQUE_STEP * pulse.ratio, bench.bounds.torque_nm / break_away_nm)
+        if ratio > LEAST_STEP * pulse.ratio:
+            return _Pulse(ratio, 1 if at_longest else max(1, pulse.periods // SHORTER))
     longest = math.floor(pulse.periods * min(factor, 2.0))
     if longest <= pulse.periods:
         raise AnswerIsNo(
@@ -96,7 +98,7 @@ def _next(bench: Bench, kick: RecordedMotion, pulse: _Pulse, break_away_nm: floa
             f"joint to {reached:.2g} rad/s, {allowed:.2g} are allowed, and it must last {1e3 * LEAST_S:g} ms and "
             f"reach {needed_rad_s:.2g} rad/s to tell; allow more (--speed, limits.speed_rad_s)"
         )
-    if long:
+    if at_longest:
         raise AnswerIsNo(
             f"the joint does not pick up speed when kicked: {reached:.2g} rad/s, and {needed_rad_s:.2g} are needed to "
             "tell; its inertia or friction is too large for the allowed torque (limits.torque_nm) or the experiments "
