@@ -50,9 +50,9 @@ class Nodes:
         if proof["asked_for"] and not proof["holds"]:
             log.warning("%s: run `servoctl guard-test` while no daemon runs; until then no enabling", proof["text"])
 
-    def look_for_strangers(self, loop_began: Callable[[], bool]) -> None:
+    def look_for_strangers(self, loop_began_ns: Callable[[], int | None]) -> None:
         """Until the loop listens: raises Unreachable where somebody else commands or asks the nodes."""
-        self._master.look_for_strangers(loop_began)
+        self._master.look_for_strangers(loop_began_ns)
 
     def hand_over(self) -> None:
         """The loop listens from now on."""

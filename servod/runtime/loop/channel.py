@@ -173,6 +173,7 @@ class Channel:
         self._next_record, self._doubtful_record = 1, 0
         self._sent = self._seen_taken = self._beats = self._tables = self._table_samples = 0
         self._seen_grants: list[Grant] | None = None
+        self._ready_ns: int | None = None
         self._seen_proofs: tuple[int, WiringReport | None] = 0, None
         self._proof_ticket = self._doubtful_proof = 0
         self._bent = False
@@ -229,7 +230,7 @@ class Channel:
 
     def publish_ready(self, grants: Sequence[Grant]) -> None:
         """Tell the supervisor that the cycle begins, and what the operating system granted."""
-        text = json.dumps(grants).encode()
+        text = json.dumps([self._clock.now_ns(), grants]).encode()
         self._grants.write(1, _LENGTH.pack(_LENGTH.size + len(text)) + text)
 
     def _take(self, number: int, data: bytes) -> Command:
@@ -268,15 +269,16 @@ class Channel:
         self._words[_BEATS] = _counter(self._beats)
 
     @property
-    def ready(self) -> bool:
-        """The loop has begun."""
+    def ready_ns(self) -> int | None:
+        """When the loop began; None before."""
         self.grants()
-        return self._seen_grants is not None
+        return self._ready_ns
 
     def grants(self) -> list[Grant]:
         """What the operating system granted the loop; empty until it is ready."""
         if self._seen_grants is None and (data := self._grants.read(1)):
-            self._seen_grants = [Grant(*row) for row in json.loads(data[_LENGTH.size :])]
+            self._ready_ns, grants = json.loads(data[_LENGTH.size :])
+            self._seen_grants = [Grant(*row) for row in grants]
         return self._seen_grants or []
 
     def proofs(self) -> tuple[int, WiringReport | None]:

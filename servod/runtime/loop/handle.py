@@ -35,11 +35,11 @@ class LoopHandle:
         self._channel = Channel()
         self._process: subprocess.Popen[str] | None = None
 
-    def start(self, meanwhile: Callable[[Callable[[], bool]], None] = lambda _: None) -> None:
+    def start(self, meanwhile: Callable[[Callable[[], int | None]], None] = lambda _: None) -> None:
         """Start the process and wait for its first cycle; raises Unreachable with its last words when it dies.
 
-        `meanwhile` is done again and again until then; what it raises ends the start. It is given what tells whether
-        the loop has begun since.
+        `meanwhile` is done again and again until then; what it raises ends the start. It is given what tells when
+        the loop began, None before.
         """
         fd = self._channel.fd
         try:
@@ -146,9 +146,9 @@ class LoopHandle:
         stream = self._process.stderr if self._process else None
         return stream.read() if stream and not stream.closed else ""
 
-    def _wait_until_ready(self, meanwhile: Callable[[Callable[[], bool]], None]) -> None:
+    def _wait_until_ready(self, meanwhile: Callable[[Callable[[], int | None]], None]) -> None:
         deadline = time.monotonic() + START_TIMEOUT_S
-        while not self._channel.ready:
+        while self._channel.ready_ns is None:
             if not self.alive():
                 words = self.last_words().strip().splitlines()
                 if self.exit_code == -signal.SIGALRM:
@@ -157,5 +157,5 @@ class LoopHandle:
             if time.monotonic() > deadline:
                 late = f"the loop process did not begin within {START_TIMEOUT_S:.0f} s"
                 raise Unreachable(f"{late}: is the machine busy with other work?")
-            meanwhile(lambda: self._channel.ready)
+            meanwhile(lambda: self._channel.ready_ns)
             time.sleep(0.01)

@@ -88,9 +88,9 @@ def test_commands_carry_all_their_arguments_and_a_full_queue_says_so():
 def test_grants_and_beats_cross_over():
     supervisor, loop = both_sides()
     assert supervisor.grants() == []
-    assert not supervisor.ready
+    assert supervisor.ready_ns is None
     loop.publish_ready([Grant("sched_fifo", False, "no")])
-    assert supervisor.ready
+    assert supervisor.ready_ns is not None
     assert supervisor.grants() == [Grant("sched_fifo", False, "no")]
     before = loop.supervisor_beats()
     supervisor.beat()

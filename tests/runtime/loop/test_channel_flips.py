@@ -60,7 +60,7 @@ class _Port(ChannelPort):
     def __init__(self, clock: Clock) -> None:
         super().__init__(clock)
         self.loop.publish_ready([Grant("sched_fifo", False, "no right")])
-        assert self.supervisor.ready
+        assert self.supervisor.ready_ns is not None
         self.written: list[bytes] = []
 
     def write_record(self, values: Sequence[float]) -> None:

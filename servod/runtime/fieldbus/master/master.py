@@ -99,17 +99,17 @@ class Master:
             raise
         return BringUp(plans[0], plans[1], load.share, report)
 
-    def look_for_strangers(self, loop_began: Callable[[], bool] = lambda: False) -> None:
+    def look_for_strangers(self, loop_began_ns: Callable[[], int | None] = lambda: None) -> None:
         """From the bring-up until `hand_over`: raises Unreachable where somebody else spoke with the nodes.
 
-        `loop_began`: whether the loop speaks by now; see StartWatch.look.
+        `loop_began_ns`: since when the loop speaks, None before; see StartWatch.look.
         """
         self._network.drain()
         for node in self._nodes.values():
             if node.watch.foreign:
                 raise foreign(node.watch.foreign)
         if self._start_watch is not None:
-            self._start_watch.look(loop_began)
+            self._start_watch.look(loop_began_ns)
 
     def hand_over(self) -> None:
         """The loop listens, and speaks, from now on."""

@@ -30,18 +30,20 @@ class StartWatch:
         self._of_loop = commands | {SYNC_ID, HEARTBEAT_BASE + config.heartbeat.master_node_id}
         network.announces.update(self._ids)
 
-    def look(self, loop_began: Callable[[], bool] = lambda: False) -> None:
+    def look(self, loop_began_ns: Callable[[], int | None] = lambda: None) -> None:
         """Take what came; raises Unreachable for what this master did not send.
 
-        `loop_began` is asked behind the last frame: what came until then is nobody's of ours while it says no. Once it
-        has begun, its cyclic frames are among them, and it hears those of others itself.
+        `loop_began_ns` is asked behind the last frame. Once the loop has begun, cyclic frames may be its own, and it
+        hears those of others itself; whatever came before is nobody's of ours.
         """
         frames = []
         while (frame := self._bus.receive(0.0)) is not None:
             frames.append(frame)
-        ids = self._ids - self._of_loop if frames and loop_began() else self._ids
+        began_ns = loop_began_ns() if frames else None
         for frame in frames:
-            if frame.can_id in ids and not self._answers.own(frame.can_id, frame.data, heard_late=True):
+            if began_ns is not None and frame.can_id in self._of_loop and frame.time_ns >= began_ns:
+                continue
+            if frame.can_id in self._ids and not self._answers.own(frame.can_id, frame.data, heard_late=True):
                 raise foreign(f"frame 0x{frame.can_id:03X} {frame.data.hex(' ')}".rstrip())
 
     def close(self) -> None:

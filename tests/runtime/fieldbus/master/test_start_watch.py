@@ -81,16 +81,21 @@ def test_the_start_ends_whenever_it_comes(kind: str, share: float, transfers: in
 
 
 @pytest.mark.parametrize("kind", FRAMES)
-@pytest.mark.parametrize("began", [False, True])
-def test_the_loops_own_first_frames_are_no_stranger(kind: str, began: bool) -> None:
-    """A machine that stood still looks when the loop has begun since: what the loop sends is no stranger's."""
+@pytest.mark.parametrize("began_s", [None, -0.001, 0.002])
+def test_the_loops_own_first_frames_are_no_stranger(kind: str, began_s: float | None) -> None:
+    """A machine that stood still looks when the loop has begun since: what the loop sends is no stranger's.
+
+    `began_s`: after the frame; one that came before the loop began is a stranger's whatever it is.
+    """
     there, axis = world(), config()
     master_bus, start_bus, loop = there.connect(master_ids(axis)), there.connect(start_ids(axis)), there.connect()
     master = Master(axis, master_bus, there.clock, threaded=False, start_bus=start_bus)
+    there.clock.sleep_until(there.clock.now_ns() + 5_000_000)
+    began_ns = None if began_s is None else there.clock.now_ns() + round(1e9 * began_s)
     loop.send(FRAMES[kind][0], bytes.fromhex(FRAMES[kind][1]))
-    there.clock.sleep_until(there.clock.now_ns() + 1_000_000)
-    if began and kind in ("SYNC", "command", "heartbeat of the master"):
-        master.look_for_strangers(lambda: began)
+    there.clock.sleep_until(there.clock.now_ns() + 4_000_000)
+    if began_s == -0.001 and kind in ("SYNC", "command", "heartbeat of the master"):
+        master.look_for_strangers(lambda: began_ns)
     else:
         with pytest.raises(Unreachable, match="somebody else spoke"):
-            master.look_for_strangers(lambda: began)
+            master.look_for_strangers(lambda: began_ns)
