@@ -169,22 +169,22 @@ def analyse(traces: Sequence[RecordedMotion], devices: Devices | None = None) ->
     slides = break_away.fit([ramp for ramp in ramps if not ramp.settings["search"]] or ramps)
     rocked = presliding.fit(of_kind(traces, ExperimentKind.PRESLIDING), slides)
     kicked = kick.fit(of_kind(traces, ExperimentKind.KICK))
-    slid = of_kind(traces, ExperimentKind.RESPONSE)[-1]
-    answer = response.fit(slid, kicked.inertia)
+    trace = of_kind(traces, ExperimentKind.RESPONSE)[-1]
+    answer = response.fit(trace, kicked.inertia)
     delay_s = answer.delay_s.value + answer.lag_s.value
     damping = _damping(traces, answer, rocked)
     bristles = _bristle(slides, rocked, damping, answer.inertia.value)
     mapped = friction_map.fit(of_kind(traces, ExperimentKind.FRICTION_MAP), answer.inertia.value, delay_s, bristles)
     positive, negative = curve.fit(mapped.positive), curve.fit(mapped.negative)
-    shaken = response.torque_noise(slid, answer, mapped.cogging)
+    torque_noise = response.torque_noise(trace, answer, mapped.cogging)
     cogs = sum(wave.amplitude.value for wave in mapped.cogging)
     return Analysis(
         fit(of_kind(traces, ExperimentKind.NOISE)[-1]),
-        break_away.widened(slides, math.hypot(cogs, EARLY_BY * shaken.value)),
+        break_away.widened(slides, math.hypot(cogs, EARLY_BY * torque_noise.value)),
         rocked,
         kicked,
         answer,
-        shaken,
+        torque_noise,
         mapped,
         positive,
         negative,

@@ -222,6 +222,25 @@ def test_the_interval_of_the_torque_noise_is_the_scatter_of_the_strokes():
     assert once.half_width > 0.5 * once.value
 
 
+@pytest.mark.parametrize("period_s", [0.004, 0.02])
+def test_torque_noise_is_told_of_a_slow_cycle_up_to_its_excited_lines(period_s):
+    """A stroke of a second has 50 samples at 20 ms, and lines up to a quarter of that."""
+    joint, count, rng = Rigid(1e-1, 0.6, 0.003, 0.0), round(1.0 / period_s), np.random.default_rng(3)
+    lines = np.arange(1, count // 4 + 1)
+    wave = 0.02 * multisine(lines, lines / lines.max(), count, rng)
+    frequency = np.fft.rfftfreq(count, period_s)
+    ratio = np.concatenate([[0.0], response_of(joint, frequency[1:], period_s)])
+    pushed = [np.fft.rfft(4e-4 * rng.normal(size=count)) for _ in range(12)]
+    ways = np.concatenate([np.fft.irfft(ratio * (np.fft.rfft(wave) + noise), count) for noise in pushed])
+    settings = {"first": 0.0, "stride": float(count), "count": float(count), "strokes": 12.0}
+    settings |= {f"line_{i}": float(line) for i, line in enumerate(lines)}
+    torque, position = np.append(np.tile(wave, 12), 0.0), np.concatenate([[0.0], np.cumsum(ways)])
+    t = np.arange(len(torque)) * period_s
+    trace = RecordedMotion(ExperimentKind.RESPONSE, t, torque, position, position, torque, torque, position, settings)
+    told = response.torque_noise(trace, response.fit(trace, 0.1), ())
+    assert told.value == pytest.approx(4e-4 * np.sqrt(min(40.0, lines[-1]) * 2.0 * period_s), rel=0.25)
+
+
 def test_cogging_that_is_known_is_no_torque_noise():
     """The plant's own simulation under the same multisine; the joint slides over 26 teeth of 20 mN*m."""
     joint = AxisModel.model_validate(

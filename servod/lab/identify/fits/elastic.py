@@ -112,7 +112,7 @@ def solve_from(first: Elastic, frequency: Array, ratio: Complex, deviation: Arra
 def longest_lag_s(
     first: Elastic, frequency: Array, ratio: Complex, deviation: Array, period_s: float, longest_s: float, worse: float
 ) -> float:
-    """Longest lag [s], up to `longest_s`, with which two masses fit no worse than by the factor `worse`; 0.0 if none.
+    """Longest lag [s], at most `longest_s`, with which two masses fit no worse than by the factor `worse`.
 
     All numbers are fitted anew behind each lag (profile likelihood); by bisection, since longer ones fit worse.
     """

@@ -37,6 +37,9 @@ UNEXPLAINED, SPRUNG_COST = 1.5, 0.2
 #: Half widths that the scatter does not show: inertia by share, delay in s. The same joint started ten milliseconds
 #: later is told a delay that differs by 25 us.
 INERTIA_ALLOWANCE, DELAY_ALLOWANCE_S = 0.01, 5e-5
+#: A lag of up to this is never told, and what is said of one that was not.
+LEAST_UNSEEN_S = 1e-4
+NO_LAG = "none that could be told from the delay; what there is, is part of the delay"
 #: Torque noise is told up to here: above, the encoder's own shows more.
 NOISE_HZ = 40.0
 #: Variance of the second difference of independent values of variance one: 1 + 4 + 1.
@@ -76,12 +79,14 @@ class ResponseFit(NamedTuple):
 
     def model(self, frequency_hz: Array) -> Complex:
         """Position over torque of what was fitted, rad/(N*m)."""
+        return position_over_torque(frequency_hz, self.way_model(frequency_hz), self.period_s)
+
+    def way_model(self, frequency_hz: Array) -> Complex:
+        """Way per period over torque of what was fitted, rad/(N*m)."""
         if self.resonance is not None:
-            ratio = elastic.response_of(self.resonance.joint, frequency_hz, self.period_s)
-        else:
-            rigid = Rigid(self.inertia.value, self.viscous_slope.value, self.delay_s.value, self.lag_s.value)
-            ratio = response_of(rigid, frequency_hz, self.period_s)
-        return position_over_torque(frequency_hz, ratio, self.period_s)
+            return elastic.response_of(self.resonance.joint, frequency_hz, self.period_s)
+        rigid = Rigid(self.inertia.value, self.viscous_slope.value, self.delay_s.value, self.lag_s.value)
+        return response_of(rigid, frequency_hz, self.period_s)
 
     def phase_rad(self, of: Complex) -> Array:
         """Phase of a response at the lines, each on the turn that is nearest to the fitted one.
@@ -166,8 +171,7 @@ def _choose(lines: _Lines, strokes: Sequence[Stroke], inertia: float) -> _Found:
         lag = estimate(lagged[3], lag_spread[3], freedom, "s", floor=DELAY_ALLOWANCE_S, note=notes[3])
         return _Found(lagged, lag_spread, notes, lag, None)
     unseen = lagged[3] + float(stats.t.ppf(LEVEL, freedom)) * lag_spread[3]
-    note = "none that could be told from the delay; what there is, is part of the delay"
-    lag = Estimate(0.0, 0.0, min(max(1e-4, unseen), float(plain[2])), "s", note)
+    lag = Estimate(0.0, 0.0, min(max(LEAST_UNSEEN_S, unseen), float(plain[2])), "s", NO_LAG)
     values, spread = jackknife(lambda parts: solve(parts, False), strokes)
     return _Found(values, spread, _notes(values, start), lag, None)
 
@@ -205,7 +209,7 @@ def _sprung(lines: _Lines, strokes: Sequence[Stroke], inertia: float, rigid: Seq
     )
     longest = min(lines.period_s, float(values[2]))
     unseen = elastic.longest_lag_s(joint, lines.frequency, ratio, lines.deviation, lines.period_s, longest, worse)
-    lag = Estimate(0.0, 0.0, unseen, "s", "none that could be told from the delay; what there is, is part of the delay")
+    lag = Estimate(0.0, 0.0, max(min(LEAST_UNSEEN_S, longest), unseen), "s", NO_LAG)
     return _Found(np.array([*values[:3], 0.0]), np.array([*spread[:3], 0.0]), notes[:3], lag, resonance)
 
 
@@ -272,18 +276,19 @@ def torque_noise(trace: RecordedMotion, answer: ResponseFit, cogging: Sequence[F
     not end as it began, which adds the same to all lines (Pintelon and Schoukens, 2012, 2.2.3).
     """
     known = replace(trace, torque_nm=trace.torque_nm - _in_commands(cogging, trace, answer))
-    count, period_s = int(trace.settings["count"]), answer.period_s
-    lines = np.arange(max(1, int(trace.settings["line_0"]) - 1), math.ceil(NOISE_HZ * count * period_s) + 1)
-    frequency = lines / (count * period_s)
-    ratio = answer.model(frequency) * (np.exp(2j * np.pi * frequency * period_s) - 1.0)
+    stroke_s, excited = trace.settings["count"] * answer.period_s, excited_lines(trace)
+    last = min(math.ceil(NOISE_HZ * stroke_s), int(excited[-1]))
+    lines = np.arange(max(1, min(int(excited[0]) - 1, last - 3)), last + 1)
+    frequency = lines / stroke_s
+    ratio = answer.way_model(frequency)
     strokes = strokes_of(known, lines)
 
     def rms(parts: Sequence[Stroke]) -> Array:
         errors = np.abs(np.diff([s.velocity / ratio - s.torque for s in parts], 2))
-        return np.sqrt(np.atleast_1d(np.mean(2.0 * errors**2) / SECOND_DIFFERENCE * NOISE_HZ * count * period_s))
+        return np.array([math.sqrt(float(np.mean(2.0 * errors**2)) / SECOND_DIFFERENCE * last)])
 
     found, spread = jackknife(rms, strokes)
-    note = f"below {NOISE_HZ:g} Hz while sliding, beside the cogging that is known"
+    note = f"below {last / stroke_s:g} Hz while sliding, beside the cogging that is known"
     return estimate(found[0], spread[0], len(strokes) - 1, "N*m", share=INERTIA_ALLOWANCE, note=note)
 
 
@@ -302,7 +307,7 @@ def _in_commands(cogging: Sequence[FittedHarmonic], trace: RecordedMotion, answe
 
 
 class Stroke(NamedTuple):
-    """Spectra of one stroke at the excited lines: velocity, torque, excitation."""
+    """Spectra of one stroke: velocity, torque, excitation."""
 
     velocity: Complex
     torque: Complex
@@ -311,15 +316,20 @@ class Stroke(NamedTuple):
 
 def spectra(trace: RecordedMotion) -> tuple[Array, list[Stroke]]:
     """Excited lines in Hz and the spectra of every whole stroke there. Raises AnswerIsNo with too few strokes."""
-    s = trace.settings
-    lines = np.array([int(s[f"line_{i}"]) for i in range(sum(key.startswith("line_") for key in s))])
+    lines = excited_lines(trace)
     strokes = strokes_of(trace, lines)
     if len(strokes) < 4:
         raise AnswerIsNo(
             f"the multisine recording has {len(strokes)} whole strokes, and four are needed: see that nothing stops "
             "the axis on its way, or give it more --travel"
         )
-    return lines / (s["count"] * trace.period_s), strokes
+    return lines / (trace.settings["count"] * trace.period_s), strokes
+
+
+def excited_lines(trace: RecordedMotion) -> NDArray[np.int_]:
+    """Numbers of the multisine's lines, in periods of a stroke, ascending."""
+    s = trace.settings
+    return np.array([int(s[f"line_{i}"]) for i in range(sum(key.startswith("line_") for key in s))])
 
 
 def strokes_of(trace: RecordedMotion, lines: NDArray[np.int_]) -> list[Stroke]:
