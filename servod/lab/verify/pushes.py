@@ -41,9 +41,12 @@ PLANTS = 3  # drawn ones, beside the model
 STRETCH_SHARE = 0.5
 #: Of a sine's amplitude: an error that swings by more from rest on is no tracking that a push could be compared with.
 OWN_SHARE = 0.5
-#: And by more than so many times what may be left of a push: a sine of a few counts or less than the bristle's stretch
-#: cannot be followed. A joint that merely stands under it has an error of the sine itself.
-OWN_LIMITS = 2.0
+#: A sine of a few counts, or of less than the bristle's stretch, cannot be followed. The error of a joint that stands
+#: under it is the sine itself, at most so many times as large; beyond so many times what may be left of a push one that
+#: stands does not follow.
+STANDS, STANDS_WITHIN = 1.05 / math.sqrt(2.0), 2.0
+#: RMS of a swing over its peak to peak.
+RMS_OF_SWING = 1.0 / (2.0 * math.sqrt(2.0))
 
 
 def frequencies_hz(period_s: float) -> list[float]:
@@ -72,6 +75,7 @@ class PushedOff:
     plant: AxisModel
     design: Design
     scale: Scale
+    rounding_rad: float = 0.0  # peak to peak that the encoder's rounding may make of the joint
 
     def excesses_rad(self) -> Iterator[float]:
         """Of all sines that the drive has the torque for: how much larger the error swings BACK_S after a push, RMS."""
@@ -85,7 +89,8 @@ class PushedOff:
     def excess_rad(self, frequency_hz: float, speed_rad_s: float) -> float:
         """Of one sine with this peak speed; inf where the joint runs away.
 
-        Where the error swings by more than OWN_SHARE of the sine without any push, that swing itself.
+        Where the error swings without any push by more than OWN_SHARE of the sine, than a joint that stands, and than
+        its encoder's rounding explains, that swing itself.
         """
         period, amplitude = self.design.period_s, speed_rad_s / (2.0 * math.pi * frequency_hz)
         watched_s = math.ceil(self._s(WATCHED_S) * frequency_hz) / frequency_hz
@@ -93,7 +98,9 @@ class PushedOff:
         motion = sine(amplitude, frequency_hz, pushed_s[1] + self._s(BACK_S) + watched_s, period)
         last = round(watched_s / period)
         own = self._swing_rad(motion, last)
-        if own > max(OWN_LIMITS * swing_limit_rad(self.design), OWN_SHARE * amplitude):
+        limit = swing_limit_rad(self.design)
+        stands = min(STANDS * amplitude, STANDS_WITHIN * limit)
+        if own > max(limit + RMS_OF_SWING * self.rounding_rad, OWN_SHARE * amplitude, stands):
             return own
         push = np.zeros(len(motion))
         push[round(pushed_s[0] / period) : round(pushed_s[1] / period)] = self.scale.torque_nm
@@ -131,6 +138,7 @@ def check_pushes(s: Subject) -> Iterator[CertificateCheck]:
     """Sines from inside Omega_L to far outside, on model and drawn plants: each pushed, or after a faster motion."""
     scale = scale_of(s.design)
     plants = [s.design.model, *(drawn(s.design.model, s.design.uncertainty, s.seed, i) for i in range(PLANTS))]
-    found = (excess for plant in plants for excess in PushedOff(s.gains, plant, s.design, scale).excesses_rad())
+    pushed = (PushedOff(s.gains, plant, s.design, scale, s.rounding_rad) for plant in plants)
+    found = (excess for each in pushed for excess in each.excesses_rad())
     worst = max(found, default=math.inf)  # a drive that has the torque for no sine proves nothing
     yield at_most("pushed off a sine, error that swings on [rad RMS]", worst, swing_limit_rad(s.design))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -91,6 +92,41 @@ def test_a_joint_that_stands_under_a_sine_of_a_few_counts_does_not_swing() -> No
     amplitude_rad = 1.9 * swing_limit_rad(coarse)
     assert amplitude_rad / math.sqrt(2.0) > swing_limit_rad(coarse)
     assert standing.excess_rad(2.5, 2.0 * math.pi * 2.5 * amplitude_rad) < 0.1 * swing_limit_rad(coarse)
+
+
+@dataclass(frozen=True)
+class Swinging(PushedOff):
+    """A joint whose error swings by so much whatever goes before."""
+
+    swing_rad: float = 0.0
+
+    def _swing_rad(self, *_motion: object) -> float:
+        return self.swing_rad
+
+
+@pytest.mark.parametrize(
+    ("swing", "amplitude", "rounding", "passes"),
+    [
+        (1.5, 1.2, 0.0, False),
+        (1.5, 2.1, 0.0, True),
+        (1.1, 0.5, 0.0, False),
+        (1.1, 0.5, 0.3, True),
+        (2.4, 4.0, 0.0, False),
+    ],
+    ids=["swings by more than the sine", "stands", "hunts", "by its rounding", "does not follow"],
+)
+def test_what_swings_more_than_a_joint_that_stands_or_its_rounding_is_refused(
+    swing, amplitude, rounding, passes
+) -> None:
+    """All in units of what may be left of a push; the rounding from peak to peak over what its RMS is of that."""
+    gains = certified()
+    design = gains.design
+    assert design is not None
+    limit = swing_limit_rad(design)
+    given = {"rounding_rad": rounding * limit * 2.0 * math.sqrt(2.0), "swing_rad": swing * limit}
+    joint = Swinging(gains, design.model, design, scale_of(design), **given)
+    excess = joint.excess_rad(3.0, 2.0 * math.pi * 3.0 * amplitude * limit)
+    assert excess == (pytest.approx(0.0, abs=1e-12) if passes else pytest.approx(swing * limit))
 
 
 @pytest.mark.parametrize("period_s", [0.0005, 0.001, 0.002, 0.003, 0.004, 0.007, 0.02])
