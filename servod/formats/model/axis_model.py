@@ -197,6 +197,16 @@ class AxisModel(Strict):
         return self.delay_s + (self.delay.additional_s if self.delay else 0.0)
 
     @property
+    def lag_s(self) -> float:
+        """Time constant of the torque behind that delay, in s."""
+        return self.actuator_lag.time_constant_s if self.actuator_lag else 0.0
+
+    @property
+    def acts_after_s(self) -> float:
+        """Delay and lag between a command and its torque, in s."""
+        return self.total_delay_s + self.lag_s
+
+    @property
     def start_temperature_c(self) -> float:
         """Joint temperature before anything has moved or been measured, in degC."""
         if self.noise is not None and self.noise.temperature_c is not None:

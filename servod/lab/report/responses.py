@@ -86,10 +86,10 @@ def compensation_only(law: LocalParameters, observer: bool) -> LocalParameters:
 
 
 def rigid(design: Design, frequencies_hz: Array) -> Complex:
-    """1/(m s^2) with the delay and the hold: the axis that a perfect compensation would leave, in rad/(N*m)."""
+    """1/(m s^2) with delay, lag and hold: the axis that a perfect compensation would leave, in rad/(N*m)."""
     friction, timing = steady_friction(design.model), timing_of(design)
     s = 2j * np.pi * frequencies_hz
-    late = np.exp(-s * (timing.delay_s + 0.5 * timing.period_s))
+    late = np.exp(-s * (timing.delay_s + 0.5 * timing.period_s)) / (1.0 + s * timing.lag_s)
     response: Complex = late / (friction.inertia * s**2)
     return response
 

@@ -172,9 +172,8 @@ def position_feedforward(model: AxisModel, gain: float, period_s: float) -> Posi
     if not waves and model.spring is None and model.torque_offset == 0.0:
         return None
     spring = model.spring or Spring()
-    lag_s = model.actuator_lag.time_constant_s if model.actuator_lag else 0.0
     return PositionFeedforward(
-        lead_s=model.total_delay_s + lag_s + 0.5 * period_s,
+        lead_s=model.acts_after_s + 0.5 * period_s,
         offset_nm=-model.torque_offset / gain,
         spring_nm_per_rad=spring.stiffness / gain,
         spring_rest_rad=spring.rest,

@@ -77,7 +77,7 @@ LONGEST_CYCLES = 5.0
 
 def delay_refusal(model: AxisModel, period_s: float) -> str | None:
     """Why no design is tried for the delay of `model` at this cycle; None where it is short enough."""
-    late_s = model.total_delay_s + (model.actuator_lag.time_constant_s if model.actuator_lag else 0.0)
+    late_s = model.acts_after_s
     cycles = late_s / period_s
     if cycles <= LONGEST_CYCLES + WHOLE:
         return None

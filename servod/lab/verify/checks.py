@@ -87,8 +87,8 @@ class Subject:
         return self.timing.as_delay.delay_s / self.timing.period_s
 
     def cycles(self, count: float) -> SampledTiming:
-        """The same loop with a delay of `count` cycles."""
-        return replace(self.timing, delay_s=count * self.timing.period_s)
+        """The same loop with a delay of `count` cycles, of which the lag is a part."""
+        return replace(self.timing, delay_s=max(count * self.timing.period_s - self.timing.lag_s, 0.0))
 
     def sweep(self, count: int, also: Iterable[float] = ()) -> Sweep:
         """The linearised law at `count` speeds per direction, and at others."""

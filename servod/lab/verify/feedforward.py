@@ -46,15 +46,10 @@ def check_feedforward(s: Subject) -> Iterator[CertificateCheck]:
     yield at_most("inertia of the feed-forward over the model's", inertia, most)
     known, cycle_s = local.position_feedforward, s.design.period_s
     lead_s = max(local.friction.lead_s, known.lead_s if known else 0.0)
-    yield at_most("lead of the feed-forward [s]", lead_s, acts_after_s(s.design.model) + LEAD_CYCLES * cycle_s)
+    yield at_most("lead of the feed-forward [s]", lead_s, s.design.model.acts_after_s + LEAD_CYCLES * cycle_s)
     if known is not None:
         limit = UNKNOWN_SHARE * s.coarse.friction.largest(s.design.speed_max_rad_s)
         yield at_most("torque over position that the model has not [N*m]", unknown_nm(known, s.design.model), limit)
-
-
-def acts_after_s(model: AxisModel) -> float:
-    """Delay and lag between a command and its torque [s]."""
-    return model.total_delay_s + (model.actuator_lag.time_constant_s if model.actuator_lag else 0.0)
 
 
 def compensated(s: Subject, local: LocalParameters, side: float) -> Iterator[tuple[float, float]]:

@@ -138,7 +138,7 @@ class Sweep:
         Without the states of the law that go by themselves; `own_radius` has their poles.
         """
         own = timing or self.timing
-        late, known = replace(own, delay_s=own.delay_s + cases[0].delay_s), tuple(cases)
+        late, known = own.later_by(cases[0].delay_s), tuple(cases)
         for velocity, slopes in self.coupled:
             kinds = [LinearBristle.STICKS] if velocity == 0.0 else [LinearBristle.SLIDES]
             if transient and velocity != 0.0:
@@ -202,7 +202,7 @@ class Sweep:
 
     def stable(self, case: LoopDeviation, extra_delay_s: float = 0.0) -> bool:
         """Whether all poles are inside, steady sliding and sticking, for one case and a longer delay."""
-        timing = replace(self.timing, delay_s=self.timing.delay_s + extra_delay_s)
+        timing = self.timing.later_by(extra_delay_s)
         systems = self.systems((case,), timing, transient=False)
         return self.own_radius < 1.0 and all(spectral_radius(closed)[0] < 1.0 for _, _, (closed, _, _) in systems)
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from itertools import pairwise, product
 
 import numpy as np
@@ -72,7 +71,7 @@ def resting_radius(s: Subject, local: LocalParameters, below_rad_s: float) -> fl
     for velocity, slopes in resting_slopes(s, local, below_rad_s):
         for group in by_delay(cases):
             own = tuple(cases[i] for i in group)
-            timing = replace(s.timing, delay_s=s.timing.delay_s + own[0].delay_s)
+            timing = s.timing.later_by(own[0].delay_s)
             for kind in LinearBristle if velocity else (LinearBristle.STICKS,):
                 joints = joints_at(s.coarse.friction, velocity, kind, own, timing)
                 worst = max(worst, float(spectral_radius(loops_around(*joints, slopes)[0]).max()))

@@ -38,6 +38,10 @@ class SampledTiming:
         """
         return replace(self, delay_s=self.delay_s + self.lag_s, lag_s=0.0)
 
+    def later_by(self, delay_s: float) -> SampledTiming:
+        """The same with more delay, or less; no torque comes before it is asked for."""
+        return replace(self, delay_s=max(self.delay_s + delay_s, 0.0))
+
     @property
     def kept(self) -> float:
         """What the velocity filter keeps of its value over one period."""
@@ -63,8 +67,7 @@ class SampledTiming:
 def timing_of(design: Design) -> SampledTiming:
     """Period, delay, filter and lag that the design states."""
     model = design.model
-    lag_s = model.actuator_lag.time_constant_s if model.actuator_lag else 0.0
-    return SampledTiming(design.period_s, model.total_delay_s, design.velocity_cutoff_hz, lag_s)
+    return SampledTiming(design.period_s, model.total_delay_s, design.velocity_cutoff_hz, model.lag_s)
 
 
 def exponential(stack: Array) -> Array:

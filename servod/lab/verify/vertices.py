@@ -202,7 +202,10 @@ def measured_widths(model: AxisModel) -> dict[str, float]:
         # lag turns the phase no further than the delay that it is taken for
         hidden = lag.high if lag is not None and lag.value == 0.0 else 0.0
         early = delay.value - max(delay.low, 0.0) - hidden  # no torque comes before it is asked for
-        found["delay_s"] = max(delay.high - delay.value, early)
+        late = delay.high - delay.value
+        if lag is not None and lag.value > 0.0:  # one that was told may be longer: as delay it is the harder
+            late += lag.high - lag.value
+        found["delay_s"] = max(late, early)
     return found | _of_map(known)
 
 

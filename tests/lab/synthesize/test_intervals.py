@@ -92,6 +92,7 @@ def test_a_lag_that_may_hide_in_the_delay_does_not_widen_it() -> None:
     assert width(IdentifiedValue(value=0.0, low=0.0, high=0.00016, unit="s")) == pytest.approx(5e-5)
     assert width(IdentifiedValue(value=0.0, low=0.0, high=0.00010, unit="s")) == pytest.approx(1e-4)
     assert width(IdentifiedValue(value=0.001, low=0.0009, high=0.0011, unit="s")) == pytest.approx(2e-4)
+    assert width(IdentifiedValue(value=0.001, low=0.0009, high=0.0013, unit="s")) == pytest.approx(3.5e-4)
 
 
 def test_a_design_narrower_than_what_was_measured_is_not_certified() -> None:

@@ -77,6 +77,16 @@ def test_a_lag_is_a_state_of_the_joint_and_a_delay_in_its_place_is_the_harder_of
     assert 0.0 < margin(late, judged.timing) < lag
 
 
+def test_a_whole_cycle_of_delay_has_the_lag_in_it() -> None:
+    """An axis that is late by its lag alone is judged no harder than one that is as late by its delay."""
+    slow = lagging(0.0007).model_copy(update={"delay_s": 0.0001})
+    judged = subject(slow)
+    assert judged.own_cycles == pytest.approx(0.8)
+    assert judged.cycles(1.0).as_delay.delay_s == pytest.approx(0.001)
+    assert judged.cycles(0.5).delay_s == 0.0
+    assert judged.timing.later_by(-0.0002).delay_s == 0.0
+
+
 def test_the_response_from_poles_is_that_of_the_states() -> None:
     closed, column, row = next(x for v, _, x in subject().coarse.systems(NOMINAL) if v > 0.05)
     z = np.exp(1j * np.geomspace(1e-3, np.pi, 200))

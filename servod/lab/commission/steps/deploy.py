@@ -88,4 +88,4 @@ def _keep(walk: Walk, done: Deployment) -> None:
 def _present(walk: Walk) -> GainSet:
     """What a virtual axis runs before: the PD feedback that its identification ended with."""
     model = load_axis_model(walk.path(MODEL))
-    return pd_set("identification", *feedback(walk.axis.config, model.inertia, model.total_delay_s, STIFF))
+    return pd_set("identification", *feedback(walk.axis.config, model.inertia, model.acts_after_s, STIFF))
