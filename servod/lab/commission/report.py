@@ -106,6 +106,7 @@ _MADE = (
     ("identify", "model", MODEL),
     ("synthesize", "design", DESIGN),
     ("verify", "verdict of the checks", CERTIFICATE),
+    ("deploy", "gain set", GAINS),
     ("deploy", "deployment", DEPLOYMENT),
 )
 
@@ -121,8 +122,9 @@ def _refused(walk: Walk, step: str) -> Iterator[tuple[str, Iterator[Part]]]:
     if step != "identify" and walk.path(IDENTIFIED).exists():
         model = load_axis_model(walk.path(MODEL))
         yield "The axis as identified", _identified(walk, model)
-        if step != "synthesize" and walk.path(DESIGN).exists():
-            yield "The law and its design", _design(load_gains(walk.path(DESIGN)), model)
+        tried = walk.path(DESIGN if step == "verify" else GAINS)
+        if step != "synthesize" and tried.exists():
+            yield "The law and its design", _design(load_gains(tried), model)
 
 
 def _judged(walk: Walk) -> dict[str, Any]:

@@ -37,7 +37,7 @@ from servod.lab.commission.state import (
 from servod.lab.commission.state import read_walk_json as read_json
 from servod.lab.commission.steps import STEPS as ALL_STEPS
 from servod.lab.commission.steps.deploy import Deploy
-from servod.lab.commission.steps.synthesize import Synthesize, Verify, agreed, relaxed, tell_clashes
+from servod.lab.commission.steps.synthesize import NO_DESIGN, Synthesize, Verify, agreed, relaxed, tell_clashes
 from servod.lab.commission.steps.validate import document as comparison
 from servod.lab.commission.walk import Outlook, Questions, Step, StepFailed, Tell, Walk, WalkOptions, run
 from servod.lab.deploy.deployment import motion_notice
@@ -209,6 +209,13 @@ def test_a_set_that_the_checks_refuse_gives_way_to_one_of_less_gain(folder: Path
     assert high.k_x_per_rad < 0.6 * high_before.k_x_per_rad
     assert gains.design.model == gains_before.design.model
     assert told[0] == "verify: not valid: pushed off a sine"
+
+    refuse("swings", 0.01)
+    monkeypatch.setattr("servod.lab.commission.steps.synthesize.synthesize", lambda *_: Infeasible((), (), ()))
+    with pytest.raises(AnswerIsNo, match=r"^verify: not valid: swings, nor is one with less position gain$"):
+        Verify().run(here)
+    refused = failure(here, StepFailed("verify", "no"))["certificate"]["refused"]
+    assert [entry["failed"] for entry in refused] == [["swings"], [NO_DESIGN], [NO_DESIGN]]
 
     refuse(PHYSICS_CHECK, 0.01)
     told.clear()

@@ -41,6 +41,8 @@ OVERLAP_SHARE = 0.5
 LADDER = (1.0, 0.3, 0.1)
 #: Checks that find something else than too much gain.
 NOT_OF_GAIN = (PLANTS_CHECK, PHYSICS_CHECK, INTERVALS_CHECK)
+#: What the document has in place of failed checks where not even a design was found.
+NO_DESIGN = "no feedback meets the demands"
 
 
 @dataclass(frozen=True)
@@ -157,31 +159,37 @@ class Verify:
         return (GAINS, CERTIFICATE)
 
     def inputs(self, walk: Walk) -> dict[str, Any]:
-        """The set, how thoroughly it is judged, and by which sources."""
-        return {**walk.hashes(DESIGN), "plants": walk.options.plants, "seed": SEED, "tool": source_sha256(VERIFIES)}
+        """The set, what others are designed from, how thoroughly they are judged, and by which sources."""
+        tools = [source_sha256(SYNTHESIZES), source_sha256(VERIFIES)]
+        others = {"loop": _loop(walk), "accuracy": walk.options.accuracy, "ladder": list(LADDER)}
+        judged = {"plants": walk.options.plants, "seed": SEED, "tool": tools}
+        return {**walk.hashes(DESIGN, MODEL, RELAXED), **others, **judged}
 
     def run(self, walk: Walk) -> None:
         """Raises AnswerIsNo when no set is valid; then the first one's document stands alone, with no set to deploy."""
         refused: list[dict[str, Any]] = []
         first: dict[str, Any] = {}
         for weight, gains in self._ladder(walk):
+            if gains is None:
+                refused.append({"position_weight": weight, "failed": [NO_DESIGN]})
+                continue
             result = self._judged(walk, gains)
             if result.valid:
-                write_json(walk.path(CERTIFICATE), result.document() | rung(weight, refused))
+                write_json(walk.path(CERTIFICATE), result.document() | ladder_entry(weight, refused))
                 write_text(walk.path(GAINS), result.certified(gains).to_yaml())
                 return
             failed = [check.name for check in result.checks if not check.passed]
             refused.append({"position_weight": weight, "failed": failed})
             first = first or result.document()
-            write_json(walk.path(CERTIFICATE), first | rung(LADDER[0], refused))
             walk.say(f"verify: not valid: {'; '.join(failed)}")
             if any(name.startswith(NOT_OF_GAIN) for name in failed):
                 break
-        neither = ", nor is one with less position gain" if len(refused) > 1 else ""
-        raise AnswerIsNo(f"verify: not valid: {'; '.join(refused[0]['failed'])}{neither}")
+        write_json(walk.path(CERTIFICATE), first | ladder_entry(LADDER[0], refused))
+        less_gain = ", nor is one with less position gain" if len(refused) > 1 else ""
+        raise AnswerIsNo(f"verify: not valid: {'; '.join(refused[0]['failed'])}{less_gain}")
 
-    def _ladder(self, walk: Walk) -> Iterator[tuple[float, GainSet]]:
-        """(share of the position error's weight, set): the step before left the first."""
+    def _ladder(self, walk: Walk) -> Iterator[tuple[float, GainSet | None]]:
+        """(share of the position error's weight, set if there is one): the step before left the first."""
         yield LADDER[0], load_gains(walk.path(DESIGN))
         model, taken = load_axis_model(walk.path(MODEL)), read_walk_json(walk.path(RELAXED))
         wishes = _wishes(walk, model)
@@ -190,8 +198,7 @@ class Verify:
         for weight in LADDER[1:]:
             walk.say(f"verify: a design in which position errors count with {weight:g} of their weight")
             found = _attempt(walk, self.title, model, replace(wishes, position_weight=weight * wishes.position_weight))
-            if isinstance(found, GainSet):
-                yield weight, found
+            yield weight, found if isinstance(found, GainSet) else None
 
     def _judged(self, walk: Walk, gains: GainSet) -> Verification:
         with walk.progress(self.title) as tell:
@@ -200,6 +207,6 @@ class Verify:
             return verify(gains, options.plants, SEED, options.processes, where, least_plants=options.least_plants)
 
 
-def rung(weight: float, refused: list[dict[str, Any]]) -> dict[str, Any]:
+def ladder_entry(weight: float, refused: list[dict[str, Any]]) -> dict[str, Any]:
     """Which set of the ladder a document is of, and what the checks found in those that they refused."""
     return {"position_weight": weight, "refused": refused}
