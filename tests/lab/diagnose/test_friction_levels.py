@@ -125,6 +125,21 @@ def test_a_friction_map_has_levels_as_a_law_has(factors: dict[str, float], level
     assert found["verdict"] == ("missing_physics" if levels else "adequate")
     assert over_model(found) == pytest.approx(levels, rel=0.04)
     assert {one["effect"] for one in found["findings"]} == set(levels)
+    assert "friction.viscous" not in found["recalibrated"]
+
+
+def test_a_maps_own_viscous_part_is_no_unknown() -> None:
+    """Beside given torques it would only be another split of them, and levels would be factors on that."""
+    assert "friction.viscous" in {unknown.key for unknown in base_unknowns(believed())}
+    assert "friction.viscous" not in {unknown.key for unknown in base_unknowns(as_map())}
+
+
+def test_what_a_map_is_off_by_less_is_told_as_recalibrated() -> None:
+    found = diagnosis_document(diagnose(as_map(), record(axis(coulomb=1.2, static=1.2), seconds=4.0)))
+    told = found["recalibrated"]["friction.dry_part"]
+    assert (found["verdict"], told["from"]) == ("adequate", 1.0)
+    assert told["to"] == pytest.approx(1.2, rel=0.02)
+    assert "dry part is 1.2" in found["summary"]
 
 
 @pytest.mark.parametrize(

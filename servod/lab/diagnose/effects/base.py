@@ -116,12 +116,17 @@ def _beside_drive(own: Unknown, document: Document, unknown: frozenset[str]) -> 
 
 
 def _friction(document: Document, axis: str, force: str) -> list[Unknown]:
-    """The friction law's parameters; a local map keeps its curve."""
+    """The friction law's parameters; a local map keeps its curve, and what of it is viscous.
+
+    Beside given torques that only moves friction from the bristle to the viscous part, which recordings hardly show;
+    and the levels of both parts would be factors on others than the model's.
+    """
     found = []
     coulomb = get(document, "friction.coulomb")
+    measured = document["friction"]["kind"] == "local"
     for key, unit in (("viscous", f"{force}·s/{axis}"), ("coulomb", force)):
         value = get(document, f"friction.{key}")
-        if value > 0.0:
+        if value > 0.0 and not measured:
             found.append(known(f"friction.{key}", unit, value))
     static = get(document, "friction.static")
     if static > 0.0 and coulomb > 0.0:

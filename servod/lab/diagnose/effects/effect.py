@@ -129,6 +129,10 @@ def level_factor() -> Unknown:
     return Unknown(LEVEL, "1", 1.0, 1.0 / LEVEL_MOST, LEVEL_MOST, spread=math.log(LEVEL_KNOWN))
 
 
+#: The torques of a friction map, dry and viscous together.
+MAP = "friction.torques"
+
+
 def map_level(effect: str, dry: bool) -> Term:
     """A factor on the dry or on the viscous part of a friction map, whose torques have both in them."""
 
@@ -145,7 +149,7 @@ def map_level(effect: str, dry: bool) -> Term:
     def tell(_document: Document, values: Sequence[float]) -> list[Reported]:
         return [Reported("over_model", values[0], "1")]
 
-    scales = ("friction.torques",) if dry else ("friction.torques", "friction.viscous")
+    scales = (MAP,) if dry else (MAP, "friction.viscous")
     return Term(effect, "level", (level_factor(),), write, tell, scales=scales)
 
 

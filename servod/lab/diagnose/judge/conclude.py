@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from servod.formats.model.axis_model import AxisModel
 from servod.lab.diagnose.effects import effect, effects
 from servod.lab.diagnose.effects.disturbance import EVERY, NAME
+from servod.lab.diagnose.effects.effect import MAP
 from servod.lab.diagnose.effects.hypothesis import LEVEL, Document, Reported, Unknown, get
 from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.judge.covariance import bounded_error, inside_region
@@ -177,6 +178,21 @@ def recalibrated(judgement: JudgedSelection) -> dict[str, FittedValue]:
             continue
         half *= size
         found[unknown.key] = FittedValue(value, unknown.unit, value - half, value + half, nominal.start)
+    return found | _parts_of_map(judgement)
+
+
+def _parts_of_map(judgement: JudgedSelection) -> dict[str, FittedValue]:
+    """Factors under their level on the dry or the viscous part of a friction map, which no number of the model says."""
+    fit, found = judgement.fit, {}
+    for place, term in enumerate(fit.hypothesis.terms):
+        if place in judgement.named or place in judgement.kept or MAP not in term.scales:
+            continue
+        index = fit.hypothesis.share(place).start
+        value = fit.values[index]
+        half = SETTINGS.intervals.z95 * math.sqrt(max(float(judgement.covariance[index, index]), 0.0))
+        if abs(value - 1.0) > max(SETTINGS.intervals.least_change, half) * value:
+            part = f"friction.{term.effect.removesuffix('_friction')}_part"
+            found[part] = FittedValue(value, "times the map's", value * (1.0 - half), value * (1.0 + half), 1.0)
     return found
 
 
