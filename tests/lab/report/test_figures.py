@@ -77,9 +77,7 @@ def sliding() -> ResponseFit:
     hz, one = np.geomspace(3.0, 160.0, 12), Estimate(1e-3, 9e-4, 1.1e-3, "1")
     none = Estimate(0.0, 0.0, 0.0, "1")
     slope, delay_s = Estimate(-0.004, -0.005, -0.003, "1"), Estimate(2e-3, 1e-3, 3e-3, "s")
-    fit = ResponseFit(
-        one, slope, delay_s, none, None, one, hz, 0j * hz, np.full(12, 0.02), np.linspace(1.0, 0.4, 12), 1e-3
-    )
+    fit = ResponseFit(one, slope, delay_s, none, None, hz, 0j * hz, np.full(12, 0.02), np.linspace(1.0, 0.4, 12), 1e-3)
     return fit._replace(response=1.05 * fit.model(hz))
 
 

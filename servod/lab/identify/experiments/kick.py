@@ -24,8 +24,8 @@ TORQUE_RATIO, TORQUE_STEP, LEAST_STEP = 1.6, 1.25, 1.05
 #: A pulse twice as long that makes the joint no faster than by this factor is long enough, where the encoder shows the
 #: slower of both by so many counts.
 LEVELS_OFF, LEAST_COUNTS = 1.3, 4.0
-#: A stronger pulse is at first this many times shorter.
-SHORTER = 4
+#: A stronger pulse is at first this many times shorter, and is tried where so many times the speed is allowed.
+SHORTER, STEP_ROOM = 4, 2.0
 #: Shorter pulses are over before the fit can tell inertia from bristles; longer ones are no kicks.
 LEAST_S, LONGEST_S = 0.004, 1.0
 #: Fast enough: this share of the allowed speed, and so many counts per period.
@@ -39,7 +39,7 @@ LEAD_S, COAST_S = 0.05, 0.35
 
 @dataclass(frozen=True)
 class _Pulse:
-    """Torque against break-away, duration in periods, and the speed that the pulse before it reached."""
+    """Torque against break-away, duration in periods, and the speed that half of that reached; 0.0: not tried."""
 
     ratio: float = TORQUE_RATIO
     periods: int = 1
@@ -87,7 +87,8 @@ def _next(bench: Bench, kick: RecordedMotion, pulse: _Pulse, break_away_nm: floa
     factor = allowed / (GROWTH * reached) if reached > 0.0 else math.inf
     at_longest = 2 * pulse.periods * bench.period_s > LONGEST_S
     shown_rad_s = LEAST_COUNTS * bench.resolution_rad / (0.5 * SPEED_SPAN_S)
-    if at_longest or (shown_rad_s < pulse.before_rad_s and reached < LEVELS_OFF * pulse.before_rad_s):
+    levels_off = shown_rad_s < pulse.before_rad_s and reached < LEVELS_OFF * pulse.before_rad_s
+    if factor >= STEP_ROOM and (at_longest or levels_off):
         ratio = min(TORQUE_STEP * pulse.ratio, bench.bounds.torque_nm / break_away_nm)
         if ratio > LEAST_STEP * pulse.ratio:
             return _Pulse(ratio, 1 if at_longest else max(1, pulse.periods // SHORTER))
@@ -105,7 +106,7 @@ def _next(bench: Bench, kick: RecordedMotion, pulse: _Pulse, break_away_nm: floa
             "are to be too fast (--speed), its travel is too short (--travel, limits.position_min_rad and "
             "position_max_rad), or its encoder is too coarse"
         )
-    return _Pulse(pulse.ratio, longest, reached)
+    return _Pulse(pulse.ratio, longest, reached if longest == 2 * pulse.periods else 0.0)
 
 
 def _kick(bench: Bench, torque_nm: float, pulse: _Pulse) -> RecordedMotion:

@@ -260,7 +260,7 @@ def _worse(costs: Sequence[float], lines: _Lines, strokes: int, with_lag: Array)
     """Whether the response without lag is significantly worse than with one (F test on one more parameter)."""
     freedom = 2 * len(lines.frequency) - 4
     gain = (costs[0] - costs[1]) / max(costs[1] / freedom, 1.0 / strokes)
-    return with_lag[3] > 1e-4 and float(stats.f.sf(gain, 1, freedom)) < LAG_SIGNIFICANCE
+    return with_lag[3] > LEAST_UNSEEN_S and float(stats.f.sf(gain, 1, freedom)) < LAG_SIGNIFICANCE
 
 
 def _delay(value_s: float, spread_s: float, freedom: int, note: str, lag: Estimate) -> Estimate:
