@@ -116,7 +116,10 @@ def commissioned(kind: str, out: Path, limit_s: float) -> dict[str, Any]:
     except subprocess.TimeoutExpired:
         return {"failed": {"message": f"not ended after {limit_s:g} s"}}
     (out / f"{kind}.json").write_text(ended.stdout)
-    return dict(json.loads(ended.stdout))
+    try:
+        return dict(json.loads(ended.stdout))
+    except json.JSONDecodeError:
+        return {"failed": {"message": f"exit code {ended.returncode}: {ended.stderr[-160:]}"}}
 
 
 def row(kind: str, told: dict[str, Any]) -> str:
@@ -143,7 +146,10 @@ def main() -> None:
     parser.add_argument("--limit-s", type=float, default=1500.0, help="longest walk")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    kinds = [kind for kind in KINDS if kind in options.only.split(",")]
+    asked = options.only.split(",")
+    if unknown := sorted({*asked} - {*KINDS}):
+        parser.error(f"--only: found {', '.join(unknown)}; allowed: {', '.join(KINDS)}")
+    kinds = [kind for kind in KINDS if kind in asked]
 
     def walk(kind: str) -> dict[str, Any]:
         told = commissioned(kind, options.out, options.limit_s)

@@ -83,7 +83,7 @@ def write_refusal(walk: Walk, failed: StepFailed) -> Path | None:
     parts = dict(_refused(walk, failed.step))
     if not parts:
         return None
-    upto = next((k for k, (step, _, _) in enumerate(_MADE) if step == failed.step), len(_MADE))
+    upto = max((k for k, (step, _, _) in enumerate(_MADE) if step == failed.step), default=len(_MADE))
     made = {what: walk.path(name) for _, what, name in _MADE[: upto + 1]}
     origin = Origin(made, walk.axis.config, walk.axis.nodes(), _facts(walk) | {"step": failed.step})
     page = Page(

@@ -182,6 +182,7 @@ def test_a_walk_without_a_valid_set_has_a_page_that_says_why(folder: Path, tmp_p
         assert re.findall("<h2>(.*?)</h2>", text)[0].startswith(parts)
         failed = re.search('<tr class="failed"><th scope="row">(.*?)</th>', text)
         assert (failed and failed[1]) == (html.escape(found["checks"][3]["name"]) if step == "verify" else None)
+        assert ("deployment: " in text, "gain set: " in text) == ((step == "deploy"),) * 2
     assert "Deployment" not in text and "deployment: " not in text
     assert write_refusal(walk_in(tmp_path / "empty"), StepFailed("identify", "the axis does not move")) is None
 
@@ -212,7 +213,7 @@ def test_a_set_that_the_checks_refuse_gives_way_to_one_of_less_gain(folder: Path
 
     refuse("swings", 0.01)
     monkeypatch.setattr("servod.lab.commission.steps.synthesize.synthesize", lambda *_: Infeasible((), (), ()))
-    with pytest.raises(AnswerIsNo, match=r"^verify: not valid: swings, nor is one with less position gain$"):
+    with pytest.raises(AnswerIsNo, match=r"^verify: not valid: swings, and none with less position gain"):
         Verify().run(here)
     refused = failure(here, StepFailed("verify", "no"))["certificate"]["refused"]
     assert [entry["failed"] for entry in refused] == [["swings"], [NO_DESIGN], [NO_DESIGN]]

@@ -185,7 +185,7 @@ class Verify:
             if any(name.startswith(NOT_OF_GAIN) for name in failed):
                 break
         write_json(walk.path(CERTIFICATE), first | ladder_entry(LADDER[0], refused))
-        less_gain = ", nor is one with less position gain" if len(refused) > 1 else ""
+        less_gain = ", and none with less position gain was found or valid" if len(refused) > 1 else ""
         raise AnswerIsNo(f"verify: not valid: {'; '.join(refused[0]['failed'])}{less_gain}")
 
     def _ladder(self, walk: Walk) -> Iterator[tuple[float, GainSet | None]]:

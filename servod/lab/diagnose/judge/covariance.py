@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.lab.diagnose.effects import effect
-from servod.lab.diagnose.effects.base import TORQUES
+from servod.lab.diagnose.effects.base import KNOWN_WITHIN, TORQUES
 from servod.lab.diagnose.select.fit import Fit, Weighing, covariance, on_bound
 from servod.lab.diagnose.select.selection import HeldOutErrors
 from servod.lab.diagnose.settings import SETTINGS
@@ -70,6 +70,8 @@ def common_factor(fit: Fit) -> Array:
     for place in gains:
         along[fit.hypothesis.share(place)] = 1.0
     known = sum(unknowns[i].spread ** -2.0 for i in np.flatnonzero(scaled))
+    if fit.hypothesis.document["friction"]["kind"] == "local":  # a map is no unknown, and known as well as one
+        known += KNOWN_WITHIN**-2.0
     return np.asarray(np.outer(along, along) / max(known, 1e-12))
 
 

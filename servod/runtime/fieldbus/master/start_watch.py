@@ -34,7 +34,8 @@ class StartWatch:
         """Take what came; raises Unreachable for what this master did not send.
 
         `loop_began_ns` is asked behind the last frame. Once the loop has begun, cyclic frames may be its own, and it
-        hears those of others itself; whatever came before is nobody's of ours.
+        hears those of others itself; whatever came before is nobody's of ours, as far as the frames' stamps tell: an
+        adapter without stamps, or one that is a second late, gives the time of reading.
         """
         frames = []
         while (frame := self._bus.receive(0.0)) is not None:
