@@ -22,22 +22,13 @@ from typing import Any
 
 import yaml
 
-PLAIN: dict[str, Any] = {
-    "axis": "rotary",
-    "inertia": 0.001,
-    "delay_s": 0.001,
-    "friction": {
-        "kind": "lugre",
-        "sigma0": 950.0,
-        "sigma1": 1.0,
-        "viscous": 0.056,
-        "coulomb": 0.045,
-        "static": 0.06,
-        "stribeck_velocity": 0.1,
-    },
-    "asymmetry": {"positive_dry": 1.1, "negative_dry": 0.9},
-    "noise": {"torque_rms": 0.0003, "torque_bandwidth_hz": 200.0, "encoder_rms": 2e-6},
-}
+from servod.common.shipped import shipped
+
+#: The paper's joint with a flatter fall, friction that differs by direction, and noise.
+PLAIN: dict[str, Any] = yaml.safe_load(shipped("gains/axes/table1_joint.yaml").read_text(encoding="utf-8"))
+PLAIN["friction"]["static"] = 0.06
+PLAIN["asymmetry"] = {"positive_dry": 1.1, "negative_dry": 0.9}
+PLAIN["noise"] = {"torque_rms": 0.0003, "torque_bandwidth_hz": 200.0, "encoder_rms": 2e-6}
 #: What is in torques, and grows with the size of a joint.
 TORQUES = ("sigma0", "sigma1", "viscous", "coulomb", "static")
 

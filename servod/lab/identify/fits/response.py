@@ -204,9 +204,8 @@ def _sprung(lines: _Lines, strokes: Sequence[Stroke], inertia: float, rigid: Seq
         ),
         elastic.Elastic(*values),
     )
-    worse = 1.0 + float(stats.f.ppf(2.0 * LEVEL - 1.0, 1, 2 * len(lines.frequency) - 6)) / (
-        2 * len(lines.frequency) - 6
-    )
+    rows = 2 * len(lines.frequency) - len(joint)
+    worse = 1.0 + float(stats.f.ppf(2.0 * LEVEL - 1.0, 1, rows)) / rows
     longest = min(lines.period_s, float(values[2]))
     unseen = elastic.longest_lag_s(joint, lines.frequency, ratio, lines.deviation, lines.period_s, longest, worse)
     lag = Estimate(0.0, 0.0, max(min(LEAST_UNSEEN_S, longest), unseen), "s", NO_LAG)
