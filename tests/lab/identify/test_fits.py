@@ -222,10 +222,11 @@ def test_the_interval_of_the_torque_noise_is_the_scatter_of_the_strokes():
     assert once.half_width > 0.5 * once.value
 
 
+@pytest.mark.parametrize("seed", range(3, 8))
 @pytest.mark.parametrize("period_s", [0.004, 0.02])
-def test_torque_noise_is_told_of_a_slow_cycle_up_to_its_excited_lines(period_s):
-    """A stroke of a second has 50 samples at 20 ms, and lines up to a quarter of that."""
-    joint, count, rng = Rigid(1e-1, 0.6, 0.003, 0.0), round(1.0 / period_s), np.random.default_rng(3)
+def test_a_slow_cycle_tells_mass_and_torque_noise_up_to_its_excited_lines(period_s, seed):
+    """A stroke of a second has 50 samples at 20 ms, and lines up to a quarter of that: none tells of a spring."""
+    joint, count, rng = Rigid(1e-1, 0.6, 0.003, 0.0), round(1.0 / period_s), np.random.default_rng(seed)
     lines = np.arange(1, count // 4 + 1)
     wave = 0.02 * multisine(lines, lines / lines.max(), count, rng)
     frequency = np.fft.rfftfreq(count, period_s)
@@ -237,7 +238,10 @@ def test_torque_noise_is_told_of_a_slow_cycle_up_to_its_excited_lines(period_s):
     torque, position = np.append(np.tile(wave, 12), 0.0), np.concatenate([[0.0], np.cumsum(ways)])
     t = np.arange(len(torque)) * period_s
     trace = RecordedMotion(ExperimentKind.RESPONSE, t, torque, position, position, torque, torque, position, settings)
-    told = response.torque_noise(trace, response.fit(trace, 0.1), ())
+    fitted = response.fit(trace, 0.1)
+    assert fitted.resonance is None
+    assert fitted.inertia.value == pytest.approx(0.1, rel=0.01)
+    told = response.torque_noise(trace, fitted, ())
     assert told.value == pytest.approx(4e-4 * np.sqrt(min(40.0, lines[-1]) * 2.0 * period_s), rel=0.25)
 
 

@@ -177,11 +177,15 @@ def _choose(lines: _Lines, strokes: Sequence[Stroke], inertia: float) -> _Found:
 
 
 def _sprung(lines: _Lines, strokes: Sequence[Stroke], inertia: float, rigid: Sequence[Array]) -> _Found | None:
-    """Two masses with a spring, if they explain what the `rigid` joints leave, beyond where cogging disturbs."""
+    """Two masses with a spring, if they explain what the `rigid` joints leave, beyond where cogging disturbs.
+
+    A slow cycle has few lines there, or none: fewer numbers than two masses have tell nothing of them.
+    """
     upper, ratio = lines.frequency >= elastic.LOWEST_HZ, ratio_of(strokes)
     seen = _Lines(lines.frequency[upper], lines.deviation[upper], lines.period_s)
     rigid_cost = min(_cost(seen, ratio[upper], values) for values in rigid)
-    if rigid_cost < UNEXPLAINED * np.count_nonzero(upper):
+    count = int(np.count_nonzero(upper))
+    if 2 * count <= len(elastic.Elastic._fields) or rigid_cost < UNEXPLAINED * count:
         return None
     joint = elastic.solve(lines.frequency, ratio, lines.deviation, lines.period_s, inertia)
     error = elastic.response_of(joint, seen.frequency, seen.period_s) / ratio[upper] - 1.0
