@@ -8,10 +8,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from servod.formats.model.effects import Gravity
-from servod.lab.diagnose.effects.effect import Effect, share
+from servod.lab.diagnose.effects.effect import Effect, harmonic, share
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Term, get
 from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.search_context import SearchContext
+
+#: Way from which on a weight on a linkage may be told from one on an arm, rad: half a turn, a wave of twice its order.
+HALF_TURN = math.pi
+
+#: Waves in a turn of what a linkage adds.
+SECOND = 2.0
 
 
 def _add(document: Document, values: Sequence[float]) -> tuple[float, float]:
@@ -27,12 +33,25 @@ def _write(document: Document, values: Sequence[float]) -> None:
 
 
 def terms(scene: SearchContext) -> list[Term]:
-    """A weight, beside the one that the model has; none on a linear axis, where it would be an offset."""
+    """A weight, beside the one that the model has; none on a linear axis, where it would be an offset.
+
+    On a linkage it makes a second wave, which the model has as one of cogging. Nothing else repeats once in a turn.
+    """
     if scene.linear:
         return []
     most = 50.0 * max(scene.dry, scene.effort)
     size = max(scene.dry, 0.1 * scene.effort)
     starts = [(0.0, 0.0), _regressed(scene, most)]
+
+    def write_linkage(document: Document, values: Sequence[float]) -> None:
+        _write(document, values[:2])
+        rows = document.setdefault("cogging", {}).setdefault("harmonics", [])
+        rows.append(harmonic(scene, SECOND, math.hypot(*values[2:]), math.atan2(values[3], values[2])))
+
+    def tell_linkage(document: Document, values: Sequence[float]) -> list[Reported]:
+        second = Reported("amplitude_2", math.hypot(*values[2:]), scene.force)
+        turned = Reported("phase_2", math.atan2(values[3], values[2]), "rad")
+        return [*tell(document, values), second, turned]
 
     def tell(document: Document, _values: Sequence[float]) -> list[Reported]:
         units = {"amplitude": scene.force, "phase": "rad"}
@@ -42,6 +61,9 @@ def terms(scene: SearchContext) -> list[Term]:
     for sine, cosine in starts:
         unknowns = (share("sine", sine, -most, most, size), share("cosine", cosine, -most, most, size))
         found.append(Term("gravity", "weight", unknowns, _write, tell))
+    if scene.reach >= HALF_TURN:
+        waves = tuple(share(f"{part}_2", 0.0, -most, most, size) for part in ("sine", "cosine"))
+        found.append(Term("gravity", "weight on a linkage", (*unknowns, *waves), write_linkage, tell_linkage))
     return found
 
 
@@ -56,7 +78,7 @@ def _regressed(scene: SearchContext, most: float) -> tuple[float, float]:
 EFFECT = Effect(
     name="gravity",
     group=Gravity,
-    equation="resisting torque += amplitude*sin(x + phase)",
+    equation="resisting torque += amplitude*sin(x + phase), on a linkage + amplitude_2*sin(2*x + phase_2)",
     source="a mass m at radius r: amplitude = m*g*r",
     statement="A weight off the axis pulls on it",
     shows="one slow wave of the mismatch over a turn, the same in both directions and at every speed",
