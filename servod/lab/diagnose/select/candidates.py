@@ -22,6 +22,9 @@ from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
 
+#: Forms of one effect are alike on shortened data where what they leave differs by less than this share.
+ALIKE = 0.15
+
 
 @dataclass(frozen=True)
 class Candidate:
@@ -72,7 +75,9 @@ class CandidateFits:
         chosen = best_of_each(second, len(second), 1)
         limit = chosen[0].left + SETTINGS.trials.in_reach * max(1.0 - chosen[0].left, 0.0) if chosen else 0.0
         close = [c for c in chosen if c.left <= limit][: SETTINGS.trials.full_fits]
+        close += [c for c in second if any(_alike(c, other) for other in close)]
         fitted = sorted(in_parallel("starts", self._fit_fully, close), key=penalised_left)
+        fitted = best_of_each(fitted, len(fitted), 1)
         return fitted + [c for c in chosen if c.effect not in {f.effect for f in fitted}]
 
     def _starts(self, name: str) -> list[Candidate]:
@@ -113,6 +118,19 @@ class CandidateFits:
             self.whole.refresh_opened(begun), SETTINGS.trials.full_steps, known=self.present.jacobian.shape[1]
         )
         return Candidate(candidate.effect, fit, fit.cost / max(self.present.cost, 1e-30))
+
+
+def _alike(one: Candidate, other: Candidate) -> bool:
+    """Whether another form of the same effect does as well on shortened data, which do not tell what time does.
+
+    A push in one recording and one in every recording are the same where the others were cut.
+    """
+    forms = one.effect == other.effect and one.term.form != other.term.form
+    return (
+        forms
+        and effect(one.effect).look.coordinate == "time"
+        and abs(one.left - other.left) <= ALIKE * max(one.left, other.left)
+    )
 
 
 def penalised_left(candidate: Candidate) -> float:
