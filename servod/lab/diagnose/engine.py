@@ -1,8 +1,8 @@
 """The whole diagnosis: recordings and a model in, a finished result out.
 
 Stands between the command line and everything else here; writes nothing. The stages, in their order: recordings are
-loaded as traces, terms are selected (forward selection with backward elimination, swap, a group of small terms, a
-drift, nominal values restored, cross-validation), what is selected is judged, and the result is concluded.
+loaded as traces, terms are selected (forward selection with backward elimination, swap, other forms, a group of small
+terms, a drift, nominal values restored, cross-validation), what is selected is judged, and the result is concluded.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.result import Diagnosis, DiagnosisVerdict
 from servod.lab.diagnose.select.cross_validation import cross_validate
 from servod.lab.diagnose.select.drive import complete_drive
+from servod.lab.diagnose.select.forms import better_forms
 from servod.lab.diagnose.select.selection import Selection
 from servod.lab.diagnose.select.selector import Selector
 from servod.lab.diagnose.select.stepwise import (
@@ -90,6 +91,7 @@ def diagnose(
 def _selected(selector: Selector, selection: Selection) -> Selection:
     """The selection with all terms that are worth it, but those of effects that were rejected."""
     selection = swap_terms(selector, forward_selection(selector, selection))
+    selection = better_forms(selector, selection)
     if above_floor(selector, selection):
         selection = add_drift(selector, add_group(selector, selection))
     return selection
@@ -97,8 +99,9 @@ def _selected(selector: Selector, selection: Selection) -> Selection:
 
 def _judged(selector: Selector, selection: Selection) -> JudgedSelection:
     """The selection cross-validated and judged, and which of its terms are findings."""
-    selection = cross_validate(selector, restore_nominal(selector, selection))
-    return name_findings(selector, judge(selector, selection))
+    finer = selector.finer(selection.fit.model)
+    selection = cross_validate(finer, restore_nominal(finer, finer.anew(selection)))
+    return name_findings(finer, judge(finer, selection))
 
 
 def _verdict(judgement: JudgedSelection) -> tuple[DiagnosisVerdict, JudgedSelection]:

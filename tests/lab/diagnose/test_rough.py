@@ -25,17 +25,21 @@ ROWS = 400
 
 
 class RoughFitter(Fitter):
-    """A straight mismatch in as many directions as there are numbers, and blows in a few rows that come at random."""
+    """A straight mismatch in as many directions as there are numbers, and blows in a few rows that come at random.
 
-    def __init__(self, hypothesis: Hypothesis, truth: Array, blow: float) -> None:
+    They come and go `often` in a radian of each coordinate.
+    """
+
+    def __init__(self, hypothesis: Hypothesis, truth: Array, blow: float, often: float = 1e5, rows: int = 20) -> None:
         rng = np.random.default_rng(3)
         self._slopes, self._truth, self._blow = rng.normal(size=(ROWS, len(truth))), truth, blow
-        self._phases = rng.uniform(0.0, 6.0, size=(20, 1))
+        self._often, self._rows = often, rows
+        self._phases = rng.uniform(0.0, 6.0, size=(rows, 1))
         super().__init__(Predictor.__new__(Predictor), Weighing(1e-3, np.ones(ROWS)))
 
     def mismatch(self, hypothesis: Hypothesis, coordinates: Array) -> Array:
         off = self._slopes @ (coordinates - self._truth)
-        off[:20] += self._blow * np.sin(1e5 * coordinates + self._phases).mean(axis=1)
+        off[: self._rows] += self._blow * np.sin(self._often * coordinates + self._phases).mean(axis=1)
         return 0.1 * off
 
 

@@ -160,7 +160,7 @@ def command_rms(drive: Drive) -> float:
     return float(np.std(drive.torque))
 
 
-def observer(trace: CheckedTrace, inertia: float, rate: float) -> Observer:
+def observer(trace: CheckedTrace, inertia: float, rate: float, longest_s: float) -> Observer:
     """Gains that put both poles of the correction at `rate` rad/s, for each row's own step."""
     t_s = trace.drive.t_s
     step = np.append(np.diff(t_s), trace.period_s)
@@ -168,7 +168,7 @@ def observer(trace: CheckedTrace, inertia: float, rate: float) -> Observer:
     decay = np.exp(-SETTINGS.observer.poles_damping * rate * step)
     turn = np.cos(rate * step * math.sqrt(1.0 - SETTINGS.observer.poles_damping**2))
     velocity_gain = (1.0 - 2.0 * decay * turn + decay**2) / step
-    return Observer(rate, 1.0 - decay**2, velocity_gain, inertia * velocity_gain / step, _steps(trace, step))
+    return Observer(rate, 1.0 - decay**2, velocity_gain, inertia * velocity_gain / step, _steps(trace, step, longest_s))
 
 
 def starts_behind_gaps(trace: CheckedTrace, rate: float) -> NDArray[np.int64]:
@@ -182,24 +182,48 @@ def starts_behind_gaps(trace: CheckedTrace, rate: float) -> NDArray[np.int64]:
     return np.unique(np.concatenate([trace.starts, np.flatnonzero(step > lost) + 1])).astype(np.int64)
 
 
-def _steps(trace: CheckedTrace, step: Array) -> NDArray[np.int64]:
+def _steps(trace: CheckedTrace, step: Array, longest_s: float) -> NDArray[np.int64]:
     """Inner steps of each row: more around reversals, where friction turns over within a sample or two."""
-    base = np.ceil(step / SETTINGS.observer.longest_step_s).astype(np.int64)
+    base = np.ceil(step / longest_s).astype(np.int64)
     slow = np.abs(trace.velocity) < 2.5 * np.abs(trace.acceleration) * step
     return np.where(slow, np.maximum(base, SETTINGS.observer.steps_at_reversal), base)
 
 
-class Predictor:
-    """Mismatch of any model with fixed recordings, as the command that would close the gap."""
+#: In a step of what is told the model's fastest mode makes so much of a turn, rad; the shortest step is this long, s.
+FINE_TURN_RAD, FINEST_STEP_S = 0.6, 2.5e-4
 
-    def __init__(self, traces: Sequence[CheckedTrace], nominal: AxisModel, rate: float | None = None) -> None:
+
+def fine_step_s(model: AxisModel) -> float:
+    """Step that the fastest mode of a model asks for, of bristle or spring on the motor alone, s; within limits."""
+    p = model.pack().p
+    squared = (p.sigma0 + p.stiffness) / p.inertia
+    if p.load_inertia > 0.0:
+        squared += p.stiffness / p.load_inertia
+    turn = FINE_TURN_RAD / math.sqrt(max(squared, 1e-30))
+    return min(max(turn, FINEST_STEP_S), SETTINGS.observer.longest_step_s)
+
+
+class Predictor:
+    """Mismatch of any model with fixed recordings, as the command that would close the gap.
+
+    Models are simulated in steps of `longest_step_s` at most.
+    """
+
+    def __init__(
+        self,
+        traces: Sequence[CheckedTrace],
+        nominal: AxisModel,
+        rate: float | None = None,
+        longest_step_s: float = SETTINGS.observer.longest_step_s,
+    ) -> None:
         self.traces = tuple(traces)
         self.dry = dry_friction(nominal)
         self.inertia = nominal.inertia
         self.drive_torque = drive_factor(nominal)
         self.linear = nominal.axis is AxisKind.LINEAR
         self.rate = bandwidth(nominal.inertia, self.dry, traces, growth_rate(nominal, traces)) if rate is None else rate
-        self.observers = tuple(observer(trace, nominal.inertia, self.rate) for trace in self.traces)
+        self.longest_step_s = longest_step_s
+        self.observers = tuple(observer(trace, nominal.inertia, self.rate, longest_step_s) for trace in self.traces)
         ends = np.cumsum([len(trace.drive.t_s) for trace in self.traces])
         self.slices = tuple(slice(int(a), int(b)) for a, b in zip([0, *ends[:-1]], ends, strict=True))
         self.starts = tuple(starts_behind_gaps(trace, self.rate) for trace in self.traces)

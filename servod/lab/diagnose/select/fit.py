@@ -149,8 +149,10 @@ class Fitter:
 
     def _column(self, fit: Fit, index: int) -> Array:
         nudged = fit.coordinates.copy()
-        nudge = max(fit.hypothesis.unknowns[index].nudge, fit.span)
-        nudge = nudge if nudged[index] + nudge <= fit.hypothesis.bounds[1][index] else -nudge
+        low, high = (float(bound[index]) for bound in fit.hypothesis.bounds)
+        fine = fit.hypothesis.unknowns[index].nudge
+        nudge = max(fine, min(fit.span, 0.5 * (high - low)))
+        nudge = nudge if nudged[index] + nudge <= high else -nudge
         nudged[index] += nudge
         there = self.mismatch(fit.hypothesis, nudged)
         return np.zeros_like(fit.mismatch) if there is None else (there - fit.mismatch) / nudge

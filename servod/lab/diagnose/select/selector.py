@@ -20,7 +20,7 @@ from servod.lab.diagnose.effects.base import base_unknowns, document_of
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
 from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.predict.floor import above_noise, noise_floor, stretch_means
-from servod.lab.diagnose.predict.predict import Predictor, shorten
+from servod.lab.diagnose.predict.predict import Predictor, fine_step_s, shorten
 from servod.lab.diagnose.select.candidates import Candidate, CandidateFits
 from servod.lab.diagnose.select.fit import Fit, Fitter, Weighing, long_run, scale_of
 from servod.lab.diagnose.select.levels import is_another, is_level_change
@@ -33,6 +33,10 @@ Tell = Callable[[str], None]
 
 #: What every geared servo has, first of all.
 SERVO = ("delay", "goal_rate", "load_dependent_friction")
+
+#: Spans of the derivatives along which what is told is fitted, one after the other: fine ones of a rough mismatch end
+#: the fit far from its end.
+SPANS = 0.1, 0.03
 
 #: Whether a new term deserves to come in, by what it is worth and the fit with it.
 Deserves = Callable[[Merit, Fit], bool]
@@ -53,10 +57,37 @@ class Selector:
         unknown: frozenset[str] = frozenset(),
     ) -> None:
         self.predictor, self.deadline, self.tell = predictor, deadline, tell
-        self.nominal = nominal
+        self.nominal, self.unknown = nominal, unknown
         self.start = Hypothesis(document_of(nominal), base_unknowns(nominal, unknown))
         self.untried = unexcited_effects(predictor.traces, nominal.inertia) | fitted_elsewhere(unknown)
         self.rows = predictor.counts.astype(np.float64)
+
+    def finer(self, model: AxisModel) -> Selector:
+        """The same with simulations as fine as a model asks for, for what is told: what is tried may be off a little.
+
+        A bristle that turns by a radian within a step is another one, and parameters that make up for that are wrong.
+        """
+        step_s = fine_step_s(model)
+        if step_s >= min(self.predictor.longest_step_s, *(trace.period_s for trace in self.predictor.traces)):
+            return self
+        predictor = Predictor(self.predictor.traces, self.nominal, self.predictor.rate, step_s)
+        return Selector(predictor, self.nominal, self.deadline, self.tell, self.unknown)
+
+    def anew(self, selection: Selection) -> Selection:
+        """The selection by this predictor, with its fits polished."""
+        base = self.polished(selection.base)
+        fit = base if selection.fit is selection.base else self.polished(selection.fit)
+        error, floor = self.error(base.mismatch), noise_floor(self.predictor, base.mismatch)
+        return self.lower_floor(replace(selection, base=base, fit=fit, base_error=error, floor=floor), fit.mismatch)
+
+    def polished(self, fit: Fit) -> Fit:
+        """A fit fitted on along derivatives over wide spans, then over less wide ones; its Jacobian is fresh."""
+        begun = self.fitter(fit.mismatch).begin(fit.hypothesis, fit.coordinates)
+        if begun is None:
+            raise ValueError("a fit that makes no sense")
+        for span in SPANS:
+            begun = self._refined(replace(begun, span=span), begun.mismatch, 0)
+        return self.refresh(replace(begun, span=max(fit.span, SETTINGS.fit.wide)))
 
     def fitter(self, mismatch: Array) -> Fitter:
         """A fitter that counts costs in the scale of this mismatch."""

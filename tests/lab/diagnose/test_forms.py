@@ -1,0 +1,124 @@
+"""Which form of an effect is found, and how far a fit is carried before it is told."""
+
+from __future__ import annotations
+
+from time import monotonic
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from servod.formats.model.axis_model import AxisModel
+from servod.kernels.laws import LAWS
+from servod.lab.diagnose.data.intake import load_traces
+from servod.lab.diagnose.document import diagnosis_document
+from servod.lab.diagnose.effects import effect
+from servod.lab.diagnose.effects.base import base_unknowns, document_of
+from servod.lab.diagnose.effects.hypothesis import Hypothesis
+from servod.lab.diagnose.effects.search_context import SearchContext
+from servod.lab.diagnose.engine import diagnose
+from servod.lab.diagnose.predict.predict import Predictor, fine_step_s
+from servod.lab.diagnose.select.forms import better_forms
+from servod.lab.diagnose.select.selection import TermEntry
+from servod.lab.diagnose.select.selector import Selector
+from servod.lab.diagnose.settings import SETTINGS
+from servod.lab.recordings import Recording
+from servod.lab.simulate.simulate import LoopSettings, simulate_closed_loop
+from tests.lab.diagnose.axes import BELIEVED, GAINS, believed, record, recording, references, rows
+from tests.lab.diagnose.test_rough import ROWS, RoughFitter
+
+Array = NDArray[np.float64]
+
+
+def selector_of(made: list[Recording], model: AxisModel) -> Selector:
+    traces, _ = load_traces(made, model)
+    return Selector(Predictor(traces, model), model, monotonic() + 600.0, lambda _line: None)
+
+
+def test_a_spring_is_straight_where_it_is_fitted_as_one_that_stiffens() -> None:
+    selector = selector_of(record(believed(spring={"stiffness": 0.1, "rest": 0.1}), seconds=3.0), believed())
+    selection = selector.fit_base()
+    scene = SearchContext(selector.start.document, selector.predictor, selection.fit.mismatch)
+    stiffening = next(term for term in effect("spring").terms(scene) if term.form == "stiffening")
+    hypothesis = selection.fit.hypothesis.with_term(stiffening)
+    fit = selector.settle(hypothesis, hypothesis.beside(selection.fit.coordinates), selection.fit.mismatch)
+    merit = selector.merit(selection, selection.fit, fit)
+    found = better_forms(selector, selection.with_term(fit, merit, TermEntry(0.1, ())))
+    assert [term.form for term in found.fit.hypothesis.terms] == ["straight"]
+    assert found.fit.model.spring is not None
+    assert found.fit.model.spring.stiffness == pytest.approx(0.1, rel=0.02)
+
+
+class RoughSelector(Selector):
+    """A selector of one rough mismatch, whatever the recordings."""
+
+    def __init__(self, rough: RoughFitter) -> None:
+        self._rough = rough
+
+    def fitter(self, _mismatch: Array) -> RoughFitter:
+        return self._rough
+
+
+def test_what_is_told_is_fitted_further_than_fine_differences_lead() -> None:
+    hypothesis = Hypothesis(document_of(believed()), base_unknowns(believed()))
+    truth = hypothesis.start + 0.05
+    selector = RoughSelector(RoughFitter(hypothesis, truth, 3.0, 100.0, ROWS))
+    settled = selector.settle(hypothesis, None, np.zeros(ROWS))
+    assert selector.polished(settled).cost < 0.7 * settled.cost
+
+
+def test_a_stiff_bristle_is_simulated_in_steps_that_it_asks_for() -> None:
+    """In steps of a sample it is another bristle, and a softer one would make less of a mismatch than its own."""
+    own = BELIEVED["friction"] | {"sigma0": 2e4, "sigma1": 5.0}
+    model = believed(inertia=0.004, friction=own)
+    traces, _ = load_traces(record(model, seconds=2.0, noise=1e-5), model)
+
+    def mismatch(step_s: float) -> Array:
+        return Predictor(traces, model, None, step_s).mismatch(model)
+
+    finest = mismatch(5e-5)
+    fine, coarse = (
+        float(np.sqrt(np.mean((mismatch(step_s) - finest) ** 2)))
+        for step_s in (fine_step_s(model), SETTINGS.observer.longest_step_s)
+    )
+    assert fine < 0.4 * coarse
+    assert fine_step_s(believed(inertia=20.0)) == SETTINGS.observer.longest_step_s
+
+
+def findings(made: list[Recording]) -> dict[str, Any]:
+    document = diagnosis_document(diagnose(believed(), made))
+    return {finding["effect"]: finding for finding in document["findings"]}
+
+
+def test_a_weight_on_a_linkage_is_no_cogging() -> None:
+    """It pulls with a second wave in a turn, which two sines of cogging have as well."""
+    second = {"amplitude": 0.02, "periods_per_turn": 2.0, "phase": 0.4}
+    model = believed(gravity={"amplitude": 0.15, "phase": 0.7}, cogging={"harmonics": [second]})
+    made = []
+    for index, reference in enumerate(references(5.0)):
+        run = simulate_closed_loop(
+            model, LAWS["pd"], GAINS, rows(4.0 * reference[:, 0]), LoopSettings(counts_per_turn=2.0**20)
+        )
+        made.append(recording(run.t_s, run.torque_nm, run.encoder_rad, f"run{index}.csv"))
+    found = findings(made)
+    assert list(found) == ["gravity"]
+    values = {name: value["value"] for name, value in found["gravity"]["parameters"].items()}
+    assert values["amplitude"] == pytest.approx(0.15, rel=0.02)
+    assert values["amplitude_2"] == pytest.approx(0.02, rel=0.1)
+
+
+def test_a_push_in_one_recording_is_told_of_it_alone() -> None:
+    made = record(believed(), seconds=12.0)
+    reference, push = references(12.0)[2], np.zeros(12_000)
+    push[2_300:4_900] = -0.05
+    noise = 0.001 * np.random.default_rng(9).normal(size=len(reference))
+    run = simulate_closed_loop(
+        believed(), LAWS["pd"], GAINS, reference, LoopSettings(counts_per_turn=2.0**20),
+        external_nm=noise + push[: len(reference)],
+    )  # fmt: skip
+    made[2] = recording(run.t_s, run.torque_nm, run.encoder_rad, "run2.csv")
+    found = findings(made)
+    assert list(found) == ["disturbance"]
+    assert found["disturbance"]["form"] == ["in one recording"]
+    assert abs(found["disturbance"]["parameters"]["torque"]["value"]) == pytest.approx(0.05, rel=0.05)
