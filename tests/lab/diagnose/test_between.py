@@ -12,6 +12,7 @@ from servod.formats.model.axis_model import AxisModel
 from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.base import base_unknowns, document_of
+from servod.lab.diagnose.effects.effect import scale_friction
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
 from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.effects.thermal import STILL_TO_GO
@@ -112,3 +113,19 @@ def test_a_row_acts_under_the_mean_of_its_commands() -> None:
     row, command = mean_command(t, torque, 0.0, -1, 0.25e-3, 1e-3, 2e-3)
     assert row == 1
     assert command == pytest.approx(0.25 * 1.0 + 0.75 * 3.0)
+
+
+def test_both_parts_of_a_map_go_on_from_recording_to_recording() -> None:
+    """The torques of a map have dry and viscous friction in them: each part by its own factor."""
+    document: dict[str, Any] = {
+        "friction": {"kind": "local", "viscous": 0.5, "velocities": [-2.0, -0.1, 0.1, 2.0]}
+        | {"torques": [-2.0, -1.05, 1.05, 2.0]}
+    }
+    scale_friction(document, 1.2, 2.0)
+    assert document["friction"]["viscous"] == 1.0
+    assert document["friction"]["torques"] == pytest.approx([-3.2, -1.3, 1.3, 3.2])
+    scene = in_order(1.0, 1.1, 1.2)
+    term = next(term for term in effect("thermal").terms(scene) if term.form == BETWEEN)
+    assert term.each is not None
+    term.each(document, (0.0, 0.0, 0.5, 0.0), 2)
+    assert document["friction"]["torques"] == pytest.approx([-3.8, -1.9, 1.9, 3.8])

@@ -129,6 +129,19 @@ def level_factor() -> Unknown:
     return Unknown(LEVEL, "1", 1.0, 1.0 / LEVEL_MOST, LEVEL_MOST, spread=math.log(LEVEL_KNOWN))
 
 
+def scale_friction(document: Document, dry: float, viscous: float) -> None:
+    """Dry and viscous friction of a document times these factors; the torques of a map have both in them."""
+    law = document["friction"]
+    if law["kind"] == "local":
+        parts = [law.get("viscous", 0.0) * v for v in law["velocities"]]
+        law["torques"] = [
+            t + (dry - 1.0) * (t - part) + (viscous - 1.0) * part for t, part in zip(law["torques"], parts, strict=True)
+        ]
+    for key, factor in (("coulomb", dry), ("static", dry), ("viscous", viscous)):
+        if key in law:
+            law[key] *= factor
+
+
 #: The torques of a friction map, dry and viscous together.
 MAP = "friction.torques"
 
@@ -137,14 +150,7 @@ def map_level(effect: str, dry: bool) -> Term:
     """A factor on the dry or on the viscous part of a friction map, whose torques have both in them."""
 
     def write(document: Document, values: Sequence[float]) -> None:
-        law = document["friction"]
-        viscous, change = law.get("viscous", 0.0), values[0] - 1.0
-        parts = [viscous * v for v in law["velocities"]]
-        if dry:
-            law["torques"] = [t + change * (t - part) for t, part in zip(law["torques"], parts, strict=True)]
-        else:
-            law["torques"] = [t + change * part for t, part in zip(law["torques"], parts, strict=True)]
-            law["viscous"] = values[0] * viscous
+        scale_friction(document, *((values[0], 1.0) if dry else (1.0, values[0])))
 
     def tell(_document: Document, values: Sequence[float]) -> list[Reported]:
         return [Reported("over_model", values[0], "1")]

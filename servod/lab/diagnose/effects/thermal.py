@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from servod.formats.model.friction import Thermal
-from servod.lab.diagnose.effects.effect import Effect, report_as_is, share, simple
+from servod.lab.diagnose.effects.effect import Effect, report_as_is, scale_friction, share, simple
 from servod.lab.diagnose.effects.hypothesis import Document, Term, Unknown
 from servod.lab.diagnose.effects.looks import Look, Split
 from servod.lab.diagnose.effects.search_context import SearchContext
@@ -53,9 +53,7 @@ def _between(drifts: list[Unknown], recordings: int) -> Term:
     def each(document: Document, values: Sequence[float], recording: int) -> None:
         dry, viscous = values[2:]
         reached = (1.0 - STILL_TO_GO**recording) / (1.0 - STILL_TO_GO ** (recordings - 1))
-        for key, more in (("coulomb", dry), ("static", dry), ("viscous", viscous)):
-            if key in document["friction"]:
-                document["friction"][key] *= 1.0 + more * reached
+        scale_friction(document, 1.0 + dry * reached, 1.0 + viscous * reached)
 
     drift = simple("thermal", "drift", drifts)
 

@@ -21,6 +21,7 @@ from servod.formats.model.axis_model import AxisModel
 from servod.formats.model.drive import DriveLaw
 from servod.lab.diagnose.data.trace import dry_friction
 from servod.lab.diagnose.effects.base import document_of
+from servod.lab.diagnose.effects.effect import scale_friction
 from servod.lab.diagnose.effects.hypothesis import get, put
 from servod.lab.recordings import Recording
 from servod.lab.simulate.replay import Drive, replay, switched_on
@@ -197,13 +198,10 @@ def _plain(model: AxisModel, key: str, numbers: dict[str, float], rate: float | 
     """The model with its own values by these numbers, and what may stand in the way beside."""
     document, law = document_of(model), model.drive
     put(document, f"drive.{key}", get(document, f"drive.{key}") * np.exp(numbers["value"]))
-    for name, by in (("viscous", "viscous"), ("coulomb", "dry"), ("static", "dry")):
-        if get(document, f"friction.{name}") > 0.0:
-            put(document, f"friction.{name}", get(document, f"friction.{name}") * np.exp(numbers[by]))
+    viscous, emf = float(np.exp(numbers["viscous"])), numbers.get("emf", 0.0)
     if "emf" in numbers:
-        whole = get(document, "friction.viscous")
-        put(document, "friction.viscous", (1.0 - numbers["emf"]) * whole)
-        put(document, "drive.emf_viscous", numbers["emf"] * whole)
+        put(document, "drive.emf_viscous", emf * viscous * get(document, "friction.viscous"))
+    scale_friction(document, float(np.exp(numbers["dry"])), (1.0 - emf) * viscous)
     if model.gravity is not None:
         put(document, "gravity.amplitude", get(document, "gravity.amplitude") * np.exp(numbers["weight"]))
     if rate is not None and law is not None and law.goal_rate is None:
