@@ -5,6 +5,7 @@ Behind `--plant`. Only the size of the drive is taken from the plant; everything
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 from servod.client.stepped import SteppedAxis, SteppedSession
@@ -13,8 +14,9 @@ from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.drivers.virtual.world import SteppedWorld
 from servod.formats.config import AxisConfig
 from servod.formats.gains.gain_set import GainSet
-from servod.formats.model.axis_model import AxisModel
+from servod.formats.model.axis_model import AxisModel, CoulombViscousFriction
 from servod.kernels.laws import LAWS
+from servod.kernels.physics.plant import Plant
 
 #: Rated torque of the drive over the joint's static friction, and peak over rated, as of the demo's axis.
 RATED_RATIO, PEAK_RATIO = 1.43, 3.0
@@ -23,6 +25,8 @@ RATE_PER_S = 1000.0
 #: A configured rated torque within this factor of what suits is taken for the drive's; any other is a wrong scale.
 ALIKE = 5.0
 ENCODER_COUNTS = 1_048_576
+#: A joint rests that moves by less within this time; it was held where it is still that near to where it began.
+REST_S, REST_TRIES, RESTS_RAD, HOLDS_RAD = 0.5, 60, 1e-6, 0.01
 SPEED_RAD_S, TRAVEL_RAD, FOLLOWING_RAD, MISMATCH_RAD = 3.0, 3.0, 0.5, 0.05
 
 
@@ -77,12 +81,40 @@ def virtual_session(
     """
     rated = rated_torque_mnm(plant)
     config = config or virtual_config(folder, rated, encoder_counts or ENCODER_COUNTS)
-    settings = settings or _devices(config, rated, encoder_counts, seed)
+    settings = settings or _devices(config, rated, encoder_counts, seed, resting_rad(plant))
     law = LAWS["pd"]
     return SteppedSession(config, SteppedWorld(settings, plant), law.number, (0.0,) * law.n_parameters)
 
 
-def _devices(config: AxisConfig, rated_mnm: int, encoder_counts: int | None, seed: int) -> VirtualAxisSettings:
+def resting_rad(plant: AxisModel) -> float:
+    """Where the joint rests without torque, rad: at zero where friction holds it, else at its lowest point.
+
+    A weight above friction hangs when somebody comes to switch the axis on. Where it fell to it would be held by
+    friction's last bit, and slide on at the first touch; whoever touches it leaves it where nothing pulls.
+    """
+    still = plant.model_copy(update={"noise": None, "disturbance": None})
+    if abs(_fallen_rad(still)) < HOLDS_RAD or still.gravity is None:
+        return 0.0
+    critical = 2.0 * math.sqrt(abs(still.gravity.amplitude) * still.inertia)
+    damped = CoulombViscousFriction(kind="coulomb_viscous", viscous=critical)
+    pulls = {key: getattr(still, key) for key in ("gravity", "spring", "torque_offset")}
+    return _fallen_rad(AxisModel(inertia=still.inertia, friction=damped, **pulls))
+
+
+def _fallen_rad(plant: AxisModel) -> float:
+    """Where the joint comes to rest that begins at zero, rad."""
+    joint = Plant(plant)
+    for _ in range(REST_TRIES):
+        before = joint.position_rad
+        joint.advance(0.0, REST_S)
+        if abs(joint.position_rad - before) < RESTS_RAD:
+            break
+    return joint.position_rad
+
+
+def _devices(
+    config: AxisConfig, rated_mnm: int, encoder_counts: int | None, seed: int, start_rad: float
+) -> VirtualAxisSettings:
     """Node ids, bus and encoder of the configuration, and a drive that suits the joint."""
     wanted = config.amplifier.rated_torque_mnm
     if wanted is not None and rated_mnm / ALIKE <= wanted <= rated_mnm * ALIKE:
@@ -95,6 +127,7 @@ def _devices(config: AxisConfig, rated_mnm: int, encoder_counts: int | None, see
         cycle_period_s=config.cycle.period_us * 1e-6,
         bit_rate=config.bus.bit_rate,
         seed=seed,
+        start_position_rad=start_rad,
     )
 
 
