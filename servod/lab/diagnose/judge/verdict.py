@@ -69,6 +69,10 @@ def without_event(predictor: Predictor, mismatch: Array) -> NDArray[np.bool_]:
     return kept if kept.any() else predictor.counts
 
 
+#: Names that remove less than this share of the explainable error explain nothing of it.
+LEAST_REMOVED = 0.05
+
+
 def verdict(named: Sequence[int], errors: Shares, dry: float, *, driven: bool = False) -> DiagnosisVerdict:
     """The verdict on what was named (places of terms) and what is left.
 
@@ -80,6 +84,8 @@ def verdict(named: Sequence[int], errors: Shares, dry: float, *, driven: bool = 
         SETTINGS.verdict.least_beside_much if left > SETTINGS.verdict.much_torque else SETTINGS.verdict.least_explained
     )
     least = SETTINGS.verdict.least_by_drive if driven else least
+    if named and errors.removed < LEAST_REMOVED:
+        return DiagnosisVerdict.UNEXPLAINED
     if much and (not named or errors.removed < least):
         return DiagnosisVerdict.UNEXPLAINED
     return DiagnosisVerdict.MISSING_PHYSICS if named else DiagnosisVerdict.ADEQUATE
