@@ -91,7 +91,9 @@ def diagnose(
 def _selected(selector: Selector, selection: Selection) -> Selection:
     """The selection with all terms that are worth it, but those of effects that were rejected."""
     selection = swap_terms(selector, forward_selection(selector, selection))
-    selection = better_forms(selector, selection)
+    better = better_forms(selector, selection)
+    if better is not selection:  # what another form had taken may be something else's
+        selection = forward_selection(selector, better)
     if above_floor(selector, selection):
         selection = add_drift(selector, add_group(selector, selection))
     return selection

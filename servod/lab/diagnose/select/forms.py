@@ -60,12 +60,12 @@ def _other_forms(selector: Selector, selection: Selection, place: int) -> list[F
     """The fit with each other form of one of its terms, fitted to its end; the fewest numbers first."""
     present = selection.fit
     own, found = present.hypothesis.terms[place], list[Fit]()
-    scene = SearchContext(
-        selector.start.document,
-        selector.predictor,
-        present.mismatch,
-        present=present.hypothesis.written(present.coordinates),
-    )
+    kept = np.delete(present.coordinates, present.hypothesis.share(place))
+    without = selector.fitter(present.mismatch).mismatch(present.hypothesis.without(place), kept)
+    if without is None:
+        return found
+    document = present.hypothesis.without(place).written(kept)
+    scene = SearchContext(selector.start.document, selector.predictor, without, present=document)
     forms = {term.form: term for term in reversed(effect(own.effect).terms(scene)) if term.each is None}
     for term in sorted(forms.values(), key=lambda term: term.numbers):
         if term.form == own.form or monotonic() > selector.deadline:
