@@ -97,8 +97,14 @@ def resting_rad(plant: AxisModel) -> float:
         return 0.0
     critical = 2.0 * math.sqrt(abs(still.gravity.amplitude) * still.inertia)
     damped = CoulombViscousFriction(kind="coulomb_viscous", viscous=critical)
-    pulls = {key: getattr(still, key) for key in ("gravity", "spring", "torque_offset")}
-    return _fallen_rad(AxisModel(inertia=still.inertia, friction=damped, **pulls))
+    hung = AxisModel(
+        inertia=still.inertia,
+        friction=damped,
+        gravity=still.gravity,
+        spring=still.spring,
+        torque_offset=still.torque_offset,
+    )
+    return _fallen_rad(hung)
 
 
 def _fallen_rad(plant: AxisModel) -> float:
