@@ -89,22 +89,21 @@ def virtual_session(
 def resting_rad(plant: AxisModel) -> float:
     """Where the joint rests without torque, rad: at zero where friction holds it, else at its lowest point.
 
-    A weight above friction hangs when somebody comes to switch the axis on. Where it fell to it would be held by
-    friction's last bit, and slide on at the first touch; whoever touches it leaves it where nothing pulls.
+    A weight or a spring above friction has pulled the joint away when somebody comes to switch the axis on. Where it
+    fell to it would be held by friction's last bit, and slide on at the first touch; whoever touches it leaves it where
+    nothing pulls.
     """
+    weight, spring = plant.gravity, plant.spring
+    stiffness = (abs(weight.amplitude) if weight else 0.0) + (spring.stiffness if spring else 0.0)
     still = plant.model_copy(update={"noise": None, "disturbance": None})
-    if abs(_fallen_rad(still)) < HOLDS_RAD or still.gravity is None:
+    if stiffness == 0.0 or abs(_fallen_rad(still)) < HOLDS_RAD:
         return 0.0
-    critical = 2.0 * math.sqrt(abs(still.gravity.amplitude) * still.inertia)
+    critical = 2.0 * math.sqrt(stiffness * plant.inertia)
     damped = CoulombViscousFriction(kind="coulomb_viscous", viscous=critical)
-    hung = AxisModel(
-        inertia=still.inertia,
-        friction=damped,
-        gravity=still.gravity,
-        spring=still.spring,
-        torque_offset=still.torque_offset,
+    offset = plant.torque_offset
+    return _fallen_rad(
+        AxisModel(inertia=plant.inertia, friction=damped, gravity=weight, spring=spring, torque_offset=offset)
     )
-    return _fallen_rad(hung)
 
 
 def _fallen_rad(plant: AxisModel) -> float:

@@ -29,6 +29,14 @@ def test_a_weight_above_friction_hangs_at_its_lowest_point():
     assert resting_rad(offset) == pytest.approx(-0.8 - math.asin(0.03 / 0.12), abs=1e-3)
 
 
+def test_a_spring_above_friction_has_pulled_the_joint_to_where_it_rests():
+    none = {"amplitude": 0.0, "phase": 0.0}
+    assert resting_rad(weighted(0.0, gravity=none, spring={"stiffness": 0.5, "rest": 0.4})) == pytest.approx(
+        0.4, abs=1e-3
+    )
+    assert resting_rad(weighted(0.0, gravity=none, spring={"stiffness": 0.1, "rest": 0.4})) == 0.0
+
+
 def test_an_axis_with_a_weight_above_friction_can_be_enabled(tmp_path):
     session = virtual_session(weighted(0.12), tmp_path, None, 1)
     session.enable()

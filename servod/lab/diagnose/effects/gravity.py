@@ -35,7 +35,7 @@ def _write(document: Document, values: Sequence[float]) -> None:
 def terms(scene: SearchContext) -> list[Term]:
     """A weight, beside the one that the model has; none on a linear axis, where it would be an offset.
 
-    On a linkage it makes a second wave, which the model has as one of cogging. Nothing else repeats once in a turn.
+    On a linkage it makes a second wave, which the model has as one of cogging.
     """
     if scene.linear:
         return []

@@ -18,7 +18,7 @@ from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.select.selection import Selection
 from servod.lab.diagnose.select.selector import Selector
-from servod.lab.diagnose.select.stepwise import backward_elimination
+from servod.lab.diagnose.select.stepwise import judged_anew, settled
 from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
@@ -36,16 +36,9 @@ def better_forms(selector: Selector, selection: Selection) -> Selection:
                 merit = selector.merit(selection, selector.settle_without(fit, place), fit)
                 if selector.may_enter(selection, merit, fit, place):
                     selection = replace(selection.with_merit(place, merit), fit=fit)
-    return selection if selection.fit is before else _settled(selector, selection)
-
-
-def _settled(selector: Selector, selection: Selection) -> Selection:
-    """Every term judged anew, and those gone whose work the others now do."""
-    selection = backward_elimination(selector, selector.lower_floor(selection, selection.fit.mismatch))
-    last = selection.terms - 1
-    return selection.with_merit(
-        last, selector.merit(selection, selector.settle_without(selection.fit, last), selection.fit)
-    )
+    if selection.fit is before:
+        return selection
+    return judged_anew(selector, selector.lower_floor(selection, selection.fit.mismatch))
 
 
 def _cost(selector: Selector, present: Fit, fit: Fit) -> float:
@@ -73,16 +66,9 @@ def _other_forms(selector: Selector, selection: Selection, place: int) -> list[F
         terms = tuple(term if index == place else other for index, other in enumerate(present.hypothesis.terms))
         hypothesis = replace(present.hypothesis, terms=terms)
         starts = _starts(present, hypothesis, place, far=effect(own.effect).far)
-        fits = [fit for at in starts if (fit := _settle(selector, hypothesis, at, present.mismatch)) is not None]
+        fits = [fit for at in starts if (fit := settled(selector, hypothesis, at, present.mismatch)) is not None]
         found += sorted(fits, key=lambda fit: _cost(selector, present, fit))[:1]
     return found
-
-
-def _settle(selector: Selector, hypothesis: Hypothesis, at: Array, mismatch: Array) -> Fit | None:
-    try:
-        return selector.settle(hypothesis, at, mismatch)
-    except ValueError:
-        return None
 
 
 def _starts(present: Fit, hypothesis: Hypothesis, place: int, far: bool) -> list[Array]:

@@ -114,8 +114,11 @@ def swap_terms(selector: Selector, selection: Selection) -> Selection:
             if swapped is not None:
                 selection = swapped
                 break
-    if selection.fit is before:
-        return selection
+    return selection if selection.fit is before else judged_anew(selector, selection)
+
+
+def judged_anew(selector: Selector, selection: Selection) -> Selection:
+    """Every term judged beside what changed, and those gone whose work the others now do."""
     selection = backward_elimination(selector, selection)
     last = selection.terms - 1
     reduced = selector.settle_without(selection.fit, last)
@@ -161,9 +164,13 @@ def _instead(selector: Selector, fit: Fit, index: int, rival: Candidate) -> Fit 
     terms = list(fit.hypothesis.terms)
     terms[index] = rival.term
     hypothesis = replace(fit.hypothesis, terms=tuple(terms))
-    at = _coordinates(fit, hypothesis, index, rival)
+    return settled(selector, hypothesis, _coordinates(fit, hypothesis, index, rival), fit.mismatch)
+
+
+def settled(selector: Selector, hypothesis: Hypothesis, at: Array, mismatch: Array) -> Fit | None:
+    """The hypothesis fitted from these coordinates; None where it makes no sense there."""
     try:
-        return selector.settle(hypothesis, at, fit.mismatch)
+        return selector.settle(hypothesis, at, mismatch)
     except ValueError:
         return None
 
