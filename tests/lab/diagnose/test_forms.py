@@ -91,21 +91,67 @@ def findings(made: list[Recording]) -> dict[str, Any]:
     return {finding["effect"]: finding for finding in document["findings"]}
 
 
-def test_a_weight_on_a_linkage_is_no_cogging() -> None:
-    """It pulls with a second wave in a turn, which two sines of cogging have as well."""
-    second = {"amplitude": 0.02, "periods_per_turn": 2.0, "phase": 0.4}
-    model = believed(gravity={"amplitude": 0.15, "phase": 0.7}, cogging={"harmonics": [second]})
+def swung(model: AxisModel, seconds: float = 5.0) -> list[Recording]:
+    """Recordings of an axis that travels more than half a turn."""
     made = []
-    for index, reference in enumerate(references(5.0)):
+    for index, reference in enumerate(references(seconds)):
         run = simulate_closed_loop(
             model, LAWS["pd"], GAINS, rows(4.0 * reference[:, 0]), LoopSettings(counts_per_turn=2.0**20)
         )
         made.append(recording(run.t_s, run.torque_nm, run.encoder_rad, f"run{index}.csv"))
-    found = findings(made)
+    return made
+
+
+def test_a_weight_on_a_linkage_is_no_cogging() -> None:
+    """It pulls with a second wave in a turn, which two sines of cogging have as well."""
+    second = {"amplitude": 0.02, "periods_per_turn": 2.0, "phase": 0.4}
+    found = findings(swung(believed(gravity={"amplitude": 0.15, "phase": 0.7}, cogging={"harmonics": [second]})))
     assert list(found) == ["gravity"]
     values = {name: value["value"] for name, value in found["gravity"]["parameters"].items()}
     assert values["amplitude"] == pytest.approx(0.15, rel=0.02)
     assert values["amplitude_2"] == pytest.approx(0.02, rel=0.1)
+
+
+def test_two_waves_in_a_turn_without_a_weight_are_cogging() -> None:
+    wave = {"amplitude": 0.1, "periods_per_turn": 2.0, "phase": 0.6}
+    found = findings(swung(believed(cogging={"harmonics": [wave]}), 4.0))
+    assert list(found) == ["cogging"]
+    assert found["cogging"]["parameters"]["amplitude"]["value"] == pytest.approx(0.1, rel=0.02)
+
+
+def test_one_wave_in_a_turn_is_never_cogging() -> None:
+    """Its order is searched from peaks beside once in a turn, and would be pulled there."""
+    selector = selector_of(swung(believed(gravity={"amplitude": 0.9, "phase": -1.2}), 3.0), believed())
+    left = selector.predictor.mismatch(believed())
+    for term in effect("cogging").terms(SearchContext(selector.start.document, selector.predictor, left)):
+        orders = [unknown for unknown in term.unknowns if unknown.key == "n"]
+        assert all(not order.low < 1.0 < order.high for order in orders)
+
+
+def test_friction_that_drifts_until_it_has_arrived_is_told_with_its_time() -> None:
+    found = findings(record(believed(thermal={"dry_per_s": -0.1, "viscous_per_s": -0.05, "drift_time_s": 4.0}), 8.0))
+    assert list(found) == ["thermal"]
+    values = {name: value["value"] for name, value in found["thermal"]["parameters"].items()}
+    assert values["dry_per_s"] == pytest.approx(-0.1, rel=0.05)
+    assert values["drift_time_s"] == pytest.approx(4.0, rel=0.1)
+
+
+def test_a_spring_far_above_the_observers_bandwidth_is_found() -> None:
+    """A load of 40 % of the motor's inertia at 100 Hz, pushed by blows that hold that frequency."""
+    load, motor, rate = 0.02 * 0.4 / 1.4, 0.02 / 1.4, 2.0 * np.pi * 100.0
+    reduced = load * motor / (load + motor)
+    model = believed(
+        joint_elasticity={"load_inertia": load, "stiffness": reduced * rate**2, "damping": 0.05 * reduced * rate}
+    )
+    made, rng = [], np.random.default_rng(4)
+    for index, reference in enumerate(references(5.0)):
+        blows = 0.3 * np.repeat(rng.choice([-1.0, 1.0], len(reference) // 5 + 1), 5)[: len(reference)]
+        kicked = reference + np.outer(blows / GAINS[1], [0.0, 1.0, 0.0])
+        run = simulate_closed_loop(model, LAWS["pd"], GAINS, kicked, LoopSettings(counts_per_turn=2.0**20))
+        made.append(recording(run.t_s, run.torque_nm, run.encoder_rad, f"run{index}.csv"))
+    found = findings(made)
+    assert list(found) == ["joint_elasticity"]
+    assert found["joint_elasticity"]["parameters"]["load_inertia"]["value"] == pytest.approx(load, rel=0.1)
 
 
 def test_a_push_in_one_recording_is_told_of_it_alone() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from servod.formats.model.effects import Cogging
 from servod.lab.diagnose.effects.effect import Effect, harmonic, report_sines, sine_term
 from servod.lab.diagnose.effects.hypothesis import Document, Reported, Term, Unknown
 from servod.lab.diagnose.effects.looks import Look
-from servod.lab.diagnose.effects.search_context import SearchContext
+from servod.lab.diagnose.effects.search_context import Peak, SearchContext
 
 Array = NDArray[np.float64]
 
@@ -20,26 +21,45 @@ Array = NDArray[np.float64]
 #: least that make a comb, and the share of the mismatch that each must take.
 WHOLE_TURN, HIGHEST_ORDER, MOST_ORDERS, LEAST_ORDERS, LEAST_SHARE = 5.9, 128, 8, 3, 0.01
 
+#: What repeats once in a turn, within this share of it, is a weight: poles and slots make more waves.
+ONCE = 0.15
+
 
 def terms(scene: SearchContext) -> list[Term]:
     """Sines whose period is searched, and with the second harmonic; whole orders of a turn where there are several."""
     peaks = scene.peaks(scene.carried(-np.ones_like(scene.position)), 3)
+    peaks = [peak for peak in peaks if scene.linear or abs(peak.n - 1.0) > ONCE]
     most = 20.0 * max(scene.dry, 0.05 * scene.effort)
-    found = [sine_term("cogging", scene, peak, scene.dry, scene.force, most=most) for peak in peaks]
-    found.append(sine_term("cogging", scene, peaks[0], scene.dry, scene.force, most=most, multiples=2))
+    found = [_sines(scene, peak, most, 1) for peak in peaks] + [_sines(scene, peak, most, 2) for peak in peaks[:1]]
     orders = [] if scene.linear or scene.reach < WHOLE_TURN else whole_orders(scene)
     return [*found, _comb(scene, orders, most)] if len(orders) >= LEAST_ORDERS else found
 
 
+def _sines(scene: SearchContext, peak: Peak, most: float, multiples: int) -> Term:
+    """Sines whose order stays on its side of once in a turn: one that is pulled there says that it is a weight."""
+    term = sine_term("cogging", scene, peak, scene.dry, scene.force, most=most, multiples=multiples)
+    if scene.linear:
+        return term
+    order, *others = term.unknowns
+    if peak.n > 1.0:
+        order = replace(order, low=max(order.low, 1.0 + ONCE))
+    else:
+        order = replace(order, high=min(order.high, 1.0 - ONCE))
+    return replace(term, unknowns=(order, *others))
+
+
 def whole_orders(scene: SearchContext) -> list[int]:
-    """Orders of a motor's turn that the mismatch holds beside each other, strongest first: matching pursuit."""
+    """Orders of a motor's turn, from two on, that the mismatch holds beside each other, strongest first.
+
+    By matching pursuit; order one is a weight's.
+    """
     columns = scene.carried(-np.ones_like(scene.position))
     wanted = scene.mismatch[scene.thinned]
     total, left = max(float(wanted @ wanted), 1e-30), wanted
     found: list[int] = []
     for _ in range(MOST_ORDERS):
         best = max(
-            (n for n in range(1, HIGHEST_ORDER + 1) if n not in found),
+            (n for n in range(2, HIGHEST_ORDER + 1) if n not in found),
             key=lambda n: explained_power(columns(float(n)), left),
         )
         design = np.column_stack([c for n in (*found, best) for c in columns(float(n))])

@@ -16,8 +16,9 @@ from servod.lab.diagnose.effects.search_context import SearchContext
 #: Way from which on a weight on a linkage may be told from one on an arm, rad: half a turn, a wave of twice its order.
 HALF_TURN = math.pi
 
-#: Waves in a turn of what a linkage adds.
-SECOND = 2.0
+#: Waves in a turn of what a linkage adds, and the most that its sine and its cosine are of the weight's: where there is
+#: more of it, it is not the weight that repeats.
+SECOND, MOST_OF_WEIGHT = 2.0, 0.5
 
 
 def _add(document: Document, values: Sequence[float]) -> tuple[float, float]:
@@ -43,15 +44,18 @@ def terms(scene: SearchContext) -> list[Term]:
     size = max(scene.dry, 0.1 * scene.effort)
     starts = [(0.0, 0.0), _regressed(scene, most)]
 
+    def second(values: Sequence[float]) -> tuple[float, float]:
+        weight = math.hypot(*values[:2])
+        return weight * math.hypot(*values[2:]), math.atan2(values[3], values[2])
+
     def write_linkage(document: Document, values: Sequence[float]) -> None:
         _write(document, values[:2])
-        rows = document.setdefault("cogging", {}).setdefault("harmonics", [])
-        rows.append(harmonic(scene, SECOND, math.hypot(*values[2:]), math.atan2(values[3], values[2])))
+        document.setdefault("cogging", {}).setdefault("harmonics", []).append(harmonic(scene, SECOND, *second(values)))
 
     def tell_linkage(document: Document, values: Sequence[float]) -> list[Reported]:
-        second = Reported("amplitude_2", math.hypot(*values[2:]), scene.force)
-        turned = Reported("phase_2", math.atan2(values[3], values[2]), "rad")
-        return [*tell(document, values), second, turned]
+        amplitude, phase = second(values)
+        waves = [Reported("amplitude_2", amplitude, scene.force), Reported("phase_2", phase, "rad")]
+        return [*tell(document, values), *waves]
 
     def tell(document: Document, _values: Sequence[float]) -> list[Reported]:
         units = {"amplitude": scene.force, "phase": "rad"}
@@ -62,7 +66,9 @@ def terms(scene: SearchContext) -> list[Term]:
         unknowns = (share("sine", sine, -most, most, size), share("cosine", cosine, -most, most, size))
         found.append(Term("gravity", "weight", unknowns, _write, tell))
     if scene.reach >= HALF_TURN:
-        waves = tuple(share(f"{part}_2", 0.0, -most, most, size) for part in ("sine", "cosine"))
+        waves = tuple(
+            share(f"{part}_2", 0.0, -MOST_OF_WEIGHT, MOST_OF_WEIGHT, MOST_OF_WEIGHT) for part in ("sine", "cosine")
+        )
         found.append(Term("gravity", "weight on a linkage", (*unknowns, *waves), write_linkage, tell_linkage))
     return found
 

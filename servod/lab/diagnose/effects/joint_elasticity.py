@@ -10,7 +10,7 @@ from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.effects.two_mass import two_mass_term
 
 #: Resonances to start from, as multiples of the observer's bandwidth, and shares of the load.
-RESONANCES, SHARES = (0.3, 0.7, 1.4, 2.8), (0.3, 0.65)
+RESONANCES, SHARES = (0.3, 0.7, 1.4, 2.8, 6.0), (0.3, 0.65)
 
 
 #: Share by which a high command stiffens the spring, to start from.

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from servod.formats.model.friction import Thermal
-from servod.lab.diagnose.effects.effect import Effect, report_as_is, scale_friction, share, simple
+from servod.lab.diagnose.effects.effect import Effect, positive, report_as_is, scale_friction, share, simple
 from servod.lab.diagnose.effects.hypothesis import Document, Term, Unknown
 from servod.lab.diagnose.effects.looks import Look, Split
 from servod.lab.diagnose.effects.search_context import SearchContext
@@ -17,6 +17,9 @@ LEAST_IN_ORDER = 3
 
 #: Share of the way to the last level that a recording leaves to those behind it: what warms up does so ever slower.
 STILL_TO_GO = 0.7
+
+#: Time in which a drift ends, as a share of the longest recording: a first guess.
+FIRST = 0.3
 
 
 def terms(scene: SearchContext) -> list[Term]:
@@ -31,7 +34,13 @@ def terms(scene: SearchContext) -> list[Term]:
         share(key, 0.0, -3.0 / length, 3.0 / length, 0.3 / length, "1/s") for key in ("dry_per_s", "viscous_per_s")
     ]
     between = [_between(drifts, len(scene.predictor.traces))] if _order_may_tell(scene) else []
-    return [*found, simple("thermal", "drift", drifts), *between]
+    lasts = positive("drift_time_s", "s", FIRST * length, 10.0)
+    return [
+        *found,
+        simple("thermal", "drift", drifts),
+        simple("thermal", "drift that ends", [*drifts, lasts]),
+        *between,
+    ]
 
 
 def _order_may_tell(scene: SearchContext) -> bool:

@@ -190,7 +190,7 @@ def _steps(trace: CheckedTrace, step: Array, longest_s: float) -> NDArray[np.int
 
 
 #: In a step of what is told the model's fastest mode makes so much of a turn, rad; the shortest step is this long, s.
-FINE_TURN_RAD, FINEST_STEP_S = 0.6, 2.5e-4
+FINE_TURN_RAD, FINEST_STEP_S = 0.2, 2.5e-4
 
 
 def fine_step_s(model: AxisModel) -> float:
