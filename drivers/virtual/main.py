@@ -69,7 +69,7 @@ class Client:
         self.port.on_state, self.port.on_link = self._state_changed, self._link_changed
         self._accepted: set[int] | None = None
         self._overflow = False
-        self.gone = False
+        self._left = self._unplugged = False
 
     def fileno(self) -> int:
         """Descriptor for select."""
@@ -78,18 +78,23 @@ class Client:
     @property
     def writable(self) -> bool:
         """False while the transmit queue is full: packets then wait in the socket, until the client's send fails."""
-        return len(self.port.queue) < self.port.depth
+        return not self._left and len(self.port.queue) < self.port.depth
+
+    @property
+    def gone(self) -> bool:
+        """Whether nothing of it is left: what a client sent before it closed still goes out, as SocketCAN has it."""
+        return self._unplugged or (self._left and not self.port.queue)
 
     def take_packet(self) -> None:
         """Read one packet: a frame for the bus, or a request for a fault."""
         try:
             packet = self.socket.recv(CAN_FRAME.size)
-        except BlockingIOError:
-            return
+        except (BlockingIOError, ConnectionResetError):
+            return  # reset: the client closed with frames unread; what it sent is read next
         except OSError:
             packet = b""
         if len(packet) != CAN_FRAME.size:
-            self.gone = True
+            self._left = True
             return
         can_id, length, data = CAN_FRAME.unpack(packet)
         now_ns = time.monotonic_ns()
@@ -111,7 +116,7 @@ class Client:
         except BlockingIOError:
             self._overflow = True
         except OSError:
-            self.gone = True
+            pass  # it closed; reading tells when the last of what it sent is there
 
     def _request(self, fault: BusFault, now_ns: int) -> None:
         if fault.kind is FaultKind.ACCEPT:
@@ -136,7 +141,7 @@ class Client:
 
     def _link_changed(self, up: bool, time_ns: int) -> None:
         """An interface that goes down ends the connection, and nothing but a new one brings it back."""
-        self.gone = self.gone or not up
+        self._unplugged = self._unplugged or not up
 
 
 class HubServer:

@@ -106,6 +106,20 @@ def test_canopen_reads_the_dictionary_from_the_node(network: canopen.Network) ->
         assert file.read() == (EDS / "encoder.eds").read_bytes()
 
 
+def test_frames_of_a_client_that_closes_at_once_go_out(axis: Axis) -> None:
+    """The frames are in the controller's queue: that their sender ended, with frames unread, takes none back."""
+    listener = VirtualBus(str(axis.bus), can_ids=(0x123,))
+    for burst in range(30):
+        leaver = VirtualBus(str(axis.bus))
+        assert listener.send(0x124, b"unread")
+        for number in range(10):
+            assert leaver.send(0x123, bytes((burst, number)))
+        leaver.close()
+        heard = [listener.receive(1.0) for _ in range(10)]
+        assert [frame[1] for frame in heard if frame] == [bytes((burst, number)) for number in range(10)]
+    listener.close()
+
+
 def test_tools_see_the_same_frames(axis: Axis) -> None:
     with can.Bus(interface="servod_virtual", channel=str(axis.bus)) as viewer:
         bus = VirtualBus(str(axis.bus))
