@@ -32,9 +32,11 @@ def captured(bus: Path, file: Path) -> Iterator[None]:
         output.write(_HEADER)
 
         def write() -> None:
-            while (frame := witness.receive(0.05)) is not None or not over.is_set():  # what waits at the end is taken
-                if frame is not None:
+            while not over.is_set():
+                if frame := witness.receive(0.05):
                     output.write(packet(frame))
+            while frame := witness.receive():  # what waits at the end; heartbeats never end
+                output.write(packet(frame))
 
         thread = threading.Thread(target=write)
         thread.start()
