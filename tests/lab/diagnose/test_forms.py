@@ -86,9 +86,12 @@ def test_a_stiff_bristle_is_simulated_in_steps_that_it_asks_for() -> None:
     assert fine_step_s(believed(inertia=20.0)) == SETTINGS.observer.longest_step_s
 
 
+def told(made: list[Recording], model: AxisModel | None = None) -> dict[str, Any]:
+    return diagnosis_document(diagnose(model or believed(), made))
+
+
 def findings(made: list[Recording]) -> dict[str, Any]:
-    document = diagnosis_document(diagnose(believed(), made))
-    return {finding["effect"]: finding for finding in document["findings"]}
+    return {finding["effect"]: finding for finding in told(made)["findings"]}
 
 
 def swung(model: AxisModel, seconds: float = 5.0) -> list[Recording]:
@@ -152,6 +155,34 @@ def test_a_spring_far_above_the_observers_bandwidth_is_found() -> None:
     found = findings(made)
     assert list(found) == ["joint_elasticity"]
     assert found["joint_elasticity"]["parameters"]["load_inertia"]["value"] == pytest.approx(load, rel=0.1)
+
+
+@pytest.mark.parametrize("behind", [0.0, 0.5])
+def test_a_spring_is_found_wherever_viscous_friction_acts(behind: float) -> None:
+    """None of it on the load or half: what is assumed of it went into damping, delay and a spring that stiffens."""
+    spring = {"load_inertia": 0.01, "stiffness": 180.0, "damping": 0.06}
+    friction = BELIEVED["friction"] | {"viscous": 0.1}
+    model = believed(friction=friction, joint_elasticity=spring | {"load_viscous": 0.1 * behind})
+    document = told(record(model, seconds=5.0), believed(friction=friction))
+    assert [(finding["effect"], finding["form"]) for finding in document["findings"]] == [
+        ("joint_elasticity", ["two masses"])
+    ]
+    for name, true in spring.items():
+        low, high = document["findings"][0]["parameters"][name]["interval"]
+        assert low <= true <= high
+    assert document["recalibrated"] == {}
+
+
+@pytest.mark.parametrize(("delay_s", "named"), [(0.0024, False), (0.003, True), (0.0047, True)])
+def test_a_dead_time_is_told_as_one_on_both_sides_of_its_level(delay_s: float, named: bool) -> None:
+    document = told(record(believed(delay_s=delay_s), seconds=5.0))
+    assert [finding["effect"] for finding in document["findings"]] == (["delay"] if named else [])
+    if named:
+        low, high = document["findings"][0]["parameters"]["additional_s"]["interval"]
+    else:
+        low, high = (end - 0.001 for end in document["recalibrated"]["delay_s"]["interval"])
+    assert low <= delay_s - 0.001 <= high
+    assert high - low < 2e-4
 
 
 def test_a_push_in_one_recording_is_told_of_it_alone() -> None:

@@ -23,6 +23,8 @@ PHASE_OFF, PHASE_KNOWN = 0.03, 0.008
 
 #: Levels of the contract: static - coulomb and offset as shares of Coulomb friction, bristle as a factor, delay in s.
 STRIBECK_SHARE, OFFSET_SHARE, BRISTLE_FACTOR, DELAY_S = 0.25, 0.03, 2.0, 0.002
+#: From where a delay is told as one: an estimate of one at the level may fall short of it.
+LATE_S = 0.95 * DELAY_S
 
 #: From which share of its own level on dry or viscous friction is a finding.
 LEVEL_SHARE = 0.25
@@ -41,7 +43,10 @@ BACK_EMF, FRICTION_FACTOR, FRICTION_KNOWN = "drive.emf_viscous", 10.0, math.log(
 
 #: Parameters that the outside contract gives a level, which is their bound until a term opens it.
 LEVELS = frozenset(
-    ("friction.static", "friction.stribeck_velocity", "friction.sigma0", "friction.sigma1", "torque_offset", "inertia")
+    (
+        *("friction.static", "friction.stribeck_velocity", "friction.sigma0", "friction.sigma1"),
+        *("torque_offset", "inertia", "delay_s"),
+    )
 )
 
 #: Torques of the model's own, which no recording tells from a common factor on all of them and on the command.
@@ -157,7 +162,7 @@ def _command(model: AxisModel, force: str) -> list[Unknown]:
     room = OFFSET_SHARE * coulomb if coulomb > 0.0 else 1e-9
     own, late = model.torque_offset, model.delay_s
     offset = Unknown("torque_offset", force, own, own - room, own + room, max(coulomb, 1e-9), OFFSET_SHARE)
-    room_s = 0.5 * DELAY_S  # what is more is for the term to say
+    room_s = LATE_S  # what is more is for the term to say
     delay = Unknown("delay_s", "s", late, max(late - room_s, 0.0), late + room_s, 1e-3, 0.3)
     return [offset, delay]
 

@@ -5,28 +5,28 @@ from __future__ import annotations
 from dataclasses import replace
 
 from servod.formats.model.effects import Delay
-from servod.lab.diagnose.effects.base import DELAY_S
-from servod.lab.diagnose.effects.effect import Effect, known_delay, simple
+from servod.lab.diagnose.effects.base import LATE_S
+from servod.lab.diagnose.effects.effect import Effect, simple
 from servod.lab.diagnose.effects.hypothesis import Document, Term, Unknown, get
 from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.search_context import SearchContext
 
 #: Delays to start from, s.
-STARTS_S = (0.003, 0.008, 0.02, 0.045)
+STARTS_S = (0.002, 0.004, 0.008, 0.02, 0.045)
 
 
 def terms(scene: SearchContext) -> list[Term]:
-    """Some starts: the cost has a valley for each wave of the excitation."""
+    """Some starts: the cost has a valley for each wave of the excitation. The model's own delay stays: both are one."""
     own = get(scene.document, "delay_s", 0.001)
     found = []
     for start in STARTS_S:
         unknown = Unknown("additional_s", "s", start, -min(own, 0.001), 0.1, 2e-3)
-        found.append(replace(simple("delay", "dead time", [unknown]), opens=known_delay(scene.document)))
+        found.append(replace(simple("delay", "dead time", [unknown]), opens={"delay_s": (own, own)}))
     return found
 
 
 def _at_level(nominal: Document, fitted: Document) -> bool:
-    return abs(get(fitted, "delay.additional_s") + get(fitted, "delay_s") - get(nominal, "delay_s")) >= DELAY_S
+    return abs(get(fitted, "delay.additional_s") + get(fitted, "delay_s") - get(nominal, "delay_s")) >= LATE_S
 
 
 EFFECT = Effect(

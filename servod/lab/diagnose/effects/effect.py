@@ -15,7 +15,7 @@ from servod.lab.diagnose.effects.hypothesis import LEVEL, Document, Reported, Te
 from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.search_context import Peak, SearchContext
 
-#: By how much the model's own delay may be off beside a lag or a longer delay, s.
+#: By how much the model's own delay may be off beside a lag, s.
 OWN_DELAY_S = 0.0002
 
 
@@ -165,7 +165,7 @@ def of_drive(effect: str, form: str, unknowns: Sequence[Unknown]) -> Term:
 
 
 def known_delay(document: Document) -> dict[str, tuple[float, float]]:
-    """Bounds of the model's own delay beside an effect that would share a longer one with it."""
+    """Bounds of the model's own delay beside a lag, which would share a longer one with it."""
     own = get(document, "delay_s", 0.001)
     return {"delay_s": (max(own - OWN_DELAY_S, 0.0), own + OWN_DELAY_S)}
 

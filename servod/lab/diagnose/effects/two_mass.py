@@ -11,6 +11,9 @@ from servod.lab.diagnose.effects.search_context import SearchContext
 #: Shares of critical damping that the joint's spring, and the contact behind a gap, start with.
 DAMPING, CONTACT_DAMPING = 0.05, 0.4
 
+#: Share of the viscous friction that acts on the load, as it is believed before any data, and how far it may be off.
+BEHIND, BEHIND_SPREAD = 0.15, 0.3
+
 #: Step of derivatives behind a gap, where every contact comes a sample earlier or later.
 GAP_NUDGE = 0.03
 
@@ -31,6 +34,7 @@ def two_mass_term(
         Unknown("load_share", "1", load, 0.03, 0.97, 0.3, nudge=nudge),
         Unknown("stiffness", per, stiffness, stiffness / 300.0, stiffness * 300.0, nudge=nudge),
         Unknown("damping", f"{scene.force}·s/{scene.length}", damping, damping / 300.0, damping * 300.0, nudge=nudge),
+        Unknown("behind", "1", BEHIND, 0.0, 0.95, size=BEHIND_SPREAD, spread=1.0, nudge=max(nudge, 0.01)),
     ]
     if bend > 0.0:
         stiffening = bend * stiffness**3 / scene.effort**2
@@ -44,9 +48,9 @@ def two_mass_term(
             "load_inertia": values[0] * get(document, "inertia"),
             "stiffness": values[1],
             "damping": values[2],
-            "load_viscous": 0.2 * get(document, "friction.viscous"),
+            "load_viscous": values[3] * get(document, "friction.viscous"),
         }
-        return found | ({unknowns[3].key: values[3]} if len(values) > 3 else {})
+        return found | {unknown.key: value for unknown, value in zip(unknowns[4:], values[4:], strict=True)}
 
     def write(document: Document, values: Sequence[float]) -> None:
         found = values_of(document, values)

@@ -315,7 +315,7 @@ def _rms(values: Array) -> float:
 
 
 #: Numbers that say where or when a term acts, whatever its size.
-WHERE = frozenset(("shift", "torque_at_middle", "start_s", "position"))
+WHERE = frozenset(("shift", "torque_at_middle", "start_s", "position", "behind"))
 
 #: Sizes that are positive by themselves, so that only their interval tells them from nothing.
 POSITIVE = frozenset(("time_constant_s", "gap"))

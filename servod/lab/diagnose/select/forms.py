@@ -23,7 +23,8 @@ from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
 
-#: Another form takes the place of the present one where it costs less than this share of it, every number counted.
+#: Another form takes the place of the present one where it costs less than this share of it, every number counted; a
+#: plainer one where it costs no more: a spring that stiffens by nothing is a spring.
 CHEAPER = 0.99
 
 
@@ -31,22 +32,33 @@ def better_forms(selector: Selector, selection: Selection) -> Selection:
     """The selection with every term in that of its forms which explains most beside the others."""
     before = selection.fit
     for place in range(selection.terms):
-        for fit in _other_forms(selector, selection, place):
-            if _cost(selector, selection.fit, fit) < CHEAPER * _cost(selector, selection.fit, selection.fit):
-                merit = selector.merit(selection, selector.settle_without(fit, place), fit)
-                if selector.may_enter(selection, merit, fit, place):
-                    selection = replace(selection.with_merit(place, merit), fit=fit)
+        while (better := _better_form(selector, selection, place)) is not selection:  # from there a plainer one may do
+            selection = better
     if selection.fit is before:
         return selection
     return judged_anew(selector, selector.lower_floor(selection, selection.fit.mismatch))
 
 
+def _better_form(selector: Selector, selection: Selection, place: int) -> Selection:
+    """The selection with one of its terms in the best of its other forms, or as it is."""
+    for fit in _other_forms(selector, selection, place):
+        limit = 1.0 if _numbers(fit) < _numbers(selection.fit) else CHEAPER
+        if _cost(selector, selection.fit, fit) < limit * _cost(selector, selection.fit, selection.fit):
+            merit = selector.merit(selection, selector.settle_without(fit, place), fit)
+            if selector.may_enter(selection, merit, fit, place):
+                selection = replace(selection.with_merit(place, merit), fit=fit)
+    return selection
+
+
 def _cost(selector: Selector, present: Fit, fit: Fit) -> float:
     """Cost of a fit in the scale of the present one, a little more for every number."""
     fitter = selector.fitter(present.mismatch)
-    numbers = sum(term.numbers for term in fit.hypothesis.terms)
     cost = fitter.cost(fit.hypothesis, fit.coordinates, fit.mismatch)
-    return cost * (1.0 + SETTINGS.trials.per_number * numbers)
+    return cost * (1.0 + SETTINGS.trials.per_number * _numbers(fit))
+
+
+def _numbers(fit: Fit) -> int:
+    return sum(term.numbers for term in fit.hypothesis.terms)
 
 
 def _other_forms(selector: Selector, selection: Selection, place: int) -> list[Fit]:

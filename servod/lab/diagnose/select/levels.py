@@ -14,18 +14,21 @@ from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.settings import SETTINGS
 
 #: Own numbers of such terms that have no level: damping that fades with speed is judged by the torque that it makes.
-NO_LEVEL = frozenset(("damping_velocity",))
+NO_LEVEL = frozenset(("damping_velocity", "time_constant_s", "slew_per_s"))
 
 
 def level_at_bound(fit: Fit) -> bool:
     """Whether a parameter with a level stands on its bound: the data pull it further.
 
-    The Stribeck velocity has none; it opens together with static friction.
+    The Stribeck velocity has none; it opens together with static friction. No delay lies below nothing.
     """
     low, high = fit.hypothesis.bounds
     watched = LEVELS - {"friction.stribeck_velocity"}
     places = [i for i, unknown in enumerate(fit.hypothesis.base) if unknown.key in watched]
-    return any(min(fit.coordinates[i] - low[i], high[i] - fit.coordinates[i]) < SETTINGS.worth.on_bound for i in places)
+    at = fit.coordinates
+    to_end = [high[i] - at[i] for i in places]
+    to_end += [at[i] - low[i] for i in places if fit.hypothesis.base[i].low != 0.0]
+    return min(to_end, default=1.0) < SETTINGS.worth.on_bound
 
 
 def is_level_change(term: Term) -> bool:
@@ -40,7 +43,7 @@ def is_level_change(term: Term) -> bool:
 MAY_END = frozenset(
     (
         *("damping", "cubic", "exponent", "delay_s", "sigma1", "friction.sigma1"),
-        *("friction.stribeck_velocity", "damping_velocity", "shift"),
+        *("friction.stribeck_velocity", "damping_velocity", "shift", "behind"),
     )
 )
 
