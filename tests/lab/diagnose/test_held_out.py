@@ -14,10 +14,16 @@ from servod.lab.diagnose.effects.hypothesis import Term
 from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.judge.free_run import window_errors
 from servod.lab.diagnose.predict.predict import Predictor
-from servod.lab.diagnose.select.cross_validation import RECORDING, make_folds, predict_held_out, single_events
+from servod.lab.diagnose.select.cross_validation import (
+    RECORDING,
+    make_folds,
+    predict_held_out,
+    predicts_most,
+    single_events,
+)
 from servod.lab.diagnose.select.fit import Fit, Fitter, Weighing
 from servod.lab.diagnose.select.free_windows import free_run_gain
-from servod.lab.diagnose.select.selection import Fold
+from servod.lab.diagnose.select.selection import Fold, Folds, HeldOutErrors
 from servod.lab.diagnose.settings import SETTINGS
 from servod.lab.simulate.replay import replay
 from tests.lab.diagnose.axes import believed
@@ -156,3 +162,13 @@ def test_free_windows_of_unseen_rows_come_nearer_with_the_terms(levels: tuple[Pr
     assert free_run_gain(predictor, without, without, shared.judged) == pytest.approx(1.0)
     assert free_run_gain(predictor, without, with_it, shared.judged) < 0.3
     assert free_run_gain(predictor, with_it, without, shared.judged) > 3.0
+
+
+@pytest.mark.parametrize(("off", "most"), [([0.1, 0.3, 0.3], False), ([0.1, 0.1, 0.9], True), ([0.1, 0.3], False)])
+def test_one_part_that_is_predicted_badly_does_not_speak_for_the_others(off: list[float], most: bool) -> None:
+    """Errors of 0.2 are what it is compared to; the last row of each part is not judged."""
+    number = np.repeat(np.arange(len(off)), 4)
+    judged = np.tile([True, True, True, False], len(off))
+    folds = Folds(tuple(number == part for part in range(len(off))), RECORDING, judged)
+    one = HeldOutErrors(np.where(judged, np.array(off)[number], 50.0), 0.0)
+    assert predicts_most(one, HeldOutErrors(np.full(len(number), 0.2), 0.0), folds) is most

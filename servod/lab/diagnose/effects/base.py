@@ -162,7 +162,8 @@ def _command(model: AxisModel, force: str) -> list[Unknown]:
     room = OFFSET_SHARE * coulomb if coulomb > 0.0 else 1e-9
     own, late = model.torque_offset, model.delay_s
     offset = Unknown("torque_offset", force, own, own - room, own + room, max(coulomb, 1e-9), OFFSET_SHARE)
-    room_s = LATE_S  # what is more is for the term to say
+    # What is more is for the term to say. A servo makes its torque from the position within a millisecond or two.
+    room_s = LATE_S if model.drive is None else 0.5 * DELAY_S
     delay = Unknown("delay_s", "s", late, max(late - room_s, 0.0), late + room_s, 1e-3, 0.3)
     return [offset, delay]
 

@@ -53,14 +53,27 @@ def _validated(selector: Selector, selection: Selection) -> CrossValidation:
 
 
 def _worst(selection: Selection, validation: CrossValidation) -> int | None:
-    """The term without which unseen rows are predicted best, if better than with it; no event in one recording."""
+    """The term without which unseen rows are predicted best, if better than with it; no event in one recording.
+
+    Better over all and in most of the parts: a recording without which the others cannot tell back-EMF from friction
+    is predicted badly whatever is in, and says nothing of a term that predicts the others.
+    """
     events = single_events(selection.fit.hypothesis)
     others = {
         place: held.rms
         for place, held in validation.without.items()
-        if held.rms <= validation.after.rms and place not in events
+        if held.rms <= validation.after.rms
+        and place not in events
+        and predicts_most(held, validation.after, validation.folds)
     }
     return min(others, key=lambda place: others[place]) if others else None
+
+
+def predicts_most(one: HeldOutErrors, other: HeldOutErrors, folds: Folds) -> bool:
+    """Whether `one` predicts most of the parts that were left out, as far as they are judged, better than `other`."""
+    rows = [part & folds.judged for part in folds.parts]
+    better = [bool(np.sum(one.mismatch[some] ** 2) <= np.sum(other.mismatch[some] ** 2)) for some in rows]
+    return 2 * sum(better) > len(better)
 
 
 def make_folds(predictor: Predictor, fit: Fit) -> Folds:
