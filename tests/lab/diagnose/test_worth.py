@@ -73,7 +73,8 @@ def test_a_push_lies_within_its_recording(scene: SearchContext) -> None:
         (0.91, 0.15, DiagnosisVerdict.UNEXPLAINED),
         (0.94, 0.15, DiagnosisVerdict.MISSING_PHYSICS),
         (0.60, 0.01, DiagnosisVerdict.MISSING_PHYSICS),
-        (0.04, 0.01, DiagnosisVerdict.UNEXPLAINED),
+        (0.14, 0.01, DiagnosisVerdict.UNEXPLAINED),
+        (0.16, 0.01, DiagnosisVerdict.MISSING_PHYSICS),
     ],
 )
 def test_names_must_explain_most_of_what_is_left(removed: float, left: float, answer: DiagnosisVerdict) -> None:

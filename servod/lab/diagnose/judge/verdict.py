@@ -69,8 +69,8 @@ def without_event(predictor: Predictor, mismatch: Array) -> NDArray[np.bool_]:
     return kept if kept.any() else predictor.counts
 
 
-#: Names that remove less than this share of the explainable error explain nothing of it.
-LEAST_REMOVED = 0.05
+#: Names that together remove less than this share of the explainable error explain next to nothing of it.
+LEAST_REMOVED = 0.15
 
 
 def verdict(named: Sequence[int], errors: Shares, dry: float, *, driven: bool = False) -> DiagnosisVerdict:
