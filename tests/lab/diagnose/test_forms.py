@@ -173,14 +173,12 @@ def test_a_spring_is_found_wherever_viscous_friction_acts(behind: float) -> None
     assert document["recalibrated"] == {}
 
 
-@pytest.mark.parametrize(("delay_s", "named"), [(0.0024, False), (0.003, True), (0.0047, True)])
-def test_a_dead_time_is_told_as_one_on_both_sides_of_its_level(delay_s: float, named: bool) -> None:
-    document = told(record(believed(delay_s=delay_s), seconds=5.0))
-    assert [finding["effect"] for finding in document["findings"]] == (["delay"] if named else [])
-    if named:
-        low, high = document["findings"][0]["parameters"]["additional_s"]["interval"]
-    else:
-        low, high = (end - 0.001 for end in document["recalibrated"]["delay_s"]["interval"])
+@pytest.mark.parametrize("delay_s", [0.003, 0.0047])
+def test_a_dead_time_is_told_with_its_whole_length(delay_s: float) -> None:
+    """At its level, which an estimate may fall short of, and beyond it."""
+    found = findings(record(believed(delay_s=delay_s), seconds=5.0))
+    assert list(found) == ["delay"]
+    low, high = found["delay"]["parameters"]["additional_s"]["interval"]
     assert low <= delay_s - 0.001 <= high
     assert high - low < 2e-4
 

@@ -47,10 +47,10 @@ def scene() -> SearchContext:
 
 
 def test_levels_are_what_opens_the_models_own(scene: SearchContext) -> None:
-    for name in ("stribeck", "presliding", "torque_offset", "inertia", "delay"):
+    for name in ("stribeck", "presliding", "torque_offset", "inertia"):
         terms = effect(name).terms(scene)
         assert all(is_level_change(term) is (term.form != "fading damping") for term in terms) and len(terms) > 0
-    for name in ("cogging", "actuator_lag", "viscous_nonlinear"):
+    for name in ("cogging", "delay", "actuator_lag", "viscous_nonlinear"):
         assert not any(is_level_change(term) for term in effect(name).terms(scene))
 
 

@@ -43,10 +43,7 @@ BACK_EMF, FRICTION_FACTOR, FRICTION_KNOWN = "drive.emf_viscous", 10.0, math.log(
 
 #: Parameters that the outside contract gives a level, which is their bound until a term opens it.
 LEVELS = frozenset(
-    (
-        *("friction.static", "friction.stribeck_velocity", "friction.sigma0", "friction.sigma1"),
-        *("torque_offset", "inertia", "delay_s"),
-    )
+    ("friction.static", "friction.stribeck_velocity", "friction.sigma0", "friction.sigma1", "torque_offset", "inertia")
 )
 
 #: Torques of the model's own, which no recording tells from a common factor on all of them and on the command.
@@ -162,8 +159,7 @@ def _command(model: AxisModel, force: str) -> list[Unknown]:
     room = OFFSET_SHARE * coulomb if coulomb > 0.0 else 1e-9
     own, late = model.torque_offset, model.delay_s
     offset = Unknown("torque_offset", force, own, own - room, own + room, max(coulomb, 1e-9), OFFSET_SHARE)
-    # What is more is for the term to say. A servo makes its torque from the position within a millisecond or two.
-    room_s = LATE_S if model.drive is None else 0.5 * DELAY_S
+    room_s = 0.5 * DELAY_S  # what is more is for the term to say
     delay = Unknown("delay_s", "s", late, max(late - room_s, 0.0), late + room_s, 1e-3, 0.3)
     return [offset, delay]
 

@@ -14,21 +14,18 @@ from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.settings import SETTINGS
 
 #: Own numbers of such terms that have no level: damping that fades with speed is judged by the torque that it makes.
-NO_LEVEL = frozenset(("damping_velocity", "time_constant_s", "slew_per_s"))
+NO_LEVEL = frozenset(("damping_velocity",))
 
 
 def level_at_bound(fit: Fit) -> bool:
     """Whether a parameter with a level stands on its bound: the data pull it further.
 
-    The Stribeck velocity has none; it opens together with static friction. No delay lies below nothing.
+    The Stribeck velocity has none; it opens together with static friction.
     """
     low, high = fit.hypothesis.bounds
     watched = LEVELS - {"friction.stribeck_velocity"}
     places = [i for i, unknown in enumerate(fit.hypothesis.base) if unknown.key in watched]
-    at = fit.coordinates
-    to_end = [high[i] - at[i] for i in places]
-    to_end += [at[i] - low[i] for i in places if fit.hypothesis.base[i].low != 0.0]
-    return min(to_end, default=1.0) < SETTINGS.worth.on_bound
+    return any(min(fit.coordinates[i] - low[i], high[i] - fit.coordinates[i]) < SETTINGS.worth.on_bound for i in places)
 
 
 def is_level_change(term: Term) -> bool:
