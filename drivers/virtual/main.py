@@ -76,8 +76,11 @@ class Client:
         return self.socket.fileno()
 
     @property
-    def writable(self) -> bool:
-        """False while the transmit queue is full: packets then wait in the socket, until the client's send fails."""
+    def readable(self) -> bool:
+        """Whether its next packet may be read: none of one that left, nor while the transmit queue is full.
+
+        Packets then wait in the socket, until the client's send fails.
+        """
         return not self._left and len(self.port.queue) < self.port.depth
 
     @property
@@ -165,7 +168,7 @@ class HubServer:
         now_ns = time.monotonic_ns()
         while not self._stopping:
             wait_s = (world.next_ns() - self._look_ahead_ns - now_ns) / NS_PER_S if self._behind else self._idle(now_ns)
-            readers = [c for c in self._clients if c.writable]
+            readers = [c for c in self._clients if c.readable]
             sources: list[socket.socket | Client] = [self._listener, *readers]
             ready = select.select(sources, (), (), min(max(wait_s, 0.0), _LONGEST_WAIT_S))[0]
             for source in ready:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from time import monotonic
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -19,8 +20,9 @@ from servod.lab.diagnose.effects.hypothesis import Hypothesis
 from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.engine import diagnose
 from servod.lab.diagnose.predict.predict import Predictor, fine_step_s
+from servod.lab.diagnose.select import stepwise
 from servod.lab.diagnose.select.forms import better_forms
-from servod.lab.diagnose.select.selection import TermEntry
+from servod.lab.diagnose.select.selection import Selection, TermEntry
 from servod.lab.diagnose.select.selector import Selector
 from servod.lab.diagnose.settings import SETTINGS
 from servod.lab.recordings import Recording
@@ -181,6 +183,35 @@ def test_a_dead_time_is_told_with_its_whole_length(delay_s: float) -> None:
     low, high = found["delay"]["parameters"]["additional_s"]["interval"]
     assert low <= delay_s - 0.001 <= high
     assert high - low < 2e-4
+
+
+def standing(*names: str) -> Selection:
+    """As much of a selection as the search asks for its terms."""
+    terms = [SimpleNamespace(effect=name, form="") for name in names]
+    return cast(
+        Selection, SimpleNamespace(terms=len(names), fit=SimpleNamespace(hypothesis=SimpleNamespace(terms=terms)))
+    )
+
+
+def test_a_search_ends_where_two_terms_drive_each_other_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A servo's delay and its lag came and went until time ended the search, and its answer with it."""
+    turns = []
+
+    def add_the_other(_selector: Selector, selection: Selection) -> Selection:
+        names = [term.effect for term in selection.fit.hypothesis.terms]
+        turns.append(names)
+        return standing(*names, "delay" if names[-1] == "actuator_lag" else "actuator_lag")
+
+    def drop_the_older(_selector: Selector, selection: Selection) -> Selection:
+        first, *_, last = selection.fit.hypothesis.terms
+        return standing(first.effect, last.effect)
+
+    monkeypatch.setattr(stepwise, "_add_best", add_the_other)
+    monkeypatch.setattr(stepwise, "backward_elimination", drop_the_older)
+    selector = cast(Selector, SimpleNamespace(nothing_left=lambda _selection: False, deadline=monotonic() + 60.0))
+    found = stepwise.forward_selection(selector, standing("spring"))
+    assert turns == [["spring"], ["spring", "actuator_lag"], ["spring", "delay"]]
+    assert [term.effect for term in found.fit.hypothesis.terms] == ["spring", "actuator_lag"]
 
 
 def test_a_push_in_one_recording_is_told_of_it_alone() -> None:

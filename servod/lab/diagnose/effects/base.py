@@ -23,8 +23,6 @@ PHASE_OFF, PHASE_KNOWN = 0.03, 0.008
 
 #: Levels of the contract: static - coulomb and offset as shares of Coulomb friction, bristle as a factor, delay in s.
 STRIBECK_SHARE, OFFSET_SHARE, BRISTLE_FACTOR, DELAY_S = 0.25, 0.03, 2.0, 0.002
-#: From where a delay is told as one: an estimate of one at the level may fall short of it.
-LATE_S = 0.95 * DELAY_S
 
 #: From which share of its own level on dry or viscous friction is a finding.
 LEVEL_SHARE = 0.25

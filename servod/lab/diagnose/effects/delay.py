@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from servod.formats.model.effects import Delay
-from servod.lab.diagnose.effects.base import LATE_S
+from servod.lab.diagnose.effects.base import DELAY_S
 from servod.lab.diagnose.effects.effect import Effect, simple
 from servod.lab.diagnose.effects.hypothesis import Document, Term, Unknown, get
 from servod.lab.diagnose.effects.looks import Look
@@ -13,6 +13,9 @@ from servod.lab.diagnose.effects.search_context import SearchContext
 
 #: Delays to start from, s.
 STARTS_S = (0.002, 0.004, 0.008, 0.02, 0.045)
+
+#: From where a delay is told as one: an estimate of one at the level may fall short of it.
+LATE_S = 0.95 * DELAY_S
 
 
 def terms(scene: SearchContext) -> list[Term]:

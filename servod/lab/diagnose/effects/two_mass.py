@@ -64,8 +64,6 @@ def two_mass_term(
         mass = "kg" if scene.linear else "kg·m²"
         units = {"load_inertia": mass, "stiffness": per, "gap": scene.length, "cubic": f"{per}/{scene.length}²"}
         other = f"{scene.force}·s/{scene.length}"
-        return [
-            Reported(k, v, units.get(k, other)) for k, v in values_of(document, values).items() if k != "load_viscous"
-        ]
+        return [Reported(key, value, units.get(key, other)) for key, value in values_of(document, values).items()]
 
     return Term(effect, "stiffening" if bend > 0.0 else "two masses", tuple(unknowns), write, tell)

@@ -27,13 +27,19 @@ Array = NDArray[np.float64]
 #: plainer one where it costs no more: a spring that stiffens by nothing is a spring.
 CHEAPER = 0.99
 
+#: To how many other forms in turn a term may go: to one that gets further, and from there to a plainer one.
+TURNS = 3
+
 
 def better_forms(selector: Selector, selection: Selection) -> Selection:
     """The selection with every term in that of its forms which explains most beside the others."""
     before = selection.fit
     for place in range(selection.terms):
-        while (better := _better_form(selector, selection, place)) is not selection:  # from there a plainer one may do
-            selection = better
+        for _ in range(TURNS):
+            found = _better_form(selector, selection, place)
+            if found is selection:
+                break
+            selection = found
     if selection.fit is before:
         return selection
     return judged_anew(selector, selector.lower_floor(selection, selection.fit.mismatch))

@@ -34,7 +34,11 @@ Array = NDArray[np.float64]
 
 
 def forward_selection(selector: Selector, selection: Selection) -> Selection:
-    """Add the term that takes most of what is left, again and again, while one deserves it and there is time."""
+    """Add the term that takes most of what is left, again and again, while one deserves it and there is time.
+
+    Where two terms drive each other out in turns, the same ones stand there a second time: that is the end.
+    """
+    seen = {_forms(selection)}
     while selection.terms < SETTINGS.forward.most_terms and _more_to_find(selector, selection):
         before = selection.terms
         if monotonic() < selector.deadline:
@@ -43,7 +47,15 @@ def forward_selection(selector: Selector, selection: Selection) -> Selection:
             return replace(selection, cut=monotonic() >= selector.deadline)
         if selection.terms >= 2:
             selection = backward_elimination(selector, selection)
+        if _forms(selection) in seen:
+            return selection
+        seen.add(_forms(selection))
     return selection
+
+
+def _forms(selection: Selection) -> tuple[tuple[str, str], ...]:
+    """The terms that are in, whatever order they came in."""
+    return tuple(sorted((term.effect, term.form) for term in selection.fit.hypothesis.terms))
 
 
 def _more_to_find(selector: Selector, selection: Selection) -> bool:
