@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -20,6 +21,7 @@ from servod.common.faults import FAULTS, FaultCode
 from servod.common.shipped import shipped
 from servod.qualify.demo.entries import entries
 from servod.qualify.demo.wall_clock import why
+from tests.starved import LOGS
 
 #: Both lines of the paper's story: feedback alone sticks, a friction model removes most of the error.
 STUCK_MRAD, COMPENSATED_MRAD = 10.0, 2.0
@@ -156,9 +158,19 @@ def started_by(tmp_path: Path) -> list[str]:
     return found
 
 
+def keep_log(tmp_path: Path) -> None:
+    """The daemon's log, which goes with the demo's folder: it says whether the drive's fault was want of heartbeats."""
+    kept = tmp_path / "servod.log"
+    for log in tmp_path.glob("servod-demo-*/servod.log"):
+        with contextlib.suppress(FileExistsError, FileNotFoundError):  # there already; gone with its demo
+            kept.hardlink_to(log)
+            LOGS.append(kept)
+
+
 def wait_until_it_moves(demo: subprocess.Popen[str], tmp_path: Path) -> None:
     deadline = time.monotonic() + 90.0
     while not list(tmp_path.glob("out/recordings/pd.mcap")):
+        keep_log(tmp_path)
         if demo.poll() is not None:
             raise ServodError(f"the demo ended with {demo.returncode} before it moved: {demo.communicate()}")
         if time.monotonic() > deadline:
@@ -169,6 +181,7 @@ def wait_until_it_moves(demo: subprocess.Popen[str], tmp_path: Path) -> None:
 @pytest.mark.serial
 def test_the_demo_on_the_wall_clock(tmp_path: Path) -> None:
     demo = start(tmp_path, "--seconds", "2.5", "--json")
+    wait_until_it_moves(demo, tmp_path)
     out, err = demo.communicate(timeout=60)
     if demo.returncode:
         raise ServodError(f"the demo ended with {demo.returncode}: {err}")
