@@ -94,6 +94,14 @@ def test_what_is_not_told_from_none_stays_where_unseen_rows_need_it(
     assert (reject_terms(selector, judgement) is None) is stays
 
 
+@pytest.mark.parametrize(("effect", "stays"), [("gravity", True), ("backlash", False), ("joint_elasticity", False)])
+def test_a_resonance_that_is_too_small_for_a_name_is_in_no_model(selector: Selector, effect: str, stays: bool) -> None:
+    """A feedback would have to be stable with it."""
+    judgement = sorted_with(selector, form(selector, effect))
+    judgement = replace(judgement, named=(), kept={0: MinorReason.SMALL})
+    assert (reject_terms(selector, judgement) is None) is stays
+
+
 def test_judging_again_changes_nothing_that_stands(selector: Selector) -> None:
     judgement = sorted_with(selector, form(selector, "gravity"))
     assert reject_terms(selector, judgement) is None

@@ -36,4 +36,5 @@ EFFECT = Effect(
     look=Look("time since reversal", Split.DIRECTION),
     far=True,
     swift=True,
+    resonant=True,
 )

@@ -49,7 +49,8 @@ class Effect:
     with one that `scales_torques`, no recording tells the common factor on all torques of the axis. Of an effect and
     what it makes a `product_with` a servo shows that alone while its duty is below the limit. An effect and its
     `twin` that are in together are one finding, by the name of the one that makes the torque later: `lateness` is the
-    key that says by how much.
+    key that says by how much. One that is `resonant` stays in the model by its name alone: a feedback has to be stable
+    with a resonance, and one too small for a name is no ground to give stiffness away.
     """
 
     name: str
@@ -77,6 +78,7 @@ class Effect:
     product_with: str = ""
     twin: str = ""
     lateness: str = ""
+    resonant: bool = False
 
 
 def share(key: str, start: float, low: float, high: float, size: float, unit: str = "1") -> Unknown:

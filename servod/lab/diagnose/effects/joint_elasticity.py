@@ -37,4 +37,5 @@ EFFECT = Effect(
     look=Look("acceleration"),
     far=True,
     swift=True,
+    resonant=True,
 )

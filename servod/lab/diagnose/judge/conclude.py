@@ -306,9 +306,9 @@ def _rms(values: Array) -> float:
 # --- Findings and minor terms ----------------------------------------------------------------------------------------
 # Which terms of the last fit are findings, and why the others are none: the levels of the outside contract once more. A
 # term comes in by what it takes when it comes; beside those that come later it may be worth less. It stays in the model
-# then, for the others were fitted beside it, and is listed with its values as minor. One whose numbers are pushed to an
-# end of their range is somebody else's shape: it goes, and what it took counts as left. So does one that is not told
-# from none, unless rows that no fit has seen are predicted worse without it.
+# then, for the others were fitted beside it, and is listed with its values as minor, unless it is a resonance. One
+# whose numbers are pushed to an end of their range is somebody else's shape: it goes, and what it took counts as left.
+# So does one that is not told from none, unless rows that no fit has seen are predicted worse without it.
 #
 # The contract counts shares of the error on unseen rows. A drift of the constant torque is next to nothing in any row
 # and adds up in every simulation that runs freely: its share is that of the means over a second, where it shows.
@@ -381,11 +381,14 @@ def plainer_form(selector: Selector, selection: Selection, place: int) -> Select
 def _goes(judgement: JudgedSelection, place: int, why: MinorReason) -> bool:
     """Whether a term goes for a reason: one that is only not told from none stays where unseen rows need it.
 
-    Not where a plainer effect is within it: what it took there is that one's.
+    Not where a plainer effect is within it: what it took there is that one's. One that is too small for a name goes
+    where it would add a resonance to the model.
     """
     if why is MinorReason.UNSURE:
         plainer = any(judgement.fit.hypothesis.terms[place].effect in one.within for one in effects())
         return plainer or judgement.removed_share(place) < SETTINGS.worth.share
+    if why is MinorReason.SMALL:
+        return effect(judgement.fit.hypothesis.terms[place].effect).resonant
     return why in {MinorReason.AT_END, MinorReason.BEYOND}
 
 
