@@ -19,7 +19,7 @@ from servod.runtime.fieldbus.bus.open import open_bus
 from servod.runtime.loop.channel import Channel
 from servod.runtime.loop.cycle import Cycle
 from servod.runtime.loop.plan import LoopPlan
-from servod.runtime.loop.realtime import apply_realtime
+from servod.runtime.loop.realtime import apply_realtime, give_way
 
 #: A supervisor whose beat stands still for this long counts as lost. Its death is seen within one cycle; this is for
 #: one that hangs, which is not urgent: the loop has everything that it needs to control the axis.
@@ -106,6 +106,7 @@ def main() -> int:
         cycle.let_go()
         raise
     bus.close()
+    give_way()
     return 0 if cycle.seen_off else NOT_SEEN_OFF
 
 

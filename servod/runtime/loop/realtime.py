@@ -1,7 +1,7 @@
 """Everything real-time that is asked of the operating system, each answered with granted or refused and the reason.
 
-Called once by the loop process, before its first cycle. Nothing here is needed for the loop to run; all of it is needed
-for it to run on time, so a refusal is reported, never swallowed.
+Called by the loop process before its first cycle, and behind its last. Nothing here is needed for the loop to run; all
+of it is needed for it to run on time, so a refusal is reported, never swallowed.
 """
 
 from __future__ import annotations
@@ -36,6 +36,11 @@ def apply_realtime(cpu: int | None, priority: int) -> list[Grant]:
         _fifo(priority),
         _freeze_collector(),
     ]
+
+
+def give_way() -> None:
+    """Leave SCHED_FIFO: the interpreter's end takes 30 ms, in which the loop of another axis on this core shall run."""
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 def _affinity(cpu: int | None) -> Grant:

@@ -315,6 +315,24 @@ def test_it_asks_for_real_time_by_itself(axis: Axis, tmp_path: Path) -> None:
         left.process.communicate()
 
 
+#: Runs a virtual axis until it is told to end, and says how its process is scheduled then.
+ENDS = """
+import os, sys
+from servod.drivers.virtual.main import main
+code = main(sys.argv[1:])
+print(code, os.sched_getscheduler(0))
+"""
+
+
+def test_it_lets_others_run_while_it_ends(tmp_path: Path) -> None:
+    """An interpreter takes 30 ms for that: too long for another axis on this processor to wait."""
+    words = [sys.executable, "-c", ENDS, "--socket", str(tmp_path / "bus")]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as axis:
+        assert axis.stdout is not None and axis.stdout.readline().startswith("ready ")
+        axis.terminate()
+        assert axis.stdout.read() == f"0 {os.SCHED_OTHER}\n"
+
+
 @pytest.mark.parametrize(
     ("options", "code", "named"),
     [
