@@ -16,6 +16,7 @@ import os
 import types
 from collections.abc import Callable
 from functools import cache
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple, get_type_hints
 
@@ -60,29 +61,37 @@ def record(values: Any) -> Record:
     import numpy as np
 
     kind: object = type(values)
-    structure, dtype = _structure(kind)
-    names = structure(*_members(structure, values))
+    structure, dtype, members = _structure(kind)
+    names: Any = structure(*members(values))
     return Record(names, np.frombuffer(names, dtype=dtype))
 
 
-def _members(structure: Any, values: Any) -> tuple[Any, ...]:
-    """The values by the fields of `structure`, as ctypes takes them."""
-    return tuple(
-        _members(kind, getattr(values, name)) if issubclass(kind, ctypes.Structure) else getattr(values, name)
-        for name, kind in structure._fields_
-    )
+class _Structure(NamedTuple):
+    """The C structure of a class of numbers; its one dtype, for numba compares another that is equal at every call; and
+    what gives the values of an instance as ctypes takes them.
+    """
+
+    fields: type[ctypes.Structure]
+    dtype: Any
+    members: Callable[[Any], tuple[Any, ...]]
 
 
 @cache
-def _structure(kind: object) -> Any:
-    """The C structure of a class of numbers, and its one dtype: numba compares another that is equal at every call."""
+def _structure(kind: object) -> _Structure:
     import numpy as np
 
     types = {float: ctypes.c_double, int: ctypes.c_int64, bool: ctypes.c_bool}
-    hints = get_type_hints(kind).items()
-    fields = [(name, types[hint] if hint in types else _structure(hint)[0]) for name, hint in hints]
+    hints = get_type_hints(kind)
+    within = {name: _structure(hint) for name, hint in hints.items() if hint not in types}
+    fields = [(name, within[name].fields if name in within else types[hint]) for name, hint in hints.items()]
     structure = type("Fields", (ctypes.Structure,), {"_fields_": fields})
-    return structure, np.dtype(structure)
+    plain = attrgetter(*hints)
+
+    def members(values: Any) -> tuple[Any, ...]:
+        parts = zip(hints, plain(values), strict=True)
+        return tuple(within[name].members(part) if name in within else part for name, part in parts)
+
+    return _Structure(structure, np.dtype(structure), members if within else plain)
 
 
 def entry(function: Kernel) -> Kernel:

@@ -23,7 +23,7 @@ from servod.kernels.laws import LAWS
 from servod.lab.export import mjcf, urdf
 from servod.lab.export.mjcf import SOLIMP, SOLREF, STEP_S
 from servod.lab.export.reduce import LostEffect, losses
-from servod.lab.simulate.motion import Start, first_row
+from servod.lab.simulate.motion import Start, beginning
 from servod.lab.simulate.replay import Array, Drive, Replay, hidden_motion, replay
 from servod.lab.simulate.simulate import LoopSettings, simulate_closed_loop
 
@@ -224,7 +224,7 @@ def _load_states(said: AxisModel, drive: Drive, starts: NDArray[np.int64]) -> Ar
     """Position and velocity of the load at the rows `starts`, as our own replay has them."""
     packed = said.pack()
     rows = drive.t_s, drive.torque, drive.position, drive.motion
-    first = first_row(Start.AUTO, *rows, packed.p.delay_s, free=False)
+    first = beginning(Start.AUTO, *rows, free=False).under(packed.p.delay_s)
     return hidden_motion(packed, drive, first, starts)[:, 3:5]
 
 

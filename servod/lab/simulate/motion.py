@@ -128,7 +128,7 @@ class Start(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class FirstRow:
-    """Motion (position, velocity, acceleration) at the first row, and the commands before it; SI units of the axis.
+    """Motion (position, velocity, acceleration) at the first row, and the command before it; SI units of the axis.
 
     `command_before` acts until the first recorded one arrives.
     """
@@ -138,10 +138,46 @@ class FirstRow:
     at_rest: bool
 
 
-def first_row(
-    start: Start, t_s: Array, torque: Array, position: Array, motion: Array, delay_s: float = 0.0, *, free: bool = True
-) -> FirstRow:
-    """How the motion begins; `motion` has the rows of `smoothed_motion`, a command acts `delay_s` after its row.
+@dataclass(frozen=True, slots=True)
+class Beginning:
+    """What the first rows say of how a motion begins, whenever commands act: `under` a delay it is a `FirstRow`.
+
+    `growth` is that of the command, 1/s of its unit; `left_s` the time at which an axis that stood had left, if it did.
+    """
+
+    motion: tuple[float, float, float]
+    at_rest: bool
+    stood: bool
+    growth: float
+    left_s: float | None
+    t_s: Array
+    torque: Array
+
+    def under(self, delay_s: float) -> FirstRow:
+        """The first row where a command acts `delay_s` after its row."""
+        command = float(self.torque[0])
+        if not self.stood:
+            before = command - self.growth * min(0.5 * delay_s, TREND_HOLDS_S)
+        else:
+            before = 0.0 if self._is_new(delay_s) else command
+        return FirstRow(self.motion, before, self.at_rest)
+
+    def _is_new(self, delay_s: float) -> bool:
+        """Whether an axis that stands at the first row leaves though the command does not grow: it was not under it
+        before.
+
+        An axis that rests under the first row's command stays where it is, until the command grows.
+        """
+        if self.left_s is None:
+            return False
+        acted = max(1, int(np.searchsorted(self.t_s, self.left_s - delay_s, side="right")))
+        return bool(np.max(np.abs(self.torque[:acted])) <= GROWN * abs(self.torque[0]))
+
+
+def beginning(
+    start: Start, t_s: Array, torque: Array, position: Array, motion: Array, *, free: bool = True
+) -> Beginning:
+    """How the motion begins; `motion` has the rows of `smoothed_motion`.
 
     AUTO is rest when the first row's speed is within its error of zero, or when the axis was just set off: motion and
     command both extrapolate to nothing within MOTION_BEGAN_S and COMMAND_BEGAN_S before the first row. People start
@@ -157,11 +193,8 @@ def first_row(
     if still and rest:
         acceleration = 0.0
     moved = place, 0.0 if rest else speed, acceleration
-    if still:
-        before = 0.0 if command_is_new(t_s, torque, position, delay_s) else float(torque[0])
-    else:
-        before = float(torque[0]) - trend(t_s, torque) * min(0.5 * delay_s, TREND_HOLDS_S)
-    return FirstRow(moved, before, rest)
+    growth, left_s = (0.0, leaves(t_s, position)) if still else (trend(t_s, torque), None)
+    return Beginning(moved, rest, still, growth, left_s, t_s, torque)
 
 
 def stands(t_s: Array, position: Array, motion: Array) -> bool:
@@ -201,14 +234,8 @@ def just_set_off(t_s: Array, torque: Array, position: Array, within_s: float = M
     return bool(moves_on and grows and command * speed > 0.0)
 
 
-def command_is_new(t_s: Array, torque: Array, position: Array, delay_s: float) -> bool:
-    """Whether an axis that stands at the first row leaves though the command does not grow: it was not under it before.
-
-    An axis that rests under the first row's command stays where it is, until the command grows.
-    """
+def leaves(t_s: Array, position: Array) -> float | None:
+    """When an axis that stands at the first row has left it, within LEAVES_S; None where it does not."""
     early = int(np.searchsorted(t_s, t_s[0] + LEAVES_S, side="right"))
     away = np.flatnonzero(np.abs(position[:early] - position[0]) > LEFT * noise_rms(position))
-    if len(away) == 0:
-        return False
-    acted = max(1, int(np.searchsorted(t_s, t_s[away[0]] - delay_s, side="right")))
-    return bool(np.max(np.abs(torque[:acted])) <= GROWN * abs(torque[0]))
+    return float(t_s[away[0]]) if len(away) else None

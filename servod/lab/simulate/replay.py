@@ -23,7 +23,7 @@ from servod.kernels.physics.compiled import Kernel, available, compiled
 from servod.kernels.physics.layout import PackedPlant, PlantState
 from servod.kernels.physics.plant import INNER_STEP_S, delay_line, inputs
 from servod.lab.simulate import open_loop, servo
-from servod.lab.simulate.motion import FirstRow, Start, first_row, smoothed_motion
+from servod.lab.simulate.motion import FirstRow, Start, beginning, smoothed_motion
 from servod.lab.simulate.servo import (
     ToldRows,
     against_emf,
@@ -149,14 +149,14 @@ def hidden_motion(packed: PackedPlant, drive: Drive, first: FirstRow, starts: ND
     return np.column_stack([motion[starts, :2], hidden[starts]])
 
 
-def driven(model: AxisModel, drive: Drive) -> tuple[PackedPlant, Drive]:
-    """The model packed and the rows with the torque that its drive makes of what the drive was told.
+def driven(model: AxisModel, drive: Drive, packed: PackedPlant | None = None) -> tuple[PackedPlant, Drive]:
+    """The model packed (unless it is) and the rows with the torque that its drive makes of what the drive was told.
 
     The delay is in that torque then, for it is on the command's way and not on that of the motion fed back. So is the
     back-EMF of a servo, by the recorded motion; that of a drive told a voltage is viscous friction. Rows of a torque,
     and a model without a drive, come back as they are.
     """
-    packed, law = model.pack(), model.drive
+    packed, law = packed or model.pack(), model.drive
     if law is None or drive.told is None:
         return packed, drive
     rows = drive.whole or drive
@@ -209,13 +209,13 @@ def replay(
     What a drive was told instead goes through the drive of the model, which a servo closes over the simulated motion.
 
     `horizon_s` None is one free run from the first row, gaps and all. `start` says how the first row is understood; an
-    axis that was just set off counts as at rest in a free run only (`first_row`). Without numba
+    axis that was just set off counts as at rest in a free run only (`beginning`). Without numba
     the same source runs in pure Python.
     """
     packed, drive = driven(model, drive) if isinstance(model, AxisModel) else (model, drive)
     starts = window_starts(drive.t_s, horizon_s)
     rows = drive.t_s, drive.torque, drive.position, drive.motion
-    first = first_row(start, *rows, packed.p.delay_s, free=horizon_s is None)
+    first = beginning(start, *rows, free=horizon_s is None).under(packed.p.delay_s)
     states = hidden_motion(packed, drive, first, starts)
     begun = inputs(packed, PlantState(temperature_c=packed.p.start_c, first_s=float(drive.t_s[0])), bare=True)
     line = np.array(delay_line(0.0, inner_step_s))

@@ -16,7 +16,7 @@ from servod.formats.model.axis_model import AxisModel
 from servod.kernels.physics.effects import encoder_position
 from servod.kernels.physics.layout import PlantState
 from servod.kernels.physics.plant import Plant
-from servod.lab.simulate.motion import Start, first_row, smoothed_motion
+from servod.lab.simulate.motion import Start, beginning, smoothed_motion
 from servod.lab.simulate.open_loop import recorded_motion
 from servod.lab.simulate.replay import Drive, replay, window_starts
 from tests.kernels.physics.models import joint
@@ -139,7 +139,7 @@ def test_the_command_before_the_first_row() -> None:
     moved = np.where(t > 0.003, 10.0 * np.clip(t - 0.003, 0.0, None) ** 2, 0.0)
 
     def before(torque: NDArray[np.float64], position: NDArray[np.float64]) -> float:
-        return first_row(Start.AUTO, t, torque, position, smoothed_motion(t, position)).command_before
+        return beginning(Start.AUTO, t, torque, position, smoothed_motion(t, position)).under(0.0).command_before
 
     assert before(np.full(200, 0.2), moved) == 0.0
     assert before(0.1 + 10.0 * t, moved) == 0.1

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.formats.model.axis_model import AxisModel
-from servod.lab.simulate.motion import FirstRow, Start, first_row, noise_rms
+from servod.lab.simulate.motion import Beginning, FirstRow, Start, beginning, noise_rms
 from servod.lab.simulate.replay import Drive, behind_gaps
 
 Array = NDArray[np.float64]
@@ -68,16 +68,12 @@ class CheckedTrace:
 
     def first_row(self, delay_s: float) -> FirstRow:
         """How the motion begins under a command that acts `delay_s` late."""
-        known = self._first.get(delay_s)
-        if known is None:
-            drive = self.drive
-            known = first_row(Start.AUTO, drive.t_s, drive.torque, drive.position, drive.motion, delay_s, free=False)
-            self._first[delay_s] = known
-        return known
+        return self._beginning.under(delay_s)
 
     @cached_property
-    def _first(self) -> dict[float, FirstRow]:
-        return {}
+    def _beginning(self) -> Beginning:
+        drive = self.drive
+        return beginning(Start.AUTO, drive.t_s, drive.torque, drive.position, drive.motion, free=False)
 
 
 def dry_friction(model: AxisModel) -> float:

@@ -259,11 +259,12 @@ class Predictor:
 
         One model for all traces, or one for each.
         """
-        each = models if len(models) > 1 else models * len(self.traces)
+        of_each = [(model, model.pack()) for model in models]
+        each = of_each if len(models) > 1 else of_each * len(self.traces)
         self.evaluations += 1
         parts = [
-            self._trace_mismatch(*driven(model, trace.drive), index, drive_factor(model) / self.drive_torque)
-            for index, (model, trace) in enumerate(zip(each, self.traces, strict=True))
+            self._trace_mismatch(*driven(model, trace.drive, packed), index, drive_factor(model) / self.drive_torque)
+            for index, ((model, packed), trace) in enumerate(zip(each, self.traces, strict=True))
         ]
         limit = SETTINGS.observer.worst * self.dry
         clean = np.nan_to_num(np.concatenate(parts), nan=limit, posinf=limit, neginf=-limit)
