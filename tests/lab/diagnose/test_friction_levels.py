@@ -77,6 +77,13 @@ def test_a_common_factor_on_all_torques_is_a_torque_gain() -> None:
     assert [one["effect"] for one in found["findings"]] == ["torque_gain"]
 
 
+def test_a_common_factor_is_none_of_mass_and_all_friction_beside_a_weight() -> None:
+    """Mass and both levels of friction explain no more than one factor does, with three numbers."""
+    gain, weight = {"factor": 0.86}, {"amplitude": 0.1, "phase": 0.5}
+    found = diagnosed(axis(1.03, more={"torque_gain": gain, "gravity": weight}))
+    assert {one["effect"] for one in found["findings"]} == {"gravity", "torque_gain"}
+
+
 @pytest.mark.parametrize(("deviation", "told"), [(0.2, True), (0.6, False)])
 def test_a_level_whose_interval_holds_the_models_own_is_no_finding(deviation: float, told: bool) -> None:
     """Nor is any term none of whose numbers is told from none by itself."""

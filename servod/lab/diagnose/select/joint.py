@@ -93,10 +93,13 @@ def _left(selector: Selector, old: Fit, new: Fit) -> float:
 def _better(rival: Candidate, left: float, numbers: int) -> bool:
     """Whether a candidate explains better than levels that leave so much with so many numbers.
 
-    Where levels leave next to nothing one with as many numbers must leave clearly less: the plain cause comes first.
+    Where levels leave next to nothing one with as many numbers must leave clearly less, and one with fewer no more: the
+    plain cause comes first, one factor on all torques before mass and friction that are off by the same.
     """
     if is_another(rival.fit, rival.place):
         return False
-    if left <= SETTINGS.joint.nearly_all and rival.term.numbers >= numbers:
-        return left > SETTINGS.joint.as_good * rival.left + SETTINGS.joint.nothing
+    if left <= SETTINGS.joint.nearly_all:
+        fewer = rival.term.numbers < numbers
+        worse, better = (rival.left, left) if fewer else (left, rival.left)
+        return fewer is (worse <= SETTINGS.joint.as_good * better + SETTINGS.joint.nothing)
     return penalised_left(rival) <= left * (1.0 + SETTINGS.trials.per_number * numbers)
