@@ -14,6 +14,7 @@ from servod.lab.diagnose.effects.hypothesis import Term
 from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.judge.free_run import window_errors
 from servod.lab.diagnose.predict.predict import Predictor
+from servod.lab.diagnose.select.candidates import Candidate, _alike
 from servod.lab.diagnose.select.cross_validation import (
     RECORDING,
     make_folds,
@@ -64,6 +65,20 @@ def pushes(predictor: Predictor) -> list[Term]:
         first = part.start + round(2.0 / trace.period_s)
         mismatch[first : first + round(0.5 / trace.period_s)] = 0.05
     return effect("disturbance").terms(SearchContext({}, predictor, mismatch))
+
+
+@pytest.mark.parametrize(
+    ("single", "every", "alike"), [(0.012, 0.017, True), (0.40, 0.44, True), (0.01, 0.05, False), (0.40, 0.60, False)]
+)
+def test_a_push_in_one_recording_and_in_all_are_alike_where_the_others_were_cut(
+    levels: tuple[Predictor, Fit], single: float, every: float, alike: bool
+) -> None:
+    """Both are fitted on everything then: the one in all of them explains next to nothing there."""
+    predictor, fit = levels
+    terms = {term.form: with_term(predictor, bare(fit), term) for term in pushes(predictor)}
+    left = {form: every if form == EVERY else single for form in terms}
+    one, other = (Candidate("disturbance", terms[form], left[form]) for form in terms)
+    assert _alike(one, other) is alike
 
 
 def test_a_level_is_not_that_of_the_rows_that_it_is_judged_by(levels: tuple[Predictor, Fit]) -> None:

@@ -22,8 +22,9 @@ from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
 
-#: Forms of one effect are alike on shortened data where what they leave differs by less than this share.
-ALIKE = 0.15
+#: Forms of one effect are alike on shortened data where what they leave differs by less than this share of it, or of
+#: what was there: next to nothing is as good as nothing.
+ALIKE, ALIKE_OF_ALL = 0.15, 0.01
 
 
 @dataclass(frozen=True)
@@ -126,11 +127,8 @@ def _alike(one: Candidate, other: Candidate) -> bool:
     A push in one recording and one in every recording are the same where the others were cut.
     """
     forms = one.effect == other.effect and one.term.form != other.term.form
-    return (
-        forms
-        and effect(one.effect).look.coordinate == "time"
-        and abs(one.left - other.left) <= ALIKE * max(one.left, other.left)
-    )
+    near = max(ALIKE * max(one.left, other.left), ALIKE_OF_ALL)
+    return forms and effect(one.effect).look.coordinate == "time" and abs(one.left - other.left) <= near
 
 
 def penalised_left(candidate: Candidate) -> float:
