@@ -37,6 +37,8 @@ from servod.formats.config import CycleConfig
 #: Share of all processors that others took, and of the time in which somebody waited; and the first where no kernel
 #: counts the second (Linux without PSI).
 OTHERS_SHARE, WAITED_SHARE, OTHERS_ALONE_SHARE = 0.25, 0.1, 0.5
+#: A shorter span tells no share [s]: the kernel counts processor time by ticks of 10 ms.
+LEAST_SPAN_S = 0.2
 #: The shortest stand-still of a processor that makes feedback stale: the default of limits.stale_cycles.
 STALL_S = 0.005
 #: An axis that one test leaves to the next shows this long afterwards what a stand-still did to it.
@@ -98,13 +100,15 @@ class Span(NamedTuple):
     @property
     def starved(self) -> str:
         """The evidence in a few words; empty when there is none."""
-        others = self.others_s / (self.seconds * self.cores) if self.seconds > 0.0 else 0.0
         if self.stall_s >= STALL_S:
             return f"a processor stood still for {1e3 * self.stall_s:.0f} ms"
+        if self.seconds < LEAST_SPAN_S:
+            return ""
+        others = self.others_s / (self.seconds * self.cores)
         said = f"other programs had {others:.0%} of {self.cores} processors for {self.seconds:.1f} s"
         if self.waited_s is None:
             return said if others > OTHERS_ALONE_SHARE else ""
-        waited = self.waited_s / self.seconds if self.seconds > 0.0 else 0.0
+        waited = self.waited_s / self.seconds
         both = others > OTHERS_SHARE and waited > WAITED_SHARE
         return f"{said}, and some waited {waited:.0%} of it" if both else ""
 

@@ -294,6 +294,12 @@ def test_a_span_of_no_time_is_no_evidence() -> None:
     assert Span(0.0, 2, 0.0, 0.0).starved == "" and Span(0.0, 2, 0.0, None).starved == ""
 
 
+def test_a_tick_of_the_kernels_clock_is_no_evidence() -> None:
+    """A fixture of 9 ms in which a tick of 10 ms ended: others had 55 % of two processors, and somebody waited."""
+    assert Span(0.009, 2, 0.01, 0.009).starved == ""
+    assert Span(0.009, 2, 0.01, 0.009, 0.006).starved != ""
+
+
 BURN = "import time\nwhile time.process_time() < 0.4: pass\n"
 
 
