@@ -19,7 +19,7 @@ from servod.lab.diagnose.select.selection import Selection
 from servod.lab.diagnose.select.selector import Selector
 from servod.lab.simulate.simulate import LoopSettings, simulate_closed_loop
 from servod.lab.tracking.metrics import paper_rows
-from tests.lab.diagnose.axes import believed, record, recording
+from tests.lab.diagnose.axes import GAINS, believed, record, recording
 
 #: A weight that pulls nearly the same way wherever the joint stands.
 GRAVITY = Gravity(amplitude=0.02, phase=1.5)
@@ -48,6 +48,17 @@ def test_true_model_leaves_noise(hidden: dict[str, Any]) -> None:
     assert left < 0.015
     if hidden:
         assert rms(predictor, believed()) > 5.0 * left
+
+
+def test_the_joint_starts_where_it_is_and_not_where_a_wave_of_the_encoder_shows_it() -> None:
+    """The correction of 7 mrad would drag the bristle along, and a joint that stands still would lack its torque."""
+    wave = {"amplitude": 0.0075, "periods_per_turn": 2.0, "phase": 1.2}
+    true, reference = believed(encoder_eccentricity={"harmonics": [wave]}), np.zeros((2000, 3))
+    reference[:, 0] = 0.0075 * np.sin(1.2) + 0.3 * np.clip(np.arange(2000) * 1e-3 - 0.5, 0.0, None) ** 2
+    run = simulate_closed_loop(true, LAWS["pd"], GAINS, reference, LoopSettings(counts_per_turn=2.0**20))
+    traces, _ = load_traces([recording(run.t_s, run.torque_nm, run.encoder_rad)], believed())
+    predictor = Predictor(traces, believed())
+    assert rms(predictor, true) < 0.01
 
 
 def rms(predictor: Predictor, model: AxisModel) -> float:

@@ -230,6 +230,7 @@ class Predictor:
         self.counts = np.concatenate([self._rows_that_count(i) for i in range(len(self.traces))])
         self.evaluations = 0
         self._run, self._follow = without_lock(innovate), without_lock(open_loop.follow)
+        self._behind = without_lock(open_loop.recorded_motion)
 
     def _rows_that_count(self, index: int) -> NDArray[np.bool_]:
         """Rows that count: those of the trace, once the observer has settled behind each start."""
@@ -300,8 +301,10 @@ class Predictor:
         axis = inputs(packed, PlantState(temperature_c=packed.p.start_c))
         one = slice(row, row + 1)
         moved = np.array([motion])
+        if packed.p.eccentricity_n > 0:  # else the observer's first correction drags the bristle along
+            self._behind(*axis, moved)
         self._follow(*axis, drive.t_s[one], moved, drive.torque[one], before, drive.temperature_c[one], hidden, 1e-3)
-        return np.array([motion[0], motion[1], *hidden[0]])
+        return np.array([*moved[0, :2], *hidden[0]])
 
 
 def drive_factor(model: AxisModel) -> float:
