@@ -94,6 +94,15 @@ def test_what_is_not_told_from_none_stays_where_unseen_rows_need_it(
     assert (reject_terms(selector, judgement) is None) is stays
 
 
+def test_a_spring_without_stiffness_gives_way_to_the_offset_that_it_is() -> None:
+    """It took all of the mismatch and had no name: an axis with half its friction as an offset was told as adequate."""
+    selector = selecting(believed(torque_offset=0.06))
+    judgement = sorted_with(selector, form(selector, "spring"))
+    assert judgement.removed_share(0) > 0.9
+    selection = reject_terms(selector, replace(judgement, named=(), kept={0: MinorReason.UNSURE}))
+    assert selection is not None and not selection.fit.hypothesis.terms
+
+
 @pytest.mark.parametrize(("effect", "stays"), [("gravity", True), ("backlash", False), ("joint_elasticity", False)])
 def test_a_resonance_that_is_too_small_for_a_name_is_in_no_model(selector: Selector, effect: str, stays: bool) -> None:
     """A feedback would have to be stable with it."""

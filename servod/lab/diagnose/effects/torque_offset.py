@@ -42,5 +42,6 @@ EFFECT = Effect(
     terms=terms,
     look=Look("time"),
     directed=True,
+    within=("spring",),
     at_level=_at_level,
 )
