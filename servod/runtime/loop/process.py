@@ -105,8 +105,9 @@ def main() -> int:
     except BaseException:
         cycle.let_go()
         raise
+    finally:
+        give_way()
     bus.close()
-    give_way()
     return 0 if cycle.seen_off else NOT_SEEN_OFF
 
 

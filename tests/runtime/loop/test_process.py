@@ -49,6 +49,18 @@ def test_a_supervisor_that_died_while_this_process_began_is_lost_at_once():
     assert not supervisor_watch(Channel(clock=clock), clock, os.getppid() + 1)()
 
 
+def test_a_loop_at_its_end_lets_others_run() -> None:
+    """Asked in a process of its own, which this one must not become: the policy before, in the loop, and at its end."""
+    code = (
+        "import os; from servod.runtime.loop.realtime import apply_realtime, give_way\n"
+        "found = [g.granted for g in apply_realtime(None, 1) if g.name == 'sched_fifo']\n"
+        "asked = os.sched_getscheduler(0); give_way()\n"
+        "print(found[0] == (asked == os.SCHED_FIFO), os.sched_getscheduler(0))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.split() == ["True", str(os.SCHED_OTHER)]
+
+
 #: In place of the loop: ready half a second after its start.
 CHILD = """
 import sys, time

@@ -99,7 +99,7 @@ def _better(rival: Candidate, left: float, numbers: int) -> bool:
     if is_another(rival.fit, rival.place):
         return False
     if left <= SETTINGS.joint.nearly_all:
-        fewer = rival.term.numbers < numbers
-        worse, better = (rival.left, left) if fewer else (left, rival.left)
-        return fewer is (worse <= SETTINGS.joint.as_good * better + SETTINGS.joint.nothing)
+        if rival.term.numbers < numbers:
+            return rival.left <= SETTINGS.joint.as_good * left + SETTINGS.joint.nothing
+        return left > SETTINGS.joint.as_good * rival.left + SETTINGS.joint.nothing
     return penalised_left(rival) <= left * (1.0 + SETTINGS.trials.per_number * numbers)
