@@ -42,6 +42,12 @@ class CheckedTrace:
         return np.unique(np.concatenate([[0], behind_gaps(self.drive.t_s)])).astype(np.int64)
 
     @cached_property
+    def at_its_own_times(self) -> Drive:
+        """The rows at the recording's own times, not shifted to those of the others."""
+        drive = self.drive
+        return Drive(drive.t_s - self.shift_s, drive.torque, drive.position, drive.temperature_c, drive.told)
+
+    @cached_property
     def position_noise(self) -> float:
         """RMS of the position's noise, quantisation included, rad or m."""
         return noise_rms(self.drive.position)

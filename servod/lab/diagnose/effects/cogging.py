@@ -53,16 +53,17 @@ def whole_orders(scene: SearchContext) -> list[int]:
 
     By matching pursuit; order one is a weight's.
     """
-    columns = scene.carried(-np.ones_like(scene.position))
+    carried = scene.carried(-np.ones_like(scene.position))
+    pairs = dict(scene.pairs(carried, np.arange(2.0, HIGHEST_ORDER + 1.0)))
     wanted = scene.mismatch[scene.thinned]
     total, left = max(float(wanted @ wanted), 1e-30), wanted
     found: list[int] = []
     for _ in range(MOST_ORDERS):
         best = max(
             (n for n in range(2, HIGHEST_ORDER + 1) if n not in found),
-            key=lambda n: explained_power(columns(float(n)), left),
+            key=lambda n: explained_power(pairs[n], left),
         )
-        design = np.column_stack([c for n in (*found, best) for c in columns(float(n))])
+        design = np.column_stack([column for n in (*found, best) for column in pairs[n]])
         after = wanted - design @ np.linalg.lstsq(design, wanted, rcond=None)[0]
         if float(left @ left) - float(after @ after) < LEAST_SHARE * total:
             break

@@ -17,12 +17,10 @@ Array = NDArray[np.float64]
 def _columns(scene: SearchContext) -> Columns:
     """What an error a*sin(n*x) of the encoder looks like: the torque that would make the joint move so."""
     rows = scene.thinned
-    place, speed, growth = scene.lagged_position[rows], scene.velocity[rows], scene.acceleration[rows]
-    fading = scene.fading[rows]
+    speed, growth, fading = scene.velocity[rows], scene.acceleration[rows], scene.fading[rows]
 
-    def columns(n: float) -> tuple[Array, Array]:
+    def columns(n: float, sine: Array, cosine: Array) -> tuple[Array, Array]:
         gain = scene.inertia / (1.0 + (n * fading) ** 2)
-        sine, cosine = np.sin(n * place), np.cos(n * place)
         bend, slope = (n * speed) ** 2, n * growth
         return gain * (slope * cosine - bend * sine), gain * (-slope * sine - bend * cosine)
 

@@ -6,7 +6,7 @@ Stands between the fit of the moment and the effects' files.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -19,8 +19,8 @@ from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
 
-#: Two columns for an order n, on the thinned rows of a scene.
-Columns = Callable[[float], tuple[Array, Array]]
+#: Two columns for an order n from sin(n*x) and cos(n*x), on the thinned rows of a scene.
+Columns = Callable[[float, Array, Array], tuple[Array, Array]]
 
 #: Periods that must lie within the range of positions before a periodic effect may be named.
 LEAST_PERIODS = 1.5
@@ -197,16 +197,29 @@ class SearchContext:
         """The `count` strongest orders, by least squares of the mismatch on the two `columns` of each order."""
         wanted = self.mismatch[self.thinned]
         total = max(float(wanted @ wanted), 1e-30)
-        found = [_peak(n, *columns(float(n)), wanted, total) for n in self.orders]
+        found = [_peak(n, *pair, wanted, total) for n, pair in self.pairs(columns, self.orders)]
         return strongest(found, count, 2.0 * math.pi / self.reach)
+
+    def pairs(self, columns: Columns, orders: Array) -> Iterator[tuple[float, tuple[Array, Array]]]:
+        """The two columns of each of some evenly spaced orders.
+
+        exp(i*n*x), x as the observer shows it, is turned on from order to order: a product costs a tenth of a sine and
+        a cosine.
+        """
+        place = self.lagged_position[self.thinned]
+        wave = np.exp(1j * orders[0] * place)
+        turn = np.exp(1j * (orders[-1] - orders[0]) / max(len(orders) - 1, 1) * place)
+        for n in orders:
+            yield float(n), columns(float(n), wave.imag, wave.real)
+            wave = wave * turn
 
     def carried(self, carrier: Array) -> Columns:
         """Columns of carrier*sin(n*x) and carrier*cos(n*x) as the observer shows them."""
-        seen, place, fading = carrier[self.thinned], self.lagged_position[self.thinned], self.fading[self.thinned]
+        seen, fading = carrier[self.thinned], self.fading[self.thinned]
 
-        def columns(n: float) -> tuple[Array, Array]:
+        def columns(n: float, sine: Array, cosine: Array) -> tuple[Array, Array]:
             gain = seen / (1.0 + (n * fading) ** 2)
-            return gain * np.sin(n * place), gain * np.cos(n * place)
+            return gain * sine, gain * cosine
 
         return columns
 
@@ -223,10 +236,13 @@ class SearchContext:
 
 
 def _peak(n: float, sine: Array, cosine: Array, wanted: Array, total: float) -> Peak:
-    normal = np.array([[sine @ sine, sine @ cosine], [sine @ cosine, cosine @ cosine]])
-    right = np.array([sine @ wanted, cosine @ wanted])
-    found = np.linalg.solve(normal + (1e-9 * float(np.trace(normal)) + 1e-30) * np.eye(2), right)
-    return Peak(n, float(found[0]), float(found[1]), float(found @ right) / total)
+    sines, both, cosines = float(sine @ sine), float(sine @ cosine), float(cosine @ cosine)
+    to_sine, to_cosine = float(sine @ wanted), float(cosine @ wanted)
+    ridge = 1e-9 * (sines + cosines) + 1e-30
+    determinant = (sines + ridge) * (cosines + ridge) - both * both
+    of_sine = (to_sine * (cosines + ridge) - to_cosine * both) / determinant
+    of_cosine = (to_cosine * (sines + ridge) - to_sine * both) / determinant
+    return Peak(n, of_sine, of_cosine, (of_sine * to_sine + of_cosine * to_cosine) / total)
 
 
 def strongest(peaks: list[Peak], count: int, apart: float) -> list[Peak]:

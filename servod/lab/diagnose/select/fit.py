@@ -145,7 +145,7 @@ class Fitter:
         columns = [fit.jacobian[:, i] for i in range(min(keep_columns, fit.jacobian.shape[1]))]
         left = range(len(columns), len(fit.coordinates))
         columns += in_parallel("columns", lambda index: self._column(fit, index), left)
-        return np.column_stack(columns)
+        return np.array(columns).T  # column by column in memory, as the normal matrix reads it
 
     def _column(self, fit: Fit, index: int) -> Array:
         nudged = fit.coordinates.copy()
@@ -180,13 +180,13 @@ class Fitter:
 
     def _normal(self, fit: Fit, jacobian: Array) -> tuple[Array, Array]:
         """Normal matrix and slope of the cost, prior included."""
-        off = fit.mismatch / self.weighing.scale
-        weight = self.weighing.rows * np.minimum(1.0, SETTINGS.fit.huber / np.maximum(np.abs(off), 1e-12))
-        scaled = jacobian / self.weighing.scale
+        off = np.abs(fit.mismatch) / self.weighing.scale
+        weight = self.weighing.rows * np.minimum(1.0, SETTINGS.fit.huber / np.maximum(off, 1e-12))
+        weight /= self.weighing.scale**2
         some = slice(jacobian.shape[1])
         centre, precision = (part[some] for part in fit.hypothesis.prior)
-        normal = scaled.T @ (weight[:, None] * scaled) + np.diag(precision**2)
-        return normal, scaled.T @ (weight * off) + precision**2 * (fit.coordinates[some] - centre)
+        normal = jacobian.T @ (weight[:, None] * jacobian) + np.diag(precision**2)
+        return normal, jacobian.T @ (weight * fit.mismatch) + precision**2 * (fit.coordinates[some] - centre)
 
 
 def secant(jacobian: Array, old: Fit, new: Fit) -> Array:
@@ -196,7 +196,7 @@ def secant(jacobian: Array, old: Fit, new: Fit) -> Array:
     if length == 0.0:
         return jacobian
     missed = new.mismatch - old.mismatch - jacobian @ step
-    return np.asarray(jacobian + np.outer(missed, step / length))
+    return np.asarray(jacobian + np.outer(step / length, missed).T)
 
 
 def _bounded_step(normal: Array, slope: Array, damping: float, fit: Fit) -> Array:

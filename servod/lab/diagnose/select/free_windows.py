@@ -52,5 +52,4 @@ def _drive(trace: CheckedTrace, model: AxisModel) -> Drive:
     """The recording on the time that the model's windows of disturbance are in: shifted, where one was fitted."""
     if model.disturbance is not None and model.disturbance.windows:
         return trace.drive
-    drive = trace.drive
-    return Drive(drive.t_s - trace.shift_s, drive.torque, drive.position, drive.temperature_c, drive.told)
+    return trace.at_its_own_times
