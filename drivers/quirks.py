@@ -58,7 +58,7 @@ class Precondition:
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
+class VendorFlag:
     """A vendor object by which a drive shows something of itself: it does where this reads `value`."""
 
     index: int
@@ -77,7 +77,9 @@ class Quirks:
     deceleration: bool = False  # 0x6085 is in the user units of 0x6064 per s^2; else the engineer sets the ramp
     command_deadline: CommandDeadline = CommandDeadline.TELLS
     deadline_source: DeadlineSource = DeadlineSource()  # for people: why `command_deadline` is what it is
-    deadline_stops: Shown | None = None  # not all drives of the row stop at it: only one that shows this is believed
+    deadline_stops: VendorFlag | None = (
+        None  # not all drives of the row stop at it: only one that shows this is believed
+    )
     max_pdo_entries: int = 8
     pdo_pairs: int = 4  # RPDOs and TPDOs to look for; all that are not planned are set not valid
     reset_communication_at_start: bool = False
@@ -250,7 +252,7 @@ _VIRTUAL = Quirks(
     ),
     deceleration=True,
     command_deadline=CommandDeadline.STOPS,
-    deadline_stops=Shown(0x2007, 0, 1),
+    deadline_stops=VendorFlag(0x2007, 0, 1),
     deviations=(
         Deviation(
             "stops by 0x6007 at the deadline of its commands (0x1400:5), and does not only tell of it, if 0x2007 is 1",

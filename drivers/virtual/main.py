@@ -34,7 +34,7 @@ from servod.drivers.virtual.node import Send, VirtualNode
 from servod.drivers.virtual.port import ErrorState, Port
 from servod.drivers.virtual.settings import VirtualAxisSettings
 from servod.drivers.virtual.timeline import Timeline
-from servod.drivers.virtual.world import Devices, World
+from servod.drivers.virtual.world import VirtualDevices, World
 from servod.formats.config import BusConfig
 from servod.formats.model.axis_model import AxisModel, load_rotary_model
 from servod.runtime.fieldbus.bus import CAN_ERR_BUSOFF, CAN_ERR_CRTL, CAN_ERR_FLAG, CAN_ERR_RESTARTED, CAN_FRAME, Bus
@@ -254,7 +254,7 @@ class CanServer:
     ) -> None:
         self._timeline = Timeline()
         self._buses = buses
-        self.devices = Devices(settings, model, self._timeline, record)
+        self.devices = VirtualDevices(settings, model, self._timeline, record)
         self.devices.build(*(_sender(bus) for bus in self._buses))
         self._bus_off = [False, False]
         self._stopping = False
@@ -362,7 +362,7 @@ def _server(arguments: argparse.Namespace) -> HubServer | CanServer:
     return server
 
 
-def _on_circuit_signals(devices: Devices) -> None:
+def _on_circuit_signals(devices: VirtualDevices) -> None:
     """Let SIGUSR1 and SIGUSR2 turn what a person at the machine would: its emergency stop and its STO circuit."""
     contacts, safe_torque_off = (devices.nodes[0].dictionary.entry(0x2000, sub) for sub in (7, 2))
 

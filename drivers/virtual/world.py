@@ -180,7 +180,7 @@ class Truth(NamedTuple):
     torque_nm: float
 
 
-class Devices:
+class VirtualDevices:
     """The amplifier, the encoder and the joint between them; `build` gives each node its way to the bus.
 
     Raises BadInput for the model of a linear axis.
@@ -223,7 +223,7 @@ class World:
         self.babbled: Counter[int] = Counter()
         self.twins: list[tuple[int, Port]] = []
         self.written = 0
-        self.devices = Devices(settings, model, self.timeline, record)
+        self.devices = VirtualDevices(settings, model, self.timeline, record)
         self._node_ports = {name: self._node_port(name) for name in ("amplifier", "encoder")}
         sends = [self.sender(port) for port in self._node_ports.values()]
         self.amplifier, self.encoder = self.devices.build(*sends)
@@ -264,7 +264,7 @@ class World:
 
     def switch_on_twin(self, node_id: int, time_ns: int) -> None:
         """A second node with this id, on a joint of its own, is switched on: somebody set the same address twice."""
-        twins = Devices(self.settings, self._model, self.timeline)
+        twins = VirtualDevices(self.settings, self._model, self.timeline)
         ports = [self._node_port(f"twin {name}") for name in self._node_ports]
         twins.build(*[self.sender(port) for port in ports])
         for port, twin in zip(ports, twins.nodes, strict=True):

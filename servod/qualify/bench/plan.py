@@ -131,7 +131,7 @@ def machine() -> dict[str, Any]:
 # The benchmark's figures as a table beside what they shall reach, and as a file.
 
 
-class Target(NamedTuple):
+class BenchGoal(NamedTuple):
     """One row: where the figure stands in the document, how it is written, and what it shall be."""
 
     label: str
@@ -157,31 +157,33 @@ class Target(NamedTuple):
 
 
 GOALS = (
-    Target(
+    BenchGoal(
         "wake-up, median against cyclictest", ("wakeup", "median_ratio"), "{:.2f}", "at most 1.3", lambda x: x <= 1.3
     ),
-    Target("wake-up, p99 against cyclictest", ("wakeup", "p99_ratio"), "{:.2f}", "at most 2", lambda x: x <= 2.0),
-    Target("whole tick, median", ("tick_us", "median"), "{:.1f} µs", "at most 45 µs", lambda x: x <= 45.0),
-    Target("whole tick, p99", ("tick_us", "p99"), "{:.1f} µs", "", lambda _: True),
-    Target("controller alone, median", ("controller_us", "median"), "{:.1f} µs", "at most 10 µs", lambda x: x <= 10.0),
-    Target("controller alone, p99", ("controller_us", "p99"), "{:.1f} µs", "", lambda _: True),
-    Target(
+    BenchGoal("wake-up, p99 against cyclictest", ("wakeup", "p99_ratio"), "{:.2f}", "at most 2", lambda x: x <= 2.0),
+    BenchGoal("whole tick, median", ("tick_us", "median"), "{:.1f} µs", "at most 45 µs", lambda x: x <= 45.0),
+    BenchGoal("whole tick, p99", ("tick_us", "p99"), "{:.1f} µs", "", lambda _: True),
+    BenchGoal(
+        "controller alone, median", ("controller_us", "median"), "{:.1f} µs", "at most 10 µs", lambda x: x <= 10.0
+    ),
+    BenchGoal("controller alone, p99", ("controller_us", "p99"), "{:.1f} µs", "", lambda _: True),
+    BenchGoal(
         "missed periods", ("wall_clock", "missed_share"), "{:.3%}", "at most 0.3 % in 60 s", lambda x: x <= 0.003, 60.0
     ),
-    Target(
+    BenchGoal(
         "deadline to torque frame, median",
         ("wall_clock", "deadline_to_torque_us"),
         "{:.0f} µs",
         "at most 250 µs",
         lambda x: x <= 250.0,
     ),
-    Target("stepped, against real time", ("stepped_speed",), "{:.1f}×", "at least 5×", lambda x: x >= 5.0),
-    Target("simulator, against real time", ("simulator_speed",), "{:.0f}×", "at least 500×", lambda x: x >= 500.0),
-    Target(
+    BenchGoal("stepped, against real time", ("stepped_speed",), "{:.1f}×", "at least 5×", lambda x: x >= 5.0),
+    BenchGoal("simulator, against real time", ("simulator_speed",), "{:.0f}×", "at least 500×", lambda x: x >= 500.0),
+    BenchGoal(
         "growth of memory", ("memory", "growth_mib"), "{:.2f} MiB", "below 1 MiB in 10 min", lambda x: x < 1.0, 600.0
     ),
-    Target("synthesis of both regions", ("synthesis", "seconds"), "{:.1f} s", "at most 2 s", lambda x: x <= 2.0),
-    Target(
+    BenchGoal("synthesis of both regions", ("synthesis", "seconds"), "{:.1f} s", "at most 2 s", lambda x: x <= 2.0),
+    BenchGoal(
         "verification with 1000 plants",
         ("verification", "seconds"),
         "{:.0f} s",
@@ -189,11 +191,11 @@ GOALS = (
         lambda x: x <= 60.0,
         plants=1000,
     ),
-    Target("commission", ("commission", "seconds"), "{:.0f} s", "at most 240 s", lambda x: x <= 240.0),
+    BenchGoal("commission", ("commission", "seconds"), "{:.0f} s", "at most 240 s", lambda x: x <= 240.0),
 )
 
 
-def figure(document: dict[str, Any], goal: Target) -> float | None:
+def figure(document: dict[str, Any], goal: BenchGoal) -> float | None:
     """The figure of one row; None when it could not be measured."""
     value: Any = document
     for key in goal.keys:
@@ -201,7 +203,7 @@ def figure(document: dict[str, Any], goal: Target) -> float | None:
     return None if value is None else float(value)
 
 
-def shown(document: dict[str, Any], goal: Target) -> str:
+def shown(document: dict[str, Any], goal: BenchGoal) -> str:
     """The figure of one row as people read it."""
     value = figure(document, goal)
     return "not measured" if value is None else goal.text.format(value)
@@ -213,7 +215,7 @@ def print_table(document: dict[str, Any], console: Console) -> None:
 
     machine = document["machine"]
     measured_on = f"{machine['cpu']}, {machine['cores']} cores, Linux {machine['kernel']}, Python {machine['python']}"
-    table = Table("Figure", "Measured", "Goal", "")
+    table = Table("Figure", "Measured", "BenchGoal", "")
     for goal in GOALS:
         table.add_row(goal.label, shown(document, goal), goal.goal, goal.verdict(document))
     console.print(measured_on, highlight=False, markup=False)

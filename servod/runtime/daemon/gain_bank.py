@@ -20,7 +20,7 @@ from servod.formats.gains.store import GainStore, StoredSet
 from servod.formats.model.identified import Devices
 from servod.formats.recording.record import CycleRecord
 from servod.runtime.daemon.arguments import GainsActivateArgs, GainsLoadArgs, GainsVerdictArgs
-from servod.runtime.daemon.requests import NoAnswer, work_of
+from servod.runtime.daemon.requests import LoopTimeout, work_of
 from servod.runtime.daemon.status import ControllerStatus
 from servod.runtime.loop.commands import Op
 
@@ -278,7 +278,7 @@ class GainBank:
         before = self.newest
         try:
             await self._send(stored, send)
-        except NoAnswer:
+        except LoopTimeout:
             log.error("the loop did not answer; gain set %s version %d is sent again", before.name, before.version)
             with contextlib.suppress(Unreachable):  # it takes both, in this order, or none
                 await self._send(before, send)

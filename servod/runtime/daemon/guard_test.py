@@ -115,7 +115,7 @@ class ProofStatus(TypedDict):
     text: str
 
 
-class Proof(TypedDict):
+class GuardTestRecord(TypedDict):
     """When the guards were tried (Unix time), and what that holds for."""
 
     time: float
@@ -412,7 +412,7 @@ def _sha256(document: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
 
 
-def read_proof(config: AxisConfig) -> Proof | str:
+def read_proof(config: AxisConfig) -> GuardTestRecord | str:
     """What the last test that passed has left, or why there is nothing that counts, in a sentence."""
     path = config.gains.directory / PROOF_NAME
     if not path.exists():
@@ -429,14 +429,16 @@ def read_proof(config: AxisConfig) -> Proof | str:
     return f"the proof of the drive's guards was changed since `servoctl guard-test` wrote it ({path})"
 
 
-def proof_status(config: AxisConfig, proof: Proof | str, found: dict[str, Any], now_s: float) -> ProofStatus:
+def proof_status(config: AxisConfig, proof: GuardTestRecord | str, found: dict[str, Any], now_s: float) -> ProofStatus:
     """Whether `proof` holds for the drive that was brought up with the terms `found`, as of `now_s` (Unix)."""
     days = config.amplifier.guard_test_days
     tested_s, text = _judge(config, proof, found, now_s)
     return {"asked_for": days is not None, "holds": not text, "time": tested_s, "text": text}
 
 
-def _judge(config: AxisConfig, proof: Proof | str, found: dict[str, Any], now_s: float) -> tuple[float | None, str]:
+def _judge(
+    config: AxisConfig, proof: GuardTestRecord | str, found: dict[str, Any], now_s: float
+) -> tuple[float | None, str]:
     if isinstance(proof, str):
         return None, proof
     tested_s = proof["time"]

@@ -168,7 +168,7 @@ def _speed_noise_rad_s(design: Design) -> float:
     return read_rad / design.period_s * (1.0 - kept) * math.sqrt(2.0 / (1.0 + kept))
 
 
-class Shares:
+class ShareEstimator:
     """Forgetting least squares of the three shares, with the prior that they are 1."""
 
     def __init__(self) -> None:
@@ -238,7 +238,7 @@ class PromiseWatch:
 
     expected: Expected | None = None
     serial: int = -1
-    shares: Shares = field(default_factory=Shares)
+    shares: ShareEstimator = field(default_factory=ShareEstimator)
     motion_s: float = 0.0
 
     def __post_init__(self) -> None:
@@ -246,7 +246,7 @@ class PromiseWatch:
 
     def begin(self, serial: int, expected: Expected | None) -> None:
         """Another gain set runs: nothing was seen of its joint yet."""
-        self.serial, self.expected, self.shares, self.motion_s = serial, expected, Shares(), 0.0
+        self.serial, self.expected, self.shares, self.motion_s = serial, expected, ShareEstimator(), 0.0
         self._torques: deque[float] = deque(maxlen=1 + (expected.late_cycles if expected else 0))
         self._cycle = -1
         self._beyond = dict.fromkeys((INERTIA, FORWARD, BACKWARD), 0)

@@ -38,13 +38,13 @@ def taken(record: CycleRecord) -> CycleRecord:
     return record
 
 
-class NoAnswer(Unreachable):
+class LoopTimeout(Unreachable):
     """The loop did not answer a command in time: it may carry it out yet."""
 
 
 class SentOrder:
     """A command to the loop. Awaited, it gives the cycle record that shows it done; raises Unreachable where it was
-    refused, NoAnswer where nobody knows."""
+    refused, LoopTimeout where nobody knows."""
 
     def __init__(self, seq: int, deadline_ns: int, waits: Waits) -> None:
         self.seq = seq
@@ -58,7 +58,7 @@ class SentOrder:
     def __await__(self) -> Generator[Any, None, CycleRecord]:
         yield from self._waits.until(self.over).__await__()
         if self.record is None:
-            raise NoAnswer("the loop did not answer in time")
+            raise LoopTimeout("the loop did not answer in time")
         return taken(self.record)
 
 

@@ -22,7 +22,7 @@ from servod.runtime.daemon.arguments import GainsActivateArgs, GainsVerdictArgs
 from servod.runtime.daemon.connection import Reply
 from servod.runtime.daemon.gain_bank import GainBank
 from servod.runtime.daemon.guard_test import ProofStatus
-from servod.runtime.daemon.requests import NoAnswer
+from servod.runtime.daemon.requests import LoopTimeout
 from servod.runtime.daemon.verbs import Verbs
 from servod.runtime.loop.commands import Op
 from tests.on_event_loop import events_pass, on_event_loop
@@ -138,7 +138,7 @@ class SlowLoop(Loop):
         if not self.hangs:
             return await super().send(op, arguments)
         self.waiting.append(int(arguments[0]))
-        raise NoAnswer("the loop did not answer in time")
+        raise LoopTimeout("the loop did not answer in time")
 
     def go_on(self) -> None:
         self.hangs = False

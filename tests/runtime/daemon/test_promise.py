@@ -31,7 +31,7 @@ from servod.kernels.laws.position import position_torque
 from servod.lab.verify import validation
 from servod.lab.verify.steady_friction import steady_friction
 from servod.runtime.daemon import promise
-from servod.runtime.daemon.promise import BACKWARD, FORWARD, INERTIA, Expected, PromiseWatch, Shares
+from servod.runtime.daemon.promise import BACKWARD, FORWARD, INERTIA, Expected, PromiseWatch, ShareEstimator
 from servod.runtime.loop.axis_state import AxisState
 
 FRICTION = ("coulomb", "static", "viscous", "sigma0", "sigma1")
@@ -303,7 +303,7 @@ def windows() -> Iterator[tuple[list[float], float]]:
 
 
 def test_shares_without_noise_are_found() -> None:
-    shares = Shares()
+    shares = ShareEstimator()
     for row, found in windows():
         shares.add(row, found, 1e-5)
     assert shares.values == pytest.approx([1.3, 0.8, 1.1], abs=1e-3)
@@ -315,7 +315,7 @@ ROW = st.tuples(st.floats(-1.0, 1.0), st.floats(0.0, 1.0), st.floats(-1.0, 0.0),
 @given(st.lists(ROW, min_size=1, max_size=40))
 @example([(0.0, 0.0, 0.0, 0.0)])
 def test_shares_are_the_weighted_least_squares_with_the_prior(rows: list[tuple[float, float, float, float]]) -> None:
-    shares = Shares()
+    shares = ShareEstimator()
     for *row, found in rows:
         shares.add(row, found, 0.1)
     weight = np.sqrt((1.0 - 1.0 / 250.0) ** np.arange(len(rows))[::-1]) / 0.1

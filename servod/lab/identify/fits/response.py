@@ -134,7 +134,7 @@ def fit(trace: RecordedMotion, inertia: float) -> ResponseFit:
             "more torque or speed, or a finer encoder"
         )
     deviation, period = deviation_of(strokes), trace.period_s
-    seen = [Stroke(s.velocity[used], s.torque[used], s.excitation[used]) for s in strokes]
+    seen = [StrokeSpectra(s.velocity[used], s.torque[used], s.excitation[used]) for s in strokes]
     found = _choose(_Lines(frequency[used], deviation[used], period), seen, inertia)
     values, spread, notes, freedom = found.values, found.spread, found.notes, len(strokes) - 1
     slope = joined("slope of the friction map at the sliding speed", notes[1])
@@ -152,11 +152,11 @@ def fit(trace: RecordedMotion, inertia: float) -> ResponseFit:
     )
 
 
-def _choose(lines: _Lines, strokes: Sequence[Stroke], inertia: float) -> _Found:
+def _choose(lines: _Lines, strokes: Sequence[StrokeSpectra], inertia: float) -> _Found:
     """The simplest model that explains the response: rigid, rigid behind a lag, two masses."""
     start = np.log([inertia, max(inertia * 10.0, 1e-12)])
 
-    def solve(parts: Sequence[Stroke], lag: bool) -> Array:
+    def solve(parts: Sequence[StrokeSpectra], lag: bool) -> Array:
         return _solve(lines.frequency, ratio_of(parts), lines.deviation, lines.period_s, start, lag)
 
     ratio = ratio_of(strokes)
@@ -176,7 +176,7 @@ def _choose(lines: _Lines, strokes: Sequence[Stroke], inertia: float) -> _Found:
     return _Found(values, spread, _notes(values, start), lag, None)
 
 
-def _sprung(lines: _Lines, strokes: Sequence[Stroke], inertia: float, rigid: Sequence[Array]) -> _Found | None:
+def _sprung(lines: _Lines, strokes: Sequence[StrokeSpectra], inertia: float, rigid: Sequence[Array]) -> _Found | None:
     """Two masses with a spring, if they explain what the `rigid` joints leave, beyond where cogging disturbs.
 
     A slow cycle has few lines there, or none: fewer numbers than two masses have tell nothing of them.
@@ -192,7 +192,7 @@ def _sprung(lines: _Lines, strokes: Sequence[Stroke], inertia: float, rigid: Seq
     if float(np.sum(np.abs(error / seen.deviation) ** 2)) > SPRUNG_COST * rigid_cost:
         return None
 
-    def solve(parts: Sequence[Stroke]) -> Array:
+    def solve(parts: Sequence[StrokeSpectra]) -> Array:
         return np.array(elastic.solve_from(joint, lines.frequency, ratio_of(parts), lines.deviation, lines.period_s))
 
     values, spread = jackknife(solve, strokes)
@@ -286,7 +286,7 @@ def torque_noise(trace: RecordedMotion, answer: ResponseFit, cogging: Sequence[F
     ratio = answer.way_model(frequency)
     strokes = strokes_of(known, lines)
 
-    def rms(parts: Sequence[Stroke]) -> Array:
+    def rms(parts: Sequence[StrokeSpectra]) -> Array:
         errors = np.abs(np.diff([s.velocity / ratio - s.torque for s in parts], 2))
         return np.array([math.sqrt(float(np.mean(2.0 * errors**2)) / SECOND_DIFFERENCE * last)])
 
@@ -309,7 +309,7 @@ def _in_commands(cogging: Sequence[FittedHarmonic], trace: RecordedMotion, answe
 # Spectra of a multisine recording, stroke by stroke: response, coherence and scatter at the excited lines.
 
 
-class Stroke(NamedTuple):
+class StrokeSpectra(NamedTuple):
     """Spectra of one stroke: velocity, torque, excitation."""
 
     velocity: Complex
@@ -317,7 +317,7 @@ class Stroke(NamedTuple):
     excitation: Complex
 
 
-def spectra(trace: RecordedMotion) -> tuple[Array, list[Stroke]]:
+def spectra(trace: RecordedMotion) -> tuple[Array, list[StrokeSpectra]]:
     """Excited lines in Hz and the spectra of every whole stroke there. Raises AnswerIsNo with too few strokes."""
     lines = excited_lines(trace)
     strokes = strokes_of(trace, lines)
@@ -335,7 +335,7 @@ def excited_lines(trace: RecordedMotion) -> NDArray[np.int_]:
     return np.array([int(s[f"line_{i}"]) for i in range(sum(key.startswith("line_") for key in s))])
 
 
-def strokes_of(trace: RecordedMotion, lines: NDArray[np.int_]) -> list[Stroke]:
+def strokes_of(trace: RecordedMotion, lines: NDArray[np.int_]) -> list[StrokeSpectra]:
     """Spectra of every whole stroke at these lines."""
     s = trace.settings
     count, first, stride = int(s["count"]), int(s["first"]), int(s["stride"])
@@ -346,11 +346,11 @@ def strokes_of(trace: RecordedMotion, lines: NDArray[np.int_]) -> list[Stroke]:
             break
         way = np.diff(trace.position_rad[start : start + count + 1])
         parts = (way - way.mean(), trace.torque_nm[start : start + count], trace.excitation_nm[start : start + count])
-        strokes.append(Stroke(*(np.fft.rfft(part)[lines] / count for part in parts)))
+        strokes.append(StrokeSpectra(*(np.fft.rfft(part)[lines] / count for part in parts)))
     return strokes
 
 
-def ratio_of(strokes: Sequence[Stroke]) -> Complex:
+def ratio_of(strokes: Sequence[StrokeSpectra]) -> Complex:
     """Way per period over torque, through the excitation as instrument."""
     way = sum(s.velocity * s.excitation.conj() for s in strokes)
     torque = sum(s.torque * s.excitation.conj() for s in strokes)
@@ -358,7 +358,7 @@ def ratio_of(strokes: Sequence[Stroke]) -> Complex:
     return ratio
 
 
-def coherence_of(strokes: Sequence[Stroke]) -> Array:
+def coherence_of(strokes: Sequence[StrokeSpectra]) -> Array:
     """Share of the motion at each line that follows the excitation."""
     cross = np.abs(sum(s.velocity * s.excitation.conj() for s in strokes)) ** 2
     powers = sum(np.abs(s.velocity) ** 2 for s in strokes) * sum(np.abs(s.excitation) ** 2 for s in strokes)
@@ -366,7 +366,7 @@ def coherence_of(strokes: Sequence[Stroke]) -> Array:
     return coherence
 
 
-def deviation_of(strokes: Sequence[Stroke]) -> Array:
+def deviation_of(strokes: Sequence[StrokeSpectra]) -> Array:
     """Relative standard deviation of the strokes' common ratio at each line, smoothed over neighbours."""
     ratio = ratio_of(strokes)
     misfit = np.array([np.abs(s.velocity - ratio * s.torque) ** 2 for s in strokes]).sum(axis=0)
