@@ -120,7 +120,7 @@ class ProfilePositionTarget(PositionTarget):
         self._raised = False
 
     def idle(self, position_counts: int, torque_per_mille: int, holding: bool) -> int:
-        """The position now present; a drive that comes back gets its target anew."""
+        """The position now present; a drive that comes back gets its target again."""
         self._offered, self._raised = None, False
         return super().idle(position_counts, torque_per_mille, holding)
 

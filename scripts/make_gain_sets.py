@@ -306,7 +306,7 @@ def certify() -> None:
 
 
 def certified_problem() -> str | None:
-    """Why the certified set must be made anew; None when it is certified, for this model and this plant."""
+    """Why the certified set must be made again; None when it is certified, for this model and this plant."""
     if not CERTIFIED.exists() or not IDENTIFIED.exists():
         return "missing"
     gains = load_gains(CERTIFIED)
@@ -323,7 +323,7 @@ def main() -> int:
     """Write the files, or compare them with `--check`."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true", help="write nothing, exit 1 when a file is stale")
-    parser.add_argument("--certified", action="store_true", help=f"make {CERTIFIED.stem} anew as well, in two minutes")
+    parser.add_argument("--certified", action="store_true", help=f"make {CERTIFIED.stem} again as well, in two minutes")
     options = parser.parse_args()
     check = options.check
     if options.certified and not check:

@@ -3,7 +3,7 @@
     pip install -e .[dev,mutation]
     nice python scripts/mutate.py                 all of it, about a quarter of an hour on one core
     nice python scripts/mutate.py limits axis     these files
-    nice python scripts/mutate.py --sample 100    a hundred changes, drawn anew with --seed
+    nice python scripts/mutate.py --sample 100    a hundred changes, drawn again with --seed
 
 A change (a mutant: another operator, number, comparison or branch, by the operators of cosmic-ray) that no test notices
 has survived. Those that no test can know of stand in scripts/mutate_survivors.yaml with the reason; any other

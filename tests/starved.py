@@ -48,7 +48,7 @@ SHOWS_AFTER_S = 1.0
 LATENESS = {
     *(FaultCode.DEADLINE_LATE, FaultCode.DEADLINE_BUDGET, FaultCode.FEEDBACK_STALE, FaultCode.SUPERVISOR_LOST),
     *(FaultCode.NODE_HEARTBEAT_LOST, FaultCode.COMMANDS_LOST, FaultCode.BUS_QUEUE_FULL),
-    # A drive that is not heard to stop is told by NMT, and must be configured anew.
+    # A drive that is not heard to stop is told by NMT, and must be configured again.
     *(FaultCode.DRIVE_STAYS_POWERED, FaultCode.NODE_LEFT_OPERATIONAL),
 }
 #: Logs of the daemons that the tests of this file started.
@@ -58,7 +58,7 @@ _LOGGED = re.compile(r"fault (\w+) \(")
 _EMCY, _MISSED_ITS_MASTER = re.compile(r"EMCY 0x([0-9A-F]{4}) .*\(DRIVE_FAULT\)"), {"8130"}
 #: From where a daemon is ended to where the next begins.
 _ENDED = re.compile(r" INFO stopping: .*?(?= INFO gain set |\Z)", re.DOTALL)
-_FOLLOWS = re.compile(r"a fault is latched|'FAULT'|is FAULT|the axis is not enabled|must be configured anew")
+_FOLLOWS = re.compile(r"a fault is latched|'FAULT'|is FAULT|the axis is not enabled|must be configured again")
 #: Sleeps on one processor before all that servod starts there, and tells when it slept too long, and how much [s].
 _WITNESS = """
 import os, sys, time
@@ -303,7 +303,7 @@ class Again:
 
     @staticmethod
     def _end_fixtures_of_file(item: pytest.Item) -> None:
-        """So that they are made anew: pytest keeps what one raised, or measured on the starved machine."""
+        """So that they are made again: pytest keeps what one raised, or measured on the starved machine."""
         file = item.getparent(pytest.Module)
         try:
             item.session._setupstate.teardown_exact(file.parent if file is not None else None)  # type: ignore[arg-type]

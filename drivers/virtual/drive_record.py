@@ -43,7 +43,7 @@ class DriveSample(NamedTuple):
 
 
 class DriveRecord:
-    """Writer of the record at `path`, which is made anew. Raises BadInput when it cannot be written."""
+    """Writer of the record at `path`, which is made again. Raises BadInput when it cannot be written."""
 
     def __init__(self, path: str | Path, capacity: int = CAPACITY) -> None:
         size = _HEADER.size + capacity * SAMPLE.size

@@ -73,7 +73,7 @@ class Emergency:
             self._inhibit_over(time_ns)
 
     def _inhibit_over(self, time_ns: int) -> None:
-        """Send the oldest waiting frame and start the inhibit time anew; without one, send all."""
+        """Send the oldest waiting frame and start the inhibit time again; without one, send all."""
         identifier = self._dictionary.value(Obj301.EMCY_COB_ID)
         inhibit_ns = self._dictionary.value(Obj301.EMCY_INHIBIT) * 100_000
         while self._waiting:
@@ -152,7 +152,7 @@ class HeartbeatConsumer:
         self._silent: set[int] = set()
 
     def configure(self) -> None:
-        """Take over 0x1016; supervision begins anew, with the next heartbeat of each node."""
+        """Take over 0x1016; supervision begins again, with the next heartbeat of each node."""
         for _, timer in self._watched.values():
             timer.cancel()
         self._watched.clear()  # the silent stay it until they are heard: so long their EMCY stands

@@ -402,7 +402,8 @@ def main(argv: list[str] | None = None) -> int:
     try:
         server.run()
     finally:
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # ending takes long, and others run before it
+        with contextlib.suppress(OSError):  # ending takes long, and others run before it
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         server.close()
     return 0
 

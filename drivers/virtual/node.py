@@ -77,7 +77,7 @@ class VirtualNode(ABC):
 
     @abstractmethod
     def reset_application(self, time_ns: int) -> None:
-        """The device starts anew (power on, NMT reset node); its objects have their defaults."""
+        """The device starts again (power on, NMT reset node); its objects have their defaults."""
 
     @abstractmethod
     def connection_lost(self, time_ns: int, code: int = Emcy.HEARTBEAT_LOST) -> None:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from servod.client.open import WalkAxis
 
 _HELP = example(
-    "Identify the axis, synthesize and verify a gain set for it, deploy it with proof, compare, and report. "
+    "Identify the axis, synthesize and verify a gain set for it, deploy it on trial, compare, and report. "
     "Interrupted at any moment, the same command goes on in the same folder. A virtual axis takes about four minutes.",
     "servoctl commission --config /etc/servod/config/can0.yaml --out commissioning",
     "servoctl commission --plant joint.yaml --out commissioning --json",
@@ -58,7 +58,7 @@ def commission(
     processes: Annotated[int, typer.Option(min=1, max=64, help="Worker processes.")] = 2,
     again: Annotated[
         list[str] | None,
-        typer.Option(help="Do this step anew, though it was done; repeatable.", autocompletion=walk_steps),
+        typer.Option(help="Do this step again, though it was done; repeatable.", autocompletion=walk_steps),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of excitation, tuning and virtual noise.")] = 1,
     yes: Annotated[

@@ -45,7 +45,7 @@ VERBS: dict[Panel, dict[str, str]] = {
         "identify": "Identify the axis: inertia, friction, delay, noise.",
         "synthesize": "Compute a gain set for an axis model.",
         "verify": "Certify a gain set, or say why not.",
-        "deploy": "Try a certified gain set on the axis; keep it if proven.",
+        "deploy": "Try a certified gain set on the axis; keep it if it does as promised.",
         "commission": "All of these in one walk, with a report.",
     },
     Panel.ANALYSE: {

@@ -45,7 +45,7 @@ def register_paper(app: typer.Typer) -> None:
 def paper(
     out: Annotated[Path, typer.Option(help="Folder for paper.html, paper.md, paper.json and pictures.")],
     quick: Annotated[
-        bool, typer.Option("--quick", help="Table I's joint alone, as it is told, short runs, no pictures.")
+        bool, typer.Option("--quick", help="Table I's joint alone, as printed, short runs, no pictures.")
     ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of noise and excitations; the same gives the same.")] = 1,
     as_json: JsonOption = False,
@@ -87,7 +87,7 @@ def print_document(document: dict[str, Any], out: Path) -> None:
 
 
 _SOAK_HELP = example(
-    "Move the virtual axis at random for hours, let faults befall it, recover as a person would, and account for every "
+    "Move the virtual axis at random for hours, inject faults, recover as a person would, and account for every "
     "cycle: loop counter, SYNC on the bus and recorded rows agree, every fault that is due in the log is there, none "
     "is without a cause, what the axis rides through left its trace on the bus, torque is gone in time by the drive's "
     "own record, memory stays flat. SYNC-stepped, so that a day takes two hours; --wall runs the real processes on the "
@@ -104,7 +104,7 @@ _FEWEST_H, _MOST_H = 1e-4, 1e5
 
 def register_soak(app: typer.Typer) -> None:
     """Add the verb to `app`."""
-    app.command("soak", help=_SOAK_HELP, short_help="Hours of random moves and faults, every cycle told.")(soak)
+    app.command("soak", help=_SOAK_HELP, short_help="Hours of random moves and faults; no cycle is lost.")(soak)
 
 
 def _hours(text: str) -> float:
@@ -175,7 +175,7 @@ def _print(found: dict[str, Any], out: Path) -> None:
 _HELP = example(
     "Run the fault campaign on the virtual axis: every scenario injects its faults, the drive's own record says when "
     "torque was gone, and the table shows what the user is told. Scenarios in virtual time first, then those of "
-    "daemon, loop and drive as processes on the wall clock, one at a time. The proof of the wiring is off but where a "
+    "daemon, loop and drive as processes on the wall clock, one at a time. The wiring test is off but where a "
     "scenario's file states wiring_proof in its `config`. Exit code 1 when one did not pass.",
     "servoctl qualify faults",
     "servoctl qualify faults --stepped --group encoder --out out/faults",

@@ -203,7 +203,7 @@ def _stopping_lines(document: dict[str, Any]) -> list[str]:
     """The stop that is stated, and what was narrowed for it."""
     stop = document["stopping"]
     if stop is None:
-        return ["[yellow]stopping[/yellow] not reckoned: nothing tells of the joint (see `servoctl config check`)"]
+        return ["[yellow]stopping[/yellow] not computed: the joint is not stated (see `servoctl config check`)"]
     coasts = "does not rest" if stop["coasts_rad"] is None else f"coasts {stop['coasts_rad']:.3g} rad at most"
     line = (
         f"stops within {1e3 * stop['time_s']:.0f} ms, {stop['speed_rad_s']:.3g} rad/s and {stop['travel_rad']:.3g} rad "

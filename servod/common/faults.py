@@ -187,7 +187,7 @@ FAULTS: dict[FaultCode, Fault] = dict(
             _C.DRIVE_RESET,
             _R.DISABLE,
             "A node sent its boot-up message while it should have been operational: it was reset.",
-            "Check the supply of the node. The service configures it anew by itself; restart a daemon without --wait.",
+            "Check the supply of the node. The service configures it again by itself; restart a daemon without --wait.",
         ),
         _row(
             _C.DRIVE_LEFT_OPERATION,
@@ -229,14 +229,14 @@ FAULTS: dict[FaultCode, Fault] = dict(
             _C.NODE_HEARTBEAT_LOST,
             _R.QUICK_STOP,
             "A node's heartbeat did not arrive within its time.",
-            "Check the node's supply and the bus wiring. The service begins anew by itself once the node answers; "
+            "Check the node's supply and the bus wiring. The service begins again by itself once the node answers; "
             "restart a daemon without --wait.",
         ),
         _row(
             _C.BUS_OFF,
             _R.QUICK_STOP,
             "The CAN controller is bus-off: too many transmit errors.",
-            "Check bit rate, termination (60 ohm across the lines) and wiring. The service begins anew by itself once "
+            "Check bit rate, termination (60 ohm across the lines) and wiring. The service begins again by itself once "
             "the nodes answer; restart a daemon without --wait.",
         ),
         _row(
@@ -249,7 +249,7 @@ FAULTS: dict[FaultCode, Fault] = dict(
             _C.BUS_DOWN,
             _R.QUICK_STOP,
             "The CAN interface is down or the bus connection was closed.",
-            "Bring the interface up (`ip link set can0 up`). The service begins anew by itself once the nodes answer; "
+            "Bring the interface up (`ip link set can0 up`). The service begins again by itself once the nodes answer; "
             "restart a daemon without --wait.",
         ),
         _row(
@@ -298,8 +298,8 @@ FAULTS: dict[FaultCode, Fault] = dict(
             _C.WIRING_NOT_PROVEN,
             _R.DISABLE,
             "The bounded test before the first torque found a wrong sign, direction or scale, or no answer.",
-            "`servoctl status` and the journal name the check, what it saw and the key to mend; then `servoctl enable "
-            "--reset-fault` repeats it.",
+            "`servoctl status` and the journal name the check, what it saw and the key to correct; then `servoctl "
+            "enable --reset-fault` repeats it.",
         ),
         _row(
             _C.NODE_LEFT_OPERATIONAL,
@@ -329,7 +329,7 @@ FAULTS: dict[FaultCode, Fault] = dict(
             "Somebody else speaks SDO with a node of the axis: a request that this master did not send, or an answer "
             "that it did not ask for. Limits and guards of the node may be changed.",
             "The journal has the frame and its object. Take the service tool or the other master off the bus, then "
-            "restart the daemon, which configures the node anew. What servod leaves as it finds it (the drive's own "
+            "restart the daemon, which configures the node again. What servod leaves as it finds it (the drive's own "
             "torque limit 0x6072, its gains) somebody must set back, or a power cycle does.",
         ),
         _row(
@@ -362,7 +362,7 @@ FAULTS: dict[FaultCode, Fault] = dict(
             "Two senders use one node id: heartbeats come between those of the node, heartbeat or EMCY have another "
             "length or NMT state than CiA 301 gives them, or an EMCY takes back an error that was never heard of, "
             "because somebody else sent it or because the bus lost the error's own frame.",
-            "Give each node its own id (`servoctl scan` shows who is there), find who sends in its name, or mend the "
+            "Give each node its own id (`servoctl scan` shows who is there), find who sends in its name, or repair the "
             "bus where it was disturbed; then restart the daemon.",
         ),
         _row(

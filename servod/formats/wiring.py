@@ -46,12 +46,12 @@ def warnings(config: AxisConfig) -> list[str]:
     proof = config.wiring_proof
     if not proof.enabled:
         return [
-            "wiring_proof.enabled is false: the first torque comes unproven; a wrong polarity, scale or direction runs "
+            "wiring_proof.enabled is false: the first torque comes untested; a wrong polarity, scale or direction runs "
             "into the limits"
         ]
     if proof.friction_nm is None or proof.inertia is None:
         return [
-            "neither `model` nor wiring_proof.friction_nm and inertia are stated: the proof of the wiring will not "
+            "neither `model` nor wiring_proof.friction_nm and inertia are stated: the wiring test will not "
             "judge the scale of the torque sharply"
         ]
     return []

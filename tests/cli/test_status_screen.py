@@ -53,7 +53,7 @@ def document() -> dict[str, Any]:
             "proof": {"asked_for": True, "holds": False, "time": None, "text": "the guards were never tested"},
         },
         "promise": {"judged": True, "note": "", "motion_s": 5.0, "joint": [], "errors": []},
-        "wiring": {"tests": 1, "last": {"passed": False, "text": "wiring not proven (TORQUE_POLARITY): turn it"}},
+        "wiring": {"tests": 1, "last": {"passed": False, "text": "wiring test failed (TORQUE_POLARITY): turn it"}},
         "faults": [
             {
                 "code": FAULT.code.name,

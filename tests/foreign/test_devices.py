@@ -148,6 +148,6 @@ def test_the_test_of_the_wiring_refuses_an_encoder_that_is_not_on_the_joint(buil
     ):
         found = {node["node_id"]: node["identity"]["vendor_id"] for node in client.call("scan")["nodes"]}
         assert found[ENCODER] == 0xC0DE
-        with pytest.raises(AnswerIsNo, match="wiring not proven"):
+        with pytest.raises(AnswerIsNo, match="wiring test failed"):
             client.call("enable")
         assert "WIRING_NOT_PROVEN" in faults(client)

@@ -19,7 +19,7 @@ from servod.formats.protocol import Verb
 from servod.formats.recording.record import FIELDS, CycleRecord
 from servod.runtime.daemon.control_server import ControlServer
 from servod.runtime.daemon.gain_bank import GainBank
-from servod.runtime.daemon.guard_test import ProofStatus
+from servod.runtime.daemon.guard_test import GuardTestStatus
 from servod.runtime.daemon.recorder import Recorder
 from servod.runtime.daemon.verbs import Verbs
 from servod.runtime.loop.axis_state import AxisState
@@ -104,7 +104,7 @@ class _Desk:
         self.loop = _Loop()
         recorder = Recorder(self.config.recorder, self.config.name, 1000)
         bank = GainBank(self.config)
-        proof = ProofStatus(asked_for=False, holds=True, time=None, text="")
+        proof = GuardTestStatus(asked_for=False, holds=True, time=None, text="")
         self.verbs = Verbs(self.config, self.loop, bank, recorder, dict, dict, lambda bus: bus, lambda: proof)
         self.server = ControlServer(self.config.control, self.verbs)
         self._events = asyncio.Runner()

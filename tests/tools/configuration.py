@@ -1,4 +1,4 @@
-"""The reference page of the axis configuration. `python tests/tools/configuration.py` writes it anew from the code."""
+"""The reference page of the axis configuration. `python tests/tools/configuration.py` writes it again from the code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The manual's tables that come from the code. `python tests/tools/readme.py` writes them anew.
+"""The manual's tables that come from the code. `python tests/tools/readme.py` writes them again.
 
 Each stands between two marks in one page of `docs`. `--measure` first runs `servoctl bench`, `servoctl qualify paper`
 and `servoctl demo --fast` with the manual's gain sets (twenty minutes on an idle machine) and writes what they print;
@@ -30,7 +30,7 @@ from tables import markdown
 from servod.common.faults import FAULTS
 from servod.common.shipped import shipped
 from servod.drivers.quirks import QUIRKS, CommandDeadline
-from servod.qualify.bench.plan import GOALS
+from servod.qualify.bench.plan import TARGETS
 from servod.qualify.bench.plan import shown as shown_figure
 from servod.qualify.demo.axis import CERTIFIED
 from servod.qualify.demo.entries import entries
@@ -152,16 +152,16 @@ def written() -> dict[Path, str]:
 
 
 def measured(document: dict[str, Any]) -> str:
-    """The benchmark's figures beside their goals, and the machine they were measured on."""
+    """The benchmark's figures beside their targets, and the machine they were measured on."""
     machine = document["machine"]
     rows = []
-    for goal in GOALS:
-        rows.append([goal.label, shown_figure(document, goal), goal.goal, goal.verdict(document)])
+    for target in TARGETS:
+        rows.append([target.label, shown_figure(document, target), target.bound, target.verdict(document)])
     wall_s, memory_s = document["wall_clock"]["seconds"], document["memory"]["seconds"]
     return (
         f"Measured by `servoctl bench` on {machine['cpu']}, {machine['cores']} cores, Linux {machine['kernel']}, "
         f"Python {machine['python']}; wall clock over {wall_s:.0f} s, memory over {memory_s:.0f} s.\n\n"
-        + markdown(["Figure", "Measured", "Goal", ""], rows)
+        + markdown(["Figure", "Measured", "Target", ""], rows)
     )
 
 

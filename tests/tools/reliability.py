@@ -62,7 +62,7 @@ def _met(faults: Iterable[dict[str, Any]]) -> Iterator[str]:
         return
     yield f"{_sum(ridden, 'ridden'):,} of {others} seen on the bus and ridden through"
     if spoilt := _sum(ridden, "spoilt"):
-        yield f"{spoilt:,} of them seen on the bus and the wiring proven again"
+        yield f"{spoilt:,} of them seen on the bus and the wiring tested again"
 
 
 def _due(fault: dict[str, Any]) -> bool:

@@ -14,7 +14,7 @@ KEYS = config_keys()
 
 
 def test_the_page_is_current() -> None:
-    """`python tests/tools/configuration.py` writes it anew."""
+    """`python tests/tools/configuration.py` writes it again."""
     text = configuration.PAGE.read_text()
     assert configuration.with_table(text) == text
 
@@ -24,6 +24,11 @@ def test_every_key_says_what_it_means(key: ConfigKey) -> None:
     assert len(key.meaning) > len("0x6002") and key.type
     if "none" in key.type.split():
         assert any(word in key.meaning for word in ("left out", "none:")), "says nothing of leaving it out"
+
+
+def test_the_gear_ratio_says_which_way_round_it_is() -> None:
+    (meaning,) = (key.meaning for key in KEYS if key.key == "amplifier.gear_ratio")
+    assert "turns of the motor for one turn of the joint" in meaning and "motor angle / gear_ratio" in meaning
 
 
 @pytest.mark.parametrize("key", [k for k in KEYS if k.type.startswith("number")], ids=lambda key: key.key)

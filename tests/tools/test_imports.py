@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -32,6 +33,13 @@ def test_the_rules_of_import_are_kept() -> None:
     lint = Path(sys.executable).with_name("lint-imports")
     result = subprocess.run([lint, "--no-cache"], cwd=source.ROOT, capture_output=True, text=True)
     assert result.returncode == 0, result.stdout + result.stderr
+
+
+def test_every_driver_of_a_device_is_held_to_the_rules_beside_the_machine() -> None:
+    contracts = tomllib.loads((source.ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    (held,) = (c["source_modules"] for c in contracts if c["name"] == "Beside the machine nothing of the laboratory")
+    drivers = {f"servod.drivers.{file.stem}" for file in (source.ROOT / "drivers").glob("*.py")}
+    assert drivers - {"servod.drivers.__init__"} == {name for name in held if name != "servod.runtime"}
 
 
 def test_nobody_imports_the_bare_folder() -> None:

@@ -30,7 +30,7 @@ def test_the_readme_is_a_front_door() -> None:
 
 
 def test_the_tables_are_current() -> None:
-    """`python tests/tools/readme.py` writes them anew."""
+    """`python tests/tools/readme.py` writes them again."""
     for page, text in readme.written().items():
         assert page.read_text() == text, page
 

@@ -42,7 +42,7 @@ _RIDDEN = {"injected": 30, "recovered": 30, "torque_gone": _NONE}
             {"due": 0, "found": 0, "ridden": 28, "spoilt": 2},
             [
                 "28 of 30 others seen on the bus and ridden through",
-                "2 of them seen on the bus and the wiring proven again",
+                "2 of them seen on the bus and the wiring tested again",
             ],
         ),
         ({}, {"found": 30}, ["enabled after 30 of 30 others"]),

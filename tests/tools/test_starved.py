@@ -230,7 +230,7 @@ BEGUN, ENDED = "00:00 INFO gain set demo_pd version 1 (pd)\n", "00:01 INFO stopp
 )
 def test_what_befalls_a_daemon_that_was_ended_is_no_cause(log: str, found: set[str]) -> None:
     assert written(log) == found
-    error = AssertionError(f"{log}servoctl: refused: must be configured anew\nassert 3 == 0")
+    error = AssertionError(f"{log}servoctl: refused: must be configured again\nassert 3 == 0")
     assert by_lateness(error, times_alone=False, faults=written(str(error))) == ("BUS_DOWN" not in found)
 
 

@@ -53,7 +53,7 @@ def wanted(name: str) -> list[Requirement]:
 
 @pytest.mark.parametrize("name", LOCKS)
 def test_every_dependency_is_locked_within_its_range(name: str) -> None:
-    """`scripts/lock` writes them anew."""
+    """`scripts/lock` writes them again."""
     found = versions(name)
     outside = [r for r in wanted(name) if not list(r.specifier.filter(found.get(r.name.lower(), ())))]
     assert outside == []

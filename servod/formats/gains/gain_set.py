@@ -42,7 +42,7 @@ class GainFault(NamedTuple):
 
 
 _VERIFY = "a valid one (`servoctl verify` issues it)"
-_REMAKE = "the file as servoctl wrote it; for other numbers make the set anew (`servoctl synthesize`, then `verify`)"
+_REMAKE = "the file as servoctl wrote it; for other numbers make the set again (`servoctl synthesize`, then `verify`)"
 
 
 def seal_fault(gains: GainSet) -> GainFault | None:
@@ -231,7 +231,7 @@ class GainSet(Strict):
         issued = self.certificate.tool_sha256 if self.certificate else None
         if issued in (None, source_sha256(VERIFIES)):
             return None
-        return "its certificate is from another version of the checks; `servoctl verify` issues it anew"
+        return "its certificate is from another version of the checks; `servoctl verify` issues it again"
 
     def to_yaml(self) -> str:
         """The set as YAML text that `parse_gains` reads back to an equal set."""

@@ -1,7 +1,7 @@
 """Signatures of gain sets: a key of the site (Ed25519) vouches for a set with its certificate.
 
 Beside the file format. Seal and hashes are without a key: they show what changed by accident, and who means to computes
-them anew. A daemon that has `gains.signers` runs only what one of these keys has signed. The package `cryptography`
+them again. A daemon that has `gains.signers` runs only what one of these keys has signed. The package `cryptography`
 (extra `sign`) is imported where somebody signs or a signer is configured, and nowhere else.
 """
 

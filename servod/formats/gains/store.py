@@ -12,7 +12,7 @@ Every file is written aside, flushed to the disk and renamed, so that a kill at 
 new one. `active.json` alone decides; the history line comes after it and may be the one thing that a kill loses.
 
 What is read is what was written, or it is refused: hashes show every change by accident, as of a bit on the disk. They
-are no signature: who means to can compute them anew.
+are no signature: who means to can compute them again.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def sealed_text(text: str, gains: GainSet) -> str:
 
 
 #: A file that was changed is refused by `gains load`, too.
-_INSTEAD = "`servoctl gains activate` another version, or make the set anew (`servoctl synthesize`, then `verify`)"
+_INSTEAD = "`servoctl gains activate` another version, or make the set again (`servoctl synthesize`, then `verify`)"
 
 
 class GainStore:
@@ -173,14 +173,14 @@ class GainStore:
                 write_atomically(self._history_file, "\n".join(lines[-_KEPT_LINES:]) + "\n")
 
     def mend(self) -> None:
-        """Write what says which set is active anew where it is damaged, has no copy or an old one, or is of an earlier
+        """Write what says which set is active again where it is damaged, has no copy or an old one, or is of an earlier
         version."""
         with self._locked(), contextlib.suppress(BadInput, OSError):  # nothing to mend it with, or a full disk: later
             state = self._active()
             if state is None or (state.sha256 and not self.damage and self._copy_is_the_same()):
                 return
             if not self.damage and self._active_copy.exists():
-                log.warning("%s: is not what %s says; written anew from it", self._active_copy, self._active_file.name)
+                log.warning("%s: is not what %s says; written again from it", self._active_copy, self._active_file.name)
             self._write_active(state)
 
     def _copy_is_the_same(self) -> bool:
@@ -243,7 +243,7 @@ class GainStore:
         return self._read(name, chosen)
 
     def _read(self, name: str, version: int) -> StoredSet:
-        """One version, as it was stored; parsed anew only when its file was touched since, so that lists are cheap."""
+        """One version, as it was stored; parsed again only when its file was touched since, so that lists are cheap."""
         path = self._path(name, version)
         try:
             status = path.stat()

@@ -99,7 +99,7 @@ class RunMark:
         try:
             before = _read(self._path, now_ns)
         except BadInput as error:
-            log.warning("%s; begun anew", error)
+            log.warning("%s; begun again", error)
             return True
         if before.alive:
             log.warning("%s: another servod holds it; give each axis a `name` of its own", self._path)

@@ -2,7 +2,7 @@
 
 Stands under the laws, which change it in place. Compiled it is a numpy record with the same names
 (`servod.kernels.physics.compiled.record`), and the same source runs on both. (A read costs 16 ns by name in a slot,
-18 by a constant in a list, 132 by an IntEnum; a NamedTuple made anew in every step would be an allocation for each.)
+18 by a constant in a list, 132 by an IntEnum; a NamedTuple made again in every step would be an allocation for each.)
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 Off the control path (simulator, identification, synthesis, diagnosis, virtual plant). The kernels carry no decorator:
 `compiled` copies a function, swaps every servod function that it calls for its compiled twin, and compiles the copy.
 Machine code is cached per user in a folder named by the kernels' source and the machine, so that a change anywhere in
-a kernel, or a new numba, compiles anew (numba by itself watches only the calling file).
+a kernel, or a new numba, compiles again (numba by itself watches only the calling file).
 """
 
 from __future__ import annotations

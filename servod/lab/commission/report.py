@@ -1,4 +1,4 @@
-"""The page of a commissioning and its pictures: from the folder's files alone, so that it can be made anew at any time.
+"""The page of a commissioning and its pictures: from the files in its folder alone, so that it can be made at any time.
 
 Stands on the figures of servod.lab.report. The last step of the walk makes it.
 """

@@ -35,7 +35,7 @@ RIVALS, TUNING = "rivals", "tuning.json"
 TRACKING, RUNS = "tracking.json", "runs"
 REPORT, REFUSED, PICTURES = "report.html", "refused.html", "pictures"
 RESULT = "commission.json"
-#: What steps had left that are done anew.
+#: What steps had left that are done again.
 EARLIER = "earlier"
 
 
@@ -98,7 +98,7 @@ class State:
     def done(self, step: str, inputs: dict[str, Any], outputs: Sequence[str]) -> bool:
         """Whether the step was done with these inputs and its files are there.
 
-        Raises BadInput when one of them is not what the step wrote, whatever else speaks for doing the step anew: that
+        Raises BadInput when one of them is not what the step wrote, whatever else speaks for doing the step again: that
         would overwrite it.
         """
         record = self._content.steps.get(step)
@@ -159,7 +159,7 @@ class State:
                 raise BadInput(
                     f"--out {self.folder}: {name}",
                     f"a file that was changed after the step {step} had written it",
-                    f"the file as it was; to have it made anew, delete it or use --again {step}. Of a model or a set "
+                    f"the file as it was; to have it made again, delete it or use --again {step}. Of a model or a set "
                     "of your own `servoctl synthesize`, `verify` and `deploy` make the same by single steps",
                 )
 

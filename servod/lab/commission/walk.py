@@ -73,7 +73,7 @@ class WalkOptions:
     rivals: bool = True
     processes: int = 2
     least_plants: int = 1000  # with fewer no certificate is issued
-    again: tuple[str, ...] = ()  # steps that are done anew, whatever was done before
+    again: tuple[str, ...] = ()  # steps that are done again, whatever was done before
 
     @property
     def tuning_seed(self) -> int:

@@ -89,7 +89,7 @@ def check_admissible(gains: GainSet, config: AxisConfig, where: str | None = Non
         raise BadInput(
             f"{where or 'gain set ' + gains.name}: certificate.promised",
             "nothing",
-            "a promise; `servoctl verify` writes it anew",
+            "a promise; `servoctl verify` writes it again",
         )
     return gains.design, gains.certificate.promised
 

@@ -102,7 +102,7 @@ def _selected(selector: Selector, selection: Selection) -> Selection:
 def _judged(selector: Selector, selection: Selection) -> JudgedSelection:
     """The selection cross-validated and judged, and which of its terms are findings."""
     finer = selector.finer(selection.fit.model)
-    selection = cross_validate(finer, restore_nominal(finer, finer.anew(selection)))
+    selection = cross_validate(finer, restore_nominal(finer, finer.refitted(selection)))
     return name_findings(finer, judge(finer, selection))
 
 

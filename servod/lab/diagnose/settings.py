@@ -116,7 +116,7 @@ class ObserverSettings:
     quiet_noises: float = 5.0
     #: Time constants of the observer that pass before a row behind a start counts: what is left of it is 1e-5 then.
     settling: float = 15.0
-    #: A gap in time of so many time constants of the observer begins anew behind it,
+    #: A gap in time of so many time constants of the observer begins again behind it,
     gap_constants: float = 2.0
     #: if it is of so many rows as well: an uneven sampling is none.
     gap_rows: float = 5.0

@@ -172,7 +172,7 @@ def _read_list(folder: Path) -> _List:
     path = folder / LIST
     document = read_json(path, _ALLOWED)
     if isinstance(document, list):
-        raise BadInput(str(path), "a list as earlier versions wrote it", f"{_ALLOWED} of this version; identify anew")
+        raise BadInput(str(path), "a list as earlier versions wrote it", f"{_ALLOWED} of this version; identify again")
     return validate(document, _List, str(path))
 
 
@@ -202,7 +202,7 @@ def _require_same(path: Path, entry: _Entry) -> str:
         raise unreadable(path, error, f"the recording that {LIST} lists") from None
     if entry.sha256 not in (None, found):
         why = "a file that was changed or cut short after it was recorded"
-        raise BadInput(str(path), why, f"the recording that {LIST} lists; without {LIST} the axis is identified anew")
+        raise BadInput(str(path), why, f"the recording that {LIST} lists; without {LIST} the axis is identified again")
     return found
 
 

@@ -395,7 +395,7 @@ def moving(rows: Rows) -> Rows:
 
 
 # --- Positions that wrap ---------------------------------------------------------------------------------------------
-# Positions that wrap: an encoder or a protocol starts anew at the end of its range; and positions in another unit.
+# Positions that wrap: an encoder or a protocol starts again at the end of its range; and positions in another unit.
 #
 # A wrap is undone where the rows say so beyond doubt: all jumps are of one size, go from one end of the range to the
 # other, and the motion goes on behind them as it was.

@@ -109,6 +109,6 @@ def cross_check(gains: GainSet) -> list[CrossCheck]:
 
 
 def cross_checked(gains: GainSet) -> GainSet:
-    """The set with the outcome in its provenance, sealed anew."""
+    """The set with the outcome in its provenance, sealed again."""
     provenance = gains.provenance.model_copy(update={"cross_checks": cross_check(gains)})
     return gains.model_copy(update={"provenance": provenance}).sealed()

@@ -105,7 +105,7 @@ def scales(friction: SteadyFriction, design: Design) -> tuple[list[float], float
 
 
 def programme(design: Design, proof: RegionProof, wishes: Wishes) -> Programme:
-    """The LMI programme of one region, over the vertices that verification will make anew, and guides beside them."""
+    """The LMI programme of one region, over the vertices that verification will make again, and guides beside them."""
     friction = steady_friction(design.model)
     span = Span(proof.name, proof.speed_from_rad_s, proof.speed_to_rad_s)
     found = joints(friction, span, wishes.uncertainty)

@@ -82,7 +82,7 @@ def disc_reach(region: RegionProof) -> float:
 
 
 def scaled_vertices(design: Design, region: RegionProof) -> tuple[list[VertexJoint], Array, Array, Array]:
-    """Joints and scaled (A, B, E) of the region's vertices, made anew from the design's model and intervals."""
+    """Joints and scaled (A, B, E) of the region's vertices, made again from the design's model and intervals."""
     span = Span(region.name, region.speed_from_rad_s, region.speed_to_rad_s)
     found = joints(steady_friction(design.model), span, design.uncertainty)
     return found, *scaled(found, design, region)
@@ -97,7 +97,7 @@ def scaled(found: list[VertexJoint], design: Design, region: RegionProof) -> tup
 
 
 def stored_deviation(design: Design, region: RegionProof) -> float:
-    """Largest difference between the stored vertices and those made anew.
+    """Largest difference between the stored vertices and those made again.
 
     Infinite when they are not the same ones of the same mode, and where one that is to perform has no H2 proof.
     """

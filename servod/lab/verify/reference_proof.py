@@ -1,6 +1,6 @@
 """The inequalities (14) of a set of the reference mode, evaluated by eigenvalues from the stored P, Y and Q.
 
-Stands on the vertices that are made anew from the model and from the law's own sets; no solver. It proves what the
+Stands on the vertices that are made again from the model and from the law's own sets; no solver. It proves what the
 paper proves: the continuous loop without delay or filter. Whether the sampled loop stands is checked apart.
 """
 
@@ -141,7 +141,7 @@ def _balanced_margin(matrix: Array) -> float:
 
 
 def stored_polytope_deviation(design: Design, law: LocalFrictionSets, proof: ReferenceProof) -> float:
-    """Largest relative difference between the stored intervals and those made anew from model and law."""
+    """Largest relative difference between the stored intervals and those made again from model and law."""
     span = Span(proof.name, proof.speed_from_rad_s, proof.speed_to_rad_s)
     made = polytope(steady_friction(design.model), law, span, design.uncertainty)
     kept = Polytope.stored(proof)

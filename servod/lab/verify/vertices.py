@@ -1,6 +1,6 @@
 """Vertices of a region: the ends of the identified intervals as linear joints, ready for the LMIs of the deployed mode.
 
-Stands on the steady friction; synthesis solves over these vertices, verification makes them anew from the model and
+Stands on the steady friction; synthesis solves over these vertices, verification makes them again from the model and
 compares. A frozen a_i would imply the damping g/v; what acts on a small deviation is the true slope g'(v), below zero
 where the Stribeck curve falls, and sigma1 makes it act at once. Near rest the bristle sticks (stiffness c0,
 damping sigma1) or has broken away and slides: both are vertices of Omega_L.

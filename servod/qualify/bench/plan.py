@@ -131,19 +131,19 @@ def machine() -> dict[str, Any]:
 # The benchmark's figures as a table beside what they shall reach, and as a file.
 
 
-class BenchGoal(NamedTuple):
+class BenchTarget(NamedTuple):
     """One row: where the figure stands in the document, how it is written, and what it shall be."""
 
     label: str
     keys: tuple[str, ...]
     text: str
-    goal: str
+    bound: str
     met: Callable[[float], bool]
-    seconds: float = 0.0  # how long the goal wants to be watched; the document says how long it was
-    plants: int = 0  # how many plants the goal is for; the document says how many there were
+    seconds: float = 0.0  # how long the target wants to be watched; the document says how long it was
+    plants: int = 0  # how many plants the target is for; the document says how many there were
 
     def verdict(self, document: dict[str, Any]) -> str:
-        """Empty when the goal is met; else "missed", or why it could not be judged."""
+        """Empty when the target is met; else "missed", or why it could not be judged."""
         value = figure(document, self)
         if value is None:
             return str(document["wakeup"].get("note", "not measured"))
@@ -156,34 +156,34 @@ class BenchGoal(NamedTuple):
         return "" if self.met(value) else "missed"
 
 
-GOALS = (
-    BenchGoal(
+TARGETS = (
+    BenchTarget(
         "wake-up, median against cyclictest", ("wakeup", "median_ratio"), "{:.2f}", "at most 1.3", lambda x: x <= 1.3
     ),
-    BenchGoal("wake-up, p99 against cyclictest", ("wakeup", "p99_ratio"), "{:.2f}", "at most 2", lambda x: x <= 2.0),
-    BenchGoal("whole tick, median", ("tick_us", "median"), "{:.1f} µs", "at most 45 µs", lambda x: x <= 45.0),
-    BenchGoal("whole tick, p99", ("tick_us", "p99"), "{:.1f} µs", "", lambda _: True),
-    BenchGoal(
+    BenchTarget("wake-up, p99 against cyclictest", ("wakeup", "p99_ratio"), "{:.2f}", "at most 2", lambda x: x <= 2.0),
+    BenchTarget("whole tick, median", ("tick_us", "median"), "{:.1f} µs", "at most 45 µs", lambda x: x <= 45.0),
+    BenchTarget("whole tick, p99", ("tick_us", "p99"), "{:.1f} µs", "", lambda _: True),
+    BenchTarget(
         "controller alone, median", ("controller_us", "median"), "{:.1f} µs", "at most 10 µs", lambda x: x <= 10.0
     ),
-    BenchGoal("controller alone, p99", ("controller_us", "p99"), "{:.1f} µs", "", lambda _: True),
-    BenchGoal(
+    BenchTarget("controller alone, p99", ("controller_us", "p99"), "{:.1f} µs", "", lambda _: True),
+    BenchTarget(
         "missed periods", ("wall_clock", "missed_share"), "{:.3%}", "at most 0.3 % in 60 s", lambda x: x <= 0.003, 60.0
     ),
-    BenchGoal(
+    BenchTarget(
         "deadline to torque frame, median",
         ("wall_clock", "deadline_to_torque_us"),
         "{:.0f} µs",
         "at most 250 µs",
         lambda x: x <= 250.0,
     ),
-    BenchGoal("stepped, against real time", ("stepped_speed",), "{:.1f}×", "at least 5×", lambda x: x >= 5.0),
-    BenchGoal("simulator, against real time", ("simulator_speed",), "{:.0f}×", "at least 500×", lambda x: x >= 500.0),
-    BenchGoal(
+    BenchTarget("stepped, against real time", ("stepped_speed",), "{:.1f}×", "at least 5×", lambda x: x >= 5.0),
+    BenchTarget("simulator, against real time", ("simulator_speed",), "{:.0f}×", "at least 500×", lambda x: x >= 500.0),
+    BenchTarget(
         "growth of memory", ("memory", "growth_mib"), "{:.2f} MiB", "below 1 MiB in 10 min", lambda x: x < 1.0, 600.0
     ),
-    BenchGoal("synthesis of both regions", ("synthesis", "seconds"), "{:.1f} s", "at most 2 s", lambda x: x <= 2.0),
-    BenchGoal(
+    BenchTarget("synthesis of both regions", ("synthesis", "seconds"), "{:.1f} s", "at most 2 s", lambda x: x <= 2.0),
+    BenchTarget(
         "verification with 1000 plants",
         ("verification", "seconds"),
         "{:.0f} s",
@@ -191,33 +191,33 @@ GOALS = (
         lambda x: x <= 60.0,
         plants=1000,
     ),
-    BenchGoal("commission", ("commission", "seconds"), "{:.0f} s", "at most 240 s", lambda x: x <= 240.0),
+    BenchTarget("commission", ("commission", "seconds"), "{:.0f} s", "at most 240 s", lambda x: x <= 240.0),
 )
 
 
-def figure(document: dict[str, Any], goal: BenchGoal) -> float | None:
+def figure(document: dict[str, Any], target: BenchTarget) -> float | None:
     """The figure of one row; None when it could not be measured."""
     value: Any = document
-    for key in goal.keys:
+    for key in target.keys:
         value = None if value is None else value.get(key)
     return None if value is None else float(value)
 
 
-def shown(document: dict[str, Any], goal: BenchGoal) -> str:
+def shown(document: dict[str, Any], target: BenchTarget) -> str:
     """The figure of one row as people read it."""
-    value = figure(document, goal)
-    return "not measured" if value is None else goal.text.format(value)
+    value = figure(document, target)
+    return "not measured" if value is None else target.text.format(value)
 
 
 def print_table(document: dict[str, Any], console: Console) -> None:
-    """Print every figure beside its goal, and what it was measured on."""
+    """Print every figure beside its target, and what it was measured on."""
     from rich.table import Table
 
     machine = document["machine"]
     measured_on = f"{machine['cpu']}, {machine['cores']} cores, Linux {machine['kernel']}, Python {machine['python']}"
-    table = Table("Figure", "Measured", "BenchGoal", "")
-    for goal in GOALS:
-        table.add_row(goal.label, shown(document, goal), goal.goal, goal.verdict(document))
+    table = Table("Figure", "Measured", "Target", "")
+    for target in TARGETS:
+        table.add_row(target.label, shown(document, target), target.bound, target.verdict(document))
     console.print(measured_on, highlight=False, markup=False)
     console.print(table)
     wall, memory = document["wall_clock"], document["memory"]

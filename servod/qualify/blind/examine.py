@@ -133,7 +133,7 @@ def one_diagnosis(out: Path, names: Sequence[str], sources: str | None = None) -
             raise BadInput(
                 str(path),
                 f"an answer of sources {found[:12]}",
-                f"sources {sources[:12]} as the others have; remove {out / ANSWERS} to diagnose all cases anew",
+                f"sources {sources[:12]} as the others have; remove {out / ANSWERS} to diagnose all cases again",
             )
         sources = found
     return sources

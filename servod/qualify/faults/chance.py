@@ -100,7 +100,7 @@ _COASTS = {
         ("safe torque off", "short circuit", "supply lost"), "the drive's power stage cannot brake any more"
     ),
     "encoder reset": "the fault's reaction is to disable: its position is gone",
-    "drive reset": "a drive that begins anew has no torque",
+    "drive reset": "a drive that begins again has no torque",
     **dict.fromkeys(
         (_FROZEN, "encoder alarm", "gains not numbers"), "the fault's reaction is to disable: no sensor, no number"
     ),

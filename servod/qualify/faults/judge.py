@@ -117,10 +117,10 @@ def _refused(words: str | None, refusal: str) -> str:
 
 
 def _says(name: str | None, told: WiringOutcome | None) -> str:
-    """The proof of the wiring names what is wrong: each finding has a remedy of its own."""
+    """The wiring test names what is wrong: each finding has a remedy of its own."""
     if name is None or (told is not None and told.name == name):
         return ""
-    return f"the proof of the wiring says {told.name if told else 'nothing'}, expected {name}"
+    return f"the wiring test says {told.name if told else 'nothing'}, expected {name}"
 
 
 def _error_shown(code: int | None, shown: frozenset[int]) -> str:

@@ -38,7 +38,7 @@ class Machine:
     """The processes in `folder` (plant.yaml, settings.yaml and axis.yaml stand there), and the ways to look at them."""
 
     def __init__(self, folder: Path, wire: Wire, waits: bool = False) -> None:
-        """With `waits` the daemon waits for bus and nodes, and begins anew after their loss."""
+        """With `waits` the daemon waits for bus and nodes, and begins again after their loss."""
         self.folder, self.wire, self._waits = folder, wire, waits
         self.config = folder / "axis.yaml"
         self.socket = folder / "axis.sock"

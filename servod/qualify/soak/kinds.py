@@ -75,7 +75,7 @@ class InjectionKind:
         return None if self.undo is None else Injection(at_ms=0.0, do=self.undo)
 
     def while_proving(self) -> InjectionKind:
-        """The same when the wiring is being proven: whatever spoils the proof may end it."""
+        """The same when the wiring is being tested: whatever spoils the test may end it."""
         spoilt = frozenset({_F.WIRING_NOT_PROVEN})
         expects = self.expects | spoilt if self.expects else self.expects
         return replace(self, expects=expects, explains=self.explains | spoilt)
@@ -121,7 +121,7 @@ def _nmt(who: str, *commands: str) -> Action:
 def _node(
     name: str, do: Action, undo: Action | None = None, takes_syncs: bool = False, left_ms: float = MASTER_LOSS_MS
 ) -> InjectionKind:
-    """A participant that is reset, stopped or away for long: it must be configured anew."""
+    """A participant that is reset, stopped or away for long: it must be configured again."""
     expects = frozenset(
         {
             *(_F.FEEDBACK_STALE, _F.DRIVE_RESET, _F.DRIVE_LEFT_OPERATION, _F.NODE_HEARTBEAT_LOST, _F.DRIVE_FAULT),
@@ -254,7 +254,7 @@ KINDS: tuple[InjectionKind, ...] = (
         _write("amplifier", 0x6060, 0, 10),
         latched_ms=400.0,
     ),
-    # The nodes must be configured anew.
+    # The nodes must be configured again.
     replace(
         _encoder("a service tool writes", {"foreign_frame": {"can_id": 0x602, "data": _WARNING}}),
         expects=frozenset({_F.FOREIGN_SDO}),

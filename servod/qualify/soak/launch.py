@@ -55,7 +55,7 @@ class SoakWatch:
         """Sample the memory of `processes` at `axis_s`, the time that the axis has run: what grows grows with cycles,
         moves and faults, and stepped time runs faster than the wall's.
 
-        One that was started anew is another one, and the longest lived is kept.
+        One that was started again is another one, and the longest lived is kept.
         """
         for name, pid in processes.items():
             memory = self.memories.get(name)

@@ -17,7 +17,7 @@ from servod.runtime.loop.commands import ReferenceKind
 
 #: Share of the episodes in which something goes wrong.
 _FAULT_SHARE = 0.7
-#: Share of these in which it goes wrong while the wiring is proven, and how long a proof takes [s].
+#: Share of these in which it goes wrong while the wiring is tested, and how long a proof takes [s].
 _PROVING_SHARE, _PROOF_S = 0.15, 0.42
 #: The fastest reference [rad/s] and the largest amplitude [rad]: what the demo joint's torque can follow.
 _FASTEST_RAD_S, _LARGEST_RAD = 1.2, 0.3
@@ -46,7 +46,7 @@ class Move:
 @dataclass(frozen=True)
 class Episode:
     """One piece of a soak: `law` is a gain set to change to, None keeps what acts; the fault comes `before_s` into the
-    motion, or, with `proves`, into a proof of the wiring in its place."""
+    motion, or, with `proves`, into a wiring test in its place."""
 
     number: int
     law: str | None

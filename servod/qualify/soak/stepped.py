@@ -159,7 +159,7 @@ class SteppedSoak:
         return refusal == Refusal.DONE
 
     def _begin_proof(self) -> None:
-        """Switch off and on, up to where the wiring is proven anew."""
+        """Switch off and on, up to where the wiring is tested again."""
         self._switch_off(Op.DISABLE)
         self._send(Op.ENABLE, [0.0, 1.0])
         self._wait_out(AxisState.ENABLING)

@@ -59,10 +59,10 @@ COUNTED = ("injected", "proving", "due", "found", "ridden", "spoilt", "recovered
 
 @dataclass
 class FaultTally:
-    """One kind of fault; `proving`: so many came while the wiring was being proven.
+    """One kind of fault; `proving`: so many came while the wiring was being tested.
 
     Of those that were injected, `due` must be found in the log, and `found` were. All others left their trace on the
-    bus: `ridden` through, or `spoilt` the proof of the wiring, which was then done again.
+    bus: `ridden` through, or `spoilt` the wiring test, which was then done again.
     """
 
     injected: int = 0

@@ -62,7 +62,7 @@ class HaltArgs(Strict):
 
 
 class TrajectoryArgs(Strict):
-    """`trajectory`: a piece of the samples of the motion that comes next; `start` 0 begins the column anew."""
+    """`trajectory`: a piece of the samples of the motion that comes next; `start` 0 begins the column again."""
 
     key: SampleKey = Field(description="the argument of `track` that the samples are of")
     start: int = Field(ge=0, description="number of the first sample; pieces follow one another without a gap")

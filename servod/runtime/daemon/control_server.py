@@ -34,7 +34,7 @@ from servod.runtime.daemon.status import LeaseStatus
 # --- The right to command --------------------------------------------------------------------------------------------
 # Who may ask what: one client at a time commands, everyone in the group may look, and stop the axis. The first client
 # that commands holds the lease until it disconnects. A stop needs no lease, and wins over whoever holds it: that client
-# may not enable the axis again until it connects anew. While a motion runs whose client has left, others can only end
+# may not enable the axis again until it connects again. While a motion runs whose client has left, others can only end
 # it.
 
 
@@ -76,7 +76,7 @@ class Lease:
         self._refuse_beside_holder(client)
         if verb is Verb.ENABLE and self._stopped_by is not None:
             stopper = self._stopped_by.pid
-            raise Unreachable(f"process {stopper} stopped the axis; connect anew to enable it again")
+            raise Unreachable(f"process {stopper} stopped the axis; connect again before you enable it")
         if verb not in _BESIDE_MOTION:
             self._refuse_beside_motion(client)
         self.holder = client

@@ -212,7 +212,7 @@ class GainBank:
                 return initial
             wanted = f"{last.name} version {last.version}"
             remedy = (
-                f"Set back what was changed and `servoctl gains activate {last.name}`, or make a set anew: "
+                f"Set back what was changed and `servoctl gains activate {last.name}`, or make a set again: "
                 "`servoctl synthesize`, `verify`, `deploy`"
             )
             active = self._store.get(last.name, last.version)

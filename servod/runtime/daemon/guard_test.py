@@ -64,7 +64,7 @@ _EARLIEST_SHARE = 0.4
 _STAYS_OFF_MS = 50.0
 #: With inputs to be read: they come by an event timer, and those that do not come count as active after 40 ms.
 _INPUTS_S = 0.06
-#: A machine that stands still lets the other guard act, or does not see when the drive stopped: tried anew, so often.
+#: A machine that stands still lets the other guard act, or does not see when the drive stopped: tried again, so often.
 _TRIES = 3
 #: The drive is looked at once in a cycle; a look that is later by more is a machine that stood still.
 _LOOK_CYCLES = 3
@@ -106,7 +106,7 @@ class _Seen(NamedTuple):
     stalled: bool
 
 
-class ProofStatus(TypedDict):
+class GuardTestStatus(TypedDict):
     """The proof of the guards as the status tells it; `text` says why it does not hold, empty where it does."""
 
     asked_for: bool
@@ -412,7 +412,7 @@ def _sha256(document: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
 
 
-def read_proof(config: AxisConfig) -> GuardTestRecord | str:
+def read_record(config: AxisConfig) -> GuardTestRecord | str:
     """What the last test that passed has left, or why there is nothing that counts, in a sentence."""
     path = config.gains.directory / PROOF_NAME
     if not path.exists():
@@ -429,7 +429,9 @@ def read_proof(config: AxisConfig) -> GuardTestRecord | str:
     return f"the proof of the drive's guards was changed since `servoctl guard-test` wrote it ({path})"
 
 
-def proof_status(config: AxisConfig, proof: GuardTestRecord | str, found: dict[str, Any], now_s: float) -> ProofStatus:
+def guard_test_status(
+    config: AxisConfig, proof: GuardTestRecord | str, found: dict[str, Any], now_s: float
+) -> GuardTestStatus:
     """Whether `proof` holds for the drive that was brought up with the terms `found`, as of `now_s` (Unix)."""
     days = config.amplifier.guard_test_days
     tested_s, text = _judge(config, proof, found, now_s)
@@ -454,7 +456,7 @@ def _judge(
     return tested_s, ""
 
 
-def require_proof(proof: ProofStatus) -> None:
+def require_guard_test(proof: GuardTestStatus) -> None:
     """Raise Unreachable where the configuration asks for a proof that does not hold."""
     if proof["asked_for"] and not proof["holds"]:
         raise Unreachable(

@@ -16,7 +16,7 @@ from servod.runtime.daemon.status import Percentiles, TimingStatus
 WINDOW_S = 10.0
 #: A loop that writes no record for so long hangs: at least this time, and at least so many periods.
 _HUNG_NS, _HUNG_PERIODS = NS_PER_S, 50
-#: After a pause of its own of this length, the watcher knows nothing of the loop and begins anew.
+#: After a pause of its own of this length, the watcher knows nothing of the loop and begins again.
 _OWN_PAUSE_NS = NS_PER_S // 5
 #: A round of the watcher that took longer says no more of the loop than this; so long a machine may stall besides.
 _ROUND_NS, _STALL_NS = NS_PER_S // 25, NS_PER_S // 10
@@ -44,7 +44,7 @@ class _Ring:
         self._at, self.filled = at, min(count, capacity)
 
     def percentiles(self) -> Percentiles:
-        """Median, 99th percentile and maximum; zeros while empty. Sorted anew when a hundredth of the values is new."""
+        """Median, 99th percentile and maximum; zeros while empty. Sorted when a hundredth of the values is new."""
         if self._new * 100 >= self.filled and self.filled:
             self._new = 0
             ordered = sorted(self._values[: self.filled])

@@ -71,7 +71,7 @@ def run(path: Path, on_ready: Callable[[Supervisor], None], waits: bool = False)
     """Run the axis that `path` configures until it ends; returns the exit code.
 
     Raises ServodError when it cannot begin. `on_ready` is told the supervisor before it begins, for signals. With
-    `waits` it waits for bus and nodes at the start, and begins anew when they were lost and are back.
+    `waits` it waits for bus and nodes at the start, and begins again when they were lost and are back.
     """
     config = check(path)
     incidents, notifier = memory_of_incidents(), Notifier()
@@ -291,7 +291,7 @@ def set_up_logging() -> None:
 _EXAMPLE = """\
 example:
   servod --config /etc/servod/config/can0.yaml          run the axis until SIGTERM
-  servod --config /etc/servod/config/can0.yaml --wait   the same as a service: wait for late nodes, begin anew
+  servod --config /etc/servod/config/can0.yaml --wait   the same as a service: wait for late nodes, begin again
   servod --config /etc/servod/config/can0.yaml --check  only check the configuration and the files it names
 
 exit codes: 0 done, 2 bad usage or input, 3 bus, device or loop cannot be reached or was lost
@@ -310,7 +310,7 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument(
         "--wait",
         action="store_true",
-        help="wait for bus and nodes that are late, and begin anew, disabled, when they were lost and are back",
+        help="wait for bus and nodes that are late, and begin again, disabled, when they were lost and are back",
     )
     found.add_argument("--check", action="store_true", help="check the configuration and end")
     found.add_argument("--version", action="version", version=f"servod {__version__}", help="print the version")

@@ -14,7 +14,7 @@ from servod.common.errors import ServodError, Unreachable
 from servod.common.faults import FAULTS, FaultCode
 from servod.common.units import NS_PER_S, TWO_PI
 from servod.formats.model.identified import Devices
-from servod.runtime.daemon.guard_test import ProofStatus, proof_status, read_proof, terms
+from servod.runtime.daemon.guard_test import GuardTestStatus, guard_test_status, read_record, terms
 from servod.runtime.daemon.status import Age, GuardStatus, IdentityStatus, NodeStatus
 from servod.runtime.fieldbus.bus import Bus
 from servod.runtime.fieldbus.cia import (
@@ -45,7 +45,7 @@ class Nodes:
     def __init__(self, master: Master, plans: BringUp) -> None:
         self._master, self.plans = master, plans
         # Once, before the rounds begin, which wait for no disk: the test runs while no daemon does.
-        self._proof = read_proof(master.config)
+        self._proof = read_record(master.config)
         proof = self.proof()
         if proof["asked_for"] and not proof["holds"]:
             log.warning("%s: run `servoctl guard-test` while no daemon runs; until then no enabling", proof["text"])
@@ -158,11 +158,11 @@ class Nodes:
         """A further connection of the daemon, which the watch over the nodes does not take for somebody else's."""
         return self._master.of_ours(bus)
 
-    def proof(self) -> ProofStatus:
+    def proof(self) -> GuardTestStatus:
         """Whether the guards of this drive are proven."""
         amplifier = self.plans.amplifier
         found = terms(amplifier, self._master.identity(amplifier.node_id))
-        return proof_status(self._master.config, self._proof, found, time.time())
+        return guard_test_status(self._master.config, self._proof, found, time.time())
 
     def guards(self) -> GuardStatus:
         """How the drive guards itself, for the status document."""

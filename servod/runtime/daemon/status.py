@@ -14,7 +14,7 @@ from servod.common.units import NS_PER_S
 from servod.formats.config import AxisConfig, BrakeConfig, BusConfig, InputsConfig
 from servod.formats.recording.record import CycleRecord
 from servod.formats.stopping import StoppingStatus
-from servod.runtime.daemon.guard_test import ProofStatus
+from servod.runtime.daemon.guard_test import GuardTestStatus
 from servod.runtime.daemon.promise import PromiseStatus
 from servod.runtime.daemon.recorder import RecorderState
 from servod.runtime.fieldbus.devices import NEVER_CYCLES, REASON_TEXT, DriveState, Goal, Reason
@@ -163,7 +163,7 @@ class NodeStatus(Age):
 
 class GuardStatus(TypedDict):
     """How the drive guards itself: how soon it stops without a master, how often its guards are read again, and their
-    proof (servod.runtime.daemon.guard_test.ProofStatus)."""
+    proof (servod.runtime.daemon.guard_test.GuardTestStatus)."""
 
     unguarded: bool
     reaction_ms: int
@@ -171,7 +171,7 @@ class GuardStatus(TypedDict):
     heartbeat_timeout_ms: int
     most_torque_nm: float | None
     watched: int
-    proof: ProofStatus
+    proof: GuardTestStatus
 
 
 class GrantStatus(TypedDict):
@@ -240,7 +240,7 @@ _BRAKE = dict.fromkeys(AxisState, "closed") | {
     AxisState.QUICK_STOPPING: "closing at rest",
 }
 #: The drive has its power; the axis is not there yet.
-_BEFORE = {AxisState.PROVING: "wiring is being proven", AxisState.RELEASING: "the brake opens"}
+_BEFORE = {AxisState.PROVING: "the wiring is being tested", AxisState.RELEASING: "the brake opens"}
 
 
 def axis_status(record: CycleRecord) -> AxisStatus:

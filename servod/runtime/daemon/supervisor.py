@@ -44,7 +44,7 @@ from servod.runtime.daemon.status import (
     motion_status,
 )
 from servod.runtime.daemon.verbs import Verbs
-from servod.runtime.daemon.waiting import BEGINS_ANEW, Comeback, carried_by
+from servod.runtime.daemon.waiting import STARTS_AGAIN, Comeback, carried_by
 from servod.runtime.fieldbus.devices import DriveState
 from servod.runtime.fieldbus.master.planned import reaction_s
 from servod.runtime.fieldbus.master.sdo import SDO_TIMEOUT_S
@@ -59,7 +59,7 @@ TICK_S = 0.02
 _STOP_MARGIN_S = 2.0
 #: Quick stop, brake, voltage off and brake again, none of them answered.
 _SILENT_S = 4 * SDO_TIMEOUT_S
-#: For a loop whose connection may be dead to see the drive off once more, before the axis begins anew.
+#: For a loop whose connection may be dead to see the drive off once more, before the axis begins again.
 _LEAVE_S = 0.5
 #: The longest that the manager's watchdog waits from there to the first round of the next supervisor: both nodes are
 #: reset and brought up by some two hundred SDO transfers.
@@ -70,9 +70,9 @@ _STAYS_POWERED = FAULTS[FaultCode.DRIVE_STAYS_POWERED].bit
 
 
 class Context(NamedTuple):
-    """What outlives the supervisor, in a daemon whose axis begins anew.
+    """What outlives the supervisor, in a daemon whose axis begins again.
 
-    `incidents` is what befell the axis; with `shown_s`, one that lost bus or nodes begins anew once they are back and
+    `incidents` is what befell the axis; with `shown_s`, one that lost bus or nodes begins again once they are back and
     its fault was shown for so long. `found` befell it before this start, and was found at it; the faults `carried`,
     as bits, are latched from before.
     """
@@ -114,7 +114,7 @@ class Supervisor:
         self._drive_told = False  # in this round, that it misses the loop
         self._health = Health(config.cycle.period_us, nodes.plans.bus_load)
         self._metrics = AxisMetrics(config.name, nodes.plans.bus_load)
-        self.carried = 0  # faults that stay latched when the axis begins anew
+        self.carried = 0  # faults that stay latched when the axis begins again
         self._faults = FaultWatch(
             recorder, self._health, self._metrics, config.name, context.incidents, context.carried
         )
@@ -142,7 +142,7 @@ class Supervisor:
         return self._stopping
 
     def run(self) -> int | None:
-        """Supervise until asked to stop (0), until the loop is lost (3), or until the axis shall begin anew (None)."""
+        """Supervise until asked to stop (0), until the loop is lost (3), or until the axis shall begin again (None)."""
         return asyncio.run(self._supervise())
 
     async def _supervise(self) -> int | None:
@@ -336,10 +336,10 @@ class Supervisor:
 
     def _leave_for_new(self) -> None:
         """Bus and nodes are back, the drive shows no power. The loop ends, in order where its own connection lives."""
-        self._why_ends = "servod begins anew, for bus and nodes are back; connect again"
-        log.warning(BEGINS_ANEW)
-        self._notifier.begins_anew(BEGINS_ANEW, _ANEW_S)
-        self._recorder.add_event("node", "bus and nodes are back: the axis begins anew, disabled")
+        self._why_ends = "servod begins again, for bus and nodes are back; connect again"
+        log.warning(STARTS_AGAIN)
+        self._notifier.begins_anew(STARTS_AGAIN, _ANEW_S)
+        self._recorder.add_event("node", "bus and nodes are back: the axis begins again, disabled")
         exit_code = self._loop.stop(_LEAVE_S)
         self._take_records(time.monotonic_ns())
         self._note_node_events()

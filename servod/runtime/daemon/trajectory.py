@@ -65,7 +65,7 @@ class MotionTable:
         return self._columns[SampleKey.TORQUES]
 
     def add(self, key: SampleKey, start: int, piece: Sequence[float]) -> None:
-        """Add a piece of a column; `start` 0 begins the column anew. Raises BadInput on a gap or too much."""
+        """Add a piece of a column; `start` 0 begins the column again. Raises BadInput on a gap or too much."""
         if start == 0:
             self._columns[key] = MotionSamples()
         column = self._columns[key]

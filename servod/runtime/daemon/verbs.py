@@ -38,7 +38,7 @@ from servod.runtime.daemon.arguments import (
 )
 from servod.runtime.daemon.connection import Reply
 from servod.runtime.daemon.gain_bank import GainBank
-from servod.runtime.daemon.guard_test import ProofStatus, require_proof
+from servod.runtime.daemon.guard_test import GuardTestStatus, require_guard_test
 from servod.runtime.daemon.recorder import Recorder
 from servod.runtime.daemon.requests import Request, Requests, SentOrder, Waits, work_of
 from servod.runtime.daemon.status import reason_texts
@@ -71,7 +71,7 @@ class Verbs:
         document: Callable[[], dict[str, Any]],
         faults: Callable[[], dict[str, Any]],
         of_ours: Callable[[Bus], Bus],
-        proof: Callable[[], ProofStatus],
+        proof: Callable[[], GuardTestStatus],
     ) -> None:
         """`document` makes the status document, `faults` that of what befell the axis, `proof` that of the drive's
         guards; `of_ours` makes a connection to the bus known as one of the daemon's."""
@@ -194,7 +194,7 @@ class Verbs:
         return {"last": serial, "records": base64.b64encode(raw).decode(), "count_rad": count_rad}
 
     async def _enable(self, args: EnableArgs) -> dict[str, Any]:
-        require_proof(self._proof())
+        require_guard_test(self._proof())
         self._bank.require_own_devices()
         if self._stopping:  # whichever came first: two connections are not always read in the order that they wrote
             raise Unreachable("refused: somebody stops the axis at this moment; enable it once that is over")

@@ -1,7 +1,7 @@
-"""Waits for bus and nodes: at the start until they are there, after their loss until the axis may begin anew.
+"""Waits for bus and nodes: at the start until they are there, after their loss until the axis may begin again.
 
 Around the loop, for a daemon that runs with `--wait`, as the service does. Whether they are there is looked at by reads
-alone on a connection of its own (servod.runtime.fieldbus.master, `Master.look`). Beginning anew ends DISABLED: it is a
+alone on a connection of its own (servod.runtime.fieldbus.master, `Master.look`). Beginning again ends DISABLED: it is a
 new bring-up, as after a restart of the daemon, and enables nothing; what else was wrong before it stays latched.
 """
 
@@ -38,10 +38,10 @@ _ROUND_S = 0.02
 _LOOK_EVERY_S, _TELL_EVERY_S = 1.0, 1.0
 #: Between two attempts to bring up nodes that answer, at the longest.
 _LONGEST_PAUSE_S = 30.0
-#: A fault is shown for so long before the axis begins anew; one that comes back at once for twice as long each time.
+#: A fault is shown for so long before the axis begins again; one that comes back at once for twice as long each time.
 SHOWN_S, _LONGEST_SHOWN_S = 2.0, 60.0
-#: What the log says when an axis begins anew.
-BEGINS_ANEW = "bus and nodes are back: bringing the axis up anew, disabled"
+#: What the log says when an axis begins again.
+STARTS_AGAIN = "bus and nodes are back: bringing the axis up again, disabled"
 #: An axis that ran for so long did begin; what takes it away then is another matter.
 _RAN_S = 60.0
 #: What takes bus or nodes away, by whatever is plugged, supplied or configured outside of servod.
@@ -191,7 +191,7 @@ class _Waiting:
 
 
 class Comeback:
-    """Whether an axis that lost bus or nodes may begin anew: it stands, its fault was shown, and both are back."""
+    """Whether an axis that lost bus or nodes may begin again: it stands, its fault was shown, and both are back."""
 
     def __init__(
         self,
@@ -212,7 +212,7 @@ class Comeback:
         self._attempt: Future[None] | None = None
 
     def see(self, record: CycleRecord | None, now_ns: int) -> bool:
-        """Once per round, with the newest record; True: begin anew."""
+        """Once per round, with the newest record; True: begin again."""
         lost = record is not None and (record.faults | record.faults_latched) & _TAKEN
         if record is not None and not lost and now_ns - self._second_ns >= NS_PER_S:
             self.before, self._newer, self._second_ns = self._newer, record.faults_latched, now_ns
@@ -232,11 +232,11 @@ class Comeback:
 
 
 def carried_by(faults: int, before: int) -> int:
-    """Of the latched `faults`, as bits, what stays latched when the axis begins anew, until somebody resets it; what
+    """Of the latched `faults`, as bits, what stays latched when the axis begins again, until somebody resets it; what
     was latched `before` the loss is not of it."""
     return faults & ~(_OF_THE_LOSS & ~(before & ~_SMALL))
 
 
 def shown_s_after(shown_s: float, ran_s: float) -> float:
-    """How long the next fault is shown, when the axis ran for `ran_s` until it began anew."""
+    """How long the next fault is shown, when the axis ran for `ran_s` until it began again."""
     return SHOWN_S if ran_s >= _RAN_S + shown_s else min(_LONGEST_SHOWN_S, 2.0 * shown_s)

@@ -67,11 +67,11 @@ REFUSAL_TEXT: dict[Refusal, str] = {
     Refusal.MOTION_RUNNING: "a motion is running; `servoctl stop` ends it",
     Refusal.BAD_ARGUMENT: "an argument is not a finite number or out of range",
     Refusal.OUT_OF_RANGE: "the motion would leave limits.position_min_rad to position_max_rad",
-    Refusal.NEEDS_RESTART: "a node or the bus was lost; the nodes must be configured anew: the service does so by "
+    Refusal.NEEDS_RESTART: "a node or the bus was lost; the nodes must be configured again: the service does so by "
     "itself once they answer; else restart the daemon",
     Refusal.OUTSIDE_LIMITS: "the joint is outside limits.position_min_rad to position_max_rad; move it back by hand",
     Refusal.TOO_FAST: "the motion would be faster than limits.speed_rad_s",
-    Refusal.PROVES_ONLY_FROM_OFF: "the wiring is proven on the way from off to on; run `servoctl disable` first",
+    Refusal.PROVES_ONLY_FROM_OFF: "the wiring is tested on the way from off to on; run `servoctl disable` first",
     Refusal.JUMPS: "the reference would jump further from the joint than limits.following_error_rad",
     Refusal.NOT_CONFIRMED: "another command came between the request to enable and its confirmation; try again",
     Refusal.ESTOP_ACTIVE: "the emergency stop is active, or its input is not heard (bit amplifier.inputs.estop_bit of "

@@ -274,7 +274,7 @@ class Cycle:
         self.torque_nm = self._ramp_from_nm = 0.0
 
     def _send(self, wanted_nm: float, output: AxisOutput) -> float:
-        """Control word and torque in one frame; the goal is asked anew, since the limits may just have changed it.
+        """Control word and torque in one frame; the goal is asked again, since the limits may just have changed it.
 
         The torque that went out: none unless the axis is to be enabled.
         """

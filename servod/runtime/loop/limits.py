@@ -197,7 +197,7 @@ class Limits:
         return difference_rad <= self.encoder_mismatch_rad + apart_cycles * self._dt_s * self.speed_rad_s
 
     def proving_faults(self, encoder: EncoderFeedback, most_travel_rad: float) -> int:
-        """While the wiring is proven: the joint stays near where the test began, whatever the test thinks of it."""
+        """While the wiring is tested: the joint stays near where the test began, whatever the test thinks of it."""
         near = abs(encoder.position_rad - self._armed_at_rad) <= PROVING_TRAVELS * most_travel_rad
         return 0 if near else _NOT_PROVEN
 

@@ -22,7 +22,7 @@ _ASKED_TURNS, _MOST_CREDIT = 2.0, 3.0
 #: Turns of the reference are those of its acceleration by this share of the greatest one of late.
 _TURN_SHARE = 0.25
 _OF_LATE_S = 0.2
-#: A step begins all anew, but no sooner than this after the last time that one did; else it is a turn of the reference.
+#: A step starts all afresh, but no sooner than this after the last that did; else it is a turn of the reference.
 _ANEW_S = 1.0
 #: Torque that is injected on purpose makes the law swing too: from this share of the least range on, and this long.
 _INJECTED_SHARE, _INJECTED_S = 0.1, 0.2
@@ -91,9 +91,9 @@ class Oscillation:
         level = max(0.0, level - forgotten) if level > 0.0 else min(0.0, level + forgotten)
         jumps = velocity == self._velocity == 0.0 and abs(position - self._position) > _LEAST_JUMP
         if jumps:
-            anew = self._since_anew_s >= _ANEW_S
-            level = (min(level, 0.0) if anew else level) - _ASKED_TURNS
-            self._since_anew_s = 0.0 if anew else self._since_anew_s
+            again = self._since_anew_s >= _ANEW_S
+            level = (min(level, 0.0) if again else level) - _ASKED_TURNS
+            self._since_anew_s = 0.0 if again else self._since_anew_s
         elif self._asked(velocity, dt_s):
             level -= _ASKED_TURNS
         self._position, self._velocity = position, velocity

@@ -98,9 +98,8 @@ def main() -> int:
     bus = open_bus(plan.config.bus)
     cycle = Cycle(plan, bus, clock, channel, supervisor_watch(channel, clock, int(sys.argv[2])))
     on_end_signals(cycle.shut_down)
-    grants = apply_realtime(plan.config.cycle.cpu, plan.config.cycle.priority)
-    channel.publish_ready(grants)
     try:
+        channel.publish_ready(apply_realtime(plan.config.cycle.cpu, plan.config.cycle.priority))
         run(cycle, clock)
     except BaseException:
         cycle.let_go()

@@ -6,6 +6,7 @@ of it is needed for it to run on time, so a refusal is reported, never swallowed
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import gc
 import os
@@ -40,7 +41,8 @@ def apply_realtime(cpu: int | None, priority: int) -> list[Grant]:
 
 def give_way() -> None:
     """Leave SCHED_FIFO: the interpreter's end takes 30 ms, in which the loop of another axis on this core shall run."""
-    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    with contextlib.suppress(OSError):  # refused, the end takes its time from others, and is an end all the same
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 def _affinity(cpu: int | None) -> Grant:

@@ -296,7 +296,7 @@ def test_a_damaged_copy_is_mended_and_the_log_says_so(tmp_path: Path, caplog: py
     copy.write_text(whole.replace("bench", "trench"))
     GainStore(tmp_path)
     assert copy.read_text() == whole
-    assert "active.copy.json: is not what active.json says; written anew from it" in caplog.text
+    assert "active.copy.json: is not what active.json says; written again from it" in caplog.text
 
 
 def test_with_both_files_damaged_the_refusal_names_both(tmp_path: Path) -> None:

@@ -154,7 +154,7 @@ def test_a_set_without_a_certificate_passes_only_where_the_configuration_accepts
         (
             parse_gains(good.PD, "x").model_copy(update={"seal": "0" * 64}),
             "seal: found numbers that were changed after the set was sealed, or a certificate that was taken out; "
-            "allowed: the file as servoctl wrote it; for other numbers make the set anew "
+            "allowed: the file as servoctl wrote it; for other numbers make the set again "
             "(`servoctl synthesize`, then `verify`)",
         ),
     ],

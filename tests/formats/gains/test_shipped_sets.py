@@ -54,7 +54,7 @@ def test_the_demos_daemon_takes_the_certified_set_by_its_certificate(tmp_path: P
 
 
 def test_the_certified_set_is_certified_by_the_checks_that_ship_with_it() -> None:
-    """Else the first line of the demo warns of it: `servoctl verify gains/demo_local_certified.yaml` issues it anew."""
+    """Else the first line of the demo warns of it: `servoctl verify gains/demo_local_certified.yaml` issues one."""
     assert load_gains(gains_file(CERTIFIED)).certificate_warning() is None
 
 

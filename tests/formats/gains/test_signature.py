@@ -61,7 +61,7 @@ CERTIFIED = load_gains(shipped("gains/demo_local_certified.yaml"))
 
 
 def bent() -> GainSet:
-    """A number of it changed after it was signed, and sealed anew, as who means to does."""
+    """A number of it changed after it was signed, and sealed again, as who means to does."""
     whole = signed(CERTIFIED)
     return whole.model_copy(update={"description": "bent"}).sealed()
 

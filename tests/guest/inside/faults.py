@@ -52,7 +52,7 @@ class UnitMachine(Machine):
         self.config, self.socket = folder / "axis.yaml", Path(SOCKET)
         self._joined = _interface_number()
         self._said = len(journal())
-        self._earlier: list[DriveSample] = []  # a start of the virtual axis begins its record anew
+        self._earlier: list[DriveSample] = []  # a start of the virtual axis begins its record again
 
     def start_virtual_axis(self) -> None:
         """Start it, or leave the one that has its place on the bus."""
@@ -115,7 +115,7 @@ class UnitMachine(Machine):
 
 
 def _interface_number() -> int:
-    """It is another one when the interface was taken away and made anew."""
+    """It is another one when the interface was taken away and made again."""
     path = Path(f"/sys/class/net/{INTERFACE}/ifindex")
     return int(path.read_text()) if path.exists() else 0
 

@@ -33,7 +33,7 @@ _MOTION_S = 1.0
 
 
 def foreign() -> dict[str, Any]:
-    """Brought up, enabled, moved; the whole master killed, brought up anew by systemd and enabled by hand."""
+    """Brought up, enabled, moved; the whole master killed, brought up again by systemd and enabled by hand."""
     shell("ip", "link", "add", "dev", INTERFACE, "type", "vcan")
     shell("ip", "link", "set", INTERFACE, "up")
     for name, node_id in NODES.items():

@@ -1,4 +1,4 @@
-"""The step that identifies a real axis: it goes on where it was interrupted, and begins anew when it is asked to."""
+"""The step that identifies a real axis: it goes on where it was interrupted, and begins again when it is asked to."""
 
 from __future__ import annotations
 

@@ -54,6 +54,17 @@ def servo_scene(folder: Path) -> SearchContext:
     return SearchContext(document_of(model), predictor, predictor.mismatch(model))
 
 
+def test_a_wave_that_is_turned_on_is_the_sine_of_its_order() -> None:
+    seen, orders = scene(), np.linspace(0.7, 130.0, 2500)
+    place = seen.lagged_position[seen.thinned]
+    pairs = list(seen.pairs(lambda n, sine, cosine: (sine + 0.0, cosine + 0.0), orders))
+    for n, (sine, cosine) in pairs[::100] + pairs[-1:]:
+        assert sine == pytest.approx(np.sin(n * place), abs=1e-9)
+        assert cosine == pytest.approx(np.cos(n * place), abs=1e-9)
+    (alone,) = seen.pairs(lambda n, sine, cosine: (sine, cosine), orders[:1])
+    assert alone[1][0] == pytest.approx(np.sin(0.7 * place), abs=1e-12)
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_starts_are_models(name: str, tmp_path_factory: pytest.TempPathFactory) -> None:
     on_drive = bool(effect(name).drive_keys)

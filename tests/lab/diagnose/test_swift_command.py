@@ -1,4 +1,4 @@
-"""A command that swings faster than the usual observer shows: the observer follows it, and gaps begin it anew."""
+"""A command that swings faster than the usual observer shows: the observer follows it, and gaps begin it again."""
 
 from __future__ import annotations
 

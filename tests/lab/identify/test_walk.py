@@ -257,7 +257,7 @@ def rested(axis: SteppedAxis, cycles: int):
 
 
 def recorded(folder, session, *durations_s: float) -> None:
-    """Rests of these durations, recorded anew in `folder`."""
+    """Rests of these durations, recorded again in `folder`."""
     axis = SteppedAxis(session, folder)
     enable_powerless(axis)
     made = store.Recordings(folder, "this axis")

@@ -40,7 +40,7 @@ def test_a_wrap_is_joined_and_told(size: float, motion: str, tmp_path: Path) -> 
     "position",
     [
         np.sign(np.sin(8.0 * T)) * 12.5,  # a square wave of the range itself
-        np.where(T > 1.0, 3.0, 0.2) + 0.1 * np.sin(9.0 * T),  # a zero that was set anew
+        np.where(T > 1.0, 3.0, 0.2) + 0.1 * np.sin(9.0 * T),  # a zero that was set again
         0.5 * np.sin(8.0 * T) + 1e-4 * NOISE,
         np.where(np.arange(len(T)) == 700, 65535.0, np.sin(T)),  # a glitch
     ],

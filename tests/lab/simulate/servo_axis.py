@@ -1,4 +1,4 @@
-"""A servo that swings a pendulum, written down anew: what recordings of a goal and a position are tested on.
+"""A servo that swings a pendulum, written down again: what recordings of a goal and a position are tested on.
 
 Knows nothing of servod's kernels: plain Euler steps of 20 us, a firmware loop of 1 kHz that reads a counting encoder,
 goals that arrive late.

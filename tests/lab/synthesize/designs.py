@@ -1,6 +1,6 @@
 """One synthesized set for Table I's joint, kept in a file for all tests that look at it.
 
-`python -m tests.lab.synthesize.designs` makes the file anew, and test_kept_set.py says when that is due.
+`python -m tests.lab.synthesize.designs` makes the file again, and test_kept_set.py says when that is due.
 """
 
 from __future__ import annotations

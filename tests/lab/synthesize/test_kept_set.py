@@ -53,7 +53,7 @@ def test_rounding_in_the_programme_moves_no_gain(index: int) -> None:
 
 
 def test_the_kept_set_is_what_synthesis_makes() -> None:
-    """Where this fails after a change of synthesis, `python -m tests.lab.synthesize.designs` writes the file anew."""
+    """Where this fails after a change of synthesis, `python -m tests.lab.synthesize.designs` writes the file again."""
     kept = table1_set()
     assert not kept.seal_broken and not made().seal_broken
     assert kept.design is not None and made().design is not None
@@ -71,9 +71,9 @@ def test_beside_the_feedback_both_sets_have_the_same_numbers() -> None:
     assert all(isinstance(law, LocalParameters) for law in laws)
     plain = [law.model_dump(exclude={"regions", "error_limit_rad", "friction"}) for law in laws]
     assert plain[0] == plain[1]
-    kept, anew = (law for law in laws if isinstance(law, LocalParameters))
-    assert anew.error_limit_rad == pytest.approx(kept.error_limit_rad, rel=GAIN_SHARE)
-    for old, new in zip(kept.friction.sets, anew.friction.sets, strict=True):
+    kept, again = (law for law in laws if isinstance(law, LocalParameters))
+    assert again.error_limit_rad == pytest.approx(kept.error_limit_rad, rel=GAIN_SHARE)
+    for old, new in zip(kept.friction.sets, again.friction.sets, strict=True):
         assert new.velocity_rad_s == pytest.approx(old.velocity_rad_s, rel=1e-9)
         assert new.decay_per_s == pytest.approx(old.decay_per_s, rel=1e-9)
 

@@ -24,7 +24,7 @@ def subject(gains: GainSet) -> Subject:
 
 
 def changed(path: tuple[Any, ...], factor: float) -> GainSet:
-    """The set with one number changed and sealed anew, as somebody who knows of the seal would."""
+    """The set with one number changed and sealed again, as somebody who knows of the seal would."""
     data = table1_set().model_dump(mode="json", exclude_none=True)
     here = data
     for key in path[:-1]:

@@ -44,7 +44,7 @@ def refused(gains: GainSet) -> list[str]:
 
 
 def with_parameters(change: dict[str, Any]) -> GainSet:
-    """The demo's set with some of its parameters replaced, sealed anew."""
+    """The demo's set with some of its parameters replaced, sealed again."""
     data = demo_set().model_dump(mode="json", exclude_none=True)
     for path, value in change.items():
         *way, last = path.split(".")

@@ -9,7 +9,7 @@ import pytest
 
 from servod.cli.common import table_console
 from servod.qualify.bench import QUICK, THOROUGH, BenchSettings, measure
-from servod.qualify.bench.plan import GOALS, figure, print_table
+from servod.qualify.bench.plan import TARGETS, figure, print_table
 
 pytestmark = pytest.mark.serial
 
@@ -31,7 +31,7 @@ def test_the_document_has_every_key_and_a_finite_figure_for_each(
     assert "growth_mib" in document["memory"]
     assert document["verification"]["plants"] == 1 and document["commission"] is None
     assert document["stepped_speed"] > 0.0 and document["simulator_speed"] > 0.0
-    figures = [figure(document, goal) for goal in GOALS]
+    figures = [figure(document, target) for target in TARGETS]
     assert all(value is None or math.isfinite(value) for value in figures)
     assert document["memory"]["seconds"] == TINY.memory_s
     monkeypatch.delenv("COLUMNS", raising=False)
@@ -39,7 +39,7 @@ def test_the_document_has_every_key_and_a_finite_figure_for_each(
     assert "not judged (measured 0.5 s)" in " ".join(capsys.readouterr().out.split())
 
 
-def test_the_thorough_plan_is_long_enough_for_every_goal() -> None:
-    longest = {goal.keys[0]: goal.seconds for goal in GOALS if goal.seconds}
+def test_the_thorough_plan_is_long_enough_for_every_target() -> None:
+    longest = {target.keys[0]: target.seconds for target in TARGETS if target.seconds}
     assert longest == {"wall_clock": THOROUGH.wall_clock_s, "memory": THOROUGH.memory_s}
     assert QUICK.memory_s < longest["memory"]

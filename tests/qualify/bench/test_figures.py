@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,11 +15,11 @@ from servod.cli.common import table_console
 from servod.common.errors import BadInput
 from servod.qualify.bench import tick, wakeup
 from servod.qualify.bench import wall_clock as wall
-from servod.qualify.bench.plan import GOALS, figure, print_table, write_json
+from servod.qualify.bench.plan import TARGETS, figure, print_table, write_json
 
 
 def document(**changes: Any) -> dict[str, Any]:
-    """A document that meets every goal, with whole groups changed."""
+    """A document that meets every target, with whole groups changed."""
     return {
         "machine": {"cpu": "a CPU", "cores": 2, "kernel": "6.1", "python": "3.11"},
         "wakeup": {"median_ratio": 1.0, "p99_ratio": 1.0, "rounds": [{}], "seconds": 10.0},
@@ -37,10 +38,10 @@ def document(**changes: Any) -> dict[str, Any]:
 def verdicts(**changes: Any) -> dict[str, str]:
     """What the table says of each row that is not simply met."""
     changed = document(**changes)
-    return {goal.label: goal.verdict(changed) for goal in GOALS if goal.verdict(changed)}
+    return {target.label: target.verdict(changed) for target in TARGETS if target.verdict(changed)}
 
 
-def test_nothing_is_said_of_goals_that_are_met() -> None:
+def test_nothing_is_said_of_targets_that_are_met() -> None:
     assert verdicts() == {}
 
 
@@ -57,7 +58,7 @@ def test_nothing_is_said_of_goals_that_are_met() -> None:
         ({"commission": {"seconds": 241.0}}, "commission"),
     ],
 )
-def test_a_goal_that_is_missed_is_called_so(changes: dict[str, Any], label: str) -> None:
+def test_a_target_that_is_missed_is_called_so(changes: dict[str, Any], label: str) -> None:
     assert verdicts(**changes) == {label: "missed"}
 
 
@@ -76,17 +77,18 @@ def test_a_certificate_of_few_plants_is_not_judged_and_what_was_left_out_is_told
 
 def test_a_document_of_an_earlier_version_is_still_read() -> None:
     earlier = {key: value for key, value in document().items() if key != "synthesis"}
-    assert [figure(earlier, goal) for goal in GOALS if goal.keys[0] == "synthesis"] == [None]
+    assert [figure(earlier, target) for target in TARGETS if target.keys[0] == "synthesis"] == [None]
 
 
 def test_a_missing_cyclictest_is_told_in_the_table(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     missing = {"median_ratio": None, "p99_ratio": None, "rounds": [{}], "seconds": 3.0, "note": "apt install rt-tests"}
-    assert figure(document(wakeup=missing), GOALS[0]) is None
+    assert figure(document(wakeup=missing), TARGETS[0]) is None
     monkeypatch.delenv("COLUMNS", raising=False)
     print_table(document(wakeup=missing), table_console())
     said = " ".join(capsys.readouterr().out.split())
+    assert "Figure Measured Target" in " ".join(re.findall(r"\w+", said))
     assert "apt install rt-tests" in said and "not measured" in said
 
 

@@ -57,7 +57,7 @@ def test_a_trial_does_not_go_on_with_other_sources(tmp_path: Path, run: dict[str
     kept = tmp_path / ANSWERS / "c000" / RUN
     kept.parent.mkdir(parents=True)
     kept.write_text(json.dumps(run))
-    with pytest.raises(BadInput, match="to diagnose all cases anew"):
+    with pytest.raises(BadInput, match="to diagnose all cases again"):
         Examiner(tmp_path, 5.0).run(1, lambda _name, _done, _of: None)
     assert not (tmp_path / ANSWERS / "c001").exists()
 

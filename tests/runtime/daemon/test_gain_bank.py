@@ -21,7 +21,7 @@ from servod.formats.recording.record import CycleRecord
 from servod.runtime.daemon.arguments import GainsActivateArgs, GainsVerdictArgs
 from servod.runtime.daemon.connection import Reply
 from servod.runtime.daemon.gain_bank import GainBank
-from servod.runtime.daemon.guard_test import ProofStatus
+from servod.runtime.daemon.guard_test import GuardTestStatus
 from servod.runtime.daemon.requests import LoopTimeout
 from servod.runtime.daemon.verbs import Verbs
 from servod.runtime.loop.commands import Op
@@ -191,7 +191,7 @@ async def test_a_set_of_other_devices_enables_nothing(tmp_path: Path) -> None:
         MagicMock(),
     )
     bank.require_own_devices.side_effect = BadInput("gain set x: devices.amplifier.serial", 4711, "1")
-    told, proof = list[dict[str, Any]](), ProofStatus(asked_for=False, holds=True, time=None, text="")
+    told, proof = list[dict[str, Any]](), GuardTestStatus(asked_for=False, holds=True, time=None, text="")
     front = Verbs(config, loop, bank, MagicMock(), dict, dict, lambda bus: bus, lambda: proof)
     front.handle(Verb.ENABLE, {}, Reply(told.append, 1))
     await events_pass()

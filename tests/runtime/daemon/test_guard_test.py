@@ -24,13 +24,13 @@ from servod.runtime.daemon.guard_test import (
     PROOF_NAME,
     GuardResult,
     GuardTest,
-    ProofStatus,
+    GuardTestStatus,
     _Cycles,
     _Silence,
+    guard_test_status,
     keep_proof,
-    proof_status,
-    read_proof,
-    require_proof,
+    read_record,
+    require_guard_test,
 )
 from servod.runtime.daemon.verbs import Verbs
 from servod.runtime.fieldbus.cia import decode_status_word
@@ -54,8 +54,8 @@ def axis(tmp_path: Path, days: float | None = 30.0, **sections: Any) -> AxisConf
     return AxisConfig.model_validate({"limits": LIMITS, "gains": gains, "amplifier": amplifier} | sections)
 
 
-def _status(config: AxisConfig, found: dict[str, Any], now_s: float) -> ProofStatus:
-    return proof_status(config, read_proof(config), found, now_s)
+def _status(config: AxisConfig, found: dict[str, Any], now_s: float) -> GuardTestStatus:
+    return guard_test_status(config, read_record(config), found, now_s)
 
 
 def tried(world: SteppedWorld, config: AxisConfig) -> tuple[list[GuardResult], dict[str, Any]]:
@@ -313,7 +313,7 @@ def test_a_proof_with_other_silences_is_told_as_such(tmp_path: Path) -> None:
     results, found = tried(world, config)
     keep_proof(config, results, {key: value for key, value in found.items() if key != "silences"})
     with pytest.raises(Unreachable, match="with other silences, by an earlier version"):
-        require_proof(_status(config, json.loads(json.dumps(found)), 1e12))
+        require_guard_test(_status(config, json.loads(json.dumps(found)), 1e12))
 
 
 def test_a_drive_that_comes_back_in_the_silence_does_not_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -383,21 +383,21 @@ def test_a_joint_that_moves_without_torque_ends_the_test(tmp_path: Path) -> None
 def test_a_proof_holds_for_its_drive_its_guards_and_its_time(tmp_path: Path) -> None:
     config, world = axis(tmp_path), world_of()
     with pytest.raises(Unreachable, match="never tested"):
-        require_proof(_status(config, {}, 0.0))
+        require_guard_test(_status(config, {}, 0.0))
     results, found = tried(world, config)
     path = keep_proof(config, results, found)
     assert path.name == PROOF_NAME
     now_s = json.loads(path.read_text())["time"]
     found = json.loads(json.dumps(found))
-    require_proof(_status(config, found, now_s + 29 * DAY_S))
+    require_guard_test(_status(config, found, now_s + 29 * DAY_S))
     with pytest.raises(Unreachable, match=r"older than amplifier.guard_test_days \(30\)"):
-        require_proof(_status(config, found, now_s + 31 * DAY_S))
+        require_guard_test(_status(config, found, now_s + 31 * DAY_S))
     with pytest.raises(Unreachable, match="dated in the future"):
-        require_proof(_status(config, found, now_s - DAY_S))
+        require_guard_test(_status(config, found, now_s - DAY_S))
     for other in (world_of(amplifier_serial=7), world):
         changed = axis(tmp_path, amplifier={"heartbeat_reaction": 2} if other is world else {})
         with pytest.raises(Unreachable, match="are others than those that were tested"):
-            require_proof(_status(config, json.loads(json.dumps(tried(other, changed)[1])), now_s))
+            require_guard_test(_status(config, json.loads(json.dumps(tried(other, changed)[1])), now_s))
     whole = path.read_text()
     endless = {**json.loads(whole), "time": 10**400}
     del endless["sha256"]
@@ -411,8 +411,8 @@ def test_a_proof_holds_for_its_drive_its_guards_and_its_time(tmp_path: Path) -> 
     ):
         path.write_text(broken)
         with pytest.raises(Unreachable, match=said):
-            require_proof(_status(config, found, now_s))
-    require_proof(_status(axis(tmp_path, days=None), found, now_s))
+            require_guard_test(_status(config, found, now_s))
+    require_guard_test(_status(axis(tmp_path, days=None), found, now_s))
 
 
 @pytest.mark.parametrize("days", [30.0, None])

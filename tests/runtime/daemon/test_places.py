@@ -175,7 +175,7 @@ def test_stop_of_another_process_wins_and_the_one_who_commanded_must_come_again(
         commander.call(Verb.ENABLE)
         stopped = other_process(served, "client.call('stop')")
         assert stopped.returncode == 0, stopped.stderr
-        with pytest.raises(Unreachable, match=r"process \d+ stopped the axis; connect anew to enable it again"):
+        with pytest.raises(Unreachable, match=r"process \d+ stopped the axis; connect again before you enable it"):
             commander.call(Verb.ENABLE)
         assert commander.call(Verb.RECORD_STOP)
     with ControlClient(served.path) as commander:
@@ -186,7 +186,7 @@ def test_disable_needs_no_lease_and_wins_as_well(served: Served) -> None:
     with ControlClient(served.path) as commander:
         commander.call(Verb.ENABLE)
         assert other_process(served, "client.call('disable')").returncode == 0
-        with pytest.raises(Unreachable, match="connect anew"):
+        with pytest.raises(Unreachable, match="connect again"):
             commander.call(Verb.ENABLE)
 
 

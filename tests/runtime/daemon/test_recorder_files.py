@@ -109,7 +109,7 @@ def test_a_folder_that_was_deleted_is_told_at_the_stop_and_before(tmp_path: Path
     with pytest.raises(Unreachable, match=r"axis-.*\.mcap: the file was deleted or moved while it was recorded"):
         recorder.stop().result(5)
     assert recorder.state()["records"] == 0 and recorder.state()["dropped"] == 100
-    again = recorder.start().result(5)  # the folder is made anew
+    again = recorder.start().result(5)  # the folder is made again
     recorder.add_rows(rows(10))
     assert recorder.stop().result(5)["records"] == 10
     recorder.close()

@@ -20,7 +20,7 @@ from servod.formats.recording.record import CycleRecord
 from servod.runtime.daemon.arguments import check_arguments
 from servod.runtime.daemon.connection import Reply
 from servod.runtime.daemon.gain_bank import GainBank
-from servod.runtime.daemon.guard_test import ProofStatus
+from servod.runtime.daemon.guard_test import GuardTestStatus
 from servod.runtime.daemon.recorder import Recorder
 from servod.runtime.daemon.requests import Requests, Waits, finish, work_of
 from servod.runtime.daemon.trajectory import MotionTable
@@ -260,8 +260,8 @@ def _same(bus: Bus) -> Bus:
     return bus
 
 
-def _proven() -> ProofStatus:
-    return ProofStatus(asked_for=False, holds=True, time=None, text="")
+def _proven() -> GuardTestStatus:
+    return GuardTestStatus(asked_for=False, holds=True, time=None, text="")
 
 
 @pytest.fixture
@@ -475,7 +475,7 @@ async def test_stops_one_after_the_other_are_one_command_until_the_loop_has_take
         front.handle(Verb.STOP, {}, answers.reply())
     assert loop.seq == 1
     front.handle(Verb.HALT, {"on": True}, answers.reply())
-    front.handle(Verb.STOP, {}, answers.reply())  # something came between: this one counts anew
+    front.handle(Verb.STOP, {}, answers.reply())  # something came between: this one counts again
     assert loop.seq == 3
     off = {"axis_state": AxisState.DISABLED, "drive_state": DriveState.SWITCH_ON_DISABLED}
     loop.latest = record(2, command_seq=3, **off)

@@ -108,7 +108,7 @@ def test_status_says_why_the_goal_is_not_reached() -> None:
 
 def test_an_axis_whose_wiring_is_being_proven_has_not_reached_its_goal() -> None:
     status = axis_status(record(axis_state=AxisState.PROVING, goal=2, goal_reached=1))
-    assert (status["goal_reached"], status["reasons"]) == (False, ["wiring is being proven"])
+    assert (status["goal_reached"], status["reasons"]) == (False, ["the wiring is being tested"])
 
 
 def test_an_axis_whose_brake_opens_has_not_reached_its_goal() -> None:

@@ -123,7 +123,7 @@ def _began_anew(service: Service) -> list[str]:
     """Wait until the axis in FAULT has, and see that it was not enabled; the faults in the daemon's memory."""
     states = set()
     deadline = time.monotonic() + 30.0
-    while "bringing the axis up anew" not in service.log:
+    while "bringing the axis up again" not in service.log:
         assert time.monotonic() < deadline, service.log
         with contextlib.suppress(Unreachable, Refused):
             states.add(service.ask("status")["axis"]["state"])
@@ -143,7 +143,7 @@ def test_supply_that_comes_back_brings_the_axis_back_disabled(service: Service) 
     service.comes_to("FAULT", "BUS_DOWN")  # nothing is back: the fault goes on to be shown
     service.axis()
     assert "BUS_DOWN" in _began_anew(service)
-    assert _shared_memories(service) == at_first, "one that began anew a thousand times would have no descriptor left"
+    assert _shared_memories(service) == at_first, "one that began again a thousand times would have no descriptor left"
     assert service.ask("enable", reset_fault=False)["state"] == "ENABLED"
     service.ask("disable")
     service.daemon.send_signal(signal.SIGTERM)

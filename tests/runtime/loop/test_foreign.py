@@ -199,7 +199,7 @@ def test_whoever_speaks_after_stalls_is_heard(stalls: list[tuple[int, int, set[i
         let_stall(axis, stalls)
         axis.run(0.4)  # heartbeats again
         if F.NODE_LEFT_OPERATIONAL in latched(axis):
-            return b"1"  # one that must be configured anew is not at work, so that nobody is told from it
+            return b"1"  # one that must be configured again is not at work, so that nobody is told from it
         return b"%d" % hear_a_stranger(axis, kind, 300)
 
     assert forked(heard) == b"1"

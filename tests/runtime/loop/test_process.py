@@ -49,16 +49,44 @@ def test_a_supervisor_that_died_while_this_process_began_is_lost_at_once():
     assert not supervisor_watch(Channel(clock=clock), clock, os.getppid() + 1)()
 
 
-def test_a_loop_at_its_end_lets_others_run() -> None:
-    """Asked in a process of its own, which this one must not become: the policy before, in the loop, and at its end."""
-    code = (
-        "import os; from servod.runtime.loop.realtime import apply_realtime, give_way\n"
-        "found = [g.granted for g in apply_realtime(None, 1) if g.name == 'sched_fifo']\n"
-        "asked = os.sched_getscheduler(0); give_way()\n"
-        "print(found[0] == (asked == os.SCHED_FIFO), os.sched_getscheduler(0))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
-    assert done.stdout.split() == ["True", str(os.SCHED_OTHER)]
+#: The loop's process, whose cycles end in an error and which says at its end how it is scheduled.
+BROKEN = """
+import atexit, os, sys
+from servod.runtime.loop import process
+
+class Cycle:
+    shut_down, let_go = (lambda *_: None), (lambda *_: None)
+
+def run(cycle, clock):
+    print(os.sched_getscheduler(0) == os.SCHED_FIFO)
+    raise RuntimeError("a cycle that ends in an error")
+
+def refused(*_):
+    raise PermissionError
+
+atexit.register(lambda: print(os.sched_getscheduler(0) == os.SCHED_FIFO))
+process._plan_in_time = lambda: None
+process.LoopPlan = type("Plan", (), {"from_json": lambda _: process.LoopPlan, "config": type("Config", (), {
+    "bus": None, "cycle": type("Settings", (), {"cpu": None, "priority": 1})})})
+process.Channel = type("Channel", (), {"__init__": lambda *_: None, "publish_ready": lambda *_: None})
+process.open_bus = process.supervisor_watch = lambda *_: None
+process.Cycle, process.run = (lambda *_: Cycle()), run
+if "refused" in sys.argv:
+    os.sched_setscheduler = refused
+process.main()
+"""
+
+
+@pytest.mark.parametrize("more", [(), ("refused",)], ids=["granted", "refused"])
+def test_a_loop_whose_cycles_end_in_an_error_lets_others_run(more: tuple[str, ...]) -> None:
+    """At its end it is no real-time process any more, and the error is what is told, not that this was refused."""
+    command = [sys.executable, "-c", BROKEN, "0", str(os.getpid()), *more]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    during, after = done.stdout.split()
+    assert after == "False"
+    assert during == "False" or not more
+    assert done.stderr.rstrip().endswith("RuntimeError: a cycle that ends in an error")
+    assert "PermissionError" not in done.stderr
 
 
 #: In place of the loop: ready half a second after its start.

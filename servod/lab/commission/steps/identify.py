@@ -30,7 +30,7 @@ class Identify:
         return {"axis": walk.axis.identity, "seed": o.seed, "travel": o.travel_rad, "speed": o.speed_rad_s}
 
     def run(self, walk: Walk) -> None:
-        """A virtual axis begins anew, so that the same model comes out, and a real one when it is asked to (--again).
+        """A virtual axis begins again, so that the same model comes out, and a real one when it is asked to (--again).
 
         Otherwise a real one goes on where it was interrupted.
         """

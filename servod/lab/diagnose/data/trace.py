@@ -38,7 +38,7 @@ class CheckedTrace:
 
     @cached_property
     def starts(self) -> NDArray[np.int64]:
-        """Rows where the motion begins anew: the first, and those behind long gaps."""
+        """Rows where the motion begins again: the first, and those behind long gaps."""
         return np.unique(np.concatenate([[0], behind_gaps(self.drive.t_s)])).astype(np.int64)
 
     @cached_property

@@ -85,7 +85,7 @@ EFFECT = Effect(
     statement="The constant torque beside the command drifts as time passes",
     shows="a mismatch that grows slowly over each recording, alike in both directions",
     confused=("torque_offset", "disturbance", "thermal"),
-    experiment="the same motion for some minutes: a drift goes on or ends, and begins anew after power-on",
+    experiment="the same motion for some minutes: a drift goes on or ends, and begins again after power-on",
     terms=terms,
     look=Look("time"),
 )

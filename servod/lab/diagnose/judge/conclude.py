@@ -324,7 +324,7 @@ POSITIVE = frozenset(("time_constant_s", "gap"))
 def name_findings(selector: Selector, judgement: JudgedSelection) -> JudgedSelection:
     """The judgement with those named that are findings beside all others, and why the rest of the terms is none.
 
-    What each term is worth is said anew. Terms of one effect are one finding, if one of them is.
+    What each term is worth is said again. Terms of one effect are one finding, if one of them is.
     """
     fit, selection = judgement.fit, judgement.selection
     for place in judgement.named:

@@ -195,7 +195,7 @@ def innovate(
     innovation that correct the motion at each row, `load_share` of them for the load. A correction of the position is
     motion to the bristle, else a model that sticks could be held along by its own break-away torque while the joint
     slides; but not where the innovation is within `quiet`, for noise would wear the bristle off. Rows in `starts` begin
-    anew from the rows of `start_states` (position, velocity, bristle, load position, load velocity, actuator torque).
+    again from the rows of `start_states` (position, velocity, bristle, load position, load velocity, actuator torque).
     """
     window, row, last, acceleration = 0, -1, len(t) - 1, 0.0
     for k in range(len(t)):

@@ -172,7 +172,7 @@ def observer(trace: CheckedTrace, inertia: float, rate: float, longest_s: float)
 
 
 def starts_behind_gaps(trace: CheckedTrace, rate: float) -> NDArray[np.int64]:
-    """Rows where the observer begins anew: the trace's own starts, and rows behind gaps too long for the observer.
+    """Rows where the observer begins again: the trace's own starts, and rows behind gaps too long for the observer.
 
     Nobody knows the command in a gap. What it did there shows as torque that the axis lacks for as long as the observer
     remembers; so a gap of some of its time constants hides what a longer one would.

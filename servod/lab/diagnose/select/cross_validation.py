@@ -137,10 +137,10 @@ def predict_held_out(predictor: Predictor, fit: Fit, folds: Folds) -> HeldOutErr
 
 
 def _refit(predictor: Predictor, fit: Fit, seen: Rows) -> Fit:
-    """The fit estimated anew on the rows that are seen, along its own Jacobian."""
+    """The fit estimated again on the rows that are seen, along its own Jacobian."""
     if seen.sum() < len(fit.coordinates):
         return fit
-    jacobian = fit.jacobian.copy()
+    jacobian = fit.jacobian.copy(order="K")
     for place in single_events(fit.hypothesis):
         jacobian[:, fit.hypothesis.share(place)] = 0.0
     scale = scale_of(fit.mismatch, seen, 1e-3 * predictor.dry)

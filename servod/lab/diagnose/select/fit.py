@@ -111,7 +111,7 @@ class Fitter:
         """Go on fitting for some steps; the first `keep_columns` columns of the Jacobian are taken as they are.
 
         The first `known` are taken as they are to begin with. The Jacobian follows the steps by secants (Broyden, Math.
-        Comp. 19, 1965) and is taken anew when they stop to help; a fit ends only on a fresh one. Where that promises
+        Comp. 19, 1965) and is taken again when they stop to help; a fit ends only on a fresh one. Where that promises
         much and no step along it helps, the mismatch is rough: a model that sticks and slips along falling friction
         does so elsewhere after the least change. Then the derivatives are taken over a wider span.
         """
@@ -132,9 +132,9 @@ class Fitter:
         return fit
 
     def refresh_opened(self, fit: Fit) -> Fit:
-        """The fit with those columns of its Jacobian anew that belong to parameters opened by its last term."""
+        """The fit with fresh columns of its Jacobian for the parameters that its last term opens."""
         keys = fit.hypothesis.terms[-1].opens
-        jacobian = fit.jacobian.copy() if keys else fit.jacobian
+        jacobian = fit.jacobian.copy(order="K") if keys else fit.jacobian
         for index, unknown in enumerate(fit.hypothesis.base):
             if unknown.key in keys and index < jacobian.shape[1]:
                 jacobian[:, index] = self._column(fit, index)

@@ -18,7 +18,7 @@ from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.select.selection import Selection
 from servod.lab.diagnose.select.selector import Selector
-from servod.lab.diagnose.select.stepwise import judged_anew, settled
+from servod.lab.diagnose.select.stepwise import judged_again, settled
 from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
@@ -42,7 +42,7 @@ def better_forms(selector: Selector, selection: Selection) -> Selection:
             selection = found
     if selection.fit is before:
         return selection
-    return judged_anew(selector, selector.lower_floor(selection, selection.fit.mismatch))
+    return judged_again(selector, selector.lower_floor(selection, selection.fit.mismatch))
 
 
 def _better_form(selector: Selector, selection: Selection, place: int) -> Selection:

@@ -22,7 +22,7 @@ class Merit:
 
     `gain` is twice the cost that it saves, in units of noise that counts correlated rows as one; `of_left` its share of
     what the fit before it had left above the noise floor. `torque` is what the term changes beside parameters fitted
-    anew, `own` what it changes beside the same ones.
+    again, `own` what it changes beside the same ones.
     """
 
     share: float

@@ -114,5 +114,5 @@ class Selection:
         return replace(self, fit=reduced, merits=merits, entries=self.entries[:index] + self.entries[index + 1 :])
 
     def with_merit(self, index: int, merit: Merit) -> Selection:
-        """This selection with the worth of one term said anew."""
+        """This selection with the worth of one term said again."""
         return replace(self, merits=(*self.merits[:index], merit, *self.merits[index + 1 :]))

@@ -73,7 +73,7 @@ class Selector:
         predictor = Predictor(self.predictor.traces, self.nominal, self.predictor.rate, step_s)
         return Selector(predictor, self.nominal, self.deadline, self.tell, self.unknown)
 
-    def anew(self, selection: Selection) -> Selection:
+    def refitted(self, selection: Selection) -> Selection:
         """The selection by this predictor, with its fits polished."""
         base = self.polished(selection.base)
         fit = base if selection.fit is selection.base else self.polished(selection.fit)

@@ -98,7 +98,7 @@ def _add_best(selector: Selector, selection: Selection) -> Selection:
 
 
 def backward_elimination(selector: Selector, selection: Selection) -> Selection:
-    """Drop every term but the last whose work the others now do, and say anew what each of those that stay is worth."""
+    """Drop every term but the last whose work the others now do, and say again what those that stay are worth."""
     index = 0
     while index < selection.terms - 1:
         reduced = selector.settle_without(selection.fit, index)
@@ -126,10 +126,10 @@ def swap_terms(selector: Selector, selection: Selection) -> Selection:
             if swapped is not None:
                 selection = swapped
                 break
-    return selection if selection.fit is before else judged_anew(selector, selection)
+    return selection if selection.fit is before else judged_again(selector, selection)
 
 
-def judged_anew(selector: Selector, selection: Selection) -> Selection:
+def judged_again(selector: Selector, selection: Selection) -> Selection:
     """Every term judged beside what changed, and those gone whose work the others now do."""
     selection = backward_elimination(selector, selection)
     last = selection.terms - 1

@@ -114,7 +114,7 @@ def longest_lag_s(
 ) -> float:
     """Longest lag [s], at most `longest_s`, with which two masses fit no worse than by the factor `worse`.
 
-    All numbers are fitted anew behind each lag (profile likelihood); by bisection, since longer ones fit worse.
+    All numbers are fitted again behind each lag (profile likelihood); by bisection, since longer ones fit worse.
     """
 
     def cost(lag_s: float) -> float:

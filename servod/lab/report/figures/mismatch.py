@@ -129,7 +129,7 @@ def window_course(windows: Sequence[Windows], left_out: str, units: Units) -> Fi
             PlotPanel(PlotAxis("time in s"), PlotAxis(f"position error in {prefix}{units.length}"), curves, title)
         )
     caption = (
-        "Simulated minus recorded position; the simulation begins anew from the recording at every window. "
+        "Simulated minus recorded position; the simulation begins again from the recording at every window. "
         f"{seen_by(left_out)}"
     )
     return Figure("windows", "How far a simulation strays", tuple(panels), 1, caption, 0.8)

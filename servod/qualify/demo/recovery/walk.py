@@ -1,7 +1,7 @@
 """`servoctl demo --diagnose`: an axis conceals an effect, its recordings tell which, the controller learns of it.
 
-Beside the data path. Design for what is believed, track, record, diagnose, design anew, deploy, track again; every step
-is the product's own.
+Beside the data path. Design for what is believed, track, record, diagnose, design again, deploy, track again; every
+step is the product's own.
 """
 
 from __future__ import annotations

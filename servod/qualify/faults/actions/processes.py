@@ -24,7 +24,7 @@ from servod.qualify.faults.actions.base import InjectionAction
 from servod.qualify.faults.machine import Process
 from servod.qualify.faults.processes import ProcessAxis
 from servod.qualify.faults.scenario import Loss, Runs
-from servod.runtime.daemon.waiting import BEGINS_ANEW
+from servod.runtime.daemon.waiting import STARTS_AGAIN
 from servod.runtime.loop.axis_state import AxisState
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ class VirtualAxisBack(ProcessAction):
 
 
 class BeginsAnew(ProcessAction):
-    """Bus and nodes are back: the daemon brings the axis up anew by itself, DISABLED, and was in FAULT until then.
+    """Bus and nodes are back: the daemon brings the axis up again by itself, DISABLED, and was in FAULT until then.
 
     It may do so before anybody looks: nodes are back before their start has told so. That it did, the log says.
     """
@@ -123,7 +123,7 @@ class BeginsAnew(ProcessAction):
         while states and states[0] == AxisState.QUICK_STOPPING.name:  # a drive that is not heard is told for a while
             states.pop(0)
         others = [state for state in states if state != AxisState.FAULT.name]
-        return others == [AxisState.DISABLED.name] and BEGINS_ANEW in axis.machine.daemon_log()
+        return others == [AxisState.DISABLED.name] and STARTS_AGAIN in axis.machine.daemon_log()
 
 
 class RestartDaemon(ProcessAction):

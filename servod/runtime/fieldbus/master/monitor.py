@@ -82,7 +82,7 @@ class Rhythm:
         self._owed, self._calm = self._rhythm, 0
 
     def restart(self, time_ns: int) -> None:
-        """The sender begins anew at `time_ns`."""
+        """The sender begins again at `time_ns`."""
         self._beats.clear()
         self._beats.append(time_ns)
         self._owed, self._calm = self._rhythm, 0
@@ -201,7 +201,7 @@ class NodeWatch:
         if state == NmtState.BOOT_UP:
             self.boot_ups += 1
         foreign = False
-        if state != previous:  # told at once, and the rhythm may begin anew with it
+        if state != previous:  # told at once, and the rhythm may begin again with it
             self._rhythm.restart(int(time_ns))
         else:
             foreign = self._rhythm.foreign(int(time_ns))

@@ -19,7 +19,7 @@ from servod.runtime.fieldbus.master.eds import Dictionary, dictionary_for
 from servod.runtime.fieldbus.master.monitor import GuardWatch, NodeWatch
 from servod.runtime.fieldbus.master.network import BusNetwork
 from servod.runtime.fieldbus.master.planned import Kind, load_setup
-from servod.runtime.fieldbus.master.sdo import NodeSdo, SdoTimeout
+from servod.runtime.fieldbus.master.sdo import NodeSdo, SdoNoAnswer
 from servod.runtime.fieldbus.setup_tools import read_optional, write_checked
 
 # --- PDO mappings ----------------------------------------------------------------------------------------------------
@@ -324,7 +324,7 @@ class Node:
         try:
             self._ask_for_a_twin()
             found = read_identity(self.sdo)
-        except SdoTimeout as error:
+        except SdoNoAnswer as error:
             raise Unreachable(self._why_silent(str(error))) from None
         check_identity(self.node_id, found, self.section.identity, PROFILE[self._kind])
         self.identity = found

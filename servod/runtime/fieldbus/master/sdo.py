@@ -75,7 +75,7 @@ class SdoAnswer(NamedTuple):
     abort: int
 
 
-class SdoTimeout(Unreachable):
+class SdoNoAnswer(Unreachable):
     """The node did not answer an SDO request in time, or not to the point."""
 
 
@@ -262,7 +262,7 @@ class NodeSdo:
                 text = f"{self._where(index, subindex)}: {verb} refused, 0x{abort.code:08X} {abort_text(abort.code)}"
                 raise SdoAbort(text, abort.code) from None
             except SdoCommunicationError as error:
-                raise SdoTimeout(f"{self._where(index, subindex)}: {verb} failed, {error}") from None
+                raise SdoNoAnswer(f"{self._where(index, subindex)}: {verb} failed, {error}") from None
 
     def _where(self, index: int, subindex: int) -> str:
         return f"node {self.node_id} object 0x{index:04X}:{subindex}"

@@ -155,12 +155,12 @@ FINDINGS: dict[WiringOutcome, _Row] = {
     _F.TOO_HEAVY: _Row(
         "the joint needs {found:.3g} N*m to move, at most {highest:.3g} N*m were expected: the scale of the torque is "
         "wrong, or something drags",
-        f"{_RATED}; free the joint; mend {_KNOWN} if they are wrong",
+        f"{_RATED}; free the joint; correct {_KNOWN} if they are wrong",
     ),
     _F.TOO_FAST: _Row(
         "the joint took up {found:.3g} times the energy that the torque can have given it, at most {highest:.3g} are "
         "allowed: the scale of the torque is wrong",
-        f"{_RATED}; mend {_KNOWN} if they are wrong",
+        f"{_RATED}; correct {_KNOWN} if they are wrong",
     ),
     _F.TRAVEL: _Row(
         "the joint moved by {found:.3g} rad, {highest:.3g} rad are allowed: it did not stop when the torque ended",
@@ -191,11 +191,11 @@ FINDINGS: dict[WiringOutcome, _Row] = {
 def wiring_sentence(proof: WiringReport) -> str:
     """What a test found, in one line: what was measured, or which check failed, found, allowed and remedy."""
     if proof.passed:
-        return f"wiring proven: {_measured(proof)}; {_scale(proof)}"
+        return f"wiring in order: {_measured(proof)}; {_scale(proof)}"
     outcome = WiringOutcome(int(proof.finding))
     row = FINDINGS[outcome]
     text = row.text.format(found=proof.found, lowest=proof.lowest, highest=proof.highest, **_longer(proof.found))
-    return f"wiring not proven ({outcome.name}): {text}; {row.remedy}. Measured: {_measured(proof)}"
+    return f"wiring test failed ({outcome.name}): {text}; {row.remedy}. Measured: {_measured(proof)}"
 
 
 def wiring_document(proof: WiringReport) -> dict[str, Any]:
@@ -223,8 +223,8 @@ def _scale(proof: WiringReport) -> str:
     only = "only " if known else ""
     how = f"to within a factor of {proof.scale_factor:.2g}" if known else "not at all, for nothing bounds it"
     if math.isfinite(proof.expected_nm) and known:
-        return f"the scale of the torque is proven {how}"
-    return f"the scale of the torque is proven {only}{how}: state {_KNOWN}"
+        return f"the scale of the torque is known {how}"
+    return f"the scale of the torque is known {only}{how}: state {_KNOWN}"
 
 
 def _measured(proof: WiringReport) -> str:

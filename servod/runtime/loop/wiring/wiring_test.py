@@ -90,7 +90,7 @@ class WiringTest:
         self._ratio = math.nan
 
     def forget(self) -> None:
-        """Nothing is proven any more; the next cycle of the axis in PROVING begins anew."""
+        """Nothing is proven any more; the next cycle of the axis in PROVING begins again."""
         self.proven, self.running, self.verdict = False, False, None
 
     def step(self, amplifier: AmplifierFeedback, encoder: EncoderFeedback, demand_nm: float, dt_s: float) -> float:

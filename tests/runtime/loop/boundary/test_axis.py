@@ -57,7 +57,7 @@ def test_recorded_numbers_of_the_states_stay() -> None:
 
 # --- faults -----------------------------------------------------------------------------------------------------------
 def expected(state: AxisState, code: FaultCode) -> AxisState:
-    """Where the fault leads, said anew from the documentation of the reactions."""
+    """Where the fault leads, said again from the documentation of the reactions."""
     reaction = FAULTS[code].reaction
     if state in (S.DISABLED, S.FAULT):
         return S.FAULT if code in (F.DRIVE_STAYS_POWERED, F.COMMANDS_LOST) else state

@@ -166,7 +166,7 @@ def test_the_axis_model_says_what_to_expect(tmp_path):
 
 def test_a_switched_off_test_is_not_run_but_when_asked_for():
     session = axis(joint(), {"wiring_proof": {"enabled": False}})
-    assert "the first torque comes unproven" in warnings(session.config)[0]
+    assert "the first torque comes untested" in warnings(session.config)[0]
     assert "judge the scale" in warnings(axis(joint()).config)[0]
     session.enable()
     assert session.proof is None
