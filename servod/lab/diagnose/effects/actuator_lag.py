@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +16,10 @@ from servod.lab.diagnose.effects.search_context import SearchContext
 #: Time constants to start from, s.
 STARTS_S = (0.002, 0.006, 0.02)
 
+#: Rate limits to start from: from this share of the command's changes that are slower up to the greatest of them, each
+#: by this factor above the one before. One too high acts nowhere, and one a little too low hardly looks better.
+OFTEN, NEXT_RATE, MOST_RATES = 0.98, 1.1, 16
+
 
 def terms(scene: SearchContext) -> list[Term]:
     """A lag from some time constants, and a limited rate; none where a servo's own loop makes the torque.
@@ -26,9 +31,14 @@ def terms(scene: SearchContext) -> list[Term]:
     own = known_delay(scene.document)
     lags = [simple("actuator_lag", "lag", [Unknown("time_constant_s", "s", start, 1e-5, 0.5)]) for start in STARTS_S]
     step = np.abs(np.diff(scene.torque)) / max(trace.period_s for trace in scene.predictor.traces)
-    fast = max(float(np.quantile(step, 0.98)), 1e-9)
-    rate = Unknown("slew_per_s", f"{scene.force}/s", fast, 0.01 * fast, 20.0 * fast)
-    return [replace(term, opens=own) for term in (*lags, simple("actuator_lag", "rate limit", [rate]))]
+    often, most = (max(float(np.quantile(step, share)), 1e-9) for share in (OFTEN, 1.0))
+    count = min(max(math.ceil(math.log(most / often) / math.log(NEXT_RATE)), 1), MOST_RATES)
+    rates = [
+        Unknown("slew_per_s", f"{scene.force}/s", float(start), 0.01 * often, 20.0 * most)
+        for start in np.geomspace(often, most, count)
+    ]
+    limits = [simple("actuator_lag", "rate limit", [rate]) for rate in rates]
+    return [replace(term, opens=own) for term in (*lags, *limits)]
 
 
 EFFECT = Effect(

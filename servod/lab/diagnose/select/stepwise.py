@@ -26,6 +26,7 @@ from servod.lab.diagnose.select.free_windows import free_run_errors
 from servod.lab.diagnose.select.joint import add_levels
 from servod.lab.diagnose.select.levels import is_another, level_at_bound
 from servod.lab.diagnose.select.merit import Merit
+from servod.lab.diagnose.select.pair import add_pair
 from servod.lab.diagnose.select.selection import Selection, TermEntry
 from servod.lab.diagnose.select.selector import Selector, is_sound
 from servod.lab.diagnose.settings import SETTINGS
@@ -63,7 +64,7 @@ def _more_to_find(selector: Selector, selection: Selection) -> bool:
 
 
 def _add_best(selector: Selector, selection: Selection) -> Selection:
-    """Try all effects beside the present fit and take the best if it deserves it.
+    """Try all effects beside the present fit and take the best if it deserves it, or two that only together do.
 
     A fit behind a gap may improve by being fitted again: what a term is worth counts from there. One that has run to
     the end of its range is none, and sets no bar for the others.
@@ -94,21 +95,25 @@ def _add_best(selector: Selector, selection: Selection) -> Selection:
         if selector.significant(selection, merit, fit) and not is_another(fit):
             first = selection.minor.get(candidate.effect, merit)
             selection = replace(selection, minor={**selection.minor, candidate.effect: first})
-    return selection
+    return add_pair(selector, selection, candidates)
 
 
 def backward_elimination(selector: Selector, selection: Selection) -> Selection:
-    """Drop every term but the last whose work the others now do, and say again what those that stay are worth."""
-    index = 0
-    while index < selection.terms - 1:
-        reduced = selector.settle_without(selection.fit, index)
-        merit = selector.merit(selection, reduced, selection.fit)
-        if selector.deserves(selection, merit, selection.fit, index):
-            selection = selection.with_merit(index, merit)
-            index += 1
-        else:
-            selection = selection.without_term(index, reduced)
-    return selection
+    """Drop every term but the last whose work the others now do, the one that is missed least first, and say again what
+    each of those that stay is worth.
+
+    The first of them in order of coming in may be the right one, whose work a wrong one does badly.
+    """
+    while True:
+        reduced = [selector.settle_without(selection.fit, index) for index in range(selection.terms - 1)]
+        merits = [selector.merit(selection, fit, selection.fit) for fit in reduced]
+        idle = [i for i, merit in enumerate(merits) if not selector.deserves(selection, merit, selection.fit, i)]
+        if not idle:
+            for index, merit in enumerate(merits):
+                selection = selection.with_merit(index, merit)
+            return selection
+        least = min(idle, key=lambda index: selector.error(reduced[index].mismatch))
+        selection = selection.without_term(least, reduced[least])
 
 
 def swap_terms(selector: Selector, selection: Selection) -> Selection:
