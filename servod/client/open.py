@@ -60,8 +60,8 @@ def daemon_axis(plant: AxisModel, gains: GainSet, folder: Path, _seed: int) -> I
     """Daemon and virtual axis as processes, enabled under `gains`. Raises Unreachable when one does not start."""
     config = config_for(plant, gains, folder)
     joint, initial = folder / "plant.yaml", folder / "initial.yaml"
-    joint.write_text(axis_model_yaml(plant))
-    initial.write_text(gains.to_yaml())
+    joint.write_text(axis_model_yaml(plant), encoding="utf-8")
+    initial.write_text(gains.to_yaml(), encoding="utf-8")
     cycle = config.cycle.model_copy(update={"cpu": last_core(), "priority": 80})
     limits = config.limits.model_copy(update={"stale_cycles": 50, "late_cycles": 500})
     kept = config.gains.model_copy(update={"directory": folder / "gains", "initial": initial})

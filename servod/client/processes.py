@@ -88,7 +88,7 @@ def wait_until(ready: Callable[[], bool], process: subprocess.Popen[bytes], log:
     deadline = time.monotonic() + timeout_s
     while not ready():
         if process.poll() is not None or time.monotonic() > deadline:
-            lines = log.read_text(errors="replace").strip().splitlines()
+            lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
             raise Unreachable(f"{log.stem} did not start: {lines[-1] if lines else 'no output'}")
         time.sleep(0.02)
 
@@ -136,7 +136,7 @@ def running_axis(
     `axis_options` are further arguments of servod-virtual-axis.
     """
     file = folder / "axis.yaml"
-    file.write_text(yaml.safe_dump(config.model_dump(mode="json")))
+    file.write_text(yaml.safe_dump(config.model_dump(mode="json")), encoding="utf-8")
     bus, control = Path(config.bus.channel), config.control.socket
     with contextlib.ExitStack() as stack:
         log = folder / "virtual-axis.log"

@@ -342,7 +342,7 @@ class SteppedAxis:
         self.session, self._slow = session, _InPlace()
         folder.mkdir(parents=True, exist_ok=True)
         file = folder / "initial.yaml"
-        file.write_text((initial or powerless()).to_yaml())
+        file.write_text((initial or powerless()).to_yaml(), encoding="utf-8")
         gains = session.config.gains.model_copy(update={"directory": folder / "gains", "initial": file})
         # Nobody can be hurt: any set may run here, as with gains.accept_uncertified, also one of another loop.
         self._bank = GainBank(session.config.model_copy(update={"gains": gains}), lambda _gains, _config: None)

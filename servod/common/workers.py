@@ -74,7 +74,7 @@ def _tracker_goes_with_us() -> None:
 def _children() -> set[int]:
     """Process ids of our children (proc(5), task/children); empty where the system does not tell."""
     with contextlib.suppress(OSError):
-        return set(map(int, Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()))
+        return set(map(int, Path(f"/proc/self/task/{os.getpid()}/children").read_text(encoding="utf-8").split()))
     return set()
 
 

@@ -112,7 +112,7 @@ def test_the_stop_that_is_stated_and_what_was_narrowed_are_shown() -> None:
     text = shown(document())
     assert "stops within 58 ms, 3.6 rad/s and 0.14 rad after a loss of the master; without the drive it does" in text
     assert "narrowed speed [limits]" in text
-    assert "stopping not reckoned" in shown({**document(), "stopping": None})
+    assert "stopping not computed" in shown({**document(), "stopping": None})
 
 
 def test_what_is_not_as_certified_is_shown() -> None:

@@ -13,6 +13,7 @@ COMMANDS = {
     "lint": ["ruff", "check", "."],
     "format": ["ruff", "format", "--check", "."],
     "types": ["mypy"],
+    "encodings": ["ruff", "check", "--preview", "--select", "PLW1514", "servod", "drivers"],
 }
 
 

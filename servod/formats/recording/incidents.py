@@ -181,7 +181,10 @@ def marks(folder: Path, axis: str | None = None) -> list[Path]:
 def of_journal(path: Path) -> list[Incident]:
     """Incidents in the daemon's log lines, as `journalctl -o short-iso` or the daemon writes them. Raises BadInput."""
     found: list[Seen] = []
-    for line in read_text(path).splitlines():
+    lines = read_text(path).splitlines()
+    if any(map(str.strip, lines)) and not any(_STAMP.search(line) or _LINE.search(line) for line in lines):
+        raise BadInput(str(path), "no line with a date", "lines of `journalctl -o short-iso` of the unit")
+    for line in lines:
         match = _LINE.search(line)
         if match is None or match["code"] not in FaultCode.__members__:
             continue

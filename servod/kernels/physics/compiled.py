@@ -192,7 +192,7 @@ def _source_in(folder: Path, source: Path) -> Path:
     try:
         if not copy.exists():
             folder.mkdir(parents=True, exist_ok=True)
-            write_atomically(copy, source.read_text())
+            write_atomically(copy, source.read_text(encoding="utf-8"))
     except OSError:
         return source
     return copy

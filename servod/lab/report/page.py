@@ -135,7 +135,7 @@ class Page:
 
     def html(self) -> str:
         """The whole page."""
-        title, style = _text(self._title), (_HERE / "page.css").read_text()
+        title, style = _text(self._title), (_HERE / "page.css").read_text(encoding="utf-8")
         return (
             f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
             '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -147,7 +147,7 @@ class Page:
 
     def _drawing(self) -> str:
         """The script, which unfolds what is printed, and the rows that it draws."""
-        script = f"<script>{(_HERE / 'page.js').read_text()}</script>\n"
+        script = f"<script>{(_HERE / 'page.js').read_text(encoding='utf-8')}</script>\n"
         if not self._figures:
             return script
         rows = json.dumps(PageData(self._figures).document(), allow_nan=False).replace("<", "\\u003c")

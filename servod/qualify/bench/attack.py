@@ -74,11 +74,11 @@ def _round(axis: RunningAxis, record: Path, log: Path, quiet_s: float, attack_s:
     before_kib = resident_kib(daemon_pid)
     seconds = str(_GATHER_S + attack_s + 60.0)
     with child("servod.qualify.bench.attackers", [client.path, seconds], log) as attackers:
-        wait_until(lambda: AT_WORK in log.read_text(errors="replace"), attackers, log, _GATHER_S)
+        wait_until(lambda: AT_WORK in log.read_text(encoding="utf-8", errors="replace"), attackers, log, _GATHER_S)
         attacked = _watch(client, attack_s)
         times_ms = [_stop(client, record) for _ in range(stops)]
         if attackers.poll() is not None:
-            raise AnswerIsNo(f"the attackers ended before the attack: {log.read_text()[-500:]}")
+            raise AnswerIsNo(f"the attackers ended before the attack: {log.read_text(encoding='utf-8')[-500:]}")
         growth_mib = (resident_kib(daemon_pid) - before_kib) / _KIB_PER_MIB
     return _Round(quiet, attacked, quiet_ms, times_ms, growth_mib, told(log))
 
@@ -88,7 +88,7 @@ def told(log: Path) -> dict[str, AttackTally]:
 
     Raises AnswerIsNo when they said nothing, or when an attack did not take place.
     """
-    lines = log.read_text(errors="replace").splitlines()
+    lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
     if not lines or not lines[-1].startswith("{"):
         raise AnswerIsNo(f"the attackers did not tell what they did: {' '.join(lines)[-500:]}")
     tallies = {name: AttackTally(**did) for name, did in json.loads(lines[-1]).items()}

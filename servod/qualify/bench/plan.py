@@ -121,7 +121,7 @@ def _commission(plan: BenchSettings, tell: Callable[[str], None]) -> dict[str, A
 
 def machine() -> dict[str, Any]:
     """The machine that the figures belong to."""
-    lines = Path("/proc/cpuinfo").read_text().splitlines()
+    lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     model = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
     cores = sum(line.startswith("processor") for line in lines)
     return {"cpu": model, "cores": cores, "kernel": platform.release(), "python": sys.version.split()[0]}

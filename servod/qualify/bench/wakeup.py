@@ -100,7 +100,7 @@ def _cyclictest(core: int, cycles: int) -> dict[str, float] | None:
         done = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, check=False)
         if done.returncode != 0 or not file.exists():
             return None
-        histogram = json.loads(file.read_text())["thread"]["0"]["histogram"]
+        histogram = json.loads(file.read_text(encoding="utf-8"))["thread"]["0"]["histogram"]
     counts = sorted((int(us), count) for us, count in histogram.items())
     return {"median": _percentile(counts, 0.5), "p99": _percentile(counts, 0.99)}
 

@@ -77,7 +77,7 @@ def _watch_memory(client: ControlClient, pids: dict[str, int], duration_s: float
 
 def _processes(daemon_pid: int) -> dict[str, int]:
     """The supervisor and its only child, the loop (proc(5), task/children)."""
-    (loop,) = Path(f"/proc/{daemon_pid}/task/{daemon_pid}/children").read_text().split()
+    (loop,) = Path(f"/proc/{daemon_pid}/task/{daemon_pid}/children").read_text(encoding="utf-8").split()
     return {"supervisor": daemon_pid, "loop": int(loop)}
 
 
@@ -88,7 +88,7 @@ def _growth_mib(samples_kib: list[int]) -> float:
 
 def resident_kib(pid: int) -> int:
     """Resident memory of a process (proc(5), status: VmRSS); 0 when it has gone."""
-    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+    for line in Path(f"/proc/{pid}/status").read_text(encoding="utf-8").splitlines():
         if line.startswith("VmRSS:"):
             return int(line.split()[1])
     return 0

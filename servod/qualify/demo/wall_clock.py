@@ -70,7 +70,7 @@ def _run(client: ControlClient, row: DemoRow, duration_s: float, recordings: Pat
 
 def activate(client: ControlClient, gains: Path) -> None:
     """Load a gain-set file into the daemon and change to it."""
-    stored = client.call("gains_load", name=str(gains), text=gains.read_text())
+    stored = client.call("gains_load", name=str(gains), text=gains.read_text(encoding="utf-8"))
     client.call("gains_activate", name=stored["name"], version=stored["version"])
 
 

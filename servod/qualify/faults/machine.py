@@ -159,5 +159,5 @@ class Machine:
 
 def _child_of(pid: int) -> int:
     """The only child of a process (proc(5), task/children)."""
-    (only,) = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    (only,) = Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="utf-8").split()
     return int(only)

@@ -227,7 +227,7 @@ def _tell(folders: Sequence[Path], cycles: int, tell: Tell) -> None:
 def _read(folder: Path) -> dict[str, Any]:
     """The document of a job. Raises Unreachable when it has not written one."""
     try:
-        found: dict[str, Any] = json.loads((folder / DOCUMENT_NAME).read_text())
+        found: dict[str, Any] = json.loads((folder / DOCUMENT_NAME).read_text(encoding="utf-8"))
     except OSError as error:
         raise Unreachable(f"{folder}: the job left no {DOCUMENT_NAME} ({reason(error)})") from None
     return found

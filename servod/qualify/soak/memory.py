@@ -70,7 +70,7 @@ class Memory:
         self._next_s = now_s + self._interval_s
         if self.pid == os.getpid():
             _hand_back()
-        pages = int((self._folder / "statm").read_text().split()[1])
+        pages = int((self._folder / "statm").read_text(encoding="utf-8").split()[1])
         self.add(now_s, pages * _PAGE_KB, sum(1 for _ in (self._folder / "fd").iterdir()))
 
     def add(self, now_s: float, resident_kb: float, descriptors: int) -> None:

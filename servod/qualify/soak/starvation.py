@@ -130,11 +130,11 @@ def waited_ns(pid: int) -> int:
     with suppress(OSError):
         for task in Path(f"/proc/{pid}/task").iterdir():
             with suppress(OSError, ValueError, IndexError):
-                total += int((task / "schedstat").read_text().split()[1])
+                total += int((task / "schedstat").read_text(encoding="utf-8").split()[1])
     return total
 
 
 def stolen_ns() -> int:
     """Time that the hypervisor gave to others while this machine wanted to run (proc_stat(5), steal)."""
-    ticks = int(Path("/proc/stat").read_text().split()[8])
+    ticks = int(Path("/proc/stat").read_text(encoding="utf-8").split()[8])
     return ticks * NS_PER_S // os.sysconf("SC_CLK_TCK")

@@ -151,7 +151,7 @@ class WallSoak:
         return str(self._axis.client.call(Verb.STATUS)["axis"]["state"])
 
     def _change_law(self, name: str) -> None:
-        text = shipped(f"gains/{name}.yaml").read_text()
+        text = shipped(f"gains/{name}.yaml").read_text(encoding="utf-8")
         if self._ask(Verb.GAINS_LOAD, name=f"{name}.yaml", text=text) and self._ask(Verb.GAINS_ACTIVATE, name=name):
             self.tally.laws[name] += 1
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+import subprocess
+import sys
 from html.parser import HTMLParser
 from itertools import pairwise
 from pathlib import Path
@@ -23,6 +25,8 @@ from servod.lab.report.figure import Colour, Figure, PageTable, PlotAxis, PlotPa
 from servod.lab.report.figures.loop import PASSED, certificate_tables, limit_used, observations_table
 from servod.lab.report.page import Origin, Page, Verdict, _is_text, drives
 from servod.lab.verify.margins import DELAY, PHASE
+
+ROOT = Path(__file__).resolve().parents[3]
 
 
 class Tags(HTMLParser):
@@ -75,6 +79,17 @@ def test_a_page_begins_with_verdict_and_signature(tmp_path: Path) -> None:
     stamp = r"<dt>drawn</dt><dd>\d{4}-\d\d-\d\d \d\d:\d\d:\d\d UTC \(here .*[+-]\d\d:\d\d\)"
     for part in (stamp, servod.__version__, "numpy", "Linux"):
         assert re.search(part, signed[0])
+
+
+def test_a_page_is_the_same_whatever_the_machine_takes_files_for() -> None:
+    """Its script has more than ASCII, which Windows, too, would read by a code page."""
+    code = (
+        "import sys; from tests.lab.report.test_page import a_page\n"
+        "sys.stdout.buffer.write(a_page().html().encode('utf-8'))"
+    )
+    elsewhere = os.environ | {"PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "LC_ALL": "C"}
+    told = subprocess.run([sys.executable, "-c", code], env=elsewhere, cwd=ROOT, capture_output=True, check=True)
+    assert told.stdout.decode() == a_page().html()
 
 
 def test_no_name_acts_on_what_stands_beside_it(tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ _CLOCK_S = 30.0
 
 def _run(*command: str) -> None:
     """Run a program of the guest; raises Unreachable with what it said, and on every machine that is no guest."""
-    if _GUEST_MARK not in Path("/proc/cmdline").read_text():
+    if _GUEST_MARK not in Path("/proc/cmdline").read_text(encoding="utf-8"):
         raise Unreachable(f"{command[0]}: only in the guest machine")
     done = subprocess.run(
         command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=_LONGEST_S, check=False
@@ -81,7 +81,7 @@ class Interface(GuestAction):
         if self.do is InterfaceChange.BACK:
             _run("ip", "link", "add", "dev", name, "type", "vcan")
         _run("ip", "link", "set", name, "up" if goes_up else "down")
-        return bool(int(_flags(name).read_text(), 16) & _IFF_UP) is goes_up
+        return bool(int(_flags(name).read_text(encoding="utf-8"), 16) & _IFF_UP) is goes_up
 
 
 class SetClock(GuestAction):

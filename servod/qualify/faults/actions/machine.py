@@ -244,8 +244,8 @@ class Damage(StrEnum):
 
 
 def _cut(path: Path) -> None:
-    text = path.read_text()
-    path.write_text(text[: len(text) // 2])
+    text = path.read_text(encoding="utf-8")
+    path.write_text(text[: len(text) // 2], encoding="utf-8")
 
 
 def _swapped(path: Path) -> None:
@@ -277,7 +277,7 @@ class StoredGains(ProcessAction):
 
     def act(self, axis: ProcessAxis) -> int:
         """Load, damage, activate."""
-        stored = axis.call(Verb.GAINS_LOAD, name=_LOADED.name, text=_LOADED.read_text())
+        stored = axis.call(Verb.GAINS_LOAD, name=_LOADED.name, text=_LOADED.read_text(encoding="utf-8"))
         name, version = stored["name"], stored["version"]
         damaged = _damaged(axis.config.gains.directory / "sets" / name / f"{version:04d}.yaml", self.damage)
         axis.call(Verb.GAINS_ACTIVATE, name=name, version=version)
@@ -296,7 +296,7 @@ class ConfiguredGains(ProcessAction):
         copy = axis.folder / "initial.yaml"
         copy.write_bytes(_LOADED.read_bytes())
         damaged = _damaged(copy, self.damage)
-        data = yaml.safe_load(axis.machine.config.read_text())
+        data = yaml.safe_load(axis.machine.config.read_text(encoding="utf-8"))
         data["gains"]["initial"] = str(copy)
         axis.machine.config.write_text(yaml.safe_dump(data))
         return damaged
