@@ -11,7 +11,7 @@ from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.predict.predict import Predictor
-from servod.lab.diagnose.select.pair import add_pair
+from servod.lab.diagnose.select.joint import add_pair
 from servod.lab.diagnose.select.selection import Selection
 from servod.lab.diagnose.select.selector import Selector
 from tests.lab.diagnose.axes import believed, record

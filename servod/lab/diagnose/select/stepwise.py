@@ -23,10 +23,9 @@ from servod.lab.diagnose.select.candidates import Candidate
 from servod.lab.diagnose.select.cross_validation import make_folds, predict_held_out
 from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.select.free_windows import free_run_errors
-from servod.lab.diagnose.select.joint import add_levels
+from servod.lab.diagnose.select.joint import add_levels, add_pair
 from servod.lab.diagnose.select.levels import is_another, level_at_bound
 from servod.lab.diagnose.select.merit import Merit
-from servod.lab.diagnose.select.pair import add_pair
 from servod.lab.diagnose.select.selection import Selection, TermEntry
 from servod.lab.diagnose.select.selector import Selector, is_sound
 from servod.lab.diagnose.settings import SETTINGS
