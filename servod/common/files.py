@@ -11,6 +11,7 @@ import errno
 import json
 import os
 import stat
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -196,6 +197,17 @@ def write_file(path: Path, text: str) -> None:
         write_atomically(path, text)
     except OSError as error:
         raise unwritable(path, error) from None
+
+
+def refusal_of(folder: Path) -> str:
+    """Why no file can be written in a folder, which is made where it is missing; empty where one can."""
+    try:
+        make_folder(folder)
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(b"servod")
+    except OSError as error:
+        return f"{folder}: no file can be written there ({reason(error)})"
+    return ""
 
 
 def make_folder(folder: Path) -> None:

@@ -218,6 +218,7 @@ def _leave_core_to_loop(cpu: int | None) -> None:
 
 def _recorder(config: AxisConfig, path: Path, bank: GainBank) -> Recorder:
     recorder = Recorder(config.recorder, config.name, config.cycle.period_us)
+    recorder.try_folder()
     recorder.set_attachment("config.yaml", read_text(path).encode())
     recorder.set_attachment("gains.yaml", bank.newest.text.encode())
     if config.model is not None:

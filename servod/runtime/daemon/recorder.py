@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, TypedDict, TypeVar
 
 from servod.common.errors import BadInput, ServodError, Unreachable
-from servod.common.files import make_folder, reason
+from servod.common.files import make_folder, reason, refusal_of
 from servod.formats.config import RecorderConfig
 from servod.formats.recording.mcap_writer import McapFile, split_rows, wall_offset_ns
 from servod.formats.recording.record import RECORD
@@ -57,6 +57,10 @@ class RecordingFiles:
         self._max_total_bytes = config.max_total_mib * MIB
         self.max_bytes = min(config.max_file_mib * MIB, self._max_total_bytes // _PART_SHARE)
         self.total_bytes = self.removed = 0
+
+    def refusal(self) -> str:
+        """Why no file can be written in the directory, which is made; empty where one can."""
+        return refusal_of(self._directory)
 
     def recording(self, name: str | None) -> Path:
         """A path in the directory, and nowhere else: clients must not write where they please. Raises BadInput."""
@@ -267,6 +271,10 @@ class Recorder:
         self._attachments[name] = data
         if not self._put(lambda: self._attach(name, data)):
             self._fail(f"the disk does not keep up; {name} was dropped")
+
+    def try_folder(self) -> None:
+        """Fail at once where no file can be written, not first when the seconds before a fault are lost."""
+        self._put(lambda: self._fail(text) if (text := self._files.refusal()) else None)
 
     def start(self, name: str | None = None) -> Future[Path]:
         """Begin a recording in the configured directory; the future gives its path, or BadInput or Unreachable."""

@@ -27,6 +27,17 @@ def _recorder(directory: Path, history_s: float = 1.0) -> Recorder:
     return Recorder(RecorderConfig(directory=directory, history_s=history_s), "axis", 1000)
 
 
+def test_a_folder_that_takes_no_file_is_told_before_anything_is_recorded(tmp_path: Path) -> None:
+    good, bad = _recorder(tmp_path / "new"), _recorder(tmp_path / "a file" / "recordings")
+    (tmp_path / "a file").touch()
+    for recorder in (good, bad):
+        recorder.try_folder()
+        recorder.close()
+    assert good.take_failure() == "" and list((tmp_path / "new").iterdir()) == []
+    assert "no file can be written there" in bad.take_failure()
+    assert "no file can be written there" in bad.state()["failure"]
+
+
 def test_recording_gives_back_rows_events_and_attachments(tmp_path: Path) -> None:
     recorder = _recorder(tmp_path)
     recorder.set_attachment("config.yaml", b"name: a\n")
