@@ -153,7 +153,7 @@ def test_cycles_without_control_or_feedback_count_for_nothing(certified: GainSet
 def test_the_daemon_tells_by_fault_status_metrics_and_command(
     certified: GainSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with daemon_axis(joint(inertia=2.0), certified, tmp_path, 0) as axis:
+    with daemon_axis(joint(inertia=1.5), certified, tmp_path, 0) as axis:  # steady, too, where a few cycles come late
         axis.run(ReferenceMotion.sine(0.01, 6.0, 5.0))
         socket = ["--socket", str(tmp_path / "axis.sock")]
         assert axis.status().enabled
@@ -163,7 +163,7 @@ def test_the_daemon_tells_by_fault_status_metrics_and_command(
         found = capsys.readouterr().out
         assert run(["status", *socket, "--json"]) == 0
         promise = json.loads(capsys.readouterr().out)["promise"]
-    assert re.search(r"not as certified inertia (1\.[89]|2\.[01])\d times the model's", told)
+    assert re.search(r"not as certified inertia 1\.[45]\d times the model's", told)
     assert "PROMISE_BROKEN" in found
     assert promise["judged"] and [row["told"] for row in promise["joint"]] == [True, False, False]
 
