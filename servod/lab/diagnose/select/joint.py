@@ -116,8 +116,9 @@ def _better(rival: Candidate, left: float, numbers: int) -> bool:
 # towards either looks poor, and a fit of either goes elsewhere.
 
 
-#: First terms beside which a second is searched, and seconds that are fitted to the end beside each.
-FIRSTS, SECONDS = 4, 2
+#: First terms beside which a second is searched, each of which costs as much as all of a plain diagnosis, and seconds that
+#: are fitted to the end beside each.
+FIRSTS, SECONDS = 2, 2
 
 #: What two terms that come in together may leave of what is there, at most: physics on nobody's list is no such pair.
 MOST_LEFT = 0.1
