@@ -116,8 +116,8 @@ def _better(rival: Candidate, left: float, numbers: int) -> bool:
 # towards either looks poor, and a fit of either goes elsewhere.
 
 
-#: First terms beside which a second is searched, each of which costs as much as all of a plain diagnosis, and seconds that
-#: are fitted to the end beside each.
+#: First terms beside which a second is searched, each of which takes as long as a plain diagnosis, and seconds that are
+#: fitted to the end beside each.
 FIRSTS, SECONDS = 2, 2
 
 #: What two terms that come in together may leave of what is there, at most: physics on nobody's list is no such pair.
@@ -138,8 +138,9 @@ def add_pair(selector: Selector, selection: Selection, candidates: Sequence[Cand
         seconds, tried = selector.candidates(begun, skip=frozenset(selection.rejected) | {first.effect})
         selection = replace(selection, tried=selection.tried + tried)
         pair = _pair(selector, selection, begun, seconds)
-        if pair is not None:
-            return _entered(selector, selection, pair, (first, seconds))
+        longer = selection if pair is None else _entered(selector, selection, pair, (first, seconds))
+        if longer.terms > selection.terms:
+            return longer
     return selection
 
 
