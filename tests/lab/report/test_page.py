@@ -89,7 +89,9 @@ def test_a_page_is_the_same_whatever_the_machine_takes_files_for() -> None:
     )
     elsewhere = os.environ | {"PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "LC_ALL": "C"}
     told = subprocess.run([sys.executable, "-c", code], env=elsewhere, cwd=ROOT, capture_output=True, check=True)
-    assert told.stdout.decode() == a_page().html()
+    drawn = re.compile(r"<dt>drawn</dt><dd>[^<]*</dd>")
+    here, there = (drawn.subn("", page) for page in (a_page().html(), told.stdout.decode()))
+    assert there == here and here[1] == 1
 
 
 def test_no_name_acts_on_what_stands_beside_it(tmp_path: Path) -> None:
