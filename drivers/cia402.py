@@ -212,8 +212,8 @@ class Cia402Amplifier:
         """Inputs that are not heard any more are taken for active: a stop that cannot be seen is one."""
         active = sum(flag for flag, _, _ in self._input_rows) if self._slow_lost() else self._inputs
         in_fault = self._state in (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE)
-        told = self._sto_error and in_fault and self._error_code == self._sto_error
-        return active | DriveInput.STO_TOLD if told else active
+        by_error_code = self._sto_error and in_fault and self._error_code == self._sto_error
+        return active | DriveInput.STO_TOLD if by_error_code else active
 
     def _shown_mode(self) -> int:
         """The mode last shown; one that is not shown any more is a wrong one while the drive acts on targets.

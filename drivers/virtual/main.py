@@ -126,8 +126,8 @@ class Client:
             self._accepted = (self._accepted or set()) | {fault.can_id}
         elif fault.kind is FaultKind.HAPPENED:
             asked = fault._replace(kind=kind_of(fault.amount))
-            told = fault._replace(amount=self._world.fault_effect(asked, self.port))
-            self.deliver(CAN_ERR_FLAG, told.encode(), now_ns)
+            answer = fault._replace(amount=self._world.fault_effect(asked, self.port))
+            self.deliver(CAN_ERR_FLAG, answer.encode(), now_ns)
         else:
             self._world.apply_fault(fault, self.port, now_ns)
 

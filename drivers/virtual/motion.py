@@ -365,8 +365,8 @@ class TorqueStage:
         """Which torque leads further beyond 0x607D."""
         per_count = self._sensor.user_per_count
         position, (lowest, highest) = self._sensor.counts * per_count, self._ends
-        beyond = (position > highest.value) - (position < lowest.value)
-        return beyond * per_count * self.nm_per_permille
+        side = (position > highest.value) - (position < lowest.value)
+        return side * per_count * self.nm_per_permille
 
     def _produce(self, demand: float, time_ns: int) -> None:
         """The last step of every mode: limits, then the power stage."""

@@ -195,7 +195,7 @@ class SteppedSession:
         self.lateness_ns: Callable[[], int] = _punctual
         self._deadline_ns = self.clock.now_ns() + self.cycle.period_ns
         self._cycles_until_poll = 0
-        self.loop_dead = self._stays_powered = self._told_off = False
+        self.loop_dead = self._stays_powered = self._switched_off = False
         self._stops_in = 0
         self._poll_cycles = max(1, _POLL_NS // self.cycle.period_ns)
 
@@ -309,8 +309,8 @@ class SteppedSession:
         self.master.poll()
         for event in self.master.events():
             self.port.send(Op.NODE_EVENT, (float(event.fault),))
-        if self._stays_powered and not self._told_off:
-            self._told_off, self._stops_in = True, ANSWERS_AGAIN_CYCLES
+        if self._stays_powered and not self._switched_off:
+            self._switched_off, self._stops_in = True, ANSWERS_AGAIN_CYCLES
 
     def _stop_withdrawn(self) -> None:
         """What the daemon does beside its rounds for a drive that stays powered, once that may answer SDO again. The

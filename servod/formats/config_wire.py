@@ -162,7 +162,7 @@ class InputsConfig(Strict):
     )
 
     @property
-    def tells_sto(self) -> bool:
+    def reports_sto(self) -> bool:
         """Something says whether STO took the torque."""
         return self.sto_bit is not None or self.sto_error is not None
 

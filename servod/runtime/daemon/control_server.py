@@ -133,7 +133,7 @@ _IDLE_NS = 2 * NS_PER_S
 _COMMANDED_NS = 60 * NS_PER_S
 
 
-class Places:
+class ConnectedClients:
     """The clients that are connected."""
 
     def __init__(self) -> None:
@@ -174,7 +174,7 @@ _BACKLOG = 24
 _ACCEPT_IN_A_ROUND = _BACKLOG
 #: Requests without an answer yet, of one client and of all; a stop has room beyond them.
 _UNDER_WAY_OF_A_CLIENT, _UNDER_WAY = 8, 64
-_STOPS_BEYOND = 32
+_EXTRA_FOR_STOPS = 32
 #: What is answered at once and never under way.
 _AT_ONCE = frozenset({Verb.STATUS, Verb.TRAJECTORY})
 _LONGEST_NUMBER = 64
@@ -220,13 +220,13 @@ class ControlServer:
         """
         self._path, self._handler, self._feed = config.socket, handler, feed
         self._group = group_id(config.group)
-        self._places = Places()
+        self._connected = ConnectedClients()
         self._lease = Lease(handler.motion_running)
         self._under_way = self._now_ns = 0
         self._status_failed = False
         self._round = asyncio.Event()
         self._listener = _listen(config.socket, self._group)
-        self._place, self._look_ns, self._closed_told = _place_of(config.socket), 0, False
+        self._inode, self._look_ns, self._closed_reported = _inode_of(config.socket), 0, False
         self._welcoming: asyncio.Task[None] | None = None
 
     def begin(self) -> None:
@@ -240,29 +240,29 @@ class ControlServer:
             self._welcoming.result()  # a mistake of ours: without a door the axis is not to run on
         self._round.set()
         self._keep_door(now_ns)
-        for client in list(self._places.clients):
+        for client in list(self._connected.clients):
             client.begin_round(now_ns)
         if (limit_ns := self._handler.renew_ns) is not None and (why := self._lease.lets_go(limit_ns)):
             self._handler.abandon_motion(why)
-        self._tell_watchers(now_ns)
+        self._serve_watchers(now_ns)
 
     def _keep_door(self, now_ns: int) -> None:
         """A socket file that somebody removed is made again: who is connected stays, and newcomers must find it."""
         if now_ns < self._look_ns or self._welcoming is None:
             return
         self._look_ns = now_ns + NS_PER_S
-        if _place_of(self._path) == self._place:
+        if _inode_of(self._path) == self._inode:
             return
         try:
             listener = _listen(self._path, self._group)
         except Unreachable as error:
-            if not self._closed_told:
+            if not self._closed_reported:
                 log.error("the control socket is gone, and newcomers cannot stop the axis: %s", error)
-            self._closed_told = True
+            self._closed_reported = True
             return
         log.warning("%s was gone and is made again", self._path)
         self._shut(taking_queue=True)
-        self._listener, self._place, self._closed_told = listener, _place_of(self._path), False
+        self._listener, self._inode, self._closed_reported = listener, _inode_of(self._path), False
         self.begin()
 
     def _shut(self, taking_queue: bool = False) -> None:
@@ -275,8 +275,8 @@ class ControlServer:
             self._take_queued(_BACKLOG + 1)
         self._listener.close()
 
-    def _tell_watchers(self, now_ns: int) -> None:
-        due = [c for c in self._places.clients if c.watch_due(now_ns)]
+    def _serve_watchers(self, now_ns: int) -> None:
+        due = [c for c in self._connected.clients if c.watch_due(now_ns)]
         if not due:
             return
         try:
@@ -302,11 +302,11 @@ class ControlServer:
     @property
     def held_bytes(self) -> int:
         """Memory of all clients' buffers."""
-        return sum(client.held_bytes for client in self._places.clients)
+        return sum(client.held_bytes for client in self._connected.clients)
 
     def close(self, why: str = "servod ends") -> None:
         """Hang up on everyone, with a line that says `why`, and remove the socket."""
-        for client in list(self._places.clients):
+        for client in list(self._connected.clients):
             Reply(client.send, None).failed(Unreachable(why))
             self.drop(client)
         self._shut()
@@ -314,7 +314,7 @@ class ControlServer:
 
     def drop(self, client: Connection) -> None:
         """Forget a client that has gone or must go; gives its lease back."""
-        self._places.leave(client)
+        self._connected.leave(client)
         client.close()
         if self._lease.left(client):
             self._handler.lease_ended()
@@ -324,18 +324,18 @@ class ControlServer:
 
         Waits for somebody to queue and takes him at once: `sock_accept`, cancelled, may have taken one and lose him.
         """
-        loop, listener, places = asyncio.get_running_loop(), self._listener, _ACCEPT_IN_A_ROUND
+        loop, listener, slots_left = asyncio.get_running_loop(), self._listener, _ACCEPT_IN_A_ROUND
         while True:
             somebody = asyncio.Event()
             loop.add_reader(listener, somebody.set)
             await somebody.wait()
             loop.remove_reader(listener)
-            taken = self._take_queued(places)
-            places -= taken
+            taken = self._take_queued(slots_left)
+            slots_left -= taken
             if not taken:
                 self._round.clear()
                 await self._round.wait()
-                places = _ACCEPT_IN_A_ROUND
+                slots_left = _ACCEPT_IN_A_ROUND
 
     def _take_queued(self, most: int) -> int:
         """How many of those who queue found their way in."""
@@ -354,7 +354,7 @@ class ControlServer:
         try:
             if not may_command(peer, self._group):
                 raise Unreachable(f"user {peer.uid} may not connect: not in the control group")
-            if leaves := self._places.make_room(peer, self._lease.holder, self._now_ns):
+            if leaves := self._connected.make_room(peer, self._lease.holder, self._now_ns):
                 Reply(leaves.send, None).failed(Unreachable("idle for longest when others wanted its place"))
                 self.drop(leaves)
         except Unreachable as error:
@@ -363,7 +363,7 @@ class ControlServer:
             connection.close()
             return
         client = Connection(connection, self, self._now_ns)
-        self._places.take(client)
+        self._connected.take(client)
         client.begin()
 
     def hear_out(self, client: Connection, lines: list[bytes]) -> None:
@@ -405,8 +405,8 @@ class ControlServer:
         """The reply of a request that is now under way. Raises Unreachable when too many are."""
         if verb in _AT_ONCE:
             return Reply(client.send, number)
-        beyond = _STOPS_BEYOND if verb in STOPPING else 0
-        if client.under_way >= _UNDER_WAY_OF_A_CLIENT + beyond or self._under_way >= _UNDER_WAY + beyond:
+        extra = _EXTRA_FOR_STOPS if verb in STOPPING else 0
+        if client.under_way >= _UNDER_WAY_OF_A_CLIENT + extra or self._under_way >= _UNDER_WAY + extra:
             raise Unreachable(f"{self._under_way} requests are under way; wait for their answers")
         client.under_way += 1
         self._under_way += 1
@@ -443,7 +443,7 @@ def _request(message: dict[str, Any]) -> tuple[Verb, dict[str, Any]]:
         raise BadInput("request: verb", repr(name)[:80], ", ".join(Verb)) from None
 
 
-def _place_of(path: Path) -> tuple[int, int] | None:
+def _inode_of(path: Path) -> tuple[int, int] | None:
     """What tells a file from another one of its name; None when there is none to be seen."""
     try:
         state = path.stat()

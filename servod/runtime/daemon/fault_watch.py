@@ -89,7 +89,7 @@ class FaultWatch:
     def _report(self, word: int, time_ns: int, now_ns: int) -> None:
         for fault in faults_in(word):
             self._note(fault.code, time_ns)
-            self.tell(fault)
+            self.log_fault(fault)
             if fault.reaction > Reaction.CLIP and not self._file_due_ns:
                 self._file_due_ns, self._file_label = now_ns + _AFTER_FAULT_NS, fault.code.name
 
@@ -97,9 +97,9 @@ class FaultWatch:
         """A fault that the supervisor found itself."""
         self._metrics.count_fault(code)
         self._note(code, time.monotonic_ns(), detail)
-        self.tell(FAULTS[code], detail)
+        self.log_fault(FAULTS[code], detail)
 
-    def tell_earlier(self, incident: Incident) -> None:
+    def add_earlier(self, incident: Incident) -> None:
         """What befell the axis before this start, and was found at it."""
         self._incidents.append(incident)
         fault = FAULTS[incident.first.code]
@@ -107,7 +107,7 @@ class FaultWatch:
         text = f"{fault.cause} [{incident.first.detail}] {fault.remedy}"
         self._recorder.add_event("fault", text, code=fault.code.name, reaction=fault.reaction.name)
 
-    def tell(self, fault: Fault, detail: str = "") -> None:
+    def log_fault(self, fault: Fault, detail: str = "") -> None:
         """Log line and event of one fault, with the health of loop and bus beside it."""
         more = f" [{detail}]" if detail else ""
         text = f"{fault.cause}{more} {fault.remedy}"
@@ -154,14 +154,14 @@ class WiringTestWatch:
 
     def __init__(self, loop: LoopHandle, recorder: Recorder) -> None:
         self._loop, self._recorder = loop, recorder
-        self._told = 0
+        self._reported = 0
 
     def see(self) -> None:
         """Tell of a test that ended since the last call."""
         count, proof = self._loop.proofs
-        if proof is None or count == self._told:
+        if proof is None or count == self._reported:
             return
-        self._told = count
+        self._reported = count
         text = wiring_sentence(proof)
         wiring_log.log(logging.INFO if proof.passed else logging.ERROR, "%s", text)
         self._recorder.add_event("wiring", text, finding=WiringOutcome(int(proof.finding)).name)

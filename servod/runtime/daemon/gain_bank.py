@@ -218,8 +218,8 @@ class GainBank:
             active = self._store.get(last.name, last.version)
             self._fits(active.gains, self._config)
         except BadInput as error:
-            place = f"{initial.name} version {initial.version} (gains.initial) runs in place of {wanted}"
-            self._note = f"{error}; {place}. {remedy}"
+            substitution = f"{initial.name} version {initial.version} (gains.initial) runs in place of {wanted}"
+            self._note = f"{error}; {substitution}. {remedy}"
             log.warning("%s", self._note)
             self._why_first = f"in place of {wanted}: {error}"
             return initial

@@ -69,7 +69,7 @@ _TRIES = 3
 #: The drive is looked at once in a cycle; a look that is later by more is a machine that stood still.
 _LOOK_CYCLES = 3
 #: What the drive tells when each guard acts.
-_TOLD = {"commands": Emcy.RPDO_TIME_OUT, "heartbeat": Emcy.HEARTBEAT_LOST}
+_GUARD_ERRORS = {"commands": Emcy.RPDO_TIME_OUT, "heartbeat": Emcy.HEARTBEAT_LOST}
 _EVERYTHING = "everything"
 _EXPECTED = (Emcy.HEARTBEAT_LOST, Emcy.RPDO_TIME_OUT)
 
@@ -145,13 +145,13 @@ def silences_of(facts: dict[str, Any]) -> list[_Silence]:
 
 
 class GuardTest:
-    """The test of one axis: `connect` gives a new connection to its bus, `tell` hears what comes next."""
+    """The test of one axis: `connect` gives a new connection to its bus, `report` hears what comes next."""
 
     def __init__(
-        self, config: AxisConfig, connect: Callable[[], Bus], clock: Clock, tell: Callable[[str], None] = log.info
+        self, config: AxisConfig, connect: Callable[[], Bus], clock: Clock, report: Callable[[str], None] = log.info
     ) -> None:
         # As the daemon runs it: with the limits and the ramp that the stop is reckoned with.
-        self._config, self._connect, self.clock, self._tell = narrowed_by_stop(config)[0], connect, clock, tell
+        self._config, self._connect, self.clock, self._report = narrowed_by_stop(config)[0], connect, clock, report
         # A drive that holds for a brake that servod closes stays in quick stop active, and has stopped there.
         self._holds = config.amplifier.brake.by == "output" and quick_stop_stays(config.amplifier.quick_stop_option)
         self._longest_ms, self._caused = 0.0, False
@@ -181,7 +181,7 @@ class GuardTest:
             raise AnswerIsNo("no guard of this drive is counted on (amplifier.unguarded): there is nothing to test")
         self._longest_ms = max(silence.limit_ms for silence in silences)
         for number, silence in enumerate(silences):
-            self._tell(
+            self._report(
                 f"{number + 1} of {len(silences)}: {silence.name} will stay away; the drive has to stop within "
                 f"{silence.limit_ms:g} ms by its guard of the {silence.guard}"
             )
@@ -196,7 +196,7 @@ class GuardTest:
         late: GuardResult | None = None
         for number in range(_TRIES):
             if number:
-                self._tell(f"again, {number + 1} of {_TRIES}: this machine stood still, or another guard acted first")
+                self._report(f"again, {number + 1} of {_TRIES}: this machine stood still, or another guard acted first")
             seen = self._try(master, up, silence)
             if seen is not None and not seen.unsure:
                 return seen.result
@@ -223,16 +223,16 @@ class GuardTest:
             if not self._rests(drive, sdo):
                 return None
             drive.silent, self._caused = silence.name, True
-            left_ms, off_ms, told, before_ms = self._look(sdo, drive, silence)
-            _refuse_other_reason(silence, told, sdo)
+            left_ms, off_ms, error_codes, before_ms = self._look(sdo, drive, silence)
+            _refuse_other_reason(silence, error_codes, sdo)
         if left_ms is not None and left_ms < _EARLIEST_SHARE * silence.limit_ms:
             raise AnswerIsNo(
                 f"{silence.name}: the drive left the command {left_ms:.1f} ms into the silence, and its guard acts "
                 f"after {silence.limit_ms:g} ms: it stops for another reason, which says nothing of its guard"
             )
         # The first that it tells is the one that acted: others may follow while its ramp lasts.
-        acted = next((code for code in told if code in _TOLD.values()), None)
-        if silence.name != _EVERYTHING and acted not in (None, _TOLD[silence.guard]):
+        acted = next((code for code in error_codes if code in _GUARD_ERRORS.values()), None)
+        if silence.name != _EVERYTHING and acted not in (None, _GUARD_ERRORS[silence.guard]):
             return None
         # What the stop is reckoned with, and no more (servod.formats.stopping).
         most_ms = silence.limit_ms + CYCLES_BEHIND * self.period_ns / _MS
@@ -241,7 +241,7 @@ class GuardTest:
         return _Seen(GuardResult(silence.name, most_ms, left_ms, off_ms), unsure, stalled)
 
     def _enable(self, drive: _Cycles, sdo: SdoAccess) -> None:
-        reads_inputs = self._config.amplifier.inputs.estop_bit is not None or self._config.amplifier.inputs.tells_sto
+        reads_inputs = self._config.amplifier.inputs.estop_bit is not None or self._config.amplifier.inputs.reports_sto
         off = drive.run(Goal.OFF, round(_INPUTS_S * 1e9 / self.period_ns) if reads_inputs else 10)
         _refuse_stopped(off)
         fault = off.state is DriveState.FAULT
@@ -288,7 +288,7 @@ class GuardTest:
         """When the drive had left the command at the latest, when it was without power, the codes that it told, and
         until when at least it had not left. Its status word is asked for by SDO in each cycle: PDOs may end with the
         reaction."""
-        last_ns, limit_ms, told = drive.last_ns[silence.guard], silence.limit_ms, list[int]()
+        last_ns, limit_ms, error_codes = drive.last_ns[silence.guard], silence.limit_ms, list[int]()
         before_ms = 0.0
         left_ms: float | None = None
         most_ms = 2.0 * limit_ms + 1e3 * self._config.amplifier.enable_timeout_s
@@ -297,7 +297,7 @@ class GuardTest:
             # Without SYNC the feedback grows old, and inputs come by an event timer all the same.
             if left_ms is None and (feedback.age_cycles == 0 or silence.name == _EVERYTHING):
                 _refuse_stopped(feedback)
-            told.append(feedback.error_code)
+            error_codes.append(feedback.error_code)
             asked_ms = (self.clock.now_ns() - last_ns) / _MS
             state = decode_status_word(sdo.read(Obj402.STATUS_WORD))
             answered_ms = (self.clock.now_ns() - last_ns) / _MS
@@ -307,10 +307,10 @@ class GuardTest:
                 left_ms = answered_ms
             if self._stopped(state):
                 off_ms = answered_ms if self._stays_off(sdo, drive, limit_ms) else None
-                return left_ms, off_ms, told, before_ms
+                return left_ms, off_ms, error_codes, before_ms
             if left_ms is None and since_ms > 2.0 * limit_ms + 100.0:
                 break
-        return left_ms, None, told, before_ms
+        return left_ms, None, error_codes, before_ms
 
     def _stopped(self, state: DriveState) -> bool:
         return state.unpowered or (self._holds and state is DriveState.QUICK_STOP_ACTIVE)
@@ -333,16 +333,16 @@ class GuardTest:
             sdo.write(Obj402.CONTROL_WORD, 0, CW_DISABLE_VOLTAGE)
 
 
-def _error_code(sdo: SdoAccess, told: int) -> int:
-    """What 0x603F says; what an EMCY has `told` where the drive does not have it."""
+def _error_code(sdo: SdoAccess, emcy_code: int) -> int:
+    """What 0x603F says; `emcy_code`, which an EMCY told, where the drive does not have it."""
     code = read_optional(sdo, Obj402.ERROR_CODE)
-    return told if code is None else code
+    return emcy_code if code is None else code
 
 
-def _refuse_other_reason(silence: _Silence, told: Sequence[int], sdo: SdoAccess) -> None:
+def _refuse_other_reason(silence: _Silence, error_codes: Sequence[int], sdo: SdoAccess) -> None:
     """Raise AnswerIsNo where the drive says that it stopped for something else than the silence."""
     faulty = decode_status_word(sdo.read(Obj402.STATUS_WORD)) is DriveState.FAULT
-    codes = [*told, _error_code(sdo, 0) if faulty else 0]
+    codes = [*error_codes, _error_code(sdo, 0) if faulty else 0]
     if other := next((code for code in codes if code and code not in _EXPECTED), None):
         raise AnswerIsNo(
             f"{silence.name}: the drive says that it stopped for another reason (error 0x{other:04X}), which says "
@@ -352,11 +352,11 @@ def _refuse_other_reason(silence: _Silence, told: Sequence[int], sdo: SdoAccess)
 
 def _refuse_stopped(feedback: AmplifierFeedback) -> None:
     """Raise AnswerIsNo while somebody holds the axis stopped."""
-    for told, name, key in (
+    for drive_input, name, key in (
         (DriveInput.ESTOP, "the emergency stop", "amplifier.inputs.estop_bit"),
         (DriveInput.STO, "STO", "amplifier.inputs.sto_bit or sto_error"),
     ):
-        if feedback.inputs & told:
+        if feedback.inputs & drive_input:
             raise AnswerIsNo(
                 f"{name} is active, or its input is not heard of (0x60FD, {key}): release it, then test again"
             )
@@ -419,8 +419,8 @@ def read_record(config: AxisConfig) -> GuardTestRecord | str:
         return f"the drive's guards were never tested (there is no {path})"
     try:
         proof = read_json(path, "a proof by `servoctl guard-test`")
-        told = proof.pop("sha256")
-        if told == _sha256(proof) and math.isfinite(proof["time"]):
+        stored_sha256 = proof.pop("sha256")
+        if stored_sha256 == _sha256(proof) and math.isfinite(proof["time"]):
             return {"time": float(proof["time"]), "terms": proof["terms"]}
     except BadInput as error:
         return f"the proof of the drive's guards cannot be read ({error})"

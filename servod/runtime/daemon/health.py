@@ -89,9 +89,9 @@ class StandingLoop:
         self._limit_ns = round(reaction_s * NS_PER_S) + _STALL_NS
         self._silent_ns = 0
         self._looked_ns: int | None = None
-        self._told = self._done = False
+        self._misses_loop = self._done = False
 
-    def look(self, wrote: bool, drive_told: bool, now_ns: int) -> bool:
+    def look(self, wrote: bool, drive_misses_loop: bool, now_ns: int) -> bool:
         """Once per round: whether records came since the last look, and whether the drive told that it misses the loop.
 
         True once for each standstill: now.
@@ -100,11 +100,11 @@ class StandingLoop:
         self._looked_ns = now_ns
         if wrote:
             # What the drive tells in the round of the last records, the next round without one acts on.
-            self._silent_ns, self._told, self._done = 0, drive_told, False
+            self._silent_ns, self._misses_loop, self._done = 0, drive_misses_loop, False
             return False
         self._silent_ns += pause_ns
-        self._told = self._told or drive_told
-        due = not self._done and (self._told or self._silent_ns > self._limit_ns)
+        self._misses_loop = self._misses_loop or drive_misses_loop
+        due = not self._done and (self._misses_loop or self._silent_ns > self._limit_ns)
         self._done = self._done or due
         return due
 

@@ -237,7 +237,7 @@ def _record_from_the_start(recorder: Recorder) -> None:
 
 
 def _start_loop(loop: LoopHandle, nodes: Nodes) -> None:
-    loop.start(nodes.look_for_strangers)
+    loop.start(nodes.look_for_foreign_traffic)
     nodes.hand_over()
     for grant in loop.grants:
         log.log(

@@ -50,9 +50,9 @@ class Nodes:
         if proof["asked_for"] and not proof["holds"]:
             log.warning("%s: run `servoctl guard-test` while no daemon runs; until then no enabling", proof["text"])
 
-    def look_for_strangers(self, loop_began_ns: Callable[[], int | None]) -> None:
+    def look_for_foreign_traffic(self, loop_began_ns: Callable[[], int | None]) -> None:
         """Until the loop listens: raises Unreachable where somebody else commands or asks the nodes."""
-        self._master.look_for_strangers(loop_began_ns)
+        self._master.look_for_foreign_traffic(loop_began_ns)
 
     def hand_over(self) -> None:
         """The loop listens from now on."""
@@ -104,7 +104,7 @@ class Nodes:
         self.brake_to_rest(self._master.config.amplifier.enable_timeout_s)
         self._voltage_off()
 
-    def told_to_miss_us(self, event: NodeEvent) -> bool:
+    def misses_loop(self, event: NodeEvent) -> bool:
         """The drive tells that it does not hear the loop any more, and so stops by itself or is to be stopped."""
         return event.node_id == self.plans.amplifier.node_id and event.code in MASTER_MISSED
 

@@ -50,7 +50,7 @@ _ABOVE_NOISE = 6.0
 #: After a reversal the bristle has turned over when the joint has gone so many of its greatest deflections.
 _TURNED_OVER = 3.0
 #: Beyond the certified interval: what friction does over a day's temperature; and so many standard errors.
-_BEYOND, _SIGMAS = 0.15, 4.0
+_OFF_BY, _SIGMAS = 0.15, 4.0
 #: So many windows in a row must say so.
 _STAYS = 25
 ERROR_S = 1.0
@@ -249,8 +249,8 @@ class PromiseWatch:
         self.serial, self.expected, self.shares, self.motion_s = serial, expected, ShareEstimator(), 0.0
         self._torques: deque[float] = deque(maxlen=1 + (expected.late_cycles if expected else 0))
         self._cycle = -1
-        self._beyond = dict.fromkeys((INERTIA, FORWARD, BACKWARD), 0)
-        self._told: set[str] = set()
+        self._windows_off = dict.fromkeys((INERTIA, FORWARD, BACKWARD), 0)
+        self._reported: set[str] = set()
         self._worse: dict[str, deque[bool]] = {}
         self._rms_rad: dict[str, float] = {}
         self._interrupt()
@@ -266,10 +266,10 @@ class PromiseWatch:
             if not (controlled and follows and record.encoder_age == 0 and _finite(record)):
                 self._interrupt()
                 continue
-            if told := self._balance(record, self.expected):
-                found.append(told)
-            if told := self._error(record, self.expected):
-                found.append(told)
+            if sentence := self._balance(record, self.expected):
+                found.append(sentence)
+            if sentence := self._error(record, self.expected):
+                found.append(sentence)
         return found
 
     def _interrupt(self) -> None:
@@ -307,24 +307,25 @@ class PromiseWatch:
     def _close(self, w: _Window, e: Expected) -> str:
         """A whole window, or what the joint left of it when it came to rest."""
         change = w.last_rad_s - w.began_rad_s
-        told, noise = math.sqrt(2.0) * e.speed_noise_rad_s, e.inertia * math.sqrt(2.0) * e.speed_noise_rad_s
+        change_noise_rad_s = math.sqrt(2.0) * e.speed_noise_rad_s
+        noise = e.inertia * math.sqrt(2.0) * e.speed_noise_rad_s
         # Noise in what is regressed on would draw the inertia to nothing: such a change is taken as the model has it.
-        tells = abs(change) > _ABOVE_NOISE * told
-        row = [e.inertia * change if tells else 0.0, max(w.friction, 0.0), min(w.friction, 0.0)]
-        found = w.torque if tells else w.torque - e.inertia * change
+        above_noise = abs(change) > _ABOVE_NOISE * change_noise_rad_s
+        row = [e.inertia * change if above_noise else 0.0, max(w.friction, 0.0), min(w.friction, 0.0)]
+        found = w.torque if above_noise else w.torque - e.inertia * change
         self.shares.add(row, found, math.hypot(_LEAST_SCATTER * w.friction, noise) or 1.0)
         self.motion_s += w.cycles * e.period_s
         return self._drifted(e)
 
     def _drifted(self, e: Expected) -> str:
         texts = []
-        for name, share, error in zip(self._beyond, self.shares.values, self.shares.errors, strict=True):
-            beyond = abs(share - 1.0) > e.width[name] + _BEYOND + _SIGMAS * error
-            self._beyond[name] = self._beyond[name] + 1 if beyond else 0
-            if not beyond:
-                self._told.discard(name)
-            elif self._beyond[name] >= _STAYS and name not in self._told:
-                self._told.add(name)
+        for name, share, error in zip(self._windows_off, self.shares.values, self.shares.errors, strict=True):
+            off = abs(share - 1.0) > e.width[name] + _OFF_BY + _SIGMAS * error
+            self._windows_off[name] = self._windows_off[name] + 1 if off else 0
+            if not off:
+                self._reported.discard(name)
+            elif self._windows_off[name] >= _STAYS and name not in self._reported:
+                self._reported.add(name)
                 texts.append(f"{name} is {share:.2f} times the model's (give or take {2.0 * error:.2f})")
         _, forward, backward = self.shares.values
         if texts and (forward - 1.0) * (backward - 1.0) < 0.0:
@@ -353,12 +354,12 @@ class PromiseWatch:
         worse = self._worse.setdefault(kind, deque(maxlen=_LAST_WINDOWS))
         worse.append(rms_rad > _WORSE * promised_rad)
         if not any(worse):
-            self._told.discard(kind)
+            self._reported.discard(kind)
         if sum(worse) < _OF_WINDOWS:
             return ""
-        if kind in self._told:
+        if kind in self._reported:
             return ""
-        self._told.add(kind)
+        self._reported.add(kind)
         return f"RMS error {1e3 * rms_rad:.3g} mrad in {kind} motion, promised {1e3 * promised_rad:.3g} mrad"
 
     def _kind(self, own: _Errors, e: Expected, promised: Promise) -> tuple[str, float]:
@@ -382,14 +383,14 @@ class PromiseWatch:
                 "share": share,
                 "standard_error": error,
                 "certified": [1.0 - e.width[name], 1.0 + e.width[name]],
-                "told": name in self._told,
+                "told": name in self._reported,
             }
-            for name, share, error in zip(self._beyond, self.shares.values, self.shares.errors, strict=True)
+            for name, share, error in zip(self._windows_off, self.shares.values, self.shares.errors, strict=True)
             if not e.left_out
         ]
         promised = {} if e.promised is None else {"slow": e.promised.slow_rad, "brisk": e.promised.brisk_rad}
         errors: list[ErrorStatus] = [
-            {"kind": kind, "rms_rad": self._rms_rad.get(kind), "promised_rad": rad, "told": kind in self._told}
+            {"kind": kind, "rms_rad": self._rms_rad.get(kind), "promised_rad": rad, "told": kind in self._reported}
             for kind, rad in promised.items()
         ]
         return {"judged": True, "note": e.left_out, "motion_s": self.motion_s, "joint": joint, "errors": errors}

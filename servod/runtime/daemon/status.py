@@ -305,7 +305,7 @@ def inputs_status(inputs: InputsConfig, record: CycleRecord) -> list[InputStatus
     """The configured inputs, as the loop judged them in this cycle."""
     rows = (
         ("estop", inputs.estop_bit is not None, FaultCode.ESTOP_ACTIVE),
-        ("sto", inputs.tells_sto, FaultCode.STO_ACTIVE),
+        ("sto", inputs.reports_sto, FaultCode.STO_ACTIVE),
     )
     return [{"name": n, "active": bool(record.faults & FAULTS[code].bit)} for n, there, code in rows if there]
 

@@ -104,14 +104,14 @@ class Supervisor:
         self._started = time.monotonic()
         self._stopping = self._textfile_failed = self._lock_lost = False
         self._lock = context.lock
-        self._told_off = False
+        self._switched_off = False
         self._why_ends = "servod was asked to end"
         self._relay = FaultRelay(loop.send)
         self._fed_cycle = -1
         self._next_feed_ns = self._next_status_ns = self._next_textfile_ns = 0
         self._pulse = Pulse(config.cycle.period_us)
         self._standing = StandingLoop(reaction_s(config, nodes.plans.amplifier))
-        self._drive_told = False  # in this round, that it misses the loop
+        self._drive_misses_loop = False  # in this round, that it misses the loop
         self._health = Health(config.cycle.period_us, nodes.plans.bus_load)
         self._metrics = AxisMetrics(config.name, nodes.plans.bus_load)
         self.carried = 0  # faults that stay latched when the axis begins again
@@ -119,11 +119,11 @@ class Supervisor:
             recorder, self._health, self._metrics, config.name, context.incidents, context.carried
         )
         if context.found is not None:
-            self._faults.tell_earlier(context.found)
+            self._faults.add_earlier(context.found)
         self._proofs = WiringTestWatch(loop, recorder)
         self._promise = PromiseWatch()
         self._metrics.joint = lambda: self._promise.status()["joint"]
-        self._verbs = Verbs(config, loop, bank, recorder, self._document, self._tell_faults, nodes.of_ours, nodes.proof)
+        self._verbs = Verbs(config, loop, bank, recorder, self._document, self._incidents, nodes.of_ours, nodes.proof)
         self._comeback = (
             Comeback(config, self._verbs.slow, nodes.of_ours, context.shown_s, context.carried)
             if context.shown_s is not None
@@ -175,7 +175,7 @@ class Supervisor:
         self._faults.tick(now_ns)
         self._proofs.see()
         self._server.tick(now_ns)
-        self._tell_manager(now_ns)
+        self._notify_manager(now_ns)
         self._write_textfile(now_ns)
 
     def _take_records(self, now_ns: int) -> list[CycleRecord]:
@@ -206,8 +206,8 @@ class Supervisor:
         if records and records[-1].controller != self._promise.serial:
             gains = self._bank.gains_of(records[-1].controller)
             self._promise.begin(records[-1].controller, None if gains is None else Expected.of(gains))
-        for told in self._promise.see(records):
-            self._faults.raise_own(FaultCode.PROMISE_BROKEN, told)
+        for sentence in self._promise.see(records):
+            self._faults.raise_own(FaultCode.PROMISE_BROKEN, sentence)
 
     def _take_node_events(self) -> None:
         """Node events, and what came corrupt from the loop, become faults of the loop in its next cycle."""
@@ -222,42 +222,43 @@ class Supervisor:
             log.error("%s (%s)", event.text, event.fault.name)
             self._recorder.add_event("node", event.text, node_id=event.node_id, fault=event.fault.name)
             self._relay.add(event.fault)
-            self._drive_told = self._drive_told or self._nodes.told_to_miss_us(event)
+            self._drive_misses_loop = self._drive_misses_loop or self._nodes.misses_loop(event)
 
     def _stop_past_standing_loop(self, wrote: bool, now_ns: int) -> None:
         """The drive stops by itself or holds its last torque, and the brake is open: at once, beside the rounds. A loop
         that wakes is told; one that does not is lost (`_loop_is_lost`)."""
-        told, self._drive_told = self._drive_told, False
+        misses_loop, self._drive_misses_loop = self._drive_misses_loop, False
         latest = self._loop.latest
-        if not self._standing.look(wrote, told, now_ns) or latest is None:
+        if not self._standing.look(wrote, misses_loop, now_ns) or latest is None:
             return
         if AxisState(latest.axis_state).stopped and not DriveState(latest.drive_state).commanded:
             return
-        log.error("the loop stands still%s: stopping the drive by SDO", " and the drive misses it" if told else "")
+        missed = " and the drive misses it" if misses_loop else ""
+        log.error("the loop stands still%s: stopping the drive by SDO", missed)
         self._relay.add(FaultCode.LOOP_LOST)
         self._beside(self._nodes.stop_past_loop)
 
     def _switch_off_if_disobeyed(self, records: list[CycleRecord]) -> None:
         """The loop's goal did not reach the drive: by SDO and NMT, once. Beside the rounds: the way to rest and the
         brake take longer than the loop and the watchdog wait for those."""
-        if self._told_off or not any(record.faults & _STAYS_POWERED for record in records):
+        if self._switched_off or not any(record.faults & _STAYS_POWERED for record in records):
             return
-        self._told_off = True
+        self._switched_off = True
         log.error("the drive stays powered: switching it off by SDO and NMT pre-operational")
         self._beside(self._nodes.stop_withdrawn)
 
     def _beside(self, job: Callable[[], None]) -> None:
         """Run `job` beside the rounds; what it did not expect itself is told, for nobody waits for it."""
 
-        def told() -> None:
+        def run_logged() -> None:
             try:
                 job()
             except Exception:
                 log.exception("stopping the drive by SDO failed in a way that nobody expected")
 
-        asyncio.get_running_loop().run_in_executor(None, told)
+        asyncio.get_running_loop().run_in_executor(None, run_logged)
 
-    def _tell_manager(self, now_ns: int) -> None:
+    def _notify_manager(self, now_ns: int) -> None:
         """Feed the watchdog only when the loop has gone on since the last time."""
         latest = self._loop.latest
         if self._notifier.watchdog_ns and now_ns >= self._next_feed_ns and latest and latest.cycle != self._fed_cycle:
@@ -300,7 +301,7 @@ class Supervisor:
         """The loop died or hangs: the drive brakes before anything else, and is off at rest; then tell, then end for
         systemd to restart. Voltage off at once would let the joint coast."""
         hung = self._loop.alive()
-        self._tell_stopping()  # before anything that a silent drive may hold up
+        self._notify_stopping()  # before anything that a silent drive may hold up
         exit_code = self._loop.stop(0.0)  # one that hangs may wake and command again
         self._nodes.stop_axis()
         self._take_records(time.monotonic_ns())
@@ -319,7 +320,7 @@ class Supervisor:
         self._notifier.stopping(timeout_s + _STOP_MARGIN_S)
         exit_code = self._loop.stop(timeout_s)
         if exit_code != 0:
-            self._tell_stopping()
+            self._notify_stopping()
             self._nodes.stop_axis()
         self._take_records(time.monotonic_ns())
         if exit_code != 0:
@@ -329,7 +330,7 @@ class Supervisor:
         log.info("stopped; the axis is disabled")
         return 0
 
-    def _tell_stopping(self) -> None:
+    def _notify_stopping(self) -> None:
         """To systemd: how long braking by SDO may take, and time-outs of a drive that does not answer."""
         amplifier = self._config.amplifier
         self._notifier.stopping(amplifier.enable_timeout_s + amplifier.brake.engage_s + _STOP_MARGIN_S + _SILENT_S)
@@ -363,7 +364,7 @@ class Supervisor:
         self._metrics_server.close()
         self._loop.close()
 
-    def _tell_faults(self) -> dict[str, Any]:
+    def _incidents(self) -> dict[str, Any]:
         """What befell the axis since the daemon started, and where the files of earlier times are."""
         directory = str(self._config.recorder.directory.resolve())
         return {"name": self._config.name, "directory": directory, "incidents": self._faults.incidents()}

@@ -103,7 +103,7 @@ class Verbs:
             Verb.RECORD_START: self._record_start,
             Verb.RECORD_STOP: self._record_stop,
             Verb.SCAN: self._scan,
-            Verb.FAULTS: self._tell_faults,
+            Verb.FAULTS: self._fault_incidents,
             Verb.CYCLES: self._cycles,
         }
 
@@ -182,7 +182,7 @@ class Verbs:
     async def _status(self, _args: NoArgs) -> dict[str, Any]:
         return self._document()
 
-    async def _tell_faults(self, _args: NoArgs) -> dict[str, Any]:
+    async def _fault_incidents(self, _args: NoArgs) -> dict[str, Any]:
         return self._faults()
 
     async def _cycles(self, args: CyclesArgs) -> dict[str, Any]:

@@ -35,7 +35,7 @@ from servod.runtime.loop.axis_state import AxisState
 log = logging.getLogger("servod")
 
 _ROUND_S = 0.02
-_LOOK_EVERY_S, _TELL_EVERY_S = 1.0, 1.0
+_LOOK_EVERY_S, _NOTIFY_EVERY_S = 1.0, 1.0
 #: Between two attempts to bring up nodes that answer, at the longest.
 _LONGEST_PAUSE_S = 30.0
 #: A fault is shown for so long before the axis begins again; one that comes back at once for twice as long each time.
@@ -120,7 +120,7 @@ class _Waiting:
 
     def __init__(self, config: AxisConfig, notifier: Notifier, incidents: Iterable[Incident]) -> None:
         self._config, self._notifier, self._incidents = config, notifier, incidents
-        self._since, self._tell_at, self._why = time.monotonic(), 0.0, ""
+        self._since, self._notify_at, self._why = time.monotonic(), 0.0, ""
 
     async def wait(self, why: str, pause_s: float) -> None:
         """Look again and again, for `why` at first and after `pause_s`."""
@@ -139,7 +139,7 @@ class _Waiting:
         pause_over, attempt = now + pause_s, None
         while attempt is None or not attempt.done():
             server.tick(time.monotonic_ns())
-            self._tell(now)
+            self._notify(now)
             await asyncio.sleep(_ROUND_S)
             now = time.monotonic()
             if attempt is None and now >= pause_over:
@@ -157,10 +157,10 @@ class _Waiting:
             log.warning("waiting for bus and nodes: %s", why)
         self._why = why
 
-    def _tell(self, now: float) -> None:
-        if now >= self._tell_at:
-            self._tell_at = now + _TELL_EVERY_S
-            self._notifier.waiting(self._state(), 10.0 * _TELL_EVERY_S)
+    def _notify(self, now: float) -> None:
+        if now >= self._notify_at:
+            self._notify_at = now + _NOTIFY_EVERY_S
+            self._notifier.waiting(self._state(), 10.0 * _NOTIFY_EVERY_S)
 
     def _state(self) -> str:
         return f"waits for bus and nodes, {time.monotonic() - self._since:.0f} s so far: {self._why}"

@@ -40,14 +40,14 @@ def drivers_of(kind: str) -> list[str]:
 
 def load_driver(name: str) -> Driver:
     """The driver of that name; raises BadInput with the known names when there is none or it cannot be loaded."""
-    place = DRIVERS.get(name) or driver_table().get(name)  # ours win: no need to search the installed packages
-    if place is None:
+    entry_point = DRIVERS.get(name) or driver_table().get(name)  # ours win: no need to search the installed packages
+    if entry_point is None:
         raise BadInput("driver", name, ", ".join(sorted(driver_table())))
-    module_name, _, attribute = place.partition(":")
+    module_name, _, attribute = entry_point.partition(":")
     try:
         driver = getattr(import_module(module_name), attribute)
     except (ImportError, AttributeError) as error:
-        raise BadInput(f"driver {name}", f"{place} ({error})", "an importable module:attribute") from error
+        raise BadInput(f"driver {name}", f"{entry_point} ({error})", "an importable module:attribute") from error
     if not isinstance(driver, Driver):
         raise BadInput(f"driver {name}", type(driver).__name__, "a servod.runtime.fieldbus.devices.Driver")
     return driver

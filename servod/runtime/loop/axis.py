@@ -435,8 +435,8 @@ class Axis:
             self._enter(AxisState.PROVING if self._prove else held)
             return not self._prove
         if self._cycles_in_state > self._timeout_cycles:
-            told = FaultCode.STO_ACTIVE if amplifier.inputs & DriveInput.STO_TOLD else FaultCode.DRIVE_FAULT
-            self._fail(told if amplifier.reasons & Reason.IN_FAULT else FaultCode.ENABLE_TIMEOUT)
+            fault_code = FaultCode.STO_ACTIVE if amplifier.inputs & DriveInput.STO_TOLD else FaultCode.DRIVE_FAULT
+            self._fail(fault_code if amplifier.reasons & Reason.IN_FAULT else FaultCode.ENABLE_TIMEOUT)
         return False
 
     def _finish_proving(self) -> bool:

@@ -167,7 +167,7 @@ class Channel:
         self._next_command = 1
         self._taken = [0] * COMMAND_SLOTS  # the tickets as they were taken, by slot
         self._command_index, self._idle = self._commands.index(1), 0
-        self._doubts, self._told_ticket, self._table_bent = 0, -1, False
+        self._doubts, self._reported_ticket, self._table_bent = 0, -1, False
         self.trajectory = SharedTable(self._blocks, self._doubt_table)
         # the supervisor's
         self._next_record, self._doubtful_record = 1, 0
@@ -210,7 +210,7 @@ class Channel:
         number, ticket = self._next_command, self._words[self._command_index]
         if data := self._commands.read(number):
             return self._take(number, data)
-        if ticket == self._told_ticket:  # that slot is given up: the first good one behind it goes on
+        if ticket == self._reported_ticket:  # that slot is given up: the first good one behind it goes on
             for later in range(number + 1, number + COMMAND_SLOTS):
                 if data := self._commands.read(later):
                     return self._take(later, data)
@@ -218,7 +218,7 @@ class Channel:
         self._doubts += 1
         if self._doubts <= _TORN_CYCLES:
             return None
-        self._doubts, self._told_ticket, self._idle = 0, ticket, -1
+        self._doubts, self._reported_ticket, self._idle = 0, ticket, -1
         return self._corrupt()
 
     def supervisor_beats(self) -> int:
@@ -238,7 +238,7 @@ class Channel:
             self._taken[taken % COMMAND_SLOTS] = self._commands.ticket(taken)
         self._next_command = number + 1
         self._command_index = self._commands.index(number + 1)
-        self._doubts, self._told_ticket = 0, -1
+        self._doubts, self._reported_ticket = 0, -1
         self._idle = self._idle_ticket()
         self._words[_TAKEN] = _counter(number)
         _, sent_ns, op, table, samples = _MESSAGE.unpack_from(data)
@@ -251,7 +251,7 @@ class Channel:
 
     def _idle_ticket(self) -> int:
         """What the next slot shows until its command comes; -1, which no word is, where another look is wanted."""
-        if self._table_bent or self._told_ticket >= 0:
+        if self._table_bent or self._reported_ticket >= 0:
             return -1
         return self._taken[self._next_command % COMMAND_SLOTS]
 

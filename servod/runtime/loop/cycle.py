@@ -97,7 +97,7 @@ class Cycle:
         self.exchange = Exchange(bus, clock, self.amplifier, self.encoder, plan)
         self.axis = Axis(
             self._period_s, config.limits.ramp_down_s, config.amplifier.enable_timeout_s, Mode.CYCLIC_SYNC_TORQUE,
-            config.wiring_proof.timeout_s, config.amplifier.inputs.tells_sto,
+            config.wiring_proof.timeout_s, config.amplifier.inputs.reports_sto,
             BrakeTimes.of(config.amplifier), config.limits.stale_cycles,
             rest_rad(config.amplifier) if quick_stop_stays(config.amplifier.quick_stop_option) else None,
         )  # fmt: skip

@@ -47,8 +47,8 @@ class Exchange:
         self._sync_frames = amplifier.sync_frames + encoder.sync_frames
         self._amplifier_id = plan.amplifier.node_id
         self._heartbeat_id = HEARTBEAT_BASE + plan.config.heartbeat.master_node_id
-        self._strangers = dict.fromkeys(_master_ids(plan), _SECOND_MASTER)
-        self._strangers |= dict.fromkeys(_unplanned_ids(plan), _FOREIGN_FEEDBACK)
+        self._foreign_ids = dict.fromkeys(_master_ids(plan), _SECOND_MASTER)
+        self._foreign_ids |= dict.fromkeys(_unplanned_ids(plan), _FOREIGN_FEEDBACK)
         repeated_ns = _REPEATED_BITS * NS_PER_S // plan.config.bus.bit_rate
         nodes = [[pdo for pdo in node.pdos if not pdo.receive] for node in (plan.amplifier, plan.encoder)]
         self._answers = Answers((pdo.cob_id for sent in nodes for pdo in sent if pdo.syncs == 1), repeated_ns)
@@ -106,7 +106,7 @@ class Exchange:
 
     def stop_drive(self) -> None:
         """NMT stop to the amplifier. From now on the supervisor stops it by NMT, too, and is no other master."""
-        self._strangers.pop(NMT_ID, None)
+        self._foreign_ids.pop(NMT_ID, None)
         self._bus.send(NMT_ID, bytes((NmtCommand.STOP, self._amplifier_id)))
 
     def make_drive_answer(self) -> None:
@@ -152,7 +152,7 @@ class Exchange:
 
     def _look_at(self, frame: Frame) -> None:
         """What does not come with each SYNC: of a master, switched off, too soon, or shorter than the node's own."""
-        self._foreign |= self._strangers.get(frame.can_id, 0)
+        self._foreign |= self._foreign_ids.get(frame.can_id, 0)
         short = len(frame.data) < self._rare_bytes.get(frame.can_id, 0)
         if short or (frame.can_id in self._rare and not self._rare.take(frame)):
             self._foreign |= _FOREIGN_FEEDBACK

@@ -71,7 +71,7 @@ class Limits:
         mismatch_nm = config.torque_mismatch_nm
         self.torque_mismatch_nm = _MISMATCH_SHARE * config.torque_nm if mismatch_nm is None else mismatch_nm
         self._forgets_nm = config.torque_nm / _MEMORY_CYCLES  # in each cycle
-        self._most_told_nm = self._least_told_nm = 0.0
+        self._most_commanded_nm = self._least_commanded_nm = 0.0
         self._bent_cycles = self._apart_cycles = 0
         self._last_torque_nm = self._dt_s = 0.0
         self._encoder_offset_rad = self._armed_at_rad = 0.0
@@ -139,15 +139,15 @@ class Limits:
         left = (_MOVES_SHARE - speed_rad_s / self.speed_rad_s) / (_MOVES_SHARE - _MOVING_SHARE)
         return min(1.0, max(0.0, left))
 
-    def arm(self, amplifier: AmplifierFeedback, encoder: EncoderFeedback, told_nm: float) -> None:
+    def arm(self, amplifier: AmplifierFeedback, encoder: EncoderFeedback, commanded_nm: float) -> None:
         """At enable: both position sensors agree by definition now; torque starts from what the drive was told last.
 
         What it shows (0x6077) may be wrong, and must not become torque: `torque_faults` judges it.
         """
         self._encoder_offset_rad = amplifier.position_rad - encoder.position_rad
         self._armed_at_rad = encoder.position_rad
-        self._last_torque_nm = told_nm
-        self._most_told_nm = self._least_told_nm = self._last_torque_nm
+        self._last_torque_nm = commanded_nm
+        self._most_commanded_nm = self._least_commanded_nm = self._last_torque_nm
         self._bent_cycles = self._apart_cycles = 0
         if self._holding is not None:
             still = abs(encoder.velocity_rad_s) <= _MOVING_SHARE * self.speed_rad_s
@@ -206,7 +206,7 @@ class Limits:
         the torque may give less, down to none."""
         if amplifier.age_cycles:
             return 0
-        most_nm, least_nm = self._most_told_nm, self._least_told_nm
+        most_nm, least_nm = self._most_commanded_nm, self._least_commanded_nm
         if amplifier.status_word & SW_INTERNAL_LIMIT:
             most_nm, least_nm = max(most_nm, 0.0), min(least_nm, 0.0)
         above_nm, below_nm = amplifier.torque_nm - most_nm, least_nm - amplifier.torque_nm
@@ -231,8 +231,8 @@ class Limits:
         if not self._least_nm <= torque_nm <= self._most_nm:
             torque_nm, faults = min(max(torque_nm, self._least_nm), self._most_nm), faults | _CLIPPED
         self._last_torque_nm = torque_nm
-        self._most_told_nm = max(torque_nm, self._most_told_nm - self._forgets_nm)
-        self._least_told_nm = min(torque_nm, self._least_told_nm + self._forgets_nm)
+        self._most_commanded_nm = max(torque_nm, self._most_commanded_nm - self._forgets_nm)
+        self._least_commanded_nm = min(torque_nm, self._least_commanded_nm + self._forgets_nm)
         return torque_nm, faults
 
     def ramp(self, from_nm: float, share: float, velocity_rad_s: float) -> float:

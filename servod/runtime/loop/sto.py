@@ -5,7 +5,7 @@ from __future__ import annotations
 from servod.common.faults import FAULTS, FaultCode
 
 #: STO makes a drive fault, or leave operation, a few cycles before or after its input and its error code tell of it.
-_STO_TOLD_S = 0.03
+_STO_REPORTED_S = 0.03
 _STO = FAULTS[FaultCode.STO_ACTIVE].bit
 _BY_STO = FAULTS[FaultCode.DRIVE_FAULT].bit | FAULTS[FaultCode.DRIVE_LEFT_OPERATION].bit
 
@@ -17,7 +17,7 @@ class StoNaming:
     """
 
     def __init__(self, period_s: float, known: bool) -> None:
-        self._window_cycles = max(1, round(_STO_TOLD_S / period_s)) if known else 0
+        self._window_cycles = max(1, round(_STO_REPORTED_S / period_s)) if known else 0
         self._left = self._window_cycles
         self._held = 0  # faults that wait for their name
         self._owns = False  # the drive's fault is STO's, until it is left, or stays when STO is over

@@ -17,8 +17,8 @@ from servod.formats.protocol import Verb
 from servod.runtime.daemon.connection import Connection
 from servod.runtime.daemon.control_server import (
     _ACCEPT_IN_A_ROUND,
+    ConnectedClients,
     ControlServer,
-    Places,
 )
 from tests.on_event_loop import events_pass, on_event_loop
 
@@ -170,7 +170,7 @@ async def test_each_request_shows_the_loop_that_the_supervisor_lives(tmp_path: P
 @on_event_loop
 async def test_door_that_broke_ends_the_supervisor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An axis that nobody could stop any more is not to run on."""
-    monkeypatch.delattr(Places, "make_room")
+    monkeypatch.delattr(ConnectedClients, "make_room")
     server = ControlServer(ControlConfig(socket=tmp_path / "s"), Echo())
     server.begin()
     with socket.socket(socket.AF_UNIX) as client:

@@ -24,7 +24,7 @@ from servod.runtime.daemon.connection import Connection
 from servod.runtime.daemon.control_server import (
     MAX_CLIENTS,
     MAX_CLIENTS_OF_A_PROCESS,
-    Places,
+    ConnectedClients,
 )
 from servod.runtime.daemon.peer import Peer
 
@@ -75,14 +75,14 @@ class _Guest:
         self.commanded_ns = commanded_ns
 
 
-def _full(*guests: _Guest) -> Places:
-    places = Places()
+def _full(*guests: _Guest) -> ConnectedClients:
+    places = ConnectedClients()
     for guest in guests:
         places.take(cast(Connection, guest))
     return places
 
 
-def _leaves(places: Places, pid: int, holder: _Guest | None = None, now_s: float = 100.0) -> _Guest | None:
+def _leaves(places: ConnectedClients, pid: int, holder: _Guest | None = None, now_s: float = 100.0) -> _Guest | None:
     newcomer = Peer(pid, 0, frozenset())
     return cast(_Guest | None, places.make_room(newcomer, cast(Connection | None, holder), int(now_s * 1e9)))
 

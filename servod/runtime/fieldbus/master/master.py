@@ -92,14 +92,14 @@ class Master:
         self._guarded = plans[0]
         self._guards = [node.guard_watch(plan) for node, plan in zip(nodes, plans, strict=True)]
         try:
-            self.look_for_strangers()
+            self.look_for_foreign_traffic()
         except Unreachable:
             for node in nodes:  # the guards stay: nobody knows what the other one has done
                 self.nmt(NmtCommand.PRE_OPERATIONAL, node.node_id)
             raise
         return BringUp(plans[0], plans[1], load.share, report)
 
-    def look_for_strangers(self, loop_began_ns: Callable[[], int | None] = lambda: None) -> None:
+    def look_for_foreign_traffic(self, loop_began_ns: Callable[[], int | None] = lambda: None) -> None:
         """From the bring-up until `hand_over`: raises Unreachable where somebody else spoke with the nodes.
 
         `loop_began_ns`: since when the loop speaks, None before; see StartWatch.look.

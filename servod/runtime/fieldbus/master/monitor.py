@@ -42,7 +42,7 @@ _UNANSWERED_NS, _MOST_UNANSWERED = 500_000_000, 5
 #: More waiting events than this means that nobody reads them; the oldest are dropped then.
 _MAX_EVENTS = 1000
 #: Who floods the bus with foreign frames is told of once in this time; the fault is latched all the same.
-_TOLD_NS = NS_PER_S
+_REPORT_EVERY_NS = NS_PER_S
 #: Some nodes take several errors back one by one although the first of these frames says that none is left.
 _TAKEN_BACK_NS = NS_PER_S
 #: A beat is foreign when it is early beside each of so many before it, and never with less than `_LEAST_NS` to go by.
@@ -126,7 +126,7 @@ class NodeWatch:
         self._in_register = True  # the last that it told of
         self._none_left_ns = 0  # since when it says that it has none, 0 while it does not
         self._answers = network.answers
-        self._told_ns: dict[FaultCode, int] = {}
+        self._reported_ns: dict[FaultCode, int] = {}
         #: Who else spoke with the node while it was set up, the first of them; `sets_up`: our own transfers write.
         self.foreign, self.sets_up = "", False
         network.subscribe(HEARTBEAT_BASE + node_id, self._on_heartbeat)
@@ -174,7 +174,7 @@ class NodeWatch:
             self.add(FaultCode.NODE_HEARTBEAT_LOST, text, 0)
 
     @property
-    def tells_errors(self) -> bool:
+    def reports_errors(self) -> bool:
         """By what was heard it has errors that it has not taken back, and they show in its error register."""
         return self._errors > 0 and self._in_register
 
@@ -275,8 +275,8 @@ class NodeWatch:
     def _blame(self, fault: FaultCode, text: str, code: int) -> None:
         """Somebody else was heard."""
         now_ns = self._clock.now_ns()
-        if self._watching and now_ns - self._told_ns.get(fault, -_TOLD_NS) >= _TOLD_NS:
-            self._told_ns[fault] = now_ns
+        if self._watching and now_ns - self._reported_ns.get(fault, -_REPORT_EVERY_NS) >= _REPORT_EVERY_NS:
+            self._reported_ns[fault] = now_ns
             self.add(fault, text, code)
 
     def add(self, fault: FaultCode, text: str, code: int) -> None:
@@ -301,12 +301,12 @@ class GuardWatch:
         self._next = self._unanswered = 0
         self._asked: tuple[int, int, int] | None = None
         self._asked_ns, self._register_next = 0, True
-        self._told: set[tuple[int, int]] = set()
+        self._reported: set[tuple[int, int]] = set()
 
     def check(self) -> None:
         """One look; call as often as the node's watch is checked."""
         now_ns = self._clock.now_ns()
-        if not self._watch.at_work or not (self._guards or self._watch.tells_errors):
+        if not self._watch.at_work or not (self._guards or self._watch.reports_errors):
             self._asked = None
         elif self._asked is not None and (answer := self._sdo.answer()) is not None:
             self._judge(self._asked, answer)
@@ -315,9 +315,9 @@ class GuardWatch:
             self._unanswered += self._asked is not _REGISTER
             self._asked = None
             if self._unanswered == _MOST_UNANSWERED:
-                self._tell((0, 0), "the guards of the drive cannot be read any more")
+                self._report((0, 0), "the guards of the drive cannot be read any more")
         elif self._asked is None and now_ns - self._asked_ns >= _GUARD_NS:
-            register = self._watch.tells_errors and (self._register_next or not self._guards)
+            register = self._watch.reports_errors and (self._register_next or not self._guards)
             question = _REGISTER if register else self._guards[self._next]
             if self._sdo.ask(question[0], question[1]):
                 self._asked, self._asked_ns, self._register_next = question, now_ns, not register
@@ -330,13 +330,13 @@ class GuardWatch:
             return
         index, subindex, value = guard
         if answer.value == value:
-            self._told.discard((index, subindex))
+            self._reported.discard((index, subindex))
             return
         found = f"aborts with 0x{answer.abort:08X}" if answer.value is None else f"reads {answer.value}"
-        self._tell((index, subindex), f"0x{index:04X}:{subindex} was {value}, now {found}")
+        self._report((index, subindex), f"0x{index:04X}:{subindex} was {value}, now {found}")
 
-    def _tell(self, guard: tuple[int, int], text: str) -> None:
+    def _report(self, guard: tuple[int, int], text: str) -> None:
         """Once, until it is right again."""
-        if guard not in self._told:
-            self._told.add(guard)
+        if guard not in self._reported:
+            self._reported.add(guard)
             self._watch.add(FaultCode.GUARD_CHANGED, f"node {self._watch.node_id}: {text}", 0)

@@ -66,8 +66,8 @@ def write_pdo(sdo: SdoAccess, pdo: PdoMap) -> tuple[PdoMap, bool]:
     present = sdo.read(parameter, _COB_ID)
     sdo.write(parameter, _COB_ID, present | PDO_NOT_VALID)
     sdo.write(mapping, 0, 0)
-    for place, entry in enumerate(pdo.entries, start=1):
-        sdo.write(mapping, place, entry.word)
+    for number, entry in enumerate(pdo.entries, start=1):
+        sdo.write(mapping, number, entry.word)
     sdo.write(mapping, 0, len(pdo.entries))
     pdo = with_type(sdo, pdo)
     for subindex, wanted, found in timers(sdo, pdo):
@@ -134,7 +134,7 @@ def expected(sdo: SdoAccess, pdo: PdoMap) -> list[tuple[int, int, int, int]]:
         (parameter, _TYPE, 0xFF, pdo.transmission_type),
         (mapping, 0, 0xFF, len(pdo.entries)),
     ]
-    rows += [(mapping, place, 0xFFFFFFFF, entry.word) for place, entry in enumerate(pdo.entries, start=1)]
+    rows += [(mapping, number, 0xFFFFFFFF, entry.word) for number, entry in enumerate(pdo.entries, start=1)]
     return rows + [(parameter, subindex, 0xFFFF, wanted) for subindex, wanted, _ in timers(sdo, pdo)]
 
 
@@ -173,8 +173,8 @@ def configure_pdos(sdo: SdoAccess, plan: NodePlan, dictionary: Dictionary) -> tu
     deadlines = [pdo.event_timer_ms for pdo, guarded in written if pdo.receive and guarded]
     events = [f"TPDO{pdo.number}" for (pdo, _), wanted in zip(written, plan.pdos, strict=True) if pdo != wanted]
     plan = replace(plan, pdos=tuple(pdo for pdo, _ in written))
-    plan.facts["deadline_told_ms"] = told_ms = min(deadlines, default=0)
-    plan.facts["command_deadline_ms"] = told_ms if plan.facts.get("deadline_stops") else 0
+    plan.facts["deadline_told_ms"] = deadline_ms = min(deadlines, default=0)
+    plan.facts["command_deadline_ms"] = deadline_ms if plan.facts.get("deadline_stops") else 0
     for pdo in plan.pdos:
         verify_pdo(sdo, plan.node_id, pdo)
     report = [f"node {plan.node_id}: {len(plan.pdos)} PDOs written and read back"]
@@ -342,10 +342,12 @@ class Node:
         self.error_register = read_optional(self.sdo, Obj301.ERROR_REGISTER) or 0
         count = min(read_optional(self.sdo, Obj301.ERROR_HISTORY) or 0, _MOST_ERRORS)
         history = [read_optional(self.sdo, Obj301.ERROR_HISTORY, number) or 0 for number in range(1, count + 1)]
-        told = ", ".join(f"0x{error & 0xFFFF:04X}" for error in history) or "none"
+        codes = ", ".join(f"0x{error & 0xFFFF:04X}" for error in history) or "none"
         if not self.error_register and not history:
             return []
-        return [f"node {self.node_id}: error register 0x{self.error_register:02X}, errors so far, newest first: {told}"]
+        return [
+            f"node {self.node_id}: error register 0x{self.error_register:02X}, errors so far, newest first: {codes}"
+        ]
 
     def _ask_for_a_twin(self) -> None:
         """One read that tells two nodes from one; raises Unreachable when both answer."""
@@ -400,8 +402,8 @@ class Node:
         if written := write_parameters(self.sdo, self.dictionary):
             plan = self.setup.configure(self.sdo)
             report.append(f"node {self.node_id}: {written} parameters written from {self.dictionary.source}")
-        plan, told = configure_pdos(self.sdo, plan, self.dictionary)
-        report += told
+        plan, lines = configure_pdos(self.sdo, plan, self.dictionary)
+        report += lines
         if self._kind == "amplifier":
             report.append(f"node {self.node_id}: {self._guard_against_silence(plan)}")
         report += [f"node {self.node_id}: {note}" for note in plan.facts.pop("notes", [])]

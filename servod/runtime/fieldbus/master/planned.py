@@ -196,8 +196,8 @@ def stopping_as_found(config: AxisConfig, plan: NodePlan) -> tuple[AxisConfig, S
     limits = config.limits.model_copy(update={"torque_nm": torque_nm})
     narrowed, stopping = narrowed_by_stop(config.model_copy(update={"limits": limits}), plan)
     # What is configured stays as it is: the test of the wiring compares it with the drive's rated torque.
-    told = narrowed.limits.model_copy(update={"torque_nm": config.limits.torque_nm})
-    return narrowed.model_copy(update={"limits": told}), stopping
+    with_torque = narrowed.limits.model_copy(update={"torque_nm": config.limits.torque_nm})
+    return narrowed.model_copy(update={"limits": with_torque}), stopping
 
 
 def checked_load(config: AxisConfig, plans: list[NodePlan]) -> BusLoad:

@@ -130,7 +130,7 @@ class Push:
         self.began_encoder_rad = self.began_amplifier_rad = 0.0
         self.furthest_encoder_rad, self.furthest_amplifier_rad = encoder_rad, amplifier_rad
         self.cut_nm = self.cut_s = math.nan
-        self.told_nm = 0.0  # the most that went out, which limits may have narrowed
+        self.commanded_nm = 0.0  # the most that went out, which limits may have narrowed
 
     def see(self, encoder_rad: float, amplifier_rad: float) -> None:
         """One cycle, until the joint stands again: where each sensor was furthest along the torque."""

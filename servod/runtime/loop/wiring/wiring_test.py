@@ -74,7 +74,7 @@ class WiringTest:
         self.running, self.verdict = True, None
         self._time_s = self._stage_s = self._hold_s = 0.0
         self._stage = _Stage.REST
-        self._sway = RestWindow(encoder_rad, 0.0)
+        self._window = RestWindow(encoder_rad, 0.0)
         self._start_rad = self._encoder_rad = encoder_rad
         self._amplifier_rad = amplifier_rad
         self._noise_rad = self._travel_rad = self._fastest_rad_s = 0.0
@@ -123,9 +123,9 @@ class WiringTest:
     # --- one cycle -------------------------------------------------------------------------------------------------
     def _see(self, amplifier: AmplifierFeedback, encoder: EncoderFeedback, demand_nm: float) -> None:
         self._encoder_rad, self._amplifier_rad = encoder.position_rad, amplifier.position_rad
-        self._sway.add(encoder.position_rad, self._time_s)
+        self._window.add(encoder.position_rad, self._time_s)
         self._travel_rad = max(self._travel_rad, abs(encoder.position_rad - self._start_rad))
-        self._fastest_rad_s = max(self._fastest_rad_s, abs(self._sway.speed_rad_s()))
+        self._fastest_rad_s = max(self._fastest_rad_s, abs(self._window.speed_rad_s()))
         if self._pushes:
             self._pushes[-1].see(encoder.position_rad, amplifier.position_rad)
         else:
@@ -133,7 +133,7 @@ class WiringTest:
         if self._stage == _Stage.PUSH:
             self._line.add(demand_nm, amplifier.torque_nm)
             push = self._pushes[-1]
-            push.told_nm = max(push.told_nm, push.sign * demand_nm)
+            push.commanded_nm = max(push.commanded_nm, push.sign * demand_nm)
 
     def _breach(self) -> CheckResult | None:
         """Further or faster than allowed; what was seen so far may say why."""
@@ -181,11 +181,11 @@ class WiringTest:
         """No torque yet: plausible sizes, and a joint that stands."""
         if verdict := judge.rated_torque(self._bounds):
             return verdict
-        if self._sway.count <= REST_CYCLES:
+        if self._window.count <= REST_CYCLES:
             return None
-        if verdict := judge.torque_at_rest(self._shown_nm / self._sway.count, self._bounds):
+        if verdict := judge.torque_at_rest(self._shown_nm / self._window.count, self._bounds):
             return verdict
-        self._noise_rad = self._sway.step_rad()
+        self._noise_rad = self._window.step_rad()
         late = self._stage_s > _REST_S
         if self._creeps() and not late:
             return self._moves_alone(0.5 * self._bounds.most_travel_rad)
@@ -205,7 +205,7 @@ class WiringTest:
     def _push(self, sign: float) -> None:
         self._enter(_Stage.PUSH)
         self._torque_nm = self._bounds.first_nm
-        self._pushes.append(Push(sign, self._sway.mean_rad(), self._amplifier_rad))
+        self._pushes.append(Push(sign, self._window.mean_rad(), self._amplifier_rad))
 
     def _ramp(self, dt_s: float) -> CheckResult | None:
         """More torque, until the joint has moved or the most was held for its time."""
@@ -254,13 +254,13 @@ class WiringTest:
         if len(self._pushes) == 1:
             self._enter(_Stage.SETTLE)
             return None
-        first, bounds, told_nm = self._pushes[0], self._bounds, self._pushes[-1].told_nm
+        first, bounds, commanded_nm = self._pushes[0], self._bounds, self._pushes[-1].commanded_nm
         if verdict := judge.actual_torque(self._line, bounds):
             return verdict
         if not first.moved:
-            return CheckResult(WiringOutcome.NO_MOTION, min(first.told_nm, told_nm))
-        at_least_nm = 0.5 * (first.began_nm + told_nm)  # friction: the other break-away lies beyond the most
-        return judge.friction(at_least_nm, bounds) or CheckResult(WiringOutcome.ONE_WAY, told_nm)
+            return CheckResult(WiringOutcome.NO_MOTION, min(first.commanded_nm, commanded_nm))
+        at_least_nm = 0.5 * (first.began_nm + commanded_nm)  # friction: the other break-away lies beyond the most
+        return judge.friction(at_least_nm, bounds) or CheckResult(WiringOutcome.ONE_WAY, commanded_nm)
 
     def _settle(self, dt_s: float) -> CheckResult | None:
         """Brake what moves, release what stands, and go on when it has stood for its time."""
@@ -281,11 +281,11 @@ class WiringTest:
 
     def _brake(self, dt_s: float) -> None:
         """Torque against the motion, growing while the joint does not slow down."""
-        direction = math.copysign(1.0, self._sway.way_rad(SPEED_CYCLES))
+        direction = math.copysign(1.0, self._window.way_rad(SPEED_CYCLES))
         if direction != self._brake_direction:
             self._torque_nm, self._brake_direction = 0.0, direction
             self._brake_first_nm *= 0.5
-        if self._stage_s > _COAST_S and not self._sway.slows():
+        if self._stage_s > _COAST_S and not self._window.slows():
             torque_nm = max(self._brake_first_nm, self._torque_nm * math.exp(dt_s / _BRAKE_GROWTH_S))
             self._torque_nm = min(self._bounds.most_nm, torque_nm)
 
@@ -309,7 +309,7 @@ class WiringTest:
     def _judge(self) -> CheckResult:
         """Over both directions."""
         if not self._pushes[0].moved:
-            return CheckResult(WiringOutcome.ONE_WAY, self._pushes[0].told_nm)
+            return CheckResult(WiringOutcome.ONE_WAY, self._pushes[0].commanded_nm)
         friction_nm = 0.5 * (self._break_away_nm(1.0) - self._break_away_nm(-1.0))
         return (
             judge.actual_torque(self._line, self._bounds)
@@ -323,7 +323,7 @@ class WiringTest:
         whole, late = push.ways(encoder_rad, amplifier_rad), push.late_ways(encoder_rad, amplifier_rad)
         if whole[0] != 0.0:
             self._ratio = whole[1] / whole[0]
-        skew_rad = abs(self._sway.way_rad(SPEED_CYCLES))
+        skew_rad = abs(self._window.way_rad(SPEED_CYCLES))
         return judge.sensors(whole, late, self._bounds, _STILL_NOISES * self._noise_rad, skew_rad)
 
     def _so_far(self) -> CheckResult | None:
@@ -335,10 +335,10 @@ class WiringTest:
         return self._sensors(*now) if max(abs(ways[0]), abs(ways[1])) > 0.5 * self._bounds.travel_rad else None
 
     def _moves(self) -> bool:
-        return abs(self._sway.way_rad(SPEED_CYCLES)) > self._still_rad()
+        return abs(self._window.way_rad(SPEED_CYCLES)) > self._still_rad()
 
     def _creeps(self) -> bool:
-        return abs(self._sway.way_rad(REST_CYCLES)) > self._still_rad()
+        return abs(self._window.way_rad(REST_CYCLES)) > self._still_rad()
 
     def _still_rad(self) -> float:
         bounds = self._bounds

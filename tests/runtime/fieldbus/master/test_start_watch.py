@@ -95,7 +95,7 @@ def test_the_loops_own_first_frames_are_no_stranger(kind: str, began_s: float | 
     loop.send(FRAMES[kind][0], bytes.fromhex(FRAMES[kind][1]))
     there.clock.sleep_until(there.clock.now_ns() + 4_000_000)
     if began_s == -0.001 and kind in ("SYNC", "command", "heartbeat of the master"):
-        master.look_for_strangers(lambda: began_ns)
+        master.look_for_foreign_traffic(lambda: began_ns)
     else:
         with pytest.raises(Unreachable, match="somebody else spoke"):
-            master.look_for_strangers(lambda: began_ns)
+            master.look_for_foreign_traffic(lambda: began_ns)
