@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from servod.client.axis import AxisClient
     from servod.formats.model.axis_model import AxisModel
     from servod.lab.identify.analysis import Analysis
-    from servod.lab.identify.walk import Tell
+    from servod.lab.identify.walk import OnProgress
 
-    Job = Callable[["_Walk", Tell], Analysis]
+    Job = Callable[["_Walk", OnProgress], Analysis]
 
 _HELP = example(
     "Identify the axis: noise, break-away, presliding stiffness, inertia, delay, friction map. Ctrl-C leaves it off.",
@@ -84,8 +84,8 @@ def identify(
         job = _virtual(plant, config, settings, encoder_counts, seed)
     else:
         job = _on_daemon(socket, config)
-    with _progress(quiet=as_json) as tell:
-        analysis = job(_Walk(recordings_folder(out), travel, speed, seed, resume), tell)
+    with _progress(quiet=as_json) as on_progress:
+        analysis = job(_Walk(recordings_folder(out), travel, speed, seed, resume), on_progress)
     model = model_of(analysis)
     write_file(out, axis_model_yaml(model))
     suggest("synthesize", "--model", str(out), "--out", "gains.yaml", why="a gain set for this axis")
@@ -110,14 +110,14 @@ class _Walk(NamedTuple):
     seed: int
     resume: bool
 
-    def on(self, axis: AxisClient, tell: Tell, subject: str) -> Analysis:
+    def on(self, axis: AxisClient, on_progress: OnProgress, subject: str) -> Analysis:
         """Run all experiments on this axis, and switch it off whatever ends them; `subject` says which one it is."""
         from servod.client.processes import sigterm_as_interrupt
         from servod.lab.identify.walk import identify as walk
 
         with sigterm_as_interrupt():
             return walk(
-                axis, self.folder, tell, travel_rad=self.travel, speed_rad_s=self.speed, seed=self.seed,
+                axis, self.folder, on_progress, travel_rad=self.travel, speed_rad_s=self.speed, seed=self.seed,
                 resume=self.resume, subject=subject,
             )  # fmt: skip
 
@@ -128,7 +128,7 @@ def _from_recordings(folder: Path) -> Job:
     from servod.lab.identify.store import load, load_devices
 
     traces, devices = load(folder), load_devices(folder)
-    return lambda _walk, _tell: analyse(traces, devices)
+    return lambda _walk, _on_progress: analyse(traces, devices)
 
 
 def _virtual(plant: Path, config: Path | None, settings: Path | None, encoder_counts: int | None, seed: int) -> Job:
@@ -142,10 +142,10 @@ def _virtual(plant: Path, config: Path | None, settings: Path | None, encoder_co
     joint, chosen = load_rotary_model(plant), load_config(config) if config is not None else None
     devices = load_model(settings, VirtualAxisSettings) if settings is not None else None
 
-    def job(walk: _Walk, tell: Tell) -> Analysis:
+    def job(walk: _Walk, on_progress: OnProgress) -> Analysis:
         with tempfile.TemporaryDirectory(prefix="servod-identify-") as folder:
             session = virtual_session(joint, Path(folder), encoder_counts, seed, chosen, devices)
-            return walk.on(SteppedAxis(session, Path(folder)), tell, axis_model_yaml(joint))
+            return walk.on(SteppedAxis(session, Path(folder)), on_progress, axis_model_yaml(joint))
 
     return job
 
@@ -160,9 +160,9 @@ def _on_daemon(socket: Path, config: Path | None) -> Job:
         )
     chosen = load_config(config)
 
-    def job(walk: _Walk, tell: Tell) -> Analysis:
+    def job(walk: _Walk, on_progress: OnProgress) -> Analysis:
         with connect(socket) as client:
-            return walk.on(DaemonAxis(client, chosen), tell, chosen.name)
+            return walk.on(DaemonAxis(client, chosen), on_progress, chosen.name)
 
     return job
 

@@ -25,7 +25,7 @@ from servod.formats.recording.mcap_reader import read_recording
 from servod.formats.recording.mcap_writer import McapFile, split_rows
 from servod.lab.commission.state import RUNS, digest, write_json
 from servod.lab.commission.state import read_walk_json as read_json
-from servod.lab.commission.walk import Tell, Walk
+from servod.lab.commission.walk import OnProgress, Walk
 from servod.lab.recordings.recording import Rows, rows_of
 from servod.lab.tracking.metrics import Curves
 from servod.lab.tracking.stepped import measure
@@ -38,16 +38,20 @@ T = TypeVar("T")
 
 
 def run_jobs(
-    work: Callable[..., T], jobs: Sequence[tuple[Any, ...]], names: Sequence[str], processes: int, tell: Tell
+    work: Callable[..., T],
+    jobs: Sequence[tuple[Any, ...]],
+    names: Sequence[str],
+    processes: int,
+    on_progress: OnProgress,
 ) -> list[T]:
     """`work(*job)` for every job, in their order. Raises what the first job that fails raises."""
-    tell(", ".join(names[:processes]), 0.0)
+    on_progress(", ".join(names[:processes]), 0.0)
     with worker_pool(min(processes, len(jobs))) as pool:
         pending = [pool.submit(work, *job) for job in jobs]
         results = []
         for index, result in enumerate(pending):
             results.append(result.result())
-            tell(", ".join(names[index + 1 : index + 1 + processes]) or names[-1], (index + 1) / len(jobs))
+            on_progress(", ".join(names[index + 1 : index + 1 + processes]) or names[-1], (index + 1) / len(jobs))
     return results
 
 
@@ -116,7 +120,7 @@ def run_files(walk: Walk, key: str) -> tuple[Path, Path]:
 
 
 def measured(
-    walk: Walk, axis: VirtualWalkAxis, sets: Mapping[str, Path], cutoff_hz: float, tell: Tell
+    walk: Walk, axis: VirtualWalkAxis, sets: Mapping[str, Path], cutoff_hz: float, on_progress: OnProgress
 ) -> dict[str, dict[str, Any]]:
     """Figures of every gain set by its key; those that ran before under the same conditions are read."""
     seed = walk.options.scoring_seed
@@ -124,7 +128,7 @@ def measured(
     left = [key for key in sets if not _done(walk, key, hashes[key])]
     jobs = [(axis, sets[key], cutoff_hz, seed, hashes[key], *run_files(walk, key)) for key in left]
     if jobs:
-        run_jobs(_measure, jobs, left, walk.options.processes, tell)
+        run_jobs(_measure, jobs, left, walk.options.processes, on_progress)
     return {key: read_json(run_files(walk, key)[0])["figures"] for key in sets}
 
 

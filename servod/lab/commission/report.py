@@ -40,7 +40,7 @@ from servod.lab.commission.state import (
     write_json,
 )
 from servod.lab.commission.state import read_walk_json as read_json
-from servod.lab.commission.walk import StepFailed, Tell, Walk
+from servod.lab.commission.walk import OnProgress, StepFailed, Walk
 from servod.lab.identify import store
 from servod.lab.identify.analysis import analyse
 from servod.lab.report.figure import Figure, PageTable
@@ -62,14 +62,14 @@ CLASSES = {
 }
 
 
-def write_report(walk: Walk, tell: Tell) -> None:
+def write_report(walk: Walk, on_progress: OnProgress) -> None:
     """Write report.html, and every figure as PNG and SVG. Raises BadInput."""
     page = Page(f"Commissioning of {walk.axis.config.name}", Verdict(verdict(walk), True), _origin(walk))
     _summary(page, walk)
     gains, model = load_gains(walk.path(GAINS)), load_axis_model(walk.path(MODEL))
     shown = sections(walk, gains, model)
     for index, (title, parts) in enumerate(shown.items()):
-        tell(title.lower(), index / len(shown))
+        on_progress(title.lower(), index / len(shown))
         page.heading(title)
         for part in parts():
             _add(page, walk, part)
@@ -453,5 +453,5 @@ class Report:
 
     def run(self, walk: Walk) -> None:
         """From the folder's files alone."""
-        with walk.progress(self.title) as tell:
-            write_report(walk, tell)
+        with walk.progress(self.title) as on_progress:
+            write_report(walk, on_progress)

@@ -50,9 +50,9 @@ class Questions:
 
 
 #: Told what a step does, and the share of it that is done.
-Tell = Callable[[str, float], None]
+OnProgress = Callable[[str, float], None]
 #: Opens the progress of one step, by its title.
-Progress = Callable[[str], AbstractContextManager[Tell]]
+Progress = Callable[[str], AbstractContextManager[OnProgress]]
 
 
 #: From the seed of excitation and virtual noise to those of scoring and of tuning. A seed begins the noise of joint and
@@ -143,7 +143,7 @@ _USUAL_S = {
 #: A step that nobody has timed.
 _UNKNOWN_S = 20.0
 #: A step's own share of progress is believed from here on.
-_TOLD_SHARE = 0.1
+_BELIEVED_SHARE = 0.1
 
 
 @dataclass
@@ -175,8 +175,8 @@ class Outlook:
         """Of this step, of which `share` is done, and of those behind it."""
         pace = self._taken_s / self._usual_s if self._usual_s else 1.0
         spent_s = self.now_s() - self._began_s
-        told = _TOLD_SHARE <= share <= 1.0
-        whole_s = spent_s / share if told else pace * self._usual(self._here)
+        believed = _BELIEVED_SHARE <= share <= 1.0
+        whole_s = spent_s / share if believed else pace * self._usual(self._here)
         behind_s = sum(self._usual(k) for k in range(self._here + 1, len(self.names)))
         return max(whole_s - spent_s, 0.0) + pace * behind_s
 
@@ -194,9 +194,9 @@ def with_outlook(walk: Walk, outlook: Outlook, where: str) -> Walk:
     """The walk as a step sees it whose progress says which step this is and how long the walk still takes."""
 
     @contextmanager
-    def progress(title: str) -> Iterator[Tell]:
-        with walk.progress(title) as tell:
-            yield lambda what, share: tell(f"{what} ({where}, {outlook.left(share)})", share)
+    def progress(title: str) -> Iterator[OnProgress]:
+        with walk.progress(title) as on_progress:
+            yield lambda what, share: on_progress(f"{what} ({where}, {outlook.left(share)})", share)
 
     return replace(walk, progress=progress)
 

@@ -22,7 +22,7 @@ from servod.lab.recordings.recording import Rows, rows_of
 from servod.lab.verify.validation import STEP_S, Figures, ValidationMotion, motion_for
 
 #: Told what is done, and the share of the whole that is.
-Tell = Callable[[str, float], None]
+OnProgress = Callable[[str, float], None]
 
 #: How a trial ended, by whether the set ran already and whether it proved itself.
 _ENDINGS = {
@@ -46,7 +46,7 @@ WINDOW_TRAVELS, WINDOW_SHARE = 3.0, 0.85
 def deploy(
     axis: AxisClient,
     gains: GainSet,
-    tell: Tell,
+    on_progress: OnProgress,
     earlier: Baseline | None = None,
     remember: Callable[[Baseline], None] = lambda _before: None,
 ) -> Deployment:
@@ -64,10 +64,10 @@ def deploy(
     motion = motion_for(design)
     window_rad = min(WINDOW_TRAVELS * motion.travel_rad, WINDOW_SHARE * axis.config.limits.following_error_rad)
     was_enabled = axis.status().enabled
-    trial = _Trial(axis, motion, window_rad, promised, tell)
+    trial = _Trial(axis, motion, window_rad, promised, on_progress)
     try:
         if not was_enabled:
-            tell("enable", 0.0)
+            on_progress("enable", 0.0)
             axis.enable()
             axis.wait(FADE_S)
         return trial.run(gains, earlier, remember)
@@ -110,10 +110,10 @@ class _Trial:
     """One trial: what it has done so far, so that it can be undone at any moment."""
 
     def __init__(
-        self, axis: AxisClient, motion: ValidationMotion, window_rad: float, promised: Promise, tell: Tell
+        self, axis: AxisClient, motion: ValidationMotion, window_rad: float, promised: Promise, on_progress: OnProgress
     ) -> None:
         self._axis, self._motion, self._window_rad = axis, motion, window_rad
-        self._promised, self._tell = promised, tell
+        self._promised, self._on_progress = promised, on_progress
         self._count_rad = 2.0 * np.pi / axis.config.encoder.counts_per_turn
         self._on_trial = False
 
@@ -159,7 +159,7 @@ class _Trial:
         """Change to the new set, unless it runs, and its motion: cycles, figures, and what speaks against it."""
         try:
             if change:
-                self._tell("change of the set", 0.48)
+                self._on_progress("change of the set", 0.48)
                 self._activate(*change)
                 self._axis.wait(FADE_S)
             rows = self._move("under the new set", 0.52)
@@ -184,9 +184,9 @@ class _Trial:
             raise
 
     def _end(self, before: Figures | None, after: Figures | None, reasons: list[str]) -> None:
-        told = {"before": before, "after": after}
-        figures = {f"{when}_{key}": value for when, of in told.items() if of for key, value in of.document().items()}
-        self._tell("verdict", 1.0)
+        runs = {"before": before, "after": after}
+        figures = {f"{when}_{key}": value for when, of in runs.items() if of for key, value in of.document().items()}
+        self._on_progress("verdict", 1.0)
         if not self._on_trial:
             return
         if reasons:
@@ -196,9 +196,9 @@ class _Trial:
         self._on_trial = False
 
     def _move(self, what: str, share: float) -> Rows:
-        self._tell(what, share)
+        self._on_progress(what, share)
         return run_validation(
-            self._axis, self._motion, self._window_rad, lambda done: self._tell(what, share + 0.43 * done)
+            self._axis, self._motion, self._window_rad, lambda done: self._on_progress(what, share + 0.43 * done)
         )
 
     def _figures(self, rows: Rows) -> Figures:
@@ -214,9 +214,12 @@ class _Trial:
 
 
 def run_validation(
-    axis: AxisClient, motion: ValidationMotion, window_rad: float, tell: Callable[[float], None] = lambda _done: None
+    axis: AxisClient,
+    motion: ValidationMotion,
+    window_rad: float,
+    on_progress: Callable[[float], None] = lambda _done: None,
 ) -> Rows:
-    """Run the motion from where the axis stands; all its cycles. `tell` gets the share that is done.
+    """Run the motion from where the axis stands; all its cycles. `on_progress` gets the share that is done.
 
     The sines end when the joint is further than `window_rad` from the reference. Nothing follows them then: a law that
     lost the joint on a sine is given no step.
@@ -224,7 +227,7 @@ def run_validation(
     before_s = 0.0
 
     def watch(passed_s: float) -> None:
-        tell(min(1.0, (before_s + passed_s) / motion.duration_s))
+        on_progress(min(1.0, (before_s + passed_s) / motion.duration_s))
 
     sines = motion.sines.tolist()
     rows = rows_of(axis.run(ReferenceMotion.excite(sines, [0.0] * len(sines), window_rad), watch, _LOOK_S))

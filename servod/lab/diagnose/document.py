@@ -64,18 +64,18 @@ def summary(diagnosis: Diagnosis) -> str:
         reasons = "; ".join(f"{r.name}: {r.reason}" for r in diagnosis.refused)
         return f"These data cannot tell: {reasons}."
     cut = describe_cut(evidence.search.starts_tried) if evidence.search.cut_by_time else ""
-    said = _found(diagnosis, evidence), describe_beyond(evidence), cut, describe_changes(evidence.recalibrated)
+    said = _found(diagnosis, evidence), describe_oversized(evidence), cut, describe_changes(evidence.recalibrated)
     return " ".join(part for part in said if part)
 
 
-def describe_beyond(evidence: Evidence) -> str:
+def describe_oversized(evidence: Evidence) -> str:
     """Effects that got no name since they would need torques beyond the recordings', as a sentence; empty for none."""
-    beyond = [name.replace("_", " ") for name, one in evidence.minor.items() if one.why is MinorReason.BEYOND]
-    if not beyond:
+    oversized = [name.replace("_", " ") for name, one in evidence.minor.items() if one.why is MinorReason.BEYOND]
+    if not oversized:
         return ""
     return (
-        f"No name is given to {' and '.join(beyond)}: it would take many times the largest torque of these recordings. "
-        "Look at the units of command and position (unit: in a --map file), and at the drive's factor."
+        f"No name is given to {' and '.join(oversized)}: it would take many times the largest torque of these "
+        "recordings. Look at the units of command and position (unit: in a --map file), and at the drive's factor."
     )
 
 

@@ -42,26 +42,26 @@ from servod.lab.diagnose.select.stepwise import (
 from servod.lab.diagnose.settings import SETTINGS
 from servod.lab.recordings import Recording
 
-Tell = Callable[[str], None]
+OnProgress = Callable[[str], None]
 
 
 def diagnose(
     model: AxisModel,
     recordings: Sequence[Recording],
     time_limit_s: float = 120.0,
-    tell: Tell | None = None,
+    on_progress: OnProgress | None = None,
     held_out: Sequence[Recording] = (),
 ) -> Diagnosis:
     """What `model` leaves out of the axis that the recordings are of.
 
-    The search for terms ends after three quarters of `time_limit_s` with what it has; `tell` is called with a line of
-    progress now and then. Recordings that cannot tell are refused with a reason each, and without any other there is no
-    evidence. `held_out` are judged by what was found, and by nothing before. Computed on up to two cores.
+    The search for terms ends after three quarters of `time_limit_s` with what it has; `on_progress` is called with
+    a line of progress now and then. Recordings that cannot tell are refused with a reason each, and without any other
+    there is no evidence. `held_out` are judged by what was found, and by nothing before. Computed on up to two cores.
 
         found = diagnose(load_axis_model(path), [load_recording(run) for run in runs])
         for effect in found.evidence.findings if found.evidence else (): print(effect.effect, effect.parameters)
     """
-    tell = tell or (lambda _line: None)
+    on_progress = on_progress or (lambda _line: None)
     begun = monotonic()
     completed = complete_drive(model, recordings)
     model = completed.model
@@ -69,9 +69,9 @@ def diagnose(
     seconds = {"intake": monotonic() - begun}
     if not traces:
         return Diagnosis(units(model), tuple(refused), DiagnosisVerdict.CANNOT_TELL, None, seconds | {"windows": 0.0})
-    tell(f"{len(traces)} recordings taken in")
+    on_progress(f"{len(traces)} recordings taken in")
     deadline = begun + SETTINGS.forward.search_share * time_limit_s
-    selector = Selector(Predictor(traces, model), model, deadline, tell, completed.unknown)
+    selector = Selector(Predictor(traces, model), model, deadline, on_progress, completed.unknown)
     selection = _selected(selector, selector.fit_base())
     seconds["search"] = monotonic() - begun - seconds["intake"]
     judgement = _judged(selector, selection)

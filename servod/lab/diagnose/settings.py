@@ -143,7 +143,7 @@ class FloorSettings:
     #: By how much slow torque noise may exceed the white part of the mismatch, in power.
     slow_over_white: float = 6.0
     #: Share of an error that the floor, known no better than this, leaves to be explained at least.
-    told: float = 0.02
+    least_share: float = 0.02
 
 
 @dataclass(frozen=True)

@@ -93,9 +93,9 @@ def _body(world: ET.Element, model: AxisModel, name: str, inertia: float, *, mot
     if load and model.spring:
         joint.set("stiffness", numbers(model.spring.stiffness, 0.0, model.spring.cubic))
         joint.set("springref", numbers(model.spring.rest))
-    mass, place, moment = weight(model, inertia, weighs=load)
+    mass, centre, moment = weight(model, inertia, weighs=load)
     ET.SubElement(
-        body, "inertial", pos=numbers(*place), mass=numbers(mass), diaginertia=numbers(moment, moment, moment)
+        body, "inertial", pos=numbers(*centre), mass=numbers(mass), diaginertia=numbers(moment, moment, moment)
     )
 
 

@@ -54,8 +54,8 @@ def write(model: AxisModel, name: str) -> str:
     link = ET.SubElement(root, "link", name=f"{name}_link")
     linear = model.axis is AxisKind.LINEAR
     inertial = ET.SubElement(link, "inertial")
-    mass, place, moment = mjcf.weight(model, model.inertia, weighs=not linear)
-    ET.SubElement(inertial, "origin", xyz=mjcf.numbers(*place), rpy="0 0 0")
+    mass, centre, moment = mjcf.weight(model, model.inertia, weighs=not linear)
+    ET.SubElement(inertial, "origin", xyz=mjcf.numbers(*centre), rpy="0 0 0")
     ET.SubElement(inertial, "mass", value=mjcf.numbers(mass))
     moments = {"ixx": moment, "ixy": 0.0, "ixz": 0.0, "iyy": moment, "iyz": 0.0, "izz": moment}
     ET.SubElement(inertial, "inertia", {key: mjcf.numbers(value) for key, value in moments.items()})

@@ -102,10 +102,10 @@ def _variance(readings: Array) -> _Variance:
     return _Variance(value, max(0.0, value - half), value + half)
 
 
-def _rounded_variance(place: float) -> Array:
-    """Variance of readings over `_GRID`, counts^2, of noise about a joint `place` off the middle of a count."""
+def _rounded_variance(offset: float) -> Array:
+    """Variance of readings over `_GRID`, counts^2, of noise about a joint `offset` off the middle of a count."""
     counts = np.arange(-12, 13)
-    edges = np.append(counts - 0.5, counts[-1] + 0.5) - place
+    edges = np.append(counts - 0.5, counts[-1] + 0.5) - offset
     shares = np.diff(stats.norm.cdf(edges[None, :] / _GRID[:, None]), axis=1)
     variance: Array = shares @ counts**2 - (shares @ counts) ** 2
     return variance

@@ -92,8 +92,8 @@ ON_BOUND = 1e-3
 
 def bound_notes(values: Sequence[float], low: Sequence[float], high: Sequence[float]) -> tuple[str, ...]:
     """A note for each of `values` that a search between `low` and `high` left at an end, empty for the others."""
-    places = [(v - a) / (b - a) for v, a, b in zip(values, low, high, strict=True)]
-    return tuple(AT_END if place < ON_BOUND or place > 1.0 - ON_BOUND else "" for place in places)
+    shares = [(v - a) / (b - a) for v, a, b in zip(values, low, high, strict=True)]
+    return tuple(AT_END if share < ON_BOUND or share > 1.0 - ON_BOUND else "" for share in shares)
 
 
 def joined(*notes: str) -> str:

@@ -241,15 +241,15 @@ _NODES = 40
 
 def changes(before: Identified, now: Identified) -> list[str]:
     """One sentence for each number, and for each direction of the friction map, that changed; empty when none did."""
-    told = [
+    sentences = [
         text
         for name, new in now.values.items()
         if name in before.values and name not in OF_THE_MOMENT
         if (text := _of_value(name, before.values[name], new))
     ]
     for direction, sign in (("positive", 1.0), ("negative", -1.0)):
-        told += _of_map(direction, *(_side(found.friction_map, sign) for found in (before, now)))
-    return told
+        sentences += _of_map(direction, *(_side(found.friction_map, sign) for found in (before, now)))
+    return sentences
 
 
 def _of_value(name: str, old: IdentifiedValue, new: IdentifiedValue) -> str:

@@ -30,7 +30,7 @@ from servod.lab.identify.fits import response as response_fit
 from servod.lab.identify.trace import ExperimentKind, RecordedMotion
 
 #: Told at every step: what is being done, and the share of the walk that is done.
-Tell = Callable[[str, float], None]
+OnProgress = Callable[[str, float], None]
 
 #: Ramps and bursts of presliding, in pairs of both directions.
 PAIRS = 5
@@ -42,7 +42,7 @@ UNKNOWN_DELAY_S = 1e-3
 def identify(
     axis: AxisClient,
     out: Path,
-    tell: Tell,
+    on_progress: OnProgress,
     *,
     travel_rad: float | None = None,
     speed_rad_s: float | None = None,
@@ -67,12 +67,12 @@ def identify(
         bounds = bounds_from(axis.config.limits, start_rad, travel_rad, speed_rad_s)
         rng = np.random.default_rng(seed)
         bench = Bench(axis, bounds, recordings, rng, start_rad=start_rad, enabled=not taken_up)
-        _experiments(bench, tell)
+        _experiments(bench, on_progress)
     finally:
         axis.disable()
         with contextlib.suppress(ServodError):  # a daemon that is gone, or no experiment was run
             axis.give_up("the feedback of experiments, which are over", {})
-    tell("fits", 0.97)
+    on_progress("fits", 0.97)
     return analyse(bench.traces, recordings.devices)
 
 
@@ -86,24 +86,24 @@ def _conditions(
     return hashlib.sha256(asked.encode()).hexdigest()
 
 
-def _experiments(bench: Bench, tell: Tell) -> None:
-    tell("noise at rest", 0.0)
+def _experiments(bench: Bench, on_progress: OnProgress) -> None:
+    on_progress("noise at rest", 0.0)
     kick.run_noise(bench)
-    tell("break-away", 0.02)
+    on_progress("break-away", 0.02)
     found = [abs(break_away_fit.torque_of(break_away.search(bench, sign))) for sign in (1.0, -1.0)]
-    tell("presliding", 0.07)
+    on_progress("presliding", 0.07)
     _rock(bench, (found[0], found[1]))
     slides = break_away_fit.fit([ramp for ramp in bench.of(ExperimentKind.BREAK_AWAY) if not ramp.settings["search"]])
     rocked = presliding_fit.fit(of_kind(bench.traces, ExperimentKind.PRESLIDING), slides)
-    tell("kicks", 0.2)
+    on_progress("kicks", 0.2)
     first = kick_fit.fit(kick.run(bench, (found[0], found[1])))
-    tell("frequency response", 0.25)
+    on_progress("frequency response", 0.25)
     config = bench.axis.config
     gains = feedback(config, first.inertia, first.delay_s + UNKNOWN_DELAY_S, CAREFUL)
     answer = response_fit.fit(response.run(bench, first.inertia, gains), first.inertia)
-    tell("bristle damping", 0.38)
+    on_progress("bristle damping", 0.38)
     presliding.run(bench, min(found))
-    tell("friction map", 0.42)
+    on_progress("friction map", 0.42)
     gains = feedback(config, answer.inertia.value, answer.delay_s.value + answer.lag_s.value, STIFF)
     friction_map.run(bench, gains, slides, break_away_rad(slides, rocked))
     bench.go_to(0.0, gains, 0.3 * bench.bounds.speed_rad_s)

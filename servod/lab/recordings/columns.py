@@ -98,7 +98,7 @@ class ColumnSource(Strict):
         return self
 
     @property
-    def told(self) -> str:
+    def in_words(self) -> str:
         """The source in words."""
         return self.source if self.source is not None else f"{self.from_name}... in the file's name"
 
@@ -221,20 +221,20 @@ def apply_map(
     present = list(names)
     chosen = {name: ColumnSource.model_validate({"from": name}) for name in present if name in ALL_NAMES}
     chosen.update(sources)
-    places: dict[str, Element] = {}
+    elements: dict[str, Element] = {}
     for canonical, source in list(chosen.items()):
         if source.source is None:
             continue
-        place = find_source(source.source, present)
-        if place is None and source.optional:
+        found_element = find_source(source.source, present)
+        if found_element is None and source.optional:
             del chosen[canonical]
             continue
-        if place is None:
+        if found_element is None:
             found = f"none, but {canonical} is mapped"
             raise BadInput(f"{where}: column {source.source}", found, _near(source.source, present))
-        places[canonical] = place
-    used = {place.name for place in places.values()}
-    return chosen, places, [name for name in present if name not in used]
+        elements[canonical] = found_element
+    used = {found_element.name for found_element in elements.values()}
+    return chosen, elements, [name for name in present if name not in used]
 
 
 def axis_of(names: Iterable[str], foreign: Iterable[str], where: str) -> AxisKind:
@@ -246,8 +246,8 @@ def axis_of(names: Iterable[str], foreign: Iterable[str], where: str) -> AxisKin
     for axis in AxisKind:
         other = {q.column(one) for q in (Quantity.TORQUE, Quantity.POSITION) for one in AxisKind if one is not axis}
         needed = all(quantity.column(axis) in present for quantity in REQUIRED)
-        told = {quantity.column(axis) for quantity in COMMANDS if quantity.column(axis) in present}
-        if needed and told and (Quantity.TORQUE.column(axis) in told or not present & other):
+        commands = {quantity.column(axis) for quantity in COMMANDS if quantity.column(axis) in present}
+        if needed and commands and (Quantity.TORQUE.column(axis) in commands or not present & other):
             return axis
     linear = any(quantity.value[1] in present for quantity in (Quantity.TORQUE, Quantity.POSITION))
     axis = AxisKind.LINEAR if linear else AxisKind.ROTARY
@@ -432,8 +432,8 @@ def find_unit(name: str, canonical: str, scaled: bool) -> Unit | str:
 
 def _plain(name: str) -> str:
     """A unit's name without blanks and signs that differ by the keyboard alone."""
-    told = unicodedata.normalize("NFKC", name.strip()).replace("μ", "u").replace("µ", "u")
+    plain = unicodedata.normalize("NFKC", name.strip()).replace("μ", "u").replace("µ", "u")
     for sign in ("·", "⋅", "∙", "•", "×"):
-        told = told.replace(sign, "*")
-    told = "".join(told.split())
-    return _ALIASES.get(told) or _ALIASES.get(told.lower()) or told
+        plain = plain.replace(sign, "*")
+    plain = "".join(plain.split())
+    return _ALIASES.get(plain) or _ALIASES.get(plain.lower()) or plain

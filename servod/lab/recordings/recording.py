@@ -50,7 +50,7 @@ LARGEST = 1e30
 SHORTEST_STEP_S, LONGEST_STEP_S = 1e-6, 20.0
 
 #: What a drive of each kind is told.
-_TOLD = {
+_COMMANDS = {
     DriveKind.POSITION_SERVO: Quantity.REFERENCE,
     DriveKind.VELOCITY: Quantity.SPEED_REFERENCE,
     DriveKind.VOLTAGE: Quantity.VOLTAGE,
@@ -115,8 +115,8 @@ class Recording:
         if last - first == len(self):
             return self
         columns = {quantity: values[first:last] for quantity, values in self.columns.items()}
-        told = f"rows from {self.t_s[first]:g} to {self.t_s[last - 1]:g} s used, as asked"
-        return replace(self, columns=columns, measured=self.measured[first:last], report=(*self.report, told))
+        note = f"rows from {self.t_s[first]:g} to {self.t_s[last - 1]:g} s used, as asked"
+        return replace(self, columns=columns, measured=self.measured[first:last], report=(*self.report, note))
 
     @cached_property
     def drive(self) -> Drive:
@@ -134,13 +134,15 @@ class Recording:
         if model.drive.factor is None:
             allowed = "N*m of a full duty, a V or an A: give it, or k_t; diagnose fits it"
             raise BadInput("model: drive.torque_per_command", "none", allowed)
-        temperature, command = self._row(Quantity.TEMPERATURE), self._told(model.drive)
-        told = ToldRows(command, self._row(Quantity.GAIN), self._row(Quantity.SUPPLY), self._on(model.drive, command))
-        if model.drive.kind.feeds_back and model.drive.kp is None and not np.isfinite(told.gain).all():
+        temperature, command = self._row(Quantity.TEMPERATURE), self._command(model.drive)
+        command_rows = ToldRows(
+            command, self._row(Quantity.GAIN), self._row(Quantity.SUPPLY), self._on(model.drive, command)
+        )
+        if model.drive.kind.feeds_back and model.drive.kp is None and not np.isfinite(command_rows.gain).all():
             raise BadInput(f"{self.path}: column kp", "none", "kp, or drive.kp in the model: the gain of its servo")
-        if model.drive.by_supply and model.drive.supply_v is None and not np.isfinite(told.supply_v).all():
+        if model.drive.by_supply and model.drive.supply_v is None and not np.isfinite(command_rows.supply_v).all():
             raise BadInput(f"{self.path}: column supply_v", "none", "supply_v, or drive.supply_v in the model")
-        return Drive(self.t_s, np.zeros(len(self)), self.position, temperature, told)
+        return Drive(self.t_s, np.zeros(len(self)), self.position, temperature, command_rows)
 
     def _row(self, quantity: Quantity) -> Array:
         """An optional column with its holes filled; NaN where there is none."""
@@ -157,9 +159,9 @@ class Recording:
             return np.ones(len(self), dtype=bool)
         return on_by_duty(duty, command - self.position)
 
-    def _told(self, law: DriveLaw) -> Array:
+    def _command(self, law: DriveLaw) -> Array:
         """The column that a drive of this law is told, holes held. Raises BadInput where the recording has none."""
-        wanted = _TOLD[law.kind]
+        wanted = _COMMANDS[law.kind]
         values = self.get(wanted)
         if values is None and law.kind is DriveKind.VOLTAGE and (duty := self.get(Quantity.DUTY)) is not None:
             supply = self._row(Quantity.SUPPLY)
@@ -209,13 +211,13 @@ def load_recording(path: str | Path, map_path: str | Path | None = None) -> Reco
     path = Path(path)
     sources = load_column_map(Path(map_path)) if map_path is not None else {}
     foreign, report = read_columns(path, wanted_names(sources.values()))
-    chosen, places, unused = apply_map(foreign, sources, str(path))
+    chosen, elements, unused = apply_map(foreign, sources, str(path))
     axis = axis_of(chosen, foreign, str(path))
     columns: dict[Quantity, Array] = {}
     for quantity in Quantity:
         source = chosen.get(name := quantity.column(axis))
         if source is not None:
-            columns[quantity] = _scaled(_column(foreign, places.get(name), source, path), name, source)
+            columns[quantity] = _scaled(_column(foreign, elements.get(name), source, path), name, source)
     foreign.clear()  # a large file's columns would stand in memory twice
     for quantity, values in columns.items():
         if not values.ndim and quantity is not Quantity.TIME:
@@ -225,21 +227,21 @@ def load_recording(path: str | Path, map_path: str | Path | None = None) -> Reco
     return _checked(path, axis, columns, report)
 
 
-def _column(foreign: dict[str, Any], place: Element | None, source: ColumnSource, path: Path) -> Array:
+def _column(foreign: dict[str, Any], cell: Element | None, source: ColumnSource, path: Path) -> Array:
     """The numbers of one source, one for each row; without dimensions where one number holds for all."""
-    if place is None:
+    if cell is None:
         behind = re.search(rf"{re.escape(source.from_name or '')}([-+]?\d+(?:\.\d+)?)", path.name)
         if behind is None:
             raise BadInput(f"{path}: file's name", "no number", f"a number behind {source.from_name!r}, as mapped")
         return np.array(float(behind[1]))
-    column = foreign[place.name]
-    if place.at is not None:
-        column = element(column, place.at, place.row, path, place.name)
-    values = numbers(column, path, place.name)
+    column = foreign[cell.name]
+    if cell.at is not None:
+        column = element(column, cell.at, cell.row, path, cell.name)
+    values = numbers(column, path, cell.name)
     if values.ndim > 1:
         rows, count = values.shape
-        found, allowed = f"a matrix of {rows} rows and {count} columns", f"from: {place.name}[:,0] to [:,{count - 1}]"
-        raise BadInput(f"{path}: column {place.name}", found, allowed)
+        found, allowed = f"a matrix of {rows} rows and {count} columns", f"from: {cell.name}[:,0] to [:,{count - 1}]"
+        raise BadInput(f"{path}: column {cell.name}", found, allowed)
     return values
 
 

@@ -61,8 +61,8 @@ def _sequences(recording: Recording, quantities: Sequence[Quantity]) -> Words:
         rows = _mixed(rows, _rounded(recording.columns[quantity]))
     windows = np.lib.stride_tricks.sliding_window_view(rows, ROWS)
     found = np.zeros(len(windows), dtype=np.uint64)
-    for place in range(ROWS):
-        found = _mixed(found, windows[:, place])
+    for row in range(ROWS):
+        found = _mixed(found, windows[:, row])
     changes = np.diff(recording.position) != 0.0
     moves = np.lib.stride_tricks.sliding_window_view(changes, ROWS - 1).sum(axis=1) >= POSITIONS - 1
     return np.asarray(found[moves])

@@ -150,7 +150,7 @@ def _small(name: str, size: Document) -> str:
     torque = f"{100.0 * size['torque_over_coulomb']:.1f} % of dry friction"
     if "why" not in size:
         return f"{name.replace('_', ' ')} ({torque}, too small to be worth a name)"
-    values = ", ".join(f"{key} {told['value']:.3g} {told['unit']}" for key, told in size["parameters"].items())
+    values = ", ".join(f"{key} {value['value']:.3g} {value['unit']}" for key, value in size["parameters"].items())
     return f"{name.replace('_', ' ')} ({torque}, {size['why']}; in the model with {values})"
 
 

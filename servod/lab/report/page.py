@@ -196,8 +196,8 @@ def _look(words: bool, cell: str) -> str:
 
 def _is_text(cells: Sequence[str]) -> bool:
     """Whether a column is aligned as text: most of its cells are no numbers."""
-    told = [cell for cell in cells if cell not in ("", "-", "–")]
-    return sum(_NUMBER.match(cell) is None for cell in told) > len(told) / 2
+    filled = [cell for cell in cells if cell not in ("", "-", "–")]
+    return sum(_NUMBER.match(cell) is None for cell in filled) > len(filled) / 2
 
 
 def _running_head(title: str) -> str:
@@ -243,11 +243,11 @@ def _recorded(origin: Origin) -> list[str]:
     if origin.recorded_ns is not None:
         return [_time_of_day(origin.recorded_ns)]
     files = [file for name in _RECORDINGS for file in origin.given(name) if file.is_file()]
-    told = sorted(at for file in files if (at := recorded_at_ns(file)) is not None)
-    if not told:
+    times_ns = sorted(at for file in files if (at := recorded_at_ns(file)) is not None)
+    if not times_ns:
         return ["not told: no time of day stands in the files"] if files else []
-    first, last = _time_of_day(told[0]), _time_of_day(told[-1])
-    return [first if len(files) == 1 else f"{first} to {last}, {len(told)} of {len(files)} files tell it"]
+    first, last = _time_of_day(times_ns[0]), _time_of_day(times_ns[-1])
+    return [first if len(files) == 1 else f"{first} to {last}, {len(times_ns)} of {len(files)} files tell it"]
 
 
 def drives(origin: Origin) -> list[str]:
@@ -260,10 +260,10 @@ def drives(origin: Origin) -> list[str]:
 
 
 def _drive(node: Mapping[str, Any]) -> str:
-    told = {name: value for name, value in (node.get("identity") or {}).items() if value is not None}
+    identity = {name: value for name, value in (node.get("identity") or {}).items() if value is not None}
     shown = (
         f"{name.replace('_id', '').replace('_code', '')} {value if name == 'serial' else hex(value)}"
-        for name, value in told.items()
+        for name, value in identity.items()
     )
     known = ", ".join(shown) or "identity not stated"
     return f"{node['role']}, node {node['node_id']}, driver {node['driver']}: {known}"
@@ -332,7 +332,7 @@ class PageData:
 
     def __init__(self, figures: Sequence[Figure]) -> None:
         self._arrays: list[dict[str, Any]] = []
-        self._places: dict[bytes, int] = {}
+        self._indices: dict[bytes, int] = {}
         shown = [y for f in figures for p in f.panels for c in p.curves for y in (c.y, *(c.bounds or ()))]
         self.most_rows = _most_rows([(len(y), _bytes_each(y)) for y in {id(y): y for y in shown}.values()])
         self._figures = [self._figure(figure) for figure in figures]
@@ -362,18 +362,18 @@ class PageData:
         held = {"label": curve.label, "detail": curve.detail, "colour": curve.colour.name.lower()}
         held |= {"style": curve.style.value, "width": curve.width}  # type: ignore[dict-item]
         kept = extremes(curve.y, self.most_rows)
-        places: dict[str, Any] = {"x": self._series(curve.x[kept], precise=True), "y": self._series(curve.y[kept])}
+        indices: dict[str, Any] = {"x": self._series(curve.x[kept], precise=True), "y": self._series(curve.y[kept])}
         if curve.bounds is not None:
-            places |= {key: self._series(y[kept]) for key, y in zip(("low", "high"), curve.bounds, strict=True)}
-        return held | places
+            indices |= {key: self._series(y[kept]) for key, y in zip(("low", "high"), curve.bounds, strict=True)}
+        return held | indices
 
     def _series(self, values: Array, precise: bool = False) -> int:
         packed = packed_series(values, precise)
         key = repr(sorted(packed.items())).encode()
-        if key not in self._places:
-            self._places[key] = len(self._arrays)
+        if key not in self._indices:
+            self._indices[key] = len(self._arrays)
             self._arrays.append(packed)
-        return self._places[key]
+        return self._indices[key]
 
 
 def packed_series(values: Array, precise: bool = False) -> dict[str, Any]:

@@ -71,7 +71,7 @@ def deployed_norm(proof: RegionProof, solver: str) -> float | None:
     """Root of the summed squared H2 bounds that `solver` finds for a region, over the vertices that shape feedback."""
     programme, found = stored_programme(proof, solver)
     shaping = programme.only("sliding")
-    solution = lmi_deployed.solve(shaping, None, found.guides())
+    solution = lmi_deployed.solve(shaping, None, found.upper_slack())
     if solution is None:
         return None
     return math.sqrt(max(sum(float(np.trace(w)) for w in solution.outputs if w is not None), 0.0))

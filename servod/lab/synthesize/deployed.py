@@ -111,8 +111,9 @@ def programme(design: Design, proof: RegionProof, wishes: Wishes) -> Programme:
     found = joints(friction, span, wishes.uncertainty)
     a, b, e = scaled(found, design, proof)
     if wishes.h2_where_it_falls and not span.holds_rest:
-        guides, *beside = turned_bristle(design, proof, wishes.overlap[1])
-        found, (a, b, e) = found + guides, [np.concatenate(pair) for pair in zip((a, b, e), beside, strict=True)]
+        turning_joints, *beside = turned_bristle(design, proof, wishes.overlap[1])
+        found = found + turning_joints
+        a, b, e = (np.concatenate(pair) for pair in zip((a, b, e), beside, strict=True))
     disc = pole_disc(wishes.least_decay_per_s, wishes.least_damping, wishes.period_s)
     ringing = 0.0, math.exp(-wishes.least_decay_per_s * wishes.period_s)  # its bristle's damping is the joint's own
     falling = 0.0, wishes.slow_disc or SLOW_DISCS[-1]

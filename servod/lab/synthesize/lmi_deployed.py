@@ -99,7 +99,7 @@ class Solution:
         """Bound of the H2 norm over all vertices, in scaled units."""
         return float(np.sqrt(max(np.trace(w) for w in self.outputs if w is not None)))
 
-    def guides(self) -> dict[str, Array]:
+    def upper_slack(self) -> dict[str, Array]:
         """[M, X] of each mode: the upper rows of its slack, seen from the first mode's G1."""
         n = len(self.feedback)
         first = next(iter(self.slack.values()))[:n, :n]
@@ -109,9 +109,9 @@ class Solution:
 
 
 class _Unknowns:
-    """Slacks, R and W of one programme: with the feedback fixed (analysis) or open (synthesis along `guides`)."""
+    """Slacks, R and W of one programme: with the feedback fixed (analysis) or open (synthesis along `upper_slack`)."""
 
-    def __init__(self, p: Programme, feedback: Array | None, guides: dict[str, Array] | None) -> None:
+    def __init__(self, p: Programme, feedback: Array | None, upper_slack: dict[str, Array] | None) -> None:
         size = p.a.shape[-1]
         self.outputs = [cp.Variable((2, 2), symmetric=True) if performs else None for performs in p.performs]
         self.h2 = [cp.Variable((size, size), symmetric=True) if performs else None for performs in p.performs]
@@ -120,13 +120,13 @@ class _Unknowns:
         self.slack: dict[str, Any] = {}
         self.r: dict[str, Any] = {}
         for mode in dict.fromkeys(p.modes):
-            if guides is None:
+            if upper_slack is None:
                 assert feedback is not None
                 self.slack[mode] = cp.Variable((size, size))
                 self.r[mode] = np.concatenate([feedback, np.zeros(size - p.fed)])[None, :] @ self.slack[mode]
             else:
-                self.slack[mode] = cp.vstack([self.upper @ guides[mode], cp.Variable((size - p.fed, size))])
-                self.r[mode] = self.row @ guides[mode]
+                self.slack[mode] = cp.vstack([self.upper @ upper_slack[mode], cp.Variable((size - p.fed, size))])
+                self.r[mode] = self.row @ upper_slack[mode]
 
     def spread(self, p: Programme, in_disc: bool) -> Any:
         """What chooses one of all slacks that reach the same bound: see the head of this file. Strictly convex."""
@@ -178,12 +178,12 @@ def _vertex_constraints(p: Programme, i: int, u: _Unknowns, in_disc: bool, stric
 def solve(
     p: Programme,
     feedback: Array | None,
-    guides: dict[str, Array] | None,
+    upper_slack: dict[str, Array] | None,
     in_disc: bool = True,
     strictness: float = EPSILON,
 ) -> Solution | None:
-    """One convex programme: analysis of `feedback`, or synthesis with slack along `guides`; None when infeasible."""
-    u = _Unknowns(p, feedback, guides)
+    """One convex programme: analysis of `feedback`, or synthesis along `upper_slack`; None when infeasible."""
+    u = _Unknowns(p, feedback, upper_slack)
     constraints = [c for i in range(len(p.a)) for c in _vertex_constraints(p, i, u, in_disc, strictness)]
     cost = sum(cp.trace(w) for w in u.outputs if w is not None)
     problem = cp.Problem(cp.Minimize(cost + u.spread(p, in_disc)), constraints)
@@ -240,10 +240,10 @@ def shaped(shaping: Programme) -> Solution | None:
     for _ in range(ROUNDS + 1):
         if last is None:
             return None
-        better = solve(shaping, None, last.guides(), strictness=PROOF_EPSILON)
+        better = solve(shaping, None, last.upper_slack(), strictness=PROOF_EPSILON)
         if better is not None:
             return better
-        plain = solve(shaping, None, last.guides(), in_disc=False)
+        plain = solve(shaping, None, last.upper_slack(), in_disc=False)
         last = None if plain is None else solve(shaping, plain.feedback, None, in_disc=False)
     return None
 
@@ -260,7 +260,7 @@ def turned(p: Programme, found: Solution) -> Solution | None:
             return found
         guide = solve(shaping.turning_within(TURN_ROOM * reach), found.feedback, None)
         radius = max(wanted, reach - TURN_STEP)
-        better = guide and solve(shaping.turning_within(radius), None, guide.guides(), strictness=PROOF_EPSILON)
+        better = guide and solve(shaping.turning_within(radius), None, guide.upper_slack(), strictness=PROOF_EPSILON)
         if better is None:
             return None
         found = better

@@ -216,13 +216,13 @@ def _proof(span: Span, intervals: Polytope, region: Region, solved: Solved) -> R
 
 def _clashes(span: Span, region: Region) -> Sequence[str]:
     """Constraints that are infeasible by themselves, with the vertices that are so alone; else all of them together."""
-    told = []
+    clashes = []
     for part in PARTS:
         if solve(region, frozenset({part})) is not None:
             continue
         alone = [v.name for v in region.found if solve(region.only(v), frozenset({part})) is None]
-        told += [f"{part}: {name}, by itself" for name in alone]
+        clashes += [f"{part}: {name}, by itself" for name in alone]
         if not alone:
-            told.append(f"{part}: {span.name}: one Lyapunov matrix for all {len(region.found)} vertices")
+            clashes.append(f"{part}: {span.name}: one Lyapunov matrix for all {len(region.found)} vertices")
     together = f"{span.name}: {', '.join(PARTS)} together over all {len(region.found)} vertices"
-    return told or [together]
+    return clashes or [together]

@@ -76,7 +76,7 @@ def _worst(friction: SteadyFriction, c: Compensator, side: float, low: float, hi
     return worst
 
 
-def place(
+def node_speeds(
     friction: SteadyFriction, c: Compensator, side: float, slowest: float, speed: float, share: float
 ) -> list[float]:
     """Speeds of the nodes of one direction, each as far from the last as the tolerance `share` of the force allows.
@@ -107,7 +107,7 @@ def local_sets(
     slowest = 1e-3 * speed_max
     nodes = {0.0}
     for side in (1.0, -1.0):
-        nodes |= {side * v for v in place(friction, c, side, slowest, speed_max, accuracy)}
+        nodes |= {side * v for v in node_speeds(friction, c, side, slowest, speed_max, accuracy)}
     if len(nodes) > MAX_SETS:
         raise BadInput("--accuracy", f"{accuracy:g}, which needs {len(nodes)} local sets", f"at most {MAX_SETS} sets")
     return sets_at(friction, c, tuple(sorted(nodes)), gain)

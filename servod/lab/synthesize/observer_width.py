@@ -116,25 +116,25 @@ def with_observer(
 
 
 def with_widest_observer(
-    design: Design, friction: SteadyFriction, law: LocalParameters, beyond_rad_s: float = 0.0
+    design: Design, friction: SteadyFriction, law: LocalParameters, above_rad_s: float = 0.0
 ) -> LocalParameters:
-    """`law` with the widest observer beyond `beyond_rad_s` that it stands; without one where it stands none.
+    """`law` with the widest observer beyond `above_rad_s` that it stands; without one where it stands none.
 
     A slow one gives way to one that is enough but has no bandwidth of its own for coming to rest: where the feedback
     of the regions differs much, the blend of both adds to it what no faster observer stands.
     """
     search = Search(design, friction)
-    found = widest(search, law, beyond_rad_s, LOW_FACTORS[-1])
+    found = widest(search, law, above_rad_s, LOW_FACTORS[-1])
     if bandwidth_of(found) >= ENOUGH_RAD_S:
         return found
-    even = widest(search, law, max(beyond_rad_s, ENOUGH_RAD_S), None)
+    even = widest(search, law, max(above_rad_s, ENOUGH_RAD_S), None)
     return even if bandwidth_of(even) else found
 
 
-def widest(search: Search, law: LocalParameters, beyond_rad_s: float, low_factor: float | None) -> LocalParameters:
+def widest(search: Search, law: LocalParameters, above_rad_s: float, low_factor: float | None) -> LocalParameters:
     """The same with one relation of the bandwidths; `low_factor`: in Omega_L over that in Omega_H, None: no own."""
     for disk in (DISK_WANTED, DISK_LIMIT):
-        for bandwidth in (g for g in OBSERVERS_RAD_S if g > beyond_rad_s):
+        for bandwidth in (g for g in OBSERVERS_RAD_S if g > above_rad_s):
             slow = with_observer(law, bandwidth, low_factor and low_factor * bandwidth)
             if search.stands(slow, disk):
                 fast = with_fastest_rest(search, slow, disk) if low_factor else slow

@@ -194,12 +194,12 @@ def step_response(
     if held.size == 0:
         raise AnswerIsNo(f"the step was held for less than {HOLD_FROM_S:.0f} s")
     error, swing_rad = step_rad - position_rad, float(np.ptp(held))
-    beyond = np.max(-error * np.sign(step_rad))
+    overshoot_rad = np.max(-error * np.sign(step_rad))
     sigma_rad = reading_rms(count_rad, encoder_rms_rad or 0.0)
     moves = encoder_rms_rad is not None and scatter(held) > SCATTER * max(sigma_rad, LEAST_COUNT_RAD / ROUNDING)
     return StepResponse(
         settling_s=settling(time_s, error, settling_band(step_rad, count_rad)),
-        overshoot=max(0.0, float(beyond) / abs(step_rad)),
+        overshoot=max(0.0, float(overshoot_rad) / abs(step_rad)),
         steady_error_mrad=abs(float(np.mean(error[time_s >= time_s[-1] - STEADY_S]))) * 1e3,
         hold_mrad=1e3 * (swing_rad if true_swing_rad is None else true_swing_rad),
         hold_of=HoldOf.ENCODER if true_swing_rad is None else HoldOf.JOINT,

@@ -28,12 +28,12 @@ from servod.lab.tracking.metrics import (
 )
 
 #: Told how much of a measurement is done, from 0 to 1.
-Tell = Callable[[float], None]
+OnProgress = Callable[[float], None]
 
 _LOOK_S = 0.5
 
 
-def measure(open_axis: Callable[[], SteppedAxis], gains: GainSet, tell: Tell | None = None) -> Tracking:
+def measure(open_axis: Callable[[], SteppedAxis], gains: GainSet, on_progress: OnProgress | None = None) -> Tracking:
     """Activate `gains` on a new axis, track (19) for 30 s, then steps of 100 and 10 mrad, each held for 20 s.
 
     The axis may be enabled or not, its controller is replaced. Raises AnswerIsNo when the axis refuses or drops out.
@@ -46,7 +46,11 @@ def measure(open_axis: Callable[[], SteppedAxis], gains: GainSet, tell: Tell | N
     def move(motion: ReferenceMotion, duration_s: float, swing: Swing | None = None) -> Curves:
         nonlocal done_s
         before_s, done_s = done_s, done_s + duration_s
-        watch = None if tell is None else lambda seconds: tell((before_s + min(seconds, duration_s)) / whole_s)
+        watch = (
+            None
+            if on_progress is None
+            else lambda seconds: on_progress((before_s + min(seconds, duration_s)) / whole_s)
+        )
         return run_motion(axis, motion, watch, gains.name, swing)
 
     followed = move(ReferenceMotion.paper(PAPER_S), PAPER_S)
@@ -86,11 +90,11 @@ def activate(axis: AxisClient, gains: GainSet) -> None:
 def run_motion(
     axis: SteppedAxis,
     motion: ReferenceMotion,
-    tell: Tell | None = None,
+    on_progress: OnProgress | None = None,
     name: str = "the gain set",
     swing: Swing | None = None,
 ) -> Curves:
-    """One motion from its first cycle to its last; `tell` gets the seconds that have passed, `swing` looks on.
+    """One motion from its first cycle to its last; `on_progress` gets the seconds that have passed, `swing` looks on.
 
     Every cycle is looked at: a slower look misses cycles of its own multiples. Raises AnswerIsNo when the motion is
     refused or the axis drops out; `name` says under what.
@@ -98,7 +102,7 @@ def run_motion(
     start_rad = axis.status().reference_rad
     each_cycle = None if swing is None else partial(swing.look, axis)
     try:
-        return curves_of(axis.run(motion, tell, _LOOK_S, each_cycle), start_rad)
+        return curves_of(axis.run(motion, on_progress, _LOOK_S, each_cycle), start_rad)
     except AxisDropped as dropped:
         raise AnswerIsNo(f"the axis went to {dropped.state} under {name}. {dropped.why}") from None
 

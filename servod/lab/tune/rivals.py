@@ -19,7 +19,7 @@ from servod.lab.tune.plan import BUDGET, Feedback, Tuned, TuningSettings
 from servod.lab.tune.tuning import Values, tune
 
 #: Told what has just been tuned ("pd_dob, equal feedback"), and how much of everything is done, from 0 to 1.
-Tell = Callable[[str, float], None]
+OnProgress = Callable[[str, float], None]
 Key = tuple[Feedback, str]
 
 _POLL_S = 0.05
@@ -31,7 +31,7 @@ def rivals(
     *,
     seed: int = 1,
     budget: int = BUDGET,
-    tell: Tell | None = None,
+    on_progress: OnProgress | None = None,
     plan: TuningSettings | None = None,
     processes: int | None = None,
 ) -> dict[Feedback, dict[str, Tuned]]:
@@ -43,7 +43,7 @@ def rivals(
     """
     plan = replace(plan or TuningSettings(), seed=seed, budget=budget)
     with worker_pool(processes or usable_cores()) as pool:
-        found = _Field(pool, model, names, plan, tell).tuned()
+        found = _Field(pool, model, names, plan, on_progress).tuned()
     return {feedback: {name: found[feedback, name] for name in names} for feedback in Feedback}
 
 
@@ -82,11 +82,16 @@ class _Field:
     """The running tasks and what they have found."""
 
     def __init__(
-        self, pool: Executor, model: AxisModel, names: Sequence[str], plan: TuningSettings, tell: Tell | None
+        self,
+        pool: Executor,
+        model: AxisModel,
+        names: Sequence[str],
+        plan: TuningSettings,
+        on_progress: OnProgress | None,
     ) -> None:
         self._waiting = needed(names)
         self._all = len(self._waiting)
-        self._pool, self._text, self._plan, self._tell = pool, model.model_dump_json(), plan, tell
+        self._pool, self._text, self._plan, self._on_progress = pool, model.model_dump_json(), plan, on_progress
         self._tasks: dict[Key, Future[Tuned]] = {}
         self._found: dict[Key, Tuned] = {}
 
@@ -108,8 +113,8 @@ class _Field:
     def _take(self, key: Key) -> None:
         feedback, name = key
         self._found[key] = self._tasks.pop(key).result()
-        if self._tell:
-            self._tell(f"{name}, {feedback.value} feedback", len(self._found) / self._all)
+        if self._on_progress:
+            self._on_progress(f"{name}, {feedback.value} feedback", len(self._found) / self._all)
 
 
 def _task(model: str, key: Key, plan: TuningSettings, starts: Sequence[Values]) -> Tuned:

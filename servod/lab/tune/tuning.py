@@ -123,7 +123,7 @@ class TuningObjective:
             return Cost(LOST_MRAD, roughness)
         error = math.hypot(_rms([run.paper_mrad for run in runs]), HELD_WEIGHT * _rms([run.held_mrad for run in runs]))
         restless = max(run.ripple_rad for run in runs) / RIPPLE_LIMIT_RAD
-        return Cost(min(error * _beyond(roughness / plan.roughness_limit) * _beyond(restless), LOST_MRAD), roughness)
+        return Cost(min(error * _penalty(roughness / plan.roughness_limit) * _penalty(restless), LOST_MRAD), roughness)
 
     def _run(self, parameters: Parameters, index: int) -> Followed:
         plant, (torque, reading), law = self.plants[index], self.noise[index], LAWS[parameters.law]
@@ -174,7 +174,7 @@ def _rms(values: Sequence[float]) -> float:
     return math.sqrt(math.fsum(v * v for v in values) / len(values))
 
 
-def _beyond(share: float) -> float:
+def _penalty(share: float) -> float:
     """Factor for a figure over its limit: 1 up to the limit."""
     return 1.0 + PENALTY * max(0.0, share - 1.0)
 
@@ -254,7 +254,7 @@ def _descend(counted: _Counted, start: Array) -> None:
 
 
 #: Told how much of a tuning is done, from 0 to 1.
-Tell = Callable[[float], None]
+OnProgress = Callable[[float], None]
 #: The numbers of a set that was tuned, by the names of their ranges.
 Values = dict[str, float]
 
@@ -265,7 +265,7 @@ def tune(
     feedback: Feedback,
     plan: TuningSettings,
     starts: Sequence[Values] = (),
-    tell: Tell | None = None,
+    on_progress: OnProgress | None = None,
 ) -> Tuned:
     """Tune the rival `name` (a key of servod.lab.tune.laws.RIVALS) in one class; the same arguments give the same set.
 
@@ -283,8 +283,8 @@ def tune(
     def cost(shares: Array) -> float:
         nonlocal done
         done += 1
-        if tell:
-            tell(done / candidates)
+        if on_progress:
+            on_progress(done / candidates)
         return trial.cost(rival.build(trial.axis, values(shares))).value
 
     best = values(minimise(cost, _shares(ranges, starts), candidates, plan.seed))

@@ -27,7 +27,7 @@ from servod.lab.commission.state import (
     file_sha256,
 )
 from servod.lab.commission.steps import STEPS, rivals, validate
-from servod.lab.commission.walk import Questions, Step, Tell, Walk, WalkOptions, run
+from servod.lab.commission.walk import OnProgress, Questions, Step, Walk, WalkOptions, run
 from tests.lab.synthesize.designs import table1
 
 AXIS = VirtualWalkAxis(table1(), seed=1)
@@ -39,7 +39,7 @@ def walk_in(folder: Path, told: list[str], cut: str = "") -> Walk:
     """A walk on a small scale; the step with the title `cut` is interrupted as soon as it has done something."""
 
     @contextmanager
-    def progress(title: str) -> Iterator[Tell]:
+    def progress(title: str) -> Iterator[OnProgress]:
         def tell(_what: str, share: float) -> None:
             if title == cut and share > 0.0:
                 raise KeyboardInterrupt

@@ -37,9 +37,9 @@ from servod.lab.commission.state import (
 from servod.lab.commission.state import read_walk_json as read_json
 from servod.lab.commission.steps import STEPS as ALL_STEPS
 from servod.lab.commission.steps.deploy import Deploy
-from servod.lab.commission.steps.synthesize import NO_DESIGN, Synthesize, Verify, agreed, relaxed, tell_clashes
+from servod.lab.commission.steps.synthesize import NO_DESIGN, Synthesize, Verify, agreed, relaxed, report_clashes
 from servod.lab.commission.steps.validate import document as comparison
-from servod.lab.commission.walk import Outlook, Questions, Step, StepFailed, Tell, Walk, WalkOptions, run
+from servod.lab.commission.walk import OnProgress, Outlook, Questions, Step, StepFailed, Walk, WalkOptions, run
 from servod.lab.deploy.deployment import motion_notice
 from servod.lab.report.figure import Figure, PageTable
 from servod.lab.synthesize.deployed import Wishes
@@ -79,7 +79,7 @@ def walk_in(folder: Path, interrupted: str = "") -> Walk:
     """A walk with few plants; `interrupted` names the step whose progress brings Ctrl-C."""
 
     @contextmanager
-    def progress(title: str) -> Iterator[Tell]:
+    def progress(title: str) -> Iterator[OnProgress]:
         def tell(_what: str, share: float) -> None:
             if title == interrupted and share > 0.05:
                 raise KeyboardInterrupt
@@ -229,7 +229,7 @@ def test_clashing_vertices_are_told_and_stand_in_the_document(tmp_path: Path) ->
     told: list[str] = []
     here = replace(walk_in(tmp_path), say=told.append)
     clashes = ("low: sticking soft: poles at 1.200 of the disc (1 allowed)", "low: sliding falling: poles at 1.1")
-    tell_clashes(here, Infeasible(("low",), clashes, (Relaxation("least decay [1/s]", 5.0, 2.0),)))
+    report_clashes(here, Infeasible(("low",), clashes, (Relaxation("least decay [1/s]", 5.0, 2.0),)))
     assert told == [f"clash: {line}" for line in clashes]
     found = failure(here, StepFailed("synthesize", "no feedback"))["infeasible"]
     assert found["regions"] == ["low"] and found["clashes"] == list(clashes)
@@ -329,7 +329,7 @@ def test_the_progress_says_which_step_it_is_and_what_is_left(tmp_path: Path) -> 
     told: list[str] = []
 
     @contextmanager
-    def progress(_title: str) -> Iterator[Tell]:
+    def progress(_title: str) -> Iterator[OnProgress]:
         yield lambda what, _share: told.append(what)
 
     @dataclass(frozen=True)

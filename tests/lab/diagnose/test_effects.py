@@ -82,7 +82,7 @@ def test_starts_are_models(name: str, tmp_path_factory: pytest.TempPathFactory) 
         assert np.all(at <= high + 1e-9)
         found = hypothesis.model(at)
         assert validate(parse_yaml(axis_model_yaml(found), "model"), AxisModel, "model") == found
-        assert term.tell(hypothesis.written(at), hypothesis.values(at)[hypothesis.share(0)])
+        assert term.report(hypothesis.written(at), hypothesis.values(at)[hypothesis.share(0)])
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -96,7 +96,7 @@ def test_explained(name: str) -> None:
 
 def test_every_number_of_a_spring_has_its_own_unit() -> None:
     for term in effect("spring").terms(scene()):
-        told = {r.name: r.unit for r in term.tell(scene().document, [u.start for u in term.unknowns])}
+        told = {r.name: r.unit for r in term.report(scene().document, [u.start for u in term.unknowns])}
         assert told["stiffness"] == "N·m/rad"
         assert told["rest"] == "rad"
         assert told.get("cubic", "N·m/rad·1/rad²") == "N·m/rad·1/rad²"

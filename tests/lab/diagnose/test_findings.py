@@ -13,7 +13,7 @@ from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.effects import effect
 from servod.lab.diagnose.effects.hypothesis import Term
 from servod.lab.diagnose.effects.search_context import SearchContext
-from servod.lab.diagnose.judge.conclude import beyond_command, differs_from_zero, minor, name_findings, plainer_form
+from servod.lab.diagnose.judge.conclude import differs_from_zero, exceeds_command, minor, name_findings, plainer_form
 from servod.lab.diagnose.judge.judgement import JudgedSelection, judge
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.result import MinorReason
@@ -90,7 +90,7 @@ def test_no_effect_takes_many_times_the_largest_command(selector: Selector, time
     own = times * float(np.max(np.abs(predictor.over("torque")))) / predictor.dry
     merit = replace(judgement.selection.merits[0], own=own)
     judgement = replace(judgement, selection=judgement.selection.with_merit(0, merit))
-    assert beyond_command(judgement, 0) is beyond
+    assert exceeds_command(judgement, 0) is beyond
 
 
 def test_numbers_that_are_sure_together_alone_give_way_to_a_plainer_form(selector: Selector) -> None:

@@ -23,7 +23,12 @@ SCORING_SEED = 4711
 def field() -> dict[Feedback, dict[str, Tuned]]:
     told: list[tuple[str, float]] = []
     found = rivals(
-        joint(), seed=1, budget=24, plan=small(), processes=2, tell=lambda name, share: told.append((name, share))
+        joint(),
+        seed=1,
+        budget=24,
+        plan=small(),
+        processes=2,
+        on_progress=lambda name, share: told.append((name, share)),
     )
     shares = [share for _, share in told]
     assert shares == sorted(shares) and shares[-1] == 1.0

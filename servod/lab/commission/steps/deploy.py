@@ -46,9 +46,9 @@ class Deploy:
             )
         with (
             walk.axis.deployment(walk.path(STORE), gains, _present(walk)) as axis,
-            walk.progress(self.title) as tell,
+            walk.progress(self.title) as on_progress,
         ):
-            done = deploy(axis, gains, tell, remembered(walk), lambda before: remember(walk, before))
+            done = deploy(axis, gains, on_progress, remembered(walk), lambda before: remember(walk, before))
         _keep(walk, done)
         if not done.proven:
             raise AnswerIsNo(f"deploy: {done.said}")

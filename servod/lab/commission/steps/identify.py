@@ -37,11 +37,11 @@ class Identify:
         options, opened = walk.options, walk.axis
         if not opened.virtual:
             walk.questions.agree(_free_travel(walk))
-        with opened.experiments() as axis, walk.progress(self.title) as tell:
+        with opened.experiments() as axis, walk.progress(self.title) as on_progress:
             analysis = identify(
                 axis,
                 walk.path(RECORDINGS),
-                tell,
+                on_progress,
                 travel_rad=options.travel_rad,
                 speed_rad_s=options.speed_rad_s,
                 seed=options.seed,

@@ -46,21 +46,29 @@ class Rivals:
             write_json(walk.path(TUNING), {})
             return
         o, model = walk.options, load_axis_model(walk.path(MODEL))
-        with walk.progress(self.title) as tell:
+        with walk.progress(self.title) as on_progress:
             plan = replace(_plan(walk), seed=o.tuning_seed, budget=o.budget or BUDGET)
             found = rivals(
-                model, CONTENDERS, seed=plan.seed, budget=plan.budget, tell=tell, plan=plan, processes=o.processes
+                model,
+                CONTENDERS,
+                seed=plan.seed,
+                budget=plan.budget,
+                on_progress=on_progress,
+                plan=plan,
+                processes=o.processes,
             )
             limit = plan.roughness_limit
-            told = {
-                feedback.value: {name: _told(t, limit) for name, t in tuned.items()}
+            figures = {
+                feedback.value: {name: _figures_of(t, limit) for name, t in tuned.items()}
                 for feedback, tuned in found.items()
             }
-            tell("the deployed law by the same measures", 1.0)
-            told[Feedback.FREE.value][DEPLOYED] = _told(as_tuned(model, load_gains(walk.path(GAINS)), plan), limit)
+            on_progress("the deployed law by the same measures", 1.0)
+            figures[Feedback.FREE.value][DEPLOYED] = _figures_of(
+                as_tuned(model, load_gains(walk.path(GAINS)), plan), limit
+            )
         for feedback, name in contenders():
             write_text(rival_file(walk, feedback, name), found[feedback][name].gains.to_yaml())
-        write_json(walk.path(TUNING), told)
+        write_json(walk.path(TUNING), figures)
 
 
 def compared(walk: Walk) -> bool:
@@ -90,7 +98,7 @@ def _plan(walk: Walk) -> TuningSettings:
     )
 
 
-def _told(tuned: Tuned, limit: float) -> dict[str, float]:
+def _figures_of(tuned: Tuned, limit: float) -> dict[str, float]:
     """Roughness and its limit are multiples of what the paper's PD makes."""
     return {
         "cost_mrad": tuned.cost,

@@ -68,24 +68,24 @@ class Synthesize:
         wishes, taken = _wishes(walk, model), None
         found = _attempt(walk, self.title, model, wishes)
         if isinstance(found, Infeasible):
-            tell_clashes(walk, found)
+            report_clashes(walk, found)
             taken = agreed(walk, found)
             found = _attempt(walk, self.title, model, relaxed(model, wishes, taken))
         if isinstance(found, Infeasible):
-            tell_clashes(walk, found)
+            report_clashes(walk, found)
             raise AnswerIsNo(f"synthesize: no design even with {taken}")
         write_json(walk.path(RELAXED), asdict(taken) if taken else None)
         write_text(walk.path(DESIGN), found.to_yaml())
 
 
 def _attempt(walk: Walk, title: str, model: AxisModel, wishes: Wishes) -> GainSet | Infeasible:
-    with walk.progress(title) as tell:
-        tell("both regions", 0.1)
+    with walk.progress(title) as on_progress:
+        on_progress("both regions", 0.1)
         options = DesignOptions(name=f"{walk.axis.config.name.lower()}_local", accuracy=walk.options.accuracy)
         return synthesize(model, wishes, options, walk.path(MODEL))
 
 
-def tell_clashes(walk: Walk, found: Infeasible) -> None:
+def report_clashes(walk: Walk, found: Infeasible) -> None:
     """Which vertices clash, and what would help: for people at once, and as a file for the document of the failure."""
     write_json(walk.path(INFEASIBLE), asdict(found))
     for line in found.clashes:
@@ -138,9 +138,9 @@ def agreed(walk: Walk, found: Infeasible) -> Relaxation:
             return relaxation
     filters = [r for r in found.relaxations if r.wish not in _CHANGES]
     remedies = [f"set encoder.velocity_cutoff_hz to {r.enough:g} in the configuration" for r in filters]
-    told = [*remedies, *(f"{relaxation} would do by itself (--yes takes the first)" for relaxation in offers)]
+    proposals = [*remedies, *(f"{relaxation} would do by itself (--yes takes the first)" for relaxation in offers)]
     where = " and ".join(found.regions) or "both regions together"
-    raise AnswerIsNo(f"synthesize: no feedback for {where}; {'; '.join(told) or 'no single relaxation helps'}")
+    raise AnswerIsNo(f"synthesize: no feedback for {where}; {'; '.join(proposals) or 'no single relaxation helps'}")
 
 
 # --- Step 3 ----------------------------------------------------------------------------------------------------------
@@ -201,8 +201,8 @@ class Verify:
             yield weight, found if isinstance(found, GainSet) else None
 
     def _judged(self, walk: Walk, gains: GainSet) -> Verification:
-        with walk.progress(self.title) as tell:
-            tell(f"{walk.options.plants} plants", 0.1)
+        with walk.progress(self.title) as on_progress:
+            on_progress(f"{walk.options.plants} plants", 0.1)
             options, where = walk.options, str(walk.path(DESIGN))
             return verify(gains, options.plants, SEED, options.processes, where, least_plants=options.least_plants)
 

@@ -34,7 +34,7 @@ def measure_on_daemon(
     socket: Path,
     config: AxisConfig,
     deployed: tuple[str, int],
-    tell: Callable[[float], None],
+    on_progress: Callable[[float], None],
     gains: GainSet | None = None,
 ) -> tuple[Tracking | None, list[str]]:
     """Figures of the set `deployed` (name, version), and what the daemon refused; None where it refused (19).
@@ -48,7 +48,7 @@ def measure_on_daemon(
         axis = DaemonAxis(client)
         _require_active(axis, deployed)
         with _enabled(axis):
-            curves, refused = _recorded(axis, tell)
+            curves, refused = _recorded(axis, on_progress)
     if "paper" not in curves:
         return None, refused
     steps = {mrad: curves[f"{mrad:g}"] for mrad in STEPS_MRAD if f"{mrad:g}" in curves}
@@ -74,14 +74,14 @@ def _enabled(axis: AxisClient) -> Iterator[None]:
             axis.disable()
 
 
-def _recorded(axis: AxisClient, tell: Callable[[float], None]) -> tuple[dict[str, Curves], list[str]]:
+def _recorded(axis: AxisClient, on_progress: Callable[[float], None]) -> tuple[dict[str, Curves], list[str]]:
     """Curves by motion, "paper" or a step's size in mrad, and the motions that the daemon refused with its reason."""
     motions = {"paper": ReferenceMotion.paper(PAPER_S)}
     motions |= {f"{mrad:g}": ReferenceMotion.step(1e-3 * mrad, HOLD_S) for mrad in STEPS_MRAD}
     curves: dict[str, Curves] = {}
     refused: list[str] = []
     for index, (name, motion) in enumerate(motions.items()):
-        tell(index / len(motions))
+        on_progress(index / len(motions))
         start_rad = axis.status().reference_rad
         try:
             curves[name] = curves_of(axis.run(motion), start_rad)
@@ -147,10 +147,12 @@ def _keys() -> list[str]:
 
 def _on_daemon(walk: Walk, axis: DaemonWalkAxis, title: str) -> dict[str, Any]:
     """The deployed law alone."""
-    told = read_json(walk.path(DEPLOYMENT))["gains"]
-    deployed, gains = (told["name"], told["version"]), load_gains(walk.path(GAINS))
-    with walk.progress(title) as tell:
-        tracking, missing = measure_on_daemon(axis.socket, axis.config, deployed, partial(tell, "deployed law"), gains)
+    active = read_json(walk.path(DEPLOYMENT))["gains"]
+    deployed, gains = (active["name"], active["version"]), load_gains(walk.path(GAINS))
+    with walk.progress(title) as on_progress:
+        tracking, missing = measure_on_daemon(
+            axis.socket, axis.config, deployed, partial(on_progress, "deployed law"), gains
+        )
     if tracking:
         save_curves(run_files(walk, DEPLOYED)[1], tracking.curves)
     return document({}, tracking.document() if tracking else None, {}) | {"not_measured": missing}
@@ -163,8 +165,8 @@ def _on_virtual(walk: Walk, axis: VirtualWalkAxis, title: str) -> dict[str, Any]
     sets = {DEPLOYED: walk.path(GAINS)}
     if compared(walk):
         sets |= {f"{feedback.value}_{name}": rival_file(walk, feedback, name) for feedback, name in contenders()}
-    with walk.progress(title) as tell:
-        figures = measured(walk, axis, sets, deployed.design.velocity_cutoff_hz, tell)
+    with walk.progress(title) as on_progress:
+        figures = measured(walk, axis, sets, deployed.design.velocity_cutoff_hz, on_progress)
     if "failed" in (proven := figures.pop(DEPLOYED)):
         raise AnswerIsNo(f"validate: {proven['failed']}")
     return document(figures, proven, read_json(walk.path(TUNING)))
@@ -192,5 +194,5 @@ def document(figures: dict[str, Any], deployed: dict[str, Any] | None, tuning: d
 
 def _bounded(tuning: dict[str, Any], feedback: Feedback, name: str) -> dict[str, Any]:
     """Whether a law was tuned, and its roughness beside the limit; where nothing is compared there is neither."""
-    told = tuning.get(feedback.value, {}).get(name, {})
-    return {"tuned": name != DEPLOYED} | {key: told[key] for key in ROUGHNESS if key in told}
+    figures = tuning.get(feedback.value, {}).get(name, {})
+    return {"tuned": name != DEPLOYED} | {key: figures[key] for key in ROUGHNESS if key in figures}

@@ -52,19 +52,19 @@ def make_trace(recording: Recording, name: str, shift_s: float, model: AxisModel
     position = _unwrap(drive.position, notes)
     position = _remove_glitches(position, "position", counts, notes)
     if drive.told is None:
-        torque, told = _remove_glitches(drive.torque, "command", counts, notes), None
+        torque, command_rows = _remove_glitches(drive.torque, "command", counts, notes), None
     else:
         guessed = bool(drive.told.on.all())
         drive = driven(model, switched_on(model, replace(drive, position=position)))[1]
-        torque, told = drive.torque, drive.told
-        _leave_out_off(told.on if told else counts, drive.t_s, counts, notes, guessed=guessed)
+        torque, command_rows = drive.torque, drive.told
+        _leave_out_off(command_rows.on if command_rows else counts, drive.t_s, counts, notes, guessed=guessed)
     _note_saturation(torque, notes)
     t_s = drive.t_s - drive.t_s[0] + shift_s
     warm = recording.get(Quantity.TEMPERATURE)
     has_temperature = (
         warm is not None and bool(np.isfinite(drive.temperature_c).all()) and _temperature_changes(drive.temperature_c)
     )
-    moved = Drive(t_s, torque, position, drive.temperature_c, told)
+    moved = Drive(t_s, torque, position, drive.temperature_c, command_rows)
     return CheckedTrace(name, moved, counts, tuple(notes), has_temperature, shift_s - float(drive.t_s[0]), shift_s)
 
 
@@ -86,11 +86,11 @@ def _leave_out_off(on: Rows, t_s: Array, counts: Rows, notes: list[str], *, gues
 def _shorten_note(note: str) -> str:
     """A note whose list of names is cut."""
     head, colon, names = note.partition(": ")
-    told = names.split(", ")
-    if not head.startswith("columns not used") or len(told) <= SETTINGS.intake.names_listed:
+    unused = names.split(", ")
+    if not head.startswith("columns not used") or len(unused) <= SETTINGS.intake.names_listed:
         return note
     most = SETTINGS.intake.names_listed
-    return f"{head}{colon}{', '.join(told[:most])} and {len(told) - most} more"
+    return f"{head}{colon}{', '.join(unused[:most])} and {len(unused) - most} more"
 
 
 def _temperature_changes(temperature_c: Array) -> bool:
@@ -302,8 +302,15 @@ def factors(trace: CheckedTrace, model: AxisModel) -> tuple[Factor, Factor, floa
     slow = max(0.05 * float(np.std(v[rows])), 1e-12)
     emf = model.drive.back_emf if model.drive is not None and trace.drive.told is not None else 0.0
     motion = model.inertia * trace.acceleration + (model.friction.viscous + emf) * v
-    place = (x - float(np.mean(x[rows]))) / max(float(np.std(x[rows])), 1e-12)
-    parts = [motion, dry_friction(model) * np.tanh(v / slow), np.ones_like(x), place, place**2, place**3]
+    scaled_position = (x - float(np.mean(x[rows]))) / max(float(np.std(x[rows])), 1e-12)
+    parts = [
+        motion,
+        dry_friction(model) * np.tanh(v / slow),
+        np.ones_like(x),
+        scaled_position,
+        scaled_position**2,
+        scaled_position**3,
+    ]
     if model.gravity is not None:
         parts.append(np.sin(x + model.gravity.phase))
     design, command = np.column_stack(parts)[rows], trace.drive.torque[rows]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from servod.formats.model.friction import Asymmetry
 from servod.lab.diagnose.effects.effect import Effect, positive, share
-from servod.lab.diagnose.effects.hypothesis import PLAINER_FACTOR, Document, Reported, Teller, Term, Writer, get
+from servod.lab.diagnose.effects.hypothesis import PLAINER_FACTOR, Document, Reported, Reporter, Term, Writer, get
 from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.search_context import SearchContext
 
@@ -37,16 +37,16 @@ def _write_dry(document: Document, values: Sequence[float]) -> None:
     document["asymmetry"] = sides | {"positive_viscous": 1.0, "negative_viscous": 1.0}
 
 
-def _teller(write: Writer) -> Teller:
+def _reporter(write: Writer) -> Reporter:
     """The ratio of friction for v < 0 to that for v > 0, and the factors themselves."""
 
-    def tell(_document: Document, values: Sequence[float]) -> list[Reported]:
+    def report(_document: Document, values: Sequence[float]) -> list[Reported]:
         written: Document = {}
         write(written, values)
         found = [Reported("negative_over_positive", (1.0 - values[0]) / (1.0 + values[0]), "1")]
         return found + [Reported(key, value, "1") for key, value in written["asymmetry"].items()]
 
-    return tell
+    return report
 
 
 def terms(_scene: SearchContext) -> list[Term]:
@@ -60,7 +60,7 @@ def terms(_scene: SearchContext) -> list[Term]:
         "both, another level": (_write, (dry, viscous, level)),
         "dry, another level": (_write_dry, (dry, level)),
     }
-    return [Term("asymmetry", form, unknowns, write, _teller(write)) for form, (write, unknowns) in forms.items()]
+    return [Term("asymmetry", form, unknowns, write, _reporter(write)) for form, (write, unknowns) in forms.items()]
 
 
 def _at_level(nominal: Document, fitted: Document) -> bool:

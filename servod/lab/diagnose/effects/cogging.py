@@ -90,10 +90,10 @@ def _comb(scene: SearchContext, orders: list[int], most: float) -> Term:
         rows = document.setdefault("cogging", {}).setdefault("harmonics", [])
         rows.extend(harmonic(scene, n, amplitude, phase) for n, amplitude, phase in sines(values))
 
-    def tell(_document: Document, values: Sequence[float]) -> list[Reported]:
+    def report(_document: Document, values: Sequence[float]) -> list[Reported]:
         return report_sines(scene, sines(values), scene.force)
 
-    return Term("cogging", "orders of a turn", unknowns, write, tell)
+    return Term("cogging", "orders of a turn", unknowns, write, report)
 
 
 EFFECT = Effect(

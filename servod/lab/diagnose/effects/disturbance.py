@@ -86,11 +86,11 @@ def _term(scene: SearchContext, t_s: Array, rows: tuple[int, int], torque: float
             start_s = shift + values[0]
             group.append({"start_s": start_s, "end_s": start_s + values[1], "torque": values[2]})
 
-    def tell(_document: Document, values: Sequence[float]) -> list[Reported]:
+    def report(_document: Document, values: Sequence[float]) -> list[Reported]:
         found = [Reported("start_s", values[0], "s"), Reported("end_s", values[0] + values[1], "s")]
         return [*found, Reported("torque", values[2], scene.force)]
 
-    return Term(NAME, EVERY if len(shifts) > 1 else "in one recording", unknowns, write, tell)
+    return Term(NAME, EVERY if len(shifts) > 1 else "in one recording", unknowns, write, report)
 
 
 EFFECT = Effect(

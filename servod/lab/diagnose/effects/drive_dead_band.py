@@ -20,8 +20,8 @@ def terms(scene: SearchContext) -> list[Term]:
     """A band from some quantiles of the error; none where the servo follows a speed."""
     if not scene.servo or scene.document["drive"]["kind"] != "position_servo":
         return []
-    told = [trace.drive for trace in scene.predictor.traces if trace.drive.told is not None]
-    error = np.abs(np.concatenate([drive.told.command - drive.position for drive in told if drive.told is not None]))
+    drives = [trace.drive for trace in scene.predictor.traces if trace.drive.told is not None]
+    error = np.abs(np.concatenate([drive.told.command - drive.position for drive in drives if drive.told is not None]))
     found = []
     for start in (max(float(np.quantile(error, quantile)), 1e-9) for quantile in QUANTILES):
         band = Unknown("dead_band", scene.length, start, 0.0, 20.0 * start, start, nudge=NUDGE)

@@ -22,11 +22,11 @@ def terms(scene: SearchContext) -> list[Term]:
     if nominal <= 0.0:
         return []
 
-    def tell(document: Document, _values: Sequence[float]) -> list[Reported]:
+    def report(document: Document, _values: Sequence[float]) -> list[Reported]:
         found = get(document, "friction.coulomb")
         return [Reported("coulomb", found, scene.force), Reported("over_model", found / nominal, "1")]
 
-    return [level("dry_friction", scene.document, SCALES, tell)]
+    return [level("dry_friction", scene.document, SCALES, report)]
 
 
 def _at_level(nominal: Document, fitted: Document) -> bool:

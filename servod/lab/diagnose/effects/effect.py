@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from servod.formats.model.keys import Group
 from servod.lab.diagnose.effects.base import BACK_EMF, DRIVE_SCALES
-from servod.lab.diagnose.effects.hypothesis import LEVEL, Document, Reported, Teller, Term, Unknown, Writer, get, put
+from servod.lab.diagnose.effects.hypothesis import LEVEL, Document, Reported, Reporter, Term, Unknown, Writer, get, put
 from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.search_context import Peak, SearchContext
 
@@ -91,7 +91,7 @@ def positive(key: str, unit: str, start: float, factor: float = 1000.0) -> Unkno
     return Unknown(key, unit, start, start / factor, start * factor)
 
 
-def report_as_is(unknowns: Sequence[Unknown]) -> Teller:
+def report_as_is(unknowns: Sequence[Unknown]) -> Reporter:
     """A term whose unknowns are what is reported."""
     return lambda _document, values: [Reported(u.key, v, u.unit) for u, v in zip(unknowns, values, strict=True)]
 
@@ -113,7 +113,7 @@ def simple(effect: str, form: str, unknowns: Sequence[Unknown], **fixed: float |
     return Term(effect, form, tuple(unknowns), write, report_as_is(unknowns))
 
 
-def level(effect: str, nominal: Document, scales: tuple[str, ...], tell: Teller) -> Term:
+def level(effect: str, nominal: Document, scales: tuple[str, ...], report: Reporter) -> Term:
     """A term that is one factor on numbers of the model's own, which start at what they are in `nominal` beside it."""
 
     def write(document: Document, values: Sequence[float]) -> None:
@@ -123,7 +123,7 @@ def level(effect: str, nominal: Document, scales: tuple[str, ...], tell: Teller)
 
     own = level_factor()
     begins = {key: get(nominal, key) for key in scales if get(nominal, key) > 0.0}
-    return Term(effect, "level", (own,), write, tell, begins=begins, scales=scales)
+    return Term(effect, "level", (own,), write, report, begins=begins, scales=scales)
 
 
 def level_factor() -> Unknown:
@@ -154,11 +154,11 @@ def map_level(effect: str, dry: bool) -> Term:
     def write(document: Document, values: Sequence[float]) -> None:
         scale_friction(document, *((values[0], 1.0) if dry else (1.0, values[0])))
 
-    def tell(_document: Document, values: Sequence[float]) -> list[Reported]:
+    def report(_document: Document, values: Sequence[float]) -> list[Reported]:
         return [Reported("over_model", values[0], "1")]
 
     scales = (MAP,) if dry else (MAP, "friction.viscous")
-    return Term(effect, "level", (level_factor(),), write, tell, scales=scales)
+    return Term(effect, "level", (level_factor(),), write, report, scales=scales)
 
 
 def of_drive(effect: str, form: str, unknowns: Sequence[Unknown]) -> Term:
@@ -217,10 +217,10 @@ def sine_term(
         rows = document.setdefault(effect, {}).setdefault("harmonics", [])
         rows.extend(harmonic(scene, n, a, phase) for n, a, phase in sines(values))
 
-    def tell(_document: Document, values: Sequence[float]) -> list[Reported]:
+    def report(_document: Document, values: Sequence[float]) -> list[Reported]:
         return report_sines(scene, sines(values), unit)
 
-    return Term(effect, f"{multiples} sines" if multiples > 1 else "sine", tuple(unknowns), write, tell)
+    return Term(effect, f"{multiples} sines" if multiples > 1 else "sine", tuple(unknowns), write, report)
 
 
 def report_sines(scene: SearchContext, sines: Sequence[tuple[float, float, float]], unit: str) -> list[Reported]:

@@ -52,24 +52,24 @@ def terms(scene: SearchContext) -> list[Term]:
         _write(document, values[:2])
         document.setdefault("cogging", {}).setdefault("harmonics", []).append(harmonic(scene, SECOND, *second(values)))
 
-    def tell_linkage(document: Document, values: Sequence[float]) -> list[Reported]:
+    def report_linkage(document: Document, values: Sequence[float]) -> list[Reported]:
         amplitude, phase = second(values)
         waves = [Reported("amplitude_2", amplitude, scene.force), Reported("phase_2", phase, "rad")]
-        return [*tell(document, values), *waves]
+        return [*report(document, values), *waves]
 
-    def tell(document: Document, _values: Sequence[float]) -> list[Reported]:
+    def report(document: Document, _values: Sequence[float]) -> list[Reported]:
         units = {"amplitude": scene.force, "phase": "rad"}
         return [Reported(key, get(document, f"gravity.{key}"), unit) for key, unit in units.items()]
 
     found = []
     for sine, cosine in starts:
         unknowns = (share("sine", sine, -most, most, size), share("cosine", cosine, -most, most, size))
-        found.append(Term("gravity", "weight", unknowns, _write, tell))
+        found.append(Term("gravity", "weight", unknowns, _write, report))
     if scene.reach >= HALF_TURN:
         waves = tuple(
             share(f"{part}_2", 0.0, -MOST_OF_WEIGHT, MOST_OF_WEIGHT, MOST_OF_WEIGHT) for part in ("sine", "cosine")
         )
-        found.append(Term("gravity", "weight on a linkage", (*unknowns, *waves), write_linkage, tell_linkage))
+        found.append(Term("gravity", "weight on a linkage", (*unknowns, *waves), write_linkage, report_linkage))
     return found
 
 

@@ -68,7 +68,7 @@ class Reported:
 Writer = Callable[[Document, Sequence[float]], None]
 
 #: Turns a term's values (and the model document they stand in) into what is reported.
-Teller = Callable[[Document, Sequence[float]], list[Reported]]
+Reporter = Callable[[Document, Sequence[float]], list[Reported]]
 
 
 #: Writes what differs in one recording, by its number, into its model document.
@@ -88,7 +88,7 @@ class Term:
     form: str
     unknowns: tuple[Unknown, ...]
     write: Writer
-    tell: Teller
+    report: Reporter
     opens: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     begins: Mapping[str, float] = field(default_factory=dict)
     each: EachWriter | None = None

@@ -19,10 +19,10 @@ def terms(scene: SearchContext) -> list[Term]:
     """The model's inertia released."""
     unit = "kg" if scene.linear else "kg·m²"
 
-    def tell(document: Document, _values: Sequence[float]) -> list[Reported]:
+    def report(document: Document, _values: Sequence[float]) -> list[Reported]:
         return [Reported("inertia", get(document, "inertia"), unit)]
 
-    return [Term("inertia", "released", (), _write, tell, {"inertia": (0.05 * scene.inertia, 20.0 * scene.inertia)})]
+    return [Term("inertia", "released", (), _write, report, {"inertia": (0.05 * scene.inertia, 20.0 * scene.inertia)})]
 
 
 def _at_level(nominal: Document, fitted: Document) -> bool:

@@ -51,10 +51,10 @@ def _straight(scene: SearchContext) -> Term:
     def write(document: Document, values: Sequence[float]) -> None:
         document["offset_drift"] = {"per_s": values[0] / length}
 
-    def tell(_document: Document, values: Sequence[float]) -> list[Reported]:
+    def report(_document: Document, values: Sequence[float]) -> list[Reported]:
         return [Reported("per_s", values[0] / length, f"{scene.force}/s")]
 
-    return Term("offset_drift", "straight", (unknown,), write, tell)
+    return Term("offset_drift", "straight", (unknown,), write, report)
 
 
 def _ending(scene: SearchContext) -> Term:
@@ -70,11 +70,11 @@ def _ending(scene: SearchContext) -> Term:
     def write(document: Document, values: Sequence[float]) -> None:
         document["offset_drift"] = {"per_s": values[0] / values[1], "time_s": values[1]}
 
-    def tell(_document: Document, values: Sequence[float]) -> list[Reported]:
+    def report(_document: Document, values: Sequence[float]) -> list[Reported]:
         per_s = Reported("per_s", values[0] / values[1], f"{scene.force}/s")
         return [per_s, Reported("time_s", values[1], "s")]
 
-    return Term("offset_drift", "ending", unknowns, write, tell)
+    return Term("offset_drift", "ending", unknowns, write, report)
 
 
 EFFECT = Effect(

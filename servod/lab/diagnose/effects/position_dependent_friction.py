@@ -29,14 +29,19 @@ def _bumps(scene: SearchContext) -> list[Term]:
     bins = np.clip(np.digitize(scene.position[rows], edges) - 1, 0, 23)
     sums = np.bincount(bins, against[rows], 24)
     mean = sums / np.maximum(np.bincount(bins, minlength=24), 50)
-    place = int(np.argmax(np.abs(mean - np.median(mean))))
+    strongest = int(np.argmax(np.abs(mean - np.median(mean))))
     low, high = float(edges[0]), float(edges[-1])
     found = []
     for width in (0.05, 0.15):
         unknowns = (
-            Unknown("factor", "1", float(np.clip(mean[place], -0.5, 2.0)), -0.9, 10.0, 0.5),
+            Unknown("factor", "1", float(np.clip(mean[strongest], -0.5, 2.0)), -0.9, 10.0, 0.5),
             Unknown(
-                "position", scene.length, 0.5 * float(edges[place] + edges[place + 1]), low, high, 0.1 * scene.reach
+                "position",
+                scene.length,
+                0.5 * float(edges[strongest] + edges[strongest + 1]),
+                low,
+                high,
+                0.1 * scene.reach,
             ),
             Unknown("width", scene.length, width * scene.reach, 0.01 * scene.reach, 0.5 * scene.reach),
         )

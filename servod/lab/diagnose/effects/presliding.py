@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from servod.formats.model.friction import Presliding
 from servod.lab.diagnose.effects.base import BRISTLE_FACTOR, factor
 from servod.lab.diagnose.effects.effect import Effect, keys, positive, simple
-from servod.lab.diagnose.effects.hypothesis import Document, Reported, Teller, Term, Unknown, get
+from servod.lab.diagnose.effects.hypothesis import Document, Reported, Reporter, Term, Unknown, get
 from servod.lab.diagnose.effects.looks import Look, Split
 from servod.lab.diagnose.effects.search_context import SearchContext
 
@@ -18,14 +18,14 @@ STARTS, MOST = ((0.25, 0.5), (4.0, 2.0), (1.0, 5.0), (1.0, 0.2)), 300.0
 WAYS = (1e-4, 1e-3, 1e-2)
 
 
-def _tell(scene: SearchContext) -> Teller:
+def _reporter(scene: SearchContext) -> Reporter:
     units = {"sigma0": f"{scene.force}/{scene.length}", "sigma1": f"{scene.force}·s/{scene.length}"}
 
-    def tell(document: Document, values: Sequence[float]) -> list[Reported]:
+    def report(document: Document, values: Sequence[float]) -> list[Reported]:
         found = [Reported(key, get(document, f"friction.{key}"), unit) for key, unit in units.items()]
         return found + [Reported("damping_velocity", value, f"{scene.length}/s") for value in values]
 
-    return tell
+    return report
 
 
 def terms(scene: SearchContext) -> list[Term]:
@@ -43,11 +43,12 @@ def terms(scene: SearchContext) -> list[Term]:
     starts = STARTS if damping > 0.0 else STARTS[:2]
     begins = [{"friction.sigma0": stiff * own, "friction.sigma1": damped * damping} for stiff, damped in starts]
     found = [
-        Term("presliding", "bristle", (), lambda _d, _v: None, _tell(scene), opens, begin) for begin in ({}, *begins)
+        Term("presliding", "bristle", (), lambda _d, _v: None, _reporter(scene), opens, begin)
+        for begin in ({}, *begins)
     ]
     fading = Unknown("damping_velocity", f"{scene.length}/s", 0.1 * scene.speed, 1e-4 * scene.speed, 10.0 * scene.speed)
     write = keys("presliding", ["damping_velocity"])
-    return [*found, Term("presliding", "fading damping", (fading,), write, _tell(scene), opens)]
+    return [*found, Term("presliding", "fading damping", (fading,), write, _reporter(scene), opens)]
 
 
 def _new(scene: SearchContext, stiffness: float) -> Term:

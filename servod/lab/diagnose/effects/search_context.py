@@ -70,14 +70,14 @@ class SearchContext:
     @property
     def servo(self) -> bool:
         """Whether the torque is what a servo makes of its goal, by the drive of the model."""
-        told = any(trace.drive.told is not None for trace in self.predictor.traces)
-        return told and self.document["drive"]["kind"] in {"position_servo", "velocity"}
+        driven = any(trace.drive.told is not None for trace in self.predictor.traces)
+        return driven and self.document["drive"]["kind"] in {"position_servo", "velocity"}
 
     @cached_property
     def servo_gain(self) -> float:
         """What the servo's loop makes of an error by the model or the recording, before `gain_scale`, 1/rad."""
-        told = [trace.drive.told.gain for trace in self.predictor.traces if trace.drive.told is not None]
-        return get(self.document, "drive.kp", float(np.median(np.concatenate(told))))
+        gains = [trace.drive.told.gain for trace in self.predictor.traces if trace.drive.told is not None]
+        return get(self.document, "drive.kp", float(np.median(np.concatenate(gains))))
 
     @property
     def force(self) -> str:
@@ -206,9 +206,9 @@ class SearchContext:
         exp(i*n*x), x as the observer shows it, is turned on from order to order: a product costs a tenth of a sine and
         a cosine.
         """
-        place = self.lagged_position[self.thinned]
-        wave = np.exp(1j * orders[0] * place)
-        turn = np.exp(1j * (orders[-1] - orders[0]) / max(len(orders) - 1, 1) * place)
+        position = self.lagged_position[self.thinned]
+        wave = np.exp(1j * orders[0] * position)
+        turn = np.exp(1j * (orders[-1] - orders[0]) / max(len(orders) - 1, 1) * position)
         for n in orders:
             yield float(n), columns(float(n), wave.imag, wave.real)
             wave = wave * turn

@@ -35,18 +35,18 @@ def terms(scene: SearchContext) -> list[Term]:
         """Both terms from the middle of the range, so that the cubic does not blow up with the rest position."""
         document["spring"] = {"stiffness": values[0], "rest": middle + values[1], "cubic": values[2]}
 
-    def tell(_document: Document, values: Sequence[float]) -> list[Reported]:
+    def report(_document: Document, values: Sequence[float]) -> list[Reported]:
         return [Reported(key, value, units[key]) for key, value in written(values).items()]
 
-    def tell_centred(_document: Document, values: Sequence[float]) -> list[Reported]:
+    def report_centred(_document: Document, values: Sequence[float]) -> list[Reported]:
         found: Document = {}
         write_centred(found, values)
         return [Reported(key, value, units[key]) for key, value in found["spring"].items()]
 
     shift = share("shift", 0.0, -2.0 * scene.reach, 2.0 * scene.reach, half, scene.length)
     return [
-        Term("spring", "straight", (stiffness, torque), write, tell),
-        Term("spring", "stiffening", (stiffness, shift, cubic), write_centred, tell_centred),
+        Term("spring", "straight", (stiffness, torque), write, report),
+        Term("spring", "stiffening", (stiffness, shift, cubic), write_centred, report_centred),
     ]
 
 

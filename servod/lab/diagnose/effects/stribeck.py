@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from servod.formats.model.friction import Stribeck
 from servod.lab.diagnose.effects.base import STRIBECK_SHARE
 from servod.lab.diagnose.effects.effect import Effect
-from servod.lab.diagnose.effects.hypothesis import Document, Reported, Teller, Term, Unknown, get, put
+from servod.lab.diagnose.effects.hypothesis import Document, Reported, Reporter, Term, Unknown, get, put
 from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.search_context import SearchContext
 
@@ -15,15 +15,15 @@ from servod.lab.diagnose.effects.search_context import SearchContext
 START = 1.4
 
 
-def _tell(scene: SearchContext) -> Teller:
-    def tell(document: Document, _values: Sequence[float]) -> list[Reported]:
+def _reporter(scene: SearchContext) -> Reporter:
+    def report(document: Document, _values: Sequence[float]) -> list[Reported]:
         found = []
         for key, unit in (("static", scene.force), ("stribeck_velocity", f"{scene.length}/s"), ("exponent", "1")):
             value = get(document, f"stribeck.{key}") or get(document, f"friction.{key}")
             found += [Reported(key, value, unit)] if value else []
         return found
 
-    return tell
+    return report
 
 
 def _exponent(document: Document, values: Sequence[float]) -> None:
@@ -47,15 +47,17 @@ def terms(scene: SearchContext) -> list[Term]:
     if get(scene.document, "friction.static") <= 0.0:
         excess = Unknown("excess", "1", START - 1.0, -0.8, 10.0, 1.0)
         curves = [(excess, Unknown("velocity", unit, v, 1e-4 * scene.speed, scene.speed)) for v in speeds]
-        return [Term("stribeck", "gauss", curve, _whole, _tell(scene)) for curve in curves]
+        return [Term("stribeck", "gauss", curve, _whole, _reporter(scene)) for curve in curves]
     opens = {
         "friction.static": (0.2 * coulomb, 10.0 * coulomb),
         "friction.stribeck_velocity": (1e-4 * scene.speed, scene.speed),
     }
     begins = [{"friction.static": START * coulomb, "friction.stribeck_velocity": v} for v in speeds]
-    found = [Term("stribeck", "gauss", (), lambda _d, _v: None, _tell(scene), opens, begin) for begin in ({}, *begins)]
+    found = [
+        Term("stribeck", "gauss", (), lambda _d, _v: None, _reporter(scene), opens, begin) for begin in ({}, *begins)
+    ]
     free = Unknown("exponent", "1", 1.0, 0.4, 4.0)
-    return [*found, Term("stribeck", "free exponent", (free,), _exponent, _tell(scene), opens, begins[0])]
+    return [*found, Term("stribeck", "free exponent", (free,), _exponent, _reporter(scene), opens, begins[0])]
 
 
 def _at_level(nominal: Document, fitted: Document) -> bool:

@@ -33,7 +33,7 @@ def terms(scene: SearchContext) -> list[Term]:
     drifts = [
         share(key, 0.0, -3.0 / length, 3.0 / length, 0.3 / length, "1/s") for key in ("dry_per_s", "viscous_per_s")
     ]
-    between = [_between(drifts, len(scene.predictor.traces))] if _order_may_tell(scene) else []
+    between = [_between(drifts, len(scene.predictor.traces))] if _order_informs(scene) else []
     lasts = positive("drift_time_s", "s", FIRST * length, 10.0)
     return [
         *found,
@@ -43,7 +43,7 @@ def terms(scene: SearchContext) -> list[Term]:
     ]
 
 
-def _order_may_tell(scene: SearchContext) -> bool:
+def _order_informs(scene: SearchContext) -> bool:
     """Whether recordings may differ by their place in time: there are enough of them, and no thermometer says more.
 
     Two recordings stand in an order whatever differs between them.

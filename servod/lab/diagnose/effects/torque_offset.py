@@ -19,10 +19,10 @@ def terms(scene: SearchContext) -> list[Term]:
     """The model's offset released."""
     most = 20.0 * max(scene.dry, scene.effort)
 
-    def tell(document: Document, _values: Sequence[float]) -> list[Reported]:
+    def report(document: Document, _values: Sequence[float]) -> list[Reported]:
         return [Reported("torque_offset", get(document, "torque_offset"), scene.force)]
 
-    return [Term("torque_offset", "released", (), _write, tell, {"torque_offset": (-most, most)})]
+    return [Term("torque_offset", "released", (), _write, report, {"torque_offset": (-most, most)})]
 
 
 def _at_level(nominal: Document, fitted: Document) -> bool:

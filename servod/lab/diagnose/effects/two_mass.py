@@ -60,10 +60,10 @@ def two_mass_term(
             document["backlash"] = {"gap": document["backlash"]["gap"]}
         document[effect] = found
 
-    def tell(document: Document, values: Sequence[float]) -> list[Reported]:
+    def report(document: Document, values: Sequence[float]) -> list[Reported]:
         mass = "kg" if scene.linear else "kg·m²"
         units = {"load_inertia": mass, "stiffness": per, "gap": scene.length, "cubic": f"{per}/{scene.length}²"}
         other = f"{scene.force}·s/{scene.length}"
         return [Reported(key, value, units.get(key, other)) for key, value in values_of(document, values).items()]
 
-    return Term(effect, "stiffening" if bend > 0.0 else "two masses", tuple(unknowns), write, tell)
+    return Term(effect, "stiffening" if bend > 0.0 else "two masses", tuple(unknowns), write, report)

@@ -22,15 +22,15 @@ def terms(scene: SearchContext) -> list[Term]:
     if scene.document["friction"]["kind"] == "local":
         return [map_level("viscous_friction", dry=False)] if nominal > 0.0 else []
 
-    def tell(document: Document, _values: Sequence[float]) -> list[Reported]:
+    def report(document: Document, _values: Sequence[float]) -> list[Reported]:
         found = get(document, KEY)
         over = [Reported("over_model", found / nominal, "1")] if nominal > 0.0 else []
         return [Reported("viscous", found, unit), *over]
 
     if nominal > 0.0:
-        return [level("viscous_friction", scene.document, (KEY,), tell)]
+        return [level("viscous_friction", scene.document, (KEY,), report)]
     size = scene.dry / scene.speed
-    return [Term("viscous_friction", "new", (Unknown("viscous", unit, 0.0, 0.0, MOST * size, size),), _write, tell)]
+    return [Term("viscous_friction", "new", (Unknown("viscous", unit, 0.0, 0.0, MOST * size, size),), _write, report)]
 
 
 def _write(document: Document, values: Sequence[float]) -> None:

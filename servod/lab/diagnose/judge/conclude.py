@@ -78,7 +78,7 @@ def conclude(
 def findings(judgement: JudgedSelection) -> tuple[NamedEffect, ...]:
     """One for each effect; terms of the same effect are one finding."""
     terms = judgement.fit.hypothesis.terms
-    names = list(dict.fromkeys(terms[place].effect for place in judgement.named))
+    names = list(dict.fromkeys(terms[index].effect for index in judgement.named))
     return tuple(_finding(judgement, name, [p for p in judgement.named if terms[p].effect == name]) for name in names)
 
 
@@ -86,11 +86,11 @@ def _finding(judgement: JudgedSelection, name: str, named: Sequence[int]) -> Nam
     fit, first, selection = judgement.fit, named[0], judgement.selection
     contribution = judgement.validation.reduced[first].mismatch - fit.mismatch
     product = product_with(judgement.predictor, fit.model, name)
-    sure = min(confidence(selection, place, judgement.errors.removed) for place in named)
+    sure = min(confidence(selection, index, judgement.errors.removed) for index in named)
     others = alternatives(selection, first)
     return NamedEffect(
         effect=name,
-        forms=tuple(fit.hypothesis.terms[place].form for place in named),
+        forms=tuple(fit.hypothesis.terms[index].form for index in named),
         parameters=parameters(judgement, named),
         confidence=min(sure, SETTINGS.verdict.either) if product else sure,
         alternatives=tuple(dict.fromkeys([product, *others] if product else others)),
@@ -99,7 +99,7 @@ def _finding(judgement: JudgedSelection, name: str, named: Sequence[int]) -> Nam
         torque=selection.merits[first].torque,
         without=judgement.validation.without[first].rms,
         after=judgement.validation.after.rms,
-        signatures=tuple(signature(judgement, place) for place in named),
+        signatures=tuple(signature(judgement, index) for index in named),
         product_with=product,
     )
 
@@ -107,9 +107,9 @@ def _finding(judgement: JudgedSelection, name: str, named: Sequence[int]) -> Nam
 def parameters(judgement: JudgedSelection, named: Sequence[int]) -> dict[str, FittedValue]:
     """Reported values of the terms with their 95 % intervals; later terms of the same effect are numbered."""
     found: dict[str, FittedValue] = {}
-    for count, place in enumerate(named):
-        values = _reported(judgement.fit, place, judgement.fit.coordinates)
-        deviations = _deviations(judgement, place, values)
+    for count, index in enumerate(named):
+        values = _reported(judgement.fit, index, judgement.fit.coordinates)
+        deviations = _deviations(judgement, index, values)
         for one, deviation in zip(values, deviations, strict=True):
             name = one.name if count == 0 else f"{one.name}_term{count + 1}"
             half = SETTINGS.intervals.z95 * deviation
@@ -117,12 +117,12 @@ def parameters(judgement: JudgedSelection, named: Sequence[int]) -> dict[str, Fi
     return found
 
 
-def _reported(fit: Fit, place: int, coordinates: Array) -> list[Reported]:
+def _reported(fit: Fit, index: int, coordinates: Array) -> list[Reported]:
     document = fit.hypothesis.written(coordinates)
-    return fit.hypothesis.terms[place].tell(document, fit.hypothesis.values(coordinates)[fit.hypothesis.share(place)])
+    return fit.hypothesis.terms[index].report(document, fit.hypothesis.values(coordinates)[fit.hypothesis.share(index)])
 
 
-def _deviations(judgement: JudgedSelection, place: int, values: Sequence[Reported]) -> Array:
+def _deviations(judgement: JudgedSelection, term_index: int, values: Sequence[Reported]) -> Array:
     """Standard deviations of reported values, by their derivatives."""
     fit = judgement.fit
     slopes = np.zeros((len(values), len(fit.coordinates)))
@@ -130,7 +130,7 @@ def _deviations(judgement: JudgedSelection, place: int, values: Sequence[Reporte
     for index, nudge in enumerate(inward):
         nudged = fit.coordinates.copy()
         nudged[index] += nudge
-        there = _reported(fit, place, nudged)
+        there = _reported(fit, term_index, nudged)
         slopes[:, index] = [(b.value - a.value) / nudge for a, b in zip(values, there, strict=True)]
     covariance = judgement.covariance + bounded_error(fit)
     variances = np.einsum("ij,jk,ik->i", slopes, covariance, slopes)
@@ -140,14 +140,14 @@ def _deviations(judgement: JudgedSelection, place: int, values: Sequence[Reporte
 def minor(judgement: JudgedSelection) -> dict[str, Minor]:
     """Effects that are there but not worth naming, and those that stand in the model and are no findings."""
     terms, merits = judgement.fit.hypothesis.terms, judgement.selection.merits
-    named = {terms[place].effect for place in judgement.named}
+    named = {terms[index].effect for index in judgement.named}
     seen = {name: _minor(merit) for name, merit in judgement.selection.minor.items() if name not in named}
     for name, (merit, why) in judgement.selection.rejected.items():
         if name not in named:
             seen[name] = replace(_minor(merit), why=why)
-    for name in dict.fromkeys(terms[place].effect for place in judgement.kept):
-        those = [place for place in judgement.kept if terms[place].effect == name]
-        largest = _minor(max((merits[place] for place in those), key=lambda merit: merit.torque))
+    for name in dict.fromkeys(terms[index].effect for index in judgement.kept):
+        those = [index for index in judgement.kept if terms[index].effect == name]
+        largest = _minor(max((merits[index] for index in those), key=lambda merit: merit.torque))
         seen[name] = Minor(largest.torque, largest.share, judgement.kept[those[0]], parameters(judgement, those))
     return seen
 
@@ -163,8 +163,16 @@ def recalibrated(judgement: JudgedSelection) -> dict[str, FittedValue]:
     A factor on the model's own that is under its level is in the value.
     """
     fit = judgement.fit
-    told = {*judgement.named, *(place for place in judgement.kept if fit.hypothesis.terms[place].scales)}
-    elsewhere = {key for place in told for term in [fit.hypothesis.terms[place]] for key in (*term.opens, *term.scales)}
+    reported = {
+        *judgement.named,
+        *(term_index for term_index in judgement.kept if fit.hypothesis.terms[term_index].scales),
+    }
+    elsewhere = {
+        key
+        for term_index in reported
+        for term in [fit.hypothesis.terms[term_index]]
+        for key in (*term.opens, *term.scales)
+    }
     bounded, written = on_bound(fit), fit.hypothesis.written(fit.coordinates)
     found = {}
     for index, (unknown, nominal) in enumerate(zip(fit.hypothesis.unknowns, fit.hypothesis.base, strict=False)):
@@ -184,10 +192,10 @@ def recalibrated(judgement: JudgedSelection) -> dict[str, FittedValue]:
 def _parts_of_map(judgement: JudgedSelection) -> dict[str, FittedValue]:
     """Factors under their level on the dry or the viscous part of a friction map, which no number of the model says."""
     fit, found = judgement.fit, {}
-    for place, term in enumerate(fit.hypothesis.terms):
-        if place in judgement.named or place in judgement.kept or MAP not in term.scales:
+    for term_index, term in enumerate(fit.hypothesis.terms):
+        if term_index in judgement.named or term_index in judgement.kept or MAP not in term.scales:
             continue
-        index = fit.hypothesis.share(place).start
+        index = fit.hypothesis.share(term_index).start
         value = fit.values[index]
         half = SETTINGS.intervals.z95 * math.sqrt(max(float(judgement.covariance[index, index]), 0.0))
         if abs(value - 1.0) > max(SETTINGS.intervals.least_change, half) * value:
@@ -200,9 +208,9 @@ def _along(fit: Fit, index: int, key: str) -> Array:
     """The coordinates whose sum is the logarithm of a number of the model's own: its own, and factors on it."""
     along = np.zeros(len(fit.coordinates))
     along[index] = 1.0
-    for place, term in enumerate(fit.hypothesis.terms):
+    for term_index, term in enumerate(fit.hypothesis.terms):
         if key in term.scales:
-            along[fit.hypothesis.share(place).start] = 1.0
+            along[fit.hypothesis.share(term_index).start] = 1.0
     return along
 
 
@@ -228,9 +236,9 @@ def extended_model(judgement: JudgedSelection, nominal: AxisModel) -> AxisModel:
     document: Document = fit.hypothesis.written(_model_coordinates(judgement))
     document.pop(NAME, None)
     values = fit.values
-    for place, term in enumerate(fit.hypothesis.terms):
+    for index, term in enumerate(fit.hypothesis.terms):
         if term.effect == NAME and term.form == EVERY:
-            start, length, torque = values[fit.hypothesis.share(place)]
+            start, length, torque = values[fit.hypothesis.share(index)]
             rows = document.setdefault(NAME, {}).setdefault("windows", [])
             rows.append({"start_s": start, "end_s": start + length, "torque": torque})
     if judgement.residual is not None:
@@ -327,14 +335,14 @@ def name_findings(selector: Selector, judgement: JudgedSelection) -> JudgedSelec
     What each term is worth is said again. Terms of one effect are one finding, if one of them is.
     """
     fit, selection = judgement.fit, judgement.selection
-    for place in judgement.named:
-        merit = selector.merit(selection, judgement.validation.reduced[place], fit)
-        selection = selection.with_merit(place, merit)
+    for index in judgement.named:
+        merit = selector.merit(selection, judgement.validation.reduced[index], fit)
+        selection = selection.with_merit(index, merit)
     judgement = replace(judgement, selection=selection)
-    why = {place: _reason(judgement, place) for place in judgement.named}
-    names = {fit.hypothesis.terms[place].effect for place, reason in why.items() if reason is None}
-    named = tuple(place for place in judgement.named if fit.hypothesis.terms[place].effect in names)
-    kept = {place: reason for place, reason in why.items() if reason is not None and place not in named}
+    why = {index: _reason(judgement, index) for index in judgement.named}
+    names = {fit.hypothesis.terms[index].effect for index, reason in why.items() if reason is None}
+    named = tuple(index for index in judgement.named if fit.hypothesis.terms[index].effect in names)
+    kept = {index: reason for index, reason in why.items() if reason is not None and index not in named}
     return replace(judgement, named=named, kept=kept | _under_level(judgement))
 
 
@@ -344,32 +352,32 @@ def reject_terms(selector: Selector, judgement: JudgedSelection) -> Selection | 
     A value at the end of its range has not been measured, and what such a term takes is not explained by it. One whose
     numbers are only told from none together gives way to a plainer form of its effect first, where there is one.
     """
-    unsure = [place for place, why in judgement.kept.items() if why is MinorReason.UNSURE]
-    for place in unsure:
-        plainer = plainer_form(selector, judgement.selection, place)
-        if plainer is not None and differ_together(judgement.fit, place, judgement.covariance):
+    unsure = [index for index, why in judgement.kept.items() if why is MinorReason.UNSURE]
+    for index in unsure:
+        plainer = plainer_form(selector, judgement.selection, index)
+        if plainer is not None and differ_together(judgement.fit, index, judgement.covariance):
             return plainer
-    rejected = sorted(place for place, why in judgement.kept.items() if _goes(judgement, place, why))
+    rejected = sorted(index for index, why in judgement.kept.items() if _goes(judgement, index, why))
     selection = judgement.selection
     terms = selection.fit.hypothesis.terms
-    why = {terms[place].effect: (selection.merits[place], judgement.kept[place]) for place in rejected}
-    for place in reversed(rejected):
-        selection = selection.without_term(place, selector.settle_without(selection.fit, place))
+    why = {terms[index].effect: (selection.merits[index], judgement.kept[index]) for index in rejected}
+    for index in reversed(rejected):
+        selection = selection.without_term(index, selector.settle_without(selection.fit, index))
     return replace(selection, rejected={**selection.rejected, **why}) if rejected else None
 
 
-def plainer_form(selector: Selector, selection: Selection, place: int) -> Selection | None:
+def plainer_form(selector: Selector, selection: Selection, index: int) -> Selection | None:
     """The selection with the best form of a term's effect that needs fewer numbers; None where there is none.
 
     Friction by the applied torque and by the load, both at once, is sure together and neither alone.
     """
     fit = selection.fit
-    own, share = fit.hypothesis.terms[place], fit.hypothesis.share(place)
+    own, share = fit.hypothesis.terms[index], fit.hypothesis.share(index)
     scene = SearchContext(selector.start.document, selector.predictor, selection.base.mismatch)
     fits = []
     for term in effect(own.effect).terms(scene):
         if term.unknowns and term.numbers < own.numbers:
-            terms = (*fit.hypothesis.terms[:place], term, *fit.hypothesis.terms[place + 1 :])
+            terms = (*fit.hypothesis.terms[:index], term, *fit.hypothesis.terms[index + 1 :])
             start = [unknown.coordinate(unknown.start) for unknown in term.unknowns]
             at = np.concatenate([fit.coordinates[: share.start], start, fit.coordinates[share.stop :]])
             fits.append(selector.settle(replace(fit.hypothesis, terms=terms), at, fit.mismatch))
@@ -378,17 +386,17 @@ def plainer_form(selector: Selector, selection: Selection, place: int) -> Select
     return replace(selection, fit=min(fits, key=lambda one: selector.error(one.mismatch)))
 
 
-def _goes(judgement: JudgedSelection, place: int, why: MinorReason) -> bool:
+def _goes(judgement: JudgedSelection, index: int, why: MinorReason) -> bool:
     """Whether a term goes for a reason: one that is only not told from none stays where unseen rows need it.
 
     Not where a plainer effect is within it: what it took there is that one's. One that is too small for a name goes
     where it would add a resonance to the model.
     """
     if why is MinorReason.UNSURE:
-        plainer = any(judgement.fit.hypothesis.terms[place].effect in one.within for one in effects())
-        return plainer or judgement.removed_share(place) < SETTINGS.worth.share
+        plainer = any(judgement.fit.hypothesis.terms[index].effect in one.within for one in effects())
+        return plainer or judgement.removed_share(index) < SETTINGS.worth.share
     if why is MinorReason.SMALL:
-        return effect(judgement.fit.hypothesis.terms[place].effect).resonant
+        return effect(judgement.fit.hypothesis.terms[index].effect).resonant
     return why in {MinorReason.AT_END, MinorReason.BEYOND}
 
 
@@ -397,75 +405,75 @@ def _under_level(judgement: JudgedSelection) -> dict[int, MinorReason]:
     twin = shorter_twin(judgement.fit)
     terms = enumerate(judgement.fit.hypothesis.terms)
     return {
-        place: MinorReason.TWIN if term.effect == twin else MinorReason.LEVEL
-        for place, term in terms
-        if place not in judgement.named and term.unknowns and not term.scales
+        index: MinorReason.TWIN if term.effect == twin else MinorReason.LEVEL
+        for index, term in terms
+        if index not in judgement.named and term.unknowns and not term.scales
     }
 
 
-def _reason(judgement: JudgedSelection, place: int) -> MinorReason | None:
+def _reason(judgement: JudgedSelection, index: int) -> MinorReason | None:
     """Why a term is no finding; None if it is one."""
     fit = judgement.fit
-    merit = replace(judgement.selection.merits[place], share=_share(judgement, place))
-    if not large_enough(merit, is_level_change(fit.hypothesis.terms[place])):
+    merit = replace(judgement.selection.merits[index], share=_share(judgement, index))
+    if not large_enough(merit, is_level_change(fit.hypothesis.terms[index])):
         return MinorReason.SMALL
-    if at_end_of_range(fit, place):
+    if at_end_of_range(fit, index):
         return MinorReason.AT_END
-    if beyond_command(judgement, place):
+    if exceeds_command(judgement, index):
         return MinorReason.BEYOND
-    return None if differs_from_zero(fit, place, judgement.covariance) else MinorReason.UNSURE
+    return None if differs_from_zero(fit, index, judgement.covariance) else MinorReason.UNSURE
 
 
-def beyond_command(judgement: JudgedSelection, place: int) -> bool:
+def exceeds_command(judgement: JudgedSelection, index: int) -> bool:
     """Whether a term makes torques that nothing in the recordings holds against: units are mixed up then.
 
     Factors on the model's own, or on the command, are judged by their ranges.
     """
-    term, predictor = judgement.fit.hypothesis.terms[place], judgement.predictor
+    term, predictor = judgement.fit.hypothesis.terms[index], judgement.predictor
     if term.scales or effect(term.effect).scales_torques or effect(term.effect).drive_keys:
         return False
     largest = float(np.max(np.abs(predictor.over("torque"))))
-    return judgement.selection.merits[place].own * predictor.dry > SETTINGS.worth.most_of_command * largest
+    return judgement.selection.merits[index].own * predictor.dry > SETTINGS.worth.most_of_command * largest
 
 
-def _share(judgement: JudgedSelection, place: int) -> float:
+def _share(judgement: JudgedSelection, index: int) -> float:
     """The share of the explainable error on unseen rows that a term takes, where it shows."""
-    rows = judgement.removed_share(place)
-    if judgement.fit.hypothesis.terms[place].effect != DRIFT[0]:
+    rows = judgement.removed_share(index)
+    if judgement.fit.hypothesis.terms[index].effect != DRIFT[0]:
         return rows
     validation = judgement.validation
-    parts = (validation.without[place], validation.after, validation.before)
+    parts = (validation.without[index], validation.after, validation.before)
     without, after, before = (power_of_means(judgement.predictor, held.mismatch) for held in parts)
     return max(rows, (without - after) / max(before, 1e-30))
 
 
-def differs_from_zero(fit: Fit, place: int, covariance: Array) -> bool:
+def differs_from_zero(fit: Fit, index: int, covariance: Array) -> bool:
     """Whether nothing at all lies outside the region of 95 % of what says how large a term is.
 
     Numbers that are only sure together are not: one of them must lie outside its own interval around nothing too, lest
     a report show an effect none of whose numbers is told from none. A term whose size has no zero, such as a stiffness
     or a limit, is told by what it takes alone.
     """
-    sizes = _sizes(fit, place)
+    sizes = _sizes(fit, index)
     half = SETTINGS.intervals.z95 * np.sqrt(np.maximum(np.diag(covariance)[sizes], 0.0))
     alone = not sizes or bool(np.any(np.abs(fit.coordinates[sizes]) > half))
-    return alone and differ_together(fit, place, covariance)
+    return alone and differ_together(fit, index, covariance)
 
 
-def differ_together(fit: Fit, place: int, covariance: Array) -> bool:
+def differ_together(fit: Fit, index: int, covariance: Array) -> bool:
     """Whether nothing at all lies outside the region of 95 % of all sizes of a term."""
-    unknowns, share = fit.hypothesis.unknowns, fit.hypothesis.share(place)
+    unknowns, share = fit.hypothesis.unknowns, fit.hypothesis.share(index)
     own = range(share.start, share.stop)
     deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     if any(unknowns[i].key in POSITIVE and SETTINGS.intervals.z95 * deviations[i] >= 1.0 for i in own):
         return False
-    sizes = _sizes(fit, place)
+    sizes = _sizes(fit, index)
     return not sizes or not inside_region(fit.coordinates[sizes], covariance[np.ix_(sizes, sizes)])
 
 
-def _sizes(fit: Fit, place: int) -> list[int]:
+def _sizes(fit: Fit, term_index: int) -> list[int]:
     """Places of the coordinates of a term that say how large it is."""
-    share = fit.hypothesis.share(place)
+    share = fit.hypothesis.share(term_index)
     return [index for index in range(share.start, share.stop) if _has_none(fit.hypothesis.unknowns[index])]
 
 

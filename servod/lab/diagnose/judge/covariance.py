@@ -48,12 +48,12 @@ def model_error(fit: Fit) -> Array:
     )
     linear = np.array([unknown.size != 0.0 for unknown in fit.hypothesis.unknowns])
     sizes[linear] = np.abs(fit.coordinates[linear])
-    for place, term in enumerate(fit.hypothesis.terms):
+    for index, term in enumerate(fit.hypothesis.terms):
         waves = [u.key.startswith(("sine", "cosine")) for u in term.unknowns]
-        some = np.arange(len(sizes))[fit.hypothesis.share(place)][np.array(waves, dtype=bool)]
+        some = np.arange(len(sizes))[fit.hypothesis.share(index)][np.array(waves, dtype=bool)]
         sizes[some] = np.linalg.norm(fit.coordinates[some])
         orders = [u.key == "n" for u in term.unknowns]
-        sizes[np.arange(len(sizes))[fit.hypothesis.share(place)][np.array(orders, dtype=bool)]] = 1.0
+        sizes[np.arange(len(sizes))[fit.hypothesis.share(index)][np.array(orders, dtype=bool)]] = 1.0
     return np.diag((SETTINGS.intervals.model_error * sizes) ** 2)
 
 
@@ -67,8 +67,8 @@ def common_factor(fit: Fit) -> Array:
         return np.zeros((size, size))
     along = np.zeros(size)
     along[: len(scaled)][scaled] = 1.0
-    for place in gains:
-        along[fit.hypothesis.share(place)] = 1.0
+    for index in gains:
+        along[fit.hypothesis.share(index)] = 1.0
     known = sum(unknowns[i].spread ** -2.0 for i in np.flatnonzero(scaled))
     if fit.hypothesis.document["friction"]["kind"] == "local":  # a map is no unknown, and known as well as one
         known += KNOWN_WITHIN**-2.0

@@ -24,14 +24,14 @@ Array = NDArray[np.float64]
 _HALVES = {Split.DIRECTION: ("forward", "back"), Split.LOAD: ("command above zero", "command below zero")}
 
 
-def signature(judgement: JudgedSelection, place: int) -> Signature:
-    """What is left without the term at `place`, and what it makes of it, over its coordinate and over time."""
-    predictor, shown = judgement.predictor, effect(judgement.fit.hypothesis.terms[place].effect).look
-    without, left = judgement.validation.reduced[place].mismatch, judgement.fit.mismatch
+def signature(judgement: JudgedSelection, term_index: int) -> Signature:
+    """What is left without the term at `term_index`, and what it makes of it, over its coordinate and over time."""
+    predictor, shown = judgement.predictor, effect(judgement.fit.hypothesis.terms[term_index].effect).look
+    without, left = judgement.validation.reduced[term_index].mismatch, judgement.fit.mismatch
     term = without - left
     known = coordinates(predictor)
     unit, values = known.get(shown.coordinate, known["position"])
-    period = _period(judgement, place, values) if shown.periodic else None
+    period = _period(judgement, term_index, values) if shown.periodic else None
     if period is not None:
         values = values % period
     parts = tuple(
@@ -42,7 +42,7 @@ def signature(judgement: JudgedSelection, place: int) -> Signature:
     trace, begun = predictor.traces[index], predictor.slices[index].start + first
     here, t_s = slice(begun, begun + rows), trace.drive.t_s[first : first + rows] - trace.shift_s
     return Signature(
-        place + 1, shown.coordinate, unit, period, parts, trace.name, t_s, without[here], term[here], left[here]
+        term_index + 1, shown.coordinate, unit, period, parts, trace.name, t_s, without[here], term[here], left[here]
     )
 
 
@@ -60,22 +60,22 @@ def _part(name: str, values: Array, without: Array, term: Array, rows: NDArray[n
     if int(rows.sum()) < 2 * SETTINGS.maps.least_in_bin:
         return SignaturePart(name, *(np.zeros(0) for _ in range(4)))
     edges = np.unique(np.quantile(values[rows], np.linspace(0.0, 1.0, SETTINGS.curves.signature_bins + 1)))
-    place = np.clip(np.searchsorted(edges, values[rows], side="right") - 1, 0, max(len(edges) - 2, 0))
-    count = np.bincount(place)
+    bin_index = np.clip(np.searchsorted(edges, values[rows], side="right") - 1, 0, max(len(edges) - 2, 0))
+    count = np.bincount(bin_index)
     full = count >= min(SETTINGS.maps.least_in_bin, count.max())
     middle, left, made = (
-        (np.bincount(place, part[rows]) / np.maximum(count, 1))[full] for part in (values, without, term)
+        (np.bincount(bin_index, part[rows]) / np.maximum(count, 1))[full] for part in (values, without, term)
     )
-    square = (np.bincount(place, without[rows] ** 2) / np.maximum(count, 1))[full]
+    square = (np.bincount(bin_index, without[rows] ** 2) / np.maximum(count, 1))[full]
     independent = np.maximum(count[full] / SETTINGS.curves.correlated_rows, 1.0)
     return SignaturePart(name, middle, left, 2.0 * np.sqrt(np.maximum(square - left**2, 0.0) / independent), made)
 
 
-def _period(judgement: JudgedSelection, place: int, values: Array) -> float | None:
+def _period(judgement: JudgedSelection, index: int, values: Array) -> float | None:
     """The period of a periodic term where many of them lie in the range."""
     fit = judgement.fit
-    reported = fit.hypothesis.terms[place].tell(
-        fit.hypothesis.written(fit.coordinates), fit.values[fit.hypothesis.share(place)]
+    reported = fit.hypothesis.terms[index].report(
+        fit.hypothesis.written(fit.coordinates), fit.values[fit.hypothesis.share(index)]
     )
     found = {one.name: one.value for one in reported}
     if "periods_per_turn" in found:
@@ -118,10 +118,10 @@ def spectrum(predictor: Predictor, error: Array) -> Spectrum:
     for trace, part in zip(predictor.traces, predictor.slices, strict=True):
         length = min(len(error[part]), round(SETTINGS.curves.window_s / trace.period_s))
         frequency, density = welch(error[part], 1.0 / trace.period_s, nperseg=length)
-        place = np.digitize(frequency, edges) - 1
-        inside = (place >= 0) & (place < bands)
-        power += np.bincount(place[inside], density[inside], bands)
-        rows += np.bincount(place[inside], minlength=bands)
+        band_index = np.digitize(frequency, edges) - 1
+        inside = (band_index >= 0) & (band_index < bands)
+        power += np.bincount(band_index[inside], density[inside], bands)
+        rows += np.bincount(band_index[inside], minlength=bands)
     full = rows > 0
     middles = np.sqrt(edges[:-1] * edges[1:])[full]
     return Spectrum(middles, np.sqrt(np.maximum(power[full] / rows[full], 1e-300)))

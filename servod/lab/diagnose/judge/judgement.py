@@ -38,12 +38,12 @@ Rows = NDArray[np.bool_]
 
 def residual_table(predictor: Predictor, mismatch: Array) -> ResidualTable | None:
     """The table that predicts most of the mismatch of unseen stretches; None where none predicts enough."""
-    found = [_table(name, values, predictor, mismatch) for name, values in _places(predictor).items()]
+    found = [_table(name, values, predictor, mismatch) for name, values in _table_coordinates(predictor).items()]
     best = max(found, key=lambda table: table.share)
     return best if best.share >= SETTINGS.maps.table_least_share else None
 
 
-def _places(predictor: Predictor) -> dict[str, Array]:
+def _table_coordinates(predictor: Predictor) -> dict[str, Array]:
     """Coordinates of tables, as late as the observer shows a torque there."""
     late = 2.0 * SETTINGS.observer.poles_damping / predictor.rate
     velocity = predictor.over("velocity")
@@ -85,7 +85,9 @@ def _with_tables(predictor: Predictor, folds: Folds, held: HeldOutErrors, coordi
     """The models of every fold with a table over `coordinate` that has not seen the fold's rows either."""
     found = []
     for out, fold in zip(folds.parts, held.folds, strict=True):
-        table = _table(coordinate, _places(predictor)[coordinate], predictor, predictor.mismatch(*fold.models), ~out)
+        table = _table(
+            coordinate, _table_coordinates(predictor)[coordinate], predictor, predictor.mismatch(*fold.models), ~out
+        )
         documents = [document_of(model) for model in fold.models]
         for document in documents:
             write_table(document, table)
@@ -95,13 +97,13 @@ def _with_tables(predictor: Predictor, folds: Folds, held: HeldOutErrors, coordi
 
 def hats(values: Array, grid: Array) -> Array:
     """Piecewise linear basis on `grid`, zero outside."""
-    place = np.clip(np.searchsorted(grid, values, side="right") - 1, 0, len(grid) - 2)
-    share = (values - grid[place]) / (grid[place + 1] - grid[place])
+    node = np.clip(np.searchsorted(grid, values, side="right") - 1, 0, len(grid) - 2)
+    share = (values - grid[node]) / (grid[node + 1] - grid[node])
     inside = (values >= grid[0]) & (values <= grid[-1])
     design = np.zeros((len(values), len(grid)))
     row = np.arange(len(values))
-    design[row, place] = np.where(inside, 1.0 - share, 0.0)
-    design[row, place + 1] = np.where(inside, share, 0.0)
+    design[row, node] = np.where(inside, 1.0 - share, 0.0)
+    design[row, node + 1] = np.where(inside, share, 0.0)
     return design
 
 
@@ -136,10 +138,10 @@ class JudgedSelection:
         """The fit that stands."""
         return self.selection.fit
 
-    def removed_share(self, place: int) -> float:
+    def removed_share(self, index: int) -> float:
         """The share of the explainable error on unseen rows that a named term removes."""
         unseen = self.unseen
-        without = float(np.mean(self.validation.without[place].mismatch[self.predictor.counts] ** 2))
+        without = float(np.mean(self.validation.without[index].mismatch[self.predictor.counts] ** 2))
         return max(without - unseen.after**2, 0.0) / above_noise(unseen.before**2, unseen.floor**2)
 
 

@@ -87,10 +87,10 @@ def map_over(
     edges = np.unique(np.quantile(values[rows], np.linspace(0.0, 1.0, bins + 1)))
     if len(edges) < 3:
         edges = np.array([edges[0] - 0.5, edges.mean(), edges[-1] + 0.5])
-    place = np.clip(np.searchsorted(edges, values[rows], side="right") - 1, 0, len(edges) - 2)
-    here, count = mismatch[rows], np.bincount(place, minlength=len(edges) - 1)
-    mean = np.bincount(place, here, len(edges) - 1) / np.maximum(count, 1)
-    square = np.bincount(place, here**2, len(edges) - 1) / np.maximum(count, 1)
+    bin_index = np.clip(np.searchsorted(edges, values[rows], side="right") - 1, 0, len(edges) - 2)
+    here, count = mismatch[rows], np.bincount(bin_index, minlength=len(edges) - 1)
+    mean = np.bincount(bin_index, here, len(edges) - 1) / np.maximum(count, 1)
+    square = np.bincount(bin_index, here**2, len(edges) - 1) / np.maximum(count, 1)
     independent = np.maximum(count / memory, 1.0)
     error = np.sqrt(np.maximum(square - mean**2, 0.0) / independent)
     alike = float(np.mean(here))
@@ -142,9 +142,9 @@ def _strong(values: Array, effect: Array, counts: NDArray[np.bool_]) -> dict[str
     edges = np.unique(np.quantile(values[rows], np.linspace(0.0, 1.0, 13)))
     if len(edges) < 3:
         return {"from": float(values[rows].min()), "to": float(values[rows].max())}
-    place = np.clip(np.searchsorted(edges, values[rows], side="right") - 1, 0, len(edges) - 2)
-    count = np.maximum(np.bincount(place, minlength=len(edges) - 1), 1)
-    power = np.bincount(place, effect[rows] ** 2, len(edges) - 1) / count
+    bin_index = np.clip(np.searchsorted(edges, values[rows], side="right") - 1, 0, len(edges) - 2)
+    count = np.maximum(np.bincount(bin_index, minlength=len(edges) - 1), 1)
+    power = np.bincount(bin_index, effect[rows] ** 2, len(edges) - 1) / count
     strong = np.flatnonzero(power > SETTINGS.maps.strong * power.max())
     return {"from": float(edges[strong[0]]), "to": float(edges[strong[-1] + 1])}
 

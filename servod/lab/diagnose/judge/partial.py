@@ -27,11 +27,11 @@ def partial_answer(judgement: JudgedSelection) -> PartialAnswer | None:
         return None
     terms = whole.fit.hypothesis.terms
     found = []
-    for name in dict.fromkeys(terms[place].effect for place in whole.named):
-        places = [place for place in whole.named if terms[place].effect == name]
-        share = min(sum(whole.removed_share(place) for place in places), whole.removed_by_known)
+    for name in dict.fromkeys(terms[index].effect for index in whole.named):
+        terms_of_effect = [index for index in whole.named if terms[index].effect == name]
+        share = min(sum(whole.removed_share(index) for index in terms_of_effect), whole.removed_by_known)
         if share >= SETTINGS.verdict.least_partial:
-            found.append(PartialEffect(name, share, parameters(whole, places)))
+            found.append(PartialEffect(name, share, parameters(whole, terms_of_effect)))
     return PartialAnswer(tuple(found), whole.removed_by_known, whole.maps_after[0].coordinate) if found else None
 
 

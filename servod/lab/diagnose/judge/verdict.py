@@ -64,8 +64,8 @@ def without_event(predictor: Predictor, mismatch: Array) -> NDArray[np.bool_]:
     worst = np.argsort(-power)[:few]
     if len(parts) < SETTINGS.verdict.event_of or float(power[worst].sum()) < SETTINGS.verdict.event_power * power.sum():
         return kept
-    for place in worst:
-        kept[parts[place]] = False
+    for worst_part in worst:
+        kept[parts[worst_part]] = False
     return kept if kept.any() else predictor.counts
 
 

@@ -26,7 +26,7 @@ def noise_floor(predictor: Predictor, mismatch: Array) -> float:
 
 def above_noise(error: float, floor: float) -> float:
     """What of a mean square lies above the floor; the least that a floor, itself an estimate, can tell from none."""
-    return max(error - floor, SETTINGS.floor.told * error, 1e-30)
+    return max(error - floor, SETTINGS.floor.least_share * error, 1e-30)
 
 
 def trace_floor(predictor: Predictor, index: int, mismatch: Array) -> float:

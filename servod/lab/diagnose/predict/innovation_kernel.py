@@ -211,8 +211,8 @@ def innovate(
         now, whole = t[k], t[k + 1] - t[k]
         dry, viscous = thermal_factors(p, s, temperature[k])
         loss = 0.0
-        beyond = max(abs(off) - quiet, 0.0)
-        pull = math.copysign(position_gain[k] * beyond / whole, off) if whole > 0.0 else 0.0
+        excess = max(abs(off) - quiet, 0.0)
+        pull = math.copysign(position_gain[k] * excess / whole, off) if whole > 0.0 else 0.0
         if steps[k] == 1:
             row, command = mean_command(t, torque, before, row, p.delay_s, now, t[k + 1])
             acceleration = step(p, tables, s, command, whole, acceleration, dry, viscous, pull)

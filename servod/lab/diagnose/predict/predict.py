@@ -151,8 +151,8 @@ def middle_frequency(drive: Drive) -> float:
     total = np.cumsum(power)
     if total[-1] <= 0.0:
         return 0.0
-    place = int(np.searchsorted(total, 0.5 * total[-1]))
-    return 2.0 * math.pi * place / (len(drive.torque) * drive.period_s)
+    line = int(np.searchsorted(total, 0.5 * total[-1]))
+    return 2.0 * math.pi * line / (len(drive.torque) * drive.period_s)
 
 
 def command_rms(drive: Drive) -> float:

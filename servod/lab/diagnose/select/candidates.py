@@ -31,23 +31,23 @@ ALIKE, ALIKE_OF_ALL = 0.15, 0.01
 class Candidate:
     """An effect on trial: its fit, and what is left of the cost of the present fit as a share of it.
 
-    `place` is that of its own term in the fit: the last, unless others came in behind it.
+    `term_index` is that of its own term in the fit: the last, unless others came in behind it.
     """
 
     effect: str
     fit: Fit
     left: float
-    place: int = -1
+    term_index: int = -1
 
     @property
     def term(self) -> Term:
         """The effect in the form that was fitted."""
-        return self.fit.hypothesis.terms[self.place]
+        return self.fit.hypothesis.terms[self.term_index]
 
     @property
     def own(self) -> Array:
         """Coordinates of the term's own unknowns."""
-        return self.fit.coordinates[self.fit.hypothesis.share(self.place)]
+        return self.fit.coordinates[self.fit.hypothesis.share(self.term_index)]
 
 
 class CandidateFits:

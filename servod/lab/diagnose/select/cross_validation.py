@@ -42,13 +42,13 @@ def _validated(selector: Selector, selection: Selection) -> CrossValidation:
     """Errors on unseen rows before and after, and without each term at the level of its effect."""
     predictor, fit, base = selector.predictor, selection.fit, selection.base
     named = named_terms(fit, selector.start.document)
-    selector.tell("held-out recordings")
-    reduced = {place: selector.settle_without(fit, place) for place in named}
+    selector.on_progress("held-out recordings")
+    reduced = {index: selector.settle_without(fit, index) for index in named}
     folds = make_folds(predictor, fit)
     before = predict_held_out(predictor, base, folds)
     after = predict_held_out(predictor, fit, folds) if fit is not base else before
     alone = len(named) == 1 and selection.terms == 1
-    without = {place: before if alone else predict_held_out(predictor, one, folds) for place, one in reduced.items()}
+    without = {index: before if alone else predict_held_out(predictor, one, folds) for index, one in reduced.items()}
     return CrossValidation(named, reduced, folds, before, after, without)
 
 
@@ -60,13 +60,13 @@ def _worst(selection: Selection, validation: CrossValidation) -> int | None:
     """
     events = single_events(selection.fit.hypothesis)
     others = {
-        place: held.rms
-        for place, held in validation.without.items()
+        index: held.rms
+        for index, held in validation.without.items()
         if held.rms <= validation.after.rms
-        and place not in events
+        and index not in events
         and predicts_most(held, validation.after, validation.folds)
     }
-    return min(others, key=lambda place: others[place]) if others else None
+    return min(others, key=lambda index: others[index]) if others else None
 
 
 def predicts_most(one: HeldOutErrors, other: HeldOutErrors, folds: Folds) -> bool:
@@ -105,9 +105,9 @@ def _rows(predictor: Predictor, parts: list[slice]) -> Rows:
 def _events(predictor: Predictor, fit: Fit) -> Rows:
     """Rows in and shortly behind the events that stand in one recording only."""
     t_s, found = predictor.over("t_s"), np.zeros(len(predictor.counts), dtype=bool)
-    for place in single_events(fit.hypothesis):
+    for index in single_events(fit.hypothesis):
         document: dict[str, Any] = {}
-        fit.hypothesis.terms[place].write(document, fit.values[fit.hypothesis.share(place)])
+        fit.hypothesis.terms[index].write(document, fit.values[fit.hypothesis.share(index)])
         for window in document[NAME]["windows"]:
             found |= (t_s >= window["start_s"]) & (t_s <= window["end_s"] + SETTINGS.validation.tail_s)
     return found
@@ -116,8 +116,8 @@ def _events(predictor: Predictor, fit: Fit) -> Rows:
 def single_events(hypothesis: Hypothesis) -> list[int]:
     """Places of the terms that are events in one recording: no other recording predicts them."""
     return [
-        place
-        for place, term in enumerate(hypothesis.terms)
+        index
+        for index, term in enumerate(hypothesis.terms)
         if term.effect == NAME and term.form != EVERY
     ]  # fmt: skip
 
@@ -141,8 +141,8 @@ def _refit(predictor: Predictor, fit: Fit, seen: Rows) -> Fit:
     if seen.sum() < len(fit.coordinates):
         return fit
     jacobian = fit.jacobian.copy(order="K")
-    for place in single_events(fit.hypothesis):
-        jacobian[:, fit.hypothesis.share(place)] = 0.0
+    for index in single_events(fit.hypothesis):
+        jacobian[:, fit.hypothesis.share(index)] = 0.0
     scale = scale_of(fit.mismatch, seen, 1e-3 * predictor.dry)
     fitter = Fitter(predictor, Weighing(scale, seen.astype(np.float64)))
     begun = fitter.begin(fit.hypothesis, fit.coordinates, jacobian)

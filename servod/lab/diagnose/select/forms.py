@@ -34,9 +34,9 @@ TURNS = 3
 def better_forms(selector: Selector, selection: Selection) -> Selection:
     """The selection with every term in that of its forms which explains most beside the others."""
     before = selection.fit
-    for place in range(selection.terms):
+    for index in range(selection.terms):
         for _ in range(TURNS):
-            found = _better_form(selector, selection, place)
+            found = _better_form(selector, selection, index)
             if found is selection:
                 break
             selection = found
@@ -45,14 +45,14 @@ def better_forms(selector: Selector, selection: Selection) -> Selection:
     return judged_again(selector, selector.lower_floor(selection, selection.fit.mismatch))
 
 
-def _better_form(selector: Selector, selection: Selection, place: int) -> Selection:
+def _better_form(selector: Selector, selection: Selection, index: int) -> Selection:
     """The selection with one of its terms in the best of its other forms, or as it is."""
-    for fit in _other_forms(selector, selection, place):
+    for fit in _other_forms(selector, selection, index):
         limit = 1.0 if _numbers(fit) < _numbers(selection.fit) else CHEAPER
         if _cost(selector, selection.fit, fit) < limit * _cost(selector, selection.fit, selection.fit):
-            merit = selector.merit(selection, selector.settle_without(fit, place), fit)
-            if selector.may_enter(selection, merit, fit, place):
-                selection = replace(selection.with_merit(place, merit), fit=fit)
+            merit = selector.merit(selection, selector.settle_without(fit, index), fit)
+            if selector.may_enter(selection, merit, fit, index):
+                selection = replace(selection.with_merit(index, merit), fit=fit)
     return selection
 
 
@@ -67,36 +67,36 @@ def _numbers(fit: Fit) -> int:
     return sum(term.numbers for term in fit.hypothesis.terms)
 
 
-def _other_forms(selector: Selector, selection: Selection, place: int) -> list[Fit]:
+def _other_forms(selector: Selector, selection: Selection, term_index: int) -> list[Fit]:
     """The fit with each other form of one of its terms, fitted to its end; the fewest numbers first."""
     present = selection.fit
-    own, found = present.hypothesis.terms[place], list[Fit]()
-    kept = np.delete(present.coordinates, present.hypothesis.share(place))
-    without = selector.fitter(present.mismatch).mismatch(present.hypothesis.without(place), kept)
+    own, found = present.hypothesis.terms[term_index], list[Fit]()
+    kept = np.delete(present.coordinates, present.hypothesis.share(term_index))
+    without = selector.fitter(present.mismatch).mismatch(present.hypothesis.without(term_index), kept)
     if without is None:
         return found
-    document = present.hypothesis.without(place).written(kept)
+    document = present.hypothesis.without(term_index).written(kept)
     scene = SearchContext(selector.start.document, selector.predictor, without, present=document)
     forms = {term.form: term for term in reversed(effect(own.effect).terms(scene)) if term.each is None}
     for term in sorted(forms.values(), key=lambda term: term.numbers):
         if term.form == own.form or monotonic() > selector.deadline:
             continue
-        terms = tuple(term if index == place else other for index, other in enumerate(present.hypothesis.terms))
+        terms = tuple(term if index == term_index else other for index, other in enumerate(present.hypothesis.terms))
         hypothesis = replace(present.hypothesis, terms=terms)
-        starts = _starts(present, hypothesis, place, far=effect(own.effect).far)
+        starts = _starts(present, hypothesis, term_index, far=effect(own.effect).far)
         fits = [fit for at in starts if (fit := settled(selector, hypothesis, at, present.mismatch)) is not None]
         found += sorted(fits, key=lambda fit: _cost(selector, present, fit))[:1]
     return found
 
 
-def _starts(present: Fit, hypothesis: Hypothesis, place: int, far: bool) -> list[Array]:
+def _starts(present: Fit, hypothesis: Hypothesis, index: int, far: bool) -> list[Array]:
     """Coordinates with those numbers of the other form as they are that it shares with the present one.
 
     Where the present form has borrowed from the model's own parameters, those stand far away: they begin at the nominal
     model as well.
     """
-    old = present.hypothesis.share(place)
-    own = _carried(present.hypothesis.terms[place], hypothesis.terms[place], present.coordinates[old])
+    old = present.hypothesis.share(index)
+    own = _carried(present.hypothesis.terms[index], hypothesis.terms[index], present.coordinates[old])
     at = np.concatenate([present.coordinates[: old.start], own, present.coordinates[old.stop :]])
     nominal = at.copy()
     nominal[: len(hypothesis.base)] = hypothesis.start[: len(hypothesis.base)]

@@ -75,16 +75,16 @@ def _pruned(selector: Selector, selection: Selection, fit: Fit) -> tuple[Fit, li
 
     How much of what is left one of them takes is not asked: all of them together must take enough.
     """
-    place, merits = selection.terms, list[Merit]()
-    while place < len(fit.hypothesis.terms):
-        reduced = selector.settle_without(fit, place)
+    index, merits = selection.terms, list[Merit]()
+    while index < len(fit.hypothesis.terms):
+        reduced = selector.settle_without(fit, index)
         merit = selector.merit(selection, reduced, fit)
-        worth = large_enough(merit, level=False) and selector.significant(selection, merit, fit, place)
-        if worth and is_sound(merit, fit, place):
+        worth = large_enough(merit, level=False) and selector.significant(selection, merit, fit, index)
+        if worth and is_sound(merit, fit, index):
             merits.append(merit)
-            place += 1
+            index += 1
         else:
-            fit, place, merits = reduced, selection.terms, []
+            fit, index, merits = reduced, selection.terms, []
     return fit, merits
 
 
@@ -101,7 +101,7 @@ def _better(rival: Candidate, left: float, numbers: int) -> bool:
     Where levels leave next to nothing one with as many numbers must leave clearly less, and one with fewer no more: the
     plain cause comes first, one factor on all torques before mass and friction that are off by the same.
     """
-    if is_another(rival.fit, rival.place):
+    if is_another(rival.fit, rival.term_index):
         return False
     if left <= SETTINGS.joint.nearly_all:
         if rival.term.numbers < numbers:

@@ -24,8 +24,10 @@ def level_at_bound(fit: Fit) -> bool:
     """
     low, high = fit.hypothesis.bounds
     watched = LEVELS - {"friction.stribeck_velocity"}
-    places = [i for i, unknown in enumerate(fit.hypothesis.base) if unknown.key in watched]
-    return any(min(fit.coordinates[i] - low[i], high[i] - fit.coordinates[i]) < SETTINGS.worth.on_bound for i in places)
+    indices = [i for i, unknown in enumerate(fit.hypothesis.base) if unknown.key in watched]
+    return any(
+        min(fit.coordinates[i] - low[i], high[i] - fit.coordinates[i]) < SETTINGS.worth.on_bound for i in indices
+    )
 
 
 def is_level_change(term: Term) -> bool:
@@ -45,16 +47,16 @@ MAY_END = frozenset(
 )
 
 
-def at_end_of_range(fit: Fit, place: int = -1) -> bool:
+def at_end_of_range(fit: Fit, term_index: int = -1) -> bool:
     """Whether a number of a term (the last), or one of the model's own that it opens, lies at an end of its range.
 
     Then the effect says itself that it is something else: ranges are wide, and an optimum at an end, twenty times the
     mass or ten times the friction at rest, borrows a shape from an effect that is not there. An end where the number is
     zero is none: there the effect is just absent.
     """
-    term, unknowns = fit.hypothesis.terms[place], fit.hypothesis.unknowns
+    term, unknowns = fit.hypothesis.terms[term_index], fit.hypothesis.unknowns
     low, high = fit.hypothesis.bounds
-    share = fit.hypothesis.share(place)
+    share = fit.hypothesis.share(term_index)
     for index, (unknown, at) in enumerate(zip(unknowns, fit.coordinates, strict=True)):
         own = share.start <= index < share.stop or unknown.key in term.opens
         if not own or unknown.key in MAY_END:
@@ -65,16 +67,16 @@ def at_end_of_range(fit: Fit, place: int = -1) -> bool:
     return False
 
 
-def is_another(fit: Fit, place: int = -1) -> bool:
+def is_another(fit: Fit, index: int = -1) -> bool:
     """Whether a term says itself that it is something else.
 
     It lies at an end of its range, or is short of its own level and has a factor that a plainer effect is alone.
     """
-    terms, place = fit.hypothesis.terms, place % len(fit.hypothesis.terms)
-    plainer = any(terms[place].effect in one.within for one in effects())
-    levelled = any(unknown.key == PLAINER_FACTOR for unknown in terms[place].unknowns)
-    short = plainer and levelled and place not in named_terms(fit, fit.hypothesis.document)
-    return short or at_end_of_range(fit, place)
+    terms, index = fit.hypothesis.terms, index % len(fit.hypothesis.terms)
+    plainer = any(terms[index].effect in one.within for one in effects())
+    levelled = any(unknown.key == PLAINER_FACTOR for unknown in terms[index].unknowns)
+    short = plainer and levelled and index not in named_terms(fit, fit.hypothesis.document)
+    return short or at_end_of_range(fit, index)
 
 
 def named_terms(fit: Fit, nominal: Document) -> tuple[int, ...]:

@@ -29,7 +29,7 @@ from servod.lab.diagnose.select.selection import Selection
 from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
-Tell = Callable[[str], None]
+OnProgress = Callable[[str], None]
 
 #: What every geared servo has, first of all.
 SERVO = ("delay", "goal_rate", "load_dependent_friction")
@@ -53,10 +53,10 @@ class Selector:
         predictor: Predictor,
         nominal: AxisModel,
         deadline: float,
-        tell: Tell,
+        on_progress: OnProgress,
         unknown: frozenset[str] = frozenset(),
     ) -> None:
-        self.predictor, self.deadline, self.tell = predictor, deadline, tell
+        self.predictor, self.deadline, self.on_progress = predictor, deadline, on_progress
         self.nominal, self.unknown = nominal, unknown
         self.start = Hypothesis(document_of(nominal), base_unknowns(nominal, unknown))
         self.untried = unexcited_effects(predictor.traces, nominal.inertia) | fitted_elsewhere(unknown)
@@ -71,7 +71,7 @@ class Selector:
         if step_s >= min(self.predictor.longest_step_s, *(trace.period_s for trace in self.predictor.traces)):
             return self
         predictor = Predictor(self.predictor.traces, self.nominal, self.predictor.rate, step_s)
-        return Selector(predictor, self.nominal, self.deadline, self.tell, self.unknown)
+        return Selector(predictor, self.nominal, self.deadline, self.on_progress, self.unknown)
 
     def refitted(self, selection: Selection) -> Selection:
         """The selection by this predictor, with its fits polished."""
@@ -177,7 +177,7 @@ class Selector:
         found = trials.run(skip=once_only(present.hypothesis) | skip | self.untried)
         if scene.servo:  # what every geared servo has comes first: others swallow it, and their own parts after it
             found.sort(key=lambda candidate: SERVO.index(candidate.effect) if candidate.effect in SERVO else len(SERVO))
-        self.tell(f"{trials.tried} starts tried; best: " + ", ".join(c.effect for c in found[:3]))
+        self.on_progress(f"{trials.tried} starts tried; best: " + ", ".join(c.effect for c in found[:3]))
         return found, trials.tried
 
     def lower_floor(self, selection: Selection, mismatch: Array) -> Selection:
@@ -214,11 +214,11 @@ class Selector:
         """The torque of the term that one fit has more than the other, all else as fitted with it; 0 for a level."""
         hypothesis = with_term.hypothesis
         pairs = zip(hypothesis.terms, (*without.hypothesis.terms, None), strict=False)
-        place = next(index for index, (term, other) in enumerate(pairs) if term is not other)
-        if not hypothesis.terms[place].unknowns:
+        term_index = next(index for index, (term, other) in enumerate(pairs) if term is not other)
+        if not hypothesis.terms[term_index].unknowns:
             return 0.0
-        kept = np.delete(with_term.coordinates, hypothesis.share(place))
-        bare = self.fitter(with_term.mismatch).mismatch(hypothesis.without(place), kept)
+        kept = np.delete(with_term.coordinates, hypothesis.share(term_index))
+        bare = self.fitter(with_term.mismatch).mismatch(hypothesis.without(term_index), kept)
         return 0.0 if bare is None else self._acting(bare, with_term.mismatch)
 
     def _correlation(self, mismatch: Array, scale: float) -> float:
@@ -229,25 +229,25 @@ class Selector:
         slow = float(long_run(clipped[:, None], max(1, round(SETTINGS.worth.gain_memory_s / period)))[0, 0])
         return max(slow / max(plain, 1e-30), 1.0)
 
-    def may_enter(self, selection: Selection, merit: Merit, fit: Fit, place: int = -1) -> bool:
-        """Whether a term (the last one, or the one at `place`) may come in: it deserves it, and its fit is sound."""
-        return self.deserves(selection, merit, fit, place) and is_sound(merit, fit, place)
+    def may_enter(self, selection: Selection, merit: Merit, fit: Fit, index: int = -1) -> bool:
+        """Whether a term (the last one, or the one at `index`) may come in: it deserves it, and its fit is sound."""
+        return self.deserves(selection, merit, fit, index) and is_sound(merit, fit, index)
 
-    def deserves(self, selection: Selection, merit: Merit, fit: Fit, place: int = -1) -> bool:
-        """Whether a term (the last one, or the one at `place`) is significant and worth naming."""
-        worth = worth_naming(merit, is_level_change(fit.hypothesis.terms[place]))
-        return worth and self.significant(selection, merit, fit, place)
+    def deserves(self, selection: Selection, merit: Merit, fit: Fit, index: int = -1) -> bool:
+        """Whether a term (the last one, or the one at `index`) is significant and worth naming."""
+        worth = worth_naming(merit, is_level_change(fit.hypothesis.terms[index]))
+        return worth and self.significant(selection, merit, fit, index)
 
-    def significant(self, selection: Selection, merit: Merit, fit: Fit, place: int = -1) -> bool:
+    def significant(self, selection: Selection, merit: Merit, fit: Fit, index: int = -1) -> bool:
         """Bayesian information criterion with a correction for the number of starts tried."""
-        unknowns = max(len(fit.hypothesis.terms[place].unknowns), 1)
+        unknowns = max(len(fit.hypothesis.terms[index].unknowns), 1)
         rows = float(self.rows.sum())
         return merit.gain > unknowns * math.log(rows) + 2.0 * math.log(max(selection.tried, 1)) + 20.0
 
 
-def is_sound(merit: Merit, fit: Fit, place: int = -1) -> bool:
+def is_sound(merit: Merit, fit: Fit, index: int = -1) -> bool:
     """Whether the fit of a term has come to an end, and says that the term is what it is called."""
-    return (fit.converged or merit.share >= SETTINGS.worth.sure_share) and not is_another(fit, place)
+    return (fit.converged or merit.share >= SETTINGS.worth.sure_share) and not is_another(fit, index)
 
 
 def once_only(hypothesis: Hypothesis) -> set[str]:

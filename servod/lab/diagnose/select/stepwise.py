@@ -76,7 +76,7 @@ def _add_best(selector: Selector, selection: Selection) -> Selection:
     deserves = partial(selector.deserves, selection)
     best = math.inf
     for candidate in candidates:
-        if is_another(candidate.fit, candidate.place):
+        if is_another(candidate.fit, candidate.term_index):
             continue
         best = min(best, candidate.left)
         if candidate.left > best + SETTINGS.forward.close * (1.0 - best):
@@ -126,9 +126,9 @@ def swap_terms(selector: Selector, selection: Selection) -> Selection:
         for rival in _rivals(selection, index):
             if monotonic() > selector.deadline:
                 break
-            swapped = _swap(selector, selection, index, rival)
-            if swapped is not None:
-                selection = swapped
+            after_swap = _swap(selector, selection, index, rival)
+            if after_swap is not None:
+                selection = after_swap
                 break
     return selection if selection.fit is before else judged_again(selector, selection)
 
@@ -196,9 +196,9 @@ def _coordinates(fit: Fit, hypothesis: Hypothesis, index: int, rival: Candidate)
     own = fit.hypothesis.share(index)
     at = np.concatenate([fit.coordinates[: own.start], rival.own, fit.coordinates[own.stop :]])
     opened = set(fit.hypothesis.terms[index].opens) | set(hypothesis.terms[index].opens)
-    for place, unknown in enumerate(hypothesis.base):
+    for base_index, unknown in enumerate(hypothesis.base):
         if unknown.key in opened:
-            at[place] = rival.fit.coordinates[place]
+            at[base_index] = rival.fit.coordinates[base_index]
     return np.asarray(at)
 
 

@@ -71,8 +71,8 @@ def fit(trace: RecordedMotion, moved: Moved, delay_s: float, viscous: float, sti
     values, spread = jackknife(damping, periods)
     note = _note(_searched(frequency, periods, moved, delay_s, trace.period_s)[0])
     found = estimate(float(values[0]), float(spread[0]), len(periods) - 1, "N*m*s/rad", share=ALLOWANCE, note=note)
-    told = found.value > 0.0 and found.half_width < WIDEST_SHARE * found.value
-    return found if told else None
+    significant = found.value > 0.0 and found.half_width < WIDEST_SHARE * found.value
+    return found if significant else None
 
 
 def response(

@@ -97,8 +97,8 @@ def solve(frequency: Array, ratio: Complex, deviation: Array, period_s: float, i
     """The two masses that fit the measured `ratio` best, relative to its `deviation`."""
     band = np.log([LOWEST_HZ, frequency[-1]])
     found = [
-        _from(frequency, ratio, deviation, period_s, np.array([np.log(inertia), 50.0, 1.5, place, load, 0.03]))
-        for place in band[0] + np.array(_STARTS) * (band[1] - band[0])
+        _from(frequency, ratio, deviation, period_s, np.array([np.log(inertia), 50.0, 1.5, log_hz, load, 0.03]))
+        for log_hz in band[0] + np.array(_STARTS) * (band[1] - band[0])
         for load in _LOADS
     ]
     return min(found, key=lambda each: each[1])[0]

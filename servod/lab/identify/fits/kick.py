@@ -32,8 +32,8 @@ def fit(kicks: Sequence[RecordedMotion]) -> KickFit:
     Of `kicks`, which grew until they told, the last of each direction counts. Raises AnswerIsNo when inertia does not
     come out positive.
     """
-    told = list({np.sign(kick.settings["pulse_nm"]): kick for kick in kicks}.values())
-    best = min((_with_delay(told, d * told[0].period_s) for d in DELAYS), key=lambda fitted: fitted[0])
+    last_kicks = list({np.sign(kick.settings["pulse_nm"]): kick for kick in kicks}.values())
+    best = min((_with_delay(last_kicks, d * last_kicks[0].period_s) for d in DELAYS), key=lambda fitted: fitted[0])
     if best[1].inertia <= 0.0:
         raise AnswerIsNo("the kicked joint did not follow the torque; is the encoder the joint's own?")
     return best[1]

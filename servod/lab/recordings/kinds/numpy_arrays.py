@@ -53,7 +53,7 @@ def read_npy(path: Path, wanted: Container[str], bounds: FileBounds, _notes: lis
         try:
             return _columns("data", stream, wanted, bounds)
         except _BROKEN as error:
-            raise BadInput(str(path), _told(error), "an array of numbers: np.save") from None
+            raise BadInput(str(path), _error_text(error), "an array of numbers: np.save") from None
 
 
 def read_npz(path: Path, wanted: Container[str], bounds: FileBounds, _notes: list[str]) -> dict[str, Any]:
@@ -70,11 +70,11 @@ def read_npz(path: Path, wanted: Container[str], bounds: FileBounds, _notes: lis
                         columns |= _columns(name, cast(BinaryIO, packed), wanted, bounds)
                     bounds.require_cells(sum(kept.size for kept in columns.values() if kept is not None), 1)
         except _BROKEN as error:
-            raise BadInput(str(path), _told(error), "arrays of numbers: np.savez") from None
+            raise BadInput(str(path), _error_text(error), "arrays of numbers: np.savez") from None
     return columns
 
 
-def _told(error: Exception) -> str:
+def _error_text(error: Exception) -> str:
     """What is wrong: in own words, for those of the libraries speak of themselves."""
     return str(error) if isinstance(error, BrokenArrayError) else "a file that is broken, or of another kind"
 

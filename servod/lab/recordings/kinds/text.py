@@ -82,17 +82,17 @@ def _table(text: _Counted, bounds: FileBounds, layout: Layout, used: list[str], 
         raise _bad_table(bounds.path, first_line(error), layout) from None
 
 
-def _bad_table(path: Path, told: str, layout: Layout) -> BadInput:
+def _bad_table(path: Path, error_text: str, layout: Layout) -> BadInput:
     """What Arrow complains of, in our words; rows count from the first below the header, as elsewhere."""
-    if ragged := _RAGGED.search(told):
+    if ragged := _RAGGED.search(error_text):
         row, wanted, found = (int(number) for number in ragged.groups())
         allowed = f"{wanted} cells, as the first line has"
         if layout.separator == "," and found == 2 * wanted:
             allowed += "; where the decimal sign is a comma, semicolons or tabs between cells"
         return BadInput(f"{path}: row {row}", f"{found} cells", allowed)
-    if told.startswith("Empty CSV"):
+    if error_text.startswith("Empty CSV"):
         return BadInput(str(path), "no row below the header", "a header line and rows of numbers")
-    return BadInput(str(path), told, "rows with as many cells as the header")
+    return BadInput(str(path), error_text, "rows with as many cells as the header")
 
 
 class _Counted:
@@ -244,8 +244,8 @@ def find_layout(head: bytes, whole: bool, path: Path) -> Layout:
     separator, blanks = (separator, False) if separator != " " else (" ", True)
     decimal = _decimal([split(line, separator) for line in lines[rows:]]) if separator != "," else "."
     skip = sum(len(line) for line in head.splitlines(keepends=True)[:rows])
-    told = max((at + 1 for at, name in enumerate(named) if name), default=width)
-    return Layout(tuple(names[:told]), tuple(names), separator, blanks, decimal, skip, tuple(notes))
+    named_width = max((at + 1 for at, name in enumerate(named) if name), default=width)
+    return Layout(tuple(names[:named_width]), tuple(names), separator, blanks, decimal, skip, tuple(notes))
 
 
 def _lines(head: bytes, whole: bool, path: Path, notes: list[str]) -> list[str]:
@@ -289,9 +289,11 @@ def split(line: str, separator: str) -> list[str]:
 
 
 def _all_numbers(cells: Sequence[str]) -> bool:
-    told = [cell for cell in cells if cell]
+    filled = [cell for cell in cells if cell]
     return (
-        bool(told) and bool(cells[0]) and all(_is_number(cell) and cell.lower() not in _NOT_A_NUMBER for cell in told)
+        bool(filled)
+        and bool(cells[0])
+        and all(_is_number(cell) and cell.lower() not in _NOT_A_NUMBER for cell in filled)
     )
 
 
@@ -305,26 +307,26 @@ def _is_number(cell: str) -> bool:
 
 def _is_unit_row(cells: Sequence[str], below: Sequence[str]) -> bool:
     """Words beneath the names, and numbers beneath the words."""
-    told = [cell for cell in cells if cell.lower() not in _NOT_A_NUMBER]
-    return bool(told) and not any(map(_is_number, told)) and any(_is_number(cell) for cell in below if cell)
+    words = [cell for cell in cells if cell.lower() not in _NOT_A_NUMBER]
+    return bool(words) and not any(map(_is_number, words)) and any(_is_number(cell) for cell in below if cell)
 
 
 def _width(first: Sequence[str], rows: Sequence[Sequence[str]]) -> int:
     """Cells of a row: as many as the header has, but for empty ones at the end of either."""
-    told = len(first)
-    while told > 1 and not first[told - 1]:
-        told -= 1
+    width = len(first)
+    while width > 1 and not first[width - 1]:
+        width -= 1
     for row in rows:
         if row and any(row) and len(row) != len(first):
-            return len(row) if len(row) >= told and not any(row[len(first) :]) else len(first)
+            return len(row) if len(row) >= width and not any(row[len(first) :]) else len(first)
     return len(first)
 
 
 def _names(named: Sequence[str], width: int, path: Path) -> list[str]:
     """A name for every cell, its number where it has none. Raises BadInput for one that stands twice."""
     refuse_repeated([name for name in named if name], path)
-    told = dict(enumerate(named))
-    return [told.get(at) or by_number(at) for at in range(width)]
+    name_at = dict(enumerate(named))
+    return [name_at.get(at) or by_number(at) for at in range(width)]
 
 
 def _decimal(rows: Sequence[Sequence[str]]) -> str:

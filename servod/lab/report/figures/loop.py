@@ -258,8 +258,8 @@ def limit_used(check: CertificateCheck) -> float:
 
 def observations_table(gains: GainSet) -> PageTable:
     """What was observed beside the checks, told and not judged. Raises BadInput for a set without a certificate."""
-    told = {k: v for k, v in _certificate(gains).observations.items() if k not in MARGINS}
-    return PageTable("Told, not judged", ("figure", "value"), tuple((k, f"{v:.4g}") for k, v in told.items()))
+    observations = {k: v for k, v in _certificate(gains).observations.items() if k not in MARGINS}
+    return PageTable("Told, not judged", ("figure", "value"), tuple((k, f"{v:.4g}") for k, v in observations.items()))
 
 
 def _exact(check: CertificateCheck) -> bool:
@@ -268,10 +268,10 @@ def _exact(check: CertificateCheck) -> bool:
 
 def margin_rows(certificate: Judged) -> Iterator[tuple[str, ...]]:
     """One row for each margin that a certificate states; none of one of an earlier version."""
-    told = certificate.observations
+    observations = certificate.observations
     for key, words in MARGINS.items():
-        if key in told:
-            yield words.name, f"{told[key]:.3g}", words.unit, words.usual, words.meaning
+        if key in observations:
+            yield words.name, f"{observations[key]:.3g}", words.unit, words.usual, words.meaning
 
 
 def _certificate(gains: GainSet) -> Certificate:

@@ -145,9 +145,10 @@ def bars(panels: Sequence[PlotPanel], left_out: str) -> Figure:
 def before_after(errors: Mapping[str, tuple[float, float]], unit: str, what: str, named: bool = True) -> PlotPanel:
     """Bars of an error before and after: name -> (before, after); a panel beside a `named` one needs no names."""
     names = tuple(reversed(list(errors)))
-    places, (factor, prefix) = np.arange(len(names), dtype=float), _prefix(max(max(pair) for pair in errors.values()))
+    positions = np.arange(len(names), dtype=float)
+    factor, prefix = _prefix(max(max(pair) for pair in errors.values()))
     bars = tuple(
-        curve(label, [factor * errors[n][side] for n in names], places + shift, colour, Style.BARS, HALF_BAR)
+        curve(label, [factor * errors[n][side] for n in names], positions + shift, colour, Style.BARS, HALF_BAR)
         for side, label, shift, colour in ((0, "before", 0.19, Colour.ORANGE), (1, "after", -0.19, Colour.BLUE))
     )
     return PlotPanel(

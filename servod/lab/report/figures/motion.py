@@ -302,9 +302,9 @@ def recorded_run(run: RecordedRun, name: str = "recording") -> Figure:
 
 def _states(run: RecordedRun, t: PlotAxis, column: str, title: str, names: StateNames) -> PlotPanel:
     """A line that jumps where the state changes; the states that occur have a place each, in the order of the enum."""
-    occur, places = np.unique(array(run.columns[column]), return_inverse=True)
+    occur, levels = np.unique(array(run.columns[column]), return_inverse=True)
     shown = tuple(names[int(k)] if 0 <= k < len(names) else f"{k:g}" for k in occur)
-    x, y = _stairs(run.time_s, places.astype(np.float64))
+    x, y = _stairs(run.time_s, levels.astype(np.float64))
     return PlotPanel(
         t, PlotAxis("", span=(-0.5, len(shown) - 0.5), names=shown), (curve(title, x, y, Colour.PURPLE),), title
     )
@@ -328,12 +328,12 @@ def _faults(run: RecordedRun, t: PlotAxis) -> list[PlotPanel]:
     if not codes:
         return []
     curves = []
-    for place, code in enumerate(codes):
+    for level, code in enumerate(codes):
         present = np.concatenate([[0], (bits >> code) & 1, [0]])
         begins, ends = np.flatnonzero(np.diff(present) > 0), np.flatnonzero(np.diff(present) < 0) - 1
         until_s = run.time_s[np.minimum(ends + 1, len(run.time_s) - 1)]
         x = np.column_stack([run.time_s[begins], until_s, until_s]).ravel()
-        y = np.tile([float(place), float(place), np.nan], len(begins))
+        y = np.tile([float(level), float(level), np.nan], len(begins))
         curves.append(curve("fault", x, y, Colour.ORANGE, width=5.0, detail=code.name))
         curves.append(curve("fault", x[::3], y[::3], Colour.ORANGE, Style.POINTS, detail=code.name))  # seen from afar
     names = tuple(code.name for code in codes)
@@ -379,14 +379,14 @@ def _following_errors(run: RecordedRun, error: Array, unit: str) -> list[str]:
         if not rows.any():
             return ["never enabled"]
     serials = np.asarray(run.columns.get("controller", np.zeros(len(error))))
-    told = []
+    sentences = []
     for serial in dict.fromkeys(serials[rows]):
         of_set = error[rows & (serials == serial)]
         name = f" under gain set {int(serial)} of this run" if len(set(serials[rows])) > 1 else ""
         if name and serial in run.sets:
             name += f" ({run.sets[serial]})"
-        told.append(_judged(of_set, unit) + name)
-    return told
+        sentences.append(_judged(of_set, unit) + name)
+    return sentences
 
 
 def _judged(error: Array, unit: str) -> str:
@@ -396,5 +396,5 @@ def _judged(error: Array, unit: str) -> str:
     if not len(known):
         return f"no error can be told, {without} cycles have none"
     rms, largest = np.sqrt(np.mean(known**2)), np.abs(known).max()
-    told = f"RMS error {rms:.4g} m{unit}, largest {largest:.4g} m{unit}"
-    return f"{told} ({without} of {len(error)} cycles, which have no error, left out)" if without else told
+    sentence = f"RMS error {rms:.4g} m{unit}, largest {largest:.4g} m{unit}"
+    return f"{sentence} ({without} of {len(error)} cycles, which have no error, left out)" if without else sentence
